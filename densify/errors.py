@@ -1,0 +1,15 @@
+# SPDX-License-Identifier: MIT
+"""The two ways a densify command can fail that are not a bug.
+
+A message is one line: what, where, got, expected, what to do.
+"""
+
+from __future__ import annotations
+
+
+class InputError(Exception):
+    """Input, configuration or output place that cannot be used. Exit code 2."""
+
+
+class ComputationError(Exception):
+    """A stage found that its result cannot be trusted. Exit code 1."""

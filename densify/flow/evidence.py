@@ -1,0 +1,119 @@
+# SPDX-License-Identifier: MIT
+"""Which points cannot belong to the static world: other sweeps saw through where they were."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from densify import poses
+from densify.range_image import RangeImage
+from densify.types import Bool, Float, Float32, Int, Window
+
+_MARGIN_M = 0.4
+_MARGIN_FRACTION = 0.015
+_NEAR_M = 0.4
+_MIN_SEED_SHARE = 0.3
+_LINK_M = 0.6
+
+
+@dataclass(frozen=True)
+class FreeSpace:
+    """What each sweep of a window saw through."""
+
+    window: Window
+    images: tuple[RangeImage, ...]
+
+    @staticmethod
+    def of(window: Window) -> FreeSpace:
+        with ThreadPoolExecutor() as pool:
+            return FreeSpace(window, tuple(pool.map(RangeImage.of, window.sweeps)))
+
+    def seen_through(self, points: Float, j: int) -> Bool:
+        """(N,3) key frame -> (N,) True where sweep number j certainly saw free space."""
+        T_lidar_key = poses.inverse(self.window.sweeps[j].T_key_lidar)
+        return self.images[j].sees_through(
+            poses.transform(T_lidar_key, points), _MARGIN_M, _MARGIN_FRACTION
+        )
+
+
+@dataclass(frozen=True)
+class Candidates:
+    """The points of one sweep that may move.
+
+    row: (C,) index into the sweep's points. points: (C,3) key frame, rigidly registered.
+    seed: (C,) some other sweep sees through the point. cluster: (C,) label, ``num_clusters`` of them.
+    """
+
+    row: Int
+    points: Float
+    seed: Bool
+    cluster: Int
+    num_clusters: int
+
+
+def find_candidates(
+    space: FreeSpace, heights_m: Sequence[Float32], min_height_m: float
+) -> tuple[Candidates, ...]:
+    """Candidates of every sweep, clustered.
+
+    A point above the ground is a seed where any other sweep of the window sees through it; points
+    close to a seed are candidates too, since a mover's own points are not all seen through.
+    min_height_m: points lower above the ground are never candidates.
+    """
+    sweeps = space.window.sweeps
+
+    def of_sweep(i: int) -> Candidates:
+        above = np.flatnonzero(heights_m[i] >= min_height_m)
+        points = poses.transform(sweeps[i].T_key_lidar, sweeps[i].sweep.points[above])
+        seed = np.zeros(len(above), bool)
+        for j in range(len(sweeps)):
+            if j != i:
+                rest = np.flatnonzero(~seed)
+                seed[rest] = space.seen_through(points[rest], j)
+        return _cluster(above, points, seed)
+
+    with ThreadPoolExecutor() as pool:
+        return tuple(pool.map(of_sweep, range(len(sweeps))))
+
+
+def _cluster(row: Int, points: Float, seed: Bool) -> Candidates:
+    """Keep the seeds that are not alone among unseen points (a hedge's flicker is), add what is
+    close to them, and link."""
+    if seed.any():
+        seeds = np.flatnonzero(seed)
+        tree = cKDTree(points)
+        num_near = tree.query_ball_point(points[seeds], _NEAR_M, return_length=True)
+        num_near_seeds = cKDTree(points[seeds]).query_ball_point(
+            points[seeds], _NEAR_M, return_length=True
+        )
+        kept = seeds[num_near_seeds >= _MIN_SEED_SHARE * num_near]
+        distance = np.full(len(points), np.inf)
+        if len(kept):
+            distance, _ = cKDTree(points[kept]).query(points, distance_upper_bound=_NEAR_M)
+        near = np.isfinite(distance)
+    else:
+        near = np.zeros(len(points), bool)
+    row, points, seed = row[near], points[near], seed[near]
+    num_clusters, cluster = link(points, _LINK_M)
+    return Candidates(row, points, seed, cluster, num_clusters)
+
+
+def link(points: Float, distance_m: float) -> tuple[int, Int]:
+    """(N,3) -> number of groups and (N,) label: points closer than about ``distance_m`` share one.
+
+    Links voxels of half that size, so the cost does not grow with the square of the density.
+    """
+    voxels, of_point = np.unique(
+        np.floor(points / (0.5 * distance_m)), axis=0, return_inverse=True
+    )
+    pairs = cKDTree(voxels).query_pairs(2.0, output_type="ndarray")
+    links = coo_array((np.ones(len(pairs), bool), pairs.T), shape=(len(voxels), len(voxels)))
+    num_groups, label = connected_components(links, directed=False)
+    return int(num_groups), label[of_point.ravel()].astype(np.int64)

@@ -1,0 +1,221 @@
+# SPDX-License-Identifier: MIT
+"""The pipeline, as a story: read, register, deskew, ground, flow, chain, accumulate, project."""
+
+from __future__ import annotations
+
+import resource
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from densify import poses, scores
+from densify.config import Config, resolve
+from densify.errors import InputError
+from densify.range_image import RangeImage
+from densify.readers.window import choose_cameras, read_sweeps, recorded_trajectory, window_frames
+from densify.stages.accumulate import accumulate
+from densify.stages.chain import chain
+from densify.stages.deskew import deskew
+from densify.stages.flow import step_flow
+from densify.stages.ground import height_above_ground
+from densify.stages.project import project
+from densify.stages.register import check_plausible, register
+from densify.types import (
+    Camera,
+    Cloud,
+    DepthMap,
+    Float,
+    FlowField,
+    LidarSequence,
+    RegisteredSweep,
+    Result,
+    StageCost,
+    Sweep,
+    Trajectory,
+    Window,
+)
+
+METHODS = ("none", "icp", "flow")
+"""The key sweep alone; registration only; registration and scene flow. Each is the baseline of the
+next."""
+
+ConfigLike = Config | str | Path | Mapping[str, Any] | None
+Progress = Callable[[str, int, int], None]
+
+
+def run(
+    sequence: LidarSequence,
+    key: int,
+    window: int = 5,
+    method: str = "flow",
+    cameras: Sequence[str] | None = None,
+    config: ConfigLike = None,
+    progress: Progress | None = None,
+) -> Result:
+    """Densify one key.
+
+    key: absolute frame number. window: sweeps on each side of it; cut at the ends of the recording,
+    with a warning. method: one of `METHODS`. cameras: names, all if None. config: what
+    `densify.config.resolve` takes. progress: called with (stage, done, total).
+
+    The result carries its baselines. Raises InputError for what cannot be used, ComputationError
+    where registration went wrong.
+    """
+    if method not in METHODS:
+        raise InputError(f"--method {method}: expected one of {', '.join(METHODS)}")
+    return compare(sequence, key, window, cameras, config, progress, upto=method)[method]
+
+
+def compare(
+    sequence: LidarSequence,
+    key: int,
+    window: int = 5,
+    cameras: Sequence[str] | None = None,
+    config: ConfigLike = None,
+    progress: Progress | None = None,
+    upto: str = "flow",
+) -> dict[str, Result]:
+    """`METHODS` up to ``upto`` on the same registration, the last with the others as its baselines.
+
+    The rest as `run`.
+    """
+    settings = resolve(config)
+    wanted = METHODS[: METHODS.index(upto) + 1]
+    chosen = choose_cameras(sequence, cameras)
+    frames, lead_in = window_frames(sequence, key, window, settings.register.num_lead_in)
+    watch = _Watch(progress)
+
+    sweeps = _read(sequence, [*lead_in, *frames], settings, watch)
+    with watch.stage("register"):
+        trajectory = _trajectory(sequence, sweeps, key, settings)
+    with watch.stage("deskew"):
+        moving_window = deskew([s for s in sweeps if s.frame in frames], trajectory, key)
+    flow: tuple[FlowField, ...] = ()
+    if "flow" in wanted:
+        with watch.stage("ground"):
+            heights_m = height_above_ground(moving_window, settings.ground)
+        with watch.stage("flow"):
+            steps = step_flow(moving_window, heights_m, settings.flow)
+        with watch.stage("chain"):
+            flow = chain(moving_window, steps, settings.chain)
+
+    results: dict[str, Result] = {}
+    for method in wanted:
+        used = Window(key, (moving_window[key],)) if method == "none" else moving_window
+        fields = flow if method == "flow" else tuple(FlowField.zero(len(s.sweep)) for s in used.sweeps)
+        with watch.stage("accumulate"):
+            cloud = accumulate(used, fields, settings.chain.unfollowed == "drop")
+        with watch.stage("project"):
+            depth = {
+                camera.name: project(
+                    cloud,
+                    camera,
+                    _camera_pose(sequence, moving_window[key], camera),
+                    settings.project,
+                    key,
+                    {s.frame: s.T_key_lidar[:3, 3] for s in used.sweeps},
+                )
+                for camera in chosen
+            }
+        with watch.stage("score"):
+            metrics = _scores(sequence, moving_window, cloud, depth)
+        results[method] = Result(
+            method, key, used.frames, cloud, depth, metrics, watch.costs(), dict(results)
+        )
+    return results
+
+
+def _read(
+    sequence: LidarSequence, frames: Sequence[int], settings: Config, watch: _Watch
+) -> list[Sweep]:
+    with watch.stage("read"):
+        sweeps = []
+        limits = (settings.register.min_range_m, settings.register.max_range_m)
+        for sweep in read_sweeps(sequence, frames, *limits):
+            sweeps.append(sweep)
+            watch.step("read", len(sweeps), len(frames))
+    return sweeps
+
+
+def _trajectory(
+    sequence: LidarSequence, sweeps: Sequence[Sweep], key: int, settings: Config
+) -> Trajectory:
+    """Poses in two passes: raw sweeps are bent by the motion that the first pass finds."""
+    if settings.register.source == "dataset":
+        trajectory = recorded_trajectory(sequence, sweeps)
+        check_plausible(trajectory, settings.register)
+        return trajectory
+    rough = register(sweeps, settings.register)
+    straight = [s.sweep for s in deskew(sweeps, rough, key).sweeps]
+    return register(straight, settings.register, rough)
+
+
+def _camera_pose(sequence: LidarSequence, key_sweep: RegisteredSweep, camera: Camera) -> Float:
+    """(4,4) T_cam_key with the ego motion from the key's reference time to the exposure."""
+    stamp_ns = sequence.image_stamp_ns(camera.name, key_sweep.frame)
+    late_s = (stamp_ns - key_sweep.sweep.stamp_ns) * 1e-9
+    twist = key_sweep.twist_before if late_s < 0 else key_sweep.twist_after
+    return camera.T_cam_lidar @ poses.inverse(poses.exp(late_s * twist))
+
+
+def _scores(
+    sequence: LidarSequence, window: Window, cloud: Cloud, depth: Mapping[str, DepthMap]
+) -> dict[str, Any]:
+    """What can be said of the result without truth, and against the truth where there is some."""
+    metrics: dict[str, Any] = {
+        "num_points": len(cloud),
+        "num_moving": int(cloud.moving.sum()),
+        "density": {
+            name: {
+                "measured": scores.image_density(maps.depth_m),
+                "filled": scores.image_density(maps.filled_m),
+            }
+            for name, maps in depth.items()
+        },
+        "ghosts": scores.ghost_scores(cloud, RangeImage.of(window[window.key]), window.key),
+    }
+    if sequence.truth is not None:
+        metrics["depth"] = {
+            name: scores.depth_scores(
+                maps,
+                sequence.truth.depth_m(name, window.key),
+                sequence.truth.moving_mask(name, window.key),
+                sequence.cameras[name],
+            )
+            for name, maps in depth.items()
+        }
+    return metrics
+
+
+class _Watch:
+    """Says which stage is at work, and what each has cost."""
+
+    def __init__(self, progress: Progress | None) -> None:
+        self._progress = progress
+        self._seconds: dict[str, float] = {}
+        self._peak_mb: dict[str, float] = {}
+
+    def step(self, name: str, done: int, total: int) -> None:
+        if self._progress is not None:
+            self._progress(name, done, total)
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        self.step(name, 0, 1)
+        start = time.perf_counter()
+        yield
+        self._seconds[name] = self._seconds.get(name, 0.0) + time.perf_counter() - start
+        self._peak_mb[name] = _peak_memory_mb()
+        self.step(name, 1, 1)
+
+    def costs(self) -> tuple[StageCost, ...]:
+        """So far; a stage that worked for several methods is counted once, in sum."""
+        return tuple(StageCost(n, s, self._peak_mb[n]) for n, s in self._seconds.items())
+
+
+def _peak_memory_mb() -> float:
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak / (1024 * 1024 if sys.platform == "darwin" else 1024)

@@ -1,0 +1,51 @@
+# SPDX-License-Identifier: MIT
+"""Accumulation: the points of all sweeps at the key's moment, with where they come from."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from densify import poses
+from densify.types import Cloud, FlowField, Window
+
+_CONFIDENCE_PER_SWEEP = 0.07
+_CONFIDENCE_MOVED = 0.8
+
+
+def accumulate(window: Window, fields: Sequence[FlowField], drop_lost: bool) -> Cloud:
+    """One cloud in the key frame from flow to the key.
+
+    fields: of each sweep to the key. drop_lost: leave out what moves but could not be followed;
+    otherwise it stays where registration puts it. Points that do not move are placed by
+    registration alone, to the last bit.
+
+    Confidence is a ranking, not a probability: it falls with the distance from the key and for
+    points that flow had to move.
+    """
+    parts = []
+    for registered, flow in zip(window.sweeps, fields, strict=True):
+        sweep = registered.sweep
+        kept = np.flatnonzero(~flow.lost) if drop_lost else np.arange(len(sweep))
+        rigid = poses.transform(registered.T_key_lidar, sweep.points)
+        points = rigid.copy()
+        moves = flow.moving & ~flow.lost
+        points[moves] += flow.displacement[moves] @ registered.T_key_lidar[:3, :3].T
+        away = abs(registered.frame - window.key)
+        confidence = np.full(len(sweep), max(0.1, 1 - _CONFIDENCE_PER_SWEEP * away))
+        confidence[moves & (away > 0)] *= _CONFIDENCE_MOVED
+        parts.append(
+            {
+                "points": points[kept],
+                "rigid_points": rigid[kept],
+                "frame": np.full(len(kept), registered.frame, np.int32),
+                "row": kept,
+                "moving": flow.moving[kept],
+                "instance": flow.instance[kept],
+                "confidence": confidence[kept].astype(np.float32),
+                "intensity": sweep.intensity[kept],
+                "rgb": np.zeros((len(kept), 3), np.uint8),
+            }
+        )
+    return Cloud(**{name: np.concatenate([p[name] for p in parts]) for name in parts[0]})

@@ -1,0 +1,61 @@
+# SPDX-License-Identifier: MIT
+"""Deskewing: every point of a sweep where it would have been at the sweep's reference time."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from densify import poses
+from densify.types import Float, RegisteredSweep, Sweep, Trajectory, Window
+
+
+def deskew(sweeps: Sequence[Sweep], trajectory: Trajectory, key: int) -> Window:
+    """Undo the lidar's own motion within each sweep, and place the sweeps around the key.
+
+    sweeps: raw, a subset of the trajectory's frames that holds the key. The half of a sweep before
+    its reference time moves with the twist from the previous sweep, the half after it with the
+    twist to the next one. Sweeps without per-point times keep their points as they are.
+    All columns stay aligned.
+    """
+    T_key_world = poses.inverse(trajectory.T_world_lidar[trajectory.frames.index(key)])
+    registered = []
+    for sweep in sweeps:
+        i = trajectory.frames.index(sweep.frame)
+        before, after = _twists(trajectory, i)
+        points = sweep.points
+        if sweep.offset_ns is None:
+            before, after = np.zeros(6), np.zeros(6)
+        else:
+            offset_s = sweep.offset_ns[:, None] * 1e-9
+            points = poses.transform_each(offset_s * np.where(offset_s < 0, before, after), points)
+        registered.append(
+            RegisteredSweep(
+                sweep=replace(sweep, points=points),
+                T_key_lidar=T_key_world @ trajectory.T_world_lidar[i],
+                twist_before=before,
+                twist_after=after,
+            )
+        )
+    return Window(key=key, sweeps=tuple(registered))
+
+
+def _twists(trajectory: Trajectory, i: int) -> tuple[Float, Float]:
+    """(6,) per second before and after sweep i; at an end both are the one that exists."""
+
+    def toward(j: int) -> Float | None:
+        if not 0 <= j < len(trajectory.frames):
+            return None
+        seconds = (trajectory.stamp_ns[j] - trajectory.stamp_ns[i]) * 1e-9
+        T = trajectory.T_world_lidar
+        return poses.log(poses.inverse(T[i]) @ T[j]) / seconds
+
+    before, after = toward(i - 1), toward(i + 1)
+    if before is None and after is None:
+        return np.zeros(6), np.zeros(6)
+    return (
+        before if before is not None else after,  # type: ignore[return-value]
+        after if after is not None else before,
+    )

@@ -1,0 +1,128 @@
+# SPDX-License-Identifier: MIT
+"""Scene flow of every sweep of a window to its neighbour on the way to the key."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from densify import poses
+from densify.config import FlowSettings
+from densify.flow.evidence import Candidates, FreeSpace, find_candidates
+from densify.flow.tracks import Track, follow_groups
+from densify.types import Float, Float32, FlowField, Window
+
+_ATTACH_M = 0.3
+_ATTACH_UNSEEN_M = 0.15
+_ATTACH_LOW_M = 0.1
+_MIN_HEIGHT_M = 0.08
+_BAND_M = 0.3
+
+
+def step_flow(
+    window: Window, heights_m: Sequence[Float32], settings: FlowSettings
+) -> tuple[FlowField, ...]:
+    """Flow of each sweep to the next one towards the key; the key's own is 0, its movers marked.
+
+    heights_m: per sweep (N,) above the ground.
+    """
+    if settings.engine == "paper":
+        return _paper_steps(window, heights_m, settings)
+    return _group_steps(window, heights_m, settings)
+
+
+def _group_steps(
+    window: Window, heights_m: Sequence[Float32], settings: FlowSettings
+) -> tuple[FlowField, ...]:
+    """Rigid groups whose motion is proven; everything else stays exactly where it is."""
+    key = window.frames.index(window.key)
+    stamp_ns = np.array([s.sweep.stamp_ns for s in window.sweeps])
+    time_s = (stamp_ns - stamp_ns[key]) * 1e-9
+    space = FreeSpace.of(window)
+    candidates = find_candidates(space, heights_m, settings.min_height_m)
+    tracks = follow_groups(candidates, space, time_s, key)
+
+    fields = []
+    for i, registered in enumerate(window.sweeps):
+        points = poses.transform(registered.T_key_lidar, registered.sweep.points)
+        instance = _attach(points, heights_m[i], candidates[i], tracks, candidates, i, time_s)
+        target = i + int(np.sign(key - i))
+        displacement = np.zeros_like(points)
+        for k, track in enumerate(tracks):
+            mine = instance == k
+            if target != i and mine.any():
+                moved = track.carry(points[mine], time_s[i], time_s[target]) - points[mine]
+                displacement[mine] = moved @ registered.T_key_lidar[:3, :3]  # into the lidar frame
+        fields.append(
+            FlowField(displacement, instance >= 0, instance, np.zeros(len(points), bool))
+        )
+    return tuple(fields)
+
+
+def _attach(
+    points: Float,
+    height_m: Float32,
+    here: Candidates,
+    tracks: Sequence[Track],
+    candidates: Sequence[Candidates],
+    i: int,
+    time_s: Float,
+) -> np.ndarray:
+    """(N,) int32: the track each point of sweep i belongs to, -1 none."""
+    instance = np.full(len(points), -1, np.int32)
+    nearest = np.full(len(points), np.inf)
+    reach = np.full(len(points), _ATTACH_UNSEEN_M)
+    reach[here.row] = _ATTACH_M
+    for k, track in enumerate(tracks):
+        if i not in track.claimed:
+            continue
+        model = np.concatenate(
+            [
+                track.carry(candidates[j].points[rows], time_s[j], time_s[i])
+                for j, rows in sorted(track.claimed.items())
+            ]
+        )
+        low, high = model.min(0) - _ATTACH_M, model.max(0) + _ATTACH_M
+        low[2] -= 1.0  # down to the wheels
+        inside = ((points > low) & (points < high)).all(1) & (height_m > _MIN_HEIGHT_M)
+        rows = np.flatnonzero(inside)
+        if not len(rows):
+            continue
+        distance, _ = cKDTree(model).query(points[rows])
+        beneath, _ = cKDTree(model[:, :2]).query(points[rows, :2])
+        belongs = (distance < reach[rows]) | (
+            (height_m[rows] < _BAND_M) & (beneath < _ATTACH_LOW_M) & (distance < 0.5)
+        )
+        closer = belongs & (distance < nearest[rows])
+        instance[rows[closer]] = k
+        nearest[rows[closer]] = distance[closer]
+    return instance
+
+
+def _paper_steps(
+    window: Window, heights_m: Sequence[Float32], settings: FlowSettings
+) -> tuple[FlowField, ...]:
+    """The published way: every point above the ground moves, pair by pair."""
+    from densify.flow.pair import device, objective_settings
+    from densify.flow.solvers import solve
+
+    key = window.frames.index(window.key)
+    above = [h >= settings.min_height_m for h in heights_m]
+    clouds = [poses.transform(s.T_key_lidar, s.sweep.points) for s in window.sweeps]
+    fields = []
+    for i, registered in enumerate(window.sweeps):
+        field = FlowField.zero(len(clouds[i]))
+        field.moving[:] = above[i]
+        target = i + int(np.sign(key - i))
+        if target != i:
+            flow = solve(
+                clouds[i][above[i]],
+                clouds[target][above[target]],
+                objective_settings(settings),
+                device=device(settings),
+            ).flow
+            field.displacement[above[i]] = flow @ registered.T_key_lidar[:3, :3]
+        fields.append(field)
+    return tuple(fields)

@@ -1,0 +1,281 @@
+# SPDX-License-Identifier: MIT
+"""What the stages hand to each other. All are frozen; columns stay aligned row by row.
+
+Poses are named ``T_target_source``: ``p_target = T_target_source @ p_source``. Frames of reference:
+``world``, ``lidar`` (at the sweep's reference time), ``key`` (the key sweep's lidar), ``cam``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+Float = NDArray[np.float64]
+Float32 = NDArray[np.float32]
+Int = NDArray[np.int64]
+Bool = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """One lidar revolution of N returns.
+
+    points: (N,3) metres, lidar frame; as read, each at its own firing time, and after deskewing all
+        at ``stamp_ns``.
+    stamp_ns: the reference time, the middle of the revolution.
+    intensity: (N,) float32, 0 to 1.
+    offset_ns: (N,) int64, firing time minus ``stamp_ns``; None where the data cannot tell.
+    lidar: (N,) uint8, which of several scanners in one sweep fired.
+    row: (N,) int64, row of the return in the source file (invalid rows are dropped on reading).
+    """
+
+    frame: int
+    stamp_ns: int
+    points: Float
+    intensity: Float32
+    offset_ns: Int | None
+    lidar: NDArray[np.uint8]
+    row: Int
+
+    def __post_init__(self) -> None:
+        n = len(self.points)
+        for name in ("intensity", "offset_ns", "lidar", "row"):
+            column = getattr(self, name)
+            if column is not None and column.shape != (n,):
+                raise ValueError(f"Sweep.{name}: expected ({n},), got {column.shape}")
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    def select(self, keep: Bool) -> Sweep:
+        """The returns where ``keep`` (N,) is True."""
+        return replace(
+            self,
+            points=self.points[keep],
+            intensity=self.intensity[keep],
+            offset_ns=None if self.offset_ns is None else self.offset_ns[keep],
+            lidar=self.lidar[keep],
+            row=self.row[keep],
+        )
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """Where the lidar was: frames ascending, stamp_ns (n,) int64, T_world_lidar (n,4,4)."""
+
+    frames: tuple[int, ...]
+    stamp_ns: Int
+    T_world_lidar: Float
+
+
+@dataclass(frozen=True)
+class RegisteredSweep:
+    """A deskewed sweep with its place in the window.
+
+    sweep: points in the lidar frame at ``sweep.stamp_ns``.
+    T_key_lidar: (4,4).
+    twist_before, twist_after: (6,) rotation vector and translation per second (rad/s, m/s) of the
+        lidar before and after its reference time, in the lidar frame: a raw point fired at offset t
+        lies at ``exp(t · twist) @ p_raw``.
+    """
+
+    sweep: Sweep
+    T_key_lidar: Float
+    twist_before: Float
+    twist_after: Float
+
+    @property
+    def frame(self) -> int:
+        return self.sweep.frame
+
+
+@dataclass(frozen=True)
+class Window:
+    """The registered sweeps around a key, by ascending frame; the key sweep is one of them."""
+
+    key: int
+    sweeps: tuple[RegisteredSweep, ...]
+
+    @property
+    def frames(self) -> tuple[int, ...]:
+        return tuple(s.frame for s in self.sweeps)
+
+    def __getitem__(self, frame: int) -> RegisteredSweep:
+        return self.sweeps[self.frames.index(frame)]
+
+
+@dataclass(frozen=True)
+class FlowField:
+    """Scene flow of one sweep's (or point file's) N points to another time, ego-motion removed.
+
+    displacement: (N,3) metres, in the coordinates the points are in. Exactly 0 where not ``moving``.
+    moving: (N,) bool, proven to move.
+    instance: (N,) int32, the moving object the point belongs to, -1 none.
+    lost: (N,) bool, belongs to something that moves but cannot be followed to the target time.
+    """
+
+    displacement: Float
+    moving: Bool
+    instance: NDArray[np.int32]
+    lost: Bool
+
+    @staticmethod
+    def zero(num_points: int) -> FlowField:
+        """Nothing moves."""
+        return FlowField(
+            displacement=np.zeros((num_points, 3)),
+            moving=np.zeros(num_points, bool),
+            instance=np.full(num_points, -1, np.int32),
+            lost=np.zeros(num_points, bool),
+        )
+
+
+@dataclass(frozen=True)
+class Cloud:
+    """M accumulated points at the key's moment.
+
+    points: (M,3) metres, key frame.
+    rigid_points: (M,3) where registration alone puts them.
+    frame: (M,) int32 source sweep. row: (M,) int64 index of the point in its deskewed sweep.
+    moving: (M,) bool. instance: (M,) int32, -1 none. confidence: (M,) float32, 0 to 1.
+    intensity: (M,) float32. rgb: (M,3) uint8, black where no camera saw the point.
+    """
+
+    points: Float
+    rigid_points: Float
+    frame: NDArray[np.int32]
+    row: Int
+    moving: Bool
+    instance: NDArray[np.int32]
+    confidence: Float32
+    intensity: Float32
+    rgb: NDArray[np.uint8]
+
+    @property
+    def displaced(self) -> Float32:
+        """(M,) metres moved beyond the rigid alignment."""
+        return np.linalg.norm(self.points - self.rigid_points, axis=1).astype(np.float32)
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A pinhole camera, rectified or with lens distortion.
+
+    width_px, height_px: image size. K: (3,3) pixels; pixel (u,v) is an integer at its centre.
+    T_cam_lidar: (4,4). distortion: OpenCV's coefficients (k1 k2 p1 p2 k3 …), empty if rectified.
+    """
+
+    name: str
+    width_px: int
+    height_px: int
+    K: Float
+    T_cam_lidar: Float
+    distortion: tuple[float, ...] = ()
+
+
+@dataclass(frozen=True)
+class DepthMap:
+    """Dense depth of one camera; (H,W) everywhere.
+
+    depth_m: float32 camera z of measured pixels, 0 none. filled_m: the same plus pixels
+    interpolated between measured ones. confidence: float32 0 to 1, of every pixel in ``filled_m``.
+    frame: int32 source sweep of measured pixels, -1 elsewhere.
+    """
+
+    camera: str
+    depth_m: Float32
+    filled_m: Float32
+    confidence: Float32
+    frame: NDArray[np.int32]
+
+
+@dataclass(frozen=True)
+class SweepTruth:
+    """What really was where, for the N points of a raw sweep, row by row.
+
+    T_world_lidar: (4,4) at the reference time. points: (N,3) lidar frame at the reference time.
+    instance: (N,) int32, -1 the static world. moving: (N,) bool, moves at that time.
+    """
+
+    T_world_lidar: Float
+    points: Float
+    instance: NDArray[np.int32]
+    moving: Bool
+
+
+class Truth(Protocol):
+    """Exact truth of a simulated sequence."""
+
+    def sweep(self, frame: int) -> SweepTruth: ...
+
+    def displacement(self, frame: int, target: int) -> Float:
+        """(N,3) scene flow from the reference time of ``frame`` to that of ``target``, in the
+        lidar frame of ``frame``, ego-motion removed."""
+        ...
+
+    def depth_m(self, camera: str, frame: int) -> Float32:
+        """(H,W) camera z of the nearest solid surface at the camera's own time, 0 none."""
+        ...
+
+    def moving_mask(self, camera: str, frame: int) -> Bool:
+        """(H,W), True where the pixel shows something that moves."""
+        ...
+
+
+class LidarSequence(Protocol):
+    """A recording, opened lazily. A reader for a data set is one class with these members.
+
+    Frames are absolute numbers. Methods raise InputError with a full sentence for anything missing
+    or malformed.
+    """
+
+    name: str
+    frames: Sequence[int]  # of the sweeps that exist, ascending
+    cameras: Mapping[str, Camera]
+    truth: Truth | None
+
+    def __getitem__(self, frame: int) -> Sweep: ...
+
+    def image(self, camera: str, frame: int) -> NDArray[np.uint8]:
+        """(H,W,3) RGB."""
+        ...
+
+    def image_stamp_ns(self, camera: str, frame: int) -> int: ...
+
+    def T_world_lidar(self, frame: int) -> Float:
+        """(4,4) the data set's own pose at the sweep's reference time."""
+        ...
+
+
+@dataclass(frozen=True)
+class StageCost:
+    """Wall seconds of a stage and the process's peak memory at its end."""
+
+    name: str
+    seconds: float
+    peak_memory_mb: float
+
+
+@dataclass(frozen=True)
+class Result:
+    """One densified key.
+
+    metrics: plain numbers, ready for JSON. baselines: the results of the simpler methods on the
+    same registration, by method.
+    """
+
+    method: str
+    key: int
+    frames: tuple[int, ...]
+    cloud: Cloud
+    depth: Mapping[str, DepthMap]
+    metrics: Mapping[str, Any] = field(default_factory=dict)
+    costs: tuple[StageCost, ...] = ()
+    baselines: Mapping[str, Result] = field(default_factory=dict)
