@@ -1,0 +1,208 @@
+# SPDX-License-Identifier: MIT
+"""Verbs and options. Imports nothing heavy, so that help answers at once."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, NoReturn
+
+from densify import __version__
+from densify.cli import verbs
+from densify.config import presets
+
+DATA_HELP = (
+    "a recording's folder, READER:PATH, or the built-in street[:PRESET][?seed=N&sensor=NAME] "
+    "(default: street)"
+)
+
+
+def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
+    """Options of one command; ``options.verb(options)`` runs it. Exits with 2 on a bad argument."""
+    parser = _Parser(
+        prog="densify",
+        description="Dense depth maps from lidar recordings, with the moving objects kept sharp.",
+        epilog="Exit codes: 0 done, 1 the computation failed, 2 bad input, 130 interrupted.",
+    )
+    parser.add_argument("--version", action="version", version=f"densify {__version__}")
+    commands = parser.add_subparsers(title="verbs", metavar="VERB", required=True)
+    _add_run(commands)
+    _add_compare(commands)
+    _add_flow(commands)
+    _add_info(commands)
+    _add_simulate(commands)
+    return parser.parse_args(arguments)
+
+
+class _Parser(argparse.ArgumentParser):
+    """Complains in one line and takes no abbreviated options, which would break with new ones."""
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(**options, allow_abbrev=False)
+
+    def error(self, message: str) -> NoReturn:
+        self.exit(2, f"densify: {message}; see {self.prog} --help\n")
+
+
+def _add_verb(
+    commands: Any,
+    name: str,
+    verb: Callable[[argparse.Namespace], None],
+    about: str,
+    epilog: str = "",
+) -> argparse.ArgumentParser:
+    parser: argparse.ArgumentParser = commands.add_parser(
+        name, help=about, description=f"{about[0].upper()}{about[1:]}.", epilog=epilog or None
+    )
+    parser.set_defaults(verb=verb)
+    return parser
+
+
+def _add_run(commands: Any) -> None:
+    parser = _add_verb(commands, "run", verbs.run, "densify one key", _config_epilog())
+    _add_key_options(parser)
+    parser.add_argument(
+        "--method",
+        choices=("flow", "icp", "none"),
+        default="flow",
+        help="flow: registration and scene flow; icp: registration only; none: the key sweep alone "
+        "(default: flow)",
+    )
+    _add_output_options(parser)
+
+
+def _add_compare(commands: Any) -> None:
+    about = "the methods none, icp and flow side by side, on the same registration"
+    parser = _add_verb(commands, "compare", verbs.compare, about, _config_epilog())
+    _add_key_options(parser)
+    _add_output_options(parser)
+
+
+def _add_flow(commands: Any) -> None:
+    about = "scene flow between two point files, already in one coordinate frame"
+    parser = _add_verb(
+        commands,
+        "flow",
+        verbs.flow,
+        about,
+        "Point files: .npy (N,3 or more columns), .npz (array 'points'), .txt (columns), .bin "
+        "(KITTI: float32 x y z reflectance). The result holds 'flow' (N,3) float32 metres, "
+        "'moving' (N,) bool, 'instance' (N,) int32 (-1 none) and 'lost' (N,) bool, row by row as "
+        "SOURCE.",
+    )
+    parser.add_argument("source", metavar="SOURCE", type=Path, help="points at the first time")
+    parser.add_argument("target", metavar="TARGET", type=Path, help="points at the second time")
+    _add_config_options(parser)
+    parser.add_argument(
+        "--out",
+        metavar="F.npz",
+        type=Path,
+        default=Path("densify-out/flow.npz"),
+        help="(default: ./densify-out/flow.npz)",
+    )
+    _add_overwrite(parser)
+
+
+def _add_info(commands: Any) -> None:
+    parser = _add_verb(
+        commands, "info", verbs.info, "what a recording holds: frames, rate, cameras, stamps, poses"
+    )
+    parser.add_argument("--data", metavar="SPEC", default="street", help=DATA_HELP)
+
+
+def _add_simulate(commands: Any) -> None:
+    about = "write the built-in street as a KITTI raw tree with exact ground truth"
+    parser = _add_verb(commands, "simulate", verbs.simulate, about)
+    parser.add_argument("--out", metavar="DIR", type=Path, required=True, help="folder to make")
+    parser.add_argument(
+        "--preset",
+        default="street",
+        metavar="NAME",
+        help="street, static, crossing or highway (default: street)",
+    )
+    parser.add_argument(
+        "--sensor", metavar="NAME", help="the scanner: hdl64, hdl32, vlp16 (default: hdl64)"
+    )
+    parser.add_argument("--seed", type=_natural, metavar="N", help="another seed, another street")
+    parser.add_argument(
+        "--frames", type=_frames, metavar="A:B", help="frames A to B-1 only (default: all)"
+    )
+    _add_camera(parser)
+    _add_overwrite(parser)
+
+
+def _add_key_options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--key", type=_natural, required=True, metavar="K", help="the frame to densify"
+    )
+    parser.add_argument(
+        "--window",
+        type=_natural,
+        default=5,
+        metavar="W",
+        help="sweeps to use on each side of the key (default: 5)",
+    )
+    parser.add_argument("--data", metavar="SPEC", default="street", help=DATA_HELP)
+    _add_camera(parser)
+    _add_config_options(parser)
+
+
+def _add_output_options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--out",
+        metavar="DIR",
+        type=Path,
+        default=Path("densify-out"),
+        help="(default: ./densify-out)",
+    )
+    _add_overwrite(parser)
+
+
+def _add_overwrite(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--overwrite", action="store_true", help="replace what is already there (default: keep it)"
+    )
+
+
+def _add_camera(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--camera",
+        action="append",
+        metavar="NAME",
+        dest="cameras",
+        help="only this camera; may be given several times (default: all)",
+    )
+
+
+def _add_config_options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--config", metavar="FILE|NAME", help=f"a YAML file or a preset: {', '.join(presets())}"
+    )
+    parser.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        metavar="section.key=value",
+        dest="overrides",
+        help="set one knob; may be given several times",
+    )
+
+
+def _config_epilog() -> str:
+    return f"Every knob with its default and what it does: {presets()['default']}"
+
+
+def _natural(text: str) -> int:
+    if not text.isascii() or not text.isdigit():
+        raise argparse.ArgumentTypeError(f"got {text!r}, expected a whole number from 0 up")
+    return int(text)
+
+
+def _frames(text: str) -> range:
+    first, colon, end = text.partition(":")
+    if not (colon and first.isdigit() and end.isdigit() and int(first) < int(end)):
+        raise argparse.ArgumentTypeError(
+            f"got {text!r}, expected A:B with A < B, for example 115:126 for frames 115 to 125"
+        )
+    return range(int(first), int(end))

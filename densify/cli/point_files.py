@@ -1,0 +1,110 @@
+# SPDX-License-Identifier: MIT
+"""Point files for ``densify flow``: reading the two clouds, writing the flow between them."""
+
+from __future__ import annotations
+
+import io
+import os
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from densify.errors import InputError
+from densify.types import Float, FlowField
+
+_SUFFIXES = (".npy", ".npz", ".txt", ".bin")
+_KITTI_ROW_BYTES = 16
+
+
+def read_points(path: Path) -> Float:
+    """(N,3) float64 metres, every row of the file in its order.
+
+    .npy: (N,3 or more columns); .npz: the same as array ``points``; .txt: columns; .bin: KITTI's
+    float32 x y z reflectance. Raises InputError if the file is missing, has another form, or holds
+    no point or one that is not finite (rows are not dropped: the flow lines up with them).
+    """
+    if not path.is_file():
+        raise InputError(f"{path}: no such file; expected a point file ({', '.join(_SUFFIXES)})")
+    if path.suffix not in _SUFFIXES:
+        raise InputError(
+            f"{path}: got {path.suffix or 'no suffix'}, expected one of {', '.join(_SUFFIXES)}"
+        )
+    try:
+        array = _read_array(path)
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+        reason = " ".join(str(error).split())
+        raise InputError(f"{path}: not a readable {path.suffix} point file: {reason}") from error
+    if array.ndim != 2 or array.shape[1] < 3 or array.dtype.kind not in "fiu":
+        raise InputError(
+            f"{path}: got an array of shape {array.shape} and type {array.dtype}, expected numbers "
+            f"of shape (N,3) or more columns"
+        )
+    points = array[:, :3].astype(np.float64)
+    if len(points) == 0:
+        raise InputError(f"{path}: holds no points, expected at least one")
+    bad = np.flatnonzero(~np.isfinite(points).all(axis=1))
+    if len(bad):
+        raise InputError(
+            f"{path}: {len(bad)} of {len(points)} points are not finite, the first in row "
+            f"{bad[0]}; remove them"
+        )
+    return points
+
+
+def check_new_file(path: Path, overwrite: bool) -> None:
+    """Raise InputError, before the computation, if ``path`` is there already or cannot be made."""
+    if path.suffix != ".npz":
+        raise InputError(f"--out {path}: expected a name that ends in .npz")
+    if path.is_dir():
+        raise InputError(f"--out {path}: is a folder, expected the name of an .npz file")
+    if path.exists() and not overwrite:
+        raise InputError(f"--out {path}: already there and kept; give --overwrite or another name")
+    place = path.parent
+    while not os.path.lexists(place):
+        place = place.parent
+    if not (place.is_dir() and os.access(place, os.W_OK | os.X_OK)):
+        raise InputError(f"--out {path}: cannot write in {place}; choose another --out")
+
+
+def write_flow(path: Path, field: FlowField) -> None:
+    """Write ``flow`` (N,3) float32 metres, ``moving`` (N,) bool, ``instance`` (N,) int32 (-1 none)
+    and ``lost`` (N,) bool, row by row as the source file. Appears only when complete.
+
+    Raises InputError if it cannot be written.
+    """
+    from densify.output.atomic import write_file
+
+    buffer = io.BytesIO()
+    np.savez_compressed(
+        buffer,
+        flow=field.displacement.astype(np.float32),
+        moving=field.moving,
+        instance=field.instance,
+        lost=field.lost,
+    )
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_file(path, buffer.getvalue())
+    except OSError as error:
+        raise InputError(f"--out {path}: cannot be written: {error.strerror or error}") from error
+
+
+def _read_array(path: Path) -> NDArray[Any]:
+    if path.suffix == ".npy":
+        return np.load(path, allow_pickle=False)
+    if path.suffix == ".txt":
+        return np.loadtxt(path, ndmin=2)
+    if path.suffix == ".bin":
+        num_bytes = path.stat().st_size
+        if num_bytes % _KITTI_ROW_BYTES:
+            raise ValueError(
+                f"got {num_bytes} bytes, expected a multiple of {_KITTI_ROW_BYTES}; it is cut off"
+            )
+        return np.fromfile(path, np.float32).reshape(-1, 4)
+    with np.load(path, allow_pickle=False) as arrays:
+        if "points" not in arrays:
+            raise ValueError(f"holds the arrays {', '.join(arrays)}, expected points")
+        return arrays["points"]

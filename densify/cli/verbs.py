@@ -1,0 +1,151 @@
+# SPDX-License-Identifier: MIT
+"""What each verb does: open, call the Python API, write, and print results and paths."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import densify
+from densify.cli.screen import progress_on_stderr
+from densify.config import as_mapping, resolve
+from densify.errors import InputError
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from densify.types import LidarSequence, Result
+
+
+def run(options: argparse.Namespace) -> None:
+    """Densify one key."""
+    config = resolve(options.config, options.overrides)
+    from densify import pipeline
+    from densify.cli.tables import summary
+    from densify.output import check_writable, write_result
+    from densify.readers import open_sequence
+
+    check_writable(options.out, options.key, options.overwrite, "run")
+    sequence = open_sequence(options.data)
+    with progress_on_stderr() as progress:
+        result = pipeline.run(
+            sequence,
+            options.key,
+            options.window,
+            options.method,
+            options.cameras,
+            config,
+            progress,
+        )
+    paths = write_result(
+        result,
+        _images(sequence, result),
+        options.out,
+        config=as_mapping(config),
+        data=options.data,
+        overwrite=options.overwrite,
+    )
+    print(summary(result))
+    _print_paths(paths)
+
+
+def compare(options: argparse.Namespace) -> None:
+    """The three methods side by side."""
+    config = resolve(options.config, options.overrides)
+    from densify import pipeline
+    from densify.cli.tables import comparison
+    from densify.output import check_writable, write_comparison
+    from densify.readers import open_sequence
+
+    check_writable(options.out, options.key, options.overwrite, "compare")
+    sequence = open_sequence(options.data)
+    with progress_on_stderr() as progress:
+        results = pipeline.compare(
+            sequence, options.key, options.window, options.cameras, config, progress
+        )
+    paths = write_comparison(
+        results,
+        _images(sequence, results["none"]),
+        options.out,
+        config=as_mapping(config),
+        data=options.data,
+        overwrite=options.overwrite,
+    )
+    print(comparison(results))
+    _print_paths(paths)
+
+
+def flow(options: argparse.Namespace) -> None:
+    """Scene flow between two point files."""
+    config = resolve(options.config, options.overrides)
+    from densify.cli.point_files import check_new_file, read_points, write_flow
+
+    check_new_file(options.out, options.overwrite)
+    source, target = read_points(options.source), read_points(options.target)
+    field = densify.estimate_flow(source, target, config=config)
+    write_flow(options.out, field)
+    num_moving = int(field.moving.sum())
+    print(f"{len(source):,} points, {num_moving:,} moving")
+    _print_paths([options.out])
+
+
+def info(options: argparse.Namespace) -> None:
+    """What a recording holds."""
+    from densify.readers import open_sequence
+    from densify.readers.describe import describe
+
+    print(describe(open_sequence(options.data)))
+
+
+def simulate(options: argparse.Namespace) -> None:
+    """The built-in street as a KITTI raw tree with truth."""
+    from densify.readers.street import Street
+    from densify.street.export import write_kitti_tree
+
+    street = Street.from_spec(_street_spec(options))
+    frames = _frames_of(street, options.frames)
+    cameras = _cameras_of(street, options.cameras)
+    with progress_on_stderr() as progress:
+        drive = write_kitti_tree(
+            street, options.out, frames, cameras, progress, overwrite=options.overwrite
+        )
+    print(f"{len(frames)} frames; open them with --data {drive}")
+
+
+def _images(sequence: LidarSequence, result: Result) -> Mapping[str, NDArray[np.uint8]]:
+    return {camera: sequence.image(camera, result.key) for camera in result.depth}
+
+
+def _street_spec(options: argparse.Namespace) -> str:
+    preset = options.preset.removeprefix("street:")
+    name = "street" if preset == "street" else f"street:{preset}"
+    query = [f"{k}={v}" for k in ("seed", "sensor") if (v := getattr(options, k)) is not None]
+    return f"{name}?{'&'.join(query)}" if query else name
+
+
+def _frames_of(street: LidarSequence, wanted: range | None) -> list[int]:
+    frames = list(street.frames)
+    if wanted is None:
+        return frames
+    if wanted[0] < frames[0] or wanted[-1] > frames[-1]:
+        raise InputError(
+            f"--frames {wanted.start}:{wanted.stop}: expected frames within "
+            f"{frames[0]}:{frames[-1] + 1}"
+        )
+    return list(wanted)
+
+
+def _cameras_of(street: LidarSequence, wanted: list[str] | None) -> list[str]:
+    for name in wanted or ():
+        if name not in street.cameras:
+            raise InputError(f"--camera {name}: expected one of {', '.join(street.cameras)}")
+    return list(street.cameras) if wanted is None else wanted
+
+
+def _print_paths(paths: list[Path]) -> None:
+    for path in paths:
+        print(path)

@@ -1,0 +1,369 @@
+# SPDX-License-Identifier: MIT
+"""Every knob of the pipeline, in one place: a frozen dataclass per stage, collected in `Config`.
+
+To add a knob, add one line to a section here and run ``python tests/test_config.py``, which writes
+its line into configs/default.yaml. To add a section, add its class and one line in `Config`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import math
+import types
+import typing
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from densify.errors import InputError
+
+
+def knob(
+    default: Any,
+    help: str,
+    low: float | None = None,
+    high: float | None = None,
+    choices: tuple[str, ...] | None = None,
+) -> Any:
+    """A dataclass field with what `Section` checks and default.yaml says.
+
+    help: what turning the knob does, unit in brackets. low, high: inclusive bounds of a number.
+    choices: the words a text knob accepts.
+    """
+    metadata = {"help": help, "low": low, "high": high, "choices": choices}
+    return dataclasses.field(default=default, metadata=metadata)
+
+
+@dataclass(frozen=True)
+class Section:
+    """The knobs of one stage, checked whenever one is made."""
+
+    def __post_init__(self) -> None:
+        for field in dataclasses.fields(self):
+            value = getattr(self, field.name)
+            object.__setattr__(self, field.name, _checked(type(self), field.name, value, ""))
+
+
+@dataclass(frozen=True)
+class RegisterSettings(Section):
+    """Where the lidar was at every sweep."""
+
+    source: str = knob(
+        "kiss-icp",
+        "kiss-icp: estimate the poses from the sweeps; dataset: take the recording's own",
+        choices=("kiss-icp", "dataset"),
+    )
+    num_lead_in: int = knob(
+        5,
+        "sweeps registered before the window so that odometry knows the speed; more is safer",
+        0,
+        50,
+    )
+    voxel_size_m: float = knob(
+        0.5,
+        "[m] cell of the local map; smaller is finer and slower, too small loses track",
+        0.05,
+        10,
+    )
+    min_range_m: float = knob(2.8, "[m] nearer returns, the own vehicle's, are left out", 0, 50)
+    max_range_m: float = knob(120.0, "[m] farther returns are left out", 5, 500)
+    deskew: bool = knob(True, "undo the motion within each sweep; off only for compensated sweeps")
+    max_speed_m_s: float = knob(
+        60.0, "[m/s] a faster step between two sweeps is an error of registration", 1, 200
+    )
+    min_num_points: int = knob(1000, "a sweep with fewer points cannot be registered", 1, 1_000_000)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.min_range_m >= self.max_range_m:
+            raise InputError(
+                f"register.min_range_m: got {self.min_range_m:g}, expected less than "
+                f"register.max_range_m = {self.max_range_m:g}"
+            )
+
+
+@dataclass(frozen=True)
+class GroundSettings(Section):
+    """How high every point is above the ground."""
+
+    cell_m: float = knob(1.0, "[m] grid cell; smaller follows kerbs, larger bridges holes", 0.1, 10)
+    max_slope: float = knob(
+        0.15, "rise per metre; steeper is taken for an object, less for ground", 0.01, 1
+    )
+
+
+@dataclass(frozen=True)
+class FlowSettings(Section):
+    """What moves, and how."""
+
+    engine: str = knob(
+        "groups",
+        "groups: rigid groups of points whose motion is proven; paper: the published objective",
+        choices=("groups", "paper"),
+    )
+    min_height_m: float = knob(
+        0.25,
+        "[m] points lower above the ground start no motion; smaller sees kerbs move, larger loses "
+        "what is flat",
+        0.02,
+        2,
+    )
+    solver: str = knob(
+        "pcg",
+        "of the objective. pcg: conjugate gradients, fast; adam: 1,500 steps as published",
+        choices=("pcg", "adam"),
+    )
+    alpha: float = knob(10.0, "weight of smoothness; larger moves neighbours more alike", 0, 1e6)
+    num_neighbors: int = knob(50, "neighbours in the graph; more is stiffer and slower", 1, 500)
+    radius_m: float | None = knob(
+        None, "[m] join all points within this radius instead of num_neighbors; null: off", 0.01, 20
+    )
+    laplacian: str = knob(
+        "symmetric",
+        "symmetric: as published; row-sum-zero: leaves a constant flow unpunished",
+        choices=("symmetric", "row-sum-zero"),
+    )
+    static_prior: bool = knob(
+        True, "points not proven to move keep exactly their rigid place; off moves every point"
+    )
+    device: str = knob("auto", "auto: CUDA where there is one", choices=("auto", "cpu", "cuda"))
+
+
+@dataclass(frozen=True)
+class ChainSettings(Section):
+    """How flow between neighbouring sweeps becomes flow to the key."""
+
+    max_gap_m: float = knob(
+        0.5, "[m] a moved point farther than this from the next sweep's flow is lost", 0.01, 10
+    )
+    unfollowed: str = knob(
+        "drop",
+        "points that move but cannot be followed. drop: leave them out; rigid: keep them where "
+        "registration puts them, as ghosts",
+        choices=("rigid", "drop"),
+    )
+
+
+@dataclass(frozen=True)
+class ProjectSettings(Section):
+    """From the accumulated cloud to each camera's depth map."""
+
+    footprint: float = knob(
+        0.4,
+        "half size of the patch a point stands for, in spacings of neighbouring rays; larger hides "
+        "more of what shines through gaps and eats background beside near objects",
+        0,
+        5,
+    )
+    slack_m: float = knob(
+        0.05, "[m] added to that half size, for errors of registration and flow", 0, 1
+    )
+    hidden_m: float = knob(
+        0.2,
+        "[m] a point this much plus hidden_fraction behind the nearest patch is hidden; smaller "
+        "removes more ghosts and more of rough and slanted surfaces",
+        0,
+        10,
+    )
+    hidden_fraction: float = knob(0.06, "see hidden_m; share of the depth", 0, 1)
+    fill_reach: float = knob(
+        0.7,
+        "how far the two-sided fill looks for measured pixels, in spacings of neighbouring rays; "
+        "larger fills more between the lines of a sparse scanner",
+        0,
+        5,
+    )
+    edge_m: float = knob(0.3, "[m] no pixel is filled where depths around it spread by more", 0, 10)
+    edge_fraction: float = knob(0.06, "the same as a share of the depth; the larger counts", 0, 1)
+    fill_confidence: float = knob(
+        0.5, "confidence of a filled pixel as a share of the least around it", 0, 1
+    )
+
+
+@dataclass(frozen=True)
+class Config:
+    """The whole configuration; ``Config()`` is the default one. Sections mirror the stages."""
+
+    register: RegisterSettings = dataclasses.field(default_factory=RegisterSettings)
+    ground: GroundSettings = dataclasses.field(default_factory=GroundSettings)
+    flow: FlowSettings = dataclasses.field(default_factory=FlowSettings)
+    chain: ChainSettings = dataclasses.field(default_factory=ChainSettings)
+    project: ProjectSettings = dataclasses.field(default_factory=ProjectSettings)
+
+
+def resolve(
+    config: Config | str | Path | Mapping[str, Any] | None = None, overrides: Sequence[str] = ()
+) -> Config:
+    """The configuration that `config` and the overrides name.
+
+    config: None for the defaults; a Config; a mapping ``{section: {key: value}}``; a Path to a YAML
+        file of that form; or a str, the name of a preset (`presets`) or else a file. Only
+        differences from the defaults need to be named.
+    overrides: ``section.key=value`` each, values written as in YAML; later ones win.
+
+    Raises InputError for anything unknown (suggesting the right name), of the wrong type or out of
+    range, naming the file or ``--set`` it comes from.
+    """
+    if isinstance(config, Config):
+        values = as_mapping(config)
+    else:
+        values = as_mapping(Config())
+        if isinstance(config, Mapping):
+            _apply(values, config, "configuration")
+        elif isinstance(config, str | Path):
+            path = _config_path(config)
+            _apply(values, _read_yaml(_read_text(path), str(path)) or {}, str(path))
+        elif config is not None:
+            raise InputError(
+                f"configuration: got {type(config).__name__}, expected a densify.Config, a "
+                f"mapping, or the name of a preset or YAML file"
+            )
+    for override in overrides:
+        _apply(values, _parse_override(override), f"--set {override}")
+    return Config(**{name: section(**values[name]) for name, section in _sections().items()})
+
+
+def as_mapping(config: Config) -> dict[str, dict[str, Any]]:
+    """Plain ``{section: {key: value}}``, every key; ``resolve(as_mapping(config)) == config``."""
+    return dataclasses.asdict(config)
+
+
+def presets() -> dict[str, Path]:
+    """Preset name -> its YAML file."""
+    inside = Path(__file__).parent / "configs"  # installed
+    folder = inside if inside.is_dir() else Path(__file__).parents[1] / "configs"  # checkout
+    return {path.stem: path for path in sorted(folder.glob("*.yaml"))}
+
+
+def _config_path(name: str | Path) -> Path:
+    if isinstance(name, str) and name in presets():
+        return presets()[name]
+    path = Path(name)
+    if path.is_file():
+        return path
+    raise InputError(
+        f"configuration {name}: no such preset or file; "
+        f"{_suggestion(str(name), list(presets()), 'preset')}"
+    )
+
+
+def _read_text(path: Path) -> str:
+    try:
+        return path.read_text("utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: cannot be read as a YAML file: {error}") from error
+
+
+def _read_yaml(text: str, where: str) -> Any:
+    """Parsed YAML, None for an empty text; a key given twice is an error."""
+    import yaml
+
+    class Loader(yaml.SafeLoader):
+        def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
+            keys = [str(key.value) for key, _ in node.value]
+            for key in keys:
+                if keys.count(key) > 1:
+                    line = node.start_mark.line + 1
+                    raise InputError(f"{where}: {key} is given twice from line {line} on; keep one")
+            return super().construct_mapping(node, deep)
+
+    try:
+        return yaml.load(text, Loader)
+    except yaml.YAMLError as error:
+        reason = " ".join(str(error).split())
+        raise InputError(f"{where}: not YAML: {reason}") from error
+
+
+def _parse_override(override: str) -> Mapping[str, Any]:
+    name, equals, text = override.partition("=")
+    section, dot, key = name.strip().partition(".")
+    if not (equals and dot and section and key):
+        raise InputError(f"--set {override}: expected section.key=value, for example flow.alpha=5")
+    value = _read_yaml(text, f"--set {override}")
+    return {section: {key: value if text.strip() else ""}}
+
+
+def _apply(values: dict[str, dict[str, Any]], changes: Any, where: str) -> None:
+    """Write the checked `changes` over `values`."""
+    _require_mapping(changes, where, "sections")
+    for name, keys in changes.items():
+        if name not in values:
+            raise InputError(
+                f"{where}: unknown section {name}; {_suggestion(name, list(values), 'section')}"
+            )
+        _require_mapping(keys, f"{where}: section {name}", "keys")
+        for key, value in keys.items():
+            if key not in values[name]:
+                hint = _key_suggestion(name, str(key), values)
+                raise InputError(f"{where}: unknown key {name}.{key}; {hint}")
+            values[name][key] = _checked(_sections()[name], key, value, f"{where}: ")
+
+
+def _sections() -> dict[str, Any]:
+    """Section name -> its class."""
+    return typing.get_type_hints(Config)
+
+
+def _require_mapping(value: Any, where: str, content: str) -> None:
+    if not isinstance(value, Mapping):
+        raise InputError(
+            f"{where}: got {value!r}, expected a mapping of {content}, for example "
+            f"flow: {{alpha: 5}}"
+        )
+
+
+def _key_suggestion(section: str, key: str, values: Mapping[str, Mapping[str, Any]]) -> str:
+    """The same key in another section, else the nearest one of this."""
+    for other, keys in values.items():
+        if key in keys:
+            return f"did you mean {other}.{key}?"
+    return _suggestion(key, list(values[section]), f"{section} key")
+
+
+def _suggestion(got: str, known: Sequence[str], kind: str) -> str:
+    close = difflib.get_close_matches(str(got), known, n=1, cutoff=0.6)
+    hint = f"did you mean {close[0]}? " if close else ""
+    return f"{hint}expected a {kind}: {', '.join(known)}"
+
+
+def _checked(section: type[Section], key: str, value: Any, where: str) -> Any:
+    """The value as its knob's type; InputError if it has another type or is out of range."""
+    field = section.__dataclass_fields__[key]
+    kind = typing.get_type_hints(section)[key]
+    optional = isinstance(kind, types.UnionType)
+    if optional:
+        kind = next(t for t in typing.get_args(kind) if t is not types.NoneType)
+        if value is None:
+            return None
+    checked = _as(kind, value)
+    low, high, choices = (field.metadata[m] for m in ("low", "high", "choices"))
+    if checked is not None:
+        if choices is not None and checked in choices:
+            return checked
+        if choices is None and (kind is bool or low <= checked <= high):
+            return checked
+    if choices is not None:
+        expected = f"one of {', '.join(choices)}"
+    elif kind is bool:
+        expected = "true or false"
+    else:
+        expected = f"{'a whole number' if kind is int else 'a number'} from {low:g} to {high:g}"
+    expected += " or null" if optional else ""
+    name = f"{section.__name__.removesuffix('Settings').lower()}.{key}"
+    raise InputError(
+        f"{where}{name}: got {value!r}, expected {expected} ({field.metadata['help']})"
+    )
+
+
+def _as(kind: Any, value: Any) -> Any:
+    """`value` as bool, int, float or str, None if it is not one."""
+    if kind is float and isinstance(value, str | int) and not isinstance(value, bool):
+        try:
+            value = float(value)  # text too: YAML 1.1 reads 1e-3 as text
+        except (ValueError, OverflowError):
+            return None
+    if type(value) is not kind or (kind is float and not math.isfinite(value)):
+        return None
+    return value
