@@ -48,7 +48,7 @@ class Candidates:
     """The points of one sweep that may move.
 
     row: (C,) index into the sweep's points. points: (C,3) key frame, rigidly registered.
-    seed: (C,) some other sweep sees through the point. cluster: (C,) label, ``num_clusters`` of them.
+    seed: (C,) some other sweep sees through the point. cluster: (C,) label, of ``num_clusters``.
     """
 
     row: Int
@@ -86,6 +86,7 @@ def find_candidates(
 def _cluster(row: Int, points: Float, seed: Bool) -> Candidates:
     """Keep the seeds that are not alone among unseen points (a hedge's flicker is), add what is
     close to them, and link."""
+    near = np.zeros(len(points), bool)
     if seed.any():
         seeds = np.flatnonzero(seed)
         tree = cKDTree(points)
@@ -94,12 +95,9 @@ def _cluster(row: Int, points: Float, seed: Bool) -> Candidates:
             points[seeds], _NEAR_M, return_length=True
         )
         kept = seeds[num_near_seeds >= _MIN_SEED_SHARE * num_near]
-        distance = np.full(len(points), np.inf)
         if len(kept):
             distance, _ = cKDTree(points[kept]).query(points, distance_upper_bound=_NEAR_M)
-        near = np.isfinite(distance)
-    else:
-        near = np.zeros(len(points), bool)
+            near = np.isfinite(distance)
     row, points, seed = row[near], points[near], seed[near]
     num_clusters, cluster = link(points, _LINK_M)
     return Candidates(row, points, seed, cluster, num_clusters)
@@ -110,9 +108,7 @@ def link(points: Float, distance_m: float) -> tuple[int, Int]:
 
     Links voxels of half that size, so the cost does not grow with the square of the density.
     """
-    voxels, of_point = np.unique(
-        np.floor(points / (0.5 * distance_m)), axis=0, return_inverse=True
-    )
+    voxels, of_point = np.unique(np.floor(points / (0.5 * distance_m)), axis=0, return_inverse=True)
     pairs = cKDTree(voxels).query_pairs(2.0, output_type="ndarray")
     links = coo_array((np.ones(len(pairs), bool), pairs.T), shape=(len(voxels), len(voxels)))
     num_groups, label = connected_components(links, directed=False)

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,6 @@ from scipy.spatial import cKDTree
 
 from densify.config import Config, FlowSettings, resolve
 from densify.flow.evidence import link
-from densify.flow.neighbors import require_points
 from densify.flow.solvers import ObjectiveSettings, solve
 from densify.types import Float, FlowField
 
@@ -42,32 +42,28 @@ def estimate_flow(
 
     Raises InputError for no points, wrong shapes or NaN.
     """
-    settings = resolve(config).flow
-    points = np.asarray(require_points(source, "source"), np.float64)
-    aim = np.asarray(require_points(target, "target"), np.float64)
-    flow = solve(
-        points, aim, objective_settings(settings), initial, device=device(settings)
-    ).flow
-    if not settings.static_prior:
-        everything = np.ones(len(points), bool)
-        none = np.full(len(points), -1, np.int32)
-        return FlowField(flow, everything, none, np.zeros(len(points), bool))
-    return _only_proven(points, aim, flow)
+    return flow_between(source, target, resolve(config).flow, initial)
 
 
-def objective_settings(settings: FlowSettings) -> ObjectiveSettings:
-    """The objective as configured."""
-    return ObjectiveSettings(
+def flow_between(
+    source: ArrayLike, target: ArrayLike, settings: FlowSettings, initial: ArrayLike | None = None
+) -> FlowField:
+    """`estimate_flow` with the section itself."""
+    objective = ObjectiveSettings(
         solver=settings.solver,
         alpha=settings.alpha,
         num_neighbors=settings.num_neighbors,
         radius_m=settings.radius_m,
         laplacian=settings.laplacian,
     )
+    flow = solve(source, target, objective, initial, _device(settings)).flow
+    if settings.static_prior:
+        return _only_proven(np.asarray(source, float), np.asarray(target, float), flow)
+    still = FlowField.zero(len(flow))
+    return replace(still, displacement=flow, moving=np.ones(len(flow), bool))
 
 
-def device(settings: FlowSettings) -> str:
-    """Where the objective is minimised."""
+def _device(settings: FlowSettings) -> str:
     if settings.device != "auto":
         return settings.device
     return "cuda" if torch.cuda.is_available() else "cpu"
@@ -82,7 +78,9 @@ def _only_proven(source: Float, target: Float, flow: Float) -> FlowField:
     instance = 0
     for k in range(num_groups):
         rows = moved[group == k]
-        if len(rows) >= _MIN_POINTS and _beats_standing_still(source[rows], target, flow[rows], trees):
+        if len(rows) < _MIN_POINTS:
+            continue
+        if _beats_standing_still(source[rows], target, flow[rows], trees):
             field.displacement[rows] = flow[rows]
             field.moving[rows] = True
             field.instance[rows] = instance

@@ -27,6 +27,7 @@ _VOTE_POINTS = 60
 _MAX_MODEL_POINTS = 1500
 _GATES_M = (0.8, 0.5, 0.3, 0.2, 0.2)
 _SURFACE_M = 0.05  # noise of a surface point
+_FIT_M = 0.3
 _MISSES_ALLOWED = 1
 _MAX_CONTRADICTIONS = 0.2  # of those that standing still leaves
 
@@ -209,11 +210,16 @@ class _Model:
         self.points = points
         self._prepare()
 
+    def nearest(self, points: Float, within_m: float) -> tuple[Float, np.ndarray]:
+        """Distance to the nearest model point, inf beyond ``within_m``, and its index."""
+        distance, index = self._tree.query(points, distance_upper_bound=within_m)
+        return np.asarray(distance), np.asarray(index)
+
     def _prepare(self) -> None:
-        self.tree = cKDTree(self.points)
+        self._tree = cKDTree(self.points)
         k = min(12, len(self.points))
-        _, near = self.tree.query(self.points, k)
-        x = self.points[near.reshape(len(self.points), k)]
+        _, near = self._tree.query(self.points, k)
+        x = self.points[np.reshape(near, (len(self.points), k))]
         x = x - x.mean(1, keepdims=True)
         covariance = np.einsum("nki,nkj->nij", x, x) / k
         scale = np.trace(covariance, axis1=1, axis2=2)[:, None, None] / 3
@@ -237,16 +243,23 @@ def _find(
     for gate in _GATES_M:
         for _ in range(2):
             m = _undo(state, target, centre)
-            distance, nearest = model.tree.query(m, distance_upper_bound=gate)
+            distance, nearest = model.nearest(m, gate)
             near = np.isfinite(distance)
             if near.sum() < 5:
                 return None
             step = _gauss_newton(
-                m[near], model.points[nearest[near]], model.information[nearest[near]],
-                distance[near], gate, centre, prior, predicted - state, state[3],
+                m[near],
+                model.points[nearest[near]],
+                model.information[nearest[near]],
+                distance[near],
+                gate,
+                centre,
+                prior,
+                predicted - state,
+                state[3],
             )
             state = state + step
-    distance, _ = model.tree.query(_undo(state, target, centre), distance_upper_bound=0.3)
+    distance, _ = model.nearest(_undo(state, target, centre), _FIT_M)
     fit = np.isfinite(distance)
     if fit.sum() < 5:
         return None
@@ -270,9 +283,7 @@ def _gauss_newton(m, q, information, distance, gate, centre, prior, to_predictio
     return -np.linalg.solve(H, g)
 
 
-def _prove(
-    track: Track, candidates: Sequence[Candidates], space: FreeSpace, time_s: Float
-) -> bool:
+def _prove(track: Track, candidates: Sequence[Candidates], space: FreeSpace, time_s: Float) -> bool:
     """Fit the smooth motion; True if the track certainly moves.
 
     The motion must be smooth, long enough to be told from noise, and must do away with the
@@ -293,9 +304,8 @@ def _prove(
     travelled = float(np.linalg.norm((fitted[-1] - fitted[0])[:2]))
     step_m = travelled / (seen[-1] - seen[0])
     range_m = float(np.linalg.norm(track.centre[:2]))
-    if (
-        track.residual_m > 0.04 + 0.0015 * range_m + 0.03 * step_m
-        or travelled < max(0.35, 8 * track.residual_m)
+    if track.residual_m > 0.04 + 0.0015 * range_m + 0.03 * step_m or travelled < max(
+        0.35, 8 * track.residual_m
     ):
         return False
     still, moved = _contradictions(track, candidates, space, time_s)
