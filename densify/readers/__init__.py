@@ -45,8 +45,8 @@ def open_sequence(spec: str | Path = "street") -> LidarSequence:
     folder = Path(text)
     if not folder.exists():
         raise InputError(
-            f"--data {text}: no such folder; expected a recording's folder, READER:PATH with READER "
-            f"one of {', '.join(READERS)}, or street[:PRESET]"
+            f"--data {text}: no such folder; expected a recording's folder, READER:PATH with "
+            f"READER one of {', '.join(READERS)}, or street[:PRESET]"
         )
     if (folder / "velodyne_points").is_dir():
         return _open_kitti_raw(text)

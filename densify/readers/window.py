@@ -30,7 +30,8 @@ def window_frames(
         raise InputError(f"--window {window}: expected 0 or more sweeps on each side of the key")
     if key not in there:
         raise InputError(
-            f"--key {key}: no such frame in {sequence.name}; it has {format_frames(sequence.frames)}"
+            f"--key {key}: no such frame in {sequence.name}; "
+            f"it has {format_frames(sequence.frames)}"
         )
     wanted = range(key - window, key + window + 1)
     first, last = min(there), max(there)
@@ -39,8 +40,8 @@ def window_frames(
     if missing:
         raise InputError(
             f"--key {key} --window {window}: {sequence.name} has no sweep for frame "
-            f"{format_frames(missing)}; it has {format_ranges(sequence.frames)}; choose another key "
-            f"or a smaller window"
+            f"{format_frames(missing)}; it has {format_frames(sequence.frames)}; "
+            f"choose another key or a smaller window"
         )
     if len(frames) < len(wanted):
         log.warning(

@@ -1,0 +1,22 @@
+# SPDX-License-Identifier: MIT
+"""Everything that writes files. Nothing else in the package touches the disk for a result."""
+
+from densify.output.cloud_laz import StoredCloud, read_cloud, write_cloud
+from densify.output.depth_png import read_depth_png, write_confidence_png, write_depth_png
+from densify.output.figure import draw_figure
+from densify.output.png import write_picture
+from densify.output.store import check_writable, write_comparison, write_result
+
+__all__ = [
+    "StoredCloud",
+    "check_writable",
+    "draw_figure",
+    "read_cloud",
+    "read_depth_png",
+    "write_cloud",
+    "write_comparison",
+    "write_confidence_png",
+    "write_depth_png",
+    "write_picture",
+    "write_result",
+]

@@ -1,0 +1,245 @@
+# SPDX-License-Identifier: MIT
+"""The files of one key, ``OUT/000120/...``: results of ``run`` and tables of ``compare``, whole or
+not at all.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import platform
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import yaml
+
+import densify
+from densify.errors import InputError
+from densify.output.atomic import staged_folder, write_file
+from densify.output.cloud_laz import write_cloud
+from densify.output.depth_png import write_confidence_png, write_depth_png
+from densify.output.figure import draw_figure
+from densify.output.png import Picture, write_picture
+from densify.types import Result
+
+Verb = Literal["run", "compare"]
+
+SCHEMA_VERSION = 1
+"""Of metrics.json and compare.json; grows when a key changes its meaning or goes."""
+
+_OWNED: Mapping[Verb, tuple[str, ...]] = {
+    "run": (
+        *("depth", "depth_filled", "confidence"),
+        *("cloud.laz", "metrics.json", "figure.png", "run.yaml"),
+    ),
+    "compare": ("compare.json", "compare.png"),
+}
+_TITLES = {"none": "sparse"}  # of the figures' rows
+_PACKAGES = (
+    *("numpy", "scipy", "torch", "open3d", "kiss-icp"),
+    *("opencv-python-headless", "laspy", "lazrs", "PyYAML"),
+)
+
+
+def check_writable(out: Path, key: int, overwrite: bool = False, verb: Verb = "run") -> None:
+    """Find out before a computation whether its result can be written; touches nothing.
+
+    out: the folder of ``--out``, which need not exist. Raises InputError if the files that ``verb``
+    writes for ``key`` are there and not to be overwritten, or the place cannot be written to.
+    """
+    folder = _key_folder(out, key)
+    place = folder
+    while not os.path.lexists(place):
+        place = place.parent
+    if not place.is_dir():
+        raise InputError(f"--out {out}: {place} is not a folder; choose another one with --out DIR")
+    if not os.access(place, os.W_OK | os.X_OK):
+        raise InputError(
+            f"--out {out}: no permission to write in {place}; choose another one with --out DIR"
+        )
+    present = [name for name in _OWNED[verb] if (folder / name).exists()]
+    if present and not overwrite:
+        raise InputError(
+            f"{folder}: {', '.join(present)} already there and kept; "
+            f"give --overwrite to replace them or another --out DIR"
+        )
+
+
+def write_result(
+    result: Result,
+    images: Mapping[str, Picture],
+    out: Path,
+    *,
+    config: Mapping[str, Any],
+    data: str,
+    overwrite: bool = False,
+) -> list[Path]:
+    """Write one densified key as ``out/KEY/``: depth, depth_filled and confidence of each camera,
+    cloud.laz, metrics.json, figure.png and run.yaml.
+
+    images: camera to (H,W,3) RGB; a camera without one is drawn on black. config: the merged
+    configuration, as plain mappings. data: the recording, as the user named it. overwrite: replace
+    an earlier result; whatever else lies in the folder is kept either way.
+
+    figure.png shows the first camera: the result's baselines from top to bottom, then the result.
+
+    Returns the files written. Raises InputError if the place cannot be written to, or holds a
+    result already.
+    """
+    with _writing(out, result.key, overwrite, "run") as folder:
+        for name, depth in result.depth.items():
+            for product in ("depth", "depth_filled", "confidence"):
+                (folder / product).mkdir(exist_ok=True)
+            write_depth_png(folder / "depth" / f"{name}.png", depth.depth_m)
+            write_depth_png(folder / "depth_filled" / f"{name}.png", depth.filled_m)
+            path = folder / "confidence" / f"{name}.png"
+            write_confidence_png(path, depth.confidence, depth.filled_m)
+        write_cloud(folder / "cloud.laz", result.cloud)
+        _write_json(
+            folder / "metrics.json",
+            {
+                "schema_version": SCHEMA_VERSION,
+                "key": result.key,
+                "method": result.method,
+                **_scores(result),
+            },
+        )
+        methods = {**result.baselines, result.method: result}
+        _write_figure(folder / "figure.png", methods, images)
+        _write_run(folder / "run.yaml", result, config, data)
+    return _written(out, result.key, "run")
+
+
+def write_comparison(
+    results: Mapping[str, Result],
+    images: Mapping[str, Picture],
+    out: Path,
+    *,
+    config: Mapping[str, Any],
+    data: str,
+    overwrite: bool = False,
+) -> list[Path]:
+    """Write methods side by side as ``out/KEY/compare.json`` and ``compare.png``, beside the files
+    of a run where there are some.
+
+    results: method to result, of one key. The rest as `write_result`.
+    """
+    key = next(iter(results.values())).key
+    table = {
+        "schema_version": SCHEMA_VERSION,
+        "key": key,
+        "data": data,
+        "methods": {method: _scores(result) for method, result in results.items()},
+        "config": config,
+        "versions": _versions(),
+    }
+    with _writing(out, key, overwrite, "compare") as folder:
+        _write_json(folder / "compare.json", table)
+        _write_figure(folder / "compare.png", results, images)
+    return _written(out, key, "compare")
+
+
+def _key_folder(out: Path, key: int) -> Path:
+    return out / f"{key:06d}"
+
+
+@contextmanager
+def _writing(out: Path, key: int, overwrite: bool, verb: Verb) -> Iterator[Path]:
+    check_writable(out, key, overwrite, verb)
+    try:
+        with staged_folder(_key_folder(out, key), _OWNED[verb]) as folder:
+            yield folder
+    except OSError as error:
+        raise InputError(
+            f"--out {out}: cannot be written: {error.strerror or error}; nothing was kept"
+        ) from error
+
+
+def _written(out: Path, key: int, verb: Verb) -> list[Path]:
+    folder = _key_folder(out, key)
+    files: list[Path] = []
+    for name in _OWNED[verb]:
+        entry = folder / name
+        files += sorted(entry.iterdir()) if entry.is_dir() else [entry] if entry.exists() else []
+    return files
+
+
+def _scores(result: Result) -> dict[str, Any]:
+    return {
+        "frames": result.frames,
+        "num_points": len(result.cloud),
+        "metrics": result.metrics,
+    }
+
+
+def _write_figure(path: Path, results: Mapping[str, Result], images: Mapping[str, Picture]) -> None:
+    """The measured depth of each method in the first camera, if there is one."""
+    depth = next(iter(results.values())).depth
+    if not depth:
+        return
+    camera = next(iter(depth))
+    image = images.get(camera)
+    if image is None:
+        image = np.zeros((*depth[camera].depth_m.shape, 3), np.uint8)
+    panels = {_TITLES.get(m, m): r.depth[camera].depth_m for m, r in results.items()}
+    write_picture(path, draw_figure(image, panels))
+
+
+def _write_run(path: Path, result: Result, config: Mapping[str, Any], data: str) -> None:
+    record = {
+        "data": data,
+        "key": result.key,
+        "method": result.method,
+        "frames": result.frames,
+        "cameras": list(result.depth),
+        "config": config,
+        "stages": [
+            {
+                "name": cost.name,
+                "seconds": round(cost.seconds, 3),
+                "peak_memory_mb": round(cost.peak_memory_mb, 1),
+            }
+            for cost in result.costs
+        ],
+        "versions": _versions(),
+    }
+    text = yaml.safe_dump(_plain(record), sort_keys=False, allow_unicode=True)
+    write_file(path, text.encode())
+
+
+def _versions() -> dict[str, str | None]:
+    versions: dict[str, str | None] = {
+        "densify": densify.__version__,
+        "python": platform.python_version(),
+        "platform": platform.platform(),
+    }
+    for package in _PACKAGES:
+        try:
+            versions[package] = version(package)
+        except PackageNotFoundError:  # conda and system builds go by other names
+            versions[package] = None
+    return versions
+
+
+def _write_json(path: Path, value: Mapping[str, Any]) -> None:
+    write_file(path, (json.dumps(_plain(value), indent=2, allow_nan=False) + "\n").encode())
+
+
+def _plain(value: Any) -> Any:
+    """Numpy's numbers as Python's, tuples as lists, and None for what JSON cannot say."""
+    if isinstance(value, Mapping):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(item) for item in value]
+    if isinstance(value, np.ndarray):
+        return _plain(value.tolist())
+    if isinstance(value, np.generic):
+        return _plain(value.item())
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    return value

@@ -1,0 +1,94 @@
+# SPDX-License-Identifier: MIT
+"""What a recording holds, in a few aligned lines for a person."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from densify.errors import InputError
+from densify.readers.files import StoresImages, format_frames
+from densify.types import LidarSequence, Sweep
+
+
+def describe(sequence: LidarSequence) -> str:
+    """Frames, rate, points, cameras, stamps, poses and truth of a recording, one line each.
+
+    Loads the first and the last sweep and no image. The rate is the median over consecutive
+    frames of the first camera's stamps; without a camera, the mean between first and last sweep.
+    """
+    first = sequence[sequence.frames[0]]
+    last = sequence[sequence.frames[-1]] if len(sequence.frames) > 1 else first
+    lines = [
+        ("name", sequence.name),
+        ("frames", _frames(sequence)),
+        ("rate", _rate(sequence, first, last)),
+        ("stamps", _stamps(first, last)),
+        ("points", _points(first, last)),
+        ("point times", _point_times(first)),
+        *_cameras(sequence),
+        ("poses", _poses(sequence)),
+        ("truth", "none" if sequence.truth is None else "exact, simulated"),
+    ]
+    width = max(len(label) for label, _ in lines) + 2
+    return "\n".join(f"{label:<{width}}{text}" for label, text in lines)
+
+
+def _frames(sequence: LidarSequence) -> str:
+    frames = sequence.frames
+    num_missing = frames[-1] - frames[0] + 1 - len(frames)
+    gaps = f", {num_missing} missing between them" if num_missing else ", no gaps"
+    return f"{format_frames(frames)} ({len(frames)}{gaps})"
+
+
+def _rate(sequence: LidarSequence, first: Sweep, last: Sweep) -> str:
+    frames = np.array(sequence.frames)
+    if len(frames) < 2:
+        return "unknown, one sweep"
+    if sequence.cameras:
+        name = next(iter(sequence.cameras))
+        stamps = np.array([sequence.image_stamp_ns(name, frame) for frame in sequence.frames])
+        period_ns = float(np.median(np.diff(stamps) / np.diff(frames)))
+    else:
+        period_ns = (last.stamp_ns - first.stamp_ns) / (last.frame - first.frame)
+    return f"{1e9 / period_ns:.2f} Hz" if period_ns > 0 else "unknown, stamps do not advance"
+
+
+def _stamps(first: Sweep, last: Sweep) -> str:
+    seconds = (last.stamp_ns - first.stamp_ns) / 1e9
+    return f"{first.stamp_ns} to {last.stamp_ns} ns ({seconds:.2f} s)"
+
+
+def _points(first: Sweep, last: Sweep) -> str:
+    if first is last:
+        return f"{len(first):,} in frame {first.frame}"
+    return f"{len(first):,} in frame {first.frame}, {len(last):,} in frame {last.frame}"
+
+
+def _point_times(first: Sweep) -> str:
+    if first.offset_ns is None:
+        return "none: sweeps cannot be deskewed from the data's own times"
+    low_ms, high_ms = first.offset_ns.min() / 1e6, first.offset_ns.max() / 1e6
+    return f"{low_ms:+.1f} to {high_ms:+.1f} ms around the stamp"
+
+
+def _cameras(sequence: LidarSequence) -> list[tuple[str, str]]:
+    if not sequence.cameras:
+        return [("cameras", "none")]
+    lines = []
+    for name, camera in sequence.cameras.items():
+        text = f"{camera.width_px} x {camera.height_px} px, fx {camera.K[0, 0]:.1f} px, "
+        text += "with lens distortion" if camera.distortion else "rectified"
+        if isinstance(sequence, StoresImages):
+            images = sequence.image_frames(name)
+            text += f", {len(images)} images: {format_frames(images)}"
+        lines.append((name, text))
+    return lines
+
+
+def _poses(sequence: LidarSequence) -> str:
+    try:
+        path = np.array([sequence.T_world_lidar(frame)[:3, 3] for frame in sequence.frames])
+    except InputError as error:
+        return f"none: {error}"
+    length_m = np.linalg.norm(np.diff(path, axis=0), axis=1).sum()
+    return f"yes, a path of {length_m:.1f} m"

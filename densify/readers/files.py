@@ -1,0 +1,114 @@
+# SPDX-License-Identifier: MIT
+"""What readers of recordings kept as one file per frame share: finding a frame's file, saying which
+frames exist when it is not there, and loading an image of the size its camera promises.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Protocol, TypeVar, runtime_checkable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from densify.errors import InputError
+from densify.types import Camera
+
+T = TypeVar("T")
+
+_MAX_RANGES_SHOWN = 8
+
+
+@runtime_checkable
+class StoresImages(Protocol):
+    """A sequence that knows, without loading them, which images it has."""
+
+    def image_frames(self, camera: str) -> tuple[int, ...]:
+        """Frames that have an image of the camera, ascending."""
+        ...
+
+
+def numbered_files(folder: Path, *suffixes: str) -> dict[int, Path]:
+    """Files of a folder named by a frame number, as ``{frame: path}`` by ascending frame.
+
+    suffixes: those accepted, with the dot and in lower case. Empty if there is no such folder.
+    """
+    if not folder.is_dir():
+        return {}
+    found = {
+        int(path.stem): path
+        for path in folder.iterdir()
+        if path.stem.isdecimal() and path.suffix.lower() in suffixes
+    }
+    return dict(sorted(found.items()))
+
+
+def format_frames(frames: Iterable[int]) -> str:
+    """Frame numbers as a person writes them: ``96-135, 140``; long lists are cut in the middle."""
+    ranges: list[list[int]] = []
+    for frame in sorted(frames):
+        if ranges and frame == ranges[-1][1] + 1:
+            ranges[-1][1] = frame
+        else:
+            ranges.append([frame, frame])
+    texts = [f"{a}-{b}" if b > a else f"{a}" for a, b in ranges]
+    if len(texts) > _MAX_RANGES_SHOWN:
+        texts = [*texts[: _MAX_RANGES_SHOWN - 1], "...", texts[-1]]
+    return ", ".join(texts) if texts else "none"
+
+
+def read_text(path: Path) -> str:
+    """The text of a small file. Raises InputError if it is missing, unreadable or not text."""
+    try:
+        return path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else "not a text file"
+        raise InputError(f"{path}: cannot be read: {reason}") from error
+
+
+def of_frame(entries: Mapping[int, T], frame: int, what: str, where: Path) -> T:
+    """The entry of a frame, or an InputError that names the frames that exist.
+
+    what, where: for the message, such as ``"sweep"`` and the recording's folder.
+    """
+    try:
+        return entries[frame]
+    except KeyError:
+        raise InputError(
+            f"{where}: no {what} of frame {frame}; frames that exist: {format_frames(entries)}"
+        ) from None
+
+
+def camera_named(cameras: Mapping[str, Camera], name: str, where: Path) -> Camera:
+    """The camera, or an InputError that names those that exist."""
+    if name not in cameras:
+        raise InputError(
+            f"{where}: no camera {name!r}; cameras that exist: {', '.join(cameras) or 'none'}"
+        )
+    return cameras[name]
+
+
+def load_image(path: Path, camera: Camera) -> NDArray[np.uint8]:
+    """(H,W,3) uint8 RGB of an image file; gray ones get three equal channels.
+
+    Raises InputError if it cannot be read or is not of the camera's size.
+    """
+    import cv2
+
+    try:
+        data = np.fromfile(path, np.uint8)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
+    bgr = cv2.imdecode(data, cv2.IMREAD_COLOR) if len(data) else None
+    if bgr is None:
+        raise InputError(
+            f"{path}: not a complete image ({len(data)} bytes); expected a PNG or JPEG file"
+        )
+    height, width = bgr.shape[:2]
+    if (width, height) != (camera.width_px, camera.height_px):
+        raise InputError(
+            f"{path}: got an image of {width} x {height} px; expected "
+            f"{camera.width_px} x {camera.height_px}, as the calibration of {camera.name} says"
+        )
+    return np.ascontiguousarray(bgr[:, :, ::-1], dtype=np.uint8)

@@ -1,0 +1,245 @@
+# SPDX-License-Identifier: MIT
+"""KITTI raw drives (Geiger, Lenz, Stiller, Urtasun, "Vision meets Robotics: The KITTI Dataset",
+IJRR 2013), in the layout in which they are downloaded: the drive's folder, with the calibration
+files in its parent. Frame numbers are file numbers and files may be missing; timestamp files are
+whole, so line ``frame`` (from 0) of each belongs to ``frame``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from densify import poses
+from densify.errors import InputError
+from densify.readers.files import camera_named, load_image, numbered_files, of_frame, read_text
+from densify.readers.kitti_files import Calibration, Stamps, parse_numbers, read_cameras
+from densify.types import Camera, Float, Int, Sweep, Truth
+
+KITTI_TRIGGER_LATENCY_NS = 10_500_000
+"""By how much KITTI's recorded image stamps lag the exposure. The cameras are triggered when the
+scanner faces forward, at the sweep's reference time; drives 0002 and 0013 of 2011_09_26 record
+10.50 ms (image_02) and 9.96 ms (image_03) after it."""
+
+_NOMINAL_PERIOD_NS = 100_000_000  # the scanner's 10 Hz
+_EARTH_RADIUS_M = 6_378_137.0  # of the devkit's Mercator projection
+_NUM_OXTS_VALUES = 30
+
+
+class KittiRaw:
+    """A KITTI raw drive as a `densify.types.LidarSequence`.
+
+    Reference time of a sweep: ``velodyne_points/timestamps.txt``, the middle of the revolution,
+    when the scanner faces forward. There are no stamps per point: the scanner turns clockwise, so a
+    return fired ``-azimuth / 2π`` of the revolution (``timestamps_start.txt`` to
+    ``timestamps_end.txt``) after the reference time. Without the start and end stamps
+    ``offset_ns`` is None; without ``timestamps.txt`` as well, frame k is stamped k times 100 ms.
+
+    Poses come from ``oxts/``; the world is the inertial unit's frame at the first oxts file.
+    """
+
+    def __init__(self, path: Path | str) -> None:
+        """path: the drive's folder, ``.../2011_09_26/2011_09_26_drive_0013_sync``.
+
+        Reads calibration and stamps at once, everything else on demand. Raises InputError if the
+        folder holds no sweeps, or calibration or stamps are malformed.
+        """
+        drive = Path(path)
+        self.name = drive.resolve().name
+        self._drive = drive
+        self._sweeps = _find_sweeps(drive)
+        self.frames: Sequence[int] = tuple(self._sweeps)
+
+        velodyne = drive / "velodyne_points"
+        self._stamps = Stamps.read(velodyne / "timestamps.txt")
+        self._start_stamps = Stamps.read(velodyne / "timestamps_start.txt")
+        self._end_stamps = Stamps.read(velodyne / "timestamps_end.txt")
+        self._oxts_stamps = Stamps.read(drive / "oxts" / "timestamps.txt")
+        self._oxts = numbered_files(drive / "oxts" / "data", ".txt")
+
+        self.cameras: Mapping[str, Camera] = read_cameras(drive)
+        self._images = {
+            name: numbered_files(drive / name / "data", ".png", ".jpg", ".jpeg")
+            for name in self.cameras
+        }
+        self._image_stamps = {
+            name: Stamps.read(drive / name / "timestamps.txt") for name in self.cameras
+        }
+        self.truth: Truth | None = _open_truth(drive / "truth")
+
+    def __getitem__(self, frame: int) -> Sweep:
+        """The sweep's valid returns, in file order.
+
+        Rows that are not finite or lie at the scanner's origin (KITTI pads with zeros) are dropped.
+        Raises InputError if the frame does not exist, or its file is truncated or empty.
+        """
+        path = of_frame(self._sweeps, frame, "sweep", self._drive)
+        columns = _read_points(path)
+        valid = np.isfinite(columns).all(axis=1) & columns[:, :3].any(axis=1)
+        row = np.flatnonzero(valid)
+        if not len(row):
+            raise InputError(
+                f"{path}: holds no points (frame {frame}: {len(columns)} rows, none valid); "
+                f"choose a key or window without this frame"
+            )
+        points = columns[row, :3].astype(np.float64)
+        return Sweep(
+            frame=int(frame),
+            stamp_ns=self._stamp_ns(frame),
+            points=points,
+            intensity=columns[row, 3],
+            offset_ns=self._offset_ns(frame, points),
+            lidar=np.zeros(len(row), np.uint8),
+            row=row.astype(np.int64),
+        )
+
+    def image(self, camera: str, frame: int) -> NDArray[np.uint8]:
+        """(H,W,3) RGB. Raises InputError for an unknown camera, a missing or unfit image."""
+        calibrated = camera_named(self.cameras, camera, self._drive)
+        path = of_frame(self._images[camera], frame, f"{camera} image", self._drive)
+        return load_image(path, calibrated)
+
+    def image_frames(self, camera: str) -> tuple[int, ...]:
+        """Frames that have an image of the camera, ascending."""
+        camera_named(self.cameras, camera, self._drive)
+        return tuple(self._images[camera])
+
+    def image_stamp_ns(self, camera: str, frame: int) -> int:
+        """When the image was exposed: the recorded stamp less `KITTI_TRIGGER_LATENCY_NS`, or the
+        sweep's reference time where none is recorded."""
+        camera_named(self.cameras, camera, self._drive)
+        stamps = self._image_stamps[camera]
+        recorded = stamps.get(frame) if stamps else None
+        return self._stamp_ns(frame) if recorded is None else recorded - KITTI_TRIGGER_LATENCY_NS
+
+    def T_world_lidar(self, frame: int) -> Float:
+        """(4,4) pose at the sweep's reference time, from GPS and inertial unit.
+
+        An oxts record is up to 20 ms away from the sweep of the same number, 0.3 m at 15 m/s, so
+        the pose is interpolated between the records before and after the sweep; at the end of the
+        records it is extrapolated from the last two. Raises InputError without oxts.
+        """
+        of_frame(self._sweeps, frame, "sweep", self._drive)
+        if not self._oxts:
+            raise InputError(
+                f"{self._drive}: no poses (expected oxts/data/*.txt); "
+                f"let the sweeps register themselves with --set register.source=kiss-icp"
+            )
+        of_frame(self._oxts, frame, "oxts record", self._drive)
+        T_world_imu = self._interpolated_T_world_imu(frame)
+        return T_world_imu @ poses.inverse(self._T_lidar_imu)
+
+    def _stamp_ns(self, frame: int) -> int:
+        if self._stamps is None:
+            return int(frame) * _NOMINAL_PERIOD_NS
+        return self._stamps[frame]
+
+    def _offset_ns(self, frame: int, points: Float) -> Int | None:
+        if self._stamps is None or self._start_stamps is None or self._end_stamps is None:
+            return None
+        start, end = self._start_stamps[frame], self._end_stamps[frame]
+        if end <= start:
+            raise InputError(
+                f"{self._end_stamps.path}: sweep of frame {frame} ends {start - end} ns before it "
+                f"starts; expected the end after the start"
+            )
+        revolution = -np.arctan2(points[:, 1], points[:, 0]) / (2 * np.pi)
+        centre_ns = (start + end) // 2 - self._stamps[frame]
+        return np.rint(revolution * (end - start)).astype(np.int64) + centre_ns
+
+    def _interpolated_T_world_imu(self, frame: int) -> Float:
+        if self._oxts_stamps is None or self._stamps is None:
+            return self._T_world_imu(frame)
+        stamp = self._stamps[frame]
+        records = [
+            (self._oxts_stamps[near], near)
+            for near in (frame - 1, frame, frame + 1)
+            if near in self._oxts
+        ]
+        # The two records that enclose the sweep, else the two nearest to it.
+        pairs = [(a, b) for a in records for b in records if a[0] < b[0]]
+        if not pairs:
+            return self._T_world_imu(frame)
+        (stamp_a, a), (stamp_b, b) = min(
+            pairs, key=lambda p: (abs(p[0][0] - stamp) + abs(p[1][0] - stamp), p)
+        )
+        fraction = (stamp - stamp_a) / (stamp_b - stamp_a)
+        return poses.interpolate(self._T_world_imu(a), self._T_world_imu(b), fraction)
+
+    def _T_world_imu(self, frame: int) -> Float:
+        return poses.inverse(self._T_mercator_world) @ self._T_mercator_imu(frame)
+
+    def _T_mercator_imu(self, frame: int) -> Float:
+        """Pose on the Mercator plane (east, north, up), as the devkit's convertOxtsToPose."""
+        lat_deg, lon_deg, alt_m, roll, pitch, yaw = _read_oxts(self._oxts[frame])[:6]
+        T = np.eye(4)
+        T[:3, :3] = Rotation.from_euler("ZYX", [yaw, pitch, roll]).as_matrix()
+        T[0, 3] = self._mercator_scale * _EARTH_RADIUS_M * np.deg2rad(lon_deg)
+        T[1, 3] = (
+            self._mercator_scale * _EARTH_RADIUS_M * np.log(np.tan(np.deg2rad(90 + lat_deg) / 2))
+        )
+        T[2, 3] = alt_m
+        return T
+
+    @cached_property
+    def _mercator_scale(self) -> float:
+        first = next(iter(self._oxts.values()))
+        return float(np.cos(np.deg2rad(_read_oxts(first)[0])))
+
+    @cached_property
+    def _T_mercator_world(self) -> Float:
+        return self._T_mercator_imu(next(iter(self._oxts)))
+
+    @cached_property
+    def _T_lidar_imu(self) -> Float:
+        return Calibration.read(self._drive.resolve().parent / "calib_imu_to_velo.txt").pose()
+
+
+def _find_sweeps(drive: Path) -> dict[int, Path]:
+    if not drive.is_dir():
+        raise InputError(f"{drive}: no such folder; expected a KITTI raw drive")
+    data = drive / "velodyne_points" / "data"
+    if not data.is_dir():
+        raise InputError(
+            f"{drive}: not a KITTI raw drive; expected the folder velodyne_points/data in it"
+        )
+    sweeps = numbered_files(data, ".bin")
+    if not sweeps:
+        raise InputError(f"{data}: no sweeps; expected files such as 0000000120.bin")
+    return sweeps
+
+
+def _read_points(path: Path) -> NDArray[np.float32]:
+    """(N,4) x, y, z in metres and reflectance."""
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
+    if len(data) % 16:
+        raise InputError(
+            f"{path}: truncated: got {len(data)} bytes, expected a multiple of 16 (x y z "
+            f"reflectance as float32), {len(data) % 16} too many; fetch the file again"
+        )
+    return np.frombuffer(data, "<f4").reshape(-1, 4).astype(np.float32)
+
+
+def _read_oxts(path: Path) -> Float:
+    """(30,) latitude and longitude (deg), altitude (m), roll, pitch, yaw (rad), ..."""
+    values = parse_numbers(read_text(path), str(path), _NUM_OXTS_VALUES)
+    if abs(values[0]) >= 90:
+        raise InputError(f"{path}: got a latitude of {values[0]:g} deg, expected -90 to 90")
+    return values
+
+
+def _open_truth(folder: Path) -> Truth | None:
+    """Exact truth, beside the sweeps of a simulated drive."""
+    if not folder.is_dir():
+        return None
+    from densify.readers.truth_files import FileTruth
+
+    return FileTruth.open(folder)
