@@ -105,7 +105,9 @@ def compare(
     results: dict[str, Result] = {}
     for method in wanted:
         used = Window(key, (moving_window[key],)) if method == "none" else moving_window
-        fields = flow if method == "flow" else tuple(FlowField.zero(len(s.sweep)) for s in used.sweeps)
+        fields = (
+            flow if method == "flow" else tuple(FlowField.zero(len(s.sweep)) for s in used.sweeps)
+        )
         with watch.stage("accumulate"):
             cloud = accumulate(used, fields, settings.chain.unfollowed == "drop")
         with watch.stage("project"):

@@ -87,15 +87,13 @@ class ScannerImage:
 
         column = _column(azimuth, num_columns)
         row = np.clip(((elevation - low) / elevation_step).astype(np.int64), 0, num_rows - 1)
-        nearest = np.full(num_rows * num_columns, np.inf, np.float32)
-        np.minimum.at(nearest, row * num_columns + column, range_m)
-        nearest = nearest.reshape(num_rows, num_columns)
-        mode = ("constant", "wrap")
+        nearest = np.full((num_rows, num_columns), np.inf, np.float32)
+        np.minimum.at(nearest, (row, column), range_m)
         filled = np.isfinite(nearest).astype(np.uint8)
         counted = ndimage.correlate1d(filled, np.ones(3, np.uint8), axis=0, mode="constant")
         counted = ndimage.correlate1d(counted, np.ones(3, np.uint8), axis=1, mode="wrap")
         return ScannerImage(
-            nearest_m=ndimage.minimum_filter(nearest, 3, mode=mode, cval=np.inf),
+            nearest_m=ndimage.minimum_filter(nearest, 3, mode=("constant", "wrap"), cval=np.inf),
             num_filled=counted,
             offset_s=_offset_per_column(column, offset_s, num_columns),
             elevation_low_rad=low,
@@ -151,11 +149,12 @@ def _at_time(
     rotation, translation = twist[:, :3] * time_s[:, None], twist[:, 3:] * time_s[:, None]
     p = points - translation
     turned = np.cross(rotation, p)
-    return p - turned + 0.5 * np.cross(rotation, turned)
+    moved: Float32 = p - turned + np.float32(0.5) * np.cross(rotation, turned)
+    return moved
 
 
 def _angular_steps(azimuth: Float32, elevation: Float32) -> tuple[float, float]:
-    """Cell width and height (rad) from the returns: the median gap along rings and between rings."""
+    """Cell width and height (rad) from the returns: the median gaps along and between rings."""
     if len(azimuth) < _MIN_POINTS_TO_MEASURE:
         return np.deg2rad(1.0), np.deg2rad(2.0)
     # A strip half a degree wide crosses every ring a few times: large gaps in elevation part rings.

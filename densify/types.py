@@ -112,7 +112,7 @@ class Window:
 class FlowField:
     """Scene flow of one sweep's (or point file's) N points to another time, ego-motion removed.
 
-    displacement: (N,3) metres, in the coordinates the points are in. Exactly 0 where not ``moving``.
+    displacement: (N,3) metres, in the coordinates the points are in; exactly 0 where not moving.
     moving: (N,) bool, proven to move.
     instance: (N,) int32, the moving object the point belongs to, -1 none.
     lost: (N,) bool, belongs to something that moves but cannot be followed to the target time.
@@ -236,10 +236,19 @@ class LidarSequence(Protocol):
     or malformed.
     """
 
-    name: str
-    frames: Sequence[int]  # of the sweeps that exist, ascending
-    cameras: Mapping[str, Camera]
-    truth: Truth | None
+    @property
+    def name(self) -> str: ...
+
+    @property
+    def frames(self) -> Sequence[int]:
+        """Of the sweeps that exist, ascending."""
+        ...
+
+    @property
+    def cameras(self) -> Mapping[str, Camera]: ...
+
+    @property
+    def truth(self) -> Truth | None: ...
 
     def __getitem__(self, frame: int) -> Sweep: ...
 

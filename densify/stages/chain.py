@@ -71,7 +71,8 @@ def _look_up(
         rest = displacement - (points @ R.T + t - points)
     k = min(_NUM_NEIGHBORS, len(points))
     distance, nearest = cKDTree(points).query(at, k)
-    distance, nearest = distance.reshape(len(at), k), nearest.reshape(len(at), k)
+    distance = np.reshape(distance, (len(at), k))
+    nearest = np.reshape(nearest, (len(at), k))
     weight = 1 / (distance + 1e-3)
     weight /= weight.sum(1, keepdims=True)
     return flow + np.einsum("nk,nkj->nj", weight, rest[nearest]), distance[:, 0] <= max_gap_m

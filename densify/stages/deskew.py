@@ -25,12 +25,13 @@ def deskew(sweeps: Sequence[Sweep], trajectory: Trajectory, key: int) -> Window:
     for sweep in sweeps:
         i = trajectory.frames.index(sweep.frame)
         before, after = _twists(trajectory, i)
-        points = sweep.points
+        points: Float = sweep.points
         if sweep.offset_ns is None:
             before, after = np.zeros(6), np.zeros(6)
         else:
             offset_s = sweep.offset_ns[:, None] * 1e-9
-            points = poses.transform_each(offset_s * np.where(offset_s < 0, before, after), points)
+            twist = offset_s * np.where(offset_s < 0, before, after)
+            points = poses.transform_each(twist.astype(np.float64), points)
         registered.append(
             RegisteredSweep(
                 sweep=replace(sweep, points=points),

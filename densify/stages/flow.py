@@ -6,19 +6,18 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.spatial import cKDTree
+from scipy.spatial import ConvexHull, QhullError, cKDTree
 
 from densify import poses
 from densify.config import FlowSettings
 from densify.flow.evidence import Candidates, FreeSpace, find_candidates
 from densify.flow.tracks import Track, follow_groups
-from densify.types import Float, Float32, FlowField, Window
+from densify.types import Bool, Float, Float32, FlowField, Window
 
 _ATTACH_M = 0.3
 _ATTACH_UNSEEN_M = 0.15
-_ATTACH_LOW_M = 0.1
+_OUTLINE_M = 0.05
 _MIN_HEIGHT_M = 0.08
-_BAND_M = 0.3
 
 
 def step_flow(
@@ -29,7 +28,7 @@ def step_flow(
     heights_m: per sweep (N,) above the ground.
     """
     if settings.engine == "paper":
-        return _paper_steps(window, heights_m, settings)
+        return _objective_steps(window, heights_m, settings)
     return _group_steps(window, heights_m, settings)
 
 
@@ -47,17 +46,24 @@ def _group_steps(
     fields = []
     for i, registered in enumerate(window.sweeps):
         points = poses.transform(registered.T_key_lidar, registered.sweep.points)
-        instance = _attach(points, heights_m[i], candidates[i], tracks, candidates, i, time_s)
+        instance = _attach(
+            points,
+            heights_m[i],
+            candidates[i],
+            tracks,
+            candidates,
+            i,
+            time_s,
+            settings.min_height_m,
+        )
         target = i + int(np.sign(key - i))
-        displacement = np.zeros_like(points)
+        displacement: Float = np.zeros_like(points)
         for k, track in enumerate(tracks):
             mine = instance == k
             if target != i and mine.any():
                 moved = track.carry(points[mine], time_s[i], time_s[target]) - points[mine]
                 displacement[mine] = moved @ registered.T_key_lidar[:3, :3]  # into the lidar frame
-        fields.append(
-            FlowField(displacement, instance >= 0, instance, np.zeros(len(points), bool))
-        )
+        fields.append(FlowField(displacement, instance >= 0, instance, np.zeros(len(points), bool)))
     return tuple(fields)
 
 
@@ -69,8 +75,13 @@ def _attach(
     candidates: Sequence[Candidates],
     i: int,
     time_s: Float,
+    min_height_m: float,
 ) -> np.ndarray:
-    """(N,) int32: the track each point of sweep i belongs to, -1 none."""
+    """(N,) int32: the track each point of sweep i belongs to, -1 none.
+
+    A point belongs to a track where it is close to the track's points of all sweeps, or stands
+    within their outline: nothing else can be where a solid object is.
+    """
     instance = np.full(len(points), -1, np.int32)
     nearest = np.full(len(points), np.inf)
     reach = np.full(len(points), _ATTACH_UNSEEN_M)
@@ -86,27 +97,33 @@ def _attach(
         )
         low, high = model.min(0) - _ATTACH_M, model.max(0) + _ATTACH_M
         low[2] -= 1.0  # down to the wheels
-        inside = ((points > low) & (points < high)).all(1) & (height_m > _MIN_HEIGHT_M)
-        rows = np.flatnonzero(inside)
+        near = ((points > low) & (points < high)).all(1) & (height_m > _MIN_HEIGHT_M)
+        rows = np.flatnonzero(near)
         if not len(rows):
             continue
-        distance, _ = cKDTree(model).query(points[rows])
-        beneath, _ = cKDTree(model[:, :2]).query(points[rows, :2])
-        belongs = (distance < reach[rows]) | (
-            (height_m[rows] < _BAND_M) & (beneath < _ATTACH_LOW_M) & (distance < 0.5)
-        )
+        distance = np.asarray(cKDTree(model).query(points[rows])[0])
+        belongs = (distance < reach[rows]) & (height_m[rows] >= min_height_m)
+        belongs |= _within_outline(points[rows, :2], model[:, :2])
         closer = belongs & (distance < nearest[rows])
         instance[rows[closer]] = k
         nearest[rows[closer]] = distance[closer]
     return instance
 
 
-def _paper_steps(
+def _within_outline(at: Float, outline: Float) -> Bool:
+    """(N,2), (M,2) -> (N,) True inside the convex hull, where there is one."""
+    try:
+        hull = ConvexHull(outline)
+    except (QhullError, ValueError):  # too few points, or all on a line
+        return np.zeros(len(at), bool)
+    return (at @ hull.equations[:, :2].T + hull.equations[:, 2] < _OUTLINE_M).all(1)
+
+
+def _objective_steps(
     window: Window, heights_m: Sequence[Float32], settings: FlowSettings
 ) -> tuple[FlowField, ...]:
-    """The published way: every point above the ground moves, pair by pair."""
-    from densify.flow.pair import device, objective_settings
-    from densify.flow.solvers import solve
+    """The published way: the points above the ground, pair by pair."""
+    from densify.flow.pair import flow_between
 
     key = window.frames.index(window.key)
     above = [h >= settings.min_height_m for h in heights_m]
@@ -114,15 +131,12 @@ def _paper_steps(
     fields = []
     for i, registered in enumerate(window.sweeps):
         field = FlowField.zero(len(clouds[i]))
-        field.moving[:] = above[i]
         target = i + int(np.sign(key - i))
-        if target != i:
-            flow = solve(
-                clouds[i][above[i]],
-                clouds[target][above[target]],
-                objective_settings(settings),
-                device=device(settings),
-            ).flow
-            field.displacement[above[i]] = flow @ registered.T_key_lidar[:3, :3]
+        if target == i:
+            field.moving[:] = above[i]  # whatever arrives here has arrived
+        else:
+            pair = flow_between(clouds[i][above[i]], clouds[target][above[target]], settings)
+            field.displacement[above[i]] = pair.displacement @ registered.T_key_lidar[:3, :3]
+            field.moving[above[i]] = pair.moving
         fields.append(field)
     return tuple(fields)

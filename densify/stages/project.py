@@ -9,7 +9,8 @@ is taken. Nothing depends on the order of the points.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import itertools
+from collections.abc import Iterator, Mapping
 
 import numpy as np
 
@@ -22,6 +23,7 @@ from densify.types import Camera, Cloud, DepthMap, Float, Float32, Int
 # Spacing of a 64-beam scanner, taken when the cloud is too small to measure it.
 _DEFAULT_SPACING_RAD = (np.radians(0.18), np.radians(0.40))
 _MAX_HALF_PX = 24.0  # a point just before the lens must not hide the whole image
+_CELLS_AT_ONCE = 1_000_000  # bounds the memory of painting
 _PLANE_REACH_PX = (2, 3)
 _PLANE_RESIDUAL = 0.03  # of the inverse depth; beyond it a window shows more than one surface
 _LEAST_CONFIDENCE = 1 / 255  # 0 means no depth once written as 8 bits
@@ -173,12 +175,7 @@ def _paint(
     canvas = np.zeros((shape[0] + 2 * border) * width)
     first = np.ceil(uv - half_px).astype(np.int64)
     count = np.floor(uv + half_px).astype(np.int64) - first + 1
-    size = count[:, 0] * 64 + count[:, 1]
-    order = np.argsort(size, kind="stable")
-    starts = np.flatnonzero(np.diff(size[order], prepend=-1))
-    for group in np.split(order, starts[1:]):  # patches of one size are painted together
-        if not len(group):
-            continue
+    for group in _same_size(count):
         steps_u, steps_v = (np.arange(n) for n in count[group[0]])
         corner = (first[group] - uv[group]) * slope[group]
         tilt_u = corner[:, :1] + slope[group, :1] * steps_u
@@ -189,6 +186,17 @@ def _paint(
         cell = start[:, None, None] + steps_v[:, None] * width + steps_u
         np.maximum.at(canvas, cell.ravel(), (inverse[group, None, None] + tilt).ravel())
     return canvas.reshape(-1, width)[border:-border, border:-border]
+
+
+def _same_size(count: Int) -> Iterator[Int]:
+    """Groups of patches of one width and height, few enough to be painted in one piece."""
+    size = count[:, 0] * 64 + count[:, 1]  # no patch has more than 49 pixels a side
+    order = np.argsort(size, kind="stable")
+    changes = np.flatnonzero(np.diff(size[order], prepend=-1))
+    for start, end in itertools.pairwise([*changes, len(order)]):
+        most = max(1, _CELLS_AT_ONCE // int(count[order[start]].prod()))
+        for piece in range(start, end, most):
+            yield order[piece : min(piece + most, end)]
 
 
 def _best_per_pixel(pixel: Int, ranks: tuple[np.ndarray, ...]) -> Int:

@@ -7,8 +7,10 @@ Vizzo et al., "KISS-ICP: In Defense of Point-to-Point ICP", RA-L 2023.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from densify import poses
 from densify.config import RegisterSettings
@@ -18,6 +20,10 @@ from densify.types import Float, Sweep, Trajectory
 _MAX_ACCELERATION_M_S2 = 30.0  # three times what tyres can do; the rest is noise of the stamps
 _MAX_TURN_RATE_DEG_S = 150.0
 _POSE_NOISE_M = 0.5
+_NUM_CATCHING_UP = 3
+_SEARCH_STEP_M = 0.5
+_SEARCH_POINTS = 800
+_STANDING_M = 0.4
 
 
 def register(
@@ -26,11 +32,12 @@ def register(
     """Poses of consecutive sweeps by lidar odometry.
 
     sweeps: ascending frames; raw for a first pass, deskewed for a second one.
-    rough: the first pass, whose first step predicts the second sweep of this pass: without it
-        odometry has to guess that the vehicle starts from rest.
+    rough: the first pass. It tells the second one how fast the vehicle starts and lets it work
+        with the fine voxels; without it they are twice as large and the start is searched for,
+        since odometry by itself takes every start for standing still.
 
     World is the first sweep's lidar frame. Raises ComputationError naming the frames where a sweep
-    is too sparse to register or the motion is none a vehicle makes.
+    is too sparse to register or, in the second pass, the motion is none a vehicle makes.
     """
     from kiss_icp.kiss_icp import KissICP
 
@@ -40,12 +47,15 @@ def register(
                 f"registration: sweep {sweep.frame} has {len(sweep)} points, expected at least "
                 f"{settings.min_num_points}; choose another key or lower register.min_num_points"
             )
-    odometry = KissICP(_kiss_icp_config(settings))
-    if rough is not None and len(rough.frames) > 1:
-        odometry.last_delta = poses.inverse(rough.T_world_lidar[0]) @ rough.T_world_lidar[1]
+    voxel_size_m = settings.voxel_size_m * (2 if rough is None else 1)
+    odometry = KissICP(_kiss_icp_config(settings, voxel_size_m))
+    if len(sweeps) > 1:
+        odometry.last_delta = _searched_step(sweeps, settings) if rough is None else _step(rough)
         odometry.last_pose = poses.inverse(odometry.last_delta)
     T_world_lidar = []
-    no_stamps = np.empty(0)  # KISS-ICP aborts the process on equal stamps; sweeps are ours to deskew
+    no_stamps = np.empty(
+        0
+    )  # KISS-ICP aborts the process on equal stamps; sweeps are ours to deskew
     for sweep in sweeps:
         odometry.register_frame(sweep.points, no_stamps)
         T_world_lidar.append(odometry.last_pose)
@@ -54,25 +64,60 @@ def register(
         stamp_ns=np.array([s.stamp_ns for s in sweeps], np.int64),
         T_world_lidar=np.stack(T_world_lidar),
     )
-    check_plausible(trajectory, settings)
+    if rough is not None:  # a first pass may stumble where it starts from rest
+        check_plausible(trajectory, settings)
     return trajectory
+
+
+def _step(rough: Trajectory) -> Float:
+    """(4,4) motion of one sweep to the next at the start, from where odometry has caught up."""
+    i = min(_NUM_CATCHING_UP, len(rough.frames) - 2)
+    return poses.inverse(rough.T_world_lidar[i]) @ rough.T_world_lidar[i + 1]
+
+
+def _searched_step(sweeps: Sequence[Sweep], settings: RegisterSettings) -> Float:
+    """(4,4) motion of one sweep to the next: the translation on a grid, up to the highest speed,
+    that best lays what stands on the ground in the first sweeps upon each other."""
+    standing = [_standing(s.points) for s in sweeps[:3]]
+    seconds = (sweeps[1].stamp_ns - sweeps[0].stamp_ns) * 1e-9
+    num = int(np.clip(settings.max_speed_m_s * seconds / _SEARCH_STEP_M, 0, 20))
+    span = np.arange(-num, num + 1) * _SEARCH_STEP_M
+    x, y = np.meshgrid(span, span, indexing="ij")
+    steps = np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], 1)
+    cost = 1e-3 * np.linalg.norm(steps, axis=1)
+    for earlier, later in pairwise(standing):
+        _, rows = np.unique(np.floor(later), axis=0, return_index=True)  # even over 1 m voxels
+        sample = later[rows[:: len(rows) // _SEARCH_POINTS + 1]]
+        moved = (sample + steps[:, None, :]).reshape(-1, 3)
+        distance, _ = cKDTree(earlier).query(moved, distance_upper_bound=1.0, workers=-1)
+        cost += np.minimum(distance, 1.0).reshape(len(steps), -1).mean(1)
+    return poses.exp(np.append(np.zeros(3), steps[np.argmin(cost)]))
+
+
+def _standing(points: Float) -> Float:
+    """The points above the ground: its rings go with the scanner and hide the motion."""
+    _, cell = np.unique(np.floor(points[:, :2]), axis=0, return_inverse=True)
+    lowest = np.full(int(cell.max()) + 1, np.inf)
+    np.minimum.at(lowest, cell.ravel(), points[:, 2])
+    standing = points[points[:, 2] > lowest[cell.ravel()] + _STANDING_M]
+    return standing if len(standing) else points
 
 
 def check_plausible(trajectory: Trajectory, settings: RegisterSettings) -> None:
     """Raise ComputationError where the trajectory jumps as no vehicle does."""
     step_s = np.diff(trajectory.stamp_ns) * 1e-9
-    pairs = list(zip(trajectory.frames, trajectory.frames[1:], strict=False))
+    pairs = list(pairwise(trajectory.frames))
     for (a, b), seconds in zip(pairs, step_s, strict=True):
         if seconds <= 0:
             raise ComputationError(
-                f"registration: the stamp of frame {b} is {-seconds:.3f} s before that of frame {a}; "
-                f"expected ascending stamps; check the recording's timestamps"
+                f"registration: the stamp of frame {b} is {-seconds:.3f} s before that of frame "
+                f"{a}; expected ascending stamps; check the recording's timestamps"
             )
     T = trajectory.T_world_lidar
     if not np.isfinite(T).all():
         bad = trajectory.frames[int(np.argmin(np.isfinite(T).all((1, 2))))]
         raise ComputationError(f"registration: the pose of frame {bad} is not finite")
-    steps = [poses.log(poses.inverse(a) @ b) for a, b in zip(T[:-1], T[1:], strict=True)]
+    steps = [poses.log(poses.inverse(a) @ b) for a, b in pairwise(T)]
     previous_m_s: Float | None = None
     for (a, b), step, seconds in zip(pairs, steps, step_s, strict=True):
         velocity_m_s = step[3:] / seconds
@@ -83,8 +128,8 @@ def check_plausible(trajectory: Trajectory, settings: RegisterSettings) -> None:
             raise ComputationError(
                 f"registration jumps from frame {a} to {b}: {speed_m_s:.0f} m/s and "
                 f"{turn_deg_s:.0f} deg/s, expected at most {settings.max_speed_m_s:g} m/s and "
-                f"{_MAX_TURN_RATE_DEG_S:.0f} deg/s; choose another key, or use the data set's poses "
-                f"(register.source=dataset)"
+                f"{_MAX_TURN_RATE_DEG_S:.0f} deg/s; choose another key, or use the data set's "
+                f"poses (register.source=dataset)"
             )
         if previous_m_s is not None:
             change_m_s = float(np.linalg.norm(velocity_m_s - previous_m_s))
@@ -97,7 +142,7 @@ def check_plausible(trajectory: Trajectory, settings: RegisterSettings) -> None:
         previous_m_s = velocity_m_s
 
 
-def _kiss_icp_config(settings: RegisterSettings):  # type: ignore[no-untyped-def]
+def _kiss_icp_config(settings: RegisterSettings, voxel_size_m: float):  # type: ignore[no-untyped-def]
     """Every field set here: KISS-ICP otherwise reads ``kiss_icp_*`` environment variables."""
     from kiss_icp.config import KISSConfig
     from kiss_icp.config.config import (
@@ -112,7 +157,7 @@ def _kiss_icp_config(settings: RegisterSettings):  # type: ignore[no-untyped-def
         data=DataConfig(
             max_range=settings.max_range_m, min_range=settings.min_range_m, deskew=False
         ),
-        mapping=MappingConfig(voxel_size=settings.voxel_size_m, max_points_per_voxel=20),
+        mapping=MappingConfig(voxel_size=voxel_size_m, max_points_per_voxel=20),
         # One thread: the parallel sum's order, and so its last bits, change from run to run.
         registration=RegistrationConfig(
             max_num_iterations=500, convergence_criterion=1e-4, max_num_threads=1
