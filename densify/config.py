@@ -126,7 +126,9 @@ class FlowSettings(Section):
         choices=("symmetric", "row-sum-zero"),
     )
     static_prior: bool = knob(
-        True, "points not proven to move keep exactly their rigid place; off moves every point"
+        True,
+        "points not proven to move keep exactly their rigid place; off moves every point, with "
+        "engine paper and in the flow of two files",
     )
     device: str = knob("auto", "auto: CUDA where there is one", choices=("auto", "cpu", "cuda"))
 

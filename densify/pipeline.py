@@ -8,6 +8,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from densify.range_image import RangeImage
 from densify.readers.window import choose_cameras, read_sweeps, recorded_trajectory, window_frames
 from densify.stages.accumulate import accumulate
 from densify.stages.chain import chain
+from densify.stages.colour import colour
 from densify.stages.deskew import deskew
 from densify.stages.flow import step_flow
 from densify.stages.ground import height_above_ground
@@ -110,18 +112,19 @@ def compare(
         )
         with watch.stage("accumulate"):
             cloud = accumulate(used, fields, settings.chain.unfollowed == "drop")
-        with watch.stage("project"):
-            depth = {
-                camera.name: project(
-                    cloud,
-                    camera,
-                    _camera_pose(sequence, moving_window[key], camera),
-                    settings.project,
-                    key,
-                    {s.frame: s.T_key_lidar[:3, 3] for s in used.sweeps},
+        depth: dict[str, DepthMap] = {}
+        for camera in chosen:
+            late_s, T_cam_key = _exposure(sequence, moving_window[key], camera)
+            exposed = cloud.after(late_s)
+            origins = {s.frame: s.T_key_lidar[:3, 3] for s in used.sweeps}
+            with watch.stage("project"):
+                seen = project(exposed, camera, T_cam_key, settings.project, key, origins)
+            with watch.stage("colour"):
+                image = sequence.image(camera.name, key)
+                cloud = replace(
+                    cloud, rgb=colour(cloud.rgb, exposed.points, camera, T_cam_key, seen, image)
                 )
-                for camera in chosen
-            }
+            depth[camera.name] = seen
         with watch.stage("score"):
             metrics = _scores(sequence, moving_window, cloud, depth)
         results[method] = Result(
@@ -135,8 +138,7 @@ def _read(
 ) -> list[Sweep]:
     with watch.stage("read"):
         sweeps = []
-        limits = (settings.register.min_range_m, settings.register.max_range_m)
-        for sweep in read_sweeps(sequence, frames, *limits):
+        for sweep in read_sweeps(sequence, frames, settings.register):
             sweeps.append(sweep)
             watch.step("read", len(sweeps), len(frames))
     return sweeps
@@ -155,12 +157,15 @@ def _trajectory(
     return register(straight, settings.register, rough)
 
 
-def _camera_pose(sequence: LidarSequence, key_sweep: RegisteredSweep, camera: Camera) -> Float:
-    """(4,4) T_cam_key with the ego motion from the key's reference time to the exposure."""
+def _exposure(
+    sequence: LidarSequence, key_sweep: RegisteredSweep, camera: Camera
+) -> tuple[float, Float]:
+    """Seconds from the key's reference time to the exposure, and (4,4) T_cam_key with the ego
+    motion until then."""
     stamp_ns = sequence.image_stamp_ns(camera.name, key_sweep.frame)
     late_s = (stamp_ns - key_sweep.sweep.stamp_ns) * 1e-9
     twist = key_sweep.twist_before if late_s < 0 else key_sweep.twist_after
-    return camera.T_cam_lidar @ poses.inverse(poses.exp(late_s * twist))
+    return late_s, camera.T_cam_lidar @ poses.inverse(poses.exp(late_s * twist))
 
 
 def _scores(

@@ -141,7 +141,8 @@ class Cloud:
     points: (M,3) metres, key frame.
     rigid_points: (M,3) where registration alone puts them.
     frame: (M,) int32 source sweep. row: (M,) int64 index of the point in its deskewed sweep.
-    moving: (M,) bool. instance: (M,) int32, -1 none. confidence: (M,) float32, 0 to 1.
+    moving: (M,) bool. instance: (M,) int32, -1 none. velocity_m_s: (M,3) float32 at the key's
+    moment, ego-motion removed, 0 where nothing moves. confidence: (M,) float32, 0 to 1.
     intensity: (M,) float32. rgb: (M,3) uint8, black where no camera saw the point.
     """
 
@@ -151,6 +152,7 @@ class Cloud:
     row: Int
     moving: Bool
     instance: NDArray[np.int32]
+    velocity_m_s: Float32
     confidence: Float32
     intensity: Float32
     rgb: NDArray[np.uint8]
@@ -159,6 +161,10 @@ class Cloud:
     def displaced(self) -> Float32:
         """(M,) metres moved beyond the rigid alignment."""
         return np.linalg.norm(self.points - self.rigid_points, axis=1).astype(np.float32)
+
+    def after(self, seconds: float) -> Cloud:
+        """Shortly after (or before) the key's moment: what moves goes on at its velocity."""
+        return replace(self, points=self.points + seconds * self.velocity_m_s)
 
     def __len__(self) -> int:
         return len(self.points)

@@ -5,9 +5,11 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
 
+from densify.config import RegisterSettings
 from densify.errors import InputError
 from densify.readers.files import format_frames
 from densify.types import Camera, LidarSequence, Sweep, Trajectory
@@ -56,13 +58,15 @@ def window_frames(
 
 
 def read_sweeps(
-    sequence: LidarSequence, frames: Sequence[int], min_range_m: float, max_range_m: float
+    sequence: LidarSequence, frames: Sequence[int], settings: RegisterSettings
 ) -> Iterator[Sweep]:
-    """The sweeps without the own vehicle's returns and those too far to trust."""
+    """The sweeps without the own vehicle's returns and those too far to trust, and without
+    per-point times where they are not to be deskewed."""
     for frame in frames:
         sweep = sequence[frame]
         range_m = np.linalg.norm(sweep.points, axis=1)
-        yield sweep.select((range_m >= min_range_m) & (range_m <= max_range_m))
+        sweep = sweep.select((range_m >= settings.min_range_m) & (range_m <= settings.max_range_m))
+        yield sweep if settings.deskew else replace(sweep, offset_ns=None)
 
 
 def choose_cameras(sequence: LidarSequence, names: Sequence[str] | None) -> list[Camera]:

@@ -1,0 +1,279 @@
+# SPDX-License-Identifier: MIT
+"""Vehicles, cyclists and walkers: their meshes and how their parts hang together.
+
+Vehicle meshes have their origin on the ground midway between the axles, x forward, z up.
+"""
+
+from __future__ import annotations
+
+import colorsys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from itertools import pairwise
+
+import numpy as np
+
+from densify.street.materials import Material
+from densify.street.mesh import Mesh, Tint, ball, box, boxes, frustum, tube
+from densify.street.motion import Driving, Limb, Towed
+from densify.street.world import Body
+from densify.types import Float
+
+CAR_WHEELBASE_M = 2.6
+TRACTOR_WHEELBASE_M = 3.4
+TRAILER_WHEELBASE_M = 8.0
+BICYCLE_WHEELBASE_M = 1.05
+WALKER_BASE_M = 0.2
+_KINGPIN_M = -1.2
+_PAINTS: tuple[Tint, ...] = (
+    (0.92, 0.92, 0.92), (0.62, 0.64, 0.66), (0.14, 0.14, 0.16), (0.62, 0.10, 0.09),
+    (0.12, 0.24, 0.52), (0.30, 0.33, 0.36), (0.20, 0.36, 0.30), (0.78, 0.66, 0.36),
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Actor:
+    """One object: its bodies and which of them count for collisions."""
+
+    name: str
+    bodies: tuple[Body, ...]
+    num_solid: int = 1
+
+
+def any_paint(rng: np.random.Generator) -> Tint:
+    return _PAINTS[int(rng.integers(len(_PAINTS)))]
+
+
+def any_cloth(rng: np.random.Generator) -> Tint:
+    r, g, b = colorsys.hsv_to_rgb(rng.random(), rng.uniform(0.2, 0.8), rng.uniform(0.25, 0.85))
+    return (r, g, b)
+
+
+def _wheel(x: float, y: float, radius: float, width: float) -> Mesh:
+    tyre = tube((x, y - width / 2, radius), (x, y + width / 2, radius), radius, Material.RUBBER,
+                num_sides=16)  # fmt: skip
+    rim = tube((x, y - width / 2 - 0.01, radius), (x, y + width / 2 + 0.01, radius), radius * 0.6,
+               Material.METAL, num_sides=12)  # fmt: skip
+    return Mesh.join([tyre, rim])
+
+
+def _both_sides(left: Float, material: Material, tint: Tint = (1.0, 1.0, 1.0)) -> Mesh:
+    """(K,4,3) quads on the left and their mirror images on the right."""
+    right = left * [1.0, -1.0, 1.0]
+    return Mesh.quads(np.concatenate([left, right]), material, tint)
+
+
+def _across(profile: Sequence[tuple[float, float, float]], material: Material, tint: Tint) -> Mesh:
+    """A sheet across the car through (x, z, half width) lines."""
+    p = np.array(profile)
+    left = np.column_stack([p[:, 0], p[:, 2], p[:, 1]])
+    right = left * [1.0, -1.0, 1.0]
+    corners = np.stack([right[:-1], right[1:], left[1:], left[:-1]], axis=1)
+    return Mesh.quads(corners, material, tint)
+
+
+def car_mesh(paint: Tint, rng: np.random.Generator) -> Mesh:
+    """A saloon or estate, 4.2 to 4.7 m long: shell, glass with an interior behind it, wheels."""
+    estate = bool(rng.random() < 0.4)
+    front, rear = 2.15 + rng.uniform(0.0, 0.2), -2.05 - rng.uniform(0.0, 0.2)
+    wide, roof, belt = 0.88, 1.44 + rng.uniform(-0.03, 0.16) * estate, 0.92
+    top = 0.64  # half width of the roof
+    cowl, screen, rear_roof = 1.05, 0.35, rear + (0.45 if estate else 0.95)
+    deck = rear + (0.08 if estate else 0.45)
+    # side panels between the sill and the shoulder line
+    line = [(rear, 0.62), (rear + 0.03, belt), (deck, belt), (cowl, belt), (front - 0.12, 0.74),
+            (front, 0.60)]  # fmt: skip
+    sill = [0.30, 0.24, 0.22, 0.22, 0.26, 0.30]
+    side = [
+        [(x0, wide, s0), (x1, wide, s1), (x1, wide, z1), (x0, wide, z0)]
+        for (x0, z0), (x1, z1), s0, s1 in zip(line[:-1], line[1:], sill[:-1], sill[1:], strict=True)
+    ]
+    shell = [
+        _both_sides(np.array(side), Material.BODYWORK, paint),
+        _across([(front - 0.02, 0.28, wide), (front, 0.60, wide), (front - 0.12, 0.74, wide),
+                 (cowl, belt, wide)], Material.BODYWORK, paint),
+        _across([(deck, belt, wide), (rear + 0.03, belt, wide), (rear, 0.62, wide),
+                 (rear + 0.02, 0.28, wide)], Material.BODYWORK, paint),
+        _across([(rear_roof, roof, top), (screen, roof + 0.01, top)], Material.BODYWORK, paint),
+        _across([(front - 0.02, 0.24, wide), (rear, 0.24, wide)], Material.RUBBER, (1, 1, 1)),
+    ]  # fmt: skip
+    # pillars and glass between shoulder line and roof
+    middle = -0.30
+    base = [(deck, belt), (middle - 0.05, belt), (middle + 0.05, belt), (cowl, belt)]
+    head = [(rear_roof, roof), (middle - 0.05, roof), (middle + 0.05, roof), (screen, roof)]
+    low = [np.array([x, wide, z]) for x, z in base]
+    high = [np.array([x, top, z]) for x, z in head]
+    for i, (a, b) in enumerate(((0, 1), (2, 3))):
+        inset = 0.13 if i == 0 else 0.10
+        l0, l1 = low[a] + (low[b] - low[a]) * inset, low[b]
+        h0, h1 = high[a] + (high[b] - high[a]) * inset, high[b]
+        if i == 1:
+            l0, l1 = low[a], low[b] - (low[b] - low[a]) * inset
+            h0, h1 = high[a], high[b] - (high[b] - high[a]) * inset
+        shell.append(_both_sides(np.array([[l0, l1, h1, h0]]), Material.GLASS))
+    pillars = [
+        [low[0], low[0] + (low[1] - low[0]) * 0.13, high[0] + (high[1] - high[0]) * 0.13, high[0]],
+        [low[1], low[2], high[2], high[1]],
+        [low[3] - (low[3] - low[2]) * 0.10, low[3], high[3],
+         high[3] - (high[3] - high[2]) * 0.10],
+    ]  # fmt: skip
+    shell.append(_both_sides(np.array(pillars), Material.BODYWORK, paint))
+    shell.append(_across([(cowl, belt, wide), (screen, roof, top)], Material.GLASS, (1, 1, 1)))
+    shell.append(_across([(rear_roof, roof, top), (deck, belt, wide)], Material.GLASS, (1, 1, 1)))
+    return Mesh.join([*shell, _inside_and_wheels(), *_lights(front, rear, wide)])
+
+
+@lru_cache(maxsize=1)
+def _inside_and_wheels() -> Mesh:
+    seats = [
+        part
+        for x in (0.05, -0.95)
+        for y in (-0.38, 0.38)
+        for part in (
+            ((x - 0.25, y - 0.25, 0.35), (x + 0.25, y + 0.25, 0.58)),
+            ((x - 0.35, y - 0.25, 0.35), (x - 0.22, y + 0.25, 1.12)),
+        )
+    ]
+    dashboard = ((0.65, -0.8, 0.5), (1.0, 0.8, 0.90))
+    driver = [
+        frustum((-0.2, 0.18, 0.55), (0.1, 0.58, 1.10), Material.CLOTH, (0.3, 0.3, 0.4), (0.8, 0.7)),
+        ball((-0.05, 0.38, 1.22), (0.10, 0.09, 0.12), Material.SKIN),
+    ]
+    half = CAR_WHEELBASE_M / 2
+    wheels = [_wheel(x, y, 0.32, 0.2) for x in (-half, half) for y in (-0.79, 0.79)]
+    return Mesh.join([boxes([*seats, dashboard], Material.UPHOLSTERY), *driver, *wheels])
+
+
+def _lights(front: float, rear: float, wide: float) -> list[Mesh]:
+    sides = (-wide + 0.05, wide - 0.40)
+    lamps = [
+        boxes([((front - 0.2, y, 0.52), (front + 0.01, y + 0.35, 0.66)) for y in sides],
+              Material.LAMP),
+        boxes([((rear - 0.01, y, 0.64), (rear + 0.1, y + 0.35, 0.80)) for y in sides],
+              Material.LAMP, (0.7, 0.08, 0.06)),
+    ]  # fmt: skip
+    plate = box((rear - 0.015, -0.26, 0.42), (rear + 0.1, 0.26, 0.53), Material.PAINT)
+    return [*lamps, plate]
+
+
+def car(motion: Driving, instance: int, rng: np.random.Generator) -> Actor:
+    return Actor("car", (Body(car_mesh(any_paint(rng), rng), motion, instance),))
+
+
+def truck(
+    motion: Driving, span_s: tuple[float, float], instance: int, rng: np.random.Generator
+) -> Actor:
+    """A 16 m articulated truck: the trailer follows the tractor through turns."""
+    paint, tarpaulin = any_paint(rng), any_cloth(rng)
+    front = TRACTOR_WHEELBASE_M / 2 + 1.3
+    cab = [
+        box((front - 2.2, -1.22, 0.55), (front, 1.22, 1.75), Material.BODYWORK, paint),
+        frustum((front - 2.2, -1.22, 2.6), (front - 0.15, 1.22, 3.5), Material.BODYWORK, paint,
+                (0.85, 0.9)),
+        box((front - 2.2, -1.22, 1.75), (front - 0.9, 1.22, 2.6), Material.BODYWORK, paint),
+        Mesh.quads(
+            np.array([
+                [(front, -1.2, 1.75), (front, 1.2, 1.75), (front - 0.15, 1.2, 2.6),
+                 (front - 0.15, -1.2, 2.6)],
+                [(front - 0.9, 1.2, 1.75), (front, 1.2, 1.75), (front - 0.15, 1.2, 2.6),
+                 (front - 0.9, 1.2, 2.6)],
+                [(front - 0.9, -1.2, 1.75), (front, -1.2, 1.75), (front - 0.15, -1.2, 2.6),
+                 (front - 0.9, -1.2, 2.6)],
+            ]),
+            Material.GLASS,
+        ),
+        box((-3.0, -0.5, 0.7), (front - 2.2, 0.5, 1.05), Material.METAL),
+        *(box((front - 0.05, y - 0.25, 0.7), (front + 0.02, y + 0.25, 0.95), Material.LAMP)
+          for y in (-0.9, 0.9)),
+    ]  # fmt: skip
+    half = TRACTOR_WHEELBASE_M / 2
+    cab += [_wheel(x, y, 0.5, 0.32) for x in (-half, half) for y in (-1.05, 1.05)]
+    trailer_half = TRAILER_WHEELBASE_M / 2
+    load = [
+        box((-trailer_half - 3.7, -1.25, 1.2), (trailer_half + 1.0, 1.25, 3.9), Material.CLOTH,
+            tarpaulin),
+        box((-trailer_half - 3.7, -0.5, 0.9), (trailer_half + 0.5, 0.5, 1.2), Material.METAL),
+        *(box((-trailer_half - 3.75, y - 0.2, 0.95), (-trailer_half - 3.6, y + 0.2, 1.15),
+              Material.LAMP, (0.7, 0.1, 0.1)) for y in (-1.0, 1.0)),
+    ]  # fmt: skip
+    axles = (-trailer_half - 1.3, -trailer_half, -trailer_half + 1.3)
+    load += [_wheel(x, y, 0.5, 0.32) for x in axles for y in (-1.05, 1.05)]
+    towed = Towed(motion, _KINGPIN_M, TRAILER_WHEELBASE_M, *span_s)
+    bodies = (Body(Mesh.join(cab), motion, instance), Body(Mesh.join(load), towed, instance))
+    return Actor("truck", bodies, num_solid=2)
+
+
+def _leg(length: float, radius: float, cloth: Tint) -> Mesh:
+    """Hangs from its hinge at the origin."""
+    return Mesh.join(
+        [
+            tube((0, 0, 0.02), (0, 0, -length), (radius, radius * 0.6), Material.CLOTH, cloth),
+            box((-0.08, -0.05, -length - 0.04), (0.18, 0.05, -length + 0.04), Material.RUBBER),
+        ]
+    )
+
+
+def _arm(cloth: Tint) -> Mesh:
+    return Mesh.join(
+        [
+            tube((0, 0, 0.02), (0.04, 0, -0.52), (0.055, 0.04), Material.CLOTH, cloth),
+            ball((0.05, 0, -0.60), (0.05, 0.04, 0.07), Material.SKIN),
+        ]
+    )
+
+
+def _upper_body(hip_m: float, cloth: Tint, hair: Tint) -> list[Mesh]:
+    return [
+        frustum((-0.12, -0.17, hip_m - 0.05), (0.12, 0.17, hip_m + 0.55), Material.CLOTH, cloth,
+                (1.0, 1.25)),
+        tube((0, 0, hip_m + 0.53), (0.01, 0, hip_m + 0.66), 0.055, Material.SKIN),
+        ball((0.02, 0, hip_m + 0.75), (0.10, 0.08, 0.12), Material.SKIN),
+        ball((0.0, 0, hip_m + 0.79), (0.105, 0.09, 0.10), Material.CLOTH, hair),
+    ]  # fmt: skip
+
+
+def walker(motion: Driving, instance: int, rng: np.random.Generator) -> Actor:
+    """A pedestrian: a trunk with two legs and two arms that swing in step."""
+    hip, cloth, trousers = 0.90 + rng.uniform(-0.06, 0.05), any_cloth(rng), any_cloth(rng)
+    hair = (0.25 * rng.random(), 0.18 * rng.random(), 0.1 * rng.random())
+    swing, stride = 0.50, 1.45
+    bodies = [Body(Mesh.join(_upper_body(hip, cloth, hair)), motion, instance)]
+    for side, phase in ((1, 0.0), (-1, np.pi)):
+        leg = Limb(motion, (0.0, 0.10 * side, hip), swing, stride, phase)
+        arm = Limb(motion, (0.0, 0.25 * side, hip + 0.50), 0.8 * swing, stride, phase + np.pi)
+        bodies.append(Body(_leg(hip - 0.06, 0.085, trousers), leg, instance))
+        bodies.append(Body(_arm(cloth), arm, instance))
+    return Actor("walker", tuple(bodies))
+
+
+def cyclist(motion: Driving, instance: int, rng: np.random.Generator) -> Actor:
+    """A bicycle with its rider, whose legs pedal."""
+    half, paint, cloth = BICYCLE_WHEELBASE_M / 2, any_cloth(rng), any_cloth(rng)
+    parts = []
+    for x in (-half, half):
+        angle = np.linspace(0, 2 * np.pi, 17)
+        rim = np.stack(
+            [x + 0.33 * np.cos(angle), np.zeros(17), 0.34 + 0.33 * np.sin(angle)], axis=1
+        )
+        parts += [tube(a, b, 0.022, Material.RUBBER, num_sides=4)
+                  for a, b in pairwise(rim)]  # fmt: skip
+        parts += [
+            tube(rim[i], rim[i + 8], 0.006, Material.METAL, num_sides=4) for i in range(0, 8, 2)
+        ]
+    seat, crank, head, bar = (-0.22, 0, 0.92), (-0.08, 0, 0.34), (0.36, 0, 0.86), (0.34, 0, 1.02)
+    hub_rear, hub_front = (-half, 0, 0.34), (half, 0, 0.34)
+    for a, b in ((seat, crank), (crank, head), (seat, head), (seat, hub_rear), (crank, hub_rear),
+                 (hub_front, bar)):  # fmt: skip
+        parts.append(tube(a, b, 0.02, Material.METAL, paint))
+    parts.append(tube((0.34, -0.28, 1.02), (0.34, 0.28, 1.02), 0.018, Material.METAL))
+    parts.append(tube((-0.20, 0, 0.94), (0.08, 0, 1.42), (0.15, 0.19), Material.CLOTH, cloth))
+    parts.append(ball((0.20, 0, 1.60), (0.10, 0.085, 0.12), Material.SKIN))
+    parts.append(ball((0.18, 0, 1.65), (0.12, 0.10, 0.10), Material.CLOTH, any_cloth(rng)))
+    for y in (-0.2, 0.2):
+        parts.append(tube((0.06, y, 1.38), (0.33, y * 1.2, 1.04), 0.045, Material.CLOTH, cloth))
+    bodies = [Body(Mesh.join(parts), motion, instance)]
+    for side, phase in ((1, 0.0), (-1, np.pi)):
+        leg = Limb(motion, (-0.16, 0.1 * side, 0.95), 0.35, 5.0, phase)
+        bodies.append(Body(_leg(0.68, 0.08, any_cloth(rng)), leg, instance))
+    return Actor("cyclist", tuple(bodies))

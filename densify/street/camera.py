@@ -1,0 +1,146 @@
+# SPDX-License-Identifier: MIT
+"""The two cameras: how they sit, and pictures with exact depth by casting one ray a pixel."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from densify.poses import inverse
+from densify.street.lidar import LIDAR_HEIGHT_M
+from densify.street.materials import (
+    COLOUR,
+    GLASS_PASSES,
+    NOTHING_PASSES,
+    Material,
+    shade_factor,
+    smooth_noise,
+)
+from densify.street.motion import Driving
+from densify.street.world import Hits, Rays, World
+from densify.types import Bool, Camera, Float, Float32
+
+MAX_DEPTH_M = 120.0
+# how KITTI's cameras sit: axes turned, a little off true, below and before the scanner
+_AXES = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
+_TILT = Rotation.from_rotvec([0.008, -0.012, 0.007]).as_matrix()
+T_RECTIFIED_LIDAR = np.eye(4)
+T_RECTIFIED_LIDAR[:3, :3] = _TILT @ _AXES
+T_RECTIFIED_LIDAR[:3, 3] = [-0.004, -0.076, -0.272]
+FOCAL_PX, CENTRE_PX = 721.5, (609.5, 172.75)
+# metres to the right of the rectified origin, nanoseconds after the sweep's reference time
+_LEFT, _RIGHT = -0.06, 0.48
+DELAY_NS = {"image_02": 0, "image_03": 15_000_000}
+_SUN = np.array([-0.45, 0.55, 0.70]) / np.linalg.norm([-0.45, 0.55, 0.70])
+
+
+def _camera(name: str, right_m: float) -> Camera:
+    T_cam_lidar = T_RECTIFIED_LIDAR.copy()
+    T_cam_lidar[0, 3] -= right_m
+    K = np.array([[FOCAL_PX, 0, CENTRE_PX[0]], [0, FOCAL_PX, CENTRE_PX[1]], [0, 0, 1.0]])
+    return Camera(name, 1242, 375, K, T_cam_lidar)
+
+
+CAMERAS = {"image_02": _camera("image_02", _LEFT), "image_03": _camera("image_03", _RIGHT)}
+
+
+@dataclass(frozen=True)
+class Picture:
+    """One exposure; (H,W) everywhere. image: (H,W,3) uint8 RGB. depth_m: float32 camera z of the
+    nearest surface, 0 where there is none within 120 m or where it is glass (which has two).
+    body: int32 index of the body seen, -1 sky."""
+
+    image: NDArray[np.uint8]
+    depth_m: Float32
+    body: NDArray[np.int32]
+
+
+def T_world_lidar(ego: Driving, time_s: float) -> Float:
+    """(4,4) pose of the (first) scanner."""
+    T_world_ego = ego.poses(np.array([time_s])).matrix()
+    T_ego_lidar = np.eye(4)
+    T_ego_lidar[2, 3] = LIDAR_HEIGHT_M
+    return T_world_ego @ T_ego_lidar
+
+
+def expose(world: World, ego: Driving, camera: Camera, time_s: float) -> Picture:
+    """Global shutter: every pixel at the same time."""
+    h, w = camera.height_px, camera.width_px
+    v, u = np.divmod(np.arange(h * w, dtype=np.float64), w)
+    ray = np.stack([u, v, np.ones_like(u)], axis=1) @ np.linalg.inv(camera.K).T
+    ray /= np.linalg.norm(ray, axis=1, keepdims=True)
+    T_world_cam = T_world_lidar(ego, time_s) @ inverse(camera.T_cam_lidar)
+    n = len(u)
+    rays = Rays(
+        np.tile(T_world_cam[:3, 3], (n, 1)), ray @ T_world_cam[:3, :3].T, np.full(n, time_s)
+    )
+    hits = world.cast(rays, NOTHING_PASSES, np.zeros(n))
+    colour = _colours(world, rays, hits)
+    glass = np.flatnonzero(_is_glass(world, hits))
+    if len(glass):
+        through = Rays(*(column[glass] for column in rays))
+        behind = world.cast(through, GLASS_PASSES, np.zeros(len(glass)))
+        colour[glass] = 0.07 * _sky(through.direction) + 0.6 * _colours(world, through, behind)
+    z = hits.range_m * ray[:, 2]
+    solid = np.isfinite(z) & (z <= MAX_DEPTH_M) & ~_is_glass(world, hits)
+    body = np.where(hits.triangle >= 0, world.body[hits.triangle], -1)
+    encoded = np.rint(255 * np.clip(colour, 0, 1) ** (1 / 2.2)).astype(np.uint8)
+    return Picture(
+        encoded.reshape(h, w, 3),
+        np.where(solid, z, 0.0).astype(np.float32).reshape(h, w),
+        body.astype(np.int32).reshape(h, w),
+    )
+
+
+def _is_glass(world: World, hits: Hits) -> Bool:
+    is_glass: Bool = (hits.triangle >= 0) & (world.material[hits.triangle] == Material.GLASS)
+    return is_glass
+
+
+def _colours(world: World, rays: Rays, hits: Hits) -> Float:
+    """(N,3) linear light: sun with shadows, sky light from above, haze."""
+    colour = _sky(rays.direction)
+    rows = np.flatnonzero(hits.triangle >= 0)
+    triangle = hits.triangle[rows]
+    material = world.material[triangle]
+    a, b = hits.barycentric[rows, 0, None], hits.barycentric[rows, 1, None]
+    uv = world.uv[triangle]
+    at = uv[:, 0] * (1 - a - b) + uv[:, 1] * a + uv[:, 2] * b
+    painted = COLOUR[material] * world.tint[triangle] * shade_factor(material, at)[:, None]
+    direction = rays.direction[rows]
+    normal = hits.normal[rows]
+    facing = np.einsum("ni,ni->n", normal, direction)
+    normal = np.where(facing[:, None] > 0, -normal, normal)
+    towards_sun = normal @ _SUN
+    leafy = material == Material.LEAF  # light shines through leaves too
+    towards_sun = np.where(leafy, 0.35 + 0.4 * np.abs(towards_sun), np.maximum(towards_sun, 0.0))
+    sunny = np.flatnonzero(towards_sun > 0)
+    point = rays.origin[rows] + direction * hits.range_m[rows, None] + 0.015 * normal
+    shadow_rays = Rays(point[sunny], np.tile(_SUN, (len(sunny), 1)), rays.time_s[rows[sunny]])
+    lit = np.zeros(len(rows))
+    lit[sunny] = world.is_lit(shadow_rays)
+    sun = 1.15 * (lit * towards_sun)[:, None] * np.array([1.0, 0.95, 0.86])
+    ambient = (0.34 + 0.16 * normal[:, 2:]) * np.array([0.88, 0.95, 1.08])
+    light = np.clip(painted, 0, 1) ** 2.2 * (sun + ambient)
+    shiny = np.isin(material, (Material.PANE, Material.BODYWORK))
+    mirrored = direction - 2 * np.einsum("ni,ni->n", direction, normal)[:, None] * normal
+    gloss = np.where(shiny, np.where(material == Material.PANE, 0.25, 0.06), 0.0)
+    light = light + gloss[:, None] * _sky(mirrored)
+    haze = np.exp(-hits.range_m[rows, None] / 700.0)
+    colour[rows] = light * haze + (1 - haze) * np.array([0.62, 0.72, 0.82])
+    return colour
+
+
+def _sky(direction: Float) -> Float:
+    """(N,3) directions -> (N,3) linear colour: paler towards the horizon, a few soft clouds."""
+    up = np.clip(direction[:, 2], 0.0, 1.0)[:, None]
+    blue = np.array([0.72, 0.80, 0.88]) * (1 - up) ** 3 + np.array([0.20, 0.38, 0.72]) * (
+        1 - (1 - up) ** 3
+    )
+    flat = direction[:, :2] / (direction[:, 2:] + 0.12).clip(0.05) * 3.0
+    cloud = sum(smooth_noise(flat + 7 * i, 0.5**i) / 2**i for i in range(3)) / 1.75
+    cover = np.clip((cloud - 0.52) * 4.0, 0, 0.8)[:, None] * np.clip(up * 12, 0, 1)
+    return blue * (1 - cover) + 0.92 * cover

@@ -1,0 +1,161 @@
+# SPDX-License-Identifier: MIT
+"""What every scene shares: a cast of traffic put on lanes so that it meets around the ego vehicle
+at frame 120 and touches nothing at any time.
+
+Time zero is frame 0's. Traffic that would touch anything is drawn again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from densify.street.actors import (
+    BICYCLE_WHEELBASE_M,
+    CAR_WHEELBASE_M,
+    TRACTOR_WHEELBASE_M,
+    WALKER_BASE_M,
+    Actor,
+    car,
+    cyclist,
+    truck,
+    walker,
+)
+from densify.street.curves import Curve, Lane, Speed
+from densify.street.footprints import Rectangles, overlap, tracks
+from densify.street.materials import Material
+from densify.street.mesh import Mesh, box
+from densify.street.motion import Driving, Still
+from densify.street.scenery import Scenery
+from densify.street.sensors import PERIOD_NS
+from densify.street.terrain import Ground
+from densify.street.world import Body, World
+
+NUM_FRAMES = 160
+MEETING_S = 12.0  # when the cast is around the ego vehicle
+SPAN_S = (-1.0, NUM_FRAMES * PERIOD_NS * 1e-9 + 1.0)  # in which poses are asked for
+FIRST_PARKED = 1000  # instances of parked cars count from here
+PAVEMENT_M = 3.3
+_TRIES = 40
+_NEAR_M = 25.0  # no two centres of things that touch are farther apart
+EGO_BOX = box((-2.1, -0.95, 0.2), (2.4, 0.95, 1.5), Material.BODYWORK)
+
+Recipe = Callable[[np.random.Generator], Actor]
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A world and who moves in it. footprints: of the scenery that stands in the way."""
+
+    world: World
+    ground: Ground
+    ego: Driving
+    actors: tuple[Actor, ...]
+    footprints: Rectangles
+
+
+class Traffic:
+    """Adds actors that touch nothing and nobody at any time."""
+
+    def __init__(self, ego: Driving, scenery: Scenery, rng: np.random.Generator) -> None:
+        self.actors: list[Actor] = []
+        self._rng = rng
+        self._times = np.arange(SPAN_S[0], SPAN_S[1], 0.1)
+        self._standing = Rectangles.stack(scenery.footprints)
+        self._moving = [Rectangles.moving(EGO_BOX, ego, self._times, 0.2)]
+
+    def add(self, recipe: Recipe) -> None:
+        """recipe: draws an actor; drawn again until one fits, and left out if none does."""
+        for _ in range(_TRIES):
+            actor = recipe(self._rng)
+            new = tracks(actor, self._times)
+            if not any(self._meets(track) for track in new):
+                self.actors.append(actor)
+                self._moving += new
+                return
+
+    def _meets(self, track: Rectangles) -> bool:
+        if any(overlap(track, other).any() for other in self._moving):
+            return True
+        away = self._standing.centre - track.centre[:, None]
+        time, which = np.nonzero((away**2).sum(axis=-1) < _NEAR_M**2)
+        return bool(overlap(track[time], self._standing[which]).any())
+
+    @property
+    def next_instance(self) -> int:
+        return len(self.actors)
+
+
+@dataclass(frozen=True)
+class Ways:
+    """Puts actors on lanes, abreast of a station of the road at the meeting time."""
+
+    ground: Ground
+    traffic: Traffic
+
+    def _driving(self, lane: Lane, station_m: float, speed: Speed, wheelbase_m: float) -> Driving:
+        at = lane.at(station_m)
+        return Driving(lane.curve, speed, at, MEETING_S, self.ground.terrain, wheelbase_m)
+
+    def car(self, lane: Lane, station_m: float, speed: Speed, slack_m: float = 2.0) -> None:
+        def recipe(rng: np.random.Generator) -> Actor:
+            at = station_m + rng.uniform(-slack_m, slack_m)
+            way = self._driving(lane, at, speed, CAR_WHEELBASE_M)
+            return car(way, self.traffic.next_instance, rng)
+
+        self.traffic.add(recipe)
+
+    def truck(self, lane: Lane, station_m: float, speed: Speed) -> None:
+        def recipe(rng: np.random.Generator) -> Actor:
+            at = station_m + rng.uniform(-1.0, 1.0)
+            way = self._driving(lane, at, speed, TRACTOR_WHEELBASE_M)
+            return truck(way, SPAN_S, self.traffic.next_instance, rng)
+
+        self.traffic.add(recipe)
+
+    def cyclist(self, lane: Lane, station_m: float, speed_m_s: float) -> None:
+        def recipe(rng: np.random.Generator) -> Actor:
+            at, v = station_m + rng.uniform(-1.0, 1.0), speed_m_s + rng.uniform(-0.3, 0.3)
+            way = self._driving(lane, at, Speed((0.0, v)), BICYCLE_WHEELBASE_M)
+            return cyclist(way, self.traffic.next_instance, rng)
+
+        self.traffic.add(recipe)
+
+    def walker(
+        self, road: Curve, offset_m: tuple[float, float], forward: bool, station_m: float,
+        slack_m: float = 4.0,
+    ) -> None:  # fmt: skip
+        """Along a road or another line, somewhere between two offsets to its left; on and off the
+        kerb where the way leads over it."""
+
+        def recipe(rng: np.random.Generator) -> Actor:
+            lane = Lane(road, rng.uniform(*offset_m), forward)
+            at = lane.at(station_m + rng.uniform(-slack_m, slack_m))
+            from_kerb = self.ground.distance(lane.curve(lane.curve.knots_m))
+            lift_m = self.ground.kerb_m * np.clip(from_kerb / 0.25, 0, 1)
+            speed = Speed((0.0, rng.uniform(1.1, 1.6)))
+            way = Driving(lane.curve, speed, at, MEETING_S, self.ground.terrain, WALKER_BASE_M,
+                          (lane.curve.knots_m, lift_m), upright=True)  # fmt: skip
+            return walker(way, self.traffic.next_instance, rng)
+
+        self.traffic.add(recipe)
+
+
+def assemble(scenery: Scenery, parts: Sequence[Mesh], ego: Driving, traffic: Traffic) -> Scene:
+    """All that stands in one body, and the bodies of all that moves."""
+    static = Body(Mesh.join([*parts, *scenery.meshes]), Still())
+    bodies = [static, *(body for actor in traffic.actors for body in actor.bodies)]
+    return Scene(
+        World(bodies),
+        scenery.ground,
+        ego,
+        tuple(traffic.actors),
+        Rectangles.stack(scenery.footprints),
+    )
+
+
+def jitter(rng: np.random.Generator, share: float = 0.15) -> float:
+    """A factor about 1."""
+    return float(rng.uniform(1 - share, 1 + share))

@@ -1,0 +1,80 @@
+# SPDX-License-Identifier: MIT
+"""Rectangles on the ground: what stands or drives where, and whether they touch."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from densify.street.actors import Actor
+from densify.street.mesh import Mesh
+from densify.street.motion import Trajectory
+from densify.types import Bool, Float, Int
+
+
+@dataclass(frozen=True)
+class Rectangles:
+    """Any number of rectangles. centre: (...,2). forward: (...,2) of length 1. half_m: (...,2)
+    half length and half width."""
+
+    centre: Float
+    forward: Float
+    half_m: Float
+
+    @staticmethod
+    def standing(mesh: Mesh, xy: Float, heading: float, slack_m: float = 0.0) -> Rectangles:
+        """One rectangle, that of a mesh put there."""
+        low, high = mesh.bounds
+        forward = np.array([np.cos(heading), np.sin(heading)])
+        middle = (low + high)[:2] / 2
+        centre = xy + middle[0] * forward + middle[1] * _left(forward)
+        return Rectangles(centre, forward, (high - low)[:2] / 2 + slack_m)
+
+    @staticmethod
+    def moving(mesh: Mesh, way: Trajectory, times_s: Float, slack_m: float = 0.0) -> Rectangles:
+        """(T,) rectangles, that of a mesh at T times."""
+        low, high = mesh.bounds
+        n = len(times_s)
+        poses = way.poses(times_s)
+        middle = np.append((low + high)[:2] / 2, 0.0)
+        centre = poses.apply(np.broadcast_to(middle, (n, 3)))[:, :2]
+        forward = poses.rotation[:, :2, 0]
+        forward = forward / np.linalg.norm(forward, axis=1, keepdims=True)
+        half = np.broadcast_to((high - low)[:2] / 2 + slack_m, (n, 2))
+        return Rectangles(centre, forward, half)
+
+    @staticmethod
+    def stack(single: Sequence[Rectangles]) -> Rectangles:
+        """(S,) rectangles from S single ones."""
+        columns = ((r.centre, r.forward, r.half_m) for r in single)
+        return Rectangles(*(np.array(c).reshape(-1, 2) for c in zip(*columns, strict=True)))
+
+    def __getitem__(self, rows: Int) -> Rectangles:
+        return Rectangles(self.centre[rows], self.forward[rows], self.half_m[rows])
+
+
+def overlap(a: Rectangles, b: Rectangles) -> Bool:
+    """Which of them touch, shapes broadcast against each other (separating axes)."""
+    away = b.centre - a.centre
+    apart = np.zeros(away.shape[:-1], bool)
+    for p, q in ((a, b), (b, a)):
+        for side, axis in enumerate((p.forward, _left(p.forward))):
+            reach = p.half_m[..., side] + q.half_m[..., 0] * np.abs((axis * q.forward).sum(-1))
+            reach = reach + q.half_m[..., 1] * np.abs((axis * _left(q.forward)).sum(-1))
+            apart |= np.abs((axis * away).sum(-1)) > reach
+    return ~apart
+
+
+def tracks(actor: Actor, times_s: Float) -> list[Rectangles]:
+    """(T,) rectangles of each solid body of an actor; swinging limbs get room."""
+    slack_m = 0.3 if len(actor.bodies) > actor.num_solid else 0.1
+    return [
+        Rectangles.moving(b.mesh, b.trajectory, times_s, slack_m)
+        for b in actor.bodies[: actor.num_solid]
+    ]
+
+
+def _left(forward: Float) -> Float:
+    return np.stack([-forward[..., 1], forward[..., 0]], axis=-1)

@@ -1,0 +1,87 @@
+# SPDX-License-Identifier: MIT
+"""``street:highway``: three lanes each way; the ego vehicle drives 25 m/s, others come with 30."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from densify.street.casting import MEETING_S, Scene, Traffic, Ways, assemble, jitter
+from densify.street.curves import Curve, Lane, Speed
+from densify.street.motion import Driving
+from densify.street.roadside import Side, mark_lanes
+from densify.street.scenery import Scenery, guard_rail, hedge, noise_barrier, tree
+from densify.street.terrain import Ground, Road, Terrain
+from densify.types import Float
+
+_LANE_M = 3.6
+_MEDIAN_M = 1.6
+
+
+def highway(rng: np.random.Generator) -> Scene:
+    """Three lanes each way; the ego vehicle drives 25 m/s, others come with 30 m/s."""
+    start_m = 240.0
+    bend, phase = jitter(rng, 0.4) / 1100.0, rng.uniform(0, 2 * np.pi)
+
+    def curvature(station: Float) -> Float:
+        return bend * np.sin(station / 160.0 + phase)
+
+    main = Curve.bending(1100.0, curvature, start_m)
+    half = _MEDIAN_M + 3 * _LANE_M + 2.6  # with the hard shoulder
+    road = Road(main, half, half)
+    ground = Ground(Terrain.hilly(rng, 0.04, 2.5), (road,), 0.0, 0.0)
+    scenery = Scenery(ground, rng)
+    _dress_highway(scenery, road)
+    lines = [_MEDIAN_M + _LANE_M * i for i in range(4)]
+    spans = [(0.0, 1090.0)]
+    parts = [
+        ground.mesh(24.0, 2.0),
+        mark_lanes(ground, road, [o * s for o in lines[1:3] for s in (1, -1)], (), spans),
+        mark_lanes(ground, road, (), [o * s for o in lines[::3] for s in (1, -1)], spans),
+    ]
+    lanes = [Lane(main, -_MEDIAN_M - _LANE_M * (i + 0.5)) for i in range(3)]
+    back = [Lane(main, _MEDIAN_M + _LANE_M * (i + 0.5), forward=False) for i in range(3)]
+    fast, middle, slow = lanes
+    at_zero = middle.at(start_m)
+    ego = Driving(middle.curve, Speed((0.0, 25.0)), at_zero, 0.0, ground.terrain, 2.7)
+    traffic = Traffic(ego, scenery, rng)
+    ways = Ways(ground, traffic)
+    here = start_m + 25.0 * MEETING_S
+    ways.truck(slow, here + 26.0, Speed((0.0, 22.0)))
+    ways.car(fast, here + 14.0, Speed((0.0, 31.0 * jitter(rng, 0.03))))
+    ways.car(middle, here + 32.0, Speed((-1.0, 26.5), (10.5, 26.5), (14.0, 22.0)))
+    ways.car(slow, here - 30.0, Speed((0.0, 23.0)))
+    ways.car(fast, here - 55.0, Speed((0.0, 29.0)), 8.0)
+    ways.car(slow, here + 62.0, Speed((0.0, 23.0)), 4.0)
+    ways.car(fast, here + 75.0, Speed((0.0, 30.0)), 6.0)
+    ways.truck(back[2], here + 28.0, Speed((0.0, 24.0)))
+    for lane, first, speed in ((0, 18.0, 33.0), (1, 34.0, 30.0), (2, 60.0, 27.0)):
+        for k in range(-9, 7):
+            gap = 62.0 * jitter(rng, 0.2)
+            ways.car(back[lane], here + first + k * gap, Speed((0.0, speed)), 6.0)
+    return assemble(scenery, parts, ego, traffic)
+
+
+def _dress_highway(scenery: Scenery, road: Road) -> None:
+    rng = scenery.rng
+    end = road.curve.length_m - 20
+    for station in np.arange(10.0, end, 4.0):
+        for side, beyond in (
+            (1, 0.7),
+            (-1, 0.7),
+            (1, -road.left_m + 0.5),
+            (-1, -road.right_m + 0.5),
+        ):
+            at = Side(road, side, 0.0, end)
+            scenery.put(guard_rail(4.0), at.at(station, beyond), at.heading(station))
+    quiet = rng.uniform(150, 260), rng.uniform(560, 640)
+    for side in (1, -1):
+        edge = Side(road, side, 0.0, end)
+        for station in np.arange(10.0, end, 4.0):
+            if side > 0 and quiet[0] < station < quiet[1]:
+                scenery.put(noise_barrier(4.0), edge.at(station, 5.0), edge.heading(station))
+            elif rng.random() < 0.16:
+                shoot, foot = tree(rng)
+                scenery.put(shoot, edge.at(station, rng.uniform(5.5, 22.0)), solid=foot)
+            elif rng.random() < 0.2:
+                bush = hedge(rng, float(rng.uniform(0.8, 1.8)))(rng.uniform(2.0, 4.0))
+                scenery.put(bush, edge.at(station, rng.uniform(3.5, 9.0)), edge.heading(station))

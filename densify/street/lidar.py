@@ -1,0 +1,125 @@
+# SPDX-License-Identifier: MIT
+"""One revolution of a scanner through the world: what comes back, where and when."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from densify.street.materials import LASER_PASSES, REFLECTIVITY
+from densify.street.motion import Driving
+from densify.street.sensors import Sensor, firings
+from densify.street.world import Hits, Rays, World
+from densify.types import Bool, Float, Float32, Int
+
+LIDAR_HEIGHT_M = 1.73
+_MIN_RANGE_M = 1.0
+_SPOT_RAD = 1.05e-3  # of a beam's spot, along each axis from its centre to the outer rays
+_FLAT_M = 0.10  # off the plane through the centre's echo: an edge
+_MERGE_M = 2.0  # echoes closer than this can melt into one
+_MELT_PROBABILITY = 0.2
+
+
+@dataclass(frozen=True)
+class Returns:
+    """The N returns of a sweep in the order of time.
+
+    points: (N,3) float32, lidar axes, each at its own firing time. intensity: (N,) 0 to 1.
+    offset_ns: (N,) int64 from the reference time. lidar: (N,) scanner. body: (N,) index of the
+    body met. instance: (N,) object met, -1 none.
+    """
+
+    points: Float32
+    intensity: Float32
+    offset_ns: NDArray[np.int64]
+    lidar: NDArray[np.uint8]
+    body: NDArray[np.int32]
+    instance: NDArray[np.int32]
+
+
+def scan(
+    world: World, ego: Driving, sensor: Sensor, time_s: float, rng: np.random.Generator
+) -> Returns:
+    """The sweep whose reference time is ``time_s``."""
+    fired = firings(sensor)
+    n = len(fired.offset_ns)
+    times = at_offsets(time_s, fired.offset_ns)
+    ego_poses = ego.poses(times)
+    up = ego_poses.rotation[:, :, 2]
+    origin = ego_poses.position + up * (LIDAR_HEIGHT_M + fired.height_m)[:, None]
+    spot = [ego_poses.turn(ray) for ray in _spot(fired.direction)]
+    lucks = [rng.random(n) for _ in spot]
+    beams = Rays(origin, spot[0], times)
+    echoes = world.cast_bundle(beams, spot, LASER_PASSES, lucks, spread=2 * _SPOT_RAD)
+    range_m, hit, edge = _echo(echoes, spot, rng)
+    surface = world.material[hit.triangle]
+    reflectivity = REFLECTIVITY[surface] * (0.6 + 0.4 * world.tint[hit.triangle].mean(axis=1))
+    grazing = np.abs(np.einsum("ni,ni->n", hit.normal, spot[0]))
+    signal = reflectivity * np.sqrt(grazing) * (60.0 / np.maximum(range_m, 5.0)) ** 2
+    heard = 0.995 * (1 - np.exp(-8.0 * signal)) * np.where(edge, 0.85, 1.0)
+    keep = np.isfinite(range_m) & (rng.random(n) < heard)
+    range_m = np.where(keep, range_m, 0.0) + sensor.range_sigma_m * rng.normal(size=n)
+    keep &= (range_m > _MIN_RANGE_M) & (range_m < sensor.max_range_m)
+    points = fired.direction * range_m[:, None]
+    points[:, 2] += fired.height_m
+    brightness = reflectivity * (0.35 + 0.65 * grazing) * (1 + 0.05 * rng.normal(size=n))
+    return Returns(
+        points[keep].astype(np.float32),
+        np.clip(np.round(brightness[keep], 2), 0, 1).astype(np.float32),
+        fired.offset_ns[keep],
+        fired.lidar[keep],
+        world.body[hit.triangle[keep]],
+        world.instance[hit.triangle[keep]],
+    )
+
+
+def at_offsets(time_s: float, offset_ns: Int) -> Float:
+    """(N,) seconds at so many nanoseconds from a reference time."""
+    times: Float = np.asarray(time_s + offset_ns * 1e-9, dtype=np.float64)
+    return times
+
+
+def _spot(direction: Float) -> list[Float]:
+    """(N,3) beams -> the rays of each beam's spot: its centre, then four around it."""
+    level = np.stack([-direction[:, 1], direction[:, 0], np.zeros(len(direction))], axis=1)
+    level /= np.linalg.norm(level, axis=1, keepdims=True)
+    across = np.cross(direction, level)
+    rays = [direction]
+    for a, b in ((1, 1), (1, -1), (-1, 1), (-1, -1)):
+        ray = direction + _SPOT_RAD * (a * level + b * across)
+        rays.append(ray / np.linalg.norm(ray, axis=1, keepdims=True))
+    return rays
+
+
+def _echo(
+    echoes: list[Hits], spot: list[Float], rng: np.random.Generator
+) -> tuple[Float, Hits, Bool]:
+    """What the receiver makes of a spot: range (N,), the surface it is from, and edges (N,).
+
+    On one plane the centre counts. At an edge each part of the spot is as likely to be the
+    strongest echo, and now and then two that lie close together melt into one between them.
+    """
+    centre = echoes[0]
+    n = len(centre.range_m)
+    rows = np.arange(n)
+    range_m = np.stack([e.range_m for e in echoes])
+    slant = [np.einsum("ni,ni->n", centre.normal, ray) for ray in spot]
+    with np.errstate(divide="ignore", invalid="ignore"):  # nothing met is infinitely far
+        off_plane = [
+            np.abs(r - centre.range_m * slant[0] / s) for r, s in zip(range_m, slant, strict=True)
+        ]
+    some = np.isfinite(range_m)
+    flat = (np.stack(off_plane) < _FLAT_M).all(axis=0)
+    edge = np.logical_and(some.any(axis=0), np.logical_not(flat))
+    # one of the rays that met something, each as likely
+    pick = np.argmax(rng.random(range_m.shape) * some, axis=0)
+    pick = np.where(edge, pick, 0)
+    chosen = range_m[pick, rows]
+    other = range_m[rng.integers(len(spot), size=n), rows]
+    melts = edge & np.isfinite(other) & (rng.random(n) < _MELT_PROBABILITY)
+    melts[melts] = np.abs(other[melts] - chosen[melts]) < _MERGE_M
+    chosen = np.where(melts, (chosen + np.where(melts, other, 0.0)) / 2, chosen)
+    columns = (np.stack(column)[pick, rows] for column in zip(*echoes, strict=True))
+    return chosen, Hits(*columns), edge

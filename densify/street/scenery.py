@@ -1,0 +1,231 @@
+# SPDX-License-Identifier: MIT
+"""Everything along a road that stands still: houses, walls, hedges, trees, poles, parked cars."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from densify.street.actors import CAR_WHEELBASE_M, any_paint, car_mesh
+from densify.street.footprints import Rectangles, overlap
+from densify.street.materials import Material
+from densify.street.mesh import Mesh, box, boxes, frustum, leaves, tube
+from densify.street.motion import on_ground
+from densify.street.terrain import Ground
+from densify.types import Float
+
+_PANEL_M = 2.0
+
+
+class Scenery:
+    """Collects what is put on the ground, as one mesh and as footprints nobody may drive over."""
+
+    def __init__(self, ground: Ground, rng: np.random.Generator) -> None:
+        self.ground = ground
+        self.rng = rng
+        self.meshes: list[Mesh] = []
+        self.footprints: list[Rectangles] = []
+
+    def put(self, mesh: Mesh, xy: Float, heading: float = 0.0, solid: Mesh | None = None) -> None:
+        """Stand a mesh (origin on the ground) somewhere. solid: the part one can run into."""
+        z = float(self.ground.terrain.height(xy)) + self.ground.kerb_m
+        self.meshes.append(mesh.moved(xy[0], xy[1], z, heading))
+        self.footprints.append(Rectangles.standing(solid or mesh, xy, heading))
+
+    def is_free(self, mesh: Mesh, xy: Float, heading: float, kerb_gap_m: float) -> bool:
+        """Whether the mesh would stand clear of the carriageway and of everything else."""
+        place = Rectangles.standing(mesh, xy, heading, 0.3)
+        if self.footprints and overlap(Rectangles.stack(self.footprints), place).any():
+            return False
+        forward = place.forward * place.half_m[0]
+        left = np.array([-place.forward[1], place.forward[0]]) * place.half_m[1]
+        around = np.array([place.centre + i * forward + j * left
+                           for i in (-1, 0, 1) for j in (-1, 0, 1)])  # fmt: skip
+        return float(self.ground.distance(around).min()) >= kerb_gap_m
+
+    def put_if_free(self, mesh: Mesh, xy: Float, heading: float, kerb_gap_m: float) -> None:
+        if self.is_free(mesh, xy, heading, kerb_gap_m):
+            self.put(mesh, xy, heading)
+
+    def park(self, xy: Float, forward: Float, instance: int) -> None:
+        """A parked car; it leans with the slope as one that drives."""
+        mesh = car_mesh(any_paint(self.rng), self.rng).of_instance(instance)
+        half = forward * CAR_WHEELBASE_M / 2
+        pose = on_ground(
+            self.ground.terrain, (xy - half)[None], (xy + half)[None], np.zeros(1)
+        ).matrix()
+        self.meshes.append(mesh.posed(pose))
+        heading = float(np.arctan2(forward[1], forward[0]))
+        self.footprints.append(Rectangles.standing(mesh, xy, heading))
+
+    def row(
+        self, panel: Callable[[float], Mesh], start: Float, end: Float, kerb_gap_m: float
+    ) -> None:
+        """A fence, wall or hedge from start to end, panel by panel, each at its own height."""
+        length = float(np.linalg.norm(end - start))
+        count = max(1, round(length / _PANEL_M))
+        heading = float(np.arctan2(*(end - start)[::-1]))
+        middles = start + (end - start) * (np.arange(count)[:, None] + 0.5) / count
+        for middle in middles[self.ground.distance(middles) > kerb_gap_m]:
+            self.put(panel(length / count), middle, heading)
+
+
+def house(rng: np.random.Generator, width_m: float, depth_m: float) -> Mesh:
+    """Front along x, facing -y. Walls with windows and a door, a gable roof."""
+    storeys = int(rng.integers(2, 4))
+    height = 2.8 * storeys + 0.4
+    wall = Material.BRICK if rng.random() < 0.55 else Material.PLASTER
+    shade = rng.uniform(0.8, 1.15, 3) if wall == Material.PLASTER else rng.uniform(0.85, 1.1, 3)
+    tint = (float(shade[0]), float(shade[1]), float(shade[2]))
+    w, d = width_m / 2, depth_m / 2
+    parts = [box((-w, -d, -1.5), (w, d, height), wall, tint)]
+    ridge = height + rng.uniform(0.3, 0.45) * depth_m
+    eaves, o = height - 0.1, 0.4
+    roof = np.array(
+        [
+            [
+                (-w - o, -d - o, eaves),
+                (w + o, -d - o, eaves),
+                (w + o, 0, ridge),
+                (-w - o, 0, ridge),
+            ],
+            [(w + o, d + o, eaves), (-w - o, d + o, eaves), (-w - o, 0, ridge), (w + o, 0, ridge)],
+        ]
+    )
+    parts.append(Mesh.quads(roof, Material.ROOF, tint))
+    gable = np.array([[(s, -d, height), (s, d, height), (s, 0, ridge - 0.1), (s, 0, ridge - 0.1)]
+                      for s in (-w, w)])  # fmt: skip
+    parts.append(Mesh.quads(gable, wall, tint))
+    parts += _windows(w, d, storeys)
+    parts.append(box((-0.55, -d - 0.06, -0.3), (0.55, -d, 2.15), Material.WOOD, tint))
+    parts.append(box((-0.9, -d - 1.0, -0.3), (0.9, -d, 0.12), Material.CONCRETE))
+    chimney = float(rng.uniform(-0.6, 0.6)) * w
+    parts.append(box((chimney - 0.35, 0.3, height), (chimney + 0.35, 1.0, ridge + 0.7),
+                     Material.BRICK))  # fmt: skip
+    return Mesh.join(parts)
+
+
+def _windows(w: float, d: float, storeys: int) -> list[Mesh]:
+    frames, panes = [], []
+    for storey in range(storeys):
+        z = 0.9 + 2.8 * storey
+        for x in np.arange(-w + 1.6, w - 1.2, 2.6):
+            if storey == 0 and abs(x) < 1.4:
+                continue
+            frames.append(((x - 0.65, -d - 0.05, z - 0.08), (x + 0.65, -d + 0.02, z + 1.43)))
+            panes += [((x + half, -d - 0.06, z), (x + half + 0.52, -d, z + 1.35))
+                      for half in (-0.55, 0.03)]  # fmt: skip
+        panes += [((s * w - 0.04, y - 0.5, z), (s * w + 0.04, y + 0.5, z + 1.35))
+                  for y in np.arange(-d + 2.0, d - 1.5, 3.4) for s in (-1, 1)]  # fmt: skip
+    return [boxes(frames, Material.CONCRETE, (1.3, 1.3, 1.3)), boxes(panes, Material.PANE)]
+
+
+def tree(rng: np.random.Generator) -> tuple[Mesh, Mesh]:
+    """A whole tree, and its trunk alone."""
+    height, spread = rng.uniform(5.5, 9.0), rng.uniform(1.5, 2.5)
+    crown = max(2.3, 0.34 * height)
+    thick = 0.02 * height + 0.03
+    top = (rng.uniform(-0.3, 0.3), rng.uniform(-0.3, 0.3), height * 0.75)
+    trunk = tube((0, 0, -0.3), top, (thick, thick * 0.45), Material.BARK)
+    parts = [trunk]
+    for _ in range(5):
+        angle, z = rng.uniform(0, 2 * np.pi), rng.uniform(crown, height * 0.7)
+        reach = spread * rng.uniform(0.4, 0.75)
+        tip = (reach * np.cos(angle), reach * np.sin(angle), z + reach * 0.8)
+        parts.append(tube((top[0] * z / top[2], top[1] * z / top[2], z), tip, (0.06, 0.02),
+                          Material.BARK, num_sides=5))  # fmt: skip
+    count = int(420 * spread)
+    away = rng.normal(size=(count, 3))
+    away /= np.linalg.norm(away, axis=1, keepdims=True)
+    away *= rng.uniform(0.45, 1.0, (count, 1)) ** 0.5
+    middle = [top[0], top[1], (crown + height) / 2 + 0.4]
+    lumps = 1 + 0.18 * np.sin(4 * away[:, :1] + rng.uniform(0, 6)) * np.cos(5 * away[:, 1:2])
+    centres = middle + away * lumps * [spread, spread, (height - crown) / 2 + 0.3]
+    green = (rng.uniform(0.8, 1.3), rng.uniform(0.8, 1.15), rng.uniform(0.7, 1.1))
+    parts.append(leaves(centres, 0.36, rng, green))
+    foot = tube((0, 0, -0.3), (0, 0, 1.0), max(thick, 0.2), Material.BARK)
+    return Mesh.join(parts), foot
+
+
+def hedge(rng: np.random.Generator, height_m: float) -> Callable[[float], Mesh]:
+    def panel(length_m: float) -> Mesh:
+        half = np.array([length_m / 2, 0.35, height_m / 2])
+        centres = rng.uniform(-1, 1, (int(75 * length_m * height_m), 3))
+        # leaves are dense on the outside, a few twigs within
+        face = rng.integers(0, 3, len(centres))
+        push = rng.random(len(centres)) < 0.75
+        side = np.sign(centres[np.arange(len(centres)), face])
+        centres[push, face[push]] = side[push] * rng.uniform(0.8, 1.0, push.sum())
+        foliage = leaves(centres * half + [0, 0, height_m / 2], 0.24, rng, (0.8, 0.9, 0.8))
+        stems = [((x - 0.02, -0.02, -0.3), (x + 0.02, 0.02, height_m * 0.7))
+                 for x in np.arange(-half[0] + 0.3, half[0], 0.6)]  # fmt: skip
+        return Mesh.join([foliage, boxes(stems, Material.BARK)])
+
+    return panel
+
+
+def wall(height_m: float, material: Material) -> Callable[[float], Mesh]:
+    def panel(length_m: float) -> Mesh:
+        half = length_m / 2 + 0.02
+        top = box((-half, -0.16, height_m), (half, 0.16, height_m + 0.07), Material.CONCRETE)
+        return Mesh.join([box((-half, -0.12, -0.5), (half, 0.12, height_m), material), top])
+
+    return panel
+
+
+def picket_fence(height_m: float, tint: tuple[float, float, float]) -> Callable[[float], Mesh]:
+    def panel(length_m: float) -> Mesh:
+        half = length_m / 2
+        rails = [((-half, -0.02, z), (half, 0.02, z + 0.08))
+                 for z in (0.25 * height_m, 0.75 * height_m)]  # fmt: skip
+        pickets = [((x, -0.045, 0.05), (x + 0.09, -0.02, height_m))
+                   for x in np.arange(-half, half, 0.17)]  # fmt: skip
+        post = ((-half, -0.06, -0.4), (-half + 0.11, 0.05, height_m + 0.1))
+        return boxes([*rails, *pickets, post], Material.WOOD, tint)
+
+    return panel
+
+
+def guard_rail(length_m: float) -> Mesh:
+    half = length_m / 2 + 0.02
+    post = box((-0.05, -0.05, -0.3), (0.05, 0.05, 0.72), Material.METAL)
+    beams = [frustum((-half, -0.08, z), (half, 0.0, z + 0.13), Material.METAL, (1.15, 1.15, 1.15),
+                     (1.0, 0.6)) for z in (0.45, 0.60)]  # fmt: skip
+    return Mesh.join([post, *beams])
+
+
+def noise_barrier(length_m: float) -> Mesh:
+    half = length_m / 2
+    return Mesh.join(
+        [
+            box((-half, -0.08, -0.8), (half, 0.08, 3.2), Material.CONCRETE, (0.9, 0.95, 0.85)),
+            box((-half - 0.1, -0.16, -0.8), (-half + 0.1, 0.16, 3.4), Material.METAL),
+        ]
+    )
+
+
+def lamp_post() -> Mesh:
+    """The arm reaches out along -y."""
+    return Mesh.join(
+        [
+            tube((0, 0, -0.3), (0, 0, 7.0), (0.09, 0.05), Material.METAL),
+            tube((0, 0, 6.9), (0, -1.6, 7.2), 0.04, Material.METAL),
+            box((-0.12, -2.1, 7.12), (0.12, -1.5, 7.24), Material.METAL),
+        ]
+    )
+
+
+def sign_post(rng: np.random.Generator) -> Mesh:
+    """Faces -x."""
+    tint = [(0.25, 0.4, 1.0), (1.0, 0.25, 0.2), (1.0, 0.9, 0.3)][int(rng.integers(3))]
+    return Mesh.join(
+        [
+            tube((0, 0, -0.3), (0, 0, 2.9), 0.035, Material.METAL),
+            box((-0.06, -0.32, 2.2), (-0.04, 0.32, 2.84), Material.PAINT, tint),
+        ]
+    )
+
+
+def litter_bin() -> Mesh:
+    return tube((0, 0, 0.0), (0, 0, 0.9), (0.22, 0.25), Material.METAL, (0.45, 0.6, 0.45), 10)

@@ -1,0 +1,32 @@
+# SPDX-License-Identifier: MIT
+"""The presets by name."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+
+import numpy as np
+
+from densify.errors import InputError
+from densify.street.casting import Scene
+from densify.street.crossing import crossing
+from densify.street.highway import highway
+from densify.street.town import street
+
+PRESETS: dict[str, Callable[[np.random.Generator], Scene]] = {
+    "street": partial(street, alive=True),
+    "static": partial(street, alive=False),
+    "crossing": crossing,
+    "highway": highway,
+}
+
+
+def build_scene(preset: str, seed: int) -> Scene:
+    """The same scene for the same preset and seed, always. Raises InputError for an unknown
+    preset."""
+    if preset not in PRESETS:
+        raise InputError(
+            f"street preset {preset!r}: no such preset; there are {', '.join(PRESETS)}"
+        )
+    return PRESETS[preset](np.random.default_rng([seed, 0]))

@@ -1,0 +1,103 @@
+# SPDX-License-Identifier: MIT
+"""Makes the frames of one scene: sweeps, pictures and the exact motion of every body.
+
+Time runs in seconds from frame 0's reference time here, in absolute nanoseconds outside.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from densify.readers.truth_files import Bodies
+from densify.street.camera import CAMERAS, DELAY_NS, Picture, T_world_lidar, expose
+from densify.street.casting import NUM_FRAMES, Scene
+from densify.street.lidar import LIDAR_HEIGHT_M, Returns, at_offsets, scan
+from densify.street.scenes import build_scene
+from densify.street.sensors import PERIOD_NS, sensor_named
+from densify.types import Bool, Float
+
+VERSION = 2  # raise it whenever the same frame would come out differently
+EPOCH_NS = 1_781_258_400_000_000_000  # 2026-06-12 10:00:00 UTC, frame 0
+_MOVING_M, _MOVING_S = 0.05, 0.5
+
+
+@dataclass(frozen=True)
+class Simulator:
+    """Everything that is random follows from preset, seed, sensor and the frame's number."""
+
+    preset: str
+    seed: int
+    sensor: str
+
+    @cached_property
+    def scene(self) -> Scene:
+        return build_scene(self.preset, self.seed)
+
+    def returns(self, frame: int) -> Returns:
+        rng = np.random.default_rng([self.seed, 1, frame])
+        sensor = sensor_named(self.sensor)
+        return scan(self.scene.world, self.scene.ego, sensor, seconds(stamp_ns(frame)), rng)
+
+    def picture(self, camera: str, frame: int) -> Picture:
+        time_s = seconds(stamp_ns(frame) + DELAY_NS[camera])
+        return expose(self.scene.world, self.scene.ego, CAMERAS[camera], time_s)
+
+    def T_world_lidar_at(self, time_ns: int) -> Float:
+        """(4,4) pose of the scanner at any time."""
+        return T_world_lidar(self.scene.ego, seconds(time_ns))
+
+    @cached_property
+    def bodies(self) -> Bodies:
+        """Where every body is at every frame's reference time."""
+        times = np.array([seconds(stamp_ns(frame)) for frame in range(NUM_FRAMES)])
+        bodies = self.scene.world.bodies
+        T_world_body = np.tile(np.eye(4), (NUM_FRAMES, len(bodies), 1, 1))
+        for index, body in enumerate(bodies):
+            poses = body.trajectory.poses(times)
+            T_world_body[:, index, :3, :3] = poses.rotation
+            T_world_body[:, index, :3, 3] = poses.position
+        return Bodies(
+            np.stack([self.T_world_lidar_at(stamp_ns(frame)) for frame in range(NUM_FRAMES)]),
+            T_world_body,
+            self._moving(times),
+        )
+
+    def _moving(self, times_s: Float) -> Bool:
+        """(F,B) whether the body is part of an object that moves around that time."""
+        bodies = self.scene.world.bodies
+        moving = np.zeros((len(times_s), len(bodies)), bool)
+        for index, body in enumerate(bodies):
+            here = body.trajectory.poses(times_s).position
+            for shift in (-_MOVING_S, -_MOVING_S / 2, _MOVING_S / 2, _MOVING_S):
+                there = body.trajectory.poses(times_s + shift).position
+                moving[:, index] |= np.linalg.norm(there - here, axis=1) >= _MOVING_M
+        instance = np.array([body.instance for body in bodies])
+        for one in np.unique(instance[instance >= 0]):
+            moving[:, instance == one] = moving[:, instance == one].any(axis=1, keepdims=True)
+        return moving
+
+    def in_bodies(self, frame: int, returns: Returns) -> Float:
+        """(N,3) the measured points in the frame of the body each belongs to.
+
+        A raw point is taken to the world by the scanner's pose at its own firing time and to its
+        body by the body's pose at that time.
+        """
+        times = at_offsets(seconds(stamp_ns(frame)), returns.offset_ns)
+        points = returns.points.astype(np.float64) + [0.0, 0.0, LIDAR_HEIGHT_M]
+        points = self.scene.ego.poses(times).apply(points)
+        for index in np.unique(returns.body[returns.body > 0]):
+            rows = np.flatnonzero(returns.body == index)
+            points[rows] = self.scene.world.poses(int(index), times[rows]).undo(points[rows])
+        return points
+
+
+def stamp_ns(frame: int) -> int:
+    """Reference time of a frame's sweep."""
+    return EPOCH_NS + frame * PERIOD_NS
+
+
+def seconds(time_ns: int) -> float:
+    return (time_ns - EPOCH_NS) * 1e-9

@@ -1,0 +1,209 @@
+# SPDX-License-Identifier: MIT
+"""The ground: a smooth hilly surface, the roads on it, and their mesh with real kerbs.
+
+Ground height is one analytic function of the position, so that roads, pavements, houses and
+everything that drives agree on it. The carriageway is the union of the roads' strips with rounded
+corners, given as a signed distance; the ground's triangles are cut along its zero line, where the
+kerb stands upright.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from densify.street.curves import Curve
+from densify.street.materials import Material
+from densify.street.mesh import Mesh
+from densify.types import Float
+
+_CORNER_RADIUS_M = 9.0
+_COARSE_M = 8.0  # cells of the ground far from roads
+
+
+@dataclass(frozen=True)
+class Terrain:
+    """Height of the bare ground, a sum of waves: ``sum a sin(k·xy + phase)``.
+
+    wave: (W,2) rad/m. amplitude_m: (W,). phase: (W,).
+    """
+
+    wave: Float
+    amplitude_m: Float
+    phase: Float
+
+    @staticmethod
+    def hilly(rng: np.random.Generator, max_slope: float, scale_m: float = 1.0) -> Terrain:
+        """Three waves in random directions; nowhere steeper than ``max_slope``."""
+        length_m = np.array([95.0, 150.0, 240.0]) * scale_m
+        angle = rng.uniform(0, 2 * np.pi, 3)
+        wave = (2 * np.pi / length_m)[:, None] * np.stack([np.cos(angle), np.sin(angle)], 1)
+        share = max_slope * np.array([0.25, 0.35, 0.4])
+        return Terrain(wave, share / np.linalg.norm(wave, axis=1), rng.uniform(0, 2 * np.pi, 3))
+
+    def height(self, xy: Float) -> Float:
+        """(N,2) -> (N,) metres."""
+        z: Float = np.sin(xy @ self.wave.T + self.phase) @ self.amplitude_m
+        return z
+
+    def slope(self, xy: Float) -> Float:
+        """(N,2) -> (N,2) gradient of the height."""
+        gradient: Float = (np.cos(xy @ self.wave.T + self.phase) * self.amplitude_m) @ self.wave
+        return gradient
+
+
+@dataclass(frozen=True)
+class Road:
+    """A strip ``left_m`` and ``right_m`` wide on the two sides of its centreline."""
+
+    curve: Curve
+    left_m: float
+    right_m: float
+
+    @cached_property
+    def _samples(self) -> tuple[Float, cKDTree]:
+        stations = np.arange(0.0, self.curve.length_m, 2.0)
+        return stations, cKDTree(self.curve(stations))
+
+    def coordinates(self, xy: Float) -> tuple[Float, Float]:
+        """(N,2) -> station along the road (N,), offset to its left (N,), metres."""
+        stations, tree = self._samples
+        station = stations[tree.query(xy)[1]]
+        for _ in range(3):  # from the nearest sample to the foot of the perpendicular
+            tangent = self.curve.tangent(station)
+            away = xy - self.curve(station)
+            station = station + np.einsum("ni,ni->n", away, tangent)
+        return station, away[:, 1] * tangent[:, 0] - away[:, 0] * tangent[:, 1]
+
+    def distance(self, xy: Float) -> Float:
+        """(N,2) -> (N,) signed metres to the strip's edge, negative on the road."""
+        station, offset = self.coordinates(xy)
+        across = np.maximum(offset - self.left_m, -self.right_m - offset)
+        return np.maximum(across, np.maximum(-station, station - self.curve.length_m))
+
+
+@dataclass(frozen=True)
+class Ground:
+    """Terrain with roads on it. kerb_m: how much all that is not road stands higher."""
+
+    terrain: Terrain
+    roads: tuple[Road, ...]
+    kerb_m: float
+    pavement_m: float
+
+    def distance(self, xy: Float) -> Float:
+        """(N,2) -> (N,) signed metres to the kerb, negative on the carriageway."""
+        distance = self.roads[0].distance(xy)
+        for road in self.roads[1:]:
+            other = road.distance(xy)
+            r = _CORNER_RADIUS_M
+            distance = np.maximum(r, np.minimum(distance, other)) - np.hypot(
+                np.maximum(r - distance, 0), np.maximum(r - other, 0)
+            )
+        return distance
+
+    def height(self, xy: Float) -> Float:
+        """(N,2) -> (N,) metres of the surface one stands on."""
+        return self.terrain.height(xy) + self.kerb_m * (self.distance(xy) > 0)
+
+    def mesh(self, margin_m: float, cell_m: float, far_m: float = 200.0) -> Mesh:
+        """Fine triangles up to ``margin_m`` from the roads, coarse ones (sunk where the fine ones
+        cover them) up to ``far_m`` around."""
+        centre = np.concatenate([r.curve(r.curve.knots_m) for r in self.roads])
+        low, high = centre.min(axis=0) - margin_m - 4, centre.max(axis=0) + margin_m + 4
+        corners, quads = _grid(low, high, cell_m)
+        distance = self.distance(corners)
+        quads = quads[(distance[quads] < margin_m).any(axis=1)]
+        triangles = np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
+        return Mesh.join(
+            [self._near(corners, distance, triangles), self._far(low, high, far_m, margin_m)]
+        )
+
+    def _near(self, xy: Float, distance: Float, triangles: Float) -> Mesh:
+        """Triangles cut at the carriageway's edge, the kerb's upright faces between the halves."""
+        pieces: list[tuple[Float, int]] = []  # (K,3,2) corners, side
+        edges: list[Float] = []  # (K,2,2), the road on the left
+        negative = distance[triangles] < 0
+        count = negative.sum(axis=1)
+        pieces += [(xy[triangles[count == 3]], 0), (xy[triangles[count == 0]], 1)]
+        for lone_is_road in (True, False):
+            mixed = count == (1 if lone_is_road else 2)
+            corner = triangles[mixed]
+            lone = np.argmax(negative[mixed] == lone_is_road, axis=1)
+            corner = np.take_along_axis(corner, (lone[:, None] + np.arange(3)) % 3, axis=1)
+            a, b, c = (xy[corner[:, i]] for i in range(3))
+            da, db, dc = (distance[corner[:, i]][:, None] for i in range(3))
+            ab, ac = a + (b - a) * da / (da - db), a + (c - a) * da / (da - dc)
+            pieces.append((np.stack([a, ab, ac], axis=1), 0 if lone_is_road else 1))
+            rest = [np.stack([ab, b, c], axis=1), np.stack([ab, c, ac], axis=1)]
+            pieces.append((np.concatenate(rest), 1 if lone_is_road else 0))
+            edges.append(np.stack([ab, ac] if lone_is_road else [ac, ab], axis=1))
+        meshes = [self._flat(corners, side) for corners, side in pieces]
+        if self.kerb_m > 0:
+            meshes.append(self._upright(np.concatenate(edges)))
+        return Mesh.join(meshes)
+
+    def _flat(self, corners: Float, side: int) -> Mesh:
+        """(K,3,2) triangles of the road (side 0) or of what lies beside it (side 1)."""
+        flat = corners.reshape(-1, 2)
+        z = self.terrain.height(flat) + self.kerb_m * side
+        material = np.full(len(corners), Material.ASPHALT)
+        if side:
+            beside = self.distance(corners.mean(axis=1)) < self.pavement_m
+            material = np.where(beside, Material.PAVING, Material.GRASS)
+        return Mesh(
+            vertices=np.column_stack([flat, z]),
+            triangles=np.arange(len(flat)).reshape(-1, 3),
+            uv=flat,
+            material=material.astype(np.int16),
+            tint=np.ones((len(corners), 3)),
+            instance=np.full(len(corners), -1, np.int32),
+        )
+
+    def _upright(self, edges: Float) -> Mesh:
+        """(K,2,2) -> kerb faces."""
+        low = np.concatenate(
+            [edges, self.terrain.height(edges.reshape(-1, 2)).reshape(-1, 2, 1)], 2
+        )
+        high = low + [0.0, 0.0, self.kerb_m]
+        corners = np.stack([low[:, 1], low[:, 0], high[:, 0], high[:, 1]], axis=1)
+        return Mesh.quads(corners, Material.KERB)
+
+    def _far(self, low: Float, high: Float, far_m: float, margin_m: float) -> Mesh:
+        corners, quads = _grid(low - far_m, high + far_m, _COARSE_M)
+        covered = self.distance(corners) < margin_m - 1.5 * _COARSE_M
+        z = self.terrain.height(corners) + np.where(covered, -1.0, self.kerb_m - 0.05)
+        return Mesh.quads(np.column_stack([corners, z])[quads], Material.GRASS)
+
+
+def _grid(low: Float, high: Float, cell_m: float) -> tuple[Float, Float]:
+    """Corners (N,2) of a regular grid and its cells (M,4), anticlockwise."""
+    nx, ny = (int(np.ceil(v)) + 1 for v in (high - low) / cell_m)
+    x, y = np.meshgrid(low[0] + cell_m * np.arange(nx), low[1] + cell_m * np.arange(ny))
+    i = (np.arange(ny - 1)[:, None] * nx + np.arange(nx - 1)).ravel()
+    return np.column_stack([x.ravel(), y.ravel()]), np.stack([i, i + 1, i + nx + 1, i + nx], axis=1)
+
+
+def strip(
+    ground: Ground,
+    curve: Curve,
+    offset_m: float,
+    width_m: float,
+    spans: Sequence[tuple[float, float]],
+) -> Mesh:
+    """Paint on the road: a band along the curve, only over the given spans of stations."""
+    meshes = []
+    for begin, end in spans:
+        stations = np.linspace(begin, end, max(2, int((end - begin) / 1.0) + 1))
+        sides = [
+            curve(stations) + curve.normal(stations) * (offset_m + shift)
+            for shift in (-width_m / 2, width_m / 2)
+        ]
+        right, left = (np.column_stack([s, ground.terrain.height(s) + 0.006]) for s in sides)
+        corners = np.stack([right[:-1], right[1:], left[1:], left[:-1]], axis=1)
+        meshes.append(Mesh.quads(corners, Material.PAINT))
+    return Mesh.join(meshes)

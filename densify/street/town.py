@@ -1,0 +1,168 @@
+# SPDX-License-Identifier: MIT
+"""``street`` and ``street:static``: a street in town with a bend, a side road and its traffic."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from densify.street.actors import TRACTOR_WHEELBASE_M, Actor, truck
+from densify.street.casting import (
+    FIRST_PARKED,
+    MEETING_S,
+    PAVEMENT_M,
+    SPAN_S,
+    Scene,
+    Traffic,
+    Ways,
+    assemble,
+    jitter,
+)
+from densify.street.curves import Curve, Lane, Speed
+from densify.street.mesh import Mesh
+from densify.street.motion import Driving
+from densify.street.roadside import Side, furnish, line_with_plots, mark_lanes, park_cars
+from densify.street.scenery import Scenery
+from densify.street.terrain import Ground, Road, Terrain
+from densify.types import Float
+
+# Offsets from the middle line of a road driven on the right: one lane against the ego vehicle's
+# direction, two with it, cycle lanes and parked cars on both sides.
+_ONCOMING_M, _FAST_M, _SLOW_M = 1.65, -1.65, -4.85
+_CYCLES_M, _CYCLES_BACK_M = -7.15, 3.95
+_ROAD_LEFT_M, _ROAD_RIGHT_M = 7.2, 10.3
+_EGO_START_M = 170.0
+
+
+def street(rng: np.random.Generator, alive: bool) -> Scene:
+    """A street in town. alive: with traffic; otherwise only the ego vehicle moves."""
+    bend = 1 / (36.0 * jitter(rng, 0.08))
+    mild = jitter(rng, 0.3) / 190.0
+    wiggle, phase = jitter(rng, 0.5) / 260.0, rng.uniform(0, 2 * np.pi)
+
+    def curvature(station: Float) -> Float:
+        s = station - _EGO_START_M
+        turn = bend * np.clip(np.minimum((s - 36) / 8, (72 - s) / 8), 0, 1)
+        calm = mild * np.clip(np.minimum((s - 84) / 8, (128 - s) / 8), 0, 1)
+        far = np.clip(np.maximum(-s / 30, (s - 160) / 30), 0, 1)
+        return turn - calm + far * wiggle * np.sin(station / 45 + phase)
+
+    main = Curve.bending(620.0, curvature, _EGO_START_M)
+    mouth_m = _EGO_START_M + 130.0
+    corner = np.array([mouth_m])
+    start, away = main(corner)[0], main.normal(corner)[0]
+    side_xy = start + away * np.arange(0.0, 130.5, 0.5)[:, None]
+    roads = (
+        Road(main, _ROAD_LEFT_M, _ROAD_RIGHT_M),
+        Road(Curve(side_xy), 4.6, 4.6),
+    )
+    ground = Ground(Terrain.hilly(rng, 0.05), roads, 0.12, PAVEMENT_M)
+    scenery = Scenery(ground, rng)
+    key_m = _EGO_START_M + 97.0
+    parts = _dress_street(scenery, roads, mouth_m, key_m)
+    slow = Lane(main, _SLOW_M)
+    ego_speed = Speed(
+        (-1, 8.4), (3, 8.4), (4.5, 7.2), (7.5, 7.2), (9.5, 8.6), (12.5, 8.2), (15, 6.5)
+    )
+    at_zero = slow.at(_EGO_START_M)
+    ego = Driving(slow.curve, ego_speed, at_zero, 0.0, ground.terrain, 2.7)
+    traffic = Traffic(ego, scenery, rng)
+    if alive:
+        _people_street(Ways(ground, traffic), roads, mouth_m, ego, slow, rng)
+    return assemble(scenery, parts, ego, traffic)
+
+
+def _dress_street(
+    scenery: Scenery, roads: tuple[Road, ...], mouth_m: float, key_m: float
+) -> list[Mesh]:
+    main, side = roads
+    end = main.curve.length_m - 20
+    gap = (mouth_m - 14, mouth_m + 14)
+    stretches = [
+        Side(main, 1, 20.0, gap[0]),
+        Side(main, 1, gap[1], end),
+        Side(main, -1, 20.0, end),
+        Side(side, 1, 24.0, 120.0),
+        Side(side, -1, 24.0, 120.0),
+    ]
+    for stretch in stretches:
+        line_with_plots(scenery, stretch, PAVEMENT_M)
+    for stretch in stretches:
+        furnish(scenery, stretch, 27.0, trees=stretch.road is main)
+    instance = FIRST_PARKED
+    for stretch in stretches[:3]:
+        # some gaps near the key, so that one sees who walks behind
+        free = [(key_m + 4, key_m + 16)] if stretch.side > 0 else [(key_m + 8, key_m + 15)]
+        free.append((mouth_m - 24, mouth_m + 24) if stretch.side > 0 else (0.0, 0.0))
+        instance = park_cars(scenery, stretch, 0.62, instance, free)
+    ground = scenery.ground
+    left_open = [(0.0, mouth_m - 10), (mouth_m + 10, end)]
+    return [
+        ground.mesh(18.0, 1.0),
+        mark_lanes(ground, main, (-3.25,), (), [(0.0, end)]),
+        mark_lanes(ground, main, (), (-6.5, 0.08, -0.08), [(0.0, end)]),
+        mark_lanes(ground, main, (), (3.3, 4.65), left_open),
+        mark_lanes(ground, main, (), (-7.85,), [(0.0, end)]),
+        mark_lanes(ground, side, (0.0,), (), [(18.0, 120.0)]),
+    ]
+
+
+def _people_street(
+    ways: Ways,
+    roads: tuple[Road, ...],
+    mouth_m: float,
+    ego: Driving,
+    slow: Lane,
+    rng: np.random.Generator,
+) -> None:
+    main, side = (road.curve for road in roads)
+    here = float(np.interp(ego.station(np.array([MEETING_S]))[0], slow.curve.knots_m, main.knots_m))
+    fast, oncoming = Lane(main, _FAST_M), Lane(main, _ONCOMING_M, forward=False)
+    # the car in front brakes; another overtakes; cars come the other way before a turning truck
+    brake = Speed((-1, 8.6), (4, 7.6), (8, 7.8), (10.2, 9.6), (11.0, 9.6), (13.0, 4.6), (14.5, 4.6),
+                  (17, 5.5))  # fmt: skip
+    ways.car(slow, here + 20.0, brake, 1.0)
+    ways.car(fast, here + 9.0, Speed((0.0, 13.5 * jitter(rng, 0.06))), 1.5)
+    ways.car(fast, here - 42.0, Speed((0.0, 12.0)), 6.0)
+    _turning_truck(ways, main, side, mouth_m)
+    ways.car(oncoming, here + 12.0, Speed((0.0, 8.8), (9.0, 8.4), (16.0, 9.0)), 1.0)
+    ways.car(oncoming, mouth_m + 30.0, Speed((0, 9.0), (8.5, 8.0), (12.0, 2.4), (17.0, 5.5)), 2.0)
+    ways.car(oncoming, here - 22.0, Speed((0.0, 10.0)), 4.0)
+    ways.car(oncoming, here - 75.0, Speed((0.0, 11.0)), 8.0)
+    ways.car(slow, here - 30.0, Speed((-1, 8.2), (4, 7.2), (9, 7.6), (15, 6.2)), 4.0)
+    ways.cyclist(Lane(main, _CYCLES_M), here + 11.5, 4.6)
+    ways.cyclist(Lane(main, _CYCLES_BACK_M, forward=False), here + 27.0, 5.2)
+    for side_of, forward, ahead in (
+        (1, False, 10.0), (1, True, 6.0), (-1, True, 11.0), (-1, False, 19.0), (-1, False, -14.0),
+        (1, True, -24.0),
+    ):  # fmt: skip
+        kerb = _ROAD_LEFT_M if side_of > 0 else _ROAD_RIGHT_M
+        low, high = sorted((side_of * (kerb + 1.3), side_of * (kerb + 2.7)))
+        ways.walker(main, (low, high), forward, here + ahead)
+
+
+def _turning_truck(ways: Ways, main: Curve, side: Curve, mouth_m: float) -> None:
+    """From the oncoming lane into the side road on its right."""
+    oncoming = Lane(main, _ONCOMING_M, forward=False).curve
+    knots = np.arange(0.0, oncoming.length_m, 0.5)
+    xy = oncoming(knots)
+    origin, out = side(np.zeros(1))[0], side.tangent(np.zeros(1))[0]
+    along = np.array([out[1], -out[0]])  # the ego vehicle's way
+    ahead = (xy - origin) @ along
+    far = np.abs(xy - origin).sum(axis=1) < 400
+    straight = xy[far & (ahead > 14.6)]
+    radius, lane_m = 13.0, 1.0
+    near = float((straight[-1] - origin) @ out)
+    centre = origin + along * (lane_m + radius) + out * (near + radius)
+    angle = np.linspace(0, np.pi / 2, 42)[1:]
+    arc = centre + radius * (-np.cos(angle)[:, None] * out - np.sin(angle)[:, None] * along)
+    rest = arc[-1] + out * np.arange(0.5, 90.0, 0.5)[:, None]
+    curve = Curve(np.concatenate([straight, arc, rest]))
+    turn_m = float(curve.length_m - 89.5 - radius * np.pi / 2)
+
+    def recipe(rng: np.random.Generator) -> Actor:
+        speed = Speed((0.0, 8.6), (8.0, 8.0), (10.5, 5.0), (15.0, 5.0), (17.0, 7.0))
+        at = turn_m + rng.uniform(6.0, 8.0)
+        way = Driving(curve, speed, at, MEETING_S, ways.ground.terrain, TRACTOR_WHEELBASE_M)
+        return truck(way, SPAN_S, ways.traffic.next_instance, rng)
+
+    ways.traffic.add(recipe)

@@ -1,0 +1,228 @@
+# SPDX-License-Identifier: MIT
+"""Rigid bodies that move, and rays cast among them, each at its own time.
+
+Rays are taken into each body's frame by the body's pose at the ray's own time, so that a body that
+moves while a sweep is taken is distorted exactly as in reality. This module is the only one that
+imports open3d.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from densify.errors import InputError
+from densify.street.materials import GLASS_PASSES
+from densify.street.mesh import Mesh
+from densify.street.motion import Poses, Still, Trajectory
+from densify.types import Bool, Float
+
+_MAX_LAYERS = 8  # of glass and leaves that one ray passes
+_STEP_M = 2e-3  # from a surface passed to where the ray goes on
+_GOLDEN = 0.6180339887498949
+
+
+@dataclass(frozen=True)
+class Body:
+    """A rigid thing. mesh: in the body's frame. instance: the object it is part of, -1 none
+    (then the triangles' own instance holds)."""
+
+    mesh: Mesh
+    trajectory: Trajectory
+    instance: int = -1
+
+
+class Rays(NamedTuple):
+    """N rays. origin, direction: (N,3) world, direction of length 1. time_s: (N,)."""
+
+    origin: Float
+    direction: Float
+    time_s: Float
+
+
+class Hits(NamedTuple):
+    """What N rays met. range_m: (N,), inf where nothing. triangle: (N,) index over all bodies'
+    triangles, -1 nothing. barycentric: (N,2) as in ``(1-u-v) a + u b + v c``. normal: (N,3) of
+    that triangle, world axes, either side."""
+
+    range_m: Float
+    triangle: NDArray[np.int64]
+    barycentric: Float
+    normal: Float
+
+    @staticmethod
+    def none(num_rays: int) -> Hits:
+        return Hits(
+            np.full(num_rays, np.inf),
+            np.full(num_rays, -1, np.int64),
+            np.zeros((num_rays, 2)),
+            np.zeros((num_rays, 3)),
+        )
+
+
+class World:
+    """All bodies; body 0 stands still.
+
+    Concretely, ``body[k]``, ``material[k]``, ``instance[k]``, ``normal[k]``, ``uv[k]`` and
+    ``tint[k]`` belong to triangle k of all bodies' triangles in a row.
+    """
+
+    def __init__(self, bodies: Sequence[Body]) -> None:
+        self.bodies = tuple(bodies)
+        meshes = [_solid(b.mesh) for b in self.bodies]
+        corners = [m.vertices[m.triangles] for m in meshes]
+        self.material = np.concatenate([m.material for m in meshes]).astype(np.int64)
+        self.tint: Float = np.concatenate([m.tint for m in meshes])
+        self.uv: Float = np.concatenate([m.uv[m.triangles] for m in meshes])
+        self.instance = np.concatenate(
+            [
+                np.full(len(m.triangles), b.instance, np.int32) if b.instance >= 0 else m.instance
+                for b, m in zip(self.bodies, meshes, strict=True)
+            ]
+        )
+        counts = [len(m.triangles) for m in meshes]
+        self.body = np.repeat(np.arange(len(meshes), dtype=np.int32), counts)
+        self._first = np.cumsum([0, *counts])
+        self._corner: Float = np.concatenate([c[:, 0] for c in corners])
+        normal = [np.cross(c[:, 1] - c[:, 0], c[:, 2] - c[:, 0]) for c in corners]
+        self.normal: Float = np.concatenate(normal)
+        self.normal /= np.linalg.norm(self.normal, axis=1, keepdims=True)
+        self._scenes = [_raycasting_scene(m) for m in meshes]
+        low, high = zip(*(m.bounds for m in meshes), strict=True)
+        self._centre = (np.array(low) + np.array(high)) / 2
+        self._radius_m = np.linalg.norm(np.array(high) - np.array(low), axis=1) / 2
+
+    def cast(self, rays: Rays, passes: Float, luck: Float) -> Hits:
+        """The first surface that stops each ray.
+
+        passes: (num materials,) probability that a surface lets the ray through. luck: (N,) in
+        [0, 1), the ray's own random number.
+        """
+        return self.cast_bundle(rays, [rays.direction], passes, [luck])[0]
+
+    def cast_bundle(
+        self,
+        rays: Rays,
+        directions: Sequence[Float],
+        passes: Float,
+        lucks: Sequence[Float],
+        spread: float = 0.0,
+    ) -> list[Hits]:
+        """`cast` for each of several sets of directions (N,3), which share origins and times and
+        differ from the rays' own by at most ``spread`` rad."""
+        n = len(rays.time_s)
+        best = [Hits.none(n) for _ in directions]
+        for index, body in enumerate(self.bodies):
+            rows = np.flatnonzero(self._near(index, rays, spread)) if index else np.arange(n)
+            if not len(rows):
+                continue
+            still = isinstance(body.trajectory, Still)
+            poses = body.trajectory.poses(rays.time_s[rows])
+            origin = rays.origin[rows] if still else poses.undo(rays.origin[rows])
+            for hits, ray, luck in zip(best, directions, lucks, strict=True):
+                direction = ray[rows] if still else poses.unturn(ray[rows])
+                found = self._cast_body(index, origin, direction, passes, luck[rows])
+                if not still:
+                    found = found._replace(normal=poses.turn(found.normal))
+                nearer = np.flatnonzero(found.range_m < hits.range_m[rows])
+                for column, new in zip(hits, found, strict=True):
+                    column[rows[nearer]] = new[nearer]
+        return best
+
+    def is_lit(self, rays: Rays) -> Bool:
+        """(N,) True where nothing but vehicle glass lies on the ray."""
+        hits = self.cast(rays, GLASS_PASSES, np.zeros(len(rays.time_s)))
+        return ~np.isfinite(hits.range_m)
+
+    def poses(self, body: int, times_s: Float) -> Poses:
+        return self.bodies[body].trajectory.poses(times_s)
+
+    def _near(self, index: int, rays: Rays, spread: float) -> Bool:
+        """(N,) the rays whose line passes the body's bounding sphere, blown up by its motion."""
+        times = np.array([rays.time_s.min(), rays.time_s.max()])
+        poses = self.poses(index, times)
+        ends = poses.apply(np.broadcast_to(self._centre[index], (2, 3)))
+        away = ends.mean(axis=0) - rays.origin
+        along = np.einsum("ni,ni->n", away, rays.direction)
+        moved = np.linalg.norm(ends[1] - ends[0])
+        radius = self._radius_m[index] + 0.75 * moved + 0.1 + spread * np.abs(along)
+        near: Bool = np.einsum("ni,ni->n", away, away) - along**2 < radius**2
+        return near & (along > -radius)
+
+    def _cast_body(
+        self, index: int, origin: Float, direction: Float, passes: Float, luck: Float
+    ) -> Hits:
+        n = len(origin)
+        hits = Hits.none(n)
+        rows, begin, luck = np.arange(n), np.zeros(n), luck.copy()
+        for _ in range(_MAX_LAYERS):
+            if not len(rows):
+                break
+            start = origin[rows] + begin[rows, None] * direction[rows]
+            which, uv = _first_hit(self._scenes[index], start, direction[rows])
+            hit = which >= 0
+            rows, which, uv = rows[hit], which[hit] + self._first[index], uv[hit]
+            # the exact distance to the triangle's plane, in double precision
+            normal = self.normal[which]
+            to_plane = np.einsum("ni,ni->n", normal, self._corner[which] - origin[rows])
+            distance = to_plane / np.einsum("ni,ni->n", normal, direction[rows])
+            stops = luck[rows] >= passes[self.material[which]]
+            done = rows[stops]
+            found = (distance, which, uv, normal)
+            for column, new in zip(hits, found, strict=True):
+                column[done] = new[stops]
+            begin[rows] = distance + _STEP_M
+            rows = rows[~stops]
+            luck[rows] = (luck[rows] + _GOLDEN) % 1.0
+        return hits
+
+
+def _solid(mesh: Mesh) -> Mesh:
+    """Without triangles of no area, with vertices as the ray caster rounds them."""
+    vertices = mesh.vertices.astype(np.float32).astype(np.float64)
+    a, b, c = (vertices[mesh.triangles[:, i]] for i in range(3))
+    keep = np.linalg.norm(np.cross(b - a, c - a), axis=1) > 1e-7
+    return Mesh(
+        vertices,
+        mesh.triangles[keep],
+        mesh.uv,
+        mesh.material[keep],
+        mesh.tint[keep],
+        mesh.instance[keep],
+    )
+
+
+def _open3d() -> Any:
+    try:
+        import open3d
+    except ImportError as error:
+        raise InputError(
+            f"open3d, which casts the street's rays, cannot be loaded: {error}; install what it "
+            f"names (on Debian and Ubuntu: apt-get install libusb-1.0-0 libgl1 libgomp1)"
+        ) from error
+    return open3d
+
+
+def _raycasting_scene(mesh: Mesh) -> Any:
+    o3d = _open3d()
+    scene = o3d.t.geometry.RaycastingScene()
+    scene.add_triangles(
+        o3d.core.Tensor(mesh.vertices.astype(np.float32)),
+        o3d.core.Tensor(mesh.triangles.astype(np.uint32)),
+    )
+    return scene
+
+
+def _first_hit(scene: Any, origin: Float, direction: Float) -> tuple[NDArray[np.int64], Float]:
+    """(N,3), (N,3) -> index of the first triangle met (N,), -1 none, and where on it (N,2)."""
+    o3d = _open3d()
+    rays = np.concatenate([origin, direction], axis=1).astype(np.float32)
+    found = scene.cast_rays(o3d.core.Tensor(rays))
+    triangle = found["primitive_ids"].numpy().astype(np.int64)
+    missed = ~np.isfinite(found["t_hit"].numpy())
+    triangle[missed] = -1
+    return triangle, found["primitive_uvs"].numpy().astype(np.float64)

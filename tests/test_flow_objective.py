@@ -1,0 +1,242 @@
+# SPDX-License-Identifier: MIT
+"""The flow objective against slow twins: neighbours, graph, Laplacian, energy, gradient."""
+
+from __future__ import annotations
+
+import warnings
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from densify.errors import InputError
+from densify.flow import graph
+from densify.flow.neighbors import NeighborIndex, nearest_by_brute_force
+from densify.flow.objective import energy
+
+NO_CUDA = not torch.cuda.is_available()
+
+
+def cloud(num_points: int, seed: int = 0, spread_m: float = 2.0) -> np.ndarray:
+    return np.random.default_rng(seed).normal(scale=spread_m, size=(num_points, 3))
+
+
+def slow_weights(points: np.ndarray, k: int, radius_m: float = np.inf) -> np.ndarray:
+    n = len(points)
+    distance = np.linalg.norm(points[:, None] - points[None], axis=2)
+    weights = np.eye(n)
+    for i in range(n):
+        others = sorted((j for j in range(n) if j != i), key=lambda j: distance[i, j])
+        for j in others[:k]:
+            if distance[i, j] <= radius_m:
+                weights[i, j] = weights[j, i] = np.exp(-(distance[i, j] ** 2))
+    return weights
+
+
+def slow_laplacian(weights: np.ndarray, kind: str) -> np.ndarray:
+    degree = np.diag(weights.sum(axis=1))
+    if kind == "row-sum-zero":
+        return (degree - weights) / np.diag(degree).mean()
+    half = np.diag(np.diag(degree) ** -0.5)
+    return half @ (degree - weights) @ half
+
+
+def slow_energy(
+    flow: np.ndarray, source: np.ndarray, target: np.ndarray, matrix: np.ndarray, alpha: float
+) -> tuple[float, float, float]:
+    data = sum(min(float(((p - q) ** 2).sum()) for q in target) for p in source + flow)
+    data += sum(min(float(((p - q) ** 2).sum()) for p in source + flow) for q in target)
+    smoothness = float(np.trace(flow.T @ matrix @ flow))
+    return data + alpha * smoothness, data, smoothness
+
+
+def problem(
+    n: int, m: int, kind: str, dtype: torch.dtype = torch.float64, seed: int = 0
+) -> tuple[torch.Tensor, ...]:
+    source, target = cloud(n, seed), cloud(m, seed + 1)
+    flow = cloud(n, seed + 2, 0.3)
+    matrix = graph.laplacian(graph.knn_graph(source, 5), kind)
+    return (
+        *(torch.from_numpy(x).to(dtype) for x in (flow, source, target)),
+        graph.sparse_tensor(matrix, dtype, "cpu"),
+    )
+
+
+@pytest.mark.parametrize("kind", graph.LAPLACIANS)
+@pytest.mark.parametrize(("n", "m"), [(40, 60), (60, 25), (1, 7), (7, 1)])
+def test_energy_equals_its_slow_twin(n: int, m: int, kind: str) -> None:
+    flow, source, target, matrix = problem(n, m, kind)
+    dense = slow_laplacian(slow_weights(source.numpy(), min(5, n - 1)), kind)
+    expected = slow_energy(flow.numpy(), source.numpy(), target.numpy(), dense, 10.0)
+    np.testing.assert_allclose(energy(flow, source, target, matrix, 10.0), expected, rtol=1e-12)
+    indexed = energy(flow, source, NeighborIndex(target), matrix, 10.0)
+    np.testing.assert_array_equal(indexed, energy(flow, source, target, matrix, 10.0))
+
+
+def test_float32_agrees_with_float64() -> None:
+    single = energy(*problem(80, 90, "symmetric", torch.float32), alpha=10.0)
+    double = energy(*problem(80, 90, "symmetric", torch.float64), alpha=10.0)
+    assert single.total.dtype == torch.float32
+    np.testing.assert_allclose(single, double, rtol=1e-5)
+
+
+@pytest.mark.parametrize("kind", graph.LAPLACIANS)
+def test_gradient_equals_finite_differences(kind: str) -> None:
+    flow, source, target, matrix = problem(30, 45, kind)
+    flow.requires_grad_()
+    for term in range(3):
+        assert torch.autograd.gradcheck(
+            lambda f, term=term: energy(f, source, target, matrix, 3.0)[term], flow, eps=1e-6
+        )
+
+
+def test_gradient_is_the_same_to_the_byte() -> None:
+    flow, source, target, matrix = problem(3000, 9000, "symmetric", torch.float32)
+    flow.requires_grad_()
+    gradients = [
+        torch.autograd.grad(energy(flow, source, target, matrix, 4.0).total, flow)[0]
+        for _ in range(5)
+    ]
+    assert all(torch.equal(gradients[0], other) for other in gradients[1:])
+
+
+def test_as_a_training_loss_it_reaches_the_parameters_of_a_network() -> None:
+    _, source, _, matrix = problem(50, 50, "row-sum-zero", torch.float32)
+    shift = torch.tensor([0.05, -0.02, 0.03])
+    parameter = torch.zeros(3, requires_grad=True)
+    optimizer = torch.optim.SGD([parameter], lr=2e-3)
+    for _ in range(100):
+        optimizer.zero_grad()
+        energy(parameter.expand(50, 3), source, source + shift, matrix, 4.0).total.backward()
+        optimizer.step()
+    np.testing.assert_allclose(parameter.detach(), shift, atol=1e-4)
+
+
+@given(n=st.integers(1, 40), k=st.integers(1, 60), seed=st.integers(0, 99))
+@settings(max_examples=40, deadline=None)
+def test_knn_graph_equals_its_slow_twin(n: int, k: int, seed: int) -> None:
+    points = cloud(n, seed)
+    np.testing.assert_allclose(graph.knn_graph(points, k).toarray(), slow_weights(points, k))
+
+
+@given(n=st.integers(1, 40), k=st.integers(1, 60), radius_m=st.floats(0.1, 6.0))
+@settings(max_examples=40, deadline=None)
+def test_radius_graph_equals_its_slow_twin(n: int, k: int, radius_m: float) -> None:
+    points = cloud(n)
+    found = graph.radius_graph(points, radius_m, k).toarray()
+    np.testing.assert_allclose(found, slow_weights(points, k, radius_m))
+
+
+def test_graph_of_duplicates_keeps_every_self_weight() -> None:
+    points = np.concatenate([np.zeros((30, 3)), cloud(10), np.full((5, 3), 60.0)])
+    weights = graph.knn_graph(points, 4)
+    dense = weights.toarray()
+    np.testing.assert_array_equal(np.diag(dense), 1.0)
+    np.testing.assert_array_equal(dense, dense.T)
+    assert ((dense[:30, :30] > 0).sum(axis=1) >= 5).all()
+    for kind in graph.LAPLACIANS:
+        np.testing.assert_allclose(
+            graph.laplacian(weights, kind).toarray(), slow_laplacian(dense, kind), atol=1e-15
+        )
+
+
+@given(n=st.integers(1, 50), k=st.integers(1, 12), seed=st.integers(0, 99))
+@settings(max_examples=30, deadline=None)
+def test_laplacian_is_symmetric_positive_and_leaves_its_null_space_alone(
+    n: int, k: int, seed: int
+) -> None:
+    weights = graph.knn_graph(cloud(n, seed), k)
+    degree = weights.sum(axis=1)
+    free = {"symmetric": np.sqrt(degree), "row-sum-zero": np.ones(n)}
+    for kind, vector in free.items():
+        matrix = graph.laplacian(weights, kind).toarray()
+        np.testing.assert_array_equal(matrix, matrix.T)
+        np.testing.assert_allclose(matrix, slow_laplacian(weights.toarray(), kind), atol=1e-14)
+        assert np.linalg.eigvalsh(matrix).min() > -1e-13
+        np.testing.assert_allclose(matrix @ vector, 0.0, atol=1e-13)
+    assert np.linalg.eigvalsh(graph.laplacian(weights).toarray()).max() < 2.0
+
+
+def test_degree_contains_the_self_weight() -> None:
+    weights = graph.knn_graph(np.array([[0.0, 0, 0], [1.0, 0, 0]]), 1)
+    degree = 1.0 + np.exp(-1.0)
+    expected = np.exp(-1.0) / degree * np.array([[1.0, -1.0], [-1.0, 1.0]])
+    np.testing.assert_allclose(graph.laplacian(weights).toarray(), expected)
+
+
+def test_sparse_tensor_multiplies_like_the_matrix_without_a_warning() -> None:
+    matrix = graph.laplacian(graph.knn_graph(cloud(200), 8))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        tensor = graph.sparse_tensor(matrix, torch.float64, "cpu")
+    flow = cloud(200, 5)
+    np.testing.assert_allclose(tensor @ torch.from_numpy(flow), matrix @ flow, atol=1e-13)
+
+
+@pytest.mark.parametrize("k", [1, 4])
+@pytest.mark.parametrize("max_chunk", [1, 700, 1 << 20])
+def test_brute_force_finds_what_the_tree_finds(k: int, max_chunk: int) -> None:
+    # Far from the origin, where float32 coordinates alone would be off by decimetres.
+    points = torch.from_numpy(cloud(300) + [4e6, 5e5, 100.0])
+    queries = torch.from_numpy(cloud(170, 1) + [4e6, 5e5, 100.0])
+    tree = NeighborIndex(points).nearest(queries, k)
+    brute = nearest_by_brute_force(queries, points, k, max_chunk)
+    assert torch.equal(tree.row, brute.row)
+    np.testing.assert_allclose(brute.distance_m, tree.distance_m, atol=1e-5)
+    distance = torch.linalg.norm(queries[:, None] - points[None], dim=2)
+    assert torch.equal(tree.row, distance.topk(k, dim=1, largest=False).indices)
+
+
+@pytest.mark.skipif(NO_CUDA, reason="no CUDA device")
+def test_cuda_finds_the_same_energy_and_gradient_as_the_cpu() -> None:
+    results = []
+    for device in ("cpu", "cuda"):
+        flow, source, target, matrix = (x.to(device) for x in problem(2000, 2500, "symmetric"))
+        flow.requires_grad_()
+        value = energy(flow, source, target, matrix, 10.0)
+        value.total.backward()
+        results.append((value.total.item(), flow.grad.cpu()))
+    np.testing.assert_allclose(results[0][0], results[1][0], rtol=1e-9)
+    np.testing.assert_allclose(results[0][1], results[1][1], atol=1e-9)
+
+
+def test_bad_input_is_one_clear_line() -> None:
+    flow, source, target, matrix = problem(10, 12, "symmetric")
+    broken = target.clone()
+    broken[3, 1] = torch.nan
+    cases = {
+        "flow: got shape (9, 3)": (flow[:9], source, target, matrix),
+        "laplacian: got shape": (flow[:9], source[:9], target, matrix),
+        "expected one dtype": (flow.float(), source, target, matrix),
+        "points: got no points": (flow, source, target[:0], matrix),
+        "source: got no points": (flow[:0], source[:0], target, matrix),
+        "points: 1 of 12 rows are NaN or infinite, the first is row 3": (
+            flow,
+            source,
+            broken,
+            matrix,
+        ),
+        "points: got shape (12, 2)": (flow, source, target[:, :2], matrix),
+        "points: got shape (12, 3) of torch.int64": (flow, source, target.long(), matrix),
+    }
+    for message, arguments in cases.items():
+        with pytest.raises(InputError) as raised:
+            energy(*arguments, alpha=1.0)
+        assert message in str(raised.value) and "\n" not in str(raised.value)
+
+
+def test_bad_graphs_and_searches_are_refused() -> None:
+    points = cloud(5)
+    with pytest.raises(InputError, match="num_neighbors: got 0"):
+        graph.knn_graph(points, 0)
+    for radius_m in (0.0, -1.0, np.nan):
+        with pytest.raises(InputError, match="radius_m"):
+            graph.radius_graph(points, radius_m, 3)
+    with pytest.raises(InputError, match="'random-walk', expected one of symmetric"):
+        graph.laplacian(graph.knn_graph(points, 2), "random-walk")
+    index = NeighborIndex(torch.from_numpy(points))
+    for k in (0, 6):
+        with pytest.raises(InputError, match=f"got {k}, expected 1 to 5"):
+            index.nearest(torch.from_numpy(points), k)

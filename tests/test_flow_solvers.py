@@ -1,0 +1,236 @@
+# SPDX-License-Identifier: MIT
+"""The solvers of the flow objective: known motions, agreement, descent, determinism, bad input."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+
+from densify.errors import InputError
+from densify.flow import graph
+from densify.flow.objective import energy
+from densify.flow.solvers import ObjectiveSettings, solve
+
+ADAM = ObjectiveSettings(solver="adam", adam_num_steps=60)
+
+
+def box(
+    num_points: int, seed: int, size_m: tuple[float, float, float] = (4.0, 2.0, 1.5)
+) -> np.ndarray:
+    """Points on the faces of a box centred at the origin."""
+    rng = np.random.default_rng(seed)
+    points = rng.uniform(-0.5, 0.5, size=(num_points, 3))
+    face = rng.integers(0, 3, num_points)
+    points[np.arange(num_points), face] = np.sign(points[np.arange(num_points), face]) * 0.5
+    return points * size_m
+
+
+def street(seed: int, num_points: int = 1000) -> tuple[np.ndarray, np.ndarray]:
+    """Two walls that stand and two boxes that move, each sampled anew in the second cloud."""
+    rng = np.random.default_rng(seed)
+
+    def sample(moved: float) -> np.ndarray:
+        walls = rng.uniform([-10, 0, 0], [10, 0, 3], size=(num_points, 3))
+        walls[::2, 1] = 12.0
+        first = box(num_points // 2, int(rng.integers(1 << 30))) + [-5 + 0.8 * moved, 3, 1]
+        second = box(num_points // 2, int(rng.integers(1 << 30))) + [5, 8 - 0.5 * moved, 1]
+        return np.concatenate([walls, first, second])
+
+    return sample(0.0), sample(1.0)
+
+
+def reported_equals_recomputed(source, target, settings, solution) -> None:
+    weights = graph.knn_graph(source, settings.num_neighbors)
+    matrix = graph.laplacian(weights, settings.laplacian)
+    value = energy(
+        *(torch.from_numpy(x) for x in (solution.flow, source, target)),
+        graph.sparse_tensor(matrix, torch.float64, "cpu"),
+        settings.alpha,
+    )
+    reported = (solution.energy, solution.data, solution.smoothness)
+    np.testing.assert_allclose(reported, value, rtol=1e-9)
+
+
+@pytest.mark.parametrize("settings", [ObjectiveSettings(), ADAM])
+def test_identical_clouds_do_not_move_at_all(settings: ObjectiveSettings) -> None:
+    points = box(500, 0) + [400.0, -3e3, 7.0]
+    solution = solve(points, points[::-1], settings)
+    assert not solution.flow.any()
+    assert solution.energy == solution.data == solution.smoothness == 0.0
+
+
+@pytest.mark.parametrize("shift", [(0.4, 0.0, 0.0), (0.9, -0.5, 0.2), (30.0, -10.0, 5.0)])
+def test_a_translated_body_is_recovered_to_the_millimetre(shift: tuple[float, ...]) -> None:
+    source = box(800, 1)
+    settings = ObjectiveSettings(laplacian="row-sum-zero", pcg_tolerance=1e-6)
+    solution = solve(source, source + shift, settings)
+    np.testing.assert_allclose(solution.flow, np.broadcast_to(shift, (800, 3)), atol=1e-3)
+
+
+def test_two_bodies_move_their_own_ways() -> None:
+    bodies = np.concatenate([box(600, 2), box(600, 3) + [12.0, 0, 0]])
+    truth = np.repeat([[0.7, 0.0, 0.0], [0.0, -0.6, 0.1]], 600, axis=0)
+    settings = ObjectiveSettings(laplacian="row-sum-zero", pcg_tolerance=1e-6)
+    solution = solve(bodies, bodies + truth, settings)
+    np.testing.assert_allclose(solution.flow, truth, atol=1e-3)
+
+
+@pytest.mark.parametrize("kind", graph.LAPLACIANS)
+def test_pcg_and_adam_reach_the_same_minimum(kind: str) -> None:
+    source, target = street(4)
+    common = ObjectiveSettings(laplacian=kind, adam_num_steps=250, pcg_tolerance=1e-4)
+    pcg = solve(source, target, common)
+    adam = solve(source, target, dataclasses.replace(common, solver="adam"))
+    assert abs(pcg.energy - adam.energy) < 0.02 * adam.energy
+    assert pcg.energy < 0.5 * pcg.energies[0]
+    assert pcg.num_steps < adam.num_steps / 3
+    for solution in (pcg, adam):
+        assert solution.energy == min(solution.energies)
+        assert len(solution.energies) == solution.num_steps + 1
+        assert solution.flow.shape == source.shape and solution.flow.dtype == np.float64
+        reported_equals_recomputed(source, target, common, solution)
+
+
+def test_pcg_never_rises_without_continuation() -> None:
+    source, target = street(5)
+    settings = ObjectiveSettings(pcg_alpha_start=0.0, pcg_tolerance=0.0)
+    energies = np.array(solve(source, target, settings).energies)
+    assert len(energies) > 5
+    assert (np.diff(energies) <= 1e-12 * energies[:-1]).all()
+    # At tolerance 0 it ends at a fixed point, not at some limit of steps.
+    assert energies[-2] - energies[-1] < 1e-6 * energies[-1]
+
+
+def test_continuation_finds_a_lower_minimum_than_starting_at_the_final_alpha() -> None:
+    source, target = box(800, 6), box(800, 7) + [2.0, 0.5, 0.0]
+    stiff_first = solve(source, target, ObjectiveSettings(laplacian="row-sum-zero"))
+    at_once = ObjectiveSettings(laplacian="row-sum-zero", pcg_alpha_start=0.0)
+    assert stiff_first.energy < 0.95 * solve(source, target, at_once).energy
+
+
+@pytest.mark.parametrize("settings", [ObjectiveSettings(), ADAM])
+def test_an_initial_flow_is_where_it_starts(settings: ObjectiveSettings) -> None:
+    source, target = street(7, 400)
+    cold = solve(source, target, settings)
+    warm = solve(source, target, settings, initial=cold.flow)
+    np.testing.assert_allclose(warm.energies[0], cold.energy, rtol=1e-12)
+    assert warm.energy <= cold.energy
+    if settings.solver == "pcg":
+        assert warm.num_steps < cold.num_steps / 2
+
+
+@pytest.mark.parametrize("settings", [ObjectiveSettings(), ADAM])
+def test_same_input_gives_the_same_bytes(settings: ObjectiveSettings) -> None:
+    source, target = street(8)
+    first, second = (solve(source, target, settings) for _ in range(2))
+    assert first.flow.tobytes() == second.flow.tobytes()
+    assert first.energies == second.energies
+
+
+def test_input_is_left_alone_and_may_be_any_real_type() -> None:
+    source, target = (x.astype(np.float32) for x in street(9, 200))
+    initial = np.zeros(source.shape)
+    kept = source.copy(), target.copy()
+    solution = solve(source, target, initial=initial)
+    assert solution.flow.any() and not initial.any()
+    assert np.array_equal(source, kept[0]) and np.array_equal(target, kept[1])
+
+
+def test_map_coordinates_lose_nothing() -> None:
+    source, target = street(10, 400)
+    origin = np.array([2.0**19, 2.0**22, 64.0])
+    source, target = ((x * 2.0**20).round() / 2.0**20 for x in (source, target))
+    near = solve(source, target)
+    far = solve(source + origin, target + origin)
+    np.testing.assert_allclose(far.energy, near.energy, rtol=1e-6)
+
+
+@pytest.mark.parametrize("solver", ["pcg", "adam"])
+@pytest.mark.parametrize("kind", graph.LAPLACIANS)
+@pytest.mark.parametrize(("n", "m"), [(1, 1), (1, 40), (40, 1), (3, 2000), (2000, 3)])
+def test_any_sizes(n: int, m: int, kind: str, solver: str) -> None:
+    settings = ObjectiveSettings(solver=solver, laplacian=kind, adam_num_steps=20)
+    solution = solve(box(n, 0), box(m, 1) + [1.0, 0, 0], settings)
+    assert np.isfinite(solution.flow).all()
+    assert solution.energy <= solution.energies[0]
+
+
+def test_one_point_moves_to_the_mean_of_what_pulls_it() -> None:
+    # One forward match and two backward ones: E = |x - a|² + |x - a|² + |x - b|².
+    solution = solve([[0.0, 0, 0]], [[3.0, 0, 0], [6.0, 0, 0]], ObjectiveSettings())
+    np.testing.assert_allclose(solution.flow, [[4.0, 0, 0]], atol=1e-9)
+    np.testing.assert_allclose(solution.energy, 1 + 1 + 4)
+
+
+def test_a_far_target_is_reached() -> None:
+    source = box(300, 1)
+    solution = solve(source, source + [5000.0, 0, 0], ObjectiveSettings(laplacian="row-sum-zero"))
+    np.testing.assert_allclose(solution.flow.mean(axis=0), [5000.0, 0, 0], atol=1.0)
+
+
+def test_alpha_zero_and_a_radius_graph_work() -> None:
+    source, target = street(11, 300)
+    free = solve(source, target, ObjectiveSettings(alpha=0.0))
+    assert free.data < solve(source, target, ObjectiveSettings(alpha=1.0)).data
+    short = solve(source, target, ObjectiveSettings(radius_m=0.3, num_neighbors=20))
+    assert short.energy < short.energies[0]
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
+@pytest.mark.parametrize("settings", [ObjectiveSettings(), ADAM])
+def test_cuda_agrees_with_the_cpu(settings: ObjectiveSettings) -> None:
+    source, target = street(12)
+    cpu = solve(source, target, settings)
+    cuda = solve(source, target, settings, device="cuda")
+    np.testing.assert_allclose(cuda.energies[0], cpu.energies[0], rtol=1e-9)
+    np.testing.assert_allclose(cuda.energy, cpu.energy, rtol=5e-3)
+    again = solve(source, target, settings, device="cuda")
+    assert cuda.flow.tobytes() == again.flow.tobytes()
+
+
+@pytest.mark.parametrize(
+    ("message", "arguments"),
+    [
+        ("source: got no points", ([], [[0.0, 0, 0]])),
+        ("target: got no points", (np.zeros((5, 3)), np.zeros((0, 3)))),
+        ("target: 1 of 2 rows are NaN", (np.zeros((5, 3)), [[0, 0, 0], [0, np.nan, 0]])),
+        ("source: 1 of 1 rows are NaN or infinite", ([[np.inf, 0, 0]], [[0.0, 0, 0]])),
+        ("source: got shape (5, 4)", (np.zeros((5, 4)), [[0.0, 0, 0]])),
+        ("source: expected (n,3) numbers", ([["a", "b", "c"]], [[0.0, 0, 0]])),
+        ("initial: got shape (4, 3)", (np.zeros((5, 3)), np.zeros((5, 3)), None, np.zeros((4, 3)))),
+        ("device: got 'tpu'", (np.zeros((5, 3)), np.zeros((5, 3)), None, None, "tpu")),
+    ],
+)
+def test_bad_clouds_are_refused(message: str, arguments: tuple) -> None:
+    with pytest.raises(InputError) as raised:
+        solve(*arguments)
+    assert message in str(raised.value) and "\n" not in str(raised.value)
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a CUDA device")
+def test_an_absent_cuda_device_is_refused() -> None:
+    with pytest.raises(InputError, match="finds no CUDA device; use cpu"):
+        solve(np.zeros((5, 3)), np.zeros((5, 3)), device="cuda")
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("solver", "newton"),
+        ("laplacian", "cotangent"),
+        ("alpha", -1.0),
+        ("alpha", np.nan),
+        ("pcg_alpha_start", np.inf),
+        ("pcg_tolerance", -1e-3),
+        ("adam_learning_rate", 0.0),
+        ("radius_m", 0.0),
+        ("num_neighbors", 0),
+        ("adam_num_steps", 0),
+    ],
+)
+def test_bad_settings_are_refused(name: str, value: object) -> None:
+    with pytest.raises(InputError, match=rf"^{name}: got .*expected"):
+        ObjectiveSettings(**{name: value})

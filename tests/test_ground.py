@@ -1,0 +1,129 @@
+# SPDX-License-Identifier: MIT
+"""Ground on a slope with kerbs, against the true heights."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from densify.config import FlowSettings, GroundSettings
+from densify.stages.ground import height_above_ground
+from densify.types import Window
+from tests.scenes import GROUND, KERB_M, KERB_Y_M, Arc, Box, Scanner, Scene, World, car, street
+
+SETTINGS = GroundSettings()
+LOW_M = FlowSettings().min_height_m
+TRAILER = Box((9.0, 2.5, 1.2), Arc(14.0, 1.0, 0.2))  # lower than the scanner: its roof is seen
+
+
+@pytest.fixture(scope="module", params=[0.0, 0.05, -0.05], ids="slope {}".format)
+def heights(request):
+    """(estimated, true, box) of all points within 35 m, over a window of 5 sweeps."""
+    world = World((TRAILER, *street()), request.param)
+    scene = Scene(world, Arc(0, -1.5, 0.0, 8.0, 0.1), Scanner(sigma_m=0.01))
+    window = scene.window(4, 2)
+    found = height_above_ground(window, SETTINGS)
+    assert [len(h) for h in found] == [len(s.sweep) for s in window.sweeps]
+    assert all(h.dtype == np.float32 for h in found)
+    near = [np.linalg.norm(s.sweep.points, axis=1) < 35 for s in window.sweeps]
+    columns = [
+        (h[n], scene.height_m(f)[n], scene.scan(f).box[n], scene.scan(f).world[n])
+        for h, f, n in zip(found, window.frames, near, strict=True)
+    ]
+    return tuple(np.concatenate(c) for c in zip(*columns, strict=True))
+
+
+def test_ground_is_at_zero(heights):
+    found, _, box, world = heights
+    ground = box == GROUND
+    assert abs(np.median(found[ground])) < 0.04
+    clear_of_kerb = ground & (np.abs(np.abs(world[:, 1]) - KERB_Y_M) > 1.5)
+    assert np.quantile(np.abs(found[clear_of_kerb]), 0.98) < 0.1
+
+
+def test_no_ground_is_taken_for_an_object_even_at_kerbs(heights):
+    found, _, box, world = heights
+    ground = box == GROUND
+    assert (found[ground] < LOW_M).mean() > 0.999
+    kerb = ground & (np.abs(np.abs(world[:, 1]) - KERB_Y_M) < 1.0)
+    assert kerb.sum() > 1000 and found[kerb].max() < KERB_M + 0.12
+
+
+def test_sides_of_objects_are_above(heights):
+    found, true, box, _ = heights
+    sides = (box >= 0) & (true > LOW_M + 0.2)
+    assert sides.sum() > 5000
+    assert (found[sides] > LOW_M).mean() > 0.995
+
+
+def test_heights_of_what_stands_on_the_ground(heights):
+    found, true, box, _ = heights
+    error = np.abs(found - true)[(box >= 0) & (true < 2.5)]
+    assert np.median(error) < 0.05 and np.quantile(error, 0.95) < 0.15
+
+
+def test_a_roof_is_not_ground(heights):
+    found, true, box, world = heights
+    roof = (box == 0) & (world[:, 2] > world[box == 0, 2].max() - 0.1)
+    assert roof.sum() > 50
+    assert found[roof].min() > 0.7
+    assert np.median(np.abs(found - true)[roof]) < 0.06
+
+
+def with_points(window: Window, points: np.ndarray) -> Window:
+    """The key sweep with points appended to it."""
+    key = window[window.key]
+    s, n = key.sweep, len(points)
+    grown = replace(
+        s,
+        points=np.vstack([s.points, points]),
+        intensity=np.append(s.intensity, np.zeros(n, np.float32)),
+        offset_ns=np.append(s.offset_ns, np.zeros(n, np.int64)),
+        lidar=np.append(s.lidar, np.zeros(n, np.uint8)),
+        row=np.append(s.row, len(s) + np.arange(n)),
+    )
+    return replace(
+        window, sweeps=tuple(replace(r, sweep=grown) if r is key else r for r in window.sweeps)
+    )
+
+
+def test_stray_low_points_do_not_dig_holes():
+    scene = Scene(World(street(), 0.03), Arc(0, -1.5), Scanner(sigma_m=0.01))
+    window = scene.window(2, 1)
+    clean = height_above_ground(window, SETTINGS)
+    rng = np.random.default_rng(0)
+    places = np.stack([rng.uniform(5, 20, 12), rng.uniform(-3, 3, 12)], 1)
+    stray = np.column_stack([np.repeat(places, 3, 0), rng.uniform(-6, -4, 36)])
+    dirty = height_above_ground(with_points(window, stray), SETTINGS)
+    for before, after in zip(clean, dirty, strict=True):
+        assert np.abs(after[: len(before)] - before).max() < 0.15
+    assert dirty[1][-36:].max() < -1.5  # they are below it, not it
+
+
+def test_the_slope_limit_is_a_knob():
+    """A wide flat roof becomes ground only where the ground may rise that steeply."""
+    scene = Scene(World((Box((12, 12, 1.2), Arc(16, 0)),)), Arc(0, 0), Scanner())
+    window = scene.window(2, 0)
+    roof = (scene.scan(2).box == 0) & (scene.height_m(2) > 1.15)
+    strict = height_above_ground(window, GroundSettings(max_slope=0.02))[0][roof]
+    loose = height_above_ground(window, GroundSettings(max_slope=1.0))[0][roof]
+    assert np.median(strict) > 1.0
+    assert np.median(loose) < 0.3
+
+
+def test_the_window_counts_not_the_sweep_alone():
+    """What hides the road in one sweep has left it in another."""
+    scene = Scene(World((car(9, 0, 20, 1, size_m=(4.2, 3.6, 1.4)),)), Arc(0, 0))
+    window = scene.window(5, 4)
+    found = height_above_ground(window, SETTINGS)[4]
+    on_car = scene.scan(5).instance == 1
+    error = np.abs(found[on_car] - scene.height_m(5)[on_car])
+    assert np.median(error) < 0.1 and error.max() < 0.2
+
+
+def test_same_bytes_every_time():
+    scene = Scene(World(street(), 0.02), Arc(0, -1.5), Scanner(sigma_m=0.01))
+    a, b = (height_above_ground(scene.window(2, 1), SETTINGS) for _ in range(2))
+    assert all(x.tobytes() == y.tobytes() for x, y in zip(a, b, strict=True))

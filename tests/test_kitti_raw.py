@@ -1,0 +1,594 @@
+# SPDX-License-Identifier: MIT
+"""The KITTI raw reader on tiny drives written here, on broken ones, and on real ones."""
+
+import os
+from pathlib import Path
+from types import SimpleNamespace
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from densify import poses
+from densify.errors import InputError
+from densify.readers import open_sequence
+from densify.readers.describe import describe
+from densify.readers.files import format_frames
+from densify.readers.kitti_raw import KITTI_TRIGGER_LATENCY_NS, KittiRaw
+
+# The epoch nanoseconds of this text do not survive a float64 (multiples of 256 there).
+BASE_TEXT, BASE_NS = "2011-09-26 13:10:51", 1317042651_000_000_000
+PERIOD_NS = 103_500_007
+NUM_LINES = 8
+FRAMES = (2, 3, 5)
+SIZE = (40, 20)  # width, height
+
+R_VELO_TO_CAM = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])
+R_RECT = Rotation.from_euler("xyz", [0.01, -0.02, 0.005]).as_matrix()
+T_VELO_TO_CAM = np.array([0.01, -0.08, -0.27])
+K = np.array([[50.0, 0, 19.5], [0, 50.0, 9.5], [0, 0, 1]])
+OFFSET_02 = np.array([0.06, 0.0, 0.003])
+T_LIDAR_IMU = np.eye(4)
+T_LIDAR_IMU[:3, :3] = Rotation.from_euler("z", 0.4, degrees=True).as_matrix()
+T_LIDAR_IMU[:3, 3] = [-0.8, 0.3, -0.8]
+
+
+def stamp_ns(frame):
+    return BASE_NS + 158_069_617 + frame * PERIOD_NS
+
+
+def stamp_text(ns):
+    seconds, fraction = divmod(ns - BASE_NS, 1_000_000_000)
+    return f"2011-09-26 13:10:{51 + seconds:02d}.{fraction:09d}"
+
+
+def words(array):
+    return " ".join(f"{value:.17g}" for value in np.ravel(array))
+
+
+def write_stamps(path, offset_ns, blank=()):
+    lines = [
+        "" if frame in blank else stamp_text(stamp_ns(frame) + offset_ns)
+        for frame in range(NUM_LINES)
+    ]
+    path.write_text("\n".join(lines) + "\n")
+
+
+def write_oxts(drive, frames, offset_ns, speed_m_s=15.0, yaw=0.3):
+    """A straight drive at constant speed along the heading, on the Mercator plane."""
+    (drive / "oxts" / "data").mkdir(parents=True)
+    write_stamps(drive / "oxts" / "timestamps.txt", offset_ns)
+    scale = np.cos(np.deg2rad(49.0)) * 6_378_137.0
+    start = scale * np.log(np.tan(np.deg2rad(90 + 49.0) / 2))
+    for frame in frames:
+        # Latitude of the first record is 49 deg exactly, so that it gives the scale.
+        metres = speed_m_s * (frame - frames[0]) * PERIOD_NS / 1e9
+        north = start + metres * np.sin(yaw)
+        lat = np.rad2deg(2 * np.arctan(np.exp(north / scale))) - 90
+        lon = 8.4 + np.rad2deg(metres * np.cos(yaw) / scale)
+        values = [lat, lon, 114.5, 0.02, -0.01, yaw, *np.zeros(24)]
+        (drive / "oxts" / "data" / f"{frame:010d}.txt").write_text(words(values))
+
+
+@pytest.fixture
+def tree(tmp_path):
+    """A drive of three sweeps with two cameras (one gray) and oxts."""
+    date, drive = tmp_path / "2011_09_26", tmp_path / "2011_09_26" / "2011_09_26_drive_0099_sync"
+    velodyne = drive / "velodyne_points"
+    (velodyne / "data").mkdir(parents=True)
+    rng = np.random.default_rng(0)
+    points = {f: rng.uniform(0.05, 1, (7, 4)).astype("<f4") * [30, 9, 2, 1] for f in FRAMES}
+    for frame, columns in points.items():
+        points[frame] = columns.astype("<f4")
+        (velodyne / "data" / f"{frame:010d}.bin").write_bytes(points[frame].tobytes())
+    for name, offset in (("", 0), ("_start", -51_750_003), ("_end", 51_750_003)):
+        write_stamps(velodyne / f"timestamps{name}.txt", offset, blank=(4,))
+
+    P2, P0 = np.zeros((3, 4)), np.zeros((3, 4))
+    P2[:, :3] = P0[:, :3] = K
+    P2[:, 3] = K @ OFFSET_02
+    (date / "calib_cam_to_cam.txt").write_text(
+        "calib_time: 09-Jan-2012 13:57:47\n"
+        f"R_rect_00: {words(R_RECT)}\n"
+        f"S_rect_00: {words(SIZE)}\nP_rect_00: {words(P0)}\n"
+        f"S_rect_02: {words(SIZE)}\nP_rect_02: {words(P2)}\n"
+    )
+    (date / "calib_velo_to_cam.txt").write_text(
+        f"calib_time: x\nR: {words(R_VELO_TO_CAM)}\nT: {words(T_VELO_TO_CAM)}\n"
+    )
+    (date / "calib_imu_to_velo.txt").write_text(
+        f"R: {words(T_LIDAR_IMU[:3, :3])}\nT: {words(T_LIDAR_IMU[:3, 3])}\n"
+    )
+    rgb = rng.integers(0, 256, (SIZE[1], SIZE[0], 3), dtype=np.uint8)
+    gray = rng.integers(0, 256, (SIZE[1], SIZE[0]), dtype=np.uint8)
+    for name, image in (("image_00", gray), ("image_02", rgb[:, :, ::-1])):
+        (drive / name / "data").mkdir(parents=True)
+        for frame in (2, 3):
+            cv2.imwrite(str(drive / name / "data" / f"{frame:010d}.png"), image)
+    write_stamps(drive / "image_02" / "timestamps.txt", KITTI_TRIGGER_LATENCY_NS + 5, blank=(5,))
+    (drive / "image_03").mkdir()  # not in the calibration
+    write_oxts(drive, (1, 2, 3, 4, 5), 17_000_000)
+    return SimpleNamespace(
+        drive=drive,
+        date=date,
+        points=points,
+        rgb=rgb,
+        gray=gray,
+        calib=date / "calib_cam_to_cam.txt",
+        bin=velodyne / "data" / "0000000003.bin",
+    )
+
+
+def one_line(error, *parts):
+    message = str(error.value)
+    assert "\n" not in message
+    for part in parts:
+        assert str(part) in message, message
+
+
+# Reading back exactly
+
+
+def test_sweep_reads_back_exactly(tree):
+    sequence = KittiRaw(tree.drive)
+    assert sequence.name == "2011_09_26_drive_0099_sync"
+    assert tuple(sequence.frames) == FRAMES
+    assert sequence.truth is None
+    for frame in FRAMES:
+        sweep = sequence[frame]
+        np.testing.assert_array_equal(sweep.points, tree.points[frame][:, :3])
+        np.testing.assert_array_equal(sweep.intensity, tree.points[frame][:, 3])
+        np.testing.assert_array_equal(sweep.row, np.arange(7))
+        assert (sweep.points.dtype, sweep.intensity.dtype) == (np.float64, np.float32)
+        assert (sweep.row.dtype, sweep.lidar.dtype) == (np.int64, np.uint8)
+        assert sweep.frame == frame
+
+
+def test_every_nanosecond_of_a_stamp_survives(tree):
+    stamp = KittiRaw(tree.drive)[3].stamp_ns
+    assert stamp == stamp_ns(3) == 1317042651_468_569_638
+    assert int(float(stamp)) != stamp  # a float would have lost it
+
+
+def test_the_guessed_reader_and_a_relative_path_open_it_too(tree, monkeypatch):
+    assert tuple(open_sequence(tree.drive).frames) == FRAMES
+    monkeypatch.chdir(tree.drive)
+    sequence = KittiRaw(".")
+    assert set(sequence.cameras) == {"image_00", "image_02"}
+    assert sequence.T_world_lidar(2).shape == (4, 4)
+
+
+def test_firing_times_follow_the_azimuth_clockwise(tree):
+    angle = np.deg2rad([0, 90, -90, 179.9, -179.9])
+    columns = np.zeros((5, 4), "<f4")
+    columns[:, 0], columns[:, 1] = 10 * np.cos(angle), 10 * np.sin(angle)
+    tree.bin.write_bytes(columns.tobytes())
+    offset = KittiRaw(tree.drive)[3].offset_ns
+    revolution_ns = 2 * 51_750_003
+    expected = revolution_ns * np.array([0, -0.25, 0.25, -0.49972, 0.49972])
+    assert offset.dtype == np.int64
+    np.testing.assert_allclose(offset, expected, atol=1000)  # left is seen before forward
+
+
+def test_a_reference_time_off_the_middle_shifts_every_offset(tree):
+    before = KittiRaw(tree.drive)[3]
+    write_stamps(tree.drive / "velodyne_points" / "timestamps.txt", 1_000_000)
+    after = KittiRaw(tree.drive)[3]
+    np.testing.assert_array_equal(
+        before.stamp_ns + before.offset_ns, after.stamp_ns + after.offset_ns
+    )
+
+
+def test_invalid_rows_are_dropped_and_the_rest_keep_their_row(tree):
+    columns = np.ones((8, 4), "<f4") * np.arange(1, 9, dtype="<f4")[:, None]
+    columns[0] = 0
+    columns[2, 1] = np.nan
+    columns[3, 3] = np.nan
+    columns[4, :3] = 0  # at the origin, with a reflectance
+    columns[5, 0] = np.inf
+    columns[6, :2] = 0  # straight up is a place
+    columns[7] = 0
+    tree.bin.write_bytes(columns.tobytes())
+    sweep = KittiRaw(tree.drive)[3]
+    np.testing.assert_array_equal(sweep.row, [1, 6])
+    np.testing.assert_array_equal(sweep.points, columns[[1, 6], :3])
+    np.testing.assert_array_equal(sweep.intensity, columns[[1, 6], 3])
+    assert sweep.offset_ns.shape == (2,)
+
+
+def test_cameras_project_as_the_calibration_chain_says(tree):
+    cameras = KittiRaw(tree.drive).cameras
+    assert list(cameras) == ["image_00", "image_02"]
+    camera = cameras["image_02"]
+    assert (camera.width_px, camera.height_px) == SIZE
+    assert camera.distortion == ()
+    point = np.array([12.0, 1.5, -0.7])
+    rectified = R_RECT @ (R_VELO_TO_CAM @ point + T_VELO_TO_CAM)
+    P = np.hstack([K, (K @ OFFSET_02)[:, None]])
+    expected = P @ np.append(rectified, 1)
+    got = camera.K @ poses.transform(camera.T_cam_lidar, point[None])[0]
+    np.testing.assert_allclose(got, expected, rtol=1e-12)
+
+
+def test_images_are_rgb_and_gray_ones_become_rgb(tree):
+    sequence = KittiRaw(tree.drive)
+    np.testing.assert_array_equal(sequence.image("image_02", 2), tree.rgb)
+    np.testing.assert_array_equal(sequence.image("image_00", 3), tree.gray[..., None].repeat(3, 2))
+    assert sequence.image_frames("image_02") == (2, 3)
+
+
+def test_jpeg_images_are_found(tree):
+    smooth = np.full((SIZE[1], SIZE[0], 3), (10, 100, 200), np.uint8)
+    cv2.imwrite(str(tree.drive / "image_02" / "data" / "0000000005.jpg"), smooth)
+    image = KittiRaw(tree.drive).image("image_02", 5)
+    np.testing.assert_allclose(image[5, 5], [200, 100, 10], atol=3)
+
+
+def test_image_stamps_are_those_of_the_exposure(tree):
+    sequence = KittiRaw(tree.drive)
+    assert sequence.image_stamp_ns("image_02", 3) == stamp_ns(3) + 5
+    assert sequence.image_stamp_ns("image_02", 5) == stamp_ns(5)  # none recorded
+    assert sequence.image_stamp_ns("image_00", 3) == stamp_ns(3)  # no file at all
+
+
+def test_without_stamps_frames_are_nominally_ten_hertz(tree):
+    for path in (tree.drive / "velodyne_points").glob("timestamps*.txt"):
+        path.unlink()
+    sweep = KittiRaw(tree.drive)[3]
+    assert sweep.stamp_ns == 300_000_000
+    assert sweep.offset_ns is None
+
+
+def test_without_start_and_end_there_are_no_firing_times(tree):
+    (tree.drive / "velodyne_points" / "timestamps_end.txt").unlink()
+    sweep = KittiRaw(tree.drive)[3]
+    assert sweep.stamp_ns == stamp_ns(3)
+    assert sweep.offset_ns is None
+
+
+def test_a_drive_of_sweeps_alone_opens(tree):
+    for path in tree.date.glob("calib*.txt"):
+        path.unlink()
+    for folder in tree.drive.glob("image_*"):
+        folder.rename(tree.date / folder.name)
+    (tree.drive / "oxts").rename(tree.date / "oxts")
+    sequence = KittiRaw(tree.drive)
+    assert dict(sequence.cameras) == {}
+    assert len(sequence[2]) == 7
+    assert "cameras" in describe(sequence)
+
+
+# Poses
+
+
+def test_world_is_the_first_oxts_record(tree):
+    (tree.drive / "oxts" / "timestamps.txt").unlink()  # then records are taken as they are
+    for frame in (1, 4):
+        (tree.drive / "oxts" / "data" / f"{frame:010d}.txt").unlink()
+    sequence = KittiRaw(tree.drive)
+    np.testing.assert_allclose(
+        sequence.T_world_lidar(2), poses.inverse(T_LIDAR_IMU), rtol=0, atol=1e-9
+    )
+
+
+def test_poses_are_interpolated_to_the_sweep(tree):
+    """Constant speed: each step is speed times the time between sweeps, whatever the oxts lag."""
+    sequence = KittiRaw(tree.drive)
+    T_2, T_3, T_5 = (sequence.T_world_lidar(frame) for frame in (2, 3, 5))
+    step = 15.0 * PERIOD_NS / 1e9
+    np.testing.assert_allclose(np.linalg.norm((T_3 - T_2)[:3, 3]), step, atol=1e-5)
+    np.testing.assert_allclose(np.linalg.norm((T_5 - T_3)[:3, 3]), 2 * step, atol=1e-5)
+    # Sweep 3 comes 17 ms before its record: behind it by that much of the way.
+    record = sequence._T_world_imu(3) @ poses.inverse(T_LIDAR_IMU)
+    np.testing.assert_allclose(
+        poses.inverse(record) @ T_3 @ [0, 0, 0, 1],
+        poses.inverse(record) @ (record + (T_2 - T_3) * 17e6 / PERIOD_NS) @ [0, 0, 0, 1],
+        atol=1e-5,
+    )
+
+
+@pytest.mark.parametrize(("lag_ns", "unused"), [(17_000_000, 4), (-17_000_000, 2)])
+def test_only_the_records_around_a_sweep_count(tree, lag_ns, unused):
+    write_stamps(tree.drive / "oxts" / "timestamps.txt", lag_ns)
+    before = KittiRaw(tree.drive).T_world_lidar(3)
+    path = tree.drive / "oxts" / "data" / f"{unused:010d}.txt"
+    values = path.read_text().split()
+    path.write_text(" ".join([*values[:2], "999", *values[3:]]))  # altitude
+    np.testing.assert_array_equal(KittiRaw(tree.drive).T_world_lidar(3), before)
+
+
+def test_at_the_ends_of_the_records_poses_are_extrapolated(tree):
+    whole = KittiRaw(tree.drive).T_world_lidar(2)
+    whole_3 = KittiRaw(tree.drive).T_world_lidar(3)
+    (tree.drive / "oxts" / "data" / "0000000001.txt").unlink()  # nothing before sweep 2 now
+    cut = KittiRaw(tree.drive)
+    np.testing.assert_allclose(
+        np.linalg.norm((cut.T_world_lidar(3) - cut.T_world_lidar(2))[:3, 3]),
+        np.linalg.norm((whole_3 - whole)[:3, 3]),
+        atol=1e-5,
+    )
+
+
+def test_attitude_is_yaw_after_pitch_after_roll(tree):
+    sequence = KittiRaw(tree.drive)
+    cy, sy, cp, sp, cr, sr = (f(a) for a in (0.3, -0.01, 0.02) for f in (np.cos, np.sin))
+    Rz = np.array([[cy, -sy, 0], [sy, cy, 0], [0, 0, 1]])
+    Ry = np.array([[cp, 0, sp], [0, 1, 0], [-sp, 0, cp]])
+    Rx = np.array([[1, 0, 0], [0, cr, -sr], [0, sr, cr]])
+    np.testing.assert_allclose(sequence._T_mercator_imu(2)[:3, :3], Rz @ Ry @ Rx, atol=1e-12)
+
+
+# Everything that can be wrong
+
+
+def test_missing_folder(tmp_path):
+    with pytest.raises(InputError) as error:
+        KittiRaw(tmp_path / "nowhere")
+    one_line(error, tmp_path / "nowhere", "no such folder")
+
+
+def test_folder_without_sweeps(tmp_path):
+    with pytest.raises(InputError) as error:
+        KittiRaw(tmp_path)
+    one_line(error, tmp_path, "velodyne_points/data")
+    (tmp_path / "velodyne_points" / "data").mkdir(parents=True)
+    with pytest.raises(InputError) as error:
+        KittiRaw(tmp_path)
+    one_line(error, "no sweeps", ".bin")
+
+
+@pytest.mark.parametrize("frame", [-1, 4, 120])
+def test_missing_frame_names_those_that_exist(tree, frame):
+    sequence = KittiRaw(tree.drive)
+    for ask in (sequence.__getitem__, sequence.T_world_lidar):
+        with pytest.raises(InputError) as error:
+            ask(frame)
+        one_line(error, tree.drive, f"frame {frame};", "2-3, 5")
+
+
+def test_truncated_sweep(tree):
+    tree.bin.write_bytes(tree.bin.read_bytes()[:-5])
+    with pytest.raises(InputError) as error:
+        KittiRaw(tree.drive)[3]
+    one_line(error, tree.bin, "got 107 bytes", "multiple of 16", "11 too many")
+
+
+@pytest.mark.parametrize("rows", [0, 3])
+def test_sweep_without_points(tree, rows):
+    tree.bin.write_bytes(np.zeros((rows, 4), "<f4").tobytes())
+    with pytest.raises(InputError) as error:
+        KittiRaw(tree.drive)[3]
+    one_line(error, tree.bin, "holds no points", "frame 3")
+
+
+def test_unknown_camera_names_those_that_exist(tree):
+    sequence = KittiRaw(tree.drive)
+    for ask in (sequence.image, sequence.image_stamp_ns, lambda c, _: sequence.image_frames(c)):
+        with pytest.raises(InputError) as error:
+            ask("image_03", 2)
+        one_line(error, "'image_03'", "image_00, image_02")
+
+
+def test_missing_image(tree):
+    with pytest.raises(InputError) as error:
+        KittiRaw(tree.drive).image("image_02", 5)
+    one_line(error, "no image_02 image of frame 5", "2-3")
+
+
+@pytest.mark.parametrize("data", [b"", b"not an image"])
+def test_broken_image(tree, data):
+    path = tree.drive / "image_02" / "data" / "0000000002.png"
+    path.write_bytes(data)
+    with pytest.raises(InputError) as error:
+        KittiRaw(tree.drive).image("image_02", 2)
+    one_line(error, path, f"{len(data)} bytes", "PNG or JPEG")
+
+
+def test_image_of_another_size(tree):
+    path = tree.drive / "image_02" / "data" / "0000000002.png"
+    cv2.imwrite(str(path), np.zeros((SIZE[1], SIZE[0] - 1, 3), np.uint8))
+    with pytest.raises(InputError) as error:
+        KittiRaw(tree.drive).image("image_02", 2)
+    one_line(error, path, "39 x 20", "40 x 20", "image_02")
+
+
+@pytest.mark.parametrize("name", ["calib_cam_to_cam.txt", "calib_velo_to_cam.txt"])
+def test_missing_calibration(tree, name):
+    (tree.date / name).unlink()
+    with pytest.raises(InputError) as error:
+        KittiRaw(tree.drive)
+    one_line(error, tree.date / name, "missing")
+
+
+def test_calibration_that_is_not_text(tree):
+    tree.calib.write_bytes(b"\xff\xfe\x00\x81")
+    with pytest.raises(InputError) as error:
+        KittiRaw(tree.drive)
+    one_line(error, tree.calib, "not a text file")
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "says"),
+    [
+        ("R_rect_00", None, "no key R_rect_00"),
+        ("S_rect_02", None, "no key S_rect_02"),
+        ("R_rect_00", "1 0 0 0 1 0 0 0", "got 8 values, expected 9"),
+        ("R_rect_00", "1 0 0 0 one 0 0 0 1", "'one'"),
+        ("R_rect_00", "1 0 0 0 nan 0 0 0 1", "not finite"),
+        ("R_rect_00", "1 0 0 0 1 0 0 0 1.01", "not a rotation"),
+        ("R_rect_00", "1 0 0 0 1 0 0 0 -1", "not a rotation"),
+        ("P_rect_02", words(np.zeros(12)), "positive focal lengths"),
+        ("P_rect_02", "50 0 20 0 0 50 10 0 0 0 2 0", "last row 0 0 1"),
+        ("S_rect_02", "40 20.5", "whole pixels"),
+        ("S_rect_02", "0 20", "whole pixels"),
+    ],
+)
+def test_malformed_calibration_names_file_and_key(tree, key, value, says):
+    lines = [x for x in tree.calib.read_text().splitlines() if not x.startswith(key)]
+    tree.calib.write_text("\n".join([*lines, *([f"{key}: {value}"] if value else [])]))
+    with pytest.raises(InputError) as error:
+        KittiRaw(tree.drive)
+    one_line(error, tree.calib, key, says)
+
+
+def test_no_oxts_says_what_to_do(tree):
+    (tree.drive / "oxts").rename(tree.date / "oxts")
+    with pytest.raises(InputError) as error:
+        KittiRaw(tree.drive).T_world_lidar(3)
+    one_line(error, "no poses", "register.source=kiss-icp")
+
+
+def test_missing_oxts_record(tree):
+    (tree.drive / "oxts" / "data" / "0000000003.txt").unlink()
+    with pytest.raises(InputError) as error:
+        KittiRaw(tree.drive).T_world_lidar(3)
+    one_line(error, "no oxts record of frame 3", "1-2, 4-5")
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("1 2 3", "got 3 values, expected 30"),
+        (words([91, *np.zeros(29)]), "latitude of 91"),
+        (" ".join(["x"] * 30), "'x'"),
+    ],
+)
+def test_malformed_oxts(tree, text, says):
+    path = tree.drive / "oxts" / "data" / "0000000003.txt"
+    path.write_text(text)
+    with pytest.raises(InputError) as error:
+        KittiRaw(tree.drive).T_world_lidar(3)
+    one_line(error, path, says)
+
+
+def test_missing_imu_calibration(tree):
+    (tree.date / "calib_imu_to_velo.txt").unlink()
+    sequence = KittiRaw(tree.drive)
+    with pytest.raises(InputError) as error:
+        sequence.T_world_lidar(3)
+    one_line(error, "calib_imu_to_velo.txt", "missing")
+
+
+@pytest.mark.parametrize(
+    "text", ["yesterday", "2011-09-26 13:10:51.1234567890", "2011-13-26 13:10:51"]
+)
+def test_malformed_stamp_names_file_and_line(tree, text):
+    path = tree.drive / "velodyne_points" / "timestamps.txt"
+    lines = path.read_text().splitlines()
+    lines[3] = text
+    path.write_text("\n".join(lines))
+    with pytest.raises(InputError) as error:
+        KittiRaw(tree.drive)
+    one_line(error, path, "line 4", repr(text), "2011-09-26 13:10:51.158069617")
+
+
+@pytest.mark.parametrize("name", ["timestamps.txt", "timestamps_start.txt", "timestamps_end.txt"])
+def test_sweep_without_its_stamp(tree, name):
+    path = tree.drive / "velodyne_points" / name
+    lines = path.read_text().splitlines()
+    path.write_text("\n".join([*lines[:3], "", *lines[4:]]))
+    with pytest.raises(InputError) as error:
+        KittiRaw(tree.drive)[3]
+    one_line(error, path, "frame 3", "blank line", "line 4")
+    path.write_text("\n".join(lines[:4]))
+    with pytest.raises(InputError) as error:
+        KittiRaw(tree.drive)[5]
+    one_line(error, path, "frame 5", "4 lines", "line 6")
+
+
+def test_sweep_that_ends_before_it_starts(tree):
+    path = tree.drive / "velodyne_points" / "timestamps_end.txt"
+    write_stamps(path, -60_000_000)
+    with pytest.raises(InputError) as error:
+        KittiRaw(tree.drive)[3]
+    one_line(error, path, "frame 3", "before it starts")
+
+
+# What people see
+
+
+def test_ranges():
+    assert format_frames([]) == "none"
+    assert format_frames([7]) == "7"
+    assert format_frames([96, 97, 98, 100, 3]) == "3, 96-98, 100"
+    assert format_frames(range(0, 100, 2)) == "0, 2, 4, 6, 8, 10, 12, ..., 98"
+
+
+def test_description_of_a_drive(tree):
+    lines = describe(KittiRaw(tree.drive)).splitlines()
+    table = {line.split("  ")[0]: line.split("  ", 1)[1].strip() for line in lines}
+    assert table["name"] == "2011_09_26_drive_0099_sync"
+    assert table["frames"] == "2-3, 5 (3, 1 missing between them)"
+    assert table["rate"] == "9.66 Hz"
+    assert table["points"] == "7 in frame 2, 7 in frame 5"
+    assert table["image_02"] == "40 x 20 px, fx 50.0 px, rectified, 2 images: 2-3"
+    assert table["poses"] == "yes, a path of 4.7 m"
+    assert table["truth"] == "none"
+    assert str(stamp_ns(2)) in table["stamps"]
+    starts = {len(line) - len(line.split("  ", 1)[1].lstrip()) for line in lines}
+    assert len(starts) == 1  # aligned
+
+
+def test_description_says_what_is_not_there(tree):
+    (tree.drive / "oxts").rename(tree.date / "oxts")
+    for frame in (3, 5):
+        (tree.drive / "velodyne_points" / "data" / f"{frame:010d}.bin").unlink()
+    (tree.drive / "velodyne_points" / "timestamps_start.txt").unlink()
+    text = describe(KittiRaw(tree.drive))
+    assert "unknown, one sweep" in text
+    assert "none: sweeps cannot be deskewed" in text
+    assert "register.source=kiss-icp" in text
+
+
+# Real drives
+
+
+@pytest.fixture(scope="module")
+def kitti():
+    folder = os.environ.get("DENSIFY_TEST_DATA")
+    if not folder:
+        pytest.skip("DENSIFY_TEST_DATA is not set: no real KITTI drives")
+    return Path(folder) / "kitti" / "2011_09_26"
+
+
+@pytest.mark.parametrize(
+    ("drive", "frames", "cameras"),
+    [("0013", range(96, 136), ["image_02"]), ("0002", range(10), ["image_02", "image_03"])],
+)
+def test_real_drive(kitti, drive, frames, cameras):
+    sequence = KittiRaw(kitti / f"2011_09_26_drive_{drive}_sync")
+    assert tuple(sequence.frames) == tuple(frames)
+    assert list(sequence.cameras) == cameras
+    sweep = sequence[frames[5]]
+    assert 110_000 < len(sweep) < 130_000
+    assert np.abs(sweep.offset_ns).max() < 52_000_000
+    assert np.ptp(sweep.offset_ns) > 100_000_000
+    for name in cameras:
+        camera = sequence.cameras[name]
+        assert sequence.image(name, frames[5]).shape == (375, 1242, 3)
+        lag_ns = sequence.image_stamp_ns(name, frames[5]) - sweep.stamp_ns
+        assert abs(lag_ns) < 1_000_000
+        p = poses.transform(camera.T_cam_lidar, sweep.points)
+        u, v, _ = (camera.K @ p[p[:, 2] > 1].T) / p[p[:, 2] > 1, 2]
+        inside = (abs(u - 621) < 621) & (abs(v - 187) < 187)
+        assert 15_000 < inside.sum() < 25_000
+        assert np.median(v[inside]) > 187  # mostly road, below the horizon
+
+
+def test_real_cameras_see_the_same_points_a_baseline_apart(kitti):
+    cameras = KittiRaw(kitti / "2011_09_26_drive_0002_sync").cameras
+    T = cameras["image_03"].T_cam_lidar @ poses.inverse(cameras["image_02"].T_cam_lidar)
+    np.testing.assert_allclose(T[:3, :3], np.eye(3), atol=1e-6)
+    np.testing.assert_allclose(T[:3, 3], [-0.533, 0, 0], atol=0.005)
+
+
+def test_real_poses_are_smooth_once_interpolated(kitti):
+    """A sweep's own oxts record is 12 to 22 ms away: taken as it is, speed jumps by metres per
+    second from sweep to sweep."""
+    sequence = KittiRaw(kitti / "2011_09_26_drive_0013_sync")
+    path = np.array([sequence.T_world_lidar(frame)[:3, 3] for frame in sequence.frames])
+    stamps = np.array([sequence[frame].stamp_ns for frame in sequence.frames])
+    speed = np.linalg.norm(np.diff(path, axis=0), axis=1) / np.diff(stamps) * 1e9
+    assert 10 < speed.min() < speed.max() < 15
+    assert np.abs(np.diff(speed, 2)).max() < 0.3

@@ -1,0 +1,148 @@
+# SPDX-License-Identifier: MIT
+"""The package as it is installed: lazy, whole, and the one that is meant."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import subprocess
+import sys
+from importlib.metadata import entry_points, version
+from pathlib import Path
+
+import pytest
+
+import densify
+from densify.config import Config, as_mapping, presets, resolve
+
+CHECKOUT = Path(__file__).parents[1]
+HEAVY = {"numpy", "scipy", "torch", "open3d", "kiss_icp", "cv2", "laspy"}
+
+needs_installation = pytest.mark.skipif(
+    "DENSIFY_TEST_INSTALLED" not in os.environ,
+    reason="DENSIFY_TEST_INSTALLED is not set: these tests may run on the checkout",
+)
+
+
+def modules_after(code: str) -> set[str]:
+    """Top-level modules that a fresh interpreter holds after the code."""
+    code += "\nimport json, sys; print('\\n' + json.dumps(sorted(sys.modules)))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    return {name.partition(".")[0] for name in json.loads(done.stdout.splitlines()[-1])}
+
+
+def test_import_is_light() -> None:
+    assert not HEAVY & modules_after("import densify, densify.config, densify.cli")
+
+
+@pytest.mark.parametrize("arguments", [["--help"], ["--version"]], ids=" ".join)
+def test_help_is_light(arguments: list[str]) -> None:
+    code = (
+        "from densify.cli import main\n"
+        f"try:\n    main({arguments!r})\nexcept SystemExit as end:\n    assert end.code == 0"
+    )
+    assert not HEAVY & modules_after(code)
+
+
+@pytest.mark.parametrize("verb", ["run", "compare", "flow", "info", "simulate"])
+def test_help_of_every_verb_is_light(verb: str) -> None:
+    code = (
+        "from densify.cli import main\n"
+        f"try:\n    main([{verb!r}, '--help'])\nexcept SystemExit as end:\n    assert end.code == 0"
+    )
+    assert not HEAVY & modules_after(code)
+
+
+def test_opening_a_recording_needs_no_torch() -> None:
+    assert not {"torch", "kiss_icp"} & modules_after("import densify; densify.open_sequence")
+
+
+@pytest.mark.parametrize("name", [n for n in dir(densify) if not n.startswith("_")])
+def test_public_names_exist(name: str) -> None:
+    assert getattr(densify, name).__name__ == name
+
+
+def test_unknown_name_is_an_attribute_error() -> None:
+    with pytest.raises(AttributeError, match="no attribute 'densfy'"):
+        _ = densify.densfy
+
+
+@needs_installation
+def test_one_version() -> None:
+    assert version("densify") == densify.__version__
+    assert f"## {densify.__version__}" in (CHECKOUT / "CHANGES.md").read_text("utf-8")
+
+
+@needs_installation
+def test_console_script() -> None:
+    scripts = [e for e in entry_points(group="console_scripts") if e.name == "densify"]
+    assert scripts and scripts[0].value == "densify.cli:script"
+
+
+def test_presets_are_those_of_the_repository() -> None:
+    sources = {path.stem: path for path in (CHECKOUT / "configs").glob("*.yaml")}
+    assert set(presets()) == set(sources)
+    for name, path in presets().items():
+        assert path.read_bytes() == sources[name].read_bytes()
+
+
+@needs_installation
+def test_the_installed_package_is_tested() -> None:
+    home = Path(densify.__file__).resolve().parent
+    assert CHECKOUT not in home.parents, f"{home} is the checkout, not an installed package"
+    assert all(path.parent == home / "configs" for path in presets().values())
+    sources = {p.relative_to(CHECKOUT / "densify") for p in (CHECKOUT / "densify").rglob("*.py")}
+    missing = sorted(str(path) for path in sources if not (home / path).is_file())
+    assert not missing
+
+
+def test_the_readme_names_knobs_that_exist() -> None:
+    knobs = re.findall(
+        r"`(?:--set )?([a-z]+\.[a-z_]+)(=[^`]+)?`", (CHECKOUT / "README.md").read_text("utf-8")
+    )
+    sections = as_mapping(Config())
+    named = [(*name.split("."), value) for name, value in knobs if name.split(".")[0] in sections]
+    assert len(named) >= 4
+    for section, key, value in named:
+        resolve(None, [f"{section}.{key}{value or '=' + str(sections[section][key])}"])
+
+
+def test_every_source_file_starts_with_its_license() -> None:
+    for folder in ("densify", "examples", "tests"):
+        for path in (CHECKOUT / folder).rglob("*.py"):
+            lines = path.read_text("utf-8").splitlines()
+            assert lines[0] == "# SPDX-License-Identifier: MIT", path
+            assert len(lines) == 1 or lines[1].startswith('"""'), f"{path}: no module docstring"
+
+
+def test_no_library_code_exits_prints_or_asserts() -> None:
+    for path in (CHECKOUT / "densify").rglob("*.py"):
+        if "cli" in path.parts or path.name == "__main__.py":
+            continue
+        text = path.read_text("utf-8")
+        found = re.search(r"^\s*(print\(|assert |sys\.exit|raise SystemExit)", text, re.MULTILINE)
+        assert not found, f"{path}: {found and found.group()}"
+
+
+def test_stages_import_no_other_stage() -> None:
+    for path in (CHECKOUT / "densify" / "stages").glob("*.py"):
+        assert "densify.stages" not in path.read_text("utf-8"), path
+
+
+DOORS = {
+    "open3d": "densify/street/",
+    "kiss_icp": "densify/stages/register.py",
+    "laspy": "densify/output/cloud_laz.py",
+    "torch": "densify/flow/",
+}
+
+
+@pytest.mark.parametrize("package", DOORS)
+def test_heavy_packages_have_one_door(package: str) -> None:
+    for path in (CHECKOUT / "densify").rglob("*.py"):
+        where = path.relative_to(CHECKOUT).as_posix()
+        imports = re.search(
+            rf"^\s*(import|from) {package}\b", path.read_text("utf-8"), re.MULTILINE
+        )
+        assert not imports or where.startswith(DOORS[package]), where

@@ -1,0 +1,96 @@
+# SPDX-License-Identifier: MIT
+"""Rigid motions: the group's laws, and the exponential against its series."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.linalg import expm
+
+from densify import poses
+
+small = st.floats(-1e-6, 1e-6)
+any_size = st.floats(-1.7, 1.7)  # a rotation vector of at most 1.7 · sqrt(3) < pi
+metres = st.floats(-200, 200)
+twists = st.tuples(
+    st.one_of(st.tuples(small, small, small), st.tuples(any_size, any_size, any_size)),
+    st.tuples(metres, metres, metres),
+).map(lambda parts: np.array([*parts[0], *parts[1]]))
+
+
+@given(twists, twists)
+def test_closure(a, b):
+    T = poses.exp(a) @ poses.exp(b)
+    np.testing.assert_allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(T[:3, :3]) == pytest.approx(1)
+    assert np.array_equal(T[3], [0, 0, 0, 1])
+
+
+@given(twists)
+def test_inverse(twist):
+    T = poses.exp(twist)
+    np.testing.assert_allclose(T @ poses.inverse(T), np.eye(4), atol=1e-10)
+    np.testing.assert_allclose(poses.inverse(T) @ T, np.eye(4), atol=1e-10)
+
+
+@given(twists, twists, twists)
+def test_transform_associates(a, b, c):
+    A, B = poses.exp(a), poses.exp(b)
+    points = np.outer([0.0, 1.0, -3.0], c[3:])
+    np.testing.assert_allclose(
+        poses.transform(A, poses.transform(B, points)), poses.transform(A @ B, points), atol=1e-9
+    )
+
+
+@given(twists)
+def test_log_undoes_exp(twist):
+    # at a millionth of a radian as well: no division by the vanishing angle
+    np.testing.assert_allclose(poses.log(poses.exp(twist)), twist, rtol=1e-9, atol=1e-12)
+
+
+def test_identity_is_exact():
+    assert np.array_equal(poses.log(np.eye(4)), np.zeros(6))
+    assert np.array_equal(poses.exp(np.zeros(6)), np.eye(4))
+    points = np.random.default_rng(0).normal(size=(20, 3)) * 100
+    assert np.array_equal(poses.transform(np.eye(4), points), points)
+    assert np.array_equal(poses.inverse(np.eye(4)), np.eye(4))
+
+
+@given(twists)
+def test_rotation_is_the_matrix_exponential(twist):
+    x, y, z = twist[:3]
+    skew = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    np.testing.assert_allclose(poses.exp(twist)[:3, :3], expm(skew), atol=1e-12)
+
+
+def test_left_turn_by_hand():
+    T = poses.exp(np.array([0, 0, np.pi / 2, 1.0, 2.0, 3.0]))
+    np.testing.assert_allclose(poses.transform(T, np.array([[1.0, 0, 0]])), [[1, 3, 3]], atol=1e-12)
+
+
+@given(st.lists(twists, min_size=1, max_size=8), st.integers(0, 1000))
+def test_transform_each_is_exp_of_every_point(each, seed):
+    points = np.random.default_rng(seed).normal(size=(len(each), 3)) * 50
+    one_by_one = [
+        poses.transform(poses.exp(t), p[None])[0] for t, p in zip(each, points, strict=True)
+    ]
+    np.testing.assert_allclose(poses.transform_each(np.array(each), points), one_by_one, atol=1e-9)
+
+
+@given(twists, twists)
+def test_interpolate_meets_both_ends_and_goes_evenly(a, b):
+    A, B = poses.exp(a), poses.exp(a) @ poses.exp(b)
+    np.testing.assert_allclose(poses.interpolate(A, B, 0.0), A, atol=1e-9)
+    np.testing.assert_allclose(poses.interpolate(A, B, 1.0), B, atol=1e-9)
+    third = poses.inverse(A) @ poses.interpolate(A, B, 1 / 3)
+    np.testing.assert_allclose(poses.log(third), b / 3, atol=1e-8)
+
+
+def test_interpolate_extrapolates():
+    A, B = np.eye(4), poses.exp(np.array([0, 0, 0.2, 1.0, 0, 0]))
+    beyond = poses.log(poses.interpolate(A, B, 2.0))
+    np.testing.assert_allclose(beyond, [0, 0, 0.4, 2, 0, 0], atol=1e-12)
+    before = poses.log(poses.interpolate(A, B, -1.0))
+    np.testing.assert_allclose(before, [0, 0, -0.2, -1, 0, 0], atol=1e-12)

@@ -1,0 +1,351 @@
+# SPDX-License-Identifier: MIT
+"""Registration and deskewing on an analytic drive, and KISS-ICP's traps."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from densify import poses
+from densify.config import RegisterSettings
+from densify.errors import ComputationError
+from densify.stages.deskew import deskew
+from densify.stages.register import check_plausible, register
+from densify.types import Trajectory
+from tests.scenes import SWEEP_S, Arc, Box, Scanner, Scene, World, street
+
+SETTINGS = RegisterSettings()
+KEY = 5
+FRAMES = range(11)
+
+
+@pytest.fixture(scope="module")
+def drive() -> Scene:
+    """12 m/s in a left bend."""
+    return Scene(World(street()), Arc(0, -1.5, 0, 12.0, 0.25), Scanner(num_azimuths=1800))
+
+
+@pytest.fixture(scope="module")
+def raw(drive):
+    return [drive.scan(f).sweep for f in FRAMES]
+
+
+@pytest.fixture(scope="module")
+def first_pass(raw):
+    return register(raw, SETTINGS)
+
+
+@pytest.fixture(scope="module")
+def second_pass(raw):
+    return both_passes(raw)
+
+
+def both_passes(raw) -> Trajectory:
+    rough = register(raw, SETTINGS)
+    return register([s.sweep for s in deskew(raw, rough, KEY).sweeps], SETTINGS, rough)
+
+
+def errors(found: Trajectory, true: Trajectory) -> tuple[np.ndarray, np.ndarray]:
+    """(n,) metres and degrees of the poses relative to the key's."""
+    i = found.frames.index(KEY)
+    off = [
+        poses.log(poses.inverse(poses.inverse(a0) @ a) @ poses.inverse(b0) @ b)
+        for a, b in zip(true.T_world_lidar, found.T_world_lidar, strict=True)
+        for a0, b0 in [(true.T_world_lidar[i], found.T_world_lidar[i])]
+    ]
+    off = np.array(off)
+    return np.linalg.norm(off[:, 3:], axis=1), np.rad2deg(np.linalg.norm(off[:, :3], axis=1))
+
+
+# --- the analytic drive ---------------------------------------------------------------------------
+
+
+def test_the_drive_is_recovered(drive, second_pass):
+    off_m, off_deg = errors(second_pass, drive.trajectory(FRAMES))
+    # the drive is 6 m to either side of the key
+    assert off_m.max() < 0.15 and off_m.mean() < 0.06
+    assert off_deg.max() < 0.2
+
+
+def test_stamps_and_frames_are_handed_on_exactly(drive, second_pass):
+    assert second_pass.frames == tuple(FRAMES)
+    assert second_pass.stamp_ns.dtype == np.int64
+    assert np.array_equal(second_pass.stamp_ns, drive.trajectory(FRAMES).stamp_ns)
+
+
+def test_speed_is_known_from_the_first_step_on(drive, second_pass):
+    """Odometry alone takes the vehicle to start from rest."""
+    true = drive.trajectory(FRAMES).T_world_lidar
+    for i in range(3):
+        found = poses.inverse(second_pass.T_world_lidar[i]) @ second_pass.T_world_lidar[i + 1]
+        step = poses.log(poses.inverse(poses.inverse(true[i]) @ true[i + 1]) @ found)
+        assert np.linalg.norm(step[3:]) < 0.12
+
+
+def test_same_bytes_every_time(raw, first_pass):
+    again = register(raw, SETTINGS)
+    assert again.T_world_lidar.tobytes() == first_pass.T_world_lidar.tobytes()
+
+
+def test_sweeps_are_left_as_they_were(drive, raw, first_pass):
+    fresh = Scene(drive.world, drive.ego, drive.scanner).scan(KEY).sweep
+    assert raw[KEY].points.tobytes() == fresh.points.tobytes()
+
+
+# --- deskewing ------------------------------------------------------------------------------------
+
+
+def plane_residual_m(points: np.ndarray) -> float:
+    return float(
+        np.linalg.svd(points - points.mean(0), compute_uv=False)[-1] / np.sqrt(len(points))
+    )
+
+
+@pytest.fixture(scope="module")
+def walled() -> Scene:
+    walls = (Box((120, 2, 6), Arc(0, 12)), Box((120, 2, 6), Arc(0, -14)), *street())
+    return Scene(World(walls), Arc(0, 0, 0, 12.0, 0.4))
+
+
+def test_walls_are_bent_by_the_drive_and_straight_again(walled):
+    scan = walled.scan(KEY)
+    right = walled.window(KEY, 0)[KEY].sweep.points
+    reversed_ = replace(scan.sweep, offset_ns=-scan.sweep.offset_ns)
+    wrong = deskew([reversed_], walled.trajectory([4, 5, 6]), KEY)[KEY].sweep.points
+    for wall in (0, 1):
+        on = scan.box == wall
+        assert on.sum() > 500
+        before, after, worse = (plane_residual_m(p[on]) for p in (scan.sweep.points, right, wrong))
+        assert before > 0.03
+        assert after < 0.1 * before
+        assert worse > 1.5 * before
+
+
+def test_static_points_come_to_where_they_are_at_the_reference_time(walled):
+    for frame in (3, KEY):
+        registered = walled.window(frame, 0)[frame]
+        T = walled.T_world_lidar(frame * SWEEP_S)
+        true = poses.transform(poses.inverse(T), walled.scan(frame).world)
+        raw_error = np.linalg.norm(
+            registered.sweep.points - walled.scan(frame).sweep.points, axis=1
+        )
+        error = np.linalg.norm(registered.sweep.points - true, axis=1)
+        assert raw_error.max() > 0.6  # half a sweep at 12 m/s
+        assert error.max() < 0.01  # the arc within a sweep is taken for a straight line
+
+
+def test_the_found_motion_straightens_too(drive, raw, second_pass):
+    window = deskew(raw, second_pass, KEY)
+    T = drive.T_world_lidar(KEY * SWEEP_S)
+    true = poses.transform(poses.inverse(T), drive.scan(KEY).world)
+    error = np.linalg.norm(window[KEY].sweep.points - true, axis=1)
+    assert np.quantile(error, 0.95) < 0.08
+
+
+def test_each_half_moves_with_its_own_twist():
+    """Braking: before the reference time faster than after it."""
+    scene = Scene(World(()), Arc(0, 0))
+    sweep = scene.scan(0).sweep
+    x = np.array([0.0, 1.5, 2.0])  # 15 m/s, then 5 m/s
+    T = np.stack([poses.exp(np.array([0, 0, 0, at, 0, 0])) for at in x])
+    stamps = sweep.stamp_ns + np.array([-100_000_000, 0, 100_000_000])
+    registered = deskew([sweep], Trajectory((-1, 0, 1), stamps, T), 0)[0]
+    np.testing.assert_allclose(registered.twist_before, [0, 0, 0, 15, 0, 0], atol=1e-9)
+    np.testing.assert_allclose(registered.twist_after, [0, 0, 0, 5, 0, 0], atol=1e-9)
+    t = sweep.offset_ns * 1e-9
+    moved = registered.sweep.points - sweep.points
+    np.testing.assert_allclose(moved[:, 0], t * np.where(t < 0, 15, 5), atol=1e-9)
+    assert np.abs(moved[:, 1:]).max() < 1e-9
+
+
+def test_at_an_end_the_only_twist_serves_both_halves(drive, raw, second_pass):
+    window = deskew(raw, second_pass, KEY)
+    for end in (window.sweeps[0], window.sweeps[-1]):
+        assert np.array_equal(end.twist_before, end.twist_after)
+        assert np.linalg.norm(end.twist_after[3:]) == pytest.approx(12, abs=1.5)
+    inner = window[KEY]
+    assert not np.array_equal(inner.twist_before, inner.twist_after)
+
+
+def test_columns_follow_their_points(walled):
+    sweep = walled.scan(KEY).sweep
+    order = np.random.default_rng(0).permutation(len(sweep))
+    shuffled = replace(
+        sweep,
+        **{
+            c: getattr(sweep, c)[order]
+            for c in ("points", "intensity", "offset_ns", "lidar", "row")
+        },
+    )
+    trajectory = walled.trajectory([4, 5, 6])
+    straight = deskew([sweep], trajectory, KEY)[KEY].sweep
+    mixed = deskew([shuffled], trajectory, KEY)[KEY].sweep
+    assert len(straight) == len(sweep)  # nothing cropped
+    for column in ("intensity", "offset_ns", "lidar", "row"):
+        assert np.array_equal(getattr(straight, column), getattr(sweep, column))
+        assert np.array_equal(getattr(mixed, column), getattr(shuffled, column))
+    np.testing.assert_allclose(mixed.points, straight.points[order], atol=1e-12)
+
+
+def test_without_times_points_stay_to_the_last_bit(walled):
+    sweep = replace(walled.scan(KEY).sweep, offset_ns=None)
+    registered = deskew([sweep], walled.trajectory([4, 5, 6]), KEY)[KEY]
+    assert registered.sweep.points.tobytes() == sweep.points.tobytes()
+    assert not registered.twist_before.any() and not registered.twist_after.any()
+
+
+def test_the_window_is_placed_around_the_key(walled):
+    window = walled.window(KEY, 2)
+    assert window.frames == (3, 4, 5, 6, 7) and window.key == KEY
+    np.testing.assert_allclose(window[KEY].T_key_lidar, np.eye(4), atol=1e-12)
+    for registered in window.sweeps:
+        world = poses.transform(
+            walled.T_world_lidar(KEY * SWEEP_S) @ registered.T_key_lidar, registered.sweep.points
+        )
+        assert np.abs(world - walled.scan(registered.frame).world).max() < 0.02
+
+
+def test_a_single_sweep_cannot_be_deskewed_and_stays(walled):
+    sweep = walled.scan(KEY).sweep
+    window = deskew([sweep], walled.trajectory([KEY]), KEY)
+    assert window.frames == (KEY,)
+    np.testing.assert_allclose(window[KEY].sweep.points, sweep.points, atol=1e-12)
+
+
+# --- KISS-ICP's traps -----------------------------------------------------------------------------
+
+
+def test_sweeps_of_equal_or_no_stamps_do_not_abort(drive, tmp_path):
+    """In a process of its own: the abort cannot be caught."""
+    scan = drive.scan(0).sweep
+    np.savez(tmp_path / "sweep.npz", points=scan.points)
+    code = f"""
+import numpy as np
+from densify.config import RegisterSettings
+from densify.stages.register import register
+from densify.types import Sweep
+p = np.load({str(tmp_path / "sweep.npz")!r})["points"]
+n = len(p)
+def sweep(frame, offset_ns):
+    return Sweep(frame, frame * 100_000_000, p, np.zeros(n, np.float32), offset_ns,
+                 np.zeros(n, np.uint8), np.arange(n))
+for offset_ns in (np.zeros(n, np.int64), np.full(n, 7, np.int64), None):
+    T = register([sweep(f, offset_ns) for f in range(3)], RegisterSettings()).T_world_lidar
+    print(float(np.abs(T - np.eye(4)).max()))
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    moved = [float(line) for line in done.stdout.split()]
+    assert len(moved) == 3 and max(moved) < 0.01
+
+
+def test_environment_variables_have_no_effect(raw, first_pass, monkeypatch):
+    from kiss_icp.config import KISSConfig
+
+    monkeypatch.setenv("kiss_icp_data", '{"max_range": 6.0, "min_range": 5.0, "deskew": true}')
+    monkeypatch.setenv("kiss_icp_mapping", '{"voxel_size": 9.0, "max_points_per_voxel": 1}')
+    monkeypatch.setenv("kiss_icp_registration", '{"max_num_iterations": 1}')
+    monkeypatch.setenv("kiss_icp_adaptive_threshold", '{"fixed_threshold": 0.01}')
+    monkeypatch.setenv("kiss_icp_out_dir", "elsewhere")
+    assert KISSConfig().data.max_range == 6.0  # they are real
+    again = register(raw, SETTINGS)
+    assert again.T_world_lidar.tobytes() == first_pass.T_world_lidar.tobytes()
+
+
+def test_knobs_reach_kiss_icp(raw, first_pass):
+    other = register(raw[:3], RegisterSettings(voxel_size_m=2.0))
+    assert not np.array_equal(other.T_world_lidar, first_pass.T_world_lidar[:3])
+    near = register(raw[:3], RegisterSettings(max_range_m=25.0))
+    assert not np.array_equal(near.T_world_lidar, first_pass.T_world_lidar[:3])
+
+
+# --- what cannot be registered --------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("num_points", [0, 50, 999])
+def test_too_few_points_names_the_frame(raw, num_points):
+    sparse = raw[2].select(np.arange(len(raw[2])) < num_points)
+    with pytest.raises(ComputationError, match=rf"sweep 2 has {num_points} points.*at least 1000"):
+        register([raw[0], raw[1], sparse], SETTINGS)
+
+
+def test_a_lowered_limit_is_obeyed(raw):
+    sparse = [s.select(np.arange(len(s)) % 40 == 0) for s in raw[:2]]
+    assert len(sparse[0]) > 600
+    register(sparse, RegisterSettings(min_num_points=600))
+
+
+def test_one_sweep_of_another_place_is_a_jump(drive, raw):
+    x, y, yaw = (float(value) for value in drive.ego.at(5 * SWEEP_S))
+    elsewhere = Scene(drive.world, Arc(x + 20, y, yaw)).scan(0).sweep
+    swapped = [
+        replace(elsewhere, frame=5, stamp_ns=s.stamp_ns) if s.frame == 5 else s for s in raw[:9]
+    ]
+    with pytest.raises(ComputationError, match=r"frame [456]\b"):
+        both_passes(swapped)
+
+
+def test_a_recording_that_goes_on_at_another_place_is_noticed(drive, raw):
+    """Odometry glides over the gap at the speed it expects: the poses alone look like a drive,
+    though half of the window lies 10 m from where it belongs."""
+    elsewhere = Scene(drive.world, replace(drive.ego, x=drive.ego.x - 10), drive.scanner)
+    joined = [*raw[:5], *(elsewhere.scan(f).sweep for f in range(5, 9))]
+    with pytest.raises(ComputationError, match=r"frame [456]\b"):
+        both_passes(joined)
+
+
+def moved(trajectory: Trajectory, index: int, twist) -> Trajectory:
+    T = trajectory.T_world_lidar.copy()
+    T[index:] = T[index] @ poses.exp(np.array(twist, float)) @ poses.inverse(T[index]) @ T[index:]
+    return replace(trajectory, T_world_lidar=T)
+
+
+def test_a_true_drive_is_plausible(drive):
+    check_plausible(drive.trajectory(FRAMES), SETTINGS)
+    check_plausible(drive.trajectory([3]), SETTINGS)
+
+
+@pytest.mark.parametrize(
+    ("twist", "what"),
+    [
+        ([0, 0, 0, 8, 0, 0], "from frame 5 to 6: 9[0-9] m/s"),
+        ([0, 0, 0, 0, -9, 0], "from frame 5 to 6"),
+        ([0, 0, 0.5, 0, 0, 0], "from frame 5 to 6: .* deg/s"),
+        ([0, 0, 0, 2, 0, 0], "at frame 5: the speed changes by 2[0-9]"),
+        ([0, 0, 0, -1.5, 0, 0], "at frame 5"),
+    ],
+)
+def test_jumps_name_their_frames(drive, twist, what):
+    with pytest.raises(ComputationError, match=what) as caught:
+        check_plausible(moved(drive.trajectory(FRAMES), 6, twist), SETTINGS)
+    assert "\n" not in str(caught.value)
+
+
+def test_noise_of_registration_is_no_jump(drive):
+    check_plausible(moved(drive.trajectory(FRAMES), 6, [0, 0, 0.02, 0.2, -0.1, 0.1]), SETTINGS)
+
+
+def test_the_speed_limit_is_a_knob(drive):
+    with pytest.raises(ComputationError, match=r"frame 0 to 1: 12 m/s.*at most 5 m/s"):
+        check_plausible(drive.trajectory(FRAMES), RegisterSettings(max_speed_m_s=5))
+
+
+@pytest.mark.parametrize("stamps", [(0, 2, 1, 3), (0, 1, 1, 2)])
+def test_stamps_have_to_ascend(drive, stamps):
+    trajectory = replace(
+        drive.trajectory(range(4)), stamp_ns=np.array(stamps, np.int64) * 100_000_000
+    )
+    with pytest.raises(ComputationError, match=r"stamp of frame 2 is .* that of frame 1"):
+        check_plausible(trajectory, SETTINGS)
+
+
+def test_a_pose_that_is_not_finite_names_its_frame(drive):
+    trajectory = drive.trajectory(range(4))
+    T = trajectory.T_world_lidar.copy()
+    T[2, 0, 3] = np.nan
+    with pytest.raises(ComputationError, match="pose of frame 2 is not finite"):
+        check_plausible(replace(trajectory, T_world_lidar=T), SETTINGS)

@@ -1,0 +1,579 @@
+# SPDX-License-Identifier: MIT
+"""The built-in street: its truth against slow twins, its sensors against geometry, its cache."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from densify.errors import InputError
+from densify.poses import inverse, transform
+from densify.readers.street import Street
+from densify.street.actors import TRAILER_WHEELBASE_M
+from densify.street.casting import EGO_BOX, SPAN_S, Scene
+from densify.street.curves import Curve, Lane, Speed, polyline
+from densify.street.footprints import Rectangles, overlap
+from densify.street.lidar import scan
+from densify.street.materials import GLASS_PASSES, LASER_PASSES, Material
+from densify.street.mesh import Mesh, box
+from densify.street.motion import Driving, Poses, Still, Towed
+from densify.street.scenes import build_scene
+from densify.street.sensors import PERIOD_NS, SENSORS, firings
+from densify.street.simulator import seconds, stamp_ns
+from densify.street.terrain import Road, Terrain
+from densify.street.world import Body, Rays, World
+
+KEY = 120
+
+
+@pytest.fixture(scope="module", autouse=True)
+def cache(tmp_path_factory):
+    with pytest.MonkeyPatch.context() as patch:
+        folder = tmp_path_factory.mktemp("cache")
+        patch.setenv("DENSIFY_CACHE_DIR", str(folder))
+        yield folder
+
+
+@pytest.fixture(scope="module")
+def street() -> Street:
+    return Street.from_spec("street")
+
+
+@pytest.fixture(scope="module")
+def static() -> Street:
+    return Street.from_spec("street:static")
+
+
+@pytest.fixture(scope="module")
+def crossing() -> Street:
+    return Street.from_spec("street:crossing?sensor=dual32")
+
+
+@pytest.fixture(scope="module")
+def highway() -> Street:
+    return Street.from_spec("street:highway?sensor=vlp16")
+
+
+# truth
+
+
+def test_static_points_have_exactly_no_flow_and_movers_that_of_their_body(street):
+    truth, displacement = street.truth.sweep(KEY), street.truth.displacement(KEY, KEY + 3)
+    assert np.all(displacement[~truth.moving] == 0.0)
+    assert np.linalg.norm(displacement[truth.moving], axis=1).max() > 2.0
+    # a slow twin: one point at a time, through (4,4) matrices
+    simulator, returns = street.simulator, street.returns(KEY)
+    world = simulator.scene.world
+    rng = np.random.default_rng(0)
+    for row in rng.choice(np.flatnonzero(truth.moving), 25, replace=False):
+        body = world.bodies[returns.body[row]].trajectory
+
+        def T_world_body(time_ns, body=body):
+            return body.poses(np.array([seconds(time_ns)])).matrix()
+
+        fired = stamp_ns(KEY) + int(returns.offset_ns[row])
+        p_lidar = np.append(returns.points[row].astype(float), 1.0)
+        p_body = inverse(T_world_body(fired)) @ simulator.T_world_lidar_at(fired) @ p_lidar
+        T_lidar_world = inverse(street.T_world_lidar(KEY))
+        here = T_lidar_world @ T_world_body(stamp_ns(KEY)) @ p_body
+        there = T_lidar_world @ T_world_body(stamp_ns(KEY + 3)) @ p_body
+        np.testing.assert_allclose(truth.points[row], here[:3], atol=1e-6)
+        np.testing.assert_allclose(displacement[row], (there - here)[:3], atol=1e-6)
+
+
+def test_raw_sweep_is_distorted_and_truth_undoes_it(static):
+    frame = 60  # in the bend
+    world, raw = static.simulator.scene.world, static[frame].points
+    truth = static.truth.sweep(frame)
+    rigid, straight = (transform(truth.T_world_lidar, p) for p in (raw, truth.points))
+    mesh = world.bodies[0].mesh
+    corners = mesh.vertices[mesh.triangles[np.isin(mesh.material, (5, 6))]]
+    sides = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    area = np.linalg.norm(np.cross(*sides), axis=1) / 2
+    large = (area > 12) & (np.linalg.norm(corners[:, 0] - truth.T_world_lidar[:3, 3], axis=1) < 40)
+    moved, stayed = [], []
+    for a, u, v in zip(corners[large, 0], sides[0][large], sides[1][large], strict=True):
+        normal = np.cross(u, v) / np.linalg.norm(np.cross(u, v))
+        inside = np.linalg.solve(np.stack([u, v, normal], axis=1), (straight - a).T).T
+        on = (inside[:, :2] > 0.05).all(1) & (inside[:, :2].sum(1) < 0.95)
+        on &= np.abs(inside[:, 2]) < 0.6
+        if on.sum() > 150:
+            stayed.append(np.median(np.abs(inside[on, 2])))
+            moved.append(np.median(np.abs((rigid[on] - a) @ normal)))
+    assert len(stayed) >= 3
+    assert np.median(stayed) < 0.025
+    assert max(stayed) < 0.06  # window frames stand out by 5 cm
+    assert max(moved) > 0.15
+
+
+def test_nothing_moves_in_the_static_street_and_parked_cars_never_do(street, static):
+    assert not static.truth.sweep(KEY).moving.any()
+    assert not static.truth.moving_mask("image_02", KEY).any()
+    truth = street.truth.sweep(KEY)
+    assert truth.moving.sum() > 2000
+    parked = truth.instance >= 1000
+    assert parked.sum() > 2000
+    assert not truth.moving[parked].any()
+    assert not truth.moving[truth.instance == -1].any()
+
+
+def test_truth_outside_the_sequence_is_refused(street):
+    for call in (lambda: street.truth.displacement(KEY, 160), lambda: street.truth.sweep(-1)):
+        with pytest.raises(InputError, match="frames 0 to 159"):
+            call()
+
+
+@pytest.mark.parametrize("camera", ["image_02", "image_03"])
+def test_depth_agrees_with_the_lidar(street, camera):
+    depth, moving = street.truth.depth_m(camera, KEY), street.truth.moving_mask(camera, KEY)
+    truth, cam = street.truth.sweep(KEY), street.cameras[camera]
+    delay_ns = street.image_stamp_ns(camera, KEY) - stamp_ns(KEY)
+    assert delay_ns == (0 if camera == "image_02" else 15_000_000)
+    T_world_lidar = street.simulator.T_world_lidar_at(street.image_stamp_ns(camera, KEY))
+    world = transform(truth.T_world_lidar, truth.points[~truth.moving])
+    p_cam = transform(cam.T_cam_lidar @ inverse(T_world_lidar), world)
+    p_cam = p_cam[p_cam[:, 2] > 1]
+    u, v = np.rint((p_cam @ cam.K.T)[:, :2] / p_cam[:, 2:]).astype(int).T
+    seen = (u >= 0) & (u < cam.width_px) & (v >= 0) & (v < cam.height_px)
+    error = depth[v[seen], u[seen]] - p_cam[seen, 2]
+    error = error[(depth[v[seen], u[seen]] > 0) & ~moving[v[seen], u[seen]]]
+    assert len(error) > 8000
+    assert np.median(np.abs(error)) < 0.04
+    assert np.mean(np.abs(error) < 0.3) > 0.85
+    assert depth.dtype == np.float32 and depth.max() <= 120.0
+    assert np.all(depth[0, 500:700] == 0)  # sky
+
+
+def test_images_are_textured_and_lit(street):
+    image = street.image("image_02", KEY)
+    assert image.shape == (375, 1242, 3) and image.dtype == np.uint8
+    assert np.std(image.mean(axis=2)) > 30
+    assert len(np.unique(image.reshape(-1, 3), axis=0)) > 5000
+
+
+# sweeps
+
+
+@pytest.mark.parametrize("fixture", ["street", "highway"])
+def test_offsets_follow_the_azimuth_clockwise(request, fixture):
+    sweep = request.getfixturevalue(fixture)[KEY]
+    assert sweep.offset_ns.dtype == np.int64
+    assert np.all(np.diff(sweep.offset_ns) > 0)  # no two pulses at once
+    assert sweep.offset_ns.min() < -49_000_000 and sweep.offset_ns.max() > 49_000_000
+    azimuth = np.arctan2(sweep.points[:, 1], sweep.points[:, 0])
+    assert np.abs(-azimuth / (2 * np.pi) * PERIOD_NS - sweep.offset_ns).max() < 20
+
+
+def test_two_scanners_look_opposite_ways(crossing):
+    sweep = crossing[KEY]
+    assert set(np.unique(sweep.lidar)) == {0, 1}
+    azimuth = np.arctan2(sweep.points[:, 1], sweep.points[:, 0])
+    turned = np.exp(1j * (azimuth + 2 * np.pi * (sweep.offset_ns / PERIOD_NS + sweep.lidar / 2)))
+    assert np.abs(np.angle(turned)).max() < 1e-5
+    elevation = np.arcsin(sweep.points[:, 2] / np.linalg.norm(sweep.points, axis=1))
+    above = np.arctan2(sweep.points[:, 2] - 0.25, np.hypot(*sweep.points[:, :2].T))
+    beams = np.radians(SENSORS["dual32"].elevation_deg)
+    for angles in (elevation[sweep.lidar == 0], above[sweep.lidar == 1]):
+        assert np.abs(angles[:, None] - beams).min(axis=1).max() < 1e-5
+
+
+def test_sweeps_are_as_large_as_a_real_one(street):
+    sweep = street[KEY]
+    assert 100_000 < len(sweep) < 135_000
+    range_m = np.linalg.norm(sweep.points, axis=1)
+    assert range_m.min() > 1.0 and range_m.max() < 100.0
+    assert sweep.intensity.min() >= 0 and sweep.intensity.max() <= 1
+    np.testing.assert_array_equal(sweep.points, sweep.points.astype(np.float32))
+    assert len(firings(SENSORS["vlp16"]).offset_ns) == 16 * 1800
+
+
+def _room(half_m: float) -> World:
+    room = box((-half_m,) * 3, (half_m,) * 3, Material.PLASTER)
+    return World([Body(room, Still())])
+
+
+def _standing(terrain: Terrain | None = None) -> Driving:
+    flat = terrain or Terrain(np.ones((1, 2)), np.zeros(1), np.zeros(1))
+    line = Curve(np.column_stack([np.arange(-50, 50.5, 0.5), np.zeros(201)]))
+    return Driving(line, Speed((0.0, 0.0)), 50.0, 0.0, flat, 2.7)
+
+
+def test_ranges_have_the_sensors_noise_and_some_pulses_are_lost():
+    sensor = SENSORS["hdl64"]
+    returns = scan(_room(15.0), _standing(), sensor, 0.0, np.random.default_rng(0))
+    world = returns.points.astype(float) + [0, 0, 1.73]
+    off_wall = 15.0 - np.abs(world).max(axis=1)
+    slant = np.abs(world / 15.0).max(axis=1) * 15.0 / np.linalg.norm(returns.points, axis=1)
+    wall = np.abs(returns.points[:, 2]) < 6  # clear of floor and ceiling
+    noise = (off_wall / slant)[wall]
+    assert abs(noise.mean()) < 0.002
+    assert abs(noise.std() - sensor.range_sigma_m) < 0.003
+    fired = sensor.num_columns * 64
+    assert 0.9 * fired < len(returns.points) < fired
+
+
+class _Sliding:
+    """10 m/s to the left."""
+
+    def poses(self, times_s):
+        n = len(times_s)
+        away = np.column_stack([np.zeros(n), 10.0 * times_s, np.zeros(n)])
+        return Poses(np.broadcast_to(np.eye(3), (n, 3, 3)), away)
+
+
+def test_each_ray_meets_a_moving_body_where_it_is_then():
+    slider = Body(box((9, -1, -1), (11, 1, 1), Material.BODYWORK), _Sliding(), 0)
+    world = World([Body(box((29, -50, -9), (30, 50, 9), Material.CONCRETE), Still()), slider])
+    times = np.repeat(np.linspace(-0.05, 0.05, 11), 41)
+    y = np.tile(np.linspace(-2.05, 2.05, 41), 11)
+    direction = np.column_stack([np.full(len(y), 9.0), y, np.zeros(len(y))])
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    rays = Rays(np.zeros((len(y), 3)), direction, times)
+    hits = world.cast(rays, np.zeros(len(Material)), np.zeros(len(y)))
+    at = hits.range_m[:, None] * direction
+    on_face = np.abs(y - 10 * times) < 1 - 1e-6
+    np.testing.assert_allclose(at[on_face, 0], 9.0, atol=1e-9)
+    assert np.all(world.body[hits.triangle[on_face]] == 1)
+    far = np.abs(y - 10 * times) > 1 + 0.3  # its side faces are seen close by
+    np.testing.assert_allclose(at[far, 0], 29.0, atol=1e-9)
+
+
+def test_glass_and_leaves_let_their_share_of_rays_through():
+    n = 4000
+    wall = box((5, -9, -9), (6, 9, 9), Material.CONCRETE)
+    rays = Rays(np.zeros((n, 3)), np.tile([1.0, 0, 0], (n, 1)), np.zeros(n))
+    luck = np.random.default_rng(0).random(n)
+    for material in (Material.GLASS, Material.LEAF):
+        sheet = np.array([[[2.0, -1, -1], [2, 1, -1], [2, 1, 1], [2, -1, 1]]])
+        world = World([Body(Mesh.join([wall, Mesh.quads(sheet, material)]), Still())])
+        passed = world.cast(rays, LASER_PASSES, luck).range_m > 4
+        assert abs(passed.mean() - LASER_PASSES[material]) < 0.03
+        assert (world.cast(rays, GLASS_PASSES, luck).range_m > 4).all() == (
+            material == Material.GLASS
+        )
+
+
+# what is there, and how it moves
+
+
+def _vertices_at(body: Body, time_s: float) -> np.ndarray:
+    return transform(body.trajectory.poses(np.array([time_s])).matrix(), body.mesh.vertices)
+
+
+_LATTICE = np.stack(np.meshgrid(*[np.linspace(0, 1, k) for k in (9, 5, 3)]), -1).reshape(-1, 3)
+
+
+def _check_no_contact(scene: Scene) -> None:
+    """A twin of the placement's own test: no point of one's upright box in that of another."""
+    boxes = [Body(EGO_BOX, scene.ego), *(b for actor in scene.actors for b in actor.bodies)]
+    owner = np.array([-1, *(i for i, actor in enumerate(scene.actors) for _ in actor.bodies)])
+    bounds = [b.mesh.bounds for b in boxes]
+    lattices = [low + _LATTICE * (high - low) for low, high in bounds]
+    times = np.arange(0.0, 16.0, 0.4)
+    poses = [b.trajectory.poses(times) for b in boxes]
+    standing = scene.footprints
+    left = np.stack([-standing.forward[:, 1], standing.forward[:, 0]], axis=1)
+    for k, time in enumerate(times):
+        matrices = [p.matrix(k) for p in poses]
+        clouds = [transform(T, lattice) for T, lattice in zip(matrices, lattices, strict=True)]
+        centres = np.array([c.mean(axis=0) for c in clouds])
+        for i, (low, high) in enumerate(bounds):
+            T_body_world = inverse(matrices[i])
+            near = np.linalg.norm(centres - centres[i], axis=1) < 20
+            for j in np.flatnonzero(near & (owner != owner[i])):
+                p = transform(T_body_world, clouds[j])
+                assert not ((p > low) & (p < high)).all(axis=1).any(), (time, owner[i], owner[j])
+            close = np.linalg.norm(standing.centre - centres[i][:2], axis=1) < 20
+            away = clouds[i][:, None, :2] - standing.centre[close]
+            along = np.abs((away * standing.forward[close]).sum(-1)) < standing.half_m[close, 0]
+            across = np.abs((away * left[close]).sum(-1)) < standing.half_m[close, 1]
+            assert not (along & across).any(), (time, owner[i])
+
+
+def _count(scene: Scene) -> dict[str, int]:
+    names = [actor.name for actor in scene.actors]
+    return {name: names.count(name) for name in ("car", "truck", "cyclist", "walker")}
+
+
+def _check_cast(preset: str, scene: Scene) -> None:
+    count = _count(scene)
+    assert count["car"] >= 7 and count["truck"] >= 1
+    if preset != "highway":
+        assert count["cyclist"] >= 1 and count["walker"] >= 3
+
+
+def test_nobody_touches_anybody(street, crossing, highway):
+    for preset, sequence in (("street", street), ("crossing", crossing), ("highway", highway)):
+        _check_cast(preset, sequence.simulator.scene)
+        _check_no_contact(sequence.simulator.scene)
+
+
+@pytest.mark.parametrize(("preset", "seed"), [("street", 7), ("crossing", 4)])
+def test_nobody_touches_anybody_in_other_scenes(preset, seed):
+    scene = build_scene(preset, seed)
+    _check_cast(preset, scene)
+    _check_no_contact(scene)
+
+
+def test_all_stand_on_the_ground(street, crossing):
+    for scene in (street.simulator.scene, crossing.simulator.scene):
+        for actor in scene.actors:
+            for time in (0.0, 6.0, 12.0):
+                vertices = np.concatenate([_vertices_at(b, time) for b in actor.bodies])
+                feet = vertices[vertices[:, 2] < vertices[:, 2].min() + 0.15]
+                gap = vertices[:, 2].min() - scene.ground.height(feet[:, :2]).mean()
+                assert -0.2 < gap < 0.2, (actor.name, time, gap)
+    terrain = street.simulator.scene.ground.terrain
+    xy = np.random.default_rng(0).uniform(-200, 200, (500, 2))
+    assert np.linalg.norm(terrain.slope(xy), axis=1).max() <= 0.05
+    step = 1e-4
+    numeric = (terrain.height(xy + [step, 0]) - terrain.height(xy - [step, 0])) / (2 * step)
+    np.testing.assert_allclose(terrain.slope(xy)[:, 0], numeric, atol=1e-6)
+
+
+def test_ground_has_upright_kerbs_and_no_holes(street):
+    ground = street.simulator.scene.ground
+    road = ground.roads[0]
+    station = np.linspace(80, 240, 60)
+    edge = road.curve(station) + road.curve.normal(station) * -road.right_m
+    inside, outside = (edge + road.curve.normal(station) * side for side in (0.05, -0.05))
+    step = ground.height(outside) - ground.height(inside)
+    np.testing.assert_allclose(step, 0.12, atol=0.01)
+    xy = road.curve(station)[:, None] + road.curve.normal(station)[:, None] * np.linspace(
+        -14, 9, 400
+    ).reshape(1, -1, 1)
+    xy = xy.reshape(-1, 2)
+    down = Rays(
+        np.column_stack([xy, np.full(len(xy), 60.0)]),
+        np.tile([0.0, 0, -1], (len(xy), 1)),
+        np.zeros(len(xy)),
+    )
+    bare = World([Body(ground.mesh(18.0, 1.0), Still())])
+    hits = bare.cast(down, np.zeros(len(Material)), np.zeros(len(xy)))
+    error = 60 - hits.range_m - ground.height(xy)
+    clear = np.abs(ground.distance(xy)) > 0.1
+    assert np.abs(error[clear]).max() < 0.02
+
+
+def test_ego_vehicles_drive_as_the_presets_say(street, crossing, highway):
+    def speed_and_turn(sequence):
+        T = np.stack([sequence.T_world_lidar(frame) for frame in range(160)])
+        yaw = np.unwrap(np.arctan2(T[:, 1, 0], T[:, 0, 0]))
+        speed = np.linalg.norm(np.diff(T[:, :3, 3], axis=0), axis=1) / 0.1
+        return speed, np.degrees(np.diff(yaw)) / 0.1
+
+    speed, turn = speed_and_turn(street)
+    assert speed.min() > 6 and speed.max() < 10
+    assert (np.abs(turn) >= 10).sum() >= 10
+    assert 1 < np.abs(turn[KEY - 5 : KEY + 5]).mean() < 6
+    speed, turn = speed_and_turn(crossing)
+    assert speed.max() == 0.0 and np.abs(turn).max() == 0.0
+    speed, _ = speed_and_turn(highway)
+    np.testing.assert_allclose(speed, 25.0, atol=0.1)
+    bodies = highway.simulator.bodies
+    velocity = (bodies.T_world_body[121] - bodies.T_world_body[119])[1:, :3, 3] / 0.2
+    ahead = velocity @ bodies.T_world_lidar[120][:3, 0]
+    assert np.any(np.abs(ahead + 30) < 1.0)
+
+
+def test_traffic_overtakes_brakes_and_keeps_city_speeds(street):
+    bodies, scene = street.simulator.bodies, street.simulator.scene
+    position = bodies.T_world_body[:, :, :3, 3]
+    speed = np.linalg.norm(np.diff(position, axis=0), axis=2) / 0.1
+    ego = bodies.T_world_lidar
+    cars = [
+        index
+        for index, body in enumerate(scene.world.bodies)
+        if body.instance >= 0 and scene.actors[body.instance].name == "car"
+    ]
+    ahead = np.einsum("fbi,fi->fb", position - ego[:, None, :3, 3], ego[:, :3, 0])
+    same_way = bodies.T_world_body[60:, :, :3, 0] @ ego[60, :3, 0]
+    assert speed[:, cars].max() < 15.5 and np.median(speed[:, cars]) > 5
+    overtakes = (ahead[40] < -5) & (ahead[KEY] > 3) & (np.abs(same_way).max(axis=0) > 0.5)
+    assert overtakes[cars].any()
+    assert (speed[105:115, cars].max(axis=0) - speed[125:145, cars].min(axis=0)).max() > 4
+
+
+def test_truck_is_16_m_long_and_its_trailer_follows_without_slip(street):
+    scene = street.simulator.scene
+    actor = next(a for a in scene.actors if a.name == "truck")
+    tractor, trailer = actor.bodies
+    assert isinstance(trailer.trajectory, Towed)
+    times = np.arange(0.0, 16.0, 0.05)
+    front, back = (b.trajectory.poses(times) for b in actor.bodies)
+    nose = front.apply(np.tile([tractor.mesh.bounds[1][0], 0, 0], (len(times), 1)))
+    tail = back.apply(np.tile([trailer.mesh.bounds[0][0], 0, 0], (len(times), 1)))
+    assert abs(np.linalg.norm(nose - tail, axis=1)[0] - 16) < 0.5
+    bent = np.degrees(np.arccos((front.rotation[:, :, 0] * back.rotation[:, :, 0]).sum(1)))
+    assert bent.max() > 20
+    axle = back.apply(np.tile([-TRAILER_WHEELBASE_M / 2, 0, 0], (len(times), 1)))
+    slip = np.einsum("ni,ni->n", np.gradient(axle, 0.05, axis=0), back.rotation[:, :, 1])
+    assert np.abs(slip[2:-2]).max() < 0.05
+
+
+def test_walkers_are_not_rigid(street):
+    scene = street.simulator.scene
+    for actor in (a for a in scene.actors if a.name == "walker"):
+        trunk, *limbs = (b.trajectory.poses(np.arange(12, 13.2, 0.1)) for b in actor.bodies)
+        assert len(limbs) == 4
+        for limb in limbs:
+            hinge = np.einsum("nji,nj->ni", trunk.rotation, limb.position - trunk.position)
+            np.testing.assert_allclose(hinge, hinge[:1].repeat(len(hinge), 0), atol=1e-9)
+            swing = np.arcsin(
+                np.clip((trunk.rotation[:, :, 0] * limb.rotation[:, :, 2]).sum(1), -1, 1)
+            )
+            assert np.ptp(swing) > 0.5
+
+
+# geometry twins
+
+
+def test_speed_profiles_integrate():
+    speed = Speed((-1, 8.0), (3, 8.0), (5, 2.0), (9, 6.0))
+    fine = np.linspace(-3, 12, 150_001)
+    v = np.interp(fine, [-1, 3, 5, 9], [8, 8, 2, 6])
+    expected = np.concatenate([[0], np.cumsum((v[1:] + v[:-1]) / 2 * np.diff(fine))])
+    got = speed.distance(fine)
+    np.testing.assert_allclose(got - got[0], expected, atol=1e-6)
+
+
+def test_curves_run_by_arc_length():
+    circle = Curve.bending(120.0, lambda s: np.full(len(s), 1 / 40), origin_m=30.0)
+    np.testing.assert_allclose(circle(np.array([30.0]))[0], [0, 0], atol=1e-3)
+    s = np.linspace(5, 115, 300)
+    np.testing.assert_allclose(np.linalg.norm(circle(s) - [0, 40], axis=1), 40, atol=2e-3)
+    np.testing.assert_allclose(circle.tangent(np.array([30.0]))[0], [1, 0], atol=1e-3)
+    lane = Lane(circle, 5.0, forward=False)
+    np.testing.assert_allclose(
+        lane.curve(np.array([lane.at(60.0)]))[0], circle(np.array([60.0]))[0]
+        + 5 * circle.normal(np.array([60.0]))[0], atol=0.01,
+    )  # fmt: skip
+    corner = polyline([(0, 0), (20, 0), (20, 20)], 5.0)
+    assert np.abs(np.linalg.norm(np.diff(corner, axis=0), axis=1) - 0.5).max() < 0.02
+    assert np.linalg.norm(corner - [15, 5], axis=1).min() > 4.98
+    station, offset = Road(circle, 1, 1).coordinates(circle(s) + 3 * circle.normal(s))
+    np.testing.assert_allclose(station, s, atol=2e-3)
+    np.testing.assert_allclose(offset, 3.0, atol=1e-3)
+
+
+def test_overlap_of_rectangles_is_that_of_their_points():
+    rng = np.random.default_rng(0)
+    grid = np.stack(np.meshgrid(*[np.linspace(-1, 1, 41)] * 2), -1).reshape(-1, 2)
+
+    def axes(r):
+        return np.stack([r.forward, [-r.forward[1], r.forward[0]]])
+
+    def share_a_point(a, b, grown_m):
+        for p, q in ((a, b), (b, a)):
+            points = p.centre + (grid * p.half_m) @ axes(p)
+            if (np.abs((points - q.centre) @ axes(q).T) <= q.half_m + grown_m).all(1).any():
+                return True
+        return False
+
+    seen = []
+    for _ in range(400):
+        pair = []
+        for _ in range(2):
+            angle = rng.uniform(0, 2 * np.pi)
+            forward = np.array([np.cos(angle), np.sin(angle)])
+            pair.append(Rectangles(rng.uniform(-2, 2, 2), forward, rng.uniform(0.3, 2, 2)))
+        sure, perhaps = (share_a_point(*pair, grown_m) for grown_m in (0.0, 0.08))
+        if sure == perhaps:  # else the grid is too coarse to tell
+            assert bool(overlap(*pair)) == sure
+            seen.append(sure)
+    assert 50 < sum(seen) < len(seen) - 50
+
+
+# reproducible, seeded, cached
+
+
+def _bytes(street: Street, frame: int) -> tuple[bytes, ...]:
+    sweep, truth = street[frame], street.truth.sweep(frame)
+    return (
+        sweep.points.tobytes(),
+        sweep.intensity.tobytes(),
+        sweep.offset_ns.tobytes(),
+        truth.points.tobytes(),
+        street.image("image_03", frame).tobytes(),
+        street.truth.depth_m("image_03", frame).tobytes(),
+    )
+
+
+def test_same_bytes_fresh_cached_damaged_and_without_a_cache(highway, tmp_path, monkeypatch):
+    first = _bytes(highway, 30)
+    again = Street.from_spec("street:highway?sensor=vlp16")
+    again.simulator.__dict__["scene"] = highway.simulator.scene
+    monkeypatch.setattr(type(again.simulator), "returns", None)  # must come from the cache
+    assert _bytes(again, 30) == first
+    monkeypatch.undo()
+
+    monkeypatch.setenv("DENSIFY_CACHE_DIR", str(tmp_path))
+    fresh = Street.from_spec("street:highway?sensor=vlp16")  # a scene of its own
+    assert _bytes(fresh, 30) == first
+    files = sorted(tmp_path.rglob("*.npz"))
+    assert len(files) == 2
+    assert not list(tmp_path.rglob(".*"))
+    for file, damage in zip(files, (b"", files[1].read_bytes()[:5000]), strict=True):
+        file.write_bytes(damage)
+    repaired = Street.from_spec("street:highway?sensor=vlp16")
+    repaired.simulator.__dict__["scene"] = highway.simulator.scene
+    assert _bytes(repaired, 30) == first
+
+    blocked = tmp_path / "file"
+    blocked.write_text("not a folder")
+    monkeypatch.setenv("DENSIFY_CACHE_DIR", str(blocked))
+    uncached = Street.from_spec("street:highway?sensor=vlp16")
+    uncached.simulator.__dict__["scene"] = highway.simulator.scene
+    assert uncached[30].points.tobytes() == first[0]
+
+
+def test_presets_seeds_and_frames_differ(street, static, highway):
+    assert not np.array_equal(street[KEY].points[:1000], static[KEY].points[:1000])
+    other = Street("street", 7).simulator.scene
+    ours = street.simulator.scene
+    assert not np.array_equal(other.footprints.centre[:20], ours.footprints.centre[:20])
+    assert not np.array_equal(highway[30].points[:50], highway[31].points[:50])
+    # static is the same street
+    still = static.simulator.scene
+    np.testing.assert_array_equal(still.footprints.centre, ours.footprints.centre)
+    assert len(still.actors) == 0
+    assert SPAN_S[0] < 0 < 16 < SPAN_S[1]
+
+
+@pytest.mark.parametrize(
+    ("spec", "message"),
+    [
+        ("street:vilage", "street, static, crossing, highway"),
+        ("street?sensor=hdl65", "hdl64, hdl32, vlp16, dual32"),
+        ("street?sede=7", "seed, sensor"),
+        ("street?seed=-1", "whole number"),
+        ("street?seed=seven", "whole number"),
+        ("street?seed=", "whole number"),
+        ("road", "street"),
+    ],
+)
+def test_bad_specs_are_one_clear_line(spec, message):
+    with pytest.raises(InputError) as error:
+        Street.from_spec(spec)
+    assert message in str(error.value) and "\n" not in str(error.value)
+
+
+def test_specs_name_what_they_open():
+    opened = Street.from_spec("street:crossing?seed=3&sensor=dual32")
+    simulator = opened.simulator
+    assert (simulator.preset, simulator.seed, simulator.sensor) == ("crossing", 3, "dual32")
+    assert Street.from_spec(opened.name).name == opened.name
+    with pytest.raises(InputError, match="seed"):
+        Street("street", -2)
+
+
+def test_frames_and_cameras_that_do_not_exist_are_named(street):
+    assert list(street.frames) == list(range(160))
+    with pytest.raises(InputError, match="no frame 160; there are frames 0 to 159"):
+        street[160]
+    with pytest.raises(InputError, match="image_02, image_03"):
+        street.image("image_00", KEY)
+    with pytest.raises(InputError, match="image_02, image_03"):
+        street.image_stamp_ns("left", KEY)
+    with pytest.raises(InputError, match="no frame -1"):
+        street.T_world_lidar(-1)
