@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Dense depth maps from lidar recordings, with the moving objects kept sharp.
 
-Names are imported on first use, so ``import densify`` costs nothing and loads no torch or open3d::
+Names are imported on first use, so ``import densify`` costs nothing and loads no torch::
 
     import densify
 

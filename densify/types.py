@@ -112,16 +112,29 @@ class Window:
 class FlowField:
     """Scene flow of one sweep's (or point file's) N points to another time, ego-motion removed.
 
+    From the sweep's reference time: a moving point that was measured earlier or later is first
+    brought there by ``to_reference``.
+
     displacement: (N,3) metres, in the coordinates the points are in; exactly 0 where not moving.
     moving: (N,) bool, proven to move.
     instance: (N,) int32, the moving object the point belongs to, -1 none.
     lost: (N,) bool, belongs to something that moves but cannot be followed to the target time.
+    to_reference: (N,3) metres, own motion between a point's firing and the sweep's reference time,
+        in the same coordinates; None where nothing is known of it.
     """
 
     displacement: Float
     moving: Bool
     instance: NDArray[np.int32]
     lost: Bool
+    to_reference: Float | None = None
+
+    @property
+    def total(self) -> Float:
+        """(N,3) from where a point was measured to where it is at the target time."""
+        if self.to_reference is None:
+            return self.displacement
+        return self.to_reference + self.displacement
 
     @staticmethod
     def zero(num_points: int) -> FlowField:

@@ -370,3 +370,16 @@ def test_confidence_falls_away_from_the_key_and_for_what_was_moved():
     assert (np.diff([c[0] for c in of_still]) < 0).all()
     assert (np.diff([c[0] for c in of_moved]) < 0).all()
     assert all(m[0] < s[0] for m, s in zip(of_moved[1:], of_still[1:], strict=True))
+
+
+def test_movers_know_their_velocity_at_the_key():
+    window, steps = scene(drifting)
+    cloud = accumulate(window, chain(window, steps, SETTINGS), drop_lost=True)
+    assert cloud.velocity_m_s.shape == (len(cloud), 3) and cloud.velocity_m_s.dtype == np.float32
+    assert not cloud.velocity_m_s[~cloud.moving].any()
+    expected = np.tile([15.0, -5.0, 1.0], (int(cloud.moving.sum()), 1))  # steps of 0.1 s
+    np.testing.assert_allclose(cloud.velocity_m_s[cloud.moving], expected, atol=1e-4)
+    later = cloud.after(0.05)
+    assert later.points[~cloud.moving].tobytes() == cloud.points[~cloud.moving].tobytes()
+    on = cloud.moving
+    np.testing.assert_allclose(later.points[on] - cloud.points[on], 0.05 * expected, atol=1e-5)

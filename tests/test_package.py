@@ -17,7 +17,7 @@ import densify
 from densify.config import Config, as_mapping, presets, resolve
 
 CHECKOUT = Path(__file__).parents[1]
-HEAVY = {"numpy", "scipy", "torch", "open3d", "kiss_icp", "cv2", "laspy"}
+HEAVY = {"numpy", "scipy", "torch", "embreex", "kiss_icp", "cv2", "laspy"}
 
 needs_installation = pytest.mark.skipif(
     "DENSIFY_TEST_INSTALLED" not in os.environ,
@@ -131,7 +131,7 @@ def test_stages_import_no_other_stage() -> None:
 
 
 DOORS = {
-    "open3d": "densify/street/",
+    "embreex": "densify/street/world.py",
     "kiss_icp": "densify/stages/register.py",
     "laspy": "densify/output/cloud_laz.py",
     "torch": "densify/flow/",

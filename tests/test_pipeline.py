@@ -12,6 +12,7 @@ import pytest
 
 import densify
 from densify import poses
+from densify.config import RegisterSettings
 from densify.errors import ComputationError, InputError
 from densify.pipeline import METHODS, compare, run
 from densify.range_image import RangeImage
@@ -123,7 +124,7 @@ def test_cameras_by_name():
 
 def test_near_and_far_returns_are_left_out():
     sequence = tiny()
-    (sweep,) = read_sweeps(sequence, [3], 5.0, 30.0)
+    (sweep,) = read_sweeps(sequence, [3], RegisterSettings(min_range_m=5.0, max_range_m=30.0))
     range_m = np.linalg.norm(sweep.points, axis=1)
     whole = sequence[3]
     assert 5 <= range_m.min() < range_m.max() <= 30 and len(sweep) < len(whole)
@@ -201,7 +202,7 @@ def test_more_sweeps_give_more_depth(moving):
 def test_costs_of_every_stage(moving):
     costs = {c.name: c for c in moving["flow"].costs}
     stages = ["read", "register", "deskew", "ground", "flow", "chain"]
-    assert list(costs) == [*stages, "accumulate", "project", "score"]
+    assert list(costs) == [*stages, "accumulate", "project", "colour", "score"]
     for cost in costs.values():
         assert cost.seconds >= 0 and cost.peak_memory_mb > 10
     peaks = [costs[s].peak_memory_mb for s in stages]
@@ -221,7 +222,7 @@ def test_progress_names_every_stage():
     seen: list[tuple[str, int, int]] = []
     run(tiny(), KEY, 1, "icp", config=POSES_GIVEN, progress=lambda *step: seen.append(step))
     names = list(dict.fromkeys(name for name, _, _ in seen))
-    assert names == ["read", "register", "deskew", "accumulate", "project", "score"]
+    assert names == ["read", "register", "deskew", "accumulate", "project", "colour", "score"]
     assert all(0 <= done <= total for _, done, total in seen)
     for name in names:
         steps = [(done, total) for n, done, total in seen if n == name]
@@ -310,6 +311,29 @@ def test_an_image_of_another_moment_sees_from_where_the_camera_was(late_s):
     on_wall = (np.abs(truth - wall_m) < 0.02) & (found > 0)
     assert on_wall.sum() > 300
     assert abs(np.median(found[on_wall]) - wall_m) < 0.05
+
+
+def test_a_mover_is_shown_where_it_was_at_the_exposure():
+    """Oncoming at 20 m/s it is 1 m nearer after 50 ms."""
+    scene = Scene(
+        World((*street(), car(40, 0.5, 20, 1, yaw=np.pi))),
+        Arc(0, -1.5),
+        Scanner(num_azimuths=1800, sigma_m=0.01),
+    )
+    sequence = TinySequence(scene, range(13), late_s=0.05)
+    found = run(sequence, 6, 4, config=POSES_GIVEN).depth["front"].depth_m
+    truth = sequence.truth.depth_m("front", 6)
+    on = sequence.truth.moving_mask("front", 6) & (found > 0)
+    assert on.sum() > 50
+    assert abs(np.median(found[on] - truth[on])) < 0.3
+
+
+def test_points_have_the_colour_of_their_pixel_or_none(moving):
+    for result in moving.values():
+        rgb = result.cloud.rgb
+        assert np.isin(rgb, [0, 128]).all() and (np.ptp(rgb, axis=1) == 0).all()
+        in_front = result.cloud.points[:, 0] > 0
+        assert not rgb[~in_front].any() and rgb[in_front].any()
 
 
 def test_the_cameras_pose_turns_with_the_vehicle():
@@ -408,7 +432,7 @@ def test_a_sweep_without_times_is_not_deskewed():
     sequence = Timeless(good.scene, good.frames)
     result = run(sequence, KEY, 1, "flow", config=POSES_GIVEN)
     own = result.cloud.frame == KEY
-    (kept,) = read_sweeps(sequence, [KEY], 2.8, 120)
+    (kept,) = read_sweeps(sequence, [KEY], RegisterSettings())
     np.testing.assert_allclose(result.cloud.points[own], kept.points, atol=1e-9)
 
 
@@ -417,7 +441,7 @@ def test_deskewing_can_be_switched_off():
     sequence = tiny()
     config = {"register": {"source": "dataset", "deskew": False}}
     result = run(sequence, KEY, 1, "icp", config=config)
-    (kept,) = read_sweeps(sequence, [KEY], 2.8, 120)
+    (kept,) = read_sweeps(sequence, [KEY], RegisterSettings())
     own = result.cloud.frame == KEY
     np.testing.assert_allclose(result.cloud.points[own], kept.points, atol=1e-9)
 
@@ -517,6 +541,6 @@ def test_the_ghost_score_agrees_with_the_truth(moving):
     true = np.zeros(len(icp), bool)
     for frame in np.unique(icp.frame):
         mine = np.flatnonzero(icp.frame == frame)
-        (kept,) = read_sweeps(sequence, [int(frame)], 2.8, 120)
+        (kept,) = read_sweeps(sequence, [int(frame)], RegisterSettings())
         true[mine] = sequence.scene.scan(int(frame)).instance[kept.row[icp.row[mine]]] >= 0
     assert true[found].mean() > 0.9

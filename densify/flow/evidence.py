@@ -48,11 +48,13 @@ class Candidates:
     """The points of one sweep that may move.
 
     row: (C,) index into the sweep's points. points: (C,3) key frame, rigidly registered.
+    time_s: (C,) when each was measured, relative to the key's reference time.
     seed: (C,) some other sweep sees through the point. cluster: (C,) label, of ``num_clusters``.
     """
 
     row: Int
     points: Float
+    time_s: Float
     seed: Bool
     cluster: Int
     num_clusters: int
@@ -77,13 +79,21 @@ def find_candidates(
             if j != i:
                 rest = np.flatnonzero(~seed)
                 seed[rest] = space.seen_through(points[rest], j)
-        return _cluster(above, points, seed)
+        return _cluster(above, points, firing_times_s(space.window, i)[above], seed)
 
     with ThreadPoolExecutor() as pool:
         return tuple(pool.map(of_sweep, range(len(sweeps))))
 
 
-def _cluster(row: Int, points: Float, seed: Bool) -> Candidates:
+def firing_times_s(window: Window, i: int) -> Float:
+    """(N,) when each point of sweep number i was measured, relative to the key's reference time."""
+    sweep = window.sweeps[i].sweep
+    offset_ns = np.zeros(len(sweep), np.int64) if sweep.offset_ns is None else sweep.offset_ns
+    key_ns = window[window.key].sweep.stamp_ns
+    return (sweep.stamp_ns - key_ns + offset_ns).astype(np.float64) * 1e-9
+
+
+def _cluster(row: Int, points: Float, time_s: Float, seed: Bool) -> Candidates:
     """Keep the seeds that are not alone among unseen points (a hedge's flicker is), add what is
     close to them, and link."""
     near = np.zeros(len(points), bool)
@@ -98,9 +108,8 @@ def _cluster(row: Int, points: Float, seed: Bool) -> Candidates:
         if len(kept):
             distance, _ = cKDTree(points[kept]).query(points, distance_upper_bound=_NEAR_M)
             near = np.isfinite(distance)
-    row, points, seed = row[near], points[near], seed[near]
-    num_clusters, cluster = link(points, _LINK_M)
-    return Candidates(row, points, seed, cluster, num_clusters)
+    num_clusters, cluster = link(points[near], _LINK_M)
+    return Candidates(row[near], points[near], time_s[near], seed[near], cluster, num_clusters)
 
 
 def link(points: Float, distance_m: float) -> tuple[int, Int]:

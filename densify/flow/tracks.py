@@ -28,6 +28,10 @@ _MAX_MODEL_POINTS = 1500
 _GATES_M = (0.8, 0.5, 0.3, 0.2, 0.2)
 _SURFACE_M = 0.05  # noise of a surface point
 _FIT_M = 0.3
+_MIN_FIT = 5  # points
+_MAX_WEIGHT = 60.0
+_PREDICTION_STD = np.array([0.3, 0.3, 0.08, 0.06])  # m, m, m, rad
+_NUM_ASKED = 60
 _MISSES_ALLOWED = 1
 _MAX_CONTRADICTIONS = 0.2  # of those that standing still leaves
 
@@ -37,35 +41,47 @@ class Track:
     """One rigid object in the window.
 
     centre: (3,) about which it turns, key frame. states: sweep index -> (4,) x y z displacement (m)
-    and yaw (rad) since the sweep it started in. smooth: (4, degree+1) polynomials of the states in
+    and yaw (rad) since the sweep it started in. times_s: sweep index -> when that sweep saw it,
+    which is not the sweep's reference time. smooth: (4, degree+1) polynomials of the states in
     time, highest power first. claimed: sweep index -> candidate rows that belong to it.
     """
 
     centre: Float
     start: int
     states: dict[int, Float] = field(default_factory=dict)
+    times_s: dict[int, float] = field(default_factory=dict)
     claimed: dict[int, np.ndarray] = field(default_factory=dict)
     smooth: Float = field(default_factory=lambda: np.zeros((4, 1)))
     residual_m: float = np.inf
 
-    def state(self, time_s: float) -> Float:
-        """(4,) of the smooth motion."""
-        return np.array([np.polyval(p, time_s) for p in self.smooth])
+    def carry(self, points: Float, from_s: float | Float, to_s: float | Float) -> Float:
+        """(N,3) points of the object at one time -> at another, key frame; one time or one each."""
+        return _apply(
+            self._state(to_s), _undo(self._state(from_s), points, self.centre), self.centre
+        )
 
-    def carry(self, points: Float, from_s: float, to_s: float) -> Float:
-        """(N,3) points of the object at one time -> at another, key frame."""
-        return _apply(self.state(to_s), _undo(self.state(from_s), points, self.centre), self.centre)
+    def _state(self, time_s: float | Float) -> Float:
+        """(..., 4) of the smooth motion."""
+        return np.stack([np.polyval(p, time_s) for p in self.smooth], axis=-1)
+
+    def add(self, j: int, state: Float, time_s: float, rows: np.ndarray) -> None:
+        """What sweep j saw of the object."""
+        self.states[j], self.times_s[j], self.claimed[j] = state, time_s, rows
+
+    def seen_at(self, j: int, sweep_time_s: Float) -> float:
+        """When sweep j sees, or would see, the object."""
+        nearest = min(self.times_s, key=lambda k: (abs(k - j), k))
+        return float(sweep_time_s[j] + self.times_s[nearest] - sweep_time_s[nearest])
 
 
 def follow_groups(
-    candidates: Sequence[Candidates], space: FreeSpace, time_s: Float, key_index: int
+    candidates: Sequence[Candidates], space: FreeSpace, sweep_time_s: Float, key_index: int
 ) -> list[Track]:
     """All proven moving objects of the window.
 
-    time_s: (W,) of the sweeps, ascending, relative to the key.
+    sweep_time_s: (W,) reference times of the sweeps, ascending, relative to the key.
     """
     fields = [DistanceField.of(c.points) for c in candidates]
-    trees = [cKDTree(c.points) for c in candidates]
     free = [np.ones(len(c.points), bool) for c in candidates]  # not yet part of a track
     untried = [np.ones(len(c.points), bool) for c in candidates]
     tracks = []
@@ -74,15 +90,13 @@ def follow_groups(
             members = members[free[i][members] & untried[i][members]]
             if len(members) < _MIN_POINTS:
                 continue
-            start_points = candidates[i].points[members]
-            velocity = _vote(start_points, i, fields, time_s)
-            track = _follow(start_points, i, velocity, candidates, trees, free, time_s)
-            proven = _prove(track, candidates, space, time_s)
+            velocity = _vote(candidates[i].points[members], i, fields, sweep_time_s)
+            track = _follow(members, i, velocity, candidates, free, sweep_time_s)
+            proven = _prove(track, candidates, space, sweep_time_s)
             for j, rows in track.claimed.items():
                 untried[j][rows] = False
                 if proven:
                     free[j][rows] = False
-            untried[i][members] = False
             if proven:
                 tracks.append(track)
     return tracks
@@ -130,12 +144,12 @@ class DistanceField:
 
 def _vote(points: Float, i: int, fields: Sequence[DistanceField], time_s: Float) -> Float:
     """(3,) m/s in the plane: where the group went in the two sweeps before and after, at once."""
-    sample = points[:: max(1, len(points) // _VOTE_POINTS)]
     around = [j for j in (i - 2, i - 1, i + 1, i + 2) if 0 <= j < len(fields)]
     step_s = float(np.median(np.diff(time_s)))
     coarse = 2 * _VOTE_STEP_M / step_s
 
-    def best(velocities: Float) -> Float:
+    def best(velocities: Float, num_points: int) -> Float:
+        sample = points[:: len(points) // num_points + 1]
         cost = np.zeros(len(velocities))
         for j in around:
             shift = velocities * (time_s[j] - time_s[i])
@@ -143,8 +157,9 @@ def _vote(points: Float, i: int, fields: Sequence[DistanceField], time_s: Float)
         return velocities[np.argmin(cost + 1e-3 * np.linalg.norm(velocities, axis=1))]
 
     n = int(_MAX_SPEED_M_S / coarse)
-    rough = best(_grid(n) * coarse)
-    return best(rough + _grid(3) * coarse / 3)
+    rough = best(_grid(n) * coarse, _VOTE_POINTS)
+    # Only the ends of a long flat side tell how fast it slides: now with more points.
+    return best(rough + _grid(6) * coarse / 3, 10 * _VOTE_POINTS)
 
 
 def _grid(n: int) -> Float:
@@ -154,46 +169,51 @@ def _grid(n: int) -> Float:
 
 
 def _follow(
-    start_points: Float,
+    members: np.ndarray,
     start: int,
     velocity: Float,
     candidates: Sequence[Candidates],
-    trees: Sequence[cKDTree],
     free: Sequence[Bool],
-    time_s: Float,
+    sweep_time_s: Float,
 ) -> Track:
     """Forwards, then backwards, with everything seen so far as the model."""
-    centre = start_points.mean(0)
-    track = Track(centre, start)
-    track.states[start] = np.zeros(4)
-    model = _Model(start_points)
+    here = candidates[start]
     rate = np.append(velocity, 0.0)
-    own = trees[start].query_ball_point(start_points, 0.05)
-    track.claimed[start] = np.unique(np.concatenate([np.asarray(o, int) for o in own]))
+    seen_s = float(here.time_s[members].mean())
+    points = _at_once(here, members, rate, seen_s)
+    track = Track(points.mean(0), start)
+    track.add(start, np.zeros(4), seen_s, members)
+    model = _Model(points)
     for direction in (1, -1):
         misses, j = 0, start + direction
         while 0 <= j < len(candidates) and misses <= _MISSES_ALLOWED:
-            predicted = _predict(track, rate, time_s, j)
-            found = _find(model, predicted, centre, candidates[j].points, trees[j], free[j])
+            found = _find(
+                model, track, rate, candidates[j], free[j], track.seen_at(j, sweep_time_s)
+            )
             if found is None:
                 misses += 1
             else:
                 misses = 0
-                state, rows = found
-                track.states[j], track.claimed[j] = state, rows
-                model.add(_undo(state, candidates[j].points[rows], centre))
+                state, seen_s, rows, points = found
+                track.add(j, state, seen_s, rows)
+                model.add(_undo(state, points, track.centre))
             j += direction
     return track
 
 
-def _predict(track: Track, rate: Float, time_s: Float, j: int) -> Float:
-    """From the states nearest in time: constant velocity."""
-    known = sorted(track.states, key=lambda k: abs(k - j))[:4]
+def _at_once(c: Candidates, rows: np.ndarray, rate: Float, time_s: float) -> Float:
+    """(N,3) candidates of one sweep, seen one after the other, where they all were at one time."""
+    return c.points[rows] + (time_s - c.time_s[rows])[:, None] * rate[:3]
+
+
+def _predict(track: Track, rate: Float, time_s: float) -> tuple[Float, Float]:
+    """State and its rate, from the states nearest in time: constant velocity."""
+    known = sorted(track.states, key=lambda k: (abs(track.times_s[k] - time_s), k))[:4]
     nearest = known[0]
     if len(known) > 1:
-        t = time_s[known] - time_s[j]
+        t = [track.times_s[k] - time_s for k in known]
         rate = np.polyfit(t, np.stack([track.states[k] for k in known]), 1)[0]
-    return track.states[nearest] + rate * (time_s[j] - time_s[nearest])
+    return track.states[nearest] + rate * (time_s - track.times_s[nearest]), rate
 
 
 class _Model:
@@ -229,61 +249,73 @@ class _Model:
 
 
 def _find(
-    model: _Model, predicted: Float, centre: Float, points: Float, tree: cKDTree, free: Bool
-) -> tuple[Float, np.ndarray] | None:
-    """Align one sweep's candidates with the model: (state, rows that fit), or None."""
-    expected = _apply(predicted, model.points, centre)
+    model: _Model, track: Track, rate: Float, c: Candidates, free: Bool, about_s: float
+) -> tuple[Float, float, np.ndarray, Float] | None:
+    """Align one sweep's candidates with the model.
+
+    about_s: roughly when the sweep saw the object. Returns the state, when it held, the rows that
+    fit and where those points were at that time; None where too few fit.
+    """
+    centre = track.centre
+    expected = _apply(_predict(track, rate, about_s)[0], model.points, centre)
     low, high = expected.min(0) - _GATES_M[0], expected.max(0) + _GATES_M[0]
-    rows = np.flatnonzero(free & ((points > low) & (points < high)).all(1))
-    if len(rows) < 5:
+    rows = np.flatnonzero(free & ((c.points > low) & (c.points < high)).all(1))
+    if len(rows) < _MIN_FIT:
         return None
-    target = points[rows]
+    seen_s = float(c.time_s[rows].mean())
+    predicted, rate = _predict(track, rate, seen_s)
+    target = _at_once(c, rows, rate, seen_s)
     state = predicted.copy()
-    prior = 1 / np.array([0.3, 0.3, 0.08, 0.06]) ** 2
     for gate in _GATES_M:
         for _ in range(2):
             m = _undo(state, target, centre)
             distance, nearest = model.nearest(m, gate)
             near = np.isfinite(distance)
-            if near.sum() < 5:
+            if near.sum() < _MIN_FIT:
                 return None
-            step = _gauss_newton(
-                m[near],
-                model.points[nearest[near]],
-                model.information[nearest[near]],
-                distance[near],
-                gate,
-                centre,
-                prior,
-                predicted - state,
+            matched = nearest[near]
+            state = state + _gauss_newton(
+                m[near] - centre,
+                m[near] - model.points[matched],
+                model.information[matched] * _robust(distance[near] / gate)[:, None, None],
                 state[3],
+                predicted - state,
             )
-            state = state + step
     distance, _ = model.nearest(_undo(state, target, centre), _FIT_M)
     fit = np.isfinite(distance)
-    if fit.sum() < 5:
+    if fit.sum() < _MIN_FIT:
         return None
-    return state, rows[fit]
+    return state, seen_s, rows[fit], target[fit]
 
 
-def _gauss_newton(m, q, information, distance, gate, centre, prior, to_prediction, yaw):  # type: ignore
-    """One robust step of the state: dxyz and dyaw."""
-    weight = (1 - (distance / gate) ** 2) ** 2
-    weight = weight * min(1.0, 60 / len(m))  # neighbours on a surface do not err independently
-    c, s = np.cos(yaw), np.sin(yaw)
-    R = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
-    J = np.zeros((len(m), 3, 4))
-    J[:, :, :3] = -R.T
-    arm = m - centre
+def _robust(distance: Float) -> Float:
+    """Tukey's weights of distances as shares of the gate, all together at most ``_MAX_WEIGHT``:
+    neighbours on a surface do not err independently."""
+    weight: Float = (1 - distance**2) ** 2
+    return weight * min(1.0, _MAX_WEIGHT / len(weight))
+
+
+def _gauss_newton(
+    arm: Float, residual: Float, information: Float, yaw: float, to_prediction: Float
+) -> Float:
+    """(4,) step of the state that lowers the weighted residuals and stays near the prediction.
+
+    arm: (N,3) of the points about the centre, residual: (N,3) to the model, both in the model's
+    orientation. information: (N,3,3).
+    """
+    prior = 1 / _PREDICTION_STD**2
+    J = np.zeros((len(arm), 3, 4))
+    J[:, :, :3] = -_turned(np.eye(3), -yaw).T
     J[:, 0, 3], J[:, 1, 3] = arm[:, 1], -arm[:, 0]
-    r = m - q
-    JA = np.einsum("nik,nij->nkj", J, information * weight[:, None, None])
+    JA = np.einsum("nik,nij->nkj", J, information)
     H = np.einsum("nkj,njl->kl", JA, J) + np.diag(prior)
-    g = np.einsum("nkj,nj->k", JA, r) - prior * to_prediction
+    g = np.einsum("nkj,nj->k", JA, residual) - prior * to_prediction
     return -np.linalg.solve(H, g)
 
 
-def _prove(track: Track, candidates: Sequence[Candidates], space: FreeSpace, time_s: Float) -> bool:
+def _prove(
+    track: Track, candidates: Sequence[Candidates], space: FreeSpace, sweep_time_s: Float
+) -> bool:
     """Fit the smooth motion; True if the track certainly moves.
 
     The motion must be smooth, long enough to be told from noise, and must do away with the
@@ -293,11 +325,11 @@ def _prove(track: Track, candidates: Sequence[Candidates], space: FreeSpace, tim
     seen = sorted(track.states)
     if len(seen) < 3:
         return False
-    t = time_s[seen]
+    t = np.array([track.times_s[j] for j in seen])
     states = np.stack([track.states[j] for j in seen])
     degree = 2 if len(seen) >= 5 else 1
     track.smooth = np.polyfit(t, states, degree).T
-    fitted = np.stack([track.state(x) for x in t])
+    fitted = np.stack([np.polyval(p, t) for p in track.smooth], axis=1)
     freedom = len(seen) / (len(seen) - degree - 0.5)
     residual = np.linalg.norm((states - fitted)[:, :2], axis=1)
     track.residual_m = float(np.sqrt((residual**2).mean() * freedom))
@@ -308,33 +340,38 @@ def _prove(track: Track, candidates: Sequence[Candidates], space: FreeSpace, tim
         0.35, 8 * track.residual_m
     ):
         return False
-    still, moved = _contradictions(track, candidates, space, time_s)
+    still, moved = _contradictions(track, candidates, space, sweep_time_s)
     return moved <= _MAX_CONTRADICTIONS * still
 
 
 def _contradictions(
-    track: Track, candidates: Sequence[Candidates], space: FreeSpace, time_s: Float
+    track: Track, candidates: Sequence[Candidates], space: FreeSpace, sweep_time_s: Float
 ) -> tuple[int, int]:
     """How many looks through the track's points the sweeps have: standing still, and moved."""
     still = moved = 0
     for i, rows in track.claimed.items():
-        points = candidates[i].points[rows]
-        points = points[:: len(points) // 60 + 1]
+        rows = rows[:: len(rows) // _NUM_ASKED + 1]
+        points, seen_s = candidates[i].points[rows], candidates[i].time_s[rows]
         for j in range(len(candidates)):
             if j != i:
+                carried = track.carry(points, seen_s, track.seen_at(j, sweep_time_s))
                 still += int(space.seen_through(points, j).sum())
-                carried = track.carry(points, time_s[i], time_s[j])
                 moved += int(space.seen_through(carried, j).sum())
     return still, moved
 
 
 def _apply(state: Float, points: Float, centre: Float) -> Float:
-    c, s = np.cos(state[3]), np.sin(state[3])
-    R = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
-    return (points - centre) @ R.T + centre + state[:3]
+    """(4,) or (N,4), (N,3) -> (N,3) the object's points in that state."""
+    return _turned(points - centre, state[..., 3]) + centre + state[..., :3]
 
 
 def _undo(state: Float, points: Float, centre: Float) -> Float:
-    c, s = np.cos(state[3]), np.sin(state[3])
-    R = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
-    return (points - centre - state[:3]) @ R + centre
+    """Inverse of `_apply`."""
+    return _turned(points - centre - state[..., :3], -state[..., 3]) + centre
+
+
+def _turned(arms: Float, yaw: float | Float) -> Float:
+    """(N,3), () or (N,) -> (N,3) about the vertical."""
+    c, s = np.cos(yaw), np.sin(yaw)
+    x, y, z = arms.T
+    return np.stack([c * x - s * y, s * x + c * y, z], axis=1)

@@ -41,7 +41,7 @@ _OWNED: Mapping[Verb, tuple[str, ...]] = {
 }
 _TITLES = {"none": "sparse"}  # of the figures' rows
 _PACKAGES = (
-    *("numpy", "scipy", "torch", "open3d", "kiss-icp"),
+    *("numpy", "scipy", "torch", "embreex", "kiss-icp"),
     *("opencv-python-headless", "laspy", "lazrs", "PyYAML"),
 )
 

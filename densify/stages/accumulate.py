@@ -33,7 +33,7 @@ def accumulate(window: Window, fields: Sequence[FlowField], drop_lost: bool) -> 
         points = rigid.copy()
         moves = flow.moving & ~flow.lost
         velocity_m_s = velocities_m_s[flow.instance] * moves[:, None]
-        points[moves] += flow.displacement[moves] @ registered.T_key_lidar[:3, :3].T
+        points[moves] += flow.total[moves] @ registered.T_key_lidar[:3, :3].T
         away = abs(registered.frame - window.key)
         confidence = np.full(len(sweep), max(0.1, 1 - _CONFIDENCE_PER_SWEEP * away))
         confidence[moves & (away > 0)] *= _CONFIDENCE_MOVED
@@ -65,7 +65,7 @@ def _velocities(window: Window, fields: Sequence[FlowField]) -> Float:
     num_instances = 1 + max((int(f.instance.max(initial=-1)) for f in fields), default=-1)
     velocities = np.zeros((num_instances + 1, 3))
     for instance in range(num_instances):
-        found = []
+        found: list[tuple[int, Float]] = []
         for i in sorted(range(len(fields)), key=lambda i: abs(i - key)):
             flow, registered = fields[i], window.sweeps[i]
             mine = (flow.instance == instance) & flow.moving & ~flow.lost

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -47,14 +48,13 @@ def _follow(
     for instance in np.unique(step.instance[step.moving]):
         mine = np.flatnonzero(step.moving & (step.instance == instance))
         theirs = np.flatnonzero(onward.moving & ~onward.lost & (onward.instance == instance))
-        arrived = poses.transform(T_there_here, here.sweep.points[mine] + displacement[mine])
+        arrived = poses.transform(T_there_here, here.sweep.points[mine] + step.total[mine])
         gap_m = np.inf if instance >= 0 else max_gap_m
-        flow, found = _look_up(
-            arrived, there.sweep.points[theirs], onward.displacement[theirs], instance >= 0, gap_m
-        )
+        known_at = there.sweep.points[theirs] + (onward.total - onward.displacement)[theirs]
+        flow, found = _look_up(arrived, known_at, onward.displacement[theirs], instance >= 0, gap_m)
         displacement[mine] += flow @ T_there_here[:3, :3]  # back into this sweep's lidar frame
         lost[mine[~found]] = True
-    return FlowField(displacement, step.moving, step.instance, lost)
+    return replace(step, displacement=displacement, lost=lost)
 
 
 def _look_up(

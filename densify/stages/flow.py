@@ -10,7 +10,7 @@ from scipy.spatial import ConvexHull, QhullError, cKDTree
 
 from densify import poses
 from densify.config import FlowSettings
-from densify.flow.evidence import Candidates, FreeSpace, find_candidates
+from densify.flow.evidence import Candidates, FreeSpace, find_candidates, firing_times_s
 from densify.flow.tracks import Track, follow_groups
 from densify.types import Bool, Float, Float32, FlowField, Window
 
@@ -46,35 +46,33 @@ def _group_steps(
     fields = []
     for i, registered in enumerate(window.sweeps):
         points = poses.transform(registered.T_key_lidar, registered.sweep.points)
+        seen_s = firing_times_s(window, i)
         instance = _attach(
-            points,
-            heights_m[i],
-            candidates[i],
-            tracks,
-            candidates,
-            i,
-            time_s,
-            settings.min_height_m,
+            points, seen_s, heights_m[i], i, tracks, candidates, settings.min_height_m
         )
         target = i + int(np.sign(key - i))
-        displacement: Float = np.zeros_like(points)
+        to_reference = np.zeros_like(points)
+        displacement = np.zeros_like(points)
         for k, track in enumerate(tracks):
-            mine = instance == k
-            if target != i and mine.any():
-                moved = track.carry(points[mine], time_s[i], time_s[target]) - points[mine]
-                displacement[mine] = moved @ registered.T_key_lidar[:3, :3]  # into the lidar frame
-        fields.append(FlowField(displacement, instance >= 0, instance, np.zeros(len(points), bool)))
+            mine = np.flatnonzero(instance == k)
+            if len(mine):
+                at_reference = track.carry(points[mine], seen_s[mine], time_s[i])
+                arrived = track.carry(at_reference, time_s[i], time_s[target])
+                into_lidar = registered.T_key_lidar[:3, :3]
+                to_reference[mine] = (at_reference - points[mine]) @ into_lidar
+                displacement[mine] = (arrived - at_reference) @ into_lidar
+        nothing_lost = np.zeros(len(points), bool)
+        fields.append(FlowField(displacement, instance >= 0, instance, nothing_lost, to_reference))
     return tuple(fields)
 
 
 def _attach(
     points: Float,
+    seen_s: Float,
     height_m: Float32,
-    here: Candidates,
+    i: int,
     tracks: Sequence[Track],
     candidates: Sequence[Candidates],
-    i: int,
-    time_s: Float,
     min_height_m: float,
 ) -> np.ndarray:
     """(N,) int32: the track each point of sweep i belongs to, -1 none.
@@ -85,13 +83,15 @@ def _attach(
     instance = np.full(len(points), -1, np.int32)
     nearest = np.full(len(points), np.inf)
     reach = np.full(len(points), _ATTACH_UNSEEN_M)
-    reach[here.row] = _ATTACH_M
+    reach[candidates[i].row] = _ATTACH_M
     for k, track in enumerate(tracks):
         if i not in track.claimed:
             continue
         model = np.concatenate(
             [
-                track.carry(candidates[j].points[rows], time_s[j], time_s[i])
+                track.carry(
+                    candidates[j].points[rows], candidates[j].time_s[rows], track.times_s[i]
+                )
                 for j, rows in sorted(track.claimed.items())
             ]
         )
@@ -101,9 +101,10 @@ def _attach(
         rows = np.flatnonzero(near)
         if not len(rows):
             continue
-        distance = np.asarray(cKDTree(model).query(points[rows])[0])
+        at_once = track.carry(points[rows], seen_s[rows], track.times_s[i])
+        distance = np.asarray(cKDTree(model).query(at_once)[0])
         belongs = (distance < reach[rows]) & (height_m[rows] >= min_height_m)
-        belongs |= _within_outline(points[rows, :2], model[:, :2])
+        belongs |= _within_outline(at_once[:, :2], model[:, :2])
         closer = belongs & (distance < nearest[rows])
         instance[rows[closer]] = k
         nearest[rows[closer]] = distance[closer]

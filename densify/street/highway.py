@@ -9,7 +9,15 @@ from densify.street.casting import MEETING_S, Scene, Traffic, Ways, assemble, ji
 from densify.street.curves import Curve, Lane, Speed
 from densify.street.motion import Driving
 from densify.street.roadside import Side, mark_lanes
-from densify.street.scenery import Scenery, guard_rail, hedge, noise_barrier, tree
+from densify.street.scenery import (
+    Scenery,
+    guard_rail,
+    hedge,
+    lamp_post,
+    noise_barrier,
+    sign_post,
+    tree,
+)
 from densify.street.terrain import Ground, Road, Terrain
 from densify.types import Float
 
@@ -73,15 +81,22 @@ def _dress_highway(scenery: Scenery, road: Road) -> None:
         ):
             at = Side(road, side, 0.0, end)
             scenery.put(guard_rail(4.0), at.at(station, beyond), at.heading(station))
+    median = Side(road, 1, 0.0, end)
+    for station in np.arange(20.0, end, 38.0):
+        scenery.put(lamp_post(), median.at(station, -road.left_m), median.heading(station))
+        for side in (1, -1):
+            edge = Side(road, side, 0.0, end)
+            spot = float(station * jitter(rng, 0.02))
+            scenery.put(sign_post(rng), edge.at(spot, 1.6), edge.heading(spot))
     quiet = rng.uniform(150, 260), rng.uniform(560, 640)
     for side in (1, -1):
         edge = Side(road, side, 0.0, end)
         for station in np.arange(10.0, end, 4.0):
             if side > 0 and quiet[0] < station < quiet[1]:
                 scenery.put(noise_barrier(4.0), edge.at(station, 5.0), edge.heading(station))
-            elif rng.random() < 0.16:
+            elif rng.random() < 0.3:
                 shoot, foot = tree(rng)
                 scenery.put(shoot, edge.at(station, rng.uniform(5.5, 22.0)), solid=foot)
-            elif rng.random() < 0.2:
+            elif rng.random() < 0.5:
                 bush = hedge(rng, float(rng.uniform(0.8, 1.8)))(rng.uniform(2.0, 4.0))
-                scenery.put(bush, edge.at(station, rng.uniform(3.5, 9.0)), edge.heading(station))
+                scenery.put(bush, edge.at(station, rng.uniform(2.5, 9.0)), edge.heading(station))

@@ -19,7 +19,7 @@ from densify.street.scenes import build_scene
 from densify.street.sensors import PERIOD_NS, sensor_named
 from densify.types import Bool, Float
 
-VERSION = 2  # raise it whenever the same frame would come out differently
+VERSION = 3  # raise it whenever the same frame would come out differently
 EPOCH_NS = 1_781_258_400_000_000_000  # 2026-06-12 10:00:00 UTC, frame 0
 _MOVING_M, _MOVING_S = 0.05, 0.5
 

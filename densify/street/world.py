@@ -3,7 +3,7 @@
 
 Rays are taken into each body's frame by the body's pose at the ray's own time, so that a body that
 moves while a sweep is taken is distorted exactly as in reality. This module is the only one that
-imports open3d.
+imports Embree.
 """
 
 from __future__ import annotations
@@ -15,7 +15,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from densify.errors import InputError
 from densify.street.materials import GLASS_PASSES
 from densify.street.mesh import Mesh
 from densify.street.motion import Poses, Still, Trajectory
@@ -196,33 +195,19 @@ def _solid(mesh: Mesh) -> Mesh:
     )
 
 
-def _open3d() -> Any:
-    try:
-        import open3d
-    except ImportError as error:
-        raise InputError(
-            f"open3d, which casts the street's rays, cannot be loaded: {error}; install what it "
-            f"names (on Debian and Ubuntu: apt-get install libusb-1.0-0 libgl1 libgomp1)"
-        ) from error
-    return open3d
-
-
 def _raycasting_scene(mesh: Mesh) -> Any:
-    o3d = _open3d()
-    scene = o3d.t.geometry.RaycastingScene()
-    scene.add_triangles(
-        o3d.core.Tensor(mesh.vertices.astype(np.float32)),
-        o3d.core.Tensor(mesh.triangles.astype(np.uint32)),
-    )
+    from embreex.mesh_construction import TriangleMesh
+    from embreex.rtcore_scene import EmbreeScene
+
+    scene = EmbreeScene()
+    TriangleMesh(scene, mesh.vertices[mesh.triangles].astype(np.float32))
     return scene
 
 
 def _first_hit(scene: Any, origin: Float, direction: Float) -> tuple[NDArray[np.int64], Float]:
     """(N,3), (N,3) -> index of the first triangle met (N,), -1 none, and where on it (N,2)."""
-    o3d = _open3d()
-    rays = np.concatenate([origin, direction], axis=1).astype(np.float32)
-    found = scene.cast_rays(o3d.core.Tensor(rays))
-    triangle = found["primitive_ids"].numpy().astype(np.int64)
-    missed = ~np.isfinite(found["t_hit"].numpy())
-    triangle[missed] = -1
-    return triangle, found["primitive_uvs"].numpy().astype(np.float64)
+    found = scene.run(
+        origin.astype(np.float32), direction.astype(np.float32), query="INTERSECT", output=True
+    )
+    where = np.stack([found["u"], found["v"]], axis=1)
+    return found["primID"].astype(np.int64), where.astype(np.float64)
