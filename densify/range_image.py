@@ -18,6 +18,7 @@ from densify.types import Bool, Float, Float32, RegisteredSweep
 
 _CELLS_PER_STEP = 1.15  # a cell a little larger than a step is rarely empty
 _MIN_POINTS_TO_MEASURE = 200
+_SETTLED_S = 0.01
 
 
 @dataclass(frozen=True)
@@ -33,7 +34,12 @@ class RangeImage:
         return RangeImage(tuple(ScannerImage.of(registered, int(i)) for i in ids))
 
     def sees_through(
-        self, points: Float, margin_m: float, margin_fraction: float, min_filled: int = 6
+        self,
+        points: Float,
+        margin_m: float,
+        margin_fraction: float,
+        min_filled: int = 6,
+        velocity_m_s: Float | None = None,
     ) -> Bool:
         """(N,3) lidar frame at the reference time -> (N,) True where the space is certainly free.
 
@@ -41,11 +47,14 @@ class RangeImage:
         return, and every return in them lies farther than the point by more than
         ``max(margin_m, margin_fraction * range)``. A larger margin forgives errors of registration
         and misses movers close to a background.
+
+        velocity_m_s: (N,3) of the points, if they move: the scanner faced them earlier or later.
         """
         free = np.zeros(len(points), bool)
         points32 = points.astype(np.float32)
+        velocity = None if velocity_m_s is None else velocity_m_s.astype(np.float32)
         for scanner in self.scanners:
-            free |= scanner.sees_through(points32, margin_m, margin_fraction, min_filled)
+            free |= scanner.sees_through(points32, velocity, margin_m, margin_fraction, min_filled)
         return free
 
 
@@ -103,17 +112,26 @@ class ScannerImage:
         )
 
     def sees_through(
-        self, points: Float32, margin_m: float, margin_fraction: float, min_filled: int
+        self,
+        points: Float32,
+        velocity: Float32 | None,
+        margin_m: float,
+        margin_fraction: float,
+        min_filled: int,
     ) -> Bool:
         num_rows, num_columns = self.nearest_m.shape
-        moved = points
+        seen = points
         for _ in range(2):  # when did the scanner face the point? converges in two steps
-            facing = _column(np.arctan2(moved[:, 1], moved[:, 0]), num_columns)
-            moved = _at_time(points, self.offset_s[facing], self.twist_before, self.twist_after)
-        azimuth, elevation, range_m = _spherical(moved)
+            time_s = self.offset_s[_column(np.arctan2(seen[:, 1], seen[:, 0]), num_columns)]
+            moved = points if velocity is None else points + time_s[:, None] * velocity
+            seen = _at_time(moved, time_s, self.twist_before, self.twist_after)
+        azimuth, elevation, range_m = _spherical(seen)
+        column = _column(azimuth, num_columns)
         row = np.floor((elevation - self.elevation_low_rad) / self.elevation_step_rad)
         inside = (row >= 0) & (row < num_rows)
-        cell = (np.where(inside, row, 0).astype(np.int64), _column(azimuth, num_columns))
+        # Where a turning scanner begins and ends its revolution it skips or repeats a sector.
+        inside &= np.abs(self.offset_s[column] - time_s) < _SETTLED_S
+        cell = (np.where(inside, row, 0).astype(np.int64), column)
         margin = np.maximum(margin_m, margin_fraction * range_m)
         return (
             inside

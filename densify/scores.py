@@ -114,7 +114,11 @@ def ghosts(cloud: Cloud, key_image: RangeImage, key: int) -> Bool:
     ghost = np.zeros(len(cloud), bool)
     other = cloud.frame != key
     ghost[other] = key_image.sees_through(
-        cloud.points[other], _GHOST_MARGIN_M, _GHOST_MARGIN_FRACTION, min_filled=6
+        cloud.points[other],
+        _GHOST_MARGIN_M,
+        _GHOST_MARGIN_FRACTION,
+        min_filled=6,
+        velocity_m_s=cloud.velocity_m_s[other],
     )
     return ghost
 

@@ -35,11 +35,17 @@ class FreeSpace:
         with ThreadPoolExecutor() as pool:
             return FreeSpace(window, tuple(pool.map(RangeImage.of, window.sweeps)))
 
-    def seen_through(self, points: Float, j: int) -> Bool:
-        """(N,3) key frame -> (N,) True where sweep number j certainly saw free space."""
+    def seen_through(self, points: Float, j: int, velocity_m_s: Float | None = None) -> Bool:
+        """(N,3) key frame -> (N,) True where sweep number j certainly saw free space.
+
+        points: at the sweep's reference time. velocity_m_s: (N,3) of those that move.
+        """
         T_lidar_key = poses.inverse(self.window.sweeps[j].T_key_lidar)
         return self.images[j].sees_through(
-            poses.transform(T_lidar_key, points), _MARGIN_M, _MARGIN_FRACTION
+            poses.transform(T_lidar_key, points),
+            _MARGIN_M,
+            _MARGIN_FRACTION,
+            velocity_m_s=None if velocity_m_s is None else velocity_m_s @ T_lidar_key[:3, :3].T,
         )
 
 

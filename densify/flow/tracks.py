@@ -19,6 +19,7 @@ from densify.flow.evidence import Candidates, FreeSpace
 from densify.types import Bool, Float
 
 _MIN_POINTS = 8
+_PER_SWEEP_AWAY = 0.8  # a start one sweep farther from the key needs as many more points
 _MIN_SEED_SHARE = 0.4
 _MAX_SPEED_M_S = 38.0
 _VOTE_STEP_M = 0.2  # per sweep
@@ -29,11 +30,13 @@ _GATES_M = (0.8, 0.5, 0.3, 0.2, 0.2)
 _SURFACE_M = 0.05  # noise of a surface point
 _FIT_M = 0.3
 _MIN_FIT = 5  # points
+_MANY_POINTS = 100  # more do not place a sweep better
 _MAX_WEIGHT = 60.0
 _PREDICTION_STD = np.array([0.3, 0.3, 0.08, 0.06])  # m, m, m, rad
+_STEADY = np.array([1.0, 1.0, 0.5, 0.9])  # of a rate lasts: slopes and turns level out
 _NUM_ASKED = 60
 _MISSES_ALLOWED = 1
-_MAX_CONTRADICTIONS = 0.2  # of those that standing still leaves
+_MAX_CONTRADICTIONS = 0.3  # of those that standing still leaves
 
 
 @dataclass
@@ -85,29 +88,34 @@ def follow_groups(
     free = [np.ones(len(c.points), bool) for c in candidates]  # not yet part of a track
     untried = [np.ones(len(c.points), bool) for c in candidates]
     tracks = []
-    for i in sorted(range(len(candidates)), key=lambda i: (abs(i - key_index), i)):
-        for members in _groups_to_start(candidates[i]):
-            members = members[free[i][members] & untried[i][members]]
-            if len(members) < _MIN_POINTS:
-                continue
-            velocity = _vote(candidates[i].points[members], i, fields, sweep_time_s)
-            track = _follow(members, i, velocity, candidates, free, sweep_time_s)
-            proven = _prove(track, candidates, space, sweep_time_s)
-            for j, rows in track.claimed.items():
-                untried[j][rows] = False
-                if proven:
-                    free[j][rows] = False
+    for i, group in _groups_to_start(candidates, key_index):
+        members = group[free[i][group] & untried[i][group]]
+        if len(members) < _MIN_POINTS:
+            continue
+        velocity = _vote(candidates[i].points[members], i, fields, sweep_time_s)
+        track = _follow(members, i, velocity, candidates, free, sweep_time_s)
+        proven = _prove(track, candidates, space, sweep_time_s)
+        for j, rows in track.claimed.items():
+            untried[j][rows] = False
             if proven:
-                tracks.append(track)
+                free[j][rows] = False
+        if proven:
+            tracks.append(track)
     return tracks
 
 
-def _groups_to_start(c: Candidates) -> list[np.ndarray]:
-    """Members of the clusters that are mostly seeds, largest first."""
-    size = np.bincount(c.cluster, minlength=c.num_clusters)
-    seeds = np.bincount(c.cluster, c.seed, minlength=c.num_clusters)
-    good = np.flatnonzero((size >= _MIN_POINTS) & (seeds >= _MIN_SEED_SHARE * size))
-    return [np.flatnonzero(c.cluster == k) for k in good[np.argsort(-size[good], kind="stable")]]
+def _groups_to_start(
+    candidates: Sequence[Candidates], key_index: int
+) -> list[tuple[int, np.ndarray]]:
+    """Sweep and members of the clusters that are mostly seeds, the best start first: what is seen
+    well makes a good model, and from the middle of the window a track has the shortest ways."""
+    groups = []
+    for i, c in enumerate(candidates):
+        size = np.bincount(c.cluster, minlength=c.num_clusters)
+        seeds = np.bincount(c.cluster, c.seed, minlength=c.num_clusters)
+        good = np.flatnonzero((size >= _MIN_POINTS) & (seeds >= _MIN_SEED_SHARE * size))
+        groups += [(i, np.flatnonzero(c.cluster == k)) for k in good]
+    return sorted(groups, key=lambda g: -len(g[1]) * _PER_SWEEP_AWAY ** abs(g[0] - key_index))
 
 
 @dataclass(frozen=True)
@@ -212,7 +220,7 @@ def _predict(track: Track, rate: Float, time_s: float) -> tuple[Float, Float]:
     nearest = known[0]
     if len(known) > 1:
         t = [track.times_s[k] - time_s for k in known]
-        rate = np.polyfit(t, np.stack([track.states[k] for k in known]), 1)[0]
+        rate = np.polyfit(t, np.stack([track.states[k] for k in known]), 1)[0] * _STEADY
     return track.states[nearest] + rate * (time_s - track.times_s[nearest]), rate
 
 
@@ -327,12 +335,14 @@ def _prove(
         return False
     t = np.array([track.times_s[j] for j in seen])
     states = np.stack([track.states[j] for j in seen])
+    weight = np.sqrt([min(len(track.claimed[j]), _MANY_POINTS) for j in seen])
     degree = 2 if len(seen) >= 5 else 1
-    track.smooth = np.polyfit(t, states, degree).T
+    track.smooth = np.polyfit(t, states, degree, w=weight).T
     fitted = np.stack([np.polyval(p, t) for p in track.smooth], axis=1)
     freedom = len(seen) / (len(seen) - degree - 0.5)
     residual = np.linalg.norm((states - fitted)[:, :2], axis=1)
-    track.residual_m = float(np.sqrt((residual**2).mean() * freedom))
+    mean_square = np.average(residual**2, weights=weight**2)
+    track.residual_m = float(np.sqrt(mean_square * freedom))
     travelled = float(np.linalg.norm((fitted[-1] - fitted[0])[:2]))
     step_m = travelled / (seen[-1] - seen[0])
     range_m = float(np.linalg.norm(track.centre[:2]))
@@ -354,9 +364,11 @@ def _contradictions(
         points, seen_s = candidates[i].points[rows], candidates[i].time_s[rows]
         for j in range(len(candidates)):
             if j != i:
-                carried = track.carry(points, seen_s, track.seen_at(j, sweep_time_s))
+                there_s = sweep_time_s[j]
+                carried = track.carry(points, seen_s, there_s)
+                velocity = (track.carry(carried, there_s, there_s + 0.01) - carried) / 0.01
                 still += int(space.seen_through(points, j).sum())
-                moved += int(space.seen_through(carried, j).sum())
+                moved += int(space.seen_through(carried, j, velocity).sum())
     return still, moved
 
 

@@ -57,10 +57,11 @@ def _group_steps(
             mine = np.flatnonzero(instance == k)
             if len(mine):
                 at_reference = track.carry(points[mine], seen_s[mine], time_s[i])
-                arrived = track.carry(at_reference, time_s[i], time_s[target])
                 into_lidar = registered.T_key_lidar[:3, :3]
                 to_reference[mine] = (at_reference - points[mine]) @ into_lidar
-                displacement[mine] = (arrived - at_reference) @ into_lidar
+                if target != i:
+                    arrived = track.carry(at_reference, time_s[i], time_s[target])
+                    displacement[mine] = (arrived - at_reference) @ into_lidar
         nothing_lost = np.zeros(len(points), bool)
         fields.append(FlowField(displacement, instance >= 0, instance, nothing_lost, to_reference))
     return tuple(fields)
@@ -135,7 +136,7 @@ def _objective_steps(
         target = i + int(np.sign(key - i))
         if target == i:
             field.moving[:] = above[i]  # whatever arrives here has arrived
-        else:
+        elif above[i].any() and above[target].any():
             pair = flow_between(clouds[i][above[i]], clouds[target][above[target]], settings)
             field.displacement[above[i]] = pair.displacement @ registered.T_key_lidar[:3, :3]
             field.moving[above[i]] = pair.moving
