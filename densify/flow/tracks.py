@@ -19,7 +19,7 @@ from densify.flow.evidence import Candidates, FreeSpace
 from densify.types import Bool, Float
 
 _MIN_POINTS = 8
-_PER_SWEEP_AWAY = 0.8  # a start one sweep farther from the key needs as many more points
+_PER_SWEEP_AWAY = 0.7  # a start one sweep farther from the key needs as many more points
 _MIN_SEED_SHARE = 0.4
 _MAX_SPEED_M_S = 38.0
 _VOTE_STEP_M = 0.2  # per sweep
