@@ -73,6 +73,13 @@ class RegisterSettings(Section):
     max_speed_m_s: float = knob(
         60.0, "[m/s] a faster step between two sweeps is an error of registration", 1, 200
     )
+    min_overlap: float = knob(
+        0.55,
+        "share of what stands in a sweep that must lie on the sweep before; right poses gave 0.73 "
+        "(16 beams, 25 m/s) to 0.98",
+        0,
+        1,
+    )
     min_num_points: int = knob(1000, "a sweep with fewer points cannot be registered", 1, 1_000_000)
 
     def __post_init__(self) -> None:
@@ -112,17 +119,25 @@ class FlowSettings(Section):
     )
     solver: str = knob(
         "pcg",
-        "of the objective. pcg: conjugate gradients, fast; adam: 1,500 steps as published",
+        "of the objective (engine paper, densify flow). pcg: conjugate gradients, fast; adam: "
+        "1,500 steps as published",
         choices=("pcg", "adam"),
     )
-    alpha: float = knob(10.0, "weight of smoothness; larger moves neighbours more alike", 0, 1e6)
-    num_neighbors: int = knob(50, "neighbours in the graph; more is stiffer and slower", 1, 500)
+    alpha: float = knob(
+        10.0, "of the objective: weight of smoothness; larger moves neighbours more alike", 0, 1e6
+    )
+    num_neighbors: int = knob(
+        50, "of the objective: neighbours in the graph; more is stiffer and slower", 1, 500
+    )
     radius_m: float | None = knob(
-        None, "[m] join all points within this radius instead of num_neighbors; null: off", 0.01, 20
+        None,
+        "[m] join the points within this radius, at most the num_neighbors nearest; null: off",
+        0.01,
+        20,
     )
     laplacian: str = knob(
         "symmetric",
-        "symmetric: as published; row-sum-zero: leaves a constant flow unpunished",
+        "of the objective. symmetric: as published; row-sum-zero: leaves a constant flow free",
         choices=("symmetric", "row-sum-zero"),
     )
     static_prior: bool = knob(
@@ -130,7 +145,9 @@ class FlowSettings(Section):
         "points not proven to move keep exactly their rigid place; off moves every point, with "
         "engine paper and in the flow of two files",
     )
-    device: str = knob("auto", "auto: CUDA where there is one", choices=("auto", "cpu", "cuda"))
+    device: str = knob(
+        "auto", "of the objective; auto: CUDA where there is one", choices=("auto", "cpu", "cuda")
+    )
 
 
 @dataclass(frozen=True)
@@ -174,7 +191,7 @@ class ProjectSettings(Section):
         0.7,
         "how far the two-sided fill looks for measured pixels, in spacings of neighbouring rays; "
         "larger fills more between the lines of a sparse scanner",
-        0,
+        0.1,
         5,
     )
     edge_m: float = knob(0.3, "[m] no pixel is filled where depths around it spread by more", 0, 10)
@@ -273,7 +290,7 @@ def _read_yaml(text: str, where: str) -> Any:
 
     try:
         return yaml.load(text, Loader)
-    except yaml.YAMLError as error:
+    except (yaml.YAMLError, ValueError) as error:  # ValueError: a date that is none, say
         reason = " ".join(str(error).split())
         raise InputError(f"{where}: not YAML: {reason}") from error
 

@@ -6,7 +6,7 @@ from __future__ import annotations
 import resource
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -24,7 +24,7 @@ from densify.stages.deskew import deskew
 from densify.stages.flow import step_flow
 from densify.stages.ground import height_above_ground
 from densify.stages.project import project
-from densify.stages.register import check_plausible, register
+from densify.stages.register import check_overlap, check_plausible, register
 from densify.types import (
     Camera,
     Cloud,
@@ -32,6 +32,7 @@ from densify.types import (
     Float,
     FlowField,
     LidarSequence,
+    Progress,
     RegisteredSweep,
     Result,
     StageCost,
@@ -45,7 +46,6 @@ METHODS = ("none", "icp", "flow")
 next."""
 
 ConfigLike = Config | str | Path | Mapping[str, Any] | None
-Progress = Callable[[str, int, int], None]
 
 
 def run(
@@ -66,8 +66,6 @@ def run(
     The result carries its baselines. Raises InputError for what cannot be used, ComputationError
     where registration went wrong.
     """
-    if method not in METHODS:
-        raise InputError(f"--method {method}: expected one of {', '.join(METHODS)}")
     return compare(sequence, key, window, cameras, config, progress, upto=method)[method]
 
 
@@ -84,6 +82,8 @@ def compare(
 
     The rest as `run`.
     """
+    if upto not in METHODS:
+        raise InputError(f"--method {upto}: expected one of {', '.join(METHODS)}")
     settings = resolve(config)
     wanted = METHODS[: METHODS.index(upto) + 1]
     chosen = choose_cameras(sequence, cameras)
@@ -91,6 +91,8 @@ def compare(
     watch = _Watch(progress)
 
     sweeps = _read(sequence, [*lead_in, *frames], settings, watch)
+    with watch.stage("images"):
+        images = {camera.name: sequence.image(camera.name, key) for camera in chosen}
     with watch.stage("register"):
         trajectory = _trajectory(sequence, sweeps, key, settings)
     with watch.stage("deskew"):
@@ -120,10 +122,9 @@ def compare(
             with watch.stage("project"):
                 seen = project(exposed, camera, T_cam_key, settings.project, key, origins)
             with watch.stage("colour"):
-                image = sequence.image(camera.name, key)
-                cloud = replace(
-                    cloud, rgb=colour(cloud.rgb, exposed.points, camera, T_cam_key, seen, image)
-                )
+                image = images[camera.name]
+                rgb = colour(cloud.rgb, exposed.points, camera, T_cam_key, seen, image)
+                cloud = replace(cloud, rgb=rgb)
             depth[camera.name] = seen
         with watch.stage("score"):
             metrics = _scores(sequence, moving_window, cloud, depth)
@@ -151,6 +152,7 @@ def _trajectory(
     if settings.register.source == "dataset":
         trajectory = recorded_trajectory(sequence, sweeps)
         check_plausible(trajectory, settings.register)
+        check_overlap(sweeps, trajectory, settings.register)
         return trajectory
     rough = register(sweeps, settings.register)
     straight = [s.sweep for s in deskew(sweeps, rough, key).sweeps]

@@ -14,7 +14,7 @@ import numpy as np
 
 from densify.errors import InputError
 from densify.range_image import RangeImage
-from densify.types import Bool, Camera, Cloud, DepthMap, Float, Float32
+from densify.types import Bool, Camera, Cloud, DepthMap, Float32
 
 KITTI_BASELINE_M = 0.54
 _OUTLIER_PX = 3.0
@@ -129,9 +129,9 @@ def ghost_rate(cloud: Cloud, key_image: RangeImage, key: int) -> float | None:
 
 
 def ghost_scores(cloud: Cloud, key_image: RangeImage, key: int) -> dict[str, Any]:
-    """Needs no truth: ``num_points`` judged and the `ghost_rate` of ``all`` of them, of those the
-    flow calls ``moving`` and of the ``static`` rest, and by distance in frames from the key
-    (``by_distance["3"]``: frames key-3 and key+3)."""
+    """Needs no truth: ``num_points`` of other sweeps and the `ghost_rate` of ``all`` of them, of
+    those the flow calls ``moving`` and of the ``static`` rest, and by distance in frames from the
+    key (``by_distance["3"]``: frames key-3 and key+3)."""
     other = cloud.frame != key
     ghost = ghosts(cloud, key_image, key)
     distance = np.abs(cloud.frame - key)
@@ -143,34 +143,6 @@ def ghost_scores(cloud: Cloud, key_image: RangeImage, key: int) -> dict[str, Any
         "by_distance": {
             str(steps): _mean(ghost[distance == steps]) for steps in np.unique(distance[other])
         },
-    }
-
-
-def flow_errors(estimated: Float, true: Float, moving: Bool) -> dict[str, dict[str, Any]]:
-    """Scene flow against truth: ``errors["all"|"moving"|"static"]``.
-
-    estimated, true: (N,3) metres, ego-motion removed. moving: (N,) bool, truly moves. Each part
-    holds ``num_points``, ``epe_m`` (mean end-point error), ``within_5cm`` and ``within_10cm`` (the
-    fractions of points whose error is no larger; the absolute halves of the strict and the relaxed
-    accuracy of Liu et al., "FlowNet3D", CVPR 2019). Moving and static stay apart because most
-    points are static: over all of them, doing nothing scores well.
-    Raises InputError if the shapes differ.
-    """
-    if estimated.shape != true.shape or moving.shape != true.shape[:1]:
-        raise InputError(
-            f"flow errors: expected (N,3), (N,3) and (N,) of one N, got {estimated.shape}, "
-            f"{true.shape} and {moving.shape}; give the flow of the same points"
-        )
-    error = np.linalg.norm(estimated - true, axis=1)
-    parts = {"all": np.ones(len(error), bool), "moving": moving, "static": ~moving}
-    return {
-        part: {
-            "num_points": int(mask.sum()),
-            "epe_m": _mean(error[mask]),
-            "within_5cm": _mean(error[mask] <= 0.05),
-            "within_10cm": _mean(error[mask] <= 0.10),
-        }
-        for part, mask in parts.items()
     }
 
 

@@ -7,7 +7,7 @@ Poses are named ``T_target_source``: ``p_target = T_target_source @ p_source``. 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
 
@@ -153,7 +153,7 @@ class Cloud:
 
     points: (M,3) metres, key frame.
     rigid_points: (M,3) where registration alone puts them.
-    frame: (M,) int32 source sweep. row: (M,) int64 index of the point in its deskewed sweep.
+    frame: (M,) int32 source sweep. row: (M,) int64 in the source sweep's file.
     moving: (M,) bool. instance: (M,) int32, -1 none. velocity_m_s: (M,3) float32 at the key's
     moment, ego-motion removed, 0 where nothing moves. confidence: (M,) float32, 0 to 1.
     intensity: (M,) float32. rgb: (M,3) uint8, black where no camera saw the point.
@@ -227,6 +227,10 @@ class SweepTruth:
     points: Float
     instance: NDArray[np.int32]
     moving: Bool
+
+
+Progress = Callable[[str, int, int], None]
+"""Called as ``(stage, done, total)`` while something takes its time."""
 
 
 class Truth(Protocol):

@@ -307,7 +307,7 @@ def test_links_of_nothing():
 def test_a_track_carries_points_along_its_smooth_motion():
     """3 m/s ahead while turning by 0.2 rad/s about the object's own centre."""
     smooth = np.array([[3.0, 1.0], [0.0, 0.0], [0.0, 0.0], [0.2, 0.0]])
-    track = Track(centre=np.array([10.0, 5.0, 0.0]), start=0, smooth=smooth)
+    track = Track(centre=np.array([10.0, 5.0, 0.0]), smooth=smooth)
     ahead = np.array([[14.0, 5.0, 1.0]])  # at t = 0, 3 m before the centre that is at x = 11
     moved = track.carry(ahead, 0.0, 0.5)
     expected = [12.5 + 3 * np.cos(0.1), 5 + 3 * np.sin(0.1), 1.0]

@@ -199,10 +199,13 @@ def test_more_sweeps_give_more_depth(moving):
     assert density["flow"] > 1.1 * density["none"]
 
 
+_LAST_STAGES = ("accumulate", "project", "colour", "score")
+
+
 def test_costs_of_every_stage(moving):
     costs = {c.name: c for c in moving["flow"].costs}
-    stages = ["read", "register", "deskew", "ground", "flow", "chain"]
-    assert list(costs) == [*stages, "accumulate", "project", "colour", "score"]
+    stages = ["read", "images", "register", "deskew", "ground", "flow", "chain"]
+    assert list(costs) == [*stages, *_LAST_STAGES]
     for cost in costs.values():
         assert cost.seconds >= 0 and cost.peak_memory_mb > 10
     peaks = [costs[s].peak_memory_mb for s in stages]
@@ -222,7 +225,7 @@ def test_progress_names_every_stage():
     seen: list[tuple[str, int, int]] = []
     run(tiny(), KEY, 1, "icp", config=POSES_GIVEN, progress=lambda *step: seen.append(step))
     names = list(dict.fromkeys(name for name, _, _ in seen))
-    assert names == ["read", "register", "deskew", "accumulate", "project", "colour", "score"]
+    assert names == ["read", "images", "register", "deskew", *_LAST_STAGES]
     assert all(0 <= done <= total for _, done, total in seen)
     for name in names:
         steps = [(done, total) for n, done, total in seen if n == name]
@@ -313,6 +316,15 @@ def test_an_image_of_another_moment_sees_from_where_the_camera_was(late_s):
     assert abs(np.median(found[on_wall]) - wall_m) < 0.05
 
 
+def test_the_camera_moves_on_though_the_sweeps_are_not_deskewed():
+    sequence = TinySequence(tiny().scene, range(14), late_s=0.05)
+    given = {"register": {"source": "dataset", "deskew": False}}
+    late = run(sequence, KEY, 1, "icp", config=given).depth["front"].depth_m
+    at_once = TinySequence(tiny().scene, range(14), late_s=0.0)
+    early = run(at_once, KEY, 1, "icp", config=given).depth["front"].depth_m
+    assert not np.array_equal(late, early)
+
+
 def test_a_mover_is_shown_where_it_was_at_the_exposure():
     """Oncoming at 20 m/s it is 1 m nearer after 50 ms."""
     scene = Scene(
@@ -369,7 +381,7 @@ def test_run_is_compare_up_to_its_method(moving):
     result = run(tiny(MOVERS), KEY, WINDOW, "icp")
     assert result.method == "icp" and tuple(result.baselines) == ("none",)
     assert same_points(result.cloud, moving["icp"].cloud)
-    assert [c.name for c in result.costs][:3] == ["read", "register", "deskew"]
+    assert [c.name for c in result.costs][:4] == ["read", "images", "register", "deskew"]
     assert "flow" not in [c.name for c in result.costs]
 
 

@@ -195,7 +195,7 @@ def test_without_times_points_stay_to_the_last_bit(walled):
     sweep = replace(walled.scan(KEY).sweep, offset_ns=None)
     registered = deskew([sweep], walled.trajectory([4, 5, 6]), KEY)[KEY]
     assert registered.sweep.points.tobytes() == sweep.points.tobytes()
-    assert not registered.twist_before.any() and not registered.twist_after.any()
+    assert registered.twist_after.any()  # the lidar moves all the same
 
 
 def test_the_window_is_placed_around_the_key(walled):

@@ -13,7 +13,6 @@ from densify.range_image import RangeImage
 from densify.scores import (
     depth_errors,
     depth_scores,
-    flow_errors,
     ghost_rate,
     ghost_scores,
     image_density,
@@ -218,31 +217,3 @@ def test_ghost_scores_by_kind_and_distance():
         "static": 0.0,
         "by_distance": {"1": 0.0, "2": 0.5},
     }
-
-
-# --- flow -----------------------------------------------------------------------------------------
-
-
-def test_flow_errors_by_hand():
-    true = np.array([[1.0, 0, 0], [0, 1.0, 0], [0, 0, 0], [0, 0, 0]])
-    found = np.array([[1.0, 0.03, 0.04], [0, 0, 0], [0, 0, 0.07], [0, 0, 0]])
-    errors = flow_errors(found, true, np.array([True, True, False, False]))
-    assert json.loads(json.dumps(errors, allow_nan=False)) == errors
-    assert errors["moving"] == {
-        "num_points": 2,
-        "epe_m": pytest.approx(0.525),
-        "within_5cm": 0.5,
-        "within_10cm": 0.5,
-    }
-    assert errors["static"]["epe_m"] == pytest.approx(0.035)
-    assert (errors["static"]["within_5cm"], errors["static"]["within_10cm"]) == (0.5, 1.0)
-    assert errors["all"]["epe_m"] == pytest.approx(0.28)
-    none = flow_errors(found, true, np.zeros(4, bool))["moving"]
-    assert none == {"num_points": 0, "epe_m": None, "within_5cm": None, "within_10cm": None}
-
-
-def test_flow_errors_name_wrong_shapes():
-    with pytest.raises(InputError, match=r"\(4, 3\), \(5, 3\) and \(4,\)"):
-        flow_errors(np.zeros((4, 3)), np.zeros((5, 3)), np.zeros(4, bool))
-    with pytest.raises(InputError):
-        flow_errors(np.zeros((4, 3)), np.zeros((4, 3)), np.zeros(3, bool))

@@ -5,11 +5,12 @@ from __future__ import annotations
 
 import logging
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import TYPE_CHECKING
 
-Progress = Callable[[str, int, int], None]
-"""Called as ``(stage, done, total)``."""
+if TYPE_CHECKING:
+    from densify.types import Progress
 
 
 class _LineHandler(logging.Handler):

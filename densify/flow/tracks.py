@@ -50,7 +50,6 @@ class Track:
     """
 
     centre: Float
-    start: int
     states: dict[int, Float] = field(default_factory=dict)
     times_s: dict[int, float] = field(default_factory=dict)
     claimed: dict[int, np.ndarray] = field(default_factory=dict)
@@ -189,7 +188,7 @@ def _follow(
     rate = np.append(velocity, 0.0)
     seen_s = float(here.time_s[members].mean())
     points = _at_once(here, members, rate, seen_s)
-    track = Track(points.mean(0), start)
+    track = Track(points.mean(0))
     track.add(start, np.zeros(4), seen_s, members)
     model = _Model(points)
     for direction in (1, -1):

@@ -1,30 +1,39 @@
 # SPDX-License-Identifier: MIT
-"""Opening recordings. A new data set is one more module here and one more line in READERS."""
+"""Opening recordings. A new data set is one more module here and one more row in READERS."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import NamedTuple
 
 from densify.errors import InputError
 from densify.types import LidarSequence
 
 
-def _open_kitti_raw(path: str) -> LidarSequence:
+def _open_kitti_raw(folder: Path) -> LidarSequence:
     from densify.readers.kitti_raw import KittiRaw
 
-    return KittiRaw(Path(path))
+    return KittiRaw(folder)
 
 
-def _open_street(spec: str) -> LidarSequence:
-    from densify.readers.street import Street
+class Reader(NamedTuple):
+    """How the recordings of one data set are opened, and told from those of others.
 
-    return Street.from_spec(spec)
+    holds: what a folder of it has inside, for messages. recognises: whether a folder is one.
+    """
+
+    open: Callable[[Path], LidarSequence]
+    recognises: Callable[[Path], bool]
+    holds: str
 
 
-READERS: dict[str, Callable[[str], LidarSequence]] = {
-    "kitti": _open_kitti_raw,
-    "street": _open_street,
+READERS: dict[str, Reader] = {
+    "kitti": Reader(
+        _open_kitti_raw,
+        lambda folder: (folder / "velodyne_points").is_dir(),
+        "a KITTI raw drive (a folder that holds velodyne_points/)",
+    ),
 }
 
 
@@ -38,19 +47,20 @@ def open_sequence(spec: str | Path = "street") -> LidarSequence:
     """
     text = str(spec)
     if text == "street" or text.startswith(("street:", "street?")):
-        return _open_street(text)
-    reader, colon, path = text.partition(":")
-    if colon and reader in READERS:
-        return READERS[reader](path)
+        from densify.readers.street import Street
+
+        return Street.from_spec(text)
+    name, colon, path = text.partition(":")
+    if colon and name in READERS:
+        return READERS[name].open(Path(path))
     folder = Path(text)
     if not folder.exists():
         raise InputError(
             f"--data {text}: no such folder; expected a recording's folder, READER:PATH with "
             f"READER one of {', '.join(READERS)}, or street[:PRESET]"
         )
-    if (folder / "velodyne_points").is_dir():
-        return _open_kitti_raw(text)
-    raise InputError(
-        f"--data {text}: no known recording there; expected a KITTI raw drive (a folder that holds "
-        f"velodyne_points/)"
-    )
+    for reader in READERS.values():
+        if reader.recognises(folder):
+            return reader.open(folder)
+    known = " or ".join(reader.holds for reader in READERS.values())
+    raise InputError(f"--data {text}: no known recording there; expected {known}")

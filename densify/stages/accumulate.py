@@ -42,7 +42,7 @@ def accumulate(window: Window, fields: Sequence[FlowField], drop_lost: bool) -> 
                 "points": points[kept],
                 "rigid_points": rigid[kept],
                 "frame": np.full(len(kept), registered.frame, np.int32),
-                "row": kept,
+                "row": sweep.row[kept],
                 "moving": flow.moving[kept],
                 "instance": flow.instance[kept],
                 "velocity_m_s": velocity_m_s[kept].astype(np.float32),

@@ -26,9 +26,7 @@ def deskew(sweeps: Sequence[Sweep], trajectory: Trajectory, key: int) -> Window:
         i = trajectory.frames.index(sweep.frame)
         before, after = _twists(trajectory, i)
         points: Float = sweep.points
-        if sweep.offset_ns is None:
-            before, after = np.zeros(6), np.zeros(6)
-        else:
+        if sweep.offset_ns is not None:
             offset_s = sweep.offset_ns[:, None] * 1e-9
             twist = offset_s * np.where(offset_s < 0, before, after)
             points = poses.transform_each(twist.astype(np.float64), points)

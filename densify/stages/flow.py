@@ -134,9 +134,7 @@ def _objective_steps(
     for i, registered in enumerate(window.sweeps):
         field = FlowField.zero(len(clouds[i]))
         target = i + int(np.sign(key - i))
-        if target == i:
-            field.moving[:] = above[i]  # whatever arrives here has arrived
-        elif above[i].any() and above[target].any():
+        if target != i and above[i].any() and above[target].any():
             pair = flow_between(clouds[i][above[i]], clouds[target][above[target]], settings)
             field.displacement[above[i]] = pair.displacement @ registered.T_key_lidar[:3, :3]
             field.moving[above[i]] = pair.moving

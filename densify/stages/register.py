@@ -26,7 +26,6 @@ _SEARCH_POINTS = 800
 _STANDING_M = 0.4
 _OVERLAP_POINTS = 2000
 _OVERLAP_M = 0.5
-_MIN_OVERLAP = 0.55  # right ones measured: 0.97 (64 beams) to 0.73 (16 beams, 25 m/s)
 
 
 def register(
@@ -69,7 +68,7 @@ def register(
     )
     if rough is not None:  # a first pass may stumble where it starts from rest
         check_plausible(trajectory, settings)
-        _check_overlap(sweeps, trajectory)
+        check_overlap(sweeps, trajectory, settings)
     return trajectory
 
 
@@ -100,31 +99,13 @@ def _searched_step(sweeps: Sequence[Sweep], settings: RegisterSettings) -> Float
 
 def _standing(points: Float) -> Float:
     """The points above the ground: its rings go with the scanner and hide the motion."""
+    if not len(points):
+        return points
     _, cell = np.unique(np.floor(points[:, :2]), axis=0, return_inverse=True)
     lowest = np.full(int(cell.max()) + 1, np.inf)
     np.minimum.at(lowest, cell.ravel(), points[:, 2])
     standing = points[points[:, 2] > lowest[cell.ravel()] + _STANDING_M]
     return standing if len(standing) else points
-
-
-def _check_overlap(sweeps: Sequence[Sweep], trajectory: Trajectory) -> None:
-    """Raise ComputationError where a sweep does not lie on the one before it: odometry may glide
-    on at the expected speed over sweeps that have nothing to do with each other."""
-    world = [
-        poses.transform(T, _standing(s.points))
-        for s, T in zip(sweeps, trajectory.T_world_lidar, strict=True)
-    ]
-    for (a, b), (earlier, later) in zip(pairwise(trajectory.frames), pairwise(world), strict=True):
-        sample = later[:: len(later) // _OVERLAP_POINTS + 1]
-        distance, _ = cKDTree(earlier).query(sample, distance_upper_bound=_OVERLAP_M)
-        overlap = float(np.isfinite(distance).mean())
-        if overlap < _MIN_OVERLAP:
-            raise ComputationError(
-                f"registration fails from frame {a} to {b}: only {100 * overlap:.0f} % of what "
-                f"stands there lies on the sweep before, expected at least "
-                f"{100 * _MIN_OVERLAP:.0f} %; choose another key or a smaller window, or use the "
-                f"data set's poses (register.source=dataset)"
-            )
 
 
 def check_plausible(trajectory: Trajectory, settings: RegisterSettings) -> None:
@@ -153,18 +134,46 @@ def check_plausible(trajectory: Trajectory, settings: RegisterSettings) -> None:
             raise ComputationError(
                 f"registration jumps from frame {a} to {b}: {speed_m_s:.0f} m/s and "
                 f"{turn_deg_s:.0f} deg/s, expected at most {settings.max_speed_m_s:g} m/s and "
-                f"{_MAX_TURN_RATE_DEG_S:.0f} deg/s; choose another key, or use the data set's "
-                f"poses (register.source=dataset)"
+                f"{_MAX_TURN_RATE_DEG_S:.0f} deg/s; {_cure(settings)}"
             )
         if previous_m_s is not None:
             change_m_s = float(np.linalg.norm(velocity_m_s - previous_m_s))
             if change_m_s > _MAX_ACCELERATION_M_S2 * seconds + slack_m_s:
                 raise ComputationError(
                     f"registration jumps at frame {a}: the speed changes by {change_m_s:.1f} m/s "
-                    f"within {seconds:.2f} s, expected a vehicle's; choose another key, or use the "
-                    f"data set's poses (register.source=dataset)"
+                    f"within {seconds:.2f} s, expected a vehicle's; {_cure(settings)}"
                 )
         previous_m_s = velocity_m_s
+
+
+def check_overlap(
+    sweeps: Sequence[Sweep], trajectory: Trajectory, settings: RegisterSettings
+) -> None:
+    """Raise ComputationError where a sweep does not lie on the one before it: odometry may glide
+    on at the expected speed over sweeps that have nothing to do with each other. Sweeps too sparse
+    to tell are passed over."""
+    world = [
+        poses.transform(T, _standing(s.points))
+        for s, T in zip(sweeps, trajectory.T_world_lidar, strict=True)
+    ]
+    for (a, b), (earlier, later) in zip(pairwise(trajectory.frames), pairwise(world), strict=True):
+        if min(len(earlier), len(later)) < _OVERLAP_POINTS // 10:
+            continue
+        sample = later[:: len(later) // _OVERLAP_POINTS + 1]
+        distance, _ = cKDTree(earlier).query(sample, distance_upper_bound=_OVERLAP_M)
+        overlap = float(np.isfinite(distance).mean())
+        if overlap < settings.min_overlap:
+            raise ComputationError(
+                f"registration fails from frame {a} to {b}: only {100 * overlap:.0f} % of what "
+                f"stands there lies on the sweep before, expected at least "
+                f"{100 * settings.min_overlap:.0f} %; {_cure(settings)}, or lower "
+                f"register.min_overlap"
+            )
+
+
+def _cure(settings: RegisterSettings) -> str:
+    other = "kiss-icp" if settings.source == "dataset" else "dataset"
+    return f"choose another key or a smaller window, or other poses (register.source={other})"
 
 
 def _kiss_icp_config(settings: RegisterSettings, voxel_size_m: float):  # type: ignore[no-untyped-def]
