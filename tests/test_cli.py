@@ -18,6 +18,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 import yaml
@@ -25,7 +26,7 @@ import yaml
 from densify import types
 from densify.cli import main, tables, verbs
 from densify.config import as_mapping, resolve
-from densify.errors import ComputationError
+from densify.errors import ComputationError, InputError
 
 STREET = "street?sensor=vlp16"
 FAST = ["--window", "1", "--config", "fast", "--camera", "image_02", "--data", STREET]
@@ -201,6 +202,15 @@ def bad_point_files(folder: Path) -> dict[str, Any]:
     np.save(folder / "none.npy", np.zeros((0, 3)))
     np.save(folder / "nan.npy", np.array([[1.0, 2, 3], [1, np.nan, 3]]))
     np.savez(folder / "wrong.npz", cloud=np.zeros((3, 3)))
+    np.save(folder / "npy", np.ones((3, 3)))
+    (folder / "npy.npy").rename(folder / "array.npz")
+    np.savez(folder / "npz", points=np.ones((3, 3)))
+    (folder / "npz.npz").rename(folder / "archive.npy")
+    np.savez_compressed(folder / "damaged.npz", points=np.arange(300.0).reshape(100, 3))
+    damaged = bytearray((folder / "damaged.npz").read_bytes())
+    damaged[80:90] = b"\xff" * 10
+    (folder / "damaged.npz").write_bytes(damaged)
+    (folder / "empty.txt").write_text("")
     (folder / "cut.bin").write_bytes(bytes(37))
     (folder / "garbage.npz").write_bytes(b"no zip")
     (folder / "empty.npy").write_bytes(b"")
@@ -215,6 +225,10 @@ def bad_point_files(folder: Path) -> dict[str, Any]:
         "none.npy": "holds no points",
         "nan.npy": "1 of 2 points are not finite, the first in row 1",
         "wrong.npz": "holds the arrays cloud, expected points",
+        "array.npz": "holds a single array; name it .npy",
+        "archive.npy": "holds an archive of arrays; name it .npz",
+        "damaged.npz": "not a readable .npz",
+        "empty.txt": "holds no points",
         "cut.bin": "got 37 bytes, expected a multiple of 16",
         "garbage.npz": "not a readable .npz",
         "empty.npy": "not a readable .npy",
@@ -230,6 +244,26 @@ def test_bad_point_files(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> 
         line = refused(capsys, 2, "flow", tmp_path / "good.npy", tmp_path / name, "--out", out)
         assert name in line and part in line
         assert not out.exists()
+
+
+@pytest.mark.parametrize("name", ["p.npy", "p.npz"])
+def test_flipped_bytes_in_a_point_file_are_no_traceback(name: str, tmp_path: Path) -> None:
+    from densify.cli.point_files import read_points
+
+    path = tmp_path / name
+    points = np.linspace(-1, 1, 30).reshape(10, 3)
+    np.save(path, points) if name == "p.npy" else np.savez_compressed(path, points=points)
+    whole = path.read_bytes()
+    num_refused = 0
+    for i in range(len(whole)):
+        for mask in (0x01, 0x08, 0xFF):
+            path.write_bytes(whole[:i] + bytes([whole[i] ^ mask]) + whole[i + 1 :])
+            try:
+                read_points(path)
+            except InputError as error:
+                num_refused += 1
+                assert str(path) in str(error) and "\n" not in str(error)
+    assert num_refused > 100
 
 
 def test_point_files_of_every_kind_agree(tmp_path: Path) -> None:
@@ -303,6 +337,59 @@ def test_bad_command(case: str, tmp_path: Path, capsys: pytest.CaptureFixture[st
     for part in parts:
         assert part.replace("{tmp}", str(tmp_path)) in line
     assert not list(tmp_path.iterdir())
+
+
+def write_tiny_drive(folder: Path) -> Path:
+    """A KITTI drive of five sweeps of 3000 points, with an image at the third."""
+    drive = folder / "2011_09_26" / "2011_09_26_drive_0099_sync"
+    sweeps = drive / "velodyne_points" / "data"
+    sweeps.mkdir(parents=True)
+    rng = np.random.default_rng(0)
+    for frame in range(5):
+        columns = rng.uniform(0.1, 1, (3000, 4)) * [30, 20, 3, 1]
+        columns.astype("<f4").tofile(sweeps / f"{frame:010d}.bin")
+    (drive / "image_02" / "data").mkdir(parents=True)
+    cv2.imwrite(
+        str(drive / "image_02" / "data" / "0000000002.png"), np.zeros((20, 40, 3), np.uint8)
+    )
+    eye = "1 0 0 0 1 0 0 0 1"
+    (drive.parent / "calib_cam_to_cam.txt").write_text(
+        f"R_rect_00: {eye}\nS_rect_02: 40 20\nP_rect_02: 50 0 19.5 0 0 50 9.5 0 0 0 1 0\n"
+    )
+    (drive.parent / "calib_velo_to_cam.txt").write_text("R: 0 -1 0 0 0 -1 1 0 0\nT: 0 0 0\n")
+    return drive
+
+
+# What is wrong with a drive: a file of it, bytes of that file that are kept (None: the file is
+# gone), the exit code, and what the one line must say besides.
+SWEEP, CALIB = "velodyne_points/data/000000000{}.bin", "../calib_{}.txt"
+BAD_DRIVES: dict[str, tuple[str, int | None, int, list[str]]] = {
+    "truncated sweep": (SWEEP.format(2), 1601, 2, ["0000000002.bin", "1601"]),
+    "missing sweep": (SWEEP.format(1), None, 2, ["--key 2", "frame 1"]),
+    "sweep of no points": (SWEEP.format(2), 0, 2, ["0000000002.bin", "no points"]),
+    "sweep of few points": (SWEEP.format(2), 50 * 16, 1, ["sweep 2", "50 points"]),
+    "missing calibration": (CALIB.format("velo_to_cam"), None, 2, ["velo_to_cam.txt: missing"]),
+    "malformed calibration": (CALIB.format("velo_to_cam"), 9, 2, ["velo_to_cam.txt: R", "9"]),
+}
+
+
+@pytest.mark.parametrize("case", BAD_DRIVES)
+def test_bad_drive(case: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    name, num_bytes, code, parts = BAD_DRIVES[case]
+    drive = write_tiny_drive(tmp_path)
+    path = drive / name
+    if num_bytes is None:
+        path.unlink()
+    else:
+        path.write_bytes(path.read_bytes()[:num_bytes])
+    before = sorted(tmp_path.rglob("*"))
+    frames = ["--key", "2", "--window", "2"]
+    assert exit_code("run", *frames, "--data", drive, "--out", tmp_path / "out") == code
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    (line,) = captured.err.splitlines()
+    assert line.startswith("densify: ") and all(part in line for part in parts), line
+    assert sorted(tmp_path.rglob("*")) == before
 
 
 @pytest.mark.parametrize("verb", ["run", "compare"])
@@ -409,6 +496,8 @@ def test_interrupt_leaves_nothing(tmp_path: Path) -> None:
         stderr=subprocess.PIPE,
         text=True,
         cwd=tmp_path,
+        # A shell starts its background jobs deaf to Ctrl-C.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
     )
     with process:
         wait_until_computing(process.pid)

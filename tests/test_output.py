@@ -28,6 +28,7 @@ from densify.output import (
     write_depth_png,
     write_result,
 )
+from densify.output.atomic import staged_folder
 from densify.types import Cloud, DepthMap, Result, StageCost
 
 H, W = 12, 20
@@ -357,8 +358,8 @@ def test_metrics_are_plain_json(put, tmp_path):
         "key": 120,
         "method": "flow",
         "frames": [119, 120, 121],
-        "num_points": 50,
-        "metrics": {"a": 0.5, "b": {"c": None, "d": [3, None, [True, None]]}},
+        "a": 0.5,
+        "b": {"c": None, "d": [3, None, [True, None]]},
     }
 
 
@@ -465,6 +466,64 @@ def test_a_failure_in_the_middle_leaves_nothing(
     assert (tmp_path / "out").exists() == existing
 
 
+@pytest.mark.parametrize("there", ["", "p", "p/q"])
+def test_a_failure_leaves_no_folder_above_the_result(tmp_path, monkeypatch, there):
+    (tmp_path / there).mkdir(parents=True, exist_ok=True)
+    before = sorted(tmp_path.rglob("*"))
+
+    def fail(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(store, "write_cloud", fail)
+    with pytest.raises(KeyboardInterrupt):
+        write_result(result_of(), {}, tmp_path / "p" / "q" / "r", config={}, data="street")
+    assert sorted(tmp_path.rglob("*")) == before
+    (tmp_path / "file").write_text("")
+    with pytest.raises(OSError), staged_folder(tmp_path / "file" / "q" / "r", ()):
+        pass
+    assert sorted(tmp_path.rglob("*")) == sorted([*before, tmp_path / "file"])
+
+
+def test_a_failure_keeps_what_others_put_into_the_new_folders(tmp_path):
+    with pytest.raises(KeyboardInterrupt), staged_folder(tmp_path / "p" / "q" / "r", ()):
+        (tmp_path / "p" / "other").write_text("keep")
+        raise KeyboardInterrupt
+    assert [p.name for p in tmp_path.rglob("*")] == ["p", "other"]
+
+
+def test_overwriting_behind_a_link_keeps_the_link(put, tmp_path):
+    put()
+    link = tmp_path / "out" / "000120"
+    (tmp_path / "elsewhere").mkdir()
+    real = link.rename(tmp_path / "elsewhere" / "key")
+    link.symlink_to(real)
+    put(result_of(seed=9), overwrite=True)
+    assert link.is_symlink()
+    assert sorted(tree(real)) == sorted(RUN_FILES)
+    assert [p.name for p in real.parent.iterdir()] == ["key"]
+    assert [p.name for p in link.parent.iterdir()] == ["000120"]
+    depth = read_depth_png(real / "depth" / "image_02.png")
+    np.testing.assert_allclose(depth, map_of("image_02", 9).depth_m, atol=1 / 512)
+
+
+def test_a_failing_clean_up_is_a_warning(put, tmp_path, monkeypatch, caplog):
+    put()
+    first = tree(tmp_path / "out" / "000120")
+
+    def fail(*_, **__):
+        raise PermissionError(errno.EACCES, "Permission denied")
+
+    with monkeypatch.context() as patch:
+        patch.setattr("densify.output.atomic.shutil.rmtree", fail)
+        paths = put(result_of(seed=9), overwrite=True)
+    assert all(path.is_file() for path in paths)
+    assert tree(tmp_path / "out" / "000120") != first
+    (left,) = (p for p in (tmp_path / "out").iterdir() if p.name != "000120")
+    assert tree(left) == first
+    (message,) = (record.getMessage() for record in caplog.records)
+    assert str(left) in message and "Permission denied" in message and "\n" not in message
+
+
 @pytest.mark.parametrize(("existing", "nth"), [(False, 1), (True, 1), (True, 2)])
 def test_a_failing_rename_leaves_the_old_result(put, tmp_path, monkeypatch, nth, existing):
     if existing:
@@ -523,6 +582,24 @@ def test_places_that_cannot_be_written_to(put, tmp_path, monkeypatch):
     assert not (tmp_path / "new").exists()
 
 
+@pytest.mark.parametrize("linked", [False, True])
+@pytest.mark.parametrize("denied", ["itself", "parent"])
+def test_an_existing_result_needs_permission_in_and_above_it(
+    put, tmp_path, monkeypatch, linked, denied
+):
+    put()
+    folder = real = tmp_path / "out" / "000120"
+    if linked:
+        (tmp_path / "elsewhere").mkdir()
+        real = folder.rename(tmp_path / "elsewhere" / "key")
+        folder.symlink_to(real)
+    place = real.parent if denied == "parent" else folder
+    monkeypatch.setattr("densify.output.store.os.access", lambda path, _: Path(path) != place)
+    with pytest.raises(InputError) as error:
+        check_writable(tmp_path / "out", 120, overwrite=True)
+    one_line(error, f"no permission to write in {place};")
+
+
 # Comparison
 
 
@@ -545,10 +622,9 @@ def test_comparison_is_written_beside_the_run(put, images, tmp_path):
     assert list(table["methods"]) == ["none", "icp", "flow"]
     assert table["methods"]["none"] == {
         "frames": [119, 120, 121],
-        "num_points": 50,
-        "metrics": {"ghost_rate": None},
+        "ghost_rate": None,
     }
-    assert table["methods"]["icp"]["metrics"] == {"ghost_rate": 0.1}
+    assert table["methods"]["icp"]["ghost_rate"] == 0.1
     assert (table["schema_version"], table["key"]) == (1, 120)
     assert table["config"] == CONFIG
     picture = cv2.imread(str(paths[1]))

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import shutil
+
 import numpy as np
 import pytest
 
@@ -145,6 +147,22 @@ def test_writing_is_whole_or_not_at_all(street, written, tmp_path):
     assert list(KittiRaw(again).frames) == FRAMES[1:]
 
 
+def test_another_calibration_is_kept(street, tmp_path):
+    drive = write_kitti_tree(street, tmp_path, FRAMES[:1], [])
+    path = drive.parent / "calib_velo_to_cam.txt"
+    ours = path.read_bytes()
+    shutil.rmtree(drive)
+    path.write_text("R: 1\n")
+    with pytest.raises(InputError, match=r"calib_velo_to_cam\.txt: another .* --overwrite"):
+        write_kitti_tree(street, tmp_path, FRAMES[:1], [])
+    assert path.read_text() == "R: 1\n" and not drive.exists()
+    path.write_bytes(ours)
+    assert write_kitti_tree(street, tmp_path, FRAMES[:1], []) == drive
+    path.write_text("R: 1\n")
+    write_kitti_tree(street, tmp_path, FRAMES[:1], [], overwrite=True)
+    assert path.read_bytes() == ours
+
+
 def test_what_cannot_be_written_is_one_clear_line(street, tmp_path):
     file = tmp_path / "file"
     file.write_text("")
@@ -221,3 +239,22 @@ def test_missing_or_malformed_truth_files_are_named(tmp_path):
     np.savez(tmp_path / "depth" / "image_02" / "0000000001.npz", depth_m=np.zeros((2, 2)))
     with pytest.raises(InputError, match="moving"):
         truth.moving_mask("image_02", 1)
+
+
+def test_flipped_bytes_in_a_truth_file_are_one_clear_line(tmp_path):
+    write_bodies(tmp_path, _bodies())
+    path = tmp_path / "bodies.npz"
+    whole = path.read_bytes()
+    num_refused = 0
+    for i in range(len(whole)):
+        path.write_bytes(whole[:i] + bytes([whole[i] ^ 0xFF]) + whole[i + 1 :])
+        try:
+            FileTruth.open(tmp_path)  # some bytes, such as dates, mean nothing
+        except InputError as error:
+            num_refused += 1
+            assert str(path) in str(error) and "\n" not in str(error)
+    assert num_refused > len(whole) / 2
+    np.save(tmp_path / "array.npy", np.eye(4))
+    (tmp_path / "array.npy").rename(path)
+    with pytest.raises(InputError, match=r"bodies\.npz: not a truth file"):
+        FileTruth.open(tmp_path)

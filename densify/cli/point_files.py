@@ -5,11 +5,15 @@ from __future__ import annotations
 
 import io
 import os
+import tokenize
+import warnings
 import zipfile
+import zlib
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.lib.npyio import NpzFile
 from numpy.typing import NDArray
 
 from densify.errors import InputError
@@ -17,6 +21,11 @@ from densify.types import Float, FlowField
 
 _SUFFIXES = (".npy", ".npz", ".txt", ".bin")
 _KITTI_ROW_BYTES = 16
+# What numpy raises on damaged files; a flipped bit can ask zipfile for a password (RuntimeError).
+_DAMAGE = (
+    *(OSError, ValueError, EOFError, RuntimeError),
+    *(zipfile.BadZipFile, zlib.error, tokenize.TokenError),
+)
 
 
 def read_points(path: Path) -> Float:
@@ -34,17 +43,17 @@ def read_points(path: Path) -> Float:
         )
     try:
         array = _read_array(path)
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+    except _DAMAGE as error:
         reason = " ".join(str(error).split())
         raise InputError(f"{path}: not a readable {path.suffix} point file: {reason}") from error
+    if array.size == 0:
+        raise InputError(f"{path}: holds no points, expected at least one")
     if array.ndim != 2 or array.shape[1] < 3 or array.dtype.kind not in "fiu":
         raise InputError(
             f"{path}: got an array of shape {array.shape} and type {array.dtype}, expected numbers "
             f"of shape (N,3) or more columns"
         )
     points = array[:, :3].astype(np.float64)
-    if len(points) == 0:
-        raise InputError(f"{path}: holds no points, expected at least one")
     bad = np.flatnonzero(~np.isfinite(points).all(axis=1))
     if len(bad):
         raise InputError(
@@ -93,10 +102,10 @@ def write_flow(path: Path, field: FlowField) -> None:
 
 
 def _read_array(path: Path) -> NDArray[Any]:
-    if path.suffix == ".npy":
-        return np.load(path, allow_pickle=False)
     if path.suffix == ".txt":
-        return np.loadtxt(path, ndmin=2)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # an empty file is refused in our words
+            return np.loadtxt(path, ndmin=2)
     if path.suffix == ".bin":
         num_bytes = path.stat().st_size
         if num_bytes % _KITTI_ROW_BYTES:
@@ -104,7 +113,15 @@ def _read_array(path: Path) -> NDArray[Any]:
                 f"got {num_bytes} bytes, expected a multiple of {_KITTI_ROW_BYTES}; it is cut off"
             )
         return np.fromfile(path, np.float32).reshape(-1, 4)
-    with np.load(path, allow_pickle=False) as arrays:
+    loaded = np.load(path, allow_pickle=False)
+    if not isinstance(loaded, NpzFile):
+        if path.suffix == ".npz":
+            raise ValueError("holds a single array; name it .npy")
+        array: NDArray[Any] = loaded
+        return array
+    with loaded as arrays:
+        if path.suffix == ".npy":
+            raise ValueError("holds an archive of arrays; name it .npz")
         if "points" not in arrays:
             raise ValueError(f"holds the arrays {', '.join(arrays)}, expected points")
         return arrays["points"]

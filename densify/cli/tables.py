@@ -37,7 +37,11 @@ def summary(result: Result) -> str:
         lines.append(f"{name}: depth in {measured} of the pixels, {filled} with filled ones")
     ghosts = _percent(_look_up(result.metrics, "ghosts", "all"))
     if ghosts != _NONE:
-        lines.append(f"ghosts: {ghosts} of the accumulated points")
+        baseline = _NONE
+        if "icp" in result.baselines:
+            baseline = _percent(_look_up(result.baselines["icp"].metrics, "ghosts", "all"))
+        beside = "" if baseline == _NONE else f" ({baseline} by registration alone)"
+        lines.append(f"ghosts: {ghosts} of the accumulated points{beside}")
     return "\n".join(lines)
 
 

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Everything that writes files. Nothing else in the package touches the disk for a result."""
+"""The files of a result, each whole or not there. What else is written to disk: the flow between
+two point files (`densify.cli.point_files`), and simulated recordings (`densify.street.export`) with
+their truth (`densify.readers.truth_files`).
+"""
 
 from densify.output.cloud_laz import StoredCloud, read_cloud, write_cloud
 from densify.output.depth_png import read_depth_png, write_confidence_png, write_depth_png

@@ -5,11 +5,14 @@ the same folder (so on the same file system), then renamed.
 
 from __future__ import annotations
 
+import logging
 import os
 import shutil
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+
+log = logging.getLogger("densify")
 
 
 def write_file(path: Path, data: bytes) -> None:
@@ -28,14 +31,17 @@ def staged_folder(folder: Path, owned: Collection[str]) -> Iterator[Path]:
     """A folder to write into that becomes ``folder`` when the block ends without an exception.
 
     owned: names of entries that belong to the writer. Where ``folder`` exists already, these are
-        replaced or vanish; every other entry is kept. On any exception, an interrupt included,
-        ``folder`` is as it was before.
+        replaced or vanish; every other entry is kept. Where ``folder`` is a link, the folder it
+        leads to is replaced and the link stays. On any exception, an interrupt included,
+        ``folder`` and the folders above it are as they were before. Warns where the replaced
+        folder cannot be removed.
     """
+    folder = Path(os.path.realpath(folder))
     parent = folder.parent
-    made_parent = not parent.exists()
-    parent.mkdir(parents=True, exist_ok=True)
+    missing = [place for place in (parent, *parent.parents) if not place.exists()]
     staging = parent / f".{folder.name}.{os.getpid()}.tmp"
     try:
+        parent.mkdir(parents=True, exist_ok=True)
         if staging.exists():  # left by a killed process of the same number
             shutil.rmtree(staging)
         staging.mkdir()
@@ -47,8 +53,9 @@ def staged_folder(folder: Path, owned: Collection[str]) -> Iterator[Path]:
             os.rename(staging, folder)
     except BaseException:
         shutil.rmtree(staging, ignore_errors=True)
-        if made_parent and parent.exists() and not any(parent.iterdir()):
-            parent.rmdir()
+        for place in missing:  # from the deepest up
+            if place.exists() and not any(place.iterdir()):
+                place.rmdir()
         raise
 
 
@@ -73,4 +80,15 @@ def _swap(staging: Path, folder: Path) -> None:
         raise
     finally:
         if old.exists() and folder.exists():
-            shutil.rmtree(old)
+            _remove_replaced(old)
+
+
+def _remove_replaced(old: Path) -> None:
+    try:
+        shutil.rmtree(old)
+    except OSError as error:  # the new folder is in place all the same
+        log.warning(
+            "%s: the replaced result cannot be removed: %s; remove it by hand",
+            old,
+            error.strerror or error,
+        )

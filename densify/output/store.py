@@ -1,6 +1,20 @@
 # SPDX-License-Identifier: MIT
 """The files of one key, ``OUT/000120/...``: results of ``run`` and tables of ``compare``, whole or
 not at all.
+
+Keys of metrics.json; compare.json holds those from ``frames`` on under ``methods`` by method, and
+data, config and versions as run.yaml::
+
+    schema_version, key, method
+    frames      of the window, absolute numbers
+    num_points  of the cloud; num_moving of those
+    density     camera -> measured, filled: fraction of the pixels with a depth
+    ghosts      `densify.scores.ghost_scores`: num_points, all, moving, static, by_distance
+    depth       where there is truth: camera -> measured, filled -> all, moving, static -> the
+                fields of `densify.scores.depth_errors`
+    baselines   the same from ``frames`` on for each simpler method on the same registration
+
+A score that nothing can be said of is null.
 """
 
 from __future__ import annotations
@@ -58,10 +72,14 @@ def check_writable(out: Path, key: int, overwrite: bool = False, verb: Verb = "r
         place = place.parent
     if not place.is_dir():
         raise InputError(f"--out {out}: {place} is not a folder; choose another one with --out DIR")
-    if not os.access(place, os.W_OK | os.X_OK):
-        raise InputError(
-            f"--out {out}: no permission to write in {place}; choose another one with --out DIR"
-        )
+    # An old folder is emptied and, as a new one, put in place from beside it.
+    beside = [Path(os.path.realpath(place)).parent] if place == folder else []
+    for touched in (place, *beside):
+        if not os.access(touched, os.W_OK | os.X_OK):
+            raise InputError(
+                f"--out {out}: no permission to write in {touched}; "
+                f"choose another one with --out DIR"
+            )
     present = [name for name in _OWNED[verb] if (folder / name).exists()]
     if present and not overwrite:
         raise InputError(
@@ -107,6 +125,7 @@ def write_result(
                 "key": result.key,
                 "method": result.method,
                 **_scores(result),
+                "baselines": {m: _scores(baseline) for m, baseline in result.baselines.items()},
             },
         )
         methods = {**result.baselines, result.method: result}
@@ -170,11 +189,7 @@ def _written(out: Path, key: int, verb: Verb) -> list[Path]:
 
 
 def _scores(result: Result) -> dict[str, Any]:
-    return {
-        "frames": result.frames,
-        "num_points": len(result.cloud),
-        "metrics": result.metrics,
-    }
+    return {"frames": result.frames, **result.metrics}
 
 
 def _write_figure(path: Path, results: Mapping[str, Result], images: Mapping[str, Picture]) -> None:

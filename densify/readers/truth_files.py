@@ -14,15 +14,24 @@ Layout of a ``truth/`` folder, frames numbered as the recording's files are::
 
 from __future__ import annotations
 
+import tokenize
 import zipfile
+import zlib
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from numpy.lib.npyio import NpzFile
 from numpy.typing import NDArray
 
 from densify.errors import InputError
 from densify.types import Bool, Float, Float32, SweepTruth
+
+# What numpy raises on damaged files; a flipped bit can ask zipfile for a password (RuntimeError).
+_DAMAGE = (
+    *(KeyError, ValueError, EOFError, OSError, RuntimeError),
+    *(zipfile.BadZipFile, zlib.error, tokenize.TokenError),
+)
 
 
 @dataclass(frozen=True)
@@ -160,11 +169,14 @@ class FileTruth:
     @staticmethod
     def _load(path: Path, *names: str) -> list[NDArray]:  # type: ignore[type-arg]
         try:
-            with np.load(path) as arrays:
+            loaded = np.load(path)
+            if not isinstance(loaded, NpzFile):
+                raise ValueError("it holds a single array")
+            with loaded as arrays:
                 return [arrays[name] for name in names]
         except FileNotFoundError:
             raise InputError(f"{path}: no such truth file; write the frame again") from None
-        except (KeyError, ValueError, EOFError, OSError, zipfile.BadZipFile) as error:
+        except _DAMAGE as error:
             raise InputError(
                 f"{path}: not a truth file with {', '.join(names)} ({error}); write it again"
             ) from error

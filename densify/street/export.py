@@ -14,7 +14,7 @@ the other files are there for the frames asked for.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -31,13 +31,10 @@ from densify.readers.truth_files import write_bodies, write_depth, write_points
 from densify.street.camera import CAMERAS, T_RECTIFIED_LIDAR
 from densify.street.sensors import PERIOD_NS
 from densify.street.simulator import EPOCH_NS
-from densify.types import Float
-
-Progress = Callable[[str, int, int], None]
+from densify.types import Float, Progress
 
 _DATE = np.datetime64(EPOCH_NS, "ns").astype("datetime64[D]").astype(str).replace("-", "_")
 DRIVE = f"{_DATE}_drive_0001_sync"
-_CALIBRATION = ("calib_cam_to_cam.txt", "calib_velo_to_cam.txt", "calib_imu_to_velo.txt")
 T_LIDAR_IMU = np.eye(4)  # the inertial unit sits behind and below the scanner, a little off true
 T_LIDAR_IMU[:3, :3] = Rotation.from_rotvec([0.012, -0.003, -0.001]).as_matrix()
 T_LIDAR_IMU[:3, 3] = [-0.81, 0.32, -0.80]
@@ -65,8 +62,8 @@ def write_kitti_tree(
     done, frames in all.
 
     Raises InputError for a frame or camera that does not exist, for two scanners in one sweep
-    (KITTI's format has no room for their times), and if the drive is there already and
-    ``overwrite`` is not set.
+    (KITTI's format has no room for their times), and if the drive or another calibration is there
+    already and ``overwrite`` is not set.
     """
     names = list(CAMERAS) if cameras is None else list(cameras)
     for name in names:
@@ -83,11 +80,13 @@ def write_kitti_tree(
             f"{street.frames[-1]}"
         )
     folder = out / _DATE
-    if (folder / DRIVE).exists() and not overwrite:
-        raise InputError(f"{folder / DRIVE}: there already, kept; give --overwrite to replace it")
+    calibration = _calibration()
     try:
-        with staged_folder(folder, (DRIVE, *_CALIBRATION)) as staging:
-            _write_calibration(staging)
+        if not overwrite:
+            _check_kept(folder, calibration)
+        with staged_folder(folder, (DRIVE, *calibration)) as staging:
+            for name, data in calibration.items():
+                _put(staging / name, data)
             _write_stamps(staging / DRIVE, street, names)
             write_bodies(staging / DRIVE / "truth", street.simulator.bodies)
             for done, frame in enumerate(frames):
@@ -99,6 +98,18 @@ def write_kitti_tree(
     except OSError as error:
         raise InputError(f"{out}: cannot be written: {error.strerror or error}") from error
     return folder / DRIVE
+
+
+def _check_kept(folder: Path, calibration: Mapping[str, bytes]) -> None:
+    if (folder / DRIVE).exists():
+        raise InputError(f"{folder / DRIVE}: there already, kept; give --overwrite to replace it")
+    for name, data in calibration.items():
+        path = folder / name
+        if path.exists() and not (path.is_file() and path.read_bytes() == data):
+            raise InputError(
+                f"{path}: another calibration is there already, kept; choose another --out, or "
+                f"give --overwrite to replace it"
+            )
 
 
 def _write_frame(drive: Path, street: Street, frame: int, first: int, names: list[str]) -> None:
@@ -125,7 +136,8 @@ def _row(values: Float) -> str:
     return " ".join(repr(float(v)) for v in np.ravel(values))
 
 
-def _write_calibration(folder: Path) -> None:
+def _calibration() -> dict[str, bytes]:
+    """Of the folder above the drive: file name to content."""
     lines = []
     for number in range(4):
         camera = CAMERAS[f"image_0{2 + number % 2}"]  # 0 and 1 would be the gray ones beside them
@@ -135,11 +147,10 @@ def _write_calibration(folder: Path) -> None:
             f"R_rect_0{number}: {_row(np.eye(3))}",
             f"P_rect_0{number}: {_row(P)}",
         ]
-    texts = ["\n".join(lines)]
-    for T in (T_RECTIFIED_LIDAR, T_LIDAR_IMU):
-        texts.append(f"R: {_row(T[:3, :3])}\nT: {_row(T[:3, 3])}")
-    for name, text in zip(_CALIBRATION, texts, strict=True):
-        _put(folder / name, f"{text}\n".encode())
+    files = {"calib_cam_to_cam.txt": "\n".join(lines) + "\n"}
+    for name, T in (("velo_to_cam", T_RECTIFIED_LIDAR), ("imu_to_velo", T_LIDAR_IMU)):
+        files[f"calib_{name}.txt"] = f"R: {_row(T[:3, :3])}\nT: {_row(T[:3, 3])}\n"
+    return {name: text.encode() for name, text in files.items()}
 
 
 def _write_stamps(drive: Path, street: Street, names: list[str]) -> None:

@@ -20,8 +20,7 @@ class Sensor:
 
     elevation_deg: of one scanner's beams in the order they fire. num_columns: firings of each beam
     per revolution. max_range_m, range_sigma_m: reach and noise. heights_m: of each scanner above
-    the first; they turn evenly out of phase. max_reach_m: distance at which a white surface seen
-    head-on returns half of its pulses.
+    the first; they turn evenly out of phase.
     """
 
     name: str
