@@ -360,7 +360,16 @@ def test_metrics_are_plain_json(put, tmp_path):
         "frames": [119, 120, 121],
         "a": 0.5,
         "b": {"c": None, "d": [3, None, [True, None]]},
+        "baselines": {},
     }
+
+
+def test_metrics_hold_those_of_the_simpler_methods(tmp_path):
+    result = replace(result_of(a=2), baselines={"none": result_of("none", 1, a=1)})
+    write_result(result, {}, tmp_path / "out", config=CONFIG, data="street")
+    metrics = json.loads((tmp_path / "out" / "000120" / "metrics.json").read_text())
+    assert metrics["a"] == 2
+    assert metrics["baselines"] == {"none": {"frames": [119, 120, 121], "a": 1}}
 
 
 def test_run_record(put, tmp_path):
