@@ -96,27 +96,26 @@ def compare(
     with watch.stage("register"):
         trajectory = _trajectory(sequence, sweeps, key, settings)
     with watch.stage("deskew"):
-        moving_window = deskew([s for s in sweeps if s.frame in frames], trajectory, key)
+        registered = deskew([s for s in sweeps if s.frame in frames], trajectory, key)
     flow: tuple[FlowField, ...] = ()
     if "flow" in wanted:
         with watch.stage("ground"):
-            heights_m = height_above_ground(moving_window, settings.ground)
+            heights_m = height_above_ground(registered, settings.ground)
         with watch.stage("flow"):
-            steps = step_flow(moving_window, heights_m, settings.flow)
+            steps = step_flow(registered, heights_m, settings.flow)
         with watch.stage("chain"):
-            flow = chain(moving_window, steps, settings.chain)
+            flow = chain(registered, steps, settings.chain)
 
     results: dict[str, Result] = {}
     for method in wanted:
-        used = Window(key, (moving_window[key],)) if method == "none" else moving_window
-        fields = (
-            flow if method == "flow" else tuple(FlowField.zero(len(s.sweep)) for s in used.sweeps)
-        )
+        used = Window(key, (registered[key],)) if method == "none" else registered
+        still = tuple(FlowField.zero(len(s.sweep)) for s in used.sweeps)
+        fields = flow if method == "flow" else still
         with watch.stage("accumulate"):
             cloud = accumulate(used, fields, settings.chain.unfollowed == "drop")
         depth: dict[str, DepthMap] = {}
         for camera in chosen:
-            late_s, T_cam_key = _exposure(sequence, moving_window[key], camera)
+            late_s, T_cam_key = _exposure(sequence, registered[key], camera)
             exposed = cloud.after(late_s)
             origins = {s.frame: s.T_key_lidar[:3, 3] for s in used.sweeps}
             with watch.stage("project"):
@@ -127,7 +126,7 @@ def compare(
                 cloud = replace(cloud, rgb=rgb)
             depth[camera.name] = seen
         with watch.stage("score"):
-            metrics = _scores(sequence, moving_window, cloud, depth)
+            metrics = _scores(sequence, registered, cloud, depth)
         results[method] = Result(
             method, key, used.frames, cloud, depth, metrics, watch.costs(), dict(results)
         )
