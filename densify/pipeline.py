@@ -97,14 +97,7 @@ def compare(
         trajectory = _trajectory(sequence, sweeps, key, settings)
     with watch.stage("deskew"):
         registered = deskew([s for s in sweeps if s.frame in frames], trajectory, key)
-    flow: tuple[FlowField, ...] = ()
-    if "flow" in wanted:
-        with watch.stage("ground"):
-            heights_m = height_above_ground(registered, settings.ground)
-        with watch.stage("flow"):
-            steps = step_flow(registered, heights_m, settings.flow)
-        with watch.stage("chain"):
-            flow = chain(registered, steps, settings.chain)
+    flow = _flow_to_key(registered, settings, watch) if "flow" in wanted else ()
 
     results: dict[str, Result] = {}
     for method in wanted:
@@ -113,18 +106,17 @@ def compare(
         fields = flow if method == "flow" else still
         with watch.stage("accumulate"):
             cloud = accumulate(used, fields, settings.chain.unfollowed == "drop")
+        origins = {s.frame: s.T_key_lidar[:3, 3] for s in used.sweeps}
         depth: dict[str, DepthMap] = {}
         for camera in chosen:
             late_s, T_cam_key = _exposure(sequence, registered[key], camera)
             exposed = cloud.after(late_s)
-            origins = {s.frame: s.T_key_lidar[:3, 3] for s in used.sweeps}
             with watch.stage("project"):
                 seen = project(exposed, camera, T_cam_key, settings.project, key, origins)
             with watch.stage("colour"):
                 image = images[camera.name]
                 rgb = colour(cloud.rgb, exposed.points, camera, T_cam_key, seen, image)
-                cloud = replace(cloud, rgb=rgb)
-            depth[camera.name] = seen
+            cloud, depth[camera.name] = replace(cloud, rgb=rgb), seen
         with watch.stage("score"):
             metrics = _scores(sequence, registered, cloud, depth)
         results[method] = Result(
@@ -156,6 +148,16 @@ def _trajectory(
     rough = register(sweeps, settings.register)
     straight = [s.sweep for s in deskew(sweeps, rough, key).sweeps]
     return register(straight, settings.register, rough)
+
+
+def _flow_to_key(registered: Window, settings: Config, watch: _Watch) -> tuple[FlowField, ...]:
+    """Of every sweep, by way of its neighbours."""
+    with watch.stage("ground"):
+        heights_m = height_above_ground(registered, settings.ground)
+    with watch.stage("flow"):
+        steps = step_flow(registered, heights_m, settings.flow)
+    with watch.stage("chain"):
+        return chain(registered, steps, settings.chain)
 
 
 def _exposure(
