@@ -140,6 +140,13 @@ class FlowSettings(Section):
         "of the objective. symmetric: as published; row-sum-zero: leaves a constant flow free",
         choices=("symmetric", "row-sum-zero"),
     )
+    max_gap_m: float = knob(
+        0.5,
+        "[m] of chained flow (engine paper): a moved point farther than this from the next sweep's "
+        "moving points is lost",
+        0.01,
+        10,
+    )
     static_prior: bool = knob(
         True,
         "points not proven to move keep exactly their rigid place; off moves every point, with "
@@ -151,12 +158,9 @@ class FlowSettings(Section):
 
 
 @dataclass(frozen=True)
-class ChainSettings(Section):
-    """How flow between neighbouring sweeps becomes flow to the key."""
+class AccumulateSettings(Section):
+    """All points at the key's moment."""
 
-    max_gap_m: float = knob(
-        0.5, "[m] a moved point farther than this from the next sweep's flow is lost", 0.01, 10
-    )
     unfollowed: str = knob(
         "drop",
         "points that move but cannot be followed. drop: leave them out; rigid: keep them where "
@@ -208,7 +212,7 @@ class Config:
     register: RegisterSettings = dataclasses.field(default_factory=RegisterSettings)
     ground: GroundSettings = dataclasses.field(default_factory=GroundSettings)
     flow: FlowSettings = dataclasses.field(default_factory=FlowSettings)
-    chain: ChainSettings = dataclasses.field(default_factory=ChainSettings)
+    accumulate: AccumulateSettings = dataclasses.field(default_factory=AccumulateSettings)
     project: ProjectSettings = dataclasses.field(default_factory=ProjectSettings)
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The pipeline, as a story: read, register, deskew, ground, flow, chain, accumulate, project."""
+"""The pipeline, as a story: read, register, deskew, ground, flow, accumulate, project."""
 
 from __future__ import annotations
 
@@ -18,10 +18,9 @@ from densify.errors import InputError
 from densify.range_image import RangeImage
 from densify.readers.window import choose_cameras, read_sweeps, recorded_trajectory, window_frames
 from densify.stages.accumulate import accumulate
-from densify.stages.chain import chain
 from densify.stages.colour import colour
 from densify.stages.deskew import deskew
-from densify.stages.flow import step_flow
+from densify.stages.flow import estimate_motion
 from densify.stages.ground import height_above_ground
 from densify.stages.project import project
 from densify.stages.register import check_overlap, check_plausible, register
@@ -36,9 +35,9 @@ from densify.types import (
     RegisteredSweep,
     Result,
     StageCost,
+    Stretch,
     Sweep,
     Trajectory,
-    Window,
 )
 
 METHODS = ("none", "icp", "flow")
@@ -94,22 +93,22 @@ def compare(
     with watch.stage("images"):
         images = {camera.name: sequence.image(camera.name, key) for camera in chosen}
     with watch.stage("register"):
-        trajectory = _trajectory(sequence, sweeps, key, settings)
+        trajectory = _trajectory(sequence, sweeps, settings)
     with watch.stage("deskew"):
-        registered = deskew([s for s in sweeps if s.frame in frames], trajectory, key)
-    flow = _flow_to_key(registered, settings, watch) if "flow" in wanted else ()
+        stretch = deskew([s for s in sweeps if s.frame in frames], trajectory)
+    flow = _flow_to_key(stretch, key, settings, watch) if "flow" in wanted else ()
 
     results: dict[str, Result] = {}
     for method in wanted:
-        used = Window(key, (registered[key],)) if method == "none" else registered
+        used = Stretch((stretch[key],)) if method == "none" else stretch
         still = tuple(FlowField.zero(len(s.sweep)) for s in used.sweeps)
         fields = flow if method == "flow" else still
         with watch.stage("accumulate"):
-            cloud = accumulate(used, fields, settings.chain.unfollowed == "drop")
-        origins = {s.frame: s.T_key_lidar[:3, 3] for s in used.sweeps}
+            cloud = accumulate(used, fields, key, settings.accumulate.unfollowed == "drop")
+        origins = {f: stretch.T_target_source(key, f)[:3, 3] for f in used.frames}
         depth: dict[str, DepthMap] = {}
         for camera in chosen:
-            late_s, T_cam_key = _exposure(sequence, registered[key], camera)
+            late_s, T_cam_key = _exposure(sequence, stretch[key], camera)
             exposed = cloud.after(late_s)
             with watch.stage("project"):
                 seen = project(exposed, camera, T_cam_key, settings.project, key, origins)
@@ -118,7 +117,7 @@ def compare(
                 rgb = colour(cloud.rgb, exposed.points, camera, T_cam_key, seen, image)
             cloud, depth[camera.name] = replace(cloud, rgb=rgb), seen
         with watch.stage("score"):
-            metrics = _scores(sequence, registered, cloud, depth)
+            metrics = _scores(sequence, stretch[key], cloud, depth)
         results[method] = Result(
             method, key, used.frames, cloud, depth, metrics, watch.costs(), dict(results)
         )
@@ -136,9 +135,7 @@ def _read(
     return sweeps
 
 
-def _trajectory(
-    sequence: LidarSequence, sweeps: Sequence[Sweep], key: int, settings: Config
-) -> Trajectory:
+def _trajectory(sequence: LidarSequence, sweeps: Sequence[Sweep], settings: Config) -> Trajectory:
     """Poses in two passes: raw sweeps are bent by the motion that the first pass finds."""
     if settings.register.source == "dataset":
         trajectory = recorded_trajectory(sequence, sweeps)
@@ -146,18 +143,19 @@ def _trajectory(
         check_overlap(sweeps, trajectory, settings.register)
         return trajectory
     rough = register(sweeps, settings.register)
-    straight = [s.sweep for s in deskew(sweeps, rough, key).sweeps]
+    straight = [s.sweep for s in deskew(sweeps, rough).sweeps]
     return register(straight, settings.register, rough)
 
 
-def _flow_to_key(registered: Window, settings: Config, watch: _Watch) -> tuple[FlowField, ...]:
-    """Of every sweep, by way of its neighbours."""
+def _flow_to_key(
+    stretch: Stretch, key: int, settings: Config, watch: _Watch
+) -> tuple[FlowField, ...]:
+    """Of every sweep."""
     with watch.stage("ground"):
-        heights_m = height_above_ground(registered, settings.ground)
+        heights_m = height_above_ground(stretch, settings.ground)
     with watch.stage("flow"):
-        steps = step_flow(registered, heights_m, settings.flow)
-    with watch.stage("chain"):
-        return chain(registered, steps, settings.chain)
+        motion = estimate_motion(stretch, heights_m, settings.flow)
+        return tuple(motion.flow(frame, key) for frame in stretch.frames)
 
 
 def _exposure(
@@ -172,7 +170,7 @@ def _exposure(
 
 
 def _scores(
-    sequence: LidarSequence, window: Window, cloud: Cloud, depth: Mapping[str, DepthMap]
+    sequence: LidarSequence, key_sweep: RegisteredSweep, cloud: Cloud, depth: Mapping[str, DepthMap]
 ) -> dict[str, Any]:
     """What can be said of the result without truth, and against the truth where there is some."""
     metrics: dict[str, Any] = {
@@ -185,14 +183,14 @@ def _scores(
             }
             for name, maps in depth.items()
         },
-        "ghosts": scores.ghost_scores(cloud, RangeImage.of(window[window.key]), window.key),
+        "ghosts": scores.ghost_scores(cloud, RangeImage.of(key_sweep), key_sweep.frame),
     }
     if sequence.truth is not None:
         metrics["depth"] = {
             name: scores.depth_scores(
                 maps,
-                sequence.truth.depth_m(name, window.key),
-                sequence.truth.moving_mask(name, window.key),
+                sequence.truth.depth_m(name, key_sweep.frame),
+                sequence.truth.moving_mask(name, key_sweep.frame),
                 sequence.cameras[name],
             )
             for name, maps in depth.items()

@@ -3,10 +3,13 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from densify.types import Float
+if TYPE_CHECKING:
+    from densify.types import Float
 
 
 def inverse(T_a_b: Float) -> Float:

@@ -2,7 +2,8 @@
 """What the stages hand to each other. All are frozen; columns stay aligned row by row.
 
 Poses are named ``T_target_source``: ``p_target = T_target_source @ p_source``. Frames of reference:
-``world``, ``lidar`` (at the sweep's reference time), ``key`` (the key sweep's lidar), ``cam``.
+``world`` (the first sweep's lidar), ``lidar`` (at the sweep's reference time), ``key`` (the key
+sweep's lidar), ``cam``.
 """
 
 from __future__ import annotations
@@ -13,6 +14,8 @@ from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+
+from densify import poses
 
 Float = NDArray[np.float64]
 Float32 = NDArray[np.float32]
@@ -74,17 +77,17 @@ class Trajectory:
 
 @dataclass(frozen=True)
 class RegisteredSweep:
-    """A deskewed sweep with its place in the window.
+    """A deskewed sweep with its place in the world.
 
     sweep: points in the lidar frame at ``sweep.stamp_ns``.
-    T_key_lidar: (4,4).
+    T_world_lidar: (4,4).
     twist_before, twist_after: (6,) rotation vector and translation per second (rad/s, m/s) of the
         lidar before and after its reference time, in the lidar frame: a raw point fired at offset t
         lies at ``exp(t · twist) @ p_raw``.
     """
 
     sweep: Sweep
-    T_key_lidar: Float
+    T_world_lidar: Float
     twist_before: Float
     twist_after: Float
 
@@ -94,10 +97,9 @@ class RegisteredSweep:
 
 
 @dataclass(frozen=True)
-class Window:
-    """The registered sweeps around a key, by ascending frame; the key sweep is one of them."""
+class Stretch:
+    """Registered sweeps of a drive in one world, by ascending frame."""
 
-    key: int
     sweeps: tuple[RegisteredSweep, ...]
 
     @property
@@ -106,6 +108,12 @@ class Window:
 
     def __getitem__(self, frame: int) -> RegisteredSweep:
         return self.sweeps[self.frames.index(frame)]
+
+    def T_target_source(self, target: int, source: int) -> Float:
+        """(4,4) from the lidar frame of one sweep to that of another, by frame number."""
+        if target == source:
+            return np.eye(4)
+        return poses.inverse(self[target].T_world_lidar) @ self[source].T_world_lidar
 
 
 @dataclass(frozen=True)
@@ -121,6 +129,7 @@ class FlowField:
     lost: (N,) bool, belongs to something that moves but cannot be followed to the target time.
     to_reference: (N,3) metres, own motion between a point's firing and the sweep's reference time,
         in the same coordinates; None where nothing is known of it.
+    velocity_m_s: (N,3) at the target time, in the same coordinates; None where nothing is known.
     """
 
     displacement: Float
@@ -128,6 +137,7 @@ class FlowField:
     instance: NDArray[np.int32]
     lost: Bool
     to_reference: Float | None = None
+    velocity_m_s: Float | None = None
 
     @property
     def total(self) -> Float:
@@ -145,6 +155,14 @@ class FlowField:
             instance=np.full(num_points, -1, np.int32),
             lost=np.zeros(num_points, bool),
         )
+
+
+class Motion(Protocol):
+    """How everything in a stretch moves, whatever found it out."""
+
+    def flow(self, frame: int, target: int) -> FlowField:
+        """Of every point of a sweep to another sweep's reference time; both by frame number."""
+        ...
 
 
 @dataclass(frozen=True)

@@ -14,38 +14,56 @@ from scipy.spatial import cKDTree
 
 from densify import poses
 from densify.range_image import RangeImage
-from densify.types import Bool, Float, Float32, Int, Window
+from densify.types import Bool, Float, Float32, Int, Stretch
 
 _MARGIN_M = 0.4
 _MARGIN_FRACTION = 0.015
 _NEAR_M = 0.4
 _MIN_SEED_SHARE = 0.3
 _LINK_M = 0.6
+_REACH = 10  # sweeps
 
 
 @dataclass(frozen=True)
 class FreeSpace:
-    """What each sweep of a window saw through."""
+    """What each sweep of a stretch saw through.
 
-    window: Window
+    T_lidar_world: (4,4) per sweep. origin: (3,) world, where each sweep's lidar stood.
+    """
+
     images: tuple[RangeImage, ...]
+    T_lidar_world: tuple[Float, ...]
+    origin: tuple[Float, ...]
 
     @staticmethod
-    def of(window: Window) -> FreeSpace:
+    def of(stretch: Stretch) -> FreeSpace:
         with ThreadPoolExecutor() as pool:
-            return FreeSpace(window, tuple(pool.map(RangeImage.of, window.sweeps)))
+            images = tuple(pool.map(RangeImage.of, stretch.sweeps))
+        return FreeSpace(
+            images,
+            tuple(poses.inverse(s.T_world_lidar) for s in stretch.sweeps),
+            tuple(s.T_world_lidar[:3, 3] for s in stretch.sweeps),
+        )
+
+    def __len__(self) -> int:
+        return len(self.images)
+
+    def others(self, i: int) -> list[int]:
+        """The sweeps around sweep number i that tell about it: from where others were taken long
+        before or after it, little of what it saw is in view."""
+        return [j for j in range(max(0, i - _REACH), min(len(self), i + _REACH + 1)) if j != i]
 
     def seen_through(self, points: Float, j: int, velocity_m_s: Float | None = None) -> Bool:
-        """(N,3) key frame -> (N,) True where sweep number j certainly saw free space.
+        """(N,3) world -> (N,) True where sweep number j certainly saw free space.
 
         points: at the sweep's reference time. velocity_m_s: (N,3) of those that move.
         """
-        T_lidar_key = poses.inverse(self.window.sweeps[j].T_key_lidar)
+        T_lidar_world = self.T_lidar_world[j]
         return self.images[j].sees_through(
-            poses.transform(T_lidar_key, points),
+            poses.transform(T_lidar_world, points),
             _MARGIN_M,
             _MARGIN_FRACTION,
-            velocity_m_s=None if velocity_m_s is None else velocity_m_s @ T_lidar_key[:3, :3].T,
+            velocity_m_s=None if velocity_m_s is None else velocity_m_s @ T_lidar_world[:3, :3].T,
         )
 
 
@@ -53,8 +71,8 @@ class FreeSpace:
 class Candidates:
     """The points of one sweep that may move.
 
-    row: (C,) index into the sweep's points. points: (C,3) key frame, rigidly registered.
-    time_s: (C,) when each was measured, relative to the key's reference time.
+    row: (C,) index into the sweep's points. points: (C,3) world, rigidly registered.
+    time_s: (C,) when each was measured, since the first sweep's reference time.
     seed: (C,) some other sweep sees through the point. cluster: (C,) label, of ``num_clusters``.
     """
 
@@ -67,36 +85,41 @@ class Candidates:
 
 
 def find_candidates(
-    space: FreeSpace, heights_m: Sequence[Float32], min_height_m: float
+    stretch: Stretch, space: FreeSpace, heights_m: Sequence[Float32], min_height_m: float
 ) -> tuple[Candidates, ...]:
     """Candidates of every sweep, clustered.
 
-    A point above the ground is a seed where any other sweep of the window sees through it; points
-    close to a seed are candidates too, since a mover's own points are not all seen through.
+    A point above the ground is a seed where any other sweep around sees through it; points close
+    to a seed are candidates too, since a mover's own points are not all seen through.
     min_height_m: points lower above the ground are never candidates.
     """
-    sweeps = space.window.sweeps
 
     def of_sweep(i: int) -> Candidates:
+        registered = stretch.sweeps[i]
         above = np.flatnonzero(heights_m[i] >= min_height_m)
-        points = poses.transform(sweeps[i].T_key_lidar, sweeps[i].sweep.points[above])
+        points = poses.transform(registered.T_world_lidar, registered.sweep.points[above])
         seed = np.zeros(len(above), bool)
-        for j in range(len(sweeps)):
-            if j != i:
-                rest = np.flatnonzero(~seed)
-                seed[rest] = space.seen_through(points[rest], j)
-        return _cluster(above, points, firing_times_s(space.window, i)[above], seed)
+        for j in space.others(i):
+            rest = np.flatnonzero(~seed)
+            seed[rest] = space.seen_through(points[rest], j)
+        return _cluster(above, points, firing_times_s(stretch, i)[above], seed)
 
     with ThreadPoolExecutor() as pool:
-        return tuple(pool.map(of_sweep, range(len(sweeps))))
+        return tuple(pool.map(of_sweep, range(len(stretch.sweeps))))
 
 
-def firing_times_s(window: Window, i: int) -> Float:
-    """(N,) when each point of sweep number i was measured, relative to the key's reference time."""
-    sweep = window.sweeps[i].sweep
+def reference_times_s(stretch: Stretch) -> Float:
+    """(W,) of the sweeps, since the first one's."""
+    stamp_ns = np.array([s.sweep.stamp_ns for s in stretch.sweeps])
+    return (stamp_ns - stamp_ns[0]) * 1e-9
+
+
+def firing_times_s(stretch: Stretch, i: int) -> Float:
+    """(N,) when each point of sweep number i was measured, since the first reference time."""
+    sweep = stretch.sweeps[i].sweep
     offset_ns = np.zeros(len(sweep), np.int64) if sweep.offset_ns is None else sweep.offset_ns
-    key_ns = window[window.key].sweep.stamp_ns
-    return (sweep.stamp_ns - key_ns + offset_ns).astype(np.float64) * 1e-9
+    begin_ns = stretch.sweeps[0].sweep.stamp_ns
+    return (sweep.stamp_ns - begin_ns + offset_ns).astype(np.float64) * 1e-9
 
 
 def _cluster(row: Int, points: Float, time_s: Float, seed: Bool) -> Candidates:

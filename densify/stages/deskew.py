@@ -9,18 +9,17 @@ from dataclasses import replace
 import numpy as np
 
 from densify import poses
-from densify.types import Float, RegisteredSweep, Sweep, Trajectory, Window
+from densify.types import Float, RegisteredSweep, Stretch, Sweep, Trajectory
 
 
-def deskew(sweeps: Sequence[Sweep], trajectory: Trajectory, key: int) -> Window:
-    """Undo the lidar's own motion within each sweep, and place the sweeps around the key.
+def deskew(sweeps: Sequence[Sweep], trajectory: Trajectory) -> Stretch:
+    """Undo the lidar's own motion within each sweep, and place the sweeps in the world.
 
-    sweeps: raw, a subset of the trajectory's frames that holds the key. The half of a sweep before
+    sweeps: raw, a subset of the trajectory's frames. The half of a sweep before
     its reference time moves with the twist from the previous sweep, the half after it with the
     twist to the next one. Sweeps without per-point times keep their points as they are.
     All columns stay aligned.
     """
-    T_key_world = poses.inverse(trajectory.T_world_lidar[trajectory.frames.index(key)])
     registered = []
     for sweep in sweeps:
         i = trajectory.frames.index(sweep.frame)
@@ -33,12 +32,12 @@ def deskew(sweeps: Sequence[Sweep], trajectory: Trajectory, key: int) -> Window:
         registered.append(
             RegisteredSweep(
                 sweep=replace(sweep, points=points),
-                T_key_lidar=T_key_world @ trajectory.T_world_lidar[i],
+                T_world_lidar=trajectory.T_world_lidar[i],
                 twist_before=before,
                 twist_after=after,
             )
         )
-    return Window(key=key, sweeps=tuple(registered))
+    return Stretch(tuple(registered))
 
 
 def _twists(trajectory: Trajectory, i: int) -> tuple[Float, Float]:

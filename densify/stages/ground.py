@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Ground: a height map of the window that follows slopes and kerbs, not a plane."""
+"""Ground: a height map of the stretch that follows slopes and kerbs, not a plane."""
 
 from __future__ import annotations
 
@@ -8,20 +8,20 @@ from scipy import ndimage
 
 from densify import poses
 from densify.config import GroundSettings
-from densify.types import Float, Float32, Window
+from densify.types import Float, Float32, Stretch
 
 _LOW_OUTLIER_M = 0.4
 
 
-def height_above_ground(window: Window, settings: GroundSettings) -> tuple[Float32, ...]:
+def height_above_ground(stretch: Stretch, settings: GroundSettings) -> tuple[Float32, ...]:
     """Per sweep (N,) metres above the ground.
 
-    All sweeps together fill a grid in the key frame, whose z is taken for up. A cell's ground is
+    All sweeps together fill a grid in the world, whose z is taken for up. A cell's ground is
     its second lowest point (the lowest may be a stray reflection), repaired where it lies below
     the median of its neighbours, then bounded by the steepest slope from every other cell, which
     cuts cars and walls away.
     """
-    clouds = [poses.transform(s.T_key_lidar, s.sweep.points) for s in window.sweeps]
+    clouds = [poses.transform(s.T_world_lidar, s.sweep.points) for s in stretch.sweeps]
     heights_m, low = _height_map(np.concatenate(clouds), settings)
     return tuple(
         (cloud[:, 2] - _sample(heights_m, low, cloud, settings.cell_m)).astype(np.float32)

@@ -1,0 +1,82 @@
+# SPDX-License-Identifier: MIT
+"""Smooth motion through what single sweeps say of an object's place.
+
+Penalised B-splines: Eilers, Marx, "Flexible Smoothing with B-splines and Penalties", Statistical
+Science 1996. The third difference is punished, so the stiffest path is a quadratic: constant
+acceleration, which most objects keep for a second. Softer ones start and stop.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.interpolate import BSpline
+
+from densify.types import Float
+
+_STIFFNESSES = (1e6, 200.0, 10.0)  # (noise of a sweep's place / change of acceleration per sweep)²
+_WORTH_SOFTENING = 0.8  # a softer path must foretell left-out sweeps so much better
+_FEW = 5  # sweeps do not tell an acceleration
+_DEGREE = 3
+
+
+@dataclass(frozen=True)
+class Path:
+    """A function of time with several coordinates.
+
+    begin_s, end_s: between them it was fitted; outside it goes on at constant velocity.
+    residual_m: (root mean square over the sweeps, first two coordinates) of what it was fitted to,
+    corrected for the freedom it had.
+    """
+
+    spline: BSpline
+    derivative: BSpline
+    begin_s: float
+    end_s: float
+    residual_m: float
+
+    @staticmethod
+    def fit(times_s: Float, states: Float, weights: Float, step_s: float) -> Path:
+        """Through (m,d) states at ascending (m,) times, weighted.
+
+        step_s: distance of the knots, the time between two sweeps. The path is as stiff as can be
+        unless a softer one foretells each sweep from the others clearly better (leave-one-out, in
+        closed form).
+        """
+        begin_s, end_s = float(times_s[0]), float(times_s[-1])
+        num_spans = max(1, round((end_s - begin_s) / step_s))
+        width_s = (end_s - begin_s) / num_spans
+        knots = begin_s + width_s * np.arange(-_DEGREE, num_spans + _DEGREE + 1)
+        inside = np.clip(times_s, begin_s, np.nextafter(end_s, begin_s))
+        B = BSpline.design_matrix(inside, knots, _DEGREE).toarray()
+        order = 3 if len(times_s) >= _FEW else 2
+        D = np.diff(np.eye(B.shape[1]), order, axis=0)
+        W = weights / weights.mean()
+        least, coefficients, residual = np.inf, np.zeros(0), np.inf
+        for stiffness in _STIFFNESSES if len(times_s) >= 2 * _FEW - 2 else _STIFFNESSES[:1]:
+            solve = np.linalg.solve(B.T @ (W[:, None] * B) + stiffness * D.T @ D, B.T * W)
+            leverage = np.einsum("ij,ji->i", B, solve)
+            found = solve @ states
+            missed = np.linalg.norm((states - B @ found)[:, :2], axis=1)
+            foretold = missed / np.maximum(1 - leverage, 1e-3)
+            error = float(np.sqrt(np.average(foretold**2, weights=W)))
+            if error < _WORTH_SOFTENING * least:
+                freedom = max(len(times_s) - leverage.sum() - 0.5, 0.5)
+                mean_square = float(np.average(missed**2, weights=W))
+                residual = float(np.sqrt(mean_square * len(times_s) / freedom))
+                least, coefficients = error, found
+        spline = BSpline(knots, coefficients, _DEGREE)
+        return Path(spline, spline.derivative(), begin_s, end_s, residual)
+
+    def __call__(self, time_s: float | Float) -> Float:
+        """(..., d) at these times."""
+        inside = np.clip(time_s, self.begin_s, self.end_s)
+        beyond = np.asarray(time_s - inside)[..., None]
+        state: Float = self.spline(inside) + beyond * self.derivative(inside)
+        return state
+
+    def rate(self, time_s: float | Float) -> Float:
+        """(..., d) per second."""
+        rate: Float = self.derivative(np.clip(time_s, self.begin_s, self.end_s))
+        return rate
