@@ -23,8 +23,8 @@ class Model:
     """An object's accumulated points with the inverse covariance of the surface around each."""
 
     def __init__(self, points: Float) -> None:
-        self.points = points
-        self._prepare()
+        self.points = np.zeros((0, 3))
+        self.add(points)
 
     def add(self, points: Float) -> None:
         points = np.concatenate([self.points, points])

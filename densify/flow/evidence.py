@@ -21,6 +21,7 @@ _MARGIN_FRACTION = 0.015
 _NEAR_M = 0.4
 _MIN_SEED_SHARE = 0.3
 _LINK_M = 0.6
+_RING_GAP_M = 0.35
 _REACH = 10  # sweeps
 
 
@@ -48,6 +49,11 @@ class FreeSpace:
     def __len__(self) -> int:
         return len(self.images)
 
+    @property
+    def ring_step_rad(self) -> float:
+        """Angle between neighbouring rings of the (coarsest) scanner."""
+        return max(s.elevation_step_rad for i in self.images for s in i.scanners)
+
     def others(self, i: int) -> list[int]:
         """The sweeps around sweep number i that tell about it: from where others were taken long
         before or after it, little of what it saw is in view."""
@@ -68,12 +74,13 @@ class FreeSpace:
 
 
 @dataclass(frozen=True)
-class Candidates:
-    """The points of one sweep that may move.
+class Standing:
+    """The points of one sweep that stand above the ground, and what the others say of them.
 
     row: (C,) index into the sweep's points. points: (C,3) world, rigidly registered.
     time_s: (C,) when each was measured, since the first sweep's reference time.
-    seed: (C,) some other sweep sees through the point. cluster: (C,) label, of ``num_clusters``.
+    seed: (C,) some other sweep sees through the point. cluster: (C,) label of ``num_clusters``
+    groups of candidates (seeds and what is close to them), -1 of points that are none.
     """
 
     row: Int
@@ -83,29 +90,46 @@ class Candidates:
     cluster: Int
     num_clusters: int
 
+    @property
+    def candidate(self) -> Bool:
+        return self.cluster >= 0
+
 
 def find_candidates(
     stretch: Stretch, space: FreeSpace, heights_m: Sequence[Float32], min_height_m: float
-) -> tuple[Candidates, ...]:
-    """Candidates of every sweep, clustered.
+) -> tuple[Standing, ...]:
+    """What stands in every sweep, and which of it may move.
 
-    A point above the ground is a seed where any other sweep around sees through it; points close
-    to a seed are candidates too, since a mover's own points are not all seen through.
-    min_height_m: points lower above the ground are never candidates.
+    A point is a seed where any other sweep around sees through it; points close to a seed are
+    candidates too, since a mover's own points are not all seen through.
+    min_height_m: points lower above the ground do not stand.
     """
 
-    def of_sweep(i: int) -> Candidates:
+    def of_sweep(i: int) -> Standing:
         registered = stretch.sweeps[i]
         above = np.flatnonzero(heights_m[i] >= min_height_m)
-        points = poses.transform(registered.T_world_lidar, registered.sweep.points[above])
+        in_lidar = registered.sweep.points[above]
+        points = poses.transform(registered.T_world_lidar, in_lidar)
         seed = np.zeros(len(above), bool)
         for j in space.others(i):
             rest = np.flatnonzero(~seed)
             seed[rest] = space.seen_through(points[rest], j)
-        return _cluster(above, points, firing_times_s(stretch, i)[above], seed)
+        close = _closer_rings(in_lidar, points, space.ring_step_rad)
+        num_clusters, cluster = _cluster(close, seed)
+        time_s = firing_times_s(stretch, i)[above]
+        return Standing(above, points, time_s, seed, cluster, num_clusters)
 
     with ThreadPoolExecutor() as pool:
         return tuple(pool.map(of_sweep, range(len(stretch.sweeps))))
+
+
+def _closer_rings(in_lidar: Float, points: Float, ring_step_rad: float) -> Float:
+    """The points with heights compressed where the scanner's rings lie farther apart than what is
+    taken for one thing."""
+    gap_m = ring_step_rad * np.linalg.norm(in_lidar, axis=1)
+    squeezed = points.copy()
+    squeezed[:, 2] *= np.minimum(1.0, _RING_GAP_M / np.maximum(gap_m, 1e-6))
+    return squeezed
 
 
 def reference_times_s(stretch: Stretch) -> Float:
@@ -122,23 +146,24 @@ def firing_times_s(stretch: Stretch, i: int) -> Float:
     return (sweep.stamp_ns - begin_ns + offset_ns).astype(np.float64) * 1e-9
 
 
-def _cluster(row: Int, points: Float, time_s: Float, seed: Bool) -> Candidates:
+def _cluster(points: Float, seed: Bool) -> tuple[int, Int]:
     """Keep the seeds that are not alone among unseen points (a hedge's flicker is), add what is
-    close to them, and link."""
-    near = np.zeros(len(points), bool)
-    if seed.any():
-        seeds = np.flatnonzero(seed)
-        tree = cKDTree(points)
-        num_near = tree.query_ball_point(points[seeds], _NEAR_M, return_length=True)
-        num_near_seeds = cKDTree(points[seeds]).query_ball_point(
-            points[seeds], _NEAR_M, return_length=True
-        )
-        kept = seeds[num_near_seeds >= _MIN_SEED_SHARE * num_near]
-        if len(kept):
-            distance, _ = cKDTree(points[kept]).query(points, distance_upper_bound=_NEAR_M)
-            near = np.isfinite(distance)
-    num_clusters, cluster = link(points[near], _LINK_M)
-    return Candidates(row[near], points[near], time_s[near], seed[near], cluster, num_clusters)
+    close to them, and link. Returns the number of clusters and (N,) labels."""
+    cluster = np.full(len(points), -1, np.int64)
+    if not seed.any():
+        return 0, cluster
+    seeds = np.flatnonzero(seed)
+    num_near = cKDTree(points).query_ball_point(points[seeds], _NEAR_M, return_length=True)
+    num_near_seeds = cKDTree(points[seeds]).query_ball_point(
+        points[seeds], _NEAR_M, return_length=True
+    )
+    kept = seeds[num_near_seeds >= _MIN_SEED_SHARE * num_near]
+    if not len(kept):
+        return 0, cluster
+    distance, _ = cKDTree(points[kept]).query(points, distance_upper_bound=_NEAR_M)
+    near = np.flatnonzero(np.isfinite(distance))
+    num_clusters, cluster[near] = link(points[near], _LINK_M)
+    return num_clusters, cluster
 
 
 def link(points: Float, distance_m: float) -> tuple[int, Int]:

@@ -12,8 +12,8 @@ from scipy.spatial import ConvexHull, QhullError, cKDTree
 
 from densify import poses
 from densify.flow.evidence import (
-    Candidates,
     FreeSpace,
+    Standing,
     find_candidates,
     firing_times_s,
     reference_times_s,
@@ -24,8 +24,9 @@ from densify.types import Bool, Float, Float32, FlowField, Stretch
 _ATTACH_M = 0.3
 _ATTACH_UNSEEN_M = 0.15
 _OUTLINE_M = 0.05
-_MIN_HEIGHT_M = 0.08
+_MIN_HEIGHT_M = 0.12
 _FORETOLD = 2  # sweeps before an object was first seen and after it was last seen
+_GAPS_REACHED = 0.8  # of the gap between neighbouring rings
 
 
 @dataclass(frozen=True)
@@ -70,59 +71,87 @@ def follow(stretch: Stretch, heights_m: Sequence[Float32], min_height_m: float) 
     heights_m: per sweep (N,) above the ground. min_height_m: lower points start no motion.
     """
     space = FreeSpace.of(stretch)
-    candidates = find_candidates(stretch, space, heights_m, min_height_m)
-    tracks = follow_groups(candidates, space, reference_times_s(stretch))
-    return GroupMotion(
-        stretch,
-        tuple(tracks),
-        tuple(
-            _attach(stretch, i, heights_m[i], tracks, candidates, min_height_m)
-            for i in range(len(stretch.sweeps))
-        ),
+    standing = find_candidates(stretch, space, heights_m, min_height_m)
+    time_s = reference_times_s(stretch)
+    tracks = follow_groups(standing, space, time_s)
+    shapes = [_shape(track, standing) for track in tracks]
+    instance = []
+    for i, height_m in enumerate(heights_m):
+        seen = _Seen.of(stretch, i, height_m, standing[i], space.ring_step_rad)
+        found = _attach(seen, i, tracks, shapes, time_s, min_height_m)
+        instance.append(found)
+    return GroupMotion(stretch, tuple(tracks), tuple(instance))
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """All points of a sweep. points: (N,3) world. time_s: (N,) when measured. reach_m: (N,) how
+    close a point must be to an object's shape to belong to it."""
+
+    points: Float
+    time_s: Float
+    height_m: Float32
+    reach_m: Float
+
+    @staticmethod
+    def of(
+        stretch: Stretch, i: int, height_m: Float32, standing: Standing, ring_step_rad: float
+    ) -> _Seen:
+        registered = stretch.sweeps[i]
+        points = registered.sweep.points
+        reach_m = np.full(len(points), _ATTACH_UNSEEN_M)
+        rows = standing.row[standing.candidate]
+        gap_m = ring_step_rad * np.linalg.norm(points[rows], axis=1)
+        reach_m[rows] = np.maximum(_ATTACH_M, _GAPS_REACHED * gap_m)
+        return _Seen(
+            poses.transform(registered.T_world_lidar, points),
+            firing_times_s(stretch, i),
+            height_m,
+            reach_m,
+        )
+
+
+def _shape(track: Track, standing: Sequence[Standing]) -> Float:
+    """(M,3) the points of all sweeps, as the object stands at the path's begin."""
+    return np.concatenate(
+        [
+            track.carry(standing[j].points[rows], standing[j].time_s[rows], track.path.begin_s)
+            for j, rows in sorted(track.claimed.items())
+        ]
     )
 
 
 def _attach(
-    stretch: Stretch,
+    seen: _Seen,
     i: int,
-    height_m: Float32,
     tracks: Sequence[Track],
-    candidates: Sequence[Candidates],
+    shapes: Sequence[Float],
+    time_s: Float,
     min_height_m: float,
 ) -> NDArray[np.int32]:
     """(N,): the track each point of sweep number i belongs to, -1 none.
 
-    A point belongs to a track where it is close to the track's points of all sweeps, or stands
+    A point belongs to a track where it is close to the object's points of all sweeps, or stands
     within their outline: nothing else can be where a solid object is.
     """
-    registered = stretch.sweeps[i]
-    points = poses.transform(registered.T_world_lidar, registered.sweep.points)
-    seen_s = firing_times_s(stretch, i)
-    instance = np.full(len(points), -1, np.int32)
-    nearest = np.full(len(points), np.inf)
-    reach = np.full(len(points), _ATTACH_UNSEEN_M)
-    reach[candidates[i].row] = _ATTACH_M
+    instance = np.full(len(seen.points), -1, np.int32)
+    nearest = np.full(len(seen.points), np.inf)
     for k, track in enumerate(tracks):
-        if i not in track.claimed:
+        if not min(track.claimed) - _FORETOLD <= i <= max(track.claimed) + _FORETOLD:
             continue
-        model = np.concatenate(
-            [
-                track.carry(
-                    candidates[j].points[rows], candidates[j].time_s[rows], track.times_s[i]
-                )
-                for j, rows in sorted(track.claimed.items())
-            ]
-        )
-        low, high = model.min(0) - _ATTACH_M, model.max(0) + _ATTACH_M
+        at_s = track.seen_at(i, time_s)
+        shape = track.carry(shapes[k], track.path.begin_s, at_s)
+        low, high = shape.min(0) - 2 * _ATTACH_M, shape.max(0) + 2 * _ATTACH_M
         low[2] -= 1.0  # down to the wheels
-        near = ((points > low) & (points < high)).all(1) & (height_m > _MIN_HEIGHT_M)
-        rows = np.flatnonzero(near)
+        rows = np.flatnonzero(
+            ((seen.points > low) & (seen.points < high)).all(1) & (seen.height_m > _MIN_HEIGHT_M)
+        )
         if not len(rows):
             continue
-        at_once = track.carry(points[rows], seen_s[rows], track.times_s[i])
-        distance = np.asarray(cKDTree(model).query(at_once)[0])
-        belongs = (distance < reach[rows]) & (height_m[rows] >= min_height_m)
-        belongs |= _within_outline(at_once[:, :2], model[:, :2])
+        at_once = track.carry(seen.points[rows], seen.time_s[rows], at_s)
+        distance = np.asarray(cKDTree(shape).query(at_once)[0])
+        belongs = (distance < seen.reach_m[rows]) & (seen.height_m[rows] >= min_height_m)
+        belongs |= _within_outline(at_once[:, :2], shape[:, :2])
         closer = belongs & (distance < nearest[rows])
         instance[rows[closer]] = k
         nearest[rows[closer]] = distance[closer]

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from densify.flow.align import GATES_M, MIN_FIT, Model, align, apply, undo
-from densify.flow.evidence import Candidates, FreeSpace
+from densify.flow.evidence import FreeSpace, Standing
 from densify.flow.paths import Path
 from densify.flow.vote import DistanceField, vote
 from densify.types import Bool, Float
@@ -22,6 +22,7 @@ from densify.types import Bool, Float
 _MIN_POINTS = 8
 _MIN_SEED_SHARE = 0.4
 _FIT_M = 0.3
+_SHARE_UNSEEN = 0.5  # of the points a sweep usually shows
 _MANY_POINTS = 100  # more do not place a sweep better
 _PREDICTION_STD = np.array([0.3, 0.3, 0.08, 0.06])  # m, m, m, rad
 _STEADY = np.array([1.0, 1.0, 0.5, 0.9])  # of a rate lasts: slopes and turns level out
@@ -36,8 +37,8 @@ class Track:
 
     centre: (3,) about which it turns, world. states: sweep index -> (4,) x y z displacement (m)
     and yaw (rad) since the sweep it started in. times_s: sweep index -> when that sweep saw it,
-    which is not the sweep's reference time. claimed: sweep index -> candidate rows that belong to
-    it. path: the smooth motion.
+    which is not the sweep's reference time. claimed: sweep index -> rows of `Standing` that are
+    its. path: the smooth motion.
     """
 
     centre: Float
@@ -60,6 +61,10 @@ class Track:
         """What sweep j saw of the object."""
         self.states[j], self.times_s[j], self.claimed[j] = state, time_s, rows
 
+    def typical_size(self) -> float:
+        """Points per sweep."""
+        return float(np.median([len(rows) for rows in self.claimed.values()]))
+
     def seen_at(self, j: int, sweep_time_s: Float) -> float:
         """When sweep j sees, or would see, the object."""
         nearest = min(self.times_s, key=lambda k: (abs(k - j), k))
@@ -67,23 +72,26 @@ class Track:
 
 
 def follow_groups(
-    candidates: Sequence[Candidates], space: FreeSpace, sweep_time_s: Float
+    standing: Sequence[Standing], space: FreeSpace, sweep_time_s: Float
 ) -> list[Track]:
     """All proven moving objects of the stretch.
 
     sweep_time_s: (W,) reference times of the sweeps, ascending.
     """
-    fields = [DistanceField.of(c.points) for c in candidates]
-    free = [np.ones(len(c.points), bool) for c in candidates]  # not yet part of a track
-    untried = [np.ones(len(c.points), bool) for c in candidates]
+    fields = [DistanceField.of(c.points[c.candidate]) for c in standing]
+    free = [np.ones(len(c.points), bool) for c in standing]  # not yet part of a track
+    untried = [np.ones(len(c.points), bool) for c in standing]
     tracks = []
-    for i, group in _groups_to_start(candidates):
+    for i, group in _groups_to_start(standing):
         members = group[free[i][group] & untried[i][group]]
         if len(members) < _MIN_POINTS:
             continue
-        velocity = vote(candidates[i].points[members], i, fields, sweep_time_s)
-        track = _follow(members, i, velocity, candidates, free, sweep_time_s)
-        proven = _prove(track, candidates, space, sweep_time_s)
+        velocity = vote(standing[i].points[members], i, fields, sweep_time_s)
+        track = _follow(members, i, velocity, standing, free, sweep_time_s)
+        proven = _prove(track, standing, space, sweep_time_s)
+        if proven:
+            _refine(track, standing)
+            proven = _prove(track, standing, space, sweep_time_s)
         for j, rows in track.claimed.items():
             untried[j][rows] = False
             if proven:
@@ -93,13 +101,13 @@ def follow_groups(
     return tracks
 
 
-def _groups_to_start(candidates: Sequence[Candidates]) -> list[tuple[int, np.ndarray]]:
+def _groups_to_start(standing: Sequence[Standing]) -> list[tuple[int, np.ndarray]]:
     """Sweep and members of the clusters that are mostly seeds, the largest first: what is seen well
     makes a good model."""
     groups = []
-    for i, c in enumerate(candidates):
-        size = np.bincount(c.cluster, minlength=c.num_clusters)
-        seeds = np.bincount(c.cluster, c.seed, minlength=c.num_clusters)
+    for i, c in enumerate(standing):
+        size = np.bincount(c.cluster[c.candidate], minlength=c.num_clusters)
+        seeds = np.bincount(c.cluster[c.candidate & c.seed], minlength=c.num_clusters)
         good = np.flatnonzero((size >= _MIN_POINTS) & (seeds >= _MIN_SEED_SHARE * size))
         groups += [(i, np.flatnonzero(c.cluster == k)) for k in good]
     return sorted(groups, key=lambda g: -len(g[1]))
@@ -109,12 +117,12 @@ def _follow(
     members: np.ndarray,
     start: int,
     velocity: Float,
-    candidates: Sequence[Candidates],
+    standing: Sequence[Standing],
     free: Sequence[Bool],
     sweep_time_s: Float,
 ) -> Track:
     """Forwards, then backwards, with everything seen so far as the model."""
-    here = candidates[start]
+    here = standing[start]
     rate = np.append(velocity, 0.0)
     seen_s = float(here.time_s[members].mean())
     points = _at_once(here, members, rate, seen_s)
@@ -123,10 +131,8 @@ def _follow(
     model = Model(points)
     for direction in (1, -1):
         misses, j = 0, start + direction
-        while 0 <= j < len(candidates) and misses <= _MISSES_ALLOWED:
-            found = _find(
-                model, track, rate, candidates[j], free[j], track.seen_at(j, sweep_time_s)
-            )
+        while 0 <= j < len(standing) and misses <= _MISSES_ALLOWED:
+            found = _find(model, track, rate, standing[j], free[j], track.seen_at(j, sweep_time_s))
             if found is None:
                 misses += 1
             else:
@@ -138,7 +144,7 @@ def _follow(
     return track
 
 
-def _at_once(c: Candidates, rows: np.ndarray, rate: Float, time_s: float) -> Float:
+def _at_once(c: Standing, rows: np.ndarray, rate: Float, time_s: float) -> Float:
     """(N,3) candidates of one sweep, seen one after the other, where they all were at one time."""
     return c.points[rows] + (time_s - c.time_s[rows])[:, None] * rate[:3]
 
@@ -154,7 +160,7 @@ def _predict(track: Track, rate: Float, time_s: float) -> tuple[Float, Float]:
 
 
 def _find(
-    model: Model, track: Track, rate: Float, c: Candidates, free: Bool, about_s: float
+    model: Model, track: Track, rate: Float, c: Standing, free: Bool, about_s: float
 ) -> tuple[Float, float, np.ndarray, Float] | None:
     """Align one sweep's candidates with the model.
 
@@ -164,8 +170,11 @@ def _find(
     centre = track.centre
     expected = apply(_predict(track, rate, about_s)[0], model.points, centre)
     low, high = expected.min(0) - GATES_M[0], expected.max(0) + GATES_M[0]
-    rows = np.flatnonzero(free & ((c.points > low) & (c.points < high)).all(1))
-    if len(rows) < MIN_FIT:
+    inside = np.flatnonzero(free & ((c.points > low) & (c.points < high)).all(1))
+    rows, enough = inside[c.candidate[inside]], MIN_FIT
+    if len(rows) < MIN_FIT:  # seen by nobody else, it may be there all the same
+        rows, enough = inside, max(MIN_FIT, _SHARE_UNSEEN * track.typical_size())
+    if len(rows) < enough:
         return None
     seen_s = float(c.time_s[rows].mean())
     predicted, rate = _predict(track, rate, seen_s)
@@ -175,13 +184,41 @@ def _find(
         return None
     distance, _ = model.nearest(undo(state, target, centre), _FIT_M)
     fit = np.isfinite(distance)
-    if fit.sum() < MIN_FIT:
+    if fit.sum() < enough:
         return None
     return state, seen_s, rows[fit], target[fit]
 
 
+def _refine(track: Track, standing: Sequence[Standing]) -> None:
+    """Align every sweep once more, with what all others saw.
+
+    Followed sweep by sweep, an object whose other side comes into view drifts: the first shape is
+    all there is to hold on to. The even sweeps are aligned with the shape that the odd ones show,
+    and the other way round, so that no sweep holds on to itself.
+    """
+    shapes = []
+    for parity in (0, 1):
+        parts = [
+            track.carry(standing[j].points[rows], standing[j].time_s[rows], track.path.begin_s)
+            for j, rows in sorted(track.claimed.items())
+            if j % 2 == parity
+        ]
+        if not parts:
+            return
+        shapes.append(np.concatenate(parts))
+    models = [Model(undo(track.path(track.path.begin_s), x, track.centre)) for x in shapes]
+    for j, rows in track.claimed.items():
+        at_s = track.times_s[j]
+        points = track.carry(standing[j].points[rows], standing[j].time_s[rows], at_s)
+        state = align(
+            models[1 - j % 2], points, track.centre, track.path(at_s), 0.5 * _PREDICTION_STD
+        )
+        if state is not None:
+            track.states[j] = state
+
+
 def _prove(
-    track: Track, candidates: Sequence[Candidates], space: FreeSpace, sweep_time_s: Float
+    track: Track, standing: Sequence[Standing], space: FreeSpace, sweep_time_s: Float
 ) -> bool:
     """Fit the smooth motion; True if the track certainly moves.
 
@@ -206,18 +243,18 @@ def _prove(
         0.35, 8 * residual_m
     ):
         return False
-    still, moved = _contradictions(track, candidates, space, sweep_time_s)
+    still, moved = _contradictions(track, standing, space, sweep_time_s)
     return moved <= _MAX_CONTRADICTIONS * still
 
 
 def _contradictions(
-    track: Track, candidates: Sequence[Candidates], space: FreeSpace, sweep_time_s: Float
+    track: Track, standing: Sequence[Standing], space: FreeSpace, sweep_time_s: Float
 ) -> tuple[int, int]:
     """How many looks through the track's points the sweeps have: standing still, and moved."""
     still = moved = 0
     for i, rows in track.claimed.items():
         rows = rows[:: len(rows) // _NUM_ASKED + 1]
-        points, seen_s = candidates[i].points[rows], candidates[i].time_s[rows]
+        points, seen_s = standing[i].points[rows], standing[i].time_s[rows]
         for j in space.others(i):
             carried = track.carry(points, seen_s, sweep_time_s[j])
             velocity_m_s = track.velocity_m_s(carried, sweep_time_s[j])
