@@ -111,7 +111,7 @@ class FlowSettings(Section):
         choices=("groups", "paper"),
     )
     min_height_m: float = knob(
-        0.25,
+        0.2,
         "[m] points lower above the ground start no motion; smaller sees kerbs move, larger loses "
         "what is flat",
         0.02,

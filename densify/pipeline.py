@@ -21,7 +21,7 @@ from densify.stages.accumulate import accumulate
 from densify.stages.colour import colour
 from densify.stages.deskew import deskew
 from densify.stages.flow import estimate_motion
-from densify.stages.ground import height_above_ground
+from densify.stages.ground import ground
 from densify.stages.project import project
 from densify.stages.register import check_overlap, check_plausible, register
 from densify.types import (
@@ -152,9 +152,9 @@ def _flow_to_key(
 ) -> tuple[FlowField, ...]:
     """Of every sweep."""
     with watch.stage("ground"):
-        heights_m = height_above_ground(stretch, settings.ground)
+        heights = ground(stretch, settings.ground)
     with watch.stage("flow"):
-        motion = estimate_motion(stretch, heights_m, settings.flow)
+        motion = estimate_motion(stretch, heights, settings.flow)
         return tuple(motion.flow(frame, key) for frame in stretch.frames)
 
 

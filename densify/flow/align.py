@@ -2,7 +2,8 @@
 """Aligning points with an object's accumulated shape, by translation and yaw.
 
 Segal, Haehnel, Thrun, "Generalized-ICP", RSS 2009, with the vertical as the only axis to turn
-about: what moves on the ground hardly tilts within a second.
+about and no motion along it: what moves on the ground hardly tilts within a second, and rises and
+falls as the ground does. Free to climb, what few beams hit climbs with the beams.
 """
 
 from __future__ import annotations
@@ -17,6 +18,8 @@ MIN_FIT = 5  # points
 _MAX_MODEL_POINTS = 1500
 _SURFACE_M = 0.05  # noise of a surface point
 _MAX_WEIGHT = 60.0
+_LOOSE = 10.0  # along the surface: sliding along it must not be held up by its own points
+_PLANAR = [0, 1, 3]
 
 
 class Model:
@@ -44,10 +47,9 @@ class Model:
         _, near = self._tree.query(self.points, k)
         x = self.points[np.reshape(near, (len(self.points), k))]
         x = x - x.mean(1, keepdims=True)
-        covariance = np.einsum("nki,nkj->nij", x, x) / k
+        covariance = _LOOSE * np.einsum("nki,nkj->nij", x, x) / k
         scale = np.trace(covariance, axis1=1, axis2=2)[:, None, None] / 3
         noise = _SURFACE_M**2 * np.eye(3)
-        # Capped along the surface: far along it a point still tells a little.
         self.information = np.linalg.inv(covariance + noise + 0.02 * scale * np.eye(3))
 
 
@@ -57,7 +59,8 @@ def align(
     """The state (4,) in which the model covers the points: x y z displacement (m) and yaw (rad).
 
     points: (N,3), all at one time. centre: (3,) about which the object turns. predicted: (4,) where
-    to start, trusted within ``prediction_std`` (4,). None where too few points have a partner.
+    to start, trusted within ``prediction_std`` (3,) in x y and yaw, and altogether in z. None where
+    too few points have a partner.
     """
     state = predicted.copy()
     for gate_m in GATES_M:
@@ -69,12 +72,12 @@ def align(
                 return None
             matched = nearest[near]
             weight = _robust(distance[near] / gate_m)[:, None, None]
-            state = state + _gauss_newton(
+            state[_PLANAR] += _gauss_newton(
                 at_model[near] - centre,
                 at_model[near] - model.points[matched],
                 model.information[matched] * weight,
                 state[3],
-                predicted - state,
+                (predicted - state)[_PLANAR],
                 prediction_std,
             )
     return state
@@ -95,15 +98,15 @@ def _gauss_newton(
     to_prediction: Float,
     prediction_std: Float,
 ) -> Float:
-    """(4,) step of the state that lowers the weighted residuals and stays near the prediction.
+    """(3,) step of x y and yaw that lowers the weighted residuals and stays near the prediction.
 
     arm: (N,3) of the points about the centre, residual: (N,3) to the model, both in the model's
     orientation. information: (N,3,3).
     """
     prior = 1 / prediction_std**2
-    J = np.zeros((len(arm), 3, 4))
-    J[:, :, :3] = -_turned(np.eye(3), -yaw).T
-    J[:, 0, 3], J[:, 1, 3] = arm[:, 1], -arm[:, 0]
+    J = np.zeros((len(arm), 3, 3))
+    J[:, :, :2] = -_turned(np.eye(3)[:2], -yaw).T
+    J[:, 0, 2], J[:, 1, 2] = arm[:, 1], -arm[:, 0]
     JA = np.einsum("nik,nij->nkj", J, information)
     H = np.einsum("nkj,njl->kl", JA, J) + np.diag(prior)
     g = np.einsum("nkj,nj->k", JA, residual) - prior * to_prediction

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
@@ -13,8 +12,9 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from densify import poses
+from densify.height_map import HeightMap
 from densify.range_image import RangeImage
-from densify.types import Bool, Float, Float32, Int, Stretch
+from densify.types import Bool, Float, Int, Stretch
 
 _MARGIN_M = 0.4
 _MARGIN_FRACTION = 0.015
@@ -96,7 +96,7 @@ class Standing:
 
 
 def find_candidates(
-    stretch: Stretch, space: FreeSpace, heights_m: Sequence[Float32], min_height_m: float
+    stretch: Stretch, space: FreeSpace, ground: HeightMap, min_height_m: float
 ) -> tuple[Standing, ...]:
     """What stands in every sweep, and which of it may move.
 
@@ -107,9 +107,9 @@ def find_candidates(
 
     def of_sweep(i: int) -> Standing:
         registered = stretch.sweeps[i]
-        above = np.flatnonzero(heights_m[i] >= min_height_m)
-        in_lidar = registered.sweep.points[above]
-        points = poses.transform(registered.T_world_lidar, in_lidar)
+        points = poses.transform(registered.T_world_lidar, registered.sweep.points)
+        above = np.flatnonzero(ground.above(points) >= min_height_m)
+        points, in_lidar = points[above], registered.sweep.points[above]
         seed = np.zeros(len(above), bool)
         for j in space.others(i):
             rest = np.flatnonzero(~seed)

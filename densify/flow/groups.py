@@ -19,12 +19,13 @@ from densify.flow.evidence import (
     reference_times_s,
 )
 from densify.flow.tracks import Track, follow_groups
+from densify.height_map import HeightMap
 from densify.types import Bool, Float, Float32, FlowField, Stretch
 
 _ATTACH_M = 0.3
 _ATTACH_UNSEEN_M = 0.15
 _OUTLINE_M = 0.05
-_MIN_HEIGHT_M = 0.12
+_MIN_HEIGHT_M = 0.08
 _FORETOLD = 2  # sweeps before an object was first seen and after it was last seen
 _GAPS_REACHED = 0.8  # of the gap between neighbouring rings
 
@@ -65,19 +66,19 @@ class GroupMotion:
         return FlowField(displacement, instance >= 0, instance, lost, to_reference, velocity_m_s)
 
 
-def follow(stretch: Stretch, heights_m: Sequence[Float32], min_height_m: float) -> GroupMotion:
+def follow(stretch: Stretch, ground: HeightMap, min_height_m: float) -> GroupMotion:
     """Find everything in the stretch that certainly moves.
 
-    heights_m: per sweep (N,) above the ground. min_height_m: lower points start no motion.
+    min_height_m: points lower above the ground start no motion.
     """
     space = FreeSpace.of(stretch)
-    standing = find_candidates(stretch, space, heights_m, min_height_m)
+    standing = find_candidates(stretch, space, ground, min_height_m)
     time_s = reference_times_s(stretch)
-    tracks = follow_groups(standing, space, time_s)
+    tracks = follow_groups(standing, space, ground, time_s)
     shapes = [_shape(track, standing) for track in tracks]
     instance = []
-    for i, height_m in enumerate(heights_m):
-        seen = _Seen.of(stretch, i, height_m, standing[i], space.ring_step_rad)
+    for i in range(len(stretch.sweeps)):
+        seen = _Seen.of(stretch, i, ground, standing[i], space.ring_step_rad)
         found = _attach(seen, i, tracks, shapes, time_s, min_height_m)
         instance.append(found)
     return GroupMotion(stretch, tuple(tracks), tuple(instance))
@@ -95,7 +96,7 @@ class _Seen:
 
     @staticmethod
     def of(
-        stretch: Stretch, i: int, height_m: Float32, standing: Standing, ring_step_rad: float
+        stretch: Stretch, i: int, ground: HeightMap, standing: Standing, ring_step_rad: float
     ) -> _Seen:
         registered = stretch.sweeps[i]
         points = registered.sweep.points
@@ -103,10 +104,11 @@ class _Seen:
         rows = standing.row[standing.candidate]
         gap_m = ring_step_rad * np.linalg.norm(points[rows], axis=1)
         reach_m[rows] = np.maximum(_ATTACH_M, _GAPS_REACHED * gap_m)
+        in_world = poses.transform(registered.T_world_lidar, points)
         return _Seen(
-            poses.transform(registered.T_world_lidar, points),
+            in_world,
             firing_times_s(stretch, i),
-            height_m,
+            ground.above(in_world),
             reach_m,
         )
 

@@ -17,6 +17,7 @@ from densify.flow.align import GATES_M, MIN_FIT, Model, align, apply, undo
 from densify.flow.evidence import FreeSpace, Standing
 from densify.flow.paths import Path
 from densify.flow.vote import DistanceField, vote
+from densify.height_map import HeightMap
 from densify.types import Bool, Float
 
 _MIN_POINTS = 8
@@ -24,8 +25,8 @@ _MIN_SEED_SHARE = 0.4
 _FIT_M = 0.3
 _SHARE_UNSEEN = 0.5  # of the points a sweep usually shows
 _MANY_POINTS = 100  # more do not place a sweep better
-_PREDICTION_STD = np.array([0.3, 0.3, 0.08, 0.06])  # m, m, m, rad
-_STEADY = np.array([1.0, 1.0, 0.5, 0.9])  # of a rate lasts: slopes and turns level out
+_PREDICTION_STD = np.array([0.3, 0.3, 0.06])  # m, m, rad
+_STEADY = np.array([1.0, 1.0, 1.0, 0.9])  # of a rate lasts: turns level out
 _NUM_ASKED = 60
 _MISSES_ALLOWED = 1
 _MAX_CONTRADICTIONS = 0.3  # of those that standing still leaves
@@ -36,9 +37,9 @@ class Track:
     """One rigid object in the stretch.
 
     centre: (3,) about which it turns, world. states: sweep index -> (4,) x y z displacement (m)
-    and yaw (rad) since the sweep it started in. times_s: sweep index -> when that sweep saw it,
-    which is not the sweep's reference time. claimed: sweep index -> rows of `Standing` that are
-    its. path: the smooth motion.
+    and yaw (rad) since the sweep it started in; z as the ground under it rises. times_s:
+    sweep index -> when that sweep saw it, which is not the sweep's reference time. claimed: sweep
+    index -> rows of `Standing` that are its. path: the smooth motion.
     """
 
     centre: Float
@@ -61,6 +62,12 @@ class Track:
         """What sweep j saw of the object."""
         self.states[j], self.times_s[j], self.claimed[j] = state, time_s, rows
 
+    def rise_m(self, ground: HeightMap, state: Float) -> float:
+        """How much higher the ground under the object is in that state."""
+        centres = np.stack([self.centre, self.centre + state[:3]])
+        start, now = ground.under(centres)
+        return float(now - start)
+
     def typical_size(self) -> float:
         """Points per sweep."""
         return float(np.median([len(rows) for rows in self.claimed.values()]))
@@ -72,7 +79,7 @@ class Track:
 
 
 def follow_groups(
-    standing: Sequence[Standing], space: FreeSpace, sweep_time_s: Float
+    standing: Sequence[Standing], space: FreeSpace, ground: HeightMap, sweep_time_s: Float
 ) -> list[Track]:
     """All proven moving objects of the stretch.
 
@@ -87,10 +94,10 @@ def follow_groups(
         if len(members) < _MIN_POINTS:
             continue
         velocity = vote(standing[i].points[members], i, fields, sweep_time_s)
-        track = _follow(members, i, velocity, standing, free, sweep_time_s)
+        track = _follow(members, i, velocity, standing, free, ground, sweep_time_s)
         proven = _prove(track, standing, space, sweep_time_s)
         if proven:
-            _refine(track, standing)
+            _refine(track, standing, ground)
             proven = _prove(track, standing, space, sweep_time_s)
         for j, rows in track.claimed.items():
             untried[j][rows] = False
@@ -119,6 +126,7 @@ def _follow(
     velocity: Float,
     standing: Sequence[Standing],
     free: Sequence[Bool],
+    ground: HeightMap,
     sweep_time_s: Float,
 ) -> Track:
     """Forwards, then backwards, with everything seen so far as the model."""
@@ -132,7 +140,9 @@ def _follow(
     for direction in (1, -1):
         misses, j = 0, start + direction
         while 0 <= j < len(standing) and misses <= _MISSES_ALLOWED:
-            found = _find(model, track, rate, standing[j], free[j], track.seen_at(j, sweep_time_s))
+            found = _find(
+                model, track, rate, standing[j], free[j], ground, track.seen_at(j, sweep_time_s)
+            )
             if found is None:
                 misses += 1
             else:
@@ -160,7 +170,13 @@ def _predict(track: Track, rate: Float, time_s: float) -> tuple[Float, Float]:
 
 
 def _find(
-    model: Model, track: Track, rate: Float, c: Standing, free: Bool, about_s: float
+    model: Model,
+    track: Track,
+    rate: Float,
+    c: Standing,
+    free: Bool,
+    ground: HeightMap,
+    about_s: float,
 ) -> tuple[Float, float, np.ndarray, Float] | None:
     """Align one sweep's candidates with the model.
 
@@ -171,17 +187,19 @@ def _find(
     expected = apply(_predict(track, rate, about_s)[0], model.points, centre)
     low, high = expected.min(0) - GATES_M[0], expected.max(0) + GATES_M[0]
     inside = np.flatnonzero(free & ((c.points > low) & (c.points < high)).all(1))
-    rows, enough = inside[c.candidate[inside]], MIN_FIT
+    rows, enough = inside[c.candidate[inside]], float(MIN_FIT)
     if len(rows) < MIN_FIT:  # seen by nobody else, it may be there all the same
         rows, enough = inside, max(MIN_FIT, _SHARE_UNSEEN * track.typical_size())
     if len(rows) < enough:
         return None
     seen_s = float(c.time_s[rows].mean())
     predicted, rate = _predict(track, rate, seen_s)
+    predicted[2] = track.rise_m(ground, predicted)
     target = _at_once(c, rows, rate, seen_s)
     state = align(model, target, centre, predicted, _PREDICTION_STD)
     if state is None:
         return None
+    state[2] = track.rise_m(ground, state)
     distance, _ = model.nearest(undo(state, target, centre), _FIT_M)
     fit = np.isfinite(distance)
     if fit.sum() < enough:
@@ -189,7 +207,7 @@ def _find(
     return state, seen_s, rows[fit], target[fit]
 
 
-def _refine(track: Track, standing: Sequence[Standing]) -> None:
+def _refine(track: Track, standing: Sequence[Standing], ground: HeightMap) -> None:
     """Align every sweep once more, with what all others saw.
 
     Followed sweep by sweep, an object whose other side comes into view drifts: the first shape is
@@ -214,6 +232,7 @@ def _refine(track: Track, standing: Sequence[Standing]) -> None:
             models[1 - j % 2], points, track.centre, track.path(at_s), 0.5 * _PREDICTION_STD
         )
         if state is not None:
+            state[2] = track.rise_m(ground, state)
             track.states[j] = state
 
 
