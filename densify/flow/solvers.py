@@ -112,9 +112,9 @@ def solve(
     defaults. initial: (n,3) flow to start from, otherwise 0; pcg then works at the final alpha at
     once, and stays near it. device: "cpu", "cuda" or "cuda:N".
 
-    Same input, same bytes on the same machine. Everything is done in float64 about the source's
-    mean, so that map coordinates lose nothing. 130,000 points against 130,000 with 50 neighbours
-    need about 1 GB.
+    Same input, same bytes on the same CPU with any number of threads. Everything is done in float64
+    about the source's mean, so that map coordinates lose nothing. 130,000 points against 130,000
+    with 50 neighbours need about 1 GB.
 
     Raises InputError for no points, wrong shapes, NaN, or a device that is not there.
     """
