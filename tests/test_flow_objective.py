@@ -189,6 +189,18 @@ def test_brute_force_finds_what_the_tree_finds(k: int, max_chunk: int) -> None:
     assert torch.equal(tree.row, distance.topk(k, dim=1, largest=False).indices)
 
 
+def test_a_moved_index_answers_like_a_new_one() -> None:
+    points, moved, queries = (torch.from_numpy(cloud(400, seed)) for seed in (0, 1, 2))
+    index = NeighborIndex(points)
+    index.move(moved)
+    for k in (1, 6):
+        found, expected = index.nearest(queries, k), NeighborIndex(moved).nearest(queries, k)
+        assert torch.equal(found.row, expected.row)
+        assert torch.equal(found.distance_m, expected.distance_m)
+    with pytest.raises(InputError, match="points: got 399, expected the 400"):
+        index.move(moved[1:])
+
+
 @pytest.mark.skipif(NO_CUDA, reason="no CUDA device")
 def test_cuda_finds_the_same_energy_and_gradient_as_the_cpu() -> None:
     results = []

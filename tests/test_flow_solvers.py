@@ -89,7 +89,8 @@ def test_pcg_and_adam_reach_the_same_minimum(kind: str) -> None:
     assert pcg.num_steps < adam.num_steps / 3
     for solution in (pcg, adam):
         assert solution.energy == min(solution.energies)
-        assert len(solution.energies) == solution.num_steps + 1
+        assert len(solution.energies) == len(solution.seconds) == solution.num_steps + 1
+        assert (np.diff([0.0, *solution.seconds]) > 0).all()
         assert solution.flow.shape == source.shape and solution.flow.dtype == np.float64
         reported_equals_recomputed(source, target, common, solution)
 

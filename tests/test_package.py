@@ -17,7 +17,7 @@ import densify
 from densify.config import Config, as_mapping, presets, resolve
 
 CHECKOUT = Path(__file__).parents[1]
-HEAVY = {"numpy", "scipy", "torch", "embreex", "kiss_icp", "cv2", "laspy"}
+HEAVY = {"numpy", "scipy", "torch", "embreex", "kiss_icp", "cv2", "laspy", "numba"}
 
 needs_installation = pytest.mark.skipif(
     "DENSIFY_TEST_INSTALLED" not in os.environ,
@@ -134,6 +134,7 @@ DOORS = {
     "embreex": "densify/street/world.py",
     "kiss_icp": "densify/stages/register.py",
     "laspy": "densify/output/cloud_laz.py",
+    "numba": "densify/kernels/",
     "torch": "densify/flow/",
 }
 

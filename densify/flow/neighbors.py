@@ -1,16 +1,17 @@
 # SPDX-License-Identifier: MIT
-"""The one door of the flow objective for nearest-neighbour search: a k-d tree on the CPU, chunked
-brute force on CUDA, with the same answer up to ties."""
+"""The one door of the flow objective for nearest-neighbour search: a compiled tree on the CPU,
+chunked brute force on CUDA, with the same answer up to ties."""
 
 from __future__ import annotations
 
 from typing import NamedTuple
 
 import torch
-from scipy.spatial import cKDTree
 from torch import Tensor
 
 from densify.errors import InputError
+from densify.kernels.nearest import BoxTree
+from densify.types import Float
 
 _MAX_CHUNK = 1 << 24  # distances held at once by brute force: two float32 buffers of 64 MB
 
@@ -27,7 +28,7 @@ class Neighbors(NamedTuple):
 
 
 class NeighborIndex:
-    """Search in fixed points, to be made once and asked often.
+    """Search in points: to be made once, asked often, and moved along where they move.
 
     points: (m,3) floating-point tensor, metres; the search runs on its device, CPU or CUDA.
 
@@ -37,11 +38,24 @@ class NeighborIndex:
     def __init__(self, points: Tensor) -> None:
         require_points(points, "points")
         self.points = points.detach()
-        # Unbalanced trees are built in half the time and answer as fast.
-        self._tree = None if points.is_cuda else cKDTree(self.points.numpy(), balanced_tree=False)
+        self._tree = None if points.is_cuda else BoxTree(_contiguous(points))
 
     def __len__(self) -> int:
         return len(self.points)
+
+    def move(self, points: Tensor) -> None:
+        """The same points elsewhere, (m,3): cheaper than a new index, and as exact.
+
+        Raises InputError like the constructor, and for another number of points.
+        """
+        require_points(points, "points")
+        if points.shape != self.points.shape:
+            raise InputError(
+                f"points: got {len(points)}, expected the {len(self)} that the index was made of"
+            )
+        self.points = points.detach()
+        if self._tree is not None:
+            self._tree.move(_contiguous(points))
 
     def nearest(self, queries: Tensor, num_neighbors: int = 1) -> Neighbors:
         """The nearest ``num_neighbors`` (at most m) points of each query.
@@ -59,8 +73,10 @@ class NeighborIndex:
         queries = queries.detach()
         if self._tree is None:
             return nearest_by_brute_force(queries, self.points, num_neighbors)
-        ranks = range(1, num_neighbors + 1)
-        distance_m, row = self._tree.query(queries.numpy(), k=list(ranks), workers=-1)
+        if num_neighbors == 1:
+            distance_m, row = (x[:, None] for x in self._tree.nearest(_contiguous(queries)))
+        else:
+            distance_m, row = self._tree.nearest_k(_contiguous(queries), num_neighbors)
         return Neighbors(torch.from_numpy(distance_m).to(queries.dtype), torch.from_numpy(row))
 
 
@@ -108,3 +124,7 @@ def require_points(points: Tensor, name: str) -> None:
             f"{name}: {int(invalid.sum())} of {len(points)} rows are NaN or infinite, the first is "
             f"row {first}; expected finite metres, drop those rows"
         )
+
+
+def _contiguous(points: Tensor) -> Float:
+    return points.detach().double().contiguous().numpy()

@@ -12,6 +12,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from densify.errors import InputError
+from densify.flow.graph import multiply
 from densify.flow.neighbors import NeighborIndex, require_points
 
 
@@ -77,15 +78,15 @@ def energy(
             f"expected one dtype"
         )
     index = target if isinstance(target, NeighborIndex) else NeighborIndex(target)
-    matches = match(source + flow, index)
+    matches = match(NeighborIndex(source + flow), index)
     return matched_energy(flow, source, index.points, laplacian, alpha, matches)
 
 
-def match(moved: Tensor, target: NeighborIndex) -> Matches:
-    """Nearest neighbours of (n,3) moved source points in the target and the other way round."""
+def match(moved: NeighborIndex, target: NeighborIndex) -> Matches:
+    """Nearest neighbours of the moved source points in the target and the other way round."""
     return Matches(
-        target.nearest(moved).row[:, 0],
-        NeighborIndex(moved).nearest(target.points).row[:, 0],
+        target.nearest(moved.points).row[:, 0],
+        moved.nearest(target.points).row[:, 0],
     )
 
 
@@ -105,7 +106,7 @@ def matched_energy(
     moved = source + flow
     forward = moved - target[matches.target_of_source]
     backward = _Gather.apply(moved, matches.source_of_target) - target
-    data = (forward * forward).sum() + (backward * backward).sum()
+    data = _SumOfSquares.apply(forward) + _SumOfSquares.apply(backward)
     smoothness = _QuadraticForm.apply(flow, laplacian)
     return Energy(data + alpha * smoothness, data, smoothness)
 
@@ -130,17 +131,37 @@ class _Gather(torch.autograd.Function):
         return torch.stack(columns, dim=1), None
 
 
+class _SumOfSquares(torch.autograd.Function):
+    """Σ x² with bytes that do not depend on threads."""
+
+    @staticmethod
+    def forward(ctx: Any, values: Tensor) -> Tensor:
+        ctx.save_for_backward(values)
+        return _sum(values * values)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, gradient: Tensor) -> Tensor:
+        (values,) = ctx.saved_tensors
+        return 2.0 * gradient * values
+
+
 class _QuadraticForm(torch.autograd.Function):
     """tr(FᵀLF) for a symmetric sparse L, with one product for value and gradient together."""
 
     @staticmethod
     def forward(ctx: Any, flow: Tensor, laplacian: Tensor) -> Tensor:
-        product = laplacian @ flow
+        product = multiply(laplacian, flow)
         ctx.save_for_backward(product)
-        return (flow * product).sum()
+        return _sum(flow * product)
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:
         (product,) = ctx.saved_tensors
         return 2.0 * gradient * product, None
+
+
+def _sum(values: Tensor) -> Tensor:
+    """Of all values: torch splits a long sum on the CPU by its threads, numpy does not."""
+    return values.sum() if values.is_cuda else torch.tensor(values.numpy().sum())

@@ -1,0 +1,226 @@
+# SPDX-License-Identifier: MIT
+"""Nearest neighbours by a tree of boxes, which keeps its shape while the points move: only the
+boxes are fitted anew, in a tenth of the time that building takes."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from densify.kernels.threads import in_parallel
+from densify.types import Float, Int
+
+_MAX_LEAF = 10  # points; 8 to 16 answer alike
+_MAX_DEPTH = 64
+_ABOVE, _TINY = 1.0 + 1e-9, 1e-300  # rounding must not cut the k-th neighbour off, nor 0 do it
+
+
+class BoxTree:
+    """Search in (m,3) points, m at least 1, finite."""
+
+    def __init__(self, points: Float) -> None:
+        depth = 0
+        while (len(points) - 1) >> depth >= _MAX_LEAF:
+            depth += 1
+        self._starts = np.zeros((2 << depth) - 1, np.int64)
+        self._stops = np.zeros_like(self._starts)
+        self._order = np.arange(len(points))
+        _split(points, depth, self._starts, self._stops, self._order)
+        self._boxes = np.empty((len(self._starts), 6))
+        self.move(points)
+
+    def move(self, points: Float) -> None:
+        """The same points elsewhere. Always exact; the less they stay neighbours, the slower."""
+        self._points = points[self._order]
+        _fit_boxes(self._points, self._starts, self._stops, self._boxes)
+
+    def nearest(self, queries: Float) -> tuple[Float, Int]:
+        """(q,) metres to the nearest point, and (q,) its row.
+
+        queries: (q,3).
+        """
+        distance_m, row = np.empty(len(queries)), np.empty(len(queries), np.int64)
+        in_parallel(_nearest, len(queries), queries, *self._search, distance_m, row)
+        return distance_m, row
+
+    def nearest_k(self, queries: Float, k: int) -> tuple[Float, Int]:
+        """(q,k) metres to the k nearest points, nearest first, and (q,k) their rows; 1 <= k <= m.
+
+        Faster where queries follow their neighbours, as in the order of a scan.
+        """
+        distance_m = np.empty((len(queries), k))
+        row = np.empty((len(queries), k), np.int64)
+        in_parallel(_nearest_k, len(queries), queries, *self._search, distance_m, row)
+        return distance_m, row
+
+    @property
+    def _search(self) -> tuple[Float, Int, Int, Int, Float]:
+        return self._points, self._order, self._starts, self._stops, self._boxes
+
+
+@njit(cache=True, nogil=True)
+def _split(points: Float, depth: int, starts: Int, stops: Int, order: Int) -> None:
+    """Halve every node's points along its longest side; node i has the children 2i+1 and 2i+2."""
+    starts[0], stops[0] = 0, len(order)
+    for node in range((1 << depth) - 1):
+        start, stop = starts[node], stops[node]
+        middle = (start + stop) // 2
+        starts[2 * node + 1], stops[2 * node + 1] = start, middle
+        starts[2 * node + 2], stops[2 * node + 2] = middle, stop
+        axis, longest = 0, -1.0
+        for candidate in range(3):
+            low = high = points[order[start], candidate]
+            for i in range(start + 1, stop):
+                value = points[order[i], candidate]
+                low, high = min(low, value), max(high, value)
+            if high - low > longest:
+                axis, longest = candidate, high - low
+        _select(points[:, axis], order, start, stop - 1, middle)
+
+
+@njit(cache=True, nogil=True)
+def _select(values: Float, order: Int, left: int, right: int, middle: int) -> None:
+    """Hoare's quickselect: no value of order[:middle] is above, none of order[middle:] below."""
+    while left < right:
+        pivot = values[order[(left + right) // 2]]
+        i, j = left, right
+        while i <= j:
+            while values[order[i]] < pivot:
+                i += 1
+            while values[order[j]] > pivot:
+                j -= 1
+            if i <= j:
+                order[i], order[j] = order[j], order[i]
+                i += 1
+                j -= 1
+        if middle <= j:
+            right = j
+        elif middle >= i:
+            left = i
+        else:
+            return
+
+
+@njit(cache=True, nogil=True)
+def _fit_boxes(points: Float, starts: Int, stops: Int, boxes: Float) -> None:
+    first_leaf = len(starts) // 2
+    for node in range(len(starts) - 1, -1, -1):
+        for axis in range(3):
+            if node < first_leaf:
+                low = min(boxes[2 * node + 1, axis], boxes[2 * node + 2, axis])
+                high = max(boxes[2 * node + 1, 3 + axis], boxes[2 * node + 2, 3 + axis])
+            else:
+                low, high = np.inf, -np.inf
+                for i in range(starts[node], stops[node]):
+                    low, high = min(low, points[i, axis]), max(high, points[i, axis])
+            boxes[node, axis], boxes[node, 3 + axis] = low, high
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _squared_to_box(boxes: Float, node: int, x: float, y: float, z: float) -> float:
+    dx = max(boxes[node, 0] - x, 0.0, x - boxes[node, 3])
+    dy = max(boxes[node, 1] - y, 0.0, y - boxes[node, 4])
+    dz = max(boxes[node, 2] - z, 0.0, z - boxes[node, 5])
+    return dx * dx + dy * dy + dz * dz
+
+
+@njit(cache=True, nogil=True)
+def _nearest(
+    begin: int,
+    end: int,
+    queries: Float,
+    points: Float,
+    order: Int,
+    starts: Int,
+    stops: Int,
+    boxes: Float,
+    distance_m: Float,
+    row: Int,
+) -> None:
+    first_leaf = len(starts) // 2
+    waiting = np.empty(_MAX_DEPTH, np.int64)
+    squared_to = np.empty(_MAX_DEPTH)
+    for q in range(begin, end):
+        x, y, z = queries[q, 0], queries[q, 1], queries[q, 2]
+        best, found = np.inf, -1
+        waiting[0], squared_to[0], top = 0, 0.0, 1
+        while top > 0:
+            top -= 1
+            if squared_to[top] >= best:
+                continue
+            node = waiting[top]
+            while node < first_leaf:
+                near, far = 2 * node + 1, 2 * node + 2
+                to_near = _squared_to_box(boxes, near, x, y, z)
+                to_far = _squared_to_box(boxes, far, x, y, z)
+                if to_far < to_near:
+                    near, far, to_near, to_far = far, near, to_far, to_near
+                if to_far < best:
+                    waiting[top], squared_to[top] = far, to_far
+                    top += 1
+                if to_near >= best:
+                    break
+                node = near
+            if node < first_leaf:
+                continue
+            for i in range(starts[node], stops[node]):
+                dx, dy, dz = points[i, 0] - x, points[i, 1] - y, points[i, 2] - z
+                squared = dx * dx + dy * dy + dz * dz
+                if squared < best:
+                    best, found = squared, i
+        distance_m[q], row[q] = np.sqrt(best), order[found]
+
+
+@njit(cache=True, nogil=True)
+def _nearest_k(
+    begin: int,
+    end: int,
+    queries: Float,
+    points: Float,
+    order: Int,
+    starts: Int,
+    stops: Int,
+    boxes: Float,
+    distance_m: Float,
+    row: Int,
+) -> None:
+    first_leaf = len(starts) // 2
+    k = distance_m.shape[1]
+    waiting = np.empty(_MAX_DEPTH, np.int64)
+    squared_to = np.empty(_MAX_DEPTH)
+    nearest = np.empty(k)
+    found = np.empty(k, np.int64)
+    for q in range(begin, end):
+        x, y, z = queries[q, 0], queries[q, 1], queries[q, 2]
+        # The k neighbours of the query before are no farther than its k-th and the way from there.
+        nearest[:] = np.inf
+        if q > begin:
+            dx, dy, dz = queries[q - 1, 0] - x, queries[q - 1, 1] - y, queries[q - 1, 2] - z
+            reach = distance_m[q - 1, k - 1] + np.sqrt(dx * dx + dy * dy + dz * dz)
+            nearest[:] = reach * reach * _ABOVE + _TINY
+        waiting[0], squared_to[0], top = 0, 0.0, 1
+        while top > 0:
+            top -= 1
+            if squared_to[top] >= nearest[k - 1]:
+                continue
+            node = waiting[top]
+            while node < first_leaf:
+                near, far = 2 * node + 1, 2 * node + 2
+                to_near = _squared_to_box(boxes, near, x, y, z)
+                to_far = _squared_to_box(boxes, far, x, y, z)
+                if to_far < to_near:
+                    near, far, to_near, to_far = far, near, to_far, to_near
+                waiting[top], squared_to[top] = far, to_far
+                top += 1
+                node = near
+            for i in range(starts[node], stops[node]):
+                dx, dy, dz = points[i, 0] - x, points[i, 1] - y, points[i, 2] - z
+                squared = dx * dx + dy * dy + dz * dz
+                if squared < nearest[k - 1]:
+                    j = k - 1
+                    while j > 0 and nearest[j - 1] > squared:
+                        nearest[j], found[j] = nearest[j - 1], found[j - 1]
+                        j -= 1
+                    nearest[j], found[j] = squared, order[i]
+        for j in range(k):
+            distance_m[q, j], row[q, j] = np.sqrt(nearest[j]), found[j]
