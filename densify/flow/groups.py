@@ -26,8 +26,13 @@ _ATTACH_M = 0.3
 _ATTACH_UNSEEN_M = 0.15
 _OUTLINE_M = 0.05
 _MIN_HEIGHT_M = 0.08
+_LENGTH_M = 15.0
+_SIDE_M = 0.1
+_LONGEST_HOLE_M = 0.6
+_MAX_CONTRADICTED = 0.05
 _FORETOLD = 2  # sweeps before an object was first seen and after it was last seen
 _GAPS_REACHED = 0.8  # of the gap between neighbouring rings
+_GAPS_REACHED_UNSEEN = 0.5
 
 
 @dataclass(frozen=True)
@@ -80,6 +85,7 @@ def follow(stretch: Stretch, ground: HeightMap, min_height_m: float) -> GroupMot
     for i in range(len(stretch.sweeps)):
         seen = _Seen.of(stretch, i, ground, standing[i], space.ring_step_rad)
         found = _attach(seen, i, tracks, shapes, time_s, min_height_m)
+        _lengthen(found, seen, i, tracks, shapes, time_s, space)
         instance.append(found)
     return GroupMotion(stretch, tuple(tracks), tuple(instance))
 
@@ -100,10 +106,10 @@ class _Seen:
     ) -> _Seen:
         registered = stretch.sweeps[i]
         points = registered.sweep.points
-        reach_m = np.full(len(points), _ATTACH_UNSEEN_M)
+        gap_m = ring_step_rad * np.linalg.norm(points, axis=1)
+        reach_m = np.maximum(_ATTACH_UNSEEN_M, _GAPS_REACHED_UNSEEN * gap_m)
         rows = standing.row[standing.candidate]
-        gap_m = ring_step_rad * np.linalg.norm(points[rows], axis=1)
-        reach_m[rows] = np.maximum(_ATTACH_M, _GAPS_REACHED * gap_m)
+        reach_m[rows] = np.maximum(_ATTACH_M, _GAPS_REACHED * gap_m[rows])
         in_world = poses.transform(registered.T_world_lidar, points)
         return _Seen(
             in_world,
@@ -158,6 +164,62 @@ def _attach(
         instance[rows[closer]] = k
         nearest[rows[closer]] = distance[closer]
     return instance
+
+
+def _lengthen(
+    instance: NDArray[np.int32],
+    seen: _Seen,
+    i: int,
+    tracks: Sequence[Track],
+    shapes: Sequence[Float],
+    time_s: Float,
+    space: FreeSpace,
+) -> None:
+    """Give the tracks what goes on ahead of and behind their points without a hole, as wide and as
+    high as they are: nobody sees through the middle of a long side that slides along itself. No
+    other sweep may see through the points where they would be carried to."""
+    for k, track in enumerate(tracks):
+        mine = np.flatnonzero(instance == k)
+        if not len(mine):
+            continue
+        at_s = track.seen_at(i, time_s)
+        ahead = track.path.rate(at_s)[:2]
+        ahead = ahead / max(float(np.linalg.norm(ahead)), 1e-6)
+        axes = np.stack([ahead, [-ahead[1], ahead[0]]], axis=1)
+        shape = track.carry(shapes[k], track.path.begin_s, at_s)
+        side = (shape[:, :2] @ axes)[:, 1]
+        near = np.abs(seen.points[:, :2] - shape[:, :2].mean(0)).max(1) < 1.5 * _LENGTH_M
+        rows = np.flatnonzero(near & (instance < 0) & (seen.height_m > _MIN_HEIGHT_M))
+        at_once = track.carry(seen.points[rows], seen.time_s[rows], at_s)
+        along = at_once[:, :2] @ axes
+        fits = (along[:, 1] > side.min() - _SIDE_M) & (along[:, 1] < side.max() + _SIDE_M)
+        fits &= at_once[:, 2] < shape[:, 2].max() + _SIDE_M
+        own = track.carry(seen.points[mine], seen.time_s[mine], at_s)[:, :2] @ ahead
+        rows, along = rows[fits], along[fits, 0]
+        rows = rows[_without_hole(along, own)]
+        if len(rows) and _contradicted(track, seen, rows, i, time_s, space) <= _MAX_CONTRADICTED:
+            instance[rows] = k
+
+
+def _without_hole(along: Float, own: Float) -> Bool:
+    """(N,) those of ``along`` that reach (M,) ``own`` by steps below ``_LONGEST_HOLE_M``."""
+    everything = np.concatenate([along, own])
+    order = np.argsort(everything, kind="stable")
+    run = np.zeros(len(everything), np.int64)
+    run[order[1:]] = np.cumsum(np.diff(everything[order]) > _LONGEST_HOLE_M)
+    return np.isin(run[: len(along)], run[len(along) :])
+
+
+def _contradicted(
+    track: Track, seen: _Seen, rows: NDArray[np.int64], i: int, time_s: Float, space: FreeSpace
+) -> float:
+    """The largest share of the points, moved with the track, that another sweep sees through."""
+    shares = [0.0]
+    for j in space.others(i):
+        carried = track.carry(seen.points[rows], seen.time_s[rows], time_s[j])
+        velocity_m_s = track.velocity_m_s(carried, time_s[j])
+        shares.append(float(space.seen_through(carried, j, velocity_m_s).mean()))
+    return max(shares)
 
 
 def _within_outline(at: Float, outline: Float) -> Bool:

@@ -22,6 +22,8 @@ from densify.types import Bool, Float
 
 _MIN_POINTS = 8
 _MIN_SEED_SHARE = 0.4
+_AROUND = 5  # sweeps before and after a start are as good as any number
+_PER_SWEEP_NEARER_END = 0.7  # a start this much nearer needs as many more points
 _FIT_M = 0.3
 _SHARE_UNSEEN = 0.5  # of the points a sweep usually shows
 _MANY_POINTS = 100  # more do not place a sweep better
@@ -109,15 +111,21 @@ def follow_groups(
 
 
 def _groups_to_start(standing: Sequence[Standing]) -> list[tuple[int, np.ndarray]]:
-    """Sweep and members of the clusters that are mostly seeds, the largest first: what is seen well
-    makes a good model."""
+    """Sweep and members of the clusters that are mostly seeds, the best start first: what is seen well
+    makes a good model, and far from the ends of the stretch both sides tell how it moves."""
     groups = []
+    last = len(standing) - 1
+
+    def worth(start: tuple[int, np.ndarray]) -> float:
+        i, members = start
+        return float(len(members) * _PER_SWEEP_NEARER_END ** max(0, _AROUND - min(i, last - i)))
+
     for i, c in enumerate(standing):
         size = np.bincount(c.cluster[c.candidate], minlength=c.num_clusters)
         seeds = np.bincount(c.cluster[c.candidate & c.seed], minlength=c.num_clusters)
         good = np.flatnonzero((size >= _MIN_POINTS) & (seeds >= _MIN_SEED_SHARE * size))
         groups += [(i, np.flatnonzero(c.cluster == k)) for k in good]
-    return sorted(groups, key=lambda g: -len(g[1]))
+    return sorted(groups, key=worth, reverse=True)
 
 
 def _follow(
