@@ -17,7 +17,7 @@ import densify
 from densify.config import Config, as_mapping, presets, resolve
 
 CHECKOUT = Path(__file__).parents[1]
-HEAVY = {"numpy", "scipy", "torch", "embreex", "kiss_icp", "cv2", "laspy"}
+HEAVY = {"numpy", "scipy", "torch", "embreex", "kiss_icp", "cv2", "laspy", "numba"}
 
 needs_installation = pytest.mark.skipif(
     "DENSIFY_TEST_INSTALLED" not in os.environ,
@@ -55,7 +55,8 @@ def test_help_of_every_verb_is_light(verb: str) -> None:
 
 
 def test_opening_a_recording_needs_no_torch() -> None:
-    assert not {"torch", "kiss_icp"} & modules_after("import densify; densify.open_sequence")
+    heavy = {"torch", "kiss_icp", "numba"}
+    assert not heavy & modules_after("import densify; densify.open_sequence")
 
 
 @pytest.mark.parametrize("name", [n for n in dir(densify) if not n.startswith("_")])
@@ -134,6 +135,7 @@ DOORS = {
     "embreex": "densify/street/world.py",
     "kiss_icp": "densify/stages/register.py",
     "laspy": "densify/output/cloud_laz.py",
+    "numba": "densify/kernels/",
     "torch": "densify/flow/",
 }
 
