@@ -127,6 +127,7 @@ def _cells(azimuth: Float32, elevation: Float32) -> tuple[Float32, int]:
     if len(azimuth) > _MANY_POINTS:  # every fourth sector tells as much
         some = np.floor(azimuth / _SECTOR_RAD) % 4 == 0
         azimuth, elevation = azimuth[some], elevation[some]
+    edges: NDArray[np.floating]
     if len(azimuth) < _MIN_POINTS_TO_MEASURE:
         edges, step = _uniform_edges(whole, np.deg2rad(2.0)), np.deg2rad(1.0)
     else:
@@ -167,7 +168,7 @@ def _rings(elevation: Float32) -> Float | None:
 def _edges_between(rings: Float) -> Float:
     """A ring's row reaches half the way to the next ring, the outermost ones as far outwards."""
     middle = 0.5 * (rings[1:] + rings[:-1])
-    outer = 2 * rings[[0, -1]] - middle[[0, -1]]
+    outer: Float = 2 * rings[[0, -1]] - middle[[0, -1]]
     edges: Float = np.concatenate([outer[:1], middle, outer[1:]])
     return edges
 
@@ -182,7 +183,7 @@ def _no_closer(edges: Float, distance: float) -> Float:
     return np.array([*kept[: max(1, len(kept) - 1)], edges[-1]])
 
 
-def _uniform_edges(elevation: Float32, step: float) -> Float:
+def _uniform_edges(elevation: Float32, step: float) -> NDArray[np.floating]:
     low = float(elevation.min(initial=0.0)) - 0.5 * step
     num_rows = int((float(elevation.max(initial=0.0)) - low) / step) + 1
     return low + step * np.arange(num_rows + 1)
