@@ -67,7 +67,7 @@ class RangeImage:
         free = np.zeros(len(points), bool)
         for scanner in self.scanners:
             rays.see_through.over_rows(
-                len(points), points32, velocity, *scanner.columns, margins, min_filled, free
+                len(points), points32, velocity, *scanner.tables, margins, min_filled, free
             )
         return free
 
@@ -113,7 +113,7 @@ class ScannerImage:
         )
 
     @property
-    def columns(self) -> tuple[NDArray[Any], ...]:
+    def tables(self) -> tuple[NDArray[Any], ...]:
         """What `densify.kernels.rays.see_through` looks points up in."""
         return (
             *(self.offset_s, self.nearest_m, self.num_filled, self.row_edges_rad),
@@ -124,9 +124,10 @@ class ScannerImage:
 def _cells(azimuth: Float32, elevation: Float32) -> tuple[Float32, int]:
     """Edges of the rows (R+1,), rad, and the number of columns."""
     whole = elevation
-    if len(azimuth) > _MANY_POINTS:  # every fourth sector tells as much
+    if len(azimuth) > _MANY_POINTS:
         some = np.floor(azimuth / _SECTOR_RAD) % 4 == 0
-        azimuth, elevation = azimuth[some], elevation[some]
+        if some.mean() > 0.1:  # of a view all round every fourth sector tells as much
+            azimuth, elevation = azimuth[some], elevation[some]
     edges: NDArray[np.floating]
     if len(azimuth) < _MIN_POINTS_TO_MEASURE:
         edges, step = _uniform_edges(whole, np.deg2rad(2.0)), np.deg2rad(1.0)
@@ -146,8 +147,8 @@ def _cells(azimuth: Float32, elevation: Float32) -> tuple[Float32, int]:
 
 def _rings(elevation: Float32) -> Float | None:
     """(K,) ascending elevations of the scanner's beams; None where the returns do not lie on rings:
-    several scanners taken for one, clouds cut, merged or thinned, and lasers that do not share an
-    origin (the HDL-64E's lie up to 0.2 m apart, which near returns show).
+    several scanners taken for one, clouds already processed, and lasers that do not share an origin
+    (KITTI's HDL-64E, whose near returns smear).
 
     The peaks of a fine histogram, if they stand alone and hold nearly all returns.
     """

@@ -365,7 +365,7 @@ def test_the_number_of_threads_changes_no_byte(monkeypatch):
         monkeypatch.setattr(numba.config, "NUMBA_NUM_THREADS", num_threads)
         image = RangeImage.of(registered)
         free = image.sees_through(points, *MARGIN, velocity_m_s=np.ones_like(points))
-        found.append([c.tobytes() for c in image.scanners[0].columns] + [free.tobytes()])
+        found.append([c.tobytes() for c in image.scanners[0].tables] + [free.tobytes()])
         assert 0 < free.mean() < 1
     assert found[0] == found[1] == found[2]
 
@@ -406,6 +406,16 @@ def test_rings_are_found_wherever_the_beams_point(name):
             TABLES[name] < np.rad2deg(edges[row + 1])
         )
         assert inside.sum() == 1
+
+
+@pytest.mark.parametrize("towards_deg", [2.5, 7.5, 12.5, 170.0])
+def test_a_narrow_view_is_measured_too(monkeypatch, towards_deg):
+    monkeypatch.setattr(range_image, "_MANY_POINTS", 1000)
+    azimuth, elevation = on_rings(TABLES["hdl64"], num_columns=7200)
+    ahead = np.abs(azimuth - np.deg2rad(towards_deg)) < np.deg2rad(2.4)
+    edges, num_columns = range_image._cells(azimuth[ahead], elevation[ahead])
+    assert len(edges) == 49
+    assert 7200 / 1.5 < num_columns <= 7200
 
 
 def test_where_there_are_no_rings_rows_are_uniform():

@@ -13,8 +13,8 @@ _PI = np.float32(np.pi)
 _HALF_PI = np.float32(0.5 * np.pi)
 _HALF = np.float32(0.5)
 _ZERO = np.float32(0)
-# Abramowitz and Stegun, "Handbook of Mathematical Functions", 4.4.47: arctan within 1e-5 rad, a
-# hundredth of the finest cell.
+# Abramowitz and Stegun, "Handbook of Mathematical Functions", 4.4.47: arctan within 1e-5 rad, far
+# less than a cell.
 _A1, _A3, _A5, _A7, _A9 = (
     np.float32(a) for a in (0.9998660, -0.3302995, 0.1801410, -0.0851330, 0.0208351)
 )
