@@ -34,6 +34,8 @@ class Sweep:
     offset_ns: (N,) int64, firing time minus ``stamp_ns``; None where the data cannot tell.
     lidar: (N,) uint8, which of several scanners in one sweep fired.
     row: (N,) int64, row of the return in the source file (invalid rows are dropped on reading).
+    scanner_origins: (S,3) metres, lidar frame, where the rays of each scanner start; None where all
+        start at the frame's origin.
     """
 
     frame: int
@@ -43,6 +45,7 @@ class Sweep:
     offset_ns: Int | None
     lidar: NDArray[np.uint8]
     row: Int
+    scanner_origins: Float | None = None
 
     def __post_init__(self) -> None:
         n = len(self.points)
@@ -50,6 +53,14 @@ class Sweep:
             column = getattr(self, name)
             if column is not None and column.shape != (n,):
                 raise ValueError(f"Sweep.{name}: expected ({n},), got {column.shape}")
+        if self.scanner_origins is not None:
+            num_scanners = int(self.lidar.max(initial=0)) + 1
+            shape = self.scanner_origins.shape
+            if len(shape) != 2 or shape[1] != 3 or shape[0] < num_scanners:
+                raise ValueError(
+                    f"Sweep.scanner_origins: expected a row (3,) for each of {num_scanners} "
+                    f"scanners, got {shape}"
+                )
 
     def __len__(self) -> int:
         return len(self.points)
@@ -64,6 +75,10 @@ class Sweep:
             lidar=self.lidar[keep],
             row=self.row[keep],
         )
+
+    def origin_m(self, lidar: int) -> Float:
+        """(3,) where the rays of that scanner start, lidar frame."""
+        return np.zeros(3) if self.scanner_origins is None else self.scanner_origins[lidar]
 
 
 @dataclass(frozen=True)

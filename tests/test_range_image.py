@@ -3,13 +3,17 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
+import numba
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
-from densify import poses
+from densify import kernels, poses, range_image
 from densify.range_image import RangeImage, ScannerImage
+from densify.street.sensors import SENSORS
 from densify.types import RegisteredSweep, Sweep
 from tests.scenes import Arc, Box, Scanner, Scene, World
 
@@ -133,7 +137,8 @@ def test_cells_follow_the_sensor(num_beams, num_azimuths):
     (only,) = image.scanners
     # no finer than the rays, or cells stay empty; no coarser than twice, or movers hide in them
     spacing = 30 / (num_beams - 1)
-    assert 1 <= np.rad2deg(only.elevation_step_rad) / spacing < 1.5
+    rows = np.diff(np.rad2deg(only.row_edges_rad)) / spacing
+    np.testing.assert_allclose(rows, 1, atol=0.08)
     assert 1 <= num_azimuths / only.nearest_m.shape[1] < 1.5
     rng = np.random.default_rng(0)
     # clear of the ground and of the upper edge, where the 3 x 3 cells leave the image
@@ -204,7 +209,8 @@ def test_returns_are_put_back_into_a_regular_grid(fast):
     still = replace(registered, twist_before=np.zeros(6), twist_after=np.zeros(6))
     bent = RangeImage.of(still).scanners[0]
     assert (image.num_filled == 9).mean() > (bent.num_filled == 9).mean()
-    assert np.rad2deg(image.elevation_step_rad) == pytest.approx(1.15 * 26.8 / 63, rel=0.15)
+    assert len(image.nearest_m) == 32  # of 64 beams, two in a row
+    np.testing.assert_allclose(np.diff(np.rad2deg(image.row_edges_rad)), 2 * 26.8 / 63, atol=0.05)
 
 
 # --- a slow twin ----------------------------------------------------------------------------------
@@ -253,6 +259,267 @@ def test_three_by_three_rule_against_a_slow_twin(min_filled):
     slow = [slow_sees_through(cells, 7, columns, a, 0.4, 0.03, min_filled) for a in asked]
     assert fast.tolist() == slow
     assert min_filled == 9 or 0 < np.mean(slow) < 1
+
+
+def look(scanner: ScannerImage, point, velocity, margin_m, margin_fraction, min_filled):
+    """The scanner's answer for one point, step by step in double precision; None where a step falls
+    so close to an edge that rounding decides."""
+    num_rows, num_columns = scanner.nearest_m.shape
+
+    def column_of(seen):
+        at = (math.atan2(seen[1], seen[0]) + math.pi) / (2 * math.pi) * num_columns
+        close = abs(at - round(at)) < 0.02
+        return (None if close else int(at) % num_columns), close
+
+    seen, time_s = point - scanner.origin_m, 0.0
+    for _ in range(2):
+        column, close = column_of(seen)
+        if close:
+            return None
+        time_s = float(scanner.offset_s[column])
+        twist = time_s * scanner.twists[0 if time_s < 0 else 1].astype(float)
+        back = Rotation.from_rotvec(twist[:3]).inv()
+        seen = back.apply(point + time_s * velocity - twist[3:]) - scanner.origin_m
+    column, close = column_of(seen)
+    elevation = math.atan2(seen[2], math.hypot(seen[0], seen[1]))
+    edges = [float(e) for e in scanner.row_edges_rad]
+    if close or min(abs(elevation - e) for e in edges) < 1e-4:
+        return None
+    row = sum(elevation >= e for e in edges) - 1
+    if not 0 <= row < num_rows or abs(scanner.offset_s[column] - time_s) >= 0.01:
+        return False
+    range_m = float(np.linalg.norm(seen))
+    gap_m = scanner.nearest_m[row, column] - range_m - max(margin_m, margin_fraction * range_m)
+    if abs(gap_m) < 1e-3:
+        return None
+    return bool(scanner.num_filled[row, column] >= min_filled and gap_m > 0)
+
+
+@pytest.mark.parametrize("moving", [False, True])
+@pytest.mark.parametrize("turn_rad_s", [0.0, 0.5])
+def test_lookup_against_a_slow_twin(turn_rad_s, moving):
+    """Rolling shutter, velocity, the seam behind and an origin of its own."""
+    registered = blocks(Arc(0, 0, 0, 20.0, turn_rad_s)).window(2, 0).sweeps[0]
+    origins = np.array([[0.3, -0.2, 0.1]])
+    sweep = replace(registered.sweep, scanner_origins=origins)
+    image = RangeImage.of(replace(registered, sweep=sweep))
+    rng = np.random.default_rng(1)
+    points = on_sphere(rng.uniform(-180, 180, 1500), rng.uniform(-26, 5, 1500), 1.0)
+    points[:300] = on_sphere(rng.uniform(178, 182, 300), rng.uniform(-8, 2, 300), 1.0)
+    points *= rng.uniform(2, 40, (1500, 1))
+    velocity = rng.normal(0, 8, (1500, 3)) * moving
+    fast = image.sees_through(points, *MARGIN, velocity_m_s=velocity if moving else None)
+    slow = [
+        look(image.scanners[0], p, v, *MARGIN, 6) for p, v in zip(points, velocity, strict=True)
+    ]
+    sure = np.array([s is not None for s in slow])
+    assert sure.mean() > 0.8
+    assert fast[sure].tolist() == [s for s in slow if s is not None]
+    assert 0.1 < fast[sure].mean() < 0.9 and 0.1 < fast[:300].mean() < 0.9
+
+
+def test_image_against_a_slow_twin():
+    registered = blocks(Arc(0, 0, 0, 20.0, 0.4)).window(2, 0).sweeps[0]
+    few = np.random.default_rng(2).random(len(registered.sweep)) < 0.05
+    sweep = replace(registered.sweep.select(few), scanner_origins=np.array([[0.5, 0.0, -0.2]]))
+    image = RangeImage.of(replace(registered, sweep=sweep)).scanners[0]
+    rows, columns = image.nearest_m.shape
+    time_s = sweep.offset_ns * 1e-9
+    twist = np.where(time_s[:, None] < 0, registered.twist_before, registered.twist_after)
+    twist = twist * time_s[:, None]
+    seen = Rotation.from_rotvec(twist[:, :3]).inv().apply(sweep.points - twist[:, 3:])
+    seen -= [0.5, 0.0, -0.2]
+    cells: dict[tuple[int, int], float] = {}
+    offsets: dict[int, list[float]] = {}
+    for (x, y, z), t in zip(seen, time_s, strict=True):
+        column = int((math.atan2(y, x) + math.pi) / (2 * math.pi) * columns) % columns
+        elevation = math.atan2(z, math.hypot(x, y))
+        row = sum(elevation >= e for e in image.row_edges_rad) - 1
+        offsets.setdefault(column, []).append(t)
+        if 0 <= row < rows:
+            range_m = math.sqrt(x * x + y * y + z * z)
+            cells[row, column] = min(range_m, cells.get((row, column), math.inf))
+    nearest, filled = np.full((rows, columns), np.inf), np.zeros((rows, columns), int)
+    for (row, column), range_m in cells.items():
+        for r in range(max(row - 1, 0), min(row + 2, rows)):
+            for c in (column - 1, column, (column + 1) % columns):
+                nearest[r, c] = min(nearest[r, c], range_m)
+                filled[r, c] += 1
+    # a return on the edge of a cell may fall on either side
+    assert (filled == image.num_filled).mean() > 0.99
+    with np.errstate(invalid="ignore"):
+        same = (np.abs(nearest - image.nearest_m) < 1e-3) | (nearest == image.nearest_m)
+    assert same.mean() > 0.99
+    mean_s = np.interp(
+        np.arange(columns), sorted(offsets), [np.mean(offsets[c]) for c in sorted(offsets)]
+    )
+    assert (np.abs(mean_s - image.offset_s) < 1e-6).mean() > 0.98
+
+
+def test_the_number_of_threads_changes_no_byte(monkeypatch):
+    registered = blocks(Arc(0, 0, 0, 20.0, 0.4)).window(2, 0).sweeps[0]
+    points = np.random.default_rng(3).normal(0, 15, (5003, 3)) * [1, 1, 0.1]
+    monkeypatch.setattr(kernels, "_MIN_ROWS_PER_THREAD", 100)
+    found = []
+    for num_threads in (1, 2, 7):
+        monkeypatch.setattr(numba.config, "NUMBA_NUM_THREADS", num_threads)
+        image = RangeImage.of(registered)
+        free = image.sees_through(points, *MARGIN, velocity_m_s=np.ones_like(points))
+        found.append([c.tobytes() for c in image.scanners[0].tables] + [free.tobytes()])
+        assert 0 < free.mean() < 1
+    assert found[0] == found[1] == found[2]
+
+
+# --- rings ----------------------------------------------------------------------------------------
+
+TABLES = {name: np.sort(sensor.elevation_deg) for name, sensor in SENSORS.items()}
+TABLES["128 beams"] = np.concatenate([np.arange(-25, -6, 0.5), np.arange(-6, 5.25, 0.125)])
+
+
+def on_rings(elevation_deg, noise_deg=0.01, num_columns=600, seed=0):
+    """(3,N) azimuth and elevation (rad) of returns, each ring with a share of its own missing."""
+    rng = np.random.default_rng(seed)
+    azimuth = np.tile(np.arange(num_columns) * 360 / num_columns - 180, len(elevation_deg))
+    elevation = np.repeat(elevation_deg, num_columns) + rng.normal(0, noise_deg, len(azimuth))
+    heard = rng.random(len(azimuth)) < np.repeat(
+        rng.uniform(0.2, 1, len(elevation_deg)), num_columns
+    )
+    return np.deg2rad(azimuth[heard], dtype=np.float32), np.deg2rad(
+        elevation[heard], dtype=np.float32
+    )
+
+
+@pytest.mark.parametrize("name", TABLES)
+def test_rings_are_found_wherever_the_beams_point(name):
+    azimuth, elevation = on_rings(TABLES[name])
+    found = range_image._rings(elevation)
+    np.testing.assert_allclose(np.rad2deg(found), TABLES[name], atol=0.03)
+    edges, num_columns = range_image._cells(azimuth, elevation)
+    assert 600 / 1.5 < num_columns <= 600
+    rows = np.diff(np.rad2deg(edges))
+    assert rows.min() > 0.44
+    lone = np.flatnonzero(np.gradient(TABLES[name]) > 1.0)  # a row each, half the way to the next
+    for ring in TABLES[name][lone]:
+        assert (np.abs(TABLES[name] - ring) < 0.01).sum() == 1
+        row = np.searchsorted(np.rad2deg(edges), ring) - 1
+        inside = (TABLES[name] > np.rad2deg(edges[row])) & (
+            TABLES[name] < np.rad2deg(edges[row + 1])
+        )
+        assert inside.sum() == 1
+
+
+@pytest.mark.parametrize("towards_deg", [2.5, 7.5, 12.5, 170.0])
+def test_a_narrow_view_is_measured_too(monkeypatch, towards_deg):
+    monkeypatch.setattr(range_image, "_MANY_POINTS", 1000)
+    azimuth, elevation = on_rings(TABLES["hdl64"], num_columns=7200)
+    ahead = np.abs(azimuth - np.deg2rad(towards_deg)) < np.deg2rad(2.4)
+    edges, num_columns = range_image._cells(azimuth[ahead], elevation[ahead])
+    assert len(edges) == 49
+    assert 7200 / 1.5 < num_columns <= 7200
+
+
+def test_where_there_are_no_rings_rows_are_uniform():
+    rng = np.random.default_rng(0)
+    smeared = on_rings(TABLES["vlp16"], noise_deg=0.6)
+    anywhere = rng.uniform(-3, 3, 30000), rng.uniform(-0.4, 0.1, 30000)
+    sparse = rng.uniform(-3, 3, 600), rng.uniform(-0.4, 0.1, 600)
+    for azimuth, elevation in (smeared, anywhere, sparse):
+        azimuth, elevation = azimuth.astype(np.float32), elevation.astype(np.float32)
+        assert range_image._rings(elevation) is None
+        edges, _ = range_image._cells(azimuth, elevation)
+        np.testing.assert_allclose(np.diff(edges), np.diff(edges)[0], rtol=1e-3)
+        assert edges[0] <= elevation.min() and edges[-1] > elevation.max()
+
+
+# --- two scanners ---------------------------------------------------------------------------------
+
+
+def two_scanners(origins, pillar) -> RegisteredSweep:
+    """In a round room of 20 m about the origin, with a round pillar (x, y, radius)."""
+    parts = []
+    for origin in origins:
+        a, e = np.meshgrid(np.deg2rad(np.arange(-180, 180, 0.4)), np.deg2rad(np.arange(-15, 16, 2)))
+        ray = on_sphere(np.rad2deg(a.ravel()), np.rad2deg(e.ravel()), 1.0)
+        flat = ray[:, :2] / np.linalg.norm(ray[:, :2], axis=1, keepdims=True)
+
+        def meets(x, y, radius, far, flat=flat, origin=origin):
+            to = origin[:2] - (x, y)
+            b, c = flat @ to, to @ to - radius**2
+            root = np.sqrt(np.where(b * b > c, b * b - c, np.nan))
+            return -b + (root if far else -root)
+
+        near = meets(*pillar, far=False)
+        wall = meets(0.0, 0.0, 20.0, far=True)
+        range_m = np.where(near > 0, near, wall) / np.linalg.norm(ray[:, :2], axis=1)
+        parts.append(origin + ray * range_m[:, None])
+    points = np.concatenate(parts)
+    n = len(points)
+    lidar = np.repeat(np.arange(len(parts)), len(parts[0])).astype(np.uint8)
+    sweep = Sweep(0, 0, points, np.zeros(n, np.float32), None, lidar, np.arange(n), origins)
+    return RegisteredSweep(sweep, np.eye(4), np.zeros(6), np.zeros(6))
+
+
+def test_free_space_is_what_either_of_two_scanners_saw():
+    origins, pillar = np.array([[0.0, 0, 0], [0.0, 2.5, 0.8]]), (6.0, 0.0, 0.8)
+    both = two_scanners(origins, pillar)
+    image = RangeImage.of(both)
+    assert [len(s.nearest_m) for s in image.scanners] == [16, 16]
+    behind = np.array([[12.0, 0.0, 0.5], [10.0, 0.3, 0.3]])  # of the pillar, for the first one
+    assert image.sees_through(behind, *MARGIN).all()
+    only_first = replace(both, sweep=both.sweep.select(both.sweep.lidar == 0))
+    assert not RangeImage.of(only_first).sees_through(behind, *MARGIN).any()
+    on_surfaces = both.sweep.points
+    assert not image.sees_through(on_surfaces, *MARGIN).any()
+    around = np.arange(-180, 180, 3.0)
+    inside = on_sphere(around[np.abs(around + 6) > 3], 1.0, 14.0)  # not hidden from both
+    assert image.sees_through(inside, *MARGIN).all()
+
+
+def test_rays_taken_to_start_elsewhere_claim_what_they_did_not_cross():
+    """Why origins matter: the same returns, thought to be seen from the lidar frame's origin."""
+    origins, pillar = np.array([[0.0, 0, 0], [0.0, 2.5, 0.8]]), (6.0, 0.0, 0.8)
+    both = two_scanners(origins, pillar)
+    second = replace(both, sweep=both.sweep.select(both.sweep.lidar == 1))
+    unknown = replace(second, sweep=replace(second.sweep, scanner_origins=None))
+    shadow = np.array([6.0, 0, 0]) + np.outer(np.linspace(1.5, 6, 40), [6.0, -2.5, -0.3]) / 6.5
+    assert not RangeImage.of(second).sees_through(shadow, *MARGIN).any()
+    assert RangeImage.of(unknown).sees_through(shadow, *MARGIN).any()
+
+
+@pytest.mark.parametrize("origins", [np.zeros((1, 3)), np.zeros(3), np.zeros((2, 2))])
+def test_every_scanner_needs_an_origin(origins):
+    lidar = np.array([0, 1], np.uint8)
+    with pytest.raises(
+        ValueError, match=r"Sweep.scanner_origins: expected a row \(3,\) for each of 2"
+    ):
+        Sweep(0, 0, np.ones((2, 3)), np.zeros(2, np.float32), None, lidar, np.arange(2), origins)
+
+
+# --- odd input ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("num_points", [1, 2, 3, 199, 201])
+def test_tiny_sweeps_know_little_and_never_fail(num_points):
+    registered = standing_sweep()
+    few = np.arange(len(registered.sweep)) < num_points
+    image = RangeImage.of(replace(registered, sweep=registered.sweep.select(few)))
+    hung = on_sphere(np.arange(-180, 180, 5.0), -14.0, 2.0)
+    assert image.sees_through(hung, *MARGIN).mean() < 0.2
+
+
+def test_points_without_a_direction_are_not_free(room):
+    odd = np.array(
+        [[np.nan, 0, 0], [np.inf, 1, 0], [0, 0, 0], [1e30, 1e30, 0], [0, 0, 9], [5, 0, 0]]
+    )
+    velocity = np.zeros_like(odd)
+    assert room.sees_through(odd, *MARGIN).tolist()[-1]
+    for answer in (
+        room.sees_through(odd, *MARGIN),
+        room.sees_through(odd, *MARGIN, velocity_m_s=velocity),
+    ):
+        assert not answer[[0, 1, 3, 4]].any()
+    velocity[:] = np.nan
+    assert not room.sees_through(odd, *MARGIN, velocity_m_s=velocity).any()
 
 
 def test_one_scanners_image_is_the_nearest_return_of_each_neighbourhood():

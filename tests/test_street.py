@@ -167,6 +167,7 @@ def test_offsets_follow_the_azimuth_clockwise(request, fixture):
 def test_two_scanners_look_opposite_ways(crossing):
     sweep = crossing[KEY]
     assert set(np.unique(sweep.lidar)) == {0, 1}
+    np.testing.assert_array_equal(sweep.scanner_origins, [[0, 0, 0], [0, 0, 0.25]])
     azimuth = np.arctan2(sweep.points[:, 1], sweep.points[:, 0])
     turned = np.exp(1j * (azimuth + 2 * np.pi * (sweep.offset_ns / PERIOD_NS + sweep.lidar / 2)))
     assert np.abs(np.angle(turned)).max() < 1e-5

@@ -111,8 +111,8 @@ def follow_groups(
 
 
 def _groups_to_start(standing: Sequence[Standing]) -> list[tuple[int, np.ndarray]]:
-    """Sweep and members of the clusters that are mostly seeds, the best start first: what is seen well
-    makes a good model, and far from the ends of the stretch both sides tell how it moves."""
+    """Sweep and members of the clusters that are mostly seeds, the best start first: what is seen
+    well makes a good model, and far from the ends of the stretch both sides tell how it moves."""
     groups = []
     last = len(standing) - 1
 

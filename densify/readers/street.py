@@ -28,7 +28,7 @@ from densify.street.camera import CAMERAS, DELAY_NS, Picture
 from densify.street.casting import NUM_FRAMES
 from densify.street.lidar import Returns
 from densify.street.scenes import PRESETS
-from densify.street.sensors import SENSORS
+from densify.street.sensors import SENSORS, sensor_named
 from densify.street.simulator import VERSION, Simulator, stamp_ns
 from densify.types import Bool, Camera, Float, Float32, Sweep, SweepTruth
 
@@ -90,6 +90,7 @@ class Street:
             offset_ns=returns.offset_ns,
             lidar=returns.lidar,
             row=np.arange(len(returns.points)),
+            scanner_origins=sensor_named(self.simulator.sensor).origins_m,
         )
 
     def returns(self, frame: int) -> Returns:

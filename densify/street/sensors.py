@@ -30,6 +30,11 @@ class Sensor:
     range_sigma_m: float
     heights_m: tuple[float, ...] = (0.0,)
 
+    @property
+    def origins_m(self) -> Float:
+        """(S,3) where the rays of each scanner start, lidar axes."""
+        return np.array([[0.0, 0.0, height_m] for height_m in self.heights_m])
+
 
 def _upward(*parts: Float) -> tuple[float, ...]:
     return tuple(float(e) for e in np.concatenate(parts))
