@@ -12,7 +12,7 @@ import numpy as np
 
 from densify import poses
 from densify.stages.deskew import deskew
-from densify.types import Camera, Sweep, SweepTruth, Trajectory, Window
+from densify.types import Camera, Stretch, Sweep, SweepTruth, Trajectory
 
 SWEEP_S = 0.1
 EPOCH_NS = 1_317_000_000_123_456_789  # stamps of 19 digits, as real ones are
@@ -232,11 +232,11 @@ class Scene:
             np.stack([self.T_world_lidar(f * SWEEP_S) for f in frames]),
         )
 
-    def window(self, key: int, size: int) -> Window:
-        """Deskewed and placed by the true trajectory."""
-        frames = list(range(key - size, key + size + 1))
+    def stretch(self, middle: int, size: int) -> Stretch:
+        """``size`` sweeps on each side of the middle one, deskewed and placed by the truth."""
+        frames = list(range(middle - size, middle + size + 1))
         sweeps = [self.scan(f).sweep for f in frames]
-        return deskew(sweeps, self.trajectory([frames[0] - 1, *frames, frames[-1] + 1]), key)
+        return deskew(sweeps, self.trajectory([frames[0] - 1, *frames, frames[-1] + 1]))
 
 
 def stamp_ns(frame: int) -> int:

@@ -126,7 +126,7 @@ def test_round_trip_through_yaml_text(lead_in: int, alpha: float, deskew: bool, 
     changes = {
         "register": {"num_lead_in": lead_in, "deskew": deskew},
         "flow": {"alpha": alpha},
-        "chain": {"unfollowed": word},
+        "accumulate": {"unfollowed": word},
     }
     config = resolve(changes)
     assert config.flow.alpha == alpha

@@ -27,7 +27,7 @@ LEVEL = Scanner(elevation_deg=(-15.0, 15.0))
 
 
 def standing_sweep(boxes=ROOM, scanner=LEVEL) -> RegisteredSweep:
-    return Scene(World(boxes), STANDING, scanner).window(2, 0).sweeps[0]
+    return Scene(World(boxes), STANDING, scanner).stretch(2, 0).sweeps[0]
 
 
 def on_sphere(azimuth_deg, elevation_deg, range_m) -> np.ndarray:
@@ -161,19 +161,19 @@ def blocks(ego: Arc) -> Scene:
 def seen_through_elsewhere(scene: Scene, first: int, other: int, twists=1.0) -> np.ndarray:
     """(K,3) points of the blocks within 40 m, as the first sweep measured them, that the other
     sweep sees through; in its lidar frame."""
-    window = scene.window((first + other) // 2, abs(other - first))
+    stretch = scene.stretch((first + other) // 2, abs(other - first))
     image = RangeImage.of(
         replace(
-            window[other],
-            twist_before=twists * window[other].twist_before,
-            twist_after=twists * window[other].twist_after,
+            stretch[other],
+            twist_before=twists * stretch[other].twist_before,
+            twist_after=twists * stretch[other].twist_after,
         )
     )
-    scan, here = scene.scan(first), window[first]
+    scan = scene.scan(first)
     on_block = (scan.box >= 0) & (np.linalg.norm(scan.sweep.points, axis=1) < 40)
     assert on_block.sum() > 5000
-    T_there_here = poses.inverse(window[other].T_key_lidar) @ here.T_key_lidar
-    points = poses.transform(T_there_here, here.sweep.points[on_block])
+    T_other_first = stretch.T_target_source(other, first)
+    points = poses.transform(T_other_first, stretch[first].sweep.points[on_block])
     return points[image.sees_through(points, *MARGIN)]
 
 
@@ -204,7 +204,7 @@ def test_the_sector_that_a_turning_scanner_skips_is_not_free(turn_rad_s, first, 
 
 def test_returns_are_put_back_into_a_regular_grid(fast):
     """At its own firing time every ray of a beam has the same elevation: rows of the image."""
-    registered = fast.window(2, 0).sweeps[0]
+    registered = fast.stretch(2, 0).sweeps[0]
     image = RangeImage.of(registered).scanners[0]
     still = replace(registered, twist_before=np.zeros(6), twist_after=np.zeros(6))
     bent = RangeImage.of(still).scanners[0]

@@ -46,7 +46,7 @@ def second_pass(raw):
 
 def both_passes(raw) -> Trajectory:
     rough = register(raw, SETTINGS)
-    return register([s.sweep for s in deskew(raw, rough, KEY).sweeps], SETTINGS, rough)
+    return register([s.sweep for s in deskew(raw, rough).sweeps], SETTINGS, rough)
 
 
 def errors(found: Trajectory, true: Trajectory) -> tuple[np.ndarray, np.ndarray]:
@@ -113,9 +113,9 @@ def walled() -> Scene:
 
 def test_walls_are_bent_by_the_drive_and_straight_again(walled):
     scan = walled.scan(KEY)
-    right = walled.window(KEY, 0)[KEY].sweep.points
+    right = walled.stretch(KEY, 0)[KEY].sweep.points
     reversed_ = replace(scan.sweep, offset_ns=-scan.sweep.offset_ns)
-    wrong = deskew([reversed_], walled.trajectory([4, 5, 6]), KEY)[KEY].sweep.points
+    wrong = deskew([reversed_], walled.trajectory([4, 5, 6]))[KEY].sweep.points
     for wall in (0, 1):
         on = scan.box == wall
         assert on.sum() > 500
@@ -127,7 +127,7 @@ def test_walls_are_bent_by_the_drive_and_straight_again(walled):
 
 def test_static_points_come_to_where_they_are_at_the_reference_time(walled):
     for frame in (3, KEY):
-        registered = walled.window(frame, 0)[frame]
+        registered = walled.stretch(frame, 0)[frame]
         T = walled.T_world_lidar(frame * SWEEP_S)
         true = poses.transform(poses.inverse(T), walled.scan(frame).world)
         raw_error = np.linalg.norm(
@@ -139,10 +139,10 @@ def test_static_points_come_to_where_they_are_at_the_reference_time(walled):
 
 
 def test_the_found_motion_straightens_too(drive, raw, second_pass):
-    window = deskew(raw, second_pass, KEY)
+    stretch = deskew(raw, second_pass)
     T = drive.T_world_lidar(KEY * SWEEP_S)
     true = poses.transform(poses.inverse(T), drive.scan(KEY).world)
-    error = np.linalg.norm(window[KEY].sweep.points - true, axis=1)
+    error = np.linalg.norm(stretch[KEY].sweep.points - true, axis=1)
     assert np.quantile(error, 0.95) < 0.08
 
 
@@ -153,7 +153,7 @@ def test_each_half_moves_with_its_own_twist():
     x = np.array([0.0, 1.5, 2.0])  # 15 m/s, then 5 m/s
     T = np.stack([poses.exp(np.array([0, 0, 0, at, 0, 0])) for at in x])
     stamps = sweep.stamp_ns + np.array([-100_000_000, 0, 100_000_000])
-    registered = deskew([sweep], Trajectory((-1, 0, 1), stamps, T), 0)[0]
+    registered = deskew([sweep], Trajectory((-1, 0, 1), stamps, T))[0]
     np.testing.assert_allclose(registered.twist_before, [0, 0, 0, 15, 0, 0], atol=1e-9)
     np.testing.assert_allclose(registered.twist_after, [0, 0, 0, 5, 0, 0], atol=1e-9)
     t = sweep.offset_ns * 1e-9
@@ -163,11 +163,11 @@ def test_each_half_moves_with_its_own_twist():
 
 
 def test_at_an_end_the_only_twist_serves_both_halves(drive, raw, second_pass):
-    window = deskew(raw, second_pass, KEY)
-    for end in (window.sweeps[0], window.sweeps[-1]):
+    stretch = deskew(raw, second_pass)
+    for end in (stretch.sweeps[0], stretch.sweeps[-1]):
         assert np.array_equal(end.twist_before, end.twist_after)
         assert np.linalg.norm(end.twist_after[3:]) == pytest.approx(12, abs=1.5)
-    inner = window[KEY]
+    inner = stretch[KEY]
     assert not np.array_equal(inner.twist_before, inner.twist_after)
 
 
@@ -182,8 +182,8 @@ def test_columns_follow_their_points(walled):
         },
     )
     trajectory = walled.trajectory([4, 5, 6])
-    straight = deskew([sweep], trajectory, KEY)[KEY].sweep
-    mixed = deskew([shuffled], trajectory, KEY)[KEY].sweep
+    straight = deskew([sweep], trajectory)[KEY].sweep
+    mixed = deskew([shuffled], trajectory)[KEY].sweep
     assert len(straight) == len(sweep)  # nothing cropped
     for column in ("intensity", "offset_ns", "lidar", "row"):
         assert np.array_equal(getattr(straight, column), getattr(sweep, column))
@@ -193,27 +193,43 @@ def test_columns_follow_their_points(walled):
 
 def test_without_times_points_stay_to_the_last_bit(walled):
     sweep = replace(walled.scan(KEY).sweep, offset_ns=None)
-    registered = deskew([sweep], walled.trajectory([4, 5, 6]), KEY)[KEY]
+    registered = deskew([sweep], walled.trajectory([4, 5, 6]))[KEY]
     assert registered.sweep.points.tobytes() == sweep.points.tobytes()
     assert registered.twist_after.any()  # the lidar moves all the same
 
 
-def test_the_window_is_placed_around_the_key(walled):
-    window = walled.window(KEY, 2)
-    assert window.frames == (3, 4, 5, 6, 7) and window.key == KEY
-    np.testing.assert_allclose(window[KEY].T_key_lidar, np.eye(4), atol=1e-12)
-    for registered in window.sweeps:
-        world = poses.transform(
-            walled.T_world_lidar(KEY * SWEEP_S) @ registered.T_key_lidar, registered.sweep.points
-        )
+def test_the_sweeps_are_placed_in_the_world(walled):
+    stretch = walled.stretch(KEY, 2)
+    assert stretch.frames == (3, 4, 5, 6, 7)
+    trajectory = walled.trajectory(stretch.frames)
+    for registered, T_world_lidar in zip(stretch.sweeps, trajectory.T_world_lidar, strict=True):
+        assert registered.T_world_lidar.tobytes() == T_world_lidar.tobytes()
+        world = poses.transform(T_world_lidar, registered.sweep.points)
         assert np.abs(world - walled.scan(registered.frame).world).max() < 0.02
+
+
+def test_from_one_sweep_to_another_by_frame_number(walled):
+    stretch = walled.stretch(KEY, 2)
+    p = stretch[3].sweep.points[::500]
+    there = poses.transform(stretch.T_target_source(7, 3), p)
+    world = poses.transform(stretch[3].T_world_lidar, p)
+    np.testing.assert_allclose(poses.transform(stretch[7].T_world_lidar, there), world, atol=1e-9)
+    np.testing.assert_allclose(
+        stretch.T_target_source(7, 3),
+        stretch.T_target_source(7, 5) @ stretch.T_target_source(5, 3),
+        atol=1e-12,
+    )
+    # a sweep's own points are not even rounded
+    assert np.array_equal(stretch.T_target_source(KEY, KEY), np.eye(4))
+    with pytest.raises(ValueError):
+        stretch[8]
 
 
 def test_a_single_sweep_cannot_be_deskewed_and_stays(walled):
     sweep = walled.scan(KEY).sweep
-    window = deskew([sweep], walled.trajectory([KEY]), KEY)
-    assert window.frames == (KEY,)
-    np.testing.assert_allclose(window[KEY].sweep.points, sweep.points, atol=1e-12)
+    stretch = deskew([sweep], walled.trajectory([KEY]))
+    assert stretch.frames == (KEY,)
+    np.testing.assert_allclose(stretch[KEY].sweep.points, sweep.points, atol=1e-12)
 
 
 # --- KISS-ICP's traps -----------------------------------------------------------------------------

@@ -1,0 +1,167 @@
+# SPDX-License-Identifier: MIT
+"""Accumulation of motions that are known exactly."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from densify import poses
+from densify.flow.chained import ChainedMotion
+from densify.stages.accumulate import accumulate
+from densify.types import FlowField
+from tests.exact_motion import (
+    CAR,
+    FRAMES,
+    KEY,
+    NUM_MOVING,
+    NUM_STATIC,
+    T_world_lidar,
+    drifting,
+    scene,
+    turning,
+)
+
+
+def to_key(motion: ChainedMotion) -> list[FlowField]:
+    """Of every sweep; the key's own movers are marked."""
+    fields = [motion.flow(f, KEY) for f in FRAMES]
+    own = motion.step(KEY - FRAMES[0], KEY - FRAMES[0] + 1)
+    fields[KEY - FRAMES[0]] = replace(own, displacement=np.zeros_like(own.displacement))
+    return fields
+
+
+def at_key(motion: ChainedMotion, frame: int) -> np.ndarray:
+    """Where registration alone puts a sweep's points."""
+    return poses.transform(
+        motion.stretch.T_target_source(KEY, frame), motion.stretch[frame].sweep.points
+    )
+
+
+def test_a_moved_object_comes_together_at_the_key():
+    motion = scene()
+    cloud = accumulate(motion.stretch, to_key(motion), KEY, drop_lost=True)
+    on = cloud.instance == CAR
+    assert on.sum() == NUM_MOVING * len(FRAMES)
+    world = poses.transform(T_world_lidar(KEY), cloud.points[on])
+    body = poses.transform(poses.inverse(turning(KEY)), world)
+    assert np.abs(body).max() <= 2 + 1e-9  # within the object's size
+    assert np.abs(cloud.rigid_points[on] - cloud.points[on]).max() > 2
+
+
+def test_nothing_moves_rigid_to_the_last_bit():
+    motion = scene()
+    zero = [FlowField.zero(len(s.sweep)) for s in motion.stretch.sweeps]
+    rigid = accumulate(motion.stretch, zero, KEY, drop_lost=True)
+    placed = np.concatenate([at_key(motion, f) for f in FRAMES])
+    assert rigid.points.tobytes() == placed.tobytes() == rigid.rigid_points.tobytes()
+    assert not rigid.displaced.any() and not rigid.moving.any() and not rigid.velocity_m_s.any()
+    flow = accumulate(motion.stretch, to_key(motion), KEY, drop_lost=True)
+    still = ~flow.moving
+    assert still.sum() == NUM_STATIC * len(FRAMES)
+    assert flow.points[still].tobytes() == rigid.points[still].tobytes()
+    assert flow.rigid_points.tobytes() == rigid.points.tobytes()
+
+
+@pytest.mark.parametrize("key", [FRAMES[0], KEY, FRAMES[-1]])
+def test_the_key_sweep_stays_where_it_is(key):
+    motion = scene()
+    fields = [motion.flow(f, key) for f in FRAMES]
+    cloud = accumulate(motion.stretch, fields, key, drop_lost=True)
+    own = cloud.frame == key
+    assert cloud.points[own].tobytes() == motion.stretch[key].sweep.points.tobytes()
+    assert not cloud.displaced[own].any()
+    assert cloud.confidence[own].min() > cloud.confidence[~own].max()
+
+
+def test_displaced_is_the_length_of_the_flow():
+    motion = scene()
+    fields = to_key(motion)
+    fields[0] = replace(fields[0], to_reference=fields[1].displacement)
+    cloud = accumulate(motion.stretch, fields, KEY, drop_lost=True)
+    moved = [f.displacement for f in fields]
+    moved[0] = moved[0] + moved[1]  # from where they were measured
+    lengths = np.concatenate([np.linalg.norm(m, axis=1) for m in moved])
+    np.testing.assert_allclose(cloud.displaced, lengths, atol=1e-5)
+    assert cloud.displaced.dtype == np.float32
+
+
+def test_columns_say_where_points_come_from():
+    motion = scene()
+    cloud = accumulate(motion.stretch, to_key(motion), KEY, drop_lost=True)
+    assert len(cloud) == sum(len(s.sweep) for s in motion.stretch.sweeps)
+    for frame in FRAMES:
+        mine, sweep = cloud.frame == frame, motion.stretch[frame].sweep
+        assert np.array_equal(cloud.row[mine], sweep.row)
+        assert np.array_equal(cloud.intensity[mine], sweep.intensity)
+        assert np.array_equal(cloud.rigid_points[mine], at_key(motion, frame))
+    kinds = {
+        "points": np.float64,
+        "rigid_points": np.float64,
+        "frame": np.int32,
+        "row": np.int64,
+        "moving": np.bool_,
+        "instance": np.int32,
+        "velocity_m_s": np.float32,
+        "confidence": np.float32,
+        "intensity": np.float32,
+        "rgb": np.uint8,
+    }
+    for name, kind in kinds.items():
+        column = getattr(cloud, name)
+        assert column.dtype == kind and len(column) == len(cloud), name
+    assert cloud.rgb.shape == (len(cloud), 3)
+
+
+def test_lost_points_are_dropped_or_kept_rigid():
+    motion = scene(sizes={f: 0 if f == KEY - 1 else NUM_MOVING for f in FRAMES})
+    fields = to_key(motion)
+    num_lost = sum(int(f.lost.sum()) for f in fields)
+    assert num_lost == 2 * NUM_MOVING
+    dropped, kept = (accumulate(motion.stretch, fields, KEY, drop) for drop in (True, False))
+    assert len(kept) - len(dropped) == num_lost
+    lost = kept.moving & (kept.frame < KEY - 1)
+    assert lost.sum() == num_lost
+    assert kept.points[lost].tobytes() == kept.rigid_points[lost].tobytes()
+    assert not kept.velocity_m_s[lost].any()
+    rest = ~lost
+    for name in ("points", "frame", "row", "instance", "confidence", "intensity"):
+        assert np.array_equal(getattr(kept, name)[rest], getattr(dropped, name)), name
+    # rows still name the return in its file, not its place in the cloud
+    for frame in FRAMES:
+        mine, sweep = dropped.frame == frame, motion.stretch[frame].sweep
+        kept_here = np.isin(sweep.row, dropped.row[mine])
+        assert kept_here.sum() == mine.sum()
+        assert np.array_equal(dropped.intensity[mine], sweep.intensity[kept_here])
+
+
+def test_confidence_falls_away_from_the_key_and_for_what_was_moved():
+    motion = scene()
+    cloud = accumulate(motion.stretch, to_key(motion), KEY, drop_lost=True)
+    assert (cloud.confidence > 0).all() and (cloud.confidence <= 1).all()
+    away = np.abs(cloud.frame - KEY)
+    of_still = [cloud.confidence[(away == d) & ~cloud.moving] for d in range(4)]
+    of_moved = [cloud.confidence[(away == d) & cloud.moving] for d in range(4)]
+    assert all(np.ptp(c) == 0 for c in of_still)
+    assert (np.diff([c[0] for c in of_still]) < 0).all()
+    assert (np.diff([c[0] for c in of_moved]) < 0).all()
+    assert all(m[0] < s[0] for m, s in zip(of_moved[1:], of_still[1:], strict=True))
+
+
+def test_movers_know_their_velocity_at_the_key():
+    motion = scene(drifting)
+    fields = to_key(motion)
+    cloud = accumulate(motion.stretch, fields, KEY, drop_lost=True)
+    assert not cloud.velocity_m_s[~cloud.moving].any()
+    assert not cloud.velocity_m_s[cloud.frame == KEY].any()  # of which its field says nothing
+    on = cloud.moving & (cloud.frame != KEY)
+    expected = np.array([15.0, -5.0, 1.0]) @ T_world_lidar(KEY)[:3, :3]  # key frame
+    assert np.ptp(cloud.velocity_m_s[on], axis=0).max() < 1e-4
+    np.testing.assert_allclose(cloud.velocity_m_s[on].mean(0), expected, atol=1e-4)
+    later = cloud.after(0.05)
+    still = ~cloud.moving
+    assert later.points[still].tobytes() == cloud.points[still].tobytes()
+    step = later.points[on] - cloud.points[on]
+    np.testing.assert_allclose(step, np.tile(0.05 * expected, (on.sum(), 1)), atol=1e-5)

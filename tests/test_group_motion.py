@@ -1,0 +1,86 @@
+# SPDX-License-Identifier: MIT
+"""The flow that follows from a known track, exactly."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from densify import poses
+from densify.flow.groups import GroupMotion
+from densify.flow.paths import Path
+from densify.flow.tracks import Track
+from tests.scenes import SWEEP_S, Arc, Scanner, Scene, World, street
+
+CENTRE = np.array([10.0, 5.0, 0.0])
+
+
+def pose(time_s: float) -> np.ndarray:
+    """(4,4) 3 m/s ahead and slower, 0.2 rad/s about the object's own centre."""
+    ahead = poses.exp(np.array([0, 0, 0.2 * time_s, *CENTRE]))
+    ahead[0, 3] += 1 + 3 * time_s - 0.5 * time_s**2
+    return ahead
+
+
+@pytest.fixture(scope="module")
+def track() -> Track:
+    t = 0.1 * np.arange(6)
+    track = Track(CENTRE)
+    states = np.stack([1 + 3 * t - 0.5 * t**2, 0 * t, 0 * t, 0.2 * t], 1)
+    track.path = Path.fit(t, states, np.ones(6), 0.1)
+    return track
+
+
+def test_a_track_carries_points_along_its_smooth_motion(track):
+    points = CENTRE + np.random.default_rng(0).uniform(-3, 3, (8, 3))
+    for a, b in [(0.0, 0.5), (0.42, 0.07), (0.3, 0.3)]:
+        expected = poses.transform(pose(b) @ poses.inverse(pose(a)), points)
+        np.testing.assert_allclose(track.carry(points, a, b), expected, atol=1e-6)
+        np.testing.assert_allclose(track.carry(expected, b, a), points, atol=1e-6)
+        # each point from its own time
+        many = track.carry(np.vstack([points, expected]), np.repeat([a, b], 8), b)
+        np.testing.assert_allclose(many, np.vstack([expected, expected]), atol=1e-6)
+    about_m_s = 0.2 * np.stack([CENTRE[1] - points[:, 1], points[:, 0] - CENTRE[0] - 1], 1)
+    expected = np.column_stack([[3.0, 0] + about_m_s, np.zeros(8)])
+    np.testing.assert_allclose(track.velocity_m_s(points, 0.0), expected, atol=2e-3)
+
+
+@pytest.fixture(scope="module")
+def alone(track) -> GroupMotion:
+    """Half of the points of each of frames 2 to 8 are on the track, that frame 5 gave."""
+    ego = Arc(0, -1.5, 0.3, 6.0, 0.4)
+    stretch = Scene(World(street()), ego, Scanner(8, 60)).stretch(5, 3)
+    track.claimed[3] = np.arange(5)
+    instance = tuple(np.arange(len(s.sweep), dtype=np.int32) % 2 - 1 for s in stretch.sweeps)
+    return GroupMotion(stretch, (track,), instance)
+
+
+@pytest.mark.parametrize(("frame", "target"), [(2, 7), (6, 3), (4, 4), (3, 4)])
+def test_flow_in_the_sweeps_own_coordinates(alone, frame, target):
+    """From where a point was measured, at its own time, to the target's reference time."""
+    flow, registered = alone.flow(frame, target), alone.stretch[frame]
+    on = np.flatnonzero(flow.moving)
+    assert len(on) == len(flow.moving) // 2 > 100
+    assert not flow.total[~flow.moving].any() and not flow.velocity_m_s[~flow.moving].any()
+    R_lidar_world = registered.T_world_lidar[:3, :3].T
+    for i in on[::40]:
+        fired_s = (frame - 2) * SWEEP_S + registered.sweep.offset_ns[i] * 1e-9
+        if not 0 <= fired_s <= 0.5:
+            continue
+        at = poses.transform(registered.T_world_lidar, registered.sweep.points[[i]])
+        there = [
+            poses.transform(pose(s) @ poses.inverse(pose(fired_s)), at)[0]
+            for s in ((frame - 2) * SWEEP_S, (target - 2) * SWEEP_S, (target - 2) * SWEEP_S - 1e-4)
+        ]
+        found = flow.to_reference[i], flow.displacement[i], flow.velocity_m_s[i]
+        expected = there[0] - at[0], there[1] - there[0], (there[1] - there[2]) / 1e-4
+        np.testing.assert_allclose(found[0], R_lidar_world @ expected[0], atol=1e-6)
+        np.testing.assert_allclose(found[1], R_lidar_world @ expected[1], atol=1e-6)
+        np.testing.assert_allclose(found[2], R_lidar_world @ expected[2], atol=1e-2)
+
+
+def test_lost_three_sweeps_before_and_after_the_object_was_seen(alone):
+    for frame in alone.stretch.frames:
+        for target in alone.stretch.frames:
+            flow = alone.flow(frame, target)
+            assert np.array_equal(flow.lost, flow.moving & (abs(target - 5) > 2))
