@@ -153,22 +153,14 @@ def _held_out(parts: tuple[Part, ...]) -> Float:
     """
     errors = np.zeros((len(parts) - 2, 1 + len(_ALPHAS)))
     for first in (0, 1):
-        kept = parts[first::2]
+        kept, left_out = parts[first::2], parts[first + 1 :: 2]
         bending = _Bending(kept)
         for k in range(1 + len(_ALPHAS)):
             if k:
                 bending.refine(k - 1)
-            to_next, to_previous = bending.at_points()
             for n in range(len(kept) - 1):
-                before, between, after = parts[first + 2 * n : first + 2 * n + 3]
-                share = (between.time_s - before.time_s) / (after.time_s - before.time_s)
-                foretold = np.concatenate(
-                    [
-                        before.points + share * to_next[n],
-                        after.points + (1 - share) * to_previous[n + 1],
-                    ]
-                )
-                errors[first + 2 * n, k] = _squared_distance(between.points, foretold)
+                foretold = bending.between(n, left_out[n].time_s)
+                errors[first + 2 * n, k] = _squared_distance(left_out[n].points, foretold)
     return errors
 
 
@@ -232,6 +224,14 @@ class _Bending:
             brought = [self._nodes[beyond] + flows[beyond, b]] if (beyond, b) in flows else []
             targets.append(np.concatenate([self._nodes[b], *brought]))
         self._target = self._side_by_side(targets)
+
+    def between(self, i: int, time_s: float) -> Float:
+        """(N,3) the nodes of part i and of the next where they are at a time between."""
+        flows = self._by_hop()
+        start_s, end_s = self._parts[i].time_s, self._parts[i + 1].time_s
+        share = (time_s - start_s) / (end_s - start_s)
+        forth = self._nodes[i] + share * flows[i, i + 1]
+        return np.concatenate([forth, self._nodes[i + 1] + (1 - share) * flows[i + 1, i]])
 
     def at_points(self) -> tuple[tuple[Float, ...], tuple[Float, ...]]:
         """For each part (n,3) to the next and to the previous one, 0 where there is none."""
@@ -324,11 +324,12 @@ def _blurred(points: Float, near: Int, at: Float, blur_m: float) -> tuple[Float,
     """(N,3) Gaussian-weighted mean of ``points[near]`` around each place, and (N,) how far the
     nearest of them is."""
     around = points[near]
-    squared = ((around - at[:, None]) ** 2).sum(axis=2)
+    away = around - at[:, None]
+    squared = np.einsum("nki,nki->nk", away, away)
     nearest = squared.min(axis=1)
     weight = np.exp((nearest[:, None] - squared) / (2 * blur_m**2))
     weight /= weight.sum(axis=1, keepdims=True)
-    return (weight[:, :, None] * around).sum(axis=1), np.sqrt(nearest)
+    return np.einsum("nk,nki->ni", weight, around), np.sqrt(nearest)
 
 
 def _look_up(at: Float, came: Float, points: Float, known_came: Float, values: Float) -> Float:
@@ -342,4 +343,4 @@ def _look_up(at: Float, came: Float, points: Float, known_came: Float, values: F
     distance_m = np.linalg.norm(known[near] - asked[:, None], axis=2)
     weight = 1 / (distance_m + 1e-3) ** 2
     weight /= weight.sum(axis=1, keepdims=True)
-    return (weight[:, :, None] * values[near]).sum(axis=1)
+    return np.einsum("nk,nki->ni", weight, values[near])
