@@ -1,0 +1,367 @@
+# SPDX-License-Identifier: MIT
+"""Objects that bend: a walker's limbs follow their truth, and what is rigid stays so to the bit."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+
+from densify.errors import InputError
+from densify.flow import soften as module
+from densify.flow.soften import Part, Softened, soften
+from densify.flow.solvers import ObjectiveSettings, solve
+
+SWEEP_S, STRIDE_S, SWING = 0.1, 1.2, 0.5
+SENSOR = np.array([2.0, -8.0, 1.7])
+BEAM, AZIMUTH = np.deg2rad(0.4), np.deg2rad(0.17)
+TRUNK, LEFT, RIGHT = 0, 1, 2
+HIPS = np.array([[0.0, 0.0, 0.9], [0.0, 0.12, 0.9], [0.0, -0.12, 0.9]])
+
+
+@dataclass
+class Body:
+    """Dense samples of a surface. limb: (n,) TRUNK, LEFT or RIGHT. points: (n,3) at rest."""
+
+    points: np.ndarray
+    limb: np.ndarray
+
+    @staticmethod
+    def walker() -> Body:
+        rng = np.random.default_rng(5)
+        trunk = tube(rng, 30000, (0.0, 0.0), 0.9, 1.7, 0.17)
+        left = tube(rng, 20000, (0.0, 0.12), 0.0, 0.9, 0.08)
+        right = tube(rng, 20000, (0.0, -0.12), 0.0, 0.9, 0.08)
+        limb = np.repeat([TRUNK, LEFT, RIGHT], [len(trunk), len(left), len(right)])
+        return Body(np.concatenate([trunk, left, right]), limb)
+
+    @staticmethod
+    def column(length_m: float = 0.0) -> Body:
+        """Two upright tubes that do not move, as far apart as is said."""
+        rng = np.random.default_rng(6)
+        near = tube(rng, 40000, (0.0, 0.0), 0.0, 1.7, 0.25)
+        points = np.concatenate([near, near + [length_m, 0.0, 0.0]]) if length_m else near
+        return Body(points, np.zeros(len(points), int))
+
+    def at(self, rows: np.ndarray, time_s: float) -> np.ndarray:
+        """The rows' places: the legs swing about the hips."""
+        limb = self.limb[rows]
+        sign = np.array([0.0, 1.0, -1.0])[limb]
+        angle = SWING * np.sin(2 * np.pi * time_s / STRIDE_S + 0.3) * sign
+        x, y, z = (self.points[rows] - HIPS[limb]).T
+        c, s = np.cos(angle), np.sin(angle)
+        return np.stack([c * x + s * z, y, c * z - s * x], axis=1) + HIPS[limb]
+
+    def scan(self, time_s: float, rng: np.random.Generator, sigma_m: float) -> Seen:
+        """The nearest sample in each of the sensor's cells, whose grid is another in each sweep."""
+        place = self.at(np.arange(len(self.points)), time_s)
+        ray = place - SENSOR
+        range_m = np.linalg.norm(ray, axis=1)
+        up = np.arcsin(ray[:, 2] / range_m) / BEAM + rng.random()
+        around = np.arctan2(ray[:, 0], ray[:, 1]) / AZIMUTH + rng.random()
+        on_beam = np.abs(up - np.rint(up)) < 0.12
+        cell = (np.rint(up) * 100000 + np.rint(around)).astype(int)
+        order = np.lexsort((range_m, cell))
+        order = order[on_beam[order]]
+        rows = order[np.unique(cell[order], return_index=True)[1]]
+        noise = rng.normal(scale=sigma_m, size=(len(rows), 1)) * ray[rows] / range_m[rows, None]
+        return Seen(rows, Part(place[rows] + noise, time_s))
+
+
+@dataclass
+class Seen:
+    rows: np.ndarray
+    part: Part
+
+
+def tube(rng, count, centre, low_m, high_m, radius_m) -> np.ndarray:
+    angle, height = rng.uniform(0, 2 * np.pi, count), rng.uniform(low_m, high_m, count)
+    x, y = centre
+    ring = [x + radius_m * np.cos(angle), y + radius_m * np.sin(angle), height]
+    return np.stack(ring, axis=1)
+
+
+def scans(body: Body, num=11, seed=0, sigma_m=0.01) -> list[Seen]:
+    rng = np.random.default_rng(seed)
+    return [body.scan(k * SWEEP_S, rng, sigma_m) for k in range(num)]
+
+
+def parts_of(seen: list[Seen]) -> list[Part]:
+    return [s.part for s in seen]
+
+
+def voxels(points: np.ndarray, size_m: float) -> set[tuple[int, ...]]:
+    return set(map(tuple, np.floor(points / size_m).astype(int)))
+
+
+def accumulated(result: Softened, at: int) -> np.ndarray:
+    return np.concatenate([result.carry(i, at) for i in range(len(result.parts))])
+
+
+def rigid(parts: list[Part]) -> Softened:
+    still = tuple(np.zeros_like(p.points) for p in parts)
+    return Softened(tuple(parts), still, still, np.inf, {})
+
+
+def forced(parts: list[Part]) -> Softened:
+    """At the softest, whatever held-out parts say."""
+    bending = module._Bending(tuple(parts))
+    for level in range(len(module._ALPHAS)):
+        bending.bring_beyond()
+        bending.refine(level)
+    bent = module._both_ways(tuple(parts), *bending.at_points())
+    return Softened(tuple(parts), *bent, module._ALPHAS[-1], {})
+
+
+# --- a walker -------------------------------------------------------------------------------------
+
+
+@dataclass
+class Walker:
+    body: Body
+    seen: list[Seen]
+    soft: Softened
+
+    def errors_m(self, result: Softened, hops: int) -> tuple[float, float]:
+        """Mean over trunk and over legs: off the true displacement over so many sweeps."""
+        trunk, legs = [], []
+        for i in range(len(self.seen) - hops):
+            for a, b in ((i, i + hops), (i + hops, i)):
+                rows, part = self.seen[a].rows, self.seen[a].part
+                true = self.body.at(rows, b * SWEEP_S) - self.body.at(rows, a * SWEEP_S)
+                error = np.linalg.norm(result.carry(a, b) - part.points - true, axis=1)
+                on_trunk = self.body.limb[rows] == TRUNK
+                trunk.append(error[on_trunk])
+                legs.append(error[~on_trunk])
+        return float(np.concatenate(trunk).mean()), float(np.concatenate(legs).mean())
+
+
+@pytest.fixture(scope="module")
+def walker() -> Walker:
+    body = Body.walker()
+    seen = scans(body)
+    return Walker(body, seen, soften(parts_of(seen)))
+
+
+def test_held_out_sweeps_confirm_that_a_walker_bends(walker):
+    assert np.isfinite(walker.soft.alpha)
+    errors_m = walker.soft.held_out_m
+    assert errors_m[walker.soft.alpha] ** 2 < 0.9 * errors_m[np.inf] ** 2
+
+
+@pytest.mark.parametrize(("hops", "of_rigid", "most_m"), [(1, 0.35, 0.006), (5, 0.2, 0.011)])
+def test_the_legs_follow_their_truth_and_the_trunk_stays(walker, hops, of_rigid, most_m):
+    trunk_m, legs_m = walker.errors_m(walker.soft, hops)
+    _, rigid_legs_m = walker.errors_m(rigid(parts_of(walker.seen)), hops)
+    assert legs_m < of_rigid * rigid_legs_m
+    assert trunk_m < most_m
+
+
+def test_accumulated_legs_are_thin_again_and_keep_their_coverage(walker):
+    key = 5
+    everything = np.arange(len(walker.body.points))
+    surface = walker.body.at(everything, key * SWEEP_S)
+    tree = cKDTree(surface)
+    true = np.concatenate([walker.body.at(s.rows, key * SWEEP_S) for s in walker.seen])
+    off_m, covered = [], []
+    for result in (rigid(parts_of(walker.seen)), walker.soft):
+        points = accumulated(result, key)
+        off_m.append(np.sqrt((tree.query(points)[0] ** 2).mean()))
+        covered.append(len(voxels(points, 0.05) & voxels(true, 0.05)))
+    assert off_m[1] < 0.6 * off_m[0]
+    assert covered[1] > covered[0]
+
+
+def test_backwards_in_time_the_same(walker):
+    parts = parts_of(walker.seen)
+    mirrored = soften([Part(p.points, -p.time_s) for p in reversed(parts)])
+    assert mirrored.alpha == walker.soft.alpha
+    for i, flow in enumerate(reversed(mirrored.to_previous)):
+        np.testing.assert_allclose(flow, walker.soft.to_next[i], atol=1e-6)
+
+
+def test_elsewhere_the_same(walker):
+    far = np.array([61.0, -40.0, 2.0])
+    moved = soften([Part(s.part.points + far, s.part.time_s + 7.0) for s in walker.seen])
+    assert moved.alpha == walker.soft.alpha
+    for here, there in zip(walker.soft.to_next, moved.to_next, strict=True):
+        # a point on the border of a voxel may fall to the other side
+        assert np.median(np.abs(here - there)) < 1e-3
+
+
+def test_the_same_bytes_alone_and_beside_others(walker):
+    parts = parts_of(walker.seen)
+    with ThreadPoolExecutor(3) as pool:
+        for again in pool.map(soften, [parts] * 3):
+            for a, b in zip(again.to_next, walker.soft.to_next, strict=True):
+                assert a.tobytes() == b.tobytes()
+
+
+def test_uneven_times_do_not_mislead(walker):
+    kept = [walker.seen[k] for k in (0, 1, 2, 4, 5, 6, 7, 9, 10)]
+    result = soften(parts_of(kept))
+    assert np.isfinite(result.alpha)
+    gap = kept[2]
+    true = walker.body.at(gap.rows, 0.4) - walker.body.at(gap.rows, 0.2)
+    legs = walker.body.limb[gap.rows] != TRUNK
+    error = np.linalg.norm(result.to_next[2] - true, axis=1)[legs].mean()
+    assert error < 0.8 * np.linalg.norm(true, axis=1)[legs].mean()
+
+
+# --- what is rigid --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("sigma_m", [0.0, 0.02])
+def test_a_rigid_object_stays_rigid_to_the_bit(seed, sigma_m):
+    parts = parts_of(scans(Body.column(), seed=seed, sigma_m=sigma_m))
+    result = soften(parts)
+    assert result.alpha == np.inf
+    assert result.held_out_m  # it was tried
+    assert not any(flow.any() for flow in (*result.to_next, *result.to_previous))
+    assert result.carry(0, 10) is result.parts[0].points
+
+
+@pytest.mark.parametrize(
+    ("body", "num", "every"),
+    [(Body.column(4.0), 7, 1), (Body.walker(), 4, 1), (Body.walker(), 7, 40)],
+    ids=["long", "few sweeps", "few points"],
+)
+def test_what_cannot_be_told_is_not_tried(body, num, every):
+    parts = [Part(p.points[::every], p.time_s) for p in parts_of(scans(body, num))]
+    result = soften(parts)
+    assert result.alpha == np.inf and not result.held_out_m
+    assert not any(flow.any() for flow in (*result.to_next, *result.to_previous))
+
+
+def test_no_part_and_one_part():
+    assert soften([]).to_next == ()
+    part = scans(Body.column(), 1)[0].part
+    assert soften([part]).carry(0, 0) is part.points
+
+
+def test_scan_lines_do_not_pull():
+    parts = parts_of(scans(Body.column(), num=5, sigma_m=0.005))
+    key = 2
+    wide = len(voxels(accumulated(rigid(parts), key), 0.02))
+    ours = len(voxels(accumulated(forced(parts), key), 0.02))
+    snapped = [parts[key].points]
+    settings = ObjectiveSettings(alpha=module._ALPHAS[-1], num_neighbors=6)
+    for part in (parts[key - 1], parts[key + 1]):
+        flow = solve(part.points, parts[key].points, settings, np.zeros_like(part.points)).flow
+        snapped.append(part.points + flow)
+    three = np.concatenate([p.points for p in parts[key - 1 : key + 2]])
+    assert ours > 0.93 * wide
+    assert len(voxels(np.concatenate(snapped), 0.02)) < 0.8 * len(voxels(three, 0.02))
+
+
+def test_edges_and_gaps_do_not_pull():
+    points = scans(Body.column())[0].part.points
+    points = points[np.abs(points[:, 2] - 1.0) > 0.15]
+    result = forced([Part(points, 0.0), Part(points, 0.1)])
+    assert np.abs(result.to_next[0]).max() < 1e-9
+
+
+# --- carrying -------------------------------------------------------------------------------------
+
+
+def test_carrying_adds_up_the_steps_both_ways():
+    rng = np.random.default_rng(1)
+    points = rng.random((30, 3))
+    step = np.array([0.1, -0.2, 0.05])
+    parts = tuple(Part(points + k * step, float(k)) for k in range(4))
+    onward, still = np.tile(step, (30, 1)), np.zeros((30, 3))
+    result = Softened(
+        parts, (onward, onward, onward, still), (still, -onward, -onward, -onward), 1.0, {}
+    )
+    for i in range(4):
+        for j in range(4):
+            np.testing.assert_allclose(result.carry(i, j), points + j * step, atol=1e-12)
+
+
+def test_limbs_that_cross_keep_their_way():
+    forth = np.array([0.1, 0.0, 0.0])
+    high, low = np.array([0.0, 0.0, 0.002]), np.zeros(3)
+    steps = np.repeat([forth, -forth], 5, axis=0)
+    start = np.repeat([high, low], 5, axis=0)  # one leg over the other, meeting at part 1
+    parts = tuple(Part(start + (k - 1) * steps, float(k)) for k in range(3))
+    still = np.zeros_like(steps)
+    result = Softened(parts, (steps, steps, still), (still, -steps, -steps), 1.0, {})
+    np.testing.assert_allclose(result.carry(0, 2), start + steps, atol=1e-6)
+
+
+def test_between_two_parts_the_share_of_the_way_that_the_time_says():
+    points = np.random.default_rng(4).random((20, 3))
+    step = np.array([0.4, 0.0, -0.2])
+    bending = module._Bending((Part(points, 0.0), Part(points + step, 0.4)))
+    num_nodes = len(bending._nodes[0])
+    bending._flow = np.repeat([step, -step], [num_nodes, len(bending._flow) - num_nodes], axis=0)
+    found = bending.between(0, 0.1)
+    np.testing.assert_allclose(found[:num_nodes], bending._nodes[0] + step / 4, atol=1e-12)
+    np.testing.assert_allclose(found[num_nodes:], bending._nodes[1] - 3 * step / 4, atol=1e-12)
+
+
+# --- slow twins -----------------------------------------------------------------------------------
+
+
+def test_blurred_against_a_loop():
+    rng = np.random.default_rng(2)
+    points, at = rng.random((40, 3)), rng.random((7, 3))
+    mean, nearest_m = module._blurred(points, module._nearest(points, at, 6), at, 0.2)
+    for k, place in enumerate(at):
+        distance = np.linalg.norm(points - place, axis=1)
+        near = np.argsort(distance)[:6]
+        weight = np.exp(-(distance[near] ** 2) / (2 * 0.2**2))
+        np.testing.assert_allclose(mean[k], weight @ points[near] / weight.sum(), atol=1e-12)
+        assert nearest_m[k] == pytest.approx(distance.min())
+
+
+def test_a_solve_minimises_what_the_docstring_says(monkeypatch):
+    monkeypatch.setattr(module, "_RESIDUAL_DROP", 1e-12)
+    monkeypatch.setattr(module, "_MAX_PRODUCTS", 2000)
+    rng = np.random.default_rng(3)
+    times_s = (0.0, 0.1, 0.3)
+    parts = tuple(Part(rng.random((12, 3)), t) for t in times_s)
+    bending = module._Bending(parts)
+    n = len(bending._source)
+    data = rng.random((n, 1)) + 0.1
+    target = rng.normal(size=(n, 3))
+    alpha = 3.0
+    bending._solve(data + bending._steady, data * target, alpha)
+
+    # |f_next / dt_next + f_previous / dt_previous|² of the middle part, point by point
+    steady = np.zeros((n, n))
+    rows = {hop: slice(*bending._start[k : k + 2]) for k, hop in enumerate(bending._hops)}
+    forth = np.arange(n)[rows[1, 2]]
+    back = np.arange(n)[rows[1, 0]]
+    velocity = np.array([1 / 0.2, 1 / 0.1])
+    velocity *= np.sqrt(2 * module._STEADY / (velocity**2).sum())
+    for pair in zip(forth, back, strict=True):
+        steady[np.ix_(pair, pair)] += np.outer(velocity, velocity)
+    dense = np.diag(data[:, 0]) + steady + alpha * bending._laplacian.toarray()
+    np.testing.assert_allclose(bending._flow, np.linalg.solve(dense, data * target), atol=1e-8)
+
+
+# --- bad input ------------------------------------------------------------------------------------
+
+GOOD = Part(np.zeros((3, 3)), 0.0)
+
+
+@pytest.mark.parametrize(
+    ("bad", "says"),
+    [
+        (Part(np.zeros((0, 3)), 1.0), r"parts\[1\]\.points.*\(0, 3\).*leave out"),
+        (Part(np.zeros((3, 2)), 1.0), r"parts\[1\]\.points.*\(3, 2\)"),
+        (Part(np.zeros(3), 1.0), r"parts\[1\]\.points.*\(3,\)"),
+        (Part(np.full((3, 3), np.nan), 1.0), r"parts\[1\]\.points.*NaN"),
+        (Part(np.zeros((3, 3)), 0.0), r"parts\[1\]\.time_s.*ascend"),
+        (Part(np.zeros((3, 3)), np.nan), r"parts\[1\]\.time_s.*nan"),
+    ],
+    ids=["empty", "two columns", "flat", "nan", "same time", "no time"],
+)
+def test_bad_parts(bad, says):
+    with pytest.raises(InputError, match=says):
+        soften([GOOD, bad])
