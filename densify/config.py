@@ -117,6 +117,10 @@ class FlowSettings(Section):
         0.02,
         2,
     )
+    soft: bool = knob(
+        True,
+        "objects bend about their rigid motion (swinging limbs) as far as held-out sweeps confirm",
+    )
     solver: str = knob(
         "pcg",
         "of the objective (engine paper, densify flow). pcg: conjugate gradients, fast; adam: "

@@ -3,7 +3,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,6 +19,7 @@ from densify.flow.evidence import (
     firing_times_s,
     reference_times_s,
 )
+from densify.flow.soften import Part, Softened, soften
 from densify.flow.tracks import Track, follow_groups
 from densify.height_map import HeightMap
 from densify.types import Bool, Float, Float32, FlowField, Stretch
@@ -39,12 +41,14 @@ _GAPS_REACHED_UNSEEN = 0.5
 class GroupMotion:
     """What moves in a stretch: a `densify.types.Motion`.
 
-    instance: per sweep (N,) int32, index of the point's track, -1 none.
+    instance: per sweep (N,) int32, index of the point's track, -1 none. bendings: of the tracks
+    that are not rigid, by index.
     """
 
     stretch: Stretch
     tracks: tuple[Track, ...]
     instance: tuple[NDArray[np.int32], ...]
+    bendings: Mapping[int, Bending]
 
     def flow(self, frame: int, target: int) -> FlowField:
         """Of every point of a sweep to another sweep's reference time; both by frame number.
@@ -60,10 +64,16 @@ class GroupMotion:
         lost = np.zeros(len(instance), bool)
         for k in np.unique(instance[instance >= 0]):
             track, mine = self.tracks[k], np.flatnonzero(instance == k)
-            at_firing = poses.transform(registered.T_world_lidar, registered.sweep.points[mine])
-            at_reference = track.carry(at_firing, seen_s[mine], time_s[here])
-            arrived = track.carry(at_reference, time_s[here], time_s[there])
-            to_reference[mine] = (at_reference - at_firing) @ R_lidar_world.T
+            measured = poses.transform(registered.T_world_lidar, registered.sweep.points[mine])
+            body = track.undo(measured, seen_s[mine])
+            at_reference, arrived = body, body
+            if k in self.bendings:
+                at_reference, arrived = self.bendings[k].carry(
+                    here, there, time_s[here], seen_s[mine]
+                )
+            at_reference = track.place(at_reference, time_s[here])
+            arrived = track.place(arrived, time_s[there])
+            to_reference[mine] = (at_reference - measured) @ R_lidar_world.T
             displacement[mine] = (arrived - at_reference) @ R_lidar_world.T
             velocity_m_s[mine] = track.velocity_m_s(arrived, time_s[there]) @ R_lidar_world.T
             seen = sorted(track.claimed)
@@ -71,10 +81,30 @@ class GroupMotion:
         return FlowField(displacement, instance >= 0, instance, lost, to_reference, velocity_m_s)
 
 
-def follow(stretch: Stretch, ground: HeightMap, min_height_m: float) -> GroupMotion:
+@dataclass(frozen=True)
+class Bending:
+    """How one object departs from its rigid motion. sweeps: the index of the sweep that each part
+    of ``softened`` is from."""
+
+    sweeps: tuple[int, ...]
+    softened: Softened
+
+    def carry(
+        self, here: int, there: int, reference_s: float, seen_s: Float
+    ) -> tuple[Float, Float]:
+        """The points of sweep number ``here`` in the object's own frame, at that sweep's reference
+        time and at that of sweep number ``there``, or of the nearest that shows the object."""
+        n = self.sweeps.index(here)
+        m = min(range(len(self.sweeps)), key=lambda p: abs(self.sweeps[p] - there))
+        points = self.softened.parts[n].points
+        at_reference = points + self.softened.velocity_m_s(n) * (reference_s - seen_s)[:, None]
+        return at_reference, at_reference + self.softened.carry(n, m) - points
+
+
+def follow(stretch: Stretch, ground: HeightMap, min_height_m: float, soft: bool) -> GroupMotion:
     """Find everything in the stretch that certainly moves.
 
-    min_height_m: points lower above the ground start no motion.
+    min_height_m: points lower above the ground start no motion. soft: objects may bend.
     """
     space = FreeSpace.of(stretch)
     standing = find_candidates(stretch, space, ground, min_height_m)
@@ -87,7 +117,29 @@ def follow(stretch: Stretch, ground: HeightMap, min_height_m: float) -> GroupMot
         found = _attach(seen, i, tracks, shapes, time_s, min_height_m)
         _lengthen(found, seen, i, tracks, shapes, time_s, space)
         instance.append(found)
-    return GroupMotion(stretch, tuple(tracks), tuple(instance))
+    bendings = _bendings(stretch, tracks, instance) if soft else {}
+    return GroupMotion(stretch, tuple(tracks), tuple(instance), bendings)
+
+
+def _bendings(
+    stretch: Stretch, tracks: Sequence[Track], instance: Sequence[NDArray[np.int32]]
+) -> dict[int, Bending]:
+    """Of the objects that certainly bend."""
+
+    def of_track(k: int) -> Bending:
+        parts, sweeps = [], []
+        for i, registered in enumerate(stretch.sweeps):
+            mine = np.flatnonzero(instance[i] == k)
+            if len(mine):
+                at = poses.transform(registered.T_world_lidar, registered.sweep.points[mine])
+                seen_s = firing_times_s(stretch, i)[mine]
+                parts.append(Part(tracks[k].undo(at, seen_s), float(seen_s.mean())))
+                sweeps.append(i)
+        return Bending(tuple(sweeps), soften(parts))
+
+    with ThreadPoolExecutor() as pool:
+        found = dict(enumerate(pool.map(of_track, range(len(tracks)))))
+    return {k: bending for k, bending in found.items() if np.isfinite(bending.softened.alpha)}
 
 
 @dataclass(frozen=True)

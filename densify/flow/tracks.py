@@ -52,8 +52,15 @@ class Track:
 
     def carry(self, points: Float, from_s: float | Float, to_s: float | Float) -> Float:
         """(N,3) points of the object at one time -> at another, world; one time or one each."""
-        there = undo(self.path(from_s), points, self.centre)
-        return apply(self.path(to_s), there, self.centre)
+        return self.place(self.undo(points, from_s), to_s)
+
+    def undo(self, points: Float, seen_s: float | Float) -> Float:
+        """(N,3) points seen at a time -> in the object's own frame."""
+        return undo(self.path(seen_s), points, self.centre)
+
+    def place(self, points: Float, time_s: float | Float) -> Float:
+        """Inverse of `undo`."""
+        return apply(self.path(time_s), points, self.centre)
 
     def velocity_m_s(self, points: Float, time_s: float) -> Float:
         """(N,3) of the object's points where they are at that time."""
