@@ -22,7 +22,7 @@ from densify.flow.evidence import (
 from densify.flow.soften import Part, Softened, soften
 from densify.flow.tracks import Track, follow_groups
 from densify.height_map import HeightMap
-from densify.types import Bool, Float, Float32, FlowField, Stretch
+from densify.types import Bool, Float, Float32, FlowField, Int, Stretch
 
 _ATTACH_M = 0.3
 _ATTACH_UNSEEN_M = 0.15
@@ -111,14 +111,19 @@ def follow(stretch: Stretch, ground: HeightMap, min_height_m: float, soft: bool)
     time_s = reference_times_s(stretch)
     tracks = follow_groups(standing, space, ground, time_s)
     shapes = [_shape(track, standing) for track in tracks]
-    instance = []
-    for i in range(len(stretch.sweeps)):
+
+    def members(i: int) -> NDArray[np.int32]:
         seen = _Seen.of(stretch, i, ground, standing[i], space.ring_step_rad)
-        found = _attach(seen, i, tracks, shapes, time_s, min_height_m)
-        _lengthen(found, seen, i, tracks, shapes, time_s, space)
-        instance.append(found)
+        attached = _attach(seen, i, tracks, shapes, time_s, min_height_m)
+        _lengthen(attached, seen, i, tracks, shapes, time_s, space)
+        instance = np.full(len(stretch.sweeps[i].sweep), -1, np.int32)
+        instance[seen.row] = attached
+        return instance
+
+    with ThreadPoolExecutor() as pool:
+        instance = tuple(pool.map(members, range(len(stretch.sweeps))))
     bendings = _bendings(stretch, tracks, instance) if soft else {}
-    return GroupMotion(stretch, tuple(tracks), tuple(instance), bendings)
+    return GroupMotion(stretch, tuple(tracks), instance, bendings)
 
 
 def _bendings(
@@ -144,9 +149,13 @@ def _bendings(
 
 @dataclass(frozen=True)
 class _Seen:
-    """All points of a sweep. points: (N,3) world. time_s: (N,) when measured. reach_m: (N,) how
-    close a point must be to an object's shape to belong to it."""
+    """The points of a sweep that may belong to something.
 
+    row: (N,) in the sweep. points: (N,3) world. time_s: (N,) when measured. height_m: (N,) above
+    the ground. reach_m: (N,) how close a point must be to an object's shape to belong to it.
+    """
+
+    row: Int
     points: Float
     time_s: Float
     height_m: Float32
@@ -157,18 +166,14 @@ class _Seen:
         stretch: Stretch, i: int, ground: HeightMap, standing: Standing, ring_step_rad: float
     ) -> _Seen:
         registered = stretch.sweeps[i]
-        points = registered.sweep.points
-        gap_m = ring_step_rad * np.linalg.norm(points, axis=1)
+        points = poses.transform(registered.T_world_lidar, registered.sweep.points)
+        height_m = ground.above(points)
+        row = np.flatnonzero(height_m > _MIN_HEIGHT_M)
+        gap_m = ring_step_rad * np.linalg.norm(registered.sweep.points, axis=1)
         reach_m = np.maximum(_ATTACH_UNSEEN_M, _GAPS_REACHED_UNSEEN * gap_m)
-        rows = standing.row[standing.candidate]
-        reach_m[rows] = np.maximum(_ATTACH_M, _GAPS_REACHED * gap_m[rows])
-        in_world = poses.transform(registered.T_world_lidar, points)
-        return _Seen(
-            in_world,
-            firing_times_s(stretch, i),
-            ground.above(in_world),
-            reach_m,
-        )
+        seeded = standing.row[standing.candidate]
+        reach_m[seeded] = np.maximum(_ATTACH_M, _GAPS_REACHED * gap_m[seeded])
+        return _Seen(row, points[row], firing_times_s(stretch, i)[row], height_m[row], reach_m[row])
 
 
 def _shape(track: Track, standing: Sequence[Standing]) -> Float:
@@ -189,7 +194,7 @@ def _attach(
     time_s: Float,
     min_height_m: float,
 ) -> NDArray[np.int32]:
-    """(N,): the track each point of sweep number i belongs to, -1 none.
+    """(N,): the track each of the points seen by sweep number i belongs to, -1 none.
 
     A point belongs to a track where it is close to the object's points of all sweeps, or stands
     within their outline: nothing else can be where a solid object is.
@@ -203,9 +208,7 @@ def _attach(
         shape = track.carry(shapes[k], track.path.begin_s, at_s)
         low, high = shape.min(0) - 2 * _ATTACH_M, shape.max(0) + 2 * _ATTACH_M
         low[2] -= 1.0  # down to the wheels
-        rows = np.flatnonzero(
-            ((seen.points > low) & (seen.points < high)).all(1) & (seen.height_m > _MIN_HEIGHT_M)
-        )
+        rows = np.flatnonzero(((seen.points > low) & (seen.points < high)).all(1))
         if not len(rows):
             continue
         at_once = track.carry(seen.points[rows], seen.time_s[rows], at_s)
@@ -241,7 +244,7 @@ def _lengthen(
         shape = track.carry(shapes[k], track.path.begin_s, at_s)
         side = (shape[:, :2] @ axes)[:, 1]
         near = np.abs(seen.points[:, :2] - shape[:, :2].mean(0)).max(1) < 1.5 * _LENGTH_M
-        rows = np.flatnonzero(near & (instance < 0) & (seen.height_m > _MIN_HEIGHT_M))
+        rows = np.flatnonzero(near & (instance < 0))
         at_once = track.carry(seen.points[rows], seen.time_s[rows], at_s)
         along = at_once[:, :2] @ axes
         fits = (along[:, 1] > side.min() - _SIDE_M) & (along[:, 1] < side.max() + _SIDE_M)

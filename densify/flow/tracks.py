@@ -64,8 +64,11 @@ class Track:
 
     def velocity_m_s(self, points: Float, time_s: float) -> Float:
         """(N,3) of the object's points where they are at that time."""
-        step_s = 1e-3
-        return (self.carry(points, time_s, time_s + step_s) - points) / step_s
+        state, rate = self.path(time_s), self.path.rate(time_s)
+        velocity_m_s = np.tile(rate[:3], (len(points), 1))
+        velocity_m_s[:, 0] -= rate[3] * (points[:, 1] - self.centre[1] - state[1])
+        velocity_m_s[:, 1] += rate[3] * (points[:, 0] - self.centre[0] - state[0])
+        return velocity_m_s
 
     def add(self, j: int, state: Float, time_s: float, rows: np.ndarray) -> None:
         """What sweep j saw of the object."""
@@ -80,6 +83,14 @@ class Track:
     def typical_size(self) -> float:
         """Points per sweep."""
         return float(np.median([len(rows) for rows in self.claimed.values()]))
+
+    def smooth(self, sweep_time_s: Float) -> None:
+        """Lay the path through the states; sweeps that saw many points count more."""
+        seen = sorted(self.states)
+        times_s = np.array([self.times_s[j] for j in seen])
+        states = np.stack([self.states[j] for j in seen])
+        weights = np.array([min(len(self.claimed[j]), _MANY_POINTS) for j in seen], float)
+        self.path = Path.fit(times_s, states, weights, float(np.median(np.diff(sweep_time_s))))
 
     def seen_at(self, j: int, sweep_time_s: Float) -> float:
         """When sweep j sees, or would see, the object."""
@@ -106,8 +117,7 @@ def follow_groups(
         track = _follow(members, i, velocity, standing, free, ground, sweep_time_s)
         proven = _prove(track, standing, space, sweep_time_s)
         if proven:
-            _refine(track, standing, ground)
-            proven = _prove(track, standing, space, sweep_time_s)
+            _refine(track, standing, ground, sweep_time_s)
         for j, rows in track.claimed.items():
             untried[j][rows] = False
             if proven:
@@ -222,8 +232,10 @@ def _find(
     return state, seen_s, rows[fit], target[fit]
 
 
-def _refine(track: Track, standing: Sequence[Standing], ground: HeightMap) -> None:
-    """Align every sweep once more, with what all others saw.
+def _refine(
+    track: Track, standing: Sequence[Standing], ground: HeightMap, sweep_time_s: Float
+) -> None:
+    """Align every sweep once more, with what others saw, if that makes the motion smoother.
 
     Followed sweep by sweep, an object whose other side comes into view drifts: the first shape is
     all there is to hold on to. The even sweeps are aligned with the shape that the odd ones show,
@@ -240,6 +252,7 @@ def _refine(track: Track, standing: Sequence[Standing], ground: HeightMap) -> No
             return
         shapes.append(np.concatenate(parts))
     models = [Model(undo(track.path(track.path.begin_s), x, track.centre)) for x in shapes]
+    before = dict(track.states), track.path
     for j, rows in track.claimed.items():
         at_s = track.times_s[j]
         points = track.carry(standing[j].points[rows], standing[j].time_s[rows], at_s)
@@ -249,6 +262,9 @@ def _refine(track: Track, standing: Sequence[Standing], ground: HeightMap) -> No
         if state is not None:
             state[2] = track.rise_m(ground, state)
             track.states[j] = state
+    track.smooth(sweep_time_s)
+    if track.path.residual_m > before[1].residual_m:
+        track.states, track.path = before
 
 
 def _prove(
@@ -260,15 +276,12 @@ def _prove(
     contradictions that brought the group here: where the sweeps see through its points at their
     rigid places, they must not see through them at the moved ones.
     """
-    seen = sorted(track.states)
-    if len(seen) < 3:
+    if len(track.states) < 3:
         return False
-    t = np.array([track.times_s[j] for j in seen])
-    states = np.stack([track.states[j] for j in seen])
-    weight = np.sqrt([min(len(track.claimed[j]), _MANY_POINTS) for j in seen])
-    track.path = Path.fit(t, states, weight**2, float(np.median(np.diff(sweep_time_s))))
-    fitted = track.path(t)
+    track.smooth(sweep_time_s)
     residual_m = track.path.residual_m
+    seen = sorted(track.states)
+    fitted = track.path(np.array([track.times_s[seen[0]], track.times_s[seen[-1]]]))
     travelled = float(np.linalg.norm((fitted[-1] - fitted[0])[:2]))
     step_m = travelled / (seen[-1] - seen[0])
     start = space.origin[next(iter(track.states))]
