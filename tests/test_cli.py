@@ -275,7 +275,7 @@ def test_point_files_of_every_kind_agree(tmp_path: Path) -> None:
     np.savetxt(tmp_path / "p.txt", points)
     points.tofile(tmp_path / "p.bin")
     for name in ("p.npy", "p.npz", "p.txt", "p.bin"):
-        read = read_points(tmp_path / name)
+        read = read_points(tmp_path / name).points
         assert read.dtype == np.float64
         assert np.array_equal(read, points[:, :3])
 

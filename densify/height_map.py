@@ -1,0 +1,70 @@
+# SPDX-License-Identifier: MIT
+"""Heights of the ground under a cloud: a map that follows slopes and kerbs, not a plane."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import ndimage
+
+from densify.config import GroundSettings
+from densify.types import Float, Float32
+
+_LOW_OUTLIER_M = 0.4
+
+
+@dataclass(frozen=True)
+class HeightMap:
+    """heights_m: (X,Y) of the cells' centres. low_m: (2,) the grid's lower corner."""
+
+    heights_m: Float
+    low_m: Float
+    cell_m: float
+
+    @staticmethod
+    def of(points: Float, settings: GroundSettings) -> HeightMap:
+        """(N,3) cloud, z up, at least one point.
+
+        A cell's ground is its second lowest point (the lowest may be a stray reflection), repaired
+        where it lies below the median of its neighbours, then bounded by the steepest slope from
+        every other cell, which cuts cars and walls away.
+        """
+        cell_m = settings.cell_m
+        low = np.floor(points[:, :2].min(0) / cell_m) * cell_m
+        index = ((points[:, :2] - low) / cell_m).astype(np.int64)
+        shape = tuple(index.max(0) + 1)
+        cell = np.ravel_multi_index(tuple(index.T), shape)
+        z = points[:, 2]
+        lowest = np.full(shape[0] * shape[1], np.inf)
+        np.minimum.at(lowest, cell, z)
+        above = z > lowest[cell]
+        second = np.full_like(lowest, np.inf)
+        np.minimum.at(second, cell[above], z[above])
+        heights = np.where(np.isfinite(second), second, lowest).reshape(shape)
+
+        known = np.isfinite(heights)
+        nearest = ndimage.distance_transform_edt(
+            ~known, return_distances=False, return_indices=True
+        )
+        around = ndimage.median_filter(heights[tuple(nearest)], 5)
+        heights = np.where(known & (heights < around - _LOW_OUTLIER_M), around, heights)
+        heights = _slope_limited(heights, settings.max_slope * cell_m)
+        return HeightMap(heights[tuple(nearest)], low, cell_m)
+
+    def above(self, points: Float) -> Float32:
+        """(N,3) -> (N,) metres above the ground; beyond the map as at its nearest edge."""
+        at = (points[:, :2] - self.low_m).T / self.cell_m - 0.5
+        ground_m = ndimage.map_coordinates(self.heights_m, at, order=1, mode="nearest")
+        height_m: Float32 = (points[:, 2] - ground_m).astype(np.float32)
+        return height_m
+
+
+def _slope_limited(heights: Float, rise: float) -> Float:
+    """The largest map below ``heights`` that rises by at most ``rise`` per cell."""
+    cone = -rise * np.hypot(*np.meshgrid([-1.0, 0.0, 1.0], [-1.0, 0.0, 1.0]))
+    while True:
+        lower = ndimage.grey_erosion(heights, structure=cone, mode="nearest")
+        if np.array_equal(lower, heights):
+            return lower
+        heights = lower
