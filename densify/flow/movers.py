@@ -34,6 +34,7 @@ _MIN_UNEXPLAINED = 5, 3  # in the source, in the target
 _MIN_TOGETHER, _MIN_TOGETHER_PER_M = 10, 3.5  # the farther, the more places fit by chance
 _MIN_MOTION_M = 0.1
 _JUDGE_POINTS = 2000
+_THIN_M, _ALONG = 0.05, 0.3
 _AROUND_M = 0.5
 _MAX_LEFT = 0.4  # of what standing still leaves unexplained, in both clouds together
 _MAX_LEFT_EACH = 0.6
@@ -229,6 +230,8 @@ def _trials(
     for h in np.flatnonzero(passed):
         k = int(hypotheses.group[h])
         motion = Motion(hypotheses.state[h], hypotheses.centre[h], float(hypotheses.share[h]))
+        if _ambiguous(ours.cloud.points[row[of_point == h]], motion.state[:3]):
+            continue
         still_there, around, explained, back_m = _looked_back(motion, groups[k], ours, theirs)
         trials.append(
             _Trial(
@@ -237,6 +240,15 @@ def _trials(
             )
         )
     return trials
+
+
+def _ambiguous(points: Float, way: Float) -> bool:
+    """Whether a flat group moves along itself, or it is but a line: so does the strip of a wall
+    that shows through a gap when the scanner moves, and its edge is any other's like."""
+    _, scale, axes = np.linalg.svd(points - points.mean(0), full_matrices=False)
+    _, width_m, thickness_m = scale / np.sqrt(len(points))
+    along = abs(axes[-1] @ way) < _ALONG * np.linalg.norm(way)
+    return bool(thickness_m < _THIN_M and (along or width_m < _THIN_M))
 
 
 def _looked_back(

@@ -31,7 +31,7 @@ _REACH_M = 0.5
 _MIN_GAIN_M = 0.07
 _MAX_EXTENT_M = 400.0
 _MIN_LOW_M = 0.08
-_BELOW_M = 0.2
+_BELOW_M = 0.3
 
 
 def estimate_flow(
@@ -153,7 +153,8 @@ def _as_cloud(values: ArrayLike, name: str) -> Float:
         cloud = np.array(values, dtype=np.float64, order="C")
     except (TypeError, ValueError) as error:
         raise InputError(f"{name}: expected (n,3) numbers, metres; {error}") from error
-    require_points(torch.from_numpy(cloud), name)
+    if cloud.ndim != 2 or cloud.shape[1] != 3 or not (len(cloud) and np.isfinite(cloud).all()):
+        require_points(torch.from_numpy(cloud), name)  # says what is wrong
     return cloud
 
 
