@@ -16,6 +16,7 @@ from scipy.spatial import cKDTree
 
 from densify.types import Float, Int
 
+_EVEN_M = 0.06
 _MAX_MOTION_M = 3.8
 _VOTE_STEP_M = 0.2
 _VOTE_SLACK_M = 0.3  # vertical
@@ -46,6 +47,14 @@ class Standing:
     @cached_property
     def tree(self) -> cKDTree:
         return tree_of(self.places(self.points, np.arange(len(self.points))))
+
+    @cached_property
+    def even_tree(self) -> cKDTree:
+        """Without the density along the scan lines, which says nothing of that across."""
+        places = self.places(self.points, np.arange(len(self.points)))
+        voxel = np.floor(places / _EVEN_M).astype(np.int64)
+        key = voxel @ np.array([1, 1 << 20, 1 << 40, 7][: voxel.shape[1]])
+        return tree_of(places[np.unique(key, return_index=True)[1]])
 
     def places(self, points: Float, rows: Int) -> Float:
         """Coordinates in which points of different scanners are far from each other: each of them

@@ -22,8 +22,7 @@ from densify.types import Bool, Float, Int
 
 _REACH_M = 0.6  # a distance beyond it counts as this
 _EXPLAINED_M = 0.1  # a nearer point is a counterpart,
-_EXPLAINED_SPACINGS = 0.8  # or one within the radius of eight neighbours, times this
-_NUM_SPACING = 8
+_NUM_SPACING = 8  # or one within the radius of so many neighbours
 _LINK_M = 0.6
 _NEAR_M = 0.4
 _MIN_SHARE = 0.2  # unexplained, of a group taken as a whole
@@ -33,6 +32,7 @@ _MIN_POINTS = 8
 _MIN_UNEXPLAINED = 5, 3  # in the source, in the target
 _MIN_TOGETHER, _MIN_TOGETHER_PER_M = 10, 3.5  # the farther, the more places fit by chance
 _MIN_MOTION_M = 0.1
+_MAX_RISE_M, _MAX_RISE = 0.12, 0.15  # and per metre
 _JUDGE_POINTS = 2000
 _THIN_M, _ALONG = 0.05, 0.3
 _AROUND_M = 0.5
@@ -84,10 +84,10 @@ class _Evidence:
 
     def tolerance_m(self, rows: Int) -> Float:
         """How far from a point a counterpart may be: what is sparse in one cloud is in both."""
-        k = min(_NUM_SPACING + 1, len(self.cloud.points))
+        k = min(_NUM_SPACING + 1, self.cloud.even_tree.n)
         place = self.cloud.places(self.cloud.points[rows], rows)
-        spacing_m = np.asarray(self.cloud.tree.query(place, [k])[0])[:, 0]
-        return np.maximum(_EXPLAINED_M, _EXPLAINED_SPACINGS * spacing_m)
+        spacing_m = np.asarray(self.cloud.even_tree.query(place, [k])[0])[:, 0]
+        return np.maximum(_EXPLAINED_M, spacing_m)
 
     def groups(self) -> list[Int]:
         """Members of those that are worth a try, by label."""
@@ -221,7 +221,8 @@ def _trials(
     still = np.bincount(of_point, ours.unexplained[row], num)
     left = np.bincount(of_point, far > tolerance_m, num)
     length_m = np.linalg.norm(hypotheses.state[:, :2], axis=1)
-    passed = (length_m >= _MIN_MOTION_M) & (left <= _MAX_LEFT_EACH * still)
+    level = np.abs(hypotheses.state[:, 2]) <= _MAX_RISE_M + _MAX_RISE * length_m
+    passed = level & (length_m >= _MIN_MOTION_M) & (left <= _MAX_LEFT_EACH * still)
     size = np.array([len(g) for g in groups])[hypotheses.group]
     count = np.bincount(of_point, minlength=num)
     gain_m = np.bincount(of_point, ours.distance_m[row] - far, num) * size / count
