@@ -22,6 +22,7 @@ from densify.types import Bool, Float, Int
 
 _REACH_M = 0.6  # a distance beyond it counts as this
 _EXPLAINED_M = 0.1  # a nearer point is a counterpart,
+_MAX_EXPLAINED_M = 0.5
 _NUM_SPACING = 8  # or one within the radius of so many neighbours
 _LINK_M = 0.6
 _NEAR_M = 0.4
@@ -87,7 +88,7 @@ class _Evidence:
         k = min(_NUM_SPACING + 1, self.cloud.even_tree.n)
         place = self.cloud.places(self.cloud.points[rows], rows)
         spacing_m = np.asarray(self.cloud.even_tree.query(place, [k])[0])[:, 0]
-        return np.maximum(_EXPLAINED_M, spacing_m)
+        return np.clip(spacing_m, _EXPLAINED_M, _MAX_EXPLAINED_M)
 
     def groups(self) -> list[Int]:
         """Members of those that are worth a try, by label."""
