@@ -123,8 +123,8 @@ class FlowSettings(Section):
     )
     solver: str = knob(
         "pcg",
-        "of the objective (engine paper, densify flow). pcg: conjugate gradients, fast; adam: "
-        "1,500 steps as published",
+        "of the objective (engine paper, or densify flow without static_prior). pcg: conjugate "
+        "gradients, fast; adam: 1,500 steps as published",
         choices=("pcg", "adam"),
     )
     alpha: float = knob(

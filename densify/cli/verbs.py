@@ -86,10 +86,16 @@ def flow(options: argparse.Namespace) -> None:
 
     check_new_file(options.out, options.overwrite)
     source, target = read_points(options.source), read_points(options.target)
-    field = densify.estimate_flow(source, target, config=config)
+    columns = {
+        f"{side}_{name}": getattr(file, name)
+        for name in ("offset_ns", "lidar")
+        if getattr(source, name) is not None and getattr(target, name) is not None
+        for side, file in (("source", source), ("target", target))
+    }
+    field = densify.estimate_flow(source.points, target.points, config, **columns)
     write_flow(options.out, field)
     num_moving = int(field.moving.sum())
-    print(f"{len(source):,} points, {num_moving:,} moving")
+    print(f"{len(source.points):,} points, {num_moving:,} moving")
     _print_paths([options.out])
 
 
