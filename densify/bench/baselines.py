@@ -27,11 +27,10 @@ _NUM_VOTERS = 30
 _ICP_REACH_M = 1.0
 _ICP_STEPS = 20
 
-STIFFNESSES = (50.0, 20.0, 8.0, 3.0, 1.0)
-"""Amberg et al. lower the stiffness in steps; the last is the softest."""
+STIFFNESSES = (50.0, 20.0, 8.0, 3.0)
+"""Amberg et al. lower the stiffness in steps; ending softer follows the noise of what stands."""
 
 _NUM_EDGES = 6
-_EDGE_M = 0.6
 _NICP_REACH_M = 2.0
 _NICP_STEPS = 4  # per stiffness
 _NICP_SETTLED_M = 0.005
@@ -138,7 +137,7 @@ def nonrigid_icp(
     point. gamma_m: weighs differences of translation against those of rotation, shear and scale
     over a metre.
 
-    Their mesh edges are the 6 nearest neighbours within 0.6 m; coordinates are taken about the mean
+    Their mesh edges are the 6 nearest neighbours; coordinates are taken about the mean
     of each connected part, where "as alike as neighbours" means most. Correspondences farther than
     2 m have weight 0, as theirs at borders have.
 
@@ -181,10 +180,10 @@ def _edges(points: Float) -> tuple[csc_array, Int]:
     """The (E,n) node-arc incidence matrix M, and (n,) the connected part of each point."""
     num_points = len(points)
     k = min(_NUM_EDGES + 1, num_points)
-    found = cKDTree(points).query(points, list(range(1, k + 1)), workers=-1)
-    distance_m, near = (np.asarray(column).ravel() for column in found)
+    _, found = cKDTree(points).query(points, list(range(1, k + 1)), workers=-1)
+    near = np.asarray(found).ravel()
     own = np.repeat(np.arange(num_points), k)
-    kept = (distance_m <= _EDGE_M) & (own != near)
+    kept = own != near
     pairs = np.unique(np.sort(np.stack([own[kept], near[kept]], axis=1), axis=1), axis=0)
     arc = np.arange(len(pairs))
     values = np.concatenate([-np.ones(len(pairs)), np.ones(len(pairs))])

@@ -3,9 +3,10 @@
 
 The pairs of a window are its sweeps and their neighbours towards the key, brought into the key's
 frame by registration; methods of two clouds get the points above the ground of both, the window
-engine gets the window. The objective and non-rigid ICP are slow: they get at most ``max_points``
-points of each cloud, drawn at random, and their flow is carried to the other points from the
-nearest three. The energy is always that of the paper's objective on those drawn points.
+engine gets the window. The objective and non-rigid ICP are slow: they move at most ``max_points``
+points, drawn at random, and their flow is carried to the other points from the nearest three. The
+objective, which matches both ways, sees as many of the target, non-rigid ICP all of it. The energy
+is always that of the paper's objective on the drawn points of both.
 
 Firing times within a sweep are used for every method: a point moves by its own flow between the
 moment it was measured and the sweep's reference time.
@@ -287,10 +288,11 @@ def _move(method: str, pair: Pair, config: Config) -> Motion:
     elif method == "cluster-icp":
         flow = cluster_icp(pair.source, pair.target)
     else:
-        source, target = pair.source[pair.drawn], pair.target[pair.target_drawn]
+        source = pair.source[pair.drawn]
         if method == "nicp":
-            drawn_flow = nonrigid_icp(source, target)
+            drawn_flow = nonrigid_icp(source, pair.target)
         else:
+            target = pair.target[pair.target_drawn]
             solver = "pcg" if method == "paper" else "adam"
             solution = solve(source, target, ObjectiveSettings(solver=solver))
             drawn_flow = solution.flow
