@@ -331,22 +331,19 @@ def _finished(measured: dict[str, _Measured]) -> dict[str, dict[str, Any]]:
 
 
 def _milestones(adam: _Measured, paper: _Measured | None) -> dict[str, Any]:
-    """Means over the pairs: steps and seconds until Adam's lowest energy, and until it first comes
-    as low as conjugate gradients end (None if it never does on some pair). A step's time is the
-    mean of the run's, the graph's included."""
+    """Means over the pairs: steps and seconds until Adam's lowest energy, and seconds until it
+    first comes as low as conjugate gradients end, over the pairs where it does. A step's time is
+    the mean of the run's, the graph's included."""
     lowest = [int(np.argmin(trace)) for trace in adam.traces]
-    step_s = [
-        seconds / (len(trace) - 1) for seconds, trace in zip(adam.seconds, adam.traces, strict=True)
-    ]
+    step_s = [s / (len(trace) - 1) for s, trace in zip(adam.seconds, adam.traces, strict=True)]
     milestones: dict[str, Any] = {
         "steps_to_lowest": float(np.mean(lowest)),
         "seconds_to_lowest": float(np.multiply(lowest, step_s).mean()),
-        "seconds_to_paper": None,
     }
     if paper is not None:
-        goals = zip(adam.traces, paper.energies, strict=True)
-        there = [np.flatnonzero(np.array(trace) <= goal) for trace, goal in goals]
-        if all(len(t) for t in there):
-            reached = np.multiply([t[0] for t in there], step_s)
-            milestones["seconds_to_paper"] = float(reached.mean())
+        goals = zip(adam.traces, paper.energies, step_s, strict=True)
+        there = [(np.flatnonzero(np.array(trace) <= goal), s) for trace, goal, s in goals]
+        seconds = [float(steps[0] * s) for steps, s in there if len(steps)]
+        milestones["seconds_to_paper"] = float(np.mean(seconds)) if seconds else None
+        milestones["pairs_as_low_as_paper"] = len(seconds)
     return milestones

@@ -76,15 +76,15 @@ Column = tuple[str, tuple[str, ...], str]
 _METHOD_COLUMNS: tuple[Column, ...] = (
     ("points", ("num_points",), ",d"),
     ("movers", ("step", "movers_m"), ".3f m"),
-    ("x ours", ("times_error",), ".1f"),
+    ("/ ours", ("times_error",), ".1f"),
     ("objects", ("step", "static_objects_m"), ".4f m"),
-    ("ground off", ("step", "background_m"), ".4f m"),
+    ("background", ("step", "background_m"), ".4f m"),
     ("found", ("step", "found"), ".1%"),
     ("false", ("step", "falsely_moving"), ".3%"),
     ("E before", ("energy_before",), ".0f"),
     ("E after", ("energy_after",), ".0f"),
     ("seconds", ("seconds_per_pair",), ".3f"),
-    ("x ours", ("times_seconds",), ".1f"),
+    ("/ ours", ("times_seconds",), ".1f"),
     ("memory", ("peak_memory_mb",), ".0f MB"),
 )
 _WINDOW_COLUMNS: tuple[Column, ...] = (
@@ -107,13 +107,8 @@ def flow_table(measured: Mapping[str, Any]) -> str:
         f"ground; paper, adam, nicp move {drawn}; E is the paper's energy on those points",
         _table(methods, _METHOD_COLUMNS),
     ]
-    adam = methods.get("adam")
-    if adam is not None:
-        as_low = _written(adam["seconds_to_paper"], ".2f")
-        lines.append(
-            f"adam: lowest energy after {adam['steps_to_lowest']:.0f} steps, "
-            f"{adam['seconds_to_lowest']:.2f} s; as low as paper's after {as_low} s"
-        )
+    if "adam" in methods:
+        lines.append(_adam_line(methods["adam"], measured["num_pairs"]))
     windows = {name: row["window"] for name, row in methods.items() if row["window"] is not None}
     if windows:
         some = next(iter(windows.values()))
@@ -123,6 +118,19 @@ def flow_table(measured: Mapping[str, Any]) -> str:
         perfect = {"(truth)": measured["truth"]} if measured["truth"] else {}
         lines += ["", _table({**windows, **perfect}, (*columns, *known))]
     return "\n".join(lines)
+
+
+def _adam_line(row: Mapping[str, Any], num_pairs: int) -> str:
+    line = (
+        f"adam: lowest energy after {row['steps_to_lowest']:.0f} steps, "
+        f"{row['seconds_to_lowest']:.2f} s"
+    )
+    if "seconds_to_paper" in row:
+        line += (
+            f"; as low as paper ends after {_written(row['seconds_to_paper'], '.2f')} s, on "
+            f"{row['pairs_as_low_as_paper']} of {num_pairs} pairs"
+        )
+    return line
 
 
 def _table(rows: Mapping[str, Any], columns: Sequence[Column]) -> str:
