@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import gc
 import re
 from pathlib import Path
@@ -16,9 +17,10 @@ _RESET_PEAK = "5"  # proc(5): sets the peak resident set size to the current one
 class PeakMemory(NamedTuple):
     """The rise of the process's peak resident memory since `start`, exact to the page.
 
-    Memory that earlier work freed but the allocator kept is used again without a rise, so this is
-    a lower bound of what the work would need in a process of its own. Nothing is known, and None
-    returned, where there is no Linux ``/proc`` that may be written to.
+    What earlier work freed is given back first, as far as the C library can; what it keeps is used
+    again without a rise, so this is a lower bound of what the work would need in a process of its
+    own. Nothing is known, and None returned, where there is no Linux ``/proc`` that may be written
+    to.
     """
 
     before_mb: float | None
@@ -26,6 +28,7 @@ class PeakMemory(NamedTuple):
     @staticmethod
     def start() -> PeakMemory:
         gc.collect()
+        _give_back()
         try:
             _CLEAR_REFS.write_text(_RESET_PEAK)
             return PeakMemory(_status_mb("VmRSS"))
@@ -37,6 +40,14 @@ class PeakMemory(NamedTuple):
             return None
         peak_mb = _status_mb("VmHWM")
         return None if peak_mb is None else max(0.0, peak_mb - self.before_mb)
+
+
+def _give_back() -> None:
+    """Freed memory back to the system, where the C library is glibc."""
+    try:
+        ctypes.CDLL(None).malloc_trim(0)
+    except (OSError, AttributeError, TypeError):  # another C library, or none to load by that name
+        return
 
 
 def _status_mb(name: str) -> float | None:

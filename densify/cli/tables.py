@@ -100,10 +100,11 @@ def flow_table(measured: Mapping[str, Any]) -> str:
     """One benchmark of flow: the methods on the pairs, and what they make of the window."""
     methods: Mapping[str, Any] = measured["methods"]
     frames, cap = measured["frames"], measured["max_points"]
+    pairs = "1 pair" if measured["num_pairs"] == 1 else f"{measured['num_pairs']} pairs"
     drawn = f"at most {cap:,} drawn points" if cap else "all points"
     lines = [
         f"{measured['data']}, key {measured['key']}, frames {frames[0]}-{frames[-1]}: "
-        f"{measured['num_pairs']} pairs of {measured['points_above_ground']:,} points above the "
+        f"{pairs} of {measured['points_above_ground']:,} points above the "
         f"ground; paper, adam, nicp move {drawn}; E is the paper's energy on those points",
         _table(methods, _METHOD_COLUMNS),
     ]
