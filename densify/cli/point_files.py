@@ -75,12 +75,12 @@ def read_points(path: Path) -> PointFile:
     return PointFile(points, **_columns(path, beside, len(points)))
 
 
-def check_new_file(path: Path, overwrite: bool) -> None:
+def check_new_file(path: Path, overwrite: bool, suffix: str = ".npz") -> None:
     """Raise InputError, before the computation, if ``path`` is there already or cannot be made."""
-    if path.suffix != ".npz":
-        raise InputError(f"--out {path}: expected a name that ends in .npz")
+    if path.suffix != suffix:
+        raise InputError(f"--out {path}: expected a name that ends in {suffix}")
     if path.is_dir():
-        raise InputError(f"--out {path}: is a folder, expected the name of an .npz file")
+        raise InputError(f"--out {path}: is a folder, expected the name of a {suffix} file")
     if path.exists() and not overwrite:
         raise InputError(f"--out {path}: already there and kept; give --overwrite or another name")
     place = path.parent
