@@ -29,6 +29,8 @@ _SHARE_UNSEEN = 0.5  # of the points a sweep usually shows
 _MANY_POINTS = 100  # more do not place a sweep better
 _PREDICTION_STD = np.array([0.3, 0.3, 0.06])  # m, m, rad
 _STEADY = np.array([1.0, 1.0, 1.0, 0.9])  # of a rate lasts: turns level out
+_ROUGH_M, _ROUGH_PER_GAP, _ROUGH_PER_STEP = 0.04, 0.2, 0.03  # by gap of rings, way per sweep
+_LEAST_WAY_M, _LEAST_WAY_PER_RESIDUAL = 0.35, 8.0
 _NUM_ASKED = 60
 _MISSES_ALLOWED = 1
 _MAX_CONTRADICTIONS = 0.3  # of those that standing still leaves
@@ -286,9 +288,8 @@ def _prove(
     step_m = travelled / (seen[-1] - seen[0])
     start = space.origin[next(iter(track.states))]
     range_m = float(np.linalg.norm((track.centre - start)[:2]))
-    if residual_m > 0.04 + 0.0015 * range_m + 0.03 * step_m or travelled < max(
-        0.35, 8 * residual_m
-    ):
+    rough_m = _ROUGH_M + _ROUGH_PER_GAP * space.ring_step_rad * range_m + _ROUGH_PER_STEP * step_m
+    if residual_m > rough_m or travelled < max(_LEAST_WAY_M, _LEAST_WAY_PER_RESIDUAL * residual_m):
         return False
     still, moved = _contradictions(track, standing, space, sweep_time_s)
     return moved <= _MAX_CONTRADICTIONS * still
