@@ -107,8 +107,8 @@ class FlowSettings(Section):
 
     engine: str = knob(
         "groups",
-        "groups: rigid groups of points whose motion is proven; paper: the published objective",
-        choices=("groups", "paper"),
+        "groups: groups of points whose motion is proven, rigid and softened; paper: the published "
+        "objective; npz:DIR: files of others, see the README",
     )
     min_height_m: float = knob(
         0.2,
@@ -160,6 +160,20 @@ class FlowSettings(Section):
         "auto", "of the objective; auto: CUDA where there is one", choices=("auto", "cpu", "cuda")
     )
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.engine not in ("groups", "paper") and not self.files:
+            raise InputError(
+                f"flow.engine: got {self.engine!r}, expected groups, paper or npz:DIR with the "
+                f"folder of flow files"
+            )
+
+    @property
+    def files(self) -> Path | None:
+        """The folder that ``engine`` names, if it names one."""
+        kind, _, folder = self.engine.partition(":")
+        return Path(folder) if kind == "npz" and folder else None
+
 
 @dataclass(frozen=True)
 class AccumulateSettings(Section):
@@ -210,6 +224,13 @@ class ProjectSettings(Section):
 
 
 @dataclass(frozen=True)
+class OutputSettings(Section):
+    """What is written beside the files that every run writes."""
+
+    flow: bool = knob(False, "flow/: scene flow of every sweep to the next one, as flow files")
+
+
+@dataclass(frozen=True)
 class Config:
     """The whole configuration; ``Config()`` is the default one. Sections mirror the stages."""
 
@@ -218,6 +239,7 @@ class Config:
     flow: FlowSettings = dataclasses.field(default_factory=FlowSettings)
     accumulate: AccumulateSettings = dataclasses.field(default_factory=AccumulateSettings)
     project: ProjectSettings = dataclasses.field(default_factory=ProjectSettings)
+    output: OutputSettings = dataclasses.field(default_factory=OutputSettings)
 
 
 def resolve(
@@ -369,7 +391,7 @@ def _checked(section: type[Section], key: str, value: Any, where: str) -> Any:
     if checked is not None:
         if choices is not None and checked in choices:
             return checked
-        if choices is None and (kind is bool or low <= checked <= high):
+        if choices is None and (kind in (bool, str) or low <= checked <= high):
             return checked
     if choices is not None:
         expected = f"one of {', '.join(choices)}"

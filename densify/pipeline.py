@@ -9,13 +9,17 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from densify import poses, scores
 from densify.config import Config, resolve
 from densify.errors import InputError
+from densify.flow.chained import ChainedMotion
+from densify.height_map import HeightMap
 from densify.range_image import RangeImage
+from densify.readers.flow_files import FlowFiles
 from densify.readers.window import choose_cameras, read_sweeps, recorded_trajectory, window_frames
 from densify.stages.accumulate import accumulate
 from densify.stages.colour import colour
@@ -31,18 +35,36 @@ from densify.types import (
     Float,
     FlowField,
     LidarSequence,
+    Motion,
     Progress,
     RegisteredSweep,
     Result,
     StageCost,
     Stretch,
+    StretchFlow,
     Sweep,
     Trajectory,
 )
 
-METHODS = ("none", "icp", "flow")
-"""The key sweep alone; registration only; registration and scene flow. Each is the baseline of the
-next."""
+
+class Method(NamedTuple):
+    """What is accumulated. all_sweeps: else the key sweep alone. engine: which flow, see
+    ``flow.engine``; None for none, "" for the configured one."""
+
+    all_sweeps: bool
+    engine: str | None
+    about: str
+
+
+METHODS = {
+    "none": Method(False, None, "the key sweep alone"),
+    "icp": Method(True, None, "registration only"),
+    "paper": Method(True, "paper", "registration and the published scene flow"),
+    "flow": Method(True, "", "registration and our scene flow"),
+}
+"""For `compare`. `run` takes all but ``paper``; each but the first is the baseline of the next."""
+
+_RUN = ("none", "icp", "flow")
 
 ConfigLike = Config | str | Path | Mapping[str, Any] | None
 
@@ -59,13 +81,16 @@ def run(
     """Densify one key.
 
     key: absolute frame number. window: sweeps on each side of it; cut at the ends of the recording,
-    with a warning. method: one of `METHODS`. cameras: names, all if None. config: what
-    `densify.config.resolve` takes. progress: called with (stage, done, total).
+    with a warning. method: none, icp or flow, see `METHODS`. cameras: names, all if None. config:
+    what `densify.config.resolve` takes. progress: called with (stage, done, total).
 
     The result carries its baselines. Raises InputError for what cannot be used, ComputationError
     where registration went wrong.
     """
-    return compare(sequence, key, window, cameras, config, progress, upto=method)[method]
+    if method not in _RUN:
+        raise InputError(f"--method {method}: expected one of {', '.join(_RUN)}")
+    methods = _RUN[: _RUN.index(method) + 1]
+    return compare(sequence, key, window, cameras, config, progress, methods)[method]
 
 
 def compare(
@@ -75,16 +100,16 @@ def compare(
     cameras: Sequence[str] | None = None,
     config: ConfigLike = None,
     progress: Progress | None = None,
-    upto: str = "flow",
+    methods: Sequence[str] = tuple(METHODS),
 ) -> dict[str, Result]:
-    """`METHODS` up to ``upto`` on the same registration, the last with the others as its baselines.
+    """Methods by name on the same registration, each with those before it as its baselines.
 
-    The rest as `run`.
+    methods: some of `METHODS`. The rest as `run`.
     """
-    if upto not in METHODS:
-        raise InputError(f"--method {upto}: expected one of {', '.join(METHODS)}")
+    for name in methods:
+        if name not in METHODS:
+            raise InputError(f"--methods {name}: expected some of {', '.join(METHODS)}")
     settings = resolve(config)
-    wanted = METHODS[: METHODS.index(upto) + 1]
     chosen = choose_cameras(sequence, cameras)
     frames, lead_in = window_frames(sequence, key, window, settings.register.num_lead_in)
     watch = _Watch(progress)
@@ -96,13 +121,23 @@ def compare(
         trajectory = _trajectory(sequence, sweeps, settings)
     with watch.stage("deskew"):
         stretch = deskew([s for s in sweeps if s.frame in frames], trajectory)
-    flow = _flow_to_key(stretch, key, settings, watch) if "flow" in wanted else ()
+    engines = [METHODS[name].engine for name in methods]
+    if any(engine is not None for engine in engines):
+        with watch.stage("ground"):
+            heights = ground(stretch, settings.ground)
 
     results: dict[str, Result] = {}
-    for method in wanted:
-        used = Stretch((stretch[key],)) if method == "none" else stretch
-        still = tuple(FlowField.zero(len(s.sweep)) for s in used.sweeps)
-        fields = flow if method == "flow" else still
+    for name, engine in zip(methods, engines, strict=True):
+        used = stretch if METHODS[name].all_sweeps else Stretch((stretch[key],))
+        fields = [FlowField.zero(len(s.sweep)) for s in used.sweeps]
+        steps: dict[tuple[int, int], FlowField] = {}
+        if engine is not None:
+            with watch.stage("flow"):
+                motion = _motion(stretch, heights, engine or settings.flow.engine, settings)
+                fields = [motion.flow(frame, key) for frame in stretch.frames]
+                if settings.output.flow:
+                    hops = _hops_to(key, stretch.frames)
+                    steps = {hop: motion.flow(*hop) for hop in hops}
         with watch.stage("accumulate"):
             cloud = accumulate(used, fields, key, settings.accumulate.unfollowed == "drop")
         origins = {f: stretch.T_target_source(key, f)[:3, 3] for f in used.frames}
@@ -118,8 +153,9 @@ def compare(
             cloud, depth[camera.name] = replace(cloud, rgb=rgb), seen
         with watch.stage("score"):
             metrics = _scores(sequence, stretch[key], cloud, depth)
-        results[method] = Result(
-            method, key, used.frames, cloud, depth, metrics, watch.costs(), dict(results)
+        results[name] = Result(
+            *(name, key, used.frames, cloud, depth, metrics, watch.costs(), dict(results)),
+            flow=StretchFlow(stretch, steps) if steps else None,
         )
     return results
 
@@ -147,15 +183,19 @@ def _trajectory(sequence: LidarSequence, sweeps: Sequence[Sweep], settings: Conf
     return register(straight, settings.register, rough)
 
 
-def _flow_to_key(
-    stretch: Stretch, key: int, settings: Config, watch: _Watch
-) -> tuple[FlowField, ...]:
-    """Of every sweep."""
-    with watch.stage("ground"):
-        heights = ground(stretch, settings.ground)
-    with watch.stage("flow"):
-        motion = estimate_motion(stretch, heights, settings.flow)
-        return tuple(motion.flow(frame, key) for frame in stretch.frames)
+def _motion(stretch: Stretch, heights: HeightMap, engine: str, settings: Config) -> Motion:
+    """By the engine, or from flow that others left on disk."""
+    flow = replace(settings.flow, engine=engine)
+    if flow.files is None:
+        return estimate_motion(stretch, heights, flow)
+    return ChainedMotion(stretch, FlowFiles(flow.files, stretch).step, flow.max_gap_m)
+
+
+def _hops_to(key: int, frames: Sequence[int]) -> list[tuple[int, int]]:
+    """Of every frame to the next one on the way to the key."""
+    before = [f for f in frames if f <= key]
+    after = [f for f in reversed(frames) if f >= key]
+    return [*pairwise(before), *pairwise(after)]
 
 
 def _exposure(

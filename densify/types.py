@@ -181,6 +181,14 @@ class Motion(Protocol):
 
 
 @dataclass(frozen=True)
+class StretchFlow:
+    """Flow between neighbouring sweeps of a stretch, by (frame, target frame)."""
+
+    stretch: Stretch
+    steps: Mapping[tuple[int, int], FlowField]
+
+
+@dataclass(frozen=True)
 class Cloud:
     """M accumulated points at the key's moment.
 
@@ -333,7 +341,8 @@ class Result:
     """One densified key.
 
     metrics: plain numbers, ready for JSON. baselines: the results of the simpler methods on the
-    same registration, by method.
+    same registration, by method. flow: of every sweep to the next one on the way to the key, where
+    asked for (``output.flow``).
     """
 
     method: str
@@ -344,3 +353,4 @@ class Result:
     metrics: Mapping[str, Any] = field(default_factory=dict)
     costs: tuple[StageCost, ...] = ()
     baselines: Mapping[str, Result] = field(default_factory=dict)
+    flow: StretchFlow | None = None

@@ -74,9 +74,16 @@ def _add_run(commands: Any) -> None:
 
 
 def _add_compare(commands: Any) -> None:
-    about = "the methods none, icp and flow side by side, on the same registration"
+    about = "methods side by side, on the same registration"
     parser = _add_verb(commands, "compare", verbs.compare, about, _config_epilog())
     _add_key_options(parser)
+    parser.add_argument(
+        "--methods",
+        type=_words,
+        metavar="NAME,…",
+        help="of none (the key sweep), icp (registration only), paper (the published scene flow), "
+        "flow (ours); default: all",
+    )
     _add_output_options(parser)
 
 
@@ -90,7 +97,7 @@ def _add_flow(commands: Any) -> None:
         "Point files: .npy (N,3 or more columns), .npz (array 'points'), .txt (columns), .bin "
         "(KITTI: float32 x y z reflectance). Where both are .npz and hold when each point was "
         "measured ('offset_ns', or 'time' in seconds) or by which scanner ('lidar'), that is used. "
-        "The result holds 'flow' (N,3) float32 metres, "
+        "The result holds 'residual_flow' (N,3) float32 metres, "
         "'moving' (N,) bool, 'instance' (N,) int32 (-1 none) and 'lost' (N,) bool, row by row as "
         "SOURCE.",
     )
@@ -207,6 +214,12 @@ def _add_key_options(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--data", metavar="SPEC", default="street", help=DATA_HELP)
     _add_camera(parser)
+    parser.add_argument(
+        "--flow",
+        metavar="ENGINE",
+        help="groups (ours), paper, or npz:DIR, flow files of another method "
+        "(short for --set flow.engine=ENGINE)",
+    )
     _add_config_options(parser)
 
 

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import io
 import os
 import tokenize
 import warnings
@@ -91,29 +90,17 @@ def check_new_file(path: Path, overwrite: bool, suffix: str = ".npz") -> None:
 
 
 def write_flow(path: Path, field: FlowField) -> None:
-    """Write ``flow`` (N,3) float32 metres, ``moving`` (N,) bool, ``instance`` (N,) int32 (-1 none)
-    and ``lost`` (N,) bool, row by row as the source file; where times are known ``to_reference``
-    (N,3) float32 metres too, see `FlowField`. Appears only when complete.
+    """Write the flow as `densify.output.flow_npz.flow_npz` does, row by row as the source file.
+    Appears only when complete.
 
     Raises InputError if it cannot be written.
     """
     from densify.output.atomic import write_file
+    from densify.output.flow_npz import flow_npz
 
-    beside: dict[str, Any] = {}
-    if field.to_reference is not None:
-        beside["to_reference"] = field.to_reference.astype(np.float32)
-    buffer = io.BytesIO()
-    np.savez_compressed(
-        buffer,
-        flow=field.displacement.astype(np.float32),
-        moving=field.moving,
-        instance=field.instance,
-        lost=field.lost,
-        **beside,
-    )
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        write_file(path, buffer.getvalue())
+        write_file(path, flow_npz(field))
     except OSError as error:
         raise InputError(f"--out {path}: cannot be written: {error.strerror or error}") from error
 

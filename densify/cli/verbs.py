@@ -25,7 +25,7 @@ _DEFAULT_KEY = 120  # of benches
 
 def run(options: argparse.Namespace) -> None:
     """Densify one key."""
-    config = resolve(options.config, options.overrides)
+    config = _config(options)
     from densify import pipeline
     from densify.cli.tables import summary
     from densify.output import check_writable, write_result
@@ -56,8 +56,8 @@ def run(options: argparse.Namespace) -> None:
 
 
 def compare(options: argparse.Namespace) -> None:
-    """The three methods side by side."""
-    config = resolve(options.config, options.overrides)
+    """Methods side by side."""
+    config = _config(options)
     from densify import pipeline
     from densify.cli.tables import comparison
     from densify.output import check_writable, write_comparison
@@ -67,11 +67,17 @@ def compare(options: argparse.Namespace) -> None:
     sequence = open_sequence(options.data)
     with progress_on_stderr() as progress:
         results = pipeline.compare(
-            sequence, options.key, options.window, options.cameras, config, progress
+            sequence,
+            options.key,
+            options.window,
+            options.cameras,
+            config,
+            progress,
+            options.methods or tuple(pipeline.METHODS),
         )
     paths = write_comparison(
         results,
-        _images(sequence, results["none"]),
+        _images(sequence, next(iter(results.values()))),
         options.out,
         config=as_mapping(config),
         data=options.data,
@@ -158,6 +164,11 @@ def bench_flow(options: argparse.Namespace) -> None:
     if options.out is not None:
         write_table(options.out, {"runs": runs, "config": as_mapping(config)})
         _print_paths([options.out])
+
+
+def _config(options: argparse.Namespace) -> densify.Config:
+    engine = [] if options.flow is None else [f"flow.engine={options.flow}"]
+    return resolve(options.config, [*options.overrides, *engine])
 
 
 def _images(sequence: LidarSequence, result: Result) -> Mapping[str, NDArray[np.uint8]]:

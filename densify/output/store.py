@@ -38,6 +38,7 @@ from densify.output.atomic import staged_folder, write_file
 from densify.output.cloud_laz import write_cloud
 from densify.output.depth_png import write_confidence_png, write_depth_png
 from densify.output.figure import draw_figure
+from densify.output.flow_npz import write_flow_files
 from densify.output.png import Picture, write_picture
 from densify.types import Result
 
@@ -48,7 +49,7 @@ SCHEMA_VERSION = 1
 
 _OWNED: Mapping[Verb, tuple[str, ...]] = {
     "run": (
-        *("depth", "depth_filled", "confidence"),
+        *("depth", "depth_filled", "confidence", "flow"),
         *("cloud.laz", "metrics.json", "figure.png", "run.yaml"),
     ),
     "compare": ("compare.json", "compare.png"),
@@ -118,6 +119,8 @@ def write_result(
             path = folder / "confidence" / f"{name}.png"
             write_confidence_png(path, depth.confidence, depth.filled_m)
         write_cloud(folder / "cloud.laz", result.cloud)
+        if result.flow is not None:
+            write_flow_files(folder / "flow", result.flow)
         _write_json(
             folder / "metrics.json",
             {

@@ -1,0 +1,125 @@
+# SPDX-License-Identifier: MIT
+"""Flow files: scene flow between two sweeps on disk, ours or another method's.
+
+``000119_000120.npz`` holds the flow of the points of sweep 119 to the time of sweep 120::
+
+    residual_flow  (N,3) metres, without the ego motion: 0 for what stands still; in the lidar frame
+                   of the source sweep, or, instead of it,
+    total_flow     (N,3) metres with the ego motion: from the point in the source's lidar frame to
+                   where it is in the target's (then our registration takes the ego motion out)
+    row            (N,) row of each point in the source sweep's file; without it N is their number
+    moving         (N,) bool; without it everything with a residual flow of 5 cm or more
+    instance       (N,) which moving object, -1 none; without it none
+    to_reference   (N,3) metres, own motion from the point's firing to the sweep's reference time;
+                   without it 0
+"""
+
+from __future__ import annotations
+
+import zipfile
+import zlib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from densify import poses
+from densify.errors import InputError
+from densify.types import FlowField, Stretch
+
+MOVES_M = 0.05
+
+
+class FlowFiles:
+    """The flow files of a folder, for the sweeps of a stretch.
+
+    Raises InputError for a folder that is not there.
+    """
+
+    def __init__(self, folder: Path, stretch: Stretch) -> None:
+        if not folder.is_dir():
+            raise InputError(f"flow.engine npz:{folder}: no such folder; expected flow files in it")
+        self._folder, self._stretch = folder, stretch
+
+    def step(self, here: int, there: int) -> FlowField:
+        """Flow of sweep number ``here`` to number ``there``; points of other rows do not move.
+
+        Raises InputError for a file that is missing, damaged, or of another form.
+        """
+        frame, target = (self._stretch.frames[i] for i in (here, there))
+        path = self._folder / f"{frame:06d}_{target:06d}.npz"
+        arrays = _load(path)
+        row = self._stretch.sweeps[here].sweep.row
+        at, known = _matched(path, arrays, row)
+
+        def column(name: str, width: int | None, default: Any) -> NDArray[Any]:
+            found = np.full(len(row) if width is None else (len(row), width), default)
+            if name in arrays:
+                found[known] = arrays[name][at]
+            return found
+
+        residual = column("residual_flow", 3, 0.0)
+        if "residual_flow" not in arrays:
+            points = self._stretch.sweeps[here].sweep.points
+            moved = points + column("total_flow", 3, 0.0)
+            back = poses.transform(self._stretch.T_target_source(frame, target), moved)
+            residual[known] = (back - points)[known]
+        moving = column("moving", None, False)
+        if "moving" not in arrays:
+            moving = np.linalg.norm(residual, axis=1) >= MOVES_M
+        residual[~moving] = 0.0
+        return FlowField(
+            residual,
+            moving,
+            column("instance", None, np.int32(-1)),
+            np.zeros(len(row), bool),
+            column("to_reference", 3, 0.0) if "to_reference" in arrays else None,
+        )
+
+
+def _matched(
+    path: Path, arrays: dict[str, NDArray[Any]], row: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+    """For each point of the sweep that the file knows its place there, and which those are."""
+    num_points = len(next(iter(arrays.values())))
+    rows = arrays.get("row", np.arange(num_points))
+    if "row" not in arrays and len(row) and row.max() >= num_points:
+        raise InputError(
+            f"{path}: holds {num_points} points, expected one for each row of the sweep's file "
+            f"(more than {row.max()}); add their 'row' where some are left out"
+        )
+    place = np.full(int(max(rows.max(initial=0), row.max(initial=0))) + 1, -1, np.int64)
+    place[rows] = np.arange(num_points)
+    found = place[row]
+    return found[found >= 0], found >= 0
+
+
+def _load(path: Path) -> dict[str, NDArray[Any]]:
+    if not path.is_file():
+        raise InputError(f"{path}: no such flow file; expected one for every step to the key")
+    try:
+        with np.load(path, allow_pickle=False) as loaded:
+            arrays = {name: loaded[name] for name in loaded}
+    except (OSError, ValueError, EOFError, RuntimeError, zipfile.BadZipFile, zlib.error) as error:
+        raise InputError(f"{path}: not a readable .npz flow file: {error}") from error
+    if "residual_flow" not in arrays and "total_flow" not in arrays:
+        raise InputError(
+            f"{path}: holds the arrays {', '.join(arrays) or 'none'}, expected residual_flow or "
+            f"total_flow"
+        )
+    num_points = len(np.atleast_1d(next(iter(arrays.values()))))
+    wide = ("residual_flow", "total_flow", "to_reference")
+    known = (*wide, "row", "moving", "instance")
+    for name in known:
+        if name not in arrays:
+            continue
+        shape = (num_points, 3) if name in wide else (num_points,)
+        if arrays[name].shape != shape or arrays[name].dtype.kind not in "fiub":
+            raise InputError(
+                f"{path}: array {name}: got shape {arrays[name].shape} of {arrays[name].dtype}, "
+                f"expected numbers of shape {shape}"
+            )
+        if not np.isfinite(arrays[name]).all():
+            raise InputError(f"{path}: array {name}: got NaN or infinite, expected finite numbers")
+    return {name: arrays[name] for name in known if name in arrays}
