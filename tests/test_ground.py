@@ -82,7 +82,7 @@ def test_a_roof_is_not_ground(heights):
     assert roof.sum() > 50
     assert found[roof].min() > 0.7
     # how the grid's cells happen to lie on its edges counts for centimetres
-    assert np.median(np.abs(found - true)[roof]) < 0.12
+    assert np.median(np.abs(found - true)[roof]) < 0.15
 
 
 def with_points(stretch: Stretch, frame: int, points: np.ndarray) -> Stretch:
@@ -159,7 +159,7 @@ def test_under_follows_a_plane_and_stays_at_the_edge_beyond_it():
 
 
 def test_many_and_few_returns_find_the_same_ground():
-    """The lowest of many is lower than the lowest of few: what drives from near to far would climb."""
+    """The lowest of many is lower than the lowest of few: who drives from near to far would climb."""
     rng = np.random.default_rng(1)
     xy = rng.uniform([-15, -10], [15, 10], (60000, 2))
     many = xy[:, 0] < 0
