@@ -117,10 +117,14 @@ class FlowSettings(Section):
         0.02,
         2,
     )
+    soft: bool = knob(
+        True,
+        "objects bend about their rigid motion (swinging limbs) as far as held-out sweeps confirm",
+    )
     solver: str = knob(
         "pcg",
-        "of the objective (engine paper, densify flow). pcg: conjugate gradients, fast; adam: "
-        "1,500 steps as published",
+        "of the objective (engine paper, or densify flow without static_prior). pcg: conjugate "
+        "gradients, fast; adam: 1,500 steps as published",
         choices=("pcg", "adam"),
     )
     alpha: float = knob(

@@ -113,6 +113,11 @@ class ScannerImage:
         )
 
     @property
+    def row_step_rad(self) -> float:
+        """Angle between neighbouring rows, mostly that between neighbouring rings."""
+        return float(np.median(np.diff(self.row_edges_rad)))
+
+    @property
     def tables(self) -> tuple[NDArray[Any], ...]:
         """What `densify.kernels.rays.see_through` looks points up in."""
         return (

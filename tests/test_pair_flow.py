@@ -15,8 +15,9 @@ from densify.flow import pair as pair_module
 from densify.flow.pair import estimate_flow
 
 MOVED = np.array([0.8, 0.1, 0.0])
-ROW_SUM_ZERO = {"flow": {"laplacian": "row-sum-zero"}}
+ROW_SUM_ZERO = {"flow": {"engine": "paper", "laplacian": "row-sum-zero"}}
 EVERYTHING = {"flow": {"static_prior": False}}
+PAPER = {"flow": {"engine": "paper"}}
 
 
 def walls(rng: np.random.Generator) -> np.ndarray:
@@ -69,7 +70,9 @@ def test_noise_is_no_motion(pair):
     assert not field.moving.any() and not field.displacement.any()
 
 
-@pytest.mark.parametrize("config", [None, ROW_SUM_ZERO], ids=["symmetric", "row-sum-zero"])
+@pytest.mark.parametrize(
+    "config", [None, PAPER, ROW_SUM_ZERO], ids=["groups", "paper", "paper, row-sum-zero"]
+)
 def test_a_box_moves_between_walls_that_do_not(pair, config):
     source, target, moved = pair
     field = estimate_flow(source, target, config)
@@ -115,9 +118,9 @@ def test_without_the_prior_everything_may_move(pair):
 
 
 def test_the_prior_only_chooses(pair):
-    """Where it lets points move, they take the objective's flow."""
+    """Of the published objective, where it lets points move, they take its flow."""
     source, target, _ = pair
-    proven = estimate_flow(source, target)
+    proven = estimate_flow(source, target, PAPER)
     free = estimate_flow(source, target, EVERYTHING)
     assert proven.moving.any()
     assert np.array_equal(proven.displacement[proven.moving], free.displacement[proven.moving])
@@ -134,7 +137,7 @@ def test_initial_is_where_it_starts(sense):
     moved = np.arange(len(source)) >= len(still)
     initial = np.where(moved[:, None], sense * (far - [0.2, 0, 0]), 0.0)
     field = estimate_flow(source, target, initial=initial)
-    assert field.moving[moved].mean() > 0.9 and not field.moving[~moved].any()
+    assert field.moving[moved].mean() > 0.85 and not field.moving[~moved].any()
     assert np.abs(np.median(field.displacement[moved], 0) - sense * far).max() < 0.2
 
 
@@ -209,7 +212,7 @@ def test_the_configuration_reaches_the_objective(monkeypatch):
         "radius_m": 1.5,
         "laplacian": "row-sum-zero",
     }
-    estimate_flow(CLOUD, CLOUD, {"flow": {**flow, "device": "cuda"}})
+    estimate_flow(CLOUD, CLOUD, {"flow": {**flow, "engine": "paper", "device": "cuda"}})
     assert {name: getattr(asked["settings"], name) for name in flow} == flow
     assert asked["device"] == "cuda"
 
@@ -218,4 +221,4 @@ def test_a_device_that_is_not_there_is_refused():
     if torch.cuda.is_available():
         pytest.skip("there is a CUDA device")
     with pytest.raises(InputError, match="cuda"):
-        estimate_flow(CLOUD, CLOUD, {"flow": {"device": "cuda"}})
+        estimate_flow(CLOUD, CLOUD, {"flow": {"engine": "paper", "device": "cuda"}})

@@ -32,6 +32,7 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     _add_flow(commands)
     _add_info(commands)
     _add_simulate(commands)
+    _add_bench(commands)
     return parser.parse_args(arguments)
 
 
@@ -87,7 +88,9 @@ def _add_flow(commands: Any) -> None:
         verbs.flow,
         about,
         "Point files: .npy (N,3 or more columns), .npz (array 'points'), .txt (columns), .bin "
-        "(KITTI: float32 x y z reflectance). The result holds 'flow' (N,3) float32 metres, "
+        "(KITTI: float32 x y z reflectance). Where both are .npz and hold when each point was "
+        "measured ('offset_ns', or 'time' in seconds) or by which scanner ('lidar'), that is used. "
+        "The result holds 'flow' (N,3) float32 metres, "
         "'moving' (N,) bool, 'instance' (N,) int32 (-1 none) and 'lost' (N,) bool, row by row as "
         "SOURCE.",
     )
@@ -129,6 +132,65 @@ def _add_simulate(commands: Any) -> None:
         "--frames", type=_frames, metavar="A:B", help="frames A to B-1 only (default: all)"
     )
     _add_camera(parser)
+    _add_overwrite(parser)
+
+
+def _add_bench(commands: Any) -> None:
+    about = "measured tables: this package's methods beside published ones"
+    parser = commands.add_parser("bench", help=about, description=f"{about.capitalize()}.")
+    benches = parser.add_subparsers(title="benches", metavar="WHAT", required=True)
+    _add_bench_flow(benches)
+
+
+def _add_bench_flow(benches: Any) -> None:
+    parser = _add_verb(
+        benches,
+        "flow",
+        verbs.bench_flow,
+        "scene flow methods on the same pairs and windows: error, energy, seconds, memory",
+        "Methods: window (ours, all sweeps), pair (ours, two clouds), paper (its objective, our "
+        "solver), adam (its objective, its solver, 1,500 steps: minutes), rigid, cluster-icp, "
+        "nicp (non-rigid ICP). Errors need a recording with truth, such as the built-in street.",
+    )
+    parser.add_argument(
+        "--data", metavar="SPEC", action="append", help=f"{DATA_HELP}; may be given several times"
+    )
+    parser.add_argument(
+        "--key",
+        type=_natural,
+        action="append",
+        dest="keys",
+        metavar="K",
+        help="frame in the middle; may be given several times (default: 120)",
+    )
+    parser.add_argument(
+        "--window",
+        type=_natural,
+        default=5,
+        metavar="W",
+        help="sweeps on each side of the key (default: 5)",
+    )
+    parser.add_argument(
+        "--methods",
+        type=_words,
+        metavar="NAME,…",
+        help="of those below, or all (default: all but adam)",
+    )
+    parser.add_argument(
+        "--pairs-only",
+        action="store_true",
+        help="one pair of sweeps for each key; nothing is accumulated",
+    )
+    parser.add_argument(
+        "--max-points",
+        type=_natural,
+        default=8000,
+        metavar="N",
+        help="points that paper, adam and nicp may move; more is slower and finer, 0: all "
+        "(default: 8000)",
+    )
+    _add_config_options(parser)
+    parser.add_argument("--out", metavar="FILE.json", type=Path, help="write every number there")
     _add_overwrite(parser)
 
 
@@ -197,6 +259,10 @@ def _natural(text: str) -> int:
     if not text.isascii() or not text.isdigit():
         raise argparse.ArgumentTypeError(f"got {text!r}, expected a whole number from 0 up")
     return int(text)
+
+
+def _words(text: str) -> list[str]:
+    return [word.strip() for word in text.split(",") if word.strip()]
 
 
 def _frames(text: str) -> range:

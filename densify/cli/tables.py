@@ -1,8 +1,10 @@
 # SPDX-License-Identifier: MIT
-"""What `run` and `compare` say on the screen. Reads `Result.metrics`:
+"""What `run`, `compare` and `bench` say on the screen. Reads `Result.metrics`:
 
 - ``ghosts``: `densify.scores.ghost_scores`;
-- ``depth``: camera -> `densify.scores.depth_scores`, where there is truth.
+- ``depth``: camera -> `densify.scores.depth_scores`, where there is truth;
+
+and for a benchmark of flow what `densify.bench.flow.bench_flow` returns.
 """
 
 from __future__ import annotations
@@ -66,6 +68,88 @@ def comparison(results: Mapping[str, Result]) -> str:
         if any(_look_up(result.metrics, "depth", name) for result in columns):
             rows += _truth_rows(columns, name)
     return _aligned(rows)
+
+
+Column = tuple[str, tuple[str, ...], str]
+"""Title, where the number lies in a method's row, and how it is written."""
+
+_METHOD_COLUMNS: tuple[Column, ...] = (
+    ("points", ("num_points",), ",d"),
+    ("movers", ("step", "movers_m"), ".3f m"),
+    ("/ ours", ("times_error",), ".1f"),
+    ("objects", ("step", "static_objects_m"), ".4f m"),
+    ("background", ("step", "background_m"), ".4f m"),
+    ("found", ("step", "found"), ".1%"),
+    ("false", ("step", "falsely_moving"), ".3%"),
+    ("E before", ("energy_before",), ".0f"),
+    ("E after", ("energy_after",), ".0f"),
+    ("seconds", ("seconds_per_pair",), ".3f"),
+    ("/ ours", ("times_seconds",), ".1f"),
+    ("memory", ("peak_memory_mb",), ".0f MB"),
+)
+_WINDOW_COLUMNS: tuple[Column, ...] = (
+    ("coverage", ("coverage",), ".3f"),
+    ("thickness", ("plane_residual_m",), ".4f m"),
+    ("extent", ("extent_m2",), ".1f m2"),
+    ("lost", ("lost",), ".1%"),
+    ("ghosts", ("ghost_rate",), ".2%"),
+)
+
+
+def flow_table(measured: Mapping[str, Any]) -> str:
+    """One benchmark of flow: the methods on the pairs, and what they make of the window."""
+    methods: Mapping[str, Any] = measured["methods"]
+    frames, cap = measured["frames"], measured["max_points"]
+    pairs = "1 pair" if measured["num_pairs"] == 1 else f"{measured['num_pairs']} pairs"
+    drawn = f"at most {cap:,} drawn points" if cap else "all points"
+    lines = [
+        f"{measured['data']}, key {measured['key']}, frames {frames[0]}-{frames[-1]}: "
+        f"{pairs} of {measured['points_above_ground']:,} points above the "
+        f"ground; paper, adam, nicp move {drawn}; E is the paper's energy on those points",
+        _table(methods, _METHOD_COLUMNS),
+    ]
+    if "adam" in methods:
+        lines.append(_adam_line(methods["adam"], measured["num_pairs"]))
+    windows = {name: row["window"] for name, row in methods.items() if row["window"] is not None}
+    if windows:
+        some = next(iter(windows.values()))
+        hops = some.get("movers_m_by_hops", {})
+        columns = [(f"{n} hops", ("movers_m_by_hops", n), ".3f m") for n in hops]
+        known = [c for c in _WINDOW_COLUMNS if c[1][0] in some]
+        perfect = {"(truth)": measured["truth"]} if measured["truth"] else {}
+        lines += ["", _table({**windows, **perfect}, (*columns, *known))]
+    return "\n".join(lines)
+
+
+def _adam_line(row: Mapping[str, Any], num_pairs: int) -> str:
+    line = (
+        f"adam: lowest energy after {row['steps_to_lowest']:.0f} steps, "
+        f"{row['seconds_to_lowest']:.2f} s"
+    )
+    if "seconds_to_paper" in row:
+        line += (
+            f"; as low as paper ends after {_written(row['seconds_to_paper'], '.2f')} s, on "
+            f"{row['pairs_as_low_as_paper']} of {num_pairs} pairs"
+        )
+    return line
+
+
+def _table(rows: Mapping[str, Any], columns: Sequence[Column]) -> str:
+    """One row per method; columns that say nothing of any are left out."""
+    told = [c for c in columns if any(_look_up(r, *c[1]) is not None for r in rows.values())]
+    body = [
+        [name, *(_written(_look_up(row, *path), form) for _, path, form in told)]
+        for name, row in rows.items()
+    ]
+    return _aligned([["", *(title for title, _, _ in told)], *body])
+
+
+def _written(value: float | None, form: str) -> str:
+    """By a format and, after a blank, a unit; percentages with a blank before the sign."""
+    if value is None:
+        return _NONE
+    number, _, unit = form.partition(" ")
+    return f"{value:{number}}".replace("%", " %") + (f" {unit}" if unit else "")
 
 
 def _truth_rows(columns: Sequence[Result], camera: str) -> list[list[str]]:

@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 
     from densify.types import LidarSequence, Result
 
+_DEFAULT_KEY = 120  # of benches
+
 
 def run(options: argparse.Namespace) -> None:
     """Densify one key."""
@@ -86,10 +88,16 @@ def flow(options: argparse.Namespace) -> None:
 
     check_new_file(options.out, options.overwrite)
     source, target = read_points(options.source), read_points(options.target)
-    field = densify.estimate_flow(source, target, config=config)
+    columns = {
+        f"{side}_{name}": getattr(file, name)
+        for name in ("offset_ns", "lidar")
+        if getattr(source, name) is not None and getattr(target, name) is not None
+        for side, file in (("source", source), ("target", target))
+    }
+    field = densify.estimate_flow(source.points, target.points, config, **columns)
     write_flow(options.out, field)
     num_moving = int(field.moving.sum())
-    print(f"{len(source):,} points, {num_moving:,} moving")
+    print(f"{len(source.points):,} points, {num_moving:,} moving")
     _print_paths([options.out])
 
 
@@ -114,6 +122,42 @@ def simulate(options: argparse.Namespace) -> None:
             street, options.out, frames, cameras, progress, overwrite=options.overwrite
         )
     print(f"{len(frames)} frames; open them with --data {drive}")
+
+
+def bench_flow(options: argparse.Namespace) -> None:
+    """Scene flow methods on the same pairs and windows."""
+    config = resolve(options.config, options.overrides)
+    from densify.bench import flow as bench
+    from densify.bench.table_file import write_table
+    from densify.cli.point_files import check_new_file
+    from densify.cli.tables import flow_table
+    from densify.readers import open_sequence
+
+    if options.out is not None:
+        check_new_file(options.out, options.overwrite, ".json")
+    methods = options.methods if options.methods is not None else bench.DEFAULT_METHODS
+    if list(methods) == ["all"]:
+        methods = tuple(bench.METHODS)
+    sequences = [open_sequence(spec) for spec in options.data or ["street"]]
+    runs = []
+    for sequence in sequences:
+        for key in options.keys or [_DEFAULT_KEY]:
+            with progress_on_stderr() as progress:
+                measured = bench.bench_flow(
+                    sequence,
+                    key,
+                    options.window,
+                    config,
+                    methods,
+                    options.pairs_only,
+                    options.max_points,
+                    progress,
+                )
+            runs.append(measured)
+            print(flow_table(measured) + "\n", flush=True)
+    if options.out is not None:
+        write_table(options.out, {"runs": runs, "config": as_mapping(config)})
+        _print_paths([options.out])
 
 
 def _images(sequence: LidarSequence, result: Result) -> Mapping[str, NDArray[np.uint8]]:

@@ -52,7 +52,7 @@ class FreeSpace:
     @property
     def ring_step_rad(self) -> float:
         """Angle between neighbouring rings of the (coarsest) scanner."""
-        return max(s.elevation_step_rad for i in self.images for s in i.scanners)
+        return max(s.row_step_rad for i in self.images for s in i.scanners)
 
     def others(self, i: int) -> list[int]:
         """The sweeps around sweep number i that tell about it: from where others were taken long

@@ -3,7 +3,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,9 +19,10 @@ from densify.flow.evidence import (
     firing_times_s,
     reference_times_s,
 )
+from densify.flow.soften import Part, Softened, soften
 from densify.flow.tracks import Track, follow_groups
 from densify.height_map import HeightMap
-from densify.types import Bool, Float, Float32, FlowField, Stretch
+from densify.types import Bool, Float, Float32, FlowField, Int, Stretch
 
 _ATTACH_M = 0.3
 _ATTACH_UNSEEN_M = 0.15
@@ -39,12 +41,14 @@ _GAPS_REACHED_UNSEEN = 0.5
 class GroupMotion:
     """What moves in a stretch: a `densify.types.Motion`.
 
-    instance: per sweep (N,) int32, index of the point's track, -1 none.
+    instance: per sweep (N,) int32, index of the point's track, -1 none. bendings: of the tracks
+    that are not rigid, by index.
     """
 
     stretch: Stretch
     tracks: tuple[Track, ...]
     instance: tuple[NDArray[np.int32], ...]
+    bendings: Mapping[int, Bending]
 
     def flow(self, frame: int, target: int) -> FlowField:
         """Of every point of a sweep to another sweep's reference time; both by frame number.
@@ -60,10 +64,16 @@ class GroupMotion:
         lost = np.zeros(len(instance), bool)
         for k in np.unique(instance[instance >= 0]):
             track, mine = self.tracks[k], np.flatnonzero(instance == k)
-            at_firing = poses.transform(registered.T_world_lidar, registered.sweep.points[mine])
-            at_reference = track.carry(at_firing, seen_s[mine], time_s[here])
-            arrived = track.carry(at_reference, time_s[here], time_s[there])
-            to_reference[mine] = (at_reference - at_firing) @ R_lidar_world.T
+            measured = poses.transform(registered.T_world_lidar, registered.sweep.points[mine])
+            body = track.undo(measured, seen_s[mine])
+            at_reference, arrived = body, body
+            if k in self.bendings:
+                at_reference, arrived = self.bendings[k].carry(
+                    here, there, time_s[here], seen_s[mine]
+                )
+            at_reference = track.place(at_reference, time_s[here])
+            arrived = track.place(arrived, time_s[there])
+            to_reference[mine] = (at_reference - measured) @ R_lidar_world.T
             displacement[mine] = (arrived - at_reference) @ R_lidar_world.T
             velocity_m_s[mine] = track.velocity_m_s(arrived, time_s[there]) @ R_lidar_world.T
             seen = sorted(track.claimed)
@@ -71,30 +81,81 @@ class GroupMotion:
         return FlowField(displacement, instance >= 0, instance, lost, to_reference, velocity_m_s)
 
 
-def follow(stretch: Stretch, ground: HeightMap, min_height_m: float) -> GroupMotion:
+@dataclass(frozen=True)
+class Bending:
+    """How one object departs from its rigid motion. sweeps: the index of the sweep that each part
+    of ``softened`` is from."""
+
+    sweeps: tuple[int, ...]
+    softened: Softened
+
+    def carry(
+        self, here: int, there: int, reference_s: float, seen_s: Float
+    ) -> tuple[Float, Float]:
+        """The points of sweep number ``here`` in the object's own frame, at that sweep's reference
+        time and at that of sweep number ``there``, or of the nearest that shows the object."""
+        n = self.sweeps.index(here)
+        m = min(range(len(self.sweeps)), key=lambda p: abs(self.sweeps[p] - there))
+        points = self.softened.parts[n].points
+        at_reference = points + self.softened.velocity_m_s(n) * (reference_s - seen_s)[:, None]
+        return at_reference, at_reference + self.softened.carry(n, m) - points
+
+
+def follow(stretch: Stretch, ground: HeightMap, min_height_m: float, soft: bool) -> GroupMotion:
     """Find everything in the stretch that certainly moves.
 
-    min_height_m: points lower above the ground start no motion.
+    min_height_m: points lower above the ground start no motion. soft: objects may bend.
     """
     space = FreeSpace.of(stretch)
     standing = find_candidates(stretch, space, ground, min_height_m)
     time_s = reference_times_s(stretch)
     tracks = follow_groups(standing, space, ground, time_s)
     shapes = [_shape(track, standing) for track in tracks]
-    instance = []
-    for i in range(len(stretch.sweeps)):
+
+    def members(i: int) -> NDArray[np.int32]:
         seen = _Seen.of(stretch, i, ground, standing[i], space.ring_step_rad)
-        found = _attach(seen, i, tracks, shapes, time_s, min_height_m)
-        _lengthen(found, seen, i, tracks, shapes, time_s, space)
-        instance.append(found)
-    return GroupMotion(stretch, tuple(tracks), tuple(instance))
+        attached = _attach(seen, i, tracks, shapes, time_s, min_height_m)
+        _lengthen(attached, seen, i, tracks, shapes, time_s, space)
+        instance = np.full(len(stretch.sweeps[i].sweep), -1, np.int32)
+        instance[seen.row] = attached
+        return instance
+
+    with ThreadPoolExecutor() as pool:
+        instance = tuple(pool.map(members, range(len(stretch.sweeps))))
+    bendings = _bendings(stretch, tracks, instance) if soft else {}
+    return GroupMotion(stretch, tuple(tracks), instance, bendings)
+
+
+def _bendings(
+    stretch: Stretch, tracks: Sequence[Track], instance: Sequence[NDArray[np.int32]]
+) -> dict[int, Bending]:
+    """Of the objects that certainly bend."""
+
+    def of_track(k: int) -> Bending:
+        parts, sweeps = [], []
+        for i, registered in enumerate(stretch.sweeps):
+            mine = np.flatnonzero(instance[i] == k)
+            if len(mine):
+                at = poses.transform(registered.T_world_lidar, registered.sweep.points[mine])
+                seen_s = firing_times_s(stretch, i)[mine]
+                parts.append(Part(tracks[k].undo(at, seen_s), float(seen_s.mean())))
+                sweeps.append(i)
+        return Bending(tuple(sweeps), soften(parts))
+
+    with ThreadPoolExecutor() as pool:
+        found = dict(enumerate(pool.map(of_track, range(len(tracks)))))
+    return {k: bending for k, bending in found.items() if np.isfinite(bending.softened.alpha)}
 
 
 @dataclass(frozen=True)
 class _Seen:
-    """All points of a sweep. points: (N,3) world. time_s: (N,) when measured. reach_m: (N,) how
-    close a point must be to an object's shape to belong to it."""
+    """The points of a sweep that may belong to something.
 
+    row: (N,) in the sweep. points: (N,3) world. time_s: (N,) when measured. height_m: (N,) above
+    the ground. reach_m: (N,) how close a point must be to an object's shape to belong to it.
+    """
+
+    row: Int
     points: Float
     time_s: Float
     height_m: Float32
@@ -105,18 +166,14 @@ class _Seen:
         stretch: Stretch, i: int, ground: HeightMap, standing: Standing, ring_step_rad: float
     ) -> _Seen:
         registered = stretch.sweeps[i]
-        points = registered.sweep.points
-        gap_m = ring_step_rad * np.linalg.norm(points, axis=1)
+        points = poses.transform(registered.T_world_lidar, registered.sweep.points)
+        height_m = ground.above(points)
+        row = np.flatnonzero(height_m > _MIN_HEIGHT_M)
+        gap_m = ring_step_rad * np.linalg.norm(registered.sweep.points, axis=1)
         reach_m = np.maximum(_ATTACH_UNSEEN_M, _GAPS_REACHED_UNSEEN * gap_m)
-        rows = standing.row[standing.candidate]
-        reach_m[rows] = np.maximum(_ATTACH_M, _GAPS_REACHED * gap_m[rows])
-        in_world = poses.transform(registered.T_world_lidar, points)
-        return _Seen(
-            in_world,
-            firing_times_s(stretch, i),
-            ground.above(in_world),
-            reach_m,
-        )
+        seeded = standing.row[standing.candidate]
+        reach_m[seeded] = np.maximum(_ATTACH_M, _GAPS_REACHED * gap_m[seeded])
+        return _Seen(row, points[row], firing_times_s(stretch, i)[row], height_m[row], reach_m[row])
 
 
 def _shape(track: Track, standing: Sequence[Standing]) -> Float:
@@ -137,7 +194,7 @@ def _attach(
     time_s: Float,
     min_height_m: float,
 ) -> NDArray[np.int32]:
-    """(N,): the track each point of sweep number i belongs to, -1 none.
+    """(N,): the track each of the points seen by sweep number i belongs to, -1 none.
 
     A point belongs to a track where it is close to the object's points of all sweeps, or stands
     within their outline: nothing else can be where a solid object is.
@@ -151,9 +208,7 @@ def _attach(
         shape = track.carry(shapes[k], track.path.begin_s, at_s)
         low, high = shape.min(0) - 2 * _ATTACH_M, shape.max(0) + 2 * _ATTACH_M
         low[2] -= 1.0  # down to the wheels
-        rows = np.flatnonzero(
-            ((seen.points > low) & (seen.points < high)).all(1) & (seen.height_m > _MIN_HEIGHT_M)
-        )
+        rows = np.flatnonzero(((seen.points > low) & (seen.points < high)).all(1))
         if not len(rows):
             continue
         at_once = track.carry(seen.points[rows], seen.time_s[rows], at_s)
@@ -189,7 +244,7 @@ def _lengthen(
         shape = track.carry(shapes[k], track.path.begin_s, at_s)
         side = (shape[:, :2] @ axes)[:, 1]
         near = np.abs(seen.points[:, :2] - shape[:, :2].mean(0)).max(1) < 1.5 * _LENGTH_M
-        rows = np.flatnonzero(near & (instance < 0) & (seen.height_m > _MIN_HEIGHT_M))
+        rows = np.flatnonzero(near & (instance < 0))
         at_once = track.carry(seen.points[rows], seen.time_s[rows], at_s)
         along = at_once[:, :2] @ axes
         fits = (along[:, 1] > side.min() - _SIDE_M) & (along[:, 1] < side.max() + _SIDE_M)

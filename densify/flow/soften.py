@@ -70,6 +70,15 @@ class Softened:
     alpha: float
     held_out_m: dict[float, float]
 
+    def velocity_m_s(self, i: int) -> Float:
+        """(n,3) of part i's points about the rigid motion: the mean of before and after."""
+        velocities = [np.zeros_like(self.parts[i].points)]
+        for j, moved in ((i + 1, self.to_next[i]), (i - 1, self.to_previous[i])):
+            if 0 <= j < len(self.parts):
+                velocities.append(moved / (self.parts[j].time_s - self.parts[i].time_s))
+        mean: Float = np.mean(velocities[1:] or velocities, axis=0)
+        return mean
+
     def carry(self, i: int, j: int) -> Float:
         """(n,3) the points of part i where they are at part j's time, by way of the parts between:
         at each a point goes on as the nearest do that came the same way."""

@@ -29,6 +29,8 @@ _SHARE_UNSEEN = 0.5  # of the points a sweep usually shows
 _MANY_POINTS = 100  # more do not place a sweep better
 _PREDICTION_STD = np.array([0.3, 0.3, 0.06])  # m, m, rad
 _STEADY = np.array([1.0, 1.0, 1.0, 0.9])  # of a rate lasts: turns level out
+_ROUGH_M, _ROUGH_PER_GAP, _ROUGH_PER_STEP = 0.04, 0.2, 0.03  # by gap of rings, way per sweep
+_LEAST_WAY_M, _LEAST_WAY_PER_RESIDUAL = 0.35, 8.0
 _NUM_ASKED = 60
 _MISSES_ALLOWED = 1
 _MAX_CONTRADICTIONS = 0.3  # of those that standing still leaves
@@ -52,13 +54,23 @@ class Track:
 
     def carry(self, points: Float, from_s: float | Float, to_s: float | Float) -> Float:
         """(N,3) points of the object at one time -> at another, world; one time or one each."""
-        there = undo(self.path(from_s), points, self.centre)
-        return apply(self.path(to_s), there, self.centre)
+        return self.place(self.undo(points, from_s), to_s)
+
+    def undo(self, points: Float, seen_s: float | Float) -> Float:
+        """(N,3) points seen at a time -> in the object's own frame."""
+        return undo(self.path(seen_s), points, self.centre)
+
+    def place(self, points: Float, time_s: float | Float) -> Float:
+        """Inverse of `undo`."""
+        return apply(self.path(time_s), points, self.centre)
 
     def velocity_m_s(self, points: Float, time_s: float) -> Float:
         """(N,3) of the object's points where they are at that time."""
-        step_s = 1e-3
-        return (self.carry(points, time_s, time_s + step_s) - points) / step_s
+        state, rate = self.path(time_s), self.path.rate(time_s)
+        velocity_m_s = np.tile(rate[:3], (len(points), 1))
+        velocity_m_s[:, 0] -= rate[3] * (points[:, 1] - self.centre[1] - state[1])
+        velocity_m_s[:, 1] += rate[3] * (points[:, 0] - self.centre[0] - state[0])
+        return velocity_m_s
 
     def add(self, j: int, state: Float, time_s: float, rows: np.ndarray) -> None:
         """What sweep j saw of the object."""
@@ -73,6 +85,14 @@ class Track:
     def typical_size(self) -> float:
         """Points per sweep."""
         return float(np.median([len(rows) for rows in self.claimed.values()]))
+
+    def smooth(self, sweep_time_s: Float) -> None:
+        """Lay the path through the states; sweeps that saw many points count more."""
+        seen = sorted(self.states)
+        times_s = np.array([self.times_s[j] for j in seen])
+        states = np.stack([self.states[j] for j in seen])
+        weights = np.array([min(len(self.claimed[j]), _MANY_POINTS) for j in seen], float)
+        self.path = Path.fit(times_s, states, weights, float(np.median(np.diff(sweep_time_s))))
 
     def seen_at(self, j: int, sweep_time_s: Float) -> float:
         """When sweep j sees, or would see, the object."""
@@ -99,8 +119,7 @@ def follow_groups(
         track = _follow(members, i, velocity, standing, free, ground, sweep_time_s)
         proven = _prove(track, standing, space, sweep_time_s)
         if proven:
-            _refine(track, standing, ground)
-            proven = _prove(track, standing, space, sweep_time_s)
+            _refine(track, standing, ground, sweep_time_s)
         for j, rows in track.claimed.items():
             untried[j][rows] = False
             if proven:
@@ -215,8 +234,10 @@ def _find(
     return state, seen_s, rows[fit], target[fit]
 
 
-def _refine(track: Track, standing: Sequence[Standing], ground: HeightMap) -> None:
-    """Align every sweep once more, with what all others saw.
+def _refine(
+    track: Track, standing: Sequence[Standing], ground: HeightMap, sweep_time_s: Float
+) -> None:
+    """Align every sweep once more, with what others saw, if that makes the motion smoother.
 
     Followed sweep by sweep, an object whose other side comes into view drifts: the first shape is
     all there is to hold on to. The even sweeps are aligned with the shape that the odd ones show,
@@ -233,6 +254,7 @@ def _refine(track: Track, standing: Sequence[Standing], ground: HeightMap) -> No
             return
         shapes.append(np.concatenate(parts))
     models = [Model(undo(track.path(track.path.begin_s), x, track.centre)) for x in shapes]
+    before = dict(track.states), track.path
     for j, rows in track.claimed.items():
         at_s = track.times_s[j]
         points = track.carry(standing[j].points[rows], standing[j].time_s[rows], at_s)
@@ -242,6 +264,9 @@ def _refine(track: Track, standing: Sequence[Standing], ground: HeightMap) -> No
         if state is not None:
             state[2] = track.rise_m(ground, state)
             track.states[j] = state
+    track.smooth(sweep_time_s)
+    if track.path.residual_m > before[1].residual_m:
+        track.states, track.path = before
 
 
 def _prove(
@@ -253,22 +278,18 @@ def _prove(
     contradictions that brought the group here: where the sweeps see through its points at their
     rigid places, they must not see through them at the moved ones.
     """
-    seen = sorted(track.states)
-    if len(seen) < 3:
+    if len(track.states) < 3:
         return False
-    t = np.array([track.times_s[j] for j in seen])
-    states = np.stack([track.states[j] for j in seen])
-    weight = np.sqrt([min(len(track.claimed[j]), _MANY_POINTS) for j in seen])
-    track.path = Path.fit(t, states, weight**2, float(np.median(np.diff(sweep_time_s))))
-    fitted = track.path(t)
+    track.smooth(sweep_time_s)
     residual_m = track.path.residual_m
+    seen = sorted(track.states)
+    fitted = track.path(np.array([track.times_s[seen[0]], track.times_s[seen[-1]]]))
     travelled = float(np.linalg.norm((fitted[-1] - fitted[0])[:2]))
     step_m = travelled / (seen[-1] - seen[0])
     start = space.origin[next(iter(track.states))]
     range_m = float(np.linalg.norm((track.centre - start)[:2]))
-    if residual_m > 0.04 + 0.0015 * range_m + 0.03 * step_m or travelled < max(
-        0.35, 8 * residual_m
-    ):
+    rough_m = _ROUGH_M + _ROUGH_PER_GAP * space.ring_step_rad * range_m + _ROUGH_PER_STEP * step_m
+    if residual_m > rough_m or travelled < max(_LEAST_WAY_M, _LEAST_WAY_PER_RESIDUAL * residual_m):
         return False
     still, moved = _contradictions(track, standing, space, sweep_time_s)
     return moved <= _MAX_CONTRADICTIONS * still

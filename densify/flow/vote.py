@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from densify.types import Float
 
@@ -18,19 +19,19 @@ _VOTE_POINTS = 60
 
 @dataclass(frozen=True)
 class DistanceField:
-    """Distance to the nearest candidate on a voxel grid, 1 beyond the reach, as a share of it."""
+    """Distance to the nearest candidate on a voxel grid, as a share of the reach in 255ths."""
 
-    share: np.ndarray
+    share: NDArray[np.uint8]
     low: Float
 
     @staticmethod
     def of(points: Float) -> DistanceField:
         step, reach = _VOTE_STEP_M, _VOTE_REACH_M
         if not len(points):
-            return DistanceField(np.ones((1, 1, 1), np.float32), np.zeros(3))
+            return DistanceField(np.full((1, 1, 1), 255, np.uint8), np.zeros(3))
         low = points.min(0) - 2 * reach
         shape = tuple(np.ceil((points.max(0) + 2 * reach - low) / step).astype(int) + 1)
-        share = np.ones(shape, np.float32)
+        share = np.full(shape, 255, np.uint8)
         occupied = np.unique(((points - low) / step).astype(np.int32), axis=0)
         n = int(np.ceil(reach / step))
         span = np.arange(-n, n + 1)
@@ -38,14 +39,14 @@ class DistanceField:
         far = np.linalg.norm(offsets, axis=1) * step / reach
         for offset, d in zip(offsets[far < 1], far[far < 1], strict=True):
             at = tuple((occupied + offset).T)
-            share[at] = np.minimum(share[at], d)
+            share[at] = np.minimum(share[at], np.uint8(round(255 * d)))
         return DistanceField(share, low)
 
     def __call__(self, points: Float) -> Float:
         at = ((points - self.low) * (1 / _VOTE_STEP_M)).astype(np.int32)
         inside = ((at >= 0) & (at < self.share.shape)).all(-1)
         at[~inside] = 0
-        return np.where(inside, self.share[at[..., 0], at[..., 1], at[..., 2]], 1.0)
+        return np.where(inside, self.share[at[..., 0], at[..., 1], at[..., 2]] / 255, 1.0)
 
 
 def vote(points: Float, i: int, fields: Sequence[DistanceField], time_s: Float) -> Float:

@@ -6,7 +6,6 @@ from __future__ import annotations
 from densify import poses
 from densify.config import FlowSettings
 from densify.flow.chained import ChainedMotion
-from densify.flow.groups import follow
 from densify.height_map import HeightMap
 from densify.types import FlowField, Motion, Stretch
 
@@ -14,7 +13,9 @@ from densify.types import FlowField, Motion, Stretch
 def estimate_motion(stretch: Stretch, ground: HeightMap, settings: FlowSettings) -> Motion:
     """By the engine that the settings name."""
     if settings.engine == "groups":
-        return follow(stretch, ground, settings.min_height_m)
+        from densify.flow.groups import follow
+
+        return follow(stretch, ground, settings.min_height_m, settings.soft)
     return ChainedMotion(
         stretch,
         lambda here, there: _objective(stretch, ground, here, there, settings),

@@ -1,0 +1,253 @@
+# SPDX-License-Identifier: MIT
+"""Motions that groups of points may have made between two clouds, and their alignment.
+
+A group starts at the few places that most of its points agree on (a vote, Hough 1962) and is
+aligned there with the surfaces of the other cloud (Segal et al., "Generalized-ICP", RSS 2009, with
+yaw as the only rotation). All groups are aligned at once.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from densify.types import Float, Int
+
+_EVEN_M = 0.06
+_MAX_MOTION_M = 3.8
+_VOTE_STEP_M = 0.2
+_VOTE_SLACK_M = 0.3  # vertical
+_VOTE_POINTS, _VOTE_TARGETS = 60, 800
+_NUM_VOTED = 4
+_APART_M = 0.7
+_ALIGN_POINTS = 150
+_GATES_M = (0.8, 0.5, 0.3, 0.2, 0.2)
+_SURFACE_M = 0.05  # noise of a surface point
+_MAX_WEIGHT = 60.0  # neighbours on a surface do not err independently
+_PRECISION = 1 / np.array([1.0, 1.0, 0.08, 0.06]) ** 2  # of m, m from the start; m, rad from zero
+_FROM_START = np.array([1.0, 1.0, 0.0, 0.0])
+
+
+@dataclass(frozen=True)
+class Standing:
+    """What stands above the ground in one of the two clouds.
+
+    points: (N,3) metres. lag: (N,) how long after the cloud's reference time each was measured, as
+    a share of the time between the two clouds; zeros where unknown. lidar: (N,) which scanner
+    measured it; None: all the same.
+    """
+
+    points: Float
+    lag: Float
+    lidar: Int | None = None
+
+    @cached_property
+    def tree(self) -> cKDTree:
+        return tree_of(self.places(self.points, np.arange(len(self.points))))
+
+    @cached_property
+    def even_tree(self) -> cKDTree:
+        """Without the density along the scan lines, which says nothing of that across."""
+        places = self.places(self.points, np.arange(len(self.points)))
+        voxel = np.floor(places / _EVEN_M).astype(np.int64)
+        key = voxel @ np.array([1, 1 << 20, 1 << 40, 7][: voxel.shape[1]])
+        return tree_of(places[np.unique(key, return_index=True)[1]])
+
+    def places(self, points: Float, rows: Int) -> Float:
+        """Coordinates in which points of different scanners are far from each other: each of them
+        sees an object at a moment of its own."""
+        if self.lidar is None:
+            return points
+        return np.column_stack([points, 1e4 * self.lidar[rows]])
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Displacement x y z (m) and yaw (rad) about ``centre`` of an object, from one cloud's
+    reference time to the other's; ``seen_share`` of it between its measurements."""
+
+    state: Float
+    centre: Float
+    seen_share: float
+
+    def seen(self, points: Float) -> Float:
+        """(N,3) points of the object as the source has them -> as the target does."""
+        return self.carry(points, self.seen_share)
+
+    def carry(self, points: Float, share: float | Float) -> Float:
+        """(N,3) points of the object after that share, one or one each, of the motion."""
+        return _carry(points, self.centre, self.state * np.reshape(share, (-1, 1)))
+
+
+class Surface:
+    """Candidates of the target with the inverse covariance of the surface around each."""
+
+    def __init__(self, target: Standing, rows: Int) -> None:
+        self.points, self.lag = target.points[rows], target.lag[rows]
+        self.tree = tree_of(target.places(self.points, rows))
+        k = min(12, len(rows))
+        tree = self.tree if target.lidar is None else tree_of(self.points)
+        _, near = tree.query(self.points, k, workers=-1)
+        x = self.points[np.reshape(near, (len(rows), k))]
+        x = x - x.mean(1, keepdims=True)
+        covariance = np.einsum("nki,nkj->nij", x, x) / k
+        scale = np.trace(covariance, axis1=1, axis2=2)[:, None, None] / 3
+        # Capped along the surface: far along it a point still tells a little.
+        self.information = np.linalg.inv(
+            covariance + _SURFACE_M**2 * np.eye(3) + 0.02 * scale * np.eye(3)
+        )
+
+
+@dataclass
+class Hypotheses:
+    """Motions to try, H of them over P points in all.
+
+    group: (H,) number of the group. state: (H,4), centre: (H,3), see `Motion`. row: (P,) of the
+    source, a sample of the group. of_point: (P,) the hypothesis. share: (H,) of the motion between
+    when the source and when the target measured the group.
+    """
+
+    source: Standing
+    group: Int
+    state: Float
+    centre: Float
+    row: Int
+    of_point: Int
+    share: Float
+
+    @staticmethod
+    def of(
+        groups: list[Int],
+        source: Standing,
+        target: Standing,
+        candidates: Int,
+        initial: Float | None,
+    ) -> Hypotheses:
+        """Every group at the places it votes for, where it stands, and where ``initial`` puts
+        it."""
+        group, state, centre, row = [], [], [], []
+        there = target.points[candidates]
+        for k, members in enumerate(groups):
+            sample = thinned(members, _ALIGN_POINTS)
+            starts = _vote(source.points[thinned(members, _VOTE_POINTS)], there)
+            if initial is not None:
+                starts = np.vstack([starts, np.median(initial[members], axis=0)])
+            for start in starts:
+                group.append(k)
+                state.append(np.append(start, 0.0))
+                centre.append(source.points[sample].mean(0))
+                row.append(sample)
+        of_point = np.repeat(np.arange(len(row)), [len(r) for r in row])
+        return Hypotheses(
+            source,
+            np.array(group),
+            np.array(state),
+            np.array(centre),
+            np.concatenate(row),
+            of_point,
+            np.ones(len(row)),
+        )
+
+    def seen(self, share: Float) -> Float:
+        """(P,3) the points after that share, (P,), of their motions."""
+        state = self.state[self.of_point] * share[:, None]
+        return _carry(self.source.points[self.row], self.centre[self.of_point], state)
+
+    def align(self, surface: Surface) -> None:
+        """Gauss-Newton steps of all states at once. A match lasts from when the source point was
+        measured to when the target's was."""
+        start = self.state.copy()
+        lag = self.source.lag[self.row]
+        for gate_m in np.repeat(_GATES_M, 2):
+            place = self.source.places(self.seen(self.share[self.of_point]), self.row)
+            far, index = surface.tree.query(place, distance_upper_bound=gate_m, workers=-1)
+            far, index = np.asarray(far), np.asarray(index)
+            near = np.flatnonzero(np.isfinite(far))
+            match, h = index[near], self.of_point[near]
+            share = self.share[self.of_point]
+            share[near] = 1 + surface.lag[match] - lag[near]
+            weight = (1 - (far[near] / gate_m) ** 2) ** 2
+            count = np.bincount(h, minlength=len(self.state))
+            weight *= np.minimum(1.0, _MAX_WEIGHT / np.maximum(count, 1))[h]
+            seen = self.seen(share)[near]
+            self.state = self.state - _step(
+                seen - surface.points[match],
+                seen - self.centre[h] - self.state[h, :3] * share[near, None],
+                share[near],
+                surface.information[match] * weight[:, None, None],
+                h,
+                _PRECISION * (self.state - start * _FROM_START),
+            )
+            matched = count > 0
+            total = np.bincount(h, share[near], len(count))
+            self.share[matched] = total[matched] / count[matched]
+
+
+def _step(
+    residual: Float, arm: Float, share: Float, information: Float, of_point: Int, prior: Float
+) -> Float:
+    """(H,4) Gauss-Newton steps from the matches of all hypotheses; prior: (H,4) gradient of what
+    holds the states."""
+    J = np.zeros((len(arm), 3, 4))
+    J[:, 0, 0] = J[:, 1, 1] = J[:, 2, 2] = 1.0
+    J[:, 0, 3], J[:, 1, 3] = -arm[:, 1], arm[:, 0]
+    J *= share[:, None, None]
+    JA = np.einsum("nik,nij->nkj", J, information)
+    rows = np.concatenate([(JA @ J).reshape(-1, 16), (JA @ residual[..., None])[..., 0]], axis=1)
+    total = np.stack([np.bincount(of_point, column, len(prior)) for column in rows.T], axis=1)
+    H = total[:, :16].reshape(-1, 4, 4) + np.diag(_PRECISION)
+    g = total[:, 16:] + prior
+    return np.asarray(np.linalg.solve(H, g[..., None])[..., 0], np.float64)
+
+
+def _vote(points: Float, there: Float) -> Float:
+    """(S,3) starts in the plane, zero first: where most of the (N,3) points find one of the
+    others, each point voting once for a place."""
+    zero = np.zeros((1, 3))
+    span_m = np.array([_MAX_MOTION_M, _MAX_MOTION_M, _VOTE_SLACK_M])
+    around = ((there > points.min(0) - span_m) & (there < points.max(0) + span_m)).all(1)
+    there = there[thinned(np.flatnonzero(around), _VOTE_TARGETS)]
+    if not len(there):
+        return zero
+    n = int(_MAX_MOTION_M / _VOTE_STEP_M) + 1
+    way = there - points[:, None, :]
+    cell = np.rint(way[..., :2] / _VOTE_STEP_M).astype(np.int64) + n
+    inside = ((cell >= 1) & (cell <= 2 * n - 1)).all(-1) & (np.abs(way[..., 2]) < _VOTE_SLACK_M)
+    voter = np.nonzero(inside)[0]
+    ballot = np.zeros((len(points), 2 * n + 1, 2 * n + 1), np.float32)
+    ballot[voter, cell[inside][:, 0], cell[inside][:, 1]] = 1.0
+    for axis in (1, 2):  # who misses a place by one cell votes for it by half
+        ballot = np.maximum(
+            ballot, 0.5 * np.maximum(np.roll(ballot, 1, axis), np.roll(ballot, -1, axis))
+        )
+    x, y = np.meshgrid(np.arange(-n, n + 1), np.arange(-n, n + 1), indexing="ij")
+    place = np.stack([x.ravel(), y.ravel(), 0 * x.ravel()], 1) * _VOTE_STEP_M
+    length_m = np.linalg.norm(place, axis=1)
+    score = ballot.mean(0, dtype=np.float64).ravel() - 1e-3 * length_m
+    score[length_m > _MAX_MOTION_M] = -1
+    starts = [zero]
+    for _ in range(_NUM_VOTED):
+        best = place[np.argmax(score)]
+        starts.append(best[None])
+        score[np.linalg.norm(place - best, axis=1) < _APART_M] = -1
+    return np.concatenate(starts)
+
+
+def _carry(points: Float, centre: Float, state: Float) -> Float:
+    """(N,3) points, (3,) or (N,3), (1,4) or (N,4) -> (N,3)."""
+    arm = points - centre
+    c, s = np.cos(state[:, 3]), np.sin(state[:, 3])
+    turned = np.stack([c * arm[:, 0] - s * arm[:, 1], s * arm[:, 0] + c * arm[:, 1], arm[:, 2]], 1)
+    return turned + centre + state[:, :3]
+
+
+def thinned(rows: Int, num: int) -> Int:
+    """At most ``num`` of them, evenly."""
+    return rows[:: (len(rows) - 1) // num + 1] if len(rows) else rows
+
+
+def tree_of(points: Float) -> cKDTree:
+    return cKDTree(points, balanced_tree=False, compact_nodes=False)

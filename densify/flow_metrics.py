@@ -1,0 +1,252 @@
+# SPDX-License-Identifier: MIT
+"""How good a scene flow is: every metric with its definition, unit and source.
+
+Flow is (N,3) metres from one time to another, ego-motion removed; masks are (N,) bool. A mean over
+nothing is NaN, never an error. Functions raise InputError where shapes do not fit.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.spatial import cKDTree
+
+from densify.errors import InputError
+from densify.types import Bool, Float, Int
+
+STRICT, RELAXED = 0.05, 0.1
+"""Metres, and parts of the true flow: the two limits of `accuracy`."""
+
+_BUCKET_M_S = 0.4
+_NUM_BUCKETS = 51  # 50 up to 20 m/s and one beyond
+_MIN_IN_PATCH = 8
+_MAX_PATCHES = 3000
+
+
+class ThreeWayError(NamedTuple):
+    """Metres. mean_m: of the three, NaN where one is."""
+
+    foreground_dynamic_m: float
+    foreground_static_m: float
+    background_static_m: float
+    mean_m: float
+
+
+class BucketedError(NamedTuple):
+    """static_m: metres. dynamic: error as a part of the speed; 1 is what doing nothing earns."""
+
+    static_m: float
+    dynamic: float
+
+
+def end_point_errors(estimated: ArrayLike, true: ArrayLike) -> Float:
+    """(N,) metres: the length of what the estimate is off by at each point."""
+    flow, truth = _flows(estimated, true)
+    return np.linalg.norm(flow - truth, axis=1)
+
+
+def end_point_error(estimated: ArrayLike, true: ArrayLike, mask: ArrayLike | None = None) -> float:
+    """EPE, metres: the mean of `end_point_errors`, over ``mask`` if given (Liu, Qi, Guibas,
+    "FlowNet3D", CVPR 2019)."""
+    error_m = end_point_errors(estimated, true)
+    return _mean(error_m if mask is None else error_m[_mask(mask, len(error_m), "mask")])
+
+
+def accuracy(estimated: ArrayLike, true: ArrayLike, limit: float) -> float:
+    """Share (0 to 1) of the points whose error is below ``limit`` metres *or* below ``limit`` times
+    the length of the true flow.
+
+    limit: `STRICT` (0.05 m or 5 %) or `RELAXED` (0.1 m or 10 %), as FlowNet3D (CVPR 2019),
+    HPLFlowNet (Gu et al., CVPR 2019) and PointPWC-Net (Wu et al., ECCV 2020) count; Pontes et al.
+    (3DV 2020) and av2's ``compute_accuracy`` do the same.
+    """
+    flow, truth = _flows(estimated, true)
+    error_m = np.linalg.norm(flow - truth, axis=1)
+    return _mean((error_m < limit) | (error_m < limit * np.linalg.norm(truth, axis=1)))
+
+
+def angle_error_rad(estimated: ArrayLike, true: ArrayLike) -> float:
+    """Mean angle between the estimated and the true flow, radians (Pontes et al., 3DV 2020).
+
+    Over the points whose true flow is not 0, since 0 has no direction; an estimate of 0 there
+    counts as a right angle.
+    """
+    flow, truth = _flows(estimated, true)
+    moves = np.linalg.norm(truth, axis=1) > 0
+    return _mean(_angles_rad(flow[moves], truth[moves]))
+
+
+def space_time_angle_error_rad(
+    estimated: ArrayLike, true: ArrayLike, duration_s: float = 0.1
+) -> float:
+    """Mean angle between (flow, duration_s) and (true flow, duration_s), radians: defined where
+    nothing moves too. As ``compute_angle_error`` of the Argoverse 2 API (av2.evaluation.scene_flow)
+    has it, where the fourth component is 0.1 s: one second weighs as much as one metre.
+    """
+    flow, truth = _flows(estimated, true)
+    time = np.full((len(flow), 1), duration_s)
+    return _mean(_angles_rad(np.hstack([flow, time]), np.hstack([truth, time])))
+
+
+def three_way_error(
+    estimated: ArrayLike, true: ArrayLike, moving: ArrayLike, foreground: ArrayLike
+) -> ThreeWayError:
+    """Mean end-point error of what moves, of objects that stand, and of the rest of the world
+    (Chodosh, Ramanan, Lucey, "Re-Evaluating LiDAR Scene Flow", WACV 2024).
+
+    moving: truly moves. foreground: belongs to an object that could. Their mean keeps the many
+    points of the background from hiding the few that matter. A moving background point counts
+    nowhere.
+    """
+    error_m = end_point_errors(estimated, true)
+    moves, objects = (
+        _mask(m, len(error_m), name) for m, name in ((moving, "moving"), (foreground, "foreground"))
+    )
+    parts = [_mean(error_m[m]) for m in (objects & moves, objects & ~moves, ~objects & ~moves)]
+    return ThreeWayError(parts[0], parts[1], parts[2], sum(parts) / 3)
+
+
+def dynamic_iou(estimated_moving: ArrayLike, moving: ArrayLike) -> float:
+    """Points rightly called moving over those that move or are called so, 0 to 1 (intersection over
+    union; from the counts of av2.evaluation.scene_flow). NaN where neither finds any."""
+    found, true = _two_masks(estimated_moving, moving)
+    return _ratio((found & true).sum(), (found | true).sum())
+
+
+def share_found(estimated_moving: ArrayLike, moving: ArrayLike) -> float:
+    """Share (0 to 1) of the points of ``moving`` that are called moving (recall)."""
+    found, true = _two_masks(estimated_moving, moving)
+    return _ratio((found & true).sum(), true.sum())
+
+
+def bucketed_error(estimated: ArrayLike, true: ArrayLike, duration_s: float = 0.1) -> BucketedError:
+    """Bucket normalised end-point error of one class of points (Khatri et al., "I Can't Believe
+    It's Not Scene Flow!", ECCV 2024; buckets as in their BucketedSceneFlowEval).
+
+    Points are sorted by true speed into buckets of 0.4 m/s up to 20 m/s and one beyond. The first
+    is static: its mean error, metres. In every other one the mean error is divided by the mean
+    length of the true flow, and those quotients are averaged over the buckets that hold points, so
+    a walker's weigh as much as a car's. For several classes take the mean over the classes.
+    """
+    flow, truth = _flows(estimated, true)
+    error_m = np.linalg.norm(flow - truth, axis=1)
+    length_m = np.linalg.norm(truth, axis=1)
+    edges_m = _BUCKET_M_S * duration_s * np.arange(1, _NUM_BUCKETS)
+    bucket = np.digitize(length_m, edges_m)
+    num, error_sum, length_sum = (
+        np.bincount(bucket, weights, _NUM_BUCKETS) for weights in (None, error_m, length_m)
+    )
+    filled = num[1:] > 0
+    parts = error_sum[1:][filled] / length_sum[1:][filled]
+    return BucketedError(_ratio(error_sum[0], num[0]), _mean(parts))
+
+
+def errors_by_hops(estimated: ArrayLike, true: ArrayLike, hops: ArrayLike) -> dict[int, float]:
+    """Mean end-point error, metres, of the points that lie so many sweeps from the target, by that
+    number: how much error a chain of steps gathers. hops: (N,) whole numbers."""
+    error_m = end_point_errors(estimated, true)
+    steps: Int = np.asarray(hops)
+    if steps.shape != error_m.shape or steps.dtype.kind not in "iu":
+        raise InputError(
+            f"hops: got {steps.dtype} of shape {steps.shape}, expected whole numbers of shape "
+            f"{error_m.shape}, one for each point"
+        )
+    return {int(n): _mean(error_m[steps == n]) for n in np.unique(steps)}
+
+
+def plane_residual_m(points: ArrayLike, radius_m: float = 0.3) -> float:
+    """Thickness of accumulated surfaces, metres: mean over points of the standard deviation, across
+    the best plane, of all points within ``radius_m``.
+
+    points: (M,3) of moving objects brought to one moment. Edges and curvature add to it, the same
+    for every flow of the same objects; it is to be read together with `coverage`, since points
+    drawn onto a few lines look thin. A larger radius adds more curvature. Patches of fewer than 8
+    points say nothing; at most 3,000 patches are looked at, evenly over the rows. (The smallest
+    eigenvalue of the local covariance; Hoppe et al., "Surface reconstruction from unorganized
+    points", SIGGRAPH 1992, section 3.)
+    """
+    cloud = _points(points, "points")
+    if not len(cloud):
+        return float("nan")
+    centres = cloud[:: -(-len(cloud) // _MAX_PATCHES)]
+    patches = np.asarray(cKDTree(cloud).query_ball_point(centres, radius_m), dtype=object)
+    spreads = [
+        np.linalg.eigvalsh(np.cov(cloud[rows].T, bias=True))[0]
+        for rows in patches
+        if len(rows) >= _MIN_IN_PATCH
+    ]
+    return _mean(np.sqrt(np.maximum(spreads, 0.0)))
+
+
+def extent_m2(points: ArrayLike, cell_m: float = 0.1) -> float:
+    """How much surface accumulated points occupy, square metres: occupied cells of a grid, times
+    ``cell_m`` squared. Needs no truth; drawing points onto scan lines lowers it, noise and wrong
+    motion raise it, so read it together with `plane_residual_m`."""
+    cells = np.unique(np.floor(_points(points, "points") / cell_m), axis=0)
+    return len(cells) * cell_m**2
+
+
+def coverage(points: ArrayLike, true_points: ArrayLike, reach_m: float = 0.1) -> float:
+    """Share (0 to 1) of the true accumulated points that have an estimated one within ``reach_m``:
+    low where the flow is wrong, and where it draws points onto scan lines.
+
+    points: (M,3), true_points: (K,3), metres, one frame. A larger reach forgives more.
+    """
+    cloud, truth = _points(points, "points"), _points(true_points, "true_points")
+    if not len(truth):
+        return float("nan")
+    if not len(cloud):
+        return 0.0
+    distance_m, _ = cKDTree(cloud).query(truth, distance_upper_bound=reach_m)
+    return _mean(np.isfinite(distance_m))
+
+
+def _angles_rad(a: Float, b: Float) -> Float:
+    """(N,) between the rows of two (N,D) arrays; a right angle where one of them is 0."""
+    lengths = np.linalg.norm(a, axis=1) * np.linalg.norm(b, axis=1)
+    dot = np.einsum("nd,nd->n", a, b)
+    cosine = np.divide(dot, lengths, out=np.zeros(len(a)), where=lengths > 0)
+    return np.arccos(np.clip(cosine, -1.0, 1.0))
+
+
+def _flows(estimated: ArrayLike, true: ArrayLike) -> tuple[Float, Float]:
+    flow, truth = _points(estimated, "estimated flow"), _points(true, "true flow")
+    if flow.shape != truth.shape:
+        raise InputError(
+            f"flow metrics: got {len(flow)} estimated and {len(truth)} true flow vectors, expected "
+            f"as many; give both for the same points"
+        )
+    return flow, truth
+
+
+def _points(values: ArrayLike, name: str) -> Float:
+    array = np.asarray(values, dtype=np.float64)
+    if array.ndim != 2 or array.shape[1] != 3:
+        raise InputError(f"flow metrics: {name}: got shape {array.shape}, expected (N,3) metres")
+    return array
+
+
+def _mask(values: ArrayLike, num_points: int, name: str) -> Bool:
+    array = np.asarray(values)
+    if array.shape != (num_points,) or array.dtype != bool:
+        raise InputError(
+            f"flow metrics: {name}: got {array.dtype} of shape {array.shape}, expected bool of "
+            f"shape ({num_points},), one for each point"
+        )
+    return array
+
+
+def _two_masks(estimated: ArrayLike, true: ArrayLike) -> tuple[Bool, Bool]:
+    num_points = np.size(np.asarray(true))
+    return _mask(estimated, num_points, "estimated_moving"), _mask(true, num_points, "moving")
+
+
+def _mean(values: ArrayLike) -> float:
+    array = np.asarray(values)
+    return float(array.mean()) if array.size else float("nan")
+
+
+def _ratio(part: float, whole: float) -> float:
+    return float(part / whole) if whole else float("nan")

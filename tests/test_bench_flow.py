@@ -1,0 +1,309 @@
+# SPDX-License-Identifier: MIT
+"""The flow benchmark: baselines where the answer is known, a tiny window, and the command."""
+
+from __future__ import annotations
+
+import json
+import logging
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from densify.bench import flow as bench
+from densify.bench.baselines import cluster_icp, nonrigid_icp
+from densify.bench.memory import PeakMemory
+from densify.cli import main, tables
+from densify.config import resolve
+from densify.errors import InputError
+from densify.flow.solvers import ObjectiveSettings, solve
+from tests.scenes import Arc, Scanner, Scene, TinySequence, World, car, street
+
+CONFIG = resolve({"register": {"source": "dataset"}})
+FAST = ("window", "rigid", "cluster-icp", "nicp")
+
+
+def shell(size_m: tuple[float, float, float], num: int) -> np.ndarray:
+    """Points at random on the six faces of a box about the origin."""
+    rng = np.random.default_rng(0)
+    points = rng.uniform(-0.5, 0.5, (num, 3))
+    points[np.arange(num), rng.integers(0, 3, num)] = rng.choice([-0.5, 0.5], num)
+    return points * size_m
+
+
+# --- baselines ------------------------------------------------------------------------------------
+
+
+def test_nonrigid_icp_bends_a_box():
+    source = shell((3.0, 0.8, 0.4), 800)
+    bend = np.zeros_like(source)
+    bend[:, 2] = 0.06 * source[:, 0] ** 2  # up to 13 cm at the ends
+    flow = nonrigid_icp(source, source + bend)
+    error, unexplained = flow - bend, bend - bend.mean(0)  # the latter by any translation
+    assert np.linalg.norm(unexplained, axis=1).mean() > 0.045
+    assert np.linalg.norm(error, axis=1).mean() < 0.025  # what is left slides along the surface
+
+
+def test_softer_follows_the_bend_more_closely():
+    source = shell((3.0, 0.8, 0.4), 800)
+    bend = np.zeros_like(source)
+    bend[:, 1] = 0.05 * np.sin(2 * source[:, 0])
+    error = [
+        np.linalg.norm(nonrigid_icp(source, source + bend, alphas) - bend, axis=1).mean()
+        for alphas in ((1000.0,), (1000.0, 3.0))
+    ]
+    assert error[1] < 0.5 * error[0]
+
+
+def test_nonrigid_icp_leaves_what_does_not_move():
+    source = shell((2.0, 1.0, 1.0), 500)
+    assert np.abs(nonrigid_icp(source, source)).max() < 1e-6
+    alone = np.array([[0.0, 0, 0], [50, 0, 0]])  # no target within reach of the second
+    flow = nonrigid_icp(alone, np.array([[0.3, 0, 0]]))
+    assert np.isfinite(flow).all()
+
+
+def test_cluster_icp_moves_each_box_by_its_own_motion():
+    box = shell((4.0, 1.8, 1.4), 900)
+    c, s = np.cos(0.1), np.sin(0.1)
+    turn = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+    moved = [box + [2.4, 0.4, 0], box @ turn.T + [0, 0.3, 0], box]
+    places = [np.array(p) for p in ([0.0, 0, 0], [20, 0, 0], [0, 15, 0])]
+    source = np.vstack([box + p for p in places])
+    goal = np.vstack([m + p for m, p in zip(moved, places, strict=True)])
+    order = np.random.default_rng(0).permutation(len(goal))
+    error = np.linalg.norm(cluster_icp(source, goal[order]) - (goal - source), axis=1)
+    assert error.max() < 1e-6
+
+
+def test_cluster_icp_makes_no_mirror_images():
+    flat = shell((2.0, 1.0, 0.0), 300)
+    flow = cluster_icp(flat, flat + [0.2, 0.1, 0])
+    assert np.abs(flow - [0.2, 0.1, 0]).max() < 1e-6
+
+
+@pytest.mark.parametrize("method", [cluster_icp, nonrigid_icp])
+@pytest.mark.parametrize("bad", [np.zeros((0, 3)), np.zeros((4, 2)), np.zeros(3)])
+def test_baselines_name_bad_clouds(method, bad):
+    good = np.zeros((5, 3))
+    with pytest.raises(InputError, match="source: got shape"):
+        method(bad, good)
+    with pytest.raises(InputError, match="target: got shape"):
+        method(good, bad)
+
+
+@pytest.mark.parametrize("stiffnesses", [(), (1.0, 0.0), (-1.0,)])
+def test_stiffness_is_positive(stiffnesses):
+    with pytest.raises(InputError, match="stiffnesses"):
+        nonrigid_icp(np.zeros((5, 3)), np.zeros((5, 3)), stiffnesses)
+
+
+# --- what is measured -----------------------------------------------------------------------------
+
+
+def tiny(**options) -> TinySequence:
+    movers = (car(6, 1.8, 9, 1), car(25, 1.8, 8, 2, yaw=np.pi))
+    scene = Scene(World((*street(40.0), *movers)), Arc(0, -1.5, 0, 5.0), Scanner(32, 450))
+    return TinySequence(scene, range(8), **options)
+
+
+@pytest.fixture(scope="module")
+def measured() -> dict:
+    return bench.bench_flow(tiny(), 4, 2, CONFIG, (*reversed(FAST), "rigid"), max_points=400)
+
+
+def test_every_method_has_every_number(measured):
+    assert tuple(measured["methods"]) == FAST  # in the table's order, each once
+    assert measured["frames"] == [2, 3, 4, 5, 6] and measured["num_pairs"] == 4
+    json.dumps(measured, allow_nan=False)
+    for name, row in measured["methods"].items():
+        for key in ("num_points", "seconds_per_pair", "energy_before", "energy_after"):
+            assert row[key] > 0, (name, key)
+        assert 0 <= row["step"]["found"] <= 1 and row["step"]["movers_m"] >= 0
+        assert set(row["window"]["movers_m_by_hops"]) == {"1", "2"}
+        assert 0 <= row["window"]["coverage"] <= 1
+        assert (
+            row["times_seconds"]
+            == row["seconds_per_pair"] / (measured["methods"]["window"]["seconds_per_pair"])
+        )
+
+
+def test_slow_methods_get_the_points_that_are_drawn(measured):
+    points = {name: row["num_points"] for name, row in measured["methods"].items()}
+    assert points["nicp"] == 400
+    assert points["rigid"] == points["cluster-icp"] > 400
+    assert points["window"] > points["rigid"]  # the ground too
+
+
+def test_rigid_is_the_motion_itself(measured):
+    rigid = measured["methods"]["rigid"]
+    assert rigid["energy_after"] == rigid["energy_before"]
+    step = rigid["step"]
+    assert step["movers_m"] == pytest.approx(0.85, abs=0.05)  # 9 and 8 m/s for 0.1 s
+    assert step["background_m"] == step["static_objects_m"] or step["static_objects_m"] is None
+    assert step["found"] == step["falsely_moving"] == step["dynamic_iou"] == 0
+    assert step["bucketed_dynamic"] == pytest.approx(1)
+    hops = rigid["window"]["movers_m_by_hops"]
+    assert hops["2"] == pytest.approx(2 * hops["1"], rel=0.02)
+
+
+def test_methods_do_what_they_are_for(measured):
+    rows = measured["methods"]
+    for name in ("window", "cluster-icp"):
+        assert rows[name]["step"]["movers_m"] < 0.5 * rows["rigid"]["step"]["movers_m"], name
+        assert rows[name]["window"]["coverage"] > rows["rigid"]["window"]["coverage"], name
+    assert rows["window"]["step"]["background_m"] == 0
+    assert rows["window"]["times_error"] == rows["window"]["times_seconds"] == 1
+
+
+def test_without_truth_energy_seconds_and_ghosts_are_left():
+    found = bench.bench_flow(
+        tiny(with_truth=False), 4, 1, CONFIG, ("window", "rigid"), max_points=600
+    )
+    for row in found["methods"].values():
+        assert set(row["step"]) == {"called_moving"}
+        assert row["window"]["ghost_rate"] is not None and "coverage" not in row["window"]
+        assert row["times_error"] is None and row["times_seconds"] > 0
+    assert found["truth"] is None
+    assert "ghosts" in tables.flow_table(found) and "coverage" not in tables.flow_table(found)
+
+
+def test_one_pair_and_adams_milestones(monkeypatch):
+    monkeypatch.setattr(ObjectiveSettings, "adam_num_steps", 30)
+    monkeypatch.setattr(
+        bench,
+        "ObjectiveSettings",
+        lambda solver="pcg": ObjectiveSettings(solver, adam_num_steps=30),
+    )
+    found = bench.bench_flow(
+        tiny(), 4, 1, CONFIG, ("paper", "adam", "pair"), pairs_only=True, max_points=300
+    )
+    assert found["num_pairs"] == 1 and found["truth"] is None
+    adam = found["methods"]["adam"]
+    assert adam["window"] is None
+    assert "times_seconds" not in adam
+    assert 1 <= adam["steps_to_lowest"] <= 30
+    share = adam["steps_to_lowest"] / 30
+    assert adam["seconds_to_lowest"] == pytest.approx(share * adam["seconds_per_pair"])
+    for name in ("adam", "paper"):
+        row = found["methods"][name]
+        assert row["num_points"] == 300 and row["energy_after"] < 0.9 * row["energy_before"]
+    assert 0 <= adam["pairs_as_low_as_paper"] <= 1
+    assert found["methods"]["pair"]["step"]["background_m"] < 0.05
+    assert "adam: lowest energy after" in tables.flow_table(found)
+
+
+def test_adam_is_as_low_as_paper_where_its_trace_says_so():
+    adam = bench._Measured({}, [], [3.0, 5.0], [(9.0, 5.0, 3.0, 4.0), (9.0, 7.0, 6.0, 2.0, 8, 8)])
+    milestones = bench._milestones(adam, bench._Measured({}, [5.5, 6.0], [], []))
+    assert milestones["steps_to_lowest"] == pytest.approx(2.5)
+    assert milestones["seconds_to_lowest"] == pytest.approx((2 + 3) / 2)  # a second each
+    assert milestones["seconds_to_paper"] == pytest.approx((1 + 2) / 2)
+    assert milestones["pairs_as_low_as_paper"] == 2
+    once = bench._milestones(adam, bench._Measured({}, [5.5, 1.0], [], []))
+    assert once["seconds_to_paper"] == pytest.approx(1) and once["pairs_as_low_as_paper"] == 1
+    never = bench._milestones(adam, bench._Measured({}, [1.0, 1.0], [], []))
+    assert never["seconds_to_paper"] is None and never["pairs_as_low_as_paper"] == 0
+    assert "seconds_to_paper" not in bench._milestones(adam, None)
+
+
+def test_energy_is_the_solvers():
+    rng = np.random.default_rng(0)
+    source, target = rng.uniform(0, 4, (90, 3)), rng.uniform(0, 4, (80, 3))
+    pair = bench.Pair(source, target, np.arange(90), np.arange(80), 0.1)
+    solution = solve(source, target)
+    assert pair.energy(solution.flow) == pytest.approx(solution.energy, rel=1e-9)
+    assert pair.energy(np.zeros_like(source)) == pytest.approx(solution.energies[0], rel=1e-9)
+
+
+def test_flow_is_carried_to_the_points_that_were_not_drawn():
+    source = np.random.default_rng(1).uniform(0, 5, (300, 3))
+    drawn = np.arange(0, 300, 3)
+    pair = bench.Pair(source, source, drawn, drawn, 0.1)
+    own = np.cos(source[drawn])
+    carried = pair.carried(own)
+    assert np.abs(carried[drawn] - own).max() < 1e-4
+    constant = pair.carried(np.tile([1.0, 2, 3], (len(drawn), 1)))
+    assert constant == pytest.approx(np.tile([1.0, 2, 3], (300, 1)))
+
+
+def test_memory_counts_what_is_held_for_a_moment():
+    memory = PeakMemory.start()
+    if memory.before_mb is None:
+        pytest.skip("this system does not tell the peak of resident memory")
+    held = np.ones(40_000_000 // 8)
+    del held
+    rise_mb = memory.rise_mb()
+    assert rise_mb is not None and 30 < rise_mb < 80
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"methods": ("window", "magic")}, "--methods magic: expected all, or of window"),
+        ({"methods": ()}, "--methods: got none"),
+        ({"window": 0}, "--window 0"),
+        ({"max_points": 49}, "--max-points 49"),
+        ({"key": 99}, "--key 99: no such frame"),
+    ],
+)
+def test_bad_input_is_named(options, words):
+    arguments = {"key": 4, "window": 1, "config": CONFIG} | options
+    with pytest.raises(InputError, match=words):
+        bench.bench_flow(tiny(), **arguments)
+
+
+# --- the command ----------------------------------------------------------------------------------
+
+COMMAND = ["bench", "flow", "--data", "street?sensor=vlp16", "--window", "1", "--max-points", "300"]
+
+
+def test_the_command_prints_tables_and_writes_numbers(tmp_path: Path, capsys, monkeypatch):
+    seen: list[tuple] = []
+
+    def measure(sequence, key, *arguments):
+        seen.append((sequence.name, key, *arguments[2:5]))
+        return bench_flow(tiny(), 4, 1, CONFIG, arguments[2], max_points=arguments[4])
+
+    bench_flow = bench.bench_flow
+    monkeypatch.setattr(bench, "bench_flow", measure)
+    out = tmp_path / "new" / "flow.json"
+    command = [*COMMAND, "--methods", "rigid,window", "--key", "3", "--key", "5", "--out", str(out)]
+    assert main(command) == 0
+    printed = capsys.readouterr().out
+    assert printed.splitlines()[-1] == str(out)
+    assert printed.count("\nrigid ") == 4 and printed.count("\nwindow ") == 4
+    assert [s[1:] for s in seen] == [(k, ["rigid", "window"], False, 300) for k in (3, 5)]
+    numbers = json.loads(out.read_text("utf-8"))
+    assert [len(run["methods"]) for run in numbers["runs"]] == [2, 2]
+    assert main(command) == 2  # kept
+    assert "--overwrite" in capsys.readouterr().err
+
+
+def test_default_methods_leave_out_the_minutes():
+    assert "adam" in bench.METHODS and "adam" not in bench.DEFAULT_METHODS
+
+
+@pytest.mark.parametrize(
+    ("extra", "words"),
+    [
+        (["--methods", "magic"], "--methods magic"),
+        (["--data", "/no/such/place"], "no such folder"),
+        (["--key", "999"], "--key 999: no such frame"),
+        (["--out", "table.txt"], "ends in .json"),
+        (["--window", "0"], "--window 0"),
+        (["--set", "flow.engine=magic"], "flow.engine"),
+    ],
+)
+def test_errors_of_the_command_are_one_line(extra, words, capsys, caplog):
+    with caplog.at_level(logging.ERROR, "densify"):
+        assert main([*COMMAND, *extra]) == 2
+    captured = capsys.readouterr()
+    assert captured.out == "" and len(captured.err.splitlines()) == 1 and words in captured.err
+
+
+@pytest.mark.parametrize("command", [["bench"], ["bench", "magic"]])
+def test_bench_wants_to_know_what(command, capsys):
+    with pytest.raises(SystemExit) as end:
+        main(command)
+    assert end.value.code == 2 and "densify: " in capsys.readouterr().err

@@ -1,0 +1,289 @@
+# SPDX-License-Identifier: MIT
+"""Scene flow of two sweeps as a user has them: two clouds in one frame, ground and all."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from densify import open_sequence, poses
+from densify.config import RegisterSettings
+from densify.errors import InputError
+from densify.flow.pair import estimate_flow
+from densify.readers.window import read_sweeps
+from densify.stages.deskew import deskew
+from densify.stages.register import register
+from tests.scenes import Arc, Box, Scanner, Scene, World, car, street
+
+FRAME = 2
+PERIOD_NS = 100_000_000
+
+
+@dataclass(frozen=True)
+class Pair:
+    """Two sweeps in the frame of the first, and what really moved by how much."""
+
+    source: np.ndarray
+    target: np.ndarray
+    truth: np.ndarray
+    instance: np.ndarray
+    source_offset_ns: np.ndarray
+    target_offset_ns: np.ndarray
+    source_height_m: np.ndarray
+    target_height_m: np.ndarray
+
+    @property
+    def moved(self) -> np.ndarray:
+        return self.instance >= 0
+
+
+def pair_of(*boxes: Box, ego: Arc | None = None, slope: float = 0.0) -> Pair:
+    world = World((*boxes, *street()), slope)
+    scene = Scene(world, ego or Arc(-0.4, -1.5, 0.0, 8.0, 0.1), Scanner(sigma_m=0.01))
+    window = scene.window(FRAME, 1)
+    here, there = window[FRAME], window[FRAME + 1]
+    return Pair(
+        here.sweep.points,
+        poses.transform(there.T_key_lidar, there.sweep.points),
+        scene.displacement(FRAME, FRAME + 1),
+        scene.scan(FRAME).instance,
+        here.sweep.offset_ns,
+        there.sweep.offset_ns,
+        scene.height_m(FRAME),
+        scene.height_m(FRAME + 1),
+    )
+
+
+def estimated(pair: Pair, **options):
+    return estimate_flow(
+        pair.source,
+        pair.target,
+        source_offset_ns=pair.source_offset_ns,
+        target_offset_ns=pair.target_offset_ns,
+        **options,
+    )
+
+
+def check(pair: Pair, field, max_error_m: float = 0.08) -> None:
+    """Movers found and right, everything else exactly where it was."""
+    still = ~pair.moved
+    assert field.moving[still].mean() <= 1e-3
+    assert not field.displacement[~field.moving].any()
+    for k in np.unique(pair.instance[pair.moved]):
+        mine = pair.instance == k
+        assert field.moving[mine].mean() >= 0.8, k
+        error = np.linalg.norm(field.displacement - pair.truth, axis=1)[mine & field.moving]
+        assert error.mean() <= max_error_m, k
+
+
+@pytest.mark.parametrize("speed_m_s", [5, 15, 30])
+@pytest.mark.parametrize("slope", [0.0, 0.04])
+def test_a_car_is_found_at_any_speed(speed_m_s, slope):
+    x = -1.0 - speed_m_s * 0.25 + 12
+    pair = pair_of(car(x, 1.5, speed_m_s, 1), slope=slope)
+    check(pair, estimated(pair))
+
+
+def test_where_nothing_moves_everything_stays_exactly():
+    pair = pair_of(ego=Arc(0.0, -1.5))
+    for field in (estimated(pair), estimate_flow(pair.source, pair.target)):
+        assert not field.moving.any() and not field.displacement.any()
+        assert (field.instance == -1).all()
+
+
+def test_what_comes_into_sight_hardly_moves():
+    field = estimated(pair_of())
+    assert field.moving.mean() < 1e-3 and not field.displacement[~field.moving].any()
+
+
+def test_similar_cars_in_a_row_keep_their_places():
+    """The second comes as near to where the first was as the first to where it was itself."""
+    lane = [car(1.0 + 7.0 * i, 2.6, 35.0, i, size_m=(3.2, 1.8, 1.2)) for i in range(2)]
+    pair = pair_of(*lane)
+    check(pair, estimated(pair))
+
+
+def test_oncoming_and_turning():
+    pair = pair_of(car(16.0, 1.8, 8.0, 1, np.pi), car(13.0, -3.0, 6.0, 2, 0.3, 0.6))
+    field = estimated(pair)
+    check(pair, field)
+    turning = (pair.instance == 2) & field.moving
+    truth = pair.truth[turning]
+    assert np.ptp(truth, axis=0).max() > 0.1  # a translation cannot do it
+    assert np.linalg.norm(field.displacement[turning] - truth, axis=1).mean() < 0.06
+
+
+def test_without_the_ground():
+    pair = pair_of(car(14.0, 1.5, 12.0, 1))
+    a, b = pair.source_height_m > 0.2, pair.target_height_m > 0.2
+    field = estimate_flow(pair.source[a], pair.target[b])
+    moved = pair.moved[a]
+    assert field.moving[moved].mean() > 0.8 and field.moving[~moved].mean() <= 5e-3
+    error = np.linalg.norm(field.displacement - pair.truth[a], axis=1)
+    assert error[moved & field.moving].mean() < 0.08
+
+
+def test_the_frame_does_not_matter():
+    pair = pair_of(car(14.0, 1.5, 12.0, 1), car(22.0, -1.0, 6.0, 2))
+    R = poses.exp(np.array([0, 0, 2.1, 0, 0, 0]))[:3, :3]
+    there = np.array([4.5e5, 5.4e6, 300.0])
+    here = estimated(pair)
+    field = estimate_flow(pair.source @ R.T + there, pair.target @ R.T + there)
+    assert (field.moving == here.moving).mean() > 0.998
+    both = field.moving & here.moving
+    assert both.sum() > 300
+    turned_back = field.displacement[both] @ R
+    assert np.linalg.norm(turned_back - here.displacement[both], axis=1).mean() < 0.05
+
+
+def test_times_make_fast_cars_right():
+    """One that is passed turns away under the scanner: it is met again sooner or later than after
+    a revolution."""
+    pair = pair_of(car(4.0, 3.0, 25.0, 1, np.pi))
+    plain, timed = estimate_flow(pair.source, pair.target), estimated(pair)
+    mine = pair.moved & plain.moving & timed.moving
+    assert mine.mean() > 0.8 * pair.moved.mean()
+    errors = [
+        np.linalg.norm(f.displacement - pair.truth, axis=1)[mine].mean() for f in (plain, timed)
+    ]
+    assert errors[0] > 0.1 and errors[1] < 0.04
+    assert plain.to_reference is None
+    velocity_m_s = timed.displacement / 0.1
+    late_s = pair.source_offset_ns[:, None] * 1e-9
+    off = timed.to_reference + velocity_m_s * late_s
+    assert np.abs(off[mine]).max() < 0.02 and not timed.to_reference[~timed.moving].any()
+
+
+def test_either_clock_will_do():
+    pair = pair_of(car(14.0, 1.5, 12.0, 1))
+    own = estimated(pair)
+    common = estimate_flow(
+        pair.source,
+        pair.target,
+        source_offset_ns=pair.source_offset_ns + 5_000,
+        target_offset_ns=pair.target_offset_ns + 5_000 + PERIOD_NS,
+    )
+    assert np.array_equal(own.moving, common.moving)
+    assert np.abs(own.displacement - common.displacement).max() < 0.01
+    flash = estimate_flow(
+        pair.source,
+        pair.target,
+        source_offset_ns=np.zeros(len(pair.source), int),
+        target_offset_ns=np.zeros(len(pair.target), int),
+    )
+    assert flash.to_reference is None
+    assert np.array_equal(flash.displacement, estimate_flow(pair.source, pair.target).displacement)
+
+
+def seen_twice(rng: np.random.Generator, time_s: float) -> tuple[np.ndarray, np.ndarray]:
+    """Cloud and scanner numbers: a wall, and a box at 20 m/s that two scanners see half a
+    revolution apart."""
+    wall = np.column_stack(
+        [rng.uniform(-10, 10, 1500), np.full(1500, 6.0), rng.uniform(0, 3, 1500)]
+    )
+    y, z, x = rng.uniform(0, 1, (3, 600))
+    rear = np.column_stack([np.zeros(300), 1.8 * y[:300], 1.4 * z[:300]])
+    side = np.column_stack([4.0 * x[300:], np.zeros(300), 1.4 * z[300:]])
+    box = np.vstack([rear, side]) + 0.01 * rng.standard_normal((600, 3))
+    lidar = np.arange(600) % 2
+    box[:, 0] += 20.0 * (time_s + 0.05 * lidar)
+    return np.vstack([wall, box]), np.concatenate([np.arange(1500) % 2, lidar])
+
+
+def test_two_scanners_see_a_car_twice():
+    rng = np.random.default_rng(0)
+    (source, a), (target, b) = seen_twice(rng, 0.0), seen_twice(rng, 0.1)
+    field = estimate_flow(source, target, source_lidar=a, target_lidar=b)
+    box = np.arange(len(source)) >= 1500
+    assert field.moving[box].mean() > 0.85 and not field.moving[~box].any()
+    error = np.linalg.norm(field.displacement - [2.0, 0, 0], axis=1)
+    assert error[box & field.moving].mean() < 0.03
+
+
+def test_a_hundred_points_are_enough():
+    rng = np.random.default_rng(4)
+    (source, _), (target, _) = seen_twice(rng, 0.0), seen_twice(rng, 0.1)
+    one = np.r_[0:1500:25, 1500:2100:15]  # every other point of the box is the second scanner's
+    one = one[(one < 1500) | (one % 2 == 0)]
+    rows = np.r_[one, 1500 + 2 * rng.permutation(300)[: 100 - len(one)]]
+    field = estimate_flow(source[rows], target[rows])
+    box = rows >= 1500
+    assert len(rows) == 100
+    assert not field.moving[~box].any() and field.moving[box].mean() > 0.5
+    error = np.linalg.norm(field.displacement - [2.0, 0, 0], axis=1)
+    assert error[box & field.moving].mean() < 0.2
+
+
+def test_far_strays_cost_nothing():
+    pair = pair_of(car(14.0, 1.5, 12.0, 1))
+    stray = np.array([[1e7, -3e6, 50.0], [0, 0, -1e5]])
+    field = estimate_flow(np.vstack([pair.source, stray]), np.vstack([pair.target, stray]))
+    assert not field.moving[-2:].any()
+    assert field.moving[:-2][pair.moved].mean() > 0.8
+
+
+def test_same_bytes_every_time():
+    pair = pair_of(car(14.0, 1.5, 12.0, 1))
+    a, b = estimated(pair), estimated(pair)
+    assert a.displacement.tobytes() == b.displacement.tobytes()
+    assert a.instance.tobytes() == b.instance.tobytes()
+
+
+CLOUD = np.random.default_rng(0).normal(size=(60, 3))
+INTS = np.arange(60)
+
+
+@pytest.mark.parametrize("name", ["offset_ns", "lidar"])
+@pytest.mark.parametrize(
+    ("source", "target", "message"),
+    [
+        (INTS, None, "target_{}: not given"),
+        (None, INTS, "source_{}: not given"),
+        (INTS[:-1], INTS, r"source_{}: got shape \(59,\)"),
+        (INTS, INTS[:, None], r"target_{}: got shape \(60, 1\)"),
+        (INTS, INTS * 1e-3, "target_{}: .*float64"),
+        (["a"] * 60, INTS, "source_{}: .*expected .60,. whole numbers"),
+    ],
+)
+def test_bad_columns_are_refused(name, source, target, message):
+    columns = {f"source_{name}": source, f"target_{name}": target}
+    with pytest.raises(InputError, match=message.format(name)) as caught:
+        estimate_flow(CLOUD, CLOUD, **columns)
+    assert "\n" not in str(caught.value)
+
+
+def test_real_traffic():
+    """A street in Karlsruhe: the cars ahead and behind move, houses and hedges do not."""
+    folder = os.environ.get("DENSIFY_TEST_DATA")
+    if not folder:
+        pytest.skip("DENSIFY_TEST_DATA is not set: no real KITTI drives")
+    drive = Path(folder) / "kitti" / "2011_09_26" / "2011_09_26_drive_0013_sync"
+    settings = RegisterSettings()
+    sweeps = list(read_sweeps(open_sequence(str(drive)), range(118, 123), settings))
+    rough = register(sweeps, settings)
+    straight = [s.sweep for s in deskew(sweeps, rough, 120).sweeps]
+    window = deskew(sweeps, register(straight, settings, rough), 120)
+    here, there = window[120], window[121]
+    target = poses.transform(there.T_key_lidar, there.sweep.points)
+    field = estimate_flow(
+        here.sweep.points,
+        target,
+        source_offset_ns=here.sweep.offset_ns,
+        target_offset_ns=there.sweep.offset_ns,
+    )
+    # Found by tracking them through eleven sweeps: place, and motion in one.
+    cars = {(-12, 3): 1.35, (-18, 0): 1.19, (31, 0): 1.6, (-29, 4): 1.28, (-60, 20): -1.48}
+    at = here.sweep.points[:, :2]
+    near_one = np.zeros(len(at), bool)
+    for place, step_m in cars.items():
+        near = np.linalg.norm(at - place, axis=1) < 3.5
+        found = near & field.moving
+        assert found.sum() >= 30, place
+        assert abs(np.median(field.displacement[found], axis=0)[0] - step_m) < 0.1, place
+        near_one |= near
+    assert (field.moving & ~near_one).mean() < 5e-3
+    assert field.moving.sum() < 2500
