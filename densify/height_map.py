@@ -66,18 +66,6 @@ class HeightMap:
         height_m: Float32 = (points[:, 2] - self.under(points)).astype(np.float32)
         return height_m
 
-    def flatten(self, points: Float) -> Float:
-        """(N,3) -> x y and the height above the ground, in which what drives moves in a plane."""
-        flat = points.copy()
-        flat[:, 2] -= self.under(points)
-        return flat
-
-    def lift(self, flat: Float) -> Float:
-        """Inverse of `flatten`."""
-        points = flat.copy()
-        points[:, 2] += self.under(flat)
-        return points
-
 
 def _averaged(hull: HeightMap, points: Float, cell: np.ndarray) -> Float:
     """Mean of what lies on the hull, about each cell; the second lowest of many is lower than the

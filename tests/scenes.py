@@ -260,6 +260,12 @@ def street(length_m: float = 90.0) -> tuple[Box, ...]:
     return tuple(boxes)
 
 
+ROOM = tuple(
+    Box((size_x, size_y, 40.0), Arc(x, y))
+    for x, y, size_x, size_y in ((21, 0, 2, 44), (-21, 0, 2, 44), (0, 21, 44, 2), (0, -21, 44, 2))
+)  # four walls 20 m away
+
+
 def car(x, y, speed_m_s, instance, yaw=0.0, turn_rad_s=0.0, size_m=(4.2, 1.8, 1.4)) -> Box:
     return Box(size_m, Arc(x, y, yaw, speed_m_s, turn_rad_s), 0.15, instance)
 
@@ -271,6 +277,12 @@ CAMERA = Camera(
     K=np.array([[150.0, 0, 119.5], [0, 150.0, 34.5], [0, 0, 1]]),
     T_cam_lidar=np.array([[0, -1, 0, 0], [0, 0, -1, -0.1], [1, 0, 0, -0.2], [0, 0, 0, 1.0]]),
 )
+
+
+def on_sphere(azimuth_deg, elevation_deg, range_m) -> np.ndarray:
+    """(N,3) points in these directions."""
+    a, e, r = np.broadcast_arrays(np.deg2rad(azimuth_deg), np.deg2rad(elevation_deg), range_m)
+    return np.stack([r * np.cos(a) * np.cos(e), r * np.sin(a) * np.cos(e), r * np.sin(e)], -1)
 
 
 class TinySequence:

@@ -7,8 +7,10 @@ import numpy as np
 import pytest
 
 from densify import poses
-from densify.config import FlowSettings
-from densify.flow.evidence import Candidates, FreeSpace, find_candidates, link
+from densify.config import FlowSettings, GroundSettings
+from densify.flow.evidence import FreeSpace, Standing, find_candidates, link
+from densify.height_map import HeightMap
+from densify.stages.ground import ground
 from densify.types import Stretch
 from tests.scenes import SWEEP_S, Arc, Scanner, Scene, World, car, street
 
@@ -28,8 +30,8 @@ def stretch(scene) -> Stretch:
 
 
 @pytest.fixture(scope="module")
-def heights_m(scene, stretch) -> list[np.ndarray]:
-    return [scene.height_m(f) for f in stretch.frames]
+def heights(stretch) -> HeightMap:
+    return ground(stretch, GroundSettings())
 
 
 @pytest.fixture(scope="module")
@@ -38,24 +40,46 @@ def space(stretch) -> FreeSpace:
 
 
 @pytest.fixture(scope="module")
-def evidence(stretch, space, heights_m) -> tuple[Candidates, ...]:
-    return find_candidates(stretch, space, heights_m, MIN_HEIGHT_M)
+def evidence(stretch, space, heights) -> tuple[Standing, ...]:
+    return find_candidates(stretch, space, heights, MIN_HEIGHT_M)
 
 
-def test_candidates_are_where_and_when_their_rows_say(stretch, evidence):
+def test_standing_points_are_where_and_when_their_rows_say(stretch, evidence):
     for i, (registered, c) in enumerate(zip(stretch.sweeps, evidence, strict=True)):
         placed = poses.transform(registered.T_world_lidar, registered.sweep.points[c.row])
         np.testing.assert_allclose(c.points, placed)
         fired_s = i * SWEEP_S + registered.sweep.offset_ns[c.row] * 1e-9
         np.testing.assert_allclose(c.time_s, fired_s, atol=1e-9)
         assert len(c.row) == len(np.unique(c.row)) == len(c.seed) == len(c.cluster)
-        assert set(np.unique(c.cluster)) == set(range(c.num_clusters))
+        assert set(np.unique(c.cluster[c.candidate])) == set(range(c.num_clusters))
+        assert (c.cluster[~c.candidate] == -1).all()
 
 
-def test_candidates_are_few_and_above_the_ground(heights_m, evidence):
-    for height_m, c in zip(heights_m, evidence, strict=True):
-        assert (height_m[c.row] >= MIN_HEIGHT_M).all()
-        assert 0 < len(c.row) < 0.1 * len(height_m)
+@pytest.mark.parametrize("min_height_m", [MIN_HEIGHT_M, 1.0])
+def test_what_stands_is_above_the_height_and_nothing_else_is(stretch, space, heights, min_height_m):
+    for found, s in zip(
+        find_candidates(stretch, space, heights, min_height_m), stretch.sweeps, strict=True
+    ):
+        height_m = heights.above(poses.transform(s.T_world_lidar, s.sweep.points))
+        np.testing.assert_array_equal(found.row, np.flatnonzero(height_m >= min_height_m))
+
+
+def test_what_truly_stands_is_there(scene, stretch, evidence):
+    for frame, c in zip(stretch.frames, evidence, strict=True):
+        near = np.linalg.norm(stretch[frame].sweep.points, axis=1) < 35
+        stands = (scene.height_m(frame) > MIN_HEIGHT_M + 0.1) & (scene.scan(frame).box >= 0) & near
+        found = np.isin(np.flatnonzero(stands), c.row)
+        assert found.mean() > 0.99
+
+
+def test_candidates_are_few_and_the_movers_are_among_them(scene, stretch, evidence):
+    for frame, c in zip(stretch.frames, evidence, strict=True):
+        assert 0 < c.candidate.sum() < 0.1 * len(stretch[frame].sweep)
+        assert c.candidate[c.seed].mean() > 0.5
+    c, instance = evidence[stretch.frames.index(KEY)], scene.scan(KEY).instance
+    for mover in (1, FAST):
+        mine = instance[c.row] == mover
+        assert mine.sum() > 100 and c.candidate[mine].mean() > 0.8
 
 
 def test_movers_are_seen_through_and_walls_are_not(scene, stretch, space):
@@ -67,12 +91,6 @@ def test_movers_are_seen_through_and_walls_are_not(scene, stretch, space):
     still = (scan.instance < 0) & (scan.box >= 0)
     assert free[still].mean() < 1e-3
     assert not space.seen_through(points, i).any()
-
-
-def test_a_higher_limit_of_height_lets_less_in(stretch, space, heights_m):
-    few = find_candidates(stretch, space, heights_m, 1.0)
-    for height_m, c in zip(heights_m, few, strict=True):
-        assert (height_m[c.row] >= 1.0).all()
 
 
 def test_links_of_voxels():

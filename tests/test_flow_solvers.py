@@ -13,6 +13,7 @@ from densify.errors import InputError
 from densify.flow import graph
 from densify.flow.objective import energy
 from densify.flow.solvers import ObjectiveSettings, solve
+from densify.kernels import threads
 
 ADAM = ObjectiveSettings(solver="adam", adam_num_steps=60)
 
@@ -129,6 +130,27 @@ def test_same_input_gives_the_same_bytes(settings: ObjectiveSettings) -> None:
     first, second = (solve(source, target, settings) for _ in range(2))
     assert first.flow.tobytes() == second.flow.tobytes()
     assert first.energies == second.energies
+
+
+@pytest.mark.parametrize("solver", ["pcg", "adam"])
+def test_the_number_of_threads_leaves_no_trace(monkeypatch, solver: str) -> None:
+    """Clouds so large that torch, too, shares them out."""
+    rng = np.random.default_rng(0)
+    source = rng.uniform(0, 20, (12000, 3)) * [1, 1, 0.1]
+    target = rng.uniform(0, 20, (12500, 3)) * [1, 1, 0.1] + [0.3, 0, 0]
+    settings = ObjectiveSettings(
+        solver=solver, num_neighbors=4, adam_num_steps=2, pcg_alpha_start=10.0
+    )
+    before, found = torch.get_num_threads(), []
+    try:
+        for cores in (1, 3):
+            monkeypatch.setattr(threads, "num_threads", lambda cores=cores: cores)
+            torch.set_num_threads(cores)
+            solution = solve(source, target, settings)
+            found.append((solution.flow.tobytes(), solution.energies))
+    finally:
+        torch.set_num_threads(before)
+    assert found[0] == found[1]
 
 
 def test_input_is_left_alone_and_may_be_any_real_type() -> None:

@@ -3,85 +3,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 import pytest
 
 from densify import poses
-from densify.config import FlowSettings
-from densify.flow.groups import GroupMotion
 from densify.stages.flow import estimate_motion
-from densify.types import FlowField, Stretch
+from densify.types import FlowField
+from tests.found_motion import KEY, NOISE, SETTINGS, Found, toward_key
 from tests.scenes import SWEEP_S, Arc, Box, Scanner, Scene, World, car, street
-
-SETTINGS = FlowSettings()
-NOISE = Scanner(sigma_m=0.01)
-KEY = 5
-
-
-@dataclass
-class Found:
-    """A scene, the motion in a stretch of it, and the flow of each sweep to the next one towards
-    the key."""
-
-    scene: Scene
-    stretch: Stretch
-    heights_m: list[np.ndarray]
-    motion: GroupMotion
-    fields: tuple[FlowField, ...]
-
-    @staticmethod
-    def of(movers, ego=None, size=4, scanner=NOISE, extra=()) -> Found:
-        world = World((*street(), *extra, *movers))
-        return Found.around(KEY, Scene(world, ego or Arc(0, -1.5, 0, 6.0, 0.0), scanner), size)
-
-    @staticmethod
-    def around(middle: int, scene: Scene, size: int) -> Found:
-        stretch = scene.stretch(middle, size)
-        heights_m = [scene.height_m(f) for f in stretch.frames]
-        motion = estimate_motion(stretch, heights_m, SETTINGS)
-        assert isinstance(motion, GroupMotion)
-        fields = tuple(motion.flow(f, toward_key(f)) for f in stretch.frames)
-        return Found(scene, stretch, heights_m, motion, fields)
-
-    def near_key(self, reach=3):
-        """(frame, scan, field) of the sweeps within ``reach`` of the key."""
-        for frame, flow in zip(self.stretch.frames, self.fields, strict=True):
-            if abs(frame - KEY) <= reach:
-                yield frame, self.scene.scan(frame), flow
-
-    def errors_m(self, instance: int, reach=3) -> np.ndarray:
-        """Of the instance's points that move: off the true displacement to the next sweep."""
-        found = []
-        for frame, scan, flow in self.near_key(reach):
-            on = (scan.instance == instance) & flow.moving
-            true = self.scene.displacement(frame, toward_key(frame))
-            found.append(np.linalg.norm(flow.displacement - true, axis=1)[on])
-        return np.concatenate(found)
-
-    def share_moving(self, instance: int, reach=3) -> float:
-        moving = [f.moving[s.instance == instance] for _, s, f in self.near_key(reach)]
-        return float(np.concatenate(moving).mean())
-
-    def track_of(self, instance: int, reach=3) -> int:
-        """The number most of the instance's moving points carry."""
-        numbers = [
-            f.instance[(s.instance == instance) & f.moving] for _, s, f in self.near_key(reach)
-        ]
-        return int(np.bincount(np.concatenate(numbers)).argmax())
-
-    def false_share(self) -> float:
-        """Of the points on what stands still: marked as moving."""
-        frames = zip(self.stretch.frames, self.fields, strict=True)
-        return float(
-            np.concatenate([f.moving[self.scene.scan(k).instance < 0] for k, f in frames]).mean()
-        )
-
-
-def toward_key(frame: int) -> int:
-    return frame + int(np.sign(KEY - frame))
-
 
 # --- nothing moves --------------------------------------------------------------------------------
 
@@ -172,7 +101,7 @@ def test_shapes_and_types(traffic):
 
 
 def test_same_bytes_every_time(traffic):
-    motion = estimate_motion(traffic.stretch, traffic.heights_m, SETTINGS)
+    motion = estimate_motion(traffic.stretch, traffic.ground, SETTINGS)
     for frame, a in zip(traffic.stretch.frames, traffic.fields, strict=True):
         b = motion.flow(frame, toward_key(frame))
         assert a.total.tobytes() == b.total.tobytes()
@@ -195,7 +124,7 @@ def test_a_turning_truck(truck):
     assert np.ptp(true, axis=0).max() > 0.1
 
 
-@pytest.mark.xfail(strict=True, reason="a face that comes apart from the rest is aligned alone")
+@pytest.mark.xfail(strict=True, reason="a face that comes apart from the rest is followed alone")
 def test_no_part_of_a_turning_truck_goes_its_own_way(truck):
     assert np.quantile(truck.errors_m(1), 0.9) < 0.08
 
@@ -232,7 +161,6 @@ def test_a_car_that_passes_behind_a_pillar(pillar):
     assert not np.concatenate(on_pillar).any()
 
 
-@pytest.mark.xfail(strict=True, reason="a side that a pillar cuts off seems to slide more slowly")
 def test_a_pillar_does_not_slow_the_car_behind_it(pillar):
     assert np.median(pillar.errors_m(1)) < 0.15
 
@@ -330,8 +258,9 @@ def test_over_several_sweeps_it_stays_right(traffic, frame, target):
     for instance in (CAR, FAST, WALKER):
         on = (traffic.scene.scan(frame).instance == instance) & flow.moving & ~flow.lost
         off_m = (flow.displacement - true)[on]  # the lidar is level here
-        assert np.median(np.linalg.norm(off_m[:, :2], axis=1)) < 0.03 + 0.01 * hops
-        assert np.median(np.abs(off_m[:, 2])) < 0.03 * hops
+        assert np.median(np.linalg.norm(off_m[:, :2], axis=1)) < 0.015 + 0.003 * hops
+        # the walker comes close to the kerb, about which the map of the ground is not sharp
+        assert np.abs(off_m[:, 2]).max() < (0.025 if instance == WALKER else 0.005)
         assert np.linalg.norm(flow.displacement[on], axis=1).min() > 0.12 * hops
 
 

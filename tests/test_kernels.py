@@ -1,15 +1,22 @@
 # SPDX-License-Identifier: MIT
-"""Compiled functions: cached where they can be, and never the reason for a crash."""
+"""Compiled functions: cached where they can be, never the reason for a crash, and shared out among
+threads row by row."""
 
 from __future__ import annotations
 
 import importlib.util
+import os
+import signal
 import sys
+import threading
+import time
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
 
 from densify import kernels
+from densify.kernels import threads
 
 SOURCE = """
 def double(first, last, values, out):
@@ -72,11 +79,92 @@ def test_without_any_place_for_a_cache():
     check(kernels.Kernel(namespace["double"]))
 
 
+@pytest.fixture
+def shared_out(monkeypatch):
+    """Three threads for anything worth sharing."""
+    monkeypatch.setattr(threads, "_LEAST_ROWS", 50)
+    monkeypatch.setattr(threads, "num_threads", lambda: 3)
+
+
 @pytest.mark.parametrize("num_rows", [0, 1, 99, 100, 1001])
-def test_every_row_is_done_once(double, monkeypatch, num_rows):
-    monkeypatch.setattr(kernels, "_MIN_ROWS_PER_THREAD", 50)
-    monkeypatch.setattr("numba.config.NUMBA_NUM_THREADS", 3)
+def test_a_kernel_does_every_row(double, shared_out, num_rows):
     values = np.arange(float(num_rows))
-    out = np.zeros_like(values)
+    out = np.full_like(values, -1)
     kernels.Kernel(double).over_rows(num_rows, values, out)
     np.testing.assert_array_equal(out, 2 * values)
+
+
+def test_a_kernel_shared_out_recovers_from_its_cache_too(double, shared_out, tmp_path):
+    check(kernels.Kernel(double))
+    for kept in tmp_path.rglob("*.nb?"):
+        kept.write_bytes(b"damaged")
+    check(kernels.Kernel(double))
+
+
+def test_what_a_kernel_returns_comes_back(double):
+    total = kernels.Kernel(lambda values: values.sum())
+    assert total(np.arange(5.0)) == 10
+
+
+# --- threads --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("cores", [1, 2, 7])
+@pytest.mark.parametrize("num_rows", [0, 1, 5000, 40001])
+def test_parts_cover_every_row_once(monkeypatch, cores, num_rows):
+    monkeypatch.setattr(threads, "num_threads", lambda: cores)
+    seen, parts = np.zeros(num_rows, int), []
+
+    def visit(begin, end):
+        seen[begin:end] += 1
+        parts.append(threading.current_thread())
+
+    threads.over_rows(visit, num_rows)
+    assert (seen == 1).all()
+    assert len(parts) <= cores and threading.current_thread() in parts
+    assert num_rows < 40000 or len(parts) == cores
+
+
+@pytest.mark.parametrize("where", ["first", "others"])
+def test_errors_come_through_once_all_are_done(shared_out, where):
+    done = []
+
+    def fail(begin, end):
+        done.append(begin)
+        if (begin == 0) == (where == "first"):
+            raise ValueError("here")
+
+    with pytest.raises(ValueError, match="here"):
+        threads.over_rows(fail, 300)
+    assert len(done) == 3
+
+
+def test_many_callers_at_once(double, shared_out):
+    kernel = kernels.Kernel(double)
+    with ThreadPoolExecutor(8) as pool:
+        for made in [pool.submit(check, kernel) for _ in range(40)]:
+            made.result()
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork here")
+@pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
+def test_a_forked_process_has_threads_of_its_own(double, shared_out):
+    kernel = kernels.Kernel(double)
+    check(kernel)  # the pool's threads are there, and stay behind
+    child = os.fork()
+    if child == 0:
+        try:
+            check(kernel)
+            os._exit(0)
+        finally:
+            os._exit(1)
+    for _ in range(200):
+        ended, status = os.waitpid(child, os.WNOHANG)
+        if ended:
+            break
+        time.sleep(0.05)
+    else:
+        os.kill(child, signal.SIGKILL)
+        os.waitpid(child, 0)
+        pytest.fail("the forked process hangs")
+    assert status == 0

@@ -6,33 +6,23 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
-import numba
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from densify import kernels, poses, range_image
+from densify import poses
+from densify.kernels import threads
 from densify.range_image import RangeImage, ScannerImage
-from densify.street.sensors import SENSORS
 from densify.types import RegisteredSweep, Sweep
-from tests.scenes import Arc, Box, Scanner, Scene, World
+from tests.scenes import ROOM, Arc, Box, Scanner, Scene, World, on_sphere
 
 MARGIN = (0.4, 0.015)
-ROOM = tuple(
-    Box((size_x, size_y, 40.0), Arc(x, y))
-    for x, y, size_x, size_y in ((21, 0, 2, 44), (-21, 0, 2, 44), (0, 21, 44, 2), (0, -21, 44, 2))
-)  # four walls 20 m away
 STANDING = Arc(0.0, 0.0)
 LEVEL = Scanner(elevation_deg=(-15.0, 15.0))
 
 
 def standing_sweep(boxes=ROOM, scanner=LEVEL) -> RegisteredSweep:
     return Scene(World(boxes), STANDING, scanner).stretch(2, 0).sweeps[0]
-
-
-def on_sphere(azimuth_deg, elevation_deg, range_m) -> np.ndarray:
-    a, e, r = np.broadcast_arrays(np.deg2rad(azimuth_deg), np.deg2rad(elevation_deg), range_m)
-    return np.stack([r * np.cos(a) * np.cos(e), r * np.sin(a) * np.cos(e), r * np.sin(e)], -1)
 
 
 @pytest.fixture(scope="module")
@@ -124,28 +114,6 @@ def test_one_scanner_cannot_veto_what_the_other_saw():
     ahead_and_behind = on_sphere([0, 20, 160, 180, 200, 340], 0.0, 8.0)
     assert image.sees_through(ahead_and_behind, *MARGIN).all()
     assert not image.sees_through(on_sphere([0, 180], 0.0, 25.0), *MARGIN).any()
-
-
-# --- the sensor's resolution ----------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("num_beams", [16, 32, 64])
-@pytest.mark.parametrize("num_azimuths", [450, 900, 1800])
-def test_cells_follow_the_sensor(num_beams, num_azimuths):
-    scanner = Scanner(num_beams, num_azimuths, elevation_deg=(-15.0, 15.0))
-    image = RangeImage.of(standing_sweep(scanner=scanner))
-    (only,) = image.scanners
-    # no finer than the rays, or cells stay empty; no coarser than twice, or movers hide in them
-    spacing = 30 / (num_beams - 1)
-    rows = np.diff(np.rad2deg(only.row_edges_rad)) / spacing
-    np.testing.assert_allclose(rows, 1, atol=0.08)
-    assert 1 <= num_azimuths / only.nearest_m.shape[1] < 1.5
-    rng = np.random.default_rng(0)
-    # clear of the ground and of the upper edge, where the 3 x 3 cells leave the image
-    hung = on_sphere(rng.uniform(-180, 180, 2000), rng.uniform(-5, 15 - 1.5 * spacing, 2000), 9.0)
-    assert image.sees_through(hung, *MARGIN).mean() > 0.995
-    wall = on_sphere(rng.uniform(-40, 40, 500), rng.uniform(-3, 3, 500), 1.0)
-    assert not image.sees_through(wall * (20 / wall[:, :1]), *MARGIN).any()
 
 
 # --- rolling shutter ------------------------------------------------------------------------------
@@ -299,7 +267,7 @@ def look(scanner: ScannerImage, point, velocity, margin_m, margin_fraction, min_
 @pytest.mark.parametrize("turn_rad_s", [0.0, 0.5])
 def test_lookup_against_a_slow_twin(turn_rad_s, moving):
     """Rolling shutter, velocity, the seam behind and an origin of its own."""
-    registered = blocks(Arc(0, 0, 0, 20.0, turn_rad_s)).window(2, 0).sweeps[0]
+    registered = blocks(Arc(0, 0, 0, 20.0, turn_rad_s)).stretch(2, 0).sweeps[0]
     origins = np.array([[0.3, -0.2, 0.1]])
     sweep = replace(registered.sweep, scanner_origins=origins)
     image = RangeImage.of(replace(registered, sweep=sweep))
@@ -319,7 +287,7 @@ def test_lookup_against_a_slow_twin(turn_rad_s, moving):
 
 
 def test_image_against_a_slow_twin():
-    registered = blocks(Arc(0, 0, 0, 20.0, 0.4)).window(2, 0).sweeps[0]
+    registered = blocks(Arc(0, 0, 0, 20.0, 0.4)).stretch(2, 0).sweeps[0]
     few = np.random.default_rng(2).random(len(registered.sweep)) < 0.05
     sweep = replace(registered.sweep.select(few), scanner_origins=np.array([[0.5, 0.0, -0.2]]))
     image = RangeImage.of(replace(registered, sweep=sweep)).scanners[0]
@@ -357,142 +325,17 @@ def test_image_against_a_slow_twin():
 
 
 def test_the_number_of_threads_changes_no_byte(monkeypatch):
-    registered = blocks(Arc(0, 0, 0, 20.0, 0.4)).window(2, 0).sweeps[0]
+    registered = blocks(Arc(0, 0, 0, 20.0, 0.4)).stretch(2, 0).sweeps[0]
     points = np.random.default_rng(3).normal(0, 15, (5003, 3)) * [1, 1, 0.1]
-    monkeypatch.setattr(kernels, "_MIN_ROWS_PER_THREAD", 100)
+    monkeypatch.setattr(threads, "_LEAST_ROWS", 100)
     found = []
-    for num_threads in (1, 2, 7):
-        monkeypatch.setattr(numba.config, "NUMBA_NUM_THREADS", num_threads)
+    for cores in (1, 2, 7):
+        monkeypatch.setattr(threads, "num_threads", lambda cores=cores: cores)
         image = RangeImage.of(registered)
         free = image.sees_through(points, *MARGIN, velocity_m_s=np.ones_like(points))
         found.append([c.tobytes() for c in image.scanners[0].tables] + [free.tobytes()])
         assert 0 < free.mean() < 1
     assert found[0] == found[1] == found[2]
-
-
-# --- rings ----------------------------------------------------------------------------------------
-
-TABLES = {name: np.sort(sensor.elevation_deg) for name, sensor in SENSORS.items()}
-TABLES["128 beams"] = np.concatenate([np.arange(-25, -6, 0.5), np.arange(-6, 5.25, 0.125)])
-
-
-def on_rings(elevation_deg, noise_deg=0.01, num_columns=600, seed=0):
-    """(3,N) azimuth and elevation (rad) of returns, each ring with a share of its own missing."""
-    rng = np.random.default_rng(seed)
-    azimuth = np.tile(np.arange(num_columns) * 360 / num_columns - 180, len(elevation_deg))
-    elevation = np.repeat(elevation_deg, num_columns) + rng.normal(0, noise_deg, len(azimuth))
-    heard = rng.random(len(azimuth)) < np.repeat(
-        rng.uniform(0.2, 1, len(elevation_deg)), num_columns
-    )
-    return np.deg2rad(azimuth[heard], dtype=np.float32), np.deg2rad(
-        elevation[heard], dtype=np.float32
-    )
-
-
-@pytest.mark.parametrize("name", TABLES)
-def test_rings_are_found_wherever_the_beams_point(name):
-    azimuth, elevation = on_rings(TABLES[name])
-    found = range_image._rings(elevation)
-    np.testing.assert_allclose(np.rad2deg(found), TABLES[name], atol=0.03)
-    edges, num_columns = range_image._cells(azimuth, elevation)
-    assert 600 / 1.5 < num_columns <= 600
-    rows = np.diff(np.rad2deg(edges))
-    assert rows.min() > 0.44
-    lone = np.flatnonzero(np.gradient(TABLES[name]) > 1.0)  # a row each, half the way to the next
-    for ring in TABLES[name][lone]:
-        assert (np.abs(TABLES[name] - ring) < 0.01).sum() == 1
-        row = np.searchsorted(np.rad2deg(edges), ring) - 1
-        inside = (TABLES[name] > np.rad2deg(edges[row])) & (
-            TABLES[name] < np.rad2deg(edges[row + 1])
-        )
-        assert inside.sum() == 1
-
-
-@pytest.mark.parametrize("towards_deg", [2.5, 7.5, 12.5, 170.0])
-def test_a_narrow_view_is_measured_too(monkeypatch, towards_deg):
-    monkeypatch.setattr(range_image, "_MANY_POINTS", 1000)
-    azimuth, elevation = on_rings(TABLES["hdl64"], num_columns=7200)
-    ahead = np.abs(azimuth - np.deg2rad(towards_deg)) < np.deg2rad(2.4)
-    edges, num_columns = range_image._cells(azimuth[ahead], elevation[ahead])
-    assert len(edges) == 49
-    assert 7200 / 1.5 < num_columns <= 7200
-
-
-def test_where_there_are_no_rings_rows_are_uniform():
-    rng = np.random.default_rng(0)
-    smeared = on_rings(TABLES["vlp16"], noise_deg=0.6)
-    anywhere = rng.uniform(-3, 3, 30000), rng.uniform(-0.4, 0.1, 30000)
-    sparse = rng.uniform(-3, 3, 600), rng.uniform(-0.4, 0.1, 600)
-    for azimuth, elevation in (smeared, anywhere, sparse):
-        azimuth, elevation = azimuth.astype(np.float32), elevation.astype(np.float32)
-        assert range_image._rings(elevation) is None
-        edges, _ = range_image._cells(azimuth, elevation)
-        np.testing.assert_allclose(np.diff(edges), np.diff(edges)[0], rtol=1e-3)
-        assert edges[0] <= elevation.min() and edges[-1] > elevation.max()
-
-
-# --- two scanners ---------------------------------------------------------------------------------
-
-
-def two_scanners(origins, pillar) -> RegisteredSweep:
-    """In a round room of 20 m about the origin, with a round pillar (x, y, radius)."""
-    parts = []
-    for origin in origins:
-        a, e = np.meshgrid(np.deg2rad(np.arange(-180, 180, 0.4)), np.deg2rad(np.arange(-15, 16, 2)))
-        ray = on_sphere(np.rad2deg(a.ravel()), np.rad2deg(e.ravel()), 1.0)
-        flat = ray[:, :2] / np.linalg.norm(ray[:, :2], axis=1, keepdims=True)
-
-        def meets(x, y, radius, far, flat=flat, origin=origin):
-            to = origin[:2] - (x, y)
-            b, c = flat @ to, to @ to - radius**2
-            root = np.sqrt(np.where(b * b > c, b * b - c, np.nan))
-            return -b + (root if far else -root)
-
-        near = meets(*pillar, far=False)
-        wall = meets(0.0, 0.0, 20.0, far=True)
-        range_m = np.where(near > 0, near, wall) / np.linalg.norm(ray[:, :2], axis=1)
-        parts.append(origin + ray * range_m[:, None])
-    points = np.concatenate(parts)
-    n = len(points)
-    lidar = np.repeat(np.arange(len(parts)), len(parts[0])).astype(np.uint8)
-    sweep = Sweep(0, 0, points, np.zeros(n, np.float32), None, lidar, np.arange(n), origins)
-    return RegisteredSweep(sweep, np.eye(4), np.zeros(6), np.zeros(6))
-
-
-def test_free_space_is_what_either_of_two_scanners_saw():
-    origins, pillar = np.array([[0.0, 0, 0], [0.0, 2.5, 0.8]]), (6.0, 0.0, 0.8)
-    both = two_scanners(origins, pillar)
-    image = RangeImage.of(both)
-    assert [len(s.nearest_m) for s in image.scanners] == [16, 16]
-    behind = np.array([[12.0, 0.0, 0.5], [10.0, 0.3, 0.3]])  # of the pillar, for the first one
-    assert image.sees_through(behind, *MARGIN).all()
-    only_first = replace(both, sweep=both.sweep.select(both.sweep.lidar == 0))
-    assert not RangeImage.of(only_first).sees_through(behind, *MARGIN).any()
-    on_surfaces = both.sweep.points
-    assert not image.sees_through(on_surfaces, *MARGIN).any()
-    around = np.arange(-180, 180, 3.0)
-    inside = on_sphere(around[np.abs(around + 6) > 3], 1.0, 14.0)  # not hidden from both
-    assert image.sees_through(inside, *MARGIN).all()
-
-
-def test_rays_taken_to_start_elsewhere_claim_what_they_did_not_cross():
-    """Why origins matter: the same returns, thought to be seen from the lidar frame's origin."""
-    origins, pillar = np.array([[0.0, 0, 0], [0.0, 2.5, 0.8]]), (6.0, 0.0, 0.8)
-    both = two_scanners(origins, pillar)
-    second = replace(both, sweep=both.sweep.select(both.sweep.lidar == 1))
-    unknown = replace(second, sweep=replace(second.sweep, scanner_origins=None))
-    shadow = np.array([6.0, 0, 0]) + np.outer(np.linspace(1.5, 6, 40), [6.0, -2.5, -0.3]) / 6.5
-    assert not RangeImage.of(second).sees_through(shadow, *MARGIN).any()
-    assert RangeImage.of(unknown).sees_through(shadow, *MARGIN).any()
-
-
-@pytest.mark.parametrize("origins", [np.zeros((1, 3)), np.zeros(3), np.zeros((2, 2))])
-def test_every_scanner_needs_an_origin(origins):
-    lidar = np.array([0, 1], np.uint8)
-    with pytest.raises(
-        ValueError, match=r"Sweep.scanner_origins: expected a row \(3,\) for each of 2"
-    ):
-        Sweep(0, 0, np.ones((2, 3)), np.zeros(2, np.float32), None, lidar, np.arange(2), origins)
 
 
 # --- odd input ------------------------------------------------------------------------------------

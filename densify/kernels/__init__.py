@@ -2,22 +2,20 @@
 """Compiled inner loops; the only door to numba.
 
 A kernel takes arrays of fixed types, writes into arrays it is given and raises nothing. It lets go
-of the interpreter while it works, and rows are shared out among plain threads: numba's own parallel
-loops abort the process when two threads enter them at once, or after a fork.
+of the interpreter while it works, so that its rows can be shared out among threads.
 """
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
-from itertools import pairwise
 from typing import Any, TypeVar
 
 import numba
 
+from densify.kernels import threads
+
 _log = logging.getLogger("densify")
-_MIN_ROWS_PER_THREAD = 50_000
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 
 # No fastmath, and divisions as numpy has them: a result is the same on every machine.
@@ -47,29 +45,20 @@ class Kernel:
         except RuntimeError as error:  # no place for a cache
             self._do_without_cache(error)
 
-    def __call__(self, *arguments: Any) -> None:
+    def __call__(self, *arguments: Any) -> Any:
         try:
-            self._compiled(*arguments)
+            return self._compiled(*arguments)
         except Exception as error:  # a full disk, a damaged file: unpickling can raise anything
             self._do_without_cache(error)
-            self._compiled(*arguments)
+            return self._compiled(*arguments)
 
     def over_rows(self, num_rows: int, *arguments: Any) -> None:
-        """Call with (first, last, *arguments) for parts of the rows, on all cores.
+        """Call with (begin, end, *arguments) for parts of the rows, on all cores.
 
         The parts do not change the result where a kernel treats every row by itself.
         NUMBA_NUM_THREADS limits the threads.
         """
-        cores = int(numba.config.NUMBA_NUM_THREADS)  # type: ignore[attr-defined]
-        num_threads = min(cores, num_rows // _MIN_ROWS_PER_THREAD)
-        if num_threads < 2:
-            self(0, num_rows, *arguments)
-            return
-        bounds = [num_rows * k // num_threads for k in range(num_threads + 1)]
-        with ThreadPoolExecutor(num_threads) as pool:
-            parts = [pool.submit(self, first, last, *arguments) for first, last in pairwise(bounds)]
-        for part in parts:
-            part.result()
+        threads.over_rows(self, num_rows, *arguments)
 
     def _do_without_cache(self, error: Exception) -> None:
         _log.debug("%s is compiled without a cache: %s", self._function.__name__, error)

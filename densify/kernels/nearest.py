@@ -5,9 +5,8 @@ boxes are fitted anew, in a tenth of the time that building takes."""
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
-from densify.kernels.threads import in_parallel
+from densify.kernels import Kernel, inlined
 from densify.types import Float, Int
 
 _MAX_LEAF = 10  # points; 8 to 16 answer alike
@@ -40,7 +39,7 @@ class BoxTree:
         queries: (q,3).
         """
         distance_m, row = np.empty(len(queries)), np.empty(len(queries), np.int64)
-        in_parallel(_nearest, len(queries), queries, *self._search, distance_m, row)
+        _nearest.over_rows(len(queries), queries, *self._search, distance_m, row)
         return distance_m, row
 
     def nearest_k(self, queries: Float, k: int) -> tuple[Float, Int]:
@@ -50,7 +49,7 @@ class BoxTree:
         """
         distance_m = np.empty((len(queries), k))
         row = np.empty((len(queries), k), np.int64)
-        in_parallel(_nearest_k, len(queries), queries, *self._search, distance_m, row)
+        _nearest_k.over_rows(len(queries), queries, *self._search, distance_m, row)
         return distance_m, row
 
     @property
@@ -58,7 +57,7 @@ class BoxTree:
         return self._points, self._order, self._starts, self._stops, self._boxes
 
 
-@njit(cache=True, nogil=True)
+@Kernel
 def _split(points: Float, depth: int, starts: Int, stops: Int, order: Int) -> None:
     """Halve every node's points along its longest side; node i has the children 2i+1 and 2i+2."""
     starts[0], stops[0] = 0, len(order)
@@ -78,7 +77,7 @@ def _split(points: Float, depth: int, starts: Int, stops: Int, order: Int) -> No
         _select(points[:, axis], order, start, stop - 1, middle)
 
 
-@njit(cache=True, nogil=True)
+@inlined
 def _select(values: Float, order: Int, left: int, right: int, middle: int) -> None:
     """Hoare's quickselect: no value of order[:middle] is above, none of order[middle:] below."""
     while left < right:
@@ -101,7 +100,7 @@ def _select(values: Float, order: Int, left: int, right: int, middle: int) -> No
             return
 
 
-@njit(cache=True, nogil=True)
+@Kernel
 def _fit_boxes(points: Float, starts: Int, stops: Int, boxes: Float) -> None:
     first_leaf = len(starts) // 2
     for node in range(len(starts) - 1, -1, -1):
@@ -116,7 +115,7 @@ def _fit_boxes(points: Float, starts: Int, stops: Int, boxes: Float) -> None:
             boxes[node, axis], boxes[node, 3 + axis] = low, high
 
 
-@njit(cache=True, nogil=True, inline="always")
+@inlined
 def _squared_to_box(boxes: Float, node: int, x: float, y: float, z: float) -> float:
     dx = max(boxes[node, 0] - x, 0.0, x - boxes[node, 3])
     dy = max(boxes[node, 1] - y, 0.0, y - boxes[node, 4])
@@ -124,7 +123,7 @@ def _squared_to_box(boxes: Float, node: int, x: float, y: float, z: float) -> fl
     return dx * dx + dy * dy + dz * dz
 
 
-@njit(cache=True, nogil=True)
+@Kernel
 def _nearest(
     begin: int,
     end: int,
@@ -171,7 +170,7 @@ def _nearest(
         distance_m[q], row[q] = np.sqrt(best), order[found]
 
 
-@njit(cache=True, nogil=True)
+@Kernel
 def _nearest_k(
     begin: int,
     end: int,

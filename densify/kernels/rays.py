@@ -78,14 +78,14 @@ def _at_time(x, y, z, time_s, twists):  # type: ignore[no-untyped-def]
 
 
 @Kernel
-def aim(first, last, points, offset_s, origin, twists, rays):  # type: ignore[no-untyped-def]
+def aim(begin, end, points, offset_s, origin, twists, rays):  # type: ignore[no-untyped-def]
     """The rays that measured a deskewed scanner's points, seen from it when it fired them.
 
     points: (N,3) lidar frame at the reference time. offset_s: (N,). origin: (3,) of the scanner.
     twists: (2,6) before and after the reference time. rays: (3,N), filled with azimuth and
     elevation (rad) and range (m). All float32.
     """
-    for i in range(first, last):
+    for i in range(begin, end):
         x, y, z = _at_time(points[i, 0], points[i, 1], points[i, 2], offset_s[i], twists)
         x, y, z = x - origin[0], y - origin[1], z - origin[2]
         ground = np.sqrt(x * x + y * y)
@@ -124,8 +124,8 @@ def fill(rays, offset_s, row_edges_rad, nearest_m, num_filled, num_rays, sum_s):
 
 @Kernel
 def see_through(  # type: ignore[no-untyped-def]
-    first,
-    last,
+    begin,
+    end,
     points,
     velocity,
     offset_s,
@@ -149,8 +149,8 @@ def see_through(  # type: ignore[no-untyped-def]
     x, y, z, time_s = np.empty((4, _BLOCK), np.float32)
     column = np.empty(_BLOCK, np.int64)
     # Each point is a long chain of steps; a block of them takes every step side by side.
-    for start in range(first, last, _BLOCK):
-        size = min(_BLOCK, last - start)
+    for start in range(begin, end, _BLOCK):
+        size = min(_BLOCK, end - start)
         for k in range(size):
             x[k] = points[start + k, 0] - origin[0]
             y[k] = points[start + k, 1] - origin[1]

@@ -7,10 +7,9 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
-from densify.kernels.threads import in_parallel
+from densify.kernels import Kernel
 from densify.types import Float, Int
 
 Index = NDArray[np.int32]
@@ -35,21 +34,21 @@ def symmetric_union(listed: Int, values: Float) -> Rows:
     n = len(listed)
     counts = np.zeros(n + 1, np.int64)
     lonely = np.zeros(listed.shape, np.bool_)
-    in_parallel(_find_one_sided, n, listed, lonely)
+    _find_one_sided.over_rows(n, listed, lonely)
     _count(listed, lonely, counts)
     starts = np.cumsum(counts)
     columns = np.empty(starts[-1], np.int32)
     filled = np.empty(starts[-1], values.dtype)
     _scatter(listed, values, lonely, starts[:-1].copy(), columns, filled)
     narrow = starts.astype(np.int32)
-    in_parallel(_sort_rows, n, narrow, columns, filled)
+    _sort_rows.over_rows(n, narrow, columns, filled)
     return Rows(narrow, columns, filled)
 
 
 def product(matrix: Rows, x: NDArray[Any]) -> NDArray[Any]:
     """A x for x (n,3), summed in float64 along each row."""
     out = np.empty_like(x)
-    in_parallel(_multiply, len(x), *matrix, x, out)
+    _multiply.over_rows(len(x), *matrix, x, out)
     return out
 
 
@@ -74,7 +73,7 @@ def conjugate_gradients(
     slope = (rhs * direction).sum(axis=0)
     enough = residual_drop**2 * (rhs * rhs).sum(axis=0)
     for _ in range(max_products):
-        in_parallel(_multiply, len(rhs), *matrix, direction, image)
+        _multiply.over_rows(len(rhs), *matrix, direction, image)
         slope, left = _descend(
             image, scale, diagonal, preconditioner, slope, direction, solution, residual
         )
@@ -83,7 +82,7 @@ def conjugate_gradients(
     return solution
 
 
-@njit(cache=True, nogil=True)
+@Kernel
 def _find_one_sided(begin: int, end: int, listed: Int, lonely: NDArray[np.bool_]) -> None:
     for i in range(begin, end):
         for a in range(listed.shape[1]):
@@ -97,7 +96,7 @@ def _find_one_sided(begin: int, end: int, listed: Int, lonely: NDArray[np.bool_]
                     break
 
 
-@njit(cache=True, nogil=True)
+@Kernel
 def _count(listed: Int, lonely: NDArray[np.bool_], counts: Int) -> None:
     for i in range(len(listed)):
         for a in range(listed.shape[1]):
@@ -107,7 +106,7 @@ def _count(listed: Int, lonely: NDArray[np.bool_], counts: Int) -> None:
                     counts[listed[i, a] + 1] += 1
 
 
-@njit(cache=True, nogil=True)
+@Kernel
 def _scatter(
     listed: Int,
     values: Float,
@@ -129,7 +128,7 @@ def _scatter(
                 free[j] += 1
 
 
-@njit(cache=True, nogil=True)
+@Kernel
 def _sort_rows(begin: int, end: int, starts: Index, columns: Index, filled: Float) -> None:
     for i in range(begin, end):
         row = slice(starts[i], starts[i + 1])
@@ -138,7 +137,7 @@ def _sort_rows(begin: int, end: int, starts: Index, columns: Index, filled: Floa
         filled[row] = filled[row][order]
 
 
-@njit(cache=True, nogil=True)
+@Kernel
 def _multiply(
     begin: int,
     end: int,
@@ -158,7 +157,7 @@ def _multiply(
         out[i, 0], out[i, 1], out[i, 2] = a, b, c
 
 
-@njit(cache=True, nogil=True)
+@Kernel
 def _descend(
     image: Float,
     scale: float,

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""Compiled functions on all cores: plain threads around functions that let go of Python's lock.
+"""Rows shared out among plain threads, around functions that let go of Python's lock.
 
 Numba's own parallel loops are not used: their order of summation follows the number of threads,
-their pools may not be entered from two threads at once, and OpenMP waits in busy loops, which
-costs tenfold where cores are shared."""
+their pools abort the process when two threads enter them at once or after a fork, and OpenMP waits
+in busy loops, which costs tenfold where cores are shared."""
 
 from __future__ import annotations
 
@@ -14,27 +14,27 @@ from functools import cache
 from itertools import pairwise
 from typing import Any
 
-_LEAST_ITEMS = 2048  # below this a second thread costs more than it saves
+import numba
+
+_LEAST_ROWS = 4096  # to hand fewer to a second thread takes longer than most kernels do for them
 
 
 def num_threads() -> int:
-    """The cores this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
+    """The cores this process may use, or fewer where NUMBA_NUM_THREADS says so."""
+    return int(numba.config.NUMBA_NUM_THREADS)  # type: ignore[attr-defined]
 
 
-def in_parallel(kernel: Callable[..., None], num_items: int, *arguments: Any) -> None:
-    """Call ``kernel(begin, end, *arguments)`` so that the ranges cover 0 to ``num_items``.
+def over_rows(function: Callable[..., None], num_rows: int, *arguments: Any) -> None:
+    """Call ``function(begin, end, *arguments)`` so that the ranges cover 0 to ``num_rows``.
 
-    kernel: nogil; what it writes for an item must depend on that item alone.
+    function: what it writes for a row must depend on that row alone. It may not call this one.
     """
-    num_parts = min(num_threads(), max(1, num_items // _LEAST_ITEMS))
-    bounds = [num_items * part // num_parts for part in range(num_parts + 1)]
+    num_parts = min(num_threads(), max(1, num_rows // _LEAST_ROWS))
+    bounds = [num_rows * part // num_parts for part in range(num_parts + 1)]
     parts = list(pairwise(bounds))
-    others = [_pool().submit(kernel, begin, end, *arguments) for begin, end in parts[1:]]
+    others = [_pool().submit(function, begin, end, *arguments) for begin, end in parts[1:]]
     try:
-        kernel(*parts[0], *arguments)
+        function(*parts[0], *arguments)
     finally:
         for other in others:
             other.result()
@@ -43,3 +43,7 @@ def in_parallel(kernel: Callable[..., None], num_items: int, *arguments: Any) ->
 @cache
 def _pool() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(num_threads(), "densify-kernel")
+
+
+if hasattr(os, "register_at_fork"):  # a forked process has the pool but not its threads
+    os.register_at_fork(after_in_child=_pool.cache_clear)

@@ -1,0 +1,79 @@
+# SPDX-License-Identifier: MIT
+"""How far a moving object reaches: along its sides, not into its neighbours, with the ground."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tests.found_motion import KEY, NOISE, Found
+from tests.scenes import Arc, Box, Scene, World, car, street
+
+EXTRA = len(street())  # number of the first box that a test adds
+PARKED_M = (4.2, 1.8, 1.4)
+
+
+def marked(found: Found, box: int) -> np.ndarray:
+    """Which of the box's returns, of all sweeps, move."""
+    return np.concatenate([f.moving[s.box == box] for _, s, f in found.near_key(4)])
+
+
+def test_a_long_side_that_slides_along_itself_belongs_to_its_object():
+    """A bus of 18 m beside the scanner: only its ends are ever seen through."""
+    found = Found.of([car(4, 2.6, 3, 1, size_m=(18.0, 2.5, 3.0))])
+    for _, scan, flow in found.near_key(4):
+        on = scan.instance == 1
+        assert on.sum() > 10_000 and flow.moving[on].mean() > 0.99
+        assert len(np.unique(flow.instance[on & flow.moving])) == 1
+    assert np.quantile(found.errors_m(1), 0.99) < 0.08
+    assert found.false_share() < 1e-4
+
+
+@pytest.mark.parametrize("gap_m", [1.0, 0.4])
+def test_a_parked_car_in_line_stays(gap_m):
+    """As wide and as high as the one that leaves, and at first so close behind it."""
+    rear, y, speed_m_s = 14.0, 2.2, 4.0
+    leaving = car(rear + 0.5 * PARKED_M[0] - 0.1 * speed_m_s, y, speed_m_s, 1, size_m=PARKED_M)
+    parked = Box(PARKED_M, Arc(rear - gap_m - 0.5 * PARKED_M[0], y), 0.15)
+    found = Found.of([leaving], extra=[parked])
+    still = marked(found, EXTRA)
+    assert len(still) > 10_000 and not still.any()
+    assert found.share_moving(1, 4) > 0.85
+    assert np.quantile(found.errors_m(1, 4), 0.9) < 0.05
+
+
+def test_a_guard_rail_beside_the_car_stays():
+    rail = Box((40.0, 0.2, 0.8), Arc(15.0, 3.5))
+    found = Found.of([car(8, 2.0, 10, 1)], extra=[rail])
+    still = marked(found, EXTRA)
+    assert len(still) > 40_000 and not still.any()
+    assert found.share_moving(1, 4) > 0.9
+
+
+@pytest.fixture(
+    scope="module",
+    params=[
+        0.05,
+        pytest.param(
+            -0.08,
+            marks=pytest.mark.xfail(
+                strict=True, reason="single rings on a flat roof are followed alone"
+            ),
+        ),
+    ],
+    ids="slope {}".format,
+)
+def hill(request) -> Found:
+    """One car drives ahead, one comes towards."""
+    movers = car(12, -1.6, 10, 1), car(25, 1.6, 14, 2, yaw=np.pi)
+    world = World((*street(), *movers), request.param)
+    return Found.around(KEY, Scene(world, Arc(0, -1.5, 0, 6.0), NOISE), 4)
+
+
+def test_what_moves_rises_and_falls_with_the_ground(hill):
+    for frame, target in [(1, 9), (8, 1), (4, 6)]:
+        flow, true = hill.motion.flow(frame, target), hill.scene.displacement(frame, target)
+        for instance in (1, 2):
+            on = (hill.scene.scan(frame).instance == instance) & flow.moving
+            assert np.abs(true[on, 2]).min() > 0.09
+            np.testing.assert_allclose(flow.displacement[on, 2], true[on, 2], atol=0.01)

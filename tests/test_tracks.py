@@ -1,0 +1,65 @@
+# SPDX-License-Identifier: MIT
+"""Where the search for tracks starts, and the ground under them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from densify.config import GroundSettings
+from densify.flow.evidence import Standing
+from densify.flow.tracks import Track, _groups_to_start
+from densify.height_map import HeightMap
+
+
+def standing(sizes: list[int], seed_share: float = 1.0) -> Standing:
+    """Clusters of these sizes, and as many points again that are no candidates."""
+    cluster = np.repeat([*range(len(sizes)), -1], [*sizes, sum(sizes)])
+    n = len(cluster)
+    nth = np.concatenate([np.arange(s) for s in [*sizes, sum(sizes)]])
+    size = np.repeat([*sizes, 1], [*sizes, sum(sizes)])
+    seed = (cluster >= 0) & (nth < seed_share * size)
+    return Standing(np.arange(n), np.zeros((n, 3)), np.zeros(n), seed, cluster, len(sizes))
+
+
+def starts(sweeps: list[Standing]) -> list[tuple[int, int]]:
+    """(sweep, size) in the order they are tried."""
+    found = _groups_to_start(sweeps)
+    for i, members in found:
+        assert len(set(sweeps[i].cluster[members])) == 1 and sweeps[i].candidate[members].all()
+    return [(i, len(members)) for i, members in found]
+
+
+def test_starts_in_the_middle_of_the_stretch_come_before_larger_ones_at_its_ends():
+    """A factor 0.7 for every sweep nearer than five to an end."""
+    rng = np.random.default_rng(0)
+    sweeps = [standing(rng.integers(10, 300, 3).tolist()) for _ in range(15)]
+    worth = [n * 0.7 ** max(0, 5 - min(i, 14 - i)) for i, n in starts(sweeps)]
+    assert len(worth) == 45 and worth == sorted(worth, reverse=True)
+    same = starts([standing([100])] * 15)
+    assert [i for i, _ in same[:5]] == [5, 6, 7, 8, 9]  # far enough from either end: alike
+    assert {i for i, _ in same[-2:]} == {0, 14}
+    # 0.7 ** 5 = 0.17: from 6 times as many points the end wins
+    assert starts([standing([594]), *[standing([100])] * 10])[0][0] != 0
+    assert starts([standing([596]), *[standing([100])] * 10])[0][0] == 0
+
+
+@pytest.mark.parametrize(
+    ("size", "seed_share", "starts_one"), [(8, 1, 1), (7, 1, 0), (40, 0.35, 0)]
+)
+def test_few_points_or_few_seeds_start_nothing(size, seed_share, starts_one):
+    assert len(starts([standing([size], seed_share)])) == starts_one
+
+
+def test_no_candidates_no_starts():
+    assert starts([standing([]), standing([])]) == []
+
+
+def test_the_ground_rises_under_a_track():
+    x, y = np.meshgrid(np.arange(-20, 20, 0.25), np.arange(-20, 20, 0.25))
+    points = np.stack([x.ravel(), y.ravel(), 0.1 * x.ravel()], 1)
+    ground = HeightMap.of(points, GroundSettings())
+    track = Track(np.array([-5.0, 2.0, 9.0]))
+    for dx, dy in ((10, 0), (-6, 3), (0, 5)):
+        rise_m = track.rise_m(ground, np.array([dx, dy, 77.0, 0.3]))
+        assert rise_m == pytest.approx(0.1 * dx, abs=0.005)
