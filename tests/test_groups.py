@@ -124,7 +124,6 @@ def test_a_turning_truck(truck):
     assert np.ptp(true, axis=0).max() > 0.1
 
 
-@pytest.mark.xfail(strict=True, reason="a face that comes apart from the rest is followed alone")
 def test_no_part_of_a_turning_truck_goes_its_own_way(truck):
     assert np.quantile(truck.errors_m(1), 0.9) < 0.08
 

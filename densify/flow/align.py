@@ -9,15 +9,16 @@ falls as the ground does. Free to climb, what few beams hit climbs with the beam
 from __future__ import annotations
 
 import numpy as np
-from scipy.spatial import cKDTree
+from scipy.spatial import ConvexHull, QhullError, cKDTree
 
-from densify.types import Float
+from densify.types import Bool, Float
 
 GATES_M = (0.8, 0.5, 0.3, 0.2, 0.2)
 MIN_FIT = 5  # points
 _MAX_MODEL_POINTS = 1500
 _SURFACE_M = 0.05  # noise of a surface point
 _MAX_WEIGHT = 60.0
+_OUTLINE_M = 0.05
 _LOOSE = 10.0  # along the surface: sliding along it must not be held up by its own points
 _PLANAR = [0, 1, 3]
 
@@ -128,3 +129,12 @@ def _turned(arms: Float, yaw: float | Float) -> Float:
     c, s = np.cos(yaw), np.sin(yaw)
     x, y, z = arms.T
     return np.stack([c * x - s * y, s * x + c * y, z], axis=1)
+
+
+def within_outline(at: Float, outline: Float) -> Bool:
+    """(N,2), (M,2) -> (N,) True inside the convex hull, where there is one."""
+    try:
+        hull = ConvexHull(outline)
+    except (QhullError, ValueError):  # too few points, or all on a line
+        return np.zeros(len(at), bool)
+    return (at @ hull.equations[:, :2].T + hull.equations[:, 2] < _OUTLINE_M).all(1)

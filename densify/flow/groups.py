@@ -9,9 +9,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import ConvexHull, QhullError, cKDTree
+from scipy.spatial import cKDTree
 
 from densify import poses
+from densify.flow.align import within_outline
 from densify.flow.evidence import (
     FreeSpace,
     Standing,
@@ -26,7 +27,6 @@ from densify.types import Bool, Float, Float32, FlowField, Int, Stretch
 
 _ATTACH_M = 0.3
 _ATTACH_UNSEEN_M = 0.15
-_OUTLINE_M = 0.05
 _MIN_HEIGHT_M = 0.08
 _LENGTH_M = 15.0
 _SIDE_M = 0.1
@@ -214,7 +214,7 @@ def _attach(
         at_once = track.carry(seen.points[rows], seen.time_s[rows], at_s)
         distance = np.asarray(cKDTree(shape).query(at_once)[0])
         belongs = (distance < seen.reach_m[rows]) & (seen.height_m[rows] >= min_height_m)
-        belongs |= _within_outline(at_once[:, :2], shape[:, :2])
+        belongs |= within_outline(at_once[:, :2], shape[:, :2])
         closer = belongs & (distance < nearest[rows])
         instance[rows[closer]] = k
         nearest[rows[closer]] = distance[closer]
@@ -275,12 +275,3 @@ def _contradicted(
         velocity_m_s = track.velocity_m_s(carried, time_s[j])
         shares.append(float(space.seen_through(carried, j, velocity_m_s).mean()))
     return max(shares)
-
-
-def _within_outline(at: Float, outline: Float) -> Bool:
-    """(N,2), (M,2) -> (N,) True inside the convex hull, where there is one."""
-    try:
-        hull = ConvexHull(outline)
-    except (QhullError, ValueError):  # too few points, or all on a line
-        return np.zeros(len(at), bool)
-    return (at @ hull.equations[:, :2].T + hull.equations[:, 2] < _OUTLINE_M).all(1)

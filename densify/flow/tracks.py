@@ -12,8 +12,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
+from scipy.spatial import cKDTree
 
-from densify.flow.align import GATES_M, MIN_FIT, Model, align, apply, undo
+from densify.flow.align import GATES_M, MIN_FIT, Model, align, apply, undo, within_outline
 from densify.flow.evidence import FreeSpace, Standing
 from densify.flow.paths import Path
 from densify.flow.vote import DistanceField, vote
@@ -25,6 +26,7 @@ _MIN_SEED_SHARE = 0.4
 _AROUND = 5  # sweeps before and after a start are as good as any number
 _PER_SWEEP_NEARER_END = 0.7  # a start this much nearer needs as many more points
 _FIT_M = 0.3
+_NEAR_SWEEPS = 3
 _SHARE_UNSEEN = 0.5  # of the points a sweep usually shows
 _MANY_POINTS = 100  # more do not place a sweep better
 _PREDICTION_STD = np.array([0.3, 0.3, 0.06])  # m, m, rad
@@ -119,6 +121,7 @@ def follow_groups(
         track = _follow(members, i, velocity, standing, free, ground, sweep_time_s)
         proven = _prove(track, standing, space, sweep_time_s)
         if proven:
+            _gather(track, standing, free, space, sweep_time_s)
             _refine(track, standing, ground, sweep_time_s)
         for j, rows in track.claimed.items():
             untried[j][rows] = False
@@ -232,6 +235,40 @@ def _find(
     if fit.sum() < enough:
         return None
     return state, seen_s, rows[fit], target[fit]
+
+
+def _gather(
+    track: Track,
+    standing: Sequence[Standing],
+    free: Sequence[Bool],
+    space: FreeSpace,
+    sweep_time_s: Float,
+) -> None:
+    """Claim the free candidates beside or within the object that its motion does not contradict,
+    before a part of it starts a track of its own."""
+    shape = np.concatenate(
+        [
+            track.carry(standing[j].points[rows], standing[j].time_s[rows], track.path.begin_s)
+            for j, rows in sorted(track.claimed.items())
+        ]
+    )
+    for j, own in track.claimed.items():
+        c, at_s = standing[j], track.times_s[j]
+        there = track.carry(shape, track.path.begin_s, at_s)
+        low, high = there.min(0) - 2 * _FIT_M, there.max(0) + 2 * _FIT_M
+        near = free[j] & c.candidate & ((c.points > low) & (c.points < high)).all(1)
+        near[own] = False
+        rows = np.flatnonzero(near)
+        at_once = track.carry(c.points[rows], c.time_s[rows], at_s)
+        belongs = np.asarray(cKDTree(there).query(at_once)[0]) < _FIT_M
+        belongs |= within_outline(at_once[:, :2], there[:, :2])
+        rows = rows[belongs]
+        for i in space.others(j):
+            if abs(i - j) <= _NEAR_SWEEPS and len(rows):
+                carried = track.carry(c.points[rows], c.time_s[rows], sweep_time_s[i])
+                velocity_m_s = track.velocity_m_s(carried, sweep_time_s[i])
+                rows = rows[~space.seen_through(carried, i, velocity_m_s)]
+        track.claimed[j] = np.concatenate([own, rows])
 
 
 def _refine(
