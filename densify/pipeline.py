@@ -22,6 +22,7 @@ from densify.range_image import RangeImage
 from densify.readers.flow_files import FlowFiles
 from densify.readers.window import choose_cameras, read_sweeps, recorded_trajectory, window_frames
 from densify.stages.accumulate import accumulate
+from densify.stages.age import with_ages
 from densify.stages.colour import colour
 from densify.stages.deskew import deskew
 from densify.stages.flow import estimate_motion
@@ -147,6 +148,7 @@ def compare(
             exposed = cloud.after(late_s)
             with watch.stage("project"):
                 seen = project(exposed, camera, T_cam_key, settings.project, key, origins)
+                seen = with_ages(seen, _ages_s(stretch, key, late_s))
             with watch.stage("colour"):
                 image = images[camera.name]
                 rgb = colour(cloud.rgb, exposed.points, camera, T_cam_key, seen, image)
@@ -207,6 +209,12 @@ def _exposure(
     late_s = (stamp_ns - key_sweep.sweep.stamp_ns) * 1e-9
     twist = key_sweep.twist_before if late_s < 0 else key_sweep.twist_after
     return late_s, camera.T_cam_lidar @ poses.inverse(poses.exp(late_s * twist))
+
+
+def _ages_s(stretch: Stretch, key: int, late_s: float) -> dict[int, float]:
+    """Seconds between each sweep's reference time and the exposure, by frame."""
+    key_ns = stretch[key].sweep.stamp_ns
+    return {s.frame: abs((s.sweep.stamp_ns - key_ns) * 1e-9 - late_s) for s in stretch.sweeps}
 
 
 def _scores(

@@ -32,6 +32,7 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     _add_flow(commands)
     _add_info(commands)
     _add_simulate(commands)
+    _add_export(commands)
     _add_bench(commands)
     return parser.parse_args(arguments)
 
@@ -139,6 +140,35 @@ def _add_simulate(commands: Any) -> None:
         "--frames", type=_frames, metavar="A:B", help="frames A to B-1 only (default: all)"
     )
     _add_camera(parser)
+    _add_overwrite(parser)
+
+
+def _add_export(commands: Any) -> None:
+    parser = _add_verb(
+        commands,
+        "export",
+        verbs.export,
+        "a finished run's depth maps with only the certain and fresh pixels",
+        "Nothing is computed again and the run stays as it is. A filled pixel has the age of the "
+        "measured pixel nearest to it.",
+    )
+    parser.add_argument(
+        "run", metavar="RUN", type=Path, help="folder of one key, such as densify-out/000120"
+    )
+    parser.add_argument(
+        "--min-confidence",
+        type=float,
+        default=0.0,
+        metavar="C",
+        help="drop pixels less certain, 0 to 1 (default: 0, keep all)",
+    )
+    parser.add_argument(
+        "--max-age-ms",
+        type=float,
+        metavar="MS",
+        help="drop pixels measured longer before or after the exposure (default: keep all)",
+    )
+    parser.add_argument("--out", metavar="DIR", type=Path, help="(default: RUN/export)")
     _add_overwrite(parser)
 
 

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from densify.output import Export
 from densify.types import Result
 
 _NONE = "-"
@@ -44,6 +45,18 @@ def summary(result: Result) -> str:
             baseline = _percent(_look_up(result.baselines["icp"].metrics, "ghosts", "all"))
         beside = "" if baseline == _NONE else f" ({baseline} by registration alone)"
         lines.append(f"ghosts: {ghosts} of the accumulated points{beside}")
+    return "\n".join(lines)
+
+
+def export_summary(exported: Export) -> str:
+    """A line for each camera: the share of its pixels with a depth, before and after."""
+    lines = []
+    for camera, products in exported.density.items():
+        measured, filled = (
+            f"{_percent(products[p].before, digits=1)} -> {_percent(products[p].after, digits=1)}"
+            for p in ("measured", "filled")
+        )
+        lines.append(f"{camera}: depth in {measured} of the pixels, {filled} with filled ones")
     return "\n".join(lines)
 
 

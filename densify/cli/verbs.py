@@ -130,6 +130,22 @@ def simulate(options: argparse.Namespace) -> None:
     print(f"{len(frames)} frames; open them with --data {drive}")
 
 
+def export(options: argparse.Namespace) -> None:
+    """A finished run's depth maps with fewer pixels."""
+    from densify.cli.tables import export_summary
+    from densify.output import export_run
+
+    exported = export_run(
+        options.run,
+        options.min_confidence,
+        options.max_age_ms,
+        options.out,
+        options.overwrite,
+    )
+    print(export_summary(exported))
+    _print_paths(exported.paths)
+
+
 def bench_flow(options: argparse.Namespace) -> None:
     """Scene flow methods on the same pairs and windows."""
     config = resolve(options.config, options.overrides)
