@@ -7,6 +7,7 @@ Every ``*_scores`` and ``*_errors`` dictionary holds plain numbers ready for JSO
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -143,6 +144,24 @@ def ghost_scores(cloud: Cloud, key_image: RangeImage, key: int) -> dict[str, Any
         "by_distance": {
             str(steps): _mean(ghost[distance == steps]) for steps in np.unique(distance[other])
         },
+    }
+
+
+def held_out_scores(
+    rest: Mapping[str, DepthMap],
+    key_alone: Mapping[str, DepthMap],
+    moving: Mapping[str, Bool],
+    cameras: Mapping[str, Camera],
+) -> dict[str, Any]:
+    """The key densified from its neighbours alone against the key sweep's own returns, by camera;
+    the fields of `depth_scores`. Needs no truth.
+
+    rest: maps of the cloud without the key sweep. key_alone: maps of the key sweep alone. moving:
+    (H,W) where its returns belong to something that moves.
+    """
+    return {
+        name: depth_scores(maps, key_alone[name].depth_m, moving[name], cameras[name])
+        for name, maps in rest.items()
     }
 
 

@@ -220,6 +220,18 @@ def _add_key_options(parser: argparse.ArgumentParser) -> None:
         help="groups (ours), paper, or npz:DIR, flow files of another method "
         "(short for --set flow.engine=ENGINE)",
     )
+    parser.add_argument(
+        "--at",
+        choices=("camera", "sweep"),
+        help="the moment the maps show: each image's own exposure, or the key sweep's reference "
+        "time (short for --set project.at=…; default: camera)",
+    )
+    parser.add_argument(
+        "--movers",
+        choices=("keep", "drop", "separate"),
+        help="moving objects in the maps, left out, or left out and written one by one (short for "
+        "--set output.movers=…; default: keep)",
+    )
     _add_config_options(parser)
 
 

@@ -2,6 +2,7 @@
 """What `run`, `compare` and `bench` say on the screen. Reads `Result.metrics`:
 
 - ``ghosts``: `densify.scores.ghost_scores`;
+- ``held_out``: `densify.scores.held_out_scores`;
 - ``depth``: camera -> `densify.scores.depth_scores`, where there is truth;
 
 and for a benchmark of flow what `densify.bench.flow.bench_flow` returns.
@@ -44,14 +45,31 @@ def summary(result: Result) -> str:
             baseline = _percent(_look_up(result.baselines["icp"].metrics, "ghosts", "all"))
         beside = "" if baseline == _NONE else f" ({baseline} by registration alone)"
         lines.append(f"ghosts: {ghosts} of the accumulated points{beside}")
+    lines += [line for name in result.depth if (line := _held_out_line(result, name))]
     return "\n".join(lines)
+
+
+def _held_out_line(result: Result, camera: str) -> str:
+    """The key from its neighbours alone, against its own returns."""
+    said = []
+    for part in ("all", "moving"):
+        path = ("held_out", camera, "measured", part, "outliers")
+        mine = _look_up(result.metrics, *path)
+        if mine is None:
+            continue
+        icp = result.baselines.get("icp")
+        other = None if icp is None else _look_up(icp.metrics, *path)
+        beside = "" if other is None else f" ({_percent(other)} by registration alone)"
+        said.append(f"{_percent(mine)} wrong{beside}{'' if part == 'all' else ' where it moves'}")
+    return f"{camera}, key held out: {', '.join(said)}" if said else ""
 
 
 def comparison(results: Mapping[str, Result]) -> str:
     """A table with one column per method.
 
-    Rows: points, image density per camera, ghost rate (needs no truth), and where there is truth,
-    coverage, MAE, RMSE and KITTI outliers of the measured depth at all, moving and static pixels.
+    Rows: points, image density per camera, ghost rate, and coverage, MAE, RMSE and KITTI outliers of
+    the measured depth at all, moving and static pixels, with the key held out (neither needs truth)
+    and against truth where there is some.
     """
     columns = list(results.values())
     rows = [
@@ -65,8 +83,9 @@ def comparison(results: Mapping[str, Result]) -> str:
     rates = [_look_up(result.metrics, "ghosts", "all") for result in columns]
     rows.append(["ghost rate", *map(_percent, rates)])
     for name in columns[0].depth:
-        if any(_look_up(result.metrics, "depth", name) for result in columns):
-            rows += _truth_rows(columns, name)
+        for source, title in (("held_out", "key held out"), ("depth", "truth")):
+            if any(_look_up(result.metrics, source, name) for result in columns):
+                rows += _score_rows(columns, source, name, title)
     return _aligned(rows)
 
 
@@ -152,16 +171,16 @@ def _written(value: float | None, form: str) -> str:
     return f"{value:{number}}".replace("%", " %") + (f" {unit}" if unit else "")
 
 
-def _truth_rows(columns: Sequence[Result], camera: str) -> list[list[str]]:
+def _score_rows(columns: Sequence[Result], source: str, camera: str, title: str) -> list[list[str]]:
     rows: list[list[str]] = [[]]
     for part in _PARTS:
-        for key, title, write in _SCORES:
+        for key, score, write in _SCORES:
             values = [
-                _look_up(result.metrics, "depth", camera, "measured", part, key)
+                _look_up(result.metrics, source, camera, "measured", part, key)
                 for result in columns
             ]
             cells = [_NONE if value is None else write(value) for value in values]
-            rows.append([f"{camera} {part}, {title}", *cells])
+            rows.append([f"{camera} {title}, {part}, {score}", *cells])
     return rows
 
 

@@ -166,9 +166,13 @@ def bench_flow(options: argparse.Namespace) -> None:
         _print_paths([options.out])
 
 
+_SHORT = {"flow": "flow.engine", "at": "project.at", "movers": "output.movers"}
+
+
 def _config(options: argparse.Namespace) -> densify.Config:
-    engine = [] if options.flow is None else [f"flow.engine={options.flow}"]
-    return resolve(options.config, [*options.overrides, *engine])
+    given = {knob: getattr(options, name) for name, knob in _SHORT.items()}
+    named = [f"{knob}={value}" for knob, value in given.items() if value is not None]
+    return resolve(options.config, [*options.overrides, *named])
 
 
 def _images(sequence: LidarSequence, result: Result) -> Mapping[str, NDArray[np.uint8]]:

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""Depth and confidence as PNG. Depth is exactly that of KITTI's depth-completion benchmark (Uhrig
-et al., "Sparsity Invariant CNNs", 3DV 2017): 16 bit, one channel, ``value / 256`` metres, 0 = none.
+"""Depth, confidence and optical flow as PNG. Depth is exactly that of KITTI's depth-completion
+benchmark (Uhrig et al., "Sparsity Invariant CNNs", 3DV 2017): 16 bit, one channel, ``value / 256``
+metres, 0 = none.
 """
 
 from __future__ import annotations
@@ -44,6 +45,22 @@ def write_confidence_png(path: Path, confidence: Float32, depth_m: Float32) -> N
     levels = np.zeros(depth_m.shape, np.uint8)
     levels[has_depth] = 1 + np.rint(254 * confidence[has_depth].astype(np.float64))
     write_file(path, encode_png(levels))
+
+
+def write_flow_png(path: Path, flow_px: Float32) -> None:
+    """Write optical flow as KITTI's flow benchmark does (Menze and Geiger, CVPR 2015): 16 bit, red
+    and green ``rint(64 * flow) + 2^15`` to the right and down, blue 1 where it is known, else 0.
+
+    flow_px: (H,W,2) pixels, NaN where unknown. What the format cannot say, beyond 512 pixels, is
+    unknown too.
+    """
+    levels = np.rint(64.0 * flow_px.astype(np.float64)) + 2**15
+    with np.errstate(invalid="ignore"):
+        known = ((levels >= 0) & (levels <= _MAX_VALUE)).all(axis=2)
+    image = np.zeros((*flow_px.shape[:2], 3), np.uint16)
+    image[known, 0] = 1
+    image[known, 1], image[known, 2] = levels[known, 1], levels[known, 0]
+    write_file(path, encode_png(image))
 
 
 def read_depth_png(path: Path) -> Float32:
