@@ -67,9 +67,9 @@ def _held_out_line(result: Result, camera: str) -> str:
 def comparison(results: Mapping[str, Result]) -> str:
     """A table with one column per method.
 
-    Rows: points, image density per camera, ghost rate, and coverage, MAE, RMSE and KITTI outliers of
-    the measured depth at all, moving and static pixels, with the key held out (neither needs truth)
-    and against truth where there is some.
+    Rows: points, image density per camera, ghost rate, and coverage, MAE, RMSE and KITTI outliers
+    of the measured depth at all, moving and static pixels, with the key held out (neither needs
+    truth) and against truth where there is some.
     """
     columns = list(results.values())
     rows = [
