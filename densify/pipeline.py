@@ -13,7 +13,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from densify import poses, scores
+from densify import depth_metrics, poses, scores
 from densify.config import Config, resolve
 from densify.errors import InputError
 from densify.flow.chained import ChainedMotion
@@ -218,8 +218,8 @@ def _scores(
         "num_moving": int(cloud.moving.sum()),
         "density": {
             name: {
-                "measured": scores.image_density(maps.depth_m),
-                "filled": scores.image_density(maps.filled_m),
+                "measured": depth_metrics.image_density(maps.depth_m),
+                "filled": depth_metrics.image_density(maps.filled_m),
             }
             for name, maps in depth.items()
         },
@@ -227,7 +227,7 @@ def _scores(
     }
     if sequence.truth is not None:
         metrics["depth"] = {
-            name: scores.depth_scores(
+            name: depth_metrics.depth_scores(
                 maps,
                 sequence.truth.depth_m(name, key_sweep.frame),
                 sequence.truth.moving_mask(name, key_sweep.frame),
