@@ -120,6 +120,9 @@ def test_of_our_output_one_product_and_nothing_beside_it(tmp_path: Path) -> None
     only_filled = own(tmp_path / "out", 120, "depth_filled").parent
     assert len(pair_depth_files(only_filled, truth.parent).pairs) == 1
     assert "--filled" in refusal(truth.parent, truth.parent, filled=True)
+    both = pair_depth_files(tmp_path / "out", tmp_path / "out", filled=True).pairs
+    filled_map, depth = (own(tmp_path / "out", 120, p) for p in ("depth_filled", "depth"))
+    assert both == (DepthPair(filled_map, depth),)
 
 
 def test_the_ground_truth_of_a_whole_kitti_tree(tmp_path: Path) -> None:
@@ -281,6 +284,17 @@ def test_the_verb_prints_a_table_and_writes_json(
     assert captured.out == "" and "--overwrite" in captured.err
     assert main([*command, "--out", str(file), "--overwrite"]) == 0
     assert file.read_bytes() == before
+
+
+def test_the_verb_scores_filled_maps_on_request(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    put(own(tmp_path / "out", 5), 10.0, 0.0)
+    put(own(tmp_path / "out", 5, "depth_filled"), 10.0, 20.0)
+    put(official(tmp_path / "t", 5), 10.0, 20.0)
+    for options, coverage in (([], "50.0 %"), (["--filled"], "100.0 %")):
+        assert main(["evaluate", str(tmp_path / "out"), str(tmp_path / "t"), *options]) == 0
+        assert coverage in capsys.readouterr().out.splitlines()[2]
 
 
 def test_the_verb_takes_focal_length_and_baseline(

@@ -75,7 +75,8 @@ def pair_depth_files(
     Raises InputError if a place is missing, names are ambiguous, or nothing pairs.
     """
     found = _product(_found(predicted, "PREDICTED"), predicted, filled)
-    true = _ground_truth(_found(truth, "TRUTH"))
+    true = _found(truth, "TRUTH")
+    true = [f for f in true if f.product in _TRUTH_PRODUCTS] or _product(true, truth, filled=False)
     if predicted.is_file() and truth.is_file():
         if mask is not None and not mask.is_file():
             raise InputError(f"--mask {mask}: expected a PNG file, as PREDICTED and TRUTH are")
@@ -142,8 +143,6 @@ def _last(pattern: re.Pattern[str], text: str, name: str) -> str | None:
 
 def _product(files: Sequence[_File], place: Path, filled: bool) -> list[_File]:
     """Of densify's own output one product."""
-    if place.is_file():
-        return list(files)
     if filled:
         wanted = [file for file in files if file.product == "depth_filled"]
         if not wanted:
@@ -152,11 +151,6 @@ def _product(files: Sequence[_File], place: Path, filled: bool) -> list[_File]:
     if any(file.product == "depth" for file in files):
         return [file for file in files if file.product != "depth_filled"]
     return list(files)
-
-
-def _ground_truth(files: Sequence[_File]) -> list[_File]:
-    true = [file for file in files if file.product in _TRUTH_PRODUCTS]
-    return true or [file for file in files if file.product != "depth_filled"] or list(files)
 
 
 def _match(
