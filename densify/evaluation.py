@@ -53,33 +53,21 @@ def evaluate(
 
     Raises InputError if a file is no depth map or mask, or the sizes of a pair differ.
     """
+    stereo = {"focal_px": focal_px, "baseline_m": baseline_m}
     by_part: dict[str, list[DepthErrors]] = defaultdict(list)
     images: list[dict[str, Any]] = []
     for number, pair in enumerate(pairs.pairs):
         predicted_m, truth_m, moving = _read(pair)
-        parts = errors_by_part(
-            predicted_m, truth_m, moving, focal_px=focal_px, baseline_m=baseline_m
-        )
+        parts = errors_by_part(predicted_m, truth_m, moving, **stereo)
         for name, errors in parts.items():
             by_part[name].append(errors)
-        images.append(
-            {
-                "predicted": str(pair.predicted),
-                "truth": str(pair.truth),
-                "mask": None if pair.mask is None else str(pair.mask),
-                "density": {
-                    "predicted": image_density(predicted_m),
-                    "truth": image_density(truth_m),
-                },
-                **asdict(parts["all"]),
-            }
-        )
+        densities = {"predicted": image_density(predicted_m), "truth": image_density(truth_m)}
+        images.append({**_paths(pair), "density": densities, **asdict(parts["all"])})
         if progress is not None:
             progress("evaluate", number + 1, len(pairs.pairs))
     return {
         "schema_version": SCHEMA_VERSION,
-        "focal_px": focal_px,
-        "baseline_m": baseline_m,
+        **stereo,
         "num_images": len(images),
         "density": {
             side: float(np.mean([image["density"][side] for image in images]))
@@ -98,6 +86,10 @@ def evaluate(
             for name in ("without_truth", "without_prediction", "without_mask")
         },
     }
+
+
+def _paths(pair: DepthPair) -> dict[str, str | None]:
+    return {name: None if path is None else str(path) for name, path in vars(pair).items()}
 
 
 def _read(pair: DepthPair) -> tuple[Float32, Float32, Bool | None]:
