@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from densify import poses, scores
+from densify import depth_metrics, poses, scores
 from densify.config import Config, resolve
 from densify.errors import InputError
 from densify.flow.chained import ChainedMotion
@@ -328,9 +328,15 @@ class _HeldOut:
         rest = cloud.select(cloud.frame != self._eye.key)
         if not len(rest):
             return None
-        cameras = {name: exposure.camera for name, exposure in self._eye.exposures.items()}
-        maps = self._eye.depth(rest)
-        return scores.held_out_scores(maps, self._key_alone, self._moving, cameras)
+        return {
+            name: depth_metrics.depth_scores(
+                maps,
+                self._key_alone[name].depth_m,
+                self._moving[name],
+                self._eye.exposures[name].camera,
+            )
+            for name, maps in self._eye.depth(rest).items()
+        }
 
 
 def _scores(
@@ -342,8 +348,8 @@ def _scores(
         "num_moving": int(cloud.moving.sum()),
         "density": {
             name: {
-                "measured": scores.image_density(maps.depth_m),
-                "filled": scores.image_density(maps.filled_m),
+                "measured": depth_metrics.image_density(maps.depth_m),
+                "filled": depth_metrics.image_density(maps.filled_m),
             }
             for name, maps in depth.items()
         },
@@ -351,7 +357,7 @@ def _scores(
     }
     if sequence.truth is not None:
         metrics["depth"] = {
-            name: scores.depth_scores(
+            name: depth_metrics.depth_scores(
                 maps,
                 sequence.truth.depth_m(name, key_sweep.frame),
                 sequence.truth.moving_mask(name, key_sweep.frame),

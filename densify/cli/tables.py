@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: MIT
-"""What `run`, `compare` and `bench` say on the screen. Reads `Result.metrics`:
+"""What the verbs say on the screen. Reads `Result.metrics`:
 
 - ``ghosts``: `densify.scores.ghost_scores`;
-- ``held_out``: `densify.scores.held_out_scores`;
-- ``depth``: camera -> `densify.scores.depth_scores`, where there is truth;
+- ``held_out``: camera -> the same for the key densified from its neighbours alone;
+- ``depth``: camera -> `densify.depth_metrics.depth_scores`, where there is truth;
 
-and for a benchmark of flow what `densify.bench.flow.bench_flow` returns.
+for a benchmark of flow what `densify.bench.flow.bench_flow` returns, and for depth on disk what
+`densify.evaluation.evaluate` does.
 """
 
 from __future__ import annotations
@@ -138,6 +139,50 @@ def flow_table(measured: Mapping[str, Any]) -> str:
         perfect = {"(truth)": measured["truth"]} if measured["truth"] else {}
         lines += ["", _table({**windows, **perfect}, (*columns, *known))]
     return "\n".join(lines)
+
+
+_EVALUATION_COLUMNS: tuple[Column, ...] = (
+    ("pixels", ("num_pixels",), ",d"),
+    ("coverage", ("coverage",), ".1%"),
+    ("MAE mm", ("mae_mm",), ",.1f"),
+    ("RMSE mm", ("rmse_mm",), ",.1f"),
+    ("iMAE 1/km", ("imae_per_km",), ".3f"),
+    ("iRMSE 1/km", ("irmse_per_km",), ".3f"),
+    ("AbsRel", ("abs_rel",), ".2%"),
+    ("SqRel", ("sq_rel",), ".2%"),
+    ("d<1.25", ("delta_1",), ".2%"),
+    ("d<1.25^2", ("delta_2",), ".2%"),
+    ("d<1.25^3", ("delta_3",), ".2%"),
+    ("outliers", ("outliers",), ".3%"),
+)
+_MISSING = {
+    "without_truth": "predicted without truth",
+    "without_prediction": "truth without prediction",
+    "without_mask": "truth without mask",
+}
+_MAX_NAMED = 5
+
+
+def evaluation_table(scores: Mapping[str, Any]) -> str:
+    """Depth against truth, a row per part of the pixels, in the units of KITTI's leaderboard; what
+    found no counterpart is counted, and named as far as there is room."""
+    num, density = scores["num_images"], scores["density"]
+    lines = [
+        f"{num:,} image{'s' if num != 1 else ''}: predicted {_percent(density['predicted'])} of "
+        f"the pixels, truth {_percent(density['truth'])}; outliers with fx "
+        f"{scores['focal_px']:g} px, baseline {scores['baseline_m']:g} m"
+    ]
+    for name, what in _MISSING.items():
+        if paths := scores[name]:
+            rest = f", ... and {len(paths) - _MAX_NAMED:,} more" if len(paths) > _MAX_NAMED else ""
+            lines.append(f"{what}: {len(paths):,}: {', '.join(paths[:_MAX_NAMED])}{rest}")
+    rows = {name: _in_mm(part) for name, part in scores["parts"].items() if part["num_pixels"]}
+    return "\n".join([*lines, _table(rows, _EVALUATION_COLUMNS)])
+
+
+def _in_mm(part: Mapping[str, Any]) -> dict[str, Any]:
+    metres = {name: part[f"{name}_m"] for name in ("mae", "rmse")}
+    return {**part, **{f"{n}_mm": None if m is None else 1000 * m for n, m in metres.items()}}
 
 
 def _adam_line(row: Mapping[str, Any], num_pairs: int) -> str:

@@ -5,7 +5,12 @@ their truth (`densify.readers.truth_files`).
 """
 
 from densify.output.cloud_laz import StoredCloud, read_cloud, write_cloud
-from densify.output.depth_png import read_depth_png, write_confidence_png, write_depth_png
+from densify.output.depth_png import (
+    read_depth_png,
+    read_mask_png,
+    write_confidence_png,
+    write_depth_png,
+)
 from densify.output.figure import draw_figure
 from densify.output.png import write_picture
 from densify.output.store import check_writable, write_comparison, write_result
@@ -16,6 +21,7 @@ __all__ = [
     "draw_figure",
     "read_cloud",
     "read_depth_png",
+    "read_mask_png",
     "write_cloud",
     "write_comparison",
     "write_confidence_png",

@@ -7,6 +7,7 @@ metres, 0 = none.
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -15,7 +16,7 @@ from numpy.typing import NDArray
 from densify.errors import InputError
 from densify.output.atomic import write_file
 from densify.output.png import encode_png
-from densify.types import Float32
+from densify.types import Bool, Float32
 
 _STEPS_PER_M = 256.0
 _MAX_VALUE = np.iinfo(np.uint16).max
@@ -65,15 +66,31 @@ def write_flow_png(path: Path, flow_px: Float32) -> None:
 
 def read_depth_png(path: Path) -> Float32:
     """(H,W) float32 metres, 0 none. Raises InputError for anything but a 16-bit gray PNG."""
-    try:
-        data = np.frombuffer(path.read_bytes(), np.uint8)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
-    image = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if len(data) else None
+    image = _decoded(path)
     if image is None or image.dtype != np.uint16 or image.ndim != 2:
         got = "no image" if image is None else f"{image.dtype} of shape {image.shape}"
         raise InputError(f"{path}: got {got}, expected a depth map (PNG, 16 bit, one channel)")
     return image.astype(np.float32) / np.float32(_STEPS_PER_M)
+
+
+def read_mask_png(path: Path) -> Bool:
+    """(H,W) bool, True where any colour is not 0; transparency says nothing. Raises InputError if
+    it is no image."""
+    image = _decoded(path)
+    if image is None:
+        raise InputError(f"{path}: got no image, expected a mask (PNG, 0 where it does not hold)")
+    colours = image if image.ndim == 2 else image[:, :, :3].max(axis=2)
+    mask: Bool = colours > 0
+    return mask
+
+
+def _decoded(path: Path) -> NDArray[Any] | None:
+    """As it is stored; None if it is no image."""
+    try:
+        data = np.frombuffer(path.read_bytes(), np.uint8)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
+    return cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if len(data) else None
 
 
 def _quantised(depth_m: Float32) -> NDArray[np.uint16]:

@@ -11,7 +11,7 @@ data, config and versions as run.yaml::
     density     camera -> measured, filled: fraction of the pixels with a depth
     ghosts      `densify.scores.ghost_scores`: num_points, all, moving, static, by_distance
     depth       where there is truth: camera -> measured, filled -> all, moving, static -> the
-                fields of `densify.scores.depth_errors`
+                fields of `densify.depth_metrics.DepthErrors`
     held_out    camera -> the same fields as depth: the key densified from its neighbours alone
                 against its own returns; null for the key sweep alone
     baselines   the same from ``frames`` on for each simpler method on the same registration
