@@ -9,7 +9,7 @@ sweep's lidar), ``cam``.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import Any, Protocol
 
 import numpy as np
@@ -220,6 +220,10 @@ class Cloud:
         """Shortly after (or before) the key's moment: what moves goes on at its velocity."""
         return replace(self, points=self.points + seconds * self.velocity_m_s)
 
+    def select(self, keep: Bool) -> Cloud:
+        """The points where ``keep`` (M,) is True."""
+        return Cloud(**{f.name: getattr(self, f.name)[keep] for f in fields(self)})
+
     def __len__(self) -> int:
         return len(self.points)
 
@@ -257,6 +261,14 @@ class DepthMap:
     confidence: Float32
     frame: NDArray[np.int32]
     age_s: Float32 | None = None
+
+
+@dataclass(frozen=True)
+class Mover:
+    """One moving object by itself: its points, and the depth it has in each camera."""
+
+    cloud: Cloud
+    depth: Mapping[str, DepthMap]
 
 
 @dataclass(frozen=True)
@@ -345,7 +357,8 @@ class Result:
 
     metrics: plain numbers, ready for JSON. baselines: the results of the simpler methods on the
     same registration, by method. flow: of every sweep to the next one on the way to the key, where
-    asked for (``output.flow``).
+    asked for (``output.flow``). movers: by instance (``output.movers``). optical_flow: camera ->
+    (H,W,2) pixels to the "previous" and the "next" image (``output.optical_flow``).
     """
 
     method: str
@@ -357,3 +370,5 @@ class Result:
     costs: tuple[StageCost, ...] = ()
     baselines: Mapping[str, Result] = field(default_factory=dict)
     flow: StretchFlow | None = None
+    movers: Mapping[int, Mover] = field(default_factory=dict)
+    optical_flow: Mapping[str, Mapping[str, Float32]] = field(default_factory=dict)

@@ -17,12 +17,30 @@ from densify.errors import InputError
 from densify.output import export_run, read_depth_png, write_result
 from densify.output.atomic import staged_folder
 from densify.stages.age import with_ages
-from densify.types import Cloud, DepthMap, Result
+from densify.types import Cloud, DepthMap, RegisteredSweep, Result, Stretch, Sweep
 
 H, W = 12, 20
 CAMERAS = ("image_02", "image_03")
 PRODUCTS = ("depth", "depth_filled", "confidence", "age")
+KEY_NS = 1_782_500_000_123_456_789
+LATE_S = 0.01
 AGE_S = {119: 0.11, 120: 0.01, 121: 0.09}
+
+
+def sweep_at(frame, since_key_s):
+    sweep = Sweep(
+        frame=frame,
+        stamp_ns=KEY_NS + round(1e9 * since_key_s),
+        points=np.zeros((0, 3)),
+        intensity=np.zeros(0, np.float32),
+        offset_ns=None,
+        lidar=np.zeros(0, np.uint8),
+        row=np.zeros(0, np.int64),
+    )
+    return RegisteredSweep(sweep, np.eye(4), np.zeros(6), np.zeros(6))
+
+
+STRETCH = Stretch((sweep_at(119, -0.1), sweep_at(120, 0.0), sweep_at(121, 0.1)))
 
 
 def map_of(camera, seed):
@@ -32,7 +50,10 @@ def map_of(camera, seed):
     filled[0] = depth[0]
     frame = np.where(depth > 0, rng.integers(119, 122, (H, W)), -1).astype(np.int32)
     return with_ages(
-        DepthMap(camera, depth, filled, rng.random((H, W), dtype=np.float32), frame), AGE_S
+        DepthMap(camera, depth, filled, rng.random((H, W), dtype=np.float32), frame),
+        STRETCH,
+        120,
+        LATE_S,
     )
 
 
@@ -181,7 +202,7 @@ def test_a_damaged_map_leaves_nothing_behind(run):
     path = run / "age" / "image_03.png"  # the last one read
     path.write_bytes(path.read_bytes()[:-20])
     before = tree(run)
-    refused(path, "no whole PNG", run=run)
+    refused(path, "no image", run=run)
     assert tree(run) == before
     refused(path, run=run, out=run.parent / "new" / "x")
     assert not (run.parent / "new").exists()
@@ -251,7 +272,7 @@ def test_a_damaged_map_is_named_and_nothing_else_is_said(run, product, damage, c
         flipped[len(data) // 2] ^= 4
         other = {"cut": data[: len(data) // 2], "flipped": bytes(flipped), "empty": b""}
         path.write_bytes(other.get(damage, b"hello"))
-    refused(path, "expected a map", run=run)
+    refused(path, f"expected a map of {product}", run=run)
     assert capfd.readouterr() == ("", "")
 
 
@@ -263,7 +284,7 @@ def test_any_damage_is_found(cut, flip, bit, tmp_path_factory):
     data[flip % len(data)] ^= 1 << bit
     path = folder / "a.png"
     path.write_bytes(bytes(data)[: max(cut, len(data) // 2)])
-    with pytest.raises(InputError, match="expected a map"):
+    with pytest.raises(InputError, match="expected a depth map"):
         read_depth_png(path)
 
 
@@ -296,7 +317,7 @@ def test_a_pixel_is_as_old_as_the_nearest_measured_one(seed, share):
     filled = np.where(rng.random((H, W)) < 0.7, 5, depth).astype(np.float32)
     frame = np.where(depth > 0, rng.integers(119, 122, (H, W)), -1).astype(np.int32)
     bare = DepthMap("cam", depth, filled, filled / 5, frame)
-    aged = with_ages(bare, AGE_S)
+    aged = with_ages(bare, STRETCH, 120, LATE_S)
     assert bare.age_s is None and aged.age_s is not None
     assert aged.age_s.dtype == np.float32
     np.testing.assert_array_equal(np.isnan(aged.age_s), filled == 0)
@@ -304,13 +325,15 @@ def test_a_pixel_is_as_old_as_the_nearest_measured_one(seed, share):
     for row, column in np.argwhere(filled > 0):
         squared = ((measured - (row, column)) ** 2).sum(axis=1)
         near = measured[squared == squared.min()]
-        allowed = {np.float32(AGE_S[int(frame[r, c])]) for r, c in near}
-        assert aged.age_s[row, column] in allowed
-    again = with_ages(bare, AGE_S).age_s
+        allowed = np.array([AGE_S[int(frame[r, c])] for r, c in near])
+        assert abs(allowed - aged.age_s[row, column]).min() < 1e-6
+    again = with_ages(bare, STRETCH, 120, LATE_S).age_s
     np.testing.assert_array_equal(again, aged.age_s)
 
 
 def test_a_map_without_depth_has_no_ages():
     empty = np.zeros((H, W), np.float32)
-    aged = with_ages(DepthMap("cam", empty, empty, empty, np.full((H, W), -1, np.int32)), {})
+    aged = with_ages(
+        DepthMap("cam", empty, empty, empty, np.full((H, W), -1, np.int32)), STRETCH, 120, 0
+    )
     assert aged.age_s is not None and np.isnan(aged.age_s).all()

@@ -7,6 +7,7 @@ their truth (`densify.readers.truth_files`).
 from densify.output.cloud_laz import StoredCloud, read_cloud, write_cloud
 from densify.output.depth_png import (
     read_depth_png,
+    read_mask_png,
     write_age_png,
     write_confidence_png,
     write_depth_png,
@@ -25,6 +26,7 @@ __all__ = [
     "export_run",
     "read_cloud",
     "read_depth_png",
+    "read_mask_png",
     "write_age_png",
     "write_cloud",
     "write_comparison",

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""Depth, confidence and age as PNG. Depth is exactly that of KITTI's depth-completion benchmark
-(Uhrig et al., "Sparsity Invariant CNNs", 3DV 2017): 16 bit, one channel, ``value / 256`` metres,
-0 = none.
+"""Depth, confidence, age and optical flow as PNG. Depth is exactly that of KITTI's depth-completion
+benchmark (Uhrig et al., "Sparsity Invariant CNNs", 3DV 2017): 16 bit, one channel, ``value / 256``
+metres, 0 = none.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from densify.errors import InputError
 from densify.output.atomic import write_file
 from densify.output.png import encode_png
-from densify.types import Float32
+from densify.types import Bool, Float32
 
 _STEPS_PER_M = 256.0
 _STEPS_OF_CONFIDENCE = 254.0
@@ -76,26 +76,59 @@ def stored_age(age_s: ArrayLike) -> NDArray[np.uint16]:
     return (1 + np.minimum(steps, _MAX_VALUE - 1)).astype(np.uint16)
 
 
+def write_flow_png(path: Path, flow_px: Float32) -> None:
+    """Write optical flow as KITTI's flow benchmark does (Menze and Geiger, CVPR 2015): 16 bit, red
+    and green ``rint(64 * flow) + 2^15`` to the right and down, blue 1 where it is known, else 0.
+
+    flow_px: (H,W,2) pixels, NaN where unknown. What the format cannot say, beyond 512 pixels, is
+    unknown too.
+    """
+    levels = np.rint(64.0 * flow_px.astype(np.float64)) + 2**15
+    with np.errstate(invalid="ignore"):
+        known = ((levels >= 0) & (levels <= _MAX_VALUE)).all(axis=2)
+    image = np.zeros((*flow_px.shape[:2], 3), np.uint16)
+    image[known, 0] = 1
+    image[known, 1], image[known, 2] = levels[known, 1], levels[known, 0]
+    write_file(path, encode_png(image))
+
+
 def read_depth_png(path: Path) -> Float32:
     """(H,W) float32 metres, 0 none. Raises InputError for anything but a 16-bit gray PNG."""
-    return read_stored(path, np.uint16).astype(np.float32) / np.float32(_STEPS_PER_M)
+    stored = read_stored(path, np.uint16, "a depth map")
+    return stored.astype(np.float32) / np.float32(_STEPS_PER_M)
 
 
-def read_stored(path: Path, kind: type[np.uint8] | type[np.uint16]) -> NDArray[Any]:
+def read_stored(path: Path, kind: type[np.uint8] | type[np.uint16], what: str) -> NDArray[Any]:
     """(H,W) of a depth, confidence or age map as it is stored. Raises InputError for anything but
-    a whole gray PNG of that many bits."""
+    a whole gray PNG of that many bits; what: for the message."""
+    image = _decoded(path)
+    if image is None or image.dtype != kind or image.ndim != 2:
+        got = "no image" if image is None else f"{image.dtype} of shape {image.shape}"
+        bits = 8 * np.dtype(kind).itemsize
+        raise InputError(f"{path}: got {got}, expected {what} (PNG, {bits} bit, one channel)")
+    return image
+
+
+def read_mask_png(path: Path) -> Bool:
+    """(H,W) bool, True where any colour is not 0; transparency says nothing. Raises InputError if
+    it is no image."""
+    image = _decoded(path)
+    if image is None:
+        raise InputError(f"{path}: got no image, expected a mask (PNG, 0 where it does not hold)")
+    colours = image if image.ndim == 2 else image[:, :, :3].max(axis=2)
+    mask: Bool = colours > 0
+    return mask
+
+
+def _decoded(path: Path) -> NDArray[Any] | None:
+    """As it is stored; None if it is no image, or not whole."""
     try:
         data = path.read_bytes()
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
-    image = None
-    if _is_whole_png(data):
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-    if image is None or image.dtype != kind or image.ndim != 2:
-        got = "no whole PNG" if image is None else f"{image.dtype} of shape {image.shape}"
-        bits = 8 * np.dtype(kind).itemsize
-        raise InputError(f"{path}: got {got}, expected a map (PNG, {bits} bit, one channel)")
-    return image
+    if not _is_whole_png(data):
+        return None
+    return cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
 
 
 def _is_whole_png(data: bytes) -> bool:

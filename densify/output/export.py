@@ -138,7 +138,10 @@ def _cameras(run: Path) -> list[str]:
 
 def _read_maps(run: Path, camera: str) -> dict[str, NDArray[Any]]:
     """By product, (H,W) each, as stored."""
-    maps = {p: read_stored(run / p / f"{camera}.png", kind) for p, kind in _KINDS.items()}
+    maps = {
+        p: read_stored(run / p / f"{camera}.png", kind, f"a map of {p}")
+        for p, kind in _KINDS.items()
+    }
     filled = maps["depth_filled"]
     for product, stored in maps.items():
         path = run / product / f"{camera}.png"

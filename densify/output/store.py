@@ -15,7 +15,9 @@ data, config and versions as run.yaml::
     density     camera -> measured, filled: fraction of the pixels with a depth
     ghosts      `densify.scores.ghost_scores`: num_points, all, moving, static, by_distance
     depth       where there is truth: camera -> measured, filled -> all, moving, static -> the
-                fields of `densify.scores.depth_errors`
+                fields of `densify.depth_metrics.DepthErrors`
+    held_out    camera -> the same fields as depth: the key densified from its neighbours alone
+                against its own returns; null for the key sweep alone
     baselines   the same from ``frames`` on for each simpler method on the same registration
 
 A score that nothing can be said of is null.
@@ -40,7 +42,12 @@ import densify
 from densify.errors import InputError
 from densify.output.atomic import staged_folder, write_file
 from densify.output.cloud_laz import write_cloud
-from densify.output.depth_png import write_age_png, write_confidence_png, write_depth_png
+from densify.output.depth_png import (
+    write_age_png,
+    write_confidence_png,
+    write_depth_png,
+    write_flow_png,
+)
 from densify.output.figure import draw_figure
 from densify.output.flow_npz import write_flow_files
 from densify.output.png import Picture, write_picture
@@ -53,7 +60,7 @@ SCHEMA_VERSION = 1
 
 _OWNED: Mapping[Verb, tuple[str, ...]] = {
     "run": (
-        *("depth", "depth_filled", "confidence", "age", "flow"),
+        *("depth", "depth_filled", "confidence", "age", "flow", "movers", "optical_flow"),
         *("cloud.laz", "metrics.json", "figure.png", "run.yaml"),
     ),
     "compare": ("compare.json", "compare.png"),
@@ -140,6 +147,16 @@ def write_result(
         write_cloud(folder / "cloud.laz", result.cloud)
         if result.flow is not None:
             write_flow_files(folder / "flow", result.flow)
+        for instance, mover in result.movers.items():
+            apart = folder / "movers" / f"{instance:04d}"
+            (apart / "depth").mkdir(parents=True)
+            for name, maps in mover.depth.items():
+                write_depth_png(apart / "depth" / f"{name}.png", maps.depth_m)
+            write_cloud(apart / "cloud.laz", mover.cloud)
+        for name, flows in result.optical_flow.items():
+            for other, flow_px in flows.items():
+                (folder / "optical_flow" / other).mkdir(parents=True, exist_ok=True)
+                write_flow_png(folder / "optical_flow" / other / f"{name}.png", flow_px)
         _write_json(
             folder / "metrics.json",
             {
@@ -194,7 +211,7 @@ def _written(out: Path, key: int, verb: Verb) -> list[Path]:
     files: list[Path] = []
     for name in _OWNED[verb]:
         entry = folder / name
-        files += sorted(entry.iterdir()) if entry.is_dir() else [entry] if entry.exists() else []
+        files += [entry] if entry.is_file() else sorted(f for f in entry.rglob("*") if f.is_file())
     return files
 
 

@@ -3,26 +3,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
 from scipy.ndimage import distance_transform_edt
 
-from densify.types import DepthMap
+from densify.types import DepthMap, Stretch
 
 
-def with_ages(depth: DepthMap, age_s: Mapping[int, float]) -> DepthMap:
-    """The map with ``age_s``.
+def with_ages(depth: DepthMap, stretch: Stretch, key: int, late_s: float) -> DepthMap:
+    """The map with ``age_s``, seconds between the moment it shows and each pixel's source sweep.
 
-    age_s: seconds between the moment the map shows and each source sweep's reference time, 0 or
-        more, by frame. A measured pixel has the age of its sweep, a filled one that of the measured
-        pixel nearest to it in the image, of equally near ones any (always the same).
+    late_s: from the key's reference time to the moment the map shows. A measured pixel has the age
+    of its sweep, a filled one that of the measured pixel nearest to it in the image, of equally
+    near ones any (always the same).
     """
+    shown_ns = stretch[key].sweep.stamp_ns + round(1e9 * late_s)
+    age_s = {s.frame: abs(s.sweep.stamp_ns - shown_ns) * 1e-9 for s in stretch.sweeps}
     measured = depth.depth_m > 0
     frames, which = np.unique(depth.frame[measured], return_inverse=True)
     ages = np.full(measured.shape, np.nan, np.float32)
-    ages[measured] = np.array([age_s[int(f)] for f in frames], np.float32)[which]
+    ages[measured] = np.array([age_s[int(f)] for f in frames])[which]
     filled = (depth.filled_m > 0) & ~measured
     if len(frames) and filled.any():
         row, column = distance_transform_edt(
