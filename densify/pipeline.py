@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from densify import poses, scores
-from densify.config import Config, resolve
+from densify.config import Config, RegisterSettings, resolve
 from densify.errors import InputError
 from densify.range_image import RangeImage
 from densify.readers.window import choose_cameras, read_sweeps, recorded_trajectory, window_frames
@@ -93,7 +93,7 @@ def compare(
     with watch.stage("images"):
         images = {camera.name: sequence.image(camera.name, key) for camera in chosen}
     with watch.stage("register"):
-        trajectory = _trajectory(sequence, sweeps, settings)
+        trajectory = find_trajectory(sequence, sweeps, settings.register)
     with watch.stage("deskew"):
         stretch = deskew([s for s in sweeps if s.frame in frames], trajectory)
     flow = _flow_to_key(stretch, key, settings, watch) if "flow" in wanted else ()
@@ -135,16 +135,23 @@ def _read(
     return sweeps
 
 
-def _trajectory(sequence: LidarSequence, sweeps: Sequence[Sweep], settings: Config) -> Trajectory:
-    """Poses in two passes: raw sweeps are bent by the motion that the first pass finds."""
-    if settings.register.source == "dataset":
+def find_trajectory(
+    sequence: LidarSequence, sweeps: Sequence[Sweep], settings: RegisterSettings
+) -> Trajectory:
+    """Where the lidar was: the recording's own poses, or registration in two passes, whose first
+    finds the motion that bends raw sweeps.
+
+    sweeps: raw, consecutive frames ascending. settings: its ``source`` decides.
+    Raises ComputationError naming the frames where the poses cannot be right.
+    """
+    if settings.source == "dataset":
         trajectory = recorded_trajectory(sequence, sweeps)
-        check_plausible(trajectory, settings.register)
-        check_overlap(sweeps, trajectory, settings.register)
+        check_plausible(trajectory, settings)
+        check_overlap(sweeps, trajectory, settings)
         return trajectory
-    rough = register(sweeps, settings.register)
+    rough = register(sweeps, settings)
     straight = [s.sweep for s in deskew(sweeps, rough).sweeps]
-    return register(straight, settings.register, rough)
+    return register(straight, settings, rough)
 
 
 def _flow_to_key(
