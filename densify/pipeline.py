@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from densify import depth_metrics, poses, scores
-from densify.config import Config, resolve
+from densify.config import Config, RegisterSettings, resolve
 from densify.errors import InputError
 from densify.flow.chained import ChainedMotion
 from densify.height_map import HeightMap
@@ -126,7 +126,7 @@ def compare(
     with watch.stage("images"):
         images = {camera.name: sequence.image(camera.name, key) for camera in chosen}
     with watch.stage("register"):
-        trajectory = _trajectory(sequence, sweeps, settings)
+        trajectory = find_trajectory(sequence, sweeps, settings.register)
     with watch.stage("deskew"):
         stretch = deskew([s for s in sweeps if s.frame in frames], trajectory)
     engines = [METHODS[name].engine for name in methods]
@@ -184,16 +184,23 @@ def _read(
     return sweeps
 
 
-def _trajectory(sequence: LidarSequence, sweeps: Sequence[Sweep], settings: Config) -> Trajectory:
-    """Poses in two passes: raw sweeps are bent by the motion that the first pass finds."""
-    if settings.register.source == "dataset":
+def find_trajectory(
+    sequence: LidarSequence, sweeps: Sequence[Sweep], settings: RegisterSettings
+) -> Trajectory:
+    """Where the lidar was: the recording's own poses, or registration in two passes, whose first
+    finds the motion that bends raw sweeps.
+
+    sweeps: raw, consecutive frames ascending. settings: its ``source`` decides.
+    Raises ComputationError naming the frames where the poses cannot be right.
+    """
+    if settings.source == "dataset":
         trajectory = recorded_trajectory(sequence, sweeps)
-        check_plausible(trajectory, settings.register)
-        check_overlap(sweeps, trajectory, settings.register)
+        check_plausible(trajectory, settings)
+        check_overlap(sweeps, trajectory, settings)
         return trajectory
-    rough = register(sweeps, settings.register)
+    rough = register(sweeps, settings)
     straight = [s.sweep for s in deskew(sweeps, rough).sweeps]
-    return register(straight, settings.register, rough)
+    return register(straight, settings, rough)
 
 
 def _motion(stretch: Stretch, heights: HeightMap, engine: str, settings: Config) -> Motion:

@@ -227,9 +227,9 @@ def _add_bench_flow(benches: Any) -> None:
         "flow",
         verbs.bench_flow,
         "scene flow methods on the same pairs and windows: error, energy, seconds, memory",
-        "Methods: window (ours, all sweeps), pair (ours, two clouds), paper (its objective, our "
-        "solver), adam (its objective, its solver, 1,500 steps: minutes), rigid, cluster-icp, "
-        "nicp (non-rigid ICP). Errors need a recording with truth, such as the built-in street.",
+        "Methods: ours (all sweeps), ours-pair (two sweeps), paper (the published objective, our "
+        "solver), paper-adam (its own solver, 1,500 steps: minutes), rigid, cluster-icp, nicp "
+        "(non-rigid ICP). Errors need a recording with truth, such as the built-in street.",
     )
     parser.add_argument(
         "--data", metavar="SPEC", action="append", help=f"{DATA_HELP}; may be given several times"
@@ -253,7 +253,7 @@ def _add_bench_flow(benches: Any) -> None:
         "--methods",
         type=_words,
         metavar="NAME,…",
-        help="of those below, or all (default: all but adam)",
+        help="of those below, or all (default: all but paper-adam)",
     )
     parser.add_argument(
         "--pairs-only",
@@ -265,7 +265,7 @@ def _add_bench_flow(benches: Any) -> None:
         type=_natural,
         default=8000,
         metavar="N",
-        help="points that paper, adam and nicp may move; more is slower and finer, 0: all "
+        help="points that paper, paper-adam and nicp may move; more is slower and finer, 0: all "
         "(default: 8000)",
     )
     _add_config_options(parser)

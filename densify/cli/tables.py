@@ -138,11 +138,13 @@ def flow_table(measured: Mapping[str, Any]) -> str:
     lines = [
         f"{measured['data']}, key {measured['key']}, frames {frames[0]}-{frames[-1]}: "
         f"{pairs} of {measured['points_above_ground']:,} points above the "
-        f"ground; paper, adam, nicp move {drawn}; E is the paper's energy on those points",
+        f"ground; paper, paper-adam, nicp move {drawn}; E is the paper's energy on those points",
         _table(methods, _METHOD_COLUMNS),
     ]
-    if "adam" in methods:
-        lines.append(_adam_line(methods["adam"], measured["num_pairs"]))
+    for name, other in (("paper", "paper-adam"), ("paper-adam", "paper")):
+        solver = _look_up(methods, name, "solver")
+        if solver is not None:
+            lines.append(_solver_line(name, solver, other, measured["num_pairs"]))
     windows = {name: row["window"] for name, row in methods.items() if row["window"] is not None}
     if windows:
         some = next(iter(windows.values()))
@@ -198,15 +200,17 @@ def _in_mm(part: Mapping[str, Any]) -> dict[str, Any]:
     return {**part, **{f"{n}_mm": None if m is None else 1000 * m for n, m in metres.items()}}
 
 
-def _adam_line(row: Mapping[str, Any], num_pairs: int) -> str:
+def _solver_line(name: str, solver: Mapping[str, Any], other: str, num_pairs: int) -> str:
     line = (
-        f"adam: lowest energy after {row['steps_to_lowest']:.0f} steps, "
-        f"{row['seconds_to_lowest']:.2f} s"
+        f"{name}: {solver['steps']:.0f} steps in {solver['seconds']:.2f} s; lowest E "
+        f"{solver['lowest_energy']:.1f} after {solver['steps_to_lowest']:.0f}, "
+        f"{solver['seconds_to_lowest']:.2f} s"
     )
-    if "seconds_to_paper" in row:
+    if "pairs_as_low_as_other" in solver:
+        seconds = _written(solver["seconds_to_others_lowest"], ".2f s")
         line += (
-            f"; as low as paper ends after {_written(row['seconds_to_paper'], '.2f')} s, on "
-            f"{row['pairs_as_low_as_paper']} of {num_pairs} pairs"
+            f"; as low as {other}'s lowest after {seconds}, on "
+            f"{solver['pairs_as_low_as_other']} of {num_pairs} pairs"
         )
     return line
 
