@@ -191,6 +191,12 @@ class AccumulateSettings(Section):
 class ProjectSettings(Section):
     """From the accumulated cloud to each camera's depth map."""
 
+    at: str = knob(
+        "camera",
+        "the moment a depth map shows. camera: the image's own exposure, ego motion and movers "
+        "included; sweep: the key sweep's reference time",
+        choices=("camera", "sweep"),
+    )
     footprint: float = knob(
         0.4,
         "half size of the patch a point stands for, in spacings of neighbouring rays; larger hides "
@@ -228,6 +234,17 @@ class OutputSettings(Section):
     """What is written beside the files that every run writes."""
 
     flow: bool = knob(False, "flow/: scene flow of every sweep to the next one, as flow files")
+    optical_flow: bool = knob(
+        False,
+        "optical_flow/: of every pixel with a measured depth to the previous and the next image, "
+        "as KITTI flow PNG",
+    )
+    movers: str = knob(
+        "keep",
+        "what moves. keep: as all else; drop: left out of maps and cloud; separate: left out and "
+        "written object by object under movers/",
+        choices=("keep", "drop", "separate"),
+    )
 
 
 @dataclass(frozen=True)

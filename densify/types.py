@@ -9,7 +9,7 @@ sweep's lidar), ``cam``.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import Any, Protocol
 
 import numpy as np
@@ -220,6 +220,10 @@ class Cloud:
         """Shortly after (or before) the key's moment: what moves goes on at its velocity."""
         return replace(self, points=self.points + seconds * self.velocity_m_s)
 
+    def select(self, keep: Bool) -> Cloud:
+        """The points where ``keep`` (M,) is True."""
+        return Cloud(**{f.name: getattr(self, f.name)[keep] for f in fields(self)})
+
     def __len__(self) -> int:
         return len(self.points)
 
@@ -246,7 +250,9 @@ class DepthMap:
 
     depth_m: float32 camera z of measured pixels, 0 none. filled_m: the same plus pixels
     interpolated between measured ones. confidence: float32 0 to 1, of every pixel in ``filled_m``.
-    frame: int32 source sweep of measured pixels, -1 elsewhere.
+    frame: int32 source sweep of measured pixels, -1 elsewhere. age_s: float32 seconds between the
+    moment the map shows and the reference time of the sweep that measured the pixel, of every pixel
+    in ``filled_m``, nan elsewhere; None until `densify.stages.age` has worked it out.
     """
 
     camera: str
@@ -254,6 +260,15 @@ class DepthMap:
     filled_m: Float32
     confidence: Float32
     frame: NDArray[np.int32]
+    age_s: Float32 | None = None
+
+
+@dataclass(frozen=True)
+class Mover:
+    """One moving object by itself: its points, and the depth it has in each camera."""
+
+    cloud: Cloud
+    depth: Mapping[str, DepthMap]
 
 
 @dataclass(frozen=True)
@@ -342,7 +357,8 @@ class Result:
 
     metrics: plain numbers, ready for JSON. baselines: the results of the simpler methods on the
     same registration, by method. flow: of every sweep to the next one on the way to the key, where
-    asked for (``output.flow``).
+    asked for (``output.flow``). movers: by instance (``output.movers``). optical_flow: camera ->
+    (H,W,2) pixels to the "previous" and the "next" image (``output.optical_flow``).
     """
 
     method: str
@@ -354,3 +370,5 @@ class Result:
     costs: tuple[StageCost, ...] = ()
     baselines: Mapping[str, Result] = field(default_factory=dict)
     flow: StretchFlow | None = None
+    movers: Mapping[int, Mover] = field(default_factory=dict)
+    optical_flow: Mapping[str, Mapping[str, Float32]] = field(default_factory=dict)

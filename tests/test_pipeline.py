@@ -314,6 +314,11 @@ def test_an_image_of_another_moment_sees_from_where_the_camera_was(late_s):
     on_wall = (np.abs(truth - wall_m) < 0.02) & (found > 0)
     assert on_wall.sum() > 300
     assert abs(np.median(found[on_wall]) - wall_m) < 0.05
+    maps = result.depth["front"]
+    since_s = (maps.frame[found > 0] - 4) * SWEEP_S
+    np.testing.assert_allclose(maps.age_s[found > 0], np.abs(since_s - late_s), atol=1e-6)
+    assert len(np.unique(since_s)) == 3
+    np.testing.assert_array_equal(np.isnan(maps.age_s), maps.filled_m == 0)
 
 
 def test_the_camera_moves_on_though_the_sweeps_are_not_deskewed():
@@ -371,7 +376,7 @@ def test_same_bytes_every_time(moving):
     again = compare(tiny(MOVERS), KEY, WINDOW)
     for method in METHODS:
         assert same_points(moving[method].cloud, again[method].cloud)
-        for name in ("depth_m", "filled_m", "confidence", "frame"):
+        for name in ("depth_m", "filled_m", "confidence", "frame", "age_s"):
             a, b = (getattr(r[method].depth["front"], name) for r in (moving, again))
             assert a.tobytes() == b.tobytes(), name
         assert moving[method].metrics == again[method].metrics

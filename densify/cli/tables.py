@@ -1,10 +1,12 @@
 # SPDX-License-Identifier: MIT
-"""What `run`, `compare` and `bench` say on the screen. Reads `Result.metrics`:
+"""What the verbs say on the screen. Reads `Result.metrics`:
 
 - ``ghosts``: `densify.scores.ghost_scores`;
-- ``depth``: camera -> `densify.scores.depth_scores`, where there is truth;
+- ``held_out``: camera -> the same for the key densified from its neighbours alone;
+- ``depth``: camera -> `densify.depth_metrics.depth_scores`, where there is truth;
 
-and for a benchmark of flow what `densify.bench.flow.bench_flow` returns.
+for a benchmark of flow what `densify.bench.flow.bench_flow` returns, and for depth on disk what
+`densify.evaluation.evaluate` does.
 """
 
 from __future__ import annotations
@@ -14,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from densify.output import Export
 from densify.types import Result
 
 _NONE = "-"
@@ -44,14 +47,43 @@ def summary(result: Result) -> str:
             baseline = _percent(_look_up(result.baselines["icp"].metrics, "ghosts", "all"))
         beside = "" if baseline == _NONE else f" ({baseline} by registration alone)"
         lines.append(f"ghosts: {ghosts} of the accumulated points{beside}")
+    lines += [line for name in result.depth if (line := _held_out_line(result, name))]
+    return "\n".join(lines)
+
+
+def _held_out_line(result: Result, camera: str) -> str:
+    """The key from its neighbours alone, against its own returns."""
+    said = []
+    for part in ("all", "moving"):
+        path = ("held_out", camera, "measured", part, "outliers")
+        mine = _look_up(result.metrics, *path)
+        if mine is None:
+            continue
+        icp = result.baselines.get("icp")
+        other = None if icp is None else _look_up(icp.metrics, *path)
+        beside = "" if other is None else f" ({_percent(other)} by registration alone)"
+        said.append(f"{_percent(mine)} wrong{beside}{'' if part == 'all' else ' where it moves'}")
+    return f"{camera}, key held out: {', '.join(said)}" if said else ""
+
+
+def export_summary(exported: Export) -> str:
+    """A line for each camera: the share of its pixels with a depth, before and after."""
+    lines = []
+    for camera, products in exported.density.items():
+        measured, filled = (
+            f"{_percent(products[p].before, digits=1)} -> {_percent(products[p].after, digits=1)}"
+            for p in ("measured", "filled")
+        )
+        lines.append(f"{camera}: depth in {measured} of the pixels, {filled} with filled ones")
     return "\n".join(lines)
 
 
 def comparison(results: Mapping[str, Result]) -> str:
     """A table with one column per method.
 
-    Rows: points, image density per camera, ghost rate (needs no truth), and where there is truth,
-    coverage, MAE, RMSE and KITTI outliers of the measured depth at all, moving and static pixels.
+    Rows: points, image density per camera, ghost rate, and coverage, MAE, RMSE and KITTI outliers
+    of the measured depth at all, moving and static pixels, with the key held out (neither needs
+    truth) and against truth where there is some.
     """
     columns = list(results.values())
     rows = [
@@ -65,8 +97,9 @@ def comparison(results: Mapping[str, Result]) -> str:
     rates = [_look_up(result.metrics, "ghosts", "all") for result in columns]
     rows.append(["ghost rate", *map(_percent, rates)])
     for name in columns[0].depth:
-        if any(_look_up(result.metrics, "depth", name) for result in columns):
-            rows += _truth_rows(columns, name)
+        for source, title in (("held_out", "key held out"), ("depth", "truth")):
+            if any(_look_up(result.metrics, source, name) for result in columns):
+                rows += _score_rows(columns, source, name, title)
     return _aligned(rows)
 
 
@@ -105,11 +138,13 @@ def flow_table(measured: Mapping[str, Any]) -> str:
     lines = [
         f"{measured['data']}, key {measured['key']}, frames {frames[0]}-{frames[-1]}: "
         f"{pairs} of {measured['points_above_ground']:,} points above the "
-        f"ground; paper, adam, nicp move {drawn}; E is the paper's energy on those points",
+        f"ground; paper, paper-adam, nicp move {drawn}; E is the paper's energy on those points",
         _table(methods, _METHOD_COLUMNS),
     ]
-    if "adam" in methods:
-        lines.append(_adam_line(methods["adam"], measured["num_pairs"]))
+    for name, other in (("paper", "paper-adam"), ("paper-adam", "paper")):
+        solver = _look_up(methods, name, "solver")
+        if solver is not None:
+            lines.append(_solver_line(name, solver, other, measured["num_pairs"]))
     windows = {name: row["window"] for name, row in methods.items() if row["window"] is not None}
     if windows:
         some = next(iter(windows.values()))
@@ -121,15 +156,61 @@ def flow_table(measured: Mapping[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def _adam_line(row: Mapping[str, Any], num_pairs: int) -> str:
+_EVALUATION_COLUMNS: tuple[Column, ...] = (
+    ("pixels", ("num_pixels",), ",d"),
+    ("coverage", ("coverage",), ".1%"),
+    ("MAE mm", ("mae_mm",), ",.1f"),
+    ("RMSE mm", ("rmse_mm",), ",.1f"),
+    ("iMAE 1/km", ("imae_per_km",), ".3f"),
+    ("iRMSE 1/km", ("irmse_per_km",), ".3f"),
+    ("AbsRel", ("abs_rel",), ".2%"),
+    ("SqRel", ("sq_rel",), ".2%"),
+    ("d<1.25", ("delta_1",), ".2%"),
+    ("d<1.25^2", ("delta_2",), ".2%"),
+    ("d<1.25^3", ("delta_3",), ".2%"),
+    ("outliers", ("outliers",), ".3%"),
+)
+_MISSING = {
+    "without_truth": "predicted without truth",
+    "without_prediction": "truth without prediction",
+    "without_mask": "truth without mask",
+}
+_MAX_NAMED = 5
+
+
+def evaluation_table(scores: Mapping[str, Any]) -> str:
+    """Depth against truth, a row per part of the pixels, in the units of KITTI's leaderboard; what
+    found no counterpart is counted, and named as far as there is room."""
+    num, density = scores["num_images"], scores["density"]
+    lines = [
+        f"{num:,} image{'s' if num != 1 else ''}: predicted {_percent(density['predicted'])} of "
+        f"the pixels, truth {_percent(density['truth'])}; outliers with fx "
+        f"{scores['focal_px']:g} px, baseline {scores['baseline_m']:g} m"
+    ]
+    for name, what in _MISSING.items():
+        if paths := scores[name]:
+            rest = f", ... and {len(paths) - _MAX_NAMED:,} more" if len(paths) > _MAX_NAMED else ""
+            lines.append(f"{what}: {len(paths):,}: {', '.join(paths[:_MAX_NAMED])}{rest}")
+    rows = {name: _in_mm(part) for name, part in scores["parts"].items() if part["num_pixels"]}
+    return "\n".join([*lines, _table(rows, _EVALUATION_COLUMNS)])
+
+
+def _in_mm(part: Mapping[str, Any]) -> dict[str, Any]:
+    metres = {name: part[f"{name}_m"] for name in ("mae", "rmse")}
+    return {**part, **{f"{n}_mm": None if m is None else 1000 * m for n, m in metres.items()}}
+
+
+def _solver_line(name: str, solver: Mapping[str, Any], other: str, num_pairs: int) -> str:
     line = (
-        f"adam: lowest energy after {row['steps_to_lowest']:.0f} steps, "
-        f"{row['seconds_to_lowest']:.2f} s"
+        f"{name}: {solver['steps']:.0f} steps in {solver['seconds']:.2f} s; lowest E "
+        f"{solver['lowest_energy']:.1f} after {solver['steps_to_lowest']:.0f}, "
+        f"{solver['seconds_to_lowest']:.2f} s"
     )
-    if "seconds_to_paper" in row:
+    if "pairs_as_low_as_other" in solver:
+        seconds = _written(solver["seconds_to_others_lowest"], ".2f s")
         line += (
-            f"; as low as paper ends after {_written(row['seconds_to_paper'], '.2f')} s, on "
-            f"{row['pairs_as_low_as_paper']} of {num_pairs} pairs"
+            f"; as low as {other}'s lowest after {seconds}, on "
+            f"{solver['pairs_as_low_as_other']} of {num_pairs} pairs"
         )
     return line
 
@@ -152,16 +233,16 @@ def _written(value: float | None, form: str) -> str:
     return f"{value:{number}}".replace("%", " %") + (f" {unit}" if unit else "")
 
 
-def _truth_rows(columns: Sequence[Result], camera: str) -> list[list[str]]:
+def _score_rows(columns: Sequence[Result], source: str, camera: str, title: str) -> list[list[str]]:
     rows: list[list[str]] = [[]]
     for part in _PARTS:
-        for key, title, write in _SCORES:
+        for key, score, write in _SCORES:
             values = [
-                _look_up(result.metrics, "depth", camera, "measured", part, key)
+                _look_up(result.metrics, source, camera, "measured", part, key)
                 for result in columns
             ]
             cells = [_NONE if value is None else write(value) for value in values]
-            rows.append([f"{camera} {part}, {title}", *cells])
+            rows.append([f"{camera} {title}, {part}, {score}", *cells])
     return rows
 
 

@@ -1,0 +1,46 @@
+# SPDX-License-Identifier: MIT
+"""Optical flow from scene flow: where the pixels with a depth go in another image."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from densify import poses
+from densify.pinhole import image_points
+from densify.types import Camera, Cloud, DepthMap, Float, Float32
+
+_SAME_DEPTH = 0.02  # share of the depth
+
+
+def optical_flow(
+    exposed: Cloud,
+    depth: DepthMap,
+    camera: Camera,
+    T_cam_key: Float,
+    T_other_key: Float,
+    seconds: float,
+) -> Float32:
+    """(H,W,2) pixels to the right and down, from one exposure to another; NaN where unknown.
+
+    exposed: the cloud at the first exposure. depth: what `project` made of it there. T_cam_key,
+    T_other_key: (4,4) the camera at the first and at the other exposure. seconds: from the first to
+    the other; what moves goes on at its velocity. Known are the measured pixels; where the other
+    image ends does not matter.
+    """
+    points_cam = poses.transform(T_cam_key, exposed.points)
+    uv, inside = image_points(camera, points_cam)
+    rows = np.flatnonzero(inside)
+    column, row = np.rint(uv[rows]).astype(np.int64).T
+    depth_m = depth.depth_m[row, column].astype(np.float64)
+    off = np.abs(points_cam[rows, 2] - depth_m)
+    good = (depth_m > 0) & (off <= _SAME_DEPTH * depth_m)
+    rows, off, pixel = rows[good], off[good], (row * depth.depth_m.shape[1] + column)[good]
+    order = np.lexsort((rows, off, pixel))
+    pixel, first = np.unique(pixel[order], return_index=True)
+    chosen = rows[order[first]]
+
+    later = exposed.points[chosen] + seconds * exposed.velocity_m_s[chosen]
+    there, _ = image_points(camera, poses.transform(T_other_key, later))
+    flow = np.full((*depth.depth_m.shape, 2), np.nan, np.float32)
+    flow.reshape(-1, 2)[pixel] = there - uv[chosen]
+    return flow
