@@ -22,6 +22,7 @@ from densify.stages.colour import colour
 from densify.stages.deskew import deskew
 from densify.stages.flow import estimate_motion
 from densify.stages.ground import ground
+from densify.stages.patches import patches
 from densify.stages.project import project
 from densify.stages.register import check_overlap, check_plausible, register
 from densify.types import (
@@ -98,6 +99,7 @@ def compare(
         stretch = deskew([s for s in sweeps if s.frame in frames], trajectory)
     flow = _flow_to_key(stretch, key, settings, watch) if "flow" in wanted else ()
 
+    key_image = RangeImage.of(stretch[key])
     results: dict[str, Result] = {}
     for method in wanted:
         used = Stretch((stretch[key],)) if method == "none" else stretch
@@ -105,19 +107,21 @@ def compare(
         fields = flow if method == "flow" else still
         with watch.stage("accumulate"):
             cloud = accumulate(used, fields, key, settings.accumulate.unfollowed == "drop")
-        origins = {f: stretch.T_target_source(key, f)[:3, 3] for f in used.frames}
+        with watch.stage("patches"):
+            origins = {f: stretch.T_target_source(key, f)[:3, 3] for f in used.frames}
+            surface = patches(cloud, key, settings.project, origins, key_image)
         depth: dict[str, DepthMap] = {}
         for camera in chosen:
             late_s, T_cam_key = _exposure(sequence, stretch[key], camera)
             exposed = cloud.after(late_s)
             with watch.stage("project"):
-                seen = project(exposed, camera, T_cam_key, settings.project, key, origins)
+                seen = project(exposed, camera, T_cam_key, settings.project, key, surface)
             with watch.stage("colour"):
                 image = images[camera.name]
                 rgb = colour(cloud.rgb, exposed.points, camera, T_cam_key, seen, image)
             cloud, depth[camera.name] = replace(cloud, rgb=rgb), seen
         with watch.stage("score"):
-            metrics = _scores(sequence, stretch[key], cloud, depth)
+            metrics = _scores(sequence, stretch[key], key_image, cloud, depth)
         results[method] = Result(
             method, key, used.frames, cloud, depth, metrics, watch.costs(), dict(results)
         )
@@ -170,7 +174,11 @@ def _exposure(
 
 
 def _scores(
-    sequence: LidarSequence, key_sweep: RegisteredSweep, cloud: Cloud, depth: Mapping[str, DepthMap]
+    sequence: LidarSequence,
+    key_sweep: RegisteredSweep,
+    key_image: RangeImage,
+    cloud: Cloud,
+    depth: Mapping[str, DepthMap],
 ) -> dict[str, Any]:
     """What can be said of the result without truth, and against the truth where there is some."""
     metrics: dict[str, Any] = {
@@ -183,7 +191,7 @@ def _scores(
             }
             for name, maps in depth.items()
         },
-        "ghosts": scores.ghost_scores(cloud, RangeImage.of(key_sweep), key_sweep.frame),
+        "ghosts": scores.ghost_scores(cloud, key_image, key_sweep.frame),
     }
     if sequence.truth is not None:
         metrics["depth"] = {

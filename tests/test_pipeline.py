@@ -199,7 +199,7 @@ def test_more_sweeps_give_more_depth(moving):
     assert density["flow"] > 1.1 * density["none"]
 
 
-_LAST_STAGES = ("accumulate", "project", "colour", "score")
+_LAST_STAGES = ("accumulate", "patches", "project", "colour", "score")
 
 
 def test_costs_of_every_stage(moving):
