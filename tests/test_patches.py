@@ -57,12 +57,12 @@ def test_spacing_is_the_sensors_own(sensor):
     range_m = np.linalg.norm(points - origin, axis=1)
     level_m = range_m * np.hypot(ray[:, 0], ray[:, 1])
     across = found.spacing_m[:, 0] / level_m / np.radians(azimuth_deg)
-    assert 0.9 < across.min() and across.max() < 1.1
+    assert across.min() > 0.9 and across.max() < 1.1
     elevation_deg = np.degrees(np.arcsin(ray[:, 2]))
     step_deg = np.interp(elevation_deg, beams_deg, np.gradient(beams_deg))
     along = found.spacing_m[:, 1] / range_m / np.radians(step_deg)
     inside = np.abs(elevation_deg + 8.5) > 1.0  # where the blocks of 64 beams meet it changes
-    assert 0.85 < along[inside].min() and along[inside].max() < 1.15
+    assert along[inside].min() > 0.85 and along[inside].max() < 1.15
 
 
 @pytest.mark.parametrize("sensor", SENSORS)

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
+from numpy.typing import NDArray
 
 from densify.config import ProjectSettings
 from densify.kernels import visibility as kernels
@@ -42,11 +43,11 @@ def patches(
     and ``veto_fraction`` in at least six of the nine cells around. Only the key's rays count: other
     sweeps rightly saw through the place where a mover was not yet.
     """
-    frames, sweep = np.unique(cloud.frame, return_inverse=True)
+    frames, inverse = np.unique(cloud.frame, return_inverse=True)
+    sweep: NDArray[np.int32] = inverse.ravel().astype(np.int32)
     places = np.zeros((len(frames), 3))
     if origins is not None and len(frames):
         places = np.array([origins[int(f)] for f in frames])
-    sweep = np.asarray(sweep.ravel(), np.int32)
     seen = np.empty((3, len(cloud)), np.float32)
     kernels.look.over_rows(len(cloud), cloud.rigid_points, places, sweep, seen)
     members = np.split(np.argsort(sweep, kind="stable"), np.cumsum(np.bincount(sweep))[:-1])
