@@ -121,12 +121,11 @@ def project(
 def _in_image(
     cloud: Cloud, camera: Camera, T_cam_key: Float, patches: Patches, vetoed: bool
 ) -> _InImage:
-    points_cam = transform(T_cam_key, cloud.points)
+    ahead = cloud.points @ T_cam_key[2, :3] + T_cam_key[2, 3] > 0
+    index = np.flatnonzero(ahead & ~patches.free if vetoed else ahead)
+    points_cam = transform(T_cam_key, cloud.points[index])
     uv, seen = image_points(camera, points_cam)
-    if vetoed:
-        seen &= ~patches.free
-    index = np.flatnonzero(seen)
-    points_cam, uv = points_cam[index], uv[index]
+    index, points_cam, uv = index[seen], points_cam[seen], uv[seen]
     depth = points_cam[:, 2].astype(np.float32)
     focal_px = camera.K[[0, 1], [0, 1]]
     normal = patches.normal[index].astype(np.float64) @ T_cam_key[:3, :3].T
