@@ -49,22 +49,28 @@ from densify.views import HeldOut, Views
 
 class Method(NamedTuple):
     """What is accumulated. all_sweeps: else the key sweep alone. engine: which flow, see
-    ``flow.engine``; None for none, "" for the configured one."""
+    ``flow.engine``; None for none, "" for the configured one. visible: what is hidden, vetoed or
+    doubtful is left out, else each pixel shows its nearest point."""
 
     all_sweeps: bool
     engine: str | None
-    about: str
+    visible: bool
 
 
 METHODS = {
-    "none": Method(False, None, "the key sweep alone"),
-    "icp": Method(True, None, "registration only"),
-    "paper": Method(True, "paper", "registration and the published scene flow"),
-    "flow": Method(True, "", "registration and our scene flow"),
+    "none": Method(False, None, False),
+    "icp": Method(True, None, False),
+    "icp-visible": Method(True, None, True),
+    "flow-plain": Method(True, "", False),
+    "paper": Method(True, "paper", True),
+    "flow": Method(True, "", True),
 }
-"""For `compare`. `run` takes all but ``paper``; each but the first is the baseline of the next."""
+"""For `compare`: the key sweep alone; registration alone, as it is and with visibility; our scene
+flow without visibility; the published scene flow; ours. `run` takes none, icp and flow."""
 
 _RUN = ("none", "icp", "flow")
+COMPARED = ("none", "icp", "paper", "flow")
+"""What `compare` shows unless told otherwise."""
 
 ConfigLike = Config | str | Path | Mapping[str, Any] | None
 
@@ -100,7 +106,7 @@ def compare(
     cameras: Sequence[str] | None = None,
     config: ConfigLike = None,
     progress: Progress | None = None,
-    methods: Sequence[str] = tuple(METHODS),
+    methods: Sequence[str] = COMPARED,
 ) -> dict[str, Result]:
     """Methods by name on the same registration, each with those before it as its baselines.
 
@@ -125,28 +131,31 @@ def compare(
         heights = ground(stretch, settings.ground)
     moments = {name: _key_moment(stretch, key, heights, name, settings, watch) for name in methods}
 
-    views = Views.of(sequence, stretch, key, chosen, settings)
+    key_image = RangeImage.of(stretch[key])
+    views = Views.of(sequence, stretch, key, key_image, chosen, settings)
     with watch.stage("held out"):
         held_out = HeldOut.of(views, moments[methods[-1]][0])
-        held_out_scores = {name: held_out.scores(cloud) for name, (cloud, _) in moments.items()}
     results: dict[str, Result] = {}
     for name, (cloud, flow) in moments.items():
+        visible = METHODS[name].visible and settings.project.visibility
+        with watch.stage("held out"):
+            held_out_scores = held_out.scores(cloud, visible)
         movers = {}
         if settings.output.movers == "separate":
             with watch.stage("project"):
-                movers = views.movers(cloud)
+                movers = views.movers(cloud, visible)
         if settings.output.movers != "keep":
             cloud = cloud.select(~cloud.moving)
         with watch.stage("project"):
-            depth = views.depth(cloud)
+            depth = views.depth(cloud, visible)
             depth = {
                 n: with_ages(m, stretch, key, views.exposures[n].late_s) for n, m in depth.items()
             }
         with watch.stage("colour"):
             cloud = views.coloured(cloud, depth, images)
         with watch.stage("score"):
-            metrics = _scores(sequence, stretch[key], cloud, depth)
-            metrics["held_out"] = held_out_scores[name]
+            metrics = _scores(sequence, stretch[key], key_image, cloud, depth)
+            metrics["held_out"] = held_out_scores
         results[name] = Result(
             *(name, key, tuple(np.unique(cloud.frame).tolist()), cloud, depth, metrics),
             costs=watch.costs(),
@@ -224,7 +233,11 @@ def _steps(motion: Motion, stretch: Stretch, key: int) -> StretchFlow:
 
 
 def _scores(
-    sequence: LidarSequence, key_sweep: RegisteredSweep, cloud: Cloud, depth: Mapping[str, DepthMap]
+    sequence: LidarSequence,
+    key_sweep: RegisteredSweep,
+    key_image: RangeImage,
+    cloud: Cloud,
+    depth: Mapping[str, DepthMap],
 ) -> dict[str, Any]:
     """What can be said of the result without truth, and against the truth where there is some."""
     metrics: dict[str, Any] = {
@@ -237,7 +250,7 @@ def _scores(
             }
             for name, maps in depth.items()
         },
-        "ghosts": scores.ghost_scores(cloud, RangeImage.of(key_sweep), key_sweep.frame),
+        "ghosts": scores.ghost_scores(cloud, key_image, key_sweep.frame),
     }
     if sequence.truth is not None:
         metrics["depth"] = {

@@ -12,8 +12,10 @@ from numpy.typing import NDArray
 
 from densify import depth_metrics, poses
 from densify.config import Config, ProjectSettings
+from densify.range_image import RangeImage
 from densify.stages.colour import colour
 from densify.stages.optical_flow import optical_flow
+from densify.stages.patches import patches
 from densify.stages.project import project
 from densify.types import (
     Bool,
@@ -67,10 +69,12 @@ class Exposure:
 class Views:
     """Every camera's exposure of one key.
 
-    origins: (3,) where each sweep's lidar stood, key frame, by frame.
+    key_image: what the key sweep saw. origins: (3,) where each sweep's lidar stood, key frame, by
+    frame.
     """
 
     key: int
+    key_image: RangeImage | None
     exposures: Mapping[str, Exposure]
     origins: Mapping[int, Float]
     settings: ProjectSettings
@@ -80,19 +84,20 @@ class Views:
         sequence: LidarSequence,
         stretch: Stretch,
         key: int,
+        key_image: RangeImage,
         cameras: list[Camera],
         settings: Config,
     ) -> Views:
         exposures = {c.name: Exposure.of(sequence, stretch, key, c, settings) for c in cameras}
         origins = {f: stretch.T_target_source(key, f)[:3, 3] for f in stretch.frames}
-        return Views(key, exposures, origins, settings.project)
+        return Views(key, key_image, exposures, origins, settings.project)
 
-    def depth(self, cloud: Cloud) -> dict[str, DepthMap]:
-        """By camera."""
+    def depth(self, cloud: Cloud, visible: bool = True) -> dict[str, DepthMap]:
+        """By camera. visible: leave out what is hidden, vetoed or doubtful."""
+        settings = replace(self.settings, visibility=visible)
+        surface = patches(cloud, self.key, settings, self.origins, self.key_image)
         return {
-            name: project(
-                cloud.after(e.late_s), e.camera, e.T_cam_key, self.settings, self.key, self.origins
-            )
+            name: project(cloud.after(e.late_s), e.camera, e.T_cam_key, settings, self.key, surface)
             for name, e in self.exposures.items()
         }
 
@@ -128,11 +133,11 @@ class Views:
             for name, e in self.exposures.items()
         }
 
-    def movers(self, cloud: Cloud) -> dict[int, Mover]:
+    def movers(self, cloud: Cloud, visible: bool) -> dict[int, Mover]:
         """Every moving object by itself."""
         instances = np.unique(cloud.instance[cloud.moving & (cloud.instance >= 0)])
         parts = {int(i): cloud.select(cloud.moving & (cloud.instance == i)) for i in instances}
-        return {i: Mover(part, self.depth(part)) for i, part in parts.items()}
+        return {i: Mover(part, self.depth(part, visible)) for i, part in parts.items()}
 
 
 @dataclass(frozen=True)
@@ -149,6 +154,7 @@ class HeldOut:
     @staticmethod
     def of(views: Views, cloud: Cloud) -> HeldOut:
         """cloud: says what moves in the key sweep, and how fast."""
+        views = replace(views, key_image=None)  # what is held out must not help
         own = cloud.select(cloud.frame == views.key)
         key_alone = views.depth(own)
         movers = views.depth(own.select(own.moving))
@@ -158,14 +164,14 @@ class HeldOut:
         }
         return HeldOut(views, key_alone, moving)
 
-    def scores(self, cloud: Cloud) -> dict[str, Any] | None:
+    def scores(self, cloud: Cloud, visible: bool) -> dict[str, Any] | None:
         """By camera, as `densify.depth_metrics.depth_scores`, and the ``curve`` of precision over
         density; None for a cloud of the key sweep alone."""
         rest = cloud.select(cloud.frame != self.views.key)
         if not len(rest):
             return None
         scores: dict[str, Any] = {}
-        for name, maps in self.views.depth(rest).items():
+        for name, maps in self.views.depth(rest, visible).items():
             truth_m, camera = self.key_alone[name].depth_m, self.views.exposures[name].camera
             scores[name] = {
                 **depth_metrics.depth_scores(maps, truth_m, self.moving[name], camera),
