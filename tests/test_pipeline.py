@@ -195,11 +195,12 @@ def test_metrics_are_plain_numbers(moving):
 
 def test_more_sweeps_give_more_depth(moving):
     density = {m: r.metrics["density"]["front"]["measured"] for m, r in moving.items()}
-    assert density["icp"] > 1.1 * density["none"]
-    assert density["flow"] > 1.1 * density["none"]
+    # a coarse image, and what is not certain at edges is left out
+    assert density["icp"] > 1.02 * density["none"]
+    assert density["flow"] > 1.02 * density["none"]
 
 
-_LAST_STAGES = ("accumulate", "project", "colour", "score")
+_LAST_STAGES = ("accumulate", "patches", "project", "colour", "score")
 
 
 def test_costs_of_every_stage(moving):
