@@ -167,7 +167,7 @@ def compare(
             costs=watch.costs(),
             baselines=dict(results),
             flow=steps.get(name),
-            movers=_movers(eye, whole) if settings.output.movers == "separate" else {},
+            movers=_movers(eye, whole, images) if settings.output.movers == "separate" else {},
             optical_flow=eye.optical_flow(cloud, depth) if settings.output.optical_flow else {},
         )
     return results
@@ -296,11 +296,17 @@ class _Eye:
         return flows
 
 
-def _movers(eye: _Eye, cloud: Cloud) -> dict[int, Mover]:
+def _movers(
+    eye: _Eye, cloud: Cloud, images: Mapping[str, NDArray[np.uint8]]
+) -> dict[int, Mover]:
     """Every moving object by itself."""
     instances = np.unique(cloud.instance[cloud.moving & (cloud.instance >= 0)])
-    parts = {int(i): cloud.select(cloud.moving & (cloud.instance == i)) for i in instances}
-    return {i: Mover(part, eye.depth(part)) for i, part in parts.items()}
+    movers = {}
+    for instance in instances.tolist():
+        part = cloud.select(cloud.moving & (cloud.instance == instance))
+        depth = eye.depth(part)
+        movers[instance] = Mover(eye.coloured(part, depth, images), depth)
+    return movers
 
 
 class _HeldOut:
