@@ -296,9 +296,7 @@ class _Eye:
         return flows
 
 
-def _movers(
-    eye: _Eye, cloud: Cloud, images: Mapping[str, NDArray[np.uint8]]
-) -> dict[int, Mover]:
+def _movers(eye: _Eye, cloud: Cloud, images: Mapping[str, NDArray[np.uint8]]) -> dict[int, Mover]:
     """Every moving object by itself."""
     instances = np.unique(cloud.instance[cloud.moving & (cloud.instance >= 0)])
     movers = {}
