@@ -16,8 +16,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from densify import poses, scores
-from densify.config import Config, resolve
+from densify import depth_metrics, poses, scores
+from densify.config import Config, RegisterSettings, resolve
 from densify.errors import InputError
 from densify.flow.chained import ChainedMotion
 from densify.height_map import HeightMap
@@ -25,6 +25,7 @@ from densify.range_image import RangeImage
 from densify.readers.flow_files import FlowFiles
 from densify.readers.window import choose_cameras, read_sweeps, recorded_trajectory, window_frames
 from densify.stages.accumulate import accumulate
+from densify.stages.age import with_ages
 from densify.stages.colour import colour
 from densify.stages.deskew import deskew
 from densify.stages.flow import estimate_motion
@@ -125,16 +126,14 @@ def compare(
     with watch.stage("images"):
         images = {camera.name: sequence.image(camera.name, key) for camera in chosen}
     with watch.stage("register"):
-        trajectory = _trajectory(sequence, sweeps, settings)
+        trajectory = find_trajectory(sequence, sweeps, settings.register)
     with watch.stage("deskew"):
         stretch = deskew([s for s in sweeps if s.frame in frames], trajectory)
     engines = [METHODS[name].engine for name in methods]
     if any(engine is not None for engine in engines):
         with watch.stage("ground"):
             heights = ground(stretch, settings.ground)
-
     exposures = {c.name: _exposure(sequence, stretch, key, c, settings) for c in chosen}
-
     clouds: dict[str, Cloud] = {}
     steps: dict[str, StretchFlow] = {}
     for name, engine in zip(methods, engines, strict=True):
@@ -157,6 +156,7 @@ def compare(
         apart = settings.output.movers != "keep"
         cloud = whole.select(~whole.moving) if apart else whole
         depth = eye.depth(cloud)
+        depth = {n: with_ages(m, stretch, key, exposures[n].late_s) for n, m in depth.items()}
         with watch.stage("colour"):
             cloud = eye.coloured(cloud, depth, images)
         with watch.stage("score"):
@@ -184,16 +184,23 @@ def _read(
     return sweeps
 
 
-def _trajectory(sequence: LidarSequence, sweeps: Sequence[Sweep], settings: Config) -> Trajectory:
-    """Poses in two passes: raw sweeps are bent by the motion that the first pass finds."""
-    if settings.register.source == "dataset":
+def find_trajectory(
+    sequence: LidarSequence, sweeps: Sequence[Sweep], settings: RegisterSettings
+) -> Trajectory:
+    """Where the lidar was: the recording's own poses, or registration in two passes, whose first
+    finds the motion that bends raw sweeps.
+
+    sweeps: raw, consecutive frames ascending. settings: its ``source`` decides.
+    Raises ComputationError naming the frames where the poses cannot be right.
+    """
+    if settings.source == "dataset":
         trajectory = recorded_trajectory(sequence, sweeps)
-        check_plausible(trajectory, settings.register)
-        check_overlap(sweeps, trajectory, settings.register)
+        check_plausible(trajectory, settings)
+        check_overlap(sweeps, trajectory, settings)
         return trajectory
-    rough = register(sweeps, settings.register)
+    rough = register(sweeps, settings)
     straight = [s.sweep for s in deskew(sweeps, rough).sweeps]
-    return register(straight, settings.register, rough)
+    return register(straight, settings, rough)
 
 
 def _motion(stretch: Stretch, heights: HeightMap, engine: str, settings: Config) -> Motion:
@@ -332,9 +339,15 @@ class _HeldOut:
         rest = cloud.select(cloud.frame != self._eye.key)
         if not len(rest):
             return None
-        cameras = {name: exposure.camera for name, exposure in self._eye.exposures.items()}
-        maps = self._eye.depth(rest)
-        return scores.held_out_scores(maps, self._key_alone, self._moving, cameras)
+        return {
+            name: depth_metrics.depth_scores(
+                maps,
+                self._key_alone[name].depth_m,
+                self._moving[name],
+                self._eye.exposures[name].camera,
+            )
+            for name, maps in self._eye.depth(rest).items()
+        }
 
 
 def _scores(
@@ -346,8 +359,8 @@ def _scores(
         "num_moving": int(cloud.moving.sum()),
         "density": {
             name: {
-                "measured": scores.image_density(maps.depth_m),
-                "filled": scores.image_density(maps.filled_m),
+                "measured": depth_metrics.image_density(maps.depth_m),
+                "filled": depth_metrics.image_density(maps.filled_m),
             }
             for name, maps in depth.items()
         },
@@ -355,7 +368,7 @@ def _scores(
     }
     if sequence.truth is not None:
         metrics["depth"] = {
-            name: scores.depth_scores(
+            name: depth_metrics.depth_scores(
                 maps,
                 sequence.truth.depth_m(name, key_sweep.frame),
                 sequence.truth.moving_mask(name, key_sweep.frame),

@@ -250,7 +250,9 @@ class DepthMap:
 
     depth_m: float32 camera z of measured pixels, 0 none. filled_m: the same plus pixels
     interpolated between measured ones. confidence: float32 0 to 1, of every pixel in ``filled_m``.
-    frame: int32 source sweep of measured pixels, -1 elsewhere.
+    frame: int32 source sweep of measured pixels, -1 elsewhere. age_s: float32 seconds between the
+    moment the map shows and the reference time of the sweep that measured the pixel, of every pixel
+    in ``filled_m``, nan elsewhere; None until `densify.stages.age` has worked it out.
     """
 
     camera: str
@@ -258,6 +260,7 @@ class DepthMap:
     filled_m: Float32
     confidence: Float32
     frame: NDArray[np.int32]
+    age_s: Float32 | None = None
 
 
 @dataclass(frozen=True)

@@ -11,8 +11,11 @@ import numpy as np
 import pytest
 
 from densify.bench import flow as bench
+from densify.bench import pairs as bench_pairs
 from densify.bench.baselines import cluster_icp, nonrigid_icp
 from densify.bench.memory import PeakMemory
+from densify.bench.pairs import Trace, pairs_of
+from densify.bench.windows import Window
 from densify.cli import main, tables
 from densify.config import resolve
 from densify.errors import InputError
@@ -20,7 +23,7 @@ from densify.flow.solvers import ObjectiveSettings, solve
 from tests.scenes import Arc, Scanner, Scene, TinySequence, World, car, street
 
 CONFIG = resolve({"register": {"source": "dataset"}})
-FAST = ("window", "rigid", "cluster-icp", "nicp")
+FAST = ("ours", "rigid", "cluster-icp", "nicp")
 
 
 def shell(size_m: tuple[float, float, float], num: int) -> np.ndarray:
@@ -124,7 +127,7 @@ def test_every_method_has_every_number(measured):
         assert 0 <= row["window"]["coverage"] <= 1
         assert (
             row["times_seconds"]
-            == row["seconds_per_pair"] / (measured["methods"]["window"]["seconds_per_pair"])
+            == row["seconds_per_pair"] / (measured["methods"]["ours"]["seconds_per_pair"])
         )
 
 
@@ -132,7 +135,7 @@ def test_slow_methods_get_the_points_that_are_drawn(measured):
     points = {name: row["num_points"] for name, row in measured["methods"].items()}
     assert points["nicp"] == 400
     assert points["rigid"] == points["cluster-icp"] > 400
-    assert points["window"] > points["rigid"]  # the ground too
+    assert points["ours"] > points["rigid"]  # the ground too
 
 
 def test_rigid_is_the_motion_itself(measured):
@@ -149,16 +152,16 @@ def test_rigid_is_the_motion_itself(measured):
 
 def test_methods_do_what_they_are_for(measured):
     rows = measured["methods"]
-    for name in ("window", "cluster-icp"):
+    for name in ("ours", "cluster-icp"):
         assert rows[name]["step"]["movers_m"] < 0.5 * rows["rigid"]["step"]["movers_m"], name
         assert rows[name]["window"]["coverage"] > rows["rigid"]["window"]["coverage"], name
-    assert rows["window"]["step"]["background_m"] == 0
-    assert rows["window"]["times_error"] == rows["window"]["times_seconds"] == 1
+    assert rows["ours"]["step"]["background_m"] == 0
+    assert rows["ours"]["times_error"] == rows["ours"]["times_seconds"] == 1
 
 
 def test_without_truth_energy_seconds_and_ghosts_are_left():
     found = bench.bench_flow(
-        tiny(with_truth=False), 4, 1, CONFIG, ("window", "rigid"), max_points=600
+        tiny(with_truth=False), 4, 1, CONFIG, ("ours", "rigid"), max_points=600
     )
     for row in found["methods"].values():
         assert set(row["step"]) == {"called_moving"}
@@ -168,63 +171,120 @@ def test_without_truth_energy_seconds_and_ghosts_are_left():
     assert "ghosts" in tables.flow_table(found) and "coverage" not in tables.flow_table(found)
 
 
-def test_one_pair_and_adams_milestones(monkeypatch):
-    monkeypatch.setattr(ObjectiveSettings, "adam_num_steps", 30)
+def test_one_pair_and_the_solvers_milestones(monkeypatch):
     monkeypatch.setattr(
-        bench,
+        bench_pairs,
         "ObjectiveSettings",
-        lambda solver="pcg": ObjectiveSettings(solver, adam_num_steps=30),
+        lambda solver: ObjectiveSettings(solver, adam_num_steps=30),
     )
     found = bench.bench_flow(
-        tiny(), 4, 1, CONFIG, ("paper", "adam", "pair"), pairs_only=True, max_points=300
+        tiny(), 4, 1, CONFIG, ("paper", "paper-adam", "ours-pair"), pairs_only=True, max_points=300
     )
     assert found["num_pairs"] == 1 and found["truth"] is None
-    adam = found["methods"]["adam"]
-    assert adam["window"] is None
-    assert "times_seconds" not in adam
-    assert 1 <= adam["steps_to_lowest"] <= 30
-    share = adam["steps_to_lowest"] / 30
-    assert adam["seconds_to_lowest"] == pytest.approx(share * adam["seconds_per_pair"])
-    for name in ("adam", "paper"):
+    for name in ("paper", "paper-adam"):
         row = found["methods"][name]
+        assert row["window"] is None and "times_seconds" not in row
         assert row["num_points"] == 300 and row["energy_after"] < 0.9 * row["energy_before"]
-    assert 0 <= adam["pairs_as_low_as_paper"] <= 1
-    assert found["methods"]["pair"]["step"]["background_m"] < 0.05
-    assert "adam: lowest energy after" in tables.flow_table(found)
+        solver = row["solver"]
+        assert solver["lowest_energy"] == pytest.approx(row["energy_after"], rel=1e-6)
+        assert 0 < solver["seconds_to_lowest"] <= solver["seconds"] <= row["seconds_per_pair"]
+        assert 0 <= solver["pairs_as_low_as_other"] <= 1
+    assert found["methods"]["paper-adam"]["solver"]["steps"] == 30
+    assert found["methods"]["ours-pair"]["step"]["background_m"] < 0.05
+    assert "paper-adam: 30 steps in " in tables.flow_table(found)
 
 
-def test_adam_is_as_low_as_paper_where_its_trace_says_so():
-    adam = bench._Measured({}, [], [3.0, 5.0], [(9.0, 5.0, 3.0, 4.0), (9.0, 7.0, 6.0, 2.0, 8, 8)])
-    milestones = bench._milestones(adam, bench._Measured({}, [5.5, 6.0], [], []))
+def test_the_pair_is_the_earlier_neighbour_and_the_key():
+    found = bench.bench_flow(tiny(), 4, 1, CONFIG, ("rigid",), pairs_only=True, max_points=100)
+    window = Window.open(tiny(), 4, 1, CONFIG)
+    pair = pairs_of(window, 100)[3]
+    assert found["methods"]["rigid"]["energy_after"] == pair.energy(np.zeros_like(pair.source))
+    assert pair.duration_s == pytest.approx(0.1)
+    start = bench.bench_flow(tiny(), 0, 1, CONFIG, ("rigid",), pairs_only=True, max_points=100)
+    assert start["num_pairs"] == 1 and start["frames"] == [0, 1]
+
+
+def test_two_sweeps_are_ours_to_compare_with_their_times():
+    """Both ways in time: one flow brings a point to the reference time and on to the other's."""
+    sequence = tiny()
+    for frame, pair in pairs_of(Window.open(sequence, 4, 1, CONFIG), 100).items():
+        field, trace = bench_pairs.flow_of_pair("ours-pair", pair, CONFIG)
+        assert trace is None and (field.instance == -1).all()
+        rows = pair.here.registered.sweep.row
+        movers = field.moving & sequence.truth.sweep(frame).moving[rows]
+        assert movers.sum() > 50
+        true = sequence.truth.displacement(frame, 4)[rows][movers]
+        assert np.linalg.norm(field.displacement[movers] - true, axis=1).mean() < 0.1
+        late = pair.here.registered.sweep.offset_ns[movers, None] * 1e-9 / pair.duration_s
+        error = np.linalg.norm(field.to_reference[movers] + late * true, axis=1)
+        assert error.mean() < 0.2 * np.linalg.norm(late * true, axis=1).mean()
+
+
+def test_milestones_are_read_off_the_traces():
+    adam = [
+        Trace((9.0, 5.0, 3.0, 4.0), (0.5, 1.0, 2.0, 3.0)),
+        Trace((9.0, 7.0, 6.0, 2.0, 8.0, 8.0), (1.0, 2.0, 3.0, 4.0, 5.0, 6.0)),
+    ]
+    milestones = bench._milestones(adam)
+    assert milestones["steps"] == pytest.approx(4) and milestones["seconds"] == pytest.approx(4.5)
     assert milestones["steps_to_lowest"] == pytest.approx(2.5)
-    assert milestones["seconds_to_lowest"] == pytest.approx((2 + 3) / 2)  # a second each
-    assert milestones["seconds_to_paper"] == pytest.approx((1 + 2) / 2)
-    assert milestones["pairs_as_low_as_paper"] == 2
-    once = bench._milestones(adam, bench._Measured({}, [5.5, 1.0], [], []))
-    assert once["seconds_to_paper"] == pytest.approx(1) and once["pairs_as_low_as_paper"] == 1
-    never = bench._milestones(adam, bench._Measured({}, [1.0, 1.0], [], []))
-    assert never["seconds_to_paper"] is None and never["pairs_as_low_as_paper"] == 0
-    assert "seconds_to_paper" not in bench._milestones(adam, None)
+    assert milestones["seconds_to_lowest"] == pytest.approx((2 + 4) / 2)
+    assert milestones["lowest_energy"] == pytest.approx(2.5)
+
+    def ending_at(*energies: float) -> list[Trace]:
+        return [Trace((9.0, energy), (0.0, 0.1)) for energy in energies]
+
+    both = bench._as_low(adam, ending_at(5.5, 6.0))
+    assert both["seconds_to_others_lowest"] == pytest.approx((1 + 3) / 2)
+    assert both["pairs_as_low_as_other"] == 2
+    once = bench._as_low(adam, ending_at(5.5, 1.0))
+    assert once == {"seconds_to_others_lowest": 1.0, "pairs_as_low_as_other": 1}
+    never = bench._as_low(adam, ending_at(1.0, 1.0))
+    assert never == {"seconds_to_others_lowest": None, "pairs_as_low_as_other": 0}
+
+
+def tiny_pair(max_points: int) -> bench_pairs.Pair:
+    return pairs_of(Window.open(tiny(), 4, 1, CONFIG), max_points)[5]
 
 
 def test_energy_is_the_solvers():
-    rng = np.random.default_rng(0)
-    source, target = rng.uniform(0, 4, (90, 3)), rng.uniform(0, 4, (80, 3))
-    pair = bench.Pair(source, target, np.arange(90), np.arange(80), 0.1)
-    solution = solve(source, target)
-    assert pair.energy(solution.flow) == pytest.approx(solution.energy, rel=1e-9)
-    assert pair.energy(np.zeros_like(source)) == pytest.approx(solution.energies[0], rel=1e-9)
+    pair = tiny_pair(90)
+    solution = solve(pair.drawn, pair.target_drawn)
+    assert len(pair.drawn) == len(pair.target_drawn) == 90
+    flow = pair.carried(solution.flow)
+    flow[pair.here.drawn] = solution.flow  # they carry to themselves but for rounding
+    assert pair.energy(flow) == pytest.approx(solution.energy, rel=1e-9)
+    assert pair.energy(np.zeros_like(pair.source)) == pytest.approx(solution.energies[0], rel=1e-9)
 
 
 def test_flow_is_carried_to_the_points_that_were_not_drawn():
-    source = np.random.default_rng(1).uniform(0, 5, (300, 3))
-    drawn = np.arange(0, 300, 3)
-    pair = bench.Pair(source, source, drawn, drawn, 0.1)
-    own = np.cos(source[drawn])
+    pair = tiny_pair(300)
+    own = np.cos(pair.drawn)
     carried = pair.carried(own)
-    assert np.abs(carried[drawn] - own).max() < 1e-4
-    constant = pair.carried(np.tile([1.0, 2, 3], (len(drawn), 1)))
-    assert constant == pytest.approx(np.tile([1.0, 2, 3], (300, 1)))
+    assert carried.shape == pair.source.shape
+    assert np.abs(carried[pair.here.drawn] - own).max() < 1e-3
+    constant = pair.carried(np.tile([1.0, 2, 3], (300, 1)))
+    assert constant == pytest.approx(np.tile([1.0, 2, 3], (len(pair.source), 1)))
+    whole = tiny_pair(0)
+    assert whole.carried(whole.source) is whole.source
+
+
+def test_a_pairs_flow_becomes_that_of_the_whole_sweep():
+    pair = tiny_pair(100)
+    registered = pair.here.registered
+    R = registered.T_world_lidar[:3, :3]
+    assert pair.duration_s == pytest.approx(-0.1)
+    fast = np.arange(len(pair.source)) % 2 == 0
+    field = pair.as_field(np.where(fast[:, None], [0.3, 0.4, 0.0], [0.04, 0.0, 0.0]))
+    assert (field.moving[pair.here.above] == fast).all() and not field.moving[
+        ~pair.here.above
+    ].any()
+    assert field.displacement[field.moving] @ R.T == pytest.approx(
+        np.tile([0.3, 0.4, 0.0], (fast.sum(), 1))
+    )
+    # Backwards in time: what was measured 20 ms late has moved a fifth of the way from the next.
+    late = registered.sweep.offset_ns * 1e-9 / 0.1
+    assert field.to_reference == pytest.approx(late[:, None] * field.displacement)
 
 
 def test_memory_counts_what_is_held_for_a_moment():
@@ -240,7 +300,7 @@ def test_memory_counts_what_is_held_for_a_moment():
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"methods": ("window", "magic")}, "--methods magic: expected all, or of window"),
+        ({"methods": ("ours", "magic")}, "--methods magic: expected all, or of ours"),
         ({"methods": ()}, "--methods: got none"),
         ({"window": 0}, "--window 0"),
         ({"max_points": 49}, "--max-points 49"),
@@ -268,12 +328,12 @@ def test_the_command_prints_tables_and_writes_numbers(tmp_path: Path, capsys, mo
     bench_flow = bench.bench_flow
     monkeypatch.setattr(bench, "bench_flow", measure)
     out = tmp_path / "new" / "flow.json"
-    command = [*COMMAND, "--methods", "rigid,window", "--key", "3", "--key", "5", "--out", str(out)]
+    command = [*COMMAND, "--methods", "rigid,ours", "--key", "3", "--key", "5", "--out", str(out)]
     assert main(command) == 0
     printed = capsys.readouterr().out
     assert printed.splitlines()[-1] == str(out)
-    assert printed.count("\nrigid ") == 4 and printed.count("\nwindow ") == 4
-    assert [s[1:] for s in seen] == [(k, ["rigid", "window"], False, 300) for k in (3, 5)]
+    assert printed.count("\nrigid ") == 4 and printed.count("\nours ") == 4
+    assert [s[1:] for s in seen] == [(k, ["rigid", "ours"], False, 300) for k in (3, 5)]
     numbers = json.loads(out.read_text("utf-8"))
     assert [len(run["methods"]) for run in numbers["runs"]] == [2, 2]
     assert main(command) == 2  # kept
@@ -281,7 +341,7 @@ def test_the_command_prints_tables_and_writes_numbers(tmp_path: Path, capsys, mo
 
 
 def test_default_methods_leave_out_the_minutes():
-    assert "adam" in bench.METHODS and "adam" not in bench.DEFAULT_METHODS
+    assert bench.ADAM in bench.METHODS and bench.ADAM not in bench.DEFAULT_METHODS
 
 
 @pytest.mark.parametrize(

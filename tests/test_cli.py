@@ -77,6 +77,7 @@ def test_run_writes_exactly_the_tree_and_names_every_file(densified: SimpleNames
         "000120/depth/image_02.png",
         "000120/depth_filled/image_02.png",
         "000120/confidence/image_02.png",
+        "000120/age/image_02.png",
         "000120/cloud.laz",
         "000120/metrics.json",
         "000120/figure.png",
@@ -124,6 +125,50 @@ def test_overwrite_gives_the_same_bytes(densified: SimpleNamespace) -> None:
     for name in before:
         if not name.endswith("run.yaml"):  # holds seconds
             assert after[name] == before[name], name
+
+
+def test_export_says_what_is_left_and_names_every_file(
+    densified: SimpleNamespace, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run, out = densified.out / "000120", tmp_path / "out"
+    before = files_in(densified.out)
+    command = ["export", run, "--min-confidence", "0.8", "--max-age-ms", "80", "--out", out]
+    assert exit_code(*command) == 0
+    line, *paths = capsys.readouterr().out.splitlines()
+    shares = [
+        100
+        * np.count_nonzero(cv2.imread(str(folder / product / "image_02.png"), -1))
+        / (375 * 1242)
+        for product in ("depth", "depth_filled")
+        for folder in (run, out)
+    ]
+    named = [float(share) for share in re.findall(r"([\d.]+) %", line)]
+    assert line.startswith("image_02: depth in ")
+    np.testing.assert_allclose(named, shares, atol=0.0501)
+    assert shares[0] > shares[1] > 0 and shares[2] > shares[3] >= shares[1]
+    assert sorted(paths) == sorted(str(out / name) for name in files_in(out))
+    assert files_in(densified.out) == before
+    assert "--overwrite" in refused(capsys, 2, *command)
+    assert exit_code(*command, "--overwrite") == 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--min-confidence", "1.5"], "--min-confidence 1.5: expected a number from 0 to 1"),
+        (["--min-confidence", "high"], "invalid float value: 'high'"),
+        (["--max-age-ms", "-1"], "--max-age-ms"),
+    ],
+)
+def test_export_refuses_in_one_line(
+    densified: SimpleNamespace,
+    capsys: pytest.CaptureFixture[str],
+    arguments: list[str],
+    words: str,
+) -> None:
+    run = densified.out / "000120"
+    assert words in refused(capsys, 2, "export", run, *arguments)
+    assert "no run.yaml" in refused(capsys, 2, "export", run.parent)
 
 
 def test_compare_prints_a_table_and_writes_it(

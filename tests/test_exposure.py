@@ -16,7 +16,7 @@ from tests.tiny_street import KEY, POSES_GIVEN, tiny
 def test_an_image_of_another_moment_sees_from_where_the_camera_was(late_s):
     """At 20 m/s a shutter 50 ms late is 1 m nearer to the wall ahead."""
     boxes = (Box((1.0, 60.0, 30.0), Arc(45, 0)), *street())
-    scene = Scene(World(boxes), Arc(-10, -1.5, 0, 20.0), Scanner(num_azimuths=1800))
+    scene = Scene(World(boxes), Arc(-10, -1.5, 0, 20.0), Scanner(num_azimuths=900))
     sequence = TinySequence(scene, range(9), late_s)
     result = run(sequence, 4, 1, "icp", config=POSES_GIVEN)
     truth = sequence.truth.depth_m("front", 4)
@@ -25,6 +25,11 @@ def test_an_image_of_another_moment_sees_from_where_the_camera_was(late_s):
     on_wall = (np.abs(truth - wall_m) < 0.02) & (found > 0)
     assert on_wall.sum() > 300
     assert abs(np.median(found[on_wall]) - wall_m) < 0.05
+    maps = result.depth["front"]
+    since_s = (maps.frame[found > 0] - 4) * SWEEP_S
+    np.testing.assert_allclose(maps.age_s[found > 0], np.abs(since_s - late_s), atol=1e-6)
+    assert len(np.unique(since_s)) == 3
+    np.testing.assert_array_equal(np.isnan(maps.age_s), maps.filled_m == 0)
 
 
 def test_the_camera_moves_on_though_the_sweeps_are_not_deskewed():
@@ -41,10 +46,10 @@ def test_a_mover_is_shown_where_it_was_at_the_exposure():
     scene = Scene(
         World((*street(), car(40, 0.5, 20, 1, yaw=np.pi))),
         Arc(0, -1.5),
-        Scanner(num_azimuths=1800, sigma_m=0.01),
+        Scanner(num_azimuths=1200, sigma_m=0.01),
     )
     sequence = TinySequence(scene, range(13), late_s=0.05)
-    found = run(sequence, 6, 4, config=POSES_GIVEN).depth["front"].depth_m
+    found = run(sequence, 6, 2, config=POSES_GIVEN).depth["front"].depth_m
     truth = sequence.truth.depth_m("front", 6)
     on = sequence.truth.moving_mask("front", 6) & (found > 0)
     assert on.sum() > 50
@@ -53,7 +58,7 @@ def test_a_mover_is_shown_where_it_was_at_the_exposure():
 
 def test_the_cameras_pose_turns_with_the_vehicle():
     """Turning by 30 deg/s, an image 50 ms late looks 1.5 deg further."""
-    scene = Scene(World(street()), Arc(0, -1.5, 0, 4.0, 0.5), Scanner(num_azimuths=1800))
+    scene = Scene(World(street()), Arc(0, -1.5, 0, 4.0, 0.5), Scanner(num_azimuths=900))
     sequence = TinySequence(scene, range(9), late_s=0.05)
     metrics = run(sequence, 4, 1, "icp", config=POSES_GIVEN).metrics
     assert metrics["depth"]["front"]["measured"]["all"]["outliers"] < 0.03

@@ -22,6 +22,7 @@ from densify.output import (
     read_cloud,
     read_depth_png,
     store,
+    write_age_png,
     write_cloud,
     write_comparison,
     write_confidence_png,
@@ -34,7 +35,7 @@ from densify.types import Cloud, DepthMap, Result, StageCost
 H, W = 12, 20
 CONFIG = {"flow": {"alpha": 10.0, "radius_m": None}, "register": {"source": "kiss-icp"}}
 RUN_FILES = [
-    *(f"{kind}/{camera}.png" for kind in ("depth", "depth_filled", "confidence")
+    *(f"{kind}/{camera}.png" for kind in ("depth", "depth_filled", "confidence", "age")
       for camera in ("image_02", "image_03")),
     *("cloud.laz", "metrics.json", "figure.png", "run.yaml"),
 ]  # fmt: skip
@@ -64,7 +65,9 @@ def map_of(camera, seed=0):
     filled = np.where(depth > 0, depth, np.float32(rng.random() * 30))
     filled[0] = depth[0]
     frame = np.where(depth > 0, rng.integers(119, 122, (H, W)), -1).astype(np.int32)
-    return DepthMap(camera, depth, filled, rng.random((H, W), dtype=np.float32), frame)
+    confidence = rng.random((H, W), dtype=np.float32)
+    age_s = np.where(filled > 0, rng.uniform(0, 0.5, (H, W)), np.nan).astype(np.float32)
+    return DepthMap(camera, depth, filled, confidence, frame, age_s)
 
 
 def result_of(method="flow", seed=0, cameras=("image_02", "image_03"), **metrics):
@@ -170,6 +173,29 @@ def test_confidence_is_checked(tmp_path):
             write_confidence_png(tmp_path / "c.png", np.array([[0, bad]], np.float32), depth)
     with pytest.raises(ValueError, match="expected"):
         write_confidence_png(tmp_path / "c.png", np.zeros((2, 1), np.float32), depth)
+
+
+def test_age_is_milliseconds_plus_1_and_0_without_depth(tmp_path):
+    depth = np.array([[0, 5, 5, 5, 5, 5, 300, 5]], np.float32)
+    age_s = np.array([[np.nan, 0, 0.0004, 0.0006, 0.3, 65.533, 1, 1e6]], np.float32)
+    write_age_png(tmp_path / "a.png", age_s, depth)
+    stored = cv2.imread(str(tmp_path / "a.png"), cv2.IMREAD_UNCHANGED)
+    assert stored.dtype == np.uint16
+    np.testing.assert_array_equal(stored, [[0, 1, 1, 2, 301, 65534, 0, 65535]])
+
+
+def test_ages_are_checked(tmp_path):
+    depth = np.ones((1, 2), np.float32)
+    for bad in (np.nan, np.inf, -0.1):
+        with pytest.raises(ValueError, match="0 or more"):
+            write_age_png(tmp_path / "a.png", np.array([[0, bad]], np.float32), depth)
+    with pytest.raises(ValueError, match="expected"):
+        write_age_png(tmp_path / "a.png", np.zeros((2, 1), np.float32), depth)
+    result = result_of()
+    ageless = {name: replace(depth, age_s=None) for name, depth in result.depth.items()}
+    with pytest.raises(ValueError, match="image_02: expected ages"):
+        write_result(replace(result, depth=ageless), {}, tmp_path, config={}, data="street")
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("kind", ["absent", "empty", "text", "8 bit", "colour"])
@@ -343,6 +369,9 @@ def test_result_is_written_as_the_contract_says(put, tmp_path):
         np.testing.assert_allclose(filled, depth.filled_m, atol=1 / 512)
         confidence = cv2.imread(str(folder / "confidence" / f"{name}.png"), cv2.IMREAD_UNCHANGED)
         np.testing.assert_array_equal(confidence > 0, filled > 0)
+        age = cv2.imread(str(folder / "age" / f"{name}.png"), cv2.IMREAD_UNCHANGED)
+        np.testing.assert_array_equal(age > 0, filled > 0)
+        np.testing.assert_allclose(age[age > 0], 1 + 1000 * depth.age_s[age > 0], atol=0.501)
     assert len(read_cloud(folder / "cloud.laz").points) == 50
 
 

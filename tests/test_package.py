@@ -45,7 +45,9 @@ def test_help_is_light(arguments: list[str]) -> None:
     assert not HEAVY & modules_after(code)
 
 
-@pytest.mark.parametrize("verb", ["run", "compare", "flow", "info", "simulate", "bench"])
+@pytest.mark.parametrize(
+    "verb", ["run", "compare", "flow", "info", "simulate", "evaluate", "export", "bench"]
+)
 def test_help_of_every_verb_is_light(verb: str) -> None:
     code = (
         "from densify.cli import main\n"

@@ -14,9 +14,9 @@ from densify import open_sequence, poses
 from densify.config import RegisterSettings
 from densify.errors import InputError
 from densify.flow.pair import estimate_flow
+from densify.pipeline import find_trajectory
 from densify.readers.window import read_sweeps
 from densify.stages.deskew import deskew
-from densify.stages.register import register
 from tests.scenes import Arc, Box, Scanner, Scene, World, car, street
 
 FRAME = 2
@@ -262,13 +262,11 @@ def test_real_traffic():
     if not folder:
         pytest.skip("DENSIFY_TEST_DATA is not set: no real KITTI drives")
     drive = Path(folder) / "kitti" / "2011_09_26" / "2011_09_26_drive_0013_sync"
-    settings = RegisterSettings()
-    sweeps = list(read_sweeps(open_sequence(str(drive)), range(118, 123), settings))
-    rough = register(sweeps, settings)
-    straight = [s.sweep for s in deskew(sweeps, rough, 120).sweeps]
-    window = deskew(sweeps, register(straight, settings, rough), 120)
-    here, there = window[120], window[121]
-    target = poses.transform(there.T_key_lidar, there.sweep.points)
+    sequence, settings = open_sequence(str(drive)), RegisterSettings()
+    sweeps = list(read_sweeps(sequence, range(118, 123), settings))
+    stretch = deskew(sweeps, find_trajectory(sequence, sweeps, settings))
+    here, there = stretch[120], stretch[121]
+    target = poses.transform(stretch.T_target_source(120, 121), there.sweep.points)
     field = estimate_flow(
         here.sweep.points,
         target,

@@ -184,7 +184,7 @@ def test_same_bytes_every_time(moving):
     again = compare(tiny(MOVERS), KEY, WINDOW, methods=USUAL)
     for method in USUAL:
         assert same_points(moving[method].cloud, again[method].cloud)
-        for name in ("depth_m", "filled_m", "confidence", "frame"):
+        for name in ("depth_m", "filled_m", "confidence", "frame", "age_s"):
             a, b = (getattr(r[method].depth["front"], name) for r in (moving, again))
             assert a.tobytes() == b.tobytes(), name
         assert moving[method].metrics == again[method].metrics

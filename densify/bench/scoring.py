@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,10 +12,11 @@ import numpy as np
 
 from densify import flow_metrics as metrics
 from densify import poses
+from densify.bench.windows import Window
 from densify.range_image import RangeImage
 from densify.scores import ghost_rate
 from densify.stages.accumulate import accumulate
-from densify.types import Bool, Float, FlowField, LidarSequence, Truth, Window
+from densify.types import Bool, Float, FlowField, LidarSequence, Truth
 
 _MIN_RETURNS = 30
 _LEAST_MOTION_M = 0.5
@@ -42,40 +43,37 @@ class SweepAnswer:
 class Scorer:
     """What methods' flows of one window are held against.
 
-    above: per sweep (N,) above the ground: errors are over these, since no method moves the ground.
-    sources: numbers of the sweeps whose step is scored. answers: per sweep, None without truth.
+    Errors are over the points above the ground, since no method moves the ground. sources: frames
+    whose step is scored. answers: by frame, None without truth.
     """
 
     window: Window
-    above: Sequence[Bool]
     sources: tuple[int, ...]
-    answers: tuple[SweepAnswer, ...] | None
+    answers: Mapping[int, SweepAnswer] | None
 
     @staticmethod
-    def of(
-        sequence: LidarSequence, window: Window, above: Sequence[Bool], sources: tuple[int, ...]
-    ) -> Scorer:
+    def of(sequence: LidarSequence, window: Window, sources: tuple[int, ...]) -> Scorer:
         truth = sequence.truth
-        rows = range(len(window.sweeps))
-        answers = None if truth is None else tuple(_answer(truth, window, i) for i in rows)
-        return Scorer(window, above, sources, answers)
+        if truth is None:
+            return Scorer(window, sources, None)
+        return Scorer(window, sources, {f: _answer(truth, window, f) for f in window.frames})
 
-    def step_scores(self, steps: Sequence[FlowField]) -> dict[str, Any]:
-        """Of the flow over one sweep, all pairs together. found: of the ``certain`` movers above
-        the ground; falsely_moving: of all that stands still, ground too."""
+    def step_scores(self, steps: Mapping[int, FlowField]) -> dict[str, Any]:
+        """Of the flow to the next sweep, by frame, all pairs together. found: of the ``certain``
+        movers above the ground; falsely_moving: of all that stands still, ground too."""
         if self.answers is None:
-            moving = np.concatenate([steps[i].moving for i in self.sources])
+            moving = np.concatenate([steps[f].moving for f in self.sources])
             return {"called_moving": _plain(float(moving.mean()))}
         answers = self.answers
-        flow = self._above(lambda i: steps[i].displacement)
-        true = self._above(lambda i: answers[i].step)
-        moving = self._above(lambda i: answers[i].moving)
-        called = self._above(lambda i: steps[i].moving)
-        certain = self._above(lambda i: answers[i].certain)
-        foreground = self._above(lambda i: answers[i].foreground)
+        flow = self._above(lambda f: steps[f].displacement)
+        true = self._above(lambda f: answers[f].step)
+        moving = self._above(lambda f: answers[f].moving)
+        called = self._above(lambda f: steps[f].moving)
+        certain = self._above(lambda f: answers[f].certain)
+        foreground = self._above(lambda f: answers[f].foreground)
         parts = metrics.three_way_error(flow, true, moving, foreground)
         buckets = metrics.bucketed_error(flow, true)
-        still = np.concatenate([steps[i].moving[~answers[i].moving] for i in self.sources])
+        still = np.concatenate([steps[f].moving[~answers[f].moving] for f in self.sources])
         scores = {
             "num_movers": int(moving.sum()),
             "movers_m": parts.foreground_dynamic_m,
@@ -94,20 +92,20 @@ class Scorer:
         }
         return {name: _plain(value) for name, value in scores.items()}
 
-    def window_scores(self, to_key: Sequence[FlowField]) -> dict[str, Any]:
-        """Of the flow to the key. Accumulated movers, the key's own left out, are the true movers
-        above the ground, without truth those that are called moving."""
-        cloud = accumulate(self.window, to_key, drop_lost=True)
-        key_image = RangeImage.of(self.window[self.window.key])
+    def window_scores(self, to_key: Mapping[int, FlowField]) -> dict[str, Any]:
+        """Of the flow to the key, by frame. Accumulated movers, the key's own left out, are the
+        true movers above the ground, without truth those that are called moving."""
+        stretch, key = self.window.stretch, self.window.key
+        cloud = accumulate(stretch, [to_key[f] for f in stretch.frames], key, drop_lost=True)
         others = self._others()
-        movers = [to_key[i].moving for i in range(len(to_key))]
+        movers = {f: to_key[f].moving for f in others}
         if self.answers is not None:
-            movers = [a.moving & above for a, above in zip(self.answers, self.above, strict=True)]
-        kept = [m & ~f.lost for m, f in zip(movers, to_key, strict=True)]
-        points = np.concatenate([self._placed(i, to_key[i])[kept[i]] for i in others])
-        num_movers = sum(int(movers[i].sum()) for i in others)
+            movers = {f: self.answers[f].moving & self.window.above[f] for f in others}
+        kept = {f: movers[f] & ~to_key[f].lost for f in others}
+        points = np.concatenate([self._placed(f, to_key[f])[kept[f]] for f in others])
+        num_movers = sum(int(movers[f].sum()) for f in others)
         scores: dict[str, Any] = {
-            "ghost_rate": ghost_rate(cloud, key_image, self.window.key),
+            "ghost_rate": ghost_rate(cloud, RangeImage.of(stretch[key]), key),
             "num_movers": num_movers,
             "lost": _plain(1 - len(points) / num_movers if num_movers else math.nan),
             "plane_residual_m": _plain(metrics.plane_residual_m(points)),
@@ -115,12 +113,12 @@ class Scorer:
         }
         if self.answers is None:
             return scores
-        answers, key = self.answers, self.window.frames.index(self.window.key)
-        true = np.concatenate([answers[i].at_key[movers[i]] for i in others])
+        answers = self.answers
+        true = np.concatenate([answers[f].at_key[movers[f]] for f in others])
         errors = metrics.errors_by_hops(
-            np.concatenate([to_key[i].displacement[kept[i]] for i in others]),
-            np.concatenate([answers[i].to_key[kept[i]] for i in others]),
-            np.concatenate([np.full(int(kept[i].sum()), abs(i - key)) for i in others]),
+            np.concatenate([to_key[f].displacement[kept[f]] for f in others]),
+            np.concatenate([answers[f].to_key[kept[f]] for f in others]),
+            np.concatenate([np.full(int(kept[f].sum()), abs(f - key)) for f in others]),
         )
         scores["movers_m_by_hops"] = {str(n): _plain(error) for n, error in errors.items()}
         scores["coverage"] = _plain(metrics.coverage(points, true))
@@ -130,8 +128,9 @@ class Scorer:
         """What perfect flow gets in the scores of accumulated movers; None without truth."""
         if self.answers is None:
             return None
+        answers, above = self.answers, self.window.above
         points = np.concatenate(
-            [self.answers[i].at_key[self.answers[i].moving & self.above[i]] for i in self._others()]
+            [answers[f].at_key[answers[f].moving & above[f]] for f in self._others()]
         )
         return {
             "num_movers": len(points),
@@ -140,34 +139,34 @@ class Scorer:
         }
 
     def _above(self, column: Callable[[int], Any]) -> Any:
-        return np.concatenate([column(i)[self.above[i]] for i in self.sources])
+        return np.concatenate([column(f)[self.window.above[f]] for f in self.sources])
 
     def _others(self) -> list[int]:
-        key = self.window.frames.index(self.window.key)
-        return [i for i in range(len(self.window.sweeps)) if i != key]
+        return [f for f in self.window.frames if f != self.window.key]
 
-    def _placed(self, i: int, field: FlowField) -> Float:
+    def _placed(self, frame: int, field: FlowField) -> Float:
         """(N,3) key frame at the key's moment, where called moving; the others rigidly."""
-        registered = self.window.sweeps[i]
         flow = np.where(field.moving[:, None], field.total, 0.0)
-        return poses.transform(registered.T_key_lidar, registered.sweep.points + flow)
+        stretch = self.window.stretch
+        T_key_lidar = stretch.T_target_source(self.window.key, frame)
+        return poses.transform(T_key_lidar, stretch[frame].sweep.points + flow)
 
 
-def _answer(truth: Truth, window: Window, i: int) -> SweepAnswer:
-    registered, key = window.sweeps[i], window.frames.index(window.key)
-    frame, rows = registered.frame, registered.sweep.row
+def _answer(truth: Truth, window: Window, frame: int) -> SweepAnswer:
+    rows = window.stretch[frame].sweep.row
     whole = truth.sweep(frame)
-    toward = window.frames[i + int(np.sign(key - i))]
     to_key = truth.displacement(frame, window.key)[rows]
-    first, last = (truth.displacement(frame, window.frames[j])[rows] for j in (0, -1))
+    T_key_lidar = window.stretch.T_target_source(window.key, frame)
+    ends = window.frames[0], window.frames[-1]
+    first, last = (truth.displacement(frame, end)[rows] for end in ends)
     moving, instance = whole.moving[rows], whole.instance[rows]
     num_returns = np.bincount(instance[instance >= 0], minlength=int(instance.max(initial=-1)) + 2)
     many = (instance >= 0) & (num_returns[instance] >= _MIN_RETURNS)
     far = np.linalg.norm(last - first, axis=1) >= _LEAST_MOTION_M
     return SweepAnswer(
-        step=truth.displacement(frame, toward)[rows],
+        step=truth.displacement(frame, window.towards_key(frame))[rows],
         to_key=to_key,
-        at_key=poses.transform(registered.T_key_lidar, whole.points[rows] + to_key),
+        at_key=poses.transform(T_key_lidar, whole.points[rows] + to_key),
         moving=moving,
         foreground=instance >= 0,
         certain=moving & many & far,

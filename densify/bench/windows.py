@@ -1,55 +1,66 @@
 # SPDX-License-Identifier: MIT
-"""The benchmarks' only way to the window engine: sweeps registered around a key, our flow of them,
-and flow between neighbours chained to the key."""
+"""The windows that benchmarks work on: sweeps registered around a key, and our motion of them."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Mapping
+from dataclasses import dataclass
 
+from densify import poses
 from densify.config import Config
-from densify.readers.window import read_sweeps, recorded_trajectory, window_frames
-from densify.stages.chain import chain
+from densify.pipeline import find_trajectory
+from densify.readers.window import read_sweeps, window_frames
 from densify.stages.deskew import deskew
-from densify.stages.flow import step_flow
-from densify.stages.ground import height_above_ground
-from densify.stages.register import register
-from densify.types import Float32, FlowField, LidarSequence, Window
+from densify.stages.flow import estimate_motion
+from densify.stages.ground import ground
+from densify.types import Bool, Float, LidarSequence, Motion, Stretch
 
 
-class WindowFlow(NamedTuple):
-    """Flow of every sweep of a window, in its own lidar frame. steps: to the next sweep towards the
-    key (the key's own is 0). to_key: to the key."""
+@dataclass(frozen=True)
+class Window:
+    """Consecutive sweeps around the key. above: by frame (N,) above the ground."""
 
-    steps: tuple[FlowField, ...]
-    to_key: tuple[FlowField, ...]
+    stretch: Stretch
+    key: int
+    above: Mapping[int, Bool]
+
+    @staticmethod
+    def open(sequence: LidarSequence, key: int, size: int, config: Config) -> Window:
+        """Read, register and deskew, as the pipeline does. Raises InputError for missing frames,
+        ComputationError where registration went wrong."""
+        frames, lead_in = window_frames(sequence, key, size, config.register.num_lead_in)
+        sweeps = list(read_sweeps(sequence, [*lead_in, *frames], config.register))
+        trajectory = find_trajectory(sequence, sweeps, config.register)
+        stretch = deskew([s for s in sweeps if s.frame in frames], trajectory)
+        heights = ground(stretch, config.ground)
+        above = {
+            f: heights.above(_in_world(stretch, f)) >= config.flow.min_height_m for f in frames
+        }
+        return Window(stretch, key, above)
+
+    @property
+    def frames(self) -> tuple[int, ...]:
+        return self.stretch.frames
+
+    def towards_key(self, frame: int) -> int:
+        """The neighbour on the way to the key; the key itself of the key."""
+        return frame + (self.key > frame) - (self.key < frame)
+
+    def points(self, frame: int) -> Float:
+        """(N,3) of a sweep, world, z up."""
+        return _in_world(self.stretch, frame)
+
+    def around_key(self) -> Stretch:
+        """The key and its neighbours."""
+        near = tuple(s for s in self.stretch.sweeps if abs(s.frame - self.key) <= 1)
+        return Stretch(near)
 
 
-def open_window(sequence: LidarSequence, key: int, size: int, config: Config) -> Window:
-    """Read, register and deskew, as the pipeline does. Raises InputError for missing frames."""
-    settings = config.register
-    frames, lead_in = window_frames(sequence, key, size, settings.num_lead_in)
-    sweeps = list(read_sweeps(sequence, [*lead_in, *frames], settings))
-    if settings.source == "dataset":
-        trajectory = recorded_trajectory(sequence, sweeps)
-    else:
-        rough = register(sweeps, settings)
-        straight = [s.sweep for s in deskew(sweeps, rough, key).sweeps]
-        trajectory = register(straight, settings, rough)
-    return deskew([s for s in sweeps if s.frame in frames], trajectory, key)
+def our_motion(stretch: Stretch, config: Config) -> Motion:
+    """From the ground on."""
+    return estimate_motion(stretch, ground(stretch, config.ground), config.flow)
 
 
-def heights_above_ground(window: Window, config: Config) -> tuple[Float32, ...]:
-    """(N,) metres per sweep."""
-    return height_above_ground(window, config.ground)
-
-
-def engine_flow(window: Window, config: Config) -> WindowFlow:
-    """Ours, from ground to the flow to the key."""
-    heights_m = heights_above_ground(window, config)
-    return chained(window, step_flow(window, heights_m, config.flow), config)
-
-
-def chained(window: Window, steps: Sequence[FlowField], config: Config) -> WindowFlow:
-    """Flow to the key of any method's steps."""
-    return WindowFlow(tuple(steps), chain(window, steps, config.chain))
+def _in_world(stretch: Stretch, frame: int) -> Float:
+    registered = stretch[frame]
+    return poses.transform(registered.T_world_lidar, registered.sweep.points)

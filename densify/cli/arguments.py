@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
@@ -32,6 +33,8 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     _add_flow(commands)
     _add_info(commands)
     _add_simulate(commands)
+    _add_export(commands)
+    _add_evaluate(commands)
     _add_bench(commands)
     return parser.parse_args(arguments)
 
@@ -142,6 +145,75 @@ def _add_simulate(commands: Any) -> None:
     _add_overwrite(parser)
 
 
+def _add_export(commands: Any) -> None:
+    parser = _add_verb(
+        commands,
+        "export",
+        verbs.export,
+        "a finished run's depth maps with only the certain and fresh pixels",
+        "Nothing is computed again and the run stays as it is. A filled pixel has the age of the "
+        "measured pixel nearest to it.",
+    )
+    parser.add_argument(
+        "run", metavar="RUN", type=Path, help="folder of one key, such as densify-out/000120"
+    )
+    parser.add_argument(
+        "--min-confidence",
+        type=float,
+        default=0.0,
+        metavar="C",
+        help="drop pixels less certain, 0 to 1 (default: 0, keep all)",
+    )
+    parser.add_argument(
+        "--max-age-ms",
+        type=float,
+        metavar="MS",
+        help="drop pixels measured longer before or after the exposure (default: keep all)",
+    )
+    parser.add_argument("--out", metavar="DIR", type=Path, help="(default: RUN/export)")
+    _add_overwrite(parser)
+
+
+def _add_evaluate(commands: Any) -> None:
+    parser = _add_verb(
+        commands,
+        "evaluate",
+        verbs.evaluate,
+        "scores of depth maps against true ones, as KITTI's depth benchmark defines them",
+        "PREDICTED and TRUTH: a depth PNG (KITTI's format) each, or folders, of which every PNG "
+        "is paired by drive, camera and frame: KITTI depth trees "
+        "(DRIVE/proj_depth/groundtruth/image_02/0000000005.png), densify's output "
+        "(000005/depth/image_02.png), or plain folders of equal names. A pixel that PREDICTED "
+        "lacks costs coverage and is no error. Numbers are means over images.",
+    )
+    parser.add_argument("predicted", metavar="PREDICTED", type=Path, help="a PNG or a folder")
+    parser.add_argument("truth", metavar="TRUTH", type=Path, help="a PNG or a folder")
+    parser.add_argument(
+        "--mask",
+        type=Path,
+        metavar="PNG|DIR",
+        help="what moves, not 0 in an image or a folder of them: scores of moving and static "
+        "pixels too",
+    )
+    parser.add_argument(
+        "--filled", action="store_true", help="of densify's output, score depth_filled"
+    )
+    parser.add_argument(
+        "--focal-px",
+        type=_positive,
+        metavar="F",
+        help="the camera's fx, for outliers and edges (default: KITTI's, 721.5377)",
+    )
+    parser.add_argument(
+        "--baseline-m",
+        type=_positive,
+        metavar="B",
+        help="stereo baseline that outliers are told by (default: KITTI's, 0.54)",
+    )
+    parser.add_argument("--out", metavar="FILE.json", type=Path, help="write every number there")
+    _add_overwrite(parser)
+
+
 def _add_bench(commands: Any) -> None:
     about = "measured tables: this package's methods beside published ones"
     parser = commands.add_parser("bench", help=about, description=f"{about.capitalize()}.")
@@ -155,9 +227,9 @@ def _add_bench_flow(benches: Any) -> None:
         "flow",
         verbs.bench_flow,
         "scene flow methods on the same pairs and windows: error, energy, seconds, memory",
-        "Methods: window (ours, all sweeps), pair (ours, two clouds), paper (its objective, our "
-        "solver), adam (its objective, its solver, 1,500 steps: minutes), rigid, cluster-icp, "
-        "nicp (non-rigid ICP). Errors need a recording with truth, such as the built-in street.",
+        "Methods: ours (all sweeps), ours-pair (two sweeps), paper (the published objective, our "
+        "solver), paper-adam (its own solver, 1,500 steps: minutes), rigid, cluster-icp, nicp "
+        "(non-rigid ICP). Errors need a recording with truth, such as the built-in street.",
     )
     parser.add_argument(
         "--data", metavar="SPEC", action="append", help=f"{DATA_HELP}; may be given several times"
@@ -181,7 +253,7 @@ def _add_bench_flow(benches: Any) -> None:
         "--methods",
         type=_words,
         metavar="NAME,…",
-        help="of those below, or all (default: all but adam)",
+        help="of those below, or all (default: all but paper-adam)",
     )
     parser.add_argument(
         "--pairs-only",
@@ -193,7 +265,7 @@ def _add_bench_flow(benches: Any) -> None:
         type=_natural,
         default=8000,
         metavar="N",
-        help="points that paper, adam and nicp may move; more is slower and finer, 0: all "
+        help="points that paper, paper-adam and nicp may move; more is slower and finer, 0: all "
         "(default: 8000)",
     )
     _add_config_options(parser)
@@ -284,6 +356,16 @@ def _natural(text: str) -> int:
     if not text.isascii() or not text.isdigit():
         raise argparse.ArgumentTypeError(f"got {text!r}, expected a whole number from 0 up")
     return int(text)
+
+
+def _positive(text: str) -> float:
+    try:
+        number = float(text)
+    except ValueError:
+        number = math.nan
+    if not (number > 0 and math.isfinite(number)):
+        raise argparse.ArgumentTypeError(f"got {text!r}, expected a number above 0")
+    return number
 
 
 def _words(text: str) -> list[str]:

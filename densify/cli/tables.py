@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: MIT
-"""What `run`, `compare` and `bench` say on the screen. Reads `Result.metrics`:
+"""What the verbs say on the screen. Reads `Result.metrics`:
 
 - ``ghosts``: `densify.scores.ghost_scores`;
-- ``held_out``: `densify.scores.held_out_scores`;
-- ``depth``: camera -> `densify.scores.depth_scores`, where there is truth;
+- ``held_out``: camera -> the same for the key densified from its neighbours alone;
+- ``depth``: camera -> `densify.depth_metrics.depth_scores`, where there is truth;
 
-and for a benchmark of flow what `densify.bench.flow.bench_flow` returns.
+for a benchmark of flow what `densify.bench.flow.bench_flow` returns, and for depth on disk what
+`densify.evaluation.evaluate` does.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from densify.output import Export
 from densify.types import Result
 
 _NONE = "-"
@@ -62,6 +64,18 @@ def _held_out_line(result: Result, camera: str) -> str:
         beside = "" if other is None else f" ({_percent(other)} by registration alone)"
         said.append(f"{_percent(mine)} wrong{beside}{'' if part == 'all' else ' where it moves'}")
     return f"{camera}, key held out: {', '.join(said)}" if said else ""
+
+
+def export_summary(exported: Export) -> str:
+    """A line for each camera: the share of its pixels with a depth, before and after."""
+    lines = []
+    for camera, products in exported.density.items():
+        measured, filled = (
+            f"{_percent(products[p].before, digits=1)} -> {_percent(products[p].after, digits=1)}"
+            for p in ("measured", "filled")
+        )
+        lines.append(f"{camera}: depth in {measured} of the pixels, {filled} with filled ones")
+    return "\n".join(lines)
 
 
 def comparison(results: Mapping[str, Result]) -> str:
@@ -124,11 +138,13 @@ def flow_table(measured: Mapping[str, Any]) -> str:
     lines = [
         f"{measured['data']}, key {measured['key']}, frames {frames[0]}-{frames[-1]}: "
         f"{pairs} of {measured['points_above_ground']:,} points above the "
-        f"ground; paper, adam, nicp move {drawn}; E is the paper's energy on those points",
+        f"ground; paper, paper-adam, nicp move {drawn}; E is the paper's energy on those points",
         _table(methods, _METHOD_COLUMNS),
     ]
-    if "adam" in methods:
-        lines.append(_adam_line(methods["adam"], measured["num_pairs"]))
+    for name, other in (("paper", "paper-adam"), ("paper-adam", "paper")):
+        solver = _look_up(methods, name, "solver")
+        if solver is not None:
+            lines.append(_solver_line(name, solver, other, measured["num_pairs"]))
     windows = {name: row["window"] for name, row in methods.items() if row["window"] is not None}
     if windows:
         some = next(iter(windows.values()))
@@ -140,15 +156,61 @@ def flow_table(measured: Mapping[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def _adam_line(row: Mapping[str, Any], num_pairs: int) -> str:
+_EVALUATION_COLUMNS: tuple[Column, ...] = (
+    ("pixels", ("num_pixels",), ",d"),
+    ("coverage", ("coverage",), ".1%"),
+    ("MAE mm", ("mae_mm",), ",.1f"),
+    ("RMSE mm", ("rmse_mm",), ",.1f"),
+    ("iMAE 1/km", ("imae_per_km",), ".3f"),
+    ("iRMSE 1/km", ("irmse_per_km",), ".3f"),
+    ("AbsRel", ("abs_rel",), ".2%"),
+    ("SqRel", ("sq_rel",), ".2%"),
+    ("d<1.25", ("delta_1",), ".2%"),
+    ("d<1.25^2", ("delta_2",), ".2%"),
+    ("d<1.25^3", ("delta_3",), ".2%"),
+    ("outliers", ("outliers",), ".3%"),
+)
+_MISSING = {
+    "without_truth": "predicted without truth",
+    "without_prediction": "truth without prediction",
+    "without_mask": "truth without mask",
+}
+_MAX_NAMED = 5
+
+
+def evaluation_table(scores: Mapping[str, Any]) -> str:
+    """Depth against truth, a row per part of the pixels, in the units of KITTI's leaderboard; what
+    found no counterpart is counted, and named as far as there is room."""
+    num, density = scores["num_images"], scores["density"]
+    lines = [
+        f"{num:,} image{'s' if num != 1 else ''}: predicted {_percent(density['predicted'])} of "
+        f"the pixels, truth {_percent(density['truth'])}; outliers with fx "
+        f"{scores['focal_px']:g} px, baseline {scores['baseline_m']:g} m"
+    ]
+    for name, what in _MISSING.items():
+        if paths := scores[name]:
+            rest = f", ... and {len(paths) - _MAX_NAMED:,} more" if len(paths) > _MAX_NAMED else ""
+            lines.append(f"{what}: {len(paths):,}: {', '.join(paths[:_MAX_NAMED])}{rest}")
+    rows = {name: _in_mm(part) for name, part in scores["parts"].items() if part["num_pixels"]}
+    return "\n".join([*lines, _table(rows, _EVALUATION_COLUMNS)])
+
+
+def _in_mm(part: Mapping[str, Any]) -> dict[str, Any]:
+    metres = {name: part[f"{name}_m"] for name in ("mae", "rmse")}
+    return {**part, **{f"{n}_mm": None if m is None else 1000 * m for n, m in metres.items()}}
+
+
+def _solver_line(name: str, solver: Mapping[str, Any], other: str, num_pairs: int) -> str:
     line = (
-        f"adam: lowest energy after {row['steps_to_lowest']:.0f} steps, "
-        f"{row['seconds_to_lowest']:.2f} s"
+        f"{name}: {solver['steps']:.0f} steps in {solver['seconds']:.2f} s; lowest E "
+        f"{solver['lowest_energy']:.1f} after {solver['steps_to_lowest']:.0f}, "
+        f"{solver['seconds_to_lowest']:.2f} s"
     )
-    if "seconds_to_paper" in row:
+    if "pairs_as_low_as_other" in solver:
+        seconds = _written(solver["seconds_to_others_lowest"], ".2f s")
         line += (
-            f"; as low as paper ends after {_written(row['seconds_to_paper'], '.2f')} s, on "
-            f"{row['pairs_as_low_as_paper']} of {num_pairs} pairs"
+            f"; as low as {other}'s lowest after {seconds}, on "
+            f"{solver['pairs_as_low_as_other']} of {num_pairs} pairs"
         )
     return line
 

@@ -130,6 +130,22 @@ def simulate(options: argparse.Namespace) -> None:
     print(f"{len(frames)} frames; open them with --data {drive}")
 
 
+def export(options: argparse.Namespace) -> None:
+    """A finished run's depth maps with fewer pixels."""
+    from densify.cli.tables import export_summary
+    from densify.output import export_run
+
+    exported = export_run(
+        options.run,
+        options.min_confidence,
+        options.max_age_ms,
+        options.out,
+        options.overwrite,
+    )
+    print(export_summary(exported))
+    _print_paths(exported.paths)
+
+
 def bench_flow(options: argparse.Namespace) -> None:
     """Scene flow methods on the same pairs and windows."""
     config = resolve(options.config, options.overrides)
@@ -163,6 +179,27 @@ def bench_flow(options: argparse.Namespace) -> None:
             print(flow_table(measured) + "\n", flush=True)
     if options.out is not None:
         write_table(options.out, {"runs": runs, "config": as_mapping(config)})
+        _print_paths([options.out])
+
+
+def evaluate(options: argparse.Namespace) -> None:
+    """Depth maps against the truth."""
+    from densify import evaluation
+    from densify.bench.table_file import write_table
+    from densify.cli.point_files import check_new_file
+    from densify.cli.tables import evaluation_table
+    from densify.readers.depth_trees import pair_depth_files
+
+    if options.out is not None:
+        check_new_file(options.out, options.overwrite, ".json")
+    pairs = pair_depth_files(options.predicted, options.truth, options.mask, filled=options.filled)
+    given = {name: getattr(options, name) for name in ("focal_px", "baseline_m")}
+    stereo = {name: value for name, value in given.items() if value is not None}
+    with progress_on_stderr() as progress:
+        scores = evaluation.evaluate(pairs, **stereo, progress=progress)
+    print(evaluation_table(scores))
+    if options.out is not None:
+        write_table(options.out, scores)
         _print_paths([options.out])
 
 

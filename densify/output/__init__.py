@@ -5,17 +5,29 @@ their truth (`densify.readers.truth_files`).
 """
 
 from densify.output.cloud_laz import StoredCloud, read_cloud, write_cloud
-from densify.output.depth_png import read_depth_png, write_confidence_png, write_depth_png
+from densify.output.depth_png import (
+    read_depth_png,
+    read_mask_png,
+    write_age_png,
+    write_confidence_png,
+    write_depth_png,
+)
+from densify.output.export import Density, Export, export_run
 from densify.output.figure import draw_figure
 from densify.output.png import write_picture
 from densify.output.store import check_writable, write_comparison, write_result
 
 __all__ = [
+    "Density",
+    "Export",
     "StoredCloud",
     "check_writable",
     "draw_figure",
+    "export_run",
     "read_cloud",
     "read_depth_png",
+    "read_mask_png",
+    "write_age_png",
     "write_cloud",
     "write_comparison",
     "write_confidence_png",

@@ -2,6 +2,10 @@
 """The files of one key, ``OUT/000120/...``: results of ``run`` and tables of ``compare``, whole or
 not at all.
 
+``age/CAMERA.png`` holds, as 16 bit, milliseconds between the camera's exposure and the sweep that
+measured the pixel, plus 1; 0 is no depth, and 65535 says 65.5 s or more. It covers the pixels of
+``depth_filled``; filled ones have the age of the nearest measured pixel.
+
 Keys of metrics.json; compare.json holds those from ``frames`` on under ``methods`` by method, and
 data, config and versions as run.yaml::
 
@@ -11,7 +15,7 @@ data, config and versions as run.yaml::
     density     camera -> measured, filled: fraction of the pixels with a depth
     ghosts      `densify.scores.ghost_scores`: num_points, all, moving, static, by_distance
     depth       where there is truth: camera -> measured, filled -> all, moving, static -> the
-                fields of `densify.scores.depth_errors`
+                fields of `densify.depth_metrics.DepthErrors`
     held_out    camera -> the same fields as depth: the key densified from its neighbours alone
                 against its own returns; null for the key sweep alone
     baselines   the same from ``frames`` on for each simpler method on the same registration
@@ -25,7 +29,7 @@ import json
 import math
 import os
 import platform
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -38,11 +42,16 @@ import densify
 from densify.errors import InputError
 from densify.output.atomic import staged_folder, write_file
 from densify.output.cloud_laz import write_cloud
-from densify.output.depth_png import write_confidence_png, write_depth_png, write_flow_png
+from densify.output.depth_png import (
+    write_age_png,
+    write_confidence_png,
+    write_depth_png,
+    write_flow_png,
+)
 from densify.output.figure import draw_figure
 from densify.output.flow_npz import write_flow_files
 from densify.output.png import Picture, write_picture
-from densify.types import Result
+from densify.types import DepthMap, Result
 
 Verb = Literal["run", "compare"]
 
@@ -51,7 +60,7 @@ SCHEMA_VERSION = 1
 
 _OWNED: Mapping[Verb, tuple[str, ...]] = {
     "run": (
-        *("depth", "depth_filled", "confidence", "flow", "movers", "optical_flow"),
+        *("depth", "depth_filled", "confidence", "age", "flow", "movers", "optical_flow"),
         *("cloud.laz", "metrics.json", "figure.png", "run.yaml"),
     ),
     "compare": ("compare.json", "compare.png"),
@@ -69,7 +78,27 @@ def check_writable(out: Path, key: int, overwrite: bool = False, verb: Verb = "r
     out: the folder of ``--out``, which need not exist. Raises InputError if the files that ``verb``
     writes for ``key`` are there and not to be overwritten, or the place cannot be written to.
     """
-    folder = _key_folder(out, key)
+    _check_place(_key_folder(out, key), _OWNED[verb], out, overwrite)
+
+
+@contextmanager
+def writing(folder: Path, owned: Collection[str], out: Path, overwrite: bool) -> Iterator[Path]:
+    """A folder to write into that becomes ``folder`` if the block ends well, see `staged_folder`.
+
+    owned: entries that are written. out: what ``--out`` says, for messages. Raises InputError if
+    one of them is there and not to be overwritten, or the place cannot be written to.
+    """
+    _check_place(folder, owned, out, overwrite)
+    try:
+        with staged_folder(folder, owned) as staging:
+            yield staging
+    except OSError as error:
+        raise InputError(
+            f"--out {out}: cannot be written: {error.strerror or error}; nothing was kept"
+        ) from error
+
+
+def _check_place(folder: Path, owned: Collection[str], out: Path, overwrite: bool) -> None:
     place = folder
     while not os.path.lexists(place):
         place = place.parent
@@ -83,7 +112,7 @@ def check_writable(out: Path, key: int, overwrite: bool = False, verb: Verb = "r
                 f"--out {out}: no permission to write in {touched}; "
                 f"choose another one with --out DIR"
             )
-    present = [name for name in _OWNED[verb] if (folder / name).exists()]
+    present = [name for name in owned if (folder / name).exists()]
     if present and not overwrite:
         raise InputError(
             f"{folder}: {', '.join(present)} already there and kept; "
@@ -100,8 +129,8 @@ def write_result(
     data: str,
     overwrite: bool = False,
 ) -> list[Path]:
-    """Write one densified key as ``out/KEY/``: depth, depth_filled and confidence of each camera,
-    cloud.laz, metrics.json, figure.png and run.yaml.
+    """Write one densified key as ``out/KEY/``: depth, depth_filled, confidence and age of each
+    camera, cloud.laz, metrics.json, figure.png and run.yaml.
 
     images: camera to (H,W,3) RGB; a camera without one is drawn on black. config: the merged
     configuration, as plain mappings. data: the recording, as the user named it. overwrite: replace
@@ -112,14 +141,9 @@ def write_result(
     Returns the files written. Raises InputError if the place cannot be written to, or holds a
     result already.
     """
-    with _writing(out, result.key, overwrite, "run") as folder:
+    with writing(_key_folder(out, result.key), _OWNED["run"], out, overwrite) as folder:
         for name, depth in result.depth.items():
-            for product in ("depth", "depth_filled", "confidence"):
-                (folder / product).mkdir(exist_ok=True)
-            write_depth_png(folder / "depth" / f"{name}.png", depth.depth_m)
-            write_depth_png(folder / "depth_filled" / f"{name}.png", depth.filled_m)
-            path = folder / "confidence" / f"{name}.png"
-            write_confidence_png(path, depth.confidence, depth.filled_m)
+            _write_depth(folder, name, depth)
         write_cloud(folder / "cloud.laz", result.cloud)
         if result.flow is not None:
             write_flow_files(folder / "flow", result.flow)
@@ -172,7 +196,7 @@ def write_comparison(
         "config": config,
         "versions": _versions(),
     }
-    with _writing(out, key, overwrite, "compare") as folder:
+    with writing(_key_folder(out, key), _OWNED["compare"], out, overwrite) as folder:
         _write_json(folder / "compare.json", table)
         _write_figure(folder / "compare.png", results, images)
     return _written(out, key, "compare")
@@ -182,18 +206,6 @@ def _key_folder(out: Path, key: int) -> Path:
     return out / f"{key:06d}"
 
 
-@contextmanager
-def _writing(out: Path, key: int, overwrite: bool, verb: Verb) -> Iterator[Path]:
-    check_writable(out, key, overwrite, verb)
-    try:
-        with staged_folder(_key_folder(out, key), _OWNED[verb]) as folder:
-            yield folder
-    except OSError as error:
-        raise InputError(
-            f"--out {out}: cannot be written: {error.strerror or error}; nothing was kept"
-        ) from error
-
-
 def _written(out: Path, key: int, verb: Verb) -> list[Path]:
     folder = _key_folder(out, key)
     files: list[Path] = []
@@ -201,6 +213,18 @@ def _written(out: Path, key: int, verb: Verb) -> list[Path]:
         entry = folder / name
         files += [entry] if entry.is_file() else sorted(f for f in entry.rglob("*") if f.is_file())
     return files
+
+
+def _write_depth(folder: Path, camera: str, depth: DepthMap) -> None:
+    if depth.age_s is None:
+        raise ValueError(f"depth map of {camera}: expected ages, see densify.stages.age")
+    for product in ("depth", "depth_filled", "confidence", "age"):
+        (folder / product).mkdir(exist_ok=True)
+    name = f"{camera}.png"
+    write_depth_png(folder / "depth" / name, depth.depth_m)
+    write_depth_png(folder / "depth_filled" / name, depth.filled_m)
+    write_confidence_png(folder / "confidence" / name, depth.confidence, depth.filled_m)
+    write_age_png(folder / "age" / name, depth.age_s, depth.filled_m)
 
 
 def _scores(result: Result) -> dict[str, Any]:

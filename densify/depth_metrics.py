@@ -1,0 +1,210 @@
+# SPDX-License-Identifier: MIT
+"""How good depth is against the truth: numbers of pixel lists or whole maps.
+
+Definitions are those of KITTI's depth development kit (``evaluate_depth.cpp``; Uhrig et al.,
+"Sparsity Invariant CNNs", 3DV 2017) where it has them, with one difference: the kit fills holes of
+a prediction before it scores, here a missing pixel costs coverage and is no error.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, fields
+from typing import Any
+
+import numpy as np
+from scipy import ndimage
+
+from densify.errors import InputError
+from densify.types import Bool, Camera, DepthMap, Float, Float32
+
+KITTI_BASELINE_M = 0.54
+_OUTLIER_PX = 3.0
+_OUTLIER_FRACTION = 0.05
+_DELTA = 1.25
+_RANGES_M = (0, 10, 20, 30, 50, 80)
+_EDGE_PX = 3
+
+
+@dataclass(frozen=True)
+class DepthErrors:
+    """Depth against truth; what is undefined (an error over no pixels) is None, never NaN.
+
+    num_pixels: with a truth. num_compared: of those, with a predicted depth too; all the errors are
+    over these. coverage: num_compared / num_pixels.
+
+    With z the predicted and t the true depth, from the kit: mae_m, rmse_m: mean absolute and root
+    mean square of z - t (its web table shows mm); imae_per_km, irmse_per_km: the same of
+    1/z - 1/t, in 1/km; abs_rel: mean of |z - t| / t; sq_rel: mean of (z - t)² / t² (others divide
+    by t once).
+
+    delta_1, delta_2, delta_3: fraction with max(z/t, t/z) < 1.25, 1.25², 1.25³ (Eigen et al.,
+    "Depth Map Prediction from a Single Image using a Multi-Scale Deep Network", NIPS 2014).
+    outliers: fraction that is wrong by the rule of KITTI's 2015 stereo benchmark (Menze and Geiger,
+    "Object Scene Flow for Autonomous Vehicles", CVPR 2015). Fractions are 0 to 1.
+    """
+
+    num_pixels: int
+    num_compared: int
+    coverage: float | None
+    mae_m: float | None
+    rmse_m: float | None
+    imae_per_km: float | None
+    irmse_per_km: float | None
+    abs_rel: float | None
+    sq_rel: float | None
+    delta_1: float | None
+    delta_2: float | None
+    delta_3: float | None
+    outliers: float | None
+
+
+def depth_errors(
+    predicted_m: Float | Float32,
+    truth_m: Float | Float32,
+    mask: Bool | None = None,
+    *,
+    focal_px: float,
+    baseline_m: float = KITTI_BASELINE_M,
+) -> DepthErrors:
+    """Errors of depths where truth exists and ``mask`` (all if None) is True.
+
+    predicted_m, truth_m: camera z in metres, 0 none; maps (H,W) or lists of pixels (N,). A depth is
+    an outlier when its disparity d = focal_px · baseline_m / z is off by more than 3 px *and* by
+    more than 5 % of the true one. ``focal_px`` is the camera's fx; the default baseline is KITTI's,
+    so that numbers compare. Raises InputError if the shapes differ.
+    """
+    _check_shapes(predicted_m, truth=truth_m, mask=mask)
+    known = truth_m > 0 if mask is None else (truth_m > 0) & mask
+    compared = known & (predicted_m > 0)
+    num_pixels, num_compared = int(known.sum()), int(compared.sum())
+    z, t = predicted_m[compared].astype(float), truth_m[compared].astype(float)
+    off_m = np.abs(z - t)
+    off_per_km = np.abs(1000 / z - 1000 / t)
+    ratio = np.maximum(z / t, t / z)
+    disparity_m_px = focal_px * baseline_m
+    return DepthErrors(
+        num_pixels=num_pixels,
+        num_compared=num_compared,
+        coverage=num_compared / num_pixels if num_pixels else None,
+        mae_m=_mean(off_m),
+        rmse_m=_root_mean_square(off_m),
+        imae_per_km=_mean(off_per_km),
+        irmse_per_km=_root_mean_square(off_per_km),
+        abs_rel=_mean(off_m / t),
+        sq_rel=_mean((off_m / t) ** 2),
+        delta_1=_mean(ratio < _DELTA),
+        delta_2=_mean(ratio < _DELTA**2),
+        delta_3=_mean(ratio < _DELTA**3),
+        outliers=_mean(_is_outlier(disparity_m_px / z, disparity_m_px / t)),
+    )
+
+
+def errors_by_part(
+    predicted_m: Float32,
+    truth_m: Float32,
+    moving: Bool | None = None,
+    *,
+    focal_px: float,
+    baseline_m: float = KITTI_BASELINE_M,
+) -> dict[str, DepthErrors]:
+    """`depth_errors` of ``all`` pixels, by true depth (``0-10 m`` … ``over 80 m``, the nearer end
+    included), on `depth_edges` (``edge``) and off them (``not edge``), and, with a mask of what
+    moves, ``moving`` and ``static``.
+
+    predicted_m, truth_m: (H,W) metres, 0 none. moving: (H,W). Raises InputError if shapes differ.
+    """
+    _check_shapes(predicted_m, truth=truth_m, mask=moving)
+    known = truth_m > 0
+    z, t = predicted_m[known], truth_m[known]
+    parts: dict[str, Bool | None] = {"all": None}
+    for near_m, far_m in zip(_RANGES_M, (*_RANGES_M[1:], math.inf), strict=True):
+        name = f"over {near_m} m" if math.isinf(far_m) else f"{near_m}-{far_m} m"
+        parts[name] = (t >= near_m) & (t < far_m)
+    edge = depth_edges(truth_m, focal_px=focal_px, baseline_m=baseline_m)[known]
+    parts |= {"edge": edge, "not edge": ~edge}
+    if moving is not None:
+        parts |= {"moving": moving[known], "static": ~moving[known]}
+    return {
+        name: depth_errors(z, t, mask, focal_px=focal_px, baseline_m=baseline_m)
+        for name, mask in parts.items()
+    }
+
+
+def depth_edges(truth_m: Float32, *, focal_px: float, baseline_m: float = KITTI_BASELINE_M) -> Bool:
+    """(H,W) bool: pixels where depth jumps, by no knob but the outlier rule: with a true depth
+    within 3 px (a 7 × 7 window) that would be an outlier if it stood here.
+
+    truth_m: (H,W) metres, 0 none; never True where there is none. The ground is no edge: seen from
+    1.65 m up, its disparity grows by 0.54/1.65 px from row to row.
+    """
+    known = truth_m > 0
+    disparity_px = np.zeros(truth_m.shape)
+    np.divide(focal_px * baseline_m, truth_m, out=disparity_px, where=known)
+    size = 2 * _EDGE_PX + 1
+    largest = ndimage.maximum_filter(disparity_px, size, mode="constant", cval=0.0)
+    holes_out = np.where(known, disparity_px, math.inf)
+    smallest = ndimage.minimum_filter(holes_out, size, mode="constant", cval=math.inf)
+    edge = np.zeros(truth_m.shape, bool)
+    here = disparity_px[known]
+    edge[known] = _is_outlier(largest[known], here) | _is_outlier(smallest[known], here)
+    return edge
+
+
+def mean_errors(images: Sequence[DepthErrors]) -> DepthErrors:
+    """Of several images: the mean of each image's value, as the kit has it, over the images where
+    it is defined, whatever their number of pixels; counts are added up."""
+    means: dict[str, Any] = {}
+    for field in fields(DepthErrors):
+        values = [value for image in images if (value := getattr(image, field.name)) is not None]
+        counted = field.name.startswith("num_")
+        means[field.name] = sum(values) if counted else _mean(np.array(values))
+    return DepthErrors(**means)
+
+
+def image_density(depth_m: Float32) -> float:
+    """Fraction (0 to 1) of all the image's pixels that have a depth."""
+    return float(np.mean(depth_m > 0)) if depth_m.size else 0.0
+
+
+def depth_scores(
+    depth: DepthMap, truth_depth_m: Float32, moving_mask: Bool, camera: Camera
+) -> dict[str, dict[str, dict[str, Any]]]:
+    """`depth_errors` as ``scores["measured"|"filled"]["all"|"moving"|"static"]``, plain numbers
+    ready for JSON.
+
+    truth_depth_m: (H,W) metres, 0 none. moving_mask: (H,W), True where a moving thing shows.
+    Measured and filled stay apart: a filled pixel costs little and says less.
+    """
+    masks = {"all": None, "moving": moving_mask, "static": ~moving_mask}
+    return {
+        product: {
+            part: asdict(depth_errors(image, truth_depth_m, mask, focal_px=camera.K[0, 0]))
+            for part, mask in masks.items()
+        }
+        for product, image in (("measured", depth.depth_m), ("filled", depth.filled_m))
+    }
+
+
+def _is_outlier(disparity_px: Float, true_px: Float) -> Bool:
+    off_px = np.abs(disparity_px - true_px)
+    wrong: Bool = (off_px > _OUTLIER_PX) & (off_px > _OUTLIER_FRACTION * true_px)
+    return wrong
+
+
+def _check_shapes(predicted_m: np.ndarray, **others: np.ndarray | None) -> None:
+    for name, image in others.items():
+        if image is not None and image.shape != predicted_m.shape:
+            raise InputError(
+                f"depth errors: {name}: expected the depth map's shape {predicted_m.shape}, got "
+                f"{image.shape}; give maps of the same camera"
+            )
+
+
+def _mean(values: np.ndarray) -> float | None:
+    return float(np.mean(values)) if len(values) else None
+
+
+def _root_mean_square(values: Float) -> float | None:
+    return float(np.sqrt(np.mean(values**2))) if len(values) else None

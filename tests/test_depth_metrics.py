@@ -1,0 +1,273 @@
+# SPDX-License-Identifier: MIT
+"""Depth scores against numbers worked out by hand and against slow twins."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import asdict, fields
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from densify.depth_metrics import (
+    DepthErrors,
+    depth_edges,
+    depth_errors,
+    depth_scores,
+    errors_by_part,
+    image_density,
+    mean_errors,
+)
+from densify.errors import InputError
+from densify.types import Camera, DepthMap
+
+KEY = 7
+
+
+def image(values):
+    return np.array([values], np.float32)
+
+
+def test_depth_errors_by_hand():
+    # f B = 700 * 0.5 = 350
+    truth = image([10.0, 10.0, 50.0, 50.0, 5.0, 0.0, 20.0])
+    found = image([11.0, 10.5, 52.0, 80.0, 5.0, 9.0, 0.0])
+    # disparities: 35 -> 31.8 (3.2 px, 9 %: wrong); 35 -> 33.3 (1.7 px); 7 -> 6.73;
+    # 7 -> 4.375 (2.6 px, 38 %: not wrong, both limits count); exact; no truth; not covered
+    errors = depth_errors(found, truth, focal_px=700.0, baseline_m=0.5)
+    assert errors.num_pixels == 6 and errors.num_compared == 5
+    assert errors.coverage == pytest.approx(5 / 6)
+    assert errors.mae_m == pytest.approx((1 + 0.5 + 2 + 30 + 0) / 5)
+    assert errors.rmse_m == pytest.approx(np.sqrt((1 + 0.25 + 4 + 900) / 5))
+    assert errors.outliers == pytest.approx(1 / 5)
+
+
+def test_outliers_need_five_percent_too():
+    # f B = 3500: d = 700 -> 696.5 at 5.025 m is 3.5 px but half a percent
+    truth, found = image([5.0]), image([5.025])
+    assert depth_errors(found, truth, focal_px=3500.0, baseline_m=1.0).outliers == 0
+    # d = 35, 38.1 and 31.9: 3.1 px and 9 %; 37.9: 2.9 px
+    truth, found = image([100.0] * 3), image([3500 / 38.1, 3500 / 31.9, 3500 / 37.9])
+    assert depth_errors(found, truth, focal_px=3500.0, baseline_m=1.0).outliers == pytest.approx(
+        2 / 3
+    )
+
+
+def test_five_percent_are_of_the_true_disparity():
+    # d = 100: 105.1 is 5.1 px off, more than 5 % of 100 and less than 5 % of itself
+    errors = depth_errors(image([1000 / 105.1]), image([10.0]), focal_px=1000.0, baseline_m=1.0)
+    assert errors.outliers == 1
+
+
+def test_kittis_baseline_is_the_default():
+    truth, found = image([10.0]), image([11.0])
+    # 100 * 0.54 / 10 = 5.4 px: 0.49 px off
+    assert depth_errors(found, truth, focal_px=100.0).outliers == 0
+    # 620 * 0.54 = 334.8: 3.04 px off; 600 * 0.54 = 324: 2.95 px off
+    assert depth_errors(found, truth, focal_px=620.0).outliers == 1
+    assert depth_errors(found, truth, focal_px=600.0).outliers == 0
+
+
+def test_nothing_to_compare_is_none_not_nan():
+    empty = np.zeros((2, 3), np.float32)
+    errors = depth_errors(empty, empty, focal_px=700.0)
+    assert (errors.num_pixels, errors.coverage, errors.mae_m) == (0, None, None)
+    errors = depth_errors(empty, empty + 1, focal_px=700.0)
+    assert (errors.num_pixels, errors.coverage, errors.mae_m, errors.outliers) == (6, 0, None, None)
+    assert errors.rmse_m is None
+
+
+def test_depth_errors_names_a_wrong_shape():
+    a, b = np.ones((2, 3), np.float32), np.ones((3, 2), np.float32)
+    with pytest.raises(InputError, match=r"truth: expected .* \(2, 3\), got \(3, 2\)"):
+        depth_errors(a, b, focal_px=700.0)
+    with pytest.raises(InputError, match="mask"):
+        depth_errors(a, a, b > 0, focal_px=700.0)
+
+
+def test_image_density():
+    assert image_density(image([0, 1, 2, 0])) == 0.5
+    assert image_density(image([])) == 0
+
+
+def test_depth_scores_split_measured_filled_moving_static():
+    truth = image([10.0, 10.0, 10.0, 10.0])
+    moving = np.array([[True, True, False, False]])
+    depth = DepthMap(
+        camera="cam",
+        depth_m=image([12.0, 0, 10.0, 0]),
+        filled_m=image([12.0, 14.0, 10.0, 0]),
+        confidence=image([1, 0.5, 1, 0]),
+        frame=np.array([[KEY, -1, KEY, -1]], np.int32),
+    )
+    camera = Camera("cam", 4, 1, np.diag([700.0, 700, 1]), np.eye(4))
+    scores = depth_scores(depth, truth, moving, camera)
+    assert json.loads(json.dumps(scores, allow_nan=False)) == scores
+    mae = {(p, m): scores[p][m]["mae_m"] for p in scores for m in scores[p]}
+    assert mae == {
+        ("measured", "all"): 1.0,
+        ("measured", "moving"): 2.0,
+        ("measured", "static"): 0.0,
+        ("filled", "all"): 2.0,
+        ("filled", "moving"): 3.0,
+        ("filled", "static"): 0.0,
+    }
+    assert scores["measured"]["moving"]["coverage"] == 0.5
+    assert scores["filled"]["moving"]["coverage"] == 1.0
+    assert scores["filled"]["moving"]["outliers"] == 1.0
+    nothing = depth_scores(depth, truth, moving & False, camera)["filled"]["moving"]
+    assert nothing["num_pixels"] == 0 and nothing["coverage"] is None
+
+
+def test_kittis_other_errors_by_hand():
+    # 1/z: 100 - 125, 50 - 40, 20 - 10 per km; ratios 1.25, 1.25 and 2: not below 1.25
+    found, truth = image([8.0, 25.0, 100.0]), image([10.0, 20.0, 50.0])
+    errors = depth_errors(found, truth, focal_px=700.0)
+    assert errors.imae_per_km == pytest.approx((25 + 10 + 10) / 3)
+    assert errors.irmse_per_km == pytest.approx(np.sqrt((625 + 100 + 100) / 3))
+    assert errors.abs_rel == pytest.approx((0.2 + 0.25 + 1) / 3)
+    assert errors.sq_rel == pytest.approx((0.04 + 0.0625 + 1) / 3)
+    assert errors.delta_1 == 0
+    assert errors.delta_2 == errors.delta_3 == pytest.approx(2 / 3)
+
+
+depth_lists = st.lists(
+    st.tuples(*[st.just(0.0) | st.floats(0.5, 200.0, width=32)] * 2), min_size=1, max_size=30
+)
+
+
+def slow_errors(pixels, fb):
+    """The kit's loop, pixel by pixel, over (predicted, true) that both exist."""
+    sums = dict.fromkeys([f.name for f in fields(DepthErrors)][3:], 0.0)
+    for z, t in pixels:
+        inverse_per_km = abs(1 / t - 1 / z) * 1000
+        off_px = abs(fb / z - fb / t)
+        sums["mae_m"] += abs(t - z)
+        sums["rmse_m"] += (t - z) ** 2
+        sums["imae_per_km"] += inverse_per_km
+        sums["irmse_per_km"] += inverse_per_km**2
+        sums["abs_rel"] += abs(t - z) / t
+        sums["sq_rel"] += (t - z) ** 2 / (t * t)
+        for n in (1, 2, 3):
+            sums[f"delta_{n}"] += max(z / t, t / z) < 1.25**n
+        sums["outliers"] += off_px > 3 and off_px > 0.05 * fb / t
+    means = {name: total / len(pixels) for name, total in sums.items()}
+    for name in ("rmse_m", "irmse_per_km"):
+        means[name] = math.sqrt(means[name])
+    return means
+
+
+@given(depth_lists)
+@settings(deadline=None, max_examples=60)
+def test_lists_and_maps_agree_with_the_slow_twin(pixels):
+    found, truth = np.array(pixels, np.float32).T
+    errors = depth_errors(found, truth, focal_px=700.0, baseline_m=0.5)
+    assert errors == depth_errors(found[None], truth[None], focal_px=700.0, baseline_m=0.5)
+    both = [(z, t) for z, t in pixels if z > 0 and t > 0]
+    assert errors.num_pixels == sum(t > 0 for _, t in pixels)
+    assert errors.num_compared == len(both)
+    values = asdict(errors)
+    if both:
+        for name, expected in slow_errors(both, 350.0).items():
+            assert values[name] == pytest.approx(expected, rel=1e-9, abs=1e-12), name
+    else:
+        assert all(value is None for value in list(values.values())[3:])
+
+
+def test_a_missing_pixel_costs_coverage_and_no_error():
+    truth, found = image([10.0, 20, 30, 40]), image([11.0, 20, 33, 40])
+    whole = depth_errors(found, truth, focal_px=700.0)
+    holes = depth_errors(found * [1, 1, 0, 1], truth, focal_px=700.0)
+    rest = depth_errors(found[:, [0, 1, 3]], truth[:, [0, 1, 3]], focal_px=700.0)
+    assert whole.coverage == 1 and holes.coverage == 0.75
+    assert list(asdict(holes).values())[3:] == list(asdict(rest).values())[3:]
+
+
+def slow_edges(truth, fb, reach=3):
+    edges = np.zeros(truth.shape, bool)
+    height, width = truth.shape
+    for v, u in np.argwhere(truth > 0):
+        d = fb / truth[v, u]
+        for row in range(max(0, v - reach), min(height, v + reach + 1)):
+            for column in range(max(0, u - reach), min(width, u + reach + 1)):
+                if truth[row, column] > 0:
+                    off_px = abs(fb / truth[row, column] - d)
+                    edges[v, u] |= off_px > 3 and off_px > 0.05 * d
+    return edges
+
+
+@pytest.mark.parametrize("density", [1.0, 0.3])
+def test_depth_edges_agree_with_the_slow_twin(density):
+    rng = np.random.default_rng(3)
+    truth = np.full((30, 40), 30.0, np.float32)
+    truth[8:20, 10:25] = 12.0
+    truth[25:, :] = 4.0
+    truth *= rng.uniform(0.97, 1.03, truth.shape)
+    truth[rng.random(truth.shape) > density] = 0
+    edges = depth_edges(truth, focal_px=700.0, baseline_m=0.5)
+    assert np.array_equal(edges, slow_edges(truth.astype(float), 350.0))
+    assert 0.1 < edges[truth > 0].mean() < 0.9
+
+
+def test_an_edge_is_where_depth_jumps_and_never_the_ground():
+    # 350 / 10 = 35 px against 350 / 20 = 17.5 px: three columns on either side
+    step = np.full((9, 20), 10.0, np.float32)
+    step[:, 10:] = 20.0
+    edges = depth_edges(step, focal_px=700.0, baseline_m=0.5)
+    near_the_step = (np.arange(20) >= 7) & (np.arange(20) <= 12)
+    assert np.array_equal(edges, np.tile(near_the_step, (9, 1)))
+    rows = np.arange(1, 200)[:, None]
+    ground = np.repeat(721.5 * 1.65 / rows, 30, axis=1).astype(np.float32)
+    assert not depth_edges(ground, focal_px=721.5).any()
+    assert not depth_edges(np.zeros((4, 5), np.float32), focal_px=721.5).any()
+
+
+def test_parts_divide_the_pixels():
+    rng = np.random.default_rng(4)
+    truth = np.where(rng.random((40, 50)) < 0.4, rng.uniform(1, 120, (40, 50)), 0)
+    truth[0, :6] = (10.0, 20, 30, 50, 80, 9.99)
+    truth = truth.astype(np.float32)
+    found = (truth * rng.uniform(0.9, 1.1, truth.shape) * (rng.random(truth.shape) < 0.7)).astype(
+        np.float32
+    )
+    moving = rng.random(truth.shape) < 0.2
+    parts = errors_by_part(found, truth, moving, focal_px=721.5)
+    ranges = ("0-10 m", "10-20 m", "20-30 m", "30-50 m", "50-80 m", "over 80 m")
+    assert list(parts) == ["all", *ranges, "edge", "not edge", "moving", "static"]
+    assert parts["all"] == depth_errors(found, truth, focal_px=721.5)
+    middle = depth_errors(found, truth, (truth >= 10) & (truth < 20), focal_px=721.5)
+    assert parts["10-20 m"] == middle
+    assert parts["moving"] == depth_errors(found, truth, moving, focal_px=721.5)
+    edges = depth_edges(truth, focal_px=721.5)
+    assert parts["edge"] == depth_errors(found, truth, edges, focal_px=721.5)
+    for split in (ranges, ("edge", "not edge"), ("moving", "static")):
+        for count in ("num_pixels", "num_compared"):
+            assert sum(getattr(parts[name], count) for name in split) == getattr(
+                parts["all"], count
+            )
+    assert "moving" not in errors_by_part(found, truth, focal_px=721.5)
+
+
+def test_parts_name_a_wrong_shape():
+    a, b = np.ones((2, 3), np.float32), np.ones((3, 2), np.float32)
+    with pytest.raises(InputError, match="truth"):
+        errors_by_part(a, b, focal_px=700.0)
+    with pytest.raises(InputError, match="mask"):
+        errors_by_part(a, a, b > 0, focal_px=700.0)
+
+
+def test_means_are_over_images_not_pixels():
+    few = depth_errors(image([12.0]), image([10.0]), focal_px=700.0)
+    many = depth_errors(image([10.0] * 9 + [0.0]), image([10.0] * 10), focal_px=700.0)
+    empty = depth_errors(image([0.0]), image([10.0]), focal_px=700.0)
+    no_truth = depth_errors(image([5.0]), image([0.0]), focal_px=700.0)
+    mean = mean_errors([few, many, empty, no_truth])
+    assert (mean.num_pixels, mean.num_compared) == (12, 10)
+    assert mean.mae_m == pytest.approx(1.0) and mean.rmse_m == pytest.approx(1.0)
+    assert mean.outliers == pytest.approx(0.5) and mean.delta_1 == 1
+    assert mean.coverage == pytest.approx((1 + 0.9 + 0) / 3)
+    assert mean_errors([few]) == few
+    assert mean_errors([empty]) == empty

@@ -1,0 +1,343 @@
+# SPDX-License-Identifier: MIT
+"""Depth maps on disk against the truth on disk: which belong together, and what the verb says."""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import asdict
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from densify.cli import main
+from densify.depth_metrics import depth_errors
+from densify.errors import InputError
+from densify.evaluation import evaluate
+from densify.output import read_depth_png, read_mask_png, write_depth_png
+from densify.readers.depth_trees import DepthPair, pair_depth_files
+
+DRIVE, OTHER_DRIVE = "2011_09_26_drive_0013_sync", "2011_09_28_drive_0002_sync"
+
+
+def put(path: Path, *depths_m: float) -> Path:
+    """A map of one row."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_depth_png(path, np.array([depths_m or (10.0, 20.0)], np.float32))
+    return path
+
+
+def put_mask(path: Path, values: np.ndarray) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    assert cv2.imwrite(str(path), values)
+    return path
+
+
+def official(root: Path, frame: int, drive: str = DRIVE, camera: str = "image_02") -> Path:
+    return root / drive / "proj_depth" / "groundtruth" / camera / f"{frame:010d}.png"
+
+
+def own(out: Path, frame: int, product: str = "depth", camera: str = "image_02") -> Path:
+    return out / f"{frame:06d}" / product / f"{camera}.png"
+
+
+def selected(root: Path, frame: int, product: str, drive: str = DRIVE) -> Path:
+    return root / product / f"{drive}_{product}_{frame:010d}_image_02.png"
+
+
+def refusal(*arguments: object, **options: bool) -> str:
+    with pytest.raises(InputError) as caught:
+        pair_depth_files(*arguments, **options)  # type: ignore[arg-type]
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+# --- which belong together ------------------------------------------------------------------------
+
+
+def test_two_files_are_a_pair_whatever_their_names(tmp_path: Path) -> None:
+    a, b, mask = put(tmp_path / "a.png"), put(official(tmp_path, 5)), put(tmp_path / "m.png")
+    assert pair_depth_files(a, b).pairs == (DepthPair(a, b),)
+    assert pair_depth_files(a, b, mask).pairs == (DepthPair(a, b, mask),)
+
+
+@pytest.mark.parametrize("predicted_layout", ["official", "own", "plain", "selected", "drive/own"])
+@pytest.mark.parametrize("truth_layout", ["official", "plain", "selected"])
+def test_layouts_pair_by_frame(tmp_path: Path, predicted_layout: str, truth_layout: str) -> None:
+    def path(side: str, layout: str, frame: int) -> Path:
+        root = tmp_path / side
+        return {
+            "official": official(root, frame),
+            "own": own(root, frame),
+            "drive/own": own(root / DRIVE, frame),
+            "plain": root / "image_02" / f"{frame:010d}.png",
+            "selected": selected(root, frame, "groundtruth_depth"),
+        }[layout]
+
+    found = {f: put(path("predicted", predicted_layout, f)) for f in (5, 120, 7)}
+    true = {f: put(path("truth", truth_layout, f)) for f in (120, 5, 9)}
+    pairs = pair_depth_files(tmp_path / "predicted", tmp_path / "truth")
+    assert pairs.pairs == (DepthPair(found[5], true[5]), DepthPair(found[120], true[120]))
+    assert (pairs.without_truth, pairs.without_prediction) == ((found[7],), (true[9],))
+    assert pairs.without_mask == ()
+
+
+def test_drive_and_camera_tell_files_apart_where_both_sides_say_them(tmp_path: Path) -> None:
+    places = [(d, c) for d in (DRIVE, OTHER_DRIVE) for c in ("image_02", "image_03")]
+    true = {place: put(official(tmp_path / "t", 5, *place)) for place in places}
+    found = {(d, c): put(own(tmp_path / "p" / d, 5, camera=c)) for d, c in places}
+    pairs = pair_depth_files(tmp_path / "p", tmp_path / "t").pairs
+    assert {(p.predicted, p.truth) for p in pairs} == {(found[k], true[k]) for k in places}
+    # A run of one recording says no drive: two drives of truth are ambiguous, one is not.
+    put(own(tmp_path / "run", 5))
+    line = refusal(tmp_path / "run", tmp_path / "t")
+    assert "both frame 5 camera image_02" in line and "one drive" in line
+    assert len(pair_depth_files(tmp_path / "run", tmp_path / "t" / DRIVE).pairs) == 1
+
+
+def test_equal_names_pair_in_plain_folders(tmp_path: Path) -> None:
+    for side, names in (("p", ("a", "left_5", "0007")), ("t", ("a", "right_5", "7"))):
+        for name in names:
+            put(tmp_path / side / f"{name}.png")
+    pairs = pair_depth_files(tmp_path / "p", tmp_path / "t")
+    assert [(p.predicted.stem, p.truth.stem) for p in pairs.pairs] == [("0007", "7"), ("a", "a")]
+    assert [path.stem for path in pairs.without_truth] == ["left_5"]
+    assert [path.stem for path in pairs.without_prediction] == ["right_5"]
+
+
+def test_of_our_output_one_product_and_nothing_beside_it(tmp_path: Path) -> None:
+    truth = put(tmp_path / "t" / "120.png")
+    for product in ("depth", "depth_filled", "confidence"):
+        put(own(tmp_path / "out", 120, product))
+    put(tmp_path / "out" / "000120" / "figure.png")
+    put(tmp_path / "out" / ".000120.99.tmp" / "000121" / "depth" / "image_02.png")
+    for filled, product in ((False, "depth"), (True, "depth_filled")):
+        pairs = pair_depth_files(tmp_path / "out", truth.parent, filled=filled)
+        assert pairs.pairs == (DepthPair(own(tmp_path / "out", 120, product), truth),)
+        assert pairs.without_truth == ()
+    only_filled = own(tmp_path / "out", 120, "depth_filled").parent
+    assert len(pair_depth_files(only_filled, truth.parent).pairs) == 1
+    assert "--filled" in refusal(truth.parent, truth.parent, filled=True)
+    both = pair_depth_files(tmp_path / "out", tmp_path / "out", filled=True).pairs
+    filled_map, depth = (own(tmp_path / "out", 120, p) for p in ("depth_filled", "depth"))
+    assert both == (DepthPair(filled_map, depth),)
+
+
+def test_the_ground_truth_of_a_whole_kitti_tree(tmp_path: Path) -> None:
+    truth = put(official(tmp_path / "t", 5))
+    put(tmp_path / "t" / DRIVE / "proj_depth" / "velodyne_raw" / "image_02" / "0000000005.png")
+    put(tmp_path / "t" / DRIVE / "image_02" / "data" / "0000000005.png")  # the photograph
+    found = put(own(tmp_path / "out", 5))
+    pairs = pair_depth_files(tmp_path / "out", tmp_path / "t")
+    assert pairs == type(pairs)((DepthPair(found, truth),))
+    assert "velodyne_raw" in refusal(tmp_path / "t", tmp_path / "t")
+
+
+def test_masks_pair_too_and_may_be_missing(tmp_path: Path) -> None:
+    for frame in (5, 6):
+        put(own(tmp_path / "out", frame))
+    true = [put(official(tmp_path / "t", frame)) for frame in (5, 6)]
+    mask = put(tmp_path / "m" / "0000000005.png")
+    pairs = pair_depth_files(tmp_path / "out", tmp_path / "t", tmp_path / "m")
+    assert [pair.mask for pair in pairs.pairs] == [mask, None]
+    assert pairs.without_mask == (true[1],)
+    assert "folder" in refusal(tmp_path / "out", tmp_path / "t", mask)
+    assert "PNG file" in refusal(true[0], true[1], tmp_path / "m")
+
+
+def test_what_cannot_be_paired_is_refused(tmp_path: Path) -> None:
+    truth, other = put(tmp_path / "t" / "5.png"), put(tmp_path / "p" / "6.png")
+    (tmp_path / "empty").mkdir()
+    line = refusal(other.parent, truth.parent)
+    assert line.startswith("no pair: ") and "frame 6" in line and "frame 5" in line
+    assert "holds no PNG" in refusal(tmp_path / "empty", truth)
+    assert "no such file" in refusal(other.parent, tmp_path / "nowhere")
+    assert refusal(other, truth.parent).startswith("no pair")
+
+
+# --- scores ---------------------------------------------------------------------------------------
+
+
+def test_scores_are_means_over_the_images(tmp_path: Path) -> None:
+    put(tmp_path / "p" / "1.png", 10.0, 22.0, 0.0, 5.0)
+    put(tmp_path / "t" / "1.png", 10.0, 20.0, 30.0, 0.0)
+    put(tmp_path / "p" / "2.png", 14.0, 0.0)
+    put(tmp_path / "t" / "2.png", 10.0, 0.0)
+    put_mask(tmp_path / "m" / "1.png", np.array([[0, 1, 255, 1]], np.uint8))
+    places = (tmp_path / side for side in "ptm")
+    scores = evaluate(pair_depth_files(*places), focal_px=700.0, baseline_m=0.5)
+    assert json.loads(json.dumps(scores, allow_nan=False)) == scores
+    assert scores["num_images"] == 2
+    assert scores["density"] == {"predicted": (0.75 + 0.5) / 2, "truth": (0.75 + 0.5) / 2}
+    everything = scores["parts"]["all"]
+    assert (everything["num_pixels"], everything["num_compared"]) == (4, 3)
+    assert everything["mae_m"] == pytest.approx((1 + 4) / 2)
+    assert everything["coverage"] == pytest.approx((2 / 3 + 1) / 2)
+    # 35 -> 25 px is wrong, 17.5 -> 15.9 is not
+    assert everything["outliers"] == pytest.approx(0.5)
+    moving, static = scores["parts"]["moving"], scores["parts"]["static"]
+    assert (moving["num_images"], moving["num_pixels"], moving["mae_m"]) == (1, 2, 2.0)
+    assert (static["num_images"], static["num_pixels"], static["mae_m"]) == (1, 1, 0.0)
+    assert scores["parts"]["over 80 m"]["num_images"] == 0
+    assert scores["parts"]["over 80 m"]["mae_m"] is None
+    first = scores["images"][0]
+    errors = depth_errors(
+        read_depth_png(tmp_path / "p" / "1.png"),
+        read_depth_png(tmp_path / "t" / "1.png"),
+        focal_px=700.0,
+        baseline_m=0.5,
+    )
+    assert {name: first[name] for name in asdict(errors)} == asdict(errors)
+    assert first["mask"] is not None and scores["images"][1]["mask"] is None
+    assert scores["without_mask"] == [str(tmp_path / "t" / "2.png")]
+
+
+def test_maps_of_another_size_are_refused(tmp_path: Path) -> None:
+    a, b = put(tmp_path / "a.png", 1.0, 2.0), put(tmp_path / "b.png", 1.0, 2.0, 3.0)
+    with pytest.raises(InputError, match=r"a\.png: got 2 x 1 px, expected 3 x 1, .*b\.png"):
+        evaluate(pair_depth_files(a, b))
+    mask = put_mask(tmp_path / "m.png", np.zeros((1, 3), np.uint8))
+    with pytest.raises(InputError, match=r"m\.png: got 3 x 1 px, expected 2 x 1"):
+        evaluate(pair_depth_files(a, a, mask))
+
+
+def test_masks_of_every_kind(tmp_path: Path) -> None:
+    expected = np.array([[False, True, True]])
+    gray = np.array([[0, 1, 255]])
+    colour = np.array([[[0, 0, 0], [0, 0, 3], [9, 0, 0]]], np.uint8)
+    opaque = np.concatenate([colour, np.full((1, 3, 1), 255, np.uint8)], axis=2)
+    for image in (gray.astype(np.uint8), gray.astype(np.uint16), colour, opaque):
+        assert np.array_equal(read_mask_png(put_mask(tmp_path / "m.png", image)), expected)
+    (tmp_path / "m.png").write_bytes(b"no image")
+    with pytest.raises(InputError, match="got no image, expected a mask"):
+        read_mask_png(tmp_path / "m.png")
+    with pytest.raises(InputError, match="cannot be read"):
+        read_mask_png(tmp_path / "nothing.png")
+
+
+def test_kittis_own_truth(test_data: Path) -> None:
+    path = test_data / "kitti" / "depth_annotated_sample" / "groundtruth_0000000050.png"
+    same = evaluate(pair_depth_files(path, path))["parts"]
+    assert same["all"]["num_pixels"] == np.count_nonzero(cv2.imread(str(path), -1)) > 90_000
+    for name, part in same.items():
+        assert part["coverage"] == part["delta_1"] == 1, name
+        assert part["mae_m"] == part["irmse_per_km"] == part["outliers"] == 0, name
+    assert 0.005 < same["edge"]["num_pixels"] / same["all"]["num_pixels"] < 0.05
+
+
+def test_a_scaled_real_map_has_the_errors_of_its_scale(tmp_path: Path, test_data: Path) -> None:
+    path = test_data / "kitti" / "depth_annotated_sample" / "groundtruth_0000000050.png"
+    truth_m = read_depth_png(path)
+    write_depth_png(tmp_path / "twice.png", 2 * truth_m)
+    everything = evaluate(pair_depth_files(tmp_path / "twice.png", path))["parts"]["all"]
+    known = truth_m[truth_m > 0].astype(float)
+    assert everything["coverage"] == 1  # twice 83 m still fits
+    assert everything["mae_m"] == pytest.approx(known.mean())
+    assert everything["rmse_m"] == pytest.approx(np.sqrt((known**2).mean()))
+    assert everything["imae_per_km"] == pytest.approx((500 / known).mean())
+    assert everything["abs_rel"] == everything["sq_rel"] == pytest.approx(1)
+    assert everything["delta_3"] == 0
+    # Half the disparity is missing: more than 3 px nearer than 721.5377 * 0.54 / 6 = 64.9 m
+    assert everything["outliers"] == pytest.approx((known < 721.5377 * 0.54 / 6).mean())
+
+
+# --- the verb -------------------------------------------------------------------------------------
+
+
+def test_the_verb_prints_a_table_and_writes_json(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for frame in range(9):
+        put(own(tmp_path / "out", frame), 10.5, 0.0, 60.0)
+    for frame in (3, 20):
+        put(official(tmp_path / "t", frame), 10.0, 20.0, 60.0)
+    mask = put_mask(tmp_path / "m" / "3.png", np.array([[1, 0, 0]], np.uint8)).parent
+    file = tmp_path / "new" / "scores.json"
+    command = ["evaluate", str(tmp_path / "out"), str(tmp_path / "t"), "--mask", str(mask)]
+    assert main([*command, "--out", str(file)]) == 0
+    captured = capsys.readouterr()
+    assert captured.err == ""
+    lines = captured.out.splitlines()
+    assert lines[0] == (
+        "1 image: predicted 66.67 % of the pixels, truth 100.00 %; outliers with fx 721.538 px, "
+        "baseline 0.54 m"
+    )
+    assert lines[1].startswith("predicted without truth: 8: ") and "... and 3 more" in lines[1]
+    assert lines[2] == f"truth without prediction: 1: {official(tmp_path / 't', 20)}"
+    assert lines[-1] == str(file)
+    titles, *rows = (re.split(r"\s{2,}", line.strip()) for line in lines[3:-1])
+    table = {row[0]: dict(zip(titles, row[1:], strict=True)) for row in rows}
+    assert table["all"]["MAE mm"] == "250.0" and table["all"]["coverage"] == "66.7 %"
+    assert table["moving"]["MAE mm"] == "500.0" and table["moving"]["iMAE 1/km"] == "4.762"
+    assert table["moving"]["AbsRel"] == "5.00 %" and table["moving"]["d<1.25"] == "100.00 %"
+    assert table["20-30 m"]["MAE mm"] == "-" and table["20-30 m"]["coverage"] == "0.0 %"
+    assert "over 80 m" not in table
+    written = json.loads(file.read_text("utf-8"))
+    assert written["schema_version"] == 1 and written["parts"]["all"]["mae_m"] == 0.25
+    assert len(written["without_truth"]) == 8
+
+    before = file.read_bytes()
+    assert main([*command, "--out", str(file)]) == 2
+    captured = capsys.readouterr()
+    assert captured.out == "" and "--overwrite" in captured.err
+    assert main([*command, "--out", str(file), "--overwrite"]) == 0
+    assert file.read_bytes() == before
+
+
+def test_the_verb_scores_filled_maps_on_request(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    put(own(tmp_path / "out", 5), 10.0, 0.0)
+    put(own(tmp_path / "out", 5, "depth_filled"), 10.0, 20.0)
+    put(official(tmp_path / "t", 5), 10.0, 20.0)
+    for options, coverage in (([], "50.0 %"), (["--filled"], "100.0 %")):
+        assert main(["evaluate", str(tmp_path / "out"), str(tmp_path / "t"), *options]) == 0
+        assert coverage in capsys.readouterr().out.splitlines()[2]
+
+
+def test_the_verb_takes_focal_length_and_baseline(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    found, truth = put(tmp_path / "p.png", 11.0), put(tmp_path / "t.png", 10.0)
+    for options, outliers in (
+        ([], "100.000 %"),  # 38.96 px: 3.5 px off
+        (["--focal-px", "600"], "0.000 %"),  # 32.4 px: 2.9 px off
+        (["--focal-px", "600", "--baseline-m", "0.6"], "100.000 %"),  # 36 px: 3.3 px off
+    ):
+        assert main(["evaluate", str(found), str(truth), *options]) == 0
+        assert capsys.readouterr().out.splitlines()[2].endswith(outliers), options
+
+
+@pytest.mark.parametrize("value", ["0", "-1", "nan", "inf", "wide"])
+def test_a_bad_focal_length_is_refused(value: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as end:
+        main(["evaluate", "p.png", "t.png", f"--focal-px={value}"])
+    assert end.value.code == 2
+    assert "expected a number above 0" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (("p", "nowhere"), "nowhere: no such file or folder"),
+        (("p", "t"), "no pair"),
+        (("p/1.png", "broken.png"), "broken.png: got no image, expected a depth map"),
+        (("p", "p", "--out", "scores.txt"), "ends in .json"),
+    ],
+)
+def test_the_verb_refuses_in_one_line(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    arguments: tuple[str, ...],
+    says: str,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    put(Path("p/1.png"))
+    put(Path("t/2.png"))
+    Path("broken.png").write_bytes(b"not a PNG")
+    assert main(["evaluate", *arguments]) == 2
+    captured = capsys.readouterr()
+    assert captured.out == "" and len(captured.err.splitlines()) == 1 and says in captured.err
