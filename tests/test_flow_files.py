@@ -15,7 +15,7 @@ from densify.pipeline import run
 from densify.readers.flow_files import MOVES_M, FlowFiles
 from densify.types import FlowField, Result, Stretch, StretchFlow
 from tests.exact_motion import registered
-from tests.outputs_street import KEY, POSES_GIVEN, one_car
+from tests.small_street import KEY, POSES_GIVEN, one_car
 
 STEP = (100, 101)
 

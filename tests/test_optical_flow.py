@@ -12,8 +12,8 @@ from densify.output.depth_png import write_flow_png
 from densify.pipeline import run
 from densify.stages.optical_flow import optical_flow
 from densify.types import Camera, Cloud, DepthMap
-from tests.outputs_street import CAR, KEY, POSES_GIVEN, one_car
 from tests.scenes import CAMERA, SWEEP_S
+from tests.small_street import CAR, KEY, POSES_GIVEN, one_car
 
 SMALL = Camera("cam", 8, 6, np.array([[10.0, 0, 3.5], [0, 11.0, 2.5], [0, 0, 1]]), np.eye(4))
 T_CAM_KEY = poses.exp(np.array([0.1, -0.2, 0.05, 0.3, 0.1, -0.2]))

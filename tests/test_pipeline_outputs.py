@@ -13,8 +13,8 @@ import pytest
 from densify.output import read_cloud, read_depth_png, write_result
 from densify.pipeline import compare, run
 from densify.types import Cloud, Result
-from tests.outputs_street import CAR, KEY, POSES_GIVEN, one_car
 from tests.scenes import ROOM, Arc, Scanner, Scene, TinySequence, World
+from tests.small_street import CAR, KEY, POSES_GIVEN, one_car
 from tests.tiny_street import same_points
 
 
