@@ -74,10 +74,13 @@ def test_beyond_the_edge_of_the_other_image_it_is_still_known():
 
 def test_the_point_that_made_the_pixels_depth_is_followed():
     """Not what is hidden behind it, nor what shines through before it."""
-    pixel, z = np.array([[2.1, 2.0], [1.8, 2.2], [2.4, 1.9]]), np.array([12.0, 4.0, 2.0])
-    found = flow_of(seen(pixel, z), map_of([[2, 2]], [4.0]))
-    alone = flow_of(seen(pixel[1], z[1]), map_of([[2, 2]], [4.0]))
-    assert np.isfinite(alone[2, 2]).all() and np.array_equal(found[2, 2], alone[2, 2])
+    pixel = np.array([[2.4, 1.9], [2.3, 2.4], [1.8, 2.2], [2.1, 2.0]])
+    z = np.array([2.0, 4.05, 4.0, 12.0])
+    depth = map_of([[2, 2]], [4.0])
+    alone = flow_of(seen(pixel[2], z[2]), depth)[2, 2]
+    assert np.isfinite(alone).all()
+    assert np.array_equal(flow_of(seen(pixel, z), depth)[2, 2], alone)
+    assert np.isnan(flow_of(seen(pixel[[0, 3]], z[[0, 3]]), depth)).all()
 
 
 # --- the pipeline ---------------------------------------------------------------------------------
