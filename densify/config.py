@@ -9,8 +9,6 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
-import math
-import types
 import typing
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -18,32 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from densify.errors import InputError
-
-
-def knob(
-    default: Any,
-    help: str,
-    low: float | None = None,
-    high: float | None = None,
-    choices: tuple[str, ...] | None = None,
-) -> Any:
-    """A dataclass field with what `Section` checks and default.yaml says.
-
-    help: what turning the knob does, unit in brackets. low, high: inclusive bounds of a number.
-    choices: the words a text knob accepts.
-    """
-    metadata = {"help": help, "low": low, "high": high, "choices": choices}
-    return dataclasses.field(default=default, metadata=metadata)
-
-
-@dataclass(frozen=True)
-class Section:
-    """The knobs of one stage, checked whenever one is made."""
-
-    def __post_init__(self) -> None:
-        for field in dataclasses.fields(self):
-            value = getattr(self, field.name)
-            object.__setattr__(self, field.name, _checked(type(self), field.name, value, ""))
+from densify.knobs import Section, checked, knob
 
 
 @dataclass(frozen=True)
@@ -197,6 +170,17 @@ class ProjectSettings(Section):
         "included; sweep: the key sweep's reference time",
         choices=("camera", "sweep"),
     )
+    visibility: bool = knob(
+        True, "off: each pixel's nearest point as it is; what is hidden shines through (a baseline)"
+    )
+    veto_m: float = knob(
+        0.3,
+        "[m] a point of another sweep this much or veto_fraction of its range (the larger) before "
+        "what the key sweep saw there is left out; smaller finds more ghosts and loses thin things",
+        0,
+        10,
+    )
+    veto_fraction: float = knob(0.015, "see veto_m; share of the range", 0, 1)
     footprint: float = knob(
         0.4,
         "half size of the patch a point stands for, in spacings of neighbouring rays; larger hides "
@@ -215,17 +199,57 @@ class ProjectSettings(Section):
         10,
     )
     hidden_fraction: float = knob(0.06, "see hidden_m; share of the depth", 0, 1)
+    support: int = knob(
+        4,
+        "sweeps that must agree with a point, the one nearest to the key among them; at most half "
+        "of those there are; more removes what was badly registered and thins far surfaces",
+        1,
+        20,
+    )
+    support_reach: float = knob(
+        0.8, "how far around a pixel they are looked for, in spacings of neighbouring rays", 0.1, 5
+    )
+    plane_reach: float = knob(
+        0.5,
+        "how far a pixel's depth is averaged, in spacings; larger is smoother and rounds what is "
+        "curved",
+        0,
+        5,
+    )
+    agree_m: float = knob(
+        0.1, "[m] points agree that deviate less than this plus agree_fraction", 0.001, 5
+    )
+    agree_fraction: float = knob(0.01, "see agree_m; share of the depth", 0, 1)
+    edge_reach: float = knob(
+        0.35,
+        "a point nearer than this to the edge of its surface is left out, in spacings along the "
+        "azimuth: beams are about as wide; smaller fattens outlines, larger eats thin things",
+        0,
+        5,
+    )
+    edge_slack_m: float = knob(
+        0.015, "[m] added to that, for errors of registration and flow", 0, 1
+    )
     fill_reach: float = knob(
-        0.7,
+        1.0,
         "how far the two-sided fill looks for measured pixels, in spacings of neighbouring rays; "
-        "larger fills more between the lines of a sparse scanner",
+        "below 1 nothing is filled between the lines of a single sweep",
         0.1,
         5,
     )
-    edge_m: float = knob(0.3, "[m] no pixel is filled where depths around it spread by more", 0, 10)
-    edge_fraction: float = knob(0.06, "the same as a share of the depth; the larger counts", 0, 1)
+    edge_m: float = knob(
+        0.1,
+        "[m] no pixel is filled where depths around it deviate more from a plane; larger fills "
+        "hedges and ragged edges, often wrongly",
+        0,
+        10,
+    )
+    edge_fraction: float = knob(0.01, "the same as a share of the depth; the larger counts", 0, 1)
     fill_confidence: float = knob(
-        0.5, "confidence of a filled pixel as a share of the least around it", 0, 1
+        0.5,
+        "confidence of a pixel filled from afar as a share of the least around it",
+        0,
+        1,
     )
 
 
@@ -364,7 +388,7 @@ def _apply(values: dict[str, dict[str, Any]], changes: Any, where: str) -> None:
             if key not in values[name]:
                 hint = _key_suggestion(name, str(key), values)
                 raise InputError(f"{where}: unknown key {name}.{key}; {hint}")
-            values[name][key] = _checked(_sections()[name], key, value, f"{where}: ")
+            values[name][key] = checked(_sections()[name], key, value, f"{where}: ")
 
 
 def _sections() -> dict[str, Any]:
@@ -392,46 +416,3 @@ def _suggestion(got: str, known: Sequence[str], kind: str) -> str:
     close = difflib.get_close_matches(str(got), known, n=1, cutoff=0.6)
     hint = f"did you mean {close[0]}? " if close else ""
     return f"{hint}expected a {kind}: {', '.join(known)}"
-
-
-def _checked(section: type[Section], key: str, value: Any, where: str) -> Any:
-    """The value as its knob's type; InputError if it has another type or is out of range."""
-    field = section.__dataclass_fields__[key]
-    kind = typing.get_type_hints(section)[key]
-    optional = isinstance(kind, types.UnionType)
-    if optional:
-        kind = next(t for t in typing.get_args(kind) if t is not types.NoneType)
-        if value is None:
-            return None
-    checked = _as(kind, value)
-    low, high, choices = (field.metadata[m] for m in ("low", "high", "choices"))
-    if checked is not None:
-        if choices is not None and checked in choices:
-            return checked
-        if choices is None and (kind in (bool, str) or low <= checked <= high):
-            return checked
-    if choices is not None:
-        expected = f"one of {', '.join(choices)}"
-    elif kind is bool:
-        expected = "true or false"
-    elif kind is str:
-        expected = "text"
-    else:
-        expected = f"{'a whole number' if kind is int else 'a number'} from {low:g} to {high:g}"
-    expected += " or null" if optional else ""
-    name = f"{section.__name__.removesuffix('Settings').lower()}.{key}"
-    raise InputError(
-        f"{where}{name}: got {value!r}, expected {expected} ({field.metadata['help']})"
-    )
-
-
-def _as(kind: Any, value: Any) -> Any:
-    """`value` as bool, int, float or str, None if it is not one."""
-    if kind is float and isinstance(value, str | int) and not isinstance(value, bool):
-        try:
-            value = float(value)  # text too: YAML 1.1 reads 1e-3 as text
-        except (ValueError, OverflowError):
-            return None
-    if type(value) is not kind or (kind is float and not math.isfinite(value)):
-        return None
-    return value

@@ -14,9 +14,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from densify import depth_metrics, poses, scores
+from densify import depth_metrics, scores
 from densify.config import Config, RegisterSettings, resolve
 from densify.errors import InputError
 from densify.flow.chained import ChainedMotion
@@ -26,24 +25,16 @@ from densify.readers.flow_files import FlowFiles
 from densify.readers.window import choose_cameras, read_sweeps, recorded_trajectory, window_frames
 from densify.stages.accumulate import accumulate
 from densify.stages.age import with_ages
-from densify.stages.colour import colour
 from densify.stages.deskew import deskew
 from densify.stages.flow import estimate_motion
 from densify.stages.ground import ground
-from densify.stages.optical_flow import optical_flow
-from densify.stages.project import project
 from densify.stages.register import check_overlap, check_plausible, register
 from densify.types import (
-    Bool,
-    Camera,
     Cloud,
     DepthMap,
-    Float,
-    Float32,
     FlowField,
     LidarSequence,
     Motion,
-    Mover,
     Progress,
     RegisteredSweep,
     Result,
@@ -53,26 +44,33 @@ from densify.types import (
     Sweep,
     Trajectory,
 )
+from densify.views import HeldOut, Views
 
 
 class Method(NamedTuple):
     """What is accumulated. all_sweeps: else the key sweep alone. engine: which flow, see
-    ``flow.engine``; None for none, "" for the configured one."""
+    ``flow.engine``; None for none, "" for the configured one. visible: what is hidden, vetoed or
+    doubtful is left out, else each pixel shows its nearest point."""
 
     all_sweeps: bool
     engine: str | None
-    about: str
+    visible: bool
 
 
 METHODS = {
-    "none": Method(False, None, "the key sweep alone"),
-    "icp": Method(True, None, "registration only"),
-    "paper": Method(True, "paper", "registration and the published scene flow"),
-    "flow": Method(True, "", "registration and our scene flow"),
+    "none": Method(False, None, False),
+    "icp": Method(True, None, False),
+    "icp-visible": Method(True, None, True),
+    "flow-plain": Method(True, "", False),
+    "paper": Method(True, "paper", True),
+    "flow": Method(True, "", True),
 }
-"""For `compare`. `run` takes all but ``paper``; each but the first is the baseline of the next."""
+"""For `compare`: the key sweep alone; registration alone, as it is and with visibility; our scene
+flow without visibility; the published scene flow; ours. `run` takes none, icp and flow."""
 
 _RUN = ("none", "icp", "flow")
+COMPARED = ("none", "icp", "paper", "flow")
+"""What `compare` shows unless told otherwise."""
 
 ConfigLike = Config | str | Path | Mapping[str, Any] | None
 
@@ -108,7 +106,7 @@ def compare(
     cameras: Sequence[str] | None = None,
     config: ConfigLike = None,
     progress: Progress | None = None,
-    methods: Sequence[str] = tuple(METHODS),
+    methods: Sequence[str] = COMPARED,
 ) -> dict[str, Result]:
     """Methods by name on the same registration, each with those before it as its baselines.
 
@@ -129,46 +127,42 @@ def compare(
         trajectory = find_trajectory(sequence, sweeps, settings.register)
     with watch.stage("deskew"):
         stretch = deskew([s for s in sweeps if s.frame in frames], trajectory)
-    engines = [METHODS[name].engine for name in methods]
-    if any(engine is not None for engine in engines):
-        with watch.stage("ground"):
-            heights = ground(stretch, settings.ground)
-    exposures = {c.name: _exposure(sequence, stretch, key, c, settings) for c in chosen}
-    clouds: dict[str, Cloud] = {}
-    steps: dict[str, StretchFlow] = {}
-    for name, engine in zip(methods, engines, strict=True):
-        used = stretch if METHODS[name].all_sweeps else Stretch((stretch[key],))
-        fields = [FlowField.zero(len(s.sweep)) for s in used.sweeps]
-        if engine is not None:
-            with watch.stage("flow"):
-                motion = _motion(stretch, heights, engine or settings.flow.engine, settings)
-                fields = [motion.flow(frame, key) for frame in stretch.frames]
-                if settings.output.flow:
-                    steps[name] = _steps(motion, stretch, key)
-        with watch.stage("accumulate"):
-            drop_lost = settings.accumulate.unfollowed == "drop"
-            clouds[name] = accumulate(used, fields, key, drop_lost)
+    with watch.stage("ground"):
+        heights = ground(stretch, settings.ground)
+    moments = {name: _key_moment(stretch, key, heights, name, settings, watch) for name in methods}
 
-    eye = _Eye(stretch, key, exposures, settings, watch)
-    held_out = _HeldOut.of(eye, clouds)
+    key_image = RangeImage.of(stretch[key])
+    views = Views.of(sequence, stretch, key, key_image, chosen, settings)
+    with watch.stage("held out"):
+        held_out = HeldOut.of(views, moments[methods[-1]][0])
     results: dict[str, Result] = {}
-    for name, whole in clouds.items():
-        apart = settings.output.movers != "keep"
-        cloud = whole.select(~whole.moving) if apart else whole
-        depth = eye.depth(cloud)
-        depth = {n: with_ages(m, stretch, key, exposures[n].late_s) for n, m in depth.items()}
+    for name, (cloud, flow) in moments.items():
+        visible = METHODS[name].visible and settings.project.visibility
+        with watch.stage("held out"):
+            held_out_scores = held_out.scores(cloud, visible)
+        movers = {}
+        if settings.output.movers == "separate":
+            with watch.stage("project"):
+                movers = views.movers(cloud, visible, images)
+        if settings.output.movers != "keep":
+            cloud = cloud.select(~cloud.moving)
+        with watch.stage("project"):
+            depth = views.depth(cloud, visible)
+            depth = {
+                n: with_ages(m, stretch, key, views.exposures[n].late_s) for n, m in depth.items()
+            }
         with watch.stage("colour"):
-            cloud = eye.coloured(cloud, depth, images)
+            cloud = views.coloured(cloud, depth, images)
         with watch.stage("score"):
-            metrics = _scores(sequence, stretch[key], cloud, depth)
-            metrics["held_out"] = held_out.scores(whole)
+            metrics = _scores(sequence, stretch[key], key_image, cloud, depth)
+            metrics["held_out"] = held_out_scores
         results[name] = Result(
-            *(name, key, tuple(np.unique(whole.frame).tolist()), cloud, depth, metrics),
+            *(name, key, tuple(np.unique(cloud.frame).tolist()), cloud, depth, metrics),
             costs=watch.costs(),
             baselines=dict(results),
-            flow=steps.get(name),
-            movers=_movers(eye, whole, images) if settings.output.movers == "separate" else {},
-            optical_flow=eye.optical_flow(cloud, depth) if settings.output.optical_flow else {},
+            flow=flow,
+            movers=movers,
+            optical_flow=views.optical_flow(cloud, depth) if settings.output.optical_flow else {},
         )
     return results
 
@@ -203,6 +197,25 @@ def find_trajectory(
     return register(straight, settings, rough)
 
 
+def _key_moment(
+    stretch: Stretch, key: int, heights: HeightMap, name: str, settings: Config, watch: _Watch
+) -> tuple[Cloud, StretchFlow | None]:
+    """All sweeps at the key's moment as a method places them, and its flow where asked for."""
+    method, flow = METHODS[name], None
+    used = stretch if method.all_sweeps else Stretch((stretch[key],))
+    fields = [FlowField.zero(len(s.sweep)) for s in used.sweeps]
+    if method.engine is not None:
+        with watch.stage("flow"):
+            engine = method.engine or settings.flow.engine
+            motion = _motion(stretch, heights, engine, settings)
+            fields = [motion.flow(frame, key) for frame in stretch.frames]
+            if settings.output.flow:
+                flow = _steps(motion, stretch, key)
+    with watch.stage("accumulate"):
+        drop_lost = settings.accumulate.unfollowed == "drop"
+        return accumulate(used, fields, key, drop_lost), flow
+
+
 def _motion(stretch: Stretch, heights: HeightMap, engine: str, settings: Config) -> Motion:
     """By the engine, or from flow that others left on disk."""
     flow = replace(settings.flow, engine=engine)
@@ -219,139 +232,12 @@ def _steps(motion: Motion, stretch: Stretch, key: int) -> StretchFlow:
     return StretchFlow(stretch, {hop: motion.flow(*hop) for hop in hops})
 
 
-class _Exposure(NamedTuple):
-    """late_s: after the key's reference time. T_cam_key: (4,4), with the ego motion until then.
-    others: "previous" and "next" image, where the stretch holds their sweeps: the same of them."""
-
-    camera: Camera
-    late_s: float
-    T_cam_key: Float
-    others: Mapping[str, tuple[float, Float]]
-
-
-def _exposure(
-    sequence: LidarSequence, stretch: Stretch, key: int, camera: Camera, settings: Config
-) -> _Exposure:
-    def of_image(frame: int) -> tuple[float, Float]:
-        registered = stretch[frame]
-        stamp_ns = sequence.image_stamp_ns(camera.name, frame)
-        if settings.project.at == "sweep":
-            stamp_ns = registered.sweep.stamp_ns
-        late_s = (stamp_ns - registered.sweep.stamp_ns) * 1e-9
-        twist = registered.twist_before if late_s < 0 else registered.twist_after
-        T_cam_lidar = camera.T_cam_lidar @ poses.inverse(poses.exp(late_s * twist))
-        since_key_s = (stamp_ns - stretch[key].sweep.stamp_ns) * 1e-9
-        return since_key_s, T_cam_lidar @ stretch.T_target_source(frame, key)
-
-    others = {
-        name: of_image(frame)
-        for name, frame in (("previous", key - 1), ("next", key + 1))
-        if settings.output.optical_flow and frame in stretch.frames
-    }
-    return _Exposure(camera, *of_image(key), others)
-
-
-class _Eye:
-    """Every camera at its own exposure."""
-
-    def __init__(
-        self,
-        stretch: Stretch,
-        key: int,
-        exposures: Mapping[str, _Exposure],
-        settings: Config,
-        watch: _Watch,
-    ) -> None:
-        self.key, self.exposures = key, exposures
-        self._settings, self._watch = settings.project, watch
-        self._origins = {f: stretch.T_target_source(key, f)[:3, 3] for f in stretch.frames}
-
-    def depth(self, cloud: Cloud) -> dict[str, DepthMap]:
-        maps = {}
-        for name, (camera, late_s, T_cam_key, _) in self.exposures.items():
-            with self._watch.stage("project"):
-                exposed = cloud.after(late_s)
-                maps[name] = project(
-                    exposed, camera, T_cam_key, self._settings, self.key, self._origins
-                )
-        return maps
-
-    def coloured(
-        self,
-        cloud: Cloud,
-        depth: Mapping[str, DepthMap],
-        images: Mapping[str, NDArray[np.uint8]],
-    ) -> Cloud:
-        rgb = cloud.rgb
-        for name, (camera, late_s, T_cam_key, _) in self.exposures.items():
-            points = cloud.after(late_s).points
-            rgb = colour(rgb, points, camera, T_cam_key, depth[name], images[name])
-        return replace(cloud, rgb=rgb)
-
-    def optical_flow(
-        self, cloud: Cloud, depth: Mapping[str, DepthMap]
-    ) -> dict[str, dict[str, Float32]]:
-        flows = {}
-        for name, (camera, late_s, T_cam_key, others) in self.exposures.items():
-            exposed = cloud.after(late_s)
-            flows[name] = {
-                other: optical_flow(
-                    exposed, depth[name], camera, T_cam_key, T_other_key, other_s - late_s
-                )
-                for other, (other_s, T_other_key) in others.items()
-            }
-        return flows
-
-
-def _movers(eye: _Eye, cloud: Cloud, images: Mapping[str, NDArray[np.uint8]]) -> dict[int, Mover]:
-    """Every moving object by itself."""
-    instances = np.unique(cloud.instance[cloud.moving & (cloud.instance >= 0)])
-    movers = {}
-    for instance in instances.tolist():
-        part = cloud.select(cloud.moving & (cloud.instance == instance))
-        depth = eye.depth(part)
-        movers[instance] = Mover(eye.coloured(part, depth, images), depth)
-    return movers
-
-
-class _HeldOut:
-    """The key sweep's own returns as the truth for the key densified from its neighbours alone."""
-
-    def __init__(
-        self, eye: _Eye, key_alone: Mapping[str, DepthMap], moving: Mapping[str, Bool]
-    ) -> None:
-        self._eye, self._key_alone, self._moving = eye, key_alone, moving
-
-    @staticmethod
-    def of(eye: _Eye, clouds: Mapping[str, Cloud]) -> _HeldOut:
-        """What moves in the key sweep the last method says."""
-        last = list(clouds.values())[-1]
-        own = last.select(last.frame == eye.key)
-        key_alone = eye.depth(own)
-        only_movers = eye.depth(own.select(own.moving))
-        moving = {
-            name: (maps.depth_m > 0) & (maps.depth_m == key_alone[name].depth_m)
-            for name, maps in only_movers.items()
-        }
-        return _HeldOut(eye, key_alone, moving)
-
-    def scores(self, cloud: Cloud) -> dict[str, Any] | None:
-        rest = cloud.select(cloud.frame != self._eye.key)
-        if not len(rest):
-            return None
-        return {
-            name: depth_metrics.depth_scores(
-                maps,
-                self._key_alone[name].depth_m,
-                self._moving[name],
-                self._eye.exposures[name].camera,
-            )
-            for name, maps in self._eye.depth(rest).items()
-        }
-
-
 def _scores(
-    sequence: LidarSequence, key_sweep: RegisteredSweep, cloud: Cloud, depth: Mapping[str, DepthMap]
+    sequence: LidarSequence,
+    key_sweep: RegisteredSweep,
+    key_image: RangeImage,
+    cloud: Cloud,
+    depth: Mapping[str, DepthMap],
 ) -> dict[str, Any]:
     """What can be said of the result without truth, and against the truth where there is some."""
     metrics: dict[str, Any] = {
@@ -364,7 +250,7 @@ def _scores(
             }
             for name, maps in depth.items()
         },
-        "ghosts": scores.ghost_scores(cloud, RangeImage.of(key_sweep), key_sweep.frame),
+        "ghosts": scores.ghost_scores(cloud, key_image, key_sweep.frame),
     }
     if sequence.truth is not None:
         metrics["depth"] = {

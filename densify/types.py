@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
+from enum import IntEnum
 from typing import Any, Protocol
 
 import numpy as np
@@ -229,6 +230,33 @@ class Cloud:
 
 
 @dataclass(frozen=True)
+class Patches:
+    """What each of a cloud's M points stands for; see `densify.stages.patches`.
+
+    normal: (M,3) float32 key frame, of any length, of the tangent plane. spacing_m: (M,2) float32
+    to the neighbouring rays of the same sweep, across and along elevation. free: (M,) bool, the key
+    sweep saw through the place. sweep: (M,) int32, which of the cloud's sweeps, counted by frame.
+    """
+
+    normal: Float32
+    spacing_m: Float32
+    free: Bool
+    sweep: NDArray[np.int32]
+
+
+class Reason(IntEnum):
+    """Why a point is not in a depth map; the first that applies."""
+
+    KEPT = 0  # its pixel's depth is from it
+    VETOED = 1  # the key sweep saw through its place
+    OUTSIDE = 2  # not in the image
+    HIDDEN = 3  # behind another point's patch
+    NOT_CHOSEN = 4  # its pixel's depth is from a point nearer in time to the key, or nearer
+    UNSUPPORTED = 5  # too few sweeps agree with it, or not the one nearest to the key
+    EDGE = 6  # so close to a depth edge that its pixel may lie beyond it
+
+
+@dataclass(frozen=True)
 class Camera:
     """A pinhole camera, rectified or with lens distortion.
 
@@ -252,7 +280,8 @@ class DepthMap:
     interpolated between measured ones. confidence: float32 0 to 1, of every pixel in ``filled_m``.
     frame: int32 source sweep of measured pixels, -1 elsewhere. age_s: float32 seconds between the
     moment the map shows and the reference time of the sweep that measured the pixel, of every pixel
-    in ``filled_m``, nan elsewhere; None until `densify.stages.age` has worked it out.
+    in ``filled_m``, nan elsewhere; None until `densify.stages.age` has worked it out. reason: (M,)
+    uint8, a `Reason` for each point of the cloud; empty if the cloud is not at hand.
     """
 
     camera: str
@@ -260,6 +289,7 @@ class DepthMap:
     filled_m: Float32
     confidence: Float32
     frame: NDArray[np.int32]
+    reason: NDArray[np.uint8] = field(default_factory=lambda: np.zeros(0, np.uint8))
     age_s: Float32 | None = None
 
 

@@ -227,7 +227,7 @@ BAD_COMMANDS: dict[str, tuple[list[str], list[str]]] = {
     "unknown method": ([*RUN, "--method", "magic"], ["'magic'", "icp"]),
     "unknown method to compare": (
         ["compare", "--key", "120", "--data", STREET, "--methods", "icp,magic", "--out", "{tmp}/o"],
-        ["--methods magic", "none, icp, paper, flow"],
+        ["--methods magic", "none, icp, "],
     ),
     "unknown engine": ([*RUN, "--flow", "magic"], ["flow.engine", "'magic'", "npz:DIR"]),
     "unknown moment": ([*RUN, "--at", "noon"], ["--at", "'noon'", "camera", "sweep"]),

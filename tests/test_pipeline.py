@@ -29,7 +29,7 @@ def moving() -> dict[str, Result]:
 
 @pytest.fixture(scope="module")
 def static() -> dict[str, Result]:
-    return compare(tiny(), KEY, WINDOW, methods=USUAL)
+    return compare(tiny(), KEY, WINDOW, methods=("none", "icp", "icp-visible", "flow"))
 
 
 # --- what comes out -------------------------------------------------------------------------------
@@ -88,14 +88,15 @@ def test_metrics_are_plain_numbers(moving):
 
 def test_more_sweeps_give_more_depth(moving):
     density = {m: r.metrics["density"]["front"]["measured"] for m, r in moving.items()}
-    assert density["icp"] > 1.1 * density["none"]
-    assert density["flow"] > 1.1 * density["none"]
+    # a coarse image, and what is not certain at edges is left out
+    assert density["icp"] > 1.02 * density["none"]
+    assert density["flow"] > 1.02 * density["none"]
 
 
 def test_costs_of_every_stage(moving):
     costs = {c.name: c for c in moving["flow"].costs}
     stages = ["read", "images", "register", "deskew", "ground", "flow"]
-    assert set(costs) == {*stages, "accumulate", "project", "colour", "score"}
+    assert set(costs) == {*stages, "accumulate", "held out", "project", "colour", "score"}
     for cost in costs.values():
         assert cost.seconds >= 0 and cost.peak_memory_mb > 10
     peaks = [costs[s].peak_memory_mb for s in stages]
@@ -115,7 +116,8 @@ def test_methods_share_one_registration(moving):
 
 
 def test_nothing_moves_flow_is_icp_to_the_last_bit(static):
-    icp, flow = static["icp"], static["flow"]
+    icp, flow = static["icp-visible"], static["flow"]
+    assert same_points(static["icp"].cloud, icp.cloud)
     assert same_points(icp.cloud, flow.cloud)
     for name in ("depth_m", "filled_m", "confidence", "frame"):
         a, b = (getattr(r.depth["front"], name) for r in (icp, flow))

@@ -141,9 +141,7 @@ def test_bad_arguments_are_refused_before_anything_is_read(arguments, message):
 
 def test_unknown_methods_are_refused_before_anything_is_read():
     sequence = one_car(())
-    with pytest.raises(
-        InputError, match="--methods magic: expected some of none, icp, paper, flow"
-    ):
+    with pytest.raises(InputError, match="--methods magic: expected some of none, icp, .*flow"):
         compare(sequence, KEY, 1, methods=("icp", "magic"))
     assert not sequence.read
 

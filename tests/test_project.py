@@ -13,16 +13,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from densify.config import ProjectSettings
-from densify.depth_fill import fill_between, fit_planes
+from densify.depth_fill import fill_between
 from densify.errors import InputError
+from densify.kernels import visibility as kernels
 from densify.pinhole import image_points
-from densify.poses import exp, inverse, transform
-from densify.stages.project import _paint, _spacing_px, project
-from densify.types import Camera, Cloud
+from densify.poses import exp
+from densify.stages.patches import patches
+from densify.stages.project import project
+from densify.types import Camera, Cloud, Patches, Reason
 
 KEY = 10
-# hides only what is more than 10 m + its own depth behind a point in the same pixel
-PLAIN = ProjectSettings(footprint=0, slack_m=0, hidden_m=10, hidden_fraction=1)
+PLAIN = ProjectSettings(visibility=False)
 T_CAM_LIDAR = np.array([[0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1.0]])  # axes only
 
 
@@ -46,6 +47,11 @@ def make_cloud(points, frame=KEY, confidence=1.0):
         intensity=np.zeros(n, np.float32),
         rgb=np.zeros((n, 3), np.uint8),
     )
+
+
+def view(cloud, camera, T_cam_key, knobs, origins=None):
+    """`project` with the cloud's patches."""
+    return project(cloud, camera, T_cam_key, knobs, KEY, patches(cloud, KEY, knobs, origins))
 
 
 def take(cloud, index):
@@ -73,7 +79,7 @@ def test_tilted_plane_from_a_known_pose_has_its_analytic_depth():
     rng = np.random.default_rng(0)
     plane = np.column_stack([rng.uniform(-6, 6, 20000), rng.uniform(-5, 5, 20000), np.zeros(20000)])
     T_cam_key = exp(np.array([0.3, -0.2, 0.1, 0.4, -0.1, 9.0]))
-    depth = project(make_cloud(plane), camera, T_cam_key, PLAIN, KEY)
+    depth = view(make_cloud(plane), camera, T_cam_key, PLAIN)
     normal, point = T_cam_key[:3, 2], T_cam_key[:3, 3]
     row, column = np.nonzero(depth.depth_m)
     assert len(row) > 2500
@@ -91,14 +97,14 @@ def test_image_edges_and_points_behind_the_camera():
     uv = [(-0.4, 0), (9.4, 1), (9.6, 2), (-0.6, 3), (9.5, 4), (4, -0.49), (5, 5.49), (5, 5.51)]
     points = at_pixel(camera, [u for u, _ in uv], [v for _, v in uv], 5.0)
     behind = [[0, 0, -5.0], [0, 0, 0.0], [0, 0, 0.09]]
-    depth = project(make_cloud(np.vstack([points, behind])), camera, np.eye(4), PLAIN, KEY)
+    depth = view(make_cloud(np.vstack([points, behind])), camera, np.eye(4), PLAIN)
     row, column = np.nonzero(depth.depth_m)
     assert set(zip(column.tolist(), row.tolist(), strict=True)) == {(0, 0), (9, 1), (4, 0), (5, 5)}
     assert np.all(depth.depth_m[row, column] == 5)
 
 
 def test_empty_cloud_gives_an_empty_map():
-    depth = project(make_cloud([]), make_camera(), np.eye(4), ProjectSettings(), KEY)
+    depth = view(make_cloud([]), make_camera(), np.eye(4), ProjectSettings())
     assert not depth.depth_m.any() and not depth.filled_m.any() and not depth.confidence.any()
     assert (depth.frame == -1).all()
     assert depth.depth_m.shape == (48, 64)
@@ -159,7 +165,7 @@ def test_bad_distortion_is_named(lens):
 
 
 def z_buffer_twin(cloud, camera):
-    """One point at a time: least |frame - key|, then least depth, then least frame."""
+    """One point at a time: least depth, then least frame."""
     best = {}
     for p, frame, confidence in zip(cloud.points, cloud.frame, cloud.confidence, strict=True):
         if p[2] <= 0.1:
@@ -167,7 +173,7 @@ def z_buffer_twin(cloud, camera):
         u = int(np.rint(camera.K[0, 0] * p[0] / p[2] + camera.K[0, 2]))
         v = int(np.rint(camera.K[1, 1] * p[1] / p[2] + camera.K[1, 2]))
         if 0 <= u < camera.width_px and 0 <= v < camera.height_px:
-            rank = (abs(int(frame) - KEY), float(np.float32(p[2])), int(frame), -float(confidence))
+            rank = (float(np.float32(p[2])), int(frame), -float(confidence))
             best[v, u] = min(best.get((v, u), rank), rank)
     return best
 
@@ -180,12 +186,13 @@ def random_cloud(rng, num):
 
 @given(st.integers(0, 2**32 - 1), st.integers(0, 400))
 @settings(max_examples=25, deadline=None)
-def test_pixels_equal_those_of_a_slow_twin(seed, num):
+def test_without_visibility_pixels_equal_those_of_a_slow_twin(seed, num):
     cloud, camera = random_cloud(np.random.default_rng(seed), num), make_camera(24, 18, 20.0)
-    depth = project(cloud, camera, np.eye(4), PLAIN, KEY)
+    depth = view(cloud, camera, np.eye(4), PLAIN)
     twin = z_buffer_twin(cloud, camera)
     assert set(zip(*np.nonzero(depth.depth_m), strict=True)) == set(twin)
-    for pixel, (_, z, frame, confidence) in twin.items():
+    assert (depth.reason == Reason.KEPT).sum() == len(twin)
+    for pixel, (z, frame, confidence) in twin.items():
         assert depth.depth_m[pixel] == np.float32(z)
         assert depth.frame[pixel] == frame
         assert depth.confidence[pixel] == np.float32(-confidence)
@@ -197,74 +204,77 @@ def test_order_of_the_points_changes_no_byte(seed):
     rng = np.random.default_rng(seed)
     cloud, camera = random_cloud(rng, 600), make_camera(24, 18, 20.0)
     origins = {frame: rng.normal(size=3) for frame in range(KEY - 3, KEY + 4)}
-    one = project(cloud, camera, np.eye(4), ProjectSettings(), KEY, origins)
-    shuffled = take(cloud, rng.permutation(len(cloud)))
-    other = project(shuffled, camera, np.eye(4), ProjectSettings(), KEY, origins)
+    knobs = ProjectSettings(support=1, edge_reach=0, edge_slack_m=0)
+    one = view(cloud, camera, np.eye(4), knobs, origins)
+    order = rng.permutation(len(cloud))
+    other = view(take(cloud, order), camera, np.eye(4), knobs, origins)
+    assert (one.depth_m > 0).any()
     for name in ("depth_m", "filled_m", "confidence", "frame"):
         assert getattr(one, name).tobytes() == getattr(other, name).tobytes(), name
-
-
-def test_nearest_in_time_wins_among_the_visible_only():
-    camera = make_camera()
-    point = at_pixel(camera, 30, 20, 10.0)
-    # the key's own point is hidden behind a later sweep's; of 10.0 and 10.1 m the nearer in time
-    points = np.vstack([point * 1.5, point, point * 1.01, point * 1.02])
-    cloud = make_cloud(points, [KEY, KEY + 3, KEY - 2, KEY + 2])
-    depth = project(cloud, camera, np.eye(4), ProjectSettings(), KEY)
-    assert depth.depth_m[20, 30] == np.float32(10.1)
-    assert depth.frame[20, 30] == KEY - 2
+    assert (one.reason[order] == other.reason).mean() > 0.95  # equal points may change places
 
 
 # --- visibility -----------------------------------------------------------------------------------
 
 
-def see(camera, points_cam, frame, knobs, origins_cam=None):
-    """`project` of points given in the camera's frame, the key frame having a lidar's axes."""
-    T_key_cam = inverse(T_CAM_LIDAR)
-    origins = None
-    if origins_cam is not None:
-        origins = {f: transform(T_key_cam, o[None])[0] for f, o in origins_cam.items()}
-    cloud = make_cloud(transform(T_key_cam, points_cam), frame)
-    return project(cloud, camera, T_CAM_LIDAR, knobs, KEY, origins)
+def facing(points, spacing_px, focal):
+    """Patches that face the camera at the origin, so many pixels apart."""
+    points = np.asarray(points, float).reshape(-1, 3)
+    normal = np.tile([0, 0, 1.0], (len(points), 1))
+    spacing_m = np.asarray(spacing_px, float) * points[:, 2:] / focal
+    return normal, np.broadcast_to(spacing_m, (len(points), 2))
+
+
+def see(camera, points_cam, frame, knobs, spacing_px=(1.0, 1.0), normal=None, free=None):
+    """`project` of points in the camera's frame, which is the key's, with patches as given."""
+    cloud = make_cloud(points_cam, frame)
+    facing_normal, spacing_m = facing(points_cam, spacing_px, camera.K[0, 0])
+    surface = Patches(
+        normal=np.asarray(facing_normal if normal is None else normal, np.float32),
+        spacing_m=np.asarray(spacing_m, np.float32),
+        free=np.zeros(len(cloud), bool) if free is None else free,
+        sweep=np.unique(cloud.frame, return_inverse=True)[1].ravel().astype(np.int32),
+    )
+    return project(cloud, camera, np.eye(4), knobs, KEY, surface)
 
 
 def test_back_wall_does_not_shine_through_the_gaps_of_the_front_wall():
     """A front wall at 10 m, sampled more coarsely than pixels, hides the left half of another."""
     camera = make_camera(120, 90, 300.0)
-    jitter = np.random.default_rng(2).uniform(-0.3, 0.3, (30, 30))
     v, u = np.mgrid[0:90:3, 0:60:2]
-    front = at_pixel(camera, u + jitter, v, 10.0)
-    back = on_every_pixel(camera, 20.0)
+    front, back = at_pixel(camera, u, v, 10.0), on_every_pixel(camera, 20.0)
     points = np.vstack([front, back])
     frame = [KEY + 4] * len(front) + [KEY] * len(back)
-    knobs = ProjectSettings(slack_m=0.05, footprint=0.4)
-    depth = see(camera, points, frame, knobs)
+    spacing = np.vstack([np.tile([2.0, 3.0], (len(front), 1)), np.ones((len(back), 2))])
+    knobs = ProjectSettings(slack_m=0.05, support=1, edge_reach=0, edge_slack_m=0)
+    depth = see(camera, points, frame, knobs, spacing)
     left, right = depth.depth_m[:88, :58], depth.depth_m[:, 62:]
-    assert (left > 0).mean() > 0.1 and (left[left > 0] == 10).all()
-    assert (right == 20).all()  # and nothing is lost beside it
-    plain = see(camera, points, frame, PLAIN)
+    assert not (left > 15).any()
+    np.testing.assert_allclose(right, 20, rtol=1e-6)  # and nothing is lost beside it
+    assert (depth.reason[len(front) :] == Reason.HIDDEN).sum() > 58 * 88
+    plain = see(camera, points, frame, PLAIN, spacing)
     assert (plain.depth_m[:88, :58] == 20).mean() > 0.5  # what the test removes
 
 
-def test_patch_grows_with_the_source_range_and_slack():
+def test_patch_grows_with_the_spacing_and_slack():
     camera = make_camera(121, 91, 300.0)
-    spot = at_pixel(camera, 60, 45, 10.0)
-    back = on_every_pixel(camera, 20.0)  # measures the spacing: a pixel each way
+    spot, back = at_pixel(camera, 60, 45, 10.0), on_every_pixel(camera, 20.0)
+    points = np.vstack([spot, back])
 
-    def hole(distance_m, slack_m):
-        origins = {KEY: np.zeros(3), KEY + 1: spot[0] - [0, 0, distance_m]}
+    def hole(spacing_px, slack_m):
+        spacing = np.vstack([[spacing_px], np.zeros((len(back), 2))])
         knobs = ProjectSettings(footprint=1.0, slack_m=slack_m)
-        frame = [KEY + 1] + [KEY] * len(back)
-        depth = see(camera, np.vstack([spot, back]), frame, knobs, origins)
-        rows, columns = np.nonzero(depth.depth_m != 20)
-        assert depth.depth_m[45, 60] == 10
+        rows, columns = np.divmod(
+            np.flatnonzero(see(camera, points, KEY, knobs, spacing).reason[1:] == Reason.HIDDEN),
+            121,
+        )
         return int(np.ptp(columns)) + 1, int(np.ptp(rows)) + 1
 
-    assert hole(0.1, 0.0) == (1, 1)
-    assert hole(0.1, 0.1) == (7, 7)  # 0.1 m at 10 m is 3 px
-    assert hole(25.0, 0.0) == (5, 5)  # 25 m / 10 m times one pixel, each side
-    assert hole(45.0, 0.0) == (9, 9)
-    assert hole(1e6, 0.0) == (49, 49)  # it never hides the whole image
+    assert hole((0.0, 0.0), 0.0) == (1, 1)
+    assert hole((0.0, 0.0), 0.1) == (7, 7)  # 0.1 m at 10 m is 3 px
+    assert hole((2.5, 0.0), 0.0) == (5, 1)
+    assert hole((0.0, 4.2), 0.0) == (1, 9)
+    assert hole((1e6, 1e6), 0.0) == (49, 49)  # it never hides the whole image
 
 
 def test_slanted_ground_does_not_hide_itself():
@@ -272,28 +282,29 @@ def test_slanted_ground_does_not_hide_itself():
     camera.K[1, 2] = 10.0  # the horizon near the top
     v, u = np.mgrid[16:100:2, 0:200:2]
     ground = at_pixel(camera, u, v, 300.0 * 1.6 / (v - 10.0))
-    knobs = ProjectSettings(footprint=1.5, hidden_m=0.2, hidden_fraction=0.06)
-    assert np.count_nonzero(see(camera, ground, KEY, knobs).depth_m) == len(ground)
-    with pytest.MonkeyPatch.context() as patch:  # facing patches would
-        patch.setattr("densify.stages.project._PLANE_RESIDUAL", 0.0)
-        assert np.count_nonzero(see(camera, ground, KEY, knobs).depth_m) < 0.9 * len(ground)
+    knobs = ProjectSettings(footprint=1.5, support=1)
+    up = np.tile([0, 1.0, 0], (len(ground), 1))
+    tilted = see(camera, ground, KEY, knobs, (2.0, 2.0), normal=up)
+    assert (tilted.reason == Reason.KEPT).all()
+    assert (see(camera, ground, KEY, knobs, (2.0, 2.0)).reason == Reason.HIDDEN).mean() > 0.1
 
 
 def test_a_patch_is_never_nearer_than_its_point():
     """A wall coming nearer to the right does not hide the panel it would meet if it went on."""
     camera = make_camera(100, 60, 100.0)
-    wall_v, wall_u = np.mgrid[0:60, 0:48]
-    wall_z = 1 / (0.05 + 0.002 * wall_u)
+    v, u = np.mgrid[0:60, 0:48]
+    z = 1 / (0.05 + 0.002 * u)
     panel_v, panel_u = np.mgrid[0:60, 48:60]
-    end_z = wall_z.min()
-    panel = at_pixel(camera, panel_u, panel_v, end_z * 1.01)
-    points = np.vstack([at_pixel(camera, wall_u, wall_v, wall_z), panel])
+    panel = at_pixel(camera, panel_u, panel_v, z.min() * 1.01)
+    points = np.vstack([at_pixel(camera, u, v, z), panel])
+    # the wall's inverse depth 0.002 u + 0.05 is n · ray
+    n = np.array([0.2, 0.0, 0.05 + 0.002 * camera.K[0, 2]])
+    normal = np.vstack([np.tile(n, (u.size, 1)), np.tile([0, 0, 1.0], (len(panel), 1))])
     knobs = ProjectSettings(footprint=3.0, slack_m=0.0, hidden_m=0.0, hidden_fraction=0.011)
-    depth = see(camera, points, KEY, knobs)
-    assert (depth.depth_m[:, 48:60] == np.float32(end_z * 1.01)).all()
+    assert (see(camera, points, KEY, knobs, normal=normal).reason[u.size :] == 0).all()
 
 
-def test_slanted_patches_are_painted_like_a_slow_twin():
+def test_patches_are_painted_like_a_slow_twin():
     rng = np.random.default_rng(6)
     uv, inverse = rng.uniform([-0.4, -0.4], [19.4, 14.4], (40, 2)), rng.uniform(0.05, 0.3, 40)
     slope, half_px = rng.normal(0, 0.03, (40, 2)), rng.uniform(0.5, 4.0, (40, 2))
@@ -303,55 +314,163 @@ def test_slanted_patches_are_painted_like_a_slow_twin():
             if abs(u - p[0]) <= hu and abs(v - p[1]) <= hv:
                 there = w + su * (u - p[0]) + sv * (v - p[1])
                 truth[v, u] = max(truth[v, u], min(max(there, w / 2), w))
-    np.testing.assert_allclose(_paint(uv, inverse, slope, half_px, (15, 20)), truth, rtol=1e-12)
+    canvas = np.zeros((15, 20), np.float32)
+    kernels.paint(uv, inverse, slope, half_px, canvas)
+    np.testing.assert_allclose(canvas, truth, rtol=1e-6)
 
 
-@given(st.integers(0, 2**32 - 1))
-@settings(max_examples=10, deadline=None)
-def test_flat_patches_equal_a_slow_twin(seed):
-    """Too few points for planes: rectangles of known size, painted one pixel at a time."""
-    rng = np.random.default_rng(seed)
-    camera = make_camera(40, 30, 50.0)
-    uv = rng.uniform([-0.4, -0.4], [39.4, 29.4], (30, 2))
-    z = rng.uniform(3, 30, 30)
-    half = np.clip(50.0 * 0.3 / z, 0.5, None)
-    nearest = np.full((30, 40), np.inf)
-    for (u, v), depth, h in zip(uv, z, half, strict=True):
-        for row in range(30):
-            for column in range(40):
-                if abs(column - u) <= h and abs(row - v) <= h:
-                    nearest[row, column] = min(nearest[row, column], depth)
-    row, column = np.rint(uv[:, 1]).astype(int), np.rint(uv[:, 0]).astype(int)
-    visible = z <= 0.2 + 1.06 * nearest[row, column]
-    truth = np.zeros((30, 40))
-    for i in np.flatnonzero(visible)[np.argsort(-z[visible])]:
-        truth[row[i], column[i]] = z[i]
-    knobs = ProjectSettings(footprint=0.0, slack_m=0.3, hidden_m=0.2, hidden_fraction=0.06)
+# --- which of the visible points is believed ------------------------------------------------------
+
+
+def wall(camera, z, frames, noise_m=0.0, step=2):
+    """A wall seen by several sweeps, each on its own grid of pixels."""
+    rng = np.random.default_rng(9)
+    parts, frame = [], []
+    for k, f in enumerate(frames):
+        v, u = np.mgrid[k % step : camera.height_px : step, k % step : camera.width_px : step]
+        parts.append(at_pixel(camera, u, v, z + noise_m * rng.normal(size=u.shape)))
+        frame += [f] * u.size
+    return np.vstack(parts), np.array(frame)
+
+
+SWEEPS = range(KEY - 4, KEY + 5)
+
+
+def test_depth_is_the_planes_in_the_middle_of_the_pixel():
+    """Of points anywhere in their pixels on a slanted plane: exact, where a point's own is not."""
+    camera = make_camera(80, 60, 100.0)
+    rng = np.random.default_rng(10)
+    n = np.array([0.5, 1.2, 0.4])  # inverse depth is n · ray
+    uv = rng.uniform([0, 0], [79, 59], (9000, 2))
+    ray = at_pixel(camera, uv[:, 0], uv[:, 1], 1.0)
+    keep = ray @ n > 0.05
+    points = (ray / (ray @ n)[:, None])[keep]
+    frame = rng.choice(SWEEPS, len(points))
+    knobs = ProjectSettings(support=1, agree_fraction=0.05)
+    normal = np.tile(n, (len(points), 1))
+    depth = see(camera, points, frame, knobs, (2.0, 2.0), normal=normal).depth_m
+    row, column = np.nonzero(depth)
+    truth = 1 / (at_pixel(camera, column, row, 1.0) @ n)
+    assert len(row) > 1500
+    np.testing.assert_allclose(depth[row, column], truth, rtol=1e-5)
+
+
+def test_noise_is_averaged():
+    camera = make_camera(80, 60, 100.0)
+    points, frame = wall(camera, 10.0, SWEEPS, noise_m=0.03, step=3)
+    depth = see(camera, points, frame, ProjectSettings(), (3.0, 3.0)).depth_m
+    assert 0 < np.std(depth[depth > 0]) < 0.015
+
+
+def test_nearest_in_time_wins_among_the_visible_only():
+    camera = make_camera()
+    points, frame = wall(camera, 10.0, SWEEPS)
+    spot = at_pixel(camera, 30, 20, 10.0)
+    here = np.linalg.norm(points[:, :2] / points[:, 2:] - spot[0, :2] / 10, axis=1) < 1e-6
+    points, frame = points[~here], frame[~here]
+    # the key's own point is hidden; of 10.08 and 10 m the one nearer in time, here the farther
+    points = np.vstack([points, spot * 1.5, spot, spot * 1.008, spot * 1.009])
+    frame = np.append(frame, [KEY, KEY + 3, KEY - 2, KEY + 2])
+    depth = see(camera, points, frame, ProjectSettings(plane_reach=0), (2.0, 2.0))
+    assert depth.frame[20, 30] == KEY - 2
+    assert [Reason(r).name for r in depth.reason[-4:]] == [
+        "HIDDEN",
+        "NOT_CHOSEN",
+        "KEPT",
+        "NOT_CHOSEN",
+    ]
+
+
+def test_what_few_sweeps_or_not_the_key_saw_is_unsupported():
+    camera = make_camera(60, 40)
+    knobs = ProjectSettings(support=4)
+
+    def kept(frames, others=()):
+        points, frame = wall(camera, 10.0, frames)
+        aside = at_pixel(
+            camera, [0] * len(others), [0] * len(others), 90.0
+        )  # they exist, elsewhere
+        depth = see(camera, np.vstack([points, aside]), [*frame, *others], knobs, (2.0, 2.0))
+        return (depth.reason[: len(points)] == Reason.KEPT).any()
+
+    assert kept([KEY, KEY + 1, KEY + 2, KEY + 3], [KEY - 1, KEY - 2, KEY - 3, KEY - 4])
+    assert not kept([KEY, KEY + 1, KEY + 2], [KEY - 1, KEY - 2, KEY - 3, KEY - 4, KEY + 3])
+    assert not kept([KEY + 1, KEY + 2, KEY + 3, KEY + 4], [KEY, KEY - 1, KEY - 2, KEY - 3])
+    assert kept([KEY + 1, KEY + 2, KEY - 1, KEY - 2])  # a key held out asks for its neighbours
+    assert kept([KEY])  # a single sweep is enough where there is one
+
+
+def test_no_point_is_believed_at_the_edge_of_its_surface():
+    """A panel before a wall: its outline is as wide as the beams, its inside stays."""
+    camera = make_camera(120, 90, 300.0)
+    back, back_frame = wall(camera, 20.0, SWEEPS)
+    front, front_frame = wall(camera, 10.0, SWEEPS)
+    u = np.rint(front[:, 0] / front[:, 2] * 300 + camera.K[0, 2])
+    panel = (u >= 40) & (u < 80)
+    points = np.vstack([front[panel], back])
+    frame = np.concatenate([front_frame[panel], back_frame])
+    knobs = ProjectSettings(edge_reach=1.0, edge_slack_m=0.0)
+    depth = see(camera, points, frame, knobs, (2.0, 2.0))
+    columns = np.flatnonzero((np.abs(depth.depth_m - 10) < 1)[20:70].any(axis=0))
+    assert (columns.min(), columns.max()) == (43, 76)  # more than a spacing of 2 px from the edge
+    fat = see(camera, points, frame, ProjectSettings(edge_reach=0, edge_slack_m=0), (2.0, 2.0))
+    columns = np.flatnonzero((np.abs(fat.depth_m - 10) < 1)[20:70].any(axis=0))
+    assert (columns.min(), columns.max()) == (40, 79)
+    assert set(np.unique(depth.reason[: panel.sum()])) == {
+        Reason.KEPT,
+        Reason.NOT_CHOSEN,
+        Reason.EDGE,
+    }
+
+
+def test_every_point_has_one_reason():
+    camera = make_camera(60, 40)
+    points, frame = wall(camera, 10.0, SWEEPS)
+    more = np.vstack([[0, 0, -5.0], at_pixel(camera, 30, 20, 5.0), at_pixel(camera, 31, 21, 30.0)])
+    free = np.zeros(len(points) + 3, bool)
+    free[-2] = True
+    depth = see(
+        camera,
+        np.vstack([points, more]),
+        [*frame, KEY, KEY + 1, KEY],
+        ProjectSettings(),
+        (2.0, 2.0),
+        free=free,
+    )
+    assert depth.reason[-3:].tolist() == [Reason.OUTSIDE, Reason.VETOED, Reason.HIDDEN]
+    assert (depth.reason == Reason.KEPT).sum() == (depth.depth_m > 0).sum()
+    assert depth.depth_m[20, 30] == pytest.approx(10)  # what was vetoed hides nothing
+
+
+def test_confidence_falls_with_fewer_sweeps_and_with_noise():
+    camera = make_camera(60, 40)
+
+    def mean(frames, noise_m, more=()):
+        points, frame = wall(camera, 10.0, frames, noise_m)
+        far = at_pixel(camera, [0] * len(more), [0] * len(more), 90.0)
+        depth = see(camera, np.vstack([points, far]), [*frame, *more], ProjectSettings(), (2, 2))
+        assert np.array_equal(depth.confidence > 0, depth.filled_m > 0)
+        assert depth.confidence.max() <= 1
+        return depth.confidence[depth.depth_m > 0].mean()
+
+    best = mean(SWEEPS, 0.0)
+    assert best > mean(SWEEPS, 0.05)
+    assert best > mean(range(KEY - 2, KEY + 3), 0.0, [KEY - 4, KEY - 3, KEY + 3, KEY + 4])
+
+
+def test_threads_change_no_byte():
+    camera = make_camera(400, 300, 300.0)  # enough pixels for two threads
+    points, frame = wall(camera, 10.0, SWEEPS, noise_m=0.05)
+
+    def maps():
+        depth = see(camera, points, frame, ProjectSettings(), (2.0, 2.0))
+        return depth.depth_m.tobytes() + depth.filled_m.tobytes() + depth.confidence.tobytes()
+
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("densify.stages.project._PLANE_RESIDUAL", 0.0)
-        depth = see(camera, at_pixel(camera, uv[:, 0], uv[:, 1], z), KEY, knobs)
-    np.testing.assert_allclose(depth.depth_m, truth, rtol=1e-6)
-
-
-@pytest.mark.parametrize(("azimuth_deg", "elevation_deg"), [(0.18, 0.42), (0.2, 1.33), (0.4, 2.0)])
-def test_spacing_is_measured_on_the_sweep_nearest_the_key(azimuth_deg, elevation_deg):
-    def sweep(azimuth_deg, elevation_deg, origin):
-        turns, beams = np.arange(0, 90, azimuth_deg), np.arange(-16, 4, elevation_deg)
-        az, el = (np.radians(a.ravel()) for a in np.meshgrid(turns, beams))
-        # the lasers sit beside each other: a beam's elevation is not exactly constant
-        el = el + np.radians(rng.uniform(-0.02, 0.02, len(el)))
-        r = np.minimum(30.0, 1.7 / np.maximum(1e-3, -np.sin(el)))  # ground and a round wall
-        ray = np.stack([np.cos(el) * np.cos(az), np.cos(el) * np.sin(az), np.sin(el)], axis=1)
-        return origin + r[:, None] * ray
-
-    rng = np.random.default_rng(7)
-    origins = {KEY + 1: np.array([3.0, 1.0, 0.2]), KEY + 2: np.zeros(3)}
-    one = sweep(azimuth_deg, elevation_deg, origins[KEY + 1])
-    other = sweep(1.0, 1.0, origins[KEY + 2])
-    cloud = make_cloud(np.vstack([other, one]), [KEY + 2] * len(other) + [KEY + 1] * len(one))
-    camera = make_camera(focal=100.0)
-    expected = 100 * np.radians([azimuth_deg, elevation_deg])
-    np.testing.assert_allclose(_spacing_px(cloud, camera, KEY, origins), expected, rtol=0.1)
+        patch.setattr("numba.config.NUMBA_NUM_THREADS", 1)
+        one = maps()
+        patch.setattr("numba.config.NUMBA_NUM_THREADS", 2)
+        assert maps() == one
 
 
 # --- fill -----------------------------------------------------------------------------------------
@@ -361,19 +480,6 @@ def ground_map(rng, share=0.4):
     v, u = np.mgrid[0:40, 0:50]
     depth = (1 / (0.02 + 0.002 * v + 0.0003 * u)).astype(np.float32)
     return depth, np.where(rng.uniform(size=depth.shape) < share, depth, 0).astype(np.float32)
-
-
-def test_planes_are_linear_in_inverse_depth():
-    _, sparse = ground_map(np.random.default_rng(3))
-    planes = fit_planes(sparse, (2, 3))
-    v, u = np.mgrid[0:40, 0:50]
-    good = planes.num_px >= 8
-    good[:3], good[-3:], good[:, :2], good[:, -2:] = False, False, False, False
-    np.testing.assert_allclose(planes.slope_v[good], 0.002, rtol=1e-3)
-    np.testing.assert_allclose(planes.slope_u[good], 0.0003, rtol=1e-2)
-    truth = 0.02 + 0.002 * v + 0.0003 * u
-    np.testing.assert_allclose(planes.centre[good], truth[good], rtol=1e-4)
-    assert planes.residual[good].max() < 1e-5
 
 
 def test_fill_of_a_plane_is_exact_and_keeps_what_was_measured():
@@ -388,7 +494,8 @@ def test_fill_of_a_plane_is_exact_and_keeps_what_was_measured():
     # held within what was measured around it, a filled pixel can be off by a few pixels' worth
     assert np.median(np.abs(filled[added] / depth[added] - 1)) < 1e-3
     assert np.abs(filled[added] / depth[added] - 1).max() < 0.1
-    assert np.allclose(confidence[added], 0.4) and np.allclose(confidence[measured], 0.8)
+    assert confidence[added].min() >= 0.4 - 1e-6 and confidence[added].max() < 0.7
+    assert np.allclose(confidence[measured], 0.8)
 
 
 def two_sided_twin(measured, reach_u, reach_v):
@@ -447,19 +554,7 @@ def test_filled_depth_and_confidence_stay_within_those_around(seed):
         window = np.s_[max(0, v - 3) : v + 4, max(0, u - 2) : u + 3]
         around = depth[window][depth[window] > 0]
         assert around.min() * 0.999 <= filled[v, u] <= around.max() * 1.001
-        assert 0 < confidence[v, u] <= 0.5 * given_confidence[window].max()
-
-
-def test_confidence_is_the_points_own_and_never_zero_where_there_is_depth():
-    camera = make_camera()
-    points = transform(inverse(T_CAM_LIDAR), on_every_pixel(camera, 6.0, step=2))
-    own = np.where(np.arange(len(points)) % 2, 0.6, 0.0)
-    knobs = ProjectSettings(fill_reach=1.0)
-    depth = project(make_cloud(points, KEY, own), camera, T_CAM_LIDAR, knobs, KEY)
-    assert np.array_equal(depth.confidence > 0, depth.filled_m > 0)
-    assert (depth.filled_m > 0).sum() > 3 * (depth.depth_m > 0).sum()
-    measured = depth.confidence[depth.depth_m > 0]
-    assert set(np.unique(measured)) == {np.float32(1 / 255), np.float32(0.6)}
+        assert 0 < confidence[v, u] <= 0.84 * given_confidence[window].max()
 
 
 # --- real -----------------------------------------------------------------------------------------
@@ -489,17 +584,10 @@ def test_real_sweep_hides_what_its_camera_cannot_see():
     points = np.fromfile(sweep, np.float32).reshape(-1, 4)[:, :3].astype(float)
     cloud = make_cloud(points[np.linalg.norm(points, axis=1) > 3])
 
-    plain = project(cloud, camera, T_cam_lidar, PLAIN, KEY)
-    depth = project(cloud, camera, T_cam_lidar, ProjectSettings(), KEY)
+    plain = view(cloud, camera, T_cam_lidar, PLAIN)
+    depth = view(cloud, camera, T_cam_lidar, ProjectSettings())
     measured = depth.depth_m > 0
     # the scanner sits above the camera, so a little of what it sees is hidden, and only a little
     assert 0.9 < measured.sum() / (plain.depth_m > 0).sum() < 1.0
     assert 0.035 < measured.mean() < 0.045
-    assert 2.5 < (depth.filled_m > 0).sum() / measured.sum() < 5
-    # every depth is a real point's, seen back in its pixel
-    row, column = np.nonzero(measured)
-    z = depth.depth_m[row, column].astype(float)
-    back = transform(inverse(T_cam_lidar), at_pixel(camera, column, row, z))
-    from scipy.spatial import cKDTree
-
-    assert (cKDTree(cloud.points).query(back)[0] < 0.001 * z + 0.001).all()
+    assert 4 < (depth.filled_m > 0).sum() / measured.sum() < 7

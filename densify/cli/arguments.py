@@ -84,8 +84,9 @@ def _add_compare(commands: Any) -> None:
         "--methods",
         type=_words,
         metavar="NAME,…",
-        help="of none (the key sweep), icp (registration only), paper (the published scene flow), "
-        "flow (ours); default: all",
+        help="of none (the key sweep), icp (registration only), icp-visible (with our visibility), "
+        "flow-plain (our scene flow without it), paper (the published scene flow), flow (ours); "
+        "default: none,icp,paper,flow",
     )
     _add_output_options(parser)
 

@@ -73,7 +73,7 @@ def compare(options: argparse.Namespace) -> None:
             options.cameras,
             config,
             progress,
-            options.methods or tuple(pipeline.METHODS),
+            options.methods or pipeline.COMPARED,
         )
     paths = write_comparison(
         results,

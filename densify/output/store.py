@@ -17,7 +17,8 @@ data, config and versions as run.yaml::
     depth       where there is truth: camera -> measured, filled -> all, moving, static -> the
                 fields of `densify.depth_metrics.DepthErrors`
     held_out    camera -> the same fields as depth: the key densified from its neighbours alone
-                against its own returns; null for the key sweep alone
+                against its own returns; and curve, `densify.depth_metrics.precision_density`, drawn
+                in curve.png; null for the key sweep alone
     baselines   the same from ``frames`` on for each simpler method on the same registration
 
 A score that nothing can be said of is null.
@@ -42,6 +43,7 @@ import densify
 from densify.errors import InputError
 from densify.output.atomic import staged_folder, write_file
 from densify.output.cloud_laz import write_cloud
+from densify.output.curve import draw_curve
 from densify.output.depth_png import (
     write_age_png,
     write_confidence_png,
@@ -61,7 +63,7 @@ SCHEMA_VERSION = 1
 _OWNED: Mapping[Verb, tuple[str, ...]] = {
     "run": (
         *("depth", "depth_filled", "confidence", "age", "flow", "movers", "optical_flow"),
-        *("cloud.laz", "metrics.json", "figure.png", "run.yaml"),
+        *("cloud.laz", "metrics.json", "figure.png", "curve.png", "run.yaml"),
     ),
     "compare": ("compare.json", "compare.png"),
 }
@@ -169,6 +171,7 @@ def write_result(
         )
         methods = {**result.baselines, result.method: result}
         _write_figure(folder / "figure.png", methods, images)
+        _write_curve(folder / "curve.png", methods)
         _write_run(folder / "run.yaml", result, config, data)
     return _written(out, result.key, "run")
 
@@ -242,6 +245,17 @@ def _write_figure(path: Path, results: Mapping[str, Result], images: Mapping[str
         image = np.zeros((*depth[camera].depth_m.shape, 3), np.uint8)
     panels = {_TITLES.get(m, m): r.depth[camera].depth_m for m, r in results.items()}
     write_picture(path, draw_figure(image, panels))
+
+
+def _write_curve(path: Path, results: Mapping[str, Result]) -> None:
+    """Of the first camera, if any method was scored with the key held out."""
+    curves = {
+        method: next(iter(held_out.values()))["curve"]
+        for method, result in results.items()
+        if (held_out := result.metrics.get("held_out"))
+    }
+    if curves:
+        write_picture(path, draw_curve(curves))
 
 
 def _write_run(path: Path, result: Result, config: Mapping[str, Any], data: str) -> None:

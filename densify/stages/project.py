@@ -1,32 +1,67 @@
 # SPDX-License-Identifier: MIT
 """The accumulated cloud seen from a camera: which points it sees, and the depth map they make.
 
-Points that the camera cannot see are found by occlusion: every point stands for the patch of
-surface between it and the neighbouring rays of the sweep that measured it, and hides what lies
-clearly behind that patch. Of the points left in a pixel the one measured nearest in time to the key
-is taken. Nothing depends on the order of the points.
+Points that the camera cannot see are found by occlusion: every point hides what lies clearly behind
+its patch (`densify.stages.patches`). Of the points left in a pixel the one measured nearest in time
+to the key is taken, if enough sweeps agree with it and no depth edge is too close to tell on which
+side of it the pixel lies. Its depth is that of the plane through the points that agree, in the
+middle of the pixel. Nothing depends on the order of the points.
 """
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 
 import numpy as np
 
 from densify.config import ProjectSettings
-from densify.depth_fill import fill_between, fit_planes
+from densify.depth_fill import fill_between
+from densify.kernels import visibility as kernels
 from densify.pinhole import image_points
 from densify.poses import transform
-from densify.types import Camera, Cloud, DepthMap, Float, Float32, Int
+from densify.types import Bool, Camera, Cloud, DepthMap, Float, Float32, Int, Patches, Reason
 
-# Spacing of a 64-beam scanner, taken when the cloud is too small to measure it.
-_DEFAULT_SPACING_RAD = (np.radians(0.18), np.radians(0.40))
 _MAX_HALF_PX = 24.0  # a point just before the lens must not hide the whole image
-_CELLS_AT_ONCE = 1_000_000  # bounds the memory of painting
-_PLANE_REACH_PX = (2, 3)
-_PLANE_RESIDUAL = 0.03  # of the inverse depth; beyond it a window shows more than one surface
+_MAX_TILT = 0.25  # of the inverse depth per pixel; a plane seen edge-on has no slope
+_MOST_SWEEPS = 63  # that are told apart when they are counted
+_EDGE_WINDOW_PX = 1.5  # beyond the edge, where points must show that a surface goes on
 _LEAST_CONFIDENCE = 1 / 255  # 0 means no depth once written as 8 bits
+# What takes how much of a pixel's confidence, at most: few sweeps, few points, an edge close by,
+# a rough fit, being nearly hidden. Set by hand, in the order of what was most often wrong.
+_DOUBTS = np.array([0.45, 0.25, 0.20, 0.10, 0.10])
+_MANY_POINTS = 20
+_ROUGH_M = 0.10
+
+
+@dataclass(frozen=True)
+class _InImage:
+    """The K points in the image. index: rows of the cloud. uv: (K,2) px. depth: (K,) m, as it is
+    stored. slope: (K,2) of the tangent plane's inverse depth, 1/m per px. spacing_px: (K,2) between
+    neighbouring rays. moving: (K,). frame, sweep: (K,) source; sweep counts from 0."""
+
+    index: Int
+    uv: Float
+    depth: Float32
+    slope: Float
+    spacing_px: Float
+    moving: Bool
+    frame: np.ndarray
+    sweep: np.ndarray
+
+    @property
+    def inverse(self) -> Float:
+        return 1 / self.depth.astype(np.float64)
+
+
+@dataclass(frozen=True)
+class _Pixels:
+    """P measured pixels. pixel: (P,) row by row. winner: (P,) which of the points in the image.
+    depth_m, confidence: (P,)."""
+
+    pixel: Int
+    winner: Int
+    depth_m: Float32
+    confidence: Float32
 
 
 def project(
@@ -35,178 +70,161 @@ def project(
     T_cam_key: Float,
     settings: ProjectSettings,
     key: int,
-    origins: Mapping[int, Float] | None = None,
+    patches: Patches,
 ) -> DepthMap:
     """The depth map that ``camera`` sees of ``cloud``.
 
     T_cam_key: (4,4), with the ego motion from the key's reference time to the camera's own.
-    settings: knobs, see `densify.config.ProjectSettings`.
-    key: the key frame; the source sweep nearest to it in time wins a pixel.
-    origins: (3,) where each source sweep's lidar stood, key frame, by frame, so that a point's
-        patch has the size its own sweep saw; without it all count as measured from the key's.
+    settings: knobs, see `densify.config.ProjectSettings`; with ``visibility`` off the nearest point
+    of each pixel is taken as it is. key: the key frame; the source sweep nearest to it in time wins
+    a pixel. patches: of the cloud, at the key's moment (`densify.stages.patches.patches`).
 
     Points with z ≤ 0.1 m, outside the image or outside the lens's valid field of view are dropped.
-    ``depth_m`` is the camera z of a real point. ``filled_m`` adds pixels interpolated between
-    measured ones (`densify.depth_fill.fill_between`). ``confidence`` ranks only.
+    ``filled_m`` adds pixels interpolated between measured ones (`densify.depth_fill.fill_between`).
+    ``confidence`` ranks only: the point's own, less where few sweeps or points agree, a depth edge
+    is close, the surface rough, or the point nearly hidden. ``reason`` says of every point why it
+    is not in the map.
     """
-    points_cam = transform(T_cam_key, cloud.points)
-    uv, seen = image_points(camera, points_cam)
-    index = np.flatnonzero(seen)
-    # Depth as it is stored, so that equal depths tie here as they do in the map.
-    uv, depth = uv[index], points_cam[index, 2].astype(np.float32)
-    spacing_px = _spacing_px(cloud, camera, key, origins)
-    half_px = _half_px(cloud, index, depth, spacing_px, camera, settings, origins)
-    visible = ~_hidden(uv, depth, half_px, camera, settings)
-    index, uv, depth = index[visible], uv[visible], depth[visible]
+    points = _in_image(cloud, camera, T_cam_key, patches, settings.visibility)
+    own = np.clip(cloud.confidence[points.index], _LEAST_CONFIDENCE, 1.0)
+    reason = np.full(len(cloud), Reason.OUTSIDE, np.uint8)
+    if settings.visibility:
+        reason[patches.free] = Reason.VETOED
+        seen = _visible(points, own, camera, settings, key, reason)
+    else:
+        start, order = _by_pixel(points, np.zeros(len(own), np.int64), own, camera)
+        pixel = np.flatnonzero(np.diff(start))
+        nearest = order[start[pixel]]
+        reason[points.index] = Reason.NOT_CHOSEN
+        seen = _Pixels(pixel, nearest, points.depth[nearest], own[nearest])
+    reason[points.index[seen.winner]] = Reason.KEPT
 
     shape = (camera.height_px, camera.width_px)
-    column, row = np.rint(uv).astype(np.int64).T
-    pixel = row * camera.width_px + column
-    frame = cloud.frame[index]
-    confidence = np.clip(cloud.confidence[index], _LEAST_CONFIDENCE, 1.0)
-    best = _best_per_pixel(pixel, (np.abs(frame - key), depth, frame, -confidence))
-    depth_m = np.zeros(shape, np.float32)
-    measured_confidence = np.zeros(shape, np.float32)
-    source = np.full(shape, -1, np.int32)
-    depth_m.flat[pixel[best]] = depth[best]
-    measured_confidence.flat[pixel[best]] = confidence[best]
-    source.flat[pixel[best]] = frame[best]
-
-    reach_px = np.maximum(1, np.rint(settings.fill_reach * spacing_px)).astype(int)
+    depth_m, confidence = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
+    frame = np.full(shape, -1, np.int32)
+    depth_m.flat[seen.pixel] = seen.depth_m
+    confidence.flat[seen.pixel] = np.maximum(seen.confidence, _LEAST_CONFIDENCE)
+    frame.flat[seen.pixel] = points.frame[seen.winner]
     filled_m, filled_confidence = fill_between(
         depth_m,
-        measured_confidence,
-        (int(reach_px[0]), int(reach_px[1])),
+        confidence,
+        _fill_reach_px(points, settings),
         settings.edge_m,
         settings.edge_fraction,
         settings.fill_confidence,
     )
-    filled_confidence[filled_m > 0] = np.maximum(
-        filled_confidence[filled_m > 0], np.float32(_LEAST_CONFIDENCE)
+    some = filled_m > 0
+    filled_confidence[some] = np.maximum(filled_confidence[some], np.float32(_LEAST_CONFIDENCE))
+    return DepthMap(camera.name, depth_m, filled_m, filled_confidence, frame, reason)
+
+
+def _in_image(
+    cloud: Cloud, camera: Camera, T_cam_key: Float, patches: Patches, vetoed: bool
+) -> _InImage:
+    ahead = cloud.points @ T_cam_key[2, :3] + T_cam_key[2, 3] > 0
+    index = np.flatnonzero(ahead & ~patches.free if vetoed else ahead)
+    points_cam = transform(T_cam_key, cloud.points[index])
+    uv, seen = image_points(camera, points_cam)
+    index, points_cam, uv = index[seen], points_cam[seen], uv[seen]
+    depth = points_cam[:, 2].astype(np.float32)
+    focal_px = camera.K[[0, 1], [0, 1]]
+    normal = patches.normal[index].astype(np.float64) @ T_cam_key[:3, :3].T
+    # On the plane n · p = d the inverse depth is n · ray / d: linear over the image.
+    d = np.einsum("ij,ij->i", normal, points_cam)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        slope = np.nan_to_num(normal[:, :2] / (d[:, None] * focal_px), posinf=0.0, neginf=0.0)
+    most = _MAX_TILT / depth[:, None]
+    return _InImage(
+        index=index,
+        uv=uv,
+        depth=depth,
+        slope=np.clip(slope, -most, most),
+        spacing_px=patches.spacing_m[index] * focal_px / depth[:, None],
+        moving=cloud.moving[index],
+        frame=cloud.frame[index],
+        sweep=np.minimum(patches.sweep[index], _MOST_SWEEPS - 1),
     )
-    return DepthMap(camera.name, depth_m, filled_m, filled_confidence, source)
 
 
-def _spacing_px(
-    cloud: Cloud, camera: Camera, key: int, origins: Mapping[int, Float] | None
-) -> Float:
-    """(2,) pixels between neighbouring rays, horizontally and vertically, seen from the scanner.
-
-    Measured on the sweep nearest the key: the medians of the gaps in azimuth within thin bands of
-    elevation, and of the gaps in elevation within thin sectors (those too small for another beam
-    left out).
-    """
-    azimuth_rad, elevation_rad = _DEFAULT_SPACING_RAD
-    if len(cloud):
-        nearest = _best_per_pixel(np.zeros(len(cloud), np.int64), (np.abs(cloud.frame - key),))
-        frame = cloud.frame[nearest].min()
-        origin = np.zeros(3) if origins is None else origins[int(frame)]
-        x, y, z = (cloud.rigid_points[cloud.frame == frame] - origin).T
-        azimuth, elevation = np.arctan2(y, x), np.arctan2(z, np.hypot(x, y))
-        azimuth_rad = _median_gap(azimuth, elevation, np.radians(0.1), 0.0, azimuth_rad)
-        elevation_rad = _median_gap(
-            elevation, azimuth, np.radians(1.0), azimuth_rad / 2, elevation_rad
-        )
-    return np.array([camera.K[0, 0] * azimuth_rad, camera.K[1, 1] * elevation_rad])
-
-
-def _median_gap(
-    angle: Float, across: Float, band_rad: float, least_rad: float, default_rad: float
-) -> float:
-    """Median gap between successive angles that share a band of the other angle."""
-    band = np.floor(across / band_rad)
-    order = np.lexsort((angle, band))
-    gap = np.diff(angle[order])[np.diff(band[order]) == 0]
-    gap = gap[(gap > max(least_rad, 1e-4)) & (gap < np.radians(4.0))]
-    return float(np.median(gap)) if len(gap) >= 100 else default_rad
-
-
-def _half_px(
-    cloud: Cloud,
-    index: Int,
-    depth: Float32,
-    spacing_px: Float,
+def _visible(
+    points: _InImage,
+    own: Float32,
     camera: Camera,
     settings: ProjectSettings,
-    origins: Mapping[int, Float] | None,
-) -> Float:
-    """(K,2) half size of each point's patch in the image."""
-    offset = cloud.rigid_points[index]
-    if origins is not None:
-        frames, which = np.unique(cloud.frame[index], return_inverse=True)
-        offset = offset - np.array([origins[int(f)] for f in frames]).reshape(-1, 3)[which]
-    ray_px = spacing_px * (np.linalg.norm(offset, axis=1) / depth)[:, None]
-    slack_px = settings.slack_m * camera.K[[0, 1], [0, 1]] / depth[:, None]
-    return np.clip(settings.footprint * ray_px + slack_px, 0.5, _MAX_HALF_PX)
-
-
-def _hidden(
-    uv: Float, depth: Float32, half_px: Float, camera: Camera, settings: ProjectSettings
-) -> np.ndarray:
-    """(K,) bool, behind some other point's patch.
-
-    A patch is slanted like the surface around it where the nearest points of the pixels around lie
-    on one plane, otherwise it faces the camera; either way it is never nearer than its own point.
-    """
-    column, row = np.rint(uv).astype(np.int64).T
-    nearest = np.full((camera.height_px, camera.width_px), np.inf, np.float32)
-    np.minimum.at(nearest, (row, column), depth)
-    nearest[np.isinf(nearest)] = 0
-    planes = fit_planes(nearest, _PLANE_REACH_PX)
-    one = planes.residual[row, column] < _PLANE_RESIDUAL * planes.centre[row, column]
-    slope = np.stack([planes.slope_u[row, column], planes.slope_v[row, column]], axis=1)
+    key: int,
+    reason: np.ndarray,
+) -> _Pixels:
+    """The pixels that the points not hidden measure; fills in the ``reason`` of the others."""
+    behind = _behind(points, camera, settings)
+    hidden = behind > 1
+    reason[points.index] = np.where(hidden, Reason.HIDDEN, Reason.NOT_CHOSEN)
+    age = np.abs(points.frame.astype(np.int64) - key)
+    last = int(age.max(initial=0)) + 1
+    start, order = _by_pixel(points, np.where(hidden, last, age), own, camera)
+    found = np.zeros((6, len(start) - 1), np.float32)
+    knobs = np.array(
+        [
+            *(settings.support_reach, settings.plane_reach),
+            *(settings.agree_m, settings.agree_fraction),
+            *(settings.hidden_m, settings.hidden_fraction),
+            *(settings.edge_reach, settings.edge_slack_m * camera.K[0, 0], _EDGE_WINDOW_PX),
+        ]
+    )
     shape = (camera.height_px, camera.width_px)
-    inverse = 1 / depth.astype(float)
-    occluder = 1 / _paint(uv, inverse, slope * one[:, None], half_px, shape)[row, column]
-    return depth > occluder + settings.hidden_m + settings.hidden_fraction * occluder
+    kernels.settle.over_rows(
+        *(len(start) - 1, start, order, points.uv, points.inverse, points.slope),
+        *(points.spacing_px, points.sweep, hidden, points.moving, age, knobs, shape, found),
+    )
+    pixel = np.flatnonzero(found[0])
+    winner = order[start[pixel]]
+    depth_m, num_sweeps, youngest, num_points, residual_m, edge = found[:, pixel]
+    most_sweeps = int(points.sweep.max(initial=0)) + 1
+    needed = min(settings.support, max(1, most_sweeps // 2))
+    supported = (num_sweeps >= needed) & (youngest <= age.min(initial=last))
+    inside = edge >= 1
+    reason[points.index[winner[~inside]]] = Reason.EDGE
+    reason[points.index[winner[~supported]]] = Reason.UNSUPPORTED
+    doubts = np.stack(
+        [
+            1 - num_sweeps / most_sweeps,
+            1 - np.minimum(num_points / _MANY_POINTS, 1),
+            np.clip(3 - edge, 0, 2) / 2,
+            np.minimum(residual_m / _ROUGH_M, 1),
+            np.clip(behind[winner], 0, 1),
+        ]
+    )
+    confidence = (own[winner] * (1 - _DOUBTS @ doubts)).astype(np.float32)
+    kept = supported & inside
+    return _Pixels(pixel[kept], winner[kept], depth_m[kept], confidence[kept])
 
 
-def _paint(
-    uv: Float, inverse: Float, slope: Float, half_px: Float, shape: tuple[int, int]
-) -> Float:
-    """(H,W) greatest inverse depth of the patches that cover a pixel, 0 none.
-
-    uv, slope, half_px: (K,2); inverse: (K,). A patch covers the pixel centres within ``half_px`` of
-    its point, with inverse depth ``inverse + slope · offset``, between half of ``inverse``
-    and all of it.
-    """
-    border = int(_MAX_HALF_PX) + 1
-    width = shape[1] + 2 * border
-    canvas = np.zeros((shape[0] + 2 * border) * width)
-    first = np.ceil(uv - half_px).astype(np.int64)
-    count = np.floor(uv + half_px).astype(np.int64) - first + 1
-    for group in _same_size(count):
-        steps_u, steps_v = (np.arange(n) for n in count[group[0]])
-        corner = (first[group] - uv[group]) * slope[group]
-        tilt_u = corner[:, :1] + slope[group, :1] * steps_u
-        tilt_v = corner[:, 1:] + slope[group, 1:] * steps_v
-        tilt = np.minimum(tilt_v[:, :, None] + tilt_u[:, None, :], 0.0)
-        tilt = np.maximum(tilt, -0.5 * inverse[group, None, None])
-        start = (first[group, 1] + border) * width + first[group, 0] + border
-        cell = start[:, None, None] + steps_v[:, None] * width + steps_u
-        np.maximum.at(canvas, cell.ravel(), (inverse[group, None, None] + tilt).ravel())
-    return canvas.reshape(-1, width)[border:-border, border:-border]
+def _behind(points: _InImage, camera: Camera, settings: ProjectSettings) -> Float:
+    """(K,) how far each point lies behind the nearest patch over its pixel, as a share of what is
+    allowed; above 1 it is hidden."""
+    slack_px = settings.slack_m * camera.K[[0, 1], [0, 1]] / points.depth[:, None]
+    half_px = np.clip(settings.footprint * points.spacing_px + slack_px, 0.5, _MAX_HALF_PX)
+    nearest = np.zeros((camera.height_px, camera.width_px), np.float32)
+    kernels.paint(points.uv, points.inverse, points.slope, half_px, nearest)
+    column, row = np.rint(points.uv).astype(np.int64).T
+    occluder = 1 / nearest[row, column].astype(np.float64)
+    allowed = settings.hidden_m + settings.hidden_fraction * occluder
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.nan_to_num((points.depth - occluder) / allowed, posinf=np.inf)
 
 
-def _same_size(count: Int) -> Iterator[Int]:
-    """Groups of patches of one width and height, few enough to be painted in one piece."""
-    size = count[:, 0] * 64 + count[:, 1]  # no patch has more than 49 pixels a side
-    order = np.argsort(size, kind="stable")
-    changes = np.flatnonzero(np.diff(size[order], prepend=-1))
-    for start, end in itertools.pairwise([*changes, len(order)]):
-        most = max(1, _CELLS_AT_ONCE // int(count[order[start]].prod()))
-        for piece in range(start, end, most):
-            yield order[piece : min(piece + most, end)]
+def _by_pixel(points: _InImage, rank: Int, own: Float32, camera: Camera) -> tuple[Int, Int]:
+    """The points of pixel p are ``order[start[p]:start[p + 1]]``, the least in rank first, then the
+    nearest."""
+    column, row = np.rint(points.uv).astype(np.int64).T
+    start = np.empty(camera.height_px * camera.width_px + 1, np.int64)
+    order = np.empty(len(rank), np.int64)
+    pixel = row * camera.width_px + column
+    kernels.by_pixel(pixel, rank, points.depth, points.frame, points.uv, own, start, order)
+    return start, order
 
 
-def _best_per_pixel(pixel: Int, ranks: tuple[np.ndarray, ...]) -> Int:
-    """Indices of the points that win their pixel: least in the first rank, then the next, …
-
-    Points equal in every rank all win.
-    """
-    winner = np.arange(len(pixel))
-    for rank in ranks:
-        least = np.full(int(pixel.max(initial=-1)) + 1, np.inf)
-        np.minimum.at(least, pixel[winner], rank[winner].astype(float))
-        winner = winner[rank[winner] == least[pixel[winner]]]
-    return winner
+def _fill_reach_px(points: _InImage, settings: ProjectSettings) -> tuple[int, int]:
+    if not len(points.index):
+        return 1, 1
+    reach = np.ceil(settings.fill_reach * np.median(points.spacing_px, axis=0))
+    return max(1, int(reach[0])), max(1, int(reach[1]))

@@ -1,0 +1,324 @@
+# SPDX-License-Identifier: MIT
+"""What a point stands for and what it hides, compiled: see `densify.stages.patches` and
+`densify.stages.project`."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from densify.kernels import Kernel, inlined
+
+_STEEP = 5.7  # metres farther per metre across, 10 degrees: a surface steeper on one side is a step
+_RIDGE_PX2 = 0.02
+_LEAST_WINDOW_PX, _LEAST_FIT_PX, _MOST_PX = 3, 2.0, 24
+_MOVING_SLACK = 2.0  # motion is known less well than where things stand
+_MOVING_WITNESS = 1  # sweeps from the key
+_ANY_AGE = 1 << 40
+_ALL_ROUND = 3.0  # edges' reaches: no edge near
+_DIAGONAL = np.sqrt(0.5)
+_BEND_M = 0.10
+_BEND = 0.25  # of the change itself
+
+
+@Kernel
+def look(first, last, points, origins, sweep, seen):  # type: ignore[no-untyped-def]
+    """Points in the directions they were measured: seen (3,N) float32, filled with azimuth,
+    elevation (rad) and range (m). points: (N,3) float64; origins: (S,3) of the scanner in each
+    sweep; sweep: (N,) int32."""
+    for i in range(first, last):
+        x = points[i, 0] - origins[sweep[i], 0]
+        y = points[i, 1] - origins[sweep[i], 1]
+        z = points[i, 2] - origins[sweep[i], 2]
+        level = np.sqrt(x * x + y * y)
+        seen[0, i] = np.arctan2(y, x)
+        seen[1, i] = np.arctan2(z, level)
+        seen[2, i] = np.sqrt(level * level + z * z)
+
+
+@inlined
+def _cell(azimuth, elevation, ring_of, low_rad, bin_rad, shape):  # type: ignore[no-untyped-def]
+    """Row and column in a sweep's grid of one ring by one azimuth step."""
+    place = (elevation - low_rad) / bin_rad
+    k = min(max(int(place), 0), len(ring_of) - 2)
+    ring = ring_of[k] + (place - k) * (ring_of[k + 1] - ring_of[k])
+    row = min(max(int(ring), 0), shape[0] - 1)
+    column = int((azimuth + np.pi) * (shape[1] / (2 * np.pi)))
+    return row, min(max(column, 0), shape[1] - 1)
+
+
+@Kernel
+def nearest_in_cells(seen, members, ring_of, low_rad, bin_rad, grid):  # type: ignore[no-untyped-def]
+    """grid: (R,C) int32, filled with the nearest of ``members`` (indices) in each cell, -1 none."""
+    grid[:] = -1
+    for i in members:
+        row, column = _cell(seen[0, i], seen[1, i], ring_of, low_rad, bin_rad, grid.shape)
+        there = grid[row, column]
+        if there < 0 or seen[2, i] < seen[2, there]:
+            grid[row, column] = i
+
+
+@inlined
+def _slope(one, other, step, range_m):  # type: ignore[no-untyped-def]
+    """Change of inverse range per radian from the changes on both sides (NaN: none).
+
+    Where both tell of one surface their mean; else the lesser, unless it is a step in depth.
+    """
+    metres = step * range_m * range_m  # of range per step, by a unit of slope
+    if abs(one - other) * metres <= _BEND_M + _BEND * abs(one + other) * metres:
+        return 0.5 * (one + other)
+    if not abs(one) <= abs(other):  # NaN too
+        one = other
+    return one if abs(one) * range_m <= _STEEP else 0.0
+
+
+@inlined
+def _beside(grid, row, column, rows, columns):  # type: ignore[no-untyped-def]
+    """The point in the first filled cell of those at the given distances, -1 none."""
+    for k in range(len(rows)):
+        r = row + rows[k]
+        if 0 <= r < grid.shape[0]:
+            there = grid[r, (column + columns[k]) % grid.shape[1]]
+            if there >= 0:
+                return there
+    return -1
+
+
+@inlined
+def _change(seen, i, there, axis, across, slope_across):  # type: ignore[no-untyped-def]
+    """Of inverse range per radian along one angle, that along the other taken off; NaN if none."""
+    if there < 0:
+        return np.nan
+    apart = seen[axis, there] - seen[axis, i]
+    if axis == 0:
+        apart -= 2 * np.pi * np.rint(apart / (2 * np.pi))
+    if abs(apart) < 1e-5:
+        return np.nan
+    beside = seen[across, there] - seen[across, i]
+    return (1 / seen[2, there] - 1 / seen[2, i] - slope_across * beside) / apart
+
+
+@Kernel
+def tangents(first, last, members, seen, ring_of, low_rad, bin_rad, steps, grid, normal, spacing):  # type: ignore[no-untyped-def]
+    """The tangent plane and the spacing of the rays at each of a sweep's points.
+
+    members: (n,) indices of its points, seen: (3,N) of `look`, grid of `nearest_in_cells`.
+    steps: (2,) rad, of azimuth and of one row of the grid. Filled: normal (N,3) float32, of any
+    length: the plane is normal · (p - origin) = 1; spacing (N,2) float32 metres between
+    neighbouring rays, across and along elevation.
+
+    On a plane the inverse range is normal · direction, so its two derivatives tell the normal.
+    """
+    left, right = np.array([-2, -1, -3]), np.array([2, 1, 3])
+    same = np.zeros(3, np.int64)
+    up, down = np.array([1, 1, 1, 2]), np.array([-1, -1, -1, -2])
+    straight = np.array([0, 1, -1, 0])
+    for k in range(first, last):
+        i = members[k]
+        azimuth, elevation, range_m = seen[0, i], seen[1, i], seen[2, i]
+        row, column = _cell(azimuth, elevation, ring_of, low_rad, bin_rad, grid.shape)
+        place = min(max(int((elevation - low_rad) / bin_rad), 0), len(ring_of) - 2)
+        ring_rad = bin_rad / (ring_of[place + 1] - ring_of[place])
+        one = _change(seen, i, _beside(grid, row, column, same, left), 0, 1, 0.0)
+        other = _change(seen, i, _beside(grid, row, column, same, right), 0, 1, 0.0)
+        level = _slope(one, other, 2 * steps[0], range_m)
+        level = 0.0 if np.isnan(level) else level
+        above = _beside(grid, row, column, up, straight)
+        below = _beside(grid, row, column, down, straight)
+        one, other = _change(seen, i, above, 1, 0, level), _change(seen, i, below, 1, 0, level)
+        rise = _slope(one, other, ring_rad, range_m)
+        rise = 0.0 if np.isnan(rise) else rise
+        ca, sa, ce, se = np.cos(azimuth), np.sin(azimuth), np.cos(elevation), np.sin(elevation)
+        aside = level / max(ce, 1e-3)
+        normal[i, 0] = ce * ca / range_m - aside * sa - rise * se * ca
+        normal[i, 1] = ce * sa / range_m + aside * ca - rise * se * sa
+        normal[i, 2] = se / range_m + rise * ce
+        spacing[i, 0] = range_m * ce * steps[0]
+        spacing[i, 1] = range_m * ring_rad
+
+
+@Kernel
+def paint(uv, inverse, slope, half_px, canvas):  # type: ignore[no-untyped-def]
+    """canvas: (H,W) float32, raised to the greatest inverse depth of the patches over a pixel.
+
+    uv, slope, half_px: (K,2); inverse: (K,). A patch covers the pixel centres within ``half_px`` of
+    its point, with inverse depth ``inverse + slope · offset``, between half of ``inverse`` and all
+    of it.
+    """
+    height, width = canvas.shape
+    for i in range(len(inverse)):
+        w = inverse[i]
+        left = max(int(np.ceil(uv[i, 0] - half_px[i, 0])), 0)
+        right = min(int(np.floor(uv[i, 0] + half_px[i, 0])), width - 1)
+        top = max(int(np.ceil(uv[i, 1] - half_px[i, 1])), 0)
+        bottom = min(int(np.floor(uv[i, 1] + half_px[i, 1])), height - 1)
+        for v in range(top, bottom + 1):
+            tilt_v = slope[i, 1] * (v - uv[i, 1])
+            for u in range(left, right + 1):
+                there = w + min(max(tilt_v + slope[i, 0] * (u - uv[i, 0]), -0.5 * w), 0.0)
+                canvas[v, u] = max(canvas[v, u], np.float32(there))
+
+
+@inlined
+def _before(a, b, rank, depth, frame, uv, confidence):  # type: ignore[no-untyped-def]
+    """Does point a win a pixel over b? Equal points change nothing whichever comes first."""
+    if rank[a] != rank[b]:
+        return rank[a] < rank[b]
+    if depth[a] != depth[b]:
+        return depth[a] < depth[b]
+    if frame[a] != frame[b]:
+        return frame[a] < frame[b]
+    if uv[a, 0] != uv[b, 0]:
+        return uv[a, 0] < uv[b, 0]
+    if uv[a, 1] != uv[b, 1]:
+        return uv[a, 1] < uv[b, 1]
+    return confidence[a] > confidence[b]
+
+
+@Kernel
+def by_pixel(pixel, rank, depth, frame, uv, confidence, start, order):  # type: ignore[no-untyped-def]
+    """Points sorted by pixel, and in each pixel by rank, then by depth.
+
+    pixel, rank: (K,) int64. Filled: start (num_pixels + 1,)
+    int64 and order (K,) int64: of pixel p the points ``order[start[p]:start[p + 1]]``.
+    """
+    start[:] = 0
+    for p in pixel:
+        start[p + 1] += 1
+    for p in range(len(start) - 1):
+        start[p + 1] += start[p]
+    filled = np.zeros(len(start) - 1, np.int32)
+    for i in range(len(pixel)):
+        p = pixel[i]
+        at = start[p] + filled[p]
+        while at > start[p] and _before(i, order[at - 1], rank, depth, frame, uv, confidence):
+            order[at] = order[at - 1]
+            at -= 1
+        order[at] = i
+        filled[p] += 1
+
+
+@inlined
+def _centre(m):  # type: ignore[no-untyped-def]
+    """Value in the origin of the weighted least-squares plane with moments n u v uu uv vv w uw vw;
+    the ridge keeps points that lie on one line, or nearly so, from tilting it."""
+    n = m[0]
+    u, v, w = m[1] / n, m[2] / n, m[6] / n
+    uu, vv = m[3] / n - u * u + _RIDGE_PX2, m[5] / n - v * v + _RIDGE_PX2
+    uv, uw, vw = m[4] / n - u * v, m[7] / n - u * w, m[8] / n - v * w
+    determinant = uu * vv - uv * uv
+    slope_u, slope_v = (vv * uw - uv * vw) / determinant, (uu * vw - uv * uw) / determinant
+    return w - slope_u * u - slope_v * v
+
+
+@inlined
+def _add(m, weight, u, v, w):  # type: ignore[no-untyped-def]
+    m[0] += weight
+    m[1] += weight * u
+    m[2] += weight * v
+    m[3] += weight * u * u
+    m[4] += weight * u * v
+    m[5] += weight * v * v
+    m[6] += weight * w
+    m[7] += weight * u * w
+    m[8] += weight * v * w
+
+
+@inlined
+def _window(reach_px):  # type: ignore[no-untyped-def]
+    return int(min(max(np.rint(reach_px), _LEAST_WINDOW_PX), _MOST_PX))
+
+
+@inlined
+def _fit(reach_px):  # type: ignore[no-untyped-def]
+    """Where the weight has fallen to zero."""
+    return min(max(reach_px, _LEAST_FIT_PX), _MOST_PX) + 1
+
+
+@inlined
+def _extend(reach, u, v):  # type: ignore[no-untyped-def]
+    """How far points lie in eight directions."""
+    reach[0], reach[1] = max(reach[0], u), max(reach[1], -u)
+    reach[2], reach[3] = max(reach[2], v), max(reach[3], -v)
+    a, b = _DIAGONAL * (u + v), _DIAGONAL * (u - v)
+    reach[4], reach[5] = max(reach[4], a), max(reach[5], -a)
+    reach[6], reach[7] = max(reach[6], b), max(reach[7], -b)
+
+
+@Kernel
+def settle(  # type: ignore[no-untyped-def]
+    first,
+    last,
+    start,
+    order,
+    uv,
+    inverse,
+    slope,
+    spacing_px,
+    sweep,
+    hidden,
+    moving,
+    age,
+    knobs,
+    shape,
+    found,
+):
+    """Each pixel's depth from the points around that agree with its first point.
+
+    start, order: of `by_pixel`, hidden points last. spacing_px: (K,2) between neighbouring rays.
+    sweep: (K,) from 0 to 62. moving: (K,) bool. age: (K,) frames from the key. knobs: reach of the
+    support and of the fit in spacings; metres and share of the depth within which points agree; the
+    same beyond which one lies behind; reach of edges in spacings and in px at 1 m, and px beyond it
+    where is looked for what goes on. shape: (height, width). found: (6,P) float32, filled where a
+    point is not hidden with depth, number of sweeps that agree, age of the youngest of them, points
+    in the fit, their root mean square residual (m), and how far the surface goes on to all sides,
+    as a share of the edges' reach.
+    """
+    height, width = shape
+    m, reach = np.zeros(9), np.zeros(8)
+    for p in range(first, last):
+        if start[p] == start[p + 1] or hidden[order[start[p]]]:
+            continue
+        i = order[start[p]]
+        v0, u0 = p // width, p % width
+        w0, su, sv = inverse[i], slope[i, 0], slope[i, 1]
+        centre = w0 + su * (u0 - uv[i, 0]) + sv * (v0 - uv[i, 1])
+        centre = min(max(centre, 0.8 * w0), 1.25 * w0)
+        agree = (knobs[2] + knobs[3] / w0) * w0 * w0
+        far = (knobs[4] + knobs[5] / w0) * w0 * w0
+        inner = knobs[6] * spacing_px[i, 0] + knobs[7] * w0 * (_MOVING_SLACK if moving[i] else 1.0)
+        outer = inner + knobs[8]
+        wide_u, fit_u = _window(knobs[0] * spacing_px[i, 0]), _fit(knobs[1] * spacing_px[i, 0])
+        wide_v, fit_v = _window(knobs[0] * spacing_px[i, 1]), _fit(knobs[1] * spacing_px[i, 1])
+        # Other sweeps saw the background where the mover was not yet, or no more.
+        witness = _MOVING_WITNESS if moving[i] else _ANY_AGE
+        m[:], reach[:] = 0.0, 0.0
+        seen, num, youngest, behind, squares = np.int64(0), 0, age[i], False, 0.0
+        for v in range(max(v0 - wide_v, 0), min(v0 + wide_v, height - 1) + 1):
+            left, right = max(u0 - wide_u, 0), min(u0 + wide_u, width - 1)
+            for q in range(start[v * width + left], start[v * width + right + 1]):
+                j = order[q]
+                du, dv = uv[j, 0] - u0, uv[j, 1] - v0
+                off = inverse[j] - (centre + su * du + sv * dv)
+                close = abs(du) <= outer and abs(dv) <= outer
+                if hidden[j] or abs(off) > agree:
+                    behind |= close and off < -far and age[j] <= witness
+                    continue
+                seen |= np.int64(1) << np.int64(sweep[j])
+                youngest = min(youngest, age[j])
+                if close:
+                    _extend(reach, du, dv)
+                if abs(du) < fit_u and abs(dv) < fit_v:
+                    weight = (1 - abs(du) / fit_u) * (1 - abs(dv) / fit_v)
+                    _add(m, weight, du, dv, off)
+                    squares += weight * off * off
+                    num += 1
+        num_sweeps = 0
+        while seen:
+            num_sweeps += seen & 1
+            seen >>= 1
+        best = min(max(_centre(m), -agree), agree)
+        found[0, p] = 1 / (centre + best)
+        found[1, p], found[2, p], found[3, p] = num_sweeps, youngest, num
+        mean = m[6] / m[0]
+        found[4, p] = np.sqrt(max(squares / m[0] - mean * mean, 0.0)) / (w0 * w0)
+        found[5, p] = np.min(reach) / inner if behind and inner > 0 else _ALL_ROUND

@@ -1,0 +1,186 @@
+# SPDX-License-Identifier: MIT
+"""The accumulated cloud as the cameras see it, each at its own exposure."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from densify import depth_metrics, poses
+from densify.config import Config, ProjectSettings
+from densify.range_image import RangeImage
+from densify.stages.colour import colour
+from densify.stages.optical_flow import optical_flow
+from densify.stages.patches import patches
+from densify.stages.project import project
+from densify.types import (
+    Bool,
+    Camera,
+    Cloud,
+    DepthMap,
+    Float,
+    Float32,
+    LidarSequence,
+    Mover,
+    Stretch,
+)
+
+
+@dataclass(frozen=True)
+class Exposure:
+    """late_s: after the key's reference time. T_cam_key: (4,4), with the ego motion until then.
+    others: "previous" and "next" image, where the stretch holds their sweeps: the same of them."""
+
+    camera: Camera
+    late_s: float
+    T_cam_key: Float
+    others: Mapping[str, tuple[float, Float]]
+
+    @staticmethod
+    def of(
+        sequence: LidarSequence, stretch: Stretch, key: int, camera: Camera, settings: Config
+    ) -> Exposure:
+        """At the image's stamp or, with ``project.at=sweep``, at the sweep's."""
+
+        def of_image(frame: int) -> tuple[float, Float]:
+            registered = stretch[frame]
+            stamp_ns = sequence.image_stamp_ns(camera.name, frame)
+            if settings.project.at == "sweep":
+                stamp_ns = registered.sweep.stamp_ns
+            late_s = (stamp_ns - registered.sweep.stamp_ns) * 1e-9
+            twist = registered.twist_before if late_s < 0 else registered.twist_after
+            T_cam_lidar = camera.T_cam_lidar @ poses.inverse(poses.exp(late_s * twist))
+            since_key_s = (stamp_ns - stretch[key].sweep.stamp_ns) * 1e-9
+            return since_key_s, T_cam_lidar @ stretch.T_target_source(frame, key)
+
+        others = {
+            name: of_image(frame)
+            for name, frame in (("previous", key - 1), ("next", key + 1))
+            if settings.output.optical_flow and frame in stretch.frames
+        }
+        return Exposure(camera, *of_image(key), others)
+
+
+@dataclass(frozen=True)
+class Views:
+    """Every camera's exposure of one key.
+
+    key_image: what the key sweep saw. origins: (3,) where each sweep's lidar stood, key frame, by
+    frame.
+    """
+
+    key: int
+    key_image: RangeImage | None
+    exposures: Mapping[str, Exposure]
+    origins: Mapping[int, Float]
+    settings: ProjectSettings
+
+    @staticmethod
+    def of(
+        sequence: LidarSequence,
+        stretch: Stretch,
+        key: int,
+        key_image: RangeImage,
+        cameras: list[Camera],
+        settings: Config,
+    ) -> Views:
+        exposures = {c.name: Exposure.of(sequence, stretch, key, c, settings) for c in cameras}
+        origins = {f: stretch.T_target_source(key, f)[:3, 3] for f in stretch.frames}
+        return Views(key, key_image, exposures, origins, settings.project)
+
+    def depth(self, cloud: Cloud, visible: bool = True) -> dict[str, DepthMap]:
+        """By camera. visible: leave out what is hidden, vetoed or doubtful."""
+        settings = replace(self.settings, visibility=visible)
+        surface = patches(cloud, self.key, settings, self.origins, self.key_image)
+        return {
+            name: project(cloud.after(e.late_s), e.camera, e.T_cam_key, settings, self.key, surface)
+            for name, e in self.exposures.items()
+        }
+
+    def coloured(
+        self,
+        cloud: Cloud,
+        depth: Mapping[str, DepthMap],
+        images: Mapping[str, NDArray[np.uint8]],
+    ) -> Cloud:
+        """With the colours of the images; depth: what `depth` made of the cloud."""
+        rgb = cloud.rgb
+        for name, e in self.exposures.items():
+            points = cloud.after(e.late_s).points
+            rgb = colour(rgb, points, e.camera, e.T_cam_key, depth[name], images[name])
+        return replace(cloud, rgb=rgb)
+
+    def optical_flow(
+        self, cloud: Cloud, depth: Mapping[str, DepthMap]
+    ) -> dict[str, dict[str, Float32]]:
+        """Camera -> "previous" and "next" image -> (H,W,2) pixels."""
+        return {
+            name: {
+                other: optical_flow(
+                    cloud.after(e.late_s),
+                    depth[name],
+                    e.camera,
+                    e.T_cam_key,
+                    T_other_key,
+                    other_s - e.late_s,
+                )
+                for other, (other_s, T_other_key) in e.others.items()
+            }
+            for name, e in self.exposures.items()
+        }
+
+    def movers(
+        self, cloud: Cloud, visible: bool, images: Mapping[str, NDArray[np.uint8]]
+    ) -> dict[int, Mover]:
+        """Every moving object by itself."""
+        instances = np.unique(cloud.instance[cloud.moving & (cloud.instance >= 0)])
+        movers = {}
+        for instance in instances.tolist():
+            part = cloud.select(cloud.moving & (cloud.instance == instance))
+            depth = self.depth(part, visible)
+            movers[instance] = Mover(self.coloured(part, depth, images), depth)
+        return movers
+
+
+@dataclass(frozen=True)
+class HeldOut:
+    """The key sweep's own returns as the truth for the key densified from its neighbours alone.
+
+    key_alone: maps of the key sweep. moving: (H,W) where its returns are something's that moves.
+    """
+
+    views: Views
+    key_alone: Mapping[str, DepthMap]
+    moving: Mapping[str, Bool]
+
+    @staticmethod
+    def of(views: Views, cloud: Cloud) -> HeldOut:
+        """cloud: says what moves in the key sweep, and how fast."""
+        views = replace(views, key_image=None)  # what is held out must not help
+        own = cloud.select(cloud.frame == views.key)
+        key_alone = views.depth(own)
+        movers = views.depth(own.select(own.moving))
+        moving = {
+            name: (maps.depth_m > 0) & (maps.depth_m == key_alone[name].depth_m)
+            for name, maps in movers.items()
+        }
+        return HeldOut(views, key_alone, moving)
+
+    def scores(self, cloud: Cloud, visible: bool) -> dict[str, Any] | None:
+        """By camera, as `densify.depth_metrics.depth_scores`, and the ``curve`` of precision over
+        density; None for a cloud of the key sweep alone."""
+        rest = cloud.select(cloud.frame != self.views.key)
+        if not len(rest):
+            return None
+        scores: dict[str, Any] = {}
+        for name, maps in self.views.depth(rest, visible).items():
+            truth_m, camera = self.key_alone[name].depth_m, self.views.exposures[name].camera
+            scores[name] = {
+                **depth_metrics.depth_scores(maps, truth_m, self.moving[name], camera),
+                "curve": depth_metrics.precision_density(maps, truth_m, camera),
+            }
+        return scores

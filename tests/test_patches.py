@@ -1,0 +1,132 @@
+# SPDX-License-Identifier: MIT
+"""What points stand for: spacing and tangent planes of scanned scenes known exactly, the veto."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from test_project import KEY, make_cloud
+
+from densify.config import ProjectSettings
+from densify.range_image import RangeImage
+from densify.stages.patches import patches
+from densify.types import RegisteredSweep, Sweep
+
+GROUND_M = 1.7
+
+
+def directions(azimuth_deg, beams_deg):
+    azimuth, elevation = (
+        np.radians(a.ravel()) for a in np.meshgrid(np.arange(-90, 90, azimuth_deg), beams_deg)
+    )
+    return np.stack(
+        [
+            np.cos(elevation) * np.cos(azimuth),
+            np.cos(elevation) * np.sin(azimuth),
+            np.sin(elevation),
+        ],
+        axis=1,
+    )
+
+
+def scanned(ray, origin=(0.0, 0.0, 0.0), wall_m=30.0):
+    """Ground 1.7 m below the origin and a wall across x, met by the rays; and which is which."""
+    with np.errstate(divide="ignore"):
+        ground = np.where(ray[:, 2] < 0, -GROUND_M / ray[:, 2], np.inf)
+        wall = np.where(ray[:, 0] > 0, wall_m / ray[:, 0], np.inf)
+    range_m = np.minimum(ground, wall)
+    return np.asarray(origin) + ray * range_m[:, None], ground < wall
+
+
+SENSORS = {
+    "64 beams": (0.17, np.concatenate([np.linspace(-24.3, -8.8, 32), np.linspace(-8.3, 2, 32)])),
+    "32 beams": (0.17, np.linspace(-30.7, 10.7, 32)),
+    "16 beams": (0.2, np.linspace(-15, 15, 16)),
+}
+
+
+@pytest.mark.parametrize("sensor", SENSORS)
+def test_spacing_is_the_sensors_own(sensor):
+    azimuth_deg, beams_deg = SENSORS[sensor]
+    origin = np.array([3.0, 1.0, 0.2])
+    ray = directions(azimuth_deg, beams_deg)
+    ray = ray[ray[:, 0] > 0.2]
+    points, _ = scanned(ray, origin)
+    cloud = make_cloud(points, KEY + 1)
+    found = patches(cloud, KEY, ProjectSettings(), {KEY + 1: origin})
+    range_m = np.linalg.norm(points - origin, axis=1)
+    level_m = range_m * np.hypot(ray[:, 0], ray[:, 1])
+    across = found.spacing_m[:, 0] / level_m / np.radians(azimuth_deg)
+    assert across.min() > 0.9 and across.max() < 1.1
+    elevation_deg = np.degrees(np.arcsin(ray[:, 2]))
+    step_deg = np.interp(elevation_deg, beams_deg, np.gradient(beams_deg))
+    along = found.spacing_m[:, 1] / range_m / np.radians(step_deg)
+    inside = np.abs(elevation_deg + 8.5) > 1.0  # where the blocks of 64 beams meet it changes
+    assert along[inside].min() > 0.85 and along[inside].max() < 1.15
+
+
+@pytest.mark.parametrize("sensor", SENSORS)
+def test_normals_of_ground_and_wall(sensor):
+    ray = directions(*SENSORS[sensor])
+    ray = ray[ray[:, 0] > 0.3]
+    points, on_ground = scanned(ray)
+    normal = patches(make_cloud(points), KEY, ProjectSettings()).normal.astype(float)
+    np.testing.assert_allclose(np.einsum("ij,ij->i", normal, points), 1, rtol=1e-3)
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    truth = np.where(on_ground[:, None], [0, 0, -1.0], [1.0, 0, 0])
+    right = np.abs(np.einsum("ij,ij->i", normal, truth)) > np.cos(np.radians(5))
+    assert right.mean() > 0.9  # all but where ground and wall meet, and at the ends of the view
+
+
+def test_a_post_before_a_wall_faces_the_scanner():
+    ray = directions(*SENSORS["64 beams"])
+    ray = ray[(ray[:, 0] > 0.3) & (ray[:, 2] > -0.02)]
+    points = ray * (30 / ray[:, :1])
+    post = np.abs(ray[:, 1]) < 0.002
+    points[post] *= 1 / 3
+    normal = patches(make_cloud(points), KEY, ProjectSettings()).normal.astype(float)
+    assert post.sum() > 10
+    towards = np.einsum("ij,ij->i", normal, ray) / np.linalg.norm(normal, axis=1)
+    assert towards[post].min() > 0.99
+
+
+def test_order_of_the_points_does_not_matter():
+    rng = np.random.default_rng(3)
+    points, _ = scanned(directions(*SENSORS["16 beams"])[:4000] + [1e-3, 0, 0])
+    order = rng.permutation(len(points))
+    one = patches(make_cloud(points), KEY, ProjectSettings())
+    other = patches(make_cloud(points[order]), KEY, ProjectSettings())
+    assert one.normal[order].tobytes() == other.normal.tobytes()
+    assert one.spacing_m[order].tobytes() == other.spacing_m.tobytes()
+
+
+def test_veto_of_what_the_key_saw_through():
+    """Points of another sweep before the wall are free, behind it or near it not; the key's own
+    points never are."""
+    points, _ = scanned(directions(*SENSORS["32 beams"]))
+    points = points[np.linalg.norm(points, axis=1) < 60]
+    n = len(points)
+    sweep = Sweep(
+        KEY, 0, points, np.zeros(n, np.float32), None, np.zeros(n, np.uint8), np.arange(n)
+    )
+    key_image = RangeImage.of(RegisteredSweep(sweep, np.eye(4), np.zeros(6), np.zeros(6)))
+    spots = np.array([[20, 0.5, 0.4], [29.9, 0.5, 0.4], [33, 0.5, 0.4], [20, 0.5, 0.4]])
+    cloud = make_cloud(np.vstack([points, spots]), [KEY] * n + [KEY + 2] * 3 + [KEY])
+    origins = {KEY: np.zeros(3), KEY + 2: np.zeros(3)}
+
+    def free(knobs, image):
+        return patches(cloud, KEY, knobs, origins, image).free
+
+    found = free(ProjectSettings(), key_image)
+    assert found[n:].tolist() == [True, False, False, False] and not found[:n].any()
+    assert not free(ProjectSettings(veto_m=10.0), key_image).any()
+    assert not free(ProjectSettings(veto_m=10.0, veto_fraction=1.0), key_image).any()
+    assert not free(ProjectSettings(), None).any()
+
+
+def test_empty_and_tiny_clouds():
+    for n in (0, 1, 3):
+        found = patches(make_cloud(np.ones((n, 3))), KEY, ProjectSettings())
+        assert found.normal.shape == (n, 3) and found.spacing_m.shape == (n, 2)
+        assert found.free.shape == (n,) and found.sweep.shape == (n,)
+        assert np.isfinite(found.normal).all() and (found.spacing_m > 0).all()
