@@ -18,6 +18,7 @@ from tests.exact_motion import registered
 from tests.small_street import KEY, POSES_GIVEN, one_car
 
 STEP = (100, 101)
+PLAIN = POSES_GIVEN | {"project": {"visibility": False}}  # no point has a say in another's depth
 
 
 # --- from the pipeline and back -------------------------------------------------------------------
@@ -26,14 +27,14 @@ STEP = (100, 101)
 @pytest.fixture(scope="module")
 def ours(tmp_path_factory) -> tuple[Result, Path]:
     """A run with the flow it found, and the folder of its flow files."""
-    result = run(one_car(), KEY, 1, config=POSES_GIVEN | {"output": {"flow": True}})
+    result = run(one_car(), KEY, 1, config=PLAIN | {"output": {"flow": True}})
     folder = tmp_path_factory.mktemp("flow")
     write_flow_files(folder, result.flow)
     return result, folder
 
 
 def depth_from(folder: Path) -> Result:
-    return run(one_car(), KEY, 1, config=POSES_GIVEN | {"flow": {"engine": f"npz:{folder}"}})
+    return run(one_car(), KEY, 1, config=PLAIN | {"flow": {"engine": f"npz:{folder}"}})
 
 
 def assert_same(found: Result, ours: Result) -> None:
@@ -43,7 +44,7 @@ def assert_same(found: Result, ours: Result) -> None:
     assert np.array_equal(found.cloud.moving[~own], ours.cloud.moving[~own])
     assert np.abs(found.cloud.points - ours.cloud.points)[~own].max() < 2e-5
     here, there = found.depth["front"], ours.depth["front"]
-    same = (here.frame == there.frame) & (here.frame != KEY)
+    same = (here.frame == there.frame) & (here.frame != KEY) & (here.frame >= 0)
     assert same.sum() > 3000
     np.testing.assert_allclose(here.depth_m[same], there.depth_m[same], atol=2e-5)
     assert (here.frame == there.frame).mean() > 0.98

@@ -113,7 +113,7 @@ def test_flow_to_both_neighbours_is_that_of_the_street(late_s):
         found = result.optical_flow["front"][name]
         known = np.isfinite(found).all(axis=2)
         measured = result.depth["front"].depth_m > 0
-        assert not (known & ~measured).any() and known.sum() > 0.99 * measured.sum()
+        assert not (known & ~measured).any() and known.sum() > 0.95 * measured.sum()
         true, moving = true_flow(sequence, other)
         off_px = np.linalg.norm(found - true, axis=2)
         for part in (moving, ~moving):

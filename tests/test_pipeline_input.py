@@ -16,7 +16,6 @@ from densify.pipeline import compare, run
 from densify.readers.window import read_sweeps
 from tests.scenes import TinySequence
 from tests.small_street import KEY, POSES_GIVEN, one_car
-from tests.tiny_street import same_points
 
 
 def test_progress_names_every_stage():
@@ -24,14 +23,8 @@ def test_progress_names_every_stage():
     run(one_car(()), KEY, 1, "icp", config=POSES_GIVEN, progress=lambda *step: seen.append(step))
     names = list(dict.fromkeys(name for name, _, _ in seen))
     assert names == [
-        "read",
-        "images",
-        "register",
-        "deskew",
-        "accumulate",
-        "project",
-        "colour",
-        "score",
+        *("read", "images", "register", "deskew", "ground", "accumulate"),
+        *("held out", "project", "colour", "score"),
     ]
     assert all(0 <= done <= total for _, done, total in seen)
     for name in names:
@@ -86,8 +79,8 @@ def test_without_truth_there_are_no_errors_of_depth():
 def test_a_window_of_the_key_alone():
     usual = ("none", "icp", "flow")
     results = compare(one_car(()), KEY, 0, config=POSES_GIVEN, methods=usual)
-    assert same_points(results["none"].cloud, results["icp"].cloud)
-    assert same_points(results["none"].cloud, results["flow"].cloud)
+    for other in ("icp", "flow"):
+        assert np.array_equal(results["none"].cloud.points, results[other].cloud.points)
 
 
 def test_at_the_start_of_the_recording(caplog):
@@ -141,7 +134,7 @@ def test_bad_arguments_are_refused_before_anything_is_read(arguments, message):
 
 def test_unknown_methods_are_refused_before_anything_is_read():
     sequence = one_car(())
-    with pytest.raises(InputError, match="--methods magic: expected some of none, icp, .*flow"):
+    with pytest.raises(InputError, match="--methods magic: expected some of none, icp, "):
         compare(sequence, KEY, 1, methods=("icp", "magic"))
     assert not sequence.read
 
