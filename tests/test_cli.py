@@ -48,6 +48,7 @@ def test_run_writes_exactly_the_tree_and_names_every_file(densified: SimpleNames
         "000120/cloud.laz",
         "000120/metrics.json",
         "000120/figure.png",
+        "000120/curve.png",
         "000120/run.yaml",
     }
     assert set(files_in(densified.out)) == expected
