@@ -59,6 +59,8 @@ def checked(section: type[Section], key: str, value: Any, where: str) -> Any:
         expected = f"one of {', '.join(choices)}"
     elif kind is bool:
         expected = "true or false"
+    elif kind is str:
+        expected = "text"
     else:
         expected = f"{'a whole number' if kind is int else 'a number'} from {low:g} to {high:g}"
     expected += " or null" if optional else ""

@@ -143,7 +143,7 @@ def compare(
         movers = {}
         if settings.output.movers == "separate":
             with watch.stage("project"):
-                movers = views.movers(cloud, visible)
+                movers = views.movers(cloud, visible, images)
         if settings.output.movers != "keep":
             cloud = cloud.select(~cloud.moving)
         with watch.stage("project"):

@@ -133,11 +133,17 @@ class Views:
             for name, e in self.exposures.items()
         }
 
-    def movers(self, cloud: Cloud, visible: bool) -> dict[int, Mover]:
+    def movers(
+        self, cloud: Cloud, visible: bool, images: Mapping[str, NDArray[np.uint8]]
+    ) -> dict[int, Mover]:
         """Every moving object by itself."""
         instances = np.unique(cloud.instance[cloud.moving & (cloud.instance >= 0)])
-        parts = {int(i): cloud.select(cloud.moving & (cloud.instance == i)) for i in instances}
-        return {i: Mover(part, self.depth(part, visible)) for i, part in parts.items()}
+        movers = {}
+        for instance in instances.tolist():
+            part = cloud.select(cloud.moving & (cloud.instance == instance))
+            depth = self.depth(part, visible)
+            movers[instance] = Mover(self.coloured(part, depth, images), depth)
+        return movers
 
 
 @dataclass(frozen=True)

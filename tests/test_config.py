@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 import yaml
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from densify import config as configuration
@@ -22,6 +22,8 @@ KNOBS = [
     for section in dataclasses.fields(Config)
     for field in dataclasses.fields(getattr(Config(), section.name))
 ]
+
+FREE_TEXT = {("flow", "engine")}  # checked by their section
 
 
 def rendered_defaults() -> str:
@@ -80,7 +82,7 @@ def test_presets_exist_and_name_only_differences() -> None:
 def test_every_knob_is_documented_and_bounded(section: str, field: Any) -> None:
     meta = field.metadata
     assert len(meta["help"]) > 10
-    if isinstance(field.default, bool):
+    if isinstance(field.default, bool) or (section, field.name) in FREE_TEXT:
         return
     numbers = meta["low"] is not None and meta["high"] is not None and meta["low"] < meta["high"]
     assert numbers != bool(meta["choices"]), f"{section}.{field.name}: needs bounds or choices"
@@ -98,6 +100,10 @@ def test_every_knob_takes_its_limits_and_refuses_what_is_beyond(section: str, fi
     elif isinstance(field.default, bool):
         assert getattr(getattr(resolve(None, [f"{name}=false"]), section), field.name) is False
         assert "true or false" in error_of(None, (f"{name}=3",))
+    elif (section, field.name) in FREE_TEXT:
+        for value in (3, True, None, ["groups"]):
+            message = error_of({section: {field.name: value}})
+            assert f"{name}: got {value!r}, expected text" in message
     else:
         for value in (meta["low"], meta["high"]):
             got = getattr(getattr(resolve({section: {field.name: value}}), section), field.name)
@@ -121,6 +127,7 @@ def test_round_trip() -> None:
     assert resolve(yaml.safe_load(text)) == config != Config()
 
 
+@settings(max_examples=20)
 @given(st.integers(0, 50), st.floats(0, 1e6), st.booleans(), st.sampled_from(["rigid", "drop"]))
 def test_round_trip_through_yaml_text(lead_in: int, alpha: float, deskew: bool, word: str) -> None:
     changes = {
@@ -166,6 +173,9 @@ def test_overrides_win_over_the_file_and_later_over_earlier() -> None:
         ("flow.radius_m=0", ["got 0", "or null"]),
         ("register.deskew=maybe", ["got 'maybe'", "true or false"]),
         ("register.source=oxts", ["got 'oxts'", "one of kiss-icp, dataset"]),
+        ("flow.engine=magic", ["got 'magic'", "groups, paper or npz:DIR"]),
+        ("project.at=noon", ["got 'noon'", "one of camera, sweep"]),
+        ("output.movers=hide", ["got 'hide'", "one of keep, drop, separate"]),
         ("flow.alpha", ["expected section.key=value"]),
         ("alpha=3", ["expected section.key=value"]),
         ("flow.alpha=[1", ["--set flow.alpha=[1", "not YAML"]),
@@ -202,6 +212,13 @@ def test_binary_file_is_an_input_error(tmp_path: Path) -> None:
     file = tmp_path / "bad.yaml"
     file.write_bytes(b"\xff\xfe\x00\x80")
     assert str(file) in error_of(file)
+
+
+def test_an_engine_may_be_a_folder_of_flow_files() -> None:
+    assert resolve(None, ["flow.engine=npz:some/flow"]).flow.files == Path("some/flow")
+    assert resolve({"flow": {"engine": "paper"}}).flow.files is Config().flow.files is None
+    with pytest.raises(InputError, match="got 'npz:', expected groups, paper or npz:DIR"):
+        FlowSettings(engine="npz:")
 
 
 def test_unknown_preset_suggests_one() -> None:

@@ -67,7 +67,7 @@ def map_of(camera, seed=0):
     frame = np.where(depth > 0, rng.integers(119, 122, (H, W)), -1).astype(np.int32)
     confidence = rng.random((H, W), dtype=np.float32)
     age_s = np.where(filled > 0, rng.uniform(0, 0.5, (H, W)), np.nan).astype(np.float32)
-    return DepthMap(camera, depth, filled, confidence, frame, age_s)
+    return DepthMap(camera, depth, filled, confidence, frame, age_s=age_s)
 
 
 def result_of(method="flow", seed=0, cameras=("image_02", "image_03"), **metrics):

@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.lib.npyio import NpzFile
 from numpy.typing import NDArray
 
 from densify import poses
@@ -29,6 +30,8 @@ from densify.errors import InputError
 from densify.types import FlowField, Stretch
 
 MOVES_M = 0.05
+_WIDE = ("residual_flow", "total_flow", "to_reference")
+_KNOWN = (*_WIDE, "row", "moving", "instance")
 
 
 class FlowFiles:
@@ -64,7 +67,7 @@ class FlowFiles:
             points = self._stretch.sweeps[here].sweep.points
             moved = points + column("total_flow", 3, 0.0)
             back = poses.transform(self._stretch.T_target_source(frame, target), moved)
-            residual[known] = (back - points)[known]
+            residual[known] = (back - points - column("to_reference", 3, 0.0))[known]
         moving = column("moving", None, False)
         if "moving" not in arrays:
             moving = np.linalg.norm(residual, axis=1) >= MOVES_M
@@ -89,8 +92,9 @@ def _matched(
             f"{path}: holds {num_points} points, expected one for each row of the sweep's file "
             f"(more than {row.max()}); add their 'row' where some are left out"
         )
-    place = np.full(int(max(rows.max(initial=0), row.max(initial=0))) + 1, -1, np.int64)
-    place[rows] = np.arange(num_points)
+    place = np.full(int(row.max(initial=0)) + 1, -1, np.int64)
+    ours = np.flatnonzero(rows < len(place))
+    place[rows[ours]] = ours
     found = place[row]
     return found[found >= 0], found >= 0
 
@@ -99,27 +103,28 @@ def _load(path: Path) -> dict[str, NDArray[Any]]:
     if not path.is_file():
         raise InputError(f"{path}: no such flow file; expected one for every step to the key")
     try:
-        with np.load(path, allow_pickle=False) as loaded:
-            arrays = {name: loaded[name] for name in loaded}
+        loaded = np.load(path, allow_pickle=False)
+        if not isinstance(loaded, NpzFile):
+            raise ValueError("holds a single array, not named ones")
+        with loaded:
+            arrays = {name: loaded[name] for name in _KNOWN if name in loaded}
+            names = ", ".join(loaded) or "none"
     except (OSError, ValueError, EOFError, RuntimeError, zipfile.BadZipFile, zlib.error) as error:
-        raise InputError(f"{path}: not a readable .npz flow file: {error}") from error
+        reason = " ".join(str(error).split())
+        raise InputError(f"{path}: not a readable .npz flow file: {reason}") from error
     if "residual_flow" not in arrays and "total_flow" not in arrays:
-        raise InputError(
-            f"{path}: holds the arrays {', '.join(arrays) or 'none'}, expected residual_flow or "
-            f"total_flow"
-        )
+        raise InputError(f"{path}: holds the arrays {names}, expected residual_flow or total_flow")
     num_points = len(np.atleast_1d(next(iter(arrays.values()))))
-    wide = ("residual_flow", "total_flow", "to_reference")
-    known = (*wide, "row", "moving", "instance")
-    for name in known:
-        if name not in arrays:
-            continue
-        shape = (num_points, 3) if name in wide else (num_points,)
-        if arrays[name].shape != shape or arrays[name].dtype.kind not in "fiub":
+    for name, array in arrays.items():
+        shape = (num_points, 3) if name in _WIDE else (num_points,)
+        kinds, expected = ("iu", "row numbers") if name == "row" else ("fiub", "numbers")
+        if array.shape != shape or array.dtype.kind not in kinds:
             raise InputError(
-                f"{path}: array {name}: got shape {arrays[name].shape} of {arrays[name].dtype}, "
-                f"expected numbers of shape {shape}"
+                f"{path}: array {name}: got shape {array.shape} of {array.dtype}, expected "
+                f"{expected} of shape {shape}"
             )
-        if not np.isfinite(arrays[name]).all():
+        if not np.isfinite(array).all():
             raise InputError(f"{path}: array {name}: got NaN or infinite, expected finite numbers")
-    return {name: arrays[name] for name in known if name in arrays}
+    if (arrays.get("row", np.zeros(1)) < 0).any():
+        raise InputError(f"{path}: array row: got a negative one, expected row numbers from 0 up")
+    return arrays

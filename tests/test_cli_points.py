@@ -1,0 +1,189 @@
+# SPDX-License-Identifier: MIT
+"""Flow between two point files on the command line, and every way such a file can be broken."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from densify.cli.point_files import read_points
+from densify.errors import InputError
+from tests.command import exit_code, refused
+
+
+def test_flow_between_two_files(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    rng = np.random.default_rng(3)
+    points = rng.uniform(-5, 5, (300, 3)) + np.array([20.0, 0, 0])
+    np.save(tmp_path / "a.npy", points)
+    np.savez(tmp_path / "b.npz", points=points)
+    out = tmp_path / "deep" / "flow.npz"
+    command = ["flow", str(tmp_path / "a.npy"), str(tmp_path / "b.npz"), "--out", str(out)]
+    assert exit_code(*command) == 0
+    captured = capsys.readouterr().out
+    assert captured.splitlines() == ["300 points, 0 moving", str(out)]
+    with np.load(out) as arrays:
+        flow = arrays["residual_flow"]
+        assert flow.shape == (300, 3) and flow.dtype == np.float32 and not flow.any()
+        assert not arrays["moving"].any()
+        assert arrays["instance"].tolist() == [-1] * 300
+    before = out.read_bytes()
+    assert "--overwrite" in refused(capsys, 2, *command)
+    assert exit_code(*command, "--overwrite") == 0
+    assert out.read_bytes() == before
+    assert [path.name for path in out.parent.iterdir()] == ["flow.npz"]
+
+
+def bad_point_files(folder: Path) -> dict[str, Any]:
+    """Name of a file made in `folder` -> what the message must say."""
+    np.save(folder / "flat.npy", np.zeros(9))
+    np.save(folder / "narrow.npy", np.zeros((9, 2)))
+    np.save(folder / "words.npy", np.array([["a", "b", "c"]]))
+    np.save(folder / "objects.npy", np.array([[{}, {}, {}]], dtype=object), allow_pickle=True)
+    np.save(folder / "none.npy", np.zeros((0, 3)))
+    np.save(folder / "nan.npy", np.array([[1.0, 2, 3], [1, np.nan, 3]]))
+    np.savez(folder / "wrong.npz", cloud=np.zeros((3, 3)))
+    np.save(folder / "npy", np.ones((3, 3)))
+    (folder / "npy.npy").rename(folder / "array.npz")
+    np.savez(folder / "npz", points=np.ones((3, 3)))
+    (folder / "npz.npz").rename(folder / "archive.npy")
+    np.savez_compressed(folder / "damaged.npz", points=np.arange(300.0).reshape(100, 3))
+    damaged = bytearray((folder / "damaged.npz").read_bytes())
+    damaged[80:90] = b"\xff" * 10
+    (folder / "damaged.npz").write_bytes(damaged)
+    (folder / "empty.txt").write_text("")
+    (folder / "cut.bin").write_bytes(bytes(37))
+    (folder / "garbage.npz").write_bytes(b"no zip")
+    (folder / "empty.npy").write_bytes(b"")
+    (folder / "words.txt").write_text("x y z\n")
+    (folder / "cloud.pcd").write_text("VERSION .7\n")
+    return {
+        "absent.npy": "no such file",
+        "flat.npy": "shape (9,)",
+        "narrow.npy": "shape (9, 2)",
+        "words.npy": "expected numbers",
+        "objects.npy": "not a readable .npy",
+        "none.npy": "holds no points",
+        "nan.npy": "1 of 2 points are not finite, the first in row 1",
+        "wrong.npz": "holds the arrays cloud, expected points",
+        "array.npz": "holds a single array; name it .npy",
+        "archive.npy": "holds an archive of arrays; name it .npz",
+        "damaged.npz": "not a readable .npz",
+        "empty.txt": "holds no points",
+        "cut.bin": "got 37 bytes, expected a multiple of 16",
+        "garbage.npz": "not a readable .npz",
+        "empty.npy": "not a readable .npy",
+        "words.txt": "not a readable .txt",
+        "cloud.pcd": "got .pcd, expected one of .npy, .npz, .txt, .bin",
+    }
+
+
+def test_bad_point_files(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    np.save(tmp_path / "good.npy", np.ones((5, 3)))
+    for name, part in bad_point_files(tmp_path).items():
+        out = tmp_path / "f.npz"
+        line = refused(capsys, 2, "flow", tmp_path / "good.npy", tmp_path / name, "--out", out)
+        assert name in line and part in line
+        assert not out.exists()
+
+
+@pytest.mark.parametrize("name", ["p.npy", "p.npz"])
+def test_flipped_bytes_in_a_point_file_are_no_traceback(name: str, tmp_path: Path) -> None:
+    path = tmp_path / name
+    points = np.linspace(-1, 1, 30).reshape(10, 3)
+    np.save(path, points) if name == "p.npy" else np.savez_compressed(path, points=points)
+    whole = path.read_bytes()
+    num_refused = 0
+    for i in range(len(whole)):
+        mask = (0x01, 0x08, 0xFF)[i % 3]
+        path.write_bytes(whole[:i] + bytes([whole[i] ^ mask]) + whole[i + 1 :])
+        try:
+            read_points(path)
+        except InputError as error:
+            num_refused += 1
+            assert str(path) in str(error) and "\n" not in str(error)
+    assert num_refused > 30
+
+
+def test_point_files_of_every_kind_agree(tmp_path: Path) -> None:
+    points = np.arange(12, dtype=np.float32).reshape(3, 4) / 8
+    np.save(tmp_path / "p.npy", points)
+    np.savez(tmp_path / "p.npz", points=points)
+    np.savetxt(tmp_path / "p.txt", points)
+    points.tofile(tmp_path / "p.bin")
+    for name in ("p.npy", "p.npz", "p.txt", "p.bin"):
+        read = read_points(tmp_path / name).points
+        assert read.dtype == np.float64
+        assert np.array_equal(read, points[:, :3])
+
+
+def test_times_and_scanners_beside_the_points(tmp_path: Path) -> None:
+    points, time_s, lidar = (
+        np.ones((3, 3)),
+        np.array([1.5, 1.6, 1.75]),
+        np.array([0, 1, 1], np.uint8),
+    )
+    np.savez(tmp_path / "time.npz", points=points, time=time_s, lidar=lidar)
+    np.savez(tmp_path / "offset.npz", points=points, time=time_s, offset_ns=np.arange(3))
+    np.savez(tmp_path / "none.npz", points=points)
+    timed = read_points(tmp_path / "time.npz")
+    assert timed.offset_ns is not None and timed.lidar is not None
+    assert timed.offset_ns.tolist() == [1_500_000_000, 1_600_000_000, 1_750_000_000]
+    assert timed.offset_ns.dtype == np.int64 and timed.lidar.tolist() == [0, 1, 1]
+    offset = read_points(tmp_path / "offset.npz")
+    assert offset.offset_ns is not None and offset.offset_ns.tolist() == [0, 1, 2]
+    assert offset.lidar is None
+    none = read_points(tmp_path / "none.npz")
+    assert none.offset_ns is None and none.lidar is None
+
+
+@pytest.mark.parametrize(
+    ("name", "column"),
+    [
+        ("offset_ns", np.arange(4)),
+        ("offset_ns", np.arange(3.0)),
+        ("time", np.array([0, np.nan, 1])),
+        ("lidar", np.array(["a", "b", "c"])),
+        ("lidar", np.zeros((3, 1), int)),
+    ],
+)
+def test_bad_columns_beside_the_points(name: str, column: np.ndarray, tmp_path: Path) -> None:
+    np.savez(tmp_path / "p.npz", points=np.ones((3, 3)), **{name: column})
+    with pytest.raises(InputError, match=rf"p\.npz: array {name}: .*expected \(3,\)") as caught:
+        read_points(tmp_path / "p.npz")
+    assert "\n" not in str(caught.value)
+
+
+def test_flow_uses_times_where_both_files_have_them(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rng = np.random.default_rng(0)
+    wall = np.column_stack([rng.uniform(-9, 9, 900), np.full(900, 6.0), rng.uniform(0, 3, 900)])
+    box = rng.uniform(0, 1, (500, 3)) * [1.5, 1.5, 1.5]
+    times = np.concatenate([rng.integers(0, 10**8, 900), np.full(500, 2 * 10**7)])
+    later = np.concatenate([times[:900], np.full(500, 6 * 10**7)])  # the box 40 ms late
+    np.savez(tmp_path / "a.npz", points=np.vstack([wall, box]), offset_ns=times)
+    np.savez(tmp_path / "b.npz", points=np.vstack([wall, box + [1.4, 0, 0]]), offset_ns=later)
+    np.savez(tmp_path / "c.npz", points=np.vstack([wall, box + [1.4, 0, 0]]))
+    for target, step_m in (("b.npz", 1.0), ("c.npz", 1.4)):
+        out = tmp_path / f"flow_{target}"
+        assert exit_code("flow", tmp_path / "a.npz", tmp_path / target, "--out", out) == 0
+        with np.load(out) as arrays:
+            assert arrays["moving"][900:].mean() > 0.8 and not arrays["moving"][:900].any()
+            moved = arrays["residual_flow"][arrays["moving"], 0]
+            assert abs(np.median(moved) - step_m) < 0.05
+            assert ("to_reference" in arrays) == (target == "b.npz")
+    capsys.readouterr()
+
+
+@pytest.mark.parametrize("out", ["flow.txt", "folder.npz", "file/deep/flow.npz"])
+def test_bad_place_for_the_flow(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], out: str
+) -> None:
+    np.save(tmp_path / "good.npy", np.ones((5, 3)))
+    (tmp_path / "folder.npz").mkdir()
+    (tmp_path / "file").write_text("")
+    good = tmp_path / "good.npy"
+    assert str(tmp_path / out) in refused(capsys, 2, "flow", good, good, "--out", tmp_path / out)

@@ -1,0 +1,228 @@
+# SPDX-License-Identifier: MIT
+"""Flow files: what a run writes it reads again, other forms of the same flow, and broken files."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from densify import poses
+from densify.errors import InputError
+from densify.output.flow_npz import write_flow_files
+from densify.pipeline import run
+from densify.readers.flow_files import MOVES_M, FlowFiles
+from densify.types import FlowField, Result, Stretch, StretchFlow
+from tests.exact_motion import registered
+from tests.small_street import KEY, POSES_GIVEN, one_car
+
+STEP = (100, 101)
+PLAIN = POSES_GIVEN | {"project": {"visibility": False}}  # no point has a say in another's depth
+
+
+# --- from the pipeline and back -------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def ours(tmp_path_factory) -> tuple[Result, Path]:
+    """A run with the flow it found, and the folder of its flow files."""
+    result = run(one_car(), KEY, 1, config=PLAIN | {"output": {"flow": True}})
+    folder = tmp_path_factory.mktemp("flow")
+    write_flow_files(folder, result.flow)
+    return result, folder
+
+
+def depth_from(folder: Path) -> Result:
+    return run(one_car(), KEY, 1, config=PLAIN | {"flow": {"engine": f"npz:{folder}"}})
+
+
+def assert_same(found: Result, ours: Result) -> None:
+    """All but the key's own returns, whose motion no file tells."""
+    own = ours.cloud.frame == KEY
+    assert np.array_equal(found.cloud.frame, ours.cloud.frame)
+    assert np.array_equal(found.cloud.moving[~own], ours.cloud.moving[~own])
+    assert np.abs(found.cloud.points - ours.cloud.points)[~own].max() < 2e-5
+    here, there = found.depth["front"], ours.depth["front"]
+    same = (here.frame == there.frame) & (here.frame != KEY) & (here.frame >= 0)
+    assert same.sum() > 3000
+    np.testing.assert_allclose(here.depth_m[same], there.depth_m[same], atol=2e-5)
+    assert (here.frame == there.frame).mean() > 0.98
+
+
+def test_a_run_leaves_a_file_for_every_step_to_the_key(ours):
+    result, folder = ours
+    assert result.cloud.moving.sum() > 100
+    assert sorted(result.flow.steps) == [(KEY - 1, KEY), (KEY + 1, KEY)]
+    names = [f"{KEY - 1:06d}_{KEY:06d}.npz", f"{KEY + 1:06d}_{KEY:06d}.npz"]
+    assert sorted(p.name for p in folder.iterdir()) == names
+    with np.load(folder / names[0]) as arrays:
+        assert arrays["residual_flow"].dtype == arrays["total_flow"].dtype == np.float32
+        assert not arrays["residual_flow"][~arrays["moving"]].any()
+
+
+def test_the_flow_of_a_run_gives_its_depth_again(ours):
+    result, folder = ours
+    assert_same(depth_from(folder), result)
+
+
+@pytest.mark.parametrize("dropped", ["residual_flow", "residual_flow and to_reference", "row"])
+def test_other_forms_of_the_same_flow(ours, dropped, tmp_path):
+    """Total flow instead of residual flow; a value for every row of the file instead of 'row'."""
+    result, folder = ours
+    num_rows = {f: len(one_car()[f]) for f in (KEY - 1, KEY + 1)}
+    for path in folder.iterdir():
+        with np.load(path) as loaded:
+            arrays = dict(loaded)
+        if dropped == "row":
+            row = arrays.pop("row")
+            for name, array in arrays.items():
+                whole = np.zeros((num_rows[int(path.stem[:6])], *array.shape[1:]), array.dtype)
+                whole[row] = array
+                arrays[name] = whole
+        else:
+            arrays = {name: a for name, a in arrays.items() if name not in dropped.split(" and ")}
+        np.savez(tmp_path / path.name, **arrays)
+    assert_same(depth_from(tmp_path), result)
+
+
+def test_chained_over_more_steps_it_is_nearly_the_same(tmp_path):
+    ours = run(one_car(), KEY, 2, config=POSES_GIVEN | {"output": {"flow": True}})
+    assert sorted(ours.flow.steps) == [(1, 2), (2, 3), (4, 3), (5, 4)]
+    write_flow_files(tmp_path, ours.flow)
+    found = run(one_car(), KEY, 2, config=POSES_GIVEN | {"flow": {"engine": f"npz:{tmp_path}"}})
+    row = {key: i for i, key in enumerate(zip(found.cloud.frame, found.cloud.row, strict=True))}
+    place = [row.get(key, -1) for key in zip(ours.cloud.frame, ours.cloud.row, strict=True)]
+    both = (np.array(place) >= 0) & ours.cloud.moving & (ours.cloud.frame != KEY)
+    assert both.sum() > 0.9 * (ours.cloud.moving & (ours.cloud.frame != KEY)).sum()
+    off_m = found.cloud.points[np.array(place)[both]] - ours.cloud.points[both]
+    assert np.median(np.linalg.norm(off_m, axis=1)) < 0.02
+
+
+# --- one file -------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def stretch() -> Stretch:
+    """Two sweeps of ten points; a sweep's rows are 0, 3, 6, …"""
+    points = np.random.default_rng(0).uniform(-20, 20, (10, 3))
+    return Stretch(tuple(registered(frame, points) for frame in STEP))
+
+
+def saved(folder: Path, **arrays: np.ndarray) -> Path:
+    path = folder / f"{STEP[0]:06d}_{STEP[1]:06d}.npz"
+    np.savez(path, **arrays)
+    return path
+
+
+def test_rows_say_which_points_and_the_rest_stands_still(stretch, tmp_path):
+    flow = np.arange(9.0).reshape(3, 3) + 1
+    saved(tmp_path, residual_flow=flow, row=np.array([27, 4, 3]))  # no point has row 4
+    field = FlowFiles(tmp_path, stretch).step(0, 1)
+    expected = np.zeros((10, 3))
+    expected[9], expected[1] = flow[0], flow[2]
+    assert np.array_equal(field.displacement, expected)
+    assert np.flatnonzero(field.moving).tolist() == [1, 9]
+    assert (field.instance == -1).all() and not field.lost.any() and field.to_reference is None
+
+
+def test_what_moves_less_than_5_cm_without_being_said_to_move_stands_still(stretch, tmp_path):
+    row = stretch[STEP[0]].sweep.row
+    flow = np.zeros((10, 3))
+    flow[:4, 0] = 0.049, 0.051, -3.0, -0.01
+    saved(tmp_path, residual_flow=flow, row=row)
+    field = FlowFiles(tmp_path, stretch).step(0, 1)
+    assert MOVES_M == 0.05 and np.flatnonzero(field.moving).tolist() == [1, 2]
+    assert not field.displacement[~field.moving].any()
+    said = np.arange(10) % 2 == 1
+    saved(tmp_path, residual_flow=flow, row=row, moving=said.astype(np.uint8))
+    field = FlowFiles(tmp_path, stretch).step(0, 1)
+    assert np.array_equal(field.moving, said)
+    assert np.array_equal(field.displacement, np.where(said[:, None], flow, 0))
+
+
+def test_ego_motion_is_taken_out_of_total_flow(stretch, tmp_path):
+    """A world point of the source at rest, and one that moves by 2 m."""
+    sweep, T = stretch[STEP[0]].sweep, stretch.T_target_source(STEP[1], STEP[0])
+    moved = np.zeros((10, 3))
+    moved[5] = 0, 2, 0
+    total = poses.transform(T, sweep.points + moved) - sweep.points
+    assert np.linalg.norm(total, axis=1).min() > 0.1
+    saved(tmp_path, total_flow=total, row=sweep.row, instance=np.arange(10))
+    field = FlowFiles(tmp_path, stretch).step(0, 1)
+    np.testing.assert_allclose(field.displacement, moved, atol=1e-9)
+    assert np.flatnonzero(field.moving).tolist() == [5]
+    assert field.instance.tolist() == list(range(10))
+
+
+def test_total_flow_holds_the_way_to_the_reference_time_once(stretch, tmp_path):
+    sweep = stretch[STEP[0]].sweep
+    one = np.ones((10, 3))
+    field = FlowField(2 * one, one[:, 0] > 0, np.zeros(10, np.int32), one[:, 0] < 0, 0.25 * one)
+    write_flow_files(tmp_path, StretchFlow(stretch, {STEP: field}))
+    path = tmp_path / f"{STEP[0]:06d}_{STEP[1]:06d}.npz"
+    with np.load(path) as arrays:
+        known = {name: arrays[name] for name in ("total_flow", "to_reference", "row")}
+    saved(tmp_path, **known)
+    found = FlowFiles(tmp_path, stretch).step(0, 1)
+    np.testing.assert_allclose(found.displacement, field.displacement, atol=1e-5)
+    np.testing.assert_allclose(found.total, field.total, atol=1e-5)
+    assert len(sweep) == 10
+
+
+FLOW = np.zeros((30, 3))
+BAD_ARRAYS = {
+    "no flow": ({"flow": FLOW}, "holds the arrays flow, expected residual_flow or total_flow"),
+    "no arrays": ({}, "holds the arrays none"),
+    "narrow": ({"residual_flow": FLOW[:, :2]}, r"residual_flow: got shape \(30, 2\).* \(30, 3\)"),
+    "a single number": ({"total_flow": np.float64(3)}, r"total_flow: got shape \(\)"),
+    "words": ({"residual_flow": np.full((30, 3), "x")}, "residual_flow: .*expected numbers"),
+    "complex": ({"residual_flow": FLOW + 1j}, "residual_flow: .*complex128, expected numbers"),
+    "NaN": ({"residual_flow": FLOW * np.nan}, "residual_flow: got NaN or infinite"),
+    "infinite": ({"total_flow": FLOW + np.inf}, "total_flow: got NaN or infinite"),
+    "short column": (
+        {"residual_flow": FLOW, "moving": np.ones(9, bool)},
+        r"moving: got shape \(9,\) of bool, expected numbers of shape \(30,\)",
+    ),
+    "fractional rows": (
+        {"residual_flow": FLOW, "row": np.arange(30.0)},
+        "row: .*float64, expected row numbers",
+    ),
+    "negative row": ({"residual_flow": FLOW, "row": np.arange(30) - 1}, "row: got a negative one"),
+    "too few": ({"residual_flow": FLOW[:20]}, "holds 20 points, expected .*more than 27.*'row'"),
+}
+
+
+@pytest.mark.parametrize("case", BAD_ARRAYS)
+def test_flow_files_of_another_form(case, stretch, tmp_path):
+    arrays, message = BAD_ARRAYS[case]
+    path = saved(tmp_path, **arrays)
+    with pytest.raises(InputError, match=message) as caught:
+        FlowFiles(tmp_path, stretch).step(0, 1)
+    assert str(path) in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_missing_folder_and_file(stretch, tmp_path):
+    with pytest.raises(InputError, match=r"npz:.*absent: no such folder"):
+        FlowFiles(tmp_path / "absent", stretch)
+    with pytest.raises(InputError, match=r"000101_000100\.npz: no such flow file"):
+        FlowFiles(tmp_path, stretch).step(1, 0)
+
+
+@pytest.mark.parametrize("kind", ["empty", "no zip", "one array", "pickled", "damaged"])
+def test_files_that_are_no_flow_file(kind, stretch, tmp_path):
+    path = saved(tmp_path, residual_flow=np.random.default_rng(0).random((30, 3)))
+    if kind in ("empty", "no zip"):
+        path.write_bytes(b"" if kind == "empty" else b"no zip")
+    elif kind == "one array":
+        with path.open("wb") as file:
+            np.save(file, FLOW)
+    elif kind == "pickled":
+        saved(tmp_path, residual_flow=np.array([{}, 1], dtype=object))
+    else:
+        data = bytearray(path.read_bytes())
+        data[300:310] = b"\xff" * 10
+        path.write_bytes(data)
+    with pytest.raises(InputError, match=r"not a readable \.npz flow file: \S") as caught:
+        FlowFiles(tmp_path, stretch).step(0, 1)
+    assert str(path) in str(caught.value) and "\n" not in str(caught.value)

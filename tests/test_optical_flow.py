@@ -1,0 +1,170 @@
+# SPDX-License-Identifier: MIT
+"""Optical flow against OpenCV's projection and against the analytic street, and as KITTI's PNG."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from densify import poses
+from densify.output.depth_png import write_flow_png
+from densify.pipeline import run
+from densify.stages.optical_flow import optical_flow
+from densify.types import Camera, Cloud, DepthMap
+from tests.scenes import CAMERA, SWEEP_S
+from tests.small_street import CAR, KEY, POSES_GIVEN, one_car
+
+SMALL = Camera("cam", 8, 6, np.array([[10.0, 0, 3.5], [0, 11.0, 2.5], [0, 0, 1]]), np.eye(4))
+T_CAM_KEY = poses.exp(np.array([0.1, -0.2, 0.05, 0.3, 0.1, -0.2]))
+T_OTHER_KEY = poses.exp(np.array([0.12, -0.15, 0.02, 0.1, 0.1, -0.6]))
+
+
+def seen(pixel, depth_m, velocity_m_s=(0, 0, 0)) -> Cloud:
+    """Points at these (N,2) image coordinates and camera depths."""
+    pixel, z = np.atleast_2d(np.asarray(pixel, float)), np.atleast_1d(np.asarray(depth_m, float))
+    n = len(pixel)
+    ray = np.column_stack([pixel, np.ones(n)]) @ np.linalg.inv(SMALL.K).T
+    points = poses.transform(poses.inverse(T_CAM_KEY), ray * z[:, None])
+    velocity = np.tile(np.asarray(velocity_m_s, np.float32), (n, 1))
+    zeros = np.zeros(n, np.int32)
+    return Cloud(
+        *(points, points, zeros, np.arange(n), zeros > 0, zeros, velocity),
+        *(np.ones(n, np.float32), np.ones(n, np.float32), np.zeros((n, 3), np.uint8)),
+    )
+
+
+def map_of(pixel, depth_m) -> DepthMap:
+    image = np.zeros((SMALL.height_px, SMALL.width_px), np.float32)
+    u, v = np.rint(np.atleast_2d(pixel)).astype(int).T
+    image[v, u] = depth_m
+    return DepthMap("cam", image, image, image, np.zeros(image.shape, np.int32))
+
+
+def flow_of(cloud: Cloud, depth: DepthMap, seconds: float = 0.1, T_other=T_OTHER_KEY):
+    return optical_flow(cloud, depth, SMALL, T_CAM_KEY, T_other, seconds)
+
+
+@pytest.mark.parametrize("velocity_m_s", [(0, 0, 0), (3.0, -2.0, 1.0)])
+def test_flow_is_the_difference_of_two_projections(velocity_m_s):
+    pixel, z = np.array([[1.2, 2.4], [6.0, 0.8], [3.7, 4.9], [4.0, 1.0]]), np.array([5.0, 9, 3, 20])
+    cloud = seen(pixel, z, velocity_m_s)
+    found = flow_of(cloud, map_of(pixel, z), seconds=-0.1)
+    later = cloud.points - 0.1 * np.array(velocity_m_s)
+    rotation = cv2.Rodrigues(T_OTHER_KEY[:3, :3])[0]
+    there, _ = cv2.projectPoints(later, rotation, T_OTHER_KEY[:3, 3], SMALL.K, None)
+    u, v = np.rint(pixel).astype(int).T
+    np.testing.assert_allclose(found[v, u], there[:, 0] - pixel, atol=1e-4)
+    assert found.dtype == np.float32 and np.isfinite(found).all(axis=2).sum() == 4
+
+
+def test_unknown_where_nothing_was_measured_or_it_falls_behind_the_other_camera():
+    cloud, depth = seen([[2, 2], [5, 3]], [4.0, 4.0]), map_of([[2, 2]], [4.0])
+    assert np.flatnonzero(np.isfinite(flow_of(cloud, depth)[..., 0])).tolist() == [2 * 8 + 2]
+    ahead = poses.exp(np.array([0, 0, 0, 0, 0, -9.0])) @ T_CAM_KEY
+    assert np.isnan(flow_of(cloud, depth, T_other=ahead)).all()
+    assert np.isnan(flow_of(cloud.select(np.zeros(2, bool)), depth)).all()
+
+
+def test_beyond_the_edge_of_the_other_image_it_is_still_known():
+    aside = poses.exp(np.array([0, 0, 0, 40.0, 0, 0])) @ T_CAM_KEY
+    found = flow_of(seen([[2, 2]], [4.0]), map_of([[2, 2]], [4.0]), T_other=aside)
+    np.testing.assert_allclose(found[2, 2], [10 * 40 / 4, 0], atol=1e-4)
+
+
+def test_the_point_that_made_the_pixels_depth_is_followed():
+    """Not what is hidden behind it, nor what shines through before it."""
+    pixel = np.array([[2.4, 1.9], [2.3, 2.4], [1.8, 2.2], [2.1, 2.0]])
+    z = np.array([2.0, 4.05, 4.0, 12.0])
+    depth = map_of([[2, 2]], [4.0])
+    alone = flow_of(seen(pixel[2], z[2]), depth)[2, 2]
+    assert np.isfinite(alone).all()
+    assert np.array_equal(flow_of(seen(pixel, z), depth)[2, 2], alone)
+    assert np.isnan(flow_of(seen(pixel[[0, 3]], z[[0, 3]]), depth)).all()
+
+
+# --- the pipeline ---------------------------------------------------------------------------------
+
+
+def true_flow(sequence, other: int) -> tuple[np.ndarray, np.ndarray]:
+    """(H,W,2) of what each pixel's centre shows, and where that moves."""
+    depth = sequence.truth.depth_m("front", KEY).astype(float)
+    moving = sequence.truth.moving_mask("front", KEY)
+    v, u = np.indices(depth.shape)
+    ray = np.stack([u, v, np.ones_like(u)], -1) @ np.linalg.inv(CAMERA.K).T
+    T_cam_world = [
+        CAMERA.T_cam_lidar
+        @ poses.inverse(sequence.scene.T_world_lidar(f * SWEEP_S + sequence.late_s))
+        for f in (KEY, other)
+    ]
+    world = poses.transform(poses.inverse(T_cam_world[0]), (ray * depth[..., None]).reshape(-1, 3))
+    world[moving.ravel(), 0] += CAR.path.speed_m_s * (other - KEY) * SWEEP_S
+    there = poses.transform(T_cam_world[1], world) @ CAMERA.K.T
+    there = (there[:, :2] / there[:, 2:]).reshape(*depth.shape, 2)
+    return there - np.stack([u, v], -1), moving
+
+
+@pytest.mark.parametrize("late_s", [0.0, 0.04])
+def test_flow_to_both_neighbours_is_that_of_the_street(late_s):
+    sequence = one_car(late_s=late_s)
+    result = run(sequence, KEY, 1, config=POSES_GIVEN | {"output": {"optical_flow": True}})
+    assert set(result.optical_flow["front"]) == {"previous", "next"}
+    for name, other in (("previous", KEY - 1), ("next", KEY + 1)):
+        found = result.optical_flow["front"][name]
+        known = np.isfinite(found).all(axis=2)
+        measured = result.depth["front"].depth_m > 0
+        assert not (known & ~measured).any() and known.sum() > 0.95 * measured.sum()
+        true, moving = true_flow(sequence, other)
+        off_px = np.linalg.norm(found - true, axis=2)
+        for part in (moving, ~moving):
+            assert (known & part).sum() > 200
+            assert np.median(off_px[known & part]) < 0.1
+            assert (off_px[known & part] < 1).mean() > 0.95
+        # neither is trivial: the street flows by, and the car goes its own way
+        assert np.median(np.linalg.norm(true, axis=2)[known & ~moving]) > 0.5
+        alone = true_flow(one_car((), late_s), other)[0]
+        still = np.linalg.norm(true - alone, axis=2)[known & moving]
+        assert np.median(still) > 0.5
+
+
+def test_at_the_end_of_the_window_one_neighbour_is_missing():
+    sequence = one_car()
+    config = POSES_GIVEN | {"output": {"optical_flow": True}}
+    assert set(run(sequence, 0, 1, "icp", config=config).optical_flow["front"]) == {"next"}
+    assert run(sequence, KEY, 0, "icp", config=config).optical_flow == {"front": {}}
+    assert run(sequence, KEY, 0, "icp", config=POSES_GIVEN).optical_flow == {}
+
+
+# --- PNG ------------------------------------------------------------------------------------------
+
+
+def read_as_kitti(path) -> tuple[np.ndarray, np.ndarray]:
+    """flow_u = (I(:,:,1) - 2^15) / 64, flow_v of the second channel, valid the third."""
+    bgr = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    assert bgr.dtype == np.uint16 and bgr.shape[2] == 3
+    rgb = bgr[..., ::-1].astype(float)
+    return (rgb[..., :2] - 2**15) / 64, rgb[..., 2]
+
+
+def test_flow_png_is_kittis(tmp_path):
+    rng = np.random.default_rng(0)
+    flow = rng.uniform(-500, 500, (20, 30, 2)).astype(np.float32)
+    flow[3, :5] = np.nan
+    flow[4, 0, 1] = np.nan
+    write_flow_png(tmp_path / "f.png", flow)
+    read, valid = read_as_kitti(tmp_path / "f.png")
+    known = np.isfinite(flow).all(axis=2)
+    assert known.sum() == 594 and np.array_equal(valid, known)
+    assert np.abs(read - flow)[known].max() <= 1 / 128
+    raw = cv2.imread(str(tmp_path / "f.png"), cv2.IMREAD_UNCHANGED)
+    assert not raw[~known].any()
+
+
+def test_what_flow_png_cannot_say_is_unknown(tmp_path):
+    across = [-512.0, -512.1, 511.98, 512.0, 1e9, -1e9, np.inf, -np.inf, 0.0]
+    flow = np.zeros((2, len(across), 2), np.float32)
+    flow[0, :, 0] = flow[1, :, 1] = across
+    write_flow_png(tmp_path / "f.png", flow)
+    read, valid = read_as_kitti(tmp_path / "f.png")
+    assert valid.tolist() == [[1, 0, 1, 0, 0, 0, 0, 0, 1]] * 2
+    assert read[0, 0].tolist() == [-512, 0] and read[1, 2].tolist() == [0, 511.984375]

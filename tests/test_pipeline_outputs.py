@@ -1,0 +1,166 @@
+# SPDX-License-Identifier: MIT
+"""Movers kept, left out or apart; speeds; and the scores of a key held out."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import fields
+
+import cv2
+import numpy as np
+import pytest
+
+from densify.output import read_cloud, read_depth_png, write_result
+from densify.pipeline import compare, run
+from densify.types import Cloud, Result
+from tests.scenes import ROOM, Arc, Scanner, Scene, TinySequence, World
+from tests.small_street import CAR, KEY, POSES_GIVEN, one_car
+from tests.tiny_street import same_points
+
+
+def with_movers(word: str, **output) -> Result:
+    return run(one_car(), KEY, 1, config=POSES_GIVEN | {"output": {"movers": word, **output}})
+
+
+@pytest.fixture(scope="module")
+def kept() -> Result:
+    return with_movers("keep")
+
+
+@pytest.fixture(scope="module")
+def apart() -> Result:
+    return with_movers("separate", flow=True, optical_flow=True)
+
+
+def rows_of(*clouds: Cloud) -> list[tuple[int, int]]:
+    return sorted(
+        pair for c in clouds for pair in zip(c.frame.tolist(), c.row.tolist(), strict=True)
+    )
+
+
+# --- movers ---------------------------------------------------------------------------------------
+
+
+def test_map_and_movers_together_are_the_whole(kept, apart):
+    assert kept.cloud.moving.sum() > 1000 and not kept.movers
+    movers = [mover.cloud for mover in apart.movers.values()]
+    assert sorted(apart.movers) == np.unique(kept.cloud.instance[kept.cloud.moving]).tolist()
+    assert rows_of(apart.cloud, *movers) == rows_of(kept.cloud)
+    for instance, mover in apart.movers.items():
+        mine = kept.cloud.select(kept.cloud.instance == instance)
+        assert mine.points.tobytes() == mover.cloud.points.tobytes()
+        assert mover.cloud.moving.all() and (mover.cloud.instance == instance).all()
+    assert not apart.cloud.moving.any()
+
+
+def test_the_images_of_map_and_movers_together_are_the_whole(kept, apart):
+    whole, still = (r.depth["front"].depth_m for r in (kept, apart))
+    alone = [m.depth["front"].depth_m for m in apart.movers.values()]
+    shown = np.any([(a > 0) & (a == whole) for a in alone], axis=0)
+    moving = one_car().truth.moving_mask("front", KEY)
+    assert shown.sum() > 300 and moving[shown].mean() > 0.95
+    measured = whole > 0
+    assert (shown | (whole == still))[measured].mean() > 0.9
+    # behind the car the map shows what other sweeps saw of the street, never the car
+    both = (still > 0) & shown
+    assert both.sum() >= 5 and (still > whole + 0.5)[both].mean() > 0.95
+
+
+def test_a_mover_has_the_colour_of_its_pixels(apart):
+    rgb = np.concatenate([mover.cloud.rgb for mover in apart.movers.values()])
+    assert np.isin(rgb, [0, 128]).all() and (rgb == 128).mean() > 0.2
+
+
+def test_dropped_movers_are_nowhere(apart):
+    dropped = with_movers("drop")
+    assert not dropped.movers and same_points(dropped.cloud, apart.cloud)
+    for name in ("depth_m", "filled_m", "confidence", "frame", "age_s"):
+        a, b = (getattr(r.depth["front"], name) for r in (dropped, apart))
+        assert a.tobytes() == b.tobytes(), name
+    assert dropped.metrics == apart.metrics and dropped.metrics["num_moving"] == 0
+
+
+def test_without_flow_nothing_moves_and_nothing_is_left_out():
+    result = run(one_car(), KEY, 1, "icp", config=POSES_GIVEN | {"output": {"movers": "separate"}})
+    assert result.movers == {}
+    assert same_points(result.cloud, run(one_car(), KEY, 1, "icp", config=POSES_GIVEN).cloud)
+
+
+def test_everything_asked_for_is_written(apart, tmp_path):
+    paths = write_result(apart, {}, tmp_path, config={}, data="tiny")
+    names = {path.relative_to(tmp_path / "000003").as_posix() for path in paths}
+    movers = {
+        f"movers/{i:04d}/{name}" for i in apart.movers for name in ("cloud.laz", "depth/front.png")
+    }
+    flows = {"flow/000002_000003.npz", "flow/000004_000003.npz"}
+    optical = {"optical_flow/previous/front.png", "optical_flow/next/front.png"}
+    assert movers and movers | flows | optical <= names
+    folder = tmp_path / "000003"
+    for instance, mover in apart.movers.items():
+        where = folder / "movers" / f"{instance:04d}"
+        assert len(read_cloud(where / "cloud.laz").points) == len(mover.cloud)
+        found = read_depth_png(where / "depth" / "front.png")
+        np.testing.assert_allclose(found, mover.depth["front"].depth_m, atol=1 / 512)
+    image = cv2.imread(str(folder / "optical_flow" / "next" / "front.png"), cv2.IMREAD_UNCHANGED)
+    known = np.isfinite(apart.optical_flow["front"]["next"]).all(axis=2)
+    assert np.array_equal(image[..., 0] == 1, known)
+
+
+def test_files_that_are_no_longer_asked_for_go(apart, kept, tmp_path):
+    write_result(apart, {}, tmp_path, config={}, data="tiny")
+    write_result(kept, {}, tmp_path, config={}, data="tiny", overwrite=True)
+    left = {path.name for path in (tmp_path / "000003").iterdir()}
+    assert not left & {"movers", "flow", "optical_flow"} and "cloud.laz" in left
+
+
+# --- speed, and parts of a cloud ------------------------------------------------------------------
+
+
+def test_a_movers_velocity_is_its_own(kept):
+    cloud = kept.cloud
+    assert not cloud.velocity_m_s[~cloud.moving].any()
+    on_car = cloud.moving & (np.abs(cloud.points[:, 1] - 3.3) < 1.0)
+    assert on_car.sum() > 1000
+    median = np.median(cloud.velocity_m_s[on_car], axis=0)
+    np.testing.assert_allclose(median, [CAR.path.speed_m_s, 0, 0], atol=0.3)
+
+
+def test_parts_of_a_cloud_keep_their_rows(kept):
+    keep = np.arange(len(kept.cloud)) % 3 == 1
+    part = kept.cloud.select(keep)
+    for field in fields(Cloud):
+        assert np.array_equal(getattr(part, field.name), getattr(kept.cloud, field.name)[keep])
+
+
+# --- the key held out -----------------------------------------------------------------------------
+
+
+def test_an_exact_static_scene_predicts_its_key():
+    scene = Scene(World(ROOM), Arc(0, -1.5, 0, 2.0), Scanner(48, 720))
+    results = compare(
+        TinySequence(scene, range(5)), 2, 1, config=POSES_GIVEN, methods=("none", "icp")
+    )
+    assert results["none"].metrics["held_out"] is None
+    scores = results["icp"].metrics["held_out"]["front"]["measured"]
+    assert scores["all"]["num_compared"] > 2000 and scores["all"]["coverage"] > 0.5
+    assert scores["all"]["outliers"] < 0.001 and scores["all"]["mae_m"] < 0.2
+    assert scores["moving"]["num_pixels"] == 0 and scores["moving"]["mae_m"] is None
+
+
+def test_flow_predicts_movers_better_than_registration(kept):
+    methods = {**kept.baselines, "flow": kept}
+    assert methods["none"].metrics["held_out"] is None
+    held = {m: methods[m].metrics["held_out"]["front"]["measured"] for m in ("icp", "flow")}
+    for scores in held.values():
+        assert scores["all"]["num_pixels"] > 2000 and scores["moving"]["num_pixels"] > 200
+        split = scores["moving"]["num_pixels"] + scores["static"]["num_pixels"]
+        assert split == scores["all"]["num_pixels"]
+    assert held["flow"]["moving"]["mae_m"] < 0.3 * held["icp"]["moving"]["mae_m"]
+    assert held["flow"]["moving"]["mae_m"] < 0.1
+    assert json.loads(json.dumps(held, allow_nan=False)) == held
+
+
+def test_what_counts_as_moving_does_not_hang_on_the_method_scored(kept):
+    """The same pixels of the key for all, whatever becomes of the movers afterwards."""
+    held = with_movers("drop").metrics["held_out"]
+    assert held == kept.metrics["held_out"]
