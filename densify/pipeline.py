@@ -13,8 +13,6 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
-
 from densify import depth_metrics, scores
 from densify.config import Config, RegisterSettings, resolve
 from densify.errors import InputError
@@ -138,6 +136,7 @@ def compare(
     results: dict[str, Result] = {}
     for name, (cloud, flow) in moments.items():
         visible = METHODS[name].visible and settings.project.visibility
+        used = stretch.frames if METHODS[name].all_sweeps else (key,)
         with watch.stage("held out"):
             held_out_scores = held_out.scores(cloud, visible)
         movers = {}
@@ -157,7 +156,7 @@ def compare(
             metrics = _scores(sequence, stretch[key], key_image, cloud, depth)
             metrics["held_out"] = held_out_scores
         results[name] = Result(
-            *(name, key, tuple(np.unique(cloud.frame).tolist()), cloud, depth, metrics),
+            *(name, key, used, cloud, depth, metrics),
             costs=watch.costs(),
             baselines=dict(results),
             flow=flow,
@@ -225,10 +224,11 @@ def _motion(stretch: Stretch, heights: HeightMap, engine: str, settings: Config)
 
 
 def _steps(motion: Motion, stretch: Stretch, key: int) -> StretchFlow:
-    """Flow of every sweep to the next one on the way to the key."""
+    """Flow of every sweep to the next one on the way to the key, and of the key to a neighbour."""
     before = [f for f in stretch.frames if f <= key]
     after = [f for f in reversed(stretch.frames) if f >= key]
-    hops = [*pairwise(before), *pairwise(after)]
+    own = [(key, key + 1 if key + 1 in stretch.frames else key - 1)] if stretch.frames[1:] else []
+    hops = [*pairwise(before), *pairwise(after), *own]
     return StretchFlow(stretch, {hop: motion.flow(*hop) for hop in hops})
 
 

@@ -136,8 +136,8 @@ class Views:
     def movers(
         self, cloud: Cloud, visible: bool, images: Mapping[str, NDArray[np.uint8]]
     ) -> dict[int, Mover]:
-        """Every moving object by itself."""
-        instances = np.unique(cloud.instance[cloud.moving & (cloud.instance >= 0)])
+        """Every moving object by itself, and as -1 together what moves without one."""
+        instances = np.unique(cloud.instance[cloud.moving])
         movers = {}
         for instance in instances.tolist():
             part = cloud.select(cloud.moving & (cloud.instance == instance))

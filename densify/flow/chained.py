@@ -41,6 +41,10 @@ class ChainedMotion:
         return self._flow(here, there)
 
     def _flow(self, here: int, there: int) -> FlowField:
+        if here == there and len(self.stretch.sweeps) > 1:
+            # What moves in a sweep itself, and how fast, a step to a neighbour tells.
+            step = self._flow(here, here + 1 if here + 1 < len(self.stretch.sweeps) else here - 1)
+            return replace(step, displacement=np.zeros_like(step.displacement))
         if here == there:
             return FlowField.zero(len(self.stretch.sweeps[here].sweep))
         if (here, there) not in self._found:

@@ -29,6 +29,7 @@ _ATTACH_M = 0.3
 _ATTACH_UNSEEN_M = 0.15
 _MIN_HEIGHT_M = 0.08
 _LENGTH_M = 15.0
+_FINE_M = 0.3
 _SIDE_M = 0.1
 _LONGEST_HOLE_M = 0.6
 _MAX_CONTRADICTED = 0.05
@@ -122,14 +123,28 @@ def follow(stretch: Stretch, ground: HeightMap, min_height_m: float, soft: bool)
 
     with ThreadPoolExecutor() as pool:
         instance = tuple(pool.map(members, range(len(stretch.sweeps))))
-    bendings = _bendings(stretch, tracks, instance) if soft else {}
+    bendings = {}
+    if soft:
+        fine = [_is_fine(track, space) for track in tracks]
+        bendings = _bendings(stretch, tracks, fine, instance)
     return GroupMotion(stretch, tuple(tracks), instance, bendings)
 
 
+def _is_fine(track: Track, space: FreeSpace) -> bool:
+    """Rings so close on the object that a limb shows in several: between rings far apart nothing
+    tells bending from gliding along them."""
+    first = min(track.claimed)
+    range_m = float(np.linalg.norm(track.centre - space.origin[first]))
+    return space.ring_step_rad * range_m <= _FINE_M
+
+
 def _bendings(
-    stretch: Stretch, tracks: Sequence[Track], instance: Sequence[NDArray[np.int32]]
+    stretch: Stretch,
+    tracks: Sequence[Track],
+    fine: Sequence[bool],
+    instance: Sequence[NDArray[np.int32]],
 ) -> dict[int, Bending]:
-    """Of the objects that certainly bend."""
+    """Of the objects that certainly bend, among those seen finely."""
 
     def of_track(k: int) -> Bending:
         parts, sweeps = [], []
@@ -143,7 +158,8 @@ def _bendings(
         return Bending(tuple(sweeps), soften(parts))
 
     with ThreadPoolExecutor() as pool:
-        found = dict(enumerate(pool.map(of_track, range(len(tracks)))))
+        seen_finely = np.flatnonzero(fine).tolist()
+        found = dict(zip(seen_finely, pool.map(of_track, seen_finely), strict=True))
     return {k: bending for k, bending in found.items() if np.isfinite(bending.softened.alpha)}
 
 

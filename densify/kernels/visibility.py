@@ -11,8 +11,9 @@ from densify.kernels import Kernel, inlined
 _STEEP = 5.7  # metres farther per metre across, 10 degrees: a surface steeper on one side is a step
 _RIDGE_PX2 = 0.02
 _LEAST_WINDOW_PX, _LEAST_FIT_PX, _MOST_PX = 3, 2.0, 24
-_MOVING_SLACK = 2.0  # motion is known less well than where things stand
+_MOVING_SLACK = 4.0  # motion is known less well than where things stand
 _MOVING_WITNESS = 1  # sweeps from the key
+_GOES_ON = 1.2  # spacings within which a surface shows again
 _ANY_AGE = 1 << 40
 _ALL_ROUND = 3.0  # edges' reaches: no edge near
 _DIAGONAL = np.sqrt(0.5)
@@ -289,6 +290,10 @@ def settle(  # type: ignore[no-untyped-def]
         outer = inner + knobs[8]
         wide_u, fit_u = _window(knobs[0] * spacing_px[i, 0]), _fit(knobs[1] * spacing_px[i, 0])
         wide_v, fit_v = _window(knobs[0] * spacing_px[i, 1]), _fit(knobs[1] * spacing_px[i, 1])
+        on_v = outer
+        if moving[i]:  # its sweeps all see it in the same rings
+            on_v = max(outer, _GOES_ON * spacing_px[i, 1])
+        wide_u, wide_v = max(wide_u, _window(outer)), max(wide_v, _window(on_v))
         # Other sweeps saw the background where the mover was not yet, or no more.
         witness = _MOVING_WITNESS if moving[i] else _ANY_AGE
         m[:], reach[:] = 0.0, 0.0
@@ -305,7 +310,7 @@ def settle(  # type: ignore[no-untyped-def]
                     continue
                 seen |= np.int64(1) << np.int64(sweep[j])
                 youngest = min(youngest, age[j])
-                if close:
+                if abs(du) <= outer and abs(dv) <= on_v:
                     _extend(reach, du, dv)
                 if abs(du) < fit_u and abs(dv) < fit_v:
                     weight = (1 - abs(du) / fit_u) * (1 - abs(dv) / fit_v)

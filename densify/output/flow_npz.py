@@ -21,7 +21,8 @@ def write_flow_files(folder: Path, flow: StretchFlow) -> None:
         sweep = flow.stretch[frame].sweep
         arrived = sweep.points + field.total
         in_target = poses.transform(flow.stretch.T_target_source(target, frame), arrived)
-        data = flow_npz(field, row=sweep.row, total_flow=(in_target - sweep.points))
+        total_flow = in_target - sweep.points
+        data = flow_npz(field, row=sweep.row, total_flow=total_flow, object=field.instance)
         write_file(folder / f"{frame:06d}_{target:06d}.npz", data)
 
 

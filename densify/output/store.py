@@ -150,7 +150,7 @@ def write_result(
         if result.flow is not None:
             write_flow_files(folder / "flow", result.flow)
         for instance, mover in result.movers.items():
-            apart = folder / "movers" / f"{instance:04d}"
+            apart = folder / "movers" / (f"{instance:04d}" if instance >= 0 else "others")
             (apart / "depth").mkdir(parents=True)
             for name, maps in mover.depth.items():
                 write_depth_png(apart / "depth" / f"{name}.png", maps.depth_m)

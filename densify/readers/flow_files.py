@@ -9,7 +9,7 @@
                    where it is in the target's (then our registration takes the ego motion out)
     row            (N,) row of each point in the source sweep's file; without it N is their number
     moving         (N,) bool; without it everything with a residual flow of 5 cm or more
-    instance       (N,) which moving object, -1 none; without it none
+    object         (N,) which moving object, the same number in every file, -1 none; without it none
     to_reference   (N,3) metres, own motion from the point's firing to the sweep's reference time;
                    without it 0
 """
@@ -31,7 +31,7 @@ from densify.types import FlowField, Stretch
 
 MOVES_M = 0.05
 _WIDE = ("residual_flow", "total_flow", "to_reference")
-_KNOWN = (*_WIDE, "row", "moving", "instance")
+_KNOWN = (*_WIDE, "row", "moving", "object")
 
 
 class FlowFiles:
@@ -75,7 +75,7 @@ class FlowFiles:
         return FlowField(
             residual,
             moving,
-            column("instance", None, np.int32(-1)),
+            column("object", None, np.int32(-1)),
             np.zeros(len(row), bool),
             column("to_reference", 3, 0.0) if "to_reference" in arrays else None,
         )

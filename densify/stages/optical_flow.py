@@ -7,9 +7,7 @@ import numpy as np
 
 from densify import poses
 from densify.pinhole import image_points
-from densify.types import Camera, Cloud, DepthMap, Float, Float32
-
-_SAME_DEPTH = 0.02  # share of the depth
+from densify.types import Camera, Cloud, DepthMap, Float, Float32, Reason
 
 
 def optical_flow(
@@ -27,20 +25,11 @@ def optical_flow(
     the other; what moves goes on at its velocity. Known are the measured pixels; where the other
     image ends does not matter.
     """
-    points_cam = poses.transform(T_cam_key, exposed.points)
-    uv, inside = image_points(camera, points_cam)
-    rows = np.flatnonzero(inside)
-    column, row = np.rint(uv[rows]).astype(np.int64).T
-    depth_m = depth.depth_m[row, column].astype(np.float64)
-    off = np.abs(points_cam[rows, 2] - depth_m)
-    good = (depth_m > 0) & (off <= _SAME_DEPTH * depth_m)
-    rows, off, pixel = rows[good], off[good], (row * depth.depth_m.shape[1] + column)[good]
-    order = np.lexsort((rows, off, pixel))
-    pixel, first = np.unique(pixel[order], return_index=True)
-    chosen = rows[order[first]]
-
+    chosen = np.flatnonzero(depth.reason == Reason.KEPT)
+    uv, _ = image_points(camera, poses.transform(T_cam_key, exposed.points))
+    column, row = np.rint(uv[chosen]).astype(np.int64).T
     later = exposed.points[chosen] + seconds * exposed.velocity_m_s[chosen]
     there, _ = image_points(camera, poses.transform(T_other_key, later))
     flow = np.full((*depth.depth_m.shape, 2), np.nan, np.float32)
-    flow.reshape(-1, 2)[pixel] = there - uv[chosen]
+    flow[row, column] = there - uv[chosen]
     return flow
