@@ -263,6 +263,9 @@ class OutputSettings(Section):
         "optical_flow/: of every pixel with a measured depth to the previous and the next image, "
         "as KITTI flow PNG",
     )
+    rejected: bool = knob(
+        False, "rejected/: a picture of what visibility left out, and why; counts in metrics.json"
+    )
     movers: str = knob(
         "keep",
         "what moves. keep: as all else; drop: left out of maps and cloud; separate: left out and "

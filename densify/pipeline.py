@@ -155,6 +155,8 @@ def compare(
         with watch.stage("score"):
             metrics = _scores(sequence, stretch[key], key_image, cloud, depth)
             metrics["held_out"] = held_out_scores
+            if settings.output.rejected:
+                metrics["rejected"] = {n: maps.counts() for n, maps in depth.items()}
         results[name] = Result(
             *(name, key, used, cloud, depth, metrics),
             costs=watch.costs(),
@@ -162,6 +164,7 @@ def compare(
             flow=flow,
             movers=movers,
             optical_flow=views.optical_flow(cloud, depth) if settings.output.optical_flow else {},
+            rejected=views.rejected(cloud, depth) if settings.output.rejected else {},
         )
     return results
 

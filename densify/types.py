@@ -292,6 +292,11 @@ class DepthMap:
     reason: NDArray[np.uint8] = field(default_factory=lambda: np.zeros(0, np.uint8))
     age_s: Float32 | None = None
 
+    def counts(self) -> dict[str, int]:
+        """Points of the cloud by what became of them."""
+        counts = np.bincount(self.reason, minlength=len(Reason))
+        return {which.name.lower(): int(counts[which]) for which in Reason}
+
 
 @dataclass(frozen=True)
 class Mover:
@@ -388,7 +393,8 @@ class Result:
     metrics: plain numbers, ready for JSON. baselines: the results of the simpler methods on the
     same registration, by method. flow: of every sweep to the next one on the way to the key, where
     asked for (``output.flow``). movers: by instance (``output.movers``). optical_flow: camera ->
-    (H,W,2) pixels to the "previous" and the "next" image (``output.optical_flow``).
+    (H,W,2) pixels to the "previous" and the "next" image (``output.optical_flow``). rejected:
+    camera -> (H,W) `Reason` of what was left out (``output.rejected``).
     """
 
     method: str
@@ -402,3 +408,4 @@ class Result:
     flow: StretchFlow | None = None
     movers: Mapping[int, Mover] = field(default_factory=dict)
     optical_flow: Mapping[str, Mapping[str, Float32]] = field(default_factory=dict)
+    rejected: Mapping[str, NDArray[np.uint8]] = field(default_factory=dict)

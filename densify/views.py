@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from densify import depth_metrics, poses
 from densify.config import Config, ProjectSettings
+from densify.pinhole import image_points
 from densify.range_image import RangeImage
 from densify.stages.colour import colour
 from densify.stages.optical_flow import optical_flow
@@ -26,6 +27,7 @@ from densify.types import (
     Float32,
     LidarSequence,
     Mover,
+    Reason,
     Stretch,
 )
 
@@ -132,6 +134,23 @@ class Views:
             }
             for name, e in self.exposures.items()
         }
+
+    def rejected(self, cloud: Cloud, depth: Mapping[str, DepthMap]) -> dict[str, NDArray[np.uint8]]:
+        """Camera -> (H,W): the `Reason` why the nearest point that was left out of a pixel was,
+        0 where none was; points that another one outdid in their pixel do not count."""
+        maps = {}
+        for name, e in self.exposures.items():
+            reason = depth[name].reason
+            left_out = np.isin(
+                reason, [Reason.VETOED, Reason.HIDDEN, Reason.UNSUPPORTED, Reason.EDGE]
+            )
+            points_cam = poses.transform(e.T_cam_key, cloud.after(e.late_s).points[left_out])
+            uv, inside = image_points(e.camera, points_cam)
+            farthest_first = np.argsort(-points_cam[inside, 2], kind="stable")
+            column, row = np.rint(uv[inside][farthest_first]).astype(np.int64).T
+            maps[name] = np.zeros(depth[name].depth_m.shape, np.uint8)
+            maps[name][row, column] = reason[left_out][inside][farthest_first]
+        return maps
 
     def movers(
         self, cloud: Cloud, visible: bool, images: Mapping[str, NDArray[np.uint8]]

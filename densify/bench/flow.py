@@ -211,7 +211,8 @@ def _chained(
     chained = ChainedMotion(
         window.stretch, lambda here, there: steps[frames[here]], config.flow.max_gap_m
     )
-    return {f: chained.flow(f, window.key) for f in frames}
+    still = FlowField.zero(len(window.stretch[window.key].sweep))
+    return {f: still if f == window.key else chained.flow(f, window.key) for f in frames}
 
 
 def _num_points(method: str, pairs: Mapping[int, Pair]) -> int:

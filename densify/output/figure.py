@@ -9,9 +9,10 @@ from collections.abc import Mapping
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from densify.output.png import Picture
-from densify.types import Float32
+from densify.types import Float32, Reason
 
 # Fixed, so that pictures of different keys compare; logarithmic, as accuracy and density are.
 _NEAR_M, _FAR_M = 3.0, 80.0
@@ -22,6 +23,13 @@ _REFERENCE_WIDTH_PX = 1242
 _MIN_WIDTH_PX = 480
 _POINT_SIZE_PX = 3
 _FONT = cv2.FONT_HERSHEY_SIMPLEX
+_LEGEND_PX = 38
+_REASON_COLOURS = {
+    Reason.VETOED: (255, 70, 70),
+    Reason.HIDDEN: (80, 140, 255),
+    Reason.UNSUPPORTED: (255, 210, 60),
+    Reason.EDGE: (90, 230, 120),
+}
 
 
 def draw_figure(image: Picture, panels: Mapping[str, Float32]) -> Picture:
@@ -49,6 +57,23 @@ def draw_figure(image: Picture, panels: Mapping[str, Float32]) -> Picture:
         rows.append(panel.repeat(enlarge, axis=0).repeat(enlarge, axis=1))
     rows.append(_colour_scale(width))
     return np.concatenate(rows)
+
+
+def draw_rejected(image: Picture, reason: NDArray[np.uint8]) -> Picture:
+    """Draw over an image in gray what was left out, in a colour for each `densify.types.Reason`.
+
+    image: (H,W,3) uint8 RGB. reason: (H,W), 0 none. Returns (H',W,3) with the legend below.
+    """
+    gray = _BRIGHTNESS * (image @ np.array([0.299, 0.587, 0.114]))
+    canvas = np.repeat(np.rint(gray).astype(np.uint8)[:, :, None], 3, axis=2)
+    legend = np.full((_LEGEND_PX, image.shape[1], 3), 20, np.uint8)
+    left = 12
+    for which, colour in _REASON_COLOURS.items():
+        canvas[reason == which] = colour
+        text = which.name.lower()
+        cv2.putText(legend, text, (left, 26), _FONT, 0.6, colour, 1, cv2.LINE_AA)
+        left += 20 + cv2.getTextSize(text, _FONT, 0.6, 1)[0][0]
+    return np.concatenate([canvas, legend])
 
 
 def _overlay(image: Picture, depth_m: Float32) -> Picture:

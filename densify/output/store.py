@@ -50,7 +50,7 @@ from densify.output.depth_png import (
     write_depth_png,
     write_flow_png,
 )
-from densify.output.figure import draw_figure
+from densify.output.figure import draw_figure, draw_rejected
 from densify.output.flow_npz import write_flow_files
 from densify.output.png import Picture, write_picture
 from densify.types import DepthMap, Result
@@ -62,7 +62,16 @@ SCHEMA_VERSION = 1
 
 _OWNED: Mapping[Verb, tuple[str, ...]] = {
     "run": (
-        *("depth", "depth_filled", "confidence", "age", "flow", "movers", "optical_flow"),
+        *(
+            "depth",
+            "depth_filled",
+            "confidence",
+            "age",
+            "flow",
+            "movers",
+            "optical_flow",
+            "rejected",
+        ),
         *("cloud.laz", "metrics.json", "figure.png", "curve.png", "run.yaml"),
     ),
     "compare": ("compare.json", "compare.png"),
@@ -155,6 +164,10 @@ def write_result(
             for name, maps in mover.depth.items():
                 write_depth_png(apart / "depth" / f"{name}.png", maps.depth_m)
             write_cloud(apart / "cloud.laz", mover.cloud)
+        for name, reason in result.rejected.items():
+            (folder / "rejected").mkdir(exist_ok=True)
+            image = images.get(name, np.zeros((*reason.shape, 3), np.uint8))
+            write_picture(folder / "rejected" / f"{name}.png", draw_rejected(image, reason))
         for name, flows in result.optical_flow.items():
             for other, flow_px in flows.items():
                 (folder / "optical_flow" / other).mkdir(parents=True, exist_ok=True)
