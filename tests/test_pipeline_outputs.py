@@ -12,7 +12,7 @@ import pytest
 
 from densify.output import read_cloud, read_depth_png, write_result
 from densify.pipeline import compare, run
-from densify.types import Cloud, Result
+from densify.types import Cloud, Reason, Result
 from tests.scenes import ROOM, Arc, Scanner, Scene, TinySequence, World
 from tests.small_street import CAR, KEY, POSES_GIVEN, one_car
 from tests.tiny_street import same_points
@@ -164,3 +164,34 @@ def test_what_counts_as_moving_does_not_hang_on_the_method_scored(kept):
     """The same pixels of the key for all, whatever becomes of the movers afterwards."""
     held = with_movers("drop").metrics["held_out"]
     assert held == kept.metrics["held_out"]
+
+
+# --- what is left out -----------------------------------------------------------------------------
+
+
+def test_every_point_is_accounted_for_and_the_picture_shows_what_was_left_out(tmp_path):
+    result = with_movers("keep", rejected=True)
+    counts, maps = result.metrics["rejected"]["front"], result.depth["front"]
+    assert sum(counts.values()) == len(result.cloud)
+    assert counts["kept"] == (maps.depth_m > 0).sum()
+    left_out = result.rejected["front"]
+    shown = {Reason(r).name.lower() for r in np.unique(left_out) if r}
+    assert shown and shown <= {"vetoed", "hidden", "unsupported", "edge"}
+    for name in shown:
+        assert (left_out == Reason[name.upper()]).sum() <= counts[name]
+    write_result(result, {}, tmp_path, config={}, data="street")
+    picture = cv2.imread(str(tmp_path / f"{KEY:06d}" / "rejected" / "front.png"))
+    assert picture.shape[1] == left_out.shape[1] and picture.shape[0] > left_out.shape[0]
+
+
+# --- precision over density -----------------------------------------------------------------------
+
+
+def test_a_higher_least_confidence_keeps_less_and_the_curve_starts_with_everything(kept):
+    held_out = kept.metrics["held_out"]["front"]
+    curve = held_out["curve"]
+    assert [p["min_confidence"] for p in curve] == [round(0.05 * i, 2) for i in range(20)]
+    for product in ("measured", "filled"):
+        density = [p[f"density_{product}"] for p in curve]
+        assert density == sorted(density, reverse=True) and density[0] > density[-1]
+        assert curve[0][f"outliers_{product}"] == held_out[product]["all"]["outliers"]
