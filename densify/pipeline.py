@@ -19,7 +19,7 @@ from densify.errors import InputError
 from densify.flow.chained import ChainedMotion
 from densify.height_map import HeightMap
 from densify.range_image import RangeImage
-from densify.readers.flow_files import FlowFiles
+from densify.readers.flow_files import FlowFiles, require_folder
 from densify.readers.window import choose_cameras, read_sweeps, recorded_trajectory, window_frames
 from densify.stages.accumulate import accumulate
 from densify.stages.age import with_ages
@@ -114,6 +114,8 @@ def compare(
         if name not in METHODS:
             raise InputError(f"--methods {name}: expected some of {', '.join(METHODS)}")
     settings = resolve(config)
+    if settings.flow.files is not None:
+        require_folder(settings.flow.files)
     chosen = choose_cameras(sequence, cameras)
     frames, lead_in = window_frames(sequence, key, window, settings.register.num_lead_in)
     watch = _Watch(progress)

@@ -34,6 +34,12 @@ _WIDE = ("residual_flow", "total_flow", "to_reference")
 _KNOWN = (*_WIDE, "row", "moving", "object")
 
 
+def require_folder(folder: Path) -> None:
+    """Raise InputError unless it is there: to be asked before anything is computed."""
+    if not folder.is_dir():
+        raise InputError(f"flow.engine npz:{folder}: no such folder; expected flow files in it")
+
+
 class FlowFiles:
     """The flow files of a folder, for the sweeps of a stretch.
 
@@ -41,8 +47,7 @@ class FlowFiles:
     """
 
     def __init__(self, folder: Path, stretch: Stretch) -> None:
-        if not folder.is_dir():
-            raise InputError(f"flow.engine npz:{folder}: no such folder; expected flow files in it")
+        require_folder(folder)
         self._folder, self._stretch = folder, stretch
 
     def step(self, here: int, there: int) -> FlowField:
