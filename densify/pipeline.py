@@ -120,13 +120,9 @@ def compare(
     frames, lead_in = window_frames(sequence, key, window, settings.register.num_lead_in)
     watch = _Watch(progress)
 
-    sweeps = _read(sequence, [*lead_in, *frames], settings, watch)
     with watch.stage("images"):
         images = {camera.name: sequence.image(camera.name, key) for camera in chosen}
-    with watch.stage("register"):
-        trajectory = find_trajectory(sequence, sweeps, settings.register)
-    with watch.stage("deskew"):
-        stretch = deskew([s for s in sweeps if s.frame in frames], trajectory)
+    stretch = _registered(sequence, lead_in, frames, settings, watch)
     with watch.stage("ground"):
         heights = ground(stretch, settings.ground)
     moments = {name: _key_moment(stretch, key, heights, name, settings, watch) for name in methods}
@@ -169,6 +165,20 @@ def compare(
             rejected=views.rejected(cloud, depth) if settings.output.rejected else {},
         )
     return results
+
+
+def _registered(
+    sequence: LidarSequence,
+    lead_in: Sequence[int],
+    frames: Sequence[int],
+    settings: Config,
+    watch: _Watch,
+) -> Stretch:
+    sweeps = _read(sequence, [*lead_in, *frames], settings, watch)
+    with watch.stage("register"):
+        trajectory = find_trajectory(sequence, sweeps, settings.register)
+    with watch.stage("deskew"):
+        return deskew([s for s in sweeps if s.frame in frames], trajectory)
 
 
 def _read(

@@ -23,7 +23,7 @@ def test_progress_names_every_stage():
     run(one_car(()), KEY, 1, "icp", config=POSES_GIVEN, progress=lambda *step: seen.append(step))
     names = list(dict.fromkeys(name for name, _, _ in seen))
     assert names == [
-        *("read", "images", "register", "deskew", "ground", "accumulate"),
+        *("images", "read", "register", "deskew", "ground", "accumulate"),
         *("held out", "project", "colour", "score"),
     ]
     assert all(0 <= done <= total for _, done, total in seen)
