@@ -13,3 +13,14 @@ class InputError(Exception):
 
 class ComputationError(Exception):
     """A stage found that its result cannot be trusted. Exit code 1."""
+
+
+class SweepError(ComputationError):
+    """One sweep is in the way: without ``frame`` the others could be used."""
+
+    def __init__(self, message: str, frame: int) -> None:
+        super().__init__(message, frame)
+        self.frame = frame
+
+    def __str__(self) -> str:
+        return str(self.args[0])
