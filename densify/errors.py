@@ -11,6 +11,10 @@ class InputError(Exception):
     """Input, configuration or output place that cannot be used. Exit code 2."""
 
 
+class OutputError(InputError):
+    """What is computed cannot be written: no permission, a full disk."""
+
+
 class ComputationError(Exception):
     """A stage found that its result cannot be trusted. Exit code 1."""
 

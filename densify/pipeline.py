@@ -9,7 +9,6 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
-from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -74,7 +73,8 @@ METHODS = {
 """For `compare`: the key sweep alone; registration alone, as it is and with visibility; our scene
 flow without visibility; the published scene flow; ours. `run` takes none, icp and flow."""
 
-_RUN = ("none", "icp", "flow")
+RUN = ("none", "icp", "flow")
+"""What `run` takes, each with those before it as its baselines."""
 COMPARED = ("none", "icp", "paper", "flow")
 """What `compare` shows unless told otherwise."""
 
@@ -99,9 +99,9 @@ def run(
     The result carries its baselines. Raises InputError for what cannot be used, ComputationError
     where registration went wrong.
     """
-    if method not in _RUN:
-        raise InputError(f"--method {method}: expected one of {', '.join(_RUN)}")
-    methods = _RUN[: _RUN.index(method) + 1]
+    if method not in RUN:
+        raise InputError(f"--method {method}: expected one of {', '.join(RUN)}")
+    methods = RUN[: RUN.index(method) + 1]
     return compare(sequence, key, window, cameras, config, progress, methods)[method]
 
 
@@ -133,7 +133,10 @@ def compare(
     stretch = _registered(sequence, lead_in, frames, settings, watch)
     with watch.stage("ground"):
         heights = ground(stretch, settings.ground)
-    motion = partial(_motion, stretch, heights, settings)
+
+    def motion(engine: str) -> Motion:
+        return motion_by(engine, stretch, heights, settings)
+
     moments = {name: _key_moment(stretch, key, name, motion, settings, watch) for name in methods}
     return _results(sequence, stretch, key, moments, chosen, images, settings, watch)
 
@@ -142,7 +145,7 @@ def densify(
     sequence: LidarSequence,
     stretch: Stretch,
     key: int,
-    motion: Motion,
+    motion: Callable[[], Motion],
     cameras: Sequence[str] | None,
     settings: Config,
     methods: Sequence[str],
@@ -150,13 +153,15 @@ def densify(
 ) -> dict[str, Result]:
     """Methods by name for one key whose stretch is registered and whose motion is known.
 
-    motion: of at least the stretch. methods: of `METHODS`, none with an engine of its own. images:
-    by camera; without them nothing is coloured, nor compared with the truth. The rest as `compare`.
+    motion: gives that of at least the stretch. methods: of `METHODS`, none with an engine of its
+    own. images: by camera; without them nothing is coloured, nor compared with the truth. The rest
+    as `compare`.
     """
     watch = Watch(None)
     chosen = choose_cameras(sequence, cameras)
     moments = {
-        name: _key_moment(stretch, key, name, lambda _: motion, settings, watch) for name in methods
+        name: _key_moment(stretch, key, name, lambda _: motion(), settings, watch)
+        for name in methods
     }
     return _results(sequence, stretch, key, moments, chosen, images, settings, watch)
 
@@ -284,8 +289,8 @@ def _key_moment(
         return accumulate(used, fields, key, drop_lost), flow
 
 
-def _motion(stretch: Stretch, heights: HeightMap, settings: Config, engine: str) -> Motion:
-    """By the engine, or from flow that others left on disk."""
+def motion_by(engine: str, stretch: Stretch, heights: HeightMap, settings: Config) -> Motion:
+    """How everything in a stretch moves: by that engine, or from flow that others left on disk."""
     flow = replace(settings.flow, engine=engine)
     if flow.files is None:
         return estimate_motion(stretch, heights, flow)
