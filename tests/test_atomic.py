@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Files whole or not there: a full disk, a lost power supply, a killed process, several machines."""
+"""Files whole or not there: a full disk, lost power, killed processes, several machines."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def killed_after_ready(code: str, *arguments: Path) -> None:
 
 WAIT = "print('ready', flush=True); time.sleep(60)"
 
-IN_A_FILE = f"""
+IN_A_FILE = """
 import os, sys, time
 from pathlib import Path
 from densify.output.atomic import write_file
