@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: MIT
+"""Whole drives into training sets."""
