@@ -1,0 +1,138 @@
+# SPDX-License-Identifier: MIT
+"""Small recordings across the border of two blocks, in memory and as a KITTI raw drive, and the
+sets that are made of them."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+import densify
+from densify.dataset.drive import BLOCK
+from tests.command import files_in
+from tests.scenes import CAMERA, Arc, Scanner, Scene, TinySequence, World, car, stamp_ns, street
+
+BORDER = 2 * BLOCK
+FRAMES = range(BORDER - 4, BORDER + 5)
+DRIVE = "2011_09_26_drive_0013_sync"
+"""One of KITTI's for validation."""
+
+
+def across_border(
+    frames: Sequence[int] = FRAMES, scanner: Scanner = Scanner(24, 360), movers: bool = True
+) -> TinySequence:
+    """At the first frame of a block the vehicle is at the start of a street, at 4 m/s, behind a car
+    at 8 m/s and with one coming towards it at 7 m/s."""
+    cars = car(9 - 8 * 4, 1.8, 8, 1), car(22 + 7 * 4, 2.3, 7, 2, np.pi)
+    world = World((*street(50.0), *(cars if movers else ())))
+    return TinySequence(Scene(world, Arc(-4 * 4, -1.5, 0, 4.0), scanner), frames)
+
+
+def write_drive(sequence: TinySequence, date: Path, drive: str = DRIVE) -> Path:
+    """The sweeps and one camera, ``image_02``, as a KITTI raw drive; returns its folder."""
+    folder = date / drive
+    R, t = CAMERA.T_cam_lidar[:3, :3], CAMERA.T_cam_lidar[:3, 3]
+    P = np.column_stack([CAMERA.K, np.zeros(3)])
+    _put(
+        date / "calib_cam_to_cam.txt",
+        f"R_rect_00: {_words(np.eye(3))}\n"
+        f"S_rect_02: {CAMERA.width_px} {CAMERA.height_px}\nP_rect_02: {_words(P)}\n",
+    )
+    _put(date / "calib_velo_to_cam.txt", f"R: {_words(R)}\nT: {_words(t)}\n")
+    image = np.full((CAMERA.height_px, CAMERA.width_px, 3), 128, np.uint8)
+    for frame in sequence.frames:
+        write_sweep(sequence, folder, frame)
+        write_pose(sequence, folder, frame)
+        path = folder / "image_02" / "data" / f"{frame:010d}.png"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        cv2.imwrite(str(path), image)
+    every = [stamp_ns(f) for f in range(max(sequence.frames) + 1)]
+    for name, late_ns in (("", 0), ("_start", -50_000_000), ("_end", 50_000_000)):
+        _put_stamps(folder / "velodyne_points" / f"timestamps{name}.txt", every, late_ns)
+    _put_stamps(folder / "oxts" / "timestamps.txt", every)
+    _put(date / "calib_imu_to_velo.txt", f"R: {_words(np.eye(3))}\nT: 0 0 0\n")
+    return folder
+
+
+def write_pose(sequence: TinySequence, drive: Path, frame: int) -> None:
+    """Of a vehicle that drives straight on to the east, at the equator, where a degree is largest."""
+    T = sequence.T_world_lidar(frame)
+    assert np.allclose(T[:3, :3], np.eye(3))
+    lat, lon = np.rad2deg(T[1, 3] / 6_378_137), np.rad2deg(T[0, 3] / 6_378_137)
+    text = f"{lat:.17g} {lon:.17g} {T[2, 3]:.17g}" + 27 * " 0" + "\n"
+    _put(drive / "oxts" / "data" / f"{frame:010d}.txt", text)
+
+
+def write_sweep(sequence: TinySequence, drive: Path, frame: int) -> None:
+    sweep = sequence[frame]
+    columns = np.column_stack([sweep.points, sweep.intensity]).astype("<f4")
+    path = sweep_file(drive, frame)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(columns.tobytes())
+
+
+def sweep_file(drive: Path, frame: int) -> Path:
+    return drive / "velodyne_points" / "data" / f"{frame:010d}.bin"
+
+
+def _put(path: Path, text: str) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(text)
+
+
+def _put_stamps(path: Path, stamps_ns: Sequence[int], late_ns: int = 0) -> None:
+    times = [str(np.datetime64(s + late_ns, "ns")).replace("T", " ") for s in stamps_ns]
+    _put(path, "\n".join(times) + "\n")
+
+
+def _words(array: np.ndarray) -> str:
+    return " ".join(f"{value:.17g}" for value in np.ravel(array))
+
+
+OPTIONS = ("--window", "2", "--set", "register.source=dataset")
+
+
+def maps_in(out: Path) -> dict[str, bytes]:
+    """What a set holds for training: path relative to it -> bytes."""
+    return {name: data for name, data in files_in(out).items() if name.endswith(".png")}
+
+
+def records(out: Path) -> list[dict]:
+    """Of all manifests, as they stand in the files."""
+    lines = [x for p in sorted(out.glob("manifest*.jsonl")) for x in p.read_text().splitlines()]
+    return [json.loads(line) for line in lines]
+
+
+def statuses(out: Path) -> dict[int, str]:
+    return {record["key"]: record["status"] for record in records(out)}
+
+
+def keys_of(names: Iterable[str]) -> set[int]:
+    return {int(Path(name).stem) for name in names}
+
+
+def copy_drive(drive: Path, to: Path) -> Path:
+    """With the calibration beside it; returns the copy's folder."""
+    shutil.copytree(drive.parent, to)
+    return to / drive.name
+
+
+def command(*arguments: str | Path, **environment: str) -> subprocess.Popen[str]:
+    """``densify dataset`` as a process in a session of its own."""
+    home = str(Path(densify.__file__).parents[1])
+    return subprocess.Popen(
+        [sys.executable, "-m", "densify", "dataset", *map(str, arguments)],
+        env={**os.environ, "PYTHONPATH": home, **environment},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
