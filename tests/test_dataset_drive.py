@@ -1,0 +1,337 @@
+# SPDX-License-Identifier: MIT
+"""What the keys of a recording share: made once, the same whatever is asked for, and one at the
+seams of the blocks that it is made in."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import replace
+from itertools import pairwise, product
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from densify import pipeline, poses
+from densify.config import Config, resolve
+from densify.dataset import drive as shared
+from densify.dataset.cache import Cache
+from densify.dataset.drive import BLOCK, Drive
+from densify.errors import InputError, SweepError
+from densify.range_image import RangeImage
+from densify.readers.window import read_sweeps
+from densify.stages.deskew import deskew
+from densify.types import Stretch, Sweep
+from tests.dataset_scenes import BORDER, across_border
+from tests.scenes import SWEEP_S, Arc, Scanner, Scene, TinySequence, World, car, street
+from tests.small_street import POSES_GIVEN, one_car
+
+LIMIT = 10**9
+GIVEN = resolve(POSES_GIVEN)
+
+
+@pytest.fixture
+def small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Blocks of 6 sweeps that look 6 beyond, so that short recordings have many."""
+    for name, size in (("BLOCK", 6), ("_MARGIN", 6), ("_BEYOND_WINDOW", 4), ("REACH", 4)):
+        monkeypatch.setattr(shared, name, size)
+
+
+@pytest.fixture(scope="module")
+def long_street() -> TinySequence:
+    """18 sweeps, two cars."""
+    cars = car(10, -1.5, 6, 1), car(40, 2.2, 7, 2, np.pi)
+    scene = Scene(World((*street(60.0), *cars)), Arc(0, -1.5, 0, 4.0), Scanner(32, 540))
+    return TinySequence(scene, range(18))
+
+
+def drive_of(sequence, folder: Path, window: int = 2, config: Config = GIVEN) -> Drive:
+    return Drive(sequence, config, window, Cache(LIMIT, folder))
+
+
+def maps_of(drive: Drive, sequence, key: int, config: Config = GIVEN) -> pipeline.Result:
+    results = pipeline.densify(
+        *(sequence, drive.window(key), key, lambda: drive.motion_of(key), None, config, ["flow"]),
+    )
+    return results["flow"]
+
+
+def assert_same_maps(a, b) -> None:
+    assert a.keys() == b.keys()
+    for name in a:
+        for field in ("depth_m", "filled_m", "confidence", "frame"):
+            np.testing.assert_array_equal(getattr(a[name], field), getattr(b[name], field), field)
+
+
+# As `run`
+
+
+class FromItsStart(TinySequence):
+    """Its world is the lidar of its first sweep, as registration's is."""
+
+    def T_world_lidar(self, frame: int) -> np.ndarray:
+        start = super().T_world_lidar(self.frames[0])
+        return poses.inverse(start) @ super().T_world_lidar(frame)
+
+
+@pytest.mark.parametrize("source", ["dataset", "kiss-icp"])
+def test_a_recording_within_the_window_is_what_run_makes(source: str, tmp_path: Path) -> None:
+    config = resolve({"register": {"source": source}})
+    sequence = FromItsStart(one_car().scene, range(5), with_truth=False)
+    drive = drive_of(sequence, tmp_path, 4, config)
+    for key in (1, 4):
+        alone = pipeline.run(sequence, key, 4, config=config)
+        here = maps_of(drive, sequence, key, config)
+        assert here.frames == alone.frames
+        assert here.metrics["num_moving"] == alone.metrics["num_moving"] > 0
+        assert_same_maps(here.depth, alone.depth)
+        for name in ("ghosts", "density"):
+            assert here.metrics[name] == alone.metrics[name]
+
+
+def test_more_sweeps_around_make_it_no_worse(small_blocks, long_street, tmp_path: Path) -> None:
+    drive = drive_of(long_street, tmp_path)
+    wrong = Counter()
+    for key in (2, 8, 15):
+        alone = pipeline.run(long_street, key, 2, config=GIVEN)
+        here = maps_of(drive, long_street, key)
+        assert here.frames == alone.frames
+        for who, result in (("alone", alone), ("here", here)):
+            ghosts = result.metrics["ghosts"]
+            wrong[who, "ghosts"] += ghosts["all"] * ghosts["num_points"]
+            truth = long_street.truth.depth_m("front", key)
+            depth_m = result.depth["front"].depth_m
+            both = (depth_m > 0) & (truth > 0)
+            wrong[who, "outliers"] += np.sum(np.abs(depth_m - truth)[both] > 0.05 * truth[both])
+            wrong[who, "pixels"] += both.sum()
+    assert wrong["here", "ghosts"] <= wrong["alone", "ghosts"] + 2
+    assert wrong["here", "outliers"] <= wrong["alone", "outliers"] + 2
+    assert wrong["here", "pixels"] > 0.97 * wrong["alone", "pixels"] > 1000
+
+
+# Whatever is asked for
+
+
+def test_keys_do_not_depend_on_others(small_blocks, long_street, tmp_path: Path) -> None:
+    """Nor on their order, nor on what is in memory or on disk already."""
+    keys = [4, 5, 6, 7, 12]
+    upward, downward = drive_of(long_street, tmp_path / "a"), drive_of(long_street, tmp_path / "b")
+    first = {key: maps_of(upward, long_street, key).depth for key in keys}
+    for key in reversed(keys):
+        assert_same_maps(maps_of(downward, long_street, key).depth, first[key])
+    alone = drive_of(long_street, tmp_path / "c")
+    assert_same_maps(maps_of(alone, long_street, 6).depth, first[6])
+    from_disk = drive_of(long_street, tmp_path / "a")
+    assert_same_maps(maps_of(from_disk, long_street, 6).depth, first[6])
+
+
+# Seams
+
+
+def test_neighbouring_blocks_say_the_same_of_what_both_know(
+    small_blocks, long_street, tmp_path: Path
+) -> None:
+    drive = drive_of(long_street, tmp_path)
+    for last in (5, 11):
+        before, after = drive.motion_of(last), drive.motion_of(last + 1)
+        both = [f for f in drive.window(last).frames if f in drive.window(last + 1).frames]
+        assert both == list(range(last - 1, last + 3))
+        num_moving, num_differing, apart_m = 0, 0, []
+        for frame, target in product(both, (last, last + 1)):
+            a, b = before.flow(frame, target), after.flow(frame, target)
+            num_moving += (a.moving & b.moving).sum()
+            num_differing += (a.moving != b.moving).sum()
+            known = a.moving & b.moving & ~a.lost & ~b.lost
+            apart_m.append(np.linalg.norm(a.displacement - b.displacement, axis=1)[known])
+        assert num_differing < 0.02 * num_moving
+        assert num_moving > 1000
+        median_m, most_m = np.percentile(np.concatenate(apart_m), [50, 90])
+        assert median_m < 0.01
+        assert most_m < 0.05
+
+
+# Poses
+
+
+def steps(stretch) -> np.ndarray:
+    T = [sweep.T_world_lidar for sweep in stretch.sweeps]
+    return np.stack([poses.inverse(a) @ b for a, b in pairwise(T)])
+
+
+def test_poses_over_a_border_are_those_registered_in_one_go(tmp_path: Path) -> None:
+    sequence = across_border(scanner=Scanner(48, 720))
+    config = resolve({})
+    drive = drive_of(sequence, tmp_path, 4, config)
+    sweeps = list(read_sweeps(sequence, sequence.frames, config.register))
+    whole = deskew(sweeps, pipeline.find_trajectory(sequence, sweeps, config.register))
+    for key in (BORDER - 1, BORDER):
+        window = drive.window(key)
+        assert window.frames == tuple(f for f in sequence.frames if abs(f - key) <= 4)
+        part = Stretch(tuple(whole[f] for f in window.frames))
+        np.testing.assert_allclose(steps(window), steps(part), atol=0.01)
+
+
+def test_sweeps_at_a_border_are_deskewed_by_their_neighbours_in_the_other_block(
+    tmp_path: Path,
+) -> None:
+    sequence = across_border()
+    sequence.T_world_lidar = lambda f: sequence.scene.T_world_lidar(
+        0.1 * (f + 0.02 * (f - 36) ** 2)
+    )
+    drive = drive_of(sequence, tmp_path, 4)
+    early, late = drive.window(BORDER - 1), drive.window(BORDER)
+    for frame in (BORDER - 1, BORDER):
+        i = early.frames.index(frame)
+        here, there = early[frame], late[frame]
+        for name in ("twist_before", "twist_after"):
+            np.testing.assert_allclose(getattr(here, name), getattr(there, name), atol=1e-9)
+        np.testing.assert_allclose(here.sweep.points, there.sweep.points, atol=1e-12)
+        np.testing.assert_allclose(
+            here.twist_after, poses.log(steps(early)[i]) / SWEEP_S, atol=1e-9
+        )
+        np.testing.assert_allclose(
+            here.twist_before, poses.log(steps(early)[i - 1]) / SWEEP_S, atol=1e-9
+        )
+        assert abs(here.twist_after - here.twist_before).max() > 0.05
+
+
+@pytest.mark.parametrize("num_lead_in", [0, 1, 5])
+def test_no_window_is_cut_at_a_border(num_lead_in: int, tmp_path: Path) -> None:
+    for source in ("dataset", "kiss-icp"):
+        config = resolve({"register": {"source": source, "num_lead_in": num_lead_in}})
+        drive = drive_of(across_border(), tmp_path, 2, config)
+        assert drive.window(BORDER - 1).frames == tuple(range(BORDER - 3, BORDER + 2))
+        assert drive.window(BORDER).frames == tuple(range(BORDER - 2, BORDER + 3))
+
+
+def test_a_gap_ends_windows_and_begins_a_world(tmp_path: Path) -> None:
+    frames = [f for f in range(BORDER - 6, BORDER + 6) if f not in (BORDER - 3, BORDER + 3)]
+    drive = drive_of(across_border(frames), tmp_path, 4)
+    pieces = {
+        BORDER - 5: [-6, -5, -4],
+        BORDER - 1: [-2, -1, 0, 1, 2],
+        BORDER: [-2, -1, 0, 1, 2],
+        BORDER + 4: [4, 5],
+    }
+    for key, around in pieces.items():
+        window = drive.window(key)
+        assert window.frames == tuple(BORDER + i for i in around)
+        own = next(s for s in window.sweeps if s.frame // BLOCK == key // BLOCK)
+        np.testing.assert_array_equal(own.T_world_lidar, np.eye(4))
+        assert drive.motion_of(key).flow(key, key).displacement.shape[1] == 3
+    end = drive.window(BORDER + 5)[BORDER + 5]
+    np.testing.assert_array_equal(end.twist_before, end.twist_after)
+
+
+# Sweeps in the way
+
+
+class Damaged(TinySequence):
+    """unreadable, posed: frames whose sweep, whose pose cannot be read. garbage: frames of noise."""
+
+    def __init__(self, sequence, unreadable=(), posed=(), garbage=()) -> None:
+        super().__init__(sequence.scene, sequence.frames)
+        self.bad = frozenset(unreadable), frozenset(posed), frozenset(garbage)
+
+    def __getitem__(self, frame: int) -> Sweep:
+        if frame in self.bad[0]:
+            raise InputError(f"frame {frame}: truncated")
+        sweep = super().__getitem__(frame)
+        if frame in self.bad[2]:
+            noise = np.random.default_rng(frame).uniform(-40, 40, sweep.points.shape)
+            sweep = replace(sweep, points=noise)
+        return sweep
+
+    def T_world_lidar(self, frame: int) -> np.ndarray:
+        if frame in self.bad[1]:
+            raise InputError(f"frame {frame}: no pose")
+        return super().T_world_lidar(frame)
+
+
+@pytest.mark.parametrize("kind", ["unreadable", "posed", "garbage"])
+@pytest.mark.parametrize("bad", [BORDER - 2, BORDER - 1, BORDER, BORDER + 2])
+def test_only_the_sweep_that_is_in_the_way_is_left_out(kind: str, bad: int, tmp_path: Path) -> None:
+    sequence = Damaged(across_border(), **{kind: [bad]})
+    drive = drive_of(sequence, tmp_path)
+    for key in sequence.frames:
+        if key == bad:
+            with pytest.raises(SweepError, match=str(bad)) as error:
+                drive.window(key)
+            assert error.value.frame == bad and "\n" not in str(error.value)
+            continue
+        near = [f for f in sequence.frames if abs(f - key) <= 2]
+        side = [f for f in near if (f < bad) == (key < bad) and f != bad]
+        assert drive.window(key).frames == tuple(side)
+
+
+# Once
+
+
+@pytest.fixture
+def counted(monkeypatch: pytest.MonkeyPatch) -> Counter[str]:
+    """How often what is costly was made."""
+    counts: Counter[str] = Counter()
+
+    def counting(name: str, made):
+        def count(*arguments, **options):
+            counts[name] += 1
+            return made(*arguments, **options)
+
+        return count
+
+    for name in ("find_trajectory", "ground", "find_candidates", "follow_candidates"):
+        monkeypatch.setattr(shared, name, counting(name, getattr(shared, name)))
+    images = SimpleNamespace(of=counting("images", RangeImage.of))
+    monkeypatch.setattr(shared, "RangeImage", images)
+    return counts
+
+
+ONCE = {"find_trajectory": 2, "ground": 2, "find_candidates": 2, "follow_candidates": 2}
+
+
+def use(sequence, folder: Path, config: Config = GIVEN, window: int = 2) -> None:
+    drive = drive_of(sequence, folder, window, config)
+    for key in sequence.frames:
+        drive.motion_of(key)
+
+
+def test_each_piece_of_work_is_made_once(counted: Counter[str], tmp_path: Path) -> None:
+    sequence = across_border()
+    use(sequence, tmp_path)
+    assert counted == {**ONCE, "images": len(sequence.frames)}
+    counted.clear()
+    use(sequence, tmp_path)
+    use(sequence, tmp_path, window=3)  # only the keys' windows are larger
+    use(sequence, tmp_path, resolve({**POSES_GIVEN, "project": {"support": 3}}))
+    assert counted == {}
+
+
+def test_other_settings_and_other_sweeps_make_anew(counted: Counter[str], tmp_path: Path) -> None:
+    sequence = across_border()
+    use(sequence, tmp_path)
+    counted.clear()
+    use(sequence, tmp_path, resolve({**POSES_GIVEN, "flow": {"soft": False}}))
+    assert counted == {"follow_candidates": 2}
+    counted.clear()
+    use(sequence, tmp_path, resolve({**POSES_GIVEN, "ground": {"cell_m": 0.8}}))
+    assert counted == {n: 2 for n in ("ground", "find_candidates", "follow_candidates")}
+    counted.clear()
+    use(sequence, tmp_path, resolve({"register": {"source": "dataset", "min_range_m": 3.5}}))
+    assert counted == {**ONCE, "images": len(sequence.frames)}
+    counted.clear()
+    whole = Damaged(sequence)
+    use(whole, tmp_path)
+    assert counted == {}
+    last = sequence.frames[-1]
+    scan = sequence.scene.scan(last)
+    nudged = replace(scan.sweep, points=scan.sweep.points + [0, 0, 1e-3])
+    sequence.scene._scans[last] = replace(scan, sweep=nudged)
+    use(whole, tmp_path)
+    assert counted == {
+        "find_trajectory": 1,
+        "images": 5,
+        "ground": 2,
+        "find_candidates": 2,
+        "follow_candidates": 2,
+    }  # the sweep is in the second block, and within reach of the first
