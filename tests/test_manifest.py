@@ -376,18 +376,18 @@ with Manifest(Path(sys.argv[1])) as manifest:
 
 
 def test_a_second_run_at_once_is_refused(tmp_path: Path) -> None:
-    process = python(APPENDING, tmp_path)
-    assert process.stdout is not None
-    with process:
-        process.stdout.readline()
-        with pytest.raises(InputError) as error:
-            Manifest(tmp_path)
-        message = str(error.value)
-        assert "\n" not in message
-        assert all(p in message for p in (str(tmp_path), "another run", "wait", "another --out"))
-        with Manifest(tmp_path, (1, 2)):  # a shard is something else
-            pass
-        process.kill()
+    with python(APPENDING, tmp_path) as process:
+        try:
+            assert process.stdout is not None and process.stdout.readline() == "0\n"
+            with pytest.raises(InputError) as error:
+                Manifest(tmp_path)
+            with Manifest(tmp_path, (1, 2)):  # a shard is something else
+                pass
+        finally:
+            process.kill()
+    message = str(error.value)
+    assert "\n" not in message
+    assert all(p in message for p in (str(tmp_path), "another run", "wait", "another --out"))
     with Manifest(tmp_path), pytest.raises(InputError, match="another run"):
         Manifest(tmp_path)  # in the same process too
 
