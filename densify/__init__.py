@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from densify.config import Config as Config
+    from densify.dataset.loader import DepthDataset as DepthDataset
     from densify.errors import ComputationError as ComputationError
     from densify.errors import InputError as InputError
     from densify.flow.pair import estimate_flow as estimate_flow
@@ -43,6 +44,7 @@ _HOME = {
     "ComputationError": "densify.errors",
     "Camera": "densify.types",
     "Cloud": "densify.types",
+    "DepthDataset": "densify.dataset.loader",
     "DepthMap": "densify.types",
     "FlowField": "densify.types",
     "LidarSequence": "densify.types",

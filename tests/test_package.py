@@ -134,17 +134,17 @@ def test_stages_import_no_other_stage() -> None:
         assert not imports, path
 
 
-DOORS = {
+DOORS: dict[str, str | tuple[str, ...]] = {
     "embreex": "densify/street/world.py",
     "kiss_icp": "densify/stages/register.py",
     "laspy": "densify/output/cloud_laz.py",
     "numba": "densify/kernels/",
-    "torch": "densify/flow/",
+    "torch": ("densify/flow/", "densify/dataset/loader.py"),
 }
 
 
 @pytest.mark.parametrize("package", DOORS)
-def test_heavy_packages_have_one_door(package: str) -> None:
+def test_heavy_packages_have_few_doors(package: str) -> None:
     for path in (CHECKOUT / "densify").rglob("*.py"):
         where = path.relative_to(CHECKOUT).as_posix()
         imports = re.search(

@@ -40,7 +40,7 @@ import numpy as np
 import yaml
 
 import densify
-from densify.errors import InputError
+from densify.errors import InputError, OutputError
 from densify.output.atomic import staged_folder, write_file
 from densify.output.cloud_laz import write_cloud
 from densify.output.curve import draw_curve
@@ -104,7 +104,7 @@ def writing(folder: Path, owned: Collection[str], out: Path, overwrite: bool) ->
         with staged_folder(folder, owned) as staging:
             yield staging
     except OSError as error:
-        raise InputError(
+        raise OutputError(
             f"--out {out}: cannot be written: {error.strerror or error}; nothing was kept"
         ) from error
 
