@@ -19,7 +19,7 @@ from densify.dataset.manifest import (
     Manifest,
     read_manifests,
 )
-from densify.errors import InputError
+from densify.errors import InputError, OutputError
 
 # Writing
 
@@ -73,7 +73,7 @@ import resource, sys
 from pathlib import Path
 from key_records import record
 from densify.dataset.manifest import Manifest
-from densify.errors import InputError
+from densify.errors import OutputError
 with Manifest(Path(sys.argv[1])) as manifest:
     size = len(record(1).to_line())
     hard = resource.getrlimit(resource.RLIMIT_FSIZE)[1]
@@ -81,7 +81,7 @@ with Manifest(Path(sys.argv[1])) as manifest:
     resource.setrlimit(resource.RLIMIT_FSIZE, (2 * size - 10, hard))
     try:
         manifest.append(record(2))
-    except InputError as error:
+    except OutputError as error:
         print(error)
     print(manifest.path.stat().st_size == size)
     resource.setrlimit(resource.RLIMIT_FSIZE, (hard, hard))
@@ -103,7 +103,7 @@ def test_a_manifest_that_cannot_be_put_in_order_is_kept(tmp_path: Path, monkeypa
     def full(*_, **__) -> None:
         raise OSError(28, "No space left on device")
 
-    with monkeypatch.context() as patch, pytest.raises(InputError, match="No space left"):
+    with monkeypatch.context() as patch, pytest.raises(OutputError, match="No space left"):
         patch.setattr("densify.dataset.manifest.write_file", full)
         manifest.close()
     assert keys(tmp_path) == [1, 2]
@@ -220,6 +220,6 @@ def test_places_that_cannot_be_written_to(tmp_path: Path) -> None:
             Manifest(out)
         assert f"--out {out}" in str(error.value) and "\n" not in str(error.value)
     (tmp_path / ".manifest.lock").mkdir()
-    with pytest.raises(InputError, match="cannot be written"):
+    with pytest.raises(OutputError, match="cannot be written"):
         Manifest(tmp_path)
     assert (tmp_path / "file").read_text() == "kept"
