@@ -148,7 +148,7 @@ def test_under_follows_a_plane_and_stays_at_the_edge_beyond_it():
     rng = np.random.default_rng(0)
     points = rng.uniform(-20, 20, (40000, 3))
     points[:, 2] = 2 + 0.1 * points[:, 0] - 0.05 * points[:, 1]
-    heights = HeightMap.of(points, SETTINGS)
+    heights = HeightMap.of([points], SETTINGS)
     inside = rng.uniform(-18, 18, (500, 2))
     plane_m = 2 + 0.1 * inside[:, 0] - 0.05 * inside[:, 1]
     off_m = np.abs(heights.under(inside) - plane_m)
@@ -165,7 +165,7 @@ def test_many_and_few_returns_find_the_same_ground():
     many = xy[:, 0] < 0
     kept = many | (rng.random(len(xy)) < 0.04)  # 100 returns in a cell, or 4
     points = np.column_stack([xy, rng.normal(0, 0.03, len(xy))])[kept]
-    heights = HeightMap.of(points, SETTINGS)
+    heights = HeightMap.of([points], SETTINGS)
     x, y = np.meshgrid(np.arange(-13, 13.5, 0.5), np.arange(-8, 8.5, 0.5), indexing="ij")
     found = heights.under(np.stack([x.ravel(), y.ravel()], 1)).reshape(x.shape)
     near_m, far_m = found[x[:, 0] < -1], found[x[:, 0] > 1]
