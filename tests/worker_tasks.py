@@ -1,0 +1,77 @@
+# SPDX-License-Identifier: MIT
+"""What the tests of the workers have called: a module of its own, for workers to import."""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+import sys
+import time
+from pathlib import Path
+
+
+class TwoPartError(Exception):
+    """Pickles, but does not come out of the pickle."""
+
+    def __init__(self, first: str, second: str) -> None:
+        super().__init__(f"{first} {second}")
+
+
+def square(number: int) -> int:
+    return number * number
+
+
+def process() -> int:
+    return os.getpid()
+
+
+def fail(error: type[Exception], *arguments: str) -> None:
+    raise error(*arguments)
+
+
+def unpicklable() -> object:
+    return lambda: None
+
+
+def warn(text: str) -> None:
+    log = logging.getLogger("densify.stages.register")
+    log.debug("not asked for")
+    log.warning("%s by %d", text, os.getpid())
+    raise ValueError(text)
+
+
+def note(folder: Path, name: str, needs: list[str]) -> list[str]:
+    """Leaves a file when it is over; the names of those that should have left theirs before."""
+    missing = [need for need in needs if not (folder / need).exists()]
+    time.sleep(0.01)
+    (folder / name).touch()
+    return missing
+
+
+def square_at_second_try(folder: Path, number: int) -> int:
+    """The first time it leaves the process that it runs in, and waits for its end."""
+    place = folder / f"{number}.pid"
+    if not place.exists():
+        wait(place)
+    return square(number)
+
+
+def wait(place: Path) -> None:
+    """Leave the process that it runs in, and never return."""
+    aside = place.with_suffix(".part")
+    aside.write_text(str(os.getpid()))
+    aside.rename(place)
+    time.sleep(600)
+
+
+def die() -> None:
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def threads() -> tuple[str, int, bool]:
+    """OPENBLAS_NUM_THREADS, numba's threads, whether numpy was there before the variable."""
+    heavy = "numba" in sys.modules or "torch" in sys.modules
+    import numba
+
+    return os.environ["OPENBLAS_NUM_THREADS"], numba.config.NUMBA_NUM_THREADS, heavy
