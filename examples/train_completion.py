@@ -1,8 +1,10 @@
 # SPDX-License-Identifier: MIT
-"""What a training set is worth: one small depth-completion network, trained from the same weights on
-maps accumulated rigidly (ICP) and on maps with scene flow, tested on the exact depth of another street.
+"""What a training set is worth: one small depth-completion network, trained from the same weights
+on maps accumulated rigidly (ICP) and on maps with scene flow, tested on the exact depth of another
+street.
 
-python examples/train_completion.py [--data SPEC] [--test SPEC] [--keys A:B:S] [--steps N] [--out DIR]
+python examples/train_completion.py [--data SPEC] [--test SPEC] [--keys A:B:S] [--steps N]
+    [--out DIR]
 """
 
 import argparse
