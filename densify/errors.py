@@ -11,5 +11,20 @@ class InputError(Exception):
     """Input, configuration or output place that cannot be used. Exit code 2."""
 
 
+class OutputError(InputError):
+    """What is computed cannot be written: no permission, a full disk."""
+
+
 class ComputationError(Exception):
     """A stage found that its result cannot be trusted. Exit code 1."""
+
+
+class SweepError(ComputationError):
+    """One sweep is in the way: without ``frame`` the others could be used."""
+
+    def __init__(self, message: str, frame: int) -> None:
+        super().__init__(message, frame)
+        self.frame = frame
+
+    def __str__(self) -> str:
+        return str(self.args[0])

@@ -6,12 +6,15 @@ from __future__ import annotations
 import resource
 import sys
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
 
 from densify import depth_metrics, scores
 from densify.config import Config, RegisterSettings, resolve
@@ -28,6 +31,7 @@ from densify.stages.flow import estimate_motion
 from densify.stages.ground import ground
 from densify.stages.register import check_overlap, check_plausible, register
 from densify.types import (
+    Camera,
     Cloud,
     DepthMap,
     FlowField,
@@ -41,8 +45,11 @@ from densify.types import (
     StretchFlow,
     Sweep,
     Trajectory,
+    Truth,
 )
 from densify.views import HeldOut, Views
+
+Image = NDArray[np.uint8]
 
 
 class Method(NamedTuple):
@@ -66,7 +73,8 @@ METHODS = {
 """For `compare`: the key sweep alone; registration alone, as it is and with visibility; our scene
 flow without visibility; the published scene flow; ours. `run` takes none, icp and flow."""
 
-_RUN = ("none", "icp", "flow")
+RUN = ("none", "icp", "flow")
+"""What `run` takes, each with those before it as its baselines."""
 COMPARED = ("none", "icp", "paper", "flow")
 """What `compare` shows unless told otherwise."""
 
@@ -91,9 +99,9 @@ def run(
     The result carries its baselines. Raises InputError for what cannot be used, ComputationError
     where registration went wrong.
     """
-    if method not in _RUN:
-        raise InputError(f"--method {method}: expected one of {', '.join(_RUN)}")
-    methods = _RUN[: _RUN.index(method) + 1]
+    if method not in RUN:
+        raise InputError(f"--method {method}: expected one of {', '.join(RUN)}")
+    methods = RUN[: RUN.index(method) + 1]
     return compare(sequence, key, window, cameras, config, progress, methods)[method]
 
 
@@ -118,19 +126,62 @@ def compare(
         require_folder(settings.flow.files)
     chosen = choose_cameras(sequence, cameras)
     frames, lead_in = window_frames(sequence, key, window, settings.register.num_lead_in)
-    watch = _Watch(progress)
+    watch = Watch(progress)
 
     with watch.stage("images"):
         images = {camera.name: sequence.image(camera.name, key) for camera in chosen}
     stretch = _registered(sequence, lead_in, frames, settings, watch)
     with watch.stage("ground"):
         heights = ground(stretch, settings.ground)
-    moments = {name: _key_moment(stretch, key, heights, name, settings, watch) for name in methods}
 
+    def motion(engine: str) -> Motion:
+        return motion_by(engine, stretch, heights, settings)
+
+    moments = {name: _key_moment(stretch, key, name, motion, settings, watch) for name in methods}
+    return _results(sequence, stretch, key, moments, chosen, images, settings, watch)
+
+
+def densify(
+    sequence: LidarSequence,
+    stretch: Stretch,
+    key: int,
+    motion: Callable[[], Motion],
+    cameras: Sequence[str] | None,
+    settings: Config,
+    methods: Sequence[str],
+    images: Mapping[str, Image] | None = None,
+) -> dict[str, Result]:
+    """Methods by name for one key whose stretch is registered and whose motion is known.
+
+    motion: gives that of at least the stretch. methods: of `METHODS`, none with an engine of its
+    own. images: by camera; without them nothing is coloured, nor compared with the truth. The rest
+    as `compare`.
+    """
+    watch = Watch(None)
+    chosen = choose_cameras(sequence, cameras)
+    moments = {
+        name: _key_moment(stretch, key, name, lambda _: motion(), settings, watch)
+        for name in methods
+    }
+    return _results(sequence, stretch, key, moments, chosen, images, settings, watch)
+
+
+def _results(
+    sequence: LidarSequence,
+    stretch: Stretch,
+    key: int,
+    moments: dict[str, tuple[Cloud, StretchFlow | None]],
+    cameras: list[Camera],
+    images: Mapping[str, Image] | None,
+    settings: Config,
+    watch: Watch,
+) -> dict[str, Result]:
+    """What the cameras see of each method's cloud, and how good that is."""
     key_image = RangeImage.of(stretch[key])
-    views = Views.of(sequence, stretch, key, key_image, chosen, settings)
+    views = Views.of(sequence, stretch, key, key_image, cameras, settings)
+    truth = sequence.truth if images is not None else None
     with watch.stage("held out"):
-        held_out = HeldOut.of(views, moments[methods[-1]][0])
+        held_out = HeldOut.of(views, moments[next(reversed(moments))][0])
     results: dict[str, Result] = {}
     for name, (cloud, flow) in moments.items():
         visible = METHODS[name].visible and settings.project.visibility
@@ -140,7 +191,7 @@ def compare(
         movers = {}
         if settings.output.movers == "separate":
             with watch.stage("project"):
-                movers = views.movers(cloud, visible, images)
+                movers = views.movers(cloud, visible, images or {})
         if settings.output.movers != "keep":
             cloud = cloud.select(~cloud.moving)
         with watch.stage("project"):
@@ -148,10 +199,11 @@ def compare(
             depth = {
                 n: with_ages(m, stretch, key, views.exposures[n].late_s) for n, m in depth.items()
             }
-        with watch.stage("colour"):
-            cloud = views.coloured(cloud, depth, images)
+        if images is not None:
+            with watch.stage("colour"):
+                cloud = views.coloured(cloud, depth, images)
         with watch.stage("score"):
-            metrics = _scores(sequence, stretch[key], key_image, cloud, depth)
+            metrics = _scores(truth, sequence.cameras, stretch[key], key_image, cloud, depth)
             metrics["held_out"] = held_out_scores
             if settings.output.rejected:
                 metrics["rejected"] = {n: maps.counts() for n, maps in depth.items()}
@@ -172,7 +224,7 @@ def _registered(
     lead_in: Sequence[int],
     frames: Sequence[int],
     settings: Config,
-    watch: _Watch,
+    watch: Watch,
 ) -> Stretch:
     sweeps = _read(sequence, [*lead_in, *frames], settings, watch)
     with watch.stage("register"):
@@ -182,7 +234,7 @@ def _registered(
 
 
 def _read(
-    sequence: LidarSequence, frames: Sequence[int], settings: Config, watch: _Watch
+    sequence: LidarSequence, frames: Sequence[int], settings: Config, watch: Watch
 ) -> list[Sweep]:
     with watch.stage("read"):
         sweeps = []
@@ -212,16 +264,23 @@ def find_trajectory(
 
 
 def _key_moment(
-    stretch: Stretch, key: int, heights: HeightMap, name: str, settings: Config, watch: _Watch
+    stretch: Stretch,
+    key: int,
+    name: str,
+    motion_of: Callable[[str], Motion],
+    settings: Config,
+    watch: Watch,
 ) -> tuple[Cloud, StretchFlow | None]:
-    """All sweeps at the key's moment as a method places them, and its flow where asked for."""
+    """All sweeps at the key's moment as a method places them, and its flow where asked for.
+
+    motion_of: by engine.
+    """
     method, flow = METHODS[name], None
     used = stretch if method.all_sweeps else Stretch((stretch[key],))
     fields = [FlowField.zero(len(s.sweep)) for s in used.sweeps]
     if method.engine is not None:
         with watch.stage("flow"):
-            engine = method.engine or settings.flow.engine
-            motion = _motion(stretch, heights, engine, settings)
+            motion = motion_of(method.engine or settings.flow.engine)
             fields = [motion.flow(frame, key) for frame in stretch.frames]
             if settings.output.flow:
                 flow = _steps(motion, stretch, key)
@@ -230,8 +289,8 @@ def _key_moment(
         return accumulate(used, fields, key, drop_lost), flow
 
 
-def _motion(stretch: Stretch, heights: HeightMap, engine: str, settings: Config) -> Motion:
-    """By the engine, or from flow that others left on disk."""
+def motion_by(engine: str, stretch: Stretch, heights: HeightMap, settings: Config) -> Motion:
+    """How everything in a stretch moves: by that engine, or from flow that others left on disk."""
     flow = replace(settings.flow, engine=engine)
     if flow.files is None:
         return estimate_motion(stretch, heights, flow)
@@ -248,7 +307,8 @@ def _steps(motion: Motion, stretch: Stretch, key: int) -> StretchFlow:
 
 
 def _scores(
-    sequence: LidarSequence,
+    truth: Truth | None,
+    cameras: Mapping[str, Camera],
     key_sweep: RegisteredSweep,
     key_image: RangeImage,
     cloud: Cloud,
@@ -267,20 +327,20 @@ def _scores(
         },
         "ghosts": scores.ghost_scores(cloud, key_image, key_sweep.frame),
     }
-    if sequence.truth is not None:
+    if truth is not None:
         metrics["depth"] = {
             name: depth_metrics.depth_scores(
                 maps,
-                sequence.truth.depth_m(name, key_sweep.frame),
-                sequence.truth.moving_mask(name, key_sweep.frame),
-                sequence.cameras[name],
+                truth.depth_m(name, key_sweep.frame),
+                truth.moving_mask(name, key_sweep.frame),
+                cameras[name],
             )
             for name, maps in depth.items()
         }
     return metrics
 
 
-class _Watch:
+class Watch:
     """Says which stage is at work, and what each has cost."""
 
     def __init__(self, progress: Progress | None) -> None:

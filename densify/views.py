@@ -109,9 +109,10 @@ class Views:
         depth: Mapping[str, DepthMap],
         images: Mapping[str, NDArray[np.uint8]],
     ) -> Cloud:
-        """With the colours of the images; depth: what `depth` made of the cloud."""
+        """With the colours of the images there are; depth: what `depth` made of the cloud."""
         rgb = cloud.rgb
-        for name, e in self.exposures.items():
+        for name in images:
+            e = self.exposures[name]
             points = cloud.after(e.late_s).points
             rgb = colour(rgb, points, e.camera, e.T_cam_key, depth[name], images[name])
         return replace(cloud, rgb=rgb)

@@ -41,7 +41,8 @@ def space(stretch) -> FreeSpace:
 
 @pytest.fixture(scope="module")
 def evidence(stretch, space, heights) -> tuple[Standing, ...]:
-    return find_candidates(stretch, space, heights, MIN_HEIGHT_M)
+    found = find_candidates(stretch, space, heights, MIN_HEIGHT_M)
+    return tuple(Standing.of(stretch, i, candidates) for i, candidates in enumerate(found))
 
 
 def test_standing_points_are_where_and_when_their_rows_say(stretch, evidence):

@@ -592,9 +592,10 @@ def test_a_full_disk_is_one_line(put, tmp_path, monkeypatch):
     assert not tree(tmp_path)
 
 
-def test_what_a_killed_process_left_is_not_in_the_way(put, tmp_path):
-    stale = tmp_path / "out" / f".000120.{os.getpid()}.tmp"
-    stale.mkdir(parents=True)
+def test_what_an_earlier_failure_left_is_not_in_the_way(put, tmp_path):
+    with staged_folder(tmp_path / "out" / "000120", ()) as stale:
+        pass
+    stale.mkdir()
     (stale / "junk").write_text("junk")
     put()
     assert [p.name for p in (tmp_path / "out").iterdir()] == ["000120"]

@@ -30,6 +30,7 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     commands = parser.add_subparsers(title="verbs", metavar="VERB", required=True)
     _add_run(commands)
     _add_compare(commands)
+    _add_dataset(commands)
     _add_flow(commands)
     _add_info(commands)
     _add_simulate(commands)
@@ -66,13 +67,7 @@ def _add_verb(
 def _add_run(commands: Any) -> None:
     parser = _add_verb(commands, "run", verbs.run, "densify one key", _config_epilog())
     _add_key_options(parser)
-    parser.add_argument(
-        "--method",
-        choices=("flow", "icp", "none"),
-        default="flow",
-        help="flow: registration and scene flow; icp: registration only; none: the key sweep alone "
-        "(default: flow)",
-    )
+    _add_method(parser)
     _add_output_options(parser)
 
 
@@ -89,6 +84,110 @@ def _add_compare(commands: Any) -> None:
         "default: none,icp,paper,flow",
     )
     _add_output_options(parser)
+
+
+def _add_dataset(commands: Any) -> None:
+    parser = _add_verb(
+        commands,
+        "dataset",
+        verbs.dataset,
+        "every key of whole recordings, as a training set",
+        "Run again, the same command goes on where it was stopped. Shares are from 0 to 1. "
+        + _config_epilog(),
+    )
+    parser.add_argument(
+        "--data", metavar="SPEC", nargs="+", action="extend", help=f"{DATA_HELP}; one or more"
+    )
+    parser.add_argument(
+        "--keys",
+        type=_keys,
+        default="all",
+        metavar="all|A:B[:S]",
+        help="frames A to B-1, every S-th (default: all)",
+    )
+    _add_window(parser)
+    parser.add_argument(
+        "--out", metavar="DIR", type=Path, help="the set's folder: a new one, or one to go on with"
+    )
+    parser.add_argument(
+        "--layout",
+        choices=("kitti-depth", "densify"),
+        default="kitti-depth",
+        help="kitti-depth: the tree of KITTI's depth completion benchmark; densify: what run "
+        "writes, for every key (default: kitti-depth)",
+    )
+    _add_method(parser)
+    _add_camera(parser)
+    parser.add_argument(
+        "--split",
+        choices=("train", "val"),
+        help="of the tree (default: KITTI's official one, train for other recordings)",
+    )
+    _add_gate(parser)
+    _add_workers(parser)
+    parser.add_argument(
+        "--status", metavar="DIR", type=Path, help="how far the set in DIR is; makes nothing"
+    )
+    _add_short_options(parser)
+    _add_config_options(parser)
+
+
+def _add_gate(parser: argparse.ArgumentParser) -> None:
+    gate = parser.add_argument_group(
+        "quality gate", "a key that misses a limit is put aside: into the manifest, not the set"
+    )
+    gate.add_argument(
+        "--max-ghost",
+        type=float,
+        metavar="SHARE",
+        help="of the accumulated points that stand where the key sweep saw through",
+    )
+    gate.add_argument(
+        "--min-density", type=float, metavar="SHARE", help="of the pixels with a measured depth"
+    )
+    gate.add_argument(
+        "--max-outliers",
+        type=float,
+        metavar="SHARE",
+        help="of the key sweep's returns that the map made without it misses",
+    )
+    gate.add_argument(
+        "--min-sweeps", type=_natural, metavar="N", help="in the window, cut at ends and gaps"
+    )
+
+
+def _add_workers(parser: argparse.ArgumentParser) -> None:
+    work = parser.add_argument_group("where it is made")
+    work.add_argument(
+        "--workers",
+        type=_natural,
+        default=1,
+        metavar="N",
+        help="processes on this machine, a local Dask cluster if densify[cluster] is installed "
+        "(default: 1)",
+    )
+    work.add_argument(
+        "--scheduler",
+        metavar="ADDRESS",
+        help="of a running Dask scheduler, such as tcp://host:8786, whose workers are used; they "
+        "need the same files at the same paths",
+    )
+    work.add_argument(
+        "--shard",
+        type=_shard,
+        metavar="i/n",
+        help="the i-th of n parts of the work, for machines that share DIR",
+    )
+    work.add_argument(
+        "--memory", type=_bytes, metavar="SIZE", help="of all processes together, such as 8G"
+    )
+    work.add_argument(
+        "--cache-size",
+        type=_bytes,
+        default="10G",
+        metavar="SIZE",
+        help="of what is kept on disk for later runs (default: 10G)",
+    )
 
 
 def _add_flow(commands: Any) -> None:
@@ -243,13 +342,7 @@ def _add_bench_flow(benches: Any) -> None:
         metavar="K",
         help="frame in the middle; may be given several times (default: 120)",
     )
-    parser.add_argument(
-        "--window",
-        type=_natural,
-        default=5,
-        metavar="W",
-        help="sweeps on each side of the key (default: 5)",
-    )
+    _add_window(parser)
     parser.add_argument(
         "--methods",
         type=_words,
@@ -278,6 +371,14 @@ def _add_key_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--key", type=_natural, required=True, metavar="K", help="the frame to densify"
     )
+    _add_window(parser)
+    parser.add_argument("--data", metavar="SPEC", default="street", help=DATA_HELP)
+    _add_camera(parser)
+    _add_short_options(parser)
+    _add_config_options(parser)
+
+
+def _add_window(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--window",
         type=_natural,
@@ -285,8 +386,19 @@ def _add_key_options(parser: argparse.ArgumentParser) -> None:
         metavar="W",
         help="sweeps to use on each side of the key (default: 5)",
     )
-    parser.add_argument("--data", metavar="SPEC", default="street", help=DATA_HELP)
-    _add_camera(parser)
+
+
+def _add_method(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--method",
+        choices=("flow", "icp", "none"),
+        default="flow",
+        help="flow: registration and scene flow; icp: registration only; none: the key sweep alone "
+        "(default: flow)",
+    )
+
+
+def _add_short_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--flow",
         metavar="ENGINE",
@@ -305,7 +417,6 @@ def _add_key_options(parser: argparse.ArgumentParser) -> None:
         help="moving objects in the maps, left out, or left out and written one by one (short for "
         "--set output.movers=…; default: keep)",
     )
-    _add_config_options(parser)
 
 
 def _add_output_options(parser: argparse.ArgumentParser) -> None:
@@ -380,3 +491,32 @@ def _frames(text: str) -> range:
             f"got {text!r}, expected A:B with A < B, for example 115:126 for frames 115 to 125"
         )
     return range(int(first), int(end))
+
+
+def _keys(text: str) -> slice | None:
+    if text == "all":
+        return None
+    numbers = text.split(":")
+    if len(numbers) in (2, 3) and all(n.isascii() and n.isdigit() for n in numbers):
+        first, end, step = *map(int, numbers), *([1] if len(numbers) == 2 else [])
+        if first < end and step > 0:
+            return slice(first, end, step)
+    raise argparse.ArgumentTypeError(
+        f"got {text!r}, expected all, or A:B[:S] with A < B, for example 0:100:5 for frames 0, 5 "
+        f"to 95"
+    )
+
+
+def _shard(text: str) -> tuple[int, int]:
+    i, slash, n = text.partition("/")
+    numbers = slash and (i + n).isascii() and i.isdigit() and n.isdigit()
+    if numbers and 1 <= int(i) <= int(n):
+        return int(i), int(n)
+    raise argparse.ArgumentTypeError(f"got {text!r}, expected i/n with i from 1 to n, as in 2/4")
+
+
+def _bytes(text: str) -> int:
+    number, unit = text[:-1], text[-1:].upper()
+    if unit in ("K", "M", "G", "T"):
+        return int(_positive(number) * 1024 ** (1 + "KMGT".index(unit)))
+    raise argparse.ArgumentTypeError(f"got {text!r}, expected a size such as 8G or 500M")

@@ -5,12 +5,18 @@ from __future__ import annotations
 
 import logging
 import sys
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from densify.dataset.make import Summary
     from densify.types import Progress
+
+_LINE_EVERY_S = 30.0
 
 
 class _LineHandler(logging.Handler):
@@ -31,6 +37,7 @@ def logging_to_stderr() -> Iterator[logging.Logger]:
     """The package's logger writes to stderr inside the block."""
     log = logging.getLogger("densify")
     handler, before = _LineHandler(), (log.level, log.propagate)
+    handler.setLevel(logging.INFO)
     log.addHandler(handler)
     log.setLevel(logging.INFO)
     log.propagate = False
@@ -61,3 +68,39 @@ def progress_on_stderr() -> Iterator[Progress | None]:
             bar.refresh()
 
         yield show
+
+
+@contextmanager
+def keys_on_stderr() -> Iterator[Callable[[Summary], None]]:
+    """Keys done, rate, time left and scores so far: a bar on a terminal, else a line now and
+    then."""
+    from densify.cli.sets import set_scores
+
+    if sys.stderr.isatty():
+        from tqdm import tqdm
+
+        layout = "{percentage:3.0f}%|{bar}| {n_fmt}/{total_fmt} keys [{elapsed}, {desc}]"
+        with tqdm(file=sys.stderr, bar_format=layout) as bar:
+
+            def show(summary: Summary) -> None:
+                bar.total, bar.n = summary.num_keys, len(summary.records)
+                bar.set_description_str(f"{_pace(summary)}, {set_scores(summary)}")
+
+            yield show
+        return
+    shown_s = time.monotonic()
+
+    def tell(summary: Summary) -> None:
+        nonlocal shown_s
+        if time.monotonic() > shown_s + _LINE_EVERY_S:
+            shown_s = time.monotonic()
+            count = f"{len(summary.records)} of {summary.num_keys} keys"
+            print(f"densify: {count}, {_pace(summary)}, {set_scores(summary)}", file=sys.stderr)
+
+    yield tell
+
+
+def _pace(summary: Summary) -> str:
+    left_s = summary.seconds_left or 0.0
+    left = f"{left_s / 60:.0f} min" if left_s < 6000 else f"{left_s / 3600:.1f} h"
+    return f"{summary.seconds / max(1, summary.num_made):.2f} s a key, {left} left"

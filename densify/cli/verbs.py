@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import densify
-from densify.cli.screen import progress_on_stderr
+from densify.cli.screen import keys_on_stderr, progress_on_stderr
 from densify.config import as_mapping, resolve
-from densify.errors import InputError
+from densify.errors import ComputationError, InputError
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -85,6 +85,46 @@ def compare(options: argparse.Namespace) -> None:
     )
     print(comparison(results))
     _print_paths(paths)
+
+
+def dataset(options: argparse.Namespace) -> None:
+    """Every key of whole recordings, or how far that is."""
+    from densify.cli.sets import set_status, set_summary
+
+    if options.status is not None:
+        from densify.dataset.make import status
+
+        print(set_status(*status(options.status)))
+        return
+    if options.out is None:
+        raise InputError("--out DIR: expected the set's folder, a new one or one to go on with")
+    config = _config(options)
+    from densify.dataset.gate import Gate
+    from densify.dataset.make import make_dataset
+    from densify.dataset.plan import Recipe
+
+    limits = ("max_ghost", "min_density", "max_outliers", "min_sweeps")
+    recipe = Recipe(
+        *(options.window, options.method, options.layout),
+        cameras=None if options.cameras is None else tuple(options.cameras),
+        split=options.split,
+        gate=Gate(**{limit: getattr(options, limit) for limit in limits}),
+        config=config,
+    )
+    with keys_on_stderr() as report:
+        summary = make_dataset(
+            *(options.data or ["street"], options.out, options.keys, recipe),
+            num_workers=options.workers,
+            scheduler=options.scheduler,
+            shard=options.shard,
+            memory_bytes=options.memory,
+            cache_bytes=options.cache_size,
+            report=report,
+        )
+    print(set_summary(summary))
+    _print_paths([options.out])
+    if summary.count("failed"):
+        raise ComputationError(f"{summary.count('failed')} of {summary.num_keys} keys not made")
 
 
 def flow(options: argparse.Namespace) -> None:

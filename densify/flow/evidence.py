@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
@@ -22,7 +23,7 @@ _NEAR_M = 0.4
 _MIN_SEED_SHARE = 0.3
 _LINK_M = 0.6
 _RING_GAP_M = 0.35
-_REACH = 10  # sweeps
+REACH = 10  # sweeps
 
 
 @dataclass(frozen=True)
@@ -37,11 +38,13 @@ class FreeSpace:
     origin: tuple[Float, ...]
 
     @staticmethod
-    def of(stretch: Stretch) -> FreeSpace:
-        with ThreadPoolExecutor() as pool:
-            images = tuple(pool.map(RangeImage.of, stretch.sweeps))
+    def of(stretch: Stretch, images: Sequence[RangeImage] | None = None) -> FreeSpace:
+        """images: of the sweeps, where they are known."""
+        if images is None:
+            with ThreadPoolExecutor() as pool:
+                images = list(pool.map(RangeImage.of, stretch.sweeps))
         return FreeSpace(
-            images,
+            tuple(images),
             tuple(poses.inverse(s.T_world_lidar) for s in stretch.sweeps),
             tuple(s.T_world_lidar[:3, 3] for s in stretch.sweeps),
         )
@@ -57,7 +60,7 @@ class FreeSpace:
     def others(self, i: int) -> list[int]:
         """The sweeps around sweep number i that tell about it: from where others were taken long
         before or after it, little of what it saw is in view."""
-        return [j for j in range(max(0, i - _REACH), min(len(self), i + _REACH + 1)) if j != i]
+        return [j for j in range(max(0, i - REACH), min(len(self), i + REACH + 1)) if j != i]
 
     def seen_through(self, points: Float, j: int, velocity_m_s: Float | None = None) -> Bool:
         """(N,3) world -> (N,) True where sweep number j certainly saw free space.
@@ -71,6 +74,16 @@ class FreeSpace:
             _MARGIN_FRACTION,
             velocity_m_s=None if velocity_m_s is None else velocity_m_s @ T_lidar_world[:3, :3].T,
         )
+
+
+@dataclass(frozen=True)
+class Candidates:
+    """What a `Standing` says of its sweep's rows, wherever the world's origin is."""
+
+    row: Int
+    seed: Bool
+    cluster: Int
+    num_clusters: int
 
 
 @dataclass(frozen=True)
@@ -90,22 +103,37 @@ class Standing:
     cluster: Int
     num_clusters: int
 
+    @staticmethod
+    def of(stretch: Stretch, i: int, found: Candidates) -> Standing:
+        """Of sweep number i."""
+        registered = stretch.sweeps[i]
+        points = poses.transform(registered.T_world_lidar, registered.sweep.points[found.row])
+        return Standing(
+            *(found.row, points, firing_times_s(stretch, i)[found.row]),
+            *(found.seed, found.cluster, found.num_clusters),
+        )
+
     @property
     def candidate(self) -> Bool:
         return self.cluster >= 0
 
 
 def find_candidates(
-    stretch: Stretch, space: FreeSpace, ground: HeightMap, min_height_m: float
-) -> tuple[Standing, ...]:
+    stretch: Stretch,
+    space: FreeSpace,
+    ground: HeightMap,
+    min_height_m: float,
+    among: Sequence[int] | None = None,
+) -> tuple[Candidates, ...]:
     """What stands in every sweep, and which of it may move.
 
     A point is a seed where any other sweep around sees through it; points close to a seed are
     candidates too, since a mover's own points are not all seen through.
-    min_height_m: points lower above the ground do not stand.
+    min_height_m: points lower above the ground do not stand. among: numbers of the sweeps to look
+    at, all if None.
     """
 
-    def of_sweep(i: int) -> Standing:
+    def of_sweep(i: int) -> Candidates:
         registered = stretch.sweeps[i]
         points = poses.transform(registered.T_world_lidar, registered.sweep.points)
         above = np.flatnonzero(ground.above(points) >= min_height_m)
@@ -116,11 +144,10 @@ def find_candidates(
             seed[rest] = space.seen_through(points[rest], j)
         close = _closer_rings(in_lidar, points, space.ring_step_rad)
         num_clusters, cluster = _cluster(close, seed)
-        time_s = firing_times_s(stretch, i)[above]
-        return Standing(above, points, time_s, seed, cluster, num_clusters)
+        return Candidates(above, seed, cluster, num_clusters)
 
     with ThreadPoolExecutor() as pool:
-        return tuple(pool.map(of_sweep, range(len(stretch.sweeps))))
+        return tuple(pool.map(of_sweep, range(len(stretch.sweeps)) if among is None else among))
 
 
 def _closer_rings(in_lidar: Float, points: Float, ring_step_rad: float) -> Float:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from densify import poses
 from densify.flow.evidence import (
+    Candidates,
     FreeSpace,
     Standing,
     find_candidates,
@@ -108,7 +109,20 @@ def follow(stretch: Stretch, ground: HeightMap, min_height_m: float, soft: bool)
     min_height_m: points lower above the ground start no motion. soft: objects may bend.
     """
     space = FreeSpace.of(stretch)
-    standing = find_candidates(stretch, space, ground, min_height_m)
+    candidates = find_candidates(stretch, space, ground, min_height_m)
+    return follow_candidates(stretch, space, candidates, ground, min_height_m, soft)
+
+
+def follow_candidates(
+    stretch: Stretch,
+    space: FreeSpace,
+    candidates: Sequence[Candidates],
+    ground: HeightMap,
+    min_height_m: float,
+    soft: bool,
+) -> GroupMotion:
+    """As `follow`, from what the stretch's sweeps saw through and what of each may move."""
+    standing = [Standing.of(stretch, i, found) for i, found in enumerate(candidates)]
     time_s = reference_times_s(stretch)
     tracks = follow_groups(standing, space, ground, time_s)
     shapes = [Shape.of(t.seen_in(standing, sorted(t.claimed))) for t in tracks]

@@ -27,17 +27,27 @@ _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 
 
 def write_depth_png(path: Path, depth_m: Float32) -> None:
-    """Write ``rint(256 * depth_m)``.
+    """Write `encode_depth`."""
+    write_file(path, encode_depth(depth_m))
+
+
+def encode_depth(depth_m: Float32) -> bytes:
+    """The PNG of ``rint(256 * depth_m)``.
 
     depth_m: (H,W) metres, 0 none. What the format cannot say becomes 0, none, never another depth:
     beyond 65535/256 = 256 m (a cast would wrap 256.5 m to 0.5 m) and nearer than half a step, 2 mm.
     Raises ValueError for depths that are negative or not finite.
     """
-    write_file(path, encode_png(_quantised(depth_m)))
+    return encode_png(_quantised(depth_m))
 
 
 def write_confidence_png(path: Path, confidence: Float32, depth_m: Float32) -> None:
-    """Write `stored_confidence` as 8 bit, 0 where `write_depth_png` writes no depth.
+    """Write `encode_confidence`."""
+    write_file(path, encode_confidence(confidence, depth_m))
+
+
+def encode_confidence(confidence: Float32, depth_m: Float32) -> bytes:
+    """The PNG of `stored_confidence`, 8 bit, 0 where `encode_depth` says no depth.
 
     confidence: (H,W), 0 to 1. depth_m: (H,W) metres, the depth it belongs to.
     """
@@ -46,7 +56,7 @@ def write_confidence_png(path: Path, confidence: Float32, depth_m: Float32) -> N
         raise ValueError("confidence: expected 0 to 1 wherever there is depth")
     levels = np.zeros(depth_m.shape, np.uint8)
     levels[has_depth] = stored_confidence(confidence[has_depth])
-    write_file(path, encode_png(levels))
+    return encode_png(levels)
 
 
 def write_age_png(path: Path, age_s: Float32, depth_m: Float32) -> None:

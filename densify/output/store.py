@@ -40,7 +40,7 @@ import numpy as np
 import yaml
 
 import densify
-from densify.errors import InputError
+from densify.errors import InputError, OutputError
 from densify.output.atomic import staged_folder, write_file
 from densify.output.cloud_laz import write_cloud
 from densify.output.curve import draw_curve
@@ -104,7 +104,7 @@ def writing(folder: Path, owned: Collection[str], out: Path, overwrite: bool) ->
         with staged_folder(folder, owned) as staging:
             yield staging
     except OSError as error:
-        raise InputError(
+        raise OutputError(
             f"--out {out}: cannot be written: {error.strerror or error}; nothing was kept"
         ) from error
 
@@ -289,7 +289,7 @@ def _write_run(path: Path, result: Result, config: Mapping[str, Any], data: str)
         ],
         "versions": _versions(),
     }
-    text = yaml.safe_dump(_plain(record), sort_keys=False, allow_unicode=True)
+    text = yaml.safe_dump(plain(record), sort_keys=False, allow_unicode=True)
     write_file(path, text.encode())
 
 
@@ -308,19 +308,20 @@ def _versions() -> dict[str, str | None]:
 
 
 def _write_json(path: Path, value: Mapping[str, Any]) -> None:
-    write_file(path, (json.dumps(_plain(value), indent=2, allow_nan=False) + "\n").encode())
+    write_file(path, (json.dumps(plain(value), indent=2, allow_nan=False) + "\n").encode())
 
 
-def _plain(value: Any) -> Any:
-    """Numpy's numbers as Python's, tuples as lists, and None for what JSON cannot say."""
+def plain(value: Any) -> Any:
+    """Numpy's numbers as Python's, tuples as lists, and None for what JSON cannot say (not finite
+    numbers); for the files that people and other programs read."""
     if isinstance(value, Mapping):
-        return {str(key): _plain(item) for key, item in value.items()}
+        return {str(key): plain(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):
-        return [_plain(item) for item in value]
+        return [plain(item) for item in value]
     if isinstance(value, np.ndarray):
-        return _plain(value.tolist())
+        return plain(value.tolist())
     if isinstance(value, np.generic):
-        return _plain(value.item())
+        return plain(value.item())
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     return value

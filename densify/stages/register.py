@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 
 from densify import poses
 from densify.config import RegisterSettings
-from densify.errors import ComputationError
+from densify.errors import SweepError
 from densify.types import Float, Sweep, Trajectory
 
 _MAX_ACCELERATION_M_S2 = 30.0  # three times what tyres can do; the rest is noise of the stamps
@@ -38,16 +38,17 @@ def register(
         with the fine voxels; without it they are twice as large and the start is searched for,
         since odometry by itself takes every start for standing still.
 
-    World is the first sweep's lidar frame. Raises ComputationError naming the frames where a sweep
+    World is the first sweep's lidar frame. Raises SweepError naming the frames where a sweep
     is too sparse to register or, in the second pass, the motion is none a vehicle makes.
     """
     from kiss_icp.kiss_icp import KissICP
 
     for sweep in sweeps:
         if len(sweep) < settings.min_num_points:
-            raise ComputationError(
+            raise SweepError(
                 f"registration: sweep {sweep.frame} has {len(sweep)} points, expected at least "
-                f"{settings.min_num_points}; choose another key or lower register.min_num_points"
+                f"{settings.min_num_points}; choose another key or lower register.min_num_points",
+                sweep.frame,
             )
     voxel_size_m = settings.voxel_size_m * (2 if rough is None else 1)
     odometry = KissICP(_kiss_icp_config(settings, voxel_size_m))
@@ -109,20 +110,21 @@ def _standing(points: Float) -> Float:
 
 
 def check_plausible(trajectory: Trajectory, settings: RegisterSettings) -> None:
-    """Raise ComputationError where the trajectory jumps as no vehicle does."""
+    """Raise SweepError where the trajectory jumps as no vehicle does."""
     step_s = np.diff(trajectory.stamp_ns) * 1e-9
     pairs = list(pairwise(trajectory.frames))
     for (a, b), seconds in zip(pairs, step_s, strict=True):
         if seconds <= 0:
-            raise ComputationError(
+            raise SweepError(
                 f"registration: the stamp of frame {b} is not after that of frame {a}, but "
                 f"{1e3 * -seconds:.1f} ms before it; expected ascending stamps; check the "
-                f"recording's timestamps"
+                f"recording's timestamps",
+                b,
             )
     T = trajectory.T_world_lidar
     if not np.isfinite(T).all():
         bad = trajectory.frames[int(np.argmin(np.isfinite(T).all((1, 2))))]
-        raise ComputationError(f"registration: the pose of frame {bad} is not finite")
+        raise SweepError(f"registration: the pose of frame {bad} is not finite", bad)
     steps = [poses.log(poses.inverse(a) @ b) for a, b in pairwise(T)]
     previous_m_s: Float | None = None
     for (a, b), step, seconds in zip(pairs, steps, step_s, strict=True):
@@ -131,17 +133,19 @@ def check_plausible(trajectory: Trajectory, settings: RegisterSettings) -> None:
         slack_m_s = _POSE_NOISE_M / seconds
         speed_m_s = float(np.linalg.norm(velocity_m_s))
         if speed_m_s > settings.max_speed_m_s + slack_m_s or turn_deg_s > _MAX_TURN_RATE_DEG_S:
-            raise ComputationError(
+            raise SweepError(
                 f"registration jumps from frame {a} to {b}: {speed_m_s:.0f} m/s and "
                 f"{turn_deg_s:.0f} deg/s, expected at most {settings.max_speed_m_s:g} m/s and "
-                f"{_MAX_TURN_RATE_DEG_S:.0f} deg/s; {_cure(settings)}"
+                f"{_MAX_TURN_RATE_DEG_S:.0f} deg/s; {_cure(settings)}",
+                b,
             )
         if previous_m_s is not None:
             change_m_s = float(np.linalg.norm(velocity_m_s - previous_m_s))
             if change_m_s > _MAX_ACCELERATION_M_S2 * seconds + slack_m_s:
-                raise ComputationError(
+                raise SweepError(
                     f"registration jumps at frame {a}: the speed changes by {change_m_s:.1f} m/s "
-                    f"within {seconds:.2f} s, expected a vehicle's; {_cure(settings)}"
+                    f"within {seconds:.2f} s, expected a vehicle's; {_cure(settings)}",
+                    a,
                 )
         previous_m_s = velocity_m_s
 
@@ -149,7 +153,7 @@ def check_plausible(trajectory: Trajectory, settings: RegisterSettings) -> None:
 def check_overlap(
     sweeps: Sequence[Sweep], trajectory: Trajectory, settings: RegisterSettings
 ) -> None:
-    """Raise ComputationError where a sweep does not lie on the one before it: odometry may glide
+    """Raise SweepError where a sweep does not lie on the one before it: odometry may glide
     on at the expected speed over sweeps that have nothing to do with each other. Sweeps too sparse
     to tell are passed over."""
     world = [
@@ -163,11 +167,12 @@ def check_overlap(
         distance, _ = cKDTree(earlier).query(sample, distance_upper_bound=_OVERLAP_M)
         overlap = float(np.isfinite(distance).mean())
         if overlap < settings.min_overlap:
-            raise ComputationError(
+            raise SweepError(
                 f"registration fails from frame {a} to {b}: only {100 * overlap:.0f} % of what "
                 f"stands there lies on the sweep before, expected at least "
                 f"{100 * settings.min_overlap:.0f} %; {_cure(settings)}, or lower "
-                f"register.min_overlap"
+                f"register.min_overlap",
+                b,
             )
 
 

@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: MIT
+"""A training set of every key of whole recordings."""

@@ -1,0 +1,352 @@
+# SPDX-License-Identifier: MIT
+"""A training set read back: what `densify dataset --layout kitti-depth` wrote, as a torch dataset.
+
+Images are not in the set: they come from the recordings it was made of.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch.utils.data import Dataset
+
+from densify.errors import InputError
+from densify.output.depth_png import read_depth_png, read_stored
+from densify.readers import open_sequence
+from densify.readers.files import read_text
+from densify.types import Camera, Float, Float32, LidarSequence
+
+LAYOUT = "kitti-depth"
+_SCHEMA_VERSION = 1
+_SPLITS = ("train", "val")
+_MOST_CERTAIN, _LEAST_CERTAIN = 255, 1  # as stored; 0 is no depth
+
+
+class DepthDataset(Dataset[dict[str, Any]]):
+    """One sample for each finished key and camera, ordered by drive, camera and frame.
+
+    A sample is a dict of float32 tensors with what belongs to them; H and W as cropped::
+
+        image           (3,H,W) RGB, 0 to 1
+        sparse_depth_m  (1,H,W) camera z of the key sweep alone, metres, 0 none
+        dense_depth_m   (1,H,W) of the accumulated sweeps, metres, 0 none
+        confidence      (1,H,W) of the dense depth, 1 most certain; 0 where there is none
+        intrinsics      (3,3) K in pixels, of the image as it is here; integers at pixel centres
+        frame           int, absolute; drive, camera: str
+
+    A flipped sample is a mirrored world: what was at camera x is at -x, the focal lengths stay
+    positive. Where a recording is not rectified, ``intrinsics`` leave the lens's distortion out.
+
+    Recordings are opened when a process first needs them, so the set can be handed to the workers
+    of a DataLoader. What is random follows from seed, epoch and index alone, whoever loads it.
+    """
+
+    def __init__(
+        self,
+        root: str | Path,
+        cameras: Sequence[str] | None = None,
+        filled: bool = False,
+        crop: tuple[int, int] | None = None,
+        flip: bool = False,
+        seed: int = 0,
+        data: Mapping[str, str | Path] | None = None,
+        split: Literal["train", "val"] | None = None,
+    ) -> None:
+        """root: ``--out`` of `densify dataset`. cameras: names, all if None. filled: dense depth
+        has the pixels interpolated between measured ones too.
+
+        crop: (height_px, width_px), cut out at the bottom of the image, where the depth is, and
+            at a random place from left to right.
+        flip: mirror every other sample, at random.
+        seed: from 0; see `set_epoch`.
+        data: drive -> where its recording is now, what `densify.open_sequence` takes; needed for
+            those that have moved since the set was made.
+        split: "train" or "val", KITTI's; both if None.
+
+        Raises InputError if there is no set of this layout, nothing in it is left to load, or a
+        crop is larger than an image; loading raises it for files that are missing or damaged.
+        """
+        self._root = Path(root)
+        self._filled, self._crop, self._flip, self._seed = filled, crop, flip, seed
+        self._check_options(split)
+        drives = _read_drives(self._root)
+        self._drives = {
+            name: drive
+            for name, drive in drives.items()
+            if split is None or drive.folder.startswith(f"{split}/")
+        }
+        self._check_cameras(cameras)
+        self._specs = {name: drive.data for name, drive in drives.items()}
+        for name, spec in (data or {}).items():
+            if name not in drives:
+                raise InputError(
+                    f"data: no drive {name!r} in {self._root}; it has {', '.join(drives)}"
+                )
+            self._specs[name] = str(spec)
+        self._samples = self._find_samples(cameras)
+        self._check_crop()
+        # Shared: workers that live on from epoch to epoch see it change.
+        self._epoch = torch.zeros((), dtype=torch.int64).share_memory_()
+        self._opened: dict[tuple[int, str], LidarSequence] = {}
+
+    def set_epoch(self, epoch: int) -> None:
+        """Draw new crops and flips: call it before each epoch with its number, from 0. Two runs
+        with the same seed get the same ones."""
+        self._epoch.fill_(epoch)
+
+    def __len__(self) -> int:
+        return len(self._samples)
+
+    def __getitem__(self, index: int) -> dict[str, Any]:
+        """The sample; see the class. Raises InputError for what is missing or damaged."""
+        sample = self._samples[index]
+        drive = self._drives[sample.drive]
+        camera = drive.cameras[sample.camera]
+        maps = self._read_maps(sample, camera)
+        maps["image"] = self._read_image(sample, camera)
+        rows, columns, mirrored = self._view(camera, index % len(self))
+        K = _viewed_K(camera.K, rows.start, columns, mirrored)
+        step = -1 if mirrored else 1
+        tensors = {
+            name: torch.from_numpy(np.ascontiguousarray(array[..., rows, columns][..., ::step]))
+            for name, array in maps.items()
+        }
+        tensors["image"] = tensors["image"].to(torch.float32).div_(255)
+        return {
+            **tensors,
+            "intrinsics": torch.from_numpy(K.astype(np.float32)),
+            "frame": sample.frame,
+            "drive": sample.drive,
+            "camera": sample.camera,
+        }
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_opened": {}}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self._epoch.share_memory_()
+
+    def _check_options(self, split: str | None) -> None:
+        if split is not None and split not in _SPLITS:
+            raise InputError(f"split: got {split!r}, expected None, {' or '.join(_SPLITS)}")
+        if self._seed < 0:
+            raise InputError(f"seed: got {self._seed}, expected a whole number from 0")
+        if self._crop is not None and (len(self._crop) != 2 or min(self._crop) < 1):
+            raise InputError(f"crop: got {self._crop}, expected (height_px, width_px)")
+
+    def _check_cameras(self, cameras: Sequence[str] | None) -> None:
+        there = sorted({name for drive in self._drives.values() for name in drive.cameras})
+        for name in cameras or ():
+            if name not in there:
+                raise InputError(
+                    f"{self._root}: no camera {name!r}; it has {', '.join(there) or 'none'}"
+                )
+
+    def _check_crop(self) -> None:
+        if self._crop is None:
+            return
+        for name, camera in sorted({(s.drive, s.camera) for s in self._samples}):
+            size = self._drives[name].cameras[camera]
+            if self._crop[0] > size.height_px or self._crop[1] > size.width_px:
+                raise InputError(
+                    f"crop: got {self._crop[0]} x {self._crop[1]} px (height x width), expected at "
+                    f"most the {size.height_px} x {size.width_px} of {camera} in {name}"
+                )
+
+    def _find_samples(self, cameras: Sequence[str] | None) -> list[_Sample]:
+        done = _done_keys(self._root)
+        samples = [
+            _Sample(name, camera, frame)
+            for (name, frame), files in done.items()
+            if name in self._drives
+            for camera in self._drives[name].cameras
+            if cameras is None or camera in cameras
+            if self._drives[name].path("groundtruth", camera, frame) in files
+        ]
+        if not samples:
+            raise InputError(
+                f"{self._root}: nothing to load: of {len(done)} finished keys in manifest*.jsonl, "
+                f"expected one of the split and cameras asked for; let densify dataset finish some"
+            )
+        return sorted(samples)
+
+    def _read_maps(self, sample: _Sample, camera: Camera) -> dict[str, NDArray[Any]]:
+        """(1,H,W) each."""
+
+        def read(kind: str, reader: Callable[[Path], NDArray[Any]]) -> NDArray[Any]:
+            drive = self._drives[sample.drive]
+            path = self._root / drive.path(kind, sample.camera, sample.frame)
+            try:
+                stored = reader(path)
+                _check_size(str(path), stored, camera)
+            except InputError as error:
+                raise InputError(
+                    f"{error}; run densify dataset again with --out {self._root}: it makes what is "
+                    f"missing or damaged anew"
+                ) from None
+            return stored[None]
+
+        dense_m = read("groundtruth_filled" if self._filled else "groundtruth", read_depth_png)
+        levels = read("confidence", lambda path: read_stored(path, np.uint8, "a confidence map"))
+        return {
+            "sparse_depth_m": read("velodyne_raw", read_depth_png),
+            "dense_depth_m": dense_m,
+            "confidence": _confidence(levels, dense_m),
+        }
+
+    def _read_image(self, sample: _Sample, camera: Camera) -> NDArray[np.uint8]:
+        """(3,H,W)."""
+        image = self._recording(sample.drive).image(sample.camera, sample.frame)
+        where = f"{self._specs[sample.drive]}: {sample.camera} of frame {sample.frame}"
+        _check_size(where, image, camera)
+        return image.transpose(2, 0, 1)
+
+    def _recording(self, drive: str) -> LidarSequence:
+        here = (os.getpid(), drive)  # a forked worker opens its own
+        if here not in self._opened:
+            try:
+                self._opened[here] = open_sequence(self._specs[drive])
+            except InputError as error:
+                raise InputError(
+                    f"{self._root}: drive {drive}: {error}; if the recording has moved, give "
+                    f"data={{{drive!r}: where it is now}}"
+                ) from None
+        return self._opened[here]
+
+    def _view(self, camera: Camera, index: int) -> tuple[slice, slice, bool]:
+        """Rows and columns that are cut out, and whether they are mirrored."""
+        height_px, width_px = self._crop or (camera.height_px, camera.width_px)
+        random = np.random.default_rng([self._seed, int(self._epoch), index])
+        left = int(random.integers(camera.width_px - width_px + 1))
+        mirrored = bool(random.integers(2)) and self._flip
+        rows = slice(camera.height_px - height_px, camera.height_px)
+        return rows, slice(left, left + width_px), mirrored
+
+
+@dataclass(frozen=True, order=True)
+class _Sample:
+    drive: str
+    camera: str
+    frame: int
+
+
+@dataclass(frozen=True)
+class _Drive:
+    """data: where its recording was. folder: in the set."""
+
+    data: str
+    folder: str
+    cameras: Mapping[str, Camera]
+
+    def path(self, kind: str, camera: str, frame: int) -> str:
+        """In the set, as the manifest names it."""
+        return f"{self.folder}/proj_depth/{kind}/{camera}/{frame:010d}.png"
+
+
+def _read_drives(root: Path) -> dict[str, _Drive]:
+    """Of dataset.json, by name."""
+    path = root / "dataset.json"
+    if not path.is_file():
+        raise InputError(
+            f"{path}: no such file; expected the folder that densify dataset --layout {LAYOUT} "
+            f"wrote"
+        )
+    try:
+        stored = json.loads(read_text(path))
+        layout, version = stored["layout"], stored["schema_version"]
+        if version != _SCHEMA_VERSION:
+            raise InputError(
+                f"{path}: got schema_version {version}, expected {_SCHEMA_VERSION}; use the "
+                f"densify that made it, or make the set again"
+            )
+        if layout != LAYOUT:
+            raise InputError(
+                f"{path}: got a set of layout {layout!r}, expected {LAYOUT!r}; make it with "
+                f"densify dataset --layout {LAYOUT}"
+            )
+        return {name: _drive(entry) for name, entry in stored["drives"].items()}
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise InputError(
+            f"{path}: damaged or no description of a training set ({type(error).__name__}: "
+            f"{error}); run densify dataset again with --out {root}"
+        ) from None
+
+
+def _drive(entry: Mapping[str, Any]) -> _Drive:
+    cameras = {
+        name: Camera(
+            name=name,
+            width_px=int(camera["width_px"]),
+            height_px=int(camera["height_px"]),
+            K=np.array(camera["K"], np.float64).reshape(3, 3),
+            T_cam_lidar=np.array(camera["T_cam_lidar"], np.float64).reshape(4, 4),
+            distortion=tuple(camera["distortion"]),
+        )
+        for name, camera in entry["cameras"].items()
+    }
+    return _Drive(str(entry["data"]), str(entry["folder"]), cameras)
+
+
+def _done_keys(root: Path) -> dict[tuple[str, int], frozenset[str]]:
+    """(drive, frame) -> files, of the keys whose last line in any manifest says that they are
+    done."""
+    done: dict[tuple[str, int], frozenset[str]] = {}
+    for manifest in sorted(root.glob("manifest*.jsonl")):
+        last = {(record["drive"], record["key"]): record for record in _records(manifest)}
+        done |= {
+            key: frozenset(record["files"])
+            for key, record in last.items()
+            if record["status"] == "done"
+        }
+    return done
+
+
+def _records(manifest: Path) -> Iterator[dict[str, Any]]:
+    """Its whole lines; a writer that was killed leaves a torn one."""
+    try:
+        lines = manifest.read_bytes().splitlines()
+    except OSError as error:
+        raise InputError(f"{manifest}: cannot be read: {error.strerror or error}") from error
+    for line in lines:
+        try:
+            record = json.loads(line)
+        except ValueError:
+            continue
+        if isinstance(record, dict) and {"drive", "key", "status", "files"} <= record.keys():
+            yield record
+
+
+def _check_size(where: str, image: NDArray[Any], camera: Camera) -> None:
+    height_px, width_px = image.shape[:2]
+    if (height_px, width_px) != (camera.height_px, camera.width_px):
+        raise InputError(
+            f"{where}: got {width_px} x {height_px} px, expected {camera.width_px} x "
+            f"{camera.height_px} as dataset.json says"
+        )
+
+
+def _confidence(levels: NDArray[np.uint8], depth_m: Float32) -> Float32:
+    """0 to 1, of what `densify.output.depth_png.stored_confidence` gave."""
+    known = (levels > 0) & (depth_m > 0)
+    scale = np.float32(1 / (_MOST_CERTAIN - _LEAST_CERTAIN))
+    return np.where(known, (levels.astype(np.float32) - _LEAST_CERTAIN) * scale, np.float32(0))
+
+
+def _viewed_K(K: Float, top: int, columns: slice, mirrored: bool) -> Float:
+    """(3,3) after the crop and then the flip, which takes pixel u to width - 1 - u."""
+    viewed = K.copy()
+    viewed[0, 2] -= columns.start
+    viewed[1, 2] -= top
+    if mirrored:
+        viewed[0, 1] = -viewed[0, 1]
+        viewed[0, 2] = columns.stop - columns.start - 1 - viewed[0, 2]
+    return viewed

@@ -1,0 +1,287 @@
+# SPDX-License-Identifier: MIT
+"""A training set, as a story: plan, see what is finished, make the rest, record every key."""
+
+from __future__ import annotations
+
+import logging
+import shutil
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from densify.config import as_mapping
+from densify.dataset.drive import BLOCK, margin
+from densify.dataset.manifest import Key, KeyRecord, Manifest, finished, read_manifests
+from densify.dataset.plan import PlannedDrive, Recipe, plan, planned_keys, read_plan, write_plan
+from densify.dataset.tasks import Outcome, run_tasks
+from densify.dataset.work import Job, tasks
+from densify.dataset.workers import open_workers
+from densify.errors import ComputationError, InputError, OutputError
+from densify.output.atomic import clear_leftovers
+from densify.output.kitti_tree import write_readme
+from densify.readers import open_sequence
+
+_log = logging.getLogger("densify")
+
+CACHE_BYTES = 10 * 1024**3
+"""Of what is kept for later runs."""
+_TREE_BYTES_PER_PIXEL = 2.2  # the four maps of a camera
+_RUN_BYTES_PER_PIXEL, _CLOUD_BYTES_PER_SWEEP = 8.0, 2.5e6
+# Of a process: what is loaded, and what a point takes in the shared steps and in a key's window.
+_BASE_BYTES, _SHARED_BYTES_PER_POINT, _KEY_BYTES_PER_POINT = 0.45e9, 110, 500
+
+
+@dataclass(frozen=True)
+class Summary:
+    """Of a set, or of a shard's part of it. records: of keys that were ever tried. num_keys: that
+    are wanted. num_made: in this run, within ``seconds``."""
+
+    records: Mapping[Key, KeyRecord]
+    num_keys: int
+    num_made: int = 0
+    seconds: float = 0.0
+
+    def count(self, status: str) -> int:
+        return sum(record.status == status for record in self.records.values())
+
+    @property
+    def num_left(self) -> int:
+        return self.num_keys - len(self.records)
+
+    @property
+    def seconds_left(self) -> float | None:
+        """At the rate so far; None before the first key."""
+        return self.seconds / self.num_made * self.num_left if self.num_made else None
+
+    def mean(self, score: str) -> float | None:
+        """Over the keys that are done, and their cameras."""
+        values: list[float | None] = []
+        for record in self.records.values():
+            value = record.scores.get(score) if record.status == "done" else None
+            values += value.values() if isinstance(value, Mapping) else [value]
+        known = [value for value in values if value is not None]
+        return sum(known) / len(known) if known else None
+
+
+def make_dataset(
+    data: Sequence[str],
+    out: Path,
+    keys: slice | None = None,
+    recipe: Recipe | None = None,
+    *,
+    num_workers: int = 1,
+    scheduler: str | None = None,
+    shard: tuple[int, int] | None = None,
+    memory_bytes: int | None = None,
+    cache_bytes: int = CACHE_BYTES,
+    report: Callable[[Summary], None] | None = None,
+) -> Summary:
+    """Every key of whole recordings, as a training set in ``out``.
+
+    data: recordings, as `densify.open_sequence` takes them. keys: all if None, else those of frames
+    ``start`` to ``stop`` - 1 by ``step``. num_workers: processes; 1 works in this one. scheduler:
+    address of a Dask scheduler whose workers are used instead; they need the same files at the same
+    paths. shard: (i, n), the i-th of n parts of the work, from 1; parts may run at the same time on
+    machines that share ``out``. memory_bytes: of all processes together; fewer are started where it
+    does not suffice. cache_bytes: bound of what is kept on disk for later runs. report: called
+    after every key.
+
+    Run again, it goes on where it was stopped, however that happened: finished keys are kept, keys
+    that failed are tried again. The files do not depend on the number of processes, on shards or on
+    interruptions. What became of a key is in the manifest (`densify.dataset.manifest`).
+
+    Raises InputError for what cannot be used, and where another run is at work on the same part;
+    ComputationError where the disk is full or the workers are lost: what is finished is kept.
+    """
+    recipe = recipe or Recipe()
+    drives = plan(data, keys, recipe)
+    with Manifest(out, shard) as manifest:
+        write_plan(out, recipe, drives)
+        with _log_file(out, shard):
+            clear_leftovers(out)
+            settings = as_mapping(recipe.config)
+            write_readme(out, method=recipe.method, window=recipe.window, settings=settings)
+            drives = _part(drives, shard)
+            done = _Done(out, drives, report)
+            left = done.left(drives)
+            num_processes = _num_processes(num_workers, memory_bytes, recipe, drives)
+            _announce(out, recipe, left, done.summary().num_keys, num_processes)
+            todo = [
+                task
+                for drive in left
+                for task in tasks(
+                    Job(drive.source, recipe, out.absolute(), cache_bytes), drive.keys
+                )
+            ]
+            try:
+                if todo:
+                    with open_workers(num_processes, scheduler, memory_bytes) as workers:
+                        for record in _records(run_tasks(todo, workers)):
+                            manifest.append(record)
+                            done.add(record)
+            except OutputError as error:
+                raise ComputationError(f"{error}; {done.kept()}") from error
+            except BaseException:
+                _log.info(done.kept())
+                raise
+    return done.summary()
+
+
+class _Done:
+    """What is finished of the keys wanted, and how fast it goes."""
+
+    def __init__(
+        self,
+        out: Path,
+        drives: Sequence[PlannedDrive],
+        report: Callable[[Summary], None] | None,
+    ) -> None:
+        wanted = {(d.source.name, key) for d in drives for key in d.keys}
+        before = read_manifests(out)
+        whole = finished(before.values(), out)
+        self._records = {name: before[name] for name in sorted(wanted & whole)}
+        self._num_keys, self._report = len(wanted), report
+        self._num_made, self._started = 0, time.monotonic()
+
+    def left(self, drives: Sequence[PlannedDrive]) -> list[PlannedDrive]:
+        rest = [
+            replace(d, keys=tuple(k for k in d.keys if (d.source.name, k) not in self._records))
+            for d in drives
+        ]
+        return [d for d in rest if d.keys]
+
+    def add(self, record: KeyRecord) -> None:
+        self._records[record.name] = record
+        self._num_made += 1
+        summary = self.summary()
+        _log.debug("%s", _line(record, summary))
+        if self._report is not None:
+            self._report(summary)
+
+    def summary(self) -> Summary:
+        seconds = time.monotonic() - self._started
+        return Summary(self._records, self._num_keys, self._num_made, seconds)
+
+    def kept(self) -> str:
+        num_kept = sum(record.status != "failed" for record in self._records.values())
+        return f"{num_kept} of {self._num_keys} keys are finished and kept"
+
+
+def status(out: Path) -> tuple[Summary, list[str]]:
+    """Of a set, finished or not, and the last line of each of its logs.
+
+    Raises InputError if ``out`` holds none.
+    """
+    table = read_plan(out)
+    if table is None:
+        raise InputError(f"--status {out}: no dataset.json in it; expected a set's folder")
+    keys = planned_keys(table)
+    records = {name: r for name, r in read_manifests(out).items() if name in keys}
+    lines = []
+    for path in sorted(out.glob("densify*.log")):
+        text = path.read_text("utf-8", errors="replace").splitlines()
+        lines += text[-1:]
+    return Summary(records, len(keys)), lines
+
+
+def _records(outcomes: Iterator[Outcome]) -> Iterator[KeyRecord]:
+    for outcome in outcomes:
+        what, *where = outcome.name
+        if what == "key":
+            if isinstance(outcome.error, OutputError):
+                raise outcome.error
+            failed = KeyRecord(where[0], where[1], "failed", str(outcome.error))
+            yield failed if outcome.error is not None else outcome.value
+        elif outcome.error is not None:
+            _log.warning("%s of block %d of %s: %s", what, where[1], where[0], outcome.error)
+        else:
+            _log.debug("%s of block %d of %s: %.1f s", what, where[1], where[0], outcome.value)
+
+
+def _part(drives: Sequence[PlannedDrive], shard: tuple[int, int] | None) -> list[PlannedDrive]:
+    """Of all drives the blocks of a shard: neighbours together, for they share work."""
+    i, n = shard or (1, 1)
+    blocks = [(d.source.name, b) for d in drives for b in sorted({k // BLOCK for k in d.keys})]
+    mine = set(blocks[len(blocks) * (i - 1) // n : len(blocks) * i // n])
+    parts = [
+        replace(d, keys=tuple(k for k in d.keys if (d.source.name, k // BLOCK) in mine))
+        for d in drives
+    ]
+    return [part for part in parts if part.keys]
+
+
+def _num_processes(
+    num_workers: int, memory_bytes: int | None, recipe: Recipe, drives: Sequence[PlannedDrive]
+) -> int:
+    """As many as wanted, or fewer that fit into the memory."""
+    if memory_bytes is None or not drives:
+        return num_workers
+    sequence = open_sequence(drives[0].source.data)
+    num_points = len(sequence[drives[0].keys[0]])
+    num_shared = BLOCK + 2 * margin(recipe.window)
+    shared = num_shared * _SHARED_BYTES_PER_POINT * num_points
+    key = (2 * recipe.window + 1) * _KEY_BYTES_PER_POINT * num_points
+    need = _BASE_BYTES + shared + key
+    num_fitting = int(memory_bytes / need)
+    if num_fitting < 1:
+        raise InputError(
+            f"--memory: got {memory_bytes / 1e9:.1f} GB, expected at least {need / 1e9:.1f} GB "
+            f"for window {recipe.window} and sweeps of {num_points:,} points"
+        )
+    if num_fitting < num_workers:
+        _log.warning("%d workers instead of %d fit into the memory", num_fitting, num_workers)
+    return min(num_workers, num_fitting)
+
+
+def _announce(
+    out: Path, recipe: Recipe, left: Sequence[PlannedDrive], num_keys: int, num_processes: int
+) -> None:
+    num_left = sum(len(d.keys) for d in left)
+    need = sum(len(d.keys) * _bytes_per_key(recipe, d) for d in left)
+    free = shutil.disk_usage(out).free
+    _log.info(
+        "%d keys, %d finished, %d to make with %d worker(s); about %.2f GB needed, %.0f GB free",
+        *(num_keys, num_keys - num_left, num_left, num_processes, need / 1e9, free / 1e9),
+    )
+    if need > free:
+        _log.warning("%s: the disk will be full before all keys are made", out)
+
+
+def _bytes_per_key(recipe: Recipe, drive: PlannedDrive) -> float:
+    num_pixels = sum(c.width_px * c.height_px for c in drive.cameras)
+    if recipe.layout == "densify":
+        return _CLOUD_BYTES_PER_SWEEP * (2 * recipe.window + 1) + _RUN_BYTES_PER_PIXEL * num_pixels
+    return _TREE_BYTES_PER_PIXEL * num_pixels
+
+
+def _line(record: KeyRecord, summary: Summary) -> str:
+    """For the log."""
+    left_s = summary.seconds_left or 0.0
+    told = f" ({record.reason})" if record.reason else ""
+    return (
+        f"key {record.key} of {record.drive}: {record.status}{told}, {record.seconds:.1f} s; "
+        f"{len(summary.records)} of {summary.num_keys}, "
+        f"{summary.seconds / summary.num_made:.2f} s a key, {left_s / 60:.1f} min left"
+    )
+
+
+@contextmanager
+def _log_file(out: Path, shard: tuple[int, int] | None) -> Iterator[None]:
+    """What is logged goes to ``OUT/densify.log`` too, behind what earlier runs logged."""
+    name = "densify.log" if shard is None else f"densify-{shard[0]}of{shard[1]}.log"
+    try:
+        handler = logging.FileHandler(out / name, encoding="utf-8")
+    except OSError as error:
+        raise OutputError(f"--out {out}: {name} cannot be written: {error.strerror}") from error
+    handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
+    before = _log.level
+    _log.addHandler(handler)
+    _log.setLevel(logging.DEBUG)
+    try:
+        yield
+    finally:
+        _log.removeHandler(handler)
+        _log.setLevel(before)
+        handler.close()

@@ -1,0 +1,256 @@
+# SPDX-License-Identifier: MIT
+"""What a training set is to be: which keys of which recordings, and how they are made.
+
+It is written down as ``OUT/dataset.json``, so that a later run goes on with the same set and no
+other, and readers find cameras and recordings:
+
+    schema_version, densify (version)
+    layout, method, window, cameras, gate, config    of every key
+    drives    name -> data (what ``--data`` says), folder (of the tree, in OUT), frames (planned
+              keys, as [first, last] runs), cameras (name -> width_px, height_px, K, T_cam_lidar,
+              distortion)
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import densify
+from densify.config import Config, as_mapping
+from densify.dataset.gate import Gate
+from densify.errors import InputError
+from densify.output.atomic import write_file
+from densify.output.kitti_tree import drive_folder, split_of
+from densify.readers import open_sequence
+from densify.readers.files import format_frames
+from densify.readers.window import choose_cameras
+from densify.types import Camera, LidarSequence
+
+SCHEMA_VERSION = 1
+LAYOUTS = ("kitti-depth", "densify")
+METHODS = ("flow", "icp", "none")
+_FILE = "dataset.json"
+_LARGEST_WINDOW = 50
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """How every key of a set is made.
+
+    window: sweeps on each side of a key. method: flow, icp or none. layout: ``kitti-depth``,
+    KITTI's depth tree, or ``densify``, what ``densify run`` writes. cameras: names, None for all.
+    split: train or val, None for KITTI's official one. gate: what puts keys aside.
+    """
+
+    window: int = 5
+    method: str = "flow"
+    layout: str = "kitti-depth"
+    cameras: tuple[str, ...] | None = None
+    split: str | None = None
+    gate: Gate = field(default_factory=Gate)
+    config: Config = field(default_factory=Config)
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.window <= _LARGEST_WINDOW:
+            raise InputError(f"--window {self.window}: expected 0 to {_LARGEST_WINDOW} sweeps")
+        for option, value, known in (
+            ("method", self.method, METHODS),
+            ("layout", self.layout, LAYOUTS),
+            ("split", self.split or "train", ("train", "val")),
+        ):
+            if value not in known:
+                raise InputError(f"--{option} {value}: expected one of {', '.join(known)}")
+
+
+@dataclass(frozen=True)
+class Source:
+    """A recording, as every process opens it. name: as a folder's. data: what ``--data`` takes.
+    folder: of its files, relative to the set's. cameras: those wanted."""
+
+    name: str
+    data: str
+    folder: str
+    cameras: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class PlannedDrive:
+    """A recording and its keys, ascending."""
+
+    source: Source
+    keys: tuple[int, ...]
+    cameras: tuple[Camera, ...]
+
+
+def plan(data: Sequence[str], keys: slice | None, recipe: Recipe) -> list[PlannedDrive]:
+    """Open every recording and choose its keys.
+
+    data: what ``--data`` takes. keys: all if None, else those of the frames ``start`` to ``stop``
+    - 1 by ``step``, of every recording.
+
+    Raises InputError for recordings that cannot be opened, have equal names, no such camera, or
+    none of the keys.
+    """
+    drives: dict[str, PlannedDrive] = {}
+    for spec in data:
+        sequence = open_sequence(spec)
+        name = drive_folder(sequence.name)
+        if name in drives:
+            raise InputError(
+                f"--data {spec}: {drives[name].source.data} is called {name} as well; give every "
+                f"recording once, or make two sets with two --out"
+            )
+        cameras = tuple(choose_cameras(sequence, recipe.cameras))
+        if not cameras:
+            raise InputError(f"--data {spec}: has no camera; expected one to make depth maps for")
+        folder = f"{recipe.split or split_of(sequence.name)}/{name}"
+        if recipe.layout == "densify":
+            folder = name if len(data) > 1 else "."
+        chosen = _keys(sequence, keys, spec)
+        given = spec if spec.startswith("street") else str(Path(spec).absolute())
+        source = Source(name, given, folder, tuple(c.name for c in cameras))
+        drives[name] = PlannedDrive(source, chosen, cameras)
+    return list(drives.values())
+
+
+def _keys(sequence: LidarSequence, keys: slice | None, spec: str) -> tuple[int, ...]:
+    if keys is None:
+        return tuple(sequence.frames)
+    wanted = range(keys.start, keys.stop, keys.step or 1)
+    first, last = min(sequence.frames), max(sequence.frames)
+    chosen = tuple(f for f in wanted if first <= f <= last)
+    if not chosen or (keys.start < first or wanted[-1] > last):
+        text = f"{keys.start}:{keys.stop}" + (f":{keys.step}" if keys.step else "")
+        raise InputError(
+            f"--keys {text}: {sequence.name} ({spec}) has {format_frames(sequence.frames)}; "
+            f"expected A:B within {first}:{last + 1}, or all"
+        )
+    return chosen
+
+
+def write_plan(out: Path, recipe: Recipe, drives: Sequence[PlannedDrive]) -> None:
+    """Begin a set, or widen one made the same way.
+
+    Raises InputError if another set, or anything else, is there.
+    """
+    table = _table(recipe, drives)
+    before = read_plan(out)
+    if before is None:
+        if out.is_dir() and any(not _begun(p.name) for p in out.iterdir()):
+            raise InputError(f"--out {out}: not empty, and no dataset.json in it; choose another")
+    else:
+        _check_same(out, before, table)
+        table["drives"] = _united(out, before["drives"], table["drives"])
+    text = json.dumps(table, indent=1) + "\n"
+    out.mkdir(parents=True, exist_ok=True)
+    if before is None or table != before:
+        write_file(out / _FILE, text.encode(), durable=True)
+
+
+def read_plan(out: Path) -> dict[str, Any] | None:
+    """dataset.json, None where there is none. Raises InputError for a damaged or foreign one."""
+    path = out / _FILE
+    if not path.is_file():
+        return None
+    try:
+        table = json.loads(path.read_text("utf-8"))
+        known: bool = table["schema_version"] == SCHEMA_VERSION
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise InputError(f"{path}: cannot be read: {error}; choose another --out") from error
+    if not known:
+        raise InputError(
+            f"{path}: got schema_version {table['schema_version']}, expected {SCHEMA_VERSION}; "
+            f"it was made by another version of densify"
+        )
+    return dict(table)
+
+
+def planned_keys(table: Mapping[str, Any]) -> set[tuple[str, int]]:
+    """(drive, frame) of every key in a dataset.json."""
+    return {(n, f) for n, drive in table["drives"].items() for f in _frames(drive["frames"])}
+
+
+def _begun(name: str) -> bool:
+    """Whether a run leaves that before there is a dataset.json."""
+    return name.startswith((".", "manifest"))
+
+
+def _table(recipe: Recipe, drives: Sequence[PlannedDrive]) -> dict[str, Any]:
+    table = {
+        "schema_version": SCHEMA_VERSION,
+        "densify": densify.__version__,
+        "layout": recipe.layout,
+        "method": recipe.method,
+        "window": recipe.window,
+        "cameras": None if recipe.cameras is None else list(recipe.cameras),
+        "gate": asdict(recipe.gate),
+        "config": as_mapping(recipe.config),
+        "drives": {
+            d.source.name: {
+                "data": d.source.data,
+                "folder": d.source.folder,
+                "frames": _as_runs(d.keys),
+                "cameras": {c.name: _as_plain(c) for c in d.cameras},
+            }
+            for d in drives
+        },
+    }
+    return dict(json.loads(json.dumps(table)))
+
+
+def _check_same(out: Path, before: Mapping[str, Any], now: Mapping[str, Any]) -> None:
+    for name in ("densify", "layout", "method", "window", "cameras", "gate", "config"):
+        if before[name] != now[name]:
+            got, expected = now[name], before[name]
+            where = name
+            while isinstance(got, dict):  # down to the one that differs
+                part = next(k for k in got if got[k] != expected.get(k))
+                got, expected, where = got[part], expected.get(part), f"{where}.{part}"
+            raise InputError(
+                f"--out {out}: the set in it was made with {where} = {expected}, got {got}; "
+                f"choose another --out, or go on with the same options"
+            )
+
+
+def _united(out: Path, before: dict[str, Any], now: dict[str, Any]) -> dict[str, Any]:
+    united = dict(before)
+    for name, drive in now.items():
+        old = before.get(name, drive)
+        for part in ("folder", "cameras"):
+            if old[part] != drive[part]:
+                raise InputError(
+                    f"--out {out}: {name} is in the set with other {part}; choose another --out"
+                )
+        if len({d["folder"] for d in (*before.values(), drive)}) < len({*before, name}):
+            raise InputError(f"--out {out}: holds another recording; choose another --out")
+        frames = sorted({*_frames(old["frames"]), *_frames(drive["frames"])})
+        united[name] = {**drive, "frames": _as_runs(frames)}
+    return dict(sorted(united.items()))
+
+
+def _as_plain(camera: Camera) -> dict[str, Any]:
+    return {
+        "width_px": camera.width_px,
+        "height_px": camera.height_px,
+        "K": camera.K.tolist(),
+        "T_cam_lidar": camera.T_cam_lidar.tolist(),
+        "distortion": list(camera.distortion),
+    }
+
+
+def _as_runs(frames: Iterable[int]) -> list[list[int]]:
+    runs: list[list[int]] = []
+    for frame in frames:
+        if runs and frame == runs[-1][1] + 1:
+            runs[-1][1] = frame
+        else:
+            runs.append([frame, frame])
+    return runs
+
+
+def _frames(runs: Iterable[Sequence[int]]) -> list[int]:
+    return [f for first, last in runs for f in range(first, last + 1)]

@@ -1,0 +1,163 @@
+# SPDX-License-Identifier: MIT
+"""The work on a training set as tasks that any process can do, in any order that `needs` allows:
+first what the keys of a block share, then its keys one by one.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+import traceback
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+
+from densify import pipeline
+from densify.config import as_mapping
+from densify.dataset.cache import Cache
+from densify.dataset.drive import BLOCK, Drive
+from densify.dataset.gate import scores_of
+from densify.dataset.manifest import KeyRecord
+from densify.dataset.plan import Recipe, Source
+from densify.dataset.tasks import Task
+from densify.errors import ComputationError, InputError, OutputError
+from densify.output.atomic import FileRecord
+from densify.output.kitti_tree import write_key
+from densify.output.store import write_result
+from densify.readers import open_sequence
+from densify.types import LidarSequence, Result
+
+_STAGES = ("registration", "images", "evidence", "motion")
+_log = logging.getLogger("densify")
+
+
+@dataclass(frozen=True)
+class Job:
+    """What every task of a recording has to know. cache_bytes: bound of the cache."""
+
+    source: Source
+    recipe: Recipe
+    out: Path
+    cache_bytes: int
+
+
+def tasks(job: Job, keys: Sequence[int]) -> Iterator[Task]:
+    """What is left to do for these keys: their records are the outcomes of the tasks named
+    ``("key", drive, frame)``. Ordered so that keys come early."""
+    name, moves = job.source.name, _follows(job.recipe)
+    blocks = sorted({key // BLOCK for key in keys})
+    known: set[tuple[str, int]] = set()
+
+    def stage(step: int, block: int) -> Iterator[Task]:
+        what = _STAGES[step]
+        if (what, block) in known or block < 0:
+            return
+        known.add((what, block))
+        around = [block - 1, block, block + 1] if step else []
+        for b in around:
+            yield from stage(step - 1, b)
+        needs = frozenset((_STAGES[step - 1], name, b) for b in around if b >= 0)
+        yield Task((what, name, block), share, (job, what, block), needs)
+
+    for block in blocks:
+        if moves:
+            yield from stage(3, block)
+            needs = frozenset({("motion", name, block)})
+        else:
+            around = [b for b in (block - 1, block, block + 1) if b >= 0]
+            for b in around:
+                yield from stage(0, b)
+            needs = frozenset(("registration", name, b) for b in around)
+        for key in keys:
+            if key // BLOCK == block:
+                yield Task(("key", name, key), make_key, (job, key), needs)
+
+
+def share(job: Job, stage: str, block: int) -> float:
+    """Make what the keys of a block share and leave it in the cache; returns the seconds."""
+    start = time.perf_counter()
+    drive, cache = _opened(job)
+    getattr(drive, stage)(block)
+    cache.trim()
+    return time.perf_counter() - start
+
+
+def make_key(job: Job, key: int) -> KeyRecord:
+    """Make and write one key. Raises OutputError if it cannot be written, which holds for all."""
+    start = time.perf_counter()
+    record = KeyRecord(job.source.name, key, "failed")
+    try:
+        record = _made(job, key)
+    except OutputError:
+        raise
+    except (InputError, ComputationError) as error:
+        record = replace(record, reason=str(error))
+    except Exception as error:  # a bug, or no memory: the other keys may go well all the same
+        _log.warning("key %d of %s: %s", key, job.source.name, traceback.format_exc())
+        record = replace(record, reason=f"{type(error).__name__}: {error}")
+    return replace(record, seconds=time.perf_counter() - start)
+
+
+def _made(job: Job, key: int) -> KeyRecord:
+    recipe = job.recipe
+    drive, _ = _opened(job)
+    sequence = _sequence(job.source.data)
+    if key not in sequence.frames:
+        raise InputError(f"{sequence.name} has no sweep for frame {key}")
+    stretch = drive.window(key)
+    pictures = recipe.layout == "densify"
+    cameras = job.source.cameras
+    images = {name: sequence.image(name, key) for name in cameras} if pictures else None
+    results = pipeline.densify(
+        *(sequence, stretch, key, lambda: drive.motion_of(key), cameras, recipe.config),
+        *(_methods(recipe), images),
+    )
+    result = results[recipe.method]
+    scores = scores_of(result)
+    record = KeyRecord(job.source.name, key, "done", frames=stretch.frames, files={}, scores=scores)
+    reason = recipe.gate.reason(scores, len(stretch.frames))
+    if reason is not None:
+        return replace(record, status="aside", reason=reason)
+    return replace(record, files=_written(job, results, images))
+
+
+def _written(
+    job: Job, results: Mapping[str, Result], images: Mapping[str, pipeline.Image] | None
+) -> dict[str, FileRecord]:
+    result = results[job.recipe.method]
+    if images is None:
+        sparse = results["none"].depth
+        return write_key(job.out, job.source.folder, result.key, sparse, result.depth)
+    paths = write_result(
+        *(result, images, job.out / job.source.folder),
+        config=as_mapping(job.recipe.config),
+        data=job.source.data,
+        overwrite=True,
+    )
+    return {
+        path.relative_to(job.out).as_posix(): FileRecord.of(path.read_bytes()) for path in paths
+    }
+
+
+def _methods(recipe: Recipe) -> tuple[str, ...]:
+    """The tree's sparse input is the key sweep alone; a run's figure shows all that is simpler."""
+    if recipe.layout == "densify":
+        return pipeline.RUN[: pipeline.RUN.index(recipe.method) + 1]
+    return tuple(dict.fromkeys(["none", recipe.method]))
+
+
+def _follows(recipe: Recipe) -> bool:
+    return recipe.method == "flow" and recipe.config.flow.engine == "groups"
+
+
+@lru_cache(maxsize=2)
+def _sequence(data: str) -> LidarSequence:
+    return open_sequence(data)
+
+
+@lru_cache(maxsize=1)
+def _opened(job: Job) -> tuple[Drive, Cache]:
+    cache = Cache(job.cache_bytes)
+    drive = Drive(_sequence(job.source.data), job.recipe.config, job.recipe.window, cache)
+    return drive, cache

@@ -1,0 +1,388 @@
+# SPDX-License-Identifier: MIT
+"""The training set read back: values, geometry under crops and flips, workers, and bad sets."""
+
+from __future__ import annotations
+
+import json
+import pickle
+import shutil
+from pathlib import Path
+from types import SimpleNamespace
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from torch.utils.data import DataLoader
+
+import densify
+from densify.dataset.loader import DepthDataset
+from densify.errors import InputError
+from densify.output.depth_png import stored_confidence, write_confidence_png, write_depth_png
+
+W, H = 60, 24
+K = np.array([[50.0, 0.25, 27.0], [0, 48.0, 10.0], [0, 0, 1]])
+VAL, TRAIN = "2011_09_26_drive_0013_sync", "2011_09_26_drive_0001_sync"
+FRAMES = {VAL: (3, 5, 8), TRAIN: (0, 2)}
+CAMERAS = ("image_02", "image_03")
+KINDS = ("velodyne_raw", "groundtruth", "groundtruth_filled", "confidence")
+
+
+def words(array):
+    return " ".join(f"{value:.17g}" for value in np.ravel(array))
+
+
+def write_recording(date: Path, drive: str, rng: np.random.Generator) -> dict:
+    """A KITTI raw drive of as little as opens; (camera, frame) -> image (H,W,3) RGB."""
+    P = words(np.column_stack([K, np.zeros(3)]))
+    sizes = [f"S_rect_{c[-2:]}: {W} {H}\nP_rect_{c[-2:]}: {P}\n" for c in CAMERAS]
+    sweeps = date / drive / "velodyne_points" / "data"
+    sweeps.mkdir(parents=True)
+    (date / "calib_cam_to_cam.txt").write_text(f"R_rect_00: {words(np.eye(3))}\n" + "".join(sizes))
+    (date / "calib_velo_to_cam.txt").write_text(f"R: {words(np.eye(3))}\nT: 0 0 0\n")
+    images = {}
+    for frame in FRAMES[drive]:
+        (sweeps / f"{frame:010d}.bin").write_bytes(np.ones(4, "<f4").tobytes())
+        for camera in CAMERAS:
+            image = rng.integers(0, 256, (H, W, 3), dtype=np.uint8)
+            path = date / drive / camera / "data" / f"{frame:010d}.png"
+            path.parent.mkdir(parents=True, exist_ok=True)
+            cv2.imwrite(str(path), image[:, :, ::-1])
+            images[camera, frame] = image
+    return images
+
+
+def write_maps(folder: Path, camera: str, frame: int, rng: np.random.Generator) -> SimpleNamespace:
+    filled_m = np.where(rng.random((H, W)) < 0.6, rng.uniform(2, 80, (H, W)), 0)
+    filled_m = (np.rint(256 * filled_m) / 256).astype(np.float32)
+    dense_m = np.where(rng.random((H, W)) < 0.7, filled_m, np.float32(0))
+    sparse_m = np.where(rng.random((H, W)) < 0.1, dense_m, np.float32(0))
+    confidence = rng.random((H, W), dtype=np.float32)
+    for kind, depth_m in zip(KINDS, (sparse_m, dense_m, filled_m, None), strict=True):
+        path = folder / "proj_depth" / kind / camera / f"{frame:010d}.png"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if depth_m is None:
+            write_confidence_png(path, confidence, filled_m)
+        else:
+            write_depth_png(path, depth_m)
+    return SimpleNamespace(
+        sparse_m=sparse_m, dense_m=dense_m, filled_m=filled_m, confidence=confidence
+    )
+
+
+def line_of(drive: str, frame: int, status: str = "done", cameras=CAMERAS) -> dict:
+    folder = f"{'val' if drive == VAL else 'train'}/{drive}"
+    paths = [f"{folder}/proj_depth/{k}/{c}/{frame:010d}.png" for k in KINDS for c in cameras]
+    files = {path: {"bytes": 1, "sha256": ""} for path in paths if status == "done"}
+    return {"drive": drive, "key": frame, "status": status, "reason": None, "files": files}
+
+
+def write_manifest(path: Path, *lines: dict) -> None:
+    path.write_text("".join(json.dumps(line) + "\n" for line in lines))
+
+
+@pytest.fixture
+def made(tmp_path):
+    """A set of two drives by hand, one of each split; its recordings are under ``tmp_path/raw``."""
+    rng = np.random.default_rng(5)
+    root, date = tmp_path / "set", tmp_path / "raw" / "2011_09_26"
+    camera = {"width_px": W, "height_px": H, "K": K.tolist(), "distortion": []}
+    camera["T_cam_lidar"] = np.eye(4).tolist()
+    drives, maps, images = {}, {}, {}
+    for drive, frames in FRAMES.items():
+        folder = f"{'val' if drive == VAL else 'train'}/{drive}"
+        recorded = write_recording(date, drive, rng)
+        images |= {(drive, *where): image for where, image in recorded.items()}
+        for frame in frames:
+            for name in CAMERAS:
+                maps[drive, name, frame] = write_maps(root / folder, name, frame, rng)
+        drives[drive] = {
+            "data": str(date / drive),
+            "folder": folder,
+            "keys": [[0, 9]],
+            "cameras": dict.fromkeys(CAMERAS, camera),
+        }
+    about = {"schema_version": 1, "layout": "kitti-depth", "method": "flow", "drives": drives}
+    (root / "dataset.json").write_text(json.dumps(about))
+    write_manifest(
+        root / "manifest.jsonl", *(line_of(d, f) for d, fs in FRAMES.items() for f in reversed(fs))
+    )
+    return SimpleNamespace(root=root, date=date, maps=maps, images=images, about=about)
+
+
+def rewrite(made, **changes) -> None:
+    (made.root / "dataset.json").write_text(json.dumps({**made.about, **changes}))
+
+
+def where_of(sample) -> tuple[str, str, int]:
+    return sample["drive"], sample["camera"], int(sample["frame"])
+
+
+# What is read
+
+
+@pytest.mark.parametrize("filled", [False, True])
+def test_every_value_comes_back(made, filled):
+    dataset = densify.DepthDataset(made.root, filled=filled)
+    assert [where_of(s) for s in dataset] == sorted(made.maps)
+    for sample in dataset:
+        maps = made.maps[where_of(sample)]
+        dense_m = maps.filled_m if filled else maps.dense_m
+        levels = stored_confidence(maps.confidence)
+        certain = np.where(dense_m > 0, (levels - 1.0) / 254, 0)
+        image = made.images[where_of(sample)].transpose(2, 0, 1)
+        np.testing.assert_array_equal(sample["sparse_depth_m"][0], maps.sparse_m)
+        np.testing.assert_array_equal(sample["dense_depth_m"][0], dense_m)
+        np.testing.assert_allclose(sample["confidence"][0], certain, atol=1e-6)
+        np.testing.assert_allclose(sample["image"], image / 255, atol=1e-6)
+        np.testing.assert_array_equal(sample["intrinsics"], K.astype(np.float32))
+        for name in ("image", "sparse_depth_m", "dense_depth_m", "confidence", "intrinsics"):
+            assert sample[name].dtype == torch.float32 and sample[name].is_contiguous()
+
+
+def test_one_camera_and_one_split(made):
+    assert {where_of(s)[1] for s in DepthDataset(made.root, cameras=["image_03"])} == {"image_03"}
+    for split, drive in (("val", VAL), ("train", TRAIN)):
+        dataset = DepthDataset(made.root, split=split)
+        assert len(dataset) == 2 * len(FRAMES[drive])
+        assert {where_of(s)[0] for s in dataset} == {drive}
+
+
+def test_a_key_without_one_cameras_files_is_a_sample_of_the_other(made):
+    write_manifest(made.root / "manifest.jsonl", line_of(VAL, 3, cameras=["image_03"]))
+    assert [where_of(s) for s in DepthDataset(made.root)] == [(VAL, "image_03", 3)]
+
+
+def test_only_what_is_done_is_in_the_set_and_the_last_line_says_so(made):
+    (made.root / "manifest.jsonl").unlink()
+    write_manifest(
+        made.root / "manifest-1of2.jsonl",
+        line_of(VAL, 8, "failed"),
+        line_of(VAL, 3),
+        line_of(VAL, 8),
+        line_of(TRAIN, 0, "aside"),
+    )
+    write_manifest(made.root / "manifest-2of2.jsonl", line_of(VAL, 5), line_of(VAL, 5, "aside"))
+    dataset = DepthDataset(made.root, cameras=["image_02"])
+    assert [where_of(s) for s in dataset] == [(VAL, "image_02", 3), (VAL, "image_02", 8)]
+
+
+def test_a_torn_last_line_is_no_line(made):
+    path = made.root / "manifest.jsonl"
+    write_manifest(path, line_of(VAL, 3), line_of(VAL, 5))
+    whole = path.read_bytes()
+    first = whole.index(b"\n") + 1
+    for end in range(first, len(whole) - 1):
+        path.write_bytes(whole[:end])
+        assert len(DepthDataset(made.root, cameras=["image_02"])) == 1
+    path.write_bytes(whole[:first] + bytes(300))
+    assert len(DepthDataset(made.root, cameras=["image_02"])) == 1
+
+
+def test_a_recording_that_has_moved(made, tmp_path):
+    shutil.move(made.date, tmp_path / "elsewhere")
+    with pytest.raises(InputError, match=rf"{VAL}.*data=\{{'{VAL}'"):
+        DepthDataset(made.root, split="val")[0]
+    moved = DepthDataset(made.root, split="val", data={VAL: tmp_path / "elsewhere" / VAL})
+    image = made.images[where_of(moved[0])].transpose(2, 0, 1)
+    np.testing.assert_allclose(moved[0]["image"], image / 255, atol=1e-6)
+
+
+# Crops and flips
+
+
+def points_by_depth(sample) -> dict[float, np.ndarray]:
+    """Depth -> where the pixels of that depth are in the camera, by the sample's intrinsics."""
+    depth_m = sample["dense_depth_m"][0].numpy()
+    v, u = np.nonzero(depth_m)
+    pixels = np.stack([u, v, np.ones(len(u))])
+    points = (np.linalg.inv(sample["intrinsics"].double().numpy()) @ pixels) * depth_m[v, u]
+    return {z: points[:, depth_m[v, u] == z] for z in np.unique(depth_m[v, u])}
+
+
+def test_crops_and_flips_keep_every_point_in_its_place(made):
+    whole = {where_of(s): points_by_depth(s) for s in DepthDataset(made.root)}
+    cut = DepthDataset(made.root, crop=(16, 31), flip=True, seed=3)
+    mirrored = set()
+    for epoch in range(3):
+        cut.set_epoch(epoch)
+        for sample in cut:
+            assert sample["dense_depth_m"].shape == (1, 16, 31)
+            sign = None
+            for z, points in points_by_depth(sample).items():
+                before = whole[where_of(sample)][z]
+                if before.shape[1] > 1:  # two pixels of one depth: which is which?
+                    continue
+                here = points[:, 0]
+                if sign is None:
+                    sign = 1 if abs(here[0] - before[0, 0]) < 1e-4 else -1
+                np.testing.assert_allclose(here, before[:, 0] * [sign, 1, 1], atol=1e-4)
+            mirrored.add(sign)
+    assert mirrored == {1, -1}
+
+
+def test_all_parts_of_a_sample_are_cut_alike_at_the_bottom(made):
+    cut = DepthDataset(made.root, crop=(10, 20), flip=True, filled=True)
+    places = set()
+    for index in range(len(cut)):
+        sample = cut[index]
+        image, maps = made.images[where_of(sample)], made.maps[where_of(sample)]
+        expected = np.concatenate(
+            [
+                image.transpose(2, 0, 1) / np.float32(255),
+                maps.sparse_m[None],
+                maps.filled_m[None],
+            ]
+        )
+        got = np.concatenate([sample[n] for n in ("image", "sparse_depth_m", "dense_depth_m")])
+        found = [
+            (left, step)
+            for left in range(W - 20 + 1)
+            for step in (1, -1)
+            if np.allclose(expected[:, H - 10 :, left : left + 20][..., ::step], got, atol=1e-6)
+        ]
+        assert len(found) == 1
+        places.add(found[0])
+    assert len({left for left, _ in places}) > 3 and {step for _, step in places} == {1, -1}
+
+
+def same(a, b) -> bool:
+    return all(torch.equal(a[n], b[n]) for n in ("image", "dense_depth_m", "intrinsics"))
+
+
+def test_random_is_what_seed_epoch_and_index_say(made):
+    options = {"crop": (12, 20), "flip": True}
+    dataset, again = (DepthDataset(made.root, seed=1, **options) for _ in range(2))
+    first = list(dataset)
+    assert all(map(same, first, again))
+    dataset.set_epoch(1)
+    assert not all(map(same, first, dataset))
+    dataset.set_epoch(0)
+    assert same(first[3], dataset[3]) and same(first[-1], dataset[-1])
+    assert not all(map(same, first, DepthDataset(made.root, seed=2, **options)))
+
+
+def test_without_crop_and_flip_nothing_is_random(made):
+    dataset = DepthDataset(made.root)
+    first = list(dataset)
+    dataset.set_epoch(7)
+    assert all(map(same, first, dataset))
+
+
+# Other processes
+
+
+@pytest.mark.parametrize("context", ["fork", "spawn"])
+def test_workers_give_what_one_process_gives(made, context):
+    dataset = DepthDataset(made.root, crop=(12, 20), flip=True, cameras=["image_02"])
+    loader = DataLoader(
+        dataset,
+        batch_size=2,
+        num_workers=2,
+        multiprocessing_context=context,
+        persistent_workers=True,  # these must hear of the new epoch too
+    )
+    drawn = []
+    for epoch in range(2):
+        dataset.set_epoch(epoch)
+        batches = list(loader)
+        alone = list(dataset)
+        for name in ("image", "sparse_depth_m", "dense_depth_m", "confidence", "intrinsics"):
+            together = torch.cat([batch[name] for batch in batches])
+            assert torch.equal(together, torch.stack([sample[name] for sample in alone]))
+        assert [f for b in batches for f in b["frame"].tolist()] == [s["frame"] for s in alone]
+        assert [d for b in batches for d in b["drive"]] == [s["drive"] for s in alone]
+        drawn.append(alone)
+    assert not all(map(same, *drawn))
+
+
+def test_a_pickled_set_is_the_same(made):
+    dataset = DepthDataset(made.root, crop=(12, 20), flip=True)
+    dataset.set_epoch(4)
+    first = list(dataset)
+    assert all(map(same, first, pickle.loads(pickle.dumps(dataset))))
+
+
+# What is wrong
+
+
+def refused(*parts, **options) -> None:
+    root = options.pop("root")
+    with pytest.raises(InputError) as error:
+        list(DepthDataset(root, **options))
+    message = str(error.value)
+    assert "\n" not in message
+    for part in parts:
+        assert str(part) in message, message
+
+
+def test_no_set(tmp_path):
+    refused(tmp_path / "dataset.json", "densify dataset --layout kitti-depth", root=tmp_path)
+
+
+def test_another_layout_or_version(made):
+    rewrite(made, layout="densify")
+    refused("'densify'", "--layout kitti-depth", root=made.root)
+    rewrite(made, schema_version=2)
+    refused("schema_version 2", root=made.root)
+
+
+@pytest.mark.parametrize("text", ["", "{", "[]", '{"schema_version": 1}', '{"layout": 1}'])
+def test_a_damaged_description(made, text):
+    (made.root / "dataset.json").write_text(text)
+    refused(made.root / "dataset.json", "damaged", root=made.root)
+
+
+def test_a_damaged_camera(made):
+    drives = json.loads(json.dumps(made.about["drives"]))
+    drives[VAL]["cameras"]["image_02"]["K"] = [[1, 2], [3, 4]]
+    rewrite(made, drives=drives)
+    refused(made.root / "dataset.json", "damaged", root=made.root)
+
+
+def test_an_empty_set(made):
+    write_manifest(made.root / "manifest.jsonl", line_of(VAL, 3))
+    refused("nothing to load", "1 finished", root=made.root, split="train")
+    (made.root / "manifest.jsonl").unlink()
+    refused("nothing to load", "0 finished", root=made.root)
+
+
+@pytest.mark.parametrize("kind", ["velodyne_raw", "groundtruth", "confidence"])
+def test_a_missing_a_damaged_and_a_foreign_map(made, kind):
+    path = made.root / "val" / VAL / "proj_depth" / kind / "image_02" / "0000000005.png"
+    whole = path.read_bytes()
+    again = "run densify dataset again"
+    path.write_bytes(whole[: len(whole) // 2])
+    refused(path, again, root=made.root)
+    path.write_bytes(whole[:100] + bytes([whole[100] ^ 1]) + whole[101:])
+    refused(path, again, root=made.root)
+    stored = cv2.imdecode(np.frombuffer(whole, np.uint8), cv2.IMREAD_UNCHANGED)
+    assert cv2.imwrite(str(path), stored[:, :-1])
+    refused(path, f"{W - 1} x {H}", f"{W} x {H}", root=made.root)
+    path.unlink()
+    refused(path, again, root=made.root)
+
+
+def test_options_that_cannot_be(made):
+    refused(f"{H + 1} x 20", f"{H} x {W}", root=made.root, crop=(H + 1, 20))
+    refused(f"20 x {W + 1}", root=made.root, crop=(20, W + 1))
+    refused("(0, 20)", root=made.root, crop=(0, 20))
+    refused("'image_07'", "image_02, image_03", root=made.root, cameras=["image_07"])
+    refused("'test'", "train", root=made.root, split="test")
+    refused("-1", root=made.root, seed=-1)
+    refused("'elsewhere'", VAL, root=made.root, data={"elsewhere": "x"})
+
+
+def test_images_of_another_size(made):
+    drives = json.loads(json.dumps(made.about["drives"]))
+    rewrite(made, drives=drives)
+    path = made.date / "calib_cam_to_cam.txt"
+    path.write_text(path.read_text().replace(f": {W} {H}", f": {W - 2} {H}"))
+    for image in made.date.glob("*/image_0?/data/*.png"):
+        assert cv2.imwrite(str(image), np.zeros((H, W - 2, 3), np.uint8))
+    refused(f"{W - 2} x {H}", "dataset.json", root=made.root)
+
+
+def test_a_recording_without_the_image(made):
+    shutil.rmtree(made.date / VAL / "image_03" / "data")
+    refused("image_03", "of frame", root=made.root, split="val")

@@ -1,0 +1,261 @@
+# SPDX-License-Identifier: MIT
+"""Keys written as KITTI's depth tree, as its own loaders and tools would read them."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import struct
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+import densify
+from densify.errors import InputError
+from densify.output.atomic import FileRecord
+from densify.output.depth_png import read_depth_png
+from densify.output.kitti_tree import drive_folder, split_of, write_key, write_readme
+from densify.readers.depth_trees import pair_depth_files
+from densify.types import DepthMap
+
+H, W = 9, 14
+CAMERAS = ("image_02", "image_03")
+PRODUCTS = ("velodyne_raw", "groundtruth", "groundtruth_filled", "confidence")
+FOLDER = "val/2011_09_26_drive_0013_sync"
+
+
+def maps(seed: int, height: int = H, width: int = W) -> dict[str, DepthMap]:
+    rng = np.random.default_rng(seed)
+    made = {}
+    for camera in CAMERAS:
+        depth = np.where(rng.random((height, width)) < 0.4, rng.uniform(2, 80, (height, width)), 0)
+        filled = np.where(depth > 0, depth, rng.uniform(2, 80, (height, width)))
+        filled[0] = depth[0]
+        confidence = rng.random((height, width), dtype=np.float32)
+        frame = np.where(depth > 0, 120, -1).astype(np.int32)
+        made[camera] = DepthMap(
+            camera, depth.astype(np.float32), filled.astype(np.float32), confidence, frame
+        )
+    return made
+
+
+def files_in(folder: Path) -> dict[str, bytes]:
+    """Hidden ones too."""
+    paths = [path for path in folder.rglob("*") if path.is_file()]
+    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in paths}
+
+
+def header(path: Path) -> tuple[int, ...]:
+    """width, height, bit depth, colour type, compression, filter and interlacing of a PNG."""
+    data = path.read_bytes()
+    assert data[12:16] == b"IHDR"
+    return struct.unpack(">IIBBBBB", data[16:29])
+
+
+# Names
+
+
+def test_the_split_is_that_of_the_benchmark() -> None:
+    official = {
+        "2011_09_26": (2, 5, 13, 20, 23, 36, 79, 95, 113),
+        "2011_09_28": (37,),
+        "2011_09_29": (26,),
+        "2011_09_30": (16,),
+        "2011_10_03": (47,),
+    }
+    drives = [
+        (date, number, f"{date}_drive_{number:04d}") for date in official for number in range(200)
+    ]
+    for date, number, drive in drives:
+        expected = "val" if number in official[date] else "train"
+        assert split_of(f"{drive}_sync") == split_of(f"{drive}_extract") == expected
+    assert sum(split_of(f"{drive}_sync") == "val" for *_, drive in drives) == 13
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["street:street?seed=0&sensor=hdl64", "", "2011_09_26_drive_0013_synced", "drive_0013_sync"],
+)
+def test_every_other_recording_is_for_training(name: str) -> None:
+    assert split_of(name) == "train"
+
+
+@pytest.mark.parametrize(
+    ("name", "folder"),
+    [
+        ("2011_09_26_drive_0013_sync", "2011_09_26_drive_0013_sync"),
+        ("street:street?seed=0&sensor=hdl64", "street-street_seed-0_sensor-hdl64"),
+        ("My drive (2)", "My-drive-2-" + hashlib.sha256(b"My drive (2)").hexdigest()[:8]),
+    ],
+)
+def test_folder_names(name: str, folder: str) -> None:
+    assert drive_folder(name) == folder
+
+
+ODD_NAMES = ["", ".", "..", "../../etc", "a/b", "/", "-rf", ".hidden", "a b", "a  b", "ä", "å"]
+ODD_NAMES += ["x" * 300, "x" * 301, "a\nb", "a\0b"]
+
+
+@given(st.lists(st.text() | st.sampled_from(ODD_NAMES), unique=True, max_size=30))
+def test_any_name_becomes_one_harmless_folder(names: list[str]) -> None:
+    plain = [name for name in names if not set(name) & set(":?=&")]
+    folders = [drive_folder(name) for name in plain]
+    assert len(set(folders)) == len(folders)
+    for folder in (*folders, *map(drive_folder, names)):
+        assert folder.isascii() and len(folder) <= 100
+        assert not set(folder) & set("/\\\0 \n\"'") and folder[0] not in ".-"
+        assert drive_folder(folder) == folder
+
+
+def test_odd_names_stay_different() -> None:
+    assert len({drive_folder(name) for name in ODD_NAMES}) == len(ODD_NAMES)
+
+
+# Maps
+
+
+def test_what_is_written_comes_back(tmp_path: Path) -> None:
+    sparse, dense = maps(1), maps(2)
+    records = write_key(tmp_path, FOLDER, 120, sparse, dense)
+    assert set(records) == {
+        f"{FOLDER}/proj_depth/{product}/{camera}/0000000120.png"
+        for product in PRODUCTS
+        for camera in CAMERAS
+    }
+    found = files_in(tmp_path)
+    assert {name: FileRecord.of(data) for name, data in found.items()} == records
+    for camera in CAMERAS:
+        for product, depth_m in (
+            ("velodyne_raw", sparse[camera].depth_m),
+            ("groundtruth", dense[camera].depth_m),
+            ("groundtruth_filled", dense[camera].filled_m),
+        ):
+            path = tmp_path / FOLDER / "proj_depth" / product / camera / "0000000120.png"
+            back = read_depth_png(path)
+            np.testing.assert_allclose(back, depth_m, atol=1 / 512)
+            np.testing.assert_array_equal(back > 0, depth_m > 0)
+            # As the README says.
+            np.testing.assert_array_equal(cv2.imread(str(path), cv2.IMREAD_UNCHANGED) / 256, back)
+        path = tmp_path / FOLDER / "proj_depth" / "confidence" / camera / "0000000120.png"
+        level = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        filled = dense[camera].filled_m > 0
+        assert level.dtype == np.uint8
+        np.testing.assert_array_equal(level > 0, filled)
+        confidence = (level.astype(float) - 1) / 254
+        np.testing.assert_allclose(
+            confidence[filled], dense[camera].confidence[filled], atol=0.5 / 254 + 1e-6
+        )
+
+
+def test_the_same_maps_give_the_same_bytes_and_replace_older_ones(tmp_path: Path) -> None:
+    first = write_key(tmp_path, FOLDER, 5, maps(1), maps(2))
+    other = write_key(tmp_path, FOLDER, 5, maps(3), maps(4))
+    assert first.keys() == other.keys() and first != other
+    assert write_key(tmp_path, FOLDER, 5, maps(1), maps(2)) == first
+    found = files_in(tmp_path)
+    assert {name: FileRecord.of(data) for name, data in found.items()} == first
+
+
+def test_the_tree_is_one_that_evaluate_reads(tmp_path: Path) -> None:
+    write_key(tmp_path, FOLDER, 5, maps(1), maps(2))
+    write_key(tmp_path, FOLDER, 6, maps(3), maps(4))
+    drive = tmp_path / FOLDER / "proj_depth"
+    pairs = pair_depth_files(drive / "velodyne_raw", tmp_path).pairs
+    assert {(p.predicted.parts[-3:], p.truth.parts[-3:]) for p in pairs} == {
+        (("velodyne_raw", *file), ("groundtruth", *file))
+        for file in ((c, f"{frame:010d}.png") for c in CAMERAS for frame in (5, 6))
+    }
+
+
+def test_the_format_is_that_of_the_official_files(tmp_path: Path, test_data: Path) -> None:
+    folder = test_data / "kitti" / "depth_annotated_sample"
+    official = folder / "groundtruth_0000000050.png"
+    image = cv2.imread(str(official), cv2.IMREAD_UNCHANGED)
+    depth_m = read_depth_png(official)
+    same = DepthMap(
+        "image_02", depth_m, depth_m, np.ones_like(depth_m), np.zeros(depth_m.shape, np.int32)
+    )
+    write_key(tmp_path, FOLDER, 50, {"image_02": same}, {"image_02": same})
+    for product in PRODUCTS[:3]:
+        ours = tmp_path / FOLDER / "proj_depth" / product / "image_02" / "0000000050.png"
+        assert header(ours) == header(official)
+        np.testing.assert_array_equal(cv2.imread(str(ours), cv2.IMREAD_UNCHANGED), image)
+    ours = tmp_path / FOLDER / "proj_depth" / "confidence" / "image_02" / "0000000050.png"
+    width, height, bits, *rest = header(official)
+    assert (bits, header(ours)) == (16, (width, height, 8, *rest))
+
+
+def test_cameras_must_agree(tmp_path: Path) -> None:
+    only_one = {"image_02": maps(1)["image_02"]}
+    with pytest.raises(ValueError, match="image_03"):
+        write_key(tmp_path, FOLDER, 5, only_one, maps(2))
+    assert files_in(tmp_path) == {}
+
+
+def test_places_that_cannot_be_written_to(tmp_path: Path) -> None:
+    (tmp_path / "val").write_text("a file")
+    with pytest.raises(InputError) as error:
+        write_key(tmp_path, FOLDER, 5, maps(1), maps(2))
+    message = str(error.value)
+    assert "\n" not in message and str(tmp_path) in message and "0000000005.png" in message
+    assert files_in(tmp_path) == {"val": b"a file"}
+
+
+def test_a_full_disk_leaves_no_part_of_a_file(tmp_path: Path) -> None:
+    code = """
+import resource, sys
+from pathlib import Path
+from test_kitti_tree import FOLDER, maps
+from densify.errors import InputError
+from densify.output.kitti_tree import write_key
+resource.setrlimit(resource.RLIMIT_FSIZE, 2 * (int(sys.argv[2]),))
+try:
+    write_key(Path(sys.argv[1]), FOLDER, 7, maps(1, 90, 140), maps(2, 90, 140))
+except InputError as error:
+    print(error)
+"""
+    whole = write_key(tmp_path / "whole", FOLDER, 7, maps(1, 90, 140), maps(2, 90, 140))
+    size = {name.split("/")[3]: file.num_bytes for name, file in whole.items()}
+    assert size["groundtruth_filled"] > size["groundtruth"] + 1000
+    limit = size["groundtruth_filled"] - 500
+    tests = str(Path(__file__).parent)
+    path = os.pathsep.join([tests, os.environ.get("PYTHONPATH", "")])
+    done = subprocess.run(
+        [sys.executable, "-c", code, tmp_path, str(limit)],
+        env={**os.environ, "PYTHONPATH": path},
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+    assert done.stderr == ""
+    (line,) = done.stdout.splitlines()
+    assert "File too large" in line and "groundtruth_filled" in line
+    left = {n: d for n, d in files_in(tmp_path).items() if not n.startswith("whole/")}
+    assert sorted(name.split("/")[3] for name in left) == ["groundtruth", "velodyne_raw"]
+    assert all(FileRecord.of(data) == whole[name] for name, data in left.items())
+
+
+# README
+
+
+def test_the_readme_says_what_a_reader_needs(tmp_path: Path) -> None:
+    settings = {"gate": {"min_score": np.float64(0.5)}, "config": {"flow": {"braces": "{window}"}}}
+    write_readme(tmp_path, method="flow", window=5, settings=settings)
+    text = (tmp_path / "README.txt").read_text("utf-8")
+    for part in (
+        *(densify.__version__, "flow", "window 5", "11 lidar sweeps", *PRODUCTS),
+        *("cv2.imread(path, cv2.IMREAD_UNCHANGED) / 256", "0 is none", "manifest.jsonl"),
+        *("licence", "min_score: 0.5", "'{window}'"),
+    ):
+        assert part in text, part
+    assert max(map(len, text.splitlines())) <= 100
+    assert str(tmp_path) not in text
+    (tmp_path / "again").mkdir()
+    write_readme(tmp_path / "again", method="flow", window=5, settings=settings)
+    assert (tmp_path / "again" / "README.txt").read_text("utf-8") == text

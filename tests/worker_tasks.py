@@ -1,0 +1,86 @@
+# SPDX-License-Identifier: MIT
+"""What the tests of the workers have called: a module of its own, for workers to import."""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+import sys
+import time
+from pathlib import Path
+
+
+class TwoPartError(Exception):
+    """Pickles, but does not come out of the pickle."""
+
+    def __init__(self, first: str, second: str) -> None:
+        super().__init__(f"{first} {second}")
+
+
+def square(number: int) -> int:
+    return number * number
+
+
+def process() -> int:
+    return os.getpid()
+
+
+def fail(error: type[Exception], *arguments: str) -> None:
+    raise error(*arguments)
+
+
+def unpicklable() -> object:
+    return lambda: None
+
+
+def warn(text: str) -> None:
+    log = logging.getLogger("densify.stages.register")
+    log.debug("not asked for")
+    log.warning("%s by %d", text, os.getpid())
+    raise ValueError(text)
+
+
+def note(folder: Path, name: str, needs: list[str]) -> list[str]:
+    """Leaves a file when it is over; the names of those that should have left theirs before."""
+    missing = [need for need in needs if not (folder / need).exists()]
+    time.sleep(0.01)
+    (folder / name).touch()
+    return missing
+
+
+def square_at_second_try(folder: Path, number: int) -> int:
+    """The first time it leaves the process that it runs in, and waits for its end."""
+    place = folder / f"{number}.pid"
+    if not place.exists():
+        wait(place)
+    return square(number)
+
+
+def wait(place: Path) -> None:
+    """Leave the process that it runs in, and never return."""
+    aside = place.with_suffix(".part")
+    aside.write_text(str(os.getpid()))
+    aside.rename(place)
+    time.sleep(600)
+
+
+def die() -> None:
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def fill_memory(num_bytes: int) -> None:
+    kept = bytearray(num_bytes)
+    kept[::4096] = b"x" * len(kept[::4096])
+    time.sleep(600)
+
+
+def threads() -> tuple[str, int, bool]:
+    """What OpenBLAS and numba are told, and whether any was loaded too early to hear it."""
+    # Dask's workers load numpy, with OpenBLAS, at once: the variable has to be there before.
+    started_with = Path("/proc/self/environ").read_bytes().split(b"\0")
+    told = f"OPENBLAS_NUM_THREADS={os.environ['OPENBLAS_NUM_THREADS']}".encode() in started_with
+    early = bool({"numba", "torch"} & set(sys.modules)) or ("numpy" in sys.modules and not told)
+    import numba
+
+    return os.environ["OPENBLAS_NUM_THREADS"], numba.config.NUMBA_NUM_THREADS, early
