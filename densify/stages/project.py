@@ -18,7 +18,7 @@ from densify.config import ProjectSettings
 from densify.depth_fill import fill_between
 from densify.kernels import visibility as kernels
 from densify.pinhole import image_points
-from densify.poses import transform
+from densify.poses import rotate, transform
 from densify.types import Bool, Camera, Cloud, DepthMap, Float, Float32, Int, Patches, Reason
 
 _MAX_HALF_PX = 24.0  # a point just before the lens must not hide the whole image
@@ -125,14 +125,15 @@ def project(
 def _in_image(
     cloud: Cloud, camera: Camera, T_cam_key: Float, patches: Patches, vetoed: bool
 ) -> _InImage:
-    ahead = cloud.points @ T_cam_key[2, :3] + T_cam_key[2, 3] > 0
+    points_cam = transform(T_cam_key, cloud.points)
+    ahead = points_cam[:, 2] > 0
     index = np.flatnonzero(ahead & ~patches.free if vetoed else ahead)
-    points_cam = transform(T_cam_key, cloud.points[index])
+    points_cam = points_cam[index]
     uv, seen = image_points(camera, points_cam)
     index, points_cam, uv = index[seen], points_cam[seen], uv[seen]
     depth = points_cam[:, 2].astype(np.float32)
     focal_px = camera.K[[0, 1], [0, 1]]
-    normal = patches.normal[index].astype(np.float64) @ T_cam_key[:3, :3].T
+    normal = rotate(T_cam_key, patches.normal[index].astype(np.float64))
     # On the plane n · p = d the inverse depth is n · ray / d: linear over the image.
     d = np.einsum("ij,ij->i", normal, points_cam)
     with np.errstate(divide="ignore", invalid="ignore"):
