@@ -344,7 +344,9 @@ def scheduler(tmp_path: Path) -> Iterator[tuple[str, subprocess.Popen[bytes]]]:
     """Address and process of a Dask scheduler that has two workers of its own."""
     place = tmp_path / "scheduler.json"
     home = Path(densify.__file__).parents[1]
-    environment = os.environ | {"PYTHONPATH": f"{home}:{Path(__file__).parent}"}
+    environment = os.environ | {
+        "PYTHONPATH": os.pathsep.join([str(home), str(Path(__file__).parent), *sys.path])
+    }
     dask = [sys.executable, "-m", "dask"]
     started = []
 
