@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import logging
 import os
+import pickle
 import random
 import re
 import signal
@@ -12,6 +13,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -20,7 +22,7 @@ import pytest
 import worker_tasks
 
 import densify
-from densify.dataset import pools, workers
+from densify.dataset import calls, pools, workers
 from densify.dataset.tasks import Outcome, Task, Workers, run_tasks
 from densify.dataset.workers import open_workers
 from densify.errors import ComputationError, InputError
@@ -149,6 +151,16 @@ def test_what_workers_log_is_logged_here(
         f"cut {n}" for n in range(4)
     ]
     assert {record.levelno for record in told} == {logging.WARNING}
+
+
+def test_a_worker_at_two_tasks_keeps_their_logs_apart() -> None:
+    """Dask workers that others started may have several threads."""
+    with ThreadPoolExecutor(2) as threads:
+        works = [pickle.dumps((worker_tasks.warn_together, (n,))) for n in range(2)]
+        answers = list(threads.map(calls._call_pickled, works, [logging.INFO] * 2))
+    for number, answer in enumerate(answers):
+        _, error, _, records = pickle.loads(answer)
+        assert error is None and [r.getMessage() for r in records] == [str(number)]
 
 
 def test_where_a_task_failed_is_in_the_debug_log(
@@ -430,11 +442,17 @@ cli.script()
 """
 
 
-def command(kind: str, plan: str, folder: Path) -> subprocess.Popen[str]:
+@contextmanager
+def command(kind: str, plan: str, folder: Path) -> Iterator[subprocess.Popen[str]]:
     """A command line of ours that has two workers, in a terminal session of its own."""
     arguments = [sys.executable, "-c", MAIN, kind, plan, str(folder), str(Path(__file__).parent)]
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
-    return subprocess.Popen(arguments, text=True, start_new_session=True, **pipes)
+    with subprocess.Popen(arguments, text=True, start_new_session=True, **pipes) as process:
+        try:
+            yield process
+        finally:
+            with suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGKILL)
 
 
 @pytest.mark.parametrize("kind", ELSEWHERE)
