@@ -29,7 +29,7 @@ class OneAtATime(Workers):
 
 
 def named(*tasks: tuple[str, str]) -> list[Task]:
-    """Names and one letter for each need; upper case comes first in no order but the list's."""
+    """Tasks of one letter, each with the letters that it needs."""
     return [
         Task((n,), worker_tasks.process, (), frozenset((m,) for m in needs)) for n, needs in tasks
     ]
