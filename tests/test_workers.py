@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import logging
 import os
+import pickle
 import random
 import re
 import signal
@@ -12,6 +13,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -20,7 +22,7 @@ import pytest
 import worker_tasks
 
 import densify
-from densify.dataset import pools, workers
+from densify.dataset import calls, pools, workers
 from densify.dataset.tasks import Outcome, Task, Workers, run_tasks
 from densify.dataset.workers import open_workers
 from densify.errors import ComputationError, InputError
@@ -151,6 +153,16 @@ def test_what_workers_log_is_logged_here(
     assert {record.levelno for record in told} == {logging.WARNING}
 
 
+def test_a_worker_at_two_tasks_keeps_their_logs_apart() -> None:
+    """Dask workers that others started may have several threads."""
+    with ThreadPoolExecutor(2) as threads:
+        works = [pickle.dumps((worker_tasks.warn_together, (n,))) for n in range(2)]
+        answers = list(threads.map(calls._call_pickled, works, [logging.INFO] * 2))
+    for number, answer in enumerate(answers):
+        _, error, _, records = pickle.loads(answer)
+        assert error is None and [r.getMessage() for r in records] == [str(number)]
+
+
 def test_where_a_task_failed_is_in_the_debug_log(
     everywhere: Workers, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -190,6 +202,14 @@ def test_a_killer_of_workers_is_given_up(processes: Workers) -> None:
     assert values(found) == {("square", n): n * n for n in range(12)}
 
 
+def test_a_task_with_too_much_memory_is_given_up() -> None:
+    tasks = [Task(("big",), worker_tasks.fill_memory, (1 << 29,)), *squares(3)]
+    with open_workers(2, memory_bytes=2 << 29) as found:
+        outcomes = done(tasks, found)
+    assert "short of memory" in str(outcomes["big",].error)
+    assert outcomes["square", 3].value == 9
+
+
 @pytest.mark.parametrize("kind", ELSEWHERE)
 def test_cores_are_shared_out(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(7)))
@@ -198,88 +218,10 @@ def test_cores_are_shared_out(kind: str, monkeypatch: pytest.MonkeyPatch) -> Non
     before = dict(os.environ)
     with opened(kind) as found:
         tasks = [Task((n,), worker_tasks.threads) for n in range(2)]
-        assert os.environ["NUMBA_NUM_THREADS"] == "6"
+        assert os.environ["NUMBA_NUM_THREADS"] == "6"  # this process's own
         assert set(values(done(tasks, found)).values()) == {("3", 3, False)}
     assert dict(os.environ) == before
     assert pools.share_of_cores(8)["OMP_NUM_THREADS"] == "1"
-
-
-class OneAtATime(Workers):
-    """Slots that come and go, each task over only when the test says so."""
-
-    def __init__(self, slots: list[int]) -> None:
-        self.slots, self.in_work, self.started = slots, [], []
-
-    def num_slots(self) -> int:
-        return self.slots.pop(0) if len(self.slots) > 1 else self.slots[0]
-
-    def submit(self, task: Task) -> None:
-        self.in_work.append(task)
-        self.started.append(task.name[0])
-
-    def next_over(self, wait_s: float) -> Outcome | None:
-        if not self.in_work:
-            return None
-        return Outcome(self.in_work.pop(0).name, None, None)
-
-
-def named(*tasks: tuple[str, str]) -> list[Task]:
-    """Names and one letter for each need; upper case comes first in no order but the list's."""
-    return [
-        Task((n,), worker_tasks.process, (), frozenset((m,) for m in needs)) for n, needs in tasks
-    ]
-
-
-def test_order_is_the_lists_among_the_ready() -> None:
-    tasks = named(("z", ""), ("y", "x"), ("d", ""), ("x", ""), ("c", ""), ("b", "z"), ("a", ""))
-    order = OneAtATime([1])
-    assert [o.name[0] for o in run_tasks(tasks, order)] == order.started == list("zdxycba")
-
-
-def test_no_more_in_work_than_there_are_workers() -> None:
-    found = OneAtATime([0, 0, 2, 2, 1, 1, 1, 3])
-    most = []
-    for _ in run_tasks(named(*((c, "") for c in "abcdefghij")), found):
-        most.append(len(found.in_work))
-    assert found.started == list("abcdefghij")
-    assert max(most[:2]) == 2 and most[2] == 1 and max(most) == 3
-
-
-def test_many_tasks_are_no_burden() -> None:
-    """Every task is looked at a few times, not once for every other."""
-    looks = 0
-
-    class Counted(tuple):  # type: ignore[type-arg]
-        def __hash__(self) -> int:
-            nonlocal looks
-            looks += 1
-            return super().__hash__()
-
-    names = [Counted((kind, n)) for kind in "red" for n in range(1000)]
-    of = {tuple(name): name for name in names}
-    tasks = [
-        Task(of["d", n], worker_tasks.process, (), frozenset({of["e", n]})) for n in range(1000)
-    ]
-    tasks += [
-        Task(of["e", n], worker_tasks.process, (), frozenset({of["r", n]})) for n in range(1000)
-    ]
-    tasks += [Task(of["r", n], worker_tasks.process) for n in range(1000)]
-    assert sum(1 for _ in run_tasks(tasks, OneAtATime([8]))) == 3000
-    assert looks < 30 * len(tasks)
-
-
-@pytest.mark.parametrize(
-    ("tasks", "words"),
-    [
-        (named(("a", ""), ("a", "")), "same name"),
-        (named(("a", "b")), "'b'.* not in the list"),
-        (named(("a", "b"), ("b", "a")), "cycle"),
-    ],
-    ids=["double", "unknown", "circle"],
-)
-def test_lists_that_make_no_sense(tasks: list[Task], words: str) -> None:
-    with pytest.raises(ValueError, match=words):
-        next(run_tasks(tasks, OneAtATime([1])))
 
 
 def test_no_workers_are_refused() -> None:
@@ -302,19 +244,33 @@ def test_a_scheduler_needs_distributed(monkeypatch: pytest.MonkeyPatch) -> None:
         pass
 
 
+class Deserted:
+    """Stands for a client of a scheduler without workers."""
+
+    def nthreads(self) -> dict[str, int]:
+        return {}
+
+    def get_executor(self, pure: bool) -> None:
+        return None
+
+
 def test_all_local_workers_gone(monkeypatch: pytest.MonkeyPatch) -> None:
-    class Client:
-        def nthreads(self) -> dict[str, int]:
-            return {}
-
-        def get_executor(self, pure: bool) -> None:
-            return None
-
     monkeypatch.setattr(workers, "_GONE_S", -1.0)
-    local = workers._Cluster(Client(), "here", local=True)
+    local = workers._Cluster(Deserted(), "here", local=True)
     assert local.num_slots() == 0
     with pytest.raises(ComputationError, match="same command again"):
         local.num_slots()
+
+
+def test_a_scheduler_without_workers_is_waited_for(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(workers, "_GONE_S", -1.0)
+    cluster = workers._Cluster(Deserted(), "tcp://there:8786", local=False)
+    assert [cluster.num_slots() for _ in range(3)] == [0, 0, 0]
+    assert [r.getMessage() for r in caplog.records] == [
+        "Dask scheduler tcp://there:8786 has no workers; waiting for one"
+    ]
 
 
 @pytest.fixture
@@ -322,7 +278,9 @@ def scheduler(tmp_path: Path) -> Iterator[tuple[str, subprocess.Popen[bytes]]]:
     """Address and process of a Dask scheduler that has two workers of its own."""
     place = tmp_path / "scheduler.json"
     home = Path(densify.__file__).parents[1]
-    environment = os.environ | {"PYTHONPATH": f"{home}:{Path(__file__).parent}"}
+    environment = os.environ | {
+        "PYTHONPATH": os.pathsep.join([str(home), str(Path(__file__).parent), *sys.path])
+    }
     dask = [sys.executable, "-m", "dask"]
     started = []
 
@@ -378,7 +336,7 @@ import sys
 from pathlib import Path
 from densify import cli
 
-kind, folder, tests = sys.argv[1:]
+kind, plan, folder, tests = sys.argv[1:]
 if kind == "pool":
     sys.modules["distributed"] = None
 sys.path.insert(0, tests)
@@ -387,48 +345,59 @@ def work(options):
     import worker_tasks
     from densify.dataset.tasks import Task, run_tasks
     from densify.dataset.workers import open_workers
-    tasks = [Task(("kill",), worker_tasks.die)]
-    tasks += [Task(("fail",), worker_tasks.fail, (ValueError, "odd"))]
-    tasks += [Task((n,), worker_tasks.square, (n,)) for n in range(2)]
+    tasks = [Task((n,), worker_tasks.square, (n,)) for n in range(2)]
+    tasks += [Task((error,), worker_tasks.fail, (error,)) for error in (KeyError, OSError)]
+    if "death" in plan:
+        tasks.insert(0, Task(("die",), worker_tasks.die))
     places = [Path(folder) / f"{n}.pid" for n in range(4)]
     waits = [Task((place,), worker_tasks.wait, (place,)) for place in places]
     with open_workers(2) as workers:
-        print(sorted(str(outcome.value) for outcome in run_tasks(tasks, workers)))
-        if options.wait:
+        print(len(list(run_tasks(tasks, workers))), flush=True)
+        if "wait" in plan:
             print(*run_tasks(waits, workers))
 
 class Options:
-    verb, wait = staticmethod(work), WAIT
+    verb = staticmethod(work)
 
 cli.parse = lambda _: Options
 cli.script()
 """
 
 
-def command(kind: str, folder: Path, wait: bool) -> subprocess.Popen[str]:
+@contextmanager
+def command(kind: str, plan: str, folder: Path) -> Iterator[subprocess.Popen[str]]:
     """A command line of ours that has two workers, in a terminal session of its own."""
-    code = MAIN.replace("WAIT", str(wait))
-    arguments = [sys.executable, "-c", code, kind, str(folder), str(Path(__file__).parent)]
+    arguments = [sys.executable, "-c", MAIN, kind, plan, str(folder), str(Path(__file__).parent)]
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
-    return subprocess.Popen(arguments, text=True, start_new_session=True, **pipes)
+    with subprocess.Popen(arguments, text=True, start_new_session=True, **pipes) as process:
+        try:
+            yield process
+        finally:
+            with suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGKILL)
 
 
 @pytest.mark.parametrize("kind", ELSEWHERE)
 def test_nothing_but_ours_reaches_the_screen(kind: str, tmp_path: Path) -> None:
-    with command(kind, tmp_path, wait=False) as process:
+    with command(kind, "", tmp_path) as process:
         said = process.communicate(timeout=PATIENCE_S)
-    assert (process.returncode, *said) == (0, "['0', '1', 'None', 'None']\n", "")
+    assert (process.returncode, *said) == (0, "4\n", "")
 
 
 @pytest.mark.parametrize("kind", ELSEWHERE)
-@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGKILL], ids=["ctrl-c", "kill"])
-def test_workers_end_with_the_command(kind: str, how: int, tmp_path: Path) -> None:
-    with command(kind, tmp_path, wait=True) as process:
+def test_an_interrupt_ends_all(kind: str, tmp_path: Path) -> None:
+    with command(kind, "death, wait", tmp_path) as process:
         pids = [pid_in(tmp_path / f"{n}.pid") for n in range(2)]
-        # Ctrl-C of a terminal goes to the workers too.
-        os.killpg(process.pid, how) if how == signal.SIGINT else process.kill()
-        _, said = process.communicate(timeout=PATIENCE_S)
-    if how == signal.SIGINT:
-        expected = "densify: interrupted; nothing was kept of the unfinished result\n"
-        assert (process.returncode, said) == (130, expected)
-    until(lambda: all(map(is_gone, pids)))
+        os.killpg(process.pid, signal.SIGINT)  # as from a terminal: to the workers too
+        said = process.communicate(timeout=PATIENCE_S)
+    told = "densify: interrupted; nothing was kept of the unfinished result\n"
+    assert (process.returncode, *said) == (130, "5\n", told)
+    assert all(map(is_gone, pids))
+
+
+@pytest.mark.parametrize("kind", ELSEWHERE)
+def test_workers_end_with_a_killed_command(kind: str, tmp_path: Path) -> None:
+    with command(kind, "wait", tmp_path) as process:
+        pids = [pid_in(tmp_path / f"{n}.pid") for n in range(2)]
+        process.kill()
+        until(lambda: all(map(is_gone, pids)))

@@ -7,6 +7,7 @@ import logging
 import os
 import signal
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -41,6 +42,16 @@ def warn(text: str) -> None:
     raise ValueError(text)
 
 
+def warn_together(number: int) -> None:
+    """By two threads of this process, at the same time."""
+    _TOGETHER.wait(30)
+    logging.getLogger("densify").warning("%d", number)
+    _TOGETHER.wait(30)
+
+
+_TOGETHER = threading.Barrier(2)
+
+
 def note(folder: Path, name: str, needs: list[str]) -> list[str]:
     """Leaves a file when it is over; the names of those that should have left theirs before."""
     missing = [need for need in needs if not (folder / need).exists()]
@@ -69,9 +80,18 @@ def die() -> None:
     os.kill(os.getpid(), signal.SIGKILL)
 
 
+def fill_memory(num_bytes: int) -> None:
+    kept = bytearray(num_bytes)
+    kept[::4096] = b"x" * len(kept[::4096])
+    time.sleep(600)
+
+
 def threads() -> tuple[str, int, bool]:
-    """OPENBLAS_NUM_THREADS, numba's threads, whether numpy was there before the variable."""
-    heavy = "numba" in sys.modules or "torch" in sys.modules
+    """What OpenBLAS and numba are told, and whether any was loaded too early to hear it."""
+    # Dask's workers load numpy, with OpenBLAS, at once: the variable has to be there before.
+    started_with = Path("/proc/self/environ").read_bytes().split(b"\0")
+    told = f"OPENBLAS_NUM_THREADS={os.environ['OPENBLAS_NUM_THREADS']}".encode() in started_with
+    early = bool({"numba", "torch"} & set(sys.modules)) or ("numpy" in sys.modules and not told)
     import numba
 
-    return os.environ["OPENBLAS_NUM_THREADS"], numba.config.NUMBA_NUM_THREADS, heavy
+    return os.environ["OPENBLAS_NUM_THREADS"], numba.config.NUMBA_NUM_THREADS, early

@@ -1,0 +1,161 @@
+# SPDX-License-Identifier: MIT
+"""What a training set is worth: one small depth-completion network, trained from the same weights
+on maps accumulated rigidly (ICP) and on maps with scene flow, tested on the exact depth of another
+street.
+
+python examples/train_completion.py [--data SPEC] [--test SPEC] [--keys A:B:S] [--steps N]
+    [--out DIR]
+"""
+
+import argparse
+import copy
+import subprocess
+import sys
+from itertools import pairwise
+from pathlib import Path
+
+import torch
+from torch import nn
+from torch.nn.functional import avg_pool2d, interpolate
+from torch.utils.data import DataLoader
+
+import densify
+from densify.depth_metrics import depth_errors, mean_errors
+
+HEIGHT_PX, CROP_PX, FULL_PX = 256, (256, 480), (256, 1242)  # rows that the lidar reaches
+CAMERA = "image_02"
+
+
+def make_set(data, method, keys, out, window):
+    """Run again, `densify dataset` makes only what is not there yet."""
+    command = ["--data", data, "--method", method, "--keys", keys, "--window", str(window)]
+    command += ["--camera", CAMERA, "--layout", "kitti-depth", "--out", str(out)]
+    subprocess.run([sys.executable, "-m", "densify", "dataset", *command], check=True)
+    return out
+
+
+def interpolated(sparse_log):
+    """(N,1,H,W) log depth, 0 none -> the same without holes: each filled by the smallest square of
+    a pyramid that holds a return."""
+    weight = (sparse_log != 0).float()
+    levels = [(sparse_log, weight)]
+    while max(levels[-1][0].shape[2:]) > 1:
+        levels.append(tuple(avg_pool2d(x, 2, ceil_mode=True) for x in levels[-1]))
+    dense = 0.0 * levels[-1][0]
+    for value, weight in reversed(levels):
+        coarser = interpolate(dense, value.shape[2:], mode="bilinear")
+        dense = torch.where(weight > 0, value / weight.clamp(min=1e-9), coarser)
+    return dense
+
+
+def conv(inputs, outputs, stride=1):
+    return nn.Sequential(nn.Conv2d(inputs, outputs, 3, stride, 1), nn.LeakyReLU(0.1))
+
+
+class Completion(nn.Module):
+    """A small U-Net that corrects the interpolated depth of one sweep by what the image shows."""
+
+    def __init__(self, widths=(16, 24, 32, 32)):
+        super().__init__()
+        levels = list(pairwise((5, *widths)))
+        self.down = nn.ModuleList(conv(a, b, 2) for a, b in levels)
+        self.up = nn.ModuleList(conv(b + a, max(a, 12)) for a, b in levels)
+        self.last = nn.Conv2d(12, 1, 3, 1, 1)
+        nn.init.zeros_(self.last.weight)
+        nn.init.zeros_(self.last.bias)
+
+    def forward(self, image, sparse_m):
+        """(N,3,H,W), (N,1,H,W) -> (N,1,H,W) metres."""
+        sparse_log = torch.where(sparse_m > 0, sparse_m.clamp(min=1.0).log() + 1e-6, 0.0)
+        base = interpolated(sparse_log)
+        x = torch.cat([image - 0.5, base / 4, (sparse_m > 0).float()], 1)
+        skips = []
+        for down in self.down:
+            skips.append(x)
+            x = down(x)
+        for up, skip in zip(reversed(self.up), reversed(skips), strict=True):
+            x = up(torch.cat([interpolate(x, skip.shape[2:], mode="bilinear"), skip], 1))
+        return (base + self.last(x)).clamp(0, 5).exp()
+
+
+def trained(network, folder, steps, seed, filled):
+    """A copy of the network after some steps on the maps of a set."""
+    network = copy.deepcopy(network).train()
+    dataset = densify.DepthDataset(folder, filled=filled, crop=CROP_PX, flip=True, seed=seed)
+    order = torch.Generator().manual_seed(seed)
+    loader = DataLoader(dataset, 2, shuffle=True, drop_last=len(dataset) > 1, generator=order)
+    optimiser = torch.optim.Adam(network.parameters(), lr=3e-3)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, 3e-3, total_steps=steps)
+    step, epoch = 0, 0
+    while step < steps:
+        dataset.set_epoch(epoch)
+        for batch in loader:
+            if step == steps:
+                break
+            target_m = batch["dense_depth_m"]
+            off_m = network(batch["image"], batch["sparse_depth_m"]) - target_m
+            loss = off_m[target_m > 0].abs().mean()
+            optimiser.zero_grad()
+            loss.backward()
+            optimiser.step()
+            schedule.step()
+            step += 1
+        epoch += 1
+    return network.eval()
+
+
+@torch.no_grad()
+def errors(network, folder, truth):
+    """`densify.depth_metrics` of all, moving and static pixels, mean of the images."""
+    parts = {"all": [], "moving": [], "static": []}
+    for sample in densify.DepthDataset(folder, crop=FULL_PX):
+        where = sample["camera"], sample["frame"]
+        truth_m = truth.depth_m(*where)[-HEIGHT_PX:]
+        moving = truth.moving_mask(*where)[-HEIGHT_PX:]
+        depth_m = network(sample["image"][None], sample["sparse_depth_m"][None])[0, 0].numpy()
+        focal_px = float(sample["intrinsics"][0, 0])
+        for part, mask in (("all", None), ("moving", moving), ("static", ~moving)):
+            parts[part].append(depth_errors(depth_m, truth_m, mask, focal_px=focal_px))
+    return {part: mean_errors(images) for part, images in parts.items()}
+
+
+def row(name, scores):
+    cells = [
+        f"{e.mae_m:6.3f} {e.rmse_m:6.3f} {e.outliers:7.2%}" if e.num_compared else " " * 21
+        for e in scores.values()
+    ]
+    return f"{name:<14}" + "  ".join(f"{cell:>23}" for cell in cells)
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--data", default="street", help="a street to train on")
+    parser.add_argument("--test", default="street?seed=1", help="another one to test on")
+    parser.add_argument("--keys", default="10:150:5", help="to train on")
+    parser.add_argument("--test-keys", default="10:150:14")
+    parser.add_argument("--steps", type=int, default=300)
+    parser.add_argument("--seeds", type=int, default=1, help="how often, from other weights")
+    parser.add_argument("--filled", action="store_true", help="train on interpolated pixels too")
+    parser.add_argument("--out", type=Path, default=Path("completion"))
+    options = parser.parse_args()
+
+    sets = {
+        method: make_set(options.data, method, options.keys, options.out / method, 5)
+        for method in ("icp", "flow")
+    }
+    test = make_set(options.test, "icp", options.test_keys, options.out / "test", 1)
+    truth = densify.open_sequence(options.test).truth
+    print(f"{'':14}{'all':^23}  {'moving':^23}  {'static':^23}")
+    print(f"{'trained on':<14}" + "  ".join([f"{'MAE m  RMSE m outliers':>23}"] * 3))
+    for seed in range(options.seeds):
+        torch.manual_seed(seed)
+        network = Completion()
+        if seed == 0:
+            print(row("nothing", errors(network.eval(), test, truth)), flush=True)
+        for method, folder in sets.items():
+            after = trained(network, folder, options.steps, seed, options.filled)
+            print(row(f"{method} maps", errors(after, test, truth)), flush=True)
+
+
+if __name__ == "__main__":
+    main()
