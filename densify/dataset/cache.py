@@ -11,9 +11,11 @@ DENSIFY_CACHE_DIR; it can be deleted at any time.
 from __future__ import annotations
 
 import hashlib
+import logging
 import os
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import fields, is_dataclass
 from functools import cache
 from pathlib import Path
@@ -45,8 +47,7 @@ class Cache:
 
         inputs: everything that the outcome depends on beside the package's own code; see `digest`.
         """
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of entries that cannot be kept or read
+        with _silent_joblib():
             made: T = self._made(stage, digest((code(), inputs)), make)
         return made
 
@@ -60,6 +61,20 @@ def digest(value: Any) -> str:
     state = hashlib.blake2b(digest_size=20)
     _feed(state, value)
     return state.hexdigest()
+
+
+@contextmanager
+def _silent_joblib() -> Iterator[None]:
+    """It warns, in two ways, of entries that cannot be kept or read."""
+    log = logging.getLogger("joblib")
+    before = log.level
+    log.setLevel(logging.CRITICAL)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    finally:
+        log.setLevel(before)
 
 
 def _feed(state: Any, value: Any) -> None:

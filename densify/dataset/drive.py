@@ -115,20 +115,21 @@ class Drive:
         return next(p for p in self._pieces(block, self._margin) if key in p.frames)
 
     def _registration(self, block: int) -> Registration:
-        first, end = block * BLOCK - self._settings.register.num_lead_in, (block + 1) * BLOCK
-        frames = [f for f in range(first, end) if f in self._frames]
-        bad, digests = {}, {}
-        for frame in frames:
+        # Without a sweep before it a block could not be joined to the one before.
+        num_before = max(1, self._settings.register.num_lead_in)
+        first, end = block * BLOCK - num_before, (block + 1) * BLOCK
+        given = self._settings.register.source == "dataset"
+        bad, known = {}, {}
+        for frame in (f for f in range(first, end) if f in self._frames):
             try:
-                digests[frame] = self._digest(frame)
+                pose = self._sequence.T_world_lidar(frame) if given else None
+                known[frame] = (self._digest(frame), pose)
             except InputError as error:
                 bad[frame] = str(error)
-        inputs = [self._settings.register, bad, digests]
-        if self._settings.register.source == "dataset":
-            inputs.append([self._sequence.T_world_lidar(f) for f in digests])
+        inputs = [self._settings.register, bad, known]
 
         def register() -> Registration:
-            return self._register(list(digests), bad)
+            return self._register(list(known), bad)
 
         return self._cache.get("registration", inputs, register)
 

@@ -7,14 +7,22 @@ import logging
 import shutil
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from densify.config import as_mapping
 from densify.dataset.drive import BLOCK, margin
 from densify.dataset.manifest import Key, KeyRecord, Manifest, finished, read_manifests
-from densify.dataset.plan import PlannedDrive, Recipe, plan, planned_keys, read_plan, write_plan
+from densify.dataset.plan import (
+    PlannedDrive,
+    Recipe,
+    check_place,
+    plan,
+    planned_keys,
+    read_plan,
+    write_plan,
+)
 from densify.dataset.tasks import Outcome, run_tasks
 from densify.dataset.work import Job, tasks
 from densify.dataset.workers import open_workers
@@ -98,6 +106,7 @@ def make_dataset(
     """
     recipe = recipe or Recipe()
     drives = plan(data, keys, recipe)
+    check_place(out)
     with Manifest(out, shard) as manifest:
         write_plan(out, recipe, drives)
         with _log_file(out, shard):
@@ -219,8 +228,7 @@ def _num_processes(
     """As many as wanted, or fewer that fit into the memory."""
     if memory_bytes is None or not drives:
         return num_workers
-    sequence = open_sequence(drives[0].source.data)
-    num_points = len(sequence[drives[0].keys[0]])
+    num_points = _num_points(drives)
     num_shared = BLOCK + 2 * margin(recipe.window)
     shared = num_shared * _SHARED_BYTES_PER_POINT * num_points
     key = (2 * recipe.window + 1) * _KEY_BYTES_PER_POINT * num_points
@@ -234,6 +242,16 @@ def _num_processes(
     if num_fitting < num_workers:
         _log.warning("%d workers instead of %d fit into the memory", num_fitting, num_workers)
     return min(num_workers, num_fitting)
+
+
+def _num_points(drives: Sequence[PlannedDrive]) -> int:
+    """Of the first sweep that can be read."""
+    for drive in drives:
+        sequence = open_sequence(drive.source.data)
+        for key in drive.keys:
+            with suppress(InputError):
+                return len(sequence[key])
+    return 0
 
 
 def _announce(

@@ -132,17 +132,20 @@ def _keys(sequence: LidarSequence, keys: slice | None, spec: str) -> tuple[int, 
     return chosen
 
 
+def check_place(out: Path) -> None:
+    """Raise InputError if anything but a set, or the beginnings of one, is there."""
+    if read_plan(out) is None and out.is_dir() and any(not _begun(p.name) for p in out.iterdir()):
+        raise InputError(f"--out {out}: not empty, and no dataset.json in it; choose another")
+
+
 def write_plan(out: Path, recipe: Recipe, drives: Sequence[PlannedDrive]) -> None:
     """Begin a set, or widen one made the same way.
 
-    Raises InputError if another set, or anything else, is there.
+    Raises InputError if another set is there.
     """
     table = _table(recipe, drives)
     before = read_plan(out)
-    if before is None:
-        if out.is_dir() and any(not _begun(p.name) for p in out.iterdir()):
-            raise InputError(f"--out {out}: not empty, and no dataset.json in it; choose another")
-    else:
+    if before is not None:
         _check_same(out, before, table)
         table["drives"] = _united(out, before["drives"], table["drives"])
     text = json.dumps(table, indent=1) + "\n"

@@ -36,13 +36,15 @@ _log = logging.getLogger("densify")
 @dataclass(frozen=True)
 class Job:
     """What every task of a recording has to know. cache_bytes: bound of the cache. code: of the
-    densify that gave it out."""
+    densify that gave it out. run: another one each time, for files change from run to run and
+    processes live on."""
 
     source: Source
     recipe: Recipe
     out: Path
     cache_bytes: int
     code: str
+    run: str
 
 
 def tasks(job: Job, keys: Sequence[int]) -> Iterator[Task]:
@@ -105,7 +107,7 @@ def make_key(job: Job, key: int) -> KeyRecord:
 def _made(job: Job, key: int) -> KeyRecord:
     recipe = job.recipe
     drive, _ = _opened(job)
-    sequence = _sequence(job.source.data)
+    sequence = _sequence(job.source.data, job.run)
     if key not in sequence.frames:
         raise InputError(f"{sequence.name} has no sweep for frame {key}")
     stretch = drive.window(key)
@@ -155,7 +157,7 @@ def _follows(recipe: Recipe) -> bool:
 
 
 @lru_cache(maxsize=2)
-def _sequence(data: str) -> LidarSequence:
+def _sequence(data: str, run: str) -> LidarSequence:
     return open_sequence(data)
 
 
@@ -167,5 +169,5 @@ def _opened(job: Job) -> tuple[Drive, Cache]:
             f"work; install the same on both"
         )
     cache = Cache(job.cache_bytes)
-    drive = Drive(_sequence(job.source.data), job.recipe.config, job.recipe.window, cache)
+    drive = Drive(_sequence(job.source.data, job.run), job.recipe.config, job.recipe.window, cache)
     return drive, cache
