@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from densify.config import as_mapping
+from densify.dataset.cache import code
 from densify.dataset.drive import BLOCK, margin
 from densify.dataset.manifest import Key, KeyRecord, Manifest, finished, read_manifests
 from densify.dataset.plan import (
@@ -122,7 +123,7 @@ def make_dataset(
                 task
                 for drive in left
                 for task in tasks(
-                    Job(drive.source, recipe, out.absolute(), cache_bytes), drive.keys
+                    Job(drive.source, recipe, out.absolute(), cache_bytes, code()), drive.keys
                 )
             ]
             try:
