@@ -22,12 +22,13 @@ from tests.scenes import CAMERA, Arc, Scanner, Scene, TinySequence, World, car, 
 
 BORDER = 2 * BLOCK
 FRAMES = range(BORDER - 4, BORDER + 5)
+COARSE = Scanner(24, 360)
 DRIVE = "2011_09_26_drive_0013_sync"
 """One of KITTI's for validation."""
 
 
 def across_border(
-    frames: Sequence[int] = FRAMES, scanner: Scanner = Scanner(24, 360), movers: bool = True
+    frames: Sequence[int] = FRAMES, scanner: Scanner = COARSE, movers: bool = True
 ) -> TinySequence:
     """At the first frame of a block the vehicle is at the start of a street, at 4 m/s, behind a car
     at 8 m/s and with one coming towards it at 7 m/s."""
@@ -63,7 +64,7 @@ def write_drive(sequence: TinySequence, date: Path, drive: str = DRIVE) -> Path:
 
 
 def write_pose(sequence: TinySequence, drive: Path, frame: int) -> None:
-    """Of a vehicle that drives straight on to the east, at the equator, where a degree is largest."""
+    """Of a vehicle that drives straight on to the east, at the equator."""
     T = sequence.T_world_lidar(frame)
     assert np.allclose(T[:3, :3], np.eye(3))
     lat, lon = np.rad2deg(T[1, 3] / 6_378_137), np.rad2deg(T[0, 3] / 6_378_137)

@@ -25,7 +25,7 @@ from densify.stages.deskew import deskew
 from densify.types import Stretch, Sweep
 from tests.dataset_scenes import BORDER, across_border
 from tests.scenes import SWEEP_S, Arc, Scanner, Scene, TinySequence, World, car, street
-from tests.small_street import POSES_GIVEN, one_car
+from tests.small_street import POSES_GIVEN
 
 LIMIT = 10**9
 GIVEN = resolve(POSES_GIVEN)
@@ -75,12 +75,14 @@ class FromItsStart(TinySequence):
         return poses.inverse(start) @ super().T_world_lidar(frame)
 
 
-@pytest.mark.parametrize("source", ["dataset", "kiss-icp"])
-def test_a_recording_within_the_window_is_what_run_makes(source: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("source", "num_sweeps"), [("dataset", 5), ("kiss-icp", 3)])
+def test_a_recording_within_the_window_is_what_run_makes(
+    source: str, num_sweeps: int, long_street, tmp_path: Path
+) -> None:
     config = resolve({"register": {"source": source}})
-    sequence = FromItsStart(one_car().scene, range(5), with_truth=False)
+    sequence = FromItsStart(long_street.scene, range(num_sweeps), with_truth=False)
     drive = drive_of(sequence, tmp_path, 4, config)
-    for key in (1, 4):
+    for key in (1, num_sweeps - 1):
         alone = pipeline.run(sequence, key, 4, config=config)
         here = maps_of(drive, sequence, key, config)
         assert here.frames == alone.frames
@@ -115,7 +117,7 @@ def test_more_sweeps_around_make_it_no_worse(small_blocks, long_street, tmp_path
 
 def test_keys_do_not_depend_on_others(small_blocks, long_street, tmp_path: Path) -> None:
     """Nor on their order, nor on what is in memory or on disk already."""
-    keys = [4, 5, 6, 7, 12]
+    keys = [4, 5, 6]
     upward, downward = drive_of(long_street, tmp_path / "a"), drive_of(long_street, tmp_path / "b")
     first = {key: maps_of(upward, long_street, key).depth for key in keys}
     for key in reversed(keys):
@@ -228,7 +230,7 @@ def test_a_gap_ends_windows_and_begins_a_world(tmp_path: Path) -> None:
 
 
 class Damaged(TinySequence):
-    """unreadable, posed: frames whose sweep, whose pose cannot be read. garbage: frames of noise."""
+    """unreadable: frames whose sweep cannot be read; posed: whose pose; garbage: of noise."""
 
     def __init__(self, sequence, unreadable=(), posed=(), garbage=()) -> None:
         super().__init__(sequence.scene, sequence.frames)
@@ -317,7 +319,7 @@ def test_other_settings_and_other_sweeps_make_anew(counted: Counter[str], tmp_pa
     use(sequence, tmp_path, resolve({**POSES_GIVEN, "ground": {"cell_m": 0.8}}))
     assert counted == {n: 2 for n in ("ground", "find_candidates", "follow_candidates")}
     counted.clear()
-    use(sequence, tmp_path, resolve({"register": {"source": "dataset", "min_range_m": 3.5}}))
+    use(sequence, tmp_path, resolve({"register": {"source": "dataset", "max_range_m": 40}}))
     assert counted == {**ONCE, "images": len(sequence.frames)}
     counted.clear()
     whole = Damaged(sequence)

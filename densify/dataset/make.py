@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
+from uuid import uuid4
 
 from densify.config import as_mapping
 from densify.dataset.cache import code
@@ -119,11 +120,12 @@ def make_dataset(
             left = done.left(drives)
             num_processes = _num_processes(num_workers, memory_bytes, recipe, drives)
             _announce(out, recipe, left, done.summary().num_keys, num_processes)
+            run = uuid4().hex
             todo = [
                 task
                 for drive in left
                 for task in tasks(
-                    Job(drive.source, recipe, out.absolute(), cache_bytes, code()), drive.keys
+                    Job(drive.source, recipe, out.absolute(), cache_bytes, code(), run), drive.keys
                 )
             ]
             try:
