@@ -9,6 +9,9 @@ from pathlib import Path
 
 import pytest
 
+from tests.command import exit_code
+from tests.dataset_scenes import OPTIONS, across_border, write_drive
+
 
 @pytest.fixture(scope="session", autouse=True)
 def own_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
@@ -17,6 +20,28 @@ def own_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
         if "DENSIFY_CACHE_DIR" not in os.environ:
             patch.setenv("DENSIFY_CACHE_DIR", str(tmp_path_factory.mktemp("cache")))
         yield Path(os.environ["DENSIFY_CACHE_DIR"])
+
+
+@pytest.fixture(scope="session")
+def border_drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Nine sweeps around the border of two blocks, as a KITTI raw drive."""
+    return write_drive(across_border(), tmp_path_factory.mktemp("raw") / "2011_09_26")
+
+
+@pytest.fixture(scope="session")
+def border_set(border_drive: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The training set of it, made undisturbed by one process."""
+    out = tmp_path_factory.mktemp("sets") / "whole"
+    assert exit_code("dataset", "--data", border_drive, *OPTIONS, "--out", out) == 0
+    return out
+
+
+@pytest.fixture
+def empty_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """For one test."""
+    cache = tmp_path / "cache"
+    monkeypatch.setenv("DENSIFY_CACHE_DIR", str(cache))
+    return cache
 
 
 @pytest.fixture(scope="session")

@@ -17,6 +17,7 @@ import numpy as np
 
 import densify
 from densify.dataset.drive import BLOCK
+from densify.dataset.manifest import damaged_files, read_manifests
 from tests.command import files_in
 from tests.scenes import CAMERA, Arc, Scanner, Scene, TinySequence, World, car, stamp_ns, street
 
@@ -118,6 +119,29 @@ def statuses(out: Path) -> dict[int, str]:
 
 def keys_of(names: Iterable[str]) -> set[int]:
     return {int(Path(name).stem) for name in names}
+
+
+def in_order(out: Path) -> None:
+    """Nothing is left over, every file is as recorded, and no file is not."""
+    names = files_in(out)
+    assert not [n for n in names if n.endswith((".tmp", ".old"))]
+    assert {n for n in names if n.startswith(".")} <= {".manifest.lock"} | {
+        n for n in names if n.startswith(".manifest-")
+    }
+    found = read_manifests(out)
+    recorded = set()
+    for record in found.values():
+        assert damaged_files(record, out) == []
+        recorded |= set(record.files)
+    assert set(maps_in(out)) == recorded
+    lines = [(r["drive"], r["key"]) for r in records(out)]
+    assert len(lines) == len(set(lines)) == len(found)
+
+
+def story(out: Path) -> list[dict]:
+    """The manifests without the seconds."""
+    said = sorted(records(out), key=lambda r: (r["drive"], r["key"]))
+    return [{k: v for k, v in r.items() if k != "seconds"} for r in said]
 
 
 def copy_drive(drive: Path, to: Path) -> Path:

@@ -1,0 +1,179 @@
+# SPDX-License-Identifier: MIT
+"""`densify dataset` from end to end: the same set however it is made."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import sys
+from pathlib import Path
+
+import pytest
+
+from densify.dataset import make
+from densify.dataset.loader import DepthDataset
+from tests.command import exit_code, files_in
+from tests.dataset_scenes import (
+    DRIVE,
+    FRAMES,
+    OPTIONS,
+    across_border,
+    keys_of,
+    maps_in,
+    records,
+    write_drive,
+)
+
+PATIENCE_S = 120
+CAMERA = "image_02"
+
+
+# The same set
+
+
+def test_a_set_is_what_it_says(border_set: Path) -> None:
+    in_order(border_set)
+    assert keys_of(maps_in(border_set)) == set(FRAMES)
+    products = {Path(name).parts[:5] for name in maps_in(border_set)}
+    kinds = ("velodyne_raw", "groundtruth", "groundtruth_filled", "confidence")
+    assert products == {("val", DRIVE, "proj_depth", kind, CAMERA) for kind in kinds}
+    for record in records(border_set):
+        near = [f for f in FRAMES if abs(f - record["key"]) <= 2]
+        assert (record["status"], record["frames"]) == ("done", near)
+        assert len(record["files"]) == 4
+        assert record["scores"]["ghost"] < 0.01
+        assert record["scores"]["num_moving"] > 100
+    assert {p.name for p in border_set.iterdir()} == {
+        *("val", "dataset.json", "manifest.jsonl", ".manifest.lock", "densify.log", "README.txt")
+    }
+
+
+@pytest.mark.parametrize(
+    "how",
+    [
+        ["--keys", "38:41"],
+        ["--keys", "36:45:4"],
+        ["--keys", "41:42", "--cache-size", "1K"],
+    ],
+    ids=" ".join,
+)
+def test_keys_do_not_depend_on_which_are_asked_for(
+    how: list[str], border_drive: Path, border_set: Path, empty_cache: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    assert exit_code("dataset", "--data", border_drive, *OPTIONS, *how, "--out", out) == 0
+    in_order(out)
+    asked = keys_of(maps_in(out))
+    assert asked == set(range(*map(int, how[1].split(":"))))
+    assert maps_in(out) == {n: d for n, d in maps_in(border_set).items() if keys_of([n]) <= asked}
+
+
+@pytest.mark.parametrize("kind", ["pool", "dask"])
+def test_two_workers_make_what_one_makes(
+    kind: str,
+    border_drive: Path,
+    border_set: Path,
+    empty_cache: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    if kind == "pool":
+        monkeypatch.setitem(sys.modules, "distributed", None)
+    else:
+        pytest.importorskip("distributed")
+    out = tmp_path / "out"
+    assert exit_code("dataset", "--data", border_drive, *OPTIONS, "--workers", 2, "--out", out) == 0
+    in_order(out)
+    assert maps_in(out) == maps_in(border_set)
+    assert story(out) == story(border_set)
+
+
+def test_shards_make_what_one_makes(border_drive: Path, border_set: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    made = []
+    for shard in ("1/3", "2/3", "3/3"):
+        arguments = ["--data", border_drive, *OPTIONS, "--shard", shard, "--out", out]
+        assert exit_code("dataset", *arguments) == 0
+        made.append(keys_of(maps_in(out)))
+    assert made[0] <= made[1] <= made[2] == set(FRAMES)
+    in_order(out)
+    assert maps_in(out) == maps_in(border_set)
+    assert story(out) == story(border_set)
+    assert (out / "dataset.json").read_bytes() == (border_set / "dataset.json").read_bytes()
+    # Who goes on without shards keeps all that.
+    before = {path: path.stat().st_mtime_ns for path in out.rglob("*.png")}
+    assert exit_code("dataset", "--data", border_drive, *OPTIONS, "--out", out) == 0
+    assert {path: path.stat().st_mtime_ns for path in out.rglob("*.png")} == before
+
+
+def test_another_run_makes_nothing_again(
+    border_drive: Path, border_set: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(make, "open_workers", None)
+    before = {p: p.stat().st_mtime_ns for p in border_set.rglob("*") if p.name != "densify.log"}
+    assert exit_code("dataset", "--data", border_drive, *OPTIONS, "--out", border_set) == 0
+    after = {p: p.stat().st_mtime_ns for p in border_set.rglob("*") if p.name != "densify.log"}
+    assert {p: t for p, t in after.items() if before[p] != t}.keys() <= {
+        border_set,
+        border_set / "README.txt",
+        border_set / ".manifest.lock",
+    }
+
+
+def test_a_damaged_set_is_made_whole(border_drive: Path, border_set: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    shutil.copytree(border_set, out)
+    maps = out / "val" / DRIVE / "proj_depth"
+    (maps / "confidence" / CAMERA / "0000000038.png").unlink()
+    path = maps / "groundtruth" / CAMERA / "0000000042.png"
+    path.write_bytes(path.read_bytes()[:-1])
+    manifest = out / "manifest.jsonl"
+    lines = manifest.read_bytes().splitlines(keepends=True)
+    lines[5] = lines[5][:40] + b"\n"
+    manifest.write_bytes(b"".join(lines[:-1]) + lines[-1][:50])
+    before = {p: p.stat().st_mtime_ns for p in out.rglob("*.png")}
+    assert exit_code("dataset", "--data", border_drive, *OPTIONS, "--out", out) == 0
+    in_order(out)
+    assert maps_in(out) == maps_in(border_set)
+    assert story(out) == story(border_set)
+    changed = {p for p in out.rglob("*.png") if p.stat().st_mtime_ns != before.get(p)}
+    assert keys_of(map(str, changed)) == {38, 41, 42, 44}
+
+
+# As `run`
+
+
+@pytest.mark.parametrize("source", ["dataset", "kiss-icp"])
+def test_the_densify_layout_is_what_run_writes(source: str, tmp_path: Path) -> None:
+    """In a recording within the window, to the last byte but for what the run has cost."""
+    short = write_drive(across_border(range(BORDER, BORDER + 4)), tmp_path / "2011_09_26")
+    method = "flow" if source == "dataset" else "icp"
+    given = ["--data", short, "--window", 4, "--method", method]
+    given += ["--set", f"register.source={source}"]
+    keys = ["--keys", f"{BORDER + 1}:{BORDER + 2}", "--layout", "densify"]
+    out, run = tmp_path / "set", tmp_path / "run"
+    assert exit_code("dataset", *given, *keys, "--out", out) == 0
+    assert exit_code("run", *given, "--key", BORDER + 1, "--out", run) == 0
+    (record,) = records(out)
+    made, alone = files_in(out / "000041"), files_in(run / "000041")
+    assert made.keys() == alone.keys() == {n.removeprefix("000041/") for n in record["files"]}
+    assert [name for name in made if made[name] != alone[name]] == ["run.yaml"]
+    with pytest.raises(InputError, match="layout") as error:
+        DepthDataset(out)
+    assert "\n" not in str(error.value)
+
+
+def test_the_tree_is_read_back(
+    border_set: Path, border_drive: Path, tmp_path: Path, capsys
+) -> None:
+    data = DepthDataset(border_set)
+    assert [sample["frame"] for sample in data] == list(FRAMES)
+    sample = data[3]
+    dense, sparse = sample["dense_depth_m"], sample["sparse_depth_m"]
+    assert (dense > 0).sum() > 2 * (sparse > 0).sum() > 1000
+    assert ((sample["confidence"] > 0) == (dense > 0)).all()
+    capsys.readouterr()
+    scores = tmp_path / "scores.json"
+    maps = border_set / "val" / DRIVE / "proj_depth"
+    assert exit_code("evaluate", maps / "groundtruth", border_set, "--out", scores) == 0
+    assert json.dumps(json.loads(scores.read_text())).count('"outliers": 0.0') > 0
