@@ -228,7 +228,7 @@ def _part(drives: Sequence[PlannedDrive], shard: tuple[int, int] | None) -> list
 def _num_processes(
     num_workers: int, memory_bytes: int | None, recipe: Recipe, drives: Sequence[PlannedDrive]
 ) -> int:
-    """As many as wanted, or fewer that fit into the memory."""
+    """As many as wanted, or fewer that fit into the memory; several are led by one more."""
     if memory_bytes is None or not drives:
         return num_workers
     num_points = _num_points(drives)
@@ -236,7 +236,7 @@ def _num_processes(
     shared = num_shared * _SHARED_BYTES_PER_POINT * num_points
     key = (2 * recipe.window + 1) * _KEY_BYTES_PER_POINT * num_points
     need = _BASE_BYTES + shared + key
-    num_fitting = int(memory_bytes / need)
+    num_fitting = max(int(memory_bytes >= need), int((memory_bytes - _BASE_BYTES) / need))
     if num_fitting < 1:
         raise InputError(
             f"--memory: got {memory_bytes / 1e9:.1f} GB, expected at least {need / 1e9:.1f} GB "
