@@ -12,15 +12,19 @@ import pytest
 
 from densify.dataset import make
 from densify.dataset.loader import DepthDataset
+from densify.errors import InputError
 from tests.command import exit_code, files_in
 from tests.dataset_scenes import (
+    BORDER,
     DRIVE,
     FRAMES,
     OPTIONS,
     across_border,
+    in_order,
     keys_of,
     maps_in,
     records,
+    story,
     write_drive,
 )
 
@@ -172,7 +176,6 @@ def test_the_tree_is_read_back(
     dense, sparse = sample["dense_depth_m"], sample["sparse_depth_m"]
     assert (dense > 0).sum() > 2 * (sparse > 0).sum() > 1000
     assert ((sample["confidence"] > 0) == (dense > 0)).all()
-    capsys.readouterr()
     scores = tmp_path / "scores.json"
     maps = border_set / "val" / DRIVE / "proj_depth"
     assert exit_code("evaluate", maps / "groundtruth", border_set, "--out", scores) == 0

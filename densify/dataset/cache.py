@@ -27,6 +27,7 @@ import platformdirs
 import densify
 
 T = TypeVar("T")
+_log = logging.getLogger("densify")
 
 
 class Cache:
@@ -37,8 +38,16 @@ class Cache:
         from joblib import Memory
 
         root = os.environ.get("DENSIFY_CACHE_DIR") or platformdirs.user_cache_dir("densify")
+        folder = folder or Path(root) / "dataset"
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            place: Path | None = folder
+        except OSError as error:
+            _log.warning("%s: %s; nothing is kept for later", folder, error.strerror or error)
+            place = None
         # Compressed entries carry a checksum: what a power failure left half-written is noticed.
-        self._memory = Memory(folder or Path(root) / "dataset", verbose=0, compress=1)
+        with _silent_joblib():
+            self._memory = Memory(place, verbose=0, compress=1)
         self._made = self._memory.cache(_made, ignore=["make"])
         self._limit_bytes = limit_bytes
 

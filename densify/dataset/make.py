@@ -290,12 +290,17 @@ def _line(record: KeyRecord, summary: Summary) -> str:
     )
 
 
+class _LogFile(logging.FileHandler):
+    def handleError(self, record: logging.LogRecord) -> None:
+        """A full disk is told of by those who write what counts."""
+
+
 @contextmanager
 def _log_file(out: Path, shard: tuple[int, int] | None) -> Iterator[None]:
     """What is logged goes to ``OUT/densify.log`` too, behind what earlier runs logged."""
     name = "densify.log" if shard is None else f"densify-{shard[0]}of{shard[1]}.log"
     try:
-        handler = logging.FileHandler(out / name, encoding="utf-8")
+        handler = _LogFile(out / name, encoding="utf-8")
     except OSError as error:
         raise OutputError(f"--out {out}: {name} cannot be written: {error.strerror}") from error
     handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
@@ -307,4 +312,5 @@ def _log_file(out: Path, shard: tuple[int, int] | None) -> Iterator[None]:
     finally:
         _log.removeHandler(handler)
         _log.setLevel(before)
-        handler.close()
+        with suppress(OSError):
+            handler.close()

@@ -180,7 +180,11 @@ class Manifest:
         error: BaseException | None,
         traceback: TracebackType | None,
     ) -> None:
-        self.close()
+        if error is None:
+            self.close()
+        else:  # what came before says more; the file goes on without the order
+            with suppress(OutputError):
+                self.close()
 
     def append(self, record: KeyRecord) -> None:
         """Add a key's record, or replace it. It is on the disk when this returns; where that fails

@@ -22,8 +22,8 @@ from typing import Any
 import densify
 from densify.config import Config, as_mapping
 from densify.dataset.gate import Gate
-from densify.errors import InputError
-from densify.output.atomic import write_file
+from densify.errors import InputError, OutputError
+from densify.output.atomic import make_folder, write_file
 from densify.output.kitti_tree import drive_folder, split_of
 from densify.readers import open_sequence
 from densify.readers.files import format_frames
@@ -141,17 +141,22 @@ def check_place(out: Path) -> None:
 def write_plan(out: Path, recipe: Recipe, drives: Sequence[PlannedDrive]) -> None:
     """Begin a set, or widen one made the same way.
 
-    Raises InputError if another set is there.
+    Raises InputError if another set is there, OutputError if it cannot be written.
     """
     table = _table(recipe, drives)
     before = read_plan(out)
     if before is not None:
         _check_same(out, before, table)
         table["drives"] = _united(out, before["drives"], table["drives"])
-    text = json.dumps(table, indent=1) + "\n"
-    out.mkdir(parents=True, exist_ok=True)
     if before is None or table != before:
-        write_file(out / _FILE, text.encode(), durable=True)
+        text = json.dumps(table, indent=1) + "\n"
+        try:
+            make_folder(out)
+            write_file(out / _FILE, text.encode(), durable=True)
+        except OSError as error:
+            raise OutputError(
+                f"--out {out}: {_FILE} cannot be written: {error.strerror or error}"
+            ) from error
 
 
 def read_plan(out: Path) -> dict[str, Any] | None:
