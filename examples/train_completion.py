@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""What a training set is worth: one small depth-completion network, trained from the same weights on
-maps accumulated rigidly (ICP) and on maps with scene flow, tested on the exact depth of another street.
+"""What a training set is worth: one small network that completes the depth of a single sweep,
+trained from the same weights on maps accumulated rigidly (ICP) and on maps with scene flow, tested
+on the exact depth of another street.
 
-python examples/train_completion.py [--data SPEC] [--test SPEC] [--keys A:B:S] [--steps N] [--out DIR]
+python examples/train_completion.py [--data SPEC] [--test SPEC] [--keys A:B:S] [--steps N] ...
 """
 
 import argparse
@@ -20,7 +21,7 @@ from torch.utils.data import DataLoader
 import densify
 from densify.depth_metrics import depth_errors, mean_errors
 
-HEIGHT_PX, CROP_PX, FULL_PX = 256, (256, 480), (256, 1242)  # rows that the lidar reaches
+HEIGHT_PX, CROP_PX, FULL_PX = 256, (256, 384), (256, 1242)  # rows that the lidar reaches
 CAMERA = "image_02"
 
 
