@@ -48,7 +48,9 @@ def interpolated(sparse_log):
 
 
 def conv(inputs, outputs, stride=1):
-    return nn.Sequential(nn.Conv2d(inputs, outputs, 3, stride, 1), nn.LeakyReLU(0.1))
+    layer = nn.Conv2d(inputs, outputs, 3, stride, 1)
+    nn.init.kaiming_normal_(layer.weight, 0.1)
+    return nn.Sequential(layer, nn.LeakyReLU(0.1))
 
 
 class Completion(nn.Module):
@@ -132,6 +134,7 @@ def main():
     parser.add_argument("--test", default="street?seed=1", help="another one to test on")
     parser.add_argument("--keys", default="10:150:5", help="to train on")
     parser.add_argument("--test-keys", default="10:150:14")
+    parser.add_argument("--window", type=int, default=5, help="sweeps on each side of a key")
     parser.add_argument("--steps", type=int, default=300)
     parser.add_argument("--seeds", type=int, default=1, help="how often, from other weights")
     parser.add_argument("--filled", action="store_true", help="train on interpolated pixels too")
@@ -139,7 +142,7 @@ def main():
     options = parser.parse_args()
 
     sets = {
-        method: make_set(options.data, method, options.keys, options.out / method, 5)
+        method: make_set(options.data, method, options.keys, options.out / method, options.window)
         for method in ("icp", "flow")
     }
     test = make_set(options.test, "icp", options.test_keys, options.out / "test", 1)
@@ -153,7 +156,7 @@ def main():
             print(row("nothing", errors(network.eval(), test, truth)), flush=True)
         for method, folder in sets.items():
             after = trained(network, folder, options.steps, seed, options.filled)
-            print(row(f"{method} maps", errors(after, test, truth)), flush=True)
+            print(row(f"{method}, seed {seed}", errors(after, test, truth)), flush=True)
 
 
 if __name__ == "__main__":
