@@ -17,7 +17,10 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from densify.config import Config as Config
+    from densify.dataset.gate import Gate as Gate
     from densify.dataset.loader import DepthDataset as DepthDataset
+    from densify.dataset.make import make_dataset as make_dataset
+    from densify.dataset.plan import Recipe as Recipe
     from densify.errors import ComputationError as ComputationError
     from densify.errors import InputError as InputError
     from densify.flow.pair import estimate_flow as estimate_flow
@@ -39,6 +42,9 @@ _HOME = {
     "run": "densify.pipeline",
     "compare": "densify.pipeline",
     "estimate_flow": "densify.flow.pair",
+    "make_dataset": "densify.dataset.make",
+    "Recipe": "densify.dataset.plan",
+    "Gate": "densify.dataset.gate",
     "Config": "densify.config",
     "InputError": "densify.errors",
     "ComputationError": "densify.errors",

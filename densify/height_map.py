@@ -3,12 +3,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
 from scipy import ndimage
 
 from densify.config import GroundSettings
+from densify.kernels.heights import add_near, two_lowest
 from densify.types import Float, Float32
 
 _LOW_OUTLIER_M = 0.4
@@ -25,25 +27,20 @@ class HeightMap:
     cell_m: float
 
     @staticmethod
-    def of(points: Float, settings: GroundSettings) -> HeightMap:
-        """(N,3) cloud, z up, at least one point.
+    def of(clouds: Iterable[Float], settings: GroundSettings) -> HeightMap:
+        """clouds: (N,3) each, z up, at least one point in all. They are walked three times and not
+        kept: what makes each of them anew needs the memory of one.
 
         A cell's ground is its second lowest point (the lowest may be a stray reflection), repaired
         where it lies below the median of its neighbours, then bounded by the steepest slope from
         every other cell, which cuts cars and walls away. What lies on that lower hull is averaged.
         """
         cell_m = settings.cell_m
-        low = np.floor(points[:, :2].min(0) / cell_m) * cell_m
-        index = ((points[:, :2] - low) / cell_m).astype(np.int64)
-        shape = tuple(index.max(0) + 1)
-        cell = np.ravel_multi_index(tuple(index.T), shape)
-        z = points[:, 2]
-        lowest = np.full(shape[0] * shape[1], np.inf)
-        np.minimum.at(lowest, cell, z)
-        above = z > lowest[cell]
-        second = np.full_like(lowest, np.inf)
-        np.minimum.at(second, cell[above], z[above])
-        heights = np.where(np.isfinite(second), second, lowest).reshape(shape)
+        low, shape = _grid(clouds, cell_m)
+        lowest, second = np.full((2, *shape), np.inf)
+        for points in clouds:
+            two_lowest(points, low, cell_m, lowest, second)
+        heights = np.where(np.isfinite(second), second, lowest)
 
         known = np.isfinite(heights)
         nearest = ndimage.distance_transform_edt(
@@ -53,7 +50,7 @@ class HeightMap:
         heights = np.where(known & (heights < around - _LOW_OUTLIER_M), around, heights)
         heights = _slope_limited(heights, settings.max_slope * cell_m)
         hull = HeightMap(heights[tuple(nearest)], low, cell_m)
-        return HeightMap(_averaged(hull, points, cell), low, cell_m)
+        return HeightMap(_averaged(hull, clouds), low, cell_m)
 
     def under(self, points: Float) -> Float:
         """(N,2) or (N,3) -> (N,) ground height there; beyond the map as at its nearest edge."""
@@ -67,14 +64,26 @@ class HeightMap:
         return height_m
 
 
-def _averaged(hull: HeightMap, points: Float, cell: np.ndarray) -> Float:
+def _grid(clouds: Iterable[Float], cell_m: float) -> tuple[Float, tuple[int, int]]:
+    """(2,) lower corner, on a multiple of the cell, and how many cells cover all points."""
+    low, high = np.full(2, np.inf), np.full(2, -np.inf)
+    for points in clouds:
+        if len(points):
+            low = np.minimum(low, points[:, :2].min(0))
+            high = np.maximum(high, points[:, :2].max(0))
+    low = np.floor(low / cell_m) * cell_m
+    num_x, num_y = ((high - low) / cell_m).astype(np.int64) + 1
+    return low, (int(num_x), int(num_y))
+
+
+def _averaged(hull: HeightMap, clouds: Iterable[Float]) -> Float:
     """Mean of what lies on the hull, about each cell; the second lowest of many is lower than the
     second lowest of few, and an object that drives from one to the other must not climb."""
-    over = points[:, 2] - hull.under(points)
-    on = np.abs(over) < _GROUND_M
-    shape = hull.heights_m.shape
-    number = np.bincount(cell[on], minlength=hull.heights_m.size).reshape(shape)
-    total = np.bincount(cell[on], over[on], hull.heights_m.size).reshape(shape)
+    number = np.zeros(hull.heights_m.shape, np.int64)
+    total = np.zeros(hull.heights_m.shape)
+    for points in clouds:
+        over_m = points[:, 2] - hull.under(points)
+        add_near(points, over_m, _GROUND_M, hull.low_m, hull.cell_m, number, total)
     number = ndimage.uniform_filter(number.astype(float), 3, mode="constant") * 9
     total = ndimage.uniform_filter(total, 3, mode="constant") * 9
     mean: Float = hull.heights_m + np.where(number >= _FEW, total / np.maximum(number, 1), 0.0)

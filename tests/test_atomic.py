@@ -249,18 +249,19 @@ def test_a_replaced_folder_that_is_still_there_goes(tmp_path: Path) -> None:
 
 
 def test_what_living_processes_and_other_machines_have_aside_stays(tmp_path: Path) -> None:
-    process = in_subprocess(IN_A_FILE, tmp_path / "theirs.png")
-    assert process.stdout is not None
-    with process:
-        assert process.stdout.readline() == "ready\n"
-        mine = atomic._aside(tmp_path / "mine.png", "tmp")
-        mine.write_text("under way")
-        elsewhere = mine.with_name(mine.name.replace(atomic._machine(), "elsewhere-4026531836"))
-        elsewhere.write_text("under way")
-        before = everything_in(tmp_path)
-        assert clear_leftovers(tmp_path) == []
-        assert everything_in(tmp_path) == before and len(before) == 3
-        process.kill()
+    mine = atomic._aside(tmp_path / "mine.png", "tmp")
+    mine.write_text("under way")
+    here = f"{atomic._machine()}.{atomic._process(os.getpid())}"
+    for machine in ("elsewhere-4026531836", atomic._machine() + "1"):  # no such process here
+        mine.with_name(mine.name.replace(here, f"{machine}.999999999-1")).write_text("under way")
+    with in_subprocess(IN_A_FILE, tmp_path / "theirs.png") as process:
+        try:
+            assert process.stdout is not None and process.stdout.readline() == "ready\n"
+            before = everything_in(tmp_path)
+            assert clear_leftovers(tmp_path) == []
+            assert everything_in(tmp_path) == before and len(before) == 4
+        finally:
+            process.kill()
 
 
 def test_a_process_number_that_came_again_is_another_process(tmp_path: Path) -> None:

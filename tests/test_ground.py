@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy import ndimage
 
 from densify import height_map, poses
 from densify.config import FlowSettings, GroundSettings
@@ -148,7 +149,7 @@ def test_under_follows_a_plane_and_stays_at_the_edge_beyond_it():
     rng = np.random.default_rng(0)
     points = rng.uniform(-20, 20, (40000, 3))
     points[:, 2] = 2 + 0.1 * points[:, 0] - 0.05 * points[:, 1]
-    heights = HeightMap.of(points, SETTINGS)
+    heights = HeightMap.of([points], SETTINGS)
     inside = rng.uniform(-18, 18, (500, 2))
     plane_m = 2 + 0.1 * inside[:, 0] - 0.05 * inside[:, 1]
     off_m = np.abs(heights.under(inside) - plane_m)
@@ -165,7 +166,7 @@ def test_many_and_few_returns_find_the_same_ground():
     many = xy[:, 0] < 0
     kept = many | (rng.random(len(xy)) < 0.04)  # 100 returns in a cell, or 4
     points = np.column_stack([xy, rng.normal(0, 0.03, len(xy))])[kept]
-    heights = HeightMap.of(points, SETTINGS)
+    heights = HeightMap.of([points], SETTINGS)
     x, y = np.meshgrid(np.arange(-13, 13.5, 0.5), np.arange(-8, 8.5, 0.5), indexing="ij")
     found = heights.under(np.stack([x.ravel(), y.ravel()], 1)).reshape(x.shape)
     near_m, far_m = found[x[:, 0] < -1], found[x[:, 0] > 1]
@@ -181,3 +182,47 @@ def test_the_slope_limit_against_a_slow_twin():
     distance = steps[..., 1] - steps[..., 0] + np.sqrt(2) * steps[..., 0]  # straight and diagonal
     expected = (heights.ravel() + 0.15 * distance).min(1).reshape(heights.shape)
     np.testing.assert_allclose(height_map._slope_limited(heights, 0.15), expected, atol=1e-12)
+
+
+def slow_map(points: np.ndarray, settings: GroundSettings) -> np.ndarray:
+    """Two lowest and the mean, cell by cell, of one cloud; what is between them from the module."""
+    cell_m = settings.cell_m
+    low = np.floor(points[:, :2].min(0) / cell_m) * cell_m
+    index = ((points[:, :2] - low) / cell_m).astype(int)
+    heights = np.full(index.max(0) + 1, np.inf)
+    for x, y in np.unique(index, axis=0):
+        z = np.unique(points[(index == [x, y]).all(1), 2])
+        heights[x, y] = z[min(1, len(z) - 1)]
+    known = np.isfinite(heights)
+    nearest = ndimage.distance_transform_edt(~known, return_distances=False, return_indices=True)
+    around = ndimage.median_filter(heights[tuple(nearest)], 5)
+    heights = np.where(known & (heights < around - 0.4), around, heights)
+    heights = height_map._slope_limited(heights, settings.max_slope * cell_m)[tuple(nearest)]
+    over_m = points[:, 2] - HeightMap(heights, low, cell_m).under(points)
+    number, total_m = np.zeros((2, *heights.shape))
+    for (x, y), over in zip(index, over_m, strict=True):
+        if abs(over) < 0.15:
+            number[x, y] += 1
+            total_m[x, y] += over
+    number = ndimage.uniform_filter(number, 3, mode="constant") * 9
+    total_m = ndimage.uniform_filter(total_m, 3, mode="constant") * 9
+    return heights + np.where(number >= 3, total_m / np.maximum(number, 1), 0.0)
+
+
+@pytest.mark.parametrize("num_clouds", [1, 2, 7])
+def test_sweep_by_sweep_it_is_the_map_of_all_points_together(num_clouds: int) -> None:
+    rng = np.random.default_rng(num_clouds)
+    points = rng.uniform(-17, 13, (6000, 3)) * [1, 0.6, 0.05]
+    points[::3, 2] = 0.25  # the lowest more than once
+    points[::50, 2] -= 3.0
+    clouds = [*np.array_split(points, num_clouds), points[:0]]
+    found = HeightMap.of(clouds, SETTINGS)
+    np.testing.assert_array_equal(found.heights_m, slow_map(points, SETTINGS))
+
+
+def test_the_ground_of_a_stretch_is_that_of_its_sweeps_together() -> None:
+    stretch = Scene(World(street(), 0.03), Arc(0, -1.5), Scanner(sigma_m=0.01)).stretch(2, 1)
+    together = np.concatenate([in_world(stretch, f) for f in stretch.frames])
+    found, expected = ground(stretch, SETTINGS), HeightMap.of([together], SETTINGS)
+    np.testing.assert_array_equal(found.heights_m, expected.heights_m)
+    np.testing.assert_array_equal(found.low_m, expected.low_m)

@@ -59,3 +59,13 @@ def test_duplicates_and_flat_clouds_are_found() -> None:
     line = np.zeros((500, 3))
     line[:, 1] = np.arange(500)
     np.testing.assert_array_equal(BoxTree(line).nearest(line)[1], np.arange(500))
+
+
+@pytest.mark.parametrize("within_m", [0.0, 0.3, 1.0, 50.0])
+def test_nothing_is_found_beyond_the_limit(within_m: float) -> None:
+    points, queries = cloud(700, 5), cloud(300, 6)
+    distance = slow_distances(queries, points)
+    near = distance.min(axis=1) < within_m
+    nearest_m, row = BoxTree(points).nearest(queries, within_m)
+    np.testing.assert_array_equal(nearest_m, np.where(near, distance.min(axis=1), np.inf))
+    np.testing.assert_array_equal(row, np.where(near, distance.argmin(axis=1), -1))

@@ -17,7 +17,18 @@ import densify
 from densify.config import Config, as_mapping, presets, resolve
 
 CHECKOUT = Path(__file__).parents[1]
-HEAVY = {"numpy", "scipy", "torch", "embreex", "kiss_icp", "cv2", "laspy", "numba"}
+HEAVY = {
+    "numpy",
+    "scipy",
+    "torch",
+    "embreex",
+    "kiss_icp",
+    "cv2",
+    "laspy",
+    "numba",
+    "dask",
+    "distributed",
+}
 
 needs_installation = pytest.mark.skipif(
     "DENSIFY_TEST_INSTALLED" not in os.environ,
@@ -135,7 +146,10 @@ def test_stages_import_no_other_stage() -> None:
 
 
 DOORS: dict[str, str | tuple[str, ...]] = {
+    "dask": "densify/dataset/workers.py",
+    "distributed": "densify/dataset/workers.py",
     "embreex": "densify/street/world.py",
+    "joblib": "densify/dataset/cache.py",
     "kiss_icp": "densify/stages/register.py",
     "laspy": "densify/output/cloud_laz.py",
     "numba": "densify/kernels/",

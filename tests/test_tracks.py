@@ -58,7 +58,7 @@ def test_no_candidates_no_starts():
 def test_the_ground_rises_under_a_track():
     x, y = np.meshgrid(np.arange(-20, 20, 0.25), np.arange(-20, 20, 0.25))
     points = np.stack([x.ravel(), y.ravel(), 0.1 * x.ravel()], 1)
-    ground = HeightMap.of(points, GroundSettings())
+    ground = HeightMap.of([points], GroundSettings())
     track = Track(np.array([-5.0, 2.0, 9.0]))
     for dx, dy in ((10, 0), (-6, 3), (0, 5)):
         rise_m = track.rise_m(ground, np.array([dx, dy, 77.0, 0.3]))

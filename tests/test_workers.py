@@ -190,6 +190,14 @@ def test_a_killer_of_workers_is_given_up(processes: Workers) -> None:
     assert values(found) == {("square", n): n * n for n in range(12)}
 
 
+def test_a_task_with_too_much_memory_is_given_up() -> None:
+    tasks = [Task(("big",), worker_tasks.fill_memory, (1 << 29,)), *squares(3)]
+    with open_workers(2, memory_bytes=2 << 29) as found:
+        outcomes = done(tasks, found)
+    assert "short of memory" in str(outcomes["big",].error)
+    assert outcomes["square", 3].value == 9
+
+
 @pytest.mark.parametrize("kind", ELSEWHERE)
 def test_cores_are_shared_out(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(7)))
@@ -198,7 +206,7 @@ def test_cores_are_shared_out(kind: str, monkeypatch: pytest.MonkeyPatch) -> Non
     before = dict(os.environ)
     with opened(kind) as found:
         tasks = [Task((n,), worker_tasks.threads) for n in range(2)]
-        assert os.environ["NUMBA_NUM_THREADS"] == "6"
+        assert os.environ["NUMBA_NUM_THREADS"] == "6"  # this process's own
         assert set(values(done(tasks, found)).values()) == {("3", 3, False)}
     assert dict(os.environ) == before
     assert pools.share_of_cores(8)["OMP_NUM_THREADS"] == "1"
@@ -302,19 +310,33 @@ def test_a_scheduler_needs_distributed(monkeypatch: pytest.MonkeyPatch) -> None:
         pass
 
 
+class Deserted:
+    """Stands for a client of a scheduler without workers."""
+
+    def nthreads(self) -> dict[str, int]:
+        return {}
+
+    def get_executor(self, pure: bool) -> None:
+        return None
+
+
 def test_all_local_workers_gone(monkeypatch: pytest.MonkeyPatch) -> None:
-    class Client:
-        def nthreads(self) -> dict[str, int]:
-            return {}
-
-        def get_executor(self, pure: bool) -> None:
-            return None
-
     monkeypatch.setattr(workers, "_GONE_S", -1.0)
-    local = workers._Cluster(Client(), "here", local=True)
+    local = workers._Cluster(Deserted(), "here", local=True)
     assert local.num_slots() == 0
     with pytest.raises(ComputationError, match="same command again"):
         local.num_slots()
+
+
+def test_a_scheduler_without_workers_is_waited_for(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(workers, "_GONE_S", -1.0)
+    cluster = workers._Cluster(Deserted(), "tcp://there:8786", local=False)
+    assert [cluster.num_slots() for _ in range(3)] == [0, 0, 0]
+    assert [r.getMessage() for r in caplog.records] == [
+        "Dask scheduler tcp://there:8786 has no workers; waiting for one"
+    ]
 
 
 @pytest.fixture
@@ -378,7 +400,7 @@ import sys
 from pathlib import Path
 from densify import cli
 
-kind, folder, tests = sys.argv[1:]
+kind, plan, folder, tests = sys.argv[1:]
 if kind == "pool":
     sys.modules["distributed"] = None
 sys.path.insert(0, tests)
@@ -387,48 +409,53 @@ def work(options):
     import worker_tasks
     from densify.dataset.tasks import Task, run_tasks
     from densify.dataset.workers import open_workers
-    tasks = [Task(("kill",), worker_tasks.die)]
-    tasks += [Task(("fail",), worker_tasks.fail, (ValueError, "odd"))]
-    tasks += [Task((n,), worker_tasks.square, (n,)) for n in range(2)]
+    tasks = [Task((n,), worker_tasks.square, (n,)) for n in range(2)]
+    tasks += [Task((error,), worker_tasks.fail, (error,)) for error in (KeyError, OSError)]
+    if "death" in plan:
+        tasks.insert(0, Task(("die",), worker_tasks.die))
     places = [Path(folder) / f"{n}.pid" for n in range(4)]
     waits = [Task((place,), worker_tasks.wait, (place,)) for place in places]
     with open_workers(2) as workers:
-        print(sorted(str(outcome.value) for outcome in run_tasks(tasks, workers)))
-        if options.wait:
+        print(len(list(run_tasks(tasks, workers))), flush=True)
+        if "wait" in plan:
             print(*run_tasks(waits, workers))
 
 class Options:
-    verb, wait = staticmethod(work), WAIT
+    verb = staticmethod(work)
 
 cli.parse = lambda _: Options
 cli.script()
 """
 
 
-def command(kind: str, folder: Path, wait: bool) -> subprocess.Popen[str]:
+def command(kind: str, plan: str, folder: Path) -> subprocess.Popen[str]:
     """A command line of ours that has two workers, in a terminal session of its own."""
-    code = MAIN.replace("WAIT", str(wait))
-    arguments = [sys.executable, "-c", code, kind, str(folder), str(Path(__file__).parent)]
+    arguments = [sys.executable, "-c", MAIN, kind, plan, str(folder), str(Path(__file__).parent)]
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
     return subprocess.Popen(arguments, text=True, start_new_session=True, **pipes)
 
 
 @pytest.mark.parametrize("kind", ELSEWHERE)
 def test_nothing_but_ours_reaches_the_screen(kind: str, tmp_path: Path) -> None:
-    with command(kind, tmp_path, wait=False) as process:
+    with command(kind, "", tmp_path) as process:
         said = process.communicate(timeout=PATIENCE_S)
-    assert (process.returncode, *said) == (0, "['0', '1', 'None', 'None']\n", "")
+    assert (process.returncode, *said) == (0, "4\n", "")
 
 
 @pytest.mark.parametrize("kind", ELSEWHERE)
-@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGKILL], ids=["ctrl-c", "kill"])
-def test_workers_end_with_the_command(kind: str, how: int, tmp_path: Path) -> None:
-    with command(kind, tmp_path, wait=True) as process:
+def test_an_interrupt_ends_all(kind: str, tmp_path: Path) -> None:
+    with command(kind, "death, wait", tmp_path) as process:
         pids = [pid_in(tmp_path / f"{n}.pid") for n in range(2)]
-        # Ctrl-C of a terminal goes to the workers too.
-        os.killpg(process.pid, how) if how == signal.SIGINT else process.kill()
-        _, said = process.communicate(timeout=PATIENCE_S)
-    if how == signal.SIGINT:
-        expected = "densify: interrupted; nothing was kept of the unfinished result\n"
-        assert (process.returncode, said) == (130, expected)
-    until(lambda: all(map(is_gone, pids)))
+        os.killpg(process.pid, signal.SIGINT)  # as from a terminal: to the workers too
+        said = process.communicate(timeout=PATIENCE_S)
+    told = "densify: interrupted; nothing was kept of the unfinished result\n"
+    assert (process.returncode, *said) == (130, "5\n", told)
+    assert all(map(is_gone, pids))
+
+
+@pytest.mark.parametrize("kind", ELSEWHERE)
+def test_workers_end_with_a_killed_command(kind: str, tmp_path: Path) -> None:
+    with command(kind, "wait", tmp_path) as process:
+        pids = [pid_in(tmp_path / f"{n}.pid") for n in range(2)]
+        process.kill()
+        until(lambda: all(map(is_gone, pids)))

@@ -69,9 +69,18 @@ def die() -> None:
     os.kill(os.getpid(), signal.SIGKILL)
 
 
+def fill_memory(num_bytes: int) -> None:
+    kept = bytearray(num_bytes)
+    kept[::4096] = b"x" * len(kept[::4096])
+    time.sleep(600)
+
+
 def threads() -> tuple[str, int, bool]:
-    """OPENBLAS_NUM_THREADS, numba's threads, whether numpy was there before the variable."""
-    heavy = "numba" in sys.modules or "torch" in sys.modules
+    """What OpenBLAS and numba are told, and whether any was loaded too early to hear it."""
+    # Dask's workers load numpy, with OpenBLAS, at once: the variable has to be there before.
+    started_with = Path("/proc/self/environ").read_bytes().split(b"\0")
+    told = f"OPENBLAS_NUM_THREADS={os.environ['OPENBLAS_NUM_THREADS']}".encode() in started_with
+    early = bool({"numba", "torch"} & set(sys.modules)) or ("numpy" in sys.modules and not told)
     import numba
 
-    return os.environ["OPENBLAS_NUM_THREADS"], numba.config.NUMBA_NUM_THREADS, heavy
+    return os.environ["OPENBLAS_NUM_THREADS"], numba.config.NUMBA_NUM_THREADS, early

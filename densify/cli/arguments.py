@@ -509,9 +509,9 @@ def _keys(text: str) -> slice | None:
 
 def _shard(text: str) -> tuple[int, int]:
     i, slash, n = text.partition("/")
-    if slash and i.isascii() and n.isascii() and i.isdigit() and n.isdigit():
-        if 1 <= int(i) <= int(n):
-            return int(i), int(n)
+    numbers = slash and (i + n).isascii() and i.isdigit() and n.isdigit()
+    if numbers and 1 <= int(i) <= int(n):
+        return int(i), int(n)
     raise argparse.ArgumentTypeError(f"got {text!r}, expected i/n with i from 1 to n, as in 2/4")
 
 

@@ -74,7 +74,7 @@ def progress_on_stderr() -> Iterator[Progress | None]:
 def keys_on_stderr() -> Iterator[Callable[[Summary], None]]:
     """Keys done, rate, time left and scores so far: a bar on a terminal, else a line now and
     then."""
-    from densify.cli.tables import set_scores
+    from densify.cli.sets import set_scores
 
     if sys.stderr.isatty():
         from tqdm import tqdm

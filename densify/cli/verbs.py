@@ -89,7 +89,7 @@ def compare(options: argparse.Namespace) -> None:
 
 def dataset(options: argparse.Namespace) -> None:
     """Every key of whole recordings, or how far that is."""
-    from densify.cli.tables import set_status, set_summary
+    from densify.cli.sets import set_status, set_summary
 
     if options.status is not None:
         from densify.dataset.make import status

@@ -48,7 +48,9 @@ class Gate:
                 return f"density {density:.4f} in {camera}, expected at least {self.min_density:g}"
         for camera, outliers in scores["outliers"].items():
             if self.max_outliers is not None and (outliers or 0) > self.max_outliers:
-                return f"outliers {outliers:.5f} in {camera}, expected at most {self.max_outliers:g}"
+                return (
+                    f"outliers {outliers:.5f} in {camera}, expected at most {self.max_outliers:g}"
+                )
         return None
 
 

@@ -11,13 +11,13 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from densify.config import as_mapping
+from densify.dataset.drive import BLOCK, margin
 from densify.dataset.manifest import Key, KeyRecord, Manifest, finished, read_manifests
 from densify.dataset.plan import PlannedDrive, Recipe, plan, planned_keys, read_plan, write_plan
 from densify.dataset.tasks import Outcome, run_tasks
-from densify.dataset.drive import BLOCK, margin
 from densify.dataset.work import Job, tasks
 from densify.dataset.workers import open_workers
-from densify.config import as_mapping
 from densify.errors import ComputationError, InputError, OutputError
 from densify.output.atomic import clear_leftovers
 from densify.output.kitti_tree import write_readme
@@ -57,7 +57,7 @@ class Summary:
 
     def mean(self, score: str) -> float | None:
         """Over the keys that are done, and their cameras."""
-        values = []
+        values: list[float | None] = []
         for record in self.records.values():
             value = record.scores.get(score) if record.status == "done" else None
             values += value.values() if isinstance(value, Mapping) else [value]
@@ -69,7 +69,7 @@ def make_dataset(
     data: Sequence[str],
     out: Path,
     keys: slice | None = None,
-    recipe: Recipe = Recipe(),
+    recipe: Recipe | None = None,
     *,
     num_workers: int = 1,
     scheduler: str | None = None,
@@ -95,6 +95,7 @@ def make_dataset(
     Raises InputError for what cannot be used, and where another run is at work on the same part;
     ComputationError where the disk is full or the workers are lost: what is finished is kept.
     """
+    recipe = recipe or Recipe()
     drives = plan(data, keys, recipe)
     with Manifest(out, shard) as manifest:
         write_plan(out, recipe, drives)
@@ -110,7 +111,9 @@ def make_dataset(
             todo = [
                 task
                 for drive in left
-                for task in tasks(Job(drive.source, recipe, out.absolute(), cache_bytes), drive.keys)
+                for task in tasks(
+                    Job(drive.source, recipe, out.absolute(), cache_bytes), drive.keys
+                )
             ]
             try:
                 if todo:

@@ -30,7 +30,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Literal, get_args
 
-from densify.errors import InputError
+from densify.errors import InputError, OutputError
 from densify.output.atomic import FileRecord, make_folder, sync_folder, write_file
 from densify.output.store import plain
 
@@ -144,7 +144,8 @@ class Manifest:
     and a third then locks a new one. On opening and on closing the file is put in order: one line
     per key, by drive and key, and nothing torn.
 
-    Raises InputError if another process has it open, or it cannot be read or written.
+    Raises InputError if another process has it open or it cannot be read, OutputError if it cannot
+    be written.
     """
 
     def __init__(self, root: Path, shard: tuple[int, int] | None = None) -> None:
@@ -183,7 +184,7 @@ class Manifest:
 
     def append(self, record: KeyRecord) -> None:
         """Add a key's record, or replace it. It is on the disk when this returns; where that fails
-        the manifest is as before, and InputError is raised."""
+        the manifest is as before, and OutputError is raised."""
         line = record.to_line()
         try:
             size = os.fstat(self._file).st_size
@@ -200,8 +201,8 @@ class Manifest:
         self._lines[record.name] = line
 
     def close(self) -> None:
-        """Put the file in order and let the next one have it. Raises InputError if the file cannot
-        be rewritten; it then is as it was, with all records."""
+        """Put the file in order and let the next one have it. Raises OutputError if the file
+        cannot be rewritten; it then is as it was, with all records."""
         os.close(self._file)
         try:
             self._put_in_order()
@@ -215,10 +216,10 @@ class Manifest:
         if _bytes_of(self.path) != data:
             write_file(self.path, data, durable=True)
 
-    def _not_written(self, error: OSError) -> InputError:
-        return InputError(
+    def _not_written(self, error: OSError) -> OutputError:
+        return OutputError(
             f"--out {self._root}: {self.path.name} cannot be written: {error.strerror or error}; "
-            f"see to it and run the same command again, what is finished is kept"
+            f"see to it and run the same command again"
         )
 
 

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -51,8 +51,8 @@ class Recipe:
     layout: str = "kitti-depth"
     cameras: tuple[str, ...] | None = None
     split: str | None = None
-    gate: Gate = Gate()
-    config: Config = Config()
+    gate: Gate = field(default_factory=Gate)
+    config: Config = field(default_factory=Config)
 
     def __post_init__(self) -> None:
         if not 0 <= self.window <= _LARGEST_WINDOW:
@@ -140,7 +140,7 @@ def write_plan(out: Path, recipe: Recipe, drives: Sequence[PlannedDrive]) -> Non
     table = _table(recipe, drives)
     before = read_plan(out)
     if before is None:
-        if out.is_dir() and any(not p.name.startswith(".") for p in out.iterdir()):
+        if out.is_dir() and any(not _begun(p.name) for p in out.iterdir()):
             raise InputError(f"--out {out}: not empty, and no dataset.json in it; choose another")
     else:
         _check_same(out, before, table)
@@ -148,7 +148,7 @@ def write_plan(out: Path, recipe: Recipe, drives: Sequence[PlannedDrive]) -> Non
     text = json.dumps(table, indent=1) + "\n"
     out.mkdir(parents=True, exist_ok=True)
     if before is None or table != before:
-        write_file(out / _FILE, text.encode())
+        write_file(out / _FILE, text.encode(), durable=True)
 
 
 def read_plan(out: Path) -> dict[str, Any] | None:
@@ -172,6 +172,11 @@ def read_plan(out: Path) -> dict[str, Any] | None:
 def planned_keys(table: Mapping[str, Any]) -> set[tuple[str, int]]:
     """(drive, frame) of every key in a dataset.json."""
     return {(n, f) for n, drive in table["drives"].items() for f in _frames(drive["frames"])}
+
+
+def _begun(name: str) -> bool:
+    """Whether a run leaves that before there is a dataset.json."""
+    return name.startswith((".", "manifest"))
 
 
 def _table(recipe: Recipe, drives: Sequence[PlannedDrive]) -> dict[str, Any]:

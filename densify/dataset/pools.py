@@ -61,7 +61,7 @@ class _Pools(Elsewhere):
 
     def _start(self, *call: Any) -> Future[bytes]:
         pool = self._idle.pop()
-        with no_interrupts_for_children():
+        with interrupts_held():
             try:
                 future = pool.submit(*call)
             except BrokenProcessPool:  # the process died while it had nothing to do
@@ -107,8 +107,8 @@ def share_of_cores(num_workers: int) -> dict[str, str]:
 
 
 @contextmanager
-def no_interrupts_for_children() -> Iterator[None]:
-    """Threads and processes that start in the block never get the Ctrl-C of the terminal."""
+def interrupts_held() -> Iterator[None]:
+    """Ctrl-C waits for the end of the block; threads and processes started in it never get it."""
     resource_tracker.ensure_running()  # else started with the first child: it lifts the block
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:

@@ -115,9 +115,7 @@ def _made(job: Job, key: int) -> KeyRecord:
     )
     result = results[recipe.method]
     scores = scores_of(result)
-    record = KeyRecord(
-        job.source.name, key, "done", frames=stretch.frames, files={}, scores=scores
-    )
+    record = KeyRecord(job.source.name, key, "done", frames=stretch.frames, files={}, scores=scores)
     reason = recipe.gate.reason(scores, len(stretch.frames))
     if reason is not None:
         return replace(record, status="aside", reason=reason)
@@ -136,7 +134,6 @@ def _written(
         config=as_mapping(job.recipe.config),
         data=job.source.data,
         overwrite=True,
-        durable=True,
     )
     return {
         path.relative_to(job.out).as_posix(): FileRecord.of(path.read_bytes()) for path in paths

@@ -9,16 +9,17 @@ a worker logs below ``densify`` comes back with its answer and is logged in this
 from __future__ import annotations
 
 import asyncio
+import gc
 import logging
 import os
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from concurrent.futures import CancelledError, Future
 from contextlib import ExitStack, contextmanager
 from typing import Any
 
 from densify.dataset.calls import Elsewhere, WorkersDiedError
-from densify.dataset.pools import TRIES, no_interrupts_for_children, open_pools, share_of_cores
+from densify.dataset.pools import TRIES, interrupts_held, open_pools, share_of_cores
 from densify.dataset.tasks import InThisProcess, Task, Workers
 from densify.errors import ComputationError, InputError
 
@@ -64,12 +65,12 @@ def _local_cluster(num_workers: int, memory_bytes: int | None) -> Iterator[Worke
     from distributed import Client, LocalCluster
 
     threads = share_of_cores(num_workers)
-    # The workers import numpy before they take over `env`, so its threads go by this process's
-    # environment. Numba, which reads it again with every compilation, must not see it there.
+    # The workers load numpy before they get `env`, so this process's environment has to say what
+    # they may have. Not for numba, which would take it for this process at its next compilation.
     early = {name: value for name, value in threads.items() if not name.startswith("NUMBA")}
     early["DASK_LOGGING__DISTRIBUTED"] = "critical"
     settings = {
-        "distributed.nanny.pre-spawn-environ": early,
+        "distributed.nanny.pre-spawn-environ": {},
         "distributed.deploy.lost-worker-timeout": "1 hour",
         "distributed.scheduler.worker-saturation": 1.0,
         "distributed.worker.profile.enabled": False,
@@ -79,10 +80,12 @@ def _local_cluster(num_workers: int, memory_bytes: int | None) -> Iterator[Worke
         "distributed.worker.memory.pause": False,
     }
     with ExitStack() as stack:
+        # Queues that wait in cycles for the collector would be told of as leaked semaphores.
+        stack.callback(gc.collect)
         stack.enter_context(_silent_dask())
-        stack.enter_context(_restored_environment(*early, "PYTHONHASHSEED"))
+        stack.enter_context(_environment(early))
         stack.enter_context(dask.config.set(settings))
-        with no_interrupts_for_children():
+        with interrupts_held():
             cluster = stack.enter_context(
                 LocalCluster(
                     n_workers=num_workers,
@@ -180,10 +183,11 @@ class _Cluster(Elsewhere):
 
 
 def _has_distributed() -> bool:
-    try:
-        import distributed  # noqa: F401
-    except ImportError:
-        return False
+    with interrupts_held():  # some of the many modules it loads would swallow one
+        try:
+            import distributed  # noqa: F401
+        except ImportError:
+            return False
     return True
 
 
@@ -216,8 +220,11 @@ def _silent_dask() -> Iterator[None]:
 
 
 @contextmanager
-def _restored_environment(*names: str) -> Iterator[None]:
+def _environment(variables: Mapping[str, str]) -> Iterator[None]:
+    """The variables for the block; Dask's own for its workers go with them."""
+    names = (*variables, "PYTHONHASHSEED", "__DASK_PARENT_PID")
     before = {name: os.environ.get(name) for name in names}
+    os.environ.update(variables)
     try:
         yield
     finally:

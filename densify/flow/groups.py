@@ -9,10 +9,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from densify import poses
-from densify.flow.align import within_outline
 from densify.flow.evidence import (
     Candidates,
     FreeSpace,
@@ -21,9 +19,11 @@ from densify.flow.evidence import (
     firing_times_s,
     reference_times_s,
 )
+from densify.flow.shapes import Shape
 from densify.flow.soften import Part, Softened, soften
 from densify.flow.tracks import Track, follow_groups
 from densify.height_map import HeightMap
+from densify.kernels.clouds import rows_inside
 from densify.types import Bool, Float, Float32, FlowField, Int, Stretch
 
 _ATTACH_M = 0.3
@@ -125,7 +125,7 @@ def follow_candidates(
     standing = [Standing.of(stretch, i, found) for i, found in enumerate(candidates)]
     time_s = reference_times_s(stretch)
     tracks = follow_groups(standing, space, ground, time_s)
-    shapes = [_shape(track, standing) for track in tracks]
+    shapes = [Shape.of(t.seen_in(standing, sorted(t.claimed))) for t in tracks]
 
     def members(i: int) -> NDArray[np.int32]:
         seen = _Seen.of(stretch, i, ground, standing[i], space.ring_step_rad)
@@ -206,21 +206,11 @@ class _Seen:
         return _Seen(row, points[row], firing_times_s(stretch, i)[row], height_m[row], reach_m[row])
 
 
-def _shape(track: Track, standing: Sequence[Standing]) -> Float:
-    """(M,3) the points of all sweeps, as the object stands at the path's begin."""
-    return np.concatenate(
-        [
-            track.carry(standing[j].points[rows], standing[j].time_s[rows], track.path.begin_s)
-            for j, rows in sorted(track.claimed.items())
-        ]
-    )
-
-
 def _attach(
     seen: _Seen,
     i: int,
     tracks: Sequence[Track],
-    shapes: Sequence[Float],
+    shapes: Sequence[Shape],
     time_s: Float,
     min_height_m: float,
 ) -> NDArray[np.int32]:
@@ -234,17 +224,16 @@ def _attach(
     for k, track in enumerate(tracks):
         if not min(track.claimed) - _FORETOLD <= i <= max(track.claimed) + _FORETOLD:
             continue
-        at_s = track.seen_at(i, time_s)
-        shape = track.carry(shapes[k], track.path.begin_s, at_s)
-        low, high = shape.min(0) - 2 * _ATTACH_M, shape.max(0) + 2 * _ATTACH_M
+        rim = track.place(shapes[k].rim, track.seen_at(i, time_s))
+        low, high = rim.min(0) - 2 * _ATTACH_M, rim.max(0) + 2 * _ATTACH_M
         low[2] -= 1.0  # down to the wheels
-        rows = np.flatnonzero(((seen.points > low) & (seen.points < high)).all(1))
+        rows = rows_inside(seen.points, low, high)
         if not len(rows):
             continue
-        at_once = track.carry(seen.points[rows], seen.time_s[rows], at_s)
-        distance = np.asarray(cKDTree(shape).query(at_once)[0])
+        in_shape = track.undo(seen.points[rows], seen.time_s[rows])
+        distance, _ = shapes[k].tree.nearest(in_shape)
         belongs = (distance < seen.reach_m[rows]) & (seen.height_m[rows] >= min_height_m)
-        belongs |= within_outline(at_once[:, :2], shape[:, :2])
+        belongs |= shapes[k].within_outline(in_shape)
         closer = belongs & (distance < nearest[rows])
         instance[rows[closer]] = k
         nearest[rows[closer]] = distance[closer]
@@ -256,7 +245,7 @@ def _lengthen(
     seen: _Seen,
     i: int,
     tracks: Sequence[Track],
-    shapes: Sequence[Float],
+    shapes: Sequence[Shape],
     time_s: Float,
     space: FreeSpace,
 ) -> None:
@@ -271,14 +260,16 @@ def _lengthen(
         ahead = track.path.rate(at_s)[:2]
         ahead = ahead / max(float(np.linalg.norm(ahead)), 1e-6)
         axes = np.stack([ahead, [-ahead[1], ahead[0]]], axis=1)
-        shape = track.carry(shapes[k], track.path.begin_s, at_s)
-        side = (shape[:, :2] @ axes)[:, 1]
-        near = np.abs(seen.points[:, :2] - shape[:, :2].mean(0)).max(1) < 1.5 * _LENGTH_M
-        rows = np.flatnonzero(near & (instance < 0))
+        rim = track.place(shapes[k].rim, at_s)
+        side = (rim[:, :2] @ axes)[:, 1]
+        middle = track.place(shapes[k].points.mean(0, keepdims=True), at_s)[0]
+        reach = np.array([1.5 * _LENGTH_M, 1.5 * _LENGTH_M, np.inf])
+        rows = rows_inside(seen.points, middle - reach, middle + reach)
+        rows = rows[instance[rows] < 0]
         at_once = track.carry(seen.points[rows], seen.time_s[rows], at_s)
         along = at_once[:, :2] @ axes
         fits = (along[:, 1] > side.min() - _SIDE_M) & (along[:, 1] < side.max() + _SIDE_M)
-        fits &= at_once[:, 2] < shape[:, 2].max() + _SIDE_M
+        fits &= at_once[:, 2] < rim[:, 2].max() + _SIDE_M
         own = track.carry(seen.points[mine], seen.time_s[mine], at_s)[:, :2] @ ahead
         rows, along = rows[fits], along[fits, 0]
         rows = rows[_without_hole(along, own)]

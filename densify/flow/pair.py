@@ -108,7 +108,7 @@ def _flow_of_groups(
     points = [cloud - middle for cloud in clouds]
     inside = [np.flatnonzero((np.abs(p[:, :2]) < _MAX_EXTENT_M).all(1)) for p in points]
     near = [p[rows] for p, rows in zip(points, inside, strict=True)]
-    ground = HeightMap.of(np.concatenate(near), settings.ground)
+    ground = HeightMap.of(near, settings.ground)
     heights_m = [ground.above(p) for p in near]
     above = [
         rows[h >= settings.flow.min_height_m] for rows, h in zip(inside, heights_m, strict=True)

@@ -8,17 +8,18 @@ model, is smoothed in time, and counts only if that smooth motion explains what 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy.spatial import cKDTree
 
-from densify.flow.align import GATES_M, MIN_FIT, Model, align, apply, undo, within_outline
+from densify.flow.align import GATES_M, MIN_FIT, Model, align, apply, undo
 from densify.flow.evidence import FreeSpace, Standing
 from densify.flow.paths import Path
+from densify.flow.shapes import Shape
 from densify.flow.vote import DistanceField, vote
 from densify.height_map import HeightMap
+from densify.kernels.clouds import rows_inside
 from densify.types import Bool, Float
 
 _MIN_POINTS = 8
@@ -73,6 +74,14 @@ class Track:
         velocity_m_s[:, 0] -= rate[3] * (points[:, 1] - self.centre[1] - state[1])
         velocity_m_s[:, 1] += rate[3] * (points[:, 0] - self.centre[0] - state[0])
         return velocity_m_s
+
+    def seen_in(self, standing: Sequence[Standing], sweeps: Iterable[int]) -> Float:
+        """(N,3) what these sweeps saw of the object, in its own frame."""
+        parts = [np.zeros((0, 3))]
+        for j in sweeps:
+            c, rows = standing[j], self.claimed[j]
+            parts.append(self.undo(c.points[rows], c.time_s[rows]))
+        return np.concatenate(parts)
 
     def add(self, j: int, state: Float, time_s: float, rows: np.ndarray) -> None:
         """What sweep j saw of the object."""
@@ -194,8 +203,9 @@ def _predict(track: Track, rate: Float, time_s: float) -> tuple[Float, Float]:
     known = sorted(track.states, key=lambda k: (abs(track.times_s[k] - time_s), k))[:4]
     nearest = known[0]
     if len(known) > 1:
-        t = [track.times_s[k] - time_s for k in known]
-        rate = np.polyfit(t, np.stack([track.states[k] for k in known]), 1)[0] * _STEADY
+        t = np.array([track.times_s[k] for k in known])
+        t -= t.mean()
+        rate = t @ np.stack([track.states[k] for k in known]) / (t @ t) * _STEADY
     return track.states[nearest] + rate * (time_s - track.times_s[nearest]), rate
 
 
@@ -216,8 +226,9 @@ def _find(
     centre = track.centre
     expected = apply(_predict(track, rate, about_s)[0], model.points, centre)
     low, high = expected.min(0) - GATES_M[0], expected.max(0) + GATES_M[0]
-    inside = np.flatnonzero(free & ((c.points > low) & (c.points < high)).all(1))
-    rows, enough = inside[c.candidate[inside]], float(MIN_FIT)
+    inside = rows_inside(c.points, low, high)
+    inside = inside[free[inside]]
+    rows, enough = inside[c.cluster[inside] >= 0], float(MIN_FIT)
     if len(rows) < MIN_FIT:  # seen by nobody else, it may be there all the same
         rows, enough = inside, max(MIN_FIT, _SHARE_UNSEEN * track.typical_size())
     if len(rows) < enough:
@@ -230,7 +241,7 @@ def _find(
     if state is None:
         return None
     state[2] = track.rise_m(ground, state)
-    distance, _ = model.nearest(undo(state, target, centre), _FIT_M)
+    distance, _ = model.tree.nearest(undo(state, target, centre), _FIT_M)
     fit = np.isfinite(distance)
     if fit.sum() < enough:
         return None
@@ -246,23 +257,16 @@ def _gather(
 ) -> None:
     """Claim the free candidates beside or within the object that its motion does not contradict,
     before a part of it starts a track of its own."""
-    shape = np.concatenate(
-        [
-            track.carry(standing[j].points[rows], standing[j].time_s[rows], track.path.begin_s)
-            for j, rows in sorted(track.claimed.items())
-        ]
-    )
+    shape = Shape.of(track.seen_in(standing, sorted(track.claimed)))
     for j, own in track.claimed.items():
-        c, at_s = standing[j], track.times_s[j]
-        there = track.carry(shape, track.path.begin_s, at_s)
-        low, high = there.min(0) - 2 * _FIT_M, there.max(0) + 2 * _FIT_M
-        near = free[j] & c.candidate & ((c.points > low) & (c.points < high)).all(1)
-        near[own] = False
-        rows = np.flatnonzero(near)
-        at_once = track.carry(c.points[rows], c.time_s[rows], at_s)
-        belongs = np.asarray(cKDTree(there).query(at_once)[0]) < _FIT_M
-        belongs |= within_outline(at_once[:, :2], there[:, :2])
-        rows = rows[belongs]
+        c = standing[j]
+        there = track.place(shape.rim, track.times_s[j])
+        rows = rows_inside(c.points, there.min(0) - 2 * _FIT_M, there.max(0) + 2 * _FIT_M)
+        rows = rows[free[j][rows] & (c.cluster[rows] >= 0)]
+        rows = np.setdiff1d(rows, own, assume_unique=True)
+        in_shape = track.undo(c.points[rows], c.time_s[rows])
+        belongs = np.isfinite(shape.tree.nearest(in_shape, _FIT_M)[0])
+        rows = rows[belongs | shape.within_outline(in_shape)]
         for i in space.others(j):
             if abs(i - j) <= _NEAR_SWEEPS and len(rows):
                 carried = track.carry(c.points[rows], c.time_s[rows], sweep_time_s[i])
@@ -280,17 +284,11 @@ def _refine(
     all there is to hold on to. The even sweeps are aligned with the shape that the odd ones show,
     and the other way round, so that no sweep holds on to itself.
     """
-    shapes = []
-    for parity in (0, 1):
-        parts = [
-            track.carry(standing[j].points[rows], standing[j].time_s[rows], track.path.begin_s)
-            for j, rows in sorted(track.claimed.items())
-            if j % 2 == parity
-        ]
-        if not parts:
-            return
-        shapes.append(np.concatenate(parts))
-    models = [Model(undo(track.path(track.path.begin_s), x, track.centre)) for x in shapes]
+    sweeps = sorted(track.claimed)
+    shapes = [track.seen_in(standing, [j for j in sweeps if j % 2 == odd]) for odd in (0, 1)]
+    if not all(map(len, shapes)):
+        return
+    models = [Model(x) for x in shapes]
     before = dict(track.states), track.path
     for j, rows in track.claimed.items():
         at_s = track.times_s[j]
@@ -336,13 +334,17 @@ def _contradictions(
     track: Track, standing: Sequence[Standing], space: FreeSpace, sweep_time_s: Float
 ) -> tuple[int, int]:
     """How many looks through the track's points the sweeps have: standing still, and moved."""
+    asked = {i: rows[:: len(rows) // _NUM_ASKED + 1] for i, rows in track.claimed.items()}
+    points = {i: standing[i].points[rows] for i, rows in asked.items()}
+    body = {i: track.undo(points[i], standing[i].time_s[rows]) for i, rows in asked.items()}
     still = moved = 0
-    for i, rows in track.claimed.items():
-        rows = rows[:: len(rows) // _NUM_ASKED + 1]
-        points, seen_s = standing[i].points[rows], standing[i].time_s[rows]
-        for j in space.others(i):
-            carried = track.carry(points, seen_s, sweep_time_s[j])
-            velocity_m_s = track.velocity_m_s(carried, sweep_time_s[j])
-            still += int(space.seen_through(points, j).sum())
-            moved += int(space.seen_through(carried, j, velocity_m_s).sum())
+    for j in range(len(space)):
+        from_others = [i for i in space.others(j) if i in asked]
+        if not from_others:
+            continue
+        carried = track.place(np.concatenate([body[i] for i in from_others]), sweep_time_s[j])
+        velocity_m_s = track.velocity_m_s(carried, sweep_time_s[j])
+        moved += int(space.seen_through(carried, j, velocity_m_s).sum())
+        standing_still = np.concatenate([points[i] for i in from_others])
+        still += int(space.seen_through(standing_still, j).sum())
     return still, moved

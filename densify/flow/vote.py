@@ -19,19 +19,22 @@ _VOTE_POINTS = 60
 
 @dataclass(frozen=True)
 class DistanceField:
-    """Distance to the nearest candidate on a voxel grid, as a share of the reach in 255ths."""
+    """How near the nearest candidate is on a voxel grid: 255 there, 0 beyond the reach.
 
-    share: NDArray[np.uint8]
+    Zeros take no memory until something is written beside them; a field is mostly zeros.
+    """
+
+    nearness: NDArray[np.uint8]
     low: Float
 
     @staticmethod
     def of(points: Float) -> DistanceField:
         step, reach = _VOTE_STEP_M, _VOTE_REACH_M
         if not len(points):
-            return DistanceField(np.full((1, 1, 1), 255, np.uint8), np.zeros(3))
+            return DistanceField(np.zeros((1, 1, 1), np.uint8), np.zeros(3))
         low = points.min(0) - 2 * reach
         shape = tuple(np.ceil((points.max(0) + 2 * reach - low) / step).astype(int) + 1)
-        share = np.full(shape, 255, np.uint8)
+        nearness = np.zeros(shape, np.uint8)
         occupied = np.unique(((points - low) / step).astype(np.int32), axis=0)
         n = int(np.ceil(reach / step))
         span = np.arange(-n, n + 1)
@@ -39,14 +42,16 @@ class DistanceField:
         far = np.linalg.norm(offsets, axis=1) * step / reach
         for offset, d in zip(offsets[far < 1], far[far < 1], strict=True):
             at = tuple((occupied + offset).T)
-            share[at] = np.minimum(share[at], np.uint8(round(255 * d)))
-        return DistanceField(share, low)
+            nearness[at] = np.maximum(nearness[at], np.uint8(255 - round(255 * d)))
+        return DistanceField(nearness, low)
 
     def __call__(self, points: Float) -> Float:
+        """(...,3) -> (...) distance to the nearest candidate as a share of the reach."""
         at = ((points - self.low) * (1 / _VOTE_STEP_M)).astype(np.int32)
-        inside = ((at >= 0) & (at < self.share.shape)).all(-1)
+        inside = ((at >= 0) & (at < self.nearness.shape)).all(-1)
         at[~inside] = 0
-        return np.where(inside, self.share[at[..., 0], at[..., 1], at[..., 2]] / 255, 1.0)
+        near = self.nearness[at[..., 0], at[..., 1], at[..., 2]]
+        return np.where(inside, (255 - near) / 255, 1.0)
 
 
 def vote(points: Float, i: int, fields: Sequence[DistanceField], time_s: Float) -> Float:

@@ -33,13 +33,14 @@ class BoxTree:
         self._points = points[self._order]
         _fit_boxes(self._points, self._starts, self._stops, self._boxes)
 
-    def nearest(self, queries: Float) -> tuple[Float, Int]:
-        """(q,) metres to the nearest point, and (q,) its row.
+    def nearest(self, queries: Float, within_m: float = np.inf) -> tuple[Float, Int]:
+        """(q,) metres to the nearest point, and (q,) its row; inf and -1 where none is closer than
+        ``within_m``.
 
         queries: (q,3).
         """
         distance_m, row = np.empty(len(queries)), np.empty(len(queries), np.int64)
-        _nearest.over_rows(len(queries), queries, *self._search, distance_m, row)
+        _nearest.over_rows(len(queries), queries, *self._search, float(within_m), distance_m, row)
         return distance_m, row
 
     def nearest_k(self, queries: Float, k: int) -> tuple[Float, Int]:
@@ -51,6 +52,42 @@ class BoxTree:
         row = np.empty((len(queries), k), np.int64)
         _nearest_k.over_rows(len(queries), queries, *self._search, distance_m, row)
         return distance_m, row
+
+    def align(
+        self,
+        queries: Float,
+        information: Float,
+        centre: Float,
+        predicted: Float,
+        prior: Float,
+        gates_m: Float,
+        max_weight: float,
+        min_matches: int,
+    ) -> Float | None:
+        """Where (q,3) queries were seen of the body that the points are of: (4,) x y z displacement
+        (m) and yaw (rad) about ``centre`` (3,).
+
+        For each of the gates, in turn: a Gauss-Newton step of x, y and yaw that lowers the
+        distances to the nearest points within the gate. None where fewer than ``min_matches`` have
+        one.
+
+        information: (m,5) xx xy yy xz yz of each point's inverse covariance, 1/m². predicted: (4,)
+        where to start. prior: (3,) inverse variance of the predicted x, y and yaw. max_weight: all
+        together the distances count at most as so many.
+        """
+        state = predicted.copy()
+        matched = _align(
+            queries,
+            *self._search,
+            information,
+            centre,
+            prior,
+            gates_m,
+            max_weight,
+            min_matches,
+            state,
+        )
+        return state if matched else None
 
     @property
     def _search(self) -> tuple[Float, Int, Int, Int, Float]:
@@ -123,6 +160,39 @@ def _squared_to_box(boxes: Float, node: int, x: float, y: float, z: float) -> fl
     return dx * dx + dy * dy + dz * dz
 
 
+@inlined
+def _closer(points, starts, stops, boxes, x, y, z, best, found, waiting, squared_to):  # type: ignore[no-untyped-def]
+    """The squared distance and the place of the nearest point, or ``best`` and ``found`` where none
+    is closer. waiting, squared_to: (_MAX_DEPTH,) to work in."""
+    first_leaf = len(starts) // 2
+    waiting[0], squared_to[0], top = 0, 0.0, 1
+    while top > 0:
+        top -= 1
+        if squared_to[top] >= best:
+            continue
+        node = waiting[top]
+        while node < first_leaf:
+            near, far = 2 * node + 1, 2 * node + 2
+            to_near = _squared_to_box(boxes, near, x, y, z)
+            to_far = _squared_to_box(boxes, far, x, y, z)
+            if to_far < to_near:
+                near, far, to_near, to_far = far, near, to_far, to_near
+            if to_far < best:
+                waiting[top], squared_to[top] = far, to_far
+                top += 1
+            if to_near >= best:
+                break
+            node = near
+        if node < first_leaf:
+            continue
+        for i in range(starts[node], stops[node]):
+            dx, dy, dz = points[i, 0] - x, points[i, 1] - y, points[i, 2] - z
+            squared = dx * dx + dy * dy + dz * dz
+            if squared < best:
+                best, found = squared, i
+    return best, found
+
+
 @Kernel
 def _nearest(
     begin: int,
@@ -133,41 +203,18 @@ def _nearest(
     starts: Int,
     stops: Int,
     boxes: Float,
+    within_m: float,
     distance_m: Float,
     row: Int,
 ) -> None:
-    first_leaf = len(starts) // 2
-    waiting = np.empty(_MAX_DEPTH, np.int64)
-    squared_to = np.empty(_MAX_DEPTH)
+    waiting, squared_to = np.empty(_MAX_DEPTH, np.int64), np.empty(_MAX_DEPTH)
     for q in range(begin, end):
         x, y, z = queries[q, 0], queries[q, 1], queries[q, 2]
-        best, found = np.inf, -1
-        waiting[0], squared_to[0], top = 0, 0.0, 1
-        while top > 0:
-            top -= 1
-            if squared_to[top] >= best:
-                continue
-            node = waiting[top]
-            while node < first_leaf:
-                near, far = 2 * node + 1, 2 * node + 2
-                to_near = _squared_to_box(boxes, near, x, y, z)
-                to_far = _squared_to_box(boxes, far, x, y, z)
-                if to_far < to_near:
-                    near, far, to_near, to_far = far, near, to_far, to_near
-                if to_far < best:
-                    waiting[top], squared_to[top] = far, to_far
-                    top += 1
-                if to_near >= best:
-                    break
-                node = near
-            if node < first_leaf:
-                continue
-            for i in range(starts[node], stops[node]):
-                dx, dy, dz = points[i, 0] - x, points[i, 1] - y, points[i, 2] - z
-                squared = dx * dx + dy * dy + dz * dz
-                if squared < best:
-                    best, found = squared, i
-        distance_m[q], row[q] = np.sqrt(best), order[found]
+        squared, found = _closer(
+            points, starts, stops, boxes, x, y, z, within_m * within_m, -1, waiting, squared_to
+        )
+        distance_m[q] = np.sqrt(squared) if found >= 0 else np.inf
+        row[q] = order[found] if found >= 0 else -1
 
 
 @Kernel
@@ -223,3 +270,103 @@ def _nearest_k(
                     nearest[j], found[j] = squared, order[i]
         for j in range(k):
             distance_m[q, j], row[q, j] = np.sqrt(nearest[j]), found[j]
+
+
+@inlined
+def _match(queries, points, starts, stops, boxes, centre, state, gate_m, found, at, squared):  # type: ignore[no-untyped-def]
+    """Undo the state: ``at``, and find the nearest points closer than the gate: ``found``, -1 for
+    none, and ``squared``. Returns how many there are. found: as the step before left it."""
+    waiting, squared_to = np.empty(_MAX_DEPTH, np.int64), np.empty(_MAX_DEPTH)
+    cos, sin, num = np.cos(state[3]), np.sin(state[3]), 0
+    for q in range(len(queries)):
+        dx, dy = queries[q, 0] - centre[0] - state[0], queries[q, 1] - centre[1] - state[1]
+        x, y = cos * dx + sin * dy + centre[0], cos * dy - sin * dx + centre[1]
+        z = queries[q, 2] - state[2]
+        best, last = gate_m * gate_m, found[q]
+        if last >= 0:  # mostly still the nearest: little is left to search
+            dx, dy, dz = points[last, 0] - x, points[last, 1] - y, points[last, 2] - z
+            known = dx * dx + dy * dy + dz * dz
+            best, last = (known, last) if known < best else (best, -1)
+        best, last = _closer(points, starts, stops, boxes, x, y, z, best, last, waiting, squared_to)
+        at[q, 0], at[q, 1], at[q, 2], squared[q], found[q] = x, y, z, best, last
+        num += last >= 0
+    return num
+
+
+@inlined
+def _add_up(H, g, at, found, squared, points, order, information, centre, yaw, gate_m):  # type: ignore[no-untyped-def]
+    """The normal equations ``H step = g`` of what was matched, by Tukey's weights."""
+    cos, sin = np.cos(yaw), np.sin(yaw)
+    H[:], g[:] = 0.0, 0.0
+    for q in range(len(found)):
+        if found[q] < 0:
+            continue
+        A, i = information[order[found[q]]], found[q]
+        weight = (1 - squared[q] / (gate_m * gate_m)) ** 2
+        u, v = at[q, 0] - centre[0], at[q, 1] - centre[1]
+        for k in range(3):
+            # How the point at the model yields to x, y and yaw.
+            if k == 0:
+                px, py = weight * cos, -weight * sin
+            elif k == 1:
+                px, py = weight * sin, weight * cos
+            else:
+                px, py = -weight * v, weight * u
+            ax, ay = px * A[0] + py * A[1], px * A[1] + py * A[2]
+            H[k, 0] += ax * cos - ay * sin
+            H[k, 1] += ax * sin + ay * cos
+            H[k, 2] += ay * u - ax * v
+            g[k] += ax * (at[q, 0] - points[i, 0]) + ay * (at[q, 1] - points[i, 1])
+            g[k] += (px * A[3] + py * A[4]) * (at[q, 2] - points[i, 2])
+
+
+@Kernel
+def _align(
+    queries: Float,
+    points: Float,
+    order: Int,
+    starts: Int,
+    stops: Int,
+    boxes: Float,
+    information: Float,
+    centre: Float,
+    prior: Float,
+    gates_m: Float,
+    max_weight: float,
+    min_matches: int,
+    state: Float,
+) -> bool:
+    """As `BoxTree.align`; the state is changed in place."""
+    found, predicted = np.full(len(queries), -1), state.copy()
+    at, squared = np.empty((len(queries), 3)), np.empty(len(queries))
+    H, g = np.empty((3, 3)), np.empty(3)
+    for gate_m in gates_m:
+        num = _match(
+            queries, points, starts, stops, boxes, centre, state, gate_m, found, at, squared
+        )
+        if num < min_matches:
+            return False
+        _add_up(H, g, at, found, squared, points, order, information, centre, state[3], gate_m)
+        scale = min(1.0, max_weight / num)
+        for k in range(3):
+            axis = k + k // 2  # x, y, yaw
+            g[k] = scale * g[k] + prior[k] * (predicted[axis] - state[axis])
+            for m in range(3):
+                H[k, m] = scale * H[k, m] + prior[k] * (k == m)
+        dx, dy, turn = _solved(H, g)
+        state[0] += dx
+        state[1] += dy
+        state[3] += turn
+    return True
+
+
+@inlined
+def _solved(H, g):  # type: ignore[no-untyped-def]
+    """Three equations with a symmetric, positive matrix, by its factors L D Lᵀ."""
+    yx, wx = H[0, 1] / H[0, 0], H[0, 2] / H[0, 0]
+    d, e = H[1, 1] - yx * H[0, 1], H[1, 2] - wx * H[0, 1]
+    wy = e / d
+    gy = g[1] - yx * g[0]
+    w = (g[2] - wx * g[0] - wy * gy) / (H[2, 2] - wx * H[0, 2] - wy * e)
+    y = gy / d - wy * w
+    return g[0] / H[0, 0] - yx * y - wx * w, y, w

@@ -19,7 +19,7 @@ from typing import Any, Literal
 import yaml
 
 import densify
-from densify.errors import InputError
+from densify.errors import OutputError
 from densify.output.atomic import FileRecord, make_folder, write_file
 from densify.output.depth_png import encode_confidence, encode_depth
 from densify.output.store import plain
@@ -78,7 +78,7 @@ def write_key(
     frame: file number. sparse, dense: camera to map, of the key sweep alone and of all sweeps.
 
     Returns path relative to ``root``, with slashes, to what the file holds; the same maps give the
-    same bytes. Raises InputError if the files cannot be written, ValueError if the cameras differ.
+    same bytes. Raises OutputError if the files cannot be written, ValueError if the cameras differ.
     """
     if sparse.keys() != dense.keys():
         raise ValueError(f"cameras: got {sorted(sparse)} sparse and {sorted(dense)} dense")
@@ -102,7 +102,7 @@ def write_readme(root: Path, *, method: str, window: int, settings: Mapping[str,
 
     window: sweeps before and after the key. settings: all others, plain mappings; they should say
     nothing of the machine. The text depends on the arguments and densify's version alone. Raises
-    InputError if it cannot be written.
+    OutputError if it cannot be written.
     """
     text = _README.format(
         version=densify.__version__,
@@ -120,9 +120,8 @@ def _put(root: Path, name: str, data: bytes) -> None:
         make_folder(path.parent)
         write_file(path, data, durable=True)
     except OSError as error:
-        raise InputError(
-            f"--out {root}: {name} cannot be written: {error.strerror or error}; see to it and run "
-            f"the same command again, what is finished is kept"
+        raise OutputError(
+            f"--out {root}: {name} cannot be written: {error.strerror or error}"
         ) from error
 
 

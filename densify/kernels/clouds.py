@@ -1,0 +1,83 @@
+# SPDX-License-Identifier: MIT
+"""Clouds, compiled: boxes cut out of them, and how certain the places of their surfaces are."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from densify.kernels import Kernel
+from densify.types import Float, Int
+
+
+def rows_inside(points: Float, low: Float, high: Float) -> Int:
+    """The rows, ascending, of (N,3) points strictly between two corners (3,)."""
+    rows = np.empty(len(points), np.int64)
+    return rows[: _collect(points, low, high, rows)]
+
+
+def surface_information(
+    points: Float, near: Int, loose: float, noise_m: float, ridge: float
+) -> Float:
+    """(N,5) xx xy yy xz yz of the inverse covariance (1/m²) of the surface around each point.
+
+    points: (N,3). near: (N,k) rows of its neighbours, itself among them. loose: factor of their
+    covariance. noise_m: standard deviation added in all directions; ridge: and so much of the mean
+    variance.
+    """
+    information = np.empty((len(points), 5))
+    _invert.over_rows(len(points), points, near, loose, noise_m * noise_m, ridge, information)
+    return information
+
+
+@Kernel
+def _collect(points: Float, low: Float, high: Float, rows: Int) -> int:
+    num = 0
+    for i in range(len(points)):
+        x, y, z = points[i, 0], points[i, 1], points[i, 2]
+        rows[num] = i  # overwritten unless it is inside: without a branch, since none foresees it
+        num += (
+            (x > low[0])
+            & (x < high[0])
+            & (y > low[1])
+            & (y < high[1])
+            & (z > low[2])
+            & (z < high[2])
+        )
+    return num
+
+
+@Kernel
+def _invert(
+    begin: int,
+    end: int,
+    points: Float,
+    near: Int,
+    loose: float,
+    noise: float,
+    ridge: float,
+    information: Float,
+) -> None:
+    num = near.shape[1]
+    for i in range(begin, end):
+        mx = my = mz = xx = xy = xz = yy = yz = zz = 0.0
+        for k in range(num):
+            j = near[i, k]
+            mx, my, mz = mx + points[j, 0], my + points[j, 1], mz + points[j, 2]
+        mx, my, mz = mx / num, my / num, mz / num
+        for k in range(num):
+            j = near[i, k]
+            x, y, z = points[j, 0] - mx, points[j, 1] - my, points[j, 2] - mz
+            xx, xy, xz = xx + x * x, xy + x * y, xz + x * z
+            yy, yz, zz = yy + y * y, yz + y * z, zz + z * z
+        factor = loose / num
+        added = noise + ridge * factor * (xx + yy + zz) / 3
+        xx, yy, zz = factor * xx + added, factor * yy + added, factor * zz + added
+        xy, xz, yz = factor * xy, factor * xz, factor * yz
+        # By cofactors: the ridge keeps the covariance far from singular.
+        of_xx, of_xy, of_xz = yy * zz - yz * yz, xz * yz - xy * zz, xy * yz - xz * yy
+        determinant = xx * of_xx + xy * of_xy + xz * of_xz
+        information[i, 0] = of_xx / determinant
+        information[i, 1] = of_xy / determinant
+        information[i, 2] = (xx * zz - xz * xz) / determinant
+        information[i, 3] = of_xz / determinant
+        information[i, 4] = (xy * xz - xx * yz) / determinant

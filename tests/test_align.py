@@ -1,0 +1,133 @@
+# SPDX-License-Identifier: MIT
+"""Alignment with an object's shape: against known motion, and against a slow twin."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+
+from densify.flow.align import GATES_M, MIN_FIT, Model, align, apply, undo
+from densify.kernels.clouds import rows_inside, surface_information
+
+CENTRE = np.array([12.0, -3.0, 0.8])
+STD = np.array([0.3, 0.3, 0.06])
+
+
+def corner(num_points: int, seed: int) -> np.ndarray:
+    """Two sides of a car, as seen from one place."""
+    rng = np.random.default_rng(seed)
+    along, up = rng.uniform([-2, 0], [2, 1.4], (num_points, 2)).T
+    side = np.arange(num_points) % 3 > 0
+    x, y = np.where(side, along, -2.0), np.where(side, -0.9, along * 0.45)
+    return CENTRE + np.stack([x, y, up], 1) + rng.normal(0, 0.01, (num_points, 3))
+
+
+def slow_information(points: np.ndarray, near: np.ndarray) -> np.ndarray:
+    """(N,3,3) as the formulas say, with an inverse of numpy."""
+    x = points[near] - points[near].mean(1, keepdims=True)
+    covariance = 10 * np.einsum("nki,nkj->nij", x, x) / near.shape[1]
+    mean_variance = np.trace(covariance, axis1=1, axis2=2)[:, None, None] / 3
+    return np.linalg.inv(covariance + (0.05**2 + 0.02 * mean_variance) * np.eye(3))
+
+
+def slow_align(model: Model, points, predicted) -> np.ndarray | None:
+    """Gauss-Newton with numerical derivatives, neighbours from another tree."""
+    tree = cKDTree(model.points)
+    _, near = tree.query(model.points, min(12, len(model.points)))
+    information = slow_information(model.points, near.reshape(len(model.points), -1))
+    state = predicted.copy()
+    for gate_m in np.repeat(GATES_M, 2):
+        at_model = undo(state, points, CENTRE)
+        distance, row = tree.query(at_model, distance_upper_bound=gate_m)
+        near = np.isfinite(distance)
+        if near.sum() < MIN_FIT:
+            return None
+        weight = (1 - (distance[near] / gate_m) ** 2) ** 2 * min(1, 60 / near.sum())
+        A = information[row[near]] * weight[:, None, None]
+        r = at_model[near] - model.points[row[near]]
+        J = np.zeros((near.sum(), 3, 3))
+        for k, axis in enumerate((0, 1, 3)):
+            h = np.zeros(4)
+            h[axis] = 1e-6
+            ahead, behind = (undo(state + s * h, points[near], CENTRE) for s in (1, -1))
+            J[:, :, k] = (ahead - behind) / 2e-6
+        H = np.einsum("nik,nij,njl->kl", J, A, J) + np.diag(1 / STD**2)
+        g = np.einsum("nik,nij,nj->k", J, A, r) - (predicted - state)[[0, 1, 3]] / STD**2
+        state[[0, 1, 3]] -= np.linalg.solve(H, g)
+    return state
+
+
+@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("num_points", [6, 40, 600])
+def test_the_compiled_loop_is_its_slow_twin(num_points: int, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    model = Model(corner(900, seed))
+    true = np.array([*rng.normal(0, 0.5, 2), rng.normal(0, 0.1), rng.normal(0, 0.3)])
+    points = apply(true, corner(num_points, seed + 50), CENTRE)
+    predicted = true + [*rng.normal(0, 0.2, 2), 0.0, rng.normal(0, 0.04)]
+    found, expected = (
+        align(model, points, CENTRE, predicted, STD),
+        slow_align(model, points, predicted),
+    )
+    assert (found is None) == (expected is None)
+    if found is not None:
+        np.testing.assert_allclose(found, expected, atol=1e-6)
+
+
+def test_a_known_motion_is_found_and_the_height_is_kept() -> None:
+    true = np.array([1.4, -0.6, 0.25, 0.3])
+    predicted = true + [0.15, -0.1, 0.0, 0.03]
+    points = apply(true, corner(500, 1), CENTRE)
+    found = align(Model(corner(900, 2)), points, CENTRE, predicted, STD)
+    np.testing.assert_allclose(found, true, atol=0.02)
+    assert found[2] == predicted[2]
+    np.testing.assert_array_equal(predicted, true + [0.15, -0.1, 0.0, 0.03])  # not changed
+
+
+def test_the_prediction_holds_what_the_points_leave_open() -> None:
+    """A single flat side may slide along itself: it stays where it is expected."""
+    rng = np.random.default_rng(3)
+    wall = CENTRE + np.column_stack([rng.uniform(-9, 9, 800), np.zeros(800), np.zeros(800)])
+    seen = CENTRE + np.column_stack([rng.uniform(-1, 1, 80), np.zeros(80), np.zeros(80)])
+    predicted = np.array([0.3, 0.2, 0.0, 0.0])
+    found = align(Model(wall), seen, CENTRE, predicted, np.array([0.01, 0.3, 0.06]))
+    assert abs(found[0] - 0.3) < 0.02 and abs(found[1]) < 0.02
+
+
+def test_too_few_partners_are_none() -> None:
+    model, still = Model(corner(300, 0)), np.zeros(4)
+    assert align(model, corner(300, 1) + [50.0, 0, 0], CENTRE, still, STD) is None
+    assert align(model, corner(MIN_FIT - 1, 1), CENTRE, still, STD) is None
+    assert align(model, corner(MIN_FIT, 1), CENTRE, still, STD) is not None
+
+
+def test_a_model_of_few_and_of_many_points() -> None:
+    for num_points in (1, 2, 8, 5000):
+        model = Model(corner(num_points, 0))
+        assert len(model.points) <= 1500 and len(model.information) == len(model.points)
+        assert np.isfinite(model.information).all()
+        before = model.points
+        model.add(corner(10, 1))
+        assert len(model.points) <= 1500 and (model.points[0] == before[0]).all()
+
+
+@pytest.mark.parametrize("flat", [False, True])
+def test_surface_information_is_the_inverse_covariance(flat: bool) -> None:
+    rng = np.random.default_rng(4)
+    points = rng.normal(size=(200, 3)) * ([3.0, 2.0, 0.0] if flat else [3.0, 2.0, 0.5])
+    near = rng.integers(0, 200, (200, 12))
+    expected = slow_information(points, near)
+    found = surface_information(points, near, 10.0, 0.05, 0.02)
+    rows, columns = [0, 0, 1, 0, 1], [0, 1, 1, 2, 2]
+    np.testing.assert_allclose(found, expected[:, rows, columns], rtol=1e-8, atol=1e-9)
+
+
+def test_rows_inside_a_box() -> None:
+    rng = np.random.default_rng(5)
+    points = rng.integers(-3, 4, (5000, 3)).astype(float)  # many exactly on the faces: outside
+    low, high = np.array([-2.0, -1.0, -3.0]), np.array([2.0, np.inf, 1.0])
+    expected = np.flatnonzero(((points > low) & (points < high)).all(1))
+    assert 100 < len(expected) < 2000
+    np.testing.assert_array_equal(rows_inside(points, low, high), expected)
+    assert rows_inside(points[:0], low, high).shape == (0,)
