@@ -8,8 +8,6 @@ python examples/train_completion.py [--data SPEC] [--test SPEC] [--keys A:B:S] [
 
 import argparse
 import copy
-import subprocess
-import sys
 from itertools import pairwise
 from pathlib import Path
 
@@ -19,6 +17,8 @@ from torch.nn.functional import avg_pool2d, interpolate
 from torch.utils.data import DataLoader
 
 import densify
+from densify.dataset.make import make_dataset
+from densify.dataset.plan import Recipe
 from densify.depth_metrics import depth_errors, mean_errors
 
 HEIGHT_PX, CROP_PX, FULL_PX = 256, (256, 384), (256, 1242)  # rows that the lidar reaches
@@ -26,10 +26,9 @@ CAMERA = "image_02"
 
 
 def make_set(data, method, keys, out, window):
-    """Run again, `densify dataset` makes only what is not there yet."""
-    command = ["--data", data, "--method", method, "--keys", keys, "--window", str(window)]
-    command += ["--camera", CAMERA, "--layout", "kitti-depth", "--out", str(out)]
-    subprocess.run([sys.executable, "-m", "densify", "dataset", *command], check=True)
+    """Run again, it makes only what is not there yet."""
+    recipe = Recipe(window=window, method=method, cameras=(CAMERA,))
+    make_dataset([data], out, slice(*map(int, keys.split(":"))), recipe)
     return out
 
 
@@ -145,7 +144,7 @@ def main():
         method: make_set(options.data, method, options.keys, options.out / method, options.window)
         for method in ("icp", "flow")
     }
-    test = make_set(options.test, "icp", options.test_keys, options.out / "test", 1)
+    test = make_set(options.test, "none", options.test_keys, options.out / "test", 1)
     truth = densify.open_sequence(options.test).truth
     print(f"{'':14}{'all':^23}  {'moving':^23}  {'static':^23}")
     print(f"{'trained on':<14}" + "  ".join([f"{'MAE m  RMSE m outliers':>23}"] * 3))
