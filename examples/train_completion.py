@@ -13,7 +13,7 @@ from pathlib import Path
 
 import torch
 from torch import nn
-from torch.nn.functional import avg_pool2d, interpolate
+from torch.nn.functional import avg_pool2d, interpolate, max_pool2d
 from torch.utils.data import DataLoader
 
 import densify
@@ -35,7 +35,7 @@ def make_set(data, method, keys, out, window):
 def interpolated(sparse_log):
     """(N,1,H,W) log depth, 0 none -> the same without holes: each filled by the smallest square of
     a pyramid that holds a return."""
-    weight = (sparse_log != 0).float()
+    weight = (sparse_log > 0).float()
     levels = [(sparse_log, weight)]
     while max(levels[-1][0].shape[2:]) > 1:
         levels.append(tuple(avg_pool2d(x, 2, ceil_mode=True) for x in levels[-1]))
@@ -46,6 +46,18 @@ def interpolated(sparse_log):
     return dense
 
 
+def choices(sparse_log):
+    """(N,1,H,W) log depth, 0 none -> (N,5,H,W) what the pixel may show: interpolated, and the
+    nearest and the farthest return of two neighbourhoods."""
+    base = interpolated(sparse_log)
+    there, layers = sparse_log > 0, [base]
+    for size in (7, 15):
+        for sign in (-1, 1):
+            most = max_pool2d(torch.where(there, sign * sparse_log, -99.0), size, 1, size // 2)
+            layers.append(torch.where(most > -99, sign * most, base))
+    return torch.cat(layers, 1)
+
+
 def conv(inputs, outputs, stride=1):
     layer = nn.Conv2d(inputs, outputs, 3, stride, 1)
     nn.init.kaiming_normal_(layer.weight, 0.1)
@@ -53,29 +65,37 @@ def conv(inputs, outputs, stride=1):
 
 
 class Completion(nn.Module):
-    """A small U-Net that corrects the interpolated depth of one sweep by what the image shows."""
+    """A small U-Net at half the resolution, which weighs what a pixel may show."""
 
     def __init__(self, widths=(16, 24, 32, 32)):
         super().__init__()
-        levels = list(pairwise((5, *widths)))
+        levels = list(pairwise(widths))
+        self.first = conv(3 + 5 + 1, widths[0])
         self.down = nn.ModuleList(conv(a, b, 2) for a, b in levels)
-        self.up = nn.ModuleList(conv(b + a, max(a, 12)) for a, b in levels)
-        self.last = nn.Conv2d(12, 1, 3, 1, 1)
+        self.up = nn.ModuleList(conv(b + a, a) for a, b in levels)
+        self.last = nn.Conv2d(widths[0], 5 + 1, 3, 1, 1)
         nn.init.zeros_(self.last.weight)
-        nn.init.zeros_(self.last.bias)
+        with torch.no_grad():  # untrained, it interpolates
+            self.last.bias.copy_(torch.tensor([4.0, 0, 0, 0, 0, 0]))
 
     def forward(self, image, sparse_m):
         """(N,3,H,W), (N,1,H,W) -> (N,1,H,W) metres."""
-        sparse_log = torch.where(sparse_m > 0, sparse_m.clamp(min=1.0).log() + 1e-6, 0.0)
-        base = interpolated(sparse_log)
-        x = torch.cat([image - 0.5, base / 4, (sparse_m > 0).float()], 1)
+        sparse_log = (sparse_m + 1e-3).clamp(min=1.0).log()  # 0 none: all returns are beyond 1 m
+        half_log = max_pool2d(torch.where(sparse_log > 0, -sparse_log, -99.0), 2, ceil_mode=True)
+        half_log = torch.where(half_log > -99, -half_log, 0.0)
+        depths = choices(half_log)
+        colours = interpolate(image, half_log.shape[2:], mode="area") - 0.5
+        shifts = depths[:, 1:] - depths[:, :1]
+        x = self.first(torch.cat([colours, depths[:, :1] / 4, shifts, (half_log > 0).float()], 1))
         skips = []
         for down in self.down:
             skips.append(x)
             x = down(x)
         for up, skip in zip(reversed(self.up), reversed(skips), strict=True):
             x = up(torch.cat([interpolate(x, skip.shape[2:], mode="bilinear"), skip], 1))
-        return (base + self.last(x)).clamp(0, 5).exp()
+        x = self.last(x)
+        log_m = (x[:, :5].softmax(1) * depths).sum(1, keepdim=True) + x[:, 5:]
+        return interpolate(log_m, image.shape[2:], mode="bilinear").clamp(0, 5).exp()
 
 
 def trained(network, folder, steps, seed, filled):
@@ -93,8 +113,8 @@ def trained(network, folder, steps, seed, filled):
             if step == steps:
                 break
             target_m = batch["dense_depth_m"]
-            off_m = network(batch["image"], batch["sparse_depth_m"]) - target_m
-            loss = off_m[target_m > 0].abs().mean()
+            ratio = network(batch["image"], batch["sparse_depth_m"]) / target_m.clamp(min=1.0)
+            loss = ratio[target_m > 0].log().abs().mean()
             optimiser.zero_grad()
             loss.backward()
             optimiser.step()
