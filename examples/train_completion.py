@@ -8,7 +8,7 @@ python examples/train_completion.py [--data SPEC] [--test SPEC] [--keys A:B:S] [
 
 import argparse
 import copy
-from itertools import pairwise
+from itertools import count, islice, pairwise
 from pathlib import Path
 
 import torch
@@ -98,29 +98,29 @@ class Completion(nn.Module):
         return interpolate(log_m, image.shape[2:], mode="bilinear").clamp(0, 5).exp()
 
 
+def batches(dataset, seed):
+    """For ever; every epoch in another order, and cut and mirrored anew."""
+    order = torch.Generator().manual_seed(seed)
+    loader = DataLoader(dataset, 4, shuffle=True, generator=order)
+    for epoch in count():
+        dataset.set_epoch(epoch)
+        yield from loader
+
+
 def trained(network, folder, steps, seed, filled):
     """A copy of the network after some steps on the maps of a set."""
     network = copy.deepcopy(network).train()
     dataset = densify.DepthDataset(folder, filled=filled, crop=CROP_PX, flip=True, seed=seed)
-    order = torch.Generator().manual_seed(seed)
-    loader = DataLoader(dataset, 2, shuffle=True, drop_last=len(dataset) > 1, generator=order)
-    optimiser = torch.optim.Adam(network.parameters(), lr=3e-3)
-    schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, 3e-3, total_steps=steps)
-    step, epoch = 0, 0
-    while step < steps:
-        dataset.set_epoch(epoch)
-        for batch in loader:
-            if step == steps:
-                break
-            target_m = batch["dense_depth_m"]
-            ratio = network(batch["image"], batch["sparse_depth_m"]) / target_m.clamp(min=1.0)
-            loss = ratio[target_m > 0].log().abs().mean()
-            optimiser.zero_grad()
-            loss.backward()
-            optimiser.step()
-            schedule.step()
-            step += 1
-        epoch += 1
+    optimiser = torch.optim.Adam(network.parameters())
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, 6e-3, total_steps=steps)
+    for batch in islice(batches(dataset, seed), steps):
+        target_m = batch["dense_depth_m"]
+        ratio = network(batch["image"], batch["sparse_depth_m"]) / target_m.clamp(min=1.0)
+        loss = ratio[target_m > 0].log().abs().mean()
+        optimiser.zero_grad()
+        loss.backward()
+        optimiser.step()
+        schedule.step()
     return network.eval()
 
 

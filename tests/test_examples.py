@@ -53,18 +53,22 @@ def test_kitti(test_data: Path, tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
-def simulated(out: Path, seed: int, frames: range) -> str:
-    """Few sweeps of a street as a recording, with its truth."""
-    return str(write_kitti_tree(Street("street", seed, "vlp16"), out, frames, ["image_02"]))
-
-
 def test_train_completion(tmp_path: Path) -> None:
-    train = simulated(tmp_path / "train", 0, range(110, 114))
-    test = simulated(tmp_path / "test", 1, range(110, 113))
+    street = Street("street", 0, "vlp16")
+    drive = write_kitti_tree(street, tmp_path, range(110, 113), ["image_02"])
     text = output_of(
         "train_completion.py",
         tmp_path,
-        *("--data", train, "--test", test, "--keys", "111:113", "--test-keys", "111:112"),
+        *(
+            "--data",
+            str(drive),
+            "--test",
+            str(drive),
+            "--keys",
+            "111:112",
+            "--test-keys",
+            "111:112",
+        ),
         *("--window", "1", "--steps", "2"),
     )
     rows = re.findall(r"^(nothing|icp, seed 0|flow, seed 0)  +(.*)$", text, re.MULTILINE)
