@@ -11,6 +11,8 @@ from scipy.spatial.transform import Rotation
 if TYPE_CHECKING:
     from densify.types import Float
 
+_ROWS = 8192  # at once: for more, OpenBLAS wakes threads that spin longer than the work takes
+
 
 def inverse(T_a_b: Float) -> Float:
     """(4,4) -> (4,4) ``T_b_a``."""
@@ -22,7 +24,20 @@ def inverse(T_a_b: Float) -> Float:
 
 def transform(T_a_b: Float, points_b: Float) -> Float:
     """(4,4), (N,3) -> (N,3) points in a."""
-    return points_b @ T_a_b[:3, :3].T + T_a_b[:3, 3]
+    return _product(points_b, T_a_b[:3, :3]) + T_a_b[:3, 3]
+
+
+def rotate(T_a_b: Float, vectors_b: Float) -> Float:
+    """(4,4), (N,3) -> (N,3) vectors in a."""
+    return _product(vectors_b, T_a_b[:3, :3])
+
+
+def _product(vectors: Float, R: Float) -> Float:
+    """(N,3), (3,3) -> (N,3)."""
+    product = np.empty(vectors.shape)
+    for i in range(0, len(vectors), _ROWS):
+        np.matmul(vectors[i : i + _ROWS], R.T, out=product[i : i + _ROWS])
+    return product
 
 
 def log(T_a_b: Float) -> Float:

@@ -94,12 +94,16 @@ class Views:
         origins = {f: stretch.T_target_source(key, f)[:3, 3] for f in stretch.frames}
         return Views(key, key_image, exposures, origins, settings.project)
 
-    def depth(self, cloud: Cloud, visible: bool = True) -> dict[str, DepthMap]:
-        """By camera. visible: leave out what is hidden, vetoed or doubtful."""
+    def depth(self, cloud: Cloud, visible: bool = True, filled: bool = True) -> dict[str, DepthMap]:
+        """By camera. visible: leave out what is hidden, vetoed or doubtful. filled: and fill
+        between what is measured."""
         settings = replace(self.settings, visibility=visible)
         surface = patches(cloud, self.key, settings, self.origins, self.key_image)
         return {
-            name: project(cloud.after(e.late_s), e.camera, e.T_cam_key, settings, self.key, surface)
+            name: project(
+                *(cloud.after(e.late_s), e.camera, e.T_cam_key, settings, self.key, surface),
+                filled,
+            )
             for name, e in self.exposures.items()
         }
 
@@ -182,8 +186,8 @@ class HeldOut:
         """cloud: says what moves in the key sweep, and how fast."""
         views = replace(views, key_image=None)  # what is held out must not help
         own = cloud.select(cloud.frame == views.key)
-        key_alone = views.depth(own)
-        movers = views.depth(own.select(own.moving))
+        key_alone = views.depth(own, filled=False)
+        movers = views.depth(own.select(own.moving), filled=False)
         moving = {
             name: (maps.depth_m > 0) & (maps.depth_m == key_alone[name].depth_m)
             for name, maps in movers.items()

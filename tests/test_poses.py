@@ -94,3 +94,13 @@ def test_interpolate_extrapolates():
     np.testing.assert_allclose(beyond, [0, 0, 0.4, 2, 0, 0], atol=1e-12)
     before = poses.log(poses.interpolate(A, B, -1.0))
     np.testing.assert_allclose(before, [0, 0, -0.2, -1, 0, 0], atol=1e-12)
+
+
+@pytest.mark.parametrize("n", [0, 1, 8192, 20_001])
+def test_many_points_are_carried_as_each_by_itself(n):
+    T, points = poses.exp(np.array([0.3, -0.2, 1.0, 5, -3, 2])), np.arange(3.0 * n).reshape(n, 3)
+    one_by_one = np.array([T[:3, :3] @ p for p in points]).reshape(n, 3)
+    np.testing.assert_allclose(poses.rotate(T, points), one_by_one, rtol=1e-12, atol=1e-9)
+    np.testing.assert_allclose(
+        poses.transform(T, points), one_by_one + T[:3, 3], rtol=1e-12, atol=1e-9
+    )

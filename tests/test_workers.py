@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import logging
 import os
+import pickle
 import random
 import re
 import signal
@@ -12,6 +13,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -20,7 +22,7 @@ import pytest
 import worker_tasks
 
 import densify
-from densify.dataset import pools, workers
+from densify.dataset import calls, pools, workers
 from densify.dataset.tasks import Outcome, Task, Workers, run_tasks
 from densify.dataset.workers import open_workers
 from densify.errors import ComputationError, InputError
@@ -151,6 +153,16 @@ def test_what_workers_log_is_logged_here(
     assert {record.levelno for record in told} == {logging.WARNING}
 
 
+def test_a_worker_at_two_tasks_keeps_their_logs_apart() -> None:
+    """Dask workers that others started may have several threads."""
+    with ThreadPoolExecutor(2) as threads:
+        works = [pickle.dumps((worker_tasks.warn_together, (n,))) for n in range(2)]
+        answers = list(threads.map(calls._call_pickled, works, [logging.INFO] * 2))
+    for number, answer in enumerate(answers):
+        _, error, _, records = pickle.loads(answer)
+        assert error is None and [r.getMessage() for r in records] == [str(number)]
+
+
 def test_where_a_task_failed_is_in_the_debug_log(
     everywhere: Workers, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -212,84 +224,6 @@ def test_cores_are_shared_out(kind: str, monkeypatch: pytest.MonkeyPatch) -> Non
     assert pools.share_of_cores(8)["OMP_NUM_THREADS"] == "1"
 
 
-class OneAtATime(Workers):
-    """Slots that come and go, each task over only when the test says so."""
-
-    def __init__(self, slots: list[int]) -> None:
-        self.slots, self.in_work, self.started = slots, [], []
-
-    def num_slots(self) -> int:
-        return self.slots.pop(0) if len(self.slots) > 1 else self.slots[0]
-
-    def submit(self, task: Task) -> None:
-        self.in_work.append(task)
-        self.started.append(task.name[0])
-
-    def next_over(self, wait_s: float) -> Outcome | None:
-        if not self.in_work:
-            return None
-        return Outcome(self.in_work.pop(0).name, None, None)
-
-
-def named(*tasks: tuple[str, str]) -> list[Task]:
-    """Names and one letter for each need; upper case comes first in no order but the list's."""
-    return [
-        Task((n,), worker_tasks.process, (), frozenset((m,) for m in needs)) for n, needs in tasks
-    ]
-
-
-def test_order_is_the_lists_among_the_ready() -> None:
-    tasks = named(("z", ""), ("y", "x"), ("d", ""), ("x", ""), ("c", ""), ("b", "z"), ("a", ""))
-    order = OneAtATime([1])
-    assert [o.name[0] for o in run_tasks(tasks, order)] == order.started == list("zdxycba")
-
-
-def test_no_more_in_work_than_there_are_workers() -> None:
-    found = OneAtATime([0, 0, 2, 2, 1, 1, 1, 3])
-    most = []
-    for _ in run_tasks(named(*((c, "") for c in "abcdefghij")), found):
-        most.append(len(found.in_work))
-    assert found.started == list("abcdefghij")
-    assert max(most[:2]) == 2 and most[2] == 1 and max(most) == 3
-
-
-def test_many_tasks_are_no_burden() -> None:
-    """Every task is looked at a few times, not once for every other."""
-    looks = 0
-
-    class Counted(tuple):  # type: ignore[type-arg]
-        def __hash__(self) -> int:
-            nonlocal looks
-            looks += 1
-            return super().__hash__()
-
-    names = [Counted((kind, n)) for kind in "red" for n in range(1000)]
-    of = {tuple(name): name for name in names}
-    tasks = [
-        Task(of["d", n], worker_tasks.process, (), frozenset({of["e", n]})) for n in range(1000)
-    ]
-    tasks += [
-        Task(of["e", n], worker_tasks.process, (), frozenset({of["r", n]})) for n in range(1000)
-    ]
-    tasks += [Task(of["r", n], worker_tasks.process) for n in range(1000)]
-    assert sum(1 for _ in run_tasks(tasks, OneAtATime([8]))) == 3000
-    assert looks < 30 * len(tasks)
-
-
-@pytest.mark.parametrize(
-    ("tasks", "words"),
-    [
-        (named(("a", ""), ("a", "")), "same name"),
-        (named(("a", "b")), "'b'.* not in the list"),
-        (named(("a", "b"), ("b", "a")), "cycle"),
-    ],
-    ids=["double", "unknown", "circle"],
-)
-def test_lists_that_make_no_sense(tasks: list[Task], words: str) -> None:
-    with pytest.raises(ValueError, match=words):
-        next(run_tasks(tasks, OneAtATime([1])))
-
-
 def test_no_workers_are_refused() -> None:
     with pytest.raises(InputError, match=r"workers: got 0, expected 1 or more"), open_workers(0):
         pass
@@ -344,7 +278,9 @@ def scheduler(tmp_path: Path) -> Iterator[tuple[str, subprocess.Popen[bytes]]]:
     """Address and process of a Dask scheduler that has two workers of its own."""
     place = tmp_path / "scheduler.json"
     home = Path(densify.__file__).parents[1]
-    environment = os.environ | {"PYTHONPATH": f"{home}:{Path(__file__).parent}"}
+    environment = os.environ | {
+        "PYTHONPATH": os.pathsep.join([str(home), str(Path(__file__).parent), *sys.path])
+    }
     dask = [sys.executable, "-m", "dask"]
     started = []
 
@@ -428,11 +364,17 @@ cli.script()
 """
 
 
-def command(kind: str, plan: str, folder: Path) -> subprocess.Popen[str]:
+@contextmanager
+def command(kind: str, plan: str, folder: Path) -> Iterator[subprocess.Popen[str]]:
     """A command line of ours that has two workers, in a terminal session of its own."""
     arguments = [sys.executable, "-c", MAIN, kind, plan, str(folder), str(Path(__file__).parent)]
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
-    return subprocess.Popen(arguments, text=True, start_new_session=True, **pipes)
+    with subprocess.Popen(arguments, text=True, start_new_session=True, **pipes) as process:
+        try:
+            yield process
+        finally:
+            with suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGKILL)
 
 
 @pytest.mark.parametrize("kind", ELSEWHERE)

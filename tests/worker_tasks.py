@@ -7,6 +7,7 @@ import logging
 import os
 import signal
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -39,6 +40,16 @@ def warn(text: str) -> None:
     log.debug("not asked for")
     log.warning("%s by %d", text, os.getpid())
     raise ValueError(text)
+
+
+def warn_together(number: int) -> None:
+    """By two threads of this process, at the same time."""
+    _TOGETHER.wait(30)
+    logging.getLogger("densify").warning("%d", number)
+    _TOGETHER.wait(30)
+
+
+_TOGETHER = threading.Barrier(2)
 
 
 def note(folder: Path, name: str, needs: list[str]) -> list[str]:

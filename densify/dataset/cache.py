@@ -47,7 +47,7 @@ class Cache:
         """
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of entries that cannot be kept or read
-            made: T = self._made(stage, digest((_code(), inputs)), make)
+            made: T = self._made(stage, digest((code(), inputs)), make)
         return made
 
     def trim(self) -> None:
@@ -85,7 +85,7 @@ def _made(stage: str, inputs: str, make: Callable[[], Any]) -> Any:
 
 
 @cache
-def _code() -> str:
+def code() -> str:
     """Of this package: another version may make something else of the same inputs."""
     package = Path(densify.__file__).parent
     sources = sorted(package.rglob("*.py"))

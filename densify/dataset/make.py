@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from densify.config import as_mapping
+from densify.dataset.cache import code
 from densify.dataset.drive import BLOCK, margin
 from densify.dataset.manifest import Key, KeyRecord, Manifest, finished, read_manifests
 from densify.dataset.plan import PlannedDrive, Recipe, plan, planned_keys, read_plan, write_plan
@@ -22,6 +23,7 @@ from densify.errors import ComputationError, InputError, OutputError
 from densify.output.atomic import clear_leftovers
 from densify.output.kitti_tree import write_readme
 from densify.readers import open_sequence
+from densify.readers.files import format_frames
 
 _log = logging.getLogger("densify")
 
@@ -112,7 +114,7 @@ def make_dataset(
                 task
                 for drive in left
                 for task in tasks(
-                    Job(drive.source, recipe, out.absolute(), cache_bytes), drive.keys
+                    Job(drive.source, recipe, out.absolute(), cache_bytes, code()), drive.keys
                 )
             ]
             try:
@@ -261,7 +263,8 @@ def _line(record: KeyRecord, summary: Summary) -> str:
     left_s = summary.seconds_left or 0.0
     told = f" ({record.reason})" if record.reason else ""
     return (
-        f"key {record.key} of {record.drive}: {record.status}{told}, {record.seconds:.1f} s; "
+        f"key {record.key} of {record.drive}: {record.status}{told}, "
+        f"frames {format_frames(record.frames) or 'none'}, {record.seconds:.1f} s; "
         f"{len(summary.records)} of {summary.num_keys}, "
         f"{summary.seconds / summary.num_made:.2f} s a key, {left_s / 60:.1f} min left"
     )

@@ -6,6 +6,7 @@ first what the keys of a block share, then its keys one by one.
 from __future__ import annotations
 
 import logging
+import platform
 import time
 import traceback
 from collections.abc import Iterator, Mapping, Sequence
@@ -15,7 +16,7 @@ from pathlib import Path
 
 from densify import pipeline
 from densify.config import as_mapping
-from densify.dataset.cache import Cache
+from densify.dataset.cache import Cache, code
 from densify.dataset.drive import BLOCK, Drive
 from densify.dataset.gate import scores_of
 from densify.dataset.manifest import KeyRecord
@@ -34,12 +35,14 @@ _log = logging.getLogger("densify")
 
 @dataclass(frozen=True)
 class Job:
-    """What every task of a recording has to know. cache_bytes: bound of the cache."""
+    """What every task of a recording has to know. cache_bytes: bound of the cache. code: of the
+    densify that gave it out."""
 
     source: Source
     recipe: Recipe
     out: Path
     cache_bytes: int
+    code: str
 
 
 def tasks(job: Job, keys: Sequence[int]) -> Iterator[Task]:
@@ -158,6 +161,11 @@ def _sequence(data: str) -> LidarSequence:
 
 @lru_cache(maxsize=1)
 def _opened(job: Job) -> tuple[Drive, Cache]:
+    if job.code != code():
+        raise ComputationError(
+            f"the worker on {platform.node()} has another densify than the one that gave it the "
+            f"work; install the same on both"
+        )
     cache = Cache(job.cache_bytes)
     drive = Drive(_sequence(job.source.data), job.recipe.config, job.recipe.window, cache)
     return drive, cache

@@ -72,7 +72,9 @@ class FreeSpace:
             poses.transform(T_lidar_world, points),
             _MARGIN_M,
             _MARGIN_FRACTION,
-            velocity_m_s=None if velocity_m_s is None else velocity_m_s @ T_lidar_world[:3, :3].T,
+            velocity_m_s=None
+            if velocity_m_s is None
+            else poses.rotate(T_lidar_world, velocity_m_s),
         )
 
 

@@ -291,8 +291,9 @@ def _contradicted(
 ) -> float:
     """The largest share of the points, moved with the track, that another sweep sees through."""
     shares = [0.0]
+    body = track.undo(seen.points[rows], seen.time_s[rows])
     for j in space.others(i):
-        carried = track.carry(seen.points[rows], seen.time_s[rows], time_s[j])
+        carried = track.place(body, time_s[j])
         velocity_m_s = track.velocity_m_s(carried, time_s[j])
         shares.append(float(space.seen_through(carried, j, velocity_m_s).mean()))
     return max(shares)

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from densify.kernels.clouds import spread
 from densify.types import Float
 
 _MAX_SPEED_M_S = 38.0
@@ -35,14 +36,12 @@ class DistanceField:
         low = points.min(0) - 2 * reach
         shape = tuple(np.ceil((points.max(0) + 2 * reach - low) / step).astype(int) + 1)
         nearness = np.zeros(shape, np.uint8)
-        occupied = np.unique(((points - low) / step).astype(np.int32), axis=0)
         n = int(np.ceil(reach / step))
         span = np.arange(-n, n + 1)
         offsets = np.stack(np.meshgrid(span, span, span, indexing="ij"), -1).reshape(-1, 3)
         far = np.linalg.norm(offsets, axis=1) * step / reach
-        for offset, d in zip(offsets[far < 1], far[far < 1], strict=True):
-            at = tuple((occupied + offset).T)
-            nearness[at] = np.maximum(nearness[at], np.uint8(255 - round(255 * d)))
+        values = (255 - np.round(255 * far[far < 1])).astype(np.uint8)
+        spread(points, low, step, offsets[far < 1], values, nearness)
         return DistanceField(nearness, low)
 
     def __call__(self, points: Float) -> Float:

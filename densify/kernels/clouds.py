@@ -4,9 +4,12 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from densify.kernels import Kernel
 from densify.types import Float, Int
+
+Bytes = NDArray[np.uint8]
 
 
 def rows_inside(points: Float, low: Float, high: Float) -> Int:
@@ -27,6 +30,26 @@ def surface_information(
     information = np.empty((len(points), 5))
     _invert.over_rows(len(points), points, near, loose, noise_m * noise_m, ridge, information)
     return information
+
+
+@Kernel
+def spread(
+    points: Float, low: Float, step: float, offsets: Int, values: Bytes, grid: Bytes
+) -> None:
+    """Raise, in place, the cells around each point to the values.
+
+    points: (N,3). low: (3,) the grid's corner. step: a cell's side. offsets: (K,3) cells from the
+    point's own; none may lead out of the grid (X,Y,Z). values: (K,).
+    """
+    for i in range(len(points)):
+        x, y, z = (
+            int((points[i, 0] - low[0]) / step),
+            int((points[i, 1] - low[1]) / step),
+            int((points[i, 2] - low[2]) / step),
+        )
+        for k in range(len(offsets)):
+            at = x + offsets[k, 0], y + offsets[k, 1], z + offsets[k, 2]
+            grid[at] = max(grid[at], values[k])
 
 
 @Kernel

@@ -32,10 +32,10 @@ def accumulate(stretch: Stretch, fields: Sequence[FlowField], key: int, drop_los
         rigid = poses.transform(T_key_lidar, sweep.points)
         points = rigid.copy()
         moves = flow.moving & ~flow.lost
-        points[moves] += flow.total[moves] @ T_key_lidar[:3, :3].T
+        points[moves] += poses.rotate(T_key_lidar, flow.total[moves])
         velocity_m_s = np.zeros_like(points)
         if flow.velocity_m_s is not None:
-            velocity_m_s[moves] = flow.velocity_m_s[moves] @ T_key_lidar[:3, :3].T
+            velocity_m_s[moves] = poses.rotate(T_key_lidar, flow.velocity_m_s[moves])
         away = abs(registered.frame - key)
         confidence = np.full(len(sweep), max(0.1, 1 - _CONFIDENCE_PER_SWEEP * away))
         confidence[moves & (away > 0)] *= _CONFIDENCE_MOVED

@@ -18,7 +18,7 @@ from densify.config import ProjectSettings
 from densify.depth_fill import fill_between
 from densify.kernels import visibility as kernels
 from densify.pinhole import image_points
-from densify.poses import transform
+from densify.poses import rotate, transform
 from densify.types import Bool, Camera, Cloud, DepthMap, Float, Float32, Int, Patches, Reason
 
 _MAX_HALF_PX = 24.0  # a point just before the lens must not hide the whole image
@@ -71,13 +71,15 @@ def project(
     settings: ProjectSettings,
     key: int,
     patches: Patches,
+    filled: bool = True,
 ) -> DepthMap:
     """The depth map that ``camera`` sees of ``cloud``.
 
     T_cam_key: (4,4), with the ego motion from the key's reference time to the camera's own.
     settings: knobs, see `densify.config.ProjectSettings`; with ``visibility`` off the nearest point
     of each pixel is taken as it is. key: the key frame; the source sweep nearest to it in time wins
-    a pixel. patches: of the cloud, at the key's moment (`densify.stages.patches.patches`).
+    a pixel. patches: of the cloud, at the key's moment (`densify.stages.patches.patches`). filled:
+    False leaves out the filling, which takes its time.
 
     Points with z ≤ 0.1 m, outside the image or outside the lens's valid field of view are dropped.
     ``filled_m`` adds pixels interpolated between measured ones (`densify.depth_fill.fill_between`).
@@ -105,6 +107,8 @@ def project(
     depth_m.flat[seen.pixel] = seen.depth_m
     confidence.flat[seen.pixel] = np.maximum(seen.confidence, _LEAST_CONFIDENCE)
     frame.flat[seen.pixel] = points.frame[seen.winner]
+    if not filled:
+        return DepthMap(camera.name, depth_m, depth_m, confidence, frame, reason)
     filled_m, filled_confidence = fill_between(
         depth_m,
         confidence,
@@ -121,14 +125,15 @@ def project(
 def _in_image(
     cloud: Cloud, camera: Camera, T_cam_key: Float, patches: Patches, vetoed: bool
 ) -> _InImage:
-    ahead = cloud.points @ T_cam_key[2, :3] + T_cam_key[2, 3] > 0
+    points_cam = transform(T_cam_key, cloud.points)
+    ahead = points_cam[:, 2] > 0
     index = np.flatnonzero(ahead & ~patches.free if vetoed else ahead)
-    points_cam = transform(T_cam_key, cloud.points[index])
+    points_cam = points_cam[index]
     uv, seen = image_points(camera, points_cam)
     index, points_cam, uv = index[seen], points_cam[seen], uv[seen]
     depth = points_cam[:, 2].astype(np.float32)
     focal_px = camera.K[[0, 1], [0, 1]]
-    normal = patches.normal[index].astype(np.float64) @ T_cam_key[:3, :3].T
+    normal = rotate(T_cam_key, patches.normal[index].astype(np.float64))
     # On the plane n · p = d the inverse depth is n · ray / d: linear over the image.
     d = np.einsum("ij,ij->i", normal, points_cam)
     with np.errstate(divide="ignore", invalid="ignore"):
