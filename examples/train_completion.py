@@ -18,7 +18,6 @@ from torch.utils.data import DataLoader
 
 import densify
 from densify.dataset.make import make_dataset
-from densify.dataset.plan import Recipe
 from densify.depth_metrics import depth_errors, mean_errors
 
 HEIGHT_PX, CROP_PX, FULL_PX = 256, (256, 384), (256, 1242)  # rows that the lidar reaches
@@ -27,8 +26,8 @@ CAMERA = "image_02"
 
 def make_set(data, method, keys, out, window):
     """Run again, it makes only what is not there yet."""
-    recipe = Recipe(window=window, method=method, cameras=(CAMERA,))
-    make_dataset([data], out, slice(*map(int, keys.split(":"))), recipe)
+    recipe = densify.Recipe(window=window, method=method, cameras=(CAMERA,))
+    densify.make_dataset([data], out, slice(*map(int, keys.split(":"))), recipe)
     return out
 
 
