@@ -8,6 +8,7 @@ python examples/train_completion.py [--data SPEC] [--test SPEC] [--keys A:B:S] [
 
 import argparse
 import copy
+import sys
 from itertools import count, islice, pairwise
 from pathlib import Path
 
@@ -17,7 +18,6 @@ from torch.nn.functional import avg_pool2d, interpolate, max_pool2d
 from torch.utils.data import DataLoader
 
 import densify
-from densify.dataset.make import make_dataset
 from densify.depth_metrics import depth_errors, mean_errors
 
 HEIGHT_PX, CROP_PX, FULL_PX = 256, (256, 384), (256, 1242)  # rows that the lidar reaches
@@ -26,6 +26,7 @@ CAMERA = "image_02"
 
 def make_set(data, method, keys, out, window):
     """Run again, it makes only what is not there yet."""
+    print(f"making {out}", file=sys.stderr, flush=True)
     recipe = densify.Recipe(window=window, method=method, cameras=(CAMERA,))
     densify.make_dataset([data], out, slice(*map(int, keys.split(":"))), recipe)
     return out
