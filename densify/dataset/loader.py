@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -18,6 +18,8 @@ import torch
 from numpy.typing import NDArray
 from torch.utils.data import Dataset
 
+from densify.dataset.manifest import read_manifests
+from densify.dataset.plan import SCHEMA_VERSION
 from densify.errors import InputError
 from densify.output.depth_png import read_depth_png, read_stored
 from densify.readers import open_sequence
@@ -25,7 +27,6 @@ from densify.readers.files import read_text
 from densify.types import Camera, Float, Float32, LidarSequence
 
 LAYOUT = "kitti-depth"
-_SCHEMA_VERSION = 1
 _SPLITS = ("train", "val")
 _MOST_CERTAIN, _LEAST_CERTAIN = 255, 1  # as stored; 0 is no depth
 
@@ -163,14 +164,14 @@ class DepthDataset(Dataset[dict[str, Any]]):
                 )
 
     def _find_samples(self, cameras: Sequence[str] | None) -> list[_Sample]:
-        done = _done_keys(self._root)
+        done = [r for r in read_manifests(self._root).values() if r.status == "done"]
         samples = [
-            _Sample(name, camera, frame)
-            for (name, frame), files in done.items()
-            if name in self._drives
-            for camera in self._drives[name].cameras
+            _Sample(record.drive, camera, record.key)
+            for record in done
+            if (drive := self._drives.get(record.drive)) is not None
+            for camera in drive.cameras
             if cameras is None or camera in cameras
-            if self._drives[name].path("groundtruth", camera, frame) in files
+            if drive.path("groundtruth", camera, record.key) in record.files
         ]
         if not samples:
             raise InputError(
@@ -263,9 +264,9 @@ def _read_drives(root: Path) -> dict[str, _Drive]:
     try:
         stored = json.loads(read_text(path))
         layout, version = stored["layout"], stored["schema_version"]
-        if version != _SCHEMA_VERSION:
+        if version != SCHEMA_VERSION:
             raise InputError(
-                f"{path}: got schema_version {version}, expected {_SCHEMA_VERSION}; use the "
+                f"{path}: got schema_version {version}, expected {SCHEMA_VERSION}; use the "
                 f"densify that made it, or make the set again"
             )
         if layout != LAYOUT:
@@ -294,35 +295,6 @@ def _drive(entry: Mapping[str, Any]) -> _Drive:
         for name, camera in entry["cameras"].items()
     }
     return _Drive(str(entry["data"]), str(entry["folder"]), cameras)
-
-
-def _done_keys(root: Path) -> dict[tuple[str, int], frozenset[str]]:
-    """(drive, frame) -> files, of the keys whose last line in any manifest says that they are
-    done."""
-    done: dict[tuple[str, int], frozenset[str]] = {}
-    for manifest in sorted(root.glob("manifest*.jsonl")):
-        last = {(record["drive"], record["key"]): record for record in _records(manifest)}
-        done |= {
-            key: frozenset(record["files"])
-            for key, record in last.items()
-            if record["status"] == "done"
-        }
-    return done
-
-
-def _records(manifest: Path) -> Iterator[dict[str, Any]]:
-    """Its whole lines; a writer that was killed leaves a torn one."""
-    try:
-        lines = manifest.read_bytes().splitlines()
-    except OSError as error:
-        raise InputError(f"{manifest}: cannot be read: {error.strerror or error}") from error
-    for line in lines:
-        try:
-            record = json.loads(line)
-        except ValueError:
-            continue
-        if isinstance(record, dict) and {"drive", "key", "status", "files"} <= record.keys():
-            yield record
 
 
 def _check_size(where: str, image: NDArray[Any], camera: Camera) -> None:
