@@ -11,7 +11,11 @@ from pathlib import Path
 import pytest
 
 from densify.dataset import make
+from densify.dataset.cache import Cache
+from densify.dataset.drive import BLOCK, margin
 from densify.dataset.loader import DepthDataset
+from densify.dataset.plan import Recipe, Source
+from densify.dataset.work import Job, tasks
 from densify.errors import InputError
 from tests.command import exit_code, files_in
 from tests.dataset_scenes import (
@@ -166,6 +170,53 @@ def test_a_damaged_set_is_made_whole(border_drive: Path, border_set: Path, tmp_p
     assert story(out) == story(border_set)
     changed = {p for p in out.rglob("*.png") if p.stat().st_mtime_ns != before.get(p)}
     assert keys_of(map(str, changed)) == {38, 41, 42, 44}
+
+
+@pytest.mark.parametrize(
+    "options",
+    [[], ["--method", "icp"], ["--set", "flow.engine=paper"]],
+    ids=" ".join,
+)
+def test_no_task_makes_what_another_is_for(
+    options: list[str], border_drive: Path, empty_cache: Path, tmp_path: Path, monkeypatch
+) -> None:
+    """Else workers would do it several times."""
+    made, get, run_tasks = [], Cache.get, make.run_tasks
+
+    def watched(self, stage, inputs, make):
+        return get(self, stage, inputs, lambda: made.append(stage) or make())
+
+    def watched_tasks(tasks, workers):
+        for outcome in run_tasks(tasks, workers):
+            assert outcome.error is None and set(made) <= {outcome.name[0]}
+            assert sum(task.name == outcome.name for task in tasks) == 1
+            made.clear()
+            yield outcome
+
+    monkeypatch.setattr(Cache, "get", watched)
+    monkeypatch.setattr(make, "run_tasks", watched_tasks)
+    arguments = [*OPTIONS, *options, "--keys", "39:41", "--out", tmp_path / "out"]
+    assert exit_code("dataset", "--data", border_drive, *arguments) == 0
+    assert statuses(tmp_path / "out") == {39: "done", 40: "done"}
+
+
+@pytest.mark.parametrize("window", [5, 14, 15, 30, 50])
+def test_tasks_wait_for_all_that_they_look_at(window: int) -> None:
+    job = Job(Source("a", "a", "a", ()), Recipe(window), Path("out"), 0, "", "")
+    listed = list(tasks(job, [210, 231]))
+    done = set()
+    for task in listed:
+        assert task.needs <= done
+        done.add(task.name)
+    assert len(done) == len(listed)
+    found = {task.name: task.needs for task in listed}
+    farthest = margin(window) + 1  # sweeps beyond a block
+    blocks = range((200 - farthest) // BLOCK, (219 + farthest) // BLOCK + 1)
+    assert {("evidence", "a", b) for b in blocks} <= found["motion", "a", 10]
+    assert {("registration", "a", b) for b in blocks} <= found["key", "a", 210]
+    assert ("motion", "a", 11) in found["key", "a", 231]
+    assert listed[-1].name == ("key", "a", 231)
+    assert found.keys() > {("key", "a", 210), ("motion", "a", 11)}
 
 
 # As `run`

@@ -17,7 +17,7 @@ from pathlib import Path
 from densify import pipeline
 from densify.config import as_mapping
 from densify.dataset.cache import Cache, code
-from densify.dataset.drive import BLOCK, Drive
+from densify.dataset.drive import BLOCK, Drive, margin
 from densify.dataset.gate import scores_of
 from densify.dataset.manifest import KeyRecord
 from densify.dataset.plan import Recipe, Source
@@ -50,30 +50,31 @@ class Job:
 def tasks(job: Job, keys: Sequence[int]) -> Iterator[Task]:
     """What is left to do for these keys: their records are the outcomes of the tasks named
     ``("key", drive, frame)``. Ordered so that keys come early."""
-    name, moves = job.source.name, _follows(job.recipe)
+    name, last = job.source.name, _last_stage(job.recipe)
     blocks = sorted({key // BLOCK for key in keys})
     known: set[tuple[str, int]] = set()
+    # Each step looks one sweep farther than it has to do with.
+    num_blocks = -(-(margin(job.recipe.window) + 1) // BLOCK)
+
+    def around(block: int, step: int) -> list[int]:
+        num = num_blocks if _STAGES[step] == "motion" else 1
+        return list(range(max(0, block - num), block + num + 1)) if step else []
 
     def stage(step: int, block: int) -> Iterator[Task]:
         what = _STAGES[step]
-        if (what, block) in known or block < 0:
+        if (what, block) in known:
             return
         known.add((what, block))
-        around = [block - 1, block, block + 1] if step else []
-        for b in around:
+        for b in around(block, step):
             yield from stage(step - 1, b)
-        needs = frozenset((_STAGES[step - 1], name, b) for b in around if b >= 0)
+        needs = frozenset((_STAGES[step - 1], name, b) for b in around(block, step))
         yield Task((what, name, block), share, (job, what, block), needs)
 
     for block in blocks:
-        if moves:
-            yield from stage(3, block)
-            needs = frozenset({("motion", name, block)})
-        else:
-            around = [b for b in (block - 1, block, block + 1) if b >= 0]
-            for b in around:
-                yield from stage(0, b)
-            needs = frozenset(("registration", name, b) for b in around)
+        before = [(last, block), *((0, b) for b in around(block, len(_STAGES) - 1))]
+        for step, b in before:
+            yield from stage(step, b)
+        needs = frozenset((_STAGES[step], name, b) for step, b in before)
         for key in keys:
             if key // BLOCK == block:
                 yield Task(("key", name, key), make_key, (job, key), needs)
@@ -152,8 +153,11 @@ def _methods(recipe: Recipe) -> tuple[str, ...]:
     return tuple(dict.fromkeys(["none", recipe.method]))
 
 
-def _follows(recipe: Recipe) -> bool:
-    return recipe.method == "flow" and recipe.config.flow.engine == "groups"
+def _last_stage(recipe: Recipe) -> int:
+    """The last of `_STAGES` that a key needs."""
+    if recipe.method != "flow":
+        return _STAGES.index("registration")
+    return _STAGES.index("motion" if recipe.config.flow.engine == "groups" else "evidence")
 
 
 @lru_cache(maxsize=2)
