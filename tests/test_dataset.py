@@ -79,19 +79,11 @@ def test_keys_do_not_depend_on_which_are_asked_for(
     assert maps_in(out) == {n: d for n, d in maps_in(border_set).items() if keys_of([n]) <= asked}
 
 
-@pytest.mark.parametrize("kind", ["pool", "dask"])
 def test_two_workers_make_what_one_makes(
-    kind: str,
-    border_drive: Path,
-    border_set: Path,
-    empty_cache: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
+    border_drive: Path, border_set: Path, tmp_path: Path, monkeypatch
 ) -> None:
-    if kind == "pool":
-        monkeypatch.setitem(sys.modules, "distributed", None)
-    else:
-        pytest.importorskip("distributed")
+    """Without Dask; those with it are killed in test_dataset_survives.py."""
+    monkeypatch.setitem(sys.modules, "distributed", None)
     out = tmp_path / "out"
     assert exit_code("dataset", "--data", border_drive, *OPTIONS, "--workers", 2, "--out", out) == 0
     in_order(out)
@@ -174,7 +166,7 @@ def test_a_damaged_set_is_made_whole(border_drive: Path, border_set: Path, tmp_p
 
 @pytest.mark.parametrize(
     "options",
-    [[], ["--method", "icp"], ["--set", "flow.engine=paper"]],
+    [[], ["--method", "icp"], ["--set", "flow.engine=paper", "--window", "1"]],
     ids=" ".join,
 )
 def test_no_task_makes_what_another_is_for(

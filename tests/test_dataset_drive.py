@@ -95,7 +95,7 @@ def test_a_recording_within_the_window_is_what_run_makes(
 def test_more_sweeps_around_make_it_no_worse(small_blocks, long_street, tmp_path: Path) -> None:
     drive = drive_of(long_street, tmp_path)
     wrong = Counter()
-    for key in (2, 8, 15):
+    for key in (4, 13):
         alone = pipeline.run(long_street, key, 2, config=GIVEN)
         here = maps_of(drive, long_street, key)
         assert here.frames == alone.frames
@@ -109,7 +109,7 @@ def test_more_sweeps_around_make_it_no_worse(small_blocks, long_street, tmp_path
             wrong[who, "pixels"] += both.sum()
     assert wrong["here", "ghosts"] <= wrong["alone", "ghosts"] + 2
     assert wrong["here", "outliers"] <= wrong["alone", "outliers"] + 2
-    assert wrong["here", "pixels"] > 0.97 * wrong["alone", "pixels"] > 1000
+    assert wrong["here", "pixels"] > 0.97 * wrong["alone", "pixels"] > 500
 
 
 # Whatever is asked for
@@ -117,13 +117,11 @@ def test_more_sweeps_around_make_it_no_worse(small_blocks, long_street, tmp_path
 
 def test_keys_do_not_depend_on_others(small_blocks, long_street, tmp_path: Path) -> None:
     """Nor on their order, nor on what is in memory or on disk already."""
-    keys = [4, 5, 6]
+    keys = [5, 6]
     upward, downward = drive_of(long_street, tmp_path / "a"), drive_of(long_street, tmp_path / "b")
     first = {key: maps_of(upward, long_street, key).depth for key in keys}
     for key in reversed(keys):
         assert_same_maps(maps_of(downward, long_street, key).depth, first[key])
-    alone = drive_of(long_street, tmp_path / "c")
-    assert_same_maps(maps_of(alone, long_street, 6).depth, first[6])
     from_disk = drive_of(long_street, tmp_path / "a")
     assert_same_maps(maps_of(from_disk, long_street, 6).depth, first[6])
 
@@ -147,7 +145,7 @@ def test_neighbouring_blocks_say_the_same_of_what_both_know(
             known = a.moving & b.moving & ~a.lost & ~b.lost
             apart_m.append(np.linalg.norm(a.displacement - b.displacement, axis=1)[known])
         assert num_differing < 0.02 * num_moving
-        assert num_moving > 1000
+        assert num_moving > 500
         median_m, most_m = np.percentile(np.concatenate(apart_m), [50, 90])
         assert median_m < 0.01
         assert most_m < 0.05
