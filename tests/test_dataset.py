@@ -20,11 +20,14 @@ from tests.dataset_scenes import (
     FRAMES,
     OPTIONS,
     across_border,
+    copy_drive,
     in_order,
     keys_of,
     maps_in,
     records,
+    statuses,
     story,
+    sweep_file,
     write_drive,
 )
 
@@ -90,6 +93,27 @@ def test_two_workers_make_what_one_makes(
     in_order(out)
     assert maps_in(out) == maps_in(border_set)
     assert story(out) == story(border_set)
+
+
+def test_a_scheduler_whose_workers_live_on(
+    border_drive: Path, border_set: Path, empty_cache: Path, tmp_path: Path
+) -> None:
+    """What they remember of one run is nothing to the next."""
+    distributed = pytest.importorskip("distributed")
+    drive, out = copy_drive(border_drive, tmp_path / "2011_09_26"), tmp_path / "out"
+    torn = sweep_file(drive, 40)
+    sweep = torn.read_bytes()
+    torn.write_bytes(sweep[:-1])
+    options = {"dashboard_address": "127.0.0.1:0", "threads_per_worker": 1}
+    with distributed.LocalCluster(n_workers=1, **options) as cluster:
+        arguments = ["--data", drive, *OPTIONS, "--scheduler", cluster.scheduler_address]
+        assert exit_code("dataset", *arguments, "--keys", "39:41", "--out", out) == 1
+        assert statuses(out) == {39: "done", 40: "failed"}
+        torn.write_bytes(sweep)
+        assert exit_code("dataset", *arguments, "--keys", "39:41", "--out", out) == 0
+    in_order(out)
+    again = {n: d for n, d in maps_in(out).items() if keys_of([n]) == {40}}
+    assert again == {n: d for n, d in maps_in(border_set).items() if keys_of([n]) == {40}}
 
 
 def test_shards_make_what_one_makes(border_drive: Path, border_set: Path, tmp_path: Path) -> None:

@@ -13,6 +13,7 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from densify.config import resolve
@@ -129,18 +130,24 @@ def workers_of(pid: int) -> list[int]:
 # Sweeps in the way
 
 
-@pytest.mark.parametrize("bad", [BORDER - 1, BORDER + 1])
+@pytest.mark.parametrize(("bad", "how"), [(BORDER - 1, "torn"), (BORDER + 1, "noise")])
 def test_a_corrupt_sweep_costs_its_key_alone(
-    bad: int, border_drive: Path, border_set: Path, tmp_path: Path, capsys
+    bad: int, how: str, border_drive: Path, border_set: Path, tmp_path: Path, capsys
 ) -> None:
     drive = copy_drive(border_drive, tmp_path / "2011_09_26")
     out = tmp_path / "out"
     path = sweep_file(drive, bad)
-    path.write_bytes(path.read_bytes()[:-5])
+    if how == "torn":
+        path.write_bytes(path.read_bytes()[:-5])
+        reason = str(path)
+    else:
+        noise = np.random.default_rng(1).uniform(-40, 40, (8000, 4))
+        path.write_bytes(noise.astype("<f4").tobytes())
+        reason = "registration fails"
     arguments = ["--data", drive, *OPTIONS, "--out", out]
     assert exit_code("dataset", *arguments) == 1
     said, errors = capsys.readouterr()
-    assert f"{drive.name} {bad} failed: " in said and str(path) in said
+    assert f"{drive.name} {bad} failed: " in said and reason in said
     assert errors.splitlines()[-1] == "densify: 1 of 9 keys not made"
     assert "Traceback" not in errors
     assert statuses(out) == {f: "failed" if f == bad else "done" for f in FRAMES}
@@ -184,6 +191,29 @@ def test_a_bug_in_one_key_costs_that_key(
 
 
 GIVEN = {"register": {"source": "dataset"}}
+
+
+def test_interrupted(
+    border_drive: Path, border_set: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys
+) -> None:
+    made = work._made
+
+    def interrupted(job, key):
+        if key == 38:
+            raise KeyboardInterrupt
+        return made(job, key)
+
+    out = tmp_path / "out"
+    arguments = ["--data", border_drive, *OPTIONS, "--out", out]
+    with monkeypatch.context() as patch:
+        patch.setattr(work, "_made", interrupted)
+        assert exit_code("dataset", *arguments) == 130
+    first, last = told(capsys)
+    assert first.endswith("2 of 9 keys are finished and kept") and "interrupted" in last
+    assert statuses(out) == {36: "done", 37: "done"}
+    assert exit_code("dataset", *arguments) == 0
+    in_order(out)
+    assert maps_in(out) == maps_in(border_set)
 
 
 # Disks

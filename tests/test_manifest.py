@@ -188,6 +188,14 @@ def test_done_counts_between_shards(tmp_path: Path, done_in: int) -> None:
     assert list(read_manifests(tmp_path)) == [("0", 7), *((DRIVE, k) for k in (1, 11, 12, 13))]
 
 
+def test_put_aside_counts_more_than_failed_between_shards(tmp_path: Path) -> None:
+    failed, aside = (record(1, status=status, files={}) for status in ("failed", "aside"))
+    for first, second in ((failed, aside), (aside, failed)):
+        write_lines(tmp_path / "manifest-1of2.jsonl", first)
+        write_lines(tmp_path / "manifest.jsonl", second)
+        assert read_manifests(tmp_path)[DRIVE, 1] == aside
+
+
 def test_a_manifest_that_cannot_be_read(tmp_path: Path) -> None:
     (tmp_path / "manifest.jsonl").mkdir()
     with pytest.raises(InputError) as error:

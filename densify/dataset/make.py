@@ -113,8 +113,9 @@ def make_dataset(
         write_plan(out, recipe, drives)
         with _log_file(out, shard):
             clear_leftovers(out)
-            settings = as_mapping(recipe.config)
-            write_readme(out, method=recipe.method, window=recipe.window, settings=settings)
+            if recipe.layout == "kitti-depth":
+                settings = as_mapping(recipe.config)
+                write_readme(out, method=recipe.method, window=recipe.window, settings=settings)
             drives = _part(drives, shard)
             done = _Done(out, drives, report)
             left = done.left(drives)

@@ -103,15 +103,19 @@ def read_manifests(root: Path) -> dict[Key, KeyRecord]:
     """The records of all manifests in a folder, ordered by drive and key.
 
     Of several lines of a key in one file the last one counts; between the files of shards one that
-    is done. A torn last line is passed over, any other damaged line too, with a warning. Raises
-    InputError if a manifest cannot be read.
+    is done, else one put aside. A torn last line is passed over, any other damaged line too, with a
+    warning. Raises InputError if a manifest cannot be read.
     """
     records: dict[Key, KeyRecord] = {}
     for path in sorted(root.glob(_PATTERN)):
         for name, (record, _) in _read(path).items():
-            if name not in records or records[name].status != "done":
+            if name not in records or _rank(record) >= _rank(records[name]):
                 records[name] = record
     return dict(sorted(records.items()))
+
+
+def _rank(record: KeyRecord) -> int:
+    return ("failed", "aside", "done").index(record.status)
 
 
 def is_whole(record: KeyRecord, root: Path) -> bool:

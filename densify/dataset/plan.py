@@ -35,6 +35,8 @@ LAYOUTS = ("kitti-depth", "densify")
 METHODS = ("flow", "icp", "none")
 _FILE = "dataset.json"
 _LARGEST_WINDOW = 50
+_SAME = ("densify", "layout", "method", "window", "cameras", "gate", "config")
+"""Of dataset.json: what a set's runs must agree in."""
 
 
 @dataclass(frozen=True)
@@ -124,7 +126,7 @@ def _keys(sequence: LidarSequence, keys: slice | None, spec: str) -> tuple[int, 
     first, last = min(sequence.frames), max(sequence.frames)
     chosen = tuple(f for f in wanted if first <= f <= last)
     if not chosen or (keys.start < first or wanted[-1] > last):
-        text = f"{keys.start}:{keys.stop}" + (f":{keys.step}" if keys.step else "")
+        text = f"{keys.start}:{keys.stop}" + ("" if keys.step in (None, 1) else f":{keys.step}")
         raise InputError(
             f"--keys {text}: {sequence.name} ({spec}) has {format_frames(sequence.frames)}; "
             f"expected A:B within {first}:{last + 1}, or all"
@@ -166,15 +168,15 @@ def read_plan(out: Path) -> dict[str, Any] | None:
         return None
     try:
         table = json.loads(path.read_text("utf-8"))
-        known: bool = table["schema_version"] == SCHEMA_VERSION
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise InputError(f"{path}: cannot be read: {error}; choose another --out") from error
-    if not known:
-        raise InputError(
-            f"{path}: got schema_version {table['schema_version']}, expected {SCHEMA_VERSION}; "
-            f"it was made by another version of densify"
-        )
-    return dict(table)
+        if table["schema_version"] == SCHEMA_VERSION:
+            planned_keys(table)
+            return {name: table[name] for name in ("schema_version", *_SAME, "drives")}
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise InputError(f"{path}: cannot be read: {error!r}; choose another --out") from error
+    raise InputError(
+        f"{path}: got schema_version {table['schema_version']}, expected {SCHEMA_VERSION}; "
+        f"it was made by another version of densify"
+    )
 
 
 def planned_keys(table: Mapping[str, Any]) -> set[tuple[str, int]]:
@@ -211,7 +213,7 @@ def _table(recipe: Recipe, drives: Sequence[PlannedDrive]) -> dict[str, Any]:
 
 
 def _check_same(out: Path, before: Mapping[str, Any], now: Mapping[str, Any]) -> None:
-    for name in ("densify", "layout", "method", "window", "cameras", "gate", "config"):
+    for name in _SAME:
         if before[name] != now[name]:
             got, expected = now[name], before[name]
             where = name
