@@ -102,10 +102,11 @@ def _standing(points: Float) -> Float:
     """The points above the ground: its rings go with the scanner and hide the motion."""
     if not len(points):
         return points
-    _, cell = np.unique(np.floor(points[:, :2]), axis=0, return_inverse=True)
-    lowest = np.full(int(cell.max()) + 1, np.inf)
-    np.minimum.at(lowest, cell.ravel(), points[:, 2])
-    standing = points[points[:, 2] > lowest[cell.ravel()] + _STANDING_M]
+    cell = np.floor(points[:, :2]).astype(np.int64)
+    cell -= cell.min(0)
+    lowest = np.full(cell.max(0) + 1, np.inf)
+    np.minimum.at(lowest, (cell[:, 0], cell[:, 1]), points[:, 2])
+    standing = points[points[:, 2] > lowest[cell[:, 0], cell[:, 1]] + _STANDING_M]
     return standing if len(standing) else points
 
 
