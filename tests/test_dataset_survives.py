@@ -69,9 +69,10 @@ def kill_at(target: int, out: Path, *arguments: str | Path) -> None:
         process.communicate(timeout=PATIENCE_S)
 
 
-@pytest.mark.parametrize(("workers", "num_kills"), [(1, 3), (2, 2)])
+@pytest.mark.parametrize(("workers", "seed", "num_kills"), [(1, 1, 3), (2, 1, 2)])
 def test_killed_at_any_moment(
     workers: int,
+    seed: int,
     num_kills: int,
     border_drive: Path,
     border_set: Path,
@@ -80,10 +81,10 @@ def test_killed_at_any_moment(
 ) -> None:
     out = tmp_path / "out"
     arguments = ["--data", border_drive, *OPTIONS, "--workers", str(workers)]
-    rng = random.Random(workers)
+    rng = random.Random(seed)
     for _ in range(num_kills):
         before = kept(out) if out.exists() else {}
-        target = (progress(out) if out.exists() else 0) + rng.randint(1, 25)
+        target = (progress(out) if out.exists() else 0) + rng.randint(5, 50)
         kill_at(target, out, *arguments)
         now = kept(out)
         assert {path: now.get(path) for path in before} == before
