@@ -21,6 +21,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from typing import Any
+from uuid import uuid4
 
 import numpy as np
 
@@ -68,18 +69,24 @@ class Evidence:
 class Drive:
     """A recording. Holds little: what was read and made last; the rest is in the cache.
 
-    window: sweeps on each side of the keys. All methods take a block's number unless they say so.
+    window: sweeps on each side of the keys. run: the same for all processes between which no sweep
+    changes; None is by itself. All methods take a block's number unless they say so.
     """
 
     def __init__(
-        self, sequence: LidarSequence, settings: Config, window: int, cache: Cache
+        self,
+        sequence: LidarSequence,
+        settings: Config,
+        window: int,
+        cache: Cache,
+        run: str | None = None,
     ) -> None:
         self._sequence, self._settings, self._window = sequence, settings, window
-        self._cache = cache
+        self._cache, self._run = cache, run or uuid4().hex
         self._frames = frozenset(sequence.frames)
         self._margin = margin(window)
         # What the next step, key or block is likely to ask for again.
-        self._digest = lru_cache(maxsize=None)(self._read_digest)
+        self._digests = lru_cache(maxsize=None)(self._find_digests)
         self.registration = lru_cache(maxsize=8)(self._registration)
         self.images = lru_cache(maxsize=4)(self._images)
         self.evidence = lru_cache(maxsize=4)(self._evidence)
@@ -230,8 +237,28 @@ class Drive:
             found.append((frames, motion))
         return found
 
-    def _read_digest(self, frame: int) -> str:
-        return digest(self._read(frame))
+    def _digest(self, frame: int) -> str:
+        """Of a sweep's content. Raises InputError if it cannot be read."""
+        found = self._digests(frame // BLOCK)[frame]
+        if isinstance(found, InputError):
+            raise found
+        return found
+
+    def _find_digests(self, block: int) -> dict[int, str | InputError]:
+        """By frame; looked up by all processes of a run, which only the first has to read for."""
+
+        def read() -> dict[int, str | InputError]:
+            found: dict[int, str | InputError] = {}
+            for frame in range(block * BLOCK, (block + 1) * BLOCK):
+                if frame in self._frames:
+                    try:
+                        found[frame] = digest(self._read(frame))
+                    except InputError as error:
+                        found[frame] = error
+            return found
+
+        inputs = [self._run, self._sequence.name, self._settings.register, block]
+        return self._cache.get("digests", inputs, read)
 
     def _read(self, frame: int) -> Sweep:
         return next(read_sweeps(self._sequence, [frame], self._settings.register))

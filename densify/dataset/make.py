@@ -38,10 +38,10 @@ _log = logging.getLogger("densify")
 
 CACHE_BYTES = 10 * 1024**3
 """Of what is kept for later runs."""
-_TREE_BYTES_PER_PIXEL = 2.2  # the four maps of a camera
+_TREE_BYTES_PER_PIXEL = 1.8  # the four maps of a camera
 _RUN_BYTES_PER_PIXEL, _CLOUD_BYTES_PER_SWEEP = 8.0, 2.5e6
 # Of a process: what is loaded, and what a point takes in the shared steps and in a key's window.
-_BASE_BYTES, _SHARED_BYTES_PER_POINT, _KEY_BYTES_PER_POINT = 0.45e9, 110, 500
+_BASE_BYTES, _SHARED_BYTES_PER_POINT, _KEY_BYTES_PER_POINT = 0.55e9, 110, 500
 
 
 @dataclass(frozen=True)

@@ -173,5 +173,6 @@ def _opened(job: Job) -> tuple[Drive, Cache]:
             f"work; install the same on both"
         )
     cache = Cache(job.cache_bytes)
-    drive = Drive(_sequence(job.source.data, job.run), job.recipe.config, job.recipe.window, cache)
+    sequence = _sequence(job.source.data, job.run)
+    drive = Drive(sequence, job.recipe.config, job.recipe.window, cache, job.run)
     return drive, cache
