@@ -180,7 +180,9 @@ def test_no_task_makes_what_another_is_for(
 
     def watched_tasks(tasks, workers):
         for outcome in run_tasks(tasks, workers):
-            assert outcome.error is None and set(made) <= {outcome.name[0]}
+            what = outcome.name[0]
+            own = {what, "digests"} if what == "registration" else {what}
+            assert outcome.error is None and set(made) <= own
             assert sum(task.name == outcome.name for task in tasks) == 1
             made.clear()
             yield outcome
