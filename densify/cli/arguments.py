@@ -4,18 +4,30 @@
 from __future__ import annotations
 
 import argparse
-import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
 from densify import __version__
 from densify.cli import verbs
-from densify.config import presets
-
-DATA_HELP = (
-    "a recording's folder, READER:PATH, or the built-in street[:PRESET][?seed=N&sensor=NAME] "
-    "(default: street)"
+from densify.cli.options import (
+    DATA_HELP,
+    add_camera,
+    add_config_options,
+    add_method,
+    add_output_options,
+    add_overwrite,
+    add_short_options,
+    add_verb,
+    add_window,
+    config_epilog,
+    frame_range,
+    key_slice,
+    natural,
+    positive,
+    shard,
+    size_bytes,
+    words,
 )
 
 
@@ -50,62 +62,48 @@ class _Parser(argparse.ArgumentParser):
         self.exit(2, f"densify: {message}; see {self.prog} --help\n")
 
 
-def _add_verb(
-    commands: Any,
-    name: str,
-    verb: Callable[[argparse.Namespace], None],
-    about: str,
-    epilog: str = "",
-) -> argparse.ArgumentParser:
-    parser: argparse.ArgumentParser = commands.add_parser(
-        name, help=about, description=f"{about[0].upper()}{about[1:]}.", epilog=epilog or None
-    )
-    parser.set_defaults(verb=verb)
-    return parser
-
-
 def _add_run(commands: Any) -> None:
-    parser = _add_verb(commands, "run", verbs.run, "densify one key", _config_epilog())
+    parser = add_verb(commands, "run", verbs.run, "densify one key", config_epilog())
     _add_key_options(parser)
-    _add_method(parser)
-    _add_output_options(parser)
+    add_method(parser)
+    add_output_options(parser)
 
 
 def _add_compare(commands: Any) -> None:
     about = "methods side by side, on the same registration"
-    parser = _add_verb(commands, "compare", verbs.compare, about, _config_epilog())
+    parser = add_verb(commands, "compare", verbs.compare, about, config_epilog())
     _add_key_options(parser)
     parser.add_argument(
         "--methods",
-        type=_words,
+        type=words,
         metavar="NAME,…",
         help="of none (the key sweep), icp (registration only), icp-visible (with our visibility), "
         "flow-plain (our scene flow without it), paper (the published scene flow), flow (ours); "
         "default: none,icp,paper,flow",
     )
-    _add_output_options(parser)
+    add_output_options(parser)
 
 
 def _add_dataset(commands: Any) -> None:
-    parser = _add_verb(
+    parser = add_verb(
         commands,
         "dataset",
         verbs.dataset,
         "every key of whole recordings, as a training set",
         "Run again, the same command goes on where it was stopped. Shares are from 0 to 1. "
-        + _config_epilog(),
+        + config_epilog(),
     )
     parser.add_argument(
         "--data", metavar="SPEC", nargs="+", action="extend", help=f"{DATA_HELP}; one or more"
     )
     parser.add_argument(
         "--keys",
-        type=_keys,
+        type=key_slice,
         default="all",
         metavar="all|A:B[:S]",
         help="frames A to B-1, every S-th (default: all)",
     )
-    _add_window(parser)
+    add_window(parser)
     parser.add_argument(
         "--out", metavar="DIR", type=Path, help="the set's folder: a new one, or one to go on with"
     )
@@ -116,8 +114,8 @@ def _add_dataset(commands: Any) -> None:
         help="kitti-depth: the tree of KITTI's depth completion benchmark; densify: what run "
         "writes, for every key (default: kitti-depth)",
     )
-    _add_method(parser)
-    _add_camera(parser)
+    add_method(parser)
+    add_camera(parser)
     parser.add_argument(
         "--split",
         choices=("train", "val"),
@@ -128,8 +126,8 @@ def _add_dataset(commands: Any) -> None:
     parser.add_argument(
         "--status", metavar="DIR", type=Path, help="how far the set in DIR is; makes nothing"
     )
-    _add_short_options(parser)
-    _add_config_options(parser)
+    add_short_options(parser)
+    add_config_options(parser)
 
 
 def _add_gate(parser: argparse.ArgumentParser) -> None:
@@ -152,7 +150,7 @@ def _add_gate(parser: argparse.ArgumentParser) -> None:
         help="of the key sweep's returns that the map made without it misses",
     )
     gate.add_argument(
-        "--min-sweeps", type=_natural, metavar="N", help="in the window, cut at ends and gaps"
+        "--min-sweeps", type=natural, metavar="N", help="in the window, cut at ends and gaps"
     )
 
 
@@ -160,7 +158,7 @@ def _add_workers(parser: argparse.ArgumentParser) -> None:
     work = parser.add_argument_group("where it is made")
     work.add_argument(
         "--workers",
-        type=_natural,
+        type=natural,
         default=1,
         metavar="N",
         help="processes on this machine, a local Dask cluster if densify[cluster] is installed "
@@ -174,16 +172,16 @@ def _add_workers(parser: argparse.ArgumentParser) -> None:
     )
     work.add_argument(
         "--shard",
-        type=_shard,
+        type=shard,
         metavar="i/n",
         help="the i-th of n parts of the work, for machines that share DIR",
     )
     work.add_argument(
-        "--memory", type=_bytes, metavar="SIZE", help="of all processes together, such as 8G"
+        "--memory", type=size_bytes, metavar="SIZE", help="of all processes together, such as 8G"
     )
     work.add_argument(
         "--cache-size",
-        type=_bytes,
+        type=size_bytes,
         default="10G",
         metavar="SIZE",
         help="of what is kept on disk for later runs (default: 10G)",
@@ -192,7 +190,7 @@ def _add_workers(parser: argparse.ArgumentParser) -> None:
 
 def _add_flow(commands: Any) -> None:
     about = "scene flow between two point files, already in one coordinate frame"
-    parser = _add_verb(
+    parser = add_verb(
         commands,
         "flow",
         verbs.flow,
@@ -206,7 +204,7 @@ def _add_flow(commands: Any) -> None:
     )
     parser.add_argument("source", metavar="SOURCE", type=Path, help="points at the first time")
     parser.add_argument("target", metavar="TARGET", type=Path, help="points at the second time")
-    _add_config_options(parser)
+    add_config_options(parser)
     parser.add_argument(
         "--out",
         metavar="F.npz",
@@ -214,11 +212,11 @@ def _add_flow(commands: Any) -> None:
         default=Path("densify-out/flow.npz"),
         help="(default: ./densify-out/flow.npz)",
     )
-    _add_overwrite(parser)
+    add_overwrite(parser)
 
 
 def _add_info(commands: Any) -> None:
-    parser = _add_verb(
+    parser = add_verb(
         commands, "info", verbs.info, "what a recording holds: frames, rate, cameras, stamps, poses"
     )
     parser.add_argument("--data", metavar="SPEC", default="street", help=DATA_HELP)
@@ -226,7 +224,7 @@ def _add_info(commands: Any) -> None:
 
 def _add_simulate(commands: Any) -> None:
     about = "write the built-in street as a KITTI raw tree with exact ground truth"
-    parser = _add_verb(commands, "simulate", verbs.simulate, about)
+    parser = add_verb(commands, "simulate", verbs.simulate, about)
     parser.add_argument("--out", metavar="DIR", type=Path, required=True, help="folder to make")
     parser.add_argument(
         "--preset",
@@ -237,16 +235,16 @@ def _add_simulate(commands: Any) -> None:
     parser.add_argument(
         "--sensor", metavar="NAME", help="the scanner: hdl64, hdl32, vlp16 (default: hdl64)"
     )
-    parser.add_argument("--seed", type=_natural, metavar="N", help="another seed, another street")
+    parser.add_argument("--seed", type=natural, metavar="N", help="another seed, another street")
     parser.add_argument(
-        "--frames", type=_frames, metavar="A:B", help="frames A to B-1 only (default: all)"
+        "--frames", type=frame_range, metavar="A:B", help="frames A to B-1 only (default: all)"
     )
-    _add_camera(parser)
-    _add_overwrite(parser)
+    add_camera(parser)
+    add_overwrite(parser)
 
 
 def _add_export(commands: Any) -> None:
-    parser = _add_verb(
+    parser = add_verb(
         commands,
         "export",
         verbs.export,
@@ -271,11 +269,11 @@ def _add_export(commands: Any) -> None:
         help="drop pixels measured longer before or after the exposure (default: keep all)",
     )
     parser.add_argument("--out", metavar="DIR", type=Path, help="(default: RUN/export)")
-    _add_overwrite(parser)
+    add_overwrite(parser)
 
 
 def _add_evaluate(commands: Any) -> None:
-    parser = _add_verb(
+    parser = add_verb(
         commands,
         "evaluate",
         verbs.evaluate,
@@ -300,18 +298,18 @@ def _add_evaluate(commands: Any) -> None:
     )
     parser.add_argument(
         "--focal-px",
-        type=_positive,
+        type=positive,
         metavar="F",
         help="the camera's fx, for outliers and edges (default: KITTI's, 721.5377)",
     )
     parser.add_argument(
         "--baseline-m",
-        type=_positive,
+        type=positive,
         metavar="B",
         help="stereo baseline that outliers are told by (default: KITTI's, 0.54)",
     )
     parser.add_argument("--out", metavar="FILE.json", type=Path, help="write every number there")
-    _add_overwrite(parser)
+    add_overwrite(parser)
 
 
 def _add_bench(commands: Any) -> None:
@@ -322,7 +320,7 @@ def _add_bench(commands: Any) -> None:
 
 
 def _add_bench_flow(benches: Any) -> None:
-    parser = _add_verb(
+    parser = add_verb(
         benches,
         "flow",
         verbs.bench_flow,
@@ -336,16 +334,16 @@ def _add_bench_flow(benches: Any) -> None:
     )
     parser.add_argument(
         "--key",
-        type=_natural,
+        type=natural,
         action="append",
         dest="keys",
         metavar="K",
         help="frame in the middle; may be given several times (default: 120)",
     )
-    _add_window(parser)
+    add_window(parser)
     parser.add_argument(
         "--methods",
-        type=_words,
+        type=words,
         metavar="NAME,…",
         help="of those below, or all (default: all but paper-adam)",
     )
@@ -356,167 +354,23 @@ def _add_bench_flow(benches: Any) -> None:
     )
     parser.add_argument(
         "--max-points",
-        type=_natural,
+        type=natural,
         default=8000,
         metavar="N",
         help="points that paper, paper-adam and nicp may move; more is slower and finer, 0: all "
         "(default: 8000)",
     )
-    _add_config_options(parser)
+    add_config_options(parser)
     parser.add_argument("--out", metavar="FILE.json", type=Path, help="write every number there")
-    _add_overwrite(parser)
+    add_overwrite(parser)
 
 
 def _add_key_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
-        "--key", type=_natural, required=True, metavar="K", help="the frame to densify"
+        "--key", type=natural, required=True, metavar="K", help="the frame to densify"
     )
-    _add_window(parser)
+    add_window(parser)
     parser.add_argument("--data", metavar="SPEC", default="street", help=DATA_HELP)
-    _add_camera(parser)
-    _add_short_options(parser)
-    _add_config_options(parser)
-
-
-def _add_window(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--window",
-        type=_natural,
-        default=5,
-        metavar="W",
-        help="sweeps to use on each side of the key (default: 5)",
-    )
-
-
-def _add_method(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--method",
-        choices=("flow", "icp", "none"),
-        default="flow",
-        help="flow: registration and scene flow; icp: registration only; none: the key sweep alone "
-        "(default: flow)",
-    )
-
-
-def _add_short_options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--flow",
-        metavar="ENGINE",
-        help="groups (ours), paper, or npz:DIR, flow files of another method "
-        "(short for --set flow.engine=ENGINE)",
-    )
-    parser.add_argument(
-        "--at",
-        choices=("camera", "sweep"),
-        help="the moment the maps show: each image's own exposure, or the key sweep's reference "
-        "time (short for --set project.at=…; default: camera)",
-    )
-    parser.add_argument(
-        "--movers",
-        choices=("keep", "drop", "separate"),
-        help="moving objects in the maps, left out, or left out and written one by one (short for "
-        "--set output.movers=…; default: keep)",
-    )
-
-
-def _add_output_options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--out",
-        metavar="DIR",
-        type=Path,
-        default=Path("densify-out"),
-        help="(default: ./densify-out)",
-    )
-    _add_overwrite(parser)
-
-
-def _add_overwrite(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--overwrite", action="store_true", help="replace what is already there (default: keep it)"
-    )
-
-
-def _add_camera(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--camera",
-        action="append",
-        metavar="NAME",
-        dest="cameras",
-        help="only this camera; may be given several times (default: all)",
-    )
-
-
-def _add_config_options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--config", metavar="FILE|NAME", help=f"a YAML file or a preset: {', '.join(presets())}"
-    )
-    parser.add_argument(
-        "--set",
-        action="append",
-        default=[],
-        metavar="section.key=value",
-        dest="overrides",
-        help="set one knob; may be given several times",
-    )
-
-
-def _config_epilog() -> str:
-    return f"Every knob with its default and what it does: {presets()['default']}"
-
-
-def _natural(text: str) -> int:
-    if not text.isascii() or not text.isdigit():
-        raise argparse.ArgumentTypeError(f"got {text!r}, expected a whole number from 0 up")
-    return int(text)
-
-
-def _positive(text: str) -> float:
-    try:
-        number = float(text)
-    except ValueError:
-        number = math.nan
-    if not (number > 0 and math.isfinite(number)):
-        raise argparse.ArgumentTypeError(f"got {text!r}, expected a number above 0")
-    return number
-
-
-def _words(text: str) -> list[str]:
-    return [word.strip() for word in text.split(",") if word.strip()]
-
-
-def _frames(text: str) -> range:
-    first, colon, end = text.partition(":")
-    if not (colon and first.isdigit() and end.isdigit() and int(first) < int(end)):
-        raise argparse.ArgumentTypeError(
-            f"got {text!r}, expected A:B with A < B, for example 115:126 for frames 115 to 125"
-        )
-    return range(int(first), int(end))
-
-
-def _keys(text: str) -> slice | None:
-    if text == "all":
-        return None
-    numbers = text.split(":")
-    if len(numbers) in (2, 3) and all(n.isascii() and n.isdigit() for n in numbers):
-        first, end, step = *map(int, numbers), *([1] if len(numbers) == 2 else [])
-        if first < end and step > 0:
-            return slice(first, end, step)
-    raise argparse.ArgumentTypeError(
-        f"got {text!r}, expected all, or A:B[:S] with A < B, for example 0:100:5 for frames 0, 5 "
-        f"to 95"
-    )
-
-
-def _shard(text: str) -> tuple[int, int]:
-    i, slash, n = text.partition("/")
-    numbers = slash and (i + n).isascii() and i.isdigit() and n.isdigit()
-    if numbers and 1 <= int(i) <= int(n):
-        return int(i), int(n)
-    raise argparse.ArgumentTypeError(f"got {text!r}, expected i/n with i from 1 to n, as in 2/4")
-
-
-def _bytes(text: str) -> int:
-    number, unit = text[:-1], text[-1:].upper()
-    if unit in ("K", "M", "G", "T"):
-        return int(_positive(number) * 1024 ** (1 + "KMGT".index(unit)))
-    raise argparse.ArgumentTypeError(f"got {text!r}, expected a size such as 8G or 500M")
+    add_camera(parser)
+    add_short_options(parser)
+    add_config_options(parser)

@@ -25,7 +25,7 @@ from densify.dataset.plan import (
     read_plan,
     write_plan,
 )
-from densify.dataset.tasks import Outcome, run_tasks
+from densify.dataset.tasks import Outcome, Task, run_tasks
 from densify.dataset.work import Job, tasks
 from densify.dataset.workers import open_workers
 from densify.errors import ComputationError, InputError, OutputError
@@ -121,14 +121,7 @@ def make_dataset(
             left = done.left(drives)
             num_processes = _num_processes(num_workers, memory_bytes, recipe, drives)
             _announce(out, recipe, left, done.summary().num_keys, num_processes)
-            run = uuid4().hex
-            todo = [
-                task
-                for drive in left
-                for task in tasks(
-                    Job(drive.source, recipe, out.absolute(), cache_bytes, code(), run), drive.keys
-                )
-            ]
+            todo = _tasks(left, recipe, out, cache_bytes)
             try:
                 if todo:
                     with open_workers(num_processes, scheduler, memory_bytes) as workers:
@@ -181,6 +174,14 @@ class _Done:
     def kept(self) -> str:
         num_kept = sum(record.status != "failed" for record in self._records.values())
         return f"{num_kept} of {self._num_keys} keys are finished and kept"
+
+
+def _tasks(
+    drives: Sequence[PlannedDrive], recipe: Recipe, out: Path, cache_bytes: int
+) -> list[Task]:
+    run, place = uuid4().hex, out.absolute()
+    jobs = [Job(d.source, recipe, place, cache_bytes, code(), run) for d in drives]
+    return [task for job, d in zip(jobs, drives, strict=True) for task in tasks(job, d.keys)]
 
 
 def status(out: Path) -> tuple[Summary, list[str]]:

@@ -1,0 +1,191 @@
+# SPDX-License-Identifier: MIT
+"""Options that several verbs have, and what their values are read with."""
+
+from __future__ import annotations
+
+import argparse
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from densify.config import presets
+
+DATA_HELP = (
+    "a recording's folder, READER:PATH, or the built-in street[:PRESET][?seed=N&sensor=NAME] "
+    "(default: street)"
+)
+
+
+def add_verb(
+    commands: Any,
+    name: str,
+    verb: Callable[[argparse.Namespace], None],
+    about: str,
+    epilog: str = "",
+) -> argparse.ArgumentParser:
+    """A verb of the command line, which calls ``verb`` with its options."""
+    parser: argparse.ArgumentParser = commands.add_parser(
+        name, help=about, description=f"{about[0].upper()}{about[1:]}.", epilog=epilog or None
+    )
+    parser.set_defaults(verb=verb)
+    return parser
+
+
+def config_epilog() -> str:
+    """Where every knob is explained."""
+    return f"Every knob with its default and what it does: {presets()['default']}"
+
+
+def add_window(parser: argparse.ArgumentParser) -> None:
+    """``--window``"""
+    parser.add_argument(
+        "--window",
+        type=natural,
+        default=5,
+        metavar="W",
+        help="sweeps to use on each side of the key (default: 5)",
+    )
+
+
+def add_method(parser: argparse.ArgumentParser) -> None:
+    """``--method``"""
+    parser.add_argument(
+        "--method",
+        choices=("flow", "icp", "none"),
+        default="flow",
+        help="flow: registration and scene flow; icp: registration only; none: the key sweep alone "
+        "(default: flow)",
+    )
+
+
+def add_camera(parser: argparse.ArgumentParser) -> None:
+    """``--camera``"""
+    parser.add_argument(
+        "--camera",
+        action="append",
+        metavar="NAME",
+        dest="cameras",
+        help="only this camera; may be given several times (default: all)",
+    )
+
+
+def add_short_options(parser: argparse.ArgumentParser) -> None:
+    """Options that are short for a knob."""
+    parser.add_argument(
+        "--flow",
+        metavar="ENGINE",
+        help="groups (ours), paper, or npz:DIR, flow files of another method "
+        "(short for --set flow.engine=ENGINE)",
+    )
+    parser.add_argument(
+        "--at",
+        choices=("camera", "sweep"),
+        help="the moment the maps show: each image's own exposure, or the key sweep's reference "
+        "time (short for --set project.at=…; default: camera)",
+    )
+    parser.add_argument(
+        "--movers",
+        choices=("keep", "drop", "separate"),
+        help="moving objects in the maps, left out, or left out and written one by one (short for "
+        "--set output.movers=…; default: keep)",
+    )
+
+
+def add_config_options(parser: argparse.ArgumentParser) -> None:
+    """``--config`` and ``--set``"""
+    parser.add_argument(
+        "--config", metavar="FILE|NAME", help=f"a YAML file or a preset: {', '.join(presets())}"
+    )
+    parser.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        metavar="section.key=value",
+        dest="overrides",
+        help="set one knob; may be given several times",
+    )
+
+
+def add_output_options(parser: argparse.ArgumentParser) -> None:
+    """``--out`` of a run, and ``--overwrite``"""
+    parser.add_argument(
+        "--out",
+        metavar="DIR",
+        type=Path,
+        default=Path("densify-out"),
+        help="(default: ./densify-out)",
+    )
+    add_overwrite(parser)
+
+
+def add_overwrite(parser: argparse.ArgumentParser) -> None:
+    """``--overwrite``"""
+    parser.add_argument(
+        "--overwrite", action="store_true", help="replace what is already there (default: keep it)"
+    )
+
+
+def natural(text: str) -> int:
+    """A whole number from 0 up."""
+    if not text.isascii() or not text.isdigit():
+        raise argparse.ArgumentTypeError(f"got {text!r}, expected a whole number from 0 up")
+    return int(text)
+
+
+def positive(text: str) -> float:
+    """A number above 0."""
+    try:
+        number = float(text)
+    except ValueError:
+        number = math.nan
+    if not (number > 0 and math.isfinite(number)):
+        raise argparse.ArgumentTypeError(f"got {text!r}, expected a number above 0")
+    return number
+
+
+def words(text: str) -> list[str]:
+    """Words parted by commas."""
+    return [word.strip() for word in text.split(",") if word.strip()]
+
+
+def frame_range(text: str) -> range:
+    """``A:B``, frames A to B-1."""
+    first, colon, end = text.partition(":")
+    if not (colon and first.isdigit() and end.isdigit() and int(first) < int(end)):
+        raise argparse.ArgumentTypeError(
+            f"got {text!r}, expected A:B with A < B, for example 115:126 for frames 115 to 125"
+        )
+    return range(int(first), int(end))
+
+
+def key_slice(text: str) -> slice | None:
+    """``all``, which is None, or ``A:B[:S]``."""
+    if text == "all":
+        return None
+    numbers = text.split(":")
+    if len(numbers) in (2, 3) and all(n.isascii() and n.isdigit() for n in numbers):
+        first, end, step = *map(int, numbers), *([1] if len(numbers) == 2 else [])
+        if first < end and step > 0:
+            return slice(first, end, step)
+    raise argparse.ArgumentTypeError(
+        f"got {text!r}, expected all, or A:B[:S] with A < B, for example 0:100:5 for frames 0, 5 "
+        f"to 95"
+    )
+
+
+def shard(text: str) -> tuple[int, int]:
+    """``i/n`` with i from 1 to n."""
+    i, slash, n = text.partition("/")
+    numbers = slash and (i + n).isascii() and i.isdigit() and n.isdigit()
+    if numbers and 1 <= int(i) <= int(n):
+        return int(i), int(n)
+    raise argparse.ArgumentTypeError(f"got {text!r}, expected i/n with i from 1 to n, as in 2/4")
+
+
+def size_bytes(text: str) -> int:
+    """A size such as 8G, in powers of 1024."""
+    number, unit = text[:-1], text[-1:].upper()
+    if unit in ("K", "M", "G", "T"):
+        return int(positive(number) * 1024 ** (1 + "KMGT".index(unit)))
+    raise argparse.ArgumentTypeError(f"got {text!r}, expected a size such as 8G or 500M")
