@@ -368,8 +368,14 @@ cli.script()
 def command(kind: str, plan: str, folder: Path) -> Iterator[subprocess.Popen[str]]:
     """A command line of ours that has two workers, in a terminal session of its own."""
     arguments = [sys.executable, "-c", MAIN, kind, plan, str(folder), str(Path(__file__).parent)]
-    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
-    with subprocess.Popen(arguments, text=True, start_new_session=True, **pipes) as process:
+    options = {
+        "stdout": subprocess.PIPE,
+        "stderr": subprocess.PIPE,
+        "start_new_session": True,
+        # Where the tests run in the background, interrupts are ignored by whoever they start.
+        "preexec_fn": lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
+    }
+    with subprocess.Popen(arguments, text=True, **options) as process:
         try:
             yield process
         finally:
