@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from densify.dataset.plan import Recipe as Recipe
     from densify.errors import ComputationError as ComputationError
     from densify.errors import InputError as InputError
-    from densify.flow.pair import estimate_flow as estimate_flow
+    from densify.flow.pairs.estimate import estimate_flow as estimate_flow
     from densify.pipeline import compare as compare
     from densify.pipeline import run as run
     from densify.readers import open_sequence as open_sequence
@@ -35,13 +35,13 @@ if TYPE_CHECKING:
     from densify.types import Result as Result
     from densify.types import Sweep as Sweep
 
-__version__ = "0.1.0"
+from densify.version import __version__ as __version__
 
 _HOME = {
     "open_sequence": "densify.readers",
     "run": "densify.pipeline",
     "compare": "densify.pipeline",
-    "estimate_flow": "densify.flow.pair",
+    "estimate_flow": "densify.flow.pairs.estimate",
     "make_dataset": "densify.dataset.make",
     "Recipe": "densify.dataset.plan",
     "Gate": "densify.dataset.gate",

@@ -16,20 +16,22 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from densify import depth_metrics, scores
 from densify.config import Config, RegisterSettings, resolve
+from densify.depth.accumulate import accumulate
+from densify.depth.age import with_ages
+from densify.depth.views import HeldOut, Views
 from densify.errors import InputError
 from densify.flow.chained import ChainedMotion
-from densify.height_map import HeightMap
-from densify.range_image import RangeImage
+from densify.flow.engines import estimate_motion
+from densify.geometry.ground import ground
+from densify.geometry.height_map import HeightMap
+from densify.geometry.range_image import RangeImage
 from densify.readers.flow_files import FlowFiles, require_folder
 from densify.readers.window import choose_cameras, read_sweeps, recorded_trajectory, window_frames
-from densify.stages.accumulate import accumulate
-from densify.stages.age import with_ages
-from densify.stages.deskew import deskew
-from densify.stages.flow import estimate_motion
-from densify.stages.ground import ground
-from densify.stages.register import check_overlap, check_plausible, register
+from densify.registration.deskew import deskew
+from densify.registration.odometry import check_overlap, check_plausible, register
+from densify.scores import depth_metrics
+from densify.scores import ghosts as scores
 from densify.types import (
     Camera,
     Cloud,
@@ -47,7 +49,6 @@ from densify.types import (
     Trajectory,
     Truth,
 )
-from densify.views import HeldOut, Views
 
 Image = NDArray[np.uint8]
 

@@ -18,7 +18,7 @@ from torch.nn.functional import avg_pool2d, interpolate, max_pool2d
 from torch.utils.data import DataLoader
 
 import densify
-from densify.depth_metrics import depth_errors, mean_errors
+from densify.scores.depth_metrics import depth_errors, mean_errors
 
 HEIGHT_PX, CROP_PX, FULL_PX = 256, (256, 384), (256, 1242)  # rows that the lidar reaches
 CAMERA = "image_02"
@@ -126,7 +126,7 @@ def trained(network, folder, steps, seed, filled):
 
 @torch.no_grad()
 def errors(network, folder, truth):
-    """`densify.depth_metrics` of all, moving and static pixels, mean of the images."""
+    """`densify.scores.depth_metrics` of all, moving and static pixels, mean of the images."""
     parts = {"all": [], "moving": [], "static": []}
     for sample in densify.DepthDataset(folder, crop=FULL_PX):
         where = sample["camera"], sample["frame"]

@@ -7,8 +7,8 @@ from collections.abc import Callable, Mapping
 
 import numpy as np
 
-from densify import poses
 from densify.flow.chained import ChainedMotion
+from densify.geometry import poses
 from densify.types import FlowField, RegisteredSweep, Stretch, Sweep
 
 FRAMES = range(100, 107)

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from densify.config import FlowSettings, GroundSettings
-from densify.flow.groups import GroupMotion
-from densify.height_map import HeightMap
-from densify.stages.flow import estimate_motion
-from densify.stages.ground import ground
+from densify.flow.engines import estimate_motion
+from densify.flow.tracking.groups import GroupMotion
+from densify.geometry.ground import ground
+from densify.geometry.height_map import HeightMap
 from densify.types import FlowField, Stretch
 from tests.scenes import Arc, Scanner, Scene, World, street
 

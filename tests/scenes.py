@@ -10,8 +10,8 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from densify import poses
-from densify.stages.deskew import deskew
+from densify.geometry import poses
+from densify.registration.deskew import deskew
 from densify.types import Camera, Stretch, Sweep, SweepTruth, Trajectory
 
 SWEEP_S = 0.1

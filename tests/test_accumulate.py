@@ -8,9 +8,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from densify import poses
+from densify.depth.accumulate import accumulate
 from densify.flow.chained import ChainedMotion
-from densify.stages.accumulate import accumulate
+from densify.geometry import poses
 from densify.types import FlowField
 from tests.exact_motion import (
     CAR,

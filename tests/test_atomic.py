@@ -13,8 +13,8 @@ from pathlib import Path
 
 import pytest
 
-from densify.output import atomic
-from densify.output.atomic import (
+from densify.outputs import atomic
+from densify.outputs.atomic import (
     FileRecord,
     clear_leftovers,
     make_folder,
@@ -51,7 +51,7 @@ WAIT = "print('ready', flush=True); time.sleep(60)"
 IN_A_FILE = """
 import os, sys, time
 from pathlib import Path
-from densify.output.atomic import write_file
+from densify.outputs.atomic import write_file
 os.replace = lambda *_: [print("ready", flush=True), time.sleep(60)]
 write_file(Path(sys.argv[1]), b"half")
 """
@@ -59,7 +59,7 @@ write_file(Path(sys.argv[1]), b"half")
 IN_A_FOLDER = f"""
 import sys, time
 from pathlib import Path
-from densify.output.atomic import staged_folder
+from densify.outputs.atomic import staged_folder
 with staged_folder(Path(sys.argv[1]), ("new",)) as staging:
     (staging / "new").write_text("new")
     {WAIT}
@@ -68,7 +68,7 @@ with staged_folder(Path(sys.argv[1]), ("new",)) as staging:
 BETWEEN_RENAMES = f"""
 import os, sys, time
 from pathlib import Path
-from densify.output.atomic import staged_folder
+from densify.outputs.atomic import staged_folder
 rename = os.rename
 def wait_before_the_second(source, target):
     if target == Path(sys.argv[1]):
@@ -169,7 +169,7 @@ def test_a_file_over_the_limit_leaves_nothing_and_keeps_the_old_one(
     code = f"""
 import resource, sys
 from pathlib import Path
-from densify.output.atomic import write_file
+from densify.outputs.atomic import write_file
 resource.setrlimit(resource.RLIMIT_FSIZE, (1000, 1000))
 for name in ("old", "new"):
     try:

@@ -19,7 +19,7 @@ from densify.bench.windows import Window
 from densify.cli import main, tables
 from densify.config import resolve
 from densify.errors import InputError
-from densify.flow.solvers import ObjectiveSettings, solve
+from densify.flow.objective.solvers import ObjectiveSettings, solve
 from tests.scenes import Arc, Scanner, Scene, TinySequence, World, car, street
 
 CONFIG = resolve({"register": {"source": "dataset"}})

@@ -6,8 +6,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from densify import poses
 from densify.flow.chained import ChainedMotion
+from densify.geometry import poses
 from densify.types import FlowField
 from tests.exact_motion import (
     CAR,

@@ -13,15 +13,16 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from densify import pipeline, poses
+from densify import pipeline
 from densify.config import Config, resolve
 from densify.dataset import drive as shared
 from densify.dataset.cache import Cache
 from densify.dataset.drive import BLOCK, Drive
 from densify.errors import InputError, SweepError
-from densify.range_image import RangeImage
+from densify.geometry import poses
+from densify.geometry.range_image import RangeImage
 from densify.readers.window import read_sweeps
-from densify.stages.deskew import deskew
+from densify.registration.deskew import deskew
 from densify.types import Stretch, Sweep
 from tests.dataset_scenes import BORDER, across_border
 from tests.scenes import SWEEP_S, Arc, Scanner, Scene, TinySequence, World, car, street

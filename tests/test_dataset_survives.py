@@ -22,7 +22,7 @@ from densify.dataset import work
 from densify.dataset.make import make_dataset
 from densify.dataset.manifest import finished, read_manifests
 from densify.dataset.plan import Recipe
-from densify.output import atomic
+from densify.outputs import atomic
 from tests.command import exit_code, files_in
 from tests.dataset_scenes import (
     BORDER,

@@ -18,7 +18,7 @@ from torch.utils.data import DataLoader
 import densify
 from densify.dataset.loader import DepthDataset
 from densify.errors import InputError
-from densify.output.depth_png import stored_confidence, write_confidence_png, write_depth_png
+from densify.outputs.depth_png import stored_confidence, write_confidence_png, write_depth_png
 
 W, H = 60, 24
 K = np.array([[50.0, 0.25, 27.0], [0, 48.0, 10.0], [0, 0, 1]])

@@ -12,7 +12,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from densify.depth_metrics import (
+from densify.errors import InputError
+from densify.scores.depth_metrics import (
     DepthErrors,
     depth_edges,
     depth_errors,
@@ -21,7 +22,6 @@ from densify.depth_metrics import (
     image_density,
     mean_errors,
 )
-from densify.errors import InputError
 from densify.types import Camera, DepthMap
 
 KEY = 7

@@ -12,12 +12,12 @@ import cv2
 import numpy as np
 import pytest
 
+from densify.bench.evaluation import evaluate
 from densify.cli import main
-from densify.depth_metrics import depth_errors
 from densify.errors import InputError
-from densify.evaluation import evaluate
-from densify.output import read_depth_png, read_mask_png, write_depth_png
+from densify.outputs import read_depth_png, read_mask_png, write_depth_png
 from densify.readers.depth_trees import DepthPair, pair_depth_files
+from densify.scores.depth_metrics import depth_errors
 
 DRIVE, OTHER_DRIVE = "2011_09_26_drive_0013_sync", "2011_09_28_drive_0002_sync"
 

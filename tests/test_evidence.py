@@ -6,11 +6,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from densify import poses
 from densify.config import FlowSettings, GroundSettings
-from densify.flow.evidence import FreeSpace, Standing, find_candidates, link
-from densify.height_map import HeightMap
-from densify.stages.ground import ground
+from densify.flow.tracking.evidence import FreeSpace, Standing, find_candidates, link
+from densify.geometry import poses
+from densify.geometry.ground import ground
+from densify.geometry.height_map import HeightMap
 from densify.types import Stretch
 from tests.scenes import SWEEP_S, Arc, Scanner, Scene, World, car, street
 

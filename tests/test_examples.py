@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from densify.readers.street import Street
-from densify.street.export import write_kitti_tree
+from densify.writers.kitti_raw import write_kitti_tree
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 

@@ -13,10 +13,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import densify
+from densify.depth.age import with_ages
 from densify.errors import InputError
-from densify.output import export_run, read_depth_png, write_result
-from densify.output.atomic import staged_folder
-from densify.stages.age import with_ages
+from densify.outputs import export_run, read_depth_png, write_result
+from densify.outputs.atomic import staged_folder
 from densify.types import Cloud, DepthMap, RegisteredSweep, Result, Stretch, Sweep
 
 H, W = 12, 20
@@ -223,7 +223,7 @@ def test_a_place_that_cannot_be_written_to(run, monkeypatch):
     def full(*_):
         raise OSError(28, os.strerror(28))
 
-    monkeypatch.setattr("densify.output.export.write_file", full)
+    monkeypatch.setattr("densify.outputs.export.write_file", full)
     refused(os.strerror(28), "nothing was kept", run=run)
     assert tree(run) == before
 

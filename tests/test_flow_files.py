@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from densify import poses
 from densify.errors import InputError
-from densify.output.flow_npz import write_flow_files
+from densify.geometry import poses
+from densify.outputs.flow_npz import write_flow_files
 from densify.pipeline import run
 from densify.readers.flow_files import MOVES_M, FlowFiles
 from densify.types import FlowField, Result, Stretch, StretchFlow

@@ -8,8 +8,8 @@ import math
 import numpy as np
 import pytest
 
-from densify import flow_metrics as metrics
 from densify.errors import InputError
+from densify.scores import flow_metrics as metrics
 
 NOTHING = np.zeros((0, 3))
 

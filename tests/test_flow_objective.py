@@ -12,9 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from densify.errors import InputError
-from densify.flow import graph
-from densify.flow.neighbors import NeighborIndex, nearest_by_brute_force
-from densify.flow.objective import energy
+from densify.flow.objective import graph
+from densify.flow.objective.energy import energy
+from densify.flow.objective.neighbors import NeighborIndex, nearest_by_brute_force
 
 NO_CUDA = not torch.cuda.is_available()
 

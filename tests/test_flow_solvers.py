@@ -10,9 +10,9 @@ import pytest
 import torch
 
 from densify.errors import InputError
-from densify.flow import graph
-from densify.flow.objective import energy
-from densify.flow.solvers import ObjectiveSettings, solve
+from densify.flow.objective import graph
+from densify.flow.objective.energy import energy
+from densify.flow.objective.solvers import ObjectiveSettings, solve
 from densify.kernels import threads
 
 ADAM = ObjectiveSettings(solver="adam", adam_num_steps=60)

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from densify import height_map, poses
 from densify.config import FlowSettings, GroundSettings
-from densify.height_map import HeightMap
-from densify.stages.ground import ground
+from densify.geometry import height_map, poses
+from densify.geometry.ground import ground
+from densify.geometry.height_map import HeightMap
 from densify.types import Stretch
 from tests.scenes import GROUND, KERB_M, KERB_Y_M, Arc, Box, Scanner, Scene, World, car, street
 

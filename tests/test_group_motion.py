@@ -6,10 +6,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from densify import poses
-from densify.flow.groups import GroupMotion
-from densify.flow.paths import Path
-from densify.flow.tracks import Track
+from densify.flow.tracking.groups import GroupMotion
+from densify.flow.tracking.paths import Path
+from densify.flow.tracking.tracks import Track
+from densify.geometry import poses
 from tests.scenes import SWEEP_S, Arc, Scanner, Scene, World, street
 
 CENTRE = np.array([10.0, 5.0, 0.0])

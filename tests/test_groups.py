@@ -6,8 +6,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from densify import poses
-from densify.stages.flow import estimate_motion
+from densify.flow.engines import estimate_motion
+from densify.geometry import poses
 from densify.types import FlowField
 from tests.found_motion import KEY, NOISE, SETTINGS, Found, toward_key
 from tests.scenes import SWEEP_S, Arc, Box, Scanner, Scene, World, car, street

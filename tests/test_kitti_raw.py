@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from densify import poses
 from densify.errors import InputError
+from densify.geometry import poses
 from densify.readers import open_sequence
 from densify.readers.describe import describe
 from densify.readers.files import format_frames

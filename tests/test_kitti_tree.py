@@ -18,9 +18,9 @@ from hypothesis import strategies as st
 
 import densify
 from densify.errors import InputError
-from densify.output.atomic import FileRecord
-from densify.output.depth_png import read_depth_png
-from densify.output.kitti_tree import drive_folder, split_of, write_key, write_readme
+from densify.outputs.atomic import FileRecord
+from densify.outputs.depth_png import read_depth_png
+from densify.outputs.kitti_tree import drive_folder, split_of, write_key, write_readme
 from densify.readers.depth_trees import pair_depth_files
 from densify.types import DepthMap
 
@@ -213,7 +213,7 @@ import resource, sys
 from pathlib import Path
 from test_kitti_tree import FOLDER, maps
 from densify.errors import InputError
-from densify.output.kitti_tree import write_key
+from densify.outputs.kitti_tree import write_key
 resource.setrlimit(resource.RLIMIT_FSIZE, 2 * (int(sys.argv[2]),))
 try:
     write_key(Path(sys.argv[1]), FOLDER, 7, maps(1, 90, 140), maps(2, 90, 140))

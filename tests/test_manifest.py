@@ -22,7 +22,7 @@ from densify.dataset.manifest import (
     read_manifests,
 )
 from densify.errors import InputError
-from densify.output.atomic import FileRecord
+from densify.outputs.atomic import FileRecord
 
 # One record
 

@@ -7,10 +7,10 @@ import cv2
 import numpy as np
 import pytest
 
-from densify import poses
-from densify.output.depth_png import write_flow_png
+from densify.depth.optical_flow import optical_flow
+from densify.geometry import poses
+from densify.outputs.depth_png import write_flow_png
 from densify.pipeline import run
-from densify.stages.optical_flow import optical_flow
 from densify.types import Camera, Cloud, DepthMap, Reason
 from tests.scenes import CAMERA, SWEEP_S
 from tests.small_street import CAR, KEY, POSES_GIVEN, one_car

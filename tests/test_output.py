@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from densify.errors import InputError
-from densify.output import (
+from densify.outputs import (
     check_writable,
     draw_figure,
     read_cloud,
@@ -29,7 +29,7 @@ from densify.output import (
     write_depth_png,
     write_result,
 )
-from densify.output.atomic import staged_folder
+from densify.outputs.atomic import staged_folder
 from densify.types import Cloud, DepthMap, Result, StageCost
 
 H, W = 12, 20
@@ -552,7 +552,7 @@ def test_a_failing_clean_up_is_a_warning(put, tmp_path, monkeypatch, caplog):
         raise PermissionError(errno.EACCES, "Permission denied")
 
     with monkeypatch.context() as patch:
-        patch.setattr("densify.output.atomic.shutil.rmtree", fail)
+        patch.setattr("densify.outputs.atomic.shutil.rmtree", fail)
         paths = put(result_of(seed=9), overwrite=True)
     assert all(path.is_file() for path in paths)
     assert tree(tmp_path / "out" / "000120") != first
@@ -575,7 +575,7 @@ def test_a_failing_rename_leaves_the_old_result(put, tmp_path, monkeypatch, nth,
             raise KeyboardInterrupt
         rename(source, target)
 
-    monkeypatch.setattr("densify.output.atomic.os.rename", fail)
+    monkeypatch.setattr("densify.outputs.atomic.os.rename", fail)
     with pytest.raises(KeyboardInterrupt):
         put(result_of(seed=9), overwrite=existing)
     assert tree(tmp_path) == before
@@ -614,7 +614,7 @@ def test_places_that_cannot_be_written_to(put, tmp_path, monkeypatch):
         put(overwrite=True)
     one_line(error, tmp_path / "out" / "000120", "not a folder")
 
-    monkeypatch.setattr("densify.output.store.os.access", lambda *_: False)  # root may write all
+    monkeypatch.setattr("densify.outputs.store.os.access", lambda *_: False)  # root may write all
     with pytest.raises(InputError) as error:
         check_writable(tmp_path / "new" / "out", 120)
     one_line(error, "no permission", f"write in {tmp_path};")
@@ -633,7 +633,7 @@ def test_an_existing_result_needs_permission_in_and_above_it(
         real = folder.rename(tmp_path / "elsewhere" / "key")
         folder.symlink_to(real)
     place = real.parent if denied == "parent" else folder
-    monkeypatch.setattr("densify.output.store.os.access", lambda path, _: Path(path) != place)
+    monkeypatch.setattr("densify.outputs.store.os.access", lambda path, _: Path(path) != place)
     with pytest.raises(InputError) as error:
         check_writable(tmp_path / "out", 120, overwrite=True)
     one_line(error, f"no permission to write in {place};")

@@ -139,10 +139,30 @@ def test_no_library_code_exits_prints_or_asserts() -> None:
         assert not found, f"{path}: {found and found.group()}"
 
 
-def test_stages_import_no_other_stage() -> None:
-    for path in (CHECKOUT / "densify" / "stages").glob("*.py"):
-        imports = re.search(r"^\s*(import|from) densify\.stages", path.read_text("utf-8"), re.M)
-        assert not imports, path
+FLOORS = (
+    ("arrays", "errors", "version", "knobs"),
+    ("config", "geometry", "kernels", "types"),
+    ("registration", "depth", "flow", "scores", "street"),
+    ("readers",),
+    ("outputs", "writers"),
+    ("pipeline",),
+    ("bench", "dataset"),
+    ("cli",),
+)
+"""A module imports from lower floors only, or from its own."""
+
+
+def test_no_arrow_runs_upward() -> None:
+    floor = {room: height for height, rooms in enumerate(FLOORS) for room in rooms}
+    package = CHECKOUT / "densify"
+    rooms = {p.stem for p in package.iterdir() if p.suffix == ".py" or (p / "__init__.py").exists()}
+    assert rooms - {"__init__", "__main__"} == set(floor)
+    for path in package.rglob("*.py"):
+        room = path.relative_to(package).parts[0].removesuffix(".py")
+        if room in floor:
+            used = re.findall(r"^\s*from densify\.(\w+)", path.read_text("utf-8"), re.MULTILINE)
+            for other in used:
+                assert floor[other] <= floor[room], f"{path} imports densify.{other}"
 
 
 DOORS: dict[str, str | tuple[str, ...]] = {
@@ -150,8 +170,8 @@ DOORS: dict[str, str | tuple[str, ...]] = {
     "distributed": "densify/dataset/workers.py",
     "embreex": "densify/street/world.py",
     "joblib": "densify/dataset/cache.py",
-    "kiss_icp": "densify/stages/register.py",
-    "laspy": "densify/output/cloud_laz.py",
+    "kiss_icp": "densify/registration/odometry.py",
+    "laspy": "densify/outputs/cloud_laz.py",
     "numba": "densify/kernels/",
     "torch": ("densify/flow/", "densify/dataset/loader.py"),
 }

@@ -11,8 +11,8 @@ import torch
 
 import densify
 from densify.errors import InputError
-from densify.flow import pair as pair_module
-from densify.flow.pair import estimate_flow
+from densify.flow.pairs import estimate as pair_module
+from densify.flow.pairs.estimate import estimate_flow
 
 MOVED = np.array([0.8, 0.1, 0.0])
 ROW_SUM_ZERO = {"flow": {"engine": "paper", "laplacian": "row-sum-zero"}}

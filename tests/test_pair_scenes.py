@@ -10,13 +10,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from densify import open_sequence, poses
+from densify import open_sequence
 from densify.config import RegisterSettings
 from densify.errors import InputError
-from densify.flow.pair import estimate_flow
+from densify.flow.pairs.estimate import estimate_flow
+from densify.geometry import poses
 from densify.pipeline import find_trajectory
 from densify.readers.window import read_sweeps
-from densify.stages.deskew import deskew
+from densify.registration.deskew import deskew
 from tests.scenes import Arc, Box, Scanner, Scene, World, car, street
 
 FRAME = 2

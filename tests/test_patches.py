@@ -8,8 +8,8 @@ import pytest
 from test_project import KEY, make_cloud
 
 from densify.config import ProjectSettings
-from densify.range_image import RangeImage
-from densify.stages.patches import patches
+from densify.depth.patches import patches
+from densify.geometry.range_image import RangeImage
 from densify.types import RegisteredSweep, Sweep
 
 GROUND_M = 1.7

@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from densify.flow.paths import Path
+from densify.flow.tracking.paths import Path
 
 STEP_S = 0.1
 NOISE_M = 0.03

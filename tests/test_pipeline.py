@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 import densify
-from densify import poses
 from densify.config import RegisterSettings
+from densify.geometry import poses
+from densify.geometry.range_image import RangeImage
 from densify.pipeline import METHODS, compare, run
-from densify.range_image import RangeImage
 from densify.readers.window import read_sweeps
-from densify.scores import ghosts
+from densify.scores.ghosts import ghosts
 from densify.types import Result
 from tests.scenes import CAMERA, SWEEP_S, Arc, Scanner, Scene, TinySequence, World, street
 from tests.small_street import one_car

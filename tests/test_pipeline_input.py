@@ -9,9 +9,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from densify import poses
 from densify.config import RegisterSettings
 from densify.errors import ComputationError, InputError
+from densify.geometry import poses
 from densify.pipeline import compare, run
 from densify.readers.window import read_sweeps
 from tests.scenes import TinySequence

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
-from densify.output import read_cloud, read_depth_png, write_result
+from densify.outputs import read_cloud, read_depth_png, write_result
 from densify.pipeline import compare, run
 from densify.types import Cloud, Reason, Result
 from tests.scenes import ROOM, Arc, Scanner, Scene, TinySequence, World

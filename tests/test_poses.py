@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.linalg import expm
 
-from densify import poses
+from densify.geometry import poses
 
 small = st.floats(-1e-6, 1e-6)
 any_size = st.floats(-1.7, 1.7)  # a rotation vector of at most 1.7 · sqrt(3) < pi

@@ -13,13 +13,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from densify.config import ProjectSettings
-from densify.depth_fill import fill_between
+from densify.depth.fill import fill_between
+from densify.depth.patches import patches
+from densify.depth.project import project
 from densify.errors import InputError
+from densify.geometry.cameras import image_points
+from densify.geometry.poses import exp
 from densify.kernels import visibility as kernels
-from densify.pinhole import image_points
-from densify.poses import exp
-from densify.stages.patches import patches
-from densify.stages.project import project
 from densify.types import Camera, Cloud, Patches, Reason
 
 KEY = 10

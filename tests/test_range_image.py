@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from densify import poses
+from densify.geometry import poses
+from densify.geometry.range_image import RangeImage, ScannerImage
 from densify.kernels import threads
-from densify.range_image import RangeImage, ScannerImage
 from densify.types import RegisteredSweep, Sweep
 from tests.scenes import ROOM, Arc, Box, Scanner, Scene, World, on_sphere
 

@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from densify import range_image
-from densify.range_image import RangeImage
+from densify.geometry import range_image
+from densify.geometry.range_image import RangeImage
 from densify.street.sensors import SENSORS
 from densify.types import RegisteredSweep, Sweep
 from tests.scenes import ROOM, Arc, Scanner, Scene, World, on_sphere

@@ -10,11 +10,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from densify import poses
 from densify.config import RegisterSettings
 from densify.errors import ComputationError
-from densify.stages.deskew import deskew
-from densify.stages.register import check_plausible, register
+from densify.geometry import poses
+from densify.registration.deskew import deskew
+from densify.registration.odometry import check_plausible, register
 from densify.types import Trajectory
 from tests.scenes import SWEEP_S, Arc, Box, Scanner, Scene, World, street
 
@@ -242,7 +242,7 @@ def test_sweeps_of_equal_or_no_stamps_do_not_abort(drive, tmp_path):
     code = f"""
 import numpy as np
 from densify.config import RegisterSettings
-from densify.stages.register import register
+from densify.registration.odometry import register
 from densify.types import Sweep
 p = np.load({str(tmp_path / "sweep.npz")!r})["points"]
 n = len(p)

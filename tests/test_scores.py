@@ -8,8 +8,8 @@ import json
 import numpy as np
 import pytest
 
-from densify.range_image import RangeImage
-from densify.scores import ghost_rate, ghost_scores
+from densify.geometry.range_image import RangeImage
+from densify.scores.ghosts import ghost_rate, ghost_scores
 from densify.types import Cloud, RegisteredSweep, Sweep
 
 KEY = 7

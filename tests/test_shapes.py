@@ -6,9 +6,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from densify.flow.align import apply
-from densify.flow.shapes import Shape
-from densify.flow.vote import DistanceField
+from densify.flow.tracking.align import apply
+from densify.flow.tracking.shapes import Shape
+from densify.flow.tracking.vote import DistanceField
 
 
 def test_the_outline_is_that_of_all_points_seen_from_above() -> None:

@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 
 from densify.errors import InputError
-from densify.poses import inverse
+from densify.geometry.poses import inverse
 from densify.readers.kitti_raw import KittiRaw
 from densify.readers.street import Street
-from densify.readers.truth_files import Bodies, FileTruth, write_bodies, write_points
-from densify.street.export import write_kitti_tree
+from densify.readers.truth_files import FileTruth, write_bodies, write_points
+from densify.street.bodies import Bodies
+from densify.writers.kitti_raw import write_kitti_tree
 
 FRAMES = [58, 60]
 

@@ -11,9 +11,9 @@ import pytest
 from scipy.spatial import cKDTree
 
 from densify.errors import InputError
-from densify.flow import soften as module
-from densify.flow.soften import Part, Softened, soften
-from densify.flow.solvers import ObjectiveSettings, solve
+from densify.flow.objective.solvers import ObjectiveSettings, solve
+from densify.flow.tracking import soften as module
+from densify.flow.tracking.soften import Part, Softened, soften
 
 SWEEP_S, STRIDE_S, SWING = 0.1, 1.2, 0.5
 SENSOR = np.array([2.0, -8.0, 1.7])

@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.sparse import csr_array
 
-from densify.flow import graph
-from densify.flow.solvers import _conjugate_gradients
+from densify.flow.objective import graph
+from densify.flow.objective.solvers import _conjugate_gradients
 from densify.kernels import sparse
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from densify.errors import InputError
-from densify.poses import inverse, transform
+from densify.geometry.poses import inverse, transform
 from densify.readers.street import Street
 from densify.street.actors import TRAILER_WHEELBASE_M
 from densify.street.casting import EGO_BOX, SPAN_S, Scene

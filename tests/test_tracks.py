@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from densify.config import GroundSettings
-from densify.flow.evidence import Standing
-from densify.flow.tracks import Track, _groups_to_start
-from densify.height_map import HeightMap
+from densify.flow.tracking.evidence import Standing
+from densify.flow.tracking.tracks import Track, _groups_to_start
+from densify.geometry.height_map import HeightMap
 
 
 def standing(sizes: list[int], seed_share: float = 1.0) -> Standing:

@@ -146,7 +146,7 @@ def test_what_workers_log_is_logged_here(
 ) -> None:
     caplog.set_level(logging.INFO, "densify")
     done([Task(("warn", n), worker_tasks.warn, (f"cut {n}",)) for n in range(4)], everywhere)
-    told = [record for record in caplog.records if record.name == "densify.stages.register"]
+    told = [record for record in caplog.records if record.name == "densify.registration.odometry"]
     assert sorted(r.getMessage().partition(" by ")[0] for r in told) == [
         f"cut {n}" for n in range(4)
     ]

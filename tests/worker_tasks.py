@@ -36,7 +36,7 @@ def unpicklable() -> object:
 
 
 def warn(text: str) -> None:
-    log = logging.getLogger("densify.stages.register")
+    log = logging.getLogger("densify.registration.odometry")
     log.debug("not asked for")
     log.warning("%s by %d", text, os.getpid())
     raise ValueError(text)

@@ -33,7 +33,7 @@ from densify.bench.windows import Window, our_motion
 from densify.config import Config
 from densify.errors import InputError
 from densify.flow.chained import ChainedMotion
-from densify.flow.solvers import solve
+from densify.flow.objective.solvers import solve
 from densify.types import FlowField, LidarSequence, Motion, Progress
 
 OURS, OURS_PAIR, PAPER, ADAM = "ours", "ours-pair", "paper", "paper-adam"

@@ -15,9 +15,9 @@ from densify.bench.baselines import cluster_icp, nonrigid_icp
 from densify.bench.windows import Window
 from densify.config import Config
 from densify.errors import InputError
-from densify.flow.graph import knn_graph, laplacian
-from densify.flow.pair import estimate_flow
-from densify.flow.solvers import ObjectiveSettings, solve
+from densify.flow.objective.graph import knn_graph, laplacian
+from densify.flow.objective.solvers import ObjectiveSettings, solve
+from densify.flow.pairs.estimate import estimate_flow
 from densify.types import Bool, Float, FlowField, Int, RegisteredSweep
 
 NUM_NEIGHBORS = 50

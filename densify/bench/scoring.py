@@ -10,12 +10,12 @@ from typing import Any
 
 import numpy as np
 
-from densify import flow_metrics as metrics
-from densify import poses
 from densify.bench.windows import Window
-from densify.range_image import RangeImage
-from densify.scores import ghost_rate
-from densify.stages.accumulate import accumulate
+from densify.depth.accumulate import accumulate
+from densify.geometry import poses
+from densify.geometry.range_image import RangeImage
+from densify.scores import flow_metrics as metrics
+from densify.scores.ghosts import ghost_rate
 from densify.types import Bool, Float, FlowField, LidarSequence, Truth
 
 _MIN_RETURNS = 30

@@ -10,9 +10,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import densify
 from densify.errors import InputError
-from densify.output.atomic import write_file
+from densify.outputs.atomic import write_file
+from densify.version import __version__
 
 
 def write_table(path: Path, numbers: Mapping[str, Any]) -> None:
@@ -21,7 +21,7 @@ def write_table(path: Path, numbers: Mapping[str, Any]) -> None:
     Raises InputError if it cannot be written.
     """
     machine = {"python": platform.python_version(), "num_cores": os.cpu_count()}
-    whole = {"densify": densify.__version__, "machine": machine, **numbers}
+    whole = {"densify": __version__, "machine": machine, **numbers}
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         write_file(path, (json.dumps(whole, indent=2, allow_nan=False) + "\n").encode())

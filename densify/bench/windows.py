@@ -6,13 +6,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from densify import poses
 from densify.config import Config
+from densify.flow.engines import estimate_motion
+from densify.geometry import poses
+from densify.geometry.ground import ground
 from densify.pipeline import find_trajectory
 from densify.readers.window import read_sweeps, window_frames
-from densify.stages.deskew import deskew
-from densify.stages.flow import estimate_motion
-from densify.stages.ground import ground
+from densify.registration.deskew import deskew
 from densify.types import Bool, Float, LidarSequence, Motion, Stretch
 
 

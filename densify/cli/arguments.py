@@ -8,7 +8,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
-from densify import __version__
 from densify.cli import verbs
 from densify.cli.options import (
     DATA_HELP,
@@ -29,6 +28,7 @@ from densify.cli.options import (
     size_bytes,
     words,
 )
+from densify.version import __version__
 
 
 def parse(arguments: Sequence[str] | None) -> argparse.Namespace:

@@ -90,13 +90,13 @@ def check_new_file(path: Path, overwrite: bool, suffix: str = ".npz") -> None:
 
 
 def write_flow(path: Path, field: FlowField) -> None:
-    """Write the flow as `densify.output.flow_npz.flow_npz` does, row by row as the source file.
+    """Write the flow as `densify.outputs.flow_npz.flow_npz` does, row by row as the source file.
     Appears only when complete.
 
     Raises InputError if it cannot be written.
     """
-    from densify.output.atomic import write_file
-    from densify.output.flow_npz import flow_npz
+    from densify.outputs.atomic import write_file
+    from densify.outputs.flow_npz import flow_npz
 
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

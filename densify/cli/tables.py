@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: MIT
 """What the verbs say on the screen. Reads `Result.metrics`:
 
-- ``ghosts``: `densify.scores.ghost_scores`;
+- ``ghosts``: `densify.scores.ghosts.ghost_scores`;
 - ``held_out``: camera -> the same for the key densified from its neighbours alone;
-- ``depth``: camera -> `densify.depth_metrics.depth_scores`, where there is truth;
+- ``depth``: camera -> `densify.scores.depth_metrics.depth_scores`, where there is truth;
 
 for a benchmark of flow what `densify.bench.flow.bench_flow` returns, and for depth on disk what
-`densify.evaluation.evaluate` does.
+`densify.bench.evaluation.evaluate` does.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from densify.output import Export
+from densify.outputs import Export
 from densify.types import Result
 
 _NONE = "-"

@@ -28,7 +28,7 @@ def run(options: argparse.Namespace) -> None:
     config = _config(options)
     from densify import pipeline
     from densify.cli.tables import summary
-    from densify.output import check_writable, write_result
+    from densify.outputs import check_writable, write_result
     from densify.readers import open_sequence
 
     check_writable(options.out, options.key, options.overwrite, "run")
@@ -60,7 +60,7 @@ def compare(options: argparse.Namespace) -> None:
     config = _config(options)
     from densify import pipeline
     from densify.cli.tables import comparison
-    from densify.output import check_writable, write_comparison
+    from densify.outputs import check_writable, write_comparison
     from densify.readers import open_sequence
 
     check_writable(options.out, options.key, options.overwrite, "compare")
@@ -158,7 +158,7 @@ def info(options: argparse.Namespace) -> None:
 def simulate(options: argparse.Namespace) -> None:
     """The built-in street as a KITTI raw tree with truth."""
     from densify.readers.street import Street
-    from densify.street.export import write_kitti_tree
+    from densify.writers.kitti_raw import write_kitti_tree
 
     street = Street.from_spec(_street_spec(options))
     frames = _frames_of(street, options.frames)
@@ -173,7 +173,7 @@ def simulate(options: argparse.Namespace) -> None:
 def export(options: argparse.Namespace) -> None:
     """A finished run's depth maps with fewer pixels."""
     from densify.cli.tables import export_summary
-    from densify.output import export_run
+    from densify.outputs import export_run
 
     exported = export_run(
         options.run,
@@ -224,7 +224,7 @@ def bench_flow(options: argparse.Namespace) -> None:
 
 def evaluate(options: argparse.Namespace) -> None:
     """Depth maps against the truth."""
-    from densify import evaluation
+    from densify.bench import evaluation
     from densify.bench.table_file import write_table
     from densify.cli.point_files import check_new_file
     from densify.cli.tables import evaluation_table

@@ -24,7 +24,7 @@ from typing import Any, TypeVar
 import numpy as np
 import platformdirs
 
-import densify
+from densify.version import __version__
 
 T = TypeVar("T")
 _log = logging.getLogger("densify")
@@ -111,7 +111,7 @@ def _made(stage: str, inputs: str, make: Callable[[], Any]) -> Any:
 @cache
 def code() -> str:
     """Of this package: another version may make something else of the same inputs."""
-    package = Path(densify.__file__).parent
+    package = Path(__file__).parents[1]
     sources = sorted(package.rglob("*.py"))
     texts = [(str(path.relative_to(package)), path.read_text("utf-8")) for path in sources]
-    return digest([densify.__version__, texts])
+    return digest([__version__, texts])

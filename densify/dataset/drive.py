@@ -28,15 +28,15 @@ import numpy as np
 from densify.config import Config
 from densify.dataset.cache import Cache, digest
 from densify.errors import InputError, SweepError
-from densify.flow.evidence import REACH, Candidates, FreeSpace, find_candidates
-from densify.flow.groups import GroupMotion, follow_candidates
-from densify.height_map import HeightMap
+from densify.flow.tracking.evidence import REACH, Candidates, FreeSpace, find_candidates
+from densify.flow.tracking.groups import GroupMotion, follow_candidates
+from densify.geometry.ground import ground
+from densify.geometry.height_map import HeightMap
+from densify.geometry.poses import inverse
+from densify.geometry.range_image import RangeImage
 from densify.pipeline import find_trajectory, motion_by
-from densify.poses import inverse
-from densify.range_image import RangeImage
 from densify.readers.window import read_sweeps
-from densify.stages.deskew import deskew
-from densify.stages.ground import ground
+from densify.registration.deskew import deskew
 from densify.types import LidarSequence, Motion, RegisteredSweep, Stretch, Sweep, Trajectory
 
 BLOCK = 20

@@ -21,7 +21,7 @@ from torch.utils.data import Dataset
 from densify.dataset.manifest import read_manifests
 from densify.dataset.plan import SCHEMA_VERSION
 from densify.errors import InputError
-from densify.output.depth_png import read_depth_png, read_stored
+from densify.outputs.depth_png import read_depth_png, read_stored
 from densify.readers import open_sequence
 from densify.readers.files import read_text
 from densify.types import Camera, Float, Float32, LidarSequence
@@ -307,7 +307,7 @@ def _check_size(where: str, image: NDArray[Any], camera: Camera) -> None:
 
 
 def _confidence(levels: NDArray[np.uint8], depth_m: Float32) -> Float32:
-    """0 to 1, of what `densify.output.depth_png.stored_confidence` gave."""
+    """0 to 1, of what `densify.outputs.depth_png.stored_confidence` gave."""
     known = (levels > 0) & (depth_m > 0)
     scale = np.float32(1 / (_MOST_CERTAIN - _LEAST_CERTAIN))
     return np.where(known, (levels.astype(np.float32) - _LEAST_CERTAIN) * scale, np.float32(0))

@@ -29,8 +29,8 @@ from densify.dataset.tasks import Outcome, Task, run_tasks
 from densify.dataset.work import Job, tasks
 from densify.dataset.workers import open_workers
 from densify.errors import ComputationError, InputError, OutputError
-from densify.output.atomic import clear_leftovers
-from densify.output.kitti_tree import write_readme
+from densify.outputs.atomic import clear_leftovers
+from densify.outputs.kitti_tree import write_readme
 from densify.readers import open_sequence
 from densify.readers.files import format_frames
 

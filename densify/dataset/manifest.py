@@ -31,8 +31,8 @@ from types import TracebackType
 from typing import Any, Literal, get_args
 
 from densify.errors import InputError, OutputError
-from densify.output.atomic import FileRecord, make_folder, sync_folder, write_file
-from densify.output.store import plain
+from densify.outputs.atomic import FileRecord, make_folder, sync_folder, write_file
+from densify.outputs.store import plain
 
 Status = Literal["done", "aside", "failed"]
 Key = tuple[str, int]

@@ -19,16 +19,16 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-import densify
 from densify.config import Config, as_mapping
 from densify.dataset.gate import Gate
 from densify.errors import InputError, OutputError
-from densify.output.atomic import make_folder, write_file
-from densify.output.kitti_tree import drive_folder, split_of
+from densify.outputs.atomic import make_folder, write_file
+from densify.outputs.kitti_tree import drive_folder, split_of
 from densify.readers import open_sequence
 from densify.readers.files import format_frames
 from densify.readers.window import choose_cameras
 from densify.types import Camera, LidarSequence
+from densify.version import __version__
 
 SCHEMA_VERSION = 1
 LAYOUTS = ("kitti-depth", "densify")
@@ -192,7 +192,7 @@ def _begun(name: str) -> bool:
 def _table(recipe: Recipe, drives: Sequence[PlannedDrive]) -> dict[str, Any]:
     table = {
         "schema_version": SCHEMA_VERSION,
-        "densify": densify.__version__,
+        "densify": __version__,
         "layout": recipe.layout,
         "method": recipe.method,
         "window": recipe.window,

@@ -23,9 +23,9 @@ from densify.dataset.manifest import KeyRecord
 from densify.dataset.plan import Recipe, Source
 from densify.dataset.tasks import Task
 from densify.errors import ComputationError, InputError, OutputError
-from densify.output.atomic import FileRecord
-from densify.output.kitti_tree import write_key
-from densify.output.store import write_result
+from densify.outputs.atomic import FileRecord
+from densify.outputs.kitti_tree import write_key
+from densify.outputs.store import write_result
 from densify.readers import open_sequence
 from densify.types import LidarSequence, Result
 

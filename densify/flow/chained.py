@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from scipy.spatial import cKDTree
 
-from densify import poses
+from densify.geometry import poses
 from densify.types import Float, FlowField, Int, Stretch
 
 _NUM_NEIGHBORS = 3

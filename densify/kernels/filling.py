@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Interpolation between measured pixels, compiled: see `densify.depth_fill`."""
+"""Interpolation between measured pixels, compiled: see `densify.depth.fill`."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def _plane(inverse, top, bottom, left, right, row, column, reach_u, reach_v):  #
 @Kernel
 def between(first, last, inverse, known, reaches, edge, filled_m, confidence, share):  # type: ignore[no-untyped-def]
     """Fill the empty pixels from ``first`` to ``last`` (row by row) as
-    `densify.depth_fill.fill_between` says.
+    `densify.depth.fill.fill_between` says.
 
     inverse: (H,W) float64, 1/m, 0 none. known: (H,W) float32 confidence. reaches: (n,2) half sizes
     of the windows (horizontal, vertical), growing. edge: metres and share of the depth. Filled:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Grids of heights, compiled: see `densify.height_map`."""
+"""Grids of heights, compiled: see `densify.geometry.height_map`."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: MIT
-"""What a point stands for and what it hides, compiled: see `densify.stages.patches` and
-`densify.stages.project`."""
+"""What a point stands for and what it hides, compiled: see `densify.depth.patches` and
+`densify.depth.project`."""
 
 from __future__ import annotations
 

@@ -25,8 +25,8 @@ import numpy as np
 from numpy.lib.npyio import NpzFile
 from numpy.typing import NDArray
 
-from densify import poses
 from densify.errors import InputError
+from densify.geometry import poses
 from densify.types import FlowField, Stretch
 
 MOVES_M = 0.05

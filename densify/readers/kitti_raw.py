@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from densify import poses
 from densify.errors import InputError
+from densify.geometry import poses
 from densify.readers.files import camera_named, load_image, numbered_files, of_frame, read_text
 from densify.readers.kitti_files import Calibration, Stamps, parse_numbers, read_cameras
 from densify.types import Camera, Float, Int, Sweep, Truth

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from densify.poses import inverse
+from densify.geometry.poses import inverse
 from densify.street.lidar import LIDAR_HEIGHT_M
 from densify.street.materials import (
     COLOUR,

@@ -11,7 +11,7 @@ from functools import cached_property
 
 import numpy as np
 
-from densify.readers.truth_files import Bodies
+from densify.street.bodies import Bodies
 from densify.street.camera import CAMERAS, DELAY_NS, Picture, T_world_lidar, expose
 from densify.street.casting import NUM_FRAMES, Scene
 from densify.street.lidar import LIDAR_HEIGHT_M, Returns, at_offsets, scan

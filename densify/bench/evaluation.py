@@ -1,0 +1,105 @@
+# SPDX-License-Identifier: MIT
+"""Depth maps on disk against the truth on disk: every pair read, scored, and averaged."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+
+from densify.errors import InputError
+from densify.outputs.depth_png import read_depth_png, read_mask_png
+from densify.readers.depth_trees import DepthPair, DepthPairs
+from densify.scores.depth_metrics import (
+    KITTI_BASELINE_M,
+    DepthErrors,
+    errors_by_part,
+    image_density,
+    mean_errors,
+)
+from densify.types import Bool, Float32, Progress
+
+SCHEMA_VERSION = 1
+"""Of `evaluate`'s dictionary; grows when a key changes its meaning or goes."""
+
+KITTI_FOCAL_PX = 721.5377
+"""fx of KITTI's rectified cameras on 2011_09_26; of its other days 707 to 719."""
+
+
+def evaluate(
+    pairs: DepthPairs,
+    *,
+    focal_px: float = KITTI_FOCAL_PX,
+    baseline_m: float = KITTI_BASELINE_M,
+    progress: Progress | None = None,
+) -> dict[str, Any]:
+    """Score pairs of depth maps; as KITTI's kit does, the mean over images of each image's value.
+
+    focal_px, baseline_m: turn depth into the disparity by which outliers and depth edges are told.
+
+    Returns plain numbers ready for JSON, None where undefined::
+
+        schema_version, focal_px, baseline_m
+        num_images   pairs
+        density      predicted, truth: mean fraction of all the pixels that have a depth
+        parts        `errors_by_part` name -> num_images (those that compare any pixel of it, which
+                     the errors are means over) and the `DepthErrors` of `mean_errors`; moving and
+                     static over the pairs with a mask
+        images       of each pair: predicted, truth, mask (paths or None), density, and the
+                     `DepthErrors` of all its pixels
+        without_truth, without_prediction, without_mask   paths
+
+    Raises InputError if a file is no depth map or mask, or the sizes of a pair differ.
+    """
+    stereo = {"focal_px": focal_px, "baseline_m": baseline_m}
+    by_part: dict[str, list[DepthErrors]] = defaultdict(list)
+    images: list[dict[str, Any]] = []
+    for number, pair in enumerate(pairs.pairs):
+        predicted_m, truth_m, moving = _read(pair)
+        parts = errors_by_part(predicted_m, truth_m, moving, **stereo)
+        for name, errors in parts.items():
+            by_part[name].append(errors)
+        densities = {"predicted": image_density(predicted_m), "truth": image_density(truth_m)}
+        images.append({**_paths(pair), "density": densities, **asdict(parts["all"])})
+        if progress is not None:
+            progress("evaluate", number + 1, len(pairs.pairs))
+    return {
+        "schema_version": SCHEMA_VERSION,
+        **stereo,
+        "num_images": len(images),
+        "density": {
+            side: float(np.mean([image["density"][side] for image in images]))
+            for side in ("predicted", "truth")
+        },
+        "parts": {
+            name: {
+                "num_images": sum(errors.num_compared > 0 for errors in several),
+                **asdict(mean_errors(several)),
+            }
+            for name, several in by_part.items()
+        },
+        "images": images,
+        **{
+            name: [str(path) for path in getattr(pairs, name)]
+            for name in ("without_truth", "without_prediction", "without_mask")
+        },
+    }
+
+
+def _paths(pair: DepthPair) -> dict[str, str | None]:
+    return {name: None if path is None else str(path) for name, path in vars(pair).items()}
+
+
+def _read(pair: DepthPair) -> tuple[Float32, Float32, Bool | None]:
+    predicted_m, truth_m = read_depth_png(pair.predicted), read_depth_png(pair.truth)
+    moving = None if pair.mask is None else read_mask_png(pair.mask)
+    for path, image in ((pair.predicted, predicted_m), (pair.mask, moving)):
+        if image is not None and image.shape != truth_m.shape:
+            raise InputError(
+                f"{path}: got {image.shape[1]} x {image.shape[0]} px, expected "
+                f"{truth_m.shape[1]} x {truth_m.shape[0]}, the size of {pair.truth}; give maps of "
+                f"the same camera, neither cropped nor scaled"
+            )
+    return predicted_m, truth_m, moving

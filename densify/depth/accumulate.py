@@ -1,0 +1,56 @@
+# SPDX-License-Identifier: MIT
+"""Accumulation: the points of all sweeps at the key's moment, with where they come from."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from densify.geometry import poses
+from densify.types import Cloud, FlowField, Stretch
+
+_CONFIDENCE_PER_SWEEP = 0.07
+_CONFIDENCE_MOVED = 0.8
+
+
+def accumulate(stretch: Stretch, fields: Sequence[FlowField], key: int, drop_lost: bool) -> Cloud:
+    """One cloud in the key frame from flow to the key.
+
+    fields: of each sweep to the key. key: its frame. drop_lost: leave out what moves but could not
+    be followed; otherwise it stays where registration puts it. Points that do not move are placed
+    by registration alone, to the last bit.
+
+    Confidence is a ranking, not a probability: it falls with the distance from the key and for
+    points that flow had to move.
+    """
+    parts = []
+    for registered, flow in zip(stretch.sweeps, fields, strict=True):
+        sweep = registered.sweep
+        T_key_lidar = stretch.T_target_source(key, registered.frame)
+        kept = np.flatnonzero(~flow.lost) if drop_lost else np.arange(len(sweep))
+        rigid = poses.transform(T_key_lidar, sweep.points)
+        points = rigid.copy()
+        moves = flow.moving & ~flow.lost
+        points[moves] += poses.rotate(T_key_lidar, flow.total[moves])
+        velocity_m_s = np.zeros_like(points)
+        if flow.velocity_m_s is not None:
+            velocity_m_s[moves] = poses.rotate(T_key_lidar, flow.velocity_m_s[moves])
+        away = abs(registered.frame - key)
+        confidence = np.full(len(sweep), max(0.1, 1 - _CONFIDENCE_PER_SWEEP * away))
+        confidence[moves & (away > 0)] *= _CONFIDENCE_MOVED
+        parts.append(
+            {
+                "points": points[kept],
+                "rigid_points": rigid[kept],
+                "frame": np.full(len(kept), registered.frame, np.int32),
+                "row": sweep.row[kept],
+                "moving": flow.moving[kept],
+                "instance": flow.instance[kept],
+                "velocity_m_s": velocity_m_s[kept].astype(np.float32),
+                "confidence": confidence[kept].astype(np.float32),
+                "intensity": sweep.intensity[kept],
+                "rgb": np.zeros((len(kept), 3), np.uint8),
+            }
+        )
+    return Cloud(**{name: np.concatenate([p[name] for p in parts]) for name in parts[0]})

@@ -1,0 +1,235 @@
+# SPDX-License-Identifier: MIT
+"""The accumulated cloud seen from a camera: which points it sees, and the depth map they make.
+
+Points that the camera cannot see are found by occlusion: every point hides what lies clearly behind
+its patch (`densify.depth.patches`). Of the points left in a pixel the one measured nearest in time
+to the key is taken, if enough sweeps agree with it and no depth edge is too close to tell on which
+side of it the pixel lies. Its depth is that of the plane through the points that agree, in the
+middle of the pixel. Nothing depends on the order of the points.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from densify.config import ProjectSettings
+from densify.depth.fill import fill_between
+from densify.geometry.cameras import image_points
+from densify.geometry.poses import rotate, transform
+from densify.kernels import visibility as kernels
+from densify.types import Bool, Camera, Cloud, DepthMap, Float, Float32, Int, Patches, Reason
+
+_MAX_HALF_PX = 24.0  # a point just before the lens must not hide the whole image
+_MAX_TILT = 0.25  # of the inverse depth per pixel; a plane seen edge-on has no slope
+_MOST_SWEEPS = 63  # that are told apart when they are counted
+_EDGE_WINDOW_PX = 1.5  # beyond the edge, where points must show that a surface goes on
+_LEAST_CONFIDENCE = 1 / 255  # 0 means no depth once written as 8 bits
+# What takes how much of a pixel's confidence, at most: few sweeps, few points, an edge close by,
+# a rough fit, being nearly hidden. Set by hand, in the order of what was most often wrong.
+_DOUBTS = np.array([0.45, 0.25, 0.20, 0.10, 0.10])
+_MANY_POINTS = 20
+_ROUGH_M = 0.10
+
+
+@dataclass(frozen=True)
+class _InImage:
+    """The K points in the image. index: rows of the cloud. uv: (K,2) px. depth: (K,) m, as it is
+    stored. slope: (K,2) of the tangent plane's inverse depth, 1/m per px. spacing_px: (K,2) between
+    neighbouring rays. moving: (K,). frame, sweep: (K,) source; sweep counts from 0."""
+
+    index: Int
+    uv: Float
+    depth: Float32
+    slope: Float
+    spacing_px: Float
+    moving: Bool
+    frame: np.ndarray
+    sweep: np.ndarray
+
+    @property
+    def inverse(self) -> Float:
+        return 1 / self.depth.astype(np.float64)
+
+
+@dataclass(frozen=True)
+class _Pixels:
+    """P measured pixels. pixel: (P,) row by row. winner: (P,) which of the points in the image.
+    depth_m, confidence: (P,)."""
+
+    pixel: Int
+    winner: Int
+    depth_m: Float32
+    confidence: Float32
+
+
+def project(
+    cloud: Cloud,
+    camera: Camera,
+    T_cam_key: Float,
+    settings: ProjectSettings,
+    key: int,
+    patches: Patches,
+    filled: bool = True,
+) -> DepthMap:
+    """The depth map that ``camera`` sees of ``cloud``.
+
+    T_cam_key: (4,4), with the ego motion from the key's reference time to the camera's own.
+    settings: knobs, see `densify.config.ProjectSettings`; with ``visibility`` off the nearest point
+    of each pixel is taken as it is. key: the key frame; the source sweep nearest to it in time wins
+    a pixel. patches: of the cloud, at the key's moment (`densify.depth.patches.patches`). filled:
+    False leaves out the filling, which takes its time.
+
+    Points with z ≤ 0.1 m, outside the image or outside the lens's valid field of view are dropped.
+    ``filled_m`` adds pixels interpolated between measured ones (`densify.depth.fill.fill_between`).
+    ``confidence`` ranks only: the point's own, less where few sweeps or points agree, a depth edge
+    is close, the surface rough, or the point nearly hidden. ``reason`` says of every point why it
+    is not in the map.
+    """
+    points = _in_image(cloud, camera, T_cam_key, patches, settings.visibility)
+    own = np.clip(cloud.confidence[points.index], _LEAST_CONFIDENCE, 1.0)
+    reason = np.full(len(cloud), Reason.OUTSIDE, np.uint8)
+    if settings.visibility:
+        reason[patches.free] = Reason.VETOED
+        seen = _visible(points, own, camera, settings, key, reason)
+    else:
+        start, order = _by_pixel(points, np.zeros(len(own), np.int64), own, camera)
+        pixel = np.flatnonzero(np.diff(start))
+        nearest = order[start[pixel]]
+        reason[points.index] = Reason.NOT_CHOSEN
+        seen = _Pixels(pixel, nearest, points.depth[nearest], own[nearest])
+    reason[points.index[seen.winner]] = Reason.KEPT
+
+    shape = (camera.height_px, camera.width_px)
+    depth_m, confidence = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
+    frame = np.full(shape, -1, np.int32)
+    depth_m.flat[seen.pixel] = seen.depth_m
+    confidence.flat[seen.pixel] = np.maximum(seen.confidence, _LEAST_CONFIDENCE)
+    frame.flat[seen.pixel] = points.frame[seen.winner]
+    if not filled:
+        return DepthMap(camera.name, depth_m, depth_m, confidence, frame, reason)
+    filled_m, filled_confidence = fill_between(
+        depth_m,
+        confidence,
+        _fill_reach_px(points, settings),
+        settings.edge_m,
+        settings.edge_fraction,
+        settings.fill_confidence,
+    )
+    some = filled_m > 0
+    filled_confidence[some] = np.maximum(filled_confidence[some], np.float32(_LEAST_CONFIDENCE))
+    return DepthMap(camera.name, depth_m, filled_m, filled_confidence, frame, reason)
+
+
+def _in_image(
+    cloud: Cloud, camera: Camera, T_cam_key: Float, patches: Patches, vetoed: bool
+) -> _InImage:
+    points_cam = transform(T_cam_key, cloud.points)
+    ahead = points_cam[:, 2] > 0
+    index = np.flatnonzero(ahead & ~patches.free if vetoed else ahead)
+    points_cam = points_cam[index]
+    uv, seen = image_points(camera, points_cam)
+    index, points_cam, uv = index[seen], points_cam[seen], uv[seen]
+    depth = points_cam[:, 2].astype(np.float32)
+    focal_px = camera.K[[0, 1], [0, 1]]
+    normal = rotate(T_cam_key, patches.normal[index].astype(np.float64))
+    # On the plane n · p = d the inverse depth is n · ray / d: linear over the image.
+    d = np.einsum("ij,ij->i", normal, points_cam)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        slope = np.nan_to_num(normal[:, :2] / (d[:, None] * focal_px), posinf=0.0, neginf=0.0)
+    most = _MAX_TILT / depth[:, None]
+    return _InImage(
+        index=index,
+        uv=uv,
+        depth=depth,
+        slope=np.clip(slope, -most, most),
+        spacing_px=patches.spacing_m[index] * focal_px / depth[:, None],
+        moving=cloud.moving[index],
+        frame=cloud.frame[index],
+        sweep=np.minimum(patches.sweep[index], _MOST_SWEEPS - 1),
+    )
+
+
+def _visible(
+    points: _InImage,
+    own: Float32,
+    camera: Camera,
+    settings: ProjectSettings,
+    key: int,
+    reason: np.ndarray,
+) -> _Pixels:
+    """The pixels that the points not hidden measure; fills in the ``reason`` of the others."""
+    behind = _behind(points, camera, settings)
+    hidden = behind > 1
+    reason[points.index] = np.where(hidden, Reason.HIDDEN, Reason.NOT_CHOSEN)
+    age = np.abs(points.frame.astype(np.int64) - key)
+    last = int(age.max(initial=0)) + 1
+    start, order = _by_pixel(points, np.where(hidden, last, age), own, camera)
+    found = np.zeros((6, len(start) - 1), np.float32)
+    knobs = np.array(
+        [
+            *(settings.support_reach, settings.plane_reach),
+            *(settings.agree_m, settings.agree_fraction),
+            *(settings.hidden_m, settings.hidden_fraction),
+            *(settings.edge_reach, settings.edge_slack_m * camera.K[0, 0], _EDGE_WINDOW_PX),
+        ]
+    )
+    shape = (camera.height_px, camera.width_px)
+    kernels.settle.over_rows(
+        *(len(start) - 1, start, order, points.uv, points.inverse, points.slope),
+        *(points.spacing_px, points.sweep, hidden, points.moving, age, knobs, shape, found),
+    )
+    pixel = np.flatnonzero(found[0])
+    winner = order[start[pixel]]
+    depth_m, num_sweeps, youngest, num_points, residual_m, edge = found[:, pixel]
+    most_sweeps = int(points.sweep.max(initial=0)) + 1
+    needed = min(settings.support, max(1, most_sweeps // 2))
+    supported = (num_sweeps >= needed) & (youngest <= age.min(initial=last))
+    inside = edge >= 1
+    reason[points.index[winner[~inside]]] = Reason.EDGE
+    reason[points.index[winner[~supported]]] = Reason.UNSUPPORTED
+    doubts = np.stack(
+        [
+            1 - num_sweeps / most_sweeps,
+            1 - np.minimum(num_points / _MANY_POINTS, 1),
+            np.clip(3 - edge, 0, 2) / 2,
+            np.minimum(residual_m / _ROUGH_M, 1),
+            np.clip(behind[winner], 0, 1),
+        ]
+    )
+    confidence = (own[winner] * (1 - _DOUBTS @ doubts)).astype(np.float32)
+    kept = supported & inside
+    return _Pixels(pixel[kept], winner[kept], depth_m[kept], confidence[kept])
+
+
+def _behind(points: _InImage, camera: Camera, settings: ProjectSettings) -> Float:
+    """(K,) how far each point lies behind the nearest patch over its pixel, as a share of what is
+    allowed; above 1 it is hidden."""
+    slack_px = settings.slack_m * camera.K[[0, 1], [0, 1]] / points.depth[:, None]
+    half_px = np.clip(settings.footprint * points.spacing_px + slack_px, 0.5, _MAX_HALF_PX)
+    nearest = np.zeros((camera.height_px, camera.width_px), np.float32)
+    kernels.paint(points.uv, points.inverse, points.slope, half_px, nearest)
+    column, row = np.rint(points.uv).astype(np.int64).T
+    occluder = 1 / nearest[row, column].astype(np.float64)
+    allowed = settings.hidden_m + settings.hidden_fraction * occluder
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.nan_to_num((points.depth - occluder) / allowed, posinf=np.inf)
+
+
+def _by_pixel(points: _InImage, rank: Int, own: Float32, camera: Camera) -> tuple[Int, Int]:
+    """The points of pixel p are ``order[start[p]:start[p + 1]]``, the least in rank first, then the
+    nearest."""
+    column, row = np.rint(points.uv).astype(np.int64).T
+    start = np.empty(camera.height_px * camera.width_px + 1, np.int64)
+    order = np.empty(len(rank), np.int64)
+    pixel = row * camera.width_px + column
+    kernels.by_pixel(pixel, rank, points.depth, points.frame, points.uv, own, start, order)
+    return start, order
+
+
+def _fill_reach_px(points: _InImage, settings: ProjectSettings) -> tuple[int, int]:
+    if not len(points.index):
+        return 1, 1
+    reach = np.ceil(settings.fill_reach * np.median(points.spacing_px, axis=0))
+    return max(1, int(reach[0])), max(1, int(reach[1]))

@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: MIT
+"""Scene flow between any two clouds."""

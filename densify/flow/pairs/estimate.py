@@ -1,0 +1,240 @@
+# SPDX-License-Identifier: MIT
+"""Scene flow between any two clouds in one frame: rigid groups that certainly move, or the
+published objective."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike
+from scipy.spatial import cKDTree
+
+from densify.config import Config, FlowSettings, resolve
+from densify.errors import InputError
+from densify.flow.objective.neighbors import require_points
+from densify.flow.objective.solvers import ObjectiveSettings, solve
+from densify.flow.pairs.hypotheses import Standing
+from densify.flow.pairs.movers import find_movers
+from densify.flow.tracking.evidence import link
+from densify.geometry.height_map import HeightMap
+from densify.types import Float, FlowField, Int
+
+_LEAST_MOTION_M = 0.15
+_LINK_M = 0.6
+_MIN_POINTS = 8
+_REACH_M = 0.5
+_MIN_GAIN_M = 0.07
+_MAX_EXTENT_M = 400.0
+_MIN_LOW_M = 0.04
+_BELOW_M = 0.3
+
+
+def estimate_flow(
+    source: ArrayLike,
+    target: ArrayLike,
+    config: Config | str | Path | Mapping[str, Any] | None = None,
+    initial: ArrayLike | None = None,
+    source_offset_ns: ArrayLike | None = None,
+    target_offset_ns: ArrayLike | None = None,
+    source_lidar: ArrayLike | None = None,
+    target_lidar: ArrayLike | None = None,
+) -> FlowField:
+    """Scene flow of two clouds in one coordinate frame, metres, z up, with or without the ground.
+
+    source: (N,3), target: (M,3). config: its ``flow`` and ``ground`` sections are used.
+    initial: (N,3) flow to start from; needed only where something moves by more than 3.8 m.
+
+    source_offset_ns, target_offset_ns: (N,), (M,) when each point was measured, both or neither.
+    On one clock, or each from its own sweep's reference time: then the target is taken for the next
+    revolution. With them the flow is that between the middles of the two clouds' times, and
+    ``to_reference`` that from a point's own time to the source's middle. Without them an object the
+    scanner meets earlier or later in the second sweep comes out too slow or too fast.
+    source_lidar, target_lidar: (N,), (M,) whole numbers, which scanner measured each point, both or
+    neither: each scanner's points are compared with its own, for each sees a mover at another time.
+
+    With ``flow.static_prior`` only groups of points move whose motion explains in both clouds what
+    standing still leaves unexplained; the flow of all others is exactly 0, as it is farther than
+    400 m from the middle. ``flow.engine=paper`` takes the published objective's flow for them.
+    Without the prior every point takes the objective's flow.
+
+    Raises InputError for no points, wrong shapes or NaN.
+    """
+    settings = resolve(config)
+    clouds = _as_cloud(source, "source"), _as_cloud(target, "target")
+    lags = _lags(_columns(source_offset_ns, target_offset_ns, clouds, "offset_ns"))
+    lidars = _columns(source_lidar, target_lidar, clouds, "lidar")
+    if not settings.flow.static_prior or settings.flow.engine == "paper":
+        return flow_between(*clouds, settings.flow, initial)
+    start = None if initial is None else _as_cloud(initial, "initial")
+    if start is not None and start.shape != clouds[0].shape:
+        raise InputError(
+            f"initial: got shape {start.shape}, expected the source's {clouds[0].shape}"
+        )
+    return _flow_of_groups(clouds, settings, start, lags, lidars)
+
+
+def flow_between(
+    source: ArrayLike, target: ArrayLike, settings: FlowSettings, initial: ArrayLike | None = None
+) -> FlowField:
+    """The published objective's flow; with ``static_prior`` only of groups that it certainly
+    moves. Arguments and errors as `estimate_flow`."""
+    objective = ObjectiveSettings(
+        solver=settings.solver,
+        alpha=settings.alpha,
+        num_neighbors=settings.num_neighbors,
+        radius_m=settings.radius_m,
+        laplacian=settings.laplacian,
+    )
+    flow = solve(source, target, objective, initial, _device(settings)).flow
+    if settings.static_prior:
+        return _only_proven(np.asarray(source, float), np.asarray(target, float), flow)
+    still = FlowField.zero(len(flow))
+    return replace(still, displacement=flow, moving=np.ones(len(flow), bool))
+
+
+def _flow_of_groups(
+    clouds: tuple[Float, Float],
+    settings: Config,
+    initial: Float | None,
+    lags: tuple[Float, Float] | None,
+    lidars: tuple[Int, Int] | None,
+) -> FlowField:
+    middle = np.median(clouds[0], axis=0)  # map coordinates lose nothing
+    points = [cloud - middle for cloud in clouds]
+    inside = [np.flatnonzero((np.abs(p[:, :2]) < _MAX_EXTENT_M).all(1)) for p in points]
+    near = [p[rows] for p, rows in zip(points, inside, strict=True)]
+    ground = HeightMap.of(near, settings.ground)
+    heights_m = [ground.above(p) for p in near]
+    above = [
+        rows[h >= settings.flow.min_height_m] for rows, h in zip(inside, heights_m, strict=True)
+    ]
+    field = FlowField.zero(len(clouds[0]))
+    if not (len(above[0]) and len(above[1])):
+        return field
+    lag = lags or (np.zeros(len(clouds[0])), np.zeros(len(clouds[1])))
+    source, target = (
+        Standing(points[i][rows], lag[i][rows], None if lidars is None else lidars[i][rows])
+        for i, rows in enumerate(above)
+    )
+    start = None if initial is None else initial[above[0]]
+    motions, field.instance[above[0]] = find_movers(source, target, start)
+    low = (heights_m[0] < settings.flow.min_height_m) & (heights_m[0] > _MIN_LOW_M)
+    _attach_below(points[0], field, inside[0][low])
+    to_reference = np.zeros_like(clouds[0])
+    for k, motion in enumerate(motions):
+        rows = np.flatnonzero(field.instance == k)
+        measured = points[0][rows]
+        at_reference = motion.carry(measured, -lag[0][rows])
+        field.displacement[rows] = motion.carry(measured, 1 - lag[0][rows]) - at_reference
+        to_reference[rows] = at_reference - measured
+    field.moving[:] = field.instance >= 0
+    return field if lags is None else replace(field, to_reference=to_reference)
+
+
+def _attach_below(points: Float, field: FlowField, low: Int) -> None:
+    """What is just below a mover is its wheels and feet."""
+    members = np.flatnonzero(field.instance >= 0)
+    if not len(members) or not len(low):
+        return
+    tree = cKDTree(points[members, :2], balanced_tree=False, compact_nodes=False)
+    far, nearest = tree.query(points[low, :2], distance_upper_bound=_BELOW_M)
+    close = np.isfinite(far)
+    field.instance[low[close]] = field.instance[members[np.asarray(nearest)[close]]]
+
+
+def _as_cloud(values: ArrayLike, name: str) -> Float:
+    """(N,3) float64. Raises InputError."""
+    try:
+        cloud = np.array(values, dtype=np.float64, order="C")
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{name}: expected (n,3) numbers, metres; {error}") from error
+    if cloud.ndim != 2 or cloud.shape[1] != 3 or not (len(cloud) and np.isfinite(cloud).all()):
+        require_points(torch.from_numpy(cloud), name)  # says what is wrong
+    return cloud
+
+
+def _columns(
+    source: ArrayLike | None, target: ArrayLike | None, clouds: tuple[Float, Float], name: str
+) -> tuple[Int, Int] | None:
+    """(N,), (M,) int64 beside the clouds' points; None where not given. Raises InputError."""
+    if source is None and target is None:
+        return None
+    columns = []
+    for values, cloud, side in zip((source, target), clouds, ("source", "target"), strict=True):
+        if values is None:
+            raise InputError(
+                f"{side}_{name}: not given, but the other cloud's is; give both or neither"
+            )
+        column = np.asarray(values)
+        if column.shape != (len(cloud),) or column.dtype.kind not in "iu":
+            raise InputError(
+                f"{side}_{name}: got shape {column.shape} and type {column.dtype}, expected "
+                f"({len(cloud)},) whole numbers, one for each point"
+            )
+        columns.append(column.astype(np.int64))
+    return columns[0], columns[1]
+
+
+def _lags(times_ns: tuple[Int, Int] | None) -> tuple[Float, Float] | None:
+    """When the points were measured, after the middle of their cloud's times, as shares of the time
+    between the middles; None where that tells nothing."""
+    if times_ns is None:
+        return None
+    low, high = (np.array([int(of(times)) for times in times_ns]) for of in (np.min, np.max))
+    middle = low + (high - low) // 2
+    span, gap = int((high - low).max()), int(middle[1] - middle[0])
+    if 2 * abs(gap) < span:
+        gap = span  # each from its own reference time: the next revolution
+    if gap == 0:
+        return None
+    first, second = ((times - m) / gap for times, m in zip(times_ns, middle, strict=True))
+    return first, second
+
+
+def _device(settings: FlowSettings) -> str:
+    if settings.device != "auto":
+        return settings.device
+    return "cuda" if torch.cuda.is_available() else "cpu"
+
+
+def _only_proven(source: Float, target: Float, flow: Float) -> FlowField:
+    """Keep the flow of groups that beat "did not move" in both directions."""
+    field = FlowField.zero(len(source))
+    moved = np.flatnonzero(np.linalg.norm(flow, axis=1) > _LEAST_MOTION_M)
+    num_groups, group = link(source[moved], _LINK_M)
+    trees = cKDTree(source), cKDTree(target)
+    instance = 0
+    for k in range(num_groups):
+        rows = moved[group == k]
+        if len(rows) < _MIN_POINTS:
+            continue
+        if _beats_standing_still(source[rows], target, flow[rows], trees):
+            field.displacement[rows] = flow[rows]
+            field.moving[rows] = True
+            field.instance[rows] = instance
+            instance += 1
+    return field
+
+
+def _beats_standing_still(
+    group: Float, target: Float, flow: Float, trees: tuple[cKDTree, cKDTree]
+) -> bool:
+    """Judged by the group's common translation: a free flow always comes closer to the target."""
+    source_tree, target_tree = trees
+    arrived = group + np.median(flow, axis=0)
+
+    def mean_distance(tree: cKDTree, points: Float) -> float:
+        return float(np.minimum(tree.query(points)[0], _REACH_M).mean())
+
+    reached = np.unique(np.concatenate(target_tree.query_ball_point(arrived, _REACH_M))).astype(int)
+    if not len(reached):
+        return False
+    forward = mean_distance(target_tree, group) - mean_distance(target_tree, arrived)
+    there = target[reached]
+    backward = mean_distance(source_tree, there) - mean_distance(cKDTree(arrived), there)
+    return min(forward, backward) >= _MIN_GAIN_M

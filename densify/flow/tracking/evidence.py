@@ -1,0 +1,207 @@
+# SPDX-License-Identifier: MIT
+"""Which points cannot belong to the static world: other sweeps saw through where they were."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from densify.geometry import poses
+from densify.geometry.height_map import HeightMap
+from densify.geometry.range_image import RangeImage
+from densify.types import Bool, Float, Int, Stretch
+
+_MARGIN_M = 0.4
+_MARGIN_FRACTION = 0.015
+_NEAR_M = 0.4
+_MIN_SEED_SHARE = 0.3
+_LINK_M = 0.6
+_RING_GAP_M = 0.35
+REACH = 10  # sweeps
+
+
+@dataclass(frozen=True)
+class FreeSpace:
+    """What each sweep of a stretch saw through.
+
+    T_lidar_world: (4,4) per sweep. origin: (3,) world, where each sweep's lidar stood.
+    """
+
+    images: tuple[RangeImage, ...]
+    T_lidar_world: tuple[Float, ...]
+    origin: tuple[Float, ...]
+
+    @staticmethod
+    def of(stretch: Stretch, images: Sequence[RangeImage] | None = None) -> FreeSpace:
+        """images: of the sweeps, where they are known."""
+        if images is None:
+            with ThreadPoolExecutor() as pool:
+                images = list(pool.map(RangeImage.of, stretch.sweeps))
+        return FreeSpace(
+            tuple(images),
+            tuple(poses.inverse(s.T_world_lidar) for s in stretch.sweeps),
+            tuple(s.T_world_lidar[:3, 3] for s in stretch.sweeps),
+        )
+
+    def __len__(self) -> int:
+        return len(self.images)
+
+    @property
+    def ring_step_rad(self) -> float:
+        """Angle between neighbouring rings of the (coarsest) scanner."""
+        return max(s.row_step_rad for i in self.images for s in i.scanners)
+
+    def others(self, i: int) -> list[int]:
+        """The sweeps around sweep number i that tell about it: from where others were taken long
+        before or after it, little of what it saw is in view."""
+        return [j for j in range(max(0, i - REACH), min(len(self), i + REACH + 1)) if j != i]
+
+    def seen_through(self, points: Float, j: int, velocity_m_s: Float | None = None) -> Bool:
+        """(N,3) world -> (N,) True where sweep number j certainly saw free space.
+
+        points: at the sweep's reference time. velocity_m_s: (N,3) of those that move.
+        """
+        T_lidar_world = self.T_lidar_world[j]
+        return self.images[j].sees_through(
+            poses.transform(T_lidar_world, points),
+            _MARGIN_M,
+            _MARGIN_FRACTION,
+            velocity_m_s=None
+            if velocity_m_s is None
+            else poses.rotate(T_lidar_world, velocity_m_s),
+        )
+
+
+@dataclass(frozen=True)
+class Candidates:
+    """What a `Standing` says of its sweep's rows, wherever the world's origin is."""
+
+    row: Int
+    seed: Bool
+    cluster: Int
+    num_clusters: int
+
+
+@dataclass(frozen=True)
+class Standing:
+    """The points of one sweep that stand above the ground, and what the others say of them.
+
+    row: (C,) index into the sweep's points. points: (C,3) world, rigidly registered.
+    time_s: (C,) when each was measured, since the first sweep's reference time.
+    seed: (C,) some other sweep sees through the point. cluster: (C,) label of ``num_clusters``
+    groups of candidates (seeds and what is close to them), -1 of points that are none.
+    """
+
+    row: Int
+    points: Float
+    time_s: Float
+    seed: Bool
+    cluster: Int
+    num_clusters: int
+
+    @staticmethod
+    def of(stretch: Stretch, i: int, found: Candidates) -> Standing:
+        """Of sweep number i."""
+        registered = stretch.sweeps[i]
+        points = poses.transform(registered.T_world_lidar, registered.sweep.points[found.row])
+        return Standing(
+            *(found.row, points, firing_times_s(stretch, i)[found.row]),
+            *(found.seed, found.cluster, found.num_clusters),
+        )
+
+    @property
+    def candidate(self) -> Bool:
+        return self.cluster >= 0
+
+
+def find_candidates(
+    stretch: Stretch,
+    space: FreeSpace,
+    ground: HeightMap,
+    min_height_m: float,
+    among: Sequence[int] | None = None,
+) -> tuple[Candidates, ...]:
+    """What stands in every sweep, and which of it may move.
+
+    A point is a seed where any other sweep around sees through it; points close to a seed are
+    candidates too, since a mover's own points are not all seen through.
+    min_height_m: points lower above the ground do not stand. among: numbers of the sweeps to look
+    at, all if None.
+    """
+
+    def of_sweep(i: int) -> Candidates:
+        registered = stretch.sweeps[i]
+        points = poses.transform(registered.T_world_lidar, registered.sweep.points)
+        above = np.flatnonzero(ground.above(points) >= min_height_m)
+        points, in_lidar = points[above], registered.sweep.points[above]
+        seed = np.zeros(len(above), bool)
+        for j in space.others(i):
+            rest = np.flatnonzero(~seed)
+            seed[rest] = space.seen_through(points[rest], j)
+        close = _closer_rings(in_lidar, points, space.ring_step_rad)
+        num_clusters, cluster = _cluster(close, seed)
+        return Candidates(above, seed, cluster, num_clusters)
+
+    with ThreadPoolExecutor() as pool:
+        return tuple(pool.map(of_sweep, range(len(stretch.sweeps)) if among is None else among))
+
+
+def _closer_rings(in_lidar: Float, points: Float, ring_step_rad: float) -> Float:
+    """The points with heights compressed where the scanner's rings lie farther apart than what is
+    taken for one thing."""
+    gap_m = ring_step_rad * np.linalg.norm(in_lidar, axis=1)
+    squeezed = points.copy()
+    squeezed[:, 2] *= np.minimum(1.0, _RING_GAP_M / np.maximum(gap_m, 1e-6))
+    return squeezed
+
+
+def reference_times_s(stretch: Stretch) -> Float:
+    """(W,) of the sweeps, since the first one's."""
+    stamp_ns = np.array([s.sweep.stamp_ns for s in stretch.sweeps])
+    return (stamp_ns - stamp_ns[0]) * 1e-9
+
+
+def firing_times_s(stretch: Stretch, i: int) -> Float:
+    """(N,) when each point of sweep number i was measured, since the first reference time."""
+    sweep = stretch.sweeps[i].sweep
+    offset_ns = np.zeros(len(sweep), np.int64) if sweep.offset_ns is None else sweep.offset_ns
+    begin_ns = stretch.sweeps[0].sweep.stamp_ns
+    return (sweep.stamp_ns - begin_ns + offset_ns).astype(np.float64) * 1e-9
+
+
+def _cluster(points: Float, seed: Bool) -> tuple[int, Int]:
+    """Keep the seeds that are not alone among unseen points (a hedge's flicker is), add what is
+    close to them, and link. Returns the number of clusters and (N,) labels."""
+    cluster = np.full(len(points), -1, np.int64)
+    if not seed.any():
+        return 0, cluster
+    seeds = np.flatnonzero(seed)
+    num_near = cKDTree(points).query_ball_point(points[seeds], _NEAR_M, return_length=True)
+    num_near_seeds = cKDTree(points[seeds]).query_ball_point(
+        points[seeds], _NEAR_M, return_length=True
+    )
+    kept = seeds[num_near_seeds >= _MIN_SEED_SHARE * num_near]
+    if not len(kept):
+        return 0, cluster
+    distance, _ = cKDTree(points[kept]).query(points, distance_upper_bound=_NEAR_M)
+    near = np.flatnonzero(np.isfinite(distance))
+    num_clusters, cluster[near] = link(points[near], _LINK_M)
+    return num_clusters, cluster
+
+
+def link(points: Float, distance_m: float) -> tuple[int, Int]:
+    """(N,3) -> number of groups and (N,) label: points closer than about ``distance_m`` share one.
+
+    Links voxels of half that size, so the cost does not grow with the square of the density.
+    """
+    voxels, of_point = np.unique(np.floor(points / (0.5 * distance_m)), axis=0, return_inverse=True)
+    pairs = cKDTree(voxels).query_pairs(2.0, output_type="ndarray")
+    links = coo_array((np.ones(len(pairs), bool), pairs.T), shape=(len(voxels), len(voxels)))
+    num_groups, label = connected_components(links, directed=False)
+    return int(num_groups), label[of_point.ravel()].astype(np.int64)

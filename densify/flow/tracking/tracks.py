@@ -1,0 +1,350 @@
+# SPDX-License-Identifier: MIT
+"""Groups of candidates followed through a stretch as rigid objects, and the proof that they move.
+
+A track is a group's accumulated shape (its model) and one planar rigid motion per sweep. It starts
+from the velocity that most sweeps agree on, is followed both ways by aligning each sweep with the
+model, is smoothed in time, and counts only if that smooth motion explains what was measured.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from densify.flow.tracking.align import GATES_M, MIN_FIT, Model, align, apply, undo
+from densify.flow.tracking.evidence import FreeSpace, Standing
+from densify.flow.tracking.paths import Path
+from densify.flow.tracking.shapes import Shape
+from densify.flow.tracking.vote import DistanceField, vote
+from densify.geometry.height_map import HeightMap
+from densify.kernels.clouds import rows_inside
+from densify.types import Bool, Float
+
+_MIN_POINTS = 8
+_MIN_SEED_SHARE = 0.4
+_AROUND = 5  # sweeps before and after a start are as good as any number
+_PER_SWEEP_NEARER_END = 0.7  # a start this much nearer needs as many more points
+_FIT_M = 0.3
+_NEAR_SWEEPS = 3
+_SHARE_UNSEEN = 0.5  # of the points a sweep usually shows
+_MANY_POINTS = 100  # more do not place a sweep better
+_PREDICTION_STD = np.array([0.3, 0.3, 0.06])  # m, m, rad
+_STEADY = np.array([1.0, 1.0, 1.0, 0.9])  # of a rate lasts: turns level out
+_ROUGH_M, _ROUGH_PER_GAP, _ROUGH_PER_STEP = 0.04, 0.2, 0.03  # by gap of rings, way per sweep
+_LEAST_WAY_M, _LEAST_WAY_PER_RESIDUAL = 0.35, 8.0
+_NUM_ASKED = 60
+_MISSES_ALLOWED = 1
+_MAX_CONTRADICTIONS = 0.3  # of those that standing still leaves
+
+
+@dataclass
+class Track:
+    """One rigid object in the stretch.
+
+    centre: (3,) about which it turns, world. states: sweep index -> (4,) x y z displacement (m)
+    and yaw (rad) since the sweep it started in; z as the ground under it rises. times_s:
+    sweep index -> when that sweep saw it, which is not the sweep's reference time. claimed: sweep
+    index -> rows of `Standing` that are its. path: the smooth motion.
+    """
+
+    centre: Float
+    states: dict[int, Float] = field(default_factory=dict)
+    times_s: dict[int, float] = field(default_factory=dict)
+    claimed: dict[int, np.ndarray] = field(default_factory=dict)
+    path: Path = field(init=False)
+
+    def carry(self, points: Float, from_s: float | Float, to_s: float | Float) -> Float:
+        """(N,3) points of the object at one time -> at another, world; one time or one each."""
+        return self.place(self.undo(points, from_s), to_s)
+
+    def undo(self, points: Float, seen_s: float | Float) -> Float:
+        """(N,3) points seen at a time -> in the object's own frame."""
+        return undo(self.path(seen_s), points, self.centre)
+
+    def place(self, points: Float, time_s: float | Float) -> Float:
+        """Inverse of `undo`."""
+        return apply(self.path(time_s), points, self.centre)
+
+    def velocity_m_s(self, points: Float, time_s: float) -> Float:
+        """(N,3) of the object's points where they are at that time."""
+        state, rate = self.path(time_s), self.path.rate(time_s)
+        velocity_m_s = np.tile(rate[:3], (len(points), 1))
+        velocity_m_s[:, 0] -= rate[3] * (points[:, 1] - self.centre[1] - state[1])
+        velocity_m_s[:, 1] += rate[3] * (points[:, 0] - self.centre[0] - state[0])
+        return velocity_m_s
+
+    def seen_in(self, standing: Sequence[Standing], sweeps: Iterable[int]) -> Float:
+        """(N,3) what these sweeps saw of the object, in its own frame."""
+        parts = [np.zeros((0, 3))]
+        for j in sweeps:
+            c, rows = standing[j], self.claimed[j]
+            parts.append(self.undo(c.points[rows], c.time_s[rows]))
+        return np.concatenate(parts)
+
+    def add(self, j: int, state: Float, time_s: float, rows: np.ndarray) -> None:
+        """What sweep j saw of the object."""
+        self.states[j], self.times_s[j], self.claimed[j] = state, time_s, rows
+
+    def rise_m(self, ground: HeightMap, state: Float) -> float:
+        """How much higher the ground under the object is in that state."""
+        centres = np.stack([self.centre, self.centre + state[:3]])
+        start, now = ground.under(centres)
+        return float(now - start)
+
+    def typical_size(self) -> float:
+        """Points per sweep."""
+        return float(np.median([len(rows) for rows in self.claimed.values()]))
+
+    def smooth(self, sweep_time_s: Float) -> None:
+        """Lay the path through the states; sweeps that saw many points count more."""
+        seen = sorted(self.states)
+        times_s = np.array([self.times_s[j] for j in seen])
+        states = np.stack([self.states[j] for j in seen])
+        weights = np.array([min(len(self.claimed[j]), _MANY_POINTS) for j in seen], float)
+        self.path = Path.fit(times_s, states, weights, float(np.median(np.diff(sweep_time_s))))
+
+    def seen_at(self, j: int, sweep_time_s: Float) -> float:
+        """When sweep j sees, or would see, the object."""
+        nearest = min(self.times_s, key=lambda k: (abs(k - j), k))
+        return float(sweep_time_s[j] + self.times_s[nearest] - sweep_time_s[nearest])
+
+
+def follow_groups(
+    standing: Sequence[Standing], space: FreeSpace, ground: HeightMap, sweep_time_s: Float
+) -> list[Track]:
+    """All proven moving objects of the stretch.
+
+    sweep_time_s: (W,) reference times of the sweeps, ascending.
+    """
+    fields = [DistanceField.of(c.points[c.candidate]) for c in standing]
+    free = [np.ones(len(c.points), bool) for c in standing]  # not yet part of a track
+    untried = [np.ones(len(c.points), bool) for c in standing]
+    tracks = []
+    for i, group in _groups_to_start(standing):
+        members = group[free[i][group] & untried[i][group]]
+        if len(members) < _MIN_POINTS:
+            continue
+        velocity = vote(standing[i].points[members], i, fields, sweep_time_s)
+        track = _follow(members, i, velocity, standing, free, ground, sweep_time_s)
+        proven = _prove(track, standing, space, sweep_time_s)
+        if proven:
+            _gather(track, standing, free, space, sweep_time_s)
+            _refine(track, standing, ground, sweep_time_s)
+        for j, rows in track.claimed.items():
+            untried[j][rows] = False
+            if proven:
+                free[j][rows] = False
+        if proven:
+            tracks.append(track)
+    return tracks
+
+
+def _groups_to_start(standing: Sequence[Standing]) -> list[tuple[int, np.ndarray]]:
+    """Sweep and members of the clusters that are mostly seeds, the best start first: what is seen
+    well makes a good model, and far from the ends of the stretch both sides tell how it moves."""
+    groups = []
+    last = len(standing) - 1
+
+    def worth(start: tuple[int, np.ndarray]) -> float:
+        i, members = start
+        return float(len(members) * _PER_SWEEP_NEARER_END ** max(0, _AROUND - min(i, last - i)))
+
+    for i, c in enumerate(standing):
+        size = np.bincount(c.cluster[c.candidate], minlength=c.num_clusters)
+        seeds = np.bincount(c.cluster[c.candidate & c.seed], minlength=c.num_clusters)
+        good = np.flatnonzero((size >= _MIN_POINTS) & (seeds >= _MIN_SEED_SHARE * size))
+        groups += [(i, np.flatnonzero(c.cluster == k)) for k in good]
+    return sorted(groups, key=worth, reverse=True)
+
+
+def _follow(
+    members: np.ndarray,
+    start: int,
+    velocity: Float,
+    standing: Sequence[Standing],
+    free: Sequence[Bool],
+    ground: HeightMap,
+    sweep_time_s: Float,
+) -> Track:
+    """Forwards, then backwards, with everything seen so far as the model."""
+    here = standing[start]
+    rate = np.append(velocity, 0.0)
+    seen_s = float(here.time_s[members].mean())
+    points = _at_once(here, members, rate, seen_s)
+    track = Track(points.mean(0))
+    track.add(start, np.zeros(4), seen_s, members)
+    model = Model(points)
+    for direction in (1, -1):
+        misses, j = 0, start + direction
+        while 0 <= j < len(standing) and misses <= _MISSES_ALLOWED:
+            found = _find(
+                model, track, rate, standing[j], free[j], ground, track.seen_at(j, sweep_time_s)
+            )
+            if found is None:
+                misses += 1
+            else:
+                misses = 0
+                state, seen_s, rows, points = found
+                track.add(j, state, seen_s, rows)
+                model.add(undo(state, points, track.centre))
+            j += direction
+    return track
+
+
+def _at_once(c: Standing, rows: np.ndarray, rate: Float, time_s: float) -> Float:
+    """(N,3) candidates of one sweep, seen one after the other, where they all were at one time."""
+    return c.points[rows] + (time_s - c.time_s[rows])[:, None] * rate[:3]
+
+
+def _predict(track: Track, rate: Float, time_s: float) -> tuple[Float, Float]:
+    """State and its rate, from the states nearest in time: constant velocity."""
+    known = sorted(track.states, key=lambda k: (abs(track.times_s[k] - time_s), k))[:4]
+    nearest = known[0]
+    if len(known) > 1:
+        t = np.array([track.times_s[k] for k in known])
+        t -= t.mean()
+        rate = t @ np.stack([track.states[k] for k in known]) / (t @ t) * _STEADY
+    return track.states[nearest] + rate * (time_s - track.times_s[nearest]), rate
+
+
+def _find(
+    model: Model,
+    track: Track,
+    rate: Float,
+    c: Standing,
+    free: Bool,
+    ground: HeightMap,
+    about_s: float,
+) -> tuple[Float, float, np.ndarray, Float] | None:
+    """Align one sweep's candidates with the model.
+
+    about_s: roughly when the sweep saw the object. Returns the state, when it held, the rows that
+    fit and where those points were at that time; None where too few fit.
+    """
+    centre = track.centre
+    expected = apply(_predict(track, rate, about_s)[0], model.points, centre)
+    low, high = expected.min(0) - GATES_M[0], expected.max(0) + GATES_M[0]
+    inside = rows_inside(c.points, low, high)
+    inside = inside[free[inside]]
+    rows, enough = inside[c.cluster[inside] >= 0], float(MIN_FIT)
+    if len(rows) < MIN_FIT:  # seen by nobody else, it may be there all the same
+        rows, enough = inside, max(MIN_FIT, _SHARE_UNSEEN * track.typical_size())
+    if len(rows) < enough:
+        return None
+    seen_s = float(c.time_s[rows].mean())
+    predicted, rate = _predict(track, rate, seen_s)
+    predicted[2] = track.rise_m(ground, predicted)
+    target = _at_once(c, rows, rate, seen_s)
+    state = align(model, target, centre, predicted, _PREDICTION_STD)
+    if state is None:
+        return None
+    state[2] = track.rise_m(ground, state)
+    distance, _ = model.tree.nearest(undo(state, target, centre), _FIT_M)
+    fit = np.isfinite(distance)
+    if fit.sum() < enough:
+        return None
+    return state, seen_s, rows[fit], target[fit]
+
+
+def _gather(
+    track: Track,
+    standing: Sequence[Standing],
+    free: Sequence[Bool],
+    space: FreeSpace,
+    sweep_time_s: Float,
+) -> None:
+    """Claim the free candidates beside or within the object that its motion does not contradict,
+    before a part of it starts a track of its own."""
+    shape = Shape.of(track.seen_in(standing, sorted(track.claimed)))
+    for j, own in track.claimed.items():
+        c = standing[j]
+        there = track.place(shape.rim, track.times_s[j])
+        rows = rows_inside(c.points, there.min(0) - 2 * _FIT_M, there.max(0) + 2 * _FIT_M)
+        rows = rows[free[j][rows] & (c.cluster[rows] >= 0)]
+        rows = np.setdiff1d(rows, own, assume_unique=True)
+        in_shape = track.undo(c.points[rows], c.time_s[rows])
+        belongs = np.isfinite(shape.tree.nearest(in_shape, _FIT_M)[0])
+        rows = rows[belongs | shape.within_outline(in_shape)]
+        for i in space.others(j):
+            if abs(i - j) <= _NEAR_SWEEPS and len(rows):
+                carried = track.carry(c.points[rows], c.time_s[rows], sweep_time_s[i])
+                velocity_m_s = track.velocity_m_s(carried, sweep_time_s[i])
+                rows = rows[~space.seen_through(carried, i, velocity_m_s)]
+        track.claimed[j] = np.concatenate([own, rows])
+
+
+def _refine(
+    track: Track, standing: Sequence[Standing], ground: HeightMap, sweep_time_s: Float
+) -> None:
+    """Align every sweep once more, with what others saw, if that makes the motion smoother.
+
+    Followed sweep by sweep, an object whose other side comes into view drifts: the first shape is
+    all there is to hold on to. The even sweeps are aligned with the shape that the odd ones show,
+    and the other way round, so that no sweep holds on to itself.
+    """
+    sweeps = sorted(track.claimed)
+    shapes = [track.seen_in(standing, [j for j in sweeps if j % 2 == odd]) for odd in (0, 1)]
+    if not all(map(len, shapes)):
+        return
+    models = [Model(x) for x in shapes]
+    before = dict(track.states), track.path
+    for j, rows in track.claimed.items():
+        at_s = track.times_s[j]
+        points = track.carry(standing[j].points[rows], standing[j].time_s[rows], at_s)
+        state = align(
+            models[1 - j % 2], points, track.centre, track.path(at_s), 0.5 * _PREDICTION_STD
+        )
+        if state is not None:
+            state[2] = track.rise_m(ground, state)
+            track.states[j] = state
+    track.smooth(sweep_time_s)
+    if track.path.residual_m > before[1].residual_m:
+        track.states, track.path = before
+
+
+def _prove(
+    track: Track, standing: Sequence[Standing], space: FreeSpace, sweep_time_s: Float
+) -> bool:
+    """Fit the smooth motion; True if the track certainly moves.
+
+    The motion must be smooth, long enough to be told from noise, and must do away with the
+    contradictions that brought the group here: where the sweeps see through its points at their
+    rigid places, they must not see through them at the moved ones.
+    """
+    if len(track.states) < 3:
+        return False
+    track.smooth(sweep_time_s)
+    residual_m = track.path.residual_m
+    seen = sorted(track.states)
+    fitted = track.path(np.array([track.times_s[seen[0]], track.times_s[seen[-1]]]))
+    travelled = float(np.linalg.norm((fitted[-1] - fitted[0])[:2]))
+    step_m = travelled / (seen[-1] - seen[0])
+    start = space.origin[next(iter(track.states))]
+    range_m = float(np.linalg.norm((track.centre - start)[:2]))
+    rough_m = _ROUGH_M + _ROUGH_PER_GAP * space.ring_step_rad * range_m + _ROUGH_PER_STEP * step_m
+    if residual_m > rough_m or travelled < max(_LEAST_WAY_M, _LEAST_WAY_PER_RESIDUAL * residual_m):
+        return False
+    still, moved = _contradictions(track, standing, space, sweep_time_s)
+    return moved <= _MAX_CONTRADICTIONS * still
+
+
+def _contradictions(
+    track: Track, standing: Sequence[Standing], space: FreeSpace, sweep_time_s: Float
+) -> tuple[int, int]:
+    """How many looks through the track's points the sweeps have: standing still, and moved."""
+    asked = {i: rows[:: len(rows) // _NUM_ASKED + 1] for i, rows in track.claimed.items()}
+    points = {i: standing[i].points[rows] for i, rows in asked.items()}
+    body = {i: track.undo(points[i], standing[i].time_s[rows]) for i, rows in asked.items()}
+    still = moved = 0
+    for j in range(len(space)):
+        from_others = [i for i in space.others(j) if i in asked]
+        if not from_others:
+            continue
+        carried = track.place(np.concatenate([body[i] for i in from_others]), sweep_time_s[j])
+        velocity_m_s = track.velocity_m_s(carried, sweep_time_s[j])
+        moved += int(space.seen_through(carried, j, velocity_m_s).sum())
+        standing_still = np.concatenate([points[i] for i in from_others])
+        still += int(space.seen_through(standing_still, j).sum())
+    return still, moved

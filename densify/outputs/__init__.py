@@ -1,0 +1,37 @@
+# SPDX-License-Identifier: MIT
+"""The files of a result, each whole or not there. What else is written to disk: the flow between
+two point files (`densify.cli.point_files`), and simulated recordings (`densify.writers.kitti_raw`)
+with their truth (`densify.readers.truth_files`).
+"""
+
+from densify.outputs.cloud_laz import StoredCloud, read_cloud, write_cloud
+from densify.outputs.depth_png import (
+    read_depth_png,
+    read_mask_png,
+    write_age_png,
+    write_confidence_png,
+    write_depth_png,
+)
+from densify.outputs.export import Density, Export, export_run
+from densify.outputs.figure import draw_figure
+from densify.outputs.png import write_picture
+from densify.outputs.store import check_writable, write_comparison, write_result
+
+__all__ = [
+    "Density",
+    "Export",
+    "StoredCloud",
+    "check_writable",
+    "draw_figure",
+    "export_run",
+    "read_cloud",
+    "read_depth_png",
+    "read_mask_png",
+    "write_age_png",
+    "write_cloud",
+    "write_comparison",
+    "write_confidence_png",
+    "write_depth_png",
+    "write_picture",
+    "write_result",
+]

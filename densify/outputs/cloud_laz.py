@@ -1,0 +1,103 @@
+# SPDX-License-Identifier: MIT
+"""The accumulated cloud as LAZ (LAS 1.4, point format 7) for CloudCompare, PDAL and QGIS."""
+
+from __future__ import annotations
+
+import datetime
+import io
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from densify.errors import InputError
+from densify.outputs.atomic import write_file
+from densify.types import Bool, Cloud, Float, Float32
+
+_SCALE_M = 0.001
+_MAX_COORDINATE_M = _SCALE_M * np.iinfo(np.int32).max
+_EXTRA_DIMENSIONS = (
+    ("frame", "int32", "source sweep"),
+    ("moving", "uint8", "1 proven to move"),
+    ("instance", "int32", "moving object, -1 none"),
+    ("confidence", "float32", "0 to 1"),
+    ("displaced", "float32", "m beyond rigid alignment"),
+)
+
+
+@dataclass(frozen=True)
+class StoredCloud:
+    """A cloud as it was written: M points, key frame, metres, rounded to the millimetre.
+
+    frame, instance: (M,) int32. moving: (M,) bool. confidence, displaced, intensity: (M,) float32.
+    rgb: (M,3) uint8.
+    """
+
+    points: Float
+    frame: NDArray[np.int32]
+    moving: Bool
+    instance: NDArray[np.int32]
+    confidence: Float32
+    displaced: Float32
+    intensity: Float32
+    rgb: NDArray[np.uint8]
+
+
+def write_cloud(path: Path, cloud: Cloud) -> None:
+    """Write a cloud with the extra dimensions frame, moving, instance, confidence and displaced.
+
+    Coordinates are rounded to 1 mm, intensity and colour widened to the format's 16 bits. The same
+    cloud gives the same bytes: the header's date is always 1 January 2000. Raises ValueError for
+    coordinates that are not finite or beyond 2,147 km.
+    """
+    import laspy
+
+    if len(cloud) and not np.abs(cloud.points).max() < _MAX_COORDINATE_M:
+        raise ValueError(f"cloud: expected finite points within {_MAX_COORDINATE_M:.0f} m")
+    header = laspy.LasHeader(version="1.4", point_format=7)
+    header.scales = np.full(3, _SCALE_M)
+    header.offsets = np.zeros(3)
+    header.creation_date = datetime.date(2000, 1, 1)
+    header.generating_software = "densify"
+    header.global_encoding.wkt = True  # demanded by LAS 1.4 for this point format
+    header.add_extra_dims(
+        [laspy.ExtraBytesParams(name, kind, text) for name, kind, text in _EXTRA_DIMENSIONS]
+    )
+    las = laspy.LasData(header)
+    las.xyz = cloud.points
+    las.intensity = np.rint(65535 * np.clip(cloud.intensity, 0, 1)).astype(np.uint16)
+    las.red, las.green, las.blue = (cloud.rgb.astype(np.uint16) * 257).T
+    las.return_number = np.ones(len(cloud), np.uint8)
+    las.number_of_returns = np.ones(len(cloud), np.uint8)
+    for name, kind, _ in _EXTRA_DIMENSIONS:
+        las[name] = getattr(cloud, name).astype(kind)
+    buffer = io.BytesIO()
+    las.write(buffer, do_compress=True)
+    write_file(path, buffer.getvalue())
+
+
+def read_cloud(path: Path) -> StoredCloud:
+    """Read back what `write_cloud` wrote. Raises InputError for any other file."""
+    import laspy
+
+    try:
+        las = laspy.read(path)
+    except (OSError, laspy.errors.LaspyException) as error:
+        raise InputError(f"{path}: not a readable LAZ file: {error}") from error
+    missing = {name for name, _, _ in _EXTRA_DIMENSIONS} - set(las.point_format.dimension_names)
+    if missing:
+        raise InputError(
+            f"{path}: no dimension {', '.join(sorted(missing))}; expected a cloud densify wrote"
+        )
+    rgb = np.stack([las.red, las.green, las.blue], axis=1)
+    return StoredCloud(
+        points=np.array(las.xyz),
+        frame=np.array(las["frame"], np.int32),
+        moving=np.array(las["moving"], bool),
+        instance=np.array(las["instance"], np.int32),
+        confidence=np.array(las["confidence"], np.float32),
+        displaced=np.array(las["displaced"], np.float32),
+        intensity=np.array(las.intensity, np.float32) / np.float32(65535),
+        rgb=(rgb // 257).astype(np.uint8),
+    )

@@ -1,0 +1,171 @@
+# SPDX-License-Identifier: MIT
+"""Depth, confidence, age and optical flow as PNG. Depth is exactly that of KITTI's depth-completion
+benchmark (Uhrig et al., "Sparsity Invariant CNNs", 3DV 2017): 16 bit, one channel, ``value / 256``
+metres, 0 = none.
+"""
+
+from __future__ import annotations
+
+import zlib
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from densify.errors import InputError
+from densify.outputs.atomic import write_file
+from densify.outputs.png import encode_png
+from densify.types import Bool, Float32
+
+_STEPS_PER_M = 256.0
+_STEPS_OF_CONFIDENCE = 254.0
+_STEPS_PER_S = 1000.0
+_MAX_VALUE = np.iinfo(np.uint16).max
+_PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+
+
+def write_depth_png(path: Path, depth_m: Float32) -> None:
+    """Write `encode_depth`."""
+    write_file(path, encode_depth(depth_m))
+
+
+def encode_depth(depth_m: Float32) -> bytes:
+    """The PNG of ``rint(256 * depth_m)``.
+
+    depth_m: (H,W) metres, 0 none. What the format cannot say becomes 0, none, never another depth:
+    beyond 65535/256 = 256 m (a cast would wrap 256.5 m to 0.5 m) and nearer than half a step, 2 mm.
+    Raises ValueError for depths that are negative or not finite.
+    """
+    return encode_png(_quantised(depth_m))
+
+
+def write_confidence_png(path: Path, confidence: Float32, depth_m: Float32) -> None:
+    """Write `encode_confidence`."""
+    write_file(path, encode_confidence(confidence, depth_m))
+
+
+def encode_confidence(confidence: Float32, depth_m: Float32) -> bytes:
+    """The PNG of `stored_confidence`, 8 bit, 0 where `encode_depth` says no depth.
+
+    confidence: (H,W), 0 to 1. depth_m: (H,W) metres, the depth it belongs to.
+    """
+    has_depth = _has_depth("confidence", confidence, depth_m)
+    if not ((confidence[has_depth] >= 0) & (confidence[has_depth] <= 1)).all():
+        raise ValueError("confidence: expected 0 to 1 wherever there is depth")
+    levels = np.zeros(depth_m.shape, np.uint8)
+    levels[has_depth] = stored_confidence(confidence[has_depth])
+    return encode_png(levels)
+
+
+def write_age_png(path: Path, age_s: Float32, depth_m: Float32) -> None:
+    """Write `stored_age` as 16 bit, 0 where `write_depth_png` writes no depth.
+
+    age_s: (H,W) seconds, 0 or more wherever there is depth. depth_m: (H,W) metres, the depth it
+    belongs to.
+    """
+    has_depth = _has_depth("age_s", age_s, depth_m)
+    if not (np.isfinite(age_s[has_depth]) & (age_s[has_depth] >= 0)).all():
+        raise ValueError("age_s: expected 0 or more wherever there is depth")
+    steps = np.zeros(depth_m.shape, np.uint16)
+    steps[has_depth] = stored_age(age_s[has_depth])
+    write_file(path, encode_png(steps))
+
+
+def stored_confidence(confidence: ArrayLike) -> NDArray[np.uint8]:
+    """``1 + rint(254 * confidence)``: 255 is most certain, 0 is left for pixels without depth."""
+    levels = np.rint(_STEPS_OF_CONFIDENCE * np.asarray(confidence, np.float64))
+    return (1 + levels).astype(np.uint8)
+
+
+def stored_age(age_s: ArrayLike) -> NDArray[np.uint16]:
+    """``1 + rint(1000 * age_s)``, milliseconds; 0 is left for pixels without depth, and 65535 says
+    65.5 s or more."""
+    steps = np.rint(_STEPS_PER_S * np.asarray(age_s, np.float64))
+    return (1 + np.minimum(steps, _MAX_VALUE - 1)).astype(np.uint16)
+
+
+def write_flow_png(path: Path, flow_px: Float32) -> None:
+    """Write optical flow as KITTI's flow benchmark does (Menze and Geiger, CVPR 2015): 16 bit, red
+    and green ``rint(64 * flow) + 2^15`` to the right and down, blue 1 where it is known, else 0.
+
+    flow_px: (H,W,2) pixels, NaN where unknown. What the format cannot say, beyond 512 pixels, is
+    unknown too.
+    """
+    levels = np.rint(64.0 * flow_px.astype(np.float64)) + 2**15
+    with np.errstate(invalid="ignore"):
+        known = ((levels >= 0) & (levels <= _MAX_VALUE)).all(axis=2)
+    image = np.zeros((*flow_px.shape[:2], 3), np.uint16)
+    image[known, 0] = 1
+    image[known, 1], image[known, 2] = levels[known, 1], levels[known, 0]
+    write_file(path, encode_png(image))
+
+
+def read_depth_png(path: Path) -> Float32:
+    """(H,W) float32 metres, 0 none. Raises InputError for anything but a 16-bit gray PNG."""
+    stored = read_stored(path, np.uint16, "a depth map")
+    return stored.astype(np.float32) / np.float32(_STEPS_PER_M)
+
+
+def read_stored(path: Path, kind: type[np.uint8] | type[np.uint16], what: str) -> NDArray[Any]:
+    """(H,W) of a depth, confidence or age map as it is stored. Raises InputError for anything but
+    a whole gray PNG of that many bits; what: for the message."""
+    image = _decoded(path)
+    if image is None or image.dtype != kind or image.ndim != 2:
+        got = "no image" if image is None else f"{image.dtype} of shape {image.shape}"
+        bits = 8 * np.dtype(kind).itemsize
+        raise InputError(f"{path}: got {got}, expected {what} (PNG, {bits} bit, one channel)")
+    return image
+
+
+def read_mask_png(path: Path) -> Bool:
+    """(H,W) bool, True where any colour is not 0; transparency says nothing. Raises InputError if
+    it is no image."""
+    image = _decoded(path)
+    if image is None:
+        raise InputError(f"{path}: got no image, expected a mask (PNG, 0 where it does not hold)")
+    colours = image if image.ndim == 2 else image[:, :, :3].max(axis=2)
+    mask: Bool = colours > 0
+    return mask
+
+
+def _decoded(path: Path) -> NDArray[Any] | None:
+    """As it is stored; None if it is no image, or not whole."""
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
+    if not _is_whole_png(data):
+        return None
+    return cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+
+
+def _is_whole_png(data: bytes) -> bool:
+    """All chunks are there with the right checksums. Of damage, libpng would write to stderr."""
+    if not data.startswith(_PNG_SIGNATURE):
+        return False
+    start, name = len(_PNG_SIGNATURE), b""
+    while name != b"IEND":
+        end = start + 12 + int.from_bytes(data[start : start + 4], "big")
+        name, checksum = data[start + 4 : start + 8], data[end - 4 : end]
+        if end > len(data) or zlib.crc32(data[start + 4 : end - 4]).to_bytes(4, "big") != checksum:
+            return False
+        start = end
+    return True
+
+
+def _has_depth(name: str, values: Float32, depth_m: Float32) -> NDArray[np.bool_]:
+    if values.shape != depth_m.shape:
+        raise ValueError(f"{name}: expected {depth_m.shape}, got {values.shape}")
+    has_depth: NDArray[np.bool_] = _quantised(depth_m) > 0
+    return has_depth
+
+
+def _quantised(depth_m: Float32) -> NDArray[np.uint16]:
+    if depth_m.ndim != 2:
+        raise ValueError(f"depth_m: expected (H,W), got {depth_m.shape}")
+    if not (np.isfinite(depth_m) & (depth_m >= 0)).all():
+        raise ValueError("depth_m: expected finite depths, 0 or more")
+    steps = np.rint(_STEPS_PER_M * depth_m.astype(np.float64))
+    return np.where(steps <= _MAX_VALUE, steps, 0).astype(np.uint16)

@@ -1,0 +1,166 @@
+# SPDX-License-Identifier: MIT
+"""Keys as files of a KITTI depth tree (Uhrig et al., "Sparsity Invariant CNNs", 3DV 2017), which
+loaders for KITTI depth completion read as it is::
+
+    val/2011_09_26_drive_0013_sync/proj_depth/velodyne_raw/image_02/0000000120.png
+                                              groundtruth/
+                                              groundtruth_filled/    only here
+                                              confidence/            only here
+"""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Literal
+
+import yaml
+
+from densify.errors import OutputError
+from densify.outputs.atomic import FileRecord, make_folder, write_file
+from densify.outputs.depth_png import encode_confidence, encode_depth
+from densify.outputs.store import plain
+from densify.types import DepthMap
+from densify.version import __version__
+
+Split = Literal["train", "val"]
+
+README = "README.txt"
+
+_VALIDATION = {
+    *("2011_09_26_drive_0002", "2011_09_26_drive_0005", "2011_09_26_drive_0013"),
+    *("2011_09_26_drive_0020", "2011_09_26_drive_0023", "2011_09_26_drive_0036"),
+    *("2011_09_26_drive_0079", "2011_09_26_drive_0095", "2011_09_26_drive_0113"),
+    *("2011_09_28_drive_0037", "2011_09_29_drive_0026", "2011_09_30_drive_0016"),
+    "2011_10_03_drive_0047",
+}
+_KITTI_DRIVE = re.compile(r"(\d{4}_\d\d_\d\d_drive_\d{4})(?:_sync|_extract)?", re.ASCII)
+_PUNCTUATION = str.maketrans({":": "-", "?": "_", "=": "-", "&": "_"})
+_FOLDER_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,99}")
+
+
+def split_of(drive: str) -> Split:
+    """Of KITTI's depth benchmark: "val" for its 13 validation drives, "train" for every other
+    recording.
+
+    drive: a recording's name, such as ``2011_09_26_drive_0013_sync``.
+    """
+    match = _KITTI_DRIVE.fullmatch(drive)
+    return "val" if match and match[1] in _VALIDATION else "train"
+
+
+def drive_folder(name: str) -> str:
+    """A recording's name as the name of a folder.
+
+    Names that can be one, as KITTI's, stay; of the built-in street's only the punctuation goes:
+    ``street:street?seed=0&sensor=hdl64`` is ``street-street_seed-0_sensor-hdl64``. Other names lose
+    what is neither ASCII letter nor digit and end in a digest, so that they stay different.
+    """
+    folder = name.translate(_PUNCTUATION)
+    if _FOLDER_NAME.fullmatch(folder):
+        return folder
+    readable = re.sub(r"[^A-Za-z0-9_.]+", "-", folder)[:80].strip(".-") or "drive"
+    return f"{readable}-{hashlib.sha256(name.encode()).hexdigest()[:8]}"
+
+
+def write_key(
+    root: Path,
+    folder: str,
+    frame: int,
+    sparse: Mapping[str, DepthMap],
+    dense: Mapping[str, DepthMap],
+) -> dict[str, FileRecord]:
+    """Write the maps of one key, each file whole or not there, and on the disk on return.
+
+    root: of the tree. folder: of the drive, relative to it: ``val/2011_09_26_drive_0013_sync``.
+    frame: file number. sparse, dense: camera to map, of the key sweep alone and of all sweeps.
+
+    Returns path relative to ``root``, with slashes, to what the file holds; the same maps give the
+    same bytes. Raises OutputError if the files cannot be written, ValueError if the cameras differ.
+    """
+    if sparse.keys() != dense.keys():
+        raise ValueError(f"cameras: got {sorted(sparse)} sparse and {sorted(dense)} dense")
+    records = {}
+    for camera, maps in dense.items():
+        products = {
+            "velodyne_raw": encode_depth(sparse[camera].depth_m),
+            "groundtruth": encode_depth(maps.depth_m),
+            "groundtruth_filled": encode_depth(maps.filled_m),
+            "confidence": encode_confidence(maps.confidence, maps.filled_m),
+        }
+        for product, data in products.items():
+            name = f"{folder}/proj_depth/{product}/{camera}/{frame:010d}.png"
+            _put(root, name, data)
+            records[name] = FileRecord.of(data)
+    return records
+
+
+def write_readme(root: Path, *, method: str, window: int, settings: Mapping[str, Any]) -> None:
+    """Write ``README.txt``, which says what lies beside it and how it was made.
+
+    window: sweeps before and after the key. settings: all others, plain mappings; they should say
+    nothing of the machine. The text depends on the arguments and densify's version alone. Raises
+    OutputError if it cannot be written.
+    """
+    text = _README.format(
+        version=__version__,
+        method=method,
+        window=window,
+        sweeps=2 * window + 1,
+        settings=yaml.safe_dump(plain(settings), sort_keys=False, allow_unicode=True).rstrip(),
+    )
+    _put(root, README, text.encode())
+
+
+def _put(root: Path, name: str, data: bytes) -> None:
+    path = root / name
+    try:
+        make_folder(path.parent)
+        write_file(path, data, durable=True)
+    except OSError as error:
+        raise OutputError(
+            f"--out {root}: {name} cannot be written: {error.strerror or error}"
+        ) from error
+
+
+_README = """\
+Depth maps for training, made by densify {version}
+{method}, window {window}: each moment from up to {sweeps} lidar sweeps
+
+The folders and files are those of KITTI's depth completion benchmark, whose loaders read them:
+
+  <train|val>/<drive>/proj_depth/<product>/<camera>/<frame, 10 digits>.png
+
+  velodyne_raw        input: depth of the sweep of that frame alone
+  groundtruth         target: depth measured by all the sweeps. Method flow moves what moves to
+                      where it was at the exposure; icp leaves it where it was measured
+  groundtruth_filled  groundtruth, and pixels interpolated between measured ones
+  confidence          of groundtruth_filled, and so of groundtruth too
+
+val holds KITTI's 13 validation drives, train every other recording.
+
+Depth is a 16-bit gray PNG: value / 256 is metres along the camera's optical axis, 0 is none.
+Confidence is an 8-bit gray PNG: 255 is most certain, 0 is no depth. It ranks pixels and is no
+probability: (value - 1) / 254 is 0 to 1.
+
+  depth_m = cv2.imread(path, cv2.IMREAD_UNCHANGED) / 256.0
+  depth_m = np.asarray(PIL.Image.open(path), np.float32) / 256.0
+
+All maps show the moment in which their own image was exposed (the middle of the sweep, where the
+settings say "at: sweep"). velodyne_raw is densify's own projection: the sweep with the sensor's
+motion undone, seen from where the camera was at that moment. KITTI's files of that name were
+projected otherwise and differ.
+
+Images are not copied; they are those of the recordings. dataset.json says which recordings these
+are, and has the cameras' calibration. manifest.jsonl (or manifest-1of4.jsonl and so on) has one
+line for every key: whether it is here, is missing and why, and size and SHA-256 of its files.
+
+The maps are made from the recordings, whose licences go on holding for them. KITTI is CC BY-NC-SA
+3.0: name its authors, no commercial use, share alike.
+
+Settings:
+
+{settings}
+"""

@@ -1,0 +1,59 @@
+# SPDX-License-Identifier: MIT
+"""Deskewing: every point of a sweep where it would have been at the sweep's reference time."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from densify.geometry import poses
+from densify.types import Float, RegisteredSweep, Stretch, Sweep, Trajectory
+
+
+def deskew(sweeps: Sequence[Sweep], trajectory: Trajectory) -> Stretch:
+    """Undo the lidar's own motion within each sweep, and place the sweeps in the world.
+
+    sweeps: raw, a subset of the trajectory's frames. The half of a sweep before
+    its reference time moves with the twist from the previous sweep, the half after it with the
+    twist to the next one. Sweeps without per-point times keep their points as they are.
+    All columns stay aligned.
+    """
+    registered = []
+    for sweep in sweeps:
+        i = trajectory.frames.index(sweep.frame)
+        before, after = _twists(trajectory, i)
+        points: Float = sweep.points
+        if sweep.offset_ns is not None:
+            offset_s = sweep.offset_ns[:, None] * 1e-9
+            twist = offset_s * np.where(offset_s < 0, before, after)
+            points = poses.transform_each(twist.astype(np.float64), points)
+        registered.append(
+            RegisteredSweep(
+                sweep=replace(sweep, points=points),
+                T_world_lidar=trajectory.T_world_lidar[i],
+                twist_before=before,
+                twist_after=after,
+            )
+        )
+    return Stretch(tuple(registered))
+
+
+def _twists(trajectory: Trajectory, i: int) -> tuple[Float, Float]:
+    """(6,) per second before and after sweep i; at an end both are the one that exists."""
+
+    def toward(j: int) -> Float | None:
+        if not 0 <= j < len(trajectory.frames):
+            return None
+        seconds = (trajectory.stamp_ns[j] - trajectory.stamp_ns[i]) * 1e-9
+        T = trajectory.T_world_lidar
+        return poses.log(poses.inverse(T[i]) @ T[j]) / seconds
+
+    before, after = toward(i - 1), toward(i + 1)
+    if before is None and after is None:
+        return np.zeros(6), np.zeros(6)
+    return (
+        before if before is not None else after,  # type: ignore[return-value]
+        after if after is not None else before,
+    )

@@ -1,0 +1,65 @@
+# SPDX-License-Identifier: MIT
+"""How good an accumulated cloud is without any truth: its ghosts. Depth against truth is scored in
+`densify.scores.depth_metrics`, flow in `densify.scores.flow_metrics`.
+
+Every ``*_scores`` dictionary holds plain numbers ready for JSON; what is undefined (a rate over no
+points) is None, never NaN.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from densify.geometry.range_image import RangeImage
+from densify.types import Bool, Cloud
+
+_GHOST_MARGIN_M = 0.5
+_GHOST_MARGIN_FRACTION = 0.02
+
+
+def ghosts(cloud: Cloud, key_image: RangeImage, key: int) -> Bool:
+    """(M,) bool: points of other sweeps standing where the key sweep saw through.
+
+    A point is a ghost when it lies clearly in front of what the key sweep measured in its direction
+    and in all 8 neighbouring directions, by more than max(0.5 m, 2 % of its range); directions
+    without a return say nothing, but six of the nine must have one.
+    """
+    ghost = np.zeros(len(cloud), bool)
+    other = cloud.frame != key
+    ghost[other] = key_image.sees_through(
+        cloud.points[other],
+        _GHOST_MARGIN_M,
+        _GHOST_MARGIN_FRACTION,
+        min_filled=6,
+        velocity_m_s=cloud.velocity_m_s[other],
+    )
+    return ghost
+
+
+def ghost_rate(cloud: Cloud, key_image: RangeImage, key: int) -> float | None:
+    """Fraction of the accumulated points that are `ghosts`, over all not from the key sweep."""
+    return _mean(ghosts(cloud, key_image, key)[cloud.frame != key])
+
+
+def ghost_scores(cloud: Cloud, key_image: RangeImage, key: int) -> dict[str, Any]:
+    """Needs no truth: ``num_points`` of other sweeps and the `ghost_rate` of ``all`` of them, of
+    those the flow calls ``moving`` and of the ``static`` rest, and by distance in frames from the
+    key (``by_distance["3"]``: frames key-3 and key+3)."""
+    other = cloud.frame != key
+    ghost = ghosts(cloud, key_image, key)
+    distance = np.abs(cloud.frame - key)
+    return {
+        "num_points": int(other.sum()),
+        "all": _mean(ghost[other]),
+        "moving": _mean(ghost[other & cloud.moving]),
+        "static": _mean(ghost[other & ~cloud.moving]),
+        "by_distance": {
+            str(steps): _mean(ghost[distance == steps]) for steps in np.unique(distance[other])
+        },
+    }
+
+
+def _mean(values: np.ndarray) -> float | None:
+    return float(np.mean(values)) if len(values) else None

@@ -1,0 +1,40 @@
+# SPDX-License-Identifier: MIT
+"""What the stages hand to each other. All are frozen; columns stay aligned row by row.
+
+Poses are named ``T_target_source``: ``p_target = T_target_source @ p_source``. Frames of reference:
+``world`` (the first sweep's lidar), ``lidar`` (at the sweep's reference time), ``key`` (the key
+sweep's lidar), ``cam``.
+"""
+
+from densify.arrays import Bool, Float, Float32, Int
+from densify.types.depth import Camera, Cloud, DepthMap, Mover, Patches, Reason
+from densify.types.flow import FlowField, Motion, StretchFlow
+from densify.types.recordings import LidarSequence, SweepTruth, Truth
+from densify.types.results import Progress, Result, StageCost
+from densify.types.sweeps import RegisteredSweep, Stretch, Sweep, Trajectory
+
+__all__ = [
+    "Bool",
+    "Camera",
+    "Cloud",
+    "DepthMap",
+    "Float",
+    "Float32",
+    "FlowField",
+    "Int",
+    "LidarSequence",
+    "Motion",
+    "Mover",
+    "Patches",
+    "Progress",
+    "Reason",
+    "RegisteredSweep",
+    "Result",
+    "StageCost",
+    "Stretch",
+    "StretchFlow",
+    "Sweep",
+    "SweepTruth",
+    "Trajectory",
+    "Truth",
+]

@@ -1,0 +1,130 @@
+# SPDX-License-Identifier: MIT
+"""Accumulated clouds and what cameras see of them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields, replace
+from enum import IntEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from densify.arrays import Bool, Float, Float32, Int
+
+
+@dataclass(frozen=True)
+class Cloud:
+    """M accumulated points at the key's moment.
+
+    points: (M,3) metres, key frame.
+    rigid_points: (M,3) where registration alone puts them.
+    frame: (M,) int32 source sweep. row: (M,) int64 in the source sweep's file.
+    moving: (M,) bool. instance: (M,) int32, -1 none. velocity_m_s: (M,3) float32 at the key's
+    moment, ego-motion removed, 0 where nothing moves. confidence: (M,) float32, 0 to 1.
+    intensity: (M,) float32. rgb: (M,3) uint8, black where no camera saw the point.
+    """
+
+    points: Float
+    rigid_points: Float
+    frame: NDArray[np.int32]
+    row: Int
+    moving: Bool
+    instance: NDArray[np.int32]
+    velocity_m_s: Float32
+    confidence: Float32
+    intensity: Float32
+    rgb: NDArray[np.uint8]
+
+    @property
+    def displaced(self) -> Float32:
+        """(M,) metres moved beyond the rigid alignment."""
+        return np.linalg.norm(self.points - self.rigid_points, axis=1).astype(np.float32)
+
+    def after(self, seconds: float) -> Cloud:
+        """Shortly after (or before) the key's moment: what moves goes on at its velocity."""
+        return replace(self, points=self.points + seconds * self.velocity_m_s)
+
+    def select(self, keep: Bool) -> Cloud:
+        """The points where ``keep`` (M,) is True."""
+        return Cloud(**{f.name: getattr(self, f.name)[keep] for f in fields(self)})
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+
+@dataclass(frozen=True)
+class Patches:
+    """What each of a cloud's M points stands for; see `densify.depth.patches`.
+
+    normal: (M,3) float32 key frame, of any length, of the tangent plane. spacing_m: (M,2) float32
+    to the neighbouring rays of the same sweep, across and along elevation. free: (M,) bool, the key
+    sweep saw through the place. sweep: (M,) int32, which of the cloud's sweeps, counted by frame.
+    """
+
+    normal: Float32
+    spacing_m: Float32
+    free: Bool
+    sweep: NDArray[np.int32]
+
+
+class Reason(IntEnum):
+    """Why a point is not in a depth map; the first that applies."""
+
+    KEPT = 0  # its pixel's depth is from it
+    VETOED = 1  # the key sweep saw through its place
+    OUTSIDE = 2  # not in the image
+    HIDDEN = 3  # behind another point's patch
+    NOT_CHOSEN = 4  # its pixel's depth is from a point nearer in time to the key, or nearer
+    UNSUPPORTED = 5  # too few sweeps agree with it, or not the one nearest to the key
+    EDGE = 6  # so close to a depth edge that its pixel may lie beyond it
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A pinhole camera, rectified or with lens distortion.
+
+    width_px, height_px: image size. K: (3,3) pixels; pixel (u,v) is an integer at its centre.
+    T_cam_lidar: (4,4). distortion: OpenCV's coefficients (k1 k2 p1 p2 k3 …), empty if rectified.
+    """
+
+    name: str
+    width_px: int
+    height_px: int
+    K: Float
+    T_cam_lidar: Float
+    distortion: tuple[float, ...] = ()
+
+
+@dataclass(frozen=True)
+class DepthMap:
+    """Dense depth of one camera; (H,W) everywhere.
+
+    depth_m: float32 camera z of measured pixels, 0 none. filled_m: the same plus pixels
+    interpolated between measured ones. confidence: float32 0 to 1, of every pixel in ``filled_m``.
+    frame: int32 source sweep of measured pixels, -1 elsewhere. age_s: float32 seconds between the
+    moment the map shows and the reference time of the sweep that measured the pixel, of every pixel
+    in ``filled_m``, nan elsewhere; None until `densify.depth.age` has worked it out. reason: (M,)
+    uint8, a `Reason` for each point of the cloud; empty if the cloud is not at hand.
+    """
+
+    camera: str
+    depth_m: Float32
+    filled_m: Float32
+    confidence: Float32
+    frame: NDArray[np.int32]
+    reason: NDArray[np.uint8] = field(default_factory=lambda: np.zeros(0, np.uint8))
+    age_s: Float32 | None = None
+
+    def counts(self) -> dict[str, int]:
+        """Points of the cloud by what became of them."""
+        counts = np.bincount(self.reason, minlength=len(Reason))
+        return {which.name.lower(): int(counts[which]) for which in Reason}
+
+
+@dataclass(frozen=True)
+class Mover:
+    """One moving object by itself: its points, and the depth it has in each camera."""
+
+    cloud: Cloud
+    depth: Mapping[str, DepthMap]

@@ -1,0 +1,82 @@
+# SPDX-License-Identifier: MIT
+"""Recordings: what a reader offers, and exact truth where there is some."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from densify.arrays import Bool, Float, Float32
+from densify.types.depth import Camera
+from densify.types.sweeps import Sweep
+
+
+@dataclass(frozen=True)
+class SweepTruth:
+    """What really was where, for the N points of a raw sweep, row by row.
+
+    T_world_lidar: (4,4) at the reference time. points: (N,3) lidar frame at the reference time.
+    instance: (N,) int32, -1 the static world. moving: (N,) bool, moves at that time.
+    """
+
+    T_world_lidar: Float
+    points: Float
+    instance: NDArray[np.int32]
+    moving: Bool
+
+
+class Truth(Protocol):
+    """Exact truth of a simulated sequence."""
+
+    def sweep(self, frame: int) -> SweepTruth: ...
+
+    def displacement(self, frame: int, target: int) -> Float:
+        """(N,3) scene flow from the reference time of ``frame`` to that of ``target``, in the
+        lidar frame of ``frame``, ego-motion removed."""
+        ...
+
+    def depth_m(self, camera: str, frame: int) -> Float32:
+        """(H,W) camera z of the nearest solid surface at the camera's own time, 0 none."""
+        ...
+
+    def moving_mask(self, camera: str, frame: int) -> Bool:
+        """(H,W), True where the pixel shows something that moves."""
+        ...
+
+
+class LidarSequence(Protocol):
+    """A recording, opened lazily. A reader for a data set is one class with these members.
+
+    Frames are absolute numbers. Methods raise InputError with a full sentence for anything missing
+    or malformed.
+    """
+
+    @property
+    def name(self) -> str: ...
+
+    @property
+    def frames(self) -> Sequence[int]:
+        """Of the sweeps that exist, ascending."""
+        ...
+
+    @property
+    def cameras(self) -> Mapping[str, Camera]: ...
+
+    @property
+    def truth(self) -> Truth | None: ...
+
+    def __getitem__(self, frame: int) -> Sweep: ...
+
+    def image(self, camera: str, frame: int) -> NDArray[np.uint8]:
+        """(H,W,3) RGB."""
+        ...
+
+    def image_stamp_ns(self, camera: str, frame: int) -> int: ...
+
+    def T_world_lidar(self, frame: int) -> Float:
+        """(4,4) the data set's own pose at the sweep's reference time."""
+        ...

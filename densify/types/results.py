@@ -1,0 +1,52 @@
+# SPDX-License-Identifier: MIT
+"""One densified key, and what it cost."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from densify.arrays import Float32
+from densify.types.depth import Cloud, DepthMap, Mover
+from densify.types.flow import StretchFlow
+
+Progress = Callable[[str, int, int], None]
+"""Called as ``(stage, done, total)`` while something takes its time."""
+
+
+@dataclass(frozen=True)
+class StageCost:
+    """Wall seconds of a stage and the process's peak memory at its end."""
+
+    name: str
+    seconds: float
+    peak_memory_mb: float
+
+
+@dataclass(frozen=True)
+class Result:
+    """One densified key.
+
+    metrics: plain numbers, ready for JSON. baselines: the results of the simpler methods on the
+    same registration, by method. flow: of every sweep to the next one on the way to the key, where
+    asked for (``output.flow``). movers: by instance (``output.movers``). optical_flow: camera ->
+    (H,W,2) pixels to the "previous" and the "next" image (``output.optical_flow``). rejected:
+    camera -> (H,W) `Reason` of what was left out (``output.rejected``).
+    """
+
+    method: str
+    key: int
+    frames: tuple[int, ...]
+    cloud: Cloud
+    depth: Mapping[str, DepthMap]
+    metrics: Mapping[str, Any] = field(default_factory=dict)
+    costs: tuple[StageCost, ...] = ()
+    baselines: Mapping[str, Result] = field(default_factory=dict)
+    flow: StretchFlow | None = None
+    movers: Mapping[int, Mover] = field(default_factory=dict)
+    optical_flow: Mapping[str, Mapping[str, Float32]] = field(default_factory=dict)
+    rejected: Mapping[str, NDArray[np.uint8]] = field(default_factory=dict)

@@ -1,0 +1,120 @@
+# SPDX-License-Identifier: MIT
+"""Sweeps as measured, and registered: the input of every later step."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from densify.arrays import Bool, Float, Float32, Int
+from densify.geometry import poses
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """One lidar revolution of N returns.
+
+    points: (N,3) metres, lidar frame; as read, each at its own firing time, and after deskewing all
+        at ``stamp_ns``.
+    stamp_ns: the reference time, the middle of the revolution.
+    intensity: (N,) float32, 0 to 1.
+    offset_ns: (N,) int64, firing time minus ``stamp_ns``; None where the data cannot tell.
+    lidar: (N,) uint8, which of several scanners in one sweep fired.
+    row: (N,) int64, row of the return in the source file (invalid rows are dropped on reading).
+    scanner_origins: (S,3) metres, lidar frame, where the rays of each scanner start; None where all
+        start at the frame's origin.
+    """
+
+    frame: int
+    stamp_ns: int
+    points: Float
+    intensity: Float32
+    offset_ns: Int | None
+    lidar: NDArray[np.uint8]
+    row: Int
+    scanner_origins: Float | None = None
+
+    def __post_init__(self) -> None:
+        n = len(self.points)
+        for name in ("intensity", "offset_ns", "lidar", "row"):
+            column = getattr(self, name)
+            if column is not None and column.shape != (n,):
+                raise ValueError(f"Sweep.{name}: expected ({n},), got {column.shape}")
+        if self.scanner_origins is not None:
+            num_scanners = int(self.lidar.max(initial=0)) + 1
+            shape = self.scanner_origins.shape
+            if len(shape) != 2 or shape[1] != 3 or shape[0] < num_scanners:
+                raise ValueError(
+                    f"Sweep.scanner_origins: expected a row (3,) for each of {num_scanners} "
+                    f"scanners, got {shape}"
+                )
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    def select(self, keep: Bool) -> Sweep:
+        """The returns where ``keep`` (N,) is True."""
+        return replace(
+            self,
+            points=self.points[keep],
+            intensity=self.intensity[keep],
+            offset_ns=None if self.offset_ns is None else self.offset_ns[keep],
+            lidar=self.lidar[keep],
+            row=self.row[keep],
+        )
+
+    def origin_m(self, lidar: int) -> Float:
+        """(3,) where the rays of that scanner start, lidar frame."""
+        return np.zeros(3) if self.scanner_origins is None else self.scanner_origins[lidar]
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """Where the lidar was: frames ascending, stamp_ns (n,) int64, T_world_lidar (n,4,4)."""
+
+    frames: tuple[int, ...]
+    stamp_ns: Int
+    T_world_lidar: Float
+
+
+@dataclass(frozen=True)
+class RegisteredSweep:
+    """A deskewed sweep with its place in the world.
+
+    sweep: points in the lidar frame at ``sweep.stamp_ns``.
+    T_world_lidar: (4,4).
+    twist_before, twist_after: (6,) rotation vector and translation per second (rad/s, m/s) of the
+        lidar before and after its reference time, in the lidar frame: a raw point fired at offset t
+        lies at ``exp(t · twist) @ p_raw``.
+    """
+
+    sweep: Sweep
+    T_world_lidar: Float
+    twist_before: Float
+    twist_after: Float
+
+    @property
+    def frame(self) -> int:
+        return self.sweep.frame
+
+
+@dataclass(frozen=True)
+class Stretch:
+    """Registered sweeps of a drive in one world, by ascending frame."""
+
+    sweeps: tuple[RegisteredSweep, ...]
+
+    @property
+    def frames(self) -> tuple[int, ...]:
+        return tuple(s.frame for s in self.sweeps)
+
+    def __getitem__(self, frame: int) -> RegisteredSweep:
+        return self.sweeps[self.frames.index(frame)]
+
+    def T_target_source(self, target: int, source: int) -> Float:
+        """(4,4) from the lidar frame of one sweep to that of another, by frame number."""
+        if target == source:
+            return np.eye(4)
+        return poses.inverse(self[target].T_world_lidar) @ self[source].T_world_lidar

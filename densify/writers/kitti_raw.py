@@ -1,0 +1,209 @@
+# SPDX-License-Identifier: MIT
+"""Writes a street as a KITTI raw drive with its truth, which the KITTI reader opens again::
+
+    OUT/2026_06_12/calib_cam_to_cam.txt calib_velo_to_cam.txt calib_imu_to_velo.txt
+    OUT/2026_06_12/2026_06_12_drive_0001_sync/
+        velodyne_points/{data/0000000120.bin, timestamps.txt, timestamps_start.txt, ..._end.txt}
+        image_02/{data/0000000120.png, timestamps.txt}  image_03/...
+        oxts/{data/0000000120.txt, timestamps.txt, dataformat.txt}
+        truth/  as in `densify.readers.truth_files`
+
+Timestamp files have a line for every frame of the street, so that a line's number is a frame's;
+the other files are there for the frames asked for.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from densify.errors import InputError
+from densify.geometry import poses
+from densify.outputs.atomic import staged_folder
+from densify.outputs.png import encode_png
+from densify.readers.files import camera_named
+from densify.readers.kitti_raw import KITTI_TRIGGER_LATENCY_NS
+from densify.readers.street import Street
+from densify.readers.truth_files import write_bodies, write_depth, write_points
+from densify.street.camera import CAMERAS, T_RECTIFIED_LIDAR
+from densify.street.sensors import PERIOD_NS
+from densify.street.simulator import EPOCH_NS
+from densify.types import Float, Progress
+
+_DATE = np.datetime64(EPOCH_NS, "ns").astype("datetime64[D]").astype(str).replace("-", "_")
+DRIVE = f"{_DATE}_drive_0001_sync"
+T_LIDAR_IMU = np.eye(4)  # the inertial unit sits behind and below the scanner, a little off true
+T_LIDAR_IMU[:3, :3] = Rotation.from_rotvec([0.012, -0.003, -0.001]).as_matrix()
+T_LIDAR_IMU[:3, 3] = [-0.81, 0.32, -0.80]
+_LATITUDE_DEG, _LONGITUDE_DEG, _ALTITUDE_M = 49.0, 8.4, 115.0
+_EARTH_RADIUS_M = 6_378_137.0
+_GRAVITY_M_S2 = 9.81
+_STEP_NS = 5_000_000  # of the differences that velocities are taken from
+_OXTS_FORMAT = (
+    "lat lon alt roll pitch yaw vn ve vf vl vu ax ay az af al au wx wy wz wf wl wu "
+    "pos_accuracy vel_accuracy navstat numsats posmode velmode orimode"
+)
+
+
+def write_kitti_tree(
+    street: Street,
+    out: Path,
+    frames: Sequence[int],
+    cameras: Sequence[str] | None = None,
+    progress: Progress | None = None,
+    overwrite: bool = False,
+) -> Path:
+    """Write the frames and return the drive's folder, which is complete or not there.
+
+    frames: absolute numbers. cameras: both if None. progress: called with a stage's name, frames
+    done, frames in all.
+
+    Raises InputError for a frame or camera that does not exist, for two scanners in one sweep
+    (KITTI's format has no room for their times), and if the drive or another calibration is there
+    already and ``overwrite`` is not set.
+    """
+    names = list(CAMERAS) if cameras is None else list(cameras)
+    for name in names:
+        camera_named(street.cameras, name, Path(street.name))
+    if street.simulator.sensor == "dual32":
+        raise InputError(
+            f"{street.name}: two scanners cannot be written as KITTI raw, whose points carry "
+            f"neither a time nor a scanner; choose sensor hdl64, hdl32 or vlp16"
+        )
+    unknown = [frame for frame in frames if frame not in street.frames]
+    if unknown or not frames:
+        raise InputError(
+            f"{street.name}: frames to write: got {unknown[:5] or 'none'}, expected some of 0 to "
+            f"{street.frames[-1]}"
+        )
+    folder = out / _DATE
+    calibration = _calibration()
+    try:
+        if not overwrite:
+            _check_kept(folder, calibration)
+        with staged_folder(folder, (DRIVE, *calibration)) as staging:
+            for name, data in calibration.items():
+                _put(staging / name, data)
+            _write_stamps(staging / DRIVE, street, names)
+            write_bodies(staging / DRIVE / "truth", street.simulator.bodies)
+            for done, frame in enumerate(frames):
+                if progress:
+                    progress("simulate", done, len(frames))
+                _write_frame(staging / DRIVE, street, frame, min(frames), names)
+            if progress:
+                progress("simulate", len(frames), len(frames))
+    except OSError as error:
+        raise InputError(f"{out}: cannot be written: {error.strerror or error}") from error
+    return folder / DRIVE
+
+
+def _check_kept(folder: Path, calibration: Mapping[str, bytes]) -> None:
+    if (folder / DRIVE).exists():
+        raise InputError(f"{folder / DRIVE}: there already, kept; give --overwrite to replace it")
+    for name, data in calibration.items():
+        path = folder / name
+        if path.exists() and not (path.is_file() and path.read_bytes() == data):
+            raise InputError(
+                f"{path}: another calibration is there already, kept; choose another --out, or "
+                f"give --overwrite to replace it"
+            )
+
+
+def _write_frame(drive: Path, street: Street, frame: int, first: int, names: list[str]) -> None:
+    returns = street.returns(frame)
+    columns = np.column_stack([returns.points, returns.intensity]).astype("<f4")
+    _put(drive / "velodyne_points" / "data" / f"{frame:010d}.bin", columns.tobytes())
+    in_bodies = street.simulator.in_bodies(frame, returns)
+    write_points(drive / "truth", frame, returns.body, returns.instance, in_bodies)
+    for name in names:
+        bgr = np.ascontiguousarray(street.image(name, frame)[:, :, ::-1])
+        _put(drive / name / "data" / f"{frame:010d}.png", encode_png(bgr))
+        depth_m, moving = street.truth.depth_m(name, frame), street.truth.moving_mask(name, frame)
+        write_depth(drive / "truth", name, frame, depth_m, moving)
+    record = " ".join(repr(float(v)) for v in _oxts(street, frame, first)) + " 4 10 4 4 0\n"
+    _put(drive / "oxts" / "data" / f"{frame:010d}.txt", record.encode())
+
+
+def _put(path: Path, data: bytes) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(data)
+
+
+def _row(values: Float) -> str:
+    return " ".join(repr(float(v)) for v in np.ravel(values))
+
+
+def _calibration() -> dict[str, bytes]:
+    """Of the folder above the drive: file name to content."""
+    lines = []
+    for number in range(4):
+        camera = CAMERAS[f"image_0{2 + number % 2}"]  # 0 and 1 would be the gray ones beside them
+        P = camera.K @ np.column_stack([np.eye(3), (camera.T_cam_lidar - T_RECTIFIED_LIDAR)[:3, 3]])
+        lines += [
+            f"S_rect_0{number}: {camera.width_px} {camera.height_px}",
+            f"R_rect_0{number}: {_row(np.eye(3))}",
+            f"P_rect_0{number}: {_row(P)}",
+        ]
+    files = {"calib_cam_to_cam.txt": "\n".join(lines) + "\n"}
+    for name, T in (("velo_to_cam", T_RECTIFIED_LIDAR), ("imu_to_velo", T_LIDAR_IMU)):
+        files[f"calib_{name}.txt"] = f"R: {_row(T[:3, :3])}\nT: {_row(T[:3, 3])}\n"
+    return {name: text.encode() for name, text in files.items()}
+
+
+def _write_stamps(drive: Path, street: Street, names: list[str]) -> None:
+    centre = np.array([EPOCH_NS + frame * PERIOD_NS for frame in street.frames])
+    half = PERIOD_NS // 2
+    files = {
+        "velodyne_points/timestamps.txt": centre,
+        "velodyne_points/timestamps_start.txt": centre - half,
+        "velodyne_points/timestamps_end.txt": centre + half,
+        "oxts/timestamps.txt": centre,
+    }
+    for name in names:
+        exposed = np.array([street.image_stamp_ns(name, frame) for frame in street.frames])
+        files[f"{name}/timestamps.txt"] = exposed + KITTI_TRIGGER_LATENCY_NS
+    for path, stamps in files.items():
+        lines = [str(stamp).replace("T", " ") for stamp in stamps.astype("datetime64[ns]")]
+        _put(drive / path, "".join(f"{line}\n" for line in lines).encode())
+    _put(drive / "oxts" / "dataformat.txt", _OXTS_FORMAT.replace(" ", "\n").encode() + b"\n")
+
+
+def _oxts(street: Street, frame: int, first: int) -> Float:
+    """(25,) all of an oxts record but the last five, from the true motion.
+
+    The first frame written lies at a fixed latitude, since readers take the Mercator projection's
+    scale from the first record they find.
+    """
+    stamp = EPOCH_NS + frame * PERIOD_NS
+    simulator = street.simulator
+
+    def T_world_imu(time_ns: int) -> Float:
+        return simulator.T_world_lidar_at(time_ns) @ T_LIDAR_IMU
+
+    before, here, after = (T_world_imu(stamp + i * _STEP_NS) for i in (-1, 0, 1))
+    step_s = _STEP_NS * 1e-9
+    east_north_up = here[:3, 3] - T_world_imu(EPOCH_NS + first * PERIOD_NS)[:3, 3]
+    scale_m = np.cos(np.radians(_LATITUDE_DEG)) * _EARTH_RADIUS_M
+    lon_deg = _LONGITUDE_DEG + np.degrees(east_north_up[0] / scale_m)
+    mercator = np.log(np.tan(np.radians(90 + _LATITUDE_DEG) / 2)) + east_north_up[1] / scale_m
+    lat_deg = np.degrees(2 * np.arctan(np.exp(mercator))) - 90
+    yaw, pitch, roll = Rotation.from_matrix(here[:3, :3]).as_euler("ZYX")
+    level = Rotation.from_euler("Z", yaw).as_matrix()
+    velocity = (after - before)[:3, 3] / (2 * step_s)
+    acceleration = (after - 2 * here + before)[:3, 3] / step_s**2 + [0, 0, _GRAVITY_M_S2]
+    rate = poses.log(poses.inverse(before) @ after)[:3] / (2 * step_s)
+    return np.concatenate(
+        [
+            [lat_deg, lon_deg, _ALTITUDE_M + east_north_up[2], roll, pitch, yaw],
+            [velocity[1], velocity[0]],
+            level.T @ velocity,
+            here[:3, :3].T @ acceleration,
+            level.T @ acceleration,
+            rate,
+            level.T @ here[:3, :3] @ rate,
+            [0.05, 0.02],
+        ]
+    )
