@@ -308,6 +308,9 @@ class TinySequence:
         self.read.append(frame)
         return self.scene.scan(frame).sweep
 
+    def stamp_ns(self, frame: int) -> int:
+        return stamp_ns(frame)
+
     def image(self, camera: str, frame: int) -> np.ndarray:
         return np.full((CAMERA.height_px, CAMERA.width_px, 3), 128, np.uint8)
 

@@ -90,13 +90,19 @@ class KittiRaw:
         points = columns[row, :3].astype(np.float64)
         return Sweep(
             frame=int(frame),
-            stamp_ns=self._stamp_ns(frame),
+            stamp_ns=self.stamp_ns(frame),
             points=points,
             intensity=columns[row, 3],
             offset_ns=self._offset_ns(frame, points),
             lidar=np.zeros(len(row), np.uint8),
             row=row.astype(np.int64),
         )
+
+    def stamp_ns(self, frame: int) -> int:
+        """Reference time of a sweep. Raises InputError for a frame without a stamp."""
+        if self._stamps is None:
+            return int(frame) * _NOMINAL_PERIOD_NS
+        return self._stamps[frame]
 
     def image(self, camera: str, frame: int) -> NDArray[np.uint8]:
         """(H,W,3) RGB. Raises InputError for an unknown camera, a missing or unfit image."""
@@ -115,7 +121,7 @@ class KittiRaw:
         camera_named(self.cameras, camera, self._drive)
         stamps = self._image_stamps[camera]
         recorded = stamps.get(frame) if stamps else None
-        return self._stamp_ns(frame) if recorded is None else recorded - KITTI_TRIGGER_LATENCY_NS
+        return self.stamp_ns(frame) if recorded is None else recorded - KITTI_TRIGGER_LATENCY_NS
 
     def T_world_lidar(self, frame: int) -> Float:
         """(4,4) pose at the sweep's reference time, from GPS and inertial unit.
@@ -133,11 +139,6 @@ class KittiRaw:
         of_frame(self._oxts, frame, "oxts record", self._drive)
         T_world_imu = self._interpolated_T_world_imu(frame)
         return T_world_imu @ poses.inverse(self._T_lidar_imu)
-
-    def _stamp_ns(self, frame: int) -> int:
-        if self._stamps is None:
-            return int(frame) * _NOMINAL_PERIOD_NS
-        return self._stamps[frame]
 
     def _offset_ns(self, frame: int, points: Float) -> Int | None:
         if self._stamps is None or self._start_stamps is None or self._end_stamps is None:

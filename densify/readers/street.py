@@ -93,6 +93,11 @@ class Street:
             scanner_origins=sensor_named(self.simulator.sensor).origins_m,
         )
 
+    def stamp_ns(self, frame: int) -> int:
+        """Reference time of a sweep."""
+        _check_frame(frame)
+        return stamp_ns(frame)
+
     def returns(self, frame: int) -> Returns:
         """The sweep's returns with the bodies they are from."""
         _check_frame(frame)

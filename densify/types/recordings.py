@@ -71,6 +71,10 @@ class LidarSequence(Protocol):
 
     def __getitem__(self, frame: int) -> Sweep: ...
 
+    def stamp_ns(self, frame: int) -> int:
+        """Reference time of a sweep, without reading its points."""
+        ...
+
     def image(self, camera: str, frame: int) -> NDArray[np.uint8]:
         """(H,W,3) RGB."""
         ...
