@@ -24,7 +24,7 @@ from densify.dataset.gate import Gate
 from densify.errors import InputError, OutputError
 from densify.outputs.atomic import make_folder, write_file
 from densify.outputs.kitti_tree import drive_folder, split_of
-from densify.readers import open_sequence
+from densify.readers import Spec, open_sequence
 from densify.readers.files import format_frames
 from densify.readers.window import choose_cameras
 from densify.types import Camera, LidarSequence
@@ -70,8 +70,8 @@ class Recipe:
 
 @dataclass(frozen=True)
 class Source:
-    """A recording, as every process opens it. name: as a folder's. data: what ``--data`` takes.
-    folder: of its files, relative to the set's. cameras: those wanted."""
+    """A recording, as every process opens it. name: as a folder's. data: what ``--data`` takes,
+    with an absolute path. folder: of its files, relative to the set's. cameras: those wanted."""
 
     name: str
     data: str
@@ -113,8 +113,8 @@ def plan(data: Sequence[str], keys: slice | None, recipe: Recipe) -> list[Planne
         if recipe.layout == "densify":
             folder = name if len(data) > 1 else "."
         chosen = _keys(sequence, keys, spec)
-        given = spec if spec.startswith("street") else str(Path(spec).absolute())
-        source = Source(name, given, folder, tuple(c.name for c in cameras))
+        cameras_wanted = tuple(c.name for c in cameras)
+        source = Source(name, Spec.parse(spec).absolute(), folder, cameras_wanted)
         drives[name] = PlannedDrive(source, chosen, cameras)
     return list(drives.values())
 
