@@ -167,19 +167,20 @@ def _visible(
     last = int(age.max(initial=0)) + 1
     start, order = _by_pixel(points, np.where(hidden, last, age), own, camera)
     found = np.zeros((6, len(start) - 1), np.float32)
-    knobs = np.array(
-        [
-            *(settings.support_reach, settings.plane_reach),
-            *(settings.agree_m, settings.agree_fraction),
-            *(settings.hidden_m, settings.hidden_fraction),
-            *(settings.edge_reach, settings.edge_slack_m * camera.K[0, 0], _EDGE_WINDOW_PX),
-        ]
+    visible = kernels.Visible(
+        start=start,
+        order=order,
+        uv=points.uv,
+        inverse=points.inverse,
+        slope=points.slope,
+        spacing_px=points.spacing_px,
+        sweep=points.sweep,
+        hidden=hidden,
+        moving=points.moving,
+        age=age,
     )
     shape = (camera.height_px, camera.width_px)
-    kernels.settle.over_rows(
-        *(len(start) - 1, start, order, points.uv, points.inverse, points.slope),
-        *(points.spacing_px, points.sweep, hidden, points.moving, age, knobs, shape, found),
-    )
+    kernels.settle.over_rows(len(start) - 1, visible, _reaches(camera, settings), shape, found)
     pixel = np.flatnonzero(found[0])
     winner = order[start[pixel]]
     depth_m, num_sweeps, youngest, num_points, residual_m, edge = found[:, pixel]
@@ -201,6 +202,20 @@ def _visible(
     confidence = (own[winner] * (1 - _DOUBTS @ doubts)).astype(np.float32)
     kept = supported & inside
     return _Pixels(pixel[kept], winner[kept], depth_m[kept], confidence[kept])
+
+
+def _reaches(camera: Camera, settings: ProjectSettings) -> kernels.Reaches:
+    return kernels.Reaches(
+        support=float(settings.support_reach),
+        plane=float(settings.plane_reach),
+        agree_m=float(settings.agree_m),
+        agree_fraction=float(settings.agree_fraction),
+        behind_m=float(settings.hidden_m),
+        behind_fraction=float(settings.hidden_fraction),
+        edge=float(settings.edge_reach),
+        edge_px_m=float(settings.edge_slack_m * camera.K[0, 0]),
+        edge_window_px=_EDGE_WINDOW_PX,
+    )
 
 
 def _behind(points: _InImage, camera: Camera, settings: ProjectSettings) -> Float:

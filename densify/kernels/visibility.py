@@ -4,8 +4,12 @@
 
 from __future__ import annotations
 
-import numpy as np
+from typing import NamedTuple
 
+import numpy as np
+from numpy.typing import NDArray
+
+from densify.arrays import Bool, Float, Int
 from densify.kernels import Kernel, inlined
 
 _STEEP = 5.7  # metres farther per metre across, 10 degrees: a surface steeper on one side is a step
@@ -245,35 +249,59 @@ def _extend(reach, u, v):  # type: ignore[no-untyped-def]
     reach[6], reach[7] = max(reach[6], b), max(reach[7], -b)
 
 
+class Visible(NamedTuple):
+    """K points in an image, by pixel.
+
+    start, order: of `by_pixel`, hidden points last. uv: (K,2) px. inverse: (K,) depth, 1/m. slope:
+    (K,2) of the tangent plane's inverse depth, 1/m per px. spacing_px: (K,2) between neighbouring
+    rays. sweep: (K,) from 0 to 62. hidden, moving: (K,). age: (K,) frames from the key.
+    """
+
+    start: Int
+    order: Int
+    uv: Float
+    inverse: Float
+    slope: Float
+    spacing_px: Float
+    sweep: NDArray[np.integer]
+    hidden: Bool
+    moving: Bool
+    age: Int
+
+
+class Reaches(NamedTuple):
+    """How far `settle` looks around a point, and what it takes for one surface.
+
+    support, plane: reach of the support and of the fitted plane, in ray spacings. agree_m,
+    agree_fraction: metres and share of the depth within which points agree; behind_m,
+    behind_fraction: the same beyond which one lies behind. edge: reach of a depth edge in ray
+    spacings, edge_px_m: and in px at 1 m, edge_window_px: px beyond it where is looked for what
+    goes on.
+    """
+
+    support: float
+    plane: float
+    agree_m: float
+    agree_fraction: float
+    behind_m: float
+    behind_fraction: float
+    edge: float
+    edge_px_m: float
+    edge_window_px: float
+
+
 @Kernel
-def settle(  # type: ignore[no-untyped-def]
-    first,
-    last,
-    start,
-    order,
-    uv,
-    inverse,
-    slope,
-    spacing_px,
-    sweep,
-    hidden,
-    moving,
-    age,
-    knobs,
-    shape,
-    found,
-):
+def settle(first, last, points, reaches, shape, found):  # type: ignore[no-untyped-def]
     """Each pixel's depth from the points around that agree with its first point.
 
-    start, order: of `by_pixel`, hidden points last. spacing_px: (K,2) between neighbouring rays.
-    sweep: (K,) from 0 to 62. moving: (K,) bool. age: (K,) frames from the key. knobs: reach of the
-    support and of the fit in spacings; metres and share of the depth within which points agree; the
-    same beyond which one lies behind; reach of edges in spacings and in px at 1 m, and px beyond it
-    where is looked for what goes on. shape: (height, width). found: (6,P) float32, filled where a
-    point is not hidden with depth, number of sweeps that agree, age of the youngest of them, points
-    in the fit, their root mean square residual (m), and how far the surface goes on to all sides,
-    as a share of the edges' reach.
+    points: `Visible`. reaches: `Reaches`. shape: (height, width). found: (6,P) float32, filled
+    where a point is not hidden with depth, number of sweeps that agree, age of the youngest of
+    them, points in the fit, their root mean square residual (m), and how far the surface goes on to
+    all sides, as a share of the edges' reach.
     """
+    start, order, uv, spacing_px = points.start, points.order, points.uv, points.spacing_px
+    inverse, slope, hidden = points.inverse, points.slope, points.hidden
+    moving, age = points.moving, points.age
     height, width = shape
     m, reach = np.zeros(9), np.zeros(8)
     for p in range(first, last):
@@ -284,12 +312,15 @@ def settle(  # type: ignore[no-untyped-def]
         w0, su, sv = inverse[i], slope[i, 0], slope[i, 1]
         centre = w0 + su * (u0 - uv[i, 0]) + sv * (v0 - uv[i, 1])
         centre = min(max(centre, 0.8 * w0), 1.25 * w0)
-        agree = (knobs[2] + knobs[3] / w0) * w0 * w0
-        far = (knobs[4] + knobs[5] / w0) * w0 * w0
-        inner = knobs[6] * spacing_px[i, 0] + knobs[7] * w0 * (_MOVING_SLACK if moving[i] else 1.0)
-        outer = inner + knobs[8]
-        wide_u, fit_u = _window(knobs[0] * spacing_px[i, 0]), _fit(knobs[1] * spacing_px[i, 0])
-        wide_v, fit_v = _window(knobs[0] * spacing_px[i, 1]), _fit(knobs[1] * spacing_px[i, 1])
+        agree = (reaches.agree_m + reaches.agree_fraction / w0) * w0 * w0
+        far = (reaches.behind_m + reaches.behind_fraction / w0) * w0 * w0
+        edge_px = reaches.edge_px_m * w0 * (_MOVING_SLACK if moving[i] else 1.0)
+        inner = reaches.edge * spacing_px[i, 0] + edge_px
+        outer = inner + reaches.edge_window_px
+        wide_u = _window(reaches.support * spacing_px[i, 0])
+        wide_v = _window(reaches.support * spacing_px[i, 1])
+        fit_u = _fit(reaches.plane * spacing_px[i, 0])
+        fit_v = _fit(reaches.plane * spacing_px[i, 1])
         on_v = outer
         if moving[i]:  # its sweeps all see it in the same rings
             on_v = max(outer, _GOES_ON * spacing_px[i, 1])
@@ -308,7 +339,7 @@ def settle(  # type: ignore[no-untyped-def]
                 if hidden[j] or abs(off) > agree:
                     behind |= close and off < -far and age[j] <= witness
                     continue
-                seen |= np.int64(1) << np.int64(sweep[j])
+                seen |= np.int64(1) << np.int64(points.sweep[j])
                 youngest = min(youngest, age[j])
                 if abs(du) <= outer and abs(dv) <= on_v:
                     _extend(reach, du, dv)
