@@ -17,6 +17,7 @@ from typing import Any
 
 from densify.errors import InputError
 from densify.knobs import Section, checked, knob
+from densify.plugins import engines
 
 
 @dataclass(frozen=True)
@@ -80,8 +81,7 @@ class FlowSettings(Section):
 
     engine: str = knob(
         "groups",
-        "groups: groups of points whose motion is proven, rigid and softened; paper: the published "
-        "objective; npz:DIR: files of others, see the README",
+        f"{engines.described()}; others by name where their package is installed",
     )
     min_height_m: float = knob(
         0.2,
@@ -135,17 +135,7 @@ class FlowSettings(Section):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.engine not in ("groups", "paper") and not self.files:
-            raise InputError(
-                f"flow.engine: got {self.engine!r}, expected groups, paper or npz:DIR with the "
-                f"folder of flow files"
-            )
-
-    @property
-    def files(self) -> Path | None:
-        """The folder that ``engine`` names, if it names one."""
-        kind, _, folder = self.engine.partition(":")
-        return Path(folder) if kind == "npz" and folder else None
+        engines.check_spec(self.engine)
 
 
 @dataclass(frozen=True)

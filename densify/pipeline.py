@@ -8,7 +8,6 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -21,12 +20,11 @@ from densify.depth.accumulate import accumulate
 from densify.depth.age import with_ages
 from densify.depth.views import HeldOut, Views
 from densify.errors import InputError
-from densify.flow.chained import ChainedMotion
-from densify.flow.engines import estimate_motion
+from densify.flow.engines import check_engine, estimate_motion
+from densify.flow.scene import Scene
 from densify.geometry.ground import ground
 from densify.geometry.height_map import HeightMap
 from densify.geometry.range_image import RangeImage
-from densify.readers.flow_files import FlowFiles, require_folder
 from densify.readers.window import choose_cameras, read_sweeps, recorded_trajectory, window_frames
 from densify.registration.deskew import deskew
 from densify.registration.odometry import check_overlap, check_plausible, register
@@ -123,8 +121,7 @@ def compare(
         if name not in METHODS:
             raise InputError(f"--methods {name}: expected some of {', '.join(METHODS)}")
     settings = resolve(config)
-    if settings.flow.files is not None:
-        require_folder(settings.flow.files)
+    check_engine(settings.flow.engine)
     chosen = choose_cameras(sequence, cameras)
     frames, lead_in = window_frames(sequence, key, window, settings.register.num_lead_in)
     watch = Watch(progress)
@@ -291,11 +288,8 @@ def _key_moment(
 
 
 def motion_by(engine: str, stretch: Stretch, heights: HeightMap, settings: Config) -> Motion:
-    """How everything in a stretch moves: by that engine, or from flow that others left on disk."""
-    flow = replace(settings.flow, engine=engine)
-    if flow.files is None:
-        return estimate_motion(stretch, heights, flow)
-    return ChainedMotion(stretch, FlowFiles(flow.files, stretch).step, flow.max_gap_m)
+    """How everything in a stretch moves, by that engine."""
+    return estimate_motion(Scene(stretch, heights, settings.flow.min_height_m), settings, engine)
 
 
 def _steps(motion: Motion, stretch: Stretch, key: int) -> StretchFlow:

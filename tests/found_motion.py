@@ -7,15 +7,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from densify.config import FlowSettings, GroundSettings
+from densify.config import Config, GroundSettings
+from densify.flow import scene as engine_scene
 from densify.flow.engines import estimate_motion
 from densify.flow.tracking.groups import GroupMotion
 from densify.geometry.ground import ground
 from densify.geometry.height_map import HeightMap
-from densify.types import FlowField, Stretch
+from densify.types import FlowField, Motion, Stretch
 from tests.scenes import Arc, Scanner, Scene, World, street
 
-SETTINGS = FlowSettings()
+CONFIG = Config()
 NOISE = Scanner(sigma_m=0.01)
 KEY = 5
 
@@ -40,7 +41,7 @@ class Found:
     def around(middle: int, scene: Scene, size: int) -> Found:
         stretch = scene.stretch(middle, size)
         heights = ground(stretch, GroundSettings())
-        motion = estimate_motion(stretch, heights, SETTINGS)
+        motion = motion_in(stretch, heights)
         assert isinstance(motion, GroupMotion)
         fields = tuple(motion.flow(f, toward_key(f)) for f in stretch.frames)
         return Found(scene, stretch, heights, motion, fields)
@@ -77,6 +78,12 @@ class Found:
         return float(
             np.concatenate([f.moving[self.scene.scan(k).instance < 0] for k, f in frames]).mean()
         )
+
+
+def motion_in(stretch: Stretch, heights: HeightMap) -> Motion:
+    """By the default engine."""
+    scene = engine_scene.Scene(stretch, heights, CONFIG.flow.min_height_m)
+    return estimate_motion(scene, CONFIG)
 
 
 def toward_key(frame: int) -> int:

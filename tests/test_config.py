@@ -173,7 +173,7 @@ def test_overrides_win_over_the_file_and_later_over_earlier() -> None:
         ("flow.radius_m=0", ["got 0", "or null"]),
         ("register.deskew=maybe", ["got 'maybe'", "true or false"]),
         ("register.source=oxts", ["got 'oxts'", "one of kiss-icp, dataset"]),
-        ("flow.engine=magic", ["got 'magic'", "groups, paper or npz:DIR"]),
+        ("flow.engine=magic", ["got 'magic'", "one of groups, paper, npz:DIR"]),
         ("project.at=noon", ["got 'noon'", "one of camera, sweep"]),
         ("output.movers=hide", ["got 'hide'", "one of keep, drop, separate"]),
         ("flow.alpha", ["expected section.key=value"]),
@@ -215,10 +215,11 @@ def test_binary_file_is_an_input_error(tmp_path: Path) -> None:
 
 
 def test_an_engine_may_be_a_folder_of_flow_files() -> None:
-    assert resolve(None, ["flow.engine=npz:some/flow"]).flow.files == Path("some/flow")
-    assert resolve({"flow": {"engine": "paper"}}).flow.files is Config().flow.files is None
-    with pytest.raises(InputError, match="got 'npz:', expected groups, paper or npz:DIR"):
+    assert resolve(None, ["flow.engine=npz:some/flow"]).flow.engine == "npz:some/flow"
+    with pytest.raises(InputError, match="got 'npz:', expected npz:DIR"):
         FlowSettings(engine="npz:")
+    with pytest.raises(InputError, match="got 'groups:9', expected groups"):
+        FlowSettings(engine="groups:9")
 
 
 def test_unknown_preset_suggests_one() -> None:

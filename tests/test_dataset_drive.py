@@ -281,14 +281,14 @@ def counted(monkeypatch: pytest.MonkeyPatch) -> Counter[str]:
 
         return count
 
-    for name in ("find_trajectory", "ground", "find_candidates", "follow_candidates"):
+    for name in ("find_trajectory", "ground", "find_candidates", "estimate_motion"):
         monkeypatch.setattr(shared, name, counting(name, getattr(shared, name)))
     images = SimpleNamespace(of=counting("images", RangeImage.of))
     monkeypatch.setattr(shared, "RangeImage", images)
     return counts
 
 
-ONCE = {"find_trajectory": 2, "ground": 2, "find_candidates": 2, "follow_candidates": 2}
+ONCE = {"find_trajectory": 2, "ground": 2, "find_candidates": 2, "estimate_motion": 2}
 
 
 def use(sequence, folder: Path, config: Config = GIVEN, window: int = 2) -> None:
@@ -313,10 +313,10 @@ def test_other_settings_and_other_sweeps_make_anew(counted: Counter[str], tmp_pa
     use(sequence, tmp_path)
     counted.clear()
     use(sequence, tmp_path, resolve({**POSES_GIVEN, "flow": {"soft": False}}))
-    assert counted == {"follow_candidates": 2}
+    assert counted == {"estimate_motion": 2}
     counted.clear()
     use(sequence, tmp_path, resolve({**POSES_GIVEN, "ground": {"cell_m": 0.8}}))
-    assert counted == {n: 2 for n in ("ground", "find_candidates", "follow_candidates")}
+    assert counted == {n: 2 for n in ("ground", "find_candidates", "estimate_motion")}
     counted.clear()
     use(sequence, tmp_path, resolve({"register": {"source": "dataset", "max_range_m": 40}}))
     assert counted == {**ONCE, "images": len(sequence.frames)}
@@ -334,5 +334,5 @@ def test_other_settings_and_other_sweeps_make_anew(counted: Counter[str], tmp_pa
         "images": 5,
         "ground": 2,
         "find_candidates": 2,
-        "follow_candidates": 2,
+        "estimate_motion": 2,
     }  # the sweep is in the second block, and within reach of the first

@@ -6,10 +6,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from densify.flow.engines import estimate_motion
 from densify.geometry import poses
 from densify.types import FlowField
-from tests.found_motion import KEY, NOISE, SETTINGS, Found, toward_key
+from tests.found_motion import KEY, NOISE, Found, motion_in, toward_key
 from tests.scenes import SWEEP_S, Arc, Box, Scanner, Scene, World, car, street
 
 # --- nothing moves --------------------------------------------------------------------------------
@@ -101,7 +100,7 @@ def test_shapes_and_types(traffic):
 
 
 def test_same_bytes_every_time(traffic):
-    motion = estimate_motion(traffic.stretch, traffic.ground, SETTINGS)
+    motion = motion_in(traffic.stretch, traffic.ground)
     for frame, a in zip(traffic.stretch.frames, traffic.fields, strict=True):
         b = motion.flow(frame, toward_key(frame))
         assert a.total.tobytes() == b.total.tobytes()

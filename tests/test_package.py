@@ -140,7 +140,7 @@ def test_no_library_code_exits_prints_or_asserts() -> None:
 
 
 FLOORS = (
-    ("arrays", "errors", "version", "knobs"),
+    ("arrays", "errors", "version", "knobs", "plugins"),
     ("config", "geometry", "kernels", "types"),
     ("registration", "depth", "flow", "scores", "street"),
     ("readers",),

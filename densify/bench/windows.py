@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 from densify.config import Config
 from densify.flow.engines import estimate_motion
+from densify.flow.scene import Scene
 from densify.geometry import poses
 from densify.geometry.ground import ground
 from densify.pipeline import find_trajectory
@@ -58,7 +59,8 @@ class Window:
 
 def our_motion(stretch: Stretch, config: Config) -> Motion:
     """From the ground on."""
-    return estimate_motion(stretch, ground(stretch, config.ground), config.flow)
+    heights = ground(stretch, config.ground)
+    return estimate_motion(Scene(stretch, heights, config.flow.min_height_m), config)
 
 
 def _in_world(stretch: Stretch, frame: int) -> Float:

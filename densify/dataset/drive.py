@@ -28,8 +28,9 @@ import numpy as np
 from densify.config import Config
 from densify.dataset.cache import Cache, digest
 from densify.errors import InputError, SweepError
+from densify.flow.scene import Scene
 from densify.flow.tracking.evidence import REACH, Candidates, FreeSpace, find_candidates
-from densify.flow.tracking.groups import GroupMotion, follow_candidates
+from densify.flow.tracking.groups import GroupMotion, estimate_motion
 from densify.geometry.ground import ground
 from densify.geometry.height_map import HeightMap
 from densify.geometry.poses import inverse
@@ -223,10 +224,14 @@ class Drive:
                 for f, c in e.candidates.items()
             }
             own = [e for e in self.evidence(block) if not e.candidates.keys().isdisjoint(frames)]
-            motion = follow_candidates(
-                *(stretch, space, [candidates[f] for f in frames], own[0].ground),
-                *(flow.min_height_m, flow.soft),
+            scene = Scene(
+                stretch,
+                own[0].ground,
+                flow.min_height_m,
+                make_space=lambda: space,
+                make_candidates=lambda: tuple(candidates[f] for f in frames),
             )
+            motion = estimate_motion(scene, self._settings, "")
             return replace(motion, stretch=Stretch(()))
 
         for piece in self._pieces(block, self._margin):

@@ -26,6 +26,7 @@ from densify.errors import ComputationError, InputError, OutputError
 from densify.outputs.atomic import FileRecord
 from densify.outputs.kitti_tree import write_key
 from densify.outputs.store import write_result
+from densify.plugins.engines import engine
 from densify.readers import open_sequence
 from densify.types import LidarSequence, Result
 
@@ -157,7 +158,7 @@ def _last_stage(recipe: Recipe) -> int:
     """The last of `_STAGES` that a key needs."""
     if recipe.method != "flow":
         return _STAGES.index("registration")
-    return _STAGES.index("motion" if recipe.config.flow.engine == "groups" else "evidence")
+    return _STAGES.index("motion" if engine(recipe.config.flow.engine)[0].shared else "evidence")
 
 
 @lru_cache(maxsize=2)

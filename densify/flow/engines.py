@@ -1,43 +1,46 @@
 # SPDX-License-Identifier: MIT
-"""How everything in a stretch moves: the engines behind one call."""
+"""How everything in a stretch moves: all engines behind one call.
+
+The table of engines, and how to add one, is `densify.plugins.engines`.
+"""
 
 from __future__ import annotations
 
-from densify.config import FlowSettings
-from densify.flow.chained import ChainedMotion
-from densify.geometry import poses
-from densify.geometry.height_map import HeightMap
-from densify.types import FlowField, Motion, Stretch
+from typing import Protocol, cast
+
+from densify.config import Config
+from densify.flow.scene import Scene
+from densify.plugins.engines import ENGINES, engine
+from densify.types import Motion
 
 
-def estimate_motion(stretch: Stretch, ground: HeightMap, settings: FlowSettings) -> Motion:
-    """By the engine that the settings name."""
-    if settings.engine == "groups":
-        from densify.flow.tracking.groups import follow
+class EngineModule(Protocol):
+    """What the module of an engine has.
 
-        return follow(stretch, ground, settings.min_height_m, settings.soft)
-    return ChainedMotion(
-        stretch,
-        lambda here, there: _objective(stretch, ground, here, there, settings),
-        settings.max_gap_m,
-    )
+    It may have ``check_argument(argument: str) -> None`` too, called before anything is computed,
+    which raises InputError for an argument that cannot be used.
+    """
+
+    def estimate_motion(self, scene: Scene, settings: Config, argument: str) -> Motion:
+        """How everything in the scene's stretch moves.
+
+        argument: what follows the engine's name and a colon in ``flow.engine``, "" for nothing.
+        May estimate at once or when the motion's ``flow`` is called; same input, same bytes.
+        """
+        ...
 
 
-def _objective(
-    stretch: Stretch, ground: HeightMap, here: int, there: int, settings: FlowSettings
-) -> FlowField:
-    """The published way: the points above the ground of two sweeps, by index."""
-    from densify.flow.pairs.estimate import flow_between
+def estimate_motion(scene: Scene, settings: Config, spec: str | None = None) -> Motion:
+    """By the engine ``NAME[:ARGUMENT]``, that of ``flow.engine`` if None."""
+    row, argument = engine(spec or settings.flow.engine)
+    module = cast(EngineModule, ENGINES.module(row))
+    return module.estimate_motion(scene, settings, argument)
 
-    clouds = [
-        poses.transform(s.T_world_lidar, s.sweep.points)
-        for s in (stretch.sweeps[here], stretch.sweeps[there])
-    ]
-    above, above_there = (ground.above(c) >= settings.min_height_m for c in clouds)
-    field = FlowField.zero(len(above))
-    if above.any() and above_there.any():
-        pair = flow_between(clouds[0][above], clouds[1][above_there], settings)
-        R_world_lidar = stretch.sweeps[here].T_world_lidar[:3, :3]
-        field.displacement[above] = pair.displacement @ R_world_lidar
-        field.moving[above] = pair.moving
-    return field
+
+def check_engine(spec: str) -> None:
+    """Find out before a computation whether the engine is there and can use its argument; imports
+    it. Raises InputError."""
+    row, argument = engine(spec)
+    check = getattr(ENGINES.module(row), "check_argument", None)
+    if check is not None:
+        check(argument)

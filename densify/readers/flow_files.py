@@ -25,19 +25,31 @@ import numpy as np
 from numpy.lib.npyio import NpzFile
 from numpy.typing import NDArray
 
+from densify.config import Config
 from densify.errors import InputError
+from densify.flow.chained import ChainedMotion
+from densify.flow.scene import Scene
 from densify.geometry import poses
-from densify.types import FlowField, Stretch
+from densify.types import FlowField, Motion, Stretch
 
 MOVES_M = 0.05
 _WIDE = ("residual_flow", "total_flow", "to_reference")
 _KNOWN = (*_WIDE, "row", "moving", "object")
 
 
-def require_folder(folder: Path) -> None:
-    """Raise InputError unless it is there: to be asked before anything is computed."""
-    if not folder.is_dir():
-        raise InputError(f"flow.engine npz:{folder}: no such folder; expected flow files in it")
+def estimate_motion(scene: Scene, settings: Config, argument: str) -> Motion:
+    """The flow files of a folder as an engine, see `densify.flow.engines.EngineModule`.
+
+    argument: the folder.
+    """
+    files = FlowFiles(Path(argument), scene.stretch)
+    return ChainedMotion(scene.stretch, files.step, settings.flow.max_gap_m)
+
+
+def check_argument(argument: str) -> None:
+    """Raise InputError unless the folder is there."""
+    if not Path(argument).is_dir():
+        raise InputError(f"flow.engine npz:{argument}: no such folder; expected flow files in it")
 
 
 class FlowFiles:
@@ -47,7 +59,7 @@ class FlowFiles:
     """
 
     def __init__(self, folder: Path, stretch: Stretch) -> None:
-        require_folder(folder)
+        check_argument(str(folder))
         self._folder, self._stretch = folder, stretch
 
     def step(self, here: int, there: int) -> FlowField:

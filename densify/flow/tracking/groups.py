@@ -10,11 +10,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from densify.config import Config
+from densify.flow.scene import Scene
 from densify.flow.tracking.evidence import (
-    Candidates,
     FreeSpace,
     Standing,
-    find_candidates,
     firing_times_s,
     reference_times_s,
 )
@@ -103,33 +103,20 @@ class Bending:
         return at_reference, at_reference + self.softened.carry(n, m) - points
 
 
-def follow(stretch: Stretch, ground: HeightMap, min_height_m: float, soft: bool) -> GroupMotion:
-    """Find everything in the stretch that certainly moves.
+def estimate_motion(scene: Scene, settings: Config, argument: str) -> GroupMotion:
+    """Find everything in the stretch that certainly moves; ``flow.soft``: objects may bend.
 
-    min_height_m: points lower above the ground start no motion. soft: objects may bend.
+    As `densify.flow.engines.EngineModule`; takes no argument.
     """
-    space = FreeSpace.of(stretch)
-    candidates = find_candidates(stretch, space, ground, min_height_m)
-    return follow_candidates(stretch, space, candidates, ground, min_height_m, soft)
-
-
-def follow_candidates(
-    stretch: Stretch,
-    space: FreeSpace,
-    candidates: Sequence[Candidates],
-    ground: HeightMap,
-    min_height_m: float,
-    soft: bool,
-) -> GroupMotion:
-    """As `follow`, from what the stretch's sweeps saw through and what of each may move."""
-    standing = [Standing.of(stretch, i, found) for i, found in enumerate(candidates)]
+    stretch, space, ground = scene.stretch, scene.space, scene.ground
+    standing = [Standing.of(stretch, i, found) for i, found in enumerate(scene.candidates)]
     time_s = reference_times_s(stretch)
     tracks = follow_groups(standing, space, ground, time_s)
     shapes = [Shape.of(t.seen_in(standing, sorted(t.claimed))) for t in tracks]
 
     def members(i: int) -> NDArray[np.int32]:
         seen = _Seen.of(stretch, i, ground, standing[i], space.ring_step_rad)
-        attached = _attach(seen, i, tracks, shapes, time_s, min_height_m)
+        attached = _attach(seen, i, tracks, shapes, time_s, scene.min_height_m)
         _lengthen(attached, seen, i, tracks, shapes, time_s, space)
         instance = np.full(len(stretch.sweeps[i].sweep), -1, np.int32)
         instance[seen.row] = attached
@@ -138,7 +125,7 @@ def follow_candidates(
     with ThreadPoolExecutor() as pool:
         instance = tuple(pool.map(members, range(len(stretch.sweeps))))
     bendings = {}
-    if soft:
+    if settings.flow.soft:
         fine = [_is_fine(track, space) for track in tracks]
         bendings = _bendings(stretch, tracks, fine, instance)
     return GroupMotion(stretch, tuple(tracks), instance, bendings)

@@ -1,0 +1,36 @@
+# SPDX-License-Identifier: MIT
+"""The published objective as an engine: between neighbouring sweeps, above the ground, chained."""
+
+from __future__ import annotations
+
+from densify.config import Config
+from densify.flow.chained import ChainedMotion
+from densify.flow.pairs.estimate import flow_between
+from densify.flow.scene import Scene
+from densify.geometry import poses
+from densify.types import FlowField, Motion
+
+
+def estimate_motion(scene: Scene, settings: Config, argument: str) -> Motion:
+    """As `densify.flow.engines.EngineModule`; takes no argument."""
+
+    def step(here: int, there: int) -> FlowField:
+        return _step(scene, here, there, settings)
+
+    return ChainedMotion(scene.stretch, step, settings.flow.max_gap_m)
+
+
+def _step(scene: Scene, here: int, there: int, settings: Config) -> FlowField:
+    """Of the points above the ground of one sweep to another's time; sweeps by number."""
+    clouds = [
+        poses.transform(s.T_world_lidar, s.sweep.points)
+        for s in (scene.stretch.sweeps[here], scene.stretch.sweeps[there])
+    ]
+    above, above_there = (scene.ground.above(c) >= scene.min_height_m for c in clouds)
+    field = FlowField.zero(len(above))
+    if above.any() and above_there.any():
+        pair = flow_between(clouds[0][above], clouds[1][above_there], settings.flow)
+        R_world_lidar = scene.stretch.sweeps[here].T_world_lidar[:3, :3]
+        field.displacement[above] = pair.displacement @ R_world_lidar
+        field.moving[above] = pair.moving
+    return field

@@ -1,0 +1,121 @@
+# SPDX-License-Identifier: MIT
+"""A table of modules with one interface: the built-in ones, and those of other people's packages.
+
+A package adds a row by an entry point: the name is the row's, the value is a module::
+
+    [project.entry-points."densify.readers"]
+    npy = "densify_npy.reader"
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib import import_module
+from types import ModuleType
+from typing import TYPE_CHECKING, Generic, Protocol, TypeVar
+
+from densify.errors import InputError
+
+if TYPE_CHECKING:
+    from importlib.metadata import EntryPoint
+
+
+class Row(Protocol):
+    """name: as users write it. module: import path of the module that does the work."""
+
+    @property
+    def name(self) -> str: ...
+
+    @property
+    def module(self) -> str: ...
+
+    @property
+    def usage(self) -> str:
+        """How users write it, what may follow the name included."""
+        ...
+
+
+R = TypeVar("R", bound=Row)
+
+
+@dataclass(frozen=True)
+class Table(Generic[R]):
+    """kind: what a row is, for messages. group: of the entry points. members: functions that every
+    module must have. row_of: name and module of another package -> row."""
+
+    kind: str
+    group: str
+    built_in: tuple[R, ...]
+    members: tuple[str, ...]
+    row_of: Callable[[str, ModuleType], R]
+
+    def usages(self) -> list[str]:
+        """How the rows are written: the built-in ones, then other packages' names, sorted."""
+        return [row.usage for row in self.built_in] + sorted(self._added())
+
+    def require(self, name: str, where: str) -> None:
+        """Raise InputError unless there is such a row. Imports nothing.
+
+        where: what the name was given to, for the message.
+        """
+        if not self._is_built_in(name) and name not in self._added():
+            raise InputError(
+                f"{where}: got {name!r}, expected one of {', '.join(self.usages())} (others come "
+                f"with packages that have an entry point in {self.group})"
+            )
+
+    def row(self, name: str, where: str) -> R:
+        """The row of that name. Imports the module of another package. Raises InputError if there
+        is none, several packages have one, or the package is broken."""
+        self.require(name, where)
+        for row in self.built_in:
+            if row.name == name:
+                return row
+        return self._load(name, self._added()[name])
+
+    def rows(self) -> list[R]:
+        """All of them; imports the modules of other packages."""
+        added = sorted(self._added().items())
+        return [*self.built_in, *(self._load(name, points) for name, points in added)]
+
+    def module(self, row: R) -> ModuleType:
+        """That does the work; imported when asked for."""
+        return import_module(row.module)
+
+    def _is_built_in(self, name: str) -> bool:
+        return any(row.name == name for row in self.built_in)
+
+    def _added(self) -> dict[str, list[EntryPoint]]:
+        """Entry points of other packages by name; no built-in row can be replaced."""
+        from importlib.metadata import entry_points
+
+        found: dict[str, list[EntryPoint]] = {}
+        for point in entry_points(group=self.group):
+            if not self._is_built_in(point.name) and point not in found.get(point.name, []):
+                found.setdefault(point.name, []).append(point)
+        return found
+
+    def _load(self, name: str, points: list[EntryPoint]) -> R:
+        packages = " and ".join(
+            sorted({point.dist.name if point.dist else "?" for point in points})
+        )
+        if len(points) > 1:
+            raise InputError(
+                f"{self.kind} {name}: comes with the packages {packages}; uninstall all but one"
+            )
+        try:
+            module = points[0].load()
+        except Exception as error:  # whatever a stranger's import raises
+            reason = " ".join(f"{type(error).__name__}: {error}".split())
+            raise InputError(
+                f"{self.kind} {name} of the package {packages}: cannot be imported from "
+                f"{points[0].value} ({reason}); mend or uninstall the package"
+            ) from error
+        missing = [m for m in self.members if not callable(getattr(module, m, None))]
+        if missing or not isinstance(module, ModuleType):
+            raise InputError(
+                f"{self.kind} {name} of the package {packages}: {points[0].value} is no module "
+                f"with {', '.join(self.members)}; mend or uninstall the package"
+            )
+        return self.row_of(name, module)

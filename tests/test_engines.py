@@ -1,0 +1,72 @@
+# SPDX-License-Identifier: MIT
+"""The table of engines, and what an engine is given."""
+
+from __future__ import annotations
+
+import inspect
+
+import numpy as np
+import pytest
+
+from densify.config import Config, resolve
+from densify.errors import InputError
+from densify.flow.engines import check_engine, estimate_motion
+from densify.flow.scene import Scene
+from densify.flow.tracking.evidence import FreeSpace, find_candidates
+from densify.geometry.ground import ground
+from densify.plugins.engines import ENGINES, engine
+from tests import scenes
+
+
+@pytest.fixture(scope="module")
+def driving() -> Scene:
+    movers = (*scenes.street(), scenes.car(14, -1.6, 10, 1))
+    stretch = scenes.Scene(scenes.World(movers), scenes.Arc(0, -1.5, 0, 6.0, 0.0)).stretch(5, 2)
+    config = Config()
+    return Scene(stretch, ground(stretch, config.ground), config.flow.min_height_m)
+
+
+@pytest.mark.parametrize("row", ENGINES.built_in, ids=lambda row: row.name)
+def test_every_engine_has_the_one_interface(row) -> None:
+    module = ENGINES.module(row)
+    assert list(inspect.signature(module.estimate_motion).parameters) == [
+        "scene",
+        "settings",
+        "argument",
+    ]
+    assert row.about and engine(row.usage)[0] is row
+
+
+def test_what_a_scene_is_asked_for_is_made_once(driving: Scene) -> None:
+    assert driving.space is driving.space and driving.candidates is driving.candidates
+    space, candidates = driving.space, driving.candidates
+    made = []
+
+    def of(found):
+        return lambda: (made.append(found), found)[1]
+
+    handed = Scene(driving.stretch, driving.ground, driving.min_height_m, of(space), of(candidates))
+    motion = estimate_motion(handed, Config())
+    assert handed.space is space and handed.candidates is candidates and len(made) == 2
+    expected = estimate_motion(driving, Config())
+    for frame in driving.stretch.frames:
+        got, wanted = motion.flow(frame, 5), expected.flow(frame, 5)
+        np.testing.assert_array_equal(got.displacement, wanted.displacement)
+        assert wanted.moving.any()
+    fresh = find_candidates(driving.stretch, FreeSpace.of(driving.stretch), driving.ground, 0.2)
+    for found, again in zip(candidates, fresh, strict=True):
+        np.testing.assert_array_equal(found.cluster, again.cluster)
+
+
+def test_the_configured_engine_is_the_default(driving: Scene) -> None:
+    given = estimate_motion(driving, Config(), "paper")
+    assert type(given) is type(estimate_motion(driving, resolve({"flow": {"engine": "paper"}})))
+    assert type(given) is not type(estimate_motion(driving, Config()))
+
+
+def test_an_engine_that_cannot_work_is_known_before_anything_is_computed() -> None:
+    check_engine("groups")
+    with pytest.raises(InputError, match=r"flow\.engine: got 'magic', expected one of groups, "):
+        check_engine("magic")
+    with pytest.raises(InputError, match="npz:nowhere: no such folder"):
+        check_engine("npz:nowhere")
