@@ -23,6 +23,7 @@ def result_with(metrics: dict[str, Any], method: str, num_points: int) -> types.
         points=np.zeros((n, 3)),
         rigid_points=np.zeros((n, 3)),
         frame=np.zeros(n, np.int32),
+        since_key_ns=np.zeros(n, np.int64),
         row=np.arange(n),
         moving=np.arange(n) < 2,
         instance=np.full(n, -1, np.int32),

@@ -69,6 +69,7 @@ def run(tmp_path, maps):
         points=np.zeros((1, 3)),
         rigid_points=np.zeros((1, 3)),
         frame=np.array([120], np.int32),
+        since_key_ns=np.zeros(1, np.int64),
         row=np.zeros(1, np.int64),
         moving=np.zeros(1, bool),
         instance=np.full(1, -1, np.int32),

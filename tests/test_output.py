@@ -49,6 +49,7 @@ def cloud_of(num_points, seed=0):
         points=points,
         rigid_points=points - 0.3 * moving[:, None],
         frame=rng.integers(115, 126, num_points, dtype=np.int32),
+        since_key_ns=np.zeros(num_points, np.int64),
         row=np.arange(num_points),
         moving=moving,
         instance=np.where(moving, 4, -1).astype(np.int32),

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import os
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -22,7 +23,7 @@ from densify.geometry.poses import exp
 from densify.kernels import visibility as kernels
 from densify.types import Camera, Cloud, Patches, Reason
 
-KEY = 10
+KEY, PERIOD_NS = 10, 100_000_000
 PLAIN = ProjectSettings(visibility=False)
 T_CAM_LIDAR = np.array([[0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1.0]])  # axes only
 
@@ -35,10 +36,12 @@ def make_camera(width=64, height=48, focal=60.0, distortion=()):
 def make_cloud(points, frame=KEY, confidence=1.0):
     points = np.asarray(points, float).reshape(-1, 3)
     n = len(points)
+    frame = np.broadcast_to(np.asarray(frame, np.int32), n).copy()
     return Cloud(
         points=points,
         rigid_points=points,
-        frame=np.broadcast_to(np.asarray(frame, np.int32), n).copy(),
+        frame=frame,
+        since_key_ns=(frame.astype(np.int64) - KEY) * PERIOD_NS,
         row=np.arange(n),
         moving=np.zeros(n, bool),
         instance=np.full(n, -1, np.int32),
@@ -51,7 +54,7 @@ def make_cloud(points, frame=KEY, confidence=1.0):
 
 def view(cloud, camera, T_cam_key, knobs, origins=None):
     """`project` with the cloud's patches."""
-    return project(cloud, camera, T_cam_key, knobs, KEY, patches(cloud, KEY, knobs, origins))
+    return project(cloud, camera, T_cam_key, knobs, patches(cloud, KEY, knobs, origins))
 
 
 def take(cloud, index):
@@ -225,7 +228,16 @@ def facing(points, spacing_px, focal):
     return normal, np.broadcast_to(spacing_m, (len(points), 2))
 
 
-def see(camera, points_cam, frame, knobs, spacing_px=(1.0, 1.0), normal=None, free=None):
+def see(
+    camera,
+    points_cam,
+    frame,
+    knobs,
+    spacing_px=(1.0, 1.0),
+    normal=None,
+    free=None,
+    since_key_ns=None,
+):
     """`project` of points in the camera's frame, which is the key's, with patches as given."""
     cloud = make_cloud(points_cam, frame)
     facing_normal, spacing_m = facing(points_cam, spacing_px, camera.K[0, 0])
@@ -235,7 +247,9 @@ def see(camera, points_cam, frame, knobs, spacing_px=(1.0, 1.0), normal=None, fr
         free=np.zeros(len(cloud), bool) if free is None else free,
         sweep=np.unique(cloud.frame, return_inverse=True)[1].ravel().astype(np.int32),
     )
-    return project(cloud, camera, np.eye(4), knobs, KEY, surface)
+    if since_key_ns is not None:
+        cloud = replace(cloud, since_key_ns=np.asarray(since_key_ns))
+    return project(cloud, camera, np.eye(4), knobs, surface)
 
 
 def test_back_wall_does_not_shine_through_the_gaps_of_the_front_wall():
@@ -379,6 +393,23 @@ def test_nearest_in_time_wins_among_the_visible_only():
         "KEPT",
         "NOT_CHOSEN",
     ]
+
+
+@pytest.mark.parametrize(
+    ("since_key_ms", "winner"),
+    [([210, -40], KEY - 3), ([-40, 210], KEY + 1), ([103, -105], KEY - 3), ([103, -140], KEY + 1)],
+)
+def test_stamps_not_numbers_say_which_sweep_is_nearest_in_time(since_key_ms, winner):
+    """And where they differ by a jitter, the nearer surface wins."""
+    camera = make_camera()
+    points, frame = wall(camera, 10.0, [KEY + 1, KEY - 3], step=1)
+    ray = at_pixel(camera, 30, 20, 1.0)
+    there = (np.abs(points / points[0, 2] - ray) < 1e-6).all(1) & (frame == KEY + 1)
+    points[there] *= 1.008
+    since_key_ns = np.where(frame == KEY + 1, *since_key_ms) * 1_000_000
+    knobs = ProjectSettings(plane_reach=0)
+    depth = see(camera, points, frame, knobs, since_key_ns=since_key_ns)
+    assert depth.frame[20, 30] == winner
 
 
 def test_what_few_sweeps_or_not_the_key_saw_is_unsupported():

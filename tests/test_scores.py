@@ -45,10 +45,12 @@ def cloud_of(*parts):
     """parts: (points, frame, moving)."""
     points = np.vstack([p for p, _, _ in parts])
     n = len(points)
+    frame = np.concatenate([np.full(len(p), f, np.int32) for p, f, _ in parts])
     return Cloud(
         points=points,
         rigid_points=points,
-        frame=np.concatenate([np.full(len(p), f, np.int32) for p, f, _ in parts]),
+        frame=frame,
+        since_key_ns=(frame.astype(np.int64) - KEY) * 100_000_000,
         row=np.arange(n),
         moving=np.concatenate([np.full(len(p), m) for p, _, m in parts]),
         instance=np.full(n, -1, np.int32),
@@ -111,4 +113,5 @@ def test_ghost_scores_by_kind_and_distance():
         "moving": 0.5,
         "static": 0.0,
         "by_distance": {"1": 0.0, "2": 0.5},
+        "by_seconds": {"0.10": 0.0, "0.20": 0.5},
     }

@@ -10,7 +10,7 @@ import numpy as np
 from densify.geometry import poses
 from densify.types import Cloud, FlowField, Stretch
 
-_CONFIDENCE_PER_SWEEP = 0.07
+_CONFIDENCE_PER_S = 0.7
 _CONFIDENCE_MOVED = 0.8
 
 
@@ -21,8 +21,8 @@ def accumulate(stretch: Stretch, fields: Sequence[FlowField], key: int, drop_los
     be followed; otherwise it stays where registration puts it. Points that do not move are placed
     by registration alone, to the last bit.
 
-    Confidence is a ranking, not a probability: it falls with the distance from the key and for
-    points that flow had to move.
+    Confidence is a ranking, not a probability: it falls with the time from the key and for points
+     that flow had to move.
     """
     parts = []
     for registered, flow in zip(stretch.sweeps, fields, strict=True):
@@ -36,14 +36,16 @@ def accumulate(stretch: Stretch, fields: Sequence[FlowField], key: int, drop_los
         velocity_m_s = np.zeros_like(points)
         if flow.velocity_m_s is not None:
             velocity_m_s[moves] = poses.rotate(T_key_lidar, flow.velocity_m_s[moves])
-        away = abs(registered.frame - key)
-        confidence = np.full(len(sweep), max(0.1, 1 - _CONFIDENCE_PER_SWEEP * away))
-        confidence[moves & (away > 0)] *= _CONFIDENCE_MOVED
+        since_key_ns = sweep.stamp_ns - stretch[key].sweep.stamp_ns
+        own = max(0.1, 1 - _CONFIDENCE_PER_S * abs(since_key_ns) * 1e-9)
+        confidence = np.full(len(sweep), own)
+        confidence[moves & (registered.frame != key)] *= _CONFIDENCE_MOVED
         parts.append(
             {
                 "points": points[kept],
                 "rigid_points": rigid[kept],
                 "frame": np.full(len(kept), registered.frame, np.int32),
+                "since_key_ns": np.full(len(kept), since_key_ns, np.int64),
                 "row": sweep.row[kept],
                 "moving": flow.moving[kept],
                 "instance": flow.instance[kept],

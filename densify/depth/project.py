@@ -11,8 +11,10 @@ middle of the pixel. Nothing depends on the order of the points.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
+from numpy.typing import NDArray
 
 from densify.config import ProjectSettings
 from densify.depth.fill import fill_between
@@ -23,6 +25,7 @@ from densify.types import Bool, Camera, Cloud, DepthMap, Float, Float32, Int, Pa
 
 _MAX_HALF_PX = 24.0  # a point just before the lens must not hide the whole image
 _MAX_TILT = 0.25  # of the inverse depth per pixel; a plane seen edge-on has no slope
+_SAME_AGE_NS = 10_000_000
 _MOST_SWEEPS = 63  # that are told apart when they are counted
 _EDGE_WINDOW_PX = 1.5  # beyond the edge, where points must show that a surface goes on
 _LEAST_CONFIDENCE = 1 / 255  # 0 means no depth once written as 8 bits
@@ -37,7 +40,8 @@ _ROUGH_M = 0.10
 class _InImage:
     """The K points in the image. index: rows of the cloud. uv: (K,2) px. depth: (K,) m, as it is
     stored. slope: (K,2) of the tangent plane's inverse depth, 1/m per px. spacing_px: (K,2) between
-    neighbouring rays. moving: (K,). frame, sweep: (K,) source; sweep counts from 0."""
+    neighbouring rays. moving: (K,). frame, sweep: (K,) source; sweep counts from 0. age_ns: (K,)
+    see `_ages_ns`."""
 
     index: Int
     uv: Float
@@ -47,6 +51,7 @@ class _InImage:
     moving: Bool
     frame: np.ndarray
     sweep: np.ndarray
+    age_ns: Int
 
     @property
     def inverse(self) -> Float:
@@ -69,7 +74,6 @@ def project(
     camera: Camera,
     T_cam_key: Float,
     settings: ProjectSettings,
-    key: int,
     patches: Patches,
     filled: bool = True,
 ) -> DepthMap:
@@ -77,9 +81,9 @@ def project(
 
     T_cam_key: (4,4), with the ego motion from the key's reference time to the camera's own.
     settings: knobs, see `densify.config.ProjectSettings`; with ``visibility`` off the nearest point
-    of each pixel is taken as it is. key: the key frame; the source sweep nearest to it in time wins
-    a pixel. patches: of the cloud, at the key's moment (`densify.depth.patches.patches`). filled:
-    False leaves out the filling, which takes its time.
+    of each pixel is taken as it is; else the source sweep nearest in time to the key wins a pixel.
+    patches: of the cloud, at the key's moment (`densify.depth.patches.patches`). filled: False
+    leaves out the filling, which takes its time.
 
     Points with z ≤ 0.1 m, outside the image or outside the lens's valid field of view are dropped.
     ``filled_m`` adds pixels interpolated between measured ones (`densify.depth.fill.fill_between`).
@@ -92,7 +96,7 @@ def project(
     reason = np.full(len(cloud), Reason.OUTSIDE, np.uint8)
     if settings.visibility:
         reason[patches.free] = Reason.VETOED
-        seen = _visible(points, own, camera, settings, key, reason)
+        seen = _visible(points, own, camera, settings, reason)
     else:
         start, order = _by_pixel(points, np.zeros(len(own), np.int64), own, camera)
         pixel = np.flatnonzero(np.diff(start))
@@ -148,7 +152,19 @@ def _in_image(
         moving=cloud.moving[index],
         frame=cloud.frame[index],
         sweep=np.minimum(patches.sweep[index], _MOST_SWEEPS - 1),
+        age_ns=_ages_ns(cloud.since_key_ns[index], patches.sweep[index]),
     )
+
+
+def _ages_ns(since_key_ns: Int, sweep: NDArray[np.int32]) -> Int:
+    """(K,) times between the key and the points' sweeps. Sweeps less than 10 ms apart count as
+    equally old: clocks that jitter do not decide between the sweeps before and after the key."""
+    of_sweep = np.zeros(int(sweep.max(initial=-1)) + 1, np.int64)
+    of_sweep[sweep] = np.abs(since_key_ns)
+    for younger, older in pairwise(np.argsort(of_sweep, kind="stable")):
+        if of_sweep[older] - of_sweep[younger] < _SAME_AGE_NS:
+            of_sweep[older] = of_sweep[younger]
+    return of_sweep[sweep]
 
 
 def _visible(
@@ -156,16 +172,14 @@ def _visible(
     own: Float32,
     camera: Camera,
     settings: ProjectSettings,
-    key: int,
     reason: np.ndarray,
 ) -> _Pixels:
     """The pixels that the points not hidden measure; fills in the ``reason`` of the others."""
     behind = _behind(points, camera, settings)
     hidden = behind > 1
     reason[points.index] = np.where(hidden, Reason.HIDDEN, Reason.NOT_CHOSEN)
-    age = np.abs(points.frame.astype(np.int64) - key)
-    last = int(age.max(initial=0)) + 1
-    start, order = _by_pixel(points, np.where(hidden, last, age), own, camera)
+    last = int(points.age_ns.max(initial=0)) + 1
+    start, order = _by_pixel(points, np.where(hidden, last, points.age_ns), own, camera)
     found = np.zeros((6, len(start) - 1), np.float32)
     visible = kernels.Visible(
         start=start,
@@ -177,16 +191,17 @@ def _visible(
         sweep=points.sweep,
         hidden=hidden,
         moving=points.moving,
-        age=age,
+        age_ns=points.age_ns,
     )
     shape = (camera.height_px, camera.width_px)
     kernels.settle.over_rows(len(start) - 1, visible, _reaches(camera, settings), shape, found)
     pixel = np.flatnonzero(found[0])
     winner = order[start[pixel]]
-    depth_m, num_sweeps, youngest, num_points, residual_m, edge = found[:, pixel]
+    depth_m, num_sweeps, youngest_ns, num_points, residual_m, edge = found[:, pixel]
     most_sweeps = int(points.sweep.max(initial=0)) + 1
     needed = min(settings.support, max(1, most_sweeps // 2))
-    supported = (num_sweeps >= needed) & (youngest <= age.min(initial=last))
+    nearest_ns = np.float32(points.age_ns.min(initial=last))
+    supported = (num_sweeps >= needed) & (youngest_ns <= nearest_ns)
     inside = edge >= 1
     reason[points.index[winner[~inside]]] = Reason.EDGE
     reason[points.index[winner[~supported]]] = Reason.UNSUPPORTED

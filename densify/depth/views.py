@@ -102,7 +102,7 @@ class Views:
         surface = patches(cloud, self.key, settings, self.origins, self.key_image)
         return {
             name: project(
-                *(cloud.after(e.late_s), e.camera, e.T_cam_key, settings, self.key, surface),
+                *(cloud.after(e.late_s), e.camera, e.T_cam_key, settings, surface),
                 filled,
             )
             for name, e in self.exposures.items()

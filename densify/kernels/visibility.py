@@ -16,9 +16,9 @@ _STEEP = 5.7  # metres farther per metre across, 10 degrees: a surface steeper o
 _RIDGE_PX2 = 0.02
 _LEAST_WINDOW_PX, _LEAST_FIT_PX, _MOST_PX = 3, 2.0, 24
 _MOVING_SLACK = 4.0  # motion is known less well than where things stand
-_MOVING_WITNESS = 1  # sweeps from the key
+_MOVING_WITNESS_NS = 120_000_000  # from the key
 _GOES_ON = 1.2  # spacings within which a surface shows again
-_ANY_AGE = 1 << 40
+_ANY_AGE_NS = 1 << 62
 _ALL_ROUND = 3.0  # edges' reaches: no edge near
 _DIAGONAL = np.sqrt(0.5)
 _BEND_M = 0.10
@@ -254,7 +254,7 @@ class Visible(NamedTuple):
 
     start, order: of `by_pixel`, hidden points last. uv: (K,2) px. inverse: (K,) depth, 1/m. slope:
     (K,2) of the tangent plane's inverse depth, 1/m per px. spacing_px: (K,2) between neighbouring
-    rays. sweep: (K,) from 0 to 62. hidden, moving: (K,). age: (K,) frames from the key.
+    rays. sweep: (K,) from 0 to 62. hidden, moving: (K,). age_ns: (K,) from the key.
     """
 
     start: Int
@@ -266,7 +266,7 @@ class Visible(NamedTuple):
     sweep: NDArray[np.integer]
     hidden: Bool
     moving: Bool
-    age: Int
+    age_ns: Int
 
 
 class Reaches(NamedTuple):
@@ -301,7 +301,7 @@ def settle(first, last, points, reaches, shape, found):  # type: ignore[no-untyp
     """
     start, order, uv, spacing_px = points.start, points.order, points.uv, points.spacing_px
     inverse, slope, hidden = points.inverse, points.slope, points.hidden
-    moving, age = points.moving, points.age
+    moving, age_ns = points.moving, points.age_ns
     height, width = shape
     m, reach = np.zeros(9), np.zeros(8)
     for p in range(first, last):
@@ -326,9 +326,9 @@ def settle(first, last, points, reaches, shape, found):  # type: ignore[no-untyp
             on_v = max(outer, _GOES_ON * spacing_px[i, 1])
         wide_u, wide_v = max(wide_u, _window(outer)), max(wide_v, _window(on_v))
         # Other sweeps saw the background where the mover was not yet, or no more.
-        witness = _MOVING_WITNESS if moving[i] else _ANY_AGE
+        witness_ns = _MOVING_WITNESS_NS if moving[i] else _ANY_AGE_NS
         m[:], reach[:] = 0.0, 0.0
-        seen, num, youngest, behind, squares = np.int64(0), 0, age[i], False, 0.0
+        seen, num, youngest, behind, squares = np.int64(0), 0, age_ns[i], False, 0.0
         for v in range(max(v0 - wide_v, 0), min(v0 + wide_v, height - 1) + 1):
             left, right = max(u0 - wide_u, 0), min(u0 + wide_u, width - 1)
             for q in range(start[v * width + left], start[v * width + right + 1]):
@@ -337,10 +337,10 @@ def settle(first, last, points, reaches, shape, found):  # type: ignore[no-untyp
                 off = inverse[j] - (centre + su * du + sv * dv)
                 close = abs(du) <= outer and abs(dv) <= outer
                 if hidden[j] or abs(off) > agree:
-                    behind |= close and off < -far and age[j] <= witness
+                    behind |= close and off < -far and age_ns[j] <= witness_ns
                     continue
                 seen |= np.int64(1) << np.int64(points.sweep[j])
-                youngest = min(youngest, age[j])
+                youngest = min(youngest, age_ns[j])
                 if abs(du) <= outer and abs(dv) <= on_v:
                     _extend(reach, du, dv)
                 if abs(du) < fit_u and abs(dv) < fit_v:

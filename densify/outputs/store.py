@@ -13,7 +13,8 @@ data, config and versions as run.yaml::
     frames      of the window, absolute numbers
     num_points  of the cloud; num_moving of those
     density     camera -> measured, filled: fraction of the pixels with a depth
-    ghosts      `densify.scores.ghosts.ghost_scores`: num_points, all, moving, static, by_distance
+    ghosts      `densify.scores.ghosts.ghost_scores`: num_points, all, moving, static, by_distance,
+                by_seconds
     depth       where there is truth: camera -> measured, filled -> all, moving, static -> the
                 fields of `densify.scores.depth_metrics.DepthErrors`
     held_out    camera -> the same fields as depth: the key densified from its neighbours alone

@@ -45,11 +45,13 @@ def ghost_rate(cloud: Cloud, key_image: RangeImage, key: int) -> float | None:
 
 def ghost_scores(cloud: Cloud, key_image: RangeImage, key: int) -> dict[str, Any]:
     """Needs no truth: ``num_points`` of other sweeps and the `ghost_rate` of ``all`` of them, of
-    those the flow calls ``moving`` and of the ``static`` rest, and by distance in frames from the
-    key (``by_distance["3"]``: frames key-3 and key+3)."""
+    those the flow calls ``moving`` and of the ``static`` rest, by distance in frames from the key
+    (``by_distance["3"]``: frames key-3 and key+3), and by time from the key, to 10 ms
+    (``by_seconds["0.30"]``)."""
     other = cloud.frame != key
     ghost = ghosts(cloud, key_image, key)
     distance = np.abs(cloud.frame - key)
+    hundredths = np.rint(np.abs(cloud.since_key_ns) / 1e7).astype(np.int64)
     return {
         "num_points": int(other.sum()),
         "all": _mean(ghost[other]),
@@ -57,6 +59,10 @@ def ghost_scores(cloud: Cloud, key_image: RangeImage, key: int) -> dict[str, Any
         "static": _mean(ghost[other & ~cloud.moving]),
         "by_distance": {
             str(steps): _mean(ghost[distance == steps]) for steps in np.unique(distance[other])
+        },
+        "by_seconds": {
+            f"{h / 100:.2f}": _mean(ghost[other & (hundredths == h)])
+            for h in np.unique(hundredths[other])
         },
     }
 
