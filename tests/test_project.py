@@ -7,7 +7,6 @@ import os
 from dataclasses import replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -17,8 +16,6 @@ from densify.config import ProjectSettings
 from densify.depth.fill import fill_between
 from densify.depth.patches import patches
 from densify.depth.project import project
-from densify.errors import InputError
-from densify.geometry.cameras import image_points
 from densify.geometry.poses import exp
 from densify.kernels import visibility as kernels
 from densify.types import Camera, Cloud, Patches, Reason
@@ -113,55 +110,6 @@ def test_empty_cloud_gives_an_empty_map():
     assert depth.depth_m.shape == (48, 64)
     types = [depth.depth_m.dtype, depth.filled_m.dtype, depth.confidence.dtype, depth.frame.dtype]
     assert types == [np.float32, np.float32, np.float32, np.int32]
-
-
-# --- lens -----------------------------------------------------------------------------------------
-
-LENSES = [
-    (-0.3, 0.1, 1e-3, -5e-4),
-    (-0.37, 0.19, 9e-4, 1e-3, -0.06),
-    (0.4, -0.2, 5e-4, 1e-3, 0.02, 0.7, -0.1, 0.05),
-    (-0.3, 0.1, 1e-3, -5e-4, 0.01, 0.02, 0.01, 0.0, 1e-3, -2e-3, 5e-4, 1e-3),
-]
-
-
-@pytest.mark.parametrize("lens", LENSES, ids=len)
-def test_distortion_equals_opencv(lens):
-    camera = make_camera(distortion=lens)
-    rng = np.random.default_rng(1)
-    points = np.column_stack([rng.uniform(-0.6, 0.6, (500, 2)), np.ones(500)])
-    points *= rng.uniform(0.5, 80, (500, 1))
-    uv, _ = image_points(camera, points)
-    truth, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), camera.K, np.array(lens))
-    np.testing.assert_allclose(uv, truth[:, 0], atol=1e-9)
-
-
-def test_far_off_axis_points_do_not_fold_back_into_the_image():
-    k1, k2 = -0.3, 0.0
-    camera = make_camera(distortion=(k1, k2, 0, 0))
-    limit = np.sqrt(-1 / (3 * k1))  # d/dr (r + k1 r^3) = 0
-    radius = np.array([0.0, 0.2, limit - 1e-6, limit + 1e-6, np.sqrt(-1 / k1), 3.0])
-    points = np.column_stack([radius, np.zeros(6), np.ones(6)])
-    folded, _ = cv2.projectPoints(
-        points, np.zeros(3), np.zeros(3), camera.K, np.array([k1, k2, 0, 0])
-    )
-    assert 0 < folded[4, 0, 0] < camera.width_px  # OpenCV alone would paint it
-    uv, seen = image_points(make_camera(width=100, distortion=(k1, k2, 0, 0)), points)
-    assert np.isfinite(uv[:, 0]).tolist() == [True, True, True, False, False, False]
-    assert seen.tolist() == [True, True, True, False, False, False]
-
-
-def test_field_of_view_ends_before_a_pole_of_the_rational_model():
-    # 1 / (1 - r^2/4): grows towards the pole at r = 2 and is negative beyond
-    camera = make_camera(width=4000, height=4000, distortion=(0, 0, 0, 0, 0, -0.25, 0, 0))
-    points = np.array([[1.9, 0, 1.0], [2.1, 0, 1.0], [5.0, 0, 1.0]])
-    assert image_points(camera, points)[1].tolist() == [True, False, False]
-
-
-@pytest.mark.parametrize("lens", [(0.1,), (0.1,) * 6, (np.nan,) * 4], ids=["one", "six", "nan"])
-def test_bad_distortion_is_named(lens):
-    with pytest.raises(InputError, match="camera cam: distortion: expected 0, 4, 5, 8 or 12"):
-        image_points(make_camera(distortion=lens), np.ones((1, 3)))
 
 
 # --- which point wins a pixel ---------------------------------------------------------------------

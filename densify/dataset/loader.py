@@ -291,6 +291,9 @@ def _drive(entry: Mapping[str, Any]) -> _Drive:
             K=np.array(camera["K"], np.float64).reshape(3, 3),
             T_cam_lidar=np.array(camera["T_cam_lidar"], np.float64).reshape(4, 4),
             distortion=tuple(camera["distortion"]),
+            model=str(camera.get("model", "pinhole")),  # sets of before name none
+            max_angle_deg=float(camera.get("max_angle_deg", 180.0)),
+            row_time_s=float(camera.get("row_time_s", 0.0)),
         )
         for name, camera in entry["cameras"].items()
     }

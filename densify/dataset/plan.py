@@ -8,7 +8,7 @@ other, and readers find cameras and recordings:
     layout, method, window, cameras, gate, config    of every key
     drives    name -> data (what ``--data`` says), folder (of the tree, in OUT), frames (planned
               keys, as [first, last] runs), cameras (name -> width_px, height_px, K, T_cam_lidar,
-              distortion)
+              distortion, model, max_angle_deg, row_time_s)
 """
 
 from __future__ import annotations
@@ -249,6 +249,9 @@ def _as_plain(camera: Camera) -> dict[str, Any]:
         "K": camera.K.tolist(),
         "T_cam_lidar": camera.T_cam_lidar.tolist(),
         "distortion": list(camera.distortion),
+        "model": camera.model,
+        "max_angle_deg": camera.max_angle_deg,
+        "row_time_s": camera.row_time_s,
     }
 
 

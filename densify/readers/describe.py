@@ -76,8 +76,8 @@ def _cameras(sequence: LidarSequence) -> list[tuple[str, str]]:
         return [("cameras", "none")]
     lines = []
     for name, camera in sequence.cameras.items():
-        text = f"{camera.width_px} x {camera.height_px} px, fx {camera.K[0, 0]:.1f} px, "
-        text += "with lens distortion" if camera.distortion else "rectified"
+        text = f"{camera.width_px} x {camera.height_px} px, fx {camera.focal_px:.1f} px, "
+        text += "rectified" if camera.is_rectified else f"{camera.model} with lens distortion"
         if isinstance(sequence, StoresImages):
             images = sequence.image_frames(name)
             text += f", {len(images)} images: {format_frames(images)}"

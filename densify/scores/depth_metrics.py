@@ -114,7 +114,7 @@ def precision_density(
         point: dict[str, float | None] = {"min_confidence": least}
         for name, depth_m in (("measured", maps.depth_m), ("filled", maps.filled_m)):
             predicted_m = np.where(kept, depth_m, np.float32(0))
-            errors = depth_errors(predicted_m, truth_m, focal_px=camera.K[0, 0])
+            errors = depth_errors(predicted_m, truth_m, focal_px=camera.focal_px)
             point[f"density_{name}"] = image_density(predicted_m)
             point[f"outliers_{name}"] = errors.outliers
         curve.append(point)
@@ -200,7 +200,7 @@ def depth_scores(
     masks = {"all": None, "moving": moving_mask, "static": ~moving_mask}
     return {
         product: {
-            part: asdict(depth_errors(image, truth_depth_m, mask, focal_px=camera.K[0, 0]))
+            part: asdict(depth_errors(image, truth_depth_m, mask, focal_px=camera.focal_px))
             for part, mask in masks.items()
         }
         for product, image in (("measured", depth.depth_m), ("filled", depth.filled_m))

@@ -84,10 +84,14 @@ class Reason(IntEnum):
 
 @dataclass(frozen=True)
 class Camera:
-    """A pinhole camera, rectified or with lens distortion.
+    """A camera, rectified or with its lens; `densify.geometry.cameras` has the models.
 
     width_px, height_px: image size. K: (3,3) pixels; pixel (u,v) is an integer at its centre.
-    T_cam_lidar: (4,4). distortion: OpenCV's coefficients (k1 k2 p1 p2 k3 …), empty if rectified.
+    T_cam_lidar: (4,4). model: pinhole, fisheye (Kannala-Brandt) or mei. distortion: the lens's
+    coefficients: of a pinhole OpenCV's (k1 k2 p1 p2 k3 ...), empty if rectified; of a fisheye k1 k2
+    k3 k4; of mei xi k1 k2 p1 p2. max_angle_deg: beyond this angle off its axis the lens sees
+    nothing. row_time_s: seconds from the exposure of a row of the image to that of the row below,
+    negative if it is read from the bottom, 0 for all at once; its stamp is that of the middle row.
     """
 
     name: str
@@ -96,6 +100,20 @@ class Camera:
     K: Float
     T_cam_lidar: Float
     distortion: tuple[float, ...] = ()
+    model: str = "pinhole"
+    max_angle_deg: float = 180.0
+    row_time_s: float = 0.0
+
+    @property
+    def is_rectified(self) -> bool:
+        """A pinhole without distortion."""
+        return self.model == "pinhole" and not self.distortion
+
+    @property
+    def focal_px(self) -> float:
+        """Pixels to the right per radian, in the middle of the image."""
+        xi = self.distortion[0] if self.model == "mei" else 0.0
+        return float(self.K[0, 0] / (1 + xi))
 
 
 @dataclass(frozen=True)
