@@ -14,7 +14,7 @@ from densify.errors import InputError
 from densify.geometry import poses
 from densify.readers import open_sequence
 from densify.readers.describe import describe
-from densify.readers.files import format_frames
+from densify.readers.files import format_frames, runs
 from densify.readers.kitti_raw import KITTI_TRIGGER_LATENCY_NS, KittiRaw
 
 # The epoch nanoseconds of this text do not survive a float64 (multiples of 256 there).
@@ -506,6 +506,11 @@ def test_sweep_that_ends_before_it_starts(tree):
 
 
 # What people see
+
+
+def test_runs_of_frames():
+    assert runs([]) == []
+    assert runs([3, 96, 97, 98, 100]) == [range(3, 4), range(96, 99), range(100, 101)]
 
 
 def test_ranges():

@@ -25,7 +25,7 @@ from densify.errors import InputError, OutputError
 from densify.outputs.atomic import make_folder, write_file
 from densify.outputs.kitti_tree import drive_folder, split_of
 from densify.readers import Spec, open_sequence
-from densify.readers.files import format_frames
+from densify.readers.files import format_frames, runs
 from densify.readers.window import choose_cameras
 from densify.types import Camera, LidarSequence
 from densify.version import __version__
@@ -256,14 +256,8 @@ def _as_plain(camera: Camera) -> dict[str, Any]:
 
 
 def _as_runs(frames: Iterable[int]) -> list[list[int]]:
-    runs: list[list[int]] = []
-    for frame in frames:
-        if runs and frame == runs[-1][1] + 1:
-            runs[-1][1] = frame
-        else:
-            runs.append([frame, frame])
-    return runs
+    return [[run[0], run[-1]] for run in runs(frames)]
 
 
-def _frames(runs: Iterable[Sequence[int]]) -> list[int]:
-    return [f for first, last in runs for f in range(first, last + 1)]
+def _frames(pairs: Iterable[Sequence[int]]) -> list[int]:
+    return [f for first, last in pairs for f in range(first, last + 1)]

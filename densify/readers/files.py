@@ -44,15 +44,20 @@ def numbered_files(folder: Path, *suffixes: str) -> dict[int, Path]:
     return dict(sorted(found.items()))
 
 
+def runs(frames: Iterable[int]) -> list[range]:
+    """Frames, ascending, cut where a number is missing."""
+    found: list[range] = []
+    for frame in frames:
+        if found and frame == found[-1].stop:
+            found[-1] = range(found[-1].start, frame + 1)
+        else:
+            found.append(range(frame, frame + 1))
+    return found
+
+
 def format_frames(frames: Iterable[int]) -> str:
     """Frame numbers as a person writes them: ``96-135, 140``; long lists are cut in the middle."""
-    ranges: list[list[int]] = []
-    for frame in sorted(frames):
-        if ranges and frame == ranges[-1][1] + 1:
-            ranges[-1][1] = frame
-        else:
-            ranges.append([frame, frame])
-    texts = [f"{a}-{b}" if b > a else f"{a}" for a, b in ranges]
+    texts = [f"{run[0]}-{run[-1]}" if len(run) > 1 else f"{run[0]}" for run in runs(sorted(frames))]
     if len(texts) > _MAX_RANGES_SHOWN:
         texts = [*texts[: _MAX_RANGES_SHOWN - 1], "...", texts[-1]]
     return ", ".join(texts) if texts else "none"
