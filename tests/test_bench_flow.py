@@ -5,6 +5,8 @@ from __future__ import annotations
 
 import json
 import logging
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -15,11 +17,13 @@ from densify.bench import pairs as bench_pairs
 from densify.bench.baselines import cluster_icp, nonrigid_icp
 from densify.bench.memory import PeakMemory
 from densify.bench.pairs import Trace, pairs_of
+from densify.bench.scoring import Scorer
 from densify.bench.windows import Window
 from densify.cli import main, tables
 from densify.config import resolve
 from densify.errors import InputError
 from densify.flow.objective.solvers import ObjectiveSettings, solve
+from densify.types import FlowField, Stretch
 from tests.scenes import Arc, Scanner, Scene, TinySequence, World, car, street
 
 CONFIG = resolve({"register": {"source": "dataset"}})
@@ -75,17 +79,17 @@ def test_cluster_icp_moves_each_box_by_its_own_motion():
     source = np.vstack([box + p for p in places])
     goal = np.vstack([m + p for m, p in zip(moved, places, strict=True)])
     order = np.random.default_rng(0).permutation(len(goal))
-    error = np.linalg.norm(cluster_icp(source, goal[order]) - (goal - source), axis=1)
+    error = np.linalg.norm(cluster_icp(source, goal[order], 0.1) - (goal - source), axis=1)
     assert error.max() < 1e-6
 
 
 def test_cluster_icp_makes_no_mirror_images():
     flat = shell((2.0, 1.0, 0.0), 300)
-    flow = cluster_icp(flat, flat + [0.2, 0.1, 0])
+    flow = cluster_icp(flat, flat + [0.2, 0.1, 0], 0.1)
     assert np.abs(flow - [0.2, 0.1, 0]).max() < 1e-6
 
 
-@pytest.mark.parametrize("method", [cluster_icp, nonrigid_icp])
+@pytest.mark.parametrize("method", [partial(cluster_icp, duration_s=0.1), nonrigid_icp])
 @pytest.mark.parametrize("bad", [np.zeros((0, 3)), np.zeros((4, 2)), np.zeros(3)])
 def test_baselines_name_bad_clouds(method, bad):
     good = np.zeros((5, 3))
@@ -218,6 +222,41 @@ def test_two_sweeps_are_ours_to_compare_with_their_times():
         late = pair.here.registered.sweep.offset_ns[movers, None] * 1e-9 / pair.duration_s
         error = np.linalg.norm(field.to_reference[movers] + late * true, axis=1)
         assert error.mean() < 0.2 * np.linalg.norm(late * true, axis=1).mean()
+
+
+def at_half_the_rate(window: Window) -> Window:
+    """The same sweeps, twice as long apart."""
+    sweeps = [
+        replace(s, sweep=replace(s.sweep, stamp_ns=2 * s.sweep.stamp_ns))
+        for s in window.stretch.sweeps
+    ]
+    return replace(window, stretch=Stretch(tuple(sweeps)))
+
+
+def test_scores_follow_the_stamps():
+    sequence = tiny()
+    window = Window.open(sequence, 4, 1, CONFIG)
+    still = {f: FlowField.zero(len(window.stretch[f].sweep)) for f in window.frames}
+    for rate, duration_s in ((window, 0.1), (at_half_the_rate(window), 0.2)):
+        scorer = Scorer.of(sequence, rate, (3, 5))
+        way_m = np.concatenate(
+            [np.linalg.norm(scorer.answers[f].step[window.above[f]], axis=1) for f in (3, 5)]
+        )
+        assert scorer.step_scores(still)["space_time_angle_rad"] == pytest.approx(
+            np.arctan2(way_m, duration_s).mean()
+        )
+        # Half as fast as they are: 8 and 9 m/s are other buckets than 4 and 4.5 m/s, and two each.
+        half = {f: replace(still[f], displacement=scorer.answers[f].step / 2) for f in (3, 5)}
+        assert scorer.step_scores(half)["bucketed_dynamic"] == pytest.approx(0.5)
+        pair = pairs_of(rate, 100)[3]
+        assert pair.duration_s == pytest.approx(duration_s)
+
+
+def test_a_cluster_may_move_as_far_as_its_time_allows():
+    box = shell((4.0, 1.8, 1.4), 900)
+    far = np.array([6.0, 0.0, 0.0])  # beyond 3.6 m, and beyond its own length
+    assert np.linalg.norm(cluster_icp(box, box + far, 0.2) - far, axis=1).mean() < 0.1
+    assert np.linalg.norm(cluster_icp(box, box + far, 0.1) - far, axis=1).mean() > 1.0
 
 
 def test_milestones_are_read_off_the_traces():

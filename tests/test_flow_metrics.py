@@ -64,7 +64,7 @@ def test_angles_by_hand():
 def test_space_time_angle_by_hand():
     # (0.1, 0, 0, 0.1) against (0, 0, 0, 0.1): 45 degrees; nothing and nothing: 0
     flow, true = along_x(0.1, 0.0), along_x(0.0, 0.0)
-    assert metrics.space_time_angle_error_rad(flow, true) == pytest.approx(math.pi / 8)
+    assert metrics.space_time_angle_error_rad(flow, true, 0.1) == pytest.approx(math.pi / 8)
     assert metrics.space_time_angle_error_rad(flow, true, 0.2) == pytest.approx(math.atan(0.5) / 2)
 
 
@@ -74,7 +74,7 @@ def test_space_time_angle_as_a_loop(flows):
         a, b = (*f, 0.1), (*t, 0.1)
         dot = sum(x * y for x, y in zip(a, b, strict=True))
         angles.append(math.acos(min(1.0, dot / math.hypot(*a) / math.hypot(*b))))
-    assert metrics.space_time_angle_error_rad(*flows) == pytest.approx(np.mean(angles))
+    assert metrics.space_time_angle_error_rad(*flows, 0.1) == pytest.approx(np.mean(angles))
 
 
 def test_perfect_flow_has_no_angle_error(flows):
@@ -109,14 +109,18 @@ def test_buckets_by_hand():
     # static below 0.04 m; buckets 0.4 to 0.8 m/s and 10 to 10.4 m/s; the second has two points
     true = along_x(0.0, 0.03, 0.06, 1.01, 1.03)
     flow = along_x(0.01, 0.0, 0.03, 1.01, 0.83)
-    error = metrics.bucketed_error(flow, true)
+    error = metrics.bucketed_error(flow, true, 0.1)
     assert error.static_m == pytest.approx(0.02)
     assert error.dynamic == pytest.approx((0.5 + 0.1 / 1.02) / 2)
+    # Twice as long: 0.06 m is static, 1.01 and 1.03 m are 5.05 and 5.15 m/s.
+    slower = metrics.bucketed_error(flow, true, np.full(5, 0.2))
+    assert slower.static_m == pytest.approx(0.07 / 3)
+    assert slower.dynamic == pytest.approx(0.1 / 1.02)
 
 
 def test_doing_nothing_earns_one_in_every_bucket(flows):
     _, true = flows
-    error = metrics.bucketed_error(np.zeros_like(true), 5 * true)
+    error = metrics.bucketed_error(np.zeros_like(true), 5 * true, 0.1)
     assert error.dynamic == pytest.approx(1)
 
 
@@ -128,7 +132,7 @@ def test_buckets_as_a_loop(flows):
         number = 50 if speed_m_s >= 20 else int(speed_m_s / 0.4 + 1e-9)
         buckets.setdefault(number, []).append((math.dist(f, t), math.hypot(*t)))
     parts = [np.mean(b, 0)[0] / np.mean(b, 0)[1] for n, b in buckets.items() if n]
-    error = metrics.bucketed_error(flow, true)
+    error = metrics.bucketed_error(flow, true, 0.1)
     assert 50 in buckets and len(buckets) > 20
     assert error.dynamic == pytest.approx(np.mean(parts))
     assert error.static_m == pytest.approx(np.mean(buckets[0], 0)[0])
@@ -207,11 +211,11 @@ def test_nothing_gives_nan():
         metrics.end_point_error(along_x(1), along_x(1), np.array([False])),
         metrics.accuracy(NOTHING, NOTHING, metrics.STRICT),
         metrics.angle_error_rad(along_x(1), along_x(0)),
-        metrics.space_time_angle_error_rad(NOTHING, NOTHING),
+        metrics.space_time_angle_error_rad(NOTHING, NOTHING, 0.1),
         *metrics.three_way_error(NOTHING, NOTHING, none, none),
         metrics.dynamic_iou(none, none),
         metrics.share_found(np.array([True]), np.array([False])),
-        *metrics.bucketed_error(NOTHING, NOTHING),
+        *metrics.bucketed_error(NOTHING, NOTHING, 0.1),
         metrics.plane_residual_m(NOTHING),
         metrics.plane_residual_m(along_x(0, 0.1, 0.2)),
     ]
@@ -237,6 +241,8 @@ def test_nothing_gives_nan():
         (lambda: metrics.errors_by_hops(along_x(1), along_x(1), np.ones(1)), "hops: got float64"),
         (lambda: metrics.errors_by_hops(along_x(1), along_x(1), np.ones(2, int)), "hops"),
         (lambda: metrics.plane_residual_m(np.zeros((2, 2))), "points"),
+        (lambda: metrics.bucketed_error(along_x(1), along_x(1), 0.0), "duration_s"),
+        (lambda: metrics.bucketed_error(along_x(1), along_x(1), [0.1, 0.1]), "duration_s"),
         (lambda: metrics.coverage(along_x(1), np.zeros(3)), "true_points"),
     ],
 )

@@ -21,7 +21,7 @@ from densify.flow.tracking.evidence import link
 from densify.types import Float, Int
 
 _LINK_M = 0.6
-_FARTHEST_M = 3.6  # motion between two sweeps: 36 m/s at 10 Hz
+_FASTEST_M_S = 36.0
 _BIN_M = 0.2
 _NUM_VOTERS = 30
 _ICP_REACH_M = 1.0
@@ -37,14 +37,14 @@ _NICP_SETTLED_M = 0.005
 _RIDGE = 1e-6  # keeps lonely points, which have no edge, determined
 
 
-def cluster_icp(source: ArrayLike, target: ArrayLike) -> Float:
+def cluster_icp(source: ArrayLike, target: ArrayLike, duration_s: float) -> Float:
     """(n,3), (m,3) metres, one frame -> (n,3) flow: each cluster of the source moves rigidly.
 
     Clusters are linked by distance. Each is started from standing still and from the translation,
-    at most 3.6 m in the plane, that most pairs of points agree on, and aligned point to point (Besl
-    and McKay, "A Method for Registration of 3-D Shapes", PAMI 1992); the start that ends closer
-    wins. Cluster, histogram and ICP are the steps of Lin and Caesar, "ICP-Flow", CVPR 2024,
-    without its filters and its network.
+    in the plane and at most 36 m/s, that most pairs of points agree on, and aligned point to point
+    (Besl and McKay, "A Method for Registration of 3-D Shapes", PAMI 1992); the start that ends
+    closer wins. Cluster, histogram and ICP are the steps of Lin and Caesar, "ICP-Flow", CVPR 2024,
+    without its filters and its network. duration_s: between the two, above 0.
 
     Raises InputError for no points or another shape.
     """
@@ -53,26 +53,26 @@ def cluster_icp(source: ArrayLike, target: ArrayLike) -> Float:
     tree = cKDTree(goal)
     still = np.zeros((num_clusters, 3))
     at_rest, cost_m = _icp(points, goal, tree, cluster, still)
-    voted, voted_cost_m = _icp(
-        points, goal, tree, cluster, _voted_translations(points, goal, tree, cluster, still)
-    )
+    farthest_m = _FASTEST_M_S * duration_s
+    starts = _voted_translations(points, goal, tree, cluster, still, farthest_m)
+    voted, voted_cost_m = _icp(points, goal, tree, cluster, starts)
     better = voted_cost_m < cost_m
     return np.where(better[cluster][:, None], voted, at_rest) - points
 
 
 def _voted_translations(
-    points: Float, goal: Float, tree: cKDTree, cluster: Int, still: Float
+    points: Float, goal: Float, tree: cKDTree, cluster: Int, still: Float, farthest_m: float
 ) -> Float:
     """(C,3): the fullest bin of all differences to goal points in reach, per cluster."""
     order = np.argsort(cluster, kind="stable")
     bounds = np.searchsorted(cluster[order], np.arange(len(still) + 1))
-    num_bins = int(2 * _FARTHEST_M / _BIN_M)
-    edges = np.linspace(-_FARTHEST_M, _FARTHEST_M, num_bins + 1)
+    num_bins = max(1, round(2 * farthest_m / _BIN_M))
+    edges, bin_m = np.linspace(-farthest_m, farthest_m, num_bins + 1, retstep=True)
     translations = still.copy()
     for k, (first, end) in enumerate(pairwise(bounds)):
         rows = order[first:end]
         voters = points[rows[:: -(-len(rows) // _NUM_VOTERS)]]
-        found = np.asarray(tree.query_ball_point(voters, _FARTHEST_M), dtype=object)
+        found = np.asarray(tree.query_ball_point(voters, farthest_m), dtype=object)
         num_found = [len(f) for f in found]
         if sum(num_found) == 0:
             continue
@@ -80,7 +80,7 @@ def _voted_translations(
         level = offsets[np.abs(offsets[:, 2]) < _BIN_M]
         votes, _, _ = np.histogram2d(level[:, 0], level[:, 1], bins=(edges, edges))
         x, y = np.unravel_index(np.argmax(votes), votes.shape)
-        translations[k, :2] = edges[x] + _BIN_M / 2, edges[y] + _BIN_M / 2
+        translations[k, :2] = edges[x] + bin_m / 2, edges[y] + bin_m / 2
     return translations
 
 

@@ -108,7 +108,8 @@ def bench_flow(
         raise InputError(f"--key {key}: no neighbour in {sequence.name}; choose another key")
     pairs = pairs_of(opened, max_points)
     if pairs_only:
-        one = key - 1 if key - 1 in pairs else key + 1
+        here = opened.frames.index(key)
+        one = opened.frames[here - 1 if here else 1]
         pairs = {one: pairs[one]}
     scorer = Scorer.of(sequence, opened, tuple(pairs))
     measured: dict[str, _Measured] = {}

@@ -148,7 +148,7 @@ def flow_of_pair(method: str, pair: Pair, config: Config) -> tuple[FlowField, Tr
     if method == "rigid":
         flow = np.zeros_like(pair.source)
     elif method == "cluster-icp":
-        flow = cluster_icp(pair.source, pair.target)
+        flow = cluster_icp(pair.source, pair.target, abs(pair.duration_s))
     elif method == "nicp":
         flow = pair.carried(nonrigid_icp(pair.drawn, pair.target))
     else:

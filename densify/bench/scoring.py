@@ -72,7 +72,8 @@ class Scorer:
         certain = self._above(lambda f: answers[f].certain)
         foreground = self._above(lambda f: answers[f].foreground)
         parts = metrics.three_way_error(flow, true, moving, foreground)
-        buckets = metrics.bucketed_error(flow, true)
+        duration_s = self._above(self._durations_s)
+        buckets = metrics.bucketed_error(flow, true, duration_s)
         still = np.concatenate([steps[f].moving[~answers[f].moving] for f in self.sources])
         scores = {
             "num_movers": int(moving.sum()),
@@ -83,7 +84,7 @@ class Scorer:
             "movers_within_5": metrics.accuracy(flow[moving], true[moving], metrics.STRICT),
             "movers_within_10": metrics.accuracy(flow[moving], true[moving], metrics.RELAXED),
             "movers_angle_rad": metrics.angle_error_rad(flow[moving], true[moving]),
-            "space_time_angle_rad": metrics.space_time_angle_error_rad(flow, true),
+            "space_time_angle_rad": metrics.space_time_angle_error_rad(flow, true, duration_s),
             "dynamic_iou": metrics.dynamic_iou(called, moving),
             "bucketed_static_m": buckets.static_m,
             "bucketed_dynamic": buckets.dynamic,
@@ -118,7 +119,7 @@ class Scorer:
         errors = metrics.errors_by_hops(
             np.concatenate([to_key[f].displacement[kept[f]] for f in others]),
             np.concatenate([answers[f].to_key[kept[f]] for f in others]),
-            np.concatenate([np.full(int(kept[f].sum()), abs(f - key)) for f in others]),
+            np.concatenate([np.full(int(kept[f].sum()), self._hops(f)) for f in others]),
         )
         scores["movers_m_by_hops"] = {str(n): _plain(error) for n, error in errors.items()}
         scores["coverage"] = _plain(metrics.coverage(points, true))
@@ -140,6 +141,17 @@ class Scorer:
 
     def _above(self, column: Callable[[int], Any]) -> Any:
         return np.concatenate([column(f)[self.window.above[f]] for f in self.sources])
+
+    def _durations_s(self, frame: int) -> Float:
+        """(N,) of the step of each of a sweep's points."""
+        here, there = (
+            self.window.stretch[f].sweep for f in (frame, self.window.towards_key(frame))
+        )
+        return np.full(len(here), abs(there.stamp_ns - here.stamp_ns) * 1e-9)
+
+    def _hops(self, frame: int) -> int:
+        """Sweeps from the key."""
+        return abs(self.window.frames.index(frame) - self.window.frames.index(self.window.key))
 
     def _others(self) -> list[int]:
         return [f for f in self.window.frames if f != self.window.key]

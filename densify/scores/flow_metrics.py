@@ -79,14 +79,15 @@ def angle_error_rad(estimated: ArrayLike, true: ArrayLike) -> float:
 
 
 def space_time_angle_error_rad(
-    estimated: ArrayLike, true: ArrayLike, duration_s: float = 0.1
+    estimated: ArrayLike, true: ArrayLike, duration_s: ArrayLike
 ) -> float:
     """Mean angle between (flow, duration_s) and (true flow, duration_s), radians: defined where
-    nothing moves too. As ``compute_angle_error`` of the Argoverse 2 API (av2.evaluation.scene_flow)
-    has it, where the fourth component is 0.1 s: one second weighs as much as one metre.
+    nothing moves too. duration_s: of the flow, one or (N,). As ``compute_angle_error`` of the
+    Argoverse 2 API (av2.evaluation.scene_flow) has it, where the fourth component is 0.1 s: one
+    second weighs as much as one metre.
     """
     flow, truth = _flows(estimated, true)
-    time = np.full((len(flow), 1), duration_s)
+    time = _durations_s(duration_s, len(flow))[:, None]
     return _mean(_angles_rad(np.hstack([flow, time]), np.hstack([truth, time])))
 
 
@@ -121,7 +122,7 @@ def share_found(estimated_moving: ArrayLike, moving: ArrayLike) -> float:
     return _ratio((found & true).sum(), true.sum())
 
 
-def bucketed_error(estimated: ArrayLike, true: ArrayLike, duration_s: float = 0.1) -> BucketedError:
+def bucketed_error(estimated: ArrayLike, true: ArrayLike, duration_s: ArrayLike) -> BucketedError:
     """Bucket normalised end-point error of one class of points (Khatri et al., "I Can't Believe
     It's Not Scene Flow!", ECCV 2024; buckets as in their BucketedSceneFlowEval).
 
@@ -129,12 +130,13 @@ def bucketed_error(estimated: ArrayLike, true: ArrayLike, duration_s: float = 0.
     is static: its mean error, metres. In every other one the mean error is divided by the mean
     length of the true flow, and those quotients are averaged over the buckets that hold points, so
     a walker's weigh as much as a car's. For several classes take the mean over the classes.
+    duration_s: of the flow, one or (N,).
     """
     flow, truth = _flows(estimated, true)
     error_m = np.linalg.norm(flow - truth, axis=1)
     length_m = np.linalg.norm(truth, axis=1)
-    edges_m = _BUCKET_M_S * duration_s * np.arange(1, _NUM_BUCKETS)
-    bucket = np.digitize(length_m, edges_m)
+    speed_m_s = length_m / _durations_s(duration_s, len(flow))
+    bucket = np.digitize(speed_m_s, _BUCKET_M_S * np.arange(1, _NUM_BUCKETS))
     num, error_sum, length_sum = (
         np.bincount(bucket, weights, _NUM_BUCKETS) for weights in (None, error_m, length_m)
     )
@@ -226,6 +228,16 @@ def _points(values: ArrayLike, name: str) -> Float:
     if array.ndim != 2 or array.shape[1] != 3:
         raise InputError(f"flow metrics: {name}: got shape {array.shape}, expected (N,3) metres")
     return array
+
+
+def _durations_s(values: ArrayLike, num_points: int) -> Float:
+    array = np.asarray(values, dtype=np.float64)
+    if array.shape not in ((), (num_points,)) or not (array > 0).all():
+        raise InputError(
+            f"flow metrics: duration_s: got shape {array.shape}, expected seconds above 0, one or "
+            f"({num_points},)"
+        )
+    return np.broadcast_to(array, (num_points,))
 
 
 def _mask(values: ArrayLike, num_points: int, name: str) -> Bool:
