@@ -171,7 +171,10 @@ def test_what_cannot_be_written_is_one_clear_line(street, tmp_path):
         ((street, tmp_path, [160]), "0 to 159"),
         ((street, tmp_path, []), "0 to 159"),
         ((street, tmp_path, [1], ["image_00"]), "image_02, image_03"),
-        ((Street("street", 0, "dual32"), tmp_path, [1]), "hdl64, hdl32 or vlp16"),
+        (
+            (Street("street", 0, "dual32"), tmp_path, [1]),
+            "spins: hdl64, hdl32, vlp16, os128, vls128",
+        ),
         ((street, file / "below", [60], []), "cannot be written"),
     ):
         with pytest.raises(InputError) as error:

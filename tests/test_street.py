@@ -13,17 +13,18 @@ from densify.street.actors import TRAILER_WHEELBASE_M
 from densify.street.casting import EGO_BOX, SPAN_S, Scene
 from densify.street.curves import Curve, Lane, Speed, polyline
 from densify.street.footprints import Rectangles, overlap
-from densify.street.lidar import scan
+from densify.street.lidar import Mounted, scan
 from densify.street.materials import GLASS_PASSES, LASER_PASSES, Material
 from densify.street.mesh import Mesh, box
 from densify.street.motion import Driving, Poses, Still, Towed
 from densify.street.scenes import build_scene
-from densify.street.sensors import PERIOD_NS, SENSORS, firings
-from densify.street.simulator import seconds, stamp_ns
+from densify.street.sensors import SENSORS, firings
+from densify.street.simulator import seconds
 from densify.street.terrain import Road, Terrain
 from densify.street.world import Body, Rays, World
 
 KEY = 120
+PERIOD_NS = 100_000_000
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -71,12 +72,12 @@ def test_static_points_have_exactly_no_flow_and_movers_that_of_their_body(street
         def T_world_body(time_ns, body=body):
             return body.poses(np.array([seconds(time_ns)])).matrix()
 
-        fired = stamp_ns(KEY) + int(returns.offset_ns[row])
+        fired = street.stamp_ns(KEY) + int(returns.offset_ns[row])
         p_lidar = np.append(returns.points[row].astype(float), 1.0)
         p_body = inverse(T_world_body(fired)) @ simulator.T_world_lidar_at(fired) @ p_lidar
         T_lidar_world = inverse(street.T_world_lidar(KEY))
-        here = T_lidar_world @ T_world_body(stamp_ns(KEY)) @ p_body
-        there = T_lidar_world @ T_world_body(stamp_ns(KEY + 3)) @ p_body
+        here = T_lidar_world @ T_world_body(street.stamp_ns(KEY)) @ p_body
+        there = T_lidar_world @ T_world_body(street.stamp_ns(KEY + 3)) @ p_body
         np.testing.assert_allclose(truth.points[row], here[:3], atol=1e-6)
         np.testing.assert_allclose(displacement[row], (there - here)[:3], atol=1e-6)
 
@@ -127,7 +128,7 @@ def test_truth_outside_the_sequence_is_refused(street):
 def test_depth_agrees_with_the_lidar(street, camera):
     depth, moving = street.truth.depth_m(camera, KEY), street.truth.moving_mask(camera, KEY)
     truth, cam = street.truth.sweep(KEY), street.cameras[camera]
-    delay_ns = street.image_stamp_ns(camera, KEY) - stamp_ns(KEY)
+    delay_ns = street.image_stamp_ns(camera, KEY) - street.stamp_ns(KEY)
     assert delay_ns == (0 if camera == "image_02" else 15_000_000)
     T_world_lidar = street.simulator.T_world_lidar_at(street.image_stamp_ns(camera, KEY))
     world = transform(truth.T_world_lidar, truth.points[~truth.moving])
@@ -173,7 +174,7 @@ def test_two_scanners_look_opposite_ways(crossing):
     assert np.abs(np.angle(turned)).max() < 1e-5
     elevation = np.arcsin(sweep.points[:, 2] / np.linalg.norm(sweep.points, axis=1))
     above = np.arctan2(sweep.points[:, 2] - 0.25, np.hypot(*sweep.points[:, :2].T))
-    beams = np.radians(SENSORS["dual32"].elevation_deg)
+    beams = np.radians(SENSORS["dual32"].scanners[0].pattern.elevation_deg)
     for angles in (elevation[sweep.lidar == 0], above[sweep.lidar == 1]):
         assert np.abs(angles[:, None] - beams).min(axis=1).max() < 1e-5
 
@@ -185,7 +186,7 @@ def test_sweeps_are_as_large_as_a_real_one(street):
     assert range_m.min() > 1.0 and range_m.max() < 100.0
     assert sweep.intensity.min() >= 0 and sweep.intensity.max() <= 1
     np.testing.assert_array_equal(sweep.points, sweep.points.astype(np.float32))
-    assert len(firings(SENSORS["vlp16"]).offset_ns) == 16 * 1800
+    assert len(firings(SENSORS["vlp16"], 0.0, PERIOD_NS).offset_ns) == 16 * 1800
 
 
 def _room(half_m: float) -> World:
@@ -200,7 +201,7 @@ def _standing(terrain: Terrain | None = None) -> Driving:
 
 
 def test_ranges_have_the_sensors_noise_and_some_pulses_are_lost():
-    sensor = SENSORS["hdl64"]
+    sensor = Mounted(SENSORS["hdl64"], PERIOD_NS)
     returns = scan(_room(15.0), _standing(), sensor, 0.0, np.random.default_rng(0))
     world = returns.points.astype(float) + [0, 0, 1.73]
     off_wall = 15.0 - np.abs(world).max(axis=1)
@@ -208,8 +209,8 @@ def test_ranges_have_the_sensors_noise_and_some_pulses_are_lost():
     wall = np.abs(returns.points[:, 2]) < 6  # clear of floor and ceiling
     noise = (off_wall / slant)[wall]
     assert abs(noise.mean()) < 0.002
-    assert abs(noise.std() - sensor.range_sigma_m) < 0.003
-    fired = sensor.num_columns * 64
+    assert abs(noise.std() - sensor.sensor.scanners[0].range_sigma_m) < 0.003
+    fired = 2083 * 64
     assert 0.9 * fired < len(returns.points) < fired
 
 
@@ -546,7 +547,11 @@ def test_presets_seeds_and_frames_differ(street, static, highway):
     [
         ("street:vilage", "street, static, crossing, highway"),
         ("street?sensor=hdl65", "hdl64, hdl32, vlp16, dual32"),
-        ("street?sede=7", "seed, sensor"),
+        ("street?sede=7", "seed, sensor, hz, tilt"),
+        ("street?hz=15", "5, 10, 20"),
+        ("street?tilt=steep", "expected degrees"),
+        ("street?tilt=nan", "-45 to 45"),
+        ("street?tilt=60", "-45 to 45"),
         ("street?seed=-1", "whole number"),
         ("street?seed=seven", "whole number"),
         ("street?seed=", "whole number"),
@@ -562,7 +567,7 @@ def test_bad_specs_are_one_clear_line(spec, message):
 def test_specs_name_what_they_open():
     opened = Street.from_spec("street:crossing?seed=3&sensor=dual32")
     simulator = opened.simulator
-    assert (simulator.preset, simulator.seed, simulator.sensor) == ("crossing", 3, "dual32")
+    assert (simulator.preset, simulator.seed, simulator.sensor.name) == ("crossing", 3, "dual32")
     assert Street.from_spec(opened.name).name == opened.name
     with pytest.raises(InputError, match="seed"):
         Street("street", -2)

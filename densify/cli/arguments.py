@@ -233,7 +233,18 @@ def _add_simulate(commands: Any) -> None:
         help="street, static, crossing or highway (default: street)",
     )
     parser.add_argument(
-        "--sensor", metavar="NAME", help="the scanner: hdl64, hdl32, vlp16 (default: hdl64)"
+        "--sensor",
+        metavar="NAME",
+        help="the scanner: hdl64, hdl32, vlp16, os128, vls128 (default: hdl64)",
+    )
+    parser.add_argument(
+        "--hz",
+        choices=("5", "10", "20"),
+        help="sweeps per second (default: 10); at 20 Hz a scanner "
+        "measures half the columns in a sweep, at 5 Hz twice as many",
+    )
+    parser.add_argument(
+        "--tilt", metavar="DEG", help="pitch of the scanner's mount, nose down (default: 0)"
     )
     parser.add_argument("--seed", type=natural, metavar="N", help="another seed, another street")
     parser.add_argument(

@@ -12,8 +12,8 @@ from typing import Any
 from densify.config import presets
 
 DATA_HELP = (
-    "a recording's folder, READER:PATH, or the built-in street[:PRESET][?seed=N&sensor=NAME] "
-    "(default: street)"
+    "a recording's folder, READER:PATH, or the built-in "
+    "street[:PRESET][?seed=N&sensor=NAME&hz=RATE&tilt=DEG] (default: street)"
 )
 
 

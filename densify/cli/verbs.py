@@ -259,7 +259,8 @@ def _images(sequence: LidarSequence, result: Result) -> Mapping[str, NDArray[np.
 def _street_spec(options: argparse.Namespace) -> str:
     preset = options.preset.removeprefix("street:")
     name = "street" if preset == "street" else f"street:{preset}"
-    query = [f"{k}={v}" for k in ("seed", "sensor") if (v := getattr(options, k)) is not None]
+    keys = ("seed", "sensor", "hz", "tilt")
+    query = [f"{k}={v}" for k in keys if (v := getattr(options, k)) is not None]
     return f"{name}?{'&'.join(query)}" if query else name
 
 

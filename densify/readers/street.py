@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: MIT
 """The built-in street as a recording: frames are made when asked for and kept in a cache folder.
 
-``street[:PRESET][?seed=N&sensor=NAME]``. Frames 0 to 159, ten a second. The cache lies in the
-user's cache directory, or in the folder named by the environment variable DENSIFY_CACHE_DIR; it can
-be deleted at any time. A cached frame equals one made anew, byte for byte.
+``street[:PRESET][?seed=N&sensor=NAME&hz=RATE&tilt=DEG]``. 16 seconds: at 10 Hz frames 0 to 159. The
+cache lies in the user's cache directory, or in the folder named by the environment variable
+DENSIFY_CACHE_DIR; it can be deleted at any time. A cached frame equals one made anew, byte for
+byte.
 """
 
 from __future__ import annotations
@@ -24,41 +25,60 @@ import platformdirs
 from numpy.typing import NDArray
 
 from densify.errors import InputError
-from densify.street.camera import CAMERAS, DELAY_NS, Picture
-from densify.street.casting import NUM_FRAMES
+from densify.street.camera import CAMERAS, DELAY_NS, Picture, cameras_beside
 from densify.street.lidar import Returns
 from densify.street.scenes import PRESETS
-from densify.street.sensors import SENSORS, sensor_named
-from densify.street.simulator import VERSION, Simulator, stamp_ns
+from densify.street.sensors import SENSORS
+from densify.street.simulator import VERSION, Simulator
 from densify.types import Bool, Camera, Float, Float32, Sweep, SweepTruth
 
 Arrays = dict[str, NDArray[Any]]
 _log = logging.getLogger("densify")
 _KEPT_IN_MEMORY = 16
+_RATES_HZ = ("5", "10", "20")
+_MAX_TILT_DEG = 45
 
 
 class Street:
     """The built-in street; members as in `densify.types.LidarSequence`.
 
     preset: street, static (nothing else moves), crossing (the ego vehicle stands) or highway.
-    seed: another number is another scene of that kind. sensor: hdl64, hdl32, vlp16, or dual32, two
-    32-beam scanners half a turn apart.
+    seed: another number is another scene of that kind. sensor: a row of
+    `densify.street.sensors.SENSORS`. hz: sweeps per second, 5, 10 or 20; the scene is the same at
+    the same time, so frame 120 at 10 Hz is frame 240 at 20 Hz and frame 60 at 5 Hz. Scanners fire
+    at a constant rate, as real ones do: a spinning one has half the columns at 20 Hz and twice as
+    many at 5 Hz. tilt_deg: the sensor's mount is pitched nose down by this angle, -45 to 45; the
+    cameras stay where they are on the vehicle.
 
-    Raises InputError for a preset, sensor or seed that does not exist.
+    Raises InputError for a value that does not exist.
     """
 
-    frames = range(NUM_FRAMES)
-    cameras: Mapping[str, Camera] = CAMERAS
-
-    def __init__(self, preset: str = "street", seed: int = 0, sensor: str = "hdl64") -> None:
+    def __init__(
+        self,
+        preset: str = "street",
+        seed: int = 0,
+        sensor: str = "hdl64",
+        hz: int = 10,
+        tilt_deg: float = 0.0,
+    ) -> None:
         _choice("preset", preset, tuple(PRESETS))
         _choice("sensor", sensor, tuple(SENSORS))
+        _choice("hz", str(hz), _RATES_HZ)
         if seed < 0:
             raise InputError(f"street seed {seed}: expected a whole number from 0")
-        self.name = f"street:{preset}?seed={seed}&sensor={sensor}"
-        self.simulator = Simulator(preset, seed, sensor)
+        if not abs(tilt_deg) <= _MAX_TILT_DEG:
+            raise InputError(
+                f"street tilt {tilt_deg:g}: expected degrees from -{_MAX_TILT_DEG} to "
+                f"{_MAX_TILT_DEG}, nose down, as in street?tilt=10"
+            )
+        changed = [("hz", hz)] * (hz != 10) + [("tilt", f"{tilt_deg:g}")] * (tilt_deg != 0)
+        options = "".join(f"&{key}={value}" for key, value in changed)
+        self.name = f"street:{preset}?seed={seed}&sensor={sensor}{options}"
+        self.simulator = Simulator(preset, seed, SENSORS[sensor], hz, tilt_deg)
+        self.frames = range(self.simulator.num_frames)
+        self.cameras: Mapping[str, Camera] = cameras_beside(tilt_deg)
         self.truth = StreetTruth(self)
-        self._store = _Store(f"{VERSION} {preset} {seed} {sensor}")
+        self._store = _Store(f"{VERSION} {preset} {seed} {sensor}{options}")
 
     @staticmethod
     def from_spec(spec: str) -> Street:
@@ -69,45 +89,56 @@ class Street:
         head, _, query = spec.partition("?")
         reader, _, preset = head.partition(":")
         if reader != "street":
-            raise InputError(f"{spec!r}: expected street[:PRESET][?seed=N&sensor=NAME]")
+            raise InputError(
+                f"{spec!r}: expected street[:PRESET][?seed=N&sensor=NAME&hz=RATE&tilt=DEG]"
+            )
         options = dict(parse_qsl(query, keep_blank_values=True))
         for key in options:
-            _choice("option", key, ("seed", "sensor"))
-        seed = options.get("seed", "0")
+            _choice("option", key, ("seed", "sensor", "hz", "tilt"))
+        seed, hz, tilt = (
+            options.get(k, v) for k, v in (("seed", "0"), ("hz", "10"), ("tilt", "0"))
+        )
         if not (seed.isascii() and seed.isdigit()):
             raise InputError(
                 f"street seed {seed!r}: expected a whole number from 0, as in street?seed=7"
             )
-        return Street(preset or "street", int(seed), options.get("sensor", "hdl64"))
+        _choice("hz", hz, _RATES_HZ)
+        return Street(
+            preset or "street",
+            int(seed),
+            options.get("sensor", "hdl64"),
+            int(hz),
+            _degrees(tilt),
+        )
 
     def __getitem__(self, frame: int) -> Sweep:
         returns = self.returns(frame)
         return Sweep(
             frame=frame,
-            stamp_ns=stamp_ns(frame),
+            stamp_ns=self.simulator.stamp_ns(frame),
             points=returns.points.astype(np.float64),
             intensity=returns.intensity,
             offset_ns=returns.offset_ns,
             lidar=returns.lidar,
             row=np.arange(len(returns.points)),
-            scanner_origins=sensor_named(self.simulator.sensor).origins_m,
+            scanner_origins=self.simulator.sensor.origins_m,
         )
 
     def stamp_ns(self, frame: int) -> int:
         """Reference time of a sweep."""
-        _check_frame(frame)
-        return stamp_ns(frame)
+        self.check(frame)
+        return self.simulator.stamp_ns(frame)
 
     def returns(self, frame: int) -> Returns:
         """The sweep's returns with the bodies they are from."""
-        _check_frame(frame)
+        self.check(frame)
         return Returns(
             **self._store.get(f"sweep/{frame}", lambda: vars(self.simulator.returns(frame)))
         )
 
     def picture(self, camera: str, frame: int) -> Picture:
         """A camera's image with its exact depth and the bodies seen."""
-        _check_frame(frame)
+        self.check(frame)
         _choice("camera", camera, tuple(CAMERAS))
         return Picture(
             **self._store.get(
@@ -121,14 +152,19 @@ class Street:
 
     def image_stamp_ns(self, camera: str, frame: int) -> int:
         """image_02 is taken at the sweep's reference time, image_03 15 ms later."""
-        _check_frame(frame)
+        self.check(frame)
         _choice("camera", camera, tuple(CAMERAS))
-        return stamp_ns(frame) + DELAY_NS[camera]
+        return self.simulator.stamp_ns(frame) + DELAY_NS[camera]
 
     def T_world_lidar(self, frame: int) -> Float:
         """(4,4) true pose at the sweep's reference time."""
-        _check_frame(frame)
+        self.check(frame)
         return self.simulator.bodies.T_world_lidar[frame]
+
+    def check(self, frame: int) -> None:
+        """Raises InputError for a frame that does not exist."""
+        if frame not in self.frames:
+            raise InputError(f"street: no frame {frame}; there are frames 0 to {self.frames[-1]}")
 
 
 class StreetTruth:
@@ -147,7 +183,7 @@ class StreetTruth:
 
     def displacement(self, frame: int, target: int) -> Float:
         """(N,3), exactly 0 for everything that stands still between the two frames."""
-        _check_frame(target)
+        self._street.check(target)
         returns = self._street.returns(frame)
         simulator = self._street.simulator
         points = simulator.in_bodies(frame, returns)
@@ -167,9 +203,13 @@ def _choice(what: str, got: str, there_are: tuple[str, ...]) -> None:
         raise InputError(f"street: no {what} {got!r}; there are {', '.join(there_are)}")
 
 
-def _check_frame(frame: int) -> None:
-    if not 0 <= frame < NUM_FRAMES:
-        raise InputError(f"street: no frame {frame}; there are frames 0 to {NUM_FRAMES - 1}")
+def _degrees(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        raise InputError(
+            f"street tilt {text!r}: expected degrees, nose down, as in street?tilt=10"
+        ) from None
 
 
 class _Store:

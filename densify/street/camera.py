@@ -3,14 +3,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from densify.geometry.poses import inverse
-from densify.street.lidar import LIDAR_HEIGHT_M
+from densify.street.lidar import T_ego_lidar
 from densify.street.materials import (
     COLOUR,
     GLASS_PASSES,
@@ -45,6 +45,19 @@ def _camera(name: str, right_m: float) -> Camera:
 
 
 CAMERAS = {"image_02": _camera("image_02", _LEFT), "image_03": _camera("image_03", _RIGHT)}
+"""With a level mount."""
+
+
+def T_level_lidar(tilt_deg: float) -> Float:
+    """(4,4) from the lidar frame of a tilted mount to that of a level one."""
+    return inverse(T_ego_lidar()) @ T_ego_lidar(tilt_deg)
+
+
+def cameras_beside(tilt_deg: float) -> dict[str, Camera]:
+    """The cameras, which stay where they are on the vehicle, in the lidar frame of a tilted
+    mount."""
+    T = T_level_lidar(tilt_deg)
+    return {name: replace(c, T_cam_lidar=c.T_cam_lidar @ T) for name, c in CAMERAS.items()}
 
 
 @dataclass(frozen=True)
@@ -58,16 +71,13 @@ class Picture:
     body: NDArray[np.int32]
 
 
-def T_world_lidar(ego: Driving, time_s: float) -> Float:
-    """(4,4) pose of the (first) scanner."""
-    T_world_ego = ego.poses(np.array([time_s])).matrix()
-    T_ego_lidar = np.eye(4)
-    T_ego_lidar[2, 3] = LIDAR_HEIGHT_M
-    return T_world_ego @ T_ego_lidar
+def T_world_lidar(ego: Driving, time_s: float, tilt_deg: float = 0.0) -> Float:
+    """(4,4) pose of the lidar frame."""
+    return ego.poses(np.array([time_s])).matrix() @ T_ego_lidar(tilt_deg)
 
 
 def expose(world: World, ego: Driving, camera: Camera, time_s: float) -> Picture:
-    """Global shutter: every pixel at the same time."""
+    """Global shutter: every pixel at the same time. camera: one of `CAMERAS`."""
     h, w = camera.height_px, camera.width_px
     v, u = np.divmod(np.arange(h * w, dtype=np.float64), w)
     ray = np.stack([u, v, np.ones_like(u)], axis=1) @ np.linalg.inv(camera.K).T

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: MIT
 """What every scene shares: a cast of traffic put on lanes so that it meets around the ego vehicle
-at frame 120 and touches nothing at any time.
+after 12 seconds and touches nothing at any time.
 
-Time zero is frame 0's. Traffic that would touch anything is drawn again.
+Time zero is frame 0's, whatever the rate of the sweeps. Traffic that would touch anything is drawn
+again.
 """
 
 from __future__ import annotations
@@ -29,13 +30,12 @@ from densify.street.materials import Material
 from densify.street.mesh import Mesh, box
 from densify.street.motion import Driving, Still
 from densify.street.scenery import Scenery
-from densify.street.sensors import PERIOD_NS
 from densify.street.terrain import Ground
 from densify.street.world import Body, World
 
-NUM_FRAMES = 160
+DURATION_S = 16
 MEETING_S = 12.0  # when the cast is around the ego vehicle
-SPAN_S = (-1.0, NUM_FRAMES * PERIOD_NS * 1e-9 + 1.0)  # in which poses are asked for
+SPAN_S = (-1.0, DURATION_S + 1.0)  # in which poses are asked for
 FIRST_PARKED = 1000  # instances of parked cars count from here
 PAVEMENT_M = 3.3
 _TRIES = 40

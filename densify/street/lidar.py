@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""One revolution of a scanner through the world: what comes back, where and when."""
+"""One sweep of a sensor through the world: what comes back, where and when."""
 
 from __future__ import annotations
 
@@ -7,7 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
+from densify.geometry.poses import rotate, transform
 from densify.street.materials import LASER_PASSES, REFLECTIVITY
 from densify.street.motion import Driving
 from densify.street.sensors import Sensor, firings
@@ -39,17 +41,37 @@ class Returns:
     instance: NDArray[np.int32]
 
 
+@dataclass(frozen=True)
+class Mounted:
+    """A sensor on the vehicle; tilt_deg: as in `T_ego_lidar`. period_ns: from sweep to sweep."""
+
+    sensor: Sensor
+    period_ns: int
+    tilt_deg: float = 0.0
+
+
+def T_ego_lidar(tilt_deg: float = 0.0) -> Float:
+    """(4,4) the lidar frame, which is the mount's.
+
+    tilt_deg: by how much the mount is pitched about the frame's origin, nose down.
+    """
+    T = np.eye(4)
+    T[:3, :3] = Rotation.from_euler("y", tilt_deg, degrees=True).as_matrix()
+    T[2, 3] = LIDAR_HEIGHT_M
+    return T
+
+
 def scan(
-    world: World, ego: Driving, sensor: Sensor, time_s: float, rng: np.random.Generator
+    world: World, ego: Driving, mounted: Mounted, time_s: float, rng: np.random.Generator
 ) -> Returns:
-    """The sweep whose reference time is ``time_s``."""
-    fired = firings(sensor)
+    """The sweep whose reference time is ``time_s``, seconds from frame 0."""
+    sensor, T = mounted.sensor, T_ego_lidar(mounted.tilt_deg)
+    fired = firings(sensor, time_s, mounted.period_ns)
     n = len(fired.offset_ns)
     times = at_offsets(time_s, fired.offset_ns)
     ego_poses = ego.poses(times)
-    up = ego_poses.rotation[:, :, 2]
-    origin = ego_poses.position + up * (LIDAR_HEIGHT_M + fired.height_m)[:, None]
-    spot = [ego_poses.turn(ray) for ray in _spot(fired.direction)]
+    origin = ego_poses.apply(transform(T, sensor.origins_m)[fired.lidar])
+    spot = [ego_poses.turn(rotate(T, ray)) for ray in _spot(fired.direction)]
     lucks = [rng.random(n) for _ in spot]
     beams = Rays(origin, spot[0], times)
     echoes = world.cast_bundle(beams, spot, LASER_PASSES, lucks, spread=2 * _SPOT_RAD)
@@ -60,10 +82,13 @@ def scan(
     signal = reflectivity * np.sqrt(grazing) * (60.0 / np.maximum(range_m, 5.0)) ** 2
     heard = 0.995 * (1 - np.exp(-8.0 * signal)) * np.where(edge, 0.85, 1.0)
     keep = np.isfinite(range_m) & (rng.random(n) < heard)
-    range_m = np.where(keep, range_m, 0.0) + sensor.range_sigma_m * rng.normal(size=n)
-    keep &= (range_m > _MIN_RANGE_M) & (range_m < sensor.max_range_m)
+    sigma_m = np.array([scanner.range_sigma_m for scanner in sensor.scanners])[fired.lidar]
+    reach_m = np.array([scanner.max_range_m for scanner in sensor.scanners])[fired.lidar]
+    range_m = np.where(keep, range_m, 0.0) + sigma_m * rng.normal(size=n)
+    keep &= (range_m > _MIN_RANGE_M) & (range_m < reach_m)
     points = fired.direction * range_m[:, None]
-    points[:, 2] += fired.height_m
+    origin_m = sensor.origins_m[fired.lidar]
+    np.add(points, origin_m, out=points, where=origin_m != 0)  # a coordinate of -0.0 stays one
     brightness = reflectivity * (0.35 + 0.65 * grazing) * (1 + 0.05 * rng.normal(size=n))
     return Returns(
         points[keep].astype(np.float32),

@@ -1,43 +1,59 @@
 # SPDX-License-Identifier: MIT
-"""The scanners: which beams they have, and when each fires."""
+"""The sensors: which scanners they are made of, and every pulse of a sweep."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from densify.errors import InputError
+from densify.street.patterns import Pattern, Raster, Rosette, Slots, Spinning
 from densify.types import Float, Int
 
-PERIOD_NS = 100_000_000
+
+@dataclass(frozen=True)
+class Scanner:
+    """One scanner of a sensor.
+
+    max_range_m, range_sigma_m: reach, and noise along the ray. origin_m: where its rays start,
+    lidar frame.
+    """
+
+    pattern: Pattern
+    max_range_m: float
+    range_sigma_m: float
+    origin_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True)
 class Sensor:
-    """One or two rotating scanners.
-
-    elevation_deg: of one scanner's beams in the order they fire. num_columns: firings of each beam
-    per revolution. max_range_m, range_sigma_m: reach and noise. heights_m: of each scanner above
-    the first; they turn evenly out of phase.
-    """
+    """One or several scanners that deliver a sweep together."""
 
     name: str
-    elevation_deg: tuple[float, ...]
-    num_columns: int
-    max_range_m: float
-    range_sigma_m: float
-    heights_m: tuple[float, ...] = (0.0,)
+    scanners: tuple[Scanner, ...]
 
     @property
     def origins_m(self) -> Float:
-        """(S,3) where the rays of each scanner start, lidar axes."""
-        return np.array([[0.0, 0.0, height_m] for height_m in self.heights_m])
+        """(S,3) where the rays of each scanner start, lidar frame."""
+        return np.array([scanner.origin_m for scanner in self.scanners])
+
+    @property
+    def azimuth_tells_time(self) -> bool:
+        """Whether a single scanner spins about the lidar frame's origin."""
+        only = self.scanners[0]
+        spins = isinstance(only.pattern, Spinning)
+        return len(self.scanners) == 1 and spins and not any(only.origin_m)
 
 
-def _upward(*parts: Float) -> tuple[float, ...]:
+def _beams(*parts: NDArray[np.floating[Any]]) -> tuple[float, ...]:
     return tuple(float(e) for e in np.concatenate(parts))
+
+
+def _widening(first_deg: float, last_deg: float, num: int) -> Float:
+    """(num,) beams from next to ``first_deg`` to ``last_deg``, ever farther apart."""
+    return first_deg + (last_deg - first_deg) * (np.arange(1, num + 1) / num) ** 1.5
 
 
 _VLP32_DEG = (
@@ -45,69 +61,89 @@ _VLP32_DEG = (
     -3.0, -2.667, -2.333, -2.0, -1.667, -1.333, -1.0, -0.667, -0.333, 0.0, 0.333, 0.667, 1.0,
     1.333, 1.667, 2.333, 3.333, 4.667, 7.0, 10.333, 15.0,
 )  # fmt: skip
+# two blocks of 32 lasers, the upper one with a third of a degree between beams
+_HDL64_DEG = _beams(np.linspace(2.0, -8.33, 32), np.linspace(-8.83, -24.33, 32))
+_OS128_DEG = _beams(np.linspace(22.5, -22.5, 128))
+# like the Pandar64: a sixth of a degree apart in the middle, 6 degrees at the lower end
+_PANDAR64_DEG = _beams(
+    np.array([15.0, 11.0, 8.0, 5.0, 3.0]),
+    np.linspace(2.0, -6.0, 49),
+    np.linspace(-7.0, -14.0, 8),
+    np.array([-19.0, -25.0]),
+)
+# like the VLS-128: 0.11 degrees apart in the middle, 0.18 beside it, 1.1 at the lower end
+_VLS128_DEG = _beams(
+    _widening(5.2, 15.0, 14)[::-1],
+    np.arange(20, 0, -1) * 0.18 + 1.6,
+    np.linspace(1.6, -3.9, 51),
+    -3.9 - np.arange(1, 21) * 0.18,
+    _widening(-7.5, -25.0, 23),
+)
 
 SENSORS: dict[str, Sensor] = {
     s.name: s
     for s in (
-        # two blocks of 32 lasers, the upper one with a third of a degree between beams
+        Sensor("hdl64", (Scanner(Spinning(_HDL64_DEG, 20830), 100.0, 0.018),)),
         Sensor(
-            "hdl64",
-            _upward(np.linspace(2.0, -8.33, 32), np.linspace(-8.83, -24.33, 32)),
-            2083,
-            100.0,
-            0.018,
+            "hdl32",
+            (Scanner(Spinning(_beams(np.linspace(10.67, -30.67, 32)), 21690), 90.0, 0.02),),
         ),
-        Sensor("hdl32", _upward(np.linspace(10.67, -30.67, 32)), 2169, 90.0, 0.02),
-        Sensor("vlp16", _upward(np.linspace(15.0, -15.0, 16)), 1800, 100.0, 0.025),
-        Sensor("dual32", _VLP32_DEG, 1800, 120.0, 0.022, (0.0, 0.25)),
+        Sensor(
+            "vlp16",
+            (Scanner(Spinning(_beams(np.linspace(15.0, -15.0, 16)), 18000), 100.0, 0.025),),
+        ),
+        # as Argoverse 2's: one above the other, half a turn apart
+        Sensor(
+            "dual32",
+            (
+                Scanner(Spinning(_VLP32_DEG, 18000), 120.0, 0.022),
+                Scanner(Spinning(_VLP32_DEG, 18000, 0.5), 120.0, 0.022, (0.0, 0.0, 0.25)),
+            ),
+        ),
+        # like the OS1-128 with 1024 columns
+        Sensor("os128", (Scanner(Spinning(_OS128_DEG, 10240), 120.0, 0.02),)),
+        Sensor("vls128", (Scanner(Spinning(_VLS128_DEG, 18000), 150.0, 0.02),)),
+        # as PandaSet's: one on the roof, and one in front of it, 0.6 m lower, that only looks ahead
+        Sensor(
+            "panda",
+            (
+                Scanner(Spinning(_PANDAR64_DEG, 18000), 120.0, 0.02, (0.2, -0.2, 0.1)),
+                Scanner(Raster(60.0, 20.0, 1000, 400_000), 150.0, 0.02, (1.7, -0.2, -0.5)),
+            ),
+        ),
+        # like Livox's: its prisms turn at 7294 and -4664 turns a minute
+        Sensor("rosette", (Scanner(Rosette(70.0, (121.6, -77.7), 200_000), 120.0, 0.02),)),
     )
 }
 
 
-def sensor_named(name: str) -> Sensor:
-    """Raises InputError for a name that does not exist."""
-    if name not in SENSORS:
-        raise InputError(f"sensor {name!r}: no such sensor; there are {', '.join(SENSORS)}")
-    return SENSORS[name]
-
-
 @dataclass(frozen=True)
 class Firings:
-    """The N pulses of a revolution in the order of time.
+    """The N pulses of a sweep in the order of time.
 
     direction: (N,3) unit vectors, lidar axes. offset_ns: (N,) int64 from the reference time.
-    lidar: (N,) uint8. height_m: (N,) of the scanner above the first one.
+    lidar: (N,) uint8 index of the scanner.
     """
 
     direction: Float
     offset_ns: Int
     lidar: NDArray[np.uint8]
-    height_m: Float
 
 
-def firings(sensor: Sensor) -> Firings:
-    """All pulses of one revolution.
+def firings(sensor: Sensor, time_s: float, period_ns: int) -> Firings:
+    """All pulses of the sweep that lasts ``period_ns`` around ``time_s``, seconds from frame 0.
 
-    The first scanner turns clockwise seen from above, from looking back through forward at offset
-    0 to back again: ``offset = -azimuth / 2π`` of a period. Beams fire one after the other, never
-    two at once, so every pulse has its own azimuth.
+    Each scanner's pulses are evenly spaced in time.
     """
-    beams, scanners = len(sensor.elevation_deg), len(sensor.heights_m)
-    slot = np.arange(sensor.num_columns * beams, dtype=np.int64)
-    offset_ns = np.tile(-PERIOD_NS // 2 + slot * PERIOD_NS // len(slot), scanners)
-    lidar = np.repeat(np.arange(scanners), len(slot))
-    azimuth = -2 * np.pi * (offset_ns / PERIOD_NS + lidar / scanners)
-    elevation = np.radians(np.tile(sensor.elevation_deg, sensor.num_columns * scanners))
-    direction = np.stack(
-        [
-            np.cos(elevation) * np.cos(azimuth),
-            np.cos(elevation) * np.sin(azimuth),
-            np.sin(elevation),
-        ],
-        axis=1,
-    )
+    parts = []
+    for index, scanner in enumerate(sensor.scanners):
+        num = scanner.pattern.num_pulses(period_ns * 1e-9)
+        number = np.arange(num, dtype=np.int64)
+        offset_ns = -period_ns // 2 + number * period_ns // num
+        share: Float = offset_ns / period_ns
+        slots = Slots(number, share, time_s + share * period_ns * 1e-9)
+        lidar = np.full(num, index, np.uint8)
+        parts.append((scanner.pattern.directions(slots), offset_ns, lidar))
+    direction, offset_ns, lidar = (np.concatenate(columns) for columns in zip(*parts, strict=True))
     order = np.argsort(offset_ns, kind="stable")
-    height_m = np.array(sensor.heights_m)[lidar]
-    return Firings(
-        direction[order], offset_ns[order], lidar[order].astype(np.uint8), height_m[order]
-    )
+    return Firings(direction[order], offset_ns[order], lidar[order])

@@ -11,12 +11,13 @@ from functools import cached_property
 
 import numpy as np
 
+from densify.geometry.poses import transform
 from densify.street.bodies import Bodies
 from densify.street.camera import CAMERAS, DELAY_NS, Picture, T_world_lidar, expose
-from densify.street.casting import NUM_FRAMES, Scene
-from densify.street.lidar import LIDAR_HEIGHT_M, Returns, at_offsets, scan
+from densify.street.casting import DURATION_S, Scene
+from densify.street.lidar import Mounted, Returns, T_ego_lidar, at_offsets, scan
 from densify.street.scenes import build_scene
-from densify.street.sensors import PERIOD_NS, sensor_named
+from densify.street.sensors import Sensor
 from densify.types import Bool, Float
 
 VERSION = 3  # raise it whenever the same frame would come out differently
@@ -26,11 +27,31 @@ _MOVING_M, _MOVING_S = 0.05, 0.5
 
 @dataclass(frozen=True)
 class Simulator:
-    """Everything that is random follows from preset, seed, sensor and the frame's number."""
+    """Everything that is random follows from these and the frame's number.
+
+    hz: sweeps per second, such as 5, 10 or 20, whose period is a whole number of nanoseconds. What
+    the scene is like at a time does not depend on it. tilt_deg: as in
+    `densify.street.lidar.T_ego_lidar`.
+    """
 
     preset: str
     seed: int
-    sensor: str
+    sensor: Sensor
+    hz: int = 10
+    tilt_deg: float = 0.0
+
+    @property
+    def period_ns(self) -> int:
+        """From sweep to sweep."""
+        return 1_000_000_000 // self.hz
+
+    @property
+    def num_frames(self) -> int:
+        return DURATION_S * self.hz
+
+    def stamp_ns(self, frame: int) -> int:
+        """Reference time of a frame's sweep."""
+        return EPOCH_NS + frame * self.period_ns
 
     @cached_property
     def scene(self) -> Scene:
@@ -38,29 +59,31 @@ class Simulator:
 
     def returns(self, frame: int) -> Returns:
         rng = np.random.default_rng([self.seed, 1, frame])
-        sensor = sensor_named(self.sensor)
-        return scan(self.scene.world, self.scene.ego, sensor, seconds(stamp_ns(frame)), rng)
+        mounted = Mounted(self.sensor, self.period_ns, self.tilt_deg)
+        time_s = seconds(self.stamp_ns(frame))
+        return scan(self.scene.world, self.scene.ego, mounted, time_s, rng)
 
     def picture(self, camera: str, frame: int) -> Picture:
-        time_s = seconds(stamp_ns(frame) + DELAY_NS[camera])
+        time_s = seconds(self.stamp_ns(frame) + DELAY_NS[camera])
         return expose(self.scene.world, self.scene.ego, CAMERAS[camera], time_s)
 
     def T_world_lidar_at(self, time_ns: int) -> Float:
-        """(4,4) pose of the scanner at any time."""
-        return T_world_lidar(self.scene.ego, seconds(time_ns))
+        """(4,4) pose of the lidar frame at any time."""
+        return T_world_lidar(self.scene.ego, seconds(time_ns), self.tilt_deg)
 
     @cached_property
     def bodies(self) -> Bodies:
         """Where every body is at every frame's reference time."""
-        times = np.array([seconds(stamp_ns(frame)) for frame in range(NUM_FRAMES)])
+        stamps = [self.stamp_ns(frame) for frame in range(self.num_frames)]
+        times = np.array([seconds(stamp) for stamp in stamps])
         bodies = self.scene.world.bodies
-        T_world_body = np.tile(np.eye(4), (NUM_FRAMES, len(bodies), 1, 1))
+        T_world_body = np.tile(np.eye(4), (len(stamps), len(bodies), 1, 1))
         for index, body in enumerate(bodies):
             poses = body.trajectory.poses(times)
             T_world_body[:, index, :3, :3] = poses.rotation
             T_world_body[:, index, :3, 3] = poses.position
         return Bodies(
-            np.stack([self.T_world_lidar_at(stamp_ns(frame)) for frame in range(NUM_FRAMES)]),
+            np.stack([self.T_world_lidar_at(stamp) for stamp in stamps]),
             T_world_body,
             self._moving(times),
         )
@@ -85,18 +108,13 @@ class Simulator:
         A raw point is taken to the world by the scanner's pose at its own firing time and to its
         body by the body's pose at that time.
         """
-        times = at_offsets(seconds(stamp_ns(frame)), returns.offset_ns)
-        points = returns.points.astype(np.float64) + [0.0, 0.0, LIDAR_HEIGHT_M]
+        times = at_offsets(seconds(self.stamp_ns(frame)), returns.offset_ns)
+        points = transform(T_ego_lidar(self.tilt_deg), returns.points.astype(np.float64))
         points = self.scene.ego.poses(times).apply(points)
         for index in np.unique(returns.body[returns.body > 0]):
             rows = np.flatnonzero(returns.body == index)
             points[rows] = self.scene.world.poses(int(index), times[rows]).undo(points[rows])
         return points
-
-
-def stamp_ns(frame: int) -> int:
-    """Reference time of a frame's sweep."""
-    return EPOCH_NS + frame * PERIOD_NS
 
 
 def seconds(time_ns: int) -> float:

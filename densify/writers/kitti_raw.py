@@ -28,16 +28,16 @@ from densify.readers.files import camera_named
 from densify.readers.kitti_raw import KITTI_TRIGGER_LATENCY_NS
 from densify.readers.street import Street
 from densify.readers.truth_files import write_bodies, write_depth, write_points
-from densify.street.camera import CAMERAS, T_RECTIFIED_LIDAR
-from densify.street.sensors import PERIOD_NS
+from densify.street.camera import CAMERAS, T_RECTIFIED_LIDAR, T_level_lidar
+from densify.street.sensors import SENSORS
 from densify.street.simulator import EPOCH_NS
 from densify.types import Float, Progress
 
 _DATE = np.datetime64(EPOCH_NS, "ns").astype("datetime64[D]").astype(str).replace("-", "_")
 DRIVE = f"{_DATE}_drive_0001_sync"
-T_LIDAR_IMU = np.eye(4)  # the inertial unit sits behind and below the scanner, a little off true
-T_LIDAR_IMU[:3, :3] = Rotation.from_rotvec([0.012, -0.003, -0.001]).as_matrix()
-T_LIDAR_IMU[:3, 3] = [-0.81, 0.32, -0.80]
+T_LEVEL_IMU = np.eye(4)  # the inertial unit sits behind and below the scanner, a little off true
+T_LEVEL_IMU[:3, :3] = Rotation.from_rotvec([0.012, -0.003, -0.001]).as_matrix()
+T_LEVEL_IMU[:3, 3] = [-0.81, 0.32, -0.80]
 _LATITUDE_DEG, _LONGITUDE_DEG, _ALTITUDE_M = 49.0, 8.4, 115.0
 _EARTH_RADIUS_M = 6_378_137.0
 _GRAVITY_M_S2 = 9.81
@@ -61,17 +61,18 @@ def write_kitti_tree(
     frames: absolute numbers. cameras: both if None. progress: called with a stage's name, frames
     done, frames in all.
 
-    Raises InputError for a frame or camera that does not exist, for two scanners in one sweep
-    (KITTI's format has no room for their times), and if the drive or another calibration is there
-    already and ``overwrite`` is not set.
+    Raises InputError for a frame or camera that does not exist, for a sensor whose points' times do
+    not follow from their azimuth (KITTI's format has no room for times), and if the drive or
+    another calibration is there already and ``overwrite`` is not set.
     """
     names = list(CAMERAS) if cameras is None else list(cameras)
     for name in names:
         camera_named(street.cameras, name, Path(street.name))
-    if street.simulator.sensor == "dual32":
+    if not street.simulator.sensor.azimuth_tells_time:
+        fit = [sensor.name for sensor in SENSORS.values() if sensor.azimuth_tells_time]
         raise InputError(
-            f"{street.name}: two scanners cannot be written as KITTI raw, whose points carry "
-            f"neither a time nor a scanner; choose sensor hdl64, hdl32 or vlp16"
+            f"{street.name}: cannot be written as KITTI raw, whose points carry neither a time nor "
+            f"a scanner; choose a single scanner that spins: {', '.join(fit)}"
         )
     unknown = [frame for frame in frames if frame not in street.frames]
     if unknown or not frames:
@@ -80,7 +81,7 @@ def write_kitti_tree(
             f"{street.frames[-1]}"
         )
     folder = out / _DATE
-    calibration = _calibration()
+    calibration = _calibration(T_level_lidar(street.simulator.tilt_deg))
     try:
         if not overwrite:
             _check_kept(folder, calibration)
@@ -136,8 +137,11 @@ def _row(values: Float) -> str:
     return " ".join(repr(float(v)) for v in np.ravel(values))
 
 
-def _calibration() -> dict[str, bytes]:
-    """Of the folder above the drive: file name to content."""
+def _calibration(T_level_lidar: Float) -> dict[str, bytes]:
+    """The files of the folder above the drive: name to content.
+
+    T_level_lidar: (4,4) how the scanner's mount is turned about its origin.
+    """
     lines = []
     for number in range(4):
         camera = CAMERAS[f"image_0{2 + number % 2}"]  # 0 and 1 would be the gray ones beside them
@@ -148,14 +152,18 @@ def _calibration() -> dict[str, bytes]:
             f"P_rect_0{number}: {_row(P)}",
         ]
     files = {"calib_cam_to_cam.txt": "\n".join(lines) + "\n"}
-    for name, T in (("velo_to_cam", T_RECTIFIED_LIDAR), ("imu_to_velo", T_LIDAR_IMU)):
+    T_lidar_imu = poses.inverse(T_level_lidar) @ T_LEVEL_IMU
+    for name, T in (
+        ("velo_to_cam", T_RECTIFIED_LIDAR @ T_level_lidar),
+        ("imu_to_velo", T_lidar_imu),
+    ):
         files[f"calib_{name}.txt"] = f"R: {_row(T[:3, :3])}\nT: {_row(T[:3, 3])}\n"
     return {name: text.encode() for name, text in files.items()}
 
 
 def _write_stamps(drive: Path, street: Street, names: list[str]) -> None:
-    centre = np.array([EPOCH_NS + frame * PERIOD_NS for frame in street.frames])
-    half = PERIOD_NS // 2
+    centre = np.array([street.stamp_ns(frame) for frame in street.frames])
+    half = street.simulator.period_ns // 2
     files = {
         "velodyne_points/timestamps.txt": centre,
         "velodyne_points/timestamps_start.txt": centre - half,
@@ -177,15 +185,15 @@ def _oxts(street: Street, frame: int, first: int) -> Float:
     The first frame written lies at a fixed latitude, since readers take the Mercator projection's
     scale from the first record they find.
     """
-    stamp = EPOCH_NS + frame * PERIOD_NS
-    simulator = street.simulator
+    simulator, stamp = street.simulator, street.stamp_ns(frame)
+    T_lidar_imu = poses.inverse(T_level_lidar(simulator.tilt_deg)) @ T_LEVEL_IMU
 
     def T_world_imu(time_ns: int) -> Float:
-        return simulator.T_world_lidar_at(time_ns) @ T_LIDAR_IMU
+        return simulator.T_world_lidar_at(time_ns) @ T_lidar_imu
 
     before, here, after = (T_world_imu(stamp + i * _STEP_NS) for i in (-1, 0, 1))
     step_s = _STEP_NS * 1e-9
-    east_north_up = here[:3, 3] - T_world_imu(EPOCH_NS + first * PERIOD_NS)[:3, 3]
+    east_north_up = here[:3, 3] - T_world_imu(street.stamp_ns(first))[:3, 3]
     scale_m = np.cos(np.radians(_LATITUDE_DEG)) * _EARTH_RADIUS_M
     lon_deg = _LONGITUDE_DEG + np.degrees(east_north_up[0] / scale_m)
     mercator = np.log(np.tan(np.radians(90 + _LATITUDE_DEG) / 2)) + east_north_up[1] / scale_m
