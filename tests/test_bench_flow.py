@@ -22,7 +22,7 @@ from densify.bench.windows import Window
 from densify.cli import main, tables
 from densify.config import resolve
 from densify.errors import InputError
-from densify.flow.objective.solvers import ObjectiveSettings, solve
+from densify.flow.objective.solvers import SolverSettings, solve
 from densify.types import FlowField, Stretch
 from tests.scenes import Arc, Scanner, Scene, TinySequence, World, car, street
 
@@ -178,8 +178,8 @@ def test_without_truth_energy_seconds_and_ghosts_are_left():
 def test_one_pair_and_the_solvers_milestones(monkeypatch):
     monkeypatch.setattr(
         bench_pairs,
-        "ObjectiveSettings",
-        lambda solver: ObjectiveSettings(solver, adam_num_steps=30),
+        "SolverSettings",
+        lambda solver: SolverSettings(solver, adam_num_steps=30),
     )
     found = bench.bench_flow(
         tiny(), 4, 1, CONFIG, ("paper", "paper-adam", "ours-pair"), pairs_only=True, max_points=300

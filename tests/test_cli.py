@@ -28,7 +28,16 @@ FAST = ["--window", "1", "--config", "fast", "--camera", "image_02", "--data", S
 def densified(tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
     """One command in a process of its own, as a user runs it."""
     out = tmp_path_factory.mktemp("densified") / "new" / "out"
-    command = ["run", "--key", "120", *FAST, "--out", str(out), "--set", "flow.num_neighbors=40"]
+    command = [
+        "run",
+        "--key",
+        "120",
+        *FAST,
+        "--out",
+        str(out),
+        "--set",
+        "objective.num_neighbors=40",
+    ]
     done = subprocess.run(
         [sys.executable, "-m", "densify", *command],
         capture_output=True,
@@ -68,7 +77,7 @@ def test_run_prints_results_on_stdout_and_no_progress_off_a_terminal(
 
 def test_run_yaml_gives_back_the_configuration(densified: SimpleNamespace) -> None:
     record = yaml.safe_load((densified.out / "000120" / "run.yaml").read_text("utf-8"))
-    expected = resolve("fast", ["flow.num_neighbors=40"])
+    expected = resolve("fast", ["objective.num_neighbors=40"])
     assert resolve(record["config"]) == expected
     assert record["config"] == as_mapping(expected)
     assert record["data"] == STREET
@@ -247,11 +256,14 @@ BAD_COMMANDS: dict[str, tuple[list[str], list[str]]] = {
     ),
     "unknown preset of the street": ([*RUN, "--data", "street:strt"], ["strt", "highway"]),
     "unknown config": ([*RUN, "--config", "fats"], ["fats", "did you mean fast?"]),
-    "unknown key": ([*RUN, "--set", "flow.alfa=3"], ["flow.alfa", "did you mean alpha?"]),
+    "unknown key": ([*RUN, "--set", "objective.alfa=3"], ["objective.alfa", "did you mean alpha?"]),
     "unknown section": ([*RUN, "--set", "flwo.alpha=3"], ["flwo", "did you mean flow?"]),
-    "wrong type": ([*RUN, "--set", "flow.alpha=ten"], ["flow.alpha", "'ten'", "a number"]),
-    "out of range": ([*RUN, "--set", "flow.alpha=-1"], ["flow.alpha", "-1", "from 0"]),
-    "not an assignment": ([*RUN, "--set", "flow.alpha"], ["section.key=value"]),
+    "wrong type": (
+        [*RUN, "--set", "objective.alpha=ten"],
+        ["objective.alpha", "'ten'", "a number"],
+    ),
+    "out of range": ([*RUN, "--set", "objective.alpha=-1"], ["objective.alpha", "-1", "from 0"]),
+    "not an assignment": ([*RUN, "--set", "objective.alpha"], ["section.key=value"]),
     "frames reversed": (["simulate", "--out", "{tmp}/o", "--frames", "5:2"], ["A:B", "'5:2'"]),
     "frames beyond": (["simulate", "--out", "{tmp}/o", "--frames", "5:999"], ["5:999", "0:160"]),
     "unknown sensor": (["simulate", "--out", "{tmp}/o", "--sensor", "hdl65"], ["hdl65", "hdl64"]),

@@ -14,7 +14,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from densify import config as configuration
-from densify.config import Config, FlowSettings, RegisterSettings, as_mapping, presets, resolve
+from densify.config import (
+    Config,
+    FlowSettings,
+    ObjectiveSettings,
+    RegisterSettings,
+    as_mapping,
+    presets,
+    resolve,
+)
 from densify.errors import InputError
 
 KNOBS = [
@@ -30,7 +38,7 @@ def rendered_defaults() -> str:
     """configs/default.yaml as the knobs say it must be."""
     lines = [
         "# Every knob with its default. Copy the lines you change into a file of your own and give",
-        "# it with --config, or set single ones: --set flow.alpha=5. (From densify/config.py.)",
+        "# it with --config, or set single ones: --set project.support=6. (From densify/config.)",
     ]
     for section in dataclasses.fields(Config):
         settings = getattr(Config(), section.name)
@@ -122,7 +130,7 @@ def test_every_knob_takes_its_limits_and_refuses_what_is_beyond(section: str, fi
 
 
 def test_round_trip() -> None:
-    config = resolve("paper", ["register.num_lead_in=7", "flow.radius_m=0.5"])
+    config = resolve("paper", ["register.num_lead_in=7", "objective.radius_m=0.5"])
     text = yaml.safe_dump(as_mapping(config))
     assert resolve(yaml.safe_load(text)) == config != Config()
 
@@ -132,19 +140,19 @@ def test_round_trip() -> None:
 def test_round_trip_through_yaml_text(lead_in: int, alpha: float, deskew: bool, word: str) -> None:
     changes = {
         "register": {"num_lead_in": lead_in, "deskew": deskew},
-        "flow": {"alpha": alpha},
+        "objective": {"alpha": alpha},
         "accumulate": {"unfollowed": word},
     }
     config = resolve(changes)
-    assert config.flow.alpha == alpha
+    assert config.objective.alpha == alpha
     assert resolve(yaml.safe_load(yaml.safe_dump(as_mapping(config)))) == config
 
 
 def test_file_preset_mapping_and_config_agree(tmp_path: Path) -> None:
     file = tmp_path / "mine.yaml"
-    file.write_text("flow:\n  alpha: 3\n")
-    expected = Config(flow=FlowSettings(alpha=3.0))
-    assert resolve(file) == resolve(str(file)) == resolve({"flow": {"alpha": 3}}) == expected
+    file.write_text("objective:\n  alpha: 3\n")
+    expected = Config(objective=ObjectiveSettings(alpha=3.0))
+    assert resolve(file) == resolve(str(file)) == resolve({"objective": {"alpha": 3}}) == expected
     assert resolve(expected) == expected
     assert resolve(None) == resolve("default") == Config()
     (tmp_path / "empty.yaml").write_text("# nothing\n")
@@ -152,33 +160,44 @@ def test_file_preset_mapping_and_config_agree(tmp_path: Path) -> None:
 
 
 def test_overrides_win_over_the_file_and_later_over_earlier() -> None:
-    config = resolve("paper", ["flow.solver=pcg", "flow.alpha=1e1", "flow.alpha=4"])
-    assert (config.flow.engine, config.flow.solver, config.flow.alpha) == ("paper", "pcg", 4.0)
-    assert isinstance(config.flow.alpha, float)
-    assert resolve(None, ["flow.alpha=1e1"]).flow.alpha == 10.0
-    assert resolve(None, ["flow.radius_m=null"]).flow.radius_m is None
+    config = resolve("paper", ["objective.solver=pcg", "objective.alpha=1e1", "objective.alpha=4"])
+    assert (config.flow.engine, config.objective.solver, config.objective.alpha) == (
+        "paper",
+        "pcg",
+        4.0,
+    )
+    assert isinstance(config.objective.alpha, float)
+    assert resolve(None, ["objective.alpha=1e1"]).objective.alpha == 10.0
+    assert resolve(None, ["objective.radius_m=null"]).objective.radius_m is None
 
 
 @pytest.mark.parametrize(
     ("override", "parts"),
     [
-        ("flow.alfa=3", ["--set flow.alfa=3", "unknown key flow.alfa", "did you mean alpha?"]),
+        ("objective.alfa=3", ["unknown key objective.alfa", "did you mean alpha?"]),
+        (
+            "flow.alpha=3",
+            ["--set flow.alpha=3", "unknown key flow.alpha; it is objective.alpha now"],
+        ),
         ("flwo.alpha=3", ["unknown section flwo", "did you mean flow?", "register, ground"]),
         ("flow.voxel_size_m=3", ["did you mean register.voxel_size_m?"]),
         ("flow.qqq=3", ["expected a flow key: "]),
-        ("flow.alpha=ten", ["--set flow.alpha=ten", "got 'ten'", "a number from 0 to 1e+06"]),
-        ("flow.alpha=-1", ["got -1", "from 0"]),
-        ("flow.alpha=", ["got ''"]),
-        ("flow.num_neighbors=2.5", ["got 2.5", "a whole number from 1 to 500"]),
-        ("flow.radius_m=0", ["got 0", "or null"]),
+        (
+            "objective.alpha=ten",
+            ["--set objective.alpha=ten", "got 'ten'", "a number from 0 to 1e+06"],
+        ),
+        ("objective.alpha=-1", ["got -1", "from 0"]),
+        ("objective.alpha=", ["got ''"]),
+        ("objective.num_neighbors=2.5", ["got 2.5", "a whole number from 1 to 500"]),
+        ("objective.radius_m=0", ["got 0", "or null"]),
         ("register.deskew=maybe", ["got 'maybe'", "true or false"]),
         ("register.source=oxts", ["got 'oxts'", "one of kiss-icp, dataset"]),
         ("flow.engine=magic", ["got 'magic'", "one of groups, paper, npz:DIR"]),
         ("project.at=noon", ["got 'noon'", "one of camera, sweep"]),
         ("output.movers=hide", ["got 'hide'", "one of keep, drop, separate"]),
-        ("flow.alpha", ["expected section.key=value"]),
+        ("objective.alpha", ["expected section.key=value"]),
         ("alpha=3", ["expected section.key=value"]),
-        ("flow.alpha=[1", ["--set flow.alpha=[1", "not YAML"]),
+        ("objective.alpha=[1", ["--set objective.alpha=[1", "not YAML"]),
     ],
 )
 def test_bad_override(override: str, parts: list[str]) -> None:
@@ -190,13 +209,16 @@ def test_bad_override(override: str, parts: list[str]) -> None:
 @pytest.mark.parametrize(
     ("text", "parts"),
     [
-        ("flow:\n  alfa: 3\n", ["unknown key flow.alfa", "did you mean alpha?"]),
+        ("objective:\n  alfa: 3\n", ["unknown key objective.alfa", "did you mean alpha?"]),
         ("flow: 3\n", ["section flow", "got 3", "mapping of keys"]),
         ("flow:\n", ["section flow", "got None"]),
         ("- flow\n", ["got ['flow']", "mapping of sections"]),
-        ("flow: {alpha: [}\n", ["not YAML"]),
-        ("flow: {alpha: 1}\nground: {}\nflow: {solver: adam}\n", ["flow is given twice"]),
-        ("flow: {alpha: .nan}\n", ["flow.alpha: got nan"]),
+        ("objective: {alpha: [}\n", ["not YAML"]),
+        (
+            "objective: {alpha: 1}\nground: {}\nobjective: {solver: adam}\n",
+            ["objective is given twice"],
+        ),
+        ("objective: {alpha: .nan}\n", ["objective.alpha: got nan"]),
         ("3: {alpha: 1}\n", ["unknown section 3"]),
     ],
 )
@@ -239,5 +261,5 @@ def test_python_users_are_checked_too() -> None:
 
 
 if __name__ == "__main__":
-    target = Path(configuration.__file__).parents[1] / "configs" / "default.yaml"
+    target = Path(configuration.__file__).parents[2] / "configs" / "default.yaml"
     target.write_text(rendered_defaults(), "utf-8")

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from pathlib import Path
 
@@ -198,6 +199,18 @@ def test_a_set_is_made_one_way(
     message = refused(capsys, 2, "dataset", *arguments)
     assert f"--out {out}: " in message and words in message
     assert files_in(out) == before
+
+
+def test_a_set_with_knobs_that_are_no_more(
+    border_drive: Path, border_set: Path, tmp_path: Path, capsys
+) -> None:
+    out = tmp_path / "out"
+    shutil.copytree(border_set, out)
+    plan = json.loads((out / "dataset.json").read_text())
+    plan["config"]["flow"]["alpha"] = 10.0
+    (out / "dataset.json").write_text(json.dumps(plan))
+    message = refused(capsys, 2, "dataset", "--data", border_drive, *OPTIONS, "--out", out)
+    assert "config.flow.alpha = 10.0, got None" in message
 
 
 def test_a_second_run_at_once(border_drive: Path, border_set: Path, tmp_path: Path, capsys) -> None:

@@ -12,10 +12,10 @@ import torch
 from densify.errors import InputError
 from densify.flow.objective import graph
 from densify.flow.objective.energy import energy
-from densify.flow.objective.solvers import ObjectiveSettings, solve
+from densify.flow.objective.solvers import SolverSettings, solve
 from densify.kernels import threads
 
-ADAM = ObjectiveSettings(solver="adam", adam_num_steps=60)
+ADAM = SolverSettings(solver="adam", adam_num_steps=60)
 
 
 def box(
@@ -55,8 +55,8 @@ def reported_equals_recomputed(source, target, settings, solution) -> None:
     np.testing.assert_allclose(reported, value, rtol=1e-9)
 
 
-@pytest.mark.parametrize("settings", [ObjectiveSettings(), ADAM])
-def test_identical_clouds_do_not_move_at_all(settings: ObjectiveSettings) -> None:
+@pytest.mark.parametrize("settings", [SolverSettings(), ADAM])
+def test_identical_clouds_do_not_move_at_all(settings: SolverSettings) -> None:
     points = box(500, 0) + [400.0, -3e3, 7.0]
     solution = solve(points, points[::-1], settings)
     assert not solution.flow.any()
@@ -66,7 +66,7 @@ def test_identical_clouds_do_not_move_at_all(settings: ObjectiveSettings) -> Non
 @pytest.mark.parametrize("shift", [(0.4, 0.0, 0.0), (0.9, -0.5, 0.2), (30.0, -10.0, 5.0)])
 def test_a_translated_body_is_recovered_to_the_millimetre(shift: tuple[float, ...]) -> None:
     source = box(800, 1)
-    settings = ObjectiveSettings(laplacian="row-sum-zero", pcg_tolerance=1e-6)
+    settings = SolverSettings(laplacian="row-sum-zero", pcg_tolerance=1e-6)
     solution = solve(source, source + shift, settings)
     np.testing.assert_allclose(solution.flow, np.broadcast_to(shift, (800, 3)), atol=1e-3)
 
@@ -74,7 +74,7 @@ def test_a_translated_body_is_recovered_to_the_millimetre(shift: tuple[float, ..
 def test_two_bodies_move_their_own_ways() -> None:
     bodies = np.concatenate([box(600, 2), box(600, 3) + [12.0, 0, 0]])
     truth = np.repeat([[0.7, 0.0, 0.0], [0.0, -0.6, 0.1]], 600, axis=0)
-    settings = ObjectiveSettings(laplacian="row-sum-zero", pcg_tolerance=1e-6)
+    settings = SolverSettings(laplacian="row-sum-zero", pcg_tolerance=1e-6)
     solution = solve(bodies, bodies + truth, settings)
     np.testing.assert_allclose(solution.flow, truth, atol=1e-3)
 
@@ -82,7 +82,7 @@ def test_two_bodies_move_their_own_ways() -> None:
 @pytest.mark.parametrize("kind", graph.LAPLACIANS)
 def test_pcg_and_adam_reach_the_same_minimum(kind: str) -> None:
     source, target = street(4)
-    common = ObjectiveSettings(laplacian=kind, adam_num_steps=250, pcg_tolerance=1e-4)
+    common = SolverSettings(laplacian=kind, adam_num_steps=250, pcg_tolerance=1e-4)
     pcg = solve(source, target, common)
     adam = solve(source, target, dataclasses.replace(common, solver="adam"))
     assert abs(pcg.energy - adam.energy) < 0.02 * adam.energy
@@ -98,7 +98,7 @@ def test_pcg_and_adam_reach_the_same_minimum(kind: str) -> None:
 
 def test_pcg_never_rises_without_continuation() -> None:
     source, target = street(5)
-    settings = ObjectiveSettings(pcg_alpha_start=0.0, pcg_tolerance=0.0)
+    settings = SolverSettings(pcg_alpha_start=0.0, pcg_tolerance=0.0)
     energies = np.array(solve(source, target, settings).energies)
     assert len(energies) > 5
     assert (np.diff(energies) <= 1e-12 * energies[:-1]).all()
@@ -108,13 +108,13 @@ def test_pcg_never_rises_without_continuation() -> None:
 
 def test_continuation_finds_a_lower_minimum_than_starting_at_the_final_alpha() -> None:
     source, target = box(800, 6), box(800, 7) + [2.0, 0.5, 0.0]
-    stiff_first = solve(source, target, ObjectiveSettings(laplacian="row-sum-zero"))
-    at_once = ObjectiveSettings(laplacian="row-sum-zero", pcg_alpha_start=0.0)
+    stiff_first = solve(source, target, SolverSettings(laplacian="row-sum-zero"))
+    at_once = SolverSettings(laplacian="row-sum-zero", pcg_alpha_start=0.0)
     assert stiff_first.energy < 0.95 * solve(source, target, at_once).energy
 
 
-@pytest.mark.parametrize("settings", [ObjectiveSettings(), ADAM])
-def test_an_initial_flow_is_where_it_starts(settings: ObjectiveSettings) -> None:
+@pytest.mark.parametrize("settings", [SolverSettings(), ADAM])
+def test_an_initial_flow_is_where_it_starts(settings: SolverSettings) -> None:
     source, target = street(7, 400)
     cold = solve(source, target, settings)
     warm = solve(source, target, settings, initial=cold.flow)
@@ -124,8 +124,8 @@ def test_an_initial_flow_is_where_it_starts(settings: ObjectiveSettings) -> None
         assert warm.num_steps < cold.num_steps / 2
 
 
-@pytest.mark.parametrize("settings", [ObjectiveSettings(), ADAM])
-def test_same_input_gives_the_same_bytes(settings: ObjectiveSettings) -> None:
+@pytest.mark.parametrize("settings", [SolverSettings(), ADAM])
+def test_same_input_gives_the_same_bytes(settings: SolverSettings) -> None:
     source, target = street(8)
     first, second = (solve(source, target, settings) for _ in range(2))
     assert first.flow.tobytes() == second.flow.tobytes()
@@ -138,7 +138,7 @@ def test_the_number_of_threads_leaves_no_trace(monkeypatch, solver: str) -> None
     rng = np.random.default_rng(0)
     source = rng.uniform(0, 20, (12000, 3)) * [1, 1, 0.1]
     target = rng.uniform(0, 20, (12500, 3)) * [1, 1, 0.1] + [0.3, 0, 0]
-    settings = ObjectiveSettings(
+    settings = SolverSettings(
         solver=solver, num_neighbors=4, adam_num_steps=2, pcg_alpha_start=10.0
     )
     before, found = torch.get_num_threads(), []
@@ -175,7 +175,7 @@ def test_map_coordinates_lose_nothing() -> None:
 @pytest.mark.parametrize("kind", graph.LAPLACIANS)
 @pytest.mark.parametrize(("n", "m"), [(1, 1), (1, 40), (40, 1), (3, 2000), (2000, 3)])
 def test_any_sizes(n: int, m: int, kind: str, solver: str) -> None:
-    settings = ObjectiveSettings(solver=solver, laplacian=kind, adam_num_steps=20)
+    settings = SolverSettings(solver=solver, laplacian=kind, adam_num_steps=20)
     solution = solve(box(n, 0), box(m, 1) + [1.0, 0, 0], settings)
     assert np.isfinite(solution.flow).all()
     assert solution.energy <= solution.energies[0]
@@ -183,28 +183,28 @@ def test_any_sizes(n: int, m: int, kind: str, solver: str) -> None:
 
 def test_one_point_moves_to_the_mean_of_what_pulls_it() -> None:
     # One forward match and two backward ones: E = |x - a|² + |x - a|² + |x - b|².
-    solution = solve([[0.0, 0, 0]], [[3.0, 0, 0], [6.0, 0, 0]], ObjectiveSettings())
+    solution = solve([[0.0, 0, 0]], [[3.0, 0, 0], [6.0, 0, 0]], SolverSettings())
     np.testing.assert_allclose(solution.flow, [[4.0, 0, 0]], atol=1e-9)
     np.testing.assert_allclose(solution.energy, 1 + 1 + 4)
 
 
 def test_a_far_target_is_reached() -> None:
     source = box(300, 1)
-    solution = solve(source, source + [5000.0, 0, 0], ObjectiveSettings(laplacian="row-sum-zero"))
+    solution = solve(source, source + [5000.0, 0, 0], SolverSettings(laplacian="row-sum-zero"))
     np.testing.assert_allclose(solution.flow.mean(axis=0), [5000.0, 0, 0], atol=1.0)
 
 
 def test_alpha_zero_and_a_radius_graph_work() -> None:
     source, target = street(11, 300)
-    free = solve(source, target, ObjectiveSettings(alpha=0.0))
-    assert free.data < solve(source, target, ObjectiveSettings(alpha=1.0)).data
-    short = solve(source, target, ObjectiveSettings(radius_m=0.3, num_neighbors=20))
+    free = solve(source, target, SolverSettings(alpha=0.0))
+    assert free.data < solve(source, target, SolverSettings(alpha=1.0)).data
+    short = solve(source, target, SolverSettings(radius_m=0.3, num_neighbors=20))
     assert short.energy < short.energies[0]
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
-@pytest.mark.parametrize("settings", [ObjectiveSettings(), ADAM])
-def test_cuda_agrees_with_the_cpu(settings: ObjectiveSettings) -> None:
+@pytest.mark.parametrize("settings", [SolverSettings(), ADAM])
+def test_cuda_agrees_with_the_cpu(settings: SolverSettings) -> None:
     source, target = street(12)
     cpu = solve(source, target, settings)
     cuda = solve(source, target, settings, device="cuda")
@@ -256,4 +256,4 @@ def test_an_absent_cuda_device_is_refused() -> None:
 )
 def test_bad_settings_are_refused(name: str, value: object) -> None:
     with pytest.raises(InputError, match=rf"^{name}: got .*expected"):
-        ObjectiveSettings(**{name: value})
+        SolverSettings(**{name: value})

@@ -33,7 +33,7 @@ from densify.outputs.atomic import staged_folder
 from densify.types import Cloud, DepthMap, Result, StageCost
 
 H, W = 12, 20
-CONFIG = {"flow": {"alpha": 10.0, "radius_m": None}, "register": {"source": "kiss-icp"}}
+CONFIG = {"objective": {"alpha": 10.0, "radius_m": None}, "register": {"source": "kiss-icp"}}
 RUN_FILES = [
     *(f"{kind}/{camera}.png" for kind in ("depth", "depth_filled", "confidence", "age")
       for camera in ("image_02", "image_03")),

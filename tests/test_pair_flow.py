@@ -15,8 +15,8 @@ from densify.flow.pairs import estimate as pair_module
 from densify.flow.pairs.estimate import estimate_flow
 
 MOVED = np.array([0.8, 0.1, 0.0])
-ROW_SUM_ZERO = {"flow": {"engine": "paper", "laplacian": "row-sum-zero"}}
-EVERYTHING = {"flow": {"static_prior": False}}
+ROW_SUM_ZERO = {"flow": {"engine": "paper"}, "objective": {"laplacian": "row-sum-zero"}}
+EVERYTHING = {"objective": {"static_prior": False}}
 PAPER = {"flow": {"engine": "paper"}}
 
 
@@ -193,8 +193,8 @@ def test_bad_clouds_are_refused(source, target, initial, message):
 
 
 def test_bad_configuration_is_refused():
-    with pytest.raises(InputError, match=r"flow\.alhpa.*alpha"):
-        estimate_flow(CLOUD, CLOUD, {"flow": {"alhpa": 3}})
+    with pytest.raises(InputError, match=r"objective\.alhpa.*alpha"):
+        estimate_flow(CLOUD, CLOUD, {"objective": {"alhpa": 3}})
 
 
 def test_the_configuration_reaches_the_objective(monkeypatch):
@@ -205,15 +205,17 @@ def test_the_configuration_reaches_the_objective(monkeypatch):
         return SimpleNamespace(flow=np.zeros_like(source))
 
     monkeypatch.setattr(pair_module, "solve", solve)
-    flow = {
+    objective = {
         "solver": "adam",
         "alpha": 3.0,
         "num_neighbors": 7,
         "radius_m": 1.5,
         "laplacian": "row-sum-zero",
     }
-    estimate_flow(CLOUD, CLOUD, {"flow": {**flow, "engine": "paper", "device": "cuda"}})
-    assert {name: getattr(asked["settings"], name) for name in flow} == flow
+    estimate_flow(
+        CLOUD, CLOUD, {"flow": {"engine": "paper"}, "objective": {**objective, "device": "cuda"}}
+    )
+    assert {name: getattr(asked["settings"], name) for name in objective} == objective
     assert asked["device"] == "cuda"
 
 
@@ -221,4 +223,4 @@ def test_a_device_that_is_not_there_is_refused():
     if torch.cuda.is_available():
         pytest.skip("there is a CUDA device")
     with pytest.raises(InputError, match="cuda"):
-        estimate_flow(CLOUD, CLOUD, {"flow": {"engine": "paper", "device": "cuda"}})
+        estimate_flow(CLOUD, CLOUD, {"flow": {"engine": "paper"}, "objective": {"device": "cuda"}})

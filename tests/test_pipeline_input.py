@@ -120,7 +120,7 @@ def test_deskewing_can_be_switched_off():
         ({"method": "magic"}, "--method magic: expected one of none, icp, flow"),
         ({"window": -2}, "--window -2"),
         ({"cameras": ["back"]}, "--camera back.*front"),
-        ({"config": {"flow": {"alhpa": 1}}}, "alpha"),
+        ({"config": {"objective": {"alhpa": 1}}}, "alpha"),
         ({"method": "paper"}, "--method paper: expected one of none, icp, flow"),
     ],
 )

@@ -244,7 +244,7 @@ def look(scanner: ScannerImage, point, velocity, margin_m, margin_fraction, min_
         column, close = column_of(seen)
         if close:
             return None
-        time_s = float(scanner.offset_s[column])
+        time_s = float(scanner.offset_s[0, column])
         twist = time_s * scanner.twists[0 if time_s < 0 else 1].astype(float)
         back = Rotation.from_rotvec(twist[:3]).inv()
         seen = back.apply(point + time_s * velocity - twist[3:]) - scanner.origin_m
@@ -254,7 +254,7 @@ def look(scanner: ScannerImage, point, velocity, margin_m, margin_fraction, min_
     if close or min(abs(elevation - e) for e in edges) < 1e-4:
         return None
     row = sum(elevation >= e for e in edges) - 1
-    if not 0 <= row < num_rows or abs(scanner.offset_s[column] - time_s) >= 0.01:
+    if not 0 <= row < num_rows or abs(scanner.offset_s[0, column] - time_s) >= 0.01:
         return False
     range_m = float(np.linalg.norm(seen))
     gap_m = scanner.nearest_m[row, column] - range_m - max(margin_m, margin_fraction * range_m)
@@ -321,7 +321,7 @@ def test_image_against_a_slow_twin():
     mean_s = np.interp(
         np.arange(columns), sorted(offsets), [np.mean(offsets[c]) for c in sorted(offsets)]
     )
-    assert (np.abs(mean_s - image.offset_s) < 1e-6).mean() > 0.98
+    assert (np.abs(mean_s - image.offset_s[0]) < 1e-6).mean() > 0.98
 
 
 def test_the_number_of_threads_changes_no_byte(monkeypatch):
@@ -367,11 +367,11 @@ def test_points_without_a_direction_are_not_free(room):
 
 def test_one_scanners_image_is_the_nearest_return_of_each_neighbourhood():
     sweep = standing_sweep()
-    image = ScannerImage.of(sweep, 0)
+    (image,) = ScannerImage.all_of(sweep, 0)
     assert image.nearest_m.shape == image.num_filled.shape
-    assert image.offset_s.shape == image.nearest_m.shape[1:]
+    assert image.offset_s.shape == (1, image.nearest_m.shape[1])
     assert image.num_filled.max() == 9
     assert np.array_equal(np.isinf(image.nearest_m), image.num_filled == 0)
     # clockwise: columns start behind, at azimuth -pi, where a sweep ends
-    assert image.offset_s[0] == pytest.approx(0.05, abs=1e-3)
-    assert image.offset_s[-1] == pytest.approx(-0.05, abs=1e-3)
+    assert image.offset_s[0, 0] == pytest.approx(0.05, abs=1e-3)
+    assert image.offset_s[0, -1] == pytest.approx(-0.05, abs=1e-3)

@@ -8,8 +8,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from densify.geometry import range_image
+from densify.geometry import range_image, sensor
 from densify.geometry.range_image import RangeImage
+from densify.geometry.rings import find_rings
+from densify.geometry.sensor import Aimed
 from densify.street.sensors import SENSORS
 from densify.types import RegisteredSweep, Sweep
 from tests.scenes import ROOM, Arc, Scanner, Scene, World, on_sphere
@@ -58,12 +60,18 @@ def on_rings(elevation_deg, noise_deg=0.01, num_columns=600, seed=0):
     )
 
 
+def cells(azimuth, elevation):
+    """Edges of the rows and number of columns of the finest image."""
+    nothing = np.zeros(len(azimuth), np.float32)
+    return range_image._cells(Aimed(azimuth, elevation, nothing, nothing))[0]
+
+
 @pytest.mark.parametrize("name", TABLES)
 def test_rings_are_found_wherever_the_beams_point(name):
     azimuth, elevation = on_rings(TABLES[name])
-    found = range_image._rings(elevation)
+    found = find_rings(elevation)
     np.testing.assert_allclose(np.rad2deg(found), TABLES[name], atol=0.03)
-    edges, num_columns = range_image._cells(azimuth, elevation)
+    edges, num_columns = cells(azimuth, elevation)
     assert 600 / 1.5 < num_columns <= 600
     rows = np.diff(np.rad2deg(edges))
     assert rows.min() > 0.44
@@ -79,10 +87,10 @@ def test_rings_are_found_wherever_the_beams_point(name):
 
 @pytest.mark.parametrize("towards_deg", [2.5, 7.5, 12.5, 170.0])
 def test_a_narrow_view_is_measured_too(monkeypatch, towards_deg):
-    monkeypatch.setattr(range_image, "_MANY_POINTS", 1000)
+    monkeypatch.setattr(sensor, "_MANY_POINTS", 1000)
     azimuth, elevation = on_rings(TABLES["hdl64"], num_columns=7200)
     ahead = np.abs(azimuth - np.deg2rad(towards_deg)) < np.deg2rad(2.4)
-    edges, num_columns = range_image._cells(azimuth[ahead], elevation[ahead])
+    edges, num_columns = cells(azimuth[ahead], elevation[ahead])
     assert len(edges) == 49
     assert 7200 / 1.5 < num_columns <= 7200
 
@@ -94,8 +102,8 @@ def test_where_there_are_no_rings_rows_are_uniform():
     sparse = rng.uniform(-3, 3, 600), rng.uniform(-0.4, 0.1, 600)
     for azimuth, elevation in (smeared, anywhere, sparse):
         azimuth, elevation = azimuth.astype(np.float32), elevation.astype(np.float32)
-        assert range_image._rings(elevation) is None
-        edges, _ = range_image._cells(azimuth, elevation)
+        assert find_rings(elevation) is None
+        edges, _ = cells(azimuth, elevation)
         np.testing.assert_allclose(np.diff(edges), np.diff(edges)[0], rtol=1e-3)
         assert edges[0] <= elevation.min() and edges[-1] > elevation.max()
 

@@ -11,7 +11,7 @@ import pytest
 from scipy.spatial import cKDTree
 
 from densify.errors import InputError
-from densify.flow.objective.solvers import ObjectiveSettings, solve
+from densify.flow.objective.solvers import SolverSettings, solve
 from densify.flow.tracking import soften as module
 from densify.flow.tracking.soften import Part, Softened, soften
 
@@ -249,7 +249,7 @@ def test_scan_lines_do_not_pull():
     wide = len(voxels(accumulated(rigid(parts), key), 0.02))
     ours = len(voxels(accumulated(forced(parts), key), 0.02))
     snapped = [parts[key].points]
-    settings = ObjectiveSettings(alpha=module._ALPHAS[-1], num_neighbors=6)
+    settings = SolverSettings(alpha=module._ALPHAS[-1], num_neighbors=6)
     for part in (parts[key - 1], parts[key + 1]):
         flow = solve(part.points, parts[key].points, settings, np.zeros_like(part.points)).flow
         snapped.append(part.points + flow)

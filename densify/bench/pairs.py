@@ -16,7 +16,7 @@ from densify.bench.windows import Window
 from densify.config import Config
 from densify.errors import InputError
 from densify.flow.objective.graph import knn_graph, laplacian
-from densify.flow.objective.solvers import ObjectiveSettings, solve
+from densify.flow.objective.solvers import SolverSettings, solve
 from densify.flow.pairs.estimate import estimate_flow
 from densify.types import Bool, Float, FlowField, Int, RegisteredSweep
 
@@ -153,7 +153,7 @@ def flow_of_pair(method: str, pair: Pair, config: Config) -> tuple[FlowField, Tr
         flow = pair.carried(nonrigid_icp(pair.drawn, pair.target))
     else:
         solver = "adam" if method == "paper-adam" else "pcg"
-        solution = solve(pair.drawn, pair.target_drawn, ObjectiveSettings(solver=solver))
+        solution = solve(pair.drawn, pair.target_drawn, SolverSettings(solver=solver))
         flow = pair.carried(solution.flow)
         trace = Trace(solution.energies, solution.seconds)
     return pair.as_field(flow), trace

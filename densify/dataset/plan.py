@@ -218,8 +218,9 @@ def _check_same(out: Path, before: Mapping[str, Any], now: Mapping[str, Any]) ->
             got, expected = now[name], before[name]
             where = name
             while isinstance(got, dict):  # down to the one that differs
-                part = next(k for k in got if got[k] != expected.get(k))
-                got, expected, where = got[part], expected.get(part), f"{where}.{part}"
+                parts = {**expected, **got}  # a set of another version may have knobs of its own
+                part = next(k for k in parts if got.get(k) != expected.get(k))
+                got, expected, where = got.get(part), expected.get(part), f"{where}.{part}"
             raise InputError(
                 f"--out {out}: the set in it was made with {where} = {expected}, got {got}; "
                 f"choose another --out, or go on with the same options"

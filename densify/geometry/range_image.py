@@ -5,34 +5,37 @@ A range image is built in the scanner's own frame at each ray's own firing time,
 a regular grid; a point of the deskewed sweep finds its cell by asking when the scanner faced it.
 Its cells follow the sensor: rows its rings, columns its azimuth step, both found in the returns
 (Thrun et al., "Probabilistic Robotics", 2005, ch. 9, for free space from range images).
+
+A scanner whose firing time does not go with the azimuth (solid state, rosettes) faces a cell at
+several moments of a sweep. There each cell knows the middle of the times at which it and those
+around it were looked at, and how far from it they were: a point is asked for at the middle, and
+what it and the scanner move in the rest is added to the margin. Where rays are unordered they are
+denser here than there, and no one size of cells is right: there are images of several sizes, and
+each vouches for what it has enough returns around.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage, signal
 
-from densify.kernels import rays
-from densify.types import Bool, Float, Float32, Int, RegisteredSweep
+from densify.geometry import rings as measure
+from densify.geometry.sensor import FEW_POINTS, Aimed, aimed, density_table, in_lines, some_sectors
+from densify.kernels import rays as kernels
+from densify.types import Bool, Float, Float32, RegisteredSweep
 
 _CELLS_PER_STEP = 1.15  # a cell a little larger than a step is rarely empty
-_MIN_POINTS_TO_MEASURE = 200
-_MANY_POINTS = 15_000
-_SECTOR_RAD = np.deg2rad(5.0)
 _MIN_ROW_RAD = np.deg2rad(0.45)
-_RING_BIN_RAD = np.deg2rad(0.02)
-_MIN_PROMINENCE = 0.5
-_MIN_RETURNS_PER_RING = 30
-_MIN_RING_SHARE = 0.8
+_SETTLED = 0.1  # of a turn
+_MIN_COLUMNS, _MAX_COLUMNS = 90, 8192
+_DENSEST, _SPARSEST = 10, 90  # percent of an unordered scanner's returns
 
 
 @dataclass(frozen=True)
 class RangeImage:
-    """Range images of a sweep, one per scanner in it."""
+    """Range images of a sweep, one or more per scanner in it."""
 
     scanners: tuple[ScannerImage, ...]
 
@@ -40,7 +43,9 @@ class RangeImage:
     def of(registered: RegisteredSweep) -> RangeImage:
         """Build from a deskewed sweep (its rays are put back to their firing times)."""
         ids = np.unique(registered.sweep.lidar)
-        return RangeImage(tuple(ScannerImage.of(registered, int(i)) for i in ids))
+        return RangeImage(
+            tuple(image for i in ids for image in ScannerImage.all_of(registered, int(i)))
+        )
 
     def sees_through(
         self,
@@ -66,8 +71,8 @@ class RangeImage:
         margins = np.array([margin_m, margin_fraction], np.float32)
         free = np.zeros(len(points), bool)
         for scanner in self.scanners:
-            rays.see_through.over_rows(
-                len(points), points32, velocity, *scanner.tables, margins, min_filled, free
+            kernels.see_through.over_rows(
+                len(points), points32, velocity, scanner.tables, margins, min_filled, free
             )
         return free
 
@@ -76,14 +81,19 @@ class RangeImage:
 class ScannerImage:
     """One scanner's range image.
 
-    offset_s: (C,) float32, when the scanner faced each column; columns start at azimuth -pi and
-    wrap around. nearest_m: (R,C) float32, nearest return within the 3 x 3 cells around each cell,
-    inf if none. num_filled: (R,C) uint8, how many of those nine hold a return. row_edges_rad:
-    (R+1,) float32 ascending elevations. origin_m: (3,) float32 of the scanner in the lidar frame.
-    twists: (2,6) float32, the sweep's before and after its reference time.
+    offset_s, spread_s: (1,C) or (R,C) float32, the middle of the times at which the scanner faced
+    the column or cell, and how far from it they were at most; columns start at azimuth -pi and wrap
+    around. settled_s: where there is one time for a column, by how much the time at which a point
+    is faced may differ from the first guess: more is the seam of the turn. nearest_m: (R,C)
+    float32, nearest return within the 3 x 3 cells around each cell, inf if none. num_filled: (R,C)
+    uint8, how many of those nine hold a return. row_edges_rad: (R+1,) float32 ascending elevations.
+    origin_m: (3,) float32 of the scanner in the lidar frame. twists: (2,6) float32, the sweep's
+    before and after its reference time.
     """
 
     offset_s: Float32
+    spread_s: Float32
+    settled_s: np.float32
     nearest_m: Float32
     num_filled: NDArray[np.uint8]
     row_edges_rad: Float32
@@ -91,26 +101,30 @@ class ScannerImage:
     twists: Float32
 
     @staticmethod
-    def of(registered: RegisteredSweep, lidar: int) -> ScannerImage:
-        sweep = registered.sweep
-        mine = np.flatnonzero(sweep.lidar == lidar)
-        offset_s = np.zeros(len(mine), np.float32)
-        if sweep.offset_ns is not None:
-            offset_s = (sweep.offset_ns[mine] * 1e-9).astype(np.float32)
-        place = (
-            sweep.origin_m(lidar).astype(np.float32),
-            np.stack([registered.twist_before, registered.twist_after]).astype(np.float32),
-        )
-        seen = np.empty((3, len(mine)), np.float32)
-        rays.aim.over_rows(len(mine), sweep.points[mine].astype(np.float32), offset_s, *place, seen)
-        row_edges_rad, num_columns = _cells(*seen[:2])
-        shape = len(row_edges_rad) - 1, num_columns
-        nearest_m, num_filled = np.empty(shape, np.float32), np.empty(shape, np.uint8)
-        num_rays, sum_s = np.zeros(num_columns, np.int64), np.zeros(num_columns)
-        rays.fill(seen, offset_s, row_edges_rad, nearest_m, num_filled, num_rays, sum_s)
-        return ScannerImage(
-            _offset_per_column(num_rays, sum_s), nearest_m, num_filled, row_edges_rad, *place
-        )
+    def all_of(registered: RegisteredSweep, lidar: int) -> tuple[ScannerImage, ...]:
+        """One, or of an unordered scanner several with cells of different sizes, finest first."""
+        rays = aimed(registered, lidar)
+        order = measure.firing_order(rays.azimuth, rays.offset_s)
+        duration_s = order.period_s or float(np.ptp(rays.offset_s)) if len(rays.offset_s) else 0.0
+        origin_m = registered.sweep.origin_m(lidar).astype(np.float32)
+        twists = np.stack([registered.twist_before, registered.twist_after]).astype(np.float32)
+
+        def image(row_edges_rad: Float32, num_columns: int) -> ScannerImage:
+            shape = len(row_edges_rad) - 1, num_columns
+            nearest_m, num_filled = np.empty(shape, np.float32), np.empty(shape, np.uint8)
+            offset_s = np.zeros((1 if order.by_azimuth else shape[0], num_columns), np.float32)
+            spread_s = np.zeros_like(offset_s)
+            kernels.fill(rays, row_edges_rad, nearest_m, num_filled)
+            if order.by_azimuth:
+                offset_s[0] = _offset_per_column(rays, num_columns)
+            else:
+                kernels.fill_times(rays, row_edges_rad, offset_s, spread_s)
+            return ScannerImage(
+                *(offset_s, spread_s, np.float32(_SETTLED * duration_s), nearest_m, num_filled),
+                *(row_edges_rad, origin_m, twists),
+            )
+
+        return tuple(image(*cells) for cells in _cells(rays))
 
     @property
     def row_step_rad(self) -> float:
@@ -118,57 +132,53 @@ class ScannerImage:
         return float(np.median(np.diff(self.row_edges_rad)))
 
     @property
-    def tables(self) -> tuple[NDArray[Any], ...]:
+    def tables(self) -> kernels.Tables:
         """What `densify.kernels.rays.see_through` looks points up in."""
-        return (
-            *(self.offset_s, self.nearest_m, self.num_filled, self.row_edges_rad),
-            *(self.origin_m, self.twists),
+        return kernels.Tables(
+            self.offset_s,
+            self.spread_s,
+            self.settled_s,
+            self.nearest_m,
+            self.num_filled,
+            self.row_edges_rad,
+            self.origin_m,
+            self.twists,
         )
 
 
-def _cells(azimuth: Float32, elevation: Float32) -> tuple[Float32, int]:
-    """Edges of the rows (R+1,), rad, and the number of columns."""
-    whole = elevation
-    if len(azimuth) > _MANY_POINTS:
-        some = np.floor(azimuth / _SECTOR_RAD) % 4 == 0
-        if some.mean() > 0.1:  # of a view all round every fourth sector tells as much
-            azimuth, elevation = azimuth[some], elevation[some]
-    edges: NDArray[np.floating]
-    if len(azimuth) < _MIN_POINTS_TO_MEASURE:
-        edges, step = _uniform_edges(whole, np.deg2rad(2.0)), np.deg2rad(1.0)
-    else:
-        rings = _rings(elevation)
-        if rings is not None:
-            edges = _edges_between(rings)
-            step = _step_along(azimuth, np.searchsorted(edges, elevation))
-            edges = _no_closer(edges, _MIN_ROW_RAD)
-        else:
-            row_step = _step_between(azimuth, elevation)
-            edges = _uniform_edges(whole, _CELLS_PER_STEP * row_step)
-            step = _step_along(azimuth, np.floor(elevation / row_step))
-        step *= _CELLS_PER_STEP
-    return edges.astype(np.float32), int(np.clip(round(2 * np.pi / step), 90, 8192))
+def _cells(rays: Aimed) -> list[tuple[Float32, int]]:
+    """Edges of the rows (R+1,), rad, and the number of columns, of each image."""
+    if len(rays.azimuth) < FEW_POINTS:
+        return [_grid(_uniform_edges(rays.elevation, np.deg2rad(2.0)), np.deg2rad(1.0))]
+    some = some_sectors(rays)
+    rings = measure.find_rings(some.elevation)
+    if rings is not None:
+        edges = _edges_between(rings)
+        step = measure.step_along(some.azimuth, np.searchsorted(edges, some.elevation))
+        return [_grid(_no_closer(edges, _MIN_ROW_RAD), _CELLS_PER_STEP * step)]
+    if in_lines(some):
+        row_step = measure.step_between(some.azimuth, some.elevation)
+        step = measure.step_along(some.azimuth, np.floor(some.elevation / row_step))
+        rows = _uniform_edges(rays.elevation, _CELLS_PER_STEP * row_step)
+        return [_grid(rows, _CELLS_PER_STEP * step)]
+    return [
+        _grid(_uniform_edges(rays.elevation, size), size / np.cos(np.median(rays.elevation)))
+        for size in _sizes(rays)
+    ]
 
 
-def _rings(elevation: Float32) -> Float | None:
-    """(K,) ascending elevations of the scanner's beams; None where the returns do not lie on rings:
-    several scanners taken for one, clouds already processed, and lasers that do not share an origin
-    (KITTI's HDL-64E, whose near returns smear).
+def _grid(edges: NDArray[np.floating], step: float) -> tuple[Float32, int]:
+    num_columns = int(np.clip(round(2 * np.pi / step), _MIN_COLUMNS, _MAX_COLUMNS))
+    return edges.astype(np.float32), num_columns
 
-    The peaks of a fine histogram, if they stand alone and hold nearly all returns.
-    """
-    of_return = ((elevation + 0.5 * np.pi) / _RING_BIN_RAD).astype(np.int64)
-    returns = np.bincount(of_return, minlength=int(np.pi / _RING_BIN_RAD) + 2).astype(float)
-    count = ndimage.gaussian_filter1d(returns, 1.0)
-    peaks, found = signal.find_peaks(count, prominence=0.0)
-    peaks = peaks[found["prominences"] >= _MIN_PROMINENCE * count[peaks]]
-    if not 3 <= len(peaks) <= len(elevation) / _MIN_RETURNS_PER_RING:
-        return None
-    rings: Float = (peaks + 0.5) * _RING_BIN_RAD - 0.5 * np.pi
-    nearest = np.searchsorted(0.5 * (rings[1:] + rings[:-1]), elevation)
-    off = np.abs(elevation - rings[nearest])
-    share = np.mean(off < 0.2 * np.gradient(rings)[nearest])
-    return rings if share >= _MIN_RING_SHARE else None
+
+def _sizes(rays: Aimed) -> list[float]:
+    """Cells (rad) as large as the spacing where rays are dense, each twice as large as the one
+    before, up to where they are sparse."""
+    spacing = density_table([rays]).at(rays.azimuth, rays.elevation)[:, 1]
+    finest, coarsest = _CELLS_PER_STEP * np.percentile(spacing, [_DENSEST, _SPARSEST])
+    num_sizes = 1 + int(np.ceil(np.log2(coarsest / finest)))
+    return [float(finest) * 2**k for k in range(num_sizes)]
 
 
 def _edges_between(rings: Float) -> Float:
@@ -195,31 +205,11 @@ def _uniform_edges(elevation: Float32, step: float) -> NDArray[np.floating]:
     return low + step * np.arange(num_rows + 1)
 
 
-def _step_between(azimuth: Float32, elevation: Float32) -> float:
-    """Median elevation between rings (rad), where rings are not distinct."""
-    # A strip half a degree wide crosses every ring a few times: large gaps in elevation part rings.
-    gaps = _gaps(np.floor(azimuth / np.deg2rad(0.5)), elevation)
-    between = gaps[gaps > max(np.deg2rad(0.08), 0.25 * float(np.percentile(gaps, 95)))]
-    return float(np.median(between)) if len(between) else np.deg2rad(0.4)
-
-
-def _step_along(azimuth: Float32, ring: NDArray[Any]) -> float:
-    """Median azimuth between neighbours on a ring (rad)."""
-    along = _gaps(ring, azimuth)
-    along = along[along > np.deg2rad(0.02)]
-    return float(np.median(along)) if len(along) else np.deg2rad(0.2)
-
-
-def _gaps(group: NDArray[Any], angle: Float32) -> Float:
-    """Between neighbouring angles of the same group; group: (N,) whole numbers."""
-    apart = 4 * np.pi  # more than angles of one group can be
-    gaps: Float = np.diff(np.sort(group * apart + angle.astype(np.float64)))
-    return gaps[gaps < 2 * np.pi]
-
-
-def _offset_per_column(num_rays: Int, sum_s: Float) -> Float32:
+def _offset_per_column(rays: Aimed, num_columns: int) -> Float32:
+    """Mean firing time of each column's returns; of a column without any that of those beside."""
+    num_rays, sum_s = np.zeros(num_columns, np.int64), np.zeros(num_columns)
+    kernels.add_times(rays, num_rays, sum_s)
     seen = np.flatnonzero(num_rays)
     if not len(seen):
-        return np.zeros(len(num_rays), np.float32)
-    mean_s = sum_s[seen] / num_rays[seen]
-    return np.interp(np.arange(len(num_rays)), seen, mean_s).astype(np.float32)
+        return np.zeros(num_columns, np.float32)
+    return np.interp(np.arange(num_columns), seen, sum_s[seen] / num_rays[seen]).astype(np.float32)

@@ -3,12 +3,15 @@
 
 from __future__ import annotations
 
-import numpy as np
+from typing import NamedTuple
 
+import numpy as np
+from numpy.typing import NDArray
+
+from densify.arrays import Float32
 from densify.kernels import Kernel, inlined
 
 _BLOCK = 128
-_SETTLED_S = np.float32(0.01)
 _PI = np.float32(np.pi)
 _HALF_PI = np.float32(0.5 * np.pi)
 _HALF = np.float32(0.5)
@@ -18,6 +21,19 @@ _ZERO = np.float32(0)
 _A1, _A3, _A5, _A7, _A9 = (
     np.float32(a) for a in (0.9998660, -0.3302995, 0.1801410, -0.0851330, 0.0208351)
 )
+
+
+class Tables(NamedTuple):
+    """One scanner's range image, see `densify.geometry.range_image.ScannerImage`."""
+
+    offset_s: Float32
+    spread_s: Float32
+    settled_s: np.float32
+    nearest_m: Float32
+    num_filled: NDArray[np.uint8]
+    row_edges_rad: Float32
+    origin_m: Float32
+    twists: Float32
 
 
 @inlined
@@ -95,22 +111,19 @@ def aim(begin, end, points, offset_s, origin, twists, rays):  # type: ignore[no-
 
 
 @Kernel
-def fill(rays, offset_s, row_edges_rad, nearest_m, num_filled, num_rays, sum_s):  # type: ignore[no-untyped-def]
+def fill(rays, row_edges_rad, nearest_m, num_filled):  # type: ignore[no-untyped-def]
     """Rays into cells.
 
-    rays: (3,N) of `aim`, offset_s: (N,), row_edges_rad: (R+1,), all float32. Filled:
-    nearest_m: (R,C) float32, nearest range within the 3 x 3 cells around each, inf if none;
-    num_filled: (R,C) uint8, how many of those nine hold a return; num_rays: (C,) int64 and
-    sum_s: (C,) float64, of the offsets.
+    rays: `densify.geometry.sensor.Aimed`. row_edges_rad: (R+1,) float32. Filled: nearest_m: (R,C)
+    float32, nearest range within the 3 x 3 cells around each, inf if none; num_filled: (R,C) uint8,
+    how many of those nine hold a return.
     """
     num_rows, num_columns = nearest_m.shape
     cells = np.full((num_rows, num_columns), np.float32(np.inf))
-    for i in range(len(offset_s)):
-        row, column = _row(rays[1, i], row_edges_rad), _column(rays[0, i], num_columns)
-        num_rays[column] += 1
-        sum_s[column] += offset_s[i]
+    for i in range(len(rays.azimuth)):
+        row, column = _row(rays.elevation[i], row_edges_rad), _column(rays.azimuth[i], num_columns)
         if row >= 0:
-            cells[row, column] = min(cells[row, column], rays[2, i])
+            cells[row, column] = min(cells[row, column], rays.range_m[i])
     for row in range(num_rows):
         for column in range(num_columns):
             nearest, filled = np.float32(np.inf), 0
@@ -123,59 +136,110 @@ def fill(rays, offset_s, row_edges_rad, nearest_m, num_filled, num_rays, sum_s):
 
 
 @Kernel
-def see_through(  # type: ignore[no-untyped-def]
-    begin,
-    end,
-    points,
-    velocity,
-    offset_s,
-    nearest_m,
-    num_filled,
-    row_edges_rad,
-    origin,
-    twists,
-    margins,
-    min_filled,
-    free,
-):
+def add_times(rays, num_rays, sum_s):  # type: ignore[no-untyped-def]
+    """Adds up how many rays each column holds and their firing times: (C,) int64, float64."""
+    for i in range(len(rays.azimuth)):
+        column = _column(rays.azimuth[i], len(num_rays))
+        num_rays[column] += 1
+        sum_s[column] += rays.offset_s[i]
+
+
+@Kernel
+def fill_times(rays, row_edges_rad, offset_s, spread_s):  # type: ignore[no-untyped-def]
+    """The middle of the first and the last firing time within the 3 x 3 cells around each cell, and
+    how far they are from it; (R,C) float32, 0 where none holds a ray."""
+    num_rows, num_columns = offset_s.shape
+    first = np.full((num_rows, num_columns), np.float32(np.inf))
+    last = np.full((num_rows, num_columns), np.float32(-np.inf))
+    for i in range(len(rays.azimuth)):
+        row, column = _row(rays.elevation[i], row_edges_rad), _column(rays.azimuth[i], num_columns)
+        if row >= 0:
+            first[row, column] = min(first[row, column], rays.offset_s[i])
+            last[row, column] = max(last[row, column], rays.offset_s[i])
+    for row in range(num_rows):
+        for column in range(num_columns):
+            low, high = np.float32(np.inf), np.float32(-np.inf)
+            for r in range(max(row - 1, 0), min(row + 2, num_rows)):
+                for c in range(column - 1, column + 2):
+                    at = c - num_columns if c == num_columns else c
+                    low, high = min(low, first[r, at]), max(high, last[r, at])
+            if low <= high:
+                offset_s[row, column] = _HALF * (low + high)
+                spread_s[row, column] = _HALF * (high - low)
+
+
+@inlined
+def _cell_time(row, column, offset_s):  # type: ignore[no-untyped-def]
+    """When a cell was faced; outside the rows, when the nearest one was."""
+    return offset_s[min(max(row, 0), len(offset_s) - 1), column]
+
+
+@inlined
+def _speed(x, y, z, vx, vy, vz, twist):  # type: ignore[no-untyped-def]
+    """m/s at which the lidar sees a point with a velocity of its own go by."""
+    vx -= twist[3] + twist[1] * z - twist[2] * y
+    vy -= twist[4] + twist[2] * x - twist[0] * z
+    vz -= twist[5] + twist[0] * y - twist[1] * x
+    return np.sqrt(vx * vx + vy * vy + vz * vz)
+
+
+@Kernel
+def see_through(begin, end, points, velocity, image, margins, min_filled, free):  # type: ignore[no-untyped-def]
     """Marks in ``free`` (N,) bool the points where one scanner certainly saw free space.
 
     points: (N,3) lidar frame at the reference time; velocity: (N,3) m/s, or (0,3) if none moves.
-    offset_s: (C,) when the scanner faced each column. nearest_m, num_filled: (R,C) as `fill` leaves
-    them. margins: (2,) metres and share of the range. The rest as in `aim`; floats are float32.
+    image: `Tables`. margins: (2,) metres and share of the range. All float32.
     """
-    num_columns = nearest_m.shape[1]
-    moving = len(velocity) > 0
+    num_columns = image.nearest_m.shape[1]
+    moving, by_azimuth = len(velocity) > 0, len(image.offset_s) == 1
+    origin, row_edges_rad = image.origin_m, image.row_edges_rad
     x, y, z, time_s = np.empty((4, _BLOCK), np.float32)
-    column = np.empty(_BLOCK, np.int64)
+    row, column = np.zeros((2, _BLOCK), np.int64)
     # Each point is a long chain of steps; a block of them takes every step side by side.
     for start in range(begin, end, _BLOCK):
         size = min(_BLOCK, end - start)
         for k in range(size):
             x[k] = points[start + k, 0] - origin[0]
             y[k] = points[start + k, 1] - origin[1]
+            z[k] = points[start + k, 2] - origin[2]
         for _ in range(2):  # when did the scanner face the point? converges in two steps
             for k in range(size):
                 column[k] = _column(_azimuth(x[k], y[k]), num_columns)
+            if not by_azimuth:
+                for k in range(size):
+                    ground = np.sqrt(x[k] * x[k] + y[k] * y[k])
+                    row[k] = max(_row(_azimuth(ground, z[k]), row_edges_rad), 0)
             for k in range(size):
-                i, t = start + k, offset_s[column[k]]
+                i, t = start + k, image.offset_s[row[k], column[k]]
                 px, py, pz = points[i, 0], points[i, 1], points[i, 2]
                 if moving:
                     px += t * velocity[i, 0]
                     py += t * velocity[i, 1]
                     pz += t * velocity[i, 2]
-                px, py, pz = _at_time(px, py, pz, t, twists)
+                px, py, pz = _at_time(px, py, pz, t, image.twists)
                 x[k], y[k], z[k], time_s[k] = px - origin[0], py - origin[1], pz - origin[2], t
         for k in range(size):
             column[k] = _column(_azimuth(x[k], y[k]), num_columns)
         for k in range(size):
-            ground = np.sqrt(x[k] * x[k] + y[k] * y[k])
-            row = _row(_azimuth(ground, z[k]), row_edges_rad)
-            # Where a turning scanner begins and ends its revolution it skips or repeats a sector.
-            settled = abs(offset_s[column[k]] - time_s[k]) < _SETTLED_S
-            if row < 0 or not settled or num_filled[row, column[k]] < min_filled:
+            i, ground = start + k, np.sqrt(x[k] * x[k] + y[k] * y[k])
+            r, c = _row(_azimuth(ground, z[k]), row_edges_rad), column[k]
+            if r < 0 or image.num_filled[r, c] < min_filled:
                 continue
             range_m = np.sqrt(ground * ground + z[k] * z[k])
             margin_m = max(margins[0], margins[1] * range_m)
-            if nearest_m[row, column[k]] > range_m + margin_m:
-                free[start + k] = True
+            away_s = abs(image.offset_s[0 if by_azimuth else r, c] - time_s[k])
+            if by_azimuth:
+                # Where a turning scanner begins and ends its turn it skips or repeats a sector.
+                if away_s > image.settled_s:
+                    continue
+            else:
+                away_s += image.spread_s[r, c]
+                vx = velocity[i, 0] if moving else _ZERO
+                vy = velocity[i, 1] if moving else _ZERO
+                vz = velocity[i, 2] if moving else _ZERO
+                twist = image.twists[0 if time_s[k] < _ZERO else 1]
+                margin_m += away_s * _speed(
+                    points[i, 0], points[i, 1], points[i, 2], vx, vy, vz, twist
+                )
+            if image.nearest_m[r, c] > range_m + margin_m:
+                free[i] = True

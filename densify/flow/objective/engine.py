@@ -17,7 +17,7 @@ def estimate_motion(scene: Scene, settings: Config, argument: str) -> Motion:
     def step(here: int, there: int) -> FlowField:
         return _step(scene, here, there, settings)
 
-    return ChainedMotion(scene.stretch, step, settings.flow.max_gap_m)
+    return ChainedMotion(scene.stretch, step, settings.objective.max_gap_m)
 
 
 def _step(scene: Scene, here: int, there: int, settings: Config) -> FlowField:
@@ -29,7 +29,7 @@ def _step(scene: Scene, here: int, there: int, settings: Config) -> FlowField:
     above, above_there = (scene.ground.above(c) >= scene.min_height_m for c in clouds)
     field = FlowField.zero(len(above))
     if above.any() and above_there.any():
-        pair = flow_between(clouds[0][above], clouds[1][above_there], settings.flow)
+        pair = flow_between(clouds[0][above], clouds[1][above_there], settings.objective)
         R_world_lidar = scene.stretch.sweeps[here].T_world_lidar[:3, :3]
         field.displacement[above] = pair.displacement @ R_world_lidar
         field.moving[above] = pair.moving

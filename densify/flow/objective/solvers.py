@@ -32,7 +32,7 @@ _TINY = 1e-300  # keeps 0 / 0 at 0
 
 
 @dataclass(frozen=True)
-class ObjectiveSettings:
+class SolverSettings:
     """What is minimised and how; the defaults are the paper's, but for the solver.
 
     solver: "pcg" or "adam".
@@ -102,7 +102,7 @@ class Solution:
 def solve(
     source: ArrayLike,
     target: ArrayLike,
-    settings: ObjectiveSettings | None = None,
+    settings: SolverSettings | None = None,
     initial: ArrayLike | None = None,
     device: str = "cpu",
 ) -> Solution:
@@ -119,7 +119,7 @@ def solve(
     Raises InputError for no points, wrong shapes, NaN, or a device that is not there.
     """
     trace = _Trace(time.perf_counter())
-    settings = settings or ObjectiveSettings()
+    settings = settings or SolverSettings()
     _require_device(device)
     moving = _cloud(source, "source")
     fixed = _cloud(target, "target")
@@ -145,10 +145,10 @@ class _Problem:
     target: NeighborIndex
     laplacian: Tensor
     diagonal: Tensor
-    settings: ObjectiveSettings
+    settings: SolverSettings
 
 
-def _pose(source: Float, target: Float, settings: ObjectiveSettings, device: str) -> _Problem:
+def _pose(source: Float, target: Float, settings: SolverSettings, device: str) -> _Problem:
     if settings.radius_m is None:
         weights = graph.knn_graph(source, settings.num_neighbors)
     else:

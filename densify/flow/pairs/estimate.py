@@ -14,10 +14,10 @@ import torch
 from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
-from densify.config import Config, FlowSettings, resolve
+from densify.config import Config, ObjectiveSettings, resolve
 from densify.errors import InputError
 from densify.flow.objective.neighbors import require_points
-from densify.flow.objective.solvers import ObjectiveSettings, solve
+from densify.flow.objective.solvers import SolverSettings, solve
 from densify.flow.pairs.hypotheses import Standing
 from densify.flow.pairs.movers import find_movers
 from densify.flow.tracking.evidence import link
@@ -57,9 +57,9 @@ def estimate_flow(
     source_lidar, target_lidar: (N,), (M,) whole numbers, which scanner measured each point, both or
     neither: each scanner's points are compared with its own, for each sees a mover at another time.
 
-    With ``flow.static_prior`` only groups of points move whose motion explains in both clouds what
-    standing still leaves unexplained; the flow of all others is exactly 0, as it is farther than
-    400 m from the middle. ``flow.engine=paper`` takes the published objective's flow for them.
+    With ``objective.static_prior`` only groups of points move whose motion explains in both clouds
+    what standing still leaves unexplained; the flow of all others is exactly 0, as it is farther
+    than 400 m from the middle. ``flow.engine=paper`` takes the published objective's flow for them.
     Without the prior every point takes the objective's flow.
 
     Raises InputError for no points, wrong shapes or NaN.
@@ -68,8 +68,8 @@ def estimate_flow(
     clouds = _as_cloud(source, "source"), _as_cloud(target, "target")
     lags = _lags(_columns(source_offset_ns, target_offset_ns, clouds, "offset_ns"))
     lidars = _columns(source_lidar, target_lidar, clouds, "lidar")
-    if not settings.flow.static_prior or settings.flow.engine == "paper":
-        return flow_between(*clouds, settings.flow, initial)
+    if not settings.objective.static_prior or settings.flow.engine == "paper":
+        return flow_between(*clouds, settings.objective, initial)
     start = None if initial is None else _as_cloud(initial, "initial")
     if start is not None and start.shape != clouds[0].shape:
         raise InputError(
@@ -79,11 +79,14 @@ def estimate_flow(
 
 
 def flow_between(
-    source: ArrayLike, target: ArrayLike, settings: FlowSettings, initial: ArrayLike | None = None
+    source: ArrayLike,
+    target: ArrayLike,
+    settings: ObjectiveSettings,
+    initial: ArrayLike | None = None,
 ) -> FlowField:
     """The published objective's flow; with ``static_prior`` only of groups that it certainly
     moves. Arguments and errors as `estimate_flow`."""
-    objective = ObjectiveSettings(
+    objective = SolverSettings(
         solver=settings.solver,
         alpha=settings.alpha,
         num_neighbors=settings.num_neighbors,
@@ -196,7 +199,7 @@ def _lags(times_ns: tuple[Int, Int] | None) -> tuple[Float, Float] | None:
     return first, second
 
 
-def _device(settings: FlowSettings) -> str:
+def _device(settings: ObjectiveSettings) -> str:
     if settings.device != "auto":
         return settings.device
     return "cuda" if torch.cuda.is_available() else "cpu"

@@ -2,21 +2,17 @@
 """Every knob of the pipeline, in one place: a frozen dataclass per stage, collected in `Config`.
 
 To add a knob, add one line to a section here and run ``python tests/test_config.py``, which writes
-its line into configs/default.yaml. To add a section, add its class and one line in `Config`.
+its line into configs/default.yaml. To add a section, add its class and one line in `Config`. A knob
+that goes or moves gets a line in `REPLACED`.
 """
 
 from __future__ import annotations
 
 import dataclasses
-import difflib
-import typing
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
 
 from densify.errors import InputError
-from densify.knobs import Section, checked, knob
+from densify.knobs import Section, knob
 from densify.plugins import engines
 
 
@@ -94,17 +90,24 @@ class FlowSettings(Section):
         True,
         "objects bend about their rigid motion (swinging limbs) as far as held-out sweeps confirm",
     )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        engines.check_spec(self.engine)
+
+
+@dataclass(frozen=True)
+class ObjectiveSettings(Section):
+    """The published objective: engine paper, and the flow of two files without static_prior."""
+
     solver: str = knob(
         "pcg",
-        "of the objective (engine paper, or densify flow without static_prior). pcg: conjugate "
-        "gradients, fast; adam: 1,500 steps as published",
+        "pcg: conjugate gradients, fast; adam: 1,500 steps as published",
         choices=("pcg", "adam"),
     )
-    alpha: float = knob(
-        10.0, "of the objective: weight of smoothness; larger moves neighbours more alike", 0, 1e6
-    )
+    alpha: float = knob(10.0, "weight of smoothness; larger moves neighbours more alike", 0, 1e6)
     num_neighbors: int = knob(
-        50, "of the objective: neighbours in the graph; more is stiffer and slower", 1, 500
+        50, "neighbours of a point in the graph; more is stiffer and slower", 1, 500
     )
     radius_m: float | None = knob(
         None,
@@ -114,28 +117,22 @@ class FlowSettings(Section):
     )
     laplacian: str = knob(
         "symmetric",
-        "of the objective. symmetric: as published; row-sum-zero: leaves a constant flow free",
+        "of the graph. symmetric: as published; row-sum-zero: leaves a constant flow free",
         choices=("symmetric", "row-sum-zero"),
-    )
-    max_gap_m: float = knob(
-        0.5,
-        "[m] of chained flow (engine paper): a moved point farther than this from the next sweep's "
-        "moving points is lost",
-        0.01,
-        10,
     )
     static_prior: bool = knob(
         True,
         "points not proven to move keep exactly their rigid place; off moves every point, with "
         "engine paper and in the flow of two files",
     )
-    device: str = knob(
-        "auto", "of the objective; auto: CUDA where there is one", choices=("auto", "cpu", "cuda")
+    max_gap_m: float = knob(
+        0.5,
+        "[m] where flow between neighbouring sweeps is chained (engines paper and npz): a moved "
+        "point farther than this from the next sweep's moving points is lost",
+        0.01,
+        10,
     )
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        engines.check_spec(self.engine)
+    device: str = knob("auto", "auto: CUDA where there is one", choices=("auto", "cpu", "cuda"))
 
 
 @dataclass(frozen=True)
@@ -271,141 +268,23 @@ class Config:
     register: RegisterSettings = dataclasses.field(default_factory=RegisterSettings)
     ground: GroundSettings = dataclasses.field(default_factory=GroundSettings)
     flow: FlowSettings = dataclasses.field(default_factory=FlowSettings)
+    objective: ObjectiveSettings = dataclasses.field(default_factory=ObjectiveSettings)
     accumulate: AccumulateSettings = dataclasses.field(default_factory=AccumulateSettings)
     project: ProjectSettings = dataclasses.field(default_factory=ProjectSettings)
     output: OutputSettings = dataclasses.field(default_factory=OutputSettings)
 
 
-def resolve(
-    config: Config | str | Path | Mapping[str, Any] | None = None, overrides: Sequence[str] = ()
-) -> Config:
-    """The configuration that `config` and the overrides name.
-
-    config: None for the defaults; a Config; a mapping ``{section: {key: value}}``; a Path to a YAML
-        file of that form; or a str, the name of a preset (`presets`) or else a file. Only
-        differences from the defaults need to be named.
-    overrides: ``section.key=value`` each, values written as in YAML; later ones win.
-
-    Raises InputError for anything unknown (suggesting the right name), of the wrong type or out of
-    range, naming the file or ``--set`` it comes from.
-    """
-    if isinstance(config, Config):
-        values = as_mapping(config)
-    else:
-        values = as_mapping(Config())
-        if isinstance(config, Mapping):
-            _apply(values, config, "configuration")
-        elif isinstance(config, str | Path):
-            path = _config_path(config)
-            _apply(values, _read_yaml(_read_text(path), str(path)) or {}, str(path))
-        elif config is not None:
-            raise InputError(
-                f"configuration: got {type(config).__name__}, expected a densify.Config, a "
-                f"mapping, or the name of a preset or YAML file"
-            )
-    for override in overrides:
-        _apply(values, _parse_override(override), f"--set {override}")
-    return Config(**{name: section(**values[name]) for name, section in _sections().items()})
-
-
-def as_mapping(config: Config) -> dict[str, dict[str, Any]]:
-    """Plain ``{section: {key: value}}``, every key; ``resolve(as_mapping(config)) == config``."""
-    return dataclasses.asdict(config)
-
-
-def presets() -> dict[str, Path]:
-    """Preset name -> its YAML file."""
-    inside = Path(__file__).parent / "configs"  # installed
-    folder = inside if inside.is_dir() else Path(__file__).parents[1] / "configs"  # checkout
-    return {path.stem: path for path in sorted(folder.glob("*.yaml"))}
-
-
-def _config_path(name: str | Path) -> Path:
-    if isinstance(name, str) and name in presets():
-        return presets()[name]
-    path = Path(name)
-    if path.is_file():
-        return path
-    raise InputError(
-        f"configuration {name}: no such preset or file; "
-        f"{_suggestion(str(name), list(presets()), 'preset')}"
+REPLACED = {
+    f"flow.{key}": f"objective.{key}"
+    for key in (
+        "solver",
+        "alpha",
+        "num_neighbors",
+        "radius_m",
+        "laplacian",
+        "max_gap_m",
+        "static_prior",
+        "device",
     )
-
-
-def _read_text(path: Path) -> str:
-    try:
-        return path.read_text("utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: cannot be read as a YAML file: {error}") from error
-
-
-def _read_yaml(text: str, where: str) -> Any:
-    """Parsed YAML, None for an empty text; a key given twice is an error."""
-    import yaml
-
-    class Loader(yaml.SafeLoader):
-        def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
-            keys = [str(key.value) for key, _ in node.value]
-            for key in keys:
-                if keys.count(key) > 1:
-                    line = node.start_mark.line + 1
-                    raise InputError(f"{where}: {key} is given twice from line {line} on; keep one")
-            return super().construct_mapping(node, deep)
-
-    try:
-        return yaml.load(text, Loader)
-    except (yaml.YAMLError, ValueError) as error:  # ValueError: a date that is none, say
-        reason = " ".join(str(error).split())
-        raise InputError(f"{where}: not YAML: {reason}") from error
-
-
-def _parse_override(override: str) -> Mapping[str, Any]:
-    name, equals, text = override.partition("=")
-    section, dot, key = name.strip().partition(".")
-    if not (equals and dot and section and key):
-        raise InputError(f"--set {override}: expected section.key=value, for example flow.alpha=5")
-    value = _read_yaml(text, f"--set {override}")
-    return {section: {key: value if text.strip() else ""}}
-
-
-def _apply(values: dict[str, dict[str, Any]], changes: Any, where: str) -> None:
-    """Write the checked `changes` over `values`."""
-    _require_mapping(changes, where, "sections")
-    for name, keys in changes.items():
-        if name not in values:
-            raise InputError(
-                f"{where}: unknown section {name}; {_suggestion(name, list(values), 'section')}"
-            )
-        _require_mapping(keys, f"{where}: section {name}", "keys")
-        for key, value in keys.items():
-            if key not in values[name]:
-                hint = _key_suggestion(name, str(key), values)
-                raise InputError(f"{where}: unknown key {name}.{key}; {hint}")
-            values[name][key] = checked(_sections()[name], key, value, f"{where}: ")
-
-
-def _sections() -> dict[str, Any]:
-    """Section name -> its class."""
-    return typing.get_type_hints(Config)
-
-
-def _require_mapping(value: Any, where: str, content: str) -> None:
-    if not isinstance(value, Mapping):
-        raise InputError(
-            f"{where}: got {value!r}, expected a mapping of {content}, for example "
-            f"flow: {{alpha: 5}}"
-        )
-
-
-def _key_suggestion(section: str, key: str, values: Mapping[str, Mapping[str, Any]]) -> str:
-    """The same key in another section, else the nearest one of this."""
-    for other, keys in values.items():
-        if key in keys:
-            return f"did you mean {other}.{key}?"
-    return _suggestion(key, list(values[section]), f"{section} key")
-
-
-def _suggestion(got: str, known: Sequence[str], kind: str) -> str:
-    close = difflib.get_close_matches(str(got), known, n=1, cutoff=0.6)
-    hint = f"did you mean {close[0]}? " if close else ""
-    return f"{hint}expected a {kind}: {', '.join(known)}"
+}
+"""Knobs that were once called otherwise: the old name -> what to give instead."""
