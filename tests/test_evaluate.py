@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 from dataclasses import asdict
 from pathlib import Path
 
@@ -133,6 +134,74 @@ def test_the_ground_truth_of_a_whole_kitti_tree(tmp_path: Path) -> None:
     pairs = pair_depth_files(tmp_path / "out", tmp_path / "t")
     assert pairs == type(pairs)((DepthPair(found, truth),))
     assert "velodyne_raw" in refusal(tmp_path / "t", tmp_path / "t")
+
+
+def tree(root: Path, drive: str, product: str, frame: int, camera: str = "front") -> Path:
+    return root / drive / "proj_depth" / product / camera / f"{frame:010d}.png"
+
+
+TREE = ("velodyne_raw", "groundtruth", "groundtruth_filled", "confidence")
+NAMES = ("street-street_seed-0", "scene-0061", DRIVE)
+
+
+@pytest.mark.parametrize(("filled", "product"), [(False, "groundtruth"), (True, TREE[2])])
+def test_a_set_in_kittis_layout(tmp_path: Path, filled: bool, product: str) -> None:
+    """As PREDICTED and as TRUTH, whatever its drives are called."""
+    made, truth = tmp_path / "set", tmp_path / "truth"
+    for drive in NAMES:
+        for frame in (5, 7):
+            for kind in TREE:
+                put(tree(made / "train", drive, kind, frame))
+            put(tree(truth, drive, "groundtruth", frame))
+    put(tree(truth, "another", "groundtruth", 5))
+    pairs = pair_depth_files(made, truth, filled=filled)
+    assert {(p.predicted, p.truth) for p in pairs.pairs} == {
+        (tree(made / "train", drive, product, f), tree(truth, drive, "groundtruth", f))
+        for drive in NAMES
+        for f in (5, 7)
+    }
+    assert pairs.without_truth == () and len(pairs.without_prediction) == 1
+    both = pair_depth_files(made, made, filled=filled).pairs
+    assert len(both) == 6 and all("/groundtruth/" in p.truth.as_posix() for p in both)
+    one = pair_depth_files(made / "train" / NAMES[1], truth).pairs
+    assert {p.truth.parents[3].name for p in one} == {NAMES[1]}
+
+
+@pytest.mark.parametrize(("filled", "product"), [(False, "depth"), (True, "depth_filled")])
+def test_a_set_of_runs(tmp_path: Path, filled: bool, product: str) -> None:
+    made, truth = tmp_path / "set", tmp_path / "truth"
+    for drive in NAMES:
+        for kind in ("depth", "depth_filled", "confidence", "age"):
+            put(own(made / drive, 5, kind, "front"))
+        put(made / drive / "000005" / "figure.png")
+        put(tree(truth, drive, "groundtruth", 5))
+    expected = {
+        (own(made / d, 5, product, "front"), tree(truth, d, "groundtruth", 5)) for d in NAMES
+    }
+    pairs = pair_depth_files(made, truth, filled=filled).pairs
+    assert {(p.predicted, p.truth) for p in pairs} == expected
+    assert len(pair_depth_files(made, made, filled=filled).pairs) == 3
+    # A folder that is no drive's says nothing: two drives are too many for it, one is not.
+    made.joinpath(NAMES[0]).rename(tmp_path / "runs")
+    assert "one drive" in refusal(tmp_path, truth)
+    alone = pair_depth_files(tmp_path / "runs", truth / NAMES[0]).pairs
+    assert [p.truth for p in alone] == [tree(truth, NAMES[0], "groundtruth", 5)]
+
+
+@pytest.mark.parametrize("layout", ["kitti-depth", "densify"])
+def test_what_dataset_made(layout: str, tmp_path: Path, border_drive: Path, capsys) -> None:
+    """The whole way: two drives made, one set is evaluated against the other."""
+    other = shutil.copytree(border_drive.parent, tmp_path / "raw") / border_drive.name
+    other = other.rename(other.with_name("night_drive"))
+    options = ["--method", "none", "--keys", "39:41", "--layout", layout]
+    out = tmp_path / "out"
+    arguments = ["dataset", "--data", border_drive, other, *options, "--out", out]
+    assert main([str(argument) for argument in arguments]) == 0
+    capsys.readouterr()
+    assert main(["evaluate", str(out), str(out)]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].startswith("4 images: ") and not lines[1].startswith("truth")
+    assert " 100.0 % " in next(line for line in lines if line.startswith("all "))
 
 
 def test_masks_pair_too_and_may_be_missing(tmp_path: Path) -> None:

@@ -292,8 +292,8 @@ def _add_evaluate(commands: Any) -> None:
         "PREDICTED and TRUTH: a depth PNG (KITTI's format) each, or folders, of which every PNG "
         "is paired by drive, camera and frame: KITTI depth trees "
         "(DRIVE/proj_depth/groundtruth/image_02/0000000005.png), densify's output "
-        "(000005/depth/image_02.png), or plain folders of equal names. A pixel that PREDICTED "
-        "lacks costs coverage and is no error. Numbers are means over images.",
+        "(000005/depth/image_02.png), sets of densify dataset, or plain folders of equal names. A "
+        "pixel that PREDICTED lacks costs coverage and is no error. Numbers are means over images.",
     )
     parser.add_argument("predicted", metavar="PREDICTED", type=Path, help="a PNG or a folder")
     parser.add_argument("truth", metavar="TRUTH", type=Path, help="a PNG or a folder")
@@ -305,7 +305,9 @@ def _add_evaluate(commands: Any) -> None:
         "pixels too",
     )
     parser.add_argument(
-        "--filled", action="store_true", help="of densify's output, score depth_filled"
+        "--filled",
+        action="store_true",
+        help="of what densify made, score depth_filled (of a set, groundtruth_filled)",
     )
     parser.add_argument(
         "--focal-px",

@@ -6,21 +6,25 @@ camera and frame, whatever layout each side has::
     <drive>_sync_<product>_0000000005_image_02.png          KITTI's selected validation images
     [<drive>/]000005/depth/image_02.png                     densify's own output (or depth_filled)
     [<drive>/][image_02/]0000000005.png, scene_a.png        plain folders; the name is the frame
+
+The sets of `densify dataset` are of the first or of the third layout. A drive is KITTI's dated name
+wherever it stands in a path, or the name of the folder in that place. The folder around keys may be
+just any that a run wrote to: its name counts only if the other side knows a drive of that name.
 """
 
 from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from densify.errors import InputError
 
 _DRIVE = re.compile(r"(?P<drive>\d{4}_\d\d_\d\d_drive_\d{4})(?:_sync|_extract)?")
 _CAMERA = re.compile(r"(?<![^/])(?P<camera>image_\d\d)(?![^/])")
-_KITTI_TREE = re.compile(
-    _DRIVE.pattern + r"/proj_depth/(?P<product>[^/]+)/(?P<camera>[^/]+)/(?P<frame>\d+)\.png$"
+_DEPTH_TREE = re.compile(
+    r"/(?P<folder>[^/]+)/proj_depth/(?P<product>[^/]+)/(?P<camera>[^/]+)/(?P<frame>\d+)\.png$"
 )
 _KITTI_SELECTION = re.compile(
     _DRIVE.pattern + r"_(?P<product>[a-z_]+)_(?P<frame>\d+)_(?P<camera>image_\d\d)\.png$"
@@ -29,6 +33,8 @@ _OWN_OUTPUT = re.compile(
     r"/(?P<frame>\d{6,})/(?P<product>depth|depth_filled)/(?P<camera>[^/]+)\.png$"
 )
 _TRUTH_PRODUCTS = ("groundtruth", "groundtruth_depth")
+_MEASURED, _FILLED = ("depth", "groundtruth"), ("depth_filled", "groundtruth_filled")
+_OURS = ("depth", *_FILLED, "confidence")  # no other trees have these
 
 
 @dataclass(frozen=True)
@@ -54,11 +60,14 @@ class DepthPairs:
 
 @dataclass(frozen=True)
 class _File:
+    """folder: around the key, perhaps its drive, where no drive is told."""
+
     path: Path
     frame: str
     drive: str | None
     camera: str | None
     product: str | None
+    folder: str | None = None
 
 
 def pair_depth_files(
@@ -68,9 +77,9 @@ def pair_depth_files(
 
     predicted, truth, mask: a file or a folder with everything under it each; two files are a pair
     whatever their names. What only one side's names say (the drive, the camera) is not compared.
-    Where a folder holds a layout other than the plain one, files outside it are no depth maps; of
-    densify's output ``depth`` is taken, or ``depth_filled`` if ``filled``; of a truth that has
-    KITTI's ``groundtruth`` nothing else.
+    Where a folder holds a layout other than the plain one, files outside it are no depth maps. Of
+    what densify made the measured maps are taken (``depth``, or ``groundtruth`` of a set), or the
+    filled ones if ``filled``; of a truth that has KITTI's ``groundtruth`` nothing else.
 
     Raises InputError if a place is missing, names are ambiguous, or nothing pairs.
     """
@@ -106,7 +115,7 @@ def pair_depth_files(
 def _found(place: Path, what: str) -> list[_File]:
     """The PNG files of a place, ordered by path; plain ones only if there are no others."""
     if place.is_file():
-        return [_parsed(place)]
+        return [_parsed(place, place.parent)]
     if not place.is_dir():
         raise InputError(f"{what} {place}: no such file or folder")
     # Hidden ones are unfinished results.
@@ -117,18 +126,21 @@ def _found(place: Path, what: str) -> list[_File]:
     ]
     if not paths:
         raise InputError(f"{what} {place}: holds no PNG files, expected depth maps")
-    files = [_parsed(path) for path in sorted(paths)]
+    files = [_parsed(path, place) for path in sorted(paths)]
     return [file for file in files if file.product is not None] or files
 
 
-def _parsed(path: Path) -> _File:
+def _parsed(path: Path, place: Path) -> _File:
     text = path.absolute().as_posix()
-    for layout in (_KITTI_TREE, _KITTI_SELECTION, _OWN_OUTPUT):
+    for layout in (_DEPTH_TREE, _KITTI_SELECTION, _OWN_OUTPUT):
         if match := layout.search(text):
             parts = match.groupdict()
-            drive = parts.get("drive") or _last(_DRIVE, text[: match.start()], "drive")
             frame = str(int(parts["frame"]))
-            return _File(path, frame, drive, parts["camera"], parts["product"])
+            above = text[: match.end("folder") if layout is _DEPTH_TREE else match.start()]
+            drive = parts.get("drive") or _last(_DRIVE, above, "drive") or parts.get("folder")
+            around = path.relative_to(place).parts[:-3] if layout is _OWN_OUTPUT else ()
+            folder = around[-1] if around else None
+            return _File(path, frame, drive, parts["camera"], parts["product"], folder)
     folder = path.absolute().parent.as_posix()
     frame = str(int(path.stem)) if path.stem.isdecimal() else path.stem
     return _File(
@@ -142,26 +154,36 @@ def _last(pattern: re.Pattern[str], text: str, name: str) -> str | None:
 
 
 def _product(files: Sequence[_File], place: Path, filled: bool) -> list[_File]:
-    """Of densify's own output one product."""
+    """One product of what densify made."""
     if filled:
-        wanted = [file for file in files if file.product == "depth_filled"]
+        wanted = [file for file in files if file.product in _FILLED]
         if not wanted:
-            raise InputError(f"--filled: {place}: holds no depth_filled maps; leave --filled out")
+            raise InputError(
+                f"--filled: {place}: holds no {' or '.join(_FILLED)} maps; leave --filled out"
+            )
         return wanted
-    if any(file.product == "depth" for file in files):
-        return [file for file in files if file.product != "depth_filled"]
-    return list(files)
+    ours = any(file.product in _OURS for file in files)
+    return [file for file in files if ours and file.product in _MEASURED] or list(files)
 
 
 def _match(
     left: Sequence[_File], right: Sequence[_File], left_place: Path, right_place: Path
 ) -> dict[Path, Path]:
     """Right path to left path, by frame and by what all the files of both sides say."""
+    left, right = _with_drives(left, right), _with_drives(right, left)
     everything = (*left, *right)
     told = [n for n in ("drive", "camera") if all(getattr(f, n) is not None for f in everything)]
     names = ["frame", *told]
     here, there = _keyed(left, names, left_place), _keyed(right, names, right_place)
     return {path: here[key] for key, path in there.items() if key in here}
+
+
+def _with_drives(files: Sequence[_File], others: Sequence[_File]) -> Sequence[_File]:
+    """Take the folders around the keys for drives if the others know one of that name."""
+    known = {file.drive or file.folder for file in others}
+    if not any(file.folder in known for file in files if file.folder is not None):
+        return files
+    return [replace(file, drive=file.drive or file.folder) for file in files]
 
 
 def _keyed(
