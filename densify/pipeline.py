@@ -1,54 +1,48 @@
 # SPDX-License-Identifier: MIT
-"""The pipeline, as a story: read, register, deskew, ground, flow, accumulate, project."""
+"""The pipeline, as a story: what is asked of a recording, for one key or for a thousand.
+
+`densify` is the whole of it: the window of a key is registered and deskewed, everything in it is
+brought to the key's moment, and each camera looks at the accumulated cloud. How the steps before
+the cloud are made, once for all keys that share them, is told by `densify.recording`.
+"""
 
 from __future__ import annotations
 
-import resource
-import sys
-import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from itertools import pairwise
+import logging
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from densify.config import Config, RegisterSettings, resolve
-from densify.depth.accumulate import accumulate
+from densify.cache import Cache
+from densify.config import Config, resolve
+from densify.costs import Watch
 from densify.depth.age import with_ages
 from densify.depth.views import HeldOut, Views
-from densify.errors import InputError
-from densify.flow.engines import check_engine, estimate_motion
-from densify.flow.scene import Scene
-from densify.geometry.ground import ground
-from densify.geometry.height_map import HeightMap
+from densify.errors import ComputationError, InputError
+from densify.flow.engines import check_engine
 from densify.geometry.range_image import RangeImage
-from densify.readers.window import choose_cameras, read_sweeps, recorded_trajectory, window_frames
-from densify.registration.deskew import deskew
-from densify.registration.odometry import check_overlap, check_plausible, register
+from densify.readers.window import choose_cameras
+from densify.recording import Recording
 from densify.scores import depth_metrics
 from densify.scores import ghosts as scores
 from densify.types import (
     Camera,
     Cloud,
     DepthMap,
-    FlowField,
     LidarSequence,
-    Motion,
     Progress,
     RegisteredSweep,
     Result,
-    StageCost,
     Stretch,
     StretchFlow,
-    Sweep,
-    Trajectory,
     Truth,
 )
 
 Image = NDArray[np.uint8]
+_log = logging.getLogger("densify")
 
 
 class Method(NamedTuple):
@@ -91,17 +85,49 @@ def run(
 ) -> Result:
     """Densify one key.
 
-    key: absolute frame number. window: sweeps on each side of it; cut at the ends of the recording,
-    with a warning. method: none, icp or flow, see `METHODS`. cameras: names, all if None. config:
-    what `densify.config.resolve` takes. progress: called with (stage, done, total).
+    key: absolute frame number. window: sweeps on each side of it, of those that exist; it is cut,
+    with a warning, at the ends of the recording, at a hole in time of more than three usual
+    periods, and at a sweep that cannot be read or registered. method: none, icp or flow, see
+    `METHODS`. cameras: names, all if None. config: what `densify.config.resolve` takes. progress:
+    called with (stage, done, total).
 
     The result carries its baselines. Raises InputError for what cannot be used, ComputationError
     where registration went wrong.
     """
-    if method not in RUN:
-        raise InputError(f"--method {method}: expected one of {', '.join(RUN)}")
-    methods = RUN[: RUN.index(method) + 1]
-    return compare(sequence, key, window, cameras, config, progress, methods)[method]
+    return compare(sequence, key, window, cameras, config, progress, with_baselines(method))[method]
+
+
+def run_keys(
+    sequence: LidarSequence,
+    keys: Sequence[int],
+    window: int = 5,
+    method: str = "flow",
+    cameras: Sequence[str] | None = None,
+    config: ConfigLike = None,
+    progress: Progress | None = None,
+    cache: Cache | None = None,
+) -> Iterator[tuple[int, Result | ComputationError | InputError]]:
+    """Densify several keys, ascending, and yield each with its result, or with what went wrong.
+
+    Keys whose windows overlap share registration, ground and motion, which is then followed over
+    all their sweeps: a key may come out a little better than by itself, and a second key near the
+    first costs a fraction of it. cache: keeps what is shared on disk. The rest as `run`.
+
+    Raises InputError at once for what no key could be made with.
+    """
+    settings, methods, watch = resolve(config), with_baselines(method), Watch(progress)
+    _check(settings, methods)
+    choose_cameras(sequence, cameras)
+    recording = Recording(sequence, settings, window, keys, cache, watch=watch)
+
+    def results() -> Iterator[tuple[int, Result | ComputationError | InputError]]:
+        for key in sorted(set(keys)):
+            try:
+                yield key, densify(recording, key, methods, cameras, watch)[method]
+            except (ComputationError, InputError) as error:
+                yield key, error
+
+    return results()
 
 
 def compare(
@@ -112,56 +138,63 @@ def compare(
     config: ConfigLike = None,
     progress: Progress | None = None,
     methods: Sequence[str] = COMPARED,
+    cache: Cache | None = None,
 ) -> dict[str, Result]:
     """Methods by name on the same registration, each with those before it as its baselines.
 
-    methods: some of `METHODS`. The rest as `run`.
+    methods: some of `METHODS`. cache: keeps what the steps before the cloud make. The rest as
+    `run`.
     """
-    for name in methods:
-        if name not in METHODS:
-            raise InputError(f"--methods {name}: expected some of {', '.join(METHODS)}")
-    settings = resolve(config)
-    check_engine(settings.flow.engine)
-    chosen = choose_cameras(sequence, cameras)
-    frames, lead_in = window_frames(sequence, key, window, settings.register.num_lead_in)
-    watch = Watch(progress)
+    settings, watch = resolve(config), Watch(progress)
+    _check(settings, methods)
+    recording = Recording(sequence, settings, window, [key], cache, watch=watch)
+    return densify(recording, key, methods, cameras, watch)
 
-    with watch.stage("images"):
-        images = {camera.name: sequence.image(camera.name, key) for camera in chosen}
-    stretch = _registered(sequence, lead_in, frames, settings, watch)
-    with watch.stage("ground"):
-        heights = ground(stretch, settings.ground)
 
-    def motion(engine: str) -> Motion:
-        return motion_by(engine, stretch, heights, settings)
-
-    moments = {name: _key_moment(stretch, key, name, motion, settings, watch) for name in methods}
-    return _results(sequence, stretch, key, moments, chosen, images, settings, watch)
+def with_baselines(method: str) -> tuple[str, ...]:
+    """A method of `RUN` behind the simpler ones. Raises InputError for another one."""
+    if method not in RUN:
+        raise InputError(f"--method {method}: expected one of {', '.join(RUN)}")
+    return RUN[: RUN.index(method) + 1]
 
 
 def densify(
-    sequence: LidarSequence,
-    stretch: Stretch,
+    recording: Recording,
     key: int,
-    motion: Callable[[], Motion],
-    cameras: Sequence[str] | None,
-    settings: Config,
     methods: Sequence[str],
-    images: Mapping[str, Image] | None = None,
+    cameras: Sequence[str] | None = None,
+    watch: Watch | None = None,
+    with_images: bool = True,
 ) -> dict[str, Result]:
-    """Methods by name for one key whose stretch is registered and whose motion is known.
+    """One key of a recording by several methods, each with those before it as its baselines.
 
-    motion: gives that of at least the stretch. methods: of `METHODS`, none with an engine of its
-    own. images: by camera; without them nothing is coloured, nor compared with the truth. The rest
-    as `compare`.
+    methods: of `METHODS`. with_images: the cloud takes the images' colours, and depth is compared
+    with the truth where there is some. Errors as `run`.
     """
-    watch = Watch(None)
+    watch, sequence, settings = watch or Watch(), recording.sequence, recording.settings
     chosen = choose_cameras(sequence, cameras)
+    frames = recording.window_frames(key)
+    for cut in frames.cuts:
+        _log.warning("the window of key %d is cut: %s", key, cut)
+    images = None
+    if with_images:
+        with watch.stage("images"):
+            images = {camera.name: sequence.image(camera.name, key) for camera in chosen}
+    stretch = recording.window(key)
     moments = {
-        name: _key_moment(stretch, key, name, lambda _: motion(), settings, watch)
+        name: recording.moment(
+            key, METHODS[name].all_sweeps, METHODS[name].engine, settings.output.flow
+        )
         for name in methods
     }
     return _results(sequence, stretch, key, moments, chosen, images, settings, watch)
+
+
+def _check(settings: Config, methods: Sequence[str]) -> None:
+    for name in methods:
+        if name not in METHODS:
+            raise InputError(f"--methods {name}: expected some of {', '.join(METHODS)}")
+    check_engine(settings.flow.engine)
 
 
 def _results(
@@ -217,90 +250,6 @@ def _results(
     return results
 
 
-def _registered(
-    sequence: LidarSequence,
-    lead_in: Sequence[int],
-    frames: Sequence[int],
-    settings: Config,
-    watch: Watch,
-) -> Stretch:
-    sweeps = _read(sequence, [*lead_in, *frames], settings, watch)
-    with watch.stage("register"):
-        trajectory = find_trajectory(sequence, sweeps, settings.register)
-    with watch.stage("deskew"):
-        return deskew([s for s in sweeps if s.frame in frames], trajectory)
-
-
-def _read(
-    sequence: LidarSequence, frames: Sequence[int], settings: Config, watch: Watch
-) -> list[Sweep]:
-    with watch.stage("read"):
-        sweeps = []
-        for sweep in read_sweeps(sequence, frames, settings.register):
-            sweeps.append(sweep)
-            watch.step("read", len(sweeps), len(frames))
-    return sweeps
-
-
-def find_trajectory(
-    sequence: LidarSequence, sweeps: Sequence[Sweep], settings: RegisterSettings
-) -> Trajectory:
-    """Where the lidar was: the recording's own poses, or registration in two passes, whose first
-    finds the motion that bends raw sweeps.
-
-    sweeps: raw, consecutive frames ascending. settings: its ``source`` decides.
-    Raises ComputationError naming the frames where the poses cannot be right.
-    """
-    if settings.source == "dataset":
-        trajectory = recorded_trajectory(sequence, sweeps)
-        check_plausible(trajectory, settings)
-        check_overlap(sweeps, trajectory, settings)
-        return trajectory
-    rough = register(sweeps, settings)
-    straight = [s.sweep for s in deskew(sweeps, rough).sweeps]
-    return register(straight, settings, rough)
-
-
-def _key_moment(
-    stretch: Stretch,
-    key: int,
-    name: str,
-    motion_of: Callable[[str], Motion],
-    settings: Config,
-    watch: Watch,
-) -> tuple[Cloud, StretchFlow | None]:
-    """All sweeps at the key's moment as a method places them, and its flow where asked for.
-
-    motion_of: by engine.
-    """
-    method, flow = METHODS[name], None
-    used = stretch if method.all_sweeps else Stretch((stretch[key],))
-    fields = [FlowField.zero(len(s.sweep)) for s in used.sweeps]
-    if method.engine is not None:
-        with watch.stage("flow"):
-            motion = motion_of(method.engine or settings.flow.engine)
-            fields = [motion.flow(frame, key) for frame in stretch.frames]
-            if settings.output.flow:
-                flow = _steps(motion, stretch, key)
-    with watch.stage("accumulate"):
-        drop_lost = settings.accumulate.unfollowed == "drop"
-        return accumulate(used, fields, key, drop_lost), flow
-
-
-def motion_by(engine: str, stretch: Stretch, heights: HeightMap, settings: Config) -> Motion:
-    """How everything in a stretch moves, by that engine."""
-    return estimate_motion(Scene(stretch, heights, settings.flow.min_height_m), settings, engine)
-
-
-def _steps(motion: Motion, stretch: Stretch, key: int) -> StretchFlow:
-    """Flow of every sweep to the next one on the way to the key, and of the key to a neighbour."""
-    before = [f for f in stretch.frames if f <= key]
-    after = [f for f in reversed(stretch.frames) if f >= key]
-    own = [(key, key + 1 if key + 1 in stretch.frames else key - 1)] if stretch.frames[1:] else []
-    hops = [*pairwise(before), *pairwise(after), *own]
-    return StretchFlow(stretch, {hop: motion.flow(*hop) for hop in hops})
-
-
 def _scores(
     truth: Truth | None,
     cameras: Mapping[str, Camera],
@@ -333,34 +282,3 @@ def _scores(
             for name, maps in depth.items()
         }
     return metrics
-
-
-class Watch:
-    """Says which stage is at work, and what each has cost."""
-
-    def __init__(self, progress: Progress | None) -> None:
-        self._progress = progress
-        self._seconds: dict[str, float] = {}
-        self._peak_mb: dict[str, float] = {}
-
-    def step(self, name: str, done: int, total: int) -> None:
-        if self._progress is not None:
-            self._progress(name, done, total)
-
-    @contextmanager
-    def stage(self, name: str) -> Iterator[None]:
-        self.step(name, 0, 1)
-        start = time.perf_counter()
-        yield
-        self._seconds[name] = self._seconds.get(name, 0.0) + time.perf_counter() - start
-        self._peak_mb[name] = _peak_memory_mb()
-        self.step(name, 1, 1)
-
-    def costs(self) -> tuple[StageCost, ...]:
-        """So far; a stage that worked for several methods is counted once, in sum."""
-        return tuple(StageCost(n, s, self._peak_mb[n]) for n, s in self._seconds.items())
-
-
-def _peak_memory_mb() -> float:
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak / (1024 * 1024 if sys.platform == "darwin" else 1024)

@@ -15,7 +15,7 @@ from densify.registration.deskew import deskew
 from densify.types import Camera, Stretch, Sweep, SweepTruth, Trajectory
 
 SWEEP_S = 0.1
-EPOCH_NS = 1_317_000_000_123_456_789  # stamps of 19 digits, as real ones are
+EPOCH_NS = 1_317_000_000_000_000_789  # stamps of 19 digits, as real ones are
 KERB_Y_M, KERB_M = 4.0, 0.12
 LIDAR_HEIGHT_M = 1.73
 GROUND, NOTHING = -1, -2  # what a ray met, if no box

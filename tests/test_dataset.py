@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from densify.dataset import make
-from densify.dataset.cache import Cache
+from densify.cache import Cache
 from densify.dataset.drive import BLOCK, margin
 from densify.dataset.loader import DepthDataset
 from densify.dataset.plan import Recipe, Source

@@ -17,7 +17,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import densify
-from densify.dataset.cache import Cache, digest
+from densify.cache import Cache, digest
 
 LIMIT = 10**9
 VALUE = {"noise": np.random.default_rng(1).random((3000, 3)), "few": np.arange(5)}

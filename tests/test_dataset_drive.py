@@ -16,7 +16,7 @@ import pytest
 from densify import pipeline
 from densify.config import Config, resolve
 from densify.dataset import drive as shared
-from densify.dataset.cache import Cache
+from densify.cache import Cache
 from densify.dataset.drive import BLOCK, Drive
 from densify.errors import InputError, SweepError
 from densify.geometry import poses

@@ -169,7 +169,7 @@ DOORS: dict[str, str | tuple[str, ...]] = {
     "dask": "densify/dataset/workers.py",
     "distributed": "densify/dataset/workers.py",
     "embreex": "densify/street/world.py",
-    "joblib": "densify/dataset/cache.py",
+    "joblib": "densify/cache.py",
     "kiss_icp": "densify/registration/odometry.py",
     "laspy": "densify/outputs/cloud_laz.py",
     "numba": "densify/kernels/",

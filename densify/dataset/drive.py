@@ -26,7 +26,7 @@ from uuid import uuid4
 import numpy as np
 
 from densify.config import Config
-from densify.dataset.cache import Cache, digest
+from densify.cache import Cache, digest
 from densify.errors import InputError, SweepError
 from densify.flow.scene import Scene
 from densify.flow.tracking.evidence import REACH, Candidates, FreeSpace, find_candidates

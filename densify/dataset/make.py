@@ -13,7 +13,7 @@ from pathlib import Path
 from uuid import uuid4
 
 from densify.config import as_mapping
-from densify.dataset.cache import code
+from densify.cache import code
 from densify.dataset.drive import BLOCK, margin
 from densify.dataset.manifest import Key, KeyRecord, Manifest, finished, read_manifests
 from densify.dataset.plan import (

@@ -16,7 +16,7 @@ from pathlib import Path
 
 from densify import pipeline
 from densify.config import as_mapping
-from densify.dataset.cache import Cache, code
+from densify.cache import Cache, code
 from densify.dataset.drive import BLOCK, Drive, margin
 from densify.dataset.gate import scores_of
 from densify.dataset.manifest import KeyRecord

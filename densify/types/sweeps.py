@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -78,6 +79,28 @@ class Trajectory:
     stamp_ns: Int
     T_world_lidar: Float
 
+    def part(self, frames: Sequence[int]) -> Trajectory:
+        """The poses of these frames alone."""
+        rows = [self.frames.index(f) for f in frames]
+        return Trajectory(tuple(frames), self.stamp_ns[rows], self.T_world_lidar[rows])
+
+    def joined(self, following: Trajectory, frames: Sequence[int]) -> Trajectory:
+        """With these frames of another trajectory, which has this one's last frame too."""
+        T_world_last = self.T_world_lidar[-1]
+        T_other_last = following.T_world_lidar[following.frames.index(self.frames[-1])]
+        T_world_other = T_world_last @ poses.inverse(T_other_last)
+        part = following.part(frames)
+        return Trajectory(
+            self.frames + part.frames,
+            np.concatenate([self.stamp_ns, part.stamp_ns]),
+            np.concatenate([self.T_world_lidar, T_world_other @ part.T_world_lidar]),
+        )
+
+    def seen_from(self, frame: int) -> Trajectory:
+        """The same with that frame's lidar as the world."""
+        T_old_new = self.T_world_lidar[self.frames.index(frame)]
+        return replace(self, T_world_lidar=poses.inverse(T_old_new) @ self.T_world_lidar)
+
 
 @dataclass(frozen=True)
 class RegisteredSweep:
@@ -98,6 +121,21 @@ class RegisteredSweep:
     @property
     def frame(self) -> int:
         return self.sweep.frame
+
+    @staticmethod
+    def without_points(trajectory: Trajectory, frame: int) -> RegisteredSweep:
+        """The place and time of a sweep of the trajectory."""
+        i, nothing = trajectory.frames.index(frame), np.zeros(0)
+        sweep = Sweep(
+            frame=frame,
+            stamp_ns=int(trajectory.stamp_ns[i]),
+            points=np.zeros((0, 3)),
+            intensity=nothing.astype(np.float32),
+            offset_ns=None,
+            lidar=nothing.astype(np.uint8),
+            row=nothing.astype(np.int64),
+        )
+        return RegisteredSweep(sweep, trajectory.T_world_lidar[i], np.zeros(6), np.zeros(6))
 
 
 @dataclass(frozen=True)

@@ -111,7 +111,7 @@ def _made(stage: str, inputs: str, make: Callable[[], Any]) -> Any:
 @cache
 def code() -> str:
     """Of this package: another version may make something else of the same inputs."""
-    package = Path(__file__).parents[1]
+    package = Path(__file__).parent
     sources = sorted(package.rglob("*.py"))
     texts = [(str(path.relative_to(package)), path.read_text("utf-8")) for path in sources]
     return digest([__version__, texts])

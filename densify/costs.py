@@ -1,0 +1,61 @@
+# SPDX-License-Identifier: MIT
+"""What each stage of the pipeline costs, and which one is at work."""
+
+from __future__ import annotations
+
+import resource
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from densify.types import Progress, StageCost
+
+
+class Watch:
+    """Measures stages and reports progress. A stage that asks for another one waits meanwhile: the
+    seconds of the inner stage count for the inner one only."""
+
+    def __init__(self, progress: Progress | None = None) -> None:
+        """progress: called as (stage, done, total)."""
+        self._progress = progress
+        self._seconds: dict[str, float] = {}
+        self._peak_mb: dict[str, float] = {}
+        self._running: list[str] = []
+        self._since_s = 0.0
+
+    def step(self, name: str, done: int, total: int) -> None:
+        """Report how far a stage is."""
+        if self._progress is not None:
+            self._progress(name, done, total)
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        """Measure what happens inside the block as the stage of this name."""
+        self.step(name, 0, 1)
+        self._count()
+        self._running.append(name)
+        try:
+            yield
+        finally:
+            self._count()
+            self._running.pop()
+            self._peak_mb[name] = _peak_memory_mb()
+        self.step(name, 1, 1)
+
+    def costs(self) -> tuple[StageCost, ...]:
+        """Costs so far; a stage that worked several times is counted once, in sum."""
+        return tuple(StageCost(n, self._seconds[n], peak) for n, peak in self._peak_mb.items())
+
+    def _count(self) -> None:
+        """Add the time since the last change to the stage that was at work."""
+        now_s = time.perf_counter()
+        if self._running:
+            name = self._running[-1]
+            self._seconds[name] = self._seconds.get(name, 0.0) + now_s - self._since_s
+        self._since_s = now_s
+
+
+def _peak_memory_mb() -> float:
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak / (1024 * 1024 if sys.platform == "darwin" else 1024)

@@ -1,0 +1,149 @@
+# SPDX-License-Identifier: MIT
+"""When the sweeps of a recording were measured, and which of them are neighbours.
+
+Sweeps are neighbours because of their stamps, not because their numbers follow: a drive of which
+every second file is missing is one of half the rate.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+
+from densify.errors import InputError
+from densify.readers.files import format_frames
+from densify.types import Int, LidarSequence
+
+_HOLE_PERIODS = 3.1  # three periods and some jitter
+_NOMINAL_PERIOD_NS = 100_000_000  # of a recording of one sweep
+
+
+class WindowFrames(NamedTuple):
+    """Sweeps around a key. frames: ascending, the key among them. cuts: why there are fewer of them
+    than asked for, a clause each."""
+
+    frames: tuple[int, ...]
+    cuts: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Timeline:
+    """name: of the recording. frames: (n,) of all its sweeps, ascending. stamp_ns: (n,) int64
+    reference times. unknown: frame -> why its stamp is not known; its row in ``stamp_ns`` is then
+    interpolated."""
+
+    name: str
+    frames: tuple[int, ...]
+    stamp_ns: Int
+    unknown: Mapping[int, str]
+
+    @staticmethod
+    def of(sequence: LidarSequence) -> Timeline:
+        """Read the stamps, no sweeps."""
+        frames, unknown = tuple(sequence.frames), {}
+        stamps_ns = np.zeros(len(frames), np.int64)
+        for row, frame in enumerate(frames):
+            try:
+                stamps_ns[row] = sequence.stamp_ns(frame)
+            except InputError as error:
+                unknown[frame] = str(error)
+        known = np.array([f not in unknown for f in frames], bool)
+        if unknown and known.any():
+            rows = np.arange(len(frames))
+            start_ns = stamps_ns[known][0]
+            since_ns = np.interp(rows, rows[known], (stamps_ns[known] - start_ns).astype(float))
+            stamps_ns = np.where(known, stamps_ns, start_ns + since_ns.astype(np.int64))
+        return Timeline(sequence.name, frames, stamps_ns, unknown)
+
+    @cached_property
+    def period_ns(self) -> int:
+        """The usual time from one sweep to the next: the median."""
+        if len(self.frames) < 2:
+            return _NOMINAL_PERIOD_NS
+        return max(1, int(np.median(np.diff(self.stamp_ns))))
+
+    @cached_property
+    def row(self) -> Mapping[int, int]:
+        """Frame -> where it stands in ``frames``."""
+        return {frame: row for row, frame in enumerate(self.frames)}
+
+    def stamp_of(self, frame: int) -> int:
+        """Reference time of a sweep (ns)."""
+        return int(self.stamp_ns[self.row[frame]])
+
+    def within(self, begin_ns: int, end_ns: int) -> list[int]:
+        """Frames with begin_ns <= stamp < end_ns."""
+        inside = (self.stamp_ns >= begin_ns) & (self.stamp_ns < end_ns)
+        return [self.frames[row] for row in np.flatnonzero(inside)]
+
+    def runs(self, frames: Collection[int]) -> list[list[int]]:
+        """The frames, ascending, parted where a sweep between them is missing from ``frames`` or a
+        hole in time lies between them (more than three usual periods)."""
+        runs: list[list[int]] = []
+        for row in sorted(self.row[f] for f in frames):
+            if runs and runs[-1][-1] == row - 1 and not self._hole_before(row):
+                runs[-1].append(row)
+            else:
+                runs.append([row])
+        return [[self.frames[row] for row in run] for run in runs]
+
+    def before(self, frame: int, num: int) -> list[int]:
+        """At most ``num`` frames directly before this one, up to a hole in time."""
+        row = first = self.row[frame]
+        while first > 0 and row - first < num and not self._hole_before(first):
+            first -= 1
+        return list(self.frames[first:row])
+
+    def after(self, frame: int, num: int) -> list[int]:
+        """At most ``num`` frames directly after this one, up to a hole in time."""
+        row = last = self.row[frame]
+        while last + 1 < len(self.frames) and last - row < num and not self._hole_before(last + 1):
+            last += 1
+        return list(self.frames[row + 1 : last + 1])
+
+    def window(
+        self, key: int, window: int, left_out: Mapping[int, str] | None = None
+    ) -> WindowFrames:
+        """The key and ``window`` sweeps on each side of it, of those that exist. A side ends early
+        at the end of the recording, at a hole in time, and at a sweep that is left out.
+
+        left_out: frame -> why it cannot be used. Raises InputError if the key does not exist.
+        """
+        if window < 0:
+            raise InputError(f"--window {window}: expected 0 or more sweeps on each side")
+        if key not in self.row:
+            raise InputError(
+                f"--key {key}: no such frame in {self.name}; it has {format_frames(self.frames)}"
+            )
+        sides, cuts = [], []
+        for step in (-1, 1):
+            side, cut = self._side(self.row[key], step, window, left_out or {})
+            sides.append(side)
+            cuts += [cut] if cut else []
+        frames = (*reversed(sides[0]), key, *sides[1])
+        return WindowFrames(frames, tuple(cuts))
+
+    def _side(
+        self, row: int, step: int, window: int, left_out: Mapping[int, str]
+    ) -> tuple[list[int], str]:
+        side: list[int] = []
+        while len(side) < window:
+            here, row = row, row + step
+            if not 0 <= row < len(self.frames):
+                return side, f"the recording ends at frame {self.frames[here]}"
+            if self._hole_before(max(here, row)):
+                gap_s = abs(int(self.stamp_ns[row] - self.stamp_ns[here])) * 1e-9
+                pair = sorted((self.frames[here], self.frames[row]))
+                return side, f"{gap_s:.1f} s lie between frames {pair[0]} and {pair[1]}"
+            if self.frames[row] in left_out:
+                return side, left_out[self.frames[row]]
+            side.append(self.frames[row])
+        return side, ""
+
+    def _hole_before(self, row: int) -> bool:
+        gap_ns = int(self.stamp_ns[row] - self.stamp_ns[row - 1])
+        return gap_ns > _HOLE_PERIODS * self.period_ns

@@ -1,0 +1,446 @@
+# SPDX-License-Identifier: MIT
+"""A recording and what is worked out about it, each step made once and asked for by name::
+
+    sweeps         read, without the own vehicle's returns
+    registration   poses of the sweeps
+    images         range images: what each sweep saw, and therefore saw through
+    ground         height of the ground
+    evidence       what may move, told by all sweeps around
+    motion         how everything moves
+    moment         all sweeps of a key's window as they stand at the key's moment
+
+The sweeps are cut into blocks, and each step works on one block. How far it looks beyond its block
+is a number of seconds, 0 at the least. Two ways to cut serve all users:
+
+* `densify.blocks.Cut.around`: the windows of a few keys, which look at nothing else. `densify run` and `compare`
+  take the seconds they must.
+* `densify.blocks.Cut.whole`: blocks of two seconds, counted from time 0 whatever keys are wanted, that look well
+  into the blocks around. The same sweeps make the same maps, whatever else is asked for:
+  `densify dataset`.
+
+Sweeps that cannot be read or registered are left out and split the recording: windows end there,
+as they do at holes in time (`densify.readers.timeline`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache, partial
+from itertools import pairwise
+from typing import Any, NamedTuple, TypeVar
+from uuid import uuid4
+
+from densify.blocks import Cut
+from densify.cache import Cache, digest
+from densify.config import Config
+from densify.costs import Watch
+from densify.depth.accumulate import accumulate
+from densify.errors import InputError, SweepError
+from densify.flow.engines import engine_named, estimate_motion
+from densify.flow.scene import Scene
+from densify.flow.tracking.evidence import REACH_S, Candidates, FreeSpace, find_candidates
+from densify.geometry.ground import ground
+from densify.geometry.height_map import HeightMap
+from densify.geometry.range_image import RangeImage
+from densify.readers.timeline import Timeline, WindowFrames
+from densify.readers.window import read_sweep, recorded_trajectory
+from densify.registration.deskew import deskew
+from densify.registration.trajectory import find_trajectory
+from densify.types import (
+    Cloud,
+    Float,
+    FlowField,
+    LidarSequence,
+    Motion,
+    RegisteredSweep,
+    Stretch,
+    StretchFlow,
+    Sweep,
+    Trajectory,
+)
+
+T = TypeVar("T")
+
+_DIGESTS_TOGETHER = 20  # sweeps
+
+
+class LeftOut(NamedTuple):
+    """Why a sweep is not used. unreadable: it could not be read; else not registered."""
+
+    reason: str
+    unreadable: bool
+
+
+@dataclass(frozen=True)
+class Registration:
+    """pieces: poses of neighbouring sweeps, each piece with a world of its own; the sweeps before
+    the block that odometry started with are among them. bad: frame -> why it is left out."""
+
+    pieces: tuple[Trajectory, ...]
+    bad: Mapping[int, LeftOut]
+
+
+class Recording:
+    """A sequence, settings, and the steps. Holds little: what was read and made last.
+
+    `window`, `motion` and `moment` answer for a key; `registration`, `images`, `ground`,
+    `evidence` and `block_motion` make what the keys of a block share.
+    """
+
+    def __init__(
+        self,
+        sequence: LidarSequence,
+        settings: Config,
+        window: int,
+        keys: Collection[int] | None = None,
+        cache: Cache | None = None,
+        run: str | None = None,
+        watch: Watch | None = None,
+    ) -> None:
+        """window: sweeps on each side of a key. keys: work on their windows alone, see
+        `Cut.around`; None for the whole recording, see `Cut.whole`. cache: keeps the steps' results
+        on disk; None keeps nothing. run: the same for all processes between which no sweep changes;
+        None for this object alone. watch: measures the steps.
+
+        Raises InputError if a key does not exist.
+        """
+        self.sequence, self.settings = sequence, settings
+        self.timeline = Timeline.of(sequence)
+        cut = Cut.whole(self.timeline, window)
+        if keys is not None:
+            cut = Cut.around(self.timeline, window, keys)
+        self.cut = cut
+        self._num_around, self._cache, self._run = window, cache, run or uuid4().hex
+        self._watch = watch or Watch()
+        # What the next step, key or block is likely to ask for again.
+        alone = not cut.margin_s
+        self._digests = lru_cache(maxsize=None)(self._find_digests)
+        self._read = lru_cache(maxsize=cut.num_kept + 50 if alone else 1)(self._read_sweep)
+        self._deskewed = lru_cache(maxsize=cut.num_kept)(self._deskew)
+        self._pieces = lru_cache(maxsize=8)(self._find_pieces)
+        self.registration = lru_cache(maxsize=8)(self._registration)
+        self.images = lru_cache(maxsize=4)(self._images)
+        self.ground = lru_cache(maxsize=4)(self._ground)
+        self.evidence = lru_cache(maxsize=4)(self._evidence)
+        self.block_motion = lru_cache(maxsize=2)(self._block_motion)
+
+    # For a key
+
+    def window_frames(self, key: int) -> WindowFrames:
+        """The frames of a key's window, and where it is cut and why.
+
+        Raises InputError if the key does not exist or cannot be read, SweepError if it cannot be
+        registered, or none of its neighbours can.
+        """
+        found = self.timeline.window(key, self._num_around)
+        number = self.cut.number_of[key]
+        bad: dict[int, LeftOut] = {}
+        for b in self._blocks_with(number, found.frames):
+            own = self.cut.blocks[b].frames
+            bad |= {f: why for f, why in self.registration(b).bad.items() if f in own}
+        if key in bad and bad[key].unreadable:
+            raise InputError(bad[key].reason)
+        if key in bad:
+            raise SweepError(bad[key].reason, key)
+        reasons = {f: why.reason for f, why in bad.items()}
+        piece = self._piece(key)[1]
+        window = self.timeline.window(key, self._num_around, reasons)
+        window = WindowFrames(tuple(f for f in window.frames if f in piece.frames), window.cuts)
+        failed = [f for f in found.frames if f in bad and not bad[f].unreadable]
+        if failed and len(window.frames) == 1:
+            raise SweepError(bad[failed[0]].reason, failed[0])
+        return window
+
+    def window(self, key: int) -> Stretch:
+        """The sweeps of a key's window, registered and deskewed. Errors as `window_frames`."""
+        number = self.cut.number_of[key]
+        frames = self.window_frames(key).frames
+        return Stretch(tuple(self._deskewed(number, self.cut.margin_s, f) for f in frames))
+
+    def motion(self, key: int, engine: str | None = None) -> Motion:
+        """How everything in a key's window moves. engine: as ``flow.engine``, which is the default.
+        """
+        engine = engine or self.settings.flow.engine
+        number, (index, piece) = self.cut.number_of[key], self._piece(key)
+        window = self.window(key)
+        if not engine_named(engine).shared:
+            heights = self.ground(number)[index]
+            return estimate_motion(Scene(window, heights), self.settings, engine)
+        frames, motion = self.block_motion(number, engine)[index]
+        # All poses, but the points of the window only.
+        at_hand = {s.frame: s for s in window.sweeps}
+        sweeps = [at_hand.get(f) or RegisteredSweep.without_points(piece, f) for f in frames]
+        return replace(motion, stretch=Stretch(tuple(sweeps)))  # type: ignore[type-var]
+
+    def moment(
+        self, key: int, all_sweeps: bool, engine: str | None, with_flow: bool = False
+    ) -> tuple[Cloud, StretchFlow | None]:
+        """What is measured around a key, as it stands at the key's moment.
+
+        all_sweeps: of the window; else the key sweep alone. engine: which flow moves the points,
+        "" for the configured one; None leaves them where registration puts them. with_flow: and
+        the flow of every sweep to the next one on the way to the key.
+        """
+        stretch, flow = self.window(key), None
+        used = stretch if all_sweeps else Stretch((stretch[key],))
+        fields = [FlowField.zero(len(s.sweep)) for s in used.sweeps]
+        if engine is not None:
+            with self._watch.stage("flow"):
+                motion = self.motion(key, engine)
+                fields = [motion.flow(frame, key) for frame in stretch.frames]
+                if with_flow:
+                    flow = _steps(motion, stretch, key)
+        with self._watch.stage("accumulate"):
+            drop_lost = self.settings.accumulate.unfollowed == "drop"
+            return accumulate(used, fields, key, drop_lost), flow
+
+    # For a block, by its number
+
+    def _registration(self, number: int) -> Registration:
+        frames = self.cut.blocks[number].frames
+        num_before = self.settings.register.num_lead_in
+        if self.cut.margin_s:  # without a sweep before it a block could not be joined to the last
+            num_before = max(1, num_before)
+        bad, known = {}, {}
+        for frame in [*self.timeline.before(frames[0], num_before), *frames]:
+            try:
+                known[frame] = (self._content(frame), self._recorded_pose(frame))
+            except InputError as error:
+                bad[frame] = LeftOut(str(error), unreadable=True)
+        return self._made(
+            "registration",
+            lambda: [self.settings.register, self.timeline.period_ns, bad, known],
+            partial(self._register, list(known), bad),
+        )
+
+    def _register(self, frames: Sequence[int], unreadable: Mapping[int, LeftOut]) -> Registration:
+        """Register every run of neighbours by itself, parted again where a sweep is in the way."""
+        pieces, bad, left = [], dict(unreadable), self.timeline.runs(frames)
+        while left:
+            run = left.pop()
+            sweeps = [self._read(f) for f in run]
+            recorded = None
+            if self.settings.register.source == "dataset":
+                recorded = recorded_trajectory(self.sequence, sweeps)
+            try:
+                with self._watch.stage("register"):
+                    pieces.append(find_trajectory(sweeps, self.settings.register, recorded))
+            except SweepError as error:
+                bad[error.frame] = LeftOut(str(error), unreadable=False)
+                left += self.timeline.runs([f for f in run if f != error.frame])
+        return Registration(tuple(sorted(pieces, key=lambda p: p.frames)), bad)
+
+    def _images(self, number: int) -> dict[int, RangeImage]:
+        """Range images of the block's sweeps, by frame."""
+        pieces = {f: p for p in self._pieces(number, 0.0) for f in self._within(p, number, 0.0)}
+
+        def make() -> dict[int, RangeImage]:
+            sweeps = [self._deskewed(number, 0.0, f) for f in pieces]
+            with self._watch.stage("flow"):
+                return {s.frame: RangeImage.of(s) for s in sweeps}
+
+        return self._made(
+            "images", lambda: [(f, self._content(f), p) for f, p in pieces.items()], make
+        )
+
+    def _ground(self, number: int) -> list[HeightMap]:
+        """Height of the ground within reach of the block, for each of its pieces."""
+
+        def make(frames: Sequence[int]) -> HeightMap:
+            stretch = self._stretch(number, REACH_S, frames)
+            with self._watch.stage("ground"):
+                return ground(stretch, self.settings.ground)
+
+        return [
+            self._made("ground", partial(self._near, number, index), partial(make, frames))
+            for index, frames in enumerate(self._frames_within(number, REACH_S))
+        ]
+
+    def _evidence(self, number: int) -> list[Mapping[int, Candidates]]:
+        """What may move in the block's sweeps, by frame, for each of its pieces."""
+        min_height_m = self.settings.flow.min_height_m
+
+        def make(index: int, frames: Sequence[int]) -> dict[int, Candidates]:
+            stretch, heights = self._stretch(number, REACH_S, frames), self.ground(number)[index]
+            space = self._space(number, stretch)
+            own = [i for i, f in enumerate(frames) if f in self.cut.blocks[number].frames]
+            with self._watch.stage("flow"):
+                found = find_candidates(stretch, space, heights, min_height_m, own)
+            return {frames[i]: c for i, c in zip(own, found, strict=True)}
+
+        return [
+            self._made(
+                "evidence", partial(self._evidence_inputs, number, index), partial(make, index, f)
+            )
+            for index, f in enumerate(self._frames_within(number, REACH_S))
+        ]
+
+    def _block_motion(self, number: int, engine: str) -> list[tuple[Sequence[int], Motion]]:
+        """How everything within the margin of the block moves, for each of its pieces: the frames,
+        and the motion without their points."""
+        margin_s = self.cut.margin_s
+
+        def make(index: int, frames: Sequence[int]) -> Motion:
+            stretch, heights = self._stretch(number, margin_s, frames), self.ground(number)[index]
+            evidence = {
+                f: found
+                for b in self._blocks_with(number, frames)
+                for piece in self.evidence(b)
+                for f, found in piece.items()
+            }
+            candidates = tuple(evidence[f] for f in frames)
+            scene = Scene(stretch, heights, self._space(number, stretch), candidates)
+            with self._watch.stage("flow"):
+                motion = estimate_motion(scene, self.settings, engine)
+            return replace(motion, stretch=Stretch(()))  # type: ignore[type-var]
+
+        def inputs(piece: Trajectory, frames: Sequence[int]) -> Any:
+            evidence = [
+                self._evidence_inputs(b, index)
+                for b in self._blocks_with(number, frames)
+                for index in range(len(self._pieces(b, REACH_S)))
+            ]
+            content = [self._content(f) for f in frames]
+            return [engine, self.settings.flow, piece, evidence, content]
+
+        found: list[tuple[Sequence[int], Motion]] = []
+        pieces = self._pieces(number, margin_s)
+        for index, frames in enumerate(self._frames_within(number, margin_s)):
+            motion = self._made(
+                "motion", partial(inputs, pieces[index], frames), partial(make, index, frames)
+            )
+            found.append((frames, motion))
+        return found
+
+    # What they are made of
+
+    def _find_pieces(self, number: int, around_s: float) -> list[Trajectory]:
+        """Poses of neighbouring sweeps of a block and so far around it, and of one more at each
+        end, which tells how the lidar moved; only those with a sweep of the block. The world is
+        the lidar of the piece's first sweep in the block."""
+        frames = self._around(number, around_s)
+        before, after = self.timeline.before(frames[0], 1), self.timeline.after(frames[-1], 1)
+        wanted = {*before, *frames, *after}
+        pieces: list[Trajectory] = []
+        for b in self._blocks_with(number, wanted):
+            members = {*self.cut.blocks[b].frames}
+            if not self.cut.margin_s:  # no other block has the sweep before
+                members |= {*before}
+            for found in self.registration(b).pieces:
+                own = [f for f in found.frames if f in wanted & members]
+                if not own:
+                    continue
+                first = found.frames.index(own[0])
+                if pieces and first and pieces[-1].frames[-1] == found.frames[first - 1]:
+                    pieces[-1] = pieces[-1].joined(found, own)
+                else:
+                    pieces.append(found.part(own))
+        in_block = [[f for f in p.frames if f in self.cut.blocks[number].frames] for p in pieces]
+        return [p.seen_from(f[0]) for f, p in zip(in_block, pieces, strict=True) if f]
+
+    def _piece(self, key: int) -> tuple[int, Trajectory]:
+        """Which of the pieces of its block has the key, and that piece with its margin."""
+        pieces = self._pieces(self.cut.number_of[key], self.cut.margin_s)
+        return next((i, p) for i, p in enumerate(pieces) if key in p.frames)
+
+    def _around(self, number: int, around_s: float) -> list[int]:
+        """Frames of a block and so far around it, but no farther than its margin."""
+        block, around_ns = self.cut.blocks[number], round(min(around_s, self.cut.margin_s) * 1e9)
+        if not around_ns:
+            return list(block.frames)
+        return self.timeline.within(block.begin_ns - around_ns, block.end_ns + around_ns)
+
+    def _within(self, piece: Trajectory, number: int, around_s: float) -> list[int]:
+        around = frozenset(self._around(number, around_s))
+        return [f for f in piece.frames if f in around]
+
+    def _frames_within(self, number: int, around_s: float) -> list[list[int]]:
+        """Frames of each piece, without the one more at each end."""
+        return [self._within(p, number, around_s) for p in self._pieces(number, around_s)]
+
+    def _blocks_with(self, number: int, frames: Collection[int]) -> list[int]:
+        """The blocks that work out these frames for this one."""
+        if not self.cut.margin_s:
+            return [number]
+        return sorted({self.cut.number_of[f] for f in frames})
+
+    def _stretch(self, number: int, around_s: float, frames: Sequence[int]) -> Stretch:
+        around_s = min(around_s, self.cut.margin_s)
+        return Stretch(tuple(self._deskewed(number, around_s, f) for f in frames))
+
+    def _deskew(self, number: int, around_s: float, frame: int) -> RegisteredSweep:
+        piece = next(p for p in self._pieces(number, around_s) if frame in p.frames)
+        sweep = self._read(frame)
+        with self._watch.stage("deskew"):
+            return deskew([sweep], piece).sweeps[0]
+
+    def _space(self, number: int, stretch: Stretch) -> FreeSpace:
+        images = {
+            f: image
+            for b in self._blocks_with(number, stretch.frames)
+            for f, image in self.images(b).items()
+        }
+        return FreeSpace.of(stretch, [images[f] for f in stretch.frames])
+
+    def _read_sweep(self, frame: int) -> Sweep:
+        with self._watch.stage("read"):
+            return read_sweep(self.sequence, frame, self.settings.register)
+
+    def _recorded_pose(self, frame: int) -> Float | None:
+        if self.settings.register.source != "dataset":
+            return None
+        return self.sequence.T_world_lidar(frame)
+
+    # Kept on disk
+
+    def _made(self, stage: str, inputs: Callable[[], Any], make: Callable[[], T]) -> T:
+        """What ``make`` returns, now or when it was made of the same inputs before."""
+        return make() if self._cache is None else self._cache.get(stage, inputs(), make)
+
+    def _near(self, number: int, index: int) -> Any:
+        """What the ground of a piece depends on."""
+        piece = self._pieces(number, REACH_S)[index]
+        content = [self._content(f) for f in self._within(piece, number, REACH_S)]
+        return [self.settings.ground, number, piece, content]
+
+    def _evidence_inputs(self, number: int, index: int) -> Any:
+        return [self.settings.flow.min_height_m, self._near(number, index)]
+
+    def _content(self, frame: int) -> str:
+        """A digest of a sweep's content where there is a cache. Raises InputError if the sweep
+        cannot be read."""
+        if self._cache is None:
+            self._read(frame)
+            return ""
+        number = self.timeline.row[frame] // _DIGESTS_TOGETHER
+        found = self._digests(number)[frame]
+        if isinstance(found, InputError):
+            raise found
+        return found
+
+    def _find_digests(self, number: int) -> dict[int, str | InputError]:
+        """By frame; looked up by all processes of a run, of which only the first has to read."""
+        first = number * _DIGESTS_TOGETHER
+
+        def read() -> dict[int, str | InputError]:
+            found: dict[int, str | InputError] = {}
+            for frame in self.timeline.frames[first : first + _DIGESTS_TOGETHER]:
+                try:
+                    found[frame] = digest(self._read(frame))
+                except InputError as error:
+                    found[frame] = error
+            return found
+
+        inputs = [self._run, self.sequence.name, self.settings.register, number]
+        return self._made("digests", lambda: inputs, read)
+
+
+def _steps(motion: Motion, stretch: Stretch, key: int) -> StretchFlow:
+    """Flow of every sweep to the next one on the way to the key, and of the key to a neighbour."""
+    before = [f for f in stretch.frames if f <= key]
+    after = [f for f in reversed(stretch.frames) if f >= key]
+    hops = [*pairwise(before), *pairwise(after)]
+    if len(stretch.frames) > 1:
+        hops.append((key, after[-2] if len(after) > 1 else before[-2]))
+    return StretchFlow(stretch, {hop: motion.flow(*hop) for hop in hops})
