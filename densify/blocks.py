@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import math
+from bisect import bisect_right
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -35,6 +37,23 @@ class Cut:
     number_of: Mapping[int, int]
     margin_s: float
     num_kept: int
+
+    def number_near(self, frame: int) -> int:
+        """The block of a frame, or of the last sweep before it where it has none."""
+        frames = sorted(self.number_of)
+        return self.number_of[frames[max(0, bisect_right(frames, frame) - 1)]]
+
+    @property
+    def num_blocks_around(self) -> int:
+        """On each side of a block, that its motion is made of. Steps look one sweep farther than
+        the margin, which may be as far as a hole in time is long."""
+        return math.ceil((self.margin_s + 0.5) / BLOCK_S)
+
+    @property
+    def num_sweeps_of_block(self) -> int:
+        """Sweeps that the motion of a block is made of, at the most."""
+        most = max((len(block.frames) for block in self.blocks), default=0)
+        return math.ceil(most * (1 + 2 * self.margin_s / BLOCK_S))
 
     @staticmethod
     def whole(timeline: Timeline, window: int) -> Cut:

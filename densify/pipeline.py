@@ -24,6 +24,7 @@ from densify.depth.views import HeldOut, Views
 from densify.errors import ComputationError, InputError
 from densify.flow.engines import check_engine
 from densify.geometry.range_image import RangeImage
+from densify.readers.files import format_frames
 from densify.readers.window import choose_cameras
 from densify.recording import Recording
 from densify.scores import depth_metrics
@@ -123,6 +124,7 @@ def run_keys(
     def results() -> Iterator[tuple[int, Result | ComputationError | InputError]]:
         for key in sorted(set(keys)):
             try:
+                _warn_of_cuts(recording, key)
                 yield key, densify(recording, key, methods, cameras, watch)[method]
             except (ComputationError, InputError) as error:
                 yield key, error
@@ -148,6 +150,7 @@ def compare(
     settings, watch = resolve(config), Watch(progress)
     _check(settings, methods)
     recording = Recording(sequence, settings, window, [key], cache, watch=watch)
+    _warn_of_cuts(recording, key)
     return densify(recording, key, methods, cameras, watch)
 
 
@@ -173,9 +176,6 @@ def densify(
     """
     watch, sequence, settings = watch or Watch(), recording.sequence, recording.settings
     chosen = choose_cameras(sequence, cameras)
-    frames = recording.window_frames(key)
-    for cut in frames.cuts:
-        _log.warning("the window of key %d is cut: %s", key, cut)
     images = None
     if with_images:
         with watch.stage("images"):
@@ -188,6 +188,13 @@ def densify(
         for name in methods
     }
     return _results(sequence, stretch, key, moments, chosen, images, settings, watch)
+
+
+def _warn_of_cuts(recording: Recording, key: int) -> None:
+    window = recording.window_frames(key)
+    for cut in window.cuts:
+        frames = format_frames(window.frames)
+        _log.warning("the window of key %d is cut to frames %s: %s", key, frames, cut)
 
 
 def _check(settings: Config, methods: Sequence[str]) -> None:

@@ -37,12 +37,13 @@ from densify.config import Config
 from densify.costs import Watch
 from densify.depth.accumulate import accumulate
 from densify.errors import InputError, SweepError
-from densify.flow.engines import engine_named, estimate_motion
+from densify.flow.engines import estimate_motion
 from densify.flow.scene import Scene
 from densify.flow.tracking.evidence import REACH_S, Candidates, FreeSpace, find_candidates
 from densify.geometry.ground import ground
 from densify.geometry.height_map import HeightMap
 from densify.geometry.range_image import RangeImage
+from densify.plugins.engines import engine as engine_row
 from densify.readers.timeline import Timeline, WindowFrames
 from densify.readers.window import read_sweep, recorded_trajectory
 from densify.registration.deskew import deskew
@@ -164,9 +165,9 @@ class Recording:
         engine = engine or self.settings.flow.engine
         number, (index, piece) = self.cut.number_of[key], self._piece(key)
         window = self.window(key)
-        if not engine_named(engine).shared:
-            heights = self.ground(number)[index]
-            return estimate_motion(Scene(window, heights), self.settings, engine)
+        if not engine_row(engine)[0].shared:
+            scene = Scene(window, self.ground(number)[index], self.settings.flow.min_height_m)
+            return estimate_motion(scene, self.settings, engine)
         frames, motion = self.block_motion(number, engine)[index]
         # All poses, but the points of the window only.
         at_hand = {s.frame: s for s in window.sweeps}
@@ -282,15 +283,14 @@ class Recording:
         margin_s = self.cut.margin_s
 
         def make(index: int, frames: Sequence[int]) -> Motion:
-            stretch, heights = self._stretch(number, margin_s, frames), self.ground(number)[index]
-            evidence = {
-                f: found
-                for b in self._blocks_with(number, frames)
-                for piece in self.evidence(b)
-                for f, found in piece.items()
-            }
-            candidates = tuple(evidence[f] for f in frames)
-            scene = Scene(stretch, heights, self._space(number, stretch), candidates)
+            stretch = self._stretch(number, margin_s, frames)
+            scene = Scene(
+                stretch,
+                self.ground(number)[index],
+                self.settings.flow.min_height_m,
+                make_space=partial(self._space, number, stretch),
+                make_candidates=partial(self._candidates, number, frames),
+            )
             with self._watch.stage("flow"):
                 motion = estimate_motion(scene, self.settings, engine)
             return replace(motion, stretch=Stretch(()))  # type: ignore[type-var]
@@ -382,6 +382,15 @@ class Recording:
             for f, image in self.images(b).items()
         }
         return FreeSpace.of(stretch, [images[f] for f in stretch.frames])
+
+    def _candidates(self, number: int, frames: Sequence[int]) -> tuple[Candidates, ...]:
+        evidence = {
+            f: found
+            for b in self._blocks_with(number, frames)
+            for piece in self.evidence(b)
+            for f, found in piece.items()
+        }
+        return tuple(evidence[f] for f in frames)
 
     def _read_sweep(self, frame: int) -> Sweep:
         with self._watch.stage("read"):

@@ -16,12 +16,12 @@ import cv2
 import numpy as np
 
 import densify
-from densify.dataset.drive import BLOCK
+from densify.blocks import BLOCK_S
 from densify.dataset.manifest import damaged_files, read_manifests
 from tests.command import files_in
-from tests.scenes import CAMERA, Arc, Scanner, Scene, TinySequence, World, car, stamp_ns, street
+from tests.scenes import CAMERA, SWEEP_S, Arc, Scanner, Scene, TinySequence, World, car, stamp_ns, street
 
-BORDER = 2 * BLOCK
+BORDER = round(2 * BLOCK_S / SWEEP_S)
 FRAMES = range(BORDER - 4, BORDER + 5)
 COARSE = Scanner(24, 360)
 DRIVE = "2011_09_26_drive_0013_sync"

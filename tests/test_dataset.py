@@ -8,14 +8,16 @@ import shutil
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from densify.dataset import make
 from densify.cache import Cache
-from densify.dataset.drive import BLOCK, margin
+from densify.blocks import Cut
 from densify.dataset.loader import DepthDataset
 from densify.dataset.plan import Recipe, Source
 from densify.dataset.work import Job, tasks
+from densify.readers.timeline import Timeline
 from densify.errors import InputError
 from tests.command import exit_code, files_in
 from tests.dataset_scenes import (
@@ -197,15 +199,17 @@ def test_no_task_makes_what_another_is_for(
 @pytest.mark.parametrize("window", [5, 14, 15, 30, 50])
 def test_tasks_wait_for_all_that_they_look_at(window: int) -> None:
     job = Job(Source("a", "a", "a", ()), Recipe(window), Path("out"), 0, "", "")
-    listed = list(tasks(job, [210, 231]))
+    stamps_ns = 10**8 * np.arange(400)
+    cut = Cut.whole(Timeline("a", tuple(range(400)), stamps_ns, {}), window)
+    listed = list(tasks(job, [210, 231], cut))
     done = set()
     for task in listed:
         assert task.needs <= done
         done.add(task.name)
     assert len(done) == len(listed)
     found = {task.name: task.needs for task in listed}
-    farthest = margin(window) + 1  # sweeps beyond a block
-    blocks = range((200 - farthest) // BLOCK, (219 + farthest) // BLOCK + 1)
+    farthest = max(15, window + 5) + 1  # sweeps beyond a block
+    blocks = range((200 - farthest) // 20, (219 + farthest) // 20 + 1)
     assert {("evidence", "a", b) for b in blocks} <= found["motion", "a", 10]
     assert {("registration", "a", b) for b in blocks} <= found["key", "a", 210]
     assert ("motion", "a", 11) in found["key", "a", 231]

@@ -15,9 +15,9 @@ from densify.config import RegisterSettings
 from densify.errors import InputError
 from densify.flow.pairs.estimate import estimate_flow
 from densify.geometry import poses
-from densify.pipeline import find_trajectory
-from densify.readers.window import read_sweeps
+from densify.readers.window import read_sweep
 from densify.registration.deskew import deskew
+from densify.registration.trajectory import find_trajectory
 from tests.scenes import Arc, Box, Scanner, Scene, World, car, street
 
 FRAME = 2
@@ -264,8 +264,8 @@ def test_real_traffic():
         pytest.skip("DENSIFY_TEST_DATA is not set: no real KITTI drives")
     drive = Path(folder) / "kitti" / "2011_09_26" / "2011_09_26_drive_0013_sync"
     sequence, settings = open_sequence(str(drive)), RegisterSettings()
-    sweeps = list(read_sweeps(sequence, range(118, 123), settings))
-    stretch = deskew(sweeps, find_trajectory(sequence, sweeps, settings))
+    sweeps = [read_sweep(sequence, frame, settings) for frame in range(118, 123)]
+    stretch = deskew(sweeps, find_trajectory(sweeps, settings))
     here, there = stretch[120], stretch[121]
     target = poses.transform(stretch.T_target_source(120, 121), there.sweep.points)
     field = estimate_flow(

@@ -13,7 +13,7 @@ from densify.config import RegisterSettings
 from densify.geometry import poses
 from densify.geometry.range_image import RangeImage
 from densify.pipeline import METHODS, compare, run
-from densify.readers.window import read_sweeps
+from densify.readers.window import read_sweep
 from densify.scores.ghosts import ghosts
 from densify.types import Result
 from tests.scenes import CAMERA, SWEEP_S, Arc, Scanner, Scene, TinySequence, World, street
@@ -250,6 +250,6 @@ def test_the_ghost_score_agrees_with_the_truth(moving):
     true = np.zeros(len(icp), bool)
     for frame in np.unique(icp.frame):
         mine = np.flatnonzero(icp.frame == frame)
-        (kept,) = read_sweeps(sequence, [int(frame)], RegisterSettings())
+        kept = read_sweep(sequence, int(frame), RegisterSettings())
         true[mine] = sequence.scene.scan(int(frame)).instance[kept.row[icp.row[mine]]] >= 0
     assert true[found].mean() > 0.9

@@ -13,7 +13,7 @@ from densify.config import RegisterSettings
 from densify.errors import ComputationError, InputError
 from densify.geometry import poses
 from densify.pipeline import compare, run
-from densify.readers.window import read_sweeps
+from densify.readers.window import read_sweep
 from tests.scenes import TinySequence
 from tests.small_street import KEY, POSES_GIVEN, one_car
 
@@ -99,7 +99,7 @@ def test_a_sweep_without_times_is_not_deskewed():
     sequence = Timeless(good.scene, good.frames)
     result = run(sequence, KEY, 1, "flow", config=POSES_GIVEN)
     own = result.cloud.frame == KEY
-    (kept,) = read_sweeps(sequence, [KEY], RegisterSettings())
+    kept = read_sweep(sequence, KEY, RegisterSettings())
     np.testing.assert_allclose(result.cloud.points[own], kept.points, atol=1e-9)
 
 
@@ -108,7 +108,7 @@ def test_deskewing_can_be_switched_off():
     sequence = one_car(())
     config = {"register": {"source": "dataset", "deskew": False}}
     result = run(sequence, KEY, 1, "icp", config=config)
-    (kept,) = read_sweeps(sequence, [KEY], RegisterSettings())
+    kept = read_sweep(sequence, KEY, RegisterSettings())
     own = result.cloud.frame == KEY
     np.testing.assert_allclose(result.cloud.points[own], kept.points, atol=1e-9)
 

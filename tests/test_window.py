@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import logging
 from dataclasses import replace
 
 import numpy as np
@@ -11,61 +10,103 @@ import pytest
 
 from densify.config import RegisterSettings
 from densify.errors import InputError
-from densify.readers.window import choose_cameras, read_sweeps, recorded_trajectory, window_frames
-from tests.scenes import CAMERA, stamp_ns
+from densify.readers.timeline import Timeline
+from densify.readers.window import choose_cameras, read_sweep, recorded_trajectory
+from tests.scenes import CAMERA, TinySequence, stamp_ns
 from tests.tiny_street import tiny
 
 
-class Frames:
-    """A sequence that only knows its frames."""
-
-    name = "rec"
-
-    def __init__(self, frames):
-        self.frames = frames
+def timeline(frames, period_ns=100_000_000, late=None) -> Timeline:
+    """late: frame -> how much later its stamp is (ns)."""
+    stamps = [period_ns * f + (late or {}).get(f, 0) for f in frames]
+    return Timeline("rec", tuple(frames), np.array(stamps, np.int64), {})
 
 
-def test_window_and_lead_in():
-    assert window_frames(Frames(range(20)), 10, 2, 3) == ([8, 9, 10, 11, 12], [5, 6, 7])
-    assert window_frames(Frames(range(100, 120)), 110, 0, 0) == ([110], [])
-
-
-def test_lead_in_is_what_lies_directly_before(caplog):
-    with caplog.at_level(logging.WARNING, "densify"):
-        assert window_frames(Frames(range(20)), 4, 3, 5) == ([1, 2, 3, 4, 5, 6, 7], [0])
-        broken = [0, 1, 2, 5, 6, 7, 8, 9]
-        assert window_frames(Frames(broken), 8, 1, 5) == ([7, 8, 9], [5, 6])
-    assert not caplog.records
+def test_a_window_has_as_many_sweeps_on_each_side():
+    assert timeline(range(20)).window(10, 2) == ((8, 9, 10, 11, 12), ())
+    assert timeline(range(100, 120)).window(110, 0) == ((110,), ())
 
 
 @pytest.mark.parametrize(
-    ("key", "frames", "words"), [(1, [0, 1, 2, 3, 4], "0-4"), (19, [16, 17, 18, 19], "16-19")]
+    ("key", "frames", "words"),
+    [(1, (0, 1, 2, 3, 4), "ends at frame 0"), (19, (16, 17, 18, 19), "ends at frame 19")],
 )
-def test_a_cut_window_warns_with_its_frames(caplog, key, frames, words):
-    with caplog.at_level(logging.WARNING, "densify"):
-        assert window_frames(Frames(range(20)), key, 3, 0)[0] == frames
-    (record,) = caplog.records
-    assert f"key {key}" in record.getMessage() and words in record.getMessage()
+def test_a_window_is_cut_where_the_recording_ends(key, frames, words):
+    found = timeline(range(20)).window(key, 3)
+    assert found.frames == frames
+    (cut,) = found.cuts
+    assert words in cut
+
+
+def test_every_second_sweep_is_a_recording_of_half_the_rate():
+    there = timeline(range(0, 40, 2))
+    assert there.period_ns == 200_000_000
+    assert there.window(20, 3) == ((14, 16, 18, 20, 22, 24, 26), ())
+    assert there.before(20, 2) == [16, 18] and there.after(20, 2) == [22, 24]
+    assert there.runs(there.frames) == [list(range(0, 40, 2))]
+
+
+@pytest.mark.parametrize("num_missing", [1, 2])
+def test_a_window_goes_on_over_a_few_missing_sweeps(num_missing):
+    there = timeline([f for f in range(20) if not 8 <= f < 8 + num_missing])
+    assert there.window(8 + num_missing, 2).frames[:2] == (6, 7)
+
+
+def test_a_hole_in_time_ends_a_window_and_is_named():
+    there = timeline([f for f in range(20) if f not in (7, 8, 9)])
+    found = there.window(10, 3)
+    assert found.frames == (10, 11, 12, 13)
+    assert found.cuts == ("0.4 s lie between frames 6 and 10",)
+    assert there.window(6, 3) == ((3, 4, 5, 6), found.cuts)
+    assert there.before(12, 5) == [10, 11] and there.after(4, 5) == [5, 6]
+    assert there.runs([4, 5, 6, 10, 11, 13]) == [[4, 5, 6], [10, 11], [13]]
+
+
+def test_holes_are_told_by_stamps_not_by_numbers():
+    late = {f: 500_000_000 for f in range(10, 20)}
+    assert timeline(range(20), late=late).window(10, 2).frames == (10, 11, 12)
+    renumbered = Timeline("rec", (3, 70, 71, 900), 10**8 * np.arange(4), {})
+    assert renumbered.window(71, 2).frames == (3, 70, 71, 900)
+
+
+def test_a_sweep_that_is_left_out_ends_a_window_with_its_reason():
+    assert timeline(range(20)).window(10, 3, {12: "12.bin: truncated"}) == (
+        (7, 8, 9, 10, 11),
+        ("12.bin: truncated",),
+    )
+
+
+def test_within_is_half_open():
+    there = timeline(range(20))
+    assert there.within(300_000_000, 600_000_000) == [3, 4, 5]
 
 
 @pytest.mark.parametrize("key", [-1, 20, 999])
 def test_a_key_out_of_range_is_named_with_what_there_is(key):
     with pytest.raises(InputError, match=rf"--key {key}: no such frame in rec; it has 0-19"):
-        window_frames(Frames(range(20)), key, 2, 0)
-
-
-def test_a_frame_missing_in_the_window_is_named():
-    there = [f for f in range(20) if f not in (8, 9)]
-    with pytest.raises(InputError, match=r"no sweep for frame 8-9; it has 0-7, 10-19"):
-        window_frames(Frames(there), 10, 3, 0)
-    with pytest.raises(InputError, match=r"--key 9: no such frame"):
-        window_frames(Frames(there), 9, 3, 0)
-    assert window_frames(Frames(there), 13, 3, 5)[0] == list(range(10, 17))
+        timeline(range(20)).window(key, 2)
 
 
 def test_a_negative_window_is_refused():
     with pytest.raises(InputError, match="--window -1"):
-        window_frames(Frames(range(20)), 10, -1, 0)
+        timeline(range(20)).window(10, -1)
+
+
+def test_a_huge_window_is_the_whole_recording():
+    assert timeline(range(20)).window(10, 2_000_000_000).frames == tuple(range(20))
+
+
+def test_a_stamp_that_cannot_be_read_is_known_by_its_frame():
+    class Unstamped(TinySequence):
+        def stamp_ns(self, frame):
+            if frame == 2:
+                raise InputError("timestamps.txt: line 3 is no time")
+            return super().stamp_ns(frame)
+
+    scene = tiny().scene
+    found = Timeline.of(Unstamped(scene, range(5)))
+    assert found.unknown == {2: "timestamps.txt: line 3 is no time"}
+    np.testing.assert_allclose(found.stamp_ns, [stamp_ns(f) for f in range(5)], atol=2)
 
 
 def test_cameras_by_name():
@@ -79,7 +120,7 @@ def test_cameras_by_name():
 
 def test_near_and_far_returns_are_left_out():
     sequence = tiny()
-    (sweep,) = read_sweeps(sequence, [3], RegisterSettings(min_range_m=5.0, max_range_m=30.0))
+    sweep = read_sweep(sequence, 3, RegisterSettings(min_range_m=5.0, max_range_m=30.0))
     range_m = np.linalg.norm(sweep.points, axis=1)
     whole = sequence[3]
     assert 5 <= range_m.min() < range_m.max() <= 30 and len(sweep) < len(whole)

@@ -11,9 +11,7 @@ from densify.flow.engines import estimate_motion
 from densify.flow.scene import Scene
 from densify.geometry import poses
 from densify.geometry.ground import ground
-from densify.pipeline import find_trajectory
-from densify.readers.window import read_sweeps, window_frames
-from densify.registration.deskew import deskew
+from densify.recording import Recording
 from densify.types import Bool, Float, LidarSequence, Motion, Stretch
 
 
@@ -27,16 +25,11 @@ class Window:
 
     @staticmethod
     def open(sequence: LidarSequence, key: int, size: int, config: Config) -> Window:
-        """Read, register and deskew, as the pipeline does. Raises InputError for missing frames,
+        """The key's window, as the pipeline has it. Raises InputError for a missing key,
         ComputationError where registration went wrong."""
-        frames, lead_in = window_frames(sequence, key, size, config.register.num_lead_in)
-        sweeps = list(read_sweeps(sequence, [*lead_in, *frames], config.register))
-        trajectory = find_trajectory(sequence, sweeps, config.register)
-        stretch = deskew([s for s in sweeps if s.frame in frames], trajectory)
-        heights = ground(stretch, config.ground)
-        above = {
-            f: heights.above(_in_world(stretch, f)) >= config.flow.min_height_m for f in frames
-        }
+        stretch = Recording(sequence, config, size, [key]).window(key)
+        heights, least_m = ground(stretch, config.ground), config.flow.min_height_m
+        above = {f: heights.above(_in_world(stretch, f)) >= least_m for f in stretch.frames}
         return Window(stretch, key, above)
 
     @property
@@ -45,7 +38,8 @@ class Window:
 
     def towards_key(self, frame: int) -> int:
         """The neighbour on the way to the key; the key itself of the key."""
-        return frame + (self.key > frame) - (self.key < frame)
+        here, key = self.frames.index(frame), self.frames.index(self.key)
+        return self.frames[here + (key > here) - (key < here)]
 
     def points(self, frame: int) -> Float:
         """(N,3) of a sweep, world, z up."""
@@ -53,14 +47,14 @@ class Window:
 
     def around_key(self) -> Stretch:
         """The key and its neighbours."""
-        near = tuple(s for s in self.stretch.sweeps if abs(s.frame - self.key) <= 1)
-        return Stretch(near)
+        key = self.frames.index(self.key)
+        return Stretch(self.stretch.sweeps[max(0, key - 1) : key + 2])
 
 
 def our_motion(stretch: Stretch, config: Config) -> Motion:
-    """From the ground on."""
-    heights = ground(stretch, config.ground)
-    return estimate_motion(Scene(stretch, heights, config.flow.min_height_m), config)
+    """This package's engine, from the ground on."""
+    scene = Scene(stretch, ground(stretch, config.ground), config.flow.min_height_m)
+    return estimate_motion(scene, config, "groups")
 
 
 def _in_world(stretch: Stretch, frame: int) -> Float:

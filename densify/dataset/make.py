@@ -14,7 +14,6 @@ from uuid import uuid4
 
 from densify.config import as_mapping
 from densify.cache import code
-from densify.dataset.drive import BLOCK, margin
 from densify.dataset.manifest import Key, KeyRecord, Manifest, finished, read_manifests
 from densify.dataset.plan import (
     PlannedDrive,
@@ -181,7 +180,9 @@ def _tasks(
 ) -> list[Task]:
     run, place = uuid4().hex, out.absolute()
     jobs = [Job(d.source, recipe, place, cache_bytes, code(), run) for d in drives]
-    return [task for job, d in zip(jobs, drives, strict=True) for task in tasks(job, d.keys)]
+    return [
+        task for job, d in zip(jobs, drives, strict=True) for task in tasks(job, d.keys, d.cut)
+    ]
 
 
 def status(out: Path) -> tuple[Summary, list[str]]:
@@ -218,10 +219,12 @@ def _records(outcomes: Iterator[Outcome]) -> Iterator[KeyRecord]:
 def _part(drives: Sequence[PlannedDrive], shard: tuple[int, int] | None) -> list[PlannedDrive]:
     """Of all drives the blocks of a shard: neighbours together, for they share work."""
     i, n = shard or (1, 1)
-    blocks = [(d.source.name, b) for d in drives for b in sorted({k // BLOCK for k in d.keys})]
+    blocks = [
+        (d.source.name, b) for d in drives for b in sorted({d.cut.number_near(k) for k in d.keys})
+    ]
     mine = set(blocks[len(blocks) * (i - 1) // n : len(blocks) * i // n])
     parts = [
-        replace(d, keys=tuple(k for k in d.keys if (d.source.name, k // BLOCK) in mine))
+        replace(d, keys=tuple(k for k in d.keys if (d.source.name, d.cut.number_near(k)) in mine))
         for d in drives
     ]
     return [part for part in parts if part.keys]
@@ -234,7 +237,7 @@ def _num_processes(
     if memory_bytes is None or not drives:
         return num_workers
     num_points = _num_points(drives)
-    num_shared = BLOCK + 2 * margin(recipe.window)
+    num_shared = max(drive.cut.num_sweeps_of_block for drive in drives)
     shared = num_shared * _SHARED_BYTES_PER_POINT * num_points
     key = (2 * recipe.window + 1) * _KEY_BYTES_PER_POINT * num_points
     need = _BASE_BYTES + shared + key

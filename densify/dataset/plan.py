@@ -19,6 +19,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+from densify.blocks import Cut
 from densify.config import Config, as_mapping
 from densify.dataset.gate import Gate
 from densify.errors import InputError, OutputError
@@ -26,6 +27,7 @@ from densify.outputs.atomic import make_folder, write_file
 from densify.outputs.kitti_tree import drive_folder, split_of
 from densify.readers import Spec, open_sequence
 from densify.readers.files import format_frames, runs
+from densify.readers.timeline import Timeline
 from densify.readers.window import choose_cameras
 from densify.types import Camera, LidarSequence
 from densify.version import __version__
@@ -81,11 +83,12 @@ class Source:
 
 @dataclass(frozen=True)
 class PlannedDrive:
-    """A recording and its keys, ascending."""
+    """A recording and its keys, ascending. cut: how the whole recording is cut into blocks."""
 
     source: Source
     keys: tuple[int, ...]
     cameras: tuple[Camera, ...]
+    cut: Cut
 
 
 def plan(data: Sequence[str], keys: slice | None, recipe: Recipe) -> list[PlannedDrive]:
@@ -115,7 +118,8 @@ def plan(data: Sequence[str], keys: slice | None, recipe: Recipe) -> list[Planne
         chosen = _keys(sequence, keys, spec)
         cameras_wanted = tuple(c.name for c in cameras)
         source = Source(name, Spec.parse(spec).absolute(), folder, cameras_wanted)
-        drives[name] = PlannedDrive(source, chosen, cameras)
+        cut = Cut.whole(Timeline.of(sequence), recipe.window)
+        drives[name] = PlannedDrive(source, chosen, cameras, cut)
     return list(drives.values())
 
 

@@ -16,8 +16,8 @@ from pathlib import Path
 
 from densify import pipeline
 from densify.config import as_mapping
+from densify.blocks import BLOCK_S, Cut
 from densify.cache import Cache, code
-from densify.dataset.drive import BLOCK, Drive, margin
 from densify.dataset.gate import scores_of
 from densify.dataset.manifest import KeyRecord
 from densify.dataset.plan import Recipe, Source
@@ -28,7 +28,8 @@ from densify.outputs.kitti_tree import write_key
 from densify.outputs.store import write_result
 from densify.plugins.engines import engine
 from densify.readers import open_sequence
-from densify.types import LidarSequence, Result
+from densify.recording import Recording
+from densify.types import Result
 
 _STAGES = ("registration", "images", "evidence", "motion")
 _log = logging.getLogger("densify")
@@ -48,27 +49,26 @@ class Job:
     run: str
 
 
-def tasks(job: Job, keys: Sequence[int]) -> Iterator[Task]:
+def tasks(job: Job, keys: Sequence[int], cut: Cut) -> Iterator[Task]:
     """What is left to do for these keys: their records are the outcomes of the tasks named
-    ``("key", drive, frame)``. Ordered so that keys come early."""
+    ``("key", drive, frame)``. Ordered so that keys come early. cut: of the recording."""
     name, last = job.source.name, _last_stage(job.recipe)
-    blocks = sorted({key // BLOCK for key in keys})
+    blocks = sorted({cut.number_near(key) for key in keys})
     known: set[tuple[str, int]] = set()
-    # Each step looks one sweep farther than it has to do with.
-    num_blocks = -(-(margin(job.recipe.window) + 1) // BLOCK)
 
     def around(block: int, step: int) -> list[int]:
-        num = num_blocks if _STAGES[step] == "motion" else 1
-        return list(range(max(0, block - num), block + num + 1)) if step else []
+        reach = {"registration": 0, "motion": cut.num_blocks_around}.get(_STAGES[step], 1)
+        return list(range(max(0, block - reach), min(len(cut.blocks), block + reach + 1)))
 
     def stage(step: int, block: int) -> Iterator[Task]:
         what = _STAGES[step]
         if (what, block) in known:
             return
         known.add((what, block))
-        for b in around(block, step):
+        before = around(block, step) if step else []
+        for b in before:
             yield from stage(step - 1, b)
-        needs = frozenset((_STAGES[step - 1], name, b) for b in around(block, step))
+        needs = frozenset((_STAGES[step - 1], name, b) for b in before)
         yield Task((what, name, block), share, (job, what, block), needs)
 
     for block in blocks:
@@ -77,15 +77,18 @@ def tasks(job: Job, keys: Sequence[int]) -> Iterator[Task]:
             yield from stage(step, b)
         needs = frozenset((_STAGES[step], name, b) for step, b in before)
         for key in keys:
-            if key // BLOCK == block:
+            if cut.number_near(key) == block:
                 yield Task(("key", name, key), make_key, (job, key), needs)
 
 
 def share(job: Job, stage: str, block: int) -> float:
     """Make what the keys of a block share and leave it in the cache; returns the seconds."""
     start = time.perf_counter()
-    drive, cache = _opened(job)
-    getattr(drive, stage)(block)
+    recording, cache = _opened(job)
+    if stage == "motion":
+        recording.block_motion(block, job.recipe.config.flow.engine)
+    else:
+        getattr(recording, stage)(block)
     cache.trim()
     return time.perf_counter() - start
 
@@ -108,24 +111,20 @@ def make_key(job: Job, key: int) -> KeyRecord:
 
 def _made(job: Job, key: int) -> KeyRecord:
     recipe = job.recipe
-    drive, _ = _opened(job)
-    sequence = _sequence(job.source.data, job.run)
+    recording, _ = _opened(job)
+    sequence = recording.sequence
     if key not in sequence.frames:
         raise InputError(f"{sequence.name} has no sweep for frame {key}")
-    stretch = drive.window(key)
     pictures = recipe.layout == "densify"
     cameras = job.source.cameras
-    images = {name: sequence.image(name, key) for name in cameras} if pictures else None
-    results = pipeline.densify(
-        *(sequence, stretch, key, lambda: drive.motion_of(key), cameras, recipe.config),
-        *(_methods(recipe), images),
-    )
+    results = pipeline.densify(recording, key, _methods(recipe), cameras, with_images=pictures)
     result = results[recipe.method]
     scores = scores_of(result)
-    record = KeyRecord(job.source.name, key, "done", frames=stretch.frames, files={}, scores=scores)
-    reason = recipe.gate.reason(scores, len(stretch.frames))
+    record = KeyRecord(job.source.name, key, "done", frames=result.frames, files={}, scores=scores)
+    reason = recipe.gate.reason(scores, len(result.frames))
     if reason is not None:
         return replace(record, status="aside", reason=reason)
+    images = {name: sequence.image(name, key) for name in cameras} if pictures else None
     return replace(record, files=_written(job, results, images))
 
 
@@ -158,22 +157,20 @@ def _last_stage(recipe: Recipe) -> int:
     """The last of `_STAGES` that a key needs."""
     if recipe.method != "flow":
         return _STAGES.index("registration")
-    return _STAGES.index("motion" if engine(recipe.config.flow.engine)[0].shared else "evidence")
-
-
-@lru_cache(maxsize=2)
-def _sequence(data: str, run: str) -> LidarSequence:
-    return open_sequence(data)
+    shared = engine(recipe.config.flow.engine)[0].shared
+    return _STAGES.index("motion" if shared else "registration")
 
 
 @lru_cache(maxsize=1)
-def _opened(job: Job) -> tuple[Drive, Cache]:
+def _opened(job: Job) -> tuple[Recording, Cache]:
     if job.code != code():
         raise ComputationError(
             f"the worker on {platform.node()} has another densify than the one that gave it the "
             f"work; install the same on both"
         )
     cache = Cache(job.cache_bytes)
-    sequence = _sequence(job.source.data, job.run)
-    drive = Drive(sequence, job.recipe.config, job.recipe.window, cache, job.run)
-    return drive, cache
+    sequence = open_sequence(job.source.data)
+    recording = Recording(
+        sequence, job.recipe.config, job.recipe.window, cache=cache, run=job.run
+    )
+    return recording, cache
