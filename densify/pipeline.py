@@ -117,8 +117,7 @@ def run_keys(
     Raises InputError at once for what no key could be made with.
     """
     settings, methods, watch = resolve(config), with_baselines(method), Watch(progress)
-    _check(settings, methods)
-    choose_cameras(sequence, cameras)
+    _check(sequence, settings, methods, cameras)
     recording = Recording(sequence, settings, window, keys, cache, watch=watch)
 
     def results() -> Iterator[tuple[int, Result | ComputationError | InputError]]:
@@ -148,7 +147,7 @@ def compare(
     `run`.
     """
     settings, watch = resolve(config), Watch(progress)
-    _check(settings, methods)
+    _check(sequence, settings, methods, cameras)
     recording = Recording(sequence, settings, window, [key], cache, watch=watch)
     _warn_of_cuts(recording, key)
     return densify(recording, key, methods, cameras, watch)
@@ -197,11 +196,18 @@ def _warn_of_cuts(recording: Recording, key: int) -> None:
         _log.warning("the window of key %d is cut to frames %s: %s", key, frames, cut)
 
 
-def _check(settings: Config, methods: Sequence[str]) -> None:
+def _check(
+    sequence: LidarSequence,
+    settings: Config,
+    methods: Sequence[str],
+    cameras: Sequence[str] | None,
+) -> None:
+    """Raise InputError before anything is read."""
     for name in methods:
         if name not in METHODS:
             raise InputError(f"--methods {name}: expected some of {', '.join(METHODS)}")
     check_engine(settings.flow.engine)
+    choose_cameras(sequence, cameras)
 
 
 def _results(

@@ -12,11 +12,11 @@
 The sweeps are cut into blocks, and each step works on one block. How far it looks beyond its block
 is a number of seconds, 0 at the least. Two ways to cut serve all users:
 
-* `densify.blocks.Cut.around`: the windows of a few keys, which look at nothing else. `densify run` and `compare`
-  take the seconds they must.
-* `densify.blocks.Cut.whole`: blocks of two seconds, counted from time 0 whatever keys are wanted, that look well
-  into the blocks around. The same sweeps make the same maps, whatever else is asked for:
-  `densify dataset`.
+* `densify.blocks.Cut.around`: the windows of a few keys, which look at nothing else. `run` and
+  `compare` use it: no key costs more than it must.
+* `densify.blocks.Cut.whole`: blocks of two seconds, counted from time 0 whatever keys are wanted,
+  that look well into the blocks around. The same sweeps make the same maps, whatever else is asked
+  for: `dataset` uses it.
 
 Sweeps that cannot be read or registered are left out and split the recording: windows end there,
 as they do at holes in time (`densify.readers.timeline`).
@@ -29,10 +29,9 @@ from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from itertools import pairwise
 from typing import Any, NamedTuple, TypeVar
-from uuid import uuid4
 
 from densify.blocks import Cut
-from densify.cache import Cache, digest
+from densify.cache import Cache
 from densify.config import Config
 from densify.costs import Watch
 from densify.depth.accumulate import accumulate
@@ -45,9 +44,10 @@ from densify.geometry.height_map import HeightMap
 from densify.geometry.range_image import RangeImage
 from densify.plugins.engines import engine as engine_row
 from densify.readers.timeline import Timeline, WindowFrames
-from densify.readers.window import read_sweep, recorded_trajectory
+from densify.readers.window import recorded_trajectory
 from densify.registration.deskew import deskew
 from densify.registration.trajectory import find_trajectory
+from densify.sweeps import Sweeps
 from densify.types import (
     Cloud,
     Float,
@@ -57,13 +57,10 @@ from densify.types import (
     RegisteredSweep,
     Stretch,
     StretchFlow,
-    Sweep,
     Trajectory,
 )
 
 T = TypeVar("T")
-
-_DIGESTS_TOGETHER = 20  # sweeps
 
 
 class LeftOut(NamedTuple):
@@ -112,12 +109,12 @@ class Recording:
         if keys is not None:
             cut = Cut.around(self.timeline, window, keys)
         self.cut = cut
-        self._num_around, self._cache, self._run = window, cache, run or uuid4().hex
-        self._watch = watch or Watch()
-        # What the next step, key or block is likely to ask for again.
-        alone = not cut.margin_s
-        self._digests = lru_cache(maxsize=None)(self._find_digests)
-        self._read = lru_cache(maxsize=cut.num_kept + 50 if alone else 1)(self._read_sweep)
+        self._num_around, self._cache, self._watch = window, cache, watch or Watch()
+        # What the next step, key or block is likely to ask for again is kept in memory.
+        num_raw = 1 if cut.margin_s else cut.num_kept + settings.register.num_lead_in
+        self.sweeps = Sweeps(
+            sequence, self.timeline, settings.register, num_raw, cache, run, self._watch
+        )
         self._deskewed = lru_cache(maxsize=cut.num_kept)(self._deskew)
         self._pieces = lru_cache(maxsize=8)(self._find_pieces)
         self.registration = lru_cache(maxsize=8)(self._registration)
@@ -160,8 +157,7 @@ class Recording:
         return Stretch(tuple(self._deskewed(number, self.cut.margin_s, f) for f in frames))
 
     def motion(self, key: int, engine: str | None = None) -> Motion:
-        """How everything in a key's window moves. engine: as ``flow.engine``, which is the default.
-        """
+        """How everything in a key's window moves. engine: None for that of ``flow.engine``."""
         engine = engine or self.settings.flow.engine
         number, (index, piece) = self.cut.number_of[key], self._piece(key)
         window = self.window(key)
@@ -206,7 +202,7 @@ class Recording:
         bad, known = {}, {}
         for frame in [*self.timeline.before(frames[0], num_before), *frames]:
             try:
-                known[frame] = (self._content(frame), self._recorded_pose(frame))
+                known[frame] = (self.sweeps.content(frame), self._recorded_pose(frame))
             except InputError as error:
                 bad[frame] = LeftOut(str(error), unreadable=True)
         return self._made(
@@ -220,7 +216,7 @@ class Recording:
         pieces, bad, left = [], dict(unreadable), self.timeline.runs(frames)
         while left:
             run = left.pop()
-            sweeps = [self._read(f) for f in run]
+            sweeps = [self.sweeps.read(f) for f in run]
             recorded = None
             if self.settings.register.source == "dataset":
                 recorded = recorded_trajectory(self.sequence, sweeps)
@@ -242,7 +238,7 @@ class Recording:
                 return {s.frame: RangeImage.of(s) for s in sweeps}
 
         return self._made(
-            "images", lambda: [(f, self._content(f), p) for f, p in pieces.items()], make
+            "images", lambda: [(f, self.sweeps.content(f), p) for f, p in pieces.items()], make
         )
 
     def _ground(self, number: int) -> list[HeightMap]:
@@ -301,7 +297,7 @@ class Recording:
                 for b in self._blocks_with(number, frames)
                 for index in range(len(self._pieces(b, REACH_S)))
             ]
-            content = [self._content(f) for f in frames]
+            content = [self.sweeps.content(f) for f in frames]
             return [engine, self.settings.flow, piece, evidence, content]
 
         found: list[tuple[Sequence[int], Motion]] = []
@@ -371,7 +367,7 @@ class Recording:
 
     def _deskew(self, number: int, around_s: float, frame: int) -> RegisteredSweep:
         piece = next(p for p in self._pieces(number, around_s) if frame in p.frames)
-        sweep = self._read(frame)
+        sweep = self.sweeps.read(frame)
         with self._watch.stage("deskew"):
             return deskew([sweep], piece).sweeps[0]
 
@@ -392,10 +388,6 @@ class Recording:
         }
         return tuple(evidence[f] for f in frames)
 
-    def _read_sweep(self, frame: int) -> Sweep:
-        with self._watch.stage("read"):
-            return read_sweep(self.sequence, frame, self.settings.register)
-
     def _recorded_pose(self, frame: int) -> Float | None:
         if self.settings.register.source != "dataset":
             return None
@@ -410,39 +402,11 @@ class Recording:
     def _near(self, number: int, index: int) -> Any:
         """What the ground of a piece depends on."""
         piece = self._pieces(number, REACH_S)[index]
-        content = [self._content(f) for f in self._within(piece, number, REACH_S)]
+        content = [self.sweeps.content(f) for f in self._within(piece, number, REACH_S)]
         return [self.settings.ground, number, piece, content]
 
     def _evidence_inputs(self, number: int, index: int) -> Any:
         return [self.settings.flow.min_height_m, self._near(number, index)]
-
-    def _content(self, frame: int) -> str:
-        """A digest of a sweep's content where there is a cache. Raises InputError if the sweep
-        cannot be read."""
-        if self._cache is None:
-            self._read(frame)
-            return ""
-        number = self.timeline.row[frame] // _DIGESTS_TOGETHER
-        found = self._digests(number)[frame]
-        if isinstance(found, InputError):
-            raise found
-        return found
-
-    def _find_digests(self, number: int) -> dict[int, str | InputError]:
-        """By frame; looked up by all processes of a run, of which only the first has to read."""
-        first = number * _DIGESTS_TOGETHER
-
-        def read() -> dict[int, str | InputError]:
-            found: dict[int, str | InputError] = {}
-            for frame in self.timeline.frames[first : first + _DIGESTS_TOGETHER]:
-                try:
-                    found[frame] = digest(self._read(frame))
-                except InputError as error:
-                    found[frame] = error
-            return found
-
-        inputs = [self._run, self.sequence.name, self.settings.register, number]
-        return self._made("digests", lambda: inputs, read)
 
 
 def _steps(motion: Motion, stretch: Stretch, key: int) -> StretchFlow:

@@ -19,7 +19,18 @@ import densify
 from densify.blocks import BLOCK_S
 from densify.dataset.manifest import damaged_files, read_manifests
 from tests.command import files_in
-from tests.scenes import CAMERA, SWEEP_S, Arc, Scanner, Scene, TinySequence, World, car, stamp_ns, street
+from tests.scenes import (
+    CAMERA,
+    SWEEP_S,
+    Arc,
+    Scanner,
+    Scene,
+    TinySequence,
+    World,
+    car,
+    stamp_ns,
+    street,
+)
 
 BORDER = round(2 * BLOCK_S / SWEEP_S)
 FRAMES = range(BORDER - 4, BORDER + 5)

@@ -11,14 +11,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from densify.dataset import make
-from densify.cache import Cache
 from densify.blocks import Cut
+from densify.cache import Cache
+from densify.dataset import make
 from densify.dataset.loader import DepthDataset
 from densify.dataset.plan import Recipe, Source
 from densify.dataset.work import Job, tasks
-from densify.readers.timeline import Timeline
 from densify.errors import InputError
+from densify.readers.timeline import Timeline
 from tests.command import exit_code, files_in
 from tests.dataset_scenes import (
     BORDER,

@@ -141,10 +141,12 @@ def test_no_library_code_exits_prints_or_asserts() -> None:
 
 FLOORS = (
     ("arrays", "errors", "version", "knobs", "plugins"),
-    ("config", "geometry", "kernels", "types"),
+    ("cache", "config", "costs", "geometry", "kernels", "types"),
     ("registration", "depth", "flow", "scores", "street"),
     ("readers",),
     ("outputs", "writers"),
+    ("blocks", "sweeps"),
+    ("recording",),
     ("pipeline",),
     ("bench", "dataset"),
     ("cli",),

@@ -15,8 +15,8 @@ import pytest
 
 from densify import blocks, pipeline
 from densify import recording as shared
-from densify.config import Config, resolve
 from densify.cache import Cache
+from densify.config import Config, resolve
 from densify.errors import InputError, SweepError
 from densify.geometry import poses
 from densify.geometry.range_image import RangeImage
@@ -205,14 +205,15 @@ def test_no_window_is_cut_at_a_border(num_lead_in: int, tmp_path: Path) -> None:
         assert drive.window(BORDER).frames == tuple(range(BORDER - 2, BORDER + 3))
 
 
-def test_a_gap_ends_windows_and_begins_a_world(tmp_path: Path) -> None:
-    frames = [f for f in range(BORDER - 6, BORDER + 6) if f not in (BORDER - 3, BORDER + 3)]
+def test_a_hole_in_time_ends_windows_and_begins_a_world(tmp_path: Path) -> None:
+    holes = [BORDER + i for i in (-5, -4, -3, 3, 4, 5)]
+    frames = [f for f in range(BORDER - 8, BORDER + 8) if f not in holes]
     drive = drive_of(across_border(frames), tmp_path, 4)
     pieces = {
-        BORDER - 5: [-6, -5, -4],
+        BORDER - 7: [-8, -7, -6],
         BORDER - 1: [-2, -1, 0, 1, 2],
         BORDER: [-2, -1, 0, 1, 2],
-        BORDER + 4: [4, 5],
+        BORDER + 6: [6, 7],
     }
     for key, around in pieces.items():
         window = drive.window(key)
@@ -220,8 +221,32 @@ def test_a_gap_ends_windows_and_begins_a_world(tmp_path: Path) -> None:
         own = next(s for s in window.sweeps if s.frame // 20 == key // 20)
         np.testing.assert_array_equal(own.T_world_lidar, np.eye(4))
         assert drive.motion(key).flow(key, key).displacement.shape[1] == 3
-    end = drive.window(BORDER + 5)[BORDER + 5]
+    assert "lie between frames" in drive.window_frames(BORDER - 1).cuts[0]
+    end = drive.window(BORDER + 7)[BORDER + 7]
     np.testing.assert_array_equal(end.twist_before, end.twist_after)
+
+
+@pytest.mark.parametrize("source", ["dataset", "kiss-icp"])
+def test_windows_go_on_over_sweeps_that_are_missing(source: str, tmp_path: Path) -> None:
+    """Every second one: half the rate; or single ones, at the border too."""
+    config = resolve({"register": {"source": source}})
+    for frames in (
+        range(BORDER - 8, BORDER + 9, 2),
+        [f for f in range(BORDER - 6, BORDER + 6) if f not in (BORDER - 3, BORDER, BORDER + 3)],
+    ):
+        sequence = across_border(list(frames), Scanner(32, 540))
+        drive = drive_of(sequence, tmp_path, 2, config)
+        for key in (frames[4], frames[5]):
+            row = list(frames).index(key)
+            window = drive.window(key)
+            assert window.frames == tuple(frames[row - 2 : row + 3])
+            for sweep in window.sweeps:
+                true = poses.inverse(sequence.T_world_lidar(key)) @ sequence.T_world_lidar(
+                    sweep.frame
+                )
+                np.testing.assert_allclose(
+                    window.T_target_source(key, sweep.frame), true, atol=0.05
+                )
 
 
 # Sweeps in the way

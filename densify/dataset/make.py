@@ -12,8 +12,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from uuid import uuid4
 
-from densify.config import as_mapping
 from densify.cache import code
+from densify.config import as_mapping
 from densify.dataset.manifest import Key, KeyRecord, Manifest, finished, read_manifests
 from densify.dataset.plan import (
     PlannedDrive,
@@ -180,9 +180,7 @@ def _tasks(
 ) -> list[Task]:
     run, place = uuid4().hex, out.absolute()
     jobs = [Job(d.source, recipe, place, cache_bytes, code(), run) for d in drives]
-    return [
-        task for job, d in zip(jobs, drives, strict=True) for task in tasks(job, d.keys, d.cut)
-    ]
+    return [task for job, d in zip(jobs, drives, strict=True) for task in tasks(job, d.keys, d.cut)]
 
 
 def status(out: Path) -> tuple[Summary, list[str]]:

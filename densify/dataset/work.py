@@ -15,9 +15,9 @@ from functools import lru_cache
 from pathlib import Path
 
 from densify import pipeline
-from densify.config import as_mapping
-from densify.blocks import BLOCK_S, Cut
+from densify.blocks import Cut
 from densify.cache import Cache, code
+from densify.config import as_mapping
 from densify.dataset.gate import scores_of
 from densify.dataset.manifest import KeyRecord
 from densify.dataset.plan import Recipe, Source
@@ -170,7 +170,5 @@ def _opened(job: Job) -> tuple[Recording, Cache]:
         )
     cache = Cache(job.cache_bytes)
     sequence = open_sequence(job.source.data)
-    recording = Recording(
-        sequence, job.recipe.config, job.recipe.window, cache=cache, run=job.run
-    )
+    recording = Recording(sequence, job.recipe.config, job.recipe.window, cache=cache, run=job.run)
     return recording, cache

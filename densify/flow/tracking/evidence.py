@@ -24,6 +24,7 @@ _MIN_SEED_SHARE = 0.3
 _LINK_M = 0.6
 _RING_GAP_M = 0.35
 REACH = 10  # sweeps
+REACH_S = 1.0
 
 
 @dataclass(frozen=True)
