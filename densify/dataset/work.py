@@ -31,7 +31,16 @@ from densify.readers import open_sequence
 from densify.recording import Recording
 from densify.types import Result
 
-_STAGES = ("registration", "images", "evidence", "motion")
+_MARGIN = 2
+_NEEDS: dict[str, dict[str, int]] = {
+    "registration": {},
+    "images": {"registration": 1},
+    "ground": {"registration": 1},
+    "evidence": {"images": 1, "ground": 0},
+    "motion": {"evidence": _MARGIN, "ground": 0},
+}
+"""Step of a block -> the steps it is made of, and how many blocks around: none, one on each side,
+or all within the margin. Steps are methods of `densify.recording.Recording`."""
 _log = logging.getLogger("densify")
 
 
@@ -52,30 +61,33 @@ class Job:
 def tasks(job: Job, keys: Sequence[int], cut: Cut) -> Iterator[Task]:
     """What is left to do for these keys: their records are the outcomes of the tasks named
     ``("key", drive, frame)``. Ordered so that keys come early. cut: of the recording."""
-    name, last = job.source.name, _last_stage(job.recipe)
-    blocks = sorted({cut.number_near(key) for key in keys})
-    known: set[tuple[str, int]] = set()
+    name, known = job.source.name, set[tuple[str, int]]()
 
-    def around(block: int, step: int) -> list[int]:
-        reach = {"registration": 0, "motion": cut.num_blocks_around}.get(_STAGES[step], 1)
-        return list(range(max(0, block - reach), min(len(cut.blocks), block + reach + 1)))
+    def needed(what: str, block: int) -> list[tuple[str, int]]:
+        reach = {0: 0, 1: 1, _MARGIN: cut.num_blocks_around}
+        return [
+            (step, b)
+            for step, around in (_NEEDS | {"key": _needs_of_keys(job.recipe)})[what].items()
+            for b in range(
+                max(0, block - reach[around]), min(len(cut.blocks), block + reach[around] + 1)
+            )
+        ]
 
-    def stage(step: int, block: int) -> Iterator[Task]:
-        what = _STAGES[step]
+    def steps(what: str, block: int) -> Iterator[Task]:
+        """What it needs, then itself, each once."""
         if (what, block) in known:
             return
         known.add((what, block))
-        before = around(block, step) if step else []
-        for b in before:
-            yield from stage(step - 1, b)
-        needs = frozenset((_STAGES[step - 1], name, b) for b in before)
-        yield Task((what, name, block), share, (job, what, block), needs)
-
-    for block in blocks:
-        before = [(last, block), *((0, b) for b in around(block, len(_STAGES) - 1))]
+        before = needed(what, block)
         for step, b in before:
-            yield from stage(step, b)
-        needs = frozenset((_STAGES[step], name, b) for step, b in before)
+            yield from steps(step, b)
+        if what != "key":
+            needs = frozenset((step, name, b) for step, b in before)
+            yield Task((what, name, block), share, (job, what, block), needs)
+
+    for block in sorted({cut.number_near(key) for key in keys}):
+        yield from steps("key", block)
+        needs = frozenset((step, name, b) for step, b in needed("key", block))
         for key in keys:
             if cut.number_near(key) == block:
                 yield Task(("key", name, key), make_key, (job, key), needs)
@@ -153,12 +165,11 @@ def _methods(recipe: Recipe) -> tuple[str, ...]:
     return tuple(dict.fromkeys(["none", recipe.method]))
 
 
-def _last_stage(recipe: Recipe) -> int:
-    """The last of `_STAGES` that a key needs."""
+def _needs_of_keys(recipe: Recipe) -> dict[str, int]:
     if recipe.method != "flow":
-        return _STAGES.index("registration")
+        return {"registration": _MARGIN}
     shared = engine(recipe.config.flow.engine)[0].shared
-    return _STAGES.index("motion" if shared else "registration")
+    return {"registration": _MARGIN, "motion" if shared else "ground": 0}
 
 
 @lru_cache(maxsize=1)
