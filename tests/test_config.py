@@ -31,7 +31,7 @@ KNOBS = [
     for field in dataclasses.fields(getattr(Config(), section.name))
 ]
 
-FREE_TEXT = {("flow", "engine")}  # checked by their section
+FREE_TEXT = {("flow", "engine"), ("output", "also")}  # checked by their section
 
 
 def rendered_defaults() -> str:
@@ -194,6 +194,7 @@ def test_overrides_win_over_the_file_and_later_over_earlier() -> None:
         ("register.source=oxts", ["got 'oxts'", "one of kiss-icp, dataset"]),
         ("flow.engine=magic", ["got 'magic'", "one of groups, paper, npz:DIR"]),
         ("project.at=noon", ["got 'noon'", "one of camera, sweep"]),
+        ("output.also=rainbow", ["output.also: got 'rainbow'", "one of depth, flow, movers"]),
         ("output.movers=hide", ["got 'hide'", "one of keep, drop, separate"]),
         ("objective.alpha", ["expected section.key=value"]),
         ("alpha=3", ["expected section.key=value"]),

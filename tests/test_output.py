@@ -18,10 +18,13 @@ from hypothesis.extra.numpy import arrays
 from densify.errors import InputError
 from densify.outputs import (
     check_writable,
+    cloud_laz,
+    depth_maps,
     draw_figure,
+    figure,
     read_cloud,
     read_depth_png,
-    store,
+    run_yaml,
     write_age_png,
     write_cloud,
     write_comparison,
@@ -432,7 +435,7 @@ def test_figure_shows_the_baselines_above_the_result(put, tmp_path, monkeypatch)
         drawn.update(panels)
         return draw_figure(image, panels)
 
-    monkeypatch.setattr(store, "draw_figure", draw)
+    monkeypatch.setattr(figure, "draw_figure", draw)
     baselines = {method: result_of(method, i) for i, method in enumerate(("none", "icp"), 1)}
     put(replace(result_of(), baselines=baselines))
     assert list(drawn) == ["sparse", "icp", "flow"]
@@ -483,12 +486,19 @@ def test_overwriting_replaces_what_densify_wrote_and_keeps_the_rest(put, tmp_pat
 
 
 @pytest.mark.parametrize(
-    "writer", ["write_depth_png", "write_cloud", "write_picture", "write_file"]
+    ("module", "writer"),
+    [
+        (depth_maps, "write_depth_png"),
+        (cloud_laz, "write_cloud"),
+        (figure, "write_picture"),
+        (run_yaml, "write_file"),
+    ],
+    ids=lambda value: value if isinstance(value, str) else "",
 )
 @pytest.mark.parametrize("failure", [KeyboardInterrupt, RuntimeError])
 @pytest.mark.parametrize("existing", [False, True])
 def test_a_failure_in_the_middle_leaves_nothing(
-    put, tmp_path, monkeypatch, writer, failure, existing
+    put, tmp_path, monkeypatch, module, writer, failure, existing
 ):
     if existing:
         put()
@@ -498,7 +508,7 @@ def test_a_failure_in_the_middle_leaves_nothing(
         path.with_suffix(".half").write_bytes(b"half")
         raise failure
 
-    monkeypatch.setattr(store, writer, fail)
+    monkeypatch.setattr(module, writer, fail)
     with pytest.raises(failure):
         put(result_of(seed=9), overwrite=existing)
     assert tree(tmp_path) == before
@@ -513,7 +523,7 @@ def test_a_failure_leaves_no_folder_above_the_result(tmp_path, monkeypatch, ther
     def fail(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(store, "write_cloud", fail)
+    monkeypatch.setattr(cloud_laz, "write_cloud", fail)
     with pytest.raises(KeyboardInterrupt):
         write_result(result_of(), {}, tmp_path / "p" / "q" / "r", config={}, data="street")
     assert sorted(tmp_path.rglob("*")) == before
@@ -586,7 +596,7 @@ def test_a_full_disk_is_one_line(put, tmp_path, monkeypatch):
     def full(*_):
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr(store, "write_cloud", full)
+    monkeypatch.setattr(cloud_laz, "write_cloud", full)
     with pytest.raises(InputError) as error:
         put()
     one_line(error, tmp_path / "out", "No space left on device")
@@ -691,7 +701,7 @@ def test_a_failing_comparison_leaves_the_run_alone(put, images, tmp_path, monkey
     def fail(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(store, "write_picture", fail)
+    monkeypatch.setattr(figure, "write_picture", fail)
     with pytest.raises(KeyboardInterrupt):
         compare(tmp_path / "out", images)
     assert tree(tmp_path) == before

@@ -31,7 +31,7 @@ def run(options: argparse.Namespace) -> None:
     from densify.outputs import check_writable, write_result
     from densify.readers import open_sequence
 
-    check_writable(options.out, options.key, options.overwrite, "run")
+    check_writable(options.out, options.key, options.overwrite, "run", config.output.also)
     sequence = open_sequence(options.data)
     with progress_on_stderr() as progress:
         result = pipeline.run(
@@ -50,6 +50,7 @@ def run(options: argparse.Namespace) -> None:
         config=as_mapping(config),
         data=options.data,
         overwrite=options.overwrite,
+        also=config.output.also,
     )
     print(summary(result))
     _print_paths(paths)

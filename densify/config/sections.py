@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 from densify.errors import InputError
 from densify.knobs import Section, knob
-from densify.plugins import engines
+from densify.plugins import engines, outputs
 
 
 @dataclass(frozen=True)
@@ -253,12 +253,19 @@ class OutputSettings(Section):
     rejected: bool = knob(
         False, "rejected/: a picture of what visibility left out, and why; counts in metrics.json"
     )
+    also: str = knob(
+        "", "outputs that other packages bring, by name, parted by commas; see examples/plugin"
+    )
     movers: str = knob(
         "keep",
         "what moves. keep: as all else; drop: left out of maps and cloud; separate: left out and "
         "written object by object under movers/",
         choices=("keep", "drop", "separate"),
     )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        outputs.check_also(self.also)
 
 
 @dataclass(frozen=True)

@@ -32,7 +32,7 @@ from typing import Any, Literal, get_args
 
 from densify.errors import InputError, OutputError
 from densify.outputs.atomic import FileRecord, make_folder, sync_folder, write_file
-from densify.outputs.store import plain
+from densify.outputs.plain import plain
 
 Status = Literal["done", "aside", "failed"]
 Key = tuple[str, int]

@@ -152,6 +152,7 @@ def _written(
         config=as_mapping(job.recipe.config),
         data=job.source.data,
         overwrite=True,
+        also=job.recipe.config.output.also,
     )
     return {
         path.relative_to(job.out).as_posix(): FileRecord.of(path.read_bytes()) for path in paths

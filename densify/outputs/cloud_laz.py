@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from densify.errors import InputError
 from densify.outputs.atomic import write_file
-from densify.types import Bool, Cloud, Float, Float32
+from densify.outputs.context import Context
+from densify.types import Bool, Cloud, Float, Float32, Result
 
 _SCALE_M = 0.001
 _MAX_COORDINATE_M = _SCALE_M * np.iinfo(np.int32).max
@@ -42,6 +43,11 @@ class StoredCloud:
     displaced: Float32
     intensity: Float32
     rgb: NDArray[np.uint8]
+
+
+def write_output(result: Result, context: Context, folder: Path) -> None:
+    """``cloud.laz``."""
+    write_cloud(folder / "cloud.laz", result.cloud)
 
 
 def write_cloud(path: Path, cloud: Cloud) -> None:

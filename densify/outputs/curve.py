@@ -4,12 +4,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 
-from densify.outputs.png import Picture
+from densify.outputs.context import Context
+from densify.outputs.png import Picture, write_picture
+from densify.types import Result
 
 _WIDTH_PX, _HEIGHT_PX, _LEFT_PX, _BOTTOM_PX, _TOP_PX = 800, 520, 90, 60, 40
 _LEAST = 1e-4  # of outliers that the axis shows
@@ -17,6 +20,17 @@ _TICKS = (1e-4, 1e-3, 1e-2, 1e-1)
 _COLOURS = ((80, 170, 255), (255, 150, 60), (120, 220, 120), (230, 120, 230))
 _GRAY, _WHITE, _DARK = (90, 90, 90), (255, 255, 255), 20
 _FONT = cv2.FONT_HERSHEY_SIMPLEX
+
+
+def write_output(result: Result, context: Context, folder: Path) -> None:
+    """``curve.png``: of the first camera, if any method was scored with the key held out."""
+    curves = {
+        method: next(iter(held_out.values()))["curve"]
+        for method, of_method in {**result.baselines, result.method: result}.items()
+        if (held_out := of_method.metrics.get("held_out"))
+    }
+    if curves:
+        write_picture(folder / "curve.png", draw_curve(curves))
 
 
 def draw_curve(curves: Mapping[str, Sequence[Mapping[str, Any]]]) -> Picture:

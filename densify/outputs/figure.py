@@ -6,13 +6,15 @@ in colour with a scale.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from densify.outputs.png import Picture
-from densify.types import Float32, Reason
+from densify.outputs.context import Context
+from densify.outputs.png import Picture, write_picture
+from densify.types import Float32, Reason, Result
 
 # Fixed, so that pictures of different keys compare; logarithmic, as accuracy and density are.
 _NEAR_M, _FAR_M = 3.0, 80.0
@@ -23,6 +25,7 @@ _REFERENCE_WIDTH_PX = 1242
 _MIN_WIDTH_PX = 480
 _POINT_SIZE_PX = 3
 _FONT = cv2.FONT_HERSHEY_SIMPLEX
+_TITLES = {"none": "sparse"}
 _LEGEND_PX = 38
 _REASON_COLOURS = {
     Reason.VETOED: (255, 70, 70),
@@ -30,6 +33,23 @@ _REASON_COLOURS = {
     Reason.UNSUPPORTED: (255, 210, 60),
     Reason.EDGE: (90, 230, 120),
 }
+
+
+def write_output(result: Result, context: Context, folder: Path) -> None:
+    """``figure.png``: the result's baselines from top to bottom, then the result."""
+    methods = {**result.baselines, result.method: result}
+    write_figure(folder / "figure.png", methods, context)
+
+
+def write_figure(path: Path, results: Mapping[str, Result], context: Context) -> None:
+    """The measured depth of each method in the first camera, if there is one."""
+    depth = next(iter(results.values())).depth
+    if not depth:
+        return
+    camera = next(iter(depth))
+    image = context.image(camera, depth[camera].depth_m.shape)
+    panels = {_TITLES.get(m, m): r.depth[camera].depth_m for m, r in results.items()}
+    write_picture(path, draw_figure(image, panels))
 
 
 def draw_figure(image: Picture, panels: Mapping[str, Float32]) -> Picture:

@@ -11,7 +11,14 @@ import numpy as np
 
 from densify.geometry import poses
 from densify.outputs.atomic import write_file
-from densify.types import FlowField, StretchFlow
+from densify.outputs.context import Context
+from densify.types import FlowField, Result, StretchFlow
+
+
+def write_output(result: Result, context: Context, folder: Path) -> None:
+    """``flow/``, where it is asked for."""
+    if result.flow is not None:
+        write_flow_files(folder / "flow", result.flow)
 
 
 def write_flow_files(folder: Path, flow: StretchFlow) -> None:

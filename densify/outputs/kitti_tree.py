@@ -21,7 +21,7 @@ import yaml
 from densify.errors import OutputError
 from densify.outputs.atomic import FileRecord, make_folder, write_file
 from densify.outputs.depth_png import encode_confidence, encode_depth
-from densify.outputs.store import plain
+from densify.outputs.plain import plain
 from densify.types import DepthMap
 from densify.version import __version__
 

@@ -1,97 +1,56 @@
 # SPDX-License-Identifier: MIT
 """The files of one key, ``OUT/000120/...``: results of ``run`` and tables of ``compare``, whole or
-not at all.
-
-``age/CAMERA.png`` holds, as 16 bit, milliseconds between the camera's exposure and the sweep that
-measured the pixel, plus 1; 0 is no depth, and 65535 says 65.5 s or more. It covers the pixels of
-``depth_filled``; filled ones have the age of the nearest measured pixel.
-
-Keys of metrics.json; compare.json holds those from ``frames`` on under ``methods`` by method, and
-data, config and versions as run.yaml::
-
-    schema_version, key, method
-    frames      of the window, absolute numbers
-    num_points  of the cloud; num_moving of those
-    density     camera -> measured, filled: fraction of the pixels with a depth
-    ghosts      `densify.scores.ghosts.ghost_scores`: num_points, all, moving, static, by_distance,
-                by_seconds
-    depth       where there is truth: camera -> measured, filled -> all, moving, static -> the
-                fields of `densify.scores.depth_metrics.DepthErrors`
-    held_out    camera -> the same fields as depth: the key densified from its neighbours alone
-                against its own returns; and curve,
-                `densify.scores.depth_metrics.precision_density`, drawn in curve.png;
-                null for the key sweep alone
-    baselines   the same from ``frames`` on for each simpler method on the same registration
-
-A score that nothing can be said of is null.
+not at all. What ``run`` writes is the table `densify.plugins.outputs`; each module says what its
+files hold.
 """
 
 from __future__ import annotations
 
-import json
-import math
 import os
-import platform
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any, Literal
-
-import numpy as np
-import yaml
+from typing import Any, Literal, Protocol, cast
 
 from densify.errors import InputError, OutputError
-from densify.outputs.atomic import staged_folder, write_file
-from densify.outputs.cloud_laz import write_cloud
-from densify.outputs.curve import draw_curve
-from densify.outputs.depth_png import (
-    write_age_png,
-    write_confidence_png,
-    write_depth_png,
-    write_flow_png,
-)
-from densify.outputs.figure import draw_figure, draw_rejected
-from densify.outputs.flow_npz import write_flow_files
-from densify.outputs.png import Picture, write_picture
-from densify.types import DepthMap, Result
-from densify.version import __version__
+from densify.outputs.atomic import staged_folder
+from densify.outputs.context import Context
+from densify.outputs.figure import write_figure
+from densify.outputs.metrics import SCHEMA_VERSION, scores_of
+from densify.outputs.plain import write_json
+from densify.outputs.png import Picture
+from densify.outputs.run_yaml import versions
+from densify.plugins.outputs import OUTPUTS, Output, chosen
+from densify.types import Result
 
 Verb = Literal["run", "compare"]
 
-SCHEMA_VERSION = 1
-"""Of metrics.json and compare.json; grows when a key changes its meaning or goes."""
-
-_OWNED: Mapping[Verb, tuple[str, ...]] = {
-    "run": (
-        *(
-            "depth",
-            "depth_filled",
-            "confidence",
-            "age",
-            "flow",
-            "movers",
-            "optical_flow",
-            "rejected",
-        ),
-        *("cloud.laz", "metrics.json", "figure.png", "curve.png", "run.yaml"),
-    ),
-    "compare": ("compare.json", "compare.png"),
-}
-_TITLES = {"none": "sparse"}  # of the figures' rows
-_PACKAGES = (
-    *("numpy", "scipy", "torch", "embreex", "kiss-icp"),
-    *("opencv-python-headless", "laspy", "lazrs", "PyYAML"),
-)
+_COMPARISON = ("compare.json", "compare.png")
 
 
-def check_writable(out: Path, key: int, overwrite: bool = False, verb: Verb = "run") -> None:
+class OutputModule(Protocol):
+    """What the module of an output has."""
+
+    def write_output(self, result: Result, context: Context, folder: Path) -> None:
+        """Write the files that the output owns, where the result has something for them.
+
+        folder: of the key, not yet in its place: all of it appears when every output is done, or
+        nothing does. Same result and context, same bytes.
+        """
+        ...
+
+
+def check_writable(
+    out: Path, key: int, overwrite: bool = False, verb: Verb = "run", also: str = ""
+) -> None:
     """Find out before a computation whether its result can be written; touches nothing.
 
-    out: the folder of ``--out``, which need not exist. Raises InputError if the files that ``verb``
-    writes for ``key`` are there and not to be overwritten, or the place cannot be written to.
+    out: the folder of ``--out``, which need not exist. also: as ``output.also``. Raises InputError
+    if the files that ``verb`` writes for ``key`` are there and not to be overwritten, the place
+    cannot be written to, or an output is not there.
     """
-    _check_place(_key_folder(out, key), _OWNED[verb], out, overwrite)
+    owned = _owned(chosen(also)) if verb == "run" else _COMPARISON
+    _check_place(_key_folder(out, key), owned, out, overwrite)
 
 
 @contextmanager
@@ -141,54 +100,30 @@ def write_result(
     config: Mapping[str, Any],
     data: str,
     overwrite: bool = False,
+    also: str = "",
 ) -> list[Path]:
-    """Write one densified key as ``out/KEY/``: depth, depth_filled, confidence and age of each
-    camera, cloud.laz, metrics.json, figure.png and run.yaml.
+    """Write one densified key as ``out/KEY/``: what the outputs of the table make of it.
 
     images: camera to (H,W,3) RGB; a camera without one is drawn on black. config: the merged
     configuration, as plain mappings. data: the recording, as the user named it. overwrite: replace
-    an earlier result; whatever else lies in the folder is kept either way.
-
-    figure.png shows the first camera: the result's baselines from top to bottom, then the result.
+    an earlier result; whatever else lies in the folder is kept either way. also: outputs of other
+    packages, as ``output.also``.
 
     Returns the files written. Raises InputError if the place cannot be written to, or holds a
     result already.
     """
-    with writing(_key_folder(out, result.key), _OWNED["run"], out, overwrite) as folder:
-        for name, depth in result.depth.items():
-            _write_depth(folder, name, depth)
-        write_cloud(folder / "cloud.laz", result.cloud)
-        if result.flow is not None:
-            write_flow_files(folder / "flow", result.flow)
-        for instance, mover in result.movers.items():
-            apart = folder / "movers" / (f"{instance:04d}" if instance >= 0 else "others")
-            (apart / "depth").mkdir(parents=True)
-            for name, maps in mover.depth.items():
-                write_depth_png(apart / "depth" / f"{name}.png", maps.depth_m)
-            write_cloud(apart / "cloud.laz", mover.cloud)
-        for name, reason in result.rejected.items():
-            (folder / "rejected").mkdir(exist_ok=True)
-            image = images.get(name, np.zeros((*reason.shape, 3), np.uint8))
-            write_picture(folder / "rejected" / f"{name}.png", draw_rejected(image, reason))
-        for name, flows in result.optical_flow.items():
-            for other, flow_px in flows.items():
-                (folder / "optical_flow" / other).mkdir(parents=True, exist_ok=True)
-                write_flow_png(folder / "optical_flow" / other / f"{name}.png", flow_px)
-        _write_json(
-            folder / "metrics.json",
-            {
-                "schema_version": SCHEMA_VERSION,
-                "key": result.key,
-                "method": result.method,
-                **_scores(result),
-                "baselines": {m: _scores(baseline) for m, baseline in result.baselines.items()},
-            },
-        )
-        methods = {**result.baselines, result.method: result}
-        _write_figure(folder / "figure.png", methods, images)
-        _write_curve(folder / "curve.png", methods)
-        _write_run(folder / "run.yaml", result, config, data)
-    return _written(out, result.key, "run")
+    rows = chosen(also)
+    owned, context = _owned(rows), Context(images, config, data)
+    with writing(_key_folder(out, result.key), owned, out, overwrite) as folder:
+        for row in rows:
+            cast(OutputModule, OUTPUTS.module(row)).write_output(result, context, folder)
+            strays = sorted({entry.name for entry in folder.iterdir()} - set(owned))
+            if strays:
+                raise InputError(
+                    f"output {row.name}: wrote {', '.join(strays)}, expected nothing but "
+                    f"{', '.join(row.owned)}; mend {row.module}"
+                )
+    return _written(out, result.key, owned)
 
 
 def write_comparison(
@@ -210,120 +145,28 @@ def write_comparison(
         "schema_version": SCHEMA_VERSION,
         "key": key,
         "data": data,
-        "methods": {method: _scores(result) for method, result in results.items()},
+        "methods": {method: scores_of(result) for method, result in results.items()},
         "config": config,
-        "versions": _versions(),
+        "versions": versions(),
     }
-    with writing(_key_folder(out, key), _OWNED["compare"], out, overwrite) as folder:
-        _write_json(folder / "compare.json", table)
-        _write_figure(folder / "compare.png", results, images)
-    return _written(out, key, "compare")
+    with writing(_key_folder(out, key), _COMPARISON, out, overwrite) as folder:
+        write_json(folder / "compare.json", table)
+        write_figure(folder / "compare.png", results, Context(images, config, data))
+    return _written(out, key, _COMPARISON)
 
 
 def _key_folder(out: Path, key: int) -> Path:
     return out / f"{key:06d}"
 
 
-def _written(out: Path, key: int, verb: Verb) -> list[Path]:
+def _owned(rows: Sequence[Output]) -> tuple[str, ...]:
+    return tuple(name for row in rows for name in row.owned)
+
+
+def _written(out: Path, key: int, owned: Sequence[str]) -> list[Path]:
     folder = _key_folder(out, key)
     files: list[Path] = []
-    for name in _OWNED[verb]:
+    for name in owned:
         entry = folder / name
         files += [entry] if entry.is_file() else sorted(f for f in entry.rglob("*") if f.is_file())
     return files
-
-
-def _write_depth(folder: Path, camera: str, depth: DepthMap) -> None:
-    if depth.age_s is None:
-        raise ValueError(f"depth map of {camera}: expected ages, see densify.depth.age")
-    for product in ("depth", "depth_filled", "confidence", "age"):
-        (folder / product).mkdir(exist_ok=True)
-    name = f"{camera}.png"
-    write_depth_png(folder / "depth" / name, depth.depth_m)
-    write_depth_png(folder / "depth_filled" / name, depth.filled_m)
-    write_confidence_png(folder / "confidence" / name, depth.confidence, depth.filled_m)
-    write_age_png(folder / "age" / name, depth.age_s, depth.filled_m)
-
-
-def _scores(result: Result) -> dict[str, Any]:
-    return {"frames": result.frames, **result.metrics}
-
-
-def _write_figure(path: Path, results: Mapping[str, Result], images: Mapping[str, Picture]) -> None:
-    """The measured depth of each method in the first camera, if there is one."""
-    depth = next(iter(results.values())).depth
-    if not depth:
-        return
-    camera = next(iter(depth))
-    image = images.get(camera)
-    if image is None:
-        image = np.zeros((*depth[camera].depth_m.shape, 3), np.uint8)
-    panels = {_TITLES.get(m, m): r.depth[camera].depth_m for m, r in results.items()}
-    write_picture(path, draw_figure(image, panels))
-
-
-def _write_curve(path: Path, results: Mapping[str, Result]) -> None:
-    """Of the first camera, if any method was scored with the key held out."""
-    curves = {
-        method: next(iter(held_out.values()))["curve"]
-        for method, result in results.items()
-        if (held_out := result.metrics.get("held_out"))
-    }
-    if curves:
-        write_picture(path, draw_curve(curves))
-
-
-def _write_run(path: Path, result: Result, config: Mapping[str, Any], data: str) -> None:
-    record = {
-        "data": data,
-        "key": result.key,
-        "method": result.method,
-        "frames": result.frames,
-        "cameras": list(result.depth),
-        "config": config,
-        "stages": [
-            {
-                "name": cost.name,
-                "seconds": round(cost.seconds, 3),
-                "peak_memory_mb": round(cost.peak_memory_mb, 1),
-            }
-            for cost in result.costs
-        ],
-        "versions": _versions(),
-    }
-    text = yaml.safe_dump(plain(record), sort_keys=False, allow_unicode=True)
-    write_file(path, text.encode())
-
-
-def _versions() -> dict[str, str | None]:
-    versions: dict[str, str | None] = {
-        "densify": __version__,
-        "python": platform.python_version(),
-        "platform": platform.platform(),
-    }
-    for package in _PACKAGES:
-        try:
-            versions[package] = version(package)
-        except PackageNotFoundError:  # conda and system builds go by other names
-            versions[package] = None
-    return versions
-
-
-def _write_json(path: Path, value: Mapping[str, Any]) -> None:
-    write_file(path, (json.dumps(plain(value), indent=2, allow_nan=False) + "\n").encode())
-
-
-def plain(value: Any) -> Any:
-    """Numpy's numbers as Python's, tuples as lists, and None for what JSON cannot say (not finite
-    numbers); for the files that people and other programs read."""
-    if isinstance(value, Mapping):
-        return {str(key): plain(item) for key, item in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [plain(item) for item in value]
-    if isinstance(value, np.ndarray):
-        return plain(value.tolist())
-    if isinstance(value, np.generic):
-        return plain(value.item())
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    return value

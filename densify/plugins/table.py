@@ -9,7 +9,7 @@ A package adds a row by an entry point: the name is the row's, the value is a mo
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from importlib import import_module
 from types import ModuleType
@@ -54,12 +54,15 @@ class Table(Generic[R]):
         """How the rows are written: the built-in ones, then other packages' names, sorted."""
         return [row.usage for row in self.built_in] + sorted(self._added())
 
+    def __contains__(self, name: str) -> bool:
+        return self._is_built_in(name) or name in self._added()
+
     def require(self, name: str, where: str) -> None:
         """Raise InputError unless there is such a row. Imports nothing.
 
         where: what the name was given to, for the message.
         """
-        if not self._is_built_in(name) and name not in self._added():
+        if name not in self:
             raise InputError(
                 f"{where}: got {name!r}, expected one of {', '.join(self.usages())} (others come "
                 f"with packages that have an entry point in {self.group})"
@@ -74,10 +77,11 @@ class Table(Generic[R]):
                 return row
         return self._load(name, self._added()[name])
 
-    def rows(self) -> list[R]:
-        """All of them; imports the modules of other packages."""
-        added = sorted(self._added().items())
-        return [*self.built_in, *(self._load(name, points) for name, points in added)]
+    def __iter__(self) -> Iterator[R]:
+        """The built-in rows, then those of other packages, each imported when its turn comes."""
+        yield from self.built_in
+        for name, points in sorted(self._added().items()):
+            yield self._load(name, points)
 
     def module(self, row: R) -> ModuleType:
         """That does the work; imported when asked for."""

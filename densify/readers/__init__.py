@@ -1,47 +1,35 @@
 # SPDX-License-Identifier: MIT
-"""Opening recordings. A new data set is one more module here and one more row in READERS."""
+"""Opening recordings. The table of readers, and how to add one, is `densify.plugins.readers`."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, Protocol, cast
 
 from densify.errors import InputError
+from densify.plugins.readers import READERS, Reader
 from densify.types import LidarSequence
 
 
-def _open_kitti_raw(folder: Path) -> LidarSequence:
-    from densify.readers.kitti_raw import KittiRaw
+class ReaderModule(Protocol):
+    """What the module of a reader has."""
 
-    return KittiRaw(folder)
+    def open_recording(self, path: Path, scene: str | None) -> LidarSequence:
+        """The recording there, lazily: nothing but small files is read before a sweep is asked for.
 
-
-class Reader(NamedTuple):
-    """How the recordings of one data set are opened, and told from those of others.
-
-    holds: what a folder of it has inside, for messages. recognises: whether a folder is one.
-    """
-
-    open: Callable[[Path], LidarSequence]
-    recognises: Callable[[Path], bool]
-    holds: str
-
-
-READERS: dict[str, Reader] = {
-    "kitti": Reader(
-        _open_kitti_raw,
-        lambda folder: (folder / "velodyne_points").is_dir(),
-        "a KITTI raw drive (a folder that holds velodyne_points/)",
-    ),
-}
+        path: what follows ``READER:``, or a place that the reader recognises. scene: what follows
+        ``#``, None for nothing; always None for readers without scenes.
+        Raises InputError, which names the place, if there is no such recording.
+        """
+        ...
 
 
 class Spec(NamedTuple):
     """What ``--data`` names.
 
-    reader: a row of `READERS`, "street" for the built-in one, None where the place tells. place: a
-    path; of the street, preset and options. scene: what follows ``#``, None for no scene.
+    reader: the name of a row of `READERS`, "street" for the built-in one, None where the place
+    tells. place: a path; of the street, preset and options. scene: what follows ``#``, None for no
+    scene.
     """
 
     reader: str | None
@@ -92,20 +80,26 @@ def open_sequence(spec: str | Path = "street") -> LidarSequence:
         from densify.readers.street import Street
 
         return Street.from_spec(parsed.place)
-    if parsed.scene is not None:
+    reader = _reader_of(parsed, str(spec))
+    if parsed.scene is not None and not reader.scenes:
         raise InputError(
-            f"--data {spec}: {parsed.reader} recordings have no scenes; leave #{parsed.scene} out"
+            f"--data {spec}: {reader.name} recordings have no scenes; leave #{parsed.scene} out"
         )
-    folder = parsed.path
+    module = cast(ReaderModule, READERS.module(reader))
+    return module.open_recording(parsed.path, parsed.scene)
+
+
+def _reader_of(parsed: Spec, text: str) -> Reader:
+    """The one named, or the first that recognises the place."""
     if parsed.reader is not None:
-        return READERS[parsed.reader].open(folder)
-    if not folder.exists():
+        return READERS.row(parsed.reader, f"--data {text}")
+    if not parsed.path.exists():
         raise InputError(
-            f"--data {spec}: no such folder; expected a recording's folder, READER:PATH with "
-            f"READER one of {', '.join(READERS)}, or street[:PRESET]"
+            f"--data {text}: no such folder; expected a recording's folder, READER:PATH with "
+            f"READER one of {', '.join(READERS.usages())}, or street[:PRESET]"
         )
-    for reader in READERS.values():
-        if reader.recognises(folder):
-            return reader.open(folder)
-    known = " or ".join(reader.holds for reader in READERS.values())
-    raise InputError(f"--data {spec}: no known recording there; expected {known}")
+    for reader in READERS:
+        if reader.recognises(parsed.path):
+            return reader
+    known = " or ".join(reader.holds for reader in READERS)
+    raise InputError(f"--data {text}: no known recording there; expected {known}")

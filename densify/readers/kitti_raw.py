@@ -31,6 +31,11 @@ _EARTH_RADIUS_M = 6_378_137.0  # of the devkit's Mercator projection
 _NUM_OXTS_VALUES = 30
 
 
+def open_recording(path: Path, scene: str | None) -> KittiRaw:
+    """As `densify.readers.ReaderModule`; a drive has no scenes."""
+    return KittiRaw(path)
+
+
 class KittiRaw:
     """A KITTI raw drive as a `densify.types.LidarSequence`.
 

@@ -1,0 +1,59 @@
+# SPDX-License-Identifier: MIT
+"""The output of how a result was made, run.yaml."""
+
+from __future__ import annotations
+
+import platform
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+import yaml
+
+from densify.outputs.atomic import write_file
+from densify.outputs.context import Context
+from densify.outputs.plain import plain
+from densify.types import Result
+from densify.version import __version__
+
+_PACKAGES = (
+    *("numpy", "scipy", "torch", "embreex", "kiss-icp"),
+    *("opencv-python-headless", "laspy", "lazrs", "PyYAML"),
+)
+
+
+def write_output(result: Result, context: Context, folder: Path) -> None:
+    """``run.yaml``: data, key, frames, cameras, configuration, cost of each stage, versions."""
+    record = {
+        "data": context.data,
+        "key": result.key,
+        "method": result.method,
+        "frames": result.frames,
+        "cameras": list(result.depth),
+        "config": context.config,
+        "stages": [
+            {
+                "name": cost.name,
+                "seconds": round(cost.seconds, 3),
+                "peak_memory_mb": round(cost.peak_memory_mb, 1),
+            }
+            for cost in result.costs
+        ],
+        "versions": versions(),
+    }
+    text = yaml.safe_dump(plain(record), sort_keys=False, allow_unicode=True)
+    write_file(folder / "run.yaml", text.encode())
+
+
+def versions() -> dict[str, str | None]:
+    """Of densify, Python, the platform and the packages that results depend on."""
+    found: dict[str, str | None] = {
+        "densify": __version__,
+        "python": platform.python_version(),
+        "platform": platform.platform(),
+    }
+    for package in _PACKAGES:
+        try:
+            found[package] = version(package)
+        except PackageNotFoundError:  # conda and system builds go by other names
+            found[package] = None
+    return found

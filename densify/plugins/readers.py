@@ -1,0 +1,59 @@
+# SPDX-License-Identifier: MIT
+"""The readers: each opens the recordings of one data set.
+
+To add one, write a module with the function that `densify.readers.ReaderModule` describes and one
+row here. In a package of your own an entry point in the group ``densify.readers`` takes the row's
+place, and the module says the rest: ``recognises(path)``, ``HOLDS`` and, if need be, ``SCENES``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from types import ModuleType
+
+from densify.plugins.table import Table
+
+
+@dataclass(frozen=True)
+class Reader:
+    """recognises: whether a place, which exists, holds such a recording; quick, from names alone.
+    holds: what is there, for messages. scenes: one place may hold several, named by ``#SCENE``."""
+
+    name: str
+    module: str
+    recognises: Callable[[Path], bool]
+    holds: str
+    scenes: bool = False
+
+    @property
+    def usage(self) -> str:
+        """As in ``READER:PATH``."""
+        return self.name
+
+
+def _row(name: str, module: ModuleType) -> Reader:
+    return Reader(
+        name,
+        module.__name__,
+        recognises=module.recognises,
+        holds=getattr(module, "HOLDS", f"a recording for the reader {name}"),
+        scenes=getattr(module, "SCENES", False),
+    )
+
+
+READERS = Table(
+    kind="reader",
+    group="densify.readers",
+    built_in=(
+        Reader(
+            "kitti",
+            "densify.readers.kitti_raw",
+            recognises=lambda path: (path / "velodyne_points").is_dir(),
+            holds="a KITTI raw drive (a folder that holds velodyne_points/)",
+        ),
+    ),
+    members=("open_recording", "recognises"),
+    row_of=_row,
+)
