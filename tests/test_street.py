@@ -189,6 +189,19 @@ def test_sweeps_are_as_large_as_a_real_one(street):
     assert len(firings(SENSORS["vlp16"], 0.0, PERIOD_NS).offset_ns) == 16 * 1800
 
 
+@pytest.mark.parametrize(
+    ("fixture", "first"),
+    [
+        ("street", [[-62.11102, 0, 2.168964], [-61.99274, 0.002921, 1.803921]]),
+        ("crossing", [[-3.699342, 0, -1.725032], [4.21622, 0, -1.716056]]),
+        ("highway", [[-35.495106, 0.069695, -1.860223], [-20.25953, 0.044199, -1.772483]]),
+    ],
+)
+def test_sweeps_are_those_that_were_always_made(request, fixture, first):
+    points = request.getfixturevalue(fixture)[KEY].points
+    np.testing.assert_allclose(points[:2], first, atol=1e-4)
+
+
 def _room(half_m: float) -> World:
     room = box((-half_m,) * 3, (half_m,) * 3, Material.PLASTER)
     return World([Body(room, Still())])

@@ -1,0 +1,288 @@
+# SPDX-License-Identifier: MIT
+"""The street's sensors, rates and tilted mounts: patterns against slow twins, truth in a room."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from densify.geometry.poses import inverse, transform
+from densify.readers.describe import describe
+from densify.readers.kitti_raw import KittiRaw
+from densify.readers.street import Street
+from densify.street.casting import Scene
+from densify.street.curves import Curve, Speed
+from densify.street.footprints import Rectangles
+from densify.street.materials import Material
+from densify.street.mesh import box
+from densify.street.motion import Driving, Still
+from densify.street.patterns import Raster, Rosette, Slots, Spinning
+from densify.street.sensors import SENSORS, firings
+from densify.street.simulator import Simulator
+from densify.street.terrain import Ground, Terrain
+from densify.street.world import Body, World
+from densify.writers.kitti_raw import write_kitti_tree
+
+PERIOD_NS = 100_000_000
+ROOM_M = 15.0
+SETUPS = [
+    ("hdl64", 10, 0.0),
+    ("hdl32", 20, 0.0),
+    ("vlp16", 5, 10.0),
+    ("dual32", 20, 10.0),
+    ("os128", 20, -10.0),
+    ("vls128", 20, 0.0),
+    ("panda", 20, 10.0),
+    ("rosette", 5, -10.0),
+]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def cache(tmp_path_factory):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("DENSIFY_CACHE_DIR", str(tmp_path_factory.mktemp("cache")))
+        yield
+
+
+@pytest.fixture(scope="module")
+def level() -> Street:
+    return Street("street", 0, "vlp16")
+
+
+def same_scene(level: Street, hz: int = 10, tilt_deg: float = 0.0) -> Street:
+    other = Street("street", 0, "vlp16", hz, tilt_deg)
+    other.simulator.__dict__["scene"] = level.simulator.scene
+    return other
+
+
+# patterns
+
+
+def earlier_firings(elevation_deg, num_columns, num_scanners):
+    """Spinning scanners at 10 Hz, as they were before there were patterns."""
+    pulses = []
+    for scanner in range(num_scanners):
+        slots = num_columns * len(elevation_deg)
+        for slot in range(slots):
+            offset_ns = -PERIOD_NS // 2 + slot * PERIOD_NS // slots
+            pulses.append((offset_ns, scanner, elevation_deg[slot % len(elevation_deg)]))
+    pulses.sort(key=lambda pulse: pulse[:2])
+    offset_ns, scanner, elevation = np.array(pulses).T
+    azimuth = -2 * np.pi * (offset_ns / PERIOD_NS + scanner / num_scanners)
+    flat = np.exp(1j * azimuth) * np.cos(np.radians(elevation))
+    return offset_ns, scanner, np.stack([flat.real, flat.imag, np.sin(np.radians(elevation))], 1)
+
+
+@pytest.mark.parametrize(
+    ("name", "num_columns", "num_scanners"),
+    [("hdl64", 2083, 1), ("hdl32", 2169, 1), ("vlp16", 1800, 1), ("dual32", 1800, 2)],
+)
+def test_spinning_scanners_fire_as_ever(name, num_columns, num_scanners):
+    elevation_deg = SENSORS[name].scanners[0].pattern.elevation_deg
+    offset_ns, lidar, direction = earlier_firings(elevation_deg, num_columns, num_scanners)
+    fired = firings(SENSORS[name], 12.0, PERIOD_NS)
+    np.testing.assert_array_equal(fired.offset_ns, offset_ns)
+    np.testing.assert_array_equal(fired.lidar, lidar)
+    np.testing.assert_allclose(fired.direction, direction, atol=1e-12)
+
+
+def test_rings_are_where_the_data_sheets_have_them():
+    elevation = {
+        name: np.sort([e for s in SENSORS[name].scanners[:1] for e in s.pattern.elevation_deg])
+        for name in ("os128", "vls128", "panda", "dual32")
+    }
+    assert [len(e) for e in elevation.values()] == [128, 128, 64, 32]
+    np.testing.assert_allclose(np.diff(elevation["os128"]), 45 / 127)
+    gaps = np.diff(elevation["vls128"])
+    assert gaps.min() == pytest.approx(0.11) and np.median(gaps) < 0.181 and gaps.max() > 1
+    assert (np.argmin(gaps) > 30) and (np.argmax(gaps) == 0)
+    gaps = np.diff(elevation["panda"])
+    assert gaps.min() == pytest.approx(1 / 6) and gaps[0] == 6.0
+    assert np.ptp(elevation["panda"]) == np.ptp(elevation["vls128"]) == 40.0
+
+
+@pytest.mark.parametrize("name", SENSORS)
+def test_pulses_fill_the_period_evenly_at_a_constant_rate(name):
+    num_pulses = []
+    for hz in (5, 10, 20):
+        period_ns = 10**9 // hz
+        fired = firings(SENSORS[name], 12.0, period_ns)
+        num_pulses.append(len(fired.offset_ns) * hz)
+        assert fired.offset_ns[0] == -period_ns // 2 and fired.offset_ns[-1] < period_ns / 2
+        np.testing.assert_allclose(np.linalg.norm(fired.direction, axis=1), 1)
+        for lidar, scanner in enumerate(SENSORS[name].scanners):
+            own = fired.lidar == lidar
+            steps = np.diff(fired.offset_ns[own])
+            assert steps.min() > 0 and np.ptp(steps) <= 1
+            if isinstance(scanner.pattern, Spinning):
+                beams = len(scanner.pattern.elevation_deg)
+                assert own.sum() == scanner.pattern.columns_per_s // hz * beams
+    assert np.ptp(num_pulses) < 1e-3 * num_pulses[0]
+
+
+def test_a_raster_covers_its_field_of_view_line_by_line():
+    raster = Raster(60.0, 20.0, 100, 4000)
+    number = np.arange(400)
+    x, y, z = raster.directions(Slots(number, number / 400 - 0.5, number / 4000)).T
+    azimuth, elevation = np.degrees(np.arctan2(y, x)), np.degrees(np.arcsin(z))
+    np.testing.assert_allclose(elevation, 10 - 0.05 * number, atol=1e-9)
+    lines = azimuth.reshape(10, 40)
+    np.testing.assert_allclose(np.diff(lines[::2]), -1.5)
+    np.testing.assert_allclose(np.diff(lines[1::2]), 1.5)
+    assert azimuth.max() == pytest.approx(30) and azimuth.min() == pytest.approx(-30)
+
+
+def test_a_rosette_is_two_prisms_and_goes_on_from_sweep_to_sweep():
+    rates, num = (121.6, -77.7), 20_000
+    share = np.arange(num) / num - 0.5
+    sweeps = []
+    for time_s in (3.0, 3.1):
+        times = time_s + 0.1 * share
+        x, y, z = Rosette(70.0, rates, 200_000).directions(Slots(np.arange(num), share, times)).T
+        prisms = sum(np.exp(2j * np.pi * rate * times) for rate in rates) / 2
+        off_axis = np.degrees(np.arccos(x))
+        np.testing.assert_allclose(off_axis, 35 * np.abs(prisms), atol=1e-5)
+        turned = (y + 1j * z) * prisms.conj()
+        np.testing.assert_allclose(np.angle(turned[off_axis > 0.1]), 0, atol=1e-6)
+        assert off_axis.max() > 34.99
+        sweeps.append(np.stack([x, y, z], axis=1))
+    step = np.linalg.norm(np.diff(np.concatenate(sweeps), axis=0), axis=1)
+    assert step[num - 1] < 1.1 * step.max()  # no jump between the sweeps
+    assert np.median(np.linalg.norm(sweeps[1] - sweeps[0], axis=1)) > 0.1  # nor a repetition
+
+
+# sweeps and truth, in a room that the vehicle drives through in a bend
+
+
+def in_a_room(name: str, hz: int, tilt_deg: float) -> Simulator:
+    flat = Terrain(np.ones((1, 2)), np.zeros(1), np.zeros(1))
+    bend = Curve.bending(120.0, lambda s: np.full(len(s), 1 / 20), origin_m=50.0)
+    ego = Driving(bend, Speed((1.0, 8.0), (2.0, 0.0)), 50.0, 0.3, flat, 2.7)
+    room = World([Body(box((-ROOM_M,) * 3, (ROOM_M,) * 3, Material.PLASTER), Still())])
+    simulator = Simulator("street", 0, SENSORS[name], hz, tilt_deg)
+    nothing = Rectangles(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros((0, 2)))
+    simulator.__dict__["scene"] = Scene(room, Ground(flat, (), 0.0, 0.0), ego, (), nothing)
+    return simulator
+
+
+@pytest.mark.parametrize(("name", "hz", "tilt_deg"), SETUPS)
+def test_rays_start_at_their_scanner_and_truth_lies_on_the_walls(name, hz, tilt_deg):
+    simulator = in_a_room(name, hz, tilt_deg)
+    frame = 3 * hz // 10
+    time_s = frame / hz
+    returns, sensor = simulator.returns(frame), simulator.sensor
+    points = simulator.in_bodies(frame, returns)
+    truth = simulator.bodies.sweep(frame, returns.body, returns.instance, points)
+    assert not truth.moving.any()
+    assert np.all(simulator.bodies.displacement(frame, frame + 1, returns.body, points) == 0)
+    world = transform(truth.T_world_lidar, truth.points)
+    T_world_lidar = simulator.T_world_lidar_at(simulator.stamp_ns(frame))
+    np.testing.assert_array_equal(truth.T_world_lidar, T_world_lidar)
+    raw = transform(T_world_lidar, returns.points.astype(float))
+    offset_ns = returns.offset_ns
+    assert np.abs(offset_ns).max() <= simulator.period_ns / 2
+    assert set(returns.lidar) == set(range(len(sensor.scanners)))
+    for lidar, scanner in enumerate(sensor.scanners):
+        own = returns.lidar == lidar
+        ray = returns.points[own] - sensor.origins_m[lidar]
+        ray /= np.linalg.norm(ray, axis=1, keepdims=True)
+        fired = firings(sensor, time_s, simulator.period_ns)
+        row = np.flatnonzero(fired.lidar == lidar)
+        row = row[np.searchsorted(fired.offset_ns[row], offset_ns[own])]
+        np.testing.assert_allclose(ray, fired.direction[row], atol=1e-6)
+        on_wall = np.sort(np.abs(world[own]), axis=1)
+        clear = on_wall[:, 1] < ROOM_M - 1  # of the room's edges
+        off_wall = on_wall[clear, 2] - ROOM_M
+        assert clear.sum() > 500
+        assert np.abs(off_wall).max() < 5 * scanner.range_sigma_m
+        assert abs(off_wall.mean()) < 0.1 * scanner.range_sigma_m
+        raw_wall = np.sort(np.abs(raw[own]), axis=1)[clear, 2] - ROOM_M
+        assert np.abs(raw_wall).max() > 0.1  # without truth the sweep is distorted
+
+
+# rates
+
+
+def test_a_rate_changes_when_sweeps_are_taken_and_not_what_is_there(level):
+    fast, slow = same_scene(level, 20), same_scene(level, 5)
+    assert [len(s.frames) for s in (level, fast, slow)] == [160, 320, 80]
+    assert fast.stamp_ns(121) - fast.stamp_ns(120) == 50_000_000
+    sizes = [len(level[120])]
+    for other, frame in ((fast, 240), (slow, 60)):
+        assert other.stamp_ns(frame) == other[frame].stamp_ns == level.stamp_ns(120)
+        for camera in other.cameras:
+            assert other.image_stamp_ns(camera, frame) == level.image_stamp_ns(camera, 120)
+        ours, theirs = level.simulator.bodies, other.simulator.bodies
+        for field in ("T_world_lidar", "T_world_body", "moving"):
+            np.testing.assert_array_equal(getattr(theirs, field)[frame], getattr(ours, field)[120])
+        sizes.append(len(other[frame]))
+    assert sizes[1] == pytest.approx(sizes[0] / 2, rel=0.02)
+    assert sizes[2] == pytest.approx(sizes[0] * 2, rel=0.02)
+    # a body's way in a tenth of a second is the same
+    returns = fast.returns(240)
+    points = fast.simulator.in_bodies(240, returns)
+    np.testing.assert_array_equal(
+        fast.truth.displacement(240, 242),
+        level.simulator.bodies.displacement(120, 121, returns.body, points),
+    )
+    assert "20.00 Hz" in describe(fast)
+
+
+def test_names_and_cached_frames_tell_rates_and_tilts_apart():
+    assert Street("street", 3, "vlp16", 10, 0.0).name == "street:street?seed=3&sensor=vlp16"
+    other = Street.from_spec("street?tilt=-7.5&hz=20")
+    assert other.name == "street:street?seed=0&sensor=hdl64&hz=20&tilt=-7.5"
+    assert Street.from_spec(other.name).name == other.name
+    assert other.simulator.tilt_deg == -7.5
+    folders = {
+        Street.from_spec(f"street{options}")._store._folder
+        for options in ("", "?hz=20", "?tilt=10", "?hz=20&tilt=10", "?sensor=os128")
+    }
+    assert len(folders) == 5
+    assert Street.from_spec("street?hz=10&tilt=0")._store._folder in folders
+
+
+# mounts
+
+
+def test_a_tilted_mount_turns_the_lidar_and_leaves_the_cameras(level):
+    tilted = same_scene(level, tilt_deg=10.0)
+    T_level_tilted = inverse(level.T_world_lidar(120)) @ tilted.T_world_lidar(120)
+    c, s = np.cos(np.radians(10)), np.sin(np.radians(10))
+    expected = [[c, 0, s, 0], [0, 1, 0, 0], [-s, 0, c, 0], [0, 0, 0, 1]]  # x looks down
+    np.testing.assert_allclose(T_level_tilted, expected, atol=1e-12)
+    for name, camera in tilted.cameras.items():
+        T_level_cam = inverse(level.cameras[name].T_cam_lidar)
+        T_tilted_cam = inverse(camera.T_cam_lidar)
+        np.testing.assert_allclose(T_level_tilted @ T_tilted_cam, T_level_cam, atol=1e-12)
+    # the sweep's truth lies on what the camera shows
+    truth, camera = tilted.truth.sweep(120), tilted.cameras["image_02"]
+    p_cam = transform(camera.T_cam_lidar, truth.points[~truth.moving])
+    p_cam = p_cam[p_cam[:, 2] > 1]
+    u, v = np.rint((p_cam @ camera.K.T)[:, :2] / p_cam[:, 2:]).astype(int).T
+    seen = (u >= 0) & (u < camera.width_px) & (v >= 0) & (v < camera.height_px)
+    depth_m = tilted.truth.depth_m("image_02", 120)[v[seen], u[seen]]
+    error = (depth_m - p_cam[seen, 2])[depth_m > 0]
+    assert len(error) > 1000
+    assert np.median(np.abs(error)) < 0.04 and np.mean(np.abs(error) < 0.3) > 0.85
+
+
+def test_a_tree_of_another_rate_and_mount_opens_as_what_it_was(level, tmp_path):
+    street = same_scene(level, 20, 10.0)
+    drive = write_kitti_tree(street, tmp_path, [116, 120], [])
+    (drive / "image_02").mkdir()  # cameras are those that have a folder
+    kitti = KittiRaw(drive)
+    for frame in (116, 120):
+        ours, read = street[frame], kitti[frame]
+        np.testing.assert_array_equal(read.points, ours.points)
+        assert read.stamp_ns == ours.stamp_ns == kitti.stamp_ns(frame)
+        assert np.abs(read.offset_ns - ours.offset_ns).max() <= 20
+    assert kitti[120].stamp_ns - kitti[116].stamp_ns == 200_000_000
+    steps = [inverse(s.T_world_lidar(116)) @ s.T_world_lidar(120) for s in (street, kitti)]
+    np.testing.assert_allclose(*steps, atol=1e-6)
+    cameras = street.cameras["image_02"], kitti.cameras["image_02"]
+    np.testing.assert_allclose(*(camera.T_cam_lidar for camera in cameras), atol=1e-12)
+    assert kitti.truth is not None
+    np.testing.assert_array_equal(
+        kitti.truth.displacement(116, 118), street.truth.displacement(116, 118)
+    )
