@@ -211,6 +211,7 @@ def test_simulate_writes_a_drive_that_info_opens(
         "vlp16",
         "--frames",
         "120:122",
+        *("--hz", "20", "--tilt", "-5"),
     ]
     assert exit_code(*command, "--camera", "image_02") == 0
     out = capsys.readouterr().out
@@ -219,7 +220,8 @@ def test_simulate_writes_a_drive_that_info_opens(
     bins = sorted(path.name for path in (drive / "velodyne_points" / "data").iterdir())
     assert bins == ["0000000120.bin", "0000000121.bin"]
     assert exit_code("info", "--data", drive) == 0
-    assert "120-121" in capsys.readouterr().out
+    out = capsys.readouterr().out
+    assert "120-121" in out and "20.00 Hz" in out
     before = files_in(tmp_path)
     assert "--overwrite" in refused(capsys, 2, *command, "--camera", "image_02")
     assert files_in(tmp_path) == before
@@ -267,6 +269,12 @@ BAD_COMMANDS: dict[str, tuple[list[str], list[str]]] = {
     "frames reversed": (["simulate", "--out", "{tmp}/o", "--frames", "5:2"], ["A:B", "'5:2'"]),
     "frames beyond": (["simulate", "--out", "{tmp}/o", "--frames", "5:999"], ["5:999", "0:160"]),
     "unknown sensor": (["simulate", "--out", "{tmp}/o", "--sensor", "hdl65"], ["hdl65", "hdl64"]),
+    "unknown rate": (["simulate", "--out", "{tmp}/o", "--hz", "15"], ["--hz", "'15'", "20"]),
+    "unknown tilt": (["simulate", "--out", "{tmp}/o", "--tilt", "up"], ["tilt 'up'", "degrees"]),
+    "sensor without KITTI's times": (
+        ["simulate", "--out", "{tmp}/o", "--sensor", "panda"],
+        ["carry neither a time", "os128"],
+    ),
     "unknown simulated camera": (
         ["simulate", "--out", "{tmp}/o", "--camera", "image_07"],
         ["image_07", "image_02"],
