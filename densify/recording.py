@@ -25,6 +25,7 @@ as they do at holes in time (`densify.readers.timeline`).
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from itertools import pairwise
@@ -234,8 +235,8 @@ class Recording:
 
         def make() -> dict[int, RangeImage]:
             sweeps = [self._deskewed(number, 0.0, f) for f in pieces]
-            with self._watch.stage("flow"):
-                return {s.frame: RangeImage.of(s) for s in sweeps}
+            with self._watch.stage("flow"), ThreadPoolExecutor() as pool:
+                return dict(zip(pieces, pool.map(RangeImage.of, sweeps), strict=True))
 
         return self._made(
             "images", lambda: [(f, self.sweeps.content(f), p) for f, p in pieces.items()], make

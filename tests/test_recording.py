@@ -359,3 +359,69 @@ def test_other_settings_and_other_sweeps_make_anew(counted: Counter[str], tmp_pa
         "find_candidates": 2,
         "estimate_motion": 2,
     }  # the sweep is in the second block, and within reach of the first
+
+
+# Several keys
+
+
+def test_keys_whose_windows_overlap_share_what_they_can(counted: Counter[str], long_street) -> None:
+    results = dict(pipeline.run_keys(long_street, [9, 4, 6], 2, config=GIVEN))
+    assert list(results) == [4, 6, 9]
+    assert [r.frames for r in results.values()] == [
+        (2, 3, 4, 5, 6),
+        (4, 5, 6, 7, 8),
+        (7, 8, 9, 10, 11),
+    ]
+    assert counted == {
+        "find_trajectory": 1,
+        "ground": 1,
+        "find_candidates": 1,
+        "estimate_motion": 1,
+        "images": 10,
+    }
+    alone = pipeline.run(long_street, 6, 2, config=GIVEN)
+    assert set(results[6].metrics) == set(alone.metrics)
+    ghosts = results[6].metrics["ghosts"]["all"], alone.metrics["ghosts"]["all"]
+    assert ghosts[0] <= ghosts[1] + 0.001
+
+
+def test_keys_far_apart_share_nothing_and_are_as_by_themselves(long_street) -> None:
+    results = dict(pipeline.run_keys(long_street, [2, 14], 2, config=GIVEN))
+    for key, result in results.items():
+        alone = pipeline.run(long_street, key, 2, config=GIVEN)
+        assert_same_maps(result.depth, alone.depth)
+
+
+def test_a_key_that_cannot_be_made_costs_no_other(long_street) -> None:
+    sequence = Damaged(long_street, unreadable=[6])
+    results = dict(pipeline.run_keys(sequence, [4, 6, 8], 2, config=GIVEN))
+    assert isinstance(results[6], InputError) and "frame 6" in str(results[6])
+    assert results[4].frames == (2, 3, 4, 5) and results[8].frames == (7, 8, 9, 10)
+
+
+def test_a_cache_gives_the_same_bytes_and_saves_the_work(
+    counted: Counter[str], long_street, tmp_path: Path
+) -> None:
+    made = {}
+    for which, cache in (
+        ("none", None),
+        ("new", Cache(LIMIT, tmp_path)),
+        ("old", Cache(LIMIT, tmp_path)),
+    ):
+        counted.clear()
+        made[which] = pipeline.compare(
+            long_street, 5, 2, config=GIVEN, methods=["flow"], cache=cache
+        )
+        assert (counted["find_trajectory"] == 0) == (which == "old")
+    for which in ("new", "old"):
+        assert_same_maps(made[which]["flow"].depth, made["none"]["flow"].depth)
+
+
+def test_a_long_row_of_keys_is_parted(long_street) -> None:
+    cut = shared.Recording(long_street, GIVEN, 1, range(2, 16)).cut
+    assert len(cut.blocks) == 1
+    timeline = shared.Recording(long_street, GIVEN, 1).timeline
+    long = replace(timeline, frames=tuple(range(100)), stamp_ns=10**8 * np.arange(100))
+    parted = blocks.Cut.around(long, 3, range(10, 90))
+    assert [len(b.frames) for b in parted.blocks] == [26, 26, 26, 26]
+    assert all(parted.blocks[n].frames[0] + 3 <= k for k, n in parted.number_of.items())

@@ -63,7 +63,22 @@ class _Parser(argparse.ArgumentParser):
 
 
 def _add_run(commands: Any) -> None:
-    parser = add_verb(commands, "run", verbs.run, "densify one key", config_epilog())
+    parser = add_verb(commands, "run", verbs.run, "densify one key or several", config_epilog())
+    parser.add_argument(
+        "--key",
+        type=natural,
+        action="append",
+        default=[],
+        metavar="K",
+        help="the frame to densify; may be given several times",
+    )
+    parser.add_argument(
+        "--keys",
+        type=key_slice,
+        metavar="A:B[:S]",
+        help="frames A to B-1, every S-th, of those that exist; keys whose windows overlap share "
+        "registration and motion",
+    )
     _add_key_options(parser)
     add_method(parser)
     add_output_options(parser)
@@ -72,6 +87,9 @@ def _add_run(commands: Any) -> None:
 def _add_compare(commands: Any) -> None:
     about = "methods side by side, on the same registration"
     parser = add_verb(commands, "compare", verbs.compare, about, config_epilog())
+    parser.add_argument(
+        "--key", type=natural, required=True, metavar="K", help="the frame to densify"
+    )
     _add_key_options(parser)
     parser.add_argument(
         "--methods",
@@ -379,10 +397,21 @@ def _add_bench_flow(benches: Any) -> None:
 
 
 def _add_key_options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--key", type=natural, required=True, metavar="K", help="the frame to densify"
-    )
     add_window(parser)
+    parser.add_argument(
+        "--cache",
+        action="store_true",
+        help="keep poses, ground, evidence and motion on disk, and take what an earlier run with "
+        "the same sweeps and settings left there (default: nothing is kept, since hashing and "
+        "writing cost more than a single run gains)",
+    )
+    parser.add_argument(
+        "--cache-size",
+        type=size_bytes,
+        default="10G",
+        metavar="SIZE",
+        help="bound of what --cache keeps (default: 10G)",
+    )
     parser.add_argument("--data", metavar="SPEC", default="street", help=DATA_HELP)
     add_camera(parser)
     add_short_options(parser)

@@ -18,42 +18,56 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
+    from densify.cache import Cache
     from densify.types import LidarSequence, Result
 
 _DEFAULT_KEY = 120  # of benches
 
 
 def run(options: argparse.Namespace) -> None:
-    """Densify one key."""
+    """Densify one key or several."""
     config = _config(options)
     from densify import pipeline
     from densify.cli.tables import summary
     from densify.outputs import check_writable, write_result
     from densify.readers import open_sequence
 
-    check_writable(options.out, options.key, options.overwrite, "run", config.output.also)
     sequence = open_sequence(options.data)
+    keys = _keys_of(sequence, options)
+    for key in keys:
+        check_writable(options.out, key, options.overwrite, "run", config.output.also)
+    failed: dict[int, Exception] = {}
     with progress_on_stderr() as progress:
-        result = pipeline.run(
+        made = pipeline.run_keys(
             sequence,
-            options.key,
+            keys,
             options.window,
             options.method,
             options.cameras,
             config,
             progress,
+            _cache(options),
         )
-    paths = write_result(
-        result,
-        _images(sequence, result),
-        options.out,
-        config=as_mapping(config),
-        data=options.data,
-        overwrite=options.overwrite,
-        also=config.output.also,
-    )
-    print(summary(result))
-    _print_paths(paths)
+        for key, result in made:
+            if isinstance(result, Exception):
+                failed[key] = result
+                continue
+            paths = write_result(
+                result,
+                _images(sequence, result),
+                options.out,
+                config=as_mapping(config),
+                data=options.data,
+                overwrite=options.overwrite,
+                also=config.output.also,
+            )
+            print(summary(result))
+            _print_paths(paths)
+    if len(keys) == 1 and failed:
+        raise failed[keys[0]]
+    if failed:
+        told = "; ".join(f"key {key}: {error}" for key, error in failed.items())
+        raise ComputationError(f"{len(failed)} of {len(keys)} keys not made: {told}")
 
 
 def compare(options: argparse.Namespace) -> None:
@@ -75,6 +89,7 @@ def compare(options: argparse.Namespace) -> None:
             config,
             progress,
             options.methods or pipeline.COMPARED,
+            _cache(options),
         )
     paths = write_comparison(
         results,
@@ -251,6 +266,39 @@ def _config(options: argparse.Namespace) -> densify.Config:
     given = {knob: getattr(options, name) for name, knob in _SHORT.items()}
     named = [f"{knob}={value}" for knob, value in given.items() if value is not None]
     return resolve(options.config, [*options.overrides, *named])
+
+
+def _keys_of(sequence: LidarSequence, options: argparse.Namespace) -> list[int]:
+    """``--key`` and ``--keys`` together, ascending."""
+    from densify.readers.files import format_frames
+
+    frames = frozenset(sequence.frames)
+    wanted = {*options.key}
+    if options.keys is not None:
+        chosen = range(options.keys.start, options.keys.stop, options.keys.step or 1)
+        there = [frame for frame in chosen if frame in frames]
+        if not there:
+            raise InputError(
+                f"--keys {options.keys.start}:{options.keys.stop}: {sequence.name} has no sweep "
+                f"among them; it has {format_frames(sequence.frames)}"
+            )
+        wanted |= {*there}
+    for key in sorted(wanted - frames):
+        raise InputError(
+            f"--key {key}: no such frame in {sequence.name}; "
+            f"it has {format_frames(sequence.frames)}"
+        )
+    if not wanted:
+        raise InputError("--key K or --keys A:B[:S]: expected the frame or frames to densify")
+    return sorted(wanted)
+
+
+def _cache(options: argparse.Namespace) -> Cache | None:
+    if not options.cache:
+        return None
+    from densify.cache import Cache
+
+    return Cache(options.cache_size)
 
 
 def _images(sequence: LidarSequence, result: Result) -> Mapping[str, NDArray[np.uint8]]:
