@@ -4,6 +4,8 @@
 from __future__ import annotations
 
 import inspect
+import pickle
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -15,6 +17,7 @@ from densify.flow.scene import Scene
 from densify.flow.tracking.evidence import FreeSpace, find_candidates
 from densify.geometry.ground import ground
 from densify.plugins.engines import ENGINES, engine
+from densify.types import Stretch
 from tests import scenes
 
 
@@ -56,6 +59,22 @@ def test_what_a_scene_is_asked_for_is_made_once(driving: Scene) -> None:
     fresh = find_candidates(driving.stretch, FreeSpace.of(driving.stretch), driving.ground, 0.2)
     for found, again in zip(candidates, fresh, strict=True):
         np.testing.assert_array_equal(found.cluster, again.cluster)
+
+
+@pytest.mark.parametrize("row", [r for r in ENGINES.built_in if r.shared], ids=lambda r: r.name)
+def test_shared_motion_is_kept_without_points(driving: Scene, row) -> None:
+    motion = estimate_motion(driving, Config(), row.usage)
+    kept = pickle.loads(pickle.dumps(motion.with_stretch(Stretch(()))))
+    nobody = replace(
+        driving.stretch.sweeps[0],
+        sweep=driving.stretch.sweeps[0].sweep.select(
+            np.zeros(len(driving.stretch.sweeps[0].sweep), bool)
+        ),
+    )
+    again = kept.with_stretch(Stretch((nobody, *driving.stretch.sweeps[1:])))
+    got, wanted = again.flow(4, 5), motion.flow(4, 5)
+    np.testing.assert_array_equal(got.displacement, wanted.displacement)
+    assert wanted.moving.any()
 
 
 def test_the_configured_engine_is_the_default(driving: Scene) -> None:

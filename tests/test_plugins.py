@@ -131,7 +131,7 @@ def test_a_module_says_what_a_row_says(package) -> None:
     assert module not in sys.modules  # the configuration imports none
     row, argument = engine("still:3")
     assert (row.name, row.module, row.about) == ("still", module, "Nothing moves.")
-    assert row.shared and row.usage == "still:N" and argument == "3"
+    assert row.version == "1.0" and row.shared and row.usage == "still:N" and argument == "3"
     check_engine("still:3")
     with pytest.raises(InputError, match="still:x: expected a number"):
         check_engine("still:x")

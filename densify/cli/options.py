@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from densify.config import presets
+from densify.plugins.engines import described
 
 DATA_HELP = (
     "a recording's folder, READER:PATH, or the built-in "
@@ -75,8 +76,7 @@ def add_short_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--flow",
         metavar="ENGINE",
-        help="groups (ours), paper, or npz:DIR, flow files of another method "
-        "(short for --set flow.engine=ENGINE)",
+        help=f"{described()} (short for --set flow.engine=ENGINE)",
     )
     parser.add_argument(
         "--at",

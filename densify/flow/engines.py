@@ -11,7 +11,16 @@ from typing import Protocol, cast
 from densify.config import Config
 from densify.flow.scene import Scene
 from densify.plugins.engines import ENGINES, engine
-from densify.types import Motion
+from densify.types import Motion, Stretch
+
+
+class SharedMotion(Motion, Protocol):
+    """Motion of a long stretch that serves every key in it. It is pickled, without points."""
+
+    def with_stretch(self, stretch: Stretch) -> SharedMotion:
+        """The same motion with the sweeps that it was estimated from, where any may lack their
+        points; an empty stretch where it is to be kept without."""
+        ...
 
 
 class EngineModule(Protocol):
@@ -25,7 +34,8 @@ class EngineModule(Protocol):
         """How everything in the scene's stretch moves.
 
         argument: what follows the engine's name and a colon in ``flow.engine``, "" for nothing.
-        May estimate at once or when the motion's ``flow`` is called; same input, same bytes.
+        May estimate at once or when the motion's ``flow`` is called; same input, same bytes. A
+        `SharedMotion` where the engine's row says ``shared``.
         """
         ...
 

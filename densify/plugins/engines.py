@@ -18,13 +18,16 @@ from densify.plugins.table import Table
 @dataclass(frozen=True)
 class Engine:
     """argument: what follows the name after a colon, "" for nothing. shared: the motion of a long
-    stretch serves every key in it; else it is made for each key's window."""
+    stretch serves every key in it (`densify.flow.engines.SharedMotion`); else it is made for each
+    key's window. version: of the package that brings it, "" for densify's own: motion that was kept
+    is of no use to another version."""
 
     name: str
     module: str
     about: str
     argument: str = ""
     shared: bool = False
+    version: str = ""
 
     @property
     def usage(self) -> str:
@@ -32,13 +35,14 @@ class Engine:
         return f"{self.name}:{self.argument}" if self.argument else self.name
 
 
-def _row(name: str, module: ModuleType) -> Engine:
+def _row(name: str, module: ModuleType, version: str) -> Engine:
     return Engine(
         name,
         module.__name__,
         about=(module.__doc__ or "").strip().partition("\n")[0],
         argument=getattr(module, "ARGUMENT", ""),
         shared=getattr(module, "SHARED", False),
+        version=version,
     )
 
 

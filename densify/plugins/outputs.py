@@ -30,7 +30,7 @@ class Output:
         return self.name
 
 
-def _row(name: str, module: ModuleType) -> Output:
+def _row(name: str, module: ModuleType, version: str) -> Output:
     return Output(name, module.__name__, tuple(getattr(module, "OWNED", ())))
 
 

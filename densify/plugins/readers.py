@@ -33,7 +33,7 @@ class Reader:
         return self.name
 
 
-def _row(name: str, module: ModuleType) -> Reader:
+def _row(name: str, module: ModuleType, version: str) -> Reader:
     return Reader(
         name,
         module.__name__,

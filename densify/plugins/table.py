@@ -42,13 +42,13 @@ R = TypeVar("R", bound=Row)
 @dataclass(frozen=True)
 class Table(Generic[R]):
     """kind: what a row is, for messages. group: of the entry points. members: functions that every
-    module must have. row_of: name and module of another package -> row."""
+    module must have. row_of: name, module and version of another package -> row."""
 
     kind: str
     group: str
     built_in: tuple[R, ...]
     members: tuple[str, ...]
-    row_of: Callable[[str, ModuleType], R]
+    row_of: Callable[[str, ModuleType, str], R]
 
     def usages(self) -> list[str]:
         """How the rows are written: the built-in ones, then other packages' names, sorted."""
@@ -122,4 +122,4 @@ class Table(Generic[R]):
                 f"{self.kind} {name} of the package {packages}: {points[0].value} is no module "
                 f"with {', '.join(self.members)}; mend or uninstall the package"
             )
-        return self.row_of(name, module)
+        return self.row_of(name, module, points[0].dist.version if points[0].dist else "")

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,6 +51,10 @@ class GroupMotion:
     tracks: tuple[Track, ...]
     instance: tuple[NDArray[np.int32], ...]
     bendings: Mapping[int, Bending]
+
+    def with_stretch(self, stretch: Stretch) -> GroupMotion:
+        """As `densify.flow.engines.SharedMotion`."""
+        return replace(self, stretch=stretch)
 
     def flow(self, frame: int, target: int) -> FlowField:
         """Of every point of a sweep to another sweep's reference time; both by frame number.
