@@ -25,7 +25,7 @@ def polynomial(times_s: np.ndarray, degree: int) -> np.ndarray:
 
 
 def fitted(times_s: np.ndarray, states: np.ndarray) -> Path:
-    return Path.fit(times_s, states, np.ones(len(times_s)), STEP_S)
+    return Path.fit(times_s, states, np.ones(len(times_s)))
 
 
 def rms(off: np.ndarray) -> float:
@@ -61,13 +61,13 @@ def test_weights_say_whom_to_believe():
     states = polynomial(t, 2)
     states[3, 0] += 1.0
     weights = np.ones(7)
-    fooled = Path.fit(t, states, weights, STEP_S)
+    fooled = Path.fit(t, states, weights)
     weights[3] = 1e-6
-    wise = Path.fit(t, states, weights, STEP_S)
+    wise = Path.fit(t, states, weights)
     assert rms(fooled(t) - polynomial(t, 2)) > 0.1
     assert rms(wise(t) - polynomial(t, 2)) < 1e-3
     # only their ratios count
-    again = Path.fit(t, states, 50 * weights, STEP_S)
+    again = Path.fit(t, states, 50 * weights)
     np.testing.assert_allclose(again(t), wise(t), atol=1e-9)
 
 

@@ -12,6 +12,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
+from densify.flow.tracking.clock import Clock
 from densify.geometry import poses
 from densify.geometry.height_map import HeightMap
 from densify.geometry.range_image import RangeImage
@@ -23,20 +24,24 @@ _NEAR_M = 0.4
 _MIN_SEED_SHARE = 0.3
 _LINK_M = 0.6
 _RING_GAP_M = 0.35
-REACH = 10  # sweeps
 REACH_S = 1.0
+"""Sweeps up to so long before and after one tell about it: from where others were taken, little of
+what it saw is in view."""
+_MOST_ASKED = 10  # of them on each side: more in the same time cost more and tell the same
 
 
 @dataclass(frozen=True)
 class FreeSpace:
     """What each sweep of a stretch saw through.
 
-    T_lidar_world: (4,4) per sweep. origin: (3,) world, where each sweep's lidar stood.
+    T_lidar_world: (4,4) per sweep. origin: (3,) world, where each sweep's lidar stood. clock: when
+    they were taken.
     """
 
     images: tuple[RangeImage, ...]
     T_lidar_world: tuple[Float, ...]
     origin: tuple[Float, ...]
+    clock: Clock
 
     @staticmethod
     def of(stretch: Stretch, images: Sequence[RangeImage] | None = None) -> FreeSpace:
@@ -48,6 +53,7 @@ class FreeSpace:
             tuple(images),
             tuple(poses.inverse(s.T_world_lidar) for s in stretch.sweeps),
             tuple(s.T_world_lidar[:3, 3] for s in stretch.sweeps),
+            Clock.of(stretch),
         )
 
     def __len__(self) -> int:
@@ -59,9 +65,8 @@ class FreeSpace:
         return max(s.row_step_rad for i in self.images for s in i.scanners)
 
     def others(self, i: int) -> list[int]:
-        """The sweeps around sweep number i that tell about it: from where others were taken long
-        before or after it, little of what it saw is in view."""
-        return [j for j in range(max(0, i - REACH), min(len(self), i + REACH + 1)) if j != i]
+        """The sweeps around sweep number i that tell about it."""
+        return self.clock.around(i, REACH_S, _MOST_ASKED)
 
     def seen_through(self, points: Float, j: int, velocity_m_s: Float | None = None) -> Bool:
         """(N,3) world -> (N,) True where sweep number j certainly saw free space.
@@ -160,12 +165,6 @@ def _closer_rings(in_lidar: Float, points: Float, ring_step_rad: float) -> Float
     squeezed = points.copy()
     squeezed[:, 2] *= np.minimum(1.0, _RING_GAP_M / np.maximum(gap_m, 1e-6))
     return squeezed
-
-
-def reference_times_s(stretch: Stretch) -> Float:
-    """(W,) of the sweeps, since the first one's."""
-    stamp_ns = np.array([s.sweep.stamp_ns for s in stretch.sweeps])
-    return (stamp_ns - stamp_ns[0]) * 1e-9
 
 
 def firing_times_s(stretch: Stretch, i: int) -> Float:

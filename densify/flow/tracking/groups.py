@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 
 from densify.config import Config
 from densify.flow.scene import Scene
+from densify.flow.tracking.clock import Clock
 from densify.flow.tracking.evidence import (
     FreeSpace,
     Standing,
     firing_times_s,
-    reference_times_s,
 )
 from densify.flow.tracking.shapes import Shape
 from densify.flow.tracking.soften import Part, Softened, soften
@@ -34,7 +34,7 @@ _FINE_M = 0.3
 _SIDE_M = 0.1
 _LONGEST_HOLE_M = 0.6
 _MAX_CONTRADICTED = 0.05
-_FORETOLD = 2  # sweeps before an object was first seen and after it was last seen
+_FORETOLD_S = 0.2  # before an object was first seen and after it was last seen
 _GAPS_REACHED = 0.8  # of the gap between neighbouring rings
 _GAPS_REACHED_UNSEEN = 0.5
 
@@ -59,12 +59,14 @@ class GroupMotion:
     def flow(self, frame: int, target: int) -> FlowField:
         """Of every point of a sweep to another sweep's reference time; both by frame number.
 
-        Points of an object that no sweep within two of the target shows are lost.
+        Points of an object that was last seen more than 0.2 s before the target, or first seen more
+        than that after it, are lost.
         """
         here, there = self.stretch.frames.index(frame), self.stretch.frames.index(target)
         registered, instance = self.stretch.sweeps[here], self.instance[here]
         R_lidar_world = registered.T_world_lidar[:3, :3].T
-        time_s = reference_times_s(self.stretch)
+        clock = Clock.of(self.stretch)
+        here_s, there_s = clock.time_s[here], clock.time_s[there]
         seen_s = firing_times_s(self.stretch, here)
         to_reference, displacement, velocity_m_s = np.zeros((3, len(instance), 3))
         lost = np.zeros(len(instance), bool)
@@ -74,16 +76,13 @@ class GroupMotion:
             body = track.undo(measured, seen_s[mine])
             at_reference, arrived = body, body
             if k in self.bendings:
-                at_reference, arrived = self.bendings[k].carry(
-                    here, there, time_s[here], seen_s[mine]
-                )
-            at_reference = track.place(at_reference, time_s[here])
-            arrived = track.place(arrived, time_s[there])
+                at_reference, arrived = self.bendings[k].carry(here, there, clock, seen_s[mine])
+            at_reference = track.place(at_reference, here_s)
+            arrived = track.place(arrived, there_s)
             to_reference[mine] = (at_reference - measured) @ R_lidar_world.T
             displacement[mine] = (arrived - at_reference) @ R_lidar_world.T
-            velocity_m_s[mine] = track.velocity_m_s(arrived, time_s[there]) @ R_lidar_world.T
-            seen = sorted(track.claimed)
-            lost[mine] = not seen[0] - _FORETOLD <= there <= seen[-1] + _FORETOLD
+            velocity_m_s[mine] = track.velocity_m_s(arrived, there_s) @ R_lidar_world.T
+            lost[mine] = not _foretold(track, there, clock)
         return FlowField(displacement, instance >= 0, instance, lost, to_reference, velocity_m_s)
 
 
@@ -95,15 +94,13 @@ class Bending:
     sweeps: tuple[int, ...]
     softened: Softened
 
-    def carry(
-        self, here: int, there: int, reference_s: float, seen_s: Float
-    ) -> tuple[Float, Float]:
+    def carry(self, here: int, there: int, clock: Clock, seen_s: Float) -> tuple[Float, Float]:
         """The points of sweep number ``here`` in the object's own frame, at that sweep's reference
         time and at that of sweep number ``there``, or of the nearest that shows the object."""
-        n = self.sweeps.index(here)
-        m = min(range(len(self.sweeps)), key=lambda p: abs(self.sweeps[p] - there))
+        n, m = (self.sweeps.index(i) for i in (here, clock.nearest(there, self.sweeps)))
         points = self.softened.parts[n].points
-        at_reference = points + self.softened.velocity_m_s(n) * (reference_s - seen_s)[:, None]
+        late_s = clock.time_s[here] - seen_s
+        at_reference = points + self.softened.velocity_m_s(n) * late_s[:, None]
         return at_reference, at_reference + self.softened.carry(n, m) - points
 
 
@@ -114,14 +111,13 @@ def estimate_motion(scene: Scene, settings: Config, argument: str) -> GroupMotio
     """
     stretch, space, ground = scene.stretch, scene.space, scene.ground
     standing = [Standing.of(stretch, i, found) for i, found in enumerate(scene.candidates)]
-    time_s = reference_times_s(stretch)
-    tracks = follow_groups(standing, space, ground, time_s)
+    tracks = follow_groups(standing, space, ground)
     shapes = [Shape.of(t.seen_in(standing, sorted(t.claimed))) for t in tracks]
 
     def members(i: int) -> NDArray[np.int32]:
         seen = _Seen.of(stretch, i, ground, standing[i], space.ring_step_rad)
-        attached = _attach(seen, i, tracks, shapes, time_s, scene.min_height_m)
-        _lengthen(attached, seen, i, tracks, shapes, time_s, space)
+        attached = _attach(seen, i, tracks, shapes, space.clock, scene.min_height_m)
+        _lengthen(attached, seen, i, tracks, shapes, space)
         instance = np.full(len(stretch.sweeps[i].sweep), -1, np.int32)
         instance[seen.row] = attached
         return instance
@@ -133,6 +129,12 @@ def estimate_motion(scene: Scene, settings: Config, argument: str) -> GroupMotio
         fine = [_is_fine(track, space) for track in tracks]
         bendings = _bendings(stretch, tracks, fine, instance)
     return GroupMotion(stretch, tuple(tracks), instance, bendings)
+
+
+def _foretold(track: Track, i: int, clock: Clock) -> bool:
+    """Whether sweep i is among those that saw the object, or little earlier or later."""
+    first, last = min(track.claimed), max(track.claimed)
+    return first <= i <= last or any(clock.near(i, end, _FORETOLD_S) for end in (first, last))
 
 
 def _is_fine(track: Track, space: FreeSpace) -> bool:
@@ -202,7 +204,7 @@ def _attach(
     i: int,
     tracks: Sequence[Track],
     shapes: Sequence[Shape],
-    time_s: Float,
+    clock: Clock,
     min_height_m: float,
 ) -> NDArray[np.int32]:
     """(N,): the track each of the points seen by sweep number i belongs to, -1 none.
@@ -213,9 +215,9 @@ def _attach(
     instance = np.full(len(seen.points), -1, np.int32)
     nearest = np.full(len(seen.points), np.inf)
     for k, track in enumerate(tracks):
-        if not min(track.claimed) - _FORETOLD <= i <= max(track.claimed) + _FORETOLD:
+        if not _foretold(track, i, clock):
             continue
-        rim = track.place(shapes[k].rim, track.seen_at(i, time_s))
+        rim = track.place(shapes[k].rim, track.seen_at(i, clock))
         low, high = rim.min(0) - 2 * _ATTACH_M, rim.max(0) + 2 * _ATTACH_M
         low[2] -= 1.0  # down to the wheels
         rows = rows_inside(seen.points, low, high)
@@ -237,7 +239,6 @@ def _lengthen(
     i: int,
     tracks: Sequence[Track],
     shapes: Sequence[Shape],
-    time_s: Float,
     space: FreeSpace,
 ) -> None:
     """Give the tracks what goes on ahead of and behind their points without a hole, as wide and as
@@ -247,7 +248,7 @@ def _lengthen(
         mine = np.flatnonzero(instance == k)
         if not len(mine):
             continue
-        at_s = track.seen_at(i, time_s)
+        at_s = track.seen_at(i, space.clock)
         ahead = track.path.rate(at_s)[:2]
         ahead = ahead / max(float(np.linalg.norm(ahead)), 1e-6)
         axes = np.stack([ahead, [-ahead[1], ahead[0]]], axis=1)
@@ -264,7 +265,7 @@ def _lengthen(
         own = track.carry(seen.points[mine], seen.time_s[mine], at_s)[:, :2] @ ahead
         rows, along = rows[fits], along[fits, 0]
         rows = rows[_without_hole(along, own)]
-        if len(rows) and _contradicted(track, seen, rows, i, time_s, space) <= _MAX_CONTRADICTED:
+        if len(rows) and _contradicted(track, seen, rows, i, space) <= _MAX_CONTRADICTED:
             instance[rows] = k
 
 
@@ -278,13 +279,14 @@ def _without_hole(along: Float, own: Float) -> Bool:
 
 
 def _contradicted(
-    track: Track, seen: _Seen, rows: NDArray[np.int64], i: int, time_s: Float, space: FreeSpace
+    track: Track, seen: _Seen, rows: NDArray[np.int64], i: int, space: FreeSpace
 ) -> float:
     """The largest share of the points, moved with the track, that another sweep sees through."""
     shares = [0.0]
     body = track.undo(seen.points[rows], seen.time_s[rows])
     for j in space.others(i):
-        carried = track.place(body, time_s[j])
-        velocity_m_s = track.velocity_m_s(carried, time_s[j])
+        at_s = space.clock.time_s[j]
+        carried = track.place(body, at_s)
+        velocity_m_s = track.velocity_m_s(carried, at_s)
         shares.append(float(space.seen_through(carried, j, velocity_m_s).mean()))
     return max(shares)

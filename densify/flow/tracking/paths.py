@@ -15,9 +15,13 @@ from scipy.interpolate import BSpline
 
 from densify.types import Float
 
-_STIFFNESSES = (1e6, 200.0, 10.0)  # (noise of a sweep's place / change of acceleration per sweep)²
+_KNOT_S = 0.1
+# (Noise of a sweep's place / jerk · knot³)²: of 3 cm, a jerk of 0.03, 2 and 10 m/s³.
+_STIFFNESSES = (1e6, 200.0, 10.0)
 _WORTH_SOFTENING = 0.8  # a softer path must foretell left-out sweeps so much better
-_FEW = 5  # sweeps do not tell an acceleration
+# Fewer sweeps, or sweeps in a shorter time, do not tell an acceleration, or how it changes.
+_TELL_ACCELERATION = 5, 0.35
+_TELL_CHANGE = 8, 0.65
 _DEGREE = 3
 
 
@@ -37,24 +41,23 @@ class Path:
     residual_m: float
 
     @staticmethod
-    def fit(times_s: Float, states: Float, weights: Float, step_s: float) -> Path:
+    def fit(times_s: Float, states: Float, weights: Float) -> Path:
         """Through (m,d) states at ascending (m,) times, weighted.
 
-        step_s: distance of the knots, the time between two sweeps. The path is as stiff as can be
-        unless a softer one foretells each sweep from the others clearly better (leave-one-out, in
-        closed form).
+        The path is as stiff as can be unless a softer one foretells each sweep from the others
+        clearly better (leave-one-out, in closed form).
         """
         begin_s, end_s = float(times_s[0]), float(times_s[-1])
-        num_spans = max(1, round((end_s - begin_s) / step_s))
+        num_spans = max(1, round((end_s - begin_s) / _KNOT_S))
         width_s = (end_s - begin_s) / num_spans
         knots = begin_s + width_s * np.arange(-_DEGREE, num_spans + _DEGREE + 1)
         inside = np.clip(times_s, begin_s, np.nextafter(end_s, begin_s))
         B = BSpline.design_matrix(inside, knots, _DEGREE).toarray()
-        order = 3 if len(times_s) >= _FEW else 2
+        order = 3 if _told(times_s, *_TELL_ACCELERATION) else 2
         D = np.diff(np.eye(B.shape[1]), order, axis=0)
         W = weights / weights.mean()
         least, coefficients, residual = np.inf, np.zeros(0), np.inf
-        for stiffness in _STIFFNESSES if len(times_s) >= 2 * _FEW - 2 else _STIFFNESSES[:1]:
+        for stiffness in _STIFFNESSES if _told(times_s, *_TELL_CHANGE) else _STIFFNESSES[:1]:
             solve = np.linalg.solve(B.T @ (W[:, None] * B) + stiffness * D.T @ D, B.T * W)
             leverage = np.einsum("ij,ji->i", B, solve)
             found = solve @ states
@@ -80,3 +83,7 @@ class Path:
         """(..., d) per second."""
         rate: Float = self.derivative(np.clip(time_s, self.begin_s, self.end_s))
         return rate
+
+
+def _told(times_s: Float, least_number: int, least_s: float) -> bool:
+    return len(times_s) >= least_number and bool(times_s[-1] - times_s[0] >= least_s)

@@ -34,7 +34,7 @@ _ANCHOR, _ANCHOR_M = 2.0, 0.02  # weight of the rigid place, and the departure t
 _MAX_PRODUCTS, _RESIDUAL_DROP = 30, 0.02
 _NUM_LOOKED_UP = 3
 _LARGEST_M = 3.0
-_MIN_PARTS, _MIN_POINTS = 5, 20
+_MIN_PARTS, _MIN_SEEN_S, _MIN_POINTS = 5, 0.35, 20
 _CAP_M = 0.3  # one stray point says no more than this
 # Measured on eight streets: parts of vehicles gain up to 0.045 of the squared distance, walkers
 # within 20 m mostly 0.06 to 0.4.
@@ -104,8 +104,8 @@ def soften(parts: Sequence[Part]) -> Softened:
     the bending between its neighbours is found without it, and the share of it until the left-out
     part's time is how they foretell it. The softest stiffness is taken that foretells clearly
     better than the rigid object does, and in most parts; if there is none the object stays rigid.
-    So does what is longer than 3 m, seen in fewer than 5 sweeps, or by fewer than 20 points in half
-    of them.
+    So does what is longer than 3 m, seen in fewer than 5 sweeps or for less than 0.35 s, or with
+    fewer than 20 points in half of them.
 
     Same input, same bytes. Raises InputError for parts that are empty, not (n,3), not finite, or
     not in order of time.
@@ -151,7 +151,9 @@ def _check(parts: tuple[Part, ...]) -> None:
 
 def _may_bend(parts: tuple[Part, ...]) -> bool:
     """False for what is a vehicle, or seen too little to tell."""
-    if len(parts) < _MIN_PARTS or np.median([len(p.points) for p in parts]) < _MIN_POINTS:
+    if len(parts) < _MIN_PARTS or parts[-1].time_s - parts[0].time_s < _MIN_SEEN_S:
+        return False
+    if np.median([len(p.points) for p in parts]) < _MIN_POINTS:
         return False
     lengths_m = [np.linalg.norm(np.ptp(p.points, axis=0)) for p in parts]
     return bool(np.median(lengths_m) < _LARGEST_M)

@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from densify.flow.tracking.align import GATES_M, MIN_FIT, Model, align, apply, undo
+from densify.flow.tracking.clock import Clock
 from densify.flow.tracking.evidence import FreeSpace, Standing
 from densify.flow.tracking.paths import Path
 from densify.flow.tracking.shapes import Shape
@@ -24,18 +25,22 @@ from densify.types import Bool, Float
 
 _MIN_POINTS = 8
 _MIN_SEED_SHARE = 0.4
-_AROUND = 5  # sweeps before and after a start are as good as any number
-_PER_SWEEP_NEARER_END = 0.7  # a start this much nearer needs as many more points
+_AROUND_S = 0.5  # before and after a start is as good as any time
+_NEARER_END, _NEARER_END_S = 0.7, 0.1  # each time a start is so much nearer it is worth less
 _FIT_M = 0.3
-_NEAR_SWEEPS = 3
+_NEAR_S = 0.3
 _SHARE_UNSEEN = 0.5  # of the points a sweep usually shows
 _MANY_POINTS = 100  # more do not place a sweep better
-_PREDICTION_STD = np.array([0.3, 0.3, 0.06])  # m, m, rad
-_STEADY = np.array([1.0, 1.0, 1.0, 0.9])  # of a rate lasts: turns level out
-_ROUGH_M, _ROUGH_PER_GAP, _ROUGH_PER_STEP = 0.04, 0.2, 0.03  # by gap of rings, way per sweep
+# m, m, rad: of what is foretold by up to so long, and in proportion by longer.
+_PREDICTION_STD, _PREDICTION_S = np.array([0.3, 0.3, 0.06]), 0.25
+_REFINED_STD = np.array([0.15, 0.15, 0.03])  # m, m, rad: of the smooth motion
+_RECENT_S = 0.4  # the states in so long tell a rate
+_STEADY = np.array([1.0, 1.0, 1.0, 0.9])  # of what it was then: turns level out
+_ROUGH_M, _ROUGH_PER_GAP, _ROUGH_S = 0.04, 0.2, 0.003  # by gap of rings, by speed
 _LEAST_WAY_M, _LEAST_WAY_PER_RESIDUAL = 0.35, 8.0
 _NUM_ASKED = 60
-_MISSES_ALLOWED = 1
+_MISSES_ALLOWED, _MISSED_S = 1, 0.2  # either: a track ends when both are exceeded
+_LEAST_STATES, _LEAST_S = 3, 0.15
 _MAX_CONTRADICTIONS = 0.3  # of those that standing still leaves
 
 
@@ -97,41 +102,36 @@ class Track:
         """Points per sweep."""
         return float(np.median([len(rows) for rows in self.claimed.values()]))
 
-    def smooth(self, sweep_time_s: Float) -> None:
+    def smooth(self) -> None:
         """Lay the path through the states; sweeps that saw many points count more."""
         seen = sorted(self.states)
         times_s = np.array([self.times_s[j] for j in seen])
         states = np.stack([self.states[j] for j in seen])
         weights = np.array([min(len(self.claimed[j]), _MANY_POINTS) for j in seen], float)
-        self.path = Path.fit(times_s, states, weights, float(np.median(np.diff(sweep_time_s))))
+        self.path = Path.fit(times_s, states, weights)
 
-    def seen_at(self, j: int, sweep_time_s: Float) -> float:
+    def seen_at(self, j: int, clock: Clock) -> float:
         """When sweep j sees, or would see, the object."""
-        nearest = min(self.times_s, key=lambda k: (abs(k - j), k))
-        return float(sweep_time_s[j] + self.times_s[nearest] - sweep_time_s[nearest])
+        nearest = clock.nearest(j, self.times_s)
+        return float(clock.time_s[j] + self.times_s[nearest] - clock.time_s[nearest])
 
 
-def follow_groups(
-    standing: Sequence[Standing], space: FreeSpace, ground: HeightMap, sweep_time_s: Float
-) -> list[Track]:
-    """All proven moving objects of the stretch.
-
-    sweep_time_s: (W,) reference times of the sweeps, ascending.
-    """
+def follow_groups(standing: Sequence[Standing], space: FreeSpace, ground: HeightMap) -> list[Track]:
+    """All proven moving objects of the stretch."""
     fields = [DistanceField.of(c.points[c.candidate]) for c in standing]
     free = [np.ones(len(c.points), bool) for c in standing]  # not yet part of a track
     untried = [np.ones(len(c.points), bool) for c in standing]
     tracks = []
-    for i, group in _groups_to_start(standing):
+    for i, group in _groups_to_start(standing, space.clock):
         members = group[free[i][group] & untried[i][group]]
         if len(members) < _MIN_POINTS:
             continue
-        velocity = vote(standing[i].points[members], i, fields, sweep_time_s)
-        track = _follow(members, i, velocity, standing, free, ground, sweep_time_s)
-        proven = _prove(track, standing, space, sweep_time_s)
+        velocity = vote(standing[i].points[members], i, fields, space.clock)
+        track = _follow(members, i, velocity, standing, free, ground, space.clock)
+        proven = _prove(track, standing, space)
         if proven:
-            _gather(track, standing, free, space, sweep_time_s)
-            _refine(track, standing, ground, sweep_time_s)
+            _gather(track, standing, free, space)
+            _refine(track, standing, ground)
         for j, rows in track.claimed.items():
             untried[j][rows] = False
             if proven:
@@ -141,15 +141,15 @@ def follow_groups(
     return tracks
 
 
-def _groups_to_start(standing: Sequence[Standing]) -> list[tuple[int, np.ndarray]]:
+def _groups_to_start(standing: Sequence[Standing], clock: Clock) -> list[tuple[int, np.ndarray]]:
     """Sweep and members of the clusters that are mostly seeds, the best start first: what is seen
     well makes a good model, and far from the ends of the stretch both sides tell how it moves."""
     groups = []
-    last = len(standing) - 1
 
     def worth(start: tuple[int, np.ndarray]) -> float:
         i, members = start
-        return float(len(members) * _PER_SWEEP_NEARER_END ** max(0, _AROUND - min(i, last - i)))
+        nearer_s = max(0.0, _AROUND_S - clock.from_end_s(i))
+        return float(len(members) * _NEARER_END ** (nearer_s / _NEARER_END_S))
 
     for i, c in enumerate(standing):
         size = np.bincount(c.cluster[c.candidate], minlength=c.num_clusters)
@@ -166,7 +166,7 @@ def _follow(
     standing: Sequence[Standing],
     free: Sequence[Bool],
     ground: HeightMap,
-    sweep_time_s: Float,
+    clock: Clock,
 ) -> Track:
     """Forwards, then backwards, with everything seen so far as the model."""
     here = standing[start]
@@ -177,15 +177,15 @@ def _follow(
     track.add(start, np.zeros(4), seen_s, members)
     model = Model(points)
     for direction in (1, -1):
-        misses, j = 0, start + direction
-        while 0 <= j < len(standing) and misses <= _MISSES_ALLOWED:
-            found = _find(
-                model, track, rate, standing[j], free[j], ground, track.seen_at(j, sweep_time_s)
-            )
-            if found is None:
-                misses += 1
-            else:
-                misses = 0
+        last, j = start, start + direction
+        while 0 <= j < len(standing) and (
+            abs(j - last) <= 1 + _MISSES_ALLOWED or clock.near(j, last, _MISSED_S)
+        ):
+            recent = clock.num_in(_RECENT_S)
+            about_s = track.seen_at(j, clock)
+            found = _find(model, track, rate, recent, standing[j], free[j], ground, about_s)
+            if found is not None:
+                last = j
                 state, seen_s, rows, points = found
                 track.add(j, state, seen_s, rows)
                 model.add(undo(state, points, track.centre))
@@ -198,21 +198,25 @@ def _at_once(c: Standing, rows: np.ndarray, rate: Float, time_s: float) -> Float
     return c.points[rows] + (time_s - c.time_s[rows])[:, None] * rate[:3]
 
 
-def _predict(track: Track, rate: Float, time_s: float) -> tuple[Float, Float]:
-    """State and its rate, from the states nearest in time: constant velocity."""
-    known = sorted(track.states, key=lambda k: (abs(track.times_s[k] - time_s), k))[:4]
+def _predict(track: Track, rate: Float, num: int, time_s: float) -> tuple[Float, Float, Float]:
+    """State, its rate, and how far off (3,) the state may be in x y and yaw, by the constant
+    velocity of the ``num`` states nearest in time."""
+    known = sorted(track.states, key=lambda k: (abs(track.times_s[k] - time_s), k))[:num]
     nearest = known[0]
+    ahead_s = time_s - track.times_s[nearest]
     if len(known) > 1:
         t = np.array([track.times_s[k] for k in known])
         t -= t.mean()
         rate = t @ np.stack([track.states[k] for k in known]) / (t @ t) * _STEADY
-    return track.states[nearest] + rate * (time_s - track.times_s[nearest]), rate
+    std = _PREDICTION_STD * max(1.0, abs(ahead_s) / _PREDICTION_S)
+    return track.states[nearest] + rate * ahead_s, rate, std
 
 
 def _find(
     model: Model,
     track: Track,
     rate: Float,
+    num_recent: int,
     c: Standing,
     free: Bool,
     ground: HeightMap,
@@ -224,7 +228,7 @@ def _find(
     fit and where those points were at that time; None where too few fit.
     """
     centre = track.centre
-    expected = apply(_predict(track, rate, about_s)[0], model.points, centre)
+    expected = apply(_predict(track, rate, num_recent, about_s)[0], model.points, centre)
     low, high = expected.min(0) - GATES_M[0], expected.max(0) + GATES_M[0]
     inside = rows_inside(c.points, low, high)
     inside = inside[free[inside]]
@@ -234,10 +238,10 @@ def _find(
     if len(rows) < enough:
         return None
     seen_s = float(c.time_s[rows].mean())
-    predicted, rate = _predict(track, rate, seen_s)
+    predicted, rate, std = _predict(track, rate, num_recent, seen_s)
     predicted[2] = track.rise_m(ground, predicted)
     target = _at_once(c, rows, rate, seen_s)
-    state = align(model, target, centre, predicted, _PREDICTION_STD)
+    state = align(model, target, centre, predicted, std)
     if state is None:
         return None
     state[2] = track.rise_m(ground, state)
@@ -253,7 +257,6 @@ def _gather(
     standing: Sequence[Standing],
     free: Sequence[Bool],
     space: FreeSpace,
-    sweep_time_s: Float,
 ) -> None:
     """Claim the free candidates beside or within the object that its motion does not contradict,
     before a part of it starts a track of its own."""
@@ -268,16 +271,15 @@ def _gather(
         belongs = np.isfinite(shape.tree.nearest(in_shape, _FIT_M)[0])
         rows = rows[belongs | shape.within_outline(in_shape)]
         for i in space.others(j):
-            if abs(i - j) <= _NEAR_SWEEPS and len(rows):
-                carried = track.carry(c.points[rows], c.time_s[rows], sweep_time_s[i])
-                velocity_m_s = track.velocity_m_s(carried, sweep_time_s[i])
+            if space.clock.near(i, j, _NEAR_S) and len(rows):
+                at_s = space.clock.time_s[i]
+                carried = track.carry(c.points[rows], c.time_s[rows], at_s)
+                velocity_m_s = track.velocity_m_s(carried, at_s)
                 rows = rows[~space.seen_through(carried, i, velocity_m_s)]
         track.claimed[j] = np.concatenate([own, rows])
 
 
-def _refine(
-    track: Track, standing: Sequence[Standing], ground: HeightMap, sweep_time_s: Float
-) -> None:
+def _refine(track: Track, standing: Sequence[Standing], ground: HeightMap) -> None:
     """Align every sweep once more, with what others saw, if that makes the motion smoother.
 
     Followed sweep by sweep, an object whose other side comes into view drifts: the first shape is
@@ -293,57 +295,53 @@ def _refine(
     for j, rows in track.claimed.items():
         at_s = track.times_s[j]
         points = track.carry(standing[j].points[rows], standing[j].time_s[rows], at_s)
-        state = align(
-            models[1 - j % 2], points, track.centre, track.path(at_s), 0.5 * _PREDICTION_STD
-        )
+        state = align(models[1 - j % 2], points, track.centre, track.path(at_s), _REFINED_STD)
         if state is not None:
             state[2] = track.rise_m(ground, state)
             track.states[j] = state
-    track.smooth(sweep_time_s)
+    track.smooth()
     if track.path.residual_m > before[1].residual_m:
         track.states, track.path = before
 
 
-def _prove(
-    track: Track, standing: Sequence[Standing], space: FreeSpace, sweep_time_s: Float
-) -> bool:
+def _prove(track: Track, standing: Sequence[Standing], space: FreeSpace) -> bool:
     """Fit the smooth motion; True if the track certainly moves.
 
     The motion must be smooth, long enough to be told from noise, and must do away with the
     contradictions that brought the group here: where the sweeps see through its points at their
     rigid places, they must not see through them at the moved ones.
     """
-    if len(track.states) < 3:
+    seen_s = np.ptp(list(track.times_s.values()))
+    if len(track.states) < _LEAST_STATES or seen_s < _LEAST_S:
         return False
-    track.smooth(sweep_time_s)
+    track.smooth()
     residual_m = track.path.residual_m
-    seen = sorted(track.states)
-    fitted = track.path(np.array([track.times_s[seen[0]], track.times_s[seen[-1]]]))
-    travelled = float(np.linalg.norm((fitted[-1] - fitted[0])[:2]))
-    step_m = travelled / (seen[-1] - seen[0])
+    begin, end = track.path(track.path.begin_s), track.path(track.path.end_s)
+    travelled = float(np.linalg.norm((end - begin)[:2]))
     start = space.origin[next(iter(track.states))]
     range_m = float(np.linalg.norm((track.centre - start)[:2]))
-    rough_m = _ROUGH_M + _ROUGH_PER_GAP * space.ring_step_rad * range_m + _ROUGH_PER_STEP * step_m
+    gap_m = space.ring_step_rad * range_m
+    rough_m = _ROUGH_M + _ROUGH_PER_GAP * gap_m + _ROUGH_S * travelled / seen_s
     if residual_m > rough_m or travelled < max(_LEAST_WAY_M, _LEAST_WAY_PER_RESIDUAL * residual_m):
         return False
-    still, moved = _contradictions(track, standing, space, sweep_time_s)
+    still, moved = _contradictions(track, standing, space)
     return moved <= _MAX_CONTRADICTIONS * still
 
 
 def _contradictions(
-    track: Track, standing: Sequence[Standing], space: FreeSpace, sweep_time_s: Float
+    track: Track, standing: Sequence[Standing], space: FreeSpace
 ) -> tuple[int, int]:
     """How many looks through the track's points the sweeps have: standing still, and moved."""
     asked = {i: rows[:: len(rows) // _NUM_ASKED + 1] for i, rows in track.claimed.items()}
     points = {i: standing[i].points[rows] for i, rows in asked.items()}
     body = {i: track.undo(points[i], standing[i].time_s[rows]) for i, rows in asked.items()}
     still = moved = 0
-    for j in range(len(space)):
+    for j, at_s in enumerate(space.clock.time_s):
         from_others = [i for i in space.others(j) if i in asked]
         if not from_others:
             continue
-        carried = track.place(np.concatenate([body[i] for i in from_others]), sweep_time_s[j])
-        velocity_m_s = track.velocity_m_s(carried, sweep_time_s[j])
+        carried = track.place(np.concatenate([body[i] for i in from_others]), at_s)
+        velocity_m_s = track.velocity_m_s(carried, at_s)
         moved += int(space.seen_through(carried, j, velocity_m_s).sum())
         standing_still = np.concatenate([points[i] for i in from_others])
         still += int(space.seen_through(standing_still, j).sum())

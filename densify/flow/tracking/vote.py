@@ -9,11 +9,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from densify.flow.tracking.clock import Clock
 from densify.kernels.clouds import spread
 from densify.types import Float
 
 _MAX_SPEED_M_S = 38.0
-_VOTE_STEP_M = 0.2  # per sweep
+_VOTE_NEAR_S = 0.1  # the nearer of the sweeps asked; the farther ones are twice as far
+_VOTE_STEP_M = 0.2
 _VOTE_REACH_M = 0.6
 _VOTE_POINTS = 60
 
@@ -53,11 +55,14 @@ class DistanceField:
         return np.where(inside, (255 - near) / 255, 1.0)
 
 
-def vote(points: Float, i: int, fields: Sequence[DistanceField], time_s: Float) -> Float:
-    """(3,) m/s in the plane: where the group went in the two sweeps before and after, at once."""
-    around = [j for j in (i - 2, i - 1, i + 1, i + 2) if 0 <= j < len(fields)]
-    step_s = float(np.median(np.diff(time_s)))
-    coarse = 2 * _VOTE_STEP_M / step_s
+def vote(points: Float, i: int, fields: Sequence[DistanceField], clock: Clock) -> Float:
+    """(3,) m/s in the plane: where the group that sweep i saw is in four sweeps at once, about 0.1
+    and 0.2 s before and after, or as near to that as the rate allows."""
+    near_s = clock.num_in(_VOTE_NEAR_S) * clock.period_ns * 1e-9
+    asked = [clock.at(i, later_s) for later_s in (-2 * near_s, -near_s, near_s, 2 * near_s)]
+    around = sorted({j for j in asked if j is not None})
+    time_s = clock.time_s
+    coarse = 2 * _VOTE_STEP_M / near_s
 
     def best(velocities: Float, num_points: int) -> Float:
         sample = points[:: len(points) // num_points + 1]
