@@ -13,6 +13,7 @@ import pytest
 from densify.config import RegisterSettings
 from densify.errors import ComputationError
 from densify.geometry import poses
+from densify.registration import odometry
 from densify.registration.deskew import deskew
 from densify.registration.odometry import check_plausible, register
 from densify.types import Trajectory
@@ -84,6 +85,34 @@ def test_speed_is_known_from_the_first_step_on(drive, second_pass):
         found = poses.inverse(second_pass.T_world_lidar[i]) @ second_pass.T_world_lidar[i + 1]
         step = poses.log(poses.inverse(poses.inverse(true[i]) @ true[i + 1]) @ found)
         assert np.linalg.norm(step[3:]) < 0.12
+
+
+@pytest.fixture(scope="module")
+def fast_drive() -> Scene:
+    """36 m/s, nearly straight."""
+    return Scene(World(street()), Arc(-20, -1.5, 0, 36.0, 0.05), Scanner(num_azimuths=900))
+
+
+@pytest.mark.parametrize(
+    "frames", [(0, 2, 4, 6, 8), (0, 1, 2, 5, 6, 8, 9)], ids=["every second", "holes"]
+)
+def test_sweeps_may_be_missing(fast_drive, frames):
+    """A hole of three periods at 36 m/s is 7 m longer than the step before it."""
+    found = both_passes([fast_drive.scan(f).sweep for f in frames])
+    true = fast_drive.trajectory(frames).T_world_lidar
+    for i in range(len(frames) - 1):
+        step = poses.inverse(true[i]) @ true[i + 1]
+        found_step = poses.inverse(found.T_world_lidar[i]) @ found.T_world_lidar[i + 1]
+        off = poses.log(poses.inverse(step) @ found_step)
+        assert np.linalg.norm(off[3:]) < 0.2
+        assert np.rad2deg(np.linalg.norm(off[:3])) < 0.2
+
+
+@pytest.mark.parametrize("period_s", [0.1, 0.2, 0.3])
+def test_the_start_is_found_at_any_rate(fast_drive, period_s):
+    frames = [round(i * period_s / SWEEP_S) for i in range(3)]
+    twist = odometry._searched_twist([fast_drive.scan(f).sweep for f in frames], SETTINGS)
+    assert np.abs(twist * period_s - [0, 0, 0, 36.0 * period_s, 0, 0]).max() < 0.6
 
 
 def test_same_bytes_every_time(raw, first_pass):

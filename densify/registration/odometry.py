@@ -15,34 +15,70 @@ from scipy.spatial import cKDTree
 from densify.config import RegisterSettings
 from densify.errors import SweepError
 from densify.geometry import poses
-from densify.types import Float, Sweep, Trajectory
+from densify.types import Float, Int, Sweep, Trajectory
 
 _MAX_ACCELERATION_M_S2 = 30.0  # three times what tyres can do; the rest is noise of the stamps
 _MAX_TURN_RATE_DEG_S = 150.0
 _POSE_NOISE_M = 0.5
-_NUM_CATCHING_UP = 3
+_NUM_CATCHING_UP = 3  # sweeps registered, however far apart in time
 _SEARCH_STEP_M = 0.5
 _SEARCH_POINTS = 800
+_SEARCH_CLOSE_M = 1.0
 _STANDING_M = 0.4
 _OVERLAP_POINTS = 2000
 _OVERLAP_M = 0.5
+# Change of a sweep's pose (rad and m) below which it counts as found. The first pass only has to
+# find the motion within a sweep: 3 mm over 0.1 s bend its ends by 1.5 mm.
+_ROUGHLY_CONVERGED = 3e-3
+_CONVERGED = 1e-3
 
 
 def register(
     sweeps: Sequence[Sweep], settings: RegisterSettings, rough: Trajectory | None = None
 ) -> Trajectory:
-    """Poses of consecutive sweeps by lidar odometry.
+    """Poses of sweeps by lidar odometry.
 
-    sweeps: ascending frames; raw for a first pass, deskewed for a second one.
-    rough: the first pass. It tells the second one how fast the vehicle starts and lets it work
-        with the fine voxels; without it they are twice as large and the start is searched for,
-        since odometry by itself takes every start for standing still.
+    sweeps: ascending in time; some of a recording's may be missing between them. Raw for a first
+        pass, deskewed for a second one.
+    rough: the first pass of the same sweeps. The second one searches around it, so that it can
+        work with fine voxels and a narrow kernel. Without it the voxels are twice as large, each
+        sweep is searched for where the vehicle would be if it kept its velocity, and the velocity
+        at the start is found on a grid, since odometry takes every start for standing still.
 
     World is the first sweep's lidar frame. Raises SweepError naming the frames where a sweep
-    is too sparse to register or, in the second pass, the motion is none a vehicle makes.
+    is too sparse to register, the stamps do not ascend or, in the second pass, the motion is none
+    a vehicle makes.
     """
     from kiss_icp.kiss_icp import KissICP
 
+    frames = tuple(s.frame for s in sweeps)
+    stamp_ns = np.array([s.stamp_ns for s in sweeps], np.int64)
+    _check_number_of_points(sweeps, settings)
+    _check_stamps(frames, stamp_ns)
+    step_s = np.diff(stamp_ns) * 1e-9
+    odometry = KissICP(_kiss_icp_config(settings, rough is not None))
+    # KISS-ICP aborts the process on equal stamps; sweeps are ours to deskew
+    no_stamps = np.empty(0)
+    T_world_lidar: list[Float] = []
+    for i, sweep in enumerate(sweeps):
+        if i:
+            if rough is not None:
+                twist = _twist(rough, min(max(i - 1, _NUM_CATCHING_UP), len(sweeps) - 2))
+            elif i == 1:
+                twist = _searched_twist(sweeps, settings)
+            else:
+                twist = poses.log(odometry.last_delta) / step_s[i - 2]
+            odometry.last_delta = poses.exp(twist * step_s[i - 1])
+        odometry.register_frame(sweep.points, no_stamps)
+        T_world_lidar.append(odometry.last_pose)
+    trajectory = Trajectory(frames, stamp_ns, np.stack(T_world_lidar))
+    if rough is not None:  # a first pass may stumble where it starts from rest
+        check_plausible(trajectory, settings)
+        check_overlap(sweeps, trajectory, settings)
+    return trajectory
+
+
+def _check_number_of_points(sweeps: Sequence[Sweep], settings: RegisterSettings) -> None:
     for sweep in sweeps:
         if len(sweep) < settings.min_num_points:
             raise SweepError(
@@ -50,52 +86,54 @@ def register(
                 f"{settings.min_num_points}; choose another key or lower register.min_num_points",
                 sweep.frame,
             )
-    voxel_size_m = settings.voxel_size_m * (2 if rough is None else 1)
-    odometry = KissICP(_kiss_icp_config(settings, voxel_size_m))
-    if len(sweeps) > 1:
-        odometry.last_delta = _searched_step(sweeps, settings) if rough is None else _step(rough)
-        odometry.last_pose = poses.inverse(odometry.last_delta)
-    T_world_lidar = []
-    no_stamps = np.empty(
-        0
-    )  # KISS-ICP aborts the process on equal stamps; sweeps are ours to deskew
-    for sweep in sweeps:
-        odometry.register_frame(sweep.points, no_stamps)
-        T_world_lidar.append(odometry.last_pose)
-    trajectory = Trajectory(
-        frames=tuple(s.frame for s in sweeps),
-        stamp_ns=np.array([s.stamp_ns for s in sweeps], np.int64),
-        T_world_lidar=np.stack(T_world_lidar),
-    )
-    if rough is not None:  # a first pass may stumble where it starts from rest
-        check_plausible(trajectory, settings)
-        check_overlap(sweeps, trajectory, settings)
-    return trajectory
 
 
-def _step(rough: Trajectory) -> Float:
-    """(4,4) motion of one sweep to the next at the start, from where odometry has caught up."""
-    i = min(_NUM_CATCHING_UP, len(rough.frames) - 2)
-    return poses.inverse(rough.T_world_lidar[i]) @ rough.T_world_lidar[i + 1]
+def _twist(trajectory: Trajectory, i: int) -> Float:
+    """(6,) per second from sweep i to the next."""
+    T = trajectory.T_world_lidar
+    seconds = (trajectory.stamp_ns[i + 1] - trajectory.stamp_ns[i]) * 1e-9
+    return poses.log(poses.inverse(T[i]) @ T[i + 1]) / seconds
 
 
-def _searched_step(sweeps: Sequence[Sweep], settings: RegisterSettings) -> Float:
-    """(4,4) motion of one sweep to the next: the translation on a grid, up to the highest speed,
-    that best lays what stands on the ground in the first sweeps upon each other."""
+def _searched_twist(sweeps: Sequence[Sweep], settings: RegisterSettings) -> Float:
+    """(6,) per second at the start: the velocity, up to the highest speed and without rotation,
+    that best lays what stands on the ground in the first sweeps upon each other.
+
+    Tried on a grid whose steps move the second sweep by 1 m, and around the best by 0.5 m.
+    """
     standing = [_standing(s.points) for s in sweeps[:3]]
-    seconds = (sweeps[1].stamp_ns - sweeps[0].stamp_ns) * 1e-9
-    num = int(np.clip(settings.max_speed_m_s * seconds / _SEARCH_STEP_M, 0, 20))
-    span = np.arange(-num, num + 1) * _SEARCH_STEP_M
-    x, y = np.meshgrid(span, span, indexing="ij")
-    steps = np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], 1)
-    cost = 1e-3 * np.linalg.norm(steps, axis=1)
-    for earlier, later in pairwise(standing):
+    first_s = (sweeps[1].stamp_ns - sweeps[0].stamp_ns) * 1e-9
+    pairs = []
+    for i, (earlier, later) in enumerate(pairwise(standing)):
         _, rows = np.unique(np.floor(later), axis=0, return_index=True)  # even over 1 m voxels
         sample = later[rows[:: len(rows) // _SEARCH_POINTS + 1]]
-        moved = (sample + steps[:, None, :]).reshape(-1, 3)
-        distance, _ = cKDTree(earlier).query(moved, distance_upper_bound=1.0, workers=-1)
-        cost += np.minimum(distance, 1.0).reshape(len(steps), -1).mean(1)
-    return poses.exp(np.append(np.zeros(3), steps[np.argmin(cost)]))
+        ratio = (sweeps[i + 1].stamp_ns - sweeps[i].stamp_ns) * 1e-9 / first_s
+        pairs.append((_tree(earlier), sample, ratio))
+
+    def best(steps_m: Float) -> Float:
+        """Of (n,3) motions between the first two sweeps; among equal ones the slowest."""
+        cost = 1e-3 * np.linalg.norm(steps_m, axis=1)
+        for tree, sample, ratio in pairs:
+            moved = (sample + ratio * steps_m[:, None, :]).reshape(-1, 3)
+            distance_m, _ = tree.query(moved, distance_upper_bound=_SEARCH_CLOSE_M, workers=-1)
+            cost += np.minimum(distance_m, _SEARCH_CLOSE_M).reshape(len(steps_m), -1).mean(1)
+        return steps_m[np.argmin(cost)]
+
+    coarse = best(_grid(np.zeros(2), settings.max_speed_m_s * first_s, 2 * _SEARCH_STEP_M))
+    fine = best(_grid(coarse[:2], 2 * _SEARCH_STEP_M, _SEARCH_STEP_M))
+    return np.append(np.zeros(3), fine / first_s)
+
+
+def _grid(center: Float, reach_m: float, step_m: float) -> Float:
+    """(n,3) horizontal motions around a center (2,)."""
+    span = np.arange(-np.ceil(reach_m / step_m), np.ceil(reach_m / step_m) + 1) * step_m
+    x, y = np.meshgrid(center[0] + span, center[1] + span, indexing="ij")
+    return np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], 1)
+
+
+def _tree(points: Float) -> cKDTree:
+    """For few queries: built without balancing, which takes longer than they do."""
+    return cKDTree(points, balanced_tree=False, compact_nodes=False)
 
 
 def _standing(points: Float) -> Float:
@@ -110,18 +148,23 @@ def _standing(points: Float) -> Float:
     return standing if len(standing) else points
 
 
-def check_plausible(trajectory: Trajectory, settings: RegisterSettings) -> None:
-    """Raise SweepError where the trajectory jumps as no vehicle does."""
-    step_s = np.diff(trajectory.stamp_ns) * 1e-9
-    pairs = list(pairwise(trajectory.frames))
-    for (a, b), seconds in zip(pairs, step_s, strict=True):
-        if seconds <= 0:
+def _check_stamps(frames: Sequence[int], stamp_ns: Int) -> None:
+    """Raise SweepError where time does not go on."""
+    for (a, b), step_ns in zip(pairwise(frames), np.diff(stamp_ns), strict=True):
+        if step_ns <= 0:
             raise SweepError(
                 f"registration: the stamp of frame {b} is not after that of frame {a}, but "
-                f"{1e3 * -seconds:.1f} ms before it; expected ascending stamps; check the "
+                f"{1e-6 * -step_ns:.1f} ms before it; expected ascending stamps; check the "
                 f"recording's timestamps",
                 b,
             )
+
+
+def check_plausible(trajectory: Trajectory, settings: RegisterSettings) -> None:
+    """Raise SweepError where the trajectory jumps as no vehicle does."""
+    _check_stamps(trajectory.frames, trajectory.stamp_ns)
+    step_s = np.diff(trajectory.stamp_ns) * 1e-9
+    pairs = list(pairwise(trajectory.frames))
     T = trajectory.T_world_lidar
     if not np.isfinite(T).all():
         bad = trajectory.frames[int(np.argmin(np.isfinite(T).all((1, 2))))]
@@ -165,7 +208,7 @@ def check_overlap(
         if min(len(earlier), len(later)) < _OVERLAP_POINTS // 10:
             continue
         sample = later[:: len(later) // _OVERLAP_POINTS + 1]
-        distance, _ = cKDTree(earlier).query(sample, distance_upper_bound=_OVERLAP_M)
+        distance, _ = _tree(earlier).query(sample, distance_upper_bound=_OVERLAP_M)
         overlap = float(np.isfinite(distance).mean())
         if overlap < settings.min_overlap:
             raise SweepError(
@@ -182,8 +225,12 @@ def _cure(settings: RegisterSettings) -> str:
     return f"choose another key or a smaller window, or other poses (register.source={other})"
 
 
-def _kiss_icp_config(settings: RegisterSettings, voxel_size_m: float):  # type: ignore[no-untyped-def]
-    """Every field set here: KISS-ICP otherwise reads ``kiss_icp_*`` environment variables."""
+def _kiss_icp_config(settings: RegisterSettings, second_pass: bool):  # type: ignore[no-untyped-def]
+    """Every field set here: KISS-ICP otherwise reads ``kiss_icp_*`` environment variables.
+
+    In the second pass the kernel is as wide as a voxel (matches count up to three times that): it
+    starts from the first pass, not from a guess whose error KISS-ICP would have to learn.
+    """
     from kiss_icp.config import KISSConfig
     from kiss_icp.config.config import (
         AdaptiveThresholdConfig,
@@ -192,6 +239,7 @@ def _kiss_icp_config(settings: RegisterSettings, voxel_size_m: float):  # type: 
         RegistrationConfig,
     )
 
+    voxel_size_m = settings.voxel_size_m * (1 if second_pass else 2)
     return KISSConfig(
         out_dir="",
         data=DataConfig(
@@ -200,9 +248,13 @@ def _kiss_icp_config(settings: RegisterSettings, voxel_size_m: float):  # type: 
         mapping=MappingConfig(voxel_size=voxel_size_m, max_points_per_voxel=20),
         # One thread: the parallel sum's order, and so its last bits, change from run to run.
         registration=RegistrationConfig(
-            max_num_iterations=500, convergence_criterion=1e-4, max_num_threads=1
+            max_num_iterations=500,
+            convergence_criterion=_CONVERGED if second_pass else _ROUGHLY_CONVERGED,
+            max_num_threads=1,
         ),
         adaptive_threshold=AdaptiveThresholdConfig(
-            fixed_threshold=None, initial_threshold=2.0, min_motion_th=0.1
+            fixed_threshold=voxel_size_m if second_pass else None,
+            initial_threshold=2.0,
+            min_motion_th=0.1,
         ),
     )
