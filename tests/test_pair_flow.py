@@ -197,6 +197,11 @@ def test_bad_configuration_is_refused():
         estimate_flow(CLOUD, CLOUD, {"objective": {"alhpa": 3}})
 
 
+def test_an_engine_of_recordings_is_refused():
+    with pytest.raises(InputError, match="got 'npz:there', expected groups or paper"):
+        estimate_flow(CLOUD, CLOUD, {"flow": {"engine": "npz:there"}})
+
+
 def test_the_configuration_reaches_the_objective(monkeypatch):
     asked = {}
 

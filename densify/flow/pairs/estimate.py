@@ -62,9 +62,14 @@ def estimate_flow(
     than 400 m from the middle. ``flow.engine=paper`` takes the published objective's flow for them.
     Without the prior every point takes the objective's flow.
 
-    Raises InputError for no points, wrong shapes or NaN.
+    Raises InputError for no points, wrong shapes, NaN or another engine, which needs a recording.
     """
     settings = resolve(config)
+    if settings.flow.engine not in ("groups", "paper"):
+        raise InputError(
+            f"flow.engine: got {settings.flow.engine!r}, expected groups or paper: two clouds "
+            "alone are no recording"
+        )
     clouds = _as_cloud(source, "source"), _as_cloud(target, "target")
     lags = _lags(_columns(source_offset_ns, target_offset_ns, clouds, "offset_ns"))
     lidars = _columns(source_lidar, target_lidar, clouds, "lidar")
