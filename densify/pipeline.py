@@ -20,6 +20,7 @@ from densify.cache import Cache
 from densify.config import Config, resolve
 from densify.costs import Watch
 from densify.depth.age import with_ages
+from densify.depth.exposure import Shot, key_shots, load_images
 from densify.depth.views import HeldOut, Views
 from densify.errors import ComputationError, InputError
 from densify.flow.engines import check_engine
@@ -30,16 +31,17 @@ from densify.recording import Recording
 from densify.scores import depth_metrics
 from densify.scores import ghosts as scores
 from densify.types import (
+    Bool,
     Camera,
     Cloud,
     DepthMap,
+    Float32,
     LidarSequence,
     Progress,
     RegisteredSweep,
     Result,
     Stretch,
     StretchFlow,
-    Truth,
 )
 
 Image = NDArray[np.uint8]
@@ -174,11 +176,11 @@ def densify(
     with the truth where there is some. Errors as `run`.
     """
     watch, sequence, settings = watch or Watch(), recording.sequence, recording.settings
-    chosen = choose_cameras(sequence, cameras)
+    shots = key_shots(sequence, choose_cameras(sequence, cameras), key, settings.project)
     images = None
     if with_images:
         with watch.stage("images"):
-            images = {camera.name: sequence.image(camera.name, key) for camera in chosen}
+            images = load_images(sequence, shots)
     stretch = recording.window(key)
     moments = {
         name: recording.moment(
@@ -186,7 +188,7 @@ def densify(
         )
         for name in methods
     }
-    return _results(sequence, stretch, key, moments, chosen, images, settings, watch)
+    return _results(sequence, stretch, key, moments, shots, images, settings, watch)
 
 
 def _warn_of_cuts(recording: Recording, key: int) -> None:
@@ -215,15 +217,17 @@ def _results(
     stretch: Stretch,
     key: int,
     moments: dict[str, tuple[Cloud, StretchFlow | None]],
-    cameras: list[Camera],
+    shots: Mapping[str, Shot],
     images: Mapping[str, Image] | None,
     settings: Config,
     watch: Watch,
 ) -> dict[str, Result]:
     """What the cameras see of each method's cloud, and how good that is."""
     key_image = RangeImage.of(stretch[key])
-    views = Views.of(sequence, stretch, key, key_image, cameras, settings)
-    truth = sequence.truth if images is not None else None
+    views = Views.of(sequence, stretch, key, key_image, shots, settings)
+    truth = {}
+    if images is not None and sequence.truth is not None:
+        truth = views.truth(sequence.truth)
     with watch.stage("held out"):
         held_out = HeldOut.of(views, moments[next(reversed(moments))][0])
     results: dict[str, Result] = {}
@@ -248,6 +252,7 @@ def _results(
                 cloud = views.coloured(cloud, depth, images)
         with watch.stage("score"):
             metrics = _scores(truth, sequence.cameras, stretch[key], key_image, cloud, depth)
+            metrics["measure"] = {n: maps.measure for n, maps in depth.items()}
             metrics["held_out"] = held_out_scores
             if settings.output.rejected:
                 metrics["rejected"] = {n: maps.counts() for n, maps in depth.items()}
@@ -259,19 +264,21 @@ def _results(
             movers=movers,
             optical_flow=views.optical_flow(cloud, depth) if settings.output.optical_flow else {},
             rejected=views.rejected(cloud, depth) if settings.output.rejected else {},
+            images=images or {},
         )
     return results
 
 
 def _scores(
-    truth: Truth | None,
+    truth: Mapping[str, tuple[Float32, Bool]],
     cameras: Mapping[str, Camera],
     key_sweep: RegisteredSweep,
     key_image: RangeImage,
     cloud: Cloud,
     depth: Mapping[str, DepthMap],
 ) -> dict[str, Any]:
-    """What can be said of the result without truth, and against the truth where there is some."""
+    """What can be said of the result without truth, and against the truth where there is some:
+    depth and what moves, by map."""
     metrics: dict[str, Any] = {
         "num_points": len(cloud),
         "num_moving": int(cloud.moving.sum()),
@@ -284,14 +291,9 @@ def _scores(
         },
         "ghosts": scores.ghost_scores(cloud, key_image, key_sweep.frame),
     }
-    if truth is not None:
+    if truth:
         metrics["depth"] = {
-            name: depth_metrics.depth_scores(
-                maps,
-                truth.depth_m(name, key_sweep.frame),
-                truth.moving_mask(name, key_sweep.frame),
-                cameras[name],
-            )
-            for name, maps in depth.items()
+            name: depth_metrics.depth_scores(depth[name], *true, cameras[depth[name].camera])
+            for name, true in truth.items()
         }
     return metrics

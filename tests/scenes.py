@@ -314,8 +314,8 @@ class TinySequence:
     def image(self, camera: str, frame: int) -> np.ndarray:
         return np.full((CAMERA.height_px, CAMERA.width_px, 3), 128, np.uint8)
 
-    def image_stamp_ns(self, camera: str, frame: int) -> int:
-        return stamp_ns(frame) + round(self.late_s * 1e9)
+    def image_stamps_ns(self, camera: str) -> Mapping[int, int]:
+        return {frame: stamp_ns(frame) + round(self.late_s * 1e9) for frame in self.frames}
 
     def T_world_lidar(self, frame: int) -> np.ndarray:
         return self.scene.T_world_lidar(frame * SWEEP_S)

@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
+from densify.depth.exposure import Exposure
 from densify.depth.optical_flow import optical_flow
 from densify.geometry import poses
 from densify.outputs.depth_png import write_flow_png
@@ -46,7 +47,9 @@ def map_of(pixel, depth_m, kept=None) -> DepthMap:
 
 
 def flow_of(cloud: Cloud, depth: DepthMap, seconds: float = 0.1, T_other=T_OTHER_KEY):
-    return optical_flow(cloud, depth, SMALL, T_CAM_KEY, T_other, seconds)
+    return optical_flow(
+        cloud, depth, Exposure(SMALL, T_CAM_KEY), Exposure(SMALL, T_other, late_s=seconds)
+    )
 
 
 @pytest.mark.parametrize("velocity_m_s", [(0, 0, 0), (3.0, -2.0, 1.0)])

@@ -13,6 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from densify.config import ProjectSettings
+from densify.depth.exposure import Exposure
 from densify.depth.fill import fill_between
 from densify.depth.patches import patches
 from densify.depth.project import project
@@ -51,7 +52,7 @@ def make_cloud(points, frame=KEY, confidence=1.0):
 
 def view(cloud, camera, T_cam_key, knobs, origins=None):
     """`project` with the cloud's patches."""
-    return project(cloud, camera, T_cam_key, knobs, patches(cloud, KEY, knobs, origins))
+    return project(cloud, Exposure(camera, T_cam_key), knobs, patches(cloud, KEY, knobs, origins))
 
 
 def take(cloud, index):
@@ -197,7 +198,7 @@ def see(
     )
     if since_key_ns is not None:
         cloud = replace(cloud, since_key_ns=np.asarray(since_key_ns))
-    return project(cloud, camera, np.eye(4), knobs, surface)
+    return project(cloud, Exposure(camera, np.eye(4)), knobs, surface)
 
 
 def test_back_wall_does_not_shine_through_the_gaps_of_the_front_wall():

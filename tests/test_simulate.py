@@ -81,7 +81,7 @@ def test_our_own_reader_gives_the_street_back(street, written):
         np.testing.assert_array_equal(read.intensity, ours.intensity)
         assert read.stamp_ns == ours.stamp_ns
         assert np.abs(read.offset_ns - ours.offset_ns).max() <= 20
-        assert kitti.image_stamp_ns("image_03", frame) == street.image_stamp_ns("image_03", frame)
+        assert kitti.image_stamps_ns("image_03")[frame] == street.image_stamps_ns("image_03")[frame]
         np.testing.assert_array_equal(
             kitti.image("image_03", frame), street.image("image_03", frame)
         )

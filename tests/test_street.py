@@ -128,9 +128,9 @@ def test_truth_outside_the_sequence_is_refused(street):
 def test_depth_agrees_with_the_lidar(street, camera):
     depth, moving = street.truth.depth_m(camera, KEY), street.truth.moving_mask(camera, KEY)
     truth, cam = street.truth.sweep(KEY), street.cameras[camera]
-    delay_ns = street.image_stamp_ns(camera, KEY) - street.stamp_ns(KEY)
+    delay_ns = street.image_stamps_ns(camera)[KEY] - street.stamp_ns(KEY)
     assert delay_ns == (0 if camera == "image_02" else 15_000_000)
-    T_world_lidar = street.simulator.T_world_lidar_at(street.image_stamp_ns(camera, KEY))
+    T_world_lidar = street.simulator.T_world_lidar_at(street.image_stamps_ns(camera)[KEY])
     world = transform(truth.T_world_lidar, truth.points[~truth.moving])
     p_cam = transform(cam.T_cam_lidar @ inverse(T_world_lidar), world)
     p_cam = p_cam[p_cam[:, 2] > 1]
@@ -593,6 +593,6 @@ def test_frames_and_cameras_that_do_not_exist_are_named(street):
     with pytest.raises(InputError, match="image_02, image_03"):
         street.image("image_00", KEY)
     with pytest.raises(InputError, match="image_02, image_03"):
-        street.image_stamp_ns("left", KEY)
+        street.image_stamps_ns("left")
     with pytest.raises(InputError, match="no frame -1"):
         street.T_world_lidar(-1)

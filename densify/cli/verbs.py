@@ -13,13 +13,8 @@ from densify.config import as_mapping, resolve
 from densify.errors import ComputationError, InputError
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    import numpy as np
-    from numpy.typing import NDArray
-
     from densify.cache import Cache
-    from densify.types import LidarSequence, Result
+    from densify.types import LidarSequence
 
 _DEFAULT_KEY = 120  # of benches
 
@@ -54,7 +49,7 @@ def run(options: argparse.Namespace) -> None:
                 continue
             paths = write_result(
                 result,
-                _images(sequence, result),
+                result.images,
                 options.out,
                 config=as_mapping(config),
                 data=options.data,
@@ -93,7 +88,7 @@ def compare(options: argparse.Namespace) -> None:
         )
     paths = write_comparison(
         results,
-        _images(sequence, next(iter(results.values()))),
+        next(iter(results.values())).images,
         options.out,
         config=as_mapping(config),
         data=options.data,
@@ -299,10 +294,6 @@ def _cache(options: argparse.Namespace) -> Cache | None:
     from densify.cache import Cache
 
     return Cache(options.cache_size)
-
-
-def _images(sequence: LidarSequence, result: Result) -> Mapping[str, NDArray[np.uint8]]:
-    return {camera: sequence.image(camera, result.key) for camera in result.depth}
 
 
 def _street_spec(options: argparse.Namespace) -> str:

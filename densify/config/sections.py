@@ -157,6 +157,18 @@ class ProjectSettings(Section):
         "included; sweep: the key sweep's reference time",
         choices=("camera", "sweep"),
     )
+    per: str = knob(
+        "sweep",
+        "sweep: of each camera the map of the image exposed nearest to the key's sweep; image: "
+        "maps of all images nearer to that sweep than to any other",
+        choices=("sweep", "image"),
+    )
+    depth: str = knob(
+        "auto",
+        "what depth is. z: along the camera's axis; range: from the lens; auto: z of a pinhole, "
+        "range of a fisheye or MEI camera, which may see behind its image plane",
+        choices=("auto", "z", "range"),
+    )
     visibility: bool = knob(
         True, "off: each pixel's nearest point as it is; what is hidden shines through (a baseline)"
     )
@@ -238,6 +250,14 @@ class ProjectSettings(Section):
         0,
         1,
     )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.per == "image" and self.at == "sweep":
+            raise InputError(
+                "project.per=image: each map shows its image's own exposure; got project.at=sweep, "
+                "expected camera"
+            )
 
 
 @dataclass(frozen=True)

@@ -136,19 +136,16 @@ def _made(job: Job, key: int) -> KeyRecord:
     reason = recipe.gate.reason(scores, len(result.frames))
     if reason is not None:
         return replace(record, status="aside", reason=reason)
-    images = {name: sequence.image(name, key) for name in cameras} if pictures else None
-    return replace(record, files=_written(job, results, images))
+    return replace(record, files=_written(job, results))
 
 
-def _written(
-    job: Job, results: Mapping[str, Result], images: Mapping[str, pipeline.Image] | None
-) -> dict[str, FileRecord]:
+def _written(job: Job, results: Mapping[str, Result]) -> dict[str, FileRecord]:
     result = results[job.recipe.method]
-    if images is None:
+    if job.recipe.layout == "kitti-depth":
         sparse = results["none"].depth
         return write_key(job.out, job.source.folder, result.key, sparse, result.depth)
     paths = write_result(
-        *(result, images, job.out / job.source.folder),
+        *(result, result.images, job.out / job.source.folder),
         config=as_mapping(job.recipe.config),
         data=job.source.data,
         overwrite=True,

@@ -10,16 +10,18 @@ middle of the pixel. Nothing depends on the order of the points.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from densify.config import ProjectSettings
+from densify.depth.exposure import Exposure
 from densify.depth.fill import fill_between
-from densify.geometry.cameras import image_points
-from densify.geometry.poses import rotate, transform
+from densify.geometry.cameras import pixels_per_metre
+from densify.geometry.poses import rotate
 from densify.kernels import visibility as kernels
 from densify.types import Bool, Camera, Cloud, DepthMap, Float, Float32, Int, Patches, Reason
 
@@ -39,13 +41,14 @@ _ROUGH_M = 0.10
 @dataclass(frozen=True)
 class _InImage:
     """The K points in the image. index: rows of the cloud. uv: (K,2) px. depth: (K,) m, as it is
-    stored. slope: (K,2) of the tangent plane's inverse depth, 1/m per px. spacing_px: (K,2) between
-    neighbouring rays. moving: (K,). frame, sweep: (K,) source; sweep counts from 0. age_ns: (K,)
-    see `_ages_ns`."""
+    stored. focal_px: (K,2) local scale, px per metre at a depth of 1 m. slope: (K,2) of the tangent
+    plane's inverse depth, 1/m per px. spacing_px: (K,2) between neighbouring rays. moving: (K,).
+    frame, sweep: (K,) source; sweep counts from 0. age_ns: (K,) see `_ages_ns`."""
 
     index: Int
     uv: Float
     depth: Float32
+    focal_px: Float
     slope: Float
     spacing_px: Float
     moving: Bool
@@ -71,27 +74,28 @@ class _Pixels:
 
 def project(
     cloud: Cloud,
-    camera: Camera,
-    T_cam_key: Float,
+    exposure: Exposure,
     settings: ProjectSettings,
     patches: Patches,
     filled: bool = True,
 ) -> DepthMap:
-    """The depth map that ``camera`` sees of ``cloud``.
+    """The depth map of ``cloud``, at the key's moment, as a camera sees it at its exposure.
 
-    T_cam_key: (4,4), with the ego motion from the key's reference time to the camera's own.
     settings: knobs, see `densify.config.ProjectSettings`; with ``visibility`` off the nearest point
     of each pixel is taken as it is; else the source sweep nearest in time to the key wins a pixel.
     patches: of the cloud, at the key's moment (`densify.depth.patches.patches`). filled: False
     leaves out the filling, which takes its time.
 
-    Points with z ≤ 0.1 m, outside the image or outside the lens's valid field of view are dropped.
+    Points nearer than 0.1 m, outside the image or outside the lens's valid field of view are
+    dropped. Planes are fitted in inverse depth, or inverse range where depth is the range: linear
+    over the image of a pinhole in the first case, nearly so over a surface's few pixels otherwise.
     ``filled_m`` adds pixels interpolated between measured ones (`densify.depth.fill.fill_between`).
     ``confidence`` ranks only: the point's own, less where few sweeps or points agree, a depth edge
     is close, the surface rough, or the point nearly hidden. ``reason`` says of every point why it
     is not in the map.
     """
-    points = _in_image(cloud, camera, T_cam_key, patches, settings.visibility)
+    camera = exposure.camera
+    points = _in_image(cloud, exposure, patches, settings.visibility)
     own = np.clip(cloud.confidence[points.index], _LEAST_CONFIDENCE, 1.0)
     reason = np.full(len(cloud), Reason.OUTSIDE, np.uint8)
     if settings.visibility:
@@ -111,8 +115,17 @@ def project(
     depth_m.flat[seen.pixel] = seen.depth_m
     confidence.flat[seen.pixel] = np.maximum(seen.confidence, _LEAST_CONFIDENCE)
     frame.flat[seen.pixel] = points.frame[seen.winner]
+    maps = DepthMap(
+        camera=camera.name,
+        depth_m=depth_m,
+        filled_m=depth_m,
+        confidence=confidence,
+        frame=frame,
+        reason=reason,
+        measure=exposure.measure,
+    )
     if not filled:
-        return DepthMap(camera.name, depth_m, depth_m, confidence, frame, reason)
+        return maps
     filled_m, filled_confidence = fill_between(
         depth_m,
         confidence,
@@ -123,37 +136,91 @@ def project(
     )
     some = filled_m > 0
     filled_confidence[some] = np.maximum(filled_confidence[some], np.float32(_LEAST_CONFIDENCE))
-    return DepthMap(camera.name, depth_m, filled_m, filled_confidence, frame, reason)
+    return replace(maps, filled_m=filled_m, confidence=filled_confidence)
 
 
-def _in_image(
-    cloud: Cloud, camera: Camera, T_cam_key: Float, patches: Patches, vetoed: bool
-) -> _InImage:
-    points_cam = transform(T_cam_key, cloud.points)
-    ahead = points_cam[:, 2] > 0
-    index = np.flatnonzero(ahead & ~patches.free if vetoed else ahead)
-    points_cam = points_cam[index]
-    uv, seen = image_points(camera, points_cam)
-    index, points_cam, uv = index[seen], points_cam[seen], uv[seen]
-    depth = points_cam[:, 2].astype(np.float32)
-    focal_px = camera.K[[0, 1], [0, 1]]
-    normal = rotate(T_cam_key, patches.normal[index].astype(np.float64))
-    # On the plane n · p = d the inverse depth is n · ray / d: linear over the image.
-    d = np.einsum("ij,ij->i", normal, points_cam)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        slope = np.nan_to_num(normal[:, :2] / (d[:, None] * focal_px), posinf=0.0, neginf=0.0)
+class _Local(NamedTuple):
+    """How surface shows around each of K points; see `_InImage`."""
+
+    focal_px: Float
+    slope: Float
+    spacing_px: Float
+
+
+def _in_image(cloud: Cloud, exposure: Exposure, patches: Patches, vetoed: bool) -> _InImage:
+    sight = exposure.sees(cloud)
+    index = np.flatnonzero(sight.inside & ~patches.free if vetoed else sight.inside)
+    points_cam = sight.points_cam[index]
+    depth = exposure.depth_m(points_cam).astype(np.float32)
+    normal = rotate(exposure.T_cam_key, patches.normal[index].astype(np.float64))
+    plain = exposure.camera.is_rectified and exposure.measure == "z"
+    local = (_pinhole if plain else _any_lens)(
+        exposure, points_cam, depth, normal, patches.spacing_m[index]
+    )
     most = _MAX_TILT / depth[:, None]
+    slope = np.nan_to_num(local.slope, posinf=0.0, neginf=0.0)
     return _InImage(
         index=index,
-        uv=uv,
+        uv=sight.uv[index],
         depth=depth,
+        focal_px=local.focal_px,
         slope=np.clip(slope, -most, most),
-        spacing_px=patches.spacing_m[index] * focal_px / depth[:, None],
+        spacing_px=local.spacing_px,
         moving=cloud.moving[index],
         frame=cloud.frame[index],
         sweep=np.minimum(patches.sweep[index], _MOST_SWEEPS - 1),
         age_ns=_ages_ns(cloud.since_key_ns[index], patches.sweep[index]),
     )
+
+
+def _pinhole(
+    exposure: Exposure, points_cam: Float, depth: Float32, normal: Float, spacing_m: Float32
+) -> _Local:
+    """Of the camera z of a rectified image, where patches count as facing the image plane."""
+    focal_px = exposure.camera.K[[0, 1], [0, 1]]
+    # On the plane n · p = d the inverse depth is n · ray / d: linear over the image.
+    d = np.einsum("ij,ij->i", normal, points_cam)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        slope = normal[:, :2] / (d[:, None] * focal_px)
+    everywhere = np.broadcast_to(focal_px, points_cam[:, :2].shape)
+    return _Local(everywhere, slope, spacing_m * focal_px / depth[:, None])
+
+
+def _any_lens(
+    exposure: Exposure, points_cam: Float, depth: Float32, normal: Float, spacing_m: Float32
+) -> _Local:
+    """By the Jacobian J (2,3) of the projection at each point p.
+
+    Moving on the plane n · p = d so that the image moves by one pixel, p moves by
+    δ = J⁺ - p (n · J⁺) / d, and the inverse depth by -δ_z / z², the inverse range by -p · δ / r³.
+    """
+    J = pixels_per_metre(exposure.camera, points_cam)
+    focal_px = np.linalg.norm(J, axis=2) * depth[:, None]
+    d = np.einsum("ij,ij->i", normal, points_cam)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        across = _pseudo_inverse(J)
+        along = -np.einsum("ij,ijk->ik", normal, across) / d[:, None]
+        if exposure.measure == "z":
+            z = points_cam[:, 2:]
+            slope = -(across[:, 2] + along * z) / z**2
+        else:
+            slope = -along / np.linalg.norm(points_cam, axis=1, keepdims=True)
+    # Rays of a scanner lie apart in azimuth and in elevation, about the key's upward axis.
+    level = np.cross(exposure.T_cam_key[:3, 2], points_cam)
+    level /= np.maximum(np.linalg.norm(level, axis=1, keepdims=True), 1e-9)
+    rise = np.cross(points_cam, level)
+    rise /= np.linalg.norm(rise, axis=1, keepdims=True)
+    sides = [np.einsum("ijk,ik->ij", J, axis) for axis in (level, rise)]
+    spacing_px = np.hypot(sides[0] * spacing_m[:, :1], sides[1] * spacing_m[:, 1:])
+    return _Local(focal_px, slope, spacing_px)
+
+
+def _pseudo_inverse(J: Float) -> Float:
+    """(K,2,3) -> (K,3,2) of full rank, Jᵀ (J Jᵀ)⁻¹."""
+    u, v = J[:, 0], J[:, 1]
+    uu, uv, vv = (np.einsum("ij,ij->i", a, b)[:, None] for a, b in ((u, u), (u, v), (v, v)))
+    across: Float = np.stack([vv * u - uv * v, uu * v - uv * u], axis=2)
+    return across / (uu * vv - uv**2)[:, :, None]
 
 
 def _ages_ns(since_key_ns: Int, sweep: NDArray[np.int32]) -> Int:
@@ -176,6 +243,7 @@ def _visible(
 ) -> _Pixels:
     """The pixels that the points not hidden measure; fills in the ``reason`` of the others."""
     behind = _behind(points, camera, settings)
+    edge_px = settings.edge_slack_m * points.focal_px[:, 0] * points.inverse
     hidden = behind > 1
     reason[points.index] = np.where(hidden, Reason.HIDDEN, Reason.NOT_CHOSEN)
     last = int(points.age_ns.max(initial=0)) + 1
@@ -188,13 +256,14 @@ def _visible(
         inverse=points.inverse,
         slope=points.slope,
         spacing_px=points.spacing_px,
+        edge_px=edge_px,
         sweep=points.sweep,
         hidden=hidden,
         moving=points.moving,
         age_ns=points.age_ns,
     )
     shape = (camera.height_px, camera.width_px)
-    kernels.settle.over_rows(len(start) - 1, visible, _reaches(camera, settings), shape, found)
+    kernels.settle.over_rows(len(start) - 1, visible, _reaches(settings), shape, found)
     pixel = np.flatnonzero(found[0])
     winner = order[start[pixel]]
     depth_m, num_sweeps, youngest_ns, num_points, residual_m, edge = found[:, pixel]
@@ -219,7 +288,7 @@ def _visible(
     return _Pixels(pixel[kept], winner[kept], depth_m[kept], confidence[kept])
 
 
-def _reaches(camera: Camera, settings: ProjectSettings) -> kernels.Reaches:
+def _reaches(settings: ProjectSettings) -> kernels.Reaches:
     return kernels.Reaches(
         support=float(settings.support_reach),
         plane=float(settings.plane_reach),
@@ -228,7 +297,6 @@ def _reaches(camera: Camera, settings: ProjectSettings) -> kernels.Reaches:
         behind_m=float(settings.hidden_m),
         behind_fraction=float(settings.hidden_fraction),
         edge=float(settings.edge_reach),
-        edge_px_m=float(settings.edge_slack_m * camera.K[0, 0]),
         edge_window_px=_EDGE_WINDOW_PX,
     )
 
@@ -236,7 +304,7 @@ def _reaches(camera: Camera, settings: ProjectSettings) -> kernels.Reaches:
 def _behind(points: _InImage, camera: Camera, settings: ProjectSettings) -> Float:
     """(K,) how far each point lies behind the nearest patch over its pixel, as a share of what is
     allowed; above 1 it is hidden."""
-    slack_px = settings.slack_m * camera.K[[0, 1], [0, 1]] / points.depth[:, None]
+    slack_px = settings.slack_m * points.focal_px / points.depth[:, None]
     half_px = np.clip(settings.footprint * points.spacing_px + slack_px, 0.5, _MAX_HALF_PX)
     nearest = np.zeros((camera.height_px, camera.width_px), np.float32)
     kernels.paint(points.uv, points.inverse, points.slope, half_px, nearest)

@@ -12,16 +12,15 @@ from numpy.typing import NDArray
 
 from densify.config import Config, ProjectSettings
 from densify.depth.colour import colour
+from densify.depth.exposure import Exposure, Shot
 from densify.depth.optical_flow import optical_flow
 from densify.depth.patches import patches
 from densify.depth.project import project
-from densify.geometry import poses
-from densify.geometry.cameras import image_points
+from densify.geometry.cameras import converted
 from densify.geometry.range_image import RangeImage
 from densify.scores import depth_metrics
 from densify.types import (
     Bool,
-    Camera,
     Cloud,
     DepthMap,
     Float,
@@ -30,47 +29,13 @@ from densify.types import (
     Mover,
     Reason,
     Stretch,
+    Truth,
 )
 
 
 @dataclass(frozen=True)
-class Exposure:
-    """late_s: after the key's reference time. T_cam_key: (4,4), with the ego motion until then.
-    others: "previous" and "next" image, where the stretch holds their sweeps: the same of them."""
-
-    camera: Camera
-    late_s: float
-    T_cam_key: Float
-    others: Mapping[str, tuple[float, Float]]
-
-    @staticmethod
-    def of(
-        sequence: LidarSequence, stretch: Stretch, key: int, camera: Camera, settings: Config
-    ) -> Exposure:
-        """At the image's stamp or, with ``project.at=sweep``, at the sweep's."""
-
-        def of_image(frame: int) -> tuple[float, Float]:
-            registered = stretch[frame]
-            stamp_ns = sequence.image_stamp_ns(camera.name, frame)
-            if settings.project.at == "sweep":
-                stamp_ns = registered.sweep.stamp_ns
-            late_s = (stamp_ns - registered.sweep.stamp_ns) * 1e-9
-            twist = registered.twist_before if late_s < 0 else registered.twist_after
-            T_cam_lidar = camera.T_cam_lidar @ poses.inverse(poses.exp(late_s * twist))
-            since_key_s = (stamp_ns - stretch[key].sweep.stamp_ns) * 1e-9
-            return since_key_s, T_cam_lidar @ stretch.T_target_source(frame, key)
-
-        others = {
-            name: of_image(frame)
-            for name, frame in (("previous", key - 1), ("next", key + 1))
-            if settings.output.optical_flow and frame in stretch.frames
-        }
-        return Exposure(camera, *of_image(key), others)
-
-
-@dataclass(frozen=True)
 class Views:
-    """Every camera's exposure of one key.
+    """What one key's depth maps show, by their names (`densify.depth.exposure.key_shots`).
 
     key_image: what the key sweep saw. origins: (3,) where each sweep's lidar stood, key frame, by
     frame.
@@ -88,24 +53,24 @@ class Views:
         stretch: Stretch,
         key: int,
         key_image: RangeImage,
-        cameras: list[Camera],
+        shots: Mapping[str, Shot],
         settings: Config,
     ) -> Views:
-        exposures = {c.name: Exposure.of(sequence, stretch, key, c, settings) for c in cameras}
+        exposures = {
+            name: Exposure.of(sequence, stretch, key, shot, settings)
+            for name, shot in shots.items()
+        }
         origins = {f: stretch.T_target_source(key, f)[:3, 3] for f in stretch.frames}
         return Views(key, key_image, exposures, origins, settings.project)
 
     def depth(self, cloud: Cloud, visible: bool = True, filled: bool = True) -> dict[str, DepthMap]:
-        """By camera. visible: leave out what is hidden, vetoed or doubtful. filled: and fill
+        """By name. visible: leave out what is hidden, vetoed or doubtful. filled: and fill
         between what is measured."""
         settings = replace(self.settings, visibility=visible)
         surface = patches(cloud, self.key, settings, self.origins, self.key_image)
         return {
-            name: project(
-                *(cloud.after(e.late_s), e.camera, e.T_cam_key, settings, surface),
-                filled,
-            )
-            for name, e in self.exposures.items()
+            name: project(cloud, exposure, settings, surface, filled)
+            for name, exposure in self.exposures.items()
         }
 
     def coloured(
@@ -115,34 +80,36 @@ class Views:
         images: Mapping[str, NDArray[np.uint8]],
     ) -> Cloud:
         """With the colours of the images there are; depth: what `depth` made of the cloud."""
-        rgb = cloud.rgb
-        for name in images:
-            e = self.exposures[name]
-            points = cloud.after(e.late_s).points
-            rgb = colour(rgb, points, e.camera, e.T_cam_key, depth[name], images[name])
-        return replace(cloud, rgb=rgb)
+        for name, image in images.items():
+            rgb = colour(cloud, self.exposures[name], depth[name], image)
+            cloud = replace(cloud, rgb=rgb)
+        return cloud
+
+    def truth(self, truth: Truth) -> dict[str, tuple[Float32, Bool]]:
+        """Of the maps that show an image: its true depth, measured as the map's, and (H,W) where
+        something moves."""
+        known = {}
+        for name, e in self.exposures.items():
+            if e.number is not None:
+                depth_m = truth.depth_m(e.camera.name, e.number)
+                depth_m = converted(e.camera, depth_m, e.camera.measure, e.measure)
+                known[name] = (depth_m, truth.moving_mask(e.camera.name, e.number))
+        return known
 
     def optical_flow(
         self, cloud: Cloud, depth: Mapping[str, DepthMap]
     ) -> dict[str, dict[str, Float32]]:
-        """Camera -> "previous" and "next" image -> (H,W,2) pixels."""
+        """Name -> "previous" and "next" image -> (H,W,2) pixels."""
         return {
             name: {
-                other: optical_flow(
-                    cloud.after(e.late_s),
-                    depth[name],
-                    e.camera,
-                    e.T_cam_key,
-                    T_other_key,
-                    other_s - e.late_s,
-                )
-                for other, (other_s, T_other_key) in e.others.items()
+                which: optical_flow(cloud, depth[name], exposure, other)
+                for which, other in exposure.others.items()
             }
-            for name, e in self.exposures.items()
+            for name, exposure in self.exposures.items()
         }
 
     def rejected(self, cloud: Cloud, depth: Mapping[str, DepthMap]) -> dict[str, NDArray[np.uint8]]:
-        """Camera -> (H,W): the `Reason` why the nearest point that was left out of a pixel was,
+        """Name -> (H,W): the `Reason` why the nearest point that was left out of a pixel was,
         0 where none was; points that another one outdid in their pixel do not count."""
         maps = {}
         for name, e in self.exposures.items():
@@ -150,10 +117,10 @@ class Views:
             left_out = np.isin(
                 reason, [Reason.VETOED, Reason.HIDDEN, Reason.UNSUPPORTED, Reason.EDGE]
             )
-            points_cam = poses.transform(e.T_cam_key, cloud.after(e.late_s).points[left_out])
-            uv, inside = image_points(e.camera, points_cam)
-            farthest_first = np.argsort(-points_cam[inside, 2], kind="stable")
-            column, row = np.rint(uv[inside][farthest_first]).astype(np.int64).T
+            sight = e.see(cloud.points[left_out], cloud.velocity_m_s[left_out])
+            inside = sight.inside
+            farthest_first = np.argsort(-e.depth_m(sight.points_cam[inside]), kind="stable")
+            column, row = np.rint(sight.uv[inside][farthest_first]).astype(np.int64).T
             maps[name] = np.zeros(depth[name].depth_m.shape, np.uint8)
             maps[name][row, column] = reason[left_out][inside][farthest_first]
         return maps
@@ -196,7 +163,7 @@ class HeldOut:
         return HeldOut(views, key_alone, moving)
 
     def scores(self, cloud: Cloud, visible: bool) -> dict[str, Any] | None:
-        """By camera, as `densify.scores.depth_metrics.depth_scores`, and the ``curve`` of
+        """By name, as `densify.scores.depth_metrics.depth_scores`, and the ``curve`` of
         precision over density; None for a cloud of the key sweep alone."""
         rest = cloud.select(cloud.frame != self.views.key)
         if not len(rest):

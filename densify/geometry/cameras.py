@@ -25,7 +25,7 @@ import numpy as np
 from numpy.polynomial import Polynomial
 
 from densify.errors import InputError
-from densify.types import Bool, Camera, Float
+from densify.types import Bool, Camera, Float, Float32
 
 NEAREST_M = 0.1
 _COEFFICIENTS = {"pinhole": (0, 4, 5, 8, 12, 14), "fisheye": (4,), "mei": (5,)}
@@ -91,6 +91,22 @@ def pixels_per_metre(camera: Camera, points_cam: Float) -> Float:
         )
         change += ((there - back) / (2 * _STEP))[:, :, None] * axis[:, None, :]
     return change / range_m[:, :, None]
+
+
+def depth_along(points_cam: Float, measure: str) -> Float:
+    """(N,3) -> (N,) metres: camera z, or the range from the lens."""
+    return points_cam[:, 2] if measure == "z" else np.linalg.norm(points_cam, axis=1)
+
+
+def converted(camera: Camera, depth_m: Float32, given: str, wanted: str) -> Float32:
+    """(H,W) depth from one measure (``z`` or ``range``) to the other; 0 where it has no z > 0."""
+    if given == wanted:
+        return depth_m
+    v, u = np.divmod(np.arange(depth_m.size, dtype=np.float64), camera.width_px)
+    z = rays(camera, np.column_stack([u, v]))[:, 2].reshape(depth_m.shape)
+    ahead = (z > 0) & (depth_m > 0)
+    per = z if wanted == "z" else 1 / np.where(ahead, z, 1.0)
+    return np.where(ahead, depth_m * per, 0.0).astype(np.float32)
 
 
 class _Lens(NamedTuple):

@@ -57,6 +57,13 @@ def exp(twist: Float) -> Float:
     return T_a_b
 
 
+def carried(T_a_b: Float, twist_b: Float) -> Float:
+    """(4,4), (6,) -> (6,): the twist of a frame b, rad/s and m/s in b, as that of a frame a that is
+    fixed to it (the adjoint)."""
+    turn = T_a_b[:3, :3] @ twist_b[:3]
+    return np.concatenate([turn, T_a_b[:3, :3] @ twist_b[3:] + np.cross(T_a_b[:3, 3], turn)])
+
+
 def transform_each(twist: Float, points: Float) -> Float:
     """(N,6), (N,3) -> (N,3): every point moved by its own ``exp(twist)``."""
     return Rotation.from_rotvec(twist[:, :3]).apply(points) + twist[:, 3:]

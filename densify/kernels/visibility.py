@@ -254,7 +254,8 @@ class Visible(NamedTuple):
 
     start, order: of `by_pixel`, hidden points last. uv: (K,2) px. inverse: (K,) depth, 1/m. slope:
     (K,2) of the tangent plane's inverse depth, 1/m per px. spacing_px: (K,2) between neighbouring
-    rays. sweep: (K,) from 0 to 62. hidden, moving: (K,). age_ns: (K,) from the key.
+    rays. edge_px: (K,) added to the reach of a depth edge. sweep: (K,) from 0 to 62. hidden,
+    moving: (K,). age_ns: (K,) from the key.
     """
 
     start: Int
@@ -263,6 +264,7 @@ class Visible(NamedTuple):
     inverse: Float
     slope: Float
     spacing_px: Float
+    edge_px: Float
     sweep: NDArray[np.integer]
     hidden: Bool
     moving: Bool
@@ -275,7 +277,7 @@ class Reaches(NamedTuple):
     support, plane: reach of the support and of the fitted plane, in ray spacings. agree_m,
     agree_fraction: metres and share of the depth within which points agree; behind_m,
     behind_fraction: the same beyond which one lies behind. edge: reach of a depth edge in ray
-    spacings, edge_px_m: and in px at 1 m, edge_window_px: px beyond it where is looked for what
+    spacings, edge_window_px: px beyond it where is looked for what
     goes on.
     """
 
@@ -286,7 +288,6 @@ class Reaches(NamedTuple):
     behind_m: float
     behind_fraction: float
     edge: float
-    edge_px_m: float
     edge_window_px: float
 
 
@@ -314,7 +315,7 @@ def settle(first, last, points, reaches, shape, found):  # type: ignore[no-untyp
         centre = min(max(centre, 0.8 * w0), 1.25 * w0)
         agree = (reaches.agree_m + reaches.agree_fraction / w0) * w0 * w0
         far = (reaches.behind_m + reaches.behind_fraction / w0) * w0 * w0
-        edge_px = reaches.edge_px_m * w0 * (_MOVING_SLACK if moving[i] else 1.0)
+        edge_px = points.edge_px[i] * (_MOVING_SLACK if moving[i] else 1.0)
         inner = reaches.edge * spacing_px[i, 0] + edge_px
         outer = inner + reaches.edge_window_px
         wide_u = _window(reaches.support * spacing_px[i, 0])

@@ -14,7 +14,7 @@ from densify.outputs.png import Picture
 
 @dataclass(frozen=True)
 class Context:
-    """images: camera -> (H,W,3) RGB of the key, some or none. config: the merged configuration as
+    """images: map -> (H,W,3) RGB of its image, some or none. config: the merged configuration as
     plain mappings, by section. data: the recording, as the user named it."""
 
     images: Mapping[str, Picture]

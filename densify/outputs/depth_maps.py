@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: MIT
 """The output of depth: ``depth``, ``depth_filled``, ``confidence`` and ``age``, a PNG each for
-every camera.
+every camera, or for every image as ``CAMERA/NUMBER.png`` (``project.per=image``).
 
 ``age/CAMERA.png`` holds, as 16 bit, milliseconds between the camera's exposure and the sweep that
 measured the pixel, plus 1; 0 is no depth, and 65535 says 65.5 s or more. It covers the pixels of
@@ -22,7 +22,7 @@ def write_output(result: Result, context: Context, folder: Path) -> None:
         if depth.age_s is None:
             raise ValueError(f"depth map of {camera}: expected ages, see densify.depth.age")
         for product in ("depth", "depth_filled", "confidence", "age"):
-            (folder / product).mkdir(exist_ok=True)
+            (folder / product / camera).parent.mkdir(parents=True, exist_ok=True)
         name = f"{camera}.png"
         write_depth_png(folder / "depth" / name, depth.depth_m)
         write_depth_png(folder / "depth_filled" / name, depth.filled_m)

@@ -11,6 +11,7 @@ and versions as run.yaml::
     ghosts      `densify.scores.ghosts.ghost_scores`: num_points, all, moving, static, by_distance
     depth       where there is truth: camera -> measured, filled -> all, moving, static -> the
                 fields of `densify.scores.depth_metrics.DepthErrors`
+    measure     map -> what its depth is: z, along the camera's axis, or range, from the lens
     held_out    camera -> the same fields as depth: the key densified from its neighbours alone
                 against its own returns; and curve,
                 `densify.scores.depth_metrics.precision_density`, drawn in curve.png;

@@ -15,7 +15,8 @@ def write_output(result: Result, context: Context, folder: Path) -> None:
     """``movers/0007/`` for instance 7, ``movers/others/`` for what moves without one."""
     for instance, mover in result.movers.items():
         apart = folder / "movers" / (f"{instance:04d}" if instance >= 0 else "others")
-        (apart / "depth").mkdir(parents=True)
+        apart.mkdir(parents=True)
         for name, maps in mover.depth.items():
+            (apart / "depth" / name).parent.mkdir(parents=True, exist_ok=True)
             write_depth_png(apart / "depth" / f"{name}.png", maps.depth_m)
         write_cloud(apart / "cloud.laz", mover.cloud)

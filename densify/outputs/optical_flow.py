@@ -14,5 +14,5 @@ def write_output(result: Result, context: Context, folder: Path) -> None:
     """``optical_flow/previous/CAMERA.png`` and ``optical_flow/next/CAMERA.png``."""
     for camera, flows in result.optical_flow.items():
         for other, flow_px in flows.items():
-            (folder / "optical_flow" / other).mkdir(parents=True, exist_ok=True)
+            (folder / "optical_flow" / other / camera).parent.mkdir(parents=True, exist_ok=True)
             write_flow_png(folder / "optical_flow" / other / f"{camera}.png", flow_px)

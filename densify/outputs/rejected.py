@@ -14,6 +14,6 @@ from densify.types import Result
 def write_output(result: Result, context: Context, folder: Path) -> None:
     """``rejected/CAMERA.png``."""
     for camera, reason in result.rejected.items():
-        (folder / "rejected").mkdir(exist_ok=True)
+        (folder / "rejected" / camera).parent.mkdir(parents=True, exist_ok=True)
         picture = draw_rejected(context.image(camera, reason.shape), reason)
         write_picture(folder / "rejected" / f"{camera}.png", picture)

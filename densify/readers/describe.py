@@ -3,25 +3,27 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from densify.errors import InputError
-from densify.readers.files import StoresImages, format_frames
+from densify.readers.files import format_frames
 from densify.types import LidarSequence, Sweep
 
 
 def describe(sequence: LidarSequence) -> str:
     """Frames, rate, points, cameras, stamps, poses and truth of a recording, one line each.
 
-    Loads the first and the last sweep and no image. The rate is the median over consecutive
-    frames of the first camera's stamps; without a camera, the mean between first and last sweep.
+    Loads the first and the last sweep and no image. Rates are those of the median time from one
+    sweep or image to the next.
     """
     first = sequence[sequence.frames[0]]
     last = sequence[sequence.frames[-1]] if len(sequence.frames) > 1 else first
     lines = [
         ("name", sequence.name),
         ("frames", _frames(sequence)),
-        ("rate", _rate(sequence, first, last)),
+        ("rate", _rate(sequence)),
         ("stamps", _stamps(first, last)),
         ("points", _points(first, last)),
         ("point times", _point_times(first)),
@@ -40,16 +42,15 @@ def _frames(sequence: LidarSequence) -> str:
     return f"{format_frames(frames)} ({len(frames)}{gaps})"
 
 
-def _rate(sequence: LidarSequence, first: Sweep, last: Sweep) -> str:
-    frames = np.array(sequence.frames)
+def _rate(sequence: LidarSequence) -> str:
+    frames = sequence.frames
     if len(frames) < 2:
         return "unknown, one sweep"
-    if sequence.cameras:
-        name = next(iter(sequence.cameras))
-        stamps = np.array([sequence.image_stamp_ns(name, frame) for frame in sequence.frames])
-        period_ns = float(np.median(np.diff(stamps) / np.diff(frames)))
-    else:
-        period_ns = (last.stamp_ns - first.stamp_ns) / (last.frame - first.frame)
+    return _hertz([sequence.stamp_ns(frame) for frame in frames])
+
+
+def _hertz(stamps_ns: Sequence[int]) -> str:
+    period_ns = sorted(np.diff(stamps_ns).tolist())[(len(stamps_ns) - 2) // 2]
     return f"{1e9 / period_ns:.2f} Hz" if period_ns > 0 else "unknown, stamps do not advance"
 
 
@@ -78,9 +79,10 @@ def _cameras(sequence: LidarSequence) -> list[tuple[str, str]]:
     for name, camera in sequence.cameras.items():
         text = f"{camera.width_px} x {camera.height_px} px, fx {camera.focal_px:.1f} px, "
         text += "rectified" if camera.is_rectified else f"{camera.model} with lens distortion"
-        if isinstance(sequence, StoresImages):
-            images = sequence.image_frames(name)
-            text += f", {len(images)} images: {format_frames(images)}"
+        exposed = sequence.image_stamps_ns(name)
+        text += f", {len(exposed)} images: {format_frames(exposed)}"
+        if len(exposed) > 1:
+            text += f", {_hertz(list(exposed.values()))}"
         lines.append((name, text))
     return lines
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Protocol, TypeVar, runtime_checkable
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,15 +18,6 @@ from densify.types import Camera
 T = TypeVar("T")
 
 _MAX_RANGES_SHOWN = 8
-
-
-@runtime_checkable
-class StoresImages(Protocol):
-    """A sequence that knows, without loading them, which images it has."""
-
-    def image_frames(self, camera: str) -> tuple[int, ...]:
-        """Frames that have an image of the camera, ascending."""
-        ...
 
 
 def numbered_files(folder: Path, *suffixes: str) -> dict[int, Path]:

@@ -115,18 +115,25 @@ class KittiRaw:
         path = of_frame(self._images[camera], frame, f"{camera} image", self._drive)
         return load_image(path, calibrated)
 
-    def image_frames(self, camera: str) -> tuple[int, ...]:
-        """Frames that have an image of the camera, ascending."""
+    def image_stamps_ns(self, camera: str) -> Mapping[int, int]:
+        """When the images that exist were exposed, by their frame: the recorded stamp less
+        `KITTI_TRIGGER_LATENCY_NS`, or the sweep's reference time where none is recorded."""
         camera_named(self.cameras, camera, self._drive)
-        return tuple(self._images[camera])
+        return self._exposed_ns[camera]
 
-    def image_stamp_ns(self, camera: str, frame: int) -> int:
-        """When the image was exposed: the recorded stamp less `KITTI_TRIGGER_LATENCY_NS`, or the
-        sweep's reference time where none is recorded."""
-        camera_named(self.cameras, camera, self._drive)
-        stamps = self._image_stamps[camera]
-        recorded = stamps.get(frame) if stamps else None
-        return self.stamp_ns(frame) if recorded is None else recorded - KITTI_TRIGGER_LATENCY_NS
+    @cached_property
+    def _exposed_ns(self) -> dict[str, dict[int, int]]:
+        def exposed_ns(camera: str, frame: int) -> int | None:
+            stamps = self._image_stamps[camera]
+            recorded = stamps.get(frame) if stamps else None
+            if recorded is not None:
+                return recorded - KITTI_TRIGGER_LATENCY_NS
+            return self.stamp_ns(frame) if self._stamps is None else self._stamps.get(frame)
+
+        return {
+            camera: {f: ns for f in images if (ns := exposed_ns(camera, f)) is not None}
+            for camera, images in self._images.items()
+        }
 
     def T_world_lidar(self, frame: int) -> Float:
         """(4,4) pose at the sweep's reference time, from GPS and inertial unit.

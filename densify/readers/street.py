@@ -150,11 +150,10 @@ class Street:
         """(H,W,3) RGB."""
         return self.picture(camera, frame).image
 
-    def image_stamp_ns(self, camera: str, frame: int) -> int:
-        """image_02 is taken at the sweep's reference time, image_03 15 ms later."""
-        self.check(frame)
+    def image_stamps_ns(self, camera: str) -> Mapping[int, int]:
+        """image_02 is taken at each sweep's reference time, image_03 15 ms later."""
         _choice("camera", camera, tuple(CAMERAS))
-        return self.simulator.stamp_ns(frame) + DELAY_NS[camera]
+        return {frame: self.simulator.stamp_ns(frame) + DELAY_NS[camera] for frame in self.frames}
 
     def T_world_lidar(self, frame: int) -> Float:
         """(4,4) true pose at the sweep's reference time."""

@@ -110,6 +110,12 @@ class Camera:
         return self.model == "pinhole" and not self.distortion
 
     @property
+    def measure(self) -> str:
+        """What depth is unless asked otherwise: camera ``z``; the ``range`` of a lens that may see
+        behind its image plane, where z is negative."""
+        return "z" if self.model == "pinhole" else "range"
+
+    @property
     def focal_px(self) -> float:
         """Pixels to the right per radian, in the middle of the image."""
         xi = self.distortion[0] if self.model == "mei" else 0.0
@@ -120,12 +126,13 @@ class Camera:
 class DepthMap:
     """Dense depth of one camera; (H,W) everywhere.
 
-    depth_m: float32 camera z of measured pixels, 0 none. filled_m: the same plus pixels
-    interpolated between measured ones. confidence: float32 0 to 1, of every pixel in ``filled_m``.
-    frame: int32 source sweep of measured pixels, -1 elsewhere. age_s: float32 seconds between the
-    moment the map shows and the reference time of the sweep that measured the pixel, of every pixel
-    in ``filled_m``, nan elsewhere; None until `densify.depth.age` has worked it out. reason: (M,)
-    uint8, a `Reason` for each point of the cloud; empty if the cloud is not at hand.
+    depth_m: float32 of measured pixels, 0 none; as measure says camera ``z``, or ``range`` from the
+    lens. filled_m: the same plus pixels interpolated between measured ones. confidence: float32 0
+    to 1, of every pixel in ``filled_m``. frame: int32 source sweep of measured pixels, -1
+    elsewhere. age_s: float32 seconds between the moment the map shows and the reference time of the
+    sweep that measured the pixel, of every pixel in ``filled_m``, nan elsewhere; None until
+    `densify.depth.age` has worked it out. reason: (M,) uint8, a `Reason` for each point of the
+    cloud; empty if the cloud is not at hand.
     """
 
     camera: str
@@ -135,6 +142,7 @@ class DepthMap:
     frame: NDArray[np.int32]
     reason: NDArray[np.uint8] = field(default_factory=lambda: np.zeros(0, np.uint8))
     age_s: Float32 | None = None
+    measure: str = "z"
 
     def counts(self) -> dict[str, int]:
         """Points of the cloud by what became of them."""

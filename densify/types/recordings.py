@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,11 +39,12 @@ class Truth(Protocol):
         lidar frame of ``frame``, ego-motion removed."""
         ...
 
-    def depth_m(self, camera: str, frame: int) -> Float32:
-        """(H,W) camera z of the nearest solid surface at the camera's own time, 0 none."""
+    def depth_m(self, camera: str, number: int) -> Float32:
+        """(H,W) of the nearest solid surface at the image's own time (of each row), 0 none: in the
+        camera's own measure, z or range (`densify.types.Camera.measure`)."""
         ...
 
-    def moving_mask(self, camera: str, frame: int) -> Bool:
+    def moving_mask(self, camera: str, number: int) -> Bool:
         """(H,W), True where the pixel shows something that moves."""
         ...
 
@@ -75,12 +76,24 @@ class LidarSequence(Protocol):
         """Reference time of a sweep, without reading its points."""
         ...
 
-    def image(self, camera: str, frame: int) -> NDArray[np.uint8]:
+    def image_stamps_ns(self, camera: str) -> Mapping[int, int]:
+        """When each of the camera's images that exist was exposed (its middle row), by the image's
+        number, ascending in both. Numbers need not be those of the sweeps."""
+        ...
+
+    def image(self, camera: str, number: int) -> NDArray[np.uint8]:
         """(H,W,3) RGB."""
         ...
 
-    def image_stamp_ns(self, camera: str, frame: int) -> int: ...
-
     def T_world_lidar(self, frame: int) -> Float:
         """(4,4) the data set's own pose at the sweep's reference time."""
+        ...
+
+
+@runtime_checkable
+class KnowsImagePoses(Protocol):
+    """A sequence that has a pose for each image; a reader may have this member."""
+
+    def T_world_cam(self, camera: str, number: int) -> Float:
+        """(4,4) the data set's own pose at the exposure, in the world of `T_world_lidar`."""
         ...

@@ -31,11 +31,13 @@ class StageCost:
 class Result:
     """One densified key.
 
-    metrics: plain numbers, ready for JSON. baselines: the results of the simpler methods on the
-    same registration, by method. flow: of every sweep to the next one on the way to the key, where
-    asked for (``output.flow``). movers: by instance (``output.movers``). optical_flow: camera ->
-    (H,W,2) pixels to the "previous" and the "next" image (``output.optical_flow``). rejected:
-    camera -> (H,W) `Reason` of what was left out (``output.rejected``).
+    depth: by name: the camera's, or CAMERA/NUMBER of each image (``project.per=image``). metrics:
+    plain numbers, ready for JSON. baselines: the results of the simpler methods on the same
+    registration, by method. flow: of every sweep to the next one on the way to the key, where
+    asked for (``output.flow``). movers: by instance (``output.movers``). optical_flow: name ->
+    (H,W,2) pixels to the "previous" and the "next" image (``output.optical_flow``). rejected: name
+    -> (H,W) `Reason` of what was left out (``output.rejected``). images: name -> (H,W,3) RGB, of
+    the maps whose image there is.
     """
 
     method: str
@@ -50,3 +52,4 @@ class Result:
     movers: Mapping[int, Mover] = field(default_factory=dict)
     optical_flow: Mapping[str, Mapping[str, Float32]] = field(default_factory=dict)
     rejected: Mapping[str, NDArray[np.uint8]] = field(default_factory=dict)
+    images: Mapping[str, NDArray[np.uint8]] = field(default_factory=dict)

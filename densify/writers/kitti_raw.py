@@ -171,7 +171,7 @@ def _write_stamps(drive: Path, street: Street, names: list[str]) -> None:
         "oxts/timestamps.txt": centre,
     }
     for name in names:
-        exposed = np.array([street.image_stamp_ns(name, frame) for frame in street.frames])
+        exposed = np.array(list(street.image_stamps_ns(name).values()))
         files[f"{name}/timestamps.txt"] = exposed + KITTI_TRIGGER_LATENCY_NS
     for path, stamps in files.items():
         lines = [str(stamp).replace("T", " ") for stamp in stamps.astype("datetime64[ns]")]

@@ -1,0 +1,235 @@
+# SPDX-License-Identifier: MIT
+"""Which images belong to a key, and where a camera sees points at an image's exposure.
+
+Images have a clock of their own. A key takes the image exposed nearest to its sweep, or, one by
+one, every image that is nearer to its sweep than to any other.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from densify.config import Config, ProjectSettings
+from densify.errors import InputError
+from densify.geometry import poses
+from densify.geometry.cameras import depth_along, image_points
+from densify.types import (
+    Bool,
+    Camera,
+    Cloud,
+    Float,
+    Float32,
+    KnowsImagePoses,
+    LidarSequence,
+    Stretch,
+)
+
+_log = logging.getLogger("densify")
+_NUM_NEIGHBOURS = 5  # sweeps on each side of a key that tell the usual period
+_JITTER = 1.5  # half a period is at most so much longer
+_NUM_ROW_STEPS = 4  # in which the row that sees a point is found
+
+
+@dataclass(frozen=True)
+class Shot:
+    """What a depth map is to show. number: of the image, None for the moment of the key sweep.
+    stamp_ns: when."""
+
+    camera: Camera
+    number: int | None
+    stamp_ns: int
+
+
+def key_shots(
+    sequence: LidarSequence, cameras: Sequence[Camera], key: int, settings: ProjectSettings
+) -> dict[str, Shot]:
+    """The depth maps of a key by name: of each camera the image exposed nearest to the key's sweep,
+    named as the camera; with ``project.per=image`` all its images that are nearer to this sweep
+    than to any other, named CAMERA/NUMBER.
+
+    A camera without such an image shows the moment of the sweep, with a warning. A recording's
+    images are nearer than about half the usual period between two sweeps; of two equally near ones
+    the earlier is taken.
+    """
+    stamp_ns = sequence.stamp_ns(key)
+    begin_ns, end_ns = _own_time_ns(sequence, key)
+    shots = {}
+    for camera in cameras:
+        near = {
+            number: exposed_ns
+            for number, exposed_ns in sequence.image_stamps_ns(camera.name).items()
+            if begin_ns < exposed_ns <= end_ns
+        }
+        if settings.per == "image":
+            for number, exposed_ns in near.items():
+                shots[f"{camera.name}/{number:06d}"] = Shot(camera, number, exposed_ns)
+        elif near:
+            number = min(near, key=lambda n: (abs(near[n] - stamp_ns), near[n]))
+            moment_ns = near[number] if settings.at == "camera" else stamp_ns
+            shots[camera.name] = Shot(camera, number, moment_ns)
+        else:
+            shots[camera.name] = Shot(camera, None, stamp_ns)
+        if not near:
+            _log.warning(
+                "key %d: %s has no image of %s within %.0f ms of the sweep: %s",
+                *(key, sequence.name, camera.name, (end_ns - begin_ns) / 2e6),
+                "no depth map" if settings.per == "image" else "its depth map has no colour",
+            )
+    return shots
+
+
+def load_images(sequence: LidarSequence, shots: Mapping[str, Shot]) -> dict[str, NDArray[np.uint8]]:
+    """(H,W,3) RGB of the shots that are images."""
+    return {
+        name: sequence.image(shot.camera.name, shot.number)
+        for name, shot in shots.items()
+        if shot.number is not None
+    }
+
+
+def _own_time_ns(sequence: LidarSequence, key: int) -> tuple[int, int]:
+    """Begin and end of the time that is nearer to the key's sweep than to another; what lies
+    between two belongs to the earlier."""
+    frames = list(sequence.frames)
+    at = frames.index(key)
+    around = frames[max(0, at - _NUM_NEIGHBOURS) : at + _NUM_NEIGHBOURS + 1]
+    stamps_ns = {}
+    for frame in around:
+        try:
+            stamps_ns[frame] = sequence.stamp_ns(frame)
+        except InputError:  # not this key's matter
+            if frame == key:
+                raise
+    if len(stamps_ns) < 2:
+        return np.iinfo(np.int64).min, np.iinfo(np.int64).max
+    half_ns = int(_JITTER / 2 * np.median(np.diff(list(stamps_ns.values()))))
+    middle_ns = stamps_ns[key]
+    before = [s for s in stamps_ns.values() if s < middle_ns]
+    after = [s for s in stamps_ns.values() if s > middle_ns]
+    begin_ns, end_ns = middle_ns - half_ns, middle_ns + half_ns
+    if before:
+        begin_ns = max(begin_ns, (before[-1] + middle_ns) // 2)
+    if after:
+        end_ns = min(end_ns, (middle_ns + after[0]) // 2)
+    return begin_ns, end_ns
+
+
+class Sight(NamedTuple):
+    """Points as a camera sees them. points_cam: (N,3) metres, camera frame, when they are seen.
+    uv: (N,2) px, NaN where there is no pixel. inside: (N,) on the image."""
+
+    points_cam: Float
+    uv: Float
+    inside: Bool
+
+
+@dataclass(frozen=True)
+class Exposure:
+    """A camera at the moment of a shot.
+
+    T_cam_key: (4,4), with the ego motion from the key's reference time. late_s: after it. twist:
+    (6,) of the camera, rad/s and m/s in its own frame. number: of the image. measure: what depth
+    is, camera ``z`` or ``range``. others: "previous" and "next" image, where the stretch reaches
+    them.
+    """
+
+    camera: Camera
+    T_cam_key: Float
+    late_s: float = 0.0
+    twist: Float = field(default_factory=lambda: np.zeros(6))
+    number: int | None = None
+    measure: str = "z"
+    others: Mapping[str, Exposure] = field(default_factory=dict)
+
+    @staticmethod
+    def of(
+        sequence: LidarSequence, stretch: Stretch, key: int, shot: Shot, settings: Config
+    ) -> Exposure:
+        """The vehicle moves on from the sweep nearest in time with that sweep's own twist; where
+        the recording knows the pose of the image itself, that is taken."""
+        others: dict[str, Exposure] = {}
+        if settings.output.optical_flow and shot.number is not None:
+            stamps_ns = sequence.image_stamps_ns(shot.camera.name)
+            numbers = list(stamps_ns)
+            at = numbers.index(shot.number)
+            for name, row in (("previous", at - 1), ("next", at + 1)):
+                if 0 <= row < len(numbers):
+                    exposed_ns = stamps_ns[numbers[row]]
+                    frame = _nearest(stretch, exposed_ns)
+                    begin_ns, end_ns = _own_time_ns(sequence, frame)
+                    if not begin_ns < exposed_ns <= end_ns:
+                        continue
+                    if settings.project.at == "sweep":
+                        exposed_ns = stretch[frame].sweep.stamp_ns
+                    other = Shot(shot.camera, numbers[row], exposed_ns)
+                    others[name] = _exposure(sequence, stretch, key, frame, other, settings)
+        return _exposure(sequence, stretch, key, key, shot, settings, others)
+
+    def see(self, points: Float, velocity_m_s: Float | Float32) -> Sight:
+        """(N,3) points and velocities at the key's moment, key frame. A rolling shutter sees each
+        point at the time of the row it lands on, where camera and point have moved on."""
+        late = points + self.late_s * velocity_m_s
+        points_cam = poses.transform(self.T_cam_key, late)
+        uv, inside = image_points(self.camera, points_cam)
+        if not self.camera.row_time_s:
+            return Sight(points_cam, uv, inside)
+        velocity_cam = poses.rotate(self.T_cam_key, velocity_m_s.astype(np.float64))
+        last = self.camera.height_px - 1
+        row_s, there = np.zeros((len(points), 1)), points_cam
+        for _ in range(_NUM_ROW_STEPS):
+            row = np.where(np.isnan(uv[:, 1]), last / 2, np.clip(uv[:, 1], 0, last))
+            row_s = (row[:, None] - last / 2) * self.camera.row_time_s
+            turn = np.hstack([-row_s * self.twist[:3], np.zeros((len(points), 3))])
+            ahead = points_cam + row_s * (velocity_cam - self.twist[3:])
+            there = poses.transform_each(turn, ahead)
+            uv, inside = image_points(self.camera, there)
+        return Sight(there, uv, inside)
+
+    def sees(self, cloud: Cloud) -> Sight:
+        """`see` of a cloud at the key's moment."""
+        return self.see(cloud.points, cloud.velocity_m_s)
+
+    def depth_m(self, points_cam: Float) -> Float:
+        """(N,3) -> (N,) as ``measure`` says."""
+        return depth_along(points_cam, self.measure)
+
+
+def _nearest(stretch: Stretch, stamp_ns: int) -> int:
+    """Frame of the sweep nearest in time."""
+    return min(stretch.sweeps, key=lambda s: abs(s.sweep.stamp_ns - stamp_ns)).frame
+
+
+def _exposure(
+    sequence: LidarSequence,
+    stretch: Stretch,
+    key: int,
+    frame: int,
+    shot: Shot,
+    settings: Config,
+    others: Mapping[str, Exposure] | None = None,
+) -> Exposure:
+    """frame: of the sweep from which the vehicle moves on."""
+    camera, registered = shot.camera, stretch[frame]
+    late_s = float(shot.stamp_ns - registered.sweep.stamp_ns) * 1e-9
+    twist = registered.twist_before if late_s < 0 else registered.twist_after
+    T_cam_lidar = camera.T_cam_lidar @ poses.inverse(poses.exp(late_s * twist))
+    at_image = settings.project.at == "camera" and shot.number is not None
+    if at_image and isinstance(sequence, KnowsImagePoses):
+        T_cam_world = poses.inverse(sequence.T_world_cam(camera.name, shot.number or 0))
+        T_cam_lidar = T_cam_world @ sequence.T_world_lidar(frame)
+    measure = settings.project.depth
+    return Exposure(
+        camera=camera,
+        T_cam_key=T_cam_lidar @ stretch.T_target_source(frame, key),
+        late_s=float(shot.stamp_ns - stretch[key].sweep.stamp_ns) * 1e-9,
+        twist=poses.carried(camera.T_cam_lidar, twist),
+        number=shot.number,
+        measure=camera.measure if measure == "auto" else measure,
+        others=others or {},
+    )
