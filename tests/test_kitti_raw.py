@@ -528,7 +528,7 @@ def test_description_of_a_drive(tree):
     assert table["frames"] == "2-3, 5 (3, 1 missing between them)"
     assert table["rate"] == "9.66 Hz"
     assert table["points"] == "7 in frame 2, 7 in frame 5"
-    assert table["image_02"] == "40 x 20 px, fx 50.0 px, rectified, 2 images: 2-3"
+    assert table["image_02"] == "40 x 20 px, fx 50.0 px, rectified, 2 images: 2-3, 9.66 Hz"
     assert table["poses"] == "yes, a path of 4.7 m"
     assert table["truth"] == "none"
     assert str(stamp_ns(2)) in table["stamps"]
