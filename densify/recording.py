@@ -26,10 +26,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
 from functools import lru_cache, partial
-from itertools import pairwise
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, TypeVar, cast
 
 from densify.blocks import Cut
 from densify.cache import Cache
@@ -37,7 +35,7 @@ from densify.config import Config
 from densify.costs import Watch
 from densify.depth.accumulate import accumulate
 from densify.errors import InputError, SweepError
-from densify.flow.engines import estimate_motion
+from densify.flow.engines import SharedMotion, estimate_motion
 from densify.flow.scene import Scene
 from densify.flow.tracking.evidence import REACH_S, Candidates, FreeSpace, find_candidates
 from densify.geometry.ground import ground
@@ -47,7 +45,7 @@ from densify.plugins.engines import engine as engine_row
 from densify.readers.timeline import Timeline, WindowFrames
 from densify.readers.window import recorded_trajectory
 from densify.registration.deskew import deskew
-from densify.registration.trajectory import find_trajectory
+from densify.registration.trajectory import LeftOut, Registration, find_trajectory
 from densify.sweeps import Sweeps
 from densify.types import (
     Cloud,
@@ -62,22 +60,6 @@ from densify.types import (
 )
 
 T = TypeVar("T")
-
-
-class LeftOut(NamedTuple):
-    """Why a sweep is not used. unreadable: it could not be read; else not registered."""
-
-    reason: str
-    unreadable: bool
-
-
-@dataclass(frozen=True)
-class Registration:
-    """pieces: poses of neighbouring sweeps, each piece with a world of its own; the sweeps before
-    the block that odometry started with are among them. bad: frame -> why it is left out."""
-
-    pieces: tuple[Trajectory, ...]
-    bad: Mapping[int, LeftOut]
 
 
 class Recording:
@@ -169,7 +151,7 @@ class Recording:
         # All poses, but the points of the window only.
         at_hand = {s.frame: s for s in window.sweeps}
         sweeps = [at_hand.get(f) or RegisteredSweep.without_points(piece, f) for f in frames]
-        return replace(motion, stretch=Stretch(tuple(sweeps)))  # type: ignore[type-var]
+        return motion.with_stretch(Stretch(tuple(sweeps)))
 
     def moment(
         self, key: int, all_sweeps: bool, engine: str | None, with_flow: bool = False
@@ -188,7 +170,7 @@ class Recording:
                 motion = self.motion(key, engine)
                 fields = [motion.flow(frame, key) for frame in stretch.frames]
                 if with_flow:
-                    flow = _steps(motion, stretch, key)
+                    flow = StretchFlow.towards(key, stretch, motion)
         with self._watch.stage("accumulate"):
             drop_lost = self.settings.accumulate.unfollowed == "drop"
             return accumulate(used, fields, key, drop_lost), flow
@@ -274,12 +256,12 @@ class Recording:
             for index, f in enumerate(self._frames_within(number, REACH_S))
         ]
 
-    def _block_motion(self, number: int, engine: str) -> list[tuple[Sequence[int], Motion]]:
+    def _block_motion(self, number: int, engine: str) -> list[tuple[Sequence[int], SharedMotion]]:
         """How everything within the margin of the block moves, for each of its pieces: the frames,
         and the motion without their points."""
         margin_s = self.cut.margin_s
 
-        def make(index: int, frames: Sequence[int]) -> Motion:
+        def make(index: int, frames: Sequence[int]) -> SharedMotion:
             stretch = self._stretch(number, margin_s, frames)
             scene = Scene(
                 stretch,
@@ -290,7 +272,7 @@ class Recording:
             )
             with self._watch.stage("flow"):
                 motion = estimate_motion(scene, self.settings, engine)
-            return replace(motion, stretch=Stretch(()))  # type: ignore[type-var]
+            return cast(SharedMotion, motion).with_stretch(Stretch(()))
 
         def inputs(piece: Trajectory, frames: Sequence[int]) -> Any:
             evidence = [
@@ -299,9 +281,10 @@ class Recording:
                 for index in range(len(self._pieces(b, REACH_S)))
             ]
             content = [self.sweeps.content(f) for f in frames]
-            return [engine, self.settings.flow, piece, evidence, content]
+            settings = [self.settings.flow, self.settings.objective]
+            return [engine, engine_row(engine)[0], settings, piece, evidence, content]
 
-        found: list[tuple[Sequence[int], Motion]] = []
+        found: list[tuple[Sequence[int], SharedMotion]] = []
         pieces = self._pieces(number, margin_s)
         for index, frames in enumerate(self._frames_within(number, margin_s)):
             motion = self._made(
@@ -408,13 +391,3 @@ class Recording:
 
     def _evidence_inputs(self, number: int, index: int) -> Any:
         return [self.settings.flow.min_height_m, self._near(number, index)]
-
-
-def _steps(motion: Motion, stretch: Stretch, key: int) -> StretchFlow:
-    """Flow of every sweep to the next one on the way to the key, and of the key to a neighbour."""
-    before = [f for f in stretch.frames if f <= key]
-    after = [f for f in reversed(stretch.frames) if f >= key]
-    hops = [*pairwise(before), *pairwise(after)]
-    if len(stretch.frames) > 1:
-        hops.append((key, after[-2] if len(after) > 1 else before[-2]))
-    return StretchFlow(stretch, {hop: motion.flow(*hop) for hop in hops})

@@ -28,6 +28,7 @@ from densify.dataset.tasks import Outcome, Task, run_tasks
 from densify.dataset.work import Job, tasks
 from densify.dataset.workers import open_workers
 from densify.errors import ComputationError, InputError, OutputError
+from densify.flow.engines import check_engine
 from densify.outputs.atomic import clear_leftovers
 from densify.outputs.kitti_tree import write_readme
 from densify.readers import open_sequence
@@ -106,6 +107,7 @@ def make_dataset(
     ComputationError where the disk is full or the workers are lost: what is finished is kept.
     """
     recipe = recipe or Recipe()
+    check_engine(recipe.config.flow.engine)
     drives = plan(data, keys, recipe)
     check_place(out)
     with Manifest(out, shard) as manifest:

@@ -3,12 +3,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
 
 from densify.config import RegisterSettings
 from densify.registration.deskew import deskew
 from densify.registration.odometry import check_overlap, check_plausible, register
 from densify.types import Sweep, Trajectory
+
+
+class LeftOut(NamedTuple):
+    """Why a sweep is not used. unreadable: it could not be read; else not registered."""
+
+    reason: str
+    unreadable: bool
+
+
+@dataclass(frozen=True)
+class Registration:
+    """pieces: poses of neighbouring sweeps, each piece with a world of its own; the sweeps before
+    the block that odometry started with are among them. bad: frame -> why it is left out."""
+
+    pieces: tuple[Trajectory, ...]
+    bad: Mapping[int, LeftOut]
 
 
 def find_trajectory(

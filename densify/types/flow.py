@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Protocol
 
 import numpy as np
@@ -69,3 +70,14 @@ class StretchFlow:
 
     stretch: Stretch
     steps: Mapping[tuple[int, int], FlowField]
+
+    @staticmethod
+    def towards(key: int, stretch: Stretch, motion: Motion) -> StretchFlow:
+        """Flow of every sweep to the next one on the way to the key, and of the key to a
+        neighbour."""
+        before = [f for f in stretch.frames if f <= key]
+        after = [f for f in reversed(stretch.frames) if f >= key]
+        hops = [*pairwise(before), *pairwise(after)]
+        if len(stretch.frames) > 1:
+            hops.append((key, after[-2] if len(after) > 1 else before[-2]))
+        return StretchFlow(stretch, {hop: motion.flow(*hop) for hop in hops})
