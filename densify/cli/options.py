@@ -85,6 +85,12 @@ def add_short_options(parser: argparse.ArgumentParser) -> None:
         "time (short for --set project.at=…; default: camera)",
     )
     parser.add_argument(
+        "--per",
+        choices=("sweep", "image"),
+        help="one depth map for each camera, or one for every image exposed nearer to this sweep "
+        "than to another (short for --set project.per=…; default: sweep)",
+    )
+    parser.add_argument(
         "--movers",
         choices=("keep", "drop", "separate"),
         help="moving objects in the maps, left out, or left out and written one by one (short for "

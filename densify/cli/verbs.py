@@ -254,7 +254,7 @@ def evaluate(options: argparse.Namespace) -> None:
         _print_paths([options.out])
 
 
-_SHORT = {"flow": "flow.engine", "at": "project.at", "movers": "output.movers"}
+_SHORT = {"flow": "flow.engine", "at": "project.at", "movers": "output.movers", "per": "project.per"}
 
 
 def _config(options: argparse.Namespace) -> densify.Config:
