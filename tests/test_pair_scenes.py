@@ -42,20 +42,21 @@ class Pair:
         return self.instance >= 0
 
 
-def pair_of(*boxes: Box, ego: Arc | None = None, slope: float = 0.0) -> Pair:
+def pair_of(*boxes: Box, ego: Arc | None = None, slope: float = 0.0, later: int = 1) -> Pair:
+    """later: revolutions between the two."""
     world = World((*boxes, *street()), slope)
     scene = Scene(world, ego or Arc(-0.4, -1.5, 0.0, 8.0, 0.1), Scanner(sigma_m=0.01))
-    stretch = scene.stretch(FRAME, 1)
-    here, there = stretch[FRAME], stretch[FRAME + 1]
+    stretch = scene.stretch(FRAME, later)
+    here, there = stretch[FRAME], stretch[FRAME + later]
     return Pair(
         here.sweep.points,
-        poses.transform(stretch.T_target_source(FRAME, FRAME + 1), there.sweep.points),
-        scene.displacement(FRAME, FRAME + 1),
+        poses.transform(stretch.T_target_source(FRAME, FRAME + later), there.sweep.points),
+        scene.displacement(FRAME, FRAME + later),
         scene.scan(FRAME).instance,
         here.sweep.offset_ns,
-        there.sweep.offset_ns,
+        there.sweep.offset_ns + (later * PERIOD_NS if later > 1 else 0),
         scene.height_m(FRAME),
-        scene.height_m(FRAME + 1),
+        scene.height_m(FRAME + later),
     )
 
 
@@ -157,6 +158,15 @@ def test_times_make_fast_cars_right():
     late_s = pair.source_offset_ns[:, None] * 1e-9
     off = timed.to_reference + velocity_m_s * late_s
     assert np.abs(off[mine]).max() < 0.02 and not timed.to_reference[~timed.moving].any()
+
+
+def test_the_longer_the_time_between_the_farther_things_are_looked_for():
+    """25 m/s over two revolutions: 5 m, more than is looked for where the time is not known."""
+    pair = pair_of(car(4.0, 3.0, 25.0, 1), later=2)
+    timed, plain = estimated(pair), estimate_flow(pair.source, pair.target)
+    assert timed.moving[pair.moved].mean() > 0.8 and not plain.moving[pair.moved].any()
+    found = pair.moved & timed.moving
+    assert np.linalg.norm(timed.displacement - pair.truth, axis=1)[found].mean() < 0.1
 
 
 def test_either_clock_will_do():

@@ -7,7 +7,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -47,7 +47,8 @@ def estimate_flow(
     """Scene flow of two clouds in one coordinate frame, metres, z up, with or without the ground.
 
     source: (N,3), target: (M,3). config: its ``flow`` and ``ground`` sections are used.
-    initial: (N,3) flow to start from; needed only where something moves by more than 3.8 m.
+    initial: (N,3) flow to start from; needed only where something moves farther than is looked
+    for: 38 m/s over the time between the clouds, at most 0.4 s; 3.8 m where that is not known.
 
     source_offset_ns, target_offset_ns: (N,), (M,) when each point was measured, both or neither.
     On one clock, or each from its own sweep's reference time: then the target is taken for the next
@@ -71,7 +72,7 @@ def estimate_flow(
             "alone are no recording"
         )
     clouds = _as_cloud(source, "source"), _as_cloud(target, "target")
-    lags = _lags(_columns(source_offset_ns, target_offset_ns, clouds, "offset_ns"))
+    times = _times(_columns(source_offset_ns, target_offset_ns, clouds, "offset_ns"))
     lidars = _columns(source_lidar, target_lidar, clouds, "lidar")
     if not settings.objective.static_prior or settings.flow.engine == "paper":
         return flow_between(*clouds, settings.objective, initial)
@@ -80,7 +81,7 @@ def estimate_flow(
         raise InputError(
             f"initial: got shape {start.shape}, expected the source's {clouds[0].shape}"
         )
-    return _flow_of_groups(clouds, settings, start, lags, lidars)
+    return _flow_of_groups(clouds, settings, start, times, lidars)
 
 
 def flow_between(
@@ -109,7 +110,7 @@ def _flow_of_groups(
     clouds: tuple[Float, Float],
     settings: Config,
     initial: Float | None,
-    lags: tuple[Float, Float] | None,
+    times: _Times | None,
     lidars: tuple[Int, Int] | None,
 ) -> FlowField:
     middle = np.median(clouds[0], axis=0)  # map coordinates lose nothing
@@ -124,13 +125,14 @@ def _flow_of_groups(
     field = FlowField.zero(len(clouds[0]))
     if not (len(above[0]) and len(above[1])):
         return field
-    lag = lags or (np.zeros(len(clouds[0])), np.zeros(len(clouds[1])))
+    lag = times.lag if times else (np.zeros(len(clouds[0])), np.zeros(len(clouds[1])))
     source, target = (
         Standing(points[i][rows], lag[i][rows], None if lidars is None else lidars[i][rows])
         for i, rows in enumerate(above)
     )
     start = None if initial is None else initial[above[0]]
-    motions, field.instance[above[0]] = find_movers(source, target, start)
+    apart_s = times.apart_s if times else None
+    motions, field.instance[above[0]] = find_movers(source, target, start, apart_s)
     low = (heights_m[0] < settings.flow.min_height_m) & (heights_m[0] > _MIN_LOW_M)
     _attach_below(points[0], field, inside[0][low])
     to_reference = np.zeros_like(clouds[0])
@@ -141,7 +143,7 @@ def _flow_of_groups(
         field.displacement[rows] = motion.carry(measured, 1 - lag[0][rows]) - at_reference
         to_reference[rows] = at_reference - measured
     field.moving[:] = field.instance >= 0
-    return field if lags is None else replace(field, to_reference=to_reference)
+    return field if times is None else replace(field, to_reference=to_reference)
 
 
 def _attach_below(points: Float, field: FlowField, low: Int) -> None:
@@ -188,9 +190,19 @@ def _columns(
     return columns[0], columns[1]
 
 
-def _lags(times_ns: tuple[Int, Int] | None) -> tuple[Float, Float] | None:
-    """When the points were measured, after the middle of their cloud's times, as shares of the time
-    between the middles; None where that tells nothing."""
+class _Times(NamedTuple):
+    """When two clouds were measured.
+
+    apart_s: from the middle of one cloud's times to that of the other's. lag: (N,), (M,) of the
+    points after the middle of their cloud's times, as a share of that.
+    """
+
+    lag: tuple[Float, Float]
+    apart_s: float
+
+
+def _times(times_ns: tuple[Int, Int] | None) -> _Times | None:
+    """None where they tell nothing."""
     if times_ns is None:
         return None
     low, high = (np.array([int(of(times)) for times in times_ns]) for of in (np.min, np.max))
@@ -201,7 +213,7 @@ def _lags(times_ns: tuple[Int, Int] | None) -> tuple[Float, Float] | None:
     if gap == 0:
         return None
     first, second = ((times - m) / gap for times, m in zip(times_ns, middle, strict=True))
-    return first, second
+    return _Times((first, second), abs(gap) * 1e-9)
 
 
 def _device(settings: ObjectiveSettings) -> str:

@@ -17,7 +17,8 @@ from scipy.spatial import cKDTree
 from densify.types import Float, Int
 
 _EVEN_M = 0.06
-_MAX_MOTION_M = 3.8
+_MAX_SPEED_M_S = 38.0
+_USUAL_S, _LONGEST_S = 0.1, 0.4  # between the clouds where nothing is known of it; at the most
 _VOTE_STEP_M = 0.2
 _VOTE_SLACK_M = 0.3  # vertical
 _VOTE_POINTS, _VOTE_TARGETS = 60, 800
@@ -125,14 +126,18 @@ class Hypotheses:
         target: Standing,
         candidates: Int,
         initial: Float | None,
+        apart_s: float | None,
     ) -> Hypotheses:
-        """Every group at the places it votes for, where it stands, and where ``initial`` puts
-        it."""
+        """Every group at the places it votes for, where it stands, and where ``initial`` puts it.
+
+        apart_s: the time between the clouds, None where unknown.
+        """
         group, state, centre, row = [], [], [], []
         there = target.points[candidates]
+        num_steps = _num_vote_steps(apart_s)
         for k, members in enumerate(groups):
             sample = thinned(members, _ALIGN_POINTS)
-            starts = _vote(source.points[thinned(members, _VOTE_POINTS)], there)
+            starts = _vote(source.points[thinned(members, _VOTE_POINTS)], there, num_steps)
             if initial is not None:
                 starts = np.vstack([starts, np.median(initial[members], axis=0)])
             for start in starts:
@@ -203,16 +208,21 @@ def _step(
     return np.asarray(np.linalg.solve(H, g[..., None])[..., 0], np.float64)
 
 
-def _vote(points: Float, there: Float) -> Float:
-    """(S,3) starts in the plane, zero first: where most of the (N,3) points find one of the
-    others, each point voting once for a place."""
+def _num_vote_steps(apart_s: float | None) -> int:
+    """As far as the fastest may have gone."""
+    apart_s = _USUAL_S if apart_s is None else min(apart_s, _LONGEST_S)
+    return max(1, round(_MAX_SPEED_M_S * apart_s / _VOTE_STEP_M))
+
+
+def _vote(points: Float, there: Float, n: int) -> Float:
+    """(S,3) starts in the plane, fewer than n steps away, zero first: where most of the (N,3)
+    points find one of the others, each point voting once for a place."""
     zero = np.zeros((1, 3))
-    span_m = np.array([_MAX_MOTION_M, _MAX_MOTION_M, _VOTE_SLACK_M])
+    span_m = np.array([n * _VOTE_STEP_M, n * _VOTE_STEP_M, _VOTE_SLACK_M])
     around = ((there > points.min(0) - span_m) & (there < points.max(0) + span_m)).all(1)
     there = there[thinned(np.flatnonzero(around), _VOTE_TARGETS)]
     if not len(there):
         return zero
-    n = int(_MAX_MOTION_M / _VOTE_STEP_M) + 1
     way = there - points[:, None, :]
     cell = np.rint(way[..., :2] / _VOTE_STEP_M).astype(np.int64) + n
     inside = ((cell >= 1) & (cell <= 2 * n - 1)).all(-1) & (np.abs(way[..., 2]) < _VOTE_SLACK_M)
@@ -227,7 +237,7 @@ def _vote(points: Float, there: Float) -> Float:
     place = np.stack([x.ravel(), y.ravel(), 0 * x.ravel()], 1) * _VOTE_STEP_M
     length_m = np.linalg.norm(place, axis=1)
     score = ballot.mean(0, dtype=np.float64).ravel() - 1e-3 * length_m
-    score[length_m > _MAX_MOTION_M] = -1
+    score[length_m > n * _VOTE_STEP_M] = -1
     starts = [zero]
     for _ in range(_NUM_VOTED):
         best = place[np.argmax(score)]

@@ -45,18 +45,22 @@ _ATTACH_UNEXPLAINED_M = 1.0
 
 
 def find_movers(
-    source: Standing, target: Standing, initial: Float | None = None
+    source: Standing,
+    target: Standing,
+    initial: Float | None = None,
+    apart_s: float | None = None,
 ) -> tuple[list[Motion], Int]:
     """The motions, and (N,) which of them each source point takes, -1 none.
 
-    initial: (N,3) flow; a group is also tried at the median of its members'.
+    initial: (N,3) flow; a group is also tried at the median of its members'. apart_s: the time
+    between the clouds, None where unknown: what moves at up to 38 m/s is looked for.
     """
     with ThreadPoolExecutor(2) as pool:
         ours, theirs = pool.map(_Evidence.of, (source, target), (target, source))
     groups = ours.groups()
     if not groups or not len(theirs.candidates):
         return [], np.full(len(source.points), -1)
-    hypotheses = Hypotheses.of(groups, source, target, theirs.candidates, initial)
+    hypotheses = Hypotheses.of(groups, source, target, theirs.candidates, initial, apart_s)
     hypotheses.align(Surface(target, theirs.candidates))
     motions, instance = _choose(hypotheses, groups, ours, theirs)
     _attach(motions, instance, ours, theirs)
