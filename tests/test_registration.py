@@ -13,7 +13,7 @@ import pytest
 from densify.config import RegisterSettings
 from densify.errors import ComputationError
 from densify.geometry import poses
-from densify.registration import odometry
+from densify.registration import odometry, trajectory
 from densify.registration.deskew import deskew
 from densify.registration.odometry import check_plausible, register
 from densify.types import Trajectory
@@ -72,6 +72,21 @@ def test_the_drive_is_recovered(drive, second_pass):
     assert off_deg.max() < 0.2
 
 
+def test_a_drive_at_twice_the_rate_is_recovered_from_every_second_sweep_first(drive, raw):
+    """The same sweeps in half the time: 24 m/s at 20 Hz."""
+    fast = [replace(s, stamp_ns=s.stamp_ns // 2, offset_ns=s.offset_ns // 2) for s in raw]
+    with pytest.MonkeyPatch.context() as patch:
+        passes = []
+        patch.setattr(trajectory, "register", lambda *a, **k: passes.append(a) or register(*a, **k))
+        found = trajectory.find_trajectory(fast, SETTINGS)
+    assert [len(sweeps) for sweeps, *_ in passes] == [6, 11]
+    rough = passes[1][2]
+    assert rough.frames == found.frames == tuple(FRAMES)
+    off_m, off_deg = errors(found, drive.trajectory(FRAMES))
+    assert off_m.max() < 0.15 and off_m.mean() < 0.06 and off_deg.max() < 0.2
+    assert errors(rough, drive.trajectory(FRAMES))[0].max() < 0.4
+
+
 def test_stamps_and_frames_are_handed_on_exactly(drive, second_pass):
     assert second_pass.frames == tuple(FRAMES)
     assert second_pass.stamp_ns.dtype == np.int64
@@ -111,7 +126,7 @@ def test_sweeps_may_be_missing(fast_drive, frames):
 @pytest.mark.parametrize("period_s", [0.1, 0.2, 0.3])
 def test_the_start_is_found_at_any_rate(fast_drive, period_s):
     frames = [round(i * period_s / SWEEP_S) for i in range(3)]
-    twist = odometry._searched_twist([fast_drive.scan(f).sweep for f in frames], SETTINGS)
+    twist = odometry.searched_twist([fast_drive.scan(f).sweep for f in frames], SETTINGS)
     assert np.abs(twist * period_s - [0, 0, 0, 36.0 * period_s, 0, 0]).max() < 0.6
 
 

@@ -21,7 +21,7 @@ _MAX_ACCELERATION_M_S2 = 30.0  # three times what tyres can do; the rest is nois
 _MAX_TURN_RATE_DEG_S = 150.0
 _POSE_NOISE_M = 0.5
 _NUM_CATCHING_UP = 3  # sweeps registered, however far apart in time
-_SEARCH_STEP_M = 0.5
+_SEARCH_STEP_M, _SEARCH_STEP_S = 0.5, 0.1  # in a shorter time less in proportion
 _SEARCH_POINTS = 800
 _SEARCH_CLOSE_M = 1.0
 _STANDING_M = 0.4
@@ -34,7 +34,10 @@ _CONVERGED = 1e-3
 
 
 def register(
-    sweeps: Sequence[Sweep], settings: RegisterSettings, rough: Trajectory | None = None
+    sweeps: Sequence[Sweep],
+    settings: RegisterSettings,
+    rough: Trajectory | None = None,
+    start: Float | None = None,
 ) -> Trajectory:
     """Poses of sweeps by lidar odometry.
 
@@ -42,8 +45,9 @@ def register(
         pass, deskewed for a second one.
     rough: the first pass of the same sweeps. The second one searches around it, so that it can
         work with fine voxels and a narrow kernel. Without it the voxels are twice as large, each
-        sweep is searched for where the vehicle would be if it kept its velocity, and the velocity
-        at the start is found on a grid, since odometry takes every start for standing still.
+        sweep is searched for where the vehicle would be if it kept its velocity.
+    start: (6,) per second, the velocity at the start of a first pass, since odometry takes every
+        start for standing still; None: `searched_twist`.
 
     World is the first sweep's lidar frame. Raises SweepError naming the frames where a sweep
     is too sparse to register, the stamps do not ascend or, in the second pass, the motion is none
@@ -65,7 +69,7 @@ def register(
             if rough is not None:
                 twist = _twist(rough, min(max(i - 1, _NUM_CATCHING_UP), len(sweeps) - 2))
             elif i == 1:
-                twist = _searched_twist(sweeps, settings)
+                twist = searched_twist(sweeps, settings) if start is None else start
             else:
                 twist = poses.log(odometry.last_delta) / step_s[i - 2]
             odometry.last_delta = poses.exp(twist * step_s[i - 1])
@@ -95,11 +99,12 @@ def _twist(trajectory: Trajectory, i: int) -> Float:
     return poses.log(poses.inverse(T[i]) @ T[i + 1]) / seconds
 
 
-def _searched_twist(sweeps: Sequence[Sweep], settings: RegisterSettings) -> Float:
+def searched_twist(sweeps: Sequence[Sweep], settings: RegisterSettings) -> Float:
     """(6,) per second at the start: the velocity, up to the highest speed and without rotation,
     that best lays what stands on the ground in the first sweeps upon each other.
 
-    Tried on a grid whose steps move the second sweep by 1 m, and around the best by 0.5 m.
+    Tried on a grid whose steps move the second sweep by 1 m, and around the best by 0.5 m, or less
+    where it follows within 0.1 s.
     """
     standing = [_standing(s.points) for s in sweeps[:3]]
     first_s = (sweeps[1].stamp_ns - sweeps[0].stamp_ns) * 1e-9
@@ -119,8 +124,9 @@ def _searched_twist(sweeps: Sequence[Sweep], settings: RegisterSettings) -> Floa
             cost += np.minimum(distance_m, _SEARCH_CLOSE_M).reshape(len(steps_m), -1).mean(1)
         return steps_m[np.argmin(cost)]
 
-    coarse = best(_grid(np.zeros(2), settings.max_speed_m_s * first_s, 2 * _SEARCH_STEP_M))
-    fine = best(_grid(coarse[:2], 2 * _SEARCH_STEP_M, _SEARCH_STEP_M))
+    step_m = _SEARCH_STEP_M * min(1.0, first_s / _SEARCH_STEP_S)
+    coarse = best(_grid(np.zeros(2), settings.max_speed_m_s * first_s, 2 * step_m))
+    fine = best(_grid(coarse[:2], 2 * step_m, step_m))
     return np.append(np.zeros(3), fine / first_s)
 
 

@@ -7,10 +7,22 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
+import numpy as np
+
 from densify.config import RegisterSettings
+from densify.geometry import poses
 from densify.registration.deskew import deskew
-from densify.registration.odometry import check_overlap, check_plausible, register
+from densify.registration.odometry import (
+    check_overlap,
+    check_plausible,
+    register,
+    searched_twist,
+)
 from densify.types import Sweep, Trajectory
+
+_ROUGH_STEP_S = (
+    0.1  # within less the rings on the ground, that go with the scanner, hide its motion
+)
 
 
 class LeftOut(NamedTuple):
@@ -44,6 +56,27 @@ def find_trajectory(
         check_plausible(recorded, settings)
         check_overlap(sweeps, recorded, settings)
         return recorded
-    rough = register(sweeps, settings)
+    rough = _rough(sweeps, settings)
     straight = [s.sweep for s in deskew(sweeps, rough).sweeps]
     return register(straight, settings, rough)
+
+
+def _rough(sweeps: Sequence[Sweep], settings: RegisterSettings) -> Trajectory:
+    """The first pass, over sweeps no closer in time than it can tell them apart, with the poses
+    between them at constant velocity."""
+    stamp_ns = np.array([s.stamp_ns for s in sweeps], np.int64)
+    usual_s = float(np.median(np.diff(stamp_ns))) * 1e-9 if len(sweeps) > 1 else _ROUGH_STEP_S
+    stride = max(1, round(_ROUGH_STEP_S / usual_s))
+    if stride == 1:
+        return register(sweeps, settings)
+    last = len(sweeps) - 1
+    rows = np.array(sorted({*range(0, last, stride), last}))
+    start = searched_twist(sweeps, settings)
+    sparse = register([sweeps[row] for row in rows], settings, start=start)
+    T_world_lidar = []
+    for i, time_ns in enumerate(stamp_ns):
+        k = min(int(np.searchsorted(rows, i, side="right")), len(rows) - 1) - 1
+        a_ns, b_ns = sparse.stamp_ns[k : k + 2]
+        a, b = sparse.T_world_lidar[k : k + 2]
+        T_world_lidar.append(poses.interpolate(a, b, (time_ns - a_ns) / (b_ns - a_ns)))
+    return Trajectory(tuple(s.frame for s in sweeps), stamp_ns, np.stack(T_world_lidar))
