@@ -66,7 +66,7 @@ class Cache:
 
 
 def digest(value: Any) -> str:
-    """Of anything made of arrays, numbers, text, dataclasses, sequences and mappings."""
+    """Digest of anything made of arrays, numbers, text, dataclasses, sequences and mappings."""
     state = hashlib.blake2b(digest_size=20)
     _feed(state, value)
     return state.hexdigest()
@@ -110,7 +110,7 @@ def _made(stage: str, inputs: str, make: Callable[[], Any]) -> Any:
 
 @cache
 def code() -> str:
-    """Of this package: another version may make something else of the same inputs."""
+    """Digest of this package's code: another version may make something else of the same inputs."""
     package = Path(__file__).parent
     sources = sorted(package.rglob("*.py"))
     texts = [(str(path.relative_to(package)), path.read_text("utf-8")) for path in sources]

@@ -257,7 +257,12 @@ def _results(
             if settings.output.rejected:
                 metrics["rejected"] = {n: maps.counts() for n, maps in depth.items()}
         results[name] = Result(
-            *(name, key, used, cloud, depth, metrics),
+            method=name,
+            key=key,
+            frames=used,
+            cloud=cloud,
+            depth=depth,
+            metrics=metrics,
             costs=watch.costs(),
             baselines=dict(results),
             flow=flow,

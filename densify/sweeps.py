@@ -54,7 +54,7 @@ class Sweeps:
             return read_sweep(self._sequence, frame, self._settings)
 
     def _find_digests(self, number: int) -> dict[int, str | InputError]:
-        """By frame; looked up by all processes of a run, of which only the first has to read."""
+        """Digests by frame; all processes of a run look them up, only the first has to read."""
         first = number * _DIGESTS_TOGETHER
 
         def read() -> dict[int, str | InputError]:

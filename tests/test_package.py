@@ -130,6 +130,12 @@ def test_every_source_file_starts_with_its_license() -> None:
             assert len(lines) == 1 or lines[1].startswith('"""'), f"{path}: no module docstring"
 
 
+def test_docstrings_are_sentences_with_a_subject() -> None:
+    for path in (CHECKOUT / "densify").rglob("*.py"):
+        found = re.search(r'"""(Of|By) [^"]*', path.read_text("utf-8"))
+        assert not found, f"{path}: {found and found.group()[:80]}"
+
+
 def test_no_library_code_exits_prints_or_asserts() -> None:
     for path in (CHECKOUT / "densify").rglob("*.py"):
         if "cli" in path.parts or path.name == "__main__.py":

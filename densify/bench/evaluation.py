@@ -22,7 +22,7 @@ from densify.scores.depth_metrics import (
 from densify.types import Bool, Float32, Progress
 
 SCHEMA_VERSION = 1
-"""Of `evaluate`'s dictionary; grows when a key changes its meaning or goes."""
+"""Version of `evaluate`'s dictionary; grows when a key changes its meaning or goes."""
 
 KITTI_FOCAL_PX = 721.5377
 """fx of KITTI's rectified cameras on 2011_09_26; of its other days 707 to 719."""

@@ -103,8 +103,8 @@ class Pair:
         return np.einsum("nk,nkj->nj", weight, drawn_flow[near])
 
     def as_field(self, flow: Float) -> FlowField:
-        """Of the whole sweep in its lidar frame from (n,3), world: the ground stands still, and
-        what was measured before or after the reference time moves as it does afterwards."""
+        """Flow of the whole sweep in its lidar frame from (n,3), world: the ground stands still,
+        and what was measured before or after the reference time moves as it does afterwards."""
         registered, above = self.here.registered, self.here.above
         field = FlowField.zero(len(above))
         field.displacement[above] = flow @ registered.T_world_lidar[:3, :3]
@@ -117,7 +117,8 @@ class Pair:
 
 
 def pairs_of(window: Window, max_points: int) -> dict[int, Pair]:
-    """By the frame of the source: every sweep but the key's with its neighbour towards the key.
+    """Pairs by the frame of the source: every sweep but the key's with its neighbour towards the
+    key.
 
     max_points: drawn of each sweep, 0 for all. Raises InputError for a sweep with too few points.
     """
@@ -160,7 +161,7 @@ def flow_of_pair(method: str, pair: Pair, config: Config) -> tuple[FlowField, Tr
 
 
 def _ours(pair: Pair, config: Config) -> FlowField:
-    """Of the whole sweeps, whose ground it finds itself."""
+    """Flow of the whole sweeps, whose ground it finds itself."""
     sweeps = [cloud.registered.sweep for cloud in (pair.here, pair.there)]
     times_ns = [None if s.offset_ns is None else s.stamp_ns + s.offset_ns for s in sweeps]
     found = estimate_flow(

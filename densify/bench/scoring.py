@@ -59,7 +59,7 @@ class Scorer:
         return Scorer(window, sources, {f: _answer(truth, window, f) for f in window.frames})
 
     def step_scores(self, steps: Mapping[int, FlowField]) -> dict[str, Any]:
-        """Of the flow to the next sweep, by frame, all pairs together. found: of the ``certain``
+        """Score the flow to the next sweep, by frame, all pairs together. found: of the ``certain``
         movers above the ground; falsely_moving: of all that stands still, ground too."""
         if self.answers is None:
             moving = np.concatenate([steps[f].moving for f in self.sources])
@@ -94,7 +94,7 @@ class Scorer:
         return {name: _plain(value) for name, value in scores.items()}
 
     def window_scores(self, to_key: Mapping[int, FlowField]) -> dict[str, Any]:
-        """Of the flow to the key, by frame. Accumulated movers, the key's own left out, are the
+        """Score the flow to the key, by frame. Accumulated movers, the key's own left out, are the
         true movers above the ground, without truth those that are called moving."""
         stretch, key = self.window.stretch, self.window.key
         cloud = accumulate(stretch, [to_key[f] for f in stretch.frames], key, drop_lost=True)

@@ -34,7 +34,7 @@ def set_summary(summary: Summary) -> str:
 
 
 def set_status(summary: Summary, last_lines: Sequence[str]) -> str:
-    """Of a set that may still be at work; last_lines: of its logs."""
+    """Describe a set that may still be at work; last_lines: of its logs."""
     return "\n".join([set_summary(summary), *(f"log: {line}" for line in last_lines)])
 
 

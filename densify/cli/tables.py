@@ -226,7 +226,7 @@ def _table(rows: Mapping[str, Any], columns: Sequence[Column]) -> str:
 
 
 def _written(value: float | None, form: str) -> str:
-    """By a format and, after a blank, a unit; percentages with a blank before the sign."""
+    """Format by a format and, after a blank, a unit; percentages with a blank before the sign."""
     if value is None:
         return _NONE
     number, _, unit = form.partition(" ")

@@ -116,7 +116,9 @@ def dataset(options: argparse.Namespace) -> None:
 
     limits = ("max_ghost", "min_density", "max_outliers", "min_sweeps")
     recipe = Recipe(
-        *(options.window, options.method, options.layout),
+        window=options.window,
+        method=options.method,
+        layout=options.layout,
         cameras=None if options.cameras is None else tuple(options.cameras),
         split=options.split,
         gate=Gate(**{limit: getattr(options, limit) for limit in limits}),
@@ -124,7 +126,10 @@ def dataset(options: argparse.Namespace) -> None:
     )
     with keys_on_stderr() as report:
         summary = make_dataset(
-            *(options.data or ["street"], options.out, options.keys, recipe),
+            options.data or ["street"],
+            options.out,
+            options.keys,
+            recipe,
             num_workers=options.workers,
             scheduler=options.scheduler,
             shard=options.shard,
@@ -254,7 +259,12 @@ def evaluate(options: argparse.Namespace) -> None:
         _print_paths([options.out])
 
 
-_SHORT = {"flow": "flow.engine", "at": "project.at", "movers": "output.movers", "per": "project.per"}
+_SHORT = {
+    "flow": "flow.engine",
+    "at": "project.at",
+    "movers": "output.movers",
+    "per": "project.per",
+}
 
 
 def _config(options: argparse.Namespace) -> densify.Config:

@@ -19,7 +19,7 @@ _log = logging.getLogger("densify")
 
 
 class WorkersDiedError(Exception):
-    """Of a task that cannot be tried once more."""
+    """The outcome of a task that cannot be tried once more."""
 
     def __init__(self, times: int) -> None:
         super().__init__(

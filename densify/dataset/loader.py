@@ -254,7 +254,7 @@ class _Drive:
 
 
 def _read_drives(root: Path) -> dict[str, _Drive]:
-    """Of dataset.json, by name."""
+    """Recordings of dataset.json, by name."""
     path = root / "dataset.json"
     if not path.is_file():
         raise InputError(

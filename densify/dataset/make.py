@@ -37,7 +37,7 @@ from densify.readers.files import format_frames
 _log = logging.getLogger("densify")
 
 CACHE_BYTES = 10 * 1024**3
-"""Of what is kept for later runs."""
+"""Bound of what is kept on disk for later runs."""
 _TREE_BYTES_PER_PIXEL = 1.8  # the four maps of a camera
 _RUN_BYTES_PER_PIXEL, _CLOUD_BYTES_PER_SWEEP = 8.0, 2.5e6
 # Of a process: what is loaded, and what a point takes in the shared steps and in a key's window.
@@ -46,8 +46,8 @@ _BASE_BYTES, _SHARED_BYTES_PER_POINT, _KEY_BYTES_PER_POINT = 0.55e9, 110, 500
 
 @dataclass(frozen=True)
 class Summary:
-    """Of a set, or of a shard's part of it. records: of keys that were ever tried. num_keys: that
-    are wanted. num_made: in this run, within ``seconds``."""
+    """How far a set is, or a shard's part of it. records: of keys that were ever tried. num_keys:
+    that are wanted. num_made: in this run, within ``seconds``."""
 
     records: Mapping[Key, KeyRecord]
     num_keys: int
@@ -186,7 +186,7 @@ def _tasks(
 
 
 def status(out: Path) -> tuple[Summary, list[str]]:
-    """Of a set, finished or not, and the last line of each of its logs.
+    """How far a set is, finished or not, and the last line of each of its logs.
 
     Raises InputError if ``out`` holds none.
     """
@@ -217,7 +217,7 @@ def _records(outcomes: Iterator[Outcome]) -> Iterator[KeyRecord]:
 
 
 def _part(drives: Sequence[PlannedDrive], shard: tuple[int, int] | None) -> list[PlannedDrive]:
-    """Of all drives the blocks of a shard: neighbours together, for they share work."""
+    """The blocks of a shard, of all drives: neighbours together, because they share work."""
     i, n = shard or (1, 1)
     blocks = [
         (d.source.name, b) for d in drives for b in sorted({d.cut.number_near(k) for k in d.keys})
@@ -233,7 +233,7 @@ def _part(drives: Sequence[PlannedDrive], shard: tuple[int, int] | None) -> list
 def _num_processes(
     num_workers: int, memory_bytes: int | None, recipe: Recipe, drives: Sequence[PlannedDrive]
 ) -> int:
-    """As many as wanted, or fewer that fit into the memory; several are led by one more."""
+    """How many processes: as wanted, or fewer that fit into the memory. One more leads several."""
     if memory_bytes is None or not drives:
         return num_workers
     num_points = _num_points(drives)
@@ -253,7 +253,7 @@ def _num_processes(
 
 
 def _num_points(drives: Sequence[PlannedDrive]) -> int:
-    """Of the first sweep that can be read."""
+    """Number of points of the first sweep that can be read."""
     for drive in drives:
         sequence = open_sequence(drive.source.data)
         for key in drive.keys:
@@ -270,7 +270,12 @@ def _announce(
     free = shutil.disk_usage(out).free
     _log.info(
         "%d keys, %d finished, %d to make with %d worker(s); about %.2f GB needed, %.0f GB free",
-        *(num_keys, num_keys - num_left, num_left, num_processes, need / 1e9, free / 1e9),
+        num_keys,
+        num_keys - num_left,
+        num_left,
+        num_processes,
+        need / 1e9,
+        free / 1e9,
     )
     if need > free:
         _log.warning("%s: the disk will be full before all keys are made", out)

@@ -258,7 +258,10 @@ def _read(path: Path) -> dict[Key, tuple[KeyRecord, bytes]]:
         log.warning(
             "%s: damaged lines passed over: %d of %d, the first is line %d; their keys are made "
             "again",
-            *(path, len(damaged), len(lines), damaged[0]),
+            path,
+            len(damaged),
+            len(lines),
+            damaged[0],
         )
     with suppress(ValueError):  # torn, unless only its end is missing
         record = KeyRecord.from_line(tail)

@@ -38,7 +38,7 @@ METHODS = ("flow", "icp", "none")
 _FILE = "dataset.json"
 _LARGEST_WINDOW = 50
 _SAME = ("densify", "layout", "method", "window", "cameras", "gate", "config")
-"""Of dataset.json: what a set's runs must agree in."""
+"""Entries of dataset.json in which all runs of a set must agree."""
 
 
 @dataclass(frozen=True)

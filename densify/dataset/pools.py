@@ -24,7 +24,7 @@ TRIES = 3  # workers that may die of one task
 
 @contextmanager
 def open_pools(num_workers: int) -> Iterator[Workers]:
-    """As many processes for the time of the block; with no limit of memory."""
+    """So many processes for the time of the block, without a limit of memory."""
     lifeline, ours = multiprocessing.get_context("spawn").Pipe(duplex=False)
     pools = _Pools(num_workers, lifeline)
     try:

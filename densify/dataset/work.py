@@ -145,7 +145,9 @@ def _written(job: Job, results: Mapping[str, Result]) -> dict[str, FileRecord]:
         sparse = results["none"].depth
         return write_key(job.out, job.source.folder, result.key, sparse, result.depth)
     paths = write_result(
-        *(result, result.images, job.out / job.source.folder),
+        result,
+        result.images,
+        job.out / job.source.folder,
         config=as_mapping(job.recipe.config),
         data=job.source.data,
         overwrite=True,

@@ -78,7 +78,10 @@ def key_shots(
         if not near:
             _log.warning(
                 "key %d: %s has no image of %s within %.0f ms of the sweep: %s",
-                *(key, sequence.name, camera.name, (end_ns - begin_ns) / 2e6),
+                key,
+                sequence.name,
+                camera.name,
+                (end_ns - begin_ns) / 2e6,
                 "no depth map" if settings.per == "image" else "its depth map has no colour",
             )
     return shots

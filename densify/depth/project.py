@@ -176,7 +176,8 @@ def _in_image(cloud: Cloud, exposure: Exposure, patches: Patches, vetoed: bool) 
 def _pinhole(
     exposure: Exposure, points_cam: Float, depth: Float32, normal: Float, spacing_m: Float32
 ) -> _Local:
-    """Of the camera z of a rectified image, where patches count as facing the image plane."""
+    """Scale for the camera z of a rectified image, where patches count as facing the image
+    plane."""
     focal_px = exposure.camera.K[[0, 1], [0, 1]]
     # On the plane n · p = d the inverse depth is n · ray / d: linear over the image.
     d = np.einsum("ij,ij->i", normal, points_cam)
@@ -189,7 +190,7 @@ def _pinhole(
 def _any_lens(
     exposure: Exposure, points_cam: Float, depth: Float32, normal: Float, spacing_m: Float32
 ) -> _Local:
-    """By the Jacobian J (2,3) of the projection at each point p.
+    """Scale by the Jacobian J (2,3) of the projection at each point p.
 
     Moving on the plane n · p = d so that the image moves by one pixel, p moves by
     δ = J⁺ - p (n · J⁺) / d, and the inverse depth by -δ_z / z², the inverse range by -p · δ / r³.

@@ -64,8 +64,8 @@ class Views:
         return Views(key, key_image, exposures, origins, settings.project)
 
     def depth(self, cloud: Cloud, visible: bool = True, filled: bool = True) -> dict[str, DepthMap]:
-        """By name. visible: leave out what is hidden, vetoed or doubtful. filled: and fill
-        between what is measured."""
+        """Depth maps by name. visible: leave out what is hidden, vetoed or doubtful. filled: and
+        fill between what is measured."""
         settings = replace(self.settings, visibility=visible)
         surface = patches(cloud, self.key, settings, self.origins, self.key_image)
         return {
@@ -86,7 +86,7 @@ class Views:
         return cloud
 
     def truth(self, truth: Truth) -> dict[str, tuple[Float32, Bool]]:
-        """Of the maps that show an image: its true depth, measured as the map's, and (H,W) where
+        """For the maps that show an image: its true depth, measured as the map's, and (H,W) where
         something moves."""
         known = {}
         for name, e in self.exposures.items():
@@ -163,7 +163,7 @@ class HeldOut:
         return HeldOut(views, key_alone, moving)
 
     def scores(self, cloud: Cloud, visible: bool) -> dict[str, Any] | None:
-        """By name, as `densify.scores.depth_metrics.depth_scores`, and the ``curve`` of
+        """Scores by name, as `densify.scores.depth_metrics.depth_scores`, and the ``curve`` of
         precision over density; None for a cloud of the key sweep alone."""
         rest = cloud.select(cloud.frame != self.views.key)
         if not len(rest):

@@ -29,7 +29,7 @@ class ChainedMotion:
     _found: dict[tuple[int, int], FlowField] = field(default_factory=dict, repr=False)
 
     def flow(self, frame: int, target: int) -> FlowField:
-        """Of every point of a sweep to another sweep's reference time; both by frame number.
+        """Flow of every point of a sweep to another sweep's reference time; both by frame number.
 
         The flow of the next sweep is looked up at the moved point: an object's points all share its
         rigid motion there plus what the nearest of them deviate from it; a point without an object

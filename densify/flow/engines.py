@@ -41,7 +41,7 @@ class EngineModule(Protocol):
 
 
 def estimate_motion(scene: Scene, settings: Config, spec: str | None = None) -> Motion:
-    """By the engine ``NAME[:ARGUMENT]``, that of ``flow.engine`` if None."""
+    """Estimate by the engine ``NAME[:ARGUMENT]``, that of ``flow.engine`` if None."""
     row, argument = engine(spec or settings.flow.engine)
     module = cast(EngineModule, ENGINES.module(row))
     return module.estimate_motion(scene, settings, argument)

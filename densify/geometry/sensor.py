@@ -73,7 +73,7 @@ def aimed(registered: RegisteredSweep, lidar: int) -> Aimed:
 
 
 def some_sectors(rays: Aimed) -> Aimed:
-    """Of a view all round every fourth sector tells as much."""
+    """Rows of every fourth sector: they tell as much of a view all round."""
     if len(rays.azimuth) > _MANY_POINTS:
         some = np.floor(rays.azimuth / _SECTOR_RAD) % 4 == 0
         if some.mean() > 0.1:

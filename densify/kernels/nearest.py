@@ -336,7 +336,7 @@ def _align(
     min_matches: int,
     state: Float,
 ) -> bool:
-    """As `BoxTree.align`; the state is changed in place."""
+    """See `BoxTree.align`; changes the state in place."""
     found, predicted = np.full(len(queries), -1), state.copy()
     at, squared = np.empty((len(queries), 3)), np.empty(len(queries))
     H, g = np.empty((3, 3)), np.empty(3)

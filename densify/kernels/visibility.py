@@ -90,7 +90,8 @@ def _beside(grid, row, column, rows, columns):  # type: ignore[no-untyped-def]
 
 @inlined
 def _change(seen, i, there, axis, across, slope_across):  # type: ignore[no-untyped-def]
-    """Of inverse range per radian along one angle, that along the other taken off; NaN if none."""
+    """Slope of inverse range per radian along one angle, that along the other taken off; NaN if
+    none."""
     if there < 0:
         return np.nan
     apart = seen[axis, there] - seen[axis, i]

@@ -17,7 +17,7 @@ from densify.types import Result
 
 
 def write_output(result: Result, context: Context, folder: Path) -> None:
-    """As `densify.outputs.store.OutputModule`. Raises ValueError for maps without ages."""
+    """See `densify.outputs.store.OutputModule`. Raises ValueError for maps without ages."""
     for camera, depth in result.depth.items():
         if depth.age_s is None:
             raise ValueError(f"depth map of {camera}: expected ages, see densify.depth.age")

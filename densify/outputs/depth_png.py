@@ -131,7 +131,7 @@ def read_mask_png(path: Path) -> Bool:
 
 
 def _decoded(path: Path) -> NDArray[Any] | None:
-    """As it is stored; None if it is no image, or not whole."""
+    """The image as it is stored; None if it is no image, or not whole."""
     try:
         data = path.read_bytes()
     except OSError as error:

@@ -118,7 +118,7 @@ def _check_thresholds(min_confidence: float, max_age_ms: float | None) -> None:
 
 
 def _cameras(run: Path) -> list[str]:
-    """Of which all maps are there."""
+    """Cameras of which all maps are there."""
     if not (run / "run.yaml").is_file():
         raise InputError(
             f"{run}: no run.yaml in it; expected the folder of a finished run and key, such as "
@@ -137,7 +137,7 @@ def _cameras(run: Path) -> list[str]:
 
 
 def _read_maps(run: Path, camera: str) -> dict[str, NDArray[Any]]:
-    """By product, (H,W) each, as stored."""
+    """Maps by product, (H,W) each, as stored."""
     maps = {
         p: read_stored(run / p / f"{camera}.png", kind, f"a map of {p}")
         for p, kind in _KINDS.items()

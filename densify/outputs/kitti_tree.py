@@ -42,7 +42,7 @@ _FOLDER_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,99}")
 
 
 def split_of(drive: str) -> Split:
-    """Of KITTI's depth benchmark: "val" for its 13 validation drives, "train" for every other
+    """Split of KITTI's depth benchmark: "val" for its 13 validation drives, "train" for every other
     recording.
 
     drive: a recording's name, such as ``2011_09_26_drive_0013_sync``.

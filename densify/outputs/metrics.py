@@ -31,7 +31,7 @@ from densify.outputs.plain import write_json
 from densify.types import Result
 
 SCHEMA_VERSION = 1
-"""Of metrics.json and compare.json; grows when a key changes its meaning or goes."""
+"""Version of metrics.json and compare.json; grows when a key changes its meaning or goes."""
 
 
 def write_output(result: Result, context: Context, folder: Path) -> None:

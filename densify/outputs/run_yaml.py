@@ -45,7 +45,7 @@ def write_output(result: Result, context: Context, folder: Path) -> None:
 
 
 def versions() -> dict[str, str | None]:
-    """Of densify, Python, the platform and the packages that results depend on."""
+    """Versions of densify, Python, the platform and the packages that results depend on."""
     found: dict[str, str | None] = {
         "densify": __version__,
         "python": platform.python_version(),

@@ -31,7 +31,7 @@ class Engine:
 
     @property
     def usage(self) -> str:
-        """As in ``flow.engine``."""
+        """How ``flow.engine`` names it."""
         return f"{self.name}:{self.argument}" if self.argument else self.name
 
 

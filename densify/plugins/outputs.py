@@ -26,7 +26,7 @@ class Output:
 
     @property
     def usage(self) -> str:
-        """As in ``output.also``."""
+        """How ``output.also`` names it."""
         return self.name
 
 

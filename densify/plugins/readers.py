@@ -29,7 +29,7 @@ class Reader:
 
     @property
     def usage(self) -> str:
-        """As in ``READER:PATH``."""
+        """How ``READER:PATH`` names it."""
         return self.name
 
 

@@ -22,7 +22,7 @@ from densify.readers.kitti_files import Calibration, Stamps, parse_numbers, read
 from densify.types import Camera, Float, Int, Sweep, Truth
 
 KITTI_TRIGGER_LATENCY_NS = 10_500_000
-"""By how much KITTI's recorded image stamps lag the exposure. The cameras are triggered when the
+"""How much KITTI's recorded image stamps lag the exposure. The cameras are triggered when the
 scanner faces forward, at the sweep's reference time; drives 0002 and 0013 of 2011_09_26 record
 10.50 ms (image_02) and 9.96 ms (image_03) after it."""
 
@@ -32,7 +32,7 @@ _NUM_OXTS_VALUES = 30
 
 
 def open_recording(path: Path, scene: str | None) -> KittiRaw:
-    """As `densify.readers.ReaderModule`; a drive has no scenes."""
+    """See `densify.readers.ReaderModule`; a drive has no scenes."""
     return KittiRaw(path)
 
 

@@ -116,7 +116,7 @@ def searched_twist(sweeps: Sequence[Sweep], settings: RegisterSettings) -> Float
         pairs.append((_tree(earlier), sample, ratio))
 
     def best(steps_m: Float) -> Float:
-        """Of (n,3) motions between the first two sweeps; among equal ones the slowest."""
+        """The best of (n,3) motions between the first two sweeps; among equal ones the slowest."""
         cost = 1e-3 * np.linalg.norm(steps_m, axis=1)
         for tree, sample, ratio in pairs:
             moved = (sample + ratio * steps_m[:, None, :]).reshape(-1, 3)

@@ -173,8 +173,8 @@ def depth_edges(truth_m: Float32, *, focal_px: float, baseline_m: float = KITTI_
 
 
 def mean_errors(images: Sequence[DepthErrors]) -> DepthErrors:
-    """Of several images: the mean of each image's value, as the kit has it, over the images where
-    it is defined, whatever their number of pixels; counts are added up."""
+    """Average several images: the mean of each image's value, as the kit has it, over the images
+    where it is defined, whatever their number of pixels; counts are added up."""
     means: dict[str, Any] = {}
     for field in fields(DepthErrors):
         values = [value for image in images if (value := getattr(image, field.name)) is not None]

@@ -60,7 +60,8 @@ class Motion(Protocol):
     """How everything in a stretch moves, whatever found it out."""
 
     def flow(self, frame: int, target: int) -> FlowField:
-        """Of every point of a sweep to another sweep's reference time; both by frame number."""
+        """Flow of every point of a sweep to another sweep's reference time; both by frame
+        number."""
         ...
 
 

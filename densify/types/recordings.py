@@ -61,7 +61,7 @@ class LidarSequence(Protocol):
 
     @property
     def frames(self) -> Sequence[int]:
-        """Of the sweeps that exist, ascending."""
+        """Numbers of the sweeps that exist, ascending."""
         ...
 
     @property

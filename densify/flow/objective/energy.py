@@ -164,5 +164,5 @@ class _QuadraticForm(torch.autograd.Function):
 
 
 def _sum(values: Tensor) -> Tensor:
-    """Of all values: torch splits a long sum on the CPU by its threads, numpy does not."""
+    """Sum of all values: torch splits a long sum on the CPU by its threads, numpy does not."""
     return values.sum() if values.is_cuda else torch.tensor(values.numpy().sum())

@@ -12,7 +12,7 @@ from densify.types import FlowField, Motion
 
 
 def estimate_motion(scene: Scene, settings: Config, argument: str) -> Motion:
-    """As `densify.flow.engines.EngineModule`; takes no argument."""
+    """See `densify.flow.engines.EngineModule`; takes no argument."""
 
     def step(here: int, there: int) -> FlowField:
         return _step(scene, here, there, settings)
@@ -21,7 +21,7 @@ def estimate_motion(scene: Scene, settings: Config, argument: str) -> Motion:
 
 
 def _step(scene: Scene, here: int, there: int, settings: Config) -> FlowField:
-    """Of the points above the ground of one sweep to another's time; sweeps by number."""
+    """Flow of one sweep's points above the ground to another's time; sweeps by number."""
     clouds = [
         poses.transform(s.T_world_lidar, s.sweep.points)
         for s in (scene.stretch.sweeps[here], scene.stretch.sweeps[there])

@@ -216,7 +216,7 @@ def _assigned(trials: list[_Trial], target_group: Int) -> list[_Trial]:
 def _trials(
     hypotheses: Hypotheses, groups: list[Int], ours: _Evidence, theirs: _Evidence
 ) -> list[_Trial]:
-    """Of the hypotheses that pass a first look, in the source alone."""
+    """Judge the hypotheses that pass a first look, in the source alone."""
     num = len(hypotheses.state)
     row, of_point = hypotheses.row, hypotheses.of_point
     place = ours.cloud.places(hypotheses.seen(hypotheses.share[of_point]), row)
@@ -241,8 +241,16 @@ def _trials(
         still_there, around, explained, back_m = _looked_back(motion, groups[k], ours, theirs)
         trials.append(
             _Trial(
-                *(k, motion, int(still[h]), int(left[h]), float(misfit[h])),
-                *(still_there, around, explained, float(gain_m[h]), float(gain_m[h]) + back_m),
+                group=k,
+                motion=motion,
+                still=int(still[h]),
+                left=int(left[h]),
+                misfit=float(misfit[h]),
+                still_there=still_there,
+                around=around,
+                explained=explained,
+                own_gain_m=float(gain_m[h]),
+                gain_m=float(gain_m[h]) + back_m,
             )
         )
     return trials

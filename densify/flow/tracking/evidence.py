@@ -113,12 +113,16 @@ class Standing:
 
     @staticmethod
     def of(stretch: Stretch, i: int, found: Candidates) -> Standing:
-        """Of sweep number i."""
+        """Place the candidates of sweep number i in the world."""
         registered = stretch.sweeps[i]
         points = poses.transform(registered.T_world_lidar, registered.sweep.points[found.row])
         return Standing(
-            *(found.row, points, firing_times_s(stretch, i)[found.row]),
-            *(found.seed, found.cluster, found.num_clusters),
+            row=found.row,
+            points=points,
+            time_s=firing_times_s(stretch, i)[found.row],
+            seed=found.seed,
+            cluster=found.cluster,
+            num_clusters=found.num_clusters,
         )
 
     @property

@@ -53,11 +53,11 @@ class GroupMotion:
     bendings: Mapping[int, Bending]
 
     def with_stretch(self, stretch: Stretch) -> GroupMotion:
-        """As `densify.flow.engines.SharedMotion`."""
+        """See `densify.flow.engines.SharedMotion`."""
         return replace(self, stretch=stretch)
 
     def flow(self, frame: int, target: int) -> FlowField:
-        """Of every point of a sweep to another sweep's reference time; both by frame number.
+        """Flow of every point of a sweep to another sweep's reference time; both by frame number.
 
         Points of an object that was last seen more than 0.2 s before the target, or first seen more
         than that after it, are lost.
@@ -151,7 +151,7 @@ def _bendings(
     fine: Sequence[bool],
     instance: Sequence[NDArray[np.int32]],
 ) -> dict[int, Bending]:
-    """Of the objects that certainly bend, among those seen finely."""
+    """Find the bendings of objects that certainly bend, among those seen finely."""
 
     def of_track(k: int) -> Bending:
         parts, sweeps = [], []

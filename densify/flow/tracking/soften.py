@@ -186,7 +186,7 @@ def _squared_distance(a: Float, b: Float) -> float:
 
 
 class _Bending:
-    """Of all parts at once, each to the next and to the previous one.
+    """Bends all parts at once, each to the next and to the previous one.
 
     A hop leads from one part to a neighbour. The nodes of all hops lie in one cloud, far apart, so
     that one search and one system of equations serve all. With the targets held, ``refine`` solves
