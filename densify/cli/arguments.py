@@ -9,6 +9,8 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from densify.cli import verbs
+from densify.cli.bench_arguments import add_bench
+from densify.cli.dataset_arguments import add_dataset
 from densify.cli.options import (
     DATA_HELP,
     add_camera,
@@ -24,7 +26,6 @@ from densify.cli.options import (
     key_slice,
     natural,
     positive,
-    shard,
     size_bytes,
     words,
 )
@@ -42,13 +43,13 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     commands = parser.add_subparsers(title="verbs", metavar="VERB", required=True)
     _add_run(commands)
     _add_compare(commands)
-    _add_dataset(commands)
+    add_dataset(commands)
     _add_flow(commands)
     _add_info(commands)
     _add_simulate(commands)
     _add_export(commands)
     _add_evaluate(commands)
-    _add_bench(commands)
+    add_bench(commands)
     return parser.parse_args(arguments)
 
 
@@ -100,110 +101,6 @@ def _add_compare(commands: Any) -> None:
         "default: none,icp,paper,flow",
     )
     add_output_options(parser)
-
-
-def _add_dataset(commands: Any) -> None:
-    parser = add_verb(
-        commands,
-        "dataset",
-        verbs.dataset,
-        "every key of whole recordings, as a training set",
-        "Run again, the same command goes on where it was stopped. Shares are from 0 to 1. "
-        + config_epilog(),
-    )
-    parser.add_argument(
-        "--data", metavar="SPEC", nargs="+", action="extend", help=f"{DATA_HELP}; one or more"
-    )
-    parser.add_argument(
-        "--keys",
-        type=key_slice,
-        default="all",
-        metavar="all|A:B[:S]",
-        help="frames A to B-1, every S-th (default: all)",
-    )
-    add_window(parser)
-    parser.add_argument(
-        "--out", metavar="DIR", type=Path, help="the set's folder: a new one, or one to go on with"
-    )
-    parser.add_argument(
-        "--layout",
-        choices=("kitti-depth", "densify"),
-        default="kitti-depth",
-        help="kitti-depth: the tree of KITTI's depth completion benchmark; densify: what run "
-        "writes, for every key (default: kitti-depth)",
-    )
-    add_method(parser)
-    add_camera(parser)
-    parser.add_argument(
-        "--split",
-        choices=("train", "val"),
-        help="of the tree (default: KITTI's official one, train for other recordings)",
-    )
-    _add_gate(parser)
-    _add_workers(parser)
-    parser.add_argument(
-        "--status", metavar="DIR", type=Path, help="how far the set in DIR is; makes nothing"
-    )
-    add_short_options(parser)
-    add_config_options(parser)
-
-
-def _add_gate(parser: argparse.ArgumentParser) -> None:
-    gate = parser.add_argument_group(
-        "quality gate", "a key that misses a limit is put aside: into the manifest, not the set"
-    )
-    gate.add_argument(
-        "--max-ghost",
-        type=float,
-        metavar="SHARE",
-        help="of the accumulated points that stand where the key sweep saw through",
-    )
-    gate.add_argument(
-        "--min-density", type=float, metavar="SHARE", help="of the pixels with a measured depth"
-    )
-    gate.add_argument(
-        "--max-outliers",
-        type=float,
-        metavar="SHARE",
-        help="of the key sweep's returns that the map made without it misses",
-    )
-    gate.add_argument(
-        "--min-sweeps", type=natural, metavar="N", help="in the window, cut at ends and gaps"
-    )
-
-
-def _add_workers(parser: argparse.ArgumentParser) -> None:
-    work = parser.add_argument_group("where it is made")
-    work.add_argument(
-        "--workers",
-        type=natural,
-        default=1,
-        metavar="N",
-        help="processes on this machine, a local Dask cluster if densify[cluster] is installed "
-        "(default: 1)",
-    )
-    work.add_argument(
-        "--scheduler",
-        metavar="ADDRESS",
-        help="of a running Dask scheduler, such as tcp://host:8786, whose workers are used; they "
-        "need the same files at the same paths",
-    )
-    work.add_argument(
-        "--shard",
-        type=shard,
-        metavar="i/n",
-        help="the i-th of n parts of the work, for machines that share DIR",
-    )
-    work.add_argument(
-        "--memory", type=size_bytes, metavar="SIZE", help="of all processes together, such as 8G"
-    )
-    work.add_argument(
-        "--cache-size",
-        type=size_bytes,
-        default="10G",
-        metavar="SIZE",
-        help="of what is kept on disk for later runs (default: 10G)",
-    )
 
 
 def _add_flow(commands: Any) -> None:
@@ -339,59 +236,6 @@ def _add_evaluate(commands: Any) -> None:
         metavar="B",
         help="stereo baseline that outliers are told by (default: KITTI's, 0.54)",
     )
-    parser.add_argument("--out", metavar="FILE.json", type=Path, help="write every number there")
-    add_overwrite(parser)
-
-
-def _add_bench(commands: Any) -> None:
-    about = "measured tables: this package's methods beside published ones"
-    parser = commands.add_parser("bench", help=about, description=f"{about.capitalize()}.")
-    benches = parser.add_subparsers(title="benches", metavar="WHAT", required=True)
-    _add_bench_flow(benches)
-
-
-def _add_bench_flow(benches: Any) -> None:
-    parser = add_verb(
-        benches,
-        "flow",
-        verbs.bench_flow,
-        "scene flow methods on the same pairs and windows: error, energy, seconds, memory",
-        "Methods: ours (all sweeps), ours-pair (two sweeps), paper (the published objective, our "
-        "solver), paper-adam (its own solver, 1,500 steps: minutes), rigid, cluster-icp, nicp "
-        "(non-rigid ICP). Errors need a recording with truth, such as the built-in street.",
-    )
-    parser.add_argument(
-        "--data", metavar="SPEC", action="append", help=f"{DATA_HELP}; may be given several times"
-    )
-    parser.add_argument(
-        "--key",
-        type=natural,
-        action="append",
-        dest="keys",
-        metavar="K",
-        help="frame in the middle; may be given several times (default: 120)",
-    )
-    add_window(parser)
-    parser.add_argument(
-        "--methods",
-        type=words,
-        metavar="NAME,…",
-        help="of those below, or all (default: all but paper-adam)",
-    )
-    parser.add_argument(
-        "--pairs-only",
-        action="store_true",
-        help="one pair of sweeps for each key; nothing is accumulated",
-    )
-    parser.add_argument(
-        "--max-points",
-        type=natural,
-        default=8000,
-        metavar="N",
-        help="points that paper, paper-adam and nicp may move; more is slower and finer, 0: all "
-        "(default: 8000)",
-    )
-    add_config_options(parser)
     parser.add_argument("--out", metavar="FILE.json", type=Path, help="write every number there")
     add_overwrite(parser)
 

@@ -1,0 +1,71 @@
+# SPDX-License-Identifier: MIT
+"""Options of ``densify bench``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from densify.cli import verbs
+from densify.cli.options import (
+    DATA_HELP,
+    add_config_options,
+    add_overwrite,
+    add_verb,
+    add_window,
+    natural,
+    words,
+)
+
+
+def add_bench(commands: Any) -> None:
+    about = "measured tables: this package's methods beside published ones"
+    parser = commands.add_parser("bench", help=about, description=f"{about.capitalize()}.")
+    benches = parser.add_subparsers(title="benches", metavar="WHAT", required=True)
+    _add_bench_flow(benches)
+
+
+def _add_bench_flow(benches: Any) -> None:
+    parser = add_verb(
+        benches,
+        "flow",
+        verbs.bench_flow,
+        "scene flow methods on the same pairs and windows: error, energy, seconds, memory",
+        "Methods: ours (all sweeps), ours-pair (two sweeps), paper (the published objective, our "
+        "solver), paper-adam (its own solver, 1,500 steps: minutes), rigid, cluster-icp, nicp "
+        "(non-rigid ICP). Errors need a recording with truth, such as the built-in street.",
+    )
+    parser.add_argument(
+        "--data", metavar="SPEC", action="append", help=f"{DATA_HELP}; may be given several times"
+    )
+    parser.add_argument(
+        "--key",
+        type=natural,
+        action="append",
+        dest="keys",
+        metavar="K",
+        help="frame in the middle; may be given several times (default: 120)",
+    )
+    add_window(parser)
+    parser.add_argument(
+        "--methods",
+        type=words,
+        metavar="NAME,…",
+        help="of those below, or all (default: all but paper-adam)",
+    )
+    parser.add_argument(
+        "--pairs-only",
+        action="store_true",
+        help="one pair of sweeps for each key; nothing is accumulated",
+    )
+    parser.add_argument(
+        "--max-points",
+        type=natural,
+        default=8000,
+        metavar="N",
+        help="points that paper, paper-adam and nicp may move; more is slower and finer, 0: all "
+        "(default: 8000)",
+    )
+    add_config_options(parser)
+    parser.add_argument("--out", metavar="FILE.json", type=Path, help="write every number there")
+    add_overwrite(parser)

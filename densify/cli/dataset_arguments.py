@@ -1,0 +1,128 @@
+# SPDX-License-Identifier: MIT
+"""Options of ``densify dataset``."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from densify.cli import verbs
+from densify.cli.options import (
+    DATA_HELP,
+    add_camera,
+    add_config_options,
+    add_method,
+    add_short_options,
+    add_verb,
+    add_window,
+    config_epilog,
+    key_slice,
+    natural,
+    shard,
+    size_bytes,
+)
+
+
+def add_dataset(commands: Any) -> None:
+    parser = add_verb(
+        commands,
+        "dataset",
+        verbs.dataset,
+        "every key of whole recordings, as a training set",
+        "Run again, the same command goes on where it was stopped. Shares are from 0 to 1. "
+        + config_epilog(),
+    )
+    parser.add_argument(
+        "--data", metavar="SPEC", nargs="+", action="extend", help=f"{DATA_HELP}; one or more"
+    )
+    parser.add_argument(
+        "--keys",
+        type=key_slice,
+        default="all",
+        metavar="all|A:B[:S]",
+        help="frames A to B-1, every S-th (default: all)",
+    )
+    add_window(parser)
+    parser.add_argument(
+        "--out", metavar="DIR", type=Path, help="the set's folder: a new one, or one to go on with"
+    )
+    parser.add_argument(
+        "--layout",
+        choices=("kitti-depth", "densify"),
+        default="kitti-depth",
+        help="kitti-depth: the tree of KITTI's depth completion benchmark; densify: what run "
+        "writes, for every key (default: kitti-depth)",
+    )
+    add_method(parser)
+    add_camera(parser)
+    parser.add_argument(
+        "--split",
+        choices=("train", "val"),
+        help="of the tree (default: KITTI's official one, train for other recordings)",
+    )
+    _add_gate(parser)
+    _add_workers(parser)
+    parser.add_argument(
+        "--status", metavar="DIR", type=Path, help="how far the set in DIR is; makes nothing"
+    )
+    add_short_options(parser)
+    add_config_options(parser)
+
+
+def _add_gate(parser: argparse.ArgumentParser) -> None:
+    gate = parser.add_argument_group(
+        "quality gate", "a key that misses a limit is put aside: into the manifest, not the set"
+    )
+    gate.add_argument(
+        "--max-ghost",
+        type=float,
+        metavar="SHARE",
+        help="of the accumulated points that stand where the key sweep saw through",
+    )
+    gate.add_argument(
+        "--min-density", type=float, metavar="SHARE", help="of the pixels with a measured depth"
+    )
+    gate.add_argument(
+        "--max-outliers",
+        type=float,
+        metavar="SHARE",
+        help="of the key sweep's returns that the map made without it misses",
+    )
+    gate.add_argument(
+        "--min-sweeps", type=natural, metavar="N", help="in the window, cut at ends and gaps"
+    )
+
+
+def _add_workers(parser: argparse.ArgumentParser) -> None:
+    work = parser.add_argument_group("where it is made")
+    work.add_argument(
+        "--workers",
+        type=natural,
+        default=1,
+        metavar="N",
+        help="processes on this machine, a local Dask cluster if densify[cluster] is installed "
+        "(default: 1)",
+    )
+    work.add_argument(
+        "--scheduler",
+        metavar="ADDRESS",
+        help="of a running Dask scheduler, such as tcp://host:8786, whose workers are used; they "
+        "need the same files at the same paths",
+    )
+    work.add_argument(
+        "--shard",
+        type=shard,
+        metavar="i/n",
+        help="the i-th of n parts of the work, for machines that share DIR",
+    )
+    work.add_argument(
+        "--memory", type=size_bytes, metavar="SIZE", help="of all processes together, such as 8G"
+    )
+    work.add_argument(
+        "--cache-size",
+        type=size_bytes,
+        default="10G",
+        metavar="SIZE",
+        help="of what is kept on disk for later runs (default: 10G)",
+    )
