@@ -1,5 +1,10 @@
 # SPDX-License-Identifier: MIT
-"""Shared by all tests: a cache of their own, and the real data where there is some."""
+"""Shared by all tests and by the processes that run them: the cores, a cache, and the real data
+where there is some.
+
+The files of tests are spread over processes, one for each core (pyproject.toml); ``pytest -n0``
+runs all in one.
+"""
 
 from __future__ import annotations
 
@@ -9,16 +14,28 @@ from pathlib import Path
 
 import pytest
 
-from tests.command import exit_code
-from tests.dataset_scenes import OPTIONS, across_border, write_drive
+from densify.dataset.pools import share_of_cores
+
+NUM_PROCESSES = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
+if NUM_PROCESSES > 1:  # libraries read it when imported: the tests' own modules come after it
+    os.environ.update(share_of_cores(NUM_PROCESSES))
+
+from tests.command import exit_code  # noqa: E402
+from tests.dataset_scenes import OPTIONS, across_border, write_drive  # noqa: E402
 
 
 @pytest.fixture(scope="session", autouse=True)
 def own_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    """Simulated sweeps go to a folder of this test session, never to the user's cache."""
+    """Simulated sweeps go to a folder of this test session, never to the user's cache.
+
+    All processes share it, so that a sweep is rendered once. Delete a folder given by
+    DENSIFY_CACHE_DIR when the street changes.
+    """
     with pytest.MonkeyPatch.context() as patch:
         if "DENSIFY_CACHE_DIR" not in os.environ:
-            patch.setenv("DENSIFY_CACHE_DIR", str(tmp_path_factory.mktemp("cache")))
+            temporary = tmp_path_factory.getbasetemp()
+            session = temporary.parent if NUM_PROCESSES > 1 else temporary
+            patch.setenv("DENSIFY_CACHE_DIR", str(session / "cache"))
         yield Path(os.environ["DENSIFY_CACHE_DIR"])
 
 

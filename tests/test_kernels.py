@@ -26,8 +26,9 @@ def double(first, last, values, out):
 
 
 @pytest.fixture
-def double(tmp_path):
-    """A function with a source file of its own."""
+def double(tmp_path, monkeypatch):
+    """A function with a source file of its own, and the cache beside it."""
+    monkeypatch.setattr("numba.config.CACHE_DIR", "")
     path = tmp_path / "doubling.py"
     path.write_text(SOURCE)
     spec = importlib.util.spec_from_file_location("doubling", path)

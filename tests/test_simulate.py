@@ -20,10 +20,8 @@ FRAMES = [58, 60]
 
 
 @pytest.fixture(scope="module")
-def street(tmp_path_factory) -> Street:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("DENSIFY_CACHE_DIR", str(tmp_path_factory.mktemp("cache")))
-        return Street("street", 0, "vlp16")
+def street() -> Street:
+    return Street("street", 0, "vlp16")
 
 
 @pytest.fixture(scope="module")

@@ -27,14 +27,6 @@ KEY = 120
 PERIOD_NS = 100_000_000
 
 
-@pytest.fixture(scope="module", autouse=True)
-def cache(tmp_path_factory):
-    with pytest.MonkeyPatch.context() as patch:
-        folder = tmp_path_factory.mktemp("cache")
-        patch.setenv("DENSIFY_CACHE_DIR", str(folder))
-        yield folder
-
-
 @pytest.fixture(scope="module")
 def street() -> Street:
     return Street.from_spec("street")

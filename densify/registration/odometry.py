@@ -30,7 +30,7 @@ _OVERLAP_M = 0.5
 # Change of a sweep's pose (rad and m) below which it counts as found. The first pass only has to
 # find the motion within a sweep: 3 mm over 0.1 s bend its ends by 1.5 mm.
 _ROUGHLY_CONVERGED = 3e-3
-_CONVERGED = 1e-3
+_CONVERGED = 5e-4
 
 
 def register(
