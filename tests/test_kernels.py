@@ -74,6 +74,19 @@ def test_a_cache_that_cannot_be_written_does_not_matter(double, tmp_path, monkey
     assert not list(tmp_path.rglob("*.nbc"))
 
 
+def test_compiling_is_announced_once_and_loading_is_not(double, caplog, monkeypatch):
+    monkeypatch.setattr(kernels._notice, "said", False)
+    caplog.set_level("INFO", "densify.progress")
+    double.__module__ = "densify.kernels.doubling"
+    check(kernels.Kernel(double))
+    assert [r.getMessage().split()[0] for r in caplog.records] == ["compiling"]
+    kernels.Kernel(double)(0, 2, np.arange(2), np.zeros(2))  # other types
+    assert len(caplog.records) == 1
+    monkeypatch.setattr(kernels._notice, "said", False)
+    check(kernels.Kernel(double))  # from the cache
+    assert len(caplog.records) == 1
+
+
 def test_without_any_place_for_a_cache():
     namespace: dict = {}
     exec(SOURCE, namespace)  # a function without a source file

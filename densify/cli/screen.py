@@ -34,19 +34,21 @@ class _LineHandler(logging.Handler):
 
 @contextmanager
 def logging_to_stderr() -> Iterator[logging.Logger]:
-    """The package's logger writes to stderr inside the block."""
-    log = logging.getLogger("densify")
-    handler, before = _LineHandler(), (log.level, log.propagate)
+    """The package's logger writes to stderr inside the block; what takes long, on a terminal."""
+    log, progress = logging.getLogger("densify"), logging.getLogger("densify.progress")
+    handler, before = _LineHandler(), (log.level, log.propagate, progress.level)
     handler.setLevel(logging.INFO)
     log.addHandler(handler)
     log.setLevel(logging.INFO)
     log.propagate = False
+    progress.setLevel(logging.INFO if sys.stderr.isatty() else logging.WARNING)
     try:
         yield log
     finally:
         log.removeHandler(handler)
         log.setLevel(before[0])
         log.propagate = before[1]
+        progress.setLevel(before[2])
 
 
 @contextmanager

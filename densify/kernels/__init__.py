@@ -12,14 +12,36 @@ from collections.abc import Callable
 from typing import Any, TypeVar
 
 import numba
+from numba.core import event
 
 from densify.kernels import threads
 
 _log = logging.getLogger("densify")
+_progress = logging.getLogger("densify.progress")
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 
 # No fastmath, and divisions as numpy has them: a result is the same on every machine.
 _OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy"}
+
+
+class _Notice(event.Listener):
+    """Says once that the first run takes longer; numba tells what it has to compile."""
+
+    said = False
+
+    def on_start(self, event: event.Event) -> None:
+        if not self.said and str(event.data["dispatcher"].__module__).startswith("densify."):
+            self.said = True
+            _progress.info(
+                "compiling the inner loops, once for this installation: 10 to 20 s in all"
+            )
+
+    def on_end(self, event: event.Event) -> None:
+        pass
+
+
+_notice = _Notice()
+event.register("numba:compile", _notice)
 
 
 def inlined(function: _Function) -> _Function:

@@ -130,11 +130,14 @@ def _scatter(
 
 @Kernel
 def _sort_rows(begin: int, end: int, starts: Index, columns: Index, filled: Float) -> None:
+    """By insertion: rows are short, and numba's own sort takes seconds to compile."""
     for i in range(begin, end):
-        row = slice(starts[i], starts[i + 1])
-        order = np.argsort(columns[row])
-        columns[row] = columns[row][order]
-        filled[row] = filled[row][order]
+        for e in range(starts[i] + 1, starts[i + 1]):
+            column, value, at = columns[e], filled[e], e
+            while at > starts[i] and columns[at - 1] > column:
+                columns[at], filled[at] = columns[at - 1], filled[at - 1]
+                at -= 1
+            columns[at], filled[at] = column, value
 
 
 @Kernel

@@ -359,4 +359,7 @@ def settle(first, last, points, reaches, shape, found):  # type: ignore[no-untyp
         found[1, p], found[2, p], found[3, p] = num_sweeps, youngest, num
         mean = m[6] / m[0]
         found[4, p] = np.sqrt(max(squares / m[0] - mean * mean, 0.0)) / (w0 * w0)
-        found[5, p] = np.min(reach) / inner if behind and inner > 0 else _ALL_ROUND
+        shortest = reach[0]
+        for side in range(1, len(reach)):
+            shortest = min(shortest, reach[side])
+        found[5, p] = shortest / inner if behind and inner > 0 else _ALL_ROUND

@@ -34,6 +34,7 @@ from densify.types import Bool, Camera, Float, Float32, Sweep, SweepTruth
 
 Arrays = dict[str, NDArray[Any]]
 _log = logging.getLogger("densify")
+_progress = logging.getLogger("densify.progress")
 _KEPT_IN_MEMORY = 16
 _RATES_HZ = ("5", "10", "20")
 _MAX_TILT_DEG = 45
@@ -223,12 +224,18 @@ class _Store:
         digest = hashlib.sha256(identity.encode()).hexdigest()[:16]
         self._folder = Path(root) / "street" / digest
         self._memory: OrderedDict[str, Arrays] = OrderedDict()
+        self._rendered = False
 
     def get(self, name: str, make: Callable[[], Arrays]) -> Arrays:
         if name not in self._memory:
             path = self._folder / f"{name}.npz"
             arrays = _read(path)
             if arrays is None:
+                if not self._rendered:
+                    self._rendered = True
+                    _progress.info(
+                        "rendering the street, 1 to 2 s a sweep; kept in %s", self._folder
+                    )
                 arrays = make()
                 _write(path, arrays)
             self._memory[name] = arrays
