@@ -25,6 +25,7 @@ def result_with(metrics: dict[str, Any], method: str, num_points: int) -> types.
         frame=np.zeros(n, np.int32),
         since_key_ns=np.zeros(n, np.int64),
         row=np.arange(n),
+        lidar=np.zeros(n, np.uint8),
         moving=np.arange(n) < 2,
         instance=np.full(n, -1, np.int32),
         velocity_m_s=np.zeros((n, 3), np.float32),

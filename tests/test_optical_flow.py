@@ -30,7 +30,8 @@ def seen(pixel, depth_m, velocity_m_s=(0, 0, 0)) -> Cloud:
     velocity = np.tile(np.asarray(velocity_m_s, np.float32), (n, 1))
     zeros = np.zeros(n, np.int32)
     return Cloud(
-        *(points, points, zeros, np.zeros(n, np.int64), np.arange(n), zeros > 0, zeros, velocity),
+        *(points, points, zeros, np.zeros(n, np.int64), np.arange(n), np.zeros(n, np.uint8)),
+        *(zeros > 0, zeros, velocity),
         *(np.ones(n, np.float32), np.ones(n, np.float32), np.zeros((n, 3), np.uint8)),
     )
 

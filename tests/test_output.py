@@ -54,6 +54,7 @@ def cloud_of(num_points, seed=0):
         frame=rng.integers(115, 126, num_points, dtype=np.int32),
         since_key_ns=np.zeros(num_points, np.int64),
         row=np.arange(num_points),
+        lidar=np.zeros(num_points, np.uint8),
         moving=moving,
         instance=np.where(moving, 4, -1).astype(np.int32),
         velocity_m_s=np.zeros((num_points, 3), np.float32),

@@ -5,10 +5,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from test_project import KEY, make_cloud
+from test_project import KEY, make_cloud, patches_of
 
 from densify.config import ProjectSettings
-from densify.depth.patches import patches
 from densify.geometry.range_image import RangeImage
 from densify.types import RegisteredSweep, Sweep
 
@@ -53,7 +52,7 @@ def test_spacing_is_the_sensors_own(sensor):
     ray = ray[ray[:, 0] > 0.2]
     points, _ = scanned(ray, origin)
     cloud = make_cloud(points, KEY + 1)
-    found = patches(cloud, KEY, ProjectSettings(), {KEY + 1: origin})
+    found = patches_of(cloud, ProjectSettings(), {KEY + 1: origin[None]})
     range_m = np.linalg.norm(points - origin, axis=1)
     level_m = range_m * np.hypot(ray[:, 0], ray[:, 1])
     across = found.spacing_m[:, 0] / level_m / np.radians(azimuth_deg)
@@ -70,7 +69,7 @@ def test_normals_of_ground_and_wall(sensor):
     ray = directions(*SENSORS[sensor])
     ray = ray[ray[:, 0] > 0.3]
     points, on_ground = scanned(ray)
-    normal = patches(make_cloud(points), KEY, ProjectSettings()).normal.astype(float)
+    normal = patches_of(make_cloud(points), ProjectSettings()).normal.astype(float)
     np.testing.assert_allclose(np.einsum("ij,ij->i", normal, points), 1, rtol=1e-3)
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
     truth = np.where(on_ground[:, None], [0, 0, -1.0], [1.0, 0, 0])
@@ -84,7 +83,7 @@ def test_a_post_before_a_wall_faces_the_scanner():
     points = ray * (30 / ray[:, :1])
     post = np.abs(ray[:, 1]) < 0.002
     points[post] *= 1 / 3
-    normal = patches(make_cloud(points), KEY, ProjectSettings()).normal.astype(float)
+    normal = patches_of(make_cloud(points), ProjectSettings()).normal.astype(float)
     assert post.sum() > 10
     towards = np.einsum("ij,ij->i", normal, ray) / np.linalg.norm(normal, axis=1)
     assert towards[post].min() > 0.99
@@ -94,8 +93,8 @@ def test_order_of_the_points_does_not_matter():
     rng = np.random.default_rng(3)
     points, _ = scanned(directions(*SENSORS["16 beams"])[:4000] + [1e-3, 0, 0])
     order = rng.permutation(len(points))
-    one = patches(make_cloud(points), KEY, ProjectSettings())
-    other = patches(make_cloud(points[order]), KEY, ProjectSettings())
+    one = patches_of(make_cloud(points), ProjectSettings())
+    other = patches_of(make_cloud(points[order]), ProjectSettings())
     assert one.normal[order].tobytes() == other.normal.tobytes()
     assert one.spacing_m[order].tobytes() == other.spacing_m.tobytes()
 
@@ -112,10 +111,9 @@ def test_veto_of_what_the_key_saw_through():
     key_image = RangeImage.of(RegisteredSweep(sweep, np.eye(4), np.zeros(6), np.zeros(6)))
     spots = np.array([[20, 0.5, 0.4], [29.9, 0.5, 0.4], [33, 0.5, 0.4], [20, 0.5, 0.4]])
     cloud = make_cloud(np.vstack([points, spots]), [KEY] * n + [KEY + 2] * 3 + [KEY])
-    origins = {KEY: np.zeros(3), KEY + 2: np.zeros(3)}
 
     def free(knobs, image):
-        return patches(cloud, KEY, knobs, origins, image).free
+        return patches_of(cloud, knobs, None, image).free
 
     found = free(ProjectSettings(), key_image)
     assert found[n:].tolist() == [True, False, False, False] and not found[:n].any()
@@ -126,7 +124,7 @@ def test_veto_of_what_the_key_saw_through():
 
 def test_empty_and_tiny_clouds():
     for n in (0, 1, 3):
-        found = patches(make_cloud(np.ones((n, 3))), KEY, ProjectSettings())
+        found = patches_of(make_cloud(np.ones((n, 3))), ProjectSettings())
         assert found.normal.shape == (n, 3) and found.spacing_m.shape == (n, 2)
         assert found.free.shape == (n,) and found.sweep.shape == (n,)
         assert np.isfinite(found.normal).all() and (found.spacing_m > 0).all()

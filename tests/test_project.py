@@ -18,8 +18,9 @@ from densify.depth.fill import fill_between
 from densify.depth.patches import patches
 from densify.depth.project import project
 from densify.geometry.poses import exp
+from densify.geometry.sensor import Sensors
 from densify.kernels import visibility as kernels
-from densify.types import Camera, Cloud, Patches, Reason
+from densify.types import Camera, Cloud, Patches, Reason, RegisteredSweep, Sweep
 
 KEY, PERIOD_NS = 10, 100_000_000
 PLAIN = ProjectSettings(visibility=False)
@@ -41,6 +42,7 @@ def make_cloud(points, frame=KEY, confidence=1.0):
         frame=frame,
         since_key_ns=(frame.astype(np.int64) - KEY) * PERIOD_NS,
         row=np.arange(n),
+        lidar=np.zeros(n, np.uint8),
         moving=np.zeros(n, bool),
         instance=np.full(n, -1, np.int32),
         velocity_m_s=np.zeros((n, 3), np.float32),
@@ -50,9 +52,29 @@ def make_cloud(points, frame=KEY, confidence=1.0):
     )
 
 
+def patches_of(cloud, knobs, origins=None, key_image=None):
+    """Patches of a cloud whose own points tell how its scanners sample directions.
+
+    origins: (S,3) of the scanners by frame; one scanner in the key frame's origin without it.
+    """
+    frames = np.unique(cloud.frame).tolist()
+    places = origins or dict.fromkeys(frames, np.zeros((1, 3)))
+    sweeps = []
+    for frame in frames:
+        mine = cloud.select(cloud.frame == frame)
+        points = mine.points - places[frame][0]
+        of_scanners = places[frame] - places[frame][0]
+        sweep = Sweep(
+            *(frame, 0, points, mine.intensity, None, mine.lidar, mine.row, of_scanners),
+        )
+        sweeps.append(RegisteredSweep(sweep, np.eye(4), np.zeros(6), np.zeros(6)))
+    return patches(cloud, KEY, knobs, Sensors.of(sweeps), places, key_image)
+
+
 def view(cloud, camera, T_cam_key, knobs, origins=None):
     """`project` with the cloud's patches."""
-    return project(cloud, Exposure(camera, T_cam_key), knobs, patches(cloud, KEY, knobs, origins))
+    surface = patches_of(cloud, knobs, origins)
+    return project(cloud, Exposure(camera, T_cam_key), knobs, surface)
 
 
 def take(cloud, index):
@@ -155,7 +177,7 @@ def test_without_visibility_pixels_equal_those_of_a_slow_twin(seed, num):
 def test_order_of_the_points_changes_no_byte(seed):
     rng = np.random.default_rng(seed)
     cloud, camera = random_cloud(rng, 600), make_camera(24, 18, 20.0)
-    origins = {frame: rng.normal(size=3) for frame in range(KEY - 3, KEY + 4)}
+    origins = {frame: rng.normal(size=(1, 3)) for frame in range(KEY - 3, KEY + 4)}
     knobs = ProjectSettings(support=1, edge_reach=0, edge_slack_m=0)
     one = view(cloud, camera, np.eye(4), knobs, origins)
     order = rng.permutation(len(cloud))

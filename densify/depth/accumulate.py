@@ -47,6 +47,7 @@ def accumulate(stretch: Stretch, fields: Sequence[FlowField], key: int, drop_los
                 "frame": np.full(len(kept), registered.frame, np.int32),
                 "since_key_ns": np.full(len(kept), since_key_ns, np.int64),
                 "row": sweep.row[kept],
+                "lidar": sweep.lidar[kept],
                 "moving": flow.moving[kept],
                 "instance": flow.instance[kept],
                 "velocity_m_s": velocity_m_s[kept].astype(np.float32),

@@ -16,8 +16,10 @@ from densify.depth.exposure import Exposure, Shot
 from densify.depth.optical_flow import optical_flow
 from densify.depth.patches import patches
 from densify.depth.project import project
+from densify.geometry import poses
 from densify.geometry.cameras import converted
 from densify.geometry.range_image import RangeImage
+from densify.geometry.sensor import Sensors
 from densify.scores import depth_metrics
 from densify.types import (
     Bool,
@@ -37,13 +39,14 @@ from densify.types import (
 class Views:
     """What one key's depth maps show, by their names (`densify.depth.exposure.key_shots`).
 
-    key_image: what the key sweep saw. origins: (3,) where each sweep's lidar stood, key frame, by
-    frame.
+    key_image: what the key sweep saw. sensors: the scanners. origins: (S,3) where they stood in
+    each sweep, key frame, by frame.
     """
 
     key: int
     key_image: RangeImage | None
     exposures: Mapping[str, Exposure]
+    sensors: Sensors
     origins: Mapping[int, Float]
     settings: ProjectSettings
 
@@ -60,14 +63,18 @@ class Views:
             name: Exposure.of(sequence, stretch, key, shot, settings)
             for name, shot in shots.items()
         }
-        origins = {f: stretch.T_target_source(key, f)[:3, 3] for f in stretch.frames}
-        return Views(key, key_image, exposures, origins, settings.project)
+        sensors = Sensors.of(stretch.sweeps)
+        origins = {
+            f: poses.transform(stretch.T_target_source(key, f), sensors.origins_m)
+            for f in stretch.frames
+        }
+        return Views(key, key_image, exposures, sensors, origins, settings.project)
 
     def depth(self, cloud: Cloud, visible: bool = True, filled: bool = True) -> dict[str, DepthMap]:
         """Depth maps by name. visible: leave out what is hidden, vetoed or doubtful. filled: and
         fill between what is measured."""
         settings = replace(self.settings, visibility=visible)
-        surface = patches(cloud, self.key, settings, self.origins, self.key_image)
+        surface = patches(cloud, self.key, settings, self.sensors, self.origins, self.key_image)
         return {
             name: project(cloud, exposure, settings, surface, filled)
             for name, exposure in self.exposures.items()

@@ -9,9 +9,9 @@ Its cells follow the sensor: rows its rings, columns its azimuth step, both foun
 A scanner whose firing time does not go with the azimuth (solid state, rosettes) faces a cell at
 several moments of a sweep. There each cell knows the middle of the times at which it and those
 around it were looked at, and how far from it they were: a point is asked for at the middle, and
-what it and the scanner move in the rest is added to the margin. Where rays are unordered they are
-denser here than there, and no one size of cells is right: there are images of several sizes, and
-each vouches for what it has enough returns around.
+what it and the scanner move in the rest is added to the margin. Rays without order are denser here
+than there, and no one size of cells is right: there are images of several sizes, each twice as
+coarse as the one before, and each vouches for what it has enough returns around.
 """
 
 from __future__ import annotations
@@ -30,7 +30,8 @@ _CELLS_PER_STEP = 1.15  # a cell a little larger than a step is rarely empty
 _MIN_ROW_RAD = np.deg2rad(0.45)
 _SETTLED = 0.1  # of a turn
 _MIN_COLUMNS, _MAX_COLUMNS = 90, 8192
-_DENSEST, _SPARSEST = 10, 90  # percent of an unordered scanner's returns
+_DENSEST = 10  # percent of an unordered scanner's returns: the finest cells
+_MIN_FILLED, _VOUCHED, _MAX_SIZES = 6, 0.8, 5  # sizes until most returns have so many cells around
 
 
 @dataclass(frozen=True)
@@ -124,12 +125,19 @@ class ScannerImage:
                 *(row_edges_rad, origin_m, twists),
             )
 
-        return tuple(image(*cells) for cells in _cells(rays))
+        images: list[ScannerImage] = []
+        for cells in _cells(rays):
+            images.append(image(*cells))
+            if images[-1].share_vouched(rays) >= _VOUCHED:
+                break
+        return tuple(images)
 
-    @property
-    def row_step_rad(self) -> float:
-        """Angle between neighbouring rows, mostly that between neighbouring rings."""
-        return float(np.median(np.diff(self.row_edges_rad)))
+    def share_vouched(self, rays: Aimed) -> float:
+        """Of the rays, those with enough filled cells around them to tell of free space."""
+        num_rows, num_columns = self.num_filled.shape
+        row = np.clip(np.searchsorted(self.row_edges_rad, rays.elevation) - 1, 0, num_rows - 1)
+        column = ((rays.azimuth + np.pi) * (num_columns / (2 * np.pi))).astype(np.int64)
+        return float((self.num_filled[row, column % num_columns] >= _MIN_FILLED).mean())
 
     @property
     def tables(self) -> kernels.Tables:
@@ -147,7 +155,8 @@ class ScannerImage:
 
 
 def _cells(rays: Aimed) -> list[tuple[Float32, int]]:
-    """Edges of the rows (R+1,), rad, and the number of columns, of each image."""
+    """Edges of the rows (R+1,), rad, and the number of columns; of an unordered scanner several,
+    finest first, of which as many are of use as it takes until cells are seldom empty."""
     if len(rays.azimuth) < FEW_POINTS:
         return [_grid(_uniform_edges(rays.elevation, np.deg2rad(2.0)), np.deg2rad(1.0))]
     some = some_sectors(rays)
@@ -161,24 +170,18 @@ def _cells(rays: Aimed) -> list[tuple[Float32, int]]:
         step = measure.step_along(some.azimuth, np.floor(some.elevation / row_step))
         rows = _uniform_edges(rays.elevation, _CELLS_PER_STEP * row_step)
         return [_grid(rows, _CELLS_PER_STEP * step)]
+    spacing = density_table([rays]).at(rays.azimuth, rays.elevation)[:, 1]
+    finest = _CELLS_PER_STEP * float(np.percentile(spacing, _DENSEST))
+    flatten = float(np.cos(np.median(rays.elevation)))
     return [
-        _grid(_uniform_edges(rays.elevation, size), size / np.cos(np.median(rays.elevation)))
-        for size in _sizes(rays)
+        _grid(_uniform_edges(rays.elevation, size), size / flatten)
+        for size in finest * 2.0 ** np.arange(_MAX_SIZES)
     ]
 
 
 def _grid(edges: NDArray[np.floating], step: float) -> tuple[Float32, int]:
     num_columns = int(np.clip(round(2 * np.pi / step), _MIN_COLUMNS, _MAX_COLUMNS))
     return edges.astype(np.float32), num_columns
-
-
-def _sizes(rays: Aimed) -> list[float]:
-    """Cells (rad) as large as the spacing where rays are dense, each twice as large as the one
-    before, up to where they are sparse."""
-    spacing = density_table([rays]).at(rays.azimuth, rays.elevation)[:, 1]
-    finest, coarsest = _CELLS_PER_STEP * np.percentile(spacing, [_DENSEST, _SPARSEST])
-    num_sizes = 1 + int(np.ceil(np.log2(coarsest / finest)))
-    return [float(finest) * 2**k for k in range(num_sizes)]
 
 
 def _edges_between(rings: Float) -> Float:

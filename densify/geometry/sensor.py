@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from densify.arrays import Bool, Float, Float32
+from densify.errors import InputError
 from densify.geometry import rings as measure
 from densify.kernels import rays as kernels
 from densify.types import RegisteredSweep
@@ -34,7 +35,8 @@ _MANY_POINTS = 15_000
 _SECTOR_RAD = np.deg2rad(5.0)
 FEW_POINTS = 200  # too few to measure anything
 _DEFAULT_RAD = (np.deg2rad(0.18), np.deg2rad(0.40))  # a 64-beam scanner's
-_RING_BIN_RAD, _LINE_BIN_RAD, _CELL_RAD = np.deg2rad([0.1, 0.5, 1.0])
+_BEAM_RAD = np.deg2rad(1 / 6)  # 3 mrad, as most have
+_RING_BIN_RAD, _LINE_BIN_RAD, _CELL_RAD = np.deg2rad([0.02, 0.5, 1.0])
 _BEYOND_RAD = np.deg2rad(1.0)
 _MIN_EVEN_SHARE = 0.5
 _MIN_GAPS, _MIN_GAPS_PER_BIN = 100, 30
@@ -108,6 +110,20 @@ class RayTable(NamedTuple):
         return np.stack([self.across[row, column], self.along[row, column]], 1).astype(np.float64)
 
 
+class RayGrid(NamedTuple):
+    """Cells of about one ray of a sweep each.
+
+    Rows go up: ``row_of`` (B+1,) counts them, a fraction at will, from elevation ``low_rad`` in
+    steps of ``bin_rad``. Columns go left from azimuth -pi, all round.
+    """
+
+    low_rad: float
+    bin_rad: float
+    row_of: Float
+    num_rows: int
+    num_columns: int
+
+
 @dataclass(frozen=True)
 class SensorModel:
     """One scanner.
@@ -132,8 +148,13 @@ class SensorModel:
     @staticmethod
     def of(sweeps: Sequence[RegisteredSweep], lidar: int) -> SensorModel:
         """Measured from at most three of the sweeps that hold returns of this scanner, evenly
-        spread. sweeps: deskewed, at least one with such returns."""
+        spread. sweeps: deskewed. Raises InputError where none has any."""
         holding = [s for s in sweeps if (s.sweep.lidar == lidar).any()]
+        if not holding:
+            raise InputError(
+                f"lidar {lidar}: no returns of that scanner in {len(sweeps)} sweeps; expected a "
+                f"number that Sweep.lidar holds"
+            )
         middles = (np.arange(_NUM_SWEEPS) + 0.5) * len(holding) / _NUM_SWEEPS
         chosen = [holding[i] for i in np.unique(middles.astype(int))]
         seen = [aimed(s, lidar) for s in chosen]
@@ -164,6 +185,24 @@ class SensorModel:
             table=table,
         )
 
+    @property
+    def grid(self) -> RayGrid:
+        """A row for each ring; of an unordered scanner cells as small as its rays are close where
+        they are closest."""
+        low, bin_rad = self.table.low_rad, self.table.bin_rad
+        if self.unordered:
+            bin_rad = float(np.percentile(self.table.along, 5))
+            num_rows = int((self.elevation_rad[1] - low) / bin_rad) + 1
+            num_columns = round(2 * np.pi / bin_rad)
+            return RayGrid(low, bin_rad, np.arange(num_rows + 1.0), num_rows, num_columns)
+        if self.rings_rad is None:
+            row_of = np.append(0.0, np.cumsum(bin_rad / self.table.along[:, 0].astype(np.float64)))
+        else:
+            edges = low + bin_rad * np.arange(len(self.table.along) + 1)
+            row_of = 0.5 + np.interp(edges, self.rings_rad, np.arange(len(self.rings_rad)))
+        num_columns = round(2 * np.pi / self.azimuth_step_rad)
+        return RayGrid(low, bin_rad, row_of, int(row_of[-1]) + 2, num_columns)
+
     def directions(self, points: Float) -> tuple[Float, Float, Float]:
         """(N,3) lidar frame -> azimuth, elevation (rad) and range (m), (N,) each, from its
         origin."""
@@ -187,15 +226,24 @@ class Sensors:
 
     models: Mapping[int, SensorModel]
 
+    @property
+    def origins_m(self) -> Float:
+        """(S,3) lidar frame, by number; zeros of numbers that no scanner has."""
+        origins_m = np.zeros((1 + max(self.models, default=0), 3))
+        for number, model in self.models.items():
+            origins_m[number] = model.origin_m
+        return origins_m
+
     @staticmethod
     def of(sweeps: Sequence[RegisteredSweep]) -> Sensors:
         """Every scanner that the deskewed sweeps hold returns of."""
-        numbers = np.unique(np.concatenate([np.unique(s.sweep.lidar) for s in sweeps]))
-        return Sensors({int(n): SensorModel.of(sweeps, int(n)) for n in numbers})
+        numbers = {int(n) for s in sweeps for n in np.unique(s.sweep.lidar)}
+        return Sensors({n: SensorModel.of(sweeps, n) for n in sorted(numbers)})
 
     def gap_m(self, points: Float, lidar: NDArray[np.uint8]) -> Float:
-        """(N,3) lidar frame, (N,) -> (N,) metres between neighbouring rings, or the rays of a
-        scanner without rings, at each point of the scanner that measured it."""
+        """(N,3) lidar frame, (N,) -> (N,) metres from each point to the next ring of the scanner
+        that measured it, or the next ray of one without rings. The width of a beam is added: a
+        return may be from anywhere in its spot."""
         gap_m = np.zeros(len(points))
         for number, model in self.models.items():
             mine = np.flatnonzero(lidar == number)
@@ -213,7 +261,7 @@ class Sensors:
 def _gap_m(model: SensorModel, points: Float) -> tuple[Float, Bool]:
     azimuth, elevation, range_m = model.directions(points)
     gap_rad = model.table.at(azimuth, elevation)[:, 1]
-    return range_m * gap_rad, model.sees(azimuth, elevation)
+    return range_m * (gap_rad + _BEAM_RAD), model.sees(azimuth, elevation)
 
 
 def _step_rad(rays: Aimed, rings: Float | None) -> float:

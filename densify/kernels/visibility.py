@@ -23,17 +23,19 @@ _ALL_ROUND = 3.0  # edges' reaches: no edge near
 _DIAGONAL = np.sqrt(0.5)
 _BEND_M = 0.10
 _BEND = 0.25  # of the change itself
+_REACH = 2.0  # spacings within which rays without order have neighbours
+_TURNS = 4  # of telling one derivative with the other known
 
 
 @Kernel
-def look(first, last, points, origins, sweep, seen):  # type: ignore[no-untyped-def]
+def look(first, last, points, origins, place, seen):  # type: ignore[no-untyped-def]
     """Points in the directions they were measured: seen (3,N) float32, filled with azimuth,
-    elevation (rad) and range (m). points: (N,3) float64; origins: (S,3) of the scanner in each
-    sweep; sweep: (N,) int32."""
+    elevation (rad) and range (m). points: (N,3) float64; origins: (P,3) where scanners stood;
+    place: (N,) int32, at which of them."""
     for i in range(first, last):
-        x = points[i, 0] - origins[sweep[i], 0]
-        y = points[i, 1] - origins[sweep[i], 1]
-        z = points[i, 2] - origins[sweep[i], 2]
+        x = points[i, 0] - origins[place[i], 0]
+        y = points[i, 1] - origins[place[i], 1]
+        z = points[i, 2] - origins[place[i], 2]
         level = np.sqrt(x * x + y * y)
         seen[0, i] = np.arctan2(y, x)
         seen[1, i] = np.arctan2(z, level)
@@ -41,25 +43,92 @@ def look(first, last, points, origins, sweep, seen):  # type: ignore[no-untyped-
 
 
 @inlined
-def _cell(azimuth, elevation, ring_of, low_rad, bin_rad, shape):  # type: ignore[no-untyped-def]
-    """Row and column in a sweep's grid of one ring by one azimuth step."""
-    place = (elevation - low_rad) / bin_rad
-    k = min(max(int(place), 0), len(ring_of) - 2)
-    ring = ring_of[k] + (place - k) * (ring_of[k + 1] - ring_of[k])
-    row = min(max(int(ring), 0), shape[0] - 1)
-    column = int((azimuth + np.pi) * (shape[1] / (2 * np.pi)))
-    return row, min(max(column, 0), shape[1] - 1)
+def _cell(azimuth, elevation, grid):  # type: ignore[no-untyped-def]
+    """Row and column of a direction in a `densify.geometry.sensor.RayGrid`."""
+    place = (elevation - grid.low_rad) / grid.bin_rad
+    k = min(max(int(place), 0), len(grid.row_of) - 2)
+    at = grid.row_of[k] + (place - k) * (grid.row_of[k + 1] - grid.row_of[k])
+    row = min(max(int(at), 0), grid.num_rows - 1)
+    column = int((azimuth + np.pi) * (grid.num_columns / (2 * np.pi)))
+    return row, min(max(column, 0), grid.num_columns - 1)
+
+
+@inlined
+def _spacing(azimuth, elevation, table):  # type: ignore[no-untyped-def]
+    """Across and along (rad), see `densify.geometry.sensor.RayTable`."""
+    row = min(max(int((elevation - table.low_rad) / table.bin_rad), 0), table.along.shape[0] - 1)
+    columns = table.along.shape[1]
+    column = int((azimuth + np.pi) * (columns / (2 * np.pi))) % columns
+    return table.across[row, column], table.along[row, column]
 
 
 @Kernel
-def nearest_in_cells(seen, members, ring_of, low_rad, bin_rad, grid):  # type: ignore[no-untyped-def]
-    """grid: (R,C) int32, filled with the nearest of ``members`` (indices) in each cell, -1 none."""
-    grid[:] = -1
+def nearest_in_cells(seen, members, grid, cells):  # type: ignore[no-untyped-def]
+    """cells: (R,C) int32 of the grid, filled with the nearest of ``members`` (indices) in each, -1
+    none."""
+    cells[:] = -1
     for i in members:
-        row, column = _cell(seen[0, i], seen[1, i], ring_of, low_rad, bin_rad, grid.shape)
-        there = grid[row, column]
+        row, column = _cell(seen[0, i], seen[1, i], grid)
+        there = cells[row, column]
         if there < 0 or seen[2, i] < seen[2, there]:
-            grid[row, column] = i
+            cells[row, column] = i
+
+
+@inlined
+def _first(cells, row, column, rows, columns):  # type: ignore[no-untyped-def]
+    """The point in the first filled cell of those at the given distances, -1 none."""
+    for k in range(len(rows)):
+        r = row + rows[k]
+        if 0 <= r < cells.shape[0]:
+            there = cells[r, (column + columns[k]) % cells.shape[1]]
+            if there >= 0:
+                return there
+    return -1
+
+
+@Kernel
+def beside_on_rings(first, last, members, seen, table, grid, cells, beside):  # type: ignore[no-untyped-def]
+    """A point's neighbours on its ring and on those above and below.
+
+    members: (n,) indices of a scanner's points in a sweep, seen: (3,N) of `look`, cells of
+    `nearest_in_cells`. beside: (N,4) int32, filled with the neighbours to the right, left, above
+    and below, -1 where there is none.
+    """
+    right, left = np.array([-2, -1, -3]), np.array([2, 1, 3])
+    same = np.zeros(3, np.int64)
+    up, down = np.array([1, 1, 1, 2]), np.array([-1, -1, -1, -2])
+    straight = np.array([0, 1, -1, 0])
+    for k in range(first, last):
+        i = members[k]
+        row, column = _cell(seen[0, i], seen[1, i], grid)
+        beside[i, 0] = _first(cells, row, column, same, right)
+        beside[i, 1] = _first(cells, row, column, same, left)
+        beside[i, 2] = _first(cells, row, column, up, straight)
+        beside[i, 3] = _first(cells, row, column, down, straight)
+
+
+@Kernel
+def beside_in_sectors(first, last, members, seen, table, grid, cells, beside):  # type: ignore[no-untyped-def]
+    """As `beside_on_rings`, of rays without order: the nearest point in each of four quarters, no
+    farther than twice the spacing there."""
+    num_rows, num_columns = cells.shape
+    for k in range(first, last):
+        i = members[k]
+        row, column = _cell(seen[0, i], seen[1, i], grid)
+        reach = 1 + int(_REACH * _spacing(seen[0, i], seen[1, i], table)[1] / grid.bin_rad)
+        for side in range(4):
+            sign, found, distance = 1 if side in (1, 2) else -1, np.int32(-1), 1
+            while found < 0 and distance <= reach:
+                for aside in range(2 * distance + 1):
+                    off = -(aside // 2) if aside % 2 == 0 else aside // 2 + 1
+                    if abs(off) > distance:
+                        continue
+                    r = row + (off if side < 2 else sign * distance)
+                    c = (column + (sign * distance if side < 2 else off)) % num_columns
+                    if found < 0 and 0 <= r < num_rows:
+                        found = cells[r, c]
+                distance += 1
+            beside[i, side] = found
 
 
 @inlined
@@ -74,18 +143,6 @@ def _slope(one, other, step, range_m):  # type: ignore[no-untyped-def]
     if not abs(one) <= abs(other):  # NaN too
         one = other
     return one if abs(one) * range_m <= _STEEP else 0.0
-
-
-@inlined
-def _beside(grid, row, column, rows, columns):  # type: ignore[no-untyped-def]
-    """The point in the first filled cell of those at the given distances, -1 none."""
-    for k in range(len(rows)):
-        r = row + rows[k]
-        if 0 <= r < grid.shape[0]:
-            there = grid[r, (column + columns[k]) % grid.shape[1]]
-            if there >= 0:
-                return there
-    return -1
 
 
 @inlined
@@ -104,42 +161,38 @@ def _change(seen, i, there, axis, across, slope_across):  # type: ignore[no-unty
 
 
 @Kernel
-def tangents(first, last, members, seen, ring_of, low_rad, bin_rad, steps, grid, normal, spacing):  # type: ignore[no-untyped-def]
+def tangents(first, last, members, seen, beside, table, unordered, normal, spacing):  # type: ignore[no-untyped-def]
     """The tangent plane and the spacing of the rays at each of a sweep's points.
 
-    members: (n,) indices of its points, seen: (3,N) of `look`, grid of `nearest_in_cells`.
-    steps: (2,) rad, of azimuth and of one row of the grid. Filled: normal (N,3) float32, of any
-    length: the plane is normal · (p - origin) = 1; spacing (N,2) float32 metres between
-    neighbouring rays, across and along elevation.
+    members: (n,) indices of its points, seen: (3,N) of `look`, beside: (N,4) neighbours. unordered:
+    those to the sides are not on a level. Filled: normal (N,3) float32, of any length: the plane is
+    normal · (p - origin) = 1; spacing (N,2) float32 metres between neighbouring rays, across and
+    along elevation.
 
     On a plane the inverse range is normal · direction, so its two derivatives tell the normal.
     """
-    left, right = np.array([-2, -1, -3]), np.array([2, 1, 3])
-    same = np.zeros(3, np.int64)
-    up, down = np.array([1, 1, 1, 2]), np.array([-1, -1, -1, -2])
-    straight = np.array([0, 1, -1, 0])
     for k in range(first, last):
         i = members[k]
         azimuth, elevation, range_m = seen[0, i], seen[1, i], seen[2, i]
-        row, column = _cell(azimuth, elevation, ring_of, low_rad, bin_rad, grid.shape)
-        place = min(max(int((elevation - low_rad) / bin_rad), 0), len(ring_of) - 2)
-        ring_rad = bin_rad / (ring_of[place + 1] - ring_of[place])
-        one = _change(seen, i, _beside(grid, row, column, same, left), 0, 1, 0.0)
-        other = _change(seen, i, _beside(grid, row, column, same, right), 0, 1, 0.0)
-        level = _slope(one, other, 2 * steps[0], range_m)
-        level = 0.0 if np.isnan(level) else level
-        above = _beside(grid, row, column, up, straight)
-        below = _beside(grid, row, column, down, straight)
-        one, other = _change(seen, i, above, 1, 0, level), _change(seen, i, below, 1, 0, level)
-        rise = _slope(one, other, ring_rad, range_m)
-        rise = 0.0 if np.isnan(rise) else rise
+        across, along = _spacing(azimuth, elevation, table)
         ca, sa, ce, se = np.cos(azimuth), np.sin(azimuth), np.cos(elevation), np.sin(elevation)
+        level_rad = across / max(ce, 1e-3)  # of azimuth to the neighbours
+        level, rise = 0.0, 0.0
+        for _ in range(_TURNS if unordered else 1):
+            one = _change(seen, i, beside[i, 0], 0, 1, rise)
+            other = _change(seen, i, beside[i, 1], 0, 1, rise)
+            level = _slope(one, other, level_rad if unordered else 2 * level_rad, range_m)
+            level = 0.0 if np.isnan(level) else level
+            one = _change(seen, i, beside[i, 2], 1, 0, level)
+            other = _change(seen, i, beside[i, 3], 1, 0, level)
+            rise = _slope(one, other, along, range_m)
+            rise = 0.0 if np.isnan(rise) else rise
         aside = level / max(ce, 1e-3)
         normal[i, 0] = ce * ca / range_m - aside * sa - rise * se * ca
         normal[i, 1] = ce * sa / range_m + aside * ca - rise * se * sa
         normal[i, 2] = se / range_m + rise * ce
-        spacing[i, 0] = range_m * ce * steps[0]
-        spacing[i, 1] = range_m * ring_rad
+        spacing[i, 0] = range_m * across
+        spacing[i, 1] = range_m * along
 
 
 @Kernel

@@ -20,7 +20,8 @@ class Cloud:
     points: (M,3) metres, key frame.
     rigid_points: (M,3) where registration alone puts them.
     frame: (M,) int32 source sweep. since_key_ns: (M,) int64 from the key's reference time to the
-    source sweep's. row: (M,) int64 in the source sweep's file.
+    source sweep's. row: (M,) int64 in the source sweep's file. lidar: (M,) uint8, which of its
+    scanners measured the point.
     moving: (M,) bool. instance: (M,) int32, -1 none. velocity_m_s: (M,3) float32 at the key's
     moment, ego-motion removed, 0 where nothing moves. confidence: (M,) float32, 0 to 1.
     intensity: (M,) float32. rgb: (M,3) uint8, black where no camera saw the point.
@@ -31,6 +32,7 @@ class Cloud:
     frame: NDArray[np.int32]
     since_key_ns: Int
     row: Int
+    lidar: NDArray[np.uint8]
     moving: Bool
     instance: NDArray[np.int32]
     velocity_m_s: Float32

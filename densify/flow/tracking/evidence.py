@@ -16,6 +16,7 @@ from densify.flow.tracking.clock import Clock
 from densify.geometry import poses
 from densify.geometry.height_map import HeightMap
 from densify.geometry.range_image import RangeImage
+from densify.geometry.sensor import Sensors
 from densify.types import Bool, Float, Int, Stretch
 
 _MARGIN_M = 0.4
@@ -34,14 +35,14 @@ _MOST_ASKED = 10  # of them on each side: more in the same time cost more and te
 class FreeSpace:
     """What each sweep of a stretch saw through.
 
-    T_lidar_world: (4,4) per sweep. origin: (3,) world, where each sweep's lidar stood. clock: when
-    they were taken.
+    T_lidar_world: (4,4) per sweep. clock: when they were taken. sensors: how far apart their rays
+    are.
     """
 
     images: tuple[RangeImage, ...]
     T_lidar_world: tuple[Float, ...]
-    origin: tuple[Float, ...]
     clock: Clock
+    sensors: Sensors
 
     @staticmethod
     def of(stretch: Stretch, images: Sequence[RangeImage] | None = None) -> FreeSpace:
@@ -52,17 +53,17 @@ class FreeSpace:
         return FreeSpace(
             tuple(images),
             tuple(poses.inverse(s.T_world_lidar) for s in stretch.sweeps),
-            tuple(s.T_world_lidar[:3, 3] for s in stretch.sweeps),
             Clock.of(stretch),
+            Sensors.of(stretch.sweeps),
         )
 
     def __len__(self) -> int:
         return len(self.images)
 
-    @property
-    def ring_step_rad(self) -> float:
-        """Angle between neighbouring rings of the (coarsest) scanner."""
-        return max(s.row_step_rad for i in self.images for s in i.scanners)
+    def gap_m(self, place: Float, i: int) -> float:
+        """Metres between neighbouring rings at a place (3,), world, as sweep number i saw it."""
+        in_lidar = poses.transform(self.T_lidar_world[i], place[None])
+        return float(self.sensors.finest_gap_m(in_lidar)[0])
 
     def others(self, i: int) -> list[int]:
         """The sweeps around sweep number i that tell about it."""
@@ -149,12 +150,13 @@ def find_candidates(
         registered = stretch.sweeps[i]
         points = poses.transform(registered.T_world_lidar, registered.sweep.points)
         above = np.flatnonzero(ground.above(points) >= min_height_m)
-        points, in_lidar = points[above], registered.sweep.points[above]
+        points = points[above]
         seed = np.zeros(len(above), bool)
         for j in space.others(i):
             rest = np.flatnonzero(~seed)
             seed[rest] = space.seen_through(points[rest], j)
-        close = _closer_rings(in_lidar, points, space.ring_step_rad)
+        gap_m = space.sensors.gap_m(registered.sweep.points[above], registered.sweep.lidar[above])
+        close = _closer_rings(points, gap_m)
         num_clusters, cluster = _cluster(close, seed)
         return Candidates(above, seed, cluster, num_clusters)
 
@@ -162,10 +164,9 @@ def find_candidates(
         return tuple(pool.map(of_sweep, range(len(stretch.sweeps)) if among is None else among))
 
 
-def _closer_rings(in_lidar: Float, points: Float, ring_step_rad: float) -> Float:
+def _closer_rings(points: Float, gap_m: Float) -> Float:
     """The points with heights compressed where the scanner's rings lie farther apart than what is
     taken for one thing."""
-    gap_m = ring_step_rad * np.linalg.norm(in_lidar, axis=1)
     squeezed = points.copy()
     squeezed[:, 2] *= np.minimum(1.0, _RING_GAP_M / np.maximum(gap_m, 1e-6))
     return squeezed

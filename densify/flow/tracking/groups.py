@@ -23,6 +23,7 @@ from densify.flow.tracking.soften import Part, Softened, soften
 from densify.flow.tracking.tracks import Track, follow_groups
 from densify.geometry import poses
 from densify.geometry.height_map import HeightMap
+from densify.geometry.sensor import Sensors
 from densify.kernels.clouds import rows_inside
 from densify.types import Bool, Float, Float32, FlowField, Int, Stretch
 
@@ -115,7 +116,7 @@ def estimate_motion(scene: Scene, settings: Config, argument: str) -> GroupMotio
     shapes = [Shape.of(t.seen_in(standing, sorted(t.claimed))) for t in tracks]
 
     def members(i: int) -> NDArray[np.int32]:
-        seen = _Seen.of(stretch, i, ground, standing[i], space.ring_step_rad)
+        seen = _Seen.of(stretch, i, ground, standing[i], space.sensors)
         attached = _attach(seen, i, tracks, shapes, space.clock, scene.min_height_m)
         _lengthen(attached, seen, i, tracks, shapes, space)
         instance = np.full(len(stretch.sweeps[i].sweep), -1, np.int32)
@@ -140,9 +141,7 @@ def _foretold(track: Track, i: int, clock: Clock) -> bool:
 def _is_fine(track: Track, space: FreeSpace) -> bool:
     """Rings so close on the object that a limb shows in several: between rings far apart nothing
     tells bending from gliding along them."""
-    first = min(track.claimed)
-    range_m = float(np.linalg.norm(track.centre - space.origin[first]))
-    return space.ring_step_rad * range_m <= _FINE_M
+    return space.gap_m(track.centre, min(track.claimed)) <= _FINE_M
 
 
 def _bendings(
@@ -186,13 +185,13 @@ class _Seen:
 
     @staticmethod
     def of(
-        stretch: Stretch, i: int, ground: HeightMap, standing: Standing, ring_step_rad: float
+        stretch: Stretch, i: int, ground: HeightMap, standing: Standing, sensors: Sensors
     ) -> _Seen:
         registered = stretch.sweeps[i]
         points = poses.transform(registered.T_world_lidar, registered.sweep.points)
         height_m = ground.above(points)
         row = np.flatnonzero(height_m > _MIN_HEIGHT_M)
-        gap_m = ring_step_rad * np.linalg.norm(registered.sweep.points, axis=1)
+        gap_m = sensors.gap_m(registered.sweep.points, registered.sweep.lidar)
         reach_m = np.maximum(_ATTACH_UNSEEN_M, _GAPS_REACHED_UNSEEN * gap_m)
         seeded = standing.row[standing.candidate]
         reach_m[seeded] = np.maximum(_ATTACH_M, _GAPS_REACHED * gap_m[seeded])

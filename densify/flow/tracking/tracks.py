@@ -318,9 +318,7 @@ def _prove(track: Track, standing: Sequence[Standing], space: FreeSpace) -> bool
     residual_m = track.path.residual_m
     begin, end = track.path(track.path.begin_s), track.path(track.path.end_s)
     travelled = float(np.linalg.norm((end - begin)[:2]))
-    start = space.origin[next(iter(track.states))]
-    range_m = float(np.linalg.norm((track.centre - start)[:2]))
-    gap_m = space.ring_step_rad * range_m
+    gap_m = space.gap_m(track.centre, next(iter(track.states)))
     rough_m = _ROUGH_M + _ROUGH_PER_GAP * gap_m + _ROUGH_S * travelled / seen_s
     if residual_m > rough_m or travelled < max(_LEAST_WAY_M, _LEAST_WAY_PER_RESIDUAL * residual_m):
         return False

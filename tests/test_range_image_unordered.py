@@ -1,0 +1,181 @@
+# SPDX-License-Identifier: MIT
+"""Free space of scanners whose firing time does not go with the azimuth: raster and rosette."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from functools import cache
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from densify.geometry import poses
+from densify.geometry.range_image import RangeImage, ScannerImage
+from densify.types import RegisteredSweep
+from tests.fired import fired
+from tests.scenes import Arc, Box, World, on_sphere
+
+MARGIN = (0.4, 0.015)
+FAST = np.array([0.0, 0.0, 0.2, 15.0, 0.0, 0.0])
+WALL = World((Box((1.0, 200.0, 40.0), Arc(40.0, 0.0), base_m=-20.0),))
+POSTS = World(
+    (
+        *(Box((0.5, 0.5, 6.0), Arc(x, y)) for x in (9, 14, 20, 27) for y in (-6, -3, -1, 2, 4, 7)),
+        Box((1.0, 300.0, 60.0), Arc(60.0, 0.0), base_m=-20.0),
+    )
+)
+
+
+def only(registered: RegisteredSweep, lidar: int) -> RegisteredSweep:
+    return replace(registered, sweep=registered.sweep.select(registered.sweep.lidar == lidar))
+
+
+@cache
+def sweep_of(name: str, moving: bool, frame: int = 0, world: World = POSTS) -> RegisteredSweep:
+    registered = fired(name, world, FAST if moving else np.zeros(6), frame, share_heard=1.0)
+    return only(registered, int(registered.sweep.lidar.max()))
+
+
+UNORDERED = ["panda", "rosette"]
+
+
+@pytest.mark.parametrize("name", UNORDERED)
+def test_each_cell_has_a_time_of_its_own(name):
+    registered = sweep_of(name, moving=False)
+    images = RangeImage.of(registered).scanners
+    assert 1 < len(images) <= 5
+    sizes = [image.nearest_m.shape for image in images]
+    for (rows, columns), (half_rows, half_columns) in pairwise(sizes):
+        assert half_rows == pytest.approx(rows / 2, abs=1)
+        assert half_columns == pytest.approx(columns / 2, abs=1) or columns < 200
+    for image in images:
+        assert image.offset_s.shape == image.spread_s.shape == image.nearest_m.shape
+        asked = registered.sweep.points[::7]
+        first, last = when_around(image, asked)
+        offset_s = registered.sweep.offset_ns[::7] * 1e-9
+        # a return on the edge of a cell may fall on either side
+        assert np.mean((first - 1e-6 <= offset_s) & (offset_s <= last + 1e-6)) > 0.99
+
+
+def when_around(image: ScannerImage, points) -> tuple[np.ndarray, np.ndarray]:
+    """First and last time at which the cells around each point's were looked at."""
+    x, y, z = (points - image.origin_m).T
+    rows, columns = image.nearest_m.shape
+    row = np.searchsorted(image.row_edges_rad, np.arctan2(z, np.hypot(x, y))) - 1
+    column = ((np.arctan2(y, x) + np.pi) / (2 * np.pi) * columns).astype(int) % columns
+    middle, spread = (
+        t[np.clip(row, 0, rows - 1), column] for t in (image.offset_s, image.spread_s)
+    )
+    return middle - spread, middle + spread
+
+
+def test_a_raster_looks_at_each_place_once_and_a_rosette_again_and_again():
+    raster, rosette = (RangeImage.of(sweep_of(n, moving=False)).scanners[-1] for n in UNORDERED)
+    assert np.median(raster.spread_s[raster.num_filled > 0]) < 0.004
+    assert np.median(rosette.spread_s[rosette.num_filled > 5]) > 0.02
+
+
+@pytest.mark.parametrize(("name", "share"), [("panda", 0.95), ("rosette", 0.7)])
+def test_free_before_a_wall_and_not_on_it(name, share):
+    image = RangeImage.of(sweep_of(name, moving=False, world=WALL))
+    rng = np.random.default_rng(0)
+    inside = on_sphere(rng.uniform(-20, 20, 2000), rng.uniform(-2, 6, 2000), 1.0)
+    origin_m = image.scanners[0].origin_m
+    near = inside * (20 / inside[:, :1]) + origin_m
+    assert image.sees_through(near, *MARGIN).mean() > share
+    on_wall = inside * ((39.5 - origin_m[0]) / inside[:, :1]) + origin_m
+    assert not image.sees_through(on_wall, *MARGIN).any()
+
+
+@pytest.mark.parametrize("name", UNORDERED)
+def test_what_stands_is_not_free_however_fast_the_scanner_drives(name):
+    """And where no cell knew its time, it would be."""
+    one, other = sweep_of(name, moving=True), sweep_of(name, moving=True, frame=2)
+    T_other_one = poses.inverse(other.T_world_lidar) @ one.T_world_lidar
+    on_post = np.linalg.norm(one.sweep.points, axis=1) < 40
+    points = poses.transform(T_other_one, one.sweep.points[on_post])
+    assert len(points) > 1000
+    image = RangeImage.of(other)
+    assert image.sees_through(points, *MARGIN).mean() < 0.002
+    timeless = [
+        replace(s, offset_s=np.zeros_like(s.offset_s), spread_s=np.zeros_like(s.spread_s))
+        for s in image.scanners
+    ]
+    assert RangeImage(tuple(timeless)).sees_through(points, *MARGIN).mean() > 0.004
+
+
+@pytest.mark.parametrize("name", UNORDERED)
+def test_what_moves_with_its_velocity_is_not_free(name):
+    """A van that comes closer is met somewhere else by each ray; with its velocity known its own
+    points are not taken for free, and standing still some of them are."""
+    van = Box((4.0, 2.0, 2.2), Arc(18.0, -3.0, 1.5, 12.0))
+    world = World((van, *WALL.boxes))
+    sweep = sweep_of(name, moving=False, world=world).sweep
+    image = RangeImage.of(sweep_of(name, moving=False, world=world))
+    on_van = (sweep.points[:, 0] < 30) & (sweep.points[:, 2] > -1.5)
+    velocity = np.tile([12 * np.cos(1.5), 12 * np.sin(1.5), 0.0], (on_van.sum(), 1))
+    at_reference = sweep.points[on_van] - velocity * sweep.offset_ns[on_van][:, None] * 1e-9
+    assert len(velocity) > 50
+    assert image.sees_through(at_reference, *MARGIN, velocity_m_s=velocity).mean() < 0.02
+    gone = at_reference + [0, 0, 0] + 3.0 * velocity / 12  # where it never was within the sweep
+    assert image.sees_through(gone, *MARGIN).mean() > 0.1
+
+
+# --- a slow twin ----------------------------------------------------------------------------------
+
+
+def look(image: ScannerImage, point, velocity, min_filled):
+    """One image's answer for one point, step by step in double precision; None where a step falls
+    so close to an edge that rounding decides."""
+    rows, columns = image.nearest_m.shape
+    edges = [float(e) for e in image.row_edges_rad]
+
+    def cell_of(seen):
+        across = (math.atan2(seen[1], seen[0]) + math.pi) / (2 * math.pi) * columns
+        elevation = math.atan2(seen[2], math.hypot(seen[0], seen[1]))
+        row = sum(elevation >= e for e in edges) - 1
+        close = abs(across - round(across)) < 0.02
+        close |= min(abs(elevation - e) for e in edges) < 1e-4
+        return (row if 0 <= row < rows else -1), int(across) % columns, close
+
+    seen, time_s, twist = point - image.origin_m, 0.0, image.twists[0].astype(float)
+    for _ in range(2):
+        row, column, close = cell_of(seen)
+        if close:
+            return None
+        time_s = float(image.offset_s[max(row, 0), column])
+        twist = image.twists[0 if time_s < 0 else 1].astype(float)
+        back = Rotation.from_rotvec(time_s * twist[:3]).inv()
+        seen = back.apply(point + time_s * velocity - time_s * twist[3:]) - image.origin_m
+    row, column, close = cell_of(seen)
+    if close:
+        return None
+    if row < 0 or image.num_filled[row, column] < min_filled:
+        return False
+    by_m_s = np.linalg.norm(velocity - twist[3:] - np.cross(twist[:3], point))
+    away_s = abs(image.offset_s[row, column] - time_s) + image.spread_s[row, column]
+    range_m = float(np.linalg.norm(seen))
+    margin_m = max(MARGIN[0], MARGIN[1] * range_m) + away_s * by_m_s
+    gap_m = image.nearest_m[row, column] - range_m - margin_m
+    return None if abs(gap_m) < 2e-3 else bool(gap_m > 0)
+
+
+@pytest.mark.parametrize("name", UNORDERED)
+def test_lookup_against_a_slow_twin(name):
+    image = RangeImage.of(sweep_of(name, moving=True))
+    rng = np.random.default_rng(1)
+    points = on_sphere(rng.uniform(-32, 32, 800), rng.uniform(-12, 10, 800), 1.0)
+    points *= rng.uniform(2, 70, (800, 1))
+    velocity = rng.normal(0, 6, (800, 3))
+    fast = image.sees_through(points, *MARGIN, velocity_m_s=velocity)
+    answers = [
+        [look(s, p, v, 6) for s in image.scanners] for p, v in zip(points, velocity, strict=True)
+    ]
+    sure = np.array([None not in a or any(x is True for x in a) for a in answers])
+    assert sure.mean() > 0.6
+    slow = [any(x is True for x in a) for a in answers]
+    assert fast[sure].tolist() == [s for s, k in zip(slow, sure, strict=True) if k]
+    assert 0.1 < fast[sure].mean() < 0.9

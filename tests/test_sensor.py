@@ -1,0 +1,238 @@
+# SPDX-License-Identifier: MIT
+"""Models of scanners, measured from sweeps whose every pulse is known."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from densify.errors import InputError
+from densify.geometry.sensor import SensorModel, Sensors, aimed
+from densify.street.patterns import Spinning
+from densify.street.sensors import SENSORS
+from densify.types import RegisteredSweep, Sweep
+from tests.fired import fired
+from tests.scenes import on_sphere
+
+DRIVING = np.array([0.0, 0.02, 0.3, 12.0, 0.0, 0.1])
+SPINNING = [
+    (name, number)
+    for name, sensor in SENSORS.items()
+    for number, scanner in enumerate(sensor.scanners)
+    if isinstance(scanner.pattern, Spinning)
+]
+
+
+@cache
+def sweeps_of(name: str) -> tuple[RegisteredSweep, ...]:
+    return tuple(fired(name, twist=DRIVING, frame=frame) for frame in (3, 4))
+
+
+@cache
+def sensors_of(name: str) -> Sensors:
+    return Sensors.of(sweeps_of(name))
+
+
+def pattern_of(name: str, number: int = 0):
+    return SENSORS[name].scanners[number].pattern
+
+
+# --- rings ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("name", "number"), SPINNING)
+def test_a_spinning_scanner_is_found_as_it_is(name, number):
+    model, pattern = sensors_of(name).models[number], pattern_of(name, number)
+    true_deg = np.sort(pattern.elevation_deg)
+    assert not model.unordered
+    np.testing.assert_allclose(np.rad2deg(model.rings_rad), true_deg, atol=0.02)
+    step_deg = 3600 / pattern.columns_per_s
+    assert np.rad2deg(model.azimuth_step_rad) == pytest.approx(step_deg, rel=0.02)
+    assert model.order.turn == -1 and model.order.by_azimuth
+    assert model.order.period_s == pytest.approx(0.1, rel=0.002)
+    assert model.azimuth_rad == (-np.pi, np.pi)
+    np.testing.assert_allclose(np.rad2deg(model.elevation_rad), true_deg[[0, -1]], atol=0.05)
+    np.testing.assert_array_equal(model.origin_m, SENSORS[name].scanners[number].origin_m)
+
+
+@pytest.mark.parametrize(("name", "number"), SPINNING)
+def test_spacing_is_that_of_the_true_rings(name, number):
+    """At every ring the mean of the gaps above and below, however close: none are merged."""
+    model, true_deg = (
+        sensors_of(name).models[number],
+        np.sort(pattern_of(name, number).elevation_deg),
+    )
+    found = np.rad2deg(model.table.at(np.zeros(len(true_deg)), np.deg2rad(true_deg)))
+    gaps = np.diff(true_deg)
+    mean = 0.5 * (np.append(gaps[0], gaps) + np.append(gaps, gaps[-1]))
+    np.testing.assert_allclose(found[:, 1], mean, rtol=0.12, atol=0.01)
+    across = 3600 / pattern_of(name, number).columns_per_s * np.cos(np.deg2rad(true_deg))
+    np.testing.assert_allclose(found[:, 0], across, rtol=0.03)
+
+
+@pytest.mark.parametrize(
+    ("name", "elevation_deg", "spacing_deg"),
+    [("panda", -0.5, 1 / 6), ("panda", -25, 6.0), ("vls128", -1, 0.11), ("os128", -10, 45 / 127)],
+)
+def test_uneven_rings_are_close_in_the_middle_and_far_at_the_ends(name, elevation_deg, spacing_deg):
+    points = on_sphere(np.arange(0, 360, 7.0), elevation_deg, 30.0)
+    model = sensors_of(name).models[0]
+    azimuth, elevation, range_m = model.directions(points + model.origin_m)
+    np.testing.assert_allclose(range_m, 30.0)
+    found = model.table.at(azimuth, elevation)[:, 1]
+    np.testing.assert_allclose(np.rad2deg(found), spacing_deg, rtol=0.03)
+
+
+@pytest.mark.parametrize(("period_ns", "columns"), [(50_000_000, 1041), (200_000_000, 4166)])
+def test_at_other_rates(period_ns, columns):
+    model = SensorModel.of([fired("hdl64", twist=DRIVING, period_ns=period_ns)], 0)
+    assert len(model.rings_rad) == 64
+    assert model.order.period_s == pytest.approx(period_ns * 1e-9, rel=0.002)
+    assert np.rad2deg(model.azimuth_step_rad) == pytest.approx(360 / columns, rel=0.02)
+
+
+def test_a_scanner_that_turns_the_other_way():
+    (sweep,) = (s.sweep for s in [fired("vlp16")])
+    mirrored = replace(sweep, points=sweep.points * [1, -1, 1])
+    model = SensorModel.of([RegisteredSweep(mirrored, np.eye(4), np.zeros(6), np.zeros(6))], 0)
+    assert model.order.turn == 1 and len(model.rings_rad) == 16
+
+
+def test_without_firing_times_rings_are_known_and_the_order_is_not():
+    registered = fired("hdl32")
+    timeless = replace(registered, sweep=replace(registered.sweep, offset_ns=None))
+    model = SensorModel.of([timeless], 0)
+    assert len(model.rings_rad) == 32
+    assert model.order == (True, 0, None)
+
+
+def test_lasers_that_share_no_origin_make_lines():
+    """As KITTI's HDL-64E: the returns of a ring smear over those of others where they are near."""
+    registered = fired("hdl64")
+    rays = aimed(registered, 0)
+    ring = np.searchsorted(np.sort(pattern_of("hdl64").elevation_deg), np.rad2deg(rays.elevation))
+    range_m = 22 + 18 * np.sin(7 * rays.azimuth + ring)
+    aside = np.where(ring % 2, 0.04, -0.04) + 0.002 * (ring - 32)
+    ray = on_sphere(np.rad2deg(rays.azimuth), np.rad2deg(rays.elevation), 1.0)
+    points = ray * range_m[:, None] + aside[:, None] * [0, 0, 1]
+    smeared = replace(registered, sweep=replace(registered.sweep, points=points))
+    model = SensorModel.of([smeared], 0)
+    assert model.rings_rad is None and not model.unordered
+    assert np.rad2deg(model.azimuth_step_rad) == pytest.approx(360 / 2083, rel=0.1)
+    for elevation_deg, spacing_deg in ((-3.0, 1 / 3), (-18.0, 0.5)):
+        around = np.deg2rad(elevation_deg + np.arange(-3, 3, 0.1))
+        found = np.rad2deg(model.table.at(np.zeros(len(around)), around)[:, 1])
+        assert np.median(found) == pytest.approx(spacing_deg, rel=0.35)
+
+
+# --- no rings -------------------------------------------------------------------------------------
+
+
+def spacing_by_neighbours(rays, at: int, num: int) -> float:
+    """The side of a square as large as each of the nearest rays has to itself."""
+    direction = on_sphere(np.rad2deg(rays.azimuth), np.rad2deg(rays.elevation), 1.0)
+    away = sorted(np.linalg.norm(direction - direction[at], axis=1))
+    return float(np.sqrt(np.pi * away[num] ** 2 / num))
+
+
+@pytest.mark.parametrize(("name", "number", "num"), [("panda", 1, 24), ("rosette", 0, 60)])
+def test_without_rings_the_spacing_is_that_of_the_neighbours(name, number, num):
+    model, rays = sensors_of(name).models[number], aimed(sweeps_of(name)[0], number)
+    assert model.unordered and model.rings_rad is None
+    assert model.order == (False, 0, None)
+    inside = np.hypot(rays.azimuth, rays.elevation) < np.deg2rad(25)
+    inside &= np.abs(rays.elevation) < np.deg2rad(8)
+    asked = np.flatnonzero(inside)[:: inside.sum() // 40]
+    slow = np.array([spacing_by_neighbours(rays, i, num) for i in asked])
+    fast = model.table.at(rays.azimuth[asked], rays.elevation[asked])
+    ratio = fast[:, 1] / slow
+    assert 0.85 < np.median(ratio) < 1.15
+    assert np.percentile(ratio, 5) > 0.5 and np.percentile(ratio, 95) < 2
+    np.testing.assert_array_equal(fast[:, 0], fast[:, 1])
+
+
+def test_a_scanner_that_looks_ahead_sees_nothing_else():
+    model = sensors_of("panda").models[1]
+    azimuth = np.deg2rad([0.0, 29.0, -29.0, 32.0, -32.0, 180.0, 0.0, 0.0])
+    elevation = np.deg2rad([0.0, 5.0, -5.0, 0.0, 0.0, 0.0, 12.0, -12.0])
+    assert model.sees(azimuth, elevation).tolist() == [True] * 3 + [False] * 5
+
+
+def test_a_view_over_the_direction_backwards():
+    registered = fired("vlp16")
+    azimuth = aimed(registered, 0).azimuth
+    behind = replace(registered, sweep=registered.sweep.select(np.abs(azimuth) > np.deg2rad(120)))
+    model = SensorModel.of([behind], 0)
+    right, left = np.rad2deg(model.azimuth_rad)
+    assert right == pytest.approx(120, abs=0.5) and left == pytest.approx(-120, abs=0.5)
+    assert model.sees(np.deg2rad([180.0, 150.0, -150.0, 0.0, 90.0]), np.zeros(5)).tolist() == [
+        *(True, True, True, False, False)
+    ]
+
+
+# --- several scanners -----------------------------------------------------------------------------
+
+
+def test_each_scanner_counts_from_where_it_stands():
+    """Of the panda's scanners, 1.6 m from each other, each tells of its own points; a place is seen
+    as finely as the finer one of those that look there sees it."""
+    sensors, registered = sensors_of("panda"), sweeps_of("panda")[0]
+    sweep = registered.sweep
+    gap_m = sensors.gap_m(sweep.points, sweep.lidar)
+    for number, model in sensors.models.items():
+        mine = sweep.lidar == number
+        range_m = np.linalg.norm(sweep.points[mine] - model.origin_m, axis=1)
+        azimuth, elevation, _ = model.directions(sweep.points[mine])
+        along = model.table.at(azimuth, elevation)[:, 1]
+        np.testing.assert_allclose(gap_m[mine], range_m * (along + np.deg2rad(1 / 6)), rtol=1e-6)
+    np.testing.assert_array_equal(sensors.origins_m, SENSORS["panda"].origins_m)
+    ahead, behind = np.array([[20.0, 0, -5.0]]), np.array([[-20.0, 0, -5.0]])
+    both = np.repeat(np.concatenate([ahead, behind]), 2, axis=0)
+    of_each = sensors.gap_m(both, np.array([0, 1, 0, 1], np.uint8))
+    # 14 degrees below the horizon rings are 3 degrees apart; only ahead the other sees more finely
+    finest = sensors.finest_gap_m(np.concatenate([ahead, behind]))
+    assert finest[0] < 0.5 * of_each[0] or not sensors.models[1].sees(
+        *sensors.models[1].directions(ahead)[:2]
+    )
+    assert finest[1] == of_each[2]
+
+
+def test_128_rings_count_as_fine_as_they_are():
+    """Rows of the range image are joined; the spacing is not."""
+    at = np.array([[40.0, 0.0, -1.0]])
+    metres = {
+        n: float(sensors_of(n).finest_gap_m(at)[0]) for n in ("vls128", "os128", "hdl64", "vlp16")
+    }
+    assert metres["vls128"] < metres["os128"] <= 1.05 * metres["hdl64"] < metres["vlp16"]
+    beam_rad = np.deg2rad(1 / 6)
+    assert metres["vls128"] == pytest.approx(40 * (np.deg2rad(0.11) + beam_rad), rel=0.05)
+
+
+# --- little, or nothing ---------------------------------------------------------------------------
+
+
+def test_too_little_to_measure_is_taken_for_a_usual_scanner():
+    n = 20
+    sweep = Sweep(
+        *(0, 0, on_sphere(np.arange(n) * 3.0, 0.0, 10.0), np.zeros(n, np.float32), None),
+        *(np.full(n, 2, np.uint8), np.arange(n)),
+    )
+    sensors = Sensors.of([RegisteredSweep(sweep, np.eye(4), np.zeros(6), np.zeros(6))])
+    assert list(sensors.models) == [2] and sensors.models[2].rings_rad is None
+    spacing = sensors.models[2].table.at(np.array([0.0]), np.array([0.3]))
+    np.testing.assert_allclose(np.rad2deg(spacing), [[0.18, 0.40]], rtol=1e-5)
+    assert sensors.origins_m.shape == (3, 3)
+
+
+def test_no_sweeps_have_no_scanners():
+    assert not Sensors.of([]).models
+    nothing = fired("vlp16", share_heard=0.0)
+    assert not Sensors.of([nothing]).models
+
+
+def test_a_scanner_that_is_not_there_cannot_be_measured():
+    with pytest.raises(InputError, match="lidar 3: no returns of that scanner in 2 sweeps"):
+        SensorModel.of(sweeps_of("vlp16"), 3)
