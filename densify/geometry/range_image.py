@@ -133,7 +133,7 @@ class ScannerImage:
         return tuple(images)
 
     def share_vouched(self, rays: Aimed) -> float:
-        """Of the rays, those with enough filled cells around them to tell of free space."""
+        """Share of the rays with enough filled cells around them to tell of free space."""
         num_rows, num_columns = self.num_filled.shape
         row = np.clip(np.searchsorted(self.row_edges_rad, rays.elevation) - 1, 0, num_rows - 1)
         column = ((rays.azimuth + np.pi) * (num_columns / (2 * np.pi))).astype(np.int64)

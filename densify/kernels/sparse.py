@@ -130,7 +130,7 @@ def _scatter(
 
 @Kernel
 def _sort_rows(begin: int, end: int, starts: Index, columns: Index, filled: Float) -> None:
-    """By insertion: rows are short, and numba's own sort takes seconds to compile."""
+    """Sorts by insertion: rows are short, and numba's own sort takes seconds to compile."""
     for i in range(begin, end):
         for e in range(starts[i] + 1, starts[i + 1]):
             column, value, at = columns[e], filled[e], e
