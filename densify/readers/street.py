@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: MIT
 """The built-in street as a recording: frames are made when asked for and kept in a cache folder.
 
-``street[:PRESET][?seed=N&sensor=NAME&hz=RATE&tilt=DEG]``. 16 seconds: at 10 Hz frames 0 to 159. The
-cache lies in the user's cache directory, or in the folder named by the environment variable
-DENSIFY_CACHE_DIR; it can be deleted at any time. A cached frame equals one made anew, byte for
-byte.
+``street[:PRESET][?seed=N&sensor=NAME&hz=RATE&tilt=DEG&cameras=NAME,NAME]``. 16 seconds: at 10 Hz
+frames 0 to 159. The cache lies in the user's cache directory, or in the folder named by the
+environment variable DENSIFY_CACHE_DIR; it can be deleted at any time. A cached frame equals one
+made anew, byte for byte.
 """
 
 from __future__ import annotations
@@ -25,8 +25,9 @@ import platformdirs
 from numpy.typing import NDArray
 
 from densify.errors import InputError
-from densify.street.camera import CAMERAS, DELAY_NS, Picture, cameras_beside
+from densify.street.camera import Picture
 from densify.street.lidar import Returns
+from densify.street.rig import CAMERAS, USUAL, cameras_beside
 from densify.street.scenes import PRESETS
 from densify.street.sensors import SENSORS
 from densify.street.simulator import VERSION, Simulator
@@ -38,6 +39,7 @@ _progress = logging.getLogger("densify.progress")
 _KEPT_IN_MEMORY = 16
 _RATES_HZ = ("5", "10", "20")
 _MAX_TILT_DEG = 45
+_NO_CAMERA = "none"
 
 
 class Street:
@@ -49,7 +51,10 @@ class Street:
     the same time, so frame 120 at 10 Hz is frame 240 at 20 Hz and frame 60 at 5 Hz. Scanners fire
     at a constant rate, as real ones do: a spinning one has half the columns at 20 Hz and twice as
     many at 5 Hz. tilt_deg: the sensor's mount is pitched nose down by this angle, -45 to 45; the
-    cameras stay where they are on the vehicle.
+    cameras stay where they are on the vehicle. cameras: names, none if empty. image_02 and image_03
+    expose once for each sweep, the second 15 ms after its reference time; the others have clocks of
+    their own: fast (30 Hz), rolling (a rolling shutter, 0.1 ms from row to row), fisheye (190
+    degrees, to the left).
 
     Raises InputError for a value that does not exist.
     """
@@ -61,6 +66,7 @@ class Street:
         sensor: str = "hdl64",
         hz: int = 10,
         tilt_deg: float = 0.0,
+        cameras: tuple[str, ...] = USUAL,
     ) -> None:
         _choice("preset", preset, tuple(PRESETS))
         _choice("sensor", sensor, tuple(SENSORS))
@@ -72,12 +78,15 @@ class Street:
                 f"street tilt {tilt_deg:g}: expected degrees from -{_MAX_TILT_DEG} to "
                 f"{_MAX_TILT_DEG}, nose down, as in street?tilt=10"
             )
+        for name in cameras:
+            _choice("camera", name, tuple(CAMERAS))
         changed = [("hz", hz)] * (hz != 10) + [("tilt", f"{tilt_deg:g}")] * (tilt_deg != 0)
         options = "".join(f"&{key}={value}" for key, value in changed)
-        self.name = f"street:{preset}?seed={seed}&sensor={sensor}{options}"
+        shown = f"&cameras={','.join(cameras) or _NO_CAMERA}" * (cameras != USUAL)
+        self.name = f"street:{preset}?seed={seed}&sensor={sensor}{options}{shown}"
         self.simulator = Simulator(preset, seed, SENSORS[sensor], hz, tilt_deg)
         self.frames = range(self.simulator.num_frames)
-        self.cameras: Mapping[str, Camera] = cameras_beside(tilt_deg)
+        self.cameras: Mapping[str, Camera] = cameras_beside(tilt_deg, cameras)
         self.truth = StreetTruth(self)
         self._store = _Store(f"{VERSION} {preset} {seed} {sensor}{options}")
 
@@ -91,11 +100,12 @@ class Street:
         reader, _, preset = head.partition(":")
         if reader != "street":
             raise InputError(
-                f"{spec!r}: expected street[:PRESET][?seed=N&sensor=NAME&hz=RATE&tilt=DEG]"
+                f"{spec!r}: expected street[:PRESET][?seed=N&sensor=NAME&hz=RATE&tilt=DEG"
+                f"&cameras=NAME,NAME]"
             )
         options = dict(parse_qsl(query, keep_blank_values=True))
         for key in options:
-            _choice("option", key, ("seed", "sensor", "hz", "tilt"))
+            _choice("option", key, ("seed", "sensor", "hz", "tilt", "cameras"))
         seed, hz, tilt = (
             options.get(k, v) for k, v in (("seed", "0"), ("hz", "10"), ("tilt", "0"))
         )
@@ -104,12 +114,14 @@ class Street:
                 f"street seed {seed!r}: expected a whole number from 0, as in street?seed=7"
             )
         _choice("hz", hz, _RATES_HZ)
+        cameras = options.get("cameras", ",".join(USUAL))
         return Street(
             preset or "street",
             int(seed),
             options.get("sensor", "hdl64"),
             int(hz),
             _degrees(tilt),
+            () if cameras == _NO_CAMERA else tuple(cameras.split(",")),
         )
 
     def __getitem__(self, frame: int) -> Sweep:
@@ -137,24 +149,27 @@ class Street:
             **self._store.get(f"sweep/{frame}", lambda: vars(self.simulator.returns(frame)))
         )
 
-    def picture(self, camera: str, frame: int) -> Picture:
+    def picture(self, camera: str, number: int) -> Picture:
         """A camera's image with its exact depth and the bodies seen."""
-        self.check(frame)
-        _choice("camera", camera, tuple(CAMERAS))
+        stamps_ns = self.image_stamps_ns(camera)
+        if number not in stamps_ns:
+            raise InputError(
+                f"street: no image {number} of {camera}; there are images 0 to {max(stamps_ns)}"
+            )
         return Picture(
             **self._store.get(
-                f"{camera}/{frame}", lambda: vars(self.simulator.picture(camera, frame))
+                f"{camera}/{number}", lambda: vars(self.simulator.picture(camera, number))
             )
         )
 
-    def image(self, camera: str, frame: int) -> NDArray[np.uint8]:
+    def image(self, camera: str, number: int) -> NDArray[np.uint8]:
         """(H,W,3) RGB."""
-        return self.picture(camera, frame).image
+        return self.picture(camera, number).image
 
     def image_stamps_ns(self, camera: str) -> Mapping[int, int]:
-        """image_02 is taken at each sweep's reference time, image_03 15 ms later."""
-        _choice("camera", camera, tuple(CAMERAS))
-        return {frame: self.simulator.stamp_ns(frame) + DELAY_NS[camera] for frame in self.frames}
+        """When the camera exposes, by the image's number from 0."""
+        _choice("camera", camera, tuple(self.cameras))
+        return self.simulator.image_stamps_ns(camera)
 
     def T_world_lidar(self, frame: int) -> Float:
         """(4,4) true pose at the sweep's reference time."""
@@ -189,12 +204,15 @@ class StreetTruth:
         points = simulator.in_bodies(frame, returns)
         return simulator.bodies.displacement(frame, target, returns.body, points)
 
-    def depth_m(self, camera: str, frame: int) -> Float32:
-        return self._street.picture(camera, frame).depth_m
+    def depth_m(self, camera: str, number: int) -> Float32:
+        return self._street.picture(camera, number).depth_m
 
-    def moving_mask(self, camera: str, frame: int) -> Bool:
-        body = self._street.picture(camera, frame).body
-        moving: Bool = (body >= 0) & self._street.simulator.bodies.moving[frame][body]
+    def moving_mask(self, camera: str, number: int) -> Bool:
+        body = self._street.picture(camera, number).body
+        simulator, frames = self._street.simulator, self._street.frames
+        since_ns = simulator.image_stamps_ns(camera)[number] - simulator.stamp_ns(0)
+        frame = min(max(round(since_ns / simulator.period_ns), 0), frames[-1])
+        moving: Bool = (body >= 0) & simulator.bodies.moving[frame][body]
         return moving
 
 

@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: MIT
-"""The two cameras: how they sit, and pictures with exact depth by casting one ray a pixel."""
+"""Pictures with exact depth, by casting one ray a pixel."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
+from densify.geometry.cameras import rays
 from densify.geometry.poses import inverse
 from densify.street.lidar import T_ego_lidar
 from densify.street.materials import (
@@ -24,47 +24,14 @@ from densify.street.world import Hits, Rays, World
 from densify.types import Bool, Camera, Float, Float32
 
 MAX_DEPTH_M = 120.0
-# how KITTI's cameras sit: axes turned, a little off true, below and before the scanner
-_AXES = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
-_TILT = Rotation.from_rotvec([0.008, -0.012, 0.007]).as_matrix()
-T_RECTIFIED_LIDAR = np.eye(4)
-T_RECTIFIED_LIDAR[:3, :3] = _TILT @ _AXES
-T_RECTIFIED_LIDAR[:3, 3] = [-0.004, -0.076, -0.272]
-FOCAL_PX, CENTRE_PX = 721.5, (609.5, 172.75)
-# metres to the right of the rectified origin, nanoseconds after the sweep's reference time
-_LEFT, _RIGHT = -0.06, 0.48
-DELAY_NS = {"image_02": 0, "image_03": 15_000_000}
 _SUN = np.array([-0.45, 0.55, 0.70]) / np.linalg.norm([-0.45, 0.55, 0.70])
-
-
-def _camera(name: str, right_m: float) -> Camera:
-    T_cam_lidar = T_RECTIFIED_LIDAR.copy()
-    T_cam_lidar[0, 3] -= right_m
-    K = np.array([[FOCAL_PX, 0, CENTRE_PX[0]], [0, FOCAL_PX, CENTRE_PX[1]], [0, 0, 1.0]])
-    return Camera(name, 1242, 375, K, T_cam_lidar)
-
-
-CAMERAS = {"image_02": _camera("image_02", _LEFT), "image_03": _camera("image_03", _RIGHT)}
-"""With a level mount."""
-
-
-def T_level_lidar(tilt_deg: float) -> Float:
-    """(4,4) from the lidar frame of a tilted mount to that of a level one."""
-    return inverse(T_ego_lidar()) @ T_ego_lidar(tilt_deg)
-
-
-def cameras_beside(tilt_deg: float) -> dict[str, Camera]:
-    """The cameras, which stay where they are on the vehicle, in the lidar frame of a tilted
-    mount."""
-    T = T_level_lidar(tilt_deg)
-    return {name: replace(c, T_cam_lidar=c.T_cam_lidar @ T) for name, c in CAMERAS.items()}
 
 
 @dataclass(frozen=True)
 class Picture:
-    """One exposure; (H,W) everywhere. image: (H,W,3) uint8 RGB. depth_m: float32 camera z of the
-    nearest surface, 0 where there is none within 120 m or where it is glass (which has two).
-    body: int32 index of the body seen, -1 sky."""
+    """One exposure; (H,W) everywhere. image: (H,W,3) uint8 RGB. depth_m: float32 of the nearest
+    surface as the camera's ``measure`` says, 0 where there is none within 120 m, where it is glass
+    (which has two) or the lens sees nothing. body: int32 index of the body seen, -1 sky."""
 
     image: NDArray[np.uint8]
     depth_m: Float32
@@ -77,32 +44,40 @@ def T_world_lidar(ego: Driving, time_s: float, tilt_deg: float = 0.0) -> Float:
 
 
 def expose(world: World, ego: Driving, camera: Camera, time_s: float) -> Picture:
-    """Global shutter: every pixel at the same time. camera: one of `CAMERAS`."""
+    """Every row at its own time. camera: beside a level mount. time_s: of the middle row."""
     h, w = camera.height_px, camera.width_px
     v, u = np.divmod(np.arange(h * w, dtype=np.float64), w)
-    ray = np.stack([u, v, np.ones_like(u)], axis=1) @ np.linalg.inv(camera.K).T
-    ray /= np.linalg.norm(ray, axis=1, keepdims=True)
-    T_world_cam = T_world_lidar(ego, time_s) @ inverse(camera.T_cam_lidar)
-    n = len(u)
-    rays = Rays(
-        np.tile(T_world_cam[:3, 3], (n, 1)), ray @ T_world_cam[:3, :3].T, np.full(n, time_s)
-    )
-    hits = world.cast(rays, NOTHING_PASSES, np.zeros(n))
-    colour = _colours(world, rays, hits)
+    ray = rays(camera, np.column_stack([u, v]))
+    seen = np.flatnonzero(np.isfinite(ray[:, 0]))
+    ray = ray[seen]
+    cast = _in_world(ego, camera, ray, time_s, v[seen] - (h - 1) / 2)
+    hits = world.cast(cast, NOTHING_PASSES, np.zeros(len(ray)))
+    colour = _colours(world, cast, hits)
     glass = np.flatnonzero(_is_glass(world, hits))
     if len(glass):
-        through = Rays(*(column[glass] for column in rays))
+        through = Rays(*(column[glass] for column in cast))
         behind = world.cast(through, GLASS_PASSES, np.zeros(len(glass)))
         colour[glass] = 0.07 * _sky(through.direction) + 0.6 * _colours(world, through, behind)
-    z = hits.range_m * ray[:, 2]
-    solid = np.isfinite(z) & (z <= MAX_DEPTH_M) & ~_is_glass(world, hits)
-    body = np.where(hits.triangle >= 0, world.body[hits.triangle], -1)
-    encoded = np.rint(255 * np.clip(colour, 0, 1) ** (1 / 2.2)).astype(np.uint8)
-    return Picture(
-        encoded.reshape(h, w, 3),
-        np.where(solid, z, 0.0).astype(np.float32).reshape(h, w),
-        body.astype(np.int32).reshape(h, w),
-    )
+    depth_m = hits.range_m * ray[:, 2] if camera.measure == "z" else hits.range_m
+    solid = np.isfinite(depth_m) & (depth_m <= MAX_DEPTH_M) & ~_is_glass(world, hits)
+    image, depth = np.zeros((h * w, 3), np.uint8), np.zeros(h * w, np.float32)
+    body = np.full(h * w, -1, np.int32)
+    image[seen] = np.rint(255 * np.clip(colour, 0, 1) ** (1 / 2.2)).astype(np.uint8)
+    depth[seen] = np.where(solid, depth_m, 0.0)
+    body[seen] = np.where(hits.triangle >= 0, world.body[hits.triangle], -1)
+    return Picture(image.reshape(h, w, 3), depth.reshape(h, w), body.reshape(h, w))
+
+
+def _in_world(ego: Driving, camera: Camera, ray: Float, time_s: float, row: Float) -> Rays:
+    """(N,3) camera frame and (N,) rows below the middle, ascending."""
+    time = time_s + row * camera.row_time_s
+    origin, direction = np.empty_like(ray), np.empty_like(ray)
+    begins = np.flatnonzero(np.diff(time, prepend=np.nan) != 0)
+    for begin, end in zip(begins, [*begins[1:], len(ray)], strict=True):
+        T_world_cam = T_world_lidar(ego, time[begin]) @ inverse(camera.T_cam_lidar)
+        origin[begin:end] = T_world_cam[:3, 3]
+        direction[begin:end] = ray[begin:end] @ T_world_cam[:3, :3].T
+    return Rays(origin, direction, time)
 
 
 def _is_glass(world: World, hits: Hits) -> Bool:

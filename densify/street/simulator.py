@@ -13,9 +13,10 @@ import numpy as np
 
 from densify.geometry.poses import transform
 from densify.street.bodies import Bodies
-from densify.street.camera import CAMERAS, DELAY_NS, Picture, T_world_lidar, expose
+from densify.street.camera import Picture, T_world_lidar, expose
 from densify.street.casting import DURATION_S, Scene
 from densify.street.lidar import Mounted, Returns, T_ego_lidar, at_offsets, scan
+from densify.street.rig import CAMERAS, SHUTTERS
 from densify.street.scenes import build_scene
 from densify.street.sensors import Sensor
 from densify.types import Bool, Float
@@ -63,8 +64,15 @@ class Simulator:
         time_s = seconds(self.stamp_ns(frame))
         return scan(self.scene.world, self.scene.ego, mounted, time_s, rng)
 
-    def picture(self, camera: str, frame: int) -> Picture:
-        time_s = seconds(self.stamp_ns(frame) + DELAY_NS[camera])
+    def image_stamps_ns(self, camera: str) -> dict[int, int]:
+        """When a camera exposes (its middle row), by the image's number."""
+        delay_ns, own_period_ns = SHUTTERS[camera]
+        period_ns = own_period_ns or self.period_ns
+        first_ns = EPOCH_NS + delay_ns
+        return {n: first_ns + n * period_ns for n in range(DURATION_S * 10**9 // period_ns)}
+
+    def picture(self, camera: str, number: int) -> Picture:
+        time_s = seconds(self.image_stamps_ns(camera)[number])
         return expose(self.scene.world, self.scene.ego, CAMERAS[camera], time_s)
 
     def T_world_lidar_at(self, time_ns: int) -> Float:

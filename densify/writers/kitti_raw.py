@@ -28,7 +28,7 @@ from densify.readers.files import camera_named
 from densify.readers.kitti_raw import KITTI_TRIGGER_LATENCY_NS
 from densify.readers.street import Street
 from densify.readers.truth_files import write_bodies, write_depth, write_points
-from densify.street.camera import CAMERAS, T_RECTIFIED_LIDAR, T_level_lidar
+from densify.street.rig import CAMERAS, T_RECTIFIED_LIDAR, USUAL, T_level_lidar
 from densify.street.sensors import SENSORS
 from densify.street.simulator import EPOCH_NS
 from densify.types import Float, Progress
@@ -58,16 +58,16 @@ def write_kitti_tree(
 ) -> Path:
     """Write the frames and return the drive's folder, which is complete or not there.
 
-    frames: absolute numbers. cameras: both if None. progress: called with a stage's name, frames
-    done, frames in all.
+    frames: absolute numbers. cameras: some of image_02 and image_03, both if None. progress: called
+    with a stage's name, frames done, frames in all.
 
     Raises InputError for a frame or camera that does not exist, for a sensor whose points' times do
     not follow from their azimuth (KITTI's format has no room for times), and if the drive or
     another calibration is there already and ``overwrite`` is not set.
     """
-    names = list(CAMERAS) if cameras is None else list(cameras)
+    names = list(USUAL) if cameras is None else list(cameras)
     for name in names:
-        camera_named(street.cameras, name, Path(street.name))
+        camera_named({n: street.cameras[n] for n in USUAL if n in street.cameras}, name, out)
     if not street.simulator.sensor.azimuth_tells_time:
         fit = [sensor.name for sensor in SENSORS.values() if sensor.azimuth_tells_time]
         raise InputError(
