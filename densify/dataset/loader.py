@@ -20,6 +20,7 @@ from torch.utils.data import Dataset
 
 from densify.dataset.manifest import read_manifests
 from densify.dataset.plan import SCHEMA_VERSION
+from densify.depth.exposure import key_shots
 from densify.errors import InputError
 from densify.outputs.depth_png import read_depth_png, read_stored
 from densify.readers import open_sequence
@@ -206,8 +207,12 @@ class DepthDataset(Dataset[dict[str, Any]]):
 
     def _read_image(self, sample: _Sample, camera: Camera) -> NDArray[np.uint8]:
         """(3,H,W)."""
-        image = self._recording(sample.drive).image(sample.camera, sample.frame)
+        recording = self._recording(sample.drive)
         where = f"{self._specs[sample.drive]}: {sample.camera} of frame {sample.frame}"
+        number = key_shots(recording, [camera], sample.frame)[sample.camera].number
+        if number is None:
+            raise InputError(f"{where}: the recording has no image near that sweep")
+        image = recording.image(sample.camera, number)
         _check_size(where, image, camera)
         return image.transpose(2, 0, 1)
 

@@ -61,6 +61,11 @@ class Recipe:
     def __post_init__(self) -> None:
         if not 0 <= self.window <= _LARGEST_WINDOW:
             raise InputError(f"--window {self.window}: expected 0 to {_LARGEST_WINDOW} sweeps")
+        if self.layout == "kitti-depth" and self.config.project.per == "image":
+            raise InputError(
+                "--layout kitti-depth: names maps by the frame of their sweep; got "
+                "project.per=image, expected sweep, or --layout densify"
+            )
         for option, value, known in (
             ("method", self.method, METHODS),
             ("layout", self.layout, LAYOUTS),

@@ -31,6 +31,7 @@ from densify.types import (
 )
 
 _log = logging.getLogger("densify")
+_USUAL = ProjectSettings()
 _NUM_NEIGHBOURS = 5  # sweeps on each side of a key that tell the usual period
 _JITTER = 1.5  # half a period is at most so much longer
 _NUM_ROW_STEPS = 4  # in which the row that sees a point is found
@@ -47,7 +48,10 @@ class Shot:
 
 
 def key_shots(
-    sequence: LidarSequence, cameras: Sequence[Camera], key: int, settings: ProjectSettings
+    sequence: LidarSequence,
+    cameras: Sequence[Camera],
+    key: int,
+    settings: ProjectSettings = _USUAL,
 ) -> dict[str, Shot]:
     """The depth maps of a key by name: of each camera the image exposed nearest to the key's sweep,
     named as the camera; with ``project.per=image`` all its images that are nearer to this sweep

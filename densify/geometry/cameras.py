@@ -31,7 +31,7 @@ NEAREST_M = 0.1
 _COEFFICIENTS = {"pinhole": (0, 4, 5, 8, 12, 14), "fisheye": (4,), "mei": (5,)}
 _STEP = 1e-6  # of differences, in radians or on the plane
 _NUM_ANGLES = 4096
-_NUM_STEPS = 20  # of Newton's method
+_NUM_STEPS = 10  # of Newton's method
 _CONVERGED = 1e-10
 
 
@@ -264,17 +264,16 @@ def _unbent(camera: Camera, lens: _Lens, uv: Float) -> Float:
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         shrink = np.where(far > 0, np.interp(far, bent, radius) / far, 1.0)
         xy = wanted * shrink[:, None]
+        left, found = np.arange(len(uv)), np.zeros(len(uv), bool)
         for _ in range(_NUM_STEPS):
-            off = np.column_stack(_bent(upright, *xy.T)) - wanted
-            (a, b), (c, d) = (_change(upright, xy, axis) for axis in np.eye(2))
-            determinant = a * d - b * c
-            xy = (
-                xy
-                - np.stack([d * off[:, 0] - c * off[:, 1], a * off[:, 1] - b * off[:, 0]], 1)
-                / (determinant[:, None])
-            )
-        off = np.column_stack(_bent(upright, *xy.T)) - wanted
-        found = (np.abs(off) < _CONVERGED * (1 + far[:, None])).all(axis=1)
+            here = xy[left]
+            off = np.column_stack(_bent(upright, *here.T)) - wanted[left]
+            done = (np.abs(off) < _CONVERGED * (1 + far[left, None])).all(axis=1)
+            found[left[done]] = True
+            left, here, off = left[~done], here[~done], off[~done]
+            (a, b), (c, d) = (_change(upright, here, axis) for axis in np.eye(2))
+            step = np.stack([d * off[:, 0] - c * off[:, 1], a * off[:, 1] - b * off[:, 0]], axis=1)
+            xy[left] -= step / (a * d - b * c)[:, None]
         found &= (xy**2).sum(axis=1) < lens.limit
     ray = np.full((len(uv), 3), np.nan)
     ray[found] = _direction(camera, *xy[found].T)

@@ -1,0 +1,131 @@
+# SPDX-License-Identifier: MIT
+"""Depth maps of lenses that are no pinholes: what depth is, how large patches are at the rim."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from densify.config import ProjectSettings
+from densify.depth.exposure import Exposure
+from densify.depth.project import project
+from densify.geometry.cameras import converted, image_points, rays
+from densify.types import Camera, Patches, Reason
+from tests.test_project import make_camera, make_cloud
+
+K = np.array([[124.0, 0, 199.5], [0, 124.0, 199.5], [0, 0, 1]])
+FISHEYE = Camera(
+    *("fish", 400, 400, K, np.eye(4), (-0.02, 0.003, -0.001, 0.0001), "fisheye"), max_angle_deg=95.0
+)
+
+
+def seen_from(camera, points, normal, spacing_m, measure, **knobs):
+    """Points in the camera's own frame, each with its patch."""
+    n = len(points)
+    patches = Patches(
+        np.broadcast_to(np.asarray(normal, np.float32), (n, 3)).copy(),
+        np.broadcast_to(np.asarray(spacing_m, np.float32), (n, 2)).copy(),
+        np.zeros(n, bool),
+        np.zeros(n, np.int32),
+    )
+    settings = ProjectSettings(support=1, **knobs)
+    return project(
+        make_cloud(points), Exposure(camera, np.eye(4), measure=measure), settings, patches
+    )
+
+
+def pixels(camera, step=1):
+    v, u = np.mgrid[0 : camera.height_px : step, 0 : camera.width_px : step]
+    return np.column_stack([u.ravel(), v.ravel()]).astype(float)
+
+
+def ground(camera, down_m=1.6, step=2, reach_m=30.0):
+    """The points of a plane below the camera on every other pixel."""
+    ray = rays(camera, pixels(camera, step))
+    ray = ray[ray[:, 1] > 0.05]
+    points = ray * (down_m / ray[:, 1])[:, None]
+    return points[np.linalg.norm(points, axis=1) < reach_m]
+
+
+@pytest.mark.parametrize("measure", ["range", "z"])
+def test_ground_hides_itself_nowhere_in_a_fisheye(measure):
+    """As it would if its slope were taken for that in a pinhole's image."""
+    points = ground(FISHEYE)
+    if measure == "z":
+        points = points[points[:, 2] > 1.0]
+    knobs = {"footprint": 0.0, "slack_m": 0.1, "hidden_m": 0.01, "hidden_fraction": 0.01}
+    maps = seen_from(FISHEYE, points, [0, 1.0, 0], (0.1, 0.1), measure, **knobs)
+    assert maps.measure == measure
+    hidden = maps.reason == Reason.HIDDEN
+    assert hidden.mean() < 0.002
+    facing = points / np.sum(points**2, axis=1, keepdims=True)
+    steep = seen_from(FISHEYE, points, facing, (0.1, 0.1), measure, **knobs)
+    assert (steep.reason == Reason.HIDDEN).mean() > 0.3  # what the slope prevents
+
+
+@pytest.mark.parametrize("measure", ["range", "z"])
+def test_depth_of_a_plane_is_that_in_the_middle_of_the_pixel(measure):
+    rng = np.random.default_rng(3)
+    points = np.column_stack([rng.uniform(-9, 9, 120_000), np.full(120_000, 1.6)])
+    points = np.column_stack([points, rng.uniform(-1 if measure == "range" else 1, 9, 120_000)])
+    maps = seen_from(FISHEYE, points, [0, 1.0, 0], (0.05, 0.05), measure)
+    row, column = np.nonzero(maps.depth_m)
+    assert len(row) > 15_000
+    ray = rays(FISHEYE, np.column_stack([column, row]).astype(float))
+    truth = 1.6 / ray[:, 1] * (ray[:, 2] if measure == "z" else 1.0)
+    error = np.abs(maps.depth_m[row, column] - truth) / truth
+    error = error[np.isfinite(error)]  # the middle of a pixel at the rim may lie beyond the lens
+    assert len(error) > 0.99 * len(row)
+    assert np.median(error) < 1e-3 and np.quantile(error, 0.99) < 0.02
+    behind = np.linalg.norm([column - 199.5, row - 199.5], axis=0) > 124 * 1.52
+    assert (behind.sum() > 100) == (measure == "range")  # beyond 90 degrees there is no z
+
+
+@pytest.mark.parametrize("angle_deg", [0.0, 50.0, 90.0])
+def test_patches_are_as_large_as_the_lens_shows_them(angle_deg):
+    """A panel of 0.6 m x 0.4 m at 6 m: along the image's middle row 0.1 rad aside."""
+    there = np.radians(angle_deg)
+    spot = 6.0 * np.array([[np.sin(there), 0.0, np.cos(there)]])
+    back = 20 * rays(FISHEYE, pixels(FISHEYE))
+    points = np.vstack([spot, back[np.isfinite(back[:, 0])]])
+    facing = points / np.sum(points**2, axis=1, keepdims=True)
+    # azimuth turns about the key's z, here the camera's axis: aside is up and down
+    exposure = np.eye(4)
+    exposure[:3, :3] = [[1, 0, 0], [0, 0, -1], [0, 1, 0]]  # key z up
+    n = len(points)
+    spacing = np.zeros((n, 2), np.float32)
+    spacing[0] = 0.6, 0.4
+    patches = Patches(
+        (facing @ exposure[:3, :3]).astype(np.float32),
+        spacing,
+        np.zeros(n, bool),
+        np.zeros(n, np.int32),
+    )
+    cloud = make_cloud(points @ exposure[:3, :3])
+    knobs = ProjectSettings(support=1, footprint=0.5, slack_m=0.0)
+    maps = project(cloud, Exposure(FISHEYE, exposure, measure="range"), knobs, patches)
+    uv, inside = image_points(FISHEYE, points)
+    assert inside.all()
+    hidden = np.rint(uv[1:][maps.reason[1:] == Reason.HIDDEN])
+    width, height = np.ptp(hidden, axis=0) + 1
+
+    def at(azimuth, elevation):
+        ray = [np.sin(azimuth) * np.cos(elevation), -np.sin(elevation), np.cos(azimuth)]
+        return image_points(FISHEYE, 6.0 * np.array([ray]))[0][0]
+
+    wide = np.abs(at(there + 0.04, 0.0) - at(there - 0.04, 0.0))[0] * 0.1 / 0.08
+    high = np.abs(at(there, 0.4 / 12) - at(there, -0.4 / 12))[1]
+    assert abs(width - wide) <= 1.1 and abs(height - high) <= 1.1
+
+
+def test_depth_turns_from_one_measure_into_the_other():
+    for camera in (FISHEYE, make_camera(40, 30, 25.0)):
+        ray = rays(camera, pixels(camera)).reshape(camera.height_px, camera.width_px, 3)
+        known = np.isfinite(ray[..., 2]) & (ray[..., 2] > 0)
+        range_m = np.where(np.isfinite(ray[..., 2]), 7.0, 0).astype(np.float32)
+        z = converted(camera, range_m, "range", "z")
+        np.testing.assert_allclose(z[known], 7 * ray[known][:, 2], rtol=1e-6)
+        assert not z[~known].any()
+        back = converted(camera, z, "z", "range")
+        np.testing.assert_allclose(back[known], 7.0, rtol=1e-5)
+        assert converted(camera, z, "z", "z") is z
