@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from densify.config import FlowSettings, GroundSettings
-from densify.flow.tracking.evidence import FreeSpace, Standing, find_candidates, link
+from densify.flow.tracking.evidence import FreeSpace, Standing, find_candidates
 from densify.geometry import poses
 from densify.geometry.ground import ground
 from densify.geometry.height_map import HeightMap
@@ -92,37 +92,3 @@ def test_movers_are_seen_through_and_walls_are_not(scene, stretch, space):
     still = (scan.instance < 0) & (scan.box >= 0)
     assert free[still].mean() < 1e-3
     assert not space.seen_through(points, i).any()
-
-
-def test_links_of_voxels():
-    gap = [[0, 0, 0], [0.5, 0, 0], [1.0, 0, 0], [3.0, 0, 0], [3.3, 0, 0]]
-    number, label = link(np.array(gap), 0.6)
-    assert number == 2
-    assert label[0] == label[1] == label[2] != label[3] == label[4]
-
-
-def test_links_against_a_slow_twin():
-    points = np.random.default_rng(3).uniform(-6, 6, (300, 3)) * [1, 1, 0.1]
-    number, label = link(points, 0.6)
-    assert set(label) == set(range(number)) and label.dtype == np.int64
-    distance = np.linalg.norm(points[:, None] - points[None], axis=-1)
-
-    def groups(reach):
-        group = np.arange(len(points))
-        for _ in range(len(points)):
-            grown = np.array([group[row].min() for row in distance <= reach])
-            if np.array_equal(grown, group):
-                break
-            group = grown
-        return group
-
-    # what is certainly close shares a label, what is certainly apart does not
-    inner, outer = groups(0.6 - 0.3 * np.sqrt(3)), groups(0.6 + 0.3 * np.sqrt(3))
-    for a, b in np.random.default_rng(0).integers(0, len(points), (3000, 2)):
-        assert label[a] == label[b] or inner[a] != inner[b]
-        assert label[a] != label[b] or outer[a] == outer[b]
-
-
-def test_links_of_nothing():
-    number, label = link(np.empty((0, 3)), 0.6)
-    assert number == 0 and label.shape == (0,)

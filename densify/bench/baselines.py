@@ -17,7 +17,7 @@ from scipy.sparse.linalg import splu
 from scipy.spatial import cKDTree
 
 from densify.errors import InputError
-from densify.flow.tracking.evidence import link
+from densify.kernels.linking import link
 from densify.types import Float, Int
 
 _LINK_M = 0.6

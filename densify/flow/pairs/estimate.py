@@ -20,8 +20,8 @@ from densify.flow.objective.neighbors import require_points
 from densify.flow.objective.solvers import SolverSettings, solve
 from densify.flow.pairs.hypotheses import Standing
 from densify.flow.pairs.movers import find_movers
-from densify.flow.tracking.evidence import link
 from densify.geometry.height_map import HeightMap
+from densify.kernels.linking import link
 from densify.types import Float, FlowField, Int
 
 _LEAST_MOTION_M = 0.15

@@ -17,7 +17,7 @@ from scipy.optimize import linear_sum_assignment
 from scipy.spatial import cKDTree
 
 from densify.flow.pairs.hypotheses import Hypotheses, Motion, Standing, Surface, thinned, tree_of
-from densify.flow.tracking.evidence import link
+from densify.kernels.linking import link
 from densify.types import Bool, Float, Int
 
 _REACH_M = 0.6  # a distance beyond it counts as this

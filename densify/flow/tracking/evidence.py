@@ -8,8 +8,6 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from densify.flow.tracking.clock import Clock
@@ -17,13 +15,14 @@ from densify.geometry import poses
 from densify.geometry.height_map import HeightMap
 from densify.geometry.range_image import RangeImage
 from densify.geometry.sensor import Sensors
+from densify.kernels.linking import link
 from densify.types import Bool, Float, Int, Stretch
 
 _MARGIN_M = 0.4
 _MARGIN_FRACTION = 0.015
 _NEAR_M = 0.4
 _MIN_SEED_SHARE = 0.3
-_LINK_M = 0.6
+LINK_M = 0.6
 _RING_GAP_M = 0.35
 REACH_S = 1.0
 """Sweeps up to so long before and after one tell about it: from where others were taken, little of
@@ -156,7 +155,8 @@ def find_candidates(
             rest = np.flatnonzero(~seed)
             seed[rest] = space.seen_through(points[rest], j)
         gap_m = space.sensors.gap_m(registered.sweep.points[above], registered.sweep.lidar[above])
-        close = _closer_rings(points, gap_m)
+        over_scanner = points - registered.T_world_lidar[:3, 3]
+        close = _closer_rings(over_scanner, gap_m)
         num_clusters, cluster = _cluster(close, seed)
         return Candidates(above, seed, cluster, num_clusters)
 
@@ -166,7 +166,11 @@ def find_candidates(
 
 def _closer_rings(points: Float, gap_m: Float) -> Float:
     """The points with heights compressed where the scanner's rings lie farther apart than what is
-    taken for one thing."""
+    taken for one thing.
+
+    points: from where the scanner stands, z up. Measured from anywhere else a level surface would
+    not stay one, for the compression grows with the range.
+    """
     squeezed = points.copy()
     squeezed[:, 2] *= np.minimum(1.0, _RING_GAP_M / np.maximum(gap_m, 1e-6))
     return squeezed
@@ -196,17 +200,5 @@ def _cluster(points: Float, seed: Bool) -> tuple[int, Int]:
         return 0, cluster
     distance, _ = cKDTree(points[kept]).query(points, distance_upper_bound=_NEAR_M)
     near = np.flatnonzero(np.isfinite(distance))
-    num_clusters, cluster[near] = link(points[near], _LINK_M)
+    num_clusters, cluster[near] = link(points[near], LINK_M)
     return num_clusters, cluster
-
-
-def link(points: Float, distance_m: float) -> tuple[int, Int]:
-    """(N,3) -> number of groups and (N,) label: points closer than about ``distance_m`` share one.
-
-    Links voxels of half that size, so the cost does not grow with the square of the density.
-    """
-    voxels, of_point = np.unique(np.floor(points / (0.5 * distance_m)), axis=0, return_inverse=True)
-    pairs = cKDTree(voxels).query_pairs(2.0, output_type="ndarray")
-    links = coo_array((np.ones(len(pairs), bool), pairs.T), shape=(len(voxels), len(voxels)))
-    num_groups, label = connected_components(links, directed=False)
-    return int(num_groups), label[of_point.ravel()].astype(np.int64)

@@ -16,6 +16,7 @@ import numpy as np
 from densify.flow.tracking.align import GATES_M, MIN_FIT, Model, align, apply, undo
 from densify.flow.tracking.clock import Clock
 from densify.flow.tracking.evidence import FreeSpace, Standing
+from densify.flow.tracking.lone_rings import in_line, linked_in_line, single_rings
 from densify.flow.tracking.paths import Path
 from densify.flow.tracking.shapes import Shape
 from densify.flow.tracking.vote import DistanceField, vote
@@ -28,6 +29,7 @@ _MIN_SEED_SHARE = 0.4
 _AROUND_S = 0.5  # before and after a start is as good as any time
 _NEARER_END, _NEARER_END_S = 0.7, 0.1  # each time a start is so much nearer it is worth less
 _FIT_M = 0.3
+_RINGS_M = 5.0
 _NEAR_S = 0.3
 _SHARE_UNSEEN = 0.5  # of the points a sweep usually shows
 _MANY_POINTS = 100  # more do not place a sweep better
@@ -38,6 +40,7 @@ _RECENT_S = 0.4  # the states in so long tell a rate
 _STEADY = np.array([1.0, 1.0, 1.0, 0.9])  # of what it was then: turns level out
 _ROUGH_M, _ROUGH_PER_GAP, _ROUGH_S = 0.04, 0.2, 0.003  # by gap of rings, by speed
 _LEAST_WAY_M, _LEAST_WAY_PER_RESIDUAL = 0.35, 8.0
+_BESIDE_M = 1.0
 _NUM_ASKED = 60
 _MISSES_ALLOWED, _MISSED_S = 1, 0.2  # either: a track ends when both are exceeded
 _LEAST_STATES, _LEAST_S = 3, 0.15
@@ -93,10 +96,11 @@ class Track:
         self.states[j], self.times_s[j], self.claimed[j] = state, time_s, rows
 
     def rise_m(self, ground: HeightMap, state: Float) -> float:
-        """How much higher the ground under the object is in that state."""
-        centres = np.stack([self.centre, self.centre + state[:3]])
-        start, now = ground.under(centres)
-        return float(now - start)
+        """How much higher the ground is in that state under the object and on both sides of it, in
+        the median: nobody may ever have seen the road that it covers."""
+        way = state[:2] / max(float(np.linalg.norm(state[:2])), 1e-9)
+        start = self.centre[:2] + np.outer([-_BESIDE_M, 0.0, _BESIDE_M], [-way[1], way[0]])
+        return float(np.median(ground.under(start + state[:2]) - ground.under(start)))
 
     def typical_size(self) -> float:
         """Points per sweep."""
@@ -132,6 +136,7 @@ def follow_groups(standing: Sequence[Standing], space: FreeSpace, ground: Height
         if proven:
             _gather(track, standing, free, space)
             _refine(track, standing, ground)
+            _claim_rings(track, standing, free, space)
         for j, rows in track.claimed.items():
             untried[j][rows] = False
             if proven:
@@ -270,13 +275,46 @@ def _gather(
         in_shape = track.undo(c.points[rows], c.time_s[rows])
         belongs = np.isfinite(shape.tree.nearest(in_shape, _FIT_M)[0])
         rows = rows[belongs | shape.within_outline(in_shape)]
-        for i in space.others(j):
-            if space.clock.near(i, j, _NEAR_S) and len(rows):
-                at_s = space.clock.time_s[i]
-                carried = track.carry(c.points[rows], c.time_s[rows], at_s)
-                velocity_m_s = track.velocity_m_s(carried, at_s)
-                rows = rows[~space.seen_through(carried, i, velocity_m_s)]
+        rows = _not_contradicted(track, c, rows, j, space)
         track.claimed[j] = np.concatenate([own, rows])
+
+
+def _claim_rings(
+    track: Track, standing: Sequence[Standing], free: Sequence[Bool], space: FreeSpace
+) -> None:
+    """Claim the free clusters of single rings ahead of and behind the object that its motion does
+    not contradict, see `densify.flow.tracking.lone_rings`. They do not place it: a ring stays where
+    the rays are."""
+    shape = Shape.of(track.seen_in(standing, sorted(track.claimed)))
+    ahead = track.path.rate(track.times_s[next(iter(track.states))])[:2]
+    found, bodies = [], []
+    for j, own in track.claimed.items():
+        c = standing[j]
+        there = track.place(shape.rim, track.times_s[j])
+        rows = rows_inside(c.points, there.min(0) - _RINGS_M, there.max(0) + _RINGS_M)
+        rows = rows[free[j][rows] & (c.cluster[rows] >= 0)]
+        rows = np.setdiff1d(rows, own, assume_unique=True)
+        rows = rows[single_rings(c, rows, space.T_lidar_world[j], space.sensors)]
+        rows = rows[in_line(shape, track.undo(c.points[rows], c.time_s[rows]), ahead)]
+        rows = _not_contradicted(track, c, rows, j, space)
+        found.append(rows)
+        bodies.append(track.undo(c.points[rows], c.time_s[rows]))
+    linked = linked_in_line(shape, bodies, ahead)
+    for j, rows, together in zip(list(track.claimed), found, linked, strict=True):
+        track.claimed[j] = np.concatenate([track.claimed[j], rows[together]])
+
+
+def _not_contradicted(
+    track: Track, c: Standing, rows: np.ndarray, j: int, space: FreeSpace
+) -> np.ndarray:
+    """Those rows of sweep j that no sweep close in time sees through where they are carried to."""
+    for i in space.others(j):
+        if space.clock.near(i, j, _NEAR_S) and len(rows):
+            at_s = space.clock.time_s[i]
+            carried = track.carry(c.points[rows], c.time_s[rows], at_s)
+            velocity_m_s = track.velocity_m_s(carried, at_s)
+            rows = rows[~space.seen_through(carried, i, velocity_m_s)]
+    return rows
 
 
 def _refine(track: Track, standing: Sequence[Standing], ground: HeightMap) -> None:

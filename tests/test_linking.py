@@ -1,0 +1,63 @@
+# SPDX-License-Identifier: MIT
+"""Groups of points linked by distance, against single linkage as its definition says it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.cluster.hierarchy import fcluster, linkage
+from scipy.spatial.transform import Rotation
+
+from densify.kernels.linking import link
+
+DISTANCE_M = 0.6
+
+
+def numbered(label: np.ndarray) -> np.ndarray:
+    """The same groups, numbered by their first points."""
+    _, first, group = np.unique(label, return_index=True, return_inverse=True)
+    return np.argsort(np.argsort(first))[group.ravel()]
+
+
+def clouds() -> list[np.ndarray]:
+    rng = np.random.default_rng(3)
+    thin = rng.uniform(-6, 6, (400, 3)) * [1, 1, 0.1]
+    clumps = rng.normal(0, 0.1, (60, 20, 3)) + rng.uniform(-4, 4, (60, 1, 3))
+    line = np.outer(np.arange(50) * 0.59, [0.6, 0.0, 0.8])
+    return [thin, clumps.reshape(-1, 3), line, line * 1.05]
+
+
+@pytest.mark.parametrize("points", clouds(), ids=["thin", "clumps", "linked line", "loose line"])
+def test_single_linkage(points: np.ndarray) -> None:
+    num, label = link(points, DISTANCE_M)
+    expected = fcluster(linkage(points, "single"), DISTANCE_M, "distance")
+    np.testing.assert_array_equal(label, numbered(expected))
+    assert num == label.max() + 1 and label.dtype == np.int64
+
+
+@pytest.mark.parametrize("points", clouds()[:2], ids=["thin", "clumps"])
+def test_wherever_the_origin_lies_and_however_the_axes_are_turned(points: np.ndarray) -> None:
+    rng = np.random.default_rng(0)
+    _, label = link(points, DISTANCE_M)
+    for _ in range(8):
+        R = Rotation.random(random_state=int(rng.integers(1 << 30))).as_matrix()
+        moved = points @ R.T + rng.uniform(-1000, 1000, 3)
+        np.testing.assert_array_equal(link(moved, DISTANCE_M)[1], label)
+
+
+def test_the_order_of_the_points_changes_only_the_numbers() -> None:
+    points = clouds()[0]
+    order = np.random.default_rng(1).permutation(len(points))
+    np.testing.assert_array_equal(
+        link(points[order], DISTANCE_M)[1], numbered(link(points, DISTANCE_M)[1][order])
+    )
+
+
+def test_points_on_one_place() -> None:
+    num, label = link(np.repeat([[1.0, 2, 3], [1.0, 2, 3.7]], 100, axis=0), DISTANCE_M)
+    assert num == 2 and (label == np.repeat([0, 1], 100)).all()
+
+
+def test_nothing() -> None:
+    num, label = link(np.empty((0, 3)), DISTANCE_M)
+    assert num == 0 and label.shape == (0,)

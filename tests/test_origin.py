@@ -1,0 +1,89 @@
+# SPDX-License-Identifier: MIT
+"""What moves does not depend on where the world's origin lies and where its x axis points."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from densify.config import GroundSettings
+from densify.flow.tracking.evidence import FreeSpace, find_candidates
+from densify.geometry.ground import ground
+from densify.types import Stretch
+from tests.dataset_scenes import COARSE
+from tests.found_motion import motion_in
+from tests.scenes import Arc, Scene, World, car, street
+
+SHIFTS_M = [(0.0, 1.5, 0.0), (0.17, 0.71, 1.7), (1234.567, -987.321, -8.0)]
+YAWS_DEG = (10.0, 45.0, 90.0)
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    """On a scanner so coarse that a few points decide whether a car is followed."""
+    cars = car(9, 1.8, 8, 1), car(18, -4.0, 6, 2, np.pi / 2)
+    scanner = replace(COARSE, sigma_m=0.01)
+    return Scene(World((*street(50.0), *cars)), Arc(0, -1.5, 0, 4.0), scanner)
+
+
+@pytest.fixture(scope="module")
+def stretch(scene: Scene) -> Stretch:
+    return scene.stretch(5, 4)
+
+
+def seen_from(stretch: Stretch, shift_m=(0.0, 0.0, 0.0), yaw_deg: float = 0.0) -> Stretch:
+    """The same sweeps in another world."""
+    T_new_old = np.eye(4)
+    c, s = np.cos(np.deg2rad(yaw_deg)), np.sin(np.deg2rad(yaw_deg))
+    T_new_old[:2, :2] = [[c, -s], [s, c]]
+    T_new_old[:3, 3] = shift_m
+    sweeps = [replace(s, T_world_lidar=T_new_old @ s.T_world_lidar) for s in stretch.sweeps]
+    return Stretch(tuple(sweeps))
+
+
+def moving(stretch: Stretch) -> np.ndarray:
+    motion = motion_in(stretch, ground(stretch, GroundSettings()))
+    return np.concatenate([instance >= 0 for instance in motion.instance])
+
+
+def test_candidates_are_the_same_groups(stretch: Stretch) -> None:
+    def found(there: Stretch):
+        heights = ground(there, GroundSettings())
+        return find_candidates(there, FreeSpace.of(there), heights, 0.3)
+
+    here = found(stretch)
+    assert sum(c.num_clusters for c in here) > 20
+    for shift_m in SHIFTS_M:
+        shifted = found(seen_from(stretch, shift_m))
+        for a, b in zip(here, shifted, strict=True):
+            # The ground's cells begin elsewhere, so a few points at the least height differ.
+            both, in_a, in_b = np.intersect1d(a.row, b.row, return_indices=True)
+            assert len(both) > 0.99 * max(len(a.row), len(b.row))
+            pairs = set(zip(a.cluster[in_a], b.cluster[in_b], strict=True))
+            assert (a.seed[in_a] == b.seed[in_b]).mean() > 0.999
+            assert len(pairs) <= max(a.num_clusters, b.num_clusters) + 2  # one to one, and none
+
+
+@pytest.fixture(scope="module")
+def here(stretch: Stretch) -> np.ndarray:
+    return moving(stretch)
+
+
+@pytest.mark.parametrize("shift_m", SHIFTS_M, ids=str)
+def test_movers_wherever_the_origin_lies(shift_m, scene, stretch, here) -> None:
+    there = moving(seen_from(stretch, shift_m))
+    instance = np.concatenate([scene.scan(f).instance for f in stretch.frames])
+    assert here[instance == 1].mean() > 0.8 and here[instance == 2].mean() > 0.9
+    assert (there != here).sum() <= 0.02 * here.sum()
+    assert not there[instance < 0].any()
+
+
+@pytest.mark.parametrize("yaw_deg", YAWS_DEG)
+def test_movers_whichever_way_the_axes_point(yaw_deg, scene, stretch, here) -> None:
+    there = moving(seen_from(stretch, yaw_deg=yaw_deg))
+    instance = np.concatenate([scene.scan(f).instance for f in stretch.frames])
+    for number in (1, 2):
+        assert there[instance == number].mean() > here[instance == number].mean() - 0.1
+    assert not there[instance < 0].any()
