@@ -36,10 +36,12 @@ needs_installation = pytest.mark.skipif(
 )
 
 
-def modules_after(code: str) -> set[str]:
+def modules_after(code: str, cwd: Path | None = None) -> set[str]:
     """Top-level modules that a fresh interpreter holds after the code."""
     code += "\nimport json, sys; print('\\n' + json.dumps(sorted(sys.modules)))"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=cwd
+    )
     return {name.partition(".")[0] for name in json.loads(done.stdout.splitlines()[-1])}
 
 
@@ -70,6 +72,18 @@ def test_help_of_every_verb_is_light(verb: str) -> None:
 def test_opening_a_recording_needs_no_torch() -> None:
     heavy = {"torch", "kiss_icp", "numba"}
     assert not heavy & modules_after("import densify; densify.open_sequence")
+
+
+def test_the_default_run_waits_for_no_torch() -> None:
+    """Nor for other packages that take longer to import than a stage to run."""
+    code = (
+        "from tests.small_street import KEY, POSES_GIVEN, one_car\n"
+        "import densify\n"
+        "result = densify.run(one_car(), KEY, 2, config=POSES_GIVEN)\n"
+        "assert result.cloud.moving.any()\n"
+        "import sys; assert 'scipy.signal' not in sys.modules"
+    )
+    assert not {"torch", "kiss_icp", "dask"} & modules_after(code, CHECKOUT)
 
 
 @pytest.mark.parametrize("name", [n for n in dir(densify) if not n.startswith("_")])

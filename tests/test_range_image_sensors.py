@@ -7,8 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy import ndimage, signal
 
-from densify.geometry import range_image, sensor
+from densify.geometry import range_image, rings, sensor
 from densify.geometry.range_image import RangeImage
 from densify.geometry.rings import find_rings
 from densify.geometry.sensor import Aimed
@@ -17,6 +18,19 @@ from densify.types import RegisteredSweep, Sweep
 from tests.scenes import ROOM, Arc, Scanner, Scene, World, on_sphere
 
 MARGIN = (0.4, 0.015)
+
+
+@pytest.mark.parametrize("num", [3, 5, 50, 2000])
+@pytest.mark.parametrize("smooth", [False, True], ids=["plateaus", "smooth"])
+def test_peaks_are_scipys(num, smooth):
+    rng = np.random.default_rng(num)
+    for _ in range(20):
+        count = rng.integers(0, 5, num).astype(float)
+        count = ndimage.gaussian_filter1d(count, 1.0) if smooth else count
+        expected, found = signal.find_peaks(count, prominence=0.0)
+        peaks, prominence = rings._peaks(count)
+        np.testing.assert_array_equal(peaks, expected)
+        np.testing.assert_array_equal(prominence, found["prominences"])
 
 
 @pytest.mark.parametrize("num_beams", [16, 32, 64])

@@ -5,16 +5,19 @@ Hays, Lucey, "Scene Flow from Point Clouds with or without Learning", 3DV 2020, 
 from __future__ import annotations
 
 import warnings
+from typing import TYPE_CHECKING
 
 import numpy as np
-import torch
 from scipy.sparse import csr_array
-from torch import Tensor
 
 from densify.errors import InputError
-from densify.flow.objective.neighbors import NeighborIndex
 from densify.kernels import sparse
+from densify.kernels.nearest import BoxTree
 from densify.types import Float
+
+if TYPE_CHECKING:  # who needs the graph alone does not wait for torch
+    import torch
+    from torch import Tensor
 
 LAPLACIANS = ("symmetric", "row-sum-zero")
 
@@ -50,9 +53,14 @@ def radius_graph(points: Float, radius_m: float, max_neighbors: int) -> csr_arra
 def _weights(points: Float, num_neighbors: int, radius_m: float) -> csr_array:
     if num_neighbors < 1:
         raise InputError(f"num_neighbors: got {num_neighbors}, expected at least 1")
-    cloud = torch.from_numpy(np.ascontiguousarray(points))
-    found = NeighborIndex(cloud).nearest(cloud, min(num_neighbors + 1, len(cloud)))
-    index, distance_m = found.row.numpy(), found.distance_m.numpy()
+    points = np.ascontiguousarray(points, np.float64)
+    if points.ndim != 2 or points.shape[1] != 3 or not len(points) or not np.isfinite(points).all():
+        import torch
+
+        from densify.flow.objective.neighbors import require_points
+
+        require_points(torch.from_numpy(points), "points")  # says what is wrong
+    distance_m, index = BoxTree(points).nearest_k(points, min(num_neighbors + 1, len(points)))
     # Among more than k duplicates a point may not find itself: it takes the last place.
     own = np.arange(len(points))
     lost = ~(index == own[:, None]).any(axis=1)
@@ -97,6 +105,8 @@ def laplacian(weights: csr_array, kind: str = "symmetric") -> csr_array:
 
 def sparse_tensor(matrix: csr_array, dtype: torch.dtype, device: str | torch.device) -> Tensor:
     """The same matrix as a torch CSR tensor, as `densify.flow.objective.energy.energy` takes it."""
+    import torch
+
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="Sparse CSR tensor support is in beta")
         return torch.sparse_csr_tensor(
@@ -110,6 +120,8 @@ def sparse_tensor(matrix: csr_array, dtype: torch.dtype, device: str | torch.dev
 
 def multiply(matrix: Tensor, values: Tensor) -> Tensor:
     """A `sparse_tensor` times (n,3); on the CPU the same bytes with any number of threads."""
+    import torch
+
     if matrix.is_cuda:
         return matrix @ values
     return torch.from_numpy(sparse.product(rows_of(matrix), values.detach().numpy()))
