@@ -66,6 +66,12 @@ def add_dataset(commands: Any) -> None:
     parser.add_argument(
         "--status", metavar="DIR", type=Path, help="how far the set in DIR is; makes nothing"
     )
+    parser.add_argument(
+        "--verify",
+        action="store_true",
+        help="compare all finished files with the hashes in the manifest: damaged ones are made "
+        "anew, or with --status listed (exit code 1)",
+    )
     add_short_options(parser)
     add_config_options(parser)
 

@@ -103,9 +103,17 @@ def dataset(options: argparse.Namespace) -> None:
     from densify.cli.sets import set_status, set_summary
 
     if options.status is not None:
-        from densify.dataset.make import status
+        from densify.dataset.make import damaged, status
 
         print(set_status(*status(options.status)))
+        files = damaged(options.status) if options.verify else []
+        for name in files:
+            print(f"damaged: {name}")
+        if files:
+            raise ComputationError(
+                f"--verify: {len(files)} damaged or missing files in {options.status}; run the "
+                f"command that made the set again with --verify, which makes them anew"
+            )
         return
     if options.out is None:
         raise InputError("--out DIR: expected the set's folder, a new one or one to go on with")
@@ -135,6 +143,7 @@ def dataset(options: argparse.Namespace) -> None:
             shard=options.shard,
             memory_bytes=options.memory,
             cache_bytes=options.cache_size,
+            verify=options.verify,
             report=report,
         )
     print(set_summary(summary))

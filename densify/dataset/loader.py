@@ -192,8 +192,8 @@ class DepthDataset(Dataset[dict[str, Any]]):
                 _check_size(str(path), stored, camera)
             except InputError as error:
                 raise InputError(
-                    f"{error}; run densify dataset again with --out {self._root}: it makes what is "
-                    f"missing or damaged anew"
+                    f"{error}; run densify dataset again with --verify, as the set was made: it "
+                    f"makes missing and damaged files in {self._root} anew"
                 ) from None
             return stored[None]
 

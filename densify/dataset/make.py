@@ -14,7 +14,14 @@ from uuid import uuid4
 
 from densify.cache import code
 from densify.config import as_mapping
-from densify.dataset.manifest import Key, KeyRecord, Manifest, finished, read_manifests
+from densify.dataset.manifest import (
+    Key,
+    KeyRecord,
+    Manifest,
+    damaged_files,
+    finished,
+    read_manifests,
+)
 from densify.dataset.plan import (
     PlannedDrive,
     Recipe,
@@ -87,6 +94,7 @@ def make_dataset(
     shard: tuple[int, int] | None = None,
     memory_bytes: int | None = None,
     cache_bytes: int = CACHE_BYTES,
+    verify: bool = False,
     report: Callable[[Summary], None] | None = None,
 ) -> Summary:
     """Every key of whole recordings, as a training set in ``out``.
@@ -96,8 +104,9 @@ def make_dataset(
     address of a Dask scheduler whose workers are used instead; they need the same files at the same
     paths. shard: (i, n), the i-th of n parts of the work, from 1; parts may run at the same time on
     machines that share ``out``. memory_bytes: of all processes together; fewer are started where it
-    does not suffice. cache_bytes: bound of what is kept on disk for later runs. report: called
-    after every key.
+    does not suffice. cache_bytes: bound of what is kept on disk for later runs. verify: compare
+    finished files with their recorded hashes, and make damaged ones anew. report: called after
+    every key.
 
     Run again, it goes on where it was stopped, however that happened: finished keys are kept, keys
     that failed are tried again. The files do not depend on the number of processes, on shards or on
@@ -118,7 +127,7 @@ def make_dataset(
                 settings = as_mapping(recipe.config)
                 write_readme(out, method=recipe.method, window=recipe.window, settings=settings)
             drives = _part(drives, shard)
-            done = _Done(out, drives, report)
+            done = _Done(out, drives, report, verify)
             left = done.left(drives)
             num_processes = _num_processes(num_workers, memory_bytes, recipe, drives)
             _announce(out, recipe, left, done.summary().num_keys, num_processes)
@@ -145,10 +154,11 @@ class _Done:
         out: Path,
         drives: Sequence[PlannedDrive],
         report: Callable[[Summary], None] | None,
+        verify: bool,
     ) -> None:
         wanted = {(d.source.name, key) for d in drives for key in d.keys}
         before = read_manifests(out)
-        whole = finished(before.values(), out)
+        whole = finished(before.values(), out, verify)
         self._records = {name: before[name] for name in sorted(wanted & whole)}
         self._num_keys, self._report = len(wanted), report
         self._num_made, self._started = 0, time.monotonic()
@@ -200,6 +210,13 @@ def status(out: Path) -> tuple[Summary, list[str]]:
         text = path.read_text("utf-8", errors="replace").splitlines()
         lines += text[-1:]
     return Summary(records, len(keys)), lines
+
+
+def damaged(out: Path) -> list[str]:
+    """Files of finished keys, relative to ``out``, that are missing or hold something else than was
+    written, by the hashes in the manifest."""
+    records = read_manifests(out).values()
+    return [name for r in records if r.status != "failed" for name in damaged_files(r, out)]
 
 
 def _records(outcomes: Iterator[Outcome]) -> Iterator[KeyRecord]:

@@ -133,9 +133,16 @@ def damaged_files(record: KeyRecord, root: Path) -> list[str]:
     return [name for name, file in record.files.items() if _content(root / name) != file]
 
 
-def finished(records: Iterable[KeyRecord], root: Path) -> set[Key]:
-    """Keys that need not be made again: done or put aside, and their files are whole."""
-    return {r.name for r in records if r.status != "failed" and is_whole(r, root)}
+def finished(records: Iterable[KeyRecord], root: Path, verify: bool = False) -> set[Key]:
+    """Keys that need not be made again: done or put aside, and their files are whole.
+
+    verify: whether their contents are compared with the recorded hashes too, which reads them all.
+    """
+    return {
+        r.name
+        for r in records
+        if r.status != "failed" and is_whole(r, root) and not (verify and damaged_files(r, root))
+    }
 
 
 class Manifest:
