@@ -98,6 +98,17 @@ def test_drive_and_camera_tell_files_apart_where_both_sides_say_them(tmp_path: P
     assert len(pair_depth_files(tmp_path / "run", tmp_path / "t" / DRIVE).pairs) == 1
 
 
+def test_maps_of_single_images_pair_by_their_numbers(tmp_path: Path) -> None:
+    ours = [
+        put(tmp_path / "out" / "000120" / "depth" / "fast" / f"{n:06d}.png") for n in (359, 360)
+    ]
+    ours.append(put(tmp_path / "out" / "000121" / "depth" / "fast" / "000361.png"))
+    put(tmp_path / "out" / "000120" / "confidence" / "fast" / "000359.png")
+    truth = [put(tmp_path / "truth" / f"{n}.png") for n in (359, 360, 361)]
+    pairs = pair_depth_files(tmp_path / "out", tmp_path / "truth").pairs
+    assert [(p.predicted, p.truth) for p in pairs] == list(zip(ours, truth, strict=True))
+
+
 def test_equal_names_pair_in_plain_folders(tmp_path: Path) -> None:
     for side, names in (("p", ("a", "left_5", "0007")), ("t", ("a", "right_5", "7"))):
         for name in names:

@@ -65,12 +65,17 @@ def maps():
 @pytest.fixture
 def run(tmp_path, maps):
     """A finished run's folder."""
+    return written(tmp_path, maps)
+
+
+def written(out, maps):
     cloud = Cloud(
         points=np.zeros((1, 3)),
         rigid_points=np.zeros((1, 3)),
         frame=np.array([120], np.int32),
         since_key_ns=np.zeros(1, np.int64),
         row=np.zeros(1, np.int64),
+        lidar=np.zeros(1, np.uint8),
         moving=np.zeros(1, bool),
         instance=np.full(1, -1, np.int32),
         velocity_m_s=np.zeros((1, 3), np.float32),
@@ -78,10 +83,8 @@ def run(tmp_path, maps):
         intensity=np.ones(1, np.float32),
         rgb=np.zeros((1, 3), np.uint8),
     )
-    write_result(
-        Result("flow", 120, tuple(AGE_S), cloud, maps), {}, tmp_path, config={}, data="street"
-    )
-    return tmp_path / "000120"
+    write_result(Result("flow", 120, tuple(AGE_S), cloud, maps), {}, out, config={}, data="street")
+    return out / "000120"
 
 
 def tree(folder):
@@ -106,6 +109,15 @@ def refused(*parts, **arguments):
 
 
 # What is kept
+
+
+def test_maps_of_single_images_lie_in_folders_of_their_cameras(tmp_path):
+    names = ("fast/000359", "fast/000360", "fisheye/000120")
+    run = written(tmp_path, {name: map_of(name.split("/")[0], i) for i, name in enumerate(names)})
+    assert set(maps_in(run)) == {f"{p}/{name}.png" for p in PRODUCTS for name in names}
+    export = export_run(run)
+    assert set(export.density) == set(names)
+    assert maps_in(run / "export") == maps_in(run)
 
 
 def test_nothing_asked_for_gives_the_same_bytes_and_leaves_the_run_alone(run):

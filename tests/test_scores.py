@@ -52,6 +52,7 @@ def cloud_of(*parts):
         frame=frame,
         since_key_ns=(frame.astype(np.int64) - KEY) * 100_000_000,
         row=np.arange(n),
+        lidar=np.zeros(n, np.uint8),
         moving=np.concatenate([np.full(len(p), m) for p, _, m in parts]),
         instance=np.full(n, -1, np.int32),
         velocity_m_s=np.zeros((n, 3), np.float32),

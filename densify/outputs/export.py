@@ -84,9 +84,9 @@ def export_run(
         )
     density: dict[str, dict[str, Density]] = {}
     with writing(folder, _OWNED, folder, overwrite) as staging:
-        for product in _KINDS:
-            (staging / product).mkdir()
         for camera in cameras:
+            for product in _KINDS:
+                (staging / product / camera).parent.mkdir(parents=True, exist_ok=True)
             maps = _read_maps(run, camera)
             keep = maps["confidence"] >= stored_confidence(min_confidence)
             if max_age_ms is not None:
@@ -118,13 +118,19 @@ def _check_thresholds(min_confidence: float, max_age_ms: float | None) -> None:
 
 
 def _cameras(run: Path) -> list[str]:
-    """Cameras of which all maps are there."""
+    """Cameras, or CAMERA/NUMBER of their images, of which all maps are there."""
     if not (run / "run.yaml").is_file():
         raise InputError(
             f"{run}: no run.yaml in it; expected the folder of a finished run and key, such as "
             f"densify-out/000120"
         )
-    cameras = sorted({path.stem for product in _KINDS for path in (run / product).glob("*.png")})
+    cameras = sorted(
+        {
+            path.relative_to(run / product).with_suffix("").as_posix()
+            for product in _KINDS
+            for path in (run / product).rglob("*.png")
+        }
+    )
     if not cameras:
         raise InputError(f"{run}: no depth maps in it; run densify with a camera first")
     paths = [run / product / f"{camera}.png" for camera in cameras for product in _KINDS]

@@ -5,6 +5,7 @@ camera and frame, whatever layout each side has::
     <drive>/proj_depth/<product>/image_02/0000000005.png    KITTI's depth trees
     <drive>_sync_<product>_0000000005_image_02.png          KITTI's selected validation images
     [<drive>/]000005/depth/image_02.png                     densify's own output (or depth_filled)
+    [<drive>/]000005/depth/image_02/000007.png              its maps of single images, by number
     [<drive>/][image_02/]0000000005.png, scene_a.png        plain folders; the name is the frame
 
 The sets of `densify dataset` are of the first or of the third layout. A drive is KITTI's dated name
@@ -32,6 +33,10 @@ _KITTI_SELECTION = re.compile(
 _OWN_OUTPUT = re.compile(
     r"/(?P<frame>\d{6,})/(?P<product>depth|depth_filled)/(?P<camera>[^/]+)\.png$"
 )
+_OWN_IMAGES = re.compile(
+    r"/\d{6,}/(?P<product>depth|depth_filled)/(?P<camera>[^/]+)/(?P<frame>\d+)\.png$"
+)
+_OWN_DEPTH = {_OWN_OUTPUT: 3, _OWN_IMAGES: 4}  # parts of a path from the key's folder on
 _TRUTH_PRODUCTS = ("groundtruth", "groundtruth_depth")
 _MEASURED, _FILLED = ("depth", "groundtruth"), ("depth_filled", "groundtruth_filled")
 _OURS = ("depth", *_FILLED, "confidence")  # no other trees have these
@@ -132,13 +137,14 @@ def _found(place: Path, what: str) -> list[_File]:
 
 def _parsed(path: Path, place: Path) -> _File:
     text = path.absolute().as_posix()
-    for layout in (_DEPTH_TREE, _KITTI_SELECTION, _OWN_OUTPUT):
+    for layout in (_DEPTH_TREE, _KITTI_SELECTION, *_OWN_DEPTH):
         if match := layout.search(text):
             parts = match.groupdict()
             frame = str(int(parts["frame"]))
             above = text[: match.end("folder") if layout is _DEPTH_TREE else match.start()]
             drive = parts.get("drive") or _last(_DRIVE, above, "drive") or parts.get("folder")
-            around = path.relative_to(place).parts[:-3] if layout is _OWN_OUTPUT else ()
+            depth = _OWN_DEPTH.get(layout)
+            around = path.relative_to(place).parts[:-depth] if depth else ()
             folder = around[-1] if around else None
             return _File(path, frame, drive, parts["camera"], parts["product"], folder)
     folder = path.absolute().parent.as_posix()
