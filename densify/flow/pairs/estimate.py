@@ -18,7 +18,7 @@ from densify.config import Config, ObjectiveSettings, resolve
 from densify.errors import InputError
 from densify.flow.objective.neighbors import require_points
 from densify.flow.objective.solvers import SolverSettings, solve
-from densify.flow.pairs.hypotheses import Standing
+from densify.flow.pairs.hypotheses import PairCloud
 from densify.flow.pairs.movers import find_movers
 from densify.geometry.height_map import HeightMap
 from densify.kernels.linking import link
@@ -127,7 +127,7 @@ def _flow_of_groups(
         return field
     lag = times.lag if times else (np.zeros(len(clouds[0])), np.zeros(len(clouds[1])))
     source, target = (
-        Standing(points[i][rows], lag[i][rows], None if lidars is None else lidars[i][rows])
+        PairCloud(points[i][rows], lag[i][rows], None if lidars is None else lidars[i][rows])
         for i, rows in enumerate(above)
     )
     start = None if initial is None else initial[above[0]]

@@ -33,7 +33,7 @@ _FROM_START = np.array([1.0, 1.0, 0.0, 0.0])
 
 
 @dataclass(frozen=True)
-class Standing:
+class PairCloud:
     """What stands above the ground in one of the two clouds.
 
     points: (N,3) metres. lag: (N,) how long after the cloud's reference time each was measured, as
@@ -66,7 +66,7 @@ class Standing:
 
 
 @dataclass(frozen=True)
-class Motion:
+class RigidMotion:
     """Displacement x y z (m) and yaw (rad) about ``centre`` of an object, from one cloud's
     reference time to the other's; ``seen_share`` of it between its measurements."""
 
@@ -86,7 +86,7 @@ class Motion:
 class Surface:
     """Candidates of the target with the inverse covariance of the surface around each."""
 
-    def __init__(self, target: Standing, rows: Int) -> None:
+    def __init__(self, target: PairCloud, rows: Int) -> None:
         self.points, self.lag = target.points[rows], target.lag[rows]
         self.tree = tree_of(target.places(self.points, rows))
         k = min(12, len(rows))
@@ -106,12 +106,12 @@ class Surface:
 class Hypotheses:
     """Motions to try, H of them over P points in all.
 
-    group: (H,) number of the group. state: (H,4), centre: (H,3), see `Motion`. row: (P,) of the
-    source, a sample of the group. of_point: (P,) the hypothesis. share: (H,) of the motion between
-    when the source and when the target measured the group.
+    group: (H,) number of the group. state: (H,4), centre: (H,3), see `RigidMotion`. row: (P,) of
+    the source, a sample of the group. of_point: (P,) the hypothesis. share: (H,) of the motion
+    between when the source and when the target measured the group.
     """
 
-    source: Standing
+    source: PairCloud
     group: Int
     state: Float
     centre: Float
@@ -122,8 +122,8 @@ class Hypotheses:
     @staticmethod
     def of(
         groups: list[Int],
-        source: Standing,
-        target: Standing,
+        source: PairCloud,
+        target: PairCloud,
         candidates: Int,
         initial: Float | None,
         apart_s: float | None,

@@ -16,7 +16,14 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial import cKDTree
 
-from densify.flow.pairs.hypotheses import Hypotheses, Motion, Standing, Surface, thinned, tree_of
+from densify.flow.pairs.hypotheses import (
+    Hypotheses,
+    PairCloud,
+    RigidMotion,
+    Surface,
+    thinned,
+    tree_of,
+)
 from densify.kernels.linking import link
 from densify.types import Bool, Float, Int
 
@@ -45,18 +52,18 @@ _ATTACH_UNEXPLAINED_M = 1.0
 
 
 def find_movers(
-    source: Standing,
-    target: Standing,
+    source: PairCloud,
+    target: PairCloud,
     initial: Float | None = None,
     apart_s: float | None = None,
-) -> tuple[list[Motion], Int]:
+) -> tuple[list[RigidMotion], Int]:
     """The motions, and (N,) which of them each source point takes, -1 none.
 
     initial: (N,3) flow; a group is also tried at the median of its members'. apart_s: the time
     between the clouds, None where unknown: what moves at up to 38 m/s is looked for.
     """
     with ThreadPoolExecutor(2) as pool:
-        ours, theirs = pool.map(_Evidence.of, (source, target), (target, source))
+        ours, theirs = pool.map(_Unexplained.of, (source, target), (target, source))
     groups = ours.groups()
     if not groups or not len(theirs.candidates):
         return [], np.full(len(source.points), -1)
@@ -67,14 +74,14 @@ def find_movers(
     return motions, instance
 
 
-class _Evidence:
+class _Unexplained:
     """Which points of a cloud the other one does not explain, and the groups they form.
 
     distance_m: (N,) to the other cloud, at most the reach. unexplained: (N,). candidates: (C,)
     rows that belong to a group. group: (N,) its label, -1 none.
     """
 
-    def __init__(self, cloud: Standing, distance_m: Float) -> None:
+    def __init__(self, cloud: PairCloud, distance_m: Float) -> None:
         self.cloud, self.distance_m = cloud, distance_m
         self.unexplained = np.zeros(len(distance_m), bool)
         far = np.flatnonzero(distance_m > _EXPLAINED_M)
@@ -83,9 +90,9 @@ class _Evidence:
         self.candidates = np.flatnonzero(self.group >= 0)
 
     @staticmethod
-    def of(cloud: Standing, other: Standing) -> _Evidence:
+    def of(cloud: PairCloud, other: PairCloud) -> _Unexplained:
         rows = np.arange(len(cloud.points))
-        return _Evidence(cloud, _distance_m(cloud.places(cloud.points, rows), other.tree))
+        return _Unexplained(cloud, _distance_m(cloud.places(cloud.points, rows), other.tree))
 
     def tolerance_m(self, rows: Int) -> Float:
         """How far from a point a counterpart may be: what is sparse in one cloud is in both."""
@@ -142,7 +149,7 @@ class _Trial:
     """
 
     group: int
-    motion: Motion
+    motion: RigidMotion
     still: int
     left: int
     misfit: float
@@ -172,13 +179,13 @@ class _Trial:
 
 
 def _choose(
-    hypotheses: Hypotheses, groups: list[Int], ours: _Evidence, theirs: _Evidence
-) -> tuple[list[Motion], Int]:
+    hypotheses: Hypotheses, groups: list[Int], ours: _Unexplained, theirs: _Unexplained
+) -> tuple[list[RigidMotion], Int]:
     """At most one motion per group; a target is explained once."""
     free = np.ones(len(theirs.unexplained), bool)
     trials = [t for t in _trials(hypotheses, groups, ours, theirs) if t.proves(free)]
     assigned = _assigned(trials, theirs.group)
-    motions: list[Motion] = []
+    motions: list[RigidMotion] = []
     instance = np.full(len(ours.unexplained), -1)
     done: set[int] = set()
     for trial in sorted(trials, key=lambda t: (t not in assigned, -t.gain_m)):
@@ -214,7 +221,7 @@ def _assigned(trials: list[_Trial], target_group: Int) -> list[_Trial]:
 
 
 def _trials(
-    hypotheses: Hypotheses, groups: list[Int], ours: _Evidence, theirs: _Evidence
+    hypotheses: Hypotheses, groups: list[Int], ours: _Unexplained, theirs: _Unexplained
 ) -> list[_Trial]:
     """Judge the hypotheses that pass a first look, in the source alone."""
     num = len(hypotheses.state)
@@ -235,7 +242,7 @@ def _trials(
     trials = []
     for h in np.flatnonzero(passed):
         k = int(hypotheses.group[h])
-        motion = Motion(hypotheses.state[h], hypotheses.centre[h], float(hypotheses.share[h]))
+        motion = RigidMotion(hypotheses.state[h], hypotheses.centre[h], float(hypotheses.share[h]))
         if _ambiguous(ours.cloud.points[row[of_point == h]], motion.state[:3]):
             continue
         still_there, around, explained, back_m = _looked_back(motion, groups[k], ours, theirs)
@@ -266,7 +273,7 @@ def _ambiguous(points: Float, way: Float) -> bool:
 
 
 def _looked_back(
-    motion: Motion, members: Int, ours: _Evidence, theirs: _Evidence
+    motion: RigidMotion, members: Int, ours: _Unexplained, theirs: _Unexplained
 ) -> tuple[int, Int, Int, float]:
     """From the target to the group where it arrives: `_Trial`'s still_there, around, explained, and
     by how much the distances become shorter (m)."""
@@ -291,7 +298,9 @@ def _looked_back(
     )
 
 
-def _attach(motions: list[Motion], instance: Int, ours: _Evidence, theirs: _Evidence) -> None:
+def _attach(
+    motions: list[RigidMotion], instance: Int, ours: _Unexplained, theirs: _Unexplained
+) -> None:
     """Give points close to a mover its motion if that explains them: those that standing still
     leaves unexplained from farther away."""
     points = ours.cloud.points
