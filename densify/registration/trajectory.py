@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -18,6 +18,7 @@ from densify.registration.odometry import (
     register,
     searched_twist,
 )
+from densify.registration.upright import upright
 from densify.types import Sweep, Trajectory
 
 _ROUGH_STEP_S = (
@@ -55,10 +56,12 @@ def find_trajectory(
     if recorded is not None:
         check_plausible(recorded, settings)
         check_overlap(sweeps, recorded, settings)
-        return recorded
-    rough = _rough(sweeps, settings)
-    straight = [s.sweep for s in deskew(sweeps, rough).sweeps]
-    return register(straight, settings, rough)
+        found = recorded
+    else:
+        rough = _rough(sweeps, settings)
+        straight = [s.sweep for s in deskew(sweeps, rough).sweeps]
+        found = register(straight, settings, rough)
+    return replace(found, R_level_lidar=upright(sweeps))
 
 
 def _rough(sweeps: Sequence[Sweep], settings: RegisterSettings) -> Trajectory:

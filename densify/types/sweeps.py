@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -73,16 +73,25 @@ class Sweep:
 
 @dataclass(frozen=True)
 class Trajectory:
-    """Where the lidar was: frames ascending, stamp_ns (n,) int64, T_world_lidar (n,4,4)."""
+    """Where the lidar was: frames ascending, stamp_ns (n,) int64, T_world_lidar (n,4,4).
+
+    R_level_lidar: (3,3) turns the lidar's axes so that z is up; not the identity where it leans.
+    """
 
     frames: tuple[int, ...]
     stamp_ns: Int
     T_world_lidar: Float
+    R_level_lidar: Float = field(default_factory=lambda: np.eye(3))
 
     def part(self, frames: Sequence[int]) -> Trajectory:
         """The poses of these frames alone."""
         rows = [self.frames.index(f) for f in frames]
-        return Trajectory(tuple(frames), self.stamp_ns[rows], self.T_world_lidar[rows])
+        return replace(
+            self,
+            frames=tuple(frames),
+            stamp_ns=self.stamp_ns[rows],
+            T_world_lidar=self.T_world_lidar[rows],
+        )
 
     def joined(self, following: Trajectory, frames: Sequence[int]) -> Trajectory:
         """With these frames of another trajectory, which has this one's last frame too."""
@@ -90,16 +99,19 @@ class Trajectory:
         T_other_last = following.T_world_lidar[following.frames.index(self.frames[-1])]
         T_world_other = T_world_last @ poses.inverse(T_other_last)
         part = following.part(frames)
-        return Trajectory(
-            self.frames + part.frames,
-            np.concatenate([self.stamp_ns, part.stamp_ns]),
-            np.concatenate([self.T_world_lidar, T_world_other @ part.T_world_lidar]),
+        return replace(
+            self,
+            frames=self.frames + part.frames,
+            stamp_ns=np.concatenate([self.stamp_ns, part.stamp_ns]),
+            T_world_lidar=np.concatenate([self.T_world_lidar, T_world_other @ part.T_world_lidar]),
         )
 
     def seen_from(self, frame: int) -> Trajectory:
-        """The same with that frame's lidar as the world."""
-        T_old_new = self.T_world_lidar[self.frames.index(frame)]
-        return replace(self, T_world_lidar=poses.inverse(T_old_new) @ self.T_world_lidar)
+        """The same in the world of that frame's lidar, upright."""
+        T_new_lidar = np.eye(4)
+        T_new_lidar[:3, :3] = self.R_level_lidar
+        T_new_old = T_new_lidar @ poses.inverse(self.T_world_lidar[self.frames.index(frame)])
+        return replace(self, T_world_lidar=T_new_old @ self.T_world_lidar)
 
 
 @dataclass(frozen=True)
