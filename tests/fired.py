@@ -45,7 +45,7 @@ def fired(
         met, _ = world.cast(start + [0, 0, 1.7], ray[:, None], since_s, rng)
         range_m = met[:, 0]
     heard = (range_m < 100) & (rng.random(len(range_m)) < share_heard)
-    hit = (start + ray * range_m[:, None])[heard]
+    hit = start[heard] + ray[heard] * range_m[heard, None]
     sweep = Sweep(
         frame=frame,
         stamp_ns=frame * period_ns,

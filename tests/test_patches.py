@@ -3,13 +3,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from test_project import KEY, make_cloud, patches_of
 
 from densify.config import ProjectSettings
+from densify.depth.patches import patches
 from densify.geometry.range_image import RangeImage
+from densify.geometry.sensor import Sensors
 from densify.types import RegisteredSweep, Sweep
+from tests.fired import fired
+from tests.scenes import Arc, Box, World
 
 GROUND_M = 1.7
 
@@ -128,3 +134,48 @@ def test_empty_and_tiny_clouds():
         assert found.normal.shape == (n, 3) and found.spacing_m.shape == (n, 2)
         assert found.free.shape == (n,) and found.sweep.shape == (n,)
         assert np.isfinite(found.normal).all() and (found.spacing_m > 0).all()
+
+
+# --- scanners of other kinds, and several ---------------------------------------------------------
+
+
+def in_a_room(name):
+    """A deskewed sweep of a scanner in a corner: ground 1.7 m below, a wall 15 m ahead."""
+    wall = World((Box((1.0, 200.0, 40.0), Arc(15.5, 0.0), base_m=-20.0),))
+    return fired(name, wall, share_heard=1.0)
+
+
+def patches_of_sweep(registered: RegisteredSweep):
+    sweep = registered.sweep
+    cloud = replace(make_cloud(sweep.points), lidar=sweep.lidar)
+    sensors = Sensors.of([registered])
+    found = patches(cloud, KEY, ProjectSettings(), sensors, {KEY: sensors.origins_m})
+    return found, sensors
+
+
+@pytest.mark.parametrize(("name", "share"), [("panda", 0.8), ("rosette", 0.7), ("dual32", 0.7)])
+def test_normals_are_told_scanner_by_scanner(name, share):
+    registered = in_a_room(name)
+    sweep = registered.sweep
+    found, _ = patches_of_sweep(registered)
+    normal = found.normal / np.linalg.norm(found.normal, axis=1, keepdims=True)
+    on_wall = (np.abs(sweep.points[:, 0] - 15.0) < 0.01) & (sweep.points[:, 2] > -1.2)
+    on_ground = (np.abs(sweep.points[:, 2] + 1.7) < 0.01) & (sweep.points[:, 0] < 13)
+    near = np.abs(np.arctan2(sweep.points[:, 1], sweep.points[:, 0])) < np.deg2rad(25)
+    for number in np.unique(sweep.lidar):
+        mine = (sweep.lidar == number) & near
+        for part, truth in ((on_wall, [1.0, 0, 0]), (on_ground, [0, 0, -1.0])):
+            right = np.abs(normal[mine & part] @ truth) > np.cos(np.radians(8))
+            assert (mine & part).sum() > 100 and right.mean() > share, (number, truth)
+
+
+def test_spacings_are_of_the_scanner_that_measured_and_from_where_it_stands():
+    registered = in_a_room("panda")
+    sweep = registered.sweep
+    found, sensors = patches_of_sweep(registered)
+    for number, model in sensors.models.items():
+        mine = np.flatnonzero(sweep.lidar == number)
+        azimuth, elevation, range_m = model.directions(sweep.points[mine])
+        expected = range_m[:, None] * model.table.at(azimuth, elevation)
+        close = np.isclose(found.spacing_m[mine], expected, rtol=1e-3).all(axis=1)
+        assert close.mean() > 0.97  # the others stand on the border of a bin

@@ -71,15 +71,11 @@ def _tangents(
     kernels.look.over_rows(len(cloud), cloud.rigid_points, np.concatenate(origins), place, seen)
     size = np.bincount(place, minlength=num_scanners * len(origins))
     members = np.split(np.argsort(place, kind="stable"), np.cumsum(size)[:-1])
-    beside = np.empty((len(cloud), 4), np.int32)
     for number, model in sensors.models.items():
         grid = model.grid
         cells = np.empty((grid.num_rows, grid.num_columns), np.int32)
+        tangents = kernels.tangents_anywhere if model.unordered else kernels.tangents_on_rings
         for mine in members[number::num_scanners]:
             kernels.nearest_in_cells(seen, mine, grid, cells)
-            find = kernels.beside_in_sectors if model.unordered else kernels.beside_on_rings
-            find.over_rows(len(mine), mine, seen, model.table, grid, cells, beside)
-            kernels.tangents.over_rows(
-                len(mine), mine, seen, beside, model.table, model.unordered, normal, spacing_m
-            )
+            tangents.over_rows(len(mine), mine, seen, model.table, grid, cells, normal, spacing_m)
     return normal, spacing_m

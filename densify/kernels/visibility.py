@@ -23,8 +23,8 @@ _ALL_ROUND = 3.0  # edges' reaches: no edge near
 _DIAGONAL = np.sqrt(0.5)
 _BEND_M = 0.10
 _BEND = 0.25  # of the change itself
-_REACH = 2.0  # spacings within which rays without order have neighbours
-_TURNS = 4  # of telling one derivative with the other known
+_AROUND, _MOST_CELLS = 5.0, 20  # spacings within which rays without order have neighbours
+_RIDGE = 0.005  # of the neighbours' mean square distance
 
 
 @Kernel
@@ -86,51 +86,6 @@ def _first(cells, row, column, rows, columns):  # type: ignore[no-untyped-def]
     return -1
 
 
-@Kernel
-def beside_on_rings(first, last, members, seen, table, grid, cells, beside):  # type: ignore[no-untyped-def]
-    """A point's neighbours on its ring and on those above and below.
-
-    members: (n,) indices of a scanner's points in a sweep, seen: (3,N) of `look`, cells of
-    `nearest_in_cells`. beside: (N,4) int32, filled with the neighbours to the right, left, above
-    and below, -1 where there is none.
-    """
-    right, left = np.array([-2, -1, -3]), np.array([2, 1, 3])
-    same = np.zeros(3, np.int64)
-    up, down = np.array([1, 1, 1, 2]), np.array([-1, -1, -1, -2])
-    straight = np.array([0, 1, -1, 0])
-    for k in range(first, last):
-        i = members[k]
-        row, column = _cell(seen[0, i], seen[1, i], grid)
-        beside[i, 0] = _first(cells, row, column, same, right)
-        beside[i, 1] = _first(cells, row, column, same, left)
-        beside[i, 2] = _first(cells, row, column, up, straight)
-        beside[i, 3] = _first(cells, row, column, down, straight)
-
-
-@Kernel
-def beside_in_sectors(first, last, members, seen, table, grid, cells, beside):  # type: ignore[no-untyped-def]
-    """As `beside_on_rings`, of rays without order: the nearest point in each of four quarters, no
-    farther than twice the spacing there."""
-    num_rows, num_columns = cells.shape
-    for k in range(first, last):
-        i = members[k]
-        row, column = _cell(seen[0, i], seen[1, i], grid)
-        reach = 1 + int(_REACH * _spacing(seen[0, i], seen[1, i], table)[1] / grid.bin_rad)
-        for side in range(4):
-            sign, found, distance = 1 if side in (1, 2) else -1, np.int32(-1), 1
-            while found < 0 and distance <= reach:
-                for aside in range(2 * distance + 1):
-                    off = -(aside // 2) if aside % 2 == 0 else aside // 2 + 1
-                    if abs(off) > distance:
-                        continue
-                    r = row + (off if side < 2 else sign * distance)
-                    c = (column + (sign * distance if side < 2 else off)) % num_columns
-                    if found < 0 and 0 <= r < num_rows:
-                        found = cells[r, c]
-                distance += 1
-            beside[i, side] = found
-
-
 @inlined
 def _slope(one, other, step, range_m):  # type: ignore[no-untyped-def]
     """Change of inverse range per radian from the changes on both sides (NaN: none).
@@ -160,39 +115,88 @@ def _change(seen, i, there, axis, across, slope_across):  # type: ignore[no-unty
     return (1 / seen[2, there] - 1 / seen[2, i] - slope_across * beside) / apart
 
 
-@Kernel
-def tangents(first, last, members, seen, beside, table, unordered, normal, spacing):  # type: ignore[no-untyped-def]
-    """The tangent plane and the spacing of the rays at each of a sweep's points.
+@inlined
+def _put(i, seen, table, level, rise, normal, spacing):  # type: ignore[no-untyped-def]
+    """Fill a point's row from the change of inverse range per radian of azimuth and elevation."""
+    azimuth, elevation, range_m = seen[0, i], seen[1, i], seen[2, i]
+    across, along = _spacing(azimuth, elevation, table)
+    ca, sa, ce, se = np.cos(azimuth), np.sin(azimuth), np.cos(elevation), np.sin(elevation)
+    aside = level / max(ce, 1e-3)
+    normal[i, 0] = ce * ca / range_m - aside * sa - rise * se * ca
+    normal[i, 1] = ce * sa / range_m + aside * ca - rise * se * sa
+    normal[i, 2] = se / range_m + rise * ce
+    spacing[i, 0] = range_m * across
+    spacing[i, 1] = range_m * along
 
-    members: (n,) indices of its points, seen: (3,N) of `look`, beside: (N,4) neighbours. unordered:
-    those to the sides are not on a level. Filled: normal (N,3) float32, of any length: the plane is
-    normal · (p - origin) = 1; spacing (N,2) float32 metres between neighbouring rays, across and
-    along elevation.
+
+@Kernel
+def tangents_on_rings(first, last, members, seen, table, grid, cells, normal, spacing):  # type: ignore[no-untyped-def]
+    """The tangent plane and the spacing of the rays at each of a scanner's points in a sweep, from
+    its neighbours on its ring and on those above and below.
+
+    members: (n,) indices of the points, seen: (3,N) of `look`, cells of `nearest_in_cells`. Filled:
+    normal (N,3) float32, of any length: the plane is normal · (p - origin) = 1; spacing (N,2)
+    float32 metres between neighbouring rays, across and along elevation.
 
     On a plane the inverse range is normal · direction, so its two derivatives tell the normal.
     """
+    right, left = np.array([-2, -1, -3]), np.array([2, 1, 3])
+    same = np.zeros(3, np.int64)
+    up, down = np.array([1, 1, 1, 2]), np.array([-1, -1, -1, -2])
+    straight = np.array([0, 1, -1, 0])
     for k in range(first, last):
         i = members[k]
-        azimuth, elevation, range_m = seen[0, i], seen[1, i], seen[2, i]
-        across, along = _spacing(azimuth, elevation, table)
-        ca, sa, ce, se = np.cos(azimuth), np.sin(azimuth), np.cos(elevation), np.sin(elevation)
-        level_rad = across / max(ce, 1e-3)  # of azimuth to the neighbours
+        across, along = _spacing(seen[0, i], seen[1, i], table)
+        step = across / max(np.cos(seen[1, i]), 1e-3)
+        row, column = _cell(seen[0, i], seen[1, i], grid)
+        one = _change(seen, i, _first(cells, row, column, same, right), 0, 1, 0.0)
+        other = _change(seen, i, _first(cells, row, column, same, left), 0, 1, 0.0)
+        level = _slope(one, other, 2 * step, seen[2, i])
+        level = 0.0 if np.isnan(level) else level
+        above = _first(cells, row, column, up, straight)
+        below = _first(cells, row, column, down, straight)
+        one, other = _change(seen, i, above, 1, 0, level), _change(seen, i, below, 1, 0, level)
+        rise = _slope(one, other, along, seen[2, i])
+        _put(i, seen, table, level, 0.0 if np.isnan(rise) else rise, normal, spacing)
+
+
+@Kernel
+def tangents_anywhere(first, last, members, seen, table, grid, cells, normal, spacing):  # type: ignore[no-untyped-def]
+    """As `tangents_on_rings`, of rays without order: least squares over the points around, then
+    over those that the first plane is right about; a point that half of them are not on one surface
+    with faces the scanner. A ridge keeps points on one line from tilting the plane."""
+    num_rows, num_columns = cells.shape
+    for k in range(first, last):
+        i = members[k]
+        range_m, flatten = seen[2, i], np.cos(seen[1, i])
+        row, column = _cell(seen[0, i], seen[1, i], grid)
+        spacing_rad = _spacing(seen[0, i], seen[1, i], table)[1]
+        reach = min(1 + int(_AROUND * spacing_rad / grid.bin_rad), _MOST_CELLS)
         level, rise = 0.0, 0.0
-        for _ in range(_TURNS if unordered else 1):
-            one = _change(seen, i, beside[i, 0], 0, 1, rise)
-            other = _change(seen, i, beside[i, 1], 0, 1, rise)
-            level = _slope(one, other, level_rad if unordered else 2 * level_rad, range_m)
-            level = 0.0 if np.isnan(level) else level
-            one = _change(seen, i, beside[i, 2], 1, 0, level)
-            other = _change(seen, i, beside[i, 3], 1, 0, level)
-            rise = _slope(one, other, along, range_m)
-            rise = 0.0 if np.isnan(rise) else rise
-        aside = level / max(ce, 1e-3)
-        normal[i, 0] = ce * ca / range_m - aside * sa - rise * se * ca
-        normal[i, 1] = ce * sa / range_m + aside * ca - rise * se * sa
-        normal[i, 2] = se / range_m + rise * ce
-        spacing[i, 0] = range_m * across
-        spacing[i, 1] = range_m * along
+        for turn in range(2):
+            uu, uv, vv, uw, vw = 0.0, 0.0, 0.0, 0.0, 0.0
+            num, num_kept = 0, 0
+            for r in range(max(row - reach, 0), min(row + reach, num_rows - 1) + 1):
+                for c in range(column - reach, column + reach + 1):
+                    j = cells[r, c % num_columns]
+                    if j < 0 or j == i:
+                        continue
+                    u = seen[0, j] - seen[0, i]
+                    u = (u - 2 * np.pi * np.rint(u / (2 * np.pi))) * flatten
+                    v, w = seen[1, j] - seen[1, i], 1 / seen[2, j] - 1 / range_m
+                    num += 1
+                    off_m = abs(w - level * u - rise * v) * range_m * range_m
+                    if turn and off_m > _BEND_M + _BEND * abs(w) * range_m * range_m:
+                        continue
+                    num_kept += 1
+                    uu, uv, vv, uw, vw = uu + u * u, uv + u * v, vv + v * v, uw + u * w, vw + v * w
+            ridge = _RIDGE * (uu + vv) + 1e-12
+            uu, vv = uu + ridge, vv + ridge
+            determinant = uu * vv - uv * uv
+            level, rise = (vv * uw - uv * vw) / determinant, (uu * vw - uv * uw) / determinant
+            if 2 * num_kept < num:
+                level, rise = 0.0, 0.0
+        _put(i, seen, table, level * flatten, rise, normal, spacing)
 
 
 @Kernel
