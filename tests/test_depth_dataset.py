@@ -108,10 +108,11 @@ def made(tmp_path):
         drives[drive] = {
             "data": str(date / drive),
             "folder": folder,
-            "keys": [[0, 9]],
+            "frames": [[0, 9]],
             "cameras": dict.fromkeys(CAMERAS, camera),
         }
     about = {"schema_version": 1, "layout": "kitti-depth", "method": "flow", "drives": drives}
+    about |= {"densify": "0.1.0", "window": 5, "cameras": None, "gate": {}, "config": {}}
     (root / "dataset.json").write_text(json.dumps(about))
     write_manifest(
         root / "manifest.jsonl", *(line_of(d, f) for d, fs in FRAMES.items() for f in reversed(fs))

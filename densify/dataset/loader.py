@@ -6,7 +6,6 @@ Images are not in the set: they come from the recordings it was made of.
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -19,12 +18,11 @@ from numpy.typing import NDArray
 from torch.utils.data import Dataset
 
 from densify.dataset.manifest import read_manifests
-from densify.dataset.plan import SCHEMA_VERSION
+from densify.dataset.plan import StoredDrive, read_plan, stored_drives
 from densify.depth.exposure import key_shots
 from densify.errors import InputError
 from densify.outputs.depth_png import read_depth_png, read_stored
 from densify.readers import open_sequence
-from densify.readers.files import read_text
 from densify.types import Camera, Float, Float32, LidarSequence
 
 LAYOUT = "kitti-depth"
@@ -172,7 +170,7 @@ class DepthDataset(Dataset[dict[str, Any]]):
             if (drive := self._drives.get(record.drive)) is not None
             for camera in drive.cameras
             if cameras is None or camera in cameras
-            if drive.path("groundtruth", camera, record.key) in record.files
+            if _map_path(drive, "groundtruth", camera, record.key) in record.files
         ]
         if not samples:
             raise InputError(
@@ -186,7 +184,7 @@ class DepthDataset(Dataset[dict[str, Any]]):
 
         def read(kind: str, reader: Callable[[Path], NDArray[Any]]) -> NDArray[Any]:
             drive = self._drives[sample.drive]
-            path = self._root / drive.path(kind, sample.camera, sample.frame)
+            path = self._root / _map_path(drive, kind, sample.camera, sample.frame)
             try:
                 stored = reader(path)
                 _check_size(str(path), stored, camera)
@@ -245,64 +243,25 @@ class _Sample:
     frame: int
 
 
-@dataclass(frozen=True)
-class _Drive:
-    """data: where its recording was. folder: in the set."""
-
-    data: str
-    folder: str
-    cameras: Mapping[str, Camera]
-
-    def path(self, kind: str, camera: str, frame: int) -> str:
-        """In the set, as the manifest names it."""
-        return f"{self.folder}/proj_depth/{kind}/{camera}/{frame:010d}.png"
-
-
-def _read_drives(root: Path) -> dict[str, _Drive]:
+def _read_drives(root: Path) -> dict[str, StoredDrive]:
     """Recordings of dataset.json, by name."""
-    path = root / "dataset.json"
-    if not path.is_file():
+    table = read_plan(root)
+    if table is None:
         raise InputError(
-            f"{path}: no such file; expected the folder that densify dataset --layout {LAYOUT} "
-            f"wrote"
+            f"{root / 'dataset.json'}: no such file; expected the folder that densify dataset "
+            f"--layout {LAYOUT} wrote"
         )
-    try:
-        stored = json.loads(read_text(path))
-        layout, version = stored["layout"], stored["schema_version"]
-        if version != SCHEMA_VERSION:
-            raise InputError(
-                f"{path}: got schema_version {version}, expected {SCHEMA_VERSION}; use the "
-                f"densify that made it, or make the set again"
-            )
-        if layout != LAYOUT:
-            raise InputError(
-                f"{path}: got a set of layout {layout!r}, expected {LAYOUT!r}; make it with "
-                f"densify dataset --layout {LAYOUT}"
-            )
-        return {name: _drive(entry) for name, entry in stored["drives"].items()}
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
+    if table["layout"] != LAYOUT:
         raise InputError(
-            f"{path}: damaged or no description of a training set ({type(error).__name__}: "
-            f"{error}); run densify dataset again with --out {root}"
-        ) from None
+            f"{root / 'dataset.json'}: got a set of layout {table['layout']!r}, expected "
+            f"{LAYOUT!r}; make it with densify dataset --layout {LAYOUT}"
+        )
+    return stored_drives(root, table)
 
 
-def _drive(entry: Mapping[str, Any]) -> _Drive:
-    cameras = {
-        name: Camera(
-            name=name,
-            width_px=int(camera["width_px"]),
-            height_px=int(camera["height_px"]),
-            K=np.array(camera["K"], np.float64).reshape(3, 3),
-            T_cam_lidar=np.array(camera["T_cam_lidar"], np.float64).reshape(4, 4),
-            distortion=tuple(camera["distortion"]),
-            model=str(camera.get("model", "pinhole")),  # sets of before name none
-            max_angle_deg=float(camera.get("max_angle_deg", 180.0)),
-            row_time_s=float(camera.get("row_time_s", 0.0)),
-        )
-        for name, camera in entry["cameras"].items()
-    }
-    return _Drive(str(entry["data"]), str(entry["folder"]), cameras)
+def _map_path(drive: StoredDrive, kind: str, camera: str, frame: int) -> str:
+    """In the set, as the manifest names it."""
+    return f"{drive.folder}/proj_depth/{kind}/{camera}/{frame:010d}.png"
 
 
 def _check_size(where: str, image: NDArray[Any], camera: Camera) -> None:

@@ -19,6 +19,8 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from densify.blocks import Cut
 from densify.config import Config, as_mapping
 from densify.dataset.gate import Gate
@@ -181,11 +183,34 @@ def read_plan(out: Path) -> dict[str, Any] | None:
             planned_keys(table)
             return {name: table[name] for name in ("schema_version", *_SAME, "drives")}
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        raise InputError(f"{path}: cannot be read: {error!r}; choose another --out") from error
+        raise InputError(
+            f"{path}: damaged or no description of a training set: {error!r}; choose another folder"
+        ) from error
     raise InputError(
         f"{path}: got schema_version {table['schema_version']}, expected {SCHEMA_VERSION}; "
         f"it was made by another version of densify"
     )
+
+
+@dataclass(frozen=True)
+class StoredDrive:
+    """A recording of dataset.json. data: what ``--data`` takes. folder: of its files, relative to
+    the set's."""
+
+    data: str
+    folder: str
+    cameras: Mapping[str, Camera]
+
+
+def stored_drives(out: Path, table: Mapping[str, Any]) -> dict[str, StoredDrive]:
+    """The recordings of what `read_plan` gave, by name. Raises InputError if it is damaged."""
+    try:
+        return {name: _stored_drive(drive) for name, drive in table["drives"].items()}
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise InputError(
+            f"{out / _FILE}: damaged or no description of a training set ({type(error).__name__}: "
+            f"{error}); run densify dataset again with --out {out}"
+        ) from None
 
 
 def planned_keys(table: Mapping[str, Any]) -> set[tuple[str, int]]:
@@ -250,6 +275,24 @@ def _united(out: Path, before: dict[str, Any], now: dict[str, Any]) -> dict[str,
         frames = sorted({*_frames(old["frames"]), *_frames(drive["frames"])})
         united[name] = {**drive, "frames": _as_runs(frames)}
     return dict(sorted(united.items()))
+
+
+def _stored_drive(entry: Mapping[str, Any]) -> StoredDrive:
+    cameras = {
+        name: Camera(
+            name=name,
+            width_px=int(camera["width_px"]),
+            height_px=int(camera["height_px"]),
+            K=np.array(camera["K"], np.float64).reshape(3, 3),
+            T_cam_lidar=np.array(camera["T_cam_lidar"], np.float64).reshape(4, 4),
+            distortion=tuple(camera["distortion"]),
+            model=str(camera.get("model", "pinhole")),  # sets of before name none
+            max_angle_deg=float(camera.get("max_angle_deg", 180.0)),
+            row_time_s=float(camera.get("row_time_s", 0.0)),
+        )
+        for name, camera in entry["cameras"].items()
+    }
+    return StoredDrive(str(entry["data"]), str(entry["folder"]), cameras)
 
 
 def _as_plain(camera: Camera) -> dict[str, Any]:
