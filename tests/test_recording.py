@@ -95,7 +95,7 @@ def test_a_recording_within_the_window_is_what_run_makes(
 def test_more_sweeps_around_make_it_no_worse(small_blocks, long_street, tmp_path: Path) -> None:
     drive = drive_of(long_street, tmp_path)
     wrong = Counter()
-    for key in (4, 13):
+    for key in range(4, 14):  # of two keys the wrong pixels differ by their number's own noise
         alone = pipeline.run(long_street, key, 2, config=GIVEN)
         here = maps_of(drive, key)
         assert here.frames == alone.frames
@@ -108,8 +108,8 @@ def test_more_sweeps_around_make_it_no_worse(small_blocks, long_street, tmp_path
             wrong[who, "outliers"] += np.sum(np.abs(depth_m - truth)[both] > 0.05 * truth[both])
             wrong[who, "pixels"] += both.sum()
     assert wrong["here", "ghosts"] <= wrong["alone", "ghosts"] + 2
-    assert wrong["here", "outliers"] <= wrong["alone", "outliers"] + 2
-    assert wrong["here", "pixels"] > 0.97 * wrong["alone", "pixels"] > 500
+    assert wrong["here", "outliers"] <= 1.05 * wrong["alone", "outliers"]
+    assert wrong["here", "pixels"] > 0.97 * wrong["alone", "pixels"] > 5000
 
 
 # Whatever is asked for

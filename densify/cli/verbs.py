@@ -303,7 +303,10 @@ def _keys_of(sequence: LidarSequence, options: argparse.Namespace) -> list[int]:
             f"it has {format_frames(sequence.frames)}"
         )
     if not wanted:
-        raise InputError("--key K or --keys A:B[:S]: expected the frame or frames to densify")
+        raise InputError(
+            "--key K or --keys A:B[:S]: expected the frame or frames to densify; "
+            "see densify run --help"
+        )
     return sorted(wanted)
 
 

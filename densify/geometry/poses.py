@@ -8,18 +8,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from densify.types.rigid import inverse as inverse
+
 if TYPE_CHECKING:
     from densify.arrays import Float
 
 _ROWS = 8192  # at once: for more, OpenBLAS wakes threads that spin longer than the work takes
-
-
-def inverse(T_a_b: Float) -> Float:
-    """(4,4) -> (4,4) ``T_b_a``."""
-    T_b_a = np.eye(4)
-    T_b_a[:3, :3] = T_a_b[:3, :3].T
-    T_b_a[:3, 3] = -T_a_b[:3, :3].T @ T_a_b[:3, 3]
-    return T_b_a
 
 
 def transform(T_a_b: Float, points_b: Float) -> Float:

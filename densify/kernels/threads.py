@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 from functools import cache
 from itertools import pairwise
 from typing import Any
@@ -36,6 +36,7 @@ def over_rows(function: Callable[..., None], num_rows: int, *arguments: Any) -> 
     try:
         function(*parts[0], *arguments)
     finally:
+        wait(others)  # before any error is raised: they write into the caller's arrays
         for other in others:
             other.result()
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from densify.arrays import Bool, Float, Float32, Int
-from densify.geometry import poses
+from densify.types.rigid import inverse
 
 
 @dataclass(frozen=True)
@@ -97,7 +97,7 @@ class Trajectory:
         """With these frames of another trajectory, which has this one's last frame too."""
         T_world_last = self.T_world_lidar[-1]
         T_other_last = following.T_world_lidar[following.frames.index(self.frames[-1])]
-        T_world_other = T_world_last @ poses.inverse(T_other_last)
+        T_world_other = T_world_last @ inverse(T_other_last)
         part = following.part(frames)
         return replace(
             self,
@@ -110,7 +110,7 @@ class Trajectory:
         """The same in the world of that frame's lidar, upright."""
         T_new_lidar = np.eye(4)
         T_new_lidar[:3, :3] = self.R_level_lidar
-        T_new_old = T_new_lidar @ poses.inverse(self.T_world_lidar[self.frames.index(frame)])
+        T_new_old = T_new_lidar @ inverse(self.T_world_lidar[self.frames.index(frame)])
         return replace(self, T_world_lidar=T_new_old @ self.T_world_lidar)
 
 
@@ -167,4 +167,4 @@ class Stretch:
         """(4,4) from the lidar frame of one sweep to that of another, by frame number."""
         if target == source:
             return np.eye(4)
-        return poses.inverse(self[target].T_world_lidar) @ self[source].T_world_lidar
+        return inverse(self[target].T_world_lidar) @ self[source].T_world_lidar
