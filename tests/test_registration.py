@@ -13,9 +13,11 @@ import pytest
 from densify.config import RegisterSettings
 from densify.errors import ComputationError
 from densify.geometry import poses
+from densify.readers.street import Street
+from densify.readers.window import read_sweep
 from densify.registration import odometry, trajectory
 from densify.registration.deskew import deskew
-from densify.registration.odometry import check_plausible, register
+from densify.registration.odometry import check_plausible, register, searched_twist
 from densify.types import Trajectory
 from tests.scenes import SWEEP_S, Arc, Box, Scanner, Scene, World, street
 
@@ -409,3 +411,11 @@ def test_a_pose_that_is_not_finite_names_its_frame(drive):
     T[2, 0, 3] = np.nan
     with pytest.raises(ComputationError, match="pose of frame 2 is not finite"):
         check_plausible(replace(trajectory, T_world_lidar=T), SETTINGS)
+
+
+def test_guard_rails_do_not_look_like_standing_still() -> None:
+    """Rails along the road are met by the same rays in every sweep, more so at a high rate."""
+    street, settings = Street("highway", 23, "hdl64", hz=20), RegisterSettings()
+    sweeps = [read_sweep(street, frame, settings) for frame in (205, 206, 207)]
+    found_m_s = searched_twist(sweeps, settings)[3:]
+    np.testing.assert_allclose(found_m_s, [25, 0, 0], atol=6)
