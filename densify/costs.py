@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import resource
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -14,33 +15,36 @@ from densify.types import Progress, StageCost
 
 class Watch:
     """Measures stages and reports progress. A stage that asks for another one waits meanwhile: the
-    seconds of the inner stage count for the inner one only."""
+    seconds of the inner stage count for the inner one only. Stages may be at work in several
+    threads; their seconds are added up."""
 
     def __init__(self, progress: Progress | None = None) -> None:
-        """progress: called as (stage, done, total)."""
+        """progress: called as (stage, done, total), by one thread at a time."""
         self._progress = progress
         self._seconds: dict[str, float] = {}
         self._peak_mb: dict[str, float] = {}
-        self._running: list[str] = []
-        self._since_s = 0.0
+        self._lock = threading.Lock()
+        self._thread = _Running()
 
     def step(self, name: str, done: int, total: int) -> None:
         """Report how far a stage is."""
         if self._progress is not None:
-            self._progress(name, done, total)
+            with self._lock:
+                self._progress(name, done, total)
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
         """Measure what happens inside the block as the stage of this name."""
         self.step(name, 0, 1)
         self._count()
-        self._running.append(name)
+        self._thread.stages.append(name)
         try:
             yield
         finally:
             self._count()
-            self._running.pop()
-            self._peak_mb[name] = _peak_memory_mb()
+            self._thread.stages.pop()
+            with self._lock:
+                self._peak_mb[name] = _peak_memory_mb()
         self.step(name, 1, 1)
 
     def costs(self) -> tuple[StageCost, ...]:
@@ -48,12 +52,21 @@ class Watch:
         return tuple(StageCost(n, self._seconds[n], peak) for n, peak in self._peak_mb.items())
 
     def _count(self) -> None:
-        """Add the time since the last change to the stage that was at work."""
-        now_s = time.perf_counter()
-        if self._running:
-            name = self._running[-1]
-            self._seconds[name] = self._seconds.get(name, 0.0) + now_s - self._since_s
-        self._since_s = now_s
+        """Add the time since this thread's last change to the stage that was at work in it."""
+        now_s, thread = time.perf_counter(), self._thread
+        if thread.stages:
+            name = thread.stages[-1]
+            with self._lock:
+                self._seconds[name] = self._seconds.get(name, 0.0) + now_s - thread.since_s
+        thread.since_s = now_s
+
+
+class _Running(threading.local):
+    """The stages at work in a thread, the innermost last, and when that changed last."""
+
+    def __init__(self) -> None:
+        self.stages: list[str] = []
+        self.since_s = 0.0
 
 
 def _peak_memory_mb() -> float:

@@ -10,6 +10,8 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -25,6 +27,7 @@ from densify.depth.views import HeldOut, Views
 from densify.errors import ComputationError, InputError
 from densify.flow.engines import check_engine
 from densify.geometry.range_image import RangeImage
+from densify.kernels.threads import num_threads
 from densify.readers.files import format_frames
 from densify.readers.window import choose_cameras
 from densify.recording import Recording
@@ -222,7 +225,8 @@ def _results(
     settings: Config,
     watch: Watch,
 ) -> dict[str, Result]:
-    """What the cameras see of each method's cloud, and how good that is."""
+    """What the cameras see of each method's cloud, and how good that is; side by side on as many
+    cores as there are."""
     key_image = RangeImage.of(stretch[key])
     views = Views.of(sequence, stretch, key, key_image, shots, settings)
     truth = {}
@@ -230,48 +234,70 @@ def _results(
         truth = views.truth(sequence.truth)
     with watch.stage("held out"):
         held_out = HeldOut.of(views, moments[next(reversed(moments))][0])
+    seen = _Seen(sequence, stretch, key_image, views, held_out, truth, images, settings, watch)
+    with ThreadPoolExecutor(num_threads()) as pool:
+        made = list(pool.map(lambda name: seen.result(name, *moments[name]), moments))
     results: dict[str, Result] = {}
-    for name, (cloud, flow) in moments.items():
-        visible = METHODS[name].visible and settings.project.visibility
-        used = stretch.frames if METHODS[name].all_sweeps else (key,)
+    for result in made:
+        linked = replace(result, costs=watch.costs(), baselines=dict(results))
+        results[result.method] = linked
+    return results
+
+
+class _Seen(NamedTuple):
+    """What all methods of a key have in common."""
+
+    sequence: LidarSequence
+    stretch: Stretch
+    key_image: RangeImage
+    views: Views
+    held_out: HeldOut
+    truth: Mapping[str, tuple[Float32, Bool]]
+    images: Mapping[str, Image] | None
+    settings: Config
+    watch: Watch
+
+    def result(self, method: str, cloud: Cloud, flow: StretchFlow | None) -> Result:
+        """One method's, without its baselines."""
+        views, watch, output, key = self.views, self.watch, self.settings.output, self.views.key
+        images, visible = self.images or {}, METHODS[method].visible
+        visible = visible and self.settings.project.visibility
         with watch.stage("held out"):
-            held_out_scores = held_out.scores(cloud, visible)
+            held_out_scores = self.held_out.scores(cloud, visible)
         movers = {}
-        if settings.output.movers == "separate":
+        if output.movers == "separate":
             with watch.stage("project"):
-                movers = views.movers(cloud, visible, images or {})
-        if settings.output.movers != "keep":
+                movers = views.movers(cloud, visible, images)
+        if output.movers != "keep":
             cloud = cloud.select(~cloud.moving)
         with watch.stage("project"):
-            depth = views.depth(cloud, visible)
             depth = {
-                n: with_ages(m, stretch, key, views.exposures[n].late_s) for n, m in depth.items()
+                name: with_ages(maps, self.stretch, key, views.exposures[name].late_s)
+                for name, maps in views.depth(cloud, visible).items()
             }
-        if images is not None:
+        if self.images is not None:
             with watch.stage("colour"):
                 cloud = views.coloured(cloud, depth, images)
         with watch.stage("score"):
-            metrics = _scores(truth, sequence.cameras, stretch[key], key_image, cloud, depth)
-            metrics["measure"] = {n: maps.measure for n, maps in depth.items()}
+            cameras, sweep = self.sequence.cameras, self.stretch[key]
+            metrics = _scores(self.truth, cameras, sweep, self.key_image, cloud, depth)
+            metrics["measure"] = {name: maps.measure for name, maps in depth.items()}
             metrics["held_out"] = held_out_scores
-            if settings.output.rejected:
-                metrics["rejected"] = {n: maps.counts() for n, maps in depth.items()}
-        results[name] = Result(
-            method=name,
+            if output.rejected:
+                metrics["rejected"] = {name: maps.counts() for name, maps in depth.items()}
+        return Result(
+            method=method,
             key=key,
-            frames=used,
+            frames=self.stretch.frames if METHODS[method].all_sweeps else (key,),
             cloud=cloud,
             depth=depth,
             metrics=metrics,
-            costs=watch.costs(),
-            baselines=dict(results),
             flow=flow,
             movers=movers,
-            optical_flow=views.optical_flow(cloud, depth) if settings.output.optical_flow else {},
-            rejected=views.rejected(cloud, depth) if settings.output.rejected else {},
-            images=images or {},
+            optical_flow=views.optical_flow(cloud, depth) if output.optical_flow else {},
+            rejected=views.rejected(cloud, depth) if output.rejected else {},
+            images=images,
         )
-    return results
 
 
 def _scores(

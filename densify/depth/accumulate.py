@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from densify.geometry import poses
-from densify.types import Cloud, FlowField, Stretch
+from densify.types import Cloud, FlowField, Int, Stretch
 
 _CONFIDENCE_PER_S = 0.7
 _CONFIDENCE_MOVED = 0.8
@@ -21,19 +21,23 @@ def accumulate(stretch: Stretch, fields: Sequence[FlowField], key: int, drop_los
     be followed; otherwise it stays where registration puts it. Points that do not move are placed
     by registration alone, to the last bit.
 
-    Confidence is a ranking, not a probability: it falls with the time from the key and for points
-     that flow had to move.
+    Confidence is a relative score, not calibrated: it falls with the time from the key and for
+    points that flow had to move.
     """
     parts = []
     for registered, flow in zip(stretch.sweeps, fields, strict=True):
         sweep = registered.sweep
         T_key_lidar = stretch.T_target_source(key, registered.frame)
-        kept = np.flatnonzero(~flow.lost) if drop_lost else np.arange(len(sweep))
+        kept: Int | slice = slice(None)
+        num_kept = len(sweep)
+        if drop_lost and flow.lost.any():
+            kept = np.flatnonzero(~flow.lost)
+            num_kept = len(kept)
         rigid = poses.transform(T_key_lidar, sweep.points)
         points = rigid.copy()
         moves = flow.moving & ~flow.lost
         points[moves] += poses.rotate(T_key_lidar, flow.total[moves])
-        velocity_m_s = np.zeros_like(points)
+        velocity_m_s = np.zeros(points.shape, np.float32)
         if flow.velocity_m_s is not None:
             velocity_m_s[moves] = poses.rotate(T_key_lidar, flow.velocity_m_s[moves])
         since_key_ns = sweep.stamp_ns - stretch[key].sweep.stamp_ns
@@ -44,16 +48,16 @@ def accumulate(stretch: Stretch, fields: Sequence[FlowField], key: int, drop_los
             {
                 "points": points[kept],
                 "rigid_points": rigid[kept],
-                "frame": np.full(len(kept), registered.frame, np.int32),
-                "since_key_ns": np.full(len(kept), since_key_ns, np.int64),
+                "frame": np.full(num_kept, registered.frame, np.int32),
+                "since_key_ns": np.full(num_kept, since_key_ns, np.int64),
                 "row": sweep.row[kept],
                 "lidar": sweep.lidar[kept],
                 "moving": flow.moving[kept],
                 "instance": flow.instance[kept],
-                "velocity_m_s": velocity_m_s[kept].astype(np.float32),
+                "velocity_m_s": velocity_m_s[kept],
                 "confidence": confidence[kept].astype(np.float32),
                 "intensity": sweep.intensity[kept],
-                "rgb": np.zeros((len(kept), 3), np.uint8),
+                "rgb": np.zeros((num_kept, 3), np.uint8),
             }
         )
     return Cloud(**{name: np.concatenate([p[name] for p in parts]) for name in parts[0]})
