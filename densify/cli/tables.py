@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from densify.outputs import Export
+from densify.readers.files import format_frames
 from densify.types import Result
 
 _NONE = "-"
@@ -32,10 +33,9 @@ _PARTS = ("all", "moving", "static")
 def summary(result: Result) -> str:
     """Three or so lines about one densified key."""
     cloud = result.cloud
-    first, last = min(result.frames), max(result.frames)
     lines = [
         f"key {result.key}, {result.method}: {len(cloud):,} points of {len(result.frames)} sweeps "
-        f"({first}-{last}), {np.count_nonzero(cloud.moving):,} on moving objects"
+        f"({format_frames(result.frames)}), {np.count_nonzero(cloud.moving):,} on moving objects"
     ]
     for name in result.depth:
         measured, filled = (_density(result, name, product) for product in ("measured", "filled"))

@@ -225,9 +225,9 @@ def check_overlap(
         overlap = float(np.isfinite(distance).mean())
         if overlap < settings.min_overlap:
             raise SweepError(
-                f"registration fails from frame {a} to {b}: only {100 * overlap:.0f} % of what "
+                f"registration fails from frame {a} to {b}: only {100 * overlap:.1f} % of what "
                 f"stands there lies on the sweep before, expected at least "
-                f"{100 * settings.min_overlap:.0f} %; {_cure(settings)}, or lower "
+                f"{100 * settings.min_overlap:.1f} %; {_cure(settings)}, or lower "
                 f"register.min_overlap",
                 b,
             )
