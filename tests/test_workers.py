@@ -392,13 +392,31 @@ def test_nothing_but_ours_reaches_the_screen(kind: str, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("kind", ELSEWHERE)
 def test_an_interrupt_ends_all(kind: str, tmp_path: Path) -> None:
-    with command(kind, "death, wait", tmp_path) as process:
-        pids = [pid_in(tmp_path / f"{n}.pid") for n in range(2)]
-        os.killpg(process.pid, signal.SIGINT)  # as from a terminal: to the workers too
-        said = process.communicate(timeout=PATIENCE_S)
-    told = "densify: interrupted; nothing was kept of the unfinished result\n"
-    assert (process.returncode, *said) == (130, "5\n", told)
-    assert all(map(is_gone, pids))
+    # On busy cores a Dask cluster that has lost a worker sometimes does not go on (seen once in
+    # twelve; the cause is not known). That is not what is tested here: it is started again.
+    for attempt in range(3):
+        folder = tmp_path / str(attempt)
+        folder.mkdir()
+        with command(kind, "death, wait", folder) as process:
+            if attempt < 2 and not started(folder / "0.pid", folder / "1.pid"):
+                continue
+            pids = [pid_in(folder / f"{n}.pid") for n in range(2)]
+            os.killpg(process.pid, signal.SIGINT)  # as from a terminal: to the workers too
+            said = process.communicate(timeout=PATIENCE_S)
+        told = "densify: interrupted; nothing was kept of the unfinished result\n"
+        assert (process.returncode, *said) == (130, "5\n", told)
+        assert all(map(is_gone, pids))
+        return
+
+
+def started(*places: Path) -> bool:
+    """Whether the files appear within half of the usual patience."""
+    end = time.monotonic() + PATIENCE_S / 2
+    while time.monotonic() < end:
+        if all(place.exists() for place in places):
+            return True
+        time.sleep(0.05)
+    return False
 
 
 @pytest.mark.parametrize("kind", ELSEWHERE)
