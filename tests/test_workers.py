@@ -12,6 +12,7 @@ import signal
 import subprocess
 import sys
 import time
+import warnings
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
@@ -399,6 +400,7 @@ def test_an_interrupt_ends_all(kind: str, tmp_path: Path) -> None:
         folder.mkdir()
         with command(kind, "death, wait", folder) as process:
             if attempt < 2 and not started(folder / "0.pid", folder / "1.pid"):
+                warnings.warn(f"{kind}: work did not go on after a worker died", stacklevel=1)
                 continue
             pids = [pid_in(folder / f"{n}.pid") for n in range(2)]
             os.killpg(process.pid, signal.SIGINT)  # as from a terminal: to the workers too
