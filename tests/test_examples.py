@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from densify.readers.street import Street
-from densify.writers.kitti_raw import write_kitti_tree
+from densify.writers import write_street
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 
@@ -55,7 +55,7 @@ def test_kitti(test_data: Path, tmp_path: Path) -> None:
 
 def test_train_completion(tmp_path: Path) -> None:
     street = Street("street", 0, "vlp16")
-    drive = write_kitti_tree(street, tmp_path, range(110, 113), ["image_02"])
+    drive = write_street("kitti", street, tmp_path, range(110, 113), ["image_02"])
     text = output_of(
         "train_completion.py",
         tmp_path,

@@ -14,7 +14,7 @@ from densify.readers.kitti_raw import KittiRaw
 from densify.readers.street import Street
 from densify.readers.truth_files import FileTruth, write_bodies, write_points
 from densify.street.bodies import Bodies
-from densify.writers.kitti_raw import write_kitti_tree
+from densify.writers import write_street
 
 FRAMES = [58, 60]
 
@@ -28,7 +28,9 @@ def street() -> Street:
 def written(street, tmp_path_factory):
     seen = []
     out = tmp_path_factory.mktemp("simulate") / "kitti"
-    drive = write_kitti_tree(street, out, FRAMES, ["image_03"], lambda *call: seen.append(call))
+    drive = write_street(
+        "kitti", street, out, FRAMES, ["image_03"], lambda *call: seen.append(call)
+    )
     assert seen == [("simulate", 0, 2), ("simulate", 1, 2), ("simulate", 2, 2)]
     return drive
 
@@ -127,7 +129,7 @@ def test_writing_is_whole_or_not_at_all(street, written, tmp_path):
     before = sorted(p.name for p in written.parent.iterdir())
     out = written.parent.parent
     with pytest.raises(InputError, match="--overwrite"):
-        write_kitti_tree(street, out, FRAMES)
+        write_street("kitti", street, out, FRAMES)
 
     def interrupted(stage, done, total):
         if done:
@@ -135,30 +137,30 @@ def test_writing_is_whole_or_not_at_all(street, written, tmp_path):
 
     for folder, overwrite in ((out, True), (tmp_path / "new", False)):
         with pytest.raises(KeyboardInterrupt):
-            write_kitti_tree(street, folder, FRAMES, [], interrupted, overwrite)
+            write_street("kitti", street, folder, FRAMES, [], interrupted, overwrite)
     assert not (tmp_path / "new").exists()
     assert sorted(p.name for p in written.parent.iterdir()) == before
     assert len(list(out.iterdir())) == 1  # nothing left aside
-    again = write_kitti_tree(street, tmp_path, FRAMES[:1], [])
+    again = write_street("kitti", street, tmp_path, FRAMES[:1], [])
     (again / "mine.txt").write_text("old")
-    assert write_kitti_tree(street, tmp_path, FRAMES[1:], [], overwrite=True) == again
+    assert write_street("kitti", street, tmp_path, FRAMES[1:], [], overwrite=True) == again
     assert not (again / "mine.txt").exists()
     assert list(KittiRaw(again).frames) == FRAMES[1:]
 
 
 def test_another_calibration_is_kept(street, tmp_path):
-    drive = write_kitti_tree(street, tmp_path, FRAMES[:1], [])
+    drive = write_street("kitti", street, tmp_path, FRAMES[:1], [])
     path = drive.parent / "calib_velo_to_cam.txt"
     ours = path.read_bytes()
     shutil.rmtree(drive)
     path.write_text("R: 1\n")
     with pytest.raises(InputError, match=r"calib_velo_to_cam\.txt: another .* --overwrite"):
-        write_kitti_tree(street, tmp_path, FRAMES[:1], [])
+        write_street("kitti", street, tmp_path, FRAMES[:1], [])
     assert path.read_text() == "R: 1\n" and not drive.exists()
     path.write_bytes(ours)
-    assert write_kitti_tree(street, tmp_path, FRAMES[:1], []) == drive
+    assert write_street("kitti", street, tmp_path, FRAMES[:1], []) == drive
     path.write_text("R: 1\n")
-    write_kitti_tree(street, tmp_path, FRAMES[:1], [], overwrite=True)
+    write_street("kitti", street, tmp_path, FRAMES[:1], [], overwrite=True)
     assert path.read_bytes() == ours
 
 
@@ -176,7 +178,7 @@ def test_what_cannot_be_written_is_one_clear_line(street, tmp_path):
         ((street, file / "below", [60], []), "cannot be written"),
     ):
         with pytest.raises(InputError) as error:
-            write_kitti_tree(*arguments)
+            write_street("kitti", *arguments)
         assert message in str(error.value) and "\n" not in str(error.value)
 
 

@@ -21,7 +21,7 @@ from densify.street.sensors import SENSORS, firings
 from densify.street.simulator import Simulator
 from densify.street.terrain import Ground, Terrain
 from densify.street.world import Body, World
-from densify.writers.kitti_raw import write_kitti_tree
+from densify.writers import write_street
 
 PERIOD_NS = 100_000_000
 ROOM_M = 15.0
@@ -263,7 +263,7 @@ def test_a_tilted_mount_turns_the_lidar_and_leaves_the_cameras(level):
 
 def test_a_tree_of_another_rate_and_mount_opens_as_what_it_was(level, tmp_path):
     street = same_scene(level, 20, 10.0)
-    drive = write_kitti_tree(street, tmp_path, [116, 120], [])
+    drive = write_street("kitti", street, tmp_path, [116, 120], [])
     (drive / "image_02").mkdir()  # cameras are those that have a folder
     kitti = KittiRaw(drive)
     for frame in (116, 120):

@@ -138,9 +138,15 @@ def _add_info(commands: Any) -> None:
 
 
 def _add_simulate(commands: Any) -> None:
-    about = "write the built-in street as a KITTI raw tree with exact ground truth"
+    about = "write the built-in street in a data set's format with exact ground truth"
     parser = add_verb(commands, "simulate", verbs.simulate, about)
     parser.add_argument("--out", metavar="DIR", type=Path, required=True, help="folder to make")
+    parser.add_argument(
+        "--format",
+        default="kitti",
+        metavar="NAME",
+        help="the data set whose format to write: kitti (default)",
+    )
     parser.add_argument(
         "--preset",
         default="street",

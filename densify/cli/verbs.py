@@ -181,18 +181,24 @@ def info(options: argparse.Namespace) -> None:
 
 
 def simulate(options: argparse.Namespace) -> None:
-    """The built-in street as a KITTI raw tree with truth."""
+    """The built-in street in a data set's format, with truth."""
     from densify.readers.street import Street
-    from densify.writers.kitti_raw import write_kitti_tree
+    from densify.writers import write_street
 
     street = Street.from_spec(_street_spec(options))
     frames = _frames_of(street, options.frames)
     cameras = _cameras_of(street, options.cameras)
     with progress_on_stderr() as progress:
-        drive = write_kitti_tree(
-            street, options.out, frames, cameras, progress, overwrite=options.overwrite
+        place = write_street(
+            options.format,
+            street,
+            options.out,
+            frames,
+            cameras,
+            progress,
+            overwrite=options.overwrite,
         )
-    print(f"{len(frames)} frames; open them with --data {drive}")
+    print(f"{len(frames)} frames; open them with --data {place}")
 
 
 def export(options: argparse.Namespace) -> None:

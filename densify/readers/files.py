@@ -85,26 +85,30 @@ def camera_named(cameras: Mapping[str, Camera], name: str, where: Path) -> Camer
     return cameras[name]
 
 
-def load_image(path: Path, camera: Camera) -> NDArray[np.uint8]:
-    """(H,W,3) uint8 RGB of an image file; gray ones get three equal channels.
+def read_bytes(path: Path) -> bytes:
+    """The content of a file. Raises InputError if it is missing or unreadable."""
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
 
-    Raises InputError if it cannot be read or is not of the camera's size.
+
+def decoded_image(data: bytes, camera: Camera, where: Path) -> NDArray[np.uint8]:
+    """(H,W,3) uint8 RGB of an image file's bytes; gray ones get three equal channels.
+
+    Raises InputError, which names the place, if it is no whole image or not of the camera's size.
     """
     import cv2
 
-    try:
-        data = np.fromfile(path, np.uint8)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
-    bgr = cv2.imdecode(data, cv2.IMREAD_COLOR) if len(data) else None
+    bgr = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR) if data else None
     if bgr is None:
         raise InputError(
-            f"{path}: not a complete image ({len(data)} bytes); expected a PNG or JPEG file"
+            f"{where}: not a complete image ({len(data)} bytes); expected a PNG or JPEG file"
         )
     height, width = bgr.shape[:2]
     if (width, height) != (camera.width_px, camera.height_px):
         raise InputError(
-            f"{path}: got an image of {width} x {height} px; expected "
+            f"{where}: got an image of {width} x {height} px; expected "
             f"{camera.width_px} x {camera.height_px}, as the calibration of {camera.name} says"
         )
     return np.ascontiguousarray(bgr[:, :, ::-1], dtype=np.uint8)

@@ -7,7 +7,6 @@ whole, so line ``frame`` (from 0) of each belongs to ``frame``.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
 
@@ -17,9 +16,10 @@ from scipy.spatial.transform import Rotation
 
 from densify.errors import InputError
 from densify.geometry import poses
-from densify.readers.files import camera_named, load_image, numbered_files, of_frame, read_text
+from densify.readers.file_sequence import FileSequence, Returns
+from densify.readers.files import numbered_files, of_frame, read_bytes, read_text
 from densify.readers.kitti_files import Calibration, Stamps, parse_numbers, read_cameras
-from densify.types import Camera, Float, Int, Sweep, Truth
+from densify.types import Float, Int, Truth
 
 KITTI_TRIGGER_LATENCY_NS = 10_500_000
 """How much KITTI's recorded image stamps lag the exposure. The cameras are triggered when the
@@ -36,7 +36,7 @@ def open_recording(path: Path, scene: str | None) -> KittiRaw:
     return KittiRaw(path)
 
 
-class KittiRaw:
+class KittiRaw(FileSequence):
     """A KITTI raw drive as a `densify.types.LidarSequence`.
 
     Reference time of a sweep: ``velodyne_points/timestamps.txt``, the middle of the revolution,
@@ -55,52 +55,24 @@ class KittiRaw:
         folder holds no sweeps, or calibration or stamps are malformed.
         """
         drive = Path(path)
-        self.name = drive.resolve().name
-        self._drive = drive
         self._sweeps = _find_sweeps(drive)
-        self.frames: Sequence[int] = tuple(self._sweeps)
-
         velodyne = drive / "velodyne_points"
         self._stamps = Stamps.read(velodyne / "timestamps.txt")
         self._start_stamps = Stamps.read(velodyne / "timestamps_start.txt")
         self._end_stamps = Stamps.read(velodyne / "timestamps_end.txt")
         self._oxts_stamps = Stamps.read(drive / "oxts" / "timestamps.txt")
         self._oxts = numbered_files(drive / "oxts" / "data", ".txt")
-
-        self.cameras: Mapping[str, Camera] = read_cameras(drive)
+        cameras = read_cameras(drive)
         self._images = {
-            name: numbered_files(drive / name / "data", ".png", ".jpg", ".jpeg")
-            for name in self.cameras
+            name: numbered_files(drive / name / "data", ".png", ".jpg", ".jpeg") for name in cameras
         }
-        self._image_stamps = {
-            name: Stamps.read(drive / name / "timestamps.txt") for name in self.cameras
-        }
-        self.truth: Truth | None = _open_truth(drive / "truth")
-
-    def __getitem__(self, frame: int) -> Sweep:
-        """The sweep's valid returns, in file order.
-
-        Rows that are not finite or lie at the scanner's origin (KITTI pads with zeros) are dropped.
-        Raises InputError if the frame does not exist, or its file is truncated or empty.
-        """
-        path = of_frame(self._sweeps, frame, "sweep", self._drive)
-        columns = _read_points(path)
-        valid = np.isfinite(columns).all(axis=1) & columns[:, :3].any(axis=1)
-        row = np.flatnonzero(valid)
-        if not len(row):
-            raise InputError(
-                f"{path}: holds no points (frame {frame}: {len(columns)} rows, none valid); "
-                f"choose a key or window without this frame"
-            )
-        points = columns[row, :3].astype(np.float64)
-        return Sweep(
-            frame=int(frame),
-            stamp_ns=self.stamp_ns(frame),
-            points=points,
-            intensity=columns[row, 3],
-            offset_ns=self._offset_ns(frame, points),
-            lidar=np.zeros(len(row), np.uint8),
-            row=row.astype(np.int64),
+        super().__init__(
+            drive.resolve().name,
+            drive,
+            tuple(self._sweeps),
+            cameras,
+            {name: self._exposures_ns(drive, name) for name in cameras},
+            _open_truth(drive / "truth"),
         )
 
     def stamp_ns(self, frame: int) -> int:
@@ -109,46 +81,37 @@ class KittiRaw:
             return int(frame) * _NOMINAL_PERIOD_NS
         return self._stamps[frame]
 
-    def image(self, camera: str, frame: int) -> NDArray[np.uint8]:
-        """(H,W,3) RGB. Raises InputError for an unknown camera, a missing or unfit image."""
-        calibrated = camera_named(self.cameras, camera, self._drive)
-        path = of_frame(self._images[camera], frame, f"{camera} image", self._drive)
-        return load_image(path, calibrated)
+    def _returns(self, frame: int) -> tuple[Path, Returns]:
+        path = self._sweeps[frame]
+        columns = _read_points(path)
+        columns[~np.isfinite(columns).all(axis=1)] = 0
+        points = columns[:, :3].astype(np.float64)
+        return path, Returns(points, columns[:, 3], self._offset_ns(frame, points))
 
-    def image_stamps_ns(self, camera: str) -> Mapping[int, int]:
-        """When the images that exist were exposed, by their frame: the recorded stamp less
+    def _encoded_image(self, camera: str, number: int) -> tuple[Path, bytes]:
+        path = self._images[camera][number]
+        return path, read_bytes(path)
+
+    def _exposures_ns(self, drive: Path, camera: str) -> dict[int, int]:
+        """When the images that exist were exposed: the recorded stamp less
         `KITTI_TRIGGER_LATENCY_NS`, or the sweep's reference time where none is recorded."""
-        camera_named(self.cameras, camera, self._drive)
-        return self._exposed_ns[camera]
+        stamps = Stamps.read(drive / camera / "timestamps.txt")
 
-    @cached_property
-    def _exposed_ns(self) -> dict[str, dict[int, int]]:
-        def exposed_ns(camera: str, frame: int) -> int | None:
-            stamps = self._image_stamps[camera]
+        def exposed_ns(frame: int) -> int | None:
             recorded = stamps.get(frame) if stamps else None
             if recorded is not None:
                 return recorded - KITTI_TRIGGER_LATENCY_NS
             return self.stamp_ns(frame) if self._stamps is None else self._stamps.get(frame)
 
-        return {
-            camera: {f: ns for f in images if (ns := exposed_ns(camera, f)) is not None}
-            for camera, images in self._images.items()
-        }
+        return {f: ns for f in self._images[camera] if (ns := exposed_ns(f)) is not None}
 
-    def T_world_lidar(self, frame: int) -> Float:
-        """(4,4) pose at the sweep's reference time, from GPS and inertial unit.
-
-        An oxts record is up to 20 ms away from the sweep of the same number, 0.3 m at 15 m/s, so
-        the pose is interpolated between the records before and after the sweep; at the end of the
-        records it is extrapolated from the last two. Raises InputError without oxts.
-        """
-        of_frame(self._sweeps, frame, "sweep", self._drive)
+    def _pose(self, frame: int) -> Float:
+        """From GPS and inertial unit. An oxts record is up to 20 ms away from the sweep of the same
+        number, 0.3 m at 15 m/s, so the pose is interpolated between the records before and after
+        the sweep; at the end of the records it is extrapolated from the last two."""
         if not self._oxts:
-            raise InputError(
-                f"{self._drive}: no poses (expected oxts/data/*.txt); "
-                f"let the sweeps register themselves with --set register.source=kiss-icp"
-            )
-        of_frame(self._oxts, frame, "oxts record", self._drive)
+            return super()._pose(frame)
+        of_frame(self._oxts, frame, "oxts record", self.where)
         T_world_imu = self._interpolated_T_world_imu(frame)
         return T_world_imu @ poses.inverse(self._T_lidar_imu)
 
@@ -210,7 +173,7 @@ class KittiRaw:
 
     @cached_property
     def _T_lidar_imu(self) -> Float:
-        return Calibration.read(self._drive.resolve().parent / "calib_imu_to_velo.txt").pose()
+        return Calibration.read(self.where.resolve().parent / "calib_imu_to_velo.txt").pose()
 
 
 def _find_sweeps(drive: Path) -> dict[int, Path]:
@@ -229,10 +192,7 @@ def _find_sweeps(drive: Path) -> dict[int, Path]:
 
 def _read_points(path: Path) -> NDArray[np.float32]:
     """(N,4) x, y, z in metres and reflectance."""
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
+    data = read_bytes(path)
     if len(data) % 16:
         raise InputError(
             f"{path}: truncated: got {len(data)} bytes, expected a multiple of 16 (x y z "

@@ -6,6 +6,7 @@ Time runs in seconds from frame 0's reference time here, in absolute nanoseconds
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -82,16 +83,19 @@ class Simulator:
     @cached_property
     def bodies(self) -> Bodies:
         """Where every body is at every frame's reference time."""
-        stamps = [self.stamp_ns(frame) for frame in range(self.num_frames)]
-        times = np.array([seconds(stamp) for stamp in stamps])
+        return self.bodies_at([self.stamp_ns(frame) for frame in range(self.num_frames)])
+
+    def bodies_at(self, stamps_ns: Sequence[int]) -> Bodies:
+        """Where every body is at these times."""
+        times = np.array([seconds(stamp) for stamp in stamps_ns])
         bodies = self.scene.world.bodies
-        T_world_body = np.tile(np.eye(4), (len(stamps), len(bodies), 1, 1))
+        T_world_body = np.tile(np.eye(4), (len(times), len(bodies), 1, 1))
         for index, body in enumerate(bodies):
             poses = body.trajectory.poses(times)
             T_world_body[:, index, :3, :3] = poses.rotation
             T_world_body[:, index, :3, 3] = poses.position
         return Bodies(
-            np.stack([self.T_world_lidar_at(stamp) for stamp in stamps]),
+            np.stack([self.T_world_lidar_at(stamp) for stamp in stamps_ns]),
             T_world_body,
             self._moving(times),
         )

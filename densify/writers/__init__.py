@@ -1,2 +1,63 @@
 # SPDX-License-Identifier: MIT
-"""Writes the built-in street in the formats of data sets, with its exact truth."""
+"""Writes the built-in street in the formats of data sets, with its exact truth.
+
+To add a format, write a module with the function that `TreeWriter` describes and one row in
+`FORMATS`. A test of its reader then has a recording of which everything is known.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from importlib import import_module
+from pathlib import Path
+from typing import Protocol, cast
+
+from densify.errors import InputError
+from densify.readers.street import Street
+from densify.types import Progress
+from densify.writers.excerpt import Excerpt
+
+FORMATS = {
+    "kitti": "densify.writers.kitti_raw",
+}
+"""Name in ``densify simulate --format`` -> module."""
+
+
+class TreeWriter(Protocol):
+    """What the module of a format has."""
+
+    def write_tree(
+        self, excerpt: Excerpt, out: Path, overwrite: bool, progress: Progress | None
+    ) -> Path:
+        """Write the excerpt below ``out``; return the place that ``--data`` opens, which is
+        complete or not there. The truth lies beside the data, as `Excerpt.write_truth` makes it.
+
+        progress: called with "simulate", frames done, frames in all. Raises InputError for what
+        the format cannot hold, and for a place that is there already unless ``overwrite`` is set.
+        """
+        ...
+
+
+def write_street(
+    format: str,
+    street: Street,
+    out: Path,
+    frames: Sequence[int],
+    cameras: Sequence[str] | None = None,
+    progress: Progress | None = None,
+    overwrite: bool = False,
+) -> Path:
+    """Write frames of a street in a data set's format and return the place that ``--data`` opens.
+
+    format: a row of `FORMATS`. frames: absolute numbers. cameras: names, those of the street if
+    None. Raises InputError as `TreeWriter.write_tree`, and for a format, frame or camera that does
+    not exist.
+    """
+    if format not in FORMATS:
+        raise InputError(f"--format {format}: expected one of {', '.join(FORMATS)}")
+    excerpt = Excerpt.of(street, frames, cameras)
+    writer = cast(TreeWriter, import_module(FORMATS[format]))
+    try:
+        return writer.write_tree(excerpt, out, overwrite, progress)
+    except OSError as error:
+        raise InputError(f"{out}: cannot be written: {error.strerror or error}") from error

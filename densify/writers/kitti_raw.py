@@ -14,7 +14,7 @@ the other files are there for the frames asked for.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +23,6 @@ from scipy.spatial.transform import Rotation
 from densify.errors import InputError
 from densify.geometry import poses
 from densify.outputs.atomic import staged_folder
-from densify.outputs.png import encode_png
 from densify.readers.files import camera_named
 from densify.readers.kitti_raw import KITTI_TRIGGER_LATENCY_NS
 from densify.readers.street import Street
@@ -32,6 +31,7 @@ from densify.street.rig import CAMERAS, T_RECTIFIED_LIDAR, USUAL, T_level_lidar
 from densify.street.sensors import SENSORS
 from densify.street.simulator import EPOCH_NS
 from densify.types import Float, Progress
+from densify.writers.excerpt import Excerpt, put
 
 _DATE = np.datetime64(EPOCH_NS, "ns").astype("datetime64[D]").astype(str).replace("-", "_")
 DRIVE = f"{_DATE}_drive_0001_sync"
@@ -48,56 +48,34 @@ _OXTS_FORMAT = (
 )
 
 
-def write_kitti_tree(
-    street: Street,
-    out: Path,
-    frames: Sequence[int],
-    cameras: Sequence[str] | None = None,
-    progress: Progress | None = None,
-    overwrite: bool = False,
-) -> Path:
-    """Write the frames and return the drive's folder, which is complete or not there.
-
-    frames: absolute numbers. cameras: some of image_02 and image_03, both if None. progress: called
-    with a stage's name, frames done, frames in all.
-
-    Raises InputError for a frame or camera that does not exist, for a sensor whose points' times do
-    not follow from their azimuth (KITTI's format has no room for times), and if the drive or
-    another calibration is there already and ``overwrite`` is not set.
-    """
-    names = list(USUAL) if cameras is None else list(cameras)
-    for name in names:
-        camera_named({n: street.cameras[n] for n in USUAL if n in street.cameras}, name, out)
+def write_tree(excerpt: Excerpt, out: Path, overwrite: bool, progress: Progress | None) -> Path:
+    """See `densify.writers.TreeWriter`. The format has room for the cameras image_02 and image_03,
+    and for a sensor whose points' times follow from their azimuth."""
+    street = excerpt.street
+    names = [name for name in excerpt.cameras if name in USUAL]
+    for name in excerpt.cameras:
+        camera_named({n: street.cameras[n] for n in names}, name, out)
     if not street.simulator.sensor.azimuth_tells_time:
         fit = [sensor.name for sensor in SENSORS.values() if sensor.azimuth_tells_time]
         raise InputError(
             f"{street.name}: cannot be written as KITTI raw, whose points carry neither a time nor "
             f"a scanner; choose a single scanner that spins: {', '.join(fit)}"
         )
-    unknown = [frame for frame in frames if frame not in street.frames]
-    if unknown or not frames:
-        raise InputError(
-            f"{street.name}: frames to write: got {unknown[:5] or 'none'}, expected some of 0 to "
-            f"{street.frames[-1]}"
-        )
     folder = out / _DATE
     calibration = _calibration(T_level_lidar(street.simulator.tilt_deg))
-    try:
-        if not overwrite:
-            _check_kept(folder, calibration)
-        with staged_folder(folder, (DRIVE, *calibration)) as staging:
-            for name, data in calibration.items():
-                _put(staging / name, data)
-            _write_stamps(staging / DRIVE, street, names)
-            write_bodies(staging / DRIVE / "truth", street.simulator.bodies)
-            for done, frame in enumerate(frames):
-                if progress:
-                    progress("simulate", done, len(frames))
-                _write_frame(staging / DRIVE, street, frame, min(frames), names)
+    if not overwrite:
+        _check_kept(folder, calibration)
+    with staged_folder(folder, (DRIVE, *calibration)) as staging:
+        for name, data in calibration.items():
+            put(staging / name, data)
+        _write_stamps(staging / DRIVE, street, names)
+        write_bodies(staging / DRIVE / "truth", street.simulator.bodies)
+        for done, frame in enumerate(excerpt.frames):
             if progress:
-                progress("simulate", len(frames), len(frames))
-    except OSError as error:
-        raise InputError(f"{out}: cannot be written: {error.strerror or error}") from error
+                progress("simulate", done, len(excerpt.frames))
+            _write_frame(staging / DRIVE, excerpt, frame)
+        if progress:
+            progress("simulate", len(excerpt.frames), len(excerpt.frames))
     return folder / DRIVE
 
 
@@ -113,24 +91,19 @@ def _check_kept(folder: Path, calibration: Mapping[str, bytes]) -> None:
             )
 
 
-def _write_frame(drive: Path, street: Street, frame: int, first: int, names: list[str]) -> None:
-    returns = street.returns(frame)
+def _write_frame(drive: Path, excerpt: Excerpt, frame: int) -> None:
+    street, returns = excerpt.street, excerpt.returns(frame)
     columns = np.column_stack([returns.points, returns.intensity]).astype("<f4")
-    _put(drive / "velodyne_points" / "data" / f"{frame:010d}.bin", columns.tobytes())
+    put(drive / "velodyne_points" / "data" / f"{frame:010d}.bin", columns.tobytes())
     in_bodies = street.simulator.in_bodies(frame, returns)
     write_points(drive / "truth", frame, returns.body, returns.instance, in_bodies)
-    for name in names:
-        bgr = np.ascontiguousarray(street.image(name, frame)[:, :, ::-1])
-        _put(drive / name / "data" / f"{frame:010d}.png", encode_png(bgr))
+    for name in excerpt.cameras:
+        put(drive / name / "data" / f"{frame:010d}.png", excerpt.encoded_image(name, frame))
         depth_m, moving = street.truth.depth_m(name, frame), street.truth.moving_mask(name, frame)
         write_depth(drive / "truth", name, frame, depth_m, moving)
-    record = " ".join(repr(float(v)) for v in _oxts(street, frame, first)) + " 4 10 4 4 0\n"
-    _put(drive / "oxts" / "data" / f"{frame:010d}.txt", record.encode())
-
-
-def _put(path: Path, data: bytes) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_bytes(data)
+    oxts = _oxts(street, frame, excerpt.frames[0])
+    record = " ".join(repr(float(v)) for v in oxts) + " 4 10 4 4 0\n"
+    put(drive / "oxts" / "data" / f"{frame:010d}.txt", record.encode())
 
 
 def _row(values: Float) -> str:
@@ -175,8 +148,8 @@ def _write_stamps(drive: Path, street: Street, names: list[str]) -> None:
         files[f"{name}/timestamps.txt"] = exposed + KITTI_TRIGGER_LATENCY_NS
     for path, stamps in files.items():
         lines = [str(stamp).replace("T", " ") for stamp in stamps.astype("datetime64[ns]")]
-        _put(drive / path, "".join(f"{line}\n" for line in lines).encode())
-    _put(drive / "oxts" / "dataformat.txt", _OXTS_FORMAT.replace(" ", "\n").encode() + b"\n")
+        put(drive / path, "".join(f"{line}\n" for line in lines).encode())
+    put(drive / "oxts" / "dataformat.txt", _OXTS_FORMAT.replace(" ", "\n").encode() + b"\n")
 
 
 def _oxts(street: Street, frame: int, first: int) -> Float:

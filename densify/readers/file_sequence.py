@@ -1,0 +1,182 @@
+# SPDX-License-Identifier: MIT
+"""What readers of recorded files share: a sequence that checks what is asked for and what is read.
+
+A reader derives from `FileSequence`, says in ``__init__`` what there is, and reads one sweep's
+returns, one image's bytes and one pose at a time. Everything a caller can ask for wrongly (a frame,
+camera or image that does not exist) and everything a file can hold wrongly (no valid returns, no
+image, another size, a pose that is no rigid motion) is refused here, in one sentence.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from densify.errors import InputError
+from densify.readers.files import camera_named, decoded_image, of_frame
+from densify.types import Camera, Float, Float32, Int, Sweep, Truth
+
+_ORTHONORMAL_TOLERANCE = 1e-3  # text files carry seven digits, float32 files as many
+
+
+@dataclass(frozen=True)
+class Returns:
+    """The N rows of a sweep's file, each as it was measured, none left out.
+
+    points: (N,3) metres, lidar frame, each at its own firing time. intensity: (N,) 0 to 1, None if
+    there is none. offset_ns: (N,) int64 since the sweep's reference time, None where the data
+    cannot tell. lidar: (N,) uint8, which of several scanners fired, None if there is one.
+    scanner_origins: (S,3) metres, lidar frame, None where all rays start at the frame's origin.
+    """
+
+    points: Float
+    intensity: Float32 | None = None
+    offset_ns: Int | None = None
+    lidar: NDArray[np.uint8] | None = None
+    scanner_origins: Float | None = None
+
+
+class FileSequence(ABC):
+    """A `densify.types.LidarSequence` read from files.
+
+    name: for people and outputs. where: the recording's place, for messages. frames: numbers of the
+    sweeps that exist, ascending. cameras: by name. exposed_ns: of each camera, when its images that
+    exist were exposed, by image number. truth: exact truth where there is some.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        where: Path,
+        frames: Sequence[int],
+        cameras: Mapping[str, Camera] | None = None,
+        exposed_ns: Mapping[str, Mapping[int, int]] | None = None,
+        truth: Truth | None = None,
+    ) -> None:
+        self.name = name
+        self.where = where
+        self.frames: Sequence[int] = frames
+        self.cameras: Mapping[str, Camera] = cameras or {}
+        self.truth = truth
+        self._frames = frozenset(frames)
+        self._exposed_ns = exposed_ns or {}
+
+    @abstractmethod
+    def stamp_ns(self, frame: int) -> int:
+        """Reference time of a sweep, without reading its points."""
+
+    @abstractmethod
+    def _returns(self, frame: int) -> tuple[Path, Returns]:
+        """The rows of an existing sweep, and the file for messages."""
+
+    def _encoded_image(self, camera: str, number: int) -> tuple[Path, bytes]:
+        """A PNG or JPEG file's bytes of an existing image, and the file for messages."""
+        raise NotImplementedError
+
+    def _pose(self, frame: int) -> Float:
+        """(4,4) T_world_lidar of an existing sweep."""
+        raise InputError(
+            f"{self.where}: no poses; let the sweeps register themselves with "
+            f"--set register.source=kiss-icp"
+        )
+
+    def __getitem__(self, frame: int) -> Sweep:
+        """The sweep's valid returns, in file order: rows that are not finite or lie at the frame's
+        origin (many formats pad with zeros) are dropped.
+
+        Raises InputError if the frame does not exist, or its file is damaged or holds no returns.
+        """
+        self.check_frame(frame)
+        path, returns = self._returns(frame)
+        valid = np.isfinite(returns.points).all(axis=1) & returns.points.any(axis=1)
+        row = np.flatnonzero(valid)
+        if not len(row):
+            raise InputError(
+                f"{path}: holds no points (frame {frame}: {len(returns.points)} rows, none valid); "
+                f"choose a key or window without this frame"
+            )
+        intensity = returns.intensity
+        lidar = returns.lidar
+        return Sweep(
+            frame=int(frame),
+            stamp_ns=self.stamp_ns(frame),
+            points=returns.points[row].astype(np.float64),
+            intensity=(np.zeros(len(row)) if intensity is None else intensity[row]).astype(
+                np.float32
+            ),
+            offset_ns=None if returns.offset_ns is None else returns.offset_ns[row],
+            lidar=(np.zeros(len(row)) if lidar is None else lidar[row]).astype(np.uint8),
+            row=row.astype(np.int64),
+            scanner_origins=returns.scanner_origins,
+        )
+
+    def image_stamps_ns(self, camera: str) -> Mapping[int, int]:
+        """When each image that exists was exposed, by its number."""
+        camera_named(self.cameras, camera, self.where)
+        return self._exposed_ns.get(camera, {})
+
+    def image(self, camera: str, number: int) -> NDArray[np.uint8]:
+        """(H,W,3) RGB. Raises InputError for an unknown camera, a missing or unfit image."""
+        calibrated = camera_named(self.cameras, camera, self.where)
+        of_frame(self._exposed_ns.get(camera, {}), number, f"{camera} image", self.where)
+        path, data = self._encoded_image(camera, number)
+        return decoded_image(data, calibrated, path)
+
+    def T_world_lidar(self, frame: int) -> Float:
+        """(4,4) the data set's own pose at the sweep's reference time. Raises InputError if there
+        is none, or it is no rigid motion."""
+        self.check_frame(frame)
+        return rigid(self._pose(frame), f"{self.where}: pose of frame {frame}")
+
+    def check_frame(self, frame: int) -> None:
+        """Raises InputError, which names the frames that exist, for one that does not."""
+        if frame not in self._frames:
+            of_frame(dict.fromkeys(self.frames), frame, "sweep", self.where)
+
+
+def rigid(T: Float, where: str) -> Float:
+    """(4,4) or (3,4) -> (4,4) float64. Raises InputError, which starts with ``where``, if it is not
+    finite or its upper left is no rotation."""
+    T = np.asarray(T, np.float64)
+    if T.shape not in ((4, 4), (3, 4)):
+        raise InputError(f"{where}: got a matrix of shape {T.shape}, expected (4, 4)")
+    if not np.isfinite(T).all():
+        raise InputError(f"{where}: got a value that is not finite, expected a rigid motion")
+    R = T[:3, :3]
+    error = np.abs(R @ R.T - np.eye(3)).max()
+    if error > _ORTHONORMAL_TOLERANCE or np.linalg.det(R) < 0:
+        raise InputError(
+            f"{where}: got a matrix that is not a rotation (R Rᵀ is off by {error:.2g}, "
+            f"determinant {np.linalg.det(R):.3f}), expected an orthonormal one"
+        )
+    return np.vstack([T[:3], [0.0, 0.0, 0.0, 1.0]])
+
+
+def quaternion_pose(w_x_y_z: Sequence[float], translation_m: Sequence[float], where: str) -> Float:
+    """(4,4) of a unit quaternion and a translation. Raises InputError, which starts with ``where``,
+    unless there are four and three finite numbers and the quaternion's length is 1 to a hundredth
+    (it is made 1 exactly)."""
+    from scipy.spatial.transform import Rotation
+
+    quaternion = np.asarray(w_x_y_z, np.float64)
+    translation = np.asarray(translation_m, np.float64)
+    if quaternion.shape != (4,) or translation.shape != (3,):
+        raise InputError(
+            f"{where}: got {quaternion.size} and {translation.size} numbers, expected a quaternion "
+            f"w x y z and a translation x y z"
+        )
+    length = float(np.linalg.norm(quaternion))
+    if not (np.isfinite(translation).all() and abs(length - 1) < 0.01):
+        raise InputError(
+            f"{where}: got a quaternion of length {length:.4g} and the translation "
+            f"{translation.tolist()}, expected a unit quaternion w x y z and metres"
+        )
+    T = np.eye(4)
+    T[:3, :3] = Rotation.from_quat(quaternion[[1, 2, 3, 0]]).as_matrix()
+    T[:3, 3] = translation
+    return T

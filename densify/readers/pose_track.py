@@ -1,0 +1,87 @@
+# SPDX-License-Identifier: MIT
+"""Where a vehicle was at any time, from poses recorded at a rate of their own.
+
+Many data sets store each sweep as if it had been measured at one moment: every point was carried
+there by the vehicle's own motion (ego-motion compensation). What moves by itself is then smeared
+and its own time is hidden, and rings are no longer rings; `PoseTrack.as_fired` undoes it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation, Slerp
+
+from densify.errors import InputError
+from densify.geometry import poses
+from densify.types import Float, Int
+
+_MAX_BEYOND_NS = 200_000_000  # a pose is extrapolated at constant velocity for so long
+
+
+@dataclass(frozen=True)
+class PoseTrack:
+    """where: the file, for messages. stamp_ns: (n,) int64, ascending. T_world_ego: (n,4,4)."""
+
+    where: str
+    stamp_ns: Int
+    T_world_ego: Float
+
+    def __post_init__(self) -> None:
+        if len(self.stamp_ns) < 2 or np.any(np.diff(self.stamp_ns) <= 0):
+            raise InputError(
+                f"{self.where}: got {len(self.stamp_ns)} poses, expected two or more with stamps "
+                f"that ascend"
+            )
+
+    def at(self, time_ns: int) -> Float:
+        """(4,4) T_world_ego: turned evenly and moved straight between two poses.
+
+        Raises InputError for a time more than 0.2 s before the first pose or after the last.
+        """
+        begin, end = int(self.stamp_ns[0]), int(self.stamp_ns[-1])
+        beyond_ns = max(begin - time_ns, time_ns - end)
+        if beyond_ns > _MAX_BEYOND_NS:
+            raise InputError(
+                f"{self.where}: no pose at {time_ns} ns: got poses from {begin} to {end}, "
+                f"{beyond_ns * 1e-9:.2f} s away; expected poses around every sweep and image"
+            )
+        i = int(np.clip(np.searchsorted(self.stamp_ns, time_ns) - 1, 0, len(self.stamp_ns) - 2))
+        span_ns = int(self.stamp_ns[i + 1] - self.stamp_ns[i])
+        fraction = (time_ns - int(self.stamp_ns[i])) / span_ns
+        return poses.interpolate(self.T_world_ego[i], self.T_world_ego[i + 1], fraction)
+
+    def as_fired(self, points: Float, stamp_ns: int, offset_ns: Int) -> Float:
+        """Undo ego-motion compensation.
+
+        points: (N,3) metres, vehicle frame at ``stamp_ns``, to which they were compensated.
+        offset_ns: (N,) firing times since then. Returns (N,3) in the vehicle frame at each point's
+        own firing time.
+        """
+        return self._carry(points, stamp_ns, offset_ns, inverse=True)
+
+    def compensated(self, points: Float, stamp_ns: int, offset_ns: Int) -> Float:
+        """Inverse of `as_fired`."""
+        return self._carry(points, stamp_ns, offset_ns, inverse=False)
+
+    def _carry(self, points: Float, stamp_ns: int, offset_ns: Int, inverse: bool) -> Float:
+        if not len(points):
+            return points
+        T_ref_world = poses.inverse(self.at(stamp_ns))
+        low, high = stamp_ns + int(offset_ns.min()), stamp_ns + int(offset_ns.max())
+        inside = self.stamp_ns[(self.stamp_ns > low) & (self.stamp_ns < high)].tolist()
+        times_ns = sorted({low, *inside, high})
+        T_ref_ego = np.stack([T_ref_world @ self.at(t) for t in times_ns])
+        since_ns = np.array([t - stamp_ns for t in times_ns], np.float64)
+        if len(times_ns) == 1:
+            turns = Rotation.from_matrix(T_ref_ego[:, :3, :3])
+            shift_m = T_ref_ego[0, :3, 3]
+        else:
+            turns = Slerp(since_ns, Rotation.from_matrix(T_ref_ego[:, :3, :3]))(offset_ns)
+            shift_m = np.stack(
+                [np.interp(offset_ns, since_ns, T_ref_ego[:, axis, 3]) for axis in range(3)], axis=1
+            )
+        if inverse:
+            return turns.apply(points - shift_m, inverse=True)
+        return turns.apply(points) + shift_m

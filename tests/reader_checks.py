@@ -1,0 +1,90 @@
+# SPDX-License-Identifier: MIT
+"""What every reader must give back of a street that was written in its format."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from densify.geometry.poses import inverse, transform
+from densify.types import LidarSequence
+from densify.writers.excerpt import Excerpt
+
+
+def check_sweeps(
+    sequence: LidarSequence,
+    excerpt: Excerpt,
+    reference_ns: int = 0,
+    T_lidar_ego: np.ndarray | None = None,
+    point_m: float = 1e-6,
+    offset_ns: int = 1,
+    row_of: np.ndarray | None = None,
+) -> None:
+    """Points as they were fired, their times, scanners, intensities and the poses.
+
+    reference_ns: how much later than the street's the format's reference time is. T_lidar_ego: the
+    frame in which the format has the points. point_m, offset_ns: what the format rounds. row_of:
+    which of the street's returns each row is, where the format sorts them.
+    """
+    street = excerpt.street
+    T_ego_lidar = np.eye(4) if T_lidar_ego is None else inverse(T_lidar_ego)
+    assert list(sequence.frames) == list(range(len(excerpt.frames)))
+    T_world_ego = excerpt.T_world_ego(
+        np.array([street.stamp_ns(f) + reference_ns for f in excerpt.frames]), T_lidar_ego
+    )
+    first = inverse(sequence.T_world_lidar(0))
+    for number, frame in enumerate(excerpt.frames):
+        read, true = sequence[number], street[frame]
+        rows = np.arange(len(true)) if row_of is None else row_of
+        assert sequence.stamp_ns(number) == read.stamp_ns == true.stamp_ns + reference_ns
+        assert len(read) == len(true)
+        moved = transform(T_ego_lidar, true.points[rows])
+        np.testing.assert_allclose(read.points, moved, atol=point_m)
+        assert np.abs(read.offset_ns + reference_ns - true.offset_ns[rows]).max() <= offset_ns
+        np.testing.assert_array_equal(read.lidar, true.lidar[rows])
+        np.testing.assert_allclose(read.intensity, true.intensity[rows], atol=1 / 255)
+        step = first @ sequence.T_world_lidar(number)
+        np.testing.assert_allclose(step, inverse(T_world_ego[0]) @ T_world_ego[number], atol=1e-5)
+
+
+def check_cameras(
+    sequence: LidarSequence,
+    excerpt: Excerpt,
+    T_lidar_ego: np.ndarray | None = None,
+    stamp_ns: int = 1,
+    same_pixels: bool = True,
+) -> None:
+    """Calibration, exposure times (to ``stamp_ns``) and images; lossy formats need not have the
+    same pixels."""
+    street = excerpt.street
+    T_ego = np.eye(4) if T_lidar_ego is None else T_lidar_ego
+    assert set(sequence.cameras) == set(excerpt.cameras)
+    for name in excerpt.cameras:
+        read, true = sequence.cameras[name], street.cameras[name]
+        assert (read.width_px, read.height_px) == (true.width_px, true.height_px)
+        assert read.model == true.model
+        np.testing.assert_allclose(read.K, true.K, atol=1e-6)
+        np.testing.assert_allclose(read.T_cam_lidar, true.T_cam_lidar @ T_ego, atol=1e-6)
+        numbers, exposed_ns = excerpt.image_numbers(name), sequence.image_stamps_ns(name)
+        assert list(exposed_ns) == list(range(len(numbers)))
+        for number, image in enumerate(numbers):
+            assert abs(exposed_ns[number] - street.image_stamps_ns(name)[image]) <= stamp_ns
+            got, expected = sequence.image(name, number), street.image(name, image)
+            assert got.shape == expected.shape
+            if same_pixels:
+                np.testing.assert_array_equal(got, expected)
+            else:
+                assert np.abs(got.astype(int) - expected).mean() < 4
+
+
+def check_truth(sequence: LidarSequence, excerpt: Excerpt) -> None:
+    """The truth beside the data belongs to its rows."""
+    truth = sequence.truth
+    assert truth is not None
+    for number in range(len(excerpt.frames)):
+        sweep, true = sequence[number], truth.sweep(number)
+        assert len(true.points) == sweep.row.max() + 1
+        away_m = np.linalg.norm(true.points[sweep.row] - sweep.points, axis=1)
+        assert np.median(away_m) < 4.0 and away_m.max() < 12.0  # the vehicle moves in a sweep
+        still = ~true.moving[sweep.row]
+        flow = truth.displacement(number, 0)[sweep.row]
+        assert not flow[still].any() or np.linalg.norm(flow[still], axis=1).max() < 0.06
