@@ -40,7 +40,6 @@ def register(
     sweeps: Sequence[Sweep],
     settings: RegisterSettings,
     rough: Trajectory | None = None,
-    start: Float | None = None,
 ) -> Trajectory:
     """Poses of sweeps by lidar odometry.
 
@@ -48,9 +47,8 @@ def register(
         pass, deskewed for a second one.
     rough: the first pass of the same sweeps. The second one searches around it, so that it can
         work with fine voxels and a narrow kernel. Without it the voxels are twice as large, each
-        sweep is searched for where the vehicle would be if it kept its velocity.
-    start: (6,) per second, the velocity at the start of a first pass, since odometry takes every
-        start for standing still; None: `searched_twist`.
+        sweep is searched for where the vehicle would be if it kept its velocity; the first one by
+        `searched_twist`, since odometry takes every start for standing still.
 
     World is the first sweep's lidar frame. Raises SweepError naming the frames where a sweep
     is too sparse to register, the stamps do not ascend or, in the second pass, the motion is none
@@ -72,7 +70,7 @@ def register(
             if rough is not None:
                 twist = _twist(rough, min(max(i - 1, _NUM_CATCHING_UP), len(sweeps) - 2))
             elif i == 1:
-                twist = searched_twist(sweeps, settings) if start is None else start
+                twist = searched_twist(sweeps, settings)
             else:
                 twist = poses.log(odometry.last_delta) / step_s[i - 2]
             odometry.last_delta = poses.exp(twist * step_s[i - 1])

@@ -12,12 +12,7 @@ import numpy as np
 from densify.config import RegisterSettings
 from densify.geometry import poses
 from densify.registration.deskew import deskew
-from densify.registration.odometry import (
-    check_overlap,
-    check_plausible,
-    register,
-    searched_twist,
-)
+from densify.registration.odometry import check_overlap, check_plausible, register
 from densify.registration.upright import upright
 from densify.types import Sweep, Trajectory
 
@@ -74,8 +69,7 @@ def _rough(sweeps: Sequence[Sweep], settings: RegisterSettings) -> Trajectory:
         return register(sweeps, settings)
     last = len(sweeps) - 1
     rows = np.array(sorted({*range(0, last, stride), last}))
-    start = searched_twist(sweeps, settings)
-    sparse = register([sweeps[row] for row in rows], settings, start=start)
+    sparse = register([sweeps[row] for row in rows], settings)
     T_world_lidar = []
     for i, time_ns in enumerate(stamp_ns):
         k = min(int(np.searchsorted(rows, i, side="right")), len(rows) - 1) - 1
