@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from densify.dataset.pools import share_of_cores
+from densify.dataset.processes import share_of_cores
 
 NUM_PROCESSES = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
 if NUM_PROCESSES > 1:  # libraries read it when imported: the tests' own modules come after it

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import json
 import shutil
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -82,10 +81,8 @@ def test_keys_do_not_depend_on_which_are_asked_for(
 
 
 def test_two_workers_make_what_one_makes(
-    border_drive: Path, border_set: Path, tmp_path: Path, monkeypatch
+    border_drive: Path, border_set: Path, tmp_path: Path
 ) -> None:
-    """Without Dask; those with it are killed in test_dataset_survives.py."""
-    monkeypatch.setitem(sys.modules, "distributed", None)
     out = tmp_path / "out"
     assert exit_code("dataset", "--data", border_drive, *OPTIONS, "--workers", 2, "--out", out) == 0
     in_order(out)

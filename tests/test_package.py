@@ -190,8 +190,8 @@ def test_no_arrow_runs_upward() -> None:
 
 
 DOORS: dict[str, str | tuple[str, ...]] = {
-    "dask": "densify/dataset/workers.py",
-    "distributed": "densify/dataset/workers.py",
+    "dask": "densify/dataset/cluster.py",
+    "distributed": "densify/dataset/cluster.py",
     "embreex": "densify/street/world.py",
     "joblib": "densify/cache.py",
     "kiss_icp": "densify/registration/odometry.py",

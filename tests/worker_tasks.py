@@ -76,7 +76,21 @@ def wait(place: Path) -> None:
     time.sleep(600)
 
 
-def die() -> None:
+def write_aside(place: Path) -> None:
+    """Have an unfinished file, never finish it, and remove it when interrupted."""
+    place.touch()
+    try:
+        while True:
+            time.sleep(0.01)
+    finally:
+        place.unlink()
+
+
+def nap(seconds: float) -> None:
+    time.sleep(seconds)
+
+
+def die(*_: object) -> None:
     os.kill(os.getpid(), signal.SIGKILL)
 
 
@@ -86,12 +100,19 @@ def fill_memory(num_bytes: int) -> None:
     time.sleep(600)
 
 
+def keep_memory(num_bytes: int) -> int:
+    """Take more each time, and never give it back."""
+    _KEPT.append(b"x" * num_bytes)
+    time.sleep(0.25)  # for who watches
+    return os.getpid()
+
+
+_KEPT: list[bytes] = []
+
+
 def threads() -> tuple[str, int, bool]:
     """What OpenBLAS and numba are told, and whether any was loaded too early to hear it."""
-    # Dask's workers load numpy, with OpenBLAS, at once: the variable has to be there before.
-    started_with = Path("/proc/self/environ").read_bytes().split(b"\0")
-    told = f"OPENBLAS_NUM_THREADS={os.environ['OPENBLAS_NUM_THREADS']}".encode() in started_with
-    early = bool({"numba", "torch"} & set(sys.modules)) or ("numpy" in sys.modules and not told)
+    early = bool({"numba", "torch", "numpy"} & set(sys.modules))
     import numba
 
     return os.environ["OPENBLAS_NUM_THREADS"], numba.config.NUMBA_NUM_THREADS, early

@@ -107,14 +107,15 @@ def _add_workers(parser: argparse.ArgumentParser) -> None:
         type=natural,
         default=1,
         metavar="N",
-        help="processes on this machine, a local Dask cluster if densify[cluster] is installed "
-        "(default: 1)",
+        help="processes on this machine (default: 1)",
     )
     work.add_argument(
         "--scheduler",
         metavar="ADDRESS",
-        help="of a running Dask scheduler, such as tcp://host:8786, whose workers are used; they "
-        "need the same files at the same paths",
+        help="of a running Dask scheduler, whose workers are used; they need the same files at the "
+        "same paths. tcp://host:8786 trusts everybody on that network: whoever reaches the "
+        "scheduler can run anything on its workers and here. tls://host:8786 lets in only who has "
+        "a certificate, by Dask's configuration (distributed.comm.tls)",
     )
     work.add_argument(
         "--shard",
@@ -123,7 +124,11 @@ def _add_workers(parser: argparse.ArgumentParser) -> None:
         help="the i-th of n parts of the work, for machines that share DIR",
     )
     work.add_argument(
-        "--memory", type=size_bytes, metavar="SIZE", help="of all processes together, such as 8G"
+        "--memory",
+        type=size_bytes,
+        metavar="SIZE",
+        help="of all processes together, such as 8G: no more workers are started than fit, and one "
+        "of several that takes more than its share is started anew",
     )
     work.add_argument(
         "--cache-size",

@@ -102,11 +102,12 @@ def make_dataset(
     data: recordings, as `densify.open_sequence` takes them. keys: all if None, else those of frames
     ``start`` to ``stop`` - 1 by ``step``. num_workers: processes; 1 works in this one. scheduler:
     address of a Dask scheduler whose workers are used instead; they need the same files at the same
-    paths. shard: (i, n), the i-th of n parts of the work, from 1; parts may run at the same time on
-    machines that share ``out``. memory_bytes: of all processes together; fewer are started where it
-    does not suffice. cache_bytes: bound of what is kept on disk for later runs. verify: compare
-    finished files with their recorded hashes, and make damaged ones anew. report: called after
-    every key.
+    paths; ``tcp://`` trusts everybody on that network, ``tls://`` takes certificates. shard: (i,
+    n), the i-th of n parts of the work, from 1; parts may run at the same time on machines that
+    share ``out``. memory_bytes: of all processes together; fewer are started where it does not
+    suffice, and one of several that takes more than its share is replaced. cache_bytes: bound of
+    what is kept on disk for later runs. verify: compare finished files with their recorded hashes,
+    and make damaged ones anew. report: called after every key.
 
     Run again, it goes on where it was stopped, however that happened: finished keys are kept, keys
     that failed are tried again. The files do not depend on the number of processes, on shards or on
