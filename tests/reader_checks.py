@@ -5,7 +5,9 @@ from __future__ import annotations
 
 import numpy as np
 
+import densify
 from densify.geometry.poses import inverse, transform
+from densify.scores.depth_metrics import depth_errors
 from densify.types import LidarSequence
 from densify.writers.excerpt import Excerpt
 
@@ -88,3 +90,21 @@ def check_truth(sequence: LidarSequence, excerpt: Excerpt) -> None:
         still = ~true.moving[sweep.row]
         flow = truth.displacement(number, 0)[sweep.row]
         assert not flow[still].any() or np.linalg.norm(flow[still], axis=1).max() < 0.06
+
+
+def check_depth(sequence: LidarSequence, excerpt: Excerpt, worse: float = 0.03) -> None:
+    """The middle sweep, densified with its neighbours and the recorded poses, has the depth that
+    the street itself gives: as many pixels and errors to the share ``worse``."""
+    camera, middle = excerpt.cameras[0], len(excerpt.frames) // 2
+    scores = []
+    for recording, key in ((sequence, middle), (excerpt.street, excerpt.frames[middle])):
+        poses_given = {"register": {"source": "dataset"}}
+        result = densify.run(recording, key, 1, cameras=[camera], config=poses_given)
+        depth_m, true_m = result.depth[camera].depth_m, recording.truth.depth_m(camera, key)
+        assert result.cloud.moving.any()
+        focal_px = recording.cameras[camera].focal_px
+        scores.append(depth_errors(depth_m, true_m, focal_px=focal_px))
+    read, true = scores
+    assert true.num_compared > 5_000
+    assert abs(read.num_compared / true.num_compared - 1) < worse
+    assert read.mae_m < (1 + worse) * true.mae_m and read.rmse_m < (1 + 2 * worse) * true.rmse_m

@@ -145,7 +145,7 @@ def _add_simulate(commands: Any) -> None:
         "--format",
         default="kitti",
         metavar="NAME",
-        help="the data set whose format to write: kitti (default)",
+        help="the data set whose format to write (default: kitti); a wrong name lists all",
     )
     parser.add_argument(
         "--preset",
@@ -156,7 +156,8 @@ def _add_simulate(commands: Any) -> None:
     parser.add_argument(
         "--sensor",
         metavar="NAME",
-        help="the scanner: hdl64, hdl32, vlp16, os128, vls128 (default: hdl64)",
+        help="the scanner: hdl64, hdl32, vlp16, os128, vls128, dual32, panda, rosette "
+        "(default: hdl64)",
     )
     parser.add_argument(
         "--hz",

@@ -43,6 +43,13 @@ def _row(name: str, module: ModuleType, version: str) -> Reader:
     )
 
 
+def _is_argoverse2(path: Path) -> bool:
+    splits = (path, *(path / split for split in ("train", "val", "test")))
+    return (path / "city_SE3_egovehicle.feather").is_file() or any(
+        any(split.glob("*/city_SE3_egovehicle.feather")) for split in splits
+    )
+
+
 READERS = Table(
     kind="reader",
     group="densify.readers",
@@ -52,6 +59,13 @@ READERS = Table(
             "densify.readers.kitti_raw",
             recognises=lambda path: (path / "velodyne_points").is_dir(),
             holds="a KITTI raw drive (a folder that holds velodyne_points/)",
+        ),
+        Reader(
+            "argoverse2",
+            "densify.readers.argoverse2",
+            recognises=_is_argoverse2,
+            holds="an Argoverse 2 log (a folder that holds city_SE3_egovehicle.feather)",
+            scenes=True,
         ),
     ),
     members=("open_recording", "recognises"),

@@ -139,6 +139,31 @@ class FileSequence(ABC):
             of_frame(dict.fromkeys(self.frames), frame, "sweep", self.where)
 
 
+def chosen_scene(reader: str, path: Path, scene: str | None, names: Sequence[str]) -> str:
+    """Which of the recordings of one place is meant: the one named, or the only one.
+
+    Raises InputError, which lists them, if that does not tell.
+    """
+    if scene in names:
+        return str(scene)
+    if scene is None and len(names) == 1:
+        return names[0]
+    shown = ", ".join(names[:4])
+    if len(names) > 4:
+        shown += f", ... {names[-1]} ({len(names)} in all)"
+    got = f"holds {len(names)} recordings" if scene is None else f"no recording {scene}"
+    raise InputError(f"{path}: {got}; choose one by {reader}:{path}#NAME, NAME one of {shown}")
+
+
+def truth_beside(recording: Path) -> Truth | None:
+    """Exact truth, in the folder ``truth`` of a simulated recording."""
+    if not (recording / "truth").is_dir():
+        return None
+    from densify.readers.truth_files import FileTruth
+
+    return FileTruth.open(recording / "truth")
+
+
 def rigid(T: Float, where: str) -> Float:
     """(4,4) or (3,4) -> (4,4) float64. Raises InputError, which starts with ``where``, if it is not
     finite or its upper left is no rotation."""

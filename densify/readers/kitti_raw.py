@@ -16,10 +16,10 @@ from scipy.spatial.transform import Rotation
 
 from densify.errors import InputError
 from densify.geometry import poses
-from densify.readers.file_sequence import FileSequence, Returns
+from densify.readers.file_sequence import FileSequence, Returns, truth_beside
 from densify.readers.files import numbered_files, of_frame, read_bytes, read_text
 from densify.readers.kitti_files import Calibration, Stamps, parse_numbers, read_cameras
-from densify.types import Float, Int, Truth
+from densify.types import Float, Int
 
 KITTI_TRIGGER_LATENCY_NS = 10_500_000
 """How much KITTI's recorded image stamps lag the exposure. The cameras are triggered when the
@@ -72,7 +72,7 @@ class KittiRaw(FileSequence):
             tuple(self._sweeps),
             cameras,
             {name: self._exposures_ns(drive, name) for name in cameras},
-            _open_truth(drive / "truth"),
+            truth_beside(drive),
         )
 
     def stamp_ns(self, frame: int) -> int:
@@ -207,12 +207,3 @@ def _read_oxts(path: Path) -> Float:
     if abs(values[0]) >= 90:
         raise InputError(f"{path}: got a latitude of {values[0]:g} deg, expected -90 to 90")
     return values
-
-
-def _open_truth(folder: Path) -> Truth | None:
-    """Exact truth, beside the sweeps of a simulated drive."""
-    if not folder.is_dir():
-        return None
-    from densify.readers.truth_files import FileTruth
-
-    return FileTruth.open(folder)

@@ -57,9 +57,10 @@ class PoseTrack:
 
         points: (N,3) metres, vehicle frame at ``stamp_ns``, to which they were compensated.
         offset_ns: (N,) firing times since then. Returns (N,3) in the vehicle frame at each point's
-        own firing time.
+        own firing time; rows of zeros, which formats pad with, stay zeros.
         """
-        return self._carry(points, stamp_ns, offset_ns, inverse=True)
+        fired = self._carry(points, stamp_ns, offset_ns, inverse=True)
+        return np.where(points.any(axis=1, keepdims=True), fired, points)
 
     def compensated(self, points: Float, stamp_ns: int, offset_ns: Int) -> Float:
         """Inverse of `as_fired`."""

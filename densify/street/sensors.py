@@ -40,11 +40,14 @@ class Sensor:
         return np.array([scanner.origin_m for scanner in self.scanners])
 
     @property
+    def spins(self) -> bool:
+        """Whether all its scanners do, with a beam for each ring."""
+        return all(isinstance(scanner.pattern, Spinning) for scanner in self.scanners)
+
+    @property
     def azimuth_tells_time(self) -> bool:
         """Whether a single scanner spins about the lidar frame's origin."""
-        only = self.scanners[0]
-        spins = isinstance(only.pattern, Spinning)
-        return len(self.scanners) == 1 and spins and not any(only.origin_m)
+        return len(self.scanners) == 1 and self.spins and not any(self.scanners[0].origin_m)
 
 
 def _beams(*parts: NDArray[np.floating[Any]]) -> tuple[float, ...]:

@@ -19,6 +19,7 @@ from densify.writers.excerpt import Excerpt
 
 FORMATS = {
     "kitti": "densify.writers.kitti_raw",
+    "argoverse2": "densify.writers.argoverse2",
 }
 """Name in ``densify simulate --format`` -> module."""
 

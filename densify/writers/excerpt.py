@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from densify.errors import InputError
 from densify.outputs.atomic import staged_folder
@@ -18,6 +19,8 @@ from densify.readers.pose_track import PoseTrack
 from densify.readers.street import Street
 from densify.readers.truth_files import write_bodies, write_depth, write_points
 from densify.street.lidar import Returns
+from densify.street.patterns import Spinning
+from densify.street.sensors import SENSORS
 from densify.types import Float, Int
 
 _POSE_STEP_NS = 5_000_000
@@ -64,6 +67,33 @@ class Excerpt:
         rgb = self.street.image(camera, number)
         return encode_png(np.ascontiguousarray(rgb[:, :, ::-1]))
 
+    def jpeg_image(self, camera: str, number: int) -> bytes:
+        """A JPEG file's bytes."""
+        import cv2
+
+        bgr = np.ascontiguousarray(self.street.image(camera, number)[:, :, ::-1])
+        return cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, 95])[1].tobytes()
+
+    def rings(self, returns: Returns) -> Int:
+        """(N,) int64 which of its scanner's beams measured each return, counted from the lowest.
+
+        Raises InputError if a scanner does not spin."""
+        ring = np.zeros(len(returns.points), np.int64)
+        for number, scanner in enumerate(self.street.simulator.sensor.scanners):
+            if not isinstance(scanner.pattern, Spinning):
+                fit = [s.name for s in SENSORS.values() if s.spins]
+                raise InputError(
+                    f"{self.street.name}: cannot be written in this format, whose points have "
+                    f"rings; choose a sensor that spins: {', '.join(fit)}"
+                )
+            rows = np.flatnonzero(returns.lidar == number)
+            away = returns.points[rows] - np.array(scanner.origin_m)
+            elevation_deg = np.degrees(np.arctan2(away[:, 2], np.hypot(away[:, 0], away[:, 1])))
+            beams_deg = np.sort(scanner.pattern.elevation_deg)
+            between_deg = (beams_deg[1:] + beams_deg[:-1]) / 2
+            ring[rows] = np.searchsorted(between_deg, elevation_deg)
+        return ring
+
     def poses(self, T_lidar_ego: Float | None = None, step_ns: int = _POSE_STEP_NS) -> PoseTrack:
         """The true path of the scanner, or of a frame fixed to it, every ``step_ns``, from 0.15 s
         before the first sweep to 0.15 s after the last."""
@@ -102,6 +132,26 @@ class Excerpt:
             for number, image in enumerate(self.image_numbers(camera)):
                 depth_m, moving = truth.depth_m(camera, image), truth.moving_mask(camera, image)
                 write_depth(folder, camera, number, depth_m, moving)
+
+
+def quaternion(T: Float) -> Float:
+    """(...,4,4) poses -> (...,4) their rotations as unit quaternions w x y z, w not negative."""
+    x_y_z_w = Rotation.from_matrix(T[..., :3, :3]).as_quat(canonical=True)
+    return x_y_z_w[..., [3, 0, 1, 2]]
+
+
+def check_plain_cameras(excerpt: Excerpt, format: str) -> None:
+    """Raise InputError for a camera with a lens or a rolling shutter, where the format has room for
+    neither."""
+    for name in excerpt.cameras:
+        camera = excerpt.street.cameras[name]
+        if not camera.is_rectified or camera.row_time_s:
+            cameras = excerpt.street.cameras.items()
+            fit = [n for n, c in cameras if c.is_rectified and not c.row_time_s]
+            raise InputError(
+                f"{excerpt.street.name}: camera {name} cannot be written as {format}, whose images "
+                f"are rectified and exposed all at once; choose among {', '.join(fit) or 'none'}"
+            )
 
 
 @contextmanager

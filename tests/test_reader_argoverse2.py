@@ -1,0 +1,262 @@
+# SPDX-License-Identifier: MIT
+"""The Argoverse 2 reader on a street written as a log, on broken logs, and on a real one."""
+
+from __future__ import annotations
+
+import shutil
+
+import numpy as np
+import pytest
+
+from densify.errors import InputError
+from densify.geometry.poses import inverse, transform
+from densify.readers import open_sequence
+from densify.readers.argoverse2 import Argoverse2
+from densify.readers.street import Street
+from densify.writers import write_street
+from densify.writers.argoverse2 import T_EGO_LIDAR
+from densify.writers.excerpt import Excerpt
+from tests.reader_checks import check_cameras, check_depth, check_sweeps, check_truth
+
+feather = pytest.importorskip("pyarrow.feather")
+
+FRAMES, CAMERA = (59, 60, 61), "image_02"
+HALF_NS = 50_000_000
+REAL = "argoverse2/sensor/val/7fab2350-7eaf-3b7e-a39d-6937a4c1bede"
+
+
+@pytest.fixture(scope="module")
+def excerpt():
+    return Excerpt.of(Street("street", 0, "vlp16", cameras=(CAMERA,)), FRAMES, None)
+
+
+@pytest.fixture(scope="module")
+def log(excerpt, tmp_path_factory):
+    out = tmp_path_factory.mktemp("argoverse2") / "val"
+    return write_street("argoverse2", excerpt.street, out, FRAMES)
+
+
+@pytest.fixture
+def broken(log, tmp_path):
+    """A copy to be damaged."""
+    return shutil.copytree(log, tmp_path / "log", ignore=shutil.ignore_patterns("truth"))
+
+
+def test_the_street_is_given_back(log, excerpt):
+    sequence = open_sequence(log)
+    assert isinstance(sequence, Argoverse2)
+    # half a step of float16 beyond 64 m, in three directions
+    check_sweeps(sequence, excerpt, -HALF_NS, inverse(T_EGO_LIDAR), point_m=0.06)
+    check_cameras(sequence, excerpt, inverse(T_EGO_LIDAR), same_pixels=False)
+    check_truth(sequence, excerpt)
+    near = np.abs(sequence[0].points).max(axis=1) < 8
+    away = excerpt.street[FRAMES[0]].points - inverse(T_EGO_LIDAR)[:3, 3]
+    assert np.abs(sequence[0].points - away)[near].max() < 0.005
+
+
+def test_a_pose_for_each_image(log, excerpt):
+    sequence = open_sequence(log)
+    for number, frame in enumerate(FRAMES):
+        expected = excerpt.street.T_world_lidar(frame) @ inverse(
+            excerpt.street.cameras[CAMERA].T_cam_lidar
+        )
+        np.testing.assert_allclose(sequence.T_world_cam(CAMERA, number), expected, atol=1e-4)
+
+
+def test_two_scanners_keep_their_places(tmp_path):
+    street = Street("static", 0, "dual32", cameras=())
+    log = write_street("argoverse2", street, tmp_path, [60])
+    sweep, true = Argoverse2(log)[0], street[60]
+    np.testing.assert_array_equal(sweep.lidar, true.lidar)
+    np.testing.assert_allclose(sweep.scanner_origins, true.scanner_origins + [1.35, 0, 1.64])
+    laser = feather.read_table(next((log / "sensors" / "lidar").iterdir()))["laser_number"]
+    assert set(laser.to_numpy()) == set(range(64))
+    away = true.points - true.scanner_origins[true.lidar]
+    elevation_deg = np.degrees(np.arctan2(away[:, 2], np.hypot(away[:, 0], away[:, 1])))
+    for ring in (0, 31, 32, 63):
+        assert np.ptp(elevation_deg[laser.to_numpy() == ring]) < 0.01
+
+
+def test_depth_is_that_of_the_street(log, excerpt):
+    check_depth(open_sequence(log), excerpt, worse=0.1)
+
+
+def test_logs_are_scenes(log):
+    for place in (log.parent, log.parent.parent):
+        assert open_sequence(place).name == log.name  # the only one
+        assert open_sequence(f"argoverse2:{place}#street").name == log.name
+        with pytest.raises(InputError, match=r"no recording other.*one of street$"):
+            open_sequence(f"argoverse2:{place}#other")
+    with pytest.raises(InputError, match="no Argoverse 2 log"):
+        open_sequence(f"argoverse2:{log / 'sensors'}")
+
+
+def test_what_the_format_cannot_hold_is_refused(tmp_path):
+    for spec in ("street?sensor=os128", "street?sensor=rosette", "street?cameras=fisheye"):
+        with pytest.raises(InputError, match="cannot be written") as error:
+            write_street("argoverse2", Street.from_spec(spec), tmp_path / "out", [60])
+        assert "choose" in str(error.value)
+    assert not (tmp_path / "out").exists()
+
+
+# Damage
+
+
+def table_of(path):
+    return feather.read_table(path, memory_map=False)
+
+
+def change(path, column, make):
+    """Replace a column by what ``make`` makes of its values; without ``make`` leave it out."""
+    import pyarrow
+
+    table = table_of(path)
+    at = table.column_names.index(column)
+    values = table[column].to_pylist()
+    table = table.remove_column(at)
+    if make:
+        table = table.add_column(at, column, pyarrow.array(make(values)))
+    feather.write_feather(table, path)
+
+
+def first(value):
+    return lambda values: [value, *values[1:]]
+
+
+POSES, SENSORS = "city_SE3_egovehicle.feather", "calibration/egovehicle_SE3_sensor.feather"
+INTRINSICS, SWEEP, IMAGE = "calibration/intrinsics.feather", "*.feather", "*.jpg"
+TABLES = {
+    "poses missing": (POSES, lambda p: p.unlink(), "no Argoverse 2 log"),
+    "poses truncated": (POSES, lambda p: p.write_bytes(p.read_bytes()[:-99]), "not a whole"),
+    "poses empty": (POSES, lambda p: p.write_bytes(b""), "not a whole"),
+    "pose column absent": (POSES, lambda p: change(p, "qx", None), "no column qx"),
+    "pose not a number": (POSES, lambda p: change(p, "tx_m", first(np.nan)), "1 not finite"),
+    "pose missing": (POSES, lambda p: change(p, "tx_m", first(None)), "1 of them missing"),
+    "pose stamps as text": (
+        POSES,
+        lambda p: change(p, "timestamp_ns", lambda v: [str(x) for x in v]),
+        "expected whole numbers",
+    ),
+    "quaternion not of unit length": (POSES, lambda p: change(p, "qw", first(7.0)), "unit quatern"),
+    "one pose": (POSES, lambda p: feather.write_feather(table_of(p)[:1], p), "two or more"),
+    "sensors missing": (SENSORS, lambda p: p.unlink(), "no such file"),
+    "scanner missing": (
+        SENSORS,
+        lambda p: change(p, "sensor_name", lambda v: ["top", *v[1:]]),
+        "no sensor up_lidar",
+    ),
+    "camera without a pose": (
+        SENSORS,
+        lambda p: change(p, "sensor_name", lambda v: [*v[:-1], "other"]),
+        "no pose",
+    ),
+    "camera without intrinsics": (
+        INTRINSICS,
+        lambda p: change(p, "sensor_name", first("other")),
+        "0 rows",
+    ),
+    "focal length 0": (INTRINSICS, lambda p: change(p, "fx_px", first(0.0)), "positive"),
+    "no sweeps": ("sensors/lidar", shutil.rmtree, "no sweeps"),
+}
+SWEEPS = {
+    "truncated": (SWEEP, lambda p: p.write_bytes(p.read_bytes()[:5000]), "not a whole"),
+    "column absent": (SWEEP, lambda p: change(p, "offset_ns", None), "no column offset_ns"),
+    "column of texts": (SWEEP, lambda p: change(p, "x", lambda v: ["1"] * len(v)), "numbers"),
+    "lasers of another sensor": (
+        SWEEP,
+        lambda p: change(p, "laser_number", lambda v: [64] * len(v)),
+        "expected 0 to 63",
+    ),
+    "no points": (SWEEP, lambda p: feather.write_feather(table_of(p)[:0], p), "holds no points"),
+    "poses end before": (
+        POSES,
+        lambda p: change(p, "timestamp_ns", lambda v: [x - 10**9 for x in v]),
+        "no pose at",
+    ),
+    "image truncated": (IMAGE, lambda p: p.write_bytes(b""), "not a complete image"),
+    "image of another size": (
+        INTRINSICS,
+        lambda p: change(p, "width_px", lambda v: [1240]),
+        "1242 x 375 px; expected 1240",
+    ),
+}
+
+
+@pytest.mark.parametrize("damage", TABLES)
+def test_damaged_logs_are_refused_in_a_line(broken, damage):
+    name, harm, says = TABLES[damage]
+    harm(broken / name)
+    with pytest.raises(InputError, match=says) as error:
+        open_sequence(f"argoverse2:{broken}")
+    assert "\n" not in str(error.value) and str(broken) in str(error.value)
+
+
+@pytest.mark.parametrize("damage", SWEEPS)
+def test_damaged_sweeps_and_images_are_refused_in_a_line(broken, damage):
+    name, harm, says = SWEEPS[damage]
+    folder = {SWEEP: broken / "sensors/lidar", IMAGE: broken / "sensors/cameras" / CAMERA}
+    harm(sorted(folder[name].glob(name))[0] if name in folder else broken / name)
+    sequence = open_sequence(broken)
+    with pytest.raises(InputError, match=says) as error:
+        sequence[0]
+        sequence.image(CAMERA, 0)
+    assert "\n" not in str(error.value) and str(broken) in str(error.value)
+
+
+def test_rows_without_a_place_are_left_out(broken):
+    path = sorted((broken / "sensors/lidar").iterdir())[0]
+    whole = len(open_sequence(broken)[0])
+    for axis in "xyz":
+        change(path, axis, lambda v: np.array([0, np.nan, *v[2:]], np.float16))
+    sweep = open_sequence(broken)[0]
+    assert len(sweep) == whole - 2 and sweep.row[0] == 2
+
+
+def test_without_the_package_the_remedy_is_named(log, monkeypatch):
+    monkeypatch.setitem(__import__("sys").modules, "pyarrow", None)
+    with pytest.raises(InputError, match=r"pip install 'densify\[argoverse\]'"):
+        open_sequence(log)
+
+
+# A real log
+
+
+def test_a_real_log(test_data):
+    sequence = open_sequence(test_data / REAL)
+    assert list(sequence.frames) == [0, 1] and not sequence.cameras
+    sweep = sequence[0]
+    assert len(sweep) == 99_229 and sweep.stamp_ns == 315_966_265_259_836_000
+    assert (sweep.offset_ns.min(), sweep.offset_ns.max()) == (2_654_000, 106_085_816)
+    np.testing.assert_allclose(
+        sweep.scanner_origins, [[1.35018, 0, 1.64042], [1.34676, 0.00457, 1.52550]], atol=1e-5
+    )
+    assert 0.4 < sweep.intensity.max() <= 1 and set(sweep.lidar) == {0, 1}
+    # The file's first row, carried back by the 6 m/s and 2.7 ms since the stamp, by hand:
+    # the vehicle was 1.6 mm farther back then, so that the point was 1.6 mm farther ahead ...
+    step_m = np.linalg.norm((inverse(sequence.T_world_lidar(0)) @ sequence.T_world_lidar(1))[:3, 3])
+    late_s = sweep.offset_ns[0] * 1e-9
+    moved_m = step_m / 0.100196 * late_s
+    away_m = np.linalg.norm(sweep.points[0] - [-1.537109375, 3.060546875, -0.322509765625])
+    assert away_m == pytest.approx(moved_m, rel=0.5)
+
+
+def test_real_rings_are_sharp_as_fired(test_data):
+    sequence = open_sequence(test_data / REAL)
+    sweep = sequence[0]
+    path = sorted((test_data / REAL / "sensors/lidar").iterdir())[0]
+    table = feather.read_table(path)
+    laser = table["laser_number"].to_numpy()
+    stored = np.stack([table[axis].to_numpy().astype(float) for axis in "xyz"], axis=1)
+    back = sequence._track.compensated(sweep.points, sweep.stamp_ns, sweep.offset_ns)
+    np.testing.assert_allclose(back, stored, atol=1e-9)
+    T_scanner_ego = inverse(sequence._T_ego_sensor["up_lidar"])
+
+    def spread_deg(points):
+        x, y, z = transform(T_scanner_ego, points).T
+        elevation_deg = np.degrees(np.arctan2(z, np.hypot(x, y)))
+        far = np.hypot(x, y) > 10
+        rings = [elevation_deg[far & (laser == ring)] for ring in range(32)]
+        return np.median([np.median(np.abs(r - np.median(r))) for r in rings if len(r)])
+
+    assert spread_deg(stored) > 0.03
+    assert spread_deg(sweep.points) < 0.003
