@@ -54,9 +54,10 @@ def check_cameras(
     T_lidar_ego: np.ndarray | None = None,
     stamp_ns: int = 1,
     same_pixels: bool = True,
+    place_m: float = 1e-6,
 ) -> None:
-    """Calibration, exposure times (to ``stamp_ns``) and images; lossy formats need not have the
-    same pixels."""
+    """Calibration (the camera's place to ``place_m``), exposure times (to ``stamp_ns``) and images;
+    lossy formats need not have the same pixels."""
     street = excerpt.street
     T_ego = np.eye(4) if T_lidar_ego is None else T_lidar_ego
     assert set(sequence.cameras) == set(excerpt.cameras)
@@ -65,7 +66,7 @@ def check_cameras(
         assert (read.width_px, read.height_px) == (true.width_px, true.height_px)
         assert read.model == true.model
         np.testing.assert_allclose(read.K, true.K, atol=1e-6)
-        np.testing.assert_allclose(read.T_cam_lidar, true.T_cam_lidar @ T_ego, atol=1e-6)
+        np.testing.assert_allclose(read.T_cam_lidar, true.T_cam_lidar @ T_ego, atol=place_m)
         numbers, exposed_ns = excerpt.image_numbers(name), sequence.image_stamps_ns(name)
         assert list(exposed_ns) == list(range(len(numbers)))
         for number, image in enumerate(numbers):

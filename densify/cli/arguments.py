@@ -156,8 +156,8 @@ def _add_simulate(commands: Any) -> None:
     parser.add_argument(
         "--sensor",
         metavar="NAME",
-        help="the scanner: hdl64, hdl32, vlp16, os128, vls128, dual32, panda, rosette "
-        "(default: hdl64)",
+        help="the scanner: hdl64, hdl32, vlp16, os128, vls128, dual32, panda, pandaset, "
+        "rosette (default: hdl64)",
     )
     parser.add_argument(
         "--hz",

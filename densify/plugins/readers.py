@@ -67,6 +67,12 @@ READERS = Table(
             holds="an Argoverse 2 log (a folder that holds city_SE3_egovehicle.feather)",
             scenes=True,
         ),
+        Reader(
+            "pandaset",
+            "densify.readers.pandaset",
+            recognises=lambda path: (path / "lidar" / "poses.json").is_file(),
+            holds="a PandaSet sequence (a folder that holds lidar/poses.json)",
+        ),
     ),
     members=("open_recording", "recognises"),
     row_of=_row,

@@ -122,8 +122,7 @@ class FileSequence(ABC):
 
     def image(self, camera: str, number: int) -> NDArray[np.uint8]:
         """(H,W,3) RGB. Raises InputError for an unknown camera, a missing or unfit image."""
-        calibrated = camera_named(self.cameras, camera, self.where)
-        of_frame(self._exposed_ns.get(camera, {}), number, f"{camera} image", self.where)
+        calibrated = self.check_image(camera, number)
         path, data = self._encoded_image(camera, number)
         return decoded_image(data, calibrated, path)
 
@@ -137,6 +136,13 @@ class FileSequence(ABC):
         """Raises InputError, which names the frames that exist, for one that does not."""
         if frame not in self._frames:
             of_frame(dict.fromkeys(self.frames), frame, "sweep", self.where)
+
+    def check_image(self, camera: str, number: int) -> Camera:
+        """The camera. Raises InputError, which names those that exist, for a camera or an image
+        that does not."""
+        calibrated = camera_named(self.cameras, camera, self.where)
+        of_frame(self._exposed_ns.get(camera, {}), number, f"{camera} image", self.where)
+        return calibrated
 
 
 def chosen_scene(reader: str, path: Path, scene: str | None, names: Sequence[str]) -> str:
@@ -188,8 +194,11 @@ def quaternion_pose(w_x_y_z: Sequence[float], translation_m: Sequence[float], wh
     (it is made 1 exactly)."""
     from scipy.spatial.transform import Rotation
 
-    quaternion = np.asarray(w_x_y_z, np.float64)
-    translation = np.asarray(translation_m, np.float64)
+    try:
+        quaternion = np.asarray(w_x_y_z, np.float64)
+        translation = np.asarray(translation_m, np.float64)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{where}: {error}; expected numbers") from None
     if quaternion.shape != (4,) or translation.shape != (3,):
         raise InputError(
             f"{where}: got {quaternion.size} and {translation.size} numbers, expected a quaternion "

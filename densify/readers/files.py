@@ -5,9 +5,10 @@ frames exist when it is not there, and loading an image of the size its camera p
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -63,6 +64,14 @@ def read_text(path: Path) -> str:
         raise InputError(f"{path}: cannot be read: {reason}") from error
 
 
+def read_json(path: Path) -> Any:
+    """What a JSON file holds. Raises InputError if it is missing, unreadable or broken."""
+    try:
+        return json.loads(read_text(path))
+    except ValueError as error:
+        raise InputError(f"{path}: not a whole JSON file ({error}); fetch it again") from error
+
+
 def of_frame(entries: Mapping[int, T], frame: int, what: str, where: Path) -> T:
     """The entry of a frame, or an InputError that names the frames that exist.
 
@@ -98,13 +107,7 @@ def decoded_image(data: bytes, camera: Camera, where: Path) -> NDArray[np.uint8]
 
     Raises InputError, which names the place, if it is no whole image or not of the camera's size.
     """
-    import cv2
-
-    bgr = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR) if data else None
-    if bgr is None:
-        raise InputError(
-            f"{where}: not a complete image ({len(data)} bytes); expected a PNG or JPEG file"
-        )
+    bgr = _decoded(data, where)
     height, width = bgr.shape[:2]
     if (width, height) != (camera.width_px, camera.height_px):
         raise InputError(
@@ -112,3 +115,22 @@ def decoded_image(data: bytes, camera: Camera, where: Path) -> NDArray[np.uint8]
             f"{camera.width_px} x {camera.height_px}, as the calibration of {camera.name} says"
         )
     return np.ascontiguousarray(bgr[:, :, ::-1], dtype=np.uint8)
+
+
+def image_size_px(path: Path) -> tuple[int, int]:
+    """Width and height of an image file, for data sets that write them nowhere else. Raises
+    InputError if it is no whole image."""
+    height, width = _decoded(read_bytes(path), path).shape[:2]
+    return width, height
+
+
+def _decoded(data: bytes, where: Path) -> NDArray[Any]:
+    """(H,W,3) BGR."""
+    import cv2
+
+    bgr = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR) if data else None
+    if bgr is None:
+        raise InputError(
+            f"{where}: not a complete image ({len(data)} bytes); expected a PNG or JPEG file"
+        )
+    return bgr

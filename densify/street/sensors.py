@@ -114,6 +114,14 @@ SENSORS: dict[str, Sensor] = {
                 Scanner(Raster(60.0, 20.0, 1000, 400_000), 150.0, 0.02, (1.7, -0.2, -0.5)),
             ),
         ),
+        # the same two exactly as far apart as on PandaSet's vehicle
+        Sensor(
+            "pandaset",
+            (
+                Scanner(Spinning(_PANDAR64_DEG, 18000), 120.0, 0.02),
+                Scanner(Raster(60.0, 20.0, 1000, 400_000), 150.0, 0.02, (0.58, 0.027, -0.294)),
+            ),
+        ),
         # like Livox's: its prisms turn at 7294 and -4664 turns a minute
         Sensor("rosette", (Scanner(Rosette(70.0, (121.6, -77.7), 200_000), 120.0, 0.02),)),
     )

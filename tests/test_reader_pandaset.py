@@ -1,0 +1,303 @@
+# SPDX-License-Identifier: MIT
+"""The PandaSet reader on a street written as a sequence, on broken ones, on pickles that want to
+run something, and on a real sequence."""
+
+from __future__ import annotations
+
+import gzip
+import json
+import pickle
+import shutil
+
+import numpy as np
+import pytest
+
+from densify.errors import InputError
+from densify.geometry.poses import inverse, transform
+from densify.geometry.rings import find_rings
+from densify.readers import open_sequence
+from densify.readers.pandaset import PANDAR_GT_M, T_POSE_LIDAR, PandaSet
+from densify.readers.pickled_frame import read_columns
+from densify.readers.street import Street
+from densify.writers import write_street
+from densify.writers.excerpt import Excerpt
+from tests.reader_checks import check_cameras, check_depth, check_sweeps, check_truth
+
+FRAMES, CAMERA = (59, 60, 61), "image_03"
+HALF_NS = 50_000_000
+
+
+@pytest.fixture(scope="module")
+def excerpt():
+    return Excerpt.of(Street("street", 0, "vlp16", cameras=(CAMERA,)), FRAMES, None)
+
+
+@pytest.fixture(scope="module")
+def written(excerpt, tmp_path_factory):
+    return write_street("pandaset", excerpt.street, tmp_path_factory.mktemp("pandaset"), FRAMES)
+
+
+@pytest.fixture
+def broken(written, tmp_path):
+    """A copy to be damaged."""
+    return shutil.copytree(written, tmp_path / "002", ignore=shutil.ignore_patterns("truth"))
+
+
+def test_the_street_is_given_back(written, excerpt):
+    sequence = open_sequence(written)
+    assert isinstance(sequence, PandaSet)
+    # seconds as float64 are good to 0.5 µs, in which the vehicle goes 7 µm
+    check_sweeps(sequence, excerpt, HALF_NS, point_m=1e-5, offset_ns=500)
+    check_cameras(sequence, excerpt, same_pixels=False, place_m=0.005)  # turns between poses
+    check_truth(sequence, excerpt)
+    T_lidar_cam = inverse(excerpt.street.cameras[CAMERA].T_cam_lidar)
+    exposed_ns = sequence.image_stamps_ns(CAMERA)[1]
+    expected = excerpt.street.simulator.T_world_lidar_at(exposed_ns) @ T_lidar_cam
+    np.testing.assert_allclose(sequence.T_world_cam(CAMERA, 1), expected, atol=1e-9)
+
+
+def test_depth_is_that_of_the_street(written, excerpt):
+    check_depth(open_sequence(written), excerpt, worse=0.1)  # seen from the sweep's end
+
+
+def test_both_scanners_stand_where_they_do(tmp_path):
+    street = Street("static", 0, "pandaset", cameras=())
+    sequence = PandaSet(write_street("pandaset", street, tmp_path, [60, 61]))
+    check_sweeps(sequence, Excerpt.of(street, [60, 61], []), HALF_NS, point_m=1e-5, offset_ns=500)
+    np.testing.assert_array_equal(sequence[0].scanner_origins, street[60].scanner_origins)
+
+
+def test_what_the_format_cannot_hold_is_refused(tmp_path):
+    for spec, frames in (
+        ("street?sensor=panda", [60, 61]),
+        ("street?sensor=dual32", [60, 61]),
+        ("street?cameras=fisheye", [60, 61]),
+        ("street", [60]),
+    ):
+        with pytest.raises(InputError, match="cannot be written as PandaSet"):
+            write_street("pandaset", Street.from_spec(spec), tmp_path / "out", frames)
+    assert not (tmp_path / "out").exists()
+
+
+# Damage
+
+
+def edit(path, change):
+    """Change what a JSON file holds."""
+    content = json.loads(path.read_text())
+    change(content)
+    path.write_text(json.dumps(content))
+
+
+def cut(path):
+    path.write_bytes(path.read_bytes()[:-40])
+
+
+def swapped(old, new):
+    """Replace bytes inside a gzipped file."""
+    return lambda p: p.write_bytes(gzip.compress(gzip.decompress(p.read_bytes()).replace(old, new)))
+
+
+LIDAR, CAMERA_FOLDER = "lidar/", f"camera/{CAMERA}/"
+TABLES = {
+    "poses missing": (LIDAR + "poses.json", lambda p: p.unlink(), "cannot be read"),
+    "poses truncated": (LIDAR + "poses.json", cut, "not a whole JSON file"),
+    "fewer poses than sweeps": (LIDAR + "poses.json", lambda p: edit(p, list.pop), "got 2 entries"),
+    "poses of something else": (
+        LIDAR + "poses.json",
+        lambda p: p.write_text("{}"),
+        "got 0 entries",
+    ),
+    "quaternion absent": (
+        LIDAR + "poses.json",
+        lambda p: edit(p, lambda c: c[1].pop("heading")),
+        "entry 1: no 'heading'",
+    ),
+    "quaternion not of unit length": (
+        LIDAR + "poses.json",
+        lambda p: edit(p, lambda c: c[2]["heading"].update(w=3.0)),
+        "entry 2: got a quaternion of length",
+    ),
+    "pose not a number": (
+        LIDAR + "poses.json",
+        lambda p: edit(p, lambda c: c[0]["position"].update(x=float("nan"))),
+        "entry 0: .* unit quaternion",
+    ),
+    "stamps missing": (LIDAR + "timestamps.json", lambda p: p.unlink(), "cannot be read"),
+    "stamps as text": (
+        LIDAR + "timestamps.json",
+        lambda p: p.write_text('["now"]'),
+        "expected a list of seconds",
+    ),
+    "stamps that go back": (
+        LIDAR + "timestamps.json",
+        lambda p: edit(p, list.reverse),
+        "stamps that ascend",
+    ),
+    "no sweeps": (LIDAR, lambda p: [f.unlink() for f in p.glob("*.gz")], "no sweeps"),
+    "no lidar": (LIDAR, shutil.rmtree, "no PandaSet sequence"),
+    "intrinsics missing": (CAMERA_FOLDER + "intrinsics.json", lambda p: p.unlink(), "cannot be"),
+    "focal length 0": (
+        CAMERA_FOLDER + "intrinsics.json",
+        lambda p: edit(p, lambda c: c.update(fx=0)),
+        "got fx 0",
+    ),
+    "focal length absent": (
+        CAMERA_FOLDER + "intrinsics.json",
+        lambda p: edit(p, lambda c: c.pop("fy")),
+        "'fy'; expected fx fy cx cy",
+    ),
+    "fewer image stamps than images": (
+        CAMERA_FOLDER + "timestamps.json",
+        lambda p: edit(p, list.pop),
+        "got 2 entries",
+    ),
+    "first image damaged": (CAMERA_FOLDER + "00.jpg", lambda p: p.write_bytes(b"x"), "complete"),
+}
+SWEEP, IMAGE = LIDAR + "01.pkl.gz", CAMERA_FOLDER + "01.jpg"
+FILES = {
+    "sweep truncated": (SWEEP, cut, "not a gzipped pandas data frame"),
+    "sweep empty": (SWEEP, lambda p: p.write_bytes(b""), "not a gzipped pandas data frame"),
+    "sweep without t": (SWEEP, swapped(b"X\1\0\0\0t", b"X\1\0\0\0q"), "no column t"),
+    "another pickle": (
+        SWEEP,
+        lambda p: p.write_bytes(gzip.compress(pickle.dumps([1, 2]))),
+        "it holds a list",
+    ),
+    "times of another clock": (SWEEP, swapped(b"\x41", b"\x40"), "within a second"),
+    "image truncated": (IMAGE, lambda p: p.write_bytes(b""), "not a complete image"),
+    "image of another size": (
+        IMAGE,
+        lambda p: __import__("cv2").imwrite(str(p), np.zeros((4, 6, 3), np.uint8)),
+        "6 x 4 px; expected 1242 x 375",
+    ),
+}
+
+
+@pytest.mark.parametrize("damage", TABLES)
+def test_damaged_sequences_are_refused_in_a_line(broken, damage):
+    name, harm, says = TABLES[damage]
+    harm(broken / name)
+    with pytest.raises(InputError, match=says) as error:
+        open_sequence(f"pandaset:{broken}")
+    assert "\n" not in str(error.value) and str(broken) in str(error.value)
+
+
+@pytest.mark.parametrize("damage", FILES)
+def test_damaged_sweeps_and_images_are_refused_in_a_line(broken, damage):
+    name, harm, says = FILES[damage]
+    harm(broken / name)
+    sequence = PandaSet(broken)
+    with pytest.raises(InputError, match=says) as error:
+        sequence[1]
+        sequence.image(CAMERA, 1)
+    assert "\n" not in str(error.value) and str(broken) in str(error.value)
+
+
+# Pickles that want to run something
+
+
+class Runs:
+    def __init__(self, path):
+        self.path = path
+
+    def __reduce__(self):
+        return open, (str(self.path), "w")
+
+
+def test_a_pickle_runs_nothing(tmp_path):
+    trace, path = tmp_path / "trace", tmp_path / "00.pkl.gz"
+    evil = (
+        pickle.dumps(Runs(trace)),
+        f"cos\nsystem\n(S'touch {trace}'\ntR.".encode(),
+        f"cbuiltins\nexec\n(Vopen({str(trace)!r}, 'w')\ntR.".encode(),
+        f"(S'touch {trace}'\nios\nsystem\n.".encode(),  # the old INST opcode
+        # by a name inside one that is allowed
+        f"\x80\x04\x8c\x06pandas\x8c\x17core.frame.os.system\x93(V{trace}\ntR.".encode("latin-1"),
+        b"\x80\x04\x8c\x0epandas.core.frame\x8c\x09DataFrame\x93\x82\x01.",  # an extension code
+        b"cpandas.core.frame\nDataFrame\n)\x81}(X\x05\0\0\0_datacos\nsystem\nub.",  # inside one
+        b"cpandas.core.frame\nDataFrame\n}X\x05\0\0\0__new__cbuiltins\nslice\nsb.",
+    )
+    for data in evil:
+        path.write_bytes(gzip.compress(data))
+        with pytest.raises(InputError, match="nothing in it was run") as error:
+            read_columns(path)
+        assert "\n" not in str(error.value)
+    assert not trace.exists()
+
+
+def test_columns_are_those_of_the_frame(written):
+    columns = read_columns(written / "lidar" / "00.pkl.gz")
+    assert list(columns) == ["x", "y", "z", "i", "t", "d"]
+    assert columns["d"].dtype == np.int64 and columns["t"].dtype == np.float64
+
+
+# A real sequence
+
+
+def test_a_real_sequence(test_data):
+    path = test_data / "pandaset/002"
+    sequence = open_sequence(path)
+    assert list(sequence.frames) == list(range(10, 25))
+    assert list(sequence.image_stamps_ns("left_camera")) == list(range(9, 26))
+    assert sequence.stamp_ns(10) == 1_557_539_957_500_393_000
+    assert sequence.image_stamps_ns("front_camera")[10] == 1_557_539_957_450_529_000
+    front = sequence.cameras["front_camera"]
+    assert (front.width_px, front.height_px, front.K[0, 0]) == (1920, 1080, 1970.0131)
+    # it hangs 9 cm before the scanner and 5 cm below it, and looks ahead
+    np.testing.assert_allclose(inverse(front.T_cam_lidar)[:3, 3], [0.08, 0, -0.05], atol=0.02)
+    np.testing.assert_allclose(inverse(front.T_cam_lidar)[:3, 2], [1, 0, 0], atol=0.03)
+    sweep, columns = sequence[24], read_columns(path / "lidar/24.pkl.gz")
+    assert len(sweep) == 167_214 and np.bincount(sweep.lidar).tolist() == [106_021, 61_193]
+    np.testing.assert_allclose(sweep.intensity * 255, columns["i"], atol=1e-4)
+    since_s = columns["t"] - 1557539958.900671
+    np.testing.assert_allclose(sweep.offset_ns, since_s * 1e9, atol=500)
+    # at the end of the sweep the points are where the file has them: the poses are those of the
+    # file, the vehicle does not turn, and at 0.35 m/s it goes 3.5 mm in a hundredth of a second
+    late = np.abs(sweep.offset_ns) < 10_000_000
+    world = transform(sequence.T_world_lidar(24), sweep.points)
+    stored = np.stack([columns[axis] for axis in "xyz"], axis=1)
+    np.testing.assert_allclose(world[late], stored[late], atol=0.0045)
+    assert 0.01 < np.linalg.norm(world - stored, axis=1).max() < 0.06
+    pose = json.loads((path / "lidar/poses.json").read_text())[24]["position"]
+    T_world_pose = sequence.T_world_lidar(24) @ inverse(T_POSE_LIDAR)
+    np.testing.assert_allclose(T_world_pose[:3, 3], [pose[axis] for axis in "xyz"], atol=1e-9)
+
+
+@pytest.mark.parametrize("frame", [10, 24])
+def test_real_rings_are_sharp_from_where_the_scanner_stands(test_data, frame):
+    sweep = open_sequence(test_data / "pandaset/002")[frame]
+    turning = sweep.points[sweep.lidar == 0]
+    x, y, z = turning[np.linalg.norm(turning, axis=1) > 4].T
+    elevation = np.arctan2(z, np.hypot(x, y)).astype(np.float32)
+    rings_deg = np.degrees(find_rings(elevation))
+    assert len(rings_deg) == 64
+    # as the maker states: a sixth of a degree apart in the middle, 6 degrees at the lower end
+    assert rings_deg[1] - rings_deg[0] == pytest.approx(6, abs=0.2)
+    np.testing.assert_allclose(
+        np.diff(rings_deg[(rings_deg > -5) & (rings_deg < 1.9)]), 1 / 6, atol=0.03
+    )
+    moved = np.arctan2(z + 0.05, np.hypot(x + 0.05, y)).astype(np.float32)
+    assert find_rings(moved) is None or len(find_rings(moved)) < 64
+
+
+def test_the_solid_state_scanners_lines_are_smooth_from_where_it_stands(test_data):
+    """Points of one mirror swing, fitted by a parabola: any other place bends them more."""
+    sweep = open_sequence(test_data / "pandaset/002")[17]
+    mine = np.flatnonzero(sweep.lidar == 1)
+    swings = np.split(mine, np.flatnonzero(np.diff(sweep.offset_ns[mine])) + 1)
+
+    def bend_deg(origin_m):
+        found = []
+        for rows in swings[260:400:3]:  # of one laser each
+            x, y, z = (sweep.points[rows] - origin_m).T
+            azimuth, elevation = np.arctan2(y, x), np.arctan2(z, np.hypot(x, y))
+            for part in (azimuth < 0.0, azimuth > 0.16):
+                if part.sum() > 20:
+                    fit = np.polyfit(azimuth[part], elevation[part], 2)
+                    found.append(np.abs(np.polyval(fit, azimuth[part]) - elevation[part]))
+        return np.degrees(np.concatenate(found).mean())
+
+    here = bend_deg(PANDAR_GT_M)
+    for away in np.vstack([np.eye(3), -np.eye(3)]) * 0.25:
+        assert bend_deg(PANDAR_GT_M + away) > 1.05 * here
