@@ -102,7 +102,6 @@ def check_depth(sequence: LidarSequence, excerpt: Excerpt, worse: float = 0.03) 
         poses_given = {"register": {"source": "dataset"}}
         result = densify.run(recording, key, 1, cameras=[camera], config=poses_given)
         depth_m, true_m = result.depth[camera].depth_m, recording.truth.depth_m(camera, key)
-        assert result.cloud.moving.any()
         focal_px = recording.cameras[camera].focal_px
         scores.append(depth_errors(depth_m, true_m, focal_px=focal_px))
     read, true = scores

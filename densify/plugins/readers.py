@@ -68,6 +68,15 @@ READERS = Table(
             scenes=True,
         ),
         Reader(
+            "nuscenes",
+            "densify.readers.nuscenes",
+            recognises=lambda path: (
+                (path / "sample_data.json").is_file() or any(path.glob("v*/sample_data.json"))
+            ),
+            holds="nuScenes (a folder that holds v1.0-*/sample_data.json)",
+            scenes=True,
+        ),
+        Reader(
             "pandaset",
             "densify.readers.pandaset",
             recognises=lambda path: (path / "lidar" / "poses.json").is_file(),

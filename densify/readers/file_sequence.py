@@ -188,7 +188,9 @@ def rigid(T: Float, where: str) -> Float:
     return np.vstack([T[:3], [0.0, 0.0, 0.0, 1.0]])
 
 
-def quaternion_pose(w_x_y_z: Sequence[float], translation_m: Sequence[float], where: str) -> Float:
+def quaternion_pose(
+    w_x_y_z: Sequence[float] | Float, translation_m: Sequence[float] | Float, where: str
+) -> Float:
     """(4,4) of a unit quaternion and a translation. Raises InputError, which starts with ``where``,
     unless there are four and three finite numbers and the quaternion's length is 1 to a hundredth
     (it is made 1 exactly)."""

@@ -20,6 +20,7 @@ from densify.writers.excerpt import Excerpt
 FORMATS = {
     "kitti": "densify.writers.kitti_raw",
     "argoverse2": "densify.writers.argoverse2",
+    "nuscenes": "densify.writers.nuscenes",
     "pandaset": "densify.writers.pandaset",
 }
 """Name in ``densify simulate --format`` -> module."""

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -108,13 +108,19 @@ class Excerpt:
         return T_world_lidar if T_lidar_ego is None else T_world_lidar @ T_lidar_ego
 
     def write_truth(
-        self, folder: Path, stamp_ns: Sequence[int], T_lidar_ego: Float | None = None
+        self,
+        folder: Path,
+        stamp_ns: Sequence[int],
+        T_lidar_ego: Float | None = None,
+        row_of: Mapping[int, Int] | None = None,
     ) -> None:
         """Exact truth as `densify.readers.truth_files` lays it out, for readers that number the
         sweeps and each camera's images from 0.
 
         stamp_ns: the reference time that the format gives each sweep. T_lidar_ego: (4,4) the frame
-        in which the format has the points, the scanner's if None.
+        in which the format has the points, the scanner's if None. row_of: by frame the (N,) rows of
+        the returns in the format's file, where it sorts or pads them; rows of none are the world's
+        origin.
         """
         simulator = self.street.simulator
         bodies = simulator.bodies_at(stamp_ns)
@@ -126,7 +132,12 @@ class Excerpt:
         for number, frame in enumerate(self.frames):
             returns = self.returns(frame)
             in_bodies = simulator.in_bodies(frame, returns)
-            write_points(folder, number, returns.body, returns.instance, in_bodies)
+            rows = np.arange(len(in_bodies)) if row_of is None else row_of[frame]
+            num_rows = int(rows.max(initial=-1)) + 1
+            body, instance = np.zeros(num_rows, np.int32), np.full(num_rows, -1, np.int32)
+            points = np.zeros((num_rows, 3))
+            body[rows], instance[rows], points[rows] = returns.body, returns.instance, in_bodies
+            write_points(folder, number, body, instance, points)
         truth = self.street.truth
         for camera in self.cameras:
             for number, image in enumerate(self.image_numbers(camera)):

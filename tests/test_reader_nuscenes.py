@@ -1,0 +1,267 @@
+# SPDX-License-Identifier: MIT
+"""The nuScenes reader on a street written as a tree, on broken trees, and on a real key frame."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import tracemalloc
+
+import numpy as np
+import pytest
+
+from densify.errors import InputError
+from densify.geometry.poses import inverse
+from densify.readers import open_sequence
+from densify.readers.json_tables import find_records
+from densify.readers.nuscenes import NuScenes
+from densify.readers.street import Street
+from densify.writers import write_street
+from densify.writers.excerpt import Excerpt
+from densify.writers.nuscenes import T_LIDAR_POINTS, last_column_ns
+from tests.reader_checks import check_cameras, check_depth, check_truth
+
+FRAMES, CAMERA = (119, 120, 121), "image_02"
+VERSION = "v1.0-mini"
+
+
+@pytest.fixture(scope="module")
+def excerpt():
+    return Excerpt.of(Street("street", 0, "hdl32", hz=20, cameras=(CAMERA,)), FRAMES, None)
+
+
+@pytest.fixture(scope="module")
+def tree(excerpt, tmp_path_factory):
+    return write_street("nuscenes", excerpt.street, tmp_path_factory.mktemp("nuscenes"), FRAMES)
+
+
+@pytest.fixture
+def broken(tree, tmp_path):
+    """A copy to be damaged."""
+    return shutil.copytree(tree, tmp_path / "tree", ignore=shutil.ignore_patterns("truth"))
+
+
+def file_order(excerpt, frame):
+    """Which of the street's returns each row of the file is: by columns, from the lowest ring."""
+    returns = excerpt.returns(frame)
+    fired_ns = np.arange(1084 * 32) * 50_000_000 // (1084 * 32) - 25_000_000
+    column = np.searchsorted(fired_ns, returns.offset_ns) // 32
+    return np.lexsort((excerpt.rings(returns), column))
+
+
+def test_the_street_is_given_back(tree, excerpt):
+    sequence = open_sequence(tree)
+    assert isinstance(sequence, NuScenes) and sequence.name == "scene-0001"
+    late_ns = last_column_ns(excerpt, FRAMES[0]) - excerpt.street.stamp_ns(FRAMES[0])
+    for number, frame in enumerate(FRAMES):  # all in the file's order
+        order = file_order(excerpt, frame)
+        read, true = sequence[number], excerpt.street[frame]
+        points = true.points[order] @ T_LIDAR_POINTS[:3, :3]
+        np.testing.assert_allclose(read.points, points, atol=0.003)
+        # 46.08 us a column instead of 50 ms / 1084, and one time for a column
+        np.testing.assert_allclose(
+            read.offset_ns + late_ns, true.offset_ns[order], atol=46_130 + 1084 * 46
+        )
+        np.testing.assert_allclose(read.intensity, true.intensity[order], atol=1 / 255)
+    check_cameras(sequence, excerpt, T_LIDAR_POINTS, stamp_ns=1000, same_pixels=False)
+    check_truth(sequence, excerpt)
+    steps = [
+        inverse(s.T_world_lidar(a)) @ s.T_world_lidar(b)
+        for s, a, b in ((sequence, 0, 2), (excerpt.street, FRAMES[0], FRAMES[2]))
+    ]
+    assert abs(np.linalg.norm(steps[0][:3, 3]) - np.linalg.norm(steps[1][:3, 3])) < 0.01
+
+
+def test_a_pose_for_each_image(tree, excerpt):
+    sequence = open_sequence(tree)
+    exposed_ns = excerpt.street.image_stamps_ns(CAMERA)
+    for number, image in enumerate(excerpt.image_numbers(CAMERA)):
+        T_world_lidar = excerpt.street.simulator.T_world_lidar_at(exposed_ns[image])
+        expected = T_world_lidar @ inverse(excerpt.street.cameras[CAMERA].T_cam_lidar)
+        np.testing.assert_allclose(sequence.T_world_cam(CAMERA, number), expected, atol=1e-6)
+
+
+def test_depth_is_that_of_the_street(tree, excerpt):
+    check_depth(open_sequence(tree), excerpt)
+
+
+def test_scenes_are_named(tree):
+    assert open_sequence(f"nuscenes:{tree}#scene-0001").name == "scene-0001"
+    assert open_sequence(tree / VERSION).name == "scene-0001"
+    with pytest.raises(InputError, match=r"no recording scene-0002; .* one of scene-0001"):
+        open_sequence(f"nuscenes:{tree}#scene-0002")
+
+
+def test_tables_that_do_not_matter_may_be_missing(broken):
+    whole = open_sequence(broken)[1]
+    for name in ("category", "attribute", "visibility", "instance", "map", "sample_annotation"):
+        (broken / VERSION / f"{name}.json").unlink()
+    edit(broken, "sample_data", lambda r: [r.pop("prev"), r.pop("next")])
+    np.testing.assert_array_equal(open_sequence(broken)[1].points, whole.points)
+
+
+def test_what_is_not_on_the_disk_leaves_a_gap(broken):
+    sweeps = sorted(broken.glob("s*/LIDAR_TOP/*"), key=lambda p: p.name)
+    sweeps[1].unlink()
+    sorted(broken.glob("s*/image_02/*"), key=lambda p: p.name)[0].unlink()
+    sequence = open_sequence(broken)
+    assert list(sequence.frames) == [0, 2]
+    assert list(sequence.image_stamps_ns(CAMERA)) == [1, 2]
+    with pytest.raises(InputError, match="frames that exist: 0, 2"):
+        sequence[1]
+
+
+def test_of_millions_of_records_few_are_parsed(tmp_path):
+    record = '{"token": "%d", "sample_token": "s%d", "filename": "x"}'
+    lines = ",\n".join(record % (i, i // 10) for i in range(50_000))
+    (tmp_path / "sample_data.json").write_text(f"[\n{lines}\n]\n")
+    tracemalloc.start()
+    found = find_records(tmp_path / "sample_data.json", "sample_token", {"s7", "s4999"})
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert list(found) == [str(i) for i in (*range(70, 80), *range(49_990, 50_000))]
+    assert peak < 1_000_000
+
+
+def test_what_the_format_cannot_hold_is_refused(tmp_path):
+    for spec in ("street", "street?sensor=dual32", "street?sensor=hdl32&cameras=rolling"):
+        with pytest.raises(InputError, match="cannot be written as nuScenes"):
+            write_street("nuscenes", Street.from_spec(spec), tmp_path / "out", [60])
+    assert not (tmp_path / "out").exists()
+
+
+# Damage
+
+
+def edit(root, table, change):
+    path = root / VERSION / f"{table}.json"
+    records = json.loads(path.read_text())
+    for record in records:
+        change(record)
+    path.write_text(json.dumps(records))
+
+
+def sets(table, **values):
+    return lambda root: edit(root, table, lambda r: r.update(values))
+
+
+def cut(table, size=-40):
+    def harm(root):
+        path = root / VERSION / f"{table}.json"
+        path.write_bytes(path.read_bytes()[:size])
+
+    return harm
+
+
+def without(table):
+    return lambda root: (root / VERSION / f"{table}.json").unlink()
+
+
+def drops(table, key):
+    return lambda root: edit(root, table, lambda r: r.pop(key))
+
+
+def on_file(pattern, change):
+    def harm(root):
+        path = sorted(root.glob(pattern), key=lambda p: p.name)[0]
+        path.write_bytes(change(path.read_bytes()))
+
+    return harm
+
+
+def rings(data):
+    rows = np.frombuffer(data, "<f4").reshape(-1, 5).copy()
+    rows[:, 4] = 40
+    return rows.tobytes()
+
+
+TREES = {
+    "no tables": (lambda root: shutil.rmtree(root / VERSION), "no nuScenes tables"),
+    "scene missing": (without("scene"), "scene.json: no such table"),
+    "poses missing": (without("ego_pose"), "ego_pose.json: no such table"),
+    "sensors missing": (without("sensor"), "sensor.json: no such table"),
+    "broken JSON": (cut("calibrated_sensor"), "not a whole JSON table"),
+    "table cut off": (cut("sample_data"), "not a whole JSON table"),
+    "table empty": (cut("ego_pose", 0), "not a whole JSON table"),
+    "no list": (
+        lambda root: (root / VERSION / "sensor.json").write_text('{"token": "x"}'),
+        "got no list of records",
+    ),
+    "key absent": (drops("sample_data", "timestamp"), "no timestamp"),
+    "stamp as text": (sets("sample_data", timestamp="7"), "expected a whole number"),
+    "pose not a number": (sets("ego_pose", translation=[0, float("nan"), 0]), "3 finite numbers"),
+    "quaternion not of unit length": (sets("ego_pose", rotation=[1, 1, 0, 0]), "length 1.414"),
+    "quaternion too short": (sets("ego_pose", rotation=[1, 0, 0]), "4 finite numbers"),
+    "poses of others": (sets("ego_pose", token="x"), "got 0 poses"),
+    "sensor of another tree": (sets("sensor", token="x"), "its table does not have"),
+    "no focal length": (sets("calibrated_sensor", camera_intrinsic=[]), "3 x 3 finite"),
+    "no sweeps": (lambda root: [shutil.rmtree(p) for p in root.glob("s*/LIDAR_TOP")], "none of"),
+    "a scene without data": (sets("sample", scene_token="x"), "its 0 records"),
+}
+FILES = {
+    "sweep truncated": (on_file("s*/LIDAR_TOP/*", lambda d: d[:-7]), "a multiple of 20"),
+    "sweep empty": (on_file("s*/LIDAR_TOP/*", lambda d: b""), "holds no points"),
+    "no rings": (on_file("s*/LIDAR_TOP/*", rings), "from 0 to 31"),
+    "image truncated": (on_file("s*/image_02/*", lambda d: d[:99]), "not a complete image"),
+    "image of another size": (sets("sample_data", width=1240), "expected 1240 x 375"),
+}
+
+
+@pytest.mark.parametrize("damage", TREES)
+def test_damaged_trees_are_refused_in_a_line(broken, damage):
+    harm, says = TREES[damage]
+    harm(broken)
+    with pytest.raises(InputError, match=says) as error:
+        open_sequence(f"nuscenes:{broken}")
+    assert "\n" not in str(error.value) and str(broken) in str(error.value)
+
+
+@pytest.mark.parametrize("damage", FILES)
+def test_damaged_files_are_refused_in_a_line(broken, damage):
+    harm, says = FILES[damage]
+    harm(broken)
+    sequence = open_sequence(broken)
+    with pytest.raises(InputError, match=says) as error:
+        sequence[0]
+        sequence.image(CAMERA, 0)
+    assert "\n" not in str(error.value) and str(broken) in str(error.value)
+
+
+# A real key frame
+
+
+def test_a_real_key_frame(test_data):
+    sequence = open_sequence(test_data / "nuscenes")
+    assert sequence.name == "scene-0061" and list(sequence.frames) == [0]
+    assert len(sequence.cameras) == 6
+    sweep = sequence[0]
+    assert sweep.stamp_ns == 1_532_402_927_647_951_000
+    assert sweep.row[-1] == 34_687 and len(sweep) == 34_688 - 4_393  # without a return
+    assert (sweep.offset_ns.min(), sweep.offset_ns.max()) == (-1083 * 46_080, 0)
+    range_m = np.linalg.norm(sweep.points, axis=1)
+    assert range_m.min() > 0.2 and 3700 < (range_m < 1).sum() < 3800  # the roof
+    assert sequence.image_stamps_ns("CAM_FRONT")[0] == 1_532_402_927_612_460_000
+    assert sequence.image("CAM_FRONT", 0).shape == (900, 1600, 3)
+    # the scanner stands 0.94 m ahead of and 1.84 m above the rear axle, and looks to the right
+    T_world_ego = sequence._track.T_world_ego[-1]
+    T_ego_lidar = inverse(T_world_ego) @ sequence.T_world_lidar(0)
+    np.testing.assert_allclose(T_ego_lidar[:3, 3], [0.943713, 0, 1.84023], atol=1e-6)
+    assert T_ego_lidar[0, 1] > 0.999
+    # exposed 35.5 ms before the stamp, at 9.25 m/s
+    T_ego_cam = inverse(T_world_ego) @ sequence.T_world_cam("CAM_FRONT", 0)
+    assert T_ego_cam[0, 3] - 1.70079 == pytest.approx(-0.0355 * 9.25, abs=0.02)
+
+
+def test_real_rings_are_sharp_as_fired(test_data):
+    sweep = open_sequence(test_data / "nuscenes")[0]
+    path = next((test_data / "nuscenes/samples/LIDAR_TOP").iterdir())
+    rows = np.fromfile(path, "<f4").reshape(-1, 5)[sweep.row]
+
+    def spread_deg(points):
+        x, y, z = points.T
+        elevation_deg = np.degrees(np.arctan2(z, np.hypot(x, y)))
+        rings = [elevation_deg[(rows[:, 4] == r) & (np.hypot(x, y) > 5)] for r in range(32)]
+        return np.median([np.median(np.abs(r - np.median(r))) for r in rings if len(r) > 50])
+
+    assert spread_deg(rows[:, :3]) > 0.03
+    assert spread_deg(sweep.points) < 0.002
