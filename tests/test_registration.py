@@ -14,10 +14,10 @@ from densify.config import RegisterSettings
 from densify.errors import ComputationError
 from densify.geometry import poses
 from densify.readers.street import Street
-from densify.readers.window import read_sweep
+from densify.readers.window import read_sweep, recorded_trajectory
 from densify.registration import odometry, trajectory
 from densify.registration.deskew import deskew
-from densify.registration.odometry import check_plausible, register
+from densify.registration.odometry import check_overlap, check_plausible, register
 from densify.types import Trajectory
 from tests.scenes import SWEEP_S, Arc, Box, Scanner, Scene, World, street
 
@@ -364,6 +364,22 @@ def moved(trajectory: Trajectory, index: int, twist) -> Trajectory:
     T = trajectory.T_world_lidar.copy()
     T[index:] = T[index] @ poses.exp(np.array(twist, float)) @ poses.inverse(T[index]) @ T[index:]
     return replace(trajectory, T_world_lidar=T)
+
+
+def test_a_pattern_that_does_not_repeat_lies_on_several_sweeps_before() -> None:
+    street, frames = Street("street", 0, "rosette"), range(100, 105)
+    raw = [read_sweep(street, f, SETTINGS) for f in frames]
+    true = recorded_trajectory(street, raw)
+    sweeps = [s.sweep for s in deskew(raw, true).sweeps]
+    check_overlap(sweeps, true, SETTINGS)
+    with pytest.raises(ComputationError, match=r"frame 10[0-3] to 10"):  # one is too few
+        for a in range(4):
+            check_overlap(sweeps[a : a + 2], true.part(true.frames[a : a + 2]), SETTINGS)
+    for twist in ([0, 0, 0, 3, 0, 0], [0, 0, 0, 0, 1.5, 0]):
+        with pytest.raises(ComputationError, match=r"to 10[1-3]: only .* sweeps before"):
+            check_overlap(sweeps, moved(true, 3, twist), SETTINGS)
+        with pytest.raises(ComputationError, match="from frame 100 to 101: only"):
+            check_overlap(sweeps, moved(true, 1, twist), SETTINGS)
 
 
 def test_a_true_drive_is_plausible(drive):

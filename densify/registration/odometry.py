@@ -6,6 +6,7 @@ Vizzo et al., "KISS-ICP: In Defense of Point-to-Point ICP", RA-L 2023.
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Sequence
 from itertools import pairwise
 
@@ -30,6 +31,7 @@ _SEARCH_RAYS_RAD = (
 _STANDING_M = 0.4
 _OVERLAP_POINTS = 2000
 _OVERLAP_M = 0.5
+_OVERLAP_NS = 350_000_000  # within it a pattern that does not repeat fills its view
 # Change of a sweep's pose (rad and m) below which it counts as found. The first pass only has to
 # find the motion within a sweep: 3 mm over 0.1 s bend its ends by 1.5 mm.
 _ROUGHLY_CONVERGED = 3e-3
@@ -208,27 +210,52 @@ def check_plausible(trajectory: Trajectory, settings: RegisterSettings) -> None:
 def check_overlap(
     sweeps: Sequence[Sweep], trajectory: Trajectory, settings: RegisterSettings
 ) -> None:
-    """Raise SweepError where a sweep does not lie on the one before it: odometry may glide
-    on at the expected speed over sweeps that have nothing to do with each other. Sweeps too sparse
-    to tell are passed over."""
-    world = [
-        poses.transform(T, _standing(s.points))
-        for s, T in zip(sweeps, trajectory.T_world_lidar, strict=True)
-    ]
-    for (a, b), (earlier, later) in zip(pairwise(trajectory.frames), pairwise(world), strict=True):
-        if min(len(earlier), len(later)) < _OVERLAP_POINTS // 10:
-            continue
-        sample = later[:: len(later) // _OVERLAP_POINTS + 1]
-        distance, _ = _tree(earlier).query(sample, distance_upper_bound=_OVERLAP_M)
-        overlap = float(np.isfinite(distance).mean())
-        if overlap < settings.min_overlap:
-            raise SweepError(
-                f"registration fails from frame {a} to {b}: only {100 * overlap:.1f} % of what "
-                f"stands there lies on the sweep before, expected at least "
-                f"{100 * settings.min_overlap:.1f} %; {_cure(settings)}, or lower "
-                f"register.min_overlap",
-                b,
+    """Raise SweepError where a sweep does not lie on those of the last third of a second: odometry
+    may glide on at the expected speed over sweeps that have nothing to do with each other. The one
+    sweep before would do for rings, but not for a pattern that does not repeat; where less than a
+    third of a second was before, the next third must lie there both ways. Sweeps too sparse to tell
+    are passed over."""
+    frames, stamp_ns = trajectory.frames, trajectory.stamp_ns
+
+    def standing(i: int) -> Float:
+        return poses.transform(trajectory.T_world_lidar[i], _standing(sweeps[i].points))
+
+    before: deque[tuple[int, cKDTree]] = deque()
+    for i in range(len(sweeps)):
+        points = standing(i)
+        while len(before) > 1 and stamp_ns[i] - before[0][0] > _OVERLAP_NS:
+            before.popleft()
+        trees = [tree for _, tree in before]
+        share = _share_on(points, trees)
+        if share < settings.min_overlap and stamp_ns[i] - stamp_ns[0] < _OVERLAP_NS:
+            end = np.searchsorted(stamp_ns, stamp_ns[i] + _OVERLAP_NS)
+            after = [_tree(standing(j)) for j in range(i + 1, int(end))]
+            own = _tree(points)
+            both_ways = min(
+                _share_on(points, trees + after), _share_on(standing(i - 1), [own, *after])
             )
+            share = max(share, both_ways)
+        if share < settings.min_overlap:
+            raise SweepError(
+                f"registration fails from frame {frames[i - 1]} to {frames[i]}: only "
+                f"{100 * share:.1f} % of what stands there lies on the sweeps before, expected at "
+                f"least {100 * settings.min_overlap:.1f} %; {_cure(settings)}, or lower "
+                f"register.min_overlap",
+                frames[i],
+            )
+        before.append((int(stamp_ns[i]), _tree(points)))
+
+
+def _share_on(points: Float, trees: Sequence[cKDTree]) -> float:
+    """Of (N,3) points, those that lie on one of the sweeps; 1 where there are too few to tell."""
+    if min(len(points), sum(tree.n for tree in trees)) < _OVERLAP_POINTS // 10:
+        return 1.0
+    left = points[:: len(points) // _OVERLAP_POINTS + 1]
+    num = len(left)
+    for tree in trees:
+        distance, _ = tree.query(left, distance_upper_bound=_OVERLAP_M)
+        left = left[~np.isfinite(distance)]
+    return 1 - len(left) / num
 
 
 def _cure(settings: RegisterSettings) -> str:
