@@ -57,8 +57,9 @@ def bad_point_files(folder: Path) -> dict[str, Any]:
     (folder / "cut.bin").write_bytes(bytes(37))
     (folder / "garbage.npz").write_bytes(b"no zip")
     (folder / "empty.npy").write_bytes(b"")
-    (folder / "words.txt").write_text("x y z\n")
+    (folder / "words.txt").write_text("such a cloud\n1 2 3\n")
     (folder / "cloud.pcd").write_text("VERSION .7\n")
+    (folder / "cloud.stl").write_text("solid\n")
     return {
         "absent.npy": "no such file",
         "flat.npy": "shape (9,)",
@@ -76,7 +77,8 @@ def bad_point_files(folder: Path) -> dict[str, Any]:
         "garbage.npz": "not a readable .npz",
         "empty.npy": "not a readable .npy",
         "words.txt": "not a readable .txt",
-        "cloud.pcd": "got .pcd, expected one of .npy, .npz, .txt, .bin",
+        "cloud.pcd": "not a readable .pcd point file: the header ends before DATA",
+        "cloud.stl": "got .stl, expected one of .npy, .npz, .txt, .csv, .bin, .pcd, .ply, ",
     }
 
 

@@ -195,7 +195,7 @@ DOORS: dict[str, str | tuple[str, ...]] = {
     "embreex": "densify/street/world.py",
     "joblib": "densify/cache.py",
     "kiss_icp": "densify/registration/odometry.py",
-    "laspy": "densify/outputs/cloud_laz.py",
+    "laspy": ("densify/outputs/cloud_laz.py", "densify/readers/point_files.py"),
     "numba": "densify/kernels/",
     "torch": ("densify/flow/", "densify/dataset/loader.py"),
 }

@@ -4,28 +4,18 @@
 from __future__ import annotations
 
 import os
-import tokenize
-import warnings
-import zipfile
-import zlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.lib.npyio import NpzFile
 from numpy.typing import NDArray
 
 from densify.errors import InputError
+from densify.readers.point_files import read_table
 from densify.types import Float, FlowField, Int
 
-_SUFFIXES = (".npy", ".npz", ".txt", ".bin")
-_KITTI_ROW_BYTES = 16
-# What numpy raises on damaged files; a flipped bit can ask zipfile for a password (RuntimeError).
-_DAMAGE = (
-    *(OSError, ValueError, EOFError, RuntimeError),
-    *(zipfile.BadZipFile, zlib.error, tokenize.TokenError),
-)
+KITTI_COLUMNS = ("x", "y", "z", "reflectance")
 
 
 @dataclass(frozen=True)
@@ -39,38 +29,28 @@ class PointFile:
 
 
 def read_points(path: Path) -> PointFile:
-    """Every row of the file in its order.
+    """Every row of the file in its order: any format of `densify.readers.point_files`.
 
-    .npy: (N,3 or more columns); .npz: the same as array ``points``, and beside it where there is
-    ``offset_ns`` or ``time`` (seconds) and ``lidar``, (N,) each; .txt: columns; .bin: KITTI's
-    float32 x y z reflectance. Raises InputError if the file is missing, has another form, or holds
-    no point or one that is not finite (rows are not dropped: the flow lines up with them).
+    An .npz file may hold, beside ``points``, ``offset_ns`` or ``time`` (seconds) and ``lidar``,
+    (N,) each; a .bin file is KITTI's float32 x y z reflectance. Raises InputError if the file is
+    missing, has another form, or holds no point or one that is not finite (rows are not dropped:
+    the flow lines up with them).
     """
-    if not path.is_file():
-        raise InputError(f"{path}: no such file; expected a point file ({', '.join(_SUFFIXES)})")
-    if path.suffix not in _SUFFIXES:
-        raise InputError(
-            f"{path}: got {path.suffix or 'no suffix'}, expected one of {', '.join(_SUFFIXES)}"
-        )
-    try:
-        array, beside = _read_arrays(path)
-    except _DAMAGE as error:
-        reason = " ".join(str(error).split())
-        raise InputError(f"{path}: not a readable {path.suffix} point file: {reason}") from error
-    if array.size == 0:
-        raise InputError(f"{path}: holds no points, expected at least one")
-    if array.ndim != 2 or array.shape[1] < 3 or array.dtype.kind not in "fiu":
-        raise InputError(
-            f"{path}: got an array of shape {array.shape} and type {array.dtype}, expected numbers "
-            f"of shape (N,3) or more columns"
-        )
-    points = array[:, :3].astype(np.float64)
+    table = read_table(path, KITTI_COLUMNS if path.suffix == ".bin" else None)
+    for name in "xyz":
+        if name not in table.columns:
+            raise InputError(
+                f"{path}: no column {name}: got {', '.join(table.columns)}, expected x, y and z"
+            )
+    points = np.column_stack([table.columns[name].astype(np.float64) for name in "xyz"])
     bad = np.flatnonzero(~np.isfinite(points).all(axis=1))
     if len(bad):
         raise InputError(
             f"{path}: {len(bad)} of {len(points)} points are not finite, the first in row "
             f"{bad[0]}; remove them"
         )
+    names = ["offset_ns" if "offset_ns" in table.beside else "time", "lidar"]
+    beside = {name: table.beside[name] for name in names if name in table.beside}
     return PointFile(points, **_columns(path, beside, len(points)))
 
 
@@ -124,31 +104,3 @@ def _columns(path: Path, beside: dict[str, NDArray[Any]], num_points: int) -> di
         else:
             columns[name] = array.astype(np.int64)
     return columns
-
-
-def _read_arrays(path: Path) -> tuple[NDArray[Any], dict[str, NDArray[Any]]]:
-    """The points, and what an .npz file holds beside them; ``time`` only without ``offset_ns``."""
-    if path.suffix == ".txt":
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", UserWarning)  # an empty file is refused in our words
-            return np.loadtxt(path, ndmin=2), {}
-    if path.suffix == ".bin":
-        num_bytes = path.stat().st_size
-        if num_bytes % _KITTI_ROW_BYTES:
-            raise ValueError(
-                f"got {num_bytes} bytes, expected a multiple of {_KITTI_ROW_BYTES}; it is cut off"
-            )
-        return np.fromfile(path, np.float32).reshape(-1, 4), {}
-    loaded = np.load(path, allow_pickle=False)
-    if not isinstance(loaded, NpzFile):
-        if path.suffix == ".npz":
-            raise ValueError("holds a single array; name it .npy")
-        array: NDArray[Any] = loaded
-        return array, {}
-    with loaded as arrays:
-        if path.suffix == ".npy":
-            raise ValueError("holds an archive of arrays; name it .npz")
-        if "points" not in arrays:
-            raise ValueError(f"holds the arrays {', '.join(arrays)}, expected points")
-        names = ["offset_ns" if "offset_ns" in arrays else "time", "lidar"]
-        return arrays["points"], {name: arrays[name] for name in names if name in arrays}

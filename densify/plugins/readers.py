@@ -8,6 +8,8 @@ place, and the module says the rest: ``recognises(path)``, ``HOLDS`` and, if nee
 
 from __future__ import annotations
 
+import os
+import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,17 +17,21 @@ from types import ModuleType
 
 from densify.plugins.table import Table
 
+_SWEEP = re.compile(r".*\d.*\.(bin|pcd|ply|las|laz)", re.IGNORECASE)
+
 
 @dataclass(frozen=True)
 class Reader:
     """recognises: whether a place, which exists, holds such a recording; quick, from names alone.
-    holds: what is there, for messages. scenes: one place may hold several, named by ``#SCENE``."""
+    holds: what is there, for messages. scenes: one place may hold several, named by ``#SCENE``.
+    general: recognises so much that all others are asked first."""
 
     name: str
     module: str
     recognises: Callable[[Path], bool]
     holds: str
     scenes: bool = False
+    general: bool = False
 
     @property
     def usage(self) -> str:
@@ -48,6 +54,18 @@ def _is_argoverse2(path: Path) -> bool:
     return (path / "city_SE3_egovehicle.feather").is_file() or any(
         any(split.glob("*/city_SE3_egovehicle.feather")) for split in splits
     )
+
+
+def _holds_sweeps(path: Path) -> bool:
+    """Down to two folders below."""
+    if (path / "densify.yaml").is_file():
+        return True
+    for place, folders, files in os.walk(path):
+        if any(_SWEEP.fullmatch(name) for name in files):
+            return True
+        if len(Path(place).relative_to(path).parts) == 2:
+            folders.clear()
+    return False
 
 
 READERS = Table(
@@ -81,6 +99,13 @@ READERS = Table(
             "densify.readers.pandaset",
             recognises=lambda path: (path / "lidar" / "poses.json").is_file(),
             holds="a PandaSet sequence (a folder that holds lidar/poses.json)",
+        ),
+        Reader(
+            "folder",
+            "densify.readers.folder",
+            recognises=_holds_sweeps,
+            holds="a folder of numbered sweeps (000120.bin, .pcd, .ply, .las, .laz)",
+            general=True,
         ),
     ),
     members=("open_recording", "recognises"),

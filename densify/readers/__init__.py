@@ -98,8 +98,9 @@ def _reader_of(parsed: Spec, text: str) -> Reader:
             f"--data {text}: no such folder; expected a recording's folder, READER:PATH with "
             f"READER one of {', '.join(READERS.usages())}, or street[:PRESET]"
         )
-    for reader in READERS:
+    readers = sorted(READERS, key=lambda reader: reader.general)
+    for reader in readers:
         if reader.recognises(parsed.path):
             return reader
-    known = " or ".join(reader.holds for reader in READERS)
+    known = " or ".join(reader.holds for reader in readers)
     raise InputError(f"--data {text}: no known recording there; expected {known}")

@@ -9,11 +9,12 @@ import numpy as np
 
 from densify.errors import InputError
 from densify.readers.files import format_frames
-from densify.types import LidarSequence, Sweep
+from densify.types import LidarSequence, SaysWhatItFound, Sweep
 
 
 def describe(sequence: LidarSequence) -> str:
-    """Frames, rate, points, cameras, stamps, poses and truth of a recording, one line each.
+    """Frames, rate, points, cameras, stamps, poses and truth of a recording, one line each, and
+    what its reader had to find out.
 
     Loads the first and the last sweep and no image. Rates are those of the median time from one
     sweep or image to the next.
@@ -30,6 +31,7 @@ def describe(sequence: LidarSequence) -> str:
         *_cameras(sequence),
         ("poses", _poses(sequence)),
         ("truth", "none" if sequence.truth is None else "exact, simulated"),
+        *(sequence.findings() if isinstance(sequence, SaysWhatItFound) else ()),
     ]
     width = max(len(label) for label, _ in lines) + 2
     return "\n".join(f"{label:<{width}}{text}" for label, text in lines)

@@ -9,7 +9,13 @@ sweep's lidar), ``cam``.
 from densify.arrays import Bool, Float, Float32, Int
 from densify.types.depth import Camera, Cloud, DepthMap, Mover, Patches, Reason
 from densify.types.flow import FlowField, Motion, StretchFlow
-from densify.types.recordings import KnowsImagePoses, LidarSequence, SweepTruth, Truth
+from densify.types.recordings import (
+    KnowsImagePoses,
+    LidarSequence,
+    SaysWhatItFound,
+    SweepTruth,
+    Truth,
+)
 from densify.types.results import Progress, Result, StageCost
 from densify.types.sweeps import RegisteredSweep, Stretch, Sweep, Trajectory
 
@@ -31,6 +37,7 @@ __all__ = [
     "Reason",
     "RegisteredSweep",
     "Result",
+    "SaysWhatItFound",
     "StageCost",
     "Stretch",
     "StretchFlow",

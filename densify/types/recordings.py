@@ -91,6 +91,15 @@ class LidarSequence(Protocol):
 
 
 @runtime_checkable
+class SaysWhatItFound(Protocol):
+    """A sequence whose form had to be found out; a reader may have this member."""
+
+    def findings(self) -> Sequence[tuple[str, str]]:
+        """What was found out or assumed, for a person: short labels and texts."""
+        ...
+
+
+@runtime_checkable
 class KnowsImagePoses(Protocol):
     """A sequence that has a pose for each image; a reader may have this member."""
 

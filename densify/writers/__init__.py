@@ -19,6 +19,7 @@ from densify.writers.excerpt import Excerpt
 
 FORMATS = {
     "kitti": "densify.writers.kitti_raw",
+    "folder": "densify.writers.folder",
     "argoverse2": "densify.writers.argoverse2",
     "nuscenes": "densify.writers.nuscenes",
     "pandaset": "densify.writers.pandaset",

@@ -1,0 +1,214 @@
+# SPDX-License-Identifier: MIT
+"""Any folder of sweeps: numbered files of points, and beside them whatever there is of stamps,
+poses and images. What the files cannot say stands in a small ``densify.yaml`` in the folder
+(`densify.readers.folder_config`); a folder without one opens as far as can be told.
+
+points
+    in the lidar's frame, as fired. ``sweeps: {compensated: true}`` says that they were carried to
+    the stamp by the vehicle's motion; it is undone where points have times and poses have stamps,
+    else the times are left out. Intensity is brought to 0 to 1.
+numbers and stamps
+    files are numbered as their names say, or from 0 in the order of time where the names are times
+    (``1317042651.468569638.pcd``). Times come from names, from a file beside the sweeps such as
+    ``timestamps.txt``, or else from the rate.
+the stamp
+    is the reference time; points' times are since it (or absolute, on its clock) unless
+    ``reference`` says that it is the start, middle or end of the sweep. Their unit is the one in
+    which a sweep takes about a period.
+poses
+    KITTI's 3x4, 4x4, TUM, tables with quaternions, or the VIEWPOINT of .pcd files: T_world_lidar,
+    or those of a frame fixed to it (``T_frame_lidar``), or inverse. With stamps they are
+    interpolated to the sweeps' stamps; without, there is one for each sweep or for each number.
+images
+    need a calibration. Their stamps come from names, a file, or the sweeps of the same numbers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+
+from densify.errors import InputError
+from densify.geometry import poses
+from densify.readers.file_sequence import (
+    FileSequence,
+    Returns,
+    quaternion_pose,
+    truth_beside,
+)
+from densify.readers.files import format_frames, read_bytes
+from densify.readers.folder_config import CameraFiles, FolderConfig
+from densify.readers.folder_files import (
+    IMAGE_SUFFIXES,
+    Series,
+    find_images,
+    find_pose_file,
+    find_sweeps,
+    in_time,
+)
+from densify.readers.point_files import read_viewpoint
+from densify.readers.pose_files import PoseFile
+from densify.readers.pose_track import PoseTrack
+from densify.readers.sweep_columns import SweepColumns
+from densify.types import Float
+
+_NO_VIEWPOINT = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
+
+
+def open_recording(path: Path, scene: str | None) -> Folder:
+    """See `densify.readers.ReaderModule`; a folder has no scenes."""
+    return Folder(path)
+
+
+class Folder(FileSequence):
+    """A folder of sweeps as a `densify.types.LidarSequence`; `findings` says what was found."""
+
+    def __init__(self, path: Path | str) -> None:
+        """Reads names, densify.yaml, stamps and poses at once, sweeps and images on demand. Raises
+        InputError if there are no sweeps, or what is beside them is malformed or contradicts."""
+        folder = Path(path)
+        if not folder.is_dir():
+            raise InputError(f"{folder}: no such folder; expected one with numbered sweeps")
+        self._config = FolderConfig.read(folder)
+        known, cameras = self._config.sweeps, self._config.cameras
+        files = find_sweeps(folder, known.files)
+        self._sweeps = in_time(folder, files, known.stamps, known.stamps_unit)
+        self._columns = SweepColumns(self._sweeps, known, self._config.path)
+        self._images = {c.camera.name: _images(folder, c) for c in cameras}
+        super().__init__(
+            folder.resolve().name,
+            folder,
+            tuple(self._sweeps.paths),
+            {c.camera.name: c.camera for c in cameras},
+            truth=truth_beside(folder),
+        )
+        self._exposed_ns = {c.camera.name: self._exposures(c) for c in cameras}
+        self._poses = self._read_poses()
+
+    def stamp_ns(self, frame: int) -> int:
+        """Reference time of a sweep."""
+        self.check_frame(frame)
+        if self._sweeps.stamps_ns is None:
+            return int(frame) * self._columns.period.ns
+        return self._sweeps.stamps_ns[frame]
+
+    def findings(self) -> Sequence[tuple[str, str]]:
+        """See `densify.types.SaysWhatItFound`."""
+        layout, first = self._columns.layout, self._sweeps.paths[self.frames[0]]
+        fields = [f"{part} = {name}" for part, name in vars(layout.fields).items() if name]
+        unused = f"; not used: {', '.join(layout.unused)}" if layout.unused else ""
+        times = layout.time_words
+        if self._config.sweeps.compensated and self._track is None:
+            times = (
+                "left out: the points are compensated, and no poses with stamps tell by how much"
+            )
+        lines = [
+            ("files", f"{(first.parent / '*').relative_to(self.where)}{first.suffix}"),
+            ("fields", ", ".join(fields) + unused),
+            ("intensity", f"divided by {layout.intensity_scale:g}"),
+            ("times", times),
+            ("stamped by", self._sweeps.told_by or self._columns.period.told_by),
+        ]
+        if self._poses is not None:
+            lines.append(("poses from", f"{self._poses.path.name} ({self._poses.form})"))
+        elif self._has_viewpoints:
+            lines.append(("poses from", "VIEWPOINT of the sweeps"))
+        used = {str(Path(c.files)) for c in self._config.cameras}
+        for name, count in find_images(self.where).items():
+            if name not in used:
+                lines.append(("no camera", f"{name} holds {count} images without a calibration"))
+        return lines
+
+    def _returns(self, frame: int) -> tuple[Path, Returns]:
+        stamp_ns = self.stamp_ns(frame)
+        path, found = self._columns.returns(frame, stamp_ns)
+        if not self._config.sweeps.compensated or found.offset_ns is None:
+            return path, found
+        if self._track is None:
+            return path, replace(found, offset_ns=None)
+        valid = np.isfinite(found.points).all(axis=1) & found.points.any(axis=1)
+        points = found.points.copy()
+        points[valid] = self._track.as_fired(points[valid], stamp_ns, found.offset_ns[valid])
+        return path, replace(found, points=points)
+
+    def _encoded_image(self, camera: str, number: int) -> tuple[Path, bytes]:
+        path = self._images[camera].paths[number]
+        return path, read_bytes(path)
+
+    def _pose(self, frame: int) -> Float:
+        if self._track is not None:
+            return self._track.at(self.stamp_ns(frame))
+        if self._poses is not None:
+            return self._T_world_lidar(self._poses.T[self._row_of_pose(frame, self._poses)])
+        if not self._has_viewpoints:
+            return super()._pose(frame)
+        path = self._sweeps.paths[frame]
+        x, y, z, *quaternion = read_viewpoint(path) or _NO_VIEWPOINT
+        return quaternion_pose(quaternion, (x, y, z), f"{path}: VIEWPOINT")
+
+    def _read_poses(self) -> PoseFile | None:
+        path = find_pose_file(self.where, self._config.poses.file)
+        if path is None:
+            return None
+        found = PoseFile.read(path, self._config.poses.stamps_unit)
+        by_row = found.stamps_ns is None and found.numbers is None
+        if by_row and len(found.T) != len(self.frames) and len(found.T) <= self.frames[-1]:
+            raise InputError(
+                f"{path}: got {len(found.T)} poses for {len(self.frames)} sweeps numbered "
+                f"{format_frames(self.frames)}, expected one for each, or for each number from 0"
+            )
+        return found
+
+    @cached_property
+    def _track(self) -> PoseTrack | None:
+        """The lidar's path, where the poses have stamps."""
+        if self._poses is None or self._poses.stamps_ns is None:
+            return None
+        T_world_lidar = np.stack([self._T_world_lidar(T) for T in self._poses.T])
+        stamps_ns = np.array(self._poses.stamps_ns, np.int64)
+        return PoseTrack(str(self._poses.path), stamps_ns, T_world_lidar)
+
+    def _row_of_pose(self, frame: int, found: PoseFile) -> int:
+        if found.numbers is not None:
+            if frame not in found.numbers:
+                raise InputError(
+                    f"{found.path}: no pose of frame {frame}; it has {format_frames(found.numbers)}"
+                )
+            return found.numbers.index(frame)
+        return list(self.frames).index(frame) if len(found.T) == len(self.frames) else frame
+
+    def _T_world_lidar(self, T: Float) -> Float:
+        """(4,4) as it stands in the file -> the lidar's pose."""
+        known = self._config.poses
+        T = poses.inverse(T) if known.inverse else T
+        return T if known.T_frame_lidar is None else T @ known.T_frame_lidar
+
+    @cached_property
+    def _has_viewpoints(self) -> bool:
+        """Whether VIEWPOINT says anything: the first sweeps of many drives stand at the origin."""
+        tried = {self.frames[0], self.frames[len(self.frames) // 2], self.frames[-1]}
+        found = [read_viewpoint(self._sweeps.paths[frame]) for frame in sorted(tried)]
+        return any(one not in (None, _NO_VIEWPOINT) for one in found)
+
+    def _exposures(self, files: CameraFiles) -> dict[int, int]:
+        images = self._images[files.camera.name]
+        shift_ns = round(files.clock_offset_s * 1e9)
+        if images.stamps_ns is not None:
+            return {n: ns + shift_ns for n, ns in images.stamps_ns.items()}
+        return {n: self.stamp_ns(n) + shift_ns for n in images.paths if n in self._frames}
+
+
+def _images(folder: Path, files: CameraFiles) -> Series:
+    place = folder / files.files
+    paths = list(place.iterdir()) if place.is_dir() else []
+    paths = [path for path in paths if path.suffix.lower() in IMAGE_SUFFIXES]
+    if not paths:
+        raise InputError(
+            f"{place}: no images, though densify.yaml names it: cameras: {{{files.camera.name}: "
+            f"{{files: {files.files}}}}}"
+        )
+    return in_time(folder, paths, files.stamps, files.stamps_unit, shared=False)

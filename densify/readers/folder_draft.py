@@ -1,0 +1,180 @@
+# SPDX-License-Identifier: MIT
+"""A first ``densify.yaml`` for a folder: what is found in it, and what only its owner knows left to
+be filled in."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from densify.readers.files import read_bytes
+from densify.readers.folder_files import (
+    IMAGE_SUFFIXES,
+    find_images,
+    find_pose_file,
+    find_sweeps,
+    in_time,
+    sweep_folders,
+)
+from densify.readers.point_fields import find_fields, find_times, full_scale
+from densify.readers.point_files import read_table, unnamed
+from densify.readers.pose_files import PoseFile
+from densify.readers.stamp_files import named
+
+_PERIOD_NS = 100_000_000
+_HEAD = """\
+# What the files of this folder cannot say themselves; every key may be left out. Lines with a # in
+# front are examples or guesses: take the # away where they are right.
+"""
+_CAMERAS = """\
+# Cameras: K and T_cam_lidar are to be filled in (p_cam = T_cam_lidar p_lidar; the camera looks
+# along z, x to the right, y down). model: pinhole (distortion k1 k2 p1 p2 k3 ..., none if
+# rectified), fisheye (k1 k2 k3 k4) or mei (xi k1 k2 p1 p2). stamps: names, a file, or sweeps (an
+# image was exposed at the stamp of the sweep of its number). row_time_s: of a rolling shutter, from
+# one row's exposure to the next one's. clock_offset_s: is added to the stamps.
+# cameras:
+"""
+_CAMERA = """\
+#   {name}:
+#     files: {files}
+#     stamps: {stamps}
+#     clock_offset_s: 0
+#     size: [{width}, {height}]
+#     model: pinhole
+#     distortion: []
+#     row_time_s: 0
+#     K: [fx, fy, cx, cy]
+#     T_cam_lidar: [[0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]]
+"""
+
+
+def draft_config(folder: Path) -> str:
+    """The text of a commented densify.yaml that opens as it is. Reads one sweep and one image of
+    each folder. Raises InputError if there are no sweeps, or the first cannot be read."""
+    groups = sweep_folders(folder)
+    choice = next(iter(groups), "")
+    paths = find_sweeps(folder, choice)
+    parts = [
+        _HEAD,
+        _sweeps(folder, choice, paths, [name for name in groups if name != choice]),
+        _poses(folder),
+        _cameras(folder),
+    ]
+    return "\n".join(parts)
+
+
+def _sweeps(folder: Path, files: str, paths: Sequence[Path], others: Sequence[str]) -> str:
+    series = in_time(folder, paths, "", "")
+    first = next(iter(series.paths.values()))
+    columns = read_table(first).columns
+    either = f"  # or: {', '.join(others)}" if others else f"  # {len(paths)} sweeps"
+    lines = ["sweeps:", f"  files: {files}{either}"]
+    stamps_ns, period_ns = series.stamps_ns, _PERIOD_NS
+    if stamps_ns is not None and len(stamps_ns) > 1:
+        period_ns = int(np.median(np.diff(list(stamps_ns.values()))))
+    names = list(columns)
+    if tuple(names) == unnamed(len(names)):
+        names = _guessed(columns, period_ns)
+        lines.append(f"  columns: [{', '.join(names)}]  # guessed by their values: check them")
+    columns = dict(zip(names, columns.values(), strict=True))
+    fields = find_fields(names)
+    if fields.intensity:
+        scale = full_scale(columns[fields.intensity])
+        lines.append(f"  intensity: {fields.intensity}")
+        lines.append(f"  intensity_scale: {scale:g}  # what full brightness is")
+    lines += _time_lines(columns, fields.time, period_ns, stamps_ns)
+    if stamps_ns is None:
+        lines.append("  rate_hz: 10  # assumed; or name a file with one time for each sweep:")
+        lines.append("  # stamps: timestamps.txt")
+    elif series.told_by.startswith("the names"):
+        lines.append("  stamps: names")
+    else:
+        lines.append(f"  # stamps are taken from {series.told_by}")
+    lines += [
+        "  # reference: start     # the stamp is the sweep's start, middle or end; without it the",
+        "  #                      # points' times are since the stamp",
+        "  # compensated: true    # the vehicle's own motion in a sweep was taken out already",
+        "  # scanner_origins: [[0, 0, 0]]  # where rays start, metres, if not at 0 0 0",
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def _guessed(columns: Mapping[str, NDArray[Any]], period_ns: int) -> list[str]:
+    """Names for the columns of a file without names: by their values, from the fifth on."""
+    names: list[str] = []
+    for name, column in columns.items():
+        if not name.startswith("column"):
+            names.append(name)
+            continue
+        whole = np.isfinite(column).all() and not (column % 1).any()
+        times = find_times(column, name, period_ns, None)[0]
+        if whole and column.min() >= 0 and 0 < column.max() < 256 and "ring" not in names:
+            names.append("ring")
+        elif times is not None and "time" not in names:
+            names.append("time")
+        else:
+            names.append(f"unknown{len(names)}")
+    return names
+
+
+def _time_lines(
+    columns: Mapping[str, NDArray[Any]],
+    field: str,
+    period_ns: int,
+    stamps_ns: Mapping[int, int] | None,
+) -> list[str]:
+    if not field:
+        return ["  # time: NAME           # no column tells when each point was measured"]
+    stamp_ns = None if stamps_ns is None else next(iter(stamps_ns.values()))
+    times, words = find_times(columns[field], field, period_ns, stamp_ns)
+    if times is None:
+        return [f"  # time_unit: ns        # {words}"]
+    return [
+        f"  time: {field}",
+        f"  time_unit: {times.unit}  # a sweep takes about a period in this unit",
+        f"  time_is: {'absolute' if times.absolute else 'relative'}"
+        + ("  # by another clock than the stamps" if times.other_clock else ""),
+    ]
+
+
+def _poses(folder: Path) -> str:
+    path = find_pose_file(folder, "")
+    lines = [
+        "# poses:",
+        "#   file: poses.txt       # KITTI 3x4, 4x4, TUM, or a table with qw qx qy qz",
+    ]
+    if path is not None:
+        form = PoseFile.read(path).form
+        lines = ["poses:", f"  file: {path.name}  # {form}"]
+    return "\n".join(
+        [
+            *lines,
+            "#   inverse: true         # the file has world-to-lidar, not lidar-to-world",
+            "#   T_frame_lidar: [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]",
+            "#                         # the lidar in the frame whose poses these are",
+            "",
+        ]
+    )
+
+
+def _cameras(folder: Path) -> str:
+    import cv2
+
+    text = _CAMERAS
+    for files in find_images(folder):
+        place = folder / files
+        first = min(p for p in place.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES)
+        image = cv2.imdecode(np.frombuffer(read_bytes(first), np.uint8), cv2.IMREAD_COLOR)
+        height, width = (0, 0) if image is None else image.shape[:2]
+        text += _CAMERA.format(
+            name=place.parent.name if place.name in ("data", "images") else place.name,
+            files=files,
+            width=width,
+            height=height,
+            stamps="names" if named(first).stamp_ns is not None else "sweeps",
+        )
+    return text

@@ -1,0 +1,175 @@
+# SPDX-License-Identifier: MIT
+"""What the fields of a point cloud mean: found by their names, and the times by their values.
+
+Every driver has names and units of its own: Velodyne's ``time`` are seconds since the stamp,
+Ouster's ``t`` nanoseconds, Hesai's and RoboSense's ``timestamp`` seconds since 1970, Livox's
+``offset_time`` nanoseconds. The span of a sweep's times tells the unit, since the units lie a
+factor of 1000 apart and a sweep takes about one period.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from densify.types import Float32, Int
+
+UNIT_NS = {"s": 1_000_000_000, "ms": 1_000_000, "us": 1_000, "ns": 1}
+REFERENCES = ("start", "middle", "end")
+
+_NAMES = {
+    "x": ("x",),
+    "y": ("y",),
+    "z": ("z",),
+    "intensity": (
+        *("intensity", "intensities", "reflectance", "reflectivity", "remission", "i", "signal"),
+        *("scalar_intensity", "amplitude"),
+    ),
+    "time": (
+        *("time", "t", "timestamp", "time_stamp", "offset_time", "time_offset", "timeoffset"),
+        *("offset_ns", "offset_us", "time_us", "time_ns", "stamp", "gps_time", "scalar_time"),
+    ),
+    "ring": (
+        *("ring", "line", "channel", "laser_id", "laser_number", "laserid", "beam", "scalar_ring"),
+    ),
+    "lidar": ("lidar", "lidar_id", "scanner", "sensor_id", "scanner_channel"),
+}
+_SHORTEST_SHARE, _LONGEST_SHARE = 0.08, 4.0  # of a period that the times of a sweep span
+_SAME_CLOCK_NS = 2_000_000_000
+_RELATIVE_NS = 3_000_000_000
+_FULL_SCALES = (1.0, 255.0, 65535.0)
+
+
+@dataclass(frozen=True)
+class Fields:
+    """Which field plays which part; "" for none."""
+
+    x: str = ""
+    y: str = ""
+    z: str = ""
+    intensity: str = ""
+    time: str = ""
+    ring: str = ""
+    lidar: str = ""
+
+
+def find_fields(names: Collection[str]) -> Fields:
+    """Found by their names, whatever their case; the first of several that could play a part."""
+    lower = {name.lower(): name for name in reversed(list(names))}
+    found = {
+        part: next((lower[name] for name in known if name in lower), "")
+        for part, known in _NAMES.items()
+    }
+    return Fields(**found)
+
+
+@dataclass(frozen=True)
+class PointTimes:
+    """How a field tells when each point was measured.
+
+    unit: a key of `UNIT_NS`. absolute: since an epoch, not since the sweep's stamp. other_clock: of
+    absolute times, an epoch that is not the stamps'. reference: which moment of the sweep the stamp
+    is, one of `REFERENCES`; "" where the times say it themselves.
+    """
+
+    field: str
+    unit: str
+    absolute: bool
+    other_clock: bool = False
+    reference: str = ""
+
+    def offset_ns(self, values: NDArray[Any], stamp_ns: int) -> Int:
+        """(N,) times of a sweep -> (N,) int64 since its stamp."""
+        if not len(values):
+            return np.zeros(0, np.int64)
+        unit_ns = UNIT_NS[self.unit]
+        values, zero = widened(values), 0
+        if self.absolute and not self.other_clock and not self.reference:
+            whole = int(np.floor(values.min()))  # so that no float holds an epoch's nanoseconds
+            values, zero = values - values.dtype.type(whole), whole * unit_ns - stamp_ns
+        elif self.absolute or self.reference:
+            low, high = values.min(), values.max()
+            share = {"": 0, "start": 0, "middle": 0.5, "end": 1}[self.reference]
+            values = values - (low + values.dtype.type(share * (high - low)))
+        return np.rint(values * unit_ns).astype(np.int64) + zero
+
+    def __str__(self) -> str:
+        text = f"{self.field} in {self.unit}, " + ("absolute" if self.absolute else "relative")
+        if self.other_clock and not self.reference:
+            text += ", by another clock than the stamps: the first point is taken for the stamp's"
+        return text + (f", the stamp is the {self.reference}" if self.reference else "")
+
+
+def widened(values: NDArray[Any]) -> NDArray[Any]:
+    """int64 or float64, whichever holds them."""
+    return values.astype(np.float64 if values.dtype.kind == "f" else np.int64)
+
+
+def find_times(
+    values: NDArray[Any],
+    field: str,
+    period_ns: int,
+    stamp_ns: int | None,
+    unit: str = "",
+    absolute: bool | None = None,
+    reference: str = "",
+) -> tuple[PointTimes | None, str]:
+    """How this field tells the times of a sweep's points, and in words what was found; None, and
+    why, where it does not tell them.
+
+    values: (N,) of one sweep. period_ns: from sweep to sweep. stamp_ns: of the sweep, None if it
+    has none. unit, absolute, reference: what is known already.
+    """
+    times = widened(values)
+    if times.dtype.kind == "f":
+        times = times[np.isfinite(times)]
+    span = times.max() - times.min() if len(times) else 0
+    if not span:
+        return None, f"{field} is the same for all points, so it does not tell their times"
+    if values.dtype.kind == "f" and np.spacing(np.abs(values).max()) * 500 > span:
+        digits = np.finfo(values.dtype).precision
+        return None, (
+            f"{field} has too few digits ({digits}) to tell times: {times.min():.10g} to "
+            f"{times.max():.10g}"
+        )
+    share = {u: float(span) * ns / period_ns for u, ns in UNIT_NS.items()}
+    fit = [unit] if unit else [u for u in share if _SHORTEST_SHARE < share[u] < _LONGEST_SHARE]
+    if not fit:
+        return None, (
+            f"{field} spans {float(span):.6g} in a sweep, which in no unit is about the "
+            f"{1e-6 * period_ns:.0f} ms from sweep to sweep; name its unit"
+        )
+    unit = fit[0]
+    away_ns = float(np.abs(times).max()) * UNIT_NS[unit]
+    if absolute is None:
+        absolute = away_ns > _RELATIVE_NS
+    other = False
+    if absolute and stamp_ns is not None:
+        first_ns = int(float(times.min()) * UNIT_NS[unit])
+        other = abs(first_ns - stamp_ns) > _SAME_CLOCK_NS
+    found = PointTimes(field, unit, absolute, other, reference)
+    return found, str(found)
+
+
+def full_scale(intensity: NDArray[Any]) -> float:
+    """What a sweep's intensities are to be divided by for 0 to 1: 1, 255, 65535, or the greatest
+    of them."""
+    greatest = float(np.nanmax(intensity, initial=0.0))
+    return next((scale for scale in _FULL_SCALES if greatest <= scale), greatest)
+
+
+def scaled(intensity: NDArray[Any], scale: float) -> Float32:
+    """0 to 1, what is brighter than ``scale`` too; 0 where it is not finite."""
+    share = np.nan_to_num(intensity.astype(np.float64), nan=0.0, posinf=0.0, neginf=0.0) / scale
+    return np.clip(share, 0, 1).astype(np.float32)
+
+
+def points_of(columns: Mapping[str, NDArray[Any]], fields: Fields) -> NDArray[np.float64]:
+    """(N,3) metres."""
+    return np.column_stack([columns[name] for name in (fields.x, fields.y, fields.z)]).astype(
+        np.float64
+    )

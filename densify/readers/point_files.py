@@ -1,0 +1,310 @@
+# SPDX-License-Identifier: MIT
+"""Files of points: one door for each format, whoever reads it. Nothing in them is run as code."""
+
+from __future__ import annotations
+
+import csv
+import io
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.lib.npyio import NpzFile
+from numpy.typing import NDArray
+
+from densify.errors import InputError
+from densify.readers.extras import needed
+from densify.readers.files import read_bytes
+
+Columns = dict[str, NDArray[Any]]
+
+_UNNAMED = ("x", "y", "z", "intensity")  # KITTI's order, which most others follow
+_BIN_COLUMNS = range(3, 17)
+_ROWS_LOOKED_AT = 4000
+_ALIKE = 0.7  # of the variance that columns explain
+
+
+@dataclass(frozen=True)
+class PointTable:
+    """What a file holds of its N points.
+
+    columns: by name, (N,) numbers each, as they are stored; those without names are called as
+    `unnamed` calls them. viewpoint: where the sensor stood as tx ty tz qw qx qy qz, of a .pcd file.
+    beside: the other arrays of an .npz file.
+    """
+
+    columns: Columns
+    viewpoint: tuple[float, ...] | None = None
+    beside: Mapping[str, NDArray[Any]] = field(default_factory=dict)
+
+    def __len__(self) -> int:
+        return len(next(iter(self.columns.values()), ()))
+
+
+def read_table(path: Path, names: Sequence[str] | None = None) -> PointTable:
+    """Every row of the file in its order.
+
+    ========================= ==================================================================
+    .bin                      float32 columns
+    .npy, .npz                an (N,3 or more) array, in an .npz called ``points``; or structured;
+                              or an .npz of x, y, z and others, (N,) each
+    .csv, .txt                numbers; a first line of words names the columns
+    .pcd                      ascii, binary, binary_compressed
+    .ply                      properties of its vertices (extra ``ply``)
+    .las, .laz                dimensions
+    ========================= ==================================================================
+
+    names: of the columns, where the file has none; a .bin file without them is cut into as many
+    columns as make neighbouring rows alike. Raises InputError if the file is missing, damaged, of
+    another form, or has no rows.
+    """
+    if not path.is_file():
+        raise InputError(f"{path}: no such file; expected a point file ({', '.join(SUFFIXES)})")
+    suffix = path.suffix.lower()
+    if suffix not in _DOORS:
+        raise InputError(
+            f"{path}: got {path.suffix or 'no suffix'}, expected one of {', '.join(SUFFIXES)}"
+        )
+    try:
+        table = _DOORS[suffix](path, names)
+    except InputError:
+        raise
+    except Exception as error:  # a damaged file makes other people's parsers raise anything
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise InputError(f"{path}: not a readable {suffix} point file: {reason}") from error
+    if not len(table):
+        raise InputError(f"{path}: holds no points, expected at least one")
+    return table
+
+
+def read_viewpoint(path: Path) -> tuple[float, ...] | None:
+    """tx ty tz qw qx qy qz in a .pcd file's header; None of other files. Raises InputError if the
+    header is damaged."""
+    if path.suffix.lower() != ".pcd":
+        return None
+    try:
+        with path.open("rb") as file:
+            lines = _pcd_header(file)
+        values = next((line.split()[1:] for line in lines if line.startswith("VIEWPOINT")), None)
+        found = None if values is None else tuple(float(v) for v in values)
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: not a readable .pcd point file: {error}") from error
+    if found is not None and len(found) != 7:
+        raise InputError(
+            f"{path}: VIEWPOINT: got {len(found)} numbers, expected tx ty tz qw qx qy qz"
+        )
+    return found
+
+
+def unnamed(num_columns: int) -> tuple[str, ...]:
+    """What the columns of a file without names are taken for: x y z intensity, then numbers."""
+    return tuple(_UNNAMED[i] if i < len(_UNNAMED) else f"column{i}" for i in range(num_columns))
+
+
+def _matrix(array: NDArray[Any], names: Sequence[str] | None, path: Path) -> Columns:
+    """Columns of an (N,k) array, or the fields of a structured one."""
+    if array.dtype.names and array.ndim == 1:
+        return {name: array[name] for name in array.dtype.names if array[name].ndim == 1}
+    if array.size == 0:
+        return {}
+    if array.ndim != 2 or array.shape[1] < 3 or array.dtype.kind not in "fiu":
+        raise InputError(
+            f"{path}: got an array of shape {array.shape} and type {array.dtype}, expected numbers "
+            f"of shape (N,3) or more columns"
+        )
+    names = unnamed(array.shape[1]) if names is None else names
+    if len(names) != array.shape[1]:
+        raise InputError(
+            f"{path}: got {array.shape[1]} columns, expected {len(names)}: {' '.join(names)}"
+        )
+    return {name: array[:, i] for i, name in enumerate(names)}
+
+
+def _read_bin(path: Path, names: Sequence[str] | None) -> PointTable:
+    data = read_bytes(path)
+    num_columns = len(names) if names is not None else _num_columns(data)
+    if len(data) % (4 * num_columns):
+        raise ValueError(
+            f"got {len(data)} bytes, expected a multiple of {4 * num_columns} "
+            f"({num_columns} float32 columns); it is cut off, or has another number of columns"
+        )
+    return PointTable(_matrix(np.frombuffer(data, "<f4").reshape(-1, num_columns), names, path))
+
+
+def _num_columns(data: bytes) -> int:
+    """The number of float32 columns for which the places of neighbouring rows are most alike: a
+    scanner's are, and a wrong number mixes x with y. Rings that fire by turns make every second or
+    third row more alike still: the smallest of such numbers is right whose columns differ in their
+    values as much."""
+    values = np.frombuffer(data[: len(data) // 4 * 4], "<f4").astype(np.float64)
+    fit = [k for k in _BIN_COLUMNS if len(values) % k == 0 and len(data) % 4 == 0]
+    if len(fit) < 2 or len(values) < 16 * 20:
+        return 4 if len(data) % 16 == 0 or not fit else fit[0]
+    values = np.nan_to_num(values, posinf=0, neginf=0)
+    best = min(fit, key=lambda k: _steps(values.reshape(-1, k)[:_ROWS_LOOKED_AT]))
+    told = {k: _told_by_column(values.reshape(-1, k)) for k in fit if best % k == 0}
+    return min(k for k, share in told.items() if share >= _ALIKE * told[best])
+
+
+def _steps(rows: NDArray[np.float64]) -> float:
+    """How far the places of neighbouring rows are apart, in proportion to their distance."""
+    places = rows[:, :3]
+    size = np.abs(places[1:]).sum(axis=1) + np.abs(places[:-1]).sum(axis=1) + 1e-9
+    return float(np.mean(np.abs(np.diff(places, axis=0)).sum(axis=1) / size))
+
+
+def _told_by_column(rows: NDArray[np.float64]) -> float:
+    """Which share of the variance of the values' sizes their columns explain."""
+    size = np.arcsinh(np.abs(rows))
+    return float(size.mean(axis=0).var() / max(size.var(), 1e-12))
+
+
+def _read_npy(path: Path, names: Sequence[str] | None) -> PointTable:
+    suffix = path.suffix.lower()
+    loaded = np.load(path, allow_pickle=False)
+    if not isinstance(loaded, NpzFile):
+        if suffix == ".npz":
+            raise ValueError("holds a single array; name it .npy")
+        return PointTable(_matrix(loaded, names, path))
+    with loaded as arrays:
+        if suffix == ".npy":
+            raise ValueError("holds an archive of arrays; name it .npz")
+        found = {name: arrays[name] for name in arrays}
+    if "points" in found:
+        return PointTable(_matrix(found.pop("points"), names, path), beside=found)
+    if not {"x", "y", "z"} <= found.keys():
+        raise ValueError(f"holds the arrays {', '.join(found)}, expected points, or x, y and z")
+    num_points = found["x"].shape
+    if len(num_points) != 1 or any(found[axis].shape != num_points for axis in "yz"):
+        raise ValueError("the arrays x, y and z have other shapes than (N,)")
+    fit = {n: a for n, a in found.items() if a.shape == num_points and a.dtype.kind in "fiu"}
+    return PointTable(fit, beside={n: a for n, a in found.items() if n not in fit})
+
+
+def _read_text(path: Path, names: Sequence[str] | None) -> PointTable:
+    text = read_bytes(path).decode("utf-8")
+    lines = text.splitlines()
+    first = next((line for line in lines if line.strip().lstrip("#").strip()), "")
+    delimiter = next((d for d in (",", ";", "\t") if d in first), None)
+    words = [word.strip() for word in next(csv.reader([first.strip().lstrip("#")]), [])]
+    if delimiter != ",":
+        words = [w.strip() for w in first.strip().lstrip("#").split(delimiter)]
+    header = bool(words) and not _are_numbers(words)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # an empty file is refused in our words
+        skip = lines.index(first) + 1 if header else 0
+        array = np.loadtxt(lines[skip:], delimiter=delimiter, ndmin=2)
+    if header and names is None:
+        if not any(word.strip('"').lower() in ("x", "y", "z") for word in words):
+            raise ValueError(f"got the first line {first[:60]!r}, expected names such as x,y,z")
+        names = [word.strip('"') for word in words]
+    return PointTable(_matrix(array, names, path))
+
+
+def _are_numbers(words: Sequence[str]) -> bool:
+    try:
+        return bool([float(word) for word in words if word])
+    except ValueError:
+        return False
+
+
+def _pcd_header(file: Any) -> list[str]:
+    """The lines up to DATA, without comments; the file then stands where the points begin.
+
+    Some writers have padding fields with a COUNT of 0, and old files have no COUNT: both are put
+    in the form that parsers take."""
+    lines: list[str] = []
+    while len(lines) < 20:
+        raw = file.readline(65536)
+        if not raw:
+            raise ValueError("the header ends before DATA; it is cut off")
+        line = raw.decode("ascii", errors="strict").strip()
+        if line and not line.startswith("#"):
+            lines.append(line)
+        if line.startswith("DATA"):
+            break
+    table = {line.split()[0]: line.split()[1:] for line in lines}
+    missing = [key for key in ("FIELDS", "SIZE", "TYPE", "WIDTH", "DATA") if not table.get(key)]
+    if missing:
+        raise ValueError(f"the header has no {', '.join(missing)}")
+    table.setdefault("HEIGHT", ["1"])
+    table.setdefault("COUNT", ["1"] * len(table["FIELDS"]))
+    table.setdefault("POINTS", [str(int(table["WIDTH"][0]) * int(table["HEIGHT"][0]))])
+    table.setdefault("VERSION", ["0.7"])
+    per_field = ("FIELDS", "SIZE", "TYPE", "COUNT")
+    if len({len(table[key]) for key in per_field}) != 1:
+        raise ValueError(
+            "the header names " + ", ".join(f"{len(table[key])} {key}" for key in per_field)
+        )
+    kept = [i for i, count in enumerate(table["COUNT"]) if count != "0"]
+    for key in per_field:
+        table[key] = [table[key][i] for i in kept]
+    data = table.pop("DATA")
+    return [f"{key} {' '.join(values)}" for key, values in table.items()] + [f"DATA {data[0]}"]
+
+
+def _read_pcd(path: Path, names: Sequence[str] | None) -> PointTable:
+    from pypcd4 import PointCloud
+
+    with path.open("rb") as file:
+        header = _pcd_header(file)
+        body = file.read()
+    if header[-1] == "DATA ascii":  # one blank between numbers, none at the end
+        body = b"\n".join(b" ".join(line.split()) for line in body.splitlines())
+    if header[-1] == "DATA binary_compressed" and len(body) < 8:
+        raise ValueError("it ends where its points should begin; it is cut off")
+    cloud = PointCloud.from_fileobj(
+        io.BytesIO("\n".join(header).encode() + b"\n" + body)  # type: ignore[arg-type]
+    )
+    rows = np.atleast_1d(cloud.pc_data)
+    if len(rows) != cloud.points:
+        raise ValueError(
+            f"got {len(rows)} points, expected {cloud.points} as its header says; it is cut off"
+        )
+    columns = {name: rows[name] for name in rows.dtype.names or () if not name.startswith("#")}
+    return PointTable(columns, tuple(cloud.metadata.viewpoint))
+
+
+def _read_ply(path: Path, names: Sequence[str] | None) -> PointTable:
+    ply = needed("trimesh.exchange.ply", "ply", ".ply files")
+    with path.open("rb") as file:
+        raw = ply.load_ply(file)["metadata"]["_ply_raw"]
+    if "vertex" not in raw:
+        raise ValueError(f"holds {', '.join(raw) or 'nothing'}, expected vertices")
+    vertex = raw["vertex"]
+    names = [name for name, kind in vertex["properties"].items() if "LIST" not in kind]
+    columns = {name: np.ravel(vertex["data"][name]) for name in names}
+    if any(len(column) != vertex["length"] for column in columns.values()):
+        raise ValueError(f"holds fewer than the {vertex['length']} vertices of its header")
+    return PointTable(columns)
+
+
+def _read_las(path: Path, names: Sequence[str] | None) -> PointTable:
+    import laspy
+
+    with laspy.open(path) as file:
+        num_points = file.header.point_count
+        cloud = file.read()
+    if len(cloud) != num_points:
+        raise ValueError(f"got {len(cloud)} points, expected {num_points}; it is cut off")
+    places = {axis: np.asarray(getattr(cloud, axis)) for axis in "xyz"}
+    others = [n for n in cloud.point_format.dimension_names if n not in ("X", "Y", "Z")]
+    return PointTable(places | {name: np.asarray(cloud[name]) for name in others})
+
+
+_DOORS: Mapping[str, Callable[[Path, Sequence[str] | None], PointTable]] = {
+    ".npy": _read_npy,
+    ".npz": _read_npy,
+    ".txt": _read_text,
+    ".csv": _read_text,
+    ".bin": _read_bin,
+    ".pcd": _read_pcd,
+    ".ply": _read_ply,
+    ".las": _read_las,
+    ".laz": _read_las,
+}
+
+SUFFIXES = tuple(_DOORS)

@@ -1,0 +1,182 @@
+# SPDX-License-Identifier: MIT
+"""Times in the names of files and in text files, whatever their unit."""
+
+from __future__ import annotations
+
+import csv
+import re
+from collections.abc import Sequence
+from decimal import Decimal, InvalidOperation
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from densify.errors import InputError
+from densify.readers.files import read_text
+from densify.readers.point_fields import UNIT_NS
+
+_EPOCH_S = (946_684_800, 4_102_444_800)  # what counts as a time since 1970: the years 2000 to 2099
+_STEP_S = (0.002, 3.9)  # from sweep to sweep, or image to image
+_SECONDS_AND_NS = re.compile(r"(?<!\d)(\d{10})[_-](\d{9})(?!\d)")
+_NUMBER = re.compile(r"\d+(?:\.\d+)?")
+_FILE_COLUMNS = ("filename", "file", "name", "image", "sweep", "path")
+_TIME_COLUMNS = ("timestamp", "time", "stamp", "t")
+_MAX_NUMBER_DIGITS = 18  # beyond, a name is no frame's number
+
+
+class Named(NamedTuple):
+    """A file and what its name says. number: None where there is none; stamp_ns: None where it is
+    no time since 1970."""
+
+    path: Path
+    number: int | None
+    stamp_ns: int | None
+
+
+def named(path: Path, unit: str = "") -> Named:
+    """What a file's name says: ``0000000120``, ``cloud_12``, ``1317042651.468569638``,
+    ``1317042651_468569638`` and ``1317042651468`` are numbers or times since 1970 in a unit that
+    their size tells. unit: the last number in the name is a time in this unit."""
+    stem = path.stem
+    words = _NUMBER.findall(stem)
+    if unit:
+        return Named(path, None, in_ns(words[-1], unit) if words else None)
+    split = _SECONDS_AND_NS.search(stem)
+    if split:
+        return Named(path, None, int(split[1]) * 1_000_000_000 + int(split[2]))
+    for word in reversed(words):
+        epoch = _epoch_unit(Decimal(word))
+        # ten digits without a fraction are a number with zeros before it, as KITTI's
+        if epoch and (epoch != "s" or "." in word) and not word.startswith("0"):
+            return Named(path, None, in_ns(word, epoch))
+    digits = [word for word in re.findall(r"\d+", stem) if len(word) <= _MAX_NUMBER_DIGITS]
+    return Named(path, int(digits[-1]) if digits else None, None)
+
+
+def in_ns(text: str, unit: str) -> int:
+    """A decimal number of this unit as nanoseconds, every digit kept. Raises ValueError."""
+    try:
+        time_ns = int((Decimal(text) * UNIT_NS[unit]).to_integral_value())
+    except (InvalidOperation, OverflowError, ValueError):
+        raise ValueError(f"got {text!r}, expected a time in {unit}") from None
+    if abs(time_ns) >= 2**63:
+        raise ValueError(f"got {text!r}, which is no time in {unit}: it lies beyond the year 2262")
+    return time_ns
+
+
+def unit_of(times: Sequence[str]) -> str:
+    """The unit in which these are times since 1970, or else that in which the usual step between
+    them is one of sweeps or images; "" if there is none. Raises ValueError for no numbers."""
+    try:
+        values = sorted(Decimal(text) for text in times)
+    except InvalidOperation:
+        raise ValueError(f"got {times[0]!r}, expected times") from None
+    if not values or not all(value.is_finite() for value in values):
+        raise ValueError("got no finite numbers, expected times")
+    epochs = {_epoch_unit(value) for value in values}
+    if len(epochs) == 1 and epochs != {""}:
+        return epochs.pop()
+    step = float(np.median(np.diff([float(value) for value in values]))) if len(values) > 1 else 0
+    low_s, high_s = _STEP_S
+    fit = [unit for unit, ns in UNIT_NS.items() if low_s <= step * ns * 1e-9 <= high_s]
+    return fit[0] if fit else ""
+
+
+class StampFile(NamedTuple):
+    """Times of a text file, line by line. unit: what was found or given. names: the file that each
+    line is of, where it says so."""
+
+    path: Path
+    stamp_ns: tuple[int, ...]
+    unit: str
+    names: tuple[str, ...] | None
+
+    @staticmethod
+    def read(path: Path, unit: str = "") -> StampFile:
+        """One time a line, or columns of which one is the time and another may be a file's name;
+        numbers, or dates such as 2011-09-26 13:10:51.158069617.
+
+        unit: "" finds it out. Raises InputError that names file and line.
+        """
+        rows = _rows(path)
+        header = [word.lower().split("[")[0].strip() for word in rows[0][1]] if rows else []
+        at_time = next((header.index(n) for n in _TIME_COLUMNS if n in header), None)
+        at_name = next((header.index(n) for n in _FILE_COLUMNS if n in header), None)
+        if at_time is None and at_name is None:
+            rows = rows[1:] if rows and rows[0][0] < 0 else rows
+            at_time, at_name = _columns(rows[0][1]) if rows else (0, None)
+        else:
+            rows = rows[1:]
+            at_time = 0 if at_time is None else at_time
+        if not rows:
+            raise InputError(f"{path}: holds no times, expected one in each line")
+        width = 1 + max(at_time, at_name or 0)
+        for line, words in rows:
+            if len(words) < width:
+                raise InputError(f"{path}: line {line}: got {len(words)} columns, expected {width}")
+        times = [words[at_time] for _, words in rows]
+        names = None if at_name is None else tuple(Path(words[at_name]).name for _, words in rows)
+        return StampFile(path, *_parse(path, rows, times, unit), names)
+
+
+def _parse(
+    path: Path, rows: Sequence[tuple[int, list[str]]], times: Sequence[str], unit: str
+) -> tuple[tuple[int, ...], str]:
+    dates = "-" in times[0][1:] and ":" in times[0]
+    if not (dates or unit):
+        try:
+            unit = unit_of(times)
+        except ValueError as error:
+            raise InputError(f"{path}: {error} in each line") from None
+        if not unit:
+            raise InputError(
+                f"{path}: the unit of its times cannot be told ({times[0]}, {times[-1]}); name it "
+                f"in densify.yaml: stamps_unit: s, ms, us or ns"
+            )
+    found = []
+    for (line, _), text in zip(rows, times, strict=True):
+        try:
+            if dates:
+                found.append(int(np.datetime64(text.rstrip("Z"), "ns").astype(np.int64)))
+            else:
+                found.append(in_ns(text, unit))
+        except ValueError:
+            raise InputError(
+                f"{path}: line {line}: got {text!r}, expected "
+                f"{'a date and time' if dates else f'a time in {unit}'}"
+            ) from None
+    return tuple(found), "date" if dates else unit
+
+
+def _rows(path: Path) -> list[tuple[int, list[str]]]:
+    """Line number and words of each line that is neither empty nor a comment; of a comment in the
+    first line too, which may name the columns, with the number -1. A blank between date and time
+    does not part words."""
+    rows: list[tuple[int, list[str]]] = []
+    lines = read_text(path).splitlines()
+    delimiter = next((d for d in (",", ";", "\t") if lines and d in lines[0]), None)
+    for number, line in enumerate(lines, 1):
+        text = line.strip()
+        if not text or (text.startswith("#") and rows):
+            continue
+        if delimiter:
+            words = [w.strip() for w in next(csv.reader([text.lstrip("# ")], delimiter=delimiter))]
+        else:
+            words = re.sub(r"(\d-\d\d) (\d\d:)", r"\1T\2", text.lstrip("# ")).split()
+        rows.append((-1 if text.startswith("#") else number, words))
+    return rows
+
+
+def _columns(words: Sequence[str]) -> tuple[int, int | None]:
+    """Which column is the time and which a file's name, by what the first line holds."""
+    names = [i for i, word in enumerate(words) if Path(word).suffix.lower()[1:2].isalpha()]
+    times = [i for i in range(len(words)) if i not in names]
+    return (times[0] if times else 0), (names[0] if names else None)
+
+
+def _epoch_unit(value: Decimal) -> str:
+    for unit, ns in UNIT_NS.items():
+        if _EPOCH_S[0] <= value * ns / 1_000_000_000 < _EPOCH_S[1]:
+            return unit
+    return ""

@@ -1,0 +1,225 @@
+# SPDX-License-Identifier: MIT
+"""Sweeps in files of columns that nobody described: what the columns mean is told by their names,
+by the values of the first sweep that can be read, and by what is known already."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from densify.errors import InputError
+from densify.readers.file_sequence import Returns
+from densify.readers.folder_config import SweepFiles
+from densify.readers.folder_files import Series
+from densify.readers.point_fields import (
+    Fields,
+    PointTimes,
+    find_fields,
+    find_times,
+    full_scale,
+    points_of,
+    scaled,
+    widened,
+)
+from densify.readers.point_files import read_table
+from densify.types import Bool, Int
+
+Columns = Mapping[str, NDArray[Any]]
+
+_ASSUMED_PERIOD_NS = 100_000_000
+_NUM_TRIED = 5  # sweeps, until one can be read
+_RATES_HZ = (5, 10, 15, 20, 25)
+
+
+class Period(NamedTuple):
+    """From sweep to sweep, and how it was found; "" where the sweeps have stamps."""
+
+    ns: int
+    told_by: str
+
+
+@dataclass(frozen=True)
+class Layout:
+    """What the columns of all sweeps mean. times: None where none tells them. time_words: what was
+    found of times. unused: columns that play no part, with their ranges."""
+
+    fields: Fields
+    times: PointTimes | None
+    time_words: str
+    intensity_scale: float
+    unused: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class SweepColumns:
+    """series: the files. settings: what is known already; config: the file that says so."""
+
+    series: Series
+    settings: SweepFiles
+    config: Path | None
+
+    def returns(self, frame: int, stamp_ns: int) -> tuple[Path, Returns]:
+        """A sweep's rows as they stand in its file. Raises InputError if the file is damaged or has
+        other columns than the first."""
+        path = self.series.paths[frame]
+        columns, layout = self._columns(path), self.layout
+        for name in vars(layout.fields).values():
+            if name and name not in columns:
+                raise InputError(
+                    f"{path}: no column {name}, which other sweeps have; got {', '.join(columns)}"
+                )
+        points = points_of(columns, layout.fields)
+        intensity = None
+        if layout.fields.intensity:
+            intensity = scaled(columns[layout.fields.intensity], layout.intensity_scale)
+        valid = np.logical_and(np.isfinite(points).all(axis=1), points.any(axis=1))
+        return path, Returns(
+            points,
+            intensity,
+            self._offset_ns(path, columns, stamp_ns, valid),
+            self._lidar(path, columns, valid),
+            self.settings.scanner_origins,
+        )
+
+    @cached_property
+    def layout(self) -> Layout:
+        """Found by the names, and by the values of the first sweep that can be read."""
+        frame, _, columns = self._sample
+        fields, times, words = self._fields, None, "none: no column of that kind"
+        if fields.time:
+            stamps_ns = self.series.stamps_ns
+            times, words = self._times(
+                columns, self.period.ns, None if stamps_ns is None else stamps_ns[frame]
+            )
+            if times is not None and times.absolute and stamps_ns is None:
+                times = replace(times, other_clock=True)  # numbers for stamps are no clock
+        scale = self.settings.intensity_scale
+        if fields.intensity and not scale:
+            scale = full_scale(columns[fields.intensity])
+        unused = tuple(
+            f"{name} ({np.nanmin(column):g} to {np.nanmax(column):g})"
+            for name, column in columns.items()
+            if name not in vars(fields).values()
+        )
+        return Layout(fields, times, words, scale or 1.0, unused)
+
+    @cached_property
+    def period(self) -> Period:
+        """Told by the stamps, the rate that is known, or the points' own times."""
+        stamps_ns, rate_hz = self.series.stamps_ns, self.settings.rate_hz
+        if stamps_ns is not None and len(stamps_ns) > 1:
+            return Period(max(1, int(np.median(np.diff(list(stamps_ns.values()))))), "")
+        if rate_hz:
+            return Period(round(1e9 / rate_hz), f"number, at the {rate_hz:g} Hz of densify.yaml")
+        return self._period_of_times() or Period(
+            _ASSUMED_PERIOD_NS, "number, at an assumed 10 Hz; say rate_hz in densify.yaml"
+        )
+
+    def _period_of_times(self) -> Period | None:
+        """From one sweep's first point to the next one's, or by how long a sweep takes."""
+        if not self._fields.time:
+            return None
+        frame, _, columns = self._sample
+        times, _ = self._times(columns, _ASSUMED_PERIOD_NS, None)
+        if times is None:
+            return None
+        values = widened(columns[times.field])
+        if not times.absolute:
+            offset_ns = times.offset_ns(values, 0)
+            share = float(offset_ns.max() - offset_ns.min()) * 1e-9
+            fit = next((hz for hz in _RATES_HZ if abs(share * hz - 1) < 0.05), None)
+            if fit is None:
+                return None
+            return Period(10**9 // fit, f"number, at {fit} Hz: a sweep takes 1/{fit} s")
+        following = [number for number in self.series.paths if number > frame][:1]
+        for number in following:
+            later = self._columns(self.series.paths[number]).get(times.field)
+            if later is None or not len(later):
+                return None
+            first = np.array([np.nanmin(values), np.nanmin(widened(later))])
+            step_ns = int(np.diff(times.offset_ns(first, 0))[0]) // (number - frame)
+            if step_ns > 0:
+                return Period(step_ns, "number, at the rate of the points' times")
+        return None
+
+    @cached_property
+    def _sample(self) -> tuple[int, Path, Columns]:
+        """The first sweep that can be read: its number, file and columns."""
+        first_error: InputError | None = None
+        for number, path in list(self.series.paths.items())[:_NUM_TRIED]:
+            try:
+                return number, path, self._columns(path)
+            except InputError as error:
+                first_error = first_error or error
+        raise first_error or InputError("no sweeps")
+
+    @cached_property
+    def _fields(self) -> Fields:
+        _, path, columns = self._sample
+        named = {part: getattr(self.settings, part) for part in ("intensity", "time", "lidar")}
+        for part, name in named.items():
+            if name and name not in columns:
+                raise InputError(
+                    f"{self.config}: sweeps.{part}: got {name!r}, expected a column of "
+                    f"{path.name}: {', '.join(columns)}"
+                )
+        found = vars(find_fields(columns)) | {part: name for part, name in named.items() if name}
+        missing = [axis for axis in "xyz" if not found[axis]]
+        if missing:
+            raise InputError(
+                f"{path}: no column {', '.join(missing)}: got {', '.join(columns)}; name them in "
+                f"densify.yaml: sweeps: {{columns: [x, y, z, ...]}}"
+            )
+        return Fields(**found)
+
+    def _columns(self, path: Path) -> Columns:
+        """All columns of numbers, (N,) each; those beside the points of an .npz file too."""
+        table = read_table(path, self.settings.columns)
+        beside = {n: a for n, a in table.beside.items() if a.shape == (len(table),)}
+        columns = {**table.columns, **beside}
+        return {name: c for name, c in columns.items() if c.dtype.kind in "fiu"}
+
+    def _times(
+        self, columns: Columns, period_ns: int, stamp_ns: int | None
+    ) -> tuple[PointTimes | None, str]:
+        known, field = self.settings, self._fields.time
+        return find_times(
+            columns[field],
+            field,
+            period_ns,
+            stamp_ns,
+            known.time_unit,
+            known.absolute,
+            known.reference,
+        )
+
+    def _offset_ns(self, path: Path, columns: Columns, stamp_ns: int, valid: Bool) -> Int | None:
+        times = self.layout.times
+        if times is None:
+            return None
+        values = columns[times.field]
+        if values.dtype.kind == "f" and not np.isfinite(values[valid]).all():
+            raise InputError(f"{path}: {times.field}: got a time that is not finite beside a point")
+        offset_ns = np.zeros(len(values), np.int64)
+        offset_ns[valid] = times.offset_ns(values[valid], stamp_ns)
+        return offset_ns
+
+    def _lidar(self, path: Path, columns: Columns, valid: Bool) -> NDArray[np.uint8] | None:
+        name, origins = self.layout.fields.lidar, self.settings.scanner_origins
+        if not name:
+            return None
+        numbers, most = columns[name][valid], 255 if origins is None else len(origins) - 1
+        if not ((numbers >= 0) & (numbers <= most) & (numbers == np.rint(numbers))).all():
+            raise InputError(
+                f"{path}: {name}: got {numbers.min():g} to {numbers.max():g}, expected the number "
+                f"of a scanner, 0 to {most}; check sweeps.scanner_origins in densify.yaml"
+            )
+        lidar = np.zeros(len(valid), np.uint8)
+        lidar[valid] = numbers
+        return lidar

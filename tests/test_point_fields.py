@@ -1,0 +1,114 @@
+# SPDX-License-Identifier: MIT
+"""What fields mean: by the names that drivers give them, and by the times' values."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from densify.readers.point_fields import find_fields, find_times, full_scale, scaled
+
+STAMP_NS = 1_317_042_661_099_997_611
+PERIOD_NS = 100_000_000
+FIRED_NS = np.sort(np.random.default_rng(2).integers(0, 99_900_000, 400))
+
+DRIVERS = {  # names, and what plays intensity, time, ring
+    "velodyne": ("x y z intensity ring time", ("intensity", "time", "ring")),
+    "ouster": ("x y z intensity t reflectivity ring ambient range", ("intensity", "t", "ring")),
+    "hesai": ("x y z intensity timestamp ring", ("intensity", "timestamp", "ring")),
+    "livox": ("x y z reflectivity tag line offset_time", ("reflectivity", "offset_time", "line")),
+    "autoware": ("X Y Z I RETURN_TYPE CHANNEL TIME_STAMP", ("I", "TIME_STAMP", "CHANNEL")),
+    "bare": ("x y z", ("", "", "")),
+}
+
+
+@pytest.mark.parametrize("driver", DRIVERS)
+def test_fields_of_drivers(driver: str) -> None:
+    names, parts = DRIVERS[driver]
+    fields = find_fields(names.split())
+    assert (fields.intensity, fields.time, fields.ring) == parts
+    assert [fields.x.lower(), fields.y.lower(), fields.z.lower()] == ["x", "y", "z"]
+
+
+TIMES = {  # values, unit, absolute
+    "velodyne": ((FIRED_NS * 1e-9).astype("f4"), "s", False),
+    "velodyne before the stamp": ((FIRED_NS * 1e-9 - 0.1).astype("f4"), "s", False),
+    "ouster": (FIRED_NS.astype("u4"), "ns", False),
+    "microseconds": ((FIRED_NS // 1000).astype("u4"), "us", False),
+    "milliseconds": ((FIRED_NS * 1e-6).astype("f4"), "ms", False),
+    "hesai": ((STAMP_NS + FIRED_NS) * 1e-9, "s", True),
+    "robosense in us": ((STAMP_NS + FIRED_NS) // 1000, "us", True),
+    "absolute ns": ((STAMP_NS + FIRED_NS).astype("u8"), "ns", True),
+    "absolute ns as floats": ((STAMP_NS + FIRED_NS).astype("f8"), "ns", True),
+}
+
+
+@pytest.mark.parametrize("kind", TIMES)
+def test_units_follow_from_the_span(kind: str) -> None:
+    values, unit, absolute = TIMES[kind]
+    found, words = find_times(values, "t", PERIOD_NS, STAMP_NS)
+    assert found is not None, words
+    assert (found.unit, found.absolute, found.other_clock) == (unit, absolute, False)
+    assert f"t in {unit}, {'absolute' if absolute else 'relative'}" in words
+    offset_ns = found.offset_ns(values, STAMP_NS)
+    assert offset_ns.dtype == np.int64
+    expected = FIRED_NS - (100_000_000 if "before" in kind else 0)
+    assert np.abs(offset_ns - expected).max() < 1200  # digits of the floats, and whole us
+
+
+@pytest.mark.parametrize("hz", [5, 10, 20])
+def test_other_rates(hz: int) -> None:
+    fired_s = np.linspace(0, 0.99 / hz, 100)
+    for unit, per_s in (("s", 1), ("ms", 1e3), ("us", 1e6), ("ns", 1e9)):
+        found, _ = find_times(fired_s * per_s, "t", 10**9 // hz, None)
+        assert found is not None and found.unit == unit
+
+
+def test_the_stamp_may_be_the_end_or_the_middle() -> None:
+    values = (FIRED_NS - FIRED_NS[0]).astype("u4")
+    span = int(values[-1])
+    for reference, first in (("start", 0), ("middle", -span / 2), ("end", -span)):
+        found, words = find_times(values, "t", PERIOD_NS, STAMP_NS, reference=reference)
+        assert found is not None and f"the stamp is the {reference}" in words
+        np.testing.assert_allclose(
+            found.offset_ns(values, STAMP_NS)[[0, -1]], [first, first + span]
+        )
+
+
+def test_another_clock_is_told_and_counted_from_the_first_point() -> None:
+    tai_ns = STAMP_NS + 37_000_000_000 + FIRED_NS
+    found, words = find_times(tai_ns, "timestamp", PERIOD_NS, STAMP_NS)
+    assert found is not None and found.other_clock and "another clock" in words
+    np.testing.assert_array_equal(found.offset_ns(tai_ns, STAMP_NS), FIRED_NS - FIRED_NS[0])
+
+
+NOT_TIMES = {
+    "the same for all": (np.full(9, 0.5), "the same for all"),
+    "seconds since 1970 as float32": (((STAMP_NS + FIRED_NS) * 1e-9).astype("f4"), "the same"),
+    "too few digits": ((1e6 + FIRED_NS * 1e-9).astype("f4"), "too few digits"),
+    "no unit fits": (np.linspace(0, 5.0, 50), "name its unit"),
+}
+
+
+@pytest.mark.parametrize("kind", NOT_TIMES)
+def test_what_tells_no_times_says_why(kind: str) -> None:
+    values, says = NOT_TIMES[kind]
+    found, words = find_times(values, "t", PERIOD_NS, STAMP_NS)
+    assert found is None and says in words
+
+
+def test_what_is_known_is_taken() -> None:
+    values = np.linspace(0, 30.0, 50)
+    found, _ = find_times(values, "t", PERIOD_NS, STAMP_NS, unit="ms", absolute=False)
+    assert found is not None
+    assert found.offset_ns(values, STAMP_NS)[-1] == 30_000_000
+
+
+def test_intensities_are_brought_to_one() -> None:
+    for values, scale in (([0, 0.4, 1], 1), ([0, 7, 200], 255), ([0, 256], 65535), ([1e6], 1e6)):
+        intensity = np.array(values, np.float32)
+        assert full_scale(intensity) == scale
+        assert scaled(intensity, scale).max() <= 1
+    np.testing.assert_array_equal(
+        scaled(np.array([np.nan, 300, 51.0]), 255), [0, 1, np.float32(0.2)]
+    )

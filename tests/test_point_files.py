@@ -1,0 +1,271 @@
+# SPDX-License-Identifier: MIT
+"""Files of points: every format holds the same points, and is refused in a line when damaged."""
+
+from __future__ import annotations
+
+import io
+import struct
+from pathlib import Path
+
+import laspy
+import lzf
+import numpy as np
+import pytest
+
+from densify.errors import InputError
+from densify.readers.point_files import read_table, read_viewpoint
+
+rng = np.random.default_rng(5)
+POINTS = np.round(rng.uniform(-40, 40, (60, 3)), 3).astype("<f4")
+INTENSITY = rng.integers(0, 256, 60).astype("u1")
+TIME = np.arange(60, dtype="<u4") * 1_700_000
+RECORD = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("intensity", "u1"), ("t", "<u4")])
+ROWS = np.rec.fromarrays([*POINTS.T, INTENSITY, TIME], dtype=RECORD)
+
+HEADER = """# .PCD v0.7
+VERSION 0.7
+FIELDS x y z _ intensity t _ noise _
+SIZE 4 4 4 1 1 4 1 2 1
+TYPE F F F U U U U U U
+COUNT 1 1 1 4 1 1 0 1 3
+WIDTH 60
+HEIGHT 1
+VIEWPOINT 1 2 3 0.5 -0.5 0.5 -0.5
+POINTS 60
+DATA """
+PADDED = np.dtype([("head", "V12"), ("a", "V4"), ("i", "u1"), ("t", "<u4"), ("b", "V5")])
+
+
+def padded() -> np.ndarray:
+    """As Ouster's driver writes it: padding between the fields, one of none."""
+    rows = np.zeros(60, PADDED)
+    rows["head"] = np.frombuffer(POINTS.tobytes(), "V12")
+    rows["i"], rows["t"] = INTENSITY, TIME
+    rows["a"], rows["b"] = b"\xff" * 4, b"\x01" * 5
+    return rows
+
+
+def write_pcd(path: Path, data: str) -> None:
+    if data == "binary":
+        body = padded().tobytes()
+    elif data == "ascii":
+        words = [f"{x} {y} {z} 7 7 7 7 {i} {t} 9 3 3 3 " for x, y, z, i, t in ROWS.tolist()]
+        body = "\r\n".join(words).encode()
+    else:  # column by column
+        columns = [*POINTS.T, *(np.zeros(60, "u1"),) * 4, INTENSITY, TIME, np.zeros(60, "<u2")]
+        whole = b"".join(c.tobytes() for c in [*columns, *(np.zeros(60, "u1"),) * 3])
+        packed = lzf.compress(whole)
+        body = struct.pack("<II", len(packed), len(whole)) + packed
+    path.write_bytes((HEADER + data + "\n").encode() + body)
+
+
+def write_ply(path: Path, form: str) -> None:
+    order = ">" if "big" in form else "<"
+    head = f"ply\nformat {form} 1.0\ncomment a scan\nelement vertex 60\n"
+    head += "".join(f"property float {axis}\n" for axis in "xyz")
+    head += "property uchar intensity\nproperty uint t\nelement face 0\n"
+    head += "property list uchar int vertex_indices\nend_header\n"
+    if form == "ascii":
+        body = "".join(" ".join(map(str, row)) + "\n" for row in ROWS.tolist()).encode()
+    else:
+        body = ROWS.astype(RECORD.newbyteorder(order)).tobytes()
+    path.write_bytes(head.encode() + body)
+
+
+def write_las(path: Path) -> None:
+    header = laspy.LasHeader(point_format=3, version="1.4")
+    header.scales = [0.001] * 3
+    cloud = laspy.LasData(header)
+    cloud.x, cloud.y, cloud.z = POINTS.T.astype(float)
+    cloud.intensity, cloud.gps_time = INTENSITY, TIME * 1e-9
+    cloud.write(path)
+
+
+def write_text(path: Path, header: str, delimiter: str) -> None:
+    np.savetxt(path, np.array(ROWS.tolist()), "%.9g", delimiter, header=header, comments="")
+
+
+WRITERS = {
+    "padded.pcd": lambda p: write_pcd(p, "binary"),
+    "words.pcd": lambda p: write_pcd(p, "ascii"),
+    "packed.pcd": lambda p: write_pcd(p, "binary_compressed"),
+    "words.ply": lambda p: write_ply(p, "ascii"),
+    "little.ply": lambda p: write_ply(p, "binary_little_endian"),
+    "big.ply": lambda p: write_ply(p, "binary_big_endian"),
+    "one.las": write_las,
+    "one.laz": write_las,
+    "comma.csv": lambda p: write_text(p, "x,y,z,intensity,t", ","),
+    "quoted.csv": lambda p: write_text(p, '"x";"y";"z";"intensity";"t"', ";"),
+    "blank.txt": lambda p: write_text(p, "# x y z intensity t", " "),
+    "records.npy": lambda p: np.save(p, ROWS),
+    "arrays.npz": lambda p: np.savez(p, **{name: ROWS[name] for name in RECORD.names}),
+}
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_formats_with_names_agree(name: str, tmp_path: Path) -> None:
+    path = tmp_path / name
+    if path.suffix == ".ply":
+        pytest.importorskip("trimesh")
+    WRITERS[name](path)
+    columns = read_table(path).columns
+    read = np.stack([columns[axis] for axis in "xyz"], axis=1)
+    np.testing.assert_allclose(read, POINTS, atol=0.0006 if "one" in name else 0)
+    np.testing.assert_array_equal(columns["intensity"], INTENSITY)
+    time = columns["gps_time"] * 1e9 if "one" in name else columns["t"]
+    np.testing.assert_allclose(time, TIME, rtol=1e-8)
+    if path.suffix == ".pcd":
+        assert columns.keys() == {"x", "y", "z", "intensity", "t", "noise"}
+        assert columns["t"].dtype == np.uint32 and read.dtype == np.float32
+
+
+@pytest.mark.parametrize("name", ["rows.npy", "rows.txt", "rows.csv", "rows.bin"])
+def test_columns_without_names_are_named_in_order(name: str, tmp_path: Path) -> None:
+    path = tmp_path / name
+    table = np.column_stack([POINTS, INTENSITY, np.arange(60)]).astype("<f4")
+    if path.suffix == ".npy":
+        np.save(path, table)
+    elif path.suffix == ".bin":
+        table.tofile(path)
+    else:
+        np.savetxt(path, table, "%.9g", "," if path.suffix == ".csv" else " ")
+    names = ("x", "y", "z", "reflectance", "ring")
+    columns = read_table(path, names).columns
+    assert tuple(columns) == names
+    np.testing.assert_allclose(np.stack([*columns.values()], axis=1), table, rtol=1e-7)
+    with pytest.raises(InputError, match=r"expected 7: x y z|multiple of 28"):
+        read_table(path, (*names, "sixth", "seventh"))
+    if path.suffix != ".bin":
+        assert tuple(read_table(path).columns) == ("x", "y", "z", "intensity", "column4")
+
+
+@pytest.mark.parametrize("by_turns", [False, True])
+@pytest.mark.parametrize("num_columns", [3, 4, 5, 6, 7, 8])
+def test_the_number_of_columns_of_a_scan_is_found(
+    num_columns: int, by_turns: bool, tmp_path: Path
+) -> None:
+    """A spinning scanner's returns at each azimuth, ring by ring or, as the VLP-16's, from below
+    and above by turns; some of them missing."""
+    azimuth, ring = np.meshgrid(np.linspace(-np.pi, np.pi, 240), np.arange(12), indexing="ij")
+    if by_turns:
+        ring = ring // 2 + 6 * (ring % 2)
+    down = np.deg2rad(ring - 14.0)
+    range_m = np.minimum(1.8 / np.sin(-down), 30 + 5 * np.sin(3 * azimuth))
+    heading = range_m * np.cos(down)
+    scan = [heading * np.cos(azimuth), heading * np.sin(azimuth), range_m * np.sin(down)]
+    time = (azimuth / (2 * np.pi) + 0.5) * 0.1
+    extra = [rng.uniform(0, 1, ring.shape), ring, time, np.zeros(ring.shape), time * 1e6]
+    table = np.stack([c.ravel() for c in (*scan, *extra)], axis=1)[:, :num_columns]
+    table = table[rng.random(len(table)) < (1 if by_turns else 0.9)][: 840 * 3].astype("<f4")
+    table.tofile(tmp_path / "0.bin")
+    assert len(read_table(tmp_path / "0.bin").columns) == num_columns
+
+
+def test_viewpoints_without_the_points(tmp_path: Path) -> None:
+    for data in ("binary", "ascii"):
+        write_pcd(tmp_path / "1.pcd", data)
+        expected = (1, 2, 3, 0.5, -0.5, 0.5, -0.5)
+        assert read_viewpoint(tmp_path / "1.pcd") == expected
+        assert read_table(tmp_path / "1.pcd").viewpoint == expected
+    assert read_viewpoint(tmp_path / "1.bin") is None
+    old = (tmp_path / "1.pcd").read_bytes().replace(b"VIEWPOINT 1 2", b"VIEWPOINT 2")
+    (tmp_path / "1.pcd").write_bytes(old)
+    with pytest.raises(InputError, match="got 6 numbers, expected tx ty tz qw"):
+        read_viewpoint(tmp_path / "1.pcd")
+
+
+def test_old_headers_have_no_counts(tmp_path: Path) -> None:
+    text = "VERSION .7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nWIDTH 2\nHEIGHT 1\nDATA ascii\n"
+    (tmp_path / "a.pcd").write_text(text + "1 2  3\n4 5 6\n")
+    columns = read_table(tmp_path / "a.pcd").columns
+    assert [c.tolist() for c in columns.values()] == [[1, 4], [2, 5], [3, 6]]
+
+
+def cut(path: Path, num_bytes: int) -> None:
+    path.write_bytes(path.read_bytes()[:-num_bytes])
+
+
+def swap(path: Path, old: bytes, new: bytes) -> None:
+    data = path.read_bytes()
+    assert old in data
+    path.write_bytes(data.replace(old, new, 1))
+
+
+DAMAGE = {
+    "pcd cut between points": ("padded.pcd", lambda p: cut(p, 26), "59 points, expected 60"),
+    "pcd cut within a point": ("padded.pcd", lambda p: cut(p, 5), "not a readable .pcd"),
+    "pcd of words cut": (
+        "words.pcd",
+        lambda p: p.write_bytes(b"".join(p.open("rb").readlines()[:-9])),
+        "51 points, expected",
+    ),
+    "packed pcd cut": ("packed.pcd", lambda p: cut(p, 40), "not a readable .pcd"),
+    "packed pcd without points": ("packed.pcd", lambda p: cut(p, 10**4), "header ends before"),
+    "pcd header cut": ("padded.pcd", lambda p: p.write_text(HEADER[:80]), "header ends before"),
+    "pcd without sizes": ("padded.pcd", lambda p: swap(p, b"SIZE", b"SIDE"), "has no SIZE"),
+    "pcd with fewer types": (
+        "padded.pcd",
+        lambda p: swap(p, b"F F F U", b"F F F"),
+        "8 TYPE",
+    ),
+    "pcd of another form": ("padded.pcd", lambda p: swap(p, b"DATA binary", b"DATA zipped"), "pcd"),
+    "ply cut": ("little.ply", lambda p: cut(p, 17), "not a readable .ply"),
+    "ply of words cut": ("words.ply", lambda p: cut(p, 200), "fewer than the 60 vertices"),
+    "ply header cut": ("little.ply", lambda p: p.write_bytes(b"ply\nformat ascii"), ".ply"),
+    "ply without vertices": (
+        "words.ply",
+        lambda p: swap(p, b"element vertex", b"element corner"),
+        "expected vertices",
+    ),
+    "las cut": ("one.las", lambda p: cut(p, 30), "not a readable .las"),
+    "las header cut": ("one.las", lambda p: p.write_bytes(p.read_bytes()[:100]), ".las"),
+    "laz cut": ("one.laz", lambda p: cut(p, 300), "not a readable .laz"),
+    "csv with a short line": ("comma.csv", lambda p: swap(p, b"\n", b"\n1,2\n"), ".csv"),
+    "csv with a word": ("comma.csv", lambda p: swap(p, b"\n", b"\n1,2,x,4,5\n"), ".csv"),
+    "csv not of text": ("comma.csv", lambda p: p.write_bytes(b"\xff\xfe\x00"), ".csv"),
+    "no points": ("comma.csv", lambda p: p.write_text("x,y,z\n"), "holds no points"),
+    "npz of other lengths": (
+        "arrays.npz",
+        lambda p: np.savez(p, x=np.ones(3), y=np.ones(3), z=np.ones(2)),
+        "other shapes",
+    ),
+    "npy of objects": (
+        "records.npy",
+        lambda p: np.save(p, np.array([{}]), allow_pickle=True),
+        "not a readable .npy",
+    ),
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGE)
+def test_damaged_files_are_refused_in_a_line(damage: str, tmp_path: Path) -> None:
+    name, harm, says = DAMAGE[damage]
+    if name.endswith(".ply"):
+        pytest.importorskip("trimesh")
+    path = tmp_path / name
+    WRITERS[name](path)
+    harm(path)
+    with pytest.raises(InputError) as error:
+        read_table(path)
+    line = str(error.value)
+    assert line.startswith(str(path)) and "\n" not in line and says in line, line
+
+
+def test_a_pickle_in_an_array_file_is_not_run(tmp_path: Path) -> None:
+    class Evil:
+        def __reduce__(self):
+            return (Path.touch, (tmp_path / "run",))
+
+    buffer = io.BytesIO()
+    np.save(buffer, np.array([Evil()], dtype=object), allow_pickle=True)
+    (tmp_path / "1.npy").write_bytes(buffer.getvalue())
+    with pytest.raises(InputError, match="not a readable"):
+        read_table(tmp_path / "1.npy")
+    assert not (tmp_path / "run").exists()
+
+
+def test_ply_names_its_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_ply(tmp_path / "1.ply", "ascii")
+    monkeypatch.setitem(__import__("sys").modules, "trimesh.exchange.ply", None)
+    with pytest.raises(InputError, match=r"pip install 'densify\[ply\]'"):
+        read_table(tmp_path / "1.ply")
