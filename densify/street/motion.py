@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from densify.street.curves import Curve, Speed
 from densify.street.terrain import Terrain
-from densify.types import Float
+from densify.types import Float, Int
 
 
 class Poses(NamedTuple):
@@ -37,6 +37,10 @@ class Poses(NamedTuple):
         """(N,3) world -> (N,3) body axes."""
         return np.einsum("nji,nj->ni", self.rotation, directions)
 
+    def rows(self, rows: Int) -> Poses:
+        """Some of them, in that order, as often as asked for."""
+        return Poses(self.rotation[rows], self.position[rows])
+
     def matrix(self, row: int = 0) -> Float:
         """(4,4) ``T_world_body`` of one row."""
         T_world_body = np.eye(4)
@@ -48,6 +52,14 @@ class Trajectory(Protocol):
     def poses(self, times_s: Float) -> Poses:
         """(N,) seconds since the sequence's time zero -> N poses."""
         ...
+
+
+def poses_at(trajectory: Trajectory, times_s: Float) -> Poses:
+    """(N,) seconds -> N poses, worked out once for equal times in a row."""
+    new = np.diff(times_s, prepend=np.nan) != 0
+    if new.all():
+        return trajectory.poses(times_s)
+    return trajectory.poses(times_s[new]).rows(np.cumsum(new) - 1)
 
 
 class Still:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from densify.street.materials import GLASS_PASSES
 from densify.street.mesh import Mesh
-from densify.street.motion import Poses, Still, Trajectory
+from densify.street.motion import Poses, Still, Trajectory, poses_at
 from densify.types import Bool, Float
 
 _MAX_LAYERS = 8  # of glass and leaves that one ray passes
@@ -115,12 +115,13 @@ class World:
         differ from the rays' own by at most ``spread`` rad."""
         n = len(rays.time_s)
         best = [Hits.none(n) for _ in directions]
+        lines = _Lines.of(rays, spread)
         for index, body in enumerate(self.bodies):
-            rows = np.flatnonzero(self._near(index, rays, spread)) if index else np.arange(n)
+            rows = lines.near(*self._ball(index, rays.time_s)) if index else np.arange(n)
             if not len(rows):
                 continue
             still = isinstance(body.trajectory, Still)
-            poses = body.trajectory.poses(rays.time_s[rows])
+            poses = poses_at(body.trajectory, rays.time_s[rows])
             origin = rays.origin[rows] if still else poses.undo(rays.origin[rows])
             for hits, ray, luck in zip(best, directions, lucks, strict=True):
                 direction = ray[rows] if still else poses.unturn(ray[rows])
@@ -140,17 +141,12 @@ class World:
     def poses(self, body: int, times_s: Float) -> Poses:
         return self.bodies[body].trajectory.poses(times_s)
 
-    def _near(self, index: int, rays: Rays, spread: float) -> Bool:
-        """(N,) the rays whose line passes the body's bounding sphere, blown up by its motion."""
-        times = np.array([rays.time_s.min(), rays.time_s.max()])
-        poses = self.poses(index, times)
-        ends = poses.apply(np.broadcast_to(self._centre[index], (2, 3)))
-        away = ends.mean(axis=0) - rays.origin
-        along = np.einsum("ni,ni->n", away, rays.direction)
-        moved = np.linalg.norm(ends[1] - ends[0])
-        radius = self._radius_m[index] + 0.75 * moved + 0.1 + spread * np.abs(along)
-        near: Bool = np.einsum("ni,ni->n", away, away) - along**2 < radius**2
-        return near & (along > -radius)
+    def _ball(self, index: int, times_s: Float) -> tuple[Float, float]:
+        """Centre (3,) and radius of a sphere that holds the body at all times between these."""
+        ends_s = np.array([times_s.min(), times_s.max()])
+        ends = self.poses(index, ends_s).apply(np.broadcast_to(self._centre[index], (2, 3)))
+        moved_m = float(np.linalg.norm(ends[1] - ends[0]))
+        return ends.mean(axis=0), float(self._radius_m[index]) + 0.75 * moved_m + 0.1
 
     def _cast_body(
         self, index: int, origin: Float, direction: Float, passes: Float, luck: Float
@@ -178,6 +174,32 @@ class World:
             rows = rows[~stops]
             luck[rows] = (luck[rows] + _GOLDEN) % 1.0
         return hits
+
+
+class _Lines(NamedTuple):
+    """Rays, asked about many balls. origin, direction: (3,N). along: (N,) their product. squared:
+    (N,) of the origin. spread: rad to either side that count as the same ray."""
+
+    origin: Float
+    direction: Float
+    along: Float
+    squared: Float
+    spread: float
+
+    @staticmethod
+    def of(rays: Rays, spread: float) -> _Lines:
+        origin, direction = rays.origin.T.copy(), rays.direction.T.copy()
+        along, squared = (np.einsum("in,in->n", origin, a) for a in (direction, origin))
+        return _Lines(origin, direction, along, squared, spread)
+
+    def near(self, centre: Float, radius_m: float) -> NDArray[np.int64]:
+        """Rows of the rays that pass a ball, or begin in it."""
+        along = np.einsum("in,i->n", self.direction, centre)
+        along -= self.along
+        squared = np.einsum("in,i->n", self.origin, -2 * centre)
+        squared += self.squared + centre @ centre - along**2
+        reach_m = radius_m + self.spread * np.abs(along)
+        return np.flatnonzero((squared < reach_m**2) & (along > -reach_m))
 
 
 def _solid(mesh: Mesh) -> Mesh:
