@@ -262,22 +262,25 @@ class _Seen(NamedTuple):
         views, watch, output, key = self.views, self.watch, self.settings.output, self.views.key
         images, visible = self.images or {}, METHODS[method].visible
         visible = visible and self.settings.project.visibility
+        with watch.stage("project"):
+            seen = views.see(cloud)
         with watch.stage("held out"):
-            held_out_scores = self.held_out.scores(cloud, visible)
+            held_out_scores = self.held_out.scores(seen, visible)
         movers = {}
         if output.movers == "separate":
             with watch.stage("project"):
                 movers = views.movers(cloud, visible, images)
-        if output.movers != "keep":
-            cloud = cloud.select(~cloud.moving)
         with watch.stage("project"):
+            if output.movers != "keep":
+                seen = views.see(cloud.select(~cloud.moving))
             depth = {
                 name: with_ages(maps, self.stretch, key, views.exposures[name].late_s)
-                for name, maps in views.depth(cloud, visible).items()
+                for name, maps in views.depth(seen, visible).items()
             }
+        cloud = seen.cloud
         if self.images is not None:
             with watch.stage("colour"):
-                cloud = views.coloured(cloud, depth, images)
+                cloud = views.coloured(seen, depth, images)
         with watch.stage("score"):
             cameras, sweep = self.sequence.cameras, self.stretch[key]
             metrics = _scores(self.truth, cameras, sweep, self.key_image, cloud, depth)

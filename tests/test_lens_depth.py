@@ -29,9 +29,9 @@ def seen_from(camera, points, normal, spacing_m, measure, **knobs):
         np.zeros(n, np.int32),
     )
     settings = ProjectSettings(support=1, **knobs)
-    return project(
-        make_cloud(points), Exposure(camera, np.eye(4), measure=measure), settings, patches
-    )
+    cloud = make_cloud(points)
+    view = Exposure(camera, np.eye(4), measure=measure).sees(cloud)
+    return project(cloud, view, settings, patches)
 
 
 def pixels(camera, step=1):
@@ -103,7 +103,7 @@ def test_patches_are_as_large_as_the_lens_shows_them(angle_deg):
     )
     cloud = make_cloud(points @ exposure[:3, :3])
     knobs = ProjectSettings(support=1, footprint=0.5, slack_m=0.0)
-    maps = project(cloud, Exposure(FISHEYE, exposure, measure="range"), knobs, patches)
+    maps = project(cloud, Exposure(FISHEYE, exposure, measure="range").sees(cloud), knobs, patches)
     uv, inside = image_points(FISHEYE, points)
     assert inside.all()
     hidden = np.rint(uv[1:][maps.reason[1:] == Reason.HIDDEN])

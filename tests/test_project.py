@@ -74,7 +74,7 @@ def patches_of(cloud, knobs, origins=None, key_image=None):
 def view(cloud, camera, T_cam_key, knobs, origins=None):
     """`project` with the cloud's patches."""
     surface = patches_of(cloud, knobs, origins)
-    return project(cloud, Exposure(camera, T_cam_key), knobs, surface)
+    return project(cloud, Exposure(camera, T_cam_key).sees(cloud), knobs, surface)
 
 
 def take(cloud, index):
@@ -220,7 +220,7 @@ def see(
     )
     if since_key_ns is not None:
         cloud = replace(cloud, since_key_ns=np.asarray(since_key_ns))
-    return project(cloud, Exposure(camera, np.eye(4)), knobs, surface)
+    return project(cloud, Exposure(camera, np.eye(4)).sees(cloud), knobs, surface)
 
 
 def test_back_wall_does_not_shine_through_the_gaps_of_the_front_wall():

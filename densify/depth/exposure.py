@@ -25,6 +25,7 @@ from densify.types import (
     Cloud,
     Float,
     Float32,
+    Int,
     KnowsImagePoses,
     LidarSequence,
     Stretch,
@@ -127,6 +128,22 @@ def _own_time_ns(sequence: LidarSequence, key: int) -> tuple[int, int]:
     return begin_ns, end_ns
 
 
+class InView(NamedTuple):
+    """The K of a cloud's points that are on the image, as the camera sees them. rows: (K,) of the
+    cloud, ascending. points_cam, uv: as of a `Sight`."""
+
+    exposure: Exposure
+    rows: Int
+    points_cam: Float
+    uv: Float
+
+    def select(self, keep: Bool) -> InView:
+        """The view of ``cloud.select(keep)``."""
+        kept = keep[self.rows]
+        rows = (np.cumsum(keep) - 1)[self.rows[kept]]
+        return InView(self.exposure, rows, self.points_cam[kept], self.uv[kept])
+
+
 class Sight(NamedTuple):
     """Points as a camera sees them. points_cam: (N,3) metres, camera frame, when they are seen.
     uv: (N,2) px, NaN where there is no pixel. inside: (N,) on the image."""
@@ -198,9 +215,11 @@ class Exposure:
             uv, inside = image_points(self.camera, there)
         return Sight(there, uv, inside)
 
-    def sees(self, cloud: Cloud) -> Sight:
-        """`see` of a cloud at the key's moment."""
-        return self.see(cloud.points, cloud.velocity_m_s)
+    def sees(self, cloud: Cloud) -> InView:
+        """What of a cloud at the key's moment is on the image."""
+        sight = self.see(cloud.points, cloud.velocity_m_s)
+        rows = np.flatnonzero(sight.inside)
+        return InView(self, rows, sight.points_cam[rows], sight.uv[rows])
 
     def depth_m(self, points_cam: Float) -> Float:
         """(N,3) -> (N,) as ``measure`` says."""

@@ -17,9 +17,10 @@ def optical_flow(cloud: Cloud, depth: DepthMap, exposure: Exposure, other: Expos
     not matter.
     """
     chosen = np.flatnonzero(depth.reason == Reason.KEPT)
-    uv = exposure.sees(cloud).uv[chosen]
+    points, velocity_m_s = cloud.points[chosen], cloud.velocity_m_s[chosen]
+    uv = exposure.see(points, velocity_m_s).uv
     column, row = np.rint(uv).astype(np.int64).T
-    there = other.see(cloud.points[chosen], cloud.velocity_m_s[chosen]).uv
+    there = other.see(points, velocity_m_s).uv
     flow = np.full((*depth.depth_m.shape, 2), np.nan, np.float32)
     flow[row, column] = there - uv
     return flow

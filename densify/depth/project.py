@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from densify.config import ProjectSettings
-from densify.depth.exposure import Exposure
+from densify.depth.exposure import Exposure, InView
 from densify.depth.fill import fill_between
 from densify.geometry.cameras import pixels_per_metre
 from densify.geometry.poses import rotate
@@ -74,13 +74,14 @@ class _Pixels:
 
 def project(
     cloud: Cloud,
-    exposure: Exposure,
+    view: InView,
     settings: ProjectSettings,
     patches: Patches,
     filled: bool = True,
 ) -> DepthMap:
     """The depth map of ``cloud``, at the key's moment, as a camera sees it at its exposure.
 
+    view: of the cloud (`densify.depth.exposure.Exposure.sees`).
     settings: knobs, see `densify.config.ProjectSettings`; with ``visibility`` off the nearest point
     of each pixel is taken as it is; else the source sweep nearest in time to the key wins a pixel.
     patches: of the cloud, at the key's moment (`densify.depth.patches.patches`). filled: False
@@ -94,8 +95,8 @@ def project(
     is close, the surface rough, or the point nearly hidden. ``reason`` says of every point why it
     is not in the map.
     """
-    camera = exposure.camera
-    points = _in_image(cloud, exposure, patches, settings.visibility)
+    camera = view.exposure.camera
+    points = _in_image(cloud, view, patches, settings.visibility)
     own = np.clip(cloud.confidence[points.index], _LEAST_CONFIDENCE, 1.0)
     reason = np.full(len(cloud), Reason.OUTSIDE, np.uint8)
     if settings.visibility:
@@ -122,7 +123,7 @@ def project(
         confidence=confidence,
         frame=frame,
         reason=reason,
-        measure=exposure.measure,
+        measure=view.exposure.measure,
     )
     if not filled:
         return maps
@@ -147,10 +148,9 @@ class _Local(NamedTuple):
     spacing_px: Float
 
 
-def _in_image(cloud: Cloud, exposure: Exposure, patches: Patches, vetoed: bool) -> _InImage:
-    sight = exposure.sees(cloud)
-    index = np.flatnonzero(sight.inside & ~patches.free if vetoed else sight.inside)
-    points_cam = sight.points_cam[index]
+def _in_image(cloud: Cloud, view: InView, patches: Patches, vetoed: bool) -> _InImage:
+    kept = ~patches.free[view.rows] if vetoed else np.ones(len(view.rows), bool)
+    exposure, index, points_cam = view.exposure, view.rows[kept], view.points_cam[kept]
     depth = exposure.depth_m(points_cam).astype(np.float32)
     normal = rotate(exposure.T_cam_key, patches.normal[index].astype(np.float64))
     plain = exposure.camera.is_rectified and exposure.measure == "z"
@@ -161,7 +161,7 @@ def _in_image(cloud: Cloud, exposure: Exposure, patches: Patches, vetoed: bool) 
     slope = np.nan_to_num(local.slope, posinf=0.0, neginf=0.0)
     return _InImage(
         index=index,
-        uv=sight.uv[index],
+        uv=view.uv[kept],
         depth=depth,
         focal_px=local.focal_px,
         slope=np.clip(slope, -most, most),

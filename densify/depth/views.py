@@ -5,14 +5,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from densify.config import Config, ProjectSettings
 from densify.depth.colour import colour
-from densify.depth.exposure import Exposure, Shot
+from densify.depth.exposure import Exposure, InView, Shot
 from densify.depth.optical_flow import optical_flow
 from densify.depth.patches import patches
 from densify.depth.project import project
@@ -29,10 +29,24 @@ from densify.types import (
     Float32,
     LidarSequence,
     Mover,
+    Patches,
     Reason,
     Stretch,
     Truth,
 )
+
+
+class SeenCloud(NamedTuple):
+    """A cloud with what every map of it needs. views: by the maps' names."""
+
+    cloud: Cloud
+    patches: Patches
+    views: Mapping[str, InView]
+
+    def select(self, keep: Bool) -> SeenCloud:
+        """Some of the points, each seen as before."""
+        views = {name: view.select(keep) for name, view in self.views.items()}
+        return SeenCloud(self.cloud.select(keep), self.patches.select(keep), views)
 
 
 @dataclass(frozen=True)
@@ -70,25 +84,34 @@ class Views:
         }
         return Views(key, key_image, exposures, sensors, origins, settings.project)
 
-    def depth(self, cloud: Cloud, visible: bool = True, filled: bool = True) -> dict[str, DepthMap]:
+    def see(self, cloud: Cloud) -> SeenCloud:
+        """A cloud as the cameras see it."""
+        surface = patches(
+            cloud, self.key, self.settings, self.sensors, self.origins, self.key_image
+        )
+        return SeenCloud(cloud, surface, {n: e.sees(cloud) for n, e in self.exposures.items()})
+
+    def depth(
+        self, seen: SeenCloud, visible: bool = True, filled: bool = True
+    ) -> dict[str, DepthMap]:
         """Depth maps by name. visible: leave out what is hidden, vetoed or doubtful. filled: and
         fill between what is measured."""
         settings = replace(self.settings, visibility=visible)
-        surface = patches(cloud, self.key, settings, self.sensors, self.origins, self.key_image)
         return {
-            name: project(cloud, exposure, settings, surface, filled)
-            for name, exposure in self.exposures.items()
+            name: project(seen.cloud, view, settings, seen.patches, filled)
+            for name, view in seen.views.items()
         }
 
     def coloured(
         self,
-        cloud: Cloud,
+        seen: SeenCloud,
         depth: Mapping[str, DepthMap],
         images: Mapping[str, NDArray[np.uint8]],
     ) -> Cloud:
         """With the colours of the images there are; depth: what `depth` made of the cloud."""
+        cloud = seen.cloud
         for name, image in images.items():
-            rgb = colour(cloud, self.exposures[name], depth[name], image)
+            rgb = colour(cloud, seen.views[name], depth[name], image)
             cloud = replace(cloud, rgb=rgb)
         return cloud
 
@@ -139,7 +162,7 @@ class Views:
         instances = np.unique(cloud.instance[cloud.moving])
         movers = {}
         for instance in instances.tolist():
-            part = cloud.select(cloud.moving & (cloud.instance == instance))
+            part = self.see(cloud.select(cloud.moving & (cloud.instance == instance)))
             depth = self.depth(part, visible)
             movers[instance] = Mover(self.coloured(part, depth, images), depth)
         return movers
@@ -161,20 +184,22 @@ class HeldOut:
         """cloud: says what moves in the key sweep, and how fast."""
         views = replace(views, key_image=None)  # what is held out must not help
         own = cloud.select(cloud.frame == views.key)
-        key_alone = views.depth(own, filled=False)
-        movers = views.depth(own.select(own.moving), filled=False)
+        key_alone = views.depth(views.see(own), filled=False)
+        movers = views.depth(views.see(own.select(own.moving)), filled=False)
         moving = {
             name: (maps.depth_m > 0) & (maps.depth_m == key_alone[name].depth_m)
             for name, maps in movers.items()
         }
         return HeldOut(views, key_alone, moving)
 
-    def scores(self, cloud: Cloud, visible: bool) -> dict[str, Any] | None:
+    def scores(self, seen: SeenCloud, visible: bool) -> dict[str, Any] | None:
         """Scores by name, as `densify.scores.depth_metrics.depth_scores`, and the ``curve`` of
         precision over density; None for a cloud of the key sweep alone."""
-        rest = cloud.select(cloud.frame != self.views.key)
-        if not len(rest):
+        others = seen.cloud.frame != self.views.key
+        if not others.any():
             return None
+        rest = seen.select(others)
+        rest = rest._replace(patches=replace(rest.patches, free=np.zeros(len(rest.cloud), bool)))
         scores: dict[str, Any] = {}
         for name, maps in self.views.depth(rest, visible).items():
             truth_m, camera = self.key_alone[name].depth_m, self.views.exposures[name].camera

@@ -71,6 +71,14 @@ class Patches:
     free: Bool
     sweep: NDArray[np.int32]
 
+    def select(self, keep: Bool) -> Patches:
+        """The patches of ``cloud.select(keep)``."""
+        sweep = self.sweep[keep]
+        number = np.cumsum(np.bincount(sweep) > 0) - 1
+        return Patches(
+            self.normal[keep], self.spacing_m[keep], self.free[keep], number[sweep].astype(np.int32)
+        )
+
 
 class Reason(IntEnum):
     """Why a point is not in a depth map; the first that applies."""
