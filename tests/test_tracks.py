@@ -9,7 +9,8 @@ import pytest
 from densify.config import GroundSettings
 from densify.flow.tracking.clock import Clock
 from densify.flow.tracking.evidence import Standing
-from densify.flow.tracking.tracks import Track, _groups_to_start
+from densify.flow.tracking.sightings import Track
+from densify.flow.tracking.tracks import _groups_to_start
 from densify.geometry.height_map import HeightMap
 
 PERIOD_NS = 100_000_000

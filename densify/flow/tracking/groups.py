@@ -19,8 +19,9 @@ from densify.flow.tracking.evidence import (
     firing_times_s,
 )
 from densify.flow.tracking.shapes import Shape
+from densify.flow.tracking.sightings import Track
 from densify.flow.tracking.soften import Part, Softened, soften
-from densify.flow.tracking.tracks import Track, follow_groups
+from densify.flow.tracking.tracks import follow_groups
 from densify.geometry import poses
 from densify.geometry.height_map import HeightMap
 from densify.geometry.sensor import Sensors
@@ -110,8 +111,7 @@ def estimate_motion(scene: Scene, settings: Config, argument: str) -> GroupMotio
 
     As `densify.flow.engines.EngineModule`; takes no argument. At any rate: what is near in time is
     asked of the stamps. Below 10 Hz what turns, bends or is hidden between two sweeps is followed
-    worse or lost; at 20 Hz most scanners measure half as many points in a sweep, so that objects
-    far away are seen by too few.
+    worse or lost; above, sweeps within 0.1 s are one look, see `densify.flow.tracking.looks`.
     """
     stretch, space, ground = scene.stretch, scene.space, scene.ground
     standing = [Standing.of(stretch, i, found) for i, found in enumerate(scene.candidates)]
@@ -219,7 +219,7 @@ def _attach(
     for k, track in enumerate(tracks):
         if not _foretold(track, i, clock):
             continue
-        rim = track.place(shapes[k].rim, track.seen_at(i, clock))
+        rim = track.place(shapes[k].rim, track.seen_at(clock.time_ns[i]))
         low, high = rim.min(0) - 2 * _ATTACH_M, rim.max(0) + 2 * _ATTACH_M
         low[2] -= 1.0  # down to the wheels
         rows = rows_inside(seen.points, low, high)
@@ -250,7 +250,7 @@ def _lengthen(
         mine = np.flatnonzero(instance == k)
         if not len(mine):
             continue
-        at_s = track.seen_at(i, space.clock)
+        at_s = track.seen_at(space.clock.time_ns[i])
         ahead = track.path.rate(at_s)[:2]
         ahead = ahead / max(float(np.linalg.norm(ahead)), 1e-6)
         axes = np.stack([ahead, [-ahead[1], ahead[0]]], axis=1)

@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: MIT
 """Groups of candidates followed through a stretch as rigid objects, and the proof that they move.
 
-A track is a group's accumulated shape (its model) and one planar rigid motion per sweep. It starts
-from the velocity that most sweeps agree on, is followed both ways by aligning each sweep with the
+A track is a group's accumulated shape (its model) and one planar rigid motion per look. It starts
+from the velocity that most looks agree on, is followed both ways by aligning each look with the
 model, is smoothed in time, and counts only if that smooth motion explains what was measured.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -17,8 +17,9 @@ from densify.flow.tracking.align import GATES_M, MIN_FIT, Model, align, apply, u
 from densify.flow.tracking.clock import Clock
 from densify.flow.tracking.evidence import FreeSpace, Standing
 from densify.flow.tracking.lone_rings import in_line, linked_in_line, single_rings
-from densify.flow.tracking.paths import Path
+from densify.flow.tracking.looks import Look, looks_of
 from densify.flow.tracking.shapes import Shape
+from densify.flow.tracking.sightings import Track
 from densify.flow.tracking.vote import DistanceField, vote
 from densify.geometry.height_map import HeightMap
 from densify.kernels.clouds import rows_inside
@@ -31,8 +32,7 @@ _NEARER_END, _NEARER_END_S = 0.7, 0.1  # each time a start is so much nearer it 
 _FIT_M = 0.3
 _RINGS_M = 5.0
 _NEAR_S = 0.3
-_SHARE_UNSEEN = 0.5  # of the points a sweep usually shows
-_MANY_POINTS = 100  # more do not place a sweep better
+_SHARE_UNSEEN = 0.5  # of the points a look usually shows
 # m, m, rad: of what is foretold by up to so long, and in proportion by longer.
 _PREDICTION_STD, _PREDICTION_S = np.array([0.3, 0.3, 0.06]), 0.25
 _REFINED_STD = np.array([0.15, 0.15, 0.03])  # m, m, rad: of the smooth motion
@@ -40,98 +40,27 @@ _RECENT_S = 0.4  # the states in so long tell a rate
 _STEADY = np.array([1.0, 1.0, 1.0, 0.9])  # of what it was then: turns level out
 _ROUGH_M, _ROUGH_PER_GAP, _ROUGH_S = 0.04, 0.2, 0.003  # by gap of rings, by speed
 _LEAST_WAY_M, _LEAST_WAY_PER_RESIDUAL = 0.35, 8.0
-_BESIDE_M = 1.0
 _NUM_ASKED = 60
 _MISSES_ALLOWED, _MISSED_S = 1, 0.2  # either: a track ends when both are exceeded
 _LEAST_STATES, _LEAST_S = 3, 0.15
 _MAX_CONTRADICTIONS = 0.3  # of those that standing still leaves
 
 
-@dataclass
-class Track:
-    """One rigid object in the stretch.
-
-    centre: (3,) about which it turns, world. states: sweep index -> (4,) x y z displacement (m)
-    and yaw (rad) since the sweep it started in; z as the ground under it rises. times_s:
-    sweep index -> when that sweep saw it, which is not the sweep's reference time. claimed: sweep
-    index -> rows of `Standing` that are its. path: the smooth motion.
-    """
-
-    centre: Float
-    states: dict[int, Float] = field(default_factory=dict)
-    times_s: dict[int, float] = field(default_factory=dict)
-    claimed: dict[int, np.ndarray] = field(default_factory=dict)
-    path: Path = field(init=False)
-
-    def carry(self, points: Float, from_s: float | Float, to_s: float | Float) -> Float:
-        """(N,3) points of the object at one time -> at another, world; one time or one each."""
-        return self.place(self.undo(points, from_s), to_s)
-
-    def undo(self, points: Float, seen_s: float | Float) -> Float:
-        """(N,3) points seen at a time -> in the object's own frame."""
-        return undo(self.path(seen_s), points, self.centre)
-
-    def place(self, points: Float, time_s: float | Float) -> Float:
-        """Inverse of `undo`."""
-        return apply(self.path(time_s), points, self.centre)
-
-    def velocity_m_s(self, points: Float, time_s: float) -> Float:
-        """(N,3) of the object's points where they are at that time."""
-        state, rate = self.path(time_s), self.path.rate(time_s)
-        velocity_m_s = np.tile(rate[:3], (len(points), 1))
-        velocity_m_s[:, 0] -= rate[3] * (points[:, 1] - self.centre[1] - state[1])
-        velocity_m_s[:, 1] += rate[3] * (points[:, 0] - self.centre[0] - state[0])
-        return velocity_m_s
-
-    def seen_in(self, standing: Sequence[Standing], sweeps: Iterable[int]) -> Float:
-        """(N,3) what these sweeps saw of the object, in its own frame."""
-        parts = [np.zeros((0, 3))]
-        for j in sweeps:
-            c, rows = standing[j], self.claimed[j]
-            parts.append(self.undo(c.points[rows], c.time_s[rows]))
-        return np.concatenate(parts)
-
-    def add(self, j: int, state: Float, time_s: float, rows: np.ndarray) -> None:
-        """What sweep j saw of the object."""
-        self.states[j], self.times_s[j], self.claimed[j] = state, time_s, rows
-
-    def rise_m(self, ground: HeightMap, state: Float) -> float:
-        """How much higher the ground is in that state under the object and on both sides of it, in
-        the median: nobody may ever have seen the road that it covers."""
-        way = state[:2] / max(float(np.linalg.norm(state[:2])), 1e-9)
-        start = self.centre[:2] + np.outer([-_BESIDE_M, 0.0, _BESIDE_M], [-way[1], way[0]])
-        return float(np.median(ground.under(start + state[:2]) - ground.under(start)))
-
-    def typical_size(self) -> float:
-        """Points per sweep."""
-        return float(np.median([len(rows) for rows in self.claimed.values()]))
-
-    def smooth(self) -> None:
-        """Lay the path through the states; sweeps that saw many points count more."""
-        seen = sorted(self.states)
-        times_s = np.array([self.times_s[j] for j in seen])
-        states = np.stack([self.states[j] for j in seen])
-        weights = np.array([min(len(self.claimed[j]), _MANY_POINTS) for j in seen], float)
-        self.path = Path.fit(times_s, states, weights)
-
-    def seen_at(self, j: int, clock: Clock) -> float:
-        """When sweep j sees, or would see, the object."""
-        nearest = clock.nearest(j, self.times_s)
-        return float(clock.time_s[j] + self.times_s[nearest] - clock.time_s[nearest])
-
-
 def follow_groups(standing: Sequence[Standing], space: FreeSpace, ground: HeightMap) -> list[Track]:
     """All proven moving objects of the stretch."""
-    fields = [DistanceField.of(c.points[c.candidate]) for c in standing]
+    looks = looks_of(standing, space.clock)
+    clock = Clock(np.array([look.time_ns for look in looks]))
+    seen = [look.seen for look in looks]
+    fields = [DistanceField.of(c.points[c.candidate]) for c in seen]
     free = [np.ones(len(c.points), bool) for c in standing]  # not yet part of a track
     untried = [np.ones(len(c.points), bool) for c in standing]
     tracks = []
-    for i, group in _groups_to_start(standing, space.clock):
-        members = group[free[i][group] & untried[i][group]]
+    for n, group in _groups_to_start(seen, clock):
+        members = group[looks[n].gather(free)[group] & looks[n].gather(untried)[group]]
         if len(members) < _MIN_POINTS:
             continue
-        velocity = vote(standing[i].points[members], i, fields, space.clock)
-        track = _follow(members, i, velocity, standing, free, ground, space.clock)
+        velocity = vote(seen[n].points[members], n, fields, clock)
+        track = _follow(members, n, velocity, looks, free, ground, clock)
         proven = _prove(track, standing, space)
         if proven:
             _gather(track, standing, free, space)
@@ -147,7 +76,7 @@ def follow_groups(standing: Sequence[Standing], space: FreeSpace, ground: Height
 
 
 def _groups_to_start(standing: Sequence[Standing], clock: Clock) -> list[tuple[int, np.ndarray]]:
-    """Sweep and members of the clusters that are mostly seeds, the best start first: what is seen
+    """Look and members of the clusters that are mostly seeds, the best start first: what is seen
     well makes a good model, and far from the ends of the stretch both sides tell how it moves."""
     groups = []
 
@@ -168,53 +97,52 @@ def _follow(
     members: np.ndarray,
     start: int,
     velocity: Float,
-    standing: Sequence[Standing],
+    looks: Sequence[Look],
     free: Sequence[Bool],
     ground: HeightMap,
     clock: Clock,
 ) -> Track:
-    """Forwards, then backwards, with everything seen so far as the model."""
-    here = standing[start]
+    """Forwards, then backwards, with everything seen so far as the model. clock: of the looks."""
+    here = looks[start].seen
     rate = np.append(velocity, 0.0)
     seen_s = float(here.time_s[members].mean())
     points = _at_once(here, members, rate, seen_s)
     track = Track(points.mean(0))
-    track.add(start, np.zeros(4), seen_s, members)
+    track.add(start, looks[start], np.zeros(4), seen_s, members)
     model = Model(points)
+    recent = clock.num_in(_RECENT_S)
     for direction in (1, -1):
-        last, j = start, start + direction
-        while 0 <= j < len(standing) and (
-            abs(j - last) <= 1 + _MISSES_ALLOWED or clock.near(j, last, _MISSED_S)
+        last, n = start, start + direction
+        while 0 <= n < len(looks) and (
+            abs(n - last) <= 1 + _MISSES_ALLOWED or clock.near(n, last, _MISSED_S)
         ):
-            recent = clock.num_in(_RECENT_S)
-            about_s = track.seen_at(j, clock)
-            found = _find(model, track, rate, recent, standing[j], free[j], ground, about_s)
+            found = _find(model, track, rate, recent, looks[n], free, ground)
             if found is not None:
-                last = j
+                last = n
                 state, seen_s, rows, points = found
-                track.add(j, state, seen_s, rows)
+                track.add(n, looks[n], state, seen_s, rows)
                 model.add(undo(state, points, track.centre))
-            j += direction
+            n += direction
     return track
 
 
 def _at_once(c: Standing, rows: np.ndarray, rate: Float, time_s: float) -> Float:
-    """(N,3) candidates of one sweep, seen one after the other, where they all were at one time."""
+    """(N,3) candidates of one look, seen one after the other, where they all were at one time."""
     return c.points[rows] + (time_s - c.time_s[rows])[:, None] * rate[:3]
 
 
 def _predict(track: Track, rate: Float, num: int, time_s: float) -> tuple[Float, Float, Float]:
     """State, its rate, and how far off (3,) the state may be in x y and yaw, by the constant
     velocity of the ``num`` states nearest in time."""
-    known = sorted(track.states, key=lambda k: (abs(track.times_s[k] - time_s), k))[:num]
-    nearest = known[0]
-    ahead_s = time_s - track.times_s[nearest]
+    nearest_first = sorted(track.sightings.items(), key=lambda s: (abs(s[1].seen_s - time_s), s[0]))
+    known = [sighting for _, sighting in nearest_first[:num]]
+    ahead_s = time_s - known[0].seen_s
     if len(known) > 1:
-        t = np.array([track.times_s[k] for k in known])
+        t = np.array([sighting.seen_s for sighting in known])
         t -= t.mean()
-        rate = t @ np.stack([track.states[k] for k in known]) / (t @ t) * _STEADY
+        rate = t @ np.stack([sighting.state for sighting in known]) / (t @ t) * _STEADY
     std = _PREDICTION_STD * max(1.0, abs(ahead_s) / _PREDICTION_S)
-    return track.states[nearest] + rate * ahead_s, rate, std
+    return known[0].state + rate * ahead_s, rate, std
 
 
 def _find(
@@ -222,21 +150,22 @@ def _find(
     track: Track,
     rate: Float,
     num_recent: int,
-    c: Standing,
-    free: Bool,
+    look: Look,
+    free: Sequence[Bool],
     ground: HeightMap,
-    about_s: float,
 ) -> tuple[Float, float, np.ndarray, Float] | None:
-    """Align one sweep's candidates with the model.
+    """Align one look's candidates with the model.
 
-    about_s: roughly when the sweep saw the object. Returns the state, when it held, the rows that
-    fit and where those points were at that time; None where too few fit.
+    Returns the state, when it held, the rows that fit and where those points were at that time;
+    None where too few fit.
     """
-    centre = track.centre
-    expected = apply(_predict(track, rate, num_recent, about_s)[0], model.points, centre)
-    low, high = expected.min(0) - GATES_M[0], expected.max(0) + GATES_M[0]
+    c, centre = look.seen, track.centre
+    about, about_rate, _ = _predict(track, rate, num_recent, track.seen_at(look.time_ns))
+    expected = apply(about, model.points, centre)
+    slack_m = GATES_M[0] + look.half_s * np.abs(about_rate[:3])
+    low, high = expected.min(0) - slack_m, expected.max(0) + slack_m
     inside = rows_inside(c.points, low, high)
-    inside = inside[free[inside]]
+    inside = inside[look.gather(free)[inside]]
     rows, enough = inside[c.cluster[inside] >= 0], float(MIN_FIT)
     if len(rows) < MIN_FIT:  # seen by nobody else, it may be there all the same
         rows, enough = inside, max(MIN_FIT, _SHARE_UNSEEN * track.typical_size())
@@ -268,7 +197,7 @@ def _gather(
     shape = Shape.of(track.seen_in(standing, sorted(track.claimed)))
     for j, own in track.claimed.items():
         c = standing[j]
-        there = track.place(shape.rim, track.times_s[j])
+        there = track.place(shape.rim, track.seen_at(space.clock.time_ns[j]))
         rows = rows_inside(c.points, there.min(0) - 2 * _FIT_M, there.max(0) + 2 * _FIT_M)
         rows = rows[free[j][rows] & (c.cluster[rows] >= 0)]
         rows = np.setdiff1d(rows, own, assume_unique=True)
@@ -286,11 +215,11 @@ def _claim_rings(
     not contradict, see `densify.flow.tracking.lone_rings`. They do not place it: a ring stays where
     the rays are."""
     shape = Shape.of(track.seen_in(standing, sorted(track.claimed)))
-    ahead = track.path.rate(track.times_s[next(iter(track.states))])[:2]
+    ahead = track.path.rate(next(iter(track.sightings.values())).seen_s)[:2]
     found, bodies = [], []
     for j, own in track.claimed.items():
         c = standing[j]
-        there = track.place(shape.rim, track.times_s[j])
+        there = track.place(shape.rim, track.seen_at(space.clock.time_ns[j]))
         rows = rows_inside(c.points, there.min(0) - _RINGS_M, there.max(0) + _RINGS_M)
         rows = rows[free[j][rows] & (c.cluster[rows] >= 0)]
         rows = np.setdiff1d(rows, own, assume_unique=True)
@@ -318,28 +247,30 @@ def _not_contradicted(
 
 
 def _refine(track: Track, standing: Sequence[Standing], ground: HeightMap) -> None:
-    """Align every sweep once more, with what others saw, if that makes the motion smoother.
+    """Align every look once more, with what others saw, if that makes the motion smoother.
 
-    Followed sweep by sweep, an object whose other side comes into view drifts: the first shape is
-    all there is to hold on to. The even sweeps are aligned with the shape that the odd ones show,
-    and the other way round, so that no sweep holds on to itself.
+    Followed look by look, an object whose other side comes into view drifts: the first shape is
+    all there is to hold on to. The even looks are aligned with the shape that the odd ones show,
+    and the other way round, so that no look holds on to itself.
     """
-    sweeps = sorted(track.claimed)
-    shapes = [track.seen_in(standing, [j for j in sweeps if j % 2 == odd]) for odd in (0, 1)]
+    sweeps: tuple[list[int], list[int]] = [], []
+    for n, sighting in sorted(track.sightings.items()):
+        sweeps[n % 2].extend(sighting.sweeps)
+    shapes = [track.seen_in(standing, some) for some in sweeps]
     if not all(map(len, shapes)):
         return
     models = [Model(x) for x in shapes]
-    before = dict(track.states), track.path
-    for j, rows in track.claimed.items():
-        at_s = track.times_s[j]
-        points = track.carry(standing[j].points[rows], standing[j].time_s[rows], at_s)
-        state = align(models[1 - j % 2], points, track.centre, track.path(at_s), _REFINED_STD)
+    before = dict(track.sightings), track.path
+    for n, sighting in track.sightings.items():
+        at_s = sighting.seen_s
+        points = track.place(track.seen_in(standing, sighting.sweeps), at_s)
+        state = align(models[1 - n % 2], points, track.centre, track.path(at_s), _REFINED_STD)
         if state is not None:
             state[2] = track.rise_m(ground, state)
-            track.states[j] = state
+            track.sightings[n] = replace(sighting, state=state)
     track.smooth()
     if track.path.residual_m > before[1].residual_m:
-        track.states, track.path = before
+        track.sightings, track.path = before
 
 
 def _prove(track: Track, standing: Sequence[Standing], space: FreeSpace) -> bool:
@@ -349,14 +280,14 @@ def _prove(track: Track, standing: Sequence[Standing], space: FreeSpace) -> bool
     contradictions that brought the group here: where the sweeps see through its points at their
     rigid places, they must not see through them at the moved ones.
     """
-    seen_s = np.ptp(list(track.times_s.values()))
-    if len(track.states) < _LEAST_STATES or seen_s < _LEAST_S:
+    seen_s = np.ptp([sighting.seen_s for sighting in track.sightings.values()])
+    if len(track.sightings) < _LEAST_STATES or seen_s < _LEAST_S:
         return False
     track.smooth()
     residual_m = track.path.residual_m
     begin, end = track.path(track.path.begin_s), track.path(track.path.end_s)
     travelled = float(np.linalg.norm((end - begin)[:2]))
-    gap_m = space.gap_m(track.centre, next(iter(track.states)))
+    gap_m = space.gap_m(track.centre, next(iter(track.claimed)))
     rough_m = _ROUGH_M + _ROUGH_PER_GAP * gap_m + _ROUGH_S * travelled / seen_s
     if residual_m > rough_m or travelled < max(_LEAST_WAY_M, _LEAST_WAY_PER_RESIDUAL * residual_m):
         return False
