@@ -67,6 +67,12 @@ ENGINES = Table(
             about="files of others, see the README",
             argument="DIR",
         ),
+        Engine(
+            "opensceneflow",
+            "densify.readers.open_scene_flow_labels",
+            about="labels or a network's flow in OpenSceneFlow's file of the recording",
+            argument="FILE[#NAME]",
+        ),
     ),
     members=("estimate_motion",),
     row_of=_row,

@@ -95,6 +95,13 @@ READERS = Table(
             scenes=True,
         ),
         Reader(
+            "opensceneflow",
+            "densify.readers.open_scene_flow",
+            recognises=lambda path: path.suffix == ".h5" or any(path.glob("*.h5")),
+            holds="OpenSceneFlow files (LOG.h5)",
+            scenes=True,
+        ),
+        Reader(
             "pandaset",
             "densify.readers.pandaset",
             recognises=lambda path: (path / "lidar" / "poses.json").is_file(),

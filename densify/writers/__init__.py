@@ -22,6 +22,7 @@ FORMATS = {
     "folder": "densify.writers.folder",
     "argoverse2": "densify.writers.argoverse2",
     "nuscenes": "densify.writers.nuscenes",
+    "opensceneflow": "densify.writers.open_scene_flow",
     "pandaset": "densify.writers.pandaset",
 }
 """Name in ``densify simulate --format`` -> module."""
