@@ -127,7 +127,7 @@ class ObjectiveSettings(Section):
     )
     max_gap_m: float = knob(
         0.5,
-        "[m] where flow between neighbouring sweeps is chained (engines paper and npz): a moved "
+        "[m] where flow between neighbouring sweeps is chained (not the engine groups): a moved "
         "point farther than this from the next sweep's moving points is lost",
         0.01,
         10,
