@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The small text files of a KITTI raw drive: timestamps, and calibration with its cameras."""
+"""What KITTI and its relatives share: sweeps, timestamps, calibration with its cameras, oxts."""
 
 from __future__ import annotations
 
@@ -9,12 +9,18 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from densify.errors import InputError
-from densify.readers.files import read_text
-from densify.types import Camera, Float
+from densify.readers.files import read_bytes, read_text
+from densify.types import Camera, Float, Float32, Int
 
 _ORTHONORMAL_TOLERANCE = 1e-3  # calibration files carry seven digits
+NOMINAL_PERIOD_NS = 100_000_000
+"""The scanner turns at 10 Hz: the time from sweep to sweep where no stamps are recorded."""
+
+NUM_OXTS_VALUES = 30
+_EARTH_RADIUS_M = 6_378_137.0  # of the devkit's Mercator projection
 _STAMP = re.compile(r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d(\.\d{1,9})?")
 
 
@@ -30,6 +36,52 @@ def parse_numbers(text: str, where: str, count: int) -> Float:
     if not np.isfinite(values).all():
         raise InputError(f"{where}: got a value that is not finite, expected {count} numbers")
     return values
+
+
+def read_points(path: Path) -> Float32:
+    """(N,4) x, y, z in metres and reflectance; zeros where a row is not finite."""
+    data = read_bytes(path)
+    if len(data) % 16:
+        raise InputError(
+            f"{path}: truncated: got {len(data)} bytes, expected a multiple of 16 (x y z "
+            f"reflectance as float32), {len(data) % 16} too many; fetch the file again"
+        )
+    columns = np.frombuffer(data, "<f4").reshape(-1, 4).astype(np.float32)
+    columns[~np.isfinite(columns).all(axis=1)] = 0
+    return columns
+
+
+def turned_ns(points: Float, revolution_ns: int) -> Int:
+    """(N,3) raw points -> (N,) when each was fired, since the scanner faced forward: it turns
+    clockwise, so a return fired ``-azimuth / 2π`` of the revolution after that."""
+    revolution = -np.arctan2(points[:, 1], points[:, 0]) / (2 * np.pi)
+    return np.rint(revolution * revolution_ns).astype(np.int64)
+
+
+def check_oxts(values: Float, where: str) -> Float:
+    """An oxts record, if its latitude is one. Raises InputError, which starts with ``where``."""
+    if abs(values[0]) >= 90:
+        raise InputError(f"{where}: got a latitude of {values[0]:g} deg, expected -90 to 90")
+    return values
+
+
+def mercator_scale(oxts: Float) -> float:
+    """Of the projection, from the first record of a drive."""
+    return float(np.cos(np.deg2rad(oxts[0])))
+
+
+def T_mercator_imu(oxts: Float, scale: float) -> Float:
+    """(4,4) pose on the Mercator plane (east, north, up), as the devkit's convertOxtsToPose.
+
+    oxts: (30,) latitude and longitude (deg), altitude (m), roll, pitch, yaw (rad), ...
+    """
+    lat_deg, lon_deg, alt_m, roll, pitch, yaw = oxts[:6]
+    T = np.eye(4)
+    T[:3, :3] = Rotation.from_euler("ZYX", [yaw, pitch, roll]).as_matrix()
+    T[0, 3] = scale * _EARTH_RADIUS_M * np.deg2rad(lon_deg)
+    T[1, 3] = scale * _EARTH_RADIUS_M * np.log(np.tan(np.deg2rad(90 + lat_deg) / 2))
+    T[2, 3] = alt_m
+    return T
 
 
 @dataclass(frozen=True)
@@ -103,7 +155,15 @@ class Calibration:
         return parse_numbers(self.entries[key], where, int(np.prod(shape))).reshape(shape)
 
     def rotation(self, key: str) -> Float:
-        R = self.numbers(key, 3, 3)
+        return self._orthonormal(key, self.numbers(key, 3, 3))
+
+    def motion(self, key: str) -> Float:
+        """(4,4) of the twelve numbers of a key, the upper rows."""
+        T = np.vstack([self.numbers(key, 3, 4), [0.0, 0.0, 0.0, 1.0]])
+        self._orthonormal(key, T[:3, :3])
+        return T
+
+    def _orthonormal(self, key: str, R: Float) -> Float:
         error = np.abs(R @ R.T - np.eye(3)).max()
         if error > _ORTHONORMAL_TOLERANCE or np.linalg.det(R) < 0:
             raise InputError(
@@ -145,20 +205,35 @@ def read_cameras(drive: Path) -> dict[str, Camera]:
 
 def _read_camera(calibration: Calibration, name: str, T_rect_lidar: Float) -> Camera:
     number = name[-2:]
-    P = calibration.numbers(f"P_rect_{number}", 3, 4)
+    size_px = read_size_px(calibration, f"S_rect_{number}")
+    return rectified_camera(calibration, f"P_rect_{number}", name, size_px, T_rect_lidar)
+
+
+def read_size_px(calibration: Calibration, key: str) -> tuple[int, int]:
+    """Width and height."""
+    width, height = calibration.numbers(key, 2)
+    if min(width, height) < 1 or width % 1 or height % 1:
+        raise InputError(
+            f"{calibration.path}: {key}: got {width:g} x {height:g}, "
+            f"expected the image's width and height in whole pixels"
+        )
+    return int(width), int(height)
+
+
+def rectified_camera(
+    calibration: Calibration, key: str, name: str, size_px: tuple[int, int], T_rect_lidar: Float
+) -> Camera:
+    """The camera of a projection matrix.
+
+    T_rect_lidar: (4,4) to the rectified camera 0, from which P = K [I | t] moves by t.
+    """
+    P = calibration.numbers(key, 3, 4)
     K = P[:, :3]
     if K[0, 0] <= 0 or K[1, 1] <= 0 or not np.allclose(K[[1, 2, 2, 2], [0, 0, 1, 2]], [0, 0, 0, 1]):
         raise InputError(
-            f"{calibration.path}: P_rect_{number}: got {np.array2string(K.ravel(), precision=4)}, "
+            f"{calibration.path}: {key}: got {np.array2string(K.ravel(), precision=4)}, "
             f"expected a projection with positive focal lengths and the last row 0 0 1"
         )
-    width, height = calibration.numbers(f"S_rect_{number}", 2)
-    if min(width, height) < 1 or width % 1 or height % 1:
-        raise InputError(
-            f"{calibration.path}: S_rect_{number}: got {width:g} x {height:g}, "
-            f"expected the image's width and height in whole pixels"
-        )
-    # P = K [I | t], t the offset of this camera from the rectified camera 0.
     T_cam_rect = np.eye(4)
     T_cam_rect[:3, 3] = np.linalg.solve(K, P[:, 3])
-    return Camera(name, int(width), int(height), K, T_cam_rect @ T_rect_lidar)
+    return Camera(name, *size_px, K, T_cam_rect @ T_rect_lidar)

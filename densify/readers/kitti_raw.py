@@ -11,24 +11,30 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from densify.errors import InputError
 from densify.geometry import poses
 from densify.readers.file_sequence import FileSequence, Returns, truth_beside
 from densify.readers.files import numbered_files, of_frame, read_bytes, read_text
-from densify.readers.kitti_files import Calibration, Stamps, parse_numbers, read_cameras
+from densify.readers.kitti_files import (
+    NOMINAL_PERIOD_NS,
+    NUM_OXTS_VALUES,
+    Calibration,
+    Stamps,
+    T_mercator_imu,
+    check_oxts,
+    mercator_scale,
+    parse_numbers,
+    read_cameras,
+    read_points,
+    turned_ns,
+)
 from densify.types import Float, Int
 
 KITTI_TRIGGER_LATENCY_NS = 10_500_000
 """How much KITTI's recorded image stamps lag the exposure. The cameras are triggered when the
 scanner faces forward, at the sweep's reference time; drives 0002 and 0013 of 2011_09_26 record
 10.50 ms (image_02) and 9.96 ms (image_03) after it."""
-
-_NOMINAL_PERIOD_NS = 100_000_000  # the scanner's 10 Hz
-_EARTH_RADIUS_M = 6_378_137.0  # of the devkit's Mercator projection
-_NUM_OXTS_VALUES = 30
 
 
 def open_recording(path: Path, scene: str | None) -> KittiRaw:
@@ -78,13 +84,12 @@ class KittiRaw(FileSequence):
     def stamp_ns(self, frame: int) -> int:
         """Reference time of a sweep. Raises InputError for a frame without a stamp."""
         if self._stamps is None:
-            return int(frame) * _NOMINAL_PERIOD_NS
+            return int(frame) * NOMINAL_PERIOD_NS
         return self._stamps[frame]
 
     def _returns(self, frame: int) -> tuple[Path, Returns]:
         path = self._sweeps[frame]
-        columns = _read_points(path)
-        columns[~np.isfinite(columns).all(axis=1)] = 0
+        columns = read_points(path)
         points = columns[:, :3].astype(np.float64)
         return path, Returns(points, columns[:, 3], self._offset_ns(frame, points))
 
@@ -124,9 +129,8 @@ class KittiRaw(FileSequence):
                 f"{self._end_stamps.path}: sweep of frame {frame} ends {start - end} ns before it "
                 f"starts; expected the end after the start"
             )
-        revolution = -np.arctan2(points[:, 1], points[:, 0]) / (2 * np.pi)
         centre_ns = (start + end) // 2 - self._stamps[frame]
-        return np.rint(revolution * (end - start)).astype(np.int64) + centre_ns
+        return turned_ns(points, end - start) + centre_ns
 
     def _interpolated_T_world_imu(self, frame: int) -> Float:
         if self._oxts_stamps is None or self._stamps is None:
@@ -151,21 +155,11 @@ class KittiRaw(FileSequence):
         return poses.inverse(self._T_mercator_world) @ self._T_mercator_imu(frame)
 
     def _T_mercator_imu(self, frame: int) -> Float:
-        """Pose on the Mercator plane (east, north, up), as the devkit's convertOxtsToPose."""
-        lat_deg, lon_deg, alt_m, roll, pitch, yaw = _read_oxts(self._oxts[frame])[:6]
-        T = np.eye(4)
-        T[:3, :3] = Rotation.from_euler("ZYX", [yaw, pitch, roll]).as_matrix()
-        T[0, 3] = self._mercator_scale * _EARTH_RADIUS_M * np.deg2rad(lon_deg)
-        T[1, 3] = (
-            self._mercator_scale * _EARTH_RADIUS_M * np.log(np.tan(np.deg2rad(90 + lat_deg) / 2))
-        )
-        T[2, 3] = alt_m
-        return T
+        return T_mercator_imu(_read_oxts(self._oxts[frame]), self._mercator_scale)
 
     @cached_property
     def _mercator_scale(self) -> float:
-        first = next(iter(self._oxts.values()))
-        return float(np.cos(np.deg2rad(_read_oxts(first)[0])))
+        return mercator_scale(_read_oxts(next(iter(self._oxts.values()))))
 
     @cached_property
     def _T_mercator_world(self) -> Float:
@@ -190,20 +184,5 @@ def _find_sweeps(drive: Path) -> dict[int, Path]:
     return sweeps
 
 
-def _read_points(path: Path) -> NDArray[np.float32]:
-    """(N,4) x, y, z in metres and reflectance."""
-    data = read_bytes(path)
-    if len(data) % 16:
-        raise InputError(
-            f"{path}: truncated: got {len(data)} bytes, expected a multiple of 16 (x y z "
-            f"reflectance as float32), {len(data) % 16} too many; fetch the file again"
-        )
-    return np.frombuffer(data, "<f4").reshape(-1, 4).astype(np.float32)
-
-
 def _read_oxts(path: Path) -> Float:
-    """(30,) latitude and longitude (deg), altitude (m), roll, pitch, yaw (rad), ..."""
-    values = parse_numbers(read_text(path), str(path), _NUM_OXTS_VALUES)
-    if abs(values[0]) >= 90:
-        raise InputError(f"{path}: got a latitude of {values[0]:g} deg, expected -90 to 90")
-    return values
+    return check_oxts(parse_numbers(read_text(path), str(path), NUM_OXTS_VALUES), str(path))

@@ -13,8 +13,8 @@ What the files say, and what was found where they are silent (sequence 002):
 - Points are in the world, ego-motion compensated: each was placed with the vehicle's pose at its
   own time. (Laid on other sweeps, a sweep's beginning and its end are off by the same, to 3 % of
   the vehicle's way between them, at 0.2 to 0.3 m/s.) Poses are the vehicle's, x right, y forward,
-  z up, 10 Hz, quaternions by name. That their clock is the points' own is known to about 20 ms only:
-  the sequence looked at goes 0.4 m/s at most where there are sweeps.
+  z up, 10 Hz, quaternions by name. That their clock is the points' own is known to 20 ms only: the
+  sequence looked at goes 0.4 m/s at most where there are sweeps.
 - Where the scanners stand is not said. The Pandar64's place and axis are those that make its rings
   sharpest: the entropy of the elevations, minimised over place and tilt, gives all 64 rings, and
   the same place to 1 cm in different sweeps. Taking the axis for upright, 0.9 degrees off, puts the
