@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 
 import densify
@@ -20,12 +22,14 @@ def check_sweeps(
     point_m: float = 1e-6,
     offset_ns: int = 1,
     row_of: np.ndarray | None = None,
+    clock_ns: int = 0,
 ) -> None:
     """Points as they were fired, their times, scanners, intensities and the poses.
 
-    reference_ns: how much later than the street's the format's reference time is. T_lidar_ego: the
-    frame in which the format has the points. point_m, offset_ns: what the format rounds. row_of:
-    which of the street's returns each row is, where the format sorts them.
+    clock_ns: what the format's clock says more than the street's. reference_ns: how much later than
+    the street's the format's reference time is. T_lidar_ego: the frame in which the format has the
+    points. point_m, offset_ns: what the format rounds. row_of: which of the street's returns each
+    row is, where the format sorts them.
     """
     street = excerpt.street
     T_ego_lidar = np.eye(4) if T_lidar_ego is None else inverse(T_lidar_ego)
@@ -37,7 +41,7 @@ def check_sweeps(
     for number, frame in enumerate(excerpt.frames):
         read, true = sequence[number], street[frame]
         rows = np.arange(len(true)) if row_of is None else row_of
-        assert sequence.stamp_ns(number) == read.stamp_ns == true.stamp_ns + reference_ns
+        assert sequence.stamp_ns(number) == read.stamp_ns == true.stamp_ns + reference_ns + clock_ns
         assert len(read) == len(true)
         moved = transform(T_ego_lidar, true.points[rows])
         np.testing.assert_allclose(read.points, moved, atol=point_m)
@@ -55,23 +59,28 @@ def check_cameras(
     stamp_ns: int = 1,
     same_pixels: bool = True,
     place_m: float = 1e-6,
+    names: Mapping[str, str] | None = None,
+    clock_ns: int = 0,
 ) -> None:
     """Calibration (the camera's place to ``place_m``), exposure times (to ``stamp_ns``) and images;
-    lossy formats need not have the same pixels."""
+    lossy formats need not have the same pixels. names: what the format calls the street's cameras,
+    if not the same. clock_ns: what its clock says more than the street's."""
     street = excerpt.street
     T_ego = np.eye(4) if T_lidar_ego is None else T_lidar_ego
-    assert set(sequence.cameras) == set(excerpt.cameras)
+    called = {name: (names or {}).get(name, name) for name in excerpt.cameras}
+    assert set(sequence.cameras) == set(called.values())
     for name in excerpt.cameras:
-        read, true = sequence.cameras[name], street.cameras[name]
+        read, true = sequence.cameras[called[name]], street.cameras[name]
         assert (read.width_px, read.height_px) == (true.width_px, true.height_px)
         assert read.model == true.model
         np.testing.assert_allclose(read.K, true.K, atol=1e-6)
         np.testing.assert_allclose(read.T_cam_lidar, true.T_cam_lidar @ T_ego, atol=place_m)
-        numbers, exposed_ns = excerpt.image_numbers(name), sequence.image_stamps_ns(name)
+        numbers, exposed_ns = excerpt.image_numbers(name), sequence.image_stamps_ns(called[name])
         assert list(exposed_ns) == list(range(len(numbers)))
         for number, image in enumerate(numbers):
-            assert abs(exposed_ns[number] - street.image_stamps_ns(name)[image]) <= stamp_ns
-            got, expected = sequence.image(name, number), street.image(name, image)
+            late_ns = exposed_ns[number] - street.image_stamps_ns(name)[image] - clock_ns
+            assert abs(late_ns) <= stamp_ns
+            got, expected = sequence.image(called[name], number), street.image(name, image)
             assert got.shape == expected.shape
             if same_pixels:
                 np.testing.assert_array_equal(got, expected)
@@ -93,12 +102,18 @@ def check_truth(sequence: LidarSequence, excerpt: Excerpt) -> None:
         assert not flow[still].any() or np.linalg.norm(flow[still], axis=1).max() < 0.06
 
 
-def check_depth(sequence: LidarSequence, excerpt: Excerpt, worse: float = 0.03) -> None:
+def check_depth(
+    sequence: LidarSequence, excerpt: Excerpt, worse: float = 0.03, name: str | None = None
+) -> None:
     """The middle sweep, densified with its neighbours and the recorded poses, has the depth that
-    the street itself gives: as many pixels and errors to the share ``worse``."""
-    camera, middle = excerpt.cameras[0], len(excerpt.frames) // 2
+    the street itself gives: as many pixels and errors to the share ``worse``. name: what the format
+    calls the street's first camera."""
+    own, middle = excerpt.cameras[0], len(excerpt.frames) // 2
     scores = []
-    for recording, key in ((sequence, middle), (excerpt.street, excerpt.frames[middle])):
+    for recording, key, camera in (
+        (sequence, middle, name or own),
+        (excerpt.street, excerpt.frames[middle], own),
+    ):
         poses_given = {"register": {"source": "dataset"}}
         result = densify.run(recording, key, 1, cameras=[camera], config=poses_given)
         depth_m, true_m = result.depth[camera].depth_m, recording.truth.depth_m(camera, key)

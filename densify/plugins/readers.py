@@ -68,6 +68,12 @@ def _holds_sweeps(path: Path) -> bool:
     return False
 
 
+def _is_kitti_odometry(path: Path) -> bool:
+    if (path / "velodyne").is_dir():
+        return path.resolve().parent.name == "sequences" or (path / "times.txt").is_file()
+    return any((path / "sequences").glob("*/velodyne"))
+
+
 READERS = Table(
     kind="reader",
     group="densify.readers",
@@ -106,6 +112,27 @@ READERS = Table(
             "densify.readers.pandaset",
             recognises=lambda path: (path / "lidar" / "poses.json").is_file(),
             holds="a PandaSet sequence (a folder that holds lidar/poses.json)",
+        ),
+        Reader(
+            "kitti-360",
+            "densify.readers.kitti_360",
+            recognises=lambda path: (path / "data_3d_raw").is_dir(),
+            holds="KITTI-360 (a folder that holds data_3d_raw/)",
+            scenes=True,
+        ),
+        Reader(
+            "kitti-tracking",
+            "densify.readers.kitti_tracking",
+            recognises=lambda path: any((path / "velodyne").glob("[0-9][0-9][0-9][0-9]/")),
+            holds="KITTI tracking (a folder that holds velodyne/0000/)",
+            scenes=True,
+        ),
+        Reader(
+            "kitti-odometry",
+            "densify.readers.kitti_odometry",
+            recognises=_is_kitti_odometry,
+            holds="KITTI odometry or SemanticKITTI (sequences/, or a folder in it with velodyne/)",
+            scenes=True,
         ),
         Reader(
             "folder",

@@ -21,6 +21,7 @@ NOMINAL_PERIOD_NS = 100_000_000
 
 NUM_OXTS_VALUES = 30
 _EARTH_RADIUS_M = 6_378_137.0  # of the devkit's Mercator projection
+_ENTRY = re.compile(r"\s*([^\s:]+)[:\s]\s*(.*)")
 _STAMP = re.compile(r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d(\.\d{1,9})?")
 
 
@@ -130,8 +131,8 @@ class Stamps:
 
 @dataclass(frozen=True)
 class Calibration:
-    """A calibration file of lines ``KEY: numbers``. Malformed entries raise InputError when asked
-    for, naming file and key."""
+    """A calibration file of lines ``KEY: numbers``, the colon at will. Malformed entries raise
+    InputError when asked for, naming file and key."""
 
     path: Path
     entries: Mapping[str, str]
@@ -140,11 +141,10 @@ class Calibration:
     def read(path: Path) -> Calibration:
         if not path.is_file():
             raise InputError(
-                f"{path}: missing; expected KITTI's calibration files in the folder that holds the "
-                f"drive (they are a download of their own)"
+                f"{path}: missing; expected KITTI's calibration there (it is a download of its own)"
             )
-        pairs = (line.partition(":") for line in read_text(path).splitlines())
-        return Calibration(path, {key.strip(): value for key, colon, value in pairs if colon})
+        matches = (_ENTRY.match(line) for line in read_text(path).splitlines())
+        return Calibration(path, {found[1]: found[2] for found in matches if found})
 
     def numbers(self, key: str, *shape: int) -> Float:
         if key not in self.entries:

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -113,6 +113,7 @@ class Excerpt:
         stamp_ns: Sequence[int],
         T_lidar_ego: Float | None = None,
         row_of: Mapping[int, Int] | None = None,
+        names: Mapping[str, str] | None = None,
     ) -> None:
         """Exact truth as `densify.readers.truth_files` lays it out, for readers that number the
         sweeps and each camera's images from 0.
@@ -120,7 +121,7 @@ class Excerpt:
         stamp_ns: the reference time that the format gives each sweep. T_lidar_ego: (4,4) the frame
         in which the format has the points, the scanner's if None. row_of: by frame the (N,) rows of
         the returns in the format's file, where it sorts or pads them; rows of none are the world's
-        origin.
+        origin. names: what the format calls the street's cameras, if not the same.
         """
         simulator = self.street.simulator
         bodies = simulator.bodies_at(stamp_ns)
@@ -142,7 +143,17 @@ class Excerpt:
         for camera in self.cameras:
             for number, image in enumerate(self.image_numbers(camera)):
                 depth_m, moving = truth.depth_m(camera, image), truth.moving_mask(camera, image)
-                write_depth(folder, camera, number, depth_m, moving)
+                write_depth(folder, (names or {}).get(camera, camera), number, depth_m, moving)
+
+
+def check_cameras_fit(excerpt: Excerpt, format: str, fit: Collection[str]) -> None:
+    """Raise InputError for a camera that is not among those that the format has room for."""
+    for name in excerpt.cameras:
+        if name not in fit:
+            raise InputError(
+                f"{excerpt.street.name}: camera {name} cannot be written as {format}; choose among "
+                f"{', '.join(fit)}"
+            )
 
 
 def quaternion(T: Float) -> Float:

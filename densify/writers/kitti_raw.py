@@ -30,7 +30,7 @@ from densify.readers.truth_files import write_bodies, write_depth, write_points
 from densify.street.rig import CAMERAS, T_RECTIFIED_LIDAR, USUAL, T_level_lidar
 from densify.street.sensors import SENSORS
 from densify.street.simulator import EPOCH_NS
-from densify.types import Float, Progress
+from densify.types import Float, Float32, Int, Progress
 from densify.writers.excerpt import Excerpt, put
 
 _DATE = np.datetime64(EPOCH_NS, "ns").astype("datetime64[D]").astype(str).replace("-", "_")
@@ -55,12 +55,7 @@ def write_tree(excerpt: Excerpt, out: Path, overwrite: bool, progress: Progress 
     names = [name for name in excerpt.cameras if name in USUAL]
     for name in excerpt.cameras:
         camera_named({n: street.cameras[n] for n in names}, name, out)
-    if not street.simulator.sensor.azimuth_tells_time:
-        fit = [sensor.name for sensor in SENSORS.values() if sensor.azimuth_tells_time]
-        raise InputError(
-            f"{street.name}: cannot be written as KITTI raw, whose points carry neither a time nor "
-            f"a scanner; choose a single scanner that spins: {', '.join(fit)}"
-        )
+    check_azimuth_tells_time(street, "KITTI raw")
     folder = out / _DATE
     calibration = _calibration(T_level_lidar(street.simulator.tilt_deg))
     if not overwrite:
@@ -93,21 +88,59 @@ def _check_kept(folder: Path, calibration: Mapping[str, bytes]) -> None:
 
 def _write_frame(drive: Path, excerpt: Excerpt, frame: int) -> None:
     street, returns = excerpt.street, excerpt.returns(frame)
-    columns = np.column_stack([returns.points, returns.intensity]).astype("<f4")
-    put(drive / "velodyne_points" / "data" / f"{frame:010d}.bin", columns.tobytes())
+    data = velodyne_bytes(returns.points, returns.intensity)
+    put(drive / "velodyne_points" / "data" / f"{frame:010d}.bin", data)
     in_bodies = street.simulator.in_bodies(frame, returns)
     write_points(drive / "truth", frame, returns.body, returns.instance, in_bodies)
     for name in excerpt.cameras:
         put(drive / name / "data" / f"{frame:010d}.png", excerpt.encoded_image(name, frame))
         depth_m, moving = street.truth.depth_m(name, frame), street.truth.moving_mask(name, frame)
         write_depth(drive / "truth", name, frame, depth_m, moving)
-    oxts = _oxts(street, frame, excerpt.frames[0])
-    record = " ".join(repr(float(v)) for v in oxts) + " 4 10 4 4 0\n"
+    record = oxts_line(street, frame, excerpt.frames[0])
     put(drive / "oxts" / "data" / f"{frame:010d}.txt", record.encode())
 
 
-def _row(values: Float) -> str:
+def numbers(values: Float) -> str:
+    """As KITTI's text files have them, every digit kept."""
     return " ".join(repr(float(v)) for v in np.ravel(values))
+
+
+def projections(key: str) -> list[str]:
+    """Lines of the keys of cameras 0 to 3, such as ``P{}``: K [I | t], moved by t from the
+    rectified camera 0."""
+    lines = []
+    for number in range(4):  # 0 and 1 would be the gray ones beside them
+        camera = CAMERAS[f"image_0{2 + number % 2}"]
+        away = (camera.T_cam_lidar - T_RECTIFIED_LIDAR)[:3, 3]
+        P = camera.K @ np.column_stack([np.eye(3), away])
+        lines.append(f"{key.format(number)}: {numbers(P)}\n")
+    return lines
+
+
+def stamp_lines(stamps_ns: Int) -> bytes:
+    """A timestamps file."""
+    texts = stamps_ns.astype("datetime64[ns]").astype(str)
+    return "".join(text.replace("T", " ") + "\n" for text in texts).encode()
+
+
+def oxts_line(street: Street, frame: int, first: int) -> str:
+    """A frame's record. first: the frame of the first one, which lies at a fixed latitude."""
+    return " ".join(repr(float(v)) for v in _oxts(street, frame, first)) + " 4 10 4 4 0\n"
+
+
+def check_azimuth_tells_time(street: Street, format: str) -> None:
+    """Raise InputError for a sensor whose points' times do not follow from their azimuth."""
+    if not street.simulator.sensor.azimuth_tells_time:
+        fit = [sensor.name for sensor in SENSORS.values() if sensor.azimuth_tells_time]
+        raise InputError(
+            f"{street.name}: cannot be written as {format}, whose points carry neither a time nor "
+            f"a scanner; choose a single scanner that spins: {', '.join(fit)}"
+        )
+
+
+def velodyne_bytes(points: Float | Float32, intensity: Float32) -> bytes:
+    """A sweep's file: (N,3), (N,)."""
+    return np.column_stack([points, intensity]).astype("<f4").tobytes()
 
 
 def _calibration(T_level_lidar: Float) -> dict[str, bytes]:
@@ -115,22 +148,18 @@ def _calibration(T_level_lidar: Float) -> dict[str, bytes]:
 
     T_level_lidar: (4,4) how the scanner's mount is turned about its origin.
     """
-    lines = []
+    usual = CAMERAS[USUAL[0]]
+    lines = projections("P_rect_0{}")
     for number in range(4):
-        camera = CAMERAS[f"image_0{2 + number % 2}"]  # 0 and 1 would be the gray ones beside them
-        P = camera.K @ np.column_stack([np.eye(3), (camera.T_cam_lidar - T_RECTIFIED_LIDAR)[:3, 3]])
-        lines += [
-            f"S_rect_0{number}: {camera.width_px} {camera.height_px}",
-            f"R_rect_0{number}: {_row(np.eye(3))}",
-            f"P_rect_0{number}: {_row(P)}",
-        ]
-    files = {"calib_cam_to_cam.txt": "\n".join(lines) + "\n"}
+        lines.append(f"S_rect_0{number}: {usual.width_px} {usual.height_px}\n")
+        lines.append(f"R_rect_0{number}: {numbers(np.eye(3))}\n")
+    files = {"calib_cam_to_cam.txt": "".join(lines)}
     T_lidar_imu = poses.inverse(T_level_lidar) @ T_LEVEL_IMU
     for name, T in (
         ("velo_to_cam", T_RECTIFIED_LIDAR @ T_level_lidar),
         ("imu_to_velo", T_lidar_imu),
     ):
-        files[f"calib_{name}.txt"] = f"R: {_row(T[:3, :3])}\nT: {_row(T[:3, 3])}\n"
+        files[f"calib_{name}.txt"] = f"R: {numbers(T[:3, :3])}\nT: {numbers(T[:3, 3])}\n"
     return {name: text.encode() for name, text in files.items()}
 
 
@@ -147,8 +176,7 @@ def _write_stamps(drive: Path, street: Street, names: list[str]) -> None:
         exposed = np.array(list(street.image_stamps_ns(name).values()))
         files[f"{name}/timestamps.txt"] = exposed + KITTI_TRIGGER_LATENCY_NS
     for path, stamps in files.items():
-        lines = [str(stamp).replace("T", " ") for stamp in stamps.astype("datetime64[ns]")]
-        put(drive / path, "".join(f"{line}\n" for line in lines).encode())
+        put(drive / path, stamp_lines(stamps))
     put(drive / "oxts" / "dataformat.txt", _OXTS_FORMAT.replace(" ", "\n").encode() + b"\n")
 
 

@@ -1,0 +1,140 @@
+# SPDX-License-Identifier: MIT
+"""KITTI odometry (Geiger, Lenz, Urtasun, "Are we ready for autonomous driving?", CVPR 2012) and
+SemanticKITTI (Behley et al., ICCV 2019), which has the same sequences::
+
+    dataset/sequences/00/velodyne/000000.bin   image_2/000000.png   calib.txt   times.txt
+    dataset/poses/00.txt   or SemanticKITTI's  dataset/sequences/00/poses.txt
+
+- Frames are file numbers. ``times.txt`` has seconds since the first frame, a line for each: when
+  the camera exposed and the scanner faced forward. Without it frame k is at k times 100 ms.
+- Points are the HDL-64E's, in its frame, and already ego-motion compensated to that time. They have
+  no times of their own, so that nothing can be undone: ``offset_ns`` is None, and what moves by
+  itself is a little smeared. Labels are not read.
+- Images are rectified; their size is that of the first. ``calib.txt`` has their projections and
+  ``Tr``, the rectified camera 0 from the scanner. Poses are camera 0's, T_first_now: the scanner's
+  are Tr⁻¹ P Tr, and the world is its frame at frame 0.
+"""
+
+from __future__ import annotations
+
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+
+from densify.errors import InputError
+from densify.geometry import poses
+from densify.readers.file_sequence import FileSequence, Returns, chosen_scene, truth_beside
+from densify.readers.files import image_size_px, numbered_files, of_frame, read_bytes, read_text
+from densify.readers.kitti_files import (
+    NOMINAL_PERIOD_NS,
+    Calibration,
+    parse_numbers,
+    read_points,
+    rectified_camera,
+)
+from densify.types import Camera, Float
+
+
+def open_recording(path: Path, scene: str | None) -> KittiOdometry:
+    """See `densify.readers.ReaderModule`. path: a sequence's folder, or one that holds some, or
+    ``sequences/`` with some; scene: a sequence's number such as ``00``."""
+    if (path / "velodyne").is_dir() and scene is None:
+        return KittiOdometry(path)
+    folder = path / "sequences" if (path / "sequences").is_dir() else path
+    names = sorted(found.parent.name for found in folder.glob("*/velodyne"))
+    if not names:
+        raise InputError(
+            f"{path}: no KITTI odometry; expected a folder with velodyne/, or sequences/ with such "
+            f"folders"
+        )
+    return KittiOdometry(folder / chosen_scene("kitti-odometry", path, scene, names))
+
+
+class KittiOdometry(FileSequence):
+    """A sequence as a `densify.types.LidarSequence`."""
+
+    def __init__(self, path: Path) -> None:
+        """path: the sequence's folder. Raises InputError if it holds no sweeps, or times, or the
+        calibration where there are images, are missing or malformed."""
+        self._sweeps = numbered_files(path / "velodyne", ".bin")
+        if not self._sweeps:
+            raise InputError(f"{path / 'velodyne'}: no sweeps; expected files such as 000000.bin")
+        times = path / "times.txt"
+        self._times_ns = _read_times_ns(times) if times.exists() else None
+        found = {
+            folder.name: numbered_files(folder, ".png", ".jpg")
+            for folder in sorted(path.glob("image_[0-3]"))
+        }
+        self._images = {name: images for name, images in found.items() if images}
+        super().__init__(
+            path.resolve().name,
+            path,
+            tuple(self._sweeps),
+            {name: self._camera(path, name) for name in self._images},
+            {n: {f: self._time_ns(f, times) for f in files} for n, files in self._images.items()},
+            truth_beside(path),
+        )
+
+    def stamp_ns(self, frame: int) -> int:
+        """When the scanner faced forward, since the first frame."""
+        self.check_frame(frame)
+        return self._time_ns(frame, self.where / "times.txt")
+
+    def _returns(self, frame: int) -> tuple[Path, Returns]:
+        columns = read_points(self._sweeps[frame])
+        return self._sweeps[frame], Returns(columns[:, :3].astype(np.float64), columns[:, 3])
+
+    def _encoded_image(self, camera: str, number: int) -> tuple[Path, bytes]:
+        path = self._images[camera][number]
+        return path, read_bytes(path)
+
+    def _pose(self, frame: int) -> Float:
+        path, lines = self._pose_lines
+        if path is None:
+            return super()._pose(frame)
+        line = of_frame(dict(enumerate(lines)), frame, "pose", path)
+        P = parse_numbers(line, f"{path}: line {frame + 1}", 12).reshape(3, 4)
+        T_cam_lidar = self._calibration.motion("Tr")
+        return poses.inverse(T_cam_lidar) @ np.vstack([P, [0.0, 0.0, 0.0, 1.0]]) @ T_cam_lidar
+
+    def _time_ns(self, frame: int, path: Path) -> int:
+        if self._times_ns is None:
+            return frame * NOMINAL_PERIOD_NS
+        return of_frame(self._times_ns, frame, "time", path)
+
+    def _camera(self, path: Path, name: str) -> Camera:
+        calibration = Calibration.read(path / "calib.txt")
+        size_px = image_size_px(next(iter(self._images[name].values())))
+        T_rect_lidar = calibration.motion("Tr")
+        return rectified_camera(calibration, f"P{name[-1]}", name, size_px, T_rect_lidar)
+
+    @cached_property
+    def _calibration(self) -> Calibration:
+        return Calibration.read(self.where / "calib.txt")
+
+    @cached_property
+    def _pose_lines(self) -> tuple[Path | None, list[str]]:
+        sequence = self.where.resolve()
+        for path in (
+            sequence / "poses.txt",
+            sequence.parent.parent / "poses" / f"{sequence.name}.txt",
+        ):
+            if path.is_file():
+                return path, read_text(path).splitlines()
+        return None, []
+
+
+def _read_times_ns(path: Path) -> dict[int, int]:
+    """By line, from 0. Raises InputError if one is no number or not after the one before."""
+    lines = read_text(path).splitlines()
+    times_ns: dict[int, int] = {}
+    for number, line in enumerate(lines):
+        (time_s,) = parse_numbers(line, f"{path}: line {number + 1}", 1)
+        times_ns[number] = round(time_s * 1e9)
+        if number and times_ns[number] <= times_ns[number - 1]:
+            raise InputError(
+                f"{path}: line {number + 1}: got {line.strip()} s, expected more than on the line "
+                f"before"
+            )
+    return times_ns
