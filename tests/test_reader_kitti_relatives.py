@@ -1,0 +1,414 @@
+# SPDX-License-Identifier: MIT
+"""The readers of KITTI odometry, KITTI tracking and KITTI-360 on streets written in their formats,
+on broken ones, and on a real sequence."""
+
+from __future__ import annotations
+
+import shutil
+
+import cv2
+import numpy as np
+import pytest
+
+from densify.errors import InputError
+from densify.geometry import cameras
+from densify.geometry.poses import inverse
+from densify.readers import open_sequence
+from densify.readers.kitti_360 import Kitti360
+from densify.readers.kitti_odometry import KittiOdometry
+from densify.readers.kitti_tracking import KittiTracking
+from densify.readers.street import Street
+from densify.writers import write_street
+from densify.writers.excerpt import Excerpt
+from tests.reader_checks import check_cameras, check_depth, check_sweeps, check_truth
+
+FRAMES, CAMERA = (59, 60, 61), "image_02"
+DRIVE = "2026_06_12_drive_0000_sync"
+FORMATS = {
+    "kitti-odometry": ("image_2", KittiOdometry),
+    "kitti-tracking": ("image_02", KittiTracking),
+    "kitti-360": ("image_00", Kitti360),
+}
+
+
+@pytest.fixture(scope="module")
+def excerpt():
+    return Excerpt.of(Street("street", 0, "vlp16", cameras=(CAMERA,)), FRAMES, None)
+
+
+@pytest.fixture(scope="module")
+def written(excerpt, tmp_path_factory):
+    out = tmp_path_factory.mktemp("kitti")
+    return {name: write_street(name, excerpt.street, out / name, FRAMES) for name in FORMATS}
+
+
+@pytest.fixture
+def copied(written, tmp_path):
+    """Makes a copy to be damaged."""
+
+    def copy(name):
+        whole = written[name].parent.parent if name == "kitti-odometry" else written[name]
+        copy = shutil.copytree(whole, tmp_path / name, ignore=shutil.ignore_patterns("truth"))
+        return copy / written[name].relative_to(whole)
+
+    return copy
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_the_place_tells_the_reader(written, name):
+    sequence = open_sequence(written[name])
+    assert isinstance(sequence, FORMATS[name][1])
+
+
+def test_odometry_is_given_back(written, excerpt):
+    sequence, street = open_sequence(written["kitti-odometry"]), excerpt.street
+    clock_ns = -street.stamp_ns(FRAMES[0])
+    check_cameras(sequence, excerpt, names={CAMERA: "image_2"}, clock_ns=clock_ns)
+    check_truth(sequence, excerpt)
+    assert [sequence.stamp_ns(n) for n in range(3)] == [0, 100_000_000, 200_000_000]
+    first, T_world_first = sequence.T_world_lidar(0), street.T_world_lidar(FRAMES[0])
+    np.testing.assert_allclose(first, np.eye(4), atol=1e-9)
+    for number, frame in enumerate(FRAMES):
+        sweep, true = sequence[number], street.truth.sweep(frame)
+        assert sweep.offset_ns is None and sweep.scanner_origins is None
+        # compensated: where everything that stands was at the stamp
+        still = ~true.moving
+        np.testing.assert_allclose(sweep.points[still], true.points[still], atol=1e-4)
+        np.testing.assert_array_equal(sweep.intensity, street[frame].intensity)
+        moved = inverse(T_world_first) @ street.T_world_lidar(frame)
+        np.testing.assert_allclose(sequence.T_world_lidar(number), moved, atol=1e-6)
+
+
+def test_tracking_is_given_back(written, excerpt):
+    sequence = open_sequence(written["kitti-tracking"])
+    clock_ns = -excerpt.street.stamp_ns(FRAMES[0])
+    check_sweeps(sequence, excerpt, offset_ns=20, clock_ns=clock_ns)
+    check_cameras(sequence, excerpt, clock_ns=clock_ns)
+    check_truth(sequence, excerpt)
+
+
+def test_kitti_360_is_given_back(written, excerpt):
+    sequence = open_sequence(written["kitti-360"])
+    check_sweeps(sequence, excerpt, offset_ns=20)
+    check_cameras(sequence, excerpt, names={CAMERA: "image_00"})
+    check_truth(sequence, excerpt)
+
+
+# Compensated points without times are no rays of one origin: fewer find support, measured 25 %.
+@pytest.mark.parametrize(("name", "worse"), [("kitti-odometry", 0.35), ("kitti-360", 0.03)])
+def test_depth_is_that_of_the_street(written, excerpt, name, worse):
+    check_depth(open_sequence(written[name]), excerpt, worse, FORMATS[name][0])
+
+
+def test_scenes(written):
+    root = written["kitti-odometry"].parent.parent
+    assert open_sequence(root).name == open_sequence(f"kitti-odometry:{root}#00").name == "00"
+    for name, scene in (("kitti-tracking", "0000"), ("kitti-360", DRIVE)):
+        assert scene in open_sequence(f"{name}:{written[name]}#{scene}").name
+    for spec in (root, written["kitti-tracking"], written["kitti-360"]):
+        reader = next(n for n, p in written.items() if p == spec or root == spec)
+        with pytest.raises(InputError, match="no recording 77; choose one"):
+            open_sequence(f"{reader}:{spec}#77")
+        with pytest.raises(InputError, match=r"no KITTI.* expected"):
+            open_sequence(f"{reader}:{spec.parent}")
+
+
+def test_what_a_format_cannot_hold_is_refused(tmp_path):
+    for name, spec, frames in (
+        ("kitti-odometry", "street?sensor=dual32", FRAMES),
+        ("kitti-odometry", "street?cameras=image_03", FRAMES),
+        ("kitti-tracking", "street?sensor=rosette&cameras=none", FRAMES),
+        ("kitti-tracking", "street?cameras=image_02", (59, 61)),
+        ("kitti-360", "street?cameras=fast", FRAMES),
+    ):
+        with pytest.raises(InputError, match=r"cannot be written as KITTI.*; choose"):
+            write_street(name, Street.from_spec(spec), tmp_path / "out", frames)
+    assert not (tmp_path / "out").exists()
+
+
+def test_semantic_kittis_poses_are_found_too(copied):
+    sequence = copied("kitti-odometry")
+    poses = sequence.parent.parent / "poses/00.txt"
+    expected = KittiOdometry(sequence).T_world_lidar(2)
+    shutil.move(poses, sequence / "poses.txt")
+    np.testing.assert_array_equal(KittiOdometry(sequence).T_world_lidar(2), expected)
+    (sequence / "poses.txt").unlink()
+    with pytest.raises(InputError, match="no poses; let the sweeps register"):
+        KittiOdometry(sequence).T_world_lidar(2)
+    (sequence / "times.txt").unlink()
+    assert KittiOdometry(sequence).stamp_ns(2) == 200_000_000
+
+
+def test_sparse_poses_are_interpolated(copied):
+    place = copied("kitti-360")
+    poses = place / "data_poses" / DRIVE / "poses.txt"
+    lines = poses.read_text().splitlines(keepends=True)
+    whole = Kitti360(place, DRIVE).T_world_lidar(1)
+    poses.write_text(lines[0] + lines[2])
+    between = Kitti360(place, DRIVE).T_world_lidar(1)
+    assert 0 < np.abs(between - whole).max() < 0.02
+    poses.unlink()
+    with pytest.raises(InputError, match="no poses"):
+        Kitti360(place, DRIVE).T_world_lidar(1)
+
+
+FISHEYE = """%YAML:1.0
+---
+model_type: MEI
+camera_name: image_02
+image_width: 1400
+image_height: 1400
+mirror_parameters:
+   xi: 2.2
+distortion_parameters:
+   k1: 0.016
+   k2: 1.65
+   p1: 0.0
+   p2: 0.0
+projection_parameters:
+   gamma1: 1336.0
+   gamma2: 1335.0
+   u0: 716.9
+   v0: 705.7
+"""
+
+
+@pytest.fixture
+def fisheye(copied):
+    """A drive with an image of a fisheye that looks to the left, a metre to the scanner's left."""
+    place = copied("kitti-360")
+    images = place / "data_2d_raw" / DRIVE / "image_02"
+    (images / "data_rgb").mkdir(parents=True)
+    cv2.imwrite(str(images / "data_rgb/0000000001.png"), np.zeros((1400, 1400, 3), np.uint8))
+    stamps = place / "data_3d_raw" / DRIVE / "velodyne_points/timestamps.txt"
+    shutil.copy(stamps, images)
+    (place / "calibration/image_02.yaml").write_text(FISHEYE)
+    to_pose = place / "calibration/calib_cam_to_pose.txt"
+    T_pose_cam = np.fromstring(to_pose.read_text().split(":")[1].split("\n")[0], sep=" ")
+    T_pose_cam0 = np.vstack([T_pose_cam.reshape(3, 4), [0, 0, 0, 1]])
+    to_velo = place / "calibration/calib_cam_to_velo.txt"
+    T_lidar_cam0 = np.vstack([np.loadtxt(to_velo).reshape(3, 4), [0, 0, 0, 1]])
+    T_lidar_cam = np.array([[1.0, 0, 0, 0], [0, 0, 1, 1], [0, -1, 0, 0], [0, 0, 0, 1]])
+    T_pose_cam = T_pose_cam0 @ inverse(T_lidar_cam0) @ T_lidar_cam
+    line = "image_02: " + " ".join(map(repr, T_pose_cam[:3].ravel().tolist()))
+    to_pose.write_text(to_pose.read_text() + line + "\n")
+    return place
+
+
+def test_a_fisheye_projects_as_the_data_sets_tools_do(fisheye):
+    sequence = Kitti360(fisheye, DRIVE)
+    camera = sequence.cameras["image_02"]
+    assert list(sequence.image_stamps_ns("image_02")) == [1]
+    assert sequence.image("image_02", 1).shape == (1400, 1400, 3)
+    points = np.array([[2.0, 5.0, 0.5], [-3.0, 4.0, 1.0], [0.0, -5.0, 0.0]])
+    in_camera = points @ camera.T_cam_lidar[:3, :3].T + camera.T_cam_lidar[:3, 3]
+    np.testing.assert_allclose(in_camera[0], [2.0, -0.5, 4.0], atol=1e-9)
+    uv, seen = cameras.image_points(camera, in_camera)
+    assert seen.tolist() == [True, True, False]
+    # kitti360scripts' CameraFisheye.cam2image, by hand
+    x, y, z = in_camera[0] / np.sqrt(2.0**2 + 0.5**2 + 4.0**2)
+    x, y = x / (z + 2.2), y / (z + 2.2)
+    bent = 1 + 0.016 * (x * x + y * y) + 1.65 * (x * x + y * y) ** 2
+    np.testing.assert_allclose(uv[0], [1336 * x * bent + 716.9, 1335 * y * bent + 705.7])
+
+
+# Damage
+
+
+def cut(path):
+    path.write_bytes(path.read_bytes()[:-5])
+
+
+def swap(old, new):
+    return lambda p: p.write_text(p.read_text().replace(old, new, 1))
+
+
+def shrink(path):
+    cv2.imwrite(str(path), np.zeros((4, 6, 3), np.uint8))
+
+
+TR = "Tr: "
+CALIBRATION, PERSPECTIVE = "calib.txt", "calibration/perspective.txt"
+STAMPS = f"data_3d_raw/{DRIVE}/velodyne_points/timestamps.txt"
+POSES_360 = f"data_poses/{DRIVE}/poses.txt"
+FISHEYE_YAML = "calibration/image_02.yaml"
+DAMAGE = {
+    "odometry: calibration missing": (
+        "kitti-odometry",
+        CALIBRATION,
+        lambda p: p.unlink(),
+        "missin",
+    ),
+    "odometry: no Tr": ("kitti-odometry", CALIBRATION, swap(TR, "Rt: "), "no key Tr"),
+    "odometry: Tr cut": (
+        "kitti-odometry",
+        CALIBRATION,
+        lambda p: p.write_text(p.read_text()[:-99]),
+        "Tr: got",
+    ),
+    "odometry: Tr is no rotation": (
+        "kitti-odometry",
+        CALIBRATION,
+        swap(TR + "-0.0", TR + "-9.0"),
+        "rotation",
+    ),
+    "odometry: a projection of text": (
+        "kitti-odometry",
+        CALIBRATION,
+        swap("P2: 7", "P2: x7"),
+        "x7",
+    ),
+    "odometry: times as text": ("kitti-odometry", "times.txt", swap("0.0", "now"), "line 1"),
+    "odometry: times that stand": (
+        "kitti-odometry",
+        "times.txt",
+        swap("2.0", "1.0"),
+        "line 3: got",
+    ),
+    "odometry: too few times": (
+        "kitti-odometry",
+        "times.txt",
+        lambda p: p.write_text("0\n"),
+        "time",
+    ),
+    "odometry: pose not finite": (
+        "kitti-odometry",
+        "../../poses/00.txt",
+        lambda p: p.write_text("nan " + p.read_text().split(" ", 1)[1]),
+        "line 1: got a value that is not finite",
+    ),
+    "odometry: too few poses": (
+        "kitti-odometry",
+        "../../poses/00.txt",
+        lambda p: p.write_text(""),
+        "no pose of frame 0",
+    ),
+    "odometry: pose is no rotation": (
+        "kitti-odometry",
+        "../../poses/00.txt",
+        lambda p: p.write_text("9" + p.read_text()[1:]),
+        "not a rotation",
+    ),
+    "odometry: sweep cut": ("kitti-odometry", "velodyne/000000.bin", cut, "truncated"),
+    "odometry: no sweeps": (
+        "kitti-odometry",
+        "velodyne",
+        lambda p: [f.unlink() for f in p.iterdir()],
+        "no sweeps",
+    ),
+    "odometry: first image cut": (
+        "kitti-odometry",
+        "image_2/000000.png",
+        lambda p: p.write_bytes(b"x"),
+        "not a complete image",
+    ),
+    "tracking: calibration missing": (
+        "kitti-tracking",
+        "calib/0000.txt",
+        lambda p: p.unlink(),
+        "missing",
+    ),
+    "tracking: no R_rect": (
+        "kitti-tracking",
+        "calib/0000.txt",
+        swap("R_rect", "R"),
+        "no key R_rect",
+    ),
+    "tracking: oxts cut": (
+        "kitti-tracking",
+        "oxts/0000.txt",
+        lambda p: p.write_text(p.read_text()[:70] + "\n"),
+        "line 1: got",
+    ),
+    "tracking: latitude": ("kitti-tracking", "oxts/0000.txt", swap("49.0", "149.0"), "149 deg"),
+    "tracking: sweep cut": ("kitti-tracking", "velodyne/0000/000000.bin", cut, "truncated"),
+    "360: stamps missing": ("kitti-360", STAMPS, lambda p: p.unlink(), "missing"),
+    "360: stamps as text": ("kitti-360", STAMPS, swap("2026", "now"), "line 1: got"),
+    "360: too few stamps": ("kitti-360", STAMPS, lambda p: p.write_text(""), "no stamp of frame 0"),
+    "360: size not whole": ("kitti-360", PERSPECTIVE, swap("1242.0", "1242.5"), "whole pixels"),
+    "360: size of another": (
+        "kitti-360",
+        PERSPECTIVE,
+        swap("1242.0", "1240"),
+        "expected 1240 x 375",
+    ),
+    "360: pose cut": ("kitti-360", POSES_360, lambda p: p.write_text("0 1 0\n"), "got 3 values"),
+    "360: one pose": (
+        "kitti-360",
+        POSES_360,
+        lambda p: p.write_text(p.read_text().split("\n")[0]),
+        "two",
+    ),
+    "360: pose is no rotation": ("kitti-360", POSES_360, swap("0 ", "0 9"), "not a rotation"),
+    "360: pose too long": ("kitti-360", POSES_360, swap("0 0.", "0 nan 0."), "got 14 values"),
+    "360: cut calibration": (
+        "kitti-360",
+        "calibration/calib_cam_to_velo.txt",
+        lambda p: p.write_text(p.read_text()[:99]),
+        "scanner: got",
+    ),
+    "360: no camera": (
+        "kitti-360",
+        "calibration/calib_cam_to_pose.txt",
+        swap("image_00", "image_04"),
+        "no key image_00",
+    ),
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGE)
+def test_damage_is_refused_in_a_line(copied, damage):
+    name, file, harm, says = DAMAGE[damage]
+    place = copied(name)
+    harm(place / file)
+    with pytest.raises(InputError, match=says) as error:
+        sequence = open_sequence(f"{name}:{place}")
+        sequence[0]
+        sequence.T_world_lidar(0)
+        sequence.image(FORMATS[name][0], 0)
+    assert "\n" not in str(error.value) and str(place.parents[1]) in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "says"),
+    [
+        ("   xi: 2.2\n", "", "expected image_width"),
+        ("1336.0", "-3", "not positive"),
+        ("k1: 0.016", "k1: abc", "abc"),
+        ("model_type: MEI", "model_type: [", "expected image_width"),
+        (
+            "model_type: MEI",
+            "model_type: !!python/object/apply:os.system ['true']",
+            "could not det",
+        ),
+        ("1400", "140", "expected 140 x 1400"),
+    ],
+)
+def test_a_broken_fisheye_is_refused_in_a_line(fisheye, old, new, says):
+    path = fisheye / FISHEYE_YAML
+    path.write_text(path.read_text().replace(old, new, 1))
+    with pytest.raises(InputError, match=says) as error:
+        Kitti360(fisheye, DRIVE).image("image_02", 1)
+    assert "\n" not in str(error.value) and "image_02" in str(error.value)
+
+
+# A real sequence
+
+
+def test_real_odometry_sweeps(test_data):
+    path = test_data / "kitti_odometry/sequences/00"
+    for place in (path, path.parent.parent):
+        sequence = open_sequence(place)
+        assert isinstance(sequence, KittiOdometry)
+    assert list(sequence.frames) == [0, 1, 2] and not sequence.cameras
+    assert [len(sequence[n]) for n in range(3)] == [
+        1_994_688 // 16,
+        1_993_680 // 16,
+        1_991_648 // 16,
+    ]
+    sweep = sequence[0]
+    raw = np.fromfile(path / "velodyne/000000.bin", "<f4").reshape(-1, 4)
+    np.testing.assert_array_equal(sweep.points, raw[:, :3])
+    np.testing.assert_array_equal(sweep.intensity, raw[:, 3])
+    near = np.hypot(*sweep.points[:, :2].T) < 10
+    assert np.median(sweep.points[near, 2]) == pytest.approx(-1.73, abs=0.1)  # the road
