@@ -35,7 +35,7 @@ from densify.config import Config
 from densify.costs import Watch
 from densify.depth.accumulate import accumulate
 from densify.errors import InputError, SweepError
-from densify.flow.engines import SharedMotion, estimate_motion
+from densify.flow.engines import SharedMotion, estimate_motion, motion_type
 from densify.flow.scene import Scene
 from densify.flow.tracking.evidence import REACH_S, Candidates, FreeSpace, find_candidates
 from densify.geometry.ground import ground
@@ -190,6 +190,7 @@ class Recording:
                 bad[frame] = LeftOut(str(error), unreadable=True)
         return self._made(
             "registration",
+            Registration,
             lambda: [self.settings.register, self.timeline.period_ns, bad, known],
             partial(self._register, list(known), bad),
         )
@@ -221,7 +222,10 @@ class Recording:
                 return dict(zip(pieces, pool.map(RangeImage.of, sweeps), strict=True))
 
         return self._made(
-            "images", lambda: [(f, self.sweeps.content(f), p) for f, p in pieces.items()], make
+            "images",
+            dict[int, RangeImage],
+            lambda: [(f, self.sweeps.content(f), p) for f, p in pieces.items()],
+            make,
         )
 
     def _ground(self, number: int) -> list[HeightMap]:
@@ -233,11 +237,13 @@ class Recording:
                 return ground(stretch, self.settings.ground)
 
         return [
-            self._made("ground", partial(self._near, number, index), partial(make, frames))
+            self._made(
+                "ground", HeightMap, partial(self._near, number, index), partial(make, frames)
+            )
             for index, frames in enumerate(self._frames_within(number, REACH_S))
         ]
 
-    def _evidence(self, number: int) -> list[Mapping[int, Candidates]]:
+    def _evidence(self, number: int) -> list[dict[int, Candidates]]:
         """What may move in the block's sweeps, by frame, for each of its pieces."""
         min_height_m = self.settings.flow.min_height_m
 
@@ -251,7 +257,10 @@ class Recording:
 
         return [
             self._made(
-                "evidence", partial(self._evidence_inputs, number, index), partial(make, index, f)
+                "evidence",
+                dict[int, Candidates],
+                partial(self._evidence_inputs, number, index),
+                partial(make, index, f),
             )
             for index, f in enumerate(self._frames_within(number, REACH_S))
         ]
@@ -288,7 +297,10 @@ class Recording:
         pieces = self._pieces(number, margin_s)
         for index, frames in enumerate(self._frames_within(number, margin_s)):
             motion = self._made(
-                "motion", partial(inputs, pieces[index], frames), partial(make, index, frames)
+                "motion",
+                motion_type(engine),
+                partial(inputs, pieces[index], frames),
+                partial(make, index, frames),
             )
             found.append((frames, motion))
         return found
@@ -379,9 +391,12 @@ class Recording:
 
     # Kept on disk
 
-    def _made(self, stage: str, inputs: Callable[[], Any], make: Callable[[], T]) -> T:
-        """What ``make`` returns, now or when it was made of the same inputs before."""
-        return make() if self._cache is None else self._cache.get(stage, inputs(), make)
+    def _made(
+        self, stage: str, kind: type[T], inputs: Callable[[], Any], make: Callable[[], T]
+    ) -> T:
+        """What ``make`` returns, of that type, now or when it was made of the same inputs
+        before."""
+        return make() if self._cache is None else self._cache.get(stage, kind, inputs(), make)
 
     def _near(self, number: int, index: int) -> Any:
         """What the ground of a piece depends on."""

@@ -12,6 +12,7 @@ from densify.costs import Watch
 from densify.errors import InputError
 from densify.readers.timeline import Timeline
 from densify.readers.window import read_sweep
+from densify.registration.trajectory import LeftOut
 from densify.types import LidarSequence, Sweep
 
 _DIGESTS_TOGETHER = 20
@@ -43,8 +44,8 @@ class Sweeps:
             self.read(frame)
             return ""
         found = self._digests(self._timeline.row[frame] // _DIGESTS_TOGETHER)[frame]
-        if isinstance(found, InputError):
-            raise found
+        if isinstance(found, LeftOut):
+            raise InputError(found.reason)
         return found
 
     def _read(self, frame: int) -> Sweep:
@@ -53,20 +54,20 @@ class Sweeps:
         with self._watch.stage("read"):
             return read_sweep(self._sequence, frame, self._settings)
 
-    def _find_digests(self, number: int) -> dict[int, str | InputError]:
+    def _find_digests(self, number: int) -> dict[int, str | LeftOut]:
         """Digests by frame; all processes of a run look them up, only the first has to read."""
         first = number * _DIGESTS_TOGETHER
 
-        def read() -> dict[int, str | InputError]:
-            found: dict[int, str | InputError] = {}
+        def read() -> dict[int, str | LeftOut]:
+            found: dict[int, str | LeftOut] = {}
             for frame in self._timeline.frames[first : first + _DIGESTS_TOGETHER]:
                 try:
                     found[frame] = digest(self._read(frame))
                 except InputError as error:
-                    found[frame] = error
+                    found[frame] = LeftOut(str(error), unreadable=True)
             return found
 
         if self._cache is None:
             return read()
         inputs = [self._run, self._sequence.name, self._settings, number]
-        return self._cache.get("digests", inputs, read)
+        return self._cache.get("digests", dict[int, str | LeftOut], inputs, read)

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from densify.blocks import Cut
-from densify.cache import Cache
-from densify.dataset import make
+from densify.cache import Cache, steps_folder
+from densify.dataset import make, work
 from densify.dataset.loader import DepthDataset
 from densify.dataset.plan import Recipe, Source
 from densify.dataset.work import Job, tasks
@@ -174,8 +174,8 @@ def test_no_task_makes_what_another_is_for(
     """Else workers would do it several times."""
     made, get, run_tasks = [], Cache.get, make.run_tasks
 
-    def watched(self, stage, inputs, make):
-        return get(self, stage, inputs, lambda: made.append(stage) or make())
+    def watched(self, stage, kind, inputs, make):
+        return get(self, stage, kind, inputs, lambda: made.append(stage) or make())
 
     def watched_tasks(tasks, workers):
         for outcome in run_tasks(tasks, workers):
@@ -191,6 +191,11 @@ def test_no_task_makes_what_another_is_for(
     arguments = [*OPTIONS, *options, "--keys", "39:41", "--out", tmp_path / "out"]
     assert exit_code("dataset", "--data", border_drive, *arguments) == 0
     assert statuses(tmp_path / "out") == {39: "done", 40: "done"}
+    kept = {path.name.partition("-")[0] for path in steps_folder().iterdir()}
+    wanted = {"digests", "registration"}
+    if "icp" not in options:
+        wanted |= {"ground"} if "flow.engine=paper" in options else {*work._NEEDS}
+    assert kept == wanted
 
 
 @pytest.mark.parametrize("window", [5, 14, 15, 30, 50])

@@ -5,9 +5,11 @@ from __future__ import annotations
 
 import logging
 import os
+import pickle
 import random
 import subprocess
 import sys
+import time
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,18 +17,22 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 
 import densify
-from densify.cache import Cache, digest
+from densify.cache import Cache, digest, steps_folder
+from densify.errors import InputError
+from tests.command import exit_code
 
 LIMIT = 10**9
 VALUE = {"noise": np.random.default_rng(1).random((3000, 3)), "few": np.arange(5)}
+KIND = dict[str, NDArray]
 
 
 def get(cache: Cache, inputs=1) -> int:
     """How often it was made; whatever happens, the value is right."""
     calls = []
-    found = cache.get("stage", inputs, lambda: calls.append(1) or VALUE)
+    found = cache.get("stage", KIND, inputs, lambda: calls.append(1) or VALUE)
     assert found.keys() == VALUE.keys()
     assert all(np.array_equal(found[name], VALUE[name]) for name in VALUE)
     return len(calls)
@@ -90,14 +96,14 @@ def test_what_fails_is_not_kept(tmp_path: Path) -> None:
     cache = Cache(LIMIT, tmp_path)
     for _ in range(2):
         with pytest.raises(ZeroDivisionError):
-            cache.get("stage", 1, fail)
+            cache.get("stage", KIND, 1, fail)
     assert get(cache) == 1
 
 
 def test_every_flipped_bit_is_noticed(tmp_path: Path, caplog) -> None:
     cache = Cache(LIMIT, tmp_path)
     get(cache)
-    (path,) = tmp_path.rglob("output.pkl")
+    (path,) = tmp_path.iterdir()
     whole, rng = path.read_bytes(), random.Random(3)
     places = [0, 1, 5, len(whole) - 1, len(whole) - 4, *rng.choices(range(len(whole)), k=60)]
     with caplog.at_level(logging.DEBUG):
@@ -105,12 +111,80 @@ def test_every_flipped_bit_is_noticed(tmp_path: Path, caplog) -> None:
             damaged = bytearray(whole)
             damaged[place] ^= 1 << rng.randrange(8)
             path.write_bytes(damaged)
-            get(cache)
-    assert caplog.records == []
-    for length in (0, 1, 10, len(whole) // 2, len(whole) - 10):
+            assert get(cache) == 1
+    assert {record.levelno for record in caplog.records} == {logging.DEBUG}
+    assert len(caplog.records) == len(places) and "made anew" in caplog.text
+    for length in (0, 1, 10, len(whole) // 2, len(whole) - 10, len(whole) - 1):
         path.write_bytes(whole[:length])
         assert get(cache) == 1
+    path.write_bytes(whole + b"x")
+    assert get(cache) == 1
     assert get(cache) == 0
+
+
+class Planted:
+    def __reduce__(self):
+        return os.mkdir, ("planted",)
+
+
+def test_nothing_that_others_put_there_is_run(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    cache = Cache(LIMIT, tmp_path / "cache")
+    get(cache)
+    (path,) = (tmp_path / "cache").iterdir()
+    path.write_bytes(pickle.dumps(Planted()))
+    assert get(cache) == 1
+    assert not (tmp_path / "planted").exists()
+
+
+def test_an_entry_larger_than_the_cache_may_be_is_not_read(tmp_path: Path) -> None:
+    cache = Cache(LIMIT, tmp_path)
+    get(cache)
+    (path,) = tmp_path.iterdir()
+    with path.open("r+b") as file:
+        file.truncate(1 << 40)  # of which nothing is on the disk
+    assert get(cache) == 1
+
+
+def test_what_cannot_be_kept_only_costs_time(tmp_path: Path) -> None:
+    cache = Cache(LIMIT, tmp_path)
+    for _ in range(2):
+        assert cache.get("stage", dict[str, str], 1, lambda: {"a": 1}) == {"a": 1}
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_folder_is_the_users_alone(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setenv("DENSIFY_CACHE_DIR", str(tmp_path / "cache"))
+    Cache(LIMIT)
+    assert {p.stat().st_mode & 0o777 for p in (tmp_path / "cache", steps_folder())} == {0o700}
+
+
+@pytest.mark.parametrize("mode", [0o770, 0o702])
+@pytest.mark.parametrize("name", ["", "steps", "street"])
+def test_a_folder_that_others_can_write_to_is_refused(
+    mode: int, name: str, tmp_path: Path, monkeypatch, capsys
+) -> None:
+    monkeypatch.setenv("DENSIFY_CACHE_DIR", str(tmp_path / "cache"))
+    folder = tmp_path / "cache" / name
+    folder.mkdir(parents=True)
+    folder.chmod(mode)
+    arguments = ["dataset", "--data", "street", "--keys", "1:2", "--out", tmp_path / "out"]
+    assert exit_code(*arguments) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith(f"densify: cache {folder}: others can write to it")
+    assert not (tmp_path / "out").exists() and list(folder.rglob("*.*")) == []
+    if name != "street":
+        with pytest.raises(InputError, match="others can write"):
+            Cache(LIMIT)
+
+
+def test_a_folder_of_somebody_else_is_refused(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setenv("DENSIFY_CACHE_DIR", str(tmp_path))
+    monkeypatch.setattr(os, "getuid", lambda: tmp_path.stat().st_uid + 1)
+    if tmp_path.stat().st_uid == 0:
+        os.chown(tmp_path, 12345, -1)
+    with pytest.raises(InputError, match="others can write"):
+        steps_folder()
 
 
 def num_bytes(folder: Path) -> int:
@@ -123,21 +197,28 @@ def test_what_was_used_longest_ago_goes_first(tmp_path: Path) -> None:
     one = num_bytes(tmp_path)
     for inputs in range(1, 6):
         get(cache, inputs)
+    for path in tmp_path.iterdir():
+        os.utime(path, (0, 0))
     for age, inputs in enumerate([3, 0, 5, 1, 4, 2]):
-        before = {path: path.stat().st_atime_ns for path in tmp_path.rglob("output.pkl")}
-        get(cache, inputs)
-        for path, seen_ns in before.items():
-            if path.stat().st_atime_ns != seen_ns:
-                os.utime(path, (age, age))
-                os.utime(path.parent, (age, age))
+        assert get(cache, inputs) == 0
+        (used,) = [path for path in tmp_path.iterdir() if path.stat().st_mtime > 100]
+        os.utime(used, (age, age))
     cache.trim()
-    assert len(list(tmp_path.rglob("output.pkl"))) == 6
+    assert len(list(tmp_path.iterdir())) == 6
     Cache(int(2.5 * one), tmp_path).trim()
     assert num_bytes(tmp_path) <= 2.5 * one
     assert [get(cache, inputs) for inputs in (2, 4)] == [0, 0]
     assert [get(cache, inputs) for inputs in (3, 0, 5, 1)] == [1, 1, 1, 1]
     Cache(0, tmp_path).trim()
-    assert list(tmp_path.rglob("output.pkl")) == []
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_what_killed_processes_left_aside_goes(tmp_path: Path) -> None:
+    for name, age_s in (("old.tmp", 7200), ("new.tmp", 5), ("of_somebody", 7200)):
+        (tmp_path / name).touch()
+        os.utime(tmp_path / name, (time.time() - age_s,) * 2)
+    Cache(0, tmp_path).trim()
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["new.tmp", "of_somebody"]
 
 
 USING = """
@@ -174,6 +255,6 @@ def test_several_processes_read_write_and_trim(tmp_path: Path) -> None:
         assert 12 < int(said) < 150
     cache = Cache(limit, tmp_path / "shared")
     cache.trim()
-    assert num_bytes(tmp_path / "shared") <= limit + 2000  # the code beside the entries
-    assert not [p for p in (tmp_path / "shared").rglob("*.thread-*")]
+    assert num_bytes(tmp_path / "shared") <= limit
+    assert not list((tmp_path / "shared").glob("*.tmp"))
     get(cache)

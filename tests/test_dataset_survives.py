@@ -305,7 +305,7 @@ def test_a_disk_that_fills_up_between_two_files(
 
 
 def files_of(cache: Path) -> list[Path]:
-    return sorted(p for p in (cache / "dataset").rglob("*") if p.is_file())
+    return sorted(p for p in (cache / "steps").rglob("*") if p.is_file())
 
 
 @pytest.fixture(scope="module")

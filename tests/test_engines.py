@@ -4,15 +4,15 @@
 from __future__ import annotations
 
 import inspect
-import pickle
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from densify.cache.codec import decode, encode
 from densify.config import Config, resolve
 from densify.errors import InputError
-from densify.flow.engines import check_engine, estimate_motion
+from densify.flow.engines import check_engine, estimate_motion, motion_type
 from densify.flow.scene import Scene
 from densify.flow.tracking.evidence import FreeSpace, find_candidates
 from densify.geometry.ground import ground
@@ -64,7 +64,8 @@ def test_what_a_scene_is_asked_for_is_made_once(driving: Scene) -> None:
 @pytest.mark.parametrize("row", [r for r in ENGINES.built_in if r.shared], ids=lambda r: r.name)
 def test_shared_motion_is_kept_without_points(driving: Scene, row) -> None:
     motion = estimate_motion(driving, Config(), row.usage)
-    kept = pickle.loads(pickle.dumps(motion.with_stretch(Stretch(()))))
+    kind = motion_type(row.usage)
+    kept = decode(encode(motion.with_stretch(Stretch(())), kind), kind)
     nobody = replace(
         driving.stretch.sweeps[0],
         sweep=driving.stretch.sweeps[0].sweep.select(

@@ -75,6 +75,26 @@ def test_a_cache_that_cannot_be_written_does_not_matter(double, tmp_path, monkey
     assert not list(tmp_path.rglob("*.nbc"))
 
 
+@pytest.mark.parametrize("name", ["", "kernels"])
+def test_code_that_others_could_have_put_there_is_not_loaded(
+    name, double, tmp_path, monkeypatch, caplog
+):
+    folder = tmp_path / "numba"
+    monkeypatch.setattr("numba.config.CACHE_DIR", str(folder))
+    check(kernels.Kernel(double))
+    (own,) = folder.iterdir()
+    kept = {path: path.read_bytes() for path in own.iterdir()}
+    assert len(kept) == 2 and caplog.records == []
+    (own if name else folder).chmod(0o777)
+    kernels._is_open.cache_clear()
+    again = kernels.Kernel(double)
+    check(again)
+    assert sum(again._compiled.stats.cache_hits.values()) == 0
+    assert {path: path.read_bytes() for path in own.iterdir()} == kept
+    assert [r.levelname for r in caplog.records] == ["WARNING"]
+    assert "others can write to it" in caplog.text
+
+
 def test_compiling_is_announced_once_and_loading_is_not(double, caplog, monkeypatch):
     monkeypatch.setattr(kernels._notice, "said", False)
     caplog.set_level("INFO", "densify.progress")

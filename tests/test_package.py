@@ -193,10 +193,10 @@ DOORS: dict[str, str | tuple[str, ...]] = {
     "dask": "densify/dataset/cluster.py",
     "distributed": "densify/dataset/cluster.py",
     "embreex": "densify/street/world.py",
-    "joblib": "densify/cache.py",
     "kiss_icp": "densify/registration/odometry.py",
     "laspy": ("densify/outputs/cloud_laz.py", "densify/readers/point_files.py"),
     "numba": "densify/kernels/",
+    "pickle": "densify/dataset/calls.py",
     "torch": ("densify/flow/", "densify/dataset/loader.py"),
 }
 

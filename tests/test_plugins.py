@@ -115,9 +115,13 @@ STILL = """
     '''Nothing moves.
 
     And more.'''
+    from dataclasses import dataclass
     ARGUMENT, SHARED = "N", True
-    def estimate_motion(scene, settings, argument):
-        return argument
+    @dataclass
+    class Still:
+        number: int
+    def estimate_motion(scene, settings, argument) -> Still:
+        return Still(int(argument))
     def check_argument(argument):
         from densify.errors import InputError
         if not argument.isdigit():
@@ -137,6 +141,13 @@ def test_a_module_says_what_a_row_says(package) -> None:
         check_engine("still:x")
     with pytest.raises(InputError, match=r"got 'stil', expected one of .*#NAME\], still \("):
         resolve(None, ["flow.engine=stil"])
+
+
+def test_shared_motion_has_to_say_what_it_is(package) -> None:
+    """Nothing else says what is read from the cache."""
+    package("densify.flow_engines", "still", STILL.replace(" -> Still", " -> int"))
+    with pytest.raises(InputError, match=r"still shares its motion .* got <class 'int'>"):
+        check_engine("still:3")
 
 
 def test_built_in_names_cannot_be_replaced(package) -> None:

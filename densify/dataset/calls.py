@@ -34,7 +34,7 @@ def answer(work: bytes) -> bytes:
 
 
 def outcome(task: Task, answered: bytes) -> Outcome:
-    """Of an answer; what the worker logged below ``densify`` is logged in this process."""
+    """What an answer says of its task; what the worker logged is logged in this process."""
     value, error, trace, records = pickle.loads(answered)
     for record in records:
         logging.getLogger(record.name).handle(record)

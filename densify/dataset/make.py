@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from uuid import uuid4
 
-from densify.cache import code
+from densify.cache import code, steps_folder
 from densify.config import as_mapping
 from densify.dataset.manifest import (
     Key,
@@ -120,6 +120,7 @@ def make_dataset(
     check_engine(recipe.config.flow.engine)
     drives = plan(data, keys, recipe)
     check_place(out)
+    steps_folder()
     with Manifest(out, shard) as manifest:
         write_plan(out, recipe, drives)
         with _log_file(out, shard):

@@ -9,11 +9,14 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
+from functools import cache
+from pathlib import Path
 from typing import Any, TypeVar
 
 import numba
 from numba.core import event
 
+from densify.cache.folder import others_can_write
 from densify.kernels import threads
 
 _log = logging.getLogger("densify")
@@ -51,12 +54,26 @@ def inlined(function: _Function) -> _Function:
     return compiled
 
 
+@cache
+def _is_open(folder: Path) -> bool:
+    """Whether others can write to it or to the folder it is in; says so."""
+    found = next((f for f in (folder, folder.parent) if others_can_write(f)), None)
+    if found is not None:
+        _log.warning(
+            "%s: others can write to it; compiled code is not kept there: chmod 700 it, or name "
+            "another folder by NUMBA_CACHE_DIR",
+            found,
+        )
+    return found is not None
+
+
 class Kernel:
     """A function that is compiled when first called with new types, and kept for later runs.
 
     The cache lies beside the source file, else in the user's cache directory, or where the
-    environment variable NUMBA_CACHE_DIR says. Where none can be written, or what lies there is
-    damaged, it is compiled anew in every run.
+    environment variable NUMBA_CACHE_DIR says. Where none can be written, what lies there is
+    damaged, or others than those who can change the source could have put it there (it is loaded as
+    code), it is compiled anew in every run.
     """
 
     def __init__(self, function: Callable[..., Any]) -> None:
@@ -66,6 +83,10 @@ class Kernel:
             self._compiled = numba.njit(function, cache=True, **_OPTIONS)
         except RuntimeError as error:  # no place for a cache
             self._do_without_cache(error)
+            return
+        folder = Path(self._compiled.stats.cache_path or "")
+        if folder.parent != Path(function.__code__.co_filename).parent and _is_open(folder):
+            self._do_without_cache(f"others can write to {folder}")
 
     def __call__(self, *arguments: Any) -> Any:
         try:
@@ -82,6 +103,6 @@ class Kernel:
         """
         threads.over_rows(self, num_rows, *arguments)
 
-    def _do_without_cache(self, error: Exception) -> None:
+    def _do_without_cache(self, error: Exception | str) -> None:
         _log.debug("%s is compiled without a cache: %s", self._function.__name__, error)
         self._compiled = numba.njit(self._function, **_OPTIONS)

@@ -21,9 +21,9 @@ from typing import Any
 from urllib.parse import parse_qsl
 
 import numpy as np
-import platformdirs
 from numpy.typing import NDArray
 
+from densify.cache.folder import own_folder
 from densify.errors import InputError
 from densify.street.camera import Picture
 from densify.street.lidar import Returns
@@ -238,9 +238,8 @@ class _Store:
     """
 
     def __init__(self, identity: str) -> None:
-        root = os.environ.get("DENSIFY_CACHE_DIR") or platformdirs.user_cache_dir("densify")
         digest = hashlib.sha256(identity.encode()).hexdigest()[:16]
-        self._folder = Path(root) / "street" / digest
+        self._folder = own_folder("street") / digest
         self._memory: OrderedDict[str, Arrays] = OrderedDict()
         self._rendered = False
 

@@ -9,6 +9,7 @@ acceleration, which most objects keep for a second. Softer ones start and stop.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy.interpolate import BSpline
@@ -27,15 +28,15 @@ _DEGREE = 3
 
 @dataclass(frozen=True)
 class Path:
-    """A function of time with several coordinates.
+    """A function of time with several coordinates: a cubic spline.
 
-    begin_s, end_s: between them it was fitted; outside it goes on at constant velocity.
-    residual_m: (root mean square over the sweeps, first two coordinates) of what it was fitted to,
-    corrected for the freedom it had.
+    knots_s, coefficients: of its B-splines, (n + 4,) and (n,d). begin_s, end_s: between them
+    it was fitted; outside it goes on at constant velocity. residual_m: (root mean square over the
+    sweeps, first two coordinates) of what it was fitted to, corrected for the freedom it had.
     """
 
-    spline: BSpline
-    derivative: BSpline
+    knots_s: Float
+    coefficients: Float
     begin_s: float
     end_s: float
     residual_m: float
@@ -50,7 +51,8 @@ class Path:
         begin_s, end_s = float(times_s[0]), float(times_s[-1])
         num_spans = max(1, round((end_s - begin_s) / _KNOT_S))
         width_s = (end_s - begin_s) / num_spans
-        knots = begin_s + width_s * np.arange(-_DEGREE, num_spans + _DEGREE + 1)
+        numbers = np.arange(-_DEGREE, num_spans + _DEGREE + 1, dtype=np.float64)
+        knots: Float = begin_s + width_s * numbers
         inside = np.clip(times_s, begin_s, np.nextafter(end_s, begin_s))
         B = BSpline.design_matrix(inside, knots, _DEGREE).toarray()
         order = 3 if _told(times_s, *_TELL_ACCELERATION) else 2
@@ -69,19 +71,26 @@ class Path:
                 mean_square = float(np.average(missed**2, weights=W))
                 residual = float(np.sqrt(mean_square * len(times_s) / freedom))
                 least, coefficients = error, found
-        spline = BSpline(knots, coefficients, _DEGREE)
-        return Path(spline, spline.derivative(), begin_s, end_s, residual)
+        return Path(knots, coefficients, begin_s, end_s, residual)
+
+    @cached_property
+    def _spline(self) -> BSpline:
+        return BSpline(self.knots_s, self.coefficients, _DEGREE)
+
+    @cached_property
+    def _derivative(self) -> BSpline:
+        return self._spline.derivative()
 
     def __call__(self, time_s: float | Float) -> Float:
         """(..., d) at these times."""
         inside = np.clip(time_s, self.begin_s, self.end_s)
         beyond = np.asarray(time_s - inside)[..., None]
-        state: Float = self.spline(inside) + beyond * self.derivative(inside)
+        state: Float = self._spline(inside) + beyond * self._derivative(inside)
         return state
 
     def rate(self, time_s: float | Float) -> Float:
         """(..., d) per second."""
-        rate: Float = self.derivative(np.clip(time_s, self.begin_s, self.end_s))
+        rate: Float = self._derivative(np.clip(time_s, self.begin_s, self.end_s))
         return rate
 
 
