@@ -133,8 +133,9 @@ class _Processes(Workers):
         except (EOFError, OSError):
             self._replaced(worker)
             return self._try_again(worker, task)
+        self._num_stillborn = 0
         if answered == _READY:
-            worker.ready, self._num_stillborn = True, 0
+            worker.ready = True
             return None
         worker.task = None
         return outcome(task, answered)
