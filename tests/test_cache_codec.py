@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 from numpy.typing import NDArray
@@ -91,6 +91,7 @@ def outers(draw) -> Outer:
     return made
 
 
+@settings(deadline=None, max_examples=60)
 @given(outers())
 def test_what_is_kept_comes_back(value: Outer) -> None:
     data = encode(value, Outer)

@@ -196,7 +196,11 @@ DOORS: dict[str, str | tuple[str, ...]] = {
     "kiss_icp": "densify/registration/odometry.py",
     "laspy": ("densify/outputs/cloud_laz.py", "densify/readers/point_files.py"),
     "numba": "densify/kernels/",
-    "pickle": "densify/dataset/calls.py",
+    "pickle": (
+        "densify/dataset/calls.py",
+        "densify/readers/pickled_frame.py",
+        "densify/writers/pandaset.py",
+    ),
     "torch": ("densify/flow/", "densify/dataset/loader.py"),
 }
 
