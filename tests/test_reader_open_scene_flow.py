@@ -61,7 +61,7 @@ def test_a_file_or_a_folder_of_files(folder, tmp_path):
         shutil.copy(folder / "street.h5", tmp_path / f"{name}.h5")
     assert open_sequence(tmp_path / "a.h5").name == "a"
     assert open_sequence(f"opensceneflow:{tmp_path}#b").name == "b"
-    with pytest.raises(InputError, match="holds 2 recordings; choose one by .*one of a, b"):
+    with pytest.raises(InputError, match=r"holds 2 recordings; choose one by .*one of a, b"):
         open_sequence(tmp_path)
 
 

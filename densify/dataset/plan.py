@@ -8,7 +8,7 @@ other, and readers find cameras and recordings:
     layout, method, window, cameras, gate, config    of every key
     drives    name -> data (what ``--data`` says), folder (of the tree, in OUT), frames (planned
               keys, as [first, last] runs), cameras (name -> width_px, height_px, K, T_cam_lidar,
-              distortion, model, max_angle_deg, row_time_s)
+              distortion, model, max_angle_deg, row_time_s, column_time_s)
 """
 
 from __future__ import annotations
@@ -289,6 +289,7 @@ def _stored_drive(entry: Mapping[str, Any]) -> StoredDrive:
             model=str(camera.get("model", "pinhole")),  # sets of before name none
             max_angle_deg=float(camera.get("max_angle_deg", 180.0)),
             row_time_s=float(camera.get("row_time_s", 0.0)),
+            column_time_s=float(camera.get("column_time_s", 0.0)),
         )
         for name, camera in entry["cameras"].items()
     }
@@ -305,6 +306,7 @@ def _as_plain(camera: Camera) -> dict[str, Any]:
         "model": camera.model,
         "max_angle_deg": camera.max_angle_deg,
         "row_time_s": camera.row_time_s,
+        "column_time_s": camera.column_time_s,
     }
 
 

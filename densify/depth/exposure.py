@@ -197,18 +197,19 @@ class Exposure:
 
     def see(self, points: Float, velocity_m_s: Float | Float32) -> Sight:
         """(N,3) points and velocities at the key's moment, key frame. A rolling shutter sees each
-        point at the time of the row it lands on, where camera and point have moved on."""
+        point at the time of the row or column it lands on, where camera and point have moved on."""
         late = points + self.late_s * velocity_m_s
         points_cam = poses.transform(self.T_cam_key, late)
         uv, inside = image_points(self.camera, points_cam)
-        if not self.camera.row_time_s:
+        if not self.camera.is_rolling:
             return Sight(points_cam, uv, inside)
         velocity_cam = poses.rotate(self.T_cam_key, velocity_m_s.astype(np.float64))
-        last = self.camera.height_px - 1
+        last = np.array([self.camera.width_px - 1, self.camera.height_px - 1])
+        time_s = np.array([self.camera.column_time_s, self.camera.row_time_s])
         row_s, there = np.zeros((len(points), 1)), points_cam
         for _ in range(_NUM_ROW_STEPS):
-            row = np.where(np.isnan(uv[:, 1]), last / 2, np.clip(uv[:, 1], 0, last))
-            row_s = (row[:, None] - last / 2) * self.camera.row_time_s
+            pixel = np.where(np.isnan(uv), last / 2, np.clip(uv, 0, last))
+            row_s = ((pixel - last / 2) * time_s).sum(axis=1, keepdims=True)
             turn = np.hstack([-row_s * self.twist[:3], np.zeros((len(points), 3))])
             ahead = points_cam + row_s * (velocity_cam - self.twist[3:])
             there = poses.transform_each(turn, ahead)

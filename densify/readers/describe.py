@@ -81,8 +81,8 @@ def _cameras(sequence: LidarSequence) -> list[tuple[str, str]]:
     for name, camera in sequence.cameras.items():
         text = f"{camera.width_px} x {camera.height_px} px, fx {camera.focal_px:.1f} px, "
         text += "rectified" if camera.is_rectified else f"{camera.model} with lens distortion"
-        if camera.row_time_s:
-            text += f", rolling shutter of {abs(camera.row_time_s) * camera.height_px * 1e3:.1f} ms"
+        if camera.is_rolling:
+            text += f", rolling shutter of {camera.readout_s * 1e3:.1f} ms"
         exposed = sequence.image_stamps_ns(name)
         text += f", {len(exposed)} images: {format_frames(exposed)}"
         if len(exposed) > 1:

@@ -101,7 +101,9 @@ class Camera:
     coefficients: of a pinhole OpenCV's (k1 k2 p1 p2 k3 ...), empty if rectified; of a fisheye k1 k2
     k3 k4; of mei xi k1 k2 p1 p2. max_angle_deg: beyond this angle off its axis the lens sees
     nothing. row_time_s: seconds from the exposure of a row of the image to that of the row below,
-    negative if it is read from the bottom, 0 for all at once; its stamp is that of the middle row.
+    negative if it is read from the bottom, 0 for all at once. column_time_s: the same from a column
+    to the one on its right, of a shutter that runs sideways. The stamp is that of the image's
+    middle.
     """
 
     name: str
@@ -113,6 +115,18 @@ class Camera:
     model: str = "pinhole"
     max_angle_deg: float = 180.0
     row_time_s: float = 0.0
+    column_time_s: float = 0.0
+
+    @property
+    def is_rolling(self) -> bool:
+        """Whether its rows or columns are exposed one after another."""
+        return bool(self.row_time_s or self.column_time_s)
+
+    @property
+    def readout_s(self) -> float:
+        """Between the exposures of the first and the last row or column, about."""
+        along = abs(self.row_time_s) * self.height_px
+        return along + abs(self.column_time_s) * self.width_px
 
     @property
     def is_rectified(self) -> bool:

@@ -167,9 +167,9 @@ def check_plain_cameras(excerpt: Excerpt, format: str) -> None:
     neither."""
     for name in excerpt.cameras:
         camera = excerpt.street.cameras[name]
-        if not camera.is_rectified or camera.row_time_s:
+        if not camera.is_rectified or camera.is_rolling:
             cameras = excerpt.street.cameras.items()
-            fit = [n for n, c in cameras if c.is_rectified and not c.row_time_s]
+            fit = [n for n, c in cameras if c.is_rectified and not c.is_rolling]
             raise InputError(
                 f"{excerpt.street.name}: camera {name} cannot be written as {format}, whose images "
                 f"are rectified and exposed all at once; choose among {', '.join(fit) or 'none'}"
