@@ -159,6 +159,19 @@ def test_no_library_code_exits_prints_or_asserts() -> None:
         assert not found, f"{path}: {found and found.group()}"
 
 
+RUNS_CODE = (
+    r"\b(eval|exec)\(|allow_pickle=True|(unsafe|full)_load|yaml\.(Unsafe|Full)?Loader\b"
+    r"|torch\.load|shell=True|os\.system|\b(marshal|shelve|subprocess|cloudpickle|dill)\b"
+)
+
+
+def test_no_file_can_have_code_run() -> None:
+    """As SECURITY.md promises; where pickle may be used, `DOORS` says."""
+    for path in (CHECKOUT / "densify").rglob("*.py"):
+        found = re.search(RUNS_CODE, path.read_text("utf-8"))
+        assert not found, f"{path}: {found and found.group()}"
+
+
 FLOORS = (
     ("arrays", "errors", "version", "knobs", "plugins"),
     ("cache", "types"),
