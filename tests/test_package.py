@@ -183,7 +183,7 @@ FLOORS = (
     ("blocks", "sweeps"),
     ("recording",),
     ("pipeline",),
-    ("bench", "dataset"),
+    ("bench", "dataset", "doctor"),
     ("cli",),
 )
 """A module imports from lower floors only, or from its own."""

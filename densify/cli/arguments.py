@@ -46,6 +46,7 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     add_dataset(commands)
     _add_flow(commands)
     _add_info(commands)
+    _add_doctor(commands)
     _add_simulate(commands)
     _add_export(commands)
     _add_evaluate(commands)
@@ -135,6 +136,36 @@ def _add_info(commands: Any) -> None:
         commands, "info", verbs.info, "what a recording holds: frames, rate, cameras, stamps, poses"
     )
     parser.add_argument("--data", metavar="SPEC", default="street", help=DATA_HELP)
+
+
+def _add_doctor(commands: Any) -> None:
+    parser = add_verb(
+        commands,
+        "doctor",
+        verbs.doctor,
+        "what may be wrong with a recording, and what mends it",
+        "Looks at fifteen sweeps and a few images from all over the recording. Each check has a "
+        "verdict (fine, unknown, suspicious, wrong), the number it rests on, and the option or "
+        "line that mends it. Exit code 2 if something is wrong.",
+    )
+    parser.add_argument(
+        "data", metavar="SPEC", nargs="?", default="street", help=f"the recording: {DATA_HELP}"
+    )
+    parser.add_argument("--json", action="store_true", help="print the findings as JSON")
+    parser.add_argument(
+        "--write-config",
+        action="store_true",
+        help="instead: draft the densify.yaml of a folder of sweeps from what is found in it",
+    )
+    parser.add_argument(
+        "--picture",
+        type=Path,
+        metavar="FILE.png",
+        help="draw neighbouring sweeps upon each other, depth over the image, and depth edges over "
+        "image edges",
+    )
+    add_config_options(parser)
+    add_overwrite(parser)
 
 
 def _add_simulate(commands: Any) -> None:

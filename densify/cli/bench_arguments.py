@@ -23,6 +23,7 @@ def add_bench(commands: Any) -> None:
     parser = commands.add_parser("bench", help=about, description=f"{about.capitalize()}.")
     benches = parser.add_subparsers(title="benches", metavar="WHAT", required=True)
     _add_bench_flow(benches)
+    _add_bench_doctor(benches)
 
 
 def _add_bench_flow(benches: Any) -> None:
@@ -65,6 +66,21 @@ def _add_bench_flow(benches: Any) -> None:
         metavar="N",
         help="points that paper, paper-adam and nicp may move; more is slower and finer, 0: all "
         "(default: 8000)",
+    )
+    add_config_options(parser)
+    parser.add_argument("--out", metavar="FILE.json", type=Path, help="write every number there")
+    add_overwrite(parser)
+
+
+def _add_bench_doctor(benches: Any) -> None:
+    parser = add_verb(
+        benches,
+        "doctor",
+        verbs.bench_doctor,
+        "mistakes made on purpose in a good recording, and which of them densify doctor names",
+    )
+    parser.add_argument(
+        "--data", metavar="SPEC", action="append", help=f"{DATA_HELP}; may be given several times"
     )
     add_config_options(parser)
     parser.add_argument("--out", metavar="FILE.json", type=Path, help="write every number there")

@@ -180,6 +180,48 @@ def info(options: argparse.Namespace) -> None:
     print(describe(open_sequence(options.data)))
 
 
+def doctor(options: argparse.Namespace) -> None:
+    """What may be wrong with a recording."""
+    config = resolve(options.config, options.overrides)
+    from densify.cli.findings import diagnosis_json, diagnosis_table
+    from densify.cli.point_files import check_new_file
+    from densify.doctor import Verdict, examine
+    from densify.readers import open_sequence
+    from densify.readers.describe import describe
+
+    if options.write_config:
+        return _write_folder_config(Path(options.data), options.overwrite)
+    if options.picture is not None:
+        check_new_file(options.picture, options.overwrite, ".png")
+    sequence = open_sequence(options.data)
+    diagnosis = examine(sequence, config, Path())
+    if options.json:
+        print(diagnosis_json(diagnosis))
+    else:
+        print(describe(sequence), diagnosis_table(diagnosis), sep="\n\n")
+    if options.picture is not None:
+        from densify.doctor.picture import draw
+        from densify.outputs.png import write_picture
+
+        write_picture(options.picture, draw(diagnosis.sample))
+        if not options.json:
+            _print_paths([options.picture])
+    wrong = [f.check for f in diagnosis.findings if f.verdict == Verdict.WRONG]
+    if wrong:
+        raise InputError(f"{options.data}: wrong: {', '.join(wrong)}; the remedies are above")
+
+
+def _write_folder_config(folder: Path, overwrite: bool) -> None:
+    from densify.outputs.atomic import write_file
+    from densify.readers.folder_draft import draft_config
+
+    path = folder / "densify.yaml"
+    if path.exists() and not overwrite:
+        raise InputError(f"{path}: there already, kept; give --overwrite to replace it")
+    write_file(path, draft_config(folder).encode())
+    _print_paths([path])
+
+
 def simulate(options: argparse.Namespace) -> None:
     """The built-in street in a data set's format, with truth."""
     from densify.readers.street import Street
@@ -215,6 +257,27 @@ def export(options: argparse.Namespace) -> None:
     )
     print(export_summary(exported))
     _print_paths(exported.paths)
+
+
+def bench_doctor(options: argparse.Namespace) -> None:
+    """Which mistakes, made on purpose in good recordings, doctor names."""
+    config = resolve(options.config, options.overrides)
+    from densify.bench import faults as bench
+    from densify.bench.table_file import write_table
+    from densify.cli.findings import fault_table
+    from densify.cli.point_files import check_new_file
+    from densify.readers import open_sequence
+
+    if options.out is not None:
+        check_new_file(options.out, options.overwrite, ".json")
+    found = {}
+    for spec in options.data or ["street"]:
+        with progress_on_stderr() as progress:
+            found[spec] = bench.bench_doctor(open_sequence(spec), config, progress)
+        print(fault_table(spec, found[spec]) + "\n", flush=True)
+    if options.out is not None:
+        write_table(options.out, {"recordings": found})
+        _print_paths([options.out])
 
 
 def bench_flow(options: argparse.Namespace) -> None:

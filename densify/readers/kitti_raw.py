@@ -87,6 +87,10 @@ class KittiRaw(FileSequence):
             return int(frame) * NOMINAL_PERIOD_NS
         return self._stamps[frame]
 
+    def sweep_bytes(self) -> dict[int, int]:
+        """See `densify.types.KnowsFiles`."""
+        return {frame: path.stat().st_size for frame, path in self._sweeps.items()}
+
     def _returns(self, frame: int) -> tuple[Path, Returns]:
         path = self._sweeps[frame]
         columns = read_points(path)

@@ -239,8 +239,8 @@ def check_overlap(
             raise SweepError(
                 f"registration fails from frame {frames[i - 1]} to {frames[i]}: only "
                 f"{100 * share:.1f} % of what stands there lies on the sweeps before, expected at "
-                f"least {100 * settings.min_overlap:.1f} %; {_cure(settings)}, or lower "
-                f"register.min_overlap",
+                f"least {100 * settings.min_overlap:.1f} %; lower register.min_overlap, or "
+                f"{_cure(settings)}",
                 frames[i],
             )
         before.append((int(stamp_ns[i]), _tree(points)))
@@ -260,7 +260,10 @@ def _share_on(points: Float, trees: Sequence[cKDTree]) -> float:
 
 def _cure(settings: RegisterSettings) -> str:
     other = "kiss-icp" if settings.source == "dataset" else "dataset"
-    return f"choose another key or a smaller window, or other poses (register.source={other})"
+    return (
+        f"choose another key or a smaller window, or other poses (register.source={other}); "
+        f"densify doctor says what is wrong with a recording"
+    )
 
 
 def _kiss_icp_config(settings: RegisterSettings, second_pass: bool):  # type: ignore[no-untyped-def]

@@ -10,6 +10,7 @@ from densify.arrays import Bool, Float, Float32, Int
 from densify.types.depth import Camera, Cloud, DepthMap, Mover, Patches, Reason
 from densify.types.flow import FlowField, Motion, StretchFlow
 from densify.types.recordings import (
+    KnowsFiles,
     KnowsImagePoses,
     LidarSequence,
     SaysWhatItFound,
@@ -28,6 +29,7 @@ __all__ = [
     "Float32",
     "FlowField",
     "Int",
+    "KnowsFiles",
     "KnowsImagePoses",
     "LidarSequence",
     "Motion",

@@ -106,3 +106,12 @@ class KnowsImagePoses(Protocol):
     def T_world_cam(self, camera: str, number: int) -> Float:
         """(4,4) the data set's own pose at the exposure, in the world of `T_world_lidar`."""
         ...
+
+
+@runtime_checkable
+class KnowsFiles(Protocol):
+    """A sequence that keeps each sweep in a file of its own; a reader may have this member."""
+
+    def sweep_bytes(self) -> Mapping[int, int]:
+        """The size of each sweep's file, by frame."""
+        ...

@@ -1,0 +1,303 @@
+# SPDX-License-Identifier: MIT
+"""Cameras: images that are there, and whether depth edges fall on image edges.
+
+The score of a calibration is how much stronger the image's edges are where depth edges of the sweep
+fall than where its other returns fall, in standard errors (after Levinson and Thrun, "Automatic
+Online Calibration of Cameras and Lasers", RSS 2013).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from densify.doctor.findings import Finding, Verdict
+from densify.doctor.sample import Sample, Spot
+from densify.errors import InputError
+from densify.geometry import poses
+from densify.geometry.cameras import image_points
+from densify.readers.files import format_frames
+from densify.types import Bool, Camera, Float, Float32
+
+_EDGE_M, _EDGE_SHARE = 0.6, 0.08
+_NEAREST_M, _FARTHEST_M = 3.0, 50.0
+_BESIDE_RAD = np.deg2rad(0.6)
+_STEEPLY = 4.0  # a neighbour above or below counts as so many times farther
+_BLUR_PX, _AROUND_PX = 1.5, 25.0  # at a focal length of 700 px
+_FOCAL_PX = 700.0
+_NUM_OTHERS, _LEAST_SEEN = 20_000, 50
+_CLEAR, _CLEARLY = 5.0, 1.25
+_SHIFT_DEG, _SHIFT_STEP_DEG, _OFF_DEG = 2.0, 0.1, 0.4
+_CLOCK_S, _CLOCK_STEP_S, _CLOCK_OFF_S = 0.2, 0.01, 0.02
+_LEAST_SPEED_M_S = 3.0
+_TURNS = {
+    "the inverse of the given pose (T_lidar_cam instead of T_cam_lidar)": "inverse",
+    "a camera whose pose is that of a body (x forward, y left, z up)": "body",
+    "the pose for a lidar with x right, y forward": "right_forward",
+    "the transposed rotation": "transposed",
+}
+
+
+@dataclass(frozen=True)
+class Pair:
+    """A sweep and an image taken near it.
+
+    points: (N,3) lidar frame, deskewed. edge: (N,) on the near side of a depth edge. twist: (6,)
+    of the lidar, per second. exposed_s: since the sweep's reference time. strength: (H,W) of image
+    edges, relative to those around.
+    """
+
+    points: Float
+    edge: Bool
+    twist: Float
+    exposed_s: float
+    strength: Float32
+    number: int
+
+    def seen_at(self, later_s: float) -> Float:
+        """(N,3) in the lidar frame at the exposure and ``later_s``."""
+        return poses.transform(
+            poses.inverse(poses.exp((self.exposed_s + later_s) * self.twist)), self.points
+        )
+
+
+def check_cameras(sample: Sample) -> list[Finding]:
+    """Every camera of the recording."""
+    if not sample.sequence.cameras:
+        return [Finding("cameras", Verdict.FINE, "none: the cloud and the scores alone")]
+    findings = []
+    for camera in sample.sequence.cameras.values():
+        findings += _check_images(sample, camera)
+        pairs, broken = image_pairs(sample, camera)
+        if broken:
+            findings.append(
+                Finding(f"{camera.name}: images", Verdict.WRONG, broken, "fetch the image again")
+            )
+        if pairs:
+            findings += _check_calibration(camera, pairs)
+    return findings
+
+
+def _check_images(sample: Sample, camera: Camera) -> list[Finding]:
+    name, period_ns = f"{camera.name}: images", sample.timeline.period_ns
+    exposed_ns = np.array(sorted(sample.sequence.image_stamps_ns(camera.name).values()), np.int64)
+    if not len(exposed_ns):
+        return [
+            Finding(
+                name,
+                Verdict.SUSPICIOUS,
+                "not a single image",
+                f"leave the camera out (--camera with the others), or fetch {camera.name}",
+            )
+        ]
+    stamp_ns = sample.timeline.stamp_ns
+    after = np.clip(np.searchsorted(exposed_ns, stamp_ns), 1, len(exposed_ns)) - 1
+    nearest = np.minimum(
+        np.abs(exposed_ns[after] - stamp_ns),
+        np.abs(exposed_ns[np.minimum(after + 1, len(exposed_ns) - 1)] - stamp_ns),
+    )
+    without = [f for f, ns in zip(sample.timeline.frames, nearest, strict=True) if ns > period_ns]
+    apart_ms = float(np.median(nearest)) * 1e-6
+    values = {"num_images": len(exposed_ns), "num_without": len(without), "apart_ms": apart_ms}
+    text = f"{len(exposed_ns)}, usually {apart_ms:.1f} ms from a sweep's reference time"
+    if not without:
+        return [Finding(name, Verdict.FINE, text, values=values)]
+    all_of_them = len(without) == len(stamp_ns)
+    return [
+        Finding(
+            name,
+            Verdict.WRONG if all_of_them else Verdict.SUSPICIOUS,
+            f"{text}; {len(without)} sweeps have none within a period: {format_frames(without)}",
+            "put sweeps and images on one clock" if all_of_them else "choose other keys than these",
+            values,
+        )
+    ]
+
+
+def image_pairs(sample: Sample, camera: Camera) -> tuple[list[Pair], str]:
+    """A sweep of each registered spot and its nearest image; and why an image cannot be read."""
+    exposed_ns = sample.sequence.image_stamps_ns(camera.name)
+    pairs: list[Pair] = []
+    for spot in sample.registered:
+        row, number = min(
+            ((r, n) for r in range(1, len(spot.sweeps)) for n in exposed_ns),
+            key=lambda rn: abs(exposed_ns[rn[1]] - spot.sweeps[rn[0]].stamp_ns),
+            default=(0, -1),
+        )
+        if number < 0:
+            break
+        apart_s = (exposed_ns[number] - spot.sweeps[row].stamp_ns) * 1e-9
+        if abs(apart_s) > sample.timeline.period_ns * 1e-9:
+            continue
+        try:
+            image = sample.sequence.image(camera.name, number)
+        except InputError as error:
+            return pairs, str(error)
+        pairs.append(_pair(spot, row, image, apart_s, number, camera))
+    return pairs, ""
+
+
+def _pair(
+    spot: Spot, row: int, image: NDArray[np.uint8], apart_s: float, number: int, camera: Camera
+) -> Pair:
+    registered = spot.stretch.sweeps[row]
+    range_m = np.linalg.norm(registered.sweep.points, axis=1)
+    points = registered.sweep.points[(range_m > _NEAREST_M) & (range_m < 2 * _FARTHEST_M)]
+    edge = depth_edges(points)
+    some = edge.copy()
+    some[:: len(points) // _NUM_OTHERS + 1] = True
+    twist = registered.twist_after if apart_s > 0 else registered.twist_before
+    strength = edge_strength(image, camera.focal_px)
+    return Pair(points[some], edge[some], twist, apart_s, strength, number)
+
+
+def depth_edges(points: Float) -> Bool:
+    """(N,3) -> (N,) whether something much farther is seen right beside the point."""
+    x, y, z = points.T
+    range_m = np.linalg.norm(points, axis=1)
+    seen = np.column_stack([np.arctan2(y, x), _STEEPLY * np.arcsin(z / range_m)])
+    _, beside = cKDTree(seen).query(seen, k=5, distance_upper_bound=_BESIDE_RAD, workers=-1)
+    far_m = np.append(range_m, 0.0)[beside].max(axis=1)
+    edge: Bool = (far_m - range_m > np.maximum(_EDGE_M, _EDGE_SHARE * range_m)) & (
+        range_m < _FARTHEST_M
+    )
+    return edge
+
+
+def edge_strength(image: NDArray[np.uint8], focal_px: float) -> Float32:
+    """(H,W,3) -> (H,W): the gradient's size against that around, at most 4."""
+    scale = focal_px / _FOCAL_PX
+    gray = cv2.GaussianBlur(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), (0, 0), max(0.8, scale))
+    x, y = (cv2.Sobel(gray, cv2.CV_32F, *order) for order in ((1, 0), (0, 1)))
+    size = cv2.blur(cv2.magnitude(x, y), (2 * round(_BLUR_PX * scale) + 1,) * 2)
+    around = cv2.GaussianBlur(size, (0, 0), _AROUND_PX * scale)
+    strength: Float32 = np.minimum(size / (around + 4.0), 4.0)
+    return strength
+
+
+def score(camera: Camera, pairs: list[Pair], later_s: float = 0.0) -> float:
+    """Standard errors by which the image is edged where depth is, over all pairs; 0 where too few
+    points are seen. later_s: what the images' clock is late."""
+    return _score(camera, [(p, *_on_image(camera, p, later_s)) for p in pairs], 0.0)
+
+
+def _on_image(camera: Camera, pair: Pair, later_s: float) -> tuple[Float, Bool]:
+    """(n,2) pixels of the points that are seen, and which of them are edges."""
+    uv, seen = image_points(camera, poses.transform(camera.T_cam_lidar, pair.seen_at(later_s)))
+    return uv[seen], pair.edge[seen]
+
+
+def _score(camera: Camera, seen: list[tuple[Pair, Float, Bool]], right_px: float) -> float:
+    on, off = [], []
+    for pair, uv, edge in seen:
+        column, line = np.rint(uv + (right_px, 0.0)).astype(np.int64).T
+        inside = (column >= 0) & (column < camera.width_px)
+        value = pair.strength[line[inside], column[inside]]
+        on.append(value[edge[inside]])
+        off.append(value[~edge[inside]])
+    edged, other = np.concatenate(on), np.concatenate(off)
+    if min(len(edged), len(other)) < _LEAST_SEEN:
+        return 0.0
+    return float((edged.mean() - other.mean()) / (other.std() / np.sqrt(len(edged)) + 1e-9))
+
+
+def alternatives(camera: Camera) -> Iterator[tuple[str, Camera]]:
+    """What calibrations often are instead of the given one."""
+    T = camera.T_cam_lidar
+    body = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
+    turned = np.array([[0.0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+    transposed = T.copy()
+    transposed[:3, :3] = T[:3, :3].T
+    changed: Mapping[str, Float] = {
+        "inverse": poses.inverse(T),
+        "body": body @ T,
+        "right_forward": T @ turned,
+        "transposed": transposed,
+    }
+    for name, which in _TURNS.items():
+        yield name, replace(camera, T_cam_lidar=changed[which])
+
+
+def _check_calibration(camera: Camera, pairs: list[Pair]) -> list[Finding]:
+    """The calibration and the clock as given against others, the best of which explains most."""
+    given = score(camera, pairs)
+    others = {what: score(other, pairs) for what, other in alternatives(camera)}
+    other = max(others, key=lambda what: others[what])
+    shift_deg, at_shift = _best_shift(camera, pairs)
+    clock = _clock(camera, pairs)
+    at_clock = 0.0 if clock is None else clock.best
+    values = {"given": given, "best_other": others[other], "shift_deg": shift_deg}
+    values |= {"at_shift": at_shift, "at_clock": at_clock}
+    text = f"depth edges lie on image edges by {given:.1f} standard errors as given"
+    most = max(others[other], at_shift, at_clock)
+    name, clearly = f"{camera.name}: calibration", max(_CLEAR, _CLEARLY * given)
+    late = clock is not None and at_clock == most and clock.is_off and most > clearly
+    if others[other] == most > clearly:
+        text += f", by {most:.1f} with {other}"
+        finding = Finding(name, Verdict.WRONG, text, "correct T_cam_lidar", values)
+    elif at_shift == most > clearly and abs(shift_deg) > _OFF_DEG:
+        side = "right" if shift_deg > 0 else "left"
+        text += f", by {most:.1f} if they were {abs(shift_deg):.1f} deg farther to the {side}"
+        remedy = "look at the overlay; correct T_cam_lidar or K"
+        finding = Finding(name, Verdict.SUSPICIOUS, text, remedy, values)
+    elif most < _CLEAR:
+        text += f", and nowhere around by more than {most:.1f}: images and sweeps do not show the"
+        text += " same, or too little"
+        remedy = "look at the overlay; check T_cam_lidar, K and the clocks"
+        finding = Finding(name, Verdict.SUSPICIOUS, text, remedy, values)
+    else:
+        text += f", by {at_shift:.1f} {abs(shift_deg):.1f} deg beside"
+        finding = Finding(name, Verdict.FINE, text, values=values)
+    if clock is None:
+        return [finding]
+    remedy = f"shift the stamps of {camera.name} by {clock.late_s * 1e3:+.0f} ms" if late else ""
+    verdict = Verdict.SUSPICIOUS if late else Verdict.FINE
+    evidence = (
+        f"depth and image fit best {clock.late_s * 1e3:+.0f} ms ({clock.low_s * 1e3:+.0f} to "
+        f"{clock.high_s * 1e3:+.0f}) after the image's stamp"
+    )
+    return [finding, Finding(f"{camera.name}: clock", verdict, evidence, remedy, vars(clock))]
+
+
+def _best_shift(camera: Camera, pairs: list[Pair]) -> tuple[float, float]:
+    """The degrees to the right by which the depth edges fit best, and the score there. Edges of
+    depth between returns of one ring are upright, so that up and down cannot be told as well."""
+    seen = [(p, *_on_image(camera, p, 0.0)) for p in pairs]
+    shifts_deg = np.arange(-_SHIFT_DEG, _SHIFT_DEG + 1e-9, _SHIFT_STEP_DEG)
+    px_per_deg = camera.focal_px * np.pi / 180
+    scores = [_score(camera, seen, shift * px_per_deg) for shift in shifts_deg]
+    row = int(np.argmax(scores))
+    return float(shifts_deg[row]), scores[row]
+
+
+@dataclass(frozen=True)
+class _Clock:
+    """late_s: after an image's stamp depth and image fit best; low_s, high_s: hardly worse between.
+    best: the score there."""
+
+    late_s: float
+    low_s: float
+    high_s: float
+    best: float
+
+    @property
+    def is_off(self) -> bool:
+        return self.low_s > _CLOCK_OFF_S or self.high_s < -_CLOCK_OFF_S
+
+
+def _clock(camera: Camera, pairs: list[Pair]) -> _Clock | None:
+    """The difference between the clocks of camera and lidar; None where the vehicle is too slow to
+    tell."""
+    moving = [p for p in pairs if np.linalg.norm(p.twist[3:]) > _LEAST_SPEED_M_S]
+    if not moving:
+        return None
+    late_s = np.arange(-_CLOCK_S, _CLOCK_S + 1e-9, _CLOCK_STEP_S)
+    scores = np.array([score(camera, moving, later_s=t) for t in late_s])
+    best = float(scores.max())
+    good = late_s[scores > best - max(1.0, 0.05 * best)]
+    return _Clock(float(late_s[np.argmax(scores)]), float(good.min()), float(good.max()), best)

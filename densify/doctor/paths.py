@@ -1,0 +1,147 @@
+# SPDX-License-Identifier: MIT
+"""The recording's poses against the path that odometry finds from the sweeps alone."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from densify.doctor.findings import Finding, Verdict
+from densify.doctor.sample import Sample, Spot
+from densify.errors import InputError
+from densify.geometry import poses
+from densify.types import Float
+
+_LEAST_WAY_M = 1.0
+_OFF_M, _OFF_PER_M, _OFF_DEG = 0.3, 0.1, 2.0  # over a spot of five sweeps
+_MUCH_BETTER, _EXACT = 0.4, 0.15  # of what is allowed
+_CAM_AXES = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
+
+
+def _inverted(T: Float) -> Float:
+    return poses.inverse(T)
+
+
+def _with_rotation(change: Callable[[Float], Float]) -> Callable[[Float], Float]:
+    def changed(T: Float) -> Float:
+        turned = T.copy()
+        turned[:3, :3] = change(T[:3, :3])
+        return turned
+
+    return changed
+
+
+def _scaled(factor: float) -> Callable[[Float], Float]:
+    def changed(T: Float) -> Float:
+        moved = T.copy()
+        moved[:3, 3] *= factor
+        return moved
+
+    return changed
+
+
+def _rolled(by: int) -> Callable[[Float], Float]:
+    """A quaternion whose numbers were taken in another order."""
+    return lambda R: Rotation.from_quat(np.roll(Rotation.from_matrix(R).as_quat(), by)).as_matrix()
+
+
+def _angle_scaled(factor: float) -> Callable[[Float], Float]:
+    def changed(R: Float) -> Float:
+        yaw, pitch, roll = Rotation.from_matrix(R).as_euler("ZYX") * factor
+        return Rotation.from_euler("ZYX", [yaw, pitch, roll]).as_matrix()
+
+    return changed
+
+
+HYPOTHESES: Mapping[str, Callable[[Float], Float]] = {
+    "they are inverted (T_lidar_world instead of T_world_lidar)": _inverted,
+    "they are a camera's, not the lidar's": lambda T: poses.inverse(_CAM_AXES) @ T @ _CAM_AXES,
+    "they are in millimetres": _scaled(1e-3),
+    "they are in kilometres": _scaled(1e3),
+    "their quaternions are x y z w, read as w x y z": _with_rotation(_rolled(-1)),
+    "their quaternions are w x y z, read as x y z w": _with_rotation(_rolled(1)),
+    "their rotations are transposed": _with_rotation(np.transpose),
+    "their angles are in degrees, read as radians": _with_rotation(_angle_scaled(np.pi / 180)),
+    "their angles are in radians, read as degrees": _with_rotation(_angle_scaled(180 / np.pi)),
+}
+"""What poses often are instead, as a change that mends them: (4,4) -> (4,4)."""
+
+
+def check_poses(sample: Sample) -> list[Finding]:
+    """Poses as given and as they would be under each of `HYPOTHESES`."""
+    spots = sample.registered
+    try:
+        given = [_given(sample, spot) for spot in spots]
+    except InputError as error:
+        if "no poses" in str(error):
+            return [Finding("poses", Verdict.FINE, "none; the sweeps register themselves")]
+        return [Finding("poses", Verdict.WRONG, str(error), "--set register.source=kiss-icp")]
+    if not spots:
+        return [Finding("poses", Verdict.UNKNOWN, "no sweeps could be registered to compare with")]
+    found = [_step(spot) for spot in spots]
+    way_m = max(float(np.linalg.norm(T[:3, 3])) for T in found)
+    off = _off([_between(T) for T in given], found)
+    values = {"off_m": off[0], "off_deg": off[1], "way_m": way_m}
+    text = f"off by {off[0]:.2f} m and {off[1]:.2f} deg from odometry over {way_m:.1f} m"
+    others = {
+        name: _off([_between([change(T) for T in pair]) for pair in given], found)
+        for name, change in HYPOTHESES.items()
+    }
+    best = min(others, key=lambda name: _cost(others[name], way_m))
+    cost, other = _cost(off, way_m), _cost(others[best], way_m)
+    if other < _MUCH_BETTER * cost and cost > _EXACT and other < 1:
+        better = f"{others[best][0]:.2f} m and {others[best][1]:.2f} deg"
+        return [
+            Finding(
+                "poses",
+                Verdict.WRONG,
+                f"{text}, but only by {better} if {best}",
+                "correct the poses, or leave them out with --set register.source=kiss-icp",
+                values,
+            )
+        ]
+    if cost <= 1:
+        slow = way_m < _LEAST_WAY_M
+        verdict = Verdict.UNKNOWN if slow else Verdict.FINE
+        text += "; the vehicle hardly moves" if slow else ""
+        return [Finding("poses", verdict, text, values=values)]
+    return [
+        Finding(
+            "poses",
+            Verdict.SUSPICIOUS,
+            f"{text}; no usual mistake explains it (another frame than the points', another "
+            f"clock, or noise)",
+            "leave them out with --set register.source=kiss-icp",
+            values,
+        )
+    ]
+
+
+def _given(sample: Sample, spot: Spot) -> list[Float]:
+    frames = spot.sweeps[0].frame, spot.sweeps[-1].frame
+    return [sample.sequence.T_world_lidar(frame) for frame in frames]
+
+
+def _step(spot: Spot) -> Float:
+    sweeps = spot.stretch.sweeps
+    return _between([sweeps[0].T_world_lidar, sweeps[-1].T_world_lidar])
+
+
+def _between(pair: list[Float]) -> Float:
+    return poses.inverse(pair[0]) @ pair[1]
+
+
+def _off(given: list[Float], found: list[Float]) -> tuple[float, float]:
+    """Metres and degrees, the median over the spots."""
+    apart = [poses.log(poses.inverse(a) @ b) for a, b in zip(given, found, strict=True)]
+    return (
+        float(np.median([np.linalg.norm(d[3:]) for d in apart])),
+        float(np.rad2deg(np.median([np.linalg.norm(d[:3]) for d in apart]))),
+    )
+
+
+def _cost(off: tuple[float, float], way_m: float) -> float:
+    """The larger of both errors, as a share of what is allowed."""
+    return max(off[0] / (_OFF_M + _OFF_PER_M * way_m), off[1] / _OFF_DEG)

@@ -1,0 +1,213 @@
+# SPDX-License-Identifier: MIT
+"""What the points themselves tell: units, axes, the own vehicle, reflectances, scanners."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from densify.config import RegisterSettings
+from densify.doctor.findings import Finding, Verdict
+from densify.doctor.sample import Sample, Spot
+from densify.geometry.sensor import Sensors
+from densify.types import Float
+
+_MEDIAN_RANGE_M = (1.5, 60.0)
+_UNITS = {"millimetres": 1e-3, "centimetres": 1e-2, "kilometres": 1e3}
+_CELL_M, _CLOSE_M = 0.1, 6.0
+_OWN_SHARE, _LEAST_OWN = 0.9, 20
+_NEAR_M = 25.0
+_UP = {
+    "z": (0, 0, 1),
+    "-z": (0, 0, -1),
+    "y": (0, 1, 0),
+    "-y": (0, -1, 0),
+    "x": (1, 0, 0),
+    "-x": (-1, 0, 0),
+}
+_UP_MEANS = {
+    "-z": "x forward, y right, z down",
+    "-y": "a camera's axes: x right, y down, z forward",
+    "y": "y up",
+}
+_LAYER_M, _LEAST_LEVEL, _FEW_BELOW = 0.3, 0.08, 0.2
+_HIGHEST_M = 0.3  # where points are in a vehicle's frame the road is at 0
+_CLEARLY = 1.5
+
+
+def check_units(sample: Sample) -> list[Finding]:
+    """Metres, or not."""
+    middle = [spot.sweeps[spot.middle].points for spot in sample.spots]
+    range_m = float(np.median([np.median(np.linalg.norm(points, axis=1)) for points in middle]))
+    values = {"median_range_m": range_m}
+    if _MEDIAN_RANGE_M[0] <= range_m <= _MEDIAN_RANGE_M[1]:
+        return [
+            Finding(
+                "unit of points",
+                Verdict.FINE,
+                f"half of the returns within {range_m:.1f} m",
+                values=values,
+            )
+        ]
+    fits = [u for u, f in _UNITS.items() if _MEDIAN_RANGE_M[0] <= range_m * f <= _MEDIAN_RANGE_M[1]]
+    guess = f", as if they were in {fits[0]}" if fits else ""
+    return [
+        Finding(
+            "unit of points",
+            Verdict.WRONG if fits else Verdict.SUSPICIOUS,
+            f"half of the returns are farther than {range_m:.4g} m, expected "
+            f"{_MEDIAN_RANGE_M[0]} to {_MEDIAN_RANGE_M[1]:.0f} m{guess}",
+            "scale the points to metres (scale_m in densify.yaml)",
+            values,
+        )
+    ]
+
+
+def check_axes(sample: Sample) -> list[Finding]:
+    """Which axis points up: the one along which a layer holds most returns and hardly any lie
+    below."""
+    level = {name: _ground_share(sample, np.array(up, float)) for name, up in _UP.items()}
+    best = max(level, key=lambda name: level[name])
+    values = {f"share_{name}": share for name, share in level.items()}
+    text = (
+        f"{100 * level[best]:.0f} % of the near returns lie in one layer below the scanner if "
+        f"{best} is up, {100 * level['z']:.0f} % if z is"
+    )
+    if level["z"] < _LEAST_LEVEL and level[best] < _LEAST_LEVEL:
+        return [
+            Finding("axes", Verdict.UNKNOWN, "no ground was found along any axis", values=values)
+        ]
+    if best == "z" or level[best] < _CLEARLY * level["z"]:
+        return [Finding("axes", Verdict.FINE, text, values=values)]
+    means = f" ({_UP_MEANS[best]})" if best in _UP_MEANS else ""
+    return [
+        Finding(
+            "axes",
+            Verdict.WRONG,
+            f"{text}{means}",
+            "turn the points so that z is up (axes in densify.yaml)",
+            values,
+        )
+    ]
+
+
+def _ground_share(sample: Sample, up: Float) -> float:
+    """The share of the near returns in the fullest layer that is not above the origin and has few
+    returns below it, beyond what an even spread over all heights would have there; the median over
+    the spots."""
+    shares = []
+    for spot in sample.spots:
+        points = spot.sweeps[spot.middle].points
+        height_m = points[np.linalg.norm(points, axis=1) < _NEAR_M] @ up
+        if not len(height_m):
+            continue
+        low_m, high_m = np.percentile(height_m, [0.5, 99.5])
+        edges = np.arange(low_m - _LAYER_M, high_m + 2 * _LAYER_M, 0.5 * _LAYER_M)
+        share = np.histogram(height_m, edges)[0] / len(height_m)
+        layer = share[:-1] + share[1:]
+        below = np.cumsum(share)[:-1] - share[:-1]
+        even = _LAYER_M / max(float(high_m - low_m), _LAYER_M)
+        allowed = (below < _FEW_BELOW) & (edges[:-2] < _HIGHEST_M)
+        shares.append(float(layer[allowed].max(initial=0.0)) - even)
+    return float(np.median(shares)) if shares else 0.0
+
+
+def check_own_vehicle(sample: Sample, settings: RegisterSettings) -> list[Finding]:
+    """Returns of the vehicle that carries the scanner: they are at the same place in sweeps far
+    apart in time, while the vehicle drives."""
+    moving = [
+        spot
+        for spot in sample.registered
+        if spot.speed_m_s > 1.0 and (np.linalg.norm(spot.sweeps[0].points, axis=1) < _NEAR_M).any()
+    ]
+    if len(moving) < 2:
+        return [
+            Finding(
+                "own vehicle", Verdict.UNKNOWN, "the vehicle hardly moves where it was looked at"
+            )
+        ]
+    range_m, num = _own_returns(moving)
+    values = {"farthest_m": range_m, "num_returns": num}
+    if num < _LEAST_OWN:
+        return [Finding("own vehicle", Verdict.FINE, "no returns of it", values=values)]
+    text = f"{num} returns a sweep, at most {range_m:.1f} m away"
+    if range_m <= settings.min_range_m:
+        text += f", all within register.min_range_m = {settings.min_range_m:g}"
+        return [Finding("own vehicle", Verdict.FINE, text, values=values)]
+    return [
+        Finding(
+            "own vehicle",
+            Verdict.SUSPICIOUS,
+            f"{text}, beyond register.min_range_m = {settings.min_range_m:g}",
+            f"--set register.min_range_m={np.ceil(10 * range_m) / 10:.1f}",
+            values,
+        )
+    ]
+
+
+def _own_returns(spots: list[Spot]) -> tuple[float, int]:
+    """How far away they are, and how many a sweep has. Ground looks the same everywhere as well:
+    what lies in the lowest layer does not count."""
+    cells = []
+    for sweep in [s for spot in spots for s in (spot.sweeps[0], spot.sweeps[-1])]:
+        range_m = np.linalg.norm(sweep.points, axis=1)
+        close = sweep.points[range_m < _CLOSE_M]
+        near = sweep.points[range_m < _NEAR_M]
+        floor_m = np.percentile(near[:, 2], 10) if len(near) else 0.0
+        close = close[close[:, 2] > floor_m + 0.4]
+        cells.append(np.floor(close / _CELL_M).astype(np.int64))
+    everywhere = {tuple(c) for c in cells[0]}
+    for other in cells[1:]:
+        everywhere &= {tuple(c) for c in other}
+    mine = np.array([c for c in map(tuple, cells[0]) if c in everywhere], float).reshape(-1, 3)
+    if not len(mine):
+        return 0.0, 0
+    range_m = np.linalg.norm((mine + 0.5) * _CELL_M, axis=1)
+    return float(np.percentile(range_m, 99)), len(mine)
+
+
+def check_intensity(sample: Sample) -> list[Finding]:
+    """Reflectances are from 0 to 1."""
+    high = max(float(spot.sweeps[spot.middle].intensity.max()) for spot in sample.spots)
+    low = min(float(spot.sweeps[spot.middle].intensity.min()) for spot in sample.spots)
+    text, values = f"{low:g} to {high:g}", {"lowest": low, "highest": high}
+    if low >= 0 and high <= 1:
+        return [Finding("intensity", Verdict.FINE, text, values=values)]
+    return [
+        Finding(
+            "intensity",
+            Verdict.SUSPICIOUS,
+            f"{text}, expected 0 to 1; only pictures and the clouds' column suffer",
+            "scale the intensities (intensity_max in densify.yaml)",
+            values,
+        )
+    ]
+
+
+def check_sensors(sample: Sample) -> list[Finding]:
+    """What each scanner is like, as the pipeline will take it."""
+    spot = sample.fastest
+    if spot is None:
+        return []
+    findings = []
+    for number, model in Sensors.of(spot.stretch.sweeps).models.items():
+        kind = "lines" if model.rings_rad is None else f"{len(model.rings_rad)} rings"
+        kind = "no rings" if model.unordered else kind
+        low, high = np.rad2deg(model.elevation_rad)
+        right, left = np.rad2deg(model.azimuth_rad)
+        counts = [int((s.lidar == number).sum()) for s in spot.sweeps]
+        text = (
+            f"{kind}, {low:.1f} to {high:.1f} deg up, {right:.0f} to {left:.0f} deg around, "
+            f"{np.rad2deg(model.azimuth_step_rad):.2f} deg from ray to ray, {min(counts):,} to "
+            f"{max(counts):,} returns a sweep"
+        )
+        short = min(counts) < 0.5 * max(counts)
+        findings.append(
+            Finding(
+                f"scanner {number}",
+                Verdict.SUSPICIOUS if short else Verdict.FINE,
+                text + "; some sweeps are broken off" * short,
+                "leave the sweeps with few returns out" * short,
+                {"returns_least": min(counts), "returns_most": max(counts)},
+            )
+        )
+    return findings

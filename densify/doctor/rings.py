@@ -1,0 +1,195 @@
+# SPDX-License-Identifier: MIT
+"""What the rings of a spinning scanner tell: they are cones about its own axis only if the points
+are seen from where it stood, as they were fired."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from densify.doctor.findings import Finding, Verdict
+from densify.doctor.sample import Sample, Spot
+from densify.geometry import poses
+from densify.types import Float, Sweep
+
+_NEAR_M, _FAR_M = 3.0, 60.0
+_COMPENSATED_M = 25.0  # nearer returns show a motion within the sweep
+_NUM_POINTS, _LEAST_POINTS = 20_000, 500
+_WINDOW_CELLS, _LEAST_SHARE = 100, 0.01
+_BIN_RAD = np.deg2rad(0.02)
+_LEAST_SPEED_M_S = 1.5
+_LEAST_SHARPNESS = 4.0  # of a scanner with distinct rings
+_CLEARLY = 1.25  # sharper by that factor
+_REACH_M = np.array([3.0, 0.8, 2.4])
+_GRID_M = (0.5, 0.4, 0.05)
+_COARSE_FROM_M, _COARSE_POINTS, _COARSE_BINS, _NUM_STARTS = 18.0, 3000, 3, 8
+_FINER = ((0.1, 3), (0.05, 2), (0.02, 1))  # step in metres, bins
+_OFF_M = (
+    0.3  # KITTI's HDL-64E, whose two blocks of lasers stand apart, is sharpest from 0.2 m higher
+)
+
+
+def sharpness(points: Float, origin_m: Float, bins: int = 1) -> float:
+    """How much the elevations seen from the origin stand in rings, 1 for an even spread.
+
+    In each window of elevation: the chance that two of its returns share a cell of ``bins`` times
+    0.02 degrees, relative to an even spread; then the mean over the windows, each counted alike,
+    since from a place on the ground all of a flat ground falls into one of them.
+    """
+    x, y, z = (points - origin_m).T
+    elevation = np.arctan2(z, np.hypot(x, y))
+    cell = ((elevation + 0.5 * np.pi) / (bins * _BIN_RAD)).astype(np.int64)
+    width = max(8, _WINDOW_CELLS // bins)
+    length = -(-int(np.pi / (bins * _BIN_RAD) + 1) // width)
+    count = np.bincount(cell, minlength=length * width).astype(np.float64).reshape(length, width)
+    held = count.sum(axis=1)
+    enough = held > _LEAST_SHARE * len(points)
+    if not enough.any():
+        return 1.0
+    return float(np.median((count[enough] ** 2).sum(axis=1) / held[enough] ** 2) * width)
+
+
+def check_rings(sample: Sample) -> list[Finding]:
+    """For each scanner: where it stands, and whether its sweeps are as they were fired."""
+    findings = []
+    for lidar in sorted({int(n) for s in sample.spots for n in np.unique(s.sweeps[0].lidar)}):
+        given_m = sample.spots[0].sweeps[0].origin_m(lidar)
+        points = _still_points(sample, lidar)
+        if len(points) < _LEAST_POINTS:
+            continue
+        found_m = found_origin(points, given_m)
+        findings.append(_check_origin(lidar, points, given_m, found_m))
+        findings.append(_check_compensation(sample, lidar, (given_m, found_m)))
+    return findings
+
+
+def _check_compensation(sample: Sample, lidar: int, origins_m: tuple[Float, Float]) -> Finding:
+    name = "motion compensation" + f" of scanner {lidar}" * (lidar > 0)
+    spot = sample.fastest
+    if spot is None or spot.speed_m_s < _LEAST_SPEED_M_S:
+        text = "the vehicle hardly moves where it was looked at"
+        return Finding(name, Verdict.UNKNOWN, text)
+    sweep = spot.sweeps[spot.middle]
+    sweep = sweep.select(sweep.lidar == lidar)
+    offset_s = _turning_s(sweep, sample) if sweep.offset_ns is None else sweep.offset_ns * 1e-9
+    near = _sample_of(sweep, _COMPENSATED_M)
+    points, offset_s = sweep.points[near], offset_s[near]
+
+    def sharpest(*variants: Float) -> float:
+        return max(sharpness(moved, origin_m) for moved in variants for origin_m in origins_m)
+
+    def carried(since_s: Float) -> Float:
+        return poses.transform_each(since_s[:, None] * spot.twist, points)
+
+    # The moment they were compensated to may be any of the sweep's.
+    moments_s = (0.0, offset_s.min(), offset_s.max())
+    as_stored = sharpest(points)
+    undone = sharpest(*[carried(at_s - offset_s) for at_s in moments_s])
+    done = sharpest(carried(offset_s))
+    if max(as_stored, undone) < _LEAST_SHARPNESS:  # the origin was looked for in smeared rings
+        straight = carried(-offset_s)
+        undone = sharpness(straight, found_origin(straight, origins_m[0]))
+    values = {"as_stored": as_stored, "undone": undone, "done": done}
+    text = (
+        f"at {spot.speed_m_s:.1f} m/s the rings' sharpness is {as_stored:.2f} as stored, "
+        f"{undone:.2f} with a compensation undone, {done:.2f} with the motion compensated"
+    )
+    if max(as_stored, undone) < _LEAST_SHARPNESS:
+        return Finding(name, Verdict.UNKNOWN, f"{text}; no distinct rings", values=values)
+    if undone > _CLEARLY * as_stored:
+        if sweep.offset_ns is None:
+            return Finding(name, Verdict.FINE, f"{text}: compensated, without times", values=values)
+        return Finding(
+            name,
+            Verdict.WRONG,
+            f"{text}: the sweeps are compensated already, and would be a second time",
+            "--set register.deskew=false",
+            values,
+        )
+    if sweep.offset_ns is None:
+        return _raw_without_times(name, text, values, spot, sample)
+    return Finding(name, Verdict.FINE, f"{text}: as they were fired", values=values)
+
+
+def _raw_without_times(
+    name: str, text: str, values: dict[str, float], spot: Spot, sample: Sample
+) -> Finding:
+    stretched_m = spot.speed_m_s * sample.timeline.period_ns * 1e-9
+    return Finding(
+        name,
+        Verdict.SUSPICIOUS,
+        f"{text}: the sweeps are as they were fired and no point has a time, so they stay "
+        f"stretched by {stretched_m:.2f} m",
+        "give the points times (a column t in the files)",
+        values,
+    )
+
+
+def _turning_s(sweep: Sweep, sample: Sample) -> Float:
+    """Times of a scanner that turns clockwise and faces forward at the stamp."""
+    turn = -np.arctan2(sweep.points[:, 1], sweep.points[:, 0]) / (2 * np.pi)
+    return turn * (sample.timeline.period_ns * 1e-9)
+
+
+def _sample_of(sweep: Sweep, far_m: float) -> np.ndarray:
+    range_m = np.linalg.norm(sweep.points, axis=1)
+    rows = np.flatnonzero((range_m > _NEAR_M) & (range_m < far_m))
+    return rows[:: len(rows) // _NUM_POINTS + 1]
+
+
+def _still_points(sample: Sample, lidar: int) -> Float:
+    """(N,3) returns of one scanner from all spots."""
+    parts = []
+    for spot in sample.spots:
+        sweep = spot.sweeps[spot.middle]
+        sweep = sweep.select(sweep.lidar == lidar)
+        parts.append(sweep.points[_sample_of(sweep, _FAR_M)])
+    return np.concatenate(parts)[:: len(parts)]
+
+
+def _check_origin(lidar: int, points: Float, given_m: Float, found_m: Float) -> Finding:
+    name = "scanner's place" if lidar == 0 else f"place of scanner {lidar}"
+    given, found = sharpness(points, given_m), sharpness(points, found_m)
+    off_m = float(np.linalg.norm(found_m - given_m))
+    values = {"given_m": given_m.tolist(), "found_m": found_m.tolist(), "off_m": off_m}
+    values |= {"sharpness_given": given, "sharpness_found": found}
+    text = (
+        f"rings are sharpest ({found:.2f}) seen from {_text(found_m)}; from the given "
+        f"{_text(given_m)}: {given:.2f}"
+    )
+    if found < _LEAST_SHARPNESS:
+        return Finding(name, Verdict.UNKNOWN, f"{text}; no distinct rings", values=values)
+    if off_m > _OFF_M and found > _CLEARLY * given:
+        line = f"scanner_origins: {[[round(float(v), 2) for v in found_m]]}"
+        remedy = f"give the scanner's place in the points' frame ({line})"
+        return Finding(name, Verdict.WRONG, text, remedy, values)
+    return Finding(name, Verdict.FINE, text, values=values)
+
+
+def _text(place_m: Float) -> str:
+    return "(" + ", ".join(f"{v:.2f}" for v in place_m) + ")"
+
+
+def found_origin(points: Float, start_m: Float) -> Float:
+    """(3,) from where the rings are sharpest, searched up to 3 m ahead and behind, 1.2 m aside and
+    2.4 m above and below a place. Heights are tried closely, since they move every ring."""
+    axes = [np.arange(-r, r + 1e-9, step) for r, step in zip(_REACH_M, _GRID_M, strict=True)]
+    grid = start_m + np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
+    far = points[np.linalg.norm(points, axis=1) > _COARSE_FROM_M]
+    some = far[:: len(far) // _COARSE_POINTS + 1]
+    value = np.array([sharpness(some, place_m, _COARSE_BINS) for place_m in grid])
+    starts = [start_m.astype(np.float64), *grid[np.argsort(-value)[:_NUM_STARTS]]]
+    for step_m, bins in _FINER:
+        starts = [_climbed(points, place_m, step_m, bins) for place_m in starts]
+    return max(starts, key=lambda place_m: sharpness(points, place_m))
+
+
+def _climbed(points: Float, place_m: Float, step_m: float, bins: int) -> Float:
+    around = step_m * np.stack(np.meshgrid(*[[-1, 0, 1]] * 3, indexing="ij"), -1).reshape(-1, 3)
+    for _ in range(8):
+        places = place_m + around
+        values = [sharpness(points, place, bins) for place in places]
+        best = int(np.argmax(values))
+        if best == 13:
+            break
+        place_m = places[best]
+    return place_m

@@ -1,0 +1,121 @@
+# SPDX-License-Identifier: MIT
+"""The sweeps that are looked at: few, from all over the recording, registered by odometry whatever
+poses it has."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from densify.config import RegisterSettings
+from densify.errors import InputError, SweepError
+from densify.readers.timeline import Timeline
+from densify.registration.deskew import deskew
+from densify.registration.trajectory import find_trajectory
+from densify.types import Float, LidarSequence, Stretch, Sweep, Trajectory
+
+_NUM_SPOTS = 3
+_NUM_SWEEPS = 5  # of a spot
+_STEP_S = 0.1
+
+
+@dataclass(frozen=True)
+class Spot:
+    """A few sweeps in a row. sweeps: as read, own vehicle included. trajectory: None where they
+    cannot be registered, for the reason in ``failure``."""
+
+    sweeps: tuple[Sweep, ...]
+    trajectory: Trajectory | None
+    failure: str = ""
+
+    @cached_property
+    def stretch(self) -> Stretch:
+        """The sweeps deskewed, in the odometry's world; empty where they are not registered."""
+        return Stretch(()) if self.trajectory is None else deskew(self.sweeps, self.trajectory)
+
+    @property
+    def middle(self) -> int:
+        """Row of the sweep in the middle."""
+        return len(self.sweeps) // 2
+
+    @property
+    def twist(self) -> Float:
+        """(6,) rad/s and m/s in the middle, lidar frame; zeros where it is not registered."""
+        if self.trajectory is None:
+            return np.zeros(6)
+        sweep = self.stretch.sweeps[self.middle]
+        return 0.5 * (sweep.twist_before + sweep.twist_after)
+
+    @property
+    def speed_m_s(self) -> float:
+        return float(np.linalg.norm(self.twist[3:]))
+
+
+@dataclass(frozen=True)
+class Sample:
+    """sequence: the recording. timeline: when its sweeps were taken. spots: in order of time.
+    unreadable: frame -> why a sweep that was to be looked at could not be read."""
+
+    sequence: LidarSequence
+    timeline: Timeline
+    spots: tuple[Spot, ...]
+    unreadable: dict[int, str]
+
+    @staticmethod
+    def of(sequence: LidarSequence, settings: RegisterSettings) -> Sample:
+        """Read and register spots at the start, in the middle and at the end."""
+        timeline = Timeline.of(sequence)
+        unreadable: dict[int, str] = {}
+        spots = []
+        for frames in _chosen(timeline):
+            sweeps = []
+            for frame in frames:
+                try:
+                    sweeps.append(sequence[frame])
+                except InputError as error:
+                    unreadable[frame] = str(error)
+            if sweeps:
+                spots.append(spot_of(tuple(sweeps), settings))
+        if not spots:
+            frame, reason = next(iter(unreadable.items()))
+            raise InputError(f"{sequence.name}: no sweep can be read; frame {frame}: {reason}")
+        return Sample(sequence, timeline, tuple(spots), unreadable)
+
+    @property
+    def registered(self) -> list[Spot]:
+        """Spots that could be registered."""
+        return [spot for spot in self.spots if spot.trajectory is not None]
+
+    @property
+    def fastest(self) -> Spot | None:
+        """The registered spot where the vehicle is fastest."""
+        return max(self.registered, key=lambda spot: spot.speed_m_s, default=None)
+
+
+def _chosen(timeline: Timeline) -> list[list[int]]:
+    """Frames of each spot: sweeps about 0.1 s apart; none twice."""
+    frames = timeline.frames
+    stride = max(1, round(_STEP_S * 1e9 / timeline.period_ns))
+    length = min(len(frames), stride * (_NUM_SWEEPS - 1) + 1)
+    most = max(1, len(frames) // length)
+    starts = np.rint(np.linspace(0, len(frames) - length, min(_NUM_SPOTS, most))).astype(int)
+    return [list(frames[start : start + length : stride]) for start in np.unique(starts)]
+
+
+def within(sweep: Sweep, settings: RegisterSettings) -> Sweep:
+    """Without the own vehicle's returns and those too far to trust."""
+    range_m = np.linalg.norm(sweep.points, axis=1)
+    return sweep.select((range_m >= settings.min_range_m) & (range_m <= settings.max_range_m))
+
+
+def spot_of(sweeps: tuple[Sweep, ...], settings: RegisterSettings) -> Spot:
+    """Registered by odometry, if they can be."""
+    if len(sweeps) < 2:
+        return Spot(sweeps, None, "one sweep alone cannot be registered")
+    try:
+        trajectory = find_trajectory([within(s, settings) for s in sweeps], settings)
+    except SweepError as error:
+        return Spot(sweeps, None, str(error))
+    return Spot(sweeps, trajectory)

@@ -1,0 +1,189 @@
+# SPDX-License-Identifier: MIT
+"""`densify doctor` names what is wrong with a recording, and finds nothing wrong with good ones."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from densify.bench.faults import FAULTS, Faulty
+from densify.config import Config
+from densify.doctor import CHECKS, Sample, Spot, Verdict, cameras, points, rings
+from densify.errors import InputError
+from densify.geometry import poses
+from densify.readers.street import Street
+from densify.readers.timeline import Timeline
+from densify.types import Sweep
+from tests.command import exit_code, refused
+
+FRAMES = range(112, 125)
+CONFIG = Config()
+
+
+@pytest.fixture(scope="module")
+def street() -> Faulty:
+    """Thirteen sweeps of sixteen rings at 7 m/s, with poses that are quick to ask for."""
+    made = Street("street", 0, "vlp16", cameras=("image_02",))
+    T_world_lidar = {frame: made.T_world_lidar(frame) for frame in FRAMES}
+    sequence = Faulty(made, frames=FRAMES)
+    sequence.T_world_lidar = T_world_lidar.__getitem__  # type: ignore[method-assign]
+    return sequence
+
+
+@pytest.fixture(scope="module")
+def good(street: Faulty) -> Sample:
+    return Sample.of(street, CONFIG.register)
+
+
+def findings(sample: Sample) -> dict[str, Verdict]:
+    return {f.check: f.verdict for check in CHECKS for f in check(sample, CONFIG)}
+
+
+def with_fault(good: Sample, street: Faulty, name: str) -> Sample:
+    """What doctor would look at in the recording with that fault: sweeps that still lie upon each
+    other are not registered again."""
+    (fault,) = (fault for fault in FAULTS if fault.name == name)
+    sequence = fault.make(street, CONFIG)
+    spots = []
+    for spot in good.spots:
+        sweeps = tuple(sequence[s.frame] for s in spot.sweeps)
+        spots.append(Spot(sweeps, spot.trajectory))
+    return Sample(sequence, Timeline.of(sequence), tuple(spots), {})
+
+
+def test_a_good_recording_raises_no_alarm(good: Sample) -> None:
+    found = findings(good)
+    assert {check for check, verdict in found.items() if verdict >= Verdict.SUSPICIOUS} == set()
+    assert {"stamps", "axes", "poses", "scanner's place", "image_02: calibration"} <= set(found)
+    assert found["motion compensation"] == found["poses"] == Verdict.FINE
+    assert [len(spot.sweeps) for spot in good.spots] == [5, 5]
+
+
+CHEAP = [
+    *("poses inverted", "poses of a camera", "poses in millimetres", "rotations transposed"),
+    *("points in millimetres", "points in a camera's axes", "points with z down"),
+    "points in the vehicle's frame, scanner's place not given",
+    *("stamps in microseconds taken for nanoseconds", "stamps in reverse", "one stamp twice"),
+    "point times in microseconds taken for nanoseconds",
+    *("reflectance from 0 to 255", "every second sweep broken off"),
+    *("T_lidar_cam given as T_cam_lidar", "T_cam_lidar without the camera's axes"),
+    *("camera's clock an hour off", "images of every third sweep only", "images black"),
+]
+
+
+@pytest.mark.parametrize("name", CHEAP)
+def test_a_fault_is_named(good: Sample, street: Faulty, name: str) -> None:
+    (fault,) = (fault for fault in FAULTS if fault.name == name)
+    found = findings(with_fault(good, street, name))
+    named = {
+        check: verdict
+        for check, verdict in found.items()
+        if any(asked in check for asked in fault.named_by)
+    }
+    assert max(named.values(), default=Verdict.FINE) >= Verdict.SUSPICIOUS, found
+
+
+def test_compensated_sweeps_are_told_from_fired_ones(good: Sample) -> None:
+    def compensated(spot: Spot) -> Spot:
+        straight = tuple(
+            replace(r.sweep, offset_ns=s.offset_ns)
+            for r, s in zip(spot.stretch.sweeps, spot.sweeps, strict=True)
+        )
+        return Spot(straight, spot.trajectory)
+
+    sample = replace(good, spots=tuple(compensated(spot) for spot in good.spots))
+    (found,) = (f for f in rings.check_rings(sample) if f.check == "motion compensation")
+    assert found.verdict == Verdict.WRONG
+    assert found.remedy == "--set register.deskew=false"
+    assert found.values["undone"] > 2 * found.values["as_stored"]
+
+
+@pytest.mark.parametrize("place_m", [(0.0, 0.0, 0.0), (1.1, -0.3, 1.75), (-0.6, 0.2, 1.6)])
+def test_where_a_scanner_stands_is_found(good: Sample, place_m: tuple[float, ...]) -> None:
+    sweep = good.spots[0].sweeps[2]
+    found_m = rings.found_origin(sweep.points[::2] + place_m, np.zeros(3))
+    np.testing.assert_allclose(found_m, place_m, atol=0.03)
+
+
+def test_rings_are_not_looked_for_on_the_ground() -> None:
+    """From a place on a plane all of it has elevation 0, which is no ring."""
+    rng = np.random.default_rng(2)
+    plane = np.column_stack([rng.uniform(-30, 30, (20_000, 2)), np.full(20_000, -1.7)])
+    walls = np.column_stack(
+        [rng.uniform(-30, 30, 9000), rng.choice([-9.0, 9.0], 9000), rng.uniform(-1.7, 4, 9000)]
+    )
+    both = np.concatenate([plane, walls])
+    assert rings.sharpness(both, np.array([0.0, 0.0, -1.7])) < 4.0
+
+
+def test_the_clock_of_a_camera_is_measured(good: Sample) -> None:
+    camera = good.sequence.cameras["image_02"]
+    pairs, broken = cameras.image_pairs(good, camera)
+    assert not broken and len(pairs) == 2
+    late_s = np.arange(-0.2, 0.21, 0.05)
+    scores = [cameras.score(camera, pairs, t) for t in late_s]
+    assert abs(late_s[int(np.argmax(scores))]) < 0.06
+    assert max(scores) > 5 * abs(scores[-1]) or max(scores) > scores[-1] + 3
+    shifted = [replace(p, exposed_s=p.exposed_s + 0.15) for p in pairs]
+    again = [cameras.score(camera, shifted, t) for t in late_s]
+    assert abs(late_s[int(np.argmax(again))] + 0.15) < 0.06
+
+
+def test_own_vehicle_is_what_stays_beside_it(good: Sample) -> None:
+    hood = np.random.default_rng(0).uniform([3.6, -0.5, -0.4], [3.9, 0.5, -0.3], (400, 3))
+
+    def with_hood(spot: Spot) -> Spot:
+        def changed(sweep: Sweep) -> Sweep:
+            raw = sweep.points.copy()
+            raw[:400] = hood
+            return replace(sweep, points=raw)
+
+        return Spot(tuple(changed(s) for s in spot.sweeps), spot.trajectory)
+
+    sample = replace(good, spots=tuple(with_hood(spot) for spot in good.spots))
+    (found,) = points.check_own_vehicle(sample, CONFIG.register)
+    assert found.verdict == Verdict.SUSPICIOUS
+    assert found.remedy in ("--set register.min_range_m=3.9", "--set register.min_range_m=4.0")
+    (before,) = points.check_own_vehicle(good, CONFIG.register)
+    assert before.verdict == Verdict.FINE
+
+
+def test_a_sweep_that_cannot_be_read_is_named_and_the_rest_looked_at(street: Faulty) -> None:
+    broken = Faulty(street, frames=range(112, 117), unreadable=[114])
+    sample = Sample.of(broken, CONFIG.register)
+    (found,) = (f for check in CHECKS[:1] for f in check(sample, CONFIG))
+    assert found.verdict == Verdict.WRONG
+    assert "frame 114" in found.evidence and "truncated" in found.evidence
+    with pytest.raises(InputError, match="no sweep can be read"):
+        Sample.of(Faulty(street, frames=range(112, 117), unreadable=FRAMES), CONFIG.register)
+
+
+def test_speed_is_that_of_the_street(good: Sample, street: Faulty) -> None:
+    a, b = (street.T_world_lidar(f) for f in (113, 115))
+    true_m_s = np.linalg.norm((poses.inverse(a) @ b)[:3, 3]) / 0.2
+    assert abs(good.spots[0].speed_m_s - true_m_s) < 0.5
+
+
+def test_the_command_on_a_real_drive(
+    test_data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    drive = test_data / "kitti" / "2011_09_26" / "2011_09_26_drive_0002_sync"
+    picture = tmp_path / "look.png"
+    assert exit_code("doctor", drive, "--json", "--picture", picture) == 0
+    printed = json.loads(capsys.readouterr().out)
+    verdicts = {f["check"]: f["verdict"] for f in printed["findings"]}
+    assert printed["worst"] in ("fine", "unknown")
+    assert verdicts["files"] == verdicts["image_03: calibration"] == "fine"
+    assert cv2.imread(str(picture)).shape[1] == 1000
+    assert "already there" in refused(capsys, 2, "doctor", drive, "--picture", picture)
+
+
+def test_bad_arguments_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert "no such folder" in refused(capsys, 2, "doctor", tmp_path / "nowhere")
+    command = ("doctor", "street", "--picture", tmp_path / "look.jpg")
+    assert ".png" in refused(capsys, 2, *command)
