@@ -17,6 +17,7 @@ from types import ModuleType
 
 from densify.plugins.table import Table
 
+_BAGS = (".bag", ".db3", ".mcap")
 _SWEEP = re.compile(r".*\d.*\.(bin|pcd|ply|las|laz)", re.IGNORECASE)
 
 
@@ -54,6 +55,12 @@ def _is_argoverse2(path: Path) -> bool:
     return (path / "city_SE3_egovehicle.feather").is_file() or any(
         any(split.glob("*/city_SE3_egovehicle.feather")) for split in splits
     )
+
+
+def _is_bag(path: Path) -> bool:
+    if path.is_file():
+        return path.suffix in _BAGS
+    return any(file.suffix in _BAGS for file in path.iterdir())
 
 
 def _holds_sweeps(path: Path) -> bool:
@@ -132,6 +139,13 @@ READERS = Table(
             "densify.readers.kitti_odometry",
             recognises=_is_kitti_odometry,
             holds="KITTI odometry or SemanticKITTI (sequences/, or a folder in it with velodyne/)",
+            scenes=True,
+        ),
+        Reader(
+            "ros",
+            "densify.readers.ros",
+            recognises=_is_bag,
+            holds="a ROS bag (.bag, .db3, .mcap, or a folder of them)",
             scenes=True,
         ),
         Reader(

@@ -74,6 +74,11 @@ class FileSequence(ABC):
     def _returns(self, frame: int) -> tuple[Path, Returns]:
         """The rows of an existing sweep, and the file for messages."""
 
+    def _image(self, camera: Camera, number: int) -> NDArray[np.uint8]:
+        """(H,W,3) RGB of an existing image."""
+        path, data = self._encoded_image(camera.name, number)
+        return decoded_image(data, camera, path)
+
     def _encoded_image(self, camera: str, number: int) -> tuple[Path, bytes]:
         """A PNG or JPEG file's bytes of an existing image, and the file for messages."""
         raise NotImplementedError
@@ -123,8 +128,7 @@ class FileSequence(ABC):
     def image(self, camera: str, number: int) -> NDArray[np.uint8]:
         """(H,W,3) RGB. Raises InputError for an unknown camera, a missing or unfit image."""
         calibrated = self.check_image(camera, number)
-        path, data = self._encoded_image(camera, number)
-        return decoded_image(data, calibrated, path)
+        return self._image(calibrated, number)
 
     def T_world_lidar(self, frame: int) -> Float:
         """(4,4) the data set's own pose at the sweep's reference time. Raises InputError if there

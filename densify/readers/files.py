@@ -108,13 +108,19 @@ def decoded_image(data: bytes, camera: Camera, where: Path) -> NDArray[np.uint8]
     Raises InputError, which names the place, if it is no whole image or not of the camera's size.
     """
     bgr = _decoded(data, where)
-    height, width = bgr.shape[:2]
+    check_image_size(bgr.shape, camera, where)
+    return np.ascontiguousarray(bgr[:, :, ::-1], dtype=np.uint8)
+
+
+def check_image_size(shape: tuple[int, ...], camera: Camera, where: Path | str) -> None:
+    """Raises InputError, which names the place, if an image (H,W,...) is not of the camera's
+    size."""
+    height, width = shape[:2]
     if (width, height) != (camera.width_px, camera.height_px):
         raise InputError(
             f"{where}: got an image of {width} x {height} px; expected "
             f"{camera.width_px} x {camera.height_px}, as the calibration of {camera.name} says"
         )
-    return np.ascontiguousarray(bgr[:, :, ::-1], dtype=np.uint8)
 
 
 def image_size_px(path: Path) -> tuple[int, int]:

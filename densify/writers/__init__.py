@@ -20,6 +20,8 @@ from densify.writers.excerpt import Excerpt
 FORMATS = {
     "kitti": "densify.writers.kitti_raw",
     "folder": "densify.writers.folder",
+    "ros1": "densify.writers.ros1",
+    "ros2": "densify.writers.ros2",
     "argoverse2": "densify.writers.argoverse2",
     "kitti-odometry": "densify.writers.kitti_odometry",
     "kitti-tracking": "densify.writers.kitti_tracking",

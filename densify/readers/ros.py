@@ -1,0 +1,274 @@
+# SPDX-License-Identifier: MIT
+"""ROS 1 bags and ROS 2 bags (.db3, .mcap), by the rosbags package, without ROS (`densify[ros]`).
+
+``ros:PATH[#points=/topic,/topic&images=/topic,/topic&poses=/topic]``: topics are guessed where one
+fits, and must be named where several do; ``images=none`` and ``poses=none`` leave them out.
+
+points
+    PointCloud2 of any layout, or Livox's CustomMsg, in the frame that their header names, taken as
+    fired: drivers do not compensate unless told to. Rays start at that frame's origin. Points of
+    several lidars make one sweep in the frame of the first one named, each message with the one
+    of the first lidar nearest to it in time, and each lidar's rays start at its own frame's
+    origin, by /tf_static.
+stamps
+    of the header (when it was recorded, if that is 0): the reference time. Times of points count
+    from it, or are absolute; field, unit and clock are found out (`densify.readers.point_fields`).
+    Sweeps and images are numbered from 0 in the order of their stamps.
+images
+    Image or CompressedImage with the CameraInfo beside them: raw ones with K and D, ``image_rect``
+    with P and R. Their frame is that of the image's header, fixed to the lidar's by /tf_static (or
+    what never moves in /tf); a P that moves the camera sideways (stereo) is taken to agree with it.
+poses
+    Odometry, PoseStamped, or /tf: of the lidar's frame by what is fixed, interpolated to the
+    sweeps' stamps.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cached_property
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from densify.errors import InputError
+from densify.geometry import poses
+from densify.readers.file_sequence import FileSequence, Returns, truth_beside
+from densify.readers.files import check_image_size
+from densify.readers.point_fields import (
+    Fields,
+    PointTimes,
+    find_fields,
+    find_times,
+    full_scale,
+    points_of,
+    scaled,
+)
+from densify.readers.pose_track import PoseTrack
+from densify.readers.ros_bag import Bag, Entry
+from densify.readers.ros_frames import Frames, plain, recorded_track
+from densify.readers.ros_messages import camera_of, cloud_columns, image_rgb
+from densify.readers.ros_topics import Images, Topics
+from densify.types import Camera, Float
+
+_NUM_TRIED = 5  # sweeps, until one holds points
+_USUAL_PERIOD_NS = 100_000_000
+
+
+def open_recording(path: Path, scene: str | None) -> RosBag:
+    """See `densify.readers.ReaderModule`; scene: which topics, see above."""
+    return RosBag(path, scene)
+
+
+class Lidar(NamedTuple):
+    """A lidar's topic. entries: its messages. T: (4,4) to the first lidar's frame. times, scale: of
+    its points and intensities; words: what was found of the times."""
+
+    topic: str
+    frame: str
+    entries: list[Entry]
+    T_first_lidar: Float
+    fields: Fields
+    times: PointTimes | None
+    scale: float
+    words: str
+
+
+class RosBag(FileSequence):
+    """A bag as a `densify.types.LidarSequence`; `findings` says what was found."""
+
+    def __init__(self, path: Path, options: str | None = None) -> None:
+        """Reads the bag through once, for the stamps of its messages. Raises InputError if it is
+        damaged, or its topics, frames or calibrations do not tell what is needed."""
+        self._bag = Bag(path)
+        self._topics = Topics.choose(self._bag, options)
+        self._left_out = list(self._topics.left_out)
+        images = self._topics.images
+        self._index = self._bag.index([*self._topics.points, *(i.topic for i in images)])
+        for topic in self._topics.points:
+            if not self._index[topic]:
+                raise InputError(f"{path}: {topic}: holds no messages")
+        self._transforms = Frames.read(self._bag)
+        self._lidars = self._open_lidars()
+        cameras = {i.camera: camera for i in images if (camera := self._camera(i)) is not None}
+        self._images = {i.camera: i.topic for i in images}
+        stamps = {
+            name: {n: e.stamp_ns for n, e in enumerate(self._index[self._images[name]])}
+            for name in cameras
+        }
+        self._sweeps = self._lidars[0].entries
+        super().__init__(
+            path.resolve().name,
+            path,
+            range(len(self._sweeps)),
+            cameras,
+            stamps,
+            truth_beside(path if path.is_dir() else path.parent),
+        )
+
+    def stamp_ns(self, frame: int) -> int:
+        """Reference time of a sweep."""
+        self.check_frame(frame)
+        return self._sweeps[frame].stamp_ns
+
+    def findings(self) -> Sequence[tuple[str, str]]:
+        """See `densify.types.SaysWhatItFound`."""
+        lines = []
+        for lidar in self._lidars:
+            used = [f"{part} = {name}" for part, name in vars(lidar.fields).items() if name]
+            lines.append(("lidar", f"{lidar.topic} in {lidar.frame}: {', '.join(used)}"))
+            lines.append(("times", f"{lidar.words}; intensity divided by {lidar.scale:g}"))
+        for name, topic in self._images.items():
+            lines.append(("images", f"{topic} ({name})"))
+        lines += [("no camera", text) for text in self._left_out]
+        return [*lines, ("poses from", self._track_and_words[1])]
+
+    def _returns(self, frame: int) -> tuple[Path, Returns]:
+        at = self._sweeps[frame]
+        parts = [self._returns_of(self._lidars[0], at, at.stamp_ns)]
+        for lidar in self._lidars[1:]:
+            near = min(lidar.entries, key=lambda e: abs(e.stamp_ns - at.stamp_ns))
+            if abs(near.stamp_ns - at.stamp_ns) <= self._period_ns // 2:
+                parts.append(self._returns_of(lidar, near, at.stamp_ns))
+            else:
+                parts.append(
+                    Returns(np.zeros((0, 3)), np.zeros(0, np.float32), np.zeros(0, np.int64))
+                )
+        timed = all(part.offset_ns is not None for part in parts)
+        numbers = [np.full(len(part.points), n, np.uint8) for n, part in enumerate(parts)]
+        origins = np.stack([lidar.T_first_lidar[:3, 3] for lidar in self._lidars])
+        return self.where, Returns(
+            np.concatenate([part.points for part in parts]),
+            np.concatenate([part.intensity for part in parts]),
+            np.concatenate([part.offset_ns for part in parts]) if timed else None,
+            np.concatenate(numbers),
+            origins if len(self._lidars) > 1 else None,
+        )
+
+    def _returns_of(self, lidar: Lidar, entry: Entry, stamp_ns: int) -> Returns:
+        """A message's points in the first lidar's frame, timed since the sweep's stamp."""
+        where = f"{self._bag.path}: {lidar.topic} at {entry.stamp_ns} ns"
+        columns = cloud_columns(self._bag.message(lidar.topic, entry), where)
+        for name in vars(lidar.fields).values():
+            if name and name not in columns:
+                raise InputError(
+                    f"{where}: no field {name}, which other messages have; got {', '.join(columns)}"
+                )
+        points = points_of(columns, lidar.fields)
+        valid = np.isfinite(points).all(axis=1) & points.any(axis=1)
+        intensity = np.zeros(len(points), np.float32)
+        if lidar.fields.intensity:
+            intensity = scaled(columns[lidar.fields.intensity], lidar.scale)
+        offset_ns = None
+        if lidar.times is not None:
+            values = columns[lidar.times.field]
+            if values.dtype.kind == "f" and not np.isfinite(values[valid]).all():
+                raise InputError(f"{where}: {lidar.times.field}: got a time that is not finite")
+            offset_ns = np.zeros(len(points), np.int64)
+            since_ns = entry.stamp_ns - stamp_ns
+            offset_ns[valid] = lidar.times.offset_ns(values[valid], entry.stamp_ns) + since_ns
+        points[valid] = poses.transform(lidar.T_first_lidar, points[valid])
+        points[~valid] = 0.0
+        return Returns(points, intensity, offset_ns)
+
+    def _image(self, camera: Camera, number: int) -> NDArray[np.uint8]:
+        topic = self._images[camera.name]
+        where = f"{self._bag.path}: {topic}: image {number}"
+        rgb = image_rgb(self._bag.message(topic, self._index[topic][number]), where)
+        check_image_size(rgb.shape, camera, where)
+        return rgb
+
+    def _pose(self, frame: int) -> Float:
+        track, _ = self._track_and_words
+        return super()._pose(frame) if track is None else track.at(self.stamp_ns(frame))
+
+    @cached_property
+    def _track_and_words(self) -> tuple[PoseTrack | None, str]:
+        """The first lidar's path, and for a person where it is from."""
+        chosen, lidar = self._topics.poses, self._lidars[0].frame
+        if not chosen:
+            return None, "none, as asked for"
+        try:
+            if chosen != "tf":
+                track = recorded_track(self._bag, chosen, self._transforms, lidar)
+                return track, f"{chosen}, {len(track.stamp_ns)} of them"
+        except InputError as error:
+            if self._topics.poses_named:
+                raise
+            return None, str(error)
+        found = self._transforms.track_of(lidar)
+        if found is None and self._topics.poses_named:
+            raise InputError(f"{self._bag.path}: /tf: nothing tells where {lidar} was")
+        if found is None:
+            return None, f"none: neither Odometry nor /tf tells where {lidar} was"
+        return found[1], f"/tf, {found[0]} to {lidar}"
+
+    @cached_property
+    def _period_ns(self) -> int:
+        stamps_ns = [entry.stamp_ns for entry in self._lidars[0].entries]
+        return (
+            max(1, int(np.median(np.diff(stamps_ns)))) if len(stamps_ns) > 1 else _USUAL_PERIOD_NS
+        )
+
+    def _open_lidars(self) -> list[Lidar]:
+        found: list[Lidar] = []
+        for topic in self._topics.points:
+            entries = self._index[topic]
+            frame, columns, entry = self._sample(topic, entries)
+            first = found[0].frame if found else frame
+            T = self._transforms.between(first, frame)
+            if T is None:
+                raise InputError(
+                    f"{self._bag.path}: nothing in /tf_static joins the frame {frame} of {topic} "
+                    f"to {first}; name the topic of one lidar: #points={topic}"
+                )
+            fields = find_fields(columns)
+            missing = [axis for axis in "xyz" if not getattr(fields, axis)]
+            if missing:
+                raise InputError(
+                    f"{self._bag.path}: {topic}: no field {', '.join(missing)}; got "
+                    f"{', '.join(columns)}"
+                )
+            times, words = None, "no field of times"
+            if fields.time:
+                steps = np.diff([e.stamp_ns for e in entries])
+                period_ns = max(1, int(np.median(steps))) if len(steps) else _USUAL_PERIOD_NS
+                times, words = find_times(
+                    columns[fields.time], fields.time, period_ns, entry.stamp_ns
+                )
+            scale = full_scale(columns[fields.intensity]) if fields.intensity else 1.0
+            found.append(Lidar(topic, frame, entries, T, fields, times, scale or 1.0, words))
+        return found
+
+    def _sample(self, topic: str, entries: Sequence[Entry]) -> tuple[str, dict[str, Any], Entry]:
+        """Frame and fields of the first message that holds points."""
+        for entry in entries[:_NUM_TRIED]:
+            message = self._bag.message(topic, entry)
+            columns = cloud_columns(message, f"{self._bag.path}: {topic}")
+            if len(next(iter(columns.values()), ())):
+                return plain(message.header.frame_id), columns, entry
+        raise InputError(f"{self._bag.path}: {topic}: its first messages hold no points")
+
+    def _camera(self, images: Images) -> Camera | None:
+        """None, with a note, where a camera that nobody named does not tell where it stands."""
+        where = f"{self._bag.path}: {images.info}"
+        try:
+            if not self._index[images.topic]:
+                raise InputError(f"{where}: no messages of {images.topic}")
+            info = next(iter(self._bag.messages(images.info)))
+            image = self._bag.message(images.topic, self._index[images.topic][0])
+            frame, lidar = plain(image.header.frame_id), self._lidars[0].frame
+            T = self._transforms.between(frame, lidar)
+            if T is None:
+                raise InputError(
+                    f"{where}: nothing in /tf_static joins the camera's frame {frame} to the "
+                    f"lidar's, {lidar}; record /tf_static, or leave images out: #images=none"
+                )
+            return camera_of(info, images.camera, T, images.rectified, where)
+        except InputError as error:
+            if images.named:
+                raise
+            self._left_out.append(f"{images.topic}: {error}")
+            return None

@@ -1,0 +1,176 @@
+# SPDX-License-Identifier: MIT
+"""Messages of ROS 1 and ROS 2 bags, by the rosbags package: no ROS is needed.
+
+A bag is read through once, to learn the time stamp in the header of every message that matters;
+of a large bag that index is kept in the user's cache. Messages are then read one at a time.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from threading import RLock
+from typing import Any, NamedTuple
+
+from densify.errors import InputError
+from densify.readers.extras import needed
+
+_LARGE_BYTES = 2**28
+_KEPT_BYTES = 2**30
+_MEND = "a bag that was cut off can be mended: rosbag reindex, ros2 bag reindex, mcap recover"
+STAMPED = (
+    *("sensor_msgs/msg/PointCloud2", "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"),
+    *("nav_msgs/msg/Odometry", "geometry_msgs/msg/PoseStamped", "sensor_msgs/msg/CameraInfo"),
+    *("geometry_msgs/msg/PoseWithCovarianceStamped", "livox_ros_driver/msg/CustomMsg"),
+    *("livox_ros_driver2/msg/CustomMsg", "livox_interfaces/msg/CustomMsg"),
+)
+"""Types whose messages begin with a header."""
+
+
+class Entry(NamedTuple):
+    """Where a message is. stamp_ns: of its header, or when it was recorded if that is 0. log_ns:
+    when it was recorded; turn: which of the topic's messages recorded then."""
+
+    stamp_ns: int
+    log_ns: int
+    turn: int
+
+
+@dataclass(frozen=True)
+class Topic:
+    """type: such as sensor_msgs/msg/PointCloud2, whichever ROS it is from."""
+
+    name: str
+    type: str
+    num_messages: int
+
+
+class Bag:
+    """path: a .bag, .db3 or .mcap file, a ROS 2 bag's folder, or a folder of .bag files that are
+    parts of one recording. topics: by name."""
+
+    def __init__(self, path: Path) -> None:
+        """Raises InputError if it is no bag, or a damaged one."""
+        self.path = path
+        self._files = bag_files(path)
+        highlevel = needed("rosbags.highlevel", "ros", "ROS bags")
+        typesys = needed("rosbags.typesys", "ros", "ROS bags")
+        known = typesys.get_typestore(typesys.Stores.ROS2_JAZZY)  # of bags without definitions
+        self._lock = RLock()
+        try:
+            self._reader = highlevel.AnyReader(self._files, default_typestore=known)
+            self._reader.open()
+            self.topics: Mapping[str, Topic] = {
+                name: Topic(name, info.msgtype or "of several types", info.msgcount)
+                for name, info in sorted(self._reader.topics.items())
+                if info.msgcount
+            }
+        except Exception as error:  # a damaged bag makes the parser raise anything
+            raise self._unreadable(error) from error
+
+    def of_type(self, *types: str) -> list[Topic]:
+        """Topics of one of these types, by name."""
+        return [topic for topic in self.topics.values() if topic.type in types]
+
+    def index(self, topics: Collection[str]) -> dict[str, list[Entry]]:
+        """Every message of these topics, whose types are among `STAMPED`, by ascending stamp."""
+        contents = self._contents()
+        size = sum(file.stat().st_size for file in contents)
+        if size < _LARGE_BYTES:
+            return self._read_index(sorted(topics))
+        from densify.cache import Cache
+
+        state = [(str(f.absolute()), f.stat().st_size, f.stat().st_mtime_ns) for f in contents]
+        names = sorted(topics)
+        return Cache(_KEPT_BYTES).get("bag", [state, names], lambda: self._read_index(names))
+
+    def message(self, topic: str, entry: Entry) -> Any:
+        """Raises InputError if it cannot be read."""
+        found = list(self._messages([topic], entry.log_ns, entry.log_ns + 1))
+        if len(found) <= entry.turn:
+            raise InputError(f"{self.path}: no message of {topic} at {entry.log_ns} ns any more")
+        _, _, raw, type_ = found[entry.turn]
+        return self._decoded(raw, type_, topic)
+
+    def messages(self, topic: str) -> Iterator[Any]:
+        """All of a topic, in the order in which they were recorded."""
+        for name, _, raw, type_ in self._messages([topic]):
+            yield self._decoded(raw, type_, name)
+
+    def _read_index(self, topics: Sequence[str]) -> dict[str, list[Entry]]:
+        found: dict[str, list[Entry]] = {topic: [] for topic in topics}
+        turns: dict[str, tuple[int, int]] = {}
+        for topic, log_ns, raw, _ in self._messages(topics) if topics else ():
+            last_ns, turn = turns.get(topic, (-1, 0))
+            turn = turn + 1 if log_ns == last_ns else 0
+            turns[topic] = (log_ns, turn)
+            try:
+                stamp_ns = _stamp_ns(raw, self._reader.is2)
+            except struct.error:
+                raise InputError(f"{self.path}: {topic}: a message of {len(raw)} bytes") from None
+            found[topic].append(Entry(stamp_ns or log_ns, log_ns, turn))
+        return {topic: sorted(entries) for topic, entries in found.items()}
+
+    def _messages(
+        self, topics: Sequence[str], start_ns: int | None = None, stop_ns: int | None = None
+    ) -> Iterator[tuple[str, int, bytes, str]]:
+        wanted = [c for c in self._reader.connections if c.topic in topics]
+        with self._lock:
+            try:
+                for connection, log_ns, raw in self._reader.messages(wanted, start_ns, stop_ns):
+                    yield connection.topic, log_ns, raw, connection.msgtype
+            except InputError:
+                raise
+            except Exception as error:  # as above
+                raise self._unreadable(error) from error
+
+    def _decoded(self, raw: bytes, type_: str, topic: str) -> Any:
+        try:
+            return self._reader.deserialize(raw, type_)
+        except Exception as error:  # as above
+            raise InputError(
+                f"{self.path}: {topic}: a message of {len(raw)} bytes is no whole {type_} "
+                f"({' '.join(str(error).split()) or type(error).__name__})"
+            ) from error
+
+    def _contents(self) -> list[Path]:
+        return [
+            f for one in self._files for f in (sorted(one.iterdir()) if one.is_dir() else [one])
+        ]
+
+    def _unreadable(self, error: Exception) -> InputError:
+        reason = " ".join(str(error).split()) or type(error).__name__
+        return InputError(f"{self.path}: not a whole bag: {reason}; {_MEND}")
+
+
+def bag_files(path: Path) -> list[Path]:
+    """What is to be opened: the file, a ROS 2 bag's folder, or the bags in a folder. Raises
+    InputError if there are none."""
+    suffixes = (".bag", ".db3", ".mcap")
+    if path.is_file() and path.suffix in suffixes:
+        return [path]
+    if (path / "metadata.yaml").is_file():
+        return [path]
+    for suffix in suffixes:
+        found = sorted(path.glob(f"*{suffix}")) if path.is_dir() else []
+        if found and (suffix == ".bag" or len(found) == 1):
+            return found
+        if found:
+            raise InputError(
+                f"{path}: {len(found)} {suffix} files without metadata.yaml; name one of them, or "
+                f"write it with ros2 bag reindex"
+            )
+    raise InputError(
+        f"{path}: no bag; expected a .bag, .mcap or .db3 file, or a ROS 2 bag's folder"
+    )
+
+
+def _stamp_ns(raw: bytes, is_ros2: bool) -> int:
+    """The stamp in the header that a message begins with."""
+    if is_ros2:  # an encapsulation of four bytes, whose second tells the order
+        seconds, nanoseconds = struct.unpack_from("<iI" if raw[1] & 1 else ">iI", raw, 4)
+    else:  # a sequence number
+        seconds, nanoseconds = struct.unpack_from("<II", raw, 4)
+    return int(seconds) * 1_000_000_000 + int(nanoseconds)

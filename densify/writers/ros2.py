@@ -1,0 +1,16 @@
+# SPDX-License-Identifier: MIT
+"""Writes a street as a ROS 2 bag, see `densify.writers.ros_bag`: OUT/street_ros2/."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from densify.types import Progress
+from densify.writers.excerpt import Excerpt
+from densify.writers.ros_bag import write_bag
+
+
+def write_tree(excerpt: Excerpt, out: Path, overwrite: bool, progress: Progress | None) -> Path:
+    """See `densify.writers.TreeWriter`."""
+    place = out / "street_ros2"
+    return write_bag(excerpt, place, overwrite, progress, is_ros2=True)

@@ -1,0 +1,186 @@
+# SPDX-License-Identifier: MIT
+"""Small bags with messages of any kind, for tests of the reader."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+STAMP_NS = 1_700_000_000_000_000_000
+PERIOD_NS = 100_000_000
+KINDS = {"i1": 1, "u1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "f8": 8}
+
+
+class Maker:
+    """Messages, and bags of them. suffix: .db3, .mcap or .bag."""
+
+    def __init__(self, suffix: str = ".db3") -> None:
+        from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+        self.is_ros2 = suffix != ".bag"
+        self.suffix = suffix
+        self.types = get_typestore(Stores.ROS2_JAZZY if self.is_ros2 else Stores.ROS1_NOETIC)
+        extra = {
+            "tf2_msgs/msg/TFMessage": "geometry_msgs/TransformStamped[] transforms",
+            "velodyne_msgs/msg/VelodyneScan": "std_msgs/Header header\nuint8[] packets",
+            "livox_ros_driver2/msg/CustomPoint": "uint32 offset_time\nfloat32 x\nfloat32 y\n"
+            "float32 z\nuint8 reflectivity\nuint8 tag\nuint8 line",
+            "livox_ros_driver2/msg/CustomMsg": "std_msgs/Header header\nuint64 timebase\n"
+            "uint32 point_num\nuint8 lidar_id\nuint8[3] rsvd\n"
+            "livox_ros_driver2/CustomPoint[] points",
+        }
+        for name, text in extra.items():
+            if name not in self.types.types:
+                self.types.register(get_types_from_msg(text, name))
+        self.written: list[tuple[int, str, str, Any]] = []
+
+    def make(self, type_: str, *values: Any) -> Any:
+        return self.types.types[type_](*values)
+
+    def header(self, stamp_ns: int, frame: str) -> Any:
+        stamp = self.make("builtin_interfaces/msg/Time", *divmod(stamp_ns, 10**9))
+        return self.make("std_msgs/msg/Header", *(() if self.is_ros2 else (7,)), stamp, frame)
+
+    def put(self, topic: str, type_: str, message: Any, log_ns: int) -> None:
+        self.written.append((log_ns, topic, type_, message))
+
+    def cloud(
+        self,
+        columns: dict[str, np.ndarray],
+        stamp_ns: int = STAMP_NS,
+        topic: str = "/points",
+        frame: str = "lidar",
+        height: int = 1,
+        padding: int = 3,
+        row_padding: int = 0,
+        big: bool = False,
+    ) -> None:
+        """columns: by name, in order; ``padding`` bytes stand between them."""
+        order, offset, layout = ">" if big else "<", 0, []
+        for name, column in columns.items():
+            layout.append((name, column.dtype.str[1:], offset))
+            offset += column.dtype.itemsize + padding
+        names, kinds, offsets = zip(*layout, strict=True)
+        dtype = np.dtype(
+            {
+                "names": names,
+                "formats": [order + k for k in kinds],
+                "offsets": offsets,
+                "itemsize": offset,
+            }
+        )
+        points = np.zeros(len(columns["x"]), dtype)
+        for name, column in columns.items():
+            points[name] = column
+        fields = [
+            self.make("sensor_msgs/msg/PointField", name, at, KINDS[kind], 1)
+            for name, kind, at in layout
+        ]
+        width = len(points) // height
+        rows = points.view(np.uint8).reshape(height, width * offset)
+        data = np.pad(rows, ((0, 0), (0, row_padding)), constant_values=9).reshape(-1)
+        step = width * offset + row_padding
+        values = (self.header(stamp_ns, frame), height, width, fields, big, offset, step, data)
+        message = self.make("sensor_msgs/msg/PointCloud2", *values, False)
+        self.put(topic, "sensor_msgs/msg/PointCloud2", message, stamp_ns + PERIOD_NS)
+
+    def sweeps(self, num: int = 2, **options: Any) -> None:
+        for i in range(num):
+            self.cloud(scan(), STAMP_NS + i * PERIOD_NS, **options)
+
+    def image(
+        self, data: np.ndarray, encoding: str, topic: str = "/front/image_raw", step: int = 0
+    ) -> None:
+        """data: (H,W,...) as stored; step: bytes of a row, more than it needs."""
+        raw = np.ascontiguousarray(data)
+        height, width = raw.shape[:2]
+        rows = raw.view(np.uint8).reshape(height, -1)
+        step = step or rows.shape[1]
+        rows = np.pad(rows, ((0, 0), (0, step - rows.shape[1])))
+        header = self.header(STAMP_NS + 1, "front_optical")
+        values = (header, height, width, encoding, 0, step, rows.reshape(-1))
+        type_ = "sensor_msgs/msg/Image"
+        self.put(topic, type_, self.make(type_, *values), STAMP_NS + 2)
+
+    def info(self, topic: str = "/front/camera_info", size=(6, 8), **changes: Any) -> None:
+        """changes: model, d, k, r, p, binning, roi (x, y, height, width)."""
+        K = changes.get("k", [100.0, 0, 3.5, 0, 110, 2.5, 0, 0, 1])
+        P = changes.get("p", [90.0, 0, 3, 0, 0, 90, 2, 0, 0, 0, 1, 0])
+        R = changes.get("r", np.eye(3).ravel())
+        region = changes.get("roi", (0, 0, 0, 0))
+        roi = self.make("sensor_msgs/msg/RegionOfInterest", *region, False)
+        arrays = [np.array(a, float) for a in (changes.get("d", []), K, R, P)]
+        header = self.header(STAMP_NS + 1, "front_optical")
+        values = (header, *size, changes.get("model", "plumb_bob"), *arrays)
+        message = self.make(
+            "sensor_msgs/msg/CameraInfo", *values, *changes.get("binning", (0, 0)), roi
+        )
+        self.put(topic, "sensor_msgs/msg/CameraInfo", message, STAMP_NS + 2)
+
+    def transform(
+        self, parent: str, child: str, T: np.ndarray, topic: str = "/tf_static", stamp_ns=STAMP_NS
+    ) -> None:
+        vector = self.make("geometry_msgs/msg/Vector3", *map(float, T[:3, 3]))
+        content = self.make("geometry_msgs/msg/Transform", vector, self.turn(T))
+        header = self.header(stamp_ns, parent)
+        stamped = self.make("geometry_msgs/msg/TransformStamped", header, child, content)
+        message = self.make("tf2_msgs/msg/TFMessage", [stamped])
+        self.put(topic, "tf2_msgs/msg/TFMessage", message, stamp_ns)
+
+    def turn(self, T: np.ndarray) -> Any:
+        quaternion = map(float, Rotation.from_matrix(T[:3, :3]).as_quat())
+        return self.make("geometry_msgs/msg/Quaternion", *quaternion)
+
+    def odometry(
+        self, T: np.ndarray, stamp_ns: int, child: str = "base", topic: str = "/odom"
+    ) -> None:
+        place = self.make("geometry_msgs/msg/Point", *map(float, T[:3, 3]))
+        pose = self.make("geometry_msgs/msg/Pose", place, self.turn(T))
+        zero = self.make("geometry_msgs/msg/Vector3", 0.0, 0.0, 0.0)
+        twist = self.make("geometry_msgs/msg/Twist", zero, zero)
+        cover = [
+            self.make(f"geometry_msgs/msg/{name}WithCovariance", value, np.zeros(36))
+            for name, value in (("Pose", pose), ("Twist", twist))
+        ]
+        message = self.make("nav_msgs/msg/Odometry", self.header(stamp_ns, "odom"), child, *cover)
+        self.put(topic, "nav_msgs/msg/Odometry", message, stamp_ns)
+
+    def write(self, folder: Path) -> Path:
+        """The bag: a ROS 2 bag's folder, or a .bag file."""
+        if self.is_ros2:
+            from rosbags.rosbag2 import StoragePlugin, Writer
+
+            mcap = self.suffix == ".mcap"
+            plugin = StoragePlugin.MCAP if mcap else StoragePlugin.SQLITE3
+            place = folder / "drive"
+            writer: Any = Writer(place, version=9, storage_plugin=plugin)
+            serialize: Any = self.types.serialize_cdr
+        else:
+            from rosbags.rosbag1 import Writer as Writer1
+
+            place = folder / "drive.bag"
+            writer, serialize = Writer1(place), self.types.serialize_ros1
+        with writer as bag:
+            topics = {(topic, type_) for _, topic, type_, _ in self.written}
+            added = {
+                t: bag.add_connection(t, type_, typestore=self.types) for t, type_ in sorted(topics)
+            }
+            for log_ns, topic, type_, message in sorted(self.written, key=lambda w: w[0]):
+                bag.write(added[topic], log_ns, serialize(message, type_))
+        return place
+
+
+def scan(num: int = 60) -> dict[str, np.ndarray]:
+    """A ring, with times in nanoseconds since the stamp."""
+    azimuth = np.linspace(-np.pi, np.pi, num, endpoint=False)
+    return {
+        "x": (8 * np.cos(azimuth)).astype("f4"),
+        "y": (8 * np.sin(azimuth)).astype("f4"),
+        "z": np.full(num, -0.5, "f4"),
+        "intensity": np.arange(num).astype("f4"),
+        "t": (np.arange(num) * (PERIOD_NS // num)).astype("u4"),
+        "ring": np.zeros(num, "u2"),
+    }

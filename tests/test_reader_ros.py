@@ -1,0 +1,587 @@
+# SPDX-License-Identifier: MIT
+"""ROS bags: a street written as each kind, messages of every layout, frames, and damage."""
+
+from __future__ import annotations
+
+import re
+import shutil
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from densify.errors import InputError
+from densify.geometry.poses import inverse, transform
+from densify.readers import open_sequence
+from densify.readers.ros import RosBag
+from densify.readers.street import Street
+from densify.writers import write_street
+from densify.writers.excerpt import Excerpt
+from tests.reader_checks import check_cameras, check_depth, check_sweeps, check_truth
+from tests.ros_bags import PERIOD_NS, STAMP_NS, Maker, scan
+
+pytest.importorskip("rosbags")
+
+FRAMES, CAMERA = (59, 60, 61), "image_02"
+HALF_NS = 50_000_000
+
+
+@pytest.fixture(scope="module")
+def excerpt():
+    return Excerpt.of(Street("street", 0, "vlp16", cameras=(CAMERA,)), FRAMES, None)
+
+
+@pytest.fixture(scope="module")
+def written(excerpt, tmp_path_factory):
+    out = tmp_path_factory.mktemp("bags")
+    return {f: write_street(f, excerpt.street, out, FRAMES) for f in ("ros1", "ros2")}
+
+
+@pytest.mark.parametrize("format", ["ros1", "ros2"])
+def test_the_street_is_given_back(format, written, excerpt):
+    sequence = open_sequence(written[format])
+    assert isinstance(sequence, RosBag)
+    check_sweeps(sequence, excerpt, -HALF_NS)
+    check_cameras(sequence, excerpt)
+    check_truth(sequence, excerpt)
+
+
+def test_depth_is_that_of_the_street(written, excerpt):
+    check_depth(open_sequence(written["ros2"]), excerpt, worse=0.02)
+
+
+def test_lenses_are_kept_and_what_has_no_place_is_refused(tmp_path):
+    street = Street("static", 0, "vlp16", cameras=("fisheye",))
+    sequence = open_sequence(write_street("ros2", street, tmp_path, [60]))
+    camera = sequence.cameras["fisheye"]
+    assert camera.model == "fisheye"
+    np.testing.assert_allclose(camera.distortion, street.cameras["fisheye"].distortion)
+    for spec in ("street?sensor=dual32", "street?sensor=vlp16&cameras=rolling"):
+        with pytest.raises(InputError, match="cannot be written as a ROS bag"):
+            write_street("ros1", Street.from_spec(spec), tmp_path / "out", [60])
+    assert not (tmp_path / "out").exists()
+
+
+# Points
+
+
+@pytest.mark.parametrize("suffix", [".db3", ".mcap", ".bag"])
+def test_bags_of_every_kind(suffix, tmp_path):
+    maker = Maker(suffix)
+    maker.sweeps(3)
+    place = maker.write(tmp_path)
+    files = [place, *(place.glob(f"*{suffix}") if place.is_dir() else [tmp_path])]
+    for path in files:
+        sequence = open_sequence(path)
+        assert list(sequence.frames) == [0, 1, 2]
+        assert sequence.stamp_ns(2) == STAMP_NS + 2 * PERIOD_NS
+        sweep = sequence[1]
+        np.testing.assert_array_equal(sweep.points[:, 0].astype("f4"), scan()["x"])
+        np.testing.assert_array_equal(sweep.offset_ns, scan()["t"])
+        assert sweep.intensity.max() == np.float32(59 / 255)
+        found = dict(sequence.findings())
+        assert found["times"].startswith("t in ns, relative")
+        assert "ring = ring" in found["lidar"] and found["poses from"].startswith("none")
+
+
+TIMES = {
+    "velodyne": ("time", lambda t: (t * 1e-9).astype("f4"), "time in s, relative"),
+    "hesai": ("timestamp", lambda t: (STAMP_NS + t) * 1e-9, "timestamp in s, absolute"),
+    "ns since 1970": ("timestamp", lambda t: (STAMP_NS + t).astype("f8"), "timestamp in ns, absol"),
+    "us": ("time_offset", lambda t: (t // 1000).astype("u4"), "time_offset in us, relative"),
+    "ms": ("t", lambda t: (t * 1e-6).astype("f4"), "t in ms, relative"),
+}
+
+
+@pytest.mark.parametrize("driver", TIMES)
+def test_layouts_and_times_of_drivers(driver, tmp_path):
+    name, make, words = TIMES[driver]
+    fired_ns = scan()["t"].astype(np.int64)
+    big = driver == "us"
+    columns = {k: v for k, v in scan().items() if k != "t"} | {name: make(fired_ns)}
+    columns |= {"x": columns["x"].astype("f8")} if driver == "ms" else {}
+    maker = Maker()
+    for i in range(2):
+        # times that are absolute go on with the sweeps
+        later = {
+            n: c + (i * PERIOD_NS * 1e-9 if driver == "hesai" else 0) for n, c in columns.items()
+        }
+        kept = columns if driver != "hesai" else columns | {name: later[name]}
+        maker.cloud(kept, STAMP_NS + i * PERIOD_NS, height=4, row_padding=5, big=big)
+    sequence = open_sequence(maker.write(tmp_path))
+    assert words in dict(sequence.findings())["times"]
+    sweep = sequence[0]
+    assert np.abs(sweep.offset_ns - fired_ns).max() <= 1200
+    np.testing.assert_allclose(sweep.points[:, 1], scan()["y"], rtol=1e-7)
+
+
+def test_padded_points_are_dropped_and_rows_are_the_messages(tmp_path):
+    columns = scan()
+    for axis, value in zip("xyz", (np.nan, np.nan, np.nan), strict=True):
+        columns[axis][3] = value
+    for axis in "xyz":
+        columns[axis][7] = 0
+    maker = Maker()
+    maker.cloud(columns)
+    sweep = open_sequence(maker.write(tmp_path))[0]
+    assert len(sweep) == 58 and {3, 7}.isdisjoint(sweep.row) and sweep.row[-1] == 59
+
+
+def test_a_livox_message(tmp_path):
+    maker = Maker(".bag")
+    points = [
+        maker.make(
+            "livox_ros_driver2/msg/CustomPoint", 990_000 * i, 5.0, 0.1 * i, 1.0, 51, 16, i % 6
+        )
+        for i in range(100)
+    ]
+    for i in range(2):
+        stamp_ns = STAMP_NS + i * PERIOD_NS
+        values = (maker.header(stamp_ns, "livox_frame"), stamp_ns, 100, 0, np.zeros(3, np.uint8))
+        type_ = "livox_ros_driver2/msg/CustomMsg"
+        maker.put("/livox/lidar", type_, maker.make(type_, *values, points), stamp_ns)
+    sweep = open_sequence(maker.write(tmp_path))[1]
+    np.testing.assert_array_equal(sweep.offset_ns, 990_000 * np.arange(100))
+    np.testing.assert_allclose(sweep.points[:, 1], 0.1 * np.arange(100), rtol=1e-6)
+    assert sweep.intensity[0] == np.float32(0.2)
+
+
+def pose(yaw_deg, *place):
+    T = np.eye(4)
+    T[:3, :3] = Rotation.from_euler("z", yaw_deg, degrees=True).as_matrix()
+    T[:3, 3] = place
+    return T
+
+
+def two_lidars(late_ns=20_000_000):
+    maker = Maker()
+    maker.sweeps(3, topic="/top/points", frame="top")
+    for i in range(3):
+        maker.cloud(scan(), STAMP_NS + i * PERIOD_NS + late_ns, topic="/side/points", frame="/side")
+    maker.transform("base", "top", pose(0, 1.0, 0, 1.8))
+    maker.transform("base", "side", pose(90, 0.5, 0.9, 1.0))
+    return maker
+
+
+def test_several_lidars_make_one_sweep(tmp_path):
+    place = two_lidars().write(tmp_path)
+    with pytest.raises(
+        InputError, match=r"several topics could be the sweeps: /side/points \(Poin"
+    ):
+        open_sequence(place)
+    assert len(open_sequence(f"ros:{place}#points=/side/points")[0]) == 60
+    sweep = open_sequence(f"ros:{place}#points=/top/points,/side/points")[1]
+    assert np.bincount(sweep.lidar).tolist() == [60, 60]
+    np.testing.assert_allclose(sweep.scanner_origins, [[0, 0, 0], [-0.5, 0.9, -0.8]], atol=1e-9)
+    own = np.column_stack([scan()[axis] for axis in "xyz"]).astype(float)
+    T_top_side = inverse(pose(0, 1.0, 0, 1.8)) @ pose(90, 0.5, 0.9, 1.0)
+    np.testing.assert_allclose(sweep.points[60:], transform(T_top_side, own), atol=1e-9)
+    np.testing.assert_array_equal(sweep.offset_ns[60:], scan()["t"].astype(int) + 20_000_000)
+
+
+def test_a_lidar_that_fails_leaves_the_others(tmp_path):
+    maker = two_lidars()
+    maker.written = [
+        w for w in maker.written if not (w[1] == "/side/points" and w[0] < STAMP_NS + 2 * PERIOD_NS)
+    ]
+    sequence = open_sequence(f"ros:{maker.write(tmp_path)}#points=/top/points,/side/points")
+    assert [len(sequence[i]) for i in range(3)] == [60, 120, 120]
+
+
+def test_lidars_that_nothing_joins(tmp_path):
+    maker = two_lidars()
+    maker.written = [w for w in maker.written if w[1] != "/tf_static"]
+    with pytest.raises(InputError, match="nothing in /tf_static joins the frame side"):
+        open_sequence(f"ros:{maker.write(tmp_path)}#points=/top/points,/side/points")
+
+
+# Images
+
+PIXELS = np.random.default_rng(1).integers(0, 256, (6, 8, 3), np.uint8)
+GRAY = PIXELS[:, :, 0]
+ALPHA = np.dstack([PIXELS, GRAY])
+IMAGES = {  # encoding: what is stored, what is seen
+    "rgb8": (PIXELS, PIXELS),
+    "bgr8": (PIXELS, PIXELS[:, :, ::-1]),
+    "rgba8": (ALPHA, PIXELS),
+    "bgra8": (ALPHA, PIXELS[:, :, ::-1]),
+    "mono8": (GRAY, np.dstack([GRAY] * 3)),
+    "mono16": (GRAY.astype("<u2") * 256 + 7, np.dstack([GRAY] * 3)),
+}
+
+
+def with_camera(encoding="rgb8", data=PIXELS, info=None, **options):
+    maker = Maker()
+    maker.sweeps(2)
+    maker.image(data, encoding, **options)
+    maker.info(**(info or {}))
+    maker.transform("lidar", "front_optical", inverse(T_CAM_LIDAR))
+    return maker
+
+
+T_CAM_LIDAR = np.array([[0, -1, 0, 0.1], [0, 0, -1, -0.2], [1, 0, 0, 0.3], [0, 0, 0, 1.0]])
+
+
+@pytest.mark.parametrize("encoding", IMAGES)
+def test_encodings(encoding, tmp_path):
+    stored, seen = IMAGES[encoding]
+    step = stored.nbytes // 6 + 5
+    sequence = open_sequence(with_camera(encoding, stored, step=step).write(tmp_path))
+    assert sequence.image_stamps_ns("front") == {0: STAMP_NS + 1}
+    np.testing.assert_array_equal(sequence.image("front", 0), seen)
+    np.testing.assert_allclose(sequence.cameras["front"].T_cam_lidar, T_CAM_LIDAR, atol=1e-12)
+
+
+@pytest.mark.parametrize("pattern", ["rggb", "bggr", "gbrg", "grbg"])
+def test_mosaics_have_the_right_colours(pattern, tmp_path):
+    colour = {"r": 200, "g": 100, "b": 30}
+    mosaic = np.array(
+        [[colour[c] for c in pattern[:2]], [colour[c] for c in pattern[2:]]], np.uint8
+    )
+    place = with_camera(f"bayer_{pattern}8", np.tile(mosaic, (3, 4))).write(tmp_path)
+    rgb = open_sequence(place).image("front", 0)
+    assert np.abs(rgb[2:4, 2:6].astype(int) - [200, 100, 30]).max() <= 1
+
+
+def test_uyvy_has_the_right_colours(tmp_path):
+    """Y 120, U 90, V 200: R = 1.164 (Y - 16) + 1.596 (V - 128), ... (ITU-R BT.601)."""
+    data = np.tile(np.array([[90, 120], [200, 120]], np.uint8), (6, 4, 1))
+    rgb = open_sequence(with_camera("yuv422", data).write(tmp_path)).image("front", 0)
+    assert np.abs(rgb[3, 3].astype(int) - [236, 77, 44]).max() <= 2
+
+
+INFOS = {
+    "raw": ({"d": [0.1, -0.2, 0.01, 0.02, 0.03]}, "image_raw", "pinhole", 5, 100.0),
+    "raw without a lens": ({"d": [0.0] * 5}, "image_raw", "pinhole", 0, 100.0),
+    "rational": (
+        {"d": [0.1] * 8, "model": "rational_polynomial"},
+        "image_raw",
+        "pinhole",
+        8,
+        100.0,
+    ),
+    "fisheye": ({"d": [0.0] * 4, "model": "equidistant"}, "image_raw", "fisheye", 4, 100.0),
+    "rectified": ({"d": [0.1] * 5}, "image_rect_color", "pinhole", 0, 90.0),
+}
+
+
+@pytest.mark.parametrize("kind", INFOS)
+def test_calibrations(kind, tmp_path):
+    info, topic, model, num, fx = INFOS[kind]
+    R = Rotation.from_euler("x", 3, degrees=True).as_matrix()
+    info = {**info, "r": R.ravel()}
+    place = with_camera(info=info, topic=f"/front/{topic}").write(tmp_path)
+    camera = open_sequence(place).cameras["front"]
+    assert (camera.model, len(camera.distortion), camera.K[0, 0]) == (model, num, fx)
+    expected = T_CAM_LIDAR.copy()
+    if kind == "rectified":
+        expected[:3] = R @ expected[:3]
+    np.testing.assert_allclose(camera.T_cam_lidar, expected, atol=1e-12)
+
+
+def test_binned_parts_of_a_sensor(tmp_path):
+    """A pixel of the image is 2 x 2 of the sensor, from (10, 4) on."""
+    info = {"size": (100, 100), "binning": (2, 2), "roi": (10, 4, 12, 16), "d": [0.0] * 5}
+    camera = open_sequence(with_camera(info=info).write(tmp_path)).cameras["front"]
+    assert (camera.width_px, camera.height_px) == (8, 6)
+    # the sensor's pixel 3.5 is -6.5 of the part: its binned pixel's centre is at (-6.5 - 0.5) / 2
+    np.testing.assert_allclose(camera.K[:2], [[50, 0, -3.5], [0, 55, -1.0]])
+
+
+def test_compressed_images_and_the_best_of_several(tmp_path):
+    maker = with_camera()
+    data = cv2.imencode(".png", PIXELS[:, :, ::-1])[1].ravel()
+    type_ = "sensor_msgs/msg/CompressedImage"
+    header = maker.header(STAMP_NS + 5, "front_optical")
+    message = maker.make(type_, header, "png", data)
+    maker.put("/front/image_rect_color/compressed", type_, message, STAMP_NS + 6)
+    maker.put("/depth/image_raw/compressed", type_, message, STAMP_NS + 6)
+    maker.put("/rear/image_raw/compressed", type_, message, STAMP_NS + 6)
+    place = maker.write(tmp_path)
+    sequence = open_sequence(place)
+    assert set(sequence.cameras) == {"front"}
+    assert sequence.cameras["front"].K[0, 0] == 90  # P
+    np.testing.assert_array_equal(sequence.image("front", 0), PIXELS)
+    assert (
+        "/rear/image_raw/compressed: no /rear/camera_info" in dict(sequence.findings())["no camera"]
+    )
+    named = open_sequence(f"ros:{place}#images=/front/image_raw")
+    assert named.cameras["front"].K[0, 0] == 100
+    assert not open_sequence(f"ros:{place}#images=none").cameras
+
+
+# Poses
+
+T_BASE_LIDAR = pose(90, 1.0, 0.2, 1.7)
+
+
+def driven(T_at):
+    """Poses every 50 ms around two sweeps."""
+    maker = Maker()
+    maker.sweeps(2)
+    maker.transform("base", "lidar", T_BASE_LIDAR)
+    for i in range(-2, 6):
+        T_at(maker, i, STAMP_NS + 25_000_000 + i * 50_000_000)
+    return maker
+
+
+def at(i):
+    return pose(2.0 * i, 0.5 * i, 0.1, 0.0)
+
+
+def test_odometry_is_brought_to_the_lidar(tmp_path):
+    maker = driven(lambda m, i, ns: m.odometry(at(i), ns))
+    sequence = open_sequence(maker.write(tmp_path))
+    between = pose(2.0 * -0.5, 0.5 * -0.5, 0.1, 0.0)  # the stamp lies halfway between two poses
+    np.testing.assert_allclose(sequence.T_world_lidar(0), between @ T_BASE_LIDAR, atol=1e-3)
+    assert "/odom, 8 of them" in dict(sequence.findings())["poses from"]
+    place = maker.write(tmp_path / "again")
+    with pytest.raises(InputError, match="no poses"):
+        open_sequence(f"ros:{place}#poses=none").T_world_lidar(0)
+
+
+def test_transforms_are_poses_and_the_smooth_frame_is_the_world(tmp_path):
+    def both(maker, i, stamp_ns):
+        maker.transform("odom", "base", at(i), "/tf", stamp_ns)
+        maker.transform("map", "odom", pose(0, 5.0 * (i > 2), 0, 0), "/tf", stamp_ns)
+        maker.transform("base", "mast", pose(0, 0, 0, 2.0), "/tf", stamp_ns)  # published, but fixed
+
+    sequence = open_sequence(driven(both).write(tmp_path))
+    between = pose(-1.0, -0.25, 0.1, 0.0)
+    np.testing.assert_allclose(sequence.T_world_lidar(0), between @ T_BASE_LIDAR, atol=1e-3)
+    assert dict(sequence.findings())["poses from"] == "/tf, odom to lidar"
+    np.testing.assert_allclose(
+        sequence._transforms.between("mast", "lidar"), pose(0, 0, 0, -2.0) @ T_BASE_LIDAR, atol=1e-9
+    )
+
+
+# Damage
+
+
+def bad_cloud(**changes):
+    def make():
+        maker = Maker()
+        maker.sweeps(2)
+        message = maker.written[1][3]
+        for name, value in changes.items():
+            object.__setattr__(message, name, value)
+        return maker
+
+    return make
+
+
+def bad_field(**changes):
+    def make():
+        maker = Maker()
+        maker.sweeps(2)
+        for name, value in changes.items():
+            object.__setattr__(maker.written[1][3].fields[4], name, value)
+        return maker
+
+    return make
+
+
+def lone(topic, type_, make):
+    def made():
+        maker = Maker()
+        maker.put(topic, type_, make(maker), STAMP_NS)
+        return maker
+
+    return made
+
+
+def named_poses(T, stamp_ns=STAMP_NS):
+    def make():
+        maker = Maker()
+        maker.sweeps(2)
+        for i in range(2):
+            maker.odometry(T if i else np.eye(4), stamp_ns + i * PERIOD_NS, child="lidar")
+        return maker
+
+    return make
+
+
+def long_quaternion():
+    maker = named_poses(np.eye(4))()
+    object.__setattr__(maker.written[-1][3].pose.pose.orientation, "w", 3.0)
+    return maker
+
+
+def without(name):
+    maker = Maker()
+    maker.sweeps(2)
+    for written in maker.written:
+        fields = [field for field in written[3].fields if field.name != name]
+        object.__setattr__(written[3], "fields", fields)
+    return maker
+
+
+SCAN = "velodyne_msgs/msg/VelodyneScan"
+BAGS = {
+    "raw packets": (
+        lone(
+            "/velodyne_packets",
+            SCAN,
+            lambda m: m.make(SCAN, m.header(1, "v"), np.zeros(9, np.uint8)),
+        ),
+        "",
+        r"raw packets only \(/velodyne_packets \(VelodyneScan, 1\)\).*play it through",
+    ),
+    "nothing of a lidar": (
+        lone("/odom", "std_msgs/msg/String", lambda m: m.make("std_msgs/msg/String", "hello")),
+        "",
+        r"no PointCloud2; got /odom \(String, 1\)",
+    ),
+    "unknown option": (bad_cloud(), "#topic=/a", r"got topic, expected #points="),
+    "no option": (bad_cloud(), "#points", r"expected #points=|no such topic"),
+    "unknown topic": (bad_cloud(), "#points=/other", r"no such topic; topics that fit: /points"),
+    "topic of another type": (
+        with_camera,
+        "#points=/front/image_raw",
+        "a topic of sensor_msgs/msg/Im",
+    ),
+    "unknown images": (
+        bad_cloud(),
+        "#images=/a",
+        "images=/a: no such topic; topics that fit: none",
+    ),
+    "unknown poses": (bad_cloud(), "#poses=/a", "poses=/a: no such topic"),
+    "no way by tf": (bad_cloud(), "#poses=tf", "nothing tells where lidar was"),
+    "field outside": (bad_field(offset=40), "", "field t: got type 6 at byte 40 of"),
+    "field of no type": (bad_field(datatype=9), "", "field t: got type 9"),
+    "field gone": (bad_field(name="u"), "", "no field t, which other messages have"),
+    "no x": (lambda: without("x"), "", "no field x; got y, z"),
+    "cut data": (bad_cloud(data=np.zeros(99, np.uint8)), "", "got 99 bytes and rows of"),
+    "rows too short": (bad_cloud(row_step=9), "", "rows of 9, expected 1 rows of 60"),
+    "no points": (
+        bad_cloud(width=0, row_step=0, data=np.zeros(0, np.uint8)),
+        "",
+        "holds no points",
+    ),
+    "encoding": (lambda: with_camera("32FC1"), "", "got the encoding 32FC1, expected one of rgb8"),
+    "image of another size": (
+        lambda: with_camera(info={"size": (9, 9)}),
+        "",
+        "image of 8 x 6 px; expected 9 x 9",
+    ),
+    "lens": (
+        lambda: with_camera(info={"model": "ftheta", "d": [1.0]}),
+        "#images=/front/image_raw",
+        "distortion model 'ftheta', expected one of plumb_bob",
+    ),
+    "coefficients": (
+        lambda: with_camera(info={"d": [0.1] * 3}),
+        "#images=/front/image_raw",
+        "3 coefficients of plumb_bob, expected 4 or 5",
+    ),
+    "no focal length": (
+        lambda: with_camera(info={"k": [0.0] * 9}),
+        "#images=/front/image_raw",
+        "positive focal lengths",
+    ),
+    "no size": (
+        lambda: with_camera(info={"size": (0, 0)}),
+        "#images=/front/image_raw",
+        "got 0 x 0 px, expected",
+    ),
+    "pose not a number": (
+        named_poses(pose(0, np.nan, 0, 0)),
+        "#poses=/odom",
+        "expected a unit quat",
+    ),
+    "quaternion too long": (long_quaternion, "#poses=/odom", "quaternion of length 3"),
+    "poses of another day": (named_poses(np.eye(4), 10**15), "#poses=/odom", "no pose at"),
+    "one pose": (
+        lambda: (m := bad_cloud()(), m.odometry(np.eye(4), STAMP_NS, child="lidar"))[0],
+        "#poses=/odom",
+        "got 1 poses, expected two",
+    ),
+    "poses of a frame that nothing joins": (
+        lambda: (m := bad_cloud()(), m.odometry(np.eye(4), STAMP_NS, child="imu"))[0],
+        "#poses=/odom",
+        "nothing in /tf_static joins its frame imu to the lidar's",
+    ),
+    "frames in a circle": (
+        lambda: (
+            m := bad_cloud()(),
+            m.transform("a", "lidar", np.eye(4)),
+            m.transform("lidar", "a", np.eye(4)),
+        )[0],
+        "#poses=tf",
+        "is above itself",
+    ),
+}
+
+
+@pytest.mark.parametrize("damage", BAGS)
+def test_bad_bags_are_refused_in_a_line(damage, tmp_path):
+    make, options, says = BAGS[damage]
+    place = make().write(tmp_path)
+    with pytest.raises(InputError) as error:
+        sequence = open_sequence(f"ros:{place}{options}")
+        sequence[0], sequence[1]
+        if "front" in sequence.cameras:
+            sequence.image("front", 0)
+        sequence.T_world_lidar(1)
+    message = str(error.value)
+    assert "\n" not in message and str(place) in message and re.search(says, message), message
+
+
+def test_a_camera_that_cannot_be_placed_is_left_out_with_a_word(tmp_path):
+    maker = with_camera()
+    maker.written = [w for w in maker.written if w[1] != "/tf_static"]
+    place = maker.write(tmp_path)
+    sequence = open_sequence(place)
+    assert not sequence.cameras
+    assert "joins the camera's frame front_optical" in dict(sequence.findings())["no camera"]
+    with pytest.raises(InputError, match="joins the camera's frame front_optical"):
+        open_sequence(f"ros:{place}#images=/front/image_raw")
+
+
+@pytest.mark.parametrize("share", [0.0, 0.01, 0.5, 0.97])
+@pytest.mark.parametrize("suffix", [".db3", ".mcap", ".bag"])
+def test_cut_off_bags_are_refused_in_a_line(suffix, share, tmp_path):
+    maker = Maker(suffix)
+    maker.sweeps(40)
+    place = maker.write(tmp_path)
+    file = place if place.is_file() else next(place.glob(f"*{suffix}"))
+    data = file.read_bytes()
+    file.write_bytes(data[: int(share * len(data))])
+    with pytest.raises(InputError) as error:
+        sequence = open_sequence(f"ros:{place}")
+        for frame in range(40):
+            sequence[frame]
+    message = str(error.value)
+    assert message.startswith(f"{place}: ") and "\n" not in message
+
+
+def test_places_without_a_bag(tmp_path):
+    with pytest.raises(InputError, match=r"no bag; expected a \.bag, \.mcap or \.db3 file"):
+        open_sequence(f"ros:{tmp_path}")
+    maker = Maker()
+    maker.sweeps(2)
+    place = maker.write(tmp_path)
+    (place / "metadata.yaml").write_text("a: [")
+    with pytest.raises(InputError, match="not a whole bag"):
+        open_sequence(place)
+    (place / "metadata.yaml").unlink()
+    assert list(open_sequence(place).frames) == [0, 1]
+    shutil.copy(next(place.glob("*.db3")), place / "second.db3")
+    with pytest.raises(InputError, match=r"2 \.db3 files without metadata\.yaml"):
+        open_sequence(place)
+
+
+def test_stamps_that_drivers_leave_at_zero_are_those_of_the_recording(tmp_path):
+    maker = Maker()
+    for i in range(2):
+        maker.cloud(scan(), 0)
+        maker.written[-1] = (STAMP_NS + i * PERIOD_NS, *maker.written[-1][1:])
+    sequence = open_sequence(maker.write(tmp_path))
+    assert [sequence.stamp_ns(f) for f in (0, 1)] == [STAMP_NS, STAMP_NS + PERIOD_NS]
+
+
+def test_without_the_package_the_remedy_is_named(written, monkeypatch):
+    monkeypatch.setitem(__import__("sys").modules, "rosbags.highlevel", None)
+    with pytest.raises(InputError, match=r"pip install 'densify\[ros\]'"):
+        open_sequence(written["ros1"])
