@@ -572,6 +572,18 @@ def test_places_without_a_bag(tmp_path):
         open_sequence(place)
 
 
+def test_the_index_of_a_large_bag_is_kept(tmp_path, empty_cache, monkeypatch):
+    maker = Maker(".mcap")
+    maker.sweeps(3)
+    place = maker.write(tmp_path)
+    whole = open_sequence(place)
+    monkeypatch.setattr("densify.readers.ros_bag._LARGE_BYTES", 0)
+    stamps_ns = [open_sequence(place).stamp_ns(1) for _ in range(2)]
+    assert stamps_ns == [whole.stamp_ns(1)] * 2 and any(empty_cache.rglob("bag-*"))
+    monkeypatch.setattr("densify.readers.ros_bag.Bag._read_index", None)  # not asked again
+    np.testing.assert_array_equal(open_sequence(place)[2].points, whole[2].points)
+
+
 def test_stamps_that_drivers_leave_at_zero_are_those_of_the_recording(tmp_path):
     maker = Maker()
     for i in range(2):

@@ -14,19 +14,15 @@ from pathlib import Path
 from threading import RLock
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from densify.errors import InputError
 from densify.readers.extras import needed
+from densify.types import Int
 
 _LARGE_BYTES = 2**28
 _KEPT_BYTES = 2**30
 _MEND = "a bag that was cut off can be mended: rosbag reindex, ros2 bag reindex, mcap recover"
-STAMPED = (
-    *("sensor_msgs/msg/PointCloud2", "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"),
-    *("nav_msgs/msg/Odometry", "geometry_msgs/msg/PoseStamped", "sensor_msgs/msg/CameraInfo"),
-    *("geometry_msgs/msg/PoseWithCovarianceStamped", "livox_ros_driver/msg/CustomMsg"),
-    *("livox_ros_driver2/msg/CustomMsg", "livox_interfaces/msg/CustomMsg"),
-)
-"""Types whose messages begin with a header."""
 
 
 class Entry(NamedTuple):
@@ -75,16 +71,19 @@ class Bag:
         return [topic for topic in self.topics.values() if topic.type in types]
 
     def index(self, topics: Collection[str]) -> dict[str, list[Entry]]:
-        """Every message of these topics, whose types are among `STAMPED`, by ascending stamp."""
-        contents = self._contents()
-        size = sum(file.stat().st_size for file in contents)
+        """Every message of these topics, whose types begin with a header, by ascending stamp."""
+        names, files = sorted(topics), self._contents()
+        size = sum(file.stat().st_size for file in files)
         if size < _LARGE_BYTES:
-            return self._read_index(sorted(topics))
-        from densify.cache import Cache
+            found = self._read_index(names)
+        else:
+            from densify.cache import Cache
 
-        state = [(str(f.absolute()), f.stat().st_size, f.stat().st_mtime_ns) for f in contents]
-        names = sorted(topics)
-        return Cache(_KEPT_BYTES).get("bag", [state, names], lambda: self._read_index(names))
+            state = [(str(f.absolute()), f.stat().st_size, f.stat().st_mtime_ns) for f in files]
+            found = Cache(_KEPT_BYTES).get(
+                "bag", dict[str, Int], [state, names], lambda: self._read_index(names)
+            )
+        return {name: [Entry(*row) for row in found[name].tolist()] for name in names}
 
     def message(self, topic: str, entry: Entry) -> Any:
         """Raises InputError if it cannot be read."""
@@ -99,19 +98,18 @@ class Bag:
         for name, _, raw, type_ in self._messages([topic]):
             yield self._decoded(raw, type_, name)
 
-    def _read_index(self, topics: Sequence[str]) -> dict[str, list[Entry]]:
+    def _read_index(self, topics: Sequence[str]) -> dict[str, Int]:
+        """(n,3) of each topic, the rows `Entry`s."""
         found: dict[str, list[Entry]] = {topic: [] for topic in topics}
-        turns: dict[str, tuple[int, int]] = {}
         for topic, log_ns, raw, _ in self._messages(topics) if topics else ():
-            last_ns, turn = turns.get(topic, (-1, 0))
-            turn = turn + 1 if log_ns == last_ns else 0
-            turns[topic] = (log_ns, turn)
+            before = found[topic][-1] if found[topic] else None
+            turn = before.turn + 1 if before is not None and before.log_ns == log_ns else 0
             try:
                 stamp_ns = _stamp_ns(raw, self._reader.is2)
             except struct.error:
                 raise InputError(f"{self.path}: {topic}: a message of {len(raw)} bytes") from None
             found[topic].append(Entry(stamp_ns or log_ns, log_ns, turn))
-        return {topic: sorted(entries) for topic, entries in found.items()}
+        return {t: np.array(sorted(e), np.int64).reshape(-1, 3) for t, e in found.items()}
 
     def _messages(
         self, topics: Sequence[str], start_ns: int | None = None, stop_ns: int | None = None
