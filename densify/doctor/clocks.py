@@ -142,7 +142,7 @@ def check_point_times(sample: Sample) -> list[Finding]:
 
 
 def _span_s(sample: Sample, lidar: int) -> tuple[float, float]:
-    """Of one scanner, the median over the spots of the earliest and the latest time."""
+    """The earliest and the latest time of one scanner, medians over the spots."""
     ends = []
     for spot in sample.spots:
         sweep = spot.sweeps[spot.middle]

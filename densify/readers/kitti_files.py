@@ -67,7 +67,7 @@ def check_oxts(values: Float, where: str) -> Float:
 
 
 def mercator_scale(oxts: Float) -> float:
-    """Of the projection, from the first record of a drive."""
+    """The scale of the projection, from the first record of a drive."""
     return float(np.cos(np.deg2rad(oxts[0])))
 
 

@@ -126,7 +126,7 @@ class KittiOdometry(FileSequence):
 
 
 def _read_times_ns(path: Path) -> dict[int, int]:
-    """By line, from 0. Raises InputError if one is no number or not after the one before."""
+    """Numbers by line, from 0. Raises InputError if one is no number or not after the one before."""
     lines = read_text(path).splitlines()
     times_ns: dict[int, int] = {}
     for number, line in enumerate(lines):

@@ -74,7 +74,7 @@ class SweepFile:
 
     @cached_property
     def names(self) -> list[str]:
-        """Of the groups, in the order of time. Raises InputError if there are none."""
+        """The groups' names in the order of time. Raises InputError if there are none."""
         with self.opened() as file:
             names = sorted((name for name in file if name.isdecimal()), key=int)
         if not names:
@@ -86,7 +86,7 @@ class SweepFile:
 
     @cached_property
     def stamps_ns(self) -> list[int]:
-        """Of the sweeps. Raises InputError if no unit fits."""
+        """The sweeps' stamps. Raises InputError if no unit fits."""
         numbers = [int(name) for name in self.names]
         step = float(np.median(np.diff(numbers))) if len(numbers) > 1 else 0.0
         fit = [u for u in _UNITS_NS if _LEAST_STEP_NS <= step * u <= _MOST_STEP_NS]
