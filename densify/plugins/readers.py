@@ -108,6 +108,15 @@ READERS = Table(
             scenes=True,
         ),
         Reader(
+            "waymo",
+            "densify.readers.waymo",
+            recognises=lambda path: (
+                (path / "lidar_calibration").is_dir() and any((path / "lidar").glob("*.parquet"))
+            ),
+            holds="Waymo's version 2 (a folder that holds lidar/*.parquet)",
+            scenes=True,
+        ),
+        Reader(
             "opensceneflow",
             "densify.readers.open_scene_flow",
             recognises=lambda path: path.suffix == ".h5" or any(path.glob("*.h5")),

@@ -13,7 +13,15 @@ from numpy.typing import NDArray
 from densify.errors import InputError
 from densify.readers.extras import needed
 
-_EXPECTED = {"n": "finite numbers", "i": "whole numbers", "s": "texts", "m": "numbers"}
+_EXPECTED = {
+    "n": "finite numbers",
+    "m": "numbers",
+    "i": "whole numbers",
+    "s": "texts",
+    "b": "bytes",
+    "l": "lists of numbers",
+}
+_TYPES = {"s": ("string", "large_string"), "b": ("binary", "large_binary")}
 
 
 def read_feather(path: Path, columns: Mapping[str, str], what: str) -> dict[str, NDArray[Any]]:
@@ -34,10 +42,36 @@ def read_feather(path: Path, columns: Mapping[str, str], what: str) -> dict[str,
     return column_arrays(table, columns, path)
 
 
+def read_parquet(
+    path: Path, columns: Mapping[str, str], what: str, where: Mapping[str, int] | None = None
+) -> dict[str, NDArray[Any]]:
+    """Columns of a parquet file, each (N,), as `column_arrays` checks them.
+
+    what: needs them (extra ``waymo``). where: column -> value that it has in the rows wanted; row
+    groups without it are not read. Raises InputError as `read_feather`.
+    """
+    parquet = needed("pyarrow.parquet", "waymo", what)
+    if not path.is_file():
+        raise InputError(f"{path}: no such file; fetch that component of the data set too")
+    filters = [(name, "=", value) for name, value in (where or {}).items()]
+    try:
+        there = parquet.read_schema(path).names
+        present = [name for name in columns if name in there]
+        table = parquet.read_table(path, columns=present, filters=filters or None)
+    except (OSError, ValueError, TypeError, NotImplementedError) as error:
+        reason = " ".join(str(error).split())
+        raise InputError(f"{path}: not a whole parquet file ({reason}); fetch it again") from error
+    if len(present) < len(columns):
+        absent = [name for name in columns if name not in there]
+        raise InputError(f"{path}: no column {', '.join(absent)}; got {', '.join(there) or 'none'}")
+    return column_arrays(table, columns, path)
+
+
 def column_arrays(table: Any, columns: Mapping[str, str], path: Path) -> dict[str, NDArray[Any]]:
     """The table's columns of these names, each (N,).
 
-    columns: name -> "n" finite numbers, "m" numbers that may be NaN, "i" whole numbers, "s" texts.
+    columns: name -> "n" finite numbers, "m" numbers that may be NaN, "i" whole numbers, "s" texts,
+    "b" bytes, "l" lists of numbers or None, as arrays in an array of objects.
     Raises InputError, which names the file, if one is absent, has gaps or holds something else.
     """
     absent = [name for name in columns if name not in table.column_names]
@@ -49,12 +83,24 @@ def column_arrays(table: Any, columns: Mapping[str, str], path: Path) -> dict[st
 
 
 def _array(column: Any, kind: str, where: str) -> NDArray[Any]:
+    type_name = str(column.type)
+    if kind == "l":
+        right = "list" in type_name and any(n in type_name for n in ("float", "double", "int"))
+        if not right:
+            raise InputError(f"{where}: got {type_name}, expected {_EXPECTED[kind]}")
+        lists = np.empty(len(column), object)
+        for row, scalar in enumerate(column):
+            values = scalar.values
+            lists[row] = None if values is None else values.to_numpy(zero_copy_only=False)
+        return lists
     array = column.to_numpy()
-    is_text = str(column.type) in ("string", "large_string")
-    fits = {"i": "iu", "s": "O", "n": "iuf", "m": "iuf"}[kind]
-    right = array.dtype.kind in fits and (is_text or kind != "s") and not column.null_count
-    if not (right and (kind != "n" or np.isfinite(array).all())):
+    if kind in _TYPES:
+        right = type_name in _TYPES[kind] and not column.null_count
+    else:
+        right = array.dtype.kind in ("iu" if kind == "i" else "iuf") and not column.null_count
+        right = right and (kind != "n" or bool(np.isfinite(array).all()))
+    if not right:
         gaps = f", {column.null_count} of them missing" if column.null_count else ""
         odd = "" if array.dtype.kind != "f" else f", {int((~np.isfinite(array)).sum())} not finite"
-        raise InputError(f"{where}: got {column.type}{gaps}{odd}, expected {_EXPECTED[kind]}")
+        raise InputError(f"{where}: got {type_name}{gaps}{odd}, expected {_EXPECTED[kind]}")
     return array

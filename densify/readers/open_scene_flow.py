@@ -13,8 +13,9 @@ vehicle's own motion, as in the data sets themselves; where ``lidar_dt`` tells w
 after the stamp that is undone with the poses; elsewhere, and in a file of one sweep, there are no
 point times. They are in the frame of ``pose``. (Files made of Argoverse 2 hold points in the frame
 of ``up_lidar`` but poses of the vehicle, 1.35 m behind it: its own motion is then wrong by that
-lever in bends. The default registration does not use the poses.) Scanners stand where ``lidar_center`` says, else all at the
-frame's origin. There are no images. ``ground_mask`` is not used: the ground is found anew.
+lever in bends. The default registration does not use the poses.) Scanners stand where
+``lidar_center`` says, else all at the frame's origin. There are no images. ``ground_mask`` is not
+used: the ground is found anew.
 """
 
 from __future__ import annotations

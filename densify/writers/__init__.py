@@ -28,6 +28,7 @@ FORMATS = {
     "kitti-360": "densify.writers.kitti_360",
     "nuscenes": "densify.writers.nuscenes",
     "opensceneflow": "densify.writers.open_scene_flow",
+    "waymo": "densify.writers.waymo",
     "pandaset": "densify.writers.pandaset",
 }
 """Name in ``densify simulate --format`` -> module."""

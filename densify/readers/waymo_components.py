@@ -1,0 +1,205 @@
+# SPDX-License-Identifier: MIT
+"""The component tables of Waymo's version 2: how its lidars and cameras are calibrated, and where
+and when its images were taken. See `densify.readers.waymo`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from densify.errors import InputError
+from densify.geometry.poses import inverse
+from densify.readers.arrow_columns import read_parquet
+from densify.readers.file_sequence import rigid
+from densify.types import Camera, Float, Int
+
+LASERS = ("TOP", "FRONT", "SIDE_LEFT", "SIDE_RIGHT", "REAR")
+CAMERAS = ("FRONT", "FRONT_LEFT", "FRONT_RIGHT", "SIDE_LEFT", "SIDE_RIGHT")
+STAMP, LASER, CAMERA = "key.frame_timestamp_micros", "key.laser_name", "key.camera_name"
+T_OPTICAL_WAYMO = np.array(  # its camera frame is x forward, y left, z up
+    [[0.0, -1.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
+)
+DOWN, RIGHT, UP, LEFT = 1, 2, 3, 4
+"""Where a rolling shutter runs to."""
+
+_LENS = ("f_u", "f_v", "c_u", "c_v", "k1", "k2", "p1", "p2", "k3")
+
+
+@dataclass(frozen=True)
+class Components:
+    """The tables of one segment. root: folder of the split."""
+
+    root: Path
+    context: str
+
+    def file(self, component: str) -> Path:
+        return self.root / component / f"{self.context}.parquet"
+
+    def read(
+        self, component: str, columns: Mapping[str, str], where: Mapping[str, int] | None = None
+    ) -> dict[str, NDArray[Any]]:
+        """As `densify.readers.arrow_columns.read_parquet`."""
+        return read_parquet(self.file(component), columns, "Waymo recordings", where)
+
+
+class Laser(NamedTuple):
+    """T_vehicle_laser: (4,4). inclinations_rad: from the lowest beam up, or None for ``num``
+    between ``bounds_rad``."""
+
+    T_vehicle_laser: Float
+    inclinations_rad: Float | None
+    bounds_rad: tuple[float, float]
+
+    def directions(self, size: tuple[int, ...], where: str) -> Float:
+        """(H,W,3) unit vectors in the laser's frame of the pixels of an image of that size."""
+        (height, width), beams = size, self.inclinations_rad
+        if beams is None:
+            low, high = self.bounds_rad
+            beams = (np.arange(height) + 0.5) / height * (high - low) + low
+        if len(beams) != height:
+            raise InputError(
+                f"{where}: got {height} rows, expected {len(beams)} as lidar_calibration has beams"
+            )
+        T = self.T_vehicle_laser
+        turned_rad = np.arctan2(T[1, 0], T[0, 0])
+        azimuth = ((np.arange(width, 0, -1) - 0.5) / width * 2 - 1) * np.pi - turned_rad
+        rise = beams[::-1, None]
+        x, y = np.cos(azimuth) * np.cos(rise), np.sin(azimuth) * np.cos(rise)
+        return np.stack([x, y, np.broadcast_to(np.sin(rise), x.shape)], axis=2)
+
+
+class Image(NamedTuple):
+    """pose_ns: when the vehicle was at T_world_vehicle. exposed_ns: its middle. readout_s: from the
+    first row or column to the last."""
+
+    pose_ns: int
+    exposed_ns: int
+    readout_s: float
+    T_world_vehicle: Float
+
+
+def read_lasers(parts: Components) -> dict[int, Laser]:
+    """By number, from 1. Raises InputError if one is malformed."""
+    head = "[LiDARCalibrationComponent]"
+    extrinsic, beams = f"{head}.extrinsic.transform", f"{head}.beam_inclination"
+    columns = {LASER: "i", extrinsic: "l", f"{beams}.values": "l"}
+    bounds = {f"{beams}.min": "m", f"{beams}.max": "m"}
+    rows = parts.read("lidar_calibration", {**columns, **bounds})
+    path, lasers = parts.file("lidar_calibration"), {}
+    for row, laser in enumerate(rows[LASER]):
+        where = f"{path}: lidar {laser}"
+        values = rows[f"{beams}.values"][row]
+        low, high = float(rows[f"{beams}.min"][row]), float(rows[f"{beams}.max"][row])
+        if values is None or not len(values):
+            values = None
+        checked = np.array([low, high]) if values is None else np.diff(values)
+        if not np.isfinite(checked).all() or (low >= high if values is None else False):
+            raise InputError(
+                f"{where}: got beams from {low:g} to {high:g}, expected inclinations in rad"
+            )
+        T_vehicle_laser = transform_of(rows[extrinsic][row], where)
+        beams_rad = None if values is None else values.astype(np.float64)
+        lasers[int(laser)] = Laser(T_vehicle_laser, beams_rad, (low, high))
+    return lasers
+
+
+def read_images(parts: Components, starts_us: Int) -> dict[str, dict[int, Image]]:
+    """What is known of each image, without its pixels, by camera and number.
+
+    starts_us: (n,) stamps of the frames. Raises InputError if a row is malformed.
+    """
+    head = "[CameraImageComponent]"
+    pose, shutter = f"{head}.pose.transform", f"{head}.rolling_shutter_params"
+    times = [f"{shutter}.{name}" for name in ("camera_trigger_time", "camera_readout_done_time")]
+    numbers = [f"{head}.pose_timestamp", *times, f"{shutter}.shutter"]
+    columns = {STAMP: "i", CAMERA: "i", pose: "l", **dict.fromkeys(numbers, "n")}
+    rows = parts.read("camera_image", columns)
+    path, found = parts.file("camera_image"), dict[str, dict[int, Image]]()
+    frame_of = {int(us): number for number, us in enumerate(starts_us)}
+    for row in np.argsort(rows[STAMP], kind="stable").tolist():
+        camera, us = int(rows[CAMERA][row]), int(rows[STAMP][row])
+        if camera not in range(1, len(CAMERAS) + 1):
+            raise InputError(f"{path}: got camera {camera}, expected 1 to {len(CAMERAS)}")
+        if us not in frame_of:
+            continue
+        pose_s, trigger_s, done_s, shutter_s = (float(rows[name][row]) for name in numbers)
+        readout_s = done_s - trigger_s - shutter_s
+        if not -1e-3 < readout_s < 1:
+            raise InputError(
+                f"{path}: camera {camera}, frame {frame_of[us]}: got {readout_s:g} s from "
+                f"trigger to end of readout less the shutter's time, expected 0 to 1"
+            )
+        T = transform_of(rows[pose][row], f"{path}: camera {camera}, frame {frame_of[us]}")
+        exposed_ns = _whole_us((trigger_s + done_s) / 2)
+        image = Image(_whole_us(pose_s), exposed_ns, max(readout_s, 0.0), T)
+        found.setdefault(CAMERAS[camera - 1], {})[frame_of[us]] = image
+    return {name: found[name] for name in CAMERAS if name in found}
+
+
+def read_cameras(parts: Components, images: Mapping[str, Mapping[int, Image]]) -> dict[str, Camera]:
+    """Those that have images. Raises InputError if one is malformed."""
+    head = "[CameraCalibrationComponent]"
+    lens = [f"{head}.intrinsic.{n}" for n in _LENS]
+    size = [f"{head}.{n}" for n in ("width", "height", "rolling_shutter_direction")]
+    extrinsic = f"{head}.extrinsic.transform"
+    columns = {CAMERA: "i", extrinsic: "l", **dict.fromkeys(lens, "n")}
+    rows = parts.read("camera_calibration", {**columns, **dict.fromkeys(size, "i")})
+    path, cameras = parts.file("camera_calibration"), {}
+    for name, taken in images.items():
+        row = np.flatnonzero(rows[CAMERA] == CAMERAS.index(name) + 1)
+        if len(row) != 1:
+            raise InputError(f"{path}: {name}: got {len(row)} rows, expected one")
+        f_u, f_v, c_u, c_v, *distortion = (float(rows[n][row[0]]) for n in lens)
+        width, height, direction = (int(rows[n][row[0]]) for n in size)
+        if min(f_u, f_v, width, height) <= 0:
+            raise InputError(
+                f"{path}: {name}: got focal lengths {f_u:g}, {f_v:g} and {width} x {height} "
+                f"px, expected positive ones"
+            )
+        readout_s = float(np.median([image.readout_s for image in taken.values()]))
+        T_vehicle_cam = transform_of(rows[extrinsic][row[0]], f"{path}: {name}")
+        cameras[name] = Camera(
+            name,
+            width,
+            height,
+            np.array([[f_u, 0, c_u - 0.5], [0, f_v, c_v - 0.5], [0, 0, 1.0]]),
+            T_OPTICAL_WAYMO @ inverse(T_vehicle_cam),
+            tuple(distortion) if any(distortion) else (),
+            row_time_s={DOWN: 1.0, UP: -1.0}.get(direction, 0.0) * readout_s / height,
+            column_time_s={RIGHT: 1.0, LEFT: -1.0}.get(direction, 0.0) * readout_s / width,
+        )
+    return cameras
+
+
+def _whole_us(seconds: float) -> int:
+    """Nanoseconds; seconds since 1970 as float64 are good to a quarter of a microsecond."""
+    return round(seconds * 1e6) * 1000
+
+
+def image_of(
+    values: NDArray[Any], shape: NDArray[Any] | None, num_channels: int, where: str
+) -> Float:
+    """(H,W,C) of a flattened one."""
+    size = () if shape is None else tuple(int(n) for n in shape)
+    if len(size) != 3 or size[2] != num_channels or np.prod(size) != len(values) or min(size) < 1:
+        raise InputError(
+            f"{where}: got {len(values)} values for an image of shape {size}, expected "
+            f"(H, W, {num_channels})"
+        )
+    return values.reshape(size).astype(np.float64)
+
+
+def transform_of(values: NDArray[Any] | None, where: str) -> Float:
+    """(4,4) of 16 numbers, row by row."""
+    if values is None or values.shape != (16,):
+        raise InputError(
+            f"{where}: got a transform of {0 if values is None else len(values)} "
+            f"numbers, expected 16"
+        )
+    return rigid(values.reshape(4, 4), where)

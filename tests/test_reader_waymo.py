@@ -1,0 +1,394 @@
+# SPDX-License-Identifier: MIT
+"""The Waymo reader on a street written as a segment, against the published formulas, and on broken
+segments."""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import densify
+from densify.errors import InputError
+from densify.geometry.poses import inverse, transform
+from densify.readers import open_sequence
+from densify.readers.describe import describe
+from densify.readers.street import Street
+from densify.readers.waymo import Waymo
+from densify.scores.depth_metrics import depth_errors
+from densify.writers import write_street
+from densify.writers.excerpt import Excerpt
+from densify.writers.waymo import T_EGO_LIDAR, _pixels
+from tests.reader_checks import check_truth
+
+parquet = pytest.importorskip("pyarrow.parquet")
+
+FRAMES, CAMERAS = (59, 60, 61), ("image_02", "rolling")
+LIDAR, POSE = "[LiDARComponent].range_image_return", "[LiDARPoseComponent].range_image_return1"
+CALIBRATION = "[LiDARCalibrationComponent]"
+
+
+@pytest.fixture(scope="module")
+def excerpt():
+    return Excerpt.of(Street("street", 0, "vlp16", cameras=CAMERAS), FRAMES, None)
+
+
+@pytest.fixture(scope="module")
+def root(excerpt, tmp_path_factory):
+    return write_street("waymo", excerpt.street, tmp_path_factory.mktemp("waymo"), FRAMES)
+
+
+@pytest.fixture
+def copy(root, tmp_path):
+    """A segment to be changed."""
+    return shutil.copytree(root, tmp_path / "copy", ignore=shutil.ignore_patterns("truth"))
+
+
+def table_of(root, component):
+    return parquet.read_table(root / component / "street.parquet")
+
+
+def rows_of(root, component):
+    return table_of(root, component).to_pylist()
+
+
+def put(root, component, rows, schema=None):
+    import pyarrow
+
+    schema = schema or table_of(root, component).schema
+    table = pyarrow.Table.from_pylist(rows, schema=schema)
+    parquet.write_table(table, root / component / "street.parquet")
+
+
+# The street
+
+
+def test_the_street_is_given_back(root, excerpt):
+    sequence = open_sequence(root)
+    assert isinstance(sequence, Waymo) and list(sequence.frames) == [0, 1, 2]
+    pattern = excerpt.street.simulator.sensor.scanners[0].pattern
+    for number, frame in enumerate(FRAMES):
+        read, true = sequence[number], excerpt.street[frame]
+        order = np.argsort(_pixels(excerpt, frame, pattern))
+        assert read.stamp_ns == sequence.stamp_ns(number) == true.stamp_ns
+        assert len(read) == len(true) and not read.lidar.any()
+        np.testing.assert_allclose(read.scanner_origins[0], [1.43, 0, 2.18])
+        away, expected = read.points - read.scanner_origins[0], true.points[order]
+        range_m = np.linalg.norm(expected, axis=1)
+        np.testing.assert_allclose(np.linalg.norm(away, axis=1), range_m, rtol=1e-6)
+        # the middle of a column, 1800 of them
+        off_rad = np.linalg.norm(away - expected, axis=1) / range_m
+        assert off_rad.max() < 1.01 * np.pi / 1800
+        assert np.abs(read.offset_ns - true.offset_ns[order]).max() < 150_000
+        np.testing.assert_allclose(
+            read.intensity, np.minimum(true.intensity[order], 0.999), atol=1e-5
+        )
+    check_truth(sequence, replace(excerpt, cameras=()))
+    step = inverse(sequence.T_world_lidar(0)) @ sequence.T_world_lidar(2)
+    T = excerpt.T_world_ego(
+        np.array([excerpt.street.stamp_ns(f) for f in FRAMES]), inverse(T_EGO_LIDAR)
+    )
+    np.testing.assert_allclose(step, inverse(T[0]) @ T[2], atol=1e-9)
+
+
+def test_cameras_are_given_back(root, excerpt):
+    sequence = open_sequence(root)
+    for name, ours in zip(("FRONT", "FRONT_LEFT"), CAMERAS, strict=True):
+        read, true = sequence.cameras[name], excerpt.street.cameras[ours]
+        np.testing.assert_allclose(read.K, true.K, atol=1e-9)
+        np.testing.assert_allclose(
+            read.T_cam_lidar, true.T_cam_lidar @ inverse(T_EGO_LIDAR), atol=1e-9
+        )
+        assert (read.width_px, read.height_px) == (true.width_px, true.height_px)
+        assert read.is_rectified and read.row_time_s == pytest.approx(true.row_time_s, rel=0.01)
+        exposed_ns, true_ns = sequence.image_stamps_ns(name), excerpt.street.image_stamps_ns(ours)
+        for number, image in enumerate(excerpt.image_numbers(ours)):
+            assert abs(exposed_ns[number] - true_ns[image]) < 1000
+            difference = sequence.image(name, number).astype(int) - excerpt.street.image(
+                ours, image
+            )
+            assert np.abs(difference).mean() < 4
+            T_world_lidar = excerpt.street.simulator.T_world_lidar_at(true_ns[image])
+            expected = T_world_lidar @ inverse(true.T_cam_lidar)
+            np.testing.assert_allclose(sequence.T_world_cam(name, number), expected, atol=2e-3)
+    assert "rolling shutter of 18.8 ms" in describe(sequence)
+
+
+def test_depth_is_that_of_the_street(root, excerpt):
+    scores = []
+    for recording, key, camera in (
+        (open_sequence(root), 1, "FRONT"),
+        (excerpt.street, FRAMES[1], "image_02"),
+    ):
+        poses_given = {"register": {"source": "dataset"}}
+        maps = densify.run(recording, key, 1, cameras=[camera], config=poses_given).depth[camera]
+        true_m = recording.truth.depth_m(camera, key)
+        focal_px = recording.cameras[camera].focal_px
+        scores.append(depth_errors(maps.depth_m, true_m, focal_px=focal_px))
+    read, true = scores
+    assert true.num_compared > 5_000
+    assert abs(read.num_compared / true.num_compared - 1) < 0.1
+    assert read.mae_m < 1.5 * true.mae_m  # the columns' azimuths
+
+
+def test_the_point_times_are_those_of_the_poses_whichever_way_it_spins(copy, root, excerpt):
+    """Poses from right to left, as if the lidar spun the other way."""
+    rows = rows_of(copy, "lidar_pose")
+    for row in rows:
+        pose = np.reshape(row[f"{POSE}.values"], row[f"{POSE}.shape"])
+        row[f"{POSE}.values"] = pose[:, ::-1].ravel()
+    put(copy, "lidar_pose", rows)
+    here, turned = open_sequence(root)[1], open_sequence(copy)[1]
+    np.testing.assert_allclose(turned.offset_ns, -here.offset_ns, atol=200_000)
+
+
+def test_a_standing_vehicle_has_the_times_of_its_columns(copy, root):
+    for component, name in (
+        ("vehicle_pose", "[VehiclePoseComponent].world_from_vehicle.transform"),
+        ("camera_image", "[CameraImageComponent].pose.transform"),
+    ):
+        rows = rows_of(copy, component)
+        for row in rows:
+            row[name] = np.eye(4).ravel()
+        put(copy, component, rows)
+    here, standing = open_sequence(root)[1], open_sequence(copy)[1]
+    np.testing.assert_allclose(standing.offset_ns, here.offset_ns, atol=100_000)
+
+
+def test_without_images_there_are_sweeps(copy, root):
+    for component in ("camera_image", "camera_calibration"):
+        shutil.rmtree(copy / component)
+    sequence = open_sequence(copy)
+    assert not sequence.cameras and sequence.stamp_ns(1) == open_sequence(root).stamp_ns(1)
+
+
+def test_segments_are_scenes(root, tmp_path):
+    for component in ("lidar", "lidar_pose", "lidar_calibration", "vehicle_pose"):
+        (tmp_path / component).mkdir()
+        for name in ("a", "b"):
+            shutil.copy(
+                root / component / "street.parquet", tmp_path / component / f"{name}.parquet"
+            )
+    assert open_sequence(f"waymo:{tmp_path}#b").name == "b"
+    with pytest.raises(InputError, match=r"holds 2 recordings.*one of a, b"):
+        open_sequence(tmp_path)
+
+
+def test_what_the_format_cannot_hold_is_refused(tmp_path):
+    for spec in ("street?sensor=dual32", "street?sensor=rosette", "street?cameras=fisheye"):
+        with pytest.raises(InputError, match="cannot be written as Waymo's"):
+            write_street("waymo", Street.from_spec(spec), tmp_path / "out", [60])
+    assert not (tmp_path / "out").exists()
+
+
+# The published formulas
+
+
+def official_points(image, inclinations, extrinsic, pixel_pose=None, frame_pose=None):
+    """compute_range_image_polar, _cartesian of waymo_open_dataset/utils/range_image_utils.py, pixel
+    by pixel."""
+    height, width = image.shape[:2]
+    correction = np.arctan2(extrinsic[1, 0], extrinsic[0, 0])
+    points = []
+    for v in range(height):
+        for u in range(width):
+            if image[v, u, 0] <= 0:
+                continue
+            ratio = (width - u - 0.5) / width
+            azimuth, rise = (ratio * 2 - 1) * np.pi - correction, inclinations[::-1][v]
+            ray = [np.cos(azimuth) * np.cos(rise), np.sin(azimuth) * np.cos(rise), np.sin(rise)]
+            point = extrinsic[:3, :3] @ (image[v, u, 0] * np.array(ray)) + extrinsic[:3, 3]
+            if pixel_pose is not None:
+                roll, pitch, yaw, *place = pixel_pose[v, u]
+                c, s = np.cos, np.sin
+                Rx = np.array([[1, 0, 0], [0, c(roll), -s(roll)], [0, s(roll), c(roll)]])
+                Ry = np.array([[c(pitch), 0, s(pitch)], [0, 1, 0], [-s(pitch), 0, c(pitch)]])
+                Rz = np.array([[c(yaw), -s(yaw), 0], [s(yaw), c(yaw), 0], [0, 0, 1]])
+                point = Rz @ Ry @ Rx @ point + place
+                point = transform(inverse(frame_pose), point[None])[0]
+            points.append(point)
+    return np.array(points)
+
+
+def thinned(root, component, name):
+    row = rows_of(root, component)[1]
+    return np.reshape(row[f"{name}.values"], row[f"{name}.shape"])
+
+
+def test_compensated_they_are_the_points_of_the_published_conversion(root):
+    sequence = open_sequence(root)
+    image, pose = thinned(root, "lidar", f"{LIDAR}1"), thinned(root, "lidar_pose", POSE)
+    image[:, np.arange(image.shape[1]) % 60 > 0, 0] = 0
+    laser = rows_of(root, "lidar_calibration")[0]
+    extrinsic = np.reshape(laser[f"{CALIBRATION}.extrinsic.transform"], (4, 4))
+    beams = np.array(laser[f"{CALIBRATION}.beam_inclination.values"])
+    expected = official_points(image, beams, extrinsic, pose, sequence.T_world_lidar(1))
+    sweep = sequence[1]
+    kept = sweep.select(sweep.row % image.shape[1] % 60 == 0)
+    assert len(kept) == len(expected) > 200
+    found = sequence._track.compensated(kept.points, kept.stamp_ns, kept.offset_ns)
+    np.testing.assert_allclose(found, expected, atol=0.01)
+
+
+def test_five_lidars_and_both_returns(copy):
+    """A small side lidar with even beams, turned, that hits something twice."""
+    schema = table_of(copy, "lidar").schema
+    rows = rows_of(copy, "lidar")
+    rng = np.random.default_rng(0)
+    side = {1: rng.uniform(3, 20, (5, 8, 4)), 2: rng.uniform(20, 30, (5, 8, 4))}
+    side[1][0, 0, 0] = side[2][0, :, 0] = -1
+    for row in list(rows):
+        new = dict(row, **{"key.laser_name": 4})
+        for number, image in side.items():
+            new[f"{LIDAR}{number}.values"] = image.ravel()
+            new[f"{LIDAR}{number}.shape"] = image.shape
+        rows.insert(0, new)
+    put(copy, "lidar", rows, schema)
+    lasers = rows_of(copy, "lidar_calibration")
+    T = np.array([[0, 1.0, 0, 0.5], [-1, 0, 0, -1], [0, 0, 1, 1], [0, 0, 0, 1]])
+    lasers.append(
+        dict(
+            lasers[0],
+            **{
+                "key.laser_name": 4,
+                f"{CALIBRATION}.extrinsic.transform": T.ravel(),
+                f"{CALIBRATION}.beam_inclination.values": None,
+                f"{CALIBRATION}.beam_inclination.min": -1.5,
+                f"{CALIBRATION}.beam_inclination.max": 0.5,
+            },
+        )
+    )
+    put(copy, "lidar_calibration", lasers)
+    sweep = open_sequence(copy)[1]
+    mine = sweep.select(sweep.lidar == 3)
+    beams = -1.5 + 2.0 * (np.arange(5) + 0.5) / 5
+    expected = np.concatenate(
+        [official_points(image.astype(np.float32), beams, T) for image in side.values()]
+    )
+    np.testing.assert_allclose(mine.points, expected, atol=1e-5)
+    assert len(mine) == 39 + 32 and not mine.offset_ns.any()
+    np.testing.assert_allclose(sweep.scanner_origins[3], T[:3, 3])
+
+
+# Damage
+
+
+def cut(component, size=-3000):
+    def harm(root):
+        path = root / component / "street.parquet"
+        path.write_bytes(path.read_bytes()[:size])
+
+    return harm
+
+
+def without(component):
+    return lambda root: shutil.rmtree(root / component)
+
+
+def drops(component, column):
+    def harm(root):
+        table = table_of(root, component)
+        path = root / component / "street.parquet"
+        parquet.write_table(table.drop_columns([column]), path)
+
+    return harm
+
+
+def sets(component, column, value, row=slice(None)):
+    def harm(root):
+        rows, schema = rows_of(root, component), table_of(root, component).schema
+        for one in rows[row]:
+            one[column] = value(one[column]) if callable(value) else value
+        put(root, component, rows, schema)
+
+    return harm
+
+
+def nothing(component):
+    return lambda root: put(root, component, [])
+
+
+VEHICLE = "[VehiclePoseComponent].world_from_vehicle.transform"
+IMAGE, LENS = "[CameraImageComponent]", "[CameraCalibrationComponent]"
+SHEARED = np.eye(4) + 0.1
+DAMAGE = {
+    "no lidar": (without("lidar"), "no segments"),
+    "no calibration": (without("lidar_calibration"), "no such file"),
+    "no poses": (without("vehicle_pose"), "no such file"),
+    "no camera calibration": (without("camera_calibration"), "no such file"),
+    "lidar truncated": (cut("lidar"), "not a whole parquet file"),
+    "lidar empty": (cut("lidar", 0), "not a whole parquet file"),
+    "no frames": (nothing("lidar"), "holds no frames"),
+    "stamps absent": (drops("lidar", "key.frame_timestamp_micros"), "no column key.frame"),
+    "ranges absent": (drops("lidar", f"{LIDAR}1.values"), "no column"),
+    "ranges of another shape": (sets("lidar", f"{LIDAR}1.shape", [1, 2, 4]), "expected .H, W, 4"),
+    "no ranges": (sets("lidar", f"{LIDAR}1.values", None), "no first returns"),
+    "two lidars of one number": (
+        lambda root: put(root, "lidar", rows_of(root, "lidar") * 2),
+        "is there twice",
+    ),
+    "lidar without calibration": (sets("lidar", "key.laser_name", 2), "no lidar 2"),
+    "a sixth lidar": (sets("lidar", "key.laser_name", 6), "expected lidars 1 to 5"),
+    "beams of another lidar": (
+        sets("lidar_calibration", f"{CALIBRATION}.beam_inclination.values", [0.0, 0.1]),
+        "expected 2 as lidar_calibration",
+    ),
+    "no beams": (
+        lambda root: [
+            sets("lidar_calibration", f"{CALIBRATION}.beam_inclination.{n}", v)(root)
+            for n, v in (("values", None), ("min", float("nan")))
+        ],
+        "expected inclinations in rad",
+    ),
+    "extrinsic no rotation": (
+        sets("lidar_calibration", f"{CALIBRATION}.extrinsic.transform", SHEARED.ravel()),
+        "not a rotation",
+    ),
+    "pose not a number": (sets("vehicle_pose", VEHICLE, np.full(16, np.nan)), "not finite"),
+    "pose of nine numbers": (sets("vehicle_pose", VEHICLE, np.zeros(9)), "of 9 numbers"),
+    "a pose missing": (
+        lambda root: put(root, "vehicle_pose", rows_of(root, "vehicle_pose")[1:]),
+        "no vehicle pose of frame 0",
+    ),
+    "pixel poses of another shape": (sets("lidar_pose", f"{POSE}.shape", [1, 1, 6]), "H, W, 6"),
+    "image pose no rotation": (
+        sets("camera_image", f"{IMAGE}.pose.transform", SHEARED.ravel()),
+        "not a rot",
+    ),
+    "image truncated": (
+        sets("camera_image", f"{IMAGE}.image", lambda b: b[:200]),
+        "not a complete",
+    ),
+    "shutter longer than the readout": (
+        sets("camera_image", f"{IMAGE}.rolling_shutter_params.shutter", 3.0),
+        "expected 0 to 1",
+    ),
+    "camera unknown": (sets("camera_image", "key.camera_name", 9), "got camera 9"),
+    "camera without calibration": (nothing("camera_calibration"), "got 0 rows"),
+    "image of another size": (sets("camera_calibration", f"{LENS}.width", 1240), "expected 1240 x"),
+    "focal length 0": (sets("camera_calibration", f"{LENS}.intrinsic.f_u", 0.0), "positive ones"),
+    "focal length missing": (
+        sets("camera_calibration", f"{LENS}.intrinsic.f_u", None),
+        "2 of them missing",
+    ),
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGE)
+def test_damaged_segments_are_refused_in_a_line(copy, damage):
+    harm, says = DAMAGE[damage]
+    harm(copy)
+    with pytest.raises(InputError, match=says) as error:
+        sequence = open_sequence(f"waymo:{copy}")
+        sequence[0]
+        sequence.T_world_lidar(0)
+        sequence.image("FRONT", 0)
+    assert "\n" not in str(error.value) and str(copy) in str(error.value)
+
+
+def test_without_the_package_the_remedy_is_named(root, monkeypatch):
+    monkeypatch.setitem(__import__("sys").modules, "pyarrow.parquet", None)
+    with pytest.raises(InputError, match=r"pip install 'densify\[waymo\]'"):
+        open_sequence(root)
