@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from densify.config import Config
 from densify.doctor import Verdict, examine
+from densify.doctor.paths import scaled, with_rotation
 from densify.errors import InputError
 from densify.geometry import poses
 from densify.registration.deskew import deskew
@@ -82,21 +83,6 @@ def _offsets(factor: float) -> Callable[[Sweep], Sweep]:
         return replace(sweep, offset_ns=np.rint(factor * sweep.offset_ns).astype(np.int64))
 
     return changed
-
-
-def _rotation(change: Callable[[Float], Float]) -> Callable[[Float], Float]:
-    def changed(T: Float) -> Float:
-        turned = T.copy()
-        turned[:3, :3] = change(T[:3, :3])
-        return turned
-
-    return changed
-
-
-def _scaled(factor: float) -> Callable[[Float], Float]:
-    return lambda T: np.block(
-        [[T[:3, :3], factor * T[:3, 3:]], [np.zeros((1, 3)), np.ones((1, 1))]]
-    )
 
 
 def _with_T_cam_lidar(change: Callable[[Float], Float]) -> Callable[[Camera], Camera]:
@@ -178,15 +164,15 @@ def _twice(sequence: LidarSequence, _: Config) -> LidarSequence:
 FAULTS: tuple[Fault, ...] = (
     _fault("poses inverted", "poses", pose=poses.inverse),
     _fault("poses of a camera", "poses", pose=lambda T: poses.inverse(_BODY_CAM) @ T @ _BODY_CAM),
-    _fault("poses in millimetres", "poses", pose=_scaled(1e3)),
+    _fault("poses in millimetres", "poses", pose=scaled(1e3)),
     _fault(
         "quaternions in another order",
         "poses",
-        pose=_rotation(
+        pose=with_rotation(
             lambda R: Rotation.from_quat(np.roll(Rotation.from_matrix(R).as_quat(), 1)).as_matrix()
         ),
     ),
-    _fault("rotations transposed", "poses", pose=_rotation(np.transpose)),
+    _fault("rotations transposed", "poses", pose=with_rotation(np.transpose)),
     _fault("points in millimetres", "unit of points", sweep=_points(lambda p: 1e3 * p)),
     _fault("points in a camera's axes", "axes", sweep=_points(lambda p: p @ _BODY_CAM[:3, :3])),
     _fault("points with z down", "axes", sweep=_points(lambda p: p * [1.0, -1.0, -1.0])),

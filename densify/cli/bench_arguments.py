@@ -6,7 +6,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from densify.cli import verbs
+from densify.cli import bench_verbs
 from densify.cli.options import (
     DATA_HELP,
     add_config_options,
@@ -30,7 +30,7 @@ def _add_bench_flow(benches: Any) -> None:
     parser = add_verb(
         benches,
         "flow",
-        verbs.bench_flow,
+        bench_verbs.bench_flow,
         "scene flow methods on the same pairs and windows: error, energy, seconds, memory",
         "Methods: ours (all sweeps), ours-pair (two sweeps), paper (the published objective, our "
         "solver), paper-adam (its own solver, 1,500 steps: minutes), rigid, cluster-icp, nicp "
@@ -76,7 +76,7 @@ def _add_bench_doctor(benches: Any) -> None:
     parser = add_verb(
         benches,
         "doctor",
-        verbs.bench_doctor,
+        bench_verbs.bench_doctor,
         "mistakes made on purpose in a good recording, and which of them densify doctor names",
     )
     parser.add_argument(

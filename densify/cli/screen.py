@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from collections.abc import Callable
+    from pathlib import Path
 
     from densify.dataset.make import Summary
     from densify.types import Progress
@@ -106,3 +107,9 @@ def _pace(summary: Summary) -> str:
     left_s = summary.seconds_left or 0.0
     left = f"{left_s / 60:.0f} min" if left_s < 6000 else f"{left_s / 3600:.1f} h"
     return f"{summary.seconds / max(1, summary.num_made):.2f} s a key, {left} left"
+
+
+def print_paths(paths: list[Path]) -> None:
+    """One to a line, on stdout."""
+    for path in paths:
+        print(path)

@@ -8,15 +8,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import densify
-from densify.cli.screen import keys_on_stderr, progress_on_stderr
+from densify.cli.screen import keys_on_stderr, print_paths, progress_on_stderr
 from densify.config import as_mapping, resolve
 from densify.errors import ComputationError, InputError
 
 if TYPE_CHECKING:
     from densify.cache import Cache
     from densify.types import LidarSequence
-
-_DEFAULT_KEY = 120  # of benches
 
 
 def run(options: argparse.Namespace) -> None:
@@ -57,7 +55,7 @@ def run(options: argparse.Namespace) -> None:
                 also=config.output.also,
             )
             print(summary(result))
-            _print_paths(paths)
+            print_paths(paths)
     if len(keys) == 1 and failed:
         raise failed[keys[0]]
     if failed:
@@ -95,7 +93,7 @@ def compare(options: argparse.Namespace) -> None:
         overwrite=options.overwrite,
     )
     print(comparison(results))
-    _print_paths(paths)
+    print_paths(paths)
 
 
 def dataset(options: argparse.Namespace) -> None:
@@ -147,7 +145,7 @@ def dataset(options: argparse.Namespace) -> None:
             report=report,
         )
     print(set_summary(summary))
-    _print_paths([options.out])
+    print_paths([options.out])
     if summary.count("failed"):
         raise ComputationError(f"{summary.count('failed')} of {summary.num_keys} keys not made")
 
@@ -169,7 +167,7 @@ def flow(options: argparse.Namespace) -> None:
     write_flow(options.out, field)
     num_moving = int(field.moving.sum())
     print(f"{len(source.points):,} points, {num_moving:,} moving")
-    _print_paths([options.out])
+    print_paths([options.out])
 
 
 def info(options: argparse.Namespace) -> None:
@@ -205,7 +203,7 @@ def doctor(options: argparse.Namespace) -> None:
 
         write_picture(options.picture, draw(diagnosis.sample))
         if not options.json:
-            _print_paths([options.picture])
+            print_paths([options.picture])
     wrong = [f.check for f in diagnosis.findings if f.verdict == Verdict.WRONG]
     if wrong:
         raise InputError(f"{options.data}: wrong: {', '.join(wrong)}; the remedies are above")
@@ -219,7 +217,7 @@ def _write_folder_config(folder: Path, overwrite: bool) -> None:
     if path.exists() and not overwrite:
         raise InputError(f"{path}: there already, kept; give --overwrite to replace it")
     write_file(path, draft_config(folder).encode())
-    _print_paths([path])
+    print_paths([path])
 
 
 def simulate(options: argparse.Namespace) -> None:
@@ -256,64 +254,7 @@ def export(options: argparse.Namespace) -> None:
         options.overwrite,
     )
     print(export_summary(exported))
-    _print_paths(exported.paths)
-
-
-def bench_doctor(options: argparse.Namespace) -> None:
-    """Which mistakes, made on purpose in good recordings, doctor names."""
-    config = resolve(options.config, options.overrides)
-    from densify.bench import faults as bench
-    from densify.bench.table_file import write_table
-    from densify.cli.findings import fault_table
-    from densify.cli.point_files import check_new_file
-    from densify.readers import open_sequence
-
-    if options.out is not None:
-        check_new_file(options.out, options.overwrite, ".json")
-    found = {}
-    for spec in options.data or ["street"]:
-        with progress_on_stderr() as progress:
-            found[spec] = bench.bench_doctor(open_sequence(spec), config, progress)
-        print(fault_table(spec, found[spec]) + "\n", flush=True)
-    if options.out is not None:
-        write_table(options.out, {"recordings": found})
-        _print_paths([options.out])
-
-
-def bench_flow(options: argparse.Namespace) -> None:
-    """Scene flow methods on the same pairs and windows."""
-    config = resolve(options.config, options.overrides)
-    from densify.bench import flow as bench
-    from densify.bench.table_file import write_table
-    from densify.cli.point_files import check_new_file
-    from densify.cli.tables import flow_table
-    from densify.readers import open_sequence
-
-    if options.out is not None:
-        check_new_file(options.out, options.overwrite, ".json")
-    methods = options.methods if options.methods is not None else bench.DEFAULT_METHODS
-    if list(methods) == ["all"]:
-        methods = tuple(bench.METHODS)
-    sequences = [open_sequence(spec) for spec in options.data or ["street"]]
-    runs = []
-    for sequence in sequences:
-        for key in options.keys or [_DEFAULT_KEY]:
-            with progress_on_stderr() as progress:
-                measured = bench.bench_flow(
-                    sequence,
-                    key,
-                    options.window,
-                    config,
-                    methods,
-                    options.pairs_only,
-                    options.max_points,
-                    progress,
-                )
-            runs.append(measured)
-            print(flow_table(measured) + "\n", flush=True)
-    if options.out is not None:
-        write_table(options.out, {"runs": runs, "config": as_mapping(config)})
-        _print_paths([options.out])
+    print_paths(exported.paths)
 
 
 def evaluate(options: argparse.Namespace) -> None:
@@ -334,7 +275,7 @@ def evaluate(options: argparse.Namespace) -> None:
     print(evaluation_table(scores))
     if options.out is not None:
         write_table(options.out, scores)
-        _print_paths([options.out])
+        print_paths([options.out])
 
 
 _SHORT = {
@@ -412,8 +353,3 @@ def _cameras_of(street: LidarSequence, wanted: list[str] | None) -> list[str]:
         if name not in street.cameras:
             raise InputError(f"--camera {name}: expected one of {', '.join(street.cameras)}")
     return list(street.cameras) if wanted is None else wanted
-
-
-def _print_paths(paths: list[Path]) -> None:
-    for path in paths:
-        print(path)

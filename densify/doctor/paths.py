@@ -24,7 +24,9 @@ def _inverted(T: Float) -> Float:
     return poses.inverse(T)
 
 
-def _with_rotation(change: Callable[[Float], Float]) -> Callable[[Float], Float]:
+def with_rotation(change: Callable[[Float], Float]) -> Callable[[Float], Float]:
+    """A change of (4,4) poses that changes their (3,3) rotations."""
+
     def changed(T: Float) -> Float:
         turned = T.copy()
         turned[:3, :3] = change(T[:3, :3])
@@ -33,7 +35,9 @@ def _with_rotation(change: Callable[[Float], Float]) -> Callable[[Float], Float]
     return changed
 
 
-def _scaled(factor: float) -> Callable[[Float], Float]:
+def scaled(factor: float) -> Callable[[Float], Float]:
+    """A change of (4,4) poses that scales their translations."""
+
     def changed(T: Float) -> Float:
         moved = T.copy()
         moved[:3, 3] *= factor
@@ -58,13 +62,13 @@ def _angle_scaled(factor: float) -> Callable[[Float], Float]:
 HYPOTHESES: Mapping[str, Callable[[Float], Float]] = {
     "they are inverted (T_lidar_world instead of T_world_lidar)": _inverted,
     "they are a camera's, not the lidar's": lambda T: poses.inverse(_CAM_AXES) @ T @ _CAM_AXES,
-    "they are in millimetres": _scaled(1e-3),
-    "they are in kilometres": _scaled(1e3),
-    "their quaternions are x y z w, read as w x y z": _with_rotation(_rolled(-1)),
-    "their quaternions are w x y z, read as x y z w": _with_rotation(_rolled(1)),
-    "their rotations are transposed": _with_rotation(np.transpose),
-    "their angles are in degrees, read as radians": _with_rotation(_angle_scaled(np.pi / 180)),
-    "their angles are in radians, read as degrees": _with_rotation(_angle_scaled(180 / np.pi)),
+    "they are in millimetres": scaled(1e-3),
+    "they are in kilometres": scaled(1e3),
+    "their quaternions are x y z w, read as w x y z": with_rotation(_rolled(-1)),
+    "their quaternions are w x y z, read as x y z w": with_rotation(_rolled(1)),
+    "their rotations are transposed": with_rotation(np.transpose),
+    "their angles are in degrees, read as radians": with_rotation(_angle_scaled(np.pi / 180)),
+    "their angles are in radians, read as degrees": with_rotation(_angle_scaled(180 / np.pi)),
 }
 """What poses often are instead, as a change that mends them: (4,4) -> (4,4)."""
 

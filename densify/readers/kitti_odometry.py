@@ -126,7 +126,7 @@ class KittiOdometry(FileSequence):
 
 
 def _read_times_ns(path: Path) -> dict[int, int]:
-    """Numbers by line, from 0. Raises InputError if one is no number or not after the one before."""
+    """Stamps by line, from 0. Raises InputError if one is no number or not after the last."""
     lines = read_text(path).splitlines()
     times_ns: dict[int, int] = {}
     for number, line in enumerate(lines):

@@ -247,7 +247,7 @@ def check_overlap(
 
 
 def _share_on(points: Float, trees: Sequence[cKDTree]) -> float:
-    """The share of (N,3) points that lie on one of the sweeps; 1 where there are too few to tell."""
+    """The share of (N,3) points that lie on one of the sweeps; 1 for too few to tell."""
     if min(len(points), sum(tree.n for tree in trees)) < _OVERLAP_POINTS // 10:
         return 1.0
     left = points[:: len(points) // _OVERLAP_POINTS + 1]

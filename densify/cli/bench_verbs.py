@@ -1,0 +1,68 @@
+# SPDX-License-Identifier: MIT
+"""What each bench does: measure, print the table, and write it if asked."""
+
+from __future__ import annotations
+
+import argparse
+
+from densify.cli.screen import print_paths, progress_on_stderr
+from densify.config import as_mapping, resolve
+
+_DEFAULT_KEY = 120
+
+
+def bench_doctor(options: argparse.Namespace) -> None:
+    """Which mistakes, made on purpose in good recordings, doctor names."""
+    config = resolve(options.config, options.overrides)
+    from densify.bench import faults as bench
+    from densify.bench.table_file import write_table
+    from densify.cli.findings import fault_table
+    from densify.cli.point_files import check_new_file
+    from densify.readers import open_sequence
+
+    if options.out is not None:
+        check_new_file(options.out, options.overwrite, ".json")
+    found = {}
+    for spec in options.data or ["street"]:
+        with progress_on_stderr() as progress:
+            found[spec] = bench.bench_doctor(open_sequence(spec), config, progress)
+        print(fault_table(spec, found[spec]) + "\n", flush=True)
+    if options.out is not None:
+        write_table(options.out, {"recordings": found})
+        print_paths([options.out])
+
+
+def bench_flow(options: argparse.Namespace) -> None:
+    """Scene flow methods on the same pairs and windows."""
+    config = resolve(options.config, options.overrides)
+    from densify.bench import flow as bench
+    from densify.bench.table_file import write_table
+    from densify.cli.point_files import check_new_file
+    from densify.cli.tables import flow_table
+    from densify.readers import open_sequence
+
+    if options.out is not None:
+        check_new_file(options.out, options.overwrite, ".json")
+    methods = options.methods if options.methods is not None else bench.DEFAULT_METHODS
+    if list(methods) == ["all"]:
+        methods = tuple(bench.METHODS)
+    sequences = [open_sequence(spec) for spec in options.data or ["street"]]
+    runs = []
+    for sequence in sequences:
+        for key in options.keys or [_DEFAULT_KEY]:
+            with progress_on_stderr() as progress:
+                measured = bench.bench_flow(
+                    sequence,
+                    key,
+                    options.window,
+                    config,
+                    methods,
+                    options.pairs_only,
+                    options.max_points,
+                    progress,
+                )
+            runs.append(measured)
+            print(flow_table(measured) + "\n", flush=True)
+    if options.out is not None:
+        write_table(options.out, {"runs": runs, "config": as_mapping(config)})
+        print_paths([options.out])
