@@ -81,6 +81,11 @@ def _is_kitti_odometry(path: Path) -> bool:
     return any((path / "sequences").glob("*/velodyne"))
 
 
+def _is_dgp(path: Path) -> bool:
+    found = (*path.glob("scene_*.json"), *path.glob("*/scene_*.json"))
+    return any(not file.name.startswith("scene_dataset") for file in found)
+
+
 READERS = Table(
     kind="reader",
     group="densify.readers",
@@ -155,6 +160,13 @@ READERS = Table(
             "densify.readers.ros",
             recognises=_is_bag,
             holds="a ROS bag (.bag, .db3, .mcap, or a folder of them)",
+            scenes=True,
+        ),
+        Reader(
+            "dgp",
+            "densify.readers.dgp",
+            recognises=_is_dgp,
+            holds="a DGP scene such as DDAD's (a folder that holds scene_<hash>.json)",
             scenes=True,
         ),
         Reader(

@@ -29,6 +29,7 @@ FORMATS = {
     "nuscenes": "densify.writers.nuscenes",
     "opensceneflow": "densify.writers.open_scene_flow",
     "waymo": "densify.writers.waymo",
+    "dgp": "densify.writers.dgp",
     "pandaset": "densify.writers.pandaset",
 }
 """Name in ``densify simulate --format`` -> module."""

@@ -1,0 +1,223 @@
+# SPDX-License-Identifier: MIT
+"""The DGP reader on a street written as a scene, on broken ones, and on a real DDAD scene."""
+
+from __future__ import annotations
+
+import io
+import json
+import pickle
+import shutil
+
+import cv2
+import numpy as np
+import pytest
+
+from densify.errors import InputError
+from densify.geometry.poses import inverse
+from densify.readers import open_sequence
+from densify.readers.dgp import Dgp
+from densify.readers.street import Street
+from densify.writers import write_street
+from densify.writers.excerpt import Excerpt
+from tests.reader_checks import check_cameras, check_depth, check_truth
+
+FRAMES, CAMERA = (59, 60, 61), "image_02"
+
+
+@pytest.fixture(scope="module")
+def excerpt():
+    return Excerpt.of(Street("street", 0, "vlp16", cameras=(CAMERA,)), FRAMES, None)
+
+
+@pytest.fixture(scope="module")
+def written(excerpt, tmp_path_factory):
+    return write_street("dgp", excerpt.street, tmp_path_factory.mktemp("dgp"), FRAMES)
+
+
+@pytest.fixture
+def broken(written, tmp_path):
+    """A copy to be damaged."""
+    return shutil.copytree(written, tmp_path / "scene_01", ignore=shutil.ignore_patterns("truth"))
+
+
+def test_the_street_is_given_back(written, excerpt):
+    sequence, street = open_sequence(written), excerpt.street
+    assert isinstance(sequence, Dgp) and list(sequence.frames) == [0, 1, 2]
+    check_cameras(sequence, excerpt)
+    check_truth(sequence, excerpt)
+    T_lidar_cam = inverse(street.cameras[CAMERA].T_cam_lidar)
+    for number, frame in enumerate(FRAMES):
+        sweep, true = sequence[number], street.truth.sweep(frame)
+        assert sweep.stamp_ns == sequence.stamp_ns(number) == street.stamp_ns(frame)
+        assert sweep.offset_ns is None and sweep.scanner_origins is None
+        still = ~true.moving
+        np.testing.assert_allclose(sweep.points[still], true.points[still], atol=1e-4)
+        np.testing.assert_array_equal(sweep.intensity, street[frame].intensity)
+        T_world_lidar = street.T_world_lidar(frame)
+        np.testing.assert_allclose(sequence.T_world_lidar(number), T_world_lidar, atol=1e-9)
+        at_image = sequence.T_world_cam(CAMERA, number)
+        np.testing.assert_allclose(at_image, T_world_lidar @ T_lidar_cam, atol=1e-9)
+
+
+def test_depth_is_that_of_the_street(written, excerpt):
+    """Compensated points without times are no rays of one origin: fewer find support."""
+    check_depth(open_sequence(written), excerpt, worse=0.35)
+
+
+def test_scenes(written, test_data):
+    assert open_sequence(written.parent).name == "scene_01"
+    assert open_sequence(f"dgp:{written.parent}#scene_01").name == "scene_01"
+    with pytest.raises(InputError, match="no recording scene_02; choose one"):
+        open_sequence(f"dgp:{written.parent}#scene_02")
+    with pytest.raises(InputError, match="no DGP scene"):
+        open_sequence(f"dgp:{written / 'rgb'}")
+
+
+def test_what_is_not_on_the_disk_leaves_a_gap(broken):
+    min((broken / "point_cloud/LIDAR").iterdir()).unlink()
+    max((broken / "rgb" / CAMERA).iterdir()).unlink()
+    sequence = Dgp(broken)
+    assert list(sequence.frames) == [1, 2]
+    assert list(sequence.image_stamps_ns(CAMERA)) == [0, 1]
+    with pytest.raises(InputError, match="frames that exist: 1-2"):
+        sequence[0]
+
+
+def test_what_the_format_cannot_hold_is_refused(tmp_path):
+    for spec in ("street?sensor=dual32", "street?cameras=fisheye", "street?cameras=rolling"):
+        with pytest.raises(InputError, match=r"cannot be written as DGP.*; choose|choose among"):
+            write_street("dgp", Street.from_spec(spec), tmp_path / "out", [60])
+    assert not (tmp_path / "out").exists()
+
+
+# Damage
+
+
+def edit(change):
+    def harm(path):
+        content = json.loads(path.read_text())
+        change(content)
+        path.write_text(json.dumps(content))
+
+    return harm
+
+
+def of_sweep(change):
+    """Change the first sweep's entry."""
+    return edit(lambda c: change(next(e for e in c["data"] if "point_cloud" in e["datum"])))
+
+
+def holds(**arrays):
+    def harm(path):
+        file = io.BytesIO()
+        np.savez(file, **arrays)
+        path.write_bytes(file.getvalue())
+
+    return harm
+
+
+SCENE, CALIBRATION = "scene_*.json", "calibration/*.json"
+SWEEP, IMAGE = "point_cloud/LIDAR/*.npz", f"rgb/{CAMERA}/*.png"
+DAMAGE = {
+    "scene cut": (SCENE, lambda p: p.write_bytes(p.read_bytes()[:-9]), "not a whole JSON"),
+    "scene of another kind": (SCENE, lambda p: p.write_text("[]"), "expected a DGP scene"),
+    "scene missing": (SCENE, lambda p: p.unlink(), "no DGP scene"),
+    "no samples": (SCENE, edit(lambda c: c.pop("samples")), "no 'samples'"),
+    "datum absent": (SCENE, edit(lambda c: c["data"].pop()), "which a sample names"),
+    "no sweeps": (SWEEP, lambda p: shutil.rmtree(p.parent), "none of its sweeps is there"),
+    "date": (SCENE, of_sweep(lambda e: e["id"].update(timestamp="now")), "got 'now'"),
+    "date absent": (SCENE, of_sweep(lambda e: e["id"].pop("timestamp")), "no 'timestamp'"),
+    "pose absent": (SCENE, of_sweep(lambda e: e["datum"]["point_cloud"].pop("pose")), "no 'pose'"),
+    "pose not finite": (
+        SCENE,
+        of_sweep(lambda e: e["datum"]["point_cloud"]["pose"]["translation"].update(x=float("nan"))),
+        "unit quaternion",
+    ),
+    "quaternion not of unit length": (
+        SCENE,
+        of_sweep(lambda e: e["datum"]["point_cloud"]["pose"]["rotation"].update(qw=5)),
+        "unit quaternion",
+    ),
+    "calibration missing": (CALIBRATION, lambda p: p.unlink(), "cannot be read"),
+    "calibration of fewer": (CALIBRATION, edit(lambda c: c["extrinsics"].pop()), "names"),
+    "no calibration of the camera": (
+        CALIBRATION,
+        edit(lambda c: c["names"].__setitem__(1, "other")),
+        f"calibration of {CAMERA}",
+    ),
+    "focal length absent": (CALIBRATION, edit(lambda c: c["intrinsics"][1].pop("fx")), "'fx'"),
+    "focal length not finite": (
+        CALIBRATION,
+        edit(lambda c: c["intrinsics"][1].update(fx=float("inf"))),
+        "no finite calibration",
+    ),
+    "focal length 0": (
+        CALIBRATION,
+        edit(lambda c: c["intrinsics"][1].update(fx=0)),
+        "positive fx",
+    ),
+    "sweep cut": (SWEEP, lambda p: p.write_bytes(p.read_bytes()[:-99]), "not a whole npz"),
+    "sweep empty": (SWEEP, lambda p: p.write_bytes(b""), "not a whole npz"),
+    "sweep of another array": (SWEEP, holds(other=np.zeros((3, 4))), "not a whole npz"),
+    "sweep of three columns": (SWEEP, holds(data=np.zeros((3, 3))), "a column for each"),
+    "sweep of objects": (SWEEP, holds(data=np.array([[None]], object)), "not a whole npz"),
+    "sweep of a pickle": (SWEEP, lambda p: p.write_bytes(pickle.dumps([1])), "not a whole npz"),
+    "sweep of nothing": (SWEEP, holds(data=np.zeros((0, 4))), "holds no points"),
+    "sweep without X": (
+        SCENE,
+        of_sweep(lambda e: e["datum"]["point_cloud"].update(point_format=list("ABZI"))),
+        "X Y Z among them",
+    ),
+    "image cut": (IMAGE, lambda p: p.write_bytes(b"x"), "not a complete image"),
+    "image of another size": (
+        IMAGE,
+        lambda p: cv2.imwrite(str(p), np.zeros((4, 6, 3), np.uint8)),
+        "6 x 4 px; expected 1242 x 375",
+    ),
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGE)
+def test_damage_is_refused_in_a_line(broken, damage):
+    pattern, harm, says = DAMAGE[damage]
+    harm(min(broken.glob(pattern)))
+    with pytest.raises(InputError, match=says) as error:
+        sequence = Dgp(broken)
+        sequence[0]
+        sequence.image(CAMERA, 0)
+    assert "\n" not in str(error.value) and str(broken) in str(error.value)
+
+
+# A real scene
+
+
+def test_a_real_scene(test_data):
+    sequence = open_sequence(test_data / "ddad")
+    assert list(sequence.frames) == [0, 1, 2]
+    assert list(sequence.cameras) == [f"CAMERA_0{n}" for n in (1, 5, 6, 7, 8, 9)]
+    # names of files are tenths of microseconds
+    assert sequence.stamp_ns(0) == 1_561_645_825_002_790_000
+    assert sequence.image_stamps_ns("CAMERA_05")[2] == 1_561_645_825_193_647_200
+    front = sequence.cameras["CAMERA_01"]
+    assert (front.width_px, front.height_px, front.K[0, 0]) == (1936, 1216, 2181.530254382263)
+    T_ego_cam = inverse(front.T_cam_lidar)
+    np.testing.assert_allclose(T_ego_cam[:3, 3], [1.48554, 0.28616, 1.56173], atol=1e-5)
+    np.testing.assert_allclose(T_ego_cam[:3, 2], [1, 0, 0], atol=0.1)  # looks ahead
+    sweep = sequence[0]
+    path = test_data / "ddad/scene_02/point_cloud/LIDAR/15616458250027900.npz"
+    stored = np.load(path)["data"]
+    assert len(sweep) == len(stored) == 47_230
+    np.testing.assert_array_equal(sweep.points, stored[:, :3])
+    np.testing.assert_allclose(sweep.intensity, stored[:, 3], atol=1e-7)
+    # the mean of the six places in the calibration
+    np.testing.assert_allclose(sweep.scanner_origins, [[1.14779, 0.07166, 1.55299]], atol=1e-5)
+    poses = [sequence.T_world_lidar(n)[:3, 3] for n in range(3)]
+    np.testing.assert_allclose(poses[0], [111.45486, -2261.38424, -12.73396], atol=1e-5)
+    steps_m = np.linalg.norm(np.diff(poses, axis=0), axis=1)
+    np.testing.assert_allclose(steps_m, 1.26, atol=0.03)
+    # an image's pose is the sweep's, 9 ms of 12.7 m/s earlier, with the camera's place
+    for name, camera in sequence.cameras.items():
+        late_s = (sequence.stamp_ns(1) - sequence.image_stamps_ns(name)[1]) * 1e-9
+        then = sequence.T_world_lidar(1) @ inverse(camera.T_cam_lidar)
+        away_m = np.linalg.norm(then[:3, 3] - sequence.T_world_cam(name, 1)[:3, 3])
+        assert away_m == pytest.approx(12.7 * late_s, abs=0.02), name
