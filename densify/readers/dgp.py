@@ -10,8 +10,8 @@ Packing for Self-Supervised Monocular Depth Estimation", CVPR 2020) and its rela
   be there and is not read. Sweeps are numbered from 0 in the order of time, each camera's images
   likewise; what is not on the disk leaves a gap.
 - Stamps are ISO dates. DDAD's are tenths of microseconds taken for microseconds, of the year 2464:
-  what lies beyond 2200 is divided by ten. DDAD's images are exposed about 9 ms before the sweep's
-  stamp.
+  what lies beyond 2200 is divided by ten. DDAD's images are stamped 9 ms before
+  the sweep, and their poses are those of 5 to 6 ms later.
 - Points have no times, so that nothing can be undone: ``offset_ns`` is None. They are in the frame
   of the sweep's sensor, and poses (one for every sweep and image) are the sensors'.
 - DDAD's sweeps are put together from several solid-state scanners, in the vehicle's frame, whose
