@@ -136,7 +136,8 @@ def make_dataset(
             todo = _tasks(left, recipe, out, cache_bytes)
             try:
                 if todo:
-                    with open_workers(num_processes, scheduler, memory_bytes) as workers:
+                    of_workers = memory_bytes and memory_bytes - int(_BASE_BYTES)
+                    with open_workers(num_processes, scheduler, of_workers) as workers:
                         for record in _records(run_tasks(todo, workers)):
                             manifest.append(record)
                             done.add(record)
