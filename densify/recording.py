@@ -52,6 +52,7 @@ from densify.types import (
     Float,
     FlowField,
     LidarSequence,
+    MakesFrames,
     Motion,
     RegisteredSweep,
     Stretch,
@@ -182,8 +183,11 @@ class Recording:
         num_before = self.settings.register.num_lead_in
         if self.cut.margin_s:  # without a sweep before it a block could not be joined to the last
             num_before = max(1, num_before)
-        bad, known = {}, {}
-        for frame in [*self.timeline.before(frames[0], num_before), *frames]:
+        bad, known, frames = {}, {}, (*self.timeline.before(frames[0], num_before), *frames)
+        if isinstance(self.sequence, MakesFrames):
+            with self._watch.stage("read"):
+                self.sequence.prepare(frames)
+        for frame in frames:
             try:
                 known[frame] = (self.sweeps.content(frame), self._recorded_pose(frame))
             except InputError as error:

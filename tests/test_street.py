@@ -19,7 +19,7 @@ from densify.street.mesh import Mesh, box
 from densify.street.motion import Driving, Poses, Still, Towed
 from densify.street.scenes import build_scene
 from densify.street.sensors import SENSORS, firings
-from densify.street.simulator import seconds
+from densify.street.simulator import Simulator, seconds
 from densify.street.terrain import Road, Terrain
 from densify.street.world import Body, Rays, World
 
@@ -588,3 +588,14 @@ def test_frames_and_cameras_that_do_not_exist_are_named(street):
         street.image_stamps_ns("left")
     with pytest.raises(InputError, match="no frame -1"):
         street.T_world_lidar(-1)
+
+
+def test_frames_made_side_by_side_are_those_made_one_by_one(tmp_path, monkeypatch):
+    monkeypatch.setenv("DENSIFY_CACHE_DIR", str(tmp_path))
+    street, wanted = Street.from_spec("street?sensor=vlp16"), (70, 71, 72)
+    street.prepare(wanted)
+    alone = [street.simulator.returns(frame) for frame in wanted]
+    monkeypatch.setattr(Simulator, "returns", None)  # nothing is left to be made
+    for frame, expected in zip(wanted, alone, strict=True):
+        for name, column in vars(street.returns(frame)).items():
+            assert column.tobytes() == getattr(expected, name).tobytes()

@@ -45,6 +45,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def script() -> NoReturn:
     """`main` as a process of its own: the console script and ``python -m densify``."""
+    # Work is shared out among our own threads; OpenBLAS's would wait beside them in busy loops.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     code = main()
     if code == INTERRUPTED:
         # Python dies of the signal, not with 130, where an extension module was being imported,

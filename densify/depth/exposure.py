@@ -28,6 +28,7 @@ from densify.types import (
     Int,
     KnowsImagePoses,
     LidarSequence,
+    MakesFrames,
     Stretch,
 )
 
@@ -94,11 +95,10 @@ def key_shots(
 
 def load_images(sequence: LidarSequence, shots: Mapping[str, Shot]) -> dict[str, NDArray[np.uint8]]:
     """(H,W,3) RGB of the shots that are images."""
-    return {
-        name: sequence.image(shot.camera.name, shot.number)
-        for name, shot in shots.items()
-        if shot.number is not None
-    }
+    images = {n: (s.camera.name, s.number) for n, s in shots.items() if s.number is not None}
+    if isinstance(sequence, MakesFrames):
+        sequence.prepare((), list(images.values()))
+    return {name: sequence.image(*image) for name, image in images.items()}
 
 
 def _own_time_ns(sequence: LidarSequence, key: int) -> tuple[int, int]:

@@ -15,7 +15,9 @@ import os
 import threading
 import zipfile
 from collections import OrderedDict
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qsl
@@ -25,6 +27,7 @@ from numpy.typing import NDArray
 
 from densify.cache.folder import own_folder
 from densify.errors import InputError
+from densify.kernels.threads import num_threads
 from densify.street.camera import Picture
 from densify.street.lidar import Returns
 from densify.street.rig import CAMERAS, USUAL, cameras_beside
@@ -149,6 +152,18 @@ class Street:
             **self._store.get(f"sweep/{frame}", lambda: vars(self.simulator.returns(frame)))
         )
 
+    def prepare(self, frames: Sequence[int], images: Sequence[tuple[str, int]] = ()) -> None:
+        """Render what is not in the cache yet, on all cores."""
+        wanted: dict[str, Callable[[], object]] = {}
+        wanted |= {f"{c}/{number}": partial(self.picture, c, number) for c, number in images}
+        wanted |= {f"sweep/{frame}": partial(self.returns, frame) for frame in frames}
+        missing = [make for name, make in wanted.items() if name not in self._store]
+        if missing:
+            _ = self.simulator.scene  # else each thread might build one
+            with ThreadPoolExecutor(num_threads()) as pool:
+                for made in [pool.submit(make) for make in missing]:
+                    made.result()
+
     def picture(self, camera: str, number: int) -> Picture:
         """A camera's image with its exact depth and the bodies seen."""
         stamps_ns = self.image_stamps_ns(camera)
@@ -241,25 +256,38 @@ class _Store:
         digest = hashlib.sha256(identity.encode()).hexdigest()[:16]
         self._folder = own_folder("street") / digest
         self._memory: OrderedDict[str, Arrays] = OrderedDict()
+        self._lock = threading.Lock()
         self._rendered = False
 
+    def __contains__(self, name: str) -> bool:
+        return name in self._memory or self._path(name).exists()
+
     def get(self, name: str, make: Callable[[], Arrays]) -> Arrays:
-        if name not in self._memory:
-            path = self._folder / f"{name}.npz"
-            arrays = _read(path)
-            if arrays is None:
-                if not self._rendered:
-                    self._rendered = True
-                    _progress.info(
-                        "rendering the street, 1 to 2 s a sweep; kept in %s", self._folder
-                    )
-                arrays = make()
-                _write(path, arrays)
+        """May be called by several threads, each for another name."""
+        with self._lock:
+            arrays = self._memory.pop(name, None)
+        if arrays is None:
+            arrays = self._read_or_make(name, make)
+        with self._lock:
             self._memory[name] = arrays
             if len(self._memory) > _KEPT_IN_MEMORY:
                 self._memory.popitem(last=False)
-        self._memory.move_to_end(name)
-        return self._memory[name]
+        return arrays
+
+    def _read_or_make(self, name: str, make: Callable[[], Arrays]) -> Arrays:
+        path = self._path(name)
+        arrays = _read(path)
+        if arrays is None:
+            with self._lock:
+                said, self._rendered = self._rendered, True
+            if not said:
+                _progress.info("rendering the street, 1 to 2 s a sweep; kept in %s", self._folder)
+            arrays = make()
+            _write(path, arrays)
+        return arrays
+
+    def _path(self, name: str) -> Path:
+        return self._folder / f"{name}.npz"
 
 
 def _read(path: Path) -> Arrays | None:

@@ -100,6 +100,17 @@ class SaysWhatItFound(Protocol):
 
 
 @runtime_checkable
+class MakesFrames(Protocol):
+    """A sequence that has to make its sweeps and images, which takes long; a reader may have this
+    member."""
+
+    def prepare(self, frames: Sequence[int], images: Sequence[tuple[str, int]] = ()) -> None:
+        """Make these sweeps and images (camera and number) side by side; they are asked for
+        next."""
+        ...
+
+
+@runtime_checkable
 class KnowsImagePoses(Protocol):
     """A sequence that has a pose for each image; a reader may have this member."""
 
