@@ -39,6 +39,7 @@ def everywhere(
     with ExitStack() as stack:
         address = None
         if request.param == "dask":
+            pytest.importorskip("distributed")
             folder = tmp_path_factory.mktemp("dask")
             address, _ = stack.enter_context(dask_scheduler(folder))
         found = stack.enter_context(open_workers(1 if request.param == "here" else 2, address))
