@@ -109,7 +109,7 @@ READERS = Table(
             recognises=lambda path: (
                 (path / "sample_data.json").is_file() or any(path.glob("v*/sample_data.json"))
             ),
-            holds="nuScenes (a folder that holds v1.0-*/sample_data.json)",
+            holds="nuScenes or TruckScenes (a folder that holds v1.0-*/sample_data.json)",
             scenes=True,
         ),
         Reader(
