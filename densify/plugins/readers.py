@@ -86,6 +86,14 @@ def _is_dgp(path: Path) -> bool:
     return any(not file.name.startswith("scene_dataset") for file in found)
 
 
+def _is_capture(path: Path) -> bool:
+    return path.suffix == ".pcap" and path.is_file()
+
+
+def _has_metadata(path: Path) -> bool:
+    return any(path.parent.glob("*.json"))
+
+
 READERS = Table(
     kind="reader",
     group="densify.readers",
@@ -167,6 +175,20 @@ READERS = Table(
             "densify.readers.dgp",
             recognises=_is_dgp,
             holds="a DGP scene such as DDAD's (a folder that holds scene_<hash>.json)",
+            scenes=True,
+        ),
+        Reader(
+            "ouster",
+            "densify.readers.ouster",
+            recognises=lambda path: _is_capture(path) and _has_metadata(path),
+            holds="an Ouster capture (.pcap with the sensor's .json beside it)",
+            scenes=True,
+        ),
+        Reader(
+            "velodyne",
+            "densify.readers.velodyne",
+            recognises=lambda path: _is_capture(path) and not _has_metadata(path),
+            holds="a Velodyne capture (.pcap), with its model behind #",
             scenes=True,
         ),
         Reader(

@@ -1,0 +1,127 @@
+# SPDX-License-Identifier: MIT
+"""Packets of an Ouster scanner: a ``.pcap`` file and the metadata ``.json`` that the sensor gives,
+decoded by the maker's ouster-sdk (densify[ouster]).
+
+The metadata is the ``.json`` beside whose name the capture's begins with, or the only one there, or
+the one named behind ``#``. A sweep is a frame of the sensor, numbered from 0; frames are found when
+the file is opened, their packets read when a sweep is asked for.
+
+- The stamp is the computer's: when the first packet of the frame was captured. The sensor's own
+  clock may count from when it was switched on; it tells how long after the first column each other
+  column was measured (``offset_ns``).
+- Points are the sensor's, as measured, in its frame (x forward, y left, z up, origin on its base);
+  rays start on the spinning axis (they leave it 1 to 2 cm ahead, in their own direction).
+- Rows count over the image of returns, ring by ring. Of two returns the first is taken.
+- There are neither cameras nor poses.
+"""
+
+from __future__ import annotations
+
+import warnings
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from densify.errors import InputError
+from densify.readers.extras import needed
+from densify.readers.file_sequence import FileSequence, Returns
+from densify.readers.files import read_json
+from densify.types import Float32
+
+_WHAT = "Ouster captures"
+
+
+def open_recording(path: Path, scene: str | None) -> Ouster:
+    """See `densify.readers.ReaderModule`. path: the capture; scene: its metadata's file name."""
+    if not path.is_file():
+        raise InputError(f"{path}: no such file; expected an Ouster capture (.pcap)")
+    metadata = find_metadata(path) if scene is None else path.with_name(scene)
+    if metadata is None or not metadata.is_file():
+        there = ", ".join(sorted(p.name for p in path.parent.glob("*.json"))) or "none"
+        raise InputError(
+            f"{path}: which metadata? beside it: {there}; put the sensor's .json there, name it by "
+            f"ouster:{path}#NAME.json if there are several"
+        )
+    return Ouster(path, metadata)
+
+
+def find_metadata(path: Path) -> Path | None:
+    """The metadata beside a capture, from names alone; None where that does not tell."""
+    found = sorted(path.parent.glob("*.json"))
+    named = [p for p in found if path.stem.startswith(p.stem)]
+    if named:
+        return max(named, key=lambda p: len(p.stem))
+    return found[0] if len(found) == 1 else None
+
+
+class Ouster(FileSequence):
+    """A capture as a `densify.types.LidarSequence`."""
+
+    def __init__(self, path: Path, metadata: Path) -> None:
+        """Raises InputError if the file is no capture, the metadata no Ouster's, or they do not
+        belong together."""
+        self._core = needed("ouster.sdk.core", "ouster", _WHAT)
+        pcap = needed("ouster.sdk.pcap", "ouster", _WHAT)
+        read_json(metadata)
+        try:
+            self._source = pcap.PcapFrameSetSource(str(path), meta=[str(metadata)], index=True)
+            index = self._source.individual_index[0]
+            self._table = self._core.XYZLut(self._source.sensor_info[0])
+        except Exception as error:  # of the library's many kinds
+            raise InputError(
+                f"{path}: cannot be decoded with {metadata.name}: {_line(error)}; expected a .pcap "
+                f"of an Ouster and the metadata of the same sensor"
+            ) from error
+        if not len(index):
+            raise InputError(
+                f"{path}: no sweeps of the sensor that {metadata.name} describes; name its own "
+                f"metadata by ouster:{path}#NAME.json"
+            )
+        self._captured_us = index[:, 0].astype(np.int64)
+        super().__init__(path.stem, path, range(len(index)))
+
+    def stamp_ns(self, frame: int) -> int:
+        """When the sweep's first packet was captured."""
+        self.check_frame(frame)
+        return int(self._captured_us[frame]) * 1000
+
+    def _returns(self, frame: int) -> tuple[Path, Returns]:
+        try:
+            scan = self._source[frame][0]
+            points = np.asarray(self._table(scan), np.float64)
+        except Exception as error:  # of the library's many kinds
+            raise InputError(
+                f"{self.where}: frame {frame} cannot be decoded: {_line(error)}; choose a key or "
+                f"window without it"
+            ) from error
+        measured = (scan.status & 1).astype(bool)
+        since_ns = np.zeros(scan.w, np.int64)
+        if measured.any():
+            column_ns = scan.timestamp.astype(np.int64)
+            since_ns[measured] = column_ns[measured] - column_ns[measured].min()
+        points[:, ~measured] = 0
+        return self.where, Returns(
+            points.reshape(-1, 3),
+            _intensity(scan).reshape(-1),
+            np.broadcast_to(since_ns, (scan.h, scan.w)).reshape(-1),
+            scanner_origins=self._origin_m()[None],
+        )
+
+    def _origin_m(self) -> np.ndarray:
+        info = self._source.sensor_info[0]
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of names that are on their way out
+            to_sensor = np.asarray(info.lidar_to_sensor_transform, np.float64)
+        return to_sensor[:3, 3] * 1e-3
+
+
+def _intensity(scan: Any) -> Float32:
+    """(H,W) 0 to 1, calibrated by the sensor; 0 where its profile has none."""
+    if not scan.has_field("REFLECTIVITY"):
+        return np.zeros((scan.h, scan.w), np.float32)
+    return np.clip(scan.field("REFLECTIVITY").astype(np.float32) / 255, 0, 1)
+
+
+def _line(error: Exception) -> str:
+    return " ".join(str(error).split()) or repr(error)

@@ -1,0 +1,160 @@
+# SPDX-License-Identifier: MIT
+"""Packets of a Velodyne scanner: a ``.pcap`` file, decoded by velodyne-decoder (densify[velodyne]).
+The packets do not tell the model reliably, so that it is named: ``velodyne:FILE.pcap#HDL-32E``.
+
+- A sweep is a turn that begins and ends straight behind (azimuth 180 degrees), to a packet; turns
+  cut off at the ends of the file are left out. Sweeps are numbered from 0. Opening the file finds
+  the packets; they are decoded when a sweep is asked for.
+- The stamp is the computer's: when the last packet of the sweep was captured. ``offset_ns`` is from
+  the packets' own clock and the model's firing order.
+- Points are as measured, in the scanner's frame: x forward (azimuth 0), y left, z up. Rays start
+  at the frame's origin, or a few centimetres ahead of it in their own direction (HDL-32E: 2.9 cm).
+- There are neither cameras nor poses; packets of a GPS are not used.
+"""
+
+from __future__ import annotations
+
+import mmap
+import struct
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from densify.errors import InputError
+from densify.readers.extras import needed
+from densify.readers.file_sequence import FileSequence, Returns
+from densify.types import Int
+
+MODELS = {
+    "VLP-16": "VLP16",
+    "Puck-Hi-Res": "PuckHiRes",
+    "HDL-32E": "HDL32E",
+    "VLP-32A": "VLP32A",
+    "VLP-32B": "VLP32B",
+    "VLP-32C": "VLP32C",
+    "VLS-128": "VLS128",
+}
+"""What a user calls a model, and what the decoder does."""
+
+_PAYLOAD = 1206  # bytes of a packet of returns
+_MAX_HEADERS = 64  # bytes before it: Ethernet, perhaps a VLAN's, IP, UDP
+_FLAGS = (b"\xff\xee", b"\xff\xdd")  # that it begins with
+_BEHIND = 18_000  # hundredths of a degree
+_WHOLE = 0.9  # of the usual number of packets
+_PCAP = {  # magic number -> byte order, nanoseconds per unit of the fraction
+    b"\xd4\xc3\xb2\xa1": ("<", 1000),
+    b"\xa1\xb2\xc3\xd4": (">", 1000),
+    b"\x4d\x3c\xb2\xa1": ("<", 1),
+    b"\xa1\xb2\x3c\x4d": (">", 1),
+}
+
+
+def open_recording(path: Path, scene: str | None) -> Velodyne:
+    """See `densify.readers.ReaderModule`. path: the capture; scene: the model."""
+    if not path.is_file():
+        raise InputError(f"{path}: no such file; expected a Velodyne capture (.pcap)")
+    if scene not in MODELS:
+        got = "no model" if scene is None else f"the model {scene}"
+        raise InputError(
+            f"{path}: got {got}; name the Velodyne by velodyne:{path}#MODEL, MODEL one of "
+            f"{', '.join(MODELS)} (an Ouster's capture needs its metadata .json beside it)"
+        )
+    return Velodyne(path, scene)
+
+
+@dataclass(frozen=True)
+class _Packets:
+    """The packets of returns in a file. begin: (P,) where each payload begins. captured_ns: (P,).
+    azimuth: (P,) of the first firing, hundredths of a degree."""
+
+    begin: Int
+    captured_ns: Int
+    azimuth: Int
+
+
+class Velodyne(FileSequence):
+    """A capture as a `densify.types.LidarSequence`."""
+
+    def __init__(self, path: Path, model: str) -> None:
+        """model: a row of `MODELS`. Raises InputError if the file is no capture, or holds less than
+        one turn."""
+        self._library = needed("velodyne_decoder", "velodyne", "Velodyne captures")
+        self._model = getattr(self._library.Model, MODELS[model])
+        self._packets = _find_packets(path)
+        self._turns = _turns(self._packets.azimuth)
+        if not self._turns:
+            raise InputError(
+                f"{path}: no whole turn: got {len(self._packets.begin)} packets of returns, "
+                f"expected those of a tenth of a second or more"
+            )
+        super().__init__(path.stem, path, range(len(self._turns)))
+
+    def stamp_ns(self, frame: int) -> int:
+        """When the sweep's last packet was captured."""
+        self.check_frame(frame)
+        return int(self._packets.captured_ns[self._turns[frame].stop - 1])
+
+    def _returns(self, frame: int) -> tuple[Path, Returns]:
+        library, packets = self._library, []
+        with self.where.open("rb") as file:
+            for row in self._turns[frame]:
+                file.seek(int(self._packets.begin[row]))
+                captured_s = float(self._packets.captured_ns[row] * 1e-9)
+                packets.append(library.VelodynePacket(captured_s, file.read(_PAYLOAD)))
+        try:
+            decoder = library.ScanDecoder(library.Config(model=self._model))
+            columns: Any = decoder.decode(library.PacketVector(packets))[1]
+        except (RuntimeError, ValueError, TypeError) as error:
+            raise InputError(
+                f"{self.where}: frame {frame} cannot be decoded: {error}; is it another model?"
+            ) from error
+        x, y, z, intensity, time_s = columns[:, :5].T
+        return self.where, Returns(
+            np.column_stack([x, y, z]).astype(np.float64),
+            (intensity / 255).astype(np.float32),
+            np.rint(time_s.astype(np.float64) * 1e9).astype(np.int64),
+        )
+
+
+def _find_packets(path: Path) -> _Packets:
+    """Every record of the file whose last bytes are a packet of returns."""
+    found: list[tuple[int, int, int]] = []
+    try:
+        with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
+            if data[:4] not in _PCAP:
+                raise ValueError(
+                    "it does not begin as a .pcap; a .pcapng becomes one with editcap -F pcap"
+                )
+            order, unit_ns = _PCAP[data[:4]]
+            record, at = struct.Struct(f"{order}IIII"), 24
+            while at + record.size <= len(data):
+                seconds, fraction, size, _ = record.unpack_from(data, at)
+                at += record.size + size
+                begin = at - _PAYLOAD
+                if at > len(data):
+                    break  # cut off
+                if _PAYLOAD < size <= _PAYLOAD + _MAX_HEADERS and data[begin : begin + 2] in _FLAGS:
+                    azimuth = data[begin + 2] + 256 * data[begin + 3]
+                    found.append((begin, seconds * 10**9 + fraction * unit_ns, azimuth))
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: not a capture of packets: {error}") from error
+    if not found:
+        raise InputError(
+            f"{path}: no Velodyne packets (of {_PAYLOAD} bytes); is it an Ouster's? Then put its "
+            f"metadata .json beside it"
+        )
+    begin, captured_ns, azimuth = np.array(found, np.int64).T
+    return _Packets(begin, captured_ns, azimuth)
+
+
+def _turns(azimuth: Int) -> list[range]:
+    """Packets of each whole turn."""
+    from_behind = (azimuth - _BEHIND) % 36_000
+    first = [0, *(np.flatnonzero(np.diff(from_behind) < -_BEHIND) + 1).tolist(), len(azimuth)]
+    turns = [range(a, b) for a, b in pairwise(first)]
+    usual = np.median([len(turn) for turn in turns[1:-1] or turns])
+    ends = {turns[0], turns[-1]}
+    return [turn for turn in turns if turn not in ends or len(turn) >= _WHOLE * usual]
