@@ -395,6 +395,10 @@ TREES = {
         edit(YAML, "- [0.0, 0.0, 0.0, 1.0]", "- [0, 0, 0, 1]\nx: 1"),
         "x: unk",
     ),
+    "camera name": (
+        edit(YAML, "  image_02:\n", "  ../cam:\n"),
+        "got the name .* expected letters",
+    ),
     "coefficients": (
         edit(YAML, "distortion: []", "distortion: [1, 2, 3]"),
         "0, 4, 5, 8, 12, 14 coef",

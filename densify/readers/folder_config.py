@@ -5,11 +5,13 @@ key may be left out; `densify.readers.folder` says what is then found or assumed
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
+from densify.errors import InputError
 from densify.readers.file_sequence import rigid
 from densify.readers.point_fields import REFERENCES, UNIT_NS
 from densify.readers.yaml_sections import Section, read_sections
@@ -106,6 +108,10 @@ class CameraFiles:
 
     @staticmethod
     def of(section: Section, name: str) -> CameraFiles:
+        if not re.fullmatch(r"[\w.-]+", name) or name.startswith("."):
+            raise InputError(
+                f"{section.where}: cameras: got the name {name!r}, expected letters, digits, _ - ."
+            )
         for key in ("files", "size", "K", "T_cam_lidar"):
             if not section.has(key):
                 expected = {

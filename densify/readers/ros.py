@@ -257,7 +257,9 @@ class RosBag(FileSequence):
         try:
             if not self._index[images.topic]:
                 raise InputError(f"{where}: no messages of {images.topic}")
-            info = next(iter(self._bag.messages(images.info)))
+            info = next(iter(self._bag.messages(images.info)), None)
+            if info is None:
+                raise InputError(f"{where}: its messages cannot be found; the bag is damaged")
             image = self._bag.message(images.topic, self._index[images.topic][0])
             frame, lidar = plain(image.header.frame_id), self._lidars[0].frame
             T = self._transforms.between(frame, lidar)

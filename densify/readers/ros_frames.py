@@ -113,6 +113,8 @@ def recorded_track(bag: Bag, topic: str, frames: Frames, lidar: str) -> PoseTrac
             )
         T = _pose(pose.position, pose.orientation, where)
         found[stamp_of(message.header)] = T @ T_child_lidar
+    if not found:
+        raise InputError(f"{bag.path}: {topic}: its messages cannot be found; the bag is damaged")
     stamps_ns = np.array(sorted(found), np.int64)
     return PoseTrack(f"{bag.path}: {topic}", stamps_ns, np.stack([found[s] for s in sorted(found)]))
 
