@@ -204,6 +204,14 @@ def test_what_poses_mean(tmp_path):
     np.testing.assert_allclose(sequence.T_world_lidar(0), POSE @ T_cam_lidar, atol=1e-12)
 
 
+def test_units_and_axes_are_mended(tmp_path):
+    """A camera's axes in millimetres: x to the right, y down, z forward."""
+    stored = scan()[:, [1, 2, 0]] * [-1000, -1000, 1000]
+    bare(tmp_path, ["0.bin"], lambda i: np.column_stack([stored, np.zeros(600)]))
+    sequence = Folder(config(tmp_path, "sweeps: {axes: [z, -x, -y], scale_m: 0.001}\n"))
+    np.testing.assert_allclose(sequence[0].points, scan(), atol=1e-5)
+
+
 def test_compensation_is_undone_with_stamped_poses(tmp_path):
     """At 10 m/s along x; the file's points were carried to the stamp, the start of the sweep."""
     fired, time_s = scan().astype(float), np.linspace(0, 0.0999, 600)
@@ -337,6 +345,10 @@ TREES = {
     "unknown key": (
         edit(YAML, "time_is", "time_iss"),
         r"line 7: sweeps\.time_iss: unknown key; did",
+    ),
+    "axes": (
+        edit(YAML, "time_unit: s", "axes: [x, y, x]"),
+        r"axes: got .* expected x, y and z in some order",
     ),
     "unit": (edit(YAML, "time_unit: s", "time_unit: sec"), "got 'sec', expected one of s, ms"),
     "text for a number": (edit(YAML, "scale: 1.0", "scale: full"), "got 'full', expected a finite"),

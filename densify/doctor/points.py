@@ -56,7 +56,7 @@ def check_units(sample: Sample) -> list[Finding]:
             Verdict.WRONG if fits else Verdict.SUSPICIOUS,
             f"half of the returns are farther than {range_m:.4g} m, expected "
             f"{_MEDIAN_RANGE_M[0]} to {_MEDIAN_RANGE_M[1]:.0f} m{guess}",
-            "scale the points to metres (scale_m in densify.yaml)",
+            "scale the points to metres (sweeps: scale_m in densify.yaml)",
             values,
         )
     ]
@@ -84,7 +84,7 @@ def check_axes(sample: Sample) -> list[Finding]:
             "axes",
             Verdict.WRONG,
             f"{text}{means}",
-            "turn the points so that z is up (axes in densify.yaml)",
+            "turn the points so that z is up (sweeps: axes in densify.yaml)",
             values,
         )
     ]
@@ -177,7 +177,7 @@ def check_intensity(sample: Sample) -> list[Finding]:
             "intensity",
             Verdict.SUSPICIOUS,
             f"{text}, expected 0 to 1; only pictures and the clouds' column suffer",
-            "scale the intensities (intensity_max in densify.yaml)",
+            "scale the intensities (sweeps: intensity_scale in densify.yaml)",
             values,
         )
     ]

@@ -25,7 +25,9 @@ _MODELS = {"pinhole": (0, 4, 5, 8, 12, 14), "fisheye": (4,), "mei": (5,)}
 class SweepFiles:
     """Section ``sweeps``.
 
-    files: folder of the sweeps, "" to look for it. columns: of files without names. intensity,
+    files: folder of the sweeps, "" to look for it. columns: of files without names. scale_m:
+    metres of a unit of the points. R_lidar_stored: (3,3), from key ``axes``, turns (or mirrors)
+    stored points to the lidar's frame, x forward, y left, z up; None leaves them. intensity,
     time, lidar: which column plays that part, "" to find it by its name. intensity_scale: what is
     full brightness, 0 to find it. time_unit, absolute, reference: as
     `densify.readers.point_fields.find_times`. stamps: ``names`` (of the files) or a file with one
@@ -36,6 +38,8 @@ class SweepFiles:
 
     files: str = ""
     columns: tuple[str, ...] | None = None
+    scale_m: float = 1.0
+    R_lidar_stored: Float | None = None
     intensity: str = ""
     intensity_scale: float = 0.0
     time: str = ""
@@ -55,6 +59,8 @@ class SweepFiles:
         found = SweepFiles(
             files=section.text("files"),
             columns=section.names("columns"),
+            scale_m=section.number("scale_m", 1.0, above=0.0),
+            R_lidar_stored=_axes(section),
             intensity=section.text("intensity"),
             intensity_scale=section.number("intensity_scale", 0.0, above=0.0),
             time=section.text("time"),
@@ -184,6 +190,20 @@ def _camera(section: Section, name: str) -> Camera:
         max_angle_deg=section.number("max_angle_deg", 180.0, above=0.0),
         row_time_s=section.number("row_time_s", 0.0),
     )
+
+
+def _axes(section: Section) -> Float | None:
+    """(3,3) of three names such as [z, -x, -y]: where the lidar's x, y and z stand in the file."""
+    names = section.names("axes")
+    if names is None:
+        return None
+    signed = {
+        s + a: (-1.0 if s else 1.0) * np.eye(3)["xyz".index(a)] for s in ("", "-") for a in "xyz"
+    }
+    R = np.array([signed.get(name, np.zeros(3)) for name in names])
+    if R.shape != (3, 3) or not np.allclose(R @ R.T, np.eye(3)):
+        raise section.wrong("axes", "x, y and z in some order, some with a -, such as [z, -x, -y]")
+    return R
 
 
 def _K(section: Section) -> Float:

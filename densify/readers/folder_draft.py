@@ -95,6 +95,8 @@ def _sweeps(folder: Path, files: str, paths: Sequence[Path], others: Sequence[st
     else:
         lines.append(f"  # stamps are taken from {series.told_by}")
     lines += [
+        "  # scale_m: 0.001       # metres of a unit of the points",
+        "  # axes: [z, -x, -y]    # which stored axes are x (forward), y (left) and z (up)",
         "  # reference: start     # the stamp is the sweep's start, middle or end; without it the",
         "  #                      # points' times are since the stamp",
         "  # compensated: true    # the vehicle's own motion in a sweep was taken out already",

@@ -74,7 +74,9 @@ class SweepColumns:
                 raise InputError(
                     f"{path}: no column {name}, which other sweeps have; got {', '.join(columns)}"
                 )
-        points = points_of(columns, layout.fields)
+        points = self.settings.scale_m * points_of(columns, layout.fields)
+        if self.settings.R_lidar_stored is not None:
+            points = points @ self.settings.R_lidar_stored.T
         intensity = None
         if layout.fields.intensity:
             intensity = scaled(columns[layout.fields.intensity], layout.intensity_scale)
