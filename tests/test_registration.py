@@ -318,6 +318,17 @@ def test_environment_variables_have_no_effect(raw, first_pass, monkeypatch):
     assert again.T_world_lidar.tobytes() == first_pass.T_world_lidar.tobytes()
 
 
+def test_sweeps_of_few_points_have_smaller_voxels(raw):
+    def of(*num_points: int) -> float:
+        sweeps = [raw[0].select(np.arange(len(raw[0])) < n) for n in num_points]
+        return odometry._voxel_size_m(sweeps, SETTINGS)
+
+    assert of(10_000) == 0.25
+    assert of(200, 10_000, 15_000) == 0.25
+    assert of(200) == pytest.approx(0.2)
+    assert odometry._voxel_size_m(raw, RegisterSettings(voxel_size_m=1)) <= 1
+
+
 def test_knobs_reach_kiss_icp(raw, first_pass):
     other = register(raw[:3], RegisterSettings(voxel_size_m=2.0))
     assert not np.array_equal(other.T_world_lidar, first_pass.T_world_lidar[:3])

@@ -29,6 +29,8 @@ _SEARCH_RAYS_RAD = (
     0.01  # what stands along the road is met by the same rays, however fast one drives
 )
 _STANDING_M = 0.4
+_MANY_POINTS = 20_000  # in a sweep; with fewer the voxels are smaller
+_LEAST_VOXEL = 0.4
 _OVERLAP_POINTS = 2000
 _OVERLAP_M = 0.5
 _OVERLAP_NS = 350_000_000  # within it a pattern that does not repeat fills its view
@@ -63,7 +65,8 @@ def register(
     _check_number_of_points(sweeps, settings)
     _check_stamps(frames, stamp_ns)
     step_s = np.diff(stamp_ns) * 1e-9
-    odometry = KissICP(_kiss_icp_config(settings, rough is not None))
+    voxel_size_m = _voxel_size_m(sweeps, settings) * (2 if rough is None else 1)
+    odometry = KissICP(_kiss_icp_config(settings, voxel_size_m, rough is not None))
     # KISS-ICP aborts the process on equal stamps; sweeps are ours to deskew
     no_stamps = np.empty(0)
     T_world_lidar: list[Float] = []
@@ -83,6 +86,13 @@ def register(
         check_plausible(trajectory, settings)
         check_overlap(sweeps, trajectory, settings)
     return trajectory
+
+
+def _voxel_size_m(sweeps: Sequence[Sweep], settings: RegisterSettings) -> float:
+    """The knob's, smaller where sweeps hold few points, so that enough of them are matched: few in
+    large voxels slide onto the pattern in which the sweep before was scanned."""
+    num_points = float(np.median([len(sweep) for sweep in sweeps]))
+    return settings.voxel_size_m * float(np.clip(num_points / _MANY_POINTS, _LEAST_VOXEL, 1.0))
 
 
 def _check_number_of_points(sweeps: Sequence[Sweep], settings: RegisterSettings) -> None:
@@ -266,7 +276,9 @@ def _cure(settings: RegisterSettings) -> str:
     )
 
 
-def _kiss_icp_config(settings: RegisterSettings, second_pass: bool):  # type: ignore[no-untyped-def]
+def _kiss_icp_config(  # type: ignore[no-untyped-def]
+    settings: RegisterSettings, voxel_size_m: float, second_pass: bool
+):
     """Every field set here: KISS-ICP otherwise reads ``kiss_icp_*`` environment variables.
 
     In the second pass the kernel is as wide as a voxel (matches count up to three times that): it
@@ -280,7 +292,6 @@ def _kiss_icp_config(settings: RegisterSettings, second_pass: bool):  # type: ig
         RegistrationConfig,
     )
 
-    voxel_size_m = settings.voxel_size_m * (1 if second_pass else 2)
     return KISSConfig(
         out_dir="",
         data=DataConfig(
