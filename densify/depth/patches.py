@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from densify.config import ProjectSettings
 from densify.geometry.range_image import RangeImage
 from densify.geometry.sensor import Sensors
-from densify.kernels import visibility as kernels
+from densify.kernels import tangents as kernels
 from densify.types import Cloud, Float, Float32, Patches
 
 _MIN_FILLED = 6

@@ -110,34 +110,43 @@ def project(
         seen = _Pixels(pixel, nearest, points.depth[nearest], own[nearest])
     reason[points.index[seen.winner]] = Reason.KEPT
 
-    shape = (camera.height_px, camera.width_px)
+    maps = _measured(seen, points, view.exposure, reason)
+    return _with_filled(maps, points, settings) if filled else maps
+
+
+def _measured(
+    seen: _Pixels, points: _InImage, exposure: Exposure, reason: NDArray[np.uint8]
+) -> DepthMap:
+    """The map with measured pixels alone; so far they are ``filled_m`` too."""
+    shape = (exposure.camera.height_px, exposure.camera.width_px)
     depth_m, confidence = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
     frame = np.full(shape, -1, np.int32)
     depth_m.flat[seen.pixel] = seen.depth_m
     confidence.flat[seen.pixel] = np.maximum(seen.confidence, _LEAST_CONFIDENCE)
     frame.flat[seen.pixel] = points.frame[seen.winner]
-    maps = DepthMap(
-        camera=camera.name,
+    return DepthMap(
+        camera=exposure.camera.name,
         depth_m=depth_m,
         filled_m=depth_m,
         confidence=confidence,
         frame=frame,
         reason=reason,
-        measure=view.exposure.measure,
+        measure=exposure.measure,
     )
-    if not filled:
-        return maps
-    filled_m, filled_confidence = fill_between(
-        depth_m,
-        confidence,
+
+
+def _with_filled(maps: DepthMap, points: _InImage, settings: ProjectSettings) -> DepthMap:
+    filled_m, confidence = fill_between(
+        maps.depth_m,
+        maps.confidence,
         _fill_reach_px(points, settings),
         settings.edge_m,
         settings.edge_fraction,
         settings.fill_confidence,
     )
     some = filled_m > 0
-    filled_confidence[some] = np.maximum(filled_confidence[some], np.float32(_LEAST_CONFIDENCE))
-    return replace(maps, filled_m=filled_m, confidence=filled_confidence)
+    confidence[some] = np.maximum(confidence[some], np.float32(_LEAST_CONFIDENCE))
+    return replace(maps, filled_m=filled_m, confidence=confidence)
 
 
 class _Local(NamedTuple):
