@@ -125,9 +125,7 @@ def make_dataset(
         write_plan(out, recipe, drives)
         with _log_file(out, shard):
             clear_leftovers(out)
-            if recipe.layout == "kitti-depth":
-                settings = as_mapping(recipe.config)
-                write_readme(out, method=recipe.method, window=recipe.window, settings=settings)
+            _explain(out, recipe)
             drives = _part(drives, shard)
             done = _Done(out, drives, report, verify)
             left = done.left(drives)
@@ -147,6 +145,13 @@ def make_dataset(
                 _log.info(done.kept())
                 raise
     return done.summary()
+
+
+def _explain(out: Path, recipe: Recipe) -> None:
+    """Write the README of a tree whose layout is not ours."""
+    if recipe.layout == "kitti-depth":
+        settings = as_mapping(recipe.config)
+        write_readme(out, method=recipe.method, window=recipe.window, settings=settings)
 
 
 class _Done:
