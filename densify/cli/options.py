@@ -171,7 +171,8 @@ def key_slice(text: str) -> slice | None:
         return None
     numbers = text.split(":")
     if len(numbers) in (2, 3) and all(n.isascii() and n.isdigit() for n in numbers):
-        first, end, step = *map(int, numbers), *([1] if len(numbers) == 2 else [])
+        first, end = int(numbers[0]), int(numbers[1])
+        step = int(numbers[2]) if len(numbers) == 3 else 1
         if first < end and step > 0:
             return slice(first, end, step)
     raise argparse.ArgumentTypeError(

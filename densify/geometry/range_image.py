@@ -121,8 +121,14 @@ class ScannerImage:
             else:
                 kernels.fill_times(rays, row_edges_rad, offset_s, spread_s)
             return ScannerImage(
-                *(offset_s, spread_s, np.float32(_SETTLED * duration_s), nearest_m, num_filled),
-                *(row_edges_rad, origin_m, twists),
+                offset_s=offset_s,
+                spread_s=spread_s,
+                settled_s=np.float32(_SETTLED * duration_s),
+                nearest_m=nearest_m,
+                num_filled=num_filled,
+                row_edges_rad=row_edges_rad,
+                origin_m=origin_m,
+                twists=twists,
             )
 
         images: list[ScannerImage] = []
