@@ -7,9 +7,12 @@ SemanticKITTI (Behley et al., ICCV 2019), which has the same sequences::
 
 - Frames are file numbers. ``times.txt`` has seconds since the first frame, a line for each: when
   the camera exposed and the scanner faced forward. Without it frame k is at k times 100 ms.
-- Points are the HDL-64E's, in its frame, and already ego-motion compensated to that time. They have
-  no times of their own, so that nothing can be undone: ``offset_ns`` is None, and what moves by
-  itself is a little smeared. Labels are not read.
+- Points are the HDL-64E's, in its frame, ego-motion compensated to that time, and have no times of
+  their own. Where there are poses the compensation is undone: a point's time follows from the
+  azimuth at which it was fired, and that from its time, in a few rounds. (On three real sweeps at
+  0.7 m a sweep the elevations are then sharpest, by entropy: 6.68 as stored, 6.50 undone once, 6.66
+  undone twice over.) Without poses points are given as they stand and ``offset_ns`` is None. Labels
+  are not read.
 - Images are rectified; their size is that of the first. ``calib.txt`` has their projections and
   ``Tr``, the rectified camera 0 from the scanner. Poses are camera 0's, T_first_now: the scanner's
   are Tr⁻¹ P Tr, and the world is its frame at frame 0.
@@ -24,7 +27,13 @@ import numpy as np
 
 from densify.errors import InputError
 from densify.geometry import poses
-from densify.readers.file_sequence import FileSequence, Returns, chosen_scene, truth_beside
+from densify.readers.file_sequence import (
+    FileSequence,
+    Returns,
+    chosen_scene,
+    rigid,
+    truth_beside,
+)
 from densify.readers.files import image_size_px, numbered_files, of_frame, read_bytes, read_text
 from densify.readers.kitti_files import (
     NOMINAL_PERIOD_NS,
@@ -32,8 +41,12 @@ from densify.readers.kitti_files import (
     parse_numbers,
     read_points,
     rectified_camera,
+    turned_ns,
 )
+from densify.readers.pose_track import PoseTrack
 from densify.types import Camera, Float
+
+_NUM_ROUNDS = 4  # the azimuth changes by degrees at most
 
 
 def open_recording(path: Path, scene: str | None) -> KittiOdometry:
@@ -82,12 +95,37 @@ class KittiOdometry(FileSequence):
         return self._time_ns(frame, self.where / "times.txt")
 
     def _returns(self, frame: int) -> tuple[Path, Returns]:
-        columns = read_points(self._sweeps[frame])
-        return self._sweeps[frame], Returns(columns[:, :3].astype(np.float64), columns[:, 3])
+        path, columns = self._sweeps[frame], read_points(self._sweeps[frame])
+        stored = columns[:, :3].astype(np.float64)
+        track = self._track_around(frame)
+        if track is None:
+            return path, Returns(stored, columns[:, 3])
+        points, stamp_ns = stored, self.stamp_ns(frame)
+        for _ in range(_NUM_ROUNDS):
+            offset_ns = turned_ns(points, self._revolution_ns)
+            points = track.as_fired(stored, stamp_ns, offset_ns)
+        return path, Returns(points, columns[:, 3], offset_ns)
 
     def _encoded_image(self, camera: str, number: int) -> tuple[Path, bytes]:
         path = self._images[camera][number]
         return path, read_bytes(path)
+
+    def _track_around(self, frame: int) -> PoseTrack | None:
+        """The scanner's, from the poses of the frame and of those beside it; None without two."""
+        path, lines = self._pose_lines
+        near = [f for f in (frame - 1, frame, frame + 1) if 0 <= f < len(lines)]
+        if len(near) < 2:
+            return None
+        stamps_ns = np.array([self._time_ns(f, self.where / "times.txt") for f in near], np.int64)
+        where = f"{path}: line {frame + 1} and those beside it"
+        T_world_lidar = [rigid(self._pose(f), where) for f in near]
+        return PoseTrack(where, stamps_ns, np.stack(T_world_lidar))
+
+    @cached_property
+    def _revolution_ns(self) -> int:
+        """The usual time from sweep to sweep."""
+        times_ns = list(self._times_ns.values()) if self._times_ns else []
+        return int(np.median(np.diff(times_ns))) if len(times_ns) > 1 else NOMINAL_PERIOD_NS
 
     def _pose(self, frame: int) -> Float:
         path, lines = self._pose_lines
