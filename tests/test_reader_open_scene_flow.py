@@ -11,6 +11,7 @@ import pytest
 import densify
 from densify.errors import InputError
 from densify.geometry.poses import transform
+from densify.outputs.flow_h5 import write_flow_h5
 from densify.readers import open_sequence
 from densify.readers.open_scene_flow import OpenSceneFlow, SweepFile
 from densify.readers.open_scene_flow_labels import FlowLabels
@@ -20,6 +21,7 @@ from densify.types import Trajectory
 from densify.writers import write_street
 from densify.writers.excerpt import Excerpt
 from tests.reader_checks import check_sweeps, check_truth
+from tests.small_street import KEY, one_car
 
 h5py = pytest.importorskip("h5py")
 
@@ -166,6 +168,32 @@ def test_densified_with_the_labels_movers_lie_on_each_other(folder, excerpt):
         off_m = np.linalg.norm(cloud.points[mine] - there, axis=1)
         left_m = np.linalg.norm(rigid.points[mine] - there, axis=1)
         assert mine.sum() > 100 and np.median(off_m) < 0.05 < 0.3 < np.median(left_m)
+
+
+def test_our_flow_is_written_as_such_a_file_and_read_again(tmp_path):
+    sequence = one_car()
+    config = POSES_GIVEN | {"output": {"flow": True}, "project": {"visibility": False}}
+    ours = densify.run(sequence, KEY, 2, config=config)
+    write_flow_h5(tmp_path, KEY, ours.flow)
+    path = tmp_path / f"{KEY:06d}.h5"
+    with h5py.File(path, "r+") as file:
+        groups = [file[name] for name in sorted(file, key=int)]
+        assert ["flow" in group for group in groups] == [True, True, True, False, False]
+        for group, frame in zip(groups, range(KEY - 2, KEY + 3), strict=True):
+            assert group.name == f"/{sequence.stamp_ns(frame)}"
+            np.testing.assert_array_equal(group["row"][:], ours.flow.stretch[frame].sweep.row)
+        for name in list(file)[3:]:
+            del file[name]
+    read = open_sequence(path)
+    labels = FlowLabels(SweepFile(path), "flow", registered(read))
+    for here in (0, 1):
+        field, step = labels.step(here, here + 1), ours.flow.steps[KEY - 2 + here, KEY - 1 + here]
+        assert step.moving.sum() > 50
+        np.testing.assert_array_equal(field.moving, step.moving)
+        np.testing.assert_allclose(
+            field.displacement[step.moving], step.total[step.moving], atol=1e-4
+        )
+        assert (field.instance[step.moving] == step.instance[step.moving]).all()
 
 
 def test_another_flow_by_its_name(copy):

@@ -266,6 +266,12 @@ class OutputSettings(Section):
     """What is written beside the files that every run writes."""
 
     flow: bool = knob(False, "flow/: scene flow of every sweep to the next one, as flow files")
+    flow_as: str = knob(
+        "npz",
+        "flow files. npz: as the README says, towards the key; opensceneflow: an .h5 file as "
+        "OpenSceneFlow has them, up to the key",
+        choices=("npz", "opensceneflow"),
+    )
     optical_flow: bool = knob(
         False,
         "optical_flow/: of every pixel with a measured depth to the previous and the next image, "

@@ -12,12 +12,17 @@ import numpy as np
 from densify.geometry import poses
 from densify.outputs.atomic import write_file
 from densify.outputs.context import Context
+from densify.outputs.flow_h5 import write_flow_h5
 from densify.types import FlowField, Result, StretchFlow
 
 
 def write_output(result: Result, context: Context, folder: Path) -> None:
-    """``flow/``, where it is asked for."""
-    if result.flow is not None:
+    """``flow/``, where it is asked for, in the form of ``output.flow_as``."""
+    if result.flow is None:
+        return
+    if context.config["output"]["flow_as"] == "opensceneflow":
+        write_flow_h5(folder / "flow", result.key, result.flow)
+    else:
         write_flow_files(folder / "flow", result.flow)
 
 
