@@ -19,10 +19,12 @@ from densify.geometry.poses import inverse, transform
 from densify.readers import open_sequence
 from densify.readers.describe import describe
 from densify.readers.folder import Folder
+from densify.readers.folder_config import FolderConfig
 from densify.readers.folder_draft import draft_config
 from densify.readers.street import Street
 from densify.writers import write_street
 from densify.writers.excerpt import Excerpt
+from densify.writers.folder import config_text
 from tests.reader_checks import check_cameras, check_depth, check_sweeps, check_truth
 from tests.test_point_files import write_pcd
 
@@ -59,15 +61,21 @@ def test_depth_is_that_of_the_street(written, excerpt):
 
 def test_scanners_lenses_and_rolling_shutters_are_kept(tmp_path):
     street = Street("static", 0, "panda", cameras=("fisheye", "rolling"))
-    sequence = open_sequence(write_street("folder", street, tmp_path, [60]))
-    sweep, true = sequence[0], street[60]
-    np.testing.assert_array_equal(sweep.lidar, true.lidar)
-    np.testing.assert_allclose(sweep.scanner_origins, true.scanner_origins)
-    for name in street.cameras:
-        read, given = vars(sequence.cameras[name]), vars(street.cameras[name])
-        assert read.keys() == given.keys()
-        for key in read:
-            np.testing.assert_array_equal(read[key], given[key])
+    config(tmp_path, config_text(Excerpt.of(street, [60], None)))
+    read = FolderConfig.read(tmp_path)
+    np.testing.assert_allclose(read.sweeps.scanner_origins, street.simulator.sensor.origins_m)
+    assert read.sweeps.columns[-1] == "lidar"
+    for files in read.cameras:
+        camera = street.cameras[files.camera.name]
+        for key, value in vars(files.camera).items():
+            np.testing.assert_array_equal(value, getattr(camera, key))
+    origins = "scanner_origins: [[0, 0, 0], [1, 0, -0.5]]"
+    config(tmp_path, f"sweeps: {{columns: [x, y, z, lidar], {origins}}}\n")
+    sweep = Folder(
+        bare(tmp_path, ["0.bin"], lambda i: np.column_stack([scan(), np.arange(600) % 2]))
+    )[0]
+    np.testing.assert_array_equal(sweep.lidar, np.arange(600) % 2)
+    np.testing.assert_array_equal(sweep.scanner_origins, [[0, 0, 0], [1, 0, -0.5]])
 
 
 # Without densify.yaml

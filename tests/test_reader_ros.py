@@ -51,12 +51,7 @@ def test_depth_is_that_of_the_street(written, excerpt):
     check_depth(open_sequence(written["ros2"]), excerpt, worse=0.02)
 
 
-def test_lenses_are_kept_and_what_has_no_place_is_refused(tmp_path):
-    street = Street("static", 0, "vlp16", cameras=("fisheye",))
-    sequence = open_sequence(write_street("ros2", street, tmp_path, [60]))
-    camera = sequence.cameras["fisheye"]
-    assert camera.model == "fisheye"
-    np.testing.assert_allclose(camera.distortion, street.cameras["fisheye"].distortion)
+def test_what_has_no_place_in_a_bag_is_refused(tmp_path):
     for spec in ("street?sensor=dual32", "street?sensor=vlp16&cameras=rolling"):
         with pytest.raises(InputError, match="cannot be written as a ROS bag"):
             write_street("ros1", Street.from_spec(spec), tmp_path / "out", [60])
@@ -339,6 +334,18 @@ def test_odometry_is_brought_to_the_lidar(tmp_path):
     place = maker.write(tmp_path / "again")
     with pytest.raises(InputError, match="no poses"):
         open_sequence(f"ros:{place}#poses=none").T_world_lidar(0)
+
+
+def test_several_odometries_are_not_chosen_among(tmp_path):
+    def two(maker, i, stamp_ns):
+        for topic in ("/odom", "/fused"):
+            maker.odometry(at(i), stamp_ns, topic=topic)
+
+    place = driven(two).write(tmp_path)
+    assert (
+        "name one of /fused, /odom: #poses=" in dict(open_sequence(place).findings())["poses from"]
+    )
+    assert open_sequence(f"ros:{place}#poses=/fused").T_world_lidar(0).shape == (4, 4)
 
 
 def test_transforms_are_poses_and_the_smooth_frame_is_the_world(tmp_path):

@@ -50,7 +50,7 @@ from densify.readers.pose_track import PoseTrack
 from densify.readers.ros_bag import Bag, Entry
 from densify.readers.ros_frames import Frames, plain, recorded_track
 from densify.readers.ros_messages import camera_of, cloud_columns, image_rgb
-from densify.readers.ros_topics import Images, Topics
+from densify.readers.ros_topics import POSES, Images, Topics
 from densify.types import Camera, Float
 
 _NUM_TRIED = 5  # sweeps, until one holds points
@@ -202,7 +202,9 @@ class RosBag(FileSequence):
         if found is None and self._topics.poses_named:
             raise InputError(f"{self._bag.path}: /tf: nothing tells where {lidar} was")
         if found is None:
-            return None, f"none: neither Odometry nor /tf tells where {lidar} was"
+            names = ", ".join(topic.name for topic in self._bag.of_type(*POSES))
+            hint = f"; name one of {names}: #poses=" if names else ", and there is no odometry"
+            return None, f"none: /tf does not tell where {lidar} was{hint}"
         return found[1], f"/tf, {found[0]} to {lidar}"
 
     @cached_property

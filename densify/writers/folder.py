@@ -43,7 +43,7 @@ def write_tree(excerpt: Excerpt, out: Path, overwrite: bool, progress: Progress 
             for number in excerpt.image_numbers(name):
                 image = excerpt.encoded_image(name, number)
                 put(folder / "images" / name / f"{exposed_ns[number]}.png", image)
-        put(folder / NAME, _config(excerpt).encode())
+        put(folder / NAME, config_text(excerpt).encode())
         excerpt.write_truth(folder / "truth", stamps_ns)
         if progress:
             progress("simulate", len(excerpt.frames), len(excerpt.frames))
@@ -64,7 +64,8 @@ def _tum(excerpt: Excerpt) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _config(excerpt: Excerpt) -> str:
+def config_text(excerpt: Excerpt) -> str:
+    """The densify.yaml of the excerpt."""
     import yaml
 
     sensor = excerpt.street.simulator.sensor
