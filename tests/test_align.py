@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from densify.flow.tracking.align import GATES_M, MIN_FIT, Model, align, apply, undo
+from densify.flow.surface_matching import GATES_M, apply, undo
+from densify.flow.tracking.align import MIN_FIT, Model, align
 from densify.kernels.clouds import rows_inside, surface_information
 
 CENTRE = np.array([12.0, -3.0, 0.8])

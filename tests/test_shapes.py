@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from densify.flow.tracking.align import apply
+from densify.flow.surface_matching import apply
 from densify.flow.tracking.shapes import Shape
 from densify.flow.tracking.vote import DistanceField
 

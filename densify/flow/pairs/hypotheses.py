@@ -14,6 +14,14 @@ from functools import cached_property
 import numpy as np
 from scipy.spatial import cKDTree
 
+from densify.flow.surface_matching import (
+    GATES_M,
+    MAX_WEIGHT,
+    NUM_NEAR,
+    RIDGE,
+    SURFACE_M,
+    apply,
+)
 from densify.types import Float, Int
 
 _EVEN_M = 0.06
@@ -25,9 +33,6 @@ _VOTE_POINTS, _VOTE_TARGETS = 60, 800
 _NUM_VOTED = 4
 _APART_M = 0.7
 _ALIGN_POINTS = 150
-_GATES_M = (0.8, 0.5, 0.3, 0.2, 0.2)
-_SURFACE_M = 0.05  # noise of a surface point
-_MAX_WEIGHT = 60.0  # neighbours on a surface do not err independently
 _PRECISION = 1 / np.array([1.0, 1.0, 0.08, 0.06]) ** 2  # of m, m from the start; m, rad from zero
 _FROM_START = np.array([1.0, 1.0, 0.0, 0.0])
 
@@ -80,7 +85,7 @@ class RigidMotion:
 
     def carry(self, points: Float, share: float | Float) -> Float:
         """(N,3) points of the object after that share, one or one each, of the motion."""
-        return _carry(points, self.centre, self.state * np.reshape(share, (-1, 1)))
+        return apply(self.state * np.reshape(share, (-1, 1)), points, self.centre)
 
 
 class Surface:
@@ -89,7 +94,7 @@ class Surface:
     def __init__(self, target: PairCloud, rows: Int) -> None:
         self.points, self.lag = target.points[rows], target.lag[rows]
         self.tree = tree_of(target.places(self.points, rows))
-        k = min(12, len(rows))
+        k = min(NUM_NEAR, len(rows))
         tree = self.tree if target.lidar is None else tree_of(self.points)
         _, near = tree.query(self.points, k, workers=-1)
         x = self.points[np.reshape(near, (len(rows), k))]
@@ -98,7 +103,7 @@ class Surface:
         scale = np.trace(covariance, axis1=1, axis2=2)[:, None, None] / 3
         # Capped along the surface: far along it a point still tells a little.
         self.information = np.linalg.inv(
-            covariance + _SURFACE_M**2 * np.eye(3) + 0.02 * scale * np.eye(3)
+            covariance + SURFACE_M**2 * np.eye(3) + RIDGE * scale * np.eye(3)
         )
 
 
@@ -159,14 +164,14 @@ class Hypotheses:
     def seen(self, share: Float) -> Float:
         """(P,3) the points after that share, (P,), of their motions."""
         state = self.state[self.of_point] * share[:, None]
-        return _carry(self.source.points[self.row], self.centre[self.of_point], state)
+        return apply(state, self.source.points[self.row], self.centre[self.of_point])
 
     def align(self, surface: Surface) -> None:
         """Gauss-Newton steps of all states at once. A match lasts from when the source point was
         measured to when the target's was."""
         start = self.state.copy()
         lag = self.source.lag[self.row]
-        for gate_m in np.repeat(_GATES_M, 2):
+        for gate_m in np.repeat(GATES_M, 2):
             place = self.source.places(self.seen(self.share[self.of_point]), self.row)
             far, index = surface.tree.query(place, distance_upper_bound=gate_m, workers=-1)
             far, index = np.asarray(far), np.asarray(index)
@@ -176,7 +181,7 @@ class Hypotheses:
             share[near] = 1 + surface.lag[match] - lag[near]
             weight = (1 - (far[near] / gate_m) ** 2) ** 2
             count = np.bincount(h, minlength=len(self.state))
-            weight *= np.minimum(1.0, _MAX_WEIGHT / np.maximum(count, 1))[h]
+            weight *= np.minimum(1.0, MAX_WEIGHT / np.maximum(count, 1))[h]
             seen = self.seen(share)[near]
             self.state = self.state - _step(
                 seen - surface.points[match],
@@ -244,14 +249,6 @@ def _vote(points: Float, there: Float, n: int) -> Float:
         starts.append(best[None])
         score[np.linalg.norm(place - best, axis=1) < _APART_M] = -1
     return np.concatenate(starts)
-
-
-def _carry(points: Float, centre: Float, state: Float) -> Float:
-    """(N,3) points, (3,) or (N,3), (1,4) or (N,4) -> (N,3)."""
-    arm = points - centre
-    c, s = np.cos(state[:, 3]), np.sin(state[:, 3])
-    turned = np.stack([c * arm[:, 0] - s * arm[:, 1], s * arm[:, 0] + c * arm[:, 1], arm[:, 2]], 1)
-    return turned + centre + state[:, :3]
 
 
 def thinned(rows: Int, num: int) -> Int:

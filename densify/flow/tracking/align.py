@@ -10,17 +10,13 @@ from __future__ import annotations
 
 import numpy as np
 
+from densify.flow.surface_matching import GATES_M, MAX_WEIGHT, NUM_NEAR, RIDGE, SURFACE_M
 from densify.kernels.clouds import surface_information
 from densify.kernels.nearest import BoxTree
 from densify.types import Float
 
-GATES_M = (0.8, 0.5, 0.3, 0.2, 0.2)
 MIN_FIT = 5  # points
 _MAX_MODEL_POINTS = 1500
-_SURFACE_M = 0.05  # noise of a surface point
-_MAX_WEIGHT = 60.0
-_NUM_NEAR = 12
-_RIDGE = 0.02  # of the mean variance, where neighbours lie on a line
 _LOOSE = 10.0  # along the surface: sliding along it must not be held up by its own points
 
 
@@ -37,8 +33,8 @@ class Model:
             points = points[:: len(points) // _MAX_MODEL_POINTS + 1]
         self.points = np.ascontiguousarray(points)
         self.tree = BoxTree(self.points)
-        _, near = self.tree.nearest_k(self.points, min(_NUM_NEAR, len(self.points)))
-        self.information = surface_information(self.points, near, _LOOSE, _SURFACE_M, _RIDGE)
+        _, near = self.tree.nearest_k(self.points, min(NUM_NEAR, len(self.points)))
+        self.information = surface_information(self.points, near, _LOOSE, SURFACE_M, RIDGE)
 
 
 def align(
@@ -50,7 +46,7 @@ def align(
     to start, trusted within ``prediction_std`` (3,) in x y and yaw, and altogether in z. None where
     too few points have a partner.
 
-    Tukey's weights, all together at most ``_MAX_WEIGHT``: neighbours on a surface do not err
+    Tukey's weights, all together at most ``MAX_WEIGHT``: neighbours on a surface do not err
     independently.
     """
     return model.tree.align(
@@ -60,23 +56,6 @@ def align(
         predicted,
         1 / prediction_std**2,
         np.repeat(GATES_M, 2),
-        _MAX_WEIGHT,
+        MAX_WEIGHT,
         MIN_FIT,
     )
-
-
-def apply(state: Float, points: Float, centre: Float) -> Float:
-    """(4,) or (N,4), (N,3) -> (N,3) the object's points in that state."""
-    return _turned(points - centre, state[..., 3]) + centre + state[..., :3]
-
-
-def undo(state: Float, points: Float, centre: Float) -> Float:
-    """Inverse of `apply`."""
-    return _turned(points - centre - state[..., :3], -state[..., 3]) + centre
-
-
-def _turned(arms: Float, yaw: float | Float) -> Float:
-    """(N,3), () or (N,) -> (N,3) about the vertical."""
-    c, s = np.cos(yaw), np.sin(yaw)
-    x, y, z = arms.T
-    return np.stack([c * x - s * y, s * x + c * y, z], axis=1)

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from densify.flow.tracking.align import apply, undo
+from densify.flow.surface_matching import apply, undo
 from densify.flow.tracking.evidence import Standing
 from densify.flow.tracking.looks import Look
 from densify.flow.tracking.paths import Path

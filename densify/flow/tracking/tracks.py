@@ -13,7 +13,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from densify.flow.tracking.align import GATES_M, MIN_FIT, Model, align, apply, undo
+from densify.flow.surface_matching import GATES_M, apply, undo
+from densify.flow.tracking.align import MIN_FIT, Model, align
 from densify.flow.tracking.clock import Clock
 from densify.flow.tracking.evidence import FreeSpace, Standing
 from densify.flow.tracking.lone_rings import in_line, linked_in_line, single_rings
