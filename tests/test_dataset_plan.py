@@ -69,6 +69,12 @@ def test_what_is_no_shard(shard: str, tmp_path: Path, capsys) -> None:
     assert "expected i/n" in capsys.readouterr().err
 
 
+def test_a_tree_of_one_map_per_sweep_says_where_each_image_has_one(tmp_path: Path, capsys) -> None:
+    message = refused(capsys, 2, "dataset", "--per", "image", "--out", tmp_path / "out")
+    assert "--per image" in message and "add --layout densify" in message
+    assert not (tmp_path / "out").exists()
+
+
 def test_more_shards_than_work(border_drive: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     for i in range(1, 5):

@@ -65,8 +65,8 @@ class Recipe:
             raise InputError(f"--window {self.window}: expected 0 to {_LARGEST_WINDOW} sweeps")
         if self.layout == "kitti-depth" and self.config.project.per == "image":
             raise InputError(
-                "--layout kitti-depth: names maps by the frame of their sweep; got "
-                "project.per=image, expected sweep, or --layout densify"
+                "--layout kitti-depth: has one map of a camera for each sweep; got --per image, "
+                "expected --per sweep; to get one for every image, add --layout densify"
             )
         for option, value, known in (
             ("method", self.method, METHODS),
