@@ -26,6 +26,7 @@ _Function = TypeVar("_Function", bound=Callable[..., Any])
 # No fastmath, and divisions as numpy has them: a result is the same on every machine. Wrappers for
 # callers that there are none of would take a tenth of the time that compiling takes.
 _OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
+_NOT_FROM_PYTHON: dict[str, Any] = {"no_cpython_wrapper": True}
 
 
 class _Notice(event.Listener):
@@ -51,7 +52,7 @@ event.register("numba:compile", _notice)
 def inlined(function: _Function) -> _Function:
     """Compiled as a part of the kernels that call it; they must stand in the same file, or a change
     would not be seen by their cached code."""
-    compiled: _Function = numba.njit(no_cpython_wrapper=True, **_OPTIONS)(function)
+    compiled: _Function = numba.njit(**_OPTIONS, **_NOT_FROM_PYTHON)(function)
     return compiled
 
 
