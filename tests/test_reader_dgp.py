@@ -145,6 +145,11 @@ DAMAGE = {
         edit(lambda c: c["names"].__setitem__(1, "other")),
         f"calibration of {CAMERA}",
     ),
+    "a name that is no text": (
+        CALIBRATION,
+        edit(lambda c: c["names"].__setitem__(1, None)),
+        f"calibration of {CAMERA}; got LIDAR, None",
+    ),
     "focal length absent": (CALIBRATION, edit(lambda c: c["intrinsics"][1].pop("fx")), "'fx'"),
     "focal length not finite": (
         CALIBRATION,

@@ -129,6 +129,11 @@ TABLES = {
         lambda p: p.write_text('["now"]'),
         "expected a list of seconds",
     ),
+    "stamps that are no dates": (
+        LIDAR + "timestamps.json",
+        lambda p: edit(p, lambda c: c.__setitem__(1, 1e300)),
+        "they are no dates; expected a list of seconds",
+    ),
     "stamps that go back": (
         LIDAR + "timestamps.json",
         lambda p: edit(p, list.reverse),

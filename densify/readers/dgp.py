@@ -228,7 +228,9 @@ def _read_calibration(file: Path) -> tuple[dict[str, Float], dict[str, Float]]:
 
 def _of_sensor(values: Mapping[str, Float], name: str, file: Path) -> Float:
     if name not in values or not np.isfinite(values[name]).all():
-        raise InputError(f"{file}: no finite calibration of {name}; got {', '.join(values)}")
+        raise InputError(
+            f"{file}: no finite calibration of {name}; got {', '.join(map(str, values))}"
+        )
     return values[name]
 
 

@@ -210,7 +210,8 @@ def quaternion_pose(
             f"{where}: got {quaternion.size} and {translation.size} numbers, expected a quaternion "
             f"w x y z and a translation x y z"
         )
-    length = float(np.linalg.norm(quaternion))
+    with np.errstate(over="ignore"):
+        length = float(np.linalg.norm(quaternion))
     if not (np.isfinite(translation).all() and abs(length - 1) < 0.01):
         raise InputError(
             f"{where}: got a quaternion of length {length:.4g} and the translation "

@@ -46,7 +46,7 @@ from densify.readers.kitti_files import (
 from densify.readers.pose_track import PoseTrack
 from densify.types import Camera, Float
 
-_NUM_ROUNDS = 4  # the azimuth changes by degrees at most
+_NUM_ROUNDS = 3  # the azimuth changes by degrees at most
 
 
 def open_recording(path: Path, scene: str | None) -> KittiOdometry:

@@ -46,6 +46,7 @@ _PLACE_M = np.array([0.777, 0.002, 1.8593])
 PANDAR_GT_M = np.array([0.580, 0.027, -0.294])
 """(3,) where the rays of the PandarGT start, in the Pandar64's frame."""
 
+_LATEST_S = 4e9  # of stamps: the year 2096
 _COLUMNS = ("x", "y", "z", "i", "t", "d")
 
 
@@ -174,8 +175,8 @@ def _stamps_ns(folder: Path) -> Int:
     path = folder / "timestamps.json"
     try:
         stamps_s = np.array(read_json(path), np.float64)
-        if stamps_s.ndim != 1 or not np.isfinite(stamps_s).all():
-            raise ValueError("it is not a plain list of numbers")
+        if stamps_s.ndim != 1 or not (np.abs(stamps_s) < _LATEST_S).all():
+            raise ValueError("it is not a plain list of numbers, or they are no dates")
     except (TypeError, ValueError) as error:
         raise InputError(f"{path}: {error}; expected a list of seconds") from None
     return np.rint(stamps_s * 1e6).astype(np.int64) * 1000

@@ -58,7 +58,10 @@ _RECORDS: dict[str, type[_Record]] = {
 }
 
 
-class _Unpickler(pickle.Unpickler):
+class _Unpickler(pickle._Unpickler):
+    """The one written in Python: a damaged file cannot reach past its buffers, and files have few
+    instructions, whatever their size."""
+
     def find_class(self, module: str, name: str) -> type[_Record]:
         named = f"{module}.{name}"
         if named not in _RECORDS:

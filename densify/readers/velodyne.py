@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import mmap
 import struct
+from array import array
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -121,7 +122,7 @@ class Velodyne(FileSequence):
 
 def _find_packets(path: Path) -> _Packets:
     """Every record of the file whose last bytes are a packet of returns."""
-    found: list[tuple[int, int, int]] = []
+    found = array("q")
     try:
         with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
             if data[:4] not in _PCAP:
@@ -138,7 +139,7 @@ def _find_packets(path: Path) -> _Packets:
                     break  # cut off
                 if _PAYLOAD < size <= _PAYLOAD + _MAX_HEADERS and data[begin : begin + 2] in _FLAGS:
                     azimuth = data[begin + 2] + 256 * data[begin + 3]
-                    found.append((begin, seconds * 10**9 + fraction * unit_ns, azimuth))
+                    found.extend((begin, seconds * 10**9 + fraction * unit_ns, azimuth))
     except (OSError, ValueError) as error:
         raise InputError(f"{path}: not a capture of packets: {error}") from error
     if not found:
@@ -146,7 +147,7 @@ def _find_packets(path: Path) -> _Packets:
             f"{path}: no Velodyne packets (of {_PAYLOAD} bytes); is it an Ouster's? Then put its "
             f"metadata .json beside it"
         )
-    begin, captured_ns, azimuth = np.array(found, np.int64).T
+    begin, captured_ns, azimuth = np.array(found).reshape(-1, 3).T
     return _Packets(begin, captured_ns, azimuth)
 
 
