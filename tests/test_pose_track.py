@@ -53,6 +53,12 @@ def test_one_time_and_no_points(track):
     np.testing.assert_allclose(same, points, atol=1e-9)
 
 
+def test_rows_that_formats_pad_with_stay_zeros(track):
+    points = np.array([[0.0, 0, 0], [5, 0, 0]])
+    fired = track.as_fired(points, 5_200_000_000, np.array([40_000_000, 40_000_000]))
+    assert not fired[0].any() and fired[1, 0] != 5
+
+
 def test_beyond_the_ends(track):
     np.testing.assert_allclose(track.at(5_450_000_000), pose(5_450_000_000), atol=5e-3)
     with pytest.raises(InputError, match=r"poses\.csv: no pose at 5700000000 ns.*0\.30 s away"):

@@ -127,6 +127,20 @@ def test_near_and_far_returns_are_left_out():
     assert np.array_equal(whole.points[sweep.row], sweep.points)
 
 
+def test_ranges_count_from_the_scanner():
+    """Not from the origin of a vehicle's frame, in which the points may be."""
+    forward_m = np.array([4.0, 0, 0])
+
+    class Moved:
+        def __getitem__(self, frame):
+            sweep = tiny()[frame]
+            return replace(sweep, points=sweep.points + forward_m, scanner_origins=forward_m[None])
+
+    settings = RegisterSettings(min_range_m=5, max_range_m=30)
+    moved, here = (read_sweep(sequence, 3, settings) for sequence in (Moved(), tiny()))
+    assert np.array_equal(moved.row, here.row)
+
+
 def test_recorded_poses_are_handed_on():
     sequence = tiny()
     sweeps = [sequence[f] for f in (2, 3, 4)]

@@ -19,7 +19,7 @@ class Sweep:
 
     points: (N,3) metres, lidar frame; as read, each at its own firing time, and after deskewing all
         at ``stamp_ns``.
-    stamp_ns: the reference time, the middle of the revolution.
+    stamp_ns: the reference time, as the data set stamps its sweeps: begin, middle or end.
     intensity: (N,) float32, 0 to 1.
     offset_ns: (N,) int64, firing time minus ``stamp_ns``; None where the data cannot tell.
     lidar: (N,) uint8, which of several scanners in one sweep fired.

@@ -22,6 +22,7 @@ from densify.errors import InputError
 from densify.geometry.poses import inverse, transform
 from densify.readers.argoverse2 import LASERS_PER_SCANNER, POSES, SCANNERS
 from densify.readers.extras import needed
+from densify.street.patterns import Spinning
 from densify.types import Float, Progress
 from densify.writers.excerpt import Excerpt, check_plain_cameras, new_folder, put, quaternion
 
@@ -34,10 +35,12 @@ def write_tree(excerpt: Excerpt, out: Path, overwrite: bool, progress: Progress 
     """See `densify.writers.TreeWriter`. The format has room for two scanners of up to 32 rings, and
     for rectified cameras."""
     street = excerpt.street
-    scanners = street.simulator.sensor.scanners
     check_plain_cameras(excerpt, "Argoverse 2")
-    rings = {f: excerpt.rings(excerpt.returns(f)) for f in excerpt.frames}
-    if len(scanners) > len(SCANNERS) or max(map(np.max, rings.values())) >= LASERS_PER_SCANNER:
+    patterns = [scanner.pattern for scanner in street.simulator.sensor.scanners]
+    if len(patterns) > len(SCANNERS) or not all(
+        isinstance(pattern, Spinning) and len(pattern.elevation_deg) <= LASERS_PER_SCANNER
+        for pattern in patterns
+    ):
         raise InputError(
             f"{street.name}: cannot be written as Argoverse 2, which has two scanners of 32 rings; "
             f"choose dual32, hdl32 or vlp16"
@@ -54,13 +57,14 @@ def write_tree(excerpt: Excerpt, out: Path, overwrite: bool, progress: Progress 
                 progress("simulate", done, len(excerpt.frames))
             returns = excerpt.returns(frame)
             stamp_ns = street.stamp_ns(frame) - half_ns
+            laser = returns.lidar * LASERS_PER_SCANNER + excerpt.rings(returns)
             offset_ns = returns.offset_ns + half_ns
             fired = transform(T_EGO_LIDAR, returns.points.astype(np.float64))
             points = track.compensated(fired, stamp_ns, offset_ns).astype(np.float16)
             columns = {
                 **dict(zip("xyz", points.T, strict=True)),
                 "intensity": np.rint(returns.intensity * 255).astype(np.uint8),
-                "laser_number": (returns.lidar * LASERS_PER_SCANNER + rings[frame]).astype("u1"),
+                "laser_number": laser.astype(np.uint8),
                 "offset_ns": offset_ns.astype(np.int32),
             }
             _put_table(log / "sensors" / "lidar" / f"{stamp_ns}.feather", columns)
