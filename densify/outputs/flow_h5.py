@@ -55,7 +55,8 @@ def _sweep(flow: StretchFlow, frame: int) -> dict[str, Any]:
 
 
 def _flow(flow: StretchFlow, frame: int, following: int) -> dict[str, Any]:
-    """Of a moving point: from where it was measured, as it is stored, to the next sweep's time."""
+    """The flow of a point leads from where it was measured, as it is stored, to the next sweep's
+    time."""
     points, field = flow.stretch[frame].sweep.points, flow.steps[frame, following]
     T = flow.stretch.T_target_source(following, frame)
     return {

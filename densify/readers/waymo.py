@@ -221,7 +221,7 @@ class Waymo(FileSequence):
 
     @cached_property
     def _T_world_vehicle(self) -> dict[int, Float]:
-        """By frame."""
+        """Poses of the vehicle, by frame."""
         name = "[VehiclePoseComponent].world_from_vehicle.transform"
         rows = self._parts.read("vehicle_pose", {STAMP: "i", name: "l"})
         where = self._parts.file("vehicle_pose")

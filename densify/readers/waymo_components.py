@@ -85,7 +85,7 @@ class Image(NamedTuple):
 
 
 def read_lasers(parts: Components) -> dict[int, Laser]:
-    """By number, from 1. Raises InputError if one is malformed."""
+    """The lidars by number, from 1. Raises InputError if one is malformed."""
     head = "[LiDARCalibrationComponent]"
     extrinsic, beams = f"{head}.extrinsic.transform", f"{head}.beam_inclination"
     columns = {LASER: "i", extrinsic: "l", f"{beams}.values": "l"}
