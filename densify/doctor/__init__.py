@@ -66,6 +66,8 @@ def examine(sequence: LidarSequence, config: Config, folder: Path | None = None)
 def registration_of(sample: Sample) -> list[Finding]:
     """Whether odometry can lay the sweeps upon each other."""
     failures = [spot.failure for spot in sample.spots if spot.trajectory is None]
+    if len(sample.timeline.frames) < 2:
+        return [Finding("registration", Verdict.UNKNOWN, failures[0])]
     if not failures:
         speeds = ", ".join(f"{spot.speed_m_s:.1f}" for spot in sample.spots)
         return [Finding("registration", Verdict.FINE, f"odometry finds {speeds} m/s")]

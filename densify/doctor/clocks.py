@@ -20,7 +20,7 @@ _UNITS = {
     "nanoseconds taken for seconds": 1e-9,
 }
 _YEAR_NS = 31_556_952 * 10**9
-_YEARS = (2000 - 1970, 2040 - 1970)
+_YEARS = (1980 - 1970, 2040 - 1970)  # the clock of GPS counts from 1980
 _WHOLE_SWEEP = (0.5, 1.5)  # of a period: from the first to the last point
 
 
@@ -105,7 +105,7 @@ def _year(sample: Sample) -> list[Finding]:
         Finding(
             "date",
             Verdict.SUSPICIOUS,
-            f"the first sweep is stamped in the year {1970 + years:.0f}, expected a date from 2000 "
+            f"the first sweep is stamped in the year {1970 + years:.0f}, expected a date from 1980 "
             f"to 2040 or a clock that starts at 0",
             "nothing, as long as sweeps, images and poses share the clock",
             {"year": 1970 + years},
@@ -119,6 +119,8 @@ def check_point_times(sample: Sample) -> list[Finding]:
     period_s = sample.timeline.period_ns * 1e-9
     findings = []
     sweeps = [spot.sweeps[spot.middle] for spot in sample.spots]
+    if len(sample.timeline.frames) < 2:
+        return []
     if any(s.offset_ns is None for s in sweeps):
         return []  # whether that matters, `check_compensation` says
     for lidar in sorted({int(n) for s in sweeps for n in np.unique(s.lidar)}):
