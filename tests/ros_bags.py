@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from densify.readers.ros_bag import message_types
+
 STAMP_NS = 1_700_000_000_000_000_000
 PERIOD_NS = 100_000_000
 KINDS = {"i1": 1, "u1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "f8": 8}
@@ -18,23 +20,13 @@ class Maker:
     """Messages, and bags of them. suffix: .db3, .mcap or .bag."""
 
     def __init__(self, suffix: str = ".db3") -> None:
-        from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+        from rosbags.typesys import get_types_from_msg
 
         self.is_ros2 = suffix != ".bag"
         self.suffix = suffix
-        self.types = get_typestore(Stores.ROS2_JAZZY if self.is_ros2 else Stores.ROS1_NOETIC)
-        extra = {
-            "tf2_msgs/msg/TFMessage": "geometry_msgs/TransformStamped[] transforms",
-            "velodyne_msgs/msg/VelodyneScan": "std_msgs/Header header\nuint8[] packets",
-            "livox_ros_driver2/msg/CustomPoint": "uint32 offset_time\nfloat32 x\nfloat32 y\n"
-            "float32 z\nuint8 reflectivity\nuint8 tag\nuint8 line",
-            "livox_ros_driver2/msg/CustomMsg": "std_msgs/Header header\nuint64 timebase\n"
-            "uint32 point_num\nuint8 lidar_id\nuint8[3] rsvd\n"
-            "livox_ros_driver2/CustomPoint[] points",
-        }
-        for name, text in extra.items():
-            if name not in self.types.types:
-                self.types.register(get_types_from_msg(text, name))
+        self.types = message_types(self.is_ros2)
+        scan_text = "std_msgs/Header header\nuint8[] packets"
+        self.types.register(get_types_from_msg(scan_text, "velodyne_msgs/msg/VelodyneScan"))
         self.written: list[tuple[int, str, str, Any]] = []
 
     def make(self, type_: str, *values: Any) -> Any:

@@ -111,6 +111,14 @@ def test_layouts_and_times_of_drivers(driver, tmp_path):
     np.testing.assert_allclose(sweep.points[:, 1], scan()["y"], rtol=1e-7)
 
 
+def test_definitions_in_a_bag_are_not_made_code_of(tmp_path, monkeypatch):
+    maker = Maker(".bag")
+    maker.sweeps(2)
+    text = "float32 no_such_field\nimport os"
+    monkeypatch.setattr(maker.types, "generate_msgdef", lambda _: (text, "0" * 32))
+    assert len(open_sequence(maker.write(tmp_path))[1]) == 60
+
+
 def test_padded_points_are_dropped_and_rows_are_the_messages(tmp_path):
     columns = scan()
     for axis, value in zip("xyz", (np.nan, np.nan, np.nan), strict=True):
@@ -601,6 +609,6 @@ def test_stamps_that_drivers_leave_at_zero_are_those_of_the_recording(tmp_path):
 
 
 def test_without_the_package_the_remedy_is_named(written, monkeypatch):
-    monkeypatch.setitem(__import__("sys").modules, "rosbags.highlevel", None)
+    monkeypatch.setitem(__import__("sys").modules, "rosbags.rosbag1", None)
     with pytest.raises(InputError, match=r"pip install 'densify\[ros\]'"):
         open_sequence(written["ros1"])

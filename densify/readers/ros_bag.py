@@ -7,6 +7,7 @@ of a large bag that index is kept in the user's cache. Messages are then read on
 
 from __future__ import annotations
 
+import heapq
 import struct
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -23,6 +24,26 @@ from densify.types import Int
 _LARGE_BYTES = 2**28
 _KEPT_BYTES = 2**30
 _MEND = "a bag that was cut off can be mended: rosbag reindex, ros2 bag reindex, mcap recover"
+
+
+_TRANSFORMS = "geometry_msgs/TransformStamped[] transforms"
+_LIVOX_POINT = """uint32 offset_time
+float32 x
+float32 y
+float32 z
+uint8 reflectivity
+uint8 tag
+uint8 line"""
+_LIVOX = """std_msgs/Header header
+uint64 timebase
+uint32 point_num
+uint8 lidar_id
+uint8[3] rsvd
+{}/CustomPoint[] points"""
+_DEFINITIONS = {"tf2_msgs/msg/TFMessage": _TRANSFORMS, "tf/msg/tfMessage": _TRANSFORMS}
+for _package in ("livox_ros_driver", "livox_ros_driver2", "livox_interfaces"):
+    _DEFINITIONS[f"{_package}/msg/CustomPoint"] = _LIVOX_POINT
+    _DEFINITIONS[f"{_package}/msg/CustomMsg"] = _LIVOX.format(_package)
 
 
 class Entry(NamedTuple):
@@ -51,18 +72,15 @@ class Bag:
         """Raises InputError if it is no bag, or a damaged one."""
         self.path = path
         self._files = bag_files(path)
-        highlevel = needed("rosbags.highlevel", "ros", "ROS bags")
-        typesys = needed("rosbags.typesys", "ros", "ROS bags")
-        known = typesys.get_typestore(typesys.Stores.ROS2_JAZZY)  # of bags without definitions
+        self._is_ros2 = not (self._files[0].suffix == ".bag" and self._files[0].is_file())
+        self._types = message_types(self._is_ros2)
+        package = needed(f"rosbags.rosbag{2 if self._is_ros2 else 1}", "ros", "ROS bags")
         self._lock = RLock()
         try:
-            self._reader = highlevel.AnyReader(self._files, default_typestore=known)
-            self._reader.open()
-            self.topics: Mapping[str, Topic] = {
-                name: Topic(name, info.msgtype or "of several types", info.msgcount)
-                for name, info in sorted(self._reader.topics.items())
-                if info.msgcount
-            }
+            self._readers = [package.Reader(file) for file in self._files]
+            for reader in self._readers:
+                reader.open()
+            self.topics: Mapping[str, Topic] = _topics(self._readers)
         except Exception as error:  # a damaged bag makes the parser raise anything
             raise self._unreadable(error) from error
 
@@ -105,7 +123,7 @@ class Bag:
             before = found[topic][-1] if found[topic] else None
             turn = before.turn + 1 if before is not None and before.log_ns == log_ns else 0
             try:
-                stamp_ns = _stamp_ns(raw, self._reader.is2)
+                stamp_ns = _stamp_ns(raw, self._is_ros2)
             except struct.error:
                 raise InputError(f"{self.path}: {topic}: a message of {len(raw)} bytes") from None
             found[topic].append(Entry(stamp_ns or log_ns, log_ns, turn))
@@ -114,19 +132,23 @@ class Bag:
     def _messages(
         self, topics: Sequence[str], start_ns: int | None = None, stop_ns: int | None = None
     ) -> Iterator[tuple[str, int, bytes, str]]:
-        wanted = [c for c in self._reader.connections if c.topic in topics]
+        parts = []
+        for reader in self._readers:
+            wanted = [c for c in reader.connections if c.topic in topics]
+            if wanted:  # none would mean all
+                parts.append(reader.messages(wanted, start_ns, stop_ns))
         with self._lock:
             try:
-                for connection, log_ns, raw in self._reader.messages(wanted, start_ns, stop_ns):
+                for connection, log_ns, raw in heapq.merge(*parts, key=lambda part: part[1]):
                     yield connection.topic, log_ns, raw, connection.msgtype
-            except InputError:
-                raise
             except Exception as error:  # as above
                 raise self._unreadable(error) from error
 
     def _decoded(self, raw: bytes, type_: str, topic: str) -> Any:
         try:
-            return self._reader.deserialize(raw, type_)
+            if self._is_ros2:
+                return self._types.deserialize_cdr(raw, type_)
+            return self._types.deserialize_ros1(raw, type_)
         except Exception as error:  # as above
             raise InputError(
                 f"{self.path}: {topic}: a message of {len(raw)} bytes is no whole {type_} "
@@ -141,6 +163,32 @@ class Bag:
     def _unreadable(self, error: Exception) -> InputError:
         reason = " ".join(str(error).split()) or type(error).__name__
         return InputError(f"{self.path}: not a whole bag: {reason}; {_MEND}")
+
+
+def message_types(is_ros2: bool) -> Any:
+    """The messages that are read and written, as ROS defines them, and never as a bag does: rosbags
+    makes code of definitions."""
+    typesys = needed("rosbags.typesys", "ros", "ROS bags")
+    stores = typesys.Stores
+    types = typesys.get_typestore(stores.ROS2_JAZZY if is_ros2 else stores.ROS1_NOETIC)
+    for name, text in _DEFINITIONS.items():
+        if name not in types.types:
+            types.register(typesys.get_types_from_msg(text, name))
+    return types
+
+
+def _topics(readers: Sequence[Any]) -> dict[str, Topic]:
+    """Those with messages, of all parts of the recording, by name."""
+    found: dict[str, Topic] = {}
+    for reader in readers:
+        for connection in reader.connections:
+            name, before = connection.topic, found.get(connection.topic)
+            num = connection.msgcount + (before.num_messages if before else 0)
+            same = before is None or before.type == connection.msgtype
+            type_ = connection.msgtype if same else "of several types"
+            if num:
+                found[name] = Topic(name, type_, num)
+    return dict(sorted(found.items()))
 
 
 def bag_files(path: Path) -> list[Path]:

@@ -22,6 +22,7 @@ import numpy as np
 from densify.errors import InputError
 from densify.geometry.poses import inverse
 from densify.readers.extras import needed
+from densify.readers.ros_bag import message_types
 from densify.street.sensors import SENSORS
 from densify.types import Camera, Float, Progress
 from densify.writers.excerpt import Excerpt, new_folder, quaternion
@@ -38,7 +39,6 @@ _POINT = np.dtype(
 )
 _DATATYPES = {"<f4": 7, "<u4": 6}
 _POSE_STEP_NS = 10_000_000
-_TRANSFORMS = "geometry_msgs/TransformStamped[] transforms"
 
 
 class _Message(NamedTuple):
@@ -56,11 +56,7 @@ def write_bag(
     """See `densify.writers.TreeWriter`; the bag and its truth are in the folder ``place``. The
     format has room for a single scanner, and for cameras without rolling shutters."""
     _check(excerpt)
-    typesys = needed("rosbags.typesys", "ros", "ROS bags")
-    stores = typesys.Stores
-    types = typesys.get_typestore(stores.ROS2_JAZZY if is_ros2 else stores.ROS1_NOETIC)
-    if not is_ros2:
-        types.register(typesys.get_types_from_msg(_TRANSFORMS, "tf2_msgs/msg/TFMessage"))
+    types = message_types(is_ros2)
     street = excerpt.street
     half_ns = street.simulator.period_ns // 2
     messages = _Messages(excerpt, types.types, is_ros2)
