@@ -113,7 +113,8 @@ def _add_flow(commands: Any) -> None:
         about,
         "Point files: .npy (N,3 or more columns), .npz (array 'points'), .txt and .csv (columns), "
         ".bin (KITTI: float32 x y z reflectance), .pcd, .ply, .las, .laz. Where both are .npz and "
-        "hold when each point was measured ('offset_ns', or 'time' in seconds) or by which scanner ('lidar'), that is used. "
+        "hold when each point was measured ('offset_ns', or 'time' in seconds) or by which "
+        "scanner ('lidar'), that is used. "
         "The result holds 'residual_flow' (N,3) float32 metres, "
         "'moving' (N,) bool, 'instance' (N,) int32 (-1 none) and 'lost' (N,) bool, row by row as "
         "SOURCE.",
