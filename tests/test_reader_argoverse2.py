@@ -10,9 +10,13 @@ import pytest
 
 from densify.errors import InputError
 from densify.geometry.poses import inverse, transform
+from densify.geometry.sensor import Sensors
 from densify.readers import open_sequence
 from densify.readers.argoverse2 import Argoverse2
 from densify.readers.street import Street
+from densify.readers.window import recorded_trajectory
+from densify.registration.deskew import deskew
+from densify.street.sensors import SENSORS
 from densify.writers import write_street
 from densify.writers.argoverse2 import T_EGO_LIDAR
 from densify.writers.excerpt import Excerpt
@@ -123,7 +127,7 @@ def first(value):
     return lambda values: [value, *values[1:]]
 
 
-POSES, SENSORS = "city_SE3_egovehicle.feather", "calibration/egovehicle_SE3_sensor.feather"
+POSES, CALIBRATION = "city_SE3_egovehicle.feather", "calibration/egovehicle_SE3_sensor.feather"
 INTRINSICS, SWEEP, IMAGE = "calibration/intrinsics.feather", "*.feather", "*.jpg"
 TABLES = {
     "poses missing": (POSES, lambda p: p.unlink(), "no Argoverse 2 log"),
@@ -139,14 +143,14 @@ TABLES = {
     ),
     "quaternion not of unit length": (POSES, lambda p: change(p, "qw", first(7.0)), "unit quatern"),
     "one pose": (POSES, lambda p: feather.write_feather(table_of(p)[:1], p), "two or more"),
-    "sensors missing": (SENSORS, lambda p: p.unlink(), "no such file"),
+    "sensors missing": (CALIBRATION, lambda p: p.unlink(), "no such file"),
     "scanner missing": (
-        SENSORS,
+        CALIBRATION,
         lambda p: change(p, "sensor_name", lambda v: ["top", *v[1:]]),
         "no sensor up_lidar",
     ),
     "camera without a pose": (
-        SENSORS,
+        CALIBRATION,
         lambda p: change(p, "sensor_name", lambda v: [*v[:-1], "other"]),
         "no pose",
     ),
@@ -219,6 +223,18 @@ def test_without_the_package_the_remedy_is_named(log, monkeypatch):
 
 
 # A real log
+
+
+def test_both_real_scanners_have_their_rings(test_data):
+    """The lower one hangs upside down; 0.06 degrees off the vehicle's axes tear its rings apart."""
+    sequence = open_sequence(test_data / REAL)
+    sweeps = [sequence[frame] for frame in sequence.frames]
+    trajectory = recorded_trajectory(sequence, sweeps)
+    models = Sensors.of(deskew(sweeps, trajectory).sweeps).models
+    rings_deg = [np.degrees(models[lidar].rings_rad) for lidar in (0, 1)]
+    vlp32_deg = np.sort(SENSORS["dual32"].scanners[0].pattern.elevation_deg)
+    np.testing.assert_allclose(rings_deg[0], vlp32_deg, atol=0.03)
+    np.testing.assert_allclose(rings_deg[1], -vlp32_deg[::-1], atol=0.03)
 
 
 def test_a_real_log(test_data):

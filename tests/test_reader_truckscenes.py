@@ -105,6 +105,8 @@ def test_lidars_are_one_sweep_in_the_vehicles_frame(root):
         sweep = sequence[number]
         assert sweep.stamp_ns == (START_US + number * 100_000) * 1000
         np.testing.assert_allclose(sweep.scanner_origins, [[5, 1.3, 2], [5, -1.3, 2]])
+        for axes, T in zip(sweep.R_scanner_lidar, T_EGO_LIDAR.values(), strict=True):
+            np.testing.assert_allclose(axes @ T[:3, :3], np.eye(3), atol=1e-9)
         for index, (channel, T) in enumerate(T_EGO_LIDAR.items()):
             mine = sweep.select(sweep.lidar == index)
             columns = points_of(channel, number)

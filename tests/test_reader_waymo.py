@@ -270,6 +270,7 @@ def test_five_lidars_and_both_returns(copy):
     np.testing.assert_allclose(mine.points, expected, atol=1e-5)
     assert len(mine) == 39 + 32 and not mine.offset_ns.any()
     np.testing.assert_allclose(sweep.scanner_origins[3], T[:3, 3])
+    np.testing.assert_allclose(sweep.R_scanner_lidar[3], T[:3, :3].T)
 
 
 # Damage

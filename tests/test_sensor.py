@@ -8,9 +8,12 @@ from functools import cache
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from densify.errors import InputError
+from densify.geometry.range_image import RangeImage
 from densify.geometry.sensor import SensorModel, Sensors, aimed
+from densify.readers.file_sequence import scanner_axes
 from densify.street.patterns import Spinning
 from densify.street.sensors import SENSORS
 from densify.types import RegisteredSweep, Sweep
@@ -38,6 +41,64 @@ def sensors_of(name: str) -> Sensors:
 
 def pattern_of(name: str, number: int = 0):
     return SENSORS[name].scanners[number].pattern
+
+
+# --- where scanners stand, and lean ---------------------------------------------------------------
+
+
+def in_another_frame(registered: RegisteredSweep, R: np.ndarray) -> RegisteredSweep:
+    """The same sweep in a lidar frame whose axes are turned; the scanners keep theirs."""
+    sweep = registered.sweep
+    turned = replace(
+        sweep,
+        points=sweep.points @ R.T,
+        scanner_origins=sweep.scanner_origins @ R.T,
+        R_scanner_lidar=np.stack([R.T] * len(sweep.scanner_origins)),
+    )
+    twists = [
+        (t.reshape(2, 3) @ R.T).ravel() for t in (registered.twist_before, registered.twist_after)
+    ]
+    T_world_lidar = registered.T_world_lidar.copy()
+    T_world_lidar[:3, :3] = T_world_lidar[:3, :3] @ R.T
+    return RegisteredSweep(turned, T_world_lidar, *twists)
+
+
+@pytest.mark.parametrize("name", ["dual32", "panda"])
+def test_the_axes_of_the_frame_do_not_matter(name):
+    """Taken for the scanner's, they would tear its rings apart."""
+    R = Rotation.from_euler("xyz", [4.0, -3.0, 20.0], degrees=True).as_matrix()
+    here = sweeps_of(name)[0]
+    there = in_another_frame(here, R)
+    model, turned = (SensorModel.of([s], 0) for s in (here, there))
+    np.testing.assert_allclose(turned.rings_rad, model.rings_rad, atol=2e-4)
+    np.testing.assert_allclose(turned.axes @ turned.origin_m, model.origin_m, atol=1e-9)
+    leaning = replace(there, sweep=replace(there.sweep, R_scanner_lidar=None))
+    assert SensorModel.of([leaning], 0).rings_rad is None
+    points = here.sweep.points * np.random.default_rng(0).uniform(0.5, 1.3, (len(here.sweep), 1))
+    free = [
+        RangeImage.of(s).sees_through(p, 0.3, 0.02)
+        for s, p in ((here, points), (there, points @ R.T))
+    ]
+    assert free[0].mean() > 0.2 and (free[0] == free[1]).mean() > 0.995
+    azimuth = [m.directions(p) for m, p in ((model, points), (turned, points @ R.T))]
+    for ours, theirs in zip(*azimuth, strict=True):
+        np.testing.assert_allclose(ours, theirs, atol=1e-9)
+
+
+def test_a_scanner_that_hangs_upside_down_has_axes_with_z_upwards():
+    T = np.tile(np.eye(4), (2, 1, 1))
+    tilt = Rotation.from_euler("y", 3.0, degrees=True).as_matrix()
+    T[0, :3, :3] = tilt
+    T[1, :3, :3] = tilt @ np.diag([1.0, -1.0, -1.0])
+    axes = scanner_axes(T)
+    np.testing.assert_allclose(axes[0] @ tilt, np.eye(3), atol=1e-12)
+    np.testing.assert_allclose(axes[1], axes[0], atol=1e-12)
+
+
+@pytest.mark.parametrize("shape", [(3, 3), (1, 3, 3), (2, 4, 4)])
+def test_every_scanner_has_axes_or_none(shape):
+    with pytest.raises(ValueError, match=r"a rotation .3,3. for each of 2 scanners"):
+        replace(sweeps_of("dual32")[0].sweep, R_scanner_lidar=np.zeros(shape))
 
 
 # --- rings ----------------------------------------------------------------------------------------

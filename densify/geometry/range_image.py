@@ -88,7 +88,8 @@ class ScannerImage:
     is faced may differ from the first guess: more is the seam of the turn. nearest_m: (R,C)
     float32, nearest return within the 3 x 3 cells around each cell, inf if none. num_filled: (R,C)
     uint8, how many of those nine hold a return. row_edges_rad: (R+1,) float32 ascending elevations.
-    origin_m: (3,) float32 of the scanner in the lidar frame. twists: (2,6) float32, the sweep's
+    origin_m: (3,) float32 of the scanner in the lidar frame. axes: (3,3) float32 from the lidar
+    frame's to its own, and whether they differ. twists: (2,6) float32, the sweep's
     before and after its reference time.
     """
 
@@ -99,6 +100,8 @@ class ScannerImage:
     num_filled: NDArray[np.uint8]
     row_edges_rad: Float32
     origin_m: Float32
+    axes: Float32
+    turned: np.bool_
     twists: Float32
 
     @staticmethod
@@ -128,6 +131,8 @@ class ScannerImage:
                 num_filled=num_filled,
                 row_edges_rad=row_edges_rad,
                 origin_m=origin_m,
+                axes=registered.sweep.axes(lidar).astype(np.float32),
+                turned=np.bool_(registered.sweep.R_scanner_lidar is not None),
                 twists=twists,
             )
 
@@ -156,6 +161,8 @@ class ScannerImage:
             self.num_filled,
             self.row_edges_rad,
             self.origin_m,
+            self.axes,
+            self.turned,
             self.twists,
         )
 

@@ -68,6 +68,8 @@ def aimed(registered: RegisteredSweep, lidar: int) -> Aimed:
         sweep.points[mine].astype(np.float32),
         offset_s,
         sweep.origin_m(lidar).astype(np.float32),
+        sweep.axes(lidar).astype(np.float32),
+        sweep.R_scanner_lidar is not None,
         np.stack([registered.twist_before, registered.twist_after]).astype(np.float32),
         seen,
     )
@@ -128,7 +130,8 @@ class RayGrid(NamedTuple):
 class SensorModel:
     """One scanner.
 
-    origin_m: (3,) lidar frame, where its rays start. rings_rad: (K,) true elevation of every ring,
+    origin_m: (3,) lidar frame, where its rays start. axes: (3,3) from the lidar frame's to its own,
+    in which its angles are. rings_rad: (K,) true elevation of every ring,
     ascending, however close they lie; None where there are no distinct rings. unordered: nor are
     there lines. azimuth_step_rad: between rays of a ring or line; of an unordered scanner between
     rays where most are. elevation_rad: (2,) the lowest and the highest ray. azimuth_rad: (2,) the
@@ -137,6 +140,7 @@ class SensorModel:
     """
 
     origin_m: Float
+    axes: Float
     rings_rad: Float | None
     unordered: bool
     azimuth_step_rad: float
@@ -176,6 +180,7 @@ class SensorModel:
                 table = _table_of_lines(seen, step_rad)
         return SensorModel(
             origin_m=chosen[0].sweep.origin_m(lidar),
+            axes=chosen[0].sweep.axes(lidar),
             rings_rad=rings,
             unordered=unordered,
             azimuth_step_rad=step_rad,
@@ -206,7 +211,8 @@ class SensorModel:
     def directions(self, points: Float) -> tuple[Float, Float, Float]:
         """(N,3) lidar frame -> azimuth, elevation (rad) and range (m), (N,) each, from its
         origin."""
-        x, y, z = (points - self.origin_m).T
+        away = points - self.origin_m
+        x, y, z = (away if np.array_equal(self.axes, np.eye(3)) else away @ self.axes.T).T
         level = np.hypot(x, y)
         return np.arctan2(y, x), np.arctan2(z, level), np.hypot(level, z)
 

@@ -33,6 +33,8 @@ class Tables(NamedTuple):
     num_filled: NDArray[np.uint8]
     row_edges_rad: Float32
     origin_m: Float32
+    axes: Float32
+    turned: np.bool_
     twists: Float32
 
 
@@ -93,17 +95,30 @@ def _at_time(x, y, z, time_s, twists):  # type: ignore[no-untyped-def]
     )
 
 
+@inlined
+def _turn(x, y, z, R):  # type: ignore[no-untyped-def]
+    """Into other axes."""
+    return (
+        R[0, 0] * x + R[0, 1] * y + R[0, 2] * z,
+        R[1, 0] * x + R[1, 1] * y + R[1, 2] * z,
+        R[2, 0] * x + R[2, 1] * y + R[2, 2] * z,
+    )
+
+
 @Kernel
-def aim(begin, end, points, offset_s, origin, twists, rays):  # type: ignore[no-untyped-def]
+def aim(begin, end, points, offset_s, origin, axes, turned, twists, rays):  # type: ignore[no-untyped-def]
     """The rays that measured a deskewed scanner's points, seen from it when it fired them.
 
     points: (N,3) lidar frame at the reference time. offset_s: (N,). origin: (3,) of the scanner.
-    twists: (2,6) before and after the reference time. rays: (3,N), filled with azimuth and
-    elevation (rad) and range (m). All float32.
+    axes: (3,3) from the lidar frame's to the scanner's, if turned. twists: (2,6) before and after
+    the reference time. rays: (3,N), filled with azimuth and elevation (rad) and range (m). All
+    float32.
     """
     for i in range(begin, end):
         x, y, z = _at_time(points[i, 0], points[i, 1], points[i, 2], offset_s[i], twists)
         x, y, z = x - origin[0], y - origin[1], z - origin[2]
+        if turned:
+            x, y, z = _turn(x, y, z, axes)
         ground = np.sqrt(x * x + y * y)
         rays[0, i] = _azimuth(x, y)
         rays[1, i] = _azimuth(ground, z)
@@ -202,6 +217,8 @@ def see_through(begin, end, points, velocity, image, margins, min_filled, free):
             x[k] = points[start + k, 0] - origin[0]
             y[k] = points[start + k, 1] - origin[1]
             z[k] = points[start + k, 2] - origin[2]
+            if image.turned:
+                x[k], y[k], z[k] = _turn(x[k], y[k], z[k], image.axes)
         for _ in range(2):  # when did the scanner face the point? converges in two steps
             for k in range(size):
                 column[k] = _column(_azimuth(x[k], y[k]), num_columns)
@@ -218,6 +235,8 @@ def see_through(begin, end, points, velocity, image, margins, min_filled, free):
                     pz += t * velocity[i, 2]
                 px, py, pz = _at_time(px, py, pz, t, image.twists)
                 x[k], y[k], z[k], time_s[k] = px - origin[0], py - origin[1], pz - origin[2], t
+                if image.turned:
+                    x[k], y[k], z[k] = _turn(x[k], y[k], z[k], image.axes)
         for k in range(size):
             column[k] = _column(_azimuth(x[k], y[k]), num_columns)
         for k in range(size):

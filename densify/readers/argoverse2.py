@@ -13,7 +13,8 @@ carried by the vehicle's own motion to the file's stamp, which is the *start* of
 elevations then spread by 0.003 degrees instead of 0.06), so that the pipeline sees each point
 where and when it was measured. Coordinates are float16: 3 cm apart beyond 32 m.
 
-Two scanners turn half a revolution apart: lasers 0 to 31 are ``up_lidar``, 32 to 63 ``down_lidar``
+Two scanners, the lower one upside down and their axes a few hundredths of a degree apart, turn half
+a revolution apart: lasers 0 to 31 are ``up_lidar``, 32 to 63 ``down_lidar``
 (https://github.com/argoverse/av2-api/issues/77; the rings say the same). Images are undistorted
 already, so that k1 to k3 of the intrinsics do not apply; their stamps are taken for those of the
 exposure. The world is the city's frame. Frames and images are numbered from 0 in the order of time.
@@ -33,6 +34,7 @@ from densify.readers.file_sequence import (
     Returns,
     chosen_scene,
     quaternion_pose,
+    scanner_axes,
     truth_beside,
 )
 from densify.readers.files import numbered_files, read_bytes
@@ -88,7 +90,8 @@ class Argoverse2(FileSequence):
                 f"{log / 'calibration' / 'egovehicle_SE3_sensor.feather'}: no sensor "
                 f"{' and '.join(missing)}; got {', '.join(self._T_ego_sensor)}"
             )
-        self._origins = np.stack([self._T_ego_sensor[name][:3, 3] for name in SCANNERS])
+        T_ego_scanner = np.stack([self._T_ego_sensor[name] for name in SCANNERS])
+        self._origins, self._axes = T_ego_scanner[:, :3, 3], scanner_axes(T_ego_scanner)
         cameras = _cameras(log, self._T_ego_sensor)
         images = {
             name: numbered_files(log / "sensors" / "cameras" / name, ".jpg", ".png")
@@ -128,6 +131,7 @@ class Argoverse2(FileSequence):
             offset_ns,
             (laser // LASERS_PER_SCANNER).astype(np.uint8),
             self._origins,
+            self._axes,
         )
 
     def _encoded_image(self, camera: str, number: int) -> tuple[Path, bytes]:

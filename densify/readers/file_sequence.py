@@ -32,6 +32,8 @@ class Returns:
     there is none. offset_ns: (N,) int64 since the sweep's reference time, None where the data
     cannot tell. lidar: (N,) uint8, which of several scanners fired, None if there is one.
     scanner_origins: (S,3) metres, lidar frame, None where all rays start at the frame's origin.
+    R_scanner_lidar: (S,3,3) from the lidar frame's axes to each scanner's, z upwards along the one
+    it spins about, None where they are the frame's.
     """
 
     points: Float
@@ -39,6 +41,7 @@ class Returns:
     offset_ns: Int | None = None
     lidar: NDArray[np.uint8] | None = None
     scanner_origins: Float | None = None
+    R_scanner_lidar: Float | None = None
 
 
 class FileSequence(ABC):
@@ -118,6 +121,7 @@ class FileSequence(ABC):
             lidar=(np.zeros(len(row)) if lidar is None else lidar[row]).astype(np.uint8),
             row=row.astype(np.int64),
             scanner_origins=returns.scanner_origins,
+            R_scanner_lidar=returns.R_scanner_lidar,
         )
 
     def image_stamps_ns(self, camera: str) -> Mapping[int, int]:
@@ -190,6 +194,14 @@ def rigid(T: Float, where: str) -> Float:
             f"determinant {np.linalg.det(R):.3f}), expected an orthonormal one"
         )
     return np.vstack([T[:3], [0.0, 0.0, 0.0, 1.0]])
+
+
+def scanner_axes(T_lidar_scanner: Float) -> Float:
+    """(S,4,4) how scanners are mounted -> (S,3,3) `Returns.R_scanner_lidar`: one that hangs upside
+    down is turned about its x axis, so that z is upwards."""
+    R = T_lidar_scanner[:, :3, :3]
+    upright = np.where(R[:, 2:, 2:] < 0, R * [1.0, -1.0, -1.0], R)
+    return np.ascontiguousarray(upright.transpose(0, 2, 1))
 
 
 def quaternion_pose(

@@ -32,7 +32,14 @@ from numpy.typing import NDArray
 
 from densify.errors import InputError
 from densify.readers.extras import needed
-from densify.readers.file_sequence import FileSequence, Returns, chosen_scene, rigid, truth_beside
+from densify.readers.file_sequence import (
+    FileSequence,
+    Returns,
+    chosen_scene,
+    rigid,
+    scanner_axes,
+    truth_beside,
+)
 from densify.readers.pose_track import PoseTrack
 from densify.types import Float, Float32
 
@@ -157,7 +164,7 @@ class OpenSceneFlow(FileSequence):
 
     def _returns(self, frame: int) -> tuple[Path, Returns]:
         read, name = self._file.array, self._file.names[frame]
-        offset_ns = lidar = origins = None
+        offset_ns = lidar = origins = axes = None
         with self._file.opened() as file:
             group = file[name]
             rows = read(group, "lidar", (None, None))
@@ -177,7 +184,7 @@ class OpenSceneFlow(FileSequence):
             if "lidar_id" in group:
                 lidar = read(group, "lidar_id", (num,), "fiu").astype(np.uint8)
             if "lidar_center" in group:
-                origins = _origins(np.asarray(group["lidar_center"]))
+                origins, axes = _mounts(np.asarray(group["lidar_center"]))
         points = rows[:, :3].astype(np.float64)
         if lidar is not None and origins is not None and lidar.max(initial=0) >= len(origins):
             raise InputError(
@@ -189,16 +196,17 @@ class OpenSceneFlow(FileSequence):
         intensity: Float32 | None = None
         if rows.shape[1] > 3:
             intensity = np.clip(rows[:, 3] / 255, 0, 1).astype(np.float32)
-        return self.where, Returns(points, intensity, offset_ns, lidar, origins)
+        return self.where, Returns(points, intensity, offset_ns, lidar, origins, axes)
 
     def _pose(self, frame: int) -> Float:
         return self._file.poses[frame]
 
 
-def _origins(places: NDArray[Any]) -> Float | None:
-    """(S,3) of poses or points."""
+def _mounts(places: NDArray[Any]) -> tuple[Float | None, Float | None]:
+    """Origins (S,3) and axes (S,3,3) of poses, or origins of points."""
     if places.ndim == 3 and places.shape[1:] == (4, 4):
-        return places[:, :3, 3].astype(np.float64)
+        T = places.astype(np.float64)
+        return T[:, :3, 3], scanner_axes(T)
     if places.ndim == 2 and places.shape[1] == 3:
-        return places.astype(np.float64)
-    return None
+        return places.astype(np.float64), None
+    return None, None

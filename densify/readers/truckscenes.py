@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from densify.errors import InputError
 from densify.geometry.poses import transform
-from densify.readers.file_sequence import Returns
+from densify.readers.file_sequence import Returns, scanner_axes
 from densify.readers.nuscenes_scene import Channel, Scene, SceneSequence
 from densify.readers.point_fields import full_scale, scaled
 from densify.readers.point_files import read_table
@@ -46,15 +46,16 @@ class TruckScenes(SceneSequence):
 
     def _returns(self, frame: int) -> tuple[Path, Returns]:
         stamp_ns = self._lidar.stamps_ns[frame]
-        parts, origins = [], []
+        parts, places = [], []
         for number, channel in enumerate(self._scene.lidars.values()):
             near = int(np.argmin(np.abs(np.array(channel.stamps_ns) - stamp_ns)))
-            origins.append(channel.T_ego_sensor[near][:3, 3])
+            places.append(channel.T_ego_sensor[near])
             if abs(channel.stamps_ns[near] - stamp_ns) <= self._period_ns / 2:
                 parts.append(self._scanner(channel, number, near, stamp_ns))
         points, intensity, offset_ns, lidar = (np.concatenate(c) for c in zip(*parts, strict=True))
         path = self._file(self._lidar.records[frame])
-        return path, Returns(points, intensity, offset_ns, lidar, np.stack(origins))
+        T = np.stack(places)
+        return path, Returns(points, intensity, offset_ns, lidar, T[:, :3, 3], scanner_axes(T))
 
     def _scanner(
         self, channel: Channel, number: int, near: int, stamp_ns: int

@@ -38,7 +38,13 @@ import numpy as np
 
 from densify.errors import InputError
 from densify.geometry.poses import inverse, transform
-from densify.readers.file_sequence import FileSequence, Returns, chosen_scene, truth_beside
+from densify.readers.file_sequence import (
+    FileSequence,
+    Returns,
+    chosen_scene,
+    scanner_axes,
+    truth_beside,
+)
 from densify.readers.files import of_frame
 from densify.readers.pose_track import PoseTrack
 from densify.readers.waymo_components import (
@@ -139,16 +145,19 @@ class Waymo(FileSequence):
             intensity.append(np.tanh(image[..., 1].ravel()))
             offset_ns.append(self._offset_ns(frame, laser, images[laser, 1]).ravel())
             lidar.append(np.full(len(met), laser - 1, np.uint8))
-        places = [
-            self._lasers[laser].T_vehicle_laser[:3, 3] if laser in self._lasers else np.zeros(3)
-            for laser in range(1, len(LASERS) + 1)
-        ]
+        T = np.stack(
+            [
+                self._lasers[laser].T_vehicle_laser if laser in self._lasers else np.eye(4)
+                for laser in range(1, len(LASERS) + 1)
+            ]
+        )
         return path, Returns(
             np.concatenate(points),
             np.concatenate(intensity).astype(np.float32),
             np.concatenate(offset_ns),
             np.concatenate(lidar),
-            np.stack(places),
+            T[:, :3, 3],
+            scanner_axes(T),
         )
 
     def _range_images(self, frame: int) -> dict[tuple[int, int], Float]:

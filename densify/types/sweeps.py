@@ -25,7 +25,8 @@ class Sweep:
     lidar: (N,) uint8, which of several scanners in one sweep fired.
     row: (N,) int64, row of the return in the source file (invalid rows are dropped on reading).
     scanner_origins: (S,3) metres, lidar frame, where the rays of each scanner start; None where all
-        start at the frame's origin.
+        start at the frame's origin. R_scanner_lidar: (S,3,3) turns the lidar frame's axes into each
+    scanner's, z along the one it spins about, upwards; None where they are the frame's.
     """
 
     frame: int
@@ -36,6 +37,7 @@ class Sweep:
     lidar: NDArray[np.uint8]
     row: Int
     scanner_origins: Float | None = None
+    R_scanner_lidar: Float | None = None
 
     def __post_init__(self) -> None:
         n = len(self.points)
@@ -43,8 +45,15 @@ class Sweep:
             column = getattr(self, name)
             if column is not None and column.shape != (n,):
                 raise ValueError(f"Sweep.{name}: expected ({n},), got {column.shape}")
+        num_scanners = int(self.lidar.max(initial=0)) + 1
+        if self.R_scanner_lidar is not None:
+            shape = self.R_scanner_lidar.shape
+            if len(shape) != 3 or shape[1:] != (3, 3) or shape[0] < num_scanners:
+                raise ValueError(
+                    f"Sweep.R_scanner_lidar: expected a rotation (3,3) for each of {num_scanners} "
+                    f"scanners, got {shape}"
+                )
         if self.scanner_origins is not None:
-            num_scanners = int(self.lidar.max(initial=0)) + 1
             shape = self.scanner_origins.shape
             if len(shape) != 2 or shape[1] != 3 or shape[0] < num_scanners:
                 raise ValueError(
@@ -65,6 +74,10 @@ class Sweep:
             lidar=self.lidar[keep],
             row=self.row[keep],
         )
+
+    def axes(self, lidar: int) -> Float:
+        """(3,3) from the lidar frame's axes to that scanner's."""
+        return np.eye(3) if self.R_scanner_lidar is None else self.R_scanner_lidar[lidar]
 
     def origin_m(self, lidar: int) -> Float:
         """(3,) where the rays of that scanner start, lidar frame."""
