@@ -76,7 +76,7 @@ def check_axes(sample: Sample) -> list[Finding]:
         return [
             Finding("axes", Verdict.UNKNOWN, "no ground was found along any axis", values=values)
         ]
-    if best == "z" or level[best] < _CLEARLY * level["z"]:
+    if level["z"] >= _LEAST_LEVEL or level[best] < _CLEARLY * level["z"]:
         return [Finding("axes", Verdict.FINE, text, values=values)]
     means = f" ({_UP_MEANS[best]})" if best in _UP_MEANS else ""
     return [
