@@ -247,8 +247,8 @@ def test_a_real_log(test_data):
         sweep.scanner_origins, [[1.35018, 0, 1.64042], [1.34676, 0.00457, 1.52550]], atol=1e-5
     )
     assert 0.4 < sweep.intensity.max() <= 1 and set(sweep.lidar) == {0, 1}
-    # The file's first row, carried back by the 6 m/s and 2.7 ms since the stamp, by hand:
-    # the vehicle was 1.6 mm farther back then, so that the point was 1.6 mm farther ahead ...
+    # The file's first row was fired 2.7 ms after the stamp: at 0.6 m/s the vehicle was 1.6 mm
+    # farther ahead by then, and the point as much nearer.
     step_m = np.linalg.norm((inverse(sequence.T_world_lidar(0)) @ sequence.T_world_lidar(1))[:3, 3])
     late_s = sweep.offset_ns[0] * 1e-9
     moved_m = step_m / 0.100196 * late_s

@@ -56,10 +56,6 @@ class Record:
             )
         return array
 
-    def has(self, key: str) -> bool:
-        """Whether there is something but an empty list or text."""
-        return self.values.get(key) not in (None, "", [])
-
     def _value(self, key: str) -> Any:
         if key not in self.values:
             raise InputError(
