@@ -153,7 +153,9 @@ def _pair(
     points, edge = sweep.points, np.zeros(len(sweep), bool)
     for lidar in np.unique(sweep.lidar):
         mine = sweep.lidar == lidar
-        edge[mine] = depth_edges(points[mine] - sweep.origin_m(int(lidar)))
+        edge[mine] = depth_edges(
+            (points[mine] - sweep.origin_m(int(lidar))) @ sweep.axes(int(lidar)).T
+        )
     some = edge.copy()
     some[:: len(points) // _NUM_OTHERS + 1] = True
     twist = registered.twist_after if apart_s > 0 else registered.twist_before

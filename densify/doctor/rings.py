@@ -52,17 +52,20 @@ def check_rings(sample: Sample) -> list[Finding]:
     """For each scanner: where it stands, and whether its sweeps are as they were fired."""
     findings = []
     for lidar in sorted({int(n) for s in sample.spots for n in np.unique(s.sweeps[0].lidar)}):
-        given_m = sample.spots[0].sweeps[0].origin_m(lidar)
-        points = _still_points(sample, lidar)
+        R = sample.spots[0].sweeps[0].axes(lidar)  # rings are level in the scanner's own axes
+        given_m = R @ sample.spots[0].sweeps[0].origin_m(lidar)
+        points = _still_points(sample, lidar) @ R.T
         if len(points) < _LEAST_POINTS:
             continue
         found_m = found_origin(points, given_m)
-        findings.append(_check_origin(lidar, points, given_m, found_m))
-        findings.append(_check_compensation(sample, lidar, (given_m, found_m)))
+        findings.append(_check_origin(lidar, points, R, given_m, found_m))
+        findings.append(_check_compensation(sample, lidar, R, (given_m, found_m)))
     return findings
 
 
-def _check_compensation(sample: Sample, lidar: int, origins_m: tuple[Float, Float]) -> Finding:
+def _check_compensation(
+    sample: Sample, lidar: int, R: Float, origins_m: tuple[Float, Float]
+) -> Finding:
     name = "motion compensation" + f" of scanner {lidar}" * (lidar > 0)
     spot = sample.fastest
     if spot is None or spot.speed_m_s < _LEAST_SPEED_M_S:
@@ -78,11 +81,11 @@ def _check_compensation(sample: Sample, lidar: int, origins_m: tuple[Float, Floa
         return max(sharpness(moved, origin_m) for moved in variants for origin_m in origins_m)
 
     def carried(since_s: Float) -> Float:
-        return poses.transform_each(since_s[:, None] * spot.twist, points)
+        return poses.transform_each(since_s[:, None] * spot.twist, points) @ R.T
 
     # The moment they were compensated to may be any of the sweep's.
     moments_s = (0.0, offset_s.min(), offset_s.max())
-    as_stored = sharpest(points)
+    as_stored = sharpest(points @ R.T)
     undone = sharpest(*[carried(at_s - offset_s) for at_s in moments_s])
     done = sharpest(carried(offset_s))
     if max(as_stored, undone) < _LEAST_SHARPNESS:  # the origin was looked for in smeared rings
@@ -146,10 +149,12 @@ def _still_points(sample: Sample, lidar: int) -> Float:
     return np.concatenate(parts)[:: len(parts)]
 
 
-def _check_origin(lidar: int, points: Float, given_m: Float, found_m: Float) -> Finding:
+def _check_origin(lidar: int, points: Float, R: Float, given_m: Float, found_m: Float) -> Finding:
+    """points, given_m, found_m: in the scanner's axes, into which R turns the lidar frame's."""
     name = "scanner's place" if lidar == 0 else f"place of scanner {lidar}"
     given, found = sharpness(points, given_m), sharpness(points, found_m)
     off_m = float(np.linalg.norm(found_m - given_m))
+    given_m, found_m = given_m @ R, found_m @ R
     values = {"given_m": given_m.tolist(), "found_m": found_m.tolist(), "off_m": off_m}
     values |= {"sharpness_given": given, "sharpness_found": found}
     text = (

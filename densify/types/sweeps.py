@@ -25,8 +25,9 @@ class Sweep:
     lidar: (N,) uint8, which of several scanners in one sweep fired.
     row: (N,) int64, row of the return in the source file (invalid rows are dropped on reading).
     scanner_origins: (S,3) metres, lidar frame, where the rays of each scanner start; None where all
-        start at the frame's origin. R_scanner_lidar: (S,3,3) turns the lidar frame's axes into each
-    scanner's, z along the one it spins about, upwards; None where they are the frame's.
+        start at the frame's origin.
+    R_scanner_lidar: (S,3,3) turns the lidar frame's axes into each scanner's, z along the one it
+        spins about, upwards; None where they are the frame's.
     """
 
     frame: int
