@@ -15,7 +15,7 @@ from densify.geometry import poses
 from densify.readers import open_sequence
 from densify.readers.describe import describe
 from densify.readers.files import format_frames, runs
-from densify.readers.kitti_raw import KITTI_TRIGGER_LATENCY_NS, KittiRaw
+from densify.readers.kitti.raw import KITTI_TRIGGER_LATENCY_NS, KittiRaw
 
 # The epoch nanoseconds of this text do not survive a float64 (multiples of 256 there).
 BASE_TEXT, BASE_NS = "2011-09-26 13:10:51", 1317042651_000_000_000

@@ -207,11 +207,11 @@ DOORS: dict[str, str | tuple[str, ...]] = {
     "distributed": "densify/dataset/cluster.py",
     "embreex": "densify/street/world.py",
     "kiss_icp": "densify/registration/odometry.py",
-    "laspy": ("densify/outputs/cloud_laz.py", "densify/readers/point_files.py"),
+    "laspy": ("densify/outputs/cloud_laz.py", "densify/readers/points/files.py"),
     "numba": "densify/kernels/",
     "pickle": (
         "densify/dataset/calls.py",
-        "densify/readers/pickled_frame.py",
+        "densify/readers/pandaset/pickled_frame.py",
         "densify/writers/pandaset.py",
     ),
     "torch": ("densify/flow/", "densify/dataset/loader.py"),

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from densify.errors import InputError
-from densify.readers.point_files import read_table, read_viewpoint
+from densify.readers.points.files import read_table, read_viewpoint
 
 rng = np.random.default_rng(5)
 POINTS = np.round(rng.uniform(-40, 40, (60, 3)), 3).astype("<f4")

@@ -18,9 +18,9 @@ from densify.errors import InputError
 from densify.geometry.poses import inverse, transform
 from densify.readers import open_sequence
 from densify.readers.describe import describe
-from densify.readers.folder import Folder
-from densify.readers.folder_config import FolderConfig
-from densify.readers.folder_draft import draft_config
+from densify.readers.folder.config import FolderConfig
+from densify.readers.folder.draft import draft_config
+from densify.readers.folder.reader import Folder
 from densify.readers.street import Street
 from densify.writers import write_street
 from densify.writers.excerpt import Excerpt

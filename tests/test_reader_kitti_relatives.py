@@ -14,9 +14,9 @@ from densify.errors import InputError
 from densify.geometry import cameras
 from densify.geometry.poses import inverse
 from densify.readers import open_sequence
-from densify.readers.kitti_360 import Kitti360
-from densify.readers.kitti_odometry import KittiOdometry
-from densify.readers.kitti_tracking import KittiTracking
+from densify.readers.kitti.kitti_360 import Kitti360
+from densify.readers.kitti.odometry import KittiOdometry
+from densify.readers.kitti.tracking import KittiTracking
 from densify.readers.street import Street
 from densify.writers import write_street
 from densify.writers.excerpt import Excerpt

@@ -13,8 +13,8 @@ import pytest
 from densify.errors import InputError
 from densify.geometry.poses import inverse
 from densify.readers import open_sequence
-from densify.readers.json_tables import find_records
-from densify.readers.nuscenes import NuScenes
+from densify.readers.nuscenes.reader import NuScenes
+from densify.readers.nuscenes.tables import find_records
 from densify.readers.street import Street
 from densify.writers import write_street
 from densify.writers.excerpt import Excerpt

@@ -13,8 +13,8 @@ from densify.errors import InputError
 from densify.geometry.poses import transform
 from densify.outputs.flow_h5 import write_flow_h5
 from densify.readers import open_sequence
-from densify.readers.open_scene_flow import OpenSceneFlow, SweepFile
-from densify.readers.open_scene_flow_labels import FlowLabels
+from densify.readers.open_scene_flow.labels import FlowLabels
+from densify.readers.open_scene_flow.reader import OpenSceneFlow, SweepFile
 from densify.readers.street import Street
 from densify.registration.deskew import deskew
 from densify.types import Trajectory

@@ -16,8 +16,8 @@ from densify.errors import InputError
 from densify.geometry.poses import inverse, transform
 from densify.geometry.rings import find_rings
 from densify.readers import open_sequence
-from densify.readers.pandaset import PANDAR_GT_M, T_POSE_LIDAR, PandaSet
-from densify.readers.pickled_frame import read_columns
+from densify.readers.pandaset.pickled_frame import read_columns
+from densify.readers.pandaset.reader import PANDAR_GT_M, T_POSE_LIDAR, PandaSet
 from densify.readers.street import Street
 from densify.writers import write_street
 from densify.writers.excerpt import Excerpt

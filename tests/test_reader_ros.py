@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from densify.errors import InputError
 from densify.geometry.poses import inverse, transform
 from densify.readers import open_sequence
-from densify.readers.ros import RosBag
+from densify.readers.ros.reader import RosBag
 from densify.readers.street import Street
 from densify.writers import write_street
 from densify.writers.excerpt import Excerpt
@@ -592,10 +592,10 @@ def test_the_index_of_a_large_bag_is_kept(tmp_path, empty_cache, monkeypatch):
     maker.sweeps(3)
     place = maker.write(tmp_path)
     whole = open_sequence(place)
-    monkeypatch.setattr("densify.readers.ros_bag._LARGE_BYTES", 0)
+    monkeypatch.setattr("densify.readers.ros.bag._LARGE_BYTES", 0)
     stamps_ns = [open_sequence(place).stamp_ns(1) for _ in range(2)]
     assert stamps_ns == [whole.stamp_ns(1)] * 2 and any(empty_cache.rglob("bag-*"))
-    monkeypatch.setattr("densify.readers.ros_bag.Bag._read_index", None)  # not asked again
+    monkeypatch.setattr("densify.readers.ros.bag.Bag._read_index", None)  # not asked again
     np.testing.assert_array_equal(open_sequence(place)[2].points, whole[2].points)
 
 

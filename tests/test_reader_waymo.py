@@ -16,7 +16,7 @@ from densify.geometry.poses import inverse, transform
 from densify.readers import open_sequence
 from densify.readers.describe import describe
 from densify.readers.street import Street
-from densify.readers.waymo import Waymo
+from densify.readers.waymo.reader import Waymo
 from densify.scores.depth_metrics import depth_errors
 from densify.writers import write_street
 from densify.writers.excerpt import Excerpt

@@ -10,7 +10,7 @@ import pytest
 
 from densify.errors import InputError
 from densify.geometry.poses import inverse
-from densify.readers.kitti_raw import KittiRaw
+from densify.readers.kitti.raw import KittiRaw
 from densify.readers.street import Street
 from densify.readers.truth_files import FileTruth, write_bodies, write_points
 from densify.street.bodies import Bodies

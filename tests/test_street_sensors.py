@@ -8,7 +8,7 @@ import pytest
 
 from densify.geometry.poses import inverse, transform
 from densify.readers.describe import describe
-from densify.readers.kitti_raw import KittiRaw
+from densify.readers.kitti.raw import KittiRaw
 from densify.readers.street import Street
 from densify.street.casting import Scene
 from densify.street.curves import Curve, Speed

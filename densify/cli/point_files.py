@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from densify.errors import InputError
-from densify.readers.point_files import read_table
+from densify.readers.points.files import read_table
 from densify.types import Float, FlowField, Int
 
 KITTI_COLUMNS = ("x", "y", "z", "reflectance")
@@ -29,7 +29,7 @@ class PointFile:
 
 
 def read_points(path: Path) -> PointFile:
-    """Every row of the file in its order: any format of `densify.readers.point_files`.
+    """Every row of the file in its order: any format of `densify.readers.points.files`.
 
     An .npz file may hold, beside ``points``, ``offset_ns`` or ``time`` (seconds) and ``lidar``,
     (N,) each; a .bin file is KITTI's float32 x y z reflectance. Raises InputError if the file is

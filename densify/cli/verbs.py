@@ -211,7 +211,7 @@ def doctor(options: argparse.Namespace) -> None:
 
 def _write_folder_config(folder: Path, overwrite: bool) -> None:
     from densify.outputs.atomic import write_file
-    from densify.readers.folder_draft import draft_config
+    from densify.readers.folder.draft import draft_config
 
     path = folder / "densify.yaml"
     if path.exists() and not overwrite:

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: MIT
-"""Flow as OpenSceneFlow's files hold it (`densify.readers.open_scene_flow`), so that its training,
-evaluation and pictures take it::
+"""Flow as OpenSceneFlow's files hold it (`densify.readers.open_scene_flow.reader`), so that its
+training, evaluation and pictures take it::
 
     flow/KEY.h5    a group for each sweep of the window, named by its stamp (ns): lidar (N,4)
                    deskewed to the stamp, pose (4,4), lidar_id; ground_mask, nothing; row (N,) in

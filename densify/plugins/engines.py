@@ -69,7 +69,7 @@ ENGINES = Table(
         ),
         Engine(
             "opensceneflow",
-            "densify.readers.open_scene_flow_labels",
+            "densify.readers.open_scene_flow.labels",
             about="labels or a network's flow in OpenSceneFlow's file of the recording",
             argument="FILE[#NAME]",
         ),

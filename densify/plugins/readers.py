@@ -100,7 +100,7 @@ READERS = Table(
     built_in=(
         Reader(
             "kitti",
-            "densify.readers.kitti_raw",
+            "densify.readers.kitti.raw",
             recognises=lambda path: (path / "velodyne_points").is_dir(),
             holds="a KITTI raw drive (a folder that holds velodyne_points/)",
         ),
@@ -113,7 +113,7 @@ READERS = Table(
         ),
         Reader(
             "nuscenes",
-            "densify.readers.nuscenes",
+            "densify.readers.nuscenes.reader",
             recognises=lambda path: (
                 (path / "sample_data.json").is_file() or any(path.glob("v*/sample_data.json"))
             ),
@@ -122,7 +122,7 @@ READERS = Table(
         ),
         Reader(
             "waymo",
-            "densify.readers.waymo",
+            "densify.readers.waymo.reader",
             recognises=lambda path: (
                 (path / "lidar_calibration").is_dir() and any((path / "lidar").glob("*.parquet"))
             ),
@@ -131,41 +131,41 @@ READERS = Table(
         ),
         Reader(
             "opensceneflow",
-            "densify.readers.open_scene_flow",
+            "densify.readers.open_scene_flow.reader",
             recognises=lambda path: path.suffix == ".h5" or any(path.glob("*.h5")),
             holds="OpenSceneFlow files (LOG.h5)",
             scenes=True,
         ),
         Reader(
             "pandaset",
-            "densify.readers.pandaset",
+            "densify.readers.pandaset.reader",
             recognises=lambda path: (path / "lidar" / "poses.json").is_file(),
             holds="a PandaSet sequence (a folder that holds lidar/poses.json)",
         ),
         Reader(
             "kitti-360",
-            "densify.readers.kitti_360",
+            "densify.readers.kitti.kitti_360",
             recognises=lambda path: (path / "data_3d_raw").is_dir(),
             holds="KITTI-360 (a folder that holds data_3d_raw/)",
             scenes=True,
         ),
         Reader(
             "kitti-tracking",
-            "densify.readers.kitti_tracking",
+            "densify.readers.kitti.tracking",
             recognises=lambda path: any((path / "velodyne").glob("[0-9][0-9][0-9][0-9]/")),
             holds="KITTI tracking (a folder that holds velodyne/0000/)",
             scenes=True,
         ),
         Reader(
             "kitti-odometry",
-            "densify.readers.kitti_odometry",
+            "densify.readers.kitti.odometry",
             recognises=_is_kitti_odometry,
             holds="KITTI odometry or SemanticKITTI (sequences/, or a folder in it with velodyne/)",
             scenes=True,
         ),
         Reader(
             "ros",
-            "densify.readers.ros",
+            "densify.readers.ros.reader",
             recognises=_is_bag,
             holds="a ROS bag (.bag, .db3, .mcap, or a folder of them)",
             scenes=True,
@@ -193,7 +193,7 @@ READERS = Table(
         ),
         Reader(
             "folder",
-            "densify.readers.folder",
+            "densify.readers.folder.reader",
             recognises=_holds_sweeps,
             holds="a folder of numbered sweeps (000120.bin, .pcd, .ply, .las, .laz)",
             general=True,

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Writes a street as a plain folder with its truth, which `densify.readers.folder` opens::
+"""Writes a street as a plain folder with its truth, which `densify.readers.folder.reader` opens::
 
 OUT/street/densify.yaml
 OUT/street/sweeps/000000.bin, ...   float32 x y z intensity time lidar, time in s since the stamp
@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from densify.readers.folder_config import NAME
+from densify.readers.folder.config import NAME
 from densify.types import Camera, Progress
 from densify.writers.excerpt import Excerpt, new_folder, put, quaternion
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Writes a street as a KITTI-360 drive, which `densify.readers.kitti_360` opens::
+"""Writes a street as a KITTI-360 drive, which `densify.readers.kitti.kitti_360` opens::
 
 OUT/data_3d_raw/2026_06_12_drive_0000_sync/velodyne_points/{data/0000000000.bin, timestamps.txt}
 OUT/data_2d_raw/2026_06_12_drive_0000_sync/image_00/{data_rect/0000000000.png, timestamps.txt}

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Writes a street as a KITTI odometry sequence, which `densify.readers.kitti_odometry` opens::
+"""Writes a street as a KITTI odometry sequence, which `densify.readers.kitti.odometry` opens::
 
     OUT/sequences/00/{velodyne/000000.bin, image_2/000000.png, calib.txt, times.txt}
     OUT/sequences/00/truth/  as in `densify.readers.truth_files`

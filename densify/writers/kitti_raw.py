@@ -24,7 +24,7 @@ from densify.errors import InputError
 from densify.geometry import poses
 from densify.outputs.atomic import staged_folder
 from densify.readers.files import camera_named
-from densify.readers.kitti_raw import KITTI_TRIGGER_LATENCY_NS
+from densify.readers.kitti.raw import KITTI_TRIGGER_LATENCY_NS
 from densify.readers.street import Street
 from densify.readers.truth_files import write_bodies, write_depth, write_points
 from densify.street.rig import CAMERAS, T_RECTIFIED_LIDAR, USUAL, T_level_lidar

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Writes a street as a KITTI tracking sequence, which `densify.readers.kitti_tracking` opens::
+"""Writes a street as a KITTI tracking sequence, which `densify.readers.kitti.tracking` opens::
 
 OUT/training/{velodyne/0000/000000.bin, image_02/0000/000000.png, calib/0000.txt, oxts/0000.txt}
 OUT/training/truth/  as in `densify.readers.truth_files`
@@ -13,7 +13,7 @@ import numpy as np
 
 from densify.errors import InputError
 from densify.geometry import poses
-from densify.readers.kitti_files import NOMINAL_PERIOD_NS
+from densify.readers.kitti.files import NOMINAL_PERIOD_NS
 from densify.street.rig import T_RECTIFIED_LIDAR, T_level_lidar
 from densify.types import Progress
 from densify.writers.excerpt import Excerpt, check_cameras_fit, new_folder, put

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Writes a street as a nuScenes tree of one scene with its truth, see `densify.readers.nuscenes`::
+"""Writes a street as a nuScenes tree of one scene with its truth::
 
     OUT/street/v1.0-mini/{scene,sample,sample_data,ego_pose,calibrated_sensor,sensor,log}.json
     OUT/street/{samples,sweeps}/{LIDAR_TOP/*.pcd.bin, NAME/*.jpg}
@@ -21,7 +21,7 @@ import numpy as np
 
 from densify.errors import InputError
 from densify.geometry.poses import inverse, transform
-from densify.readers.nuscenes import COLUMN_NS, NUM_RINGS
+from densify.readers.nuscenes.reader import COLUMN_NS, NUM_RINGS
 from densify.street.patterns import Spinning
 from densify.types import Float, Int, Progress
 from densify.writers.excerpt import Excerpt, check_plain_cameras, new_folder, put, quaternion

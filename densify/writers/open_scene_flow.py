@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: MIT
 """Writes a street as OpenSceneFlow preprocesses recordings, with its truth beside it, see
-`densify.readers.open_scene_flow`::
+`densify.readers.open_scene_flow.reader`::
 
     OUT/street/street.h5    lidar, lidar_id, lidar_dt, lidar_center, pose, ground_mask; of all but
                             the last sweep flow, flow_is_valid, flow_category_indices,

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Writes a street as a PandaSet sequence, which `densify.readers.pandaset` opens::
+"""Writes a street as a PandaSet sequence, which `densify.readers.pandaset.reader` opens::
 
     OUT/002/lidar/{00.pkl.gz, ..., poses.json, timestamps.json}
     OUT/002/camera/image_02/{00.jpg, ..., poses.json, timestamps.json, intrinsics.json}
@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from densify.errors import InputError
 from densify.geometry import poses
-from densify.readers.pandaset import PANDAR_GT_M, T_POSE_LIDAR
+from densify.readers.pandaset.reader import PANDAR_GT_M, T_POSE_LIDAR
 from densify.readers.pose_track import PoseTrack
 from densify.types import Camera, Float, Int, Progress
 from densify.writers.excerpt import (

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Writes a street as a ROS bag with its truth, which `densify.readers.ros` opens::
+"""Writes a street as a ROS bag with its truth, which `densify.readers.ros.reader` opens::
 
 /points                        PointCloud2: x y z intensity t, t in ns since the stamp, which is
                                the sweep's start; with padding, as drivers have it
@@ -22,7 +22,7 @@ import numpy as np
 from densify.errors import InputError
 from densify.geometry.poses import inverse
 from densify.readers.extras import needed
-from densify.readers.ros_bag import message_types
+from densify.readers.ros.bag import message_types
 from densify.street.sensors import SENSORS
 from densify.types import Camera, Float, Progress
 from densify.writers.excerpt import Excerpt, new_folder, quaternion

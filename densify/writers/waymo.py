@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Writes a street as a segment of Waymo's version 2 with its truth, see `densify.readers.waymo`::
+"""Writes a street as a segment of Waymo's version 2 with its truth::
 
     OUT/street/{lidar,lidar_pose,lidar_calibration,vehicle_pose}/street.parquet
     OUT/street/{camera_image,camera_calibration}/street.parquet
@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 from densify.errors import InputError
 from densify.geometry.poses import inverse
 from densify.readers.extras import needed
-from densify.readers.waymo_components import (
+from densify.readers.waymo.components import (
     CAMERA,
     CAMERAS,
     DOWN,

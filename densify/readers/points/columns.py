@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 
 from densify.errors import InputError
 from densify.readers.file_sequence import Returns
-from densify.readers.folder_config import SweepFiles
-from densify.readers.folder_files import Series
-from densify.readers.point_fields import (
+from densify.readers.folder.config import SweepFiles
+from densify.readers.folder.files import Series
+from densify.readers.points.fields import (
     Fields,
     PointTimes,
     find_fields,
@@ -27,7 +27,7 @@ from densify.readers.point_fields import (
     scaled,
     widened,
 )
-from densify.readers.point_files import read_table
+from densify.readers.points.files import read_table
 from densify.types import Bool, Int
 
 Columns = Mapping[str, NDArray[Any]]

@@ -12,7 +12,7 @@ points
     origin, by /tf_static.
 stamps
     of the header (when it was recorded, if that is 0): the reference time. Times of points count
-    from it, or are absolute; field, unit and clock are found out (`densify.readers.point_fields`).
+    from it, or are absolute; field, unit and clock are found out (`densify.readers.points.fields`).
     Sweeps and images are numbered from 0 in the order of their stamps.
 images
     Image or CompressedImage with the CameraInfo beside them: raw ones with K and D, ``image_rect``
@@ -37,7 +37,7 @@ from densify.errors import InputError
 from densify.geometry import poses
 from densify.readers.file_sequence import FileSequence, Returns, truth_beside
 from densify.readers.files import check_image_size
-from densify.readers.point_fields import (
+from densify.readers.points.fields import (
     Fields,
     PointTimes,
     find_fields,
@@ -47,10 +47,10 @@ from densify.readers.point_fields import (
     scaled,
 )
 from densify.readers.pose_track import PoseTrack
-from densify.readers.ros_bag import Bag, Entry
-from densify.readers.ros_frames import Frames, plain, recorded_track
-from densify.readers.ros_messages import camera_of, cloud_columns, image_rgb
-from densify.readers.ros_topics import POSES, Images, Topics
+from densify.readers.ros.bag import Bag, Entry
+from densify.readers.ros.frames import Frames, plain, recorded_track
+from densify.readers.ros.messages import camera_of, cloud_columns, image_rgb
+from densify.readers.ros.topics import POSES, Images, Topics
 from densify.types import Camera, Float
 
 _NUM_TRIED = 5  # sweeps, until one holds points

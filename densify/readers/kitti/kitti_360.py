@@ -37,7 +37,7 @@ from densify.readers.file_sequence import (
     truth_beside,
 )
 from densify.readers.files import numbered_files, read_bytes, read_text
-from densify.readers.kitti_files import (
+from densify.readers.kitti.files import (
     NOMINAL_PERIOD_NS,
     Calibration,
     Stamps,

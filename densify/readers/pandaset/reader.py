@@ -37,7 +37,7 @@ from densify.errors import InputError
 from densify.geometry import poses
 from densify.readers.file_sequence import FileSequence, Returns, quaternion_pose, truth_beside
 from densify.readers.files import image_size_px, numbered_files, read_bytes, read_json
-from densify.readers.pickled_frame import read_columns
+from densify.readers.pandaset.pickled_frame import read_columns
 from densify.readers.pose_track import PoseTrack
 from densify.types import Camera, Float, Int
 

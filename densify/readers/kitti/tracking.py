@@ -25,7 +25,7 @@ from densify.errors import InputError
 from densify.geometry import poses
 from densify.readers.file_sequence import FileSequence, Returns, chosen_scene, truth_beside
 from densify.readers.files import image_size_px, numbered_files, of_frame, read_bytes, read_text
-from densify.readers.kitti_files import (
+from densify.readers.kitti.files import (
     NOMINAL_PERIOD_NS,
     NUM_OXTS_VALUES,
     Calibration,

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: MIT
 """``densify.yaml`` beside a recording of no known form: what its files cannot say themselves. Every
-key may be left out; `densify.readers.folder` says what is then found or assumed.
+key may be left out; `densify.readers.folder.reader` says what is then found or assumed.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ import numpy as np
 
 from densify.errors import InputError
 from densify.readers.file_sequence import rigid
-from densify.readers.point_fields import REFERENCES, UNIT_NS
-from densify.readers.yaml_sections import Section, read_sections
+from densify.readers.folder.yaml_sections import Section, read_sections
+from densify.readers.points.fields import REFERENCES, UNIT_NS
 from densify.types import Camera, Float
 
 NAME = "densify.yaml"
@@ -30,7 +30,7 @@ class SweepFiles:
     stored points to the lidar's frame, x forward, y left, z up; None leaves them. intensity,
     time, lidar: which column plays that part, "" to find it by its name. intensity_scale: what is
     full brightness, 0 to find it. time_unit, absolute, reference: as
-    `densify.readers.point_fields.find_times`. stamps: ``names`` (of the files) or a file with one
+    `densify.readers.points.fields.find_times`. stamps: ``names`` (of the files) or a file with one
     time for each sweep, "" to look for them; stamps_unit: theirs. rate_hz: of sweeps without
     stamps, 0 to take it from the points' times. compensated: the points were carried to the
     stamp by the vehicle's motion. scanner_origins: (S,3) metres, None where rays start at 0 0 0.

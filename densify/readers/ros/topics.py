@@ -9,7 +9,7 @@ from typing import NamedTuple
 from urllib.parse import parse_qsl
 
 from densify.errors import InputError
-from densify.readers.ros_bag import Bag, Topic
+from densify.readers.ros.bag import Bag, Topic
 
 CLOUD = "sensor_msgs/msg/PointCloud2"
 LIVOX = tuple(

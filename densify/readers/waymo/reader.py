@@ -47,7 +47,7 @@ from densify.readers.file_sequence import (
 )
 from densify.readers.files import of_frame
 from densify.readers.pose_track import PoseTrack
-from densify.readers.waymo_components import (
+from densify.readers.waymo.components import (
     CAMERA,
     CAMERAS,
     LASER,

@@ -22,7 +22,7 @@ from densify.flow.chained import ChainedMotion
 from densify.flow.scene import Scene
 from densify.geometry import poses
 from densify.readers.flow_files import MOVES_M
-from densify.readers.open_scene_flow import SweepFile
+from densify.readers.open_scene_flow.reader import SweepFile
 from densify.types import Bool, Float, FlowField, Stretch
 
 _ARRIVES_M = 0.5

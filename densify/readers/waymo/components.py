@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: MIT
 """The component tables of Waymo's version 2: how its lidars and cameras are calibrated, and where
-and when its images were taken. See `densify.readers.waymo`.
+and when its images were taken. See `densify.readers.waymo.reader`.
 """
 
 from __future__ import annotations

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from densify.errors import InputError
-from densify.readers.folder_config import NAME
-from densify.readers.point_files import SUFFIXES
+from densify.readers.folder.config import NAME
+from densify.readers.points.files import SUFFIXES
 from densify.readers.stamp_files import Named, StampFile, named
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")

@@ -5,7 +5,7 @@
 
     lidar (N,3 or more) float32 metres, a fourth column is the intensity     pose (4,4)
     ground_mask (N,)    lidar_id (N,)    lidar_dt (N,) s    lidar_center (L,4,4) or (L,3)
-    flow (N,3) ...      labels and estimates, see `densify.readers.open_scene_flow_labels`
+    flow (N,3) ...      labels and estimates, see `densify.readers.open_scene_flow.labels`
 
 Stamps are in the unit that makes neighbouring sweeps lie 0.01 to 2 s apart: nanoseconds for files
 made of Argoverse 2, microseconds for the others. Points lie at the stamp, carried there by the

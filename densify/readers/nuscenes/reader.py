@@ -10,7 +10,7 @@ A scene is named by ``#scene-0061``. Its sweeps, key frames or not, are numbered
 of time, images likewise by camera; what is not on the disk leaves a gap. ``prev`` and ``next`` are
 not used. Images are undistorted; their stamps are those of the exposure. Poses are the vehicle's in
 the map's frame; every record has its own, and all of a scene together tell where the vehicle was at
-any time. TruckScenes has the same tables: see `densify.readers.truckscenes`.
+any time. TruckScenes has the same tables: see `densify.readers.nuscenes.truckscenes`.
 
 nuScenes: one HDL-32E at 20 Hz. Points are in the scanner's frame (x right, y forward, z up), all
 carried by the vehicle's own motion to the stamp, which is that of the *last* packet. There are no
@@ -30,8 +30,8 @@ import numpy as np
 from densify.errors import InputError
 from densify.readers.file_sequence import Returns, chosen_scene
 from densify.readers.files import read_bytes
-from densify.readers.json_tables import read_table
-from densify.readers.nuscenes_scene import Scene, SceneSequence
+from densify.readers.nuscenes.scene import Scene, SceneSequence
+from densify.readers.nuscenes.tables import read_table
 from densify.readers.pose_track import PoseTrack
 from densify.types import Int
 
@@ -59,7 +59,7 @@ def open_recording(path: Path, scene: str | None) -> SceneSequence:
     found = Scene.read(*scenes[name], name)
     lidars = list(found.lidars.values())
     if lidars[0].records[0].text("filename").endswith(".pcd"):
-        from densify.readers.truckscenes import TruckScenes
+        from densify.readers.nuscenes.truckscenes import TruckScenes
 
         return TruckScenes(found)
     if len(lidars) > 1:

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Any folder of sweeps: numbered files of points, and beside them whatever there is of stamps,
 poses and images. What the files cannot say stands in a small ``densify.yaml`` in the folder
-(`densify.readers.folder_config`); a folder without one opens as far as can be told.
+(`densify.readers.folder.config`); a folder without one opens as far as can be told.
 
 points
     in the lidar's frame, as fired. ``sweeps: {compensated: true}`` says that they were carried to
@@ -41,8 +41,8 @@ from densify.readers.file_sequence import (
     truth_beside,
 )
 from densify.readers.files import format_frames, read_bytes
-from densify.readers.folder_config import CameraFiles, FolderConfig
-from densify.readers.folder_files import (
+from densify.readers.folder.config import CameraFiles, FolderConfig
+from densify.readers.folder.files import (
     IMAGE_SUFFIXES,
     Series,
     find_images,
@@ -50,10 +50,10 @@ from densify.readers.folder_files import (
     find_sweeps,
     in_time,
 )
-from densify.readers.point_files import read_viewpoint
+from densify.readers.points.columns import SweepColumns
+from densify.readers.points.files import read_viewpoint
 from densify.readers.pose_files import PoseFile
 from densify.readers.pose_track import PoseTrack
-from densify.readers.sweep_columns import SweepColumns
 from densify.types import Float
 
 _NO_VIEWPOINT = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)

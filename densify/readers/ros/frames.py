@@ -13,7 +13,7 @@ from densify.errors import InputError
 from densify.geometry.poses import inverse
 from densify.readers.file_sequence import quaternion_pose
 from densify.readers.pose_track import PoseTrack
-from densify.readers.ros_bag import Bag
+from densify.readers.ros.bag import Bag
 from densify.types import Float
 
 _TF = "tf2_msgs/msg/TFMessage"

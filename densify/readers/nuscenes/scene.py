@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: MIT
 """A scene of nuScenes or TruckScenes: what its tables tell of sensors, cameras and poses. See
-`densify.readers.nuscenes`.
+`densify.readers.nuscenes.reader`.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from densify.errors import InputError
 from densify.geometry.poses import inverse
 from densify.readers.file_sequence import FileSequence, quaternion_pose, truth_beside
 from densify.readers.files import read_bytes
-from densify.readers.json_tables import Record, find_records, read_table
+from densify.readers.nuscenes.tables import Record, find_records, read_table
 from densify.readers.pose_track import PoseTrack
 from densify.types import Camera, Float
 

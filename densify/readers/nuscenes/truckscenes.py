@@ -23,9 +23,9 @@ from numpy.typing import NDArray
 from densify.errors import InputError
 from densify.geometry.poses import transform
 from densify.readers.file_sequence import Returns, scanner_axes
-from densify.readers.nuscenes_scene import Channel, Scene, SceneSequence
-from densify.readers.point_fields import full_scale, scaled
-from densify.readers.point_files import read_table
+from densify.readers.nuscenes.scene import Channel, Scene, SceneSequence
+from densify.readers.points.fields import full_scale, scaled
+from densify.readers.points.files import read_table
 from densify.types import Bool, Float, Float32, Int
 
 _FIELDS = ("x", "y", "z", "intensity", "timestamp")

@@ -35,7 +35,7 @@ from densify.readers.file_sequence import (
     truth_beside,
 )
 from densify.readers.files import image_size_px, numbered_files, of_frame, read_bytes, read_text
-from densify.readers.kitti_files import (
+from densify.readers.kitti.files import (
     NOMINAL_PERIOD_NS,
     Calibration,
     parse_numbers,

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from densify.readers.files import read_bytes
-from densify.readers.folder_files import (
+from densify.readers.folder.files import (
     IMAGE_SUFFIXES,
     find_images,
     find_pose_file,
@@ -20,8 +20,8 @@ from densify.readers.folder_files import (
     in_time,
     sweep_folders,
 )
-from densify.readers.point_fields import find_fields, find_times, full_scale
-from densify.readers.point_files import read_table, unnamed
+from densify.readers.points.fields import find_fields, find_times, full_scale
+from densify.readers.points.files import read_table, unnamed
 from densify.readers.pose_files import PoseFile
 from densify.readers.stamp_files import named
 

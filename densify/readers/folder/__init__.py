@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: MIT
+"""Any folder of sweeps, and the densify.yaml beside them."""

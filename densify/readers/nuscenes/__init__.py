@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: MIT
+"""nuScenes, and TruckScenes in the same tables."""

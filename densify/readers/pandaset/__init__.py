@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: MIT
+"""PandaSet, whose tables are pickles."""

@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: MIT
+"""The Waymo Open Dataset, perception, version 2."""
