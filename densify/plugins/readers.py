@@ -86,6 +86,14 @@ def _is_dgp(path: Path) -> bool:
     return any(not file.name.startswith("scene_dataset") for file in found)
 
 
+def _is_once_or_zod(path: Path) -> bool:
+    return (
+        any(path.glob("data/*/lidar_roof/"))
+        or any(path.glob("*/data/*/lidar_roof/"))
+        or any(path.glob("trainval-frames-*.json"))
+    )
+
+
 def _is_capture(path: Path) -> bool:
     return path.suffix == ".pcap" and path.is_file()
 
@@ -175,6 +183,13 @@ READERS = Table(
             "densify.readers.dgp",
             recognises=_is_dgp,
             holds="a DGP scene such as DDAD's (a folder that holds scene_<hash>.json)",
+            scenes=True,
+        ),
+        Reader(
+            "tri3d",
+            "densify.readers.tri3d",
+            recognises=_is_once_or_zod,
+            holds="ONCE (data/*/lidar_roof/) or ZOD Frames (trainval-frames-*.json)",
             scenes=True,
         ),
         Reader(
