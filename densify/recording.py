@@ -49,10 +49,8 @@ from densify.registration.trajectory import LeftOut, Registration, find_trajecto
 from densify.sweeps import Sweeps
 from densify.types import (
     Cloud,
-    Float,
     FlowField,
     LidarSequence,
-    MakesFrames,
     Motion,
     RegisteredSweep,
     Stretch,
@@ -184,12 +182,10 @@ class Recording:
         if self.cut.margin_s:  # without a sweep before it a block could not be joined to the last
             num_before = max(1, num_before)
         bad, known, frames = {}, {}, (*self.timeline.before(frames[0], num_before), *frames)
-        if isinstance(self.sequence, MakesFrames):
-            with self._watch.stage("read"):
-                self.sequence.prepare(frames)
+        self.sweeps.prepare(frames)
         for frame in frames:
             try:
-                known[frame] = (self.sweeps.content(frame), self._recorded_pose(frame))
+                known[frame] = (self.sweeps.content(frame), self.sweeps.recorded_pose(frame))
             except InputError as error:
                 bad[frame] = LeftOut(str(error), unreadable=True)
         return self._made(
@@ -387,11 +383,6 @@ class Recording:
             for f, found in piece.items()
         }
         return tuple(evidence[f] for f in frames)
-
-    def _recorded_pose(self, frame: int) -> Float | None:
-        if self.settings.register.source != "dataset":
-            return None
-        return self.sequence.T_world_lidar(frame)
 
     # Kept on disk
 

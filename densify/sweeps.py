@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import lru_cache
 from uuid import uuid4
 
@@ -13,7 +14,7 @@ from densify.errors import InputError
 from densify.readers.timeline import Timeline
 from densify.readers.window import read_sweep
 from densify.registration.trajectory import LeftOut
-from densify.types import LidarSequence, Sweep
+from densify.types import Float, LidarSequence, MakesFrames, Sweep
 
 _DIGESTS_TOGETHER = 20
 
@@ -47,6 +48,19 @@ class Sweeps:
         if isinstance(found, LeftOut):
             raise InputError(found.reason)
         return found
+
+    def prepare(self, frames: Sequence[int]) -> None:
+        """Have a recording that makes its sweeps make these, side by side."""
+        if isinstance(self._sequence, MakesFrames):
+            with self._watch.stage("read"):
+                self._sequence.prepare(frames)
+
+    def recorded_pose(self, frame: int) -> Float | None:
+        """(4,4) the recording's own ``T_world_lidar``, None where its poses are not asked for.
+        Raises InputError if there is none."""
+        if self._settings.source != "dataset":
+            return None
+        return self._sequence.T_world_lidar(frame)
 
     def _read(self, frame: int) -> Sweep:
         if frame in self._timeline.unknown:
