@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from densify.config import resolve
-from densify.dataset import make, workers
+from densify.dataset import cluster, make
 from densify.dataset.gate import Gate
 from densify.dataset.manifest import Manifest
 from densify.dataset.plan import Recipe, plan, read_plan
@@ -235,7 +235,7 @@ def test_a_second_run_at_once(border_drive: Path, border_set: Path, tmp_path: Pa
 def test_a_scheduler_that_does_not_answer(
     address: str, border_drive: Path, tmp_path: Path, monkeypatch, capsys
 ) -> None:
-    monkeypatch.setattr(workers, "_CONNECT_S", 1)
+    monkeypatch.setattr(cluster, "_CONNECT_S", 1)
     options = [*OPTIONS, *TWO_KEYS, "--scheduler", address, "--out", tmp_path / "out"]
     assert exit_code("dataset", "--data", border_drive, *options) == 2
     error = capsys.readouterr().err.splitlines()[-1]

@@ -22,6 +22,9 @@ def with_movers(word: str, **output) -> Result:
     return run(one_car(), KEY, 1, config=POSES_GIVEN | {"output": {"movers": word, **output}})
 
 
+NPZ = {"output": {"flow_as": "npz"}}
+
+
 @pytest.fixture(scope="module")
 def kept() -> Result:
     return with_movers("keep")
@@ -87,7 +90,7 @@ def test_without_flow_nothing_moves_and_nothing_is_left_out():
 
 
 def test_everything_asked_for_is_written(apart, tmp_path):
-    paths = write_result(apart, {}, tmp_path, config={}, data="tiny")
+    paths = write_result(apart, {}, tmp_path, config=NPZ, data="tiny")
     names = {path.relative_to(tmp_path / "000003").as_posix() for path in paths}
     movers = {
         f"movers/{i:04d}/{name}" for i in apart.movers for name in ("cloud.laz", "depth/front.png")
@@ -107,8 +110,8 @@ def test_everything_asked_for_is_written(apart, tmp_path):
 
 
 def test_files_that_are_no_longer_asked_for_go(apart, kept, tmp_path):
-    write_result(apart, {}, tmp_path, config={}, data="tiny")
-    write_result(kept, {}, tmp_path, config={}, data="tiny", overwrite=True)
+    write_result(apart, {}, tmp_path, config=NPZ, data="tiny")
+    write_result(kept, {}, tmp_path, config=NPZ, data="tiny", overwrite=True)
     left = {path.name for path in (tmp_path / "000003").iterdir()}
     assert not left & {"movers", "flow", "optical_flow"} and "cloud.laz" in left
 
@@ -179,7 +182,7 @@ def test_every_point_is_accounted_for_and_the_picture_shows_what_was_left_out(tm
     assert shown and shown <= {"vetoed", "hidden", "unsupported", "edge"}
     for name in shown:
         assert (left_out == Reason[name.upper()]).sum() <= counts[name]
-    write_result(result, {}, tmp_path, config={}, data="street")
+    write_result(result, {}, tmp_path, config=NPZ, data="street")
     picture = cv2.imread(str(tmp_path / f"{KEY:06d}" / "rejected" / "front.png"))
     assert picture.shape[1] == left_out.shape[1] and picture.shape[0] > left_out.shape[0]
 

@@ -34,7 +34,8 @@ def check_sweep_files(sample: Sample) -> list[Finding]:
             )
         )
     if isinstance(sample.sequence, KnowsFiles):
-        findings.append(_sizes(sample.sequence.sweep_bytes()))
+        sizes = sample.sequence.sweep_bytes()
+        findings += [_sizes(sizes)] if sizes else []
     return findings
 
 

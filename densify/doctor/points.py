@@ -14,7 +14,8 @@ from densify.types import Float
 _MEDIAN_RANGE_M = (1.5, 60.0)
 _UNITS = {"millimetres": 1e-3, "centimetres": 1e-2, "kilometres": 1e3}
 _CELL_M, _CLOSE_M = 0.1, 6.0
-_OWN_SHARE, _LEAST_OWN = 0.9, 20
+_LEAST_OWN = 20
+_LEAST_WITHOUT = 0.005  # of the rows
 _NEAR_M = 25.0
 _UP = {
     "z": (0, 0, 1),
@@ -195,11 +196,14 @@ def check_sensors(sample: Sample) -> list[Finding]:
         low, high = np.rad2deg(model.elevation_rad)
         right, left = np.rad2deg(model.azimuth_rad)
         counts = [int((s.lidar == number).sum()) for s in spot.sweeps]
+        without = [1 - len(s) / (int(s.row.max(initial=0)) + 1) for s in spot.sweeps]
         text = (
             f"{kind}, {low:.1f} to {high:.1f} deg up, {right:.0f} to {left:.0f} deg around, "
             f"{np.rad2deg(model.azimuth_step_rad):.2f} deg from ray to ray, {min(counts):,} to "
             f"{max(counts):,} returns a sweep"
         )
+        if max(without) > _LEAST_WITHOUT:
+            text += f", {100 * max(without):.0f} % of the rows without a return"
         short = min(counts) < 0.5 * max(counts)
         findings.append(
             Finding(
@@ -207,7 +211,11 @@ def check_sensors(sample: Sample) -> list[Finding]:
                 Verdict.SUSPICIOUS if short else Verdict.FINE,
                 text + "; some sweeps are broken off" * short,
                 "leave the sweeps with few returns out" * short,
-                {"returns_least": min(counts), "returns_most": max(counts)},
+                {
+                    "returns_least": min(counts),
+                    "returns_most": max(counts),
+                    "without_return": max(without),
+                },
             )
         )
     return findings

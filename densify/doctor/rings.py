@@ -84,9 +84,15 @@ def _check_compensation(
         return poses.transform_each(since_s[:, None] * spot.twist, points) @ R.T
 
     # The moment they were compensated to may be any of the sweep's.
-    moments_s = (0.0, offset_s.min(), offset_s.max())
+    moments_s = {
+        "its stamp": 0.0,
+        "its first point": float(offset_s.min()),
+        "its last point": float(offset_s.max()),
+    }
     as_stored = sharpest(points @ R.T)
-    undone = sharpest(*[carried(at_s - offset_s) for at_s in moments_s])
+    undone_to = {name: sharpest(carried(at_s - offset_s)) for name, at_s in moments_s.items()}
+    moment = max(undone_to, key=lambda name: undone_to[name])
+    undone = undone_to[moment]
     done = sharpest(carried(offset_s))
     if max(as_stored, undone) < _LEAST_SHARPNESS:  # the origin was looked for in smeared rings
         straight = carried(-offset_s)
@@ -100,11 +106,13 @@ def _check_compensation(
         return Finding(name, Verdict.UNKNOWN, f"{text}; no distinct rings", values=values)
     if undone > _CLEARLY * as_stored:
         if sweep.offset_ns is None:
-            return Finding(name, Verdict.FINE, f"{text}: compensated, without times", values=values)
+            return Finding(
+                name, Verdict.FINE, f"{text}: compensated to {moment}, without times", values=values
+            )
         return Finding(
             name,
             Verdict.WRONG,
-            f"{text}: the sweeps are compensated already, and would be a second time",
+            f"{text}: the sweeps are compensated already, to {moment}, and would be a second time",
             "--set register.deskew=false",
             values,
         )

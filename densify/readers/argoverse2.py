@@ -105,6 +105,7 @@ class Argoverse2(FileSequence):
             cameras,
             {name: dict(enumerate(files)) for name, files in images.items()},
             truth_beside(log),
+            dict(enumerate(self._paths)),
         )
 
     def stamp_ns(self, frame: int) -> int:

@@ -49,7 +49,8 @@ class FileSequence(ABC):
 
     name: for people and outputs. where: the recording's place, for messages. frames: numbers of the
     sweeps that exist, ascending. cameras: by name. exposed_ns: of each camera, when its images that
-    exist were exposed, by image number. truth: exact truth where there is some.
+    exist were exposed, by image number. truth: exact truth where there is some. files: of the
+    sweeps, where each has one of its own.
     """
 
     def __init__(
@@ -60,6 +61,7 @@ class FileSequence(ABC):
         cameras: Mapping[str, Camera] | None = None,
         exposed_ns: Mapping[str, Mapping[int, int]] | None = None,
         truth: Truth | None = None,
+        files: Mapping[int, Path] | None = None,
     ) -> None:
         self.name = name
         self.where = where
@@ -68,6 +70,7 @@ class FileSequence(ABC):
         self.truth = truth
         self._frames = frozenset(frames)
         self._exposed_ns = exposed_ns or {}
+        self._files = files or {}
 
     @abstractmethod
     def stamp_ns(self, frame: int) -> int:
@@ -76,6 +79,10 @@ class FileSequence(ABC):
     @abstractmethod
     def _returns(self, frame: int) -> tuple[Path, Returns]:
         """The rows of an existing sweep, and the file for messages."""
+
+    def sweep_bytes(self) -> dict[int, int]:
+        """See `densify.types.KnowsFiles`; empty where sweeps share files."""
+        return {frame: path.stat().st_size for frame, path in self._files.items()}
 
     def _image(self, camera: Camera, number: int) -> NDArray[np.uint8]:
         """(H,W,3) RGB of an existing image."""

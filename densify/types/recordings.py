@@ -124,5 +124,5 @@ class KnowsFiles(Protocol):
     """A sequence that keeps each sweep in a file of its own; a reader may have this member."""
 
     def sweep_bytes(self) -> Mapping[int, int]:
-        """The size of each sweep's file, by frame."""
+        """The size of each sweep's file, by frame; empty where sweeps share files."""
         ...

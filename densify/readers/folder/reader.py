@@ -85,6 +85,7 @@ class Folder(FileSequence):
             tuple(self._sweeps.paths),
             {c.camera.name: c.camera for c in cameras},
             truth=truth_beside(folder),
+            files=self._sweeps.paths,
         )
         self._exposed_ns = {c.camera.name: self._exposures(c) for c in cameras}
         self._poses = self._read_poses()

@@ -95,7 +95,13 @@ class Kitti360(FileSequence):
                 cameras[name] = _camera(path / "calibration", name)
                 exposed_ns[name] = {f: ns for f in images if (ns := stamps.get(f)) is not None}
         super().__init__(
-            drive, path, tuple(self._sweeps), cameras, exposed_ns, truth_beside(velodyne.parent)
+            drive,
+            path,
+            tuple(self._sweeps),
+            cameras,
+            exposed_ns,
+            truth_beside(velodyne.parent),
+            self._sweeps,
         )
 
     def stamp_ns(self, frame: int) -> int:

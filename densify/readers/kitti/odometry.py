@@ -87,6 +87,7 @@ class KittiOdometry(FileSequence):
             {name: self._camera(path, name) for name in self._images},
             {n: {f: self._time_ns(f, times) for f in files} for n, files in self._images.items()},
             truth_beside(path),
+            self._sweeps,
         )
 
     def stamp_ns(self, frame: int) -> int:

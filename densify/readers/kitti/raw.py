@@ -79,6 +79,7 @@ class KittiRaw(FileSequence):
             cameras,
             {name: self._exposures_ns(drive, name) for name in cameras},
             truth_beside(drive),
+            self._sweeps,
         )
 
     def stamp_ns(self, frame: int) -> int:
@@ -86,10 +87,6 @@ class KittiRaw(FileSequence):
         if self._stamps is None:
             return int(frame) * NOMINAL_PERIOD_NS
         return self._stamps[frame]
-
-    def sweep_bytes(self) -> dict[int, int]:
-        """See `densify.types.KnowsFiles`."""
-        return {frame: path.stat().st_size for frame, path in self._sweeps.items()}
 
     def _returns(self, frame: int) -> tuple[Path, Returns]:
         path = self._sweeps[frame]

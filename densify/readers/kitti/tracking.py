@@ -74,6 +74,7 @@ class KittiTracking(FileSequence):
             {name: self._camera(path, name) for name in self._images},
             {n: {f: f * NOMINAL_PERIOD_NS for f in files} for n, files in self._images.items()},
             truth_beside(path),
+            self._sweeps,
         )
 
     def stamp_ns(self, frame: int) -> int:

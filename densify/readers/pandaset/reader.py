@@ -114,6 +114,7 @@ class PandaSet(FileSequence):
             cameras,
             exposed_ns,
             truth_beside(path),
+            self._sweeps,
         )
 
     def stamp_ns(self, frame: int) -> int:
