@@ -18,7 +18,7 @@ from densify.errors import InputError
 from densify.geometry import poses
 from densify.readers.street import Street
 from densify.readers.timeline import Timeline
-from densify.types import Sweep
+from densify.types import RegisteredSweep, Sweep, Trajectory
 from tests.command import exit_code, refused
 
 FRAMES = range(112, 125)
@@ -197,3 +197,43 @@ def test_bad_arguments_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture
     assert "no such folder" in refused(capsys, 2, "doctor", tmp_path / "nowhere")
     command = ("doctor", "street", "--picture", tmp_path / "look.jpg")
     assert ".png" in refused(capsys, 2, *command)
+
+
+@pytest.mark.parametrize("late_ms", [0, 120, -160])
+def test_the_clock_of_poses_is_measured_in_a_bend(late_ms: int) -> None:
+    """10 m/s along bends; poses of where the vehicle was late_ms before their stamps."""
+
+    def pose(time_s: float) -> np.ndarray:
+        s = np.linspace(0, time_s, 400)
+        yaw = 0.4 * np.sin(1.5 * s)
+        T = poses.exp(np.array([0, 0, yaw[-1], 0, 0, 0]))
+        T[:2, 3] = [np.trapezoid(10 * f(yaw), s) for f in (np.cos, np.sin)]
+        return T
+
+    period_ns = 100_000_000
+
+    class Bend:
+        name, frames = "bend", range(40)
+
+        def stamp_ns(self, frame: int) -> int:
+            return frame * period_ns
+
+        def T_world_lidar(self, frame: int) -> np.ndarray:
+            return pose(frame * 0.1 - late_ms * 1e-3)
+
+    def spot(first: int) -> Spot:
+        frames = tuple(range(first, first + 5))
+        T_world_lidar = np.stack([pose(f * 0.1) for f in frames])
+        stamp_ns = np.array(frames) * period_ns
+        trajectory = Trajectory(frames, stamp_ns, T_world_lidar)
+        empty = [RegisteredSweep.without_points(trajectory, f).sweep for f in frames]
+        return Spot(tuple(empty), trajectory)
+
+    bend = Bend()
+    sample = Sample(bend, Timeline.of(bend), (spot(8), spot(18), spot(28)), {})  # type: ignore[arg-type]
+    *others, clock = paths.check_poses(sample)
+    assert clock.check == "clock of poses", others
+    assert abs(clock.values["late_s"] - late_ms * 1e-3) < 0.025
+    assert clock.values["low_s"] - 0.01 <= late_ms * 1e-3 <= clock.values["high_s"] + 0.01
+    assert clock.verdict == (Verdict.SUSPICIOUS if late_ms else Verdict.FINE)
+    assert f"by {-late_ms:+.0f} ms" in clock.remedy or not late_ms

@@ -12,10 +12,13 @@ from densify.doctor.findings import Finding, Verdict
 from densify.doctor.sample import Sample, Spot
 from densify.errors import InputError
 from densify.geometry import poses
+from densify.readers.pose_track import PoseTrack
 from densify.types import Float
 
 _LEAST_WAY_M = 1.0
 _OFF_M, _OFF_PER_M, _OFF_DEG = 0.3, 0.1, 2.0  # over a spot of five sweeps
+_CLOCK_S, _CLOCK_STEP_S, _CLOCK_OFF_S = 0.3, 0.02, 0.04
+_NOISE_M, _NOISE_RAD, _EVEN_COST = 0.05, 1.5e-3, 4.0
 _MUCH_BETTER, _EXACT = 0.4, 0.15  # of what is allowed
 _CAM_AXES = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
 
@@ -110,7 +113,7 @@ def check_poses(sample: Sample) -> list[Finding]:
         slow = way_m < _LEAST_WAY_M
         verdict = Verdict.UNKNOWN if slow else Verdict.FINE
         text += "; the vehicle hardly moves" if slow else ""
-        return [Finding("poses", verdict, text, values=values)]
+        return [Finding("poses", verdict, text, values=values), *_check_clock(sample, found)]
     return [
         Finding(
             "poses",
@@ -119,8 +122,56 @@ def check_poses(sample: Sample) -> list[Finding]:
             f"clock, or noise)",
             "leave them out with --set register.source=kiss-icp",
             values,
-        )
+        ),
+        *_check_clock(sample, found),
     ]
+
+
+def _check_clock(sample: Sample, found: list[Float]) -> list[Finding]:
+    """The difference between the clocks of poses and sweeps: the shift with which the poses agree
+    best with odometry. It shows where the vehicle turns or changes its speed."""
+    stamps_ns = [(s.sweeps[0].stamp_ns, s.sweeps[-1].stamp_ns) for s in sample.registered]
+    late_s = np.arange(-_CLOCK_S, _CLOCK_S + 1e-9, _CLOCK_STEP_S)
+    cost = np.zeros(len(late_s))
+    tracks = [_track(sample, *ends_ns) for ends_ns in stamps_ns]
+    for (first_ns, last_ns), step, track in zip(stamps_ns, found, tracks, strict=True):
+        if track is None:  # at the recording's ends
+            continue
+        for row, seconds in enumerate(late_s):
+            ends_ns = [int(ns + 1e9 * seconds) for ns in (first_ns, last_ns)]
+            off = poses.log(poses.inverse(_between([track.at(ns) for ns in ends_ns])) @ step)
+            cost[row] += np.sum((off[3:] / _NOISE_M) ** 2) + np.sum((off[:3] / _NOISE_RAD) ** 2)
+    if all(track is None for track in tracks):
+        return []
+    good = late_s[cost < cost.min() + _EVEN_COST]
+    low_s, high_s, best_s = float(good.min()), float(good.max()), float(late_s[np.argmin(cost)])
+    values = {"late_s": best_s, "low_s": low_s, "high_s": high_s}
+    text = (
+        f"odometry agrees best with the poses stamped {best_s * 1e3:+.0f} ms "
+        f"({low_s * 1e3:+.0f} to {high_s * 1e3:+.0f}) later"
+    )
+    if high_s - low_s > _CLOCK_S:
+        text += "; the vehicle drives too evenly to tell"
+        return [Finding("clock of poses", Verdict.UNKNOWN, text, values=values)]
+    if low_s > _CLOCK_OFF_S or high_s < -_CLOCK_OFF_S:
+        remedy = f"shift the poses' stamps by {-best_s * 1e3:+.0f} ms"
+        return [Finding("clock of poses", Verdict.SUSPICIOUS, text, remedy, values)]
+    return [Finding("clock of poses", Verdict.FINE, text, values=values)]
+
+
+def _track(sample: Sample, first_ns: int, last_ns: int) -> PoseTrack | None:
+    """The recording's poses around a spot; None at its ends, or where one is missing."""
+    reach_ns = int(1e9 * _CLOCK_S)
+    timeline = sample.timeline
+    frames = timeline.within(first_ns - 2 * reach_ns, last_ns + 2 * reach_ns)
+    stamp_ns = np.array([timeline.stamp_of(f) for f in frames], np.int64)
+    if stamp_ns[0] > first_ns - reach_ns or stamp_ns[-1] < last_ns + reach_ns:
+        return None
+    try:
+        T_world_lidar = np.stack([sample.sequence.T_world_lidar(f) for f in frames])
+        return PoseTrack(sample.sequence.name, stamp_ns, T_world_lidar)
+    except InputError:
+        return None
 
 
 def _given(sample: Sample, spot: Spot) -> list[Float]:
