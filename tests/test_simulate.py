@@ -14,7 +14,8 @@ from densify.readers.kitti.raw import KittiRaw
 from densify.readers.street import Street
 from densify.readers.truth_files import FileTruth, write_bodies, write_points
 from densify.street.bodies import Bodies
-from densify.writers import write_street
+from densify.writers import FORMATS, write_street
+from tests.command import exit_code
 
 FRAMES = [58, 60]
 
@@ -262,3 +263,9 @@ def test_flipped_bytes_in_a_truth_file_are_one_clear_line(tmp_path):
     (tmp_path / "array.npy").rename(path)
     with pytest.raises(InputError, match=r"bodies\.npz: not a truth file"):
         FileTruth.open(tmp_path)
+
+
+def test_help_names_every_format(capsys: pytest.CaptureFixture[str]) -> None:
+    assert exit_code("simulate", "--help") == 0
+    words = capsys.readouterr().out.replace(",", " ").split()
+    assert set(FORMATS) <= set(words)

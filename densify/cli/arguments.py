@@ -177,7 +177,8 @@ def _add_simulate(commands: Any) -> None:
         "--format",
         default="kitti",
         metavar="NAME",
-        help="the data set whose format to write (default: kitti); a wrong name lists all",
+        help="the format to write: kitti (default), folder, ros1, ros2, argoverse2, "
+        "kitti-odometry, kitti-tracking, kitti-360, nuscenes, opensceneflow, waymo, dgp, pandaset",
     )
     parser.add_argument(
         "--preset",
