@@ -151,6 +151,7 @@ def test_what_workers_log_is_logged_here(
 
 def test_a_worker_at_two_tasks_keeps_their_logs_apart(caplog: pytest.LogCaptureFixture) -> None:
     """Dask workers that others started may have several threads."""
+    caplog.set_level(logging.WARNING, "densify")  # and back at the end: a worker sets its own
     tasks = [Task((n,), worker_tasks.warn_together, (n,)) for n in range(2)]
     with ThreadPoolExecutor(2) as threads:
         answers = list(threads.map(calls.answer, map(calls.packed, tasks)))
