@@ -389,8 +389,7 @@ class Recording:
     def _made(
         self, stage: str, kind: type[T], inputs: Callable[[], Any], make: Callable[[], T]
     ) -> T:
-        """What ``make`` returns, of that type, now or when it was made of the same inputs
-        before."""
+        """What ``make`` returns, now or when it was made of the same inputs before."""
         return make() if self._cache is None else self._cache.get(stage, kind, inputs(), make)
 
     def _near(self, number: int, index: int) -> Any:

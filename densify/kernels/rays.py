@@ -105,6 +105,15 @@ def _turn(x, y, z, R):  # type: ignore[no-untyped-def]
     )
 
 
+@inlined
+def _from_scanner(x, y, z, origin, turned, axes):  # type: ignore[no-untyped-def]
+    """A point of the lidar frame from where a scanner stands, in its axes."""
+    x, y, z = x - origin[0], y - origin[1], z - origin[2]
+    if turned:
+        x, y, z = _turn(x, y, z, axes)
+    return x, y, z
+
+
 @Kernel
 def aim(begin, end, points, offset_s, origin, axes, turned, twists, rays):  # type: ignore[no-untyped-def]
     """The rays that measured a deskewed scanner's points, seen from it when it fired them.
@@ -116,9 +125,7 @@ def aim(begin, end, points, offset_s, origin, axes, turned, twists, rays):  # ty
     """
     for i in range(begin, end):
         x, y, z = _at_time(points[i, 0], points[i, 1], points[i, 2], offset_s[i], twists)
-        x, y, z = x - origin[0], y - origin[1], z - origin[2]
-        if turned:
-            x, y, z = _turn(x, y, z, axes)
+        x, y, z = _from_scanner(x, y, z, origin, turned, axes)
         ground = np.sqrt(x * x + y * y)
         rays[0, i] = _azimuth(x, y)
         rays[1, i] = _azimuth(ground, z)
@@ -214,11 +221,8 @@ def see_through(begin, end, points, velocity, image, margins, min_filled, free):
     for start in range(begin, end, _BLOCK):
         size = min(_BLOCK, end - start)
         for k in range(size):
-            x[k] = points[start + k, 0] - origin[0]
-            y[k] = points[start + k, 1] - origin[1]
-            z[k] = points[start + k, 2] - origin[2]
-            if image.turned:
-                x[k], y[k], z[k] = _turn(x[k], y[k], z[k], image.axes)
+            px, py, pz = points[start + k, 0], points[start + k, 1], points[start + k, 2]
+            x[k], y[k], z[k] = _from_scanner(px, py, pz, origin, image.turned, image.axes)
         for _ in range(2):  # when did the scanner face the point? converges in two steps
             for k in range(size):
                 column[k] = _column(_azimuth(x[k], y[k]), num_columns)
@@ -234,9 +238,8 @@ def see_through(begin, end, points, velocity, image, margins, min_filled, free):
                     py += t * velocity[i, 1]
                     pz += t * velocity[i, 2]
                 px, py, pz = _at_time(px, py, pz, t, image.twists)
-                x[k], y[k], z[k], time_s[k] = px - origin[0], py - origin[1], pz - origin[2], t
-                if image.turned:
-                    x[k], y[k], z[k] = _turn(x[k], y[k], z[k], image.axes)
+                time_s[k] = t
+                x[k], y[k], z[k] = _from_scanner(px, py, pz, origin, image.turned, image.axes)
         for k in range(size):
             column[k] = _column(_azimuth(x[k], y[k]), num_columns)
         for k in range(size):

@@ -91,7 +91,7 @@ class FileSequence(ABC):
 
     def _encoded_image(self, camera: str, number: int) -> tuple[Path, bytes]:
         """A PNG or JPEG file's bytes of an existing image, and the file for messages."""
-        raise NotImplementedError
+        raise InputError(f"{self.where}: holds no images of {camera}")
 
     def _pose(self, frame: int) -> Float:
         """(4,4) T_world_lidar of an existing sweep."""
