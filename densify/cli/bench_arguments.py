@@ -9,6 +9,7 @@ from typing import Any
 from densify.cli import bench_verbs
 from densify.cli.options import (
     DATA_HELP,
+    add_camera,
     add_config_options,
     add_overwrite,
     add_verb,
@@ -23,6 +24,7 @@ def add_bench(commands: Any) -> None:
     parser = commands.add_parser("bench", help=about, description=f"{about.capitalize()}.")
     benches = parser.add_subparsers(title="benches", metavar="WHAT", required=True)
     _add_bench_flow(benches)
+    _add_bench_depth(benches)
     _add_bench_doctor(benches)
 
 
@@ -66,6 +68,50 @@ def _add_bench_flow(benches: Any) -> None:
         metavar="N",
         help="points that paper, paper-adam and nicp may move; more is slower and finer, 0: all "
         "(default: 8000)",
+    )
+    add_config_options(parser)
+    parser.add_argument("--out", metavar="FILE.json", type=Path, help="write every number there")
+    add_overwrite(parser)
+
+
+def _add_bench_depth(benches: Any) -> None:
+    parser = add_verb(
+        benches,
+        "depth",
+        bench_verbs.bench_depth,
+        "depth maps of several configurations side by side, against every truth there is",
+        "Truths: the built-in street's exact one, where a scanner in the key sweep can reach; the "
+        "key sweep's returns, for the key made without them; with --scanner the returns of one of "
+        "several scanners, for maps made without it.",
+    )
+    parser.add_argument("--data", metavar="SPEC", help=DATA_HELP)
+    parser.add_argument(
+        "--key",
+        type=natural,
+        action="append",
+        dest="keys",
+        metavar="K",
+        help="may be given several times (default: 120)",
+    )
+    add_window(parser)
+    add_camera(parser)
+    parser.add_argument(
+        "--method", default="flow", metavar="NAME", help="as of compare (default: flow)"
+    )
+    parser.add_argument(
+        "--variant",
+        nargs="+",
+        action="append",
+        default=[],
+        metavar=("NAME", "section.key=value"),
+        help="a configuration beside the given one, with these values changed; may be given "
+        "several times",
+    )
+    parser.add_argument(
+        "--scanner",
+        type=natural,
+        metavar="N",
+        help="leave this scanner's returns out of the maps and take them for the truth",
     )
     add_config_options(parser)
     parser.add_argument("--out", metavar="FILE.json", type=Path, help="write every number there")

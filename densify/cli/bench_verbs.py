@@ -11,6 +11,38 @@ from densify.config import as_mapping, resolve
 _DEFAULT_KEY = 120
 
 
+def bench_depth(options: argparse.Namespace) -> None:
+    """Depth maps of several configurations against every truth."""
+    variants = {"as configured": resolve(options.config, options.overrides)}
+    for name, *changes in options.variant:
+        variants[name] = resolve(options.config, [*options.overrides, *changes])
+    from densify.bench import depth as bench
+    from densify.bench.table_file import write_table
+    from densify.cli.point_files import check_new_file
+    from densify.cli.tables import depth_table
+    from densify.readers import open_sequence
+
+    if options.out is not None:
+        check_new_file(options.out, options.overwrite, ".json")
+    with progress_on_stderr() as progress:
+        measured = bench.bench_depth(
+            open_sequence(options.data or "street"),
+            options.keys or [_DEFAULT_KEY],
+            options.window,
+            variants,
+            options.cameras,
+            options.scanner,
+            options.method,
+            progress,
+        )
+    print(depth_table(measured), flush=True)
+    if options.out is not None:
+        write_table(
+            options.out, {**measured, "config": {n: as_mapping(c) for n, c in variants.items()}}
+        )
+        print_paths([options.out])
+
+
 def bench_doctor(options: argparse.Namespace) -> None:
     """Which mistakes, made on purpose in good recordings, doctor names."""
     config = resolve(options.config, options.overrides)

@@ -156,6 +156,29 @@ def flow_table(measured: Mapping[str, Any]) -> str:
     return "\n".join(lines)
 
 
+def depth_table(measured: Mapping[str, Any]) -> str:
+    """A table for each truth: a row per variant, coverage and outliers of each product."""
+    variants: Mapping[str, Any] = measured["variants"]
+    keys = format_frames(measured["keys"])
+    sources = {source: None for row in variants.values() for source in row["scores"]}
+    lines = []
+    for source in sources:
+        columns: list[Column] = []
+        for product in ("measured", "filled"):
+            columns.append((f"{product}", ("density", product), ".1%"))
+            for part, title in (("all", ""), ("moving", " movers")):
+                path = ("scores", source, product, part)
+                columns.append((f"cov{title}", (*path, "coverage"), ".3f"))
+                columns.append((f"wrong{title}", (*path, "outliers"), ".3%"))
+        columns.append(("s/key", ("seconds",), ".2f"))
+        lines += [
+            f"{measured['data']}, keys {keys}, against {source}",
+            _table(variants, columns),
+            "",
+        ]
+    return "\n".join(lines)
+
+
 _EVALUATION_COLUMNS: tuple[Column, ...] = (
     ("pixels", ("num_pixels",), ",d"),
     ("coverage", ("coverage",), ".1%"),

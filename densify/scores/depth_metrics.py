@@ -98,7 +98,7 @@ def depth_errors(
         delta_1=_mean(ratio < _DELTA),
         delta_2=_mean(ratio < _DELTA**2),
         delta_3=_mean(ratio < _DELTA**3),
-        outliers=_mean(_is_outlier(disparity_m_px / z, disparity_m_px / t)),
+        outliers=_mean(is_outlier(disparity_m_px / z, disparity_m_px / t)),
     )
 
 
@@ -168,7 +168,7 @@ def depth_edges(truth_m: Float32, *, focal_px: float, baseline_m: float = KITTI_
     smallest = ndimage.minimum_filter(holes_out, size, mode="constant", cval=math.inf)
     edge = np.zeros(truth_m.shape, bool)
     here = disparity_px[known]
-    edge[known] = _is_outlier(largest[known], here) | _is_outlier(smallest[known], here)
+    edge[known] = is_outlier(largest[known], here) | is_outlier(smallest[known], here)
     return edge
 
 
@@ -207,7 +207,8 @@ def depth_scores(
     }
 
 
-def _is_outlier(disparity_px: Float, true_px: Float) -> Bool:
+def is_outlier(disparity_px: Float, true_px: Float) -> Bool:
+    """(N,) True where a disparity is wrong by KITTI's rule, see `DepthErrors`."""
     off_px = np.abs(disparity_px - true_px)
     wrong: Bool = (off_px > _OUTLIER_PX) & (off_px > _OUTLIER_FRACTION * true_px)
     return wrong

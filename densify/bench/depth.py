@@ -1,0 +1,253 @@
+# SPDX-License-Identifier: MIT
+"""Depth maps of several configurations side by side, against every truth that there is.
+
+``truth``: a simulated recording's, where a scanner in the key sweep can reach: below its top ring
+and within 80 m. ``key held out``: the key sweep's own returns, for the key densified from the other
+sweeps. ``scanner``: the returns of one of several scanners, none of which goes into the maps.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from densify import pipeline
+from densify.cache import Cache
+from densify.config import Config
+from densify.costs import Watch
+from densify.depth.exposure import Exposure, key_shots
+from densify.errors import InputError
+from densify.geometry import poses
+from densify.geometry.cameras import converted, depth_along, rays
+from densify.readers.window import choose_cameras
+from densify.recording import Recording
+from densify.scores.depth_metrics import KITTI_BASELINE_M, image_density, is_outlier
+from densify.types import Bool, Camera, Float32, LidarSequence, Progress, Result, Sweep
+
+PRODUCTS = ("measured", "filled")
+_REACH_M = 80.0
+_TOP_QUANTILE = 0.999
+_HIDING_PX = 11  # a second scanner stands elsewhere: what it sees behind a near return is hidden
+_HIDING_FRACTION, _HIDING_M = 0.03, 0.2
+_WRONG_M, _WRONG_FRACTION = 0.3, 0.05
+_CACHE_BYTES = 8 << 30
+_STAGE = "project"
+
+
+class TruthMap(NamedTuple):
+    """depth_m: (H,W), 0 none. moving: (H,W). by_disparity: what is wrong is told by KITTI's rule,
+    more than 3 px of disparity and 5 %; else by more than 0.3 m and 5 %, whatever the camera."""
+
+    depth_m: Float32
+    moving: Bool
+    by_disparity: bool
+
+
+def bench_depth(
+    sequence: LidarSequence,
+    keys: Sequence[int],
+    window: int,
+    variants: Mapping[str, Config],
+    cameras: Sequence[str] | None = None,
+    scanner: int | None = None,
+    method: str = "flow",
+    progress: Progress | None = None,
+) -> dict[str, Any]:
+    """Make the keys with each variant and score the pixels of all keys and cameras together.
+
+    variants: configurations by name. scanner: number of the one whose returns are the truth. The
+    rest as `densify.pipeline.run`.
+
+    Returns plain numbers: by variant ``density`` (mean share of the image) of each product,
+    ``seconds`` a key of the stages that make the maps, and ``scores`` by truth, product and part
+    (``all``, ``moving``): num_pixels, coverage, outliers.
+
+    Raises InputError for what cannot be used, ComputationError where registration went wrong.
+    """
+    choose_cameras(sequence, cameras)
+    if method not in pipeline.METHODS:
+        raise InputError(f"--method {method}: expected one of {', '.join(pipeline.METHODS)}")
+    if scanner is not None and not np.any(sequence[keys[0]].lidar == scanner):
+        raise InputError(f"--scanner {scanner}: no returns of it in sweep {keys[0]}")
+    used = sequence if scanner is None else _Without(sequence, scanner)
+    sums = {name: _Sums() for name in variants}
+    cache, done = Cache(_CACHE_BYTES), 0
+    for key in keys:
+        returns: dict[str, TruthMap] = {}
+        for name, config in variants.items():
+            if scanner is not None and not returns:
+                returns = _returns_of(scanner, sequence, key, window, cameras, config, cache)
+            watch = Watch()
+            recording = Recording(used, config, window, [key], cache, watch=watch)
+            made = pipeline.densify(recording, key, [method], cameras, watch)[method]
+            exact = _exact(used, recording.window(key)[key].sweep, key, cameras, config)
+            sums[name].add(made, {"truth": exact, "scanner": returns}, used.cameras)
+            done += 1
+            if progress is not None:
+                progress("bench", done, len(keys) * len(variants))
+    return {
+        "data": sequence.name,
+        "keys": list(keys),
+        "scanner": scanner,
+        "variants": {name: found.numbers(len(keys)) for name, found in sums.items()},
+    }
+
+
+class _Without:
+    """A sequence without the returns of one scanner."""
+
+    def __init__(self, sequence: LidarSequence, scanner: int) -> None:
+        self._sequence, self._scanner = sequence, scanner
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._sequence, name)
+
+    def __getitem__(self, frame: int) -> Sweep:
+        sweep = self._sequence[frame]
+        return sweep.select(sweep.lidar != self._scanner)
+
+
+def _returns_of(
+    scanner: int,
+    sequence: LidarSequence,
+    key: int,
+    window: int,
+    cameras: Sequence[str] | None,
+    config: Config,
+    cache: Cache,
+) -> dict[str, TruthMap]:
+    """What one scanner of the key sweep measured, by map, without what is hidden."""
+    recording = Recording(sequence, config, window, [key], cache)
+    cloud, _ = recording.moment(key, all_sweeps=True, engine="")
+    cloud = cloud.select((cloud.lidar == scanner) & (cloud.frame == key))
+    stretch = recording.window(key)
+    shots = key_shots(sequence, choose_cameras(sequence, cameras), key, config.project)
+    maps = {}
+    for name, shot in shots.items():
+        view = Exposure.of(sequence, stretch, key, shot, config).sees(cloud)
+        depth_m = view.exposure.depth_m(view.points_cam)
+        farthest_first = np.argsort(-depth_m, kind="stable")
+        column, row = np.rint(view.uv[farthest_first]).astype(np.int64).T
+        shape = (shot.camera.height_px, shot.camera.width_px)
+        nearest_m, moving = np.zeros(shape, np.float32), np.zeros(shape, bool)
+        nearest_m[row, column] = depth_m[farthest_first]
+        moving[row, column] = cloud.moving[view.rows[farthest_first]]
+        before_m = ndimage.minimum_filter(
+            np.where(nearest_m > 0, nearest_m, np.float32(np.inf)), _HIDING_PX
+        )
+        nearest_m[nearest_m > (1 + _HIDING_FRACTION) * before_m + _HIDING_M] = 0
+        maps[name] = TruthMap(nearest_m, moving, by_disparity=False)
+    return maps
+
+
+def _exact(
+    sequence: LidarSequence,
+    key_sweep: Sweep,
+    key: int,
+    cameras: Sequence[str] | None,
+    config: Config,
+) -> dict[str, TruthMap]:
+    """The exact truth by map, where a scanner can reach it."""
+    maps: dict[str, TruthMap] = {}
+    if sequence.truth is None:
+        return maps
+    away = key_sweep.points
+    if key_sweep.scanner_origins is not None:
+        away = away - key_sweep.scanner_origins[key_sweep.lidar]
+    rise = away[:, 2] / np.linalg.norm(away[:, :2], axis=1)
+    top = np.quantile(rise, _TOP_QUANTILE)
+    shots = key_shots(sequence, choose_cameras(sequence, cameras), key, config.project)
+    for name, shot in shots.items():
+        if shot.number is None:
+            continue
+        camera, number = shot.camera, shot.number
+        depth_m = sequence.truth.depth_m(camera.name, number)
+        v, u = np.nonzero((depth_m > 0) & (depth_m <= _REACH_M))
+        ray = rays(camera, np.stack([u, v], 1).astype(np.float64))
+        scale = depth_m[v, u] / depth_along(ray, camera.measure)
+        lidar = poses.transform(poses.inverse(camera.T_cam_lidar), ray * scale[:, None])
+        below = lidar[:, 2] <= top * np.linalg.norm(lidar[:, :2], axis=1)
+        known_m = np.zeros_like(depth_m)
+        known_m[v[below], u[below]] = depth_m[v[below], u[below]]
+        moving = sequence.truth.moving_mask(camera.name, number)
+        measure = config.project.depth if config.project.depth != "auto" else camera.measure
+        known_m = converted(camera, known_m, camera.measure, measure)
+        maps[name] = TruthMap(known_m, moving, by_disparity=True)
+    return maps
+
+
+class _Sums:
+    """Pixels counted over keys and cameras."""
+
+    def __init__(self) -> None:
+        self._counts: dict[tuple[str, str, str], NDArray[np.int64]] = {}
+        self._densities: dict[str, list[float]] = {product: [] for product in PRODUCTS}
+        self._seconds = 0.0
+
+    def add(
+        self,
+        made: Result,
+        truths: Mapping[str, Mapping[str, TruthMap]],
+        cameras: Mapping[str, Camera],
+    ) -> None:
+        self._seconds += sum(cost.seconds for cost in made.costs if cost.name == _STAGE)
+        for name, maps in made.depth.items():
+            for product, depth_m in zip(PRODUCTS, (maps.depth_m, maps.filled_m), strict=True):
+                self._densities[product].append(image_density(depth_m))
+                for source, by_map in truths.items():
+                    if name in by_map:
+                        truth, focal_px = by_map[name], cameras[maps.camera].focal_px
+                        self._count(source, product, "all", depth_m, truth, focal_px)
+                        movers = truth._replace(depth_m=np.where(truth.moving, truth.depth_m, 0))
+                        self._count(source, product, "moving", depth_m, movers, focal_px)
+        held_out = made.metrics.get("held_out") or {}
+        for scores in held_out.values():
+            for product in PRODUCTS:
+                for part in ("all", "moving"):
+                    score = scores[product][part]
+                    wrong = round((score["outliers"] or 0.0) * score["num_compared"])
+                    self._sum(
+                        "key held out",
+                        product,
+                        part,
+                        score["num_pixels"],
+                        score["num_compared"],
+                        wrong,
+                    )
+
+    def _count(
+        self,
+        source: str,
+        product: str,
+        part: str,
+        depth_m: Float32,
+        truth: TruthMap,
+        focal_px: float,
+    ) -> None:
+        known = truth.depth_m > 0
+        both = known & (depth_m > 0)
+        z, t = depth_m[both].astype(np.float64), truth.depth_m[both].astype(np.float64)
+        if truth.by_disparity:
+            wrong = is_outlier(focal_px * KITTI_BASELINE_M / z, focal_px * KITTI_BASELINE_M / t)
+        else:
+            wrong = (np.abs(z - t) > _WRONG_M) & (np.abs(z - t) > _WRONG_FRACTION * t)
+        self._sum(source, product, part, int(known.sum()), int(both.sum()), int(wrong.sum()))
+
+    def _sum(self, source: str, product: str, part: str, *counts: int) -> None:
+        so_far = self._counts.setdefault((source, product, part), np.zeros(3, np.int64))
+        so_far += counts
+
+    def numbers(self, num_keys: int) -> dict[str, Any]:
+        scores: dict[str, Any] = {}
+        for (source, product, part), (num, compared, wrong) in self._counts.items():
+            scores.setdefault(source, {}).setdefault(product, {})[part] = {
+                "num_pixels": int(num),
+                "coverage": compared / num if num else None,
+                "outliers": wrong / compared if compared else None,
+            }
+        density = {p: float(np.mean(d)) for p, d in self._densities.items() if d}
+        return {"density": density, "seconds": self._seconds / num_keys, "scores": scores}
