@@ -176,14 +176,12 @@ def densify(
     """One key of a recording by several methods, each with those before it as its baselines.
 
     methods: of `METHODS`. with_images: the cloud takes the images' colours, and depth is compared
-    with the truth where there is some. Errors as `run`.
+    with the truth where there is some; the maps are the same either way. Errors as `run`.
     """
     watch, sequence, settings = watch or Watch(), recording.sequence, recording.settings
     shots = key_shots(sequence, choose_cameras(sequence, cameras), key, settings.project)
-    images = None
-    if with_images:
-        with watch.stage("images"):
-            images = load_images(sequence, shots)
+    with watch.stage("images"):
+        images = load_images(sequence, shots)
     stretch = recording.window(key)
     moments = {
         name: recording.moment(
@@ -191,7 +189,7 @@ def densify(
         )
         for name in methods
     }
-    return _results(sequence, stretch, key, moments, shots, images, settings, watch)
+    return _results(sequence, stretch, key, moments, shots, images, with_images, settings, watch)
 
 
 def _warn_of_cuts(recording: Recording, key: int) -> None:
@@ -221,20 +219,22 @@ def _results(
     key: int,
     moments: dict[str, tuple[Cloud, StretchFlow | None]],
     shots: Mapping[str, Shot],
-    images: Mapping[str, Image] | None,
+    images: Mapping[str, Image],
+    with_images: bool,
     settings: Config,
     watch: Watch,
 ) -> dict[str, Result]:
     """What the cameras see of each method's cloud, and how good that is; side by side on as many
     cores as there are."""
     key_image = RangeImage.of(stretch[key])
-    views = Views.of(sequence, stretch, key, key_image, shots, settings)
+    views = Views.of(sequence, stretch, key, key_image, shots, images, settings)
     truth = {}
-    if images is not None and sequence.truth is not None:
+    if with_images and sequence.truth is not None:
         truth = views.truth(sequence.truth)
     with watch.stage("held out"):
         held_out = HeldOut.of(views, moments[next(reversed(moments))][0])
-    seen = _Seen(sequence, stretch, key_image, views, held_out, truth, images, settings, watch)
+    pictures = images if with_images else None
+    seen = _Seen(sequence, stretch, key_image, views, held_out, truth, pictures, settings, watch)
     with ThreadPoolExecutor(num_threads()) as pool:
         made = list(pool.map(lambda name: seen.result(name, *moments[name]), moments))
     results: dict[str, Result] = {}

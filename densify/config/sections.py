@@ -230,6 +230,12 @@ class ProjectSettings(Section):
     edge_slack_m: float = knob(
         0.015, "[m] added to that, for errors of registration and flow", 0, 1
     )
+    rims: str = knob(
+        "strict",
+        "pixels measured that close to a depth edge. strict: leave them out; keep: keep them all, "
+        "which fattens outlines",
+        choices=("strict", "keep"),
+    )
     fill_reach: float = knob(
         1.0,
         "how far the two-sided fill looks for measured pixels, in spacings of neighbouring rays; "

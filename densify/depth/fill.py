@@ -6,10 +6,35 @@ A plane in space is linear in *inverse* depth over the image, so planes are fitt
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
+from densify.config import ProjectSettings
+from densify.depth.layers import Layers
 from densify.kernels import filling
 from densify.types import Float32
+
+
+def fill(layers: Layers, settings: ProjectSettings) -> Layers:
+    """Interpolate as `fill_between`, as far as rays lie apart in the middle of the image."""
+    filled_m, confidence = fill_between(
+        layers.depth_m,
+        np.where(layers.depth_m > 0, layers.confidence, np.float32(0)),
+        _reach_px(layers, settings),
+        settings.edge_m,
+        settings.edge_fraction,
+        settings.fill_confidence,
+    )
+    return replace(layers, filled_m=filled_m, confidence=confidence)
+
+
+def _reach_px(layers: Layers, settings: ProjectSettings) -> tuple[int, int]:
+    known = layers.depth_m > 0
+    if not known.any():
+        return 1, 1
+    reach = np.ceil(settings.fill_reach * np.median(layers.spacing_px[known], axis=0))
+    return max(1, int(reach[0])), max(1, int(reach[1]))
 
 
 def fill_between(

@@ -4,22 +4,26 @@
 Points that the camera cannot see are found by occlusion: every point hides what lies clearly behind
 its patch (`densify.depth.patches`). Of the points left in a pixel the one measured nearest in time
 to the key is taken, if enough sweeps agree with it and no depth edge is too close to tell on which
-side of it the pixel lies. Its depth is that of the plane through the points that agree, in the
-middle of the pixel. Nothing depends on the order of the points.
+side of it the pixel lies: those are its rims, which `densify.depth.rims` decides upon. Its depth is
+that of the plane through the points that agree, in the middle of the pixel. Nothing depends on the
+order of the points.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 
 from densify.config import ProjectSettings
 from densify.depth.exposure import Exposure, InView
-from densify.depth.fill import fill_between
+from densify.depth.fill import fill
+from densify.depth.layers import Layers
+from densify.depth.rims import decide
 from densify.geometry.cameras import pixels_per_metre
 from densify.geometry.poses import rotate
 from densify.kernels import visibility as kernels
@@ -28,6 +32,7 @@ from densify.types import Bool, Camera, Cloud, DepthMap, Float, Float32, Int, Pa
 _MAX_HALF_PX = 24.0  # a point just before the lens must not hide the whole image
 _MAX_TILT = 0.25  # of the inverse depth per pixel; a plane seen edge-on has no slope
 _SAME_AGE_NS = 10_000_000
+_BLOCK_PX = 16  # over which rays lie about equally dense
 _MOST_SWEEPS = 63  # that are told apart when they are counted
 _EDGE_WINDOW_PX = 1.5  # beyond the edge, where points must show that a surface goes on
 _LEAST_CONFIDENCE = 1 / 255  # 0 means no depth once written as 8 bits
@@ -64,12 +69,15 @@ class _InImage:
 @dataclass(frozen=True)
 class _Pixels:
     """P measured pixels. pixel: (P,) row by row. winner: (P,) which of the points in the image.
-    depth_m, confidence: (P,)."""
+    depth_m, confidence: (P,). tilt: (P,2) of the inverse depth, 1/m per px. inside: (P,) no depth
+    edge near."""
 
     pixel: Int
     winner: Int
     depth_m: Float32
     confidence: Float32
+    tilt: Float
+    inside: Bool
 
 
 def project(
@@ -78,6 +86,7 @@ def project(
     settings: ProjectSettings,
     patches: Patches,
     filled: bool = True,
+    lab: Float32 | None = None,
 ) -> DepthMap:
     """The depth map of ``cloud``, at the key's moment, as a camera sees it at its exposure.
 
@@ -85,12 +94,13 @@ def project(
     settings: knobs, see `densify.config.ProjectSettings`; with ``visibility`` off the nearest point
     of each pixel is taken as it is; else the source sweep nearest in time to the key wins a pixel.
     patches: of the cloud, at the key's moment (`densify.depth.patches.patches`). filled: False
-    leaves out the filling, which takes its time.
+    leaves out the filling, which takes its time. lab: (H,W,3) the image, as `densify.depth.picture`
+    makes it; without it nothing that needs one is done.
 
     Points nearer than 0.1 m, outside the image or outside the lens's valid field of view are
     dropped. Planes are fitted in inverse depth, or inverse range where depth is the range: linear
     over the image of a pinhole in the first case, nearly so over a surface's few pixels otherwise.
-    ``filled_m`` adds pixels interpolated between measured ones (`densify.depth.fill.fill_between`).
+    ``filled_m`` adds pixels interpolated between measured ones (`densify.depth.fill`).
     ``confidence`` ranks only: the point's own, less where few sweeps or points agree, a depth edge
     is close, the surface rough, or the point nearly hidden. ``reason`` says of every point why it
     is not in the map.
@@ -103,50 +113,77 @@ def project(
         reason[patches.free] = Reason.VETOED
         seen = _visible(points, own, camera, settings, reason)
     else:
-        start, order = _by_pixel(points, np.zeros(len(own), np.int64), own, camera)
-        pixel = np.flatnonzero(np.diff(start))
-        nearest = order[start[pixel]]
-        reason[points.index] = Reason.NOT_CHOSEN
-        seen = _Pixels(pixel, nearest, points.depth[nearest], own[nearest])
-    reason[points.index[seen.winner]] = Reason.KEPT
+        seen = _nearest(points, own, camera, reason)
 
-    maps = _measured(seen, points, view.exposure, reason)
-    return _with_filled(maps, points, settings) if filled else maps
+    layers = decide(_measured(seen, points, camera, lab), settings)
+    if filled:
+        layers = fill(layers, settings)
+    return _finished(layers, cloud, view.exposure, reason)
 
 
-def _measured(
-    seen: _Pixels, points: _InImage, exposure: Exposure, reason: NDArray[np.uint8]
-) -> DepthMap:
-    """The map with measured pixels alone; so far they are ``filled_m`` too."""
-    shape = (exposure.camera.height_px, exposure.camera.width_px)
-    depth_m, confidence = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
-    frame = np.full(shape, -1, np.int32)
-    depth_m.flat[seen.pixel] = seen.depth_m
+def _nearest(points: _InImage, own: Float32, camera: Camera, reason: NDArray[np.uint8]) -> _Pixels:
+    """Each pixel's nearest point, as it is; fills in the ``reason`` of the others."""
+    start, order = _by_pixel(points, np.zeros(len(own), np.int64), own, camera)
+    pixel = np.flatnonzero(np.diff(start))
+    nearest = order[start[pixel]]
+    reason[points.index] = Reason.NOT_CHOSEN
+    everywhere = np.ones(len(pixel), bool)
+    tilt = points.slope[nearest]
+    return _Pixels(pixel, nearest, points.depth[nearest], own[nearest], tilt, everywhere)
+
+
+def _measured(seen: _Pixels, points: _InImage, camera: Camera, lab: Float32 | None) -> Layers:
+    """What is measured away from depth edges is accepted, what is at them to be decided."""
+    shape = (camera.height_px, camera.width_px)
+    depth_m, rim_m, confidence = (np.zeros(shape, np.float32) for _ in range(3))
+    tilt = np.zeros((*shape, 2), np.float32)
+    point = np.full(shape, -1, np.int32)
+    depth_m.flat[seen.pixel] = np.where(seen.inside, seen.depth_m, 0)
+    rim_m.flat[seen.pixel] = np.where(seen.inside, 0, seen.depth_m)
     confidence.flat[seen.pixel] = np.maximum(seen.confidence, _LEAST_CONFIDENCE)
-    frame.flat[seen.pixel] = points.frame[seen.winner]
+    tilt.reshape(-1, 2)[seen.pixel] = seen.tilt
+    point.flat[seen.pixel] = points.index[seen.winner]
+    spacing_px = _spacing_px(points, shape)
+    return Layers(depth_m, rim_m, depth_m, confidence, point, tilt, spacing_px, lab)
+
+
+def _spacing_px(points: _InImage, shape: tuple[int, int]) -> Float32:
+    """(H,W,2) between neighbouring rays: their mean over blocks, the nearest block's where there
+    are no points."""
+    height, width = (-(-size // _BLOCK_PX) for size in shape)
+    column, row = np.rint(points.uv).astype(np.int64).T // _BLOCK_PX
+    block = row * width + column
+    num = np.bincount(block, minlength=height * width)
+    if not num.any():
+        return np.ones((*shape, 2), np.float32)
+    sums = [np.bincount(block, s, height * width) for s in points.spacing_px.T]
+    mean = (np.stack(sums, axis=1) / np.maximum(num, 1)[:, None]).astype(np.float32)
+    empty = (num == 0).reshape(height, width)
+    nearest = ndimage.distance_transform_edt(empty, return_distances=False, return_indices=True)
+    blocks = mean.reshape(height, width, 2)[tuple(nearest)]
+    every = blocks.repeat(_BLOCK_PX, axis=0).repeat(_BLOCK_PX, axis=1)
+    return np.ascontiguousarray(every[: shape[0], : shape[1]])
+
+
+def _finished(
+    layers: Layers, cloud: Cloud, exposure: Exposure, reason: NDArray[np.uint8]
+) -> DepthMap:
+    measured, rim = layers.depth_m > 0, layers.rim_m > 0
+    reason[layers.point[rim]] = Reason.EDGE
+    reason[layers.point[measured]] = Reason.KEPT
+    frame = np.full(measured.shape, -1, np.int32)
+    frame[measured] = cloud.frame[layers.point[measured]]
+    shown = layers.filled_m > 0
+    confidence = np.where(shown, np.maximum(layers.confidence, np.float32(_LEAST_CONFIDENCE)), 0)
     return DepthMap(
         camera=exposure.camera.name,
-        depth_m=depth_m,
-        filled_m=depth_m,
+        depth_m=layers.depth_m,
+        filled_m=layers.filled_m,
         confidence=confidence,
         frame=frame,
         reason=reason,
         measure=exposure.measure,
     )
-
-
-def _with_filled(maps: DepthMap, points: _InImage, settings: ProjectSettings) -> DepthMap:
-    filled_m, confidence = fill_between(
-        maps.depth_m,
-        maps.confidence,
-        _fill_reach_px(points, settings),
-        settings.edge_m,
-        settings.edge_fraction,
-        settings.fill_confidence,
-    )
-    some = filled_m > 0
-    confidence[some] = np.maximum(confidence[some], np.float32(_LEAST_CONFIDENCE))
-    return replace(maps, filled_m=filled_m, confidence=confidence)
 
 
 class _Local(NamedTuple):
@@ -281,8 +318,6 @@ def _visible(
     needed = min(settings.support, max(1, most_sweeps // 2))
     nearest_ns = np.float32(points.age_ns.min(initial=last))
     supported = (num_sweeps >= needed) & (youngest_ns <= nearest_ns)
-    inside = edge >= 1
-    reason[points.index[winner[~inside]]] = Reason.EDGE
     reason[points.index[winner[~supported]]] = Reason.UNSUPPORTED
     doubts = np.stack(
         [
@@ -294,8 +329,8 @@ def _visible(
         ]
     )
     confidence = (own[winner] * (1 - _DOUBTS @ doubts)).astype(np.float32)
-    kept = supported & inside
-    return _Pixels(pixel[kept], winner[kept], depth_m[kept], confidence[kept])
+    every = _Pixels(pixel, winner, depth_m, confidence, points.slope[winner], edge >= 1)
+    return _Pixels(**{name: column[supported] for name, column in vars(every).items()})
 
 
 def _reaches(settings: ProjectSettings) -> kernels.Reaches:
@@ -334,10 +369,3 @@ def _by_pixel(points: _InImage, rank: Int, own: Float32, camera: Camera) -> tupl
     pixel = row * camera.width_px + column
     kernels.by_pixel(pixel, rank, points.depth, points.frame, points.uv, own, start, order)
     return start, order
-
-
-def _fill_reach_px(points: _InImage, settings: ProjectSettings) -> tuple[int, int]:
-    if not len(points.index):
-        return 1, 1
-    reach = np.ceil(settings.fill_reach * np.median(points.spacing_px, axis=0))
-    return max(1, int(reach[0])), max(1, int(reach[1]))

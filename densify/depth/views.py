@@ -15,6 +15,7 @@ from densify.depth.colour import colour
 from densify.depth.exposure import Exposure, InView, Shot
 from densify.depth.optical_flow import optical_flow
 from densify.depth.patches import patches
+from densify.depth.picture import lab
 from densify.depth.project import project
 from densify.geometry import poses
 from densify.geometry.cameras import converted
@@ -54,7 +55,7 @@ class Views:
     """What one key's depth maps show, by their names (`densify.depth.exposure.key_shots`).
 
     key_image: what the key sweep saw. sensors: the scanners. origins: (S,3) where they stood in
-    each sweep, key frame, by frame.
+    each sweep, key frame, by frame. lab: of those that show an image, see `densify.depth.picture`.
     """
 
     key: int
@@ -63,6 +64,7 @@ class Views:
     sensors: Sensors
     origins: Mapping[int, Float]
     settings: ProjectSettings
+    lab: Mapping[str, Float32]
 
     @staticmethod
     def of(
@@ -71,6 +73,7 @@ class Views:
         key: int,
         key_image: RangeImage,
         shots: Mapping[str, Shot],
+        images: Mapping[str, NDArray[np.uint8]],
         settings: Config,
     ) -> Views:
         exposures = {
@@ -82,7 +85,8 @@ class Views:
             f: poses.transform(stretch.T_target_source(key, f), sensors.origins_m)
             for f in stretch.frames
         }
-        return Views(key, key_image, exposures, sensors, origins, settings.project)
+        pictures = {name: lab(image) for name, image in images.items()}
+        return Views(key, key_image, exposures, sensors, origins, settings.project, pictures)
 
     def see(self, cloud: Cloud) -> SeenCloud:
         """A cloud as the cameras see it."""
@@ -98,7 +102,7 @@ class Views:
         fill between what is measured."""
         settings = replace(self.settings, visibility=visible)
         return {
-            name: project(seen.cloud, view, settings, seen.patches, filled)
+            name: project(seen.cloud, view, settings, seen.patches, filled, self.lab.get(name))
             for name, view in seen.views.items()
         }
 
@@ -172,7 +176,8 @@ class Views:
 class HeldOut:
     """The key sweep's own returns as the truth for the key densified from its neighbours alone.
 
-    key_alone: maps of the key sweep. moving: (H,W) where its returns are something's that moves.
+    key_alone: maps of the key sweep, without rims. moving: (H,W) where its returns are something's
+    that moves.
     """
 
     views: Views
@@ -183,9 +188,10 @@ class HeldOut:
     def of(views: Views, cloud: Cloud) -> HeldOut:
         """cloud: says what moves in the key sweep, and how fast."""
         views = replace(views, key_image=None)  # what is held out must not help
+        sure = replace(views, settings=replace(views.settings, rims="strict"))
         own = cloud.select(cloud.frame == views.key)
-        key_alone = views.depth(views.see(own), filled=False)
-        movers = views.depth(views.see(own.select(own.moving)), filled=False)
+        key_alone = sure.depth(sure.see(own), filled=False)
+        movers = sure.depth(sure.see(own.select(own.moving)), filled=False)
         moving = {
             name: (maps.depth_m > 0) & (maps.depth_m == key_alone[name].depth_m)
             for name, maps in movers.items()

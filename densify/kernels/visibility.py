@@ -231,6 +231,8 @@ def settle(first, last, points, reaches, shape, found):  # type: ignore[no-untyp
         on_v = outer
         if moving[i]:  # its sweeps all see it in the same rings
             on_v = max(outer, _GOES_ON * spacing_px[i, 1])
+        # Whether enough sweeps agree does not depend on how far edges are looked for.
+        support_u, support_v = wide_u, wide_v
         wide_u, wide_v = max(wide_u, _window(outer)), max(wide_v, _window(on_v))
         # Other sweeps saw the background where the mover was not yet, or no more.
         witness_ns = _MOVING_WITNESS_NS if moving[i] else _ANY_AGE_NS
@@ -246,8 +248,9 @@ def settle(first, last, points, reaches, shape, found):  # type: ignore[no-untyp
                 if hidden[j] or abs(off) > agree:
                     behind |= close and off < -far and age_ns[j] <= witness_ns
                     continue
-                seen |= np.int64(1) << np.int64(points.sweep[j])
-                youngest = min(youngest, age_ns[j])
+                if abs(du) <= support_u + 0.5 and abs(v - v0) <= support_v:
+                    seen |= np.int64(1) << np.int64(points.sweep[j])
+                    youngest = min(youngest, age_ns[j])
                 if abs(du) <= outer and abs(dv) <= on_v:
                     _extend(reach, du, dv)
                 if abs(du) < fit_u and abs(dv) < fit_v:

@@ -1,0 +1,40 @@
+# SPDX-License-Identifier: MIT
+"""A depth map while it is being made: what the stages of `densify.depth.project` pass on."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from densify.types import Bool, Float32
+
+
+@dataclass(frozen=True)
+class Layers:
+    """One camera's map with all that is known of its pixels; (H,W) everywhere.
+
+    depth_m: float32, accepted as measured, 0 none. rim_m: float32, measured so near to a depth edge
+    that the pixel may show what lies beyond, 0 where not; it stays when the pixel is accepted.
+    filled_m: float32, the accepted ones plus interpolated ones. confidence: float32 0 to 1, of
+    every pixel in any of the three. point: int32 row of the cloud that measured the pixel, -1 none.
+    tilt: (H,W,2) float32 slope of the measured surface's inverse depth to the right and down, 1/m
+    per px. spacing_px: (H,W,2) float32 between neighbouring rays of one sweep, across and along
+    elevation, everywhere. lab: (H,W,3) float32 the image as `densify.depth.picture` makes it, None
+    without one.
+    """
+
+    depth_m: Float32
+    rim_m: Float32
+    filled_m: Float32
+    confidence: Float32
+    point: NDArray[np.int32]
+    tilt: Float32
+    spacing_px: Float32
+    lab: Float32 | None = None
+
+    @property
+    def strict(self) -> Bool:
+        """(H,W) measured, and no depth edge near."""
+        return (self.depth_m > 0) & (self.rim_m == 0)
