@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from densify.cache import Cache
+from densify.completion import completed, key_priors
 from densify.config import Config, resolve
 from densify.costs import Watch
 from densify.depth.age import with_ages
@@ -29,6 +30,7 @@ from densify.flow.engines import check_engine
 from densify.geometry.range_image import RangeImage
 from densify.kernels.threads import num_threads
 from densify.readers.files import format_frames
+from densify.readers.prior_files import PriorFiles
 from densify.readers.window import choose_cameras
 from densify.recording import Recording
 from densify.scores import depth_metrics
@@ -40,6 +42,7 @@ from densify.types import (
     DepthMap,
     Float32,
     LidarSequence,
+    Prior,
     Progress,
     RegisteredSweep,
     Result,
@@ -88,6 +91,7 @@ def run(
     cameras: Sequence[str] | None = None,
     config: ConfigLike = None,
     progress: Progress | None = None,
+    prior: str | Path | None = None,
 ) -> Result:
     """Densify one key.
 
@@ -95,12 +99,16 @@ def run(
     with a warning, at the ends of the recording, at a hole in time of more than three usual
     periods, and at a sweep that cannot be read or registered. method: none, icp or flow, see
     `METHODS`. cameras: names, all if None. config: what `densify.config.resolve` takes. progress:
-    called with (stage, done, total).
+    called with (stage, done, total). prior: a folder of depth images that complete the maps where
+    nothing is measured or filled, see `densify.readers.prior_files`; what is measured and filled
+    does not depend on it.
 
     The result carries its baselines. Raises InputError for what cannot be used, ComputationError
     where registration went wrong.
     """
-    return compare(sequence, key, window, cameras, config, progress, with_baselines(method))[method]
+    methods = with_baselines(method)
+    made = compare(sequence, key, window, cameras, config, progress, methods, prior=prior)
+    return made[method]
 
 
 def run_keys(
@@ -112,6 +120,7 @@ def run_keys(
     config: ConfigLike = None,
     progress: Progress | None = None,
     cache: Cache | None = None,
+    prior: str | Path | None = None,
 ) -> Iterator[tuple[int, Result | ComputationError | InputError]]:
     """Densify several keys, ascending, and yield each with its result, or with what went wrong.
 
@@ -123,13 +132,14 @@ def run_keys(
     """
     settings, methods, watch = resolve(config), with_baselines(method), Watch(progress)
     _check(sequence, settings, methods, cameras)
+    priors = _open_priors(prior, sequence, cameras)
     recording = Recording(sequence, settings, window, keys, cache, watch=watch)
 
     def results() -> Iterator[tuple[int, Result | ComputationError | InputError]]:
         for key in sorted(set(keys)):
             try:
                 _warn_of_cuts(recording, key)
-                yield key, densify(recording, key, methods, cameras, watch)[method]
+                yield key, densify(recording, key, methods, cameras, watch, priors=priors)[method]
             except (ComputationError, InputError) as error:
                 yield key, error
 
@@ -145,17 +155,19 @@ def compare(
     progress: Progress | None = None,
     methods: Sequence[str] = COMPARED,
     cache: Cache | None = None,
+    prior: str | Path | None = None,
 ) -> dict[str, Result]:
     """Methods by name on the same registration, each with those before it as its baselines.
 
-    methods: some of `METHODS`. cache: keeps what the steps before the cloud make. The rest as
-    `run`.
+    methods: some of `METHODS`. cache: keeps what the steps before the cloud make. prior: completes
+    the maps of the last of the methods. The rest as `run`.
     """
     settings, watch = resolve(config), Watch(progress)
     _check(sequence, settings, methods, cameras)
+    priors = _open_priors(prior, sequence, cameras)
     recording = Recording(sequence, settings, window, [key], cache, watch=watch)
     _warn_of_cuts(recording, key)
-    return densify(recording, key, methods, cameras, watch)
+    return densify(recording, key, methods, cameras, watch, priors=priors)
 
 
 def with_baselines(method: str) -> tuple[str, ...]:
@@ -172,16 +184,19 @@ def densify(
     cameras: Sequence[str] | None = None,
     watch: Watch | None = None,
     with_images: bool = True,
+    priors: PriorFiles | None = None,
 ) -> dict[str, Result]:
     """One key of a recording by several methods, each with those before it as its baselines.
 
     methods: of `METHODS`. with_images: the cloud takes the images' colours, and depth is compared
-    with the truth where there is some; the maps are the same either way. Errors as `run`.
+    with the truth where there is some; the maps are the same either way. priors: complete the maps
+    of the last of the methods. Errors as `run`.
     """
     watch, sequence, settings = watch or Watch(), recording.sequence, recording.settings
     shots = key_shots(sequence, choose_cameras(sequence, cameras), key, settings.project)
     with watch.stage("images"):
         images = load_images(sequence, shots)
+    found = {} if priors is None else key_priors(priors, shots, key)
     stretch = recording.window(key)
     moments = {
         name: recording.moment(
@@ -189,7 +204,17 @@ def densify(
         )
         for name in methods
     }
-    return _results(sequence, stretch, key, moments, shots, images, with_images, settings, watch)
+    return _results(
+        sequence, stretch, key, moments, shots, images, with_images, found, settings, watch
+    )
+
+
+def _open_priors(
+    place: str | Path | None, sequence: LidarSequence, cameras: Sequence[str] | None
+) -> PriorFiles | None:
+    if place is None:
+        return None
+    return PriorFiles.open(Path(place), [c.name for c in choose_cameras(sequence, cameras)])
 
 
 def _warn_of_cuts(recording: Recording, key: int) -> None:
@@ -221,6 +246,7 @@ def _results(
     shots: Mapping[str, Shot],
     images: Mapping[str, Image],
     with_images: bool,
+    priors: Mapping[str, Prior],
     settings: Config,
     watch: Watch,
 ) -> dict[str, Result]:
@@ -237,6 +263,9 @@ def _results(
     seen = _Seen(sequence, stretch, key_image, views, held_out, truth, pictures, settings, watch)
     with ThreadPoolExecutor(num_threads()) as pool:
         made = list(pool.map(lambda name: seen.result(name, *moments[name]), moments))
+    if priors and made:
+        with watch.stage("prior"):
+            made[-1] = completed(made[-1], priors, truth, sequence.cameras, settings.prior)
     results: dict[str, Result] = {}
     for result in made:
         linked = replace(result, costs=watch.costs(), baselines=dict(results))

@@ -194,7 +194,7 @@ def test_overrides_win_over_the_file_and_later_over_earlier() -> None:
         ("register.source=oxts", ["got 'oxts'", "one of kiss-icp, dataset"]),
         ("flow.engine=magic", ["got 'magic'", "one of groups, paper, npz:DIR"]),
         ("project.at=noon", ["got 'noon'", "one of camera, sweep"]),
-        ("output.also=rainbow", ["output.also: got 'rainbow'", "one of depth, flow, movers"]),
+        ("output.also=rainbow", ["output.also: got 'rainbow'", "one of depth, full, flow"]),
         ("output.movers=hide", ["got 'hide'", "one of keep, drop, separate"]),
         ("objective.alpha", ["expected section.key=value"]),
         ("alpha=3", ["expected section.key=value"]),

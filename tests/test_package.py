@@ -180,7 +180,7 @@ FLOORS = (
     ("registration", "depth", "flow", "scores", "street"),
     ("readers",),
     ("outputs", "writers"),
-    ("blocks", "sweeps"),
+    ("blocks", "completion", "sweeps"),
     ("recording",),
     ("pipeline",),
     ("bench", "dataset", "doctor"),

@@ -83,6 +83,14 @@ def _add_run(commands: Any) -> None:
     )
     _add_key_options(parser)
     add_method(parser)
+    parser.add_argument(
+        "--prior",
+        type=Path,
+        metavar="DIR",
+        help="depth images of your own, as of a monocular network: DIR/CAMERA/FRAME.npy, .exr or "
+        ".png (16 bit), of any scale, depth or inverse depth; fitted to what is measured they make "
+        "depth_full/, where nothing is measured or filled; masks in DIR/sky/CAMERA/FRAME.png",
+    )
     add_output_options(parser)
 
 

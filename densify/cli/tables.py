@@ -39,7 +39,10 @@ def summary(result: Result) -> str:
     ]
     for name in result.depth:
         measured, filled = (_density(result, name, product) for product in ("measured", "filled"))
-        lines.append(f"{name}: depth in {measured} of the pixels, {filled} with filled ones")
+        line = f"{name}: depth in {measured} of the pixels, {filled} with filled ones"
+        if name in result.full:
+            line += f", {_density(result, name, 'full')} with those from the prior"
+        lines.append(line)
     ghosts = _percent(_look_up(result.metrics, "ghosts", "all"))
     if ghosts != _NONE:
         baseline = _NONE
@@ -270,8 +273,11 @@ def _score_rows(columns: Sequence[Result], source: str, camera: str, title: str)
 
 
 def _density(result: Result, camera: str, product: str) -> str:
-    depth = result.depth[camera]
-    image = depth.depth_m if product == "measured" else depth.filled_m
+    if product == "full":
+        image = result.full[camera].depth_m
+    else:
+        depth = result.depth[camera]
+        image = depth.depth_m if product == "measured" else depth.filled_m
     return _percent(np.count_nonzero(image) / image.size, digits=1)
 
 

@@ -40,6 +40,7 @@ def run(options: argparse.Namespace) -> None:
             config,
             progress,
             _cache(options),
+            options.prior,
         )
         for key, result in made:
             if isinstance(result, Exception):

@@ -24,6 +24,9 @@ from densify.config.sections import (
     OutputSettings as OutputSettings,
 )
 from densify.config.sections import (
+    PriorSettings as PriorSettings,
+)
+from densify.config.sections import (
     ProjectSettings as ProjectSettings,
 )
 from densify.config.sections import (

@@ -268,6 +268,27 @@ class ProjectSettings(Section):
 
 
 @dataclass(frozen=True)
+class PriorSettings(Section):
+    """What is not measurable, from depth images that the user brings (--prior)."""
+
+    kind: str = knob(
+        "auto",
+        "what their values are. depth; inverse: inverse depth, disparity; auto: whichever fits the "
+        "measured pixels better",
+        choices=("auto", "depth", "inverse"),
+    )
+    far_m: float = knob(120.0, "[m] what is farther by the prior stays empty, as sky", 1, 250)
+    max_wrong: float = knob(
+        0.2,
+        "a prior is not used if its best fit is off by more than 25 % at a larger share of the "
+        "measured pixels, each octave of depth counted alike; good ones had up to 0.11, those of "
+        "other images 0.25 to 0.6 where the vehicle moves",
+        0,
+        1,
+    )
+
+
+@dataclass(frozen=True)
 class OutputSettings(Section):
     """What is written beside the files that every run writes."""
 
@@ -311,6 +332,7 @@ class Config:
     objective: ObjectiveSettings = dataclasses.field(default_factory=ObjectiveSettings)
     accumulate: AccumulateSettings = dataclasses.field(default_factory=AccumulateSettings)
     project: ProjectSettings = dataclasses.field(default_factory=ProjectSettings)
+    prior: PriorSettings = dataclasses.field(default_factory=PriorSettings)
     output: OutputSettings = dataclasses.field(default_factory=OutputSettings)
 
 

@@ -7,10 +7,12 @@ and versions as run.yaml::
     schema_version, key, method
     frames      of the window, absolute numbers
     num_points  of the cloud; num_moving of those
-    density     camera -> measured, filled: fraction of the pixels with a depth
+    density     camera -> measured, filled: fraction of the pixels with a depth; with
+                --prior also full, and prior, the share that came from it
     ghosts      `densify.scores.ghosts.ghost_scores`: num_points, all, moving, static, by_distance
     depth       where there is truth: camera -> measured, filled -> all, moving, static -> the
-                fields of `densify.scores.depth_metrics.DepthErrors`
+                fields of `densify.scores.depth_metrics.DepthErrors`; with --prior also full, and
+                prior, the pixels that came from it alone
     measure     map -> what its depth is: z, along the camera's axis, or range, from the lens
     held_out    camera -> the same fields as depth: the key densified from its neighbours alone
                 against its own returns; and curve,

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import platform
+from dataclasses import asdict
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
@@ -22,13 +23,18 @@ _PACKAGES = (
 
 
 def write_output(result: Result, context: Context, folder: Path) -> None:
-    """``run.yaml``: data, key, frames, cameras, configuration, cost of each stage, versions."""
+    """``run.yaml``: data, key, frames, cameras, how priors
+    fit, configuration, cost of each stage, versions."""
     record = {
         "data": context.data,
         "key": result.key,
         "method": result.method,
         "frames": result.frames,
         "cameras": list(result.depth),
+        "prior": {
+            name: {"source": full.source, **asdict(full.fit), "share": full.share}
+            for name, full in result.full.items()
+        },
         "config": context.config,
         "stages": [
             {

@@ -43,6 +43,7 @@ OUTPUTS = Table(
             "densify.outputs.depth_maps",
             owned=("depth", "depth_filled", "confidence", "age"),
         ),
+        Output("full", "densify.outputs.full_maps", owned=("depth_full", "confidence_full")),
         Output("flow", "densify.outputs.flow_npz", owned=("flow",)),
         Output("movers", "densify.outputs.movers", owned=("movers",)),
         Output("optical_flow", "densify.outputs.optical_flow", owned=("optical_flow",)),

@@ -197,13 +197,21 @@ def depth_scores(
     truth_depth_m: (H,W) metres, 0 none. moving_mask: (H,W), True where a moving thing shows.
     Measured and filled stay apart: a filled pixel costs little and says less.
     """
+    return {
+        product: scores_by_motion(image, truth_depth_m, moving_mask, camera)
+        for product, image in (("measured", depth.depth_m), ("filled", depth.filled_m))
+    }
+
+
+def scores_by_motion(
+    depth_m: Float32, truth_depth_m: Float32, moving_mask: Bool, camera: Camera
+) -> dict[str, dict[str, Any]]:
+    """`depth_errors` of one image as ``scores["all"|"moving"|"static"]``; the rest as
+    `depth_scores`."""
     masks = {"all": None, "moving": moving_mask, "static": ~moving_mask}
     return {
-        product: {
-            part: asdict(depth_errors(image, truth_depth_m, mask, focal_px=camera.focal_px))
-            for part, mask in masks.items()
-        }
-        for product, image in (("measured", depth.depth_m), ("filled", depth.filled_m))
+        part: asdict(depth_errors(depth_m, truth_depth_m, mask, focal_px=camera.focal_px))
+        for part, mask in masks.items()
     }
 
 

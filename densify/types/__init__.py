@@ -9,6 +9,7 @@ sweep's lidar), ``cam``.
 from densify.arrays import Bool, Float, Float32, Int
 from densify.types.depth import Camera, Cloud, DepthMap, Mover, Patches, Reason
 from densify.types.flow import FlowField, Motion, StretchFlow
+from densify.types.prior import FullDepth, Prior, PriorFit
 from densify.types.recordings import (
     KnowsFiles,
     KnowsImagePoses,
@@ -29,6 +30,7 @@ __all__ = [
     "Float",
     "Float32",
     "FlowField",
+    "FullDepth",
     "Int",
     "KnowsFiles",
     "KnowsImagePoses",
@@ -37,6 +39,8 @@ __all__ = [
     "Motion",
     "Mover",
     "Patches",
+    "Prior",
+    "PriorFit",
     "Progress",
     "Reason",
     "RegisteredSweep",

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from densify.arrays import Float32
 from densify.types.depth import Cloud, DepthMap, Mover
 from densify.types.flow import StretchFlow
+from densify.types.prior import FullDepth
 
 Progress = Callable[[str, int, int], None]
 """Called as ``(stage, done, total)`` while something takes its time."""
@@ -36,7 +37,8 @@ class Result:
     registration, by method. flow: of every sweep to the next one on the way to the key, where
     asked for (``output.flow``). movers: by instance (``output.movers``). optical_flow: name ->
     (H,W,2) pixels to the "previous" and the "next" image (``output.optical_flow``). rejected: name
-    -> (H,W) `Reason` of what was left out (``output.rejected``). images: name -> (H,W,3) RGB, of
+    -> (H,W) `Reason` of what was left out (``output.rejected``). full: of the maps that a prior was
+    given for. images: name -> (H,W,3) RGB, of
     the maps whose image there is.
     """
 
@@ -52,4 +54,5 @@ class Result:
     movers: Mapping[int, Mover] = field(default_factory=dict)
     optical_flow: Mapping[str, Mapping[str, Float32]] = field(default_factory=dict)
     rejected: Mapping[str, NDArray[np.uint8]] = field(default_factory=dict)
+    full: Mapping[str, FullDepth] = field(default_factory=dict)
     images: Mapping[str, NDArray[np.uint8]] = field(default_factory=dict)

@@ -1,0 +1,253 @@
+# SPDX-License-Identifier: MIT
+"""Depth where nothing is measured, from a depth image that the user brings, such as a monocular
+network's.
+
+First one curve takes the prior's values to metres (`PriorFit`), by robust least squares on their
+medians in steps of measured depth. What it leaves differs from place to place: that correction of
+the logarithm of depth is spread over the image as a membrane that is tied to the known pixels and
+torn at the prior's own depth edges (random walks on the image, Grady, "Random walks for image
+segmentation", PAMI 2006; as edge-aware interpolation Barron and Poole, "The fast bilateral solver",
+ECCV 2016).
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from scipy import ndimage, optimize, sparse
+from scipy.sparse import linalg
+
+from densify.config import PriorSettings
+from densify.types import Bool, DepthMap, Float, Float32, FullDepth, Int, Prior, PriorFit
+
+_FORMS = {"auto": ("depth", "log", "inverse"), "depth": ("depth", "log"), "inverse": ("inverse",)}
+_MIN_FITTED = 100
+_STEP, _LEAST_OF_STEP = 0.05, 0.002  # of depth's logarithm; share of the pixels that it must hold
+_WRONG = np.log(1.25)
+_TOLERANCE = 0.05  # of the logarithm of depth: smaller errors count squared, larger ones less
+_LEAST_OF_OCTAVE = 0.02  # an octave of depth with a smaller share of the pixels counts less
+_LIMIT_SHARE, _LIMIT_SEEN = 0.002, 0.1  # of the image; of those pixels, seen by the lidar
+_MAX_CELLS = 40_000
+_EDGE = 0.05  # step of the logarithm from cell to cell that the correction hardly crosses
+_SMOOTHNESS = 10.0  # against 1 for a cell all of whose pixels are known
+_TOWARDS_NONE = 0.002  # pull to no correction and the usual error, where nothing is known around
+_NUM_PASSES = 3
+_DOUBTFUL = 0.1  # deviation or steepness at which a known pixel counts half
+_LEAST_ALIKE = 1e-6  # where no cell around a pixel is on its surface, all count
+_MIXED = 0.1  # a pixel so far from both the nearest and the farthest around it is on neither
+_AROUND = np.ones((5, 5), np.uint8)
+_HIGHEST_CONFIDENCE = 0.1
+_EMPTY = 10.0  # logarithm of a depth that is farther than all
+
+
+def complete(maps: DepthMap, prior: Prior, settings: PriorSettings) -> FullDepth:
+    """Add the prior's pixels where a depth map has neither measured nor filled ones.
+
+    maps: is not changed, nor is any of its pixels. prior: of the same shape, its depth measured as
+    the map's (``z``, or ``range`` from the lens).
+
+    Left empty: what has no value, the mask's sky, what is farther than ``far_m``, the prior's own
+    far limit (its farthest value where it is that of many pixels that the lidar did not see), and
+    pixels between two surfaces, as blurred priors have them. Of a prior that does not fit
+    (``max_wrong``) nothing is used.
+
+    A prior pixel's confidence is at most 0.1, less the more the prior deviates from known pixels
+    nearby on the same surface and the steeper it is; a ranking, not calibrated.
+    """
+    known = (prior.value > 0) & ~prior.sky
+    measured = known & (maps.depth_m > 0)
+    fit = fit_prior(prior.value[measured], maps.depth_m[measured], settings)
+    if not fit.used:
+        nothing = np.zeros(known.shape, bool)
+        return FullDepth(maps.filled_m, maps.confidence, nothing, fit, prior.source)
+    log_depth = _log_depth(prior.value, fit)
+    usable = known & (log_depth < np.log(settings.far_m))
+    usable &= ~_far_limit(prior.value, known, measured, fit)
+    guide = np.where(usable, log_depth, _EMPTY).astype(np.float32)
+    guide = cv2.medianBlur(guide, 5).astype(np.float32)
+    farther, nearer = cv2.dilate(guide, _AROUND) - guide, guide - cv2.erode(guide, _AROUND)
+    correction, spread = _correction(maps.filled_m, log_depth, guide, farther + nearer, usable)
+    full_m = np.exp(np.minimum(log_depth + correction, _EMPTY)).astype(np.float32)
+    usable &= (np.minimum(farther, nearer) < _MIXED) & (full_m < settings.far_m)
+    from_prior = usable & (maps.filled_m == 0)
+    error = np.hypot(spread, farther + nearer) / _TOLERANCE
+    return FullDepth(
+        np.where(from_prior, full_m, maps.filled_m),
+        np.where(from_prior, _HIGHEST_CONFIDENCE / (1 + error), maps.confidence).astype(np.float32),
+        from_prior,
+        fit,
+        prior.source,
+    )
+
+
+def fit_prior(value: Float32, depth_m: Float32, settings: PriorSettings) -> PriorFit:
+    """The curve from a prior's values to depth that leaves the least ``residual``.
+
+    value, depth_m: (N,) above 0, of measured pixels. A curve that turns near into far is none.
+    """
+    fits = [
+        _fitted(form, value.astype(np.float64), depth_m.astype(np.float64), settings.max_wrong)
+        for form in _FORMS[settings.kind]
+    ]
+    return min(fits, key=lambda fit: (not fit.scale > 0, fit.residual))
+
+
+def _fitted(form: str, p: Float, z: Float, max_wrong: float) -> PriorFit:
+    """One form's, through the medians of the values in steps of depth: measured depth is exact,
+    values are not, and a wrong tenth of them moves no median."""
+    if len(z) < _MIN_FITTED:
+        return PriorFit(form, 0.0, 0.0, np.inf, 1.0, False)
+    step = np.floor(np.log(z / z.min()) / _STEP).astype(np.int64)
+    steps = np.flatnonzero(np.bincount(step) >= _LEAST_OF_STEP * len(z))
+    middle_p = ndimage.median(p, step, steps)
+    scale, shift = _line(form, middle_p, ndimage.median(z, step, steps))
+    fit = PriorFit(form, scale, shift, np.inf, 1.0, False)
+    off = np.abs(_log_depth(p, fit) - np.log(z))
+    octave = np.floor(np.log2(z / z.min())).astype(np.int64)
+    weight = 1 / np.maximum(np.bincount(octave), _LEAST_OF_OCTAVE * len(z))[octave]
+    residual = float(np.average(np.minimum(off, _WRONG), weights=weight))
+    wrong = float(np.average(off > _WRONG, weights=weight))
+    return PriorFit(form, scale, shift, residual, wrong, scale > 0 and wrong <= max_wrong)
+
+
+def _line(form: str, p: Float, z: Float) -> tuple[float, float]:
+    """Scale and shift. Linear in both, weighted so that residuals are about those of the logarithm
+    of depth, and convex: there is one optimum, wherever the search starts."""
+    unit, one = float(np.median(p)), np.ones(len(z))
+    if form == "log":
+        columns, target = [np.log(p / unit), one], np.log(z)
+    else:
+        weight = z if form == "inverse" else 1 / z
+        columns, target = [p / unit * weight, weight], one
+    A = np.stack(columns, axis=1)
+
+    def residual(x: Float) -> Float:
+        return A @ x - target
+
+    def slope(x: Float) -> Float:
+        return A
+
+    start = np.linalg.lstsq(A, target, rcond=None)[0]
+    found = optimize.least_squares(residual, start, slope, loss="soft_l1", f_scale=_TOLERANCE)
+    scale, shift = (float(x) for x in found.x)
+    return (scale, shift - scale * np.log(unit)) if form == "log" else (scale / unit, shift)
+
+
+def _log_depth(value: Float | Float32, fit: PriorFit) -> Float:
+    """The logarithm of depth in metres by the curve alone; far where the curve ends."""
+    value = value.astype(np.float64)
+    if fit.kind == "log":
+        return fit.scale * np.log(np.maximum(value, np.finfo(np.float64).tiny)) + fit.shift
+    of = np.log(np.maximum(fit.scale * value + fit.shift, np.exp(-_EMPTY)))
+    return -of if fit.kind == "inverse" else of
+
+
+def _far_limit(value: Float32, known: Bool, measured: Bool, fit: PriorFit) -> Bool:
+    """(H,W) where the prior says no more than that it is far."""
+    if not known.any():
+        return known
+    limit = value[known].min() if fit.kind == "inverse" else value[known].max()
+    at_limit: Bool = known & (value == limit)
+    num = np.count_nonzero(at_limit)
+    many = num > _LIMIT_SHARE * value.size
+    if many and np.count_nonzero(at_limit & measured) < _LIMIT_SEEN * num:
+        return at_limit
+    return np.zeros(value.shape, bool)
+
+
+class _Cells(NamedTuple):
+    """The image in squares of ``size`` pixels; each has the guide of its middle pixel.
+
+    guide: (R,C) logarithm of depth. of: (H,W) number of each pixel's cell, row by row.
+    """
+
+    size: int
+    guide: Float
+    of: Int
+
+    @staticmethod
+    def over(guide: Float32) -> _Cells:
+        height, width = guide.shape
+        size = max(1, int(np.ceil(np.sqrt(guide.size / _MAX_CELLS))))
+        rows, columns = (
+            np.minimum(np.arange(0, length, size) + size // 2, length - 1)
+            for length in (height, width)
+        )
+        of = np.arange(height)[:, None] // size * len(columns) + np.arange(width) // size
+        return _Cells(size, guide[np.ix_(rows, columns)].astype(np.float64), of)
+
+    def membrane(self) -> sparse.csr_array:
+        """The (RC,RC) matrix whose quadratic form is the squared difference between neighbouring
+        cells, which counts less the more their guides differ."""
+        number = np.arange(self.guide.size).reshape(self.guide.shape)
+        first = np.concatenate([number[:, :-1].ravel(), number[:-1].ravel()])
+        second = np.concatenate([number[:, 1:].ravel(), number[1:].ravel()])
+        step = (self.guide.ravel()[first] - self.guide.ravel()[second]) / _EDGE
+        tied = _SMOOTHNESS * np.exp(-(step**2))
+        shape = (number.size, number.size)
+        half = sparse.coo_array((tied, (first, second)), shape=shape)
+        both = (half + half.T).tocsr()
+        return sparse.diags_array(both.sum(axis=1)) - both
+
+    def at_pixels(self, values: Float, guide: Float32) -> Float:
+        """(K,RC) values of cells -> (K,H,W), between the four cells around each pixel; those whose
+        guide is another surface's hardly count."""
+        grid = values.reshape(-1, *self.guide.shape)
+        down, right = ((np.arange(length) - self.size // 2) / self.size for length in guide.shape)
+        total, result = np.zeros(guide.shape), np.zeros((len(grid), *guide.shape))
+        for row, row_weight in _both_ways(down, self.guide.shape[0]):
+            for column, column_weight in _both_ways(right, self.guide.shape[1]):
+                place = np.ix_(row, column)
+                alike = np.exp(-(((guide - self.guide[place]) / _EDGE) ** 2)) + _LEAST_ALIKE
+                weight = alike * np.outer(row_weight, column_weight)
+                total += weight
+                result += weight * grid[:, row[:, None], column]
+        return result / total
+
+
+def _both_ways(place: Float, num: int) -> list[tuple[Int, Float]]:
+    """The cells before and behind fractional places, and their weights."""
+    before = np.clip(np.floor(place), 0, num - 1).astype(np.int64)
+    behind = np.minimum(before + 1, num - 1)
+    share = np.clip(place - before, 0, 1)
+    return [(before, 1 - share), (behind, share)]
+
+
+def _correction(
+    filled_m: Float32, log_depth: Float, guide: Float32, steepness: Float32, usable: Bool
+) -> tuple[Float, Float]:
+    """(H,W) to be added to the logarithm of depth, and how far known pixels nearby on the same
+    surface still are from it; where none are near, no correction and what they lack on average."""
+    cells = _Cells.over(guide)
+    area, num = cells.size**2, cells.guide.size
+    near = usable & (filled_m > 0) & (np.abs(guide - cells.guide.ravel()[cells.of]) < _EDGE)
+    cell = cells.of[near]
+    lacking = np.log(filled_m[near].astype(np.float64)) - log_depth[near]
+    # Where the prior is steep it may be blurred, and what it lacks there says little.
+    flat = 1 / (1 + (steepness[near].astype(np.float64) / _DOUBTFUL) ** 2)
+    membrane, off, trust = cells.membrane(), np.abs(lacking), flat
+    usual = float(np.average(off, weights=flat)) if len(off) else 0.0
+    for _ in range(_NUM_PASSES):
+        tied = np.bincount(cell, trust, num) / area
+        correction = _settled(
+            membrane, tied + _TOWARDS_NONE, np.bincount(cell, trust * lacking, num) / area
+        )
+        off = np.abs(lacking - correction[cell])
+        trust = flat / (1 + (off / _DOUBTFUL) ** 2)
+    tied, deviation = (np.bincount(cell, w, num) / area for w in (trust, trust * off))
+    spread = _settled(membrane, tied + _TOWARDS_NONE, deviation + _TOWARDS_NONE * usual)
+    at_pixels = cells.at_pixels(np.stack([correction, spread]), guide)
+    return at_pixels[0], at_pixels[1]
+
+
+def _settled(membrane: sparse.csr_array, tied: Float, pulled: Float) -> Float:
+    """Where the membrane comes to rest: cell by cell it is pulled to ``pulled / tied``."""
+    solver = linalg.splu(
+        (membrane + sparse.diags_array(tied)).tocsc(),
+        permc_spec="MMD_AT_PLUS_A",
+        options={"SymmetricMode": True},
+    )
+    at_rest: Float = solver.solve(pulled)
+    return at_rest

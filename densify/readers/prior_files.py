@@ -1,0 +1,198 @@
+# SPDX-License-Identifier: MIT
+"""Depth images that the user brings, such as a monocular network's, in a folder::
+
+    DIR/CAMERA/FRAME.npy, .exr or .png   (or DIR/CAMERA/data/..., as KITTI has its images)
+    DIR/FRAME.npy, .exr or .png          of a single camera
+    DIR/sky/CAMERA/FRAME.png, DIR/sky/FRAME.png    optional masks, not 0 where there is sky
+
+FRAME is the image's number: 120, 000120, 0000000120, 0000000120_depth or _disp. Arrays are (H,W) of
+any number type, with further axes of length 1; EXR files have one channel, or one called Z, Y or
+depth; PNG files are 16 bit gray. What is not finite or not above 0 is no value.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from densify.errors import InputError
+from densify.readers.extras import needed
+from densify.readers.files import format_frames, read_bytes
+from densify.types import Bool, Camera, Float32, Prior
+
+_SUFFIXES = (".npy", ".exr", ".png")  # the finest first
+_STEM = re.compile(r"(\d+)(?:[_-](?:depth|disp|disparity|pred|prior))?", re.IGNORECASE)
+_CHANNELS = ("Z", "Y", "depth", "Depth")
+_SAME_ASPECT = 0.02
+
+
+@dataclass(frozen=True)
+class PriorFiles:
+    """values, sky: camera -> number of the image -> file."""
+
+    place: Path
+    values: Mapping[str, Mapping[int, Path]]
+    sky: Mapping[str, Mapping[int, Path]]
+
+    @staticmethod
+    def open(place: Path, cameras: Sequence[str]) -> PriorFiles:
+        """What lies in a folder for some cameras. Raises InputError if there is nothing, or it is
+        not clear for which of several cameras it is."""
+        if not place.is_dir():
+            raise InputError(
+                f"--prior {place}: no such folder; expected depth images DIR/CAMERA/FRAME.npy, "
+                f".exr or .png"
+            )
+        values = {camera: _in(place / camera) for camera in cameras}
+        sky = {camera: _in(place / "sky" / camera) for camera in cameras}
+        if not any(values.values()) and (flat := _in(place)):
+            if len(cameras) > 1:
+                raise InputError(
+                    f"--prior {place}: holds depth images of one camera, and there are "
+                    f"{', '.join(cameras)}; choose one with --camera, or put them into "
+                    f"{place / 'CAMERA'}"
+                )
+            values, sky = {cameras[0]: flat}, {cameras[0]: _in(place / "sky")}
+        if not any(values.values()):
+            raise InputError(
+                f"--prior {place}: holds no depth images named by frame; expected "
+                f"{place / (cameras[0] if cameras else 'CAMERA')}/0000000120.npy, .exr or .png"
+            )
+        return PriorFiles(place, values, sky)
+
+    def said_of(self, camera: str) -> str:
+        """For messages, which images of a camera there is a prior for."""
+        return f"there are {format_frames(self.values[camera])}"
+
+    def prior(self, camera: Camera, number: int) -> Prior | None:
+        """The prior of an image, at the camera's size; None if there is none.
+
+        One of another size is resized if its aspect agrees. Raises InputError for files that
+        cannot be read or are something else.
+        """
+        path = self.values[camera.name].get(number)
+        if path is None:
+            return None
+        value = _resized(_value(path), camera, path)
+        mask = self.sky[camera.name].get(number)
+        sky = np.zeros(value.shape, bool) if mask is None else _sky(mask, camera)
+        return Prior(value, sky, str(path))
+
+
+def _in(folder: Path) -> dict[int, Path]:
+    """Number -> file, in the folder or its ``data``."""
+    for place in (folder, folder / "data"):
+        found: dict[int, Path] = {}
+        for path in sorted(place.iterdir()) if place.is_dir() else ():
+            stem = _STEM.fullmatch(path.stem)
+            if stem is None or path.suffix.lower() not in _SUFFIXES:
+                continue
+            other = found.setdefault(int(stem[1]), path)
+            rank, other_rank = (_SUFFIXES.index(p.suffix.lower()) for p in (path, other))
+            if rank == other_rank and other != path:
+                raise InputError(
+                    f"--prior: {other} and {path.name} are both of image {int(stem[1])}; "
+                    f"leave one there"
+                )
+            if rank < other_rank:
+                found[int(stem[1])] = path
+        if found:
+            return dict(sorted(found.items()))
+    return {}
+
+
+def _value(path: Path) -> Float32:
+    """(H,W), 0 none."""
+    read = {".npy": _npy, ".exr": _exr, ".png": _png}[path.suffix.lower()]
+    image = np.asarray(read(path))
+    image = image.reshape([n for n in image.shape if n != 1]) if image.ndim > 2 else image
+    if image.ndim != 2 or image.dtype.kind not in "fui":
+        raise InputError(
+            f"{path}: got {image.dtype} of shape {image.shape}, expected numbers (H,W): one depth "
+            f"or inverse depth for each pixel"
+        )
+    with np.errstate(over="ignore"):
+        value = image.astype(np.float32)
+    value[~(np.isfinite(value) & (value > 0))] = 0
+    if not value.any():
+        raise InputError(f"{path}: holds no number above 0, expected depth or inverse depth")
+    return value
+
+
+def _npy(path: Path) -> NDArray[Any]:
+    try:
+        array: NDArray[Any] = np.load(BytesIO(read_bytes(path)), allow_pickle=False)
+    except (ValueError, EOFError, OSError) as error:
+        raise InputError(f"{path}: not a whole .npy file ({error}); write it again") from error
+    return array
+
+
+def _exr(path: Path) -> NDArray[Any]:
+    library = needed("OpenEXR", "exr", "EXR files")
+    try:
+        channels = library.File(str(path)).channels()
+    except RuntimeError as error:
+        raise InputError(f"{path}: not a whole EXR file ({error})") from error
+    named = [name for name in _CHANNELS if name in channels]
+    if not named and len(channels) > 1:
+        raise InputError(
+            f"{path}: has the channels {', '.join(channels)}, expected one, or Z, Y or depth"
+        )
+    return np.asarray(channels[named[0] if named else next(iter(channels))].pixels)
+
+
+def _png(path: Path) -> NDArray[Any]:
+    image = _decoded(path)
+    if image.dtype != np.uint16 or image.ndim != 2:
+        bits = 8 * image.dtype.itemsize
+        raise InputError(
+            f"{path}: got {bits} bit of shape {image.shape}, expected 16 bit and one channel; "
+            f"pictures of depth are too coarse: save it as .npy"
+        )
+    return image
+
+
+def _decoded(path: Path) -> NDArray[Any]:
+    data = np.frombuffer(read_bytes(path), np.uint8)
+    image = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if len(data) else None
+    if image is None:
+        raise InputError(f"{path}: not a whole PNG file; write it again")
+    return image
+
+
+def _resized(value: Float32, camera: Camera, path: Path) -> Float32:
+    """At the camera's size; between two values linear, and none beside none."""
+    size = (camera.width_px, camera.height_px)
+    if value.shape == size[::-1]:
+        return value
+    _check_aspect(value.shape, camera, path)
+    known = cv2.resize((value > 0).astype(np.float32), size, interpolation=cv2.INTER_LINEAR)
+    resized = cv2.resize(value, size, interpolation=cv2.INTER_LINEAR)
+    return np.where(known > 1 - 1e-3, resized, np.float32(0)).astype(np.float32)
+
+
+def _sky(path: Path, camera: Camera) -> Bool:
+    mask = _decoded(path)
+    mask = mask if mask.ndim == 2 else mask[:, :, :3].max(axis=2)
+    size = (camera.width_px, camera.height_px)
+    if mask.shape != size[::-1]:
+        _check_aspect(mask.shape, camera, path)
+    sky: Bool = cv2.resize((mask > 0).astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
+    return sky
+
+
+def _check_aspect(shape: tuple[int, ...], camera: Camera, path: Path) -> None:
+    scale = shape[1] / camera.width_px, shape[0] / camera.height_px
+    if abs(scale[0] / scale[1] - 1) > _SAME_ASPECT:
+        raise InputError(
+            f"{path}: got {shape[1]} x {shape[0]} px, expected {camera.width_px} x "
+            f"{camera.height_px} as {camera.name} has, or another size of that aspect"
+        )

@@ -1,0 +1,261 @@
+# SPDX-License-Identifier: MIT
+"""Maps completed with the user's depth images: against exact depth, and what must stay empty."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from densify.config import PriorSettings
+from densify.depth import prior as stage
+from densify.depth.prior import complete, fit_prior
+from densify.types import DepthMap, Prior
+
+H, W, FOCAL_PX, HEIGHT_M = 150, 240, 200.0, 1.6
+AUTO = PriorSettings()
+
+
+def scene():
+    """True depth and sky: a road, a house at 20 m with a slanting wall, a car at 8 m."""
+    row, column = np.mgrid[:H, :W].astype(float)
+    down = (row - 60) / FOCAL_PX
+    depth = np.where(down > 0, HEIGHT_M / np.maximum(down, 1e-6), np.inf)
+    wall = 20 + 0.1 * column
+    depth = np.where(row > 15, np.minimum(depth, wall), depth)
+    depth[70:110, 60:120] = 8.0
+    return np.where(np.isfinite(depth), depth, 0).astype(np.float32), ~np.isfinite(depth)
+
+
+TRUE_M, SKY = scene()
+BLIND = SKY.copy()
+BLIND[:50] = True  # above the scanner's top ring
+BLIND[85:95, 100:140] = True
+BLIND[120:130] = True
+
+
+def measured(true_m=TRUE_M, seen=~BLIND):
+    """A map that has every second pixel measured and the others filled."""
+    first = np.where(seen, true_m, 0).astype(np.float32)
+    depth = first.copy()
+    depth[::2] = 0
+    confidence = np.where(first > 0, 0.7, 0).astype(np.float32)
+    return DepthMap("front", depth, first, confidence, np.where(depth > 0, 3, -1).astype(np.int32))
+
+
+def prior(value, sky=SKY):
+    return Prior(np.where(sky, 0, value).astype(np.float32), sky, "test")
+
+
+def smooth(seed=0, sigma=0.1):
+    field = cv2.GaussianBlur(np.random.default_rng(seed).standard_normal((H, W)), (0, 0), 25)
+    return np.exp(sigma * field / field.std())
+
+
+def off(full, where):
+    return np.abs(np.log(full.depth_m[where] / TRUE_M[where]))
+
+
+SAFE = np.where(SKY, 1.0, TRUE_M)
+VALUES = {
+    "scaled": (0.3 * SAFE, "depth", 1 / 0.3, 0.0),
+    "shifted": (3 * SAFE + 20, "depth", 1 / 3, -20 / 3),
+    "inverse": (7 / SAFE + 0.4, "inverse", 1 / 7, -0.4 / 7),
+    "power": (2 * SAFE**0.5, "log", 2.0, -2 * np.log(2)),
+}
+
+
+@pytest.mark.parametrize("name", VALUES)
+def test_any_scale_shift_and_kind_is_undone(name):
+    value, kind, scale, shift = VALUES[name]
+    maps = measured()
+    full = complete(maps, prior(value), AUTO)
+    assert full.fit.used and full.fit.residual < 1e-4
+    if name != "scaled":  # which two forms say alike
+        assert full.fit.kind == kind
+        np.testing.assert_allclose([full.fit.scale, full.fit.shift], [scale, shift], rtol=1e-3)
+    assert full.from_prior.sum() > 0.9 * (BLIND & ~SKY).sum()
+    assert not (full.from_prior & (SKY | (maps.filled_m > 0))).any()
+    assert off(full, full.from_prior).max() < 2e-3
+    assert full.share == full.from_prior.mean()
+
+
+@pytest.mark.parametrize("name", VALUES)
+def test_what_is_known_stays_as_it_is(name):
+    maps = measured()
+    before = [a.tobytes() for a in (maps.depth_m, maps.filled_m, maps.confidence)]
+    full = complete(maps, prior(VALUES[name][0] * smooth(sigma=0.02)), AUTO)
+    assert [a.tobytes() for a in (maps.depth_m, maps.filled_m, maps.confidence)] == before
+    known = maps.filled_m > 0
+    assert np.array_equal(full.depth_m[known], maps.filled_m[known])
+    assert np.array_equal(full.confidence[known], maps.confidence[known])
+    assert ((full.depth_m > 0) == (known | full.from_prior)).all()
+    of_prior = full.confidence[full.from_prior]
+    assert of_prior.min() > 0 and of_prior.max() <= 0.1
+    assert not full.confidence[full.depth_m == 0].any()
+
+
+def test_smooth_errors_are_taken_off():
+    value = SAFE * smooth(3)
+    full = complete(measured(), prior(value), PriorSettings(kind="depth"))
+    where = full.from_prior
+    p = value[where] if full.fit.kind == "depth" else np.log(value[where])
+    by_curve = full.fit.scale * p + full.fit.shift
+    log_depth = np.log(by_curve) if full.fit.kind == "depth" else by_curve
+    assert where.sum() > 5000
+    assert off(full, where).mean() < 0.6 * np.abs(log_depth - np.log(TRUE_M[where])).mean()
+
+
+def test_where_a_prior_deviates_it_is_less_certain():
+    right = np.arange(W) >= 120
+    ragged = np.exp(0.1 * np.random.default_rng(0).standard_normal((H, W)))
+    full = complete(measured(), prior(SAFE * np.where(right, ragged, 1)), AUTO)
+    sure, unsure = (
+        full.confidence[full.from_prior & there & (np.abs(np.arange(W) - 120) > 30)]
+        for there in (~right, right)
+    )
+    assert np.percentile(sure, 10) > np.percentile(unsure, 90)
+
+
+def test_a_correction_does_not_cross_depth_edges():
+    """The prior has the car a tenth too near and all else a twentieth too far."""
+    car = TRUE_M == 8.0
+    value = SAFE * np.where(car, 0.9, 1.05)
+    full = complete(measured(), prior(value), AUTO)
+    for side in (car, ~car):
+        here = full.from_prior & side
+        assert here.sum() > 100 and np.median(off(full, here)) < 0.01
+        assert np.percentile(off(full, here), 95) < 0.03
+
+
+def test_the_membrane_ties_neighbours_of_one_surface():
+    """Against the same matrix written out cell by cell."""
+    rng = np.random.default_rng(0)
+    guide = (2 + 0.02 * rng.standard_normal((9, 11))).astype(np.float32)
+    guide[:, 6:] += 0.5
+    cells = stage._Cells.over(guide)
+    assert cells.size == 1 and np.array_equal(cells.of.ravel(), np.arange(99))
+    A = np.zeros((99, 99))
+    for r in range(9):
+        for c in range(11):
+            for r2, c2 in ((r + 1, c), (r, c + 1)):
+                if r2 < 9 and c2 < 11:
+                    step = (float(guide[r, c]) - float(guide[r2, c2])) / stage._EDGE
+                    tied = stage._SMOOTHNESS * np.exp(-(step**2))
+                    i, j = 11 * r + c, 11 * r2 + c2
+                    A[[i, j], [i, j]] += tied
+                    A[[i, j], [j, i]] -= tied
+    np.testing.assert_allclose(cells.membrane().toarray(), A, rtol=1e-9, atol=1e-12)
+
+
+def test_values_of_cells_come_back_at_pixels():
+    guide = np.full((300, 500), 2, np.float32)
+    guide[:, 250:] = 3
+    cells = stage._Cells.over(guide)
+    assert cells.size == 2 and cells.of.max() == cells.guide.size - 1
+    constant = np.full((1, cells.guide.size), 0.3)
+    np.testing.assert_allclose(cells.at_pixels(constant, guide), 0.3)
+    two = np.where(cells.guide.ravel() < 2.5, 1.0, 5.0)[None]
+    at = cells.at_pixels(two, guide)[0]
+    assert np.abs(at[:, :250] - 1).max() < 1e-4 and np.abs(at[:, 250:] - 5).max() < 1e-4
+    column = np.arange(cells.guide.size) % cells.guide.shape[1]
+    flat = stage._Cells.over(np.full_like(guide, 2))
+    ramp = flat.at_pixels((2.0 * column + 1)[None], np.full_like(guide, 2))[0]
+    np.testing.assert_allclose(ramp[:, 1:-1], np.tile(np.arange(1, 499.0), (300, 1)), atol=1e-6)
+
+
+# --- what stays empty -----------------------------------------------------------------------------
+
+
+def test_sky_stays_empty_by_mask_and_by_distance():
+    value = 5 / np.where(SKY, 1e6, TRUE_M)
+    masked = complete(measured(), Prior(value.astype(np.float32), SKY, "test"), AUTO)
+    unmasked = complete(measured(), Prior(value.astype(np.float32), ~(SKY | ~SKY), "test"), AUTO)
+    for full in (masked, unmasked):
+        assert not full.depth_m[SKY].any() and full.from_prior.sum() > 3000
+    nearer = complete(measured(), prior(value), PriorSettings(far_m=25))
+    assert nearer.from_prior.any() and nearer.depth_m[nearer.from_prior].max() < 25
+    assert not nearer.from_prior[TRUE_M > 25.5].any()
+
+
+@pytest.mark.parametrize("inverse", [False, True])
+def test_the_priors_own_far_limit_is_no_depth(inverse):
+    clipped = np.where(SKY, 60, np.minimum(TRUE_M, 60)).astype(np.float32)
+    value = 1 / clipped if inverse else clipped
+    full = complete(measured(), Prior(value, np.zeros_like(SKY), "test"), AUTO)
+    assert full.fit.used and not full.depth_m[SKY].any() and full.from_prior.sum() > 3000
+
+
+def test_a_wall_that_the_lidar_sees_is_no_far_limit():
+    true_m = np.full((H, W), 30.0, np.float32)
+    true_m[90:] = 10
+    maps = measured(true_m, np.arange(H)[:, None] * np.ones((1, W)) > 60)
+    full = complete(maps, Prior(true_m * 2, np.zeros((H, W), bool), "test"), AUTO)
+    assert full.from_prior[:50].all() and np.allclose(full.depth_m[:50], 30, rtol=1e-3)
+
+
+def test_pixels_between_two_surfaces_are_left_out():
+    value = cv2.GaussianBlur(1 / np.where(SKY, 1e4, TRUE_M), (0, 0), 3)
+    full = complete(measured(), Prior(value.astype(np.float32), SKY, "test"), AUTO)
+    sharp = complete(measured(), prior(SAFE), AUTO)
+    wrong = full.from_prior & (np.abs(full.depth_m / np.where(SKY, 1, TRUE_M) - 1) > 0.2)
+    assert wrong.sum() < 0.02 * full.from_prior.sum()
+    assert 0.8 * sharp.from_prior.sum() < full.from_prior.sum() < sharp.from_prior.sum()
+
+
+# --- what does not fit ----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "value",
+    [
+        np.random.default_rng(0).uniform(1, 50, (H, W)),
+        SAFE[:, ::-1] * np.where(TRUE_M == 8, 4, 1),
+        np.repeat(np.linspace(80, 3, H)[:, None], W, 1),
+        -SAFE + 100,  # near is far
+    ],
+    ids=["noise", "another scene", "rows", "turned over"],
+)
+def test_what_does_not_fit_is_not_used(value):
+    maps = measured()
+    settings = PriorSettings(kind="depth")
+    full = complete(maps, prior(np.maximum(value, 0.01)), settings)
+    assert not full.fit.used and not full.from_prior.any() and full.share == 0
+    assert full.depth_m.tobytes() == maps.filled_m.tobytes()
+    assert full.confidence.tobytes() == maps.confidence.tobytes()
+
+
+def test_a_kind_can_be_forced():
+    fits = {
+        kind: complete(measured(), prior(7 / SAFE + 0.4), PriorSettings(kind=kind)).fit
+        for kind in ("inverse", "depth")
+    }
+    assert fits["inverse"].used and not fits["depth"].used
+    assert fits["depth"].kind in ("depth", "log")
+
+
+def test_too_few_measured_pixels_fit_nothing():
+    p = np.linspace(1, 2, 99).astype(np.float32)
+    assert not fit_prior(p, 3 * p, AUTO).used
+    p = np.linspace(1, 2, 100).astype(np.float32)
+    assert fit_prior(p, 3 * p, AUTO).used
+    nothing = measured(np.zeros_like(TRUE_M))
+    assert not complete(nothing, prior(SAFE), AUTO).depth_m.any()
+
+
+def test_a_tenth_of_wrong_pixels_does_not_bend_the_curve():
+    rng = np.random.default_rng(0)
+    z = rng.uniform(3, 60, 20_000)
+    p = 5 / z + 0.1
+    p[rng.random(len(p)) < 0.1] *= 3
+    fit = fit_prior(p.astype(np.float32), z.astype(np.float32), AUTO)
+    assert fit.kind == "inverse" and fit.used
+    np.testing.assert_allclose([fit.scale, fit.shift], [1 / 5, -0.1 / 5], rtol=0.03)
+
+
+def test_octaves_count_alike():
+    """A prior that is right on the road alone does not fit."""
+    z = np.concatenate([np.full(8000, 6.0), np.full(900, 30.0), np.full(1100, 50.0)])
+    p = np.concatenate([z[:8000], np.full(2000, 12.0)]) * (1 + 1e-3 * np.sin(np.arange(10_000)))
+    fit = fit_prior(p.astype(np.float32), z.astype(np.float32), PriorSettings(kind="depth"))
+    assert fit.wrong > 0.25 and not fit.used
