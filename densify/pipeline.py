@@ -306,6 +306,9 @@ class _Seen(NamedTuple):
                 name: with_ages(maps, self.stretch, key, views.exposures[name].late_s)
                 for name, maps in views.depth(seen, visible).items()
             }
+        for name, maps in depth.items():
+            for warning in maps.warnings:
+                _log.warning("key %d: %s: %s", key, name, warning)
         cloud = seen.cloud
         if self.images is not None:
             with watch.stage("colour"):

@@ -231,10 +231,11 @@ class ProjectSettings(Section):
         0.015, "[m] added to that, for errors of registration and flow", 0, 1
     )
     rims: str = knob(
-        "strict",
-        "pixels measured that close to a depth edge. strict: leave them out; keep: keep them all, "
-        "which fattens outlines",
-        choices=("strict", "keep"),
+        "image",
+        "pixels measured that close to a depth edge. image: keep those that the camera's image "
+        "puts on the measured surface (strict without an image, or with one that does not fit); "
+        "strict: leave them out; keep: keep them all, which fattens outlines",
+        choices=("image", "strict", "keep"),
     )
     fill_reach: float = knob(
         1.0,

@@ -22,7 +22,7 @@ class Layers:
     tilt: (H,W,2) float32 slope of the measured surface's inverse depth to the right and down, 1/m
     per px. spacing_px: (H,W,2) float32 between neighbouring rays of one sweep, across and along
     elevation, everywhere. lab: (H,W,3) float32 the image as `densify.depth.picture` makes it, None
-    without one.
+    without one. warnings: what could not be done as asked.
     """
 
     depth_m: Float32
@@ -33,6 +33,12 @@ class Layers:
     tilt: Float32
     spacing_px: Float32
     lab: Float32 | None = None
+    warnings: tuple[str, ...] = ()
+
+    @property
+    def gap_px(self) -> Float32:
+        """(H,W) between neighbouring rays, whichever way."""
+        return np.sqrt(self.spacing_px[..., 0] * self.spacing_px[..., 1])
 
     @property
     def strict(self) -> Bool:

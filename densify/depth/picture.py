@@ -7,9 +7,16 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from densify.types import Float32
+from densify.types import Bool, Float32
 
 _BLUR_PX = 0.6  # standard deviation; noise and the colour filter's pattern
+_AROUND_PX = 20.0  # standard deviation; over which edges are compared
+_EDGE_PX = 1.5  # standard deviation of the blur that tells which way depth changes
+_MOST = 6000  # edges that are looked at
+_STRONG = 4.0  # a stronger edge counts no more
+_REACH = 14  # steps to all sides in which the image is laid elsewhere
+_ASIDE, _ELSEWHERE = 3.2, 6.0  # steps; nearer and it fits, farther and it cannot
+_LEAST_SCORE = 2.2  # standard deviations above what it is elsewhere
 
 
 def lab(image: NDArray[np.uint8]) -> Float32:
@@ -17,3 +24,68 @@ def lab(image: NDArray[np.uint8]) -> Float32:
     about how different two colours look."""
     blurred = cv2.GaussianBlur(image.astype(np.float32) / 255, (0, 0), _BLUR_PX)
     return cv2.cvtColor(blurred, cv2.COLOR_RGB2LAB).astype(np.float32, copy=False)
+
+
+def edges_fit(lab: Float32, depth_m: Float32, at: Bool, step_px: int = 1) -> bool:
+    """Whether the image has edges where depth has, and nowhere beside more.
+
+    lab: (H,W,3). depth_m: (H,W), 0 none, with edges ``at`` (H,W). How much the image changes there
+    across the edges of depth is summed up with the image as it is and laid elsewhere, by up to 14
+    steps to all sides. It fits if the sum is largest at most 3.2 steps away, and 2.2 standard
+    deviations larger than 6 steps and more away.
+    """
+    row, column = (f[:: len(f) // _MOST + 1] // step_px for f in np.nonzero(at))
+    right, down = _across(depth_m, step_px)[:, row, column]
+    changes = _changes(_reduced(lab, step_px))
+    changes = np.pad(changes, ((0, 0), (_REACH, _REACH), (_REACH, _REACH)), "edge")
+    width, (x, y) = changes.shape[2], changes.reshape(2, -1)
+    place = (row + _REACH) * width + column + _REACH
+    offsets = range(-_REACH, _REACH + 1)
+
+    def change(du: int, dv: int) -> float:
+        there = place + dv * width + du
+        return float(np.abs(x[there] * right + y[there] * down).mean())
+
+    sums = np.array([[change(du, dv) for du in offsets] for dv in offsets])
+    steps = np.hypot(*np.meshgrid(offsets, offsets))
+    elsewhere = sums[steps > _ELSEWHERE]
+    best = sums[steps <= _ASIDE].max()
+    return bool(best >= sums.max() and best > elsewhere.mean() + _LEAST_SCORE * elsewhere.std())
+
+
+def _reduced(image: Float32, step_px: int) -> Float32:
+    """(H,W,…), each pixel the mean of ``step_px`` by ``step_px``."""
+    if step_px == 1:
+        return image
+    size = (-(-image.shape[1] // step_px), -(-image.shape[0] // step_px))
+    return cv2.resize(image, size, interpolation=cv2.INTER_AREA).astype(np.float32, copy=False)
+
+
+def _across(depth_m: Float32, step_px: int) -> Float32:
+    """(2,H,W) direction right and down in which depth changes most, of the reduced map."""
+    known = depth_m > 0
+    inverse = np.divide(1, depth_m, out=np.zeros_like(depth_m), where=known)
+    sums, weight = (
+        cv2.GaussianBlur(_reduced(part, step_px), (0, 0), _EDGE_PX)
+        for part in (inverse, known.astype(np.float32))
+    )
+    direction = _gradient((sums / (weight + 1e-3)).astype(np.float32, copy=False))
+    return direction / np.maximum(np.hypot(*direction), 1e-12)
+
+
+def _changes(lab: Float32) -> Float32:
+    """(2,H,W) gradient of the channel that changes most, against the changes around."""
+    change, size = _gradient(lab[..., 0]), np.zeros(lab.shape[:2], np.float32)
+    for channel in np.moveaxis(lab, 2, 0):
+        gradient = _gradient(channel)
+        length = np.hypot(*gradient)
+        change = np.where(length > size, gradient, change)
+        size = np.maximum(length, size)
+    around = cv2.GaussianBlur(size, (0, 0), _AROUND_PX) + 1
+    return change / np.maximum(around, size / _STRONG)
+
+
+def _gradient(image: Float32) -> Float32:
+    """(2,H,W) right and down."""
+    orders = ((1, 0), (0, 1))
+    return np.stack([cv2.Sobel(image, cv2.CV_32F, *order) for order in orders])

@@ -23,7 +23,7 @@ from densify.config import ProjectSettings
 from densify.depth.exposure import Exposure, InView
 from densify.depth.fill import fill
 from densify.depth.layers import Layers
-from densify.depth.rims import decide
+from densify.depth.rims import MOST_CONFIDENCE, decide
 from densify.geometry.cameras import pixels_per_metre
 from densify.geometry.poses import rotate
 from densify.kernels import visibility as kernels
@@ -183,6 +183,7 @@ def _finished(
         frame=frame,
         reason=reason,
         measure=exposure.measure,
+        warnings=layers.warnings,
     )
 
 
@@ -328,8 +329,10 @@ def _visible(
             np.clip(behind[winner], 0, 1),
         ]
     )
-    confidence = (own[winner] * (1 - _DOUBTS @ doubts)).astype(np.float32)
-    every = _Pixels(pixel, winner, depth_m, confidence, points.slope[winner], edge >= 1)
+    confidence = np.maximum(own[winner] * (1 - _DOUBTS @ doubts), MOST_CONFIDENCE)
+    every = _Pixels(
+        pixel, winner, depth_m, confidence.astype(np.float32), points.slope[winner], edge >= 1
+    )
     return _Pixels(**{name: column[supported] for name, column in vars(every).items()})
 
 

@@ -23,8 +23,8 @@ _PACKAGES = (
 
 
 def write_output(result: Result, context: Context, folder: Path) -> None:
-    """``run.yaml``: data, key, frames, cameras, how priors
-    fit, configuration, cost of each stage, versions."""
+    """``run.yaml``: data, key, frames, cameras, warnings, how priors fit, configuration, cost of
+    each stage, versions."""
     record = {
         "data": context.data,
         "key": result.key,
@@ -35,6 +35,7 @@ def write_output(result: Result, context: Context, folder: Path) -> None:
             name: {"source": full.source, **asdict(full.fit), "share": full.share}
             for name, full in result.full.items()
         },
+        "warnings": [f"{name}: {w}" for name, m in result.depth.items() for w in m.warnings],
         "config": context.config,
         "stages": [
             {

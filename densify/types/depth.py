@@ -156,7 +156,7 @@ class DepthMap:
     elsewhere. age_s: float32 seconds between the moment the map shows and the reference time of the
     sweep that measured the pixel, of every pixel in ``filled_m``, nan elsewhere; None until
     `densify.depth.age` has worked it out. reason: (M,) uint8, a `Reason` for each point of the
-    cloud; empty if the cloud is not at hand.
+    cloud; empty if the cloud is not at hand. warnings: what could not be done as asked.
     """
 
     camera: str
@@ -167,6 +167,7 @@ class DepthMap:
     reason: NDArray[np.uint8] = field(default_factory=lambda: np.zeros(0, np.uint8))
     age_s: Float32 | None = None
     measure: str = "z"
+    warnings: tuple[str, ...] = ()
 
     def counts(self) -> dict[str, int]:
         """Points of the cloud by what became of them."""

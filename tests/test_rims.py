@@ -1,0 +1,216 @@
+# SPDX-License-Identifier: MIT
+"""Rims by the image: panels before a wall, known exactly; images that do not belong to them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import densify
+from densify.config import ProjectSettings
+from densify.depth.layers import Layers
+from densify.depth.picture import edges_fit, lab
+from densify.depth.rims import RULES, decide, shares
+from densify.kernels import voting
+from densify.kernels.marching import DIRECTIONS, first_known
+from tests.small_street import KEY, POSES_GIVEN, one_car
+
+HEIGHT, WIDTH = 200, 320
+WALL_M, FAT_PX = 20.0, 3
+
+
+def scene(seed=0):
+    """Layers and image of a dozen panels before a wall. Of each pixel a third is measured; panels
+    reach 3 px beyond their outline, as wide beams make them, and are rims from there to 3 px
+    inside. Returns them and the true depth."""
+    rng = np.random.default_rng(seed)
+    v, u = np.mgrid[0:HEIGHT, 0:WIDTH]
+    truth = np.full((HEIGHT, WIDTH), WALL_M, np.float32)
+    depth, rim = truth.copy(), np.zeros_like(truth)
+    image = np.full((HEIGHT, WIDTH, 3), [90, 110, 150.0])
+    for place in range(12):
+        left, top = 20 + 75 * (place % 4), 15 + 62 * (place // 4)
+        width, height, z = rng.integers(20, 45), rng.integers(25, 40), rng.uniform(6, 12)
+        beyond = np.maximum(
+            np.maximum(left - u, u - left - width + 1), np.maximum(top - v, v - top - height + 1)
+        )
+        truth[beyond <= 0] = z
+        image[beyond <= 0] = rng.uniform(20, 250, 3)
+        fat = (beyond > -FAT_PX) & (beyond <= FAT_PX)
+        depth[fat], rim[fat] = 0, z
+        depth[beyond <= -FAT_PX] = z
+    known = rng.uniform(size=truth.shape) < 0.33
+    depth, rim = (np.where(known, part, 0).astype(np.float32) for part in (depth, rim))
+    layers = Layers(
+        depth_m=depth,
+        rim_m=rim,
+        filled_m=depth,
+        confidence=np.where(known, np.float32(0.6), np.float32(0)),
+        point=np.where(known, 0, -1).astype(np.int32),
+        tilt=np.zeros((HEIGHT, WIDTH, 2), np.float32),
+        spacing_px=np.broadcast_to(np.float32([2, 5]), (HEIGHT, WIDTH, 2)),
+    )
+    image += rng.normal(0, 3, image.shape)
+    return layers, image.clip(0, 255).astype(np.uint8), truth
+
+
+def decided(layers, image, rims="image"):
+    pictured = replace(layers, lab=None if image is None else lab(image))
+    return decide(pictured, ProjectSettings(rims=rims))
+
+
+def test_rims_are_kept_on_the_side_where_the_image_has_them():
+    layers, image, truth = scene()
+    made = decided(layers, image)
+    rims, kept = layers.rim_m > 0, made.depth_m > 0
+    right = np.isclose(layers.rim_m, truth)
+    assert not made.warnings
+    assert (kept & rims & right).sum() > 0.5 * (rims & right).sum()
+    assert (kept & rims & ~right).sum() < 0.04 * (rims & ~right).sum()
+    assert np.array_equal(made.depth_m[layers.depth_m > 0], layers.depth_m[layers.depth_m > 0])
+    assert np.array_equal(made.filled_m, made.depth_m)
+
+
+def test_confidence_leads_from_the_strict_map_to_the_widest():
+    layers, image, truth = scene()
+    kept, all_of_them = decided(layers, image), decided(layers, image, "keep")
+    strict = layers.depth_m > 0
+    assert np.array_equal(all_of_them.depth_m > 0, strict | (layers.rim_m > 0))
+    for made in (kept, all_of_them):
+        assert np.array_equal(made.confidence > 0.2 - 1e-6, strict)
+    rims = layers.rim_m > 0
+    least = kept.confidence[rims & (kept.depth_m > 0)].min()
+    assert least > all_of_them.confidence[rims & (kept.depth_m == 0)].max()
+    right = np.isclose(layers.rim_m, truth)
+    assert all_of_them.confidence[rims & right].mean() > (
+        3 * all_of_them.confidence[rims & ~right].mean()
+    )
+
+
+def test_without_an_image_rims_are_left_out():
+    layers, image, _ = scene()
+    for made in (decided(layers, None), decided(layers, image, "strict")):
+        assert np.array_equal(made.depth_m, layers.depth_m) and not made.warnings
+
+
+@pytest.mark.parametrize("shift", [1, 2, 3, 5, 7, 10])
+@pytest.mark.parametrize("axis", [0, 1])
+def test_a_shifted_image_does_no_harm(shift, axis):
+    """Either it is noticed, or hardly any wrong pixel is added."""
+    layers, image, truth = scene()
+    made = decided(layers, np.roll(image, shift, axis))
+    if shift >= 5:
+        assert made.warnings
+    if made.warnings:
+        assert np.array_equal(made.depth_m, layers.depth_m)
+    wrong = (made.depth_m > 0) & ~np.isclose(made.depth_m, truth)
+    assert wrong.sum() < 0.005 * (made.depth_m > 0).sum()
+    assert wrong.sum() < 0.1 * ((layers.rim_m > 0) & ~np.isclose(layers.rim_m, truth)).sum()
+
+
+def spoiled(image):
+    rng = np.random.default_rng(1)
+    return {
+        "noise": rng.integers(0, 256, image.shape).astype(np.uint8),
+        "black": np.zeros_like(image),
+        "another": scene(5)[1][::-1, ::-1],
+    }
+
+
+@pytest.mark.parametrize("how", ["noise", "black", "another"])
+def test_an_image_that_does_not_belong_is_noticed(how):
+    layers, image, _ = scene()
+    made = decided(layers, spoiled(image)[how])
+    assert made.warnings and np.array_equal(made.depth_m, layers.depth_m)
+
+
+def test_a_dark_image_still_fits():
+    layers, image, _ = scene()
+    at, dark = layers.rim_m > 0, (image // 4).astype(np.uint8)
+    assert edges_fit(lab(dark), np.maximum(layers.depth_m, layers.rim_m), at)
+
+
+def test_a_mirrored_scene_has_mirrored_votes():
+    layers, image, _ = scene()
+    flipped = Layers(
+        *(
+            np.ascontiguousarray(getattr(layers, name)[:, ::-1])
+            for name in vars(layers)
+            if name not in ("lab", "warnings")
+        )
+    )
+    rims, mirrored = (np.flatnonzero(part.rim_m) for part in (layers, flipped))
+    share = np.zeros((2, HEIGHT, WIDTH), np.float32)
+    share[0].flat[rims] = shares(layers, lab(image), rims)
+    share[1].flat[mirrored] = shares(flipped, lab(np.ascontiguousarray(image[:, ::-1])), mirrored)
+    np.testing.assert_allclose(share[0], share[1][:, ::-1], atol=1e-4)
+
+
+def vote_twin(pixel, inverse, known, seeds, colours, gap_px, rules):
+    """One pixel, one direction, one step at a time."""
+    height, width = gap_px.shape
+    v, u = divmod(pixel, width)
+    gap, least = gap_px[v, u], 1.0
+    aside = round(rules.aside * gap)
+
+    def colour(row, column):
+        return colours[np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)].astype(float)
+
+    for right, down in ((0, 0), (aside, 0), (-aside, 0), (0, aside), (0, -aside)):
+        votes_for, votes = rules.doubt / 2, rules.doubt
+        for (u1, v1), (u2, v2) in DIRECTIONS.tolist():
+            change, step = 0.0, 0
+            while True:
+                step += 1
+                du, dv = step // 2 * u2 + step % 2 * u1, step // 2 * v2 + step % 2 * v1
+                if not (0 <= u + du < width and 0 <= v + dv < height):
+                    break
+                if max(abs(du), abs(dv)) > rules.reach * gap:
+                    break
+                off = colour(v + down + dv, u + right + du) - colour(v + down, u + right)
+                change = max(change, off @ off)
+                if known[v + dv, u + du]:
+                    there = seeds.inverse[v + dv, u + du]
+                    here = there - seeds.tilt[v + dv, u + du] @ (du, dv)
+                    here = min(max(here, 0.7 * there), 1.4 * there)
+                    weight = seeds.weight[v + dv, u + du] / (1 + step / (rules.decay * gap))
+                    weight *= np.exp(-change / (2 * rules.colours**2)) + rules.through
+                    votes += weight
+                    near = abs(1 / here - 1 / inverse)
+                    votes_for += weight * (near <= rules.same_m + rules.same_fraction / inverse)
+                    break
+        least = min(least, votes_for / votes)
+    return least
+
+
+def test_votes_equal_those_of_a_slow_twin():
+    rng = np.random.default_rng(3)
+    shape = (24, 30)
+    known = rng.uniform(size=shape) < 0.2
+    inverse = np.where(known, rng.choice([0.05, 0.052, 0.1], shape), 0).astype(np.float32)
+    tilt = rng.normal(0, 0.001, (*shape, 2)).astype(np.float32)
+    weight = rng.uniform(0.2, 1, shape).astype(np.float32)
+    seeds = voting.Seeds(first_known(known), DIRECTIONS, inverse, tilt, weight)
+    colours = (50 + np.cumsum(rng.normal(0, 1, (*shape, 3)), axis=1)).astype(np.float32)
+    gap_px = rng.uniform(1, 3, shape).astype(np.float32)
+    pixel = np.concatenate([np.flatnonzero(known), np.flatnonzero(~known)[::5]])
+    here = np.where(known.flat[pixel], inverse.flat[pixel], np.float32(0.05)).astype(np.float32)
+    share = np.zeros(len(pixel), np.float32)
+    voting.vote(0, len(pixel), pixel, here, seeds, colours, gap_px, RULES, share)
+    twin = [
+        vote_twin(p, w, known, seeds, colours, gap_px, RULES)
+        for p, w in zip(pixel, here, strict=True)
+    ]
+    np.testing.assert_allclose(share, twin, rtol=1e-4)
+    assert np.ptp(share) > 0.5
+
+
+def test_the_run_says_that_an_image_does_not_fit(caplog):
+    grey = densify.run(one_car(), KEY, 2, config=POSES_GIVEN)  # its images show nothing
+    strict = densify.run(one_car(), KEY, 2, config={**POSES_GIVEN, "project": {"rims": "strict"}})
+    (name,) = grey.depth
+    assert "image edges" in caplog.text and name in caplog.text
+    assert grey.depth[name].warnings and not strict.depth[name].warnings
+    assert np.array_equal(grey.depth[name].depth_m, strict.depth[name].depth_m)
