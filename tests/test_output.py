@@ -432,9 +432,9 @@ def test_the_same_result_gives_the_same_bytes(put, tmp_path):
 def test_figure_shows_the_baselines_above_the_result(put, tmp_path, monkeypatch):
     drawn = {}
 
-    def draw(image, panels):
+    def draw(image, panels, said):
         drawn.update(panels)
-        return draw_figure(image, panels)
+        return draw_figure(image, panels, said)
 
     monkeypatch.setattr(figure, "draw_figure", draw)
     baselines = {method: result_of(method, i) for i, method in enumerate(("none", "icp"), 1)}

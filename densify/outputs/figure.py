@@ -42,23 +42,40 @@ def write_output(result: Result, context: Context, folder: Path) -> None:
 
 
 def write_figure(path: Path, results: Mapping[str, Result], context: Context) -> None:
-    """The measured depth of each method in the first camera, if there is one."""
+    """The measured depth of each method in the first camera, if there is one, and the last one's
+    completed with a prior, if there was one."""
     depth = next(iter(results.values())).depth
     if not depth:
         return
     camera = next(iter(depth))
     image = context.image(camera, depth[camera].depth_m.shape)
     panels = {_TITLES.get(m, m): r.depth[camera].depth_m for m, r in results.items()}
-    write_picture(path, draw_figure(image, panels))
+    said = {_TITLES.get(m, m): _error(r, camera, "measured") for m, r in results.items()}
+    method, result = list(results.items())[-1]
+    if camera in result.full:
+        title = f"{method} and prior"
+        panels[title], said[title] = result.full[camera].depth_m, _error(result, camera, "full")
+    write_picture(path, draw_figure(image, panels, said))
 
 
-def draw_figure(image: Picture, panels: Mapping[str, Float32]) -> Picture:
+def _error(result: Result, camera: str, product: str) -> str:
+    """How much is wrong, against the truth where there is some, else with the key held out."""
+    for source, against in (("depth", "truth"), ("held_out", "key held out")):
+        scores = (result.metrics.get(source) or {}).get(camera, {}).get(product)
+        if scores and scores["all"]["outliers"] is not None:
+            return f", {scores['all']['outliers']:.2%} wrong ({against})"
+    return ""
+
+
+def draw_figure(
+    image: Picture, panels: Mapping[str, Float32], said: Mapping[str, str] | None = None
+) -> Picture:
     """Draw depth maps over an image, from top to bottom in the mapping's order.
 
     image: (H,W,3) uint8 RGB. panels: title to (H,W) depth in metres, 0 none. Each is drawn over
     the image in gray; a depth covers 3 x 3 pixels (the nearest wins) so that single returns are
-    seen; the share of pixels that have one stands beside the title. Near is red, far is blue,
-    logarithmic from 3 to 80 m, clamped beyond.
+    seen; the share of pixels that have one stands beside the title, and behind it what is said of
+    that title. Near is red, far is blue, logarithmic from 3 to 80 m, clamped beyond.
 
     Returns (H',W',3) uint8 RGB, at least 480 pixels wide.
     """
@@ -72,7 +89,8 @@ def draw_figure(image: Picture, panels: Mapping[str, Float32]) -> Picture:
     rows = []
     for title, depth_m in panels.items():
         density = np.count_nonzero(depth_m) / depth_m.size
-        rows.append(_title(f"{title}: {density:.1%} of pixels", width))
+        beside = (said or {}).get(title, "")
+        rows.append(_title(f"{title}: {density:.1%} of pixels{beside}", width))
         panel = _overlay(image, depth_m)
         rows.append(panel.repeat(enlarge, axis=0).repeat(enlarge, axis=1))
     rows.append(_colour_scale(width))
@@ -123,7 +141,10 @@ def _colours(depth_m: Float32) -> Picture:
 def _title(text: str, width: int) -> Picture:
     size = max(width / _REFERENCE_WIDTH_PX, 0.5)
     bar = np.full((round(38 * size), width, 3), 20, np.uint8)
-    _write(bar, text, round(12 * size), round(27 * size), 0.85 * size)
+    scale = 0.85 * size
+    room = width - round(24 * size)
+    wide = cv2.getTextSize(text, _FONT, scale, _thickness(scale))[0][0]
+    _write(bar, text, round(12 * size), round(27 * size), scale * min(1, room / wide))
     return bar
 
 
