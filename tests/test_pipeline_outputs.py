@@ -179,7 +179,7 @@ def test_every_point_is_accounted_for_and_the_picture_shows_what_was_left_out(tm
     assert counts["kept"] == (maps.depth_m > 0).sum()
     left_out = result.rejected["front"]
     shown = {Reason(r).name.lower() for r in np.unique(left_out) if r}
-    assert shown and shown <= {"vetoed", "hidden", "unsupported", "edge"}
+    assert shown and shown <= {"vetoed", "hidden", "unsupported", "edge", "glass"}
     for name in shown:
         assert (left_out == Reason[name.upper()]).sum() <= counts[name]
     write_result(result, {}, tmp_path, config=NPZ, data="street")

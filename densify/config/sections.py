@@ -252,6 +252,19 @@ class ProjectSettings(Section):
         10,
     )
     edge_fraction: float = knob(0.01, "the same as a share of the depth; the larger counts", 0, 1)
+    glass: str = knob(
+        "plane",
+        "windows of vehicles. plane: what is measured behind them is taken out, and the filled map "
+        "has the plane of their frames; keep: it stays",
+        choices=("plane", "keep"),
+    )
+    star_reach: float = knob(
+        1.0,
+        "how far, in spacings of neighbouring rays, known pixels all round may be from a hole that "
+        "the two-sided fill leaves; 0: it is left",
+        0,
+        20,
+    )
     fill_confidence: float = knob(
         0.5,
         "confidence of a pixel filled from afar as a share of the least around it",

@@ -22,8 +22,10 @@ from scipy import ndimage
 from densify.config import ProjectSettings
 from densify.depth.exposure import Exposure, InView
 from densify.depth.fill import fill
+from densify.depth.glass import close_windows
 from densify.depth.layers import Layers
 from densify.depth.rims import MOST_CONFIDENCE, decide
+from densify.depth.star import fill_stars
 from densify.geometry.cameras import pixels_per_metre
 from densify.geometry.poses import rotate
 from densify.kernels import visibility as kernels
@@ -118,6 +120,10 @@ def project(
     layers = decide(_measured(seen, points, camera, lab), settings)
     if filled:
         layers = fill(layers, settings)
+        if settings.visibility and settings.glass == "plane":
+            layers = close_windows(layers, camera.focal_px, settings)
+        if settings.star_reach > 0:
+            layers = fill_stars(layers, settings)
     return _finished(layers, cloud, view.exposure, reason)
 
 
@@ -171,6 +177,8 @@ def _finished(
     measured, rim = layers.depth_m > 0, layers.rim_m > 0
     reason[layers.point[rim]] = Reason.EDGE
     reason[layers.point[measured]] = Reason.KEPT
+    if layers.glass is not None:
+        reason[layers.point[layers.glass]] = Reason.GLASS
     frame = np.full(measured.shape, -1, np.int32)
     frame[measured] = cloud.frame[layers.point[measured]]
     shown = layers.filled_m > 0

@@ -148,9 +148,7 @@ class Views:
         maps = {}
         for name, e in self.exposures.items():
             reason = depth[name].reason
-            left_out = np.isin(
-                reason, [Reason.VETOED, Reason.HIDDEN, Reason.UNSUPPORTED, Reason.EDGE]
-            )
+            left_out = ~np.isin(reason, [Reason.KEPT, Reason.OUTSIDE, Reason.NOT_CHOSEN])
             sight = e.see(cloud.points[left_out], cloud.velocity_m_s[left_out])
             inside = sight.inside
             farthest_first = np.argsort(-e.depth_m(sight.points_cam[inside]), kind="stable")

@@ -32,6 +32,7 @@ _REASON_COLOURS = {
     Reason.HIDDEN: (80, 140, 255),
     Reason.UNSUPPORTED: (255, 210, 60),
     Reason.EDGE: (90, 230, 120),
+    Reason.GLASS: (235, 120, 255),
 }
 
 

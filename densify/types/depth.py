@@ -90,6 +90,7 @@ class Reason(IntEnum):
     NOT_CHOSEN = 4  # its pixel's depth is from a point nearer in time to the key, or nearer
     UNSUPPORTED = 5  # too few sweeps agree with it, or not the one nearest to the key
     EDGE = 6  # so close to a depth edge that its pixel may lie beyond it
+    GLASS = 7  # inside a vehicle, seen through a window
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,208 @@
+# SPDX-License-Identifier: MIT
+"""Windows of vehicles: closed on an analytic car, left open where it only looks like one, by a slow
+twin, and on a real car."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from densify.config import ProjectSettings
+from densify.depth import glass
+from densify.depth.glass import close_windows
+from densify.depth.layers import Layers
+from densify.kernels import threads
+from densify.kernels.framing import framed
+from densify.kernels.marching import DIRECTIONS, first_known
+
+FOCAL_PX, SHAPE = 720.0, (240, 320)
+SETTINGS = ProjectSettings()
+ROW, COLUMN = np.mgrid[: SHAPE[0], : SHAPE[1]].astype(float)
+RIGHT, DOWN = (COLUMN - 160) / FOCAL_PX, (ROW - 80) / FOCAL_PX  # of rays, per metre of depth
+
+
+def layers_of(depth_m, measured=None, confidence=0.8):
+    """As after the fill. measured: (H,W) bool, all if None."""
+    filled_m = np.ascontiguousarray(depth_m, np.float32)
+    known = filled_m > 0
+    depth_m = np.where(known if measured is None else known & measured, filled_m, 0)
+    return Layers(
+        depth_m=depth_m.astype(np.float32),
+        rim_m=np.zeros(SHAPE, np.float32),
+        filled_m=filled_m,
+        confidence=np.where(known, np.float32(confidence), np.float32(0)),
+        point=np.where(depth_m > 0, np.arange(depth_m.size).reshape(SHAPE), -1).astype(np.int32),
+        tilt=np.zeros((*SHAPE, 2), np.float32),
+        spacing_px=np.full((*SHAPE, 2), 3, np.float32),
+    )
+
+
+def street_behind():
+    """Ground 1.7 m below the camera, a wall at 25 m."""
+    with np.errstate(divide="ignore"):
+        return np.where(DOWN > 1.7 / 25, 1.7 / DOWN, 25.0)
+
+
+def side_m(yaw=0.3, lean=0.3):
+    """Depth of a leaning plane 8 m ahead, seen at an angle."""
+    return 8.0 / (1 - yaw * RIGHT - lean * DOWN)
+
+
+def box(left_m, right_m, top_m, bottom_m):
+    """Where a rectangle at 8 m is, from the middle of the image's column and horizon."""
+    at = 8 * RIGHT, 8 * DOWN
+    return (at[0] > left_m) & (at[0] < right_m) & (at[1] > top_m) & (at[1] < bottom_m)
+
+
+BODY, WINDOW = box(-1.6, 1.6, -0.5, 1.0), box(-0.5, 0.45, -0.38, 0.05)
+
+
+def car(rng, behind_m=0.6, seen=0.5):
+    """A car's side with a window, through which seats are seen."""
+    depth_m = np.where(BODY, side_m(), street_behind())
+    seats = side_m() + behind_m + 0.1 * np.sin(COLUMN / 7)
+    some = (rng.random(SHAPE) < seen) & (np.abs(8 * RIGHT) > 0.15)
+    return np.where(WINDOW, np.where(some, seats, 0), depth_m)
+
+
+def test_a_window_gets_the_plane_of_its_frame():
+    layers = layers_of(car(np.random.default_rng(1)))
+    closed = close_windows(layers, FOCAL_PX, SETTINGS)
+    right = np.abs(closed.filled_m / side_m() - 1) < 0.01
+    assert right[WINDOW].mean() > 0.98  # a few corners of two pixels are left
+    assert closed.glass is not None
+    np.testing.assert_array_equal(closed.glass, (layers.depth_m > 0) & (closed.depth_m == 0))
+    assert (closed.glass == (layers.depth_m > 0))[WINDOW].mean() > 0.98
+    np.testing.assert_allclose(closed.confidence[right & WINDOW], 0.8 * SETTINGS.fill_confidence)
+    for before, after in ((layers.depth_m, closed.depth_m), (layers.filled_m, closed.filled_m)):
+        np.testing.assert_array_equal(after[~WINDOW], before[~WINDOW])
+
+
+def test_what_glass_itself_sent_back_stays_measured():
+    rng = np.random.default_rng(2)
+    depth_m = car(rng)
+    pane = WINDOW & (rng.random(SHAPE) < 0.12)
+    depth_m[pane] = side_m()[pane]
+    closed = close_windows(layers_of(depth_m), FOCAL_PX, SETTINGS)
+    np.testing.assert_array_equal(closed.depth_m[pane], depth_m[pane].astype(np.float32))
+    assert (closed.depth_m[WINDOW & ~pane] == 0).mean() > 0.98
+
+
+def no_window(kind, rng):
+    if kind == "a wall behind":
+        return np.where(BODY & ~WINDOW, side_m(), street_behind())
+    if kind == "a truck's open bed":
+        return np.where(BODY & ~box(-1.3, 1.3, -9, 0.3), side_m(), side_m() + 1.5)
+    if kind == "an open door":
+        return np.where(box(-0.5, 0.45, -0.4, 9), side_m() + 0.8, side_m())
+    if kind == "a gap between two cars":
+        return np.where(box(-0.3, 0.3, -9, 9), side_m() + 1.2, np.where(BODY, side_m(), 25))
+    if kind == "a tree's crown":
+        return 8 + rng.uniform(-1.5, 1.5, SHAPE)
+    if kind == "a shallow recess":
+        return np.where(WINDOW, side_m() + 0.15, side_m())
+    assert kind == "the plain street"
+    return street_behind()
+
+
+@pytest.mark.parametrize(
+    "kind",
+    ["a wall behind", "a truck's open bed", "an open door", "a gap between two cars"]
+    + ["a tree's crown", "a shallow recess", "the plain street"],
+)
+def test_what_is_no_window_is_left(kind):
+    rng = np.random.default_rng(3)
+    depth_m = np.where(rng.random(SHAPE) < 0.6, no_window(kind, rng), 0)
+    layers = layers_of(depth_m)
+    closed = close_windows(layers, FOCAL_PX, SETTINGS)
+    np.testing.assert_array_equal(closed.depth_m, layers.depth_m)
+    np.testing.assert_array_equal(closed.filled_m, layers.filled_m)
+
+
+def test_an_empty_map_stays_empty():
+    closed = close_windows(layers_of(np.zeros(SHAPE)), FOCAL_PX, SETTINGS)
+    assert not closed.filled_m.any()
+
+
+def test_threads_change_no_byte(monkeypatch):
+    layers = layers_of(car(np.random.default_rng(4)))
+    results = []
+    for cores in (1, 3):
+        monkeypatch.setattr(threads, "num_threads", lambda cores=cores: cores)
+        results.append(close_windows(layers, FOCAL_PX, SETTINGS).filled_m.tobytes())
+    assert results[0] == results[1]
+
+
+def on_ray(row, column, d, near, reach_px):
+    """(k,3) offsets and inverse depths step by step."""
+    steps = []
+    for k in range(1, reach_px + 1):
+        du, dv = (k // 2) * DIRECTIONS[d, 1] + (k % 2) * DIRECTIONS[d, 0]
+        if not (0 <= row + dv < near.shape[0] and 0 <= column + du < near.shape[1]):
+            break
+        steps.append((du, dv, near[row + dv, column + du]))
+    return np.array(steps).reshape(-1, 3)
+
+
+def fitted(parts):
+    design = np.column_stack([np.ones(len(parts)), parts[:, :2]])
+    return np.linalg.lstsq(design, parts[:, 2], rcond=None)[0]
+
+
+def twin(row, column, near, far, rules):
+    """The plane of the frame around a pixel, None if there is none."""
+    if far[row, column] > 0:
+        depth = 1 / float(far[row, column])
+    else:
+        first = [on_ray(row, column, d, near, rules.reach_px) for d in range(16)]
+        first = [ray[ray[:, 2] > 0][0, 2] for ray in first if (ray[:, 2] > 0).any()]
+        if not first:
+            return None
+        depth = 1 / min(first) + rules.empty_m
+    reach_px = int(min(rules.reach_m * rules.focal_px / depth, rules.reach_px))
+    rays = [on_ray(row, column, d, near, reach_px) for d in range(16)]
+    nearest = [ray[ray[:, 2].argmax()] for ray in rays if len(ray) and ray[:, 2].any()]
+    good = [
+        i
+        for i, part in enumerate(nearest)
+        if rules.each_m < depth - 1 / part[2] and depth - 1 / part[2] <= rules.most_m
+    ]
+    rays, parts = [rays[i] for i in good], np.array([nearest[i] for i in good])
+    for off_m in (rules.rough_m, rules.off_m):
+        if len(parts) < 16 - rules.open:
+            return None
+        plane = fitted(parts)
+        before = depth - 1 / plane[0]
+        if not (plane[0] > 0 and rules.behind_m < before <= rules.most_m):
+            return None
+        if abs(plane[2]) * rules.focal_px > rules.lean * plane[0]:
+            return None
+        at = plane[0] + parts[:, :2] @ plane[1:]
+        if (np.abs(1 / at - 1 / parts[:, 2]) <= off_m).sum() < 16 - rules.open:
+            return None
+        touching = []
+        for ray in rays:
+            known = ray[ray[:, 2] > 0]
+            there = 1 / known[:, 2] < 1 / (plane[0] + known[:, :2] @ plane[1:]) + rules.touch_m
+            touching += [known[there.argmax()]] if there.any() else []
+        parts = np.array(touching)
+    return plane
+
+
+def test_frames_equal_those_of_a_slow_twin():
+    rng = np.random.default_rng(5)
+    depth_m = car(rng)[22:96:2, 110:210:2]
+    depth_m[rng.random(depth_m.shape) < 0.1] = 0
+    near = np.divide(1, depth_m, out=np.zeros_like(depth_m), where=depth_m > 0).astype(np.float32)
+    rules, found = glass._rules(FOCAL_PX / 2), np.zeros((4, *near.shape), np.float32)
+    known = np.where(near > 0, np.float32(0.5), np.float32(0))
+    steps = first_known(near > 0)
+    framed.over_rows(near.size, near, near, known, steps, DIRECTIONS, rules, found)
+    num = 0
+    for row, column in np.ndindex(near.shape):
+        plane = twin(row, column, near, near, rules)
+        assert (found[0, row, column] > 0) == (plane is not None), (row, column)
+        if plane is not None:
+            num += 1
+            np.testing.assert_allclose(found[:3, row, column], plane, rtol=1e-3, atol=1e-6)
+    assert num > 200
