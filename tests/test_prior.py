@@ -91,7 +91,7 @@ def test_what_is_known_stays_as_it_is(name):
     assert np.array_equal(full.confidence[known], maps.confidence[known])
     assert ((full.depth_m > 0) == (known | full.from_prior)).all()
     of_prior = full.confidence[full.from_prior]
-    assert of_prior.min() > 0 and of_prior.max() <= 0.1
+    assert of_prior.min() > 0 and of_prior.max() <= 0.05
     assert not full.confidence[full.depth_m == 0].any()
 
 

@@ -207,7 +207,7 @@ def test_a_prior_changes_nothing_of_what_is_measured_or_filled(runs, tmp_path):
     assert np.array_equal(depth_m[filled_m > 0], filled_m[filled_m > 0])
     confidence = read_stored(folder / "confidence_full" / "front.png", np.uint8, "confidence")
     assert np.array_equal(confidence > 0, depth_m > 0)
-    assert confidence[(depth_m > 0) & (filled_m == 0)].max() <= 26
+    assert confidence[(depth_m > 0) & (filled_m == 0)].max() <= 14
     record = yaml.safe_load((folder / "run.yaml").read_text())["prior"]["front"]
     assert record["kind"] == "inverse" and record["used"] and abs(record["scale"] - 0.2) < 0.01
     metrics = json.loads((folder / "metrics.json").read_text())
@@ -248,3 +248,9 @@ def test_a_prior_that_does_not_fit_is_not_used_with_a_warning(tmp_path, caplog):
 def test_the_command_line_refuses_a_folder_that_is_not_there(tmp_path, capsys):
     line = refused(capsys, 2, "run", "--key", "120", "--prior", tmp_path / "no", "--out", tmp_path)
     assert "--prior" in line and "no such folder" in line
+
+
+def test_pixels_of_a_prior_are_less_certain_than_filled_ones(runs):
+    full, maps = runs.full.full["front"], runs.full.depth["front"]
+    known = full.confidence[maps.filled_m > 0]
+    assert full.confidence[full.from_prior].max() < np.percentile(known, 0.1)

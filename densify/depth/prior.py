@@ -38,7 +38,7 @@ _DOUBTFUL = 0.1  # deviation or steepness at which a known pixel counts half
 _LEAST_ALIKE = 1e-6  # where no cell around a pixel is on its surface, all count
 _MIXED = 0.1  # a pixel so far from both the nearest and the farthest around it is on neither
 _AROUND = np.ones((5, 5), np.uint8)
-_HIGHEST_CONFIDENCE = 0.1
+_HIGHEST_CONFIDENCE = 0.05  # filled pixels have more
 _EMPTY = 10.0  # logarithm of a depth that is farther than all
 
 
@@ -53,7 +53,7 @@ def complete(maps: DepthMap, prior: Prior, settings: PriorSettings) -> FullDepth
     pixels between two surfaces, as blurred priors have them. Of a prior that does not fit
     (``max_wrong``) nothing is used.
 
-    A prior pixel's confidence is at most 0.1, less the more the prior deviates from known pixels
+    A prior pixel's confidence is at most 0.05, less the more the prior deviates from known pixels
     nearby on the same surface and the steeper it is; a ranking, not calibrated.
     """
     known = (prior.value > 0) & ~prior.sky
