@@ -88,10 +88,12 @@ def test_what_is_known_stays_as_it_is(name):
     assert [a.tobytes() for a in (maps.depth_m, maps.filled_m, maps.confidence)] == before
     known = maps.filled_m > 0
     assert np.array_equal(full.depth_m[known], maps.filled_m[known])
-    assert np.array_equal(full.confidence[known], maps.confidence[known])
+    np.testing.assert_allclose(
+        full.confidence[known], 0.2 + 0.8 * maps.confidence[known], rtol=1e-6
+    )
     assert ((full.depth_m > 0) == (known | full.from_prior)).all()
     of_prior = full.confidence[full.from_prior]
-    assert of_prior.min() > 0 and of_prior.max() <= 0.05
+    assert of_prior.min() > 0 and of_prior.max() <= 0.2
     assert not full.confidence[full.depth_m == 0].any()
 
 
@@ -222,7 +224,8 @@ def test_what_does_not_fit_is_not_used(value):
     full = complete(maps, prior(np.maximum(value, 0.01)), settings)
     assert not full.fit.used and not full.from_prior.any() and full.share == 0
     assert full.depth_m.tobytes() == maps.filled_m.tobytes()
-    assert full.confidence.tobytes() == maps.confidence.tobytes()
+    assert (full.confidence[maps.filled_m > 0] > 0.2).all()
+    assert not full.confidence[maps.filled_m == 0].any()
 
 
 def test_a_kind_can_be_forced():

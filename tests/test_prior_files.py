@@ -207,7 +207,7 @@ def test_a_prior_changes_nothing_of_what_is_measured_or_filled(runs, tmp_path):
     assert np.array_equal(depth_m[filled_m > 0], filled_m[filled_m > 0])
     confidence = read_stored(folder / "confidence_full" / "front.png", np.uint8, "confidence")
     assert np.array_equal(confidence > 0, depth_m > 0)
-    assert confidence[(depth_m > 0) & (filled_m == 0)].max() <= 14
+    assert confidence[(depth_m > 0) & (filled_m == 0)].max() <= 52
     record = yaml.safe_load((folder / "run.yaml").read_text())["prior"]["front"]
     assert record["kind"] == "inverse" and record["used"] and abs(record["scale"] - 0.2) < 0.01
     metrics = json.loads((folder / "metrics.json").read_text())
@@ -253,4 +253,4 @@ def test_the_command_line_refuses_a_folder_that_is_not_there(tmp_path, capsys):
 def test_pixels_of_a_prior_are_less_certain_than_filled_ones(runs):
     full, maps = runs.full.full["front"], runs.full.depth["front"]
     known = full.confidence[maps.filled_m > 0]
-    assert full.confidence[full.from_prior].max() < np.percentile(known, 0.1)
+    assert full.confidence[full.from_prior].max() < known.min()

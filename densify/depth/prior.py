@@ -38,7 +38,7 @@ _DOUBTFUL = 0.1  # deviation or steepness at which a known pixel counts half
 _LEAST_ALIKE = 1e-6  # where no cell around a pixel is on its surface, all count
 _MIXED = 0.1  # a pixel so far from both the nearest and the farthest around it is on neither
 _AROUND = np.ones((5, 5), np.uint8)
-_HIGHEST_CONFIDENCE = 0.05  # filled pixels have more
+_HIGHEST = 0.2  # confidence of the prior's pixels; known ones have more
 _EMPTY = 10.0  # logarithm of a depth that is farther than all
 
 
@@ -53,15 +53,18 @@ def complete(maps: DepthMap, prior: Prior, settings: PriorSettings) -> FullDepth
     pixels between two surfaces, as blurred priors have them. Of a prior that does not fit
     (``max_wrong``) nothing is used.
 
-    A prior pixel's confidence is at most 0.05, less the more the prior deviates from known pixels
-    nearby on the same surface and the steeper it is; a ranking, not calibrated.
+    Confidences are a ranking, not calibrated. A pixel of the prior has at most 0.2, less the more
+    the prior deviates from known pixels nearby on the same surface and the steeper it is. All known
+    pixels have more: 0.2 + 0.8 times the map's.
     """
     known = (prior.value > 0) & ~prior.sky
+    above = np.where(maps.filled_m > 0, _HIGHEST + (1 - _HIGHEST) * maps.confidence, 0)
+    confidence = above.astype(np.float32)
     measured = known & (maps.depth_m > 0)
     fit = fit_prior(prior.value[measured], maps.depth_m[measured], settings)
     if not fit.used:
         nothing = np.zeros(known.shape, bool)
-        return FullDepth(maps.filled_m, maps.confidence, nothing, fit, prior.source)
+        return FullDepth(maps.filled_m, confidence, nothing, fit, prior.source)
     log_depth = _log_depth(prior.value, fit)
     usable = known & (log_depth < np.log(settings.far_m))
     usable &= ~_far_limit(prior.value, known, measured, fit)
@@ -75,7 +78,7 @@ def complete(maps: DepthMap, prior: Prior, settings: PriorSettings) -> FullDepth
     error = np.hypot(spread, farther + nearer) / _TOLERANCE
     return FullDepth(
         np.where(from_prior, full_m, maps.filled_m),
-        np.where(from_prior, _HIGHEST_CONFIDENCE / (1 + error), maps.confidence).astype(np.float32),
+        np.where(from_prior, _HIGHEST / (1 + error), confidence).astype(np.float32),
         from_prior,
         fit,
         prior.source,

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
 """The output of depth completed with the user's prior: ``depth_full``, and ``confidence_full``,
-which says of the prior's pixels 0.05 (14 as it is stored) at most; a PNG each for every map."""
+in which the prior's pixels have 0.2 (52 as it is stored) at most and all others more; a PNG each
+for every map."""
 
 from __future__ import annotations
 

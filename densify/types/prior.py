@@ -47,7 +47,7 @@ class FullDepth:
     """A depth map completed with a prior; (H,W) each.
 
     depth_m: float32 metres, 0 none: ``DepthMap.filled_m`` where that has a depth. confidence:
-    float32 0 to 1; that of the map where it has one. from_prior: bool, the pixels from the prior.
+    float32 0 to 1, of the prior's pixels less than of all others. from_prior: bool, the prior's.
     source: where the prior is from.
     """
 
