@@ -24,7 +24,7 @@ from densify.config import Config, resolve
 from densify.costs import Watch
 from densify.depth.age import with_ages
 from densify.depth.exposure import Shot, key_shots, load_images
-from densify.depth.views import HeldOut, Views
+from densify.depth.views import HeldOut, SeenCloud, Views
 from densify.errors import ComputationError, InputError
 from densify.flow.engines import check_engine
 from densify.geometry.range_image import RangeImage
@@ -40,12 +40,14 @@ from densify.types import (
     Camera,
     Cloud,
     DepthMap,
+    Float,
     Float32,
     LidarSequence,
     Prior,
     Progress,
     RegisteredSweep,
     Result,
+    Standing,
     Stretch,
     StretchFlow,
 )
@@ -57,27 +59,31 @@ _log = logging.getLogger("densify")
 class Method(NamedTuple):
     """What is accumulated. all_sweeps: else the key sweep alone. engine: which flow, see
     ``flow.engine``; None for none, "" for the configured one. visible: what is hidden, vetoed or
-    doubtful is left out, else each pixel shows its nearest point."""
+    doubtful is left out, else each pixel shows its nearest point. far: with the standing world
+    beyond the window (``accumulate.far_m``)."""
 
     all_sweeps: bool
     engine: str | None
     visible: bool
+    far: bool
 
 
 METHODS = {
-    "none": Method(False, None, False),
-    "icp": Method(True, None, False),
-    "icp-visible": Method(True, None, True),
-    "flow-plain": Method(True, "", False),
-    "paper": Method(True, "paper", True),
-    "flow": Method(True, "", True),
+    "none": Method(False, None, False, False),
+    "icp": Method(True, None, False, False),
+    "icp-far": Method(True, None, False, True),
+    "icp-visible": Method(True, None, True, True),
+    "flow-plain": Method(True, "", False, False),
+    "paper": Method(True, "paper", True, True),
+    "flow": Method(True, "", True, True),
 }
-"""For `compare`: the key sweep alone; registration alone, as it is and with visibility; our scene
-flow without visibility; the published scene flow; ours. `run` takes none, icp and flow."""
+"""For `compare`: the key sweep alone; registration alone, of the window and of all sweeps within
+``accumulate.far_m``; with visibility; our scene flow without visibility; the published scene flow;
+ours. `run` takes none, icp and flow."""
 
 RUN = ("none", "icp", "flow")
 """What `run` takes, each with those before it as its baselines."""
-COMPARED = ("none", "icp", "paper", "flow")
+COMPARED = ("none", "icp", "icp-far", "paper", "flow")
 """What `compare` shows unless told otherwise."""
 
 ConfigLike = Config | str | Path | Mapping[str, Any] | None
@@ -204,8 +210,12 @@ def densify(
         )
         for name in methods
     }
+    beyond = None
+    if any(METHODS[name].far for name in methods):
+        beyond = recording.standing(key)
     return _results(
-        sequence, stretch, key, moments, shots, images, with_images, found, settings, watch
+        *(sequence, stretch, key, moments, beyond, shots, images, with_images, found),
+        *(settings, watch),
     )
 
 
@@ -243,6 +253,7 @@ def _results(
     stretch: Stretch,
     key: int,
     moments: dict[str, tuple[Cloud, StretchFlow | None]],
+    beyond: tuple[Standing, Float] | None,
     shots: Mapping[str, Shot],
     images: Mapping[str, Image],
     with_images: bool,
@@ -260,7 +271,16 @@ def _results(
     with watch.stage("held out"):
         held_out = HeldOut.of(views, moments[next(reversed(moments))][0])
     pictures = images if with_images else None
-    seen = _Seen(sequence, stretch, key_image, views, held_out, truth, pictures, settings, watch)
+    far, stamps_ns = {}, {s.frame: s.sweep.stamp_ns for s in stretch.sweeps}
+    if beyond is not None:
+        stamps_ns |= beyond[0].stamps_ns
+        with watch.stage("far"):
+            for visible in {METHODS[name].visible for name in moments if METHODS[name].far}:
+                far[visible] = views.far(*beyond, stretch, standing_only=visible)
+    seen = _Seen(
+        *(sequence, stretch, key_image, views, far, stamps_ns, held_out, truth, pictures),
+        *(settings, watch),
+    )
     with ThreadPoolExecutor(num_threads()) as pool:
         made = list(pool.map(lambda name: seen.result(name, *moments[name]), moments))
     if priors and made:
@@ -274,12 +294,15 @@ def _results(
 
 
 class _Seen(NamedTuple):
-    """What all methods of a key have in common."""
+    """What all methods of a key have in common. far: what sweeps beyond the window measured, for
+    methods with and without visibility. stamps_ns: of all sweeps, by frame."""
 
     sequence: LidarSequence
     stretch: Stretch
     key_image: RangeImage
     views: Views
+    far: Mapping[bool, SeenCloud]
+    stamps_ns: Mapping[int, int]
     held_out: HeldOut
     truth: Mapping[str, tuple[Float32, Bool]]
     images: Mapping[str, Image] | None
@@ -291,8 +314,9 @@ class _Seen(NamedTuple):
         views, watch, output, key = self.views, self.watch, self.settings.output, self.views.key
         images, visible = self.images or {}, METHODS[method].visible
         visible = visible and self.settings.project.visibility
+        far = self.far.get(METHODS[method].visible) if METHODS[method].far else None
         with watch.stage("project"):
-            seen = views.see(cloud)
+            seen = views.see(cloud).joined(far)
         with watch.stage("held out"):
             held_out_scores = self.held_out.scores(seen, visible)
         movers = {}
@@ -301,9 +325,9 @@ class _Seen(NamedTuple):
                 movers = views.movers(cloud, visible, images)
         with watch.stage("project"):
             if output.movers != "keep":
-                seen = views.see(cloud.select(~cloud.moving))
+                seen = views.see(cloud.select(~cloud.moving)).joined(far)
             depth = {
-                name: with_ages(maps, self.stretch, key, views.exposures[name].late_s)
+                name: with_ages(maps, self.stamps_ns, key, views.exposures[name].late_s)
                 for name, maps in views.depth(seen, visible).items()
             }
         for name, maps in depth.items():
@@ -355,7 +379,7 @@ def _scores(
             }
             for name, maps in depth.items()
         },
-        "ghosts": scores.ghost_scores(cloud, key_image, key_sweep.frame),
+        "ghosts": scores.ghost_scores(cloud.select(~cloud.far), key_image, key_sweep.frame),
     }
     if truth:
         metrics["depth"] = {

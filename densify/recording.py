@@ -38,6 +38,7 @@ from densify.errors import InputError, SweepError
 from densify.flow.engines import SharedMotion, estimate_motion, motion_type
 from densify.flow.scene import Scene
 from densify.flow.tracking.evidence import REACH_S, Candidates, FreeSpace, find_candidates
+from densify.geometry import poses
 from densify.geometry.ground import ground
 from densify.geometry.height_map import HeightMap
 from densify.geometry.range_image import RangeImage
@@ -46,13 +47,16 @@ from densify.readers.timeline import Timeline, WindowFrames
 from densify.readers.window import recorded_trajectory
 from densify.registration.deskew import deskew
 from densify.registration.trajectory import LeftOut, Registration, find_trajectory
+from densify.road import Road
 from densify.sweeps import Sweeps
 from densify.types import (
     Cloud,
+    Float,
     FlowField,
     LidarSequence,
     Motion,
     RegisteredSweep,
+    Standing,
     Stretch,
     StretchFlow,
     Trajectory,
@@ -104,6 +108,7 @@ class Recording:
         self.ground = lru_cache(maxsize=4)(self._ground)
         self.evidence = lru_cache(maxsize=4)(self._evidence)
         self.block_motion = lru_cache(maxsize=2)(self._block_motion)
+        self._beyond = lru_cache(maxsize=1)(self._find_beyond)
 
     # For a key
 
@@ -174,7 +179,33 @@ class Recording:
             drop_lost = self.settings.accumulate.unfollowed == "drop"
             return accumulate(used, fields, key, drop_lost), flow
 
+    def standing(self, key: int) -> tuple[Standing, Float] | None:
+        """What stands along the road before and behind the key's window, and ``T_key_standing``
+        (4,4); None where nothing beyond it is known, or wanted (``accumulate.far_m``)."""
+        if not self.settings.accumulate.far_m:
+            return None
+        number, (index, _) = self.cut.number_of[key], self._piece(key)
+        found = self._beyond(number, index)
+        if found is None:
+            return None
+        return found, poses.inverse(self.window(key)[key].T_world_lidar)
+
     # For a block, by its number
+
+    def _find_beyond(self, number: int, index: int) -> Standing | None:
+        """What stands beyond a piece of the block, in its world."""
+        frames = self._frames_within(number, 0.0)[index]
+        near = self._stretch(number, 0.0, frames)
+        keys = [k for k, n in self.cut.number_of.items() if n == number and k in frames]
+        road = Road(
+            self.timeline,
+            self.sweeps,
+            list(self.sequence.cameras.values()),
+            self.settings.register,
+            self.settings.accumulate.far_m,
+            self._watch,
+        )
+        return road.beyond(near, keys)
 
     def _registration(self, number: int) -> Registration:
         frames = self.cut.blocks[number].frames

@@ -187,7 +187,7 @@ def test_short_options_are_knobs(
     assert config.flow.engine == "npz:some/flow" and config.project.at == "sweep"
     assert config.output.movers == "separate"
     if verb == "compare":
-        assert ("none", "icp", "paper", "flow") in seen
+        assert ("none", "icp", "icp-far", "paper", "flow") in seen
     seen.clear()
     assert exit_code(*command) == 1
     (config,) = (a for a in seen if isinstance(a, Config))

@@ -32,6 +32,7 @@ def result_with(metrics: dict[str, Any], method: str, num_points: int) -> types.
         confidence=np.ones(n, np.float32),
         intensity=np.ones(n, np.float32),
         rgb=np.zeros((n, 3), np.uint8),
+        far=np.zeros(n, bool),
     )
     return types.Result(method, 7, (6, 7, 8), cloud, {"cam": depth}, metrics)
 

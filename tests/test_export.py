@@ -17,7 +17,7 @@ from densify.depth.age import with_ages
 from densify.errors import InputError
 from densify.outputs import export_run, read_depth_png, write_result
 from densify.outputs.atomic import staged_folder
-from densify.types import Cloud, DepthMap, RegisteredSweep, Result, Stretch, Sweep
+from densify.types import Cloud, DepthMap, Result
 
 H, W = 12, 20
 CAMERAS = ("image_02", "image_03")
@@ -25,22 +25,7 @@ PRODUCTS = ("depth", "depth_filled", "confidence", "age")
 KEY_NS = 1_782_500_000_123_456_789
 LATE_S = 0.01
 AGE_S = {119: 0.11, 120: 0.01, 121: 0.09}
-
-
-def sweep_at(frame, since_key_s):
-    sweep = Sweep(
-        frame=frame,
-        stamp_ns=KEY_NS + round(1e9 * since_key_s),
-        points=np.zeros((0, 3)),
-        intensity=np.zeros(0, np.float32),
-        offset_ns=None,
-        lidar=np.zeros(0, np.uint8),
-        row=np.zeros(0, np.int64),
-    )
-    return RegisteredSweep(sweep, np.eye(4), np.zeros(6), np.zeros(6))
-
-
-STRETCH = Stretch((sweep_at(119, -0.1), sweep_at(120, 0.0), sweep_at(121, 0.1)))
+STAMPS_NS = {119: KEY_NS - 100_000_000, 120: KEY_NS, 121: KEY_NS + 100_000_000}
 
 
 def map_of(camera, seed):
@@ -51,7 +36,7 @@ def map_of(camera, seed):
     frame = np.where(depth > 0, rng.integers(119, 122, (H, W)), -1).astype(np.int32)
     return with_ages(
         DepthMap(camera, depth, filled, rng.random((H, W), dtype=np.float32), frame),
-        STRETCH,
+        STAMPS_NS,
         120,
         LATE_S,
     )
@@ -82,6 +67,7 @@ def written(out, maps):
         confidence=np.ones(1, np.float32),
         intensity=np.ones(1, np.float32),
         rgb=np.zeros((1, 3), np.uint8),
+        far=np.zeros(1, bool),
     )
     write_result(Result("flow", 120, tuple(AGE_S), cloud, maps), {}, out, config={}, data="street")
     return out / "000120"
@@ -330,7 +316,7 @@ def test_a_pixel_is_as_old_as_the_nearest_measured_one(seed, share):
     filled = np.where(rng.random((H, W)) < 0.7, 5, depth).astype(np.float32)
     frame = np.where(depth > 0, rng.integers(119, 122, (H, W)), -1).astype(np.int32)
     bare = DepthMap("cam", depth, filled, filled / 5, frame)
-    aged = with_ages(bare, STRETCH, 120, LATE_S)
+    aged = with_ages(bare, STAMPS_NS, 120, LATE_S)
     assert bare.age_s is None and aged.age_s is not None
     assert aged.age_s.dtype == np.float32
     np.testing.assert_array_equal(np.isnan(aged.age_s), filled == 0)
@@ -340,13 +326,13 @@ def test_a_pixel_is_as_old_as_the_nearest_measured_one(seed, share):
         near = measured[squared == squared.min()]
         allowed = np.array([AGE_S[int(frame[r, c])] for r, c in near])
         assert abs(allowed - aged.age_s[row, column]).min() < 1e-6
-    again = with_ages(bare, STRETCH, 120, LATE_S).age_s
+    again = with_ages(bare, STAMPS_NS, 120, LATE_S).age_s
     np.testing.assert_array_equal(again, aged.age_s)
 
 
 def test_a_map_without_depth_has_no_ages():
     empty = np.zeros((H, W), np.float32)
     aged = with_ages(
-        DepthMap("cam", empty, empty, empty, np.full((H, W), -1, np.int32)), STRETCH, 120, 0
+        DepthMap("cam", empty, empty, empty, np.full((H, W), -1, np.int32)), STAMPS_NS, 120, 0
     )
     assert aged.age_s is not None and np.isnan(aged.age_s).all()

@@ -27,6 +27,7 @@ def seen_from(camera, points, normal, spacing_m, measure, **knobs):
         np.broadcast_to(np.asarray(spacing_m, np.float32), (n, 2)).copy(),
         np.zeros(n, bool),
         np.zeros(n, np.int32),
+        np.full(n, -1, np.int32),
     )
     settings = ProjectSettings(support=1, **knobs)
     cloud = make_cloud(points)
@@ -100,6 +101,7 @@ def test_patches_are_as_large_as_the_lens_shows_them(angle_deg):
         spacing,
         np.zeros(n, bool),
         np.zeros(n, np.int32),
+        np.full(n, -1, np.int32),
     )
     cloud = make_cloud(points @ exposure[:3, :3])
     knobs = ProjectSettings(support=1, footprint=0.5, slack_m=0.0)

@@ -33,6 +33,7 @@ def seen(pixel, depth_m, velocity_m_s=(0, 0, 0)) -> Cloud:
         *(points, points, zeros, np.zeros(n, np.int64), np.arange(n), np.zeros(n, np.uint8)),
         *(zeros > 0, zeros, velocity),
         *(np.ones(n, np.float32), np.ones(n, np.float32), np.zeros((n, 3), np.uint8)),
+        far=np.zeros(n, bool),
     )
 
 

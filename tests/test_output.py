@@ -61,6 +61,7 @@ def cloud_of(num_points, seed=0):
         confidence=rng.random(num_points, dtype=np.float32),
         intensity=rng.random(num_points, dtype=np.float32),
         rgb=rng.integers(0, 256, (num_points, 3), dtype=np.uint8),
+        far=rng.random(num_points) < 0.5,
     )
 
 
@@ -241,7 +242,7 @@ def test_cloud_comes_back(tmp_path, num_points):
     write_cloud(tmp_path / "cloud.laz", cloud)
     back = read_cloud(tmp_path / "cloud.laz")
     np.testing.assert_allclose(back.points, cloud.points, rtol=0, atol=0.0005 + 1e-9)
-    for name in ("frame", "moving", "instance", "confidence", "displaced", "rgb"):
+    for name in ("frame", "moving", "instance", "confidence", "displaced", "rgb", "far"):
         np.testing.assert_array_equal(getattr(back, name), getattr(cloud, name))
         assert getattr(back, name).dtype == getattr(cloud, name).dtype
     np.testing.assert_allclose(back.intensity, cloud.intensity, atol=1 / 65535)
@@ -259,6 +260,7 @@ def test_cloud_file_says_what_the_contract_says(tmp_path):
         "instance": np.int32,
         "confidence": np.float32,
         "displaced": np.float32,
+        "far": np.uint8,
     }
     assert list(las.header.scales) == [0.001] * 3
     np.testing.assert_array_equal(las.intensity, [0, 65535, 65535])

@@ -23,6 +23,7 @@ HEAVY = {
     "torch",
     "embreex",
     "kiss_icp",
+    "small_gicp",
     "cv2",
     "laspy",
     "numba",
@@ -70,7 +71,7 @@ def test_help_of_every_verb_is_light(verb: str) -> None:
 
 
 def test_opening_a_recording_needs_no_torch() -> None:
-    heavy = {"torch", "kiss_icp", "numba"}
+    heavy = {"torch", "kiss_icp", "small_gicp", "numba"}
     assert not heavy & modules_after("import densify; densify.open_sequence")
 
 
@@ -181,6 +182,7 @@ FLOORS = (
     ("readers",),
     ("outputs", "writers"),
     ("blocks", "completion", "sweeps"),
+    ("road",),
     ("recording",),
     ("pipeline",),
     ("bench", "dataset", "doctor"),
@@ -214,6 +216,7 @@ DOORS: dict[str, str | tuple[str, ...]] = {
         "densify/readers/pandaset/pickled_frame.py",
         "densify/writers/pandaset.py",
     ),
+    "small_gicp": "densify/registration/chain.py",
     "torch": ("densify/flow/", "densify/dataset/loader.py"),
 }
 

@@ -21,16 +21,17 @@ from tests.small_street import one_car
 from tests.tiny_street import KEY, MOVERS, POSES_GIVEN, WINDOW, same_points, tiny
 
 USUAL = ("none", "icp", "flow")
+NEAR = {"accumulate": {"far_m": 0.0}}  # test_far looks beyond the window
 
 
 @pytest.fixture(scope="module")
 def moving() -> dict[str, Result]:
-    return compare(tiny(MOVERS), KEY, WINDOW, methods=USUAL)
+    return compare(tiny(MOVERS), KEY, WINDOW, config=NEAR, methods=USUAL)
 
 
 @pytest.fixture(scope="module")
 def static() -> dict[str, Result]:
-    return compare(tiny(), KEY, WINDOW, methods=("none", "icp", "icp-visible", "flow"))
+    return compare(tiny(), KEY, WINDOW, config=NEAR, methods=("none", "icp", "icp-visible", "flow"))
 
 
 # --- what comes out -------------------------------------------------------------------------------
@@ -228,7 +229,9 @@ def test_a_real_drive(test_data):
     icp, flow = results["icp"], results["flow"]
     assert flow.frames == tuple(range(115, 126))
     assert flow.metrics["ghosts"]["all"] <= 0.5 * icp.metrics["ghosts"]["all"]
-    cloud = flow.cloud
+    assert flow.cloud.far.sum() > 100_000 and not icp.cloud.far.any()
+    assert flow.cloud.frame.min() < 110 and flow.cloud.frame.max() > 130
+    cloud = flow.cloud.select(~flow.cloud.far)
     assert cloud.moving.sum() > 1000
     still = ~cloud.moving
     assert cloud.points[still].tobytes() == cloud.rigid_points[still].tobytes()

@@ -49,6 +49,7 @@ def make_cloud(points, frame=KEY, confidence=1.0):
         confidence=np.broadcast_to(np.asarray(confidence, np.float32), n).copy(),
         intensity=np.zeros(n, np.float32),
         rgb=np.zeros((n, 3), np.uint8),
+        far=np.zeros(n, bool),
     )
 
 
@@ -217,6 +218,7 @@ def see(
         spacing_m=np.asarray(spacing_m, np.float32),
         free=np.zeros(len(cloud), bool) if free is None else free,
         sweep=np.unique(cloud.frame, return_inverse=True)[1].ravel().astype(np.int32),
+        place=np.full(len(cloud), -1, np.int32),
     )
     if since_key_ns is not None:
         cloud = replace(cloud, since_key_ns=np.asarray(since_key_ns))

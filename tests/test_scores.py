@@ -59,6 +59,7 @@ def cloud_of(*parts):
         confidence=np.ones(n, np.float32),
         intensity=np.zeros(n, np.float32),
         rgb=np.zeros((n, 3), np.uint8),
+        far=np.zeros(n, bool),
     )
 
 

@@ -105,9 +105,11 @@ def _add_compare(commands: Any) -> None:
         "--methods",
         type=words,
         metavar="NAME,…",
-        help="of none (the key sweep), icp (registration only), icp-visible (with our visibility), "
+        help="of none (the key sweep), icp (registration only), icp-far (the same of all sweeps "
+        "within accumulate.far_m), "
+        "icp-visible (registration with our visibility), "
         "flow-plain (our scene flow without it), paper (the published scene flow), flow (ours); "
-        "default: none,icp,paper,flow",
+        "default: none,icp,icp-far,paper,flow",
     )
     add_output_options(parser)
 

@@ -146,6 +146,13 @@ class AccumulateSettings(Section):
         "registration puts them, as ghosts",
         choices=("rigid", "drop"),
     )
+    far_m: float = knob(
+        40.0,
+        "[m] of travel before the window and after it from which what stands still is taken too; "
+        "more shows more of far surfaces and takes longer; 0: only the window",
+        0,
+        500,
+    )
 
 
 @dataclass(frozen=True)

@@ -58,6 +58,7 @@ def accumulate(stretch: Stretch, fields: Sequence[FlowField], key: int, drop_los
                 "confidence": confidence[kept].astype(np.float32),
                 "intensity": sweep.intensity[kept],
                 "rgb": np.zeros((num_kept, 3), np.uint8),
+                "far": np.zeros(num_kept, bool),
             }
         )
     return Cloud(**{name: np.concatenate([p[name] for p in parts]) for name in parts[0]})

@@ -3,23 +3,24 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
 from scipy.ndimage import distance_transform_edt
 
-from densify.types import DepthMap, Stretch
+from densify.types import DepthMap
 
 
-def with_ages(depth: DepthMap, stretch: Stretch, key: int, late_s: float) -> DepthMap:
+def with_ages(depth: DepthMap, stamps_ns: Mapping[int, int], key: int, late_s: float) -> DepthMap:
     """The map with ``age_s``, seconds between the moment it shows and each pixel's source sweep.
 
-    late_s: from the key's reference time to the moment the map shows. A measured pixel has the age
-    of its sweep, a filled one that of the measured pixel nearest to it in the image, of equally
-    near ones any (always the same).
+    stamps_ns: reference times of the sweeps, by frame. late_s: from the key's reference time to the
+    moment the map shows. A measured pixel has the age of its sweep, a filled one that of the
+    measured pixel nearest to it in the image, of equally near ones any (always the same).
     """
-    shown_ns = stretch[key].sweep.stamp_ns + round(1e9 * late_s)
-    age_s = {s.frame: abs(s.sweep.stamp_ns - shown_ns) * 1e-9 for s in stretch.sweeps}
+    shown_ns = stamps_ns[key] + round(1e9 * late_s)
+    age_s = {frame: abs(stamp_ns - shown_ns) * 1e-9 for frame, stamp_ns in stamps_ns.items()}
     measured = depth.depth_m > 0
     frames, which = np.unique(depth.frame[measured], return_inverse=True)
     ages = np.full(measured.shape, np.nan, np.float32)

@@ -143,6 +143,15 @@ class InView(NamedTuple):
         rows = (np.cumsum(keep) - 1)[self.rows[kept]]
         return InView(self.exposure, rows, self.points_cam[kept], self.uv[kept])
 
+    def joined(self, other: InView, num_points: int) -> InView:
+        """The view of two clouds as one. num_points: of this one's cloud."""
+        return InView(
+            self.exposure,
+            np.concatenate([self.rows, num_points + other.rows]),
+            np.concatenate([self.points_cam, other.points_cam]),
+            np.concatenate([self.uv, other.uv]),
+        )
+
 
 class Sight(NamedTuple):
     """Points as a camera sees them. points_cam: (N,3) metres, camera frame, when they are seen.

@@ -14,7 +14,7 @@ from densify.config import ProjectSettings
 from densify.geometry.range_image import RangeImage
 from densify.geometry.sensor import Sensors
 from densify.kernels import tangents as kernels
-from densify.types import Cloud, Float, Float32, Patches
+from densify.types import Bool, Cloud, Float, Float32, Patches
 
 _MIN_FILLED = 6
 
@@ -40,42 +40,57 @@ def patches(
     """
     frames, inverse = np.unique(cloud.frame, return_inverse=True)
     sweep: NDArray[np.int32] = inverse.ravel().astype(np.int32)
-    normal, spacing_m = _tangents(cloud, sweep, sensors, [origins[int(f)] for f in frames])
+    normal, spacing_m = tangents(
+        cloud.rigid_points, cloud.lidar, sweep, sensors, [origins[int(f)] for f in frames]
+    )
     free = np.zeros(len(cloud), bool)
     other = np.flatnonzero(cloud.frame != key)
     if key_image is not None and len(other):
-        free[other] = key_image.sees_through(
-            cloud.points[other],
-            settings.veto_m,
-            settings.veto_fraction,
-            _MIN_FILLED,
-            cloud.velocity_m_s[other].astype(np.float64),
-        )
-    return Patches(normal, spacing_m, free, sweep)
+        free[other] = vetoed(cloud.points[other], cloud.velocity_m_s[other], key_image, settings)
+    return Patches(normal, spacing_m, free, sweep, np.full(len(cloud), -1, np.int32))
 
 
-def _tangents(
-    cloud: Cloud, sweep: NDArray[np.int32], sensors: Sensors, origins: Sequence[Float]
+def vetoed(
+    points: Float, velocity_m_s: Float32, key_image: RangeImage, settings: ProjectSettings
+) -> Bool:
+    """(N,3) of other sweeps at the key's moment, key frame -> (N,) where the key sweep saw through
+    them."""
+    return key_image.sees_through(
+        points,
+        settings.veto_m,
+        settings.veto_fraction,
+        _MIN_FILLED,
+        velocity_m_s.astype(np.float64),
+    )
+
+
+def tangents(
+    points: Float,
+    lidar: NDArray[np.uint8],
+    sweep: NDArray[np.int32],
+    sensors: Sensors,
+    origins: Sequence[Float],
 ) -> tuple[Float32, Float32]:
     """Normals (M,3) and spacings (M,2), scanner by scanner and sweep by sweep.
 
-    sweep: (M,) which of ``origins``.
+    points: (M,3), rigidly registered. lidar: (M,) which scanner. sweep: (M,) which of ``origins``,
+    (S,3) each.
     """
-    normal = np.zeros((len(cloud), 3), np.float32)
-    spacing_m = np.zeros((len(cloud), 2), np.float32)
-    if not len(cloud):
+    normal = np.zeros((len(points), 3), np.float32)
+    spacing_m = np.zeros((len(points), 2), np.float32)
+    if not len(points):
         return normal, spacing_m
     num_scanners = len(origins[0])
-    place = (sweep * num_scanners + cloud.lidar).astype(np.int32)
-    seen = np.empty((3, len(cloud)), np.float32)
-    kernels.look.over_rows(len(cloud), cloud.rigid_points, np.concatenate(origins), place, seen)
+    place = (sweep * num_scanners + lidar).astype(np.int32)
+    seen = np.empty((3, len(points)), np.float32)
+    kernels.look.over_rows(len(points), points, np.concatenate(origins), place, seen)
     size = np.bincount(place, minlength=num_scanners * len(origins))
     members = np.split(np.argsort(place, kind="stable"), np.cumsum(size)[:-1])
     for number, model in sensors.models.items():
         grid = model.grid
         cells = np.empty((grid.num_rows, grid.num_columns), np.int32)
-        tangents = kernels.tangents_anywhere if model.unordered else kernels.tangents_on_rings
+        find = kernels.tangents_anywhere if model.unordered else kernels.tangents_on_rings
         for mine in members[number::num_scanners]:
             kernels.nearest_in_cells(seen, mine, grid, cells)
-            tangents.over_rows(len(mine), mine, seen, model.table, grid, cells, normal, spacing_m)
+            find.over_rows(len(mine), mine, seen, model.table, grid, cells, normal, spacing_m)
     return normal, spacing_m

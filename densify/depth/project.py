@@ -11,7 +11,7 @@ order of the points.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -37,6 +37,9 @@ _SAME_AGE_NS = 10_000_000
 _BLOCK_PX = 16  # over which rays lie about equally dense
 _MOST_SWEEPS = 63  # that are told apart when they are counted
 _EDGE_WINDOW_PX = 1.5  # beyond the edge, where points must show that a surface goes on
+# Of pixels that sweeps beyond the window give: these vouch that a surface goes on where something
+# nearer begins, so both are stricter.
+_FAR_SUPPORT, _FAR_EDGE = 6, 1.5
 _LEAST_CONFIDENCE = 1 / 255  # 0 means no depth once written as 8 bits
 # What takes how much of a pixel's confidence, at most: few sweeps, few points, an edge close by,
 # a rough fit, being nearly hidden. Set by hand, in the order of what was most often wrong.
@@ -50,7 +53,8 @@ class _InImage:
     """The K points in the image. index: rows of the cloud. uv: (K,2) px. depth: (K,) m, as it is
     stored. focal_px: (K,2) local scale, px per metre at a depth of 1 m. slope: (K,2) of the tangent
     plane's inverse depth, 1/m per px. spacing_px: (K,2) between neighbouring rays. moving: (K,).
-    frame, sweep: (K,) source; sweep counts from 0. age_ns: (K,) see `_ages_ns`."""
+    frame, sweep: (K,) source, see `_witness`. age_ns: (K,) see `_ages_ns`. far: (K,) from a sweep
+    beyond the window."""
 
     index: Int
     uv: Float
@@ -62,6 +66,12 @@ class _InImage:
     frame: np.ndarray
     sweep: np.ndarray
     age_ns: Int
+    far: Bool
+
+    def select(self, keep: Bool) -> _InImage:
+        if keep.all():
+            return self
+        return _InImage(**{f.name: getattr(self, f.name)[keep] for f in fields(self)})
 
     @property
     def inverse(self) -> Float:
@@ -80,6 +90,16 @@ class _Pixels:
     confidence: Float32
     tilt: Float
     inside: Bool
+
+    def select(self, keep: Bool | Int) -> _Pixels:
+        return _Pixels(**{name: column[keep] for name, column in vars(self).items()})
+
+    def replaced(self, others: _Pixels) -> _Pixels:
+        """With other pixels of the same points, which count where both know one."""
+        kept = self.select(~np.isin(self.pixel, others.pixel))
+        more = vars(others)
+        both = _Pixels(**{n: np.concatenate([c, more[n]]) for n, c in vars(kept).items()})
+        return both.select(np.argsort(both.pixel))
 
 
 def project(
@@ -149,7 +169,7 @@ def _measured(seen: _Pixels, points: _InImage, camera: Camera, lab: Float32 | No
     confidence.flat[seen.pixel] = np.maximum(seen.confidence, _LEAST_CONFIDENCE)
     tilt.reshape(-1, 2)[seen.pixel] = seen.tilt
     point.flat[seen.pixel] = points.index[seen.winner]
-    spacing_px = _spacing_px(points, shape)
+    spacing_px = _spacing_px(points if points.far.all() else points.select(~points.far), shape)
     return Layers(depth_m, rim_m, depth_m, confidence, point, tilt, spacing_px, lab)
 
 
@@ -212,7 +232,7 @@ def _in_image(cloud: Cloud, view: InView, patches: Patches, vetoed: bool) -> _In
     local = (_pinhole if plain else _any_lens)(
         exposure, points_cam, depth, normal, patches.spacing_m[index]
     )
-    most = _MAX_TILT / depth[:, None]
+    most, far = _MAX_TILT / depth[:, None], patches.place >= 0
     slope = np.nan_to_num(local.slope, posinf=0.0, neginf=0.0)
     return _InImage(
         index=index,
@@ -223,8 +243,9 @@ def _in_image(cloud: Cloud, view: InView, patches: Patches, vetoed: bool) -> _In
         spacing_px=local.spacing_px,
         moving=cloud.moving[index],
         frame=cloud.frame[index],
-        sweep=np.minimum(patches.sweep[index], _MOST_SWEEPS - 1),
-        age_ns=_ages_ns(cloud.since_key_ns[index], patches.sweep[index]),
+        sweep=_witness(patches, far)[index],
+        age_ns=_ages_ns(cloud.since_key_ns[index], patches.sweep[index], far[index]),
+        far=far[index],
     )
 
 
@@ -279,15 +300,27 @@ def _pseudo_inverse(J: Float) -> Float:
     return across / (uu * vv - uv**2)[:, :, None]
 
 
-def _ages_ns(since_key_ns: Int, sweep: NDArray[np.int32]) -> Int:
-    """(K,) times between the key and the points' sweeps. Sweeps less than 10 ms apart count as
-    equally old: clocks that jitter do not decide between the sweeps before and after the key."""
-    of_sweep = np.zeros(int(sweep.max(initial=-1)) + 1, np.int64)
-    of_sweep[sweep] = np.abs(since_key_ns)
+def _witness(patches: Patches, far: Bool) -> NDArray[np.int32]:
+    """(M,) which of 63 a point's sweep is when those that agree are counted: a number for each
+    sweep of the window, and for each stretch of road beyond it; distant stretches may share one."""
+    num_near = min(int(patches.sweep[~far].max(initial=-1)) + 1, _MOST_SWEEPS - 1)
+    shared = num_near + patches.place % (_MOST_SWEEPS - num_near)
+    return np.where(far, shared, np.minimum(patches.sweep, _MOST_SWEEPS - 1)).astype(np.int32)
+
+
+def _ages_ns(since_key_ns: Int, sweep: NDArray[np.int32], far: Bool) -> Int:
+    """(K,) times between the key and the points' sweeps. Sweeps of the window less than 10 ms
+    apart count as equally old: clocks that jitter do not decide between the sweeps before and after
+    the key."""
+    near = ~far
+    of_sweep = np.zeros(int(sweep[near].max(initial=-1)) + 1, np.int64)
+    of_sweep[sweep[near]] = np.abs(since_key_ns[near])
     for younger, older in pairwise(np.argsort(of_sweep, kind="stable")):
         if of_sweep[older] - of_sweep[younger] < _SAME_AGE_NS:
             of_sweep[older] = of_sweep[younger]
-    return of_sweep[sweep]
+    ages_ns = np.abs(since_key_ns)
+    ages_ns[near] = of_sweep[sweep[near]]
+    return ages_ns
 
 
 def _visible(
@@ -297,14 +330,45 @@ def _visible(
     settings: ProjectSettings,
     reason: np.ndarray,
 ) -> _Pixels:
-    """The pixels that the points not hidden measure; fills in the ``reason`` of the others."""
+    """The pixels that the points not hidden measure; fills in the ``reason`` of the others.
+
+    What sweeps beyond the window measured comes second. It gives pixels where the window has none
+    away from depth edges, and vouches there for what the window saw too rarely.
+    """
+    near = ~points.far
+    pixels, why = _settled(points.select(near), own[near], camera, settings)
+    pixels = replace(pixels, winner=np.flatnonzero(near)[pixels.winner])
+    reason[points.index[near]] = why
+    if near.all():
+        return pixels
+    taken = pixels.pixel[pixels.inside]
+    others, why = _settled(points, own, camera, settings, taken)
+    reason[points.index[~near]] = why[~near]
+    return pixels.replaced(others.select(others.inside))
+
+
+def _settled(
+    points: _InImage,
+    own: Float32,
+    camera: Camera,
+    settings: ProjectSettings,
+    taken: Int | None = None,
+) -> tuple[_Pixels, NDArray[np.uint8]]:
+    """The pixels that points measure, and of every point the `Reason`.
+
+    taken: where given, pixels to leave alone; for the others the stricter rules hold of what sweeps
+    beyond the window measured.
+    """
     behind = _behind(points, camera, settings)
     edge_px = settings.edge_slack_m * points.focal_px[:, 0] * points.inverse
     hidden = behind > 1
-    reason[points.index] = np.where(hidden, Reason.HIDDEN, Reason.NOT_CHOSEN)
+    reason = np.where(hidden, Reason.HIDDEN, Reason.NOT_CHOSEN).astype(np.uint8)
     last = int(points.age_ns.max(initial=0)) + 1
     start, order = _by_pixel(points, np.where(hidden, last, points.age_ns), own, camera)
     found = np.zeros((6, len(start) - 1), np.float32)
+    done = np.zeros(len(start) - 1, bool)
+    if taken is not None:
+        done[taken] = True
     visible = kernels.Visible(
         start=start,
         order=order,
@@ -319,18 +383,23 @@ def _visible(
         age_ns=points.age_ns,
     )
     shape = (camera.height_px, camera.width_px)
-    kernels.settle.over_rows(len(start) - 1, visible, _reaches(settings), shape, found)
+    kernels.settle.over_rows(len(done), visible, _reaches(settings), shape, done, found)
     pixel = np.flatnonzero(found[0])
     winner = order[start[pixel]]
     depth_m, num_sweeps, youngest_ns, num_points, residual_m, edge = found[:, pixel]
-    most_sweeps = int(points.sweep.max(initial=0)) + 1
-    needed = min(settings.support, max(1, most_sweeps // 2))
-    nearest_ns = np.float32(points.age_ns.min(initial=last))
-    supported = (num_sweeps >= needed) & (youngest_ns <= nearest_ns)
-    reason[points.index[winner[~supported]]] = Reason.UNSUPPORTED
+    if taken is None:
+        many = int(points.sweep.max(initial=0)) + 1
+        nearest_ns = np.float32(points.age_ns.min(initial=last))
+        supported = num_sweeps >= min(settings.support, max(1, many // 2))
+        supported &= youngest_ns <= nearest_ns
+        inside = edge >= 1
+    else:
+        many, supported, inside = 2 * _FAR_SUPPORT, num_sweeps >= _FAR_SUPPORT, edge >= _FAR_EDGE
+        reason[winner[~inside]] = Reason.EDGE
+    reason[winner[~supported]] = Reason.UNSUPPORTED
     doubts = np.stack(
         [
-            1 - num_sweeps / most_sweeps,
+            1 - np.minimum(num_sweeps / many, 1),
             1 - np.minimum(num_points / _MANY_POINTS, 1),
             np.clip(3 - edge, 0, 2) / 2,
             np.minimum(residual_m / _ROUGH_M, 1),
@@ -339,9 +408,9 @@ def _visible(
     )
     confidence = np.maximum(own[winner] * (1 - _DOUBTS @ doubts), MOST_CONFIDENCE)
     every = _Pixels(
-        pixel, winner, depth_m, confidence.astype(np.float32), points.slope[winner], edge >= 1
+        pixel, winner, depth_m, confidence.astype(np.float32), points.slope[winner], inside
     )
-    return _Pixels(**{name: column[supported] for name, column in vars(every).items()})
+    return every.select(supported), reason
 
 
 def _reaches(settings: ProjectSettings) -> kernels.Reaches:

@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 from densify.config import Config, ProjectSettings
 from densify.depth.colour import colour
 from densify.depth.exposure import Exposure, InView, Shot
+from densify.depth.far import far_cloud
 from densify.depth.optical_flow import optical_flow
-from densify.depth.patches import patches
+from densify.depth.patches import patches, vetoed
 from densify.depth.picture import lab
 from densify.depth.project import project
 from densify.geometry import poses
@@ -32,6 +33,7 @@ from densify.types import (
     Mover,
     Patches,
     Reason,
+    Standing,
     Stretch,
     Truth,
 )
@@ -48,6 +50,13 @@ class SeenCloud(NamedTuple):
         """Some of the points, each seen as before."""
         views = {name: view.select(keep) for name, view in self.views.items()}
         return SeenCloud(self.cloud.select(keep), self.patches.select(keep), views)
+
+    def joined(self, far: SeenCloud | None) -> SeenCloud:
+        """With what sweeps beyond the window measured."""
+        if far is None or not len(far.cloud):
+            return self
+        views = {n: view.joined(far.views[n], len(self.cloud)) for n, view in self.views.items()}
+        return SeenCloud(self.cloud.joined(far.cloud), self.patches.joined(far.patches), views)
 
 
 @dataclass(frozen=True)
@@ -94,6 +103,18 @@ class Views:
             cloud, self.key, self.settings, self.sensors, self.origins, self.key_image
         )
         return SeenCloud(cloud, surface, {n: e.sees(cloud) for n, e in self.exposures.items()})
+
+    def far(
+        self, found: Standing, T_key_found: Float, stretch: Stretch, standing_only: bool
+    ) -> SeenCloud:
+        """What sweeps beyond the window measured, see `densify.depth.far.far_cloud`."""
+        cloud, surface, views = far_cloud(
+            found, T_key_found, stretch, self.key, self.exposures, standing_only
+        )
+        if self.key_image is not None:
+            free = vetoed(cloud.points, cloud.velocity_m_s, self.key_image, self.settings)
+            surface = replace(surface, free=free)
+        return SeenCloud(cloud, surface, views)
 
     def depth(
         self, seen: SeenCloud, visible: bool = True, filled: bool = True

@@ -198,10 +198,11 @@ class Reaches(NamedTuple):
 
 
 @Kernel
-def settle(first, last, points, reaches, shape, found):  # type: ignore[no-untyped-def]
+def settle(first, last, points, reaches, shape, taken, found):  # type: ignore[no-untyped-def]
     """Each pixel's depth from the points around that agree with its first point.
 
-    points: `Visible`. reaches: `Reaches`. shape: (height, width). found: (6,P) float32, filled
+    points: `Visible`. reaches: `Reaches`. shape: (height, width). taken: (P,) bool, pixels to leave
+    alone. found: (6,P) float32, filled
     where a point is not hidden with depth, number of sweeps that agree, age of the youngest of
     them, points in the fit, their root mean square residual (m), and how far the surface goes on to
     all sides, as a share of the edges' reach.
@@ -212,7 +213,7 @@ def settle(first, last, points, reaches, shape, found):  # type: ignore[no-untyp
     height, width = shape
     m, reach = np.zeros(9), np.zeros(8)
     for p in range(first, last):
-        if start[p] == start[p + 1] or hidden[order[start[p]]]:
+        if taken[p] or start[p] == start[p + 1] or hidden[order[start[p]]]:
             continue
         i = order[start[p]]
         v0, u0 = p // width, p % width

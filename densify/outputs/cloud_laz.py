@@ -24,6 +24,7 @@ _EXTRA_DIMENSIONS = (
     ("instance", "int32", "moving object, -1 none"),
     ("confidence", "float32", "0 to 1"),
     ("displaced", "float32", "m beyond rigid alignment"),
+    ("far", "uint8", "1 from beyond the window"),
 )
 
 
@@ -31,8 +32,8 @@ _EXTRA_DIMENSIONS = (
 class StoredCloud:
     """A cloud as it was written: M points, key frame, metres, rounded to the millimetre.
 
-    frame, instance: (M,) int32. moving: (M,) bool. confidence, displaced, intensity: (M,) float32.
-    rgb: (M,3) uint8.
+    frame, instance: (M,) int32. moving, far: (M,) bool. confidence, displaced, intensity: (M,)
+    float32. rgb: (M,3) uint8.
     """
 
     points: Float
@@ -43,6 +44,7 @@ class StoredCloud:
     displaced: Float32
     intensity: Float32
     rgb: NDArray[np.uint8]
+    far: Bool
 
 
 def write_output(result: Result, context: Context, folder: Path) -> None:
@@ -51,7 +53,8 @@ def write_output(result: Result, context: Context, folder: Path) -> None:
 
 
 def write_cloud(path: Path, cloud: Cloud) -> None:
-    """Write a cloud with the extra dimensions frame, moving, instance, confidence and displaced.
+    """Write a cloud with the extra dimensions frame, moving, instance, confidence, displaced and
+    far.
 
     Coordinates are rounded to 1 mm, intensity and colour widened to the format's 16 bits. The same
     cloud gives the same bytes: the header's date is always 1 January 2000. Raises ValueError for
@@ -91,7 +94,8 @@ def read_cloud(path: Path) -> StoredCloud:
         las = laspy.read(path)
     except (OSError, laspy.errors.LaspyException) as error:
         raise InputError(f"{path}: not a readable LAZ file: {error}") from error
-    missing = {name for name, _, _ in _EXTRA_DIMENSIONS} - set(las.point_format.dimension_names)
+    names = set(las.point_format.dimension_names)
+    missing = {name for name, _, _ in _EXTRA_DIMENSIONS} - names - {"far"}
     if missing:
         raise InputError(
             f"{path}: no dimension {', '.join(sorted(missing))}; expected a cloud densify wrote"
@@ -106,4 +110,5 @@ def read_cloud(path: Path) -> StoredCloud:
         displaced=np.array(las["displaced"], np.float32),
         intensity=np.array(las.intensity, np.float32) / np.float32(65535),
         rgb=(rgb // 257).astype(np.uint8),
+        far=np.array(las["far"], bool) if "far" in names else np.zeros(len(rgb), bool),
     )

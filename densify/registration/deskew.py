@@ -23,24 +23,21 @@ def deskew(sweeps: Sequence[Sweep], trajectory: Trajectory) -> Stretch:
     registered = []
     for sweep in sweeps:
         i = trajectory.frames.index(sweep.frame)
-        before, after = _twists(trajectory, i)
-        points: Float = sweep.points
-        if sweep.offset_ns is not None:
-            offset_s = sweep.offset_ns[:, None] * 1e-9
-            twist = offset_s * np.where(offset_s < 0, before, after)
-            points = poses.transform_each(twist.astype(np.float64), points)
-        registered.append(
-            RegisteredSweep(
-                sweep=replace(sweep, points=points),
-                T_world_lidar=trajectory.T_world_lidar[i],
-                twist_before=before,
-                twist_after=after,
-            )
-        )
+        registered.append(placed(sweep, trajectory.T_world_lidar[i], *twists(trajectory, i)))
     return Stretch(tuple(registered))
 
 
-def _twists(trajectory: Trajectory, i: int) -> tuple[Float, Float]:
+def placed(sweep: Sweep, T_world_lidar: Float, before: Float, after: Float) -> RegisteredSweep:
+    """The raw sweep deskewed, by the (6,) twists per second before and after its reference time."""
+    points: Float = sweep.points
+    if sweep.offset_ns is not None:
+        offset_s = sweep.offset_ns[:, None] * 1e-9
+        twist = offset_s * np.where(offset_s < 0, before, after)
+        points = poses.transform_each(twist.astype(np.float64), points)
+    return RegisteredSweep(replace(sweep, points=points), T_world_lidar, before, after)
+
+
+def twists(trajectory: Trajectory, i: int) -> tuple[Float, Float]:
     """(6,) per second before and after sweep i; at an end both are the one that exists."""
 
     def toward(j: int) -> Float | None:

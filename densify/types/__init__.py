@@ -7,7 +7,7 @@ sweep's lidar), ``cam``.
 """
 
 from densify.arrays import Bool, Float, Float32, Int
-from densify.types.depth import Camera, Cloud, DepthMap, Mover, Patches, Reason
+from densify.types.depth import Camera, Cloud, DepthMap, Mover, Patches, Reason, Standing
 from densify.types.flow import FlowField, Motion, StretchFlow
 from densify.types.prior import FullDepth, Prior, PriorFit
 from densify.types.recordings import (
@@ -47,6 +47,7 @@ __all__ = [
     "Result",
     "SaysWhatItFound",
     "StageCost",
+    "Standing",
     "Stretch",
     "StretchFlow",
     "Sweep",

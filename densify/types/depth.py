@@ -24,7 +24,8 @@ class Cloud:
     scanners measured the point.
     moving: (M,) bool. instance: (M,) int32, -1 none. velocity_m_s: (M,3) float32 at the key's
     moment, ego-motion removed, 0 where nothing moves. confidence: (M,) float32, 0 to 1.
-    intensity: (M,) float32. rgb: (M,3) uint8, black where no camera saw the point.
+    intensity: (M,) float32. rgb: (M,3) uint8, black where no camera saw the point. far: (M,) bool,
+    from a sweep beyond the window (``accumulate.far_m``).
     """
 
     points: Float
@@ -39,6 +40,7 @@ class Cloud:
     confidence: Float32
     intensity: Float32
     rgb: NDArray[np.uint8]
+    far: Bool
 
     @property
     def displaced(self) -> Float32:
@@ -48,6 +50,11 @@ class Cloud:
     def after(self, seconds: float) -> Cloud:
         """Shortly after (or before) the key's moment: what moves goes on at its velocity."""
         return replace(self, points=self.points + seconds * self.velocity_m_s)
+
+    def joined(self, other: Cloud) -> Cloud:
+        """With another's points behind these."""
+        names = [f.name for f in fields(self)]
+        return Cloud(**{n: np.concatenate([getattr(self, n), getattr(other, n)]) for n in names})
 
     def select(self, keep: Bool) -> Cloud:
         """The points where ``keep`` (M,) is True."""
@@ -63,21 +70,77 @@ class Patches:
 
     normal: (M,3) float32 key frame, of any length, of the tangent plane. spacing_m: (M,2) float32
     to the neighbouring rays of the same sweep, across and along elevation. free: (M,) bool, the key
-    sweep saw through the place. sweep: (M,) int32, which of the cloud's sweeps, counted by frame.
+    sweep saw through the place. sweep: (M,) int32, which of the cloud's sweeps, counted by
+    frame, those beyond the window last. place: (M,) int32, number of the stretch of road from which
+    a sweep beyond the window measured the point; -1 of those within.
     """
 
     normal: Float32
     spacing_m: Float32
     free: Bool
     sweep: NDArray[np.int32]
+    place: NDArray[np.int32]
+
+    def joined(self, other: Patches) -> Patches:
+        """With those of another cloud behind these; no sweep is in both."""
+        num_sweeps = np.int32(self.sweep.max(initial=-1) + 1)
+        return Patches(
+            np.concatenate([self.normal, other.normal]),
+            np.concatenate([self.spacing_m, other.spacing_m]),
+            np.concatenate([self.free, other.free]),
+            np.concatenate([self.sweep, num_sweeps + other.sweep]),
+            np.concatenate([self.place, other.place]),
+        )
 
     def select(self, keep: Bool) -> Patches:
         """The patches of ``cloud.select(keep)``."""
         sweep = self.sweep[keep]
         number = np.cumsum(np.bincount(sweep) > 0) - 1
         return Patches(
-            self.normal[keep], self.spacing_m[keep], self.free[keep], number[sweep].astype(np.int32)
+            self.normal[keep],
+            self.spacing_m[keep],
+            self.free[keep],
+            number[sweep].astype(np.int32),
+            self.place[keep],
         )
+
+
+@dataclass(frozen=True)
+class Standing:
+    """K points of the standing world, measured along a stretch of road.
+
+    points: (K,3) float32 metres. normal: (K,3) float32 of any length, of the tangent plane.
+    spacing_m: (K,2) float32 to the neighbouring rays of the same sweep. source: (K,) int32, which
+    of the sweeps ``frames`` measured it. row, lidar, intensity: as in `Cloud`. frames: n sweeps.
+    stamp_ns: (n,) int64. travel_m: (n,) float64, where along the road they were: 0 at the key's
+    window, negative behind it.
+    """
+
+    points: Float32
+    normal: Float32
+    spacing_m: Float32
+    source: NDArray[np.int32]
+    row: Int
+    lidar: NDArray[np.uint8]
+    intensity: Float32
+    frames: tuple[int, ...]
+    stamp_ns: Int
+    travel_m: Float
+
+    @property
+    def stamps_ns(self) -> dict[int, int]:
+        """Reference times by frame."""
+        return dict(zip(self.frames, self.stamp_ns.tolist(), strict=True))
+
+    def select(self, keep: Bool | Int) -> Standing:
+        """Some of the points."""
+        return replace(self, **{name: getattr(self, name)[keep] for name in _COLUMNS_OF_STANDING})
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+
+_COLUMNS_OF_STANDING = ("points", "normal", "spacing_m", "source", "row", "lidar", "intensity")
 
 
 class Reason(IntEnum):

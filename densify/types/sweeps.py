@@ -65,8 +65,8 @@ class Sweep:
     def __len__(self) -> int:
         return len(self.points)
 
-    def select(self, keep: Bool) -> Sweep:
-        """The returns where ``keep`` (N,) is True."""
+    def select(self, keep: Bool | slice) -> Sweep:
+        """The returns where ``keep`` (N,) is True, or of a slice."""
         return replace(
             self,
             points=self.points[keep],

@@ -1,0 +1,180 @@
+# SPDX-License-Identifier: MIT
+"""What stands still, as sweeps beyond a key's window measured it: before and after it is thinned
+and brought to the key."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from densify.depth.exposure import Exposure, InView
+from densify.depth.patches import tangents
+from densify.geometry import poses
+from densify.geometry.range_image import RangeImage
+from densify.geometry.sensor import Sensors
+from densify.kernels import clouds as kernels
+from densify.types import (
+    Bool,
+    Camera,
+    Cloud,
+    Float,
+    Float32,
+    Patches,
+    RegisteredSweep,
+    Standing,
+    Stretch,
+    Sweep,
+)
+
+_MOST_RANGE_M = 60.0
+_MOST_SPACING_M = 0.05  # surfaces are met by many sweeps' rays; larger patches hide edges
+_GROUP_M = 2.5  # of travel: what is nearer sees the same, and errs alike
+_CONFIDENCE = 0.5
+_SLACK_M = 0.5
+_SAME_DEPTH, _MOST_IN_PIXEL = 0.05, 1
+_MIN_FILLED = 6
+_FREE_M, _FREE_FRACTION = 0.3, 0.015
+
+
+def in_reach(sweep: Sweep) -> Bool:
+    """(N,) the returns that are not too far away to be placed well."""
+    x, y, z = sweep.points.T
+    return x * x + y * y + z * z < _MOST_RANGE_M**2
+
+
+def standing(registered: RegisteredSweep, sensors: Sensors, travel_m: float) -> Standing:
+    """The points of one sweep, in the world. sensors: of the recording."""
+    sweep, T_world_lidar = registered.sweep, registered.T_world_lidar
+    one = np.zeros(len(sweep), np.int32)
+    normal, spacing_m = tangents(sweep.points, sweep.lidar, one, sensors, [sensors.origins_m])
+    return Standing(
+        points=poses.transform(T_world_lidar, sweep.points).astype(np.float32),
+        normal=poses.rotate(T_world_lidar, normal.astype(np.float64)).astype(np.float32),
+        spacing_m=np.minimum(spacing_m, np.float32(_MOST_SPACING_M)),
+        source=one,
+        row=sweep.row,
+        lidar=sweep.lidar,
+        intensity=sweep.intensity,
+        frames=(sweep.frame,),
+        stamp_ns=np.array([sweep.stamp_ns], np.int64),
+        travel_m=np.array([travel_m]),
+    )
+
+
+def together(parts: Sequence[Standing]) -> Standing:
+    """Parts of one world as one, by ascending frame."""
+    parts = sorted(parts, key=lambda part: part.frames)
+    counts = np.cumsum([0, *(len(part.frames) for part in parts)])
+    return Standing(
+        points=np.concatenate([p.points for p in parts]),
+        normal=np.concatenate([p.normal for p in parts]),
+        spacing_m=np.concatenate([p.spacing_m for p in parts]),
+        source=np.concatenate(
+            [p.source + np.int32(first) for p, first in zip(parts, counts, strict=False)]
+        ),
+        row=np.concatenate([p.row for p in parts]),
+        lidar=np.concatenate([p.lidar for p in parts]),
+        intensity=np.concatenate([p.intensity for p in parts]),
+        frames=tuple(f for p in parts for f in p.frames),
+        stamp_ns=np.concatenate([p.stamp_ns for p in parts]),
+        travel_m=np.concatenate([p.travel_m for p in parts]),
+    )
+
+
+def may_see(camera: Camera, T_cam_world: Float, points: Float32, slack_m: float) -> Bool:
+    """(N,3) world -> (N,) False where a camera certainly does not see a point, were it up to
+    ``slack_m`` elsewhere. All of a lens that is no pinhole."""
+    if camera.model != "pinhole":
+        return np.ones(len(points), bool)
+    T, K = T_cam_world.astype(np.float32), camera.K.astype(np.float32)
+    x, y, z = T[:3, :3] @ points.T + T[:3, 3:]
+    slack_m, bent = np.float32(slack_m), np.float32(1.2 if camera.distortion else 1.0)
+    right, left = bent * (camera.width_px - K[0, 2]) / K[0, 0], -bent * K[0, 2] / K[0, 0]
+    low, high = bent * (camera.height_px - K[1, 2]) / K[1, 1], -bent * K[1, 2] / K[1, 1]
+    inside: Bool = (x < right * z + slack_m) & (x > left * z - slack_m) & (z > -slack_m)
+    inside &= (y < low * z + slack_m) & (y > high * z - slack_m)
+    return inside
+
+
+def far_cloud(
+    found: Standing,
+    T_key_found: Float,
+    stretch: Stretch,
+    key: int,
+    exposures: Mapping[str, Exposure],
+    standing_only: bool,
+) -> tuple[Cloud, Patches, dict[str, InView]]:
+    """What sweeps beyond the window measured that a camera sees: in the key frame, with patches as
+    `densify.depth.patches` makes them of the others.
+
+    T_key_found: (4,4) to the key from the world of ``found``. stretch: the window.
+    standing_only: without what is not there at the time of the window, for its first or its last
+    sweep saw through the place. Of the points in a pixel a few of every depth are enough.
+    """
+    inside = np.zeros(len(found), bool)
+    for exposure in exposures.values():
+        T_cam_found = exposure.T_cam_key @ T_key_found
+        inside |= may_see(exposure.camera, T_cam_found, found.points, _SLACK_M)
+    found = found.select(inside & ~np.isin(found.frames, stretch.frames)[found.source])
+    points = poses.transform(T_key_found, found.points.astype(np.float64))
+    rows = np.flatnonzero(_thinned_in_image(points, found.source, exposures))
+    if standing_only:
+        ends = sorted({stretch.frames[0], stretch.frames[-1]} - {key})
+        rows = rows[~_gone(points[rows], stretch, key, ends)]
+    found, points = found.select(rows), points[rows]
+    num, source = len(found), found.source
+    cloud = Cloud(
+        points=points,
+        rigid_points=points,
+        frame=np.array(found.frames, np.int32)[source],
+        since_key_ns=(found.stamp_ns - stretch[key].sweep.stamp_ns)[source],
+        row=found.row,
+        lidar=found.lidar,
+        moving=np.zeros(num, bool),
+        instance=np.full(num, -1, np.int32),
+        velocity_m_s=np.zeros((num, 3), np.float32),
+        confidence=np.full(num, _CONFIDENCE, np.float32),
+        intensity=found.intensity,
+        rgb=np.zeros((num, 3), np.uint8),
+        far=np.ones(num, bool),
+    )
+    group = np.floor(found.travel_m / _GROUP_M).astype(np.int32)
+    surface = Patches(
+        normal=poses.rotate(T_key_found, found.normal.astype(np.float64)).astype(np.float32),
+        spacing_m=found.spacing_m,
+        free=np.zeros(num, bool),
+        sweep=source,
+        place=(group - group.min(initial=0))[source],
+    )
+    return cloud, surface, {name: e.sees(cloud) for name, e in exposures.items()}
+
+
+def _thinned_in_image(
+    points: Float, source: NDArray[np.int32], exposures: Mapping[str, Exposure]
+) -> Bool:
+    """(M,) whether one of the cameras needs the point: in every pixel and share of the depth the
+    first few, in an order that mixes the sweeps."""
+    keep = np.zeros(len(points), bool)
+    # Neighbouring pixels are to be from many sweeps: these have to agree.
+    order = np.argsort((source * 7919 + np.arange(len(points))) % 65521, kind="stable")
+    for exposure in exposures.values():
+        sight = exposure.see(points, np.zeros((len(points), 3), np.float32))
+        shown = order[sight.inside[order]]
+        depth = np.log(np.maximum(exposure.depth_m(sight.points_cam), 0.1)) / _SAME_DEPTH
+        cell = np.column_stack([sight.uv + 0.5, depth])
+        cell[~sight.inside] = 0.0
+        keep[kernels.thinned(cell, shown, 1.0, _MOST_IN_PIXEL)] = True
+    return keep
+
+
+def _gone(points: Float, stretch: Stretch, key: int, witnesses: Sequence[int]) -> Bool:
+    """(M,) where one of these sweeps of the window saw through a place: what stood there has left,
+    or has not come yet. points: (M,3) key frame."""
+    free = np.zeros(len(points), bool)
+    for frame in witnesses:
+        there = poses.transform(stretch.T_target_source(frame, key), points)
+        image = RangeImage.of(stretch[frame])
+        free |= image.sees_through(there, _FREE_M, _FREE_FRACTION, _MIN_FILLED)
+    return free
