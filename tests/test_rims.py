@@ -181,11 +181,12 @@ def vote_twin(pixel, inverse, known, seeds, colours, gap_px, rules):
                     near = abs(1 / here - 1 / inverse)
                     votes_for += weight * (near <= rules.same_m + rules.same_fraction / inverse)
                     break
-        least = min(least, votes_for / votes)
+        least = min(least, votes_for / votes if votes else 0.0)
     return least
 
 
-def test_votes_equal_those_of_a_slow_twin():
+@pytest.mark.parametrize("doubt", [0.0, RULES.doubt])
+def test_votes_equal_those_of_a_slow_twin(doubt):
     rng = np.random.default_rng(3)
     shape = (24, 30)
     known = rng.uniform(size=shape) < 0.2
@@ -197,10 +198,10 @@ def test_votes_equal_those_of_a_slow_twin():
     gap_px = rng.uniform(1, 3, shape).astype(np.float32)
     pixel = np.concatenate([np.flatnonzero(known), np.flatnonzero(~known)[::5]])
     here = np.where(known.flat[pixel], inverse.flat[pixel], np.float32(0.05)).astype(np.float32)
-    share = np.zeros(len(pixel), np.float32)
-    voting.vote(0, len(pixel), pixel, here, seeds, colours, gap_px, RULES, share)
+    share, rules = np.zeros(len(pixel), np.float32), RULES._replace(doubt=doubt)
+    voting.vote(0, len(pixel), pixel, here, seeds, colours, gap_px, rules, share)
     twin = [
-        vote_twin(p, w, known, seeds, colours, gap_px, RULES)
+        vote_twin(p, w, known, seeds, colours, gap_px, rules)
         for p, w in zip(pixel, here, strict=True)
     ]
     np.testing.assert_allclose(share, twin, rtol=1e-4)

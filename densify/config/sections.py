@@ -245,20 +245,20 @@ class ProjectSettings(Section):
         choices=("image", "strict", "keep"),
     )
     fill_reach: float = knob(
-        1.0,
-        "how far the two-sided fill looks for measured pixels, in spacings of neighbouring rays; "
-        "below 1 nothing is filled between the lines of a single sweep",
+        1.5,
+        "how far the two-sided fill looks for measured pixels, in spacings of neighbouring rays "
+        "there; below 1 nothing is filled between the lines of a single sweep",
         0.1,
         5,
     )
     edge_m: float = knob(
-        0.1,
+        0.2,
         "[m] no pixel is filled where depths around it deviate more from a plane; larger fills "
         "hedges and ragged edges, often wrongly",
         0,
         10,
     )
-    edge_fraction: float = knob(0.01, "the same as a share of the depth; the larger counts", 0, 1)
+    edge_fraction: float = knob(0.05, "the same as a share of the depth; the larger counts", 0, 1)
     glass: str = knob(
         "plane",
         "windows of vehicles. plane: what is measured behind them is taken out, and the filled map "

@@ -12,35 +12,50 @@ import numpy as np
 
 from densify.config import ProjectSettings
 from densify.depth.layers import Layers
-from densify.kernels import filling
-from densify.types import Float32
+from densify.depth.rims import RULES
+from densify.kernels import filling, voting
+from densify.kernels.marching import DIRECTIONS, first_known
+from densify.types import Float32, Int
+
+_GROWTH = (1 / 3, 2 / 3, 1.0)  # spacings
+_LEAST_SHARE = 0.9  # of the votes for a pixel that is kept
+_RULES = RULES._replace(doubt=0.0, aside=0.0)
 
 
 def fill(layers: Layers, settings: ProjectSettings) -> Layers:
-    """Interpolate as `fill_between`, as far as rays lie apart in the middle of the image."""
+    """Interpolate as `fill_between`, and keep what is `voted` for."""
     filled_m, confidence = fill_between(
         layers.depth_m,
         np.where(layers.depth_m > 0, layers.confidence, np.float32(0)),
-        _reach_px(layers, settings),
+        layers.spacing_px,
+        settings.fill_reach,
         settings.edge_m,
         settings.edge_fraction,
         settings.fill_confidence,
     )
+    return voted(replace(layers, filled_m=filled_m, confidence=confidence), layers.depth_m)
+
+
+def voted(layers: Layers, before_m: Float32) -> Layers:
+    """Without what has been filled since ``before_m`` (H,W) against the votes of the measured
+    pixels around.
+
+    They vote as for rims (`densify.depth.rims`), nine of ten must be in favour; what is filled has
+    no vote, it would vote for itself. Without an image that fits they tell by distance alone.
+    """
+    pixel = np.flatnonzero((layers.filled_m > 0) & (before_m == 0))
+    dropped = pixel[shares(layers, layers.filled_m, pixel) < _LEAST_SHARE]
+    filled_m, confidence = layers.filled_m.copy(), layers.confidence.copy()
+    filled_m.flat[dropped] = 0
+    confidence.flat[dropped] = 0
     return replace(layers, filled_m=filled_m, confidence=confidence)
-
-
-def _reach_px(layers: Layers, settings: ProjectSettings) -> tuple[int, int]:
-    known = layers.depth_m > 0
-    if not known.any():
-        return 1, 1
-    reach = np.ceil(settings.fill_reach * np.median(layers.spacing_px[known], axis=0))
-    return max(1, int(reach[0])), max(1, int(reach[1]))
 
 
 def fill_between(
     depth_m: Float32,
     confidence: Float32,
-    reach_px: tuple[int, int],
+    spacing_px: Float32,
+    reach: float,
     edge_m: float,
     edge_fraction: float,
     factor: float,
@@ -53,20 +68,44 @@ def fill_between(
     nearest), between the farthest and the nearest deviation; of fewer than six their depths
     themselves. It gets the plane's depth (weighted least squares in inverse depth, the weight
     falling to zero just outside the window), held between the least and the greatest depth measured
-    in the window: nothing is extrapolated, in the image or in depth. The window grows in thirds to
-    the half size ``reach_px`` (horizontal, vertical) and the smallest that serves is taken.
+    in the window: nothing is extrapolated, in the image or in depth. The window grows to the half
+    size ``reach`` in thirds of the spacing of rays there, and the smallest that serves is taken.
 
-    depth_m, confidence: (H,W), 0 none. Returns both with the filled pixels added; a filled pixel's
-    confidence is the least of the measured ones in its window, times ``factor`` in the largest
-    window, less lowered in smaller ones.
+    depth_m, confidence: (H,W), 0 none. spacing_px: (H,W,2) between rays, horizontally and
+    vertically. Returns both with the filled pixels added; a filled pixel's confidence is the least
+    of the measured ones in its window, times ``factor`` in the largest window, less lowered in
+    smaller ones.
     """
     filled_m, filled_confidence = depth_m.copy(), confidence.copy()
-    inverse = np.divide(1.0, depth_m, out=np.zeros(depth_m.shape), where=depth_m > 0)
-    reaches = np.array([[max(1, round(r * k / 3)) for r in reach_px] for k in (1, 2, 3)])
     share = np.zeros(depth_m.shape, np.float32)
     edge = np.array([edge_m, edge_fraction])
+    reaches = np.array([*(min(reach, 1.0) * step for step in _GROWTH), *([reach] * (reach > 1))])
+    measured = depth_m > 0
+    before = np.zeros((len(depth_m), depth_m.shape[1] + 1), np.int32)
+    before[:, 1:] = np.cumsum(measured.ravel()).reshape(depth_m.shape)
+    before[1:, 0] = before[:-1, -1]
+    known = filling.Known(
+        before=before,
+        column=np.nonzero(measured)[1].astype(np.int32),
+        inverse=1 / depth_m[measured].astype(np.float64),
+        confidence=confidence[measured],
+    )
     filling.between.over_rows(
-        depth_m.size, inverse, confidence, reaches, edge, filled_m, filled_confidence, share
+        *(depth_m.size, known, spacing_px, reaches, edge, filled_m, filled_confidence, share)
     )
     filled_confidence *= 1 - share * np.float32(1 - factor)
     return filled_m, filled_confidence
+
+
+def shares(layers: Layers, filled_m: Float32, pixel: Int) -> Float32:
+    """(P,) share of the measured pixels' votes for the depth of ``pixel`` (P,)."""
+    measured = layers.depth_m > 0
+    inverse = np.divide(1, layers.depth_m, out=np.zeros_like(filled_m), where=measured)
+    seeds = voting.Seeds(
+        first_known(measured), DIRECTIONS, inverse, layers.tilt, np.ones_like(inverse)
+    )
+    lab = layers.lab if layers.lab is not None else np.zeros((*measured.shape, 3), np.float32)
+    share = np.ones(len(pixel), np.float32)
+    here = 1 / filled_m.flat[pixel]
+    voting.vote.over_rows(len(pixel), pixel, here, seeds, lab, layers.gap_px, _RULES, share)
+    return share

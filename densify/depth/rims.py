@@ -49,16 +49,17 @@ def decide(layers: Layers, settings: ProjectSettings) -> Layers:
     image between them, two pixels show the same surface.
 
     An image that does not belong to the depth is not listened to (`edges_fit`): as ``strict``, with
-    a warning; without an image as ``strict``.
+    a warning; without an image as ``strict``. ``lab`` goes on only if it was listened to.
 
     The ``confidence`` of rims becomes 0 to 0.2, by the share of the votes against.
     """
     rims = np.flatnonzero(layers.rim_m)
-    share, warnings = np.full(len(rims), np.float32(0.5)), layers.warnings
+    share, lab, warnings = np.full(len(rims), np.float32(0.5)), None, layers.warnings
     known_m = np.maximum(layers.depth_m, layers.rim_m)
     if layers.lab is not None and settings.rims != "strict" and len(rims) >= _FEW:
         if edges_fit(layers.lab, known_m, layers.rim_m > 0, _scale(layers)):
-            share = shares(layers, layers.lab, rims)
+            lab = layers.lab
+            share = shares(layers, lab, rims)
         else:
             warnings = (*warnings, _MISFIT)
     least = {"image": _LEAST_SHARE, "strict": np.inf, "keep": 0.0}[settings.rims]
@@ -70,7 +71,12 @@ def decide(layers: Layers, settings: ProjectSettings) -> Layers:
     confidence.flat[rims] = sure * np.float32(MOST_CONFIDENCE)
     confidence = np.where(depth_m > 0, confidence, np.float32(0))
     return replace(
-        layers, depth_m=depth_m, filled_m=depth_m, confidence=confidence, warnings=warnings
+        layers,
+        depth_m=depth_m,
+        filled_m=depth_m,
+        confidence=confidence,
+        lab=lab,
+        warnings=warnings,
     )
 
 

@@ -3,35 +3,65 @@
 
 from __future__ import annotations
 
-import numpy as np
+from typing import NamedTuple
 
+import numpy as np
+from numpy.typing import NDArray
+
+from densify.arrays import Float, Float32
 from densify.kernels import Kernel, inlined
 
 _RIDGE = 1e-7  # gives the slope of least norm where the pixels lie on one line
 _MIN_PLANE_PX = 6  # fewer do not tell a plane from a step
+_MOST_PX = 60  # half a window's size: thin rays are not bridged at any price
+
+
+class Known(NamedTuple):
+    """The measured pixels row by row, of which those of row r left of column c are before
+    ``before[r, c]``. before: (H,W+1) int32. column: (K,) int32. inverse: (K,) float64, 1/m.
+    confidence: (K,) float32."""
+
+    before: NDArray[np.int32]
+    column: NDArray[np.int32]
+    inverse: Float
+    confidence: Float32
 
 
 @inlined
-def _plane(inverse, top, bottom, left, right, row, column, reach_u, reach_v):  # type: ignore[no-untyped-def]
+def _sides(known, top, bottom, left, right, row, column):  # type: ignore[no-untyped-def]
+    """Bits for measured pixels to the left, to the right, above and below; the greatest and the
+    least inverse depth, how many pixels, and the least confidence."""
+    sides, num, near, far, least = 0, 0, 0.0, np.inf, np.float32(np.inf)
+    for r in range(top, bottom):
+        for k in range(known.before[r, left], known.before[r, right]):
+            c, there = known.column[k], known.inverse[k]
+            num += 1
+            near, far = max(near, there), min(far, there)
+            least = min(least, known.confidence[k])
+            sides |= (c < column) + 2 * (c > column) + 4 * (r < row) + 8 * (r > row)
+    return sides, near, far, num, least
+
+
+@inlined
+def _plane(known, top, bottom, left, right, row, column, reach_u, reach_v):  # type: ignore[no-untyped-def]
     """Inverse depth in the centre and its two slopes: weighted least squares, the weight falling
     linearly to zero just outside the window."""
     n = u = v = uu = uv = vv = w = uw = vw = 0.0
     for r in range(top, bottom):
-        weight_v = 1 - abs(r - row) / (reach_v + 1)
-        for c in range(left, right):
-            there = inverse[r, c]
-            if there > 0:
-                du, dv = float(c - column), float(r - row)
-                weight = weight_v * (1 - abs(du) / (reach_u + 1))
-                n += weight
-                u += weight * du
-                v += weight * dv
-                uu += weight * du * du
-                uv += weight * du * dv
-                vv += weight * dv * dv
-                w += weight * there
-                uw += weight * du * there
-                vw += weight * dv * there
+        dv = float(r - row)
+        weight_v = 1 - abs(dv) / (reach_v + 1)
+        for k in range(known.before[r, left], known.before[r, right]):
+            there, du = known.inverse[k], float(known.column[k] - column)
+            weight = weight_v * (1 - abs(du) / (reach_u + 1))
+            n += weight
+            u += weight * du
+            v += weight * dv
+            uu += weight * du * du
+            uv += weight * du * dv
+            vv += weight * dv * dv
+            w += weight * there
+            uw += weight * du * there
+            vw += weight * dv * there
     u, v, w = u / n, v / n, w / n
     uu, vv, uv = uu / n - u * u + _RIDGE, vv / n - v * v + _RIDGE, uv / n - u * v
     uw, vw = uw / n - u * w, vw / n - v * w
@@ -40,53 +70,62 @@ def _plane(inverse, top, bottom, left, right, row, column, reach_u, reach_v):  #
     return w - slope_u * u - slope_v * v, slope_u, slope_v
 
 
+@inlined
+def _spread(known, top, bottom, left, right, row, column, centre, slope_u, slope_v):  # type: ignore[no-untyped-def]
+    """Between the least and the greatest deviation from a plane, 1/m."""
+    low, high = np.inf, -np.inf
+    for r in range(top, bottom):
+        there = centre + (r - row) * slope_v
+        for k in range(known.before[r, left], known.before[r, right]):
+            off = known.inverse[k] - there - (known.column[k] - column) * slope_u
+            low, high = min(low, off), max(high, off)
+    return high - low
+
+
 @Kernel
-def between(first, last, inverse, known, reaches, edge, filled_m, confidence, share):  # type: ignore[no-untyped-def]
+def between(first, last, known, spacing_px, reaches, edge, filled_m, confidence, share):  # type: ignore[no-untyped-def]
     """Fill the empty pixels from ``first`` to ``last`` (row by row) as
     `densify.depth.fill.fill_between` says.
 
-    inverse: (H,W) float64, 1/m, 0 none. known: (H,W) float32 confidence. reaches: (n,2) half sizes
-    of the windows (horizontal, vertical), growing. edge: metres and share of the depth. Filled:
-    filled_m and confidence (H,W) float32; share (H,W) float32, size of the window used as a share
-    of the largest, 0 where nothing was filled.
+    known: `Known`. spacing_px: (H,W,2) float32 horizontally, vertically. reaches: (n,) half sizes
+    of the windows in spacings, growing. edge: metres and share of the depth. Filled: filled_m and
+    confidence (H,W) float32; share (H,W) float32, size of the window used as a share of the
+    largest, 0 where nothing was filled.
     """
-    height, width = inverse.shape
+    height, width = filled_m.shape
     for p in range(first, last):
         row, column = p // width, p % width
-        if inverse[row, column] > 0:
+        if filled_m[row, column] > 0:
             continue
-        for k in range(len(reaches)):
-            reach_u, reach_v = reaches[k]
+        before_u, before_v = 0, 0
+        for step in range(len(reaches)):
+            reach_u = min(
+                max(int(np.rint(reaches[step] * spacing_px[row, column, 0])), 1), _MOST_PX
+            )
+            reach_v = min(
+                max(int(np.rint(reaches[step] * spacing_px[row, column, 1])), 1), _MOST_PX
+            )
+            if reach_u == before_u and reach_v == before_v:
+                continue
+            before_u, before_v = reach_u, reach_v
             top, bottom = max(row - reach_v, 0), min(row + reach_v + 1, height)
             left, right = max(column - reach_u, 0), min(column + reach_u + 1, width)
-            sides, num, near, far, least = 0, 0, 0.0, np.inf, np.float32(np.inf)
-            for r in range(top, bottom):
-                for c in range(left, right):
-                    there = inverse[r, c]
-                    if there > 0:
-                        num += 1
-                        near, far = max(near, there), min(far, there)
-                        least = min(least, known[r, c])
-                        sides |= (c < column) + 2 * (c > column) + 4 * (r < row) + 8 * (r > row)
+            sides, near, far, num, least = _sides(known, top, bottom, left, right, row, column)
             if sides != 15:
                 continue
             centre, slope_u, slope_v = _plane(
-                inverse, top, bottom, left, right, row, column, reach_u, reach_v
+                known, top, bottom, left, right, row, column, reach_u, reach_v
             )
             allowed = max(edge[0], edge[1] / near)
             if num < _MIN_PLANE_PX:
                 spread_m = 1 / far - 1 / near
             else:
-                low, high = np.inf, -np.inf
-                for r in range(top, bottom):
-                    for c in range(left, right):
-                        if inverse[r, c] > 0:
-                            plane = centre + (c - column) * slope_u + (r - row) * slope_v
-                            low = min(low, inverse[r, c] - plane)
-                            high = max(high, inverse[r, c] - plane)
-                spread_m = (high - low) / (centre * centre)
+                spread = _spread(
+                    known, top, bottom, left, right, row, column, centre, slope_u, slope_v
+                )
+                spread_m = spread / (centre * centre)
             if spread_m <= allowed and centre > 0:
                 filled_m[row, column] = 1 / min(max(centre, far), near)
                 confidence[row, column] = least
-                share[row, column] = (k + 1) / len(reaches)
+                share[row, column] = (step + 1) / len(reaches)
                 break
