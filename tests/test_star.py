@@ -21,7 +21,11 @@ ROW, COLUMN = np.mgrid[: SHAPE[0], : SHAPE[1]].astype(float)
 TILTED = 1 / (0.1 + 5e-4 * (COLUMN - 40) + 8e-4 * (ROW - 30))  # m, a plane
 
 
-def layers_of(filled_m, confidence=0.6, spacing_px=(2.0, 4.0)):
+TILT = (5e-4, 8e-4)  # its slope
+
+
+def layers_of(filled_m, confidence=0.6, spacing_px=(2.0, 4.0), tilt=(0.0, 0.0)):
+    """All known pixels measured."""
     filled_m = np.ascontiguousarray(filled_m, np.float32)
     known = filled_m > 0
     return Layers(
@@ -30,7 +34,7 @@ def layers_of(filled_m, confidence=0.6, spacing_px=(2.0, 4.0)):
         filled_m=filled_m,
         confidence=np.where(known, confidence, 0).astype(np.float32),
         point=np.where(known, 0, -1).astype(np.int32),
-        tilt=np.zeros((*SHAPE, 2), np.float32),
+        tilt=np.broadcast_to(np.float32(tilt), (*SHAPE, 2)).copy(),
         spacing_px=np.broadcast_to(np.float32(spacing_px), (*SHAPE, 2)).copy(),
     )
 
@@ -41,7 +45,7 @@ def disc(radius_px, row=30, column=40):
 
 def test_a_hole_in_a_plane_gets_the_planes_depth():
     hole = disc(9) | ((ROW == 44) & (COLUMN > 10))  # such as between a scanner's two blocks
-    layers = layers_of(np.where(hole, 0, TILTED))
+    layers = layers_of(np.where(hole, 0, TILTED), tilt=TILT)
     filled = fill_stars(layers, SETTINGS)
     assert (filled.filled_m > 0).all()
     np.testing.assert_allclose(filled.filled_m, TILTED, rtol=2e-3)
@@ -50,9 +54,23 @@ def test_a_hole_in_a_plane_gets_the_planes_depth():
     np.testing.assert_allclose(filled.confidence[hole], 0.6 * SETTINGS.fill_confidence)
 
 
+def test_slopes_of_filled_pixels_come_from_those_around():
+    hole = disc(7)
+    layers = layers_of(np.where(hole, 0, TILTED), tilt=TILT)
+    sparse = np.random.default_rng(8).random(SHAPE) < 0.2
+    layers = replace(
+        layers,
+        depth_m=np.where(sparse, layers.depth_m, np.float32(0)),
+        tilt=np.where(sparse[..., None], layers.tilt, np.float32(0)),
+    )
+    filled = fill_stars(layers, SETTINGS).filled_m
+    assert (filled[hole] > 0).all()
+    np.testing.assert_allclose(filled[hole], TILTED[hole], rtol=2e-3)
+
+
 def test_the_comb_at_the_lower_border_is_closed_and_nothing_below_it():
     teeth = np.where(COLUMN % 6 == 0, 56, 48)
-    filled = fill_stars(layers_of(np.where(teeth > ROW, TILTED, 0)), SETTINGS)
+    filled = fill_stars(layers_of(np.where(teeth > ROW, TILTED, 0), tilt=TILT), SETTINGS)
     between = (ROW < 54) & (COLUMN > 0) & (COLUMN < 78)
     np.testing.assert_allclose(filled.filled_m[between], TILTED[between], rtol=5e-3)
     assert not filled.filled_m[ROW >= 56].any()
@@ -74,7 +92,7 @@ def test_no_depth_edge_is_crossed(edge, width_px):
 
 
 def test_what_known_pixels_do_not_surround_is_left():
-    layers = layers_of(np.where(ROW < 30, TILTED, 0))
+    layers = layers_of(np.where(ROW < 30, TILTED, 0), tilt=TILT)
     np.testing.assert_array_equal(fill_stars(layers, SETTINGS).filled_m, layers.filled_m)
     corner = layers_of(np.where((ROW < 30) | (COLUMN < 20), 10.0, 0))
     filled = fill_stars(corner, SETTINGS).filled_m
@@ -82,7 +100,7 @@ def test_what_known_pixels_do_not_surround_is_left():
 
 
 def test_holes_wider_than_the_reach_are_left():
-    layers = layers_of(np.where(disc(20), 0, TILTED))
+    layers = layers_of(np.where(disc(20), 0, TILTED), tilt=TILT)
     filled = fill_stars(layers, replace(SETTINGS, star_reach=3))
     assert not filled.filled_m[disc(6)].any()
 

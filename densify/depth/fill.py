@@ -33,18 +33,20 @@ def fill(layers: Layers, settings: ProjectSettings) -> Layers:
         settings.edge_fraction,
         settings.fill_confidence,
     )
-    return voted(replace(layers, filled_m=filled_m, confidence=confidence), layers.depth_m)
+    filled = replace(layers, filled_m=filled_m, confidence=confidence)
+    return voted(filled, layers.depth_m, _LEAST_SHARE)
 
 
-def voted(layers: Layers, before_m: Float32) -> Layers:
+def voted(layers: Layers, before_m: Float32, least_share: float) -> Layers:
     """Without what has been filled since ``before_m`` (H,W) against the votes of the measured
     pixels around.
 
-    They vote as for rims (`densify.depth.rims`), nine of ten must be in favour; what is filled has
-    no vote, it would vote for itself. Without an image that fits they tell by distance alone.
+    They vote as for rims (`densify.depth.rims`), and ``least_share`` must be in favour; what is
+    filled has no vote, it would vote for itself. Without an image that fits they tell by distance
+    alone.
     """
     pixel = np.flatnonzero((layers.filled_m > 0) & (before_m == 0))
-    dropped = pixel[shares(layers, layers.filled_m, pixel) < _LEAST_SHARE]
+    dropped = pixel[shares(layers, layers.filled_m, pixel) < least_share]
     filled_m, confidence = layers.filled_m.copy(), layers.confidence.copy()
     filled_m.flat[dropped] = 0
     confidence.flat[dropped] = 0

@@ -141,7 +141,7 @@ def _windows(inverse: Float32, cells: _Cells, focal_px: float) -> NDArray[np.int
         good[number] = (
             num_framed >= max(_LEAST_CELLS, _LEAST_SOLID * region.size)
             and _AREA_M2[0] < area_m2[box][region].sum() < _AREA_M2[1]
-            and _MEASURED[0] < cells.measured[box][region].mean() < _MEASURED[1]
+            and _MEASURED[0] < cells.measured[box][region & framed[box]].mean() < _MEASURED[1]
             and in_plane.sum() <= _MOST_IN_PLANE * whole.sum()
         )
     row, column = ndimage.distance_transform_edt(

@@ -21,7 +21,7 @@ from scipy import ndimage
 
 from densify.config import ProjectSettings
 from densify.depth.exposure import Exposure, InView
-from densify.depth.fill import fill, voted
+from densify.depth.fill import fill
 from densify.depth.glass import close_windows
 from densify.depth.layers import Layers
 from densify.depth.rims import MOST_CONFIDENCE, decide
@@ -143,7 +143,7 @@ def project(
         if settings.visibility and settings.glass == "plane":
             layers = close_windows(layers, camera.focal_px, settings)
         if settings.star_reach > 0:
-            layers = voted(fill_stars(layers, settings), layers.filled_m)
+            layers = fill_stars(layers, settings)
     return _finished(layers, cloud, view.exposure, reason)
 
 
