@@ -46,6 +46,7 @@ def scene(seed=0):
     layers = Layers(
         depth_m=depth,
         rim_m=rim,
+        veiled=np.zeros(truth.shape, bool),
         filled_m=depth,
         confidence=np.where(known, np.float32(0.6), np.float32(0)),
         point=np.where(known, 0, -1).astype(np.int32),
@@ -67,7 +68,7 @@ def test_rims_are_kept_on_the_side_where_the_image_has_them():
     rims, kept = layers.rim_m > 0, made.depth_m > 0
     right = np.isclose(layers.rim_m, truth)
     assert not made.warnings
-    assert (kept & rims & right).sum() > 0.5 * (rims & right).sum()
+    assert (kept & rims & right).sum() > 0.4 * (rims & right).sum()
     assert (kept & rims & ~right).sum() < 0.04 * (rims & ~right).sum()
     assert np.array_equal(made.depth_m[layers.depth_m > 0], layers.depth_m[layers.depth_m > 0])
     assert np.array_equal(made.filled_m, made.depth_m)
@@ -87,6 +88,22 @@ def test_confidence_leads_from_the_strict_map_to_the_widest():
     assert all_of_them.confidence[rims & right].mean() > (
         3 * all_of_them.confidence[rims & ~right].mean()
     )
+
+
+def test_what_a_patch_veils_is_kept_by_the_image_alone():
+    """The wall right beside the panels, and behind them, measured behind their patches."""
+    layers, image, truth = scene()
+    v, u = np.mgrid[0:HEIGHT, 0:WIDTH]
+    behind = (layers.rim_m > 0) & ((u + v) % 2 == 0)
+    seen = behind & (truth == WALL_M)
+    layers = replace(
+        layers, rim_m=np.where(behind, np.float32(WALL_M), layers.rim_m), veiled=behind
+    )
+    kept = decided(layers, image).depth_m > 0
+    assert (kept & seen).sum() > 0.15 * seen.sum()  # the image may lie 2 of the 3 px aside
+    assert (kept & behind & ~seen).sum() < 0.01 * (behind & ~seen).sum()
+    assert not ((decided(layers, image, "strict").depth_m > 0) & behind).any()
+    assert not ((decided(layers, None, "keep").depth_m > 0) & behind).any()
 
 
 def test_without_an_image_rims_are_left_out():

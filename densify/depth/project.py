@@ -82,7 +82,7 @@ class _InImage:
 class _Pixels:
     """P measured pixels. pixel: (P,) row by row. winner: (P,) which of the points in the image.
     depth_m, confidence: (P,). tilt: (P,2) of the inverse depth, 1/m per px. inside: (P,) no depth
-    edge near."""
+    edge near. veiled: (P,) behind another point's patch."""
 
     pixel: Int
     winner: Int
@@ -90,6 +90,7 @@ class _Pixels:
     confidence: Float32
     tilt: Float
     inside: Bool
+    veiled: Bool
 
     def select(self, keep: Bool | Int) -> _Pixels:
         return _Pixels(**{name: column[keep] for name, column in vars(self).items()})
@@ -155,7 +156,9 @@ def _nearest(points: _InImage, own: Float32, camera: Camera, reason: NDArray[np.
     reason[points.index] = Reason.NOT_CHOSEN
     everywhere = np.ones(len(pixel), bool)
     tilt = points.slope[nearest]
-    return _Pixels(pixel, nearest, points.depth[nearest], own[nearest], tilt, everywhere)
+    return _Pixels(
+        pixel, nearest, points.depth[nearest], own[nearest], tilt, everywhere, ~everywhere
+    )
 
 
 def _measured(seen: _Pixels, points: _InImage, camera: Camera, lab: Float32 | None) -> Layers:
@@ -169,8 +172,10 @@ def _measured(seen: _Pixels, points: _InImage, camera: Camera, lab: Float32 | No
     confidence.flat[seen.pixel] = np.maximum(seen.confidence, _LEAST_CONFIDENCE)
     tilt.reshape(-1, 2)[seen.pixel] = seen.tilt
     point.flat[seen.pixel] = points.index[seen.winner]
+    veiled = np.zeros(shape, bool)
+    veiled.flat[seen.pixel] = seen.veiled
     spacing_px = _spacing_px(points if points.far.all() else points.select(~points.far), shape)
-    return Layers(depth_m, rim_m, depth_m, confidence, point, tilt, spacing_px, lab)
+    return Layers(depth_m, rim_m, veiled, depth_m, confidence, point, tilt, spacing_px, lab)
 
 
 def _spacing_px(points: _InImage, shape: tuple[int, int]) -> Float32:
@@ -194,7 +199,7 @@ def _spacing_px(points: _InImage, shape: tuple[int, int]) -> Float32:
 def _finished(
     layers: Layers, cloud: Cloud, exposure: Exposure, reason: NDArray[np.uint8]
 ) -> DepthMap:
-    measured, rim = layers.depth_m > 0, layers.rim_m > 0
+    measured, rim = layers.depth_m > 0, (layers.rim_m > 0) & ~layers.veiled
     reason[layers.point[rim]] = Reason.EDGE
     reason[layers.point[measured]] = Reason.KEPT
     if layers.glass is not None:
@@ -386,6 +391,7 @@ def _settled(
     kernels.settle.over_rows(len(done), visible, _reaches(settings), shape, done, found)
     pixel = np.flatnonzero(found[0])
     winner = order[start[pixel]]
+    veiled = hidden[winner]
     depth_m, num_sweeps, youngest_ns, num_points, residual_m, edge = found[:, pixel]
     if taken is None:
         many = int(points.sweep.max(initial=0)) + 1
@@ -395,8 +401,8 @@ def _settled(
         inside = edge >= 1
     else:
         many, supported, inside = 2 * _FAR_SUPPORT, num_sweeps >= _FAR_SUPPORT, edge >= _FAR_EDGE
-        reason[winner[~inside]] = Reason.EDGE
-    reason[winner[~supported]] = Reason.UNSUPPORTED
+        reason[winner[~inside & ~veiled]] = Reason.EDGE
+    reason[winner[~supported & ~veiled]] = Reason.UNSUPPORTED
     doubts = np.stack(
         [
             1 - np.minimum(num_sweeps / many, 1),
@@ -407,9 +413,9 @@ def _settled(
         ]
     )
     confidence = np.maximum(own[winner] * (1 - _DOUBTS @ doubts), MOST_CONFIDENCE)
-    every = _Pixels(
-        pixel, winner, depth_m, confidence.astype(np.float32), points.slope[winner], inside
-    )
+    confidence, tilt = confidence.astype(np.float32), points.slope[winner]
+    inside &= ~veiled
+    every = _Pixels(pixel, winner, depth_m, confidence, tilt, inside, veiled)
     return every.select(supported), reason
 
 

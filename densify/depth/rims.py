@@ -29,7 +29,7 @@ RULES = voting.Rules(
 )
 _NUM_ROUNDS = 2
 _RIM_WEIGHT = 0.5  # of a rim's own vote, at most
-_LEAST_SHARE = 0.95  # of the votes for a pixel that is kept
+_LEAST_SHARE = 0.97  # of the votes for a pixel that is kept
 _FEW = 100  # rims, of which nothing can be told
 _SUREST = 2.5  # -log10 of the share against
 _MISFIT = (
@@ -40,11 +40,12 @@ _MISFIT = (
 
 def decide(layers: Layers, settings: ProjectSettings) -> Layers:
     """Accept rims as ``project.rims`` says: ``image`` those that the image puts on the measured
-    surface, ``keep`` all, ``strict`` none.
+    surface, ``keep`` all that are not veiled too, ``strict`` none. Veiled ones are what is measured
+    right beside a nearer surface, whose patches are larger than itself.
 
     Every pixel whose depth is known votes in 16 directions for the rims it sees first, as far as
     its surface goes on to them, and against them otherwise (`densify.kernels.voting.vote`); rims
-    vote too, by half, in a second round less the less they are believed. Kept is what has 95 % of
+    vote too, by half, in a second round less the less they are believed. Kept is what has 97 % of
     the votes. The idea is that of a bilateral grid or a geodesic matting: without an edge of the
     image between them, two pixels show the same surface.
 
@@ -55,15 +56,20 @@ def decide(layers: Layers, settings: ProjectSettings) -> Layers:
     """
     rims = np.flatnonzero(layers.rim_m)
     share, lab, warnings = np.full(len(rims), np.float32(0.5)), None, layers.warnings
-    known_m = np.maximum(layers.depth_m, layers.rim_m)
+    at_edge = (layers.rim_m > 0) & ~layers.veiled
+    known_m = np.where(layers.veiled, np.float32(0), np.maximum(layers.depth_m, layers.rim_m))
     if layers.lab is not None and settings.rims != "strict" and len(rims) >= _FEW:
-        if edges_fit(layers.lab, known_m, layers.rim_m > 0, _scale(layers)):
+        if edges_fit(layers.lab, known_m, at_edge, _scale(layers)):
             lab = layers.lab
             share = shares(layers, lab, rims)
         else:
             warnings = (*warnings, _MISFIT)
-    least = {"image": _LEAST_SHARE, "strict": np.inf, "keep": 0.0}[settings.rims]
-    kept = rims[share >= least]
+    believed = share >= _LEAST_SHARE
+    if settings.rims == "strict":
+        believed[:] = False
+    elif settings.rims == "keep":
+        believed |= ~layers.veiled.flat[rims]
+    kept = rims[believed]
     depth_m = layers.depth_m.copy()
     depth_m.flat[kept] = layers.rim_m.flat[kept]
     confidence = layers.confidence.copy()

@@ -202,10 +202,10 @@ def settle(first, last, points, reaches, shape, taken, found):  # type: ignore[n
     """Each pixel's depth from the points around that agree with its first point.
 
     points: `Visible`. reaches: `Reaches`. shape: (height, width). taken: (P,) bool, pixels to leave
-    alone. found: (6,P) float32, filled
-    where a point is not hidden with depth, number of sweeps that agree, age of the youngest of
-    them, points in the fit, their root mean square residual (m), and how far the surface goes on to
-    all sides, as a share of the edges' reach.
+    alone. found: (6,P) float32, filled where there is a point with depth, number of sweeps that
+    agree, age of the youngest of them, points in the fit, their root mean square residual (m), and
+    how far the surface goes on to all sides, as a share of the edges' reach. Hidden points agree
+    with a hidden one only.
     """
     start, order, uv, spacing_px = points.start, points.order, points.uv, points.spacing_px
     inverse, slope, hidden = points.inverse, points.slope, points.hidden
@@ -213,7 +213,7 @@ def settle(first, last, points, reaches, shape, taken, found):  # type: ignore[n
     height, width = shape
     m, reach = np.zeros(9), np.zeros(8)
     for p in range(first, last):
-        if taken[p] or start[p] == start[p + 1] or hidden[order[start[p]]]:
+        if taken[p] or start[p] == start[p + 1]:
             continue
         i = order[start[p]]
         v0, u0 = p // width, p % width
@@ -246,7 +246,7 @@ def settle(first, last, points, reaches, shape, taken, found):  # type: ignore[n
                 du, dv = uv[j, 0] - u0, uv[j, 1] - v0
                 off = inverse[j] - (centre + su * du + sv * dv)
                 close = abs(du) <= outer and abs(dv) <= outer
-                if hidden[j] or abs(off) > agree:
+                if (hidden[j] and not hidden[i]) or abs(off) > agree:
                     behind |= close and off < -far and age_ns[j] <= witness_ns
                     continue
                 if abs(du) <= support_u + 0.5 and abs(v - v0) <= support_v:
