@@ -348,6 +348,7 @@ class _Seen(NamedTuple):
             method=method,
             key=key,
             frames=self.stretch.frames if METHODS[method].all_sweeps else (key,),
+            far_frames=() if far is None else tuple(np.unique(far.cloud.frame).tolist()),
             cloud=cloud,
             depth=depth,
             metrics=metrics,

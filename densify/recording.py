@@ -8,6 +8,7 @@
     evidence       what may move, told by all sweeps around
     motion         how everything moves
     moment         all sweeps of a key's window as they stand at the key's moment
+    far            what stands along the road around, as sweeps beyond the window saw it
 
 The sweeps are cut into blocks, and each step works on one block. How far it looks beyond its block
 is a number of seconds, 0 at the least. Two ways to cut serve all users:
@@ -68,8 +69,8 @@ T = TypeVar("T")
 class Recording:
     """A sequence, settings, and the steps. Holds little: what was read and made last.
 
-    `window`, `motion` and `moment` answer for a key; `registration`, `images`, `ground`,
-    `evidence` and `block_motion` make what the keys of a block share.
+    `window`, `motion`, `moment` and `standing` answer for a key; `registration`, `images`,
+    `ground`, `evidence`, `block_motion` and `far` make what the keys of a block share.
     """
 
     def __init__(
@@ -108,7 +109,7 @@ class Recording:
         self.ground = lru_cache(maxsize=4)(self._ground)
         self.evidence = lru_cache(maxsize=4)(self._evidence)
         self.block_motion = lru_cache(maxsize=2)(self._block_motion)
-        self._beyond = lru_cache(maxsize=1)(self._find_beyond)
+        self.far = lru_cache(maxsize=1)(self._far)
 
     # For a key
 
@@ -184,28 +185,15 @@ class Recording:
         (4,4); None where nothing beyond it is known, or wanted (``accumulate.far_m``)."""
         if not self.settings.accumulate.far_m:
             return None
-        number, (index, _) = self.cut.number_of[key], self._piece(key)
-        found = self._beyond(number, index)
-        if found is None:
+        number = self.cut.number_of[key]
+        pieces = self._pieces(number, 0.0)
+        index, piece = next((i, p) for i, p in enumerate(pieces) if key in p.frames)
+        found = self.far(number)[index]
+        if not len(found.frames):
             return None
-        return found, poses.inverse(self.window(key)[key].T_world_lidar)
+        return found, poses.inverse(piece.T_world_lidar[piece.frames.index(key)])
 
     # For a block, by its number
-
-    def _find_beyond(self, number: int, index: int) -> Standing | None:
-        """What stands beyond a piece of the block, in its world."""
-        frames = self._frames_within(number, 0.0)[index]
-        near = self._stretch(number, 0.0, frames)
-        keys = [k for k, n in self.cut.number_of.items() if n == number and k in frames]
-        road = Road(
-            self.timeline,
-            self.sweeps,
-            list(self.sequence.cameras.values()),
-            self.settings.register,
-            self.settings.accumulate.far_m,
-            self._watch,
-        )
-        return road.beyond(near, keys)
 
     def _registration(self, number: int) -> Registration:
         frames = self.cut.blocks[number].frames
@@ -335,6 +323,29 @@ class Recording:
             )
             found.append((frames, motion))
         return found
+
+    def _far(self, number: int) -> list[Standing]:
+        """What stands along the road, for each piece of the block and in its world; of a whole
+        recording with the block's own sweeps, of which a key leaves out those of its window."""
+        cameras = list(self.sequence.cameras.values())
+        far_m, settings = self.settings.accumulate.far_m, self.settings.register
+        road = Road(self.timeline, self.sweeps, cameras, settings, far_m, self._watch)
+
+        def make(frames: Sequence[int]) -> Standing:
+            keys = [k for k, n in self.cut.number_of.items() if n == number and k in frames]
+            near = self._stretch(number, 0.0, frames)
+            with self._watch.stage("far"):
+                return road.standing(near, keys, with_near=len(keys) > 1)
+
+        def inputs(piece: Trajectory, frames: Sequence[int]) -> Any:
+            content = [self.sweeps.content_if_readable(f) for f in road.frames(piece, frames)]
+            return [settings, far_m, cameras, piece, list(frames), content]
+
+        pieces = self._pieces(number, 0.0)
+        return [
+            self._made("far", Standing, partial(inputs, pieces[i], f), partial(make, f))
+            for i, f in enumerate(self._frames_within(number, 0.0))
+        ]
 
     # What they are made of
 

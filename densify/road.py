@@ -24,6 +24,7 @@ from densify.types import (
     Bool,
     Camera,
     Float,
+    Int,
     RegisteredSweep,
     Standing,
     Stretch,
@@ -32,9 +33,10 @@ from densify.types import (
 )
 
 _STEP_M = 2.0
-_MOST_S = 30.0  # on each side: who stands, or crawls, sees nothing new
+_MOST_S = 15.0  # on each side: who stands, or crawls, sees nothing new
 _LEAST_STEP_M = 0.5 * _STEP_M
-_SLACK_M = 3.0  # that a lidar moves within a sweep, and a camera until its exposure
+_SAME_VIEW_M = 3.0
+_SLACK_M = 4.0  # that a lidar moves within a sweep, and a camera until its exposure
 
 
 @dataclass(frozen=True)
@@ -48,51 +50,81 @@ class Road:
     far_m: float
     watch: Watch
 
-    def beyond(self, near: Stretch, keys: Sequence[int]) -> Standing | None:
-        """What stands along the road, in the world of ``near``; None where no sweep beyond it can
+    def frames(self, piece: Trajectory, frames: Sequence[int]) -> list[int]:
+        """Which sweeps may be read for a piece with these neighbouring frames."""
+        at = np.searchsorted(piece.frames, [frames[0], frames[-1]])
+        num = self._most_sweeps(piece.T_world_lidar[at], piece.stamp_ns[at])
+        before, after = self.timeline.before(frames[0], num), self.timeline.after(frames[-1], num)
+        return [*before, *frames, *after]
+
+    def standing(self, near: Stretch, keys: Sequence[int], with_near: bool) -> Standing:
+        """What stands along the road, in the world of ``near``; nothing where no other sweep can
         be used.
 
-        near: registered, deskewed sweeps, those of the keys among them. Of several keys; the window
-        of a single one is all of them, and nothing beyond.
+        near: registered, deskewed sweeps, those of the keys among them. with_near: what they saw
+        too.
         """
-        sensors = Sensors.of(near.sweeps)
-        views = [
-            (camera, camera.T_cam_lidar @ poses.inverse(near[key].T_world_lidar))
-            for camera in self.cameras
-            for key in keys
-        ]
+        sensors, views = Sensors.of(near.sweeps), self._views(near, keys)
+        places = np.stack([s.T_world_lidar[:3, 3] for s in near.sweeps])
+        along_m = np.append(0.0, np.linalg.norm(np.diff(places, axis=0), axis=1).cumsum())
 
         def parts(side: int) -> list[Standing]:
             found: list[Standing] = []
-            last_m, travel_m, T_last = 0.0, 0.0, near.sweeps[-1 if side > 0 else 0].T_world_lidar
+            begin_m, last = (along_m[-1], places[-1]) if side > 0 else (0.0, places[0])
+            last_m = travel_m = 0.0
             for sweep, T_world_lidar, before, after in self._sweeps(near, side):
-                travel_m += float(np.linalg.norm(T_world_lidar[:3, 3] - T_last[:3, 3]))
-                T_last = T_world_lidar
+                travel_m += float(np.linalg.norm(T_world_lidar[:3, 3] - last))
+                last = T_world_lidar[:3, 3]
                 if travel_m - last_m >= _LEAST_STEP_M:
                     last_m = travel_m
-                    seen = sweep.select(_in_view(sweep, T_world_lidar, views))
-                    registered = placed(seen, T_world_lidar, before, after)
-                    found.append(far.standing(registered, sensors, side * travel_m))
+                    some = sweep.select(_in_view(sweep, T_world_lidar, views))
+                    registered = placed(some, T_world_lidar, before, after)
+                    found.append(far.standing(registered, sensors, begin_m + side * travel_m))
             return found
 
         def own() -> list[Standing]:
-            if len(keys) < 2:
-                return []
-            seen = [
-                replace(s, sweep=s.sweep.select(_in_view(s.sweep, s.T_world_lidar, views)))
-                for s in near.sweeps
-            ]
-            return [far.standing(s, sensors, 0.0) for s in seen]
+            found, last_m = [], -np.inf
+            for s, at_m in zip(near.sweeps if with_near else (), along_m.tolist(), strict=False):
+                if at_m - last_m >= _LEAST_STEP_M:
+                    last_m = at_m
+                    some = s.sweep.select(_in_view(s.sweep, s.T_world_lidar, views))
+                    found.append(far.standing(replace(s, sweep=some), sensors, at_m))
+            return found
 
-        with self.watch.stage("far"), ThreadPoolExecutor(2) as pool:
+        with ThreadPoolExecutor(2) as pool:
             behind, ahead = pool.map(parts, (-1, 1))
-            found = behind + own() + ahead
-            return far.together(found) if found else None
+        return far.together(behind + own() + ahead)
+
+    def _views(self, near: Stretch, keys: Sequence[int]) -> list[tuple[Camera, Float]]:
+        """Cameras and ``T_cam_world`` of the keys; of keys close to each other of one."""
+        chosen: list[Float] = []
+        for key in keys:
+            T_world_lidar = near[key].T_world_lidar
+            apart = [np.linalg.norm(T[:3, 3] - T_world_lidar[:3, 3]) for T in chosen[-1:]]
+            if not apart or apart[0] > _SAME_VIEW_M:
+                chosen.append(T_world_lidar)
+        return [
+            (camera, camera.T_cam_lidar @ poses.inverse(T))
+            for camera in self.cameras
+            for T in chosen
+        ]
+
+    def _most_sweeps(self, T_world_lidar: Float, stamp_ns: Int) -> int:
+        """How many on each side, at half the speed between two poses (2,4,4); stamp_ns: (2,)."""
+        most_s = _MOST_S
+        if stamp_ns[1] > stamp_ns[0]:
+            travel_m = float(np.linalg.norm(T_world_lidar[1, :3, 3] - T_world_lidar[0, :3, 3]))
+            speed_m_s = travel_m / (1e-9 * float(stamp_ns[1] - stamp_ns[0]))
+            most_s = min(most_s, 2 * self.far_m / max(speed_m_s, 1e-3))
+        return int(most_s * 1e9 / self.timeline.period_ns)
 
     def _sweeps(self, near: Stretch, side: int) -> Iterator[tuple[Sweep, Float, Float, Float]]:
         """Raw sweeps before (-1) or behind (1) the known ones, the nearest first, their poses, and
         their twists before and after their reference times."""
-        num = int(_MOST_S * 1e9 / self.timeline.period_ns)
+        ends = near.sweeps[0], near.sweeps[-1]
+        num = self._most_sweeps(
+            np.stack([s.T_world_lidar for s in ends]), np.array([s.sweep.stamp_ns for s in ends])
+        )
         if side < 0:
             known = near.sweeps[::-1]
             frames = self.timeline.before(known[-1].frame, num)[::-1]
@@ -141,5 +173,7 @@ def _in_view(sweep: Sweep, T_world_lidar: Float, views: Sequence[tuple[Camera, F
     rows = np.flatnonzero(far.in_reach(sweep))
     points = sweep.points[rows].astype(np.float32)
     for camera, T_cam_world in views:
-        keep[rows] |= far.may_see(camera, T_cam_world @ T_world_lidar, points, _SLACK_M)
+        inside = far.may_see(camera, T_cam_world @ T_world_lidar, points, _SLACK_M)
+        keep[rows[inside]] = True
+        rows, points = rows[~inside], points[~inside]
     return keep

@@ -49,6 +49,13 @@ class Sweeps:
             raise InputError(found.reason)
         return found
 
+    def content_if_readable(self, frame: int) -> str:
+        """The same, of a sweep that cannot be read why."""
+        try:
+            return self.content(frame)
+        except InputError as error:
+            return str(error)
+
     def prepare(self, frames: Sequence[int]) -> None:
         """Have a recording that makes its sweeps make these, side by side."""
         if isinstance(self._sequence, MakesFrames):

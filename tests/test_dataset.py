@@ -194,7 +194,7 @@ def test_no_task_makes_what_another_is_for(
     kept = {path.name.partition("-")[0] for path in steps_folder().iterdir()}
     wanted = {"digests", "registration"}
     if "icp" not in options:
-        wanted |= {"ground"} if "flow.engine=paper" in options else {*work._NEEDS}
+        wanted |= {"ground", "far"} if "flow.engine=paper" in options else {*work._NEEDS}
     assert kept == wanted
 
 

@@ -10,11 +10,13 @@ import numpy as np
 import pytest
 
 from densify import pipeline
+from densify.cache import Cache
 from densify.config import resolve
 from densify.errors import InputError
 from densify.geometry import poses
 from densify.kernels.clouds import thinned
 from densify.readers.timeline import Timeline
+from densify.recording import Recording
 from densify.registration.chain import follow
 from densify.scores.depth_metrics import depth_scores
 from tests.scenes import CAMERA, Arc, Scanner, Scene, TinySequence, World, car, street
@@ -162,6 +164,50 @@ def test_the_chain_finds_the_true_poses(side):
         assert np.rad2deg(np.linalg.norm(error[:3])) < 0.1, sweep.frame
     again = found()
     assert all(a[1].tobytes() == b[1].tobytes() for a, b in zip(first, again, strict=True))
+
+
+def whole(folder, settings=FAR) -> Recording:
+    """The recording as `dataset` takes it: in blocks, whatever keys are asked for."""
+    return Recording(drive((LEAVES,)), resolve(settings), WINDOW, cache=Cache(1 << 30, folder))
+
+
+def made(recording: Recording, key: int):
+    return pipeline.densify(recording, key, ["flow"], with_images=False)["flow"]
+
+
+def same(a, b) -> bool:
+    names = ("depth_m", "filled_m", "confidence", "frame", "age_s")
+    one, other = a.depth["front"], b.depth["front"]
+    return all(getattr(one, n).tobytes() == getattr(other, n).tobytes() for n in names)
+
+
+def test_a_key_of_a_set_does_not_depend_on_others(tmp_path):
+    """Nor on what is in memory, or on disk already."""
+    upward, downward = whole(tmp_path / "a"), whole(tmp_path / "b")
+    first = {key: made(upward, key) for key in (KEY, KEY + 1)}
+    assert all(same(made(downward, key), first[key]) for key in (KEY + 1, KEY))
+    assert same(made(whole(tmp_path / "a"), KEY + 1), first[KEY + 1])
+    frames = np.unique(first[KEY].cloud.frame[first[KEY].cloud.far])
+    assert set(frames).isdisjoint(first[KEY].frames)
+    assert first[KEY].far_frames == tuple(frames)
+
+
+def test_sets_see_as_far_as_runs(tmp_path):
+    of_set, of_run = made(whole(tmp_path), KEY), results(movers=True)[1]
+    off = made(whole(tmp_path, OFF), KEY)
+    assert not off.cloud.far.any() and not off.far_frames
+    share = {
+        who: (r.depth["front"].depth_m > 0).mean()
+        for who, r in (("set", of_set), ("run", of_run), ("off", off))
+    }
+    assert share["set"] > share["off"] + 0.05
+    assert abs(share["set"] - share["run"]) < 0.03
+    truth_m = drive((LEAVES,)).truth.depth_m("front", KEY)
+    wrong = [
+        np.mean(np.abs(d - truth_m)[(d > 0) & (truth_m > 0)] > 0.3)
+        for d in (r.depth["front"].depth_m for r in (of_set, off))
+    ]
+    assert wrong[0] < wrong[1] + 0.003
 
 
 def test_thinning_keeps_the_first_of_each_cell():

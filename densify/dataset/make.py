@@ -47,8 +47,10 @@ CACHE_BYTES = 10 * 1024**3
 """Bound of what is kept on disk for later runs."""
 _TREE_BYTES_PER_PIXEL = 1.8  # the four maps of a camera
 _RUN_BYTES_PER_PIXEL, _CLOUD_BYTES_PER_SWEEP = 8.0, 2.5e6
-# Of a process: what is loaded, and what a point takes in the shared steps and in a key's window.
+# Of a process: what is loaded, and what a point takes in the shared steps, in a key's window, and,
+# of one sweep, for all beyond the window.
 _BASE_BYTES, _SHARED_BYTES_PER_POINT, _KEY_BYTES_PER_POINT = 0.55e9, 110, 500
+_FAR_BYTES_PER_POINT = 6000
 
 
 @dataclass(frozen=True)
@@ -265,7 +267,8 @@ def _num_processes(
     num_shared = max(drive.cut.num_sweeps_of_block for drive in drives)
     shared = num_shared * _SHARED_BYTES_PER_POINT * num_points
     key = (2 * recipe.window + 1) * _KEY_BYTES_PER_POINT * num_points
-    need = _BASE_BYTES + shared + key
+    far = _FAR_BYTES_PER_POINT * num_points if recipe.config.accumulate.far_m else 0
+    need = _BASE_BYTES + shared + key + far
     num_fitting = max(int(memory_bytes >= need), int((memory_bytes - _BASE_BYTES) / need))
     if num_fitting < 1:
         raise InputError(

@@ -38,6 +38,7 @@ _NEEDS: dict[str, dict[str, int]] = {
     "ground": {"registration": 1},
     "evidence": {"images": 1, "ground": 0},
     "motion": {"evidence": _MARGIN, "ground": 0},
+    "far": {"registration": 1},
 }
 """Step of a block -> the steps it is made of, and how many blocks around: none, one on each side,
 or all within the margin. Steps are methods of `densify.recording.Recording`."""
@@ -166,10 +167,13 @@ def _methods(recipe: Recipe) -> tuple[str, ...]:
 
 
 def _needs_of_keys(recipe: Recipe) -> dict[str, int]:
-    if recipe.method != "flow":
-        return {"registration": _MARGIN}
-    shared = engine(recipe.config.flow.engine)[0].shared
-    return {"registration": _MARGIN, "motion" if shared else "ground": 0}
+    needs = {"registration": _MARGIN}
+    if pipeline.METHODS[recipe.method].far and recipe.config.accumulate.far_m:
+        needs["far"] = 0
+    if recipe.method == "flow":
+        shared = engine(recipe.config.flow.engine)[0].shared
+        needs["motion" if shared else "ground"] = 0
+    return needs
 
 
 @lru_cache(maxsize=1)

@@ -7,7 +7,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from densify.depth.exposure import Exposure, InView
 from densify.depth.patches import tangents
@@ -21,6 +20,7 @@ from densify.types import (
     Cloud,
     Float,
     Float32,
+    Int,
     Patches,
     RegisteredSweep,
     Standing,
@@ -34,6 +34,7 @@ _GROUP_M = 2.5  # of travel: what is nearer sees the same, and errs alike
 _CONFIDENCE = 0.5
 _SLACK_M = 0.5
 _SAME_DEPTH, _MOST_IN_PIXEL = 0.05, 1
+_PRIME = 2_654_435_761  # its multiples go through any smaller number of points in a mixed order
 _MIN_FILLED = 6
 _FREE_M, _FREE_FRACTION = 0.3, 0.015
 
@@ -65,6 +66,8 @@ def standing(registered: RegisteredSweep, sensors: Sensors, travel_m: float) -> 
 
 def together(parts: Sequence[Standing]) -> Standing:
     """Parts of one world as one, by ascending frame."""
+    if not parts:
+        return _NOTHING
     parts = sorted(parts, key=lambda part: part.frames)
     counts = np.cumsum([0, *(len(part.frames) for part in parts)])
     return Standing(
@@ -83,14 +86,39 @@ def together(parts: Sequence[Standing]) -> Standing:
     )
 
 
+_NOTHING = Standing(
+    points=np.zeros((0, 3), np.float32),
+    normal=np.zeros((0, 3), np.float32),
+    spacing_m=np.zeros((0, 2), np.float32),
+    source=np.zeros(0, np.int32),
+    row=np.zeros(0, np.int64),
+    lidar=np.zeros(0, np.uint8),
+    intensity=np.zeros(0, np.float32),
+    frames=(),
+    stamp_ns=np.zeros(0, np.int64),
+    travel_m=np.zeros(0),
+)
+
+
 def may_see(camera: Camera, T_cam_world: Float, points: Float32, slack_m: float) -> Bool:
     """(N,3) world -> (N,) False where a camera certainly does not see a point, were it up to
     ``slack_m`` elsewhere. All of a lens that is no pinhole."""
     if camera.model != "pinhole":
         return np.ones(len(points), bool)
-    T, K = T_cam_world.astype(np.float32), camera.K.astype(np.float32)
-    x, y, z = T[:3, :3] @ points.T + T[:3, 3:]
-    slack_m, bent = np.float32(slack_m), np.float32(1.2 if camera.distortion else 1.0)
+    x, y, z = _from_camera(T_cam_world, points)
+    return _in_pyramid(camera, x, y, z, slack_m)
+
+
+def _from_camera(T_cam_world: Float, points: Float32) -> Float32:
+    """(N,3) -> (3,N) camera frame."""
+    T = T_cam_world.astype(np.float32)
+    there: Float32 = T[:3, :3] @ points.T + T[:3, 3:]
+    return there
+
+
+def _in_pyramid(camera: Camera, x: Float32, y: Float32, z: Float32, slack_m: float) -> Bool:
+    K, slack_m = camera.K.astype(np.float32), np.float32(slack_m)
+    bent = np.float32(1.2 if camera.distortion else 1.0)
     right, left = bent * (camera.width_px - K[0, 2]) / K[0, 0], -bent * K[0, 2] / K[0, 0]
     low, high = bent * (camera.height_px - K[1, 2]) / K[1, 1], -bent * K[1, 2] / K[1, 1]
     inside: Bool = (x < right * z + slack_m) & (x > left * z - slack_m) & (z > -slack_m)
@@ -113,17 +141,18 @@ def far_cloud(
     standing_only: without what is not there at the time of the window, for its first or its last
     sweep saw through the place. Of the points in a pixel a few of every depth are enough.
     """
-    inside = np.zeros(len(found), bool)
+    beyond = ~np.isin(found.frames, stretch.frames)
+    rows = np.flatnonzero(beyond[found.source])
+    needed = np.zeros(len(rows), bool)
     for exposure in exposures.values():
-        T_cam_found = exposure.T_cam_key @ T_key_found
-        inside |= may_see(exposure.camera, T_cam_found, found.points, _SLACK_M)
-    found = found.select(inside & ~np.isin(found.frames, stretch.frames)[found.source])
-    points = poses.transform(T_key_found, found.points.astype(np.float64))
-    rows = np.flatnonzero(_thinned_in_image(points, found.source, exposures))
+        needed[_seen(found.points[rows], T_key_found, exposure)] = True
+    rows = rows[needed]
+    points = poses.transform(T_key_found, found.points[rows].astype(np.float64))
     if standing_only:
         ends = sorted({stretch.frames[0], stretch.frames[-1]} - {key})
-        rows = rows[~_gone(points[rows], stretch, key, ends)]
-    found, points = found.select(rows), points[rows]
+        stands = ~_gone(points, stretch, key, ends)
+        rows, points = rows[stands], points[stands]
+    found = found.select(rows)
     num, source = len(found), found.source
     cloud = Cloud(
         points=points,
@@ -151,22 +180,27 @@ def far_cloud(
     return cloud, surface, {name: e.sees(cloud) for name, e in exposures.items()}
 
 
-def _thinned_in_image(
-    points: Float, source: NDArray[np.int32], exposures: Mapping[str, Exposure]
-) -> Bool:
-    """(M,) whether one of the cameras needs the point: in every pixel and share of the depth the
-    first few, in an order that mixes the sweeps."""
-    keep = np.zeros(len(points), bool)
+def _seen(points: Float32, T_key_world: Float, exposure: Exposure) -> Int:
+    """(N,3) world -> rows, ascending, of the points that a camera needs: in every pixel and share
+    of the depth the first few, in an order that mixes the sweeps."""
+    camera, T_cam_world = exposure.camera, exposure.T_cam_key @ T_key_world
+    if camera.is_rectified and not camera.is_rolling:
+        x, y, z = _from_camera(T_cam_world, points)
+        rows = np.flatnonzero(_in_pyramid(camera, x, y, z, _SLACK_M))
+        depth = np.maximum(z[rows], np.float32(0.1))
+        K = camera.K.astype(np.float32)
+        u = (K[0, 0] * x[rows] + K[0, 1] * y[rows]) / depth + K[0, 2]
+        v = K[1, 1] * y[rows] / depth + K[1, 2]
+    else:
+        there = poses.transform(T_key_world, points.astype(np.float64))
+        sight = exposure.see(there, np.zeros((len(points), 3), np.float32))
+        rows = np.flatnonzero(sight.inside)
+        depth = np.maximum(exposure.depth_m(sight.points_cam[rows]), 0.1)
+        u, v = sight.uv[rows].T
+    cell = np.rint(np.column_stack([u, v, np.log(depth) / _SAME_DEPTH]).astype(np.float32))
     # Neighbouring pixels are to be from many sweeps: these have to agree.
-    order = np.argsort((source * 7919 + np.arange(len(points))) % 65521, kind="stable")
-    for exposure in exposures.values():
-        sight = exposure.see(points, np.zeros((len(points), 3), np.float32))
-        shown = order[sight.inside[order]]
-        depth = np.log(np.maximum(exposure.depth_m(sight.points_cam), 0.1)) / _SAME_DEPTH
-        cell = np.column_stack([sight.uv + 0.5, depth])
-        cell[~sight.inside] = 0.0
-        keep[kernels.thinned(cell, shown, 1.0, _MOST_IN_PIXEL)] = True
-    return keep
+    mixed = np.arange(len(rows)) * _PRIME % max(1, len(rows))
+    return rows[kernels.thinned(cell, mixed, 1.0, _MOST_IN_PIXEL)]
 
 
 def _gone(points: Float, stretch: Stretch, key: int, witnesses: Sequence[int]) -> Bool:

@@ -23,13 +23,14 @@ _PACKAGES = (
 
 
 def write_output(result: Result, context: Context, folder: Path) -> None:
-    """``run.yaml``: data, key, frames, cameras, warnings, how priors fit, configuration, cost of
-    each stage, versions."""
+    """``run.yaml``: data, key, frames, those beyond the window, cameras, warnings, how priors fit,
+    configuration, cost of each stage, versions."""
     record = {
         "data": context.data,
         "key": result.key,
         "method": result.method,
         "frames": result.frames,
+        "far_frames": result.far_frames,
         "cameras": list(result.depth),
         "prior": {
             name: {"source": full.source, **asdict(full.fit), "share": full.share}

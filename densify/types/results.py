@@ -32,6 +32,7 @@ class StageCost:
 class Result:
     """One densified key.
 
+    frames: of the window. far_frames: sweeps beyond it of which the cloud holds what stands still.
     depth: by name: the camera's, or CAMERA/NUMBER of each image (``project.per=image``). metrics:
     plain numbers, ready for JSON. baselines: the results of the simpler methods on the same
     registration, by method. flow: of every sweep to the next one on the way to the key, where
@@ -56,3 +57,4 @@ class Result:
     rejected: Mapping[str, NDArray[np.uint8]] = field(default_factory=dict)
     full: Mapping[str, FullDepth] = field(default_factory=dict)
     images: Mapping[str, NDArray[np.uint8]] = field(default_factory=dict)
+    far_frames: tuple[int, ...] = ()
