@@ -6,8 +6,30 @@ A message is one line: what, where, got, expected, what to do.
 
 from __future__ import annotations
 
+import re
 
-class InputError(Exception):
+_LONG_VALUE = re.compile(r"""'[^']{201,}'|"[^"]{201,}"|\S{301,}""")
+_MOST_CHARACTERS = 1000
+
+
+def brief(message: str) -> str:
+    """A message whose echo of the input is cut: quoted texts beyond 200 characters, words beyond
+    300 (paths are words), and what is still beyond 1,000 in its middle."""
+    message = _LONG_VALUE.sub(lambda found: _cut(found[0], 200), message)
+    return _cut(message, _MOST_CHARACTERS) if len(message) > _MOST_CHARACTERS else message
+
+
+def _cut(text: str, num_characters: int) -> str:
+    end = num_characters // 4
+    return f"{text[: num_characters - end - 3]}...{text[-end:]}"
+
+
+class _ShortError(Exception):
+    def __init__(self, message: str, *others: object) -> None:
+        super().__init__(brief(message), *others)
+
+
+class InputError(_ShortError):
     """Input, configuration or output place that cannot be used. Exit code 2."""
 
 
@@ -15,7 +37,7 @@ class OutputError(InputError):
     """What is computed cannot be written: no permission, a full disk."""
 
 
-class ComputationError(Exception):
+class ComputationError(_ShortError):
     """A stage found that its result cannot be trusted. Exit code 1."""
 
 

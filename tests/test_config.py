@@ -126,7 +126,9 @@ def test_every_knob_takes_its_limits_and_refuses_what_is_beyond(section: str, fi
             float("nan"),
         ):
             message = error_of({section: {field.name: value}})
-            assert name in message and repr(value) in message and f"{meta['low']:g}" in message
+            assert (
+                name in message and repr(value)[:100] in message and f"{meta['low']:g}" in message
+            )
 
 
 def test_round_trip() -> None:

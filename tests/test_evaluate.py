@@ -291,7 +291,7 @@ def test_masks_of_every_kind(tmp_path: Path) -> None:
     for image in (gray.astype(np.uint8), gray.astype(np.uint16), colour, opaque):
         assert np.array_equal(read_mask_png(put_mask(tmp_path / "m.png", image)), expected)
     (tmp_path / "m.png").write_bytes(b"no image")
-    with pytest.raises(InputError, match="got no image, expected a mask"):
+    with pytest.raises(InputError, match="not a complete image"):
         read_mask_png(tmp_path / "m.png")
     with pytest.raises(InputError, match="cannot be read"):
         read_mask_png(tmp_path / "nothing.png")
@@ -403,7 +403,7 @@ def test_a_bad_focal_length_is_refused(value: str, capsys: pytest.CaptureFixture
     [
         (("p", "nowhere"), "nowhere: no such file or folder"),
         (("p", "t"), "no pair"),
-        (("p/1.png", "broken.png"), "broken.png: got no image, expected a depth map"),
+        (("p/1.png", "broken.png"), "broken.png: not a complete image"),
         (("p", "p", "--out", "scores.txt"), "ends in .json"),
     ],
 )

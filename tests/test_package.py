@@ -175,6 +175,7 @@ def test_no_file_can_have_code_run() -> None:
 
 FLOORS = (
     ("arrays", "errors", "version", "knobs", "plugins"),
+    ("files",),
     ("cache", "types"),
     ("config", "costs", "kernels"),
     ("geometry",),

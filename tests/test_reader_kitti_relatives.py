@@ -387,7 +387,7 @@ def test_damage_is_refused_in_a_line(copied, damage):
         ("   xi: 2.2\n", "", "expected image_width"),
         ("1336.0", "-3", "not positive"),
         ("k1: 0.016", "k1: abc", "abc"),
-        ("model_type: MEI", "model_type: [", "expected image_width"),
+        ("model_type: MEI", "model_type: [", "not YAML"),
         (
             "model_type: MEI",
             "model_type: !!python/object/apply:os.system ['true']",

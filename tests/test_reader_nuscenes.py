@@ -180,7 +180,7 @@ TREES = {
     "scene missing": (without("scene"), "scene.json: no such table"),
     "poses missing": (without("ego_pose"), "ego_pose.json: no such table"),
     "sensors missing": (without("sensor"), "sensor.json: no such table"),
-    "broken JSON": (cut("calibrated_sensor"), "not a whole JSON table"),
+    "broken JSON": (cut("calibrated_sensor"), "not a whole JSON file"),
     "table cut off": (cut("sample_data"), "not a whole JSON table"),
     "table empty": (cut("ego_pose", 0), "not a whole JSON table"),
     "no list": (

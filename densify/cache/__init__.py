@@ -25,6 +25,8 @@ import numpy as np
 
 from densify.cache.codec import MOST_BYTES, DamagedError, decode, encode
 from densify.cache.folder import own_folder
+from densify.errors import InputError
+from densify.files.content import read_bytes
 from densify.version import __version__
 
 T = TypeVar("T")
@@ -62,9 +64,7 @@ class Cache:
         try:
             value: T = decode(self._read(path), kind)
             return value
-        except FileNotFoundError:
-            pass
-        except (OSError, DamagedError) as error:
+        except (InputError, DamagedError) as error:
             _log.debug("%s: made anew: %s", path, error)
         value = make()
         try:
@@ -93,11 +93,7 @@ class Cache:
             left -= num_bytes
 
     def _read(self, path: Path) -> bytes:
-        with path.open("rb") as file:
-            num_bytes = os.fstat(file.fileno()).st_size
-            if num_bytes > MOST_BYTES:
-                raise DamagedError(f"{num_bytes} bytes")
-            data = file.read(num_bytes)
+        data = read_bytes(path, MOST_BYTES)
         with suppress(OSError):
             os.utime(path)  # it was used
         return data

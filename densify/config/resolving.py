@@ -12,6 +12,7 @@ from typing import Any
 
 from densify.config.sections import REPLACED, Config
 from densify.errors import InputError
+from densify.files.texts import parse_yaml, read_yaml
 from densify.knobs import checked
 
 
@@ -36,7 +37,7 @@ def resolve(
             _apply(values, config, "configuration")
         elif isinstance(config, str | Path):
             path = _config_path(config)
-            _apply(values, _read_yaml(_read_text(path), str(path)) or {}, str(path))
+            _apply(values, read_yaml(path)[0] or {}, str(path))
         elif config is not None:
             raise InputError(
                 f"configuration: got {type(config).__name__}, expected a densify.Config, a "
@@ -72,33 +73,6 @@ def _config_path(name: str | Path) -> Path:
     )
 
 
-def _read_text(path: Path) -> str:
-    try:
-        return path.read_text("utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: cannot be read as a YAML file: {error}") from error
-
-
-def _read_yaml(text: str, where: str) -> Any:
-    """Parsed YAML, None for an empty text; a key given twice is an error."""
-    import yaml
-
-    class Loader(yaml.SafeLoader):
-        def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
-            keys = [str(key.value) for key, _ in node.value]
-            for key in keys:
-                if keys.count(key) > 1:
-                    line = node.start_mark.line + 1
-                    raise InputError(f"{where}: {key} is given twice from line {line} on; keep one")
-            return super().construct_mapping(node, deep)
-
-    try:
-        return yaml.load(text, Loader)
-    except (yaml.YAMLError, ValueError) as error:  # ValueError: a date that is none, say
-        reason = " ".join(str(error).split())
-        raise InputError(f"{where}: not YAML: {reason}") from error
-
-
 def _parse_override(override: str) -> Mapping[str, Any]:
     name, equals, text = override.partition("=")
     section, dot, key = name.strip().partition(".")
@@ -106,7 +80,7 @@ def _parse_override(override: str) -> Mapping[str, Any]:
         raise InputError(
             f"--set {override}: expected section.key=value, for example project.support=6"
         )
-    value = _read_yaml(text, f"--set {override}")
+    value, _ = parse_yaml(text, f"--set {override}")
     return {section: {key: value if text.strip() else ""}}
 
 

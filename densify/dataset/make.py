@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 from uuid import uuid4
 
 from densify.cache import code, steps_folder
@@ -77,11 +78,11 @@ class Summary:
 
     def mean(self, score: str) -> float | None:
         """Over the keys that are done, and their cameras."""
-        values: list[float | None] = []
+        values: list[Any] = []  # a manifest of others may hold anything
         for record in self.records.values():
             value = record.scores.get(score) if record.status == "done" else None
             values += value.values() if isinstance(value, Mapping) else [value]
-        known = [value for value in values if value is not None]
+        known = [value for value in values if isinstance(value, float | int)]
         return sum(known) / len(known) if known else None
 
 

@@ -31,6 +31,8 @@ from types import TracebackType
 from typing import Any, Literal, get_args
 
 from densify.errors import InputError, OutputError
+from densify.files.content import open_file, read_bytes
+from densify.files.texts import parse_json
 from densify.outputs.atomic import FileRecord, make_folder, sync_folder, write_file
 from densify.outputs.plain import plain
 
@@ -94,8 +96,15 @@ class KeyRecord:
     def from_line(line: bytes) -> KeyRecord:
         """Fields of later versions are passed over. Raises ValueError for a damaged line."""
         try:
-            return _record(json.loads(line))
-        except (KeyError, TypeError, AttributeError, OverflowError, RecursionError) as error:
+            return _record(parse_json(line, "a line"))
+        except (
+            InputError,
+            KeyError,
+            TypeError,
+            AttributeError,
+            OverflowError,
+            RecursionError,
+        ) as error:
             raise ValueError(f"no record of a key: {error!r}") from error
 
 
@@ -278,12 +287,7 @@ def _read(path: Path) -> dict[Key, tuple[KeyRecord, bytes]]:
 
 def _bytes_of(path: Path) -> bytes | None:
     """None if there is no such file."""
-    try:
-        return path.read_bytes()
-    except FileNotFoundError:
-        return None
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
+    return read_bytes(path) if path.exists() else None
 
 
 def _size(path: Path) -> int | None:
@@ -295,12 +299,12 @@ def _size(path: Path) -> int | None:
 
 def _content(path: Path) -> FileRecord | None:
     try:
-        with path.open("rb") as file:
+        with open_file(path) as file:
             digest = hashlib.sha256()
             while block := file.read(1 << 20):
                 digest.update(block)
             return FileRecord(file.tell(), digest.hexdigest())
-    except OSError:
+    except (InputError, OSError):
         return None
 
 

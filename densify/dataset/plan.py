@@ -25,6 +25,7 @@ from densify.blocks import Cut
 from densify.config import Config, as_mapping
 from densify.dataset.gate import Gate
 from densify.errors import InputError, OutputError
+from densify.files.texts import read_json
 from densify.outputs.atomic import make_folder, write_file
 from densify.outputs.kitti_tree import drive_folder, split_of
 from densify.readers import Spec, open_sequence
@@ -39,6 +40,7 @@ LAYOUTS = ("kitti-depth", "densify")
 METHODS = ("flow", "icp", "none")
 _FILE = "dataset.json"
 _LARGEST_WINDOW = 50
+_MOST_FRAMES = 10_000_000
 _SAME = ("densify", "layout", "method", "window", "cameras", "gate", "config")
 """Entries of dataset.json in which all runs of a set must agree."""
 
@@ -178,11 +180,12 @@ def read_plan(out: Path) -> dict[str, Any] | None:
     if not path.is_file():
         return None
     try:
-        table = json.loads(path.read_text("utf-8"))
+        table = read_json(path)
         if table["schema_version"] == SCHEMA_VERSION:
+            _check_kinds(table)
             planned_keys(table)
             return {name: table[name] for name in ("schema_version", *_SAME, "drives")}
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise InputError(
             f"{path}: damaged or no description of a training set: {error!r}; choose another folder"
         ) from error
@@ -218,6 +221,16 @@ def planned_keys(table: Mapping[str, Any]) -> set[tuple[str, int]]:
     return {(n, f) for n, drive in table["drives"].items() for f in _frames(drive["frames"])}
 
 
+def _check_kinds(table: Mapping[str, Any]) -> None:
+    """Raise TypeError unless what is looked up in later is there to be looked up in."""
+    drives = table["drives"]
+    parts = [table["config"], table["gate"], drives, *drives.values()]
+    if not all(isinstance(part, dict) for part in (*parts, *(d["cameras"] for d in parts[3:]))):
+        raise TypeError("got no mapping where one is expected")
+    if not all(isinstance(d[part], str) for d in parts[3:] for part in ("data", "folder")):
+        raise TypeError("got no text where one is expected")
+
+
 def _begun(name: str) -> bool:
     """Whether a run leaves that before there is a dataset.json."""
     return name.startswith((".", "manifest"))
@@ -251,7 +264,9 @@ def _check_same(out: Path, before: Mapping[str, Any], now: Mapping[str, Any]) ->
         if before[name] != now[name]:
             got, expected = now[name], before[name]
             where = name
-            while isinstance(got, dict):  # down to the one that differs
+            while isinstance(got, dict) and isinstance(
+                expected, dict
+            ):  # down to the one that differs
                 parts = {**expected, **got}  # a set of another version may have knobs of its own
                 part = next(k for k in parts if got.get(k) != expected.get(k))
                 got, expected, where = got.get(part), expected.get(part), f"{where}.{part}"
@@ -315,4 +330,7 @@ def _as_runs(frames: Iterable[int]) -> list[list[int]]:
 
 
 def _frames(pairs: Iterable[Sequence[int]]) -> list[int]:
-    return [f for first, last in pairs for f in range(first, last + 1)]
+    runs = [range(first, last + 1) for first, last in pairs]
+    if sum(max(0, run.stop - run.start) for run in runs) > _MOST_FRAMES:
+        raise ValueError(f"more than {_MOST_FRAMES:,} frames of one recording")
+    return [frame for run in runs for frame in run]

@@ -6,15 +6,14 @@ metres, 0 = none.
 
 from __future__ import annotations
 
-import zlib
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from densify.errors import InputError
+from densify.files.images import read_image
 from densify.outputs.atomic import write_file
 from densify.outputs.png import encode_png
 from densify.types import Bool, Float32
@@ -23,7 +22,6 @@ _STEPS_PER_M = 256.0
 _STEPS_OF_CONFIDENCE = 254.0
 _STEPS_PER_S = 1000.0
 _MAX_VALUE = np.iinfo(np.uint16).max
-_PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 
 
 def write_depth_png(path: Path, depth_m: Float32) -> None:
@@ -111,9 +109,9 @@ def read_depth_png(path: Path) -> Float32:
 def read_stored(path: Path, kind: type[np.uint8] | type[np.uint16], what: str) -> NDArray[Any]:
     """(H,W) of a depth, confidence or age map as it is stored. Raises InputError for anything but
     a whole gray PNG of that many bits; what: for the message."""
-    image = _decoded(path)
-    if image is None or image.dtype != kind or image.ndim != 2:
-        got = "no image" if image is None else f"{image.dtype} of shape {image.shape}"
+    image = read_image(path, as_stored=True)
+    if image.dtype != kind or image.ndim != 2:
+        got = f"{image.dtype} of shape {image.shape}"
         bits = 8 * np.dtype(kind).itemsize
         raise InputError(f"{path}: got {got}, expected {what} (PNG, {bits} bit, one channel)")
     return image
@@ -122,37 +120,10 @@ def read_stored(path: Path, kind: type[np.uint8] | type[np.uint16], what: str) -
 def read_mask_png(path: Path) -> Bool:
     """(H,W) bool, True where any colour is not 0; transparency says nothing. Raises InputError if
     it is no image."""
-    image = _decoded(path)
-    if image is None:
-        raise InputError(f"{path}: got no image, expected a mask (PNG, 0 where it does not hold)")
+    image = read_image(path, as_stored=True)
     colours = image if image.ndim == 2 else image[:, :, :3].max(axis=2)
     mask: Bool = colours > 0
     return mask
-
-
-def _decoded(path: Path) -> NDArray[Any] | None:
-    """The image as it is stored; None if it is no image, or not whole."""
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
-    if not _is_whole_png(data):
-        return None
-    return cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-
-
-def _is_whole_png(data: bytes) -> bool:
-    """All chunks are there with the right checksums. Of damage, libpng would write to stderr."""
-    if not data.startswith(_PNG_SIGNATURE):
-        return False
-    start, name = len(_PNG_SIGNATURE), b""
-    while name != b"IEND":
-        end = start + 12 + int.from_bytes(data[start : start + 4], "big")
-        name, checksum = data[start + 4 : start + 8], data[end - 4 : end]
-        if end > len(data) or zlib.crc32(data[start + 4 : end - 4]).to_bytes(4, "big") != checksum:
-            return False
-        start = end
-    return True
 
 
 def _has_depth(name: str, values: Float32, depth_m: Float32) -> NDArray[np.bool_]:

@@ -27,6 +27,7 @@ from pathlib import Path
 import numpy as np
 
 from densify.errors import InputError
+from densify.files.content import read_bytes
 from densify.geometry.poses import inverse
 from densify.readers.arrow_columns import read_feather
 from densify.readers.file_sequence import (
@@ -37,7 +38,7 @@ from densify.readers.file_sequence import (
     scanner_axes,
     truth_beside,
 )
-from densify.readers.files import numbered_files, read_bytes
+from densify.readers.files import numbered_files
 from densify.readers.pose_track import PoseTrack
 from densify.types import Camera, Float
 

@@ -23,9 +23,6 @@ Packing for Self-Supervised Monocular Depth Estimation", CVPR 2020) and its rela
 
 from __future__ import annotations
 
-import io
-import zipfile
-import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime, timedelta, timezone
@@ -35,6 +32,9 @@ from typing import Any
 import numpy as np
 
 from densify.errors import InputError
+from densify.files.arrays import read_arrays
+from densify.files.content import read_bytes
+from densify.files.texts import read_json
 from densify.geometry import poses
 from densify.readers.file_sequence import (
     FileSequence,
@@ -43,12 +43,10 @@ from densify.readers.file_sequence import (
     quaternion_pose,
     truth_beside,
 )
-from densify.readers.files import read_bytes, read_json
 from densify.types import Camera, Float
 
 _BOGUS_YEAR = 2200
 _FIELDS = ("X", "Y", "Z")
-_DAMAGE = (KeyError, ValueError, EOFError, OSError, zipfile.BadZipFile, zlib.error)
 
 
 def open_recording(path: Path, scene: str | None) -> Dgp:
@@ -236,15 +234,10 @@ def _of_sensor(values: Mapping[str, Float], name: str, file: Path) -> Float:
 
 def _read_points(datum: _Datum) -> dict[str, Float]:
     """Columns by name; no Python objects are read."""
-    try:
-        with np.load(io.BytesIO(read_bytes(datum.path)), allow_pickle=False) as arrays:
-            points = arrays["data"]
-    except InputError:
-        raise
-    except _DAMAGE as error:
-        raise InputError(
-            f"{datum.path}: not a whole npz file with the array data ({error}); fetch it again"
-        ) from error
+    arrays = read_arrays(datum.path, ("data",))
+    if "data" not in arrays:
+        raise InputError(f"{datum.path}: holds no array data, expected its points there")
+    points = arrays["data"]
     fits = points.ndim == 2 and points.shape[1] == len(datum.fields) and points.dtype.kind in "fiu"
     if not fits or not set(_FIELDS) <= set(datum.fields):
         raise InputError(

@@ -5,15 +5,15 @@ frames exist when it is not there, and loading an image of the size its camera p
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from densify.errors import InputError
+from densify.files.images import decode_image
 from densify.types import Camera
 
 T = TypeVar("T")
@@ -55,23 +55,6 @@ def format_frames(frames: Iterable[int]) -> str:
     return ", ".join(texts) if texts else "none"
 
 
-def read_text(path: Path) -> str:
-    """The text of a small file. Raises InputError if it is missing, unreadable or not text."""
-    try:
-        return path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        reason = error.strerror if isinstance(error, OSError) else "not a text file"
-        raise InputError(f"{path}: cannot be read: {reason}") from error
-
-
-def read_json(path: Path) -> Any:
-    """What a JSON file holds. Raises InputError if it is missing, unreadable or broken."""
-    try:
-        return json.loads(read_text(path))
-    except ValueError as error:
-        raise InputError(f"{path}: not a whole JSON file ({error}); fetch it again") from error
-
-
 def of_frame(entries: Mapping[int, T], frame: int, what: str, where: Path) -> T:
     """The entry of a frame, or an InputError that names the frames that exist.
 
@@ -94,20 +77,12 @@ def camera_named(cameras: Mapping[str, Camera], name: str, where: Path) -> Camer
     return cameras[name]
 
 
-def read_bytes(path: Path) -> bytes:
-    """The content of a file. Raises InputError if it is missing or unreadable."""
-    try:
-        return path.read_bytes()
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
-
-
 def decoded_image(data: bytes, camera: Camera, where: Path) -> NDArray[np.uint8]:
     """(H,W,3) uint8 RGB of an image file's bytes; gray ones get three equal channels.
 
     Raises InputError, which names the place, if it is no whole image or not of the camera's size.
     """
-    bgr = _decoded(data, where)
+    bgr = decode_image(data, where)
     check_image_size(bgr.shape, camera, where)
     return np.ascontiguousarray(bgr[:, :, ::-1], dtype=np.uint8)
 
@@ -121,22 +96,3 @@ def check_image_size(shape: tuple[int, ...], camera: Camera, where: Path | str) 
             f"{where}: got an image of {width} x {height} px; expected "
             f"{camera.width_px} x {camera.height_px}, as the calibration of {camera.name} says"
         )
-
-
-def image_size_px(path: Path) -> tuple[int, int]:
-    """Width and height of an image file, for data sets that write them nowhere else. Raises
-    InputError if it is no whole image."""
-    height, width = _decoded(read_bytes(path), path).shape[:2]
-    return width, height
-
-
-def _decoded(data: bytes, where: Path) -> NDArray[Any]:
-    """(H,W,3) BGR."""
-    import cv2
-
-    bgr = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR) if data else None
-    if bgr is None:
-        raise InputError(
-            f"{where}: not a complete image ({len(data)} bytes); expected a PNG or JPEG file"
-        )
-    return bgr

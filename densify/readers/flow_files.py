@@ -16,23 +16,23 @@
 
 from __future__ import annotations
 
-import zipfile
-import zlib
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.lib.npyio import NpzFile
 from numpy.typing import NDArray
 
 from densify.config import Config
 from densify.errors import InputError
+from densify.files.arrays import read_arrays
 from densify.flow.chained import ChainedMotion
 from densify.flow.scene import Scene
 from densify.geometry import poses
 from densify.types import FlowField, Motion, Stretch
 
 MOVES_M = 0.05
+FARTHEST_M = 1000.0
+"""From sweep to sweep nothing on a road goes farther."""
 _WIDE = ("residual_flow", "total_flow", "to_reference")
 _KNOWN = (*_WIDE, "row", "moving", "object")
 
@@ -119,18 +119,11 @@ def _matched(
 def _load(path: Path) -> dict[str, NDArray[Any]]:
     if not path.is_file():
         raise InputError(f"{path}: no such flow file; expected one for every step to the key")
-    try:
-        loaded = np.load(path, allow_pickle=False)
-        if not isinstance(loaded, NpzFile):
-            raise ValueError("holds a single array, not named ones")
-        with loaded:
-            arrays = {name: loaded[name] for name in _KNOWN if name in loaded}
-            names = ", ".join(loaded) or "none"
-    except (OSError, ValueError, EOFError, RuntimeError, zipfile.BadZipFile, zlib.error) as error:
-        reason = " ".join(str(error).split())
-        raise InputError(f"{path}: not a readable .npz flow file: {reason}") from error
+    arrays = read_arrays(path, _KNOWN)
     if "residual_flow" not in arrays and "total_flow" not in arrays:
-        raise InputError(f"{path}: holds the arrays {names}, expected residual_flow or total_flow")
+        raise InputError(
+            f"{path}: holds none of the arrays residual_flow and total_flow, expected one of them"
+        )
     num_points = len(np.atleast_1d(next(iter(arrays.values()))))
     for name, array in arrays.items():
         shape = (num_points, 3) if name in _WIDE else (num_points,)
@@ -142,6 +135,11 @@ def _load(path: Path) -> dict[str, NDArray[Any]]:
             )
         if not np.isfinite(array).all():
             raise InputError(f"{path}: array {name}: got NaN or infinite, expected finite numbers")
+        if name in _WIDE and (np.abs(array, dtype=np.float64) > FARTHEST_M).any():
+            raise InputError(
+                f"{path}: array {name}: got a step of {np.abs(array, dtype=np.float64).max():g} m, "
+                f"expected metres, {FARTHEST_M:g} at most"
+            )
     if (arrays.get("row", np.zeros(1)) < 0).any():
         raise InputError(f"{path}: array row: got a negative one, expected row numbers from 0 up")
     return arrays

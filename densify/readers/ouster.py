@@ -24,9 +24,9 @@ from typing import Any
 import numpy as np
 
 from densify.errors import InputError
+from densify.files.texts import read_json
 from densify.readers.extras import needed
 from densify.readers.file_sequence import FileSequence, Returns
-from densify.readers.files import read_json
 from densify.types import Float32
 
 _WHAT = "Ouster captures"

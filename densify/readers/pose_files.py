@@ -12,8 +12,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from densify.errors import InputError
+from densify.files.texts import read_text
 from densify.readers.file_sequence import rigid
-from densify.readers.files import read_text
 from densify.readers.pose_track import PoseTrack
 from densify.readers.stamp_files import in_ns, unit_of
 from densify.types import Float

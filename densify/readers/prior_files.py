@@ -15,7 +15,6 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -24,8 +23,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from densify.errors import InputError
+from densify.files.arrays import read_array
+from densify.files.content import open_file, reason
+from densify.files.images import check_pixels, read_image
 from densify.readers.extras import needed
-from densify.readers.files import format_frames, read_bytes
+from densify.readers.files import format_frames
 from densify.types import Bool, Camera, Float32, Prior
 
 _SUFFIXES = (".npy", ".exr", ".png")  # the finest first
@@ -111,7 +113,7 @@ def _in(folder: Path) -> dict[int, Path]:
 
 def _value(path: Path) -> Float32:
     """(H,W), 0 none."""
-    read = {".npy": _npy, ".exr": _exr, ".png": _png}[path.suffix.lower()]
+    read = {".npy": read_array, ".exr": _exr, ".png": _png}[path.suffix.lower()]
     image = np.asarray(read(path))
     image = image.reshape([n for n in image.shape if n != 1]) if image.ndim > 2 else image
     if image.ndim != 2 or image.dtype.kind not in "fui":
@@ -127,20 +129,17 @@ def _value(path: Path) -> Float32:
     return value
 
 
-def _npy(path: Path) -> NDArray[Any]:
-    try:
-        array: NDArray[Any] = np.load(BytesIO(read_bytes(path)), allow_pickle=False)
-    except (ValueError, EOFError, OSError) as error:
-        raise InputError(f"{path}: not a whole .npy file ({error}); write it again") from error
-    return array
-
-
 def _exr(path: Path) -> NDArray[Any]:
     library = needed("OpenEXR", "exr", "EXR files")
+    open_file(path).close()
     try:
+        (left, top), (right, bottom) = library.File(str(path), header_only=True).header()[
+            "dataWindow"
+        ]
+        check_pixels((int(right) - int(left) + 1, int(bottom) - int(top) + 1), path)
         channels = library.File(str(path)).channels()
-    except RuntimeError as error:
-        raise InputError(f"{path}: not a whole EXR file ({error})") from error
+    except (RuntimeError, KeyError, TypeError, ValueError) as error:
+        raise InputError(f"{path}: not a whole EXR file ({reason(error)})") from error
     named = [name for name in _CHANNELS if name in channels]
     if not named and len(channels) > 1:
         raise InputError(
@@ -150,21 +149,13 @@ def _exr(path: Path) -> NDArray[Any]:
 
 
 def _png(path: Path) -> NDArray[Any]:
-    image = _decoded(path)
+    image = read_image(path, as_stored=True)
     if image.dtype != np.uint16 or image.ndim != 2:
         bits = 8 * image.dtype.itemsize
         raise InputError(
             f"{path}: got {bits} bit of shape {image.shape}, expected 16 bit and one channel; "
             f"pictures of depth are too coarse: save it as .npy"
         )
-    return image
-
-
-def _decoded(path: Path) -> NDArray[Any]:
-    data = np.frombuffer(read_bytes(path), np.uint8)
-    image = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if len(data) else None
-    if image is None:
-        raise InputError(f"{path}: not a whole PNG file; write it again")
     return image
 
 
@@ -180,7 +171,7 @@ def _resized(value: Float32, camera: Camera, path: Path) -> Float32:
 
 
 def _sky(path: Path, camera: Camera) -> Bool:
-    mask = _decoded(path)
+    mask = read_image(path, as_stored=True)
     mask = mask if mask.ndim == 2 else mask[:, :, :3].max(axis=2)
     size = (camera.width_px, camera.height_px)
     if mask.shape != size[::-1]:

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from densify.errors import InputError
-from densify.readers.files import read_text
+from densify.files.texts import read_text
 from densify.readers.points.fields import UNIT_NS
 
 _EPOCH_S = (946_684_800, 4_102_444_800)  # what counts as a time since 1970: the years 2000 to 2099
@@ -63,6 +63,15 @@ def in_ns(text: str, unit: str) -> int:
     if abs(time_ns) >= 2**63:
         raise ValueError(f"got {text!r}, which is no time in {unit}: it lies beyond the year 2262")
     return time_ns
+
+
+def date_ns(text: str) -> int:
+    """A date and time in UTC as nanoseconds since 1970, every digit kept. Raises ValueError, also
+    for years that nanoseconds in 64 bits do not reach, of which numpy makes others."""
+    day = np.datetime64(text, "D")
+    if not np.datetime64("1970-01-01") <= day < np.datetime64("2262-01-01"):
+        raise ValueError(f"got {text!r}, expected a year from 1970 to 2261")
+    return int(np.datetime64(text, "ns").astype(np.int64))  # never through a float
 
 
 def unit_of(times: Sequence[str]) -> str:
@@ -138,13 +147,13 @@ def _parse(
     for (line, _), text in zip(rows, times, strict=True):
         try:
             if dates:
-                found.append(int(np.datetime64(text.rstrip("Z"), "ns").astype(np.int64)))
+                found.append(date_ns(text.rstrip("Z")))
             else:
                 found.append(in_ns(text, unit))
         except ValueError:
             raise InputError(
                 f"{path}: line {line}: got {text!r}, expected "
-                f"{'a date and time' if dates else f'a time in {unit}'}"
+                f"{'a date and time from 1970 to 2261' if dates else f'a time in {unit}'}"
             ) from None
     return tuple(found), "date" if dates else unit
 

@@ -13,7 +13,6 @@ import hashlib
 import logging
 import os
 import threading
-import zipfile
 from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -27,6 +26,7 @@ from numpy.typing import NDArray
 
 from densify.cache.folder import own_folder
 from densify.errors import InputError
+from densify.files.arrays import read_arrays
 from densify.kernels.threads import num_threads
 from densify.street.camera import Picture
 from densify.street.lidar import Returns
@@ -292,9 +292,8 @@ class _Store:
 
 def _read(path: Path) -> Arrays | None:
     try:
-        with np.load(path) as arrays:
-            return {name: arrays[name] for name in arrays.files}
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile):
+        return read_arrays(path)
+    except InputError:
         return None  # not there, or damaged: it is made anew
 
 

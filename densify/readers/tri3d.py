@@ -39,9 +39,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from densify.errors import InputError
+from densify.files.content import read_bytes
+from densify.files.texts import read_json
 from densify.readers.extras import needed
 from densify.readers.file_sequence import FileSequence, Returns, chosen_scene, rigid
-from densify.readers.files import read_bytes, read_json
 from densify.readers.pose_track import PoseTrack
 from densify.types import Camera, Float, Int
 

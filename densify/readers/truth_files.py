@@ -14,24 +14,15 @@ Layout of a ``truth/`` folder, frames numbered as the recording's files are::
 
 from __future__ import annotations
 
-import tokenize
-import zipfile
-import zlib
 from pathlib import Path
 
 import numpy as np
-from numpy.lib.npyio import NpzFile
 from numpy.typing import NDArray
 
 from densify.errors import InputError
+from densify.files.arrays import read_arrays
 from densify.street.bodies import Bodies
 from densify.types import Bool, Float, Float32, SweepTruth
-
-# What numpy raises on damaged files; a flipped bit can ask zipfile for a password (RuntimeError).
-_DAMAGE = (
-    *(KeyError, ValueError, EOFError, OSError, RuntimeError),
-    *(zipfile.BadZipFile, zlib.error, tokenize.TokenError),
-)
 
 
 def write_bodies(folder: Path, bodies: Bodies) -> None:
@@ -126,15 +117,7 @@ class FileTruth:
 
     @staticmethod
     def _load(path: Path, *names: str) -> list[NDArray]:  # type: ignore[type-arg]
-        try:
-            loaded = np.load(path)
-            if not isinstance(loaded, NpzFile):
-                raise ValueError("it holds a single array")
-            with loaded as arrays:
-                return [arrays[name] for name in names]
-        except FileNotFoundError:
-            raise InputError(f"{path}: no such truth file; write the frame again") from None
-        except _DAMAGE as error:
-            raise InputError(
-                f"{path}: not a truth file with {', '.join(names)} ({error}); write it again"
-            ) from error
+        arrays = read_arrays(path, names)
+        if missing := [name for name in names if name not in arrays]:
+            raise InputError(f"{path}: holds no {', '.join(missing)}; write the truth again")
+        return [arrays[name] for name in names]

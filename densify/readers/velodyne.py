@@ -25,6 +25,7 @@ from typing import Any
 import numpy as np
 
 from densify.errors import InputError
+from densify.files.content import open_file
 from densify.readers.extras import needed
 from densify.readers.file_sequence import FileSequence, Returns
 from densify.types import Int
@@ -100,7 +101,7 @@ class Velodyne(FileSequence):
 
     def _returns(self, frame: int) -> tuple[Path, Returns]:
         library, packets = self._library, []
-        with self.where.open("rb") as file:
+        with open_file(self.where) as file:
             for row in self._turns[frame]:
                 file.seek(int(self._packets.begin[row]))
                 captured_s = float(self._packets.captured_ns[row] * 1e-9)
@@ -124,7 +125,7 @@ def _find_packets(path: Path) -> _Packets:
     """Every record of the file whose last bytes are a packet of returns."""
     found = array("q")
     try:
-        with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
+        with open_file(path) as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
             if data[:4] not in _PCAP:
                 raise ValueError(
                     "it does not begin as a .pcap; a .pcapng becomes one with editcap -F pcap"

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from densify.readers.files import read_bytes
+from densify.files.images import image_size_px
 from densify.readers.folder.files import (
     IMAGE_SUFFIXES,
     find_images,
@@ -164,14 +164,11 @@ def _poses(folder: Path) -> str:
 
 
 def _cameras(folder: Path) -> str:
-    import cv2
-
     text = _CAMERAS
     for files in find_images(folder):
         place = folder / files
         first = min(p for p in place.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES)
-        image = cv2.imdecode(np.frombuffer(read_bytes(first), np.uint8), cv2.IMREAD_COLOR)
-        height, width = (0, 0) if image is None else image.shape[:2]
+        width, height = image_size_px(first)
         text += _CAMERA.format(
             name=place.parent.name if place.name in ("data", "images") else place.name,
             files=files,

@@ -33,6 +33,7 @@ from pathlib import Path
 import numpy as np
 
 from densify.errors import InputError
+from densify.files.content import read_bytes
 from densify.geometry import poses
 from densify.readers.file_sequence import (
     FileSequence,
@@ -40,7 +41,7 @@ from densify.readers.file_sequence import (
     quaternion_pose,
     truth_beside,
 )
-from densify.readers.files import format_frames, read_bytes
+from densify.readers.files import format_frames
 from densify.readers.folder.config import CameraFiles, FolderConfig
 from densify.readers.folder.files import (
     IMAGE_SUFFIXES,

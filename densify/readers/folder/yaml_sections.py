@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from densify.errors import InputError
-from densify.readers.files import read_text
+from densify.files.texts import read_yaml
 from densify.types import Float
 
 
@@ -134,36 +134,12 @@ class Section:
 def read_sections(path: Path) -> Section:
     """The whole file as a section, empty if it holds nothing. Raises InputError if it is not YAML
     or not a mapping. Tags that build objects are refused."""
-    import yaml
-
-    text = read_text(path)
-    try:
-        values = yaml.safe_load(text)
-        root = yaml.compose(text, Loader=yaml.SafeLoader)
-    except (yaml.YAMLError, ValueError) as error:  # ValueError: a date that is none, say
-        reason = " ".join(str(error).split())
-        raise InputError(f"{path}: not YAML: {reason}") from error
+    values, lines = read_yaml(path)
     if values is None:
         values = {}
     if not isinstance(values, dict) or not all(isinstance(key, str) for key in values):
         raise InputError(f"{path}: got {values!r:.60}, expected a mapping such as sweeps: {{...}}")
-    lines: dict[str, int] = {}
-    _note_lines(root, "", lines, path)
     return Section(path, "", values, lines)
-
-
-def _note_lines(node: Any, name: str, lines: dict[str, int], path: Path) -> None:
-    import yaml
-
-    if not isinstance(node, yaml.MappingNode):
-        return
-    for key, value in node.value:
-        full = f"{name}.{key.value}" if name else str(key.value)
-        line = key.start_mark.line + 1
-        if full in lines:
-            raise InputError(f"{path}: line {line}: {full} is given twice; keep one")
-        lines[full] = line
-        _note_lines(value, full, lines, path)
 
 
 def _is_number(value: Any) -> bool:

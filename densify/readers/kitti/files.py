@@ -12,7 +12,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from densify.errors import InputError
-from densify.readers.files import read_bytes, read_text
+from densify.files.content import read_bytes
+from densify.files.texts import read_text
+from densify.readers.stamp_files import date_ns
 from densify.types import Camera, Float, Float32, Int
 
 _ORTHONORMAL_TOLERANCE = 1e-3  # calibration files carry seven digits
@@ -108,11 +110,11 @@ class Stamps:
         try:
             if not _STAMP.fullmatch(text):
                 raise ValueError
-            return int(np.datetime64(text, "ns").astype(np.int64))  # never through a float
+            return date_ns(text)
         except ValueError:
             raise InputError(
                 f"{path}: line {index + 1}: got {text!r}, "
-                f"expected a stamp such as 2011-09-26 13:10:51.158069617"
+                f"expected a stamp such as 2011-09-26 13:10:51.158069617, from 1970 to 2261"
             ) from None
 
     def get(self, frame: int) -> int | None:

@@ -22,12 +22,12 @@ from __future__ import annotations
 
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-import yaml
 
 from densify.errors import InputError
+from densify.files.content import read_bytes
+from densify.files.texts import parse_yaml, read_text
 from densify.geometry import poses
 from densify.readers.file_sequence import (
     FileSequence,
@@ -36,7 +36,7 @@ from densify.readers.file_sequence import (
     rigid,
     truth_beside,
 )
-from densify.readers.files import numbered_files, read_bytes, read_text
+from densify.readers.files import numbered_files
 from densify.readers.kitti.files import (
     NOMINAL_PERIOD_NS,
     Calibration,
@@ -179,8 +179,8 @@ def _camera(folder: Path, name: str) -> Camera:
 def _fisheye(path: Path, name: str, T_cam_lidar: Float) -> Camera:
     """OpenCV writes ``%YAML:1.0`` where YAML has ``%YAML 1.0``."""
     text = read_text(path).replace("%YAML:1.0", "", 1)
+    given, _ = parse_yaml(text, path)
     try:
-        given: Any = yaml.safe_load(text)
         lens, onto = given["distortion_parameters"], given["projection_parameters"]
         numbers = [given["mirror_parameters"]["xi"], *(lens[k] for k in ("k1", "k2", "p1", "p2"))]
         fx, fy, cx, cy = (float(onto[k]) for k in ("gamma1", "gamma2", "u0", "v0"))
@@ -188,7 +188,7 @@ def _fisheye(path: Path, name: str, T_cam_lidar: Float) -> Camera:
         width, height = int(given["image_width"]), int(given["image_height"])
         if not np.isfinite([*distortion, fx, fy, cx, cy]).all() or min(fx, fy, width, height) <= 0:
             raise ValueError("a value is not finite or not positive")
-    except (yaml.YAMLError, KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
         what = " ".join(str(error).split())
         raise InputError(
             f"{path}: {what}; expected image_width, image_height, xi, k1 k2 p1 p2, gamma1 gamma2 "

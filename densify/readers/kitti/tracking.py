@@ -22,9 +22,12 @@ from pathlib import Path
 import numpy as np
 
 from densify.errors import InputError
+from densify.files.content import read_bytes
+from densify.files.images import image_size_px
+from densify.files.texts import read_text
 from densify.geometry import poses
 from densify.readers.file_sequence import FileSequence, Returns, chosen_scene, truth_beside
-from densify.readers.files import image_size_px, numbered_files, of_frame, read_bytes, read_text
+from densify.readers.files import numbered_files, of_frame
 from densify.readers.kitti.files import (
     NOMINAL_PERIOD_NS,
     NUM_OXTS_VALUES,

@@ -28,8 +28,8 @@ from pathlib import Path
 import numpy as np
 
 from densify.errors import InputError
+from densify.files.content import read_bytes
 from densify.readers.file_sequence import Returns, chosen_scene
-from densify.readers.files import read_bytes
 from densify.readers.nuscenes.scene import Scene, SceneSequence
 from densify.readers.nuscenes.tables import read_table
 from densify.readers.pose_track import PoseTrack

@@ -12,9 +12,9 @@ from pathlib import Path
 import numpy as np
 
 from densify.errors import InputError
+from densify.files.content import read_bytes
 from densify.geometry.poses import inverse
 from densify.readers.file_sequence import FileSequence, quaternion_pose, truth_beside
-from densify.readers.files import read_bytes
 from densify.readers.nuscenes.tables import Record, find_records, read_table
 from densify.readers.pose_track import PoseTrack
 from densify.types import Camera, Float

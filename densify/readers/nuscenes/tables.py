@@ -18,6 +18,8 @@ from typing import Any
 import numpy as np
 
 from densify.errors import InputError
+from densify.files.content import open_file, reason
+from densify.files.texts import read_json
 from densify.types import Float
 
 _RECORD = re.compile(rb"\{[^{}]*\}")
@@ -66,14 +68,7 @@ class Record:
 
 def read_table(path: Path) -> dict[str, Record]:
     """All records by their token. Raises InputError if the file is missing or no such table."""
-    try:
-        data = path.read_bytes()
-        found = json.loads(data)
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such table; fetch the data set's metadata") from None
-    except (OSError, ValueError) as error:
-        reason = " ".join(str(error).split())
-        raise InputError(f"{path}: not a whole JSON table: {reason}; fetch it again") from error
+    found = read_json(_there(path))
     if not isinstance(found, list) or not all(isinstance(r, dict) for r in found):
         raise InputError(f"{path}: got no list of records, expected [{{...}}, ...]")
     return _by_token(path, found)
@@ -88,19 +83,27 @@ def find_records(path: Path, key: str, wanted: Collection[str]) -> dict[str, Rec
     names = frozenset(name.encode() for name in wanted)
     found = []
     try:
-        with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
+        with (
+            open_file(_there(path)) as file,
+            mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data,
+        ):
             if data[:4096].lstrip()[:1] != b"[" or data[-4096:].rstrip()[-1:] != b"]":
                 raise ValueError("it does not begin with [ or end with ]")
             for match in _RECORD.finditer(data):
                 of = pattern.search(match[0])
                 if of and of[1] in names:
                     found.append(json.loads(match[0]))
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such table; fetch the data set's metadata") from None
-    except (OSError, ValueError) as error:
-        reason = " ".join(str(error).split())
-        raise InputError(f"{path}: not a whole JSON table: {reason}; fetch it again") from error
+    except (OSError, ValueError, RecursionError) as error:
+        raise InputError(
+            f"{path}: not a whole JSON table: {reason(error)}; fetch it again"
+        ) from error
     return _by_token(path, found)
+
+
+def _there(path: Path) -> Path:
+    if not path.exists():
+        raise InputError(f"{path}: no such table; fetch the data set's metadata")
+    return path
 
 
 def _by_token(path: Path, records: list[dict[str, Any]]) -> dict[str, Record]:

@@ -8,7 +8,6 @@ have are refused, so nothing is ever run; the columns are then taken from the no
 
 from __future__ import annotations
 
-import gzip
 import io
 import pickle
 import re
@@ -20,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from densify.errors import InputError
-from densify.readers.files import read_bytes
+from densify.files.content import gunzipped, read_bytes
 
 _NUMBERS = re.compile(r"[fiu][1248]")
 
@@ -77,7 +76,7 @@ def read_columns(path: Path) -> dict[str, NDArray[Any]]:
     """
     data = read_bytes(path)
     try:
-        return _columns(_Unpickler(io.BytesIO(gzip.decompress(data))).load())
+        return _columns(_Unpickler(io.BytesIO(gunzipped(data, path))).load())
     except Exception as error:  # any kind: the file decides which
         raise InputError(
             f"{path}: not a gzipped pandas data frame of numbers ({str(error) or repr(error)}); "

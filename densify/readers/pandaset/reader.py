@@ -34,9 +34,12 @@ from pathlib import Path
 import numpy as np
 
 from densify.errors import InputError
+from densify.files.content import read_bytes
+from densify.files.images import image_size_px
+from densify.files.texts import read_json
 from densify.geometry import poses
 from densify.readers.file_sequence import FileSequence, Returns, quaternion_pose, truth_beside
-from densify.readers.files import image_size_px, numbered_files, read_bytes, read_json
+from densify.readers.files import numbered_files
 from densify.readers.pandaset.pickled_frame import read_columns
 from densify.readers.pose_track import PoseTrack
 from densify.types import Camera, Float, Int

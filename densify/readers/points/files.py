@@ -12,12 +12,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.lib.npyio import NpzFile
 from numpy.typing import NDArray
 
 from densify.errors import InputError
+from densify.files.arrays import read_array, read_arrays
+from densify.files.content import check_size, open_file, read_bytes
 from densify.readers.extras import needed
-from densify.readers.files import read_bytes
 
 Columns = dict[str, NDArray[Any]]
 
@@ -86,7 +86,7 @@ def read_viewpoint(path: Path) -> tuple[float, ...] | None:
     if path.suffix.lower() != ".pcd":
         return None
     try:
-        with path.open("rb") as file:
+        with open_file(path) as file:
             lines = _pcd_header(file)
         values = next((line.split()[1:] for line in lines if line.startswith("VIEWPOINT")), None)
         found = None if values is None else tuple(float(v) for v in values)
@@ -163,16 +163,9 @@ def _told_by_column(rows: NDArray[np.float64]) -> float:
 
 
 def _read_npy(path: Path, names: Sequence[str] | None) -> PointTable:
-    suffix = path.suffix.lower()
-    loaded = np.load(path, allow_pickle=False)
-    if not isinstance(loaded, NpzFile):
-        if suffix == ".npz":
-            raise ValueError("holds a single array; name it .npy")
-        return PointTable(_matrix(loaded, names, path))
-    with loaded as arrays:
-        if suffix == ".npy":
-            raise ValueError("holds an archive of arrays; name it .npz")
-        found = {name: arrays[name] for name in arrays}
+    if path.suffix.lower() == ".npy":
+        return PointTable(_matrix(read_array(path), names, path))
+    found = read_arrays(path)
     if "points" in found:
         return PointTable(_matrix(found.pop("points"), names, path), beside=found)
     if not {"x", "y", "z"} <= found.keys():
@@ -249,13 +242,15 @@ def _pcd_header(file: Any) -> list[str]:
 def _read_pcd(path: Path, names: Sequence[str] | None) -> PointTable:
     from pypcd4 import PointCloud
 
-    with path.open("rb") as file:
-        header = _pcd_header(file)
-        body = file.read()
+    file = io.BytesIO(read_bytes(path))
+    header = _pcd_header(file)
+    body = file.read()
     if header[-1] == "DATA ascii":  # one blank between numbers, none at the end
         body = b"\n".join(b" ".join(line.split()) for line in body.splitlines())
-    if header[-1] == "DATA binary_compressed" and len(body) < 8:
-        raise ValueError("it ends where its points should begin; it is cut off")
+    if header[-1] == "DATA binary_compressed":
+        if len(body) < 8:
+            raise ValueError("it ends where its points should begin; it is cut off")
+        check_size(int.from_bytes(body[4:8], "little"), path)
     cloud = PointCloud.from_fileobj(
         io.BytesIO("\n".join(header).encode() + b"\n" + body)  # type: ignore[arg-type]
     )
@@ -270,8 +265,7 @@ def _read_pcd(path: Path, names: Sequence[str] | None) -> PointTable:
 
 def _read_ply(path: Path, names: Sequence[str] | None) -> PointTable:
     ply = needed("trimesh.exchange.ply", "ply", ".ply files")
-    with path.open("rb") as file:
-        raw = ply.load_ply(file)["metadata"]["_ply_raw"]
+    raw = ply.load_ply(io.BytesIO(read_bytes(path)))["metadata"]["_ply_raw"]
     if "vertex" not in raw:
         raise ValueError(f"holds {', '.join(raw) or 'nothing'}, expected vertices")
     vertex = raw["vertex"]
@@ -285,8 +279,9 @@ def _read_ply(path: Path, names: Sequence[str] | None) -> PointTable:
 def _read_las(path: Path, names: Sequence[str] | None) -> PointTable:
     import laspy
 
-    with laspy.open(path) as file:
+    with laspy.open(open_file(path)) as file:
         num_points = file.header.point_count
+        check_size(num_points * file.header.point_format.size, path)
         cloud = file.read()
     if len(cloud) != num_points:
         raise ValueError(f"got {len(cloud)} points, expected {num_points}; it is cut off")

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from densify.errors import InputError
+from densify.files.images import decode_image
 from densify.readers.file_sequence import rigid
 from densify.types import Camera, Float
 
@@ -95,9 +96,7 @@ def image_rgb(message: Any, where: str) -> NDArray[np.uint8]:
 
     data = np.ascontiguousarray(message.data, np.uint8)
     if hasattr(message, "format"):
-        bgr = cv2.imdecode(data, cv2.IMREAD_COLOR) if len(data) else None
-        if bgr is None:
-            raise InputError(f"{where}: not a complete image ({len(data)} bytes, {message.format})")
+        bgr = decode_image(data.tobytes(), where)
         return np.ascontiguousarray(bgr[:, :, ::-1], dtype=np.uint8)
     encoding = message.encoding.lower()
     if encoding in ("mono16", "16uc1"):
