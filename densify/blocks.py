@@ -9,7 +9,7 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from densify.readers.timeline import Timeline
+from densify.readers.timeline import Timeline, check_window
 
 BLOCK_S = 2.0
 _MARGIN_S = 1.5  # beyond a block within which its motion is found,
@@ -58,6 +58,7 @@ class Cut:
     @staticmethod
     def whole(timeline: Timeline, window: int) -> Cut:
         """Blocks of `BLOCK_S`, counted from time 0, of every sweep that has a stamp."""
+        check_window(window)
         length_ns = round(BLOCK_S * 1e9)
         members: dict[int, list[int]] = {}
         for frame in timeline.frames:

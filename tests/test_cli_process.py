@@ -18,7 +18,7 @@ from typing import Any
 
 import pytest
 
-from densify.cli import main, verbs
+from densify.cli import verbs
 from densify.errors import ComputationError
 from tests.command import exit_code, refused
 
@@ -35,20 +35,119 @@ def test_exit_codes(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixtu
     assert refused(capsys, 1, "info") == "densify: registration: sweep 3 is odd"
     monkeypatch.setattr(verbs, "info", failing(KeyboardInterrupt()))
     assert "interrupted" in refused(capsys, 130, "info")
-    monkeypatch.setattr(verbs, "info", failing(ZeroDivisionError("a bug")))
-    with pytest.raises(ZeroDivisionError):
-        main(["info"])
+    monkeypatch.setattr(verbs, "info", failing(MemoryError()))
+    assert "out of memory; try a smaller --window" in refused(capsys, 1, "info")
+    monkeypatch.setattr(verbs, "info", failing(PermissionError(13, "Permission denied", "/a/b")))
+    assert refused(capsys, 2, "info") == "densify: /a/b: Permission denied"
 
 
-def test_an_unknown_error_keeps_its_traceback() -> None:
-    code = (
-        "import sys; from densify import cli; from densify.cli import verbs\n"
-        "verbs.info = lambda options: 1 / 0\n"
-        "sys.exit(cli.main(['info']))"
+@pytest.mark.parametrize("writable", [True, False], ids=["cache", "no cache"])
+def test_what_nobody_foresaw_is_a_line_and_a_log(writable, monkeypatch, tmp_path, capsys) -> None:
+    folder = tmp_path / "cache"
+    folder.mkdir(mode=0o700 if writable else 0o777)
+    folder.chmod(0o700 if writable else 0o777)  # a folder of everybody's is refused
+    monkeypatch.setenv("DENSIFY_CACHE_DIR", str(folder))
+    monkeypatch.setattr(verbs, "info", failing(ZeroDivisionError("not foreseen")))
+    line = refused(capsys, 1, "info")
+    said = re.fullmatch(
+        r"densify: this is a bug in densify; please report it with the log at (/\S+\.log)", line
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-    assert done.returncode == 1
-    assert "Traceback" in done.stderr and "ZeroDivisionError" in done.stderr
+    assert said is not None
+    log = Path(said[1])
+    assert (folder / "bugs" in log.parents) == writable
+    text = log.read_text()
+    log.unlink()
+    assert "Traceback" in text and "ZeroDivisionError: not foreseen" in text
+    assert text.startswith("densify ") and "command: " in text
+
+
+def command(redirected: str, **environment: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        ["sh", "-c", f"{sys.executable} -m densify {redirected}"],
+        capture_output=True,
+        text=True,
+        env={**os.environ, **environment},
+    )
+
+
+def test_stdout_that_cannot_be_written() -> None:
+    full = command("--version >/dev/full")
+    assert (full.returncode, full.stderr) == (2, "densify: stdout: No space left on device\n")
+    for redirected in ("--version >&-", "--version >&- 2>&- <&-"):
+        closed = command(redirected)
+        assert (closed.returncode, closed.stdout, closed.stderr) == (0, "", "")
+    assert command("info --data nowhere 2>&-").returncode == 2
+    assert command("info --data nowhere 2>/dev/full").returncode == 2
+
+
+def test_a_terminal_of_ascii_only() -> None:
+    done = command("run --help", PYTHONIOENCODING="ascii", PYTHONUTF8="0")
+    assert done.returncode == 0 and "\\u2026" in done.stdout and done.stderr == ""
+
+
+def test_warnings_of_others_are_not_shown(monkeypatch, capsys) -> None:
+    import warnings
+
+    def warn(_: Any) -> None:
+        warnings.warn("divide by zero encountered", RuntimeWarning, stacklevel=1)
+
+    monkeypatch.setattr(verbs, "info", warn)
+    assert exit_code("info") == 0
+    assert capsys.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (("run", "--key", "120", "--window", "9" * 19), "argument --window: got '999"),
+        (("run", "--key", "1" * 5000), "argument --key: got '1111"),
+        (("run", "--key", "120", "--cache-size", "1e300T"), "got '1e300T', expected a size"),
+        (("dataset", "--out", "x", "--memory", "1e300T"), "got '1e300T', expected a size"),
+        (("dataset", "--out", "x", "--memory", "nanG"), "expected a number above 0"),
+        (("info", "--data", "street?seed=1&seed=2"), "an option is given twice"),
+        (("info", "--data", f"street?seed={'1' * 5000}"), "of up to 18 digits"),
+        (("info", "--data", "x" * 5000), "File name too long"),
+        (("evaluate", "x" * 5000, "y"), "File name too long"),
+        (("flow", f"{'x' * 5000}.npy", "y.npy"), "File name too long"),
+        (("run", "--key", "120", "--prior", "x" * 5000), "File name too long"),
+        (("run", "--key", "120", "--config", "x" * 5000), "File name too long"),
+        (("export", "x" * 5000), "File name too long"),
+        (("dataset", "--status", "x" * 5000), "File name too long"),
+        (("dataset", "--out", "x" * 5000), "File name too long"),
+    ],
+    ids=lambda value: " ".join(value)[:60] if isinstance(value, tuple) else "",
+)
+def test_hostile_arguments_are_refused_in_a_line(arguments, says, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    line = refused(capsys, 2, *arguments)
+    assert says in line and len(line) < 1100
+    assert not any(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("option", "says"),
+    [
+        (("--workers", "0"), "--workers 0: expected 1 or more"),
+        (("--scheduler", "x"), "scheduler x: "),
+        (("--memory", "1K"), "--memory: got 0.0 GB, expected at least"),
+    ],
+    ids=str,
+)
+def test_a_set_is_not_begun_before_all_is_known_to_fit(option, says, capsys, tmp_path):
+    out = tmp_path / "set"
+    assert says in refused(capsys, 2, "dataset", "--out", out, "--keys", "100:102", *option)
+    assert not out.exists()
+
+
+def test_arguments_of_python_of_a_wrong_kind() -> None:
+    import densify
+    from densify.errors import InputError
+
+    street = densify.open_sequence("street")
+    with pytest.raises(InputError, match=r"--window '1': expected a whole number"):
+        densify.run(street, 120, "1")
+    with pytest.raises(InputError, match=r"cameras: got 'image_02', expected a list"):
+        densify.run(street, 120, 1, cameras="image_02")
 
 
 def test_warnings_are_one_line_on_stderr(
@@ -124,7 +223,7 @@ def test_interrupt_leaves_nothing(tmp_path: Path) -> None:
     assert process.returncode == 130, stderr
     assert stdout == ""
     errors = [x for x in stderr.splitlines() if not x.startswith("densify: warning: ")]
-    assert errors == ["densify: interrupted; nothing was kept of the unfinished result"]
+    assert errors == ["densify: interrupted; what was unfinished is not kept"]
     assert not list(tmp_path.iterdir())
 
 

@@ -294,7 +294,7 @@ def listening(pid: int) -> set[str]:
 
 
 def test_no_workers_are_refused() -> None:
-    with pytest.raises(InputError, match=r"workers: got 0, expected 1 or more"), open_workers(0):
+    with pytest.raises(InputError, match=r"--workers 0: expected 1 or more"), open_workers(0):
         pass
 
 
@@ -488,7 +488,7 @@ def test_an_interrupt_ends_all(tmp_path: Path) -> None:
         pids = [pid_in(tmp_path / f"{n}.pid") for n in range(2)]
         os.killpg(process.pid, signal.SIGINT)  # as from a terminal: to the workers too
         said = process.communicate(timeout=PATIENCE_S)
-    told = "densify: interrupted; nothing was kept of the unfinished result\n"
+    told = "densify: interrupted; what was unfinished is not kept\n"
     assert (process.returncode, *said) == (130, "5\n", told)
     assert all(map(is_gone, pids))
 

@@ -7,6 +7,7 @@ load numpy and heavier things are imported by the verb that needs them, so that 
 
 from __future__ import annotations
 
+import io
 import os
 import sys
 from collections.abc import Sequence
@@ -22,8 +23,8 @@ DONE, FAILED, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command and return its exit code.
 
-    0 done; 1 a ComputationError; 2 an InputError (argparse exits with 2 as well); 130 interrupted.
-    Anything else is a bug and keeps its traceback.
+    0 done; 1 a ComputationError, or anything unforeseen, whose traceback is put into a file; 2 an
+    InputError or what the system refuses (argparse exits with 2 as well); 130 interrupted.
     """
     with logging_to_stderr() as log:
         try:
@@ -35,16 +36,28 @@ def main(arguments: Sequence[str] | None = None) -> int:
             log.error("%s", error)
             return FAILED
         except KeyboardInterrupt:
-            log.error("interrupted; nothing was kept of the unfinished result")
+            log.error("interrupted; what was unfinished is not kept")
             return INTERRUPTED
         except BrokenPipeError:
-            # The reader of stdout has seen enough; keep the interpreter from flushing into it.
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            _let_go_of_stdout()  # its reader has seen enough
+        except OSError as error:
+            _let_go_of_stdout()
+            log.error("%s: %s", error.filename or "stdout", error.strerror or error)
+            return BAD_INPUT
+        except MemoryError:
+            log.error("out of memory; try a smaller --window, fewer --workers or one --camera")
+            return FAILED
+        except Exception as error:
+            from densify.cli.bugs import kept
+
+            log.error("this is a bug in densify; please report it with the log at %s", kept(error))
+            return FAILED
     return DONE
 
 
 def script() -> NoReturn:
     """`main` as a process of its own: the console script and ``python -m densify``."""
+    _open_what_is_closed()
     # Work is shared out among our own threads; OpenBLAS's would wait beside them in busy loops.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     code = main()
@@ -54,6 +67,29 @@ def script() -> NoReturn:
         sys.stderr.flush()
         os._exit(code)
     sys.exit(code)
+
+
+def _open_what_is_closed() -> None:
+    """Standard streams that the caller has closed: else the first file opened would take their
+    place. What a terminal's encoding lacks is shown by its number."""
+    for number in range(3):
+        try:
+            os.fstat(number)
+        except OSError:
+            os.open(os.devnull, os.O_RDWR)
+    sys.stdout = sys.stdout or os.fdopen(1, "w", closefd=False)
+    sys.stderr = sys.stderr or os.fdopen(2, "w", closefd=False)
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
+
+
+def _let_go_of_stdout() -> None:
+    """Keep the interpreter from flushing once more into what cannot be written."""
+    try:
+        sys.stdout.flush()
+    except OSError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _run(arguments: Sequence[str] | None) -> None:

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NoReturn
@@ -29,6 +30,7 @@ from densify.cli.options import (
     size_bytes,
     words,
 )
+from densify.errors import brief
 from densify.version import __version__
 
 
@@ -60,8 +62,13 @@ class _Parser(argparse.ArgumentParser):
     def __init__(self, **options: Any) -> None:
         super().__init__(**options, allow_abbrev=False)
 
+    def _print_message(self, message: str, file: Any = None) -> None:
+        """As argparse has it, but where it cannot be written that is said."""
+        if message:
+            print(message, end="", file=file or sys.stderr)
+
     def error(self, message: str) -> NoReturn:
-        self.exit(2, f"densify: {message}; see {self.prog} --help\n")
+        self.exit(2, f"densify: {brief(message)}; see {self.prog} --help\n")
 
 
 def _add_run(commands: Any) -> None:

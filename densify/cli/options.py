@@ -12,6 +12,8 @@ from typing import Any
 from densify.config import presets
 from densify.plugins.engines import described
 
+_MOST_DIGITS = 18
+_UNITS = ("K", "M", "G", "T")
 DATA_HELP = (
     "a recording's folder, READER:PATH, or the built-in "
     "street[:PRESET][?seed=N&sensor=NAME&hz=RATE&tilt=DEG] (default: street)"
@@ -135,7 +137,7 @@ def add_overwrite(parser: argparse.ArgumentParser) -> None:
 
 def natural(text: str) -> int:
     """A whole number from 0 up."""
-    if not text.isascii() or not text.isdigit():
+    if not _are_digits(text):
         raise argparse.ArgumentTypeError(f"got {text!r}, expected a whole number from 0 up")
     return int(text)
 
@@ -159,7 +161,7 @@ def words(text: str) -> list[str]:
 def frame_range(text: str) -> range:
     """``A:B``, frames A to B-1."""
     first, colon, end = text.partition(":")
-    if not (colon and first.isdigit() and end.isdigit() and int(first) < int(end)):
+    if not (colon and _are_digits(first, end) and int(first) < int(end)):
         raise argparse.ArgumentTypeError(
             f"got {text!r}, expected A:B with A < B, for example 115:126 for frames 115 to 125"
         )
@@ -171,7 +173,7 @@ def key_slice(text: str) -> slice | None:
     if text == "all":
         return None
     numbers = text.split(":")
-    if len(numbers) in (2, 3) and all(n.isascii() and n.isdigit() for n in numbers):
+    if len(numbers) in (2, 3) and _are_digits(*numbers):
         first, end = int(numbers[0]), int(numbers[1])
         step = int(numbers[2]) if len(numbers) == 3 else 1
         if first < end and step > 0:
@@ -185,8 +187,7 @@ def key_slice(text: str) -> slice | None:
 def shard(text: str) -> tuple[int, int]:
     """``i/n`` with i from 1 to n."""
     i, slash, n = text.partition("/")
-    numbers = slash and (i + n).isascii() and i.isdigit() and n.isdigit()
-    if numbers and 1 <= int(i) <= int(n):
+    if slash and _are_digits(i, n) and 1 <= int(i) <= int(n):
         return int(i), int(n)
     raise argparse.ArgumentTypeError(f"got {text!r}, expected i/n with i from 1 to n, as in 2/4")
 
@@ -194,6 +195,13 @@ def shard(text: str) -> tuple[int, int]:
 def size_bytes(text: str) -> int:
     """A size such as 8G, in powers of 1024."""
     number, unit = text[:-1], text[-1:].upper()
-    if unit in ("K", "M", "G", "T"):
-        return int(positive(number) * 1024 ** (1 + "KMGT".index(unit)))
-    raise argparse.ArgumentTypeError(f"got {text!r}, expected a size such as 8G or 500M")
+    size = positive(number) * 1024.0 ** (1 + "KMGT".index(unit)) if unit in _UNITS else 0
+    if not 1 <= size <= 1024**5:
+        raise argparse.ArgumentTypeError(
+            f"got {text!r}, expected a size such as 8G or 500M, up to 1024T"
+        )
+    return int(size)
+
+
+def _are_digits(*texts: str) -> bool:
+    return all(t.isascii() and t.isdigit() and len(t) <= _MOST_DIGITS for t in texts)

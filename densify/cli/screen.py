@@ -6,9 +6,12 @@ from __future__ import annotations
 import logging
 import sys
 import time
+import warnings
 from collections.abc import Iterator
-from contextlib import contextmanager
-from typing import TYPE_CHECKING
+from contextlib import contextmanager, suppress
+from typing import TYPE_CHECKING, Any
+
+from densify.errors import brief
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -25,12 +28,18 @@ class _LineHandler(logging.Handler):
 
     def emit(self, record: logging.LogRecord) -> None:
         level = "warning: " if record.levelno == logging.WARNING else ""
-        line = f"densify: {level}{' '.join(record.getMessage().split())}"
+        line = f"densify: {level}{brief(' '.join(record.getMessage().split()))}"
         bars = sys.modules.get("tqdm")
-        if bars is None:
-            print(line, file=sys.stderr, flush=True)
-        else:
-            bars.tqdm.write(line, file=sys.stderr)
+        with suppress(OSError, ValueError):  # full or closed: there is nobody to tell
+            if bars is None:
+                print(line, file=sys.stderr, flush=True)
+            else:
+                bars.tqdm.write(line, file=sys.stderr)
+
+
+def _log_warning(message: Warning | str, category: type[Warning], *where: Any) -> None:
+    """What numpy and others warn of is for who mends this package."""
+    logging.getLogger("densify").debug("%s: %s (%s:%s)", category.__name__, message, *where[:2])
 
 
 @contextmanager
@@ -44,7 +53,9 @@ def logging_to_stderr() -> Iterator[logging.Logger]:
     log.propagate = False
     progress.setLevel(logging.INFO if sys.stderr.isatty() else logging.WARNING)
     try:
-        yield log
+        with warnings.catch_warnings():
+            warnings.showwarning = _log_warning  # type: ignore[assignment]
+            yield log
     finally:
         log.removeHandler(handler)
         log.setLevel(before[0])

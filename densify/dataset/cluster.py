@@ -25,42 +25,56 @@ _log = logging.getLogger("densify")
 _CONNECT_S = 10
 
 
-@contextmanager
-def connected(scheduler: str) -> Iterator[Workers]:
-    """scheduler: its address; how ``tls://`` shows who it is says Dask's own configuration.
-
-    Raises InputError if it cannot be used.
-    """
+def check_reached(scheduler: str) -> None:
+    """Raise InputError unless a Dask scheduler answers at this address."""
     if not _has_distributed():
         raise InputError(
             f"scheduler {scheduler}: needs Dask, which is not installed; "
             "pip install 'densify[cluster]'"
         )
-    from distributed import Client, Security
+    from distributed import Security
     from distributed.core import connect
 
     async def reach() -> None:
         arguments = Security().get_connection_args("client")
         await (await connect(scheduler, timeout=_CONNECT_S, **arguments)).close()
 
+    with _silent_dask():
+        try:
+            asyncio.run(reach())
+        except Exception as error:  # whatever it is that answers there
+            raise _not_reached(scheduler, error) from error
+
+
+@contextmanager
+def connected(scheduler: str) -> Iterator[Workers]:
+    """scheduler: its address; how ``tls://`` shows who it is says Dask's own configuration.
+
+    Raises InputError if it cannot be used.
+    """
+    check_reached(scheduler)  # first, for a client that failed to start is hard to get rid of
+    from distributed import Client
+
     with ExitStack() as stack:
         stack.enter_context(_silent_dask())
         try:
-            asyncio.run(reach())  # first, for a client that failed to start is hard to get rid of
             client = Client(scheduler, timeout=_CONNECT_S, set_as_default=False)
-        except Exception as error:  # whatever it is that answers there
-            expected = "the address of a running Dask scheduler, such as tcp://host:8786"
-            if scheduler.startswith("tls://"):
-                expected += (
-                    "; for tls://, Dask's configuration has to name certificates that the "
-                    "scheduler trusts (distributed.comm.tls.ca-file, .client.cert, .client.key)"
-                )
-            raise InputError(
-                f"scheduler {scheduler}: not reached within {_CONNECT_S} s ({error}), expected "
-                f"{expected}"
-            ) from error
+        except Exception as error:
+            raise _not_reached(scheduler, error) from error
         stack.enter_context(client)
         yield _Cluster(client, scheduler)
+
+
+def _not_reached(scheduler: str, error: Exception) -> InputError:
+    expected = "the address of a running Dask scheduler, such as tcp://host:8786"
+    if scheduler.startswith("tls://"):
+        expected += (
+            "; for tls://, Dask's configuration has to name certificates that the scheduler trusts "
+            "(distributed.comm.tls.ca-file, .client.cert, .client.key)"
+        )
+    return InputError(
+        f"scheduler {scheduler}: not reached within {_CONNECT_S} s ({error}), expected {expected}"
+    )
 
 
 class _Cluster(Workers):

@@ -34,7 +34,7 @@ from densify.dataset.plan import (
 )
 from densify.dataset.tasks import Outcome, Task, run_tasks
 from densify.dataset.work import Job, tasks
-from densify.dataset.workers import open_workers
+from densify.dataset.workers import check_workers, open_workers
 from densify.errors import ComputationError, InputError, OutputError
 from densify.flow.engines import check_engine
 from densify.outputs.atomic import clear_leftovers
@@ -124,6 +124,8 @@ def make_dataset(
     drives = plan(data, keys, recipe)
     check_place(out)
     steps_folder()
+    check_workers(num_workers, scheduler)
+    num_processes = _num_processes(num_workers, memory_bytes, recipe, drives)
     with Manifest(out, shard) as manifest:
         write_plan(out, recipe, drives)
         with _log_file(out, shard):
@@ -132,7 +134,6 @@ def make_dataset(
             drives = _part(drives, shard)
             done = _Done(out, drives, report, verify)
             left = done.left(drives)
-            num_processes = _num_processes(num_workers, memory_bytes, recipe, drives)
             _announce(out, recipe, left, done.summary().num_keys, num_processes)
             todo = _tasks(left, recipe, out, cache_bytes)
             try:

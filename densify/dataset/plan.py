@@ -30,7 +30,7 @@ from densify.outputs.atomic import make_folder, write_file
 from densify.outputs.kitti_tree import drive_folder, split_of
 from densify.readers import Spec, open_sequence
 from densify.readers.files import format_frames, runs
-from densify.readers.timeline import Timeline
+from densify.readers.timeline import Timeline, check_window
 from densify.readers.window import choose_cameras
 from densify.types import Camera, LidarSequence
 from densify.version import __version__
@@ -63,7 +63,8 @@ class Recipe:
     config: Config = field(default_factory=Config)
 
     def __post_init__(self) -> None:
-        if not 0 <= self.window <= _LARGEST_WINDOW:
+        check_window(self.window)
+        if self.window > _LARGEST_WINDOW:
             raise InputError(f"--window {self.window}: expected 0 to {_LARGEST_WINDOW} sweeps")
         if self.layout == "kitti-depth" and self.config.project.per == "image":
             raise InputError(

@@ -11,10 +11,18 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from densify.dataset.cluster import connected
+from densify.dataset.cluster import check_reached, connected
 from densify.dataset.processes import open_processes
 from densify.dataset.tasks import InThisProcess, Workers
 from densify.errors import InputError
+
+
+def check_workers(num_workers: int, scheduler: str | None) -> None:
+    """Raise InputError, before anything is begun, for what `open_workers` would refuse."""
+    if scheduler is not None:
+        check_reached(scheduler)
+    elif num_workers < 1:
+        raise InputError(f"--workers {num_workers}: expected 1 or more processes")
 
 
 @contextmanager
@@ -34,9 +42,9 @@ def open_workers(
     if scheduler is not None:
         with connected(scheduler) as workers:
             yield workers
-    elif num_workers < 1:
-        raise InputError(f"workers: got {num_workers}, expected 1 or more")
-    elif num_workers == 1:
+        return
+    check_workers(num_workers, scheduler)
+    if num_workers == 1:
         yield InThisProcess()
     else:
         with open_processes(num_workers, memory_bytes) as workers:

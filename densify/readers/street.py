@@ -41,6 +41,7 @@ _log = logging.getLogger("densify")
 _progress = logging.getLogger("densify.progress")
 _KEPT_IN_MEMORY = 16
 _RATES_HZ = ("5", "10", "20")
+_SEED_DIGITS = 18
 _MAX_TILT_DEG = 45
 _NO_CAMERA = "none"
 
@@ -106,15 +107,19 @@ class Street:
                 f"{spec!r}: expected street[:PRESET][?seed=N&sensor=NAME&hz=RATE&tilt=DEG"
                 f"&cameras=NAME,NAME]"
             )
-        options = dict(parse_qsl(query, keep_blank_values=True))
+        given = parse_qsl(query, keep_blank_values=True)
+        options = dict(given)
         for key in options:
             _choice("option", key, ("seed", "sensor", "hz", "tilt", "cameras"))
+        if len(options) < len(given):
+            raise InputError(f"{spec!r}: an option is given twice; keep one of each")
         seed, hz, tilt = (
             options.get(k, v) for k, v in (("seed", "0"), ("hz", "10"), ("tilt", "0"))
         )
-        if not (seed.isascii() and seed.isdigit()):
+        if not (seed.isascii() and seed.isdigit() and len(seed) <= _SEED_DIGITS):
             raise InputError(
-                f"street seed {seed!r}: expected a whole number from 0, as in street?seed=7"
+                f"street seed {seed!r}: expected a whole number from 0, of up to {_SEED_DIGITS} "
+                f"digits, as in street?seed=7"
             )
         _choice("hz", hz, _RATES_HZ)
         cameras = options.get("cameras", ",".join(USUAL))

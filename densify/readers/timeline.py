@@ -30,6 +30,15 @@ class WindowFrames(NamedTuple):
     cuts: tuple[str, ...]
 
 
+def check_window(window: int) -> None:
+    """Raise InputError unless it is a number of sweeps on each side of a key."""
+    if not isinstance(window, int | np.integer) or window < 0:
+        raise InputError(
+            f"--window {window!r}: expected a whole number of sweeps on each side of the key, 0 or "
+            f"more"
+        )
+
+
 @dataclass(frozen=True)
 class Timeline:
     """name: of the recording. frames: (n,) of all its sweeps, ascending. stamp_ns: (n,) int64
@@ -113,8 +122,7 @@ class Timeline:
 
         left_out: frame -> why it cannot be used. Raises InputError if the key does not exist.
         """
-        if window < 0:
-            raise InputError(f"--window {window}: expected 0 or more sweeps on each side")
+        check_window(window)
         if key not in self.row:
             raise InputError(
                 f"--key {key}: no such frame in {self.name}; it has {format_frames(self.frames)}"

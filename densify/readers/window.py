@@ -27,6 +27,8 @@ def read_sweep(sequence: LidarSequence, frame: int, settings: RegisterSettings) 
 
 def choose_cameras(sequence: LidarSequence, names: Sequence[str] | None) -> list[Camera]:
     """The cameras of these names, all if None. Raises InputError naming those that exist."""
+    if isinstance(names, str):
+        raise InputError(f"cameras: got {names!r}, expected a list of names, such as [{names!r}]")
     for name in names or ():
         if name not in sequence.cameras:
             known = ", ".join(sequence.cameras) or "none"
