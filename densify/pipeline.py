@@ -25,6 +25,7 @@ from densify.costs import Watch
 from densify.depth.age import with_ages
 from densify.depth.exposure import Shot, key_shots, load_images
 from densify.depth.views import HeldOut, SeenCloud, Views
+from densify.doubts import with_doubts
 from densify.errors import ComputationError, InputError
 from densify.flow.engines import check_engine
 from densify.geometry.range_image import RangeImage
@@ -213,10 +214,11 @@ def densify(
     beyond = None
     if any(METHODS[name].far for name in methods):
         beyond = recording.standing(key)
-    return _results(
+    made = _results(
         *(sequence, stretch, key, moments, beyond, shots, images, with_images, found),
         *(settings, watch),
     )
+    return with_doubts(made, sequence, stretch, shots, settings)
 
 
 def _open_priors(

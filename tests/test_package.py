@@ -182,7 +182,7 @@ FLOORS = (
     ("registration", "depth", "flow", "scores", "street"),
     ("readers",),
     ("outputs", "writers"),
-    ("blocks", "completion", "sweeps"),
+    ("blocks", "completion", "doubts", "sweeps"),
     ("road",),
     ("recording",),
     ("pipeline",),

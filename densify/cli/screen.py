@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 from densify.errors import brief
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Mapping, Sequence
     from pathlib import Path
 
     from densify.dataset.make import Summary
@@ -124,3 +124,12 @@ def print_paths(paths: list[Path]) -> None:
     """One to a line, on stdout."""
     for path in paths:
         print(path)
+
+
+def tell_doubts(doubts: Mapping[str, Sequence[int]]) -> None:
+    """At the end, each once; doubts: warning -> keys."""
+    from densify.readers.files import format_frames
+
+    for warning, keys in doubts.items():
+        where = f"key {format_frames(keys)}"
+        logging.getLogger("densify").warning("%s: %s", where, warning)

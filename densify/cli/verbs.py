@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import densify
-from densify.cli.screen import keys_on_stderr, print_paths, progress_on_stderr
+from densify.cli.screen import keys_on_stderr, print_paths, progress_on_stderr, tell_doubts
 from densify.config import as_mapping, resolve
 from densify.errors import ComputationError, InputError
 
@@ -30,6 +30,7 @@ def run(options: argparse.Namespace) -> None:
     for key in keys:
         check_writable(options.out, key, options.overwrite, "run", config.output.also)
     failed: dict[int, Exception] = {}
+    doubts: dict[str, list[int]] = {}
     with progress_on_stderr() as progress:
         made = pipeline.run_keys(
             sequence,
@@ -57,6 +58,9 @@ def run(options: argparse.Namespace) -> None:
             )
             print(summary(result))
             print_paths(paths)
+            for warning in result.warnings:
+                doubts.setdefault(warning, []).append(key)
+    tell_doubts(doubts)
     if len(keys) == 1 and failed:
         raise failed[keys[0]]
     if failed:
@@ -95,6 +99,7 @@ def compare(options: argparse.Namespace) -> None:
     )
     print(comparison(results))
     print_paths(paths)
+    tell_doubts({w: [options.key] for r in results.values() for w in r.warnings})
 
 
 def dataset(options: argparse.Namespace) -> None:

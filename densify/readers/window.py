@@ -26,7 +26,8 @@ def read_sweep(sequence: LidarSequence, frame: int, settings: RegisterSettings) 
 
 
 def choose_cameras(sequence: LidarSequence, names: Sequence[str] | None) -> list[Camera]:
-    """The cameras of these names, all if None. Raises InputError naming those that exist."""
+    """The cameras of these names; if None all with images, or simply all where none has any.
+    Raises InputError naming those that exist."""
     if isinstance(names, str):
         raise InputError(f"cameras: got {names!r}, expected a list of names, such as [{names!r}]")
     for name in names or ():
@@ -35,7 +36,9 @@ def choose_cameras(sequence: LidarSequence, names: Sequence[str] | None) -> list
             raise InputError(
                 f"--camera {name}: no such camera in {sequence.name}; expected one of {known}"
             )
-    return [sequence.cameras[n] for n in (sequence.cameras if names is None else names)]
+    if names is None:
+        names = [n for n in sequence.cameras if sequence.image_stamps_ns(n)] or [*sequence.cameras]
+    return [sequence.cameras[name] for name in names]
 
 
 def recorded_trajectory(sequence: LidarSequence, sweeps: Sequence[Sweep]) -> Trajectory:

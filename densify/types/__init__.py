@@ -13,6 +13,7 @@ from densify.types.prior import FullDepth, Prior, PriorFit
 from densify.types.recordings import (
     KnowsFiles,
     KnowsImagePoses,
+    KnowsItsGaps,
     LidarSequence,
     MakesFrames,
     SaysWhatItFound,
@@ -34,6 +35,7 @@ __all__ = [
     "Int",
     "KnowsFiles",
     "KnowsImagePoses",
+    "KnowsItsGaps",
     "LidarSequence",
     "MakesFrames",
     "Motion",

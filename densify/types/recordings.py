@@ -100,6 +100,15 @@ class SaysWhatItFound(Protocol):
 
 
 @runtime_checkable
+class KnowsItsGaps(Protocol):
+    """A sequence that can do without some of its files; a reader may have this member."""
+
+    def gaps(self) -> Sequence[str]:
+        """What is missing and what is assumed instead, a sentence each."""
+        ...
+
+
+@runtime_checkable
 class MakesFrames(Protocol):
     """A sequence that has to make its sweeps and images, which takes long; a reader may have this
     member."""

@@ -40,7 +40,7 @@ class Result:
     (H,W,2) pixels to the "previous" and the "next" image (``output.optical_flow``). rejected: name
     -> (H,W) `Reason` of what was left out (``output.rejected``). full: of the maps that a prior was
     given for. images: name -> (H,W,3) RGB, of
-    the maps whose image there is.
+    the maps whose image there is. warnings: what was assumed or looks wrong, a sentence each.
     """
 
     method: str
@@ -58,3 +58,4 @@ class Result:
     full: Mapping[str, FullDepth] = field(default_factory=dict)
     images: Mapping[str, NDArray[np.uint8]] = field(default_factory=dict)
     far_frames: tuple[int, ...] = ()
+    warnings: tuple[str, ...] = ()

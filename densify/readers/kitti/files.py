@@ -97,7 +97,7 @@ class Stamps:
     @staticmethod
     def read(path: Path) -> Stamps | None:
         """None if there is no such file."""
-        if not path.is_file():
+        if not path.exists():
             return None
         lines = read_text(path).splitlines()
         return Stamps(path, tuple(Stamps._parse(path, i, line) for i, line in enumerate(lines)))
@@ -182,6 +182,11 @@ class Calibration:
         return T
 
 
+def camera_folders(drive: Path) -> list[str]:
+    """Names of the cameras that have a folder in the drive."""
+    return sorted(p.name for p in drive.glob("image_[0-9][0-9]") if p.is_dir())
+
+
 def read_cameras(drive: Path) -> dict[str, Camera]:
     """Cameras by name: those with a folder in the drive and a rectified calibration in its parent.
 
@@ -189,7 +194,7 @@ def read_cameras(drive: Path) -> dict[str, Camera]:
     ``T_cam_lidar`` is camera 0's rectification after ``calib_velo_to_cam``, moved by the camera's
     offset in ``P_rect``. Empty for a drive without image folders.
     """
-    names = sorted(p.name for p in drive.glob("image_[0-9][0-9]") if p.is_dir())
+    names = camera_folders(drive)
     if not names:
         return {}
     folder = drive.resolve().parent

@@ -24,6 +24,7 @@ from densify.readers.kitti.files import (
     Calibration,
     Stamps,
     T_mercator_imu,
+    camera_folders,
     check_oxts,
     mercator_scale,
     parse_numbers,
@@ -83,6 +84,21 @@ class KittiRaw(FileSequence):
             truth_beside(drive),
             self._sweeps,
         )
+
+    def gaps(self) -> list[str]:
+        """See `densify.types.KnowsItsGaps`."""
+        velodyne = self.where / "velodyne_points"
+        stamps = (self._stamps, self._start_stamps, self._end_stamps)
+        names = [f"timestamps{part}.txt" for part in ("", "_start", "_end")]
+        missing = [n for n, found in zip(names, stamps, strict=True) if found is None]
+        told = [f"{velodyne} has no {', '.join(missing)}"] if missing else []
+        if self._stamps is None:
+            told.append(f"{velodyne} has no timestamps.txt: sweeps are taken for 100 ms apart")
+        left_out = [name for name in camera_folders(self.where) if name not in self.cameras]
+        return told + [
+            f"{name} is left out: calib_cam_to_cam.txt has no P_rect_{name[-2:]}"
+            for name in left_out
+        ]
 
     def stamp_ns(self, frame: int) -> int:
         """Reference time of a sweep. Raises InputError for a frame without a stamp."""

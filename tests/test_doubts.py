@@ -1,0 +1,157 @@
+# SPDX-License-Identifier: MIT
+"""A run says what it had to assume, and what looks wrong about its calibration and its clocks."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import yaml
+
+from densify.outputs import write_result
+from densify.pipeline import run
+from densify.readers.kitti.raw import KittiRaw
+from densify.readers.window import choose_cameras
+from densify.types import Camera
+from tests.command import exit_code
+from tests.scenes import CAMERA, TinySequence, stamp_ns
+from tests.small_street import KEY, POSES_GIVEN, one_car
+
+
+class Changed(TinySequence):
+    """The small street with other cameras, image stamps (ms after the first sweep) and times of
+    points."""
+
+    def __init__(self, cameras=(CAMERA,), images_ms=None, times=None):
+        usual = one_car()
+        super().__init__(usual.scene, usual.frames)
+        self.cameras = {camera.name: camera for camera in cameras}
+        self._images_ms, self._times = images_ms, times
+
+    def image_stamps_ns(self, camera):
+        if self._images_ms is None:
+            return super().image_stamps_ns(CAMERA.name)
+        return {n: stamp_ns(0) + ms * 10**6 for n, ms in self._images_ms.get(camera, {}).items()}
+
+    def image(self, camera, number):
+        return np.zeros((CAMERA.height_px, CAMERA.width_px, 3), np.uint8)
+
+    def __getitem__(self, frame):
+        sweep = super().__getitem__(frame)
+        return sweep if self._times is None else replace(sweep, offset_ns=self._times(sweep))
+
+    def gaps(self):
+        return ["a file is missing"] if self._times is None else []
+
+
+def moved(T_change) -> Camera:
+    return replace(CAMERA, T_cam_lidar=T_change @ CAMERA.T_cam_lidar)
+
+
+def in_millimetres() -> Camera:
+    T = CAMERA.T_cam_lidar.copy()
+    T[:3, 3] = 1000 * T[:3, 3] + [0, -200.0, 0]
+    return replace(CAMERA, T_cam_lidar=T)
+
+
+def warnings_of(sequence, **options) -> tuple[str, ...]:
+    return run(sequence, KEY, 1, "icp", config=POSES_GIVEN, **options).warnings
+
+
+def test_nothing_is_said_of_what_is_right():
+    assert warnings_of(one_car()) == ()
+
+
+@pytest.mark.parametrize(
+    ("sequence", "says"),
+    [
+        (lambda: Changed(), "a file is missing"),
+        (lambda: Changed([in_millimetres()]), "is the translation in metres?"),
+        (lambda: Changed([replace(CAMERA, T_cam_lidar=np.eye(4))]), "looks up by 90 deg"),
+        (lambda: Changed(times=lambda sweep: None), "the points have no times of their own"),
+        (
+            lambda: Changed(times=lambda sweep: np.linspace(0, 5e9, len(sweep)).astype(np.int64)),
+            "a sweep takes 5000 ms by the times of its points, and the next comes after 100 ms",
+        ),
+        (
+            lambda: Changed(images_ms={"front": {0: 10**12}}),
+            "front: no image belongs to the sweep, the nearest was taken 1e+09 s away",
+        ),
+        (
+            lambda: Changed([moved(np.diag([1.0, -1, -1, 1]) @ shifted(0, 500, 0))]),
+            "0.00 % of the pixels have a measured depth",
+        ),
+        (
+            lambda: Changed([CAMERA, replace(CAMERA, name="rear")], {"front": {3: 300}}),
+            "rear is left out: the recording has no images of it",
+        ),
+    ],
+)
+def test_what_looks_wrong_is_said(sequence, says, tmp_path):
+    result = run(sequence(), KEY, 1, "icp", config=POSES_GIVEN)
+    assert sum(says in warning for warning in result.warnings) == 1, result.warnings
+    write_result(result, result.images, tmp_path, config={}, data="tiny")
+    record = yaml.safe_load((tmp_path / f"{KEY:06d}" / "run.yaml").read_text())
+    assert set(result.warnings) <= set(record["warnings"])
+
+
+def shifted(*by_m: float) -> np.ndarray:
+    T = np.eye(4)
+    T[:3, 3] = by_m
+    return T
+
+
+def test_times_that_were_not_wanted_are_not_missed():
+    config = {**POSES_GIVEN, "register": {"source": "dataset", "deskew": False}}
+    sequence = Changed(times=lambda sweep: None)
+    assert run(sequence, KEY, 1, "icp", config=config).warnings == ()
+
+
+def test_cameras_without_images_are_left_out_unless_none_has_any():
+    rear = replace(CAMERA, name="rear")
+    cameras = Changed([CAMERA, rear], {"front": {3: 300}})
+    assert [camera.name for camera in choose_cameras(cameras, None)] == ["front"]
+    assert [camera.name for camera in choose_cameras(cameras, ["rear"])] == ["rear"]
+    nowhere = Changed([CAMERA, rear], {})
+    assert [camera.name for camera in choose_cameras(nowhere, None)] == ["front", "rear"]
+
+
+def test_a_run_ends_with_its_warnings_each_once(monkeypatch, tmp_path, capsys):
+    import densify.readers
+
+    monkeypatch.setattr(densify.readers, "open_sequence", lambda spec: Changed())
+    settings = ["--set", "register.source=dataset", "--set", "accumulate.far_m=0"]
+    keys = ["--keys", "2:5", "--window", "1", "--method", "icp"]
+    assert exit_code("run", *keys, *settings, "--out", tmp_path / "out") == 0
+    told = [line for line in capsys.readouterr().err.splitlines() if "a file is missing" in line]
+    assert told == ["densify: warning: key 2-4: a file is missing"]
+
+
+class TestKitti:
+    @pytest.fixture
+    def drive(self, tmp_path):
+        from densify.readers.street import Street
+        from densify.writers import write_street
+
+        street = Street()
+        return write_street("kitti", street, tmp_path, [0, 1], ["image_02"])
+
+    def test_gaps(self, drive):
+        assert KittiRaw(drive).gaps() == []
+        (drive / "image_03").mkdir()
+        calibration = drive.parent / "calib_cam_to_cam.txt"
+        lines = calibration.read_text().splitlines(keepends=True)
+        calibration.write_text("".join(line for line in lines if "P_rect_03" not in line))
+        (drive / "velodyne_points" / "timestamps_start.txt").unlink()
+        start, camera = KittiRaw(drive).gaps()
+        assert start.endswith("velodyne_points has no timestamps_start.txt")
+        assert camera == "image_03 is left out: calib_cam_to_cam.txt has no P_rect_03"
+
+    def test_a_stamps_file_that_is_no_file_is_not_an_absent_one(self, drive):
+        from densify.errors import InputError
+
+        (drive / "velodyne_points" / "timestamps_start.txt").unlink()
+        (drive / "velodyne_points" / "timestamps_start.txt").mkdir()
+        with pytest.raises(InputError, match=r"timestamps_start\.txt: cannot be read"):
+            KittiRaw(drive)
