@@ -8,6 +8,8 @@ import sys
 
 import densify
 
+if len(sys.argv) < 2:
+    sys.exit(__doc__)
 sequence = densify.open_sequence(sys.argv[1])
 key = int(sys.argv[2]) if len(sys.argv) > 2 else sequence.frames[len(sequence.frames) // 2]
 result = densify.run(sequence, key=key, window=2, cameras=["image_02"])

@@ -362,6 +362,7 @@ def test_status(border_drive: Path, tmp_path: Path, capsys) -> None:
         said[0] == "2 keys: 2 done"
         and said[1].startswith("density ")
         and said[2].startswith("log: ")
+        and "DEBUG" not in said[2]
     )
     assert {p: p.stat().st_mtime_ns for p in out.rglob("*")} == before
     (out / "manifest.jsonl").write_text("")
@@ -375,8 +376,8 @@ def test_status_in_the_middle(border_drive: Path, tmp_path: Path, monkeypatch, c
     def look(summary) -> None:
         here, lines = make.status(out)
         seen.append((here.count("done"), here.num_keys, here.num_left))
-        assert f"{len(seen)} of 2" in lines[0]
+        assert len(seen) == 1 or f"{len(seen) - 1} of 2" in lines[0]
 
     recipe = Recipe(2, config=resolve({"register": {"source": "dataset"}}))
     make.make_dataset([str(border_drive)], out, slice(39, 41), recipe, report=look)
-    assert seen == [(1, 2, 1), (2, 2, 0)]
+    assert seen == [(0, 2, 2), (1, 2, 1), (2, 2, 0)]

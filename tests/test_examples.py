@@ -27,6 +27,14 @@ def output_of(script: str, cwd: Path, *arguments: str) -> str:
     return done.stdout
 
 
+def test_kitti_says_what_it_takes(tmp_path: Path) -> None:
+    done = subprocess.run(
+        [sys.executable, str(EXAMPLES / "kitti.py")], capture_output=True, text=True, cwd=tmp_path
+    )
+    assert done.returncode == 1 and "Traceback" not in done.stderr
+    assert "python examples/kitti.py ..." in done.stderr and "[KEY]" in done.stderr
+
+
 def number_before(text: str, words: str) -> float:
     found = re.search(rf"([\d.,]+) ?%? {words}", text)
     assert found, text

@@ -115,6 +115,8 @@ def keys_on_stderr() -> Iterator[Callable[[Summary], None]]:
 
 
 def _pace(summary: Summary) -> str:
+    if not summary.num_made:
+        return "the first is being made"
     left_s = summary.seconds_left or 0.0
     left = f"{left_s / 60:.0f} min" if left_s < 6000 else f"{left_s / 3600:.1f} h"
     return f"{summary.seconds / max(1, summary.num_made):.2f} s a key, {left} left"

@@ -110,7 +110,7 @@ def make_dataset(
     share ``out``. memory_bytes: of all processes together; fewer are started where it does not
     suffice, and one of several that takes more than its share is replaced. cache_bytes: bound of
     what is kept on disk for later runs. verify: compare finished files with their recorded hashes,
-    and make damaged ones anew. report: called after every key.
+    and make damaged ones anew. report: called before the first key and after every one.
 
     Run again, it goes on where it was stopped, however that happened: finished keys are kept, keys
     that failed are tried again. The files do not depend on the number of processes, on shards or on
@@ -136,6 +136,8 @@ def make_dataset(
             left = done.left(drives)
             _announce(out, recipe, left, done.summary().num_keys, num_processes)
             todo = _tasks(left, recipe, out, cache_bytes)
+            if report is not None:
+                report(done.summary())
             try:
                 if todo:
                     of_workers = memory_bytes and memory_bytes - int(_BASE_BYTES)
@@ -220,7 +222,7 @@ def status(out: Path) -> tuple[Summary, list[str]]:
     lines = []
     for path in sorted(out.glob("densify*.log")):
         text = path.read_text("utf-8", errors="replace").splitlines()
-        lines += text[-1:]
+        lines += [line.replace(" DEBUG ", " ", 1) for line in text[-1:]]
     return Summary(records, len(keys)), lines
 
 

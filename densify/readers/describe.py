@@ -95,6 +95,7 @@ def _poses(sequence: LidarSequence) -> str:
     try:
         path = np.array([sequence.T_world_lidar(frame)[:3, 3] for frame in sequence.frames])
     except InputError as error:
-        return f"none: {error}"
+        place = getattr(sequence, "where", None)
+        return f"none: {str(error).removeprefix(f'{place}: ')}"
     length_m = np.linalg.norm(np.diff(path, axis=0), axis=1).sum()
     return f"yes, a path of {length_m:.1f} m"
