@@ -45,8 +45,8 @@ def close_windows(layers: Layers, focal_px: float, settings: ProjectSettings) ->
     them but not all are measured, and if few among them lie in the plane, as in a hedge.
 
     focal_px: pixels per radian. The planes are as certain as the least certain part of their
-    frames, times ``settings.fill_confidence``. ``layers.glass`` says where a measured pixel was
-    taken out.
+    frames, times ``settings.fill_confidence``. ``layers.window`` says where windows are,
+    ``layers.glass`` where a measured pixel was taken out.
     """
     size = max(1, round(focal_px * _CELL_RAD))
     cells = _cells(layers, size)
@@ -63,6 +63,8 @@ def close_windows(layers: Layers, focal_px: float, settings: ProjectSettings) ->
     )
     source = _windows(found[0], cells, focal_px / size)
     row, column, plane_m, confidence = _planes(found, source, size, layers.filled_m.shape)
+    window = np.zeros(layers.filled_m.shape, bool)
+    window[row, column] = True
     seen_m = layers.filled_m[row, column]
     behind = (seen_m == 0) | (seen_m > plane_m + _TAKEN_M) & (seen_m <= plane_m + _MOST_M)
     row, column = row[behind], column[behind]
@@ -73,7 +75,14 @@ def close_windows(layers: Layers, focal_px: float, settings: ProjectSettings) ->
     depth_m[row, column] = 0
     filled_m[row, column] = plane_m[behind]
     certain[row, column] = confidence[behind] * np.float32(settings.fill_confidence)
-    return replace(layers, depth_m=depth_m, filled_m=filled_m, confidence=certain, glass=glass)
+    return replace(
+        layers,
+        depth_m=depth_m,
+        filled_m=filled_m,
+        confidence=certain,
+        window=window,
+        glass=glass,
+    )
 
 
 class _Cells(NamedTuple):

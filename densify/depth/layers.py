@@ -23,8 +23,8 @@ class Layers:
     tilt: (H,W,2) float32 slope of the measured surface's inverse depth to the right and down, 1/m
     per px. spacing_px: (H,W,2) float32 between neighbouring rays of one sweep, across and along
     elevation, everywhere. lab: (H,W,3) float32 the image as `densify.depth.picture` makes it, None
-    without one. warnings: what could not be done as asked. glass: (H,W) True where a measured pixel
-    was taken out of a window; None before.
+    without one. warnings: what could not be done as asked. window: (H,W) True inside the windows of
+    vehicles, and glass: where a measured pixel was taken out of one; None before they are closed.
     """
 
     depth_m: Float32
@@ -37,6 +37,7 @@ class Layers:
     spacing_px: Float32
     lab: Float32 | None = None
     warnings: tuple[str, ...] = ()
+    window: Bool | None = None
     glass: Bool | None = None
 
     @property

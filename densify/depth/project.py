@@ -18,6 +18,7 @@ from scipy import ndimage
 from densify.config import ProjectSettings
 from densify.depth.exposure import Exposure, InView
 from densify.depth.fill import fill
+from densify.depth.free_space import Rays, without_seen_through
 from densify.depth.glass import close_windows
 from densify.depth.image_points import PointsInImage, in_image
 from densify.depth.layers import Layers
@@ -37,6 +38,7 @@ def project(
     patches: Patches,
     filled: bool = True,
     lab: Float32 | None = None,
+    rays: Rays | None = None,
 ) -> DepthMap:
     """The depth map of ``cloud``, at the key's moment, as a camera sees it at its exposure.
 
@@ -45,7 +47,8 @@ def project(
     of each pixel is taken as it is; else the source sweep nearest in time to the key wins a pixel.
     patches: of the cloud, at the key's moment (`densify.depth.patches.patches`). filled: False
     leaves out the filling, which takes its time. lab: (H,W,3) the image, as `densify.depth.picture`
-    makes it; without it nothing that needs one is done.
+    makes it; without it nothing that needs one is done. rays: tell where the map is open
+    (`densify.depth.free_space`); without them nothing is taken out.
 
     Points nearer than 0.1 m, outside the image or outside the lens's valid field of view are
     dropped. Planes are fitted in inverse depth, or inverse range where depth is the range: linear
@@ -72,6 +75,8 @@ def project(
             layers = close_windows(layers, camera.focal_px, settings)
         if settings.star_reach > 0:
             layers = fill_stars(layers, settings)
+    if settings.visibility and rays is not None and settings.seen_through < 1:
+        layers = without_seen_through(layers, cloud, view.exposure, rays, reason, settings)
     return _finished(layers, cloud, view.exposure, reason)
 
 

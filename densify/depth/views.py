@@ -14,6 +14,7 @@ from densify.config import Config, ProjectSettings
 from densify.depth.colour import colour
 from densify.depth.exposure import Exposure, InView, Shot
 from densify.depth.far import far_cloud
+from densify.depth.free_space import Rays
 from densify.depth.optical_flow import optical_flow
 from densify.depth.patches import patches, vetoed
 from densify.depth.picture import lab
@@ -64,7 +65,8 @@ class Views:
     """What one key's depth maps show, by their names (`densify.depth.exposure.key_shots`).
 
     key_image: what the key sweep saw. sensors: the scanners. origins: (S,3) where they stood in
-    each sweep, key frame, by frame. lab: of those that show an image, see `densify.depth.picture`.
+    each sweep, key frame, by frame. rays: of these sweeps. lab: of those that show an
+    image, see `densify.depth.picture`.
     """
 
     key: int
@@ -72,6 +74,7 @@ class Views:
     exposures: Mapping[str, Exposure]
     sensors: Sensors
     origins: Mapping[int, Float]
+    rays: Rays
     settings: ProjectSettings
     lab: Mapping[str, Float32]
 
@@ -95,7 +98,16 @@ class Views:
             for f in stretch.frames
         }
         pictures = {name: lab(image) for name, image in images.items()}
-        return Views(key, key_image, exposures, sensors, origins, settings.project, pictures)
+        return Views(
+            key,
+            key_image,
+            exposures,
+            sensors,
+            origins,
+            Rays(stretch, key),
+            settings.project,
+            pictures,
+        )
 
     def see(self, cloud: Cloud) -> SeenCloud:
         """A cloud as the cameras see it."""
@@ -123,7 +135,10 @@ class Views:
         fill between what is measured."""
         settings = replace(self.settings, visibility=visible)
         return {
-            name: project(seen.cloud, view, settings, seen.patches, filled, self.lab.get(name))
+            name: project(
+                *(seen.cloud, view, settings, seen.patches, filled),
+                *(self.lab.get(name), self.rays),
+            )
             for name, view in seen.views.items()
         }
 
@@ -207,7 +222,8 @@ class HeldOut:
     def of(views: Views, cloud: Cloud) -> HeldOut:
         """cloud: says what moves in the key sweep, and how fast."""
         views = replace(views, key_image=None)  # what is held out must not help
-        sure = replace(views, settings=replace(views.settings, rims="strict"))
+        alone = replace(views.settings, rims="strict", seen_through=1.0)
+        sure = replace(views, settings=alone)
         own = cloud.select(cloud.frame == views.key)
         key_alone = sure.depth(sure.see(own), filled=False)
         movers = sure.depth(sure.see(own.select(own.moving)), filled=False)

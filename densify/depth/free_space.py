@@ -1,0 +1,166 @@
+# SPDX-License-Identifier: MIT
+"""What other rays say against a depth map: a pixel whose surface more rays went through than
+stopped at is open there, like the gaps of a fence between its pickets.
+
+The image alone cannot tell: what a scanner saw elsewhere behind a car shows on the car too. So
+every ray is followed to where it crosses the map's own surface, and tells of that pixel (free-space
+evidence as in occupancy grids: Thrun et al., "Probabilistic Robotics", 2005, ch. 9).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from densify.config import ProjectSettings
+from densify.depth.exposure import Exposure
+from densify.depth.layers import Layers
+from densify.geometry import poses
+from densify.types import Bool, Cloud, Float, Float32, Reason, Stretch
+
+_NUM_STEPS = 6
+_SAME_M, _SAME_FRACTION = 0.05, 0.01  # from one step to the next: the crossing is found
+_BLUR = 0.25  # of the gap between rays, standard deviation: what rays tell of pixels around
+_LEAST_BLUR_PX = 1.0
+_LEAST_RAYS = 0.9  # through a pixel itself, or more of them around it
+_MOVER_PX = 25  # across: rays of other sweeps passed where movers were not yet, or no more
+
+
+@dataclass(frozen=True)
+class Rays:
+    """The rays of the sweeps of a stretch, for a key of it."""
+
+    stretch: Stretch
+    key: int
+
+    def starts(self, cloud: Cloud) -> Float:
+        """(M,3) key frame, where the ray of each point started when it was fired."""
+        starts = np.empty((len(cloud), 3))
+        for frame in np.unique(cloud.frame).tolist():
+            mine, registered = np.flatnonzero(cloud.frame == frame), self.stretch[frame]
+            sweep = registered.sweep
+            origin = np.stack([sweep.origin_m(n) for n in range(int(sweep.lidar.max()) + 1)])
+            start = origin[cloud.lidar[mine]]
+            if sweep.offset_ns is not None:
+                order = np.argsort(sweep.row, kind="stable")
+                found = order[np.searchsorted(sweep.row, cloud.row[mine], sorter=order)]
+                offset_s = sweep.offset_ns[found, None] * 1e-9
+                twist: Float = np.where(
+                    offset_s < 0, registered.twist_before, registered.twist_after
+                )
+                start = poses.transform_each(offset_s * twist, start)
+            starts[mine] = poses.transform(self.stretch.T_target_source(self.key, frame), start)
+        return starts
+
+
+def without_seen_through(
+    layers: Layers,
+    cloud: Cloud,
+    exposure: Exposure,
+    rays: Rays,
+    reason: NDArray[np.uint8],
+    settings: ProjectSettings,
+) -> Layers:
+    """Without the pixels of which rays say that the place is open; what was measured there becomes
+    a rim that is not accepted.
+
+    rays: those that tell; of other sweeps and of what moves they tell nothing. reason: (M,) of the
+    points, as far as the map is made.
+
+    A ray of a hidden point went through where it crosses the surface that the map shows, if the
+    point lies behind by more than ``settings.hidden_m`` plus ``hidden_fraction``; a ray stopped at
+    the pixel of a point that is not hidden. Both are blurred by a quarter of the gap between rays,
+    and more than the share ``settings.seen_through`` of rays that went through takes a pixel away.
+    Closed windows stay (`densify.depth.glass`): lasers go through glass.
+    """
+    shape = layers.filled_m.shape
+    told = np.isin(cloud.frame, rays.stretch.frames)
+    told &= (reason != Reason.OUTSIDE) & (reason != Reason.VETOED)
+    hidden = reason == Reason.HIDDEN
+    passed = told & hidden & ~cloud.moving
+    if not passed.any():
+        return layers
+    blur_px = max(_LEAST_BLUR_PX, _BLUR * float(np.median(layers.gap_px)))
+    seen = exposure.sees(cloud.select(told & ~hidden))
+    moving = cloud.moving[told & ~hidden][seen.rows]
+    near_mover = ndimage.maximum_filter(_counts(seen.uv[moving], shape), _MOVER_PX) > 0
+    hits = cloud.select(passed)
+    through = crossings(layers.filled_m, rays.starts(hits), hits.points, exposure, settings)
+    num_through, num_stopped = (
+        _counts(uv, shape, blur_px) * (2 * np.pi * blur_px**2) for uv in (through, seen.uv)
+    )
+    dropped = num_through > settings.seen_through * (num_through + num_stopped)
+    dropped &= (num_through >= _LEAST_RAYS) & (layers.filled_m > 0) & ~near_mover
+    if layers.window is not None:
+        dropped &= ~layers.window
+    return _without(layers, dropped)
+
+
+def _without(layers: Layers, dropped: Bool) -> Layers:
+    rim_m = np.where(dropped & (layers.depth_m > 0), layers.depth_m, layers.rim_m)
+    depth_m, filled_m, confidence = (
+        np.where(dropped, np.float32(0), values)
+        for values in (layers.depth_m, layers.filled_m, layers.confidence)
+    )
+    return replace(layers, rim_m=rim_m, depth_m=depth_m, filled_m=filled_m, confidence=confidence)
+
+
+def _counts(uv: Float, shape: tuple[int, ...], blur_px: float = 0.0) -> Float32:
+    """(K,2) px -> (H,W) how many in each pixel."""
+    column, row = np.rint(uv).astype(np.int64).T
+    counts = np.bincount(row * shape[1] + column, minlength=shape[0] * shape[1])
+    pixels = counts.reshape(shape).astype(np.float32)
+    blurred: Float32 = ndimage.gaussian_filter(pixels, blur_px, truncate=2.5)
+    return blurred
+
+
+def crossings(
+    surface_m: Float32,
+    from_key: Float,
+    to_key: Float,
+    exposure: Exposure,
+    settings: ProjectSettings,
+) -> Float:
+    """(P,2) px where the rays from ``from_key`` to ``to_key`` (K,3), key frame, cross the surface
+    ``surface_m`` (H,W), of those that do clearly before they end.
+
+    Looked for from the ray's end on: at the depth of the surface in that pixel the ray shows in
+    another pixel, and so on until the depth stays the same.
+    """
+    start = poses.transform(exposure.T_cam_key, from_key)
+    end = poses.transform(exposure.T_cam_key, to_key)
+    end_m, still = exposure.depth_m(end), np.zeros(to_key.shape, np.float32)
+    sight = exposure.see(to_key, still)
+    uv, good = sight.uv, sight.inside
+    depth_m = np.full(len(to_key), np.inf)
+    for _ in range(_NUM_STEPS):
+        column, row = np.rint(np.where(good[:, None], uv, 0)).astype(np.int64).T
+        there_m = surface_m[row, column].astype(np.float64)
+        with np.errstate(invalid="ignore"):
+            same = abs(there_m - depth_m) <= _SAME_M + _SAME_FRACTION * depth_m
+        depth_m = there_m
+        share = _share(start, end, depth_m, exposure.measure)
+        good &= (depth_m > 0) & (share > 0) & (share < 1)
+        share = np.where(good, share, 1.0)[:, None]
+        sight = exposure.see(from_key + share * (to_key - from_key), still)
+        uv, good = sight.uv, good & sight.inside
+    allowed_m = settings.hidden_m + settings.hidden_fraction * depth_m
+    crosses: Float = uv[good & same & (end_m - depth_m > allowed_m)]
+    return crosses
+
+
+def _share(start: Float, end: Float, depth_m: Float, measure: str) -> Float:
+    """(P,) at which share of the ways (P,3) from start to end, camera frame, they are as deep; NaN:
+    nowhere."""
+    way = end - start
+    with np.errstate(divide="ignore", invalid="ignore"):
+        if measure == "z":
+            share: Float = (depth_m - start[:, 2]) / way[:, 2]
+            return share
+        square, along = (way**2).sum(axis=1), (start * way).sum(axis=1)
+        within = along**2 - square * ((start**2).sum(axis=1) - depth_m**2)
+        share = (np.sqrt(within) - along) / square
+        return share
