@@ -23,6 +23,7 @@ from densify.completion import completed, key_priors
 from densify.config import Config, resolve
 from densify.costs import Watch
 from densify.depth.age import with_ages
+from densify.depth.confidence import expected_outliers, reliability
 from densify.depth.exposure import Shot, key_shots, load_images
 from densify.depth.views import HeldOut, SeenCloud, Views
 from densify.doubts import with_doubts
@@ -342,6 +343,10 @@ class _Seen(NamedTuple):
         with watch.stage("score"):
             cameras, sweep = self.sequence.cameras, self.stretch[key]
             metrics = _scores(self.truth, cameras, sweep, self.key_image, cloud, depth)
+            if visible:
+                metrics["expected_outliers"] = {
+                    n: expected_outliers(maps) for n, maps in depth.items()
+                }
             metrics["measure"] = {name: maps.measure for name, maps in depth.items()}
             metrics["held_out"] = held_out_scores
             if output.rejected:
@@ -388,5 +393,9 @@ def _scores(
         metrics["depth"] = {
             name: depth_metrics.depth_scores(depth[name], *true, cameras[depth[name].camera])
             for name, true in truth.items()
+        }
+        metrics["reliability"] = {
+            name: reliability(depth[name], true_m, cameras[depth[name].camera])
+            for name, (true_m, _) in truth.items()
         }
     return metrics

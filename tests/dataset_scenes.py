@@ -110,7 +110,11 @@ def _words(array: np.ndarray) -> str:
     return " ".join(f"{value:.17g}" for value in np.ravel(array))
 
 
-OPTIONS = ("--window", "2", "--set", "register.source=dataset")
+# The drives' images are of one colour, of which rims would be told only with a warning.
+OPTIONS = (
+    *("--window", "2", "--set", "register.source=dataset"),
+    *("--set", "project.rims=strict"),
+)
 
 
 def maps_in(out: Path) -> dict[str, bytes]:

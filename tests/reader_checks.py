@@ -114,8 +114,9 @@ def check_depth(
         (sequence, middle, name or own),
         (excerpt.street, excerpt.frames[middle], own),
     ):
-        poses_given = {"register": {"source": "dataset"}}
-        result = densify.run(recording, key, 1, cameras=[camera], config=poses_given)
+        # The excerpt ends where the street goes on: nothing from beyond the window.
+        config = {"register": {"source": "dataset"}, "accumulate": {"far_m": 0}}
+        result = densify.run(recording, key, 1, cameras=[camera], config=config)
         depth_m, true_m = result.depth[camera].depth_m, recording.truth.depth_m(camera, key)
         focal_px = recording.cameras[camera].focal_px
         scores.append(depth_errors(depth_m, true_m, focal_px=focal_px))

@@ -109,7 +109,7 @@ def test_export_says_what_is_left_and_names_every_file(
 ) -> None:
     run, out = densified.out / "000120", tmp_path / "out"
     before = files_in(densified.out)
-    command = ["export", run, "--min-confidence", "0.8", "--max-age-ms", "80", "--out", out]
+    command = ["export", run, "--min-confidence", "0.5", "--max-age-ms", "80", "--out", out]
     assert exit_code(*command) == 0
     line, *paths = capsys.readouterr().out.splitlines()
     shares = [

@@ -203,8 +203,9 @@ def test_a_reader_of_another_package(package, tmp_path: Path) -> None:
 
 
 RESULT = SimpleNamespace(
-    **{name: {} for name in ("depth", "movers", "optical_flow", "rejected", "metrics")},
+    **{name: {} for name in ("depth", "full", "movers", "optical_flow", "rejected", "metrics")},
     **{"baselines": {}, "flow": None, "key": 3, "method": "flow", "frames": (3,), "costs": ()},
+    **{"far_frames": (), "warnings": ()},
     cloud=None,
 )
 

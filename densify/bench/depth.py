@@ -19,13 +19,14 @@ from densify import pipeline
 from densify.cache import Cache
 from densify.config import Config
 from densify.costs import Watch
+from densify.depth.confidence import reliability
 from densify.depth.exposure import Exposure, key_shots
 from densify.errors import InputError
 from densify.geometry import poses
 from densify.geometry.cameras import converted, depth_along, rays
 from densify.readers.window import choose_cameras
 from densify.recording import Recording
-from densify.scores.depth_metrics import KITTI_BASELINE_M, image_density, is_outlier
+from densify.scores.depth_metrics import image_density, is_outlier_depth
 from densify.types import Bool, Camera, Float32, LidarSequence, Progress, Result, Sweep
 
 PRODUCTS = ("measured", "filled")
@@ -64,7 +65,8 @@ def bench_depth(
 
     Returns plain numbers: by variant ``density`` (mean share of the image) of each product,
     ``seconds`` a key of the stages that make the maps, and ``scores`` by truth, product and part
-    (``all``, ``moving``): num_pixels, coverage, outliers.
+    (``all``, ``moving``): num_pixels, coverage, outliers; and ``reliability`` by truth, as
+    `densify.depth.confidence.reliability`.
 
     Raises InputError for what cannot be used, ComputationError where registration went wrong.
     """
@@ -186,6 +188,7 @@ class _Sums:
     def __init__(self) -> None:
         self._counts: dict[tuple[str, str, str], NDArray[np.int64]] = {}
         self._densities: dict[str, list[float]] = {product: [] for product in PRODUCTS}
+        self._steps: dict[str, dict[float, NDArray[np.float64]]] = {}
         self._seconds = 0.0
 
     def add(
@@ -196,16 +199,19 @@ class _Sums:
     ) -> None:
         self._seconds += sum(cost.seconds for cost in made.costs if cost.name == _STAGE)
         for name, maps in made.depth.items():
-            for product, depth_m in zip(PRODUCTS, (maps.depth_m, maps.filled_m), strict=True):
+            camera = cameras[maps.camera]
+            products = dict(zip(PRODUCTS, (maps.depth_m, maps.filled_m), strict=True))
+            for product, depth_m in products.items():
                 self._densities[product].append(image_density(depth_m))
-                for source, by_map in truths.items():
-                    if name in by_map:
-                        truth, focal_px = by_map[name], cameras[maps.camera].focal_px
-                        self._count(source, product, "all", depth_m, truth, focal_px)
-                        movers = truth._replace(depth_m=np.where(truth.moving, truth.depth_m, 0))
-                        self._count(source, product, "moving", depth_m, movers, focal_px)
+            for source, truth in [(s, t[name]) for s, t in truths.items() if name in t]:
+                movers = truth._replace(depth_m=np.where(truth.moving, truth.depth_m, 0))
+                for product, depth_m in products.items():
+                    self._count(source, product, "all", depth_m, truth, camera.focal_px)
+                    self._count(source, product, "moving", depth_m, movers, camera.focal_px)
+                self._rely(source, reliability(maps, truth.depth_m, camera))
         held_out = made.metrics.get("held_out") or {}
         for scores in held_out.values():
+            self._rely("key held out", scores["reliability"])
             for product in PRODUCTS:
                 for part in ("all", "moving"):
                     score = scores[product][part]
@@ -232,10 +238,17 @@ class _Sums:
         both = known & (depth_m > 0)
         z, t = depth_m[both].astype(np.float64), truth.depth_m[both].astype(np.float64)
         if truth.by_disparity:
-            wrong = is_outlier(focal_px * KITTI_BASELINE_M / z, focal_px * KITTI_BASELINE_M / t)
+            wrong = is_outlier_depth(z, t, focal_px)
         else:
             wrong = (np.abs(z - t) > _WRONG_M) & (np.abs(z - t) > _WRONG_FRACTION * t)
         self._sum(source, product, part, int(known.sum()), int(both.sum()), int(wrong.sum()))
+
+    def _rely(self, source: str, steps: list[dict[str, Any]]) -> None:
+        so_far = self._steps.setdefault(source, {})
+        for step in steps:
+            num = step["num_compared"]
+            counts = np.array([num, num * step["expected"], num * step["outliers"]])
+            so_far[step["confidence"]] = so_far.get(step["confidence"], 0) + counts
 
     def _sum(self, source: str, product: str, part: str, *counts: int) -> None:
         so_far = self._counts.setdefault((source, product, part), np.zeros(3, np.int64))
@@ -249,5 +262,22 @@ class _Sums:
                 "coverage": compared / num if num else None,
                 "outliers": wrong / compared if compared else None,
             }
+        steps = {
+            source: [
+                {
+                    "confidence": least,
+                    "num_compared": round(num),
+                    "expected": expected / num,
+                    "outliers": wrong / num,
+                }
+                for least, (num, expected, wrong) in sorted(found.items())
+            ]
+            for source, found in self._steps.items()
+        }
         density = {p: float(np.mean(d)) for p, d in self._densities.items() if d}
-        return {"density": density, "seconds": self._seconds / num_keys, "scores": scores}
+        return {
+            "density": density,
+            "seconds": self._seconds / num_keys,
+            "scores": scores,
+            "reliability": steps,
+        }

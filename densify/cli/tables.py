@@ -159,8 +159,16 @@ def flow_table(measured: Mapping[str, Any]) -> str:
     return "\n".join(lines)
 
 
+_RELIABILITY_COLUMNS: tuple[Column, ...] = (
+    ("confidence from: pixels", ("num_compared",), ",d"),
+    ("expected wrong", ("expected",), ".3%"),
+    ("wrong", ("outliers",), ".3%"),
+)
+
+
 def depth_table(measured: Mapping[str, Any]) -> str:
-    """A table for each truth: a row per variant, coverage and outliers of each product."""
+    """Two tables for each truth: a row per variant, coverage and outliers of each product; and how
+    far confidence keeps what it promises, of the first variant."""
     variants: Mapping[str, Any] = measured["variants"]
     keys = format_frames(measured["keys"])
     sources = {source: None for row in variants.values() for source in row["scores"]}
@@ -179,6 +187,10 @@ def depth_table(measured: Mapping[str, Any]) -> str:
             _table(variants, columns),
             "",
         ]
+        steps = next(iter(variants.values()))["reliability"].get(source, ())
+        if steps:
+            rows = {f"{step['confidence']:.2f}": step for step in steps}
+            lines += [_table(rows, _RELIABILITY_COLUMNS), ""]
     return "\n".join(lines)
 
 

@@ -59,8 +59,8 @@ class _Local(NamedTuple):
 
 
 def in_image(cloud: Cloud, view: InView, patches: Patches, vetoed: bool) -> PointsInImage:
-    """The points of ``cloud`` that are in the ``view``. vetoed: without those that the key sweep saw
-    through."""
+    """The points of ``cloud`` that are in the ``view``. vetoed: without those that the key sweep
+    saw through."""
     kept = ~patches.free[view.rows] if vetoed else np.ones(len(view.rows), bool)
     exposure, index, points_cam = view.exposure, view.rows[kept], view.points_cam[kept]
     depth = exposure.depth_m(points_cam).astype(np.float32)

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from densify.config import ProjectSettings
+from densify.depth.confidence import calibrated
 from densify.depth.exposure import Exposure, InView
 from densify.depth.fill import fill
 from densify.depth.free_space import Rays, without_seen_through
@@ -28,7 +29,7 @@ from densify.depth.star import fill_stars
 from densify.types import Camera, Cloud, DepthMap, Float32, Patches, Reason
 
 _BLOCK_PX = 16  # over which rays lie about equally dense
-_LEAST_CONFIDENCE = 1 / 255  # 0 means no depth once written as 8 bits
+_LEAST_CONFIDENCE = np.float32(1 / 255)  # 0 means no depth once written as 8 bits
 
 
 def project(
@@ -54,8 +55,9 @@ def project(
     dropped. Planes are fitted in inverse depth, or inverse range where depth is the range: linear
     over the image of a pinhole in the first case, nearly so over a surface's few pixels otherwise.
     ``filled_m`` adds pixels interpolated between measured ones (`densify.depth.fill`).
-    ``confidence`` ranks only: the point's own, less where few sweeps or points agree, a depth edge
-    is close, the surface rough, or the point nearly hidden. ``reason`` says of every point why it
+    ``confidence`` starts from the point's own, less where few sweeps or points agree, a depth edge
+    is close, the surface rough, or the point nearly hidden; that rank is turned into a probability
+    (`densify.depth.confidence`), but with ``visibility`` off. ``reason`` says of every point why it
     is not in the map.
     """
     camera = view.exposure.camera
@@ -77,7 +79,7 @@ def project(
             layers = fill_stars(layers, settings)
     if settings.visibility and rays is not None and settings.seen_through < 1:
         layers = without_seen_through(layers, cloud, view.exposure, rays, reason, settings)
-    return _finished(layers, cloud, view.exposure, reason)
+    return _finished(layers, cloud, view.exposure, reason, settings.visibility)
 
 
 def _measured(
@@ -118,7 +120,7 @@ def _spacing_px(points: PointsInImage, shape: tuple[int, int]) -> Float32:
 
 
 def _finished(
-    layers: Layers, cloud: Cloud, exposure: Exposure, reason: NDArray[np.uint8]
+    layers: Layers, cloud: Cloud, exposure: Exposure, reason: NDArray[np.uint8], visible: bool
 ) -> DepthMap:
     measured, rim = layers.depth_m > 0, (layers.rim_m > 0) & ~layers.veiled
     reason[layers.point[rim]] = Reason.EDGE
@@ -128,7 +130,8 @@ def _finished(
     frame = np.full(measured.shape, -1, np.int32)
     frame[measured] = cloud.frame[layers.point[measured]]
     shown = layers.filled_m > 0
-    confidence = np.where(shown, np.maximum(layers.confidence, np.float32(_LEAST_CONFIDENCE)), 0)
+    confidence = calibrated(layers.confidence, measured) if visible else layers.confidence
+    confidence = np.where(shown, np.maximum(confidence, _LEAST_CONFIDENCE), 0)
     return DepthMap(
         camera=exposure.camera.name,
         depth_m=layers.depth_m,

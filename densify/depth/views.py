@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from densify.config import Config, ProjectSettings
 from densify.depth.colour import colour
+from densify.depth.confidence import reliability
 from densify.depth.exposure import Exposure, InView, Shot
 from densify.depth.far import far_cloud
 from densify.depth.free_space import Rays
@@ -234,8 +235,9 @@ class HeldOut:
         return HeldOut(views, key_alone, moving)
 
     def scores(self, seen: SeenCloud, visible: bool) -> dict[str, Any] | None:
-        """Scores by name, as `densify.scores.depth_metrics.depth_scores`, and the ``curve`` of
-        precision over density; None for a cloud of the key sweep alone."""
+        """Scores by name, as `densify.scores.depth_metrics.depth_scores`, the ``curve`` of
+        precision over density, and the confidence's ``reliability``; None for a cloud of the key
+        sweep alone."""
         others = seen.cloud.frame != self.views.key
         if not others.any():
             return None
@@ -247,5 +249,6 @@ class HeldOut:
             scores[name] = {
                 **depth_metrics.depth_scores(maps, truth_m, self.moving[name], camera),
                 "curve": depth_metrics.precision_density(maps, truth_m, camera),
+                "reliability": reliability(maps, truth_m, camera),
             }
         return scores

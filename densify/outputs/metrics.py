@@ -16,8 +16,10 @@ and versions as run.yaml::
     measure     map -> what its depth is: z, along the camera's axis, or range, from the lens
     held_out    camera -> the same fields as depth: the key densified from its neighbours alone
                 against its own returns; and curve,
-                `densify.scores.depth_metrics.precision_density`, drawn in curve.png;
-                null for the key sweep alone
+                `densify.scores.depth_metrics.precision_density`, drawn in curve.png; and
+                reliability, `densify.depth.confidence.reliability`; null for the key sweep alone
+    reliability where there is truth: map -> the same list against it
+    expected_outliers  map -> measured, filled: the share of wrong pixels that confidence expects
     baselines   the same from ``frames`` on for each simpler method on the same registration
 
 A score that nothing can be said of is null.

@@ -84,7 +84,6 @@ def depth_errors(
     off_m = np.abs(z - t)
     off_per_km = np.abs(1000 / z - 1000 / t)
     ratio = np.maximum(z / t, t / z)
-    disparity_m_px = focal_px * baseline_m
     return DepthErrors(
         num_pixels=num_pixels,
         num_compared=num_compared,
@@ -98,7 +97,7 @@ def depth_errors(
         delta_1=_mean(ratio < _DELTA),
         delta_2=_mean(ratio < _DELTA**2),
         delta_3=_mean(ratio < _DELTA**3),
-        outliers=_mean(is_outlier(disparity_m_px / z, disparity_m_px / t)),
+        outliers=_mean(is_outlier_depth(z, t, focal_px, baseline_m)),
     )
 
 
@@ -168,7 +167,7 @@ def depth_edges(truth_m: Float32, *, focal_px: float, baseline_m: float = KITTI_
     smallest = ndimage.minimum_filter(holes_out, size, mode="constant", cval=math.inf)
     edge = np.zeros(truth_m.shape, bool)
     here = disparity_px[known]
-    edge[known] = is_outlier(largest[known], here) | is_outlier(smallest[known], here)
+    edge[known] = _is_outlier(largest[known], here) | _is_outlier(smallest[known], here)
     return edge
 
 
@@ -215,8 +214,19 @@ def scores_by_motion(
     }
 
 
-def is_outlier(disparity_px: Float, true_px: Float) -> Bool:
-    """(N,) True where a disparity is wrong by KITTI's rule, see `DepthErrors`."""
+def is_outlier_depth(
+    predicted_m: Float | Float32,
+    truth_m: Float | Float32,
+    focal_px: float,
+    baseline_m: float = KITTI_BASELINE_M,
+) -> Bool:
+    """(N,) True where a depth is wrong by KITTI's rule, see `DepthErrors`. Both: (N,) above 0."""
+    disparity_m_px = focal_px * baseline_m
+    predicted_px = disparity_m_px / predicted_m.astype(np.float64)
+    return _is_outlier(predicted_px, disparity_m_px / truth_m.astype(np.float64))
+
+
+def _is_outlier(disparity_px: Float, true_px: Float) -> Bool:
     off_px = np.abs(disparity_px - true_px)
     wrong: Bool = (off_px > _OUTLIER_PX) & (off_px > _OUTLIER_FRACTION * true_px)
     return wrong
