@@ -11,7 +11,7 @@ import io
 import os
 import sys
 from collections.abc import Sequence
-from typing import NoReturn
+from typing import NoReturn, TextIO
 
 from densify.cli.arguments import parse
 from densify.cli.screen import logging_to_stderr
@@ -39,9 +39,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
             log.error("interrupted; what was unfinished is not kept")
             return INTERRUPTED
         except BrokenPipeError:
-            _let_go_of_stdout()  # its reader has seen enough
+            _let_go_of(sys.stdout)  # its reader has seen enough
         except OSError as error:
-            _let_go_of_stdout()
+            _let_go_of(sys.stdout)
             log.error("%s: %s", error.filename or "stdout", error.strerror or error)
             return BAD_INPUT
         except MemoryError:
@@ -66,6 +66,7 @@ def script() -> NoReturn:
         # and waits for threads that are at work.
         sys.stderr.flush()
         os._exit(code)
+    _let_go_of(sys.stderr)
     sys.exit(code)
 
 
@@ -84,12 +85,12 @@ def _open_what_is_closed() -> None:
             stream.reconfigure(errors="backslashreplace")
 
 
-def _let_go_of_stdout() -> None:
+def _let_go_of(stream: TextIO) -> None:
     """Keep the interpreter from flushing once more into what cannot be written."""
     try:
-        sys.stdout.flush()
+        stream.flush()
     except OSError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
 def _run(arguments: Sequence[str] | None) -> None:

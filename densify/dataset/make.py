@@ -145,6 +145,7 @@ def make_dataset(
                         for record in _records(run_tasks(todo, workers)):
                             manifest.append(record)
                             done.add(record)
+                    clear_leftovers(out)  # of workers that were killed
             except OutputError as error:
                 raise ComputationError(f"{error}; {done.kept()}") from error
             except BaseException:
