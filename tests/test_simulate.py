@@ -208,7 +208,7 @@ def test_displacement_is_written_in_the_frames_own_axes(tmp_path):
 
 def test_missing_or_malformed_truth_files_are_named(tmp_path):
     assert FileTruth.open(tmp_path / "none") is None
-    with pytest.raises(InputError, match=r"bodies\.npz: cannot be read: No such file"):
+    with pytest.raises(InputError, match=r"bodies\.npz: no such truth file"):
         FileTruth.open(tmp_path)
     np.savez(tmp_path / "bodies.npz", T_world_lidar=np.eye(4))
     with pytest.raises(InputError, match=r"bodies\.npz: holds no T_world_body, moving"):
@@ -222,7 +222,7 @@ def test_missing_or_malformed_truth_files_are_named(tmp_path):
     assert truth is not None
     with pytest.raises(InputError, match="0 to 2"):
         truth.sweep(3)
-    with pytest.raises(InputError, match=r"0000000001\.npz: cannot be read: No such file"):
+    with pytest.raises(InputError, match=r"0000000001\.npz: no such truth file"):
         truth.sweep(1)
     one = np.zeros(1, np.int32)
     for body, instance, point in (
@@ -236,9 +236,9 @@ def test_missing_or_malformed_truth_files_are_named(tmp_path):
             truth.displacement(1, 2)
     path = tmp_path / "points" / "0000000001.npz"
     path.write_bytes(path.read_bytes()[:60])
-    with pytest.raises(InputError, match=r"not a whole \.npz file|not a readable \.npz file"):
+    with pytest.raises(InputError, match=r"not a readable \.npz file"):
         truth.sweep(1)
-    with pytest.raises(InputError, match="cannot be read: No such file"):
+    with pytest.raises(InputError, match="no such truth file"):
         truth.depth_m("image_02", 1)
     (tmp_path / "depth" / "image_02").mkdir(parents=True)
     np.savez(tmp_path / "depth" / "image_02" / "0000000001.npz", depth_m=np.zeros((2, 2)))

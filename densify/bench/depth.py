@@ -41,7 +41,8 @@ _STAGE = "project"
 
 class TruthMap(NamedTuple):
     """depth_m: (H,W), 0 none. moving: (H,W). by_disparity: what is wrong is told by KITTI's rule,
-    more than 3 px of disparity and 5 %; else by more than 0.3 m and 5 %, whatever the camera."""
+    more than 3 px of disparity and 5 %; else by more than 0.3 m and 5 %, whatever the camera. What
+    confidence promises is always compared by KITTI's rule."""
 
     depth_m: Float32
     moving: Bool

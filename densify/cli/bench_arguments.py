@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import argparse
 from pathlib import Path
 from typing import Any
 
@@ -41,14 +42,7 @@ def _add_bench_flow(benches: Any) -> None:
     parser.add_argument(
         "--data", metavar="SPEC", action="append", help=f"{DATA_HELP}; may be given several times"
     )
-    parser.add_argument(
-        "--key",
-        type=natural,
-        action="append",
-        dest="keys",
-        metavar="K",
-        help="frame in the middle; may be given several times (default: 120)",
-    )
+    _add_keys(parser)
     add_window(parser)
     parser.add_argument(
         "--methods",
@@ -69,9 +63,7 @@ def _add_bench_flow(benches: Any) -> None:
         help="points that paper, paper-adam and nicp may move; more is slower and finer, 0: all "
         "(default: 8000)",
     )
-    add_config_options(parser)
-    parser.add_argument("--out", metavar="FILE.json", type=Path, help="write every number there")
-    add_overwrite(parser)
+    _add_configuration_and_file(parser)
 
 
 def _add_bench_depth(benches: Any) -> None:
@@ -85,14 +77,7 @@ def _add_bench_depth(benches: Any) -> None:
         "several scanners, for maps made without it.",
     )
     parser.add_argument("--data", metavar="SPEC", help=DATA_HELP)
-    parser.add_argument(
-        "--key",
-        type=natural,
-        action="append",
-        dest="keys",
-        metavar="K",
-        help="may be given several times (default: 120)",
-    )
+    _add_keys(parser)
     add_window(parser)
     add_camera(parser)
     parser.add_argument(
@@ -113,9 +98,7 @@ def _add_bench_depth(benches: Any) -> None:
         metavar="N",
         help="leave this scanner's returns out of the maps and take them for the truth",
     )
-    add_config_options(parser)
-    parser.add_argument("--out", metavar="FILE.json", type=Path, help="write every number there")
-    add_overwrite(parser)
+    _add_configuration_and_file(parser)
 
 
 def _add_bench_doctor(benches: Any) -> None:
@@ -128,6 +111,21 @@ def _add_bench_doctor(benches: Any) -> None:
     parser.add_argument(
         "--data", metavar="SPEC", action="append", help=f"{DATA_HELP}; may be given several times"
     )
+    _add_configuration_and_file(parser)
+
+
+def _add_keys(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--key",
+        type=natural,
+        action="append",
+        dest="keys",
+        metavar="K",
+        help="frame in the middle; may be given several times (default: 120)",
+    )
+
+
+def _add_configuration_and_file(parser: argparse.ArgumentParser) -> None:
     add_config_options(parser)
     parser.add_argument("--out", metavar="FILE.json", type=Path, help="write every number there")
     add_overwrite(parser)

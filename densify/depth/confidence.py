@@ -1,9 +1,13 @@
 # SPDX-License-Identifier: MIT
 """What a confidence means: the probability that a pixel's depth is right.
 
-A map's stages rank its pixels. The rank is turned into the probability of a wrong depth by a table
-measured on the built-in street, where the truth is exact (`densify bench depth --out FILE.json`
-holds what it is made of); the order of the pixels stays.
+A map's stages rank its pixels. The rank is turned into the probability of a wrong depth by tables
+measured where the truth is exact, on both cameras of eight streets: ``street`` seed 51,
+``street:crossing`` 52, ``street:highway`` 53, ``street`` 54 with hdl32, ``street:crossing`` 55 with
+vlp16, ``street`` 56 with os128, ``street:highway`` 57 with hdl32 and ``street:static`` 58; key 60,
+but 80 of the crossings and of 57, and 70 of 53. They are the shares of wrong pixels by rank, every
+map counted alike, made to fall with the rank (pool adjacent violators) and a little from knot to
+knot: the order of pixels measured, and of those filled, stays.
 """
 
 from __future__ import annotations

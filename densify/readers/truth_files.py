@@ -117,6 +117,8 @@ class FileTruth:
 
     @staticmethod
     def _load(path: Path, *names: str) -> list[NDArray]:  # type: ignore[type-arg]
+        if not path.exists():
+            raise InputError(f"{path}: no such truth file; write the frame again")
         arrays = read_arrays(path, names)
         if missing := [name for name in names if name not in arrays]:
             raise InputError(f"{path}: holds no {', '.join(missing)}; write the truth again")
