@@ -126,10 +126,19 @@ def test_the_installed_package_is_tested() -> None:
     assert not missing
 
 
-def test_the_readme_names_knobs_that_exist() -> None:
-    knobs = re.findall(
-        r"`(?:--set )?([a-z]+\.[a-z_]+)(=[^`]+)?`", (CHECKOUT / "README.md").read_text("utf-8")
-    )
+PAGES = [CHECKOUT / "README.md", *sorted((CHECKOUT / "docs").glob("*.md"))]
+
+
+def test_the_readme_is_short_and_links_lead_somewhere() -> None:
+    assert len(PAGES[0].read_text("utf-8").splitlines()) <= 150
+    for page in PAGES:
+        for link in re.findall(r"\]\(([^)#]+)", page.read_text("utf-8")):
+            assert link.startswith("https://") or (page.parent / link).exists(), f"{page}: {link}"
+
+
+def test_the_pages_name_knobs_that_exist() -> None:
+    text = "".join(page.read_text("utf-8") for page in PAGES)
+    knobs = re.findall(r"`(?:--set )?([a-z]+\.[a-z_]+)(=[^`]+)?`", text)
     sections = as_mapping(Config())
     named = [(*name.split("."), value) for name, value in knobs if name.split(".")[0] in sections]
     assert len(named) >= 4

@@ -274,8 +274,8 @@ def test_images_by_names_file_and_sweeps(tmp_path):
     np.testing.assert_array_equal(sequence.cameras["front"].K[:2], [[9, 0, 3.5], [0, 9, 2.5]])
 
 
-def test_the_example_of_the_readme_is_right(tmp_path):
-    text = (Path(__file__).parents[1] / "README.md").read_text("utf-8")
+def test_the_documented_example_is_right(tmp_path):
+    text = (Path(__file__).parents[1] / "docs" / "formats.md").read_text("utf-8")
     read = FolderConfig.read(config(tmp_path, text.split("```yaml\n")[1].split("```")[0]))
     assert read.sweeps.compensated and read.poses.T_frame_lidar[2, 3] == 1.6
     assert read.cameras[0].camera.K[0, 0] == 1000

@@ -27,6 +27,7 @@ def add_bench(commands: Any) -> None:
     _add_bench_flow(benches)
     _add_bench_depth(benches)
     _add_bench_doctor(benches)
+    _add_bench_readme(benches)
 
 
 def _add_bench_flow(benches: Any) -> None:
@@ -112,6 +113,27 @@ def _add_bench_doctor(benches: Any) -> None:
         "--data", metavar="SPEC", action="append", help=f"{DATA_HELP}; may be given several times"
     )
     _add_configuration_and_file(parser)
+
+
+def _add_bench_readme(benches: Any) -> None:
+    parser = add_verb(
+        benches,
+        "readme",
+        bench_verbs.bench_readme,
+        "the tables of docs/results.md made again, as Markdown on stdout; all of them take an hour",
+    )
+    parser.add_argument(
+        "tables",
+        nargs="*",
+        metavar="TABLE",
+        help="of methods, depth, parts, flow, rates (default: all)",
+    )
+    parser.add_argument(
+        "--kitti", metavar="DIR", type=Path, help="drive 2011_09_26_drive_0013_sync, for its rows"
+    )
+    parser.add_argument(
+        "--pandaset", metavar="DIR", type=Path, help="sequence 002 of PandaSet, for its rows"
+    )
 
 
 def _add_keys(parser: argparse.ArgumentParser) -> None:

@@ -98,3 +98,12 @@ def bench_flow(options: argparse.Namespace) -> None:
     if options.out is not None:
         write_table(options.out, {"runs": runs, "config": as_mapping(config)})
         print_paths([options.out])
+
+
+def bench_readme(options: argparse.Namespace) -> None:
+    """The tables of the documentation, made again."""
+    from densify.bench.readme import tables
+
+    with progress_on_stderr() as progress:
+        for line in tables(options.tables, options.kitti, options.pandaset, progress):
+            print(line, flush=True)

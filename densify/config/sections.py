@@ -323,7 +323,7 @@ class OutputSettings(Section):
     flow: bool = knob(False, "flow/: scene flow of every sweep to the next one, as flow files")
     flow_as: str = knob(
         "npz",
-        "flow files. npz: as the README says, towards the key; opensceneflow: an .h5 file as "
+        "flow files. npz: as docs/formats.md says, towards the key; opensceneflow: an .h5 file as "
         "OpenSceneFlow has them, up to the key",
         choices=("npz", "opensceneflow"),
     )

@@ -64,7 +64,7 @@ ENGINES = Table(
         Engine(
             "npz",
             "densify.readers.flow_files",
-            about="files of others, see the README",
+            about="files of others, see docs/formats.md",
             argument="DIR",
         ),
         Engine(

@@ -1,0 +1,261 @@
+# SPDX-License-Identifier: MIT
+"""``densify bench readme``: the tables of docs/results.md, made again as Markdown.
+
+Each table is a list of recordings and keys, and one function that measures a row. Streets have
+exact truth; of those with a seed none was looked at when parameters were chosen, except where the
+table says so. Real recordings are rows where their folders are given.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from densify import pipeline
+from densify.bench.depth import bench_depth
+from densify.bench.flow import bench_flow
+from densify.config import Config, resolve
+from densify.errors import InputError
+from densify.readers import open_sequence
+from densify.types import Progress
+
+_METHODS = ("none", "icp", "icp-far", "flow")
+
+
+class Scene(NamedTuple):
+    """window: sweeps on each side. scanner: whose returns are the truth, None for none."""
+
+    data: str
+    keys: tuple[int, ...]
+    camera: str = "image_02"
+    window: int = 5
+    scanner: int | None = None
+
+    def __str__(self) -> str:
+        keys = str(self.keys[0]) if len(self.keys) == 1 else f"{self.keys[0]}-{self.keys[-1]}"
+        return f"`{Path(self.data).name}`, key {keys}" + (
+            "" if self.camera == "image_02" else f", `{self.camera}`"
+        )
+
+
+_PRESETS = tuple(
+    Scene(data, (120,))
+    for data in (
+        *("street", "street:crossing", "street:highway", "street:static"),
+        *("street?seed=31", "street:crossing?seed=32", "street:highway?seed=33"),
+    )
+)
+_DEPTH = (
+    Scene("street?seed=41", (70,)),
+    Scene("street:crossing?seed=42", (90,)),
+    Scene("street:highway?seed=43", (60,)),
+    Scene("street?seed=44", (100,), "image_03"),
+    Scene("street?seed=45&sensor=hdl32", (80,)),
+    Scene("street?seed=46&sensor=vlp16", (80,)),
+)
+_FLOW = (
+    Scene("street?seed=21", (70,)),
+    Scene("street:crossing?seed=22", (90,)),
+    Scene("street:highway?seed=23", (110,)),
+    Scene("street:static?seed=24", (60,)),
+    Scene("street?seed=25&sensor=hdl32", (70,)),
+    Scene("street:crossing?seed=26&sensor=vlp16", (90,)),
+    Scene("street?seed=27&sensor=dual32", (60,)),
+)
+_RATES = tuple(
+    Scene(f"{data}{'&' if '?' in data else '?'}hz={hz}", (12 * hz,), window=hz // 2)
+    for data in ("street", "street:crossing", "street:highway", "street:static")
+    for hz in (5, 10, 20)
+)
+_PARTS = {
+    "all parts": (),
+    "no far range": ("accumulate.far_m=0",),
+    "no rims": ("project.rims=strict",),
+    "no windows": ("project.glass=keep",),
+    "no star fill": ("project.star_reach=0",),
+    "fences closed": ("project.seen_through=1",),
+}
+
+
+class _Table(NamedTuple):
+    """row: the cells of a scene, one line or several. kitti, pandaset: real scenes by folder."""
+
+    about: str
+    titles: tuple[str, ...]
+    scenes: tuple[Scene, ...]
+    row: Callable[[Scene], list[list[str]]]
+    real: bool = False
+
+
+def tables(
+    names: Sequence[str],
+    kitti: Path | None = None,
+    pandaset: Path | None = None,
+    progress: Progress | None = None,
+) -> Iterator[str]:
+    """Make the tables of these names, `TABLES`, and yield the lines of each as they are measured.
+
+    kitti: the folder of drive 2011_09_26_drive_0013_sync. pandaset: that of sequence 002. Their
+    rows are left out where none is given.
+
+    Raises InputError for other names, ComputationError where registration went wrong.
+    """
+    for name in names:
+        if name not in TABLES:
+            raise InputError(f"bench readme {name}: expected of {', '.join(TABLES)}")
+    chosen = [TABLES[name] for name in names or TABLES]
+    done, total = 0, sum(len(_scenes(table, kitti, pandaset)) for table in chosen)
+    for table in chosen:
+        yield f"{table.about}\n"
+        yield _line(("", *table.titles))
+        yield _line(["---"] * (len(table.titles) + 1))
+        for scene in _scenes(table, kitti, pandaset):
+            for cells in table.row(scene):
+                yield _line(cells)
+            done += 1
+            if progress is not None:
+                progress("bench", done, total)
+        yield ""
+
+
+def _scenes(table: _Table, kitti: Path | None, pandaset: Path | None) -> tuple[Scene, ...]:
+    real = []
+    if table.real and kitti is not None:
+        real.append(Scene(str(kitti), tuple(range(101, 127, 4))))
+    if table.real and pandaset is not None:
+        keys = tuple(range(15, 20))
+        real.append(Scene(f"pandaset:{pandaset}", keys, "front_camera", scanner=1))
+    return (*table.scenes, *real)
+
+
+def _line(cells: Sequence[str]) -> str:
+    return f"| {' | '.join(cells)} |"
+
+
+def _percent(value: float | None, digits: int = 2) -> str:
+    return "–" if value is None else f"{100 * value:.{digits}f}"
+
+
+def _row_of_methods(scene: Scene) -> list[list[str]]:
+    """`_METHODS` beside each other against exact truth."""
+    sequence, key = open_sequence(scene.data), scene.keys[0]
+    made = pipeline.compare(sequence, key, scene.window, [scene.camera], methods=_METHODS)
+    scores = [made[name].metrics for name in _METHODS]
+
+    def cells(digits: int, of: Callable[[Mapping[str, Any]], float | None]) -> str:
+        return f"{', '.join(_percent(of(score), digits) for score in scores)} %"
+
+    def truth(part: str, number: str) -> Callable[[Mapping[str, Any]], float | None]:
+        return lambda score: score["depth"][scene.camera]["measured"][part][number]
+
+    ours, filled = scores[-1], scores[-1]["depth"][scene.camera]["filled"]
+    density = ours["density"][scene.camera]["filled"]
+    moves = truth("moving", "coverage")(ours) is not None
+    return [
+        [
+            f"`{scene.data}`",
+            cells(1, lambda score: score["density"][scene.camera]["measured"]),
+            cells(2, truth("all", "outliers")),
+            cells(1, truth("moving", "outliers")) if moves else "",
+            cells(0, truth("moving", "coverage")) if moves else "",
+            f"{_percent(filled['all']['outliers'])} % at {_percent(density, 0)} %",
+            f"{_percent(scores[1]['ghosts']['all'])}, {_percent(ours['ghosts']['all'])} %",
+        ]
+    ]
+
+
+def _row_of_depth(scene: Scene) -> list[list[str]]:
+    """Measured and filled maps against the best truth there is."""
+    return [[str(scene), *cells] for _, cells in _depth_cells(scene, {"": resolve(None)})]
+
+
+def _rows_of_parts(scene: Scene) -> list[list[str]]:
+    """The same without each part of a map."""
+    variants = {name: resolve(None, changes) for name, changes in _PARTS.items()}
+    rows = _depth_cells(scene, variants)
+    return [[f"{scene}: {name}", *cells] for name, cells in rows]
+
+
+def _depth_cells(scene: Scene, variants: Mapping[str, Config]) -> Iterator[tuple[str, list[str]]]:
+    cameras = [scene.camera]
+    measured = bench_depth(
+        open_sequence(scene.data), scene.keys, scene.window, variants, cameras, scene.scanner
+    )
+    for name, numbers in measured["variants"].items():
+        scores = numbers["scores"]
+        source = next(s for s in ("truth", "scanner", "key held out") if s in scores)
+        cells = []
+        for product, part in (("measured", "all"), ("filled", "all"), ("filled", "moving")):
+            score = scores[source][product][part]
+            coverage = score["coverage"]
+            cells.append("–" if coverage is None else f"{coverage:.2f}")
+            cells.append(f"{_percent(score['outliers'])} %")
+        yield name, [*cells, f"{numbers['seconds']:.1f}"]
+
+
+def _row_of_flow(scene: Scene) -> list[list[str]]:
+    """Our flow: one sweep, and the same number of sweeps as the window has on each side."""
+    return [[str(scene), *_flow_cells(scene, scene.window)]]
+
+
+def _row_of_rates(scene: Scene) -> list[list[str]]:
+    """Our flow over 0.4 s at any rate."""
+    return [[str(scene), *_flow_cells(scene, round(0.8 * scene.window))]]
+
+
+def _flow_cells(scene: Scene, num_sweeps: int) -> list[str]:
+    sequence, key = open_sequence(scene.data), scene.keys[0]
+    measured = bench_flow(sequence, key, scene.window, resolve(None), ["ours"])
+    ours = measured["methods"]["ours"]
+    return [
+        f"{_percent(ours['step']['found'], 1)} %",
+        _centimetres(ours["step"]["movers_m"]),
+        _centimetres(ours["window"]["movers_m_by_hops"].get(str(num_sweeps))),
+        f"{_percent(ours['step']['falsely_moving'], 4)} %",
+        f"{_percent(ours['window']['ghost_rate'])} %",
+    ]
+
+
+def _centimetres(value_m: float | None) -> str:
+    return "–" if value_m is None else f"{100 * value_m:.1f} cm"
+
+
+_DEPTH_TITLES = (
+    *("measured", "wrong", "filled", "wrong", "movers, filled", "wrong"),
+    "seconds after the cloud",
+)
+TABLES: Mapping[str, _Table] = {
+    "methods": _Table(
+        "One sweep, ICP, ICP over 40 m of road each way, ours; measured depth but where it says "
+        "filled (seeds 31 to 33: looked at).",
+        (
+            *("density", "outliers", "on moving objects", "movers' coverage"),
+            *("ours, filled: outliers at density", "ghosts: ICP, ours"),
+        ),
+        _PRESETS,
+        _row_of_methods,
+    ),
+    "depth": _Table(
+        "Coverage of the truth's pixels within a scanner's reach, and wrong ones.",
+        _DEPTH_TITLES,
+        _DEPTH,
+        _row_of_depth,
+        real=True,
+    ),
+    "parts": _Table(
+        "The same without each part of a map.", _DEPTH_TITLES, _DEPTH[:4], _rows_of_parts, real=True
+    ),
+    "flow": _Table(
+        "Moving points found, errors with missed points counted as standing still.",
+        ("found", "one sweep", "five sweeps", "falsely moving", "ghosts"),
+        _FLOW,
+        _row_of_flow,
+    ),
+    "rates": _Table(
+        "The same streets at 5, 10 and 20 Hz, half a second on each side (looked at).",
+        ("found", "one sweep", "0.4 s", "falsely moving", "ghosts"),
+        _RATES,
+        _row_of_rates,
+    ),
+}

@@ -1,0 +1,53 @@
+# SPDX-License-Identifier: MIT
+"""The tables of the documentation: their rows, and what is refused."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+from densify.bench import readme
+from densify.cli import main
+from densify.readers import open_sequence
+
+RESULTS = Path(__file__).parents[1] / "docs" / "results.md"
+
+
+def test_every_scene_is_a_street_that_opens():
+    for table in readme.TABLES.values():
+        for scene in table.scenes:
+            sequence = open_sequence(scene.data)
+            assert set(scene.keys) <= set(sequence.frames) and scene.camera in sequence.cameras
+
+
+def test_a_row_is_what_its_bench_measures(capsys, monkeypatch):
+    scene = readme.Scene("street:static?seed=5", (30,), window=1)
+    table = readme.TABLES["flow"]._replace(scenes=(scene,))
+    monkeypatch.setattr(readme, "TABLES", {"flow": table})
+    assert main(["bench", "readme", "flow"]) == 0
+    about, _, titles, rule, row, _ = capsys.readouterr().out.splitlines()
+    assert about == table.about and rule.count("---") == titles.count("|") - 1
+    cells = [cell.strip() for cell in row.strip("|").split("|")]
+    # Nothing moves on this street, and nothing is said to.
+    assert cells[:5] == ["`street:static?seed=5`, key 30", "– %", "–", "–", "0.0000 %"]
+    assert re.fullmatch(r"0\.\d\d %", cells[5])
+
+
+def test_unknown_tables_are_refused_before_anything_is_measured(capsys):
+    assert main(["bench", "readme", "flows"]) == 2
+    said = capsys.readouterr().err
+    assert "flows" in said and "methods, depth, parts, flow, rates" in said
+
+
+def test_real_rows_come_with_their_folders(tmp_path):
+    table = readme.TABLES["depth"]
+    assert len(readme._scenes(table, tmp_path, None)) == len(table.scenes) + 1
+    assert readme._scenes(table, None, tmp_path)[-1].scanner == 1
+    assert readme._scenes(readme.TABLES["flow"], tmp_path, tmp_path) == readme._FLOW
+
+
+@pytest.mark.parametrize("name", readme.TABLES)
+def test_the_results_name_the_command_of_each_table(name):
+    assert f"densify bench readme {name}" in RESULTS.read_text("utf-8")
