@@ -9,7 +9,7 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from densify.readers.timeline import Timeline, check_window
+from densify.readers.timeline import Timeline, check_key, check_window
 
 BLOCK_S = 2.0
 _MARGIN_S = 1.5  # beyond a block within which its motion is found,
@@ -75,6 +75,8 @@ class Cut:
     def around(timeline: Timeline, window: int, keys: Collection[int]) -> Cut:
         """The windows of the keys; those that overlap are one block, unless its keys then are more
         than `BLOCK_S` apart. Raises InputError if a key does not exist."""
+        for key in keys:
+            check_key(key)
         groups: list[list[int]] = []
         spans: list[tuple[int, int]] = []
         for key in sorted(set(keys)):

@@ -4,7 +4,7 @@ no other way to tell."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -26,15 +26,18 @@ def with_doubts(
     stretch: Stretch,
     shots: Mapping[str, Shot],
     settings: Config,
+    cuts: Sequence[str] = (),
 ) -> dict[str, Result]:
     """The results of a key's methods with `Result.warnings`, each a sentence.
 
-    shots: what the maps show. Checked: what the reader had to assume, cameras left out for want of
-    images, where cameras stand and look, point times that are absent or longer than a sweep, images
-    too far in time, maps with next to nothing in them.
+    shots: what the maps show. cuts: of the window, sentences that come first. Checked: what the
+    reader had to assume, cameras left out for want of images, where cameras stand and look, point
+    times that are absent or longer than a sweep, images too far in time, what maps could not be
+    made as asked, maps with next to nothing in them.
     """
     chosen = {shot.camera.name: shot.camera for shot in shots.values()}
     shared = [
+        *cuts,
         *(sequence.gaps() if isinstance(sequence, KnowsItsGaps) else ()),
         *_left_out(sequence, chosen),
         *(doubt for camera in chosen.values() for doubt in _of_camera(camera)),
@@ -95,7 +98,10 @@ def _of_shots(
 ) -> Iterator[str]:
     for name, shot in shots.items():
         stamps_ns = list(sequence.image_stamps_ns(shot.camera.name).values())
-        if shot.number is not None or not stamps_ns:
+        if shot.number is not None:
+            continue
+        if not stamps_ns:
+            yield f"{name}: the recording has no image of it: its map has no colour"
             continue
         nearest_s = min(abs(stamp_ns - shot.stamp_ns) for stamp_ns in stamps_ns) * 1e-9
         yield (
@@ -106,6 +112,7 @@ def _of_shots(
 
 def _of_maps(result: Result) -> Iterator[str]:
     for name, maps in result.depth.items():
+        yield from (f"{name}: {warning}" for warning in maps.warnings)
         density = image_density(maps.depth_m)
         if density < _LEAST_DENSITY:
             yield (

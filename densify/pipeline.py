@@ -146,7 +146,6 @@ def run_keys(
     def results() -> Iterator[tuple[int, Result | ComputationError | InputError]]:
         for key in sorted(set(keys)):
             try:
-                _warn_of_cuts(recording, key)
                 yield key, densify(recording, key, methods, cameras, watch, priors=priors)[method]
             except (ComputationError, InputError) as error:
                 yield key, error
@@ -174,7 +173,6 @@ def compare(
     _check(sequence, settings, methods, cameras)
     priors = _open_priors(prior, sequence, cameras)
     recording = Recording(sequence, settings, window, [key], cache, watch=watch)
-    _warn_of_cuts(recording, key)
     return densify(recording, key, methods, cameras, watch, priors=priors)
 
 
@@ -201,6 +199,7 @@ def densify(
     of the last of the methods. Errors as `run`.
     """
     watch, sequence, settings = watch or Watch(), recording.sequence, recording.settings
+    cuts = _cuts(recording, key)
     shots = key_shots(sequence, choose_cameras(sequence, cameras), key, settings.project)
     with watch.stage("images"):
         images = load_images(sequence, shots)
@@ -219,7 +218,7 @@ def densify(
         *(sequence, stretch, key, moments, beyond, shots, images, with_images, found),
         *(settings, watch),
     )
-    return with_doubts(made, sequence, stretch, shots, settings)
+    return with_doubts(made, sequence, stretch, shots, settings, cuts)
 
 
 def _open_priors(
@@ -230,11 +229,11 @@ def _open_priors(
     return PriorFiles.open(Path(place), [c.name for c in choose_cameras(sequence, cameras)])
 
 
-def _warn_of_cuts(recording: Recording, key: int) -> None:
+def _cuts(recording: Recording, key: int) -> list[str]:
+    """Why a key's window has fewer sweeps than asked for, a sentence each."""
     window = recording.window_frames(key)
-    for cut in window.cuts:
-        frames = format_frames(window.frames)
-        _log.warning("the window of key %d is cut to frames %s: %s", key, frames, cut)
+    frames = format_frames(window.frames)
+    return [f"the window is cut to frames {frames}: {cut}" for cut in window.cuts]
 
 
 def _check(
@@ -333,9 +332,6 @@ class _Seen(NamedTuple):
                 name: with_ages(maps, self.stamps_ns, key, views.exposures[name].late_s)
                 for name, maps in views.depth(seen, visible).items()
             }
-        for name, maps in depth.items():
-            for warning in maps.warnings:
-                _log.warning("key %d: %s: %s", key, name, warning)
         cloud = seen.cloud
         if self.images is not None:
             with watch.stage("colour"):
@@ -364,6 +360,7 @@ class _Seen(NamedTuple):
             optical_flow=views.optical_flow(cloud, depth) if output.optical_flow else {},
             rejected=views.rejected(cloud, depth) if output.rejected else {},
             images=images,
+            stamp_ns=self.stretch[key].sweep.stamp_ns,
         )
 
 

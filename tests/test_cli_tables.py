@@ -91,3 +91,12 @@ def test_summary_compares_the_key_held_out_with_registration_alone() -> None:
     assert tables.summary(still).splitlines()[-1] == "cam, key held out: 1.00 % wrong"
     nothing = result_with({"ghosts": {"all": 0.01}, "held_out": None}, "none", 9)
     assert "held out" not in tables.summary(nothing)
+
+
+def test_movers_apart_are_counted_beside_the_rest() -> None:
+    result = result_with({}, "flow", 1234)
+    still = replace(result.cloud, moving=np.zeros(1234, bool))
+    movers = {i: types.Mover(result.cloud.select(result.cloud.frame == 0), {}) for i in (0, 3)}
+    text = tables.summary(replace(result, cloud=still, movers=movers))
+    num = 2 * int((result.cloud.frame == 0).sum())
+    assert f"(6-8), {num:,} more apart, on 2 moving objects" in text and num > 0

@@ -15,6 +15,7 @@ from densify.readers.kitti.raw import KittiRaw
 from densify.readers.window import choose_cameras
 from densify.types import Camera
 from tests.command import exit_code
+from tests.dataset_scenes import FRAMES, OPTIONS, copy_drive, records
 from tests.scenes import CAMERA, TinySequence, stamp_ns
 from tests.small_street import KEY, POSES_GIVEN, one_car
 
@@ -126,6 +127,30 @@ def test_a_run_ends_with_its_warnings_each_once(monkeypatch, tmp_path, capsys):
     assert exit_code("run", *keys, *settings, "--out", tmp_path / "out") == 0
     told = [line for line in capsys.readouterr().err.splitlines() if "a file is missing" in line]
     assert told == ["densify: warning: key 2-4: a file is missing"]
+
+
+@pytest.mark.parametrize("layout", ["kitti-depth", "densify"])
+def test_a_set_ends_with_its_warnings_and_keeps_them(layout, border_drive, tmp_path, capsys):
+    drive, out = copy_drive(border_drive, tmp_path / "2011_09_26"), tmp_path / "out"
+    (drive / "velodyne_points" / "timestamps_start.txt").unlink()
+    first, settings = FRAMES[0], (*OPTIONS, "--layout", layout, "--method", "icp")
+    keys = ("--keys", f"{first}:{first + 3}")
+    assert exit_code("dataset", "--data", drive, *settings, *keys, "--out", out) == 0
+    told = [line for line in capsys.readouterr().err.splitlines() if "warning" in line]
+    untimed = "the points have no times of their own: motion within a sweep is not undone"
+    ends = f"the recording ends at frame {first}"
+    assert told[:2] == [
+        f"densify: warning: {drive.name} key 36-38: {drive / 'velodyne_points'} has no "
+        f"timestamps_start.txt",
+        f"densify: warning: {drive.name} key 36-38: {untimed}",
+    ]
+    assert [line.rpartition(": ")[2] for line in told[2:]] == [ends, ends]  # of window 2
+    for record in records(out):
+        cut = record["key"] < first + 2
+        assert untimed in record["warnings"] and len(record["warnings"]) == 2 + cut
+        if layout == "densify":
+            (path,) = out.glob(f"**/{record['key']:06d}/run.yaml")
+            assert yaml.safe_load(path.read_text())["warnings"] == record["warnings"]
 
 
 class TestKitti:

@@ -38,6 +38,7 @@ def test_a_line_is_what_the_contract_says() -> None:
         "files": {f"val/{DRIVE}/0000000005.png": {"bytes": 1, "sha256": digest}},
         "scores": {"ghost": 0.5},
         "seconds": 2.5,
+        "warnings": [],
     }
 
 
@@ -57,6 +58,7 @@ json_values = st.recursive(
     files=st.dictionaries(st.text(), st.binary().map(FileRecord.of), max_size=3),
     scores=st.dictionaries(st.text(), json_values, max_size=3),
     seconds=st.integers(0, 10**9).map(lambda ms: ms / 1000),
+    warnings=st.lists(st.text()).map(tuple),
 )
 def test_every_record_comes_back_from_one_line(**fields) -> None:
     made = KeyRecord(**fields)

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
 """What is written: exact formats, whole or not at all, the same bytes every time."""
 
+import datetime
 import errno
 import json
 import os
@@ -8,6 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import cv2
+import laspy
 import numpy as np
 import pytest
 import yaml
@@ -269,12 +271,26 @@ def test_cloud_file_says_what_the_contract_says(tmp_path):
 
 
 def test_cloud_bytes_do_not_depend_on_the_day(tmp_path):
-    write_cloud(tmp_path / "a.laz", cloud_of(100))
-    write_cloud(tmp_path / "b.laz", cloud_of(100))
+    stamp_ns = 1_317_046_451_000_000_000  # 2011-09-26 14:14:11, day 269
+    write_cloud(tmp_path / "a.laz", cloud_of(100), stamp_ns)
+    write_cloud(tmp_path / "b.laz", cloud_of(100), stamp_ns)
     data = (tmp_path / "a.laz").read_bytes()
     assert data == (tmp_path / "b.laz").read_bytes()
     day, year = (int.from_bytes(data[i : i + 2], "little") for i in (90, 92))
-    assert (day, year) == (1, 2000)
+    assert (day, year) == (269, 2011)
+
+
+def test_points_have_the_time_of_their_sweep(tmp_path):
+    """Adjusted standard GPS time, as LAS 1.4 has it."""
+    stamp_ns = 1_317_046_451_000_000_000
+    cloud = replace(cloud_of(3), since_key_ns=np.array([-100_000_000, 0, 200_000_000]))
+    write_cloud(tmp_path / "cloud.laz", cloud, stamp_ns)
+    las = laspy.read(tmp_path / "cloud.laz")
+    assert las.header.global_encoding.gps_time_type == laspy.header.GpsTimeType.STANDARD
+    epoch = datetime.datetime(1980, 1, 6) + datetime.timedelta(seconds=10**9)
+    found = [epoch + datetime.timedelta(seconds=t) for t in np.round(las.gps_time, 6).tolist()]
+    assert [str(t)[10:] for t in found] == [" 14:14:10.900000", " 14:14:11", " 14:14:11.200000"]
+    assert {t.date() for t in found} == {datetime.date(2011, 9, 26)}
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, 3e6])

@@ -8,6 +8,7 @@ load numpy and heavier things are imported by the verb that needs them, so that 
 from __future__ import annotations
 
 import io
+import logging
 import os
 import sys
 from collections.abc import Sequence
@@ -60,6 +61,7 @@ def script() -> NoReturn:
     _open_what_is_closed()
     # Work is shared out among our own threads; OpenBLAS's would wait beside them in busy loops.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    logging.getLogger("densify.progress").setLevel(logging.INFO)
     code = main()
     if code == INTERRUPTED:
         # Python dies of the signal, not with 130, where an extension module was being imported,

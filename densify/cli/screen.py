@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 from densify.errors import brief
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Callable, Iterable
     from pathlib import Path
 
     from densify.dataset.make import Summary
@@ -44,14 +44,16 @@ def _log_warning(message: Warning | str, category: type[Warning], *where: Any) -
 
 @contextmanager
 def logging_to_stderr() -> Iterator[logging.Logger]:
-    """The package's logger writes to stderr inside the block; what takes long, on a terminal."""
+    """The package's logger writes to stderr inside the block; what takes long, on a terminal or
+    where the level of ``densify.progress`` says so."""
     log, progress = logging.getLogger("densify"), logging.getLogger("densify.progress")
     handler, before = _LineHandler(), (log.level, log.propagate, progress.level)
     handler.setLevel(logging.INFO)
     log.addHandler(handler)
     log.setLevel(logging.INFO)
     log.propagate = False
-    progress.setLevel(logging.INFO if sys.stderr.isatty() else logging.WARNING)
+    if not progress.level:
+        progress.setLevel(logging.INFO if sys.stderr.isatty() else logging.WARNING)
     try:
         with warnings.catch_warnings():
             warnings.showwarning = _log_warning  # type: ignore[assignment]
@@ -128,10 +130,17 @@ def print_paths(paths: list[Path]) -> None:
         print(path)
 
 
-def tell_doubts(doubts: Mapping[str, Sequence[int]]) -> None:
-    """At the end, each once; doubts: warning -> keys."""
+def tell_doubts(doubts: Iterable[tuple[str, str, int]], most: int = 20) -> None:
+    """At the end, each once, what holds for most keys first; doubts: (warning, recording or "",
+    key)."""
     from densify.readers.files import format_frames
 
-    for warning, keys in doubts.items():
-        where = f"key {format_frames(keys)}"
-        logging.getLogger("densify").warning("%s: %s", where, warning)
+    log = logging.getLogger("densify")
+    keys: dict[tuple[str, str], list[int]] = {}
+    for warning, recording, key in doubts:
+        keys.setdefault((warning, recording), []).append(key)
+    ordered = sorted(keys.items(), key=lambda entry: -len(entry[1]))
+    for (warning, recording), found in ordered[:most]:
+        log.warning("%s: %s", f"{recording} key {format_frames(found)}".lstrip(), warning)
+    if len(ordered) > most:
+        log.warning("... and %d more warnings, see run.yaml or the manifest", len(ordered) - most)

@@ -35,7 +35,7 @@ def summary(result: Result) -> str:
     cloud = result.cloud
     lines = [
         f"key {result.key}, {result.method}: {len(cloud):,} points of {len(result.frames)} sweeps "
-        f"({format_frames(result.frames)}), {np.count_nonzero(cloud.moving):,} on moving objects"
+        f"({format_frames(result.frames)}), {_moving(result)}"
     ]
     for name in result.depth:
         measured, filled = (_density(result, name, product) for product in ("measured", "filled"))
@@ -52,6 +52,13 @@ def summary(result: Result) -> str:
         lines.append(f"ghosts: {ghosts} of the accumulated points{beside}")
     lines += [line for name in result.depth if (line := _held_out_line(result, name))]
     return "\n".join(lines)
+
+
+def _moving(result: Result) -> str:
+    if not result.movers:
+        return f"{np.count_nonzero(result.cloud.moving):,} on moving objects"
+    num_apart = sum(len(mover.cloud) for mover in result.movers.values())
+    return f"{num_apart:,} more apart, on {len(result.movers)} moving objects"
 
 
 def _held_out_line(result: Result, camera: str) -> str:

@@ -30,7 +30,7 @@ def run(options: argparse.Namespace) -> None:
     for key in keys:
         check_writable(options.out, key, options.overwrite, "run", config.output.also)
     failed: dict[int, Exception] = {}
-    doubts: dict[str, list[int]] = {}
+    doubts: list[tuple[str, str, int]] = []
     with progress_on_stderr() as progress:
         made = pipeline.run_keys(
             sequence,
@@ -58,8 +58,7 @@ def run(options: argparse.Namespace) -> None:
             )
             print(summary(result))
             print_paths(paths)
-            for warning in result.warnings:
-                doubts.setdefault(warning, []).append(key)
+            doubts += [(warning, "", key) for warning in result.warnings]
     tell_doubts(doubts)
     if len(keys) == 1 and failed:
         raise failed[keys[0]]
@@ -99,7 +98,8 @@ def compare(options: argparse.Namespace) -> None:
     )
     print(comparison(results))
     print_paths(paths)
-    tell_doubts({w: [options.key] for r in results.values() for w in r.warnings})
+    told = dict.fromkeys(w for r in results.values() for w in r.warnings)
+    tell_doubts((warning, "", options.key) for warning in told)
 
 
 def dataset(options: argparse.Namespace) -> None:
@@ -152,6 +152,7 @@ def dataset(options: argparse.Namespace) -> None:
         )
     print(set_summary(summary))
     print_paths([options.out])
+    tell_doubts((w, r.drive, r.key) for r in summary.records.values() for w in r.warnings)
     if summary.count("failed"):
         raise ComputationError(f"{summary.count('failed')} of {summary.num_keys} keys not made")
 

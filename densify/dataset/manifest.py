@@ -9,6 +9,7 @@ of four shards, one JSON line per key::
     files        path relative to OUT, with slashes -> bytes, sha256
     scores       numbers; null where nothing can be said
     seconds      of computing
+    warnings     what was assumed or looks wrong, sentences
 
 A line is on the disk before the next one is begun, so whatever kills the writer damages at most the
 last one. A damaged line counts as none, and its key is made again. A later line of a key replaces
@@ -58,6 +59,7 @@ class KeyRecord:
     files: Mapping[str, FileRecord] = field(default_factory=dict)
     scores: Mapping[str, Any] = field(default_factory=dict)
     seconds: float = 0.0
+    warnings: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         sane = (
@@ -67,6 +69,7 @@ class KeyRecord:
             and all(type(number) is int for number in (self.key, *self.frames))
             and all(type(f.num_bytes) is int and len(f.sha256) == 64 for f in self.files.values())
             and math.isfinite(self.seconds)
+            and all(isinstance(warning, str) for warning in self.warnings)
         )
         if not sane:
             raise ValueError(f"KeyRecord: a value of a wrong kind: {self}")
@@ -89,6 +92,7 @@ class KeyRecord:
             },
             "scores": self.scores,
             "seconds": round(self.seconds, 3),
+            "warnings": self.warnings,
         }
         return (json.dumps(plain(record), allow_nan=False) + "\n").encode()
 
@@ -257,6 +261,7 @@ def _record(fields: Mapping[str, Any]) -> KeyRecord:
         files={n: FileRecord(f["bytes"], f["sha256"]) for n, f in fields["files"].items()},
         scores=dict(fields["scores"].items()),
         seconds=float(fields["seconds"]),
+        warnings=tuple(fields.get("warnings", ())),
     )
 
 

@@ -133,7 +133,12 @@ def _made(job: Job, key: int) -> KeyRecord:
     results = pipeline.densify(recording, key, _methods(recipe), cameras, with_images=pictures)
     result = results[recipe.method]
     scores = scores_of(result)
-    record = KeyRecord(job.source.name, key, "done", frames=result.frames, files={}, scores=scores)
+    record = KeyRecord(
+        *(job.source.name, key, "done"),
+        frames=result.frames,
+        scores=scores,
+        warnings=result.warnings,
+    )
     reason = recipe.gate.reason(scores, len(result.frames))
     if reason is not None:
         return replace(record, status="aside", reason=reason)

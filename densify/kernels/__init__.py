@@ -38,7 +38,7 @@ class _Notice(event.Listener):
         if not self.said and str(event.data["dispatcher"].__module__).startswith("densify."):
             self.said = True
             _progress.info(
-                "compiling the inner loops, once for this installation: 10 to 20 s in all"
+                "compiling the inner loops, once for this installation: about a minute in all"
             )
 
     def on_end(self, event: event.Event) -> None:

@@ -17,6 +17,8 @@ from densify.outputs.context import Context
 from densify.types import Bool, Cloud, Float, Float32, Result
 
 _SCALE_M = 0.001
+_UNIX_DAY_0, _DAY_NS = datetime.date(1970, 1, 1), 86400 * 10**9
+_LAS_EPOCH_NS = (315_964_800 + 10**9) * 10**9  # 1980-01-06, and what LAS takes off
 _MAX_COORDINATE_M = _SCALE_M * np.iinfo(np.int32).max
 _EXTRA_DIMENSIONS = (
     ("frame", "int32", "source sweep"),
@@ -49,16 +51,20 @@ class StoredCloud:
 
 def write_output(result: Result, context: Context, folder: Path) -> None:
     """``cloud.laz``."""
-    write_cloud(folder / "cloud.laz", result.cloud)
+    write_cloud(folder / "cloud.laz", result.cloud, result.stamp_ns)
 
 
-def write_cloud(path: Path, cloud: Cloud) -> None:
+def write_cloud(path: Path, cloud: Cloud, stamp_ns: int = 0) -> None:
     """Write a cloud with the extra dimensions frame, moving, instance, confidence, displaced and
     far.
 
+    stamp_ns: the key's reference time. ``gps_time`` is the reference time of the sweep that
+    measured the point, as LAS 1.4 has it: seconds since 1980-01-06, less 10^9, by the recording's
+    clock taken as UNIX time, without leap seconds. The header's date is the key's.
+
     Coordinates are rounded to 1 mm, intensity and colour widened to the format's 16 bits. The same
-    cloud gives the same bytes: the header's date is always 1 January 2000. Raises ValueError for
-    coordinates that are not finite or beyond 2,147 km.
+    cloud gives the same bytes. Raises ValueError for coordinates that are not finite or beyond
+    2,147 km.
     """
     import laspy
 
@@ -67,14 +73,16 @@ def write_cloud(path: Path, cloud: Cloud) -> None:
     header = laspy.LasHeader(version="1.4", point_format=7)
     header.scales = np.full(3, _SCALE_M)
     header.offsets = np.zeros(3)
-    header.creation_date = datetime.date(2000, 1, 1)
+    header.creation_date = _UNIX_DAY_0 + datetime.timedelta(days=stamp_ns // _DAY_NS)
     header.generating_software = "densify"
+    header.global_encoding.gps_time_type = laspy.header.GpsTimeType.STANDARD
     header.global_encoding.wkt = True  # demanded by LAS 1.4 for this point format
     header.add_extra_dims(
         [laspy.ExtraBytesParams(name, kind, text) for name, kind, text in _EXTRA_DIMENSIONS]
     )
     las = laspy.LasData(header)
     las.xyz = cloud.points
+    las.gps_time = (stamp_ns - _LAS_EPOCH_NS + cloud.since_key_ns) * 1e-9
     las.intensity = np.rint(65535 * np.clip(cloud.intensity, 0, 1)).astype(np.uint16)
     las.red, las.green, las.blue = (cloud.rgb.astype(np.uint16) * 257).T
     las.return_number = np.ones(len(cloud), np.uint8)

@@ -19,4 +19,4 @@ def write_output(result: Result, context: Context, folder: Path) -> None:
         for name, maps in mover.depth.items():
             (apart / "depth" / name).parent.mkdir(parents=True, exist_ok=True)
             write_depth_png(apart / "depth" / f"{name}.png", maps.depth_m)
-        write_cloud(apart / "cloud.laz", mover.cloud)
+        write_cloud(apart / "cloud.laz", mover.cloud, result.stamp_ns)

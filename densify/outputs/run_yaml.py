@@ -36,10 +36,7 @@ def write_output(result: Result, context: Context, folder: Path) -> None:
             name: {"source": full.source, **asdict(full.fit), "share": full.share}
             for name, full in result.full.items()
         },
-        "warnings": [
-            *result.warnings,
-            *(f"{name}: {w}" for name, m in result.depth.items() for w in m.warnings),
-        ],
+        "warnings": result.warnings,
         "config": context.config,
         "stages": [
             {

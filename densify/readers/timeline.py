@@ -32,11 +32,17 @@ class WindowFrames(NamedTuple):
 
 def check_window(window: int) -> None:
     """Raise InputError unless it is a number of sweeps on each side of a key."""
-    if not isinstance(window, int | np.integer) or window < 0:
+    if isinstance(window, bool) or not isinstance(window, int | np.integer) or window < 0:
         raise InputError(
             f"--window {window!r}: expected a whole number of sweeps on each side of the key, 0 or "
             f"more"
         )
+
+
+def check_key(key: int) -> None:
+    """Raise InputError unless it is the number of a frame."""
+    if isinstance(key, bool) or not isinstance(key, int | np.integer):
+        raise InputError(f"--key {key!r}: expected a frame's number, a whole one")
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -28,8 +28,9 @@ def read_sweep(sequence: LidarSequence, frame: int, settings: RegisterSettings) 
 def choose_cameras(sequence: LidarSequence, names: Sequence[str] | None) -> list[Camera]:
     """The cameras of these names; if None all with images, or simply all where none has any.
     Raises InputError naming those that exist."""
-    if isinstance(names, str):
-        raise InputError(f"cameras: got {names!r}, expected a list of names, such as [{names!r}]")
+    if isinstance(names, str) or not isinstance(names, Iterable | None):
+        one = [*sequence.cameras][:1]
+        raise InputError(f"cameras: got {names!r}, expected a list of names, such as {one}")
     for name in names or ():
         if name not in sequence.cameras:
             known = ", ".join(sequence.cameras) or "none"

@@ -39,8 +39,8 @@ class Result:
     asked for (``output.flow``). movers: by instance (``output.movers``). optical_flow: name ->
     (H,W,2) pixels to the "previous" and the "next" image (``output.optical_flow``). rejected: name
     -> (H,W) `Reason` of what was left out (``output.rejected``). full: of the maps that a prior was
-    given for. images: name -> (H,W,3) RGB, of
-    the maps whose image there is. warnings: what was assumed or looks wrong, a sentence each.
+    given for. images: name -> (H,W,3) RGB, of the maps whose image there is. warnings: what was
+    assumed or looks wrong, a sentence each. stamp_ns: the key's reference time.
     """
 
     method: str
@@ -59,3 +59,4 @@ class Result:
     images: Mapping[str, NDArray[np.uint8]] = field(default_factory=dict)
     far_frames: tuple[int, ...] = ()
     warnings: tuple[str, ...] = ()
+    stamp_ns: int = 0
