@@ -61,10 +61,20 @@ def empty_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return cache
 
 
+class RealData:
+    """The folder of real recordings: ``test_data / "kitti/2011_09_26"`` is that path in it, or ends
+    the test as skipped."""
+
+    def __truediv__(self, name: str) -> Path:
+        folder = os.environ.get("DENSIFY_TEST_DATA")
+        if not folder:
+            pytest.skip("DENSIFY_TEST_DATA is not set: no real recordings to test on")
+        path = Path(folder) / name
+        if not path.exists():
+            pytest.skip(f"{path} is not there")
+        return path
+
+
 @pytest.fixture(scope="session")
-def test_data() -> Path:
-    """The folder of real recordings."""
-    folder = os.environ.get("DENSIFY_TEST_DATA")
-    if not folder:
-        pytest.skip("DENSIFY_TEST_DATA is not set: no real recordings to test on")
-    return Path(folder)
+def test_data() -> RealData:
+    return RealData()

@@ -180,9 +180,9 @@ def test_speed_is_that_of_the_street(good: Sample, street: Faulty) -> None:
 
 
 def test_the_command_on_a_real_drive(
-    test_data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    test_data, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    drive = test_data / "kitti" / "2011_09_26" / "2011_09_26_drive_0002_sync"
+    drive = test_data / "kitti/2011_09_26/2011_09_26_drive_0002_sync"
     picture = tmp_path / "look.png"
     assert exit_code("doctor", drive, "--json", "--picture", picture) == 0
     printed = json.loads(capsys.readouterr().out)

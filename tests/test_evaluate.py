@@ -297,8 +297,8 @@ def test_masks_of_every_kind(tmp_path: Path) -> None:
         read_mask_png(tmp_path / "nothing.png")
 
 
-def test_kittis_own_truth(test_data: Path) -> None:
-    path = test_data / "kitti" / "depth_annotated_sample" / "groundtruth_0000000050.png"
+def test_kittis_own_truth(test_data) -> None:
+    path = test_data / "kitti/depth_annotated_sample" / "groundtruth_0000000050.png"
     same = evaluate(pair_depth_files(path, path))["parts"]
     assert same["all"]["num_pixels"] == np.count_nonzero(cv2.imread(str(path), -1)) > 90_000
     for name, part in same.items():
@@ -307,8 +307,8 @@ def test_kittis_own_truth(test_data: Path) -> None:
     assert 0.005 < same["edge"]["num_pixels"] / same["all"]["num_pixels"] < 0.05
 
 
-def test_a_scaled_real_map_has_the_errors_of_its_scale(tmp_path: Path, test_data: Path) -> None:
-    path = test_data / "kitti" / "depth_annotated_sample" / "groundtruth_0000000050.png"
+def test_a_scaled_real_map_has_the_errors_of_its_scale(tmp_path: Path, test_data) -> None:
+    path = test_data / "kitti/depth_annotated_sample" / "groundtruth_0000000050.png"
     truth_m = read_depth_png(path)
     write_depth_png(tmp_path / "twice.png", 2 * truth_m)
     everything = evaluate(pair_depth_files(tmp_path / "twice.png", path))["parts"]["all"]

@@ -52,8 +52,8 @@ def test_street(tmp_path: Path) -> None:
     assert f"depth in {np.mean(depth_m > 0):.1%} of the pixels" in text
 
 
-def test_kitti(test_data: Path, tmp_path: Path) -> None:
-    drive = test_data / "kitti" / "2011_09_26" / "2011_09_26_drive_0013_sync"
+def test_kitti(test_data, tmp_path: Path) -> None:
+    drive = test_data / "kitti/2011_09_26/2011_09_26_drive_0013_sync"
     text = output_of("kitti.py", tmp_path, str(drive), "120")
     assert text.startswith("key 120: sweeps 118 to 122, ")
     assert number_before(text, "points\n") > 5 * 100_000

@@ -173,8 +173,8 @@ def test_the_tree_is_one_that_evaluate_reads(tmp_path: Path) -> None:
     }
 
 
-def test_the_format_is_that_of_the_official_files(tmp_path: Path, test_data: Path) -> None:
-    folder = test_data / "kitti" / "depth_annotated_sample"
+def test_the_format_is_that_of_the_official_files(tmp_path: Path, test_data) -> None:
+    folder = test_data / "kitti/depth_annotated_sample"
     official = folder / "groundtruth_0000000050.png"
     image = cv2.imread(str(official), cv2.IMREAD_UNCHANGED)
     depth_m = read_depth_png(official)

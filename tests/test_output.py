@@ -219,11 +219,8 @@ def test_files_that_are_no_depth_map(tmp_path, kind):
     one_line(error, path)
 
 
-def test_the_official_depth_map_reencodes_to_the_same_pixels(tmp_path):
-    folder = os.environ.get("DENSIFY_TEST_DATA")
-    if not folder:
-        pytest.skip("DENSIFY_TEST_DATA is not set: no official KITTI depth map")
-    path = Path(folder) / "kitti" / "depth_annotated_sample" / "groundtruth_0000000050.png"
+def test_the_official_depth_map_reencodes_to_the_same_pixels(tmp_path, test_data):
+    path = test_data / "kitti/depth_annotated_sample/groundtruth_0000000050.png"
     depth = read_depth_png(path)
     assert 1 < depth[depth > 0].min() < depth.max() < 120
     write_depth_png(tmp_path / "a.png", depth)

@@ -3,9 +3,7 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -267,12 +265,9 @@ def test_bad_columns_are_refused(name, source, target, message):
     assert "\n" not in str(caught.value)
 
 
-def test_real_traffic():
+def test_real_traffic(test_data):
     """A street in Karlsruhe: the cars ahead and behind move, houses and hedges do not."""
-    folder = os.environ.get("DENSIFY_TEST_DATA")
-    if not folder:
-        pytest.skip("DENSIFY_TEST_DATA is not set: no real KITTI drives")
-    drive = Path(folder) / "kitti" / "2011_09_26" / "2011_09_26_drive_0013_sync"
+    drive = test_data / "kitti/2011_09_26/2011_09_26_drive_0013_sync"
     sequence, settings = open_sequence(str(drive)), RegisterSettings()
     sweeps = [read_sweep(sequence, frame, settings) for frame in range(118, 123)]
     stretch = deskew(sweeps, find_trajectory(sweeps, settings))

@@ -3,9 +3,7 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -575,11 +573,11 @@ def kitti_calibration(path):
     return {name: text.split() for name, _, text in rows}
 
 
-def test_real_sweep_hides_what_its_camera_cannot_see():
-    data = os.environ.get("DENSIFY_TEST_DATA")
-    if not data:
-        pytest.skip("DENSIFY_TEST_DATA is not set")
-    day = Path(data) / "kitti/2011_09_26"
+def test_real_sweep_hides_what_its_camera_cannot_see(test_data):
+    sweep = test_data / (
+        "kitti/2011_09_26/2011_09_26_drive_0013_sync/velodyne_points/data/0000000120.bin"
+    )
+    day = test_data / "kitti/2011_09_26"
     camera_text = kitti_calibration(day / "calib_cam_to_cam.txt")
     lidar_text = kitti_calibration(day / "calib_velo_to_cam.txt")
     P = np.array(camera_text["P_rect_02"], float).reshape(3, 4)
@@ -590,7 +588,6 @@ def test_real_sweep_hides_what_its_camera_cannot_see():
     T_rect[:3, 3] = np.linalg.solve(P[:, :3], P[:, 3])
     T_cam_lidar = T_rect @ T_cam_lidar
     camera = Camera("image_02", 1242, 375, P[:, :3], T_cam_lidar)
-    sweep = day / "2011_09_26_drive_0013_sync/velodyne_points/data/0000000120.bin"
     points = np.fromfile(sweep, np.float32).reshape(-1, 4)[:, :3].astype(float)
     cloud = make_cloud(points[np.linalg.norm(points, axis=1) > 3])
 
