@@ -61,6 +61,12 @@ def add_dataset(commands: Any) -> None:
         choices=("train", "val"),
         help="of the tree (default: KITTI's official one, train for other recordings)",
     )
+    parser.add_argument(
+        "--links",
+        action="store_true",
+        help="make data_depth_velodyne, data_depth_annotated and data_rgb, links by which loaders "
+        "of others find the tree and its images",
+    )
     _add_gate(parser)
     _add_workers(parser)
     parser.add_argument(

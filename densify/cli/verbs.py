@@ -148,6 +148,7 @@ def dataset(options: argparse.Namespace) -> None:
             memory_bytes=options.memory,
             cache_bytes=options.cache_size,
             verify=options.verify,
+            links=options.links,
             report=report,
         )
     print(set_summary(summary))

@@ -15,6 +15,7 @@ from uuid import uuid4
 
 from densify.cache import code, steps_folder
 from densify.config import as_mapping
+from densify.dataset.links import make_links
 from densify.dataset.manifest import (
     Key,
     KeyRecord,
@@ -98,6 +99,7 @@ def make_dataset(
     memory_bytes: int | None = None,
     cache_bytes: int = CACHE_BYTES,
     verify: bool = False,
+    links: bool = False,
     report: Callable[[Summary], None] | None = None,
 ) -> Summary:
     """Every key of whole recordings, as a training set in ``out``.
@@ -110,7 +112,8 @@ def make_dataset(
     share ``out``. memory_bytes: of all processes together; fewer are started where it does not
     suffice, and one of several that takes more than its share is replaced. cache_bytes: bound of
     what is kept on disk for later runs. verify: compare finished files with their recorded hashes,
-    and make damaged ones anew. report: called before the first key and after every one.
+    and make damaged ones anew. links: of the tree, for loaders of others, see
+    `densify.dataset.links`. report: called before the first key and after every one.
 
     Run again, it goes on where it was stopped, however that happened: finished keys are kept, keys
     that failed are tried again. The files do not depend on the number of processes, on shards or on
@@ -123,6 +126,8 @@ def make_dataset(
     check_engine(recipe.config.flow.engine)
     drives = plan(data, keys, recipe)
     check_place(out)
+    if links and recipe.layout != "kitti-depth":
+        raise InputError(f"--links: of --layout kitti-depth, got --layout {recipe.layout}")
     steps_folder()
     check_workers(num_workers, scheduler)
     num_processes = _num_processes(num_workers, memory_bytes, recipe, drives)
@@ -131,6 +136,8 @@ def make_dataset(
         with _log_file(out, shard):
             clear_leftovers(out)
             _explain(out, recipe)
+            if links:
+                make_links(out, drives)
             drives = _part(drives, shard)
             done = _Done(out, drives, report, verify)
             left = done.left(drives)
