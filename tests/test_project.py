@@ -331,7 +331,7 @@ def test_depth_is_the_planes_in_the_middle_of_the_pixel():
     keep = ray @ n > 0.05
     points = (ray / (ray @ n)[:, None])[keep]
     frame = rng.choice(SWEEPS, len(points))
-    knobs = ProjectSettings(support=1, agree_fraction=0.05)
+    knobs = ProjectSettings(support=1, agree_fraction=0.05, spot=0)
     normal = np.tile(n, (len(points), 1))
     depth = see(camera, points, frame, knobs, (2.0, 2.0), normal=normal).depth_m
     row, column = np.nonzero(depth)
@@ -592,7 +592,7 @@ def test_real_sweep_hides_what_its_camera_cannot_see(test_data):
     cloud = make_cloud(points[np.linalg.norm(points, axis=1) > 3])
 
     plain = view(cloud, camera, T_cam_lidar, PLAIN)
-    depth = view(cloud, camera, T_cam_lidar, ProjectSettings())
+    depth = view(cloud, camera, T_cam_lidar, ProjectSettings(spot=0))
     measured = depth.depth_m > 0
     # the scanner sits above the camera, so a little of what it sees is hidden, and only a little
     assert 0.9 < measured.sum() / (plain.depth_m > 0).sum() < 1.0

@@ -244,6 +244,13 @@ class ProjectSettings(Section):
     edge_slack_m: float = knob(
         0.015, "[m] added to that, for errors of registration and flow", 0, 1
     )
+    spot: float = knob(
+        0.35,
+        "half width of a laser's spot, in spacings along the azimuth: filled pixels of the same "
+        "surface that a return's spot covers count as measured; 0: only the pixel it falls into",
+        0,
+        2,
+    )
     rims: str = knob(
         "image",
         "pixels measured that close to a depth edge. image: keep those that the camera's image "

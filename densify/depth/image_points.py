@@ -45,6 +45,13 @@ class PointsInImage:
             return self
         return PointsInImage(**{f.name: getattr(self, f.name)[keep] for f in fields(self)})
 
+    def at(self, rows: Int) -> Int:
+        """Where rows of the cloud, all in the image, are among these."""
+        place = np.zeros(int(self.index.max(initial=-1)) + 1, np.int64)
+        place[self.index] = np.arange(len(self.index))
+        found: Int = place[rows]
+        return found
+
     @property
     def inverse(self) -> Float:
         return 1 / self.depth.astype(np.float64)

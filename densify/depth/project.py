@@ -11,6 +11,8 @@ order of the points.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
@@ -25,6 +27,7 @@ from densify.depth.image_points import PointsInImage, in_image
 from densify.depth.layers import Layers
 from densify.depth.rims import decide
 from densify.depth.settling import MeasuredPixels, nearest_pixels, visible_pixels
+from densify.depth.spot import measure_spots
 from densify.depth.star import fill_stars
 from densify.types import Camera, Cloud, DepthMap, Float32, Patches, Reason
 
@@ -54,7 +57,8 @@ def project(
     Points nearer than 0.1 m, outside the image or outside the lens's valid field of view are
     dropped. Planes are fitted in inverse depth, or inverse range where depth is the range: linear
     over the image of a pinhole in the first case, nearly so over a surface's few pixels otherwise.
-    ``filled_m`` adds pixels interpolated between measured ones (`densify.depth.fill`).
+    ``filled_m`` adds pixels interpolated between measured ones (`densify.depth.fill`); those that
+    the spot of a measured return covers count as measured too (`densify.depth.spot`).
     ``confidence`` starts from the point's own, less where few sweeps or points agree, a depth edge
     is close, the surface rough, or the point nearly hidden; that rank is turned into a probability
     (`densify.depth.confidence`), but with ``visibility`` off. ``reason`` says of every point why it
@@ -79,7 +83,12 @@ def project(
             layers = fill_stars(layers, settings)
     if settings.visibility and rays is not None and settings.seen_through < 1:
         layers = without_seen_through(layers, cloud, view.exposure, rays, reason, settings)
-    return _finished(layers, cloud, view.exposure, reason, settings.visibility)
+    _tell(layers, reason)
+    if settings.visibility:
+        layers = replace(layers, confidence=calibrated(layers.confidence, layers.depth_m > 0))
+        if filled and settings.spot > 0:
+            layers = measure_spots(layers, points, settings)
+    return _finished(layers, cloud, view.exposure, reason)
 
 
 def _measured(
@@ -119,24 +128,26 @@ def _spacing_px(points: PointsInImage, shape: tuple[int, int]) -> Float32:
     return np.ascontiguousarray(every[: shape[0], : shape[1]])
 
 
-def _finished(
-    layers: Layers, cloud: Cloud, exposure: Exposure, reason: NDArray[np.uint8], visible: bool
-) -> DepthMap:
-    measured, rim = layers.depth_m > 0, (layers.rim_m > 0) & ~layers.veiled
-    reason[layers.point[rim]] = Reason.EDGE
-    reason[layers.point[measured]] = Reason.KEPT
+def _tell(layers: Layers, reason: NDArray[np.uint8]) -> None:
+    """Fill in the ``reason`` of the points that are in the map, or were taken out of it."""
+    reason[layers.point[(layers.rim_m > 0) & ~layers.veiled]] = Reason.EDGE
+    reason[layers.point[layers.depth_m > 0]] = Reason.KEPT
     if layers.glass is not None:
         reason[layers.point[layers.glass]] = Reason.GLASS
+
+
+def _finished(
+    layers: Layers, cloud: Cloud, exposure: Exposure, reason: NDArray[np.uint8]
+) -> DepthMap:
+    measured = layers.depth_m > 0
     frame = np.full(measured.shape, -1, np.int32)
     frame[measured] = cloud.frame[layers.point[measured]]
     shown = layers.filled_m > 0
-    confidence = calibrated(layers.confidence, measured) if visible else layers.confidence
-    confidence = np.where(shown, np.maximum(confidence, _LEAST_CONFIDENCE), 0)
     return DepthMap(
         camera=exposure.camera.name,
         depth_m=layers.depth_m,
         filled_m=layers.filled_m,
-        confidence=confidence,
+        confidence=np.where(shown, np.maximum(layers.confidence, _LEAST_CONFIDENCE), 0),
         frame=frame,
         reason=reason,
         measure=exposure.measure,
