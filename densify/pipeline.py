@@ -361,6 +361,9 @@ class _Seen(NamedTuple):
             rejected=views.rejected(cloud, depth) if output.rejected else {},
             images=images,
             stamp_ns=self.stretch[key].sweep.stamp_ns,
+            views=views.cameras(),
+            truth_m={name: true_m for name, (true_m, _) in self.truth.items()},
+            T_key_lidar={f: self.stretch.T_target_source(key, f) for f in self.stretch.frames},
         )
 
 

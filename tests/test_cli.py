@@ -59,6 +59,9 @@ def test_run_writes_exactly_the_tree_and_names_every_file(densified: SimpleNames
         "000120/figure.png",
         "000120/curve.png",
         "000120/run.yaml",
+        "000120/scene/scene.json",
+        "000120/scene/image/image_02.jpg",
+        *(f"000120/scene/{k}/image_02.png" for k in ("none", "icp", "truth", "sweep")),
     }
     assert set(files_in(densified.out)) == expected
     named = {line for line in densified.stdout.splitlines() if line.startswith(str(densified.out))}
@@ -160,7 +163,10 @@ def test_compare_prints_a_table_and_writes_it(
         *("image_02 truth, moving, outliers", "image_02 key held out, all, coverage"),
     ):
         assert any(line.startswith(row) for line in lines), row
-    assert set(files_in(tmp_path / "out")) == {"000120/compare.json", "000120/compare.png"}
+    files = set(files_in(tmp_path / "out"))
+    beside = {name for name in files if name.startswith("000120/compare/")}
+    assert files - beside == {"000120/compare.json", "000120/compare.png"}
+    assert {"000120/compare/depth/image_02.png", "000120/compare/cloud.laz"} < beside
     table = json.loads((tmp_path / "out" / "000120" / "compare.json").read_text("utf-8"))
     assert list(table["methods"]) == ["none", "icp", "flow"]
     num_points = int(next(x for x in lines if x.startswith("points")).split()[3].replace(",", ""))

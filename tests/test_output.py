@@ -245,6 +245,8 @@ def test_cloud_comes_back(tmp_path, num_points):
         np.testing.assert_array_equal(getattr(back, name), getattr(cloud, name))
         assert getattr(back, name).dtype == getattr(cloud, name).dtype
     np.testing.assert_allclose(back.intensity, cloud.intensity, atol=1 / 65535)
+    displacement = cloud.points - cloud.rigid_points
+    np.testing.assert_array_equal(back.displacement, displacement.astype(np.float32))
 
 
 def test_cloud_file_says_what_the_contract_says(tmp_path):
@@ -260,6 +262,7 @@ def test_cloud_file_says_what_the_contract_says(tmp_path):
         "confidence": np.float32,
         "displaced": np.float32,
         "far": np.uint8,
+        **{f"displaced_{axis}": np.float32 for axis in "xyz"},
     }
     assert list(las.header.scales) == [0.001] * 3
     np.testing.assert_array_equal(las.intensity, [0, 65535, 65535])
@@ -681,7 +684,11 @@ def test_comparison_is_written_beside_the_run(put, images, tmp_path):
     put()
     run = tree(tmp_path)
     paths = compare(tmp_path / "out", images)
-    assert [p.name for p in paths] == ["compare.json", "compare.png"]
+    maps = sorted(f"{k}/{c}.png" for k in ("depth", "depth_filled", "confidence", "age")
+                  for c in ("image_02", "image_03"))  # fmt: skip
+    beside = [p.relative_to(tmp_path / "out/000120/compare").as_posix() for p in paths[2:]]
+    assert [p.name for p in paths[:2]] == ["compare.json", "compare.png"]
+    assert beside == sorted([*maps, "cloud.laz"])
     after = tree(tmp_path)
     assert {k: v for k, v in after.items() if "compare" not in k} == run
     table = json.loads(paths[0].read_text())
@@ -702,7 +709,7 @@ def test_comparison_is_kept_and_survives_a_new_run(put, images, tmp_path):
     data = [p.read_bytes() for p in first]
     with pytest.raises(InputError) as error:
         compare(tmp_path / "out", images)
-    one_line(error, "compare.json, compare.png already there", "--overwrite")
+    one_line(error, "compare.json, compare.png, compare already there", "--overwrite")
     put()  # no --overwrite needed: nothing of a run is there
     assert [p.read_bytes() for p in first] == data
     compare(tmp_path / "out", images, overwrite=True, seed=5)

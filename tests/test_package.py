@@ -60,7 +60,7 @@ def test_help_is_light(arguments: list[str]) -> None:
 
 
 @pytest.mark.parametrize(
-    "verb", ["run", "compare", "flow", "info", "simulate", "evaluate", "export", "bench"]
+    "verb", ["run", "compare", "flow", "info", "simulate", "evaluate", "export", "report", "bench"]
 )
 def test_help_of_every_verb_is_light(verb: str) -> None:
     code = (
@@ -121,7 +121,9 @@ def test_the_installed_package_is_tested() -> None:
     home = Path(densify.__file__).resolve().parent
     assert CHECKOUT not in home.parents, f"{home} is the checkout, not an installed package"
     assert all(path.parent == home / "configs" for path in presets().values())
-    sources = {p.relative_to(CHECKOUT / "densify") for p in (CHECKOUT / "densify").rglob("*.py")}
+    package = CHECKOUT / "densify"
+    sources = {p.relative_to(package) for p in package.rglob("*.py")}
+    sources |= {p.relative_to(package) for p in (package / "report" / "page").iterdir()}
     missing = sorted(str(path) for path in sources if not (home / path).is_file())
     assert not missing
 
@@ -191,6 +193,7 @@ FLOORS = (
     ("registration", "depth", "flow", "scores", "street"),
     ("readers",),
     ("outputs", "writers"),
+    ("report",),
     ("blocks", "completion", "doubts", "sweeps"),
     ("road",),
     ("recording",),

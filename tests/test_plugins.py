@@ -205,7 +205,7 @@ def test_a_reader_of_another_package(package, tmp_path: Path) -> None:
 RESULT = SimpleNamespace(
     **{name: {} for name in ("depth", "full", "movers", "optical_flow", "rejected", "metrics")},
     **{"baselines": {}, "flow": None, "key": 3, "method": "flow", "frames": (3,), "costs": ()},
-    **{"far_frames": (), "warnings": ()},
+    **{"far_frames": (), "warnings": (), "stamp_ns": 0, "T_key_lidar": {}},
     cloud=None,
 )
 

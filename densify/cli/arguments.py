@@ -51,6 +51,7 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     _add_doctor(commands)
     _add_simulate(commands)
     _add_export(commands)
+    _add_report(commands)
     _add_evaluate(commands)
     add_bench(commands)
     return parser.parse_args(arguments)
@@ -252,6 +253,31 @@ def _add_export(commands: Any) -> None:
         help="drop pixels measured longer before or after the exposure (default: keep all)",
     )
     parser.add_argument("--out", metavar="DIR", type=Path, help="(default: RUN/export)")
+    add_overwrite(parser)
+
+
+def _add_report(commands: Any) -> None:
+    parser = add_verb(
+        commands,
+        "report",
+        verbs.report,
+        "one self-contained page to look at a run or a comparison in a browser",
+        "The image with every map, depth under the pointer, what a least confidence leaves, the "
+        "cloud in 3-D, scores and costs, in one HTML file of 12 MB at most that needs no network. "
+        "Files that are missing or damaged are named on it.",
+    )
+    parser.add_argument(
+        "place",
+        metavar="DIR",
+        type=Path,
+        help="folder of one key, such as densify-out/000120, or one above a single key",
+    )
+    parser.add_argument(
+        "--out",
+        metavar="FILE.html",
+        type=Path,
+        help="(default: report.html of a run, compare.html of a comparison, in the key's folder)",
+    )
     add_overwrite(parser)
 
 

@@ -99,6 +99,12 @@ def add_short_options(parser: argparse.ArgumentParser) -> None:
         help="moving objects in the maps, left out, or left out and written one by one (short for "
         "--set output.movers=…; default: keep)",
     )
+    parser.add_argument(
+        "--report",
+        action="store_true",
+        help="a page to look at each key in a browser, with what was left out and why (short for "
+        "--set output.report=true --set output.rejected=true; densify report makes it later)",
+    )
 
 
 def add_config_options(parser: argparse.ArgumentParser) -> None:

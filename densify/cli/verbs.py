@@ -96,6 +96,10 @@ def compare(options: argparse.Namespace) -> None:
         data=options.data,
         overwrite=options.overwrite,
     )
+    if config.output.report:
+        from densify.report import write_comparison_page
+
+        paths.append(write_comparison_page(paths[0].parent))
     print(comparison(results))
     print_paths(paths)
     told = dict.fromkeys(w for r in results.values() for w in r.warnings)
@@ -265,6 +269,13 @@ def export(options: argparse.Namespace) -> None:
     print_paths(exported.paths)
 
 
+def report(options: argparse.Namespace) -> None:
+    """A page of what is in a folder."""
+    from densify.report import write_report
+
+    print_paths(write_report(options.place, options.out, options.overwrite))
+
+
 def evaluate(options: argparse.Namespace) -> None:
     """Depth maps against the truth."""
     from densify.bench import evaluation
@@ -297,6 +308,8 @@ _SHORT = {
 def _config(options: argparse.Namespace) -> densify.Config:
     given = {knob: getattr(options, name) for name, knob in _SHORT.items()}
     named = [f"{knob}={value}" for knob, value in given.items() if value is not None]
+    if options.report:
+        named += ["output.report=true", "output.rejected=true"]
     return resolve(options.config, [*options.overrides, *named])
 
 

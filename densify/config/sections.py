@@ -342,6 +342,11 @@ class OutputSettings(Section):
     rejected: bool = knob(
         False, "rejected/: a picture of what visibility left out, and why; counts in metrics.json"
     )
+    report: bool = knob(
+        False,
+        "report.html: the result to look at in a browser; with output.rejected also what was left "
+        "out and why (--report is both)",
+    )
     also: str = knob(
         "", "outputs that other packages bring, by name, parted by commas; see examples/plugin"
     )

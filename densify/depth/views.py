@@ -27,6 +27,7 @@ from densify.geometry.sensor import Sensors
 from densify.scores import depth_metrics
 from densify.types import (
     Bool,
+    CameraView,
     Cloud,
     DepthMap,
     Float,
@@ -166,6 +167,13 @@ class Views:
                 depth_m = converted(e.camera, depth_m, e.camera.measure, e.measure)
                 known[name] = (depth_m, truth.moving_mask(e.camera.name, e.number))
         return known
+
+    def cameras(self) -> dict[str, CameraView]:
+        """From where each map looks."""
+        return {
+            name: CameraView(e.camera, e.T_cam_key, e.late_s, e.number)
+            for name, e in self.exposures.items()
+        }
 
     def optical_flow(
         self, cloud: Cloud, depth: Mapping[str, DepthMap]

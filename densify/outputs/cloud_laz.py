@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import datetime
 import io
+import logging
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from densify.errors import InputError
+from densify.files.content import check_size, open_file, reason
 from densify.outputs.atomic import write_file
 from densify.outputs.context import Context
 from densify.types import Bool, Cloud, Float, Float32, Result
@@ -27,7 +29,12 @@ _EXTRA_DIMENSIONS = (
     ("confidence", "float32", "0 to 1"),
     ("displaced", "float32", "m beyond rigid alignment"),
     ("far", "uint8", "1 from beyond the window"),
+    ("displaced_x", "float32", "m, displaced as a vector"),
+    ("displaced_y", "float32", "m"),
+    ("displaced_z", "float32", "m"),
 )
+_SINCE = {"far", "displaced_x", "displaced_y", "displaced_z"}
+"""Dimensions that older clouds lack."""
 
 
 @dataclass(frozen=True)
@@ -35,7 +42,8 @@ class StoredCloud:
     """A cloud as it was written: M points, key frame, metres, rounded to the millimetre.
 
     frame, instance: (M,) int32. moving, far: (M,) bool. confidence, displaced, intensity: (M,)
-    float32. rgb: (M,3) uint8.
+    float32. rgb: (M,3) uint8. displacement: (M,3) float32 metres, by which a point was moved beyond
+    the rigid alignment; None in clouds of older versions.
     """
 
     points: Float
@@ -47,6 +55,7 @@ class StoredCloud:
     intensity: Float32
     rgb: NDArray[np.uint8]
     far: Bool
+    displacement: Float32 | None
 
 
 def write_output(result: Result, context: Context, folder: Path) -> None:
@@ -55,8 +64,8 @@ def write_output(result: Result, context: Context, folder: Path) -> None:
 
 
 def write_cloud(path: Path, cloud: Cloud, stamp_ns: int = 0) -> None:
-    """Write a cloud with the extra dimensions frame, moving, instance, confidence, displaced and
-    far.
+    """Write a cloud with the extra dimensions frame, moving, instance, confidence, displaced, far,
+    displaced_x, displaced_y and displaced_z.
 
     stamp_ns: the key's reference time. ``gps_time`` is the reference time of the sweep that
     measured the point, as LAS 1.4 has it: seconds since 1980-01-06, less 10^9, by the recording's
@@ -87,8 +96,10 @@ def write_cloud(path: Path, cloud: Cloud, stamp_ns: int = 0) -> None:
     las.red, las.green, las.blue = (cloud.rgb.astype(np.uint16) * 257).T
     las.return_number = np.ones(len(cloud), np.uint8)
     las.number_of_returns = np.ones(len(cloud), np.uint8)
+    displacement = cloud.points - cloud.rigid_points
+    vector = dict(zip(("displaced_x", "displaced_y", "displaced_z"), displacement.T, strict=True))
     for name, kind, _ in _EXTRA_DIMENSIONS:
-        las[name] = getattr(cloud, name).astype(kind)
+        las[name] = (vector[name] if name in vector else getattr(cloud, name)).astype(kind)
     buffer = io.BytesIO()
     las.write(buffer, do_compress=True)
     write_file(path, buffer.getvalue())
@@ -98,17 +109,32 @@ def read_cloud(path: Path) -> StoredCloud:
     """Read back what `write_cloud` wrote. Raises InputError for any other file."""
     import laspy
 
+    quiet = logging.getLogger("laspy")
     try:
-        las = laspy.read(path)
-    except (OSError, laspy.errors.LaspyException) as error:
-        raise InputError(f"{path}: not a readable LAZ file: {error}") from error
+        quiet.disabled = True  # it tells stderr what the exception says too
+        with laspy.open(open_file(path)) as file:
+            num_points = file.header.point_count
+            check_size(num_points * file.header.point_format.size, path)
+            las = file.read()
+        if len(las) != num_points:
+            raise ValueError(f"got {len(las)} points, expected {num_points}; it is cut off")
+    except InputError:
+        raise
+    except Exception as error:  # damaged ones raise anything
+        raise InputError(f"{path}: not a readable LAZ file: {reason(error)}") from error
+    finally:
+        quiet.disabled = False
     names = set(las.point_format.dimension_names)
-    missing = {name for name, _, _ in _EXTRA_DIMENSIONS} - names - {"far"}
+    missing = {name for name, _, _ in _EXTRA_DIMENSIONS} - names - _SINCE
     if missing:
         raise InputError(
             f"{path}: no dimension {', '.join(sorted(missing))}; expected a cloud densify wrote"
         )
     rgb = np.stack([las.red, las.green, las.blue], axis=1)
+    displacement = None
+    if names >= _SINCE:
+        vector = [np.array(las[f"displaced_{axis}"], np.float32) for axis in "xyz"]
+        displacement = np.stack(vector, axis=1)
     return StoredCloud(
         points=np.array(las.xyz),
         frame=np.array(las["frame"], np.int32),
@@ -119,4 +145,5 @@ def read_cloud(path: Path) -> StoredCloud:
         intensity=np.array(las.intensity, np.float32) / np.float32(65535),
         rgb=(rgb // 257).astype(np.uint8),
         far=np.array(las["far"], bool) if "far" in names else np.zeros(len(rgb), bool),
+        displacement=displacement,
     )

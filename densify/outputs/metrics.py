@@ -2,7 +2,7 @@
 """The output of scores, metrics.json.
 
 Its keys; compare.json holds those from ``frames`` on under ``methods`` by method, and data, config
-and versions as run.yaml::
+stages, warnings and versions as run.yaml::
 
     schema_version, key, method
     frames      of the window, absolute numbers

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""PNG encoding, and pictures as files."""
+"""PNG and JPEG encoding, and pictures as files."""
 
 from __future__ import annotations
 
@@ -20,6 +20,15 @@ def encode_png(image: NDArray[np.uint16] | NDArray[np.uint8]) -> bytes:
     done, data = cv2.imencode(".png", image)
     if not done:
         raise ValueError(f"an image of shape {image.shape} cannot be written as PNG")
+    return data.tobytes()
+
+
+def encode_jpeg(picture: Picture, quality: int = 92) -> bytes:
+    """An RGB picture as JPEG. quality: 0 to 100; lower is smaller and shows blocks."""
+    bgr = np.ascontiguousarray(picture[:, :, ::-1])
+    done, data = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, quality])
+    if not done:
+        raise ValueError(f"a picture of shape {picture.shape} cannot be written as JPEG")
     return data.tobytes()
 
 

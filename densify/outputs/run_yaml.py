@@ -7,6 +7,7 @@ import platform
 from dataclasses import asdict
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
+from typing import Any
 
 import yaml
 
@@ -38,18 +39,23 @@ def write_output(result: Result, context: Context, folder: Path) -> None:
         },
         "warnings": result.warnings,
         "config": context.config,
-        "stages": [
-            {
-                "name": cost.name,
-                "seconds": round(cost.seconds, 3),
-                "peak_memory_mb": round(cost.peak_memory_mb, 1),
-            }
-            for cost in result.costs
-        ],
+        "stages": stages(result),
         "versions": versions(),
     }
     text = yaml.safe_dump(plain(record), sort_keys=False, allow_unicode=True)
     write_file(folder / "run.yaml", text.encode())
+
+
+def stages(result: Result) -> list[dict[str, Any]]:
+    """What each stage cost: name, seconds, peak_memory_mb."""
+    return [
+        {
+            "name": cost.name,
+            "seconds": round(cost.seconds, 3),
+            "peak_memory_mb": round(cost.peak_memory_mb, 1),
+        }
+        for cost in result.costs
+    ]
 
 
 def versions() -> dict[str, str | None]:

@@ -13,19 +13,20 @@ from pathlib import Path
 from typing import Any, Literal, Protocol, cast
 
 from densify.errors import InputError, OutputError
+from densify.outputs import cloud_laz, depth_maps, scene
 from densify.outputs.atomic import staged_folder
 from densify.outputs.context import Context
 from densify.outputs.figure import write_figure
 from densify.outputs.metrics import SCHEMA_VERSION, scores_of
 from densify.outputs.plain import write_json
 from densify.outputs.png import Picture
-from densify.outputs.run_yaml import versions
+from densify.outputs.run_yaml import stages, versions
 from densify.plugins.outputs import OUTPUTS, Output, chosen
 from densify.types import Result
 
 Verb = Literal["run", "compare"]
 
-_COMPARISON = ("compare.json", "compare.png")
+_COMPARISON = ("compare.json", "compare.png", "compare", "compare.html")
 
 
 class OutputModule(Protocol):
@@ -136,22 +137,30 @@ def write_comparison(
     overwrite: bool = False,
 ) -> list[Path]:
     """Write methods side by side as ``out/KEY/compare.json`` and ``compare.png``, beside the files
-    of a run where there are some.
+    of a run where there are some; in ``compare/`` the last method's maps and cloud as
+    `write_result` has them, with the others' maps in its scene.
 
     results: method to result, of one key. The rest as `write_result`.
     """
-    key = next(iter(results.values())).key
+    last = list(results.values())[-1]
+    key, context = last.key, Context(images, config, data)
     table = {
         "schema_version": SCHEMA_VERSION,
         "key": key,
         "data": data,
         "methods": {method: scores_of(result) for method, result in results.items()},
         "config": config,
+        "stages": stages(last),
+        "warnings": list(dict.fromkeys(w for r in results.values() for w in r.warnings)),
         "versions": versions(),
     }
     with writing(_key_folder(out, key), _COMPARISON, out, overwrite) as folder:
         write_json(folder / "compare.json", table)
-        write_figure(folder / "compare.png", results, Context(images, config, data))
+        write_figure(folder / "compare.png", results, context)
+        maps = folder / "compare"
+        maps.mkdir()
+        for output in (depth_maps, cloud_laz, scene):
+            output.write_output(last, context, maps)
     return _written(out, key, _COMPARISON)
 
 

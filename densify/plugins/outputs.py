@@ -49,10 +49,13 @@ OUTPUTS = Table(
         Output("optical_flow", "densify.outputs.optical_flow", owned=("optical_flow",)),
         Output("rejected", "densify.outputs.rejected", owned=("rejected",)),
         Output("cloud", "densify.outputs.cloud_laz", owned=("cloud.laz",)),
+        Output("scene", "densify.outputs.scene", owned=("scene",)),
         Output("metrics", "densify.outputs.metrics", owned=("metrics.json",)),
         Output("figure", "densify.outputs.figure", owned=("figure.png",)),
         Output("curve", "densify.outputs.curve", owned=("curve.png",)),
         Output("run", "densify.outputs.run_yaml", owned=("run.yaml",)),
+        # Last, for it reads what the others wrote.
+        Output("report", "densify.report", owned=("report.html",)),
     ),
     members=("write_output",),
     row_of=_row,

@@ -7,7 +7,16 @@ sweep's lidar), ``cam``.
 """
 
 from densify.arrays import Bool, Float, Float32, Int
-from densify.types.depth import Camera, Cloud, DepthMap, Mover, Patches, Reason, Standing
+from densify.types.depth import (
+    Camera,
+    CameraView,
+    Cloud,
+    DepthMap,
+    Mover,
+    Patches,
+    Reason,
+    Standing,
+)
 from densify.types.flow import FlowField, Motion, StretchFlow
 from densify.types.prior import FullDepth, Prior, PriorFit
 from densify.types.recordings import (
@@ -26,6 +35,7 @@ from densify.types.sweeps import RegisteredSweep, Stretch, Sweep, Trajectory
 __all__ = [
     "Bool",
     "Camera",
+    "CameraView",
     "Cloud",
     "DepthMap",
     "Float",

@@ -211,6 +211,20 @@ class Camera:
 
 
 @dataclass(frozen=True)
+class CameraView:
+    """From where a depth map looks.
+
+    T_cam_key: (4,4) at the moment the map shows. late_s: seconds from the key's reference time to
+    that moment. number: of the image, None where there is none.
+    """
+
+    camera: Camera
+    T_cam_key: Float
+    late_s: float
+    number: int | None
+
+
+@dataclass(frozen=True)
 class DepthMap:
     """Dense depth of one camera; (H,W) everywhere.
 

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from densify.arrays import Float32
-from densify.types.depth import Cloud, DepthMap, Mover
+from densify.arrays import Float, Float32
+from densify.types.depth import CameraView, Cloud, DepthMap, Mover
 from densify.types.flow import StretchFlow
 from densify.types.prior import FullDepth
 
@@ -40,7 +40,9 @@ class Result:
     (H,W,2) pixels to the "previous" and the "next" image (``output.optical_flow``). rejected: name
     -> (H,W) `Reason` of what was left out (``output.rejected``). full: of the maps that a prior was
     given for. images: name -> (H,W,3) RGB, of the maps whose image there is. warnings: what was
-    assumed or looks wrong, a sentence each. stamp_ns: the key's reference time.
+    assumed or looks wrong, a sentence each. stamp_ns: the key's reference time. views: from where
+    each map looks. truth_m: name -> (H,W) true depth, 0 none, where there is truth. T_key_lidar:
+    (4,4) of every sweep of the window, by frame.
     """
 
     method: str
@@ -60,3 +62,6 @@ class Result:
     far_frames: tuple[int, ...] = ()
     warnings: tuple[str, ...] = ()
     stamp_ns: int = 0
+    views: Mapping[str, CameraView] = field(default_factory=dict)
+    truth_m: Mapping[str, Float32] = field(default_factory=dict)
+    T_key_lidar: Mapping[int, Float] = field(default_factory=dict)

@@ -1,0 +1,348 @@
+# SPDX-License-Identifier: MIT
+"""Pages as files: what they carry comes back, they stay small, and nothing in them can run."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import json
+import re
+import zlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from densify.errors import InputError
+from densify.outputs import StoredCloud, read_cloud
+from densify.outputs.depth_png import read_stored
+from densify.outputs.png import encode_png
+from densify.report import key_page, write_report
+from densify.report.camera_maps import packed_camera
+from densify.report.cloud_points import packed_cloud
+from densify.report.key_files import KeyFiles
+from densify.report.pack import Blobs, smallest
+from densify.report.page_file import page_file
+from densify.report.thinning import in_space_order, thinned
+from tests.command import refused
+from tests.report_runs import write_compared, write_run
+
+KINDS = {1: np.uint8, 2: np.uint16, 4: np.uint32}
+
+
+def unpacked(blobs: Blobs, entry) -> np.ndarray:
+    """As page/unpack.js does it."""
+    planes = np.frombuffer(zlib.decompress(base64.b64decode(blobs.texts[entry["blob"]])), np.uint8)
+    values = np.zeros(planes.size // entry["bytes"], KINDS[entry["bytes"]])
+    for place, plane in enumerate(planes.reshape(entry["bytes"], -1)):
+        values += plane.astype(values.dtype) << values.dtype.type(8 * place)
+    values = values.reshape(entry["shape"])
+    return np.cumsum(values, axis=-1, dtype=values.dtype) if entry["delta"] else values
+
+
+def data_of(page: bytes) -> dict:
+    return json.loads(re.search(rb'id="page-data">(.*?)</script>', page, re.DOTALL)[1])
+
+
+def blobs_of(page: bytes) -> Blobs:
+    blobs = Blobs()
+    found = re.findall(r'<script type="text/plain" id="(.*?)">(.*?)</script>', page.decode())
+    blobs.texts.update(found)
+    return blobs
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_run(tmp_path_factory.mktemp("run"))
+
+
+class TestPacking:
+    @pytest.mark.parametrize("kind", [np.uint8, np.uint16, np.uint32])
+    @pytest.mark.parametrize("shape", [(0,), (7,), (5, 11)])
+    @pytest.mark.parametrize("smooth", [True, False])
+    def test_arrays_come_back(self, kind, shape, smooth) -> None:
+        rng = np.random.default_rng(3)
+        array = rng.integers(0, np.iinfo(kind).max, shape, kind, endpoint=True)
+        if smooth:
+            array = np.cumsum(array // 64, axis=-1, dtype=kind)  # wraps around
+        blobs = Blobs()
+        entry = blobs.add(array)
+        assert unpacked(blobs, entry).tobytes() == array.tobytes()
+
+    def test_the_smaller_way_is_taken(self) -> None:
+        ramp, noise = np.arange(4000, dtype=np.uint16), np.random.default_rng(0)
+        blobs = Blobs()
+        assert blobs.add(ramp)["delta"] and blobs.num_bytes < 200
+        assert not blobs.add(noise.integers(0, 2, 4000, np.uint16))["delta"]
+
+    def test_as_few_bits_as_numbers_need(self) -> None:
+        assert [smallest(np.array([n])).dtype for n in (255, 256, 65536)] == [*KINDS.values()]
+        with pytest.raises(ValueError, match="32 bits"):
+            smallest(np.array([1 << 32]))
+
+
+class TestThinning:
+    points = np.random.default_rng(1).normal(0, [30, 30, 2], (40_000, 3))
+    moving = np.arange(40_000) < 500
+
+    def test_all_if_there_is_room(self) -> None:
+        assert len(thinned(self.points, self.moving, 40_000)) == 40_000
+
+    @pytest.mark.parametrize("most", [1000, 5000, 30_000])
+    def test_what_moves_stays_and_the_room_is_used(self, most: int) -> None:
+        rows = thinned(self.points, self.moving, most)
+        assert 0.8 * most <= len(rows) <= most and (np.diff(rows) > 0).all()
+        assert self.moving[rows].sum() == 500
+        assert np.array_equal(rows, thinned(self.points, self.moving, most))
+
+    def test_movers_leave_half_of_the_room(self) -> None:
+        rows = thinned(self.points, np.arange(40_000) < 30_000, 10_000)
+        assert (rows < 30_000).sum() == 5000
+
+    def test_what_looks_the_same_goes_first(self) -> None:
+        """A far wall that is as dense as a near one loses more of its points."""
+        y, z = np.meshgrid(np.linspace(-2, 2, 100), np.linspace(-1, 1, 50))
+        walls = [np.stack([np.full(y.size, x), y.ravel(), z.ravel()], axis=1) for x in (8.0, 80.0)]
+        rows = thinned(np.concatenate(walls), np.zeros(10_000, bool), 3000)
+        near, far = (rows < 5000).sum(), (rows >= 5000).sum()
+        assert near > 10 * far > 0
+
+    def test_space_order_keeps_neighbours_together(self) -> None:
+        levels = np.random.default_rng(0).integers(0, 65536, (5000, 3)).astype(np.uint16)
+        order = in_space_order(levels)
+        assert np.array_equal(np.sort(order), np.arange(5000))
+        code = [
+            sum(((int(row[k]) >> bit) & 1) << (3 * bit + k) for k in range(3) for bit in range(16))
+            for row in levels[order[:200]]
+        ]
+        assert code == sorted(code)
+
+
+def cloud_of(num_points: int, moving) -> StoredCloud:
+    rng = np.random.default_rng(5)
+    displacement = np.where(moving[:, None], rng.normal(0, 8, (num_points, 3)), 0)
+    return StoredCloud(
+        points=rng.uniform(-90, 120, (num_points, 3)),
+        frame=rng.integers(10, 13, num_points, dtype=np.int32),
+        moving=moving,
+        instance=np.where(moving, rng.integers(-1, 3, num_points), -1).astype(np.int32),
+        confidence=rng.random(num_points, np.float32),
+        displaced=np.linalg.norm(displacement, axis=1).astype(np.float32),
+        intensity=rng.random(num_points, np.float32),
+        rgb=rng.integers(1, 256, (num_points, 3), np.uint8),
+        far=np.zeros(num_points, bool),
+        displacement=displacement.astype(np.float32),
+    )
+
+
+def test_points_come_back_to_half_a_step() -> None:
+    cloud, blobs = cloud_of(3000, np.arange(3000) % 5 == 0), Blobs()
+    entry = packed_cloud(blobs, cloud, [10, 11, 12], [2, 0])
+    assert (entry["num_points"], entry["num_all"], entry["num_moving"]) == (3000, 3000, 600)
+    assert entry["step_m"] < 0.0035
+    places = np.stack([unpacked(blobs, e) for e in entry["places"]], axis=1)
+    points = np.array(entry["low_m"]) + entry["step_m"] * places
+    nearest = [np.abs(cloud.points - p).max(axis=1).argmin() for p in points]
+    assert sorted(nearest) == list(range(3000))
+    assert np.abs(cloud.points[nearest] - points).max() <= 0.5001 * entry["step_m"]
+    assert np.array_equal(unpacked(blobs, entry["sweep"]), cloud.frame[nearest] - 10)
+    number = {-1: 1, 2: 2, 0: 3, 1: 1}  # 1: has no number
+    expected = [number[i] if m else 0 for i, m in zip(cloud.instance, cloud.moving, strict=True)]
+    assert np.array_equal(unpacked(blobs, entry["mover"]), np.array(expected)[nearest])
+    displaced = np.stack([unpacked(blobs, e) for e in entry["displaced"]], axis=1) - 32768.0
+    found = entry["displaced_step_m"] * displaced
+    assert (
+        np.abs(found - cloud.displacement[nearest[:600]]).max() <= 0.51 * entry["displaced_step_m"]
+    )
+    rgb = np.stack([unpacked(blobs, e) for e in entry["rgb"]], axis=1)
+    assert np.array_equal(rgb, cloud.rgb[nearest] >> 2)
+    off = (
+        unpacked(blobs, entry["confidence"]) / entry["confidence_steps"] - cloud.confidence[nearest]
+    )
+    assert np.abs(off).max() <= 0.5001 / entry["confidence_steps"]
+
+
+def test_a_cloud_of_no_points_and_of_an_older_version() -> None:
+    cloud = cloud_of(0, np.zeros(0, bool))
+    assert packed_cloud(Blobs(), cloud, [], [])["num_points"] == 0
+    old = StoredCloud(**{**vars(cloud_of(9, np.ones(9, bool))), "displacement": None})
+    assert "displaced" not in packed_cloud(Blobs(), old, [10, 11, 12], [])
+
+
+class TestPage:
+    def test_maps_come_back_as_the_files_have_them(self, run: Path) -> None:
+        page = (run / "report.html").read_bytes()
+        data, blobs = data_of(page), blobs_of(page)
+        camera = data["cameras"]["front"]
+        stored = {
+            kind: read_stored(run / place / "front.png", bits, kind)
+            for kind, place, bits in (
+                ("depth", "depth", np.uint16),
+                ("filled", "depth_filled", np.uint16),
+                ("confidence", "confidence", np.uint8),
+                ("age", "age", np.uint16),
+                ("truth", "scene/truth", np.uint16),
+                ("reason", "scene/reason", np.uint8),
+                ("sweep", "scene/sweep", np.uint16),
+                ("icp", "scene/icp", np.uint16),
+                ("none", "scene/none", np.uint16),
+            )
+        }
+        for kind in ("filled", "confidence", "truth", "reason"):
+            assert np.array_equal(unpacked(blobs, camera[kind]), stored[kind]), kind
+        assert list(camera["others"]) == ["none", "icp"]
+        for method, entry in camera["others"].items():
+            assert np.array_equal(unpacked(blobs, entry), stored[method])
+        sources = np.array(camera["sources"])[unpacked(blobs, camera["source"])]
+        assert np.array_equal(sources[..., 0], stored["sweep"])
+        assert np.array_equal(sources[..., 1], stored["age"])
+        assert np.array_equal(sources[..., 2] > 0, stored["depth"] > 0)
+        sweeps = np.array([s["frame"] for s in data["sweeps"]])
+        measured = stored["depth"] > 0
+        assert set(sweeps[stored["sweep"][measured] - 1]) <= {1, 2, 3, 4, 5}
+        assert data["missing"] == [] and data["cloud"]["num_all"] == len(
+            read_cloud(run / "cloud.laz").points
+        )
+
+    def test_the_same_files_give_the_same_page(self, run: Path, tmp_path: Path) -> None:
+        a, b = (write_report(run, tmp_path / name)[0].read_bytes() for name in "ab")
+        assert a == b and len(a) < 2_000_000
+
+    def test_paths_lead_through_the_key(self, run: Path) -> None:
+        """The car comes nearer at 4 m/s, and its way through the window is 0.4 s long."""
+        mover = data_of((run / "report.html").read_bytes())["movers"][0]
+        way = np.diff([p["position_m"] for p in mover["path"]], axis=0)
+        speed = np.linalg.norm(mover["velocity_m_s"])
+        assert len(way) == 4 and np.linalg.norm(way, axis=1) == pytest.approx(
+            [0.1 * speed] * 4, abs=0.05
+        )
+        assert abs(speed - 8) < 0.3
+
+    def test_too_large_maps_lose_pixels_and_points(self, run: Path, monkeypatch) -> None:
+        monkeypatch.setattr("densify.report.key_page._MOST_FOR_MAPS", 30_000)
+        monkeypatch.setattr("densify.report.key_page.MOST_BYTES", 460_000)
+        page = key_page.key_page(KeyFiles.of_run(run), "x")
+        camera = data_of(page)["cameras"]["front"]
+        assert camera["every"] > 1 and len(page) < 460_000
+        whole = read_stored(run / "depth_filled" / "front.png", np.uint16, "")
+        small = unpacked(blobs_of(page), camera["filled"])
+        assert np.array_equal(small, whole[:: camera["every"], :: camera["every"]])
+        assert data_of(page)["cloud"]["num_points"] < data_of(page)["cloud"]["num_all"]
+
+    def test_the_command_makes_it_again(self, run: Path) -> None:
+        data = data_of((run / "report.html").read_bytes())
+        assert data["command"] == (
+            "densify run --data 'tiny street' --key 3 --window 2 --method flow "
+            "--set register.source=dataset --set accumulate.far_m=0.0 --set output.rejected=true "
+            "--set output.report=true"
+        )
+
+    def test_a_comparison_has_all_methods(self, tmp_path: Path) -> None:
+        folder = write_compared(tmp_path)
+        (page,) = write_report(tmp_path)
+        assert page == folder / "compare.html"
+        data = data_of(page.read_bytes())
+        assert list(data["methods"]) == ["none", "icp", "flow"] and data["method"] == "flow"
+        assert list(data["cameras"]["front"]["others"]) == ["none", "icp"]
+        assert data["cloud"]["displaced"] and data["about"]["stages"]
+        assert data["command"].endswith("--methods none,icp,flow --set register.source=dataset "
+                                        "--set accumulate.far_m=0.0")  # fmt: skip
+
+    def test_a_run_of_before_has_what_is_there(self, run: Path, tmp_path: Path) -> None:
+        for name in ("run.yaml", "metrics.json"):
+            (tmp_path / name).write_bytes((run / name).read_bytes())
+        for kind in ("depth", "depth_filled"):
+            (tmp_path / kind).mkdir()
+            (tmp_path / kind / "front.png").write_bytes((run / kind / "front.png").read_bytes())
+        (page,) = write_report(tmp_path)
+        data = data_of(page.read_bytes())
+        assert data["cloud"] is None and data["missing"] == [
+            "cloud.laz: not there, so there is no view in 3-D"
+        ]
+        assert "confidence" not in data["cameras"]["front"]
+
+
+class TestNothingRuns:
+    EVIL = "</script><script>alert(1)</script><img src=x onerror=alert(2)>\u2028<!--&"
+
+    def page(self) -> bytes:
+        return page_file("key.html", ["dom.js"], self.EVIL, {"title": self.EVIL}, Blobs())
+
+    def test_texts_cannot_end_their_element(self) -> None:
+        text = self.page().decode()
+        assert text.count("<script") == 2 and "<img" not in text and "onerror=alert(2)>" not in text
+        assert "&lt;/script&gt;" in re.search("<title>(.*)</title>", text)[1]
+        assert data_of(text.encode())["title"] == self.EVIL
+
+    def test_the_policy_allows_this_script_and_style_alone(self) -> None:
+        text = self.page().decode()
+        policy = re.search('Content-Security-Policy" content="(.*?)"', text)[1]
+        rules = dict(rule.split(" ", 1) for rule in policy.split("; "))
+        assert rules["default-src"] == "'none'" and rules["img-src"] == "data: blob:"
+        for rule, part in (
+            ("script-src", "<script>(.*?)</script>"),
+            ("style-src", "<style>(.*?)</style>"),
+        ):
+            content = re.search(part, text, re.DOTALL)[1]
+            digest = base64.b64encode(hashlib.sha256(content.encode()).digest()).decode()
+            assert rules[rule] == f"'sha256-{digest}'"
+        assert not re.search(r"https?://(?!www\.w3\.org/2000/svg)", text)
+
+
+class TestErrors:
+    @pytest.mark.parametrize(
+        ("name", "content", "words"),
+        [
+            ("run.yaml", None, "no run.yaml in it|none of these"),
+            ("run.yaml", b"a: [", "not YAML"),
+        ],
+    )
+    def test_what_cannot_be_a_run(self, name, content, words, run, tmp_path, capsys) -> None:
+        if content is not None:
+            (tmp_path / name).write_bytes(content)
+        assert re.search(words, refused(capsys, 2, "report", tmp_path))
+        assert "no such folder" in refused(capsys, 2, "report", tmp_path / "nothing")
+
+    def test_neither_maps_nor_cloud(self, run: Path, tmp_path: Path) -> None:
+        (tmp_path / "run.yaml").write_bytes((run / "run.yaml").read_bytes())
+        with pytest.raises(InputError, match="no depth map and no cloud"):
+            write_report(tmp_path)
+        assert not (tmp_path / "report.html").exists()
+
+    def test_a_page_is_kept(self, run: Path, capsys) -> None:
+        before = (run / "report.html").stat().st_mtime_ns
+        assert "already there and kept; give --overwrite" in refused(capsys, 2, "report", run)
+        assert (run / "report.html").stat().st_mtime_ns == before
+        write_report(run, overwrite=True)
+
+    def test_several_keys_are_not_one(self, run: Path, tmp_path: Path) -> None:
+        for key in ("000003", "000004"):
+            (tmp_path / key).mkdir()
+            (tmp_path / key / "run.yaml").write_bytes((run / "run.yaml").read_bytes())
+        with pytest.raises(InputError, match="holds 2 keys"):
+            write_report(tmp_path)
+
+    def test_a_map_of_another_size_is_left_out(self, tmp_path: Path) -> None:
+        folder = write_run(tmp_path, report=False)
+        (folder / "confidence" / "front.png").write_bytes(encode_png(np.zeros((3, 3), np.uint8)))
+        (folder / "age" / "front.png").write_bytes(b"no image")
+        (folder / "metrics.json").write_bytes(b"{")
+        (page,) = write_report(folder)
+        told = data_of(page.read_bytes())["missing"]
+        assert "confidence/front.png: not as large as the others; left out" in told
+        assert any(t.startswith("age/front.png: not a complete image") for t in told)
+        assert any("metrics.json" in t for t in told) and len(told) == 3
+        assert str(tmp_path) not in " ".join(told)
+
+
+def test_a_hundred_thousand_sources_pack() -> None:
+    """More than damaged files could name with 16 bits."""
+    rng = np.random.default_rng(0)
+    shape = (200, 400)
+    maps = {"depth": np.full(shape, 9, np.uint16)}
+    maps |= {k: rng.integers(0, 65536, shape, np.uint16) for k in ("sweep", "age")}
+    blobs = Blobs()
+    entry = packed_camera(blobs, maps, None, {}, 1)
+    sources = np.array(entry["sources"])[unpacked(blobs, entry["source"])]
+    assert np.array_equal(sources[..., 0], maps["sweep"])
+    assert np.array_equal(sources[..., 1], maps["age"])

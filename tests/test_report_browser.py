@@ -1,0 +1,294 @@
+# SPDX-License-Identifier: MIT
+"""Pages in a real browser: what they show is what the files say, and a control changes it."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+
+from densify.files.images import decode_image
+from densify.outputs import export_run
+from densify.outputs.depth_png import read_stored
+from densify.report import write_report
+from tests.browser import Opened, chromium
+from tests.report_runs import results, write_compared, write_run
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    with chromium() as program:
+        yield program
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_run(tmp_path_factory.mktemp("run"))
+
+
+@pytest.fixture
+def opened(browser: Any, run: Path) -> Iterator[Opened]:
+    page = Opened(browser, run / "report.html")
+    yield page
+    assert page.told == [] and page.foreign() == []
+    page.page.close()
+
+
+def numbers(text: str) -> list[float]:
+    return [float(n) for n in re.findall(r"-?\d+\.?\d*", text)]
+
+
+def kept(opened: Opened) -> list[list[float]]:
+    """Rows measured and filled: density, expected wrong, wrong, mean error."""
+    return [numbers(opened.text(f"#kept tr:nth-child({row})")) for row in (2, 3)]
+
+
+def pixels(png: bytes) -> np.ndarray:
+    return decode_image(png, "screen").astype(int)
+
+
+def test_it_opens_without_a_word(opened: Opened) -> None:
+    assert opened.problems() == []
+    assert opened.text("h1") == "tiny street, key 3"
+    assert opened.value("document.scripts.length") == 2 + opened.value(
+        "document.querySelectorAll('[id^=blob-]').length"
+    )
+
+
+def test_its_numbers_are_those_of_the_run(opened: Opened, run: Path) -> None:
+    metrics = json.loads((run / "metrics.json").read_text())
+    for product, row in zip(("measured", "filled"), kept(opened), strict=True):
+        scores = metrics["depth"]["front"][product]["all"]
+        assert row[0] == pytest.approx(100 * metrics["density"]["front"][product], abs=0.006)
+        expected = metrics["expected_outliers"]["front"][product]
+        assert row[1] == pytest.approx(100 * expected, abs=0.02)
+        assert row[2] == pytest.approx(100 * scores["outliers"], abs=0.03)
+        assert row[3] == pytest.approx(scores["mae_m"], abs=0.002)
+    table = opened.text("#score-tables div:first-of-type")
+    assert f"{100 * metrics['depth']['front']['measured']['all']['outliers']:.2f} %" in table
+    stages = yaml.safe_load((run / "run.yaml").read_text())["stages"]
+    assert all(stage["name"] in opened.text("#costs") for stage in stages)
+
+
+def test_its_maps_are_those_of_the_files(opened: Opened, run: Path) -> None:
+    for kind, place, bits in (
+        ("filled", "depth_filled", np.uint16),
+        ("confidence", "confidence", np.uint8),
+        ("truth", "scene/truth", np.uint16),
+    ):
+        stored = read_stored(run / place / "front.png", bits, kind)
+        assert opened.value(f"[...imagePane.maps.{kind}]") == stored.ravel().tolist(), kind
+
+
+@pytest.mark.parametrize(("confidence", "age_ms"), [(0.5, None), (0.0, 100), (0.35, 150)])
+def test_sliders_keep_what_export_keeps(
+    confidence: float, age_ms: int | None, opened: Opened, run: Path, tmp_path: Path
+) -> None:
+    before = opened.picture("#picture")
+    opened.set("confidence", confidence)
+    if age_ms is not None:
+        opened.set("age", age_ms)
+    exported = export_run(run, confidence, age_ms, tmp_path / "export").density["front"]
+    for product, row in zip(("measured", "filled"), kept(opened), strict=True):
+        assert row[0] == pytest.approx(100 * exported[product].after, abs=0.006)
+        assert exported[product].after < exported[product].before
+    assert opened.picture("#picture") != before
+    assert f"--min-confidence {confidence:g}" in opened.text("#export-command")
+
+
+def test_the_divider_and_every_layer_change_pixels(opened: Opened) -> None:
+    seen = []
+    for share in (0, 30, 100):
+        opened.set("split", share)
+        seen.append(opened.picture("#picture"))
+    for layer in opened.value("[...document.getElementById('left').options].map((o) => o.value)"):
+        opened.set("left", layer)
+        seen.append(opened.picture("#picture"))
+    layers = len(seen) - 3
+    assert layers == 11 and len({*seen}) >= len(seen) - 1  # the divider at 100 shows the left layer
+    opened.set("palette", "turbo")
+    opened.set("left", "filled")
+    assert opened.picture("#picture") not in seen
+
+
+def test_what_is_under_the_pointer(opened: Opened, run: Path) -> None:
+    depth = results()["flow"].depth["front"]
+    row, column = np.argwhere((depth.depth_m > 0) & (depth.frame != 3))[40]
+    box = opened.page.locator("#picture").bounding_box()
+    height, width = depth.depth_m.shape
+    opened.page.mouse.move(
+        box["x"] + (column + 0.5) * box["width"] / width,
+        box["y"] + (row + 0.5) * box["height"] / height,
+    )
+    said = opened.text("#reading")
+    assert f"u {column}, v {row}" in said and "measured" in said
+    assert f"{depth.depth_m[row, column]:.2f} m" in said
+    assert re.search(rf"source sweep\s*{depth.frame[row, column]} ", said)
+    assert f"{round(1000 * depth.age_s[row, column])} ms" in said
+    assert f"{depth.confidence[row, column]:.2f}: one in" in said
+    opened.page.locator("#picture").focus()
+    opened.page.keyboard.press("ArrowRight")
+    opened.page.keyboard.press("Shift+ArrowDown")
+    assert f"u {column + 1}, v {min(row + 10, height - 1)}" in opened.text("#reading")
+
+
+def foreground(opened: Opened) -> np.ndarray:
+    """(H,W) where the 3-D view is not background, without its border and the note in its corner."""
+    shown = pixels(opened.picture("#space"))[20:-60, 20:-20]
+    return np.abs(shown - [10, 7, 5]).max(axis=2) > 12
+
+
+def drawn(opened: Opened) -> float:
+    return float(foreground(opened).mean())
+
+
+def test_the_cloud_is_drawn_and_its_controls_change_it(opened: Opened) -> None:
+    opened.page.locator("#cloud").scroll_into_view_if_needed()
+    opened.page.wait_for_timeout(600)
+    assert drawn(opened) > 0.1
+    for name in ("show-paths", "show-cameras"):
+        opened.value(f"document.getElementById('{name}').click()")
+    everything = drawn(opened)
+    last = opened.picture("#space")
+    for control, value in (
+        *(("colouring", n) for n in "12345"),
+        *(("morph", 0), ("morph", 1), ("sweeps-shown", "one"), ("sweep", 0), ("sweep", 4)),
+        *(("sweeps-shown", "all"), ("point-size", 3)),
+    ):
+        opened.set(control, value)
+        opened.page.wait_for_timeout(350)
+        now = opened.picture("#space")
+        assert now != last, (control, value)
+        last = now
+    opened.set("point-size", 1)
+    opened.value("document.getElementById('only-moving').click()")
+    opened.page.wait_for_timeout(350)
+    assert 0 < drawn(opened) < 0.2 * everything
+
+
+def test_the_trail_collapses(opened: Opened) -> None:
+    """From above the car is longer where registration alone puts its points: it moves 0.4 s at
+    8 m/s."""
+    for name in ("show-paths", "show-cameras", "only-moving"):
+        opened.value(f"document.getElementById('{name}').click()")
+    opened.value("cloudPane.look({ yaw: Math.PI, pitch: 1.5, distance: 30, target: [9, 1.8, 0] })")
+    lengths = []
+    for value in (0, 1):
+        opened.set("morph", value)
+        opened.page.wait_for_timeout(400)
+        lengths.append(np.ptp(np.flatnonzero(foreground(opened).any(axis=1))))
+    assert lengths[0] > 1.4 * lengths[1] > 0
+
+
+def test_the_keyboard_moves_the_view(opened: Opened) -> None:
+    opened.page.locator("#space").focus()
+    seen = {opened.picture("#space")}
+    for key in ("ArrowLeft", "ArrowUp", "+", "w"):
+        opened.page.keyboard.press(key)
+        opened.page.wait_for_timeout(400)
+        seen.add(opened.picture("#space"))
+    assert len(seen) == 5
+
+
+def test_every_control_has_a_name_and_is_reached_by_tab(opened: Opened) -> None:
+    unnamed = opened.value(
+        """[...document.querySelectorAll("input, select, button, [tabindex], summary, [role=img]")]
+        .filter((e) => !(e.getAttribute("aria-label") || e.closest("label") || e.textContent.trim()
+          || e.querySelector("title") || e.hidden)).map((e) => e.outerHTML)"""
+    )
+    assert unnamed == []
+    reached = set()
+    for _ in range(60):
+        opened.page.keyboard.press("Tab")
+        reached.add(opened.value("document.activeElement.id"))
+    assert {
+        "camera",
+        "left",
+        "right",
+        "picture",
+        "split",
+        "confidence",
+        "age",
+        "colouring",
+    } <= reached
+    assert {"morph", "morph-play", "sweep", "space", "turn", "copy"} <= reached
+
+
+def test_dark_and_light_can_be_read(opened: Opened) -> None:
+    def contrast() -> float:
+        rgb = opened.value(
+            """["color", "backgroundColor"].map((k) =>
+            getComputedStyle(document.body)[k].match(/[0-9.]+/g).slice(0, 3).map(Number))"""
+        )
+        share = np.array(rgb) / 255
+        linear = np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)
+        bright, dark = sorted((linear @ [0.2126, 0.7152, 0.0722]).tolist(), reverse=True)
+        return (bright + 0.05) / (dark + 0.05)
+
+    first = contrast()
+    opened.value("document.getElementById('theme').click()")
+    assert min(first, contrast()) > 7
+
+
+def test_a_narrow_screen_does_not_scroll_sideways(browser: Any, run: Path) -> None:
+    page = Opened(browser, run / "report.html", width=380)
+    assert page.value("document.documentElement.scrollWidth") <= 380
+    page.page.close()
+
+
+def test_a_comparison(browser: Any, tmp_path: Path) -> None:
+    folder = write_compared(tmp_path)
+    page = Opened(browser, write_report(folder)[0])
+    assert page.text("h1") == "tiny street, key 3: none, icp, flow"
+    assert page.problems() == page.told == page.foreign() == []
+    layers = page.value("[...document.getElementById('left').options].map((o) => o.value)")
+    assert {"none", "icp", "measured", "filled", "truth"} <= {*layers}
+    assert drawn(page) > 0.05
+    page.page.close()
+
+
+def test_a_damaged_run_says_what_is_damaged(browser: Any, run: Path, tmp_path: Path) -> None:
+    folder = write_run(tmp_path, report=False)
+    for name in ("confidence/front.png", "cloud.laz", "scene/image/front.jpg"):
+        data = (folder / name).read_bytes()
+        (folder / name).write_bytes(data[: len(data) // 2])
+    (folder / "metrics.json").write_text('{"baselines": [1], "depth": 7, "held_out": {"front": 3}}')
+    page = Opened(browser, write_report(folder)[0])
+    said = "\n".join(page.problems())
+    for name in ("confidence/front.png", "cloud.laz", "scene/image/front.jpg"):
+        assert name in said
+    assert page.told == [] and page.foreign() == []
+    assert not page.page.locator("#cloud").is_visible()
+    page.set("left", "icp")
+    page.set("right", "measured")
+    assert len(np.unique(pixels(page.picture("#picture")).reshape(-1, 3), axis=0)) > 50
+    page.page.close()
+
+
+EVIL = '</script><img src=x onerror="alert(1)"><b id=evil>'
+
+
+def test_texts_of_others_stay_texts(browser: Any, tmp_path: Path) -> None:
+    folder = write_run(tmp_path, report=False)
+    about = yaml.safe_load((folder / "run.yaml").read_text())
+    about |= {"data": EVIL, "warnings": [EVIL], "versions": {EVIL: EVIL}, "method": EVIL}
+    about["config"][EVIL] = {EVIL: EVIL}
+    about["stages"] = [{"name": EVIL, "seconds": EVIL, "peak_memory_mb": None}]
+    (folder / "run.yaml").write_text(yaml.safe_dump(about))
+    scene = json.loads((folder / "scene" / "scene.json").read_text())
+    scene["movers"][0] |= {"instance": 0, "num_points": EVIL}
+    scene["views"] |= {EVIL: {"T_cam_key": EVIL, "K": 3}}
+    (folder / "scene" / "scene.json").write_text(json.dumps(scene))
+    for kind in ("depth", "depth_filled", "confidence", "age"):
+        (folder / kind / "front.png").rename(folder / kind / "<b id=evil>.png")
+    page = Opened(browser, write_report(folder)[0])
+    assert page.page.locator("#evil").count() == 0 and page.told == [] and page.foreign() == []
+    assert EVIL in page.text("#warnings") and EVIL in page.text("#versions")
+    assert page.value("document.getElementById('camera').value") == "<b id=evil>"
+    page.page.close()
