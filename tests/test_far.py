@@ -24,9 +24,8 @@ from tests.scenes import CAMERA, Arc, Scanner, Scene, TinySequence, World, car, 
 KEY, WINDOW, NUM_FRAMES = 15, 2, 36
 EGO = Arc(0, -1.5, 0, 8.0, 0.02)
 LEAVES = car(22, 3.0, 6.0, 1)  # ahead of the vehicle in the lane beside it
-SETTINGS = {"register": {"source": "dataset"}}
 # Without spots, which the fill decides upon.
-SETTINGS = {**SETTINGS, "project": {**SETTINGS.get("project", {}), "spot": 0}}
+SETTINGS = {"register": {"source": "dataset"}, "project": {"spot": 0}}
 FAR = {**SETTINGS, "accumulate": {"far_m": 20.0}}
 OFF = {**SETTINGS, "accumulate": {"far_m": 0.0}}
 
