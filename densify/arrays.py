@@ -1,7 +1,10 @@
 # SPDX-License-Identifier: MIT
-"""Names of the array types used everywhere."""
+"""Names of the array types used everywhere, and tables of columns."""
 
 from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,3 +13,13 @@ Float = NDArray[np.float64]
 Float32 = NDArray[np.float32]
 Int = NDArray[np.int64]
 Bool = NDArray[np.bool_]
+
+
+def table(columns: Mapping[str, NDArray[Any]]) -> NDArray[Any]:
+    """(M,) structured, a field for each of the (M,) columns, without gaps between them."""
+    rows = np.empty(
+        len(next(iter(columns.values()))), [(name, c.dtype) for name, c in columns.items()]
+    )
+    for name, column in columns.items():
+        rows[name] = column
+    return rows

@@ -169,6 +169,7 @@ def test_the_record(run):
     density = record.pop("density")
     assert record == {
         "run": str(run),
+        "to": "png",
         "min_confidence": 0.5,
         "max_age_ms": 100.0,
         "version": densify.__version__,

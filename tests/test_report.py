@@ -132,6 +132,7 @@ def cloud_of(num_points: int, moving) -> StoredCloud:
         rgb=rng.integers(1, 256, (num_points, 3), np.uint8),
         far=np.zeros(num_points, bool),
         displacement=displacement.astype(np.float32),
+        gps_time=np.zeros(num_points),
     )
 
 

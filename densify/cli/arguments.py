@@ -31,6 +31,7 @@ from densify.cli.options import (
     words,
 )
 from densify.errors import brief
+from densify.plugins.exports import EXPORTS
 from densify.version import __version__
 
 
@@ -232,27 +233,32 @@ def _add_export(commands: Any) -> None:
         commands,
         "export",
         verbs.export,
-        "a finished run's depth maps with only the certain and fresh pixels",
+        "a finished run in other tools' formats, or with only the certain and fresh pixels",
         "Nothing is computed again and the run stays as it is. A filled pixel has the age of the "
-        "measured pixel nearest to it.",
+        "measured pixel nearest to it. FORMAT is "
+        + "; ".join(f"{form.name}: {form.about}" for form in EXPORTS.built_in)
+        + ".",
     )
     parser.add_argument(
         "run", metavar="RUN", type=Path, help="folder of one key, such as densify-out/000120"
     )
+    parser.add_argument("--to", metavar="FORMAT", default="png", help="(default: png)")
     parser.add_argument(
         "--min-confidence",
         type=float,
         default=0.0,
         metavar="C",
-        help="drop pixels less certain, 0 to 1 (default: 0, keep all)",
+        help="drop pixels and points less certain, 0 to 1 (default: 0, keep all)",
     )
     parser.add_argument(
         "--max-age-ms",
         type=float,
         metavar="MS",
-        help="drop pixels measured longer before or after the exposure (default: keep all)",
+        help="drop pixels and points measured longer before or after (default: keep all)",
     )
-    parser.add_argument("--out", metavar="DIR", type=Path, help="(default: RUN/export)")
+    parser.add_argument(
+        "--out", metavar="DIR", type=Path, help="(default: RUN/export, RUN/export/FORMAT)"
+    )
     add_overwrite(parser)
 
 

@@ -77,7 +77,8 @@ def _held_out_line(result: Result, camera: str) -> str:
 
 
 def export_summary(exported: Export) -> str:
-    """A line for each camera: the share of its pixels with a depth, before and after."""
+    """A line for each camera, the share of its pixels with a depth, before and after, and one for
+    the cloud."""
     lines = []
     for camera, products in exported.density.items():
         measured, filled = (
@@ -85,6 +86,10 @@ def export_summary(exported: Export) -> str:
             for p in ("measured", "filled")
         )
         lines.append(f"{camera}: depth in {measured} of the pixels, {filled} with filled ones")
+    if exported.num_points is not None:
+        lines.append(
+            f"cloud: {exported.num_points.after:,} of {exported.num_points.before:,} points"
+        )
     return "\n".join(lines)
 
 

@@ -254,7 +254,7 @@ def simulate(options: argparse.Namespace) -> None:
 
 
 def export(options: argparse.Namespace) -> None:
-    """A finished run's depth maps with fewer pixels."""
+    """A finished run in another form, or with fewer pixels."""
     from densify.cli.tables import export_summary
     from densify.outputs import export_run
 
@@ -264,8 +264,10 @@ def export(options: argparse.Namespace) -> None:
         options.max_age_ms,
         options.out,
         options.overwrite,
+        options.to,
     )
-    print(export_summary(exported))
+    if said := export_summary(exported):
+        print(said)
     print_paths(exported.paths)
 
 

@@ -6,8 +6,9 @@ from __future__ import annotations
 import datetime
 import io
 import logging
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,7 +44,7 @@ class StoredCloud:
 
     frame, instance: (M,) int32. moving, far: (M,) bool. confidence, displaced, intensity: (M,)
     float32. rgb: (M,3) uint8. displacement: (M,3) float32 metres, by which a point was moved beyond
-    the rigid alignment; None in clouds of older versions.
+    the rigid alignment; None in clouds of older versions. gps_time: (M,) as `write_cloud` has it.
     """
 
     points: Float
@@ -56,6 +57,31 @@ class StoredCloud:
     rgb: NDArray[np.uint8]
     far: Bool
     displacement: Float32 | None
+    gps_time: Float
+
+    def select(self, keep: Bool) -> StoredCloud:
+        """The points where ``keep`` (M,) is True."""
+        columns = {f.name: getattr(self, f.name) for f in fields(self)}
+        kept: dict[str, Any] = {n: None if c is None else c[keep] for n, c in columns.items()}
+        return StoredCloud(**kept)
+
+    def columns(self) -> dict[str, NDArray[Any]]:
+        """Everything as (M,) columns, for formats of named columns: x y z red green blue intensity
+        confidence frame instance moving far displaced displaced_x displaced_y displaced_z gps_time.
+        What is true or false as uint8, places as float32, which keeps the millimetre up to
+        8 km."""
+        by_axis = {"": self.points, "displaced_": self.displacement}
+        vectors = {
+            f"{name}{axis}": np.ascontiguousarray(values[:, i], np.float32)
+            for name, values in by_axis.items()
+            if values is not None
+            for i, axis in enumerate("xyz")
+        }
+        columns: dict[str, NDArray[Any]] = {name: vectors.pop(name) for name in "xyz"}
+        columns |= {n: self.rgb[:, i].copy() for i, n in enumerate(("red", "green", "blue"))}
+        columns |= {n: getattr(self, n) for n in ("intensity", "confidence", "frame", "instance")}
+        columns |= {n: getattr(self, n).astype(np.uint8) for n in ("moving", "far")}
+        return columns | {"displaced": self.displaced} | vectors | {"gps_time": self.gps_time}
 
 
 def write_output(result: Result, context: Context, folder: Path) -> None:
@@ -146,4 +172,5 @@ def read_cloud(path: Path) -> StoredCloud:
         rgb=(rgb // 257).astype(np.uint8),
         far=np.array(las["far"], bool) if "far" in names else np.zeros(len(rgb), bool),
         displacement=displacement,
+        gps_time=np.array(las.gps_time),
     )

@@ -1,0 +1,155 @@
+# SPDX-License-Identifier: MIT
+"""A finished run's folder as exports read it, with what thresholds leave."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from densify.errors import InputError
+from densify.files.texts import read_yaml
+from densify.outputs.cloud_laz import StoredCloud, read_cloud
+from densify.outputs.depth_png import read_stored, stored_age, stored_confidence
+from densify.types import Bool
+
+KINDS: Mapping[str, type[np.uint8] | type[np.uint16]] = {
+    "depth": np.uint16,
+    "depth_filled": np.uint16,
+    "confidence": np.uint8,
+    "age": np.uint16,
+}
+
+
+@dataclass(frozen=True)
+class Density:
+    """Fractions of the pixels that have a depth."""
+
+    before: float
+    after: float
+
+
+@dataclass(frozen=True)
+class Kept:
+    """Numbers of points."""
+
+    before: int
+    after: int
+
+
+class FinishedRun:
+    """One key's folder. Parts are read when asked for; ``density`` (by camera and product) and
+    ``num_points`` say what the thresholds left of those that were."""
+
+    def __init__(self, folder: Path, min_confidence: float, max_age_ms: float | None) -> None:
+        """Thresholds as `densify.outputs.export.export_run`. Raises InputError if the folder holds
+        no run."""
+        if not (folder / "run.yaml").is_file():
+            raise InputError(
+                f"{folder}: no run.yaml in it; expected the folder of a finished run and key, such "
+                f"as densify-out/000120"
+            )
+        self.folder = folder
+        self.min_confidence = min_confidence
+        self.max_age_ms = max_age_ms
+        self.density: dict[str, dict[str, Density]] = {}
+        self.num_points: Kept | None = None
+
+    @cached_property
+    def key(self) -> int:
+        """Its frame. Raises InputError where run.yaml does not say it."""
+        path = self.folder / "run.yaml"
+        record, _ = read_yaml(path)
+        key = record.get("key") if isinstance(record, dict) else None
+        if not isinstance(key, int):
+            raise InputError(f"{path}: key: got {key!r}, expected a frame's number")
+        return key
+
+    @cached_property
+    def cameras(self) -> list[str]:
+        """Cameras, or CAMERA/NUMBER of their images, with maps. Raises InputError if there are
+        none, or not all four maps of one."""
+        cameras = sorted(
+            {
+                path.relative_to(self.folder / product).with_suffix("").as_posix()
+                for product in KINDS
+                for path in (self.folder / product).rglob("*.png")
+            }
+        )
+        if not cameras:
+            raise InputError(f"{self.folder}: no depth maps in it; run densify with a camera first")
+        paths = [self._map(product, camera) for camera in cameras for product in KINDS]
+        missing = [str(p.relative_to(self.folder)) for p in paths if not p.is_file()]
+        if missing:
+            raise InputError(
+                f"{self.folder}: {', '.join(missing)} missing; densify the key again (run "
+                f"--overwrite)"
+            )
+        return cameras
+
+    def maps(self, camera: str) -> dict[str, NDArray[Any]]:
+        """(H,W) by product, as stored (`densify.outputs.depth_png`), 0 where a pixel is left out.
+        Raises InputError for maps that are damaged or do not belong together."""
+        maps = self._read_maps(camera)
+        keep = maps["confidence"] >= stored_confidence(self.min_confidence)
+        if self.max_age_ms is not None:
+            keep &= maps["age"] <= stored_age(self.max_age_ms / 1000)
+        self.density[camera] = {
+            "measured": _density(maps["depth"], keep),
+            "filled": _density(maps["depth_filled"], keep),
+        }
+        return {product: stored * keep for product, stored in maps.items()}
+
+    def cloud(self) -> StoredCloud:
+        """The points that are left. Raises InputError for a cloud that is missing or damaged, or
+        whose points' ages cannot be told."""
+        path = self.folder / "cloud.laz"
+        cloud = read_cloud(path)
+        keep = stored_confidence(cloud.confidence) >= stored_confidence(self.min_confidence)
+        if self.max_age_ms is not None:
+            own = cloud.gps_time[cloud.frame == self.key]
+            if not len(own):
+                raise InputError(
+                    f"{path}: has no point of the key sweep {self.key} to tell ages from; leave "
+                    f"--max-age-ms out"
+                )
+            age_s = np.abs(cloud.gps_time - own[0])
+            keep &= stored_age(age_s) <= stored_age(self.max_age_ms / 1000)
+        self.num_points = Kept(len(keep), int(keep.sum()))
+        return cloud.select(keep)
+
+    def _map(self, product: str, camera: str) -> Path:
+        return self.folder / product / f"{camera}.png"
+
+    def _read_maps(self, camera: str) -> dict[str, NDArray[Any]]:
+        maps = {
+            p: read_stored(self._map(p, camera), kind, f"a map of {p}") for p, kind in KINDS.items()
+        }
+        filled = maps["depth_filled"]
+        for product, stored in maps.items():
+            path = self._map(product, camera)
+            if stored.shape != filled.shape:
+                raise InputError(
+                    f"{path}: got {stored.shape[1]} x {stored.shape[0]} px, expected "
+                    f"{filled.shape[1]} x {filled.shape[0]} as in depth_filled; densify the key "
+                    f"again"
+                )
+            strangers = (stored > 0) & (filled == 0)
+            if product != "depth":
+                strangers |= (stored == 0) & (filled > 0)
+            if strangers.any():
+                raise InputError(
+                    f"{path}: does not belong to depth_filled, {np.count_nonzero(strangers)} "
+                    f"pixels have a value in one of them only; densify the key again"
+                )
+        return maps
+
+
+def _density(stored: NDArray[Any], keep: Bool) -> Density:
+    has_depth = stored > 0
+    return Density(float(has_depth.mean()), float((has_depth & keep).mean()))

@@ -1,0 +1,59 @@
+# SPDX-License-Identifier: MIT
+"""The forms in which `densify export` writes a finished run.
+
+To add one, write a module with the function that `densify.outputs.export.ExportModule` describes
+and one row here. In a package of your own an entry point in the group ``densify.exports`` takes the
+row's place, and ``OWNED`` of the module says what the row's ``owned`` says.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from types import ModuleType
+
+from densify.plugins.table import Table
+
+
+@dataclass(frozen=True)
+class ExportFormat:
+    """owned: the files and folders in the export's folder that it may write. about: what it
+    writes, for the help."""
+
+    name: str
+    module: str
+    owned: tuple[str, ...]
+    about: str
+
+    @property
+    def usage(self) -> str:
+        """How ``--to`` names it."""
+        return self.name
+
+
+def _row(name: str, module: ModuleType, version: str) -> ExportFormat:
+    owned = tuple(getattr(module, "OWNED", ()))
+    return ExportFormat(name, module.__name__, owned, about="of another package")
+
+
+_HERE = "densify.outputs.export."
+_FLOATS = ("depth", "depth_filled", "confidence")
+
+EXPORTS = Table(
+    kind="export",
+    group="densify.exports",
+    built_in=(
+        ExportFormat(
+            "png",
+            _HERE + "png",
+            owned=("depth", "depth_filled", "confidence", "age"),
+            about="the maps as the run has them",
+        ),
+        ExportFormat("npy", _HERE + "npy", owned=_FLOATS, about="maps, float32 metres"),
+        ExportFormat("tiff", _HERE + "tiff", owned=_FLOATS, about="maps, float32 metres"),
+        ExportFormat("exr", _HERE + "exr", owned=_FLOATS, about="maps, float32 metres"),
+        ExportFormat("ply", _HERE + "ply", owned=("cloud.ply",), about="the cloud, all columns"),
+        ExportFormat("pcd", _HERE + "pcd", owned=("cloud.pcd",), about="the cloud, all columns"),
+    ),
+    members=("write_export",),
+    row_of=_row,
+)
