@@ -73,5 +73,4 @@ class Opened:
 
     def foreign(self) -> list[str]:
         """Requests for anything but itself and what it has in itself."""
-        own = ("file:", "data:", "blob:")
-        return [*self.asked[1:], *(u for u in self.asked if not u.startswith(own))]
+        return [u for u in self.asked[1:] if not u.startswith(("data:", "blob:"))]

@@ -193,12 +193,12 @@ FLOORS = (
     ("registration", "depth", "flow", "scores", "street"),
     ("readers",),
     ("outputs", "writers"),
-    ("report",),
     ("blocks", "completion", "doubts", "sweeps"),
     ("road",),
     ("recording",),
     ("pipeline",),
     ("bench", "dataset", "doctor"),
+    ("report",),
     ("cli",),
 )
 """A module imports from lower floors only, or from its own."""

@@ -267,22 +267,24 @@ def _add_report(commands: Any) -> None:
         commands,
         "report",
         verbs.report,
-        "one self-contained page to look at a run or a comparison in a browser",
-        "The image with every map, depth under the pointer, what a least confidence leaves, the "
-        "cloud in 3-D, scores and costs, in one HTML file of 12 MB at most that needs no network. "
-        "Files that are missing or damaged are named on it.",
+        "one self-contained page to look at a run, a comparison or a training set in a browser",
+        "Of a key: the image with every map, depth under the pointer, what a least confidence "
+        "leaves, the cloud in 3-D, scores and costs, in one HTML file of 12 MB at most that needs "
+        "no network. "
+        "Files that are missing or damaged are named on it. Of a training set, or of a folder of "
+        "several runs: every key with a picture and its scores, what was put aside and why.",
     )
     parser.add_argument(
         "place",
         metavar="DIR",
         type=Path,
-        help="folder of one key, such as densify-out/000120, or one above a single key",
+        help="folder of one key, such as densify-out/000120, one of several, or a training set",
     )
     parser.add_argument(
         "--out",
         metavar="FILE.html",
         type=Path,
-        help="(default: report.html of a run, compare.html of a comparison, in the key's folder)",
+        help="(default: DIR/report.html, and compare.html of a comparison)",
     )
     add_overwrite(parser)
 

@@ -275,7 +275,9 @@ def report(options: argparse.Namespace) -> None:
     """A page of what is in a folder."""
     from densify.report import write_report
 
-    print_paths(write_report(options.place, options.out, options.overwrite))
+    with progress_on_stderr() as progress:
+        paths = write_report(options.place, options.out, options.overwrite, progress)
+    print_paths(paths)
 
 
 def evaluate(options: argparse.Namespace) -> None:

@@ -58,7 +58,11 @@ def scores_of(result: Result) -> dict[str, Any]:
     """The scores of a key that a manifest records: ``num_points``, ``num_moving``, ``ghost``, and
     by camera ``density``, ``density_filled``, ``outliers`` and ``mae_m`` of the key held out; None
     for what cannot be said."""
-    metrics = result.metrics
+    return scores_of_metrics(result.metrics)
+
+
+def scores_of_metrics(metrics: Mapping[str, Any]) -> dict[str, Any]:
+    """The same of ``Result.metrics``, or of a metrics.json."""
     held_out = metrics["held_out"] or {}
     errors = {name: scores["measured"]["all"] for name, scores in held_out.items()}
     return {
