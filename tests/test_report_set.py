@@ -198,7 +198,8 @@ class TestInABrowser:
         opened.set("search", "")
         opened.set("drive", "")
         opened.set("status", "")
-        bar = opened.page.locator("#histograms rect[tabindex='0']").last
+        ghosts = opened.page.locator("#histograms .panel", has_text="ghosts")
+        bar = ghosts.locator("rect[tabindex='0']").nth(2)
         said = bar.get_attribute("aria-label")
         bar.focus()
         opened.page.keyboard.press("Enter")
