@@ -241,9 +241,12 @@ def test_thresholds_leave_pixels_of_float_maps(run):
 
 
 @pytest.mark.parametrize("to", [form.name for form in EXPORTS.built_in])
-def test_a_form_is_whole_repeatable_and_leaves_the_run_alone(run, to):
+def test_a_form_is_whole_repeatable_and_leaves_the_run_alone(tmp_path, to):
+    from tests.exported import write_views
+
     if to == "exr":
         pytest.importorskip("OpenEXR")
+    run, _ = write_views(tmp_path, {"image_02": "plain", "image_03": "bent"})
     before = tree(run)
     exported = export_run(run, to=to)
     folder = run / "export" if to == "png" else run / "export" / to

@@ -259,6 +259,7 @@ def _add_export(commands: Any) -> None:
     parser.add_argument(
         "--out", metavar="DIR", type=Path, help="(default: RUN/export, RUN/export/FORMAT)"
     )
+    add_camera(parser)
     add_overwrite(parser)
 
 

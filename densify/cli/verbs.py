@@ -265,6 +265,7 @@ def export(options: argparse.Namespace) -> None:
         options.out,
         options.overwrite,
         options.to,
+        options.cameras,
     )
     if said := export_summary(exported):
         print(said)

@@ -53,6 +53,18 @@ EXPORTS = Table(
         ExportFormat("exr", _HERE + "exr", owned=_FLOATS, about="maps, float32 metres"),
         ExportFormat("ply", _HERE + "ply", owned=("cloud.ply",), about="the cloud, all columns"),
         ExportFormat("pcd", _HERE + "pcd", owned=("cloud.pcd",), about="the cloud, all columns"),
+        ExportFormat(
+            "nerfstudio",
+            _HERE + "nerfstudio",
+            owned=("transforms.json", "images", "depth", "cloud.ply"),
+            about="images, cameras, depth and cloud",
+        ),
+        ExportFormat(
+            "colmap",
+            _HERE + "colmap",
+            owned=("images", "sparse", "text"),
+            about="images, cameras and points, binary and text",
+        ),
     ),
     members=("write_export",),
     row_of=_row,

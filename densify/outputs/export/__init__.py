@@ -16,7 +16,7 @@ and export.yaml::
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Protocol, cast
@@ -62,6 +62,7 @@ def export_run(
     out: Path | None = None,
     overwrite: bool = False,
     to: str = "png",
+    cameras: Sequence[str] | None = None,
 ) -> Export:
     """Write a finished run in another form, or with fewer pixels; nothing is computed again.
 
@@ -72,7 +73,7 @@ def export_run(
     of 1/254 and 1 ms. A filled pixel goes by its own confidence and the age of the measured pixel
     nearest to it, and stays even if those around it go. out: the folder to make; if None,
     ``export`` in ``run``, and ``export/FORM`` for all but png. overwrite: replace an earlier
-    export. to: a name of `densify.plugins.exports.EXPORTS`.
+    export. to: a name of `densify.plugins.exports.EXPORTS`. cameras: only these, all if None.
 
     The folder is complete or not there. Raises InputError for a folder that is no run, thresholds
     out of range, files that are missing, damaged or do not belong together, a form that is none or
@@ -81,7 +82,7 @@ def export_run(
     """
     _check_thresholds(min_confidence, max_age_ms)
     form = EXPORTS.row(to, "--to")
-    finished = FinishedRun(run, min_confidence, max_age_ms)
+    finished = FinishedRun(run, min_confidence, max_age_ms, cameras)
     folder = out or (run / "export" if to == "png" else run / "export" / to)
     if (folder / "run.yaml").exists():
         raise InputError(

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -13,9 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from densify.errors import InputError
-from densify.files.texts import read_yaml
+from densify.files.texts import read_json, read_yaml
 from densify.outputs.cloud_laz import StoredCloud, read_cloud
 from densify.outputs.depth_png import read_stored, stored_age, stored_confidence
+from densify.outputs.export.scene_file import SceneFile, read_scene
 from densify.types import Bool
 
 KINDS: Mapping[str, type[np.uint8] | type[np.uint16]] = {
@@ -46,9 +47,15 @@ class FinishedRun:
     """One key's folder. Parts are read when asked for; ``density`` (by camera and product) and
     ``num_points`` say what the thresholds left of those that were."""
 
-    def __init__(self, folder: Path, min_confidence: float, max_age_ms: float | None) -> None:
-        """Thresholds as `densify.outputs.export.export_run`. Raises InputError if the folder holds
-        no run."""
+    def __init__(
+        self,
+        folder: Path,
+        min_confidence: float = 0.0,
+        max_age_ms: float | None = None,
+        chosen: Sequence[str] | None = None,
+    ) -> None:
+        """Thresholds as `densify.outputs.export.export_run`. chosen: cameras, all if None. Raises
+        InputError if the folder holds no run."""
         if not (folder / "run.yaml").is_file():
             raise InputError(
                 f"{folder}: no run.yaml in it; expected the folder of a finished run and key, such "
@@ -57,6 +64,7 @@ class FinishedRun:
         self.folder = folder
         self.min_confidence = min_confidence
         self.max_age_ms = max_age_ms
+        self._chosen = chosen
         self.density: dict[str, dict[str, Density]] = {}
         self.num_points: Kept | None = None
 
@@ -72,8 +80,8 @@ class FinishedRun:
 
     @cached_property
     def cameras(self) -> list[str]:
-        """Cameras, or CAMERA/NUMBER of their images, with maps. Raises InputError if there are
-        none, or not all four maps of one."""
+        """The chosen cameras, or CAMERA/NUMBER of their images. Raises InputError if there are no
+        maps of one, or not all four."""
         cameras = sorted(
             {
                 path.relative_to(self.folder / product).with_suffix("").as_posix()
@@ -83,6 +91,12 @@ class FinishedRun:
         )
         if not cameras:
             raise InputError(f"{self.folder}: no depth maps in it; run densify with a camera first")
+        there = {camera.partition("/")[0] for camera in cameras}
+        for name in self._chosen or ():
+            if name not in there:
+                raise InputError(f"--camera {name}: expected one of {', '.join(sorted(there))}")
+        if self._chosen is not None:
+            cameras = [c for c in cameras if c.partition("/")[0] in self._chosen]
         paths = [self._map(product, camera) for camera in cameras for product in KINDS]
         missing = [str(p.relative_to(self.folder)) for p in paths if not p.is_file()]
         if missing:
@@ -91,6 +105,20 @@ class FinishedRun:
                 f"--overwrite)"
             )
         return cameras
+
+    @cached_property
+    def scene(self) -> SceneFile:
+        """Raises InputError where scene.json is missing or damaged."""
+        return read_scene(self.folder / "scene" / "scene.json")
+
+    def measure(self, camera: str) -> str:
+        """What a map's depth is, camera ``z`` or ``range``, as metrics.json says."""
+        path = self.folder / "metrics.json"
+        scores = read_json(path)
+        measures = scores.get("measure") if isinstance(scores, dict) else None
+        if not isinstance(measures, dict) or measures.get(camera) not in ("z", "range"):
+            raise InputError(f"{path}: measure: does not say z or range of {camera}")
+        return str(measures[camera])
 
     def maps(self, camera: str) -> dict[str, NDArray[Any]]:
         """(H,W) by product, as stored (`densify.outputs.depth_png`), 0 where a pixel is left out.

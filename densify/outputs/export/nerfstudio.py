@@ -1,0 +1,85 @@
+# SPDX-License-Identifier: MIT
+"""A folder that nerfstudio opens (``ns-train depth-nerfacto --data DIR``, ``splatfacto``).
+
+The world is the key frame. Poses are camera to world with OpenGL's axes: x right, y up, the camera
+looks along -z. Depth is in millimetres, which its reader's usual ``depth_unit_scale_factor`` of
+0.001 makes metres.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from densify.errors import InputError
+from densify.outputs.export.finished_run import FinishedRun
+from densify.outputs.export.npy import write_array
+from densify.outputs.export.pictures import Picture, intrinsics, seen, write_pictures
+from densify.outputs.export.ply import write_ply
+from densify.outputs.plain import write_json
+from densify.types.rigid import inverse
+
+_MM_PER_STEP = np.float32(1000 / 256)
+_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
+_LENS = ("k1", "k2", "k3", "p1", "p2")
+
+
+def write_export(run: FinishedRun, folder: Path) -> None:
+    """``transforms.json``, ``images/``, ``depth/CAMERA.npy`` (measured, float32 millimetres, 0
+    none) and ``cloud.ply`` (what a camera saw).
+
+    Raises InputError for cameras that cannot be said there: maps of ranges, lenses other than
+    OpenCV's with k1 k2 k3 p1 p2, fisheyes together with others.
+    """
+    pictures = write_pictures(run, folder / "images")
+    models = {_model(picture) for picture in pictures}
+    if len(models) > 1:
+        raise InputError(
+            "--to nerfstudio: it has one camera model for all images, and there are fisheyes and "
+            "others; choose among them with --camera"
+        )
+    for picture in pictures:
+        path = folder / "depth" / f"{picture.name}.npy"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_array(path, run.maps(picture.name)["depth"] * _MM_PER_STEP)
+    columns = seen(run.cloud()).columns()
+    names = ("x", "y", "z", "red", "green", "blue")
+    write_ply(folder / "cloud.ply", {name: columns[name] for name in names})
+    transforms = {
+        "camera_model": models.pop(),
+        "ply_file_path": "cloud.ply",
+        "frames": [_frame(run, picture) for picture in pictures],
+    }
+    write_json(folder / "transforms.json", transforms)
+
+
+def _model(picture: Picture) -> str:
+    return "OPENCV_FISHEYE" if picture.view.camera.model == "fisheye" else "OPENCV"
+
+
+def _frame(run: FinishedRun, picture: Picture) -> dict[str, Any]:
+    camera, name = picture.view.camera, picture.name
+    if run.measure(name) != "z":
+        raise InputError(
+            f"{name}: its depth is the range from the lens, and nerfstudio takes camera z; densify "
+            f"it with --set project.depth=z, or leave it out by naming the others with --camera"
+        )
+    lens = intrinsics(camera)
+    K = {"fl_x": lens.pop("fx"), "fl_y": lens.pop("fy"), "cx": lens.pop("cx"), "cy": lens.pop("cy")}
+    known = _LENS if camera.model == "pinhole" else ("k1", "k2", "k3", "k4")
+    if unknown := [n for n, value in lens.items() if value and n not in known]:
+        raise InputError(
+            f"{name}: nerfstudio has no lens with {', '.join(unknown)}; leave it out by naming the "
+            f"others with --camera"
+        )
+    return {
+        "file_path": f"images/{picture.file}",
+        "depth_file_path": f"depth/{name}.npy",
+        **K,
+        "w": camera.width_px,
+        "h": camera.height_px,
+        **{n: lens.get(n, 0.0) for n in known},
+        "transform_matrix": inverse(picture.view.T_cam_key) @ _OPENGL,
+    }
