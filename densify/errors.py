@@ -9,12 +9,14 @@ from __future__ import annotations
 import re
 
 _LONG_VALUE = re.compile(r"""'[^']{201,}'|"[^"]{201,}"|\S{301,}""")
+_BREAK = re.compile(r"[\x00-\x1f\x7f\x85\u2028\u2029]+")
 _MOST_CHARACTERS = 1000
 
 
 def brief(message: str) -> str:
-    """A message whose echo of the input is cut: quoted texts beyond 200 characters, words beyond
-    300 (paths are words), and what is still beyond 1,000 in its middle."""
+    """A message on one line, whose echo of the input is cut: quoted texts beyond 200 characters,
+    words beyond 300 (paths are words), and what is still beyond 1,000 in its middle."""
+    message = _BREAK.sub(" ", message)
     message = _LONG_VALUE.sub(lambda found: _cut(found[0], 200), message)
     return _cut(message, _MOST_CHARACTERS) if len(message) > _MOST_CHARACTERS else message
 

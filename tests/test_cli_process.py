@@ -228,6 +228,23 @@ def test_interrupt_leaves_nothing(tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_other_signals_end_it_as_cleanly(number: int) -> None:
+    code = (
+        "import os, sys; from densify import cli; from densify.cli import verbs\n"
+        f"verbs.info = lambda options: os.kill(os.getpid(), {int(number)})\n"
+        "cli.script()"
+    )
+    for ignored, expected in ((False, 130), (True, 0)):
+        before = "import signal; signal.signal(signal.SIGHUP, signal.SIG_IGN)\n" * ignored
+        if ignored and number != signal.SIGHUP:  # as nohup has it
+            continue
+        done = subprocess.run(
+            [sys.executable, "-c", before + code, "info"], capture_output=True, text=True
+        )
+        assert (done.returncode, "interrupted" in done.stderr) == (expected, not ignored)
+
+
 def wait_until_computing(pid: int) -> None:
     """Until the process has used a second of processor time: imports are over, a result is far."""
     for _ in range(600):

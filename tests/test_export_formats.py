@@ -175,7 +175,7 @@ def test_ages_need_a_point_of_the_key(run):
 def test_a_damaged_or_missing_cloud(run):
     whole = (run / "cloud.laz").read_bytes()
     (run / "cloud.laz").write_bytes(whole[: len(whole) // 2])
-    refused("cloud.laz: not a readable LAZ file", run=run, to="pcd")
+    refused("cloud.laz: not a readable .laz file", run=run, to="pcd")
     (run / "cloud.laz").unlink()
     refused("cloud.laz", run=run, to="pcd")
 

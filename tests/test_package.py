@@ -222,7 +222,7 @@ DOORS: dict[str, str | tuple[str, ...]] = {
     "distributed": "densify/dataset/cluster.py",
     "embreex": "densify/street/world.py",
     "kiss_icp": "densify/registration/odometry.py",
-    "laspy": ("densify/outputs/cloud_laz.py", "densify/readers/points/files.py"),
+    "laspy": ("densify/files/las.py", "densify/outputs/cloud_laz.py"),
     "numba": "densify/kernels/",
     "pickle": (
         "densify/dataset/calls.py",

@@ -10,6 +10,7 @@ from __future__ import annotations
 import io
 import logging
 import os
+import signal
 import sys
 from collections.abc import Sequence
 from typing import NoReturn, TextIO
@@ -62,6 +63,9 @@ def script() -> NoReturn:
     # Work is shared out among our own threads; OpenBLAS's would wait beside them in busy loops.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     logging.getLogger("densify.progress").setLevel(logging.INFO)
+    for number in (signal.SIGTERM, signal.SIGHUP):
+        if signal.getsignal(number) == signal.SIG_DFL:  # nohup has it ignored
+            signal.signal(number, signal.default_int_handler)
     code = main()
     if code == INTERRUPTED:
         # Python dies of the signal, not with 130, where an extension module was being imported,

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import datetime
 import io
-import logging
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -14,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from densify.errors import InputError
-from densify.files.content import check_size, open_file, reason
+from densify.files.las import read_las
 from densify.outputs.atomic import write_file
 from densify.outputs.context import Context
 from densify.types import Bool, Cloud, Float, Float32, Result
@@ -133,23 +132,7 @@ def write_cloud(path: Path, cloud: Cloud, stamp_ns: int = 0) -> None:
 
 def read_cloud(path: Path) -> StoredCloud:
     """Read back what `write_cloud` wrote. Raises InputError for any other file."""
-    import laspy
-
-    quiet = logging.getLogger("laspy")
-    try:
-        quiet.disabled = True  # it tells stderr what the exception says too
-        with laspy.open(open_file(path)) as file:
-            num_points = file.header.point_count
-            check_size(num_points * file.header.point_format.size, path)
-            las = file.read()
-        if len(las) != num_points:
-            raise ValueError(f"got {len(las)} points, expected {num_points}; it is cut off")
-    except InputError:
-        raise
-    except Exception as error:  # damaged ones raise anything
-        raise InputError(f"{path}: not a readable LAZ file: {reason(error)}") from error
-    finally:
-        quiet.disabled = False
+    las = read_las(path)
     names = set(las.point_format.dimension_names)
     missing = {name for name, _, _ in _EXTRA_DIMENSIONS} - names - _SINCE
     if missing:

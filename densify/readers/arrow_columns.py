@@ -36,7 +36,7 @@ def read_feather(path: Path, columns: Mapping[str, str], what: str) -> dict[str,
         raise InputError(f"{path}: no such file; expected the columns {', '.join(columns)} in it")
     try:
         table = feather.read_table(path, memory_map=False)
-    except (OSError, ValueError) as error:
+    except Exception as error:  # a damaged schema raises anything
         reason = " ".join(str(error).split())
         raise InputError(f"{path}: not a whole feather file ({reason}); fetch it again") from error
     return column_arrays(table, columns, path)
@@ -58,7 +58,7 @@ def read_parquet(
         there = parquet.read_schema(path).names
         present = [name for name in columns if name in there]
         table = parquet.read_table(path, columns=present, filters=filters or None)
-    except (OSError, ValueError, TypeError, NotImplementedError) as error:
+    except Exception as error:  # likewise
         reason = " ".join(str(error).split())
         raise InputError(f"{path}: not a whole parquet file ({reason}); fetch it again") from error
     if len(present) < len(columns):

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from densify.errors import InputError
 from densify.files.arrays import read_array, read_arrays
 from densify.files.content import check_size, open_file, read_bytes
+from densify.files.las import read_las
 from densify.readers.extras import needed
 
 Columns = dict[str, NDArray[Any]]
@@ -277,14 +278,7 @@ def _read_ply(path: Path, names: Sequence[str] | None) -> PointTable:
 
 
 def _read_las(path: Path, names: Sequence[str] | None) -> PointTable:
-    import laspy
-
-    with laspy.open(open_file(path)) as file:
-        num_points = file.header.point_count
-        check_size(num_points * file.header.point_format.size, path)
-        cloud = file.read()
-    if len(cloud) != num_points:
-        raise ValueError(f"got {len(cloud)} points, expected {num_points}; it is cut off")
+    cloud = read_las(path)
     places = {axis: np.asarray(getattr(cloud, axis)) for axis in "xyz"}
     others = [n for n in cloud.point_format.dimension_names if n not in ("X", "Y", "Z")]
     return PointTable(places | {name: np.asarray(cloud[name]) for name in others})

@@ -131,6 +131,8 @@ class Waymo(FileSequence):
 
     def _returns(self, frame: int) -> tuple[Path, Returns]:
         path, images = self._parts.file("lidar"), self._range_images(frame)
+        if not images:
+            raise InputError(f"{path}: no range image of frame {frame}; fetch it again")
         points, intensity, offset_ns, lidar = [], [], [], []
         for (laser, _), image in images.items():
             if laser not in self._lasers:
