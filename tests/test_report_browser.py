@@ -196,6 +196,26 @@ def test_the_keyboard_moves_the_view(opened: Opened) -> None:
     assert len(seen) == 5
 
 
+def test_a_slow_gpu_is_given_one_frame_at_a_time(opened: Opened) -> None:
+    """Else frames pile up where it draws them, for minutes."""
+    opened.value(
+        """(() => {
+          const painter = cloudPane.painter, draw = painter.draw;
+          window.drawn = 0; window.busy = true;
+          painter.draw = (...all) => { window.drawn += 1; draw.apply(painter, all); };
+          painter.isBusy = () => window.busy;
+        })()"""
+    )
+    opened.settle()
+    for _ in range(5):
+        opened.value("cloudPane.orbit(0.1, 0)")
+        opened.settle()
+    assert opened.value("drawn") == 0
+    opened.value("busy = false")
+    opened.page.wait_for_timeout(1000)
+    assert 1 <= opened.value("drawn") <= 3  # and the last with all points
+
+
 def test_every_control_has_a_name_and_is_reached_by_tab(opened: Opened) -> None:
     unnamed = opened.value(
         """[...document.querySelectorAll("input, select, button, [tabindex], summary, [role=img]")]

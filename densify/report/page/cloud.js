@@ -3,7 +3,7 @@
 
 const NEAR_M = 0.3, FAR_M = 900, FOV = 0.9;
 const COLOURINGS = [["0", "camera"], ["1", "height"], ["2", "source sweep"], ["3", "moving object"], ["4", "confidence"], ["5", "distance moved"]];
-const SLOW_MS = 40, LEAST_SHARE = 0.04;
+const SLOW_MS = 40, PAUSE_MS = 1500, LEAST_SHARE = 0.02;
 
 // Buffers of the points in an order of chance, so that the first few show everything thinly.
 async function cloudBuffers(cloud) {
@@ -301,27 +301,33 @@ class CloudPane {
     }[kind];
     drawLegend($("legend-cloud"), legend);
   }
-  soon() {
+  // A frame; a while after the last one that was asked for comes one with all points.
+  soon(whole = false) {
+    this.whole = whole;
+    clearTimeout(this.settle);
+    if (!whole) this.settle = setTimeout(() => this.soon(true), 300);
     if (this.waiting) return;
     this.waiting = true;
-    requestAnimationFrame((now) => { this.waiting = false; this.draw(now); });
+    const next = (now) => {
+      if (this.painter.isBusy()) return requestAnimationFrame(next);
+      this.waiting = false;
+      this.draw(now);
+    };
+    requestAnimationFrame(next);
   }
   // While frames follow each other too slowly, fewer points are drawn; the last one has all.
   pace(now) {
     const since = now - (this.before || 0);
     this.before = now;
-    clearTimeout(this.settle);
-    if (since < 300) {
+    if (since < PAUSE_MS) {
       this.frameMs = this.frameMs ? 0.8 * this.frameMs + 0.2 * since : since;
-      if (this.frameMs > SLOW_MS) this.share = Math.max(LEAST_SHARE, this.share * 0.8);
+      if (since > SLOW_MS) this.share = Math.max(LEAST_SHARE, this.share * Math.max(SLOW_MS / since, 0.3));
       else if (this.frameMs < SLOW_MS / 2) this.share = Math.min(1, this.share * 1.1);
     } else this.frameMs = null;
-    this.settle = setTimeout(() => { this.whole = true; this.soon(); }, 250);
   }
   draw(now) {
     const share = this.whole ? 1 : this.share;
-    if (this.whole) this.whole = false;
-    else this.pace(now);
+    if (!this.whole) this.pace(now);
     this.painter.resize();
     const s = this.state, canvas = this.painter.canvas, cloud = page.cloud;
     const eye = sum(s.target, [Math.cos(s.pitch) * Math.cos(s.yaw), Math.cos(s.pitch) * Math.sin(s.yaw), Math.sin(s.pitch)], s.distance);

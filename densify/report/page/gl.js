@@ -226,5 +226,16 @@ class Painter {
     gl.uniform1f(s.at.reach, Math.min(devicePixelRatio || 1, 2));
     gl.bindVertexArray(this.empty);
     gl.drawArrays(gl.TRIANGLES, 0, 3);
+    this.fence = gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0);
+    gl.flush();
+  }
+  // Whether the last frame is still being drawn. A slow GPU would otherwise be given ever more.
+  isBusy() {
+    const { gl, fence } = this;
+    if (!fence || gl.isContextLost()) return false;
+    if (gl.getSyncParameter(fence, gl.SYNC_STATUS) !== gl.SIGNALED) return true;
+    gl.deleteSync(fence);
+    this.fence = null;
+    return false;
   }
 }

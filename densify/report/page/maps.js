@@ -249,9 +249,12 @@ class ImagePane {
   }
   legends() {
     if (!this.sides) return;
-    drawLegend($("legend-left"), this.sides[0].legend);
-    const same = JSON.stringify(this.sides[0].legend) === JSON.stringify(this.sides[1].legend);
-    drawLegend($("legend-right"), same ? null : this.sides[1].legend);
+    const [left, right] = this.sides.map((side) => side.legend);
+    const other = JSON.stringify(left) === JSON.stringify(right) ? null : right;
+    $("legend-left").hidden = !left; // both before either is measured
+    $("legend-right").hidden = !other;
+    drawLegend($("legend-left"), left);
+    drawLegend($("legend-right"), other);
   }
   compose() {
     const share = Number($("split").value) / 100, c = $("picture").getContext("2d");
@@ -333,6 +336,7 @@ class ImagePane {
     const held = isNumber(curve) ? `With the key sweep held out, ${percent(curve)} of the measured pixels this certain are wrong.` : "";
     $("kept-note").textContent = part + held;
     const age = ageMs === Infinity ? "" : ` --max-age-ms ${ageMs}`;
+    $("export-command").parentElement.hidden = !page.folder;
     $("export-command").textContent = page.folder ? `densify export ${page.folder} --min-confidence ${confidence}${age}` : "";
   }
 }
