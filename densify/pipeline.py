@@ -34,7 +34,7 @@ from densify.kernels.threads import num_threads
 from densify.readers.files import format_frames
 from densify.readers.prior_files import PriorFiles
 from densify.readers.window import choose_cameras
-from densify.recording import Recording
+from densify.recording import Moment, Recording
 from densify.scores import depth_metrics
 from densify.scores import ghosts as scores
 from densify.types import (
@@ -51,7 +51,6 @@ from densify.types import (
     Result,
     Standing,
     Stretch,
-    StretchFlow,
 )
 
 Image = NDArray[np.uint8]
@@ -254,7 +253,7 @@ def _results(
     sequence: LidarSequence,
     stretch: Stretch,
     key: int,
-    moments: dict[str, tuple[Cloud, StretchFlow | None]],
+    moments: dict[str, Moment],
     beyond: tuple[Standing, Float] | None,
     shots: Mapping[str, Shot],
     images: Mapping[str, Image],
@@ -271,7 +270,7 @@ def _results(
     if with_images and sequence.truth is not None:
         truth = views.truth(sequence.truth)
     with watch.stage("held out"):
-        held_out = HeldOut.of(views, moments[next(reversed(moments))][0])
+        held_out = HeldOut.of(views, moments[next(reversed(moments))].cloud)
     pictures = images if with_images else None
     far, stamps_ns = {}, {s.frame: s.sweep.stamp_ns for s in stretch.sweeps}
     if beyond is not None:
@@ -284,7 +283,7 @@ def _results(
         *(settings, watch),
     )
     with ThreadPoolExecutor(num_threads()) as pool:
-        made = list(pool.map(lambda name: seen.result(name, *moments[name]), moments))
+        made = list(pool.map(lambda name: seen.result(name, moments[name]), moments))
     if priors and made:
         with watch.stage("prior"):
             made[-1] = completed(made[-1], priors, truth, sequence.cameras, settings.prior)
@@ -311,8 +310,9 @@ class _Seen(NamedTuple):
     settings: Config
     watch: Watch
 
-    def result(self, method: str, cloud: Cloud, flow: StretchFlow | None) -> Result:
+    def result(self, method: str, moment: Moment) -> Result:
         """One method's, without its baselines."""
+        cloud = moment.cloud
         views, watch, output, key = self.views, self.watch, self.settings.output, self.views.key
         images, visible = self.images or {}, METHODS[method].visible
         visible = visible and self.settings.project.visibility
@@ -355,7 +355,8 @@ class _Seen(NamedTuple):
             cloud=cloud,
             depth=depth,
             metrics=metrics,
-            flow=flow,
+            flow=moment.flow,
+            tracks=moment.tracks,
             movers=movers,
             optical_flow=views.optical_flow(cloud, depth) if output.optical_flow else {},
             rejected=views.rejected(cloud, depth) if output.rejected else {},

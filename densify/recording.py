@@ -28,13 +28,14 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache, partial
-from typing import Any, TypeVar, cast
+from typing import Any, NamedTuple, TypeVar, cast
 
 from densify.blocks import Cut
 from densify.cache import Cache
 from densify.config import Config
 from densify.costs import Watch
 from densify.depth.accumulate import accumulate
+from densify.depth.object_tracks import object_tracks
 from densify.errors import InputError, SweepError
 from densify.flow.engines import SharedMotion, estimate_motion, motion_type
 from densify.flow.scene import Scene
@@ -56,6 +57,7 @@ from densify.types import (
     FlowField,
     LidarSequence,
     Motion,
+    ObjectTrack,
     RegisteredSweep,
     Standing,
     Stretch,
@@ -64,6 +66,15 @@ from densify.types import (
 )
 
 T = TypeVar("T")
+
+
+class Moment(NamedTuple):
+    """What is measured around a key, as it stands at the key's moment. flow: where asked for.
+    tracks: of what moves; none without flow."""
+
+    cloud: Cloud
+    flow: StretchFlow | None
+    tracks: tuple[ObjectTrack, ...]
 
 
 class Recording:
@@ -160,7 +171,7 @@ class Recording:
 
     def moment(
         self, key: int, all_sweeps: bool, engine: str | None, with_flow: bool = False
-    ) -> tuple[Cloud, StretchFlow | None]:
+    ) -> Moment:
         """What is measured around a key, as it stands at the key's moment.
 
         all_sweeps: of the window; else the key sweep alone. engine: which flow moves the points,
@@ -168,17 +179,19 @@ class Recording:
         the flow of every sweep to the next one on the way to the key.
         """
         stretch, flow = self.window(key), None
+        tracks: tuple[ObjectTrack, ...] = ()
         used = stretch if all_sweeps else Stretch((stretch[key],))
         fields = [FlowField.zero(len(s.sweep)) for s in used.sweeps]
         if engine is not None:
             with self._watch.stage("flow"):
                 motion = self.motion(key, engine)
                 fields = [motion.flow(frame, key) for frame in stretch.frames]
+                tracks = object_tracks(stretch, fields, key)
                 if with_flow:
                     flow = StretchFlow.towards(key, stretch, motion)
         with self._watch.stage("accumulate"):
             drop_lost = self.settings.accumulate.unfollowed == "drop"
-            return accumulate(used, fields, key, drop_lost), flow
+            return Moment(accumulate(used, fields, key, drop_lost), flow, tracks)
 
     def standing(self, key: int) -> tuple[Standing, Float] | None:
         """What stands along the road before and behind the key's window, and ``T_key_standing``

@@ -59,6 +59,7 @@ def test_run_writes_exactly_the_tree_and_names_every_file(densified: SimpleNames
         "000120/figure.png",
         "000120/curve.png",
         "000120/run.yaml",
+        "000120/movers.json",
         "000120/scene/scene.json",
         "000120/scene/image/image_02.jpg",
         *(f"000120/scene/{k}/image_02.png" for k in ("none", "icp", "truth", "sweep")),

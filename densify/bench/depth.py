@@ -125,7 +125,7 @@ def _returns_of(
 ) -> dict[str, TruthMap]:
     """What one scanner of the key sweep measured, by map, without what is hidden."""
     recording = Recording(sequence, config, window, [key], cache)
-    cloud, _ = recording.moment(key, all_sweeps=True, engine="")
+    cloud = recording.moment(key, all_sweeps=True, engine="").cloud
     cloud = cloud.select((cloud.lidar == scanner) & (cloud.frame == key))
     stretch = recording.window(key)
     shots = key_shots(sequence, choose_cameras(sequence, cameras), key, config.project)

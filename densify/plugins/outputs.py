@@ -46,6 +46,7 @@ OUTPUTS = Table(
         Output("full", "densify.outputs.full_maps", owned=("depth_full", "confidence_full")),
         Output("flow", "densify.outputs.flow_npz", owned=("flow",)),
         Output("movers", "densify.outputs.movers", owned=("movers",)),
+        Output("tracks", "densify.outputs.tracks", owned=("movers.json",)),
         Output("optical_flow", "densify.outputs.optical_flow", owned=("optical_flow",)),
         Output("rejected", "densify.outputs.rejected", owned=("rejected",)),
         Output("cloud", "densify.outputs.cloud_laz", owned=("cloud.laz",)),

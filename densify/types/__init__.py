@@ -31,6 +31,7 @@ from densify.types.recordings import (
 )
 from densify.types.results import Progress, Result, StageCost
 from densify.types.sweeps import RegisteredSweep, Stretch, Sweep, Trajectory
+from densify.types.tracks import ObjectTrack
 
 __all__ = [
     "Bool",
@@ -50,6 +51,7 @@ __all__ = [
     "MakesFrames",
     "Motion",
     "Mover",
+    "ObjectTrack",
     "Patches",
     "Prior",
     "PriorFit",

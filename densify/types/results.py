@@ -14,6 +14,7 @@ from densify.arrays import Float, Float32
 from densify.types.depth import CameraView, Cloud, DepthMap, Mover
 from densify.types.flow import StretchFlow
 from densify.types.prior import FullDepth
+from densify.types.tracks import ObjectTrack
 
 Progress = Callable[[str, int, int], None]
 """Called as ``(stage, done, total)`` while something takes its time."""
@@ -42,7 +43,7 @@ class Result:
     given for. images: name -> (H,W,3) RGB, of the maps whose image there is. warnings: what was
     assumed or looks wrong, a sentence each. stamp_ns: the key's reference time. views: from where
     each map looks. truth_m: name -> (H,W) true depth, 0 none, where there is truth. T_key_lidar:
-    (4,4) of every sweep of the window, by frame.
+    (4,4) of every sweep of the window, by frame. tracks: of what moves.
     """
 
     method: str
@@ -65,3 +66,4 @@ class Result:
     views: Mapping[str, CameraView] = field(default_factory=dict)
     truth_m: Mapping[str, Float32] = field(default_factory=dict)
     T_key_lidar: Mapping[int, Float] = field(default_factory=dict)
+    tracks: tuple[ObjectTrack, ...] = ()

@@ -30,24 +30,33 @@ def write_export(run: FinishedRun, folder: Path) -> None:
 
     Raises InputError for lenses that COLMAP has no model of.
     """
-    pictures = write_pictures(run, folder / "images")
-    cameras = _cameras(pictures)
-    number = {camera.camera.name: i for i, camera in enumerate(cameras, 1)}
-    images = [_Image.of(i, p, number[p.view.camera.name]) for i, p in enumerate(pictures, 1)]
-    points = seen(run.cloud())
-    for place in (folder / "sparse" / "0", folder / "text"):
-        place.mkdir(parents=True)
     binary, text = folder / "sparse" / "0", folder / "text"
-    write_file(binary / "cameras.bin", _count(cameras) + b"".join(c.packed() for c in cameras))
-    write_file(binary / "images.bin", _count(images) + b"".join(i.packed() for i in images))
-    write_file(binary / "points3D.bin", _packed_points(points))
+    for place in (binary, text):
+        place.mkdir(parents=True)
+    pictures, points = write_pictures(run, folder / "images"), seen(run.cloud())
+    cameras, images = write_cameras(binary, pictures)
+    write_file(binary / "points3D.bin", packed_points(points))
     write_file(text / "cameras.txt", "".join(c.line() for c in cameras).encode())
     write_file(text / "images.txt", "".join(i.lines() for i in images).encode())
     write_file(text / "points3D.txt", _point_lines(points))
 
 
+def write_cameras(
+    folder: Path, pictures: Sequence[Picture]
+) -> tuple[list[ModelCamera], list[ModelImage]]:
+    """Write cameras.bin and images.bin, and return what is in them."""
+    cameras = _cameras(pictures)
+    number = {camera.camera.name: camera.number for camera in cameras}
+    images = [ModelImage.of(i, p, number[p.view.camera.name]) for i, p in enumerate(pictures, 1)]
+    write_file(folder / "cameras.bin", _count(cameras) + b"".join(c.packed() for c in cameras))
+    write_file(folder / "images.bin", _count(images) + b"".join(i.packed() for i in images))
+    return cameras, images
+
+
 @dataclass(frozen=True)
-class _Camera:
+class ModelCamera:
+    """number: in the model. model, params: as COLMAP has them."""
+
     number: int
     camera: Camera
     model: str
@@ -64,7 +73,7 @@ class _Camera:
         return f"{self.number} {self.model} {size} {numbers}\n"
 
 
-def _cameras(pictures: Sequence[Picture]) -> list[_Camera]:
+def _cameras(pictures: Sequence[Picture]) -> list[ModelCamera]:
     """Each once, in order, however many images are of it."""
     known = {p.view.camera.name: p.view.camera for p in pictures}
     cameras = []
@@ -75,13 +84,14 @@ def _cameras(pictures: Sequence[Picture]) -> list[_Camera]:
             model = {4: "PINHOLE", 8: "OPENCV"}.get(len(params), "FULL_OPENCV")
         if model == "FULL_OPENCV":
             params += [0.0] * (12 - len(params))
-        cameras.append(_Camera(number, camera, model, tuple(params)))
+        cameras.append(ModelCamera(number, camera, model, tuple(params)))
     return cameras
 
 
 @dataclass(frozen=True)
-class _Image:
-    """quaternion: (4,) w x y z of the turn from world to camera. t_m: (3,)."""
+class ModelImage:
+    """number: in the model. camera: its number. quaternion: (4,) w x y z of the turn from world to
+    camera. t_m: (3,)."""
 
     number: int
     camera: int
@@ -90,11 +100,11 @@ class _Image:
     t_m: Float
 
     @staticmethod
-    def of(number: int, picture: Picture, camera: int) -> _Image:
+    def of(number: int, picture: Picture, camera: int) -> ModelImage:
         T_cam_world = picture.view.T_cam_key
         quaternion = np.roll(Rotation.from_matrix(T_cam_world[:3, :3]).as_quat(), 1)
         quaternion *= 1 if quaternion[0] >= 0 else -1
-        return _Image(number, camera, picture.file, quaternion, T_cam_world[:3, 3])
+        return ModelImage(number, camera, picture.file, quaternion, T_cam_world[:3, 3])
 
     def packed(self) -> bytes:
         pose = struct.pack("<i7di", self.number, *self.quaternion, *self.t_m, self.camera)
@@ -109,8 +119,8 @@ def _count(entries: Sequence[object]) -> bytes:
     return struct.pack("<Q", len(entries))
 
 
-def _packed_points(points: StoredCloud) -> bytes:
-    """Each: number, place, colour, reprojection error 0, length of its track 0."""
+def packed_points(points: StoredCloud) -> bytes:
+    """points3D.bin. Each: number, place, colour, reprojection error 0, length of its track 0."""
     num_points = len(points.points)
     columns = {"number": np.arange(1, num_points + 1, dtype="<u8")}
     columns |= {axis: points.points[:, i].astype("<f8") for i, axis in enumerate("xyz")}

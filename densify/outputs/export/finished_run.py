@@ -17,7 +17,8 @@ from densify.files.texts import read_json, read_yaml
 from densify.outputs.cloud_laz import StoredCloud, read_cloud
 from densify.outputs.depth_png import read_stored, stored_age, stored_confidence
 from densify.outputs.export.scene_file import SceneFile, read_scene
-from densify.types import Bool
+from densify.outputs.export.tracks_file import read_tracks
+from densify.types import Bool, CameraView, ObjectTrack
 
 KINDS: Mapping[str, type[np.uint8] | type[np.uint16]] = {
     "depth": np.uint16,
@@ -133,23 +134,59 @@ class FinishedRun:
         }
         return {product: stored * keep for product, stored in maps.items()}
 
+    @cached_property
+    def chosen_views(self) -> dict[str, CameraView]:
+        """From where the chosen cameras' maps look."""
+        return {name: view for name, view in self.scene.views.items() if name in self.cameras}
+
+    @cached_property
+    def tracks(self) -> list[ObjectTrack]:
+        """Raises InputError where movers.json is missing or damaged, or lacks the key."""
+        path = self.folder / "movers.json"
+        tracks = read_tracks(path)
+        for track in tracks:
+            if self.key not in track.frames:
+                raise InputError(f"{path}: object {track.instance} has no pose at key {self.key}")
+        return tracks
+
+    def check_no_thresholds(self, form: str) -> None:
+        """Raise InputError if there are some, for forms that they say nothing of."""
+        if self.min_confidence or self.max_age_ms is not None:
+            raise InputError(
+                f"--to {form}: holds neither pixels nor points; leave --min-confidence and "
+                f"--max-age-ms out"
+            )
+
+    def mover_clouds(self) -> list[StoredCloud]:
+        """What is left of the objects that the run has apart (``output.movers=separate``)."""
+        return [self._points(path) for path in sorted(self.folder.glob("movers/*/cloud.laz"))]
+
     def cloud(self) -> StoredCloud:
         """The points that are left. Raises InputError for a cloud that is missing or damaged, or
         whose points' ages cannot be told."""
-        path = self.folder / "cloud.laz"
+        return self._points(self.folder / "cloud.laz")
+
+    def _points(self, path: Path) -> StoredCloud:
         cloud = read_cloud(path)
         keep = stored_confidence(cloud.confidence) >= stored_confidence(self.min_confidence)
         if self.max_age_ms is not None:
-            own = cloud.gps_time[cloud.frame == self.key]
-            if not len(own):
-                raise InputError(
-                    f"{path}: has no point of the key sweep {self.key} to tell ages from; leave "
-                    f"--max-age-ms out"
-                )
-            age_s = np.abs(cloud.gps_time - own[0])
+            age_s = np.abs(cloud.gps_time - self._key_gps_time)
             keep &= stored_age(age_s) <= stored_age(self.max_age_ms / 1000)
-        self.num_points = Kept(len(keep), int(keep.sum()))
+        before = self.num_points or Kept(0, 0)
+        self.num_points = Kept(before.before + len(keep), before.after + int(keep.sum()))
         return cloud.select(keep)
+
+    @cached_property
+    def _key_gps_time(self) -> float:
+        path = self.folder / "cloud.laz"
+        cloud = read_cloud(path)
+        own = cloud.gps_time[cloud.frame == self.key]
+        if not len(own):
+            raise InputError(
+                f"{path}: has no point of the key sweep {self.key} to tell ages from; leave "
+                f"--max-age-ms out"
+            )
+        return float(own[0])
 
     def _map(self, product: str, camera: str) -> Path:
         return self.folder / product / f"{camera}.png"
