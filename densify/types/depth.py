@@ -6,11 +6,15 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from enum import IntEnum
+from importlib import import_module
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from densify.arrays import Bool, Float, Float32, Int
+from densify.arrays import Bool, Float, Float32, Int, table
+from densify.errors import InputError
+from densify.types.rigid import inverse
 
 
 @dataclass(frozen=True)
@@ -60,8 +64,57 @@ class Cloud:
         """The points where ``keep`` (M,) is True."""
         return Cloud(**{f.name: getattr(self, f.name)[keep] for f in fields(self)})
 
+    def columns(self) -> dict[str, NDArray[Any]]:
+        """Everything as (M,) columns in the types they have here, vectors by axis: x y z, rigid_x
+        rigid_y rigid_z, velocity_x velocity_y velocity_z (m/s), red green blue, and the rest by the
+        names above."""
+        by_axis = {
+            "points": ("x", "y", "z"),
+            "rigid_points": ("rigid_x", "rigid_y", "rigid_z"),
+            "velocity_m_s": ("velocity_x", "velocity_y", "velocity_z"),
+            "rgb": ("red", "green", "blue"),
+        }
+        columns: dict[str, NDArray[Any]] = {}
+        for f in fields(self):
+            values = getattr(self, f.name)
+            names = by_axis.get(f.name)
+            columns |= dict(zip(names, values.T, strict=True)) if names else {f.name: values}
+        return columns
+
+    def to_numpy(self) -> NDArray[Any]:
+        """(M,) structured, a field for each of `columns`."""
+        return table(self.columns())
+
+    def to_pandas(self) -> Any:
+        """A ``pandas.DataFrame`` of M rows with `columns`. Raises InputError without pandas."""
+        return _needed("pandas", "to_pandas()").DataFrame(self.columns())
+
+    def to_open3d(self) -> Any:
+        """An ``open3d.t.geometry.PointCloud``: positions (float64) and colors (0 to 1, float32),
+        and the other `columns` as attributes (M,1) by their names. Raises InputError without
+        open3d."""
+        open3d = _needed("open3d", "to_open3d()")
+        cloud = open3d.t.geometry.PointCloud()
+        cloud.point.positions = open3d.core.Tensor(np.ascontiguousarray(self.points))
+        cloud.point.colors = open3d.core.Tensor(self.rgb.astype(np.float32) / np.float32(255))
+        for name, values in self.columns().items():
+            if name not in ("x", "y", "z", "red", "green", "blue"):
+                column = values.astype(np.uint8) if values.dtype == bool else values
+                cloud.point[name] = open3d.core.Tensor(np.ascontiguousarray(column[:, None]))
+        return cloud
+
     def __len__(self) -> int:
         return len(self.points)
+
+
+def _needed(package: str, what: str) -> Any:
+    """The imported module."""
+    try:
+        return import_module(package)
+    except ImportError as error:
+        raise InputError(
+            f"{what} needs the package {package} ({error}); install it with pip install {package}"
+        ) from None
 
 
 @dataclass(frozen=True)
@@ -246,6 +299,27 @@ class DepthMap:
     age_s: Float32 | None = None
     measure: str = "z"
     warnings: tuple[str, ...] = ()
+
+    def to_points(self, view: CameraView, filled: bool = True) -> Float:
+        """(K,3) the map's pixels as points in the key frame, metres, row by row.
+
+        view: ``Result.views`` of the same name. filled: with the interpolated pixels, else the
+        measured ones alone. What moves is where it was when the image was exposed. Raises
+        InputError for a camera that is not rectified, or a map of ranges.
+        """
+        camera = view.camera
+        if not camera.is_rectified or self.measure != "z":
+            raise InputError(
+                f"{self.camera}: to_points() needs a rectified pinhole and depth along its axis, "
+                f"got {camera.model} with {len(camera.distortion)} coefficients and depth as "
+                f"{self.measure}; take result.cloud"
+            )
+        depth_m = (self.filled_m if filled else self.depth_m).astype(np.float64)
+        v, u = np.nonzero(depth_m)
+        rays = np.column_stack([u, v, np.ones(len(u))]) @ np.linalg.inv(camera.K).T
+        points_cam = rays * depth_m[v, u][:, None]
+        T_key_cam = inverse(view.T_cam_key)
+        return np.asarray(points_cam @ T_key_cam[:3, :3].T + T_key_cam[:3, 3])
 
     def counts(self) -> dict[str, int]:
         """Points of the cloud by what became of them."""
