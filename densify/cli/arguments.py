@@ -100,6 +100,13 @@ def _add_run(commands: Any) -> None:
         ".png (16 bit), of any scale, depth or inverse depth; fitted to what is measured they make "
         "depth_full/, where nothing is measured or filled; masks in DIR/sky/CAMERA/FRAME.png",
     )
+    parser.add_argument(
+        "--film",
+        type=Path,
+        metavar="FILE",
+        help="of one key: a film of 8 s, .webp (half a megabyte), .gif or .mp4: registration alone "
+        "turns into ours, then sweep by sweep",
+    )
     add_output_options(parser)
 
 

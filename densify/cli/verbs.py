@@ -29,6 +29,12 @@ def run(options: argparse.Namespace) -> None:
     keys = _keys_of(sequence, options)
     for key in keys:
         check_writable(options.out, key, options.overwrite, "run", config.output.also)
+    if options.film is not None:
+        from densify.report.film import check_film, write_film
+
+        if len(keys) > 1:
+            raise InputError(f"--film {options.film}: got {len(keys)} keys, expected one")
+        check_film(options.film, options.overwrite)
     failed: dict[int, Exception] = {}
     doubts: list[tuple[str, str, int]] = []
     with progress_on_stderr() as progress:
@@ -56,6 +62,9 @@ def run(options: argparse.Namespace) -> None:
                 overwrite=options.overwrite,
                 also=config.output.also,
             )
+            if options.film is not None:
+                write_film(options.out / f"{key:06d}", options.film, overwrite=True)
+                paths.append(options.film)
             print(summary(result))
             print_paths(paths)
             doubts += [(warning, "", key) for warning in result.warnings]

@@ -1,0 +1,90 @@
+# SPDX-License-Identifier: MIT
+"""The film of a run: a trail becomes a car, then the sweeps come one by one."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from densify.errors import InputError
+from densify.outputs import read_cloud, write_cloud
+from densify.report import film
+from tests.command import refused
+from tests.report_runs import results, write_run
+
+animated = pytest.mark.skipif(
+    not hasattr(cv2, "imwriteanimation"), reason="this opencv writes no animations"
+)
+ORANGE = np.array([0, 159, 230])  # BGR of the first object
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_run(tmp_path_factory.mktemp("run"), report=False)
+
+
+def frames_of(path: Path) -> list[np.ndarray]:
+    if path.suffix == ".mp4":
+        video, frames = cv2.VideoCapture(str(path)), []
+        while (read := video.read())[0]:
+            frames.append(read[1])
+        return frames
+    done, animation = cv2.imreadanimation(str(path))
+    assert done
+    return [frame[:, :, :3] for frame in animation.frames]
+
+
+def test_the_trail_collapses_and_sweeps_fill(run: Path) -> None:
+    pictures = list(film._pictures(read_cloud(run / "cloud.laz")))
+    num_turns, num_sweeps = 16, len(results()["flow"].frames)
+    assert len(pictures) == num_turns + 1 + num_sweeps
+    bare = [picture[45:].astype(int) for picture, _ in pictures]  # without the title
+    length = [
+        np.ptp(np.flatnonzero((np.abs(p - ORANGE).max(axis=2) < 40).any(axis=1))) for p in bare
+    ]
+    assert length[0] > 1.3 * length[num_turns] > 0
+    assert all(a >= b - 1 for a, b in pairwise(length[: num_turns + 1]))
+    filled = [int((p > 20).any(axis=2).sum()) for p in bare[num_turns + 1 :]]
+    assert (np.diff(filled) > 0).all()
+    assert np.array_equal(bare[-1], bare[num_turns])  # nothing from beyond the window here
+    assert 4 < sum(seconds for _, seconds in pictures) < 12
+
+
+@pytest.mark.parametrize(
+    "suffix", [pytest.param(s, marks=animated) for s in (".gif", ".webp")] + [".mp4"]
+)
+def test_every_kind_can_be_played(suffix: str, run: Path, tmp_path: Path) -> None:
+    path = tmp_path / "new" / f"film{suffix}"
+    film.write_film(run, path)
+    frames = frames_of(path)
+    first = next(film._pictures(read_cloud(run / "cloud.laz")))[0]
+    assert frames[0].shape == first.shape and len(frames) >= 20
+    coarse = 15 if suffix == ".gif" else 6  # 256 colours
+    assert np.abs(frames[0].astype(int) - first).mean() < coarse
+    assert path.stat().st_size < 3_000_000
+    if suffix != ".mp4":  # whose encoder notes the time
+        film.write_film(run, tmp_path / f"again{suffix}")
+        assert path.read_bytes() == (tmp_path / f"again{suffix}").read_bytes()
+
+
+def test_what_cannot_be_filmed(run: Path, tmp_path: Path, capsys) -> None:
+    (tmp_path / "there.mp4").touch()
+    for name, words in (("film.avi", "ends in .gif, .mp4, .webp"), ("there.mp4", "already there")):
+        said = refused(capsys, 2, "run", "--key", 3, "--film", tmp_path / name)
+        assert words in said
+    said = refused(capsys, 2, "run", "--keys", "3:5", "--film", tmp_path / "film.mp4")
+    assert "got 2 keys, expected one" in said
+    with pytest.raises(InputError, match="cannot be read"):
+        film.write_film(tmp_path, tmp_path / "film.mp4")
+    assert not (tmp_path / "film.mp4").exists()
+
+
+def test_a_run_in_which_nothing_moves(tmp_path: Path) -> None:
+    cloud = results()["flow"].cloud
+    write_cloud(tmp_path / "cloud.laz", cloud.select(~cloud.moving))
+    film.write_film(tmp_path, tmp_path / "film.mp4")
+    assert len(frames_of(tmp_path / "film.mp4")) > 20
