@@ -11,6 +11,7 @@ import numpy as np
 
 from densify.config import Config
 from densify.depth.exposure import Shot
+from densify.readers.files import format_frames
 from densify.scores.depth_metrics import image_density
 from densify.types import Camera, KnowsItsGaps, LidarSequence, Result, Stretch
 
@@ -32,8 +33,8 @@ def with_doubts(
 
     shots: what the maps show. cuts: of the window, sentences that come first. Checked: what the
     reader had to assume, cameras left out for want of images, where cameras stand and look, point
-    times that are absent or longer than a sweep, images too far in time, what maps could not be
-    made as asked, maps with next to nothing in them.
+    times that are absent or longer than a sweep, images too far in time, sweeps left out of the
+    far range, what maps could not be made as asked, maps with next to nothing in them.
     """
     chosen = {shot.camera.name: shot.camera for shot in shots.values()}
     shared = [
@@ -44,8 +45,9 @@ def with_doubts(
         *_of_times(stretch, settings),
         *_of_shots(sequence, stretch, shots),
     ]
+    own = {name: [*_of_far(result), *_of_maps(result)] for name, result in results.items()}
     return {
-        name: replace(result, warnings=tuple(dict.fromkeys([*shared, *_of_maps(result)])))
+        name: replace(result, warnings=tuple(dict.fromkeys([*shared, *own[name]])))
         for name, result in results.items()
     }
 
@@ -107,6 +109,14 @@ def _of_shots(
         yield (
             f"{name}: no image belongs to the sweep, the nearest was taken {nearest_s:.3g} s away; "
             f"are the stamps of both by one clock?"
+        )
+
+
+def _of_far(result: Result) -> Iterator[str]:
+    if result.far_left_out:
+        yield (
+            f"sweeps {format_frames(result.far_left_out)} are left out of the far range: surfaces "
+            f"there do not lie well on those nearer to the window; run.yaml has the pairs"
         )
 
 

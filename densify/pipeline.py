@@ -290,6 +290,9 @@ def _results(
     results: dict[str, Result] = {}
     for result in made:
         linked = replace(result, costs=watch.costs(), baselines=dict(results))
+        if beyond is not None and METHODS[result.method].far:
+            found = beyond[0]
+            linked = replace(linked, far_links=found.links, far_left_out=found.left_out)
         results[result.method] = linked
     return results
 

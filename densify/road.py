@@ -6,7 +6,8 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from typing import cast
+from functools import partial
+from typing import NamedTuple, cast
 
 import numpy as np
 
@@ -16,15 +17,19 @@ from densify.depth import far
 from densify.errors import InputError
 from densify.geometry import poses
 from densify.geometry.sensor import Sensors
+from densify.kernels.threads import num_threads
 from densify.readers.timeline import Timeline
+from densify.registration.alignment import some
 from densify.registration.chain import follow
 from densify.registration.deskew import placed, twists
+from densify.registration.submaps import num_in_submap, relax
 from densify.sweeps import Sweeps
 from densify.types import (
     Bool,
     Camera,
     Float,
     Int,
+    Links,
     RegisteredSweep,
     Standing,
     Stretch,
@@ -37,6 +42,17 @@ _MOST_S = 15.0  # on each side: who stands, or crawls, sees nothing new
 _LEAST_STEP_M = 0.5 * _STEP_M
 _SAME_VIEW_M = 3.0
 _SLACK_M = 4.0  # that a lidar moves within a sweep, and a camera until its exposure
+
+
+class _Passed(NamedTuple):
+    """A sweep along the road. registered: what a camera may see of it; raw, unless it was known.
+    sample: (N,3) deskewed, some of all its points. travel_m: since the first sweep of the window.
+    known: of the window."""
+
+    registered: RegisteredSweep
+    sample: Float
+    travel_m: float
+    known: bool
 
 
 @dataclass(frozen=True)
@@ -65,35 +81,46 @@ class Road:
         too.
         """
         sensors, views = Sensors.of(near.sweeps), self._views(near, keys)
-        places = np.stack([s.T_world_lidar[:3, 3] for s in near.sweeps])
-        along_m = np.append(0.0, np.linalg.norm(np.diff(places, axis=0), axis=1).cumsum())
-
-        def parts(side: int) -> list[Standing]:
-            found: list[Standing] = []
-            begin_m, last = (along_m[-1], places[-1]) if side > 0 else (0.0, places[0])
-            last_m = travel_m = 0.0
-            for sweep, T_world_lidar, before, after in self._sweeps(near, side):
-                travel_m += float(np.linalg.norm(T_world_lidar[:3, 3] - last))
-                last = T_world_lidar[:3, 3]
-                if travel_m - last_m >= _LEAST_STEP_M:
-                    last_m = travel_m
-                    some = sweep.select(_in_view(sweep, T_world_lidar, views))
-                    registered = placed(some, T_world_lidar, before, after)
-                    found.append(far.standing(registered, sensors, begin_m + side * travel_m))
-            return found
-
-        def own() -> list[Standing]:
-            found, last_m = [], -np.inf
-            for s, at_m in zip(near.sweeps if with_near else (), along_m.tolist(), strict=False):
-                if at_m - last_m >= _LEAST_STEP_M:
-                    last_m = at_m
-                    some = s.sweep.select(_in_view(s.sweep, s.T_world_lidar, views))
-                    found.append(far.standing(replace(s, sweep=some), sensors, at_m))
-            return found
-
         with ThreadPoolExecutor(2) as pool:
-            behind, ahead = pool.map(parts, (-1, 1))
-        return far.together(behind + own() + ahead)
+            behind, ahead = pool.map(partial(self._beyond, near, views), (-1, 1))
+        passed = [*behind[::-1], *_within(near, views), *ahead]
+        links, left_out = Links.none(), frozenset[int]()
+        if self.settings.source != "dataset" and len(passed) > 1:
+            passed, links, left_out = _relaxed(passed, near)
+        shown = [
+            p for p in passed if (with_near or not p.known) and p.registered.frame not in left_out
+        ]
+
+        def part(p: _Passed) -> Standing:
+            sweep = p.registered
+            if not p.known:
+                sweep = placed(
+                    sweep.sweep, sweep.T_world_lidar, sweep.twist_before, sweep.twist_after
+                )
+            return far.standing(sweep, sensors, p.travel_m)
+
+        with ThreadPoolExecutor(num_threads()) as pool:
+            parts = list(pool.map(part, shown))
+        return replace(far.together(parts), links=links, left_out=tuple(sorted(left_out)))
+
+    def _beyond(
+        self, near: Stretch, views: Sequence[tuple[Camera, Float]], side: int
+    ) -> list[_Passed]:
+        """Sweeps before (-1) or behind (1) those near, the nearest first."""
+        last = near.sweeps[0 if side < 0 else -1].T_world_lidar[:3, 3]
+        begin_m = 0.0 if side < 0 else _along_m(near)[-1]
+        found, last_m, travel_m = list[_Passed](), 0.0, 0.0
+        for sweep, T_world_lidar, before, after in self._sweeps(near, side):
+            travel_m += float(np.linalg.norm(T_world_lidar[:3, 3] - last))
+            last = T_world_lidar[:3, 3]
+            if travel_m - last_m < _LEAST_STEP_M:
+                continue
+            last_m = travel_m
+            seen = sweep.select(_in_view(sweep, T_world_lidar, views))
+            sample = placed(some(sweep), T_world_lidar, before, after).sweep.points
+            registered = RegisteredSweep(seen, T_world_lidar, before, after)
+            found.append(_Passed(registered, sample, begin_m + side * travel_m, known=False))
+        return found
 
     def _views(self, near: Stretch, keys: Sequence[int]) -> list[tuple[Camera, Float]]:
         """Cameras and ``T_cam_world`` of the keys; of keys close to each other of one."""
@@ -165,6 +192,50 @@ class Road:
             except InputError:
                 return
             yield sweep, T[i], *twists(trajectory, trajectory.frames.index(chosen[i]))
+
+
+def _along_m(near: Stretch) -> Float:
+    """(n,) metres of travel since the first of these sweeps."""
+    places = np.stack([s.T_world_lidar[:3, 3] for s in near.sweeps])
+    return np.append(0.0, np.linalg.norm(np.diff(places, axis=0), axis=1).cumsum())
+
+
+def _within(near: Stretch, views: Sequence[tuple[Camera, Float]]) -> list[_Passed]:
+    """Sweeps of a stretch that is registered already."""
+    found, last_m = list[_Passed](), -np.inf
+    for s, at_m in zip(near.sweeps, _along_m(near).tolist(), strict=True):
+        if at_m - last_m >= _LEAST_STEP_M:
+            last_m = at_m
+            seen = replace(s, sweep=s.sweep.select(_in_view(s.sweep, s.T_world_lidar, views)))
+            found.append(_Passed(seen, some(s.sweep).points, at_m, known=True))
+    return found
+
+
+def _relaxed(
+    passed: Sequence[_Passed], near: Stretch
+) -> tuple[list[_Passed], Links, frozenset[int]]:
+    """The same with poses that agree, the pairs that say so, and the frames not to be used."""
+    frames = tuple(p.registered.frame for p in passed)
+    found = relax(
+        frames,
+        [p.sample for p in passed],
+        np.stack([p.registered.T_world_lidar for p in passed]),
+        np.array([p.known for p in passed]),
+        num_in_submap(float(np.median([len(s.sweep) for s in near.sweeps]))),
+    )
+    stamp_ns = np.array([p.registered.sweep.stamp_ns for p in passed], np.int64)
+    trajectory = Trajectory(frames, stamp_ns, found.T_world_lidar)
+
+    def moved(i: int, p: _Passed) -> _Passed:
+        if p.known:
+            return p
+        sweep = RegisteredSweep(
+            p.registered.sweep, trajectory.T_world_lidar[i], *twists(trajectory, i)
+        )
+        return p._replace(registered=sweep)
+
+    left_out = frozenset(f for f, holds in zip(frames, found.holds, strict=True) if not holds)
+    return [moved(i, p) for i, p in enumerate(passed)], found.links, left_out
 
 
 def _in_view(sweep: Sweep, T_world_lidar: Float, views: Sequence[tuple[Camera, Float]]) -> Bool:

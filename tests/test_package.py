@@ -229,7 +229,7 @@ DOORS: dict[str, str | tuple[str, ...]] = {
         "densify/readers/pandaset/pickled_frame.py",
         "densify/writers/pandaset.py",
     ),
-    "small_gicp": "densify/registration/chain.py",
+    "small_gicp": "densify/registration/alignment.py",
     "torch": ("densify/flow/", "densify/dataset/loader.py"),
 }
 

@@ -9,6 +9,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import yaml
 
 from densify.outputs.atomic import write_file
@@ -25,7 +26,7 @@ _PACKAGES = (
 
 def write_output(result: Result, context: Context, folder: Path) -> None:
     """``run.yaml``: data, key, frames, those beyond the window, cameras, warnings, how priors fit,
-    configuration, cost of each stage, versions."""
+    configuration, cost of each stage, versions, how what is beyond the window was registered."""
     record = {
         "data": context.data,
         "key": result.key,
@@ -43,7 +44,20 @@ def write_output(result: Result, context: Context, folder: Path) -> None:
         "versions": versions(),
     }
     text = yaml.safe_dump(plain(record), sort_keys=False, allow_unicode=True)
+    text += yaml.safe_dump({"far_links": _far_links(result)}, default_flow_style=None, width=200)
     write_file(folder / "run.yaml", text.encode())
+
+
+def _far_links(result: Result) -> dict[str, Any]:
+    """A row for each pair of submaps, and the names of its columns (`densify.types.Links`)."""
+    links = result.far_links
+    names = ("overlap", "rms_m", "num_matches", "correction_m", "correction_deg", "left_m")
+    columns = [*links.frames.T, *(np.round(getattr(links, name), 4) for name in names)]
+    return {
+        "left_out": list(result.far_left_out),
+        "columns": ["target", "source", *names],
+        "pairs": [list(row) for row in zip(*(c.tolist() for c in columns), strict=True)],
+    }
 
 
 def stages(result: Result) -> list[dict[str, Any]]:

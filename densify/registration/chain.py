@@ -1,9 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Poses of sweeps beyond a window, one after another and in one pass. A door to small_gicp.
-
-Koide et al., "Voxelized GICP for Fast and Accurate 3D Point Cloud Registration", ICRA 2021;
-Koide, "small_gicp: Efficient and parallel algorithms for point cloud registration", JOSS 2024.
-"""
+"""Poses of sweeps beyond a window, one after another and in one pass."""
 
 from __future__ import annotations
 
@@ -14,11 +10,10 @@ import numpy as np
 from densify.config import RegisterSettings
 from densify.errors import InputError
 from densify.geometry import poses
+from densify.registration.alignment import Surface, SurfaceMap, some
 from densify.registration.deskew import placed
 from densify.types import Float, Int, RegisteredSweep, Sweep
 
-_VOXEL_M, _LEAF_M, _NUM_NEIGHBORS = 0.5, 1.0, 10
-_MANY_POINTS = 30_000  # before they are thinned to voxels
 _MATCH_M = 2.0
 _NUM_KNOWN = 6  # sweeps of the window that the map starts with
 _LONGEST_GAP_S = 0.4  # between two sweeps of the chain
@@ -48,47 +43,61 @@ def follow(
     would be at constant velocity. The chain ends where a sweep cannot be read, is too sparse, does
     not lie on the map or moves as no vehicle does.
     """
-    import small_gicp
-
-    voxels = small_gicp.GaussianVoxelMap(_LEAF_M)
-    for s in known[-_NUM_KNOWN:]:
-        voxels.insert(_surface(_some(s.sweep)), s.T_world_lidar)
-    last = known[-1]
-    T_world_lidar, last_ns = last.T_world_lidar, last.sweep.stamp_ns
-    backwards = len(frames) > 0 and int(stamp_ns[0]) < last_ns
-    twist = last.twist_before if backwards else last.twist_after
-    travel_m, row = 0.0, 0
+    backwards = len(frames) > 0 and int(stamp_ns[0]) < known[-1].sweep.stamp_ns
+    end, travel_m, row = _End(known, backwards, settings), 0.0, 0
     while travel_m < reach_m and row < len(frames):
-        rows = _next_rows(stamp_ns, row, last_ns, step_m, float(np.linalg.norm(twist[3:])))
+        rows = _next_rows(stamp_ns, row, end.stamp_ns, step_m, end.speed_m_s)
         prepare([frames[r] for r in rows])
         for r in rows:
             try:
                 sweep = read(frames[r])
             except InputError:
                 return
-            if len(sweep) < settings.min_num_points:
+            before_ns = end.stamp_ns
+            if not end.moved_to(sweep):
                 return
-            step_s = (sweep.stamp_ns - last_ns) * 1e-9
-            surface = _surface(placed(_some(sweep), T_world_lidar, twist, twist).sweep)
-            found = small_gicp.align(
-                voxels,
-                surface,
-                T_world_lidar @ poses.exp(twist * step_s),
-                max_correspondence_distance=_MATCH_M,
-                num_threads=1,  # the order of a parallel sum changes from run to run
-            )
-            T_now = np.asarray(found.T_target_source)
-            new = poses.log(poses.inverse(T_world_lidar) @ T_now) / step_s
-            share = found.num_inliers / max(surface.size(), 1)
-            if share < settings.min_overlap or not _plausible(twist, new, step_s, settings):
-                return
-            travel_m += float(np.linalg.norm(new[3:])) * abs(step_s)
-            twist, T_world_lidar, last_ns = new, T_now, sweep.stamp_ns
-            voxels.insert(surface, T_world_lidar)
-            yield sweep, T_world_lidar, twist, twist
+            travel_m += end.speed_m_s * abs(end.stamp_ns - before_ns) * 1e-9
+            yield sweep, end.T_world_lidar, end.twist, end.twist
             if travel_m >= reach_m:
                 return
         row = rows[-1] + 1
+
+
+class _End:
+    """The end of the chain: the map of all sweeps so far, and place, time and twist of the last."""
+
+    def __init__(
+        self, known: Sequence[RegisteredSweep], backwards: bool, settings: RegisterSettings
+    ) -> None:
+        self._settings, self._map, last = settings, SurfaceMap(), known[-1]
+        for s in known[-_NUM_KNOWN:]:
+            self._map.insert(Surface.of(some(s.sweep).points), s.T_world_lidar)
+        self.T_world_lidar, self.stamp_ns = last.T_world_lidar, last.sweep.stamp_ns
+        self.twist = last.twist_before if backwards else last.twist_after
+
+    @property
+    def speed_m_s(self) -> float:
+        return float(np.linalg.norm(self.twist[3:]))
+
+    def moved_to(self, sweep: Sweep) -> bool:
+        """Lay the next sweep on the map; False where it cannot be."""
+        settings = self._settings
+        if len(sweep) < settings.min_num_points:
+            return False
+        step_s = (sweep.stamp_ns - self.stamp_ns) * 1e-9
+        straight = placed(some(sweep), self.T_world_lidar, self.twist, self.twist).sweep
+        surface = Surface.of(straight.points)
+        guess = self.T_world_lidar @ poses.exp(self.twist * step_s)
+        found = self._map.lay(surface, guess, _MATCH_M)
+        twist = poses.log(poses.inverse(self.T_world_lidar) @ found.T_target_source) / step_s
+        if found.overlap < settings.min_overlap:
+            return False
+        if not _plausible(self.twist, twist, step_s, settings):
+            return False
+        self.T_world_lidar, self.stamp_ns = found.T_target_source, sweep.stamp_ns
+        self.twist = twist
+        self._map.insert(surface, self.T_world_lidar)
+        return True
 
 
 def _next_rows(stamp_ns: Int, row: int, last_ns: int, step_m: float, speed_m_s: float) -> list[int]:
@@ -104,19 +113,6 @@ def _next_rows(stamp_ns: Int, row: int, last_ns: int, step_m: float, speed_m_s: 
         if len(rows) == _TOGETHER:
             break
     return rows or [len(stamp_ns) - 1]
-
-
-def _surface(sweep: Sweep):  # type: ignore[no-untyped-def]
-    """Points thinned to voxels, with the covariance of their neighbours."""
-    import small_gicp
-
-    return small_gicp.preprocess_points(sweep.points, _VOXEL_M, _NUM_NEIGHBORS, 1)[0]
-
-
-def _some(sweep: Sweep) -> Sweep:
-    """Every few points of a sweep that holds many."""
-    step = max(1, len(sweep) // _MANY_POINTS)
-    return sweep if step == 1 else sweep.select(slice(None, None, step))
 
 
 def _plausible(before: Float, after: Float, step_s: float, settings: RegisterSettings) -> bool:

@@ -30,7 +30,7 @@ from densify.types.recordings import (
     Truth,
 )
 from densify.types.results import Progress, Result, StageCost
-from densify.types.sweeps import RegisteredSweep, Stretch, Sweep, Trajectory
+from densify.types.sweeps import Links, RegisteredSweep, Stretch, Sweep, Trajectory
 from densify.types.tracks import ObjectTrack
 
 __all__ = [
@@ -48,6 +48,7 @@ __all__ = [
     "KnowsImagePoses",
     "KnowsItsGaps",
     "LidarSequence",
+    "Links",
     "MakesFrames",
     "Motion",
     "Mover",

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from densify.arrays import Bool, Float, Float32, Int, table
 from densify.errors import InputError
 from densify.types.rigid import inverse
+from densify.types.sweeps import Links
 
 
 @dataclass(frozen=True)
@@ -166,7 +167,8 @@ class Standing:
     spacing_m: (K,2) float32 to the neighbouring rays of the same sweep. source: (K,) int32, which
     of the sweeps ``frames`` measured it. row, lidar, intensity: as in `Cloud`. frames: n sweeps.
     stamp_ns: (n,) int64. travel_m: (n,) float64, where along the road they were: 0 at the key's
-    window, negative behind it.
+    window, negative behind it. links: pairs of submaps, by which the sweeps were placed. left_out:
+    sweeps beyond that hang on bad pairs only.
     """
 
     points: Float32
@@ -179,6 +181,8 @@ class Standing:
     frames: tuple[int, ...]
     stamp_ns: Int
     travel_m: Float
+    links: Links = field(default_factory=Links.none)
+    left_out: tuple[int, ...] = ()
 
     @property
     def stamps_ns(self) -> dict[int, int]:

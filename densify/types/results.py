@@ -14,6 +14,7 @@ from densify.arrays import Float, Float32
 from densify.types.depth import CameraView, Cloud, DepthMap, Mover
 from densify.types.flow import StretchFlow
 from densify.types.prior import FullDepth
+from densify.types.sweeps import Links
 from densify.types.tracks import ObjectTrack
 
 Progress = Callable[[str, int, int], None]
@@ -34,6 +35,7 @@ class Result:
     """One densified key.
 
     frames: of the window. far_frames: sweeps beyond it of which the cloud holds what stands still.
+    far_links: how those lie on each other; far_left_out: sweeps beyond that could not be placed.
     depth: by name: the camera's, or CAMERA/NUMBER of each image (``project.per=image``). metrics:
     plain numbers, ready for JSON. baselines: the results of the simpler methods on the same
     registration, by method. flow: of every sweep to the next one on the way to the key, where
@@ -61,6 +63,8 @@ class Result:
     full: Mapping[str, FullDepth] = field(default_factory=dict)
     images: Mapping[str, NDArray[np.uint8]] = field(default_factory=dict)
     far_frames: tuple[int, ...] = ()
+    far_links: Links = field(default_factory=Links.none)
+    far_left_out: tuple[int, ...] = ()
     warnings: tuple[str, ...] = ()
     stamp_ns: int = 0
     views: Mapping[str, CameraView] = field(default_factory=dict)

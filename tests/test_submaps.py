@@ -1,0 +1,189 @@
+# SPDX-License-Identifier: MIT
+"""The graph of submaps: poses that agree, what is left out, and the solver beside a slow twin."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import pytest
+import yaml
+from scipy.optimize import minimize
+
+from densify import pipeline, road
+from densify.geometry import poses
+from densify.outputs import write_result
+from densify.registration import submaps
+from densify.registration.alignment import Lay, some
+from densify.registration.submaps import num_in_submap, relax
+from densify.types import Sweep
+from tests.scenes import Arc, Scanner, Scene, TinySequence, World, street
+
+NUM, KNOWN = 14, np.arange(14) < 4
+EGO = Arc(0, -1.5, 0, 8.0, 0.02)
+
+
+@cache
+def true():
+    """Frames 1.6 m apart, points as if the lidar stood still, and true poses."""
+    scene = Scene(World(street(60.0)), EGO, Scanner(48, 720, sigma_m=0.01))
+    stretch = scene.stretch(NUM, NUM)
+    sweeps = stretch.sweeps[: 2 * NUM : 2]
+    T_world_lidar = np.stack([s.T_world_lidar for s in sweeps])
+    return [s.frame for s in sweeps], [s.sweep.points for s in sweeps], T_world_lidar
+
+
+def displaced(step_m: float, begin: int = 9):
+    """Poses that drift a little, and at one sweep by much."""
+    rng, (_, _, T) = np.random.default_rng(0), true()
+    found, drift = [], np.eye(4)
+    for i, pose in enumerate(T):
+        if not KNOWN[i]:
+            drift = drift @ poses.exp(
+                np.concatenate([rng.normal(0, 1e-3, 3), rng.normal(0, 0.02, 3)])
+            )
+        if i == begin:
+            drift = drift @ poses.exp(np.array([0, 0, 0, 0.8, 0.6, 0]) * step_m)
+        found.append(pose @ drift)
+    return np.stack(found)
+
+
+def errors(T_world_lidar):
+    """(n,) m, (n,) degrees off the truth."""
+    apart = [poses.log(poses.inverse(a) @ b) for a, b in zip(true()[2], T_world_lidar, strict=True)]
+    turn, shift = np.split(np.array(apart), 2, axis=1)
+    return np.linalg.norm(shift, axis=1), np.rad2deg(np.linalg.norm(turn, axis=1))
+
+
+@pytest.mark.parametrize("num_sweeps", [1, 2])
+def test_drift_is_mended(num_sweeps):
+    frames, points, _ = true()
+    given = displaced(0.0)
+    found = relax(frames, points, given, KNOWN, num_sweeps)
+    before, after = errors(given), errors(found.T_world_lidar)
+    if num_sweeps == 1:
+        assert before[0].max() > 0.08 and after[0].max() < 0.02
+        assert before[1].max() > 0.1 and after[1].max() < 0.05
+    else:  # within a submap the drift stays
+        assert after[0].max() < 0.6 * before[0].max()
+    assert found.holds.all()
+    assert found.T_world_lidar[KNOWN].tobytes() == given[KNOWN].tobytes()
+
+
+def test_a_step_is_mended_and_told():
+    frames, points, _ = true()
+    found = relax(frames, points, displaced(0.7), KNOWN, 1)
+    assert errors(found.T_world_lidar)[0].max() < 0.02
+    assert found.holds.all()
+    links = found.links
+    over = (links.frames[:, 0] < frames[9]) & (links.frames[:, 1] >= frames[9])
+    assert (links.correction_m[over] > 0.6).all() and (links.correction_m[~over] < 0.15).all()
+    assert links.left_m.max() < 0.03 and links.rms_m.max() < 0.05
+    assert (links.num_matches > 500).all() and (links.overlap <= 1).all()
+
+
+def test_what_cannot_be_mended_is_left_out():
+    frames, points, _ = true()
+    found = relax(frames, points, displaced(7.0), KNOWN, 1)
+    assert found.holds[:9].all() and not found.holds[9:].any()
+    assert errors(found.T_world_lidar)[0][:9].max() < 0.02
+
+
+def test_the_same_bytes_by_any_number_of_threads(monkeypatch):
+    frames, points, _ = true()
+    found = []
+    for num in (1, 3):
+        monkeypatch.setattr(submaps, "num_threads", lambda num=num: num)
+        found.append(relax(frames, points, displaced(0.3), KNOWN, 1))
+    assert found[0].T_world_lidar.tobytes() == found[1].T_world_lidar.tobytes()
+    assert found[0].links.left_m.tobytes() == found[1].links.left_m.tobytes()
+
+
+@pytest.mark.parametrize("known", [[0], [3, 4, 5], [9], list(range(10))])
+@pytest.mark.parametrize("num_sweeps", [1, 3, 5])
+def test_submaps_part_the_sweeps(known, num_sweeps):
+    is_known = np.isin(np.arange(10), known)
+    member, middle = submaps._submaps(is_known, num_sweeps)
+    assert (np.diff(member) >= 0).all() and (np.diff(member) <= 1).all() and member[0] == 0
+    assert (member[middle] == np.arange(member[-1] + 1)).all()
+    for i in range(member[-1] + 1):
+        rows = np.flatnonzero(member == i)
+        assert len(set(is_known[rows])) == 1 and len(rows) <= num_sweeps
+    for first in (known[0] - 1, known[-1] + 1):  # beside the known ones they are complete
+        if num_sweeps <= first < 10 - num_sweeps:
+            assert (member == member[first]).sum() == num_sweeps
+
+
+def test_sparse_scanners_have_submaps_of_several_sweeps():
+    assert [num_in_submap(n) for n in (120_000, 60_000, 25_000, 5_000, 0)] == [1, 2, 4, 5, 5]
+
+
+def test_the_solver_finds_what_a_slow_one_does():
+    """The least sum of log(1 + lift² / s²), by an optimiser that knows nothing of slopes."""
+    rng = np.random.default_rng(4)
+    T = np.stack([poses.exp(np.append(rng.normal(0, 0.3, 3), [2.0 * i, 0, 0])) for i in range(4)])
+    ends = np.array([[0, 1], [1, 2], [2, 3], [0, 2], [1, 3]])
+    lays = []
+    for i, j in ends:
+        noise = np.append(rng.normal(0, 2e-3, 3), rng.normal(0, 0.02, 3))
+        root = rng.normal(0, 1, (6, 6)) + np.diag([5.0] * 3 + [2.0] * 3)
+        M = poses.inverse(T[i]) @ T[j] @ poses.exp(noise)
+        lays.append(Lay(M, 1.0, 0.02, 1000, root.T @ root))
+    graph = submaps._Graph(ends, np.array([True, False, False, False]), lays)
+
+    def moved(x):
+        return [T[0], *(a @ poses.exp(m) for a, m in zip(T[1:], x.reshape(3, 6), strict=True))]
+
+    def cost(x):
+        now, total = moved(x), 0.0
+        for (i, j), a in zip(ends, lays, strict=True):
+            off = poses.log(poses.inverse(a.T_target_source) @ poses.inverse(now[i]) @ now[j])
+            total += np.log1p(off @ a.information @ off / submaps._USUAL_M**2)
+        return total
+
+    found = graph.relaxed(T)
+    x = np.concatenate(
+        [poses.log(poses.inverse(a) @ b) for a, b in zip(T[1:], found[1:], strict=True)]
+    )
+    slow = minimize(cost, x, method="Nelder-Mead", options={"maxiter": 2000})
+    assert cost(x) < 0.8 * cost(np.zeros(18))
+    assert cost(x) < slow.fun + 1e-3
+    assert all((cost(x + d) >= cost(x) - 1e-7) for d in 1e-4 * np.eye(18))
+    assert found[0].tobytes() == T[0].tobytes()
+
+
+@pytest.mark.parametrize("num_rings", [16, 32, 64])
+def test_thinning_takes_of_every_ring_alike(num_rings):
+    num = 200_000
+    nothing = np.zeros(num)
+    sweep = Sweep(0, 0, np.zeros((num, 3)), nothing, None, nothing.astype(np.uint8), np.arange(num))
+    kept = some(sweep)
+    assert abs(len(kept) - 30_000) < 10
+    of_ring = np.bincount(kept.row % num_rings, minlength=num_rings)
+    assert of_ring.min() > 0.9 * of_ring.max()
+
+
+def test_a_stretch_that_does_not_hold_is_left_out_with_a_warning(tmp_path, monkeypatch):
+    usual = road.follow
+
+    def torn(*arguments):
+        for i, (sweep, T_world_lidar, *twists) in enumerate(usual(*arguments)):
+            yield (
+                sweep,
+                T_world_lidar @ poses.exp(np.array([0, 0, 0, 6.0, 5, 0]) * (i >= 3)),
+                *twists,
+            )
+
+    monkeypatch.setattr(road, "follow", torn)
+    sequence = TinySequence(
+        Scene(World(street(60.0)), EGO, Scanner(48, 720, sigma_m=0.01)), range(36)
+    )
+    settings = {"accumulate": {"far_m": 14.0}, "register": {"num_lead_in": 2}}
+    result = pipeline.run(sequence, 15, 2, config=settings)
+    assert result.far_left_out and set(result.far_left_out).isdisjoint(result.far_frames)
+    assert any("left out of the far range" in text for text in result.warnings)
+    write_result(result, {}, tmp_path, config={}, data="a drive")
+    record = yaml.safe_load((tmp_path / "000015" / "run.yaml").read_text())["far_links"]
+    assert record["left_out"] == list(result.far_left_out)
+    assert len(record["pairs"]) == len(result.far_links.overlap) > 5
+    assert all(len(row) == len(record["columns"]) for row in record["pairs"])
