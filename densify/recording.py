@@ -77,6 +77,13 @@ class Moment(NamedTuple):
     tracks: tuple[ObjectTrack, ...]
 
 
+class Beyond(NamedTuple):
+    """What stands along the road beyond a key's window, in a world of its own."""
+
+    standing: Standing
+    T_key_standing: Float
+
+
 class Recording:
     """A sequence, settings, and the steps. Holds little: what was read and made last.
 
@@ -193,9 +200,9 @@ class Recording:
             drop_lost = self.settings.accumulate.unfollowed == "drop"
             return Moment(accumulate(used, fields, key, drop_lost), flow, tracks)
 
-    def standing(self, key: int) -> tuple[Standing, Float] | None:
-        """What stands along the road before and behind the key's window, and ``T_key_standing``
-        (4,4); None where nothing beyond it is known, or wanted (``accumulate.far_m``)."""
+    def standing(self, key: int) -> Beyond | None:
+        """What stands along the road before and behind the key's window; None where nothing beyond
+        it is known, or wanted (``accumulate.far_m``)."""
         if not self.settings.accumulate.far_m:
             return None
         number = self.cut.number_of[key]
@@ -204,7 +211,7 @@ class Recording:
         found = self.far(number)[index]
         if not len(found.frames):
             return None
-        return found, poses.inverse(piece.T_world_lidar[piece.frames.index(key)])
+        return Beyond(found, poses.inverse(piece.T_world_lidar[piece.frames.index(key)]))
 
     # For a block, by its number
 

@@ -12,7 +12,8 @@ import densify
 from densify.config import RegisterSettings
 from densify.geometry import poses
 from densify.geometry.range_image import RangeImage
-from densify.pipeline import METHODS, compare, run
+from densify.methods import METHODS
+from densify.pipeline import compare, run
 from densify.readers.window import read_sweep
 from densify.scores.ghosts import ghosts
 from densify.types import Result

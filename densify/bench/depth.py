@@ -24,6 +24,7 @@ from densify.depth.exposure import Exposure, key_shots
 from densify.errors import InputError
 from densify.geometry import poses
 from densify.geometry.cameras import converted, depth_along, rays
+from densify.methods import METHODS
 from densify.readers.window import choose_cameras
 from densify.recording import Recording
 from densify.scores.depth_metrics import image_density, is_outlier_depth
@@ -72,8 +73,8 @@ def bench_depth(
     Raises InputError for what cannot be used, ComputationError where registration went wrong.
     """
     choose_cameras(sequence, cameras)
-    if method not in pipeline.METHODS:
-        raise InputError(f"--method {method}: expected one of {', '.join(pipeline.METHODS)}")
+    if method not in METHODS:
+        raise InputError(f"--method {method}: expected one of {', '.join(METHODS)}")
     if scanner is not None and not np.any(sequence[keys[0]].lidar == scanner):
         raise InputError(f"--scanner {scanner}: no returns of it in sweep {keys[0]}")
     used = sequence if scanner is None else _Without(sequence, scanner)

@@ -81,6 +81,7 @@ def compare(options: argparse.Namespace) -> None:
     config = _config(options)
     from densify import pipeline
     from densify.cli.tables import comparison
+    from densify.methods import COMPARED
     from densify.outputs import check_writable, write_comparison
     from densify.readers import open_sequence
 
@@ -94,7 +95,7 @@ def compare(options: argparse.Namespace) -> None:
             options.cameras,
             config,
             progress,
-            options.methods or pipeline.COMPARED,
+            options.methods or COMPARED,
             _cache(options),
         )
     paths = write_comparison(

@@ -23,6 +23,7 @@ from densify.dataset.manifest import KeyRecord
 from densify.dataset.plan import Recipe, Source
 from densify.dataset.tasks import Task
 from densify.errors import ComputationError, InputError, OutputError
+from densify.methods import METHODS, with_baselines
 from densify.outputs.atomic import FileRecord
 from densify.outputs.kitti_tree import write_key
 from densify.outputs.store import write_result
@@ -167,13 +168,13 @@ def _written(job: Job, results: Mapping[str, Result]) -> dict[str, FileRecord]:
 def _methods(recipe: Recipe) -> tuple[str, ...]:
     """The tree's sparse input is the key sweep alone; a run's figure shows all that is simpler."""
     if recipe.layout == "densify":
-        return pipeline.RUN[: pipeline.RUN.index(recipe.method) + 1]
+        return with_baselines(recipe.method)
     return tuple(dict.fromkeys(["none", recipe.method]))
 
 
 def _needs_of_keys(recipe: Recipe) -> dict[str, int]:
     needs = {"registration": _MARGIN}
-    if pipeline.METHODS[recipe.method].far and recipe.config.accumulate.far_m:
+    if METHODS[recipe.method].far and recipe.config.accumulate.far_m:
         needs["far"] = 0
     if recipe.method == "flow":
         shared = engine(recipe.config.flow.engine)[0].shared
