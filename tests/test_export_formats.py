@@ -13,6 +13,7 @@ from densify.outputs import export_run, read_cloud, read_depth_png, write_cloud
 from densify.outputs.depth_png import stored_age, stored_confidence
 from densify.plugins.exports import EXPORTS
 from densify.types import Cloud
+from tests.command import exit_code
 from tests.test_export import CAMERAS, KEY_NS, STAMPS_NS, map_of, stored, tree, written
 
 NUM_POINTS = 400
@@ -260,6 +261,48 @@ def test_a_form_is_whole_repeatable_and_leaves_the_run_alone(tmp_path, to):
     if to != "exr":  # may hold the moment it was written
         assert again == after
     assert set(again) == set(after)
+
+
+def test_forms_of_other_packages(run, tmp_path, monkeypatch):
+    package = tmp_path / "site" / "xyz_export"
+    about = tmp_path / "site" / "xyz_export-1.dist-info"
+    for folder in (package, about):
+        folder.mkdir(parents=True)
+    code = """
+OWNED = ("cloud.xyz",)
+name = "cloud.xyz"
+
+
+def write_export(run, folder):
+    lines = [f"{x} {y} {z}" for x, y, z in run.cloud().points.tolist()]
+    (folder / name).write_text("\\n".join(lines))
+"""
+    (package / "__init__.py").write_text(code)
+    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: xyz-export\nVersion: 1\n")
+    (about / "entry_points.txt").write_text("[densify.exports]\nxyz = xyz_export\n")
+    monkeypatch.syspath_prepend(tmp_path / "site")
+    (path, _) = export_run(run, to="xyz").paths
+    points = read_cloud(run / "cloud.laz").points
+    np.testing.assert_array_equal(np.loadtxt(path), points)
+    monkeypatch.setattr("xyz_export.name", "points.xyz")
+    refused("wrote points.xyz, expected nothing but cloud.xyz", run=run, to="xyz", overwrite=True)
+
+
+def test_the_command(run, capsys):
+    command = ["export", run, "--to", "ply", "--min-confidence", "0.5"]
+    assert exit_code(*command) == 0
+    line, *paths = capsys.readouterr().out.splitlines()
+    kept = (read_cloud(run / "cloud.laz").confidence >= 0.499).sum()
+    assert abs(int(line.split()[1]) - kept) <= 2 and line.endswith(f"of {NUM_POINTS} points")
+    folder = run / "export" / "ply"
+    assert paths == [str(folder / "cloud.ply"), str(folder / "export.yaml")]
+    assert exit_code(*command) == 2
+    assert "--overwrite" in capsys.readouterr().err
+    assert exit_code("export", run, "--to", "obj") == 2
+    assert "expected one of png, npy" in capsys.readouterr().err
+    assert exit_code("export", run, "--to", "npy", "--camera", "image_03") == 0
+    named = [line for line in capsys.readouterr().out.splitlines() if line.endswith(".npy")]
+    assert len(named) == 3 and all("image_03" in name for name in named)
 
 
 def test_a_form_that_is_none(run):

@@ -91,6 +91,11 @@ def export_run(
     owned = (*form.owned, _RECORD)
     with writing(folder, owned, folder, overwrite) as staging:
         cast(ExportModule, EXPORTS.module(form)).write_export(finished, staging)
+        if strays := sorted({entry.name for entry in staging.iterdir()} - {*form.owned}):
+            raise InputError(
+                f"--to {to}: wrote {', '.join(strays)}, expected nothing but "
+                f"{', '.join(form.owned) or 'what OWNED names'}; mend {form.module}"
+            )
         record = {
             "run": str(run),
             "to": to,
