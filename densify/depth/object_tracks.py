@@ -82,7 +82,8 @@ def _track(
         way = ends[1] - ends[0]
     heading = np.arctan2(way[1], way[0])
     T_key_object = poses.exp(np.array([0, 0, heading, 0, 0, 0]))
-    low, high = np.percentile(at_key @ T_key_object[:3, :3], _PERCENTILES, axis=0)
+    body = poses.rotate(poses.inverse(T_key_object), at_key)
+    low, high = np.percentile(body, _PERCENTILES, axis=0)
     T_key_object[:3, 3] = T_key_object[:3, :3] @ ((low + high) / 2)
     T = np.stack([T_there_key[frame] @ T_key_object for frame in frames])
     stamp_ns = np.array([stamps_ns[frame] for frame in frames], np.int64)
@@ -103,8 +104,9 @@ def _track(
 def _rigid(source: Float, target: Float) -> Float:
     """(4,4) the rigid motion that brings (N,3) points nearest to others."""
     from_m, to_m = source.mean(axis=0), target.mean(axis=0)
-    spread = (target - to_m).T @ (source - from_m)
-    spread += _HOLD * np.trace((source - from_m).T @ (source - from_m)) * np.eye(3)
+    # einsum and not BLAS: the same sums whatever the number of threads.
+    spread = np.einsum("ni,nj->ij", target - to_m, source - from_m)
+    spread += _HOLD * np.square(source - from_m).sum() * np.eye(3)
     left, _, right = np.linalg.svd(spread)
     turn = left @ np.diag([1, 1, np.linalg.det(left @ right)]) @ right
     T = np.eye(4)
