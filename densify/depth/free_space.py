@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from densify.config import ProjectSettings
-from densify.depth.exposure import Exposure
+from densify.depth.exposure import Exposure, InView
 from densify.depth.layers import Layers
 from densify.geometry import poses
 from densify.types import Bool, Cloud, Float, Float32, Reason, Stretch
@@ -59,7 +59,7 @@ class Rays:
 def without_seen_through(
     layers: Layers,
     cloud: Cloud,
-    exposure: Exposure,
+    view: InView,
     rays: Rays,
     reason: NDArray[np.uint8],
     settings: ProjectSettings,
@@ -67,8 +67,8 @@ def without_seen_through(
     """Without the pixels of which rays say that the place is open; what was measured there becomes
     a rim that is not accepted.
 
-    rays: those that tell; of other sweeps and of what moves they tell nothing. reason: (M,) of the
-    points, as far as the map is made.
+    view: of the cloud. rays: those that tell; of other sweeps and of what moves they tell nothing.
+    reason: (M,) of the points, as far as the map is made.
 
     A ray of a hidden point went through where it crosses the surface that the map shows, if the
     point lies behind by more than ``settings.hidden_m`` plus ``hidden_fraction``; a ray stopped at
@@ -84,13 +84,13 @@ def without_seen_through(
     if not passed.any():
         return layers
     blur_px = max(_LEAST_BLUR_PX, _BLUR * float(np.median(layers.gap_px)))
-    seen = exposure.sees(cloud.select(told & ~hidden))
-    moving = cloud.moving[told & ~hidden][seen.rows]
-    near_mover = ndimage.maximum_filter(_counts(seen.uv[moving], shape), _MOVER_PX) > 0
+    stopped = (told & ~hidden)[view.rows]
+    moving = stopped & cloud.moving[view.rows]
+    near_mover = ndimage.maximum_filter(_counts(view.uv[moving], shape), _MOVER_PX) > 0
     hits = cloud.select(passed)
-    through = crossings(layers.filled_m, rays.starts(hits), hits.points, exposure, settings)
+    through = crossings(layers.filled_m, rays.starts(hits), hits.points, view.exposure, settings)
     num_through, num_stopped = (
-        _counts(uv, shape, blur_px) * (2 * np.pi * blur_px**2) for uv in (through, seen.uv)
+        _counts(uv, shape, blur_px) * (2 * np.pi * blur_px**2) for uv in (through, view.uv[stopped])
     )
     dropped = num_through > settings.seen_through * (num_through + num_stopped)
     dropped &= (num_through >= _LEAST_RAYS) & (layers.filled_m > 0) & ~near_mover

@@ -82,7 +82,7 @@ def project(
         if settings.star_reach > 0:
             layers = fill_stars(layers, settings)
     if settings.visibility and rays is not None and settings.seen_through < 1:
-        layers = without_seen_through(layers, cloud, view.exposure, rays, reason, settings)
+        layers = without_seen_through(layers, cloud, view, rays, reason, settings)
     _tell(layers, reason)
     if settings.visibility:
         layers = replace(layers, confidence=calibrated(layers.confidence, layers.depth_m > 0))

@@ -54,6 +54,13 @@ class SeenCloud(NamedTuple):
         views = {name: view.select(keep) for name, view in self.views.items()}
         return SeenCloud(self.cloud.select(keep), self.patches.select(keep), views)
 
+    def in_view(self) -> Bool:
+        """(M,) the points that some map may show."""
+        found = np.zeros(len(self.cloud), bool)
+        for view in self.views.values():
+            found[view.rows] = True
+        return found
+
     def joined(self, far: SeenCloud | None) -> SeenCloud:
         """With what sweeps beyond the window measured."""
         if far is None or not len(far.cloud):
@@ -249,7 +256,7 @@ class HeldOut:
         others = seen.cloud.frame != self.views.key
         if not others.any():
             return None
-        rest = seen.select(others)
+        rest = seen.select(others & seen.in_view())
         rest = rest._replace(patches=replace(rest.patches, free=np.zeros(len(rest.cloud), bool)))
         scores: dict[str, Any] = {}
         for name, maps in self.views.depth(rest, visible).items():
