@@ -316,13 +316,6 @@ class TestErrors:
         assert (run / "report.html").stat().st_mtime_ns == before
         write_report(run, overwrite=True)
 
-    def test_several_keys_are_not_one(self, run: Path, tmp_path: Path) -> None:
-        for key in ("000003", "000004"):
-            (tmp_path / key).mkdir()
-            (tmp_path / key / "run.yaml").write_bytes((run / "run.yaml").read_bytes())
-        with pytest.raises(InputError, match="holds 2 keys"):
-            write_report(tmp_path)
-
     def test_a_map_of_another_size_is_left_out(self, tmp_path: Path) -> None:
         folder = write_run(tmp_path, report=False)
         (folder / "confidence" / "front.png").write_bytes(encode_png(np.zeros((3, 3), np.uint8)))

@@ -302,9 +302,9 @@ def test_texts_of_others_stay_texts(browser: Any, tmp_path: Path) -> None:
     about["stages"] = [{"name": EVIL, "seconds": EVIL, "peak_memory_mb": None}]
     (folder / "run.yaml").write_text(yaml.safe_dump(about))
     scene = json.loads((folder / "scene" / "scene.json").read_text())
-    scene["movers"][0] |= {"instance": 0, "num_points": EVIL}
     scene["views"] |= {EVIL: {"T_cam_key": EVIL, "K": 3}}
     (folder / "scene" / "scene.json").write_text(json.dumps(scene))
+    (folder / "movers.json").write_text(json.dumps({"objects": [{"instance": EVIL}]}))
     for kind in ("depth", "depth_filled", "confidence", "age"):
         (folder / kind / "front.png").rename(folder / kind / "<b id=evil>.png")
     page = Opened(browser, write_report(folder)[0])

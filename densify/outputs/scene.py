@@ -16,9 +16,6 @@ tools.
                 T_key_lidar (4,4)
       views     map -> the camera (width_px, height_px, K, model, distortion, ...), T_cam_key (4,4)
                 when it shows the scene, late_s after the key, number of its image
-      movers    moving objects: instance, num_points, and in key coordinates at the key's time
-                centre_m, size_m along the axes, velocity_m_s, and path: where the centre was at
-                each sweep that saw it (frame, since_key_s, position_m)
 """
 
 from __future__ import annotations
@@ -34,11 +31,9 @@ from densify.outputs.context import Context
 from densify.outputs.depth_png import write_depth_png
 from densify.outputs.plain import write_json
 from densify.outputs.png import encode_jpeg, encode_png
-from densify.types import Camera, CameraView, Cloud, Result
+from densify.types import Camera, CameraView, Result
 
 SCHEMA_VERSION = 1
-_LEAST_POINTS = 20  # fewer say nothing of an object's place
-_SIZE_PERCENTILES = (2, 98)
 
 
 def write_output(result: Result, context: Context, folder: Path) -> None:
@@ -65,7 +60,6 @@ def write_output(result: Result, context: Context, folder: Path) -> None:
         "key": result.key,
         "sweeps": sweeps,
         "views": {name: _view(view) for name, view in result.views.items()},
-        "movers": _movers(result),
     }
     place.mkdir(exist_ok=True)
     write_json(place / "scene.json", table)
@@ -96,39 +90,3 @@ def _sweeps(result: Result) -> list[dict[str, Any]]:
 def _view(view: CameraView) -> dict[str, Any]:
     camera = {f.name: getattr(view.camera, f.name) for f in fields(Camera)}
     return {**camera, "T_cam_key": view.T_cam_key, "late_s": view.late_s, "number": view.number}
-
-
-def _movers(result: Result) -> list[dict[str, Any]]:
-    """The objects with enough points, the largest first."""
-    parts = [mover.cloud for instance, mover in result.movers.items() if instance >= 0]
-    if not result.movers:
-        cloud = result.cloud
-        moving = cloud.select(cloud.moving & (cloud.instance >= 0))
-        parts = [moving.select(moving.instance == i) for i in np.unique(moving.instance)]
-    movers = [_mover(part) for part in parts if len(part) >= _LEAST_POINTS]
-    return sorted(movers, key=lambda mover: -mover["num_points"])
-
-
-def _mover(points: Cloud) -> dict[str, Any]:
-    """One object. What one sweep sees of it is a part only, so its way is taken from how far its
-    points were moved, not from their middle."""
-    low, high = np.percentile(points.points, _SIZE_PERCENTILES, axis=0)
-    centre_m, displacement_m = (low + high) / 2, points.points - points.rigid_points
-    path = []
-    for frame in np.unique(points.frame):
-        own = points.frame == frame
-        path.append(
-            {
-                "frame": frame,
-                "since_key_s": points.since_key_ns[own][0] * 1e-9,
-                "position_m": centre_m - np.median(displacement_m[own], axis=0),
-            }
-        )
-    return {
-        "instance": points.instance[0],
-        "num_points": len(points),
-        "centre_m": centre_m,
-        "size_m": high - low,
-        "velocity_m_s": np.median(points.velocity_m_s, axis=0),
-        "path": path,
-    }

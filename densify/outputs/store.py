@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, Literal, Protocol, cast
 
 from densify.errors import InputError, OutputError
-from densify.outputs import cloud_laz, depth_maps, scene
+from densify.outputs import cloud_laz, depth_maps, scene, tracks
 from densify.outputs.atomic import staged_folder
 from densify.outputs.context import Context
 from densify.outputs.figure import write_figure
@@ -159,7 +159,7 @@ def write_comparison(
         write_figure(folder / "compare.png", results, context)
         maps = folder / "compare"
         maps.mkdir()
-        for output in (depth_maps, cloud_laz, scene):
+        for output in (depth_maps, cloud_laz, tracks, scene):
             output.write_output(last, context, maps)
     return _written(out, key, _COMPARISON)
 

@@ -17,6 +17,8 @@ from densify.files.images import decode_image
 from densify.files.texts import read_json, read_yaml
 from densify.outputs.cloud_laz import StoredCloud, read_cloud
 from densify.outputs.depth_png import read_stored
+from densify.outputs.export.tracks_file import read_tracks
+from densify.types import ObjectTrack
 
 T = TypeVar("T")
 
@@ -123,6 +125,12 @@ class KeyFiles:
         """scene.json, empty where there is none."""
         path = self.maps / "scene" / "scene.json"
         return _mapping(self._tried(read_json, path) or {}) if path.is_file() else {}
+
+    def tracks(self) -> list[ObjectTrack]:
+        """Where moving objects were, those with most points first."""
+        path = self.maps / "movers.json"
+        tracks = self._tried(read_tracks, path) if path.is_file() else None
+        return sorted(tracks or (), key=lambda track: -int(track.num_points.sum()))
 
     def cloud(self) -> StoredCloud | None:
         """The accumulated cloud."""

@@ -16,6 +16,7 @@ from densify.report.cloud_points import MOST_POINTS, packed_cloud
 from densify.report.key_files import KeyFiles
 from densify.report.pack import Blobs
 from densify.report.page_file import page_file
+from densify.types import ObjectTrack
 from densify.version import __version__
 
 MOST_BYTES = 12_000_000
@@ -42,7 +43,8 @@ def key_page(files: KeyFiles, folder: str) -> bytes:
     stored = files.cloud()
     if not cameras and stored is None:
         raise InputError(f"{files.maps}: no depth map and no cloud in it that can be read")
-    sweeps, movers = _sweeps(files, scene, stored), _movers(scene)
+    sweeps = _sweeps(files, scene, stored)
+    movers = [_mover(track, files.about.get("key")) for track in files.tracks()]
     cloud = None
     if stored is not None and len(stored.points):
         cloud = _cloud(blobs, stored, sweeps, movers)
@@ -117,20 +119,20 @@ def _sweeps(
     return [{"frame": f, "since_key_s": None, "far": f in far} for f in frames]
 
 
-def _movers(scene: Mapping[str, Any]) -> list[dict[str, Any]]:
-    movers = scene.get("movers")
-    return [m for m in movers if _is_mover(m)] if isinstance(movers, list) else []
-
-
-def _is_mover(mover: Any) -> bool:
-    try:
-        vectors = [mover[name] for name in ("centre_m", "size_m", "velocity_m_s")]
-        vectors += [place["position_m"] for place in mover["path"]]
-        return isinstance(mover["instance"], int) and all(
-            len(v) == 3 and all(isinstance(x, (int, float)) for x in v) for v in vectors
-        )
-    except (KeyError, TypeError):
-        return False
+def _mover(track: ObjectTrack, key: Any) -> dict[str, Any]:
+    at = track.frames.index(key) if key in track.frames else len(track.frames) // 2
+    places_m = track.T_key_object[:, :3, 3]
+    way = zip(track.frames, places_m, strict=True)
+    return {
+        "instance": track.instance,
+        "num_points": track.num_points.sum(),
+        "centre_m": places_m[at],
+        "size_m": track.size_m,
+        "velocity_m_s": track.velocity_m_s[at],
+        "path": [
+            {"frame": f, "position_m": p} for f, p in zip(track.frames, places_m, strict=True)
+        ],
+    }
 
 
 def _input(about: Mapping[str, Any]) -> list[tuple[str, str]]:

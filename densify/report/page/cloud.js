@@ -275,7 +275,7 @@ class CloudPane {
   }
   moverTable() {
     $("movers-panel").hidden = !page.movers.length;
-    const head = ["object", "points", "speed", "place ahead, left", "size along x, y, z", ""];
+    const head = ["object", "points", "speed", "place ahead, left", "length, width, height", ""];
     const rows = page.movers.map((m, i) => {
       const name = element("th", { scope: "row" }, element("i", { class: `swatch mover-${i % DISTINCT.length}` }), String(m.instance));
       name.firstChild.style.background = rgbText(DISTINCT[i % DISTINCT.length]);
