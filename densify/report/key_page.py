@@ -129,9 +129,7 @@ def _mover(track: ObjectTrack, key: Any) -> dict[str, Any]:
         "centre_m": places_m[at],
         "size_m": track.size_m,
         "velocity_m_s": track.velocity_m_s[at],
-        "path": [
-            {"frame": f, "position_m": p} for f, p in zip(track.frames, places_m, strict=True)
-        ],
+        "path": [{"frame": frame, "position_m": place_m} for frame, place_m in way],
     }
 
 
