@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import gzip
 import io
+import json
 import os
 import shutil
 from collections.abc import Callable, Iterator
@@ -168,6 +169,18 @@ def _cloud(path: Path) -> None:
     read_cloud(path)
 
 
+def _scene(path: Path) -> None:
+    from densify.outputs.export.scene_file import read_scene
+
+    read_scene(path)
+
+
+def _movers(path: Path) -> None:
+    from densify.outputs.export.tracks_file import read_tracks
+
+    read_tracks(path)
+
+
 def _gzip(path: Path) -> None:
     from densify.files.content import gunzipped, read_bytes
 
@@ -221,6 +234,17 @@ def _file_doors() -> Iterator[Door]:
     tum = "".join(f"{1.3e9 + n / 10:.3f} {n} 0 0 0 0 0 1\n" for n in range(5))
     yield Door("poses", _poses, {"a.txt": kitti.encode(), "b.txt": tum.encode()})
     yield Door("cloud", _cloud, {"cloud.laz": _laz(points)})
+    T = np.eye(4).tolist()
+    view = {"name": "a", "width_px": 9, "height_px": 5, "K": np.eye(3).tolist(), "T_cam_lidar": T}
+    view |= {"distortion": [0.1, 0.2], "model": "pinhole", "row_time_s": 0, "column_time_s": 0.0}
+    scene = {
+        "views": {"a": {**view, "T_cam_key": T, "late_s": 0.1, "number": 4}},
+        "sweeps": [{"frame": 3, "T_key_lidar": T}, {"frame": 4, "T_key_lidar": None}],
+    }
+    yield Door("scene", _scene, {"scene.json": json.dumps(scene).encode()})
+    pose = {"frame": 3, "stamp_ns": 10**18, "num_points": 9, "T_key_object": T}
+    track = {"instance": 2, "size_m": [4, 2, 1.5], "poses": [{**pose, "velocity_m_s": [1, 2, 0]}]}
+    yield Door("movers", _movers, {"movers.json": json.dumps({"objects": [track]}).encode()})
     yield Door("gzip", _gzip, {"a.gz": gzip.compress(points.tobytes())})
     entry = encode({1: (points, "x"), 2: (deep, "y")}, _ENTRY)
     yield Door("cache entry", _entry, {"a.entry": entry})

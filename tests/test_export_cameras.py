@@ -275,6 +275,8 @@ DAMAGE = {
     "views.image_02": [],
     "views.image_02.K": [[1, 0, 0], [0, 1, 0]],
     "views.image_02.T_cam_key": [[1, 0, 0, "x"]] * 4,
+    "views.image_02.T_cam_lidar": (2 * np.eye(4)).tolist(),
+    "views.image_03.T_cam_key": np.diag([1, 1, -1, 1]).tolist(),
     "views.image_02.model": "cone",
     "views.image_02.distortion": [True],
     "views.image_02.width_px": 0,

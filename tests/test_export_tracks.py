@@ -283,6 +283,7 @@ DAMAGE = {
     "objects[0].poses": [],
     "objects[0].poses[0].stamp_ns": 1.5,
     "objects[0].poses[0].T_key_object": [[0, 0, 0, None]] * 4,
+    "objects[0].poses[1].T_key_object": np.zeros((4, 4)).tolist(),
     "objects[0].poses[0].velocity_m_s": "fast",
     "objects[0].poses[0].frame": "x",
 }
@@ -293,7 +294,7 @@ def test_damaged_tracks_are_named(bare, place):
     put_tracks(bare, track_of())
     path = bare / "movers.json"
     table = json.loads(path.read_text())
-    *way, last = place.replace("[0]", ".0").split(".")
+    *way, last = place.replace("[", ".").replace("]", "").split(".")
     inner = table
     for name in way:
         inner = inner[int(name) if name.isdigit() else name]

@@ -70,6 +70,18 @@ class Fields:
 
         return np.array(self.value(name, fits, f"{size} x {size} numbers"), np.float64)
 
+    def pose(self, name: str) -> Float:
+        """(4,4) a rotation and a translation."""
+        T = self.matrix(name, 4)
+        R = T[:3, :3]
+        upright = np.allclose(R @ R.T, np.eye(3), atol=1e-3) and np.linalg.det(R) > 0
+        if not upright or T[3].tolist() != [0, 0, 0, 1]:
+            raise InputError(
+                f"{self.path}: {self.prefix}{name}: expected a rotation and a translation; densify "
+                f"the key again"
+            )
+        return T
+
     def each(self, name: str) -> list[tuple[str, Fields]]:
         inner = self.value(name, lambda v: isinstance(v, dict), "a mapping")
         return [(n, Fields(self.path, f"{self.prefix}{name}.{n}.", v)) for n, v in inner.items()]

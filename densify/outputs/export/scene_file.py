@@ -31,7 +31,7 @@ def read_scene(path: Path) -> SceneFile:
     for of_sweep in fields.rows("sweeps"):
         frame = int(of_sweep.number("frame"))
         if of_sweep.table.get("T_key_lidar") is not None:
-            T_key_lidar[frame] = of_sweep.matrix("T_key_lidar", 4)
+            T_key_lidar[frame] = of_sweep.pose("T_key_lidar")
     return SceneFile(views, T_key_lidar)
 
 
@@ -46,7 +46,7 @@ def _view(view: Fields) -> CameraView:
         width_px=int(view.number("width_px", 1, _MOST_PX)),
         height_px=int(view.number("height_px", 1, _MOST_PX)),
         K=view.matrix("K", 3),
-        T_cam_lidar=view.matrix("T_cam_lidar", 4),
+        T_cam_lidar=view.pose("T_cam_lidar"),
         distortion=tuple(map(float, distortion)),
         model=model,
         row_time_s=view.number("row_time_s"),
@@ -54,5 +54,5 @@ def _view(view: Fields) -> CameraView:
     )
     if min(camera.K[0, 0], camera.K[1, 1]) <= 0:
         raise InputError(f"{view.path}: {view.prefix}K: expected focal lengths above 0")
-    T_cam_key, late_s = view.matrix("T_cam_key", 4), view.number("late_s")
+    T_cam_key, late_s = view.pose("T_cam_key"), view.number("late_s")
     return CameraView(camera, T_cam_key, late_s, None if number is None else int(number))

@@ -27,7 +27,7 @@ def _track(entry: Fields) -> ObjectTrack:
         size_m=entry.vector("size_m", 3),
         frames=tuple(int(pose.number("frame", 0, 1 << 31)) for pose in poses),
         stamp_ns=np.array([pose.whole("stamp_ns") for pose in poses], np.int64),
-        T_key_object=np.stack([pose.matrix("T_key_object", 4) for pose in poses]),
+        T_key_object=np.stack([pose.pose("T_key_object") for pose in poses]),
         velocity_m_s=np.stack([pose.vector("velocity_m_s", 3) for pose in poses]),
         num_points=np.array([pose.whole("num_points") for pose in poses], np.int64),
     )
