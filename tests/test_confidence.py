@@ -7,8 +7,12 @@ import numpy as np
 import pytest
 
 from densify.depth import confidence as scale
-from densify.types import DepthMap
+from densify.depth.layers import Layers
+from densify.files.texts import read_json
+from densify.types import DepthMap, Ranked
 from tests.scenes import CAMERA
+
+GROUPS = ("window, smooth", "window, 0.25", "filled, 0.1")
 
 
 def made(confidence, filled_m) -> DepthMap:
@@ -22,12 +26,81 @@ def test_a_fifth_more_is_ten_times_less_wrong():
     assert scale.wrong(np.array([0, 0.2, 0.4, 1.0])) == pytest.approx([1, 0.1, 0.01, 1e-5])
 
 
-@pytest.mark.parametrize("measured", [True, False])
-def test_calibration_keeps_the_order(measured):
-    rank = np.linspace(0, 1, 400, dtype=np.float32)
-    confidence = scale.calibrated(rank, np.full(400, measured))
+SMOOTH, FENCE, FILLED = (scale.GROUPS.index(name) for name in GROUPS)
+"""Of these groups; the tables of a test say what each is worth."""
+
+
+def tables(**worth) -> np.ndarray:
+    """(G,R) log10 P, which falls by a decade over the ranks; worth: at rank 0, by group."""
+    log = np.full((len(scale.GROUPS), scale.NUM_RANKS), -1.0)
+    for name, value in worth.items():
+        log[scale.GROUPS.index(name)] = value
+    return log - np.linspace(0, 1, scale.NUM_RANKS)
+
+
+@pytest.mark.parametrize("groups", [(SMOOTH,), (SMOOTH, FENCE), (FILLED,)])
+def test_calibration_keeps_the_order(groups):
+    """Of pixels measured, and of pixels filled, wherever they are."""
+    rng = np.random.default_rng(3)
+    rank = np.linspace(0, 1, 4000, dtype=np.float32).reshape(40, 100)
+    ranked = Ranked(rank, rng.choice(groups, rank.shape).astype(np.uint8))
+    confidence = scale.calibrated(ranked, np.ones(rank.shape, bool))
     assert confidence.dtype == np.float32
-    assert (np.diff(confidence) > 0).all() and confidence[0] >= 0 and confidence[-1] <= 1
+    assert (np.diff(confidence.ravel()) > 0).all()
+    assert confidence.min() >= 0 and confidence.max() <= 1
+
+
+def test_a_map_expects_what_its_own_pixels_are_worth():
+    """Rough places cost a map as much confidence as there are of them, and empty pixels nothing."""
+    rng = np.random.default_rng(4)
+    worth = tables(**{GROUPS[0]: -3.0, GROUPS[1]: -1.0, GROUPS[2]: -2.0})
+    rank = rng.uniform(size=(200, 300)).astype(np.float32)
+    for share in (0.0, 0.2, 0.9):
+        rough, filled = rng.uniform(size=(2, *rank.shape)) < [[[share]], [[0.5]]]
+        group = np.where(filled, FILLED, np.where(rough, FENCE, SMOOTH)).astype(np.uint8)
+        shown = rng.uniform(size=rank.shape) < 0.6
+        confidence = scale.calibrated(Ranked(rank, group), shown, worth)
+        assert (confidence[~shown] == 0).all()
+        step = np.minimum((rank * scale.NUM_RANKS).astype(int), scale.NUM_RANKS - 1)
+        for part in (shown & filled, shown & ~filled):
+            expected = 10.0 ** worth[group[part], step[part]].astype(float)
+            assert scale.wrong(confidence[part]).mean() == pytest.approx(expected.mean(), rel=0.03)
+
+
+def test_groups_are_how_a_pixel_came_and_how_ragged_it_is_around():
+    shape = (60, 120)
+    none, everywhere = np.zeros(shape, np.float32), np.ones(shape, np.float32)
+    left = np.arange(shape[1]) < 60
+    rim_m = np.where(left & (np.arange(shape[1]) % 2 == 0), everywhere, none)
+    depth_m = everywhere.copy()
+    depth_m[30:] = 0
+    layers = Layers(
+        depth_m=depth_m,
+        rim_m=rim_m,
+        veiled=none > 0,
+        refused=none > 0,
+        filled_m=everywhere,
+        confidence=everywhere / 2,
+        point=np.zeros(shape, np.int32),
+        tilt=np.zeros((*shape, 2), np.float32),
+        spacing_px=np.ones((*shape, 2), np.float32),
+    )
+    far = np.zeros(shape, bool)
+    far[:10] = True
+    rank, group = scale.ranked(layers, far)
+    assert (rank == 0.5).all()
+    names = np.array(scale.GROUPS)[group]
+    assert names[5, 11] == "beyond, 0.25" and names[20, 11] == "window, 0.25"
+    assert names[5, 90] == "beyond, smooth" and names[20, 90] == "window, smooth"
+    assert names[45, 11] == "filled, 0.5" and names[45, 90] == "filled, smooth"
+
+
+def test_the_packages_own_tables_fall_with_the_rank():
+    own = scale.tables_of(read_json(scale.TABLES))
+    assert own.shape == (len(scale.GROUPS), scale.NUM_RANKS)
+    assert (np.diff(own) <= 1e-9).all() and own.max() <= 0 and own.min() >= -scale.DECADES
+    smooth, ragged = (own[k::5].mean() for k in (0, 4))
+    assert ragged > smooth + 0.5
 
 
 def test_reliability_counts_what_is_wrong():

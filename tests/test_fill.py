@@ -22,6 +22,7 @@ def layers_of(depth, spacing_px, image=None):
         depth_m=depth,
         rim_m=np.zeros_like(depth),
         veiled=np.zeros(SHAPE, bool),
+        refused=np.zeros(SHAPE, bool),
         filled_m=depth,
         confidence=(depth > 0) * np.float32(0.8),
         point=np.where(depth > 0, 0, -1).astype(np.int32),

@@ -30,6 +30,7 @@ def layers_of(depth_m, measured=None, confidence=0.8):
         depth_m=depth_m.astype(np.float32),
         rim_m=np.zeros(SHAPE, np.float32),
         veiled=np.zeros(SHAPE, bool),
+        refused=np.zeros(SHAPE, bool),
         filled_m=filled_m,
         confidence=np.where(known, np.float32(confidence), np.float32(0)),
         point=np.where(depth_m > 0, np.arange(depth_m.size).reshape(SHAPE), -1).astype(np.int32),

@@ -12,7 +12,8 @@ import densify
 from densify.config import ProjectSettings
 from densify.depth.layers import Layers
 from densify.depth.picture import edges_fit, lab
-from densify.depth.rims import RULES, decide, shares
+from densify.depth.rims import decide, shares
+from densify.depth.votes import RULES
 from densify.kernels import voting
 from densify.kernels.marching import DIRECTIONS, first_known
 from tests.small_street import KEY, POSES_GIVEN, one_car
@@ -47,6 +48,7 @@ def scene(seed=0):
         depth_m=depth,
         rim_m=rim,
         veiled=np.zeros(truth.shape, bool),
+        refused=np.zeros(truth.shape, bool),
         filled_m=depth,
         confidence=np.where(known, np.float32(0.6), np.float32(0)),
         point=np.where(known, 0, -1).astype(np.int32),
@@ -106,6 +108,18 @@ def test_what_a_patch_veils_is_kept_by_the_image_alone():
     assert not ((decided(layers, None, "keep").depth_m > 0) & behind).any()
 
 
+def test_what_is_refused_stays_out_and_votes():
+    layers, image, _ = scene()
+    kept = decided(layers, image).depth_m > 0
+    for rims in ("image", "keep"):
+        some = np.arange(WIDTH) % 80 < 40
+        refused = (layers.rim_m > 0) & some
+        made = decided(replace(layers, refused=refused), image, rims)
+        assert not ((made.depth_m > 0) & refused).any()
+        if rims == "image":
+            assert np.array_equal((made.depth_m > 0)[:, ~some], kept[:, ~some])
+
+
 def test_without_an_image_rims_are_left_out():
     layers, image, _ = scene()
     for made in (decided(layers, None), decided(layers, image, "strict")):
@@ -160,8 +174,9 @@ def test_a_mirrored_scene_has_mirrored_votes():
     )
     rims, mirrored = (np.flatnonzero(part.rim_m) for part in (layers, flipped))
     share = np.zeros((2, HEIGHT, WIDTH), np.float32)
-    share[0].flat[rims] = shares(layers, lab(image), rims)
-    share[1].flat[mirrored] = shares(flipped, lab(np.ascontiguousarray(image[:, ::-1])), mirrored)
+    for part, place, seen in ((0, rims, image), (1, mirrored, image[:, ::-1])):
+        pictured = replace((layers, flipped)[part], lab=lab(np.ascontiguousarray(seen)))
+        share[part].flat[place] = shares(pictured, place)
     np.testing.assert_allclose(share[0], share[1][:, ::-1], atol=1e-4)
 
 

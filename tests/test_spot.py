@@ -37,7 +37,7 @@ def measured_at(uv, spacing_px):
     )
     empty = np.zeros_like(PLANE)
     layers = Layers(
-        *(depth_m, empty, empty > 0, PLANE, empty + np.float32(0.5), point),
+        *(depth_m, empty, empty > 0, empty > 0, PLANE, empty + np.float32(0.5), point),
         tilt=np.broadcast_to(np.float32(TILT), (HEIGHT, WIDTH, 2)).copy(),
         spacing_px=np.ones((HEIGHT, WIDTH, 2), np.float32),
     )

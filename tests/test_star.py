@@ -32,6 +32,7 @@ def layers_of(filled_m, confidence=0.6, spacing_px=(2.0, 4.0), tilt=(0.0, 0.0)):
         depth_m=filled_m,
         rim_m=np.zeros(SHAPE, np.float32),
         veiled=np.zeros(SHAPE, bool),
+        refused=np.zeros(SHAPE, bool),
         filled_m=filled_m,
         confidence=np.where(known, confidence, 0).astype(np.float32),
         point=np.where(known, 0, -1).astype(np.int32),

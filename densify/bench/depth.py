@@ -88,7 +88,7 @@ def bench_depth(
             watch = Watch()
             recording = Recording(used, config, window, [key], cache, watch=watch)
             made = pipeline.densify(recording, key, [method], cameras, watch)[method]
-            exact = _exact(used, recording.window(key)[key].sweep, key, cameras, config)
+            exact = exact_truth(used, recording.window(key)[key].sweep, key, cameras, config)
             sums[name].add(made, {"truth": exact, "scanner": returns}, used.cameras)
             done += 1
             if progress is not None:
@@ -148,7 +148,7 @@ def _returns_of(
     return maps
 
 
-def _exact(
+def exact_truth(
     sequence: LidarSequence,
     key_sweep: Sweep,
     key: int,

@@ -16,6 +16,7 @@ from densify.cli.options import (
     add_verb,
     add_window,
     natural,
+    recording_keys,
     words,
 )
 
@@ -26,6 +27,7 @@ def add_bench(commands: Any) -> None:
     benches = parser.add_subparsers(title="benches", metavar="WHAT", required=True)
     _add_bench_flow(benches)
     _add_bench_depth(benches)
+    _add_bench_confidence(benches)
     _add_bench_doctor(benches)
     _add_bench_readme(benches)
 
@@ -99,6 +101,36 @@ def _add_bench_depth(benches: Any) -> None:
         metavar="N",
         help="leave this scanner's returns out of the maps and take them for the truth",
     )
+    _add_configuration_and_file(parser)
+
+
+def _add_bench_confidence(benches: Any) -> None:
+    parser = add_verb(
+        benches,
+        "confidence",
+        bench_verbs.bench_confidence,
+        "the tables behind confidence: fitted to exact truth, checked where they were not fitted",
+        "What --out writes is used in the place of densify/depth/confidence.json. Checked are maps "
+        "against exact truth, where there is some, and maps made without the key sweep "
+        "against its returns. Hold means: expected and found differ by at most a fifth or 0.05 %.",
+    )
+    parser.add_argument(
+        "--fit",
+        type=recording_keys,
+        action="append",
+        metavar="SPEC@KEYS",
+        help="simulated recording to fit to, and its keys (K,K,… or A:B[:S]); may be given several "
+        "times (default: streets of several kinds, seeds and scanners)",
+    )
+    parser.add_argument(
+        "--check",
+        type=recording_keys,
+        action="append",
+        metavar="SPEC@KEYS",
+        help="recording to check on; may be given several times (default: other streets)",
+    )
+    add_window(parser)
+    add_camera(parser)
     _add_configuration_and_file(parser)
 
 

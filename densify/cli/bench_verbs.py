@@ -11,6 +11,31 @@ from densify.config import as_mapping, resolve
 _DEFAULT_KEY = 120
 
 
+def bench_confidence(options: argparse.Namespace) -> None:
+    """The tables that turn a rank into a probability, and how far they hold."""
+    config = resolve(options.config, options.overrides)
+    from densify.bench import confidence as bench
+    from densify.bench.table_file import write_table
+    from densify.cli.point_files import check_new_file
+    from densify.cli.tables import reliability_tables
+    from densify.readers import open_sequence
+
+    if options.out is not None:
+        check_new_file(options.out, options.overwrite, ".json")
+    fitted, checked = (
+        [(open_sequence(spec), keys) for spec, keys in given]
+        for given in (options.fit or bench.FITTED, options.check or bench.CHECKED)
+    )
+    with progress_on_stderr() as progress:
+        measured = bench.bench_confidence(
+            fitted, checked, options.window, config, options.cameras, progress
+        )
+    print(reliability_tables(measured["reliability"]), flush=True)
+    if options.out is not None:
+        write_table(options.out, {**measured, "config": as_mapping(config)})
+        print_paths([options.out])
+
+
 def bench_depth(options: argparse.Namespace) -> None:
     """Depth maps of several configurations against every truth."""
     variants = {"as configured": resolve(options.config, options.overrides)}

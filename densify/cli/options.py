@@ -190,6 +190,21 @@ def key_slice(text: str) -> slice | None:
     )
 
 
+def recording_keys(text: str) -> tuple[str, list[int]]:
+    """``SPEC@KEYS``: a recording and its frames, ``K,K,…`` or ``A:B[:S]``."""
+    spec, _, keys = text.rpartition("@")
+    numbers = keys.split(",")
+    if spec and _are_digits(*numbers):
+        return spec, [int(number) for number in numbers]
+    frames = key_slice(keys) if spec and ":" in keys else None
+    if frames is None:
+        raise argparse.ArgumentTypeError(
+            f"got {text!r}, expected a recording and frames such as street?seed=51@60,80 or "
+            f"drive@101:126:4"
+        )
+    return spec, list(range(frames.start, frames.stop, frames.step))
+
+
 def shard(text: str) -> tuple[int, int]:
     """``i/n`` with i from 1 to n."""
     i, slash, n = text.partition("/")

@@ -206,6 +206,27 @@ def depth_table(measured: Mapping[str, Any]) -> str:
     return "\n".join(lines)
 
 
+_HOLDS_WITHIN, _HOLDS_WITHIN_SHARE = 0.2, 0.0005
+
+
+def reliability_tables(rows: Mapping[str, Sequence[Mapping[str, Any]]]) -> str:
+    """A table for each recording: by confidence the pixels, and the share of them that was expected
+    to be wrong and is."""
+    lines = []
+    for name, steps in rows.items():
+        total = sum(step["num_compared"] for step in steps)
+        holding, table = 0, {}
+        for step in steps:
+            off = abs(step["outliers"] - step["expected"])
+            holds = off <= max(_HOLDS_WITHIN * step["expected"], _HOLDS_WITHIN_SHARE)
+            holding += holds * step["num_compared"]
+            table[f"{step['confidence']:.2f}{'' if holds else ' !'}"] = step
+        share = _percent(holding / total if total else None, digits=1)
+        lines += [f"{name}: holds for {share} of the pixels", _table(table, _RELIABILITY_COLUMNS)]
+        lines.append("")
+    return "\n".join(lines).rstrip()
+
+
 _EVALUATION_COLUMNS: tuple[Column, ...] = (
     ("pixels", ("num_pixels",), ",d"),
     ("coverage", ("coverage",), ".1%"),

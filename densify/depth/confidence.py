@@ -1,85 +1,131 @@
 # SPDX-License-Identifier: MIT
 """What a confidence means: the probability that a pixel's depth is right.
 
-A map's stages rank its pixels. The rank is turned into the probability of a wrong depth by tables
-measured where the truth is exact, on both cameras of eight streets: ``street`` seed 51,
-``street:crossing`` 52, ``street:highway`` 53, ``street`` 54 with hdl32, ``street:crossing`` 55 with
-vlp16, ``street`` 56 with os128, ``street:highway`` 57 with hdl32 and ``street:static`` 58; key 60,
-but 80 of the crossings and of 57, and 70 of 53. They are the shares of wrong pixels by rank, every
-map counted alike, made to fall with the rank (pool adjacent violators) and a little from knot to
-knot: the order of pixels measured, and of those filled, stays.
+A map's stages rank its pixels: by sweeps and points that agree, nearness of an edge, roughness, how
+far was filled, votes of the image. What a rank is worth depends on where it is had: among the
+leaves of a hedge far more pixels are wrong than on a road at the same rank. So the probability of a
+wrong depth was measured, where the truth is exact, by rank *and* group: how a pixel came to its
+depth (measured within the window, beyond it, or filled), and how ragged its surroundings are, the
+share of what is measured around it that lies at depth edges. ``densify bench confidence`` makes
+these tables, ``confidence.json`` beside this file, and says how far they hold elsewhere.
+
+Within a map the order of the ranks stays, of pixels measured and of pixels filled: each rank gets
+the mean probability of the map's own pixels at that rank, made to fall with the rank.
 """
 
 from __future__ import annotations
 
+from functools import cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+from scipy.optimize import isotonic_regression
 
+from densify.depth.layers import Layers
+from densify.files.texts import read_json
 from densify.scores.depth_metrics import is_outlier_depth
-from densify.types import Bool, Camera, DepthMap, Float, Float32
+from densify.types import Bool, Camera, DepthMap, Float, Float32, Ranked
 
 DECADES = 5.0
 """Confidence 1 is one wrong pixel in 10^5, each fifth less ten times as many."""
+GROUPS = tuple(
+    f"{how}, {ragged}"
+    for how in ("window", "beyond", "filled")
+    for ragged in ("smooth", "rough from 0.02", "0.1", "0.25", "0.5")
+)
+"""How pixels came to their depth, and the share of what is measured around that is at edges."""
+NUM_RANKS = 200
+TABLES = Path(__file__).with_name("confidence.json")
 
+_RAGGED = np.array([0.02, 0.1, 0.25, 0.5])
+_NUM_RAGGED = len(_RAGGED) + 1
+_NUM_MEASURED = 2 * _NUM_RAGGED  # groups; those behind are filled
+_AROUND = 4.0  # gaps between rays to all sides
+_TILT = 0.01  # decades over all ranks: pixels of different rank keep a different confidence
 _NUM_STEPS = 20
-# Rank -> share of wrong pixels, of those measured and those filled.
-_MEASURED = (
-    (0.000, 0.0615),
-    (0.123, 0.041),
-    (0.163, 0.013),
-    (0.188, 0.0064),
-    (0.378, 0.0058),
-    (0.430, 0.0042),
-    (0.472, 0.0023),
-    (0.576, 0.0021),
-    (0.626, 0.00207),
-    (0.678, 0.002),
-    (0.722, 0.00197),
-    (0.771, 0.0015),
-    (0.828, 0.00059),
-    (0.877, 0.00016),
-    (0.954, 1.8e-05),
-    (1.000, 1.08e-05),
-)
-_FILLED = (
-    (0.000, 0.096),
-    (0.040, 0.064),
-    (0.062, 0.063),
-    (0.089, 0.059),
-    (0.113, 0.031),
-    (0.137, 0.014),
-    (0.162, 0.01),
-    (0.183, 0.0072),
-    (0.227, 0.0065),
-    (0.278, 0.0036),
-    (0.325, 0.0033),
-    (0.377, 0.003),
-    (0.420, 0.00053),
-    (0.475, 0.00048),
-    (0.526, 0.00039),
-    (0.567, 0.00021),
-    (0.619, 9.1e-05),
-    (0.728, 8.2e-05),
-    (0.788, 8.08e-05),
-    (0.854, 7.96e-05),
-    (1.000, 4.77e-05),
-)
 
 
-def calibrated(rank: Float32, measured: Bool) -> Float32:
-    """(H,W) ranks, 0 to 1, and whether pixels are measured or filled -> (H,W) confidence, 0 to 1:
-    ``-log10(P) / 5`` with the probability P that a depth is wrong by KITTI's rule, see
-    `densify.scores.depth_metrics.DepthErrors`."""
-    log_wrong = np.where(measured, _log_wrong(rank, _MEASURED), _log_wrong(rank, _FILLED))
-    confidence: Float32 = np.clip(-log_wrong / DECADES, 0.0, 1.0).astype(np.float32)
+def ranked(layers: Layers, far: Bool) -> Ranked:
+    """The rank and group of a map's pixels. far: (H,W) measured by sweeps beyond the window."""
+    reach = max(2, round(_AROUND * float(np.median(layers.gap_px))))
+    rim, measured = layers.rim_m > 0, (layers.depth_m > 0) | (layers.rim_m > 0)
+    at_edges, around = (
+        ndimage.uniform_filter(part.astype(np.float32), 2 * reach + 1, mode="constant")
+        for part in (rim, measured)
+    )
+    ragged = at_edges / np.maximum(around, 1 / (2 * reach + 1) ** 2)
+    how = np.where(layers.depth_m > 0, far.astype(np.uint8), np.uint8(2))
+    group = how * _NUM_RAGGED + np.searchsorted(_RAGGED, ragged, side="right")
+    shown = layers.filled_m > 0
+    rank = np.where(shown, np.clip(layers.confidence, 0, 1), np.float32(0))
+    return Ranked(rank, np.where(shown, group, 0).astype(np.uint8))
+
+
+def calibrated(found: Ranked, shown: Bool, tables: Float | None = None) -> Float32:
+    """(H,W) confidence, 0 to 1, 0 where nothing is ``shown`` (H,W): ``-log10(P) / 5`` with the
+    probability P that a depth is wrong by KITTI's rule, see
+    `densify.scores.depth_metrics.DepthErrors`.
+
+    tables: (G,R) log10 P by group and step of the rank, else the package's own.
+    """
+    rank, group = found.rank[shown], found.group[shown]
+    log_wrong = curves(counts(rank, group), _own_tables() if tables is None else tables)
+    place = rank.astype(np.float64) * NUM_RANKS - 0.5
+    steps = np.arange(NUM_RANKS)
+    measured, filled = (np.interp(place, steps, curve) for curve in log_wrong)
+    confidence = np.zeros(shown.shape, np.float32)
+    log = np.where(group < _NUM_MEASURED, measured, filled) + _TILT * (0.5 - rank)
+    confidence[shown] = np.clip(-log / DECADES, 0, 1)
     return confidence
 
 
-def _log_wrong(rank: Float32, table: tuple[tuple[float, float], ...]) -> Float:
-    ranks, shares = zip(*table, strict=True)
-    log_wrong: Float = np.interp(rank, ranks, np.log10(shares))
-    return log_wrong
+def counts(rank: Float32, group: NDArray[np.uint8]) -> Float:
+    """(P,) and (P,) -> (G,R) pixels by group and step of the rank."""
+    step = np.minimum((rank * NUM_RANKS).astype(np.int64), NUM_RANKS - 1)
+    place = group.astype(np.int64) * NUM_RANKS + step
+    num = np.bincount(place, minlength=len(GROUPS) * NUM_RANKS)
+    return num.reshape(len(GROUPS), NUM_RANKS).astype(np.float64)
+
+
+def curves(num: Float, tables: Float) -> Float:
+    """(2,R) log10 of the probability that a pixel is wrong by step of the rank, of those measured
+    and of those filled, in a map with ``num`` (G,R) of them. tables: (G,R) log10."""
+    wrong_num = num * 10.0**tables
+    found = [
+        falling(num[part].sum(axis=0), wrong_num[part].sum(axis=0))
+        for part in (slice(_NUM_MEASURED), slice(_NUM_MEASURED, None))
+    ]
+    return np.array(found)
+
+
+def falling(num: Float, wrong_num: Float) -> Float:
+    """(R,) log10 of the share that is wrong, which falls with the rank (isotonic regression). num,
+    wrong_num: (R,) pixels, weighted or not; steps without any lie between their neighbours."""
+    some = num > 0
+    if not some.any():
+        return np.full(len(num), _TILT - DECADES)
+    share = isotonic_regression(wrong_num[some] / num[some], weights=num[some], increasing=False).x
+    log = np.log10(np.clip(share, 10.0 ** (_TILT - DECADES), 1))
+    steps = np.arange(len(num))
+    between: Float = np.interp(steps, steps[some], log)
+    return between
+
+
+@cache
+def _own_tables() -> Float:
+    return tables_of(read_json(TABLES))
+
+
+def tables_of(written: dict[str, Any]) -> Float:
+    """(G,R) log10 of the share that is wrong, from what `densify.bench.confidence` wrote."""
+    steps, tables = np.arange(NUM_RANKS), []
+    for name in GROUPS:
+        ranks, shares = np.array(written["tables"][name]).T
+        tables.append(np.interp((steps + 0.5) / NUM_RANKS, ranks, np.log10(shares)))
+    return np.array(tables)
 
 
 def wrong(confidence: Float | Float32) -> Float:

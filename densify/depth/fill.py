@@ -12,10 +12,9 @@ import numpy as np
 
 from densify.config import ProjectSettings
 from densify.depth.layers import Layers
-from densify.depth.rims import RULES
-from densify.kernels import filling, voting
-from densify.kernels.marching import DIRECTIONS, first_known
-from densify.types import Float32, Int
+from densify.depth.votes import RULES, shares, voters
+from densify.kernels import filling
+from densify.types import Float32
 
 _GROWTH = (1 / 3, 2 / 3, 1.0)  # spacings
 _LEAST_SHARE = 0.9  # of the votes for a pixel that is kept
@@ -41,12 +40,12 @@ def voted(layers: Layers, before_m: Float32, least_share: float) -> Layers:
     """Without what has been filled since ``before_m`` (H,W) against the votes of the measured
     pixels around.
 
-    They vote as for rims (`densify.depth.rims`), and ``least_share`` must be in favour; what is
-    filled has no vote, it would vote for itself. Without an image that fits they tell by distance
-    alone.
+    ``least_share`` of the votes (`densify.depth.votes`) must be in favour; what is filled has none,
+    it would vote for itself.
     """
     pixel = np.flatnonzero((layers.filled_m > 0) & (before_m == 0))
-    dropped = pixel[shares(layers, layers.filled_m, pixel) < least_share]
+    depth_m, seeds = layers.filled_m.flat[pixel], voters(layers, layers.depth_m)
+    dropped = pixel[shares(layers, seeds, pixel, depth_m, _RULES) < least_share]
     filled_m, confidence = layers.filled_m.copy(), layers.confidence.copy()
     filled_m.flat[dropped] = 0
     confidence.flat[dropped] = 0
@@ -97,17 +96,3 @@ def fill_between(
     )
     filled_confidence *= 1 - share * np.float32(1 - factor)
     return filled_m, filled_confidence
-
-
-def shares(layers: Layers, filled_m: Float32, pixel: Int) -> Float32:
-    """(P,) share of the measured pixels' votes for the depth of ``pixel`` (P,)."""
-    measured = layers.depth_m > 0
-    inverse = np.divide(1, layers.depth_m, out=np.zeros_like(filled_m), where=measured)
-    seeds = voting.Seeds(
-        first_known(measured), DIRECTIONS, inverse, layers.tilt, np.ones_like(inverse)
-    )
-    lab = layers.lab if layers.lab is not None else np.zeros((*measured.shape, 3), np.float32)
-    share = np.ones(len(pixel), np.float32)
-    here = 1 / filled_m.flat[pixel]
-    voting.vote.over_rows(len(pixel), pixel, here, seeds, lab, layers.gap_px, _RULES, share)
-    return share

@@ -26,7 +26,8 @@ _SAME_M, _SAME_FRACTION = 0.05, 0.01  # from one step to the next: the crossing 
 _BLUR = 0.25  # of the gap between rays, standard deviation: what rays tell of pixels around
 _LEAST_BLUR_PX = 1.0
 _LEAST_RAYS = 0.9  # through a pixel itself, or more of them around it
-_MOVER_PX = 25  # across: rays of other sweeps passed where movers were not yet, or no more
+# Gaps between rays to all sides of a mover: rays of other sweeps passed there before and after it.
+_MOVER_GAPS = 3.6
 
 
 @dataclass(frozen=True)
@@ -83,10 +84,11 @@ def without_seen_through(
     passed = told & hidden & ~cloud.moving
     if not passed.any():
         return layers
-    blur_px = max(_LEAST_BLUR_PX, _BLUR * float(np.median(layers.gap_px)))
+    gap_px = float(np.median(layers.gap_px))
+    blur_px, around_px = max(_LEAST_BLUR_PX, _BLUR * gap_px), 2 * round(_MOVER_GAPS * gap_px) + 1
     stopped = (told & ~hidden)[view.rows]
     moving = stopped & cloud.moving[view.rows]
-    near_mover = ndimage.maximum_filter(_counts(view.uv[moving], shape), _MOVER_PX) > 0
+    near_mover = ndimage.maximum_filter(_counts(view.uv[moving], shape), around_px) > 0
     hits = cloud.select(passed)
     through = crossings(layers.filled_m, rays.starts(hits), hits.points, view.exposure, settings)
     num_through, num_stopped = (

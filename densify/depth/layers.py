@@ -18,6 +18,8 @@ class Layers:
     depth_m: float32, accepted as measured, 0 none. rim_m: float32, measured so near to a depth edge
     that the pixel may show what lies beyond, 0 where not; it stays when the pixel is accepted.
     veiled: (H,W) such a pixel is measured behind the patch of a nearer point, and not at all else.
+    refused: (H,W) such a pixel is never accepted: on a mover, where the key sweep saw past it, or
+    behind the patch of one, seen at another time.
     filled_m: float32, the accepted ones plus interpolated ones. confidence: float32 0 to 1, of
     every pixel in any of the three. point: int32 row of the cloud that measured the pixel, -1 none.
     tilt: (H,W,2) float32 slope of the measured surface's inverse depth to the right and down, 1/m
@@ -30,6 +32,7 @@ class Layers:
     depth_m: Float32
     rim_m: Float32
     veiled: Bool
+    refused: Bool
     filled_m: Float32
     confidence: Float32
     point: NDArray[np.int32]

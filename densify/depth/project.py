@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from densify.config import ProjectSettings
-from densify.depth.confidence import calibrated
+from densify.depth.confidence import calibrated, ranked
 from densify.depth.exposure import Exposure, InView
 from densify.depth.fill import fill
 from densify.depth.free_space import Rays, without_seen_through
@@ -29,7 +29,7 @@ from densify.depth.rims import decide
 from densify.depth.settling import MeasuredPixels, nearest_pixels, visible_pixels
 from densify.depth.spot import measure_spots
 from densify.depth.star import fill_stars
-from densify.types import Camera, Cloud, DepthMap, Float32, Patches, Reason
+from densify.types import Camera, Cloud, DepthMap, Float32, Patches, Ranked, Reason
 
 _BLOCK_PX = 16  # over which rays lie about equally dense
 _LEAST_CONFIDENCE = np.float32(1 / 255)  # 0 means no depth once written as 8 bits
@@ -84,11 +84,16 @@ def project(
     if settings.visibility and rays is not None and settings.seen_through < 1:
         layers = without_seen_through(layers, cloud, view, rays, reason, settings)
     _tell(layers, reason)
+    rank = None
     if settings.visibility:
-        layers = replace(layers, confidence=calibrated(layers.confidence, layers.depth_m > 0))
+        measured = layers.depth_m > 0
+        far = np.zeros(measured.shape, bool)
+        far[measured] = cloud.far[layers.point[measured]]
+        rank = ranked(layers, far)
+        layers = replace(layers, confidence=calibrated(rank, layers.filled_m > 0))
         if filled and settings.spot > 0:
             layers = measure_spots(layers, points, settings)
-    return _finished(layers, cloud, view.exposure, reason)
+    return _finished(layers, cloud, view.exposure, reason, rank)
 
 
 def _measured(
@@ -104,10 +109,13 @@ def _measured(
     confidence.flat[seen.pixel] = np.maximum(seen.confidence, _LEAST_CONFIDENCE)
     tilt.reshape(-1, 2)[seen.pixel] = seen.tilt
     point.flat[seen.pixel] = points.index[seen.winner]
-    veiled = np.zeros(shape, bool)
+    veiled, refused = np.zeros(shape, bool), np.zeros(shape, bool)
     veiled.flat[seen.pixel] = seen.veiled
+    refused.flat[seen.pixel] = seen.refused
     spacing_px = _spacing_px(points if points.far.all() else points.select(~points.far), shape)
-    return Layers(depth_m, rim_m, veiled, depth_m, confidence, point, tilt, spacing_px, lab)
+    return Layers(
+        depth_m, rim_m, veiled, refused, depth_m, confidence, point, tilt, spacing_px, lab
+    )
 
 
 def _spacing_px(points: PointsInImage, shape: tuple[int, int]) -> Float32:
@@ -137,7 +145,11 @@ def _tell(layers: Layers, reason: NDArray[np.uint8]) -> None:
 
 
 def _finished(
-    layers: Layers, cloud: Cloud, exposure: Exposure, reason: NDArray[np.uint8]
+    layers: Layers,
+    cloud: Cloud,
+    exposure: Exposure,
+    reason: NDArray[np.uint8],
+    rank: Ranked | None,
 ) -> DepthMap:
     measured = layers.depth_m > 0
     frame = np.full(measured.shape, -1, np.int32)
@@ -152,4 +164,5 @@ def _finished(
         reason=reason,
         measure=exposure.measure,
         warnings=layers.warnings,
+        ranked=rank,
     )

@@ -9,24 +9,14 @@ from dataclasses import replace
 import numpy as np
 
 from densify.config import ProjectSettings
+from densify.depth import votes
 from densify.depth.layers import Layers
 from densify.depth.picture import edges_fit
-from densify.kernels import voting
-from densify.kernels.marching import DIRECTIONS, first_known
+from densify.depth.votes import voters
 from densify.types import Float32, Int
 
 MOST_CONFIDENCE = 0.2
 """A rim has no more, what is no rim no less."""
-RULES = voting.Rules(
-    reach=6.0,
-    decay=1.2,
-    same_m=0.2,
-    same_fraction=0.05,
-    colours=6.0,
-    through=0.001,
-    doubt=0.04,
-    aside=0.6,
-)
 _NUM_ROUNDS = 2
 _RIM_WEIGHT = 0.5  # of a rim's own vote, at most
 _LEAST_SHARE = 0.97  # of the votes for a pixel that is kept
@@ -43,11 +33,9 @@ def decide(layers: Layers, settings: ProjectSettings) -> Layers:
     surface, ``keep`` all that are not veiled too, ``strict`` none. Veiled ones are what is measured
     right beside a nearer surface, whose patches are larger than itself.
 
-    Every pixel whose depth is known votes in 16 directions for the rims it sees first, as far as
-    its surface goes on to them, and against them otherwise (`densify.kernels.voting.vote`); rims
-    vote too, by half, in a second round less the less they are believed. Kept is what has 97 % of
-    the votes. The idea is that of a bilateral grid or a geodesic matting: without an edge of the
-    image between them, two pixels show the same surface.
+    Known pixels vote for or against them (`densify.depth.votes`); rims vote too, by half, in a
+    second round less the less they are believed. Kept is what has 97 % of the votes, but nothing
+    that is ``refused``.
 
     An image that does not belong to the depth is not listened to (`edges_fit`): as ``strict``, with
     a warning; without an image as ``strict``. ``lab`` goes on only if it was listened to.
@@ -61,7 +49,7 @@ def decide(layers: Layers, settings: ProjectSettings) -> Layers:
     if layers.lab is not None and settings.rims != "strict" and len(rims) >= _FEW:
         if edges_fit(layers.lab, known_m, at_edge, _scale(layers)):
             lab = layers.lab
-            share = shares(layers, lab, rims)
+            share = shares(layers, rims)
         else:
             warnings = (*warnings, _MISFIT)
     believed = share >= _LEAST_SHARE
@@ -69,6 +57,7 @@ def decide(layers: Layers, settings: ProjectSettings) -> Layers:
         believed[:] = False
     elif settings.rims == "keep":
         believed |= ~layers.veiled.flat[rims]
+    believed &= ~layers.refused.flat[rims]
     kept = rims[believed]
     depth_m = layers.depth_m.copy()
     depth_m.flat[kept] = layers.rim_m.flat[kept]
@@ -86,19 +75,13 @@ def decide(layers: Layers, settings: ProjectSettings) -> Layers:
     )
 
 
-def shares(layers: Layers, lab: Float32, rims: Int) -> Float32:
+def shares(layers: Layers, rims: Int) -> Float32:
     """(R,) share of the votes for each of the pixels ``rims`` (R,)."""
-    known_m = np.maximum(layers.depth_m, layers.rim_m)
-    inverse = np.divide(1, known_m, out=np.zeros_like(known_m), where=known_m > 0)
-    weight = np.ones_like(known_m)
-    steps, gap_px = first_known(known_m > 0), layers.gap_px
+    seeds = voters(layers, np.maximum(layers.depth_m, layers.rim_m))
     share = np.ones(len(rims), np.float32)
     for _ in range(_NUM_ROUNDS):
-        weight.flat[rims] = _RIM_WEIGHT * share**2
-        seeds = voting.Seeds(steps, DIRECTIONS, inverse, layers.tilt, weight)
-        voting.vote.over_rows(
-            *(len(rims), rims, inverse.flat[rims], seeds, lab, gap_px, RULES, share)
-        )
+        seeds.weight.flat[rims] = _RIM_WEIGHT * share**2
+        share = votes.shares(layers, seeds, rims, layers.rim_m.flat[rims], votes.RULES)
     return share
 
 

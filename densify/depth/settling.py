@@ -15,6 +15,7 @@ from densify.depth.rims import MOST_CONFIDENCE
 from densify.kernels import visibility as kernels
 from densify.types import Bool, Camera, Float, Float32, Int, Reason
 
+_NEVER_NS = np.iinfo(np.int64).max
 _MAX_HALF_PX = 24.0  # a point just before the lens must not hide the whole image
 _EDGE_WINDOW_PX = 1.5  # beyond the edge, where points must show that a surface goes on
 # Of pixels that sweeps beyond the window give: these vouch that a surface goes on where something
@@ -31,7 +32,7 @@ _ROUGH_M = 0.10
 class MeasuredPixels:
     """P measured pixels. pixel: (P,) row by row. winner: (P,) which of the points in the image.
     depth_m, confidence: (P,). tilt: (P,2) of the inverse depth, 1/m per px. inside: (P,) no depth
-    edge near. veiled: (P,) behind another point's patch."""
+    edge near. veiled: (P,) behind another point's patch. refused: (P,) see `Layers`."""
 
     pixel: Int
     winner: Int
@@ -40,6 +41,7 @@ class MeasuredPixels:
     tilt: Float
     inside: Bool
     veiled: Bool
+    refused: Bool
 
     def select(self, keep: Bool | Int) -> MeasuredPixels:
         """Some of the pixels."""
@@ -90,39 +92,19 @@ def _settled(
     beyond the window measured.
     """
     behind = _behind(points, camera, settings)
-    edge_px = settings.edge_slack_m * points.focal_px[:, 0] * points.inverse
     hidden = behind > 1
     reason = np.where(hidden, Reason.HIDDEN, Reason.NOT_CHOSEN).astype(np.uint8)
-    last = int(points.age_ns.max(initial=0)) + 1
-    start, order = _by_pixel(points, np.where(hidden, last, points.age_ns), own, camera)
-    found = np.zeros((6, len(start) - 1), np.float32)
-    done = np.zeros(len(start) - 1, bool)
-    if taken is not None:
-        done[taken] = True
-    visible = kernels.Visible(
-        start=start,
-        order=order,
-        uv=points.uv,
-        inverse=points.inverse,
-        slope=points.slope,
-        spacing_px=points.spacing_px,
-        edge_px=edge_px,
-        sweep=points.sweep,
-        hidden=hidden,
-        moving=points.moving,
-        age_ns=points.age_ns,
-    )
-    shape = (camera.height_px, camera.width_px)
-    kernels.settle.over_rows(len(done), visible, _reaches(settings), shape, done, found)
-    pixel = np.flatnonzero(found[0])
-    winner = order[start[pixel]]
+    pixel, winner, found = _found(points, hidden, own, camera, settings, taken)
+    depth_m, num_sweeps, youngest_ns, num_points, residual_m, edge = found
     veiled = hidden[winner]
-    depth_m, num_sweeps, youngest_ns, num_points, residual_m, edge = found[:, pixel]
+    refused = veiled & (points.age_ns[winner] > kernels.NOW_NS)
+    if refused.any():
+        refused &= _behind(points, camera, settings, points.moving)[winner] > 1
+    refused |= edge < 0
     if taken is None:
         many = int(points.sweep.max(initial=0)) + 1
-        nearest_ns = np.float32(points.age_ns.min(initial=last))
         supported = num_sweeps >= min(settings.support, max(1, many // 2))
-        supported &= youngest_ns <= nearest_ns
+        supported &= youngest_ns <= np.float32(points.age_ns.min(initial=_NEVER_NS))
         inside = edge >= 1
     else:
         many, supported, inside = 2 * _FAR_SUPPORT, num_sweeps >= _FAR_SUPPORT, edge >= _FAR_EDGE
@@ -140,8 +122,45 @@ def _settled(
     confidence = np.maximum(own[winner] * (1 - _DOUBTS @ doubts), MOST_CONFIDENCE)
     confidence, tilt = confidence.astype(np.float32), points.slope[winner]
     inside &= ~veiled
-    every = MeasuredPixels(pixel, winner, depth_m, confidence, tilt, inside, veiled)
+    every = MeasuredPixels(
+        pixel, winner, depth_m, confidence, tilt, inside, veiled, refused & ~inside
+    )
     return every.select(supported), reason
+
+
+def _found(
+    points: PointsInImage,
+    hidden: Bool,
+    own: Float32,
+    camera: Camera,
+    settings: ProjectSettings,
+    taken: Int | None,
+) -> tuple[Int, Int, Float32]:
+    """The pixels (P,) with points but those ``taken``, which point comes first in each (P,), and
+    what `densify.kernels.visibility.settle` finds around it, (6,P)."""
+    last = int(points.age_ns.max(initial=0)) + 1
+    start, order = _by_pixel(points, np.where(hidden, last, points.age_ns), own, camera)
+    found = np.zeros((6, len(start) - 1), np.float32)
+    done = np.zeros(len(start) - 1, bool)
+    if taken is not None:
+        done[taken] = True
+    visible = kernels.Visible(
+        start=start,
+        order=order,
+        uv=points.uv,
+        inverse=points.inverse,
+        slope=points.slope,
+        spacing_px=points.spacing_px,
+        edge_px=settings.edge_slack_m * points.focal_px[:, 0] * points.inverse,
+        sweep=points.sweep,
+        hidden=hidden,
+        moving=points.moving,
+        age_ns=points.age_ns,
+    )
+    shape = (camera.height_px, camera.width_px)
+    kernels.settle.over_rows(len(done), visible, _reaches(settings), shape, done, found)
+    pixel = np.flatnonzero(found[0])
+    return pixel, order[start[pixel]], found[:, pixel]
 
 
 def _reaches(settings: ProjectSettings) -> kernels.Reaches:
@@ -157,15 +176,21 @@ def _reaches(settings: ProjectSettings) -> kernels.Reaches:
     )
 
 
-def _behind(points: PointsInImage, camera: Camera, settings: ProjectSettings) -> Float:
+def _behind(
+    points: PointsInImage,
+    camera: Camera,
+    settings: ProjectSettings,
+    who: Bool | slice = slice(None),
+) -> Float:
     """(K,) how far each point lies behind the nearest patch over its pixel, as a share of what is
-    allowed; above 1 it is hidden."""
+    allowed; above 1 it is hidden. who: (K,) whose patches hide."""
     slack_px = settings.slack_m * points.focal_px / points.depth[:, None]
     half_px = np.clip(settings.footprint * points.spacing_px + slack_px, 0.5, _MAX_HALF_PX)
     nearest = np.zeros((camera.height_px, camera.width_px), np.float32)
-    kernels.paint(points.uv, points.inverse, points.slope, half_px, nearest)
+    kernels.paint(points.uv[who], points.inverse[who], points.slope[who], half_px[who], nearest)
     column, row = np.rint(points.uv).astype(np.int64).T
-    occluder = 1 / nearest[row, column].astype(np.float64)
+    with np.errstate(divide="ignore"):
+        occluder = 1 / nearest[row, column].astype(np.float64)
     allowed = settings.hidden_m + settings.hidden_fraction * occluder
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.nan_to_num((points.depth - occluder) / allowed, posinf=np.inf)
@@ -193,5 +218,12 @@ def nearest_pixels(
     everywhere = np.ones(len(pixel), bool)
     tilt = points.slope[nearest]
     return MeasuredPixels(
-        pixel, nearest, points.depth[nearest], own[nearest], tilt, everywhere, ~everywhere
+        pixel,
+        nearest,
+        points.depth[nearest],
+        own[nearest],
+        tilt,
+        everywhere,
+        ~everywhere,
+        ~everywhere,
     )

@@ -249,17 +249,24 @@ class HeldOut:
         }
         return HeldOut(views, key_alone, moving)
 
+    def depth(self, seen: SeenCloud, visible: bool) -> dict[str, DepthMap]:
+        """Depth maps by name without the key sweep; none for a cloud of the key sweep alone."""
+        others = seen.cloud.frame != self.views.key
+        if not others.any():
+            return {}
+        rest = seen.select(others & seen.in_view())
+        rest = rest._replace(patches=replace(rest.patches, free=np.zeros(len(rest.cloud), bool)))
+        return self.views.depth(rest, visible)
+
     def scores(self, seen: SeenCloud, visible: bool) -> dict[str, Any] | None:
         """Scores by name, as `densify.scores.depth_metrics.depth_scores`, the ``curve`` of
         precision over density, and the confidence's ``reliability``; None for a cloud of the key
         sweep alone."""
-        others = seen.cloud.frame != self.views.key
-        if not others.any():
+        made = self.depth(seen, visible)
+        if not made:
             return None
-        rest = seen.select(others & seen.in_view())
-        rest = rest._replace(patches=replace(rest.patches, free=np.zeros(len(rest.cloud), bool)))
         scores: dict[str, Any] = {}
-        for name, maps in self.views.depth(rest, visible).items():
+        for name, maps in made.items():
             truth_m, camera = self.key_alone[name].depth_m, self.views.exposures[name].camera
             scores[name] = {
                 **depth_metrics.depth_scores(maps, truth_m, self.moving[name], camera),

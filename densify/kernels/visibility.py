@@ -12,10 +12,14 @@ from numpy.typing import NDArray
 from densify.arrays import Bool, Float, Int
 from densify.kernels import Kernel, inlined
 
+NOW_NS = 60_000_000
+"""Older is not the key sweep."""
+
 _RIDGE_PX2 = 0.02
 _LEAST_WINDOW_PX, _LEAST_FIT_PX, _MOST_PX = 3, 2.0, 24
 _MOVING_SLACK = 4.0  # motion is known less well than where things stand
 _MOVING_WITNESS_NS = 120_000_000  # from the key
+_CLEARLY = 0.25  # of the squared distance
 _GOES_ON = 1.2  # spacings within which a surface shows again
 _ANY_AGE_NS = 1 << 62
 _ALL_ROUND = 3.0  # edges' reaches: no edge near
@@ -197,6 +201,69 @@ class Reaches(NamedTuple):
     edge_window_px: float
 
 
+@inlined
+def _expected(points, i, u0, v0):  # type: ignore[no-untyped-def]
+    """Inverse depth of point i's tangent plane in a pixel."""
+    w0, uv = points.inverse[i], points.uv
+    centre = w0 + points.slope[i, 0] * (u0 - uv[i, 0]) + points.slope[i, 1] * (v0 - uv[i, 1])
+    return min(max(centre, 0.8 * w0), 1.25 * w0)
+
+
+@inlined
+def _look_round(points, reaches, shape, i, u0, v0, centre, agree, inner, m, reach):  # type: ignore[no-untyped-def]
+    """The points around a pixel beside point i's tangent plane, ``centre`` in the pixel.
+
+    Fills the moments m and how far the surface goes on, reach. Returns a bit for each sweep that
+    agrees, the age of the youngest, points in the fit, their weighted squares, whether something
+    lies behind close by, and the squared distances in ray spacings to what the key sweep, on a
+    mover, saw of its surface and behind it.
+    """
+    start, order, uv = points.start, points.order, points.uv
+    inverse, hidden, age_ns = points.inverse, points.hidden, points.age_ns
+    across, along = points.spacing_px[i, 0], points.spacing_px[i, 1]
+    su, sv, moving = points.slope[i, 0], points.slope[i, 1], points.moving[i]
+    w0 = inverse[i]
+    far = (reaches.behind_m + reaches.behind_fraction / w0) * w0 * w0
+    outer = inner + reaches.edge_window_px
+    # What moves is seen by its sweeps in the same rings.
+    on_v = max(outer, _GOES_ON * along) if moving else outer
+    # Other sweeps saw the background where the mover was not yet, or no more.
+    witness_ns = _MOVING_WITNESS_NS if moving else _ANY_AGE_NS
+    # Whether enough sweeps agree does not depend on how far edges are looked for.
+    support_u, support_v = _window(reaches.support * across), _window(reaches.support * along)
+    wide_u, wide_v = max(support_u, _window(outer)), max(support_v, _window(on_v))
+    fit_u, fit_v = _fit(reaches.plane * across), _fit(reaches.plane * along)
+    seen, num, youngest, behind, squares = np.int64(0), 0, age_ns[i], False, 0.0
+    now, now_behind = np.inf, np.inf
+    left, right = max(u0 - wide_u, 0), min(u0 + wide_u, shape[1] - 1)
+    for v in range(max(v0 - wide_v, 0), min(v0 + wide_v, shape[0] - 1) + 1):
+        for q in range(start[v * shape[1] + left], start[v * shape[1] + right + 1]):
+            j = order[q]
+            du, dv = uv[j, 0] - u0, uv[j, 1] - v0
+            off = inverse[j] - (centre + su * du + sv * dv)
+            away = np.inf
+            if moving and age_ns[j] <= NOW_NS:
+                away = (du / across) ** 2 + (dv / along) ** 2
+            if (hidden[j] and not hidden[i]) or abs(off) > agree:
+                close = abs(du) <= outer and abs(dv) <= outer
+                behind |= close and off < -far and age_ns[j] <= witness_ns
+                if off < -far:
+                    now_behind = min(now_behind, away)
+                continue
+            now = min(now, away)
+            if abs(du) <= support_u + 0.5 and abs(v - v0) <= support_v:
+                seen |= np.int64(1) << np.int64(points.sweep[j])
+                youngest = min(youngest, age_ns[j])
+            if abs(du) <= outer and abs(dv) <= on_v:
+                _extend(reach, du, dv)
+            if abs(du) < fit_u and abs(dv) < fit_v:
+                weight = (1 - abs(du) / fit_u) * (1 - abs(dv) / fit_v)
+                _add(m, weight, du, dv, off)
+                squares += weight * off * off
+                num += 1
+    return seen, youngest, num, squares, behind, now, now_behind
+
+
 @Kernel
 def settle(first, last, points, reaches, shape, taken, found):  # type: ignore[no-untyped-def]
     """Each pixel's depth from the points around that agree with its first point.
@@ -206,59 +273,27 @@ def settle(first, last, points, reaches, shape, taken, found):  # type: ignore[n
     agree, age of the youngest of them, points in the fit, their root mean square residual (m), and
     how far the surface goes on to all sides, as a share of the edges' reach. Hidden points agree
     with a hidden one only.
+
+    Limbs swing, so a mover's other sweeps tell less of its outline than the key sweep: where that
+    saw past the mover nearer by than it saw the mover, an edge is near (0), and at half the
+    distance, the pixel shows what is behind (-1).
     """
-    start, order, uv, spacing_px = points.start, points.order, points.uv, points.spacing_px
-    inverse, slope, hidden = points.inverse, points.slope, points.hidden
-    moving, age_ns = points.moving, points.age_ns
-    height, width = shape
     m, reach = np.zeros(9), np.zeros(8)
     for p in range(first, last):
-        if taken[p] or start[p] == start[p + 1]:
+        if taken[p] or points.start[p] == points.start[p + 1]:
             continue
-        i = order[start[p]]
-        v0, u0 = p // width, p % width
-        w0, su, sv = inverse[i], slope[i, 0], slope[i, 1]
-        centre = w0 + su * (u0 - uv[i, 0]) + sv * (v0 - uv[i, 1])
-        centre = min(max(centre, 0.8 * w0), 1.25 * w0)
+        i = points.order[points.start[p]]
+        v0, u0 = p // shape[1], p % shape[1]
+        w0, centre = points.inverse[i], _expected(points, i, u0, v0)
         agree = (reaches.agree_m + reaches.agree_fraction / w0) * w0 * w0
-        far = (reaches.behind_m + reaches.behind_fraction / w0) * w0 * w0
-        edge_px = points.edge_px[i] * (_MOVING_SLACK if moving[i] else 1.0)
-        inner = reaches.edge * spacing_px[i, 0] + edge_px
-        outer = inner + reaches.edge_window_px
-        wide_u = _window(reaches.support * spacing_px[i, 0])
-        wide_v = _window(reaches.support * spacing_px[i, 1])
-        fit_u = _fit(reaches.plane * spacing_px[i, 0])
-        fit_v = _fit(reaches.plane * spacing_px[i, 1])
-        on_v = outer
-        if moving[i]:  # its sweeps all see it in the same rings
-            on_v = max(outer, _GOES_ON * spacing_px[i, 1])
-        # Whether enough sweeps agree does not depend on how far edges are looked for.
-        support_u, support_v = wide_u, wide_v
-        wide_u, wide_v = max(wide_u, _window(outer)), max(wide_v, _window(on_v))
-        # Other sweeps saw the background where the mover was not yet, or no more.
-        witness_ns = _MOVING_WITNESS_NS if moving[i] else _ANY_AGE_NS
+        edge_px = points.edge_px[i] * (_MOVING_SLACK if points.moving[i] else 1.0)
+        inner = reaches.edge * points.spacing_px[i, 0] + edge_px
         m[:], reach[:] = 0.0, 0.0
-        seen, num, youngest, behind, squares = np.int64(0), 0, age_ns[i], False, 0.0
-        for v in range(max(v0 - wide_v, 0), min(v0 + wide_v, height - 1) + 1):
-            left, right = max(u0 - wide_u, 0), min(u0 + wide_u, width - 1)
-            for q in range(start[v * width + left], start[v * width + right + 1]):
-                j = order[q]
-                du, dv = uv[j, 0] - u0, uv[j, 1] - v0
-                off = inverse[j] - (centre + su * du + sv * dv)
-                close = abs(du) <= outer and abs(dv) <= outer
-                if (hidden[j] and not hidden[i]) or abs(off) > agree:
-                    behind |= close and off < -far and age_ns[j] <= witness_ns
-                    continue
-                if abs(du) <= support_u + 0.5 and abs(v - v0) <= support_v:
-                    seen |= np.int64(1) << np.int64(points.sweep[j])
-                    youngest = min(youngest, age_ns[j])
-                if abs(du) <= outer and abs(dv) <= on_v:
-                    _extend(reach, du, dv)
-                if abs(du) < fit_u and abs(dv) < fit_v:
-                    weight = (1 - abs(du) / fit_u) * (1 - abs(dv) / fit_v)
-                    _add(m, weight, du, dv, off)
-                    squares += weight * off * off
-                    num += 1
+        seen, youngest, num, squares, behind, now, now_behind = _look_round(
+            points, reaches, shape, i, u0, v0, centre, agree, inner, m, reach
+        )
         _write(found[:, p], centre, w0, agree, m, squares, num, seen, youngest)
         if behind and inner > 0:
             found[5, p] = _shortest(reach) / inner
+        if now_behind < now:
+            found[5, p] = -1.0 if now_behind < _CLEARLY * now else 0.0

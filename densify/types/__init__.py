@@ -14,6 +14,7 @@ from densify.types.depth import (
     DepthMap,
     Mover,
     Patches,
+    Ranked,
     Reason,
     Standing,
 )
@@ -57,6 +58,7 @@ __all__ = [
     "Prior",
     "PriorFit",
     "Progress",
+    "Ranked",
     "Reason",
     "RegisteredSweep",
     "Result",

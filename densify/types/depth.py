@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from enum import IntEnum
 from importlib import import_module
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -267,6 +267,17 @@ class Camera:
         return float(self.K[0, 0] / (1 + xi))
 
 
+class Ranked(NamedTuple):
+    """What the confidence of a map's pixels was made from (`densify.depth.confidence`); (H,W).
+
+    rank: float32 0 to 1, the greater the surer, 0 where ``filled_m`` has none. group: uint8, which
+    pixels are alike.
+    """
+
+    rank: Float32
+    group: NDArray[np.uint8]
+
+
 @dataclass(frozen=True)
 class CameraView:
     """From where a depth map looks.
@@ -291,7 +302,8 @@ class DepthMap:
     elsewhere. age_s: float32 seconds between the moment the map shows and the reference time of the
     sweep that measured the pixel, of every pixel in ``filled_m``, nan elsewhere; None until
     `densify.depth.age` has worked it out. reason: (M,) uint8, a `Reason` for each point of the
-    cloud; empty if the cloud is not at hand. warnings: what could not be done as asked.
+    cloud; empty if the cloud is not at hand. warnings: what could not be done as asked. ranked:
+    what a calibrated confidence was made from, None of another one.
     """
 
     camera: str
@@ -303,6 +315,7 @@ class DepthMap:
     age_s: Float32 | None = None
     measure: str = "z"
     warnings: tuple[str, ...] = ()
+    ranked: Ranked | None = None
 
     def to_points(self, view: CameraView, filled: bool = True) -> Float:
         """(K,3) the map's pixels as points in the key frame, metres, row by row.

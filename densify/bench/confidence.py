@@ -1,0 +1,215 @@
+# SPDX-License-Identifier: MIT
+"""The tables of `densify.depth.confidence`: measured on recordings with exact truth, and checked on
+others."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from densify.bench.depth import exact_truth
+from densify.config import Config
+from densify.depth import confidence as scale
+from densify.depth.exposure import key_shots, load_images
+from densify.depth.views import HeldOut, Views
+from densify.errors import InputError
+from densify.geometry.range_image import RangeImage
+from densify.readers.window import choose_cameras
+from densify.recording import Recording
+from densify.scores.depth_metrics import is_outlier_depth
+from densify.types import DepthMap, Float, Float32, LidarSequence, Progress
+
+FITTED = (
+    ("street?seed=51", (60,)),
+    ("street:crossing?seed=52", (80,)),
+    ("street:highway?seed=53", (70,)),
+    ("street?seed=54&sensor=hdl32", (60,)),
+    ("street:crossing?seed=55&sensor=vlp16", (80,)),
+    ("street?seed=56&sensor=os128", (60,)),
+    ("street:highway?seed=57&sensor=hdl32", (80,)),
+    ("street:static?seed=58", (60,)),
+    ("street?seed=71", (60,)),
+    ("street:crossing?seed=72", (70,)),
+    ("street:highway?seed=73", (60,)),
+    ("street?seed=74&sensor=hdl32", (80,)),
+    ("street:crossing?seed=75&sensor=hdl32", (60,)),
+    ("street?seed=77&sensor=vlp16", (60,)),
+)
+CHECKED = (
+    ("street?seed=41", (70,)),
+    ("street:crossing?seed=42", (90,)),
+    ("street:highway?seed=43", (60,)),
+    ("street?seed=44", (100,)),
+    ("street:crossing", (120,)),
+    ("street:crossing?seed=32", (120,)),
+    ("street?seed=61&sensor=hdl32", (80,)),
+    ("street:crossing?seed=62&sensor=vlp16", (80,)),
+    ("street?seed=63&sensor=vlp16", (60,)),
+    ("street:highway?seed=64&sensor=hdl32", (70,)),
+)
+"""Recordings and keys, unless others are asked for."""
+
+_STEPS = np.array([0.0, 0.2, 0.25, 0.3, 0.35, 0.4, 0.45, 0.5, 0.6, 0.7, 0.8, 0.9])
+_BORROWED = 3e-4  # of a map's pixels: what a group takes over from all that came the same way
+_LEAST = 1e-5  # share wrong where none was
+_NUM_WAYS = 3
+_DIGITS = 4
+
+Asked = Sequence[tuple[LidarSequence, Sequence[int]]]
+
+
+class Evidence(NamedTuple):
+    """One map, by group and step of the rank (G,R): the pixels ``shown``, those ``compared`` with
+    the truth, and those of them that are ``wrong``."""
+
+    data: str
+    key: int
+    camera: str
+    source: str
+    shown: Float
+    compared: Float
+    wrong: Float
+
+
+def bench_confidence(
+    fitted: Asked,
+    checked: Asked,
+    window: int,
+    config: Config,
+    cameras: Sequence[str] | None = None,
+    progress: Progress | None = None,
+) -> dict[str, Any]:
+    """Fit the tables to maps of ``fitted``, recordings with the keys to make, and see how far they
+    hold on those of ``checked``. The rest as `densify.pipeline.run`.
+
+    Returns plain numbers: ``maps`` that were fitted on, ``tables``: by group the rank and the share
+    that is wrong, and ``reliability`` by recording and truth, where ``fitted`` is all that was
+    fitted on together, and ``unseen`` all others against exact truth.
+
+    Raises InputError for what cannot be used, ComputationError where registration went wrong.
+    """
+    for sequence, _ in fitted:
+        if sequence.truth is None:
+            raise InputError(f"--fit {sequence.name}: no exact truth; expected a simulated one")
+    num, done = sum(len(keys) for _, keys in (*fitted, *checked)), 0
+    found: list[list[Evidence]] = []
+    for number, (sequence, keys) in enumerate((*fitted, *checked)):
+        found.append([])
+        for key in keys:
+            found[-1] += _evidence(sequence, key, window, config, cameras, number >= len(fitted))
+            done += 1
+            if progress is not None:
+                progress("bench", done, num)
+    fit_on = [e for part in found[: len(fitted)] for e in part]
+    knots = {name: _knots(log) for name, log in zip(scale.GROUPS, fit(fit_on), strict=True)}
+    tables = scale.tables_of({"tables": knots})
+    unseen = [e for part in found[len(fitted) :] for e in part]
+    exact = [e for e in unseen if e.source == "truth"]
+    rows = {"fitted": _reliability(fit_on, tables), "unseen": _reliability(exact, tables)}
+    for data, source in dict.fromkeys((e.data, e.source) for e in unseen):
+        part = [e for e in unseen if (e.data, e.source) == (data, source)]
+        rows[f"{data}, {source}"] = _reliability(part, tables)
+    return {
+        "maps": [{"data": e.data, "key": e.key, "camera": e.camera} for e in fit_on],
+        "tables": knots,
+        "reliability": rows,
+    }
+
+
+def _evidence(
+    sequence: LidarSequence,
+    key: int,
+    window: int,
+    config: Config,
+    cameras: Sequence[str] | None,
+    held_out: bool,
+) -> Iterator[Evidence]:
+    """The maps of a key against exact truth, where there is some, and if asked for those made
+    without the key sweep against its own returns."""
+    recording = Recording(sequence, config, window, [key])
+    shots = key_shots(sequence, choose_cameras(sequence, cameras), key, config.project)
+    stretch = recording.window(key)
+    images = load_images(sequence, shots)
+    views = Views.of(sequence, stretch, key, RangeImage.of(stretch[key]), shots, images, config)
+    cloud = recording.moment(key, all_sweeps=True, engine="").cloud
+    seen, standing = views.see(cloud), recording.standing(key)
+    if standing is not None:
+        seen = seen.joined(views.far(*standing, stretch, standing_only=True))
+    truth = exact_truth(sequence, stretch[key].sweep, key, cameras, config)
+    for name, maps in views.depth(seen).items():
+        if name in truth:
+            yield _counted(sequence, key, maps, "truth", truth[name].depth_m)
+    if held_out:
+        out = HeldOut.of(views, cloud)
+        for name, maps in out.depth(seen, visible=True).items():
+            yield _counted(sequence, key, maps, "key held out", out.key_alone[name].depth_m)
+
+
+def _counted(
+    sequence: LidarSequence, key: int, maps: DepthMap, source: str, truth_m: Float32
+) -> Evidence:
+    if maps.ranked is None:
+        raise InputError("project.visibility=false: its confidence is not calibrated")
+    focal_px = sequence.cameras[maps.camera].focal_px
+    shown = maps.filled_m > 0
+    compared = shown & (truth_m > 0)
+    bad = compared.copy()
+    bad[compared] = is_outlier_depth(maps.filled_m[compared], truth_m[compared], focal_px)
+    rank, group = maps.ranked
+    num = [scale.counts(rank[part], group[part]) for part in (shown, compared, bad)]
+    return Evidence(sequence.name, key, maps.camera, source, *num)
+
+
+def fit(evidence: Sequence[Evidence]) -> Float:
+    """(G,R) log10 of the share that is wrong by group and step of the rank.
+
+    Every map counts alike, so that none decides alone. Within a group the share falls with the rank
+    (`densify.depth.confidence.falling`). Where a group has hardly any pixels, it takes the share of
+    all groups that came to their depth the same way.
+    """
+    weights = [1 / max(e.compared.sum(), 1) for e in evidence]
+    num = sum(w * e.compared for w, e in zip(weights, evidence, strict=True))
+    wrong = sum(w * e.wrong for w, e in zip(weights, evidence, strict=True))
+    tables = []
+    for same_way in np.split(np.arange(len(scale.GROUPS)), _NUM_WAYS):
+        all_num = num[same_way].sum(axis=0)
+        alike = scale.falling(all_num, wrong[same_way].sum(axis=0) + _LEAST * all_num)
+        borrowed = _BORROWED * all_num / max(all_num.sum(), 1e-9)
+        for group in same_way:
+            tables.append(
+                scale.falling(num[group] + borrowed, wrong[group] + borrowed * 10.0**alike)
+            )
+    return np.array(tables)
+
+
+def _knots(log: Float) -> list[list[float]]:
+    """(R,) -> rank and share wherever the curve bends."""
+    bends = np.abs(np.diff(log, 2)) > 1e-9
+    kept = np.concatenate([[True], bends, [True]])
+    ranks = (np.flatnonzero(kept) + 0.5) / scale.NUM_RANKS
+    shares = [float(f"{10.0**value:.{_DIGITS}g}") for value in log[kept]]
+    return [[round(float(r), 4), s] for r, s in zip(ranks, shares, strict=True)]
+
+
+def _reliability(evidence: Sequence[Evidence], tables: Float) -> list[dict[str, Any]]:
+    """As `densify.depth.confidence.reliability`, in wider steps where hardly anything is wrong."""
+    sums = np.zeros((3, len(_STEPS)))
+    for e in evidence:
+        measured, filled = scale.curves(e.shown, tables)
+        filled_from = len(scale.GROUPS) * 2 // _NUM_WAYS
+        log = np.where((np.arange(len(scale.GROUPS)) < filled_from)[:, None], measured, filled)
+        step = np.searchsorted(_STEPS, np.clip(-log / scale.DECADES, 0, 1), side="right") - 1
+        for total, num in zip(sums, (e.compared, e.compared * 10.0**log, e.wrong), strict=True):
+            total += np.bincount(step.ravel(), num.ravel(), len(_STEPS))
+    return [
+        {
+            "confidence": float(least),
+            "num_compared": round(num),
+            "expected": expected / num,
+            "outliers": bad / num,
+        }
+        for least, num, expected, bad in zip(_STEPS, *sums.tolist(), strict=True)
+        if num > 0
+    ]

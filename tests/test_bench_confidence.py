@@ -1,0 +1,110 @@
+# SPDX-License-Identifier: MIT
+"""The tables behind confidence: fitted to evidence drawn from known ones, and by the verb."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from densify.bench import confidence as bench
+from densify.cli import main
+from densify.cli.options import recording_keys
+from densify.depth import confidence as scale
+
+NUM_GROUPS = len(scale.GROUPS)
+
+
+def drawn(seed: int, log, num=2_000_000, source="truth") -> bench.Evidence:
+    """A map of ``num`` pixels, evenly of all groups and ranks, wrong as ``log`` (G,R) says."""
+    rng = np.random.default_rng(seed)
+    shown = rng.poisson(num / log.size, log.shape).astype(float)
+    wrong = rng.binomial(shown.astype(int), 10.0**log).astype(float)
+    return bench.Evidence("drawn", seed, "front", source, shown, shown, wrong)
+
+
+def known() -> np.ndarray:
+    """(G,R) log10 P: each group another, falling with the rank."""
+    at_zero = np.linspace(-0.5, -1.5, NUM_GROUPS)[:, None]
+    return at_zero - 1.2 * np.linspace(0, 1, scale.NUM_RANKS)
+
+
+def test_known_tables_are_found_again():
+    found = bench.fit([drawn(seed, known()) for seed in range(6)])
+    assert (np.diff(found) <= 1e-9).all()
+    inside = slice(10, -10)
+    np.testing.assert_allclose(found[:, inside], known()[:, inside], atol=0.12)
+    assert abs((found - known())[:, inside].mean()) < 0.02
+
+
+def test_every_map_counts_alike():
+    """A map of ten times the pixels, none of them wrong, counts like a small one."""
+    small = drawn(1, known())
+    large = small._replace(compared=10 * small.compared, wrong=0 * small.wrong)
+    half = bench.fit([small, large])
+    np.testing.assert_allclose(
+        10.0 ** half[:, 20:-20].mean(), 10.0 ** known()[:, 20:-20].mean() / 2, rtol=0.2
+    )
+
+
+def test_knots_say_the_whole_table():
+    log = bench.fit([drawn(3, known())])
+    knots = {name: bench._knots(row) for name, row in zip(scale.GROUPS, log, strict=True)}
+    assert max(len(k) for k in knots.values()) < scale.NUM_RANKS
+    np.testing.assert_allclose(scale.tables_of({"tables": knots}), log, atol=1e-3)
+
+
+@pytest.mark.parametrize("better", [0.0, 0.5])
+def test_reliability_is_that_of_the_maps_pixels(better):
+    steps = bench._reliability([drawn(5, known() - better)], known())
+    total = sum(step["num_compared"] for step in steps)
+    assert total == pytest.approx(2_000_000, rel=0.01)
+    expected, found = (
+        sum(s[n] * s["num_compared"] for s in steps) for n in ("expected", "outliers")
+    )
+    assert found == pytest.approx(expected * 10**-better, rel=0.05)
+
+
+def test_recordings_and_keys_of_the_command_line():
+    assert recording_keys("street?seed=5@60,80") == ("street?seed=5", [60, 80])
+    assert recording_keys("a@b/drive@101:126:10") == ("a@b/drive", [101, 111, 121])
+    for text in ("street", "street@", "@5", "street@all", "street@9:3", "street@5,x"):
+        with pytest.raises(argparse.ArgumentTypeError, match=r"a recording and frames|A < B"):
+            recording_keys(text)
+
+
+def test_fits_and_checks_by_the_verb(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    out = tmp_path / "table.json"
+    street = "street:static?sensor=vlp16"
+    arguments = ["--fit", f"{street}@40", "--check", f"{street}&seed=2@40", "--window", "1"]
+    chosen = ["--camera", "image_02", "--out", str(out)]
+    assert main(["bench", "confidence", *arguments, *chosen]) == 0
+    written, shown = json.loads(out.read_text()), capsys.readouterr().out
+    assert [m["camera"] for m in written["maps"]] == ["image_02"]
+    own = scale.tables_of(written)
+    assert (np.diff(own) <= 1e-9).all()
+    sources = list(written["reliability"])
+    assert sources[:2] == ["fitted", "unseen"]
+    assert [s.rpartition(", ")[2] for s in sources[2:]] == ["truth", "key held out"]
+    for name, steps in written["reliability"].items():
+        assert f"{name}: holds for" in shown
+        assert sum(step["num_compared"] for step in steps) > 1000
+    steps = written["reliability"]["fitted"]
+    expected, found = (
+        sum(s[n] * s["num_compared"] for s in steps) for n in ("expected", "outliers")
+    )
+    assert expected == pytest.approx(found, rel=0.3, abs=20)
+
+
+def test_without_truth_there_is_nothing_to_fit(capsys: pytest.CaptureFixture[str]):
+    from densify.config import resolve
+    from densify.errors import InputError
+    from tests.small_street import KEY, one_car
+
+    sequence = one_car()
+    sequence.truth = None
+    with pytest.raises(InputError, match=r"--fit .*: no exact truth"):
+        bench.bench_confidence([(sequence, [KEY])], [], 1, resolve(None))
