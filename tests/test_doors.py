@@ -304,6 +304,7 @@ OTHER_PLACES = {
     "cache/codec.py": "behind a check sum, bounded there",
     "bench/memory.py": "/proc",
     "dataset/make.py": "its own log files",
+    "memory.py": "/proc, /sys",
     "dataset/plan.py": "what it has made itself",
     "dataset/processes.py": "/proc",
     "dataset/work.py": "what it has just written",

@@ -193,7 +193,7 @@ FLOORS = (
     ("registration", "depth", "flow", "scores", "street"),
     ("readers",),
     ("outputs", "writers"),
-    ("blocks", "completion", "doubts", "methods", "sweeps"),
+    ("blocks", "completion", "doubts", "memory", "methods", "sweeps"),
     ("road",),
     ("recording",),
     ("key_results",),

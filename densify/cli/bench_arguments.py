@@ -29,6 +29,7 @@ def add_bench(commands: Any) -> None:
     _add_bench_depth(benches)
     _add_bench_confidence(benches)
     _add_bench_doctor(benches)
+    _add_bench_memory(benches)
     _add_bench_readme(benches)
 
 
@@ -166,6 +167,35 @@ def _add_bench_readme(benches: Any) -> None:
     parser.add_argument(
         "--pandaset", metavar="DIR", type=Path, help="sequence 002 of PandaSet, for its rows"
     )
+
+
+def _add_bench_memory(benches: Any) -> None:
+    parser = add_verb(
+        benches,
+        "memory",
+        bench_verbs.bench_memory,
+        "peak memory of runs on the built-in street over window, cameras and rings, and what is "
+        "said before",
+        "Window 50 takes some 12 GB. Each run is a process of its own; the first camera is there "
+        "several times.",
+    )
+    _add_keys(parser)
+    for name, kind in (("window", "sweeps on each side"), ("cameras", "a number of cameras")):
+        parser.add_argument(
+            f"--{name}",
+            type=natural,
+            action="append",
+            metavar="N",
+            help=f"{kind}; may be given several times",
+        )
+    parser.add_argument(
+        "--rings",
+        type=natural,
+        choices=(16, 32, 64, 128),
+        action="append",
+        help="of the scanner; may be given several times",
+    )
+    _add_configuration_and_file(parser)
 
 
 def _add_keys(parser: argparse.ArgumentParser) -> None:

@@ -9,6 +9,7 @@ from densify.cli.screen import print_paths, progress_on_stderr
 from densify.config import as_mapping, resolve
 
 _DEFAULT_KEY = 120
+_MIDDLE_KEY = 80  # of the street's 160 frames
 
 
 def bench_confidence(options: argparse.Namespace) -> None:
@@ -86,6 +87,30 @@ def bench_doctor(options: argparse.Namespace) -> None:
         print(fault_table(spec, found[spec]) + "\n", flush=True)
     if options.out is not None:
         write_table(options.out, {"recordings": found})
+        print_paths([options.out])
+
+
+def bench_memory(options: argparse.Namespace) -> None:
+    """Peak memory of runs, and what is said of it before."""
+    config = resolve(options.config, options.overrides)
+    from densify.bench import peaks as bench
+    from densify.bench.table_file import write_table
+    from densify.cli.point_files import check_new_file
+    from densify.cli.tables import memory_table
+
+    if options.out is not None:
+        check_new_file(options.out, options.overwrite, ".json")
+    cases = bench.grid(
+        options.window or bench.WINDOWS,
+        options.cameras or bench.NUM_CAMERAS,
+        options.rings or bench.RINGS,
+    )
+    with progress_on_stderr() as progress:
+        key = (options.keys or [_MIDDLE_KEY])[0]
+        rows = bench.bench_memory(key, config, cases, progress)
+    print(memory_table(rows))
+    if options.out is not None:
+        write_table(options.out, {"key": key, "runs": rows, "config": as_mapping(config)})
         print_paths([options.out])
 
 

@@ -338,6 +338,21 @@ def _look_up(metrics: Mapping[str, Any], *path: str) -> Any:
     return value
 
 
+def memory_table(rows: Sequence[Mapping[str, Any]]) -> str:
+    """What `densify.bench.peaks.bench_memory` returns."""
+    head = ["rings", "points", "window", "cameras", "peak", "said before"]
+    body = [
+        [
+            str(row["rings"]),
+            f"{row['points']:,}",
+            *(str(row[name]) for name in ("window", "cameras")),
+            *(f"{row[name]:.2f} GB" for name in ("peak_gb", "said_gb")),
+        ]
+        for row in rows
+    ]
+    return _aligned([head, *body])
+
+
 def _aligned(rows: Sequence[Sequence[str]]) -> str:
     """First column to the left, the others to the right; an empty row is a blank line."""
     widths = [max(map(len, column)) for column in zip(*filter(None, rows), strict=True)]

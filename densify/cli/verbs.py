@@ -22,6 +22,7 @@ def run(options: argparse.Namespace) -> None:
     config = _config(options)
     from densify import pipeline
     from densify.cli.tables import summary
+    from densify.memory import check_fits
     from densify.outputs import check_writable, write_result
     from densify.readers import open_sequence
 
@@ -49,6 +50,7 @@ def run(options: argparse.Namespace) -> None:
             _cache(options),
             options.prior,
         )
+        check_fits(sequence, keys[0], options.window, options.cameras, config)
         for key, result in made:
             if isinstance(result, Exception):
                 failed[key] = result
@@ -81,12 +83,14 @@ def compare(options: argparse.Namespace) -> None:
     config = _config(options)
     from densify import pipeline
     from densify.cli.tables import comparison
+    from densify.memory import check_fits
     from densify.methods import COMPARED
     from densify.outputs import check_writable, write_comparison
     from densify.readers import open_sequence
 
     check_writable(options.out, options.key, options.overwrite, "compare")
     sequence = open_sequence(options.data)
+    check_fits(sequence, options.key, options.window, options.cameras, config)
     with progress_on_stderr() as progress:
         results = pipeline.compare(
             sequence,

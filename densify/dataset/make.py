@@ -38,6 +38,7 @@ from densify.dataset.work import Job, tasks
 from densify.dataset.workers import check_workers, open_workers
 from densify.errors import ComputationError, InputError, OutputError
 from densify.flow.engines import check_engine
+from densify.memory import check_free
 from densify.outputs.atomic import clear_leftovers
 from densify.outputs.kitti_tree import write_readme
 from densify.readers import open_sequence
@@ -272,8 +273,9 @@ def _part(drives: Sequence[PlannedDrive], shard: tuple[int, int] | None) -> list
 def _num_processes(
     num_workers: int, memory_bytes: int | None, recipe: Recipe, drives: Sequence[PlannedDrive]
 ) -> int:
-    """How many processes: as wanted, or fewer that fit into the memory. One more leads several."""
-    if memory_bytes is None or not drives:
+    """How many processes: as wanted, or fewer that fit into the memory. One more leads several.
+    Raises InputError if the memory does not suffice for a single one."""
+    if not drives:
         return num_workers
     num_points = _num_points(drives)
     num_shared = max(drive.cut.num_sweeps_of_block for drive in drives)
@@ -281,6 +283,9 @@ def _num_processes(
     key = (2 * recipe.window + 1) * _KEY_BYTES_PER_POINT * num_points
     far = _FAR_BYTES_PER_POINT * num_points if recipe.config.accumulate.far_m else 0
     need = _BASE_BYTES + shared + key + far
+    if memory_bytes is None:
+        check_free(need, f"--window {recipe.window}: a process")
+        return num_workers
     num_fitting = max(int(memory_bytes >= need), int((memory_bytes - _BASE_BYTES) / need))
     if num_fitting < 1:
         raise InputError(
