@@ -25,13 +25,13 @@ as they do at holes in time (`densify.readers.timeline`).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache, partial
 from typing import Any, NamedTuple, TypeVar, cast
 
 from densify.blocks import Cut
-from densify.cache import Cache
+from densify.cache import Cache, kept
 from densify.config import Config
 from densify.costs import Watch
 from densify.depth.accumulate import accumulate
@@ -44,11 +44,10 @@ from densify.geometry import poses
 from densify.geometry.ground import ground
 from densify.geometry.height_map import HeightMap
 from densify.geometry.range_image import RangeImage
+from densify.places import Places
 from densify.plugins.engines import engine as engine_row
 from densify.readers.timeline import Timeline, WindowFrames
-from densify.readers.window import recorded_trajectory
-from densify.registration.deskew import deskew
-from densify.registration.trajectory import LeftOut, Registration, find_trajectory
+from densify.registration.trajectory import LeftOut
 from densify.road import Road
 from densify.sweeps import Sweeps
 from densify.types import (
@@ -120,9 +119,10 @@ class Recording:
         self.sweeps = Sweeps(
             sequence, self.timeline, settings.register, num_raw, cache, run, self._watch
         )
-        self._deskewed = lru_cache(maxsize=cut.num_kept)(self._deskew)
-        self._pieces = lru_cache(maxsize=8)(self._find_pieces)
-        self.registration = lru_cache(maxsize=8)(self._registration)
+        self._places = Places(
+            sequence, settings.register, self.timeline, cut, self.sweeps, cache, self._watch
+        )
+        self.registration = self._places.registration
         self.images = lru_cache(maxsize=4)(self._images)
         self.ground = lru_cache(maxsize=4)(self._ground)
         self.evidence = lru_cache(maxsize=4)(self._evidence)
@@ -140,7 +140,7 @@ class Recording:
         found = self.timeline.window(key, self._num_around)
         number = self.cut.number_of[key]
         bad: dict[int, LeftOut] = {}
-        for b in self._blocks_with(number, found.frames):
+        for b in self._places.blocks_with(number, found.frames):
             own = self.cut.blocks[b].frames
             bad |= {f: why for f, why in self.registration(b).bad.items() if f in own}
         if key in bad and bad[key].unreadable:
@@ -148,7 +148,7 @@ class Recording:
         if key in bad:
             raise SweepError(bad[key].reason, key)
         reasons = {f: why.reason for f, why in bad.items()}
-        piece = self._piece(key)[1]
+        piece = self._places.piece(key)[1]
         window = self.timeline.window(key, self._num_around, reasons)
         window = WindowFrames(tuple(f for f in window.frames if f in piece.frames), window.cuts)
         failed = [f for f in found.frames if f in bad and not bad[f].unreadable]
@@ -160,12 +160,12 @@ class Recording:
         """The sweeps of a key's window, registered and deskewed. Errors as `window_frames`."""
         number = self.cut.number_of[key]
         frames = self.window_frames(key).frames
-        return Stretch(tuple(self._deskewed(number, self.cut.margin_s, f) for f in frames))
+        return self._places.stretch(number, self.cut.margin_s, frames)
 
     def motion(self, key: int, engine: str | None = None) -> Motion:
         """How everything in a key's window moves. engine: None for that of ``flow.engine``."""
         engine = engine or self.settings.flow.engine
-        number, (index, piece) = self.cut.number_of[key], self._piece(key)
+        number, (index, piece) = self.cut.number_of[key], self._places.piece(key)
         window = self.window(key)
         if not engine_row(engine)[0].shared:
             scene = Scene(window, self.ground(number)[index], self.settings.flow.min_height_m)
@@ -206,7 +206,7 @@ class Recording:
         if not self.settings.accumulate.far_m:
             return None
         number = self.cut.number_of[key]
-        pieces = self._pieces(number, 0.0)
+        pieces = self._places.pieces(number, 0.0)
         index, piece = next((i, p) for i, p in enumerate(pieces) if key in p.frames)
         found = self.far(number)[index]
         if not len(found.frames):
@@ -215,52 +215,18 @@ class Recording:
 
     # For a block, by its number
 
-    def _registration(self, number: int) -> Registration:
-        frames = self.cut.blocks[number].frames
-        num_before = self.settings.register.num_lead_in
-        if self.cut.margin_s:  # without a sweep before it a block could not be joined to the last
-            num_before = max(1, num_before)
-        bad, known, frames = {}, {}, (*self.timeline.before(frames[0], num_before), *frames)
-        self.sweeps.prepare(frames)
-        for frame in frames:
-            try:
-                known[frame] = (self.sweeps.content(frame), self.sweeps.recorded_pose(frame))
-            except InputError as error:
-                bad[frame] = LeftOut(str(error), unreadable=True)
-        return self._made(
-            "registration",
-            Registration,
-            lambda: [self.settings.register, self.timeline.period_ns, bad, known],
-            partial(self._register, list(known), bad),
-        )
-
-    def _register(self, frames: Sequence[int], unreadable: Mapping[int, LeftOut]) -> Registration:
-        """Register every run of neighbours by itself, parted again where a sweep is in the way."""
-        pieces, bad, left = [], dict(unreadable), self.timeline.runs(frames)
-        while left:
-            run = left.pop()
-            sweeps = [self.sweeps.read(f) for f in run]
-            recorded = None
-            if self.settings.register.source == "dataset":
-                recorded = recorded_trajectory(self.sequence, sweeps)
-            try:
-                with self._watch.stage("register"):
-                    pieces.append(find_trajectory(sweeps, self.settings.register, recorded))
-            except SweepError as error:
-                bad[error.frame] = LeftOut(str(error), unreadable=False)
-                left += self.timeline.runs([f for f in run if f != error.frame])
-        return Registration(tuple(sorted(pieces, key=lambda p: p.frames)), bad)
-
     def _images(self, number: int) -> dict[int, RangeImage]:
         """Range images of the block's sweeps, by frame."""
-        pieces = {f: p for p in self._pieces(number, 0.0) for f in self._within(p, number, 0.0)}
+        places = self._places
+        pieces = {f: p for p in places.pieces(number, 0.0) for f in places.within(p, number, 0.0)}
 
         def make() -> dict[int, RangeImage]:
-            sweeps = [self._deskewed(number, 0.0, f) for f in pieces]
+            sweeps = [places.deskewed(number, 0.0, f) for f in pieces]
             with self._watch.stage("flow"), ThreadPoolExecutor() as pool:
                 return dict(zip(pieces, pool.map(RangeImage.of, sweeps), strict=True))
 
-        return self._made(
+        return kept(
+            self._cache,
             "images",
             dict[int, RangeImage],
             lambda: [(f, self.sweeps.content(f), p) for f, p in pieces.items()],
@@ -271,15 +237,19 @@ class Recording:
         """Height of the ground within reach of the block, for each of its pieces."""
 
         def make(frames: Sequence[int]) -> HeightMap:
-            stretch = self._stretch(number, REACH_S, frames)
+            stretch = self._places.stretch(number, REACH_S, frames)
             with self._watch.stage("ground"):
                 return ground(stretch, self.settings.ground)
 
         return [
-            self._made(
-                "ground", HeightMap, partial(self._near, number, index), partial(make, frames)
+            kept(
+                self._cache,
+                "ground",
+                HeightMap,
+                partial(self._near, number, index),
+                partial(make, frames),
             )
-            for index, frames in enumerate(self._frames_within(number, REACH_S))
+            for index, frames in enumerate(self._places.frames_within(number, REACH_S))
         ]
 
     def _evidence(self, number: int) -> list[dict[int, Candidates]]:
@@ -287,7 +257,8 @@ class Recording:
         min_height_m = self.settings.flow.min_height_m
 
         def make(index: int, frames: Sequence[int]) -> dict[int, Candidates]:
-            stretch, heights = self._stretch(number, REACH_S, frames), self.ground(number)[index]
+            stretch = self._places.stretch(number, REACH_S, frames)
+            heights = self.ground(number)[index]
             space = self._space(number, stretch)
             own = [i for i, f in enumerate(frames) if f in self.cut.blocks[number].frames]
             with self._watch.stage("flow"):
@@ -295,13 +266,14 @@ class Recording:
             return {frames[i]: c for i, c in zip(own, found, strict=True)}
 
         return [
-            self._made(
+            kept(
+                self._cache,
                 "evidence",
                 dict[int, Candidates],
                 partial(self._evidence_inputs, number, index),
                 partial(make, index, f),
             )
-            for index, f in enumerate(self._frames_within(number, REACH_S))
+            for index, f in enumerate(self._places.frames_within(number, REACH_S))
         ]
 
     def _block_motion(self, number: int, engine: str) -> list[tuple[Sequence[int], SharedMotion]]:
@@ -310,7 +282,7 @@ class Recording:
         margin_s = self.cut.margin_s
 
         def make(index: int, frames: Sequence[int]) -> SharedMotion:
-            stretch = self._stretch(number, margin_s, frames)
+            stretch = self._places.stretch(number, margin_s, frames)
             scene = Scene(
                 stretch,
                 self.ground(number)[index],
@@ -325,17 +297,18 @@ class Recording:
         def inputs(piece: Trajectory, frames: Sequence[int]) -> Any:
             evidence = [
                 self._evidence_inputs(b, index)
-                for b in self._blocks_with(number, frames)
-                for index in range(len(self._pieces(b, REACH_S)))
+                for b in self._places.blocks_with(number, frames)
+                for index in range(len(self._places.pieces(b, REACH_S)))
             ]
             content = [self.sweeps.content(f) for f in frames]
             settings = [self.settings.flow, self.settings.objective]
             return [engine, engine_row(engine)[0], settings, piece, evidence, content]
 
         found: list[tuple[Sequence[int], SharedMotion]] = []
-        pieces = self._pieces(number, margin_s)
-        for index, frames in enumerate(self._frames_within(number, margin_s)):
-            motion = self._made(
+        pieces = self._places.pieces(number, margin_s)
+        for index, frames in enumerate(self._places.frames_within(number, margin_s)):
+            motion = kept(
+                self._cache,
                 "motion",
                 motion_type(engine),
                 partial(inputs, pieces[index], frames),
@@ -353,7 +326,7 @@ class Recording:
 
         def make(frames: Sequence[int]) -> Standing:
             keys = [k for k, n in self.cut.number_of.items() if n == number and k in frames]
-            near = self._stretch(number, 0.0, frames)
+            near = self._places.stretch(number, 0.0, frames)
             with self._watch.stage("far"):
                 return road.standing(near, keys, with_near=len(keys) > 1)
 
@@ -361,78 +334,18 @@ class Recording:
             content = [self.sweeps.content_if_readable(f) for f in road.frames(piece, frames)]
             return [settings, far_m, cameras, piece, list(frames), content]
 
-        pieces = self._pieces(number, 0.0)
+        pieces = self._places.pieces(number, 0.0)
         return [
-            self._made("far", Standing, partial(inputs, pieces[i], f), partial(make, f))
-            for i, f in enumerate(self._frames_within(number, 0.0))
+            kept(self._cache, "far", Standing, partial(inputs, pieces[i], f), partial(make, f))
+            for i, f in enumerate(self._places.frames_within(number, 0.0))
         ]
 
     # What they are made of
 
-    def _find_pieces(self, number: int, around_s: float) -> list[Trajectory]:
-        """Poses of neighbouring sweeps of a block and so far around it, and of one more at each
-        end, which tells how the lidar moved; only those with a sweep of the block. The world is
-        the lidar of the piece's first sweep in the block."""
-        frames = self._around(number, around_s)
-        before, after = self.timeline.before(frames[0], 1), self.timeline.after(frames[-1], 1)
-        wanted = {*before, *frames, *after}
-        pieces: list[Trajectory] = []
-        for b in self._blocks_with(number, wanted):
-            members = {*self.cut.blocks[b].frames}
-            if not self.cut.margin_s:  # no other block has the sweep before
-                members |= {*before}
-            for found in self.registration(b).pieces:
-                own = [f for f in found.frames if f in wanted & members]
-                if not own:
-                    continue
-                first = found.frames.index(own[0])
-                if pieces and first and pieces[-1].frames[-1] == found.frames[first - 1]:
-                    pieces[-1] = pieces[-1].joined(found, own)
-                else:
-                    pieces.append(found.part(own))
-        in_block = [[f for f in p.frames if f in self.cut.blocks[number].frames] for p in pieces]
-        return [p.seen_from(f[0]) for f, p in zip(in_block, pieces, strict=True) if f]
-
-    def _piece(self, key: int) -> tuple[int, Trajectory]:
-        """Which of the pieces of its block has the key, and that piece with its margin."""
-        pieces = self._pieces(self.cut.number_of[key], self.cut.margin_s)
-        return next((i, p) for i, p in enumerate(pieces) if key in p.frames)
-
-    def _around(self, number: int, around_s: float) -> list[int]:
-        """Frames of a block and so far around it, but no farther than its margin."""
-        block, around_ns = self.cut.blocks[number], round(min(around_s, self.cut.margin_s) * 1e9)
-        if not around_ns:
-            return list(block.frames)
-        return self.timeline.within(block.begin_ns - around_ns, block.end_ns + around_ns)
-
-    def _within(self, piece: Trajectory, number: int, around_s: float) -> list[int]:
-        around = frozenset(self._around(number, around_s))
-        return [f for f in piece.frames if f in around]
-
-    def _frames_within(self, number: int, around_s: float) -> list[list[int]]:
-        """Frames of each piece, without the one more at each end."""
-        return [self._within(p, number, around_s) for p in self._pieces(number, around_s)]
-
-    def _blocks_with(self, number: int, frames: Collection[int]) -> list[int]:
-        """The blocks that work out these frames for this one."""
-        if not self.cut.margin_s:
-            return [number]
-        return sorted({self.cut.number_of[f] for f in frames})
-
-    def _stretch(self, number: int, around_s: float, frames: Sequence[int]) -> Stretch:
-        around_s = min(around_s, self.cut.margin_s)
-        return Stretch(tuple(self._deskewed(number, around_s, f) for f in frames))
-
-    def _deskew(self, number: int, around_s: float, frame: int) -> RegisteredSweep:
-        piece = next(p for p in self._pieces(number, around_s) if frame in p.frames)
-        sweep = self.sweeps.read(frame)
-        with self._watch.stage("deskew"):
-            return deskew([sweep], piece).sweeps[0]
-
     def _space(self, number: int, stretch: Stretch) -> FreeSpace:
         images = {
             f: image
-            for b in self._blocks_with(number, stretch.frames)
+            for b in self._places.blocks_with(number, stretch.frames)
             for f, image in self.images(b).items()
         }
         return FreeSpace.of(stretch, [images[f] for f in stretch.frames])
@@ -440,7 +353,7 @@ class Recording:
     def _candidates(self, number: int, frames: Sequence[int]) -> tuple[Candidates, ...]:
         evidence = {
             f: found
-            for b in self._blocks_with(number, frames)
+            for b in self._places.blocks_with(number, frames)
             for piece in self.evidence(b)
             for f, found in piece.items()
         }
@@ -448,16 +361,10 @@ class Recording:
 
     # Kept on disk
 
-    def _made(
-        self, stage: str, kind: type[T], inputs: Callable[[], Any], make: Callable[[], T]
-    ) -> T:
-        """What ``make`` returns, now or when it was made of the same inputs before."""
-        return make() if self._cache is None else self._cache.get(stage, kind, inputs(), make)
-
     def _near(self, number: int, index: int) -> Any:
         """What the ground of a piece depends on."""
-        piece = self._pieces(number, REACH_S)[index]
-        content = [self.sweeps.content(f) for f in self._within(piece, number, REACH_S)]
+        piece = self._places.pieces(number, REACH_S)[index]
+        content = [self.sweeps.content(f) for f in self._places.within(piece, number, REACH_S)]
         return [self.settings.ground, number, piece, content]
 
     def _evidence_inputs(self, number: int, index: int) -> Any:

@@ -194,7 +194,7 @@ FLOORS = (
     ("readers",),
     ("outputs", "writers"),
     ("blocks", "completion", "doubts", "memory", "methods", "sweeps"),
-    ("road",),
+    ("places", "road"),
     ("recording",),
     ("key_results",),
     ("pipeline",),

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from densify import blocks, pipeline
+from densify import blocks, pipeline, places
 from densify import recording as shared
 from densify.cache import Cache
 from densify.config import Config, resolve
@@ -304,7 +304,8 @@ def counted(monkeypatch: pytest.MonkeyPatch) -> Counter[str]:
         return count
 
     for name in ("find_trajectory", "ground", "find_candidates", "estimate_motion"):
-        monkeypatch.setattr(shared, name, counting(name, getattr(shared, name)))
+        room = places if hasattr(places, name) else shared
+        monkeypatch.setattr(room, name, counting(name, getattr(room, name)))
     monkeypatch.setattr(RangeImage, "of", staticmethod(counting("images", RangeImage.of)))
     return counts
 

@@ -99,6 +99,13 @@ class Cache:
         return data
 
 
+def kept(
+    cache: Cache | None, stage: str, kind: type[T], inputs: Callable[[], Any], make: Callable[[], T]
+) -> T:
+    """What ``make`` returns, now or when it was made of the same inputs before."""
+    return make() if cache is None else cache.get(stage, kind, inputs(), make)
+
+
 def _write(path: Path, data: bytes) -> None:
     """Complete or not at all."""
     number, aside = tempfile.mkstemp(_ASIDE, dir=path.parent)
