@@ -20,6 +20,7 @@ from densify.flow.objective.neighbors import require_points
 from densify.flow.objective.solvers import SolverSettings, solve
 from densify.flow.pairs.hypotheses import PairCloud
 from densify.flow.pairs.movers import find_movers
+from densify.flow.pairs.scanners import scanners_told
 from densify.geometry.height_map import HeightMap
 from densify.kernels.linking import link
 from densify.types import Float, FlowField, Int
@@ -56,7 +57,9 @@ def estimate_flow(
     ``to_reference`` that from a point's own time to the source's middle. Without them an object the
     scanner meets earlier or later in the second sweep comes out too slow or too fast.
     source_lidar, target_lidar: (N,), (M,) whole numbers, which scanner measured each point, both or
-    neither: each scanner's points are compared with its own, for each sees a mover at another time.
+    neither: each scanner's points are compared with its own, for each sees a mover at another time;
+    with the times, with the others' too, each at its own. Times alone tell two scanners that spin
+    half a turn apart.
 
     With ``objective.static_prior`` only groups of points move whose motion explains in both clouds
     what standing still leaves unexplained; the flow of all others is exactly 0, as it is farther
@@ -74,6 +77,8 @@ def estimate_flow(
     clouds = _as_cloud(source, "source"), _as_cloud(target, "target")
     times = _times(_columns(source_offset_ns, target_offset_ns, clouds, "offset_ns"))
     lidars = _columns(source_lidar, target_lidar, clouds, "lidar")
+    if lidars is None and times is not None:
+        lidars = scanners_told(clouds, times.lag)
     if not settings.objective.static_prior or settings.flow.engine == "paper":
         return flow_between(*clouds, settings.objective, initial)
     start = None if initial is None else _as_cloud(initial, "initial")
@@ -132,7 +137,7 @@ def _flow_of_groups(
     )
     start = None if initial is None else initial[above[0]]
     apart_s = times.apart_s if times else None
-    motions, field.instance[above[0]] = find_movers(source, target, start, apart_s)
+    motions, field.instance[above[0]] = find_movers(source, target, ground, start, apart_s)
     low = (heights_m[0] < settings.flow.min_height_m) & (heights_m[0] > _MIN_LOW_M)
     _attach_below(points[0], field, inside[0][low])
     to_reference = np.zeros_like(clouds[0])

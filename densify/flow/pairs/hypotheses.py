@@ -22,6 +22,7 @@ from densify.flow.surface_matching import (
     SURFACE_M,
     apply,
 )
+from densify.geometry.height_map import HeightMap
 from densify.types import Float, Int
 
 _EVEN_M = 0.06
@@ -33,8 +34,10 @@ _VOTE_POINTS, _VOTE_TARGETS = 60, 800
 _NUM_VOTED = 4
 _APART_M = 0.7
 _ALIGN_POINTS = 150
-_PRECISION = 1 / np.array([1.0, 1.0, 0.08, 0.06]) ** 2  # of m, m from the start; m, rad from zero
-_FROM_START = np.array([1.0, 1.0, 0.0, 0.0])
+_PRECISION = 1 / np.array([1.0, 1.0, 0.01, 0.06]) ** 2  # of m from the start; of rad from zero
+_FROM_START = np.array([1.0, 1.0, 1.0, 0.0])
+_SLOPE_STEP_M, _SLOPE_STEPS = 2.0, 4  # of a grid around a place
+_ROUGH_M = 0.1  # off a plane: no ground to tell a slope
 
 
 @dataclass(frozen=True)
@@ -58,9 +61,7 @@ class PairCloud:
     def even_tree(self) -> cKDTree:
         """Without the density along the scan lines, which says nothing of that across."""
         places = self.places(self.points, np.arange(len(self.points)))
-        voxel = np.floor(places / _EVEN_M).astype(np.int64)
-        key = voxel @ np.array([1, 1 << 20, 1 << 40, 7][: voxel.shape[1]])
-        return tree_of(places[np.unique(key, return_index=True)[1]])
+        return tree_of(places[one_per_voxel(places, _EVEN_M)])
 
     def places(self, points: Float, rows: Int) -> Float:
         """Coordinates in which points of different scanners are far from each other: each of them
@@ -132,8 +133,10 @@ class Hypotheses:
         candidates: Int,
         initial: Float | None,
         apart_s: float | None,
+        ground: HeightMap,
     ) -> Hypotheses:
-        """Every group at the places it votes for, where it stands, and where ``initial`` puts it.
+        """Every group at the places it votes for, where it stands, and where ``initial`` puts it,
+        as high above the ground as it is.
 
         apart_s: the time between the clouds, None where unknown.
         """
@@ -145,10 +148,12 @@ class Hypotheses:
             starts = _vote(source.points[thinned(members, _VOTE_POINTS)], there, num_steps)
             if initial is not None:
                 starts = np.vstack([starts, np.median(initial[members], axis=0)])
+            middle = source.points[sample].mean(0)
+            starts[:, 2] = starts[:, :2] @ slope_of(ground, middle)
             for start in starts:
                 group.append(k)
                 state.append(np.append(start, 0.0))
-                centre.append(source.points[sample].mean(0))
+                centre.append(middle)
                 row.append(sample)
         of_point = np.repeat(np.arange(len(row)), [len(r) for r in row])
         return Hypotheses(
@@ -249,6 +254,24 @@ def _vote(points: Float, there: Float, n: int) -> Float:
         starts.append(best[None])
         score[np.linalg.norm(place - best, axis=1) < _APART_M] = -1
     return np.concatenate(starts)
+
+
+def slope_of(ground: HeightMap, place: Float) -> Float:
+    """(2,) rise per metre along x and y of the ground within some metres of a place, 0 where the
+    map is not like a plane: clouds may come without their ground."""
+    steps = np.arange(-_SLOPE_STEPS, _SLOPE_STEPS + 1) * _SLOPE_STEP_M
+    arm = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
+    height_m = ground.under(place[:2] + arm)
+    height_m -= height_m.mean()
+    slope: Float = arm.T @ height_m / (arm**2).sum(axis=0)
+    return slope if (height_m - arm @ slope).std() <= _ROUGH_M else np.zeros(2)
+
+
+def one_per_voxel(places: Float, side_m: float) -> Int:
+    """Rows of the first of the (N,3) or (N,4) `PairCloud.places` in each cube."""
+    voxel = np.floor(places / side_m).astype(np.int64)
+    key = voxel @ np.array([1, 1 << 20, 1 << 40, 7][: voxel.shape[1]])
+    return np.sort(np.unique(key, return_index=True)[1])
 
 
 def thinned(rows: Int, num: int) -> Int:

@@ -14,8 +14,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
-from scipy.spatial import cKDTree
 
+from densify.flow.pairs.evidence import EXPLAINED_M, MIN_UNEXPLAINED, Unexplained, distances_m
 from densify.flow.pairs.hypotheses import (
     Hypotheses,
     PairCloud,
@@ -24,20 +24,10 @@ from densify.flow.pairs.hypotheses import (
     thinned,
     tree_of,
 )
-from densify.kernels.linking import link
+from densify.flow.pairs.refine import refined
+from densify.geometry.height_map import HeightMap
 from densify.types import Bool, Float, Int
 
-_REACH_M = 0.6  # a distance beyond it counts as this
-_EXPLAINED_M = 0.1  # a nearer point is a counterpart,
-_MAX_EXPLAINED_M = 0.5
-_NUM_SPACING = 8  # or one within the radius of so many neighbours
-_LINK_M = 0.6
-_NEAR_M = 0.4
-_MIN_SHARE = 0.2  # unexplained, of a group taken as a whole
-_MAX_EXTENT_M = 20.0
-_MIN_SEED_SHARE = 0.3
-_MIN_POINTS = 8
-_MIN_UNEXPLAINED = 5, 3  # in the source, in the target
 _MIN_TOGETHER, _MIN_TOGETHER_PER_M = 10, 3.5  # the farther, the more places fit by chance
 _MIN_MOTION_M = 0.1
 _MAX_RISE_M, _MAX_RISE = 0.12, 0.15  # and per metre
@@ -54,87 +44,34 @@ _ATTACH_UNEXPLAINED_M = 1.0
 def find_movers(
     source: PairCloud,
     target: PairCloud,
+    ground: HeightMap,
     initial: Float | None = None,
     apart_s: float | None = None,
 ) -> tuple[list[RigidMotion], Int]:
     """The motions, and (N,) which of them each source point takes, -1 none.
 
-    initial: (N,3) flow; a group is also tried at the median of its members'. apart_s: the time
-    between the clouds, None where unknown: what moves at up to 38 m/s is looked for.
+    ground: under both clouds. initial: (N,3) flow; a group is also tried at the median of its
+    members'. apart_s: the time between the clouds, None where unknown: what moves at up to 38 m/s
+    is looked for.
     """
     with ThreadPoolExecutor(2) as pool:
-        ours, theirs = pool.map(_Unexplained.of, (source, target), (target, source))
-    groups = ours.groups()
-    if not groups or not len(theirs.candidates):
+        ours, theirs = pool.map(Unexplained.of, (source, target), (target, source))
+    groups = ours.groups(ground)
+    there = theirs.candidates
+    if not groups or not len(there):
         return [], np.full(len(source.points), -1)
-    hypotheses = Hypotheses.of(groups, source, target, theirs.candidates, initial, apart_s)
-    hypotheses.align(Surface(target, theirs.candidates))
+    hypotheses = Hypotheses.of(groups, source, target, there, initial, apart_s, ground)
+    hypotheses.align(Surface(target, there))
     motions, instance = _choose(hypotheses, groups, ours, theirs)
+
+    def refine(k: int) -> RigidMotion:
+        members, timed = np.flatnonzero(instance == k), apart_s is not None
+        return refined(motions[k], members, source, target, there, ground, timed)
+
+    with ThreadPoolExecutor(2) as pool:
+        motions = list(pool.map(refine, range(len(motions))))
     _attach(motions, instance, ours, theirs)
     return motions, instance
-
-
-class _Unexplained:
-    """Which points of a cloud the other one does not explain, and the groups they form.
-
-    distance_m: (N,) to the other cloud, at most the reach. unexplained: (N,). candidates: (C,)
-    rows that belong to a group. group: (N,) its label, -1 none.
-    """
-
-    def __init__(self, cloud: PairCloud, distance_m: Float) -> None:
-        self.cloud, self.distance_m = cloud, distance_m
-        self.unexplained = np.zeros(len(distance_m), bool)
-        far = np.flatnonzero(distance_m > _EXPLAINED_M)
-        self.unexplained[far] = distance_m[far] > self.tolerance_m(far)
-        self.group = self._grouped()
-        self.candidates = np.flatnonzero(self.group >= 0)
-
-    @staticmethod
-    def of(cloud: PairCloud, other: PairCloud) -> _Unexplained:
-        rows = np.arange(len(cloud.points))
-        return _Unexplained(cloud, _distance_m(cloud.places(cloud.points, rows), other.tree))
-
-    def tolerance_m(self, rows: Int) -> Float:
-        """How far from a point a counterpart may be: what is sparse in one cloud is in both."""
-        k = min(_NUM_SPACING + 1, self.cloud.even_tree.n)
-        place = self.cloud.places(self.cloud.points[rows], rows)
-        spacing_m = np.asarray(self.cloud.even_tree.query(place, [k])[0])[:, 0]
-        return np.clip(spacing_m, _EXPLAINED_M, _MAX_EXPLAINED_M)
-
-    def groups(self) -> list[Int]:
-        """Members of those that are worth a try, by label."""
-        order = self.candidates[np.argsort(self.group[self.candidates], kind="stable")]
-        parts = np.split(order, np.flatnonzero(np.diff(self.group[order])) + 1)
-        return [
-            part
-            for part in parts
-            if len(part) >= _MIN_POINTS and self.unexplained[part].sum() >= _MIN_UNEXPLAINED[0]
-        ]
-
-    def _grouped(self) -> Int:
-        """What is connected is one group if it is no longer than a vehicle and much of it is
-        unexplained; elsewhere only what is close to unexplained points that are not alone."""
-        points = self.cloud.points
-        num, label = link(points, _LINK_M)
-        size = np.bincount(label, minlength=num)
-        share = np.bincount(label, self.unexplained, num) / np.maximum(size, 1)
-        whole = (share >= _MIN_SHARE) & (_extents_m(points, label, num) <= _MAX_EXTENT_M)
-        group = np.where(whole[label], label, -1)
-        rest = np.flatnonzero(~whole[label])
-        seeds = rest[self.unexplained[rest]]
-        if not len(seeds):
-            return group
-        tree = tree_of(points[rest])
-        num_near = tree.query_ball_point(points[seeds], _NEAR_M, return_length=True)
-        num_seeds = tree_of(points[seeds]).query_ball_point(
-            points[seeds], _NEAR_M, return_length=True
-        )
-        seeds = seeds[num_seeds >= _MIN_SEED_SHARE * num_near]
-        if len(seeds):
-            far, _ = tree_of(points[seeds]).query(points[rest], distance_upper_bound=_NEAR_M)
-            near = rest[np.isfinite(far)]
-            group[near] = num + link(points[near], _LINK_M)[1]
-        return group
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,8 +79,9 @@ class _Trial:
     """What a hypothesis explains of the group, and of the target around where the group arrives.
 
     still: unexplained source points without the motion, left: with it. misfit: mean distance to the
-    target with it, as a share of the tolerance. still_there: unexplained
-    targets without it. around: targets that are near. explained: those of them that it explains.
+    target with it, as a share of the tolerance. still_there: unexplained targets without it.
+    firmly, firmly_there: those that no scanner explains. around: targets that are near. explained:
+    those of them that it explains.
     own_gain_m: by how much all distances from the group to the target become shorter, gain_m: and
     those from the target around.
     """
@@ -151,9 +89,11 @@ class _Trial:
     group: int
     motion: RigidMotion
     still: int
+    firmly: int
     left: int
     misfit: float
     still_there: int
+    firmly_there: int
     around: Int
     explained: Int
     own_gain_m: float
@@ -168,9 +108,9 @@ class _Trial:
         still, left = self.still + self.still_there, self.left + left_there
         far_m = float(np.linalg.norm(self.motion.state[:2]))
         return (
-            self.still >= _MIN_UNEXPLAINED[0]
-            and self.still_there >= _MIN_UNEXPLAINED[1]
-            and still >= _MIN_TOGETHER + _MIN_TOGETHER_PER_M * far_m
+            self.firmly >= MIN_UNEXPLAINED[0]
+            and self.firmly_there >= MIN_UNEXPLAINED[1]
+            and self.firmly + self.firmly_there >= _MIN_TOGETHER + _MIN_TOGETHER_PER_M * far_m
             and self.left <= _MAX_LEFT_EACH * self.still
             and left_there <= _MAX_LEFT_EACH * self.still_there
             and left <= _MAX_LEFT * still
@@ -179,7 +119,7 @@ class _Trial:
 
 
 def _choose(
-    hypotheses: Hypotheses, groups: list[Int], ours: _Unexplained, theirs: _Unexplained
+    hypotheses: Hypotheses, groups: list[Int], ours: Unexplained, theirs: Unexplained
 ) -> tuple[list[RigidMotion], Int]:
     """At most one motion per group; a target is explained once."""
     free = np.ones(len(theirs.unexplained), bool)
@@ -221,16 +161,16 @@ def _assigned(trials: list[_Trial], target_group: Int) -> list[_Trial]:
 
 
 def _trials(
-    hypotheses: Hypotheses, groups: list[Int], ours: _Unexplained, theirs: _Unexplained
+    hypotheses: Hypotheses, groups: list[Int], ours: Unexplained, theirs: Unexplained
 ) -> list[_Trial]:
     """Judge the hypotheses that pass a first look, in the source alone."""
     num = len(hypotheses.state)
     row, of_point = hypotheses.row, hypotheses.of_point
     place = ours.cloud.places(hypotheses.seen(hypotheses.share[of_point]), row)
-    far = _distance_m(place, theirs.cloud.tree, workers=-1)
+    far = distances_m(place, theirs.cloud.tree, workers=-1)
     sampled, back = np.unique(row, return_inverse=True)
     tolerance_m = ours.tolerance_m(sampled)[back.ravel()]
-    still = np.bincount(of_point, ours.unexplained[row], num)
+    still, firmly = (np.bincount(of_point, of[row], num) for of in (ours.unexplained, ours.firmly))
     left = np.bincount(of_point, far > tolerance_m, num)
     length_m = np.linalg.norm(hypotheses.state[:, :2], axis=1)
     level = np.abs(hypotheses.state[:, 2]) <= _MAX_RISE_M + _MAX_RISE * length_m
@@ -245,15 +185,17 @@ def _trials(
         motion = RigidMotion(hypotheses.state[h], hypotheses.centre[h], float(hypotheses.share[h]))
         if _ambiguous(ours.cloud.points[row[of_point == h]], motion.state[:3]):
             continue
-        still_there, around, explained, back_m = _looked_back(motion, groups[k], ours, theirs)
+        around, explained, back_m = _looked_back(motion, groups[k], ours, theirs)
         trials.append(
             _Trial(
                 group=k,
                 motion=motion,
                 still=int(still[h]),
+                firmly=int(firmly[h]),
                 left=int(left[h]),
                 misfit=float(misfit[h]),
-                still_there=still_there,
+                still_there=int(theirs.unexplained[around].sum()),
+                firmly_there=int(theirs.firmly[around].sum()),
                 around=around,
                 explained=explained,
                 own_gain_m=float(gain_m[h]),
@@ -273,33 +215,27 @@ def _ambiguous(points: Float, way: Float) -> bool:
 
 
 def _looked_back(
-    motion: RigidMotion, members: Int, ours: _Unexplained, theirs: _Unexplained
-) -> tuple[int, Int, Int, float]:
-    """From the target to the group where it arrives: `_Trial`'s still_there, around, explained, and
-    by how much the distances become shorter (m)."""
+    motion: RigidMotion, members: Int, ours: Unexplained, theirs: Unexplained
+) -> tuple[Int, Int, float]:
+    """From the target to the group where it arrives: `_Trial`'s around, explained, and by how much
+    the distances become shorter (m)."""
     sample = thinned(members, _JUDGE_POINTS)
     arrived = motion.seen(ours.cloud.points[sample])
     low, high = arrived.min(0) - _AROUND_M, arrived.max(0) + _AROUND_M
     at = theirs.cloud.points
     box = thinned(np.flatnonzero(((at > low) & (at < high)).all(1)), 2 * _JUDGE_POINTS)
     tree = tree_of(ours.cloud.places(arrived, sample))
-    far = _distance_m(theirs.cloud.places(at[box], box), tree)
+    far = distances_m(theirs.cloud.places(at[box], box), tree)
     around, far = box[far < _AROUND_M], far[far < _AROUND_M]
-    explained = far <= _EXPLAINED_M
+    explained = far <= EXPLAINED_M
     unsure = np.flatnonzero(~explained)
     thinning = np.sqrt(len(members) / len(sample))
     explained[unsure] = far[unsure] <= theirs.tolerance_m(around[unsure]) * thinning
-    still_there = int(theirs.unexplained[around].sum())
-    return (
-        still_there,
-        around,
-        around[explained],
-        float((theirs.distance_m[around] - far).sum()),
-    )
+    return around, around[explained], float((theirs.distance_m[around] - far).sum())
 
 
 def _attach(
-    motions: list[RigidMotion], instance: Int, ours: _Unexplained, theirs: _Unexplained
+    motions: list[RigidMotion], instance: Int, ours: Unexplained, theirs: Unexplained
 ) -> None:
     """Give points close to a mover its motion if that explains them: those that standing still
     leaves unexplained from farther away."""
@@ -321,19 +257,6 @@ def _attach(
     arrived = points[others]
     for k in np.unique(mine):
         arrived[mine == k] = motions[k].seen(points[others[mine == k]])
-    moved_m = _distance_m(ours.cloud.places(arrived, others), theirs.cloud.tree)
+    moved_m = distances_m(ours.cloud.places(arrived, others), theirs.cloud.tree)
     fits = moved_m <= ours.tolerance_m(others)
     instance[others[fits]] = mine[fits]
-
-
-def _extents_m(points: Float, label: Int, num: int) -> Float:
-    """(num,) diagonals of the groups' bounding boxes in the plane."""
-    low, high = np.full((num, 2), np.inf), np.full((num, 2), -np.inf)
-    np.minimum.at(low, label, points[:, :2])
-    np.maximum.at(high, label, points[:, :2])
-    return np.linalg.norm(high - low, axis=1)
-
-
-def _distance_m(points: Float, tree: cKDTree, workers: int = 1) -> Float:
-    far = tree.query(points, distance_upper_bound=_REACH_M, workers=workers)[0]
-    return np.minimum(far, _REACH_M)

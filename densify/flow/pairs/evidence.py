@@ -1,0 +1,119 @@
+# SPDX-License-Identifier: MIT
+"""What of two clouds tells that something moves: points of one without a counterpart in the
+other."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from densify.flow.pairs.hypotheses import PairCloud, tree_of
+from densify.geometry.height_map import HeightMap
+from densify.kernels.linking import link
+from densify.types import Bool, Float, Float32, Int
+
+EXPLAINED_M = 0.1  # a nearer point is a counterpart,
+MIN_UNEXPLAINED = 5, 3  # in the source, in the target
+_REACH_M = 0.6  # a distance beyond it counts as this
+_MAX_EXPLAINED_M = 0.5
+_NUM_SPACING = 8  # or one within the radius of so many neighbours
+_LINK_M = 0.6
+_NEAR_M = 0.4
+_MIN_SHARE = 0.2  # unexplained, of a group taken as a whole
+_MAX_EXTENT_M = 20.0
+_MIN_SEED_SHARE = 0.3
+_MIN_POINTS = 8
+_MAX_LOW_M, _MAX_HIGH_M = 3.4, 6.0  # above the ground, of its lowest and highest points
+
+
+class Unexplained:
+    """Which points of a cloud the other one does not explain, and the groups they form.
+
+    distance_m: (N,) to the other cloud, at most the reach. unexplained: (N,). firmly: (N,) nor does
+    another scanner: where two of them see a rail by different rings, each has posts of its own.
+    candidates: (C,) rows that belong to a group. group: (N,) its label, -1 none.
+    """
+
+    def __init__(self, cloud: PairCloud, distance_m: Float, alone: Bool) -> None:
+        self.cloud, self.distance_m = cloud, distance_m
+        self.unexplained = np.zeros(len(distance_m), bool)
+        far = np.flatnonzero(distance_m > EXPLAINED_M)
+        self.unexplained[far] = distance_m[far] > self.tolerance_m(far)
+        self.firmly = self.unexplained & alone
+        self.group = self._grouped()
+        self.candidates = np.flatnonzero(self.group >= 0)
+
+    @staticmethod
+    def of(cloud: PairCloud, other: PairCloud) -> Unexplained:
+        rows = np.arange(len(cloud.points))
+        own_m = distances_m(cloud.places(cloud.points, rows), other.tree)
+        alone = own_m > EXPLAINED_M
+        if cloud.lidar is not None:
+            far = np.flatnonzero(alone)
+            alone[far] = distances_m(cloud.points[far], tree_of(other.points)) > EXPLAINED_M
+        return Unexplained(cloud, own_m, alone)
+
+    def tolerance_m(self, rows: Int) -> Float:
+        """How far from a point a counterpart may be: what is sparse in one cloud is in both."""
+        k = min(_NUM_SPACING + 1, self.cloud.even_tree.n)
+        place = self.cloud.places(self.cloud.points[rows], rows)
+        spacing_m = np.asarray(self.cloud.even_tree.query(place, [k])[0])[:, 0]
+        return np.clip(spacing_m, EXPLAINED_M, _MAX_EXPLAINED_M)
+
+    def groups(self, ground: HeightMap) -> list[Int]:
+        """Members of those that are worth a try, by label: crowns of trees and walls of houses are
+        not."""
+        order = self.candidates[np.argsort(self.group[self.candidates], kind="stable")]
+        parts = np.split(order, np.flatnonzero(np.diff(self.group[order])) + 1)
+        return [
+            part
+            for part in parts
+            if len(part) >= _MIN_POINTS
+            and self.firmly[part].sum() >= MIN_UNEXPLAINED[0]
+            and _may_drive(ground.above(self.cloud.points[part]))
+        ]
+
+    def _grouped(self) -> Int:
+        """What is connected is one group if it is no longer than a vehicle and much of it is
+        unexplained; elsewhere only what is close to unexplained points that are not alone."""
+        points = self.cloud.points
+        num, label = link(points, _LINK_M)
+        size = np.bincount(label, minlength=num)
+        share = np.bincount(label, self.unexplained, num) / np.maximum(size, 1)
+        whole = (share >= _MIN_SHARE) & (_extents_m(points, label, num) <= _MAX_EXTENT_M)
+        group = np.where(whole[label], label, -1)
+        rest = np.flatnonzero(~whole[label])
+        seeds = rest[self.unexplained[rest]]
+        if not len(seeds):
+            return group
+        tree = tree_of(points[rest])
+        num_near = tree.query_ball_point(points[seeds], _NEAR_M, return_length=True)
+        num_seeds = tree_of(points[seeds]).query_ball_point(
+            points[seeds], _NEAR_M, return_length=True
+        )
+        seeds = seeds[num_seeds >= _MIN_SEED_SHARE * num_near]
+        if len(seeds):
+            far, _ = tree_of(points[seeds]).query(points[rest], distance_upper_bound=_NEAR_M)
+            near = rest[np.isfinite(far)]
+            group[near] = num + link(points[near], _LINK_M)[1]
+        return group
+
+
+def _extents_m(points: Float, label: Int, num: int) -> Float:
+    """(num,) diagonals of the groups' bounding boxes in the plane."""
+    low, high = np.full((num, 2), np.inf), np.full((num, 2), -np.inf)
+    np.minimum.at(low, label, points[:, :2])
+    np.maximum.at(high, label, points[:, :2])
+    return np.linalg.norm(high - low, axis=1)
+
+
+def _may_drive(height_m: Float32) -> bool:
+    """Whether a group with those heights above the ground may be a road user."""
+    low_m, high_m = np.percentile(height_m, (5, 95))
+    return bool(low_m <= _MAX_LOW_M and high_m <= _MAX_HIGH_M)
+
+
+def distances_m(points: Float, tree: cKDTree, workers: int = 1) -> Float:
+    """(N,) to the nearest point of the tree, at most the reach."""
+    far = tree.query(points, distance_upper_bound=_REACH_M, workers=workers)[0]
+    return np.minimum(far, _REACH_M)
