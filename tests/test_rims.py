@@ -7,11 +7,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy import ndimage
 
 import densify
 from densify.config import ProjectSettings
 from densify.depth.layers import Layers
-from densify.depth.picture import edges_fit, lab
+from densify.depth.picture import lab, laid_over
 from densify.depth.rims import decide, shares
 from densify.depth.votes import RULES
 from densify.kernels import voting
@@ -160,7 +161,33 @@ def test_an_image_that_does_not_belong_is_noticed(how):
 def test_a_dark_image_still_fits():
     layers, image, _ = scene()
     at, dark = layers.rim_m > 0, (image // 4).astype(np.uint8)
-    assert edges_fit(lab(dark), np.maximum(layers.depth_m, layers.rim_m), at)
+    known_m = np.maximum(layers.depth_m, layers.rim_m)
+    assert laid_over(lab(dark), known_m, at) is not None
+    assert np.percentile(lab(dark)[..., 0], 99) == pytest.approx(70, abs=1)
+
+
+@pytest.mark.parametrize(("right", "down"), [(0, 0), (2, 0), (-3, 0), (0, -2), (1, 2)])
+def test_an_image_that_lies_aside_is_moved_back(right, down):
+    layers, image, _ = scene()
+    at, known_m = layers.rim_m > 0, np.maximum(layers.depth_m, layers.rim_m)
+    straight = laid_over(lab(image), known_m, at)
+    moved = laid_over(lab(np.roll(image, (down, right), (0, 1))), known_m, at)
+    inside = (slice(8, -8), slice(8, -8))
+    off = [
+        np.abs(np.roll(moved, by, axis)[inside] - straight[inside]).mean()
+        for by, axis in ((0, 0), (1, 0), (-1, 0), (1, 1), (-1, 1))
+    ]
+    assert np.argmin(off) == 0
+
+
+@pytest.mark.parametrize("blur_px", [0.5, 2.0, 4.0])
+def test_a_blurred_image_is_noticed(blur_px):
+    layers, image, _ = scene()
+    blurred = np.stack(
+        [ndimage.gaussian_filter(c.astype(float), blur_px) for c in np.moveaxis(image, 2, 0)], 2
+    ).astype(np.uint8)
+    made = decided(layers, blurred)
+    assert bool(made.warnings) == (blur_px > 1)
 
 
 def test_a_mirrored_scene_has_mirrored_votes():

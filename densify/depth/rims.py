@@ -11,7 +11,7 @@ import numpy as np
 from densify.config import ProjectSettings
 from densify.depth import votes
 from densify.depth.layers import Layers
-from densify.depth.picture import edges_fit
+from densify.depth.picture import laid_over
 from densify.depth.votes import voters
 from densify.types import Float32, Int
 
@@ -23,7 +23,7 @@ _LEAST_SHARE = 0.97  # of the votes for a pixel that is kept
 _FEW = 100  # rims, of which nothing can be told
 _SUREST = 2.5  # -log10 of the share against
 _MISFIT = (
-    "image edges do not lie where depth has edges (calibration, clock, exposure?): pixels at depth "
+    "image edges do not lie where depth has edges (calibration, clock, blur?): pixels at depth "
     "edges are left out as with project.rims=strict"
 )
 
@@ -37,8 +37,9 @@ def decide(layers: Layers, settings: ProjectSettings) -> Layers:
     second round less the less they are believed. Kept is what has 97 % of the votes, but nothing
     that is ``refused``.
 
-    An image that does not belong to the depth is not listened to (`edges_fit`): as ``strict``, with
-    a warning; without an image as ``strict``. ``lab`` goes on only if it was listened to.
+    An image that lies up to 3 steps aside is moved, one that does not belong to the depth or is
+    blurred is not listened to (`densify.depth.picture.laid_over`): as ``strict``, with a warning;
+    without an image as ``strict``. ``lab`` goes on only if it was listened to.
 
     The ``confidence`` of rims becomes 0 to 0.2, by the share of the votes against.
     """
@@ -47,9 +48,9 @@ def decide(layers: Layers, settings: ProjectSettings) -> Layers:
     at_edge = (layers.rim_m > 0) & ~layers.veiled
     known_m = np.where(layers.veiled, np.float32(0), np.maximum(layers.depth_m, layers.rim_m))
     if layers.lab is not None and settings.rims != "strict" and len(rims) >= _FEW:
-        if edges_fit(layers.lab, known_m, at_edge, _scale(layers)):
-            lab = layers.lab
-            share = shares(layers, rims)
+        lab = laid_over(layers.lab, known_m, at_edge, _scale(layers))
+        if lab is not None:
+            share = shares(replace(layers, lab=lab), rims)
         else:
             warnings = (*warnings, _MISFIT)
     believed = share >= _LEAST_SHARE
