@@ -12,6 +12,7 @@ import os
 from collections.abc import Iterator
 from pathlib import Path
 
+import hypothesis
 import pytest
 
 from densify.dataset.processes import share_of_cores
@@ -22,6 +23,10 @@ if NUM_PROCESSES > 1:  # libraries read it when imported: the tests' own modules
 
 from tests.command import exit_code  # noqa: E402
 from tests.dataset_scenes import OPTIONS, across_border, write_drive  # noqa: E402
+
+# No test depends on how busy the machine is.
+hypothesis.settings.register_profile("densify", deadline=None)
+hypothesis.settings.load_profile("densify")
 
 
 @pytest.fixture(scope="session", autouse=True)
