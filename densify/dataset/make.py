@@ -146,7 +146,7 @@ def make_dataset(
             todo = _tasks(left, recipe, out, cache_bytes)
             if report is not None:
                 report(done.summary())
-            try:
+            with _kept_told(done):
                 if todo:
                     of_workers = memory_bytes and memory_bytes - int(_BASE_BYTES)
                     with open_workers(num_processes, scheduler, of_workers) as workers:
@@ -154,11 +154,6 @@ def make_dataset(
                             manifest.append(record)
                             done.add(record)
                     clear_leftovers(out)  # of workers that were killed
-            except OutputError as error:
-                raise ComputationError(f"{error}; {done.kept()}") from error
-            except BaseException:
-                _log.info(done.kept())
-                raise
     return done.summary()
 
 
@@ -208,6 +203,18 @@ class _Done:
     def kept(self) -> str:
         num_kept = sum(record.status != "failed" for record in self._records.values())
         return f"{num_kept} of {self._num_keys} keys are finished and kept"
+
+
+@contextmanager
+def _kept_told(done: _Done) -> Iterator[None]:
+    """However the block ends early, it is said what is kept; a full disk is a ComputationError."""
+    try:
+        yield
+    except OutputError as error:
+        raise ComputationError(f"{error}; {done.kept()}") from error
+    except BaseException:
+        _log.info(done.kept())
+        raise
 
 
 def _tasks(
