@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import NamedTuple, Protocol, cast
 
@@ -49,7 +50,7 @@ class Spec(NamedTuple):
         if not (colon and name in READERS):
             return Spec(None, text)
         path, mark, scene = place.rpartition("#")
-        if not mark or Path(place).expanduser().exists():
+        if not mark or os.path.exists(Path(place).expanduser()):
             return Spec(name, place)
         return Spec(name, path, scene)
 

@@ -245,6 +245,9 @@ def _read_pcd(path: Path, names: Sequence[str] | None) -> PointTable:
 
     file = io.BytesIO(read_bytes(path))
     header = _pcd_header(file)
+    counts = next((line.split()[1:] for line in header if line.startswith("COUNT")), [])
+    if not all(word.isascii() and word.isdigit() and len(word) < 5 for word in counts):
+        raise ValueError("COUNT: expected a small whole number for each field")
     body = file.read()
     if header[-1] == "DATA ascii":  # one blank between numbers, none at the end
         body = b"\n".join(b" ".join(line.split()) for line in body.splitlines())
@@ -272,6 +275,8 @@ def _read_ply(path: Path, names: Sequence[str] | None) -> PointTable:
     vertex = raw["vertex"]
     names = [name for name, kind in vertex["properties"].items() if "LIST" not in kind]
     columns = {name: np.ravel(vertex["data"][name]) for name in names}
+    if any(column.dtype.kind not in "fiub" for column in columns.values()):
+        raise ValueError("its vertices are no numbers")
     if any(len(column) != vertex["length"] for column in columns.values()):
         raise ValueError(f"holds fewer than the {vertex['length']} vertices of its header")
     return PointTable(columns)
