@@ -275,10 +275,10 @@ def _read_ply(path: Path, names: Sequence[str] | None) -> PointTable:
     vertex = raw["vertex"]
     names = [name for name, kind in vertex["properties"].items() if "LIST" not in kind]
     columns = {name: np.ravel(vertex["data"][name]) for name in names}
-    if any(column.dtype.kind not in "fiub" for column in columns.values()):
-        raise ValueError("its vertices are no numbers")
     if any(len(column) != vertex["length"] for column in columns.values()):
         raise ValueError(f"holds fewer than the {vertex['length']} vertices of its header")
+    if any(column.dtype.kind not in "fiub" for column in columns.values()):
+        raise ValueError("its vertices are no numbers")
     return PointTable(columns)
 
 
