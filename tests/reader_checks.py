@@ -114,8 +114,13 @@ def check_depth(
         (sequence, middle, name or own),
         (excerpt.street, excerpt.frames[middle], own),
     ):
-        # The excerpt ends where the street goes on: nothing from beyond the window.
-        config = {"register": {"source": "dataset"}, "accumulate": {"far_m": 0}}
+        # The excerpt ends where the street goes on: nothing from beyond the window. Spots would
+        # count the same returns several times.
+        config = {
+            "register": {"source": "dataset"},
+            "accumulate": {"far_m": 0},
+            "project": {"spot": 0},
+        }
         result = densify.run(recording, key, 1, cameras=[camera], config=config)
         depth_m, true_m = result.depth[camera].depth_m, recording.truth.depth_m(camera, key)
         focal_px = recording.cameras[camera].focal_px

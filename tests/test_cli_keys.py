@@ -39,7 +39,7 @@ def test_a_key_that_cannot_be_read_costs_only_itself(
     assert sorted(p.name for p in out.iterdir()) == [f"{BORDER - 1:06d}", f"{BORDER + 1:06d}"]
     last = told.err.splitlines()[-1]
     assert "1 of 3 keys not made" in last and f"{BORDER:010d}.bin: truncated" in last
-    assert f"window of key {BORDER - 1} is cut" in told.err
+    assert f"key {BORDER - 1}: the window is cut" in told.err
     assert run(drive, tmp_path / "alone", "--key", BORDER) == 2
     assert not (tmp_path / "alone").exists()
 

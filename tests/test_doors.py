@@ -311,6 +311,7 @@ OTHER_PLACES = {
     "outputs/atomic.py": "/proc",
     "outputs/kitti_tree.py": "text of a README",
     "readers/nuscenes/tables.py": "single records, bounded there",
+    "report/film.py": "what it made itself",
     "report/page_file.py": "the package's own page",
     "writers/kitti_raw.py": "what it writes itself",
 }

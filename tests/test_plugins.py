@@ -24,6 +24,7 @@ from densify.plugins.engines import ENGINES, engine
 from densify.plugins.outputs import OUTPUTS, chosen
 from densify.plugins.readers import READERS
 from densify.readers import Spec
+from densify.types import Links
 from tests.tiny_street import MOVERS, tiny
 
 EXAMPLE = Path(__file__).parents[1] / "examples" / "plugin"
@@ -206,6 +207,7 @@ RESULT = SimpleNamespace(
     **{name: {} for name in ("depth", "full", "movers", "optical_flow", "rejected", "metrics")},
     **{"baselines": {}, "flow": None, "key": 3, "method": "flow", "frames": (3,), "costs": ()},
     **{"far_frames": (), "warnings": (), "stamp_ns": 0, "T_key_lidar": {}},
+    **{"far_links": Links.none(), "far_left_out": ()},
     cloud=None,
 )
 
