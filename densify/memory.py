@@ -80,7 +80,8 @@ def _of_group() -> Iterator[float]:
         with suppress(OSError, ValueError):  # no limit is the word max
             most = int((group / "memory.max").read_text())
             used = int((group / "memory.current").read_text())
-            files = sum(_table(group / "memory.stat", "inactive_file"))
+            stat = group / "memory.stat"
+            files = sum(_table(stat, "inactive_file") + _table(stat, "active_file"))
             yield float(max(0, most - used + files))
 
 

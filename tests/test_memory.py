@@ -71,7 +71,11 @@ def test_what_the_machine_has_counts(monkeypatch, tmp_path: Path) -> None:
     group = tmp_path / "a" / "b"
     group.mkdir(parents=True)
     (group / "memory.max").write_text("max\n")
-    for name, text in (("max", "3000"), ("current", "1000"), ("stat", "anon 5\ninactive_file 7\n")):
+    for name, text in (
+        ("max", "3000"),
+        ("current", "1000"),
+        ("stat", "anon 5\ninactive_file 4\nactive_file 3\n"),
+    ):
         (group.parent / f"memory.{name}").write_text(text)
     monkeypatch.setattr(memory, "_GROUPS", tmp_path)
     monkeypatch.setattr(memory, "_own_group", lambda: group)
