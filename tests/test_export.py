@@ -85,13 +85,16 @@ def stored(folder, product, camera="image_02"):
     return cv2.imread(str(folder / product / f"{camera}.png"), cv2.IMREAD_UNCHANGED)
 
 
-def refused(*parts, **arguments):
+def refused(*parts, run, **arguments):
+    """In one line that names these parts, and the run stays as it was."""
+    before = tree(run)
     with pytest.raises(InputError) as error:
-        export_run(**arguments)
+        export_run(run, **arguments)
     message = str(error.value)
     assert "\n" not in message
     for part in parts:
         assert str(part) in message, message
+    assert tree(run) == before
 
 
 # What is kept

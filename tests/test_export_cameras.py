@@ -11,11 +11,10 @@ import pytest
 from plyfile import PlyData
 from scipy.ndimage import map_coordinates
 
-from densify.errors import InputError
 from densify.geometry.cameras import image_points
 from densify.outputs import export_run, read_cloud, read_depth_png
 from tests.exported import street_result, write_street, write_views
-from tests.test_export import H, W, tree
+from tests.test_export import H, W, refused
 
 TWO = {"image_02": "plain", "image_03": "bent"}
 
@@ -28,17 +27,6 @@ def put(tmp_path):
 @pytest.fixture(scope="module")
 def street(tmp_path_factory):
     return write_street(tmp_path_factory.mktemp("street"))
-
-
-def refused(*words, run, **arguments):
-    before = tree(run)
-    with pytest.raises(InputError) as error:
-        export_run(run, **arguments)
-    message = str(error.value)
-    assert "\n" not in message
-    for word in words:
-        assert str(word) in message, message
-    assert tree(run) == before
 
 
 def colmap(run, **arguments):

@@ -8,13 +8,12 @@ import pytest
 import yaml
 from PIL import Image
 
-from densify.errors import InputError
 from densify.outputs import export_run, read_cloud, read_depth_png, write_cloud
 from densify.outputs.depth_png import stored_age, stored_confidence
 from densify.plugins.exports import EXPORTS
 from densify.types import Cloud
 from tests.command import exit_code
-from tests.test_export import CAMERAS, KEY_NS, STAMPS_NS, map_of, stored, tree, written
+from tests.test_export import CAMERAS, KEY_NS, STAMPS_NS, map_of, refused, stored, tree, written
 
 NUM_POINTS = 400
 COLUMNS = {
@@ -66,17 +65,6 @@ def expected(run):
     assert displacement is not None
     values |= {f"displaced_{axis}": displacement[:, i] for i, axis in enumerate("xyz")}
     return {name: values[name].astype(kind) for name, kind in COLUMNS.items()}
-
-
-def refused(*words, run, **arguments):
-    before = tree(run)
-    with pytest.raises(InputError) as error:
-        export_run(run, **arguments)
-    message = str(error.value)
-    assert "\n" not in message
-    for word in words:
-        assert str(word) in message, message
-    assert tree(run) == before
 
 
 # --- clouds ---------------------------------------------------------------------------------------

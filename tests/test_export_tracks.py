@@ -11,25 +11,13 @@ import pytest
 from plyfile import PlyData
 from scipy.spatial.transform import Rotation
 
-from densify.errors import InputError
 from densify.geometry import poses
 from densify.outputs import export_run, read_cloud, write_cloud
 from densify.types import ObjectTrack
 from tests.exported import street_result, write_street, write_views
 from tests.small_street import KEY
-from tests.test_export import KEY_NS, H, W, tree
+from tests.test_export import KEY_NS, H, W, refused
 from tests.test_export_formats import cloud_of
-
-
-def refused(*words, run, **arguments):
-    before = tree(run)
-    with pytest.raises(InputError) as error:
-        export_run(run, **arguments)
-    message = str(error.value)
-    assert "\n" not in message
-    for word in words:
-        assert str(word) in message, message
-    assert tree(run) == before
 
 
 @pytest.fixture(scope="module")

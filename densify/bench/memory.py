@@ -5,12 +5,12 @@ from __future__ import annotations
 
 import ctypes
 import gc
-import re
 from pathlib import Path
 from typing import NamedTuple
 
+from densify.costs import status_mb
+
 _CLEAR_REFS = Path("/proc/self/clear_refs")
-_STATUS = Path("/proc/self/status")
 _RESET_PEAK = "5"  # proc(5): sets the peak resident set size to the current one
 
 
@@ -31,14 +31,14 @@ class PeakMemory(NamedTuple):
         _give_back()
         try:
             _CLEAR_REFS.write_text(_RESET_PEAK)
-            return PeakMemory(_status_mb("VmRSS"))
+            return PeakMemory(status_mb("VmRSS"))
         except OSError:
             return PeakMemory(None)
 
     def rise_mb(self) -> float | None:
         if self.before_mb is None:
             return None
-        peak_mb = _status_mb("VmHWM")
+        peak_mb = status_mb("VmHWM")
         return None if peak_mb is None else max(0.0, peak_mb - self.before_mb)
 
 
@@ -48,8 +48,3 @@ def _give_back() -> None:
         ctypes.CDLL(None).malloc_trim(0)
     except (OSError, AttributeError, TypeError):  # another C library, or none to load by that name
         return
-
-
-def _status_mb(name: str) -> float | None:
-    found = re.search(rf"^{name}:\s+(\d+) kB$", _STATUS.read_text(), re.MULTILINE)
-    return int(found[1]) / 1024 if found else None

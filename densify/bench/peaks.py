@@ -4,8 +4,6 @@
 from __future__ import annotations
 
 import multiprocessing
-import resource
-import sys
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -17,6 +15,7 @@ from numpy.typing import NDArray
 
 from densify import memory, pipeline
 from densify.config import Config, as_mapping, resolve
+from densify.costs import peak_memory_mb
 from densify.errors import ComputationError
 from densify.outputs import write_result
 from densify.readers import open_sequence
@@ -97,9 +96,7 @@ def _measured(
     result = pipeline.run(sequence, key, window, config=config)
     with tempfile.TemporaryDirectory() as folder:
         write_result(result, result.images, Path(folder), config=config, data=spec)
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    peak_bytes = peak * (1 if sys.platform == "darwin" else 1024)
-    told.send((len(sequence[key]), said_bytes, peak_bytes))
+    told.send((len(sequence[key]), said_bytes, peak_memory_mb() * 2**20))
 
 
 class _WithCameras:

@@ -71,6 +71,15 @@ def _bring_back(points, share, centre, state, at):  # type: ignore[no-untyped-de
 
 
 @inlined
+def _add(H, g, J, weight, off_m):  # type: ignore[no-untyped-def]
+    """One residual, by its derivatives J (4,), to the normal equations."""
+    for m in range(4):
+        g[m] += weight * J[m] * off_m
+        for n in range(4):
+            H[m, n] += weight * J[m] * J[n]
+
+
+@inlined
 def _add_up(at, share, sampling, judges, centre, reach_m, gate_m, limit_m, H, g, told):  # type: ignore[no-untyped-def]
     """Fill the normal equations, by Tukey's weights, and ``told``; returns the weights' sum."""
     H[:], g[:] = 0.0, 0.0
@@ -129,10 +138,7 @@ def _add_up(at, share, sampling, judges, centre, reach_m, gate_m, limit_m, H, g,
         J[0], J[1], J[2] = a * later, b * later, c * later
         J[3] = (b * (x - centre[0]) - a * (y - centre[1])) * later
         total += weight
-        for m in range(4):
-            g[m] += weight * J[m] * off_m
-            for n in range(4):
-                H[m, n] += weight * J[m] * J[n]
+        _add(H, g, J, weight, off_m)
     told[0], told[1] = distance_m / len(px), num_planes / len(px)
     return total
 

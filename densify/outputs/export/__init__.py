@@ -19,7 +19,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Protocol, cast
+from typing import Any, Protocol, cast
 
 import numpy as np
 import yaml
@@ -96,22 +96,13 @@ def export_run(
                 f"--to {to}: wrote {', '.join(strays)}, expected nothing but "
                 f"{', '.join(form.owned) or 'what OWNED names'}; mend {form.module}"
             )
-        record = {
+        asked = {
             "run": str(run),
             "to": to,
             "min_confidence": float(min_confidence),
             "max_age_ms": None if max_age_ms is None else float(max_age_ms),
         }
-        if finished.density:
-            record["density"] = {
-                camera: {product: asdict(density) for product, density in products.items()}
-                for camera, products in finished.density.items()
-            }
-        if finished.num_points is not None:
-            record["num_points"] = asdict(finished.num_points)
-        record["version"] = __version__
-        text = yaml.safe_dump(record, sort_keys=False, allow_unicode=True)
-        write_file(staging / _RECORD, text.encode())
+        write_file(staging / _RECORD, _record(asked, finished))
         written = [
             folder / file.relative_to(staging)
             for name in owned
@@ -119,6 +110,20 @@ def export_run(
             if file.is_file()
         ]
     return Export(written, finished.density, finished.num_points)
+
+
+def _record(asked: dict[str, Any], finished: FinishedRun) -> bytes:
+    """What was asked for, and how much of the run was left."""
+    record = dict(asked)
+    if finished.density:
+        record["density"] = {
+            camera: {product: asdict(density) for product, density in products.items()}
+            for camera, products in finished.density.items()
+        }
+    if finished.num_points is not None:
+        record["num_points"] = asdict(finished.num_points)
+    record["version"] = __version__
+    return yaml.safe_dump(record, sort_keys=False, allow_unicode=True).encode()
 
 
 def _check_thresholds(min_confidence: float, max_age_ms: float | None) -> None:
