@@ -27,7 +27,7 @@ from densify.readers.files import format_frames
 from densify.readers.prior_files import PriorFiles
 from densify.readers.window import choose_cameras
 from densify.recording import Recording
-from densify.types import LidarSequence, Progress, Result
+from densify.types import LidarSequence, Progress, Result, StretchFlow
 
 ConfigLike = Config | str | Path | Mapping[str, Any] | None
 
@@ -92,6 +92,36 @@ def run_keys(
                 yield key, error
 
     return results()
+
+
+def flow_steps(
+    sequence: LidarSequence,
+    frames: Sequence[int],
+    config: ConfigLike = None,
+    progress: Progress | None = None,
+    cache: Cache | None = None,
+) -> Iterator[tuple[int, StretchFlow | ComputationError | InputError]]:
+    """The flow of sweeps of a whole recording to the next ones; motion is followed over all sweeps
+    around, as for a training set.
+
+    frames: ascending. cache: keeps what is shared on disk. Yields each sweep with the one step that
+    leads from it, none where no sweep follows (the last one, before a hole in time), or with what
+    went wrong. Raises InputError at once for what nothing can be made with.
+    """
+    settings, watch = resolve(config), Watch()
+    _check(sequence, settings, ["flow"], None)
+    recording = Recording(sequence, settings, 1, cache=cache, watch=watch)
+
+    def steps() -> Iterator[tuple[int, StretchFlow | ComputationError | InputError]]:
+        for done, frame in enumerate(frames):
+            if progress:
+                progress("flow", done, len(frames))
+            try:
+                yield frame, recording.step(frame)
+            except (ComputationError, InputError) as error:
+                yield frame, error
+
+    return steps()
 
 
 def compare(

@@ -176,6 +176,16 @@ class Recording:
         sweeps = [at_hand.get(f) or RegisteredSweep.without_points(piece, f) for f in frames]
         return motion.with_stretch(Stretch(tuple(sweeps)))
 
+    def step(self, frame: int) -> StretchFlow:
+        """The flow of a sweep to the next; no step where none follows. Errors as `window_frames`,
+        but a sweep may be alone."""
+        window = self.window(frame)
+        following = [f for f in window.frames if f > frame][:1]
+        motion = self.motion(frame) if following else None
+        return StretchFlow(
+            window, {(frame, f): motion.flow(frame, f) for f in following if motion is not None}
+        )
+
     def moment(
         self, key: int, all_sweeps: bool, engine: str | None, with_flow: bool = False
     ) -> Moment:

@@ -371,7 +371,7 @@ def test_the_command_prints_tables_and_writes_numbers(tmp_path: Path, capsys, mo
     assert main(command) == 0
     printed = capsys.readouterr().out
     assert printed.splitlines()[-1] == str(out)
-    assert printed.count("\nrigid ") == 4 and printed.count("\nours ") == 4
+    assert printed.count("\nrigid ") == 8 and printed.count("\nours ") == 8
     assert [s[1:] for s in seen] == [(k, ["rigid", "ours"], False, 300) for k in (3, 5)]
     numbers = json.loads(out.read_text("utf-8"))
     assert [len(run["methods"]) for run in numbers["runs"]] == [2, 2]

@@ -10,7 +10,8 @@ all of it. The energy is always that of the paper's objective on the drawn point
 
 Seconds are per pair: those of ``ours`` are its whole time, from the ground to the flow to the key,
 over the number of sweeps. Registration counts for none, nor does what is compiled when first used.
-Errors are over the points above the ground of all pairs together.
+Errors are over the points above the ground of all pairs together; those of the Argoverse 2
+challenges as `densify.scores.challenge` says, with our ground left out.
 
 Firing times within a sweep are used for every method: a point moves by its own flow between the
 moment it was measured and the sweep's reference time.
@@ -22,6 +23,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -91,12 +93,15 @@ def bench_flow(
     pairs_only: bool = False,
     max_points: int = DEFAULT_MAX_POINTS,
     progress: Progress | None = None,
+    truth: Path | None = None,
 ) -> dict[str, Any]:
     """Run and measure; plain numbers ready for JSON, None where nothing can be said.
 
     window: sweeps on each side of the key. methods: of `METHODS`. pairs_only: one pair, the key's
     earlier neighbour (the later where there is none) to the key, and nothing accumulated.
-    max_points: of each cloud for the slow methods; 0 for all. Errors need ``sequence.truth``.
+    max_points: of each cloud for the slow methods; 0 for all. truth: a place of true flow, see
+    `densify.readers.true_flow`, which leads forwards only: then the pairs are those before the key.
+    Errors need that, or ``sequence.truth``.
 
     Raises InputError for unknown methods, a window without neighbours, or missing frames.
     """
@@ -107,11 +112,17 @@ def bench_flow(
     if len(opened.frames) < 2:
         raise InputError(f"--key {key}: no neighbour in {sequence.name}; choose another key")
     pairs = pairs_of(opened, max_points)
+    here = opened.frames.index(key)
+    if truth is not None:
+        if here == 0:
+            raise InputError(
+                f"--key {key}: no sweep before it, whose flow --truth could tell; choose another"
+            )
+        pairs = {f: pairs[f] for f in opened.frames[:here]}
     if pairs_only:
-        here = opened.frames.index(key)
         one = opened.frames[here - 1 if here else 1]
         pairs = {one: pairs[one]}
-    scorer = Scorer.of(sequence, opened, tuple(pairs))
+    scorer = Scorer.of(sequence, opened, tuple(pairs), truth)
     measured: dict[str, _Measured] = {}
     chosen = [name for name in METHODS if name in methods]
     for done, method in enumerate(chosen):
@@ -182,6 +193,7 @@ def _measure(
         "energy_before": float(np.mean(before)),
         "energy_after": float(np.mean(after)),
         "step": scorer.step_scores(steps),
+        "challenge": scorer.challenge_scores(steps),
         "window": None if pairs_only else scorer.window_scores(to_key),
     }
     return _Measured(row, traces)

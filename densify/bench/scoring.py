@@ -6,6 +6,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,9 @@ from densify.bench.windows import Window
 from densify.depth.accumulate import accumulate
 from densify.geometry import poses
 from densify.geometry.range_image import RangeImage
+from densify.readers.true_flow import LabelledFlow, labelled_flow
 from densify.scores import flow_metrics as metrics
+from densify.scores.challenge import CLASSES, ChallengeScorer
 from densify.scores.ghosts import ghost_rate
 from densify.types import Bool, Float, FlowField, LidarSequence, Truth
 
@@ -38,25 +41,58 @@ class SweepAnswer:
     foreground: Bool
     certain: Bool
 
+    def label(self) -> LabelledFlow:
+        """The step, and what belongs to an object."""
+        classes = np.where(self.foreground, CLASSES.index("OBJECT"), 0).astype(np.uint8)
+        return LabelledFlow(self.step, classes, np.ones(len(classes), bool))
+
 
 @dataclass(frozen=True)
 class Scorer:
     """What methods' flows of one window are held against.
 
     Errors are over the points above the ground, since no method moves the ground. sources: frames
-    whose step is scored. answers: by frame, None without truth.
+    whose step is scored. answers: by frame, None without exact truth. labels: of the steps of the
+    sources, none without truth.
     """
 
     window: Window
     sources: tuple[int, ...]
     answers: Mapping[int, SweepAnswer] | None
+    labels: Mapping[int, LabelledFlow]
 
     @staticmethod
-    def of(sequence: LidarSequence, window: Window, sources: tuple[int, ...]) -> Scorer:
-        truth = sequence.truth
-        if truth is None:
-            return Scorer(window, sources, None)
-        return Scorer(window, sources, {f: _answer(truth, window, f) for f in window.frames})
+    def of(
+        sequence: LidarSequence, window: Window, sources: tuple[int, ...], place: Path | None = None
+    ) -> Scorer:
+        """place: of true flow, see `densify.readers.true_flow`; then ``sources`` lie before the
+        key. None for the exact truth of the sequence, where it has one."""
+        answers, labels = None, {}
+        if sequence.truth is not None:
+            answers = {f: _answer(sequence.truth, window, f) for f in window.frames}
+            labels = {f: answers[f].label() for f in sources}
+        if place is not None:
+            labels = {f: labelled_flow(place, sequence.name, window.stretch, f) for f in sources}
+        return Scorer(window, sources, answers, labels)
+
+    def challenge_scores(self, steps: Mapping[int, FlowField]) -> dict[str, Any] | None:
+        """The flow to the next sweep as the Argoverse 2 challenges score it, all pairs together,
+        see `densify.scores.challenge`; None without truth."""
+        if not self.labels:
+            return None
+        scorer = ChallengeScorer()
+        for frame, label in self.labels.items():
+            counted = self.window.above[frame] & label.valid
+            points = self.window.stretch[frame].sweep.points
+            flow, true, classes = steps[frame].displacement, label.flow, label.classes
+            scorer.add(*(column[counted] for column in (points, flow, true, classes)))
+        scores = scorer.scores()
+        by_class = {name: _plainly(error._asdict()) for name, error in scores.by_class.items()}
+        return {
+            "three_way": _plainly(scores.three_way._asdict()),
+            "bucketed": {**by_class, "MEAN": _plainly(scores.mean._asdict())},
+            "num_points": scores.num_points,
+        }
 
     def step_scores(self, steps: Mapping[int, FlowField]) -> dict[str, Any]:
         """Score the flow to the next sweep, by frame, all pairs together. found: of the ``certain``
@@ -188,3 +224,7 @@ def _answer(truth: Truth, window: Window, frame: int) -> SweepAnswer:
 def _plain(value: float) -> float | None:
     """Not a number is None in JSON."""
     return None if math.isnan(value) else value
+
+
+def _plainly(values: Mapping[str, float]) -> dict[str, float | None]:
+    return {name: _plain(value) for name, value in values.items()}

@@ -131,7 +131,7 @@ def _add_compare(commands: Any) -> None:
 
 
 def _add_flow(commands: Any) -> None:
-    about = "scene flow between two point files, already in one coordinate frame"
+    about = "scene flow of a recording, or between two point files in one coordinate frame"
     parser = add_verb(
         commands,
         "flow",
@@ -143,17 +143,31 @@ def _add_flow(commands: Any) -> None:
         "scanner ('lidar'), that is used. "
         "The result holds 'residual_flow' (N,3) float32 metres, "
         "'moving' (N,) bool, 'instance' (N,) int32 (-1 none) and 'lost' (N,) bool, row by row as "
-        "SOURCE.",
+        "SOURCE. Of a recording, the flow of each sweep to the next is written: npz: "
+        "DIR/FRAME_NEXT.npz, flow files as --flow npz:DIR reads them; av2: DIR/NAME/STAMP.feather, "
+        "the files of the Argoverse 2 scene flow challenge (all points, without the ego-motion); "
+        "opensceneflow: DIR/NAME.h5, all sweeps with their flow.",
     )
-    parser.add_argument("source", metavar="SOURCE", type=Path, help="points at the first time")
-    parser.add_argument("target", metavar="TARGET", type=Path, help="points at the second time")
+    for name, when in (("source", "first"), ("target", "second")):
+        parser.add_argument(
+            name, metavar=name.upper(), type=Path, nargs="?", help=f"points at the {when} time"
+        )
+    parser.add_argument("--data", metavar="SPEC", help=f"instead: {DATA_HELP.partition(' (')[0]}")
+    parser.add_argument("--all", action="store_true", help="every sweep of it")
+    parser.add_argument(
+        "--keys", type=key_slice, metavar="A:B[:S]", help="sweeps A to B-1, every S-th"
+    )
+    parser.add_argument(
+        "--format",
+        choices=("npz", "av2", "opensceneflow"),
+        help="of what is written (default: npz)",
+    )
     add_config_options(parser)
     parser.add_argument(
         "--out",
-        metavar="F.npz",
+        metavar="F.npz|DIR",
         type=Path,
-        default=Path("densify-out/flow.npz"),
-        help="(default: ./densify-out/flow.npz)",
+        help="(default: ./densify-out/flow.npz, of a recording ./densify-out)",
     )
     add_overwrite(parser)
 

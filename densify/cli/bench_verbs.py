@@ -142,6 +142,7 @@ def bench_flow(options: argparse.Namespace) -> None:
                     options.pairs_only,
                     options.max_points,
                     progress,
+                    options.truth,
                 )
             runs.append(measured)
             print(flow_table(measured) + "\n", flush=True)

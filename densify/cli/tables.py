@@ -144,6 +144,14 @@ _WINDOW_COLUMNS: tuple[Column, ...] = (
 )
 
 
+_CHALLENGE_COLUMNS: tuple[Column, ...] = (
+    ("challenge: dynamic", ("three_way", "foreground_dynamic_m"), ".4f m"),
+    ("static objects", ("three_way", "foreground_static_m"), ".4f m"),
+    ("background", ("three_way", "background_static_m"), ".4f m"),
+    ("three-way", ("three_way", "mean_m"), ".4f m"),
+)
+
+
 def flow_table(measured: Mapping[str, Any]) -> str:
     """One benchmark of flow: the methods on the pairs, and what they make of the window."""
     methods: Mapping[str, Any] = measured["methods"]
@@ -168,7 +176,21 @@ def flow_table(measured: Mapping[str, Any]) -> str:
         known = [c for c in _WINDOW_COLUMNS if c[1][0] in some]
         perfect = {"(truth)": measured["truth"]} if measured["truth"] else {}
         lines += ["", _table({**windows, **perfect}, (*columns, *known))]
+    lines += _challenge_lines({name: row["challenge"] for name, row in methods.items()})
     return "\n".join(lines)
+
+
+def _challenge_lines(rows: Mapping[str, Any]) -> list[str]:
+    scored = {name: row for name, row in rows.items() if row is not None}
+    if not scored:
+        return []
+    classes = next(iter(scored.values()))["bucketed"]
+    parts = [
+        (f"{name.lower().replace('_', ' ')} {kind}", ("bucketed", name, key), form)
+        for name in classes
+        for kind, key, form in (("static", "static_m", ".4f m"), ("dynamic", "dynamic", ".3f"))
+    ]
+    return ["", _table(scored, _CHALLENGE_COLUMNS), "", _table(scored, parts)]
 
 
 _RELIABILITY_COLUMNS: tuple[Column, ...] = (

@@ -177,10 +177,18 @@ def dataset(options: argparse.Namespace) -> None:
 
 
 def flow(options: argparse.Namespace) -> None:
-    """Scene flow between two point files."""
+    """Scene flow between two point files, or of a recording."""
     config = resolve(options.config, options.overrides)
+    if options.data is not None:
+        return _flow_of_recording(options, config)
     from densify.cli.point_files import check_new_file, read_points, write_flow
 
+    if options.target is None or options.keys is not None or options.all or options.format:
+        raise InputError(
+            "densify flow: expected SOURCE and TARGET, two point files, or --data SPEC with --all "
+            "or --keys A:B[:S]; see densify flow --help"
+        )
+    options.out = options.out or Path("densify-out/flow.npz")
     check_new_file(options.out, options.overwrite)
     source, target = read_points(options.source), read_points(options.target)
     columns = {
@@ -194,6 +202,39 @@ def flow(options: argparse.Namespace) -> None:
     num_moving = int(field.moving.sum())
     print(f"{len(source.points):,} points, {num_moving:,} moving")
     print_paths([options.out])
+
+
+def _flow_of_recording(options: argparse.Namespace, config: densify.Config) -> None:
+    from densify.outputs.flow_sets import flow_writer
+    from densify.pipeline import flow_steps
+    from densify.readers import open_sequence
+
+    if options.source is not None or options.all == (options.keys is not None):
+        raise InputError(
+            "densify flow --data SPEC: expected either --all or --keys A:B[:S], and no point files"
+        )
+    sequence, out = open_sequence(options.data), options.out or Path("densify-out")
+    frames = list(sequence.frames)
+    if options.keys is not None:
+        frames = _sliced(sequence, options.keys)
+    paths: dict[Path, None] = {}
+    failed: dict[int, Exception] = {}
+    num_moving = 0
+    with (
+        progress_on_stderr() as progress,
+        flow_writer(options.format or "npz", sequence, out, frames, options.overwrite) as write,
+    ):
+        for frame, flow in flow_steps(sequence, frames, config, progress):
+            if isinstance(flow, Exception):
+                failed[frame] = flow
+                continue
+            paths[write(frame, flow)] = None
+            num_moving += sum(int(field.moving.sum()) for field in flow.steps.values())
+    print(f"{len(frames) - len(failed):,} sweeps, {num_moving:,} points moving")
+    print_paths(list(dict.fromkeys(path.parent for path in paths)))
+    if failed:
+        told = "; ".join(f"sweep {frame}: {error}" for frame, error in failed.items())
+        raise ComputationError(f"{len(failed)} of {len(frames)} sweeps not made: {told}")
 
 
 def info(options: argparse.Namespace) -> None:
@@ -339,14 +380,7 @@ def _keys_of(sequence: LidarSequence, options: argparse.Namespace) -> list[int]:
     frames = frozenset(sequence.frames)
     wanted = {*options.key}
     if options.keys is not None:
-        chosen = range(options.keys.start, options.keys.stop, options.keys.step or 1)
-        there = [frame for frame in chosen if frame in frames]
-        if not there:
-            raise InputError(
-                f"--keys {options.keys.start}:{options.keys.stop}: {sequence.name} has no sweep "
-                f"among them; it has {format_frames(sequence.frames)}"
-            )
-        wanted |= {*there}
+        wanted |= {*_sliced(sequence, options.keys)}
     for key in sorted(wanted - frames):
         raise InputError(
             f"--key {key}: no such frame in {sequence.name}; "
@@ -358,6 +392,19 @@ def _keys_of(sequence: LidarSequence, options: argparse.Namespace) -> list[int]:
             "see densify run --help"
         )
     return sorted(wanted)
+
+
+def _sliced(sequence: LidarSequence, keys: slice) -> list[int]:
+    from densify.readers.files import format_frames
+
+    chosen = frozenset(range(keys.start, keys.stop, keys.step or 1))
+    there = [frame for frame in sequence.frames if frame in chosen]
+    if not there:
+        raise InputError(
+            f"--keys {keys.start}:{keys.stop}: {sequence.name} has no sweep among them; it has "
+            f"{format_frames(sequence.frames)}"
+        )
+    return there
 
 
 def _cache(options: argparse.Namespace) -> Cache | None:

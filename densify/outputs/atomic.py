@@ -63,6 +63,19 @@ def write_file(path: Path, data: bytes, durable: bool = False) -> None:
         sync_folder(path.parent)
 
 
+@contextmanager
+def file_aside(path: Path) -> Iterator[Path]:
+    """A place to write a large file to, which becomes ``path`` when the block ends without an
+    exception; on any exception nothing is left, and an old file stays."""
+    aside = _aside(path, "tmp")
+    try:
+        yield aside
+        os.replace(aside, path)
+    except BaseException:
+        aside.unlink(missing_ok=True)
+        raise
+
+
 def make_folder(folder: Path) -> None:
     """Make a folder and those above it, where missing; they are on the disk when this returns."""
     missing = [place for place in (folder, *folder.parents) if not place.exists()]

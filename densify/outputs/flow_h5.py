@@ -14,6 +14,8 @@ marked, since no later step here needs it marked: whoever wants it left out segm
 from __future__ import annotations
 
 import io
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -27,19 +29,31 @@ from densify.types import StretchFlow
 
 def write_flow_h5(folder: Path, key: int, flow: StretchFlow) -> None:
     """``folder/000120.h5``. Raises InputError where h5py is not installed."""
-    h5py = needed("h5py", "opensceneflow", "OpenSceneFlow's files")
     folder.mkdir(exist_ok=True)
     buffer = io.BytesIO()
-    frames = flow.stretch.frames
-    with h5py.File(buffer, "w") as file:
-        for frame, following in zip(frames, (*frames[1:], None), strict=True):
+    with flow_h5(buffer) as put:
+        for frame in flow.stretch.frames:
+            put(frame, flow)
+    write_file(folder / f"{key:06d}.h5", buffer.getvalue())
+
+
+@contextmanager
+def flow_h5(place: Path | io.BytesIO) -> Iterator[Callable[[int, StretchFlow], None]]:
+    """A file that takes sweep after sweep, each with its flow to the next where that is known.
+    Raises InputError where h5py is not installed."""
+    h5py = needed("h5py", "opensceneflow", "OpenSceneFlow's files")
+    with h5py.File(place, "w") as file:
+
+        def put(frame: int, flow: StretchFlow) -> None:
             group = file.create_group(str(flow.stretch[frame].sweep.stamp_ns))
             arrays = _sweep(flow, frame)
-            if following is not None and (frame, following) in flow.steps:
-                arrays |= _flow(flow, frame, following)
+            for here, following in flow.steps:
+                if here == frame and following > frame:
+                    arrays |= _flow(flow, frame, following)
             for name, array in arrays.items():
                 group.create_dataset(name, data=array)
-    write_file(folder / f"{key:06d}.h5", buffer.getvalue())
+
+        yield put
 
 
 def _sweep(flow: StretchFlow, frame: int) -> dict[str, Any]:

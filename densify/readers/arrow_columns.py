@@ -19,6 +19,7 @@ _EXPECTED = {
     "i": "whole numbers",
     "s": "texts",
     "b": "bytes",
+    "t": "truth values",
     "l": "lists of numbers",
 }
 _TYPES = {"s": ("string", "large_string"), "b": ("binary", "large_binary")}
@@ -71,7 +72,7 @@ def column_arrays(table: Any, columns: Mapping[str, str], path: Path) -> dict[st
     """The table's columns of these names, each (N,).
 
     columns: name -> "n" finite numbers, "m" numbers that may be NaN, "i" whole numbers, "s" texts,
-    "b" bytes, "l" lists of numbers or None, as arrays in an array of objects.
+    "b" bytes, "t" truth values, "l" lists of numbers or None, as arrays in an array of objects.
     Raises InputError, which names the file, if one is absent, has gaps or holds something else.
     """
     absent = [name for name in columns if name not in table.column_names]
@@ -97,7 +98,8 @@ def _array(column: Any, kind: str, where: str) -> NDArray[Any]:
     if kind in _TYPES:
         right = type_name in _TYPES[kind] and not column.null_count
     else:
-        right = array.dtype.kind in ("iu" if kind == "i" else "iuf") and not column.null_count
+        kinds = {"i": "iu", "t": "b"}.get(kind, "iuf")
+        right = array.dtype.kind in kinds and not column.null_count
         right = right and (kind != "n" or bool(np.isfinite(array).all()))
     if not right:
         gaps = f", {column.null_count} of them missing" if column.null_count else ""

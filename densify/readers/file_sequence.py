@@ -131,6 +131,11 @@ class FileSequence(ABC):
             R_scanner_lidar=returns.R_scanner_lidar,
         )
 
+    def num_rows(self, frame: int) -> int:
+        """See `densify.types.KnowsRows`."""
+        self.check_frame(frame)
+        return len(self._returns(frame)[1].points)
+
     def image_stamps_ns(self, camera: str) -> Mapping[int, int]:
         """When each image that exists was exposed, by its number."""
         camera_named(self.cameras, camera, self.where)

@@ -10,6 +10,7 @@
     row            (N,) row of each point in the source sweep's file; without it N is their number
     moving         (N,) bool; without it everything with a residual flow of 5 cm or more
     object         (N,) which moving object, the same number in every file, -1 none; without it none
+    valid          (N,) bool, of labels: the point's flow is known; read for scoring alone
     to_reference   (N,3) metres, own motion from the point's firing to the sweep's reference time;
                    without it 0
 """
@@ -34,7 +35,7 @@ MOVES_M = 0.05
 FARTHEST_M = 1000.0
 """From sweep to sweep nothing on a road goes farther."""
 _WIDE = ("residual_flow", "total_flow", "to_reference")
-_KNOWN = (*_WIDE, "row", "moving", "object")
+_KNOWN = (*_WIDE, "row", "moving", "object", "valid")
 
 
 def estimate_motion(scene: Scene, settings: Config, argument: str) -> Motion:
@@ -69,9 +70,9 @@ class FlowFiles:
         """
         frame, target = (self._stretch.frames[i] for i in (here, there))
         path = self._folder / f"{frame:06d}_{target:06d}.npz"
-        arrays = _load(path)
+        arrays = load_flow_file(path)
         row = self._stretch.sweeps[here].sweep.row
-        at, known = _matched(path, arrays, row)
+        at, known = rows_in_file(path, arrays, row)
 
         def column(name: str, width: int | None, default: Any) -> NDArray[Any]:
             found = np.full(len(row) if width is None else (len(row), width), default)
@@ -98,10 +99,13 @@ class FlowFiles:
         )
 
 
-def _matched(
+def rows_in_file(
     path: Path, arrays: dict[str, NDArray[Any]], row: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-    """For each point of the sweep that the file knows its place there, and which those are."""
+    """For each of the sweep's points that the file knows its place there, and which those are.
+
+    row: (N,) of the points in the sweep's file. Raises InputError where the file has too few.
+    """
     num_points = len(next(iter(arrays.values())))
     rows = arrays.get("row", np.arange(num_points))
     if "row" not in arrays and len(row) and row.max() >= num_points:
@@ -116,7 +120,8 @@ def _matched(
     return found[found >= 0], found >= 0
 
 
-def _load(path: Path) -> dict[str, NDArray[Any]]:
+def load_flow_file(path: Path) -> dict[str, NDArray[Any]]:
+    """A flow file's arrays. Raises InputError if it is missing, damaged, or of another form."""
     if not path.is_file():
         raise InputError(f"{path}: no such flow file; expected one for every step to the key")
     arrays = read_arrays(path, _KNOWN)

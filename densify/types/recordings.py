@@ -135,3 +135,13 @@ class KnowsFiles(Protocol):
     def sweep_bytes(self) -> Mapping[int, int]:
         """The size of each sweep's file, by frame; empty where sweeps share files."""
         ...
+
+
+@runtime_checkable
+class KnowsRows(Protocol):
+    """A sequence whose sweeps' files have rows that are no valid returns; a reader may have this
+    member."""
+
+    def num_rows(self, frame: int) -> int:
+        """How many rows the sweep's file has, valid or not."""
+        ...

@@ -74,7 +74,7 @@ class FlowLabels:
                 f"{self.file.path}: no flow from sweep {frame} to {after.frame}: got "
                 f"{len(self.file.names)} sweeps, each with the flow to the next one only"
             )
-        residual, valid, instance = self._read(frame, int(sweep.row.max(initial=-1)) + 1)
+        residual, valid, instance = self.read(frame, int(sweep.row.max(initial=-1)) + 1)
         residual = residual[sweep.row]
         moving = valid[sweep.row] & (np.linalg.norm(residual, axis=1) >= MOVES_M)
         residual[~moving] = 0.0
@@ -100,8 +100,9 @@ class FlowLabels:
         objects = np.where(moving, forward.instance[nearest], -1).astype(np.int32)
         return FlowField(back, moving, objects, np.zeros(len(moving), bool), to_reference)
 
-    def _read(self, frame: int, num_rows: int) -> tuple[Float, Bool, Float]:
-        """Flow without ego-motion (N,3), whether it is valid (N,), and the object, -1 none (N,)."""
+    def read(self, frame: int, num_rows: int) -> tuple[Float, Bool, Float]:
+        """Flow without ego-motion (N,3), whether it is valid (N,), and the object, -1 none (N,), of
+        all rows. num_rows: at the least. Raises InputError where the file has no such flow."""
         read = self.file.array
         with self.file.opened() as groups:
             group = groups[self.file.names[frame]]

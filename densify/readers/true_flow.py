@@ -1,0 +1,185 @@
+# SPDX-License-Identifier: MIT
+"""True scene flow beside a recording, for scoring: labels of every point's flow to the next sweep.
+
+One of three forms, told apart by what lies there::
+
+    DIR/000119_000120.npz   as `densify.readers.flow_files` describes: residual_flow or total_flow,
+                            object (N,) -1 none, row; and valid (N,) bool, without it all are
+    DIR/[LOG/]STAMP.feather Argoverse 2's labels as BucketedSceneFlowEval stores them: flow_tx_m
+                            flow_ty_m flow_tz_m without ego-motion, in the vehicle's frame at the
+                            stamp; is_valid; classes_0, -1 the background, else the category's
+                            place in `CATEGORIES`. Named by stamps, or 0000000000, 0000000001, …
+    LOG.h5                  OpenSceneFlow's: flow with ego-motion, flow_is_valid,
+                            flow_category_indices, 0 the background, else one more than above
+
+All points of the sweep's file are in it, row by row.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from densify.errors import InputError
+from densify.geometry import poses
+from densify.readers.arrow_columns import read_feather
+from densify.readers.flow_files import load_flow_file, rows_in_file
+from densify.readers.open_scene_flow.labels import FlowLabels
+from densify.readers.open_scene_flow.reader import SweepFile
+from densify.scores.challenge import CLASSES, IGNORED
+from densify.types import Bool, Float, Stretch
+
+CATEGORIES = {
+    "ANIMAL": None,
+    "ARTICULATED_BUS": "OTHER_VEHICLES",
+    "BICYCLE": "WHEELED_VRU",
+    "BICYCLIST": "WHEELED_VRU",
+    "BOLLARD": None,
+    "BOX_TRUCK": "OTHER_VEHICLES",
+    "BUS": "OTHER_VEHICLES",
+    "CONSTRUCTION_BARREL": None,
+    "CONSTRUCTION_CONE": None,
+    "DOG": None,
+    "LARGE_VEHICLE": "OTHER_VEHICLES",
+    "MESSAGE_BOARD_TRAILER": None,
+    "MOBILE_PEDESTRIAN_CROSSING_SIGN": None,
+    "MOTORCYCLE": "WHEELED_VRU",
+    "MOTORCYCLIST": "WHEELED_VRU",
+    "OFFICIAL_SIGNALER": "PEDESTRIAN",
+    "PEDESTRIAN": "PEDESTRIAN",
+    "RAILED_VEHICLE": "OTHER_VEHICLES",
+    "REGULAR_VEHICLE": "CAR",
+    "SCHOOL_BUS": "OTHER_VEHICLES",
+    "SIGN": None,
+    "STOP_SIGN": None,
+    "STROLLER": "PEDESTRIAN",
+    "TRAFFIC_LIGHT_TRAILER": None,
+    "TRUCK": "OTHER_VEHICLES",
+    "TRUCK_CAB": "OTHER_VEHICLES",
+    "VEHICULAR_TRAILER": "OTHER_VEHICLES",
+    "WHEELCHAIR": "PEDESTRIAN",
+    "WHEELED_DEVICE": "WHEELED_VRU",
+    "WHEELED_RIDER": "WHEELED_VRU",
+}
+"""Argoverse 2's categories and the classes that the challenge of 2024 puts them in; None: left out
+(`av2_metacategories` of the package bucketed-scene-flow-eval)."""
+
+_CLASS_OF = np.array(
+    [0] + [IGNORED if c is None else CLASSES.index(c) for c in CATEGORIES.values()], np.uint8
+)
+_OBJECT = CLASSES.index("OBJECT")
+_FLOW = ("flow_tx_m", "flow_ty_m", "flow_tz_m")
+_WHAT = "Argoverse 2's flow labels"
+
+
+@dataclass(frozen=True)
+class LabelledFlow:
+    """The truth of a registered sweep's N points.
+
+    flow: (N,3) metres to the next sweep, ego-motion removed, in the lidar frame. classes: (N,)
+    uint8 as in `densify.scores.challenge`. valid: (N,) bool, its flow is known.
+    """
+
+    flow: Float
+    classes: NDArray[np.uint8]
+    valid: Bool
+
+
+def labelled_flow(place: Path, name: str, stretch: Stretch, frame: int) -> LabelledFlow:
+    """The labels of one sweep's flow to the next sweep of the stretch.
+
+    place: as above. name: of the recording, whose folder may lie there. Raises InputError where
+    there are no labels of that sweep, or they are damaged or not its own.
+    """
+    if place.suffix == ".h5":
+        return _from_h5(place, stretch, frame)
+    if not place.is_dir():
+        raise InputError(
+            f"--truth {place}: no such folder; expected true flow in it, or a .h5 file"
+        )
+    target = stretch.frames[stretch.frames.index(frame) + 1]
+    path = place / f"{frame:06d}_{target:06d}.npz"
+    if path.is_file() or any(place.glob("*_*.npz")):
+        return _from_npz(path, stretch, frame, target)
+    here = place / name if (place / name).is_dir() else place
+    files = {int(p.stem): p for p in here.glob("*.feather") if p.stem.isdecimal()}
+    if not files:
+        raise InputError(
+            f"--truth {place}: holds no labels of {name}; expected FRAME_NEXT.npz, or "
+            f"STAMP.feather there or in a folder {name}"
+        )
+    stamp_ns = stretch[frame].sweep.stamp_ns
+    path = files.get(stamp_ns, files.get(frame, here / f"{stamp_ns}.feather"))
+    return _from_feather(path, stretch, frame)
+
+
+def _from_feather(path: Path, stretch: Stretch, frame: int) -> LabelledFlow:
+    kinds = {**dict.fromkeys(_FLOW, "m"), "is_valid": "t", "classes_0": "i"}
+    columns = read_feather(path, kinds, _WHAT)
+    flow = np.stack([columns[axis].astype(np.float64) for axis in _FLOW], axis=1)
+    classes = _classes(path, columns["classes_0"].astype(np.int64) + 1)
+    return _of_sweep(path, flow, columns["is_valid"], classes, stretch, frame)
+
+
+def _from_h5(path: Path, stretch: Stretch, frame: int) -> LabelledFlow:
+    file = SweepFile(path)
+    flow, valid, instance = FlowLabels(file, "flow", stretch).read(frame, 0)
+    classes = np.where(instance >= 0, _OBJECT, 0).astype(np.uint8)
+    with file.opened() as groups:
+        group = groups[file.names[frame]]
+        if "flow_category_indices" in group:
+            number = file.array(group, "flow_category_indices", (len(flow),), "iu")
+            classes = _classes(path, number.astype(np.int64))
+    return _of_sweep(path, flow, valid, classes, stretch, frame)
+
+
+def _of_sweep(
+    path: Path,
+    flow: Float,
+    valid: Bool,
+    classes: NDArray[np.uint8],
+    stretch: Stretch,
+    frame: int,
+) -> LabelledFlow:
+    """What is known of all rows of a file, at the sweep's points."""
+    row = stretch[frame].sweep.row
+    if len(row) and row.max() >= len(flow):
+        raise InputError(
+            f"{path}: holds {len(flow)} labels, expected one for each row of the sweep's file "
+            f"(more than {row.max()}); give the labels of the recording that --data names"
+        )
+    valid = valid & np.isfinite(flow).all(axis=1)
+    flow = np.where(valid[:, None], flow, 0.0)
+    return LabelledFlow(flow[row], classes[row], valid[row])
+
+
+def _classes(path: Path, number: NDArray[np.int64]) -> NDArray[np.uint8]:
+    """number: of each row's category, 0 the background, from 1 its place in `CATEGORIES`."""
+    if ((number < 0) | (number >= len(_CLASS_OF))).any():
+        raise InputError(
+            f"{path}: got categories {number.min() - 1} to {number.max() - 1}, expected -1 to "
+            f"{len(CATEGORIES) - 1}"
+        )
+    return _CLASS_OF[number]
+
+
+def _from_npz(path: Path, stretch: Stretch, frame: int, target: int) -> LabelledFlow:
+    arrays = load_flow_file(path)
+    sweep = stretch[frame].sweep
+    at, known = rows_in_file(path, arrays, sweep.row)
+    flow, classes = np.zeros((len(sweep), 3)), np.zeros(len(sweep), np.uint8)
+    if "residual_flow" in arrays:
+        flow[known] = arrays["residual_flow"][at]
+    else:
+        moved = sweep.points[known] + arrays["total_flow"][at]
+        T_here_next = stretch.T_target_source(frame, target)
+        flow[known] = poses.transform(T_here_next, moved) - sweep.points[known]
+    if "object" in arrays:
+        classes[known] = np.where(arrays["object"][at] >= 0, _OBJECT, 0)
+    valid = known.copy()
+    if "valid" in arrays:
+        valid[known] = arrays["valid"][at].astype(bool)
+    return LabelledFlow(flow, classes, valid)

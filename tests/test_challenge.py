@@ -1,0 +1,154 @@
+# SPDX-License-Identifier: MIT
+"""The challenge's scores: against the numbers of its own packages, and slow twins."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from densify.errors import InputError
+from densify.readers.true_flow import CATEGORIES
+from densify.scores.challenge import CLASSES, IGNORED, ChallengeScorer
+
+NAMES = ("NONE", *CATEGORIES)
+BUCKETED = {
+    "BACKGROUND": (0.06863006888603677, math.nan),
+    "CAR": (0.07095842394563887, 0.22422062776973084),
+    "OTHER_VEHICLES": (0.05423443861208953, 0.42148736759483413),
+    "PEDESTRIAN": (0.05028076342454082, 0.27415212933020605),
+    "WHEELED_VRU": (0.054204363692551855, 0.31231146158957823),
+}
+THREE_WAY = (0.23507497759129833, 0.053893685746032975, 0.06863006888603677)
+"""What bucketed-scene-flow-eval 2.0.25 says of `frames`: static and dynamic by class; dynamic and
+static foreground, static background."""
+
+CLASS_OF = [0, *(IGNORED if c is None else CLASSES.index(c) for c in CATEGORIES.values())]
+
+
+def frames() -> list[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]]:
+    """Three pairs: points, estimated and true flow, and the place of each category in `NAMES`. The
+    legacy generator gives the same numbers in every version of numpy. float32, as the files'."""
+    rng = np.random.RandomState(7)
+    found = []
+    for num in (900, 1300, 700):
+        points = rng.uniform(-60, 60, (num, 3))
+        kind = np.where(rng.uniform(size=num) < 0.4, 0, rng.randint(0, len(NAMES), num))
+        true = rng.normal(size=(num, 3)) * rng.uniform(0, 1.2, (num, 1)) ** 2
+        true[(kind == 0) | (rng.uniform(size=num) < 0.3)] = 0.0
+        small = rng.uniform(size=num) < 0.1
+        true[small & (kind > 0)] *= 0.02
+        estimated = true + rng.normal(size=(num, 3)) * 0.1 * rng.uniform(size=(num, 1))
+        estimated[rng.uniform(size=num) < 0.2] = 0.0
+        found.append(
+            (points, estimated.astype(np.float32), true.astype(np.float32), kind.astype(int))
+        )
+    return found
+
+
+def scored(within_m: float = 35.0) -> ChallengeScorer:
+    scorer = ChallengeScorer(within_m)
+    for points, estimated, true, kind in frames():
+        scorer.add(points, estimated, true, np.array(CLASS_OF)[kind])
+    return scorer
+
+
+def test_the_numbers_of_the_challenges_own_package():
+    """`BucketedEPEEvaluator` and `ThreeWayEPEEvaluator` of bucketed-scene-flow-eval 2.0.25, with
+    its `BUCKETED_METACATAGORIES` and `THREEWAY_EPE_METACATAGORIES`, on the same arrays."""
+    scores = scored().scores()
+    assert set(scores.by_class) == set(BUCKETED)
+    for name, numbers in BUCKETED.items():
+        assert scores.by_class[name] == pytest.approx(numbers, rel=1e-6, nan_ok=True), name
+    assert scores.mean == pytest.approx(np.nanmean(list(BUCKETED.values()), axis=0), rel=1e-6)
+    assert scores.three_way[:3] == pytest.approx(THREE_WAY, rel=1e-6)
+    assert scores.three_way.mean_m == pytest.approx(sum(THREE_WAY) / 3, rel=1e-6)
+
+
+@pytest.mark.parametrize("close", [True, False])
+def test_three_way_of_av2(close):
+    """The package's own evaluation, run here. It counts signs and animals as objects, which the
+    challenge of 2024 leaves out: they get no label."""
+    evaluation = pytest.importorskip(
+        "av2.evaluation.scene_flow.eval", reason="av2 is not installed (it pulls torch and kornia)"
+    )
+    pandas = pytest.importorskip("pandas")
+    from av2.evaluation.scene_flow.constants import FOREGROUND_BACKGROUND_BREAKDOWN
+
+    tables = []
+    for points, estimated, true, kind in frames():
+        moving = np.linalg.norm(true, axis=1) >= 0.05
+        results = evaluation.compute_metrics(
+            estimated,
+            np.linalg.norm(estimated, axis=1) >= 0.05,
+            true,
+            kind,
+            moving,
+            np.logical_and.reduce(np.abs(points[:, :2]) <= 35.0, axis=1),
+            np.array(CLASS_OF)[kind] != IGNORED,
+            FOREGROUND_BACKGROUND_BREAKDOWN,
+        )
+        tables.append(pandas.DataFrame(results))
+    theirs = evaluation.results_to_dict(pandas.concat(tables))
+    end = "/Close" if close else ""
+    ours = scored(35.0 if close else math.inf).scores().three_way
+    parts = ("Foreground/Dynamic", "Foreground/Static", "Background/Static")
+    assert ours[:3] == pytest.approx([theirs[f"EPE/{part}{end}"] for part in parts], rel=1e-6)
+    if not close:
+        assert ours.mean_m == pytest.approx(theirs["EPE 3-Way Average"], rel=1e-6)
+
+
+def test_buckets_as_a_loop():
+    cells: dict[tuple[str, int], list[tuple[float, float]]] = {}
+    for points, estimated, true, kind in frames():
+        for p, f, t, k in zip(points, estimated, true, kind, strict=True):
+            if max(abs(p[0]), abs(p[1])) < 35 and CLASS_OF[k] != IGNORED:
+                length_m = math.hypot(*t)
+                bucket = sum(length_m >= 2.0 * i / 50 for i in range(51)) - 1
+                cells.setdefault((CLASSES[CLASS_OF[k]], bucket), []).append(
+                    (math.dist(f, t), length_m)
+                )
+    scores = scored().scores()
+    assert sum(map(len, cells.values())) == scores.num_points
+    assert {bucket for _, bucket in cells} > {0, 1, 50}
+    for name, found in scores.by_class.items():
+        means = {b: np.mean(v, 0) for (n, b), v in cells.items() if n == name}
+        assert found.static_m == pytest.approx(means[0][0])
+        quotients = [error / length for b, (error, length) in means.items() if b]
+        assert found.dynamic == pytest.approx(
+            np.mean(quotients) if quotients else math.nan, nan_ok=True
+        )
+
+
+def test_order_and_parts_do_not_matter():
+    whole = ChallengeScorer()
+    parts = [np.concatenate(column) for column in zip(*reversed(frames()), strict=True)]
+    points, estimated, true, kind = parts
+    whole.add(points, estimated, true, np.array(CLASS_OF)[kind])
+    together, apart = whole.scores(), scored().scores()
+    assert together.mean == pytest.approx(apart.mean)
+    assert together.three_way == pytest.approx(apart.three_way)
+
+
+def test_nothing_scored_is_nan():
+    scores = ChallengeScorer().scores()
+    assert scores.num_points == 0 and not scores.by_class
+    assert all(math.isnan(value) for value in (*scores.three_way, *scores.mean))
+    only_far = ChallengeScorer()
+    only_far.add([[35.0, 0, 0]], np.zeros((1, 3)), np.ones((1, 3)), [1])
+    assert only_far.scores().num_points == 0
+
+
+@pytest.mark.parametrize(
+    ("points", "classes", "words"),
+    [
+        (np.zeros((2, 3)), [0], "points of shape"),
+        (np.zeros((1, 3)), [0.0], "float64 classes"),
+        (np.zeros((1, 3)), [6], "got class 6"),
+        (np.zeros((1, 3)), [-1], "got class -1"),
+    ],
+)
+def test_what_does_not_fit_is_named(points, classes, words):
+    with pytest.raises(InputError, match=words):
+        ChallengeScorer().add(points, np.zeros((1, 3)), np.zeros((1, 3)), classes)
