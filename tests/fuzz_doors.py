@@ -311,6 +311,11 @@ def _read_all(place: Path) -> None:
     for camera in list(sequence.cameras)[:2]:
         numbers = list(sequence.image_stamps_ns(camera))[:2]
         steps += [lambda c=camera, n=number: sequence.image(c, n) for number in numbers]
+    _try_each(steps)
+
+
+def _try_each(steps: list[Callable[[], Any]]) -> None:
+    """All of them; raises the last refusal."""
     refused = None
     for step in steps:
         try:
@@ -335,19 +340,38 @@ def _set(place: Path) -> None:
 
     status(place)
     damaged(place)
-    data = DepthDataset(place)
+    _try_each([lambda: _page(place), lambda: _samples(DepthDataset(place))])
+
+
+def _samples(data: Any) -> None:
     for index in range(min(2, len(data))):
         data[index]
 
 
 def _run(place: Path) -> None:
+    """A finished run: its page, and what is exported of it."""
     from densify.outputs import export_run
+    from densify.plugins.exports import EXPORTS
 
     out = place.with_name("exported")
     try:
-        export_run(place, 0.3, None, out, True)
+        _try_each(
+            [
+                lambda: _page(place),
+                *(
+                    lambda to=n: export_run(place, 0.3, None, out / to, to=to)
+                    for n in [row.name for row in EXPORTS]
+                ),
+            ]
+        )
     finally:
         shutil.rmtree(out, ignore_errors=True)
+
+
+def _page(place: Path) -> None:
+    from densify.report import write_report
+
+    write_report(place, place.with_name("report.html"), overwrite=True)
 
 
 def _tree(name: str, home: Path, place: str, use: Callable[[Path], Any]) -> Door:

@@ -188,6 +188,18 @@ class TestImages:
         assert np.array_equal(decode_image(data[:33] + profile + data[33:], "x"), IMAGE)
         assert capfd.readouterr() == ("", "")
 
+    def test_damaged_jpegs_are_refused_in_our_own_words(self, capfd) -> None:
+        """opencv decodes them to wrong colours, with a line of libjpeg's on stderr."""
+        data, refusals = encoded(".jpg", cv2.IMWRITE_JPEG_RST_INTERVAL, 2), 0
+        for at in range(data.index(b"\xff\xda") + 14, len(data) - 2, 7):
+            changed = data[:at] + bytes([data[at] ^ 0x10]) + data[at + 1 :]
+            try:
+                decode_image(changed, "x")
+            except InputError as error:
+                refusals += "x: a damaged JPEG image (" in str(error)
+        assert refusals > 20
+        assert capfd.readouterr() == ("", "")
+
     @pytest.mark.parametrize("suffix", [".bmp", ".tiff", ".webp"])
     def test_other_formats_are_not_decoded(self, suffix: str) -> None:
         refused(decode_image, encoded(suffix), "x", says="expected a PNG or JPEG", where="x")

@@ -230,6 +230,7 @@ DOORS: dict[str, str | tuple[str, ...]] = {
         "densify/readers/pandaset/pickled_frame.py",
         "densify/writers/pandaset.py",
     ),
+    "simplejpeg": "densify/files/images.py",
     "small_gicp": "densify/registration/alignment.py",
     "torch": ("densify/flow/", "densify/dataset/loader.py"),
 }

@@ -40,7 +40,7 @@ def _view(view: Fields) -> CameraView:
     distortion = view.value(
         "distortion", lambda v: isinstance(v, list) and all(map(is_number, v)), "numbers"
     )
-    number = view.table.get("number")
+    number = None if view.table.get("number") is None else view.whole("number")
     camera = Camera(
         name=str(view.table.get("name")),
         width_px=int(view.number("width_px", 1, _MOST_PX)),
@@ -55,4 +55,4 @@ def _view(view: Fields) -> CameraView:
     if min(camera.K[0, 0], camera.K[1, 1]) <= 0:
         raise InputError(f"{view.path}: {view.prefix}K: expected focal lengths above 0")
     T_cam_key, late_s = view.pose("T_cam_key"), view.number("late_s")
-    return CameraView(camera, T_cam_key, late_s, None if number is None else int(number))
+    return CameraView(camera, T_cam_key, late_s, number)
