@@ -6,8 +6,12 @@ from __future__ import annotations
 
 import io
 import logging
+import os
 import struct
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from threading import Lock
 from typing import Any
 
 from densify.errors import InputError
@@ -18,6 +22,9 @@ _EXTENDED = struct.Struct("<235xQIQ")  # of version 1.4
 _LASZIP = ("laszip encoded", 22204)
 _ITEMS_AT, _ITEM_BYTES = 34, 6
 _VARIABLE = 0xFFFFFFFF
+_ONE_AT_A_TIME = Lock()
+_LAYERED = 3  # the compressor of version 1.4's points
+_NUM_LAYERS = {10: 9, 11: 1, 12: 2, 13: 1}  # by item; further bytes have one each
 
 
 def read_las(path: Path) -> Any:
@@ -30,7 +37,9 @@ def read_las(path: Path) -> Any:
         quiet.disabled = True  # it tells stderr what the exception says too
         num_points, num_bytes = _claimed(data)
         check_size(num_points * num_bytes, path)
-        with laspy.open(io.BytesIO(data)) as file:
+        # Not the parallel one, which makes room for what the table of chunks claims.
+        backend = laspy.LazBackend.Lazrs
+        with laspy.open(io.BytesIO(data), laz_backend=backend) as file, _stderr_aside():
             cloud = file.read()
         if len(cloud) != num_points:
             raise ValueError(f"got {len(cloud)} points, expected {num_points}; it is cut off")
@@ -45,6 +54,25 @@ def read_las(path: Path) -> Any:
         raise InputError(f"{path}: not a readable {path.suffix} file: it is damaged") from error
     finally:
         quiet.disabled = False
+
+
+@contextmanager
+def _stderr_aside() -> Iterator[None]:
+    """While lazrs decodes: a panic of Rust's writes to stderr before it can be caught."""
+    with _ONE_AT_A_TIME:
+        try:
+            kept = os.dup(2)
+        except OSError:  # closed
+            yield
+            return
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        try:
+            os.dup2(nowhere, 2)
+            yield
+        finally:
+            os.dup2(kept, 2)
+            os.close(kept)
+            os.close(nowhere)
 
 
 def _claimed(data: bytes) -> tuple[int, int]:
@@ -96,12 +124,12 @@ def _check_packing(
     (num_items,) = struct.unpack_from("<H", packing, _ITEMS_AT - 2)
     if len(packing) < _ITEMS_AT + num_items * _ITEM_BYTES:
         raise ValueError("nothing says how its points are packed")
-    sizes = [
-        struct.unpack_from("<HHH", packing, _ITEMS_AT + i * _ITEM_BYTES)[1]
-        for i in range(num_items)
+    items = [
+        struct.unpack_from("<HH", packing, _ITEMS_AT + i * _ITEM_BYTES) for i in range(num_items)
     ]
-    if sum(sizes) != num_bytes:
-        raise ValueError(f"its points of {num_bytes} bytes are packed as {sum(sizes)}")
+    item_bytes = sum(size for _, size in items)
+    if item_bytes != num_bytes:
+        raise ValueError(f"its points of {num_bytes} bytes are packed as {item_bytes}")
     if compressor not in (2, 3):
         raise ValueError(f"its points are packed in a way that is not known ({compressor})")
     (table,) = struct.unpack_from("<q", data, begin)
@@ -116,3 +144,17 @@ def _check_packing(
         (num_chunks - 1) * chunk_points < num_points <= num_chunks * chunk_points or not num_points
     ):
         raise ValueError(f"{num_chunks:,} chunks of {chunk_points:,} do not make {num_points:,}")
+    if compressor == _LAYERED:
+        num_layers = sum(_NUM_LAYERS.get(kind, size) for kind, size in items)
+        _check_layers(data[begin + 8 : table], num_chunks, num_bytes, num_layers)
+
+
+def _check_layers(chunks: bytes, num_chunks: int, num_bytes: int, num_layers: int) -> None:
+    """Raise ValueError or struct.error unless the chunks, each of a point as it is, a number and
+    the layers' sizes before the layers, fill their place."""
+    at = 0
+    for _ in range(num_chunks):
+        sizes = struct.unpack_from(f"<{num_layers}I", chunks, at + num_bytes + 4)
+        at += num_bytes + 4 + 4 * num_layers + sum(sizes)
+    if at != len(chunks):
+        raise ValueError("the sizes of its chunks do not fit; it is damaged")

@@ -33,6 +33,7 @@ _EXTRA_DIMENSIONS = (
     ("displaced_y", "float32", "m"),
     ("displaced_z", "float32", "m"),
 )
+_OF_THE_FORMAT = {"intensity", "gps_time", "red", "green", "blue"}
 _SINCE = {"far", "displaced_x", "displaced_y", "displaced_z"}
 """Dimensions that older clouds lack."""
 
@@ -134,7 +135,7 @@ def read_cloud(path: Path) -> StoredCloud:
     """Read back what `write_cloud` wrote. Raises InputError for any other file."""
     las = read_las(path)
     names = set(las.point_format.dimension_names)
-    missing = {name for name, _, _ in _EXTRA_DIMENSIONS} - names - _SINCE
+    missing = {*_OF_THE_FORMAT, *(n for n, _, _ in _EXTRA_DIMENSIONS)} - names - _SINCE
     if missing:
         raise InputError(
             f"{path}: no dimension {', '.join(sorted(missing))}; expected a cloud densify wrote"
