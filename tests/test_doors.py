@@ -24,7 +24,8 @@ from densify.files.content import gunzipped, read_bytes
 from densify.files.images import decode_image
 from densify.files.texts import parse_json, parse_yaml
 from densify.readers.kitti.files import Stamps
-from densify.readers.stamp_files import StampFile
+from densify.readers.kitti.odometry import _read_times_ns
+from densify.readers.stamp_files import StampFile, named
 
 CHECKOUT = Path(__file__).parents[1]
 
@@ -248,6 +249,27 @@ def test_stamps_of_years_that_64_bits_cannot_say(year: str, tmp_path: Path) -> N
     path.write_text(f"2011-09-26 13:10:51.158069617\n{year}-09-26 13:10:51.158069617\n")
     for read in (Stamps.read, StampFile.read):
         refused(read, path, says=rf"line 2: got '{year}.* from 1970 to 2261")
+
+
+@pytest.mark.parametrize("time", ["1e999999999", "1e999000", "inf", "nan", "9" * 400])
+def test_times_that_are_none(time: str, tmp_path: Path) -> None:
+    """Some of them are minutes of work as whole numbers."""
+    path = tmp_path / "times.txt"
+    path.write_text(f"0\n0.1\n{time}\n")
+    refused(StampFile.read, path, says="expected times|no finite numbers")
+    refused(StampFile.read, path, "s", says="line 3: got .* expected a time in s")
+    refused(_read_times_ns, path, says=r"line 3: got .*(expected a time in s|beyond the year 2262)")
+
+
+@pytest.mark.parametrize("name", ["9999999999_000000000", "1" * 200, "1" * 20 + "." + "2" * 20])
+def test_names_that_are_no_times(name: str) -> None:
+    assert named(Path(f"{name}.bin")).stamp_ns is None
+    assert named(Path(f"{name}.bin"), "s").stamp_ns is None or len(name) == 20
+
+
+@pytest.mark.parametrize("data", [b"1" * 5000, b'{"a": [' + b"9" * 400 + b"]}"])
+def test_json_numbers_that_no_float_holds(data: bytes) -> None:
+    refused(parse_json, data, "x", says="not a whole JSON file .*number of", where="x")
 
 
 @pytest.mark.parametrize(

@@ -30,11 +30,18 @@ def read_json(path: Path) -> Any:
 def parse_json(data: bytes, where: Path | str) -> Any:
     """What a JSON text holds. Raises InputError, which begins with ``where``, if it is broken."""
     try:
-        return json.loads(data)
+        return json.loads(data, parse_int=_whole_number)
     except (ValueError, RecursionError) as error:
         raise InputError(
             f"{where}: not a whole JSON file ({reason(error)}); fetch it again"
         ) from error
+
+
+def _whole_number(digits: str) -> int:
+    """Raises ValueError for one that no float can be made of."""
+    if len(digits) > 300:
+        raise ValueError(f"a number of {len(digits)} digits")
+    return int(digits)
 
 
 def read_yaml(path: Path) -> tuple[Any, dict[str, int]]:

@@ -23,6 +23,7 @@ _NUMBER = re.compile(r"\d+(?:\.\d+)?")
 _FILE_COLUMNS = ("filename", "file", "name", "image", "sweep", "path")
 _TIME_COLUMNS = ("timestamp", "time", "stamp", "t")
 _MAX_NUMBER_DIGITS = 18  # beyond, a name is no frame's number
+_MOST_NS = 2**63
 
 
 class Named(NamedTuple):
@@ -41,10 +42,13 @@ def named(path: Path, unit: str = "") -> Named:
     stem = path.stem
     words = _NUMBER.findall(stem)
     if unit:
-        return Named(path, None, in_ns(words[-1], unit) if words else None)
+        try:
+            return Named(path, None, in_ns(words[-1], unit) if words else None)
+        except ValueError:
+            return Named(path, None, None)
     split = _SECONDS_AND_NS.search(stem)
-    if split:
-        return Named(path, None, int(split[1]) * 1_000_000_000 + int(split[2]))
+    if split and _epoch_unit(Decimal(split[1])) == "s":
+        return Named(path, None, in_ns(f"{split[1]}.{split[2]}", "s"))
     for word in reversed(words):
         epoch = _epoch_unit(Decimal(word))
         # ten digits without a fraction are a number with zeros before it, as KITTI's
@@ -57,12 +61,15 @@ def named(path: Path, unit: str = "") -> Named:
 def in_ns(text: str, unit: str) -> int:
     """A decimal number of this unit as nanoseconds, every digit kept. Raises ValueError."""
     try:
-        time_ns = int((Decimal(text) * UNIT_NS[unit]).to_integral_value())
-    except (InvalidOperation, OverflowError, ValueError):
-        raise ValueError(f"got {text!r}, expected a time in {unit}") from None
-    if abs(time_ns) >= 2**63:
+        value = Decimal(text)
+    except InvalidOperation:
+        value = Decimal("nan")
+    if not value.is_finite():
+        raise ValueError(f"got {text!r}, expected a time in {unit}")
+    # A power of ten with a long exponent takes minutes to become a whole number.
+    if value.copy_abs() >= _MOST_NS or abs(value * UNIT_NS[unit]) >= _MOST_NS:
         raise ValueError(f"got {text!r}, which is no time in {unit}: it lies beyond the year 2262")
-    return time_ns
+    return int((value * UNIT_NS[unit]).to_integral_value())
 
 
 def date_ns(text: str) -> int:
@@ -81,7 +88,7 @@ def unit_of(times: Sequence[str]) -> str:
         values = sorted(Decimal(text) for text in times)
     except InvalidOperation:
         raise ValueError(f"got {times[0]!r}, expected times") from None
-    if not values or not all(value.is_finite() for value in values):
+    if not values or not all(value.is_finite() and value.copy_abs() < _MOST_NS for value in values):
         raise ValueError("got no finite numbers, expected times")
     epochs = {_epoch_unit(value) for value in values}
     if len(epochs) == 1 and epochs != {""}:

@@ -137,6 +137,8 @@ class Kitti360(FileSequence):
         for number, line in enumerate(read_text(self._poses_file).splitlines(), 1):
             where = f"{self._poses_file}: line {number}"
             frame, *numbers = parse_numbers(line, where, 13)
+            if not 0 <= frame < 1 << 31:
+                raise InputError(f"{where}: got {frame:g}, expected the number of a frame")
             stamps_ns.append(self._stamps[int(frame)])
             T_world_pose.append(rigid(np.reshape(numbers, (3, 4)), where))
         return PoseTrack(

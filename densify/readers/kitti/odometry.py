@@ -47,6 +47,7 @@ from densify.readers.kitti.files import (
     turned_ns,
 )
 from densify.readers.pose_track import PoseTrack
+from densify.readers.stamp_files import in_ns
 from densify.types import Camera, Float
 
 _NUM_ROUNDS = 3  # the azimuth changes by degrees at most
@@ -172,8 +173,10 @@ def _read_times_ns(path: Path) -> dict[int, int]:
     lines = read_text(path).splitlines()
     times_ns: dict[int, int] = {}
     for number, line in enumerate(lines):
-        (time_s,) = parse_numbers(line, f"{path}: line {number + 1}", 1)
-        times_ns[number] = round(time_s * 1e9)
+        try:
+            times_ns[number] = in_ns(line.strip(), "s")
+        except ValueError as error:
+            raise InputError(f"{path}: line {number + 1}: {error}") from None
         if number and times_ns[number] <= times_ns[number - 1]:
             raise InputError(
                 f"{path}: line {number + 1}: got {line.strip()} s, expected more than on the line "

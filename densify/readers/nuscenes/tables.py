@@ -7,7 +7,6 @@ are parsed.
 
 from __future__ import annotations
 
-import json
 import mmap
 import re
 from collections.abc import Collection, Mapping
@@ -19,7 +18,7 @@ import numpy as np
 
 from densify.errors import InputError
 from densify.files.content import open_file, reason
-from densify.files.texts import read_json
+from densify.files.texts import parse_json, read_json
 from densify.types import Float
 
 _RECORD = re.compile(rb"\{[^{}]*\}")
@@ -92,8 +91,8 @@ def find_records(path: Path, key: str, wanted: Collection[str]) -> dict[str, Rec
             for match in _RECORD.finditer(data):
                 of = pattern.search(match[0])
                 if of and of[1] in names:
-                    found.append(json.loads(match[0]))
-    except (OSError, ValueError, RecursionError) as error:
+                    found.append(parse_json(match[0], path))
+    except (OSError, ValueError) as error:
         raise InputError(
             f"{path}: not a whole JSON table: {reason(error)}; fetch it again"
         ) from error
