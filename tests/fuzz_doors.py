@@ -94,9 +94,9 @@ def _points(path: Path) -> None:
 
 
 def _flow(path: Path) -> None:
-    from densify.readers.flow_files import _load
+    from densify.readers.flow_files import load_flow_file
 
-    _load(path)
+    load_flow_file(path)
 
 
 def _prior(path: Path) -> None:
