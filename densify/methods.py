@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 from densify.errors import InputError
@@ -44,3 +45,9 @@ def with_baselines(method: str) -> tuple[str, ...]:
     if method not in RUN:
         raise InputError(f"--method {method}: expected one of {', '.join(RUN)}")
     return RUN[: RUN.index(method) + 1]
+
+
+def engines(methods: Sequence[str], configured: str) -> list[str]:
+    """Which flow each method uses, "" for none. configured: ``flow.engine``."""
+    used = [METHODS[name].engine for name in methods if name in METHODS]
+    return ["" if engine is None else engine or configured for engine in used]

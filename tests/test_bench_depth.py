@@ -12,7 +12,8 @@ import pytest
 
 from densify import pipeline
 from densify.bench.depth import bench_depth
-from densify.cli import main, tables
+from densify.cli import bench_tables as tables
+from densify.cli import main
 from densify.config import resolve
 from densify.errors import InputError
 from tests.scenes import TinySequence

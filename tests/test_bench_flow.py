@@ -19,7 +19,8 @@ from densify.bench.memory import PeakMemory
 from densify.bench.pairs import Trace, pairs_of
 from densify.bench.scoring import Scorer
 from densify.bench.windows import Window
-from densify.cli import main, tables
+from densify.cli import bench_tables as tables
+from densify.cli import main
 from densify.config import resolve
 from densify.errors import InputError
 from densify.flow.objective.solvers import SolverSettings, solve

@@ -18,7 +18,8 @@ from typing import Any
 
 import pytest
 
-from densify.cli import verbs
+from densify.cli.answer import Answer
+from densify.cli.verbs import info
 from densify.errors import ComputationError
 from tests.command import exit_code, refused
 
@@ -31,13 +32,13 @@ def failing(error: BaseException) -> Any:
 
 
 def test_exit_codes(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    monkeypatch.setattr(verbs, "info", failing(ComputationError("registration: sweep 3\nis odd")))
+    monkeypatch.setattr(info, "answer", failing(ComputationError("registration: sweep 3\nis odd")))
     assert refused(capsys, 1, "info") == "densify: registration: sweep 3 is odd"
-    monkeypatch.setattr(verbs, "info", failing(KeyboardInterrupt()))
+    monkeypatch.setattr(info, "answer", failing(KeyboardInterrupt()))
     assert "interrupted" in refused(capsys, 130, "info")
-    monkeypatch.setattr(verbs, "info", failing(MemoryError()))
+    monkeypatch.setattr(info, "answer", failing(MemoryError()))
     assert "out of memory; try a smaller --window" in refused(capsys, 1, "info")
-    monkeypatch.setattr(verbs, "info", failing(PermissionError(13, "Permission denied", "/a/b")))
+    monkeypatch.setattr(info, "answer", failing(PermissionError(13, "Permission denied", "/a/b")))
     assert refused(capsys, 2, "info") == "densify: /a/b: Permission denied"
 
 
@@ -47,7 +48,7 @@ def test_what_nobody_foresaw_is_a_line_and_a_log(writable, monkeypatch, tmp_path
     folder.mkdir(mode=0o700 if writable else 0o777)
     folder.chmod(0o700 if writable else 0o777)  # a folder of everybody's is refused
     monkeypatch.setenv("DENSIFY_CACHE_DIR", str(folder))
-    monkeypatch.setattr(verbs, "info", failing(ZeroDivisionError("not foreseen")))
+    monkeypatch.setattr(info, "answer", failing(ZeroDivisionError("not foreseen")))
     line = refused(capsys, 1, "info")
     said = re.fullmatch(
         r"densify: this is a bug in densify; please report it with the log at (/\S+\.log)", line
@@ -88,10 +89,11 @@ def test_a_terminal_of_ascii_only() -> None:
 def test_warnings_of_others_are_not_shown(monkeypatch, capsys) -> None:
     import warnings
 
-    def warn(_: Any) -> None:
+    def warn(_: Any) -> list[Answer]:
         warnings.warn("divide by zero encountered", RuntimeWarning, stacklevel=1)
+        return []
 
-    monkeypatch.setattr(verbs, "info", warn)
+    monkeypatch.setattr(info, "answer", warn)
     assert exit_code("info") == 0
     assert capsys.readouterr() == ("", "")
 
@@ -155,11 +157,11 @@ def test_warnings_are_one_line_on_stderr(
 ) -> None:
     import logging
 
-    def warn(_: Any) -> None:
+    def warn(_: Any) -> list[Answer]:
         logging.getLogger("densify").warning("window cut to frames %d to %d", 0, 5)
-        print("result")
+        return [Answer("result")]
 
-    monkeypatch.setattr(verbs, "info", warn)
+    monkeypatch.setattr(info, "answer", warn)
     assert exit_code("info") == 0 and exit_code("info") == 0
     captured = capsys.readouterr()
     assert captured.out == "result\n" * 2
@@ -168,13 +170,15 @@ def test_warnings_are_one_line_on_stderr(
 
 def test_progress_shows_on_a_terminal_and_goes_away() -> None:
     code = (
-        "import sys; from densify.cli import main, verbs; from densify.cli.screen import *\n"
+        "import logging, sys; from densify.cli import main; from densify.cli.verbs import info\n"
+        "from densify.cli.progress import progress_on_stderr\n"
         "def verb(options):\n"
         "    with progress_on_stderr() as progress:\n"
         "        progress('register', 3, 11)\n"
         "        logging.getLogger('densify').warning('cut')\n"
         "        progress('project', 1, 2)\n"
-        "verbs.info = verb; sys.exit(main(['info']))"
+        "    return []\n"
+        "info.answer = verb; sys.exit(main(['info']))"
     )
     terminal, side = pty.openpty()
     fcntl.ioctl(side, termios.TIOCSWINSZ, struct.pack("HHHH", 24, 80, 0, 0))
@@ -191,8 +195,8 @@ def test_progress_shows_on_a_terminal_and_goes_away() -> None:
 @pytest.mark.parametrize("command", ["--help", "info"])
 def test_a_reader_that_stops_reading_is_no_error(command: str) -> None:
     code = (
-        "import sys; from densify import cli; from densify.cli import verbs\n"
-        "verbs.info = lambda options: print('result')\n"
+        "import sys; from densify import cli; from densify.cli.verbs import info\n"
+        "info.answer = lambda options: [cli.answer.Answer('result')]\n"
         "cli.script()"
     )
     reader, writer = os.pipe()
@@ -231,8 +235,8 @@ def test_interrupt_leaves_nothing(tmp_path: Path) -> None:
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
 def test_other_signals_end_it_as_cleanly(number: int) -> None:
     code = (
-        "import os, sys; from densify import cli; from densify.cli import verbs\n"
-        f"verbs.info = lambda options: os.kill(os.getpid(), {int(number)})\n"
+        "import os, sys; from densify import cli; from densify.cli.verbs import info\n"
+        f"info.answer = lambda options: os.kill(os.getpid(), {int(number)}) or []\n"
         "cli.script()"
     )
     for ignored, expected in ((False, 130), (True, 0)):

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from densify import types
-from densify.cli import tables
+from densify.cli import results as said
 
 
 def result_with(metrics: dict[str, Any], method: str, num_points: int) -> types.Result:
@@ -38,13 +38,13 @@ def result_with(metrics: dict[str, Any], method: str, num_points: int) -> types.
 
 
 def test_summary_says_the_numbers() -> None:
-    text = tables.summary(result_with({"ghosts": {"all": 0.0123}}, "icp", 1234))
+    text = said.summary(result_with({"ghosts": {"all": 0.0123}}, "icp", 1234))
     assert text.splitlines() == [
         "key 7, icp: 1,234 points of 3 sweeps (6-8), 2 on moving objects",
         "cam: depth in 5.0 % of the pixels, 50.0 % with filled ones",
         "ghosts: 1.23 % of the accumulated points",
     ]
-    assert "ghosts" not in tables.summary(result_with({"ghosts": {"all": None}}, "none", 2))
+    assert "ghosts" not in said.summary(result_with({"ghosts": {"all": None}}, "none", 2))
 
 
 def test_comparison_table_is_aligned_and_complete() -> None:
@@ -60,7 +60,7 @@ def test_comparison_table_is_aligned_and_complete() -> None:
         "icp": result_with(metrics, "icp", 1000),
         "flow": result_with({"ghosts": {"all": 0.001}, "depth": truth}, "flow", 999),
     }
-    lines = tables.comparison(results).splitlines()
+    lines = said.comparison(results).splitlines()
     cells = [re.split(r"\s{2,}", line) for line in lines]
     rows = {title: values for title, *values in cells}
     assert rows["points"] == ["10", "1,000", "999"]
@@ -72,7 +72,7 @@ def test_comparison_table_is_aligned_and_complete() -> None:
     assert rows["cam key held out, static, RMSE"] == ["-"] * 3
     assert len({len(line) for line in lines if line}) == 1
     without = {m: result_with({"ghosts": {"all": 0.0}}, m, 5) for m in ("none", "icp", "flow")}
-    assert "MAE" not in tables.comparison(without)
+    assert "MAE" not in said.comparison(without)
 
 
 def test_summary_compares_the_key_held_out_with_registration_alone() -> None:
@@ -82,21 +82,21 @@ def test_summary_compares_the_key_held_out_with_registration_alone() -> None:
 
     icp = result_with(scored(all=0.02, moving=0.3), "icp", 9)
     flow = result_with(scored(all=0.01, moving=0.05), "flow", 9)
-    last = tables.summary(replace(flow, baselines={"icp": icp})).splitlines()[-1]
+    last = said.summary(replace(flow, baselines={"icp": icp})).splitlines()[-1]
     assert last == (
         "cam, key held out: 1.00 % wrong (2.00 % by registration alone), "
         "5.00 % wrong (30.00 % by registration alone) where it moves"
     )
     still = result_with(scored(all=0.01, moving=None), "icp", 9)
-    assert tables.summary(still).splitlines()[-1] == "cam, key held out: 1.00 % wrong"
+    assert said.summary(still).splitlines()[-1] == "cam, key held out: 1.00 % wrong"
     nothing = result_with({"ghosts": {"all": 0.01}, "held_out": None}, "none", 9)
-    assert "held out" not in tables.summary(nothing)
+    assert "held out" not in said.summary(nothing)
 
 
 def test_movers_apart_are_counted_beside_the_rest() -> None:
     result = result_with({}, "flow", 1234)
     still = replace(result.cloud, moving=np.zeros(1234, bool))
     movers = {i: types.Mover(result.cloud.select(result.cloud.frame == 0), {}) for i in (0, 3)}
-    text = tables.summary(replace(result, cloud=still, movers=movers))
+    text = said.summary(replace(result, cloud=still, movers=movers))
     num = 2 * int((result.cloud.frame == 0).sum())
     assert f"(6-8), {num:,} more apart, on 2 moving objects" in text and num > 0

@@ -449,9 +449,10 @@ def work(options):
         if "write" in plan:
             asides = [place.with_suffix(".aside") for place in places]
             print(*run_tasks([Task((a,), worker_tasks.write_aside, (a,)) for a in asides], workers))
+    return []
 
 class Options:
-    verb = staticmethod(work)
+    name, verb = "work", staticmethod(work)
 
 cli.parse = lambda _: Options
 cli.script()

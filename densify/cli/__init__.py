@@ -16,7 +16,7 @@ from collections.abc import Sequence
 from typing import NoReturn, TextIO
 
 from densify.cli.arguments import parse
-from densify.cli.screen import logging_to_stderr
+from densify.cli.screen import Screen
 from densify.errors import ComputationError, InputError
 
 DONE, FAILED, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
@@ -28,33 +28,32 @@ def main(arguments: Sequence[str] | None = None) -> int:
     0 done; 1 a ComputationError, or anything unforeseen, whose traceback is put into a file; 2 an
     InputError or what the system refuses (argparse exits with 2 as well); 130 interrupted.
     """
-    with logging_to_stderr() as log:
+    with Screen() as screen:
         try:
-            _run(arguments)
+            _run(arguments, screen)
+            return screen.end(DONE)
         except InputError as error:
-            log.error("%s", error)
-            return BAD_INPUT
+            return screen.end(BAD_INPUT, str(error))
         except ComputationError as error:
-            log.error("%s", error)
-            return FAILED
+            return screen.end(FAILED, str(error))
         except KeyboardInterrupt:
-            log.error("interrupted; what was unfinished is not kept")
-            return INTERRUPTED
+            return screen.end(INTERRUPTED, "interrupted; what was unfinished is not kept")
         except BrokenPipeError:
             _let_go_of(sys.stdout)  # its reader has seen enough
+            return DONE
         except OSError as error:
             _let_go_of(sys.stdout)
-            log.error("%s: %s", error.filename or "stdout", error.strerror or error)
-            return BAD_INPUT
+            said = f"{error.filename or 'stdout'}: {error.strerror or error}"
+            return screen.end(BAD_INPUT, said)
         except MemoryError:
-            log.error("out of memory; try a smaller --window, fewer --workers or one --camera")
-            return FAILED
+            advice = "try a smaller --window, fewer --workers or one --camera"
+            return screen.end(FAILED, f"out of memory; {advice}")
         except Exception as error:
             from densify.cli.bugs import kept
 
-            log.error("this is a bug in densify; please report it with the log at %s", kept(error))
-            return FAILED
-    return DONE
+            log = kept(error)
+            said = f"this is a bug in densify; please report it with the log at {log}"
+            return screen.end(FAILED, said)
 
 
 def script() -> NoReturn:
@@ -99,11 +98,12 @@ def _let_go_of(stream: TextIO) -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
-def _run(arguments: Sequence[str] | None) -> None:
+def _run(arguments: Sequence[str] | None, screen: Screen) -> None:
     try:
         options = parse(arguments)
     except SystemExit:  # help, version or a bad argument; a closed stdout shows only on flushing
         sys.stdout.flush()
         raise
-    options.verb(options)
-    sys.stdout.flush()
+    screen.heed(options)
+    for answer in options.verb(options):
+        screen.show(answer)

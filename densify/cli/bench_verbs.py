@@ -4,21 +4,24 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Iterator
+from pathlib import Path
 
-from densify.cli.screen import print_paths, progress_on_stderr
+from densify.cli.answer import Answer
+from densify.cli.progress import progress_on_stderr
 from densify.config import as_mapping, resolve
 
 _DEFAULT_KEY = 120
 _MIDDLE_KEY = 80  # of the street's 160 frames
 
 
-def bench_confidence(options: argparse.Namespace) -> None:
+def bench_confidence(options: argparse.Namespace) -> Iterator[Answer]:
     """The tables that turn a rank into a probability, and how far they hold."""
     config = resolve(options.config, options.overrides)
     from densify.bench import confidence as bench
     from densify.bench.table_file import write_table
+    from densify.cli.bench_tables import reliability_tables
     from densify.cli.point_files import check_new_file
-    from densify.cli.tables import reliability_tables
     from densify.readers import open_sequence
 
     if options.out is not None:
@@ -31,21 +34,20 @@ def bench_confidence(options: argparse.Namespace) -> None:
         measured = bench.bench_confidence(
             fitted, checked, options.window, config, options.cameras, progress
         )
-    print(reliability_tables(measured["reliability"]), flush=True)
     if options.out is not None:
         write_table(options.out, {**measured, "config": as_mapping(config)})
-        print_paths([options.out])
+    yield Answer(reliability_tables(measured["reliability"]), measured, _files(options))
 
 
-def bench_depth(options: argparse.Namespace) -> None:
+def bench_depth(options: argparse.Namespace) -> Iterator[Answer]:
     """Depth maps of several configurations against every truth."""
     variants = {"as configured": resolve(options.config, options.overrides)}
     for name, *changes in options.variant:
         variants[name] = resolve(options.config, [*options.overrides, *changes])
     from densify.bench import depth as bench
     from densify.bench.table_file import write_table
+    from densify.cli.bench_tables import depth_table
     from densify.cli.point_files import check_new_file
-    from densify.cli.tables import depth_table
     from densify.readers import open_sequence
 
     if options.out is not None:
@@ -61,15 +63,14 @@ def bench_depth(options: argparse.Namespace) -> None:
             options.method,
             progress,
         )
-    print(depth_table(measured), flush=True)
     if options.out is not None:
         write_table(
             options.out, {**measured, "config": {n: as_mapping(c) for n, c in variants.items()}}
         )
-        print_paths([options.out])
+    yield Answer(depth_table(measured), measured, _files(options))
 
 
-def bench_doctor(options: argparse.Namespace) -> None:
+def bench_doctor(options: argparse.Namespace) -> Iterator[Answer]:
     """Which mistakes, made on purpose in good recordings, doctor names."""
     config = resolve(options.config, options.overrides)
     from densify.bench import faults as bench
@@ -84,19 +85,19 @@ def bench_doctor(options: argparse.Namespace) -> None:
     for spec in options.data or ["street"]:
         with progress_on_stderr() as progress:
             found[spec] = bench.bench_doctor(open_sequence(spec), config, progress)
-        print(fault_table(spec, found[spec]) + "\n", flush=True)
+        yield Answer(fault_table(spec, found[spec]) + "\n")
     if options.out is not None:
         write_table(options.out, {"recordings": found})
-        print_paths([options.out])
+    yield Answer(facts={"recordings": found}, files=_files(options))
 
 
-def bench_memory(options: argparse.Namespace) -> None:
+def bench_memory(options: argparse.Namespace) -> Iterator[Answer]:
     """Peak memory of runs, and what is said of it before."""
     config = resolve(options.config, options.overrides)
     from densify.bench import peaks as bench
     from densify.bench.table_file import write_table
+    from densify.cli.bench_tables import memory_table
     from densify.cli.point_files import check_new_file
-    from densify.cli.tables import memory_table
 
     if options.out is not None:
         check_new_file(options.out, options.overwrite, ".json")
@@ -108,19 +109,18 @@ def bench_memory(options: argparse.Namespace) -> None:
     with progress_on_stderr() as progress:
         key = (options.keys or [_MIDDLE_KEY])[0]
         rows = bench.bench_memory(key, config, cases, progress)
-    print(memory_table(rows))
     if options.out is not None:
         write_table(options.out, {"key": key, "runs": rows, "config": as_mapping(config)})
-        print_paths([options.out])
+    yield Answer(memory_table(rows), {"key": key, "runs": rows}, _files(options))
 
 
-def bench_flow(options: argparse.Namespace) -> None:
+def bench_flow(options: argparse.Namespace) -> Iterator[Answer]:
     """Scene flow methods on the same pairs and windows."""
     config = resolve(options.config, options.overrides)
     from densify.bench import flow as bench
     from densify.bench.table_file import write_table
+    from densify.cli.bench_tables import flow_table
     from densify.cli.point_files import check_new_file
-    from densify.cli.tables import flow_table
     from densify.readers import open_sequence
 
     if options.out is not None:
@@ -145,16 +145,20 @@ def bench_flow(options: argparse.Namespace) -> None:
                     options.truth,
                 )
             runs.append(measured)
-            print(flow_table(measured) + "\n", flush=True)
+            yield Answer(flow_table(measured) + "\n", {"runs": [measured]})
     if options.out is not None:
         write_table(options.out, {"runs": runs, "config": as_mapping(config)})
-        print_paths([options.out])
+    yield Answer(files=_files(options))
 
 
-def bench_readme(options: argparse.Namespace) -> None:
+def bench_readme(options: argparse.Namespace) -> Iterator[Answer]:
     """The tables of the documentation, made again."""
     from densify.bench.readme import tables
 
     with progress_on_stderr() as progress:
         for line in tables(options.tables, options.kitti, options.pandaset, progress):
-            print(line, flush=True)
+            yield Answer(line, {"lines": [line]})
+
+
+def _files(options: argparse.Namespace) -> list[Path]:
+    return [] if options.out is None else [options.out]

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import json
 import textwrap
 from collections.abc import Mapping
 from typing import Any
@@ -32,26 +31,22 @@ def diagnosis_table(diagnosis: Diagnosis) -> str:
     return "\n".join([*lines, "", ", ".join(f"{n} {v}" for v, n in counts.items())])
 
 
-def diagnosis_json(diagnosis: Diagnosis) -> str:
+def diagnosis_facts(diagnosis: Diagnosis) -> dict[str, Any]:
     """The findings with their values, for programs."""
-    return json.dumps(
-        {
-            "schema": 1,
-            "recording": diagnosis.sample.sequence.name,
-            "worst": str(diagnosis.worst),
-            "findings": [
-                {
-                    "check": f.check,
-                    "verdict": str(f.verdict),
-                    "evidence": f.evidence,
-                    "remedy": f.remedy,
-                    "values": plain(f.values),
-                }
-                for f in diagnosis.findings
-            ],
-        },
-        indent=1,
-    )
+    return {
+        "recording": diagnosis.sample.sequence.name,
+        "worst": str(diagnosis.worst),
+        "findings": [
+            {
+                "check": f.check,
+                "verdict": str(f.verdict),
+                "evidence": f.evidence,
+                "remedy": f.remedy,
+                "values": plain(f.values),
+            }
+            for f in diagnosis.findings
+        ],
+    }
 
 
 def fault_table(spec: str, measured: Mapping[str, Any]) -> str:

@@ -5,15 +5,27 @@ from __future__ import annotations
 
 import argparse
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from densify.config import presets
+from densify.cli.answer import Answer
+from densify.config import Config, presets, resolve
+from densify.errors import InputError
 from densify.plugins.engines import described
+
+if TYPE_CHECKING:
+    from densify.cache import Cache
+    from densify.types import LidarSequence
 
 _MOST_DIGITS = 18
 _UNITS = ("K", "M", "G", "T")
+_SHORT = {
+    "flow": "flow.engine",
+    "at": "project.at",
+    "movers": "output.movers",
+    "per": "project.per",
+}
 DATA_HELP = (
     "a recording's folder, READER:PATH, or the built-in "
     "street[:PRESET][?seed=N&sensor=NAME&hz=RATE&tilt=DEG] (default: street)"
@@ -23,7 +35,7 @@ DATA_HELP = (
 def add_verb(
     commands: Any,
     name: str,
-    verb: Callable[[argparse.Namespace], None],
+    verb: Callable[[argparse.Namespace], Iterable[Answer]],
     about: str,
     epilog: str = "",
 ) -> argparse.ArgumentParser:
@@ -31,7 +43,9 @@ def add_verb(
     parser: argparse.ArgumentParser = commands.add_parser(
         name, help=about, description=f"{about[0].upper()}{about[1:]}.", epilog=epilog or None
     )
-    parser.set_defaults(verb=verb)
+    parser.set_defaults(verb=verb, name=name)
+    parser.add_argument("--json", action="store_true", help="print one JSON object, nothing else")
+    parser.add_argument("--quiet", action="store_true", help="say nothing but errors")
     return parser
 
 
@@ -122,6 +136,29 @@ def add_config_options(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def add_key_options(parser: argparse.ArgumentParser) -> None:
+    """What ``run`` and ``compare`` share."""
+    add_window(parser)
+    parser.add_argument(
+        "--cache",
+        action="store_true",
+        help="keep poses, ground, evidence and motion on disk, and take what an earlier run with "
+        "the same sweeps and settings left there (default: nothing is kept, since hashing and "
+        "writing cost more than a single run gains)",
+    )
+    parser.add_argument(
+        "--cache-size",
+        type=size_bytes,
+        default="10G",
+        metavar="SIZE",
+        help="bound of what --cache keeps (default: 10G)",
+    )
+    parser.add_argument("--data", metavar="SPEC", default="street", help=DATA_HELP)
+    add_camera(parser)
+    add_short_options(parser)
+    add_config_options(parser)
+
+
 def add_output_options(parser: argparse.ArgumentParser) -> None:
     """``--out`` of a run, and ``--overwrite``"""
     parser.add_argument(
@@ -139,6 +176,38 @@ def add_overwrite(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--overwrite", action="store_true", help="replace what is already there (default: keep it)"
     )
+
+
+def config_of(options: argparse.Namespace) -> Config:
+    """The configuration with the options that are short for a knob."""
+    given = {knob: getattr(options, name) for name, knob in _SHORT.items()}
+    named = [f"{knob}={value}" for knob, value in given.items() if value is not None]
+    if options.report:
+        named += ["output.report=true", "output.rejected=true"]
+    return resolve(options.config, [*options.overrides, *named])
+
+
+def cache_of(options: argparse.Namespace) -> Cache | None:
+    """What ``--cache`` keeps."""
+    if not options.cache:
+        return None
+    from densify.cache import Cache
+
+    return Cache(options.cache_size)
+
+
+def sliced(sequence: LidarSequence, keys: slice) -> list[int]:
+    """The frames of ``--keys``. Raises InputError if there is none."""
+    from densify.readers.files import format_frames
+
+    chosen = frozenset(range(keys.start, keys.stop, keys.step or 1))
+    there = [frame for frame in sequence.frames if frame in chosen]
+    if not there:
+        raise InputError(
+            f"--keys {keys.start}:{keys.stop}: {sequence.name} has no sweep among them; it has "
+            f"{format_frames(sequence.frames)}"
+        )
+    return there
 
 
 def natural(text: str) -> int:

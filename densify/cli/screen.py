@@ -1,133 +1,131 @@
 # SPDX-License-Identifier: MIT
-"""What goes to stderr: log lines and progress bars that don't run into each other."""
+"""What a command shows: answers on stdout; log lines and the one error on stderr."""
 
 from __future__ import annotations
 
+import argparse
+import json
 import logging
 import sys
-import time
 import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterable
+from contextlib import AbstractContextManager, ExitStack, nullcontext, suppress
+from types import TracebackType
+from typing import Any
 
+from densify.cli.answer import Answer
 from densify.errors import brief
 
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
-    from pathlib import Path
-
-    from densify.dataset.make import Summary
-    from densify.types import Progress
-
-_LINE_EVERY_S = 30.0
+_SCHEMA = 1
+"""Version of what ``--json`` prints; grows when a key changes its meaning or goes."""
 
 
-class _LineHandler(logging.Handler):
-    """One line per record; printed above a progress bar if there is one."""
+class Screen:
+    """Shows what one command says while it is entered: as text, as one JSON object at the end
+    (``--json``), or nothing but errors (``--quiet``)."""
+
+    def __init__(self) -> None:
+        self._json = self._quiet = False
+        self._facts: dict[str, Any] = {}
+        self._lines = _Lines()
+        self._left = ExitStack()
+
+    def heed(self, options: argparse.Namespace) -> None:
+        """Take ``--json`` and ``--quiet`` of a command that has them."""
+        self._json = getattr(options, "json", False)
+        self._quiet = getattr(options, "quiet", False)
+        if self._quiet:
+            self._lines.least_shown = logging.ERROR
+            logging.getLogger("densify.progress").setLevel(logging.ERROR)
+        self._facts = {"schema": _SCHEMA, "verb": options.name, "files": [], "open_first": []}
+
+    def show(self, answer: Answer) -> None:
+        """Print it, or keep it for the end."""
+        if self._json:
+            files = {"files": answer.files, "open_first": [*answer.first]}
+            for name, value in {**answer.facts, **files}.items():
+                joined = isinstance(value, list | tuple) and name in self._facts
+                self._facts[name] = [*self._facts[name], *value] if joined else value
+        elif not self._quiet:
+            with _above_bars():
+                for line in answer.lines():
+                    print(line)
+                sys.stdout.flush()
+
+    def end(self, exit_code: int, error: str | None = None) -> int:
+        """Say what went wrong, and with ``--json`` all there is to say; gives the code back."""
+        if error is not None:
+            logging.getLogger("densify").error("%s", error)
+        if self._json:
+            outcome = {"exit_code": exit_code, "error": error, "warnings": self._lines.warnings}
+            self._print_json({**self._facts, **outcome})
+        return exit_code
+
+    def _print_json(self, facts: dict[str, Any]) -> None:
+        from densify.outputs.plain import plain
+
+        print(json.dumps(plain(facts), indent=1, allow_nan=False, default=str))
+        sys.stdout.flush()
+
+    def __enter__(self) -> Screen:
+        """The package's logger writes to stderr; what takes long, on a terminal or where the level
+        of ``densify.progress`` says so."""
+        log, progress = logging.getLogger("densify"), logging.getLogger("densify.progress")
+        before = log.level, log.propagate, progress.level
+        log.addHandler(self._lines)
+        log.setLevel(logging.INFO)
+        log.propagate = False
+        if not progress.level:
+            progress.setLevel(logging.INFO if sys.stderr.isatty() else logging.WARNING)
+
+        def undo() -> None:
+            log.removeHandler(self._lines)
+            log.setLevel(before[0])
+            log.propagate = before[1]
+            progress.setLevel(before[2])
+
+        self._left.callback(undo)
+        self._left.enter_context(warnings.catch_warnings())
+        warnings.showwarning = _log_warning  # type: ignore[assignment]
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._left.close()
+
+
+class _Lines(logging.Handler):
+    """One line per record, printed above a progress bar if there is one; keeps the warnings."""
+
+    def __init__(self) -> None:
+        super().__init__(logging.INFO)
+        self.least_shown = logging.INFO
+        self.warnings: list[str] = []
 
     def emit(self, record: logging.LogRecord) -> None:
-        level = "warning: " if record.levelno == logging.WARNING else ""
-        line = f"densify: {level}{brief(' '.join(record.getMessage().split()))}"
-        bars = sys.modules.get("tqdm")
-        with suppress(OSError, ValueError):  # full or closed: there is nobody to tell
-            if bars is None:
-                print(line, file=sys.stderr, flush=True)
-            else:
-                bars.tqdm.write(line, file=sys.stderr)
+        text = brief(" ".join(record.getMessage().split()))
+        if record.levelno == logging.WARNING:
+            self.warnings.append(text)
+        if record.levelno < self.least_shown:
+            return
+        line = f"densify: {'warning: ' if record.levelno == logging.WARNING else ''}{text}"
+        with suppress(OSError, ValueError), _above_bars():  # full or closed: nobody to tell
+            print(line, file=sys.stderr, flush=True)
+
+
+def _above_bars() -> AbstractContextManager[None]:
+    """Progress bars go away within the block."""
+    bars = sys.modules.get("tqdm")
+    return nullcontext() if bars is None else bars.tqdm.external_write_mode(sys.stderr)
 
 
 def _log_warning(message: Warning | str, category: type[Warning], *where: Any) -> None:
     """What numpy and others warn of is for who mends this package."""
     logging.getLogger("densify").debug("%s: %s (%s:%s)", category.__name__, message, *where[:2])
-
-
-@contextmanager
-def logging_to_stderr() -> Iterator[logging.Logger]:
-    """The package's logger writes to stderr inside the block; what takes long, on a terminal or
-    where the level of ``densify.progress`` says so."""
-    log, progress = logging.getLogger("densify"), logging.getLogger("densify.progress")
-    handler, before = _LineHandler(), (log.level, log.propagate, progress.level)
-    handler.setLevel(logging.INFO)
-    log.addHandler(handler)
-    log.setLevel(logging.INFO)
-    log.propagate = False
-    if not progress.level:
-        progress.setLevel(logging.INFO if sys.stderr.isatty() else logging.WARNING)
-    try:
-        with warnings.catch_warnings():
-            warnings.showwarning = _log_warning  # type: ignore[assignment]
-            yield log
-    finally:
-        log.removeHandler(handler)
-        log.setLevel(before[0])
-        log.propagate = before[1]
-        progress.setLevel(before[2])
-
-
-@contextmanager
-def progress_on_stderr() -> Iterator[Progress | None]:
-    """One bar, renamed as the stages go by; None where stderr is no terminal."""
-    if not sys.stderr.isatty():
-        yield None
-        return
-    from tqdm import tqdm
-
-    layout = "{desc:<12} {percentage:3.0f}%|{bar}| {n_fmt}/{total_fmt} [{elapsed}]"
-    with tqdm(total=1, file=sys.stderr, leave=False, bar_format=layout) as bar:
-
-        def show(stage: str, done: int, total: int) -> None:
-            if bar.desc.rstrip(": ") != stage:
-                bar.reset(total)
-                bar.set_description(stage, refresh=False)
-            bar.total, bar.n = total, done
-            bar.refresh()
-
-        yield show
-
-
-@contextmanager
-def keys_on_stderr() -> Iterator[Callable[[Summary], None]]:
-    """Keys done, rate, time left and scores so far: a bar on a terminal, else a line now and
-    then."""
-    from densify.cli.sets import set_scores
-
-    if sys.stderr.isatty():
-        from tqdm import tqdm
-
-        layout = "{percentage:3.0f}%|{bar}| {n_fmt}/{total_fmt} keys [{elapsed}, {desc}]"
-        with tqdm(file=sys.stderr, bar_format=layout) as bar:
-
-            def show(summary: Summary) -> None:
-                bar.total, bar.n = summary.num_keys, len(summary.records)
-                bar.set_description_str(f"{_pace(summary)}, {set_scores(summary)}")
-
-            yield show
-        return
-    shown_s = time.monotonic()
-
-    def tell(summary: Summary) -> None:
-        nonlocal shown_s
-        if time.monotonic() > shown_s + _LINE_EVERY_S:
-            shown_s = time.monotonic()
-            count = f"{len(summary.records)} of {summary.num_keys} keys"
-            print(f"densify: {count}, {_pace(summary)}, {set_scores(summary)}", file=sys.stderr)
-
-    yield tell
-
-
-def _pace(summary: Summary) -> str:
-    if not summary.num_made:
-        return "the first is being made"
-    left_s = summary.seconds_left or 0.0
-    left = f"{left_s / 60:.0f} min" if left_s < 6000 else f"{left_s / 3600:.1f} h"
-    return f"{summary.seconds / max(1, summary.num_made):.2f} s a key, {left} left"
-
-
-def print_paths(paths: list[Path]) -> None:
-    """One to a line, on stdout."""
-    for path in paths:
-        print(path)
 
 
 def tell_doubts(doubts: Iterable[tuple[str, str, int]], most: int = 20) -> None:

@@ -4,11 +4,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from densify.dataset.make import Summary
 
+FIRST_OF_SET = {
+    "README.txt": "what the set holds and how to read it",
+    "manifest.jsonl": "every key with its files and scores",
+    "dataset.json": "how it was made",
+}
 _MOST_SHOWN = 20
 
 
@@ -36,6 +41,23 @@ def set_summary(summary: Summary) -> str:
 def set_status(summary: Summary, last_lines: Sequence[str]) -> str:
     """Describe a set that may still be at work; last_lines: of its logs."""
     return "\n".join([set_summary(summary), *(f"log: {line}" for line in last_lines)])
+
+
+def set_facts(summary: Summary) -> dict[str, Any]:
+    """The same for programs."""
+    missing = [r for r in summary.records.values() if r.status != "done"]
+    return {
+        "num_keys": summary.num_keys,
+        **{f"num_{status}": summary.count(status) for status in ("done", "aside", "failed")},
+        "num_left": summary.num_left,
+        "num_made": summary.num_made,
+        "seconds": summary.seconds,
+        "means": {score: summary.mean(score) for score in ("density", "ghost", "outliers")},
+        "missing": [
+            {"drive": r.drive, "key": r.key, "status": r.status, "reason": r.reason}
+            for r in missing
+        ],
+    }
 
 
 def set_scores(summary: Summary) -> str:

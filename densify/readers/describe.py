@@ -13,7 +13,18 @@ from densify.types import LidarSequence, SaysWhatItFound, Sweep
 
 
 def describe(sequence: LidarSequence) -> str:
-    """Frames, rate, points, cameras, stamps, poses and truth of a recording, one line each, and
+    """What `findings` says, a line each."""
+    return in_lines(findings(sequence))
+
+
+def in_lines(lines: Sequence[tuple[str, str]]) -> str:
+    """A name and what is said of it to a line."""
+    width = max(len(label) for label, _ in lines) + 2
+    return "\n".join(f"{label:<{width}}{text}" for label, text in lines)
+
+
+def findings(sequence: LidarSequence) -> list[tuple[str, str]]:
+    """Frames, rate, points, cameras, stamps, poses and truth of a recording, by their names, and
     what its reader had to find out.
 
     Loads the first and the last sweep and no image. Rates are those of the median time from one
@@ -21,7 +32,7 @@ def describe(sequence: LidarSequence) -> str:
     """
     first = sequence[sequence.frames[0]]
     last = sequence[sequence.frames[-1]] if len(sequence.frames) > 1 else first
-    lines = [
+    return [
         ("name", sequence.name),
         ("frames", _frames(sequence)),
         ("rate", _rate(sequence)),
@@ -33,8 +44,6 @@ def describe(sequence: LidarSequence) -> str:
         ("truth", "none" if sequence.truth is None else "exact, simulated"),
         *(sequence.findings() if isinstance(sequence, SaysWhatItFound) else ()),
     ]
-    width = max(len(label) for label, _ in lines) + 2
-    return "\n".join(f"{label:<{width}}{text}" for label, text in lines)
 
 
 def _frames(sequence: LidarSequence) -> str:

@@ -1,13 +1,14 @@
 # SPDX-License-Identifier: MIT
-"""Options of ``densify dataset``."""
+"""``densify dataset``: every key of whole recordings."""
 
 from __future__ import annotations
 
 import argparse
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from densify.cli import verbs
+from densify.cli.answer import Answer, first_of
 from densify.cli.options import (
     DATA_HELP,
     add_camera,
@@ -17,18 +18,23 @@ from densify.cli.options import (
     add_verb,
     add_window,
     config_epilog,
+    config_of,
     key_slice,
     natural,
     shard,
     size_bytes,
 )
+from densify.cli.progress import keys_on_stderr
+from densify.cli.screen import tell_doubts
+from densify.errors import ComputationError, InputError
 
 
-def add_dataset(commands: Any) -> None:
+def add(commands: Any) -> None:
+    """Its options."""
     parser = add_verb(
         commands,
         "dataset",
-        verbs.dataset,
+        answer,
         "every key of whole recordings, as a training set",
         "Run again, the same command goes on where it was stopped. Shares are from 0 to 1. "
         + config_epilog(),
@@ -143,3 +149,60 @@ def _add_workers(parser: argparse.ArgumentParser) -> None:
         metavar="SIZE",
         help="of what is kept on disk for later runs (default: 10G)",
     )
+
+
+def answer(options: argparse.Namespace) -> Iterator[Answer]:
+    """Every key of whole recordings, or how far that is."""
+    from densify.cli.sets import FIRST_OF_SET, set_facts, set_status, set_summary
+
+    if options.status is not None:
+        from densify.dataset.make import damaged, status
+
+        so_far, last_lines = status(options.status)
+        files = damaged(options.status) if options.verify else []
+        text = "\n".join([set_status(so_far, last_lines), *(f"damaged: {name}" for name in files)])
+        yield Answer(text, {**set_facts(so_far), "damaged": files})
+        if files:
+            raise ComputationError(
+                f"--verify: {len(files)} damaged or missing files in {options.status}; run the "
+                f"command that made the set again with --verify, which makes them anew"
+            )
+        return
+    if options.out is None:
+        raise InputError("--out DIR: expected the set's folder, a new one or one to go on with")
+    config = config_of(options)
+    from densify.dataset.gate import Gate
+    from densify.dataset.make import make_dataset
+    from densify.dataset.plan import Recipe
+
+    limits = ("max_ghost", "min_density", "max_outliers", "min_sweeps")
+    recipe = Recipe(
+        window=options.window,
+        method=options.method,
+        layout=options.layout,
+        cameras=None if options.cameras is None else tuple(options.cameras),
+        split=options.split,
+        gate=Gate(**{limit: getattr(options, limit) for limit in limits}),
+        config=config,
+    )
+    with keys_on_stderr() as report:
+        summary = make_dataset(
+            options.data or ["street"],
+            options.out,
+            options.keys,
+            recipe,
+            num_workers=options.workers,
+            scheduler=options.scheduler,
+            shard=options.shard,
+            memory_bytes=options.memory,
+            cache_bytes=options.cache_size,
+            verify=options.verify,
+            links=options.links,
+            report=report,
+        )
+    told = [options.out / name for name in FIRST_OF_SET if (options.out / name).is_file()]
+    first = first_of(told, FIRST_OF_SET)
+    yield Answer(set_summary(summary), set_facts(summary), [options.out], first)
+    tell_doubts((w, r.drive, r.key) for r in summary.records.values() for w in r.warnings)
+    if summary.count("failed"):
+        raise ComputationError(f"{summary.count('failed')} of {summary.num_keys} keys not made")

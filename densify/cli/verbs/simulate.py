@@ -1,0 +1,107 @@
+# SPDX-License-Identifier: MIT
+"""``densify simulate``: the built-in street in a data set's own format."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from densify.cli.answer import Answer
+from densify.cli.options import add_camera, add_overwrite, add_verb, frame_range, natural
+from densify.cli.progress import progress_on_stderr
+from densify.errors import InputError
+
+if TYPE_CHECKING:
+    from densify.types import LidarSequence
+
+
+def add(commands: Any) -> None:
+    """Its options."""
+    about = "write the built-in street in a data set's format with exact ground truth"
+    parser = add_verb(commands, "simulate", answer, about)
+    parser.add_argument("--out", metavar="DIR", type=Path, required=True, help="folder to make")
+    parser.add_argument(
+        "--format",
+        default="kitti",
+        metavar="NAME",
+        help="the format to write: kitti (default), folder, ros1, ros2, argoverse2, "
+        "kitti-odometry, kitti-tracking, kitti-360, nuscenes, opensceneflow, waymo, dgp, pandaset",
+    )
+    parser.add_argument(
+        "--preset",
+        default="street",
+        metavar="NAME",
+        help="street, static, crossing or highway (default: street)",
+    )
+    parser.add_argument(
+        "--sensor",
+        metavar="NAME",
+        help="the scanner: hdl64, hdl32, vlp16, os128, vls128, dual32, panda, pandaset, "
+        "rosette (default: hdl64)",
+    )
+    parser.add_argument(
+        "--hz",
+        choices=("5", "10", "20"),
+        help="sweeps per second (default: 10); at 20 Hz a scanner "
+        "measures half the columns in a sweep, at 5 Hz twice as many",
+    )
+    parser.add_argument(
+        "--tilt", metavar="DEG", help="pitch of the scanner's mount, nose down (default: 0)"
+    )
+    parser.add_argument("--seed", type=natural, metavar="N", help="another seed, another street")
+    parser.add_argument(
+        "--frames", type=frame_range, metavar="A:B", help="frames A to B-1 only (default: all)"
+    )
+    add_camera(parser)
+    add_overwrite(parser)
+
+
+def answer(options: argparse.Namespace) -> Iterator[Answer]:
+    """The built-in street in a data set's format, with truth."""
+    from densify.readers.street import Street
+    from densify.writers import write_street
+
+    street = Street.from_spec(_street_spec(options))
+    frames = _frames_of(street, options.frames)
+    cameras = _cameras_of(street, options.cameras)
+    with progress_on_stderr() as progress:
+        place = write_street(
+            options.format,
+            street,
+            options.out,
+            frames,
+            cameras,
+            progress,
+            overwrite=options.overwrite,
+        )
+    text = f"{len(frames)} frames; open them with --data {place}"
+    yield Answer(text, {"data": str(place), "num_frames": len(frames)})
+
+
+def _street_spec(options: argparse.Namespace) -> str:
+    preset = options.preset.removeprefix("street:")
+    name = "street" if preset == "street" else f"street:{preset}"
+    keys = ("seed", "sensor", "hz", "tilt")
+    query = [f"{k}={v}" for k in keys if (v := getattr(options, k)) is not None]
+    return f"{name}?{'&'.join(query)}" if query else name
+
+
+def _frames_of(street: LidarSequence, wanted: range | None) -> list[int]:
+    frames = list(street.frames)
+    if wanted is None:
+        return frames
+    if wanted[0] < frames[0] or wanted[-1] > frames[-1]:
+        raise InputError(
+            f"--frames {wanted.start}:{wanted.stop}: expected frames within "
+            f"{frames[0]}:{frames[-1] + 1}"
+        )
+    return list(wanted)
+
+
+def _cameras_of(street: LidarSequence, wanted: list[str] | None) -> list[str]:
+    for name in wanted or ():
+        if name not in street.cameras:
+            raise InputError(f"--camera {name}: expected one of {', '.join(street.cameras)}")
+    return list(street.cameras) if wanted is None else wanted
