@@ -450,6 +450,30 @@ def test_a_swinging_limb_ends_where_the_key_sweep_saw_past_it(moves):
     assert near[:, 61:64].any() != moves  # of what stands still every sweep tells
 
 
+@pytest.mark.parametrize("moves", [True, False])
+def test_what_the_key_sweep_should_have_met_on_a_mover_is_not_taken_from_others(moves):
+    """It has one ray of three by three pixels. In a hole of nine by nine two went past the mover:
+    what other sweeps saw there is out as far as the rays that met it are clearly farther away."""
+    camera = make_camera(120, 90, 300.0)
+    v, u = np.mgrid[0:90, 40:80]
+    hole = (abs(u - 60) <= 4) & (abs(v - 45) <= 4)
+    met = ~hole & (u % 3 == 0) & (v % 3 == 0)
+    frame = np.repeat(SWEEPS, u.size)
+    seen = np.where(frame == KEY, np.tile(met.ravel(), len(SWEEPS)), True)
+    points = np.concatenate([at_pixel(camera, u, v, 10.0)] * len(SWEEPS))[seen]
+    past = at_pixel(camera, [57, 63], 45, 20.0)
+    frame = [*frame[seen], KEY, KEY]
+    moving = np.arange(len(frame)) < seen.sum() if moves else False
+    knobs = ProjectSettings(edge_reach=0.0, edge_slack_m=0.0, rims="keep", spot=0.0)
+    points = np.vstack([points, past])
+    depth = see(camera, points, frame, knobs, (3.0, 3.0), moving=moving)
+    near = abs(depth.depth_m - 10) < 1
+    beside = np.ix_([44, 46], [56, 57, 63, 64])
+    assert near[beside].any() != moves
+    assert near[beside].all() != moves
+    assert near[20:35, 45:75].all() and near[45, 45:54].all()
+
+
 def test_every_point_has_one_reason():
     camera = make_camera(60, 40)
     points, frame = wall(camera, 10.0, SWEEPS)

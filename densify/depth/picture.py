@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -34,7 +36,22 @@ def lab(image: NDArray[np.uint8]) -> Float32:
     return colours * np.float32(max(1.0, _LEAST_LIGHT / max(light, 1.0)))
 
 
-def laid_over(lab: Float32, depth_m: Float32, at: Bool, step_px: int = 1) -> Float32 | None:
+class Laid(NamedTuple):
+    """An image (H,W,3) moved to where it fits. right_px, down_px: by how much it lay aside."""
+
+    lab: Float32
+    right_px: int = 0
+    down_px: int = 0
+
+    def __str__(self) -> str:
+        """How it lay aside: "2 px to the left and 1 px too high"."""
+        across = f"{abs(self.right_px)} px to the {'right' if self.right_px > 0 else 'left'}"
+        along = f"{abs(self.down_px)} px too {'low' if self.down_px > 0 else 'high'}"
+        ways = ((self.right_px, across), (self.down_px, along))
+        return " and ".join(said for off_px, said in ways if off_px)
+
+
+def laid_over(lab: Float32, depth_m: Float32, at: Bool, step_px: int = 1) -> Laid | None:
     """The image moved to where it has edges where depth has; None if it does not fit.
 
     lab: (H,W,3). depth_m: (H,W), 0 none, with edges ``at`` (H,W). How much the image changes there
@@ -57,13 +74,13 @@ def laid_over(lab: Float32, depth_m: Float32, at: Bool, step_px: int = 1) -> Flo
     if best < sums.max() or best <= least:
         return None
     if best - here <= _LEAST_GAIN * (best - mean):
-        return lab
+        return Laid(lab)
     down, right = step_px * (np.array(np.unravel_index(sums.argmax(), sums.shape)) - _REACH)
     rows, columns = (
         np.clip(np.arange(size) + off, 0, size - 1)
         for size, off in zip(lab.shape[:2], (down, right), strict=True)
     )
-    return np.ascontiguousarray(lab[rows[:, None], columns])
+    return Laid(np.ascontiguousarray(lab[rows[:, None], columns]), int(right), int(down))
 
 
 def _edge_sums(lab: Float32, depth_m: Float32, at: Bool, step_px: int) -> Float:

@@ -26,6 +26,10 @@ _MISFIT = (
     "image edges do not lie where depth has edges (calibration, clock, blur?): pixels at depth "
     "edges are left out as with project.rims=strict"
 )
+_MOVED = (
+    "image edges lie {laid} of where depth has edges: the image is moved for "
+    "project.rims; are calibration and clock right?"
+)
 
 
 def decide(layers: Layers, settings: ProjectSettings) -> Layers:
@@ -37,9 +41,10 @@ def decide(layers: Layers, settings: ProjectSettings) -> Layers:
     second round less the less they are believed. Kept is what has 97 % of the votes, but nothing
     that is ``refused``.
 
-    An image that lies up to 3 steps aside is moved, one that does not belong to the depth or is
-    blurred is not listened to (`densify.depth.picture.laid_over`): as ``strict``, with a warning;
-    without an image as ``strict``. ``lab`` goes on only if it was listened to.
+    An image that lies up to 3 steps aside is moved, with a warning that says how far. To one that
+    does not belong to the depth or is blurred (`densify.depth.picture.laid_over`) nobody listens:
+    as ``strict``, with a warning; without an image as ``strict``. ``lab`` goes on only if it was
+    listened to.
 
     The ``confidence`` of rims becomes 0 to 0.2, by the share of the votes against.
     """
@@ -48,11 +53,14 @@ def decide(layers: Layers, settings: ProjectSettings) -> Layers:
     at_edge = (layers.rim_m > 0) & ~layers.veiled
     known_m = np.where(layers.veiled, np.float32(0), np.maximum(layers.depth_m, layers.rim_m))
     if layers.lab is not None and settings.rims != "strict" and len(rims) >= _FEW:
-        lab = laid_over(layers.lab, known_m, at_edge, _scale(layers))
-        if lab is not None:
-            share = shares(replace(layers, lab=lab), rims)
-        else:
+        laid = laid_over(layers.lab, known_m, at_edge, _scale(layers))
+        if laid is None:
             warnings = (*warnings, _MISFIT)
+        else:
+            lab = laid.lab
+            share = shares(replace(layers, lab=lab), rims)
+            if laid.right_px or laid.down_px:
+                warnings = (*warnings, _MOVED.format(laid=laid))
     believed = share >= _LEAST_SHARE
     if settings.rims == "strict":
         believed[:] = False

@@ -139,7 +139,9 @@ def _found(
     """The pixels (P,) with points but those ``taken``, which point comes first in each (P,), and
     what `densify.kernels.visibility.settle` finds around it, (6,P)."""
     last = int(points.age_ns.max(initial=0)) + 1
-    start, order = _by_pixel(points, np.where(hidden, last, points.age_ns), own, camera)
+    late = points.age_ns > kernels.NOW_NS
+    rank = np.where(hidden, last + late, points.age_ns)
+    start, order = _by_pixel(points, rank, own, camera)
     found = np.zeros((6, len(start) - 1), np.float32)
     done = np.zeros(len(start) - 1, bool)
     if taken is not None:

@@ -20,6 +20,7 @@ _LEAST_WINDOW_PX, _LEAST_FIT_PX, _MOST_PX = 3, 2.0, 24
 _MOVING_SLACK = 4.0  # motion is known less well than where things stand
 _MOVING_WITNESS_NS = 120_000_000  # from the key
 _CLEARLY = 0.25  # of the squared distance
+_ALONE = 0.5  # squared spacings; a ray of each sweep falls nearer to every point of a surface
 _GOES_ON = 1.2  # spacings within which a surface shows again
 _ANY_AGE_NS = 1 << 62
 _ALL_ROUND = 3.0  # edges' reaches: no edge near
@@ -275,8 +276,9 @@ def settle(first, last, points, reaches, shape, taken, found):  # type: ignore[n
     with a hidden one only.
 
     Limbs swing, so a mover's other sweeps tell less of its outline than the key sweep: where that
-    saw past the mover nearer by than it saw the mover, an edge is near (0), and at half the
-    distance, the pixel shows what is behind (-1).
+    saw past the mover nearer by than it saw the mover, an edge is near (0); at half the distance,
+    or if it should have met the mover there and did not, the pixel shows what is behind (-1). An
+    edge is near too where it should have met the mover and saw past it anywhere around.
     """
     m, reach = np.zeros(9), np.zeros(8)
     for p in range(first, last):
@@ -295,5 +297,8 @@ def settle(first, last, points, reaches, shape, taken, found):  # type: ignore[n
         _write(found[:, p], centre, w0, agree, m, squares, num, seen, youngest)
         if behind and inner > 0:
             found[5, p] = _shortest(reach) / inner
+        alone = now > _ALONE
         if now_behind < now:
-            found[5, p] = -1.0 if now_behind < _CLEARLY * now else 0.0
+            found[5, p] = -1.0 if alone or now_behind < _CLEARLY * now else 0.0
+        elif alone and now_behind < np.inf:
+            found[5, p] = 0.0
