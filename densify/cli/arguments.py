@@ -21,11 +21,12 @@ from densify.cli.verbs import (
     report,
     run,
     simulate,
+    train,
 )
 from densify.errors import brief
 from densify.version import __version__
 
-_VERBS = (run, compare, dataset, flow, info, doctor, simulate, export, report, evaluate)
+_VERBS = (run, compare, dataset, flow, info, doctor, simulate, export, report, evaluate, train)
 
 
 def parse(arguments: Sequence[str] | None) -> argparse.Namespace:

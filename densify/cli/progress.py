@@ -184,6 +184,36 @@ def _shows() -> bool:
     return sys.stderr.isatty() and logging.getLogger("densify.progress").isEnabledFor(logging.INFO)
 
 
+@contextmanager
+def steps_on_stderr() -> Iterator[Callable[[int, float, float], None]]:
+    """Steps of a training, how much of it is done, and its loss, smoothed: a bar on a terminal,
+    else a line now and then."""
+    smooth = shown_s = 0.0
+    bar = None
+    if _shows():
+        from tqdm import tqdm
+
+        layout = "{percentage:3.0f}%|{bar}| [{elapsed}<{remaining}], {desc}"
+        bar = tqdm(total=1.0, file=sys.stderr, leave=False, bar_format=layout)
+
+    def tell(steps: int, done: float, loss: float) -> None:
+        nonlocal smooth, shown_s
+        smooth = loss if steps == 1 or not smooth else 0.95 * smooth + 0.05 * loss
+        told = f"{steps} steps, loss {smooth:.4g}"
+        if bar is not None:
+            bar.n = min(1.0, done)
+            bar.set_description_str(told)
+        elif time.monotonic() > shown_s + _LINE_EVERY_S:
+            shown_s = time.monotonic()
+            logging.getLogger("densify").info("%.0f %%, %s", 100 * done, told)
+
+    try:
+        yield tell
+    finally:
+        if bar is not None:
+            bar.close()
+
+
 def _pace(summary: Summary) -> str:
     if not summary.num_made:
         return "the first is being made"

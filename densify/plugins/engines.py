@@ -62,6 +62,12 @@ ENGINES = Table(
             about="the published objective, see the section objective",
         ),
         Engine(
+            "network",
+            "densify.learning.engine",
+            about="what a network of densify train flow sees move, proven as with groups",
+            argument="MODEL",
+        ),
+        Engine(
             "npz",
             "densify.readers.flow_files",
             about="files of others, see docs/formats.md",

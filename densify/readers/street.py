@@ -145,6 +145,10 @@ class Street:
             scanner_origins=self.simulator.sensor.origins_m,
         )
 
+    def keep_nothing(self) -> None:
+        """Leave the cache folder alone from now on: nobody will ask for this street again."""
+        self._store.on_disk = False
+
     def stamp_ns(self, frame: int) -> int:
         """Reference time of a sweep."""
         self.check(frame)
@@ -263,9 +267,10 @@ class _Store:
         self._memory: OrderedDict[str, Arrays] = OrderedDict()
         self._lock = threading.Lock()
         self._rendered = False
+        self.on_disk = True
 
     def __contains__(self, name: str) -> bool:
-        return name in self._memory or self._path(name).exists()
+        return name in self._memory or (self.on_disk and self._path(name).exists())
 
     def get(self, name: str, make: Callable[[], Arrays]) -> Arrays:
         """May be called by several threads, each for another name."""
@@ -280,6 +285,8 @@ class _Store:
         return arrays
 
     def _read_or_make(self, name: str, make: Callable[[], Arrays]) -> Arrays:
+        if not self.on_disk:
+            return make()
         path = self._path(name)
         arrays = _read(path)
         if arrays is None:

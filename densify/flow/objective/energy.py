@@ -106,14 +106,20 @@ def matched_energy(
     """
     moved = source + flow
     forward = moved - target[matches.target_of_source]
-    backward = _Gather.apply(moved, matches.source_of_target) - target
+    backward = take(moved, matches.source_of_target) - target
     data = _SumOfSquares.apply(forward) + _SumOfSquares.apply(backward)
     smoothness = _QuadraticForm.apply(flow, laplacian)
     return Energy(data + alpha * smoothness, data, smoothness)
 
 
-class _Gather(torch.autograd.Function):
+def take(values: Tensor, index: Tensor) -> Tensor:
     """``values[index]`` for (n,3) values, with a gradient whose bytes do not depend on threads."""
+    taken: Tensor = _Gather.apply(values, index)
+    return taken
+
+
+class _Gather(torch.autograd.Function):
+    """See `take`."""
 
     @staticmethod
     def forward(ctx: Any, values: Tensor, index: Tensor) -> Tensor:

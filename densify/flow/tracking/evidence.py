@@ -156,15 +156,15 @@ def find_candidates(
             seed[rest] = space.seen_through(points[rest], j)
         gap_m = space.sensors.gap_m(registered.sweep.points[above], registered.sweep.lidar[above])
         over_scanner = points - registered.T_world_lidar[:3, 3]
-        close = _closer_rings(over_scanner, gap_m)
-        num_clusters, cluster = _cluster(close, seed)
+        close = closer_rings(over_scanner, gap_m)
+        num_clusters, cluster = cluster_around(close, seed)
         return Candidates(above, seed, cluster, num_clusters)
 
     with ThreadPoolExecutor() as pool:
         return tuple(pool.map(of_sweep, range(len(stretch.sweeps)) if among is None else among))
 
 
-def _closer_rings(points: Float, gap_m: Float) -> Float:
+def closer_rings(points: Float, gap_m: Float) -> Float:
     """The points with heights compressed where the scanner's rings lie farther apart than what is
     taken for one thing.
 
@@ -184,7 +184,7 @@ def firing_times_s(stretch: Stretch, i: int) -> Float:
     return (sweep.stamp_ns - begin_ns + offset_ns).astype(np.float64) * 1e-9
 
 
-def _cluster(points: Float, seed: Bool) -> tuple[int, Int]:
+def cluster_around(points: Float, seed: Bool) -> tuple[int, Int]:
     """Keep the seeds that are not alone among unseen points (a hedge's flicker is), add what is
     close to them, and link. Returns the number of clusters and (N,) labels."""
     cluster = np.full(len(points), -1, np.int64)

@@ -14,6 +14,7 @@ from densify.config import Config
 from densify.flow.scene import Scene
 from densify.flow.tracking.clock import Clock
 from densify.flow.tracking.evidence import (
+    Candidates,
     FreeSpace,
     Standing,
     firing_times_s,
@@ -113,9 +114,20 @@ def estimate_motion(scene: Scene, settings: Config, argument: str) -> GroupMotio
     asked of the stamps. Below 10 Hz what turns, bends or is hidden between two sweeps is followed
     worse or lost; above, sweeps within 0.1 s are one look, see `densify.flow.tracking.looks`.
     """
+    return motion_of(scene, scene.candidates, settings)
+
+
+def motion_of(
+    scene: Scene,
+    candidates: Sequence[Candidates],
+    settings: Config,
+    velocities_m_s: Sequence[Float] | None = None,
+) -> GroupMotion:
+    """The same with what may move given, and how fast it may: (C,3) of each sweep's candidates,
+    world; None has the sweeps vote."""
     stretch, space, ground = scene.stretch, scene.space, scene.ground
-    standing = [Standing.of(stretch, i, found) for i, found in enumerate(scene.candidates)]
-    tracks = follow_groups(standing, space, ground)
+    standing = [Standing.of(stretch, i, found) for i, found in enumerate(candidates)]
+    tracks = follow_groups(standing, space, ground, velocities_m_s)
     shapes = [Shape.of(t.seen_in(standing, sorted(t.claimed))) for t in tracks]
 
     def members(i: int) -> NDArray[np.int32]:

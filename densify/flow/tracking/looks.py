@@ -9,15 +9,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from densify.flow.tracking.clock import Clock
 from densify.flow.tracking.evidence import LINK_M, Standing
 from densify.kernels.linking import link
-from densify.types import Bool
+
+T = TypeVar("T", bound=np.generic)
 
 _LOOK_NS = 100_000_000
 
@@ -45,8 +48,8 @@ class Look:
         middle_ns, half_s = (first_ns + last_ns) // 2, (last_ns - first_ns) * 0.5e-9
         return Look(tuple(sweeps), middle_ns, half_s, _together(parts), tuple(begins))
 
-    def gather(self, columns: Sequence[Bool]) -> Bool:
-        """(N,) of what the look saw, from (n,) of what each sweep of the stretch saw."""
+    def gather(self, columns: Sequence[NDArray[T]]) -> NDArray[T]:
+        """(N,...) of what the look saw, from (n,...) of what each sweep of the stretch saw."""
         return np.concatenate([columns[j] for j in self.sweeps])
 
     def split(self, rows: np.ndarray) -> dict[int, np.ndarray]:

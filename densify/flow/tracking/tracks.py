@@ -47,12 +47,20 @@ _LEAST_STATES, _LEAST_S = 3, 0.15
 _MAX_CONTRADICTIONS = 0.3  # of those that standing still leaves
 
 
-def follow_groups(standing: Sequence[Standing], space: FreeSpace, ground: HeightMap) -> list[Track]:
-    """All proven moving objects of the stretch."""
+def follow_groups(
+    standing: Sequence[Standing],
+    space: FreeSpace,
+    ground: HeightMap,
+    velocities_m_s: Sequence[Float] | None = None,
+) -> list[Track]:
+    """All proven moving objects of the stretch. velocities_m_s: (C,3) of each sweep's points, with
+    which groups of them start; None has the sweeps around vote."""
     looks = looks_of(standing, space.clock)
     clock = Clock(np.array([look.time_ns for look in looks]))
     seen = [look.seen for look in looks]
-    fields = [DistanceField.of(c.points[c.candidate]) for c in seen]
+    fields = []
+    if velocities_m_s is None:
+        fields = [DistanceField.of(c.points[c.candidate]) for c in seen]
     free = [np.ones(len(c.points), bool) for c in standing]  # not yet part of a track
     untried = [np.ones(len(c.points), bool) for c in standing]
     tracks = []
@@ -60,7 +68,10 @@ def follow_groups(standing: Sequence[Standing], space: FreeSpace, ground: Height
         members = group[looks[n].gather(free)[group] & looks[n].gather(untried)[group]]
         if len(members) < _MIN_POINTS:
             continue
-        velocity = vote(seen[n].points[members], n, fields, clock)
+        if velocities_m_s is None:
+            velocity = vote(seen[n].points[members], n, fields, clock)
+        else:
+            velocity = np.median(looks[n].gather(velocities_m_s)[members], axis=0)
         track = _follow(members, n, velocity, looks, free, ground, clock)
         proven = _prove(track, standing, space)
         if proven:

@@ -1,0 +1,115 @@
+# SPDX-License-Identifier: MIT
+"""``densify train flow``: a network for scene flow."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from densify.cli.answer import Answer
+from densify.cli.options import add_overwrite, add_verb, natural, positive
+from densify.cli.progress import steps_on_stderr
+from densify.errors import InputError
+
+
+def add(commands: Any) -> None:
+    """Its options."""
+    about = "train a network for scene flow; a trained one is the engine network:MODEL"
+    parser = commands.add_parser("train", help=about, description=f"{about.capitalize()}.")
+    kinds = parser.add_subparsers(title="trainings", metavar="WHAT", required=True)
+    flow = add_verb(
+        kinds,
+        "flow",
+        answer,
+        "train a network for scene flow, with labels or without",
+        "Teachers: objective (the published one), pointpwc (PointPWC-Net's self-supervised loss), "
+        "cycle (nearest neighbours and anchored cycles), engine (this package's engine makes the "
+        "labels), truth (where the recording has some: streets). Ctrl-C or a kill loses at most a "
+        "minute: go on with --resume.",
+    )
+    flow.add_argument(
+        "--data",
+        metavar="SPEC",
+        action="append",
+        help="a recording as everywhere, may be given several times; streets[?sensor=NAME]: a new "
+        "street for every clip of 7 sweeps, never the same twice (default: streets)",
+    )
+    flow.add_argument(
+        "--out", metavar="MODEL", type=Path, required=True, help="the model; MODEL.png: its loss"
+    )
+    flow.add_argument(
+        "--teacher",
+        choices=("objective", "pointpwc", "cycle", "engine", "truth"),
+        default="objective",
+        help="where the loss comes from (default: objective)",
+    )
+    flow.add_argument(
+        "--model",
+        choices=("voxels", "flownet3d"),
+        default="voxels",
+        help="voxels: whole sweeps in a fraction of a second; flownet3d: the paper's, of 8,192 "
+        "points (default: voxels)",
+    )
+    limit = flow.add_mutually_exclusive_group(required=True)
+    limit.add_argument("--minutes", type=positive, metavar="M", help="train so long")
+    limit.add_argument("--steps", type=natural, metavar="N", help="train so many pairs of sweeps")
+    flow.add_argument(
+        "--start", metavar="MODEL", type=Path, help="begin with this model's weights: fine-tune it"
+    )
+    flow.add_argument(
+        "--resume", action="store_true", help="go on from MODEL.checkpoint of a stopped training"
+    )
+    flow.add_argument(
+        "--seed",
+        type=natural,
+        default=0,
+        metavar="N",
+        help="first weights, choice of sweeps (default: 0)",
+    )
+    flow.add_argument(
+        "--device", choices=("auto", "cpu", "cuda"), default="auto", help="(default: auto)"
+    )
+    flow.add_argument(
+        "--workers",
+        type=natural,
+        default=1,
+        metavar="N",
+        help="processes that make sweeps ready beside the training; 0: none (default: 1)",
+    )
+    flow.add_argument(
+        "--keep",
+        metavar="DIR",
+        type=Path,
+        help="keep the sweeps made ready there, 6 MB a clip: another training with the same --data "
+        "and --seed does not make them again",
+    )
+    add_overwrite(flow)
+
+
+def answer(options: argparse.Namespace) -> Iterator[Answer]:
+    """A network for scene flow."""
+    from densify.learning.training import Training, train
+
+    if options.out.exists() and not options.overwrite:
+        raise InputError(f"{options.out}: there already, kept; give --overwrite to replace it")
+    if options.steps == 0:
+        raise InputError("--steps 0: expected 1 or more")
+    training = Training(
+        data=tuple(options.data or ["streets"]),
+        teacher=options.teacher,
+        model=options.model,
+        seed=options.seed,
+        steps=options.steps,
+        minutes=options.minutes,
+        device=options.device,
+        start=options.start,
+        keep=options.keep,
+        num_workers=options.workers,
+    )
+    with steps_on_stderr() as report:
+        trained = train(training, options.out, options.resume, report)
+    text = f"{trained.num_steps:,} steps, loss {trained.loss:.4g}"
+    facts = {"num_steps": trained.num_steps, "loss": trained.loss}
+    yield Answer(text, facts, trained.files)

@@ -1,0 +1,66 @@
+# SPDX-License-Identifier: MIT
+"""What a network sees of a sweep: its points above the ground, with the vehicle's motion undone.
+
+The same in training and in use.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from densify.geometry import poses
+from densify.geometry.height_map import HeightMap
+from densify.types import Float, Float32, Int, RegisteredSweep
+
+
+class Cloud(NamedTuple):
+    """One sweep of n points. points: (n,3) float32 metres, axes of the world (z up), origin at the
+    scanner when it took the *source* sweep. height_m: (n,) float32 above the ground."""
+
+    points: Tensor
+    height_m: Tensor
+
+    def rows(self, index: Tensor) -> Cloud:
+        return Cloud(self.points[index], self.height_m[index])
+
+    def to(self, device: torch.device) -> Cloud:
+        return Cloud(self.points.to(device), self.height_m.to(device))
+
+
+class Standing(NamedTuple):
+    """What stands above the ground in one sweep. row: (n,) in the sweep. points: (n,3) world.
+    height_m: (n,)."""
+
+    row: Int
+    points: Float
+    height_m: Float32
+
+    @staticmethod
+    def of(registered: RegisteredSweep, ground: HeightMap, min_height_m: float) -> Standing:
+        points = poses.transform(registered.T_world_lidar, registered.sweep.points)
+        height_m = ground.above(points)
+        row = np.flatnonzero(height_m >= min_height_m)
+        return Standing(row, points[row], height_m[row])
+
+    def cloud(self, origin: Float) -> Cloud:
+        """As a network takes it, about the origin (3,)."""
+        points = torch.from_numpy((self.points - origin).astype(np.float32))
+        return Cloud(points, torch.from_numpy(np.ascontiguousarray(self.height_m)))
+
+
+def order_for(source: int, target: int, num_sweeps: int, num_wanted: int) -> list[int | None]:
+    """Numbers of the sweeps that a network gets for the flow of ``source`` to its neighbour
+    ``target``: those two, then the ones before the source in that direction of time, None beyond
+    the first and the last."""
+    step = source - target
+    wanted = [source, target, *(source + step * n for n in range(1, num_wanted - 1))]
+    return [n if 0 <= n < num_sweeps else None for n in wanted]
+
+
+Sweeps = Sequence[Cloud | None]
+"""Source, target, and any number of sweeps before the source; None where there is none."""

@@ -1,0 +1,104 @@
+# SPDX-License-Identifier: MIT
+"""The one door to files of networks: numpy's archive of arrays, read without running any code.
+
+A member ``header`` holds JSON (format, version, network, how it was trained); ``weights/NAME`` are
+the network's arrays; a checkpoint has more beside them. The file's name may be anything.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import nn
+
+from densify.errors import InputError
+from densify.files.arrays import read_arrays
+from densify.learning.networks import NETWORKS, build
+from densify.outputs.atomic import write_file
+
+FORMAT, VERSION = "densify model", 1
+_HEADER, _WEIGHTS = "header", "weights/"
+
+
+@dataclass(frozen=True)
+class Model:
+    """A network by name with its weights. made: how it was trained, plain values for JSON. beside:
+    what a checkpoint keeps beside the weights, arrays by name."""
+
+    name: str
+    network: nn.Module
+    made: Mapping[str, Any] = field(default_factory=dict)
+    beside: Mapping[str, NDArray[Any]] = field(default_factory=dict)
+
+
+def write_model(path: Path, model: Model) -> None:
+    """The same bytes for the same model; the file appears when it is complete. Raises InputError
+    where it cannot be written."""
+    header = {"format": FORMAT, "version": VERSION, "network": model.name, "made": model.made}
+    text = json.dumps(header, sort_keys=True).encode()
+    arrays: dict[str, NDArray[Any]] = {_HEADER: np.frombuffer(text, np.uint8)}
+    for name, tensor in model.network.state_dict().items():
+        arrays[_WEIGHTS + name] = tensor.detach().cpu().numpy()
+    arrays.update(model.beside)
+    buffer = io.BytesIO()
+    np.savez(buffer, **arrays)  # type: ignore[arg-type]
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_file(path, buffer.getvalue(), durable=True)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written: {error.strerror or error}") from error
+
+
+def read_model(path: Path) -> Model:
+    """Raises InputError for a file that is none, is damaged, or is of another version."""
+    if not path.is_file():
+        raise InputError(f"{path}: no such file; expected a model that densify train flow wrote")
+    arrays = read_arrays(path)
+    header = _header(path, arrays)
+    network = build(header["network"])
+    expected = network.state_dict()
+    weights = {n.removeprefix(_WEIGHTS): a for n, a in arrays.items() if n.startswith(_WEIGHTS)}
+    for name, tensor in expected.items():
+        array = weights.get(name)
+        if array is None or array.shape != tensor.shape or array.dtype != np.float32:
+            got = "nothing" if array is None else f"{array.dtype} of shape {array.shape}"
+            raise InputError(
+                f"{path}: weights {name}: got {got}, expected float32 of shape "
+                f"{tuple(tensor.shape)}; the file is damaged"
+            )
+        if not np.isfinite(array).all():
+            raise InputError(f"{path}: weights {name}: not all finite; train again")
+    if extra := set(weights) - set(expected):
+        raise InputError(f"{path}: weights {min(extra)}: {header['network']} has none so called")
+    network.load_state_dict({name: torch.from_numpy(weights[name]) for name in expected})
+    beside = {n: a for n, a in arrays.items() if n != _HEADER and not n.startswith(_WEIGHTS)}
+    return Model(header["network"], network.train(False), header["made"], beside)
+
+
+def _header(path: Path, arrays: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
+    try:
+        header = json.loads(bytes(arrays[_HEADER].astype(np.uint8)))
+        found = header["format"], header["version"], header["network"], header["made"]
+    except (KeyError, ValueError, TypeError, RecursionError) as error:
+        raise InputError(f"{path}: no model that densify train flow wrote") from error
+    if found[0] != FORMAT or not isinstance(found[3], dict):
+        raise InputError(f"{path}: no model that densify train flow wrote")
+    if found[1] != VERSION:
+        raise InputError(
+            f"{path}: a model of version {found[1]}, expected {VERSION}; train again, or use the "
+            f"densify that wrote it"
+        )
+    if found[2] not in NETWORKS:
+        raise InputError(
+            f"{path}: a network {found[2]!r}, expected one of {', '.join(NETWORKS)}; use a newer "
+            f"densify"
+        )
+    return dict(header)

@@ -1,0 +1,178 @@
+# SPDX-License-Identifier: MIT
+"""Pairs of sweeps to train on, in an order that follows from a seed alone.
+
+Several clips are mixed: their pairs, both ways in time, come in random order and several times,
+each time turned about the vertical, mirrored and scaled anew. Clips are made ahead by worker
+processes.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+from collections import deque
+from collections.abc import Generator
+from concurrent.futures import Future, ProcessPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from densify.learning.clips import Clip, ClipMaker
+from densify.learning.clouds import Cloud, Sweeps, order_for
+from densify.learning.networks.voxels import REACH_M
+from densify.types import Float32
+
+NUM_DRAWN = 4096
+"""Points of source and target that self-supervised losses look at."""
+_NUM_MIXED = 4  # clips
+_PAIRS_OF_CLIP = 48
+_SCALES = (0.95, 1.05)
+
+
+@dataclass(frozen=True)
+class Sample:
+    """One pair. sweeps: source, target, and those before. drawn: (d,) rows of the source;
+    drawn_source, drawn_target: what is drawn. in_reach: (n,) of the source's points, which count.
+    flow, moving: (n,3), (n,), None without labels."""
+
+    sweeps: Sweeps
+    drawn: Tensor
+    drawn_source: Cloud
+    drawn_target: Cloud
+    in_reach: Tensor
+    duration_s: float
+    flow: Tensor | None = None
+    moving: Tensor | None = None
+
+    def to(self, device: torch.device) -> Sample:
+        if device.type == "cpu":
+            return self
+        return Sample(
+            tuple(None if s is None else s.to(device) for s in self.sweeps),
+            self.drawn.to(device),
+            self.drawn_source.to(device),
+            self.drawn_target.to(device),
+            self.in_reach.to(device),
+            self.duration_s,
+            None if self.flow is None else self.flow.to(device),
+            None if self.moving is None else self.moving.to(device),
+        )
+
+
+def samples(
+    make: ClipMaker, num_wanted: int, num_workers: int, first: int = 0
+) -> Generator[Sample, None, None]:
+    """Samples from number ``first`` on, without end. num_wanted: sweeps that the network takes.
+    num_workers: processes that make clips; 0 makes them here."""
+    per_group = _NUM_MIXED * _PAIRS_OF_CLIP
+    group, skip = divmod(first, per_group)
+    clips = _clips(make, group * _NUM_MIXED, num_workers)
+    try:
+        while True:
+            mixed = [next(clips) for _ in range(_NUM_MIXED)]
+            rng = np.random.default_rng([make.seed, group, 1])
+            pairs = [pair for c, clip in enumerate(mixed) for pair in _pairs(c, clip, rng)]
+            order = rng.permutation(len(pairs))[skip:]
+            for place in order:
+                own = np.random.default_rng([make.seed, group, 2, int(place)])
+                c, source, target = pairs[place]
+                yield sample_of(mixed[c], source, target, num_wanted, make.labels, own)
+            group, skip = group + 1, 0
+    finally:
+        clips.close()
+
+
+def _pairs(c: int, clip: Clip, rng: np.random.Generator) -> list[tuple[int, int, int]]:
+    """As many of every clip, in rounds of all it has."""
+    count = len(clip.sweeps)
+    found = [(c, i, j) for i in range(count) for j in (i - 1, i + 1) if 0 <= j < count]
+    times = -(-_PAIRS_OF_CLIP // len(found))
+    order = [place for _ in range(times) for place in rng.permutation(len(found))]
+    return [found[place] for place in order[:_PAIRS_OF_CLIP]]
+
+
+def sample_of(
+    clip: Clip,
+    source: int,
+    target: int,
+    num_wanted: int,
+    labels: str,
+    rng: np.random.Generator | None = None,
+) -> Sample:
+    """One pair of a clip. rng: changes it at random and draws; None leaves it as it is and draws
+    evenly."""
+    here, there = clip.sweeps[source], clip.sweeps[target]
+    change = np.eye(3, dtype=np.float32)
+    if rng is not None:
+        change = _change(rng)
+    scale = np.float32(np.linalg.norm(change[2]))
+    sweeps = [
+        None
+        if n is None
+        else Cloud(
+            torch.from_numpy((clip.sweeps[n].points - here.origin_m) @ change.T),
+            torch.from_numpy(clip.sweeps[n].height_m * scale),
+        )
+        for n in order_for(source, target, len(clip.sweeps), num_wanted)
+    ]
+    first, second = sweeps[0], sweeps[1]
+    if first is None or second is None:
+        raise ValueError("expected neighbouring sweeps")
+    in_reach = [(c.points[:, :2].abs() < REACH_M).all(dim=1) for c in (first, second)]
+    drawn = [_draw(within.numpy(), rng) for within in in_reach]
+    flow = moving = None
+    if labels:
+        found = getattr(here, labels)
+        flow = torch.from_numpy(found.flow[int(target > source)] @ change.T)
+        moving = torch.from_numpy(found.moving)
+    duration_s = abs(there.time_s - here.time_s)
+    return Sample(
+        tuple(sweeps),
+        drawn[0],
+        first.rows(drawn[0]),
+        second.rows(drawn[1]),
+        in_reach[0],
+        duration_s,
+        flow,
+        moving,
+    )
+
+
+def _change(rng: np.random.Generator) -> Float32:
+    """(3,3) turns about z, mirrors half the time, and scales."""
+    angle = rng.uniform(0, 2 * np.pi)
+    cosine, sine = np.cos(angle), np.sin(angle)
+    turn = np.array([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1]])
+    mirror = np.diag([1.0, -1.0 if rng.random() < 0.5 else 1.0, 1.0])
+    return (rng.uniform(*_SCALES) * turn @ mirror).astype(np.float32)
+
+
+def _draw(within: np.ndarray, rng: np.random.Generator | None) -> Tensor:
+    rows = np.flatnonzero(within)
+    if len(rows) > NUM_DRAWN:
+        if rng is None:
+            rows = rows[np.arange(NUM_DRAWN) * len(rows) // NUM_DRAWN]
+        else:
+            rows = np.sort(rng.choice(rows, NUM_DRAWN, replace=False))
+    return torch.from_numpy(rows)
+
+
+def _clips(make: ClipMaker, first: int, num_workers: int) -> Generator[Clip, None, None]:
+    if num_workers == 0:
+        while True:
+            yield make(first)
+            first += 1
+    # A forked process would inherit torch's threads, which it does not have.
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(num_workers, context) as pool:
+        waiting: deque[Future[Clip]] = deque()
+        try:
+            while True:
+                while len(waiting) < num_workers + _NUM_MIXED:
+                    waiting.append(pool.submit(make, first))
+                    first += 1
+                yield waiting.popleft().result()
+        finally:
+            for one in waiting:
+                one.cancel()
