@@ -61,7 +61,7 @@ def test_help_is_light(arguments: list[str]) -> None:
 
 @pytest.mark.parametrize(
     "verb",
-    ["run", "compare", "flow", "info", "simulate", "evaluate", "export", "report", "bench"]
+    ["run", "compare", "flow", "info", "simulate", "evaluate", "export", "report", "view", "bench"]
     + ["train"],
 )
 def test_help_of_every_verb_is_light(verb: str) -> None:
@@ -224,6 +224,8 @@ def test_no_arrow_runs_upward() -> None:
 DOORS: dict[str, str | tuple[str, ...]] = {
     "dask": "densify/dataset/cluster.py",
     "distributed": "densify/dataset/cluster.py",
+    "foxglove": "densify/outputs/export/mcap.py",
+    "rerun": "densify/outputs/export/rrd.py",
     "embreex": "densify/street/world.py",
     "kiss_icp": "densify/registration/odometry.py",
     "laspy": ("densify/files/las.py", "densify/outputs/cloud_laz.py"),

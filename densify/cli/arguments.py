@@ -22,11 +22,15 @@ from densify.cli.verbs import (
     run,
     simulate,
     train,
+    view,
 )
 from densify.errors import brief
 from densify.version import __version__
 
-_VERBS = (run, compare, dataset, flow, info, doctor, simulate, export, report, evaluate, train)
+_VERBS = (
+    *(run, compare, dataset, flow, train, info, doctor, simulate),
+    *(export, report, view, evaluate),
+)
 
 
 def parse(arguments: Sequence[str] | None) -> argparse.Namespace:

@@ -16,7 +16,7 @@ from densify.errors import InputError
 from densify.files.las import read_las
 from densify.outputs.atomic import write_file
 from densify.outputs.context import Context
-from densify.types import Bool, Cloud, Float, Float32, Result
+from densify.types import Bool, Cloud, Float, Float32, Int, Result
 
 _SCALE_M = 0.001
 _UNIX_DAY_0, _DAY_NS = datetime.date(1970, 1, 1), 86400 * 10**9
@@ -58,6 +58,16 @@ class StoredCloud:
     far: Bool
     displacement: Float32 | None
     gps_time: Float
+
+    @property
+    def rigid_points(self) -> Float:
+        """(M,3) where registration alone puts them; as ``points`` in clouds of older versions."""
+        return self.points if self.displacement is None else self.points - self.displacement
+
+    @property
+    def stamp_ns(self) -> Int:
+        """(M,) reference time of the sweep that measured the point, to the microsecond."""
+        return np.rint(self.gps_time * 1e6).astype(np.int64) * 1000 + _LAS_EPOCH_NS
 
     def select(self, keep: Bool) -> StoredCloud:
         """The points where ``keep`` (M,) is True."""

@@ -83,6 +83,18 @@ EXPORTS = Table(
             owned=("label",),
             about="the same as label lines",
         ),
+        ExportFormat(
+            "rrd",
+            _HERE + "rrd",
+            owned=("recording.rrd",),
+            about="one key or several over time, for rerun's viewer",
+        ),
+        ExportFormat(
+            "mcap",
+            _HERE + "mcap",
+            owned=("recording.mcap",),
+            about="the same for Foxglove",
+        ),
     ),
     members=("write_export",),
     row_of=_row,

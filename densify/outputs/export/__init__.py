@@ -26,7 +26,7 @@ import yaml
 
 from densify.errors import InputError
 from densify.outputs.atomic import write_file
-from densify.outputs.export.finished_run import Density, FinishedRun, Kept
+from densify.outputs.export.finished_run import Density, FinishedRun, Kept, finished_runs
 from densify.outputs.store import writing
 from densify.plugins.exports import EXPORTS
 from densify.version import __version__
@@ -42,6 +42,14 @@ class ExportModule(Protocol):
 
         Raises InputError where the run lacks what the form needs. Same run, same bytes.
         """
+        ...
+
+
+class DriveModule(Protocol):
+    """What the module of a form has that takes several keys as well."""
+
+    def write_drive(self, runs: Sequence[FinishedRun], folder: Path) -> None:
+        """As `ExportModule.write_export`; runs: by key."""
         ...
 
 
@@ -66,7 +74,8 @@ def export_run(
 ) -> Export:
     """Write a finished run in another form, or with fewer pixels; nothing is computed again.
 
-    run: the folder of one key, such as ``densify-out/000120``. min_confidence: 0 to 1; higher keeps
+    run: the folder of one key, such as ``densify-out/000120``; of forms that take drives also one
+    with several keys in it. min_confidence: 0 to 1; higher keeps
     fewer pixels, and points by their own, relative confidence. max_age_ms: 0 or more, between the
     exposure and the sweep that measured the pixel, or the key and the sweep that measured the
     point; lower keeps fewer; None for any age. Both are compared as the maps store them, in steps
@@ -82,7 +91,9 @@ def export_run(
     """
     _check_thresholds(min_confidence, max_age_ms)
     form = EXPORTS.row(to, "--to")
-    finished = FinishedRun(run, min_confidence, max_age_ms, cameras)
+    module = EXPORTS.module(form)
+    read = finished_runs if hasattr(module, "write_drive") else _one_run
+    runs = read(run, min_confidence, max_age_ms, cameras)
     folder = out or (run / "export" if to == "png" else run / "export" / to)
     if (folder / "run.yaml").exists():
         raise InputError(
@@ -90,7 +101,10 @@ def export_run(
         )
     owned = (*form.owned, _RECORD)
     with writing(folder, owned, folder, overwrite) as staging:
-        cast(ExportModule, EXPORTS.module(form)).write_export(finished, staging)
+        if len(runs) > 1:
+            cast(DriveModule, module).write_drive(runs, staging)
+        else:
+            cast(ExportModule, module).write_export(runs[0], staging)
         if strays := sorted({entry.name for entry in staging.iterdir()} - {*form.owned}):
             raise InputError(
                 f"--to {to}: wrote {', '.join(strays)}, expected nothing but "
@@ -102,26 +116,41 @@ def export_run(
             "min_confidence": float(min_confidence),
             "max_age_ms": None if max_age_ms is None else float(max_age_ms),
         }
-        write_file(staging / _RECORD, _record(asked, finished))
+        density = runs[0].density if len(runs) == 1 else {}
+        num_points = _sum([run.num_points for run in runs])
+        write_file(staging / _RECORD, _record(asked, density, num_points))
         written = [
             folder / file.relative_to(staging)
             for name in owned
             for file in [staging / name, *sorted((staging / name).rglob("*"))]
             if file.is_file()
         ]
-    return Export(written, finished.density, finished.num_points)
+    return Export(written, density, num_points)
 
 
-def _record(asked: dict[str, Any], finished: FinishedRun) -> bytes:
+def _one_run(run: Path, *thresholds: Any) -> list[FinishedRun]:
+    return [FinishedRun(run, *thresholds)]
+
+
+def _sum(counts: Sequence[Kept | None]) -> Kept | None:
+    known = [count for count in counts if count is not None]
+    return Kept(sum(k.before for k in known), sum(k.after for k in known)) if known else None
+
+
+def _record(
+    asked: dict[str, Any],
+    density: Mapping[str, Mapping[str, Density]],
+    num_points: Kept | None,
+) -> bytes:
     """What was asked for, and how much of the run was left."""
     record = dict(asked)
-    if finished.density:
+    if density:
         record["density"] = {
-            camera: {product: asdict(density) for product, density in products.items()}
-            for camera, products in finished.density.items()
+            camera: {product: asdict(value) for product, value in products.items()}
+            for camera, products in density.items()
         }
-    if finished.num_points is not None:
-        record["num_points"] = asdict(finished.num_points)
+    if num_points is not None:
+        record["num_points"] = asdict(num_points)
     record["version"] = __version__
     return yaml.safe_dump(record, sort_keys=False, allow_unicode=True).encode()
 

@@ -215,6 +215,21 @@ class FinishedRun:
         return maps
 
 
+def finished_runs(
+    folder: Path,
+    min_confidence: float = 0.0,
+    max_age_ms: float | None = None,
+    chosen: Sequence[str] | None = None,
+) -> list[FinishedRun]:
+    """The run in a folder, or those of several keys in its subfolders, ascending. Arguments and
+    errors as `FinishedRun`."""
+    places = sorted(path.parent for path in folder.glob("*/run.yaml"))
+    if (folder / "run.yaml").is_file() or not places:
+        places = [folder]
+    runs = [FinishedRun(place, min_confidence, max_age_ms, chosen) for place in places]
+    return runs if len(runs) == 1 else sorted(runs, key=lambda run: run.key)
+
+
 def _density(stored: NDArray[Any], keep: Bool) -> Density:
     has_depth = stored > 0
     return Density(float(has_depth.mean()), float((has_depth & keep).mean()))

@@ -33,30 +33,39 @@ class Picture:
 def write_pictures(run: FinishedRun, folder: Path) -> list[Picture]:
     """Write the images of the run's maps as ``CAMERA.jpg``, as scene/image has them.
 
-    Raises InputError if there is none, or one is damaged or not of its camera's size.
+    Raises InputError if there is none, or as `jpeg_of`.
     """
-    views, pictures = run.scene.views, []
+    pictures = []
     for name in run.cameras:
-        source = run.folder / "scene" / "image" / f"{name}.jpg"
-        if name not in views or not source.is_file():
+        data = jpeg_of(run, name)
+        if data is None:
             continue
-        camera, data = views[name].camera, read_bytes(source)
-        height, width = decode_image(data, source).shape[:2]
-        if (width, height) != (camera.width_px, camera.height_px):
-            raise InputError(
-                f"{source}: got {width} x {height} px, expected {camera.width_px} x "
-                f"{camera.height_px} as scene.json says; densify the key again"
-            )
         path = folder / f"{name}.jpg"
         path.parent.mkdir(parents=True, exist_ok=True)
         write_file(path, data)
-        pictures.append(Picture(name, f"{name}.jpg", views[name]))
+        pictures.append(Picture(name, f"{name}.jpg", run.scene.views[name]))
     if not pictures:
         raise InputError(
             f"{run.folder}: no images in scene/image of {', '.join(run.cameras)}; densify the key "
             f"with a camera that has images"
         )
     return pictures
+
+
+def jpeg_of(run: FinishedRun, name: str) -> bytes | None:
+    """The image of a map, as scene/image has it; None where there is none. Raises InputError if it
+    is damaged or not of its camera's size."""
+    source = run.folder / "scene" / "image" / f"{name}.jpg"
+    if name not in run.scene.views or not source.is_file():
+        return None
+    camera, data = run.scene.views[name].camera, read_bytes(source)
+    height, width = decode_image(data, source).shape[:2]
+    if (width, height) != (camera.width_px, camera.height_px):
+        raise InputError(
+            f"{source}: got {width} x {height} px, expected {camera.width_px} x "
+            f"{camera.height_px} as scene.json says; densify the key again"
+        )
+    return data
 
 
 def intrinsics(camera: Camera) -> dict[str, float]:
