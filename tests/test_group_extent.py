@@ -49,6 +49,16 @@ def test_a_guard_rail_beside_the_car_stays():
     assert found.share_moving(1, 4) > 0.9
 
 
+def test_a_wall_that_somebody_walks_along_stays():
+    """It goes on from him without a hole and nothing is ever seen through it, but it is still there
+    where he has been."""
+    wall = Box((16.0, 0.2, 1.9), Arc(12.0, 3.42))
+    found = Found.of([car(9, 3.0, 1.6, 1, size_m=(0.8, 0.6, 1.75))], extra=[wall])
+    still = marked(found, EXTRA)
+    assert found.share_moving(1, 4) > 0.9
+    assert len(still) > 20_000 and still.mean() < 0.04  # an arm's length of it
+
+
 @pytest.fixture(
     scope="module",
     params=[0.05, -0.08],

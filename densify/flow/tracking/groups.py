@@ -19,27 +19,15 @@ from densify.flow.tracking.evidence import (
     Standing,
     firing_times_s,
 )
+from densify.flow.tracking.extent import Seen, attach, detach, foretold, lengthen
 from densify.flow.tracking.shapes import Shape
 from densify.flow.tracking.sightings import Track
 from densify.flow.tracking.soften import Part, Softened, soften
 from densify.flow.tracking.tracks import follow_groups
 from densify.geometry import poses
-from densify.geometry.height_map import HeightMap
-from densify.geometry.sensor import Sensors
-from densify.kernels.clouds import rows_inside
-from densify.types import Bool, Float, Float32, FlowField, Int, Stretch
+from densify.types import Float, FlowField, Stretch
 
-_ATTACH_M = 0.3
-_ATTACH_UNSEEN_M = 0.15
-_MIN_HEIGHT_M = 0.08
-_LENGTH_M = 15.0
 _FINE_M = 0.3
-_SIDE_M = 0.1
-_LONGEST_HOLE_M = 0.6
-_MAX_CONTRADICTED = 0.05
-_FORETOLD_S = 0.2  # before an object was first seen and after it was last seen
-_GAPS_REACHED = 0.8  # of the gap between neighbouring rings
-_GAPS_REACHED_UNSEEN = 0.5
 
 
 @dataclass(frozen=True)
@@ -85,7 +73,7 @@ class GroupMotion:
             to_reference[mine] = (at_reference - measured) @ R_lidar_world.T
             displacement[mine] = (arrived - at_reference) @ R_lidar_world.T
             velocity_m_s[mine] = track.velocity_m_s(arrived, there_s) @ R_lidar_world.T
-            lost[mine] = not _foretold(track, there, clock)
+            lost[mine] = not foretold(track, there, clock)
         return FlowField(displacement, instance >= 0, instance, lost, to_reference, velocity_m_s)
 
 
@@ -131,9 +119,10 @@ def motion_of(
     shapes = [Shape.of(t.seen_in(standing, sorted(t.claimed))) for t in tracks]
 
     def members(i: int) -> NDArray[np.int32]:
-        seen = _Seen.of(stretch, i, ground, standing[i], space.sensors)
-        attached = _attach(seen, i, tracks, shapes, space.clock, scene.min_height_m)
-        _lengthen(attached, seen, i, tracks, shapes, space)
+        seen = Seen.of(stretch, i, ground, standing[i], space.sensors)
+        attached = attach(seen, i, tracks, shapes, space.clock, scene.min_height_m)
+        detach(attached, seen, i, tracks, shapes, standing, space.clock)
+        lengthen(attached, seen, i, tracks, shapes, standing, space)
         instance = np.full(len(stretch.sweeps[i].sweep), -1, np.int32)
         instance[seen.row] = attached
         return instance
@@ -145,12 +134,6 @@ def motion_of(
         fine = [_is_fine(track, space) for track in tracks]
         bendings = _bendings(stretch, tracks, fine, instance)
     return GroupMotion(stretch, tuple(tracks), instance, bendings)
-
-
-def _foretold(track: Track, i: int, clock: Clock) -> bool:
-    """Whether sweep i is among those that saw the object, or little earlier or later."""
-    first, last = min(track.claimed), max(track.claimed)
-    return first <= i <= last or any(clock.near(i, end, _FORETOLD_S) for end in (first, last))
 
 
 def _is_fine(track: Track, space: FreeSpace) -> bool:
@@ -182,125 +165,3 @@ def _bendings(
         seen_finely = np.flatnonzero(fine).tolist()
         found = dict(zip(seen_finely, pool.map(of_track, seen_finely), strict=True))
     return {k: bending for k, bending in found.items() if np.isfinite(bending.softened.alpha)}
-
-
-@dataclass(frozen=True)
-class _Seen:
-    """The points of a sweep that may belong to something.
-
-    row: (N,) in the sweep. points: (N,3) world. time_s: (N,) when measured. height_m: (N,) above
-    the ground. reach_m: (N,) how close a point must be to an object's shape to belong to it.
-    """
-
-    row: Int
-    points: Float
-    time_s: Float
-    height_m: Float32
-    reach_m: Float
-
-    @staticmethod
-    def of(
-        stretch: Stretch, i: int, ground: HeightMap, standing: Standing, sensors: Sensors
-    ) -> _Seen:
-        registered = stretch.sweeps[i]
-        points = poses.transform(registered.T_world_lidar, registered.sweep.points)
-        height_m = ground.above(points)
-        row = np.flatnonzero(height_m > _MIN_HEIGHT_M)
-        gap_m = sensors.gap_m(registered.sweep.points, registered.sweep.lidar)
-        reach_m = np.maximum(_ATTACH_UNSEEN_M, _GAPS_REACHED_UNSEEN * gap_m)
-        seeded = standing.row[standing.candidate]
-        reach_m[seeded] = np.maximum(_ATTACH_M, _GAPS_REACHED * gap_m[seeded])
-        return _Seen(row, points[row], firing_times_s(stretch, i)[row], height_m[row], reach_m[row])
-
-
-def _attach(
-    seen: _Seen,
-    i: int,
-    tracks: Sequence[Track],
-    shapes: Sequence[Shape],
-    clock: Clock,
-    min_height_m: float,
-) -> NDArray[np.int32]:
-    """(N,): the track each of the points seen by sweep number i belongs to, -1 none.
-
-    A point belongs to a track where it is close to the object's points of all sweeps, or stands
-    within their outline: nothing else can be where a solid object is.
-    """
-    instance = np.full(len(seen.points), -1, np.int32)
-    nearest = np.full(len(seen.points), np.inf)
-    for k, track in enumerate(tracks):
-        if not _foretold(track, i, clock):
-            continue
-        rim = track.place(shapes[k].rim, track.seen_at(clock.time_ns[i]))
-        low, high = rim.min(0) - 2 * _ATTACH_M, rim.max(0) + 2 * _ATTACH_M
-        low[2] -= 1.0  # down to the wheels
-        rows = rows_inside(seen.points, low, high)
-        if not len(rows):
-            continue
-        in_shape = track.undo(seen.points[rows], seen.time_s[rows])
-        distance, _ = shapes[k].tree.nearest(in_shape)
-        belongs = (distance < seen.reach_m[rows]) & (seen.height_m[rows] >= min_height_m)
-        belongs |= shapes[k].within_outline(in_shape)
-        closer = belongs & (distance < nearest[rows])
-        instance[rows[closer]] = k
-        nearest[rows[closer]] = distance[closer]
-    return instance
-
-
-def _lengthen(
-    instance: NDArray[np.int32],
-    seen: _Seen,
-    i: int,
-    tracks: Sequence[Track],
-    shapes: Sequence[Shape],
-    space: FreeSpace,
-) -> None:
-    """Give the tracks what goes on ahead of and behind their points without a hole, as wide and as
-    high as they are: nobody sees through the middle of a long side that slides along itself. No
-    other sweep may see through the points where they would be carried to."""
-    for k, track in enumerate(tracks):
-        mine = np.flatnonzero(instance == k)
-        if not len(mine):
-            continue
-        at_s = track.seen_at(space.clock.time_ns[i])
-        ahead = track.path.rate(at_s)[:2]
-        ahead = ahead / max(float(np.linalg.norm(ahead)), 1e-6)
-        axes = np.stack([ahead, [-ahead[1], ahead[0]]], axis=1)
-        rim = track.place(shapes[k].rim, at_s)
-        side = (rim[:, :2] @ axes)[:, 1]
-        middle = track.place(shapes[k].points.mean(0, keepdims=True), at_s)[0]
-        reach = np.array([1.5 * _LENGTH_M, 1.5 * _LENGTH_M, np.inf])
-        rows = rows_inside(seen.points, middle - reach, middle + reach)
-        rows = rows[instance[rows] < 0]
-        at_once = track.carry(seen.points[rows], seen.time_s[rows], at_s)
-        along = at_once[:, :2] @ axes
-        fits = (along[:, 1] > side.min() - _SIDE_M) & (along[:, 1] < side.max() + _SIDE_M)
-        fits &= at_once[:, 2] < rim[:, 2].max() + _SIDE_M
-        own = track.carry(seen.points[mine], seen.time_s[mine], at_s)[:, :2] @ ahead
-        rows, along = rows[fits], along[fits, 0]
-        rows = rows[_without_hole(along, own)]
-        if len(rows) and _contradicted(track, seen, rows, i, space) <= _MAX_CONTRADICTED:
-            instance[rows] = k
-
-
-def _without_hole(along: Float, own: Float) -> Bool:
-    """(N,) those of ``along`` that reach (M,) ``own`` by steps below ``_LONGEST_HOLE_M``."""
-    everything = np.concatenate([along, own])
-    order = np.argsort(everything, kind="stable")
-    run = np.zeros(len(everything), np.int64)
-    run[order[1:]] = np.cumsum(np.diff(everything[order]) > _LONGEST_HOLE_M)
-    return np.isin(run[: len(along)], run[len(along) :])
-
-
-def _contradicted(
-    track: Track, seen: _Seen, rows: NDArray[np.int64], i: int, space: FreeSpace
-) -> float:
-    """The largest share of the points, moved with the track, that another sweep sees through."""
-    shares = [0.0]
-    body = track.undo(seen.points[rows], seen.time_s[rows])
-    for j in space.others(i):
-        at_s = space.clock.time_s[j]
-        carried = track.place(body, at_s)
-        velocity_m_s = track.velocity_m_s(carried, at_s)
-        shares.append(float(space.seen_through(carried, j, velocity_m_s).mean()))
-    return max(shares)

@@ -1,0 +1,248 @@
+# SPDX-License-Identifier: MIT
+"""Which points of a sweep belong to the objects that are followed: how far each reaches."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from densify.flow.tracking.clock import Clock
+from densify.flow.tracking.evidence import FreeSpace, Standing, firing_times_s
+from densify.flow.tracking.shapes import Shape
+from densify.flow.tracking.sightings import Track
+from densify.geometry import poses
+from densify.geometry.height_map import HeightMap
+from densify.geometry.sensor import Sensors
+from densify.kernels.clouds import rows_inside
+from densify.kernels.nearest import BoxTree
+from densify.types import Bool, Float, Float32, Int, Stretch
+
+_ATTACH_M = 0.3
+_ATTACH_UNSEEN_M = 0.15
+_MIN_HEIGHT_M = 0.1
+_LENGTH_M = 15.0
+_SIDE_M = 0.1
+_LONGEST_HOLE_M = 0.6
+_MAX_CONTRADICTED = 0.05
+_WALKS_M_S, _FAST_M_S = 2.0, 8.0
+_LEFT_M = 0.6  # from all of the object
+_THERE_M = 0.2
+_MAX_STILL_THERE = 0.2
+_FORETOLD_S = 0.2  # before an object was first seen and after it was last seen
+_GAPS_REACHED = 0.8  # of the gap between neighbouring rings
+_GAPS_REACHED_UNSEEN = 0.5
+
+
+@dataclass(frozen=True)
+class Seen:
+    """The points of a sweep that may belong to something.
+
+    row: (N,) in the sweep. points: (N,3) world. time_s: (N,) when measured. height_m: (N,) above
+    the ground. reach_m: (N,) how close a point must be to an object's shape to belong to it. seed:
+    (N,) another sweep saw through it.
+    """
+
+    row: Int
+    points: Float
+    time_s: Float
+    height_m: Float32
+    reach_m: Float
+    seed: Bool
+
+    @staticmethod
+    def of(
+        stretch: Stretch, i: int, ground: HeightMap, standing: Standing, sensors: Sensors
+    ) -> Seen:
+        registered = stretch.sweeps[i]
+        points = poses.transform(registered.T_world_lidar, registered.sweep.points)
+        height_m = ground.above(points)
+        row = np.flatnonzero(height_m > _MIN_HEIGHT_M)
+        gap_m = sensors.gap_m(registered.sweep.points, registered.sweep.lidar)
+        reach_m = np.maximum(_ATTACH_UNSEEN_M, _GAPS_REACHED_UNSEEN * gap_m)
+        seeded = standing.row[standing.candidate]
+        reach_m[seeded] = np.maximum(_ATTACH_M, _GAPS_REACHED * gap_m[seeded])
+        seed = np.zeros(len(points), bool)
+        seed[standing.row[standing.seed]] = True
+        time_s = firing_times_s(stretch, i)
+        return Seen(row, points[row], time_s[row], height_m[row], reach_m[row], seed[row])
+
+
+def attach(
+    seen: Seen,
+    i: int,
+    tracks: Sequence[Track],
+    shapes: Sequence[Shape],
+    clock: Clock,
+    min_height_m: float,
+) -> NDArray[np.int32]:
+    """(N,): the track each of the points seen by sweep number i belongs to, -1 none.
+
+    A point belongs to a track where it is close to the object's points of all sweeps, or stands
+    within their outline: nothing else can be where a solid object is.
+    """
+    instance = np.full(len(seen.points), -1, np.int32)
+    nearest = np.full(len(seen.points), np.inf)
+    for k, track in enumerate(tracks):
+        if not foretold(track, i, clock):
+            continue
+        rim = track.place(shapes[k].rim, track.seen_at(clock.time_ns[i]))
+        low, high = rim.min(0) - 2 * _ATTACH_M, rim.max(0) + 2 * _ATTACH_M
+        low[2] -= 1.0  # down to the wheels
+        rows = rows_inside(seen.points, low, high)
+        if not len(rows):
+            continue
+        in_shape = track.undo(seen.points[rows], seen.time_s[rows])
+        distance, _ = shapes[k].tree.nearest(in_shape)
+        belongs = (distance < seen.reach_m[rows]) & (seen.height_m[rows] >= min_height_m)
+        belongs |= shapes[k].within_outline(in_shape)
+        closer = belongs & (distance < nearest[rows])
+        instance[rows[closer]] = k
+        nearest[rows[closer]] = distance[closer]
+    return instance
+
+
+def detach(
+    instance: NDArray[np.int32],
+    seen: Seen,
+    i: int,
+    tracks: Sequence[Track],
+    shapes: Sequence[Shape],
+    standing: Sequence[Standing],
+    clock: Clock,
+) -> None:
+    """Take from those who walk what no sweep saw through and what is still there when they are
+    gone: the wall beside them. (What drives has sides that slide along themselves.)"""
+    for k, track in enumerate(tracks):
+        if _speed_m_s(track, i, clock) > _WALKS_M_S:
+            continue
+        rows = np.flatnonzero((instance == k) & ~seen.seed)
+        if len(rows):
+            _, there = _left_behind(track, shapes[k].tree, seen.points[rows], i, standing, clock)
+            instance[rows[there]] = -1
+
+
+def lengthen(
+    instance: NDArray[np.int32],
+    seen: Seen,
+    i: int,
+    tracks: Sequence[Track],
+    shapes: Sequence[Shape],
+    standing: Sequence[Standing],
+    space: FreeSpace,
+) -> None:
+    """Give the tracks what goes on ahead of and behind their points without a hole, as wide and as
+    high as they are: nobody sees through the middle of a long side that slides along itself. No
+    other sweep may see through the points where they would be carried to, and they must leave their
+    places: the wall that somebody walks along is still there when he has passed."""
+    for k, track in enumerate(tracks):
+        mine = np.flatnonzero(instance == k)
+        if not len(mine):
+            continue
+        at_s = track.seen_at(space.clock.time_ns[i])
+        ahead = track.path.rate(at_s)[:2]
+        ahead = ahead / max(float(np.linalg.norm(ahead)), 1e-6)
+        axes = np.stack([ahead, [-ahead[1], ahead[0]]], axis=1)
+        rim = track.place(shapes[k].rim, at_s)
+        side = (rim[:, :2] @ axes)[:, 1]
+        middle = track.place(shapes[k].points.mean(0, keepdims=True), at_s)[0]
+        reach = np.array([1.5 * _LENGTH_M, 1.5 * _LENGTH_M, np.inf])
+        rows = rows_inside(seen.points, middle - reach, middle + reach)
+        rows = rows[instance[rows] < 0]
+        at_once = track.carry(seen.points[rows], seen.time_s[rows], at_s)
+        along = at_once[:, :2] @ axes
+        fits = (along[:, 1] > side.min() - _SIDE_M) & (along[:, 1] < side.max() + _SIDE_M)
+        fits &= at_once[:, 2] < rim[:, 2].max() + _SIDE_M
+        own = track.carry(seen.points[mine], seen.time_s[mine], at_s)[:, :2] @ ahead
+        rows, along = rows[fits], along[fits, 0]
+        rows = rows[_without_hole(along, own)]
+        if (
+            len(rows)
+            and _contradicted(track, seen, rows, i, space) <= _MAX_CONTRADICTED
+            and _leaves(track, seen, mine, rows, i, standing, space.clock)
+        ):
+            instance[rows] = k
+
+
+def _without_hole(along: Float, own: Float) -> Bool:
+    """(N,) those of ``along`` that reach (M,) ``own`` by steps below ``_LONGEST_HOLE_M``."""
+    everything = np.concatenate([along, own])
+    order = np.argsort(everything, kind="stable")
+    run = np.zeros(len(everything), np.int64)
+    run[order[1:]] = np.cumsum(np.diff(everything[order]) > _LONGEST_HOLE_M)
+    return np.isin(run[: len(along)], run[len(along) :])
+
+
+def _contradicted(
+    track: Track, seen: Seen, rows: NDArray[np.int64], i: int, space: FreeSpace
+) -> float:
+    """The largest share of the points, moved with the track, that another sweep sees through."""
+    shares = [0.0]
+    body = track.undo(seen.points[rows], seen.time_s[rows])
+    for j in space.others(i):
+        at_s = space.clock.time_s[j]
+        carried = track.place(body, at_s)
+        velocity_m_s = track.velocity_m_s(carried, at_s)
+        shares.append(float(space.seen_through(carried, j, velocity_m_s).mean()))
+    return max(shares)
+
+
+def _leaves(
+    track: Track,
+    seen: Seen,
+    mine: NDArray[np.int64],
+    rows: NDArray[np.int64],
+    i: int,
+    standing: Sequence[Standing],
+    clock: Clock,
+) -> bool:
+    """Whether the rows leave their places empty when the object with them is gone. mine: its other
+    points.
+
+    Who walks has no long side, and what drives fast is elsewhere soon. Between the two nothing is
+    asked: where a slow truck was are the parts of it that are not known yet to be its own.
+    """
+    if _WALKS_M_S < _speed_m_s(track, i, clock) < _FAST_M_S:
+        return True
+    both = np.concatenate([mine, rows])
+    tree = BoxTree(track.undo(seen.points[both], seen.time_s[both]))
+    gone, there = _left_behind(track, tree, seen.points[rows], i, standing, clock)
+    return bool(gone.any() and there.sum() <= _MAX_STILL_THERE * gone.sum())
+
+
+def _speed_m_s(track: Track, i: int, clock: Clock) -> float:
+    """When sweep number i is taken."""
+    return float(np.linalg.norm(track.path.rate(track.seen_at(clock.time_ns[i]))[:2]))
+
+
+def _left_behind(
+    track: Track,
+    tree: BoxTree,
+    points: Float,
+    i: int,
+    standing: Sequence[Standing],
+    clock: Clock,
+) -> tuple[Bool, Bool]:
+    """From which of the places (N,3) that sweep number i shows the object is gone in the first or
+    in the last sweep that saw it, and where something that stands is there then. tree: of the
+    object, in its own frame."""
+    gone, there = np.zeros((2, len(points)), bool)
+    for j in {min(track.claimed), max(track.claimed)} - {i}:
+        body = track.undo(points, clock.time_s[j])
+        away = np.flatnonzero(~np.isfinite(tree.nearest(body, _LEFT_M)[0]))
+        if not len(away):
+            continue
+        gone[away] = True
+        places, stands = points[away], standing[j].points[~standing[j].candidate]
+        stands = stands[rows_inside(stands, places.min(0) - _THERE_M, places.max(0) + _THERE_M)]
+        if len(stands):
+            there[away] |= np.isfinite(BoxTree(stands).nearest(places, _THERE_M)[0])
+    return gone, there
+
+
+def foretold(track: Track, i: int, clock: Clock) -> bool:
+    """Whether sweep i is among those that saw the object, or little earlier or later."""
+    first, last = min(track.claimed), max(track.claimed)
+    return first <= i <= last or any(clock.near(i, end, _FORETOLD_S) for end in (first, last))
