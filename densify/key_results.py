@@ -24,6 +24,7 @@ from densify.methods import METHODS
 from densify.recording import Beyond, Moment
 from densify.scores import depth_metrics
 from densify.scores import ghosts as scores
+from densify.scores.radial_velocity import radial_velocity_scores
 from densify.types import (
     Bool,
     Cloud,
@@ -198,6 +199,9 @@ class _Shared:
             },
             "ghosts": scores.ghost_scores(near, self.key_image, self.key.frame),
         }
+        radial = radial_velocity_scores(near, self.key.stretch[self.key.frame])
+        if radial is not None:
+            metrics["radial_velocity"] = radial
         if self.truth:
             metrics["depth"] = {
                 name: depth_metrics.depth_scores(depth[name], *true, cameras[depth[name].camera])

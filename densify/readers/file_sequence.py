@@ -33,7 +33,8 @@ class Returns:
     cannot tell. lidar: (N,) uint8, which of several scanners fired, None if there is one.
     scanner_origins: (S,3) metres, lidar frame, None where all rays start at the frame's origin.
     R_scanner_lidar: (S,3,3) from the lidar frame's axes to each scanner's, z upwards along the one
-    it spins about, None where they are the frame's.
+    it spins about, None where they are the frame's. radial_velocity_m_s: (N,) float32, relative to
+    the scanner and away from it, None if it was not measured.
     """
 
     points: Float
@@ -42,6 +43,7 @@ class Returns:
     lidar: NDArray[np.uint8] | None = None
     scanner_origins: Float | None = None
     R_scanner_lidar: Float | None = None
+    radial_velocity_m_s: Float32 | None = None
 
 
 class FileSequence(ABC):
@@ -129,6 +131,9 @@ class FileSequence(ABC):
             row=row.astype(np.int64),
             scanner_origins=returns.scanner_origins,
             R_scanner_lidar=returns.R_scanner_lidar,
+            radial_velocity_m_s=(
+                None if returns.radial_velocity_m_s is None else returns.radial_velocity_m_s[row]
+            ),
         )
 
     def num_rows(self, frame: int) -> int:

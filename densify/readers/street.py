@@ -143,6 +143,7 @@ class Street:
             lidar=returns.lidar,
             row=np.arange(len(returns.points)),
             scanner_origins=self.simulator.sensor.origins_m,
+            radial_velocity_m_s=returns.radial_velocity_m_s,
         )
 
     def keep_nothing(self) -> None:
@@ -158,7 +159,12 @@ class Street:
         """The sweep's returns with the bodies they are from."""
         self.check(frame)
         return Returns(
-            **self._store.get(f"sweep/{frame}", lambda: vars(self.simulator.returns(frame)))
+            **self._store.get(
+                f"sweep/{frame}",
+                lambda: {
+                    k: v for k, v in vars(self.simulator.returns(frame)).items() if v is not None
+                },
+            )
         )
 
     def prepare(self, frames: Sequence[int], images: Sequence[tuple[str, int]] = ()) -> None:

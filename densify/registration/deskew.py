@@ -34,7 +34,13 @@ def placed(sweep: Sweep, T_world_lidar: Float, before: Float, after: Float) -> R
         offset_s = sweep.offset_ns[:, None] * 1e-9
         twist = offset_s * np.where(offset_s < 0, before, after)
         points = poses.transform_each(twist.astype(np.float64), points)
-    return RegisteredSweep(replace(sweep, points=points), T_world_lidar, before, after)
+    straight = RegisteredSweep(replace(sweep, points=points), T_world_lidar, before, after)
+    if sweep.radial_velocity_m_s is None:
+        return straight
+    ray, own_m_s = straight.rays()
+    over_ground = sweep.radial_velocity_m_s + np.einsum("ni,ni->n", ray, own_m_s)
+    measured = replace(straight.sweep, radial_velocity_m_s=over_ground.astype(np.float32))
+    return replace(straight, sweep=measured)
 
 
 def twists(trajectory: Trajectory, i: int) -> tuple[Float, Float]:

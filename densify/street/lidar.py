@@ -22,6 +22,7 @@ _SPOT_RAD = 1.05e-3  # of a beam's spot, along each axis from its centre to the 
 _FLAT_M = 0.10  # off the plane through the centre's echo: an edge
 _MERGE_M = 2.0  # echoes closer than this can melt into one
 _MELT_PROBABILITY = 0.2
+_STEP_S = 1e-3  # of velocities
 
 
 @dataclass(frozen=True)
@@ -30,7 +31,8 @@ class Returns:
 
     points: (N,3) float32, lidar axes, each at its own firing time. intensity: (N,) 0 to 1.
     offset_ns: (N,) int64 from the reference time. lidar: (N,) scanner. body: (N,) index of the
-    body met. instance: (N,) object met, -1 none.
+    body met. instance: (N,) object met, -1 none. radial_velocity_m_s: (N,) relative to the scanner,
+    away from it; None for sensors that do not measure it.
     """
 
     points: Float32
@@ -39,6 +41,7 @@ class Returns:
     lidar: NDArray[np.uint8]
     body: NDArray[np.int32]
     instance: NDArray[np.int32]
+    radial_velocity_m_s: Float32 | None = None
 
 
 @dataclass(frozen=True)
@@ -90,14 +93,46 @@ def scan(
     origin_m = sensor.origins_m[fired.lidar]
     np.add(points, origin_m, out=points, where=origin_m != 0)  # a coordinate of -0.0 stays one
     brightness = reflectivity * (0.35 + 0.65 * grazing) * (1 + 0.05 * rng.normal(size=n))
+    body = world.body[hit.triangle[keep]]
+    radial_m_s = None
+    if sensor.measures_velocity:
+        sigmas_m_s = [scanner.velocity_sigma_m_s for scanner in sensor.scanners]
+        places = origin[keep] + spot[0][keep] * range_m[keep, None]
+        v_m_s = velocities_m_s(world, body, places, times[keep])
+        v_m_s -= _at_rest_on(ego, T, sensor.origins_m[fired.lidar[keep]], times[keep])
+        radial_m_s = np.einsum("ni,ni->n", v_m_s, spot[0][keep])
+        noise = np.array(sigmas_m_s, np.float64)[fired.lidar[keep]] * rng.normal(size=len(v_m_s))
+        radial_m_s = (radial_m_s + noise).astype(np.float32)
     return Returns(
         points[keep].astype(np.float32),
         np.clip(np.round(brightness[keep], 2), 0, 1).astype(np.float32),
         fired.offset_ns[keep],
         fired.lidar[keep],
-        world.body[hit.triangle[keep]],
+        body,
         world.instance[hit.triangle[keep]],
+        radial_m_s,
     )
+
+
+def velocities_m_s(world: World, body: NDArray[np.int32], places: Float, times: Float) -> Float:
+    """(N,3) world axes: of the points of bodies that are at these places (N,3) at these times."""
+    found = np.zeros_like(places)
+    for index in np.unique(body[body > 0]):
+        rows = np.flatnonzero(body == index)
+        in_body = world.poses(int(index), times[rows]).undo(places[rows])
+        ends = [
+            world.poses(int(index), times[rows] + h).apply(in_body) for h in (-_STEP_S, _STEP_S)
+        ]
+        found[rows] = (ends[1] - ends[0]) / (2 * _STEP_S)
+    return found
+
+
+def _at_rest_on(ego: Driving, T_ego: Float, origins: Float, times: Float) -> Float:
+    """(N,3) m/s, world axes: of scanners at these places (N,3) of the lidar frame."""
+    mounts = transform(T_ego, origins)
+    ends = [ego.poses(times + h).apply(mounts) for h in (-_STEP_S, _STEP_S)]
+    moved: Float = ends[1] - ends[0]
+    return moved / (2 * _STEP_S)
 
 
 def at_offsets(time_s: float, offset_ns: Int) -> Float:

@@ -18,13 +18,14 @@ class Scanner:
     """One scanner of a sensor.
 
     max_range_m, range_sigma_m: reach, and noise along the ray. origin_m: where its rays start,
-    lidar frame.
+    lidar frame. velocity_sigma_m_s: noise of the radial velocity, None if it does not measure it.
     """
 
     pattern: Pattern
     max_range_m: float
     range_sigma_m: float
     origin_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    velocity_sigma_m_s: float | None = None
 
 
 @dataclass(frozen=True)
@@ -38,6 +39,11 @@ class Sensor:
     def origins_m(self) -> Float:
         """(S,3) where the rays of each scanner start, lidar frame."""
         return np.array([scanner.origin_m for scanner in self.scanners])
+
+    @property
+    def measures_velocity(self) -> bool:
+        """Whether all its returns have a radial velocity."""
+        return all(scanner.velocity_sigma_m_s is not None for scanner in self.scanners)
 
     @property
     def spins(self) -> bool:
@@ -120,6 +126,17 @@ SENSORS: dict[str, Sensor] = {
             (
                 Scanner(Spinning(_PANDAR64_DEG, 18000), 120.0, 0.02),
                 Scanner(Raster(60.0, 20.0, 1000, 400_000), 150.0, 0.02, (0.58, 0.027, -0.294)),
+            ),
+        ),
+        # like Aeva's: frequency-modulated, so that each return has its radial velocity
+        Sensor(
+            "fmcw",
+            (
+                Scanner(
+                    Raster(110.0, 28.0, 900, 1_000_000),
+                    *(150.0, 0.02),
+                    velocity_sigma_m_s=0.05,
+                ),
             ),
         ),
         # like Livox's: its prisms turn at 7294 and -4664 turns a minute

@@ -2,7 +2,8 @@
 """Writes a street as a plain folder with its truth, which `densify.readers.folder.reader` opens::
 
 OUT/street/densify.yaml
-OUT/street/sweeps/000000.bin, ...   float32 x y z intensity time lidar, time in s since the stamp
+OUT/street/sweeps/000000.bin, ...   float32 x y z intensity time lidar, time in s since the stamp,
+                                    and radial_velocity of sensors that measure it
 OUT/street/timestamps.txt           one time for each sweep (s since 1970)
 OUT/street/poses.txt                the lidar's path, TUM: time x y z qx qy qz qw
 OUT/street/images/CAMERA/1781258406000000000.png, ...  named by their times (ns)
@@ -33,7 +34,9 @@ def write_tree(excerpt: Excerpt, out: Path, overwrite: bool, progress: Progress 
             if progress:
                 progress("simulate", done, len(excerpt.frames))
             returns = excerpt.returns(frame)
-            columns = (returns.intensity, returns.offset_ns * 1e-9, returns.lidar)
+            columns = [returns.intensity, returns.offset_ns * 1e-9, returns.lidar]
+            if returns.radial_velocity_m_s is not None:
+                columns.append(returns.radial_velocity_m_s)
             table = np.column_stack([returns.points, *columns]).astype("<f4")
             put(folder / "sweeps" / f"{done:06d}.bin", table.tobytes())
         put(folder / "timestamps.txt", "".join(f"{_seconds(ns)}\n" for ns in stamps_ns).encode())
@@ -72,7 +75,7 @@ def config_text(excerpt: Excerpt) -> str:
     config = {
         "sweeps": {
             "files": "sweeps",
-            "columns": list(COLUMNS),
+            "columns": [*COLUMNS, *["radial_velocity"] * sensor.measures_velocity],
             "intensity_scale": 1.0,
             "time_unit": "s",
             "time_is": "relative",

@@ -11,6 +11,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from densify.flow.tracking.clock import Clock
+from densify.flow.tracking.radial import Radial
 from densify.geometry import poses
 from densify.geometry.height_map import HeightMap
 from densify.geometry.range_image import RangeImage
@@ -100,8 +101,9 @@ class Standing:
 
     row: (C,) index into the sweep's points. points: (C,3) world, rigidly registered.
     time_s: (C,) when each was measured, since the first sweep's reference time.
-    seed: (C,) some other sweep sees through the point. cluster: (C,) label of ``num_clusters``
-    groups of candidates (seeds and what is close to them), -1 of points that are none.
+    seed: (C,) some other sweep sees through the point, or its radial velocity is none of what
+    stands. cluster: (C,) label of ``num_clusters`` groups of candidates (seeds and what is close to
+    them), -1 of points that are none. radial: None where no scanner measures it.
     """
 
     row: Int
@@ -110,12 +112,14 @@ class Standing:
     seed: Bool
     cluster: Int
     num_clusters: int
+    radial: Radial | None = None
 
     @staticmethod
     def of(stretch: Stretch, i: int, found: Candidates) -> Standing:
         """Place the candidates of sweep number i in the world."""
         registered = stretch.sweeps[i]
         points = poses.transform(registered.T_world_lidar, registered.sweep.points[found.row])
+        radial = Radial.of(registered)
         return Standing(
             row=found.row,
             points=points,
@@ -123,6 +127,7 @@ class Standing:
             seed=found.seed,
             cluster=found.cluster,
             num_clusters=found.num_clusters,
+            radial=None if radial is None else radial.rows(found.row),
         )
 
     @property
@@ -140,7 +145,8 @@ def find_candidates(
     """What stands in every sweep, and which of it may move.
 
     A point is a seed where any other sweep around sees through it; points close to a seed are
-    candidates too, since a mover's own points are not all seen through.
+    candidates too, since a mover's own points are not all seen through. Points beside these whose
+    measured radial velocity says that they move are candidates of their own.
     min_height_m: points lower above the ground do not stand. among: numbers of the sweeps to look
     at, all if None.
     """
@@ -158,6 +164,12 @@ def find_candidates(
         over_scanner = points - registered.T_world_lidar[:3, 3]
         close = closer_rings(over_scanner, gap_m)
         num_clusters, cluster = cluster_around(close, seed)
+        radial = Radial.of(registered)
+        if radial is not None:
+            fast = np.flatnonzero(radial.moving()[above] & (cluster < 0))
+            num_more, more = link(close[fast], LINK_M)
+            seed[fast], cluster[fast] = True, num_clusters + more
+            num_clusters += num_more
         return Candidates(above, seed, cluster, num_clusters)
 
     with ThreadPoolExecutor() as pool:

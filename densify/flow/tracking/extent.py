@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from densify.flow.tracking.clock import Clock
 from densify.flow.tracking.evidence import FreeSpace, Standing, firing_times_s
+from densify.flow.tracking.radial import Radial
 from densify.flow.tracking.shapes import Shape
 from densify.flow.tracking.sightings import Track
 from densify.geometry import poses
@@ -122,6 +123,18 @@ def detach(
         if len(rows):
             _, there = _left_behind(track, shapes[k].tree, seen.points[rows], i, standing, clock)
             instance[rows[there]] = -1
+
+
+def leave_out_slower(
+    instance: NDArray[np.int32], seen: Seen, radial: Radial, tracks: Sequence[Track]
+) -> None:
+    """Take from the tracks the points whose measured radial velocities are not theirs: of what
+    stands beside something fast, and of echoes that melt into one."""
+    for k in np.unique(instance[instance >= 0]):
+        rows = np.flatnonzero(instance == k)
+        at_s = float(seen.time_s[rows].mean())
+        velocity_m_s = tracks[k].velocity_m_s(seen.points[rows], at_s)
+        instance[rows[radial.rows(rows).contradicts(velocity_m_s)]] = -1
 
 
 def lengthen(

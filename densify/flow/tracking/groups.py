@@ -19,7 +19,15 @@ from densify.flow.tracking.evidence import (
     Standing,
     firing_times_s,
 )
-from densify.flow.tracking.extent import Seen, attach, detach, foretold, lengthen
+from densify.flow.tracking.extent import (
+    Seen,
+    attach,
+    detach,
+    foretold,
+    leave_out_slower,
+    lengthen,
+)
+from densify.flow.tracking.radial import Radial
 from densify.flow.tracking.shapes import Shape
 from densify.flow.tracking.sightings import Track
 from densify.flow.tracking.soften import Part, Softened, soften
@@ -123,6 +131,9 @@ def motion_of(
         attached = attach(seen, i, tracks, shapes, space.clock, scene.min_height_m)
         detach(attached, seen, i, tracks, shapes, standing, space.clock)
         lengthen(attached, seen, i, tracks, shapes, standing, space)
+        radial = Radial.of(stretch.sweeps[i])
+        if radial is not None:
+            leave_out_slower(attached, seen, radial.rows(seen.row), tracks)
         instance = np.full(len(stretch.sweeps[i].sweep), -1, np.int32)
         instance[seen.row] = attached
         return instance

@@ -18,6 +18,7 @@ from scipy.sparse.csgraph import connected_components
 
 from densify.flow.tracking.clock import Clock
 from densify.flow.tracking.evidence import LINK_M, Standing
+from densify.flow.tracking.radial import Radial
 from densify.kernels.linking import link
 
 T = TypeVar("T", bound=np.generic)
@@ -89,6 +90,7 @@ def _together(parts: Sequence[Standing]) -> Standing:
     together = coo_array((np.ones(len(candidate), bool), ends), shape=(num, num))
     num_clusters, cluster = connected_components(together, directed=False)
     label[candidate] = cluster[label[candidate]]
+    radial = [c.radial for c in parts if c.radial is not None]
     return Standing(
         row=np.concatenate([c.row for c in parts]),
         points=points,
@@ -96,4 +98,5 @@ def _together(parts: Sequence[Standing]) -> Standing:
         seed=np.concatenate([c.seed for c in parts]),
         cluster=label,
         num_clusters=int(num_clusters),
+        radial=Radial.together(radial) if len(radial) == len(parts) else None,
     )

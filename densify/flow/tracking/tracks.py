@@ -19,6 +19,7 @@ from densify.flow.tracking.clock import Clock
 from densify.flow.tracking.evidence import FreeSpace, Standing
 from densify.flow.tracking.lone_rings import in_line, linked_in_line, single_rings
 from densify.flow.tracking.looks import Look, looks_of
+from densify.flow.tracking.radial import Radial
 from densify.flow.tracking.shapes import Shape
 from densify.flow.tracking.sightings import Track
 from densify.flow.tracking.vote import DistanceField, vote
@@ -72,6 +73,9 @@ def follow_groups(
             velocity = vote(seen[n].points[members], n, fields, clock)
         else:
             velocity = np.median(looks[n].gather(velocities_m_s)[members], axis=0)
+        radial = seen[n].radial
+        if radial is not None:
+            velocity = radial.rows(members).corrected(velocity)
         track = _follow(members, n, velocity, looks, free, ground, clock)
         proven = _prove(track, standing, space)
         if proven:
@@ -289,7 +293,8 @@ def _prove(track: Track, standing: Sequence[Standing], space: FreeSpace) -> bool
     """Fit the smooth motion; True if the track certainly moves.
 
     The motion must be smooth, long enough to be told from noise, and must do away with the
-    contradictions that brought the group here: where the sweeps see through its points at their
+    contradictions that brought the group here, and have the radial velocities that were measured,
+    where any were: where the sweeps see through its points at their
     rigid places, they must not see through them at the moved ones.
     """
     seen_s = np.ptp([sighting.seen_s for sighting in track.sightings.values()])
@@ -303,8 +308,22 @@ def _prove(track: Track, standing: Sequence[Standing], space: FreeSpace) -> bool
     rough_m = _ROUGH_M + _ROUGH_PER_GAP * gap_m + _ROUGH_S * travelled / seen_s
     if residual_m > rough_m or travelled < max(_LEAST_WAY_M, _LEAST_WAY_PER_RESIDUAL * residual_m):
         return False
+    if not _as_fast_as_measured(track, standing):
+        return False
     still, moved = _contradictions(track, standing, space)
     return moved <= _MAX_CONTRADICTIONS * still
+
+
+def _as_fast_as_measured(track: Track, standing: Sequence[Standing]) -> bool:
+    """Whether the motion has the radial velocities that were measured, where any were."""
+    parts, velocities = [], []
+    for j, rows in track.claimed.items():
+        radial = standing[j].radial
+        if radial is not None:
+            at_s = float(standing[j].time_s[rows].mean())
+            parts.append(radial.rows(rows))
+            velocities.append(track.velocity_m_s(standing[j].points[rows], at_s))
+    return not parts or Radial.together(parts).agrees(np.concatenate(velocities))
 
 
 def _contradictions(

@@ -28,8 +28,8 @@ class SweepFiles:
     files: folder of the sweeps, "" to look for it. columns: of files without names. scale_m:
     metres of a unit of the points. R_lidar_stored: (3,3), from key ``axes``, turns (or mirrors)
     stored points to the lidar's frame, x forward, y left, z up; None leaves them. intensity,
-    time, lidar: which column plays that part, "" to find it by its name. intensity_scale: what is
-    full brightness, 0 to find it. time_unit, absolute, reference: as
+    time, lidar, radial_velocity: which column plays that part, "" to find it by its name.
+    intensity_scale: what is full brightness, 0 to find it. time_unit, absolute, reference: as
     `densify.readers.points.fields.find_times`. stamps: ``names`` (of the files) or a file with one
     time for each sweep, "" to look for them; stamps_unit: theirs. rate_hz: of sweeps without
     stamps, 0 to take it from the points' times. compensated: the points were carried to the
@@ -47,6 +47,7 @@ class SweepFiles:
     absolute: bool | None = None
     reference: str = ""
     lidar: str = ""
+    radial_velocity: str = ""
     stamps: str = ""
     stamps_unit: str = ""
     rate_hz: float = 0.0
@@ -68,6 +69,7 @@ class SweepFiles:
             absolute=None if not kind else kind == "absolute",
             reference=section.choice("reference", REFERENCES),
             lidar=section.text("lidar"),
+            radial_velocity=section.text("radial_velocity"),
             stamps=section.text("stamps"),
             stamps_unit=section.choice("stamps_unit", tuple(UNIT_NS)),
             rate_hz=section.number("rate_hz", 0.0, above=0.0),

@@ -24,6 +24,7 @@ from densify.readers.points.fields import (
     find_times,
     full_scale,
     points_of,
+    radial_velocities,
     scaled,
     widened,
 )
@@ -33,6 +34,7 @@ from densify.types import Bool, Int
 Columns = Mapping[str, NDArray[Any]]
 
 _ASSUMED_PERIOD_NS = 100_000_000
+_NAMED = ("intensity", "time", "lidar", "radial_velocity")
 _NUM_TRIED = 5  # sweeps, until one can be read
 _RATES_HZ = (5, 10, 15, 20, 25)
 
@@ -87,6 +89,7 @@ class SweepColumns:
             self._offset_ns(path, columns, stamp_ns, valid),
             self._lidar(path, columns, valid),
             self.settings.scanner_origins,
+            radial_velocity_m_s=radial_velocities(columns, layout.fields),
         )
 
     @cached_property
@@ -164,7 +167,7 @@ class SweepColumns:
     @cached_property
     def _fields(self) -> Fields:
         _, path, columns = self._sample
-        named = {part: getattr(self.settings, part) for part in ("intensity", "time", "lidar")}
+        named = {part: getattr(self.settings, part) for part in _NAMED}
         for part, name in named.items():
             if name and name not in columns:
                 raise InputError(

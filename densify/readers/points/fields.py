@@ -36,11 +36,16 @@ _NAMES = {
     "ring": (
         *("ring", "line", "channel", "laser_id", "laser_number", "laserid", "beam", "scalar_ring"),
     ),
+    "radial_velocity": (
+        *("radial_velocity", "radial_speed", "doppler", "doppler_velocity", "velocity"),
+        *("v_r", "vr", "radial_velocity_m_s"),
+    ),
     "lidar": ("lidar", "lidar_id", "scanner", "sensor_id", "scanner_channel"),
 }
 _SHORTEST_SHARE, _LONGEST_SHARE = 0.08, 4.0  # of a period that the times of a sweep span
 _SAME_CLOCK_NS = 2_000_000_000
 _RELATIVE_NS = 3_000_000_000
+_FASTEST_M_S = 200.0
 _FULL_SCALES = (1.0, 255.0, 65535.0)
 
 
@@ -55,6 +60,7 @@ class Fields:
     time: str = ""
     ring: str = ""
     lidar: str = ""
+    radial_velocity: str = ""
 
 
 def find_fields(names: Collection[str]) -> Fields:
@@ -173,3 +179,12 @@ def points_of(columns: Mapping[str, NDArray[Any]], fields: Fields) -> NDArray[np
     return np.column_stack([columns[name] for name in (fields.x, fields.y, fields.z)]).astype(
         np.float64
     )
+
+
+def radial_velocities(columns: Mapping[str, NDArray[Any]], fields: Fields) -> Float32 | None:
+    """(N,) m/s away from the scanner, NaN where it was not measured; None without such a field."""
+    if not fields.radial_velocity:
+        return None
+    found = columns[fields.radial_velocity].astype(np.float32)
+    found[~(np.abs(found) < _FASTEST_M_S)] = np.nan
+    return found

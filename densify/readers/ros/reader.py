@@ -44,6 +44,7 @@ from densify.readers.points.fields import (
     find_times,
     full_scale,
     points_of,
+    radial_velocities,
     scaled,
 )
 from densify.readers.pose_track import PoseTrack
@@ -51,7 +52,7 @@ from densify.readers.ros.bag import Bag, Entry
 from densify.readers.ros.frames import Frames, plain, recorded_track
 from densify.readers.ros.messages import camera_of, cloud_columns, image_rgb
 from densify.readers.ros.topics import POSES, Images, Topics
-from densify.types import Camera, Float
+from densify.types import Camera, Float, Float32
 
 _NUM_TRIED = 5  # sweeps, until one holds points
 _USUAL_PERIOD_NS = 100_000_000
@@ -145,6 +146,7 @@ class RosBag(FileSequence):
             np.concatenate([part.offset_ns for part in parts]) if timed else None,
             np.concatenate(numbers),
             origins if len(self._lidars) > 1 else None,
+            radial_velocity_m_s=_together([part.radial_velocity_m_s for part in parts], numbers),
         )
 
     def _returns_of(self, lidar: Lidar, entry: Entry, stamp_ns: int) -> Returns:
@@ -171,7 +173,8 @@ class RosBag(FileSequence):
             offset_ns[valid] = lidar.times.offset_ns(values[valid], entry.stamp_ns) + since_ns
         points[valid] = poses.transform(lidar.T_first_lidar, points[valid])
         points[~valid] = 0.0
-        return Returns(points, intensity, offset_ns)
+        radial_m_s = radial_velocities(columns, lidar.fields)
+        return Returns(points, intensity, offset_ns, radial_velocity_m_s=radial_m_s)
 
     def _image(self, camera: Camera, number: int) -> NDArray[np.uint8]:
         topic = self._images[camera.name]
@@ -276,3 +279,16 @@ class RosBag(FileSequence):
                 raise
             self._left_out.append(f"{images.topic}: {error}")
             return None
+
+
+def _together(measured: Sequence[Float32 | None], like: Sequence[NDArray[Any]]) -> Float32 | None:
+    """What several lidars measured, one after the other, NaN of those that do not; None if none
+    does. like: a row for each of their points."""
+    if all(column is None for column in measured):
+        return None
+    return np.concatenate(
+        [
+            np.full(len(rows), np.nan, np.float32) if column is None else column
+            for column, rows in zip(measured, like, strict=True)
+        ]
+    )
