@@ -111,6 +111,13 @@ def test_what_is_not_on_the_disk_leaves_a_gap(broken):
         sequence[1]
 
 
+def test_a_name_that_no_file_can_have_leaves_a_gap_too(broken):
+    path = next(broken.glob("v1.0-*/sample_data.json"))
+    sweeps = sorted(broken.glob("s*/LIDAR_TOP/*"), key=lambda p: p.name)
+    path.write_text(path.read_text().replace(sweeps[1].name, "1" * 300))
+    assert list(open_sequence(broken).frames) == [0, 2]
+
+
 def test_of_millions_of_records_few_are_parsed(tmp_path):
     record = '{"token": "%d", "sample_token": "s%d", "filename": "x"}'
     lines = ",\n".join(record % (i, i // 10) for i in range(50_000))

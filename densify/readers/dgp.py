@@ -26,6 +26,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime, timedelta, timezone
+from os.path import isfile
 from pathlib import Path
 from typing import Any
 
@@ -160,7 +161,7 @@ def _read_scene(file: Path) -> tuple[_Numbered, _Numbered, Path]:
                 every.setdefault(entry["id"]["name"], []).append(entry)
             for name, of_sensor in every.items():
                 numbered = {i: _datum(file, kind, entry) for i, entry in enumerate(of_sensor)}
-                there = {i: datum for i, datum in numbered.items() if datum.path.is_file()}
+                there = {i: datum for i, datum in numbered.items() if isfile(datum.path)}
                 if there:
                     by_sensor[name] = there
         key = content["samples"][0]["calibration_key"]

@@ -33,6 +33,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from os.path import isfile
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -262,6 +263,6 @@ def _anonymized(path: Path, images: Mapping[str, Any]) -> str:
     """How the front camera's images that are there were made anonymous."""
     for method in _ANONYMIZED:
         listed = images.get(f"front_{method}")
-        if listed and (path / listed[0]["filepath"]).is_file():
+        if listed and isfile(path / listed[0]["filepath"]):
             return method
     return next((m for m in _ANONYMIZED if f"front_{m}" in images), _ANONYMIZED[0])

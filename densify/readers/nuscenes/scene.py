@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from os.path import isfile
 from pathlib import Path
 
 import numpy as np
@@ -34,9 +35,8 @@ class Channel:
 
     def on_disk(self, root: Path) -> list[int]:
         """Numbers of the records whose file is there."""
-        return [
-            i for i, record in enumerate(self.records) if (root / record.text("filename")).is_file()
-        ]
+        files = [root / record.text("filename") for record in self.records]
+        return [i for i, file in enumerate(files) if isfile(file)]  # no name is too long for it
 
 
 @dataclass(frozen=True)
