@@ -19,7 +19,7 @@ import torch
 from numpy.typing import NDArray
 from torch import nn
 
-from densify.errors import InputError
+from densify.errors import InputError, brief
 from densify.files.arrays import read_arrays
 from densify.learning.networks import NETWORKS, build
 from densify.outputs.atomic import write_file
@@ -96,9 +96,9 @@ def _header(path: Path, arrays: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
             f"{path}: a model of version {found[1]}, expected {VERSION}; train again, or use the "
             f"densify that wrote it"
         )
-    if found[2] not in NETWORKS:
+    if not isinstance(found[2], str) or found[2] not in NETWORKS:
         raise InputError(
-            f"{path}: a network {found[2]!r}, expected one of {', '.join(NETWORKS)}; use a newer "
+            f"{path}: a network {brief(repr(found[2]))}, expected one of {', '.join(NETWORKS)}; use a newer "
             f"densify"
         )
     return dict(header)
