@@ -98,7 +98,7 @@ def _header(path: Path, arrays: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
         )
     if not isinstance(found[2], str) or found[2] not in NETWORKS:
         raise InputError(
-            f"{path}: a network {brief(repr(found[2]))}, expected one of {', '.join(NETWORKS)}; use a newer "
-            f"densify"
+            f"{path}: a network {brief(repr(found[2]))}, expected one of "
+            f"{', '.join(NETWORKS)}; use a newer densify"
         )
     return dict(header)
