@@ -22,14 +22,10 @@ def bench_confidence(options: argparse.Namespace) -> Iterator[Answer]:
     from densify.bench.table_file import write_table
     from densify.cli.bench_tables import reliability_tables
     from densify.cli.point_files import check_new_file
-    from densify.readers import open_sequence
 
     if options.out is not None:
         check_new_file(options.out, options.overwrite, ".json")
-    fitted, checked = (
-        [(open_sequence(spec), keys) for spec, keys in given]
-        for given in (options.fit or bench.FITTED, options.check or bench.CHECKED)
-    )
+    fitted, checked = options.fit or bench.FITTED, options.check or bench.CHECKED
     with progress_on_stderr() as progress:
         measured = bench.bench_confidence(
             fitted, checked, options.window, config, options.cameras, progress
