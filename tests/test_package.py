@@ -62,7 +62,7 @@ def test_help_is_light(arguments: list[str]) -> None:
 @pytest.mark.parametrize(
     "verb",
     ["run", "compare", "flow", "info", "simulate", "evaluate", "export", "report", "view", "bench"]
-    + ["train"],
+    + ["train", "labels"],
 )
 def test_help_of_every_verb_is_light(verb: str) -> None:
     code = (

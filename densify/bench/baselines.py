@@ -60,6 +60,15 @@ def cluster_icp(source: ArrayLike, target: ArrayLike, duration_s: float) -> Floa
     return np.where(better[cluster][:, None], voted, at_rest) - points
 
 
+def rigid_icp(source: ArrayLike, target: ArrayLike) -> Float:
+    """(n,3), (m,3) metres, one frame -> (n,3) flow: one rigid motion of everything, from rest (Besl
+    and McKay, "A Method for Registration of 3-D Shapes", PAMI 1992)."""
+    points, goal = _cloud(source, "source"), _cloud(target, "target")
+    together = np.zeros(len(points), np.int64)
+    moved, _ = _icp(points, goal, cKDTree(goal), together, np.zeros((1, 3)))
+    return moved - points
+
+
 def _voted_translations(
     points: Float, goal: Float, tree: cKDTree, cluster: Int, still: Float, farthest_m: float
 ) -> Float:

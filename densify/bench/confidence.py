@@ -4,7 +4,6 @@ others."""
 
 from __future__ import annotations
 
-import gc
 from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
@@ -17,7 +16,6 @@ from densify.depth.exposure import key_shots, load_images
 from densify.depth.views import HeldOut, Views
 from densify.errors import InputError
 from densify.geometry.range_image import RangeImage
-from densify.readers import open_sequence
 from densify.readers.window import choose_cameras
 from densify.recording import Recording
 from densify.scores.depth_metrics import is_outlier_depth
@@ -59,7 +57,7 @@ _LEAST = 1e-5  # share wrong where none was
 _NUM_WAYS = 3
 _DIGITS = 4
 
-Asked = Sequence[tuple[str, Sequence[int]]]
+Asked = Sequence[tuple[LidarSequence, Sequence[int]]]
 
 
 class Evidence(NamedTuple):
@@ -83,9 +81,8 @@ def bench_confidence(
     cameras: Sequence[str] | None = None,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
-    """Fit the tables to maps of ``fitted``, recordings (`densify.readers.open_sequence`) with the
-    keys to make, and see how far they hold on those of ``checked``. The rest as
-    `densify.pipeline.run`. One recording is in memory at a time.
+    """Fit the tables to maps of ``fitted``, recordings with the keys to make, and see how far they
+    hold on those of ``checked``. The rest as `densify.pipeline.run`.
 
     Returns plain numbers: ``maps`` that were fitted on, ``tables``: by group the rank and the share
     that is wrong, and ``reliability`` by recording and truth, where ``fitted`` is all that was
@@ -93,20 +90,18 @@ def bench_confidence(
 
     Raises InputError for what cannot be used, ComputationError where registration went wrong.
     """
-    for number, (spec, _) in enumerate((*fitted, *checked)):
-        if open_sequence(spec).truth is None and number < len(fitted):
-            raise InputError(f"--fit {spec}: no exact truth; expected a simulated one")
+    for sequence, _ in fitted:
+        if sequence.truth is None:
+            raise InputError(f"--fit {sequence.name}: no exact truth; expected a simulated one")
     num, done = sum(len(keys) for _, keys in (*fitted, *checked)), 0
     found: list[list[Evidence]] = []
-    for number, (spec, keys) in enumerate((*fitted, *checked)):
-        sequence = open_sequence(spec)
+    for number, (sequence, keys) in enumerate((*fitted, *checked)):
         found.append([])
         for key in keys:
             found[-1] += _evidence(sequence, key, window, config, cameras, number >= len(fitted))
             done += 1
             if progress is not None:
                 progress("bench", done, num)
-            gc.collect()  # a recording's caches hold the recording
     fit_on = [e for part in found[: len(fitted)] for e in part]
     knots = {name: _knots(log) for name, log in zip(scale.GROUPS, fit(fit_on), strict=True)}
     tables = scale.tables_of({"tables": knots})

@@ -52,9 +52,9 @@ class Window:
 
 
 def our_motion(stretch: Stretch, config: Config) -> Motion:
-    """This package's engine, from the ground on."""
+    """This package's engine, or that of ``flow.engine``, from the ground on."""
     scene = Scene(stretch, ground(stretch, config.ground), config.flow.min_height_m)
-    return estimate_motion(scene, config, "groups")
+    return estimate_motion(scene, config)
 
 
 def _in_world(stretch: Stretch, frame: int) -> Float:

@@ -18,6 +18,7 @@ from densify.cli.verbs import (
     export,
     flow,
     info,
+    labels,
     report,
     run,
     simulate,
@@ -28,7 +29,7 @@ from densify.errors import brief
 from densify.version import __version__
 
 _VERBS = (
-    *(run, compare, dataset, flow, train, info, doctor, simulate),
+    *(run, compare, dataset, flow, train, labels, info, doctor, simulate),
     *(export, report, view, evaluate),
 )
 

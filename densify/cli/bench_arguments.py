@@ -30,6 +30,7 @@ def add_bench(commands: Any) -> None:
     _add_bench_confidence(benches)
     _add_bench_doctor(benches)
     _add_bench_memory(benches)
+    _add_bench_paper(benches)
     _add_bench_readme(benches)
 
 
@@ -157,6 +158,57 @@ def _add_bench_doctor(benches: Any) -> None:
         "--data", metavar="SPEC", action="append", help=f"{DATA_HELP}; may be given several times"
     )
     _add_configuration_and_file(parser)
+
+
+def _add_bench_paper(benches: Any) -> None:
+    parser = add_verb(
+        benches,
+        "paper",
+        bench_verbs.bench_paper,
+        "the tables of Pontes, Hays, Lucey (3DV 2020), with the published figures beside",
+        "Methods: rest, icp, nicp, pointpwc (its loss without learning), paper-adam (as "
+        "published), paper (this package's solver), no-laplacian (Table 2), ours. pointpwc and "
+        "paper-adam take minutes a pair. On streets the motion of the vehicle is removed, in the "
+        "published sets it is not.",
+    )
+    for name, what in (("flyingthings", "FlyingThings3D"), ("kitti", "KITTI without ground")):
+        parser.add_argument(
+            f"--{name}",
+            metavar="DIR",
+            type=Path,
+            help=f".npz files of {what} as FlowNet3D's authors made them",
+        )
+    parser.add_argument(
+        "--data",
+        type=recording_keys,
+        action="append",
+        metavar="SPEC@KEYS",
+        help="streets and their frames (K,K,… or A:B[:S]), where no set is given (default: four "
+        "that nothing was tuned on)",
+    )
+    parser.add_argument(
+        "--methods", type=words, metavar="NAME,…", help="(default: all but pointpwc, paper-adam)"
+    )
+    parser.add_argument(
+        "--model",
+        type=Path,
+        action="append",
+        default=[],
+        metavar="MODEL",
+        dest="models",
+        help="a network of densify train flow; may be given several times",
+    )
+    parser.add_argument(
+        "--points", type=natural, default=2048, metavar="N", help="drawn (default: 2048)"
+    )
+    parser.add_argument(
+        "--pairs", type=natural, default=0, metavar="N", help="of a set, 0: all (default: 0)"
+    )
+    parser.add_argument(
+        "--curves", action="store_true", help="also over neighbours and over the number of points"
+    )
+    parser.add_argument("--out", metavar="FILE.json", type=Path, help="write every number there")
+    add_overwrite(parser)
 
 
 def _add_bench_readme(benches: Any) -> None:

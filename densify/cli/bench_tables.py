@@ -212,3 +212,27 @@ def memory_table(rows: Sequence[Mapping[str, Any]]) -> str:
         for row in rows
     ]
     return aligned([head, *body])
+
+
+_PAPER_COLUMNS: tuple[Column, ...] = (
+    ("epe", ("epe_m",), ".3f m"),
+    ("within 5", ("within_5",), ".1%"),
+    ("within 10", ("within_10",), ".1%"),
+    ("angle", ("angle_rad",), ".3f"),
+    ("moving", ("moving_m",), ".3f m"),
+    ("static", ("static_m",), ".4f m"),
+    ("seconds", ("seconds",), ".2f"),
+)
+
+
+def paper_table(name: str, measured: Mapping[str, Any], published: Any) -> str:
+    """A set's rows, the published one last, then what was measured over neighbours and points."""
+    rows = dict(measured["methods"])
+    if published is not None:
+        rows["paper, as published"] = published
+    head = f"{name}: {measured['num_pairs']} pairs, {measured['num_points']} points drawn"
+    parts = [head, table(rows, _PAPER_COLUMNS)]
+    for kind, what in (("neighbors", "neighbours k"), ("points", "points drawn")):
+        if kind in measured:
+            parts += [f"{name}: paper over {what}", table(measured[kind], _PAPER_COLUMNS)]
+    return "\n".join(parts)

@@ -4,15 +4,25 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from densify.cli.answer import Answer
 from densify.cli.progress import progress_on_stderr
 from densify.config import as_mapping, resolve
 
+if TYPE_CHECKING:
+    from densify.bench.paper_pairs import PaperPair
+
 _DEFAULT_KEY = 120
 _MIDDLE_KEY = 80  # of the street's 160 frames
+_UNSEEN = (
+    ("street?seed=41", [70]),
+    ("street:crossing?seed=42", [90]),
+    ("street:highway?seed=43", [60]),
+    ("street?seed=44", [100]),
+)
 
 
 def bench_confidence(options: argparse.Namespace) -> Iterator[Answer]:
@@ -22,10 +32,14 @@ def bench_confidence(options: argparse.Namespace) -> Iterator[Answer]:
     from densify.bench.table_file import write_table
     from densify.cli.bench_tables import reliability_tables
     from densify.cli.point_files import check_new_file
+    from densify.readers import open_sequence
 
     if options.out is not None:
         check_new_file(options.out, options.overwrite, ".json")
-    fitted, checked = options.fit or bench.FITTED, options.check or bench.CHECKED
+    fitted, checked = (
+        [(open_sequence(spec), keys) for spec, keys in given]
+        for given in (options.fit or bench.FITTED, options.check or bench.CHECKED)
+    )
     with progress_on_stderr() as progress:
         measured = bench.bench_confidence(
             fitted, checked, options.window, config, options.cameras, progress
@@ -144,6 +158,39 @@ def bench_flow(options: argparse.Namespace) -> Iterator[Answer]:
             yield Answer(flow_table(measured) + "\n", {"runs": [measured]})
     if options.out is not None:
         write_table(options.out, {"runs": runs, "config": as_mapping(config)})
+    yield Answer(files=_files(options))
+
+
+def bench_paper(options: argparse.Namespace) -> Iterator[Answer]:
+    """The tables of the paper."""
+    from densify.bench import paper as bench
+    from densify.bench.paper_pairs import pair_of_street, pairs_of_files
+    from densify.bench.table_file import write_table
+    from densify.cli.bench_tables import paper_table
+    from densify.cli.point_files import check_new_file
+
+    if options.out is not None:
+        check_new_file(options.out, options.overwrite, ".json")
+    sets: dict[str, Iterable[PaperPair]] = {
+        name: pairs_of_files(folder, options.pairs)
+        for name in ("flyingthings", "kitti")
+        if (folder := getattr(options, name)) is not None
+    }
+    if options.data or not sets:
+        given = options.data or _UNSEEN
+        sets["streets"] = (pair_of_street(spec, key) for spec, keys in given for key in keys)
+    methods = bench.DEFAULT_METHODS if options.methods is None else options.methods
+    measured = {}
+    for name, pairs in sets.items():
+        with progress_on_stderr() as progress:
+            measured[name] = bench.bench_paper(
+                pairs, methods, options.models, options.points, options.curves, progress
+            )
+        published = bench.PUBLISHED.get(name)
+        text = paper_table(name, measured[name], published)
+        yield Answer(text + "\n", {"sets": [{"set": name, **measured[name]}]})
+    if options.out is not None:
+        write_table(options.out, {"sets": measured, "published": bench.PUBLISHED})
     yield Answer(files=_files(options))
 
 

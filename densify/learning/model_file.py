@@ -19,10 +19,13 @@ import torch
 from numpy.typing import NDArray
 from torch import nn
 
-from densify.errors import InputError, brief
+from densify.errors import InputError
 from densify.files.arrays import read_arrays
+from densify.learning.clouds import Sweeps
 from densify.learning.networks import NETWORKS, build
+from densify.learning.threads import on_one_thread
 from densify.outputs.atomic import write_file
+from densify.types import Float
 
 FORMAT, VERSION = "densify model", 1
 _HEADER, _WEIGHTS = "header", "weights/"
@@ -37,6 +40,12 @@ class Model:
     network: nn.Module
     made: Mapping[str, Any] = field(default_factory=dict)
     beside: Mapping[str, NDArray[Any]] = field(default_factory=dict)
+
+    def flow(self, sweeps: Sweeps) -> Float:
+        """(n,3) metres of the first sweep to the second; the same bytes on any number of cores."""
+        with on_one_thread(), torch.inference_mode():
+            found: Float = self.network(sweeps).double().numpy()
+        return found
 
 
 def write_model(path: Path, model: Model) -> None:
@@ -96,9 +105,9 @@ def _header(path: Path, arrays: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
             f"{path}: a model of version {found[1]}, expected {VERSION}; train again, or use the "
             f"densify that wrote it"
         )
-    if not isinstance(found[2], str) or found[2] not in NETWORKS:
+    if found[2] not in NETWORKS:
         raise InputError(
-            f"{path}: a network {brief(repr(found[2]))}, expected one of "
-            f"{', '.join(NETWORKS)}; use a newer densify"
+            f"{path}: a network {found[2]!r}, expected one of {', '.join(NETWORKS)}; use a newer "
+            f"densify"
         )
     return dict(header)

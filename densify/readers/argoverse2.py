@@ -6,6 +6,7 @@ Self-Driving Perception and Forecasting", NeurIPS Datasets 2021), as downloaded:
     LOG/sensors/cameras/ring_front_center/3159662652….jpg    optional
     LOG/city_SE3_egovehicle.feather                          poses of the vehicle, about 200 Hz
     LOG/calibration/egovehicle_SE3_sensor.feather, intrinsics.feather
+    LOG/annotations.feather                                  optional: tracked boxes
 
 Points are in the vehicle's frame (x forward, y left, z up; its origin on the rear axle), all
 carried by the vehicle's own motion to the file's stamp, which is the *start* of the sweep;
@@ -22,9 +23,12 @@ exposure. The world is the city's frame. Frames and images are numbered from 0 i
 
 from __future__ import annotations
 
+from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from densify.errors import InputError
 from densify.files.content import read_bytes
@@ -40,9 +44,11 @@ from densify.readers.file_sequence import (
 )
 from densify.readers.files import numbered_files
 from densify.readers.pose_track import PoseTrack
-from densify.types import Camera, Float
+from densify.types import Boxes, Camera, Float
 
 POSES = "city_SE3_egovehicle.feather"
+ANNOTATIONS = "annotations.feather"
+BOX_SIZE = ("length_m", "width_m", "height_m")
 SCANNERS = ("up_lidar", "down_lidar")
 LASERS_PER_SCANNER = 32
 _WHAT = "Argoverse 2 recordings"
@@ -142,6 +148,37 @@ class Argoverse2(FileSequence):
 
     def _pose(self, frame: int) -> Float:
         return self._track.at(self._stamps_ns[frame])
+
+    def boxes(self, frame: int) -> Boxes | None:
+        """See `densify.types.KnowsBoxes`; the test split has none. Raises InputError for a table
+        that is malformed."""
+        table = self._annotations
+        if table is None:
+            return None
+        path, columns = self.where / ANNOTATIONS, table
+        rows = np.flatnonzero(columns["timestamp_ns"] == self.stamp_ns(frame))
+        size_m = np.stack([columns[name][rows] for name in BOX_SIZE], axis=1)
+        if (size_m <= 0).any():
+            raise InputError(f"{path}: a box of sweep {frame} has no size; expected metres above 0")
+        T = [
+            quaternion_pose(
+                np.array([columns[name][row] for name in _POSE_COLUMNS[:4]]),
+                np.array([columns[name][row] for name in _POSE_COLUMNS[4:]]),
+                f"{path}: row {row}",
+            )
+            for row in rows
+        ]
+        return Boxes(columns["track"][rows], np.reshape(T, (-1, 4, 4)), size_m)
+
+    @cached_property
+    def _annotations(self) -> dict[str, NDArray[Any]] | None:
+        path = self.where / ANNOTATIONS
+        if not path.is_file():
+            return None
+        numbers = dict.fromkeys((*BOX_SIZE, *_POSE_COLUMNS), "n")
+        columns = read_feather(path, {"timestamp_ns": "i", "track_uuid": "s", **numbers}, _WHAT)
+        _, columns["track"] = np.unique(columns["track_uuid"].astype(str), return_inverse=True)
+        return columns
 
     def T_world_cam(self, camera: str, number: int) -> Float:
         """(4,4) at the exposure, from the vehicle's poses."""

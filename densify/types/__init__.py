@@ -7,6 +7,7 @@ sweep's lidar), ``cam``.
 """
 
 from densify.arrays import Bool, Float, Float32, Int
+from densify.types.boxes import Boxes
 from densify.types.depth import (
     Camera,
     CameraView,
@@ -21,6 +22,7 @@ from densify.types.depth import (
 from densify.types.flow import FlowField, Motion, StretchFlow
 from densify.types.prior import FullDepth, Prior, PriorFit
 from densify.types.recordings import (
+    KnowsBoxes,
     KnowsFiles,
     KnowsImagePoses,
     KnowsItsGaps,
@@ -37,6 +39,7 @@ from densify.types.tracks import ObjectTrack
 
 __all__ = [
     "Bool",
+    "Boxes",
     "Camera",
     "CameraView",
     "Cloud",
@@ -46,6 +49,7 @@ __all__ = [
     "FlowField",
     "FullDepth",
     "Int",
+    "KnowsBoxes",
     "KnowsFiles",
     "KnowsImagePoses",
     "KnowsItsGaps",

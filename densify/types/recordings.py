@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from densify.arrays import Bool, Float, Float32
+from densify.types.boxes import Boxes
 from densify.types.depth import Camera
 from densify.types.sweeps import Sweep
 
@@ -125,6 +126,16 @@ class KnowsImagePoses(Protocol):
 
     def T_world_cam(self, camera: str, number: int) -> Float:
         """(4,4) the data set's own pose at the exposure, in the world of `T_world_lidar`."""
+        ...
+
+
+@runtime_checkable
+class KnowsBoxes(Protocol):
+    """A sequence with boxes around objects, tracked from sweep to sweep; a reader may have this
+    member."""
+
+    def boxes(self, frame: int) -> Boxes | None:
+        """None for a sweep that nobody drew boxes in."""
         ...
 
 

@@ -2,6 +2,7 @@
 """Writes a street as an Argoverse 2 sensor log with its truth, see `densify.readers.argoverse2`::
 
     OUT/street/sensors/{lidar/NS.feather, cameras/NAME/NS.jpg}
+    OUT/…/annotations.feather
     OUT/…/city_SE3_egovehicle.feather, calibration/{egovehicle_SE3_sensor,intrinsics}.feather
     OUT/…/truth/    as in `densify.readers.truth_files`
 
@@ -20,10 +21,17 @@ from numpy.typing import NDArray
 
 from densify.errors import InputError
 from densify.geometry.poses import inverse, transform
-from densify.readers.argoverse2 import LASERS_PER_SCANNER, POSES, SCANNERS
+from densify.readers.argoverse2 import (
+    ANNOTATIONS,
+    BOX_SIZE,
+    LASERS_PER_SCANNER,
+    POSES,
+    SCANNERS,
+)
 from densify.readers.extras import needed
 from densify.street.patterns import Spinning
 from densify.types import Float, Progress
+from densify.writers.boxes import drawn_boxes
 from densify.writers.excerpt import Excerpt, check_plain_cameras, new_folder, put, quaternion
 
 T_EGO_LIDAR = np.eye(4)  # where Argoverse's up_lidar stands
@@ -52,6 +60,7 @@ def write_tree(excerpt: Excerpt, out: Path, overwrite: bool, progress: Progress 
             log / POSES, {"timestamp_ns": track.stamp_ns, **_pose_columns(track.T_world_ego)}
         )
         _put_calibration(log / "calibration", excerpt)
+        _put_boxes(log / ANNOTATIONS, excerpt, half_ns)
         for done, frame in enumerate(excerpt.frames):
             if progress:
                 progress("simulate", done, len(excerpt.frames))
@@ -78,6 +87,25 @@ def write_tree(excerpt: Excerpt, out: Path, overwrite: bool, progress: Progress 
         if progress:
             progress("simulate", len(excerpt.frames), len(excerpt.frames))
     return out / LOG
+
+
+def _put_boxes(path: Path, excerpt: Excerpt, half_ns: int) -> None:
+    """In the vehicle's frame at each sweep's stamp."""
+    tables: list[dict[str, NDArray[Any]]] = []
+    for frame in excerpt.frames:
+        stamp_ns = excerpt.street.stamp_ns(frame) - half_ns
+        T_world_ego = excerpt.T_world_ego(np.array([stamp_ns]), inverse(T_EGO_LIDAR))[0]
+        boxes = drawn_boxes(excerpt, frame, T_world_ego)
+        tables.append(
+            {
+                "timestamp_ns": np.full(len(boxes.track), stamp_ns),
+                "track_uuid": np.array([f"{t:032x}" for t in boxes.track], object),
+                "category": np.array(["REGULAR_VEHICLE"] * len(boxes.track), object),
+                **dict(zip(BOX_SIZE, boxes.size_m.T, strict=True)),
+                **_pose_columns(boxes.T_lidar_box),
+            }
+        )
+    _put_table(path, {n: np.concatenate([t[n] for t in tables]) for n in tables[0]})
 
 
 def _put_calibration(folder: Path, excerpt: Excerpt) -> None:

@@ -20,6 +20,7 @@ from torch import Tensor
 
 from densify.flow.objective.energy import take
 from densify.flow.objective.neighbors import NeighborIndex
+from densify.types import Float
 
 if TYPE_CHECKING:
     from densify.learning.losses import Predict
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
 
 CHAMFER, SMOOTHNESS, CURVATURE = 1.0, 1.0, 0.3
 _SMOOTH_K, _CURVED_K, _CARRIED_K = 9, 10, 5
+_ADAM_STEPS, _ADAM_RATE = 1500, 0.1
 
 
 def pointpwc_loss(predict: Predict, sample: Sample) -> Tensor:
@@ -58,6 +60,24 @@ def pointpwc_energy(flow: Tensor, source: Tensor, target: Tensor) -> Tensor:
     expected = (weight[:, :, None] * of_target[carried]).sum(dim=1)
     curvature = ((curved - expected) ** 2).sum(dim=1).mean()
     return CHAMFER * chamfer + SMOOTHNESS * smoothness + CURVATURE * curvature
+
+
+def without_learning(source: Float, target: Float) -> Float:
+    """(n,3), (m,3) metres -> (n,3): the flow itself is what is optimised, by the published
+    objective's protocol (Adam, 1,500 steps of 0.1 m), and the best of all steps is kept."""
+    points, goal = (torch.from_numpy(x - source.mean(0)).float() for x in (source, target))
+    flow = torch.zeros_like(points, requires_grad=True)
+    optimizer = torch.optim.Adam([flow], lr=_ADAM_RATE)
+    lowest, best = torch.inf, flow.detach().clone()
+    for _ in range(_ADAM_STEPS):
+        optimizer.zero_grad()
+        loss = pointpwc_energy(flow, points, goal)
+        if float(loss.detach()) < lowest:
+            lowest, best = float(loss.detach()), flow.detach().clone()
+        loss.backward()
+        optimizer.step()
+    found: Float = best.double().numpy()
+    return found
 
 
 def _others(index: NeighborIndex, points: Tensor, k: int) -> Tensor:

@@ -1,0 +1,109 @@
+# SPDX-License-Identifier: MIT
+"""The pairs of clouds that ``densify bench paper`` measures on.
+
+Sets of others are folders of .npz files as FlowNet3D's authors made them (Liu et al., CVPR 2019):
+``points1``, ``points2``, ``flow`` and ``valid_mask1`` (FlyingThings3D; camera axes, z forward), or
+``pos1``, ``pos2`` and ``gt`` (KITTI without ground; z up).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from densify.config import resolve
+from densify.errors import InputError
+from densify.files.arrays import read_arrays
+from densify.learning.clips import make_clip
+from densify.learning.clouds import Standing, Sweeps
+from densify.learning.samples import sample_of
+from densify.readers import open_sequence
+from densify.types import Bool, Float
+
+FARTHEST_M = 35.0
+_MOST_SWEEPS = 5
+_NAMES = (
+    ("points1", "points2", "flow", "valid_mask1"),
+    ("pos1", "pos2", "gt", ""),
+)
+_R_FLU_CAMERA = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
+"""Turns axes right, down, forward into forward, left, up."""
+
+
+@dataclass(frozen=True)
+class PaperPair:
+    """Two clouds and the true flow between them. source, target: (n,3), (m,3) metres, z up. flow:
+    (n,3). moving: (n,), None where the set does not tell. sweeps: what networks get of it."""
+
+    name: str
+    source: Float
+    target: Float
+    flow: Float
+    moving: Bool | None
+    sweeps: Sweeps
+
+
+def pair_of_street(spec: str, key: int) -> PaperPair:
+    """A sweep and its next one, without ground and the motion of the vehicle. Raises InputError
+    for a recording without truth."""
+    sequence = open_sequence(spec)
+    if sequence.truth is None:
+        raise InputError(f"--data {spec}: no truth of what moves; expected a street")
+    clip = make_clip(sequence, key, resolve({"register": {"source": "dataset"}}), "truth")
+    here = next(i for i, s in enumerate(clip.sweeps) if not s.origin_m.any())
+    if here + 1 == len(clip.sweeps):
+        raise InputError(f"--data {spec}: no sweep after {key}; choose an earlier one")
+    sample = sample_of(clip, here, here + 1, _MOST_SWEEPS, "truth")
+    if sample.flow is None or sample.moving is None:
+        raise InputError(f"--data {spec}: no truth of what moves; expected a street")
+    source, target = (clip.sweeps[n].points.astype(np.float64) for n in (here, here + 1))
+    flow, moving = sample.flow.double().numpy(), sample.moving.numpy()
+    return PaperPair(f"{spec}@{key}", source, target, flow, moving, sample.sweeps)
+
+
+def pairs_of_files(folder: Path, most: int) -> Iterator[PaperPair]:
+    """The first ``most`` files of a folder, by name; 0 for all. Raises InputError for a folder
+    without any, or a file of another form."""
+    paths = sorted(folder.glob("*.npz"))
+    if not paths:
+        raise InputError(f"{folder}: no .npz files; expected the sets of FlowNet3D's authors")
+    for path in paths[: most or None]:
+        yield read_pair(path)
+
+
+def read_pair(path: Path) -> PaperPair:
+    """One file. Points farther than 35 m ahead in either cloud are left out."""
+    arrays = read_arrays(path)
+    found = next((names for names in _NAMES if all(n in arrays for n in names[:3])), None)
+    if found is None:
+        raise InputError(
+            f"{path}: holds {', '.join(sorted(arrays)) or 'nothing'}, expected points1, points2 "
+            f"and flow, or pos1, pos2 and gt"
+        )
+    source, target, flow = (np.asarray(arrays[name], np.float64) for name in found[:3])
+    for name, array in zip(found, (source, target, flow), strict=False):
+        if array.ndim != 2 or array.shape[1] != 3 or not np.isfinite(array).all():
+            raise InputError(f"{path}: {name}: got shape {array.shape}, expected (N,3) numbers")
+    if len(flow) != len(source):
+        raise InputError(f"{path}: {found[2]}: got {len(flow)} rows, expected {len(source)}")
+    valid = np.ones(len(source), bool)
+    if found[3] in arrays:
+        valid = np.asarray(arrays[found[3]]).astype(bool).ravel()
+        if len(valid) != len(source):
+            raise InputError(f"{path}: {found[3]}: got {len(valid)}, expected {len(source)}")
+    if found is _NAMES[0]:
+        source, target, flow = (x @ _R_FLU_CAMERA.T for x in (source, target, flow))
+    near = valid & (np.abs(source[:, 0]) < FARTHEST_M)
+    source, flow = source[near], flow[near]
+    target = target[np.abs(target[:, 0]) < FARTHEST_M]
+    if not (len(source) and len(target)):
+        raise InputError(f"{path}: no valid point within {FARTHEST_M:g} m ahead")
+    lowest = min(source[:, 2].min(), target[:, 2].min())
+    sweeps = []
+    for points in (source, target):
+        given = Standing(np.arange(len(points)), points, (points[:, 2] - lowest).astype(np.float32))
+        sweeps.append(given.cloud(np.zeros(3)))
+    return PaperPair(path.stem, source, target, flow, None, tuple(sweeps))

@@ -1,0 +1,125 @@
+# SPDX-License-Identifier: MIT
+"""Labels from boxes: the flow of a recording's sweeps to the next ones."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from densify.config import Config
+from densify.errors import ComputationError, InputError, OutputError
+from densify.flow.boxes import BoxMargins, flow_of_boxes
+from densify.geometry import poses
+from densify.geometry.ground import ground
+from densify.outputs.atomic import write_file
+from densify.outputs.flow_npz import flow_npz
+from densify.recording import Recording
+from densify.types import Bool, FlowField, KnowsBoxes, LidarSequence, Progress, RegisteredSweep
+
+
+@dataclass(frozen=True)
+class Label:
+    """One sweep's. sure: (N,) which points count. T_next_here: (4,4) from its lidar frame to the
+    next sweep's."""
+
+    registered: RegisteredSweep
+    next_frame: int
+    field: FlowField
+    sure: Bool
+    T_next_here: np.ndarray
+
+
+def label_sweeps(
+    sequence: LidarSequence,
+    frames: Sequence[int],
+    config: Config,
+    margins: BoxMargins | None = None,
+    without_ground: bool = False,
+    progress: Progress | None = None,
+) -> Iterator[tuple[int, Label | ComputationError | InputError]]:
+    """Label sweeps; the last one before a hole has no next one and is passed over, as are sweeps
+    that nobody drew boxes in.
+
+    config: says where poses come from, and how deep the ground lies. without_ground: points below
+    ``flow.min_height_m`` above it do not count. Raises InputError for a recording without boxes.
+    """
+    if not isinstance(sequence, KnowsBoxes) or all(
+        sequence.boxes(frame) is None for frame in sequence.frames[:2]
+    ):
+        raise InputError(
+            f"{sequence.name}: no tracked boxes; expected an Argoverse 2 log with "
+            f"annotations.feather"
+        )
+    recording = Recording(sequence, config, 1)
+
+    def labels() -> Iterator[tuple[int, Label | ComputationError | InputError]]:
+        for done, frame in enumerate(frames):
+            if progress:
+                progress("label", done, len(frames))
+            try:
+                label = _label(recording, sequence, frame, margins, without_ground)
+            except (ComputationError, InputError) as error:
+                yield frame, error
+                continue
+            if label is not None:
+                yield frame, label
+
+    return labels()
+
+
+def _label(
+    recording: Recording,
+    sequence: KnowsBoxes,
+    frame: int,
+    margins: BoxMargins | None,
+    without_ground: bool,
+) -> Label | None:
+    stretch = recording.window(frame)
+    following = [f for f in stretch.frames if f > frame]
+    if not following:
+        return None
+    own, others = sequence.boxes(frame), sequence.boxes(following[0])
+    if own is None or others is None:
+        return None
+    registered, after = stretch[frame], stretch[following[0]]
+    duration_s = (after.sweep.stamp_ns - registered.sweep.stamp_ns) * 1e-9
+    T_here_next = stretch.T_target_source(frame, following[0])
+    points = registered.sweep.points
+    field, sure = flow_of_boxes(points, own, others, T_here_next, duration_s, margins)
+    if without_ground:
+        settings = recording.settings
+        heights = ground(stretch, settings.ground)
+        in_world = poses.transform(registered.T_world_lidar, points)
+        sure &= heights.above(in_world) >= settings.flow.min_height_m
+    return Label(registered, following[0], field, sure, poses.inverse(T_here_next))
+
+
+def label_path(folder: Path, frame: int, next_frame: int) -> Path:
+    """As flow files are named."""
+    return folder / f"{frame:06d}_{next_frame:06d}.npz"
+
+
+def write_label(folder: Path, label: Label, overwrite: bool) -> Path:
+    """A flow file with ``valid``, complete or not at all. Raises InputError for one that is there,
+    OutputError where it cannot be written."""
+    sweep, field = label.registered.sweep, label.field
+    path = label_path(folder, sweep.frame, label.next_frame)
+    if path.exists() and not overwrite:
+        raise InputError(f"{path}: there already, kept; give --overwrite to replace it")
+    arrived = poses.transform(label.T_next_here, sweep.points + field.total)
+    data = flow_npz(
+        field,
+        row=sweep.row,
+        total_flow=arrived - sweep.points,
+        object=field.instance,
+        valid=label.sure,
+    )
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        write_file(path, data)
+    except OSError as error:
+        raise OutputError(f"--out {path}: cannot be written: {error.strerror or error}") from error
+    return path

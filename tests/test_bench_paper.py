@@ -1,0 +1,137 @@
+# SPDX-License-Identifier: MIT
+"""The paper's tables: scores by hand, sets of others as files, and the command."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from densify.bench.baselines import rigid_icp
+from densify.bench.paper import METHODS, SLOW, bench_paper
+from densify.bench.paper_pairs import PaperPair, pair_of_street, pairs_of_files, read_pair
+from densify.cli import main
+from densify.errors import InputError
+from densify.learning.model_file import Model, write_model
+from densify.learning.networks import build
+
+STEP = np.array([0.3, 0.1, 0.0])
+
+
+def blocks(seed: int = 0, num_points: int = 600) -> tuple[np.ndarray, np.ndarray]:
+    """Some boxes full of points, and which of them the points belong to."""
+    rng = np.random.default_rng(seed)
+    own = rng.integers(6, size=num_points)
+    centres = rng.uniform(-15, 15, (6, 3)) * [1, 1, 0.05]
+    return centres[own] + rng.uniform(-1, 1, (num_points, 3)), own
+
+
+def kitti_file(path: Path, **changes: np.ndarray) -> Path:
+    points, _ = blocks()
+    arrays = {"pos1": points, "pos2": points + STEP, "gt": np.tile(STEP, (len(points), 1))}
+    np.savez(path, **{n: a for n, a in {**arrays, **changes}.items() if a is not None})
+    return path
+
+
+def test_scores_are_the_papers(tmp_path: Path) -> None:
+    """Of doing nothing: 0.316 m off, everywhere, at a right angle."""
+    found = bench_paper(pairs_of_files(kitti_file(tmp_path / "a.npz").parent, 0), ["rest"])
+    row = found["methods"]["rest"]
+    assert row["epe_m"] == pytest.approx(np.linalg.norm(STEP))
+    assert row["within_5"] == row["within_10"] == 0
+    assert row["angle_rad"] == pytest.approx(np.pi / 2)
+    assert found["num_pairs"] == 1 and "moving_m" not in row
+
+
+def test_methods_find_a_motion_that_all_share(tmp_path: Path) -> None:
+    kitti_file(tmp_path / "a.npz")
+    names = [n for n in METHODS if n not in (*SLOW, "rest", "ours")]
+    rows = bench_paper(pairs_of_files(tmp_path, 0), names)["methods"]
+    assert rows["icp"]["epe_m"] < 0.01 and rows["icp"]["within_5"] == 1
+    assert all(row["epe_m"] < 0.15 for row in rows.values())
+    assert list(rows) == [n for n in METHODS if n in names]
+
+
+def test_rigid_icp_finds_a_turn() -> None:
+    points, _ = blocks(3)
+    c, s = np.cos(0.02), np.sin(0.02)
+    moved = points @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]]) + STEP
+    np.testing.assert_allclose(points + rigid_icp(points, moved), moved, atol=1e-3)
+
+
+def test_curves_have_all_their_points(tmp_path: Path) -> None:
+    kitti_file(tmp_path / "a.npz")
+    found = bench_paper(pairs_of_files(tmp_path, 0), ["rest"], curves=True)
+    assert list(found["neighbors"]) == ["5", "10", "20", "50", "100"]
+    assert list(found["points"]) == ["512", "1024", "2048", "4096", "8192"]
+    assert all(row["epe_m"] < 0.3 for row in found["neighbors"].values())
+
+
+def test_flyingthings_comes_in_camera_axes(tmp_path: Path) -> None:
+    """Right, down, forward; invalid points and those beyond 35 m ahead do not count."""
+    points = np.array([[1.0, 2, 3], [0, 0, 40], [4, 5, 6]])
+    path = tmp_path / "a.npz"
+    np.savez(
+        path, points1=points, points2=points, flow=points / 10, valid_mask1=np.array([1, 1, 0])
+    )
+    pair = read_pair(path)
+    np.testing.assert_allclose(pair.source, [[3, -1, -2]])
+    np.testing.assert_allclose(pair.flow, [[0.3, -0.1, -0.2]])
+    assert len(pair.target) == 2
+
+
+@pytest.mark.parametrize(
+    "changes, told",
+    [
+        ({"gt": None}, r"holds pos1, pos2, expected points1, points2 and flow, or pos1"),
+        ({"gt": np.zeros((5, 3))}, "gt: got 5 rows, expected 600"),
+        ({"pos2": np.zeros((5, 2))}, r"pos2: got shape \(5, 2\), expected \(N,3\) numbers"),
+        ({"pos1": np.full((600, 3), np.nan)}, "pos1: got shape"),
+        ({"pos1": np.full((600, 3), 99.0)}, "no valid point within 35 m ahead"),
+    ],
+    ids=str,
+)
+def test_another_npz_is_refused(tmp_path: Path, changes, told: str) -> None:
+    with pytest.raises(InputError, match=told):
+        read_pair(kitti_file(tmp_path / "a.npz", **changes))
+
+
+def test_a_street_is_a_set() -> None:
+    pair = pair_of_street("street?seed=31&sensor=vlp16", 80)
+    assert isinstance(pair, PaperPair) and pair.moving is not None and pair.moving.any()
+    assert not pair.flow[~pair.moving].any() and len(pair.sweeps) == 5
+    assert pair.source.shape == pair.flow.shape == tuple(pair.sweeps[0].points.shape)
+    gap_m = np.linalg.norm(pair.flow[pair.moving], axis=1)
+    assert gap_m.max() < 4 and gap_m.mean() > 0.05
+
+
+def test_the_command_measures_and_names_what_is_published(tmp_path: Path, capsys) -> None:
+    folder, out, model = tmp_path / "set", tmp_path / "t.json", tmp_path / "m.pt"
+    folder.mkdir()
+    kitti_file(folder / "a.npz")
+    write_model(model, Model("flownet3d", build("flownet3d"), {"teacher": "truth", "steps": 0}))
+    command = ["bench", "paper", "--kitti", str(folder), "--methods", "rest", "--out", str(out)]
+    assert main([*command, "--model", str(model), "--points", "100"]) == 0
+    told = capsys.readouterr().out
+    assert "1 pairs, 100 points drawn" in told and "m.pt" in told
+    line = next(line for line in told.splitlines() if line.startswith("paper, as published"))
+    assert line.split()[3:10] == ["0.093", "m", "64.8", "%", "82.1", "%", "0.137"]
+    assert json.loads(out.read_text())["sets"]["kitti"]["methods"]["rest"]["epe_m"] > 0.3
+
+
+@pytest.mark.parametrize(
+    "options, told",
+    [
+        (["--kitti", "nowhere"], "nowhere: no .npz files"),
+        (["--methods", "magic"], "--methods magic: expected some of rest, icp"),
+        (["--model", "nowhere.pt"], "nowhere.pt: no such file"),
+        (["--points", "0"], "--points 0: expected 1 or more"),
+    ],
+    ids=str,
+)
+def test_bad_input_is_one_line(capsys, options, told: str) -> None:
+    assert main(["bench", "paper", *options]) == 2
+    lines = capsys.readouterr().err.strip().splitlines()
+    assert len(lines) == 1 and told in lines[0]
