@@ -224,6 +224,9 @@ def test_no_arrow_runs_upward() -> None:
 DOORS: dict[str, str | tuple[str, ...]] = {
     "dask": "densify/dataset/cluster.py",
     "distributed": "densify/dataset/cluster.py",
+    "copclib": "densify/outputs/export/copc.py",
+    "pye57": "densify/outputs/export/e57.py",
+    "shtab": "densify/cli/verbs/completion.py",
     "foxglove": "densify/outputs/export/mcap.py",
     "rerun": "densify/outputs/export/rrd.py",
     "embreex": "densify/street/world.py",

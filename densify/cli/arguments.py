@@ -12,6 +12,7 @@ from typing import Any, NoReturn
 from densify.cli.bench_arguments import add_bench
 from densify.cli.verbs import (
     compare,
+    completion,
     dataset,
     doctor,
     evaluate,
@@ -30,12 +31,17 @@ from densify.version import __version__
 
 _VERBS = (
     *(run, compare, dataset, flow, train, labels, info, doctor, simulate),
-    *(export, report, view, evaluate),
+    *(export, report, view, evaluate, completion),
 )
 
 
 def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     """Options of one command; ``options.verb(options)`` runs it. Exits with 2 on a bad argument."""
+    return command_line().parse_args(arguments)
+
+
+def command_line() -> argparse.ArgumentParser:
+    """All verbs with their options."""
     parser = _Parser(
         prog="densify",
         description="Dense depth maps from lidar recordings, with the moving objects kept sharp.",
@@ -46,7 +52,7 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     for verb in _VERBS:
         verb.add(commands)
     add_bench(commands)
-    return parser.parse_args(arguments)
+    return parser
 
 
 class _Parser(argparse.ArgumentParser):

@@ -54,6 +54,15 @@ EXPORTS = Table(
         ExportFormat("ply", _HERE + "ply", owned=("cloud.ply",), about="the cloud, all columns"),
         ExportFormat("pcd", _HERE + "pcd", owned=("cloud.pcd",), about="the cloud, all columns"),
         ExportFormat(
+            "copc",
+            _HERE + "copc",
+            owned=("cloud.copc.laz",),
+            about="the cloud for viewers in a browser",
+        ),
+        ExportFormat(
+            "e57", _HERE + "e57", owned=("cloud.e57",), about="the cloud with colour and intensity"
+        ),
+        ExportFormat(
             "nerfstudio",
             _HERE + "nerfstudio",
             owned=("transforms.json", "images", "depth", "cloud.ply"),
@@ -82,6 +91,18 @@ EXPORTS = Table(
             _HERE + "kitti_tracking",
             owned=("label",),
             about="the same as label lines",
+        ),
+        ExportFormat(
+            "kitti",
+            _HERE + "kitti",
+            owned=("train", "val"),
+            about="maps, images and intrinsics in the tree of KITTI depth completion",
+        ),
+        ExportFormat(
+            "nuscenes",
+            _HERE + "nuscenes",
+            owned=("samples", "depth_gt", "depth_gt_filled"),
+            about="cloud, images and depth as detectors on nuScenes read them",
         ),
         ExportFormat(
             "rrd",
