@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import densify
+from densify.bench.paper_pairs import pair_of_street
 from densify.cli import main
 from densify.config import Config, resolve
 from densify.errors import InputError
@@ -16,8 +17,9 @@ from densify.flow.engines import check_engine, estimate_motion
 from densify.flow.scene import Scene
 from densify.geometry.ground import ground
 from densify.learning import engine
-from densify.learning.model_file import Model, write_model
+from densify.learning.model_file import Model, read_model, write_model
 from densify.learning.networks import build
+from densify.learning.networks.voxels import REACH_M
 from tests import scenes
 from tests.small_street import KEY, POSES_GIVEN, one_car
 
@@ -105,6 +107,19 @@ def test_a_run_takes_a_network(model: Path) -> None:
     again = densify.run(one_car(), KEY, 2, config=settings)
     assert len(result.cloud.points) and not result.cloud.displaced[~result.cloud.moving].any()
     np.testing.assert_array_equal(result.cloud.points, again.cloud.points)
+
+
+def test_the_shipped_model_knows_moving_from_standing() -> None:
+    """On a street that it was not trained on, as it comes, without any proof."""
+    pair = pair_of_street("street?seed=31&sensor=hdl32", 80)
+    model = read_model(Path("streets"))
+    assert model.made["teacher"] == "truth" and model.made["data"] == ["streets"]
+    error_m = np.linalg.norm(model.flow(pair.sweeps) - pair.flow, axis=1)
+    near = (np.abs(pair.source[:, :2]) < REACH_M).all(axis=1)
+    moves = near & (np.linalg.norm(pair.flow, axis=1) > 0.3)
+    length_m = np.linalg.norm(pair.flow[moves], axis=1).mean()
+    assert error_m[moves].mean() < 0.7 * length_m
+    assert np.median(error_m[near & ~pair.moving]) < 0.03
 
 
 def test_a_model_is_checked_before_anything_is_computed(tmp_path: Path, capsys) -> None:

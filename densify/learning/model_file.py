@@ -28,6 +28,9 @@ from densify.outputs.atomic import write_file
 from densify.types import Float
 
 FORMAT, VERSION = "densify model", 1
+SHIPPED = {"streets": Path(__file__).parent / "streets.model"}
+"""Models that come with the package, by what stands in the place of a path. ``streets``: voxels, of
+simulated streets only, by ``densify train flow --teacher truth --steps 768 --out FILE``."""
 _HEADER, _WEIGHTS = "header", "weights/"
 
 
@@ -67,7 +70,10 @@ def write_model(path: Path, model: Model) -> None:
 
 
 def read_model(path: Path) -> Model:
-    """Raises InputError for a file that is none, is damaged, or is of another version."""
+    """path: or the name of one of `SHIPPED`, where no such file is. Raises InputError for a file
+    that is none, is damaged, or is of another version."""
+    if not path.exists():
+        path = SHIPPED.get(str(path), path)
     if not path.is_file():
         raise InputError(f"{path}: no such file; expected a model that densify train flow wrote")
     arrays = read_arrays(path)
