@@ -23,7 +23,7 @@ from densify.types import Bool, Float, Float32, Int, Stretch
 
 _ATTACH_M = 0.3
 _ATTACH_UNSEEN_M = 0.15
-_MIN_HEIGHT_M = 0.1
+_MIN_HEIGHT_M, _MIN_HEIGHT_OF_WALKERS_M = 0.08, 0.1
 _LENGTH_M = 15.0
 _SIDE_M = 0.1
 _LONGEST_HOLE_M = 0.6
@@ -115,10 +115,12 @@ def detach(
     clock: Clock,
 ) -> None:
     """Take from those who walk what no sweep saw through and what is still there when they are
-    gone: the wall beside them. (What drives has sides that slide along themselves.)"""
+    gone: the wall beside them; and the ground under them. (What drives has sides that slide along
+    themselves, and wheels.)"""
     for k, track in enumerate(tracks):
         if _speed_m_s(track, i, clock) > _WALKS_M_S:
             continue
+        instance[(instance == k) & (seen.height_m < _MIN_HEIGHT_OF_WALKERS_M)] = -1
         rows = np.flatnonzero((instance == k) & ~seen.seed)
         if len(rows):
             _, there = _left_behind(track, shapes[k].tree, seen.points[rows], i, standing, clock)
@@ -148,11 +150,11 @@ def lengthen(
 ) -> None:
     """Give the tracks what goes on ahead of and behind their points without a hole, as wide and as
     high as they are: nobody sees through the middle of a long side that slides along itself. No
-    other sweep may see through the points where they would be carried to, and they must leave their
-    places: the wall that somebody walks along is still there when he has passed."""
+    other sweep may see through the points where they would be carried to, and what is fast must
+    leave their places. Who walks has no long side, but there may be a wall beside him."""
     for k, track in enumerate(tracks):
         mine = np.flatnonzero(instance == k)
-        if not len(mine):
+        if not len(mine) or _speed_m_s(track, i, space.clock) <= _WALKS_M_S:
             continue
         at_s = track.seen_at(space.clock.time_ns[i])
         ahead = track.path.rate(at_s)[:2]
@@ -211,13 +213,11 @@ def _leaves(
     standing: Sequence[Standing],
     clock: Clock,
 ) -> bool:
-    """Whether the rows leave their places empty when the object with them is gone. mine: its other
-    points.
-
-    Who walks has no long side, and what drives fast is elsewhere soon. Between the two nothing is
-    asked: where a slow truck was are the parts of it that are not known yet to be its own.
+    """Whether the rows leave their places empty when the object with them is gone; asked of what is
+    fast. Where a slow truck was are the parts of it that are not known yet to be its own. mine: its
+    other points.
     """
-    if _WALKS_M_S < _speed_m_s(track, i, clock) < _FAST_M_S:
+    if _speed_m_s(track, i, clock) < _FAST_M_S:
         return True
     both = np.concatenate([mine, rows])
     tree = BoxTree(track.undo(seen.points[both], seen.time_s[both]))
