@@ -21,6 +21,7 @@ _ASIDE, _ELSEWHERE = 3.2, 6.0  # steps; nearer and it fits, farther and it canno
 _LEAST_SCORE = 2.2  # standard deviations above what it is elsewhere
 _LEAST_RATIO = 1.05  # to what it is elsewhere; noise reaches 1.03
 _LEAST_GAIN = 0.1  # of what edges stand out by, for which the image is moved
+_CERTAIN_GAIN = 1.0  # standard deviations elsewhere; right images reach 0.9
 _LEAST_LIGHT = 70.0  # L of the lightest hundredth; a darker image is lightened
 _REBLUR_PX = 1.5  # standard deviation
 _MOST_BLUR = 2.0  # steps, standard deviation
@@ -37,11 +38,13 @@ def lab(image: NDArray[np.uint8]) -> Float32:
 
 
 class Laid(NamedTuple):
-    """An image (H,W,3) moved to where it fits. right_px, down_px: by how much it lay aside."""
+    """An image (H,W,3) moved to where it fits. right_px, down_px: by how much it lay aside.
+    certain: more than right images are moved by chance."""
 
     lab: Float32
     right_px: int = 0
     down_px: int = 0
+    certain: bool = False
 
     def __str__(self) -> str:
         """How it lay aside: "2 px to the left and 1 px too high"."""
@@ -80,7 +83,8 @@ def laid_over(lab: Float32, depth_m: Float32, at: Bool, step_px: int = 1) -> Lai
         np.clip(np.arange(size) + off, 0, size - 1)
         for size, off in zip(lab.shape[:2], (down, right), strict=True)
     )
-    return Laid(np.ascontiguousarray(lab[rows[:, None], columns]), int(right), int(down))
+    moved = np.ascontiguousarray(lab[rows[:, None], columns])
+    return Laid(moved, int(right), int(down), bool(best - here > _CERTAIN_GAIN * elsewhere.std()))
 
 
 def _edge_sums(lab: Float32, depth_m: Float32, at: Bool, step_px: int) -> Float:

@@ -41,7 +41,8 @@ def decide(layers: Layers, settings: ProjectSettings) -> Layers:
     second round less the less they are believed. Kept is what has 97 % of the votes, but nothing
     that is ``refused``.
 
-    An image that lies up to 3 steps aside is moved, with a warning that says how far. To one that
+    An image that lies up to 3 steps aside is moved, with a warning that says how far where that is
+    certain. To one that
     does not belong to the depth or is blurred (`densify.depth.picture.laid_over`) nobody listens:
     as ``strict``, with a warning; without an image as ``strict``. ``lab`` goes on only if it was
     listened to.
@@ -59,7 +60,7 @@ def decide(layers: Layers, settings: ProjectSettings) -> Layers:
         else:
             lab = laid.lab
             share = shares(replace(layers, lab=lab), rims)
-            if laid.right_px or laid.down_px:
+            if laid.certain:
                 warnings = (*warnings, _MOVED.format(laid=laid))
     believed = share >= _LEAST_SHARE
     if settings.rims == "strict":
