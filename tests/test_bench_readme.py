@@ -25,9 +25,11 @@ def test_every_scene_is_a_street_that_opens():
 def test_a_row_is_what_its_bench_measures(capsys, monkeypatch):
     scene = readme.Scene("street:static?seed=5", (30,), window=1)
     table = readme.TABLES["flow"]._replace(scenes=(scene,))
-    monkeypatch.setattr(readme, "TABLES", {"flow": table})
-    assert main(["bench", "readme", "flow"]) == 0
-    about, _, titles, rule, row, _ = capsys.readouterr().out.splitlines()
+    monkeypatch.setattr(readme, "TABLES", {"flow": table, "none": table._replace(scenes=())})
+    assert main(["bench", "readme", "flow", "none"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    about, _, titles, rule, row = lines[:5]
+    assert lines[5:] == ["", about, "", titles, rule]
     assert about == table.about and rule.count("---") == titles.count("|") - 1
     cells = [cell.strip() for cell in row.strip("|").split("|")]
     # Nothing moves on this street, and nothing is said to.

@@ -106,8 +106,8 @@ def tables(
             raise InputError(f"bench readme {name}: expected of {', '.join(TABLES)}")
     chosen = [TABLES[name] for name in names or TABLES]
     done, total = 0, sum(len(_scenes(table, kitti, pandaset)) for table in chosen)
-    for table in chosen:
-        yield f"{table.about}\n"
+    for number, table in enumerate(chosen):
+        yield "\n" * (number > 0) + f"{table.about}\n"
         yield _line(("", *table.titles))
         yield _line(["---"] * (len(table.titles) + 1))
         for scene in _scenes(table, kitti, pandaset):
@@ -116,7 +116,6 @@ def tables(
             done += 1
             if progress is not None:
                 progress("bench", done, total)
-        yield ""
 
 
 def _scenes(table: _Table, kitti: Path | None, pandaset: Path | None) -> tuple[Scene, ...]:
