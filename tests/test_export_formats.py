@@ -233,8 +233,8 @@ def test_thresholds_leave_pixels_of_float_maps(run):
 def test_a_form_is_whole_repeatable_and_leaves_the_run_alone(tmp_path, to):
     from tests.exported import write_views
 
-    if to == "exr":
-        pytest.importorskip("OpenEXR")
+    package = {"exr": "OpenEXR", "rrd": "rerun", "mcap": "foxglove", "copc": "copclib"}
+    pytest.importorskip(package.get(to, "numpy"), reason=f"{package.get(to)} is not installed")
     run, _ = write_views(tmp_path, {"image_02": "plain", "image_03": "bent"})
     before = tree(run)
     exported = export_run(run, to=to)
@@ -246,7 +246,7 @@ def test_a_form_is_whole_repeatable_and_leaves_the_run_alone(tmp_path, to):
     refused(folder, "--overwrite", run=run, to=to)
     export_run(run, overwrite=True, to=to)
     again = tree(run)
-    if to != "exr":  # may hold the moment it was written
+    if to not in ("exr", "rrd", "e57"):  # may hold the moment or the process that wrote it
         assert again == after
     assert set(again) == set(after)
 
