@@ -2,8 +2,9 @@
 """The forms in which `densify export` writes a finished run.
 
 To add one, write a module with the function that `densify.outputs.export.ExportModule` describes
-(and that of `densify.outputs.export.DriveModule`, if it takes several keys) and one row here. In a package of your own an entry point in the group ``densify.exports`` takes the
-row's place, and ``OWNED`` of the module says what the row's ``owned`` says.
+(and that of `densify.outputs.export.DriveModule`, if it takes several keys) and one row here. In a
+package of your own an entry point in the group ``densify.exports`` takes the row's place, and
+``OWNED`` of the module says what the row's ``owned`` says.
 """
 
 from __future__ import annotations
