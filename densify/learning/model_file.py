@@ -21,6 +21,7 @@ from torch import nn
 
 from densify.errors import InputError
 from densify.files.arrays import read_arrays
+from densify.files.texts import parse_json
 from densify.learning.clouds import Sweeps
 from densify.learning.networks import NETWORKS, build
 from densify.learning.threads import on_one_thread
@@ -100,9 +101,9 @@ def read_model(path: Path) -> Model:
 
 def _header(path: Path, arrays: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
     try:
-        header = json.loads(bytes(arrays[_HEADER].astype(np.uint8)))
+        header = parse_json(bytes(arrays[_HEADER].astype(np.uint8)), path)
         found = header["format"], header["version"], header["network"], header["made"]
-    except (KeyError, ValueError, TypeError, RecursionError) as error:
+    except (KeyError, ValueError, TypeError, InputError) as error:
         raise InputError(f"{path}: no model that densify train flow wrote") from error
     if found[0] != FORMAT or not isinstance(found[3], dict):
         raise InputError(f"{path}: no model that densify train flow wrote")
