@@ -22,7 +22,7 @@ from densify.doubts import with_doubts
 from densify.errors import ComputationError, InputError
 from densify.flow.engines import check_engine
 from densify.key_results import Key, key_results
-from densify.methods import COMPARED, METHODS, looks_around, with_baselines
+from densify.methods import COMPARED, METHODS, with_baselines
 from densify.readers.files import format_frames
 from densify.readers.prior_files import PriorFiles
 from densify.readers.window import choose_cameras
@@ -82,8 +82,7 @@ def run_keys(
     settings, methods, watch = resolve(config), with_baselines(method), Watch(progress)
     _check(sequence, settings, methods, cameras)
     priors = _open_priors(prior, sequence, cameras)
-    looks = looks_around(methods)
-    recording = Recording(sequence, settings, window, keys, cache, None, watch, looks)
+    recording = Recording(sequence, settings, window, keys, cache, watch=watch)
 
     def results() -> Iterator[tuple[int, Result | ComputationError | InputError]]:
         for key in sorted(set(keys)):
@@ -144,8 +143,7 @@ def compare(
     settings, watch = resolve(config), Watch(progress)
     _check(sequence, settings, methods, cameras)
     priors = _open_priors(prior, sequence, cameras)
-    looks = looks_around(methods)
-    recording = Recording(sequence, settings, window, [key], cache, None, watch, looks)
+    recording = Recording(sequence, settings, window, [key], cache, watch=watch)
     return densify(recording, key, methods, cameras, watch, priors=priors)
 
 

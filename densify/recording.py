@@ -28,7 +28,6 @@ from __future__ import annotations
 from collections.abc import Collection, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache, partial
-from itertools import chain
 from typing import Any, NamedTuple, TypeVar, cast
 
 from densify.blocks import Cut
@@ -100,24 +99,19 @@ class Recording:
         cache: Cache | None = None,
         run: str | None = None,
         watch: Watch | None = None,
-        looks_around: bool = False,
     ) -> None:
         """window: sweeps on each side of a key. keys: work on their windows alone, see
         `Cut.around`; None for the whole recording, see `Cut.whole`. cache: keeps the steps' results
         on disk; None keeps nothing. run: the same for all processes between which no sweep changes;
         None for this object alone. watch: measures the steps.
-        looks_around: of keys, what moves is looked for ``flow.look_around_s`` beyond their windows
-        too, where the engine can make use of that.
 
         Raises InputError if a key does not exist.
         """
         self.sequence, self.settings = sequence, settings
         self.timeline = Timeline.of(sequence)
-        cut, self._beyond_s = Cut.whole(self.timeline, window), 0.0
+        cut = Cut.whole(self.timeline, window)
         if keys is not None:
-            looks_around = looks_around and engine_row(settings.flow.engine)[0].shared
-            self._beyond_s = settings.flow.look_around_s if looks_around else 0.0
-            cut = Cut.around(self.timeline, window, keys, self._beyond_s)
+            cut = Cut.around(self.timeline, window, keys)
         self.cut = cut
         self._num_around, self._cache, self._watch = window, cache, watch or Watch()
         # What the next step, key or block is likely to ask for again is kept in memory.
@@ -167,13 +161,6 @@ class Recording:
         number = self.cut.number_of[key]
         frames = self.window_frames(key).frames
         return self._places.stretch(number, self.cut.margin_s, frames)
-
-    def around(self, key: int) -> Stretch:
-        """The sweeps that the motion in a key's window is found out from."""
-        number, (index, _) = self.cut.number_of[key], self._places.piece(key)
-        margin_s = self.cut.margin_s
-        frames = self._places.frames_within(number, margin_s)[index]
-        return self._places.stretch(number, margin_s, frames)
 
     def motion(self, key: int, engine: str | None = None) -> Motion:
         """How everything in a key's window moves. engine: None for that of ``flow.engine``."""
@@ -348,7 +335,7 @@ class Recording:
         road = Road(self.timeline, self.sweeps, cameras, settings, far_m, self._watch)
 
         def make(frames: Sequence[int]) -> Standing:
-            keys = [k for k in keys_of_block if k in frames]
+            keys = [k for k, n in self.cut.number_of.items() if n == number and k in frames]
             near = self._places.stretch(number, 0.0, frames)
             with self._watch.stage("far"):
                 return road.standing(near, keys, with_near=len(keys) > 1)
@@ -357,16 +344,10 @@ class Recording:
             content = [self.sweeps.content_if_readable(f) for f in road.frames(piece, frames)]
             return [settings, far_m, cameras, piece, list(frames), content]
 
-        keys_of_block = [k for k, n in self.cut.number_of.items() if n == number]
         pieces = self._places.pieces(number, 0.0)
-        near_frames = self._places.frames_within(number, 0.0)
-        if self._beyond_s:  # what is looked at beyond the windows is as far as the rest of the road
-            windows = [self.timeline.window(k, self._num_around).frames for k in keys_of_block]
-            inside = {*chain(*windows)}
-            near_frames = [[f for f in frames if f in inside] or frames for frames in near_frames]
         return [
             kept(self._cache, "far", Standing, partial(inputs, pieces[i], f), partial(make, f))
-            for i, f in enumerate(near_frames)
+            for i, f in enumerate(self._places.frames_within(number, 0.0))
         ]
 
     # What they are made of

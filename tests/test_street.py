@@ -598,4 +598,5 @@ def test_frames_made_side_by_side_are_those_made_one_by_one(tmp_path, monkeypatc
     monkeypatch.setattr(Simulator, "returns", None)  # nothing is left to be made
     for frame, expected in zip(wanted, alone, strict=True):
         for name, column in vars(street.returns(frame)).items():
-            np.testing.assert_array_equal(column, getattr(expected, name))
+            made = getattr(expected, name)
+            assert column is made is None or column.tobytes() == made.tobytes()

@@ -17,23 +17,20 @@ from densify.types import Bool, Float, LidarSequence, Motion, Stretch
 
 @dataclass(frozen=True)
 class Window:
-    """Consecutive sweeps around the key. above: by frame (N,) above the ground. around: the
-    sweeps that our motion of it is found out from."""
+    """Consecutive sweeps around the key. above: by frame (N,) above the ground."""
 
     stretch: Stretch
     key: int
-    around: Stretch
     above: Mapping[int, Bool]
 
     @staticmethod
     def open(sequence: LidarSequence, key: int, size: int, config: Config) -> Window:
         """The key's window, as the pipeline has it. Raises InputError for a missing key,
         ComputationError where registration went wrong."""
-        recording = Recording(sequence, config, size, [key], looks_around=True)
-        stretch, around = recording.window(key), recording.around(key)
+        stretch = Recording(sequence, config, size, [key]).window(key)
         heights, least_m = ground(stretch, config.ground), config.flow.min_height_m
         above = {f: heights.above(_in_world(stretch, f)) >= least_m for f in stretch.frames}
-        return Window(stretch, key, around, above)
+        return Window(stretch, key, above)
 
     @property
     def frames(self) -> tuple[int, ...]:

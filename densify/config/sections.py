@@ -87,13 +87,6 @@ class FlowSettings(Section):
         0.02,
         2,
     )
-    look_around_s: float = knob(
-        0.0,
-        "[s] so long before and after the window sweeps are asked too what moves; 1 halves "
-        "what is missed in 1.4 times the time (densify dataset looks 1.5 s and more)",
-        0,
-        5,
-    )
     soft: bool = knob(
         True,
         "objects bend about their rigid motion (swinging limbs) as far as held-out sweeps confirm",

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 
@@ -45,8 +44,6 @@ _ROUGH_M, _ROUGH_PER_GAP, _ROUGH_S = 0.04, 0.2, 0.003  # by gap of rings, by spe
 _LEAST_WAY_M, _LEAST_WAY_PER_RESIDUAL = 0.35, 8.0
 _NUM_ASKED = 60
 _MISSES_ALLOWED, _MISSED_S = 1, 0.2  # either: a track ends when both are exceeded
-_AGAIN_S, _AGAIN_POINTS = 0.3, 50  # so far both ways so large a group is followed again
-_MAX_CONTRADICTIONS_AGAIN = 0.1
 _LEAST_STATES, _LEAST_S = 3, 0.15
 _MAX_CONTRADICTIONS = 0.3  # of those that standing still leaves
 
@@ -79,13 +76,8 @@ def follow_groups(
         radial = seen[n].radial
         if radial is not None:
             velocity = radial.rows(members).corrected(velocity)
-        follow = partial(_follow, members, n, velocity, looks, free, ground, clock)
-        track = follow(np.inf)
-        proven = _prove(track, standing, space, _MAX_CONTRADICTIONS)
-        if not proven and len(members) >= _AGAIN_POINTS:
-            # One that is lost sight of or turns on the way may be certain for a while.
-            track = follow(_AGAIN_S)
-            proven = _prove(track, standing, space, _MAX_CONTRADICTIONS_AGAIN)
+        track = _follow(members, n, velocity, looks, free, ground, clock)
+        proven = _prove(track, standing, space)
         if proven:
             _gather(track, standing, free, space)
             _refine(track, standing, ground)
@@ -125,10 +117,8 @@ def _follow(
     free: Sequence[Bool],
     ground: HeightMap,
     clock: Clock,
-    within_s: float,
 ) -> Track:
-    """Forwards, then backwards, with everything seen so far as the model. clock: of the looks.
-    within_s: no farther from the start."""
+    """Forwards, then backwards, with everything seen so far as the model. clock: of the looks."""
     here = looks[start].seen
     rate = np.append(velocity, 0.0)
     seen_s = float(here.time_s[members].mean())
@@ -139,10 +129,8 @@ def _follow(
     recent = clock.num_in(_RECENT_S)
     for direction in (1, -1):
         last, n = start, start + direction
-        while (
-            0 <= n < len(looks)
-            and abs(clock.time_s[n] - clock.time_s[start]) <= within_s
-            and (abs(n - last) <= 1 + _MISSES_ALLOWED or clock.near(n, last, _MISSED_S))
+        while 0 <= n < len(looks) and (
+            abs(n - last) <= 1 + _MISSES_ALLOWED or clock.near(n, last, _MISSED_S)
         ):
             found = _find(model, track, rate, recent, looks[n], free, ground)
             if found is not None:
@@ -301,13 +289,13 @@ def _refine(track: Track, standing: Sequence[Standing], ground: HeightMap) -> No
         track.sightings, track.path = before
 
 
-def _prove(track: Track, standing: Sequence[Standing], space: FreeSpace, most: float) -> bool:
+def _prove(track: Track, standing: Sequence[Standing], space: FreeSpace) -> bool:
     """Fit the smooth motion; True if the track certainly moves.
 
     The motion must be smooth, long enough to be told from noise, and must do away with the
-    contradictions that brought the group here, but for ``most`` of them: where the sweeps see
-    through its points at their rigid places, they must not see through them at the moved ones.
-    Where radial velocities were measured, it must have them.
+    contradictions that brought the group here, and have the radial velocities that were measured,
+    where any were: where the sweeps see through its points at their
+    rigid places, they must not see through them at the moved ones.
     """
     seen_s = np.ptp([sighting.seen_s for sighting in track.sightings.values()])
     if len(track.sightings) < _LEAST_STATES or seen_s < _LEAST_S:
@@ -323,7 +311,7 @@ def _prove(track: Track, standing: Sequence[Standing], space: FreeSpace, most: f
     if not _as_fast_as_measured(track, standing):
         return False
     still, moved = _contradictions(track, standing, space)
-    return moved <= most * still
+    return moved <= _MAX_CONTRADICTIONS * still
 
 
 def _as_fast_as_measured(track: Track, standing: Sequence[Standing]) -> bool:
