@@ -42,10 +42,9 @@ def decide(layers: Layers, settings: ProjectSettings) -> Layers:
     that is ``refused``.
 
     An image that lies up to 3 steps aside is moved, with a warning that says how far where that is
-    certain. To one that
-    does not belong to the depth or is blurred (`densify.depth.picture.laid_over`) nobody listens:
-    as ``strict``, with a warning; without an image as ``strict``. ``lab`` goes on only if it was
-    listened to.
+    certain. To one that does not belong to the depth or is blurred
+    (`densify.depth.picture.laid_over`) nobody listens: as ``strict``, with a warning; without an
+    image as ``strict``. ``lab`` goes on only if it was listened to.
 
     The ``confidence`` of rims becomes 0 to 0.2, by the share of the votes against.
     """

@@ -293,9 +293,9 @@ def _prove(track: Track, standing: Sequence[Standing], space: FreeSpace) -> bool
     """Fit the smooth motion; True if the track certainly moves.
 
     The motion must be smooth, long enough to be told from noise, and must do away with the
-    contradictions that brought the group here, and have the radial velocities that were measured,
-    where any were: where the sweeps see through its points at their
-    rigid places, they must not see through them at the moved ones.
+    contradictions that brought the group here: where the sweeps see through its points at their
+    rigid places, they must not see through them at the moved ones. Where radial velocities were
+    measured, it must have them.
     """
     seen_s = np.ptp([sighting.seen_s for sighting in track.sightings.values()])
     if len(track.sightings) < _LEAST_STATES or seen_s < _LEAST_S:

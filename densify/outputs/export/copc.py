@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from densify.errors import InputError
 from densify.outputs.cloud_laz import StoredCloud
 from densify.outputs.export.finished_run import FinishedRun
+from densify.readers.extras import needed
 from densify.types import Int
 
 _SCALE_M = 0.001
@@ -35,12 +36,7 @@ def write_export(run: FinishedRun, folder: Path) -> None:
     """``cloud.copc.laz``: places, colour, intensity, gps_time; ``user_data`` 1 for what moves,
     ``point_source_id`` 1 + object, 0 none; copclib writes no dimensions with names of their own.
     Raises InputError without copclib, or if nothing is left of the cloud."""
-    try:
-        import copclib
-    except ImportError as error:
-        raise InputError(
-            f"copclib is not there ({error}); install it with pip install 'densify[copc]'"
-        ) from None
+    copclib = needed("copclib", "copc", "COPC files")
     cloud = run.cloud()
     if not len(cloud.points):
         raise InputError(f"{run.folder}: nothing is left of the cloud; lower --min-confidence")

@@ -9,18 +9,14 @@ import numpy as np
 
 from densify.errors import InputError
 from densify.outputs.export.finished_run import FinishedRun
+from densify.readers.extras import needed
 
 
 def write_export(run: FinishedRun, folder: Path) -> None:
     """``cloud.e57``: one scan of places (float32 metres, key frame), colours and intensity, the
     columns that the format has. Its identifiers are new every time, so bytes differ. Raises
     InputError without pye57, or if nothing is left of the cloud, which the format cannot say."""
-    try:
-        import pye57
-    except ImportError as error:
-        raise InputError(
-            f"pye57 is not there ({error}); install it with pip install 'densify[e57]'"
-        ) from None
+    pye57 = needed("pye57", "e57", "E57 files")
     cloud = run.cloud()
     if not len(cloud.points):
         raise InputError(f"{run.folder}: nothing is left of the cloud; lower --min-confidence")

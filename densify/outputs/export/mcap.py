@@ -23,9 +23,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from densify.errors import InputError
 from densify.outputs.export.finished_run import FinishedRun
 from densify.outputs.export.timeline import Shot, Timeline, timelines
+from densify.readers.extras import needed
 from densify.types import Camera, Float, ObjectTrack
 from densify.types.rigid import inverse
 
@@ -46,12 +46,7 @@ def write_export(run: FinishedRun, folder: Path) -> None:
 def write_drive(runs: Sequence[FinishedRun], folder: Path) -> None:
     """``recording.mcap``. Same runs, same bytes. Raises InputError without foxglove-sdk, and as
     `timelines`."""
-    try:
-        import foxglove
-    except ImportError as error:
-        raise InputError(
-            f"foxglove-sdk is not there ({error}); install it with pip install 'densify[mcap]'"
-        ) from None
+    foxglove = needed("foxglove", "mcap", "MCAP files")
     context, channels = foxglove.Context(), {}
     options = foxglove.mcap.MCAPWriteOptions(compression_threads=0)
     with foxglove.open_mcap(folder / "recording.mcap", context=context, writer_options=options):

@@ -23,9 +23,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from densify.errors import InputError
 from densify.outputs.export.finished_run import FinishedRun
 from densify.outputs.export.timeline import Shot, Timeline, timelines
+from densify.readers.extras import needed
 from densify.types import Float, ObjectTrack
 from densify.types.rigid import inverse
 
@@ -50,7 +50,7 @@ def write_export(run: FinishedRun, folder: Path) -> None:
 def write_drive(runs: Sequence[FinishedRun], folder: Path) -> None:
     """``recording.rrd``. The same runs give the same data; rerun numbers its chunks by the clock,
     so bytes differ. Raises InputError without rerun, and as `timelines`."""
-    rr = _rerun()
+    rr = needed("rerun", "rerun", "Recordings for rerun")
     with _stream(rr, runs) as stream:
         stream.save(folder / "recording.rrd", default_blueprint=_blueprint(rr, runs))
         for timeline in timelines(runs):
@@ -60,22 +60,12 @@ def write_drive(runs: Sequence[FinishedRun], folder: Path) -> None:
 def show(runs: Sequence[FinishedRun], port: int = 9876) -> None:
     """The same in rerun's viewer: the one that listens on the port, else a new one, which stays
     when this process ends. Raises InputError without rerun, and as `timelines`."""
-    rr = _rerun()
+    rr = needed("rerun", "rerun", "Recordings for rerun")
     with _stream(rr, runs) as stream:
         stream.spawn(port=port, default_blueprint=_blueprint(rr, runs))
         for timeline in timelines(runs):
             _log(rr, stream, timeline)
         stream.flush()
-
-
-def _rerun() -> Any:
-    try:
-        import rerun
-    except ImportError as error:
-        raise InputError(
-            f"rerun is not there ({error}); install it with pip install 'densify[rerun]'"
-        ) from None
-    return rerun
 
 
 def _stream(rr: Any, runs: Sequence[FinishedRun]) -> rerun.RecordingStream:
