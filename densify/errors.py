@@ -52,3 +52,8 @@ class SweepError(ComputationError):
 
     def __str__(self) -> str:
         return str(self.args[0])
+
+
+def is_out_of_memory(error: Exception) -> bool:
+    """Whether the system had none left: also for the stack of one more thread."""
+    return isinstance(error, MemoryError) or str(error) == "can't start new thread"

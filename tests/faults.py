@@ -19,7 +19,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 
@@ -42,11 +42,13 @@ CALLS = ("write", "fsync", "rename", "open", "read")
 
 @dataclass(frozen=True)
 class Bench:
-    """drive: a recording. whole: the set of it, made undisturbed. place: for everything else."""
+    """drive: a recording. whole: the set of it, made undisturbed. place: for everything else.
+    usual_s: how long that takes."""
 
     drive: Path
     whole: Path
     place: Path
+    usual_s: float = 0.0
 
     @staticmethod
     def of(place: Path) -> Bench:
@@ -55,7 +57,9 @@ class Bench:
         code, errors = bench.made(bench.whole)
         if code:
             raise RuntimeError(errors)
-        return bench
+        start_s = time.monotonic()
+        bench.made(bench.fresh())
+        return replace(bench, usual_s=time.monotonic() - start_s)
 
     def start(self, out: Path, *more: str, **environment: str) -> subprocess.Popen[str]:
         """The command. Its temporary files and its cache are its own."""
@@ -118,7 +122,7 @@ def told_in_a_line(code: int, errors: str) -> None:
 def killed(bench: Bench, out: Path, rng: random.Random, number: int, workers: int) -> str:
     """With a signal, somewhere among the keys."""
     before: dict[Path, int] = {}
-    after_s = rng.uniform(1.0, 9.0)
+    after_s = rng.uniform(0.2, 0.9) * bench.usual_s
     with bench.start(out, "--workers", str(workers)) as process:
         try:
             process.communicate(timeout=after_s)

@@ -5,6 +5,7 @@ stays, the rest is made by the same command, and it is the same set."""
 from __future__ import annotations
 
 import errno
+import logging
 import os
 import random
 import shutil
@@ -189,8 +190,25 @@ def test_a_bug_in_one_key_costs_that_key(
     )
     assert (summary.count("done"), summary.count("failed"), summary.num_left) == (2, 1, 0)
     (failed,) = [r for r in records(out) if r["status"] == "failed"]
-    assert (failed["key"], failed["reason"]) == (40, "ZeroDivisionError: by zero")
+    told = "this is a bug in densify; please report it with densify.log: ZeroDivisionError: by zero"
+    assert (failed["key"], failed["reason"]) == (40, told)
     assert "failing" in (out / "densify.log").read_text()  # the traceback
+    shown = [r.getMessage() for r in caplog.records if r.levelno > logging.DEBUG]
+    assert not any("Traceback" in text for text in shown)
+
+
+@pytest.mark.parametrize("error", [MemoryError(), RuntimeError("can't start new thread")], ids=str)
+def test_no_memory_for_one_key_costs_that_key(
+    error: Exception, border_drive: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def failing(job, key):
+        raise error
+
+    monkeypatch.setattr(work, "_made", failing)
+    out = tmp_path / "out"
+    make_dataset([str(border_drive)], out, slice(39, 40), Recipe(2, config=resolve(GIVEN)))
+    (failed,) = records(out)
+    assert failed["status"] == "failed" and failed["reason"].startswith("out of memory (")
 
 
 GIVEN = {"register": {"source": "dataset"}}

@@ -4,6 +4,8 @@ one line."""
 
 from __future__ import annotations
 
+import errno
+import io
 import json
 import os
 import pickle
@@ -19,6 +21,7 @@ import pytest
 
 from densify.config import resolve
 from densify.errors import ComputationError, InputError, OutputError, SweepError
+from densify.files import content
 from densify.files.arrays import read_array, read_arrays
 from densify.files.content import gunzipped, read_bytes
 from densify.files.images import decode_image
@@ -43,6 +46,38 @@ class TestContent:
         os.mkfifo(tmp_path / "pipe")
         for path in (tmp_path / "pipe", tmp_path, Path("/dev/zero")):
             refused(read_bytes, path, says="no file but a folder, pipe or device")
+
+    @pytest.mark.parametrize(
+        ("number", "failures", "reads"),
+        [(errno.EIO, 1, 2), (errno.EIO, 2, 3), (errno.EIO, 9, 3), (errno.EPERM, 1, 1)],
+    )
+    def test_what_disks_recover_from_is_tried_again(
+        self, number: int, failures: int, reads: int, tmp_path: Path, monkeypatch
+    ) -> None:
+        """Half of it had been read before."""
+        path, calls = tmp_path / "a", []
+        path.write_bytes(b"0123456789")
+
+        class Failing(io.BytesIO):
+            def fileno(self) -> int:
+                return number_of
+
+            def read(self, size: int = -1) -> bytes:
+                calls.append(size)
+                if len(calls) <= failures:
+                    super().read(5)
+                    raise OSError(number, os.strerror(number))
+                return super().read(size)
+
+        with path.open("rb") as real:
+            number_of = real.fileno()
+            monkeypatch.setattr(content, "open_file", lambda _: Failing(b"0123456789"))
+            monkeypatch.setattr(content, "_PAUSES_S", (0.0, 0.0))
+            if failures < reads:
+                assert read_bytes(path) == b"0123456789"
+            else:
+                refused(read_bytes, path, says=os.strerror(number))
+        assert len(calls) == reads
 
     def test_a_file_is_no_larger_than_that(self, tmp_path: Path) -> None:
         path = tmp_path / "sparse"
@@ -291,6 +326,9 @@ def test_descriptions_of_sets_are_not_believed(change, tmp_path: Path) -> None:
     ):
         path.write_text(json.dumps(bad))
         refused(read_plan, tmp_path, says="damaged or no description of a training set")
+    for bad, told in (({}, "it has no schema_version"), ([table], "it holds no mapping")):
+        path.write_text(json.dumps(bad))
+        refused(read_plan, tmp_path, says=told)
 
 
 def test_scores_of_other_kinds_are_not_averaged(tmp_path: Path) -> None:

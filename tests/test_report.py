@@ -7,6 +7,7 @@ import base64
 import hashlib
 import json
 import re
+import shutil
 import zlib
 from pathlib import Path
 
@@ -261,6 +262,13 @@ class TestPage:
             "cloud.laz: not there, so there is no view in 3-D"
         ]
         assert "confidence" not in data["cameras"]["front"]
+
+    def test_a_record_that_says_nothing_is_told_of(self, run: Path, tmp_path: Path) -> None:
+        folder = shutil.copytree(run, tmp_path / "run")
+        (folder / "run.yaml").write_text("text")
+        (page,) = write_report(folder, tmp_path / "page.html")
+        told = "run.yaml: damaged, so nothing says how this was made"
+        assert told in data_of(page.read_bytes())["missing"]
 
 
 class TestNothingRuns:

@@ -17,7 +17,7 @@ from typing import NoReturn, TextIO
 
 from densify.cli.arguments import parse
 from densify.cli.screen import Screen
-from densify.errors import ComputationError, InputError
+from densify.errors import ComputationError, InputError, is_out_of_memory
 
 DONE, FAILED, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
 
@@ -45,10 +45,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
             _let_go_of(sys.stdout)
             said = f"{error.filename or 'stdout'}: {error.strerror or error}"
             return screen.end(BAD_INPUT, said)
-        except MemoryError:
-            advice = "try a smaller --window, fewer --workers or one --camera"
-            return screen.end(FAILED, f"out of memory; {advice}")
         except Exception as error:
+            if is_out_of_memory(error):
+                advice = "try a smaller --window, fewer --workers or one --camera"
+                return screen.end(FAILED, f"out of memory; {advice}")
             from densify.cli.bugs import kept
 
             log = kept(error)

@@ -182,13 +182,16 @@ def read_plan(out: Path) -> dict[str, Any] | None:
         return None
     try:
         table = read_json(path)
+        if not isinstance(table, dict):
+            raise TypeError("it holds no mapping")
         if table["schema_version"] == SCHEMA_VERSION:
             _check_kinds(table)
             planned_keys(table)
             return {name: table[name] for name in ("schema_version", *_SAME, "drives")}
     except (ValueError, KeyError, TypeError, AttributeError) as error:
+        told = f"it has no {error.args[0]}" if isinstance(error, KeyError) else str(error)
         raise InputError(
-            f"{path}: damaged or no description of a training set: {error!r}; choose another folder"
+            f"{path}: damaged or no description of a training set: {told}; choose another folder"
         ) from error
     raise InputError(
         f"{path}: got schema_version {table['schema_version']}, expected {SCHEMA_VERSION}; "

@@ -22,7 +22,7 @@ from densify.dataset.gate import scores_of
 from densify.dataset.manifest import KeyRecord
 from densify.dataset.plan import Recipe, Source
 from densify.dataset.tasks import Task
-from densify.errors import ComputationError, InputError, OutputError
+from densify.errors import ComputationError, InputError, OutputError, is_out_of_memory
 from densify.methods import METHODS, with_baselines
 from densify.outputs.atomic import FileRecord
 from densify.outputs.kitti_tree import write_key
@@ -118,8 +118,13 @@ def make_key(job: Job, key: int) -> KeyRecord:
     except (InputError, ComputationError) as error:
         record = replace(record, reason=str(error))
     except Exception as error:  # a bug, or no memory: the other keys may go well all the same
-        _log.warning("key %d of %s: %s", key, job.source.name, traceback.format_exc())
-        record = replace(record, reason=f"{type(error).__name__}: {error}")
+        _log.debug("key %d of %s: %s", key, job.source.name, traceback.format_exc())
+        told = f"{type(error).__name__}: {error}"
+        if is_out_of_memory(error):
+            told = f"out of memory ({told}); fewer --workers or a smaller --window take less"
+        else:
+            told = f"this is a bug in densify; please report it with densify.log: {told}"
+        record = replace(record, reason=told)
     return replace(record, seconds=time.perf_counter() - start)
 
 

@@ -3,8 +3,10 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import stat
+import time
 import zlib
 from pathlib import Path
 from typing import BinaryIO
@@ -13,6 +15,8 @@ from densify.errors import InputError
 
 MOST_BYTES = 1 << 30
 """No file is larger in memory, compressed or not; a sweep has 2 to 10 MB."""
+_PASSING = (errno.EIO, errno.ESTALE, errno.ETIMEDOUT, errno.EAGAIN)
+_PAUSES_S = (0.05, 0.5)
 
 
 def open_file(path: Path) -> BinaryIO:
@@ -35,9 +39,23 @@ def read_bytes(path: Path, most_bytes: int = MOST_BYTES) -> bytes:
         num_bytes = os.fstat(file.fileno()).st_size
         check_size(num_bytes, path, most_bytes)
         try:
-            return file.read(num_bytes)
+            return _read(file, num_bytes)
         except OSError as error:
             raise InputError(f"{path}: cannot be read: {reason(error)}") from error
+
+
+def _read(file: BinaryIO, num_bytes: int) -> bytes:
+    """Tried again after what disks and network folders recover from: a sweep that is missing only
+    now would be missing for good from what is made of its neighbours."""
+    for pause_s in _PAUSES_S:
+        try:
+            return file.read(num_bytes)
+        except OSError as error:
+            if error.errno not in _PASSING:
+                raise
+        time.sleep(pause_s)
+        file.seek(0)
+    return file.read(num_bytes)
 
 
 def gunzipped(data: bytes, where: Path | str, most_bytes: int = MOST_BYTES) -> bytes:

@@ -62,6 +62,8 @@ class KeyFiles:
             )
         about, _ = read_yaml(path)
         files = KeyFiles(folder, _mapping(about), {})
+        if not files.about:
+            files.missing.append("run.yaml: damaged, so nothing says how this was made")
         metrics = _mapping(files._tried(read_json, folder / "metrics.json") or {})
         method = str(files.about.get("method", "run"))
         files.methods = {**_mapping(metrics.get("baselines")), method: metrics}
