@@ -6,16 +6,24 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
 from densify.bench.baselines import rigid_icp
 from densify.bench.paper import METHODS, SLOW, bench_paper
-from densify.bench.paper_pairs import PaperPair, pair_of_street, pairs_of_files, read_pair
+from densify.bench.paper_pairs import (
+    PaperPair,
+    pair_of_street,
+    pairs_of_files,
+    pairs_of_kitti,
+    read_pair,
+)
 from densify.cli import main
 from densify.errors import InputError
 from densify.learning.model_file import Model, write_model
 from densify.learning.networks import build
+from densify.readers.kitti import scene_flow
 
 STEP = np.array([0.3, 0.1, 0.0])
 
@@ -96,6 +104,104 @@ def test_flyingthings_comes_in_camera_axes(tmp_path: Path) -> None:
 def test_another_npz_is_refused(tmp_path: Path, changes, told: str) -> None:
     with pytest.raises(InputError, match=told):
         read_pair(kitti_file(tmp_path / "a.npz", **changes))
+
+
+FOCAL_PX, BASELINE_M, CENTRE_PX = 720.0, 0.54, np.array([100.0, 30.0])
+OWN_M, WALL_M = np.array([0.1, 0.0, -1.0]), np.array([0.4, 0.0, 0.5])
+
+
+def scene_flow_folder(root: Path) -> Path:
+    """KITTI's scene flow 2015: a wall 12 m ahead that moves, another 50 m ahead, the road."""
+    v, u = np.mgrid[:100, :200]
+    rays = np.dstack(
+        [(u - CENTRE_PX[0]) / FOCAL_PX, (v - CENTRE_PX[1]) / FOCAL_PX, np.ones(u.shape)]
+    )
+    wall = (abs(u - 90) < 40) & (v < 90)
+    depth_m = np.where(wall, 12.0, np.minimum(1.65 / np.maximum(rays[..., 1], 1e-6), 50.0))
+    here = rays * depth_m[..., None]
+    there = here + np.where(wall[..., None], WALL_M, OWN_M)
+    moved_px = there[..., :2] / there[..., 2:] * FOCAL_PX + CENTRE_PX - np.stack([u, v], axis=-1)
+    valid = np.ones(u.shape)
+    valid[40:50, 80:90] = 0
+    images = {
+        "disp_occ_0": 256 * FOCAL_PX * BASELINE_M / here[..., 2],
+        "disp_occ_1": 256 * FOCAL_PX * BASELINE_M / there[..., 2],
+        "flow_occ": np.dstack(
+            [valid, 64 * moved_px[..., 1] + 2**15, 64 * moved_px[..., 0] + 2**15]
+        ),
+    }
+    images["disp_occ_0"][:, 99] = 0  # as where no disparity is known
+    for name, image in images.items():
+        (root / "training" / name).mkdir(parents=True)
+        cv2.imwrite(
+            str(root / "training" / name / "000003_10.png"), np.rint(image).astype(np.uint16)
+        )
+    left, right = (
+        f"{FOCAL_PX} 0 {CENTRE_PX[0]} {FOCAL_PX * x} 0 {FOCAL_PX} {CENTRE_PX[1]} 0 0 0 1 0"
+        for x in (0.06, 0.06 - BASELINE_M)
+    )
+    (root / "training" / "calib_cam_to_cam").mkdir()
+    calibration = root / "training" / "calib_cam_to_cam" / "000003.txt"
+    calibration.write_text(f"P_rect_02: {left}\nP_rect_03: {right}\n")
+    return root
+
+
+@pytest.mark.parametrize("within", ["", "training"])
+def test_kittis_disparities_and_flow_are_lifted(tmp_path: Path, within: str) -> None:
+    """The wall alone is left of what is nearer than 35 m and no road, at its own depth, and goes
+    as far as it does."""
+    pairs = list(pairs_of_kitti(scene_flow_folder(tmp_path) / within, 0))
+    assert [pair.name for pair in pairs] == ["000003_10"]
+    pair = pairs[0]
+    on_wall = 79 * 90 - 90 - 100  # without the column and the square where something is unknown
+    assert len(pair.source) + len(pair.target) == on_wall
+    assert abs(len(pair.source) - len(pair.target)) < 100
+    np.testing.assert_allclose(pair.source[:, 0], 12.0, atol=0.01)
+    assert pair.source[:, 2].max() < 12 * 31 / FOCAL_PX and pair.source[:, 2].min() > -1.0
+    ahead_left_up = [WALL_M[2], -WALL_M[0], -WALL_M[1]]
+    np.testing.assert_allclose(pair.flow, np.tile(ahead_left_up, (len(pair.flow), 1)), atol=0.01)
+    arrived = pair.source + pair.flow
+    apart_m = np.linalg.norm(arrived[:200, None] - pair.target[None], axis=2).min(axis=1)
+    assert 0.01 < np.median(apart_m) < 0.03  # a pixel aside
+
+
+def test_the_road_is_left_out_where_it_stays_the_road(tmp_path: Path) -> None:
+    training = scene_flow_folder(tmp_path) / "training"
+    moments = scene_flow.read_moments(training, "000003_10")
+    low = ~moments.above_ground() & (moments.here[:, 2] < 45)
+    np.testing.assert_allclose(moments.here[low, 1], 1.65, atol=0.01)
+    road = np.isclose(moments.here[:, 1], 1.65, atol=0.01)
+    assert road.sum() > 500 and not moments.above_ground()[road].any()
+    np.testing.assert_allclose((moments.there - moments.here)[road].mean(axis=0), OWN_M, atol=0.01)
+
+
+@pytest.mark.parametrize(
+    "name, image, told",
+    [
+        ("disp_occ_0", np.ones((100, 200), np.uint8), "got 1 channels of uint8, expected 1 of"),
+        ("flow_occ", np.ones((100, 200), np.uint16), "got 1 channels of uint16, expected 3 of"),
+        ("disp_occ_1", np.ones((9, 8), np.uint16), "8 x 9 pixels, expected 200 x 100"),
+        ("disp_occ_0", np.zeros((100, 200), np.uint16), "no valid point within 35 m ahead"),
+        ("flow_occ", None, "000003_10.png: no such file"),
+        ("disp_occ_0", None, r"disp_occ_0: no images such as 000000_10.png"),
+    ],
+    ids=str,
+)
+def test_another_scene_flow_folder_is_refused(tmp_path: Path, name: str, image, told: str) -> None:
+    path = scene_flow_folder(tmp_path) / "training" / name / "000003_10.png"
+    path.unlink()
+    if image is not None:
+        cv2.imwrite(str(path), image)
+    with pytest.raises(InputError, match=told):
+        list(pairs_of_kitti(tmp_path, 0))
+
+
+def test_cameras_the_wrong_way_round_are_refused(tmp_path: Path) -> None:
+    path = scene_flow_folder(tmp_path) / "training" / "calib_cam_to_cam" / "000003.txt"
+    text = path.read_text()
+    path.write_text(text.replace("_02", "_xx").replace("_03", "_02").replace("_xx", "_03"))
+    with pytest.raises(InputError, match=r"stand -0\.54 m apart, expected above 0"):
+        list(pairs_of_kitti(tmp_path, 0))
 
 
 def test_a_street_is_a_set() -> None:

@@ -3,7 +3,8 @@
 
 Sets of others are folders of .npz files as FlowNet3D's authors made them (Liu et al., CVPR 2019):
 ``points1``, ``points2``, ``flow`` and ``valid_mask1`` (FlyingThings3D; camera axes, z forward), or
-``pos1``, ``pos2`` and ``gt`` (KITTI without ground; z up).
+``pos1``, ``pos2`` and ``gt`` (KITTI without ground; z up). KITTI's own scene flow 2015 is lifted as
+`densify.readers.kitti.scene_flow` says, without the road.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from densify.learning.clips import make_clip
 from densify.learning.clouds import Standing, Sweeps
 from densify.learning.samples import sample_of
 from densify.readers import open_sequence
+from densify.readers.kitti import scene_flow
 from densify.types import Bool, Float
 
 FARTHEST_M = 35.0
@@ -64,12 +66,36 @@ def pair_of_street(spec: str, key: int) -> PaperPair:
     return PaperPair(f"{spec}@{key}", source, target, flow, moving, sample.sweeps)
 
 
-def pairs_of_files(folder: Path, most: int) -> Iterator[PaperPair]:
-    """The first ``most`` files of a folder, by name; 0 for all. Raises InputError for a folder
-    without any, or a file of another form."""
+def pairs_of_kitti(folder: Path, most: int) -> Iterator[PaperPair]:
+    """KITTI's scene flow 2015, or the .npz files made of it; see `pairs_of_files`."""
+    training = scene_flow.training_folder(folder)
+    if training is None:
+        yield from pairs_of_files(folder, most, "; nor KITTI's training/disp_occ_0")
+        return
+    for name in scene_flow.image_names(training)[: most or None]:
+        yield lift_pair(training, name)
+
+
+def lift_pair(training: Path, name: str) -> PaperPair:
+    """One pair of KITTI's images, within 35 m and without the road. No point is in both clouds:
+    pixels take turns, as the squares of a chessboard. Raises InputError for a file of another
+    form, or no points."""
+    moments = scene_flow.read_moments(training, name)
+    kept = moments.above_ground()
+    here, there = (x[kept] @ _R_FLU_CAMERA.T for x in moments[:2])
+    first = moments.is_white[kept]
+    where = f"{training}: {name}"
+    return _pair(name, here[first], there[~first], (there - here)[first], where)
+
+
+def pairs_of_files(folder: Path, most: int, beside: str = "") -> Iterator[PaperPair]:
+    """The first ``most`` files of a folder, by name; 0 for all. beside: what else was looked for.
+    Raises InputError for a folder without any, or a file of another form."""
     paths = sorted(folder.glob("*.npz"))
     if not paths:
-        raise InputError(f"{folder}: no .npz files; expected the sets of FlowNet3D's authors")
+        raise InputError(
+            f"{folder}: no .npz files; expected the sets of FlowNet3D's authors{beside}"
+        )
     for path in paths[: most or None]:
         yield read_pair(path)
 
@@ -96,14 +122,19 @@ def read_pair(path: Path) -> PaperPair:
             raise InputError(f"{path}: {found[3]}: got {len(valid)}, expected {len(source)}")
     if found is _NAMES[0]:
         source, target, flow = (x @ _R_FLU_CAMERA.T for x in (source, target, flow))
-    near = valid & (np.abs(source[:, 0]) < FARTHEST_M)
+    return _pair(path.stem, source[valid], target, flow[valid], str(path))
+
+
+def _pair(name: str, source: Float, target: Float, flow: Float, where: str) -> PaperPair:
+    """Within 35 m ahead (x). Raises InputError, which begins with ``where``, for nothing there."""
+    near = np.abs(source[:, 0]) < FARTHEST_M
     source, flow = source[near], flow[near]
     target = target[np.abs(target[:, 0]) < FARTHEST_M]
     if not (len(source) and len(target)):
-        raise InputError(f"{path}: no valid point within {FARTHEST_M:g} m ahead")
+        raise InputError(f"{where}: no valid point within {FARTHEST_M:g} m ahead")
     lowest = min(source[:, 2].min(), target[:, 2].min())
     sweeps = []
     for points in (source, target):
         given = Standing(np.arange(len(points)), points, (points[:, 2] - lowest).astype(np.float32))
         sweeps.append(given.cloud(np.zeros(3)))
-    return PaperPair(path.stem, source, target, flow, None, tuple(sweeps))
+    return PaperPair(name, source, target, flow, None, tuple(sweeps))

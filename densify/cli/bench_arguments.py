@@ -171,13 +171,12 @@ def _add_bench_paper(benches: Any) -> None:
         "paper-adam take minutes a pair. On streets the motion of the vehicle is removed, in the "
         "published sets it is not.",
     )
-    for name, what in (("flyingthings", "FlyingThings3D"), ("kitti", "KITTI without ground")):
-        parser.add_argument(
-            f"--{name}",
-            metavar="DIR",
-            type=Path,
-            help=f".npz files of {what} as FlowNet3D's authors made them",
-        )
+    made = "as FlowNet3D's authors made them"
+    for name, what in (
+        ("flyingthings", f".npz files of FlyingThings3D {made}"),
+        ("kitti", f"KITTI's scene flow 2015 with its calibration, or .npz files {made}"),
+    ):
+        parser.add_argument(f"--{name}", metavar="DIR", type=Path, help=what)
     parser.add_argument(
         "--data",
         type=recording_keys,

@@ -164,7 +164,7 @@ def bench_flow(options: argparse.Namespace) -> Iterator[Answer]:
 def bench_paper(options: argparse.Namespace) -> Iterator[Answer]:
     """The tables of the paper."""
     from densify.bench import paper as bench
-    from densify.bench.paper_pairs import pair_of_street, pairs_of_files
+    from densify.bench.paper_pairs import pair_of_street, pairs_of_files, pairs_of_kitti
     from densify.bench.table_file import write_table
     from densify.cli.bench_tables import paper_table
     from densify.cli.point_files import check_new_file
@@ -172,8 +172,8 @@ def bench_paper(options: argparse.Namespace) -> Iterator[Answer]:
     if options.out is not None:
         check_new_file(options.out, options.overwrite, ".json")
     sets: dict[str, Iterable[PaperPair]] = {
-        name: pairs_of_files(folder, options.pairs)
-        for name in ("flyingthings", "kitti")
+        name: pairs_of(folder, options.pairs)
+        for name, pairs_of in (("flyingthings", pairs_of_files), ("kitti", pairs_of_kitti))
         if (folder := getattr(options, name)) is not None
     }
     if options.data or not sets:
