@@ -182,7 +182,7 @@ def test_the_road_is_left_out_where_it_stays_the_road(tmp_path: Path) -> None:
         ("flow_occ", np.ones((100, 200), np.uint16), "got 1 channels of uint16, expected 3 of"),
         ("disp_occ_1", np.ones((9, 8), np.uint16), "8 x 9 pixels, expected 200 x 100"),
         ("disp_occ_0", np.zeros((100, 200), np.uint16), "no valid point within 35 m ahead"),
-        ("flow_occ", None, "000003_10.png: no such file"),
+        ("flow_occ", None, "000003_10.png: cannot be read"),
         ("disp_occ_0", None, r"disp_occ_0: no images such as 000000_10.png"),
     ],
     ids=str,

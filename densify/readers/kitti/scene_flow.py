@@ -52,7 +52,7 @@ def training_folder(folder: Path) -> Path | None:
 
 
 def image_names(training: Path) -> list[str]:
-    """Of the pairs that have a disparity: ``000000_10`` and so on. Raises InputError for none."""
+    """The pairs that have a disparity: ``000000_10`` and so on. Raises InputError for none."""
     names = sorted(path.stem for path in (training / _IMAGES[0]).glob("*_10.png"))
     if not names:
         raise InputError(f"{training / _IMAGES[0]}: no images such as 000000_10.png")
