@@ -12,7 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from densify.geometry import poses
-from densify.types import Bool, Boxes, Float, FlowField
+from densify.geometry.cameras import image_points
+from densify.types import Bool, Boxes, BoxView, Float, FlowField, Int, RegisteredSweep
 
 MOVES_M_S = 0.5
 """Slower boxes stand still: nobody draws a box to the centimetre (Chodosh et al., WACV 2024)."""
@@ -28,47 +29,83 @@ class BoxMargins:
 
 
 def flow_of_boxes(
-    points: Float,
+    here: RegisteredSweep,
+    after: RegisteredSweep,
     boxes: Boxes,
     next_boxes: Boxes,
-    T_here_next: Float,
-    duration_s: float,
     margins: BoxMargins | None = None,
 ) -> tuple[FlowField, Bool]:
-    """Flow of one sweep to the next, and which of it is sure.
+    """Flow of the N points of one sweep to the next, and which of it is sure.
 
-    points: (N,3) lidar frame at the sweep's reference time. boxes, next_boxes: of the two sweeps.
-    T_here_next: (4,4) from the next sweep's lidar frame. duration_s: between the two.
+    here, after: the two sweeps in one world; of the second the points are not used. boxes,
+    next_boxes: of the two.
 
     Returns the field, whose ``instance`` is the box's row (-1 none), and (N,) bool: False in two
-    boxes, just outside one, and in a box that is not there in the next sweep.
+    boxes, just outside one, in a box that is not there in the next sweep, and where nobody drew
+    boxes.
     """
     margins = margins or BoxMargins()
+    points = here.sweep.points
     field = FlowField.zero(len(points))
     num_inside, near = np.zeros(len(points), np.int64), np.zeros(len(points), bool)
-    sure = np.ones(len(points), bool)
-    row_of = {int(track): row for row, track in enumerate(next_boxes.track)}
-    for k, (track, T_here_box, size_m) in enumerate(
-        zip(boxes.track, boxes.T_lidar_box, boxes.size_m, strict=True)
+    sure = _looked_at(boxes.view, points)
+    duration_s = (after.sweep.stamp_ns - here.sweep.stamp_ns) * 1e-9
+    T_here_next = poses.inverse(here.T_world_lidar) @ after.T_world_lidar
+    T_there = T_here_next @ _at_reference(next_boxes, after)
+    row_of = {track: row for row, track in enumerate(next_boxes.track) if track}
+    reach_m = np.linalg.norm(boxes.size_m / 2 + margins.grown_m + margins.unsure_m, axis=1)
+    x, y = np.ascontiguousarray(points[:, 0]), np.ascontiguousarray(points[:, 1])
+    for k, (track, T_here_box) in enumerate(
+        zip(boxes.track, _at_reference(boxes, here), strict=True)
     ):
-        in_box = poses.transform(poses.inverse(T_here_box), points)
-        outside_m = (np.abs(in_box) - size_m / 2).max(axis=1)
+        rows: Int = np.flatnonzero(
+            (np.abs(x - T_here_box[0, 3]) <= reach_m[k])
+            & (np.abs(y - T_here_box[1, 3]) <= reach_m[k])
+        )
+        if boxes.lidar is not None and boxes.lidar[k] >= 0:
+            rows = rows[here.sweep.lidar[rows] == boxes.lidar[k]]
+        in_box = poses.transform(poses.inverse(T_here_box), points[rows])
+        outside_m = (np.abs(in_box) - boxes.size_m[k] / 2).max(axis=1)
+        near[rows] |= outside_m <= margins.grown_m + margins.unsure_m
         inside = outside_m <= margins.grown_m
-        num_inside += inside
-        near |= (outside_m <= margins.grown_m + margins.unsure_m) & ~inside
-        field.instance[inside] = k
-        if int(track) not in row_of:
-            sure[inside] = False
+        rows, in_box = rows[inside], in_box[inside]
+        num_inside[rows] += 1
+        field.instance[rows] = k
+        if track not in row_of:
+            sure[rows] = False
             continue
-        T_here_there = T_here_next @ next_boxes.T_lidar_box[row_of[int(track)]]
+        T_here_there = T_there[row_of[track]]
         shift_m = np.linalg.norm(T_here_there[:3, 3] - T_here_box[:3, 3])
         if shift_m < MOVES_M_S * duration_s:
             continue
-        rows = np.flatnonzero(inside)
-        field.displacement[rows] = poses.transform(T_here_there, in_box[rows]) - points[rows]
+        field.displacement[rows] = poses.transform(T_here_there, in_box) - points[rows]
         field.moving[rows] = True
     twice = num_inside > 1
     sure &= ~twice & ~(near & (num_inside == 0))
     field.displacement[twice] = 0.0
     field.moving[twice] = False
     return field, sure
+
+
+def _at_reference(boxes: Boxes, registered: RegisteredSweep) -> Float:
+    """(K,4,4) where the boxes are in the lidar frame at the sweep's reference time, carried by the
+    vehicle's own motion as the points are."""
+    if boxes.offset_ns is None:
+        return boxes.T_lidar_box
+    T = boxes.T_lidar_box.copy()
+    for k, offset_ns in enumerate(boxes.offset_ns.tolist()):
+        twist = registered.twist_before if offset_ns < 0 else registered.twist_after
+        T[k] = poses.exp(offset_ns * 1e-9 * twist) @ T[k]
+    return T
+
+
+def _looked_at(view: BoxView | None, points: Float) -> Bool:
+    """(N,) bool: where boxes were drawn if there was something."""
+    if view is None:
+        return np.ones(len(points), bool)
+    uv, seen = image_points(view.camera, poses.transform(view.camera.T_cam_lidar, points))
+    with np.errstate(invalid="ignore"):
+        for left, top, right, bottom in view.left_out_px:
+            inside = (uv >= (left, top)) & (uv <= (right, bottom))
+            seen &= ~inside.all(axis=1)
+    return seen

@@ -16,6 +16,7 @@ from densify.geometry import poses
 from densify.geometry.ground import ground
 from densify.outputs.atomic import write_file
 from densify.outputs.flow_npz import flow_npz
+from densify.plugins.readers import READERS
 from densify.recording import Recording
 from densify.types import Bool, FlowField, KnowsBoxes, LidarSequence, Progress, RegisteredSweep
 
@@ -47,12 +48,10 @@ def label_sweeps(
     ``flow.min_height_m`` above it do not count. Raises InputError for a recording without boxes.
     """
     if not isinstance(sequence, KnowsBoxes) or all(
-        sequence.boxes(frame) is None for frame in sequence.frames[:2]
+        sequence.boxes(frame) is None for frame in sequence.frames
     ):
-        raise InputError(
-            f"{sequence.name}: no tracked boxes; expected an Argoverse 2 log with "
-            f"annotations.feather"
-        )
+        known = ", ".join(f"{row.boxes} ({row.name})" for row in READERS if row.boxes)
+        raise InputError(f"{sequence.name}: no tracked boxes; expected one of {known}")
     recording = Recording(sequence, config, 1)
 
     def labels() -> Iterator[tuple[int, Label | ComputationError | InputError]]:
@@ -85,16 +84,14 @@ def _label(
     if own is None or others is None:
         return None
     registered, after = stretch[frame], stretch[following[0]]
-    duration_s = (after.sweep.stamp_ns - registered.sweep.stamp_ns) * 1e-9
-    T_here_next = stretch.T_target_source(frame, following[0])
-    points = registered.sweep.points
-    field, sure = flow_of_boxes(points, own, others, T_here_next, duration_s, margins)
+    field, sure = flow_of_boxes(registered, after, own, others, margins)
     if without_ground:
         settings = recording.settings
         heights = ground(stretch, settings.ground)
-        in_world = poses.transform(registered.T_world_lidar, points)
+        in_world = poses.transform(registered.T_world_lidar, registered.sweep.points)
         sure &= heights.above(in_world) >= settings.flow.min_height_m
-    return Label(registered, following[0], field, sure, poses.inverse(T_here_next))
+    T_next_here = stretch.T_target_source(following[0], frame)
+    return Label(registered, following[0], field, sure, T_next_here)
 
 
 def label_path(folder: Path, frame: int, next_frame: int) -> Path:

@@ -3,7 +3,8 @@
 
 To add one, write a module with the function that `densify.readers.ReaderModule` describes and one
 row here. In a package of your own an entry point in the group ``densify.readers`` takes the row's
-place, and the module says the rest: ``recognises(path)``, ``HOLDS`` and, if need be, ``SCENES``.
+place, and the module says the rest: ``recognises(path)``, ``HOLDS`` and, if need be, ``SCENES`` and
+``BOXES``.
 """
 
 from __future__ import annotations
@@ -25,7 +26,8 @@ _SWEEP = re.compile(r".*\d.*\.(bin|pcd|ply|las|laz)", re.IGNORECASE)
 class Reader:
     """recognises: whether a place, which exists, holds such a recording; quick, from names alone.
     holds: what is there, for messages. scenes: one place may hold several, named by ``#SCENE``.
-    general: recognises so much that all others are asked first."""
+    general: recognises so much that all others are asked first. boxes: where tracked boxes lie in a
+    recording of which it reads them, for messages; empty for one of which it reads none."""
 
     name: str
     module: str
@@ -33,6 +35,7 @@ class Reader:
     holds: str
     scenes: bool = False
     general: bool = False
+    boxes: str = ""
 
     @property
     def usage(self) -> str:
@@ -47,6 +50,7 @@ def _row(name: str, module: ModuleType, version: str) -> Reader:
         recognises=module.recognises,
         holds=getattr(module, "HOLDS", f"a recording for the reader {name}"),
         scenes=getattr(module, "SCENES", False),
+        boxes=getattr(module, "BOXES", ""),
     )
 
 
@@ -118,6 +122,7 @@ READERS = Table(
             recognises=_is_argoverse2,
             holds="an Argoverse 2 log (a folder that holds city_SE3_egovehicle.feather)",
             scenes=True,
+            boxes="annotations.feather",
         ),
         Reader(
             "nuscenes",
@@ -163,6 +168,7 @@ READERS = Table(
             recognises=lambda path: any((path / "velodyne").glob("[0-9][0-9][0-9][0-9]/")),
             holds="KITTI tracking (a folder that holds velodyne/0000/)",
             scenes=True,
+            boxes="label_02/0000.txt",
         ),
         Reader(
             "kitti-odometry",

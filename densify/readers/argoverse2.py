@@ -34,6 +34,7 @@ from densify.errors import InputError
 from densify.files.content import read_bytes
 from densify.geometry.poses import inverse
 from densify.readers.arrow_columns import read_feather
+from densify.readers.boxes import checked_boxes
 from densify.readers.file_sequence import (
     FileSequence,
     Returns,
@@ -157,9 +158,9 @@ class Argoverse2(FileSequence):
             return None
         path, columns = self.where / ANNOTATIONS, table
         rows = np.flatnonzero(columns["timestamp_ns"] == self.stamp_ns(frame))
+        if not len(rows):
+            return None  # nothing there and not looked at are told in the same way
         size_m = np.stack([columns[name][rows] for name in BOX_SIZE], axis=1)
-        if (size_m <= 0).any():
-            raise InputError(f"{path}: a box of sweep {frame} has no size; expected metres above 0")
         T = [
             quaternion_pose(
                 np.array([columns[name][row] for name in _POSE_COLUMNS[:4]]),
@@ -168,7 +169,7 @@ class Argoverse2(FileSequence):
             )
             for row in rows
         ]
-        return Boxes(columns["track"][rows], np.reshape(T, (-1, 4, 4)), size_m)
+        return checked_boxes(columns["track_uuid"][rows], T, size_m, f"{path}: sweep {frame}")
 
     @cached_property
     def _annotations(self) -> dict[str, NDArray[Any]] | None:
@@ -176,9 +177,7 @@ class Argoverse2(FileSequence):
         if not path.is_file():
             return None
         numbers = dict.fromkeys((*BOX_SIZE, *_POSE_COLUMNS), "n")
-        columns = read_feather(path, {"timestamp_ns": "i", "track_uuid": "s", **numbers}, _WHAT)
-        _, columns["track"] = np.unique(columns["track_uuid"].astype(str), return_inverse=True)
-        return columns
+        return read_feather(path, {"timestamp_ns": "i", "track_uuid": "s", **numbers}, _WHAT)
 
     def T_world_cam(self, camera: str, number: int) -> Float:
         """(4,4) at the exposure, from the vehicle's poses."""

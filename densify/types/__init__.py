@@ -7,7 +7,7 @@ sweep's lidar), ``cam``.
 """
 
 from densify.arrays import Bool, Float, Float32, Int
-from densify.types.boxes import Boxes
+from densify.types.boxes import Boxes, BoxView
 from densify.types.depth import (
     Camera,
     CameraView,
@@ -39,6 +39,7 @@ from densify.types.tracks import ObjectTrack
 
 __all__ = [
     "Bool",
+    "BoxView",
     "Boxes",
     "Camera",
     "CameraView",

@@ -95,14 +95,15 @@ def _put_boxes(path: Path, excerpt: Excerpt, half_ns: int) -> None:
     for frame in excerpt.frames:
         stamp_ns = excerpt.street.stamp_ns(frame) - half_ns
         T_world_ego = excerpt.T_world_ego(np.array([stamp_ns]), inverse(T_EGO_LIDAR))[0]
-        boxes = drawn_boxes(excerpt, frame, T_world_ego)
+        boxes = drawn_boxes(excerpt, frame)
+        num = len(boxes.instance)
         tables.append(
             {
-                "timestamp_ns": np.full(len(boxes.track), stamp_ns),
-                "track_uuid": np.array([f"{t:032x}" for t in boxes.track], object),
-                "category": np.array(["REGULAR_VEHICLE"] * len(boxes.track), object),
+                "timestamp_ns": np.full(num, stamp_ns),
+                "track_uuid": np.array([f"{i:032x}" for i in boxes.instance], object),
+                "category": np.array(["REGULAR_VEHICLE"] * num, object),
                 **dict(zip(BOX_SIZE, boxes.size_m.T, strict=True)),
-                **_pose_columns(boxes.T_lidar_box),
+                **_pose_columns(inverse(T_world_ego) @ boxes.T_world_box),
             }
         )
     _put_table(path, {n: np.concatenate([t[n] for t in tables]) for n in tables[0]})

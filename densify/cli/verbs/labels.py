@@ -29,9 +29,10 @@ def add(commands: Any) -> None:
         "labels",
         answer,
         "scene flow of every sweep to the next from tracked boxes and poses",
-        "Of Argoverse 2 logs. Flow files as --flow npz:DIR and bench flow --truth read them, with "
-        "'valid' (N,) bool: False in two boxes, just outside one, and in a box that the next sweep "
-        "lacks. Poses are the recording's own (--set register.source=kiss-icp: estimated).",
+        "Flow files as --flow npz:DIR and bench flow --truth read them, with 'valid' (N,) bool: "
+        "False in two boxes, just outside one, in a box that the next sweep lacks, and where "
+        "nobody drew boxes. Poses are the recording's own (--set register.source=kiss-icp: "
+        "estimated).",
     )
     parser.add_argument("--data", metavar="SPEC", required=True, help="a recording with boxes")
     parser.add_argument("--out", metavar="DIR", type=Path, required=True, help="for the flow files")

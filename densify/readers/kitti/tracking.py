@@ -3,12 +3,13 @@
 sequences are scenes::
 
     velodyne/0000/000000.bin   image_02/0000/000000.png   calib/0000.txt   oxts/0000.txt
+    label_02/0000.txt    optional: tracked boxes, see `densify.readers.kitti.tracking_labels`
 
 - Frames are file numbers; a sweep's file can be absent. There are no stamps: frame k is at k times
   100 ms, its images too.
 - Points are the HDL-64E's, in its frame, the same as in the raw drives that the sequences are cut
   from: as measured. A point's time follows from its azimuth, as there, the turn taken to last
-  100 ms. Boxes are not read.
+  100 ms.
 - Images are rectified; their size is that of the first. ``calib`` has their projections, R_rect and
   Tr_velo_cam, and Tr_imu_velo. Poses come from oxts (a line for each frame); the world is the
   inertial unit's frame at frame 0.
@@ -40,7 +41,10 @@ from densify.readers.kitti.files import (
     rectified_camera,
     turned_ns,
 )
-from densify.types import Camera, Float
+from densify.readers.kitti.tracking_labels import LabelFile
+from densify.types import Boxes, BoxView, Camera, Float
+
+_SMALLEST_IMAGE_PX = (1224, 370)
 
 
 def open_recording(path: Path, scene: str | None) -> KittiTracking:
@@ -74,7 +78,10 @@ class KittiTracking(FileSequence):
             f"{path.resolve().name}/{scene}",
             path,
             tuple(self._sweeps),
-            {name: self._camera(path, name) for name in self._images},
+            {
+                name: self._camera(path, name, image_size_px(next(iter(images.values()))))
+                for name, images in self._images.items()
+            },
             {n: {f: f * NOMINAL_PERIOD_NS for f in files} for n, files in self._images.items()},
             truth_beside(path),
             self._sweeps,
@@ -115,13 +122,39 @@ class KittiTracking(FileSequence):
         path = self.where / "oxts" / f"{self._scene}.txt"
         return path, read_text(path).splitlines()
 
+    def boxes(self, frame: int) -> Boxes | None:
+        """See `densify.types.KnowsBoxes`; ``testing`` has none. Without images their size is taken
+        for the smallest of KITTI's. Raises InputError for labels or a calibration that are missing
+        or malformed."""
+        self.check_frame(frame)
+        if self._labels is None:
+            return None
+        track, T_cam_box, size_m = self._labels.boxes(frame)
+        T_lidar_box = poses.inverse(self._T_rect_lidar(self.where)) @ T_cam_box
+        view = BoxView(self._labelled_camera, self._labels.left_out_px(frame))
+        offset_ns = turned_ns(T_lidar_box[:, :3, 3], NOMINAL_PERIOD_NS)
+        return Boxes(track, T_lidar_box, size_m, offset_ns, view=view)
+
+    @cached_property
+    def _labels(self) -> LabelFile | None:
+        return LabelFile.read(self.where / "label_02" / f"{self._scene}.txt")
+
+    @cached_property
+    def _labelled_camera(self) -> Camera:
+        known = self.cameras.get("image_02")
+        return known or self._camera(self.where, "image_02", _SMALLEST_IMAGE_PX)
+
     def _calibration_file(self, path: Path) -> Path:
         return path / "calib" / f"{self._scene}.txt"
 
-    def _camera(self, path: Path, name: str) -> Camera:
+    def _T_rect_lidar(self, path: Path) -> Float:
+        """(4,4) the rectified camera 0 from the scanner."""
         calibration = Calibration.read(self._calibration_file(path))
         R = np.eye(4)
         R[:3, :3] = calibration.rotation("R_rect")
-        T_rect_lidar = R @ calibration.motion("Tr_velo_cam")
-        size_px = image_size_px(next(iter(self._images[name].values())))
-        return rectified_camera(calibration, f"P{name[-1]}", name, size_px, T_rect_lidar)
+        return R @ calibration.motion("Tr_velo_cam")
+
+    def _camera(self, path: Path, name: str, size_px: tuple[int, int]) -> Camera:
+        calibration = Calibration.read(self._calibration_file(path))
+        key = f"P{name[-1]}"
+        return rectified_camera(calibration, key, name, size_px, self._T_rect_lidar(path))
