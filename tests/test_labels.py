@@ -23,11 +23,13 @@ from densify.learning.labels import label_sweeps
 from densify.readers import open_sequence
 from densify.readers.kitti.files import Calibration
 from densify.readers.street import Street
+from densify.readers.waymo.components import BOX_HEADING, BOX_SIZE, STAMP
 from densify.types import Boxes, BoxView, Camera, RegisteredSweep, Sweep
 from densify.writers import write_street
 
-pytest.importorskip("pyarrow.feather")
+pyarrow = pytest.importorskip("pyarrow")
 FRAMES = range(60, 63)
+GIVEN = resolve(None, ["register.source=dataset"])
 
 
 def boxes(*placed: tuple[int, float, float, float]) -> Boxes:
@@ -148,6 +150,7 @@ class Written(NamedTuple):
 _CROSSING = Street("crossing", 5, "vlp16", cameras=())
 WRITTEN = {
     "argoverse2": Written(_CROSSING),
+    "waymo": Written(_CROSSING),
     "kitti-tracking": Written(_CROSSING, least_valid=0.15, most_valid=0.25),  # one camera's view
 }
 
@@ -222,15 +225,12 @@ def test_a_recording_without_boxes_is_refused(tmp_path: Path, capsys) -> None:
 
 
 def test_damaged_boxes_are_refused(log: Path, tmp_path: Path) -> None:
-    import pyarrow as arrow
     from pyarrow import feather
 
     copy = shutil.copytree(log, tmp_path / "log")
     table = feather.read_table(copy / "annotations.feather")
     assert open_sequence(str(copy)).boxes(0).size_m.min() > 0.2
-    flat = table.set_column(
-        table.column_names.index("width_m"), "width_m", arrow.array(np.zeros(len(table)))
-    )
+    flat = with_column(table, "width_m", np.zeros(len(table)))
     feather.write_feather(flat, str(copy / "annotations.feather"))
     with pytest.raises(InputError, match="sweep 0: a box has no size"):
         open_sequence(str(copy)).boxes(0)
@@ -239,6 +239,58 @@ def test_damaged_boxes_are_refused(log: Path, tmp_path: Path) -> None:
         open_sequence(str(copy)).boxes(0)
     (copy / "annotations.feather").unlink()
     assert open_sequence(str(copy)).boxes(0) is None
+
+
+# Waymo
+
+
+def test_damaged_waymo_boxes_are_refused(places, tmp_path: Path, capsys) -> None:
+    from pyarrow import parquet
+
+    copy = shutil.copytree(places("waymo"), tmp_path / "street")
+    path = copy / "lidar_box" / "street.parquet"
+    whole = path.read_bytes()
+    table = parquet.read_table(path)
+    heading, size = BOX_HEADING, BOX_SIZE[0]
+    twice = pyarrow.concat_tables([table, table])
+    for wrong, said in (
+        (table.drop_columns([heading]), f"no column {heading}"),
+        (with_column(table, size, np.zeros(len(table))), "a box has no size"),
+        (with_column(table, heading, np.full(len(table), np.nan)), "not finite"),
+        (twice, "is there twice"),
+    ):
+        parquet.write_table(wrong, path)
+        assert said in refused(copy, tmp_path, capsys)
+    path.write_bytes(whole[: len(whole) // 2])
+    assert "not a whole parquet file" in refused(copy, tmp_path, capsys)
+    path.unlink()
+    assert "lidar_box/CONTEXT.parquet (waymo)" in refused(copy, tmp_path, capsys)
+
+
+def test_a_waymo_frame_without_boxes_has_no_label(places, tmp_path: Path) -> None:
+    """Whether nobody looked or nothing was there is not told."""
+    from pyarrow import parquet
+
+    copy = shutil.copytree(places("waymo"), tmp_path / "street")
+    path = copy / "lidar_box" / "street.parquet"
+    table = parquet.read_table(path)
+    stamps = table[STAMP].to_numpy()
+    parquet.write_table(table.filter(stamps < stamps.max()), path)
+    labels = label_sweeps(open_sequence(str(copy)), range(3), GIVEN)
+    assert [frame for frame, _ in labels] == [0]
+
+
+def with_column(table, name: str, values: np.ndarray):
+    return table.set_column(table.column_names.index(name), name, pyarrow.array(values))
+
+
+def refused(place: Path, tmp_path: Path, capsys) -> str:
+    """The one line."""
+    assert main(["labels", "--data", str(place), "--out", str(tmp_path / "out")]) == 2
+    assert not (tmp_path / "out").exists()
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1
+    return error
 
 
 # KITTI tracking
@@ -259,13 +311,10 @@ def test_damaged_kitti_labels_are_refused(places, tmp_path: Path, capsys) -> Non
         (f"{lines[0]}\n{lines[0]}", f"frame 0: the box {words[1]} is there twice"),
     ):
         (copy / LABELS).write_text("\n".join([wrong, *lines[1:]]))
-        assert main(["labels", "--data", str(copy), "--out", str(tmp_path / "out")]) == 2
-        error = capsys.readouterr().err
-        assert said in error and "0000.txt" in error and error.count("\n") == 1
+        error = refused(copy, tmp_path, capsys)
+        assert said in error and "0000.txt" in error
     (copy / LABELS).unlink()
-    assert main(["labels", "--data", str(copy), "--out", str(tmp_path / "out")]) == 2
-    assert "label_02/0000.txt (kitti-tracking)" in capsys.readouterr().err
-    assert not (tmp_path / "out").exists()
+    assert "label_02/0000.txt (kitti-tracking)" in refused(copy, tmp_path, capsys)
 
 
 def test_kitti_boxes_stand_as_the_devkit_has_them(places, tmp_path: Path) -> None:
@@ -296,8 +345,7 @@ def test_real_boxes_carry_points_onto_the_next_sweep(test_data: Path, tmp_path: 
     next sweep measured, 1.4 m on."""
     root = tracking_tree(test_data / "kitti", range(103, 105), tmp_path / "training")
     sequence = open_sequence(str(root))
-    config = resolve(None, ["register.source=dataset"])
-    ((_, label),) = label_sweeps(sequence, [103], config)
+    ((_, label),) = label_sweeps(sequence, [103], GIVEN)
     moving = label.field.moving & label.sure
     points = label.registered.sweep.points[moving]
     assert moving.sum() > 100 and 0.1 < label.sure.mean() < 0.2

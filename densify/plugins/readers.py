@@ -141,6 +141,7 @@ READERS = Table(
             ),
             holds="Waymo's version 2 (a folder that holds lidar/*.parquet)",
             scenes=True,
+            boxes="lidar_box/CONTEXT.parquet",
         ),
         Reader(
             "opensceneflow",

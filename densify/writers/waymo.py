@@ -3,6 +3,7 @@
 
     OUT/street/{lidar,lidar_pose,lidar_calibration,vehicle_pose}/street.parquet
     OUT/street/{camera_image,camera_calibration}/street.parquet
+    OUT/street/lidar_box/street.parquet
     OUT/street/truth/    as in `densify.readers.truth_files`, cameras by Waymo's names
 
 A range image has a column for each firing of all beams: within it, beams that fire one after the
@@ -11,7 +12,7 @@ other get the azimuth of the column's middle. Cameras become FRONT, FRONT_LEFT, 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,16 +23,21 @@ from densify.errors import InputError
 from densify.geometry.poses import inverse
 from densify.readers.extras import needed
 from densify.readers.waymo.components import (
+    BOX_CENTRE,
+    BOX_HEADING,
+    BOX_SIZE,
     CAMERA,
     CAMERAS,
     DOWN,
     LASER,
+    OBJECT,
     STAMP,
     T_OPTICAL_WAYMO,
     UP,
 )
 from densify.street.patterns import Spinning
 from densify.types import Camera, Float, Float32, Int, Progress
+from densify.writers.boxes import drawn_boxes
 from densify.writers.excerpt import Excerpt, new_folder, put
 
 T_EGO_LIDAR = np.eye(4)  # where Waymo's TOP stands
@@ -69,6 +75,9 @@ def write_tree(excerpt: Excerpt, out: Path, overwrite: bool, progress: Progress 
             poses.append(pose)
         _put(root, "lidar", ranges)
         _put(root, "lidar_pose", poses)
+        boxes = [box for frame in excerpt.frames for box in _boxes(excerpt, frame)]
+        if boxes:
+            _put(root, "lidar_box", boxes)
         if excerpt.cameras:
             cameras = [street.cameras[name] for name in excerpt.cameras]
             _put(root, "camera_calibration", [_lens(c, i + 1) for i, c in enumerate(cameras)])
@@ -159,6 +168,21 @@ def _vehicle(excerpt: Excerpt, stamp_ns: int) -> dict[str, Any]:
     T = excerpt.T_world_ego(np.array([stamp_ns]), inverse(T_EGO_LIDAR))[0]
     name = "[VehiclePoseComponent].world_from_vehicle.transform"
     return {**_key(excerpt, stamp_ns), name: T.ravel()}
+
+
+def _boxes(excerpt: Excerpt, frame: int) -> Iterator[dict[str, Any]]:
+    stamp_ns, boxes = excerpt.street.stamp_ns(frame), drawn_boxes(excerpt, frame)
+    T_world_vehicle = excerpt.T_world_ego(np.array([stamp_ns]), inverse(T_EGO_LIDAR))[0]
+    T_vehicle_box = inverse(T_world_vehicle) @ boxes.T_world_box
+    for instance, T, size_m in zip(boxes.instance, T_vehicle_box, boxes.size_m, strict=True):
+        yield {
+            **_key(excerpt, stamp_ns),
+            OBJECT: f"object_{instance}",
+            **dict(zip(BOX_CENTRE, T[:3, 3].tolist(), strict=True)),
+            **dict(zip(BOX_SIZE, size_m.tolist(), strict=True)),
+            BOX_HEADING: float(np.arctan2(T[1, 0], T[0, 0])),
+            "[LiDARBoxComponent].type": np.int8(1),
+        }
 
 
 def _lens(camera: Camera, number: int) -> dict[str, Any]:

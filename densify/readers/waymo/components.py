@@ -16,9 +16,15 @@ from numpy.typing import NDArray
 from densify.errors import InputError
 from densify.geometry.poses import inverse
 from densify.readers.arrow_columns import read_parquet
+from densify.readers.boxes import checked_boxes, upright_poses
 from densify.readers.file_sequence import rigid
-from densify.types import Camera, Float, Int
+from densify.types import Boxes, Camera, Float, Int
 
+OBJECT = "key.laser_object_id"
+_BOX = "[LiDARBoxComponent].box"
+BOX_CENTRE = tuple(f"{_BOX}.center.{axis}" for axis in "xyz")
+BOX_SIZE = tuple(f"{_BOX}.size.{axis}" for axis in "xyz")  # length, width, height
+BOX_HEADING = f"{_BOX}.heading"
 LASERS = ("TOP", "FRONT", "SIDE_LEFT", "SIDE_RIGHT", "REAR")
 CAMERAS = ("FRONT", "FRONT_LEFT", "FRONT_RIGHT", "SIDE_LEFT", "SIDE_RIGHT")
 STAMP, LASER, CAMERA = "key.frame_timestamp_micros", "key.laser_name", "key.camera_name"
@@ -107,6 +113,24 @@ def read_lasers(parts: Components) -> dict[int, Laser]:
         beams_rad = None if values is None else values.astype(np.float64)
         lasers[int(laser)] = Laser(T_vehicle_laser, beams_rad, (low, high))
     return lasers
+
+
+def read_boxes(parts: Components) -> dict[int, Boxes]:
+    """The boxes by the frame's stamp in µs, in the vehicle's frame at its pose; frames without any
+    are not there. Raises InputError if the component is malformed."""
+    numbers = (*BOX_CENTRE, *BOX_SIZE, BOX_HEADING)
+    rows = parts.read("lidar_box", {STAMP: "i", OBJECT: "s", **dict.fromkeys(numbers, "n")})
+    centre_m, size_m = (
+        np.stack([rows[name].astype(np.float64) for name in names], axis=1)
+        for names in (BOX_CENTRE, BOX_SIZE)
+    )
+    T_vehicle_box = upright_poses(centre_m, rows[BOX_HEADING].astype(np.float64))
+    path, found = parts.file("lidar_box"), {}
+    for us in np.unique(rows[STAMP]).tolist():
+        mine = rows[STAMP] == us
+        where = f"{path}: frame_timestamp_micros {us}"
+        found[us] = checked_boxes(rows[OBJECT][mine], T_vehicle_box[mine], size_m[mine], where)
+    return found
 
 
 def read_images(parts: Components, starts_us: Int) -> dict[str, dict[int, Image]]:

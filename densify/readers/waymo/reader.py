@@ -4,6 +4,7 @@ Driving: Waymo Open Dataset", CVPR 2020), read without TensorFlow::
 
     ROOT/{lidar,lidar_pose,lidar_calibration,vehicle_pose}/CONTEXT.parquet
     ROOT/{camera_image,camera_calibration}/CONTEXT.parquet    optional
+    ROOT/lidar_box/CONTEXT.parquet    optional: tracked boxes, in the vehicle's frame
 
 ROOT is ``training``, ``validation`` or ``testing``; a segment is named by ``#CONTEXT``. Frames are
 numbered from 0 in the order of time, images by the number of their frame.
@@ -55,12 +56,13 @@ from densify.readers.waymo.components import (
     STAMP,
     Components,
     image_of,
+    read_boxes,
     read_cameras,
     read_images,
     read_lasers,
     transform_of,
 )
-from densify.types import Bool, Float, Int
+from densify.types import Bool, Boxes, Float, Int
 
 _NOMINAL_PERIOD_NS = 100_000_000
 _LEAST_WAY_M = 0.3  # of the vehicle in a sweep, from which its poses tell time
@@ -116,6 +118,16 @@ class Waymo(FileSequence):
 
     def _pose(self, frame: int) -> Float:
         return self._T_world_vehicle[frame]
+
+    def boxes(self, frame: int) -> Boxes | None:
+        """See `densify.types.KnowsBoxes`; the test split has none. Raises InputError if they are
+        malformed."""
+        self.check_frame(frame)
+        return self._boxes.get(int(self._starts_us[frame]))
+
+    @cached_property
+    def _boxes(self) -> dict[int, Boxes]:
+        return read_boxes(self._parts) if self._parts.file("lidar_box").is_file() else {}
 
     def T_world_cam(self, camera: str, number: int) -> Float:
         """(4,4) at the exposure of the image's middle."""
