@@ -9,12 +9,14 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
 from densify.bench.baselines import rigid_icp
 from densify.bench.paper import METHODS, SLOW, bench_paper
 from densify.bench.paper_pairs import (
     PaperPair,
     pair_of_street,
+    pairs_of_boxes,
     pairs_of_files,
     pairs_of_kitti,
     read_pair,
@@ -24,6 +26,8 @@ from densify.errors import InputError
 from densify.learning.model_file import Model, write_model
 from densify.learning.networks import build
 from densify.readers.kitti import scene_flow
+from densify.readers.street import Street
+from densify.writers import write_street
 
 STEP = np.array([0.3, 0.1, 0.0])
 
@@ -213,6 +217,43 @@ def test_a_street_is_a_set() -> None:
     assert gap_m.max() < 4 and gap_m.mean() > 0.05
 
 
+@pytest.fixture(scope="module")
+def log(tmp_path_factory) -> Path:
+    pytest.importorskip("pyarrow.feather")
+    street = Street("street", 5, "vlp16", cameras=())
+    return write_street("argoverse2", street, tmp_path_factory.mktemp("log"), range(58, 61))
+
+
+def test_boxes_make_the_flow_that_the_sensor_sees(log: Path) -> None:
+    """What stands moves as the vehicle makes it; what is in a moving box meets itself again."""
+    pairs = list(pairs_of_boxes([f"argoverse2:{log}"], 0))
+    assert len(pairs) == 2
+    pair = pairs[0]
+    assert pair.moving is not None and pair.moving.sum() > 50
+    np.testing.assert_allclose(pair.flow[~pair.moving], pair.of_vehicle()[~pair.moving], atol=1e-9)
+    assert np.linalg.norm(pair.of_vehicle(), axis=1).mean() > 0.1
+    reached_m, _ = cKDTree(pair.target).query((pair.source + pair.flow)[pair.moving])
+    before_m, _ = cKDTree(pair.target).query(pair.source[pair.moving])
+    assert np.median(reached_m) < 0.15 < 2 * np.median(before_m)
+    rows = bench_paper(pairs[:1], ["rest"])["methods"]["rest"]
+    assert rows["static_m"] < 1e-6 and rows["moving_m"] > 0.2
+
+
+def test_ours_sees_clouds_without_the_vehicles_motion(log: Path) -> None:
+    row = bench_paper(pairs_of_boxes([f"argoverse2:{log}"], 1), ["ours"])["methods"]["ours"]
+    assert row["static_m"] < 0.01
+
+
+def test_the_command_labels_recordings(log: Path, capsys) -> None:
+    command = ["bench", "paper", "--argoverse", str(log), "--methods", "rest", "--pairs", "1"]
+    assert main(command) == 0
+    told = capsys.readouterr().out
+    assert "argoverse: 1 pair, 2048 points drawn" in told
+    published = [line for line in told.splitlines() if "as published" in line]
+    assert "DCP" in published[0] and not any(c.isdigit() for c in published[0])
+    assert published[-1].split()[3:5] == ["0.257", "m"]
+
+
 def test_the_command_measures_and_names_what_is_published(tmp_path: Path, capsys) -> None:
     folder, out, model = tmp_path / "set", tmp_path / "t.json", tmp_path / "m.pt"
     folder.mkdir()
@@ -221,7 +262,7 @@ def test_the_command_measures_and_names_what_is_published(tmp_path: Path, capsys
     command = ["bench", "paper", "--kitti", str(folder), "--methods", "rest", "--out", str(out)]
     assert main([*command, "--model", str(model), "--points", "100"]) == 0
     told = capsys.readouterr().out
-    assert "1 pairs, 100 points drawn" in told and "m.pt" in told
+    assert "1 pair, 100 points drawn" in told and "m.pt" in told
     line = next(line for line in told.splitlines() if line.startswith("paper, as published"))
     assert line.split()[3:10] == ["0.093", "m", "64.8", "%", "82.1", "%", "0.137"]
     assert json.loads(out.read_text())["sets"]["kitti"]["methods"]["rest"]["epe_m"] > 0.3
@@ -234,6 +275,7 @@ def test_the_command_measures_and_names_what_is_published(tmp_path: Path, capsys
         (["--methods", "magic"], "--methods magic: expected some of rest, icp"),
         (["--model", "nowhere.pt"], "nowhere.pt: no such file"),
         (["--points", "0"], "--points 0: expected 1 or more"),
+        (["--nuscenes", "nowhere"], "nowhere: no nuScenes tables"),
     ],
     ids=str,
 )

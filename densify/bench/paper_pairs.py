@@ -4,26 +4,31 @@
 Sets of others are folders of .npz files as FlowNet3D's authors made them (Liu et al., CVPR 2019):
 ``points1``, ``points2``, ``flow`` and ``valid_mask1`` (FlyingThings3D; camera axes, z forward), or
 ``pos1``, ``pos2`` and ``gt`` (KITTI without ground; z up). KITTI's own scene flow 2015 is lifted as
-`densify.readers.kitti.scene_flow` says, without the road.
+`densify.readers.kitti.scene_flow` says, without the road. Recordings with boxes are labelled as
+`densify.learning.labels` does, without ground and without what is unsure; as in the paper, flow
+there is what the sensor sees, motion of the vehicle included.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
-from densify.config import resolve
+from densify.config import Config, resolve
 from densify.errors import InputError
 from densify.files.arrays import read_arrays
+from densify.geometry import poses
+from densify.geometry.ground import ground
 from densify.learning.clips import make_clip
 from densify.learning.clouds import Standing, Sweeps
+from densify.learning.labels import Label, label_sweeps
 from densify.learning.samples import sample_of
 from densify.readers import open_sequence
 from densify.readers.kitti import scene_flow
-from densify.types import Bool, Float
+from densify.types import Bool, Float, Stretch
 
 FARTHEST_M = 35.0
 _MOST_SWEEPS = 5
@@ -38,7 +43,9 @@ _R_FLU_CAMERA = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
 @dataclass(frozen=True)
 class PaperPair:
     """Two clouds and the true flow between them. source, target: (n,3), (m,3) metres, z up. flow:
-    (n,3). moving: (n,), None where the set does not tell. sweeps: what networks get of it."""
+    (n,3). moving: (n,), None where the set does not tell. sweeps: what networks get of it.
+    T_target_source: (4,4) the vehicle's motion that is part of the flow, where poses tell: methods
+    of registered sweeps, networks among them, see clouds without it."""
 
     name: str
     source: Float
@@ -46,6 +53,12 @@ class PaperPair:
     flow: Float
     moving: Bool | None
     sweeps: Sweeps
+    T_target_source: Float = field(default_factory=lambda: np.eye(4))
+
+    def of_vehicle(self) -> Float:
+        """(n,3) metres by which the vehicle's motion, as far as it is known, moves the source."""
+        moved: Float = poses.transform(self.T_target_source, self.source) - self.source
+        return moved
 
 
 def pair_of_street(spec: str, key: int) -> PaperPair:
@@ -64,6 +77,37 @@ def pair_of_street(spec: str, key: int) -> PaperPair:
     source, target = (clip.sweeps[n].points.astype(np.float64) for n in (here, here + 1))
     flow, moving = sample.flow.double().numpy(), sample.moving.numpy()
     return PaperPair(f"{spec}@{key}", source, target, flow, moving, sample.sweeps)
+
+
+def pairs_of_boxes(specs: Sequence[str], most: int) -> Iterator[PaperPair]:
+    """The sweeps of recordings with tracked boxes, each with its next; of each recording the first
+    ``most``, 0 for all. Raises InputError for a recording without boxes, or one that cannot be
+    read; ComputationError where a sweep cannot be placed."""
+    config = resolve({"register": {"source": "dataset"}})
+    for spec in specs:
+        sequence = open_sequence(spec)
+        labels = label_sweeps(sequence, sequence.frames, config)
+        for _, (frame, label) in zip(range(most or len(sequence.frames)), labels, strict=False):
+            if not isinstance(label, Label):
+                raise label
+            yield _pair_of_label(f"{sequence.name}@{frame}", label, config)
+
+
+def _pair_of_label(name: str, label: Label, config: Config) -> PaperPair:
+    stretch = Stretch((label.registered, label.after))
+    heights = ground(stretch, config.ground)
+    least_m = config.flow.min_height_m
+    here, there = (Standing.of(s, heights, least_m) for s in stretch.sweeps)
+    known = label.sure[here.row]
+    row, T = here.row[known], label.T_next_here
+    source, target = label.registered.sweep.points[row], label.after.sweep.points[there.row]
+    if not (len(source) and len(target)):
+        raise InputError(f"{name}: no labelled point above the ground")
+    moved = label.field.total[row]
+    placed = Standing(row, poses.transform(T, source), here.height_m[known])
+    sweeps = tuple(s.cloud(T[:3, 3]) for s in (placed, Standing(there.row, target, there.height_m)))
+    flow = poses.transform(T, source + moved) - source
+    return PaperPair(name, source, target, flow, label.field.moving[row], sweeps, T)
 
 
 def pairs_of_kitti(folder: Path, most: int) -> Iterator[PaperPair]:

@@ -169,7 +169,7 @@ def _add_bench_paper(benches: Any) -> None:
         "Methods: rest, icp, nicp, pointpwc (its loss without learning), paper-adam (as "
         "published), paper (this package's solver), no-laplacian (Table 2), ours. pointpwc and "
         "paper-adam take minutes a pair. On streets the motion of the vehicle is removed, in the "
-        "published sets it is not.",
+        "published sets it is not; ours and networks know it where the recording has poses.",
     )
     made = "as FlowNet3D's authors made them"
     for name, what in (
@@ -177,6 +177,14 @@ def _add_bench_paper(benches: Any) -> None:
         ("kitti", f"KITTI's scene flow 2015 with its calibration, or .npz files {made}"),
     ):
         parser.add_argument(f"--{name}", metavar="DIR", type=Path, help=what)
+    for name, what in (("argoverse", "DIR[#LOG]"), ("nuscenes", "DIR[#SCENE]")):
+        parser.add_argument(
+            f"--{name}",
+            metavar=what,
+            action="append",
+            help="a recording with tracked boxes, whose flow densify labels makes; may be given "
+            "several times",
+        )
     parser.add_argument(
         "--data",
         type=recording_keys,
@@ -201,7 +209,11 @@ def _add_bench_paper(benches: Any) -> None:
         "--points", type=natural, default=2048, metavar="N", help="drawn (default: 2048)"
     )
     parser.add_argument(
-        "--pairs", type=natural, default=0, metavar="N", help="of a set, 0: all (default: 0)"
+        "--pairs",
+        type=natural,
+        default=0,
+        metavar="N",
+        help="of a set or recording, 0: all (default: 0)",
     )
     parser.add_argument(
         "--curves", action="store_true", help="also over neighbours and over the number of points"

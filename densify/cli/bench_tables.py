@@ -225,13 +225,18 @@ _PAPER_COLUMNS: tuple[Column, ...] = (
 )
 
 
-def paper_table(name: str, measured: Mapping[str, Any], published: Any) -> str:
-    """A set's rows, the published one last, then what was measured over neighbours and points."""
+def paper_table(
+    name: str, measured: Mapping[str, Any], published: Any, only_published: Sequence[str]
+) -> str:
+    """A set's rows, the published ones last, then what was measured over neighbours and points."""
     rows = dict(measured["methods"])
     if published is not None:
+        rows |= {f"{learned}, as published": {} for learned in only_published}
         rows["paper, as published"] = published
-    head = f"{name}: {measured['num_pairs']} pairs, {measured['num_points']} points drawn"
-    parts = [head, table(rows, _PAPER_COLUMNS)]
+    pairs = f"{measured['num_pairs']} pair{'s' if measured['num_pairs'] != 1 else ''}"
+    parts = [f"{name}: {pairs}, {measured['num_points']} points drawn", table(rows, _PAPER_COLUMNS)]
+    if published is not None:
+        parts.append(f"Figures of {'; '.join(only_published)}: in the paper's Table 1")
     for kind, what in (("neighbors", "neighbours k"), ("points", "points drawn")):
         if kind in measured:
             parts += [f"{name}: paper over {what}", table(measured[kind], _PAPER_COLUMNS)]

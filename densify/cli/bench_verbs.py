@@ -164,21 +164,27 @@ def bench_flow(options: argparse.Namespace) -> Iterator[Answer]:
 def bench_paper(options: argparse.Namespace) -> Iterator[Answer]:
     """The tables of the paper."""
     from densify.bench import paper as bench
-    from densify.bench.paper_pairs import pair_of_street, pairs_of_files, pairs_of_kitti
+    from densify.bench import paper_pairs
     from densify.bench.table_file import write_table
     from densify.cli.bench_tables import paper_table
     from densify.cli.point_files import check_new_file
 
     if options.out is not None:
         check_new_file(options.out, options.overwrite, ".json")
-    sets: dict[str, Iterable[PaperPair]] = {
-        name: pairs_of(folder, options.pairs)
-        for name, pairs_of in (("flyingthings", pairs_of_files), ("kitti", pairs_of_kitti))
-        if (folder := getattr(options, name)) is not None
-    }
+    sets: dict[str, Iterable[PaperPair]] = {}
+    if options.flyingthings is not None:
+        sets["flyingthings"] = paper_pairs.pairs_of_files(options.flyingthings, options.pairs)
+    if options.kitti is not None:
+        sets["kitti"] = paper_pairs.pairs_of_kitti(options.kitti, options.pairs)
+    for name, reader in (("argoverse", "argoverse2"), ("nuscenes", "nuscenes")):
+        if places := getattr(options, name):
+            specs = [f"{reader}:{place}" for place in places]
+            sets[name] = paper_pairs.pairs_of_boxes(specs, options.pairs)
     if options.data or not sets:
         given = options.data or _UNSEEN
-        sets["streets"] = (pair_of_street(spec, key) for spec, keys in given for key in keys)
+        sets["streets"] = (
+            paper_pairs.pair_of_street(spec, key) for spec, keys in given for key in keys
+        )
     methods = bench.DEFAULT_METHODS if options.methods is None else options.methods
     measured = {}
     for name, pairs in sets.items():
@@ -187,7 +193,7 @@ def bench_paper(options: argparse.Namespace) -> Iterator[Answer]:
                 pairs, methods, options.models, options.points, options.curves, progress
             )
         published = bench.PUBLISHED.get(name)
-        text = paper_table(name, measured[name], published)
+        text = paper_table(name, measured[name], published, bench.ONLY_PUBLISHED)
         yield Answer(text + "\n", {"sets": [{"set": name, **measured[name]}]})
     if options.out is not None:
         write_table(options.out, {"sets": measured, "published": bench.PUBLISHED})

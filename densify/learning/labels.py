@@ -23,11 +23,11 @@ from densify.types import Bool, FlowField, KnowsBoxes, LidarSequence, Progress, 
 
 @dataclass(frozen=True)
 class Label:
-    """One sweep's. sure: (N,) which points count. T_next_here: (4,4) from its lidar frame to the
-    next sweep's."""
+    """One sweep's. after: the next one. sure: (N,) which points count. T_next_here: (4,4) from its
+    lidar frame to the next sweep's."""
 
     registered: RegisteredSweep
-    next_frame: int
+    after: RegisteredSweep
     field: FlowField
     sure: Bool
     T_next_here: np.ndarray
@@ -91,7 +91,7 @@ def _label(
         in_world = poses.transform(registered.T_world_lidar, registered.sweep.points)
         sure &= heights.above(in_world) >= settings.flow.min_height_m
     T_next_here = stretch.T_target_source(following[0], frame)
-    return Label(registered, following[0], field, sure, T_next_here)
+    return Label(registered, after, field, sure, T_next_here)
 
 
 def label_path(folder: Path, frame: int, next_frame: int) -> Path:
@@ -103,7 +103,7 @@ def write_label(folder: Path, label: Label, overwrite: bool) -> Path:
     """A flow file with ``valid``, complete or not at all. Raises InputError for one that is there,
     OutputError where it cannot be written."""
     sweep, field = label.registered.sweep, label.field
-    path = label_path(folder, sweep.frame, label.next_frame)
+    path = label_path(folder, sweep.frame, label.after.frame)
     if path.exists() and not overwrite:
         raise InputError(f"{path}: there already, kept; give --overwrite to replace it")
     arrived = poses.transform(label.T_next_here, sweep.points + field.total)
