@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -22,6 +23,7 @@ from densify.geometry.poses import transform
 from densify.learning.labels import label_sweeps
 from densify.readers import open_sequence
 from densify.readers.kitti.files import Calibration
+from densify.readers.nuscenes.annotations import Annotations
 from densify.readers.street import Street
 from densify.readers.waymo.components import BOX_HEADING, BOX_SIZE, STAMP
 from densify.types import Boxes, BoxView, Camera, RegisteredSweep, Sweep
@@ -151,6 +153,10 @@ _CROSSING = Street("crossing", 5, "vlp16", cameras=())
 WRITTEN = {
     "argoverse2": Written(_CROSSING),
     "waymo": Written(_CROSSING),
+    # the first and the last sweep are key frames
+    "nuscenes": Written(
+        Street("crossing", 5, "hdl32", hz=20, cameras=()), frames=(120, 124, 125, 130)
+    ),
     "kitti-tracking": Written(_CROSSING, least_valid=0.15, most_valid=0.25),  # one camera's view
 }
 
@@ -175,13 +181,15 @@ def log(places) -> Path:
 @pytest.mark.parametrize("format", WRITTEN)
 def test_labels_of_a_street_are_its_exact_flow(format, places, tmp_path: Path, capsys) -> None:
     out, place, written = tmp_path / "labels", places(format), WRITTEN[format]
+    num = len(written.frames) - 1
     assert main(["labels", "--data", str(place), "--out", str(out)]) == 0
-    assert "2 sweeps" in capsys.readouterr().out
-    assert [p.name for p in sorted(out.iterdir())] == ["000000_000001.npz", "000001_000002.npz"]
+    assert f"{num} sweeps" in capsys.readouterr().out
+    files = [f"{i:06d}_{i + 1:06d}.npz" for i in range(num)]
+    assert sorted(path.name for path in out.iterdir()) == files
     sequence = open_sequence(str(place))
     found, true_m = [], []
-    for i in range(2):
-        with np.load(out / f"{i:06d}_{i + 1:06d}.npz") as file:
+    for i in range(num):
+        with np.load(out / files[i]) as file:
             found.append(dict(file))
         true_m.append(sequence.truth.displacement(i, i + 1)[found[i]["row"]])
     flow, moving, valid = (
@@ -291,6 +299,76 @@ def refused(place: Path, tmp_path: Path, capsys) -> str:
     error = capsys.readouterr().err
     assert error.count("\n") == 1
     return error
+
+
+# nuScenes
+
+
+def key_box(token: str, x: float, yaw: float = 0.0) -> dict:
+    """4 m long, 2 m wide, 1.5 m high."""
+    return {
+        "instance_token": token,
+        "translation": [x, 5.0, 1.0],
+        "size": [2.0, 4.0, 1.5],
+        "rotation": [np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)],
+    }
+
+
+def annotated(folder: Path, *keys: list[dict]) -> Annotations | None:
+    """Tables of a scene with a key frame every half a second and their boxes."""
+    scene = {"scene_token": "here"}
+    samples = [{"token": f"s{k}", "timestamp": k * 500_000, **scene} for k in range(len(keys))]
+    boxes = [(f"s{k}", box) for k, key in enumerate(keys) for box in key]
+    annotations = [
+        {"token": f"a{i}", "sample_token": sample, "attribute_tokens": [], **box}
+        for i, (sample, box) in enumerate(boxes)
+    ]
+    (folder / "sample.json").write_text(json.dumps(samples))
+    (folder / "sample_annotation.json").write_text(json.dumps(annotations))
+    return Annotations.read(folder, "here")
+
+
+def test_boxes_between_key_frames_go_straight_and_turn_evenly(tmp_path: Path) -> None:
+    """``a`` is in all of them, ``b`` comes, ``c`` goes, ``d`` is in one."""
+    found = annotated(
+        tmp_path,
+        [key_box("a", 0), key_box("c", 3)],
+        [key_box("a", 2), key_box("b", 10), key_box("c", 4), key_box("d", 50)],
+        [key_box("a", 6, np.pi / 2), key_box("b", 15)],
+    )
+    first, second, key = (found.at(ns, np.eye(4)) for ns in (125_000_000, 750_000_000, 500_000_000))
+    assert first.track.tolist() == ["a", "c", "", ""]
+    np.testing.assert_allclose(first.T_lidar_box[:, 0, 3], [0.5, 3.25, 6.25, 50])
+    assert second.track.tolist() == ["a", "b", "", ""]
+    np.testing.assert_allclose(second.T_lidar_box[:, 0, 3], [4, 12.5, 4.5, 50])
+    np.testing.assert_allclose(second.T_lidar_box[0, :2, 0], 2 * [np.sqrt(0.5)])
+    assert key.track.tolist() == ["a", "b", "c", "d"]
+    np.testing.assert_allclose(key.T_lidar_box[:, 0, 3], [2, 10, 4, 50])
+    for boxes_then in (first, second, key):
+        np.testing.assert_array_equal(boxes_then.size_m, 4 * [[4.0, 2.0, 1.5]])
+    assert found.at(-1, np.eye(4)) is None and found.at(1_000_000_001, np.eye(4)) is None
+    assert annotated(tmp_path, [], []) is None
+
+
+def test_damaged_nuscenes_boxes_are_refused(places, tmp_path: Path, capsys) -> None:
+    copy = shutil.copytree(places("nuscenes"), tmp_path / "street")
+    path = copy / "v1.0-mini" / "sample_annotation.json"
+    whole = path.read_bytes()
+    records = json.loads(whole)
+    for change, said in (
+        ({"size": [0, 4, 1.5]}, "a box has no size"),
+        ({"size": [4, 1.5]}, "size: got [4, 1.5], expected 3 finite numbers"),
+        ({"rotation": [1, 1, 0, 0]}, "expected a unit quaternion"),
+        ({"instance_token": records[1]["instance_token"]}, "a second box of the instance"),
+        ({"translation": None}, "translation: got None"),
+    ):
+        path.write_text(json.dumps([{**records[0], **change}, *records[1:]]))
+        error = refused(copy, tmp_path, capsys)
+        assert said in error and "sample_annotation.json" in error
+    path.write_bytes(whole[: len(whole) // 2])
+    assert "not a whole JSON table" in refused(copy, tmp_path, capsys)
+    path.unlink()
+    assert "v1.0-*/sample_annotation.json (nuscenes)" in refused(copy, tmp_path, capsys)
 
 
 # KITTI tracking

@@ -132,6 +132,7 @@ READERS = Table(
             ),
             holds="nuScenes or TruckScenes (a folder that holds v1.0-*/sample_data.json)",
             scenes=True,
+            boxes="v1.0-*/sample_annotation.json",
         ),
         Reader(
             "waymo",

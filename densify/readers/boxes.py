@@ -39,7 +39,7 @@ def checked_boxes(
             f"and height in metres above 0"
         )
     names = np.array(track, np.str_)
-    found, times = np.unique(names, return_counts=True)
+    found, times = np.unique(names[names != ""], return_counts=True)
     if (times > 1).any():
         raise InputError(f"{where}: the box {found[times > 1][0]} is there twice, expected once")
     return Boxes(names, np.reshape(T_lidar_box, (-1, 4, 4)), size_m.reshape(-1, 3), lidar=lidar)

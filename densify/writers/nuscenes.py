@@ -2,6 +2,7 @@
 """Writes a street as a nuScenes tree of one scene with its truth::
 
     OUT/street/v1.0-mini/{scene,sample,sample_data,ego_pose,calibrated_sensor,sensor,log}.json
+    OUT/street/v1.0-mini/{sample_annotation,instance,category}.json    boxes of the key frames
     OUT/street/{samples,sweeps}/{LIDAR_TOP/*.pcd.bin, NAME/*.jpg}
     OUT/street/truth/    as in `densify.readers.truth_files`
 
@@ -24,6 +25,7 @@ from densify.geometry.poses import inverse, transform
 from densify.readers.nuscenes.reader import COLUMN_NS, NUM_RINGS
 from densify.street.patterns import Spinning
 from densify.types import Float, Int, Progress
+from densify.writers.boxes import drawn_boxes
 from densify.writers.excerpt import Excerpt, check_plain_cameras, new_folder, put, quaternion
 
 T_LIDAR_POINTS = np.eye(4)  # x right, y forward
@@ -63,6 +65,8 @@ def write_tree(excerpt: Excerpt, out: Path, overwrite: bool, progress: Progress 
             stamp_ns = last_column_ns(excerpt, frame)
             row_of[frame], data = _sweep(excerpt, frame, stamp_ns)
             put(root / tables.add(_LIDAR, stamp_ns, ".pcd.bin"), data)
+            if tables.records["sample_data"][-1]["is_key_frame"]:
+                tables.annotate(frame)
             stamps_ns.append(stamp_ns)
         for name in excerpt.cameras:
             exposed_ns = street.image_stamps_ns(name)
@@ -114,7 +118,8 @@ class _Tables:
     records: dict[str, list[dict[str, Any]]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        self.records = {"sample_data": [], "ego_pose": [], "calibrated_sensor": [], "sensor": []}
+        names = ("sample_data", "ego_pose", "calibrated_sensor", "sensor", "sample_annotation")
+        self.records = {name: [] for name in names}
         self._add_sensor(_LIDAR, "lidar", T_EGO_LIDAR @ T_LIDAR_POINTS, [])
         for name in self.excerpt.cameras:
             camera = self.excerpt.street.cameras[name]
@@ -167,6 +172,52 @@ class _Tables:
         )
         return str(self.records["sample_data"][-1]["filename"])
 
+    def annotate(self, frame: int) -> None:
+        """The boxes of a key frame, whose record of data is the last one."""
+        sample = self.records["sample_data"][-1]["sample_token"]
+        returns, boxes = self.excerpt.returns(frame), drawn_boxes(self.excerpt, frame)
+        annotations = self.records["sample_annotation"]
+        for instance, T, size_m in zip(
+            boxes.instance, boxes.T_world_box, boxes.size_m, strict=True
+        ):
+            of_instance = _token("instance", str(instance))
+            before = [r for r in annotations if r["instance_token"] == of_instance]
+            token = _token(sample, str(instance))
+            if before:
+                before[-1]["next"] = token
+            length, width, height = size_m.tolist()
+            annotations.append(
+                {
+                    "token": token,
+                    "sample_token": sample,
+                    "instance_token": of_instance,
+                    "visibility_token": "4",
+                    "attribute_tokens": [],
+                    **_pose(T),
+                    "size": [width, length, height],
+                    "prev": before[-1]["token"] if before else "",
+                    "next": "",
+                    "num_lidar_pts": int((returns.instance == instance).sum()),
+                    "num_radar_pts": 0,
+                }
+            )
+
+    def _instances(self) -> list[dict[str, Any]]:
+        """The objects of the annotations."""
+        found: dict[str, list[str]] = {}
+        for record in self.records["sample_annotation"]:
+            found.setdefault(record["instance_token"], []).append(record["token"])
+        return [
+            {
+                "token": instance,
+                "category_token": _CATEGORY["token"],
+                "nbr_annotations": len(tokens),
+                "first_annotation_token": tokens[0],
+                "last_annotation_token": tokens[-1],
+            }
+            for instance, tokens in found.items()
+        ]
+
     def finished(self) -> dict[str, list[dict[str, Any]]]:
         """All tables by name."""
         first_us = last_column_ns(self.excerpt, self.excerpt.frames[0]) // 1000
@@ -196,8 +247,9 @@ class _Tables:
                 for number, token in enumerate(samples)
             ],
             "log": [{"token": scene["log_token"], "logfile": "street", "location": "street"}],
-            **{name: [] for name in ("category", "attribute", "visibility", "instance", "map")},
-            "sample_annotation": [],
+            "category": [_CATEGORY],
+            "instance": self._instances(),
+            **{name: [] for name in ("attribute", "visibility", "map")},
         }
 
 
@@ -207,3 +259,6 @@ def _pose(T: Float) -> dict[str, list[float]]:
 
 def _token(kind: str, name: str) -> str:
     return hashlib.md5(f"{kind} {name}".encode(), usedforsecurity=False).hexdigest()
+
+
+_CATEGORY = {"token": _token("category", "vehicle.car"), "name": "vehicle.car", "description": ""}

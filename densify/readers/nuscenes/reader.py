@@ -3,6 +3,7 @@
 without its devkit::
 
     ROOT/v1.0-trainval/{scene,sample,sample_data,ego_pose,calibrated_sensor,sensor}.json
+    ROOT/v1.0-trainval/sample_annotation.json    optional: tracked boxes, see `.annotations`
     ROOT/samples/LIDAR_TOP/*.pcd.bin, ROOT/sweeps/LIDAR_TOP/*.pcd.bin    key frames, and the others
     ROOT/samples/CAM_FRONT/*.jpg ...
 

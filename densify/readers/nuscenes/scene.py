@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from os.path import isfile
 from pathlib import Path
 
@@ -16,9 +17,10 @@ from densify.errors import InputError
 from densify.files.content import read_bytes
 from densify.geometry.poses import inverse
 from densify.readers.file_sequence import FileSequence, quaternion_pose, truth_beside
+from densify.readers.nuscenes.annotations import Annotations
 from densify.readers.nuscenes.tables import Record, find_records, read_table
 from densify.readers.pose_track import PoseTrack
-from densify.types import Camera, Float
+from densify.types import Boxes, Camera, Float
 
 _LIDARS, _CAMERAS = "lidar", "camera"
 
@@ -41,11 +43,12 @@ class Channel:
 
 @dataclass(frozen=True)
 class Scene:
-    """What the tables tell. root: of the files. lidars, cameras: by channel, sorted. track: of the
-    vehicle."""
+    """What the tables tell. tables: their folder. token: of the scene. lidars, cameras: by channel,
+    sorted. track: of the vehicle."""
 
     name: str
-    root: Path
+    tables: Path
+    token: str
     lidars: Mapping[str, Channel]
     cameras: Mapping[str, Channel]
     track: PoseTrack
@@ -57,7 +60,12 @@ class Scene:
         channels, track = _read_scene(tables, token, name)
         if not channels[_LIDARS]:
             raise InputError(f"{tables / 'sample_data.json'}: no lidar data of {name}")
-        return Scene(name, tables.parent, channels[_LIDARS], channels[_CAMERAS], track)
+        return Scene(name, tables, token, channels[_LIDARS], channels[_CAMERAS], track)
+
+    @property
+    def root(self) -> Path:
+        """The folder that file names start from."""
+        return self.tables.parent
 
 
 class SceneSequence(FileSequence):
@@ -112,6 +120,18 @@ class SceneSequence(FileSequence):
 
     def _pose(self, frame: int) -> Float:
         return self._scene.track.at(self._lidar.stamps_ns[frame]) @ self._T_ego_frame
+
+    def boxes(self, frame: int) -> Boxes | None:
+        """See `densify.types.KnowsBoxes`; the test split has none. Raises InputError for a table
+        that is malformed."""
+        self.check_frame(frame)
+        if self._annotations is None:
+            return None
+        return self._annotations.at(self._lidar.stamps_ns[frame], inverse(self._pose(frame)))
+
+    @cached_property
+    def _annotations(self) -> Annotations | None:
+        return Annotations.read(self._scene.tables, self._scene.token)
 
     def T_world_cam(self, camera: str, number: int) -> Float:
         """(4,4) of the image's own pose of the vehicle."""
