@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -125,6 +127,27 @@ def test_a_turning_truck(truck):
 
 def test_no_part_of_a_turning_truck_goes_its_own_way(truck):
     assert np.quantile(truck.errors_m(1), 0.9) < 0.08
+
+
+def test_the_trailer_of_a_turning_truck_is_found():
+    """Its long side slides along itself: nothing but the tractor tells how fast."""
+    tractor, lag_rad, wheelbase_m = Arc(20, 1.0, np.pi * 0.75, 4.0, 0.4), 0.45, 9.0
+    at_key_s = KEY * SWEEP_S
+    x, y, yaw = tractor.at(at_key_s)
+    kingpin = np.array([x - 1.5 * np.cos(yaw), y - 1.5 * np.sin(yaw)])
+    speed_m_s = tractor.speed_m_s * np.cos(lag_rad)
+    turn_rad_s = tractor.speed_m_s * np.sin(lag_rad) / wheelbase_m
+    yaw -= lag_rad
+    begin = Arc(0.0, 0.0, yaw - turn_rad_s * at_key_s, speed_m_s, turn_rad_s)
+    x, y = kingpin - 5.5 * np.array([np.cos(yaw), np.sin(yaw)]) - begin.at(at_key_s)[:2]
+    trailer = replace(begin, x=x, y=y)
+    boxes = [Box((5.5, 2.5, 3.2), tractor, 0.5, 1), Box((10.5, 2.5, 3.0), trailer, 0.9, 2)]
+    found = Found.of(boxes, Arc(0, -1.5, 0, 2.0), 5, Scanner(64, 1800, (-24.8, 2.0), 0.01))
+    assert found.share_moving(1) > 0.9
+    assert found.share_moving(2) > 0.7
+    assert np.median(found.errors_m(2)) < 0.05
+    assert np.quantile(found.errors_m(2), 0.9) < 0.1
+    assert found.false_share() < 1e-3
 
 
 def test_cars_in_a_row_keep_their_own_motion():

@@ -149,9 +149,9 @@ def lengthen(
     space: FreeSpace,
 ) -> None:
     """Give the tracks what goes on ahead of and behind their points without a hole, as wide and as
-    high as they are: nobody sees through the middle of a long side that slides along itself. No
-    other sweep may see through the points where they would be carried to, and what is fast must
-    leave their places. Who walks has no long side, but there may be a wall beside him."""
+    high as they are: nobody sees through the middle of a long side that slides along itself. Only
+    as far as no other sweep sees through the points where they would be carried to; and what is
+    fast must leave their places. Who walks has no long side, but there may be a wall beside him."""
     for k, track in enumerate(tracks):
         mine = np.flatnonzero(instance == k)
         if not len(mine) or _speed_m_s(track, i, space.clock) <= _WALKS_M_S:
@@ -172,12 +172,10 @@ def lengthen(
         fits &= at_once[:, 2] < rim[:, 2].max() + _SIDE_M
         own = track.carry(seen.points[mine], seen.time_s[mine], at_s)[:, :2] @ ahead
         rows, along = rows[fits], along[fits, 0]
-        rows = rows[_without_hole(along, own)]
-        if (
-            len(rows)
-            and _contradicted(track, seen, rows, i, space) <= _MAX_CONTRADICTED
-            and _leaves(track, seen, mine, rows, i, standing, space.clock)
-        ):
+        linked = _without_hole(along, own)
+        rows, along = rows[linked], along[linked] - np.median(own)
+        rows = rows[_uncontradicted(track, seen, rows, along, i, space)]
+        if len(rows) and _leaves(track, seen, mine, rows, i, standing, space.clock):
             instance[rows] = k
 
 
@@ -190,18 +188,30 @@ def _without_hole(along: Float, own: Float) -> Bool:
     return np.isin(run[: len(along)], run[len(along) :])
 
 
-def _contradicted(
-    track: Track, seen: Seen, rows: NDArray[np.int64], i: int, space: FreeSpace
-) -> float:
-    """The largest share of the points, moved with the track, that another sweep sees through."""
-    shares = [0.0]
+def _uncontradicted(
+    track: Track, seen: Seen, rows: NDArray[np.int64], along: Float, i: int, space: FreeSpace
+) -> Bool:
+    """(N,) those of the points from the middle of the object outwards, ahead and behind, up to
+    where another sweep sees through too many of them when they are moved with the track.
+
+    along: (N,) metres ahead of the middle.
+    """
+    step = np.floor(np.abs(along) / _LONGEST_HOLE_M).astype(np.int64)
+    behind = along < 0
+    num_steps = int(step.max(initial=0)) + 1
+    step += num_steps * behind  # those ahead, then those behind
+    size = np.bincount(step, minlength=2 * num_steps).reshape(2, num_steps).cumsum(axis=1)
+    ends = np.zeros((2, num_steps), bool)
     body = track.undo(seen.points[rows], seen.time_s[rows])
     for j in space.others(i):
         at_s = space.clock.time_s[j]
         carried = track.place(body, at_s)
         velocity_m_s = track.velocity_m_s(carried, at_s)
-        shares.append(float(space.seen_through(carried, j, velocity_m_s).mean()))
-    return max(shares)
+        through = step[space.seen_through(carried, j, velocity_m_s)]
+        looks = np.bincount(through, minlength=2 * num_steps).reshape(2, num_steps).cumsum(axis=1)
+        ends |= looks > _MAX_CONTRADICTED * size
+    kept: Bool = ~np.logical_or.accumulate(ends, axis=1).ravel()[step]
+    return kept
 
 
 def _leaves(

@@ -8,7 +8,7 @@ model, is smoothed in time, and counts only if that smooth motion explains what 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -25,6 +25,7 @@ from densify.flow.tracking.sightings import Track
 from densify.flow.tracking.vote import DistanceField, vote
 from densify.geometry.height_map import HeightMap
 from densify.kernels.clouds import rows_inside
+from densify.kernels.nearest import BoxTree
 from densify.types import Bool, Float
 
 _MIN_POINTS = 8
@@ -44,6 +45,8 @@ _ROUGH_M, _ROUGH_PER_GAP, _ROUGH_S = 0.04, 0.2, 0.003  # by gap of rings, by spe
 _LEAST_WAY_M, _LEAST_WAY_PER_RESIDUAL = 0.35, 8.0
 _NUM_ASKED = 60
 _MISSES_ALLOWED, _MISSED_S = 1, 0.2  # either: a track ends when both are exceeded
+_BESIDE_M = 1.0  # as far as what is towed is from what tows it
+_MAX_CONTRADICTED_PARTS = 0.05  # of the points of a part of an object
 _LEAST_STATES, _LEAST_S = 3, 0.15
 _MAX_CONTRADICTIONS = 0.3  # of those that standing still leaves
 
@@ -64,7 +67,8 @@ def follow_groups(
         fields = [DistanceField.of(c.points[c.candidate]) for c in seen]
     free = [np.ones(len(c.points), bool) for c in standing]  # not yet part of a track
     untried = [np.ones(len(c.points), bool) for c in standing]
-    tracks = []
+    tracks: list[Track] = []
+    bodies: list[tuple[Track, Float]] = []
     for n, group in _groups_to_start(seen, clock):
         members = group[looks[n].gather(free)[group] & looks[n].gather(untried)[group]]
         if len(members) < _MIN_POINTS:
@@ -76,8 +80,11 @@ def follow_groups(
         radial = seen[n].radial
         if radial is not None:
             velocity = radial.rows(members).corrected(velocity)
-        track = _follow(members, n, velocity, looks, free, ground, clock)
-        proven = _prove(track, standing, space)
+        for start in (velocity, *_velocities_beside(looks[n], members, bodies, space)):
+            track = _follow(members, n, start, looks, free, ground, clock)
+            proven = _prove(track, standing, space)
+            if proven:
+                break
         if proven:
             _gather(track, standing, free, space)
             _refine(track, standing, ground)
@@ -88,6 +95,7 @@ def follow_groups(
                 free[j][rows] = False
         if proven:
             tracks.append(track)
+            bodies.append((track, track.seen_in(standing, sorted(track.claimed))))
     return tracks
 
 
@@ -107,6 +115,35 @@ def _groups_to_start(standing: Sequence[Standing], clock: Clock) -> list[tuple[i
         good = np.flatnonzero((size >= _MIN_POINTS) & (seeds >= _MIN_SEED_SHARE * size))
         groups += [(i, np.flatnonzero(c.cluster == k)) for k in good]
     return sorted(groups, key=worth, reverse=True)
+
+
+def _velocities_beside(
+    look: Look, members: np.ndarray, bodies: Sequence[tuple[Track, Float]], space: FreeSpace
+) -> Iterator[Float]:
+    """The velocities (3,) that proven tracks close to a group have there, where the group cannot be
+    a part of them: of what tows it, say. Little else tells how fast a long side slides.
+
+    bodies: the tracks with all their points.
+    """
+    c = look.seen
+    tree, middle = BoxTree(c.points[members]), c.points[members].mean(0, keepdims=True)
+    for track, points in bodies:
+        at_s = track.seen_at(look.time_ns)
+        if not np.isfinite(tree.nearest(track.place(points, at_s), _BESIDE_M)[0]).any():
+            continue
+        body = track.undo(c.points[members], c.time_s[members])
+        if _contradicted(track, body, space) > _MAX_CONTRADICTED_PARTS:
+            yield track.velocity_m_s(middle, at_s)[0]
+
+
+def _contradicted(track: Track, body: Float, space: FreeSpace) -> float:
+    """The largest share that a sweep sees through of (N,3) points in the track's frame."""
+    shares = []
+    for j, at_s in enumerate(space.clock.time_s):
+        carried = track.place(body, at_s)
+        velocity_m_s = track.velocity_m_s(carried, at_s)
+        shares.append(float(space.seen_through(carried, j, velocity_m_s).mean()))
+    return max(shares)
 
 
 def _follow(
