@@ -125,7 +125,7 @@ class _Shared:
         visible = method.visible and key.settings.project.visibility
         far = self.far.get(method.visible) if method.far else None
         with watch.stage("project"):
-            seen = views.see(moment.cloud).joined(far)
+            seen = views.see(moment.cloud, visible).joined(far)
         with watch.stage("held out"):
             held_out = self.held_out.scores(seen, visible)
         with watch.stage("project"):
@@ -133,7 +133,8 @@ class _Shared:
             if output.movers == "separate":
                 movers = views.movers(moment.cloud, visible, images)
             if output.movers != "keep":
-                seen = views.see(moment.cloud.select(~moment.cloud.moving)).joined(far)
+                standing = moment.cloud.select(~moment.cloud.moving)
+                seen = views.see(standing, visible).joined(far)
             depth = self._depth(seen, visible)
         cloud = seen.cloud
         if key.with_images:

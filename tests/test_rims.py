@@ -14,7 +14,7 @@ from densify.config import ProjectSettings
 from densify.depth.layers import Layers
 from densify.depth.picture import lab, laid_over
 from densify.depth.rims import decide, shares
-from densify.depth.votes import RULES
+from densify.depth.votes import RULES, Canvass, elected
 from densify.kernels import voting
 from densify.kernels.marching import DIRECTIONS, first_known
 from tests.small_street import KEY, POSES_GIVEN, one_car
@@ -211,7 +211,7 @@ def test_a_mirrored_scene_has_mirrored_votes():
     np.testing.assert_allclose(share[0], share[1][:, ::-1], atol=1e-4)
 
 
-def vote_twin(pixel, inverse, known, seeds, colours, gap_px, rules):
+def vote_twin(pixel, inverse, known, seeds, weight, colours, gap_px, rules):
     """One pixel, one direction, one step at a time."""
     height, width = gap_px.shape
     v, u = divmod(pixel, width)
@@ -238,37 +238,58 @@ def vote_twin(pixel, inverse, known, seeds, colours, gap_px, rules):
                     there = seeds.inverse[v + dv, u + du]
                     here = there - seeds.tilt[v + dv, u + du] @ (du, dv)
                     here = min(max(here, 0.7 * there), 1.4 * there)
-                    weight = seeds.weight[v + dv, u + du] / (1 + step / (rules.decay * gap))
-                    weight *= np.exp(-change / (2 * rules.colours**2)) + rules.through
-                    votes += weight
+                    vote = weight[v + dv, u + du] / (1 + step / (rules.decay * gap))
+                    vote *= np.exp(-change / (2 * rules.colours**2)) + rules.through
+                    votes += vote
                     near = abs(1 / here - 1 / inverse)
-                    votes_for += weight * (near <= rules.same_m + rules.same_fraction / inverse)
+                    votes_for += vote * (near <= rules.same_m + rules.same_fraction / inverse)
                     break
         least = min(least, votes_for / votes if votes else 0.0)
     return least
 
 
-@pytest.mark.parametrize("doubt", [0.0, RULES.doubt])
-def test_votes_equal_those_of_a_slow_twin(doubt):
+def vote_scene():
+    """Seeds, the weights of their votes, an image and gaps; pixels and their inverse depth."""
     rng = np.random.default_rng(3)
     shape = (24, 30)
     known = rng.uniform(size=shape) < 0.2
     inverse = np.where(known, rng.choice([0.05, 0.052, 0.1], shape), 0).astype(np.float32)
     tilt = rng.normal(0, 0.001, (*shape, 2)).astype(np.float32)
     weight = rng.uniform(0.2, 1, shape).astype(np.float32)
-    seeds = voting.Seeds(first_known(known), DIRECTIONS, inverse, tilt, weight)
+    seeds = voting.Seeds(first_known(known), DIRECTIONS, inverse, tilt)
     colours = (50 + np.cumsum(rng.normal(0, 1, (*shape, 3)), axis=1)).astype(np.float32)
     gap_px = rng.uniform(1, 3, shape).astype(np.float32)
+    layers = Layers(
+        *(inverse, inverse, known, known, inverse, inverse, np.zeros(shape, np.int32), tilt),
+        *(np.repeat(gap_px[..., None], 2, axis=2), colours),
+    )
     pixel = np.concatenate([np.flatnonzero(known), np.flatnonzero(~known)[::5]])
     here = np.where(known.flat[pixel], inverse.flat[pixel], np.float32(0.05)).astype(np.float32)
-    share, rules = np.zeros(len(pixel), np.float32), RULES._replace(doubt=doubt)
-    voting.vote(0, len(pixel), pixel, here, seeds, colours, gap_px, rules, share)
-    twin = [
-        vote_twin(p, w, known, seeds, colours, gap_px, rules)
-        for p, w in zip(pixel, here, strict=True)
-    ]
-    np.testing.assert_allclose(share, twin, rtol=1e-4)
+    return layers, seeds, weight, pixel, here
+
+
+def twins(layers, seeds, weight, pixel, here, rules):
+    known = seeds.inverse > 0
+    rest = (known, seeds, weight, layers.lab, layers.gap_px, rules)
+    return np.array([vote_twin(p, w, *rest) for p, w in zip(pixel, here, strict=True)])
+
+
+def test_votes_equal_those_of_a_slow_twin():
+    layers, seeds, weight, pixel, here = vote_scene()
+    share = Canvass(layers, seeds, pixel, 1 / here).shares(weight)
+    np.testing.assert_allclose(share, twins(*vote_scene(), RULES), rtol=1e-4)
     assert np.ptp(share) > 0.5
+
+
+@pytest.mark.parametrize("least", [0.5, 0.8, 0.9])
+def test_elections_stop_early_without_another_outcome(least):
+    layers, seeds, weight, pixel, here = vote_scene()
+    rules = RULES._replace(doubt=0.0, aside=0.0)
+    share = twins(layers, seeds, np.ones_like(weight), pixel, here, rules)
+    made = elected(layers, seeds, pixel, 1 / here, least)
+    told = abs(share - least) > 1e-4
+    assert np.array_equal(made[told], (share >= least)[told])
+    assert 0.05 < made.mean() < 0.95 and told.mean() > 0.95
 
 
 def test_the_run_says_that_an_image_does_not_fit():

@@ -12,13 +12,12 @@ import numpy as np
 
 from densify.config import ProjectSettings
 from densify.depth.layers import Layers
-from densify.depth.votes import RULES, shares, voters
+from densify.depth.votes import elected, voters
 from densify.kernels import filling
 from densify.types import Float32
 
 _GROWTH = (1 / 3, 2 / 3, 1.0)  # spacings
 _LEAST_SHARE = 0.9  # of the votes for a pixel that is kept
-_RULES = RULES._replace(doubt=0.0, aside=0.0)
 
 
 def fill(layers: Layers, settings: ProjectSettings) -> Layers:
@@ -45,7 +44,7 @@ def voted(layers: Layers, before_m: Float32, least_share: float) -> Layers:
     """
     pixel = np.flatnonzero((layers.filled_m > 0) & (before_m == 0))
     depth_m, seeds = layers.filled_m.flat[pixel], voters(layers, layers.depth_m)
-    dropped = pixel[shares(layers, seeds, pixel, depth_m, _RULES) < least_share]
+    dropped = pixel[~elected(layers, seeds, pixel, depth_m, least_share)]
     filled_m, confidence = layers.filled_m.copy(), layers.confidence.copy()
     filled_m.flat[dropped] = 0
     confidence.flat[dropped] = 0
@@ -82,11 +81,15 @@ def fill_between(
     edge = np.array([edge_m, edge_fraction])
     reaches = np.array([*(min(reach, 1.0) * step for step in _GROWTH), *([reach] * (reach > 1))])
     measured = depth_m > 0
-    before = np.zeros((len(depth_m), depth_m.shape[1] + 1), np.int32)
-    before[:, 1:] = np.cumsum(measured.ravel()).reshape(depth_m.shape)
-    before[1:, 0] = before[:-1, -1]
+    height, width = depth_m.shape
+    before = np.zeros((height, width + 1), np.int32)
+    np.cumsum(measured, axis=1, dtype=np.int32, out=before[:, 1:])
+    num = np.zeros((height + 1, width + 1), np.int32)
+    np.cumsum(before, axis=0, out=num[1:])
+    before += num[:-1, -1:]
     known = filling.Known(
         before=before,
+        num=num,
         column=np.nonzero(measured)[1].astype(np.int32),
         inverse=1 / depth_m[measured].astype(np.float64),
         confidence=confidence[measured],

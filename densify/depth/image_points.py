@@ -68,7 +68,10 @@ class _Local(NamedTuple):
 def in_image(cloud: Cloud, view: InView, patches: Patches, vetoed: bool) -> PointsInImage:
     """The points of ``cloud`` that are in the ``view``. vetoed: without those that the key sweep
     saw through."""
-    kept = ~patches.free[view.rows] if vetoed else np.ones(len(view.rows), bool)
+    row = np.rint(view.uv[:, 1]).astype(np.uint16)
+    kept = np.argsort(row, kind="stable")
+    if vetoed:
+        kept = kept[~patches.free[view.rows[kept]]]
     exposure, index, points_cam = view.exposure, view.rows[kept], view.points_cam[kept]
     depth = exposure.depth_m(points_cam).astype(np.float32)
     normal = rotate(exposure.T_cam_key, patches.normal[index].astype(np.float64))

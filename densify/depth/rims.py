@@ -9,10 +9,9 @@ from dataclasses import replace
 import numpy as np
 
 from densify.config import ProjectSettings
-from densify.depth import votes
 from densify.depth.layers import Layers
 from densify.depth.picture import laid_over
-from densify.depth.votes import voters
+from densify.depth.votes import Canvass, voters
 from densify.types import Float32, Int
 
 MOST_CONFIDENCE = 0.2
@@ -87,10 +86,11 @@ def decide(layers: Layers, settings: ProjectSettings) -> Layers:
 def shares(layers: Layers, rims: Int) -> Float32:
     """(R,) share of the votes for each of the pixels ``rims`` (R,)."""
     seeds = voters(layers, np.maximum(layers.depth_m, layers.rim_m))
-    share = np.ones(len(rims), np.float32)
+    canvass = Canvass(layers, seeds, rims, layers.rim_m.flat[rims])
+    share, weight = np.ones(len(rims), np.float32), np.ones_like(layers.depth_m)
     for _ in range(_NUM_ROUNDS):
-        seeds.weight.flat[rims] = _RIM_WEIGHT * share**2
-        share = votes.shares(layers, seeds, rims, layers.rim_m.flat[rims], votes.RULES)
+        weight.flat[rims] = _RIM_WEIGHT * share**2
+        share = canvass.shares(weight)
     return share
 
 

@@ -136,8 +136,9 @@ def _found(
     settings: ProjectSettings,
     taken: Int | None,
 ) -> tuple[Int, Int, Float32]:
-    """The pixels (P,) with points but those ``taken``, which point comes first in each (P,), and
-    what `densify.kernels.visibility.settle` finds around it, (6,P)."""
+    """The pixels (P,) with points, which point comes first in each (P,), and what
+    `densify.kernels.visibility.settle` finds around it, (6,P). taken: where given, neither these
+    nor those with hidden points alone."""
     last = int(points.age_ns.max(initial=0)) + 1
     late = points.age_ns > kernels.NOW_NS
     rank = np.where(hidden, last + late, points.age_ns)
@@ -145,19 +146,22 @@ def _found(
     found = np.zeros((6, len(start) - 1), np.float32)
     done = np.zeros(len(start) - 1, bool)
     if taken is not None:
+        some = np.flatnonzero(np.diff(start))
+        done[some[hidden[order[start[some]]]]] = True
         done[taken] = True
+    inverse = points.inverse
+    edge_px = settings.edge_slack_m * points.focal_px[:, 0] * inverse
     visible = kernels.Visible(
         start=start,
-        order=order,
-        uv=points.uv,
-        inverse=points.inverse,
-        slope=points.slope,
-        spacing_px=points.spacing_px,
-        edge_px=settings.edge_slack_m * points.focal_px[:, 0] * points.inverse,
-        sweep=points.sweep,
-        hidden=hidden,
-        moving=points.moving,
-        age_ns=points.age_ns,
+        uv=points.uv[order],
+        inverse=inverse[order],
+        slope=points.slope[order],
+        spacing_px=points.spacing_px[order],
+        edge_px=edge_px[order],
+        sweep=points.sweep[order],
+        hidden=hidden[order],
+        moving=points.moving[order],
+        age_ns=points.age_ns[order],
     )
     shape = (camera.height_px, camera.width_px)
     kernels.settle.over_rows(len(done), visible, _reaches(settings), shape, done, found)
@@ -191,11 +195,14 @@ def _behind(
     nearest = np.zeros((camera.height_px, camera.width_px), np.float32)
     kernels.paint(points.uv[who], points.inverse[who], points.slope[who], half_px[who], nearest)
     column, row = np.rint(points.uv).astype(np.int64).T
-    with np.errstate(divide="ignore"):
-        occluder = 1 / nearest[row, column].astype(np.float64)
-    allowed = settings.hidden_m + settings.hidden_fraction * occluder
+    occluder = nearest[row, column].astype(np.float64)
+    covered = occluder > 0
+    np.divide(1, occluder, out=occluder, where=covered)
+    off = np.where(covered, points.depth - occluder, 0.0)
     with np.errstate(divide="ignore", invalid="ignore"):
-        return np.nan_to_num((points.depth - occluder) / allowed, posinf=np.inf)
+        return np.nan_to_num(
+            off / (settings.hidden_m + settings.hidden_fraction * occluder), posinf=np.inf
+        )
 
 
 def _by_pixel(points: PointsInImage, rank: Int, own: Float32, camera: Camera) -> tuple[Int, Int]:

@@ -40,12 +40,12 @@ def measure_spots(layers: Layers, points: PointsInImage, settings: ProjectSettin
     middle = np.stack(np.divmod(measured, shape[1])[::-1], axis=1)
     known.middle_px.reshape(-1, 2)[measured] = points.uv[point] - middle
     known.radius_px.flat[measured] = radius_px
-    pixel = np.flatnonzero((layers.filled_m > 0) & (layers.depth_m == 0))
-    found, agree = np.full(len(pixel), -1), np.array([settings.agree_m, settings.agree_fraction])
-    # A spot's middle lies in its pixel: half a pixel from that pixel's, at most.
-    reach = int(radius_px.max() + 0.5)
-    spots.nearest_over.over_rows(len(pixel), pixel, layers.filled_m, known, reach, agree, found)
-    covered, by = pixel[found >= 0], found[found >= 0]
+    open_m = np.where(layers.depth_m == 0, layers.filled_m, np.float32(0))
+    found, agree = np.full(shape, -1), np.array([settings.agree_m, settings.agree_fraction])
+    nearest = np.full(shape, np.inf)
+    spots.cover(measured, open_m, known, agree, found, nearest)
+    covered = np.flatnonzero(found >= 0)
+    by = found.flat[covered]
     depth_m, of_point = layers.depth_m.copy(), layers.point.copy()
     depth_m.flat[covered] = layers.filled_m.flat[covered]
     of_point.flat[covered] = layers.point.flat[by]

@@ -118,21 +118,21 @@ class Views:
             pictures,
         )
 
-    def see(self, cloud: Cloud) -> SeenCloud:
-        """A cloud as the cameras see it."""
-        surface = patches(
-            cloud, self.key, self.settings, self.sensors, self.origins, self.key_image
-        )
+    def see(self, cloud: Cloud, visible: bool = True) -> SeenCloud:
+        """A cloud as the cameras see it. visible: and which of it the key sweep saw through."""
+        key_image = self.key_image if visible else None
+        surface = patches(cloud, self.key, self.settings, self.sensors, self.origins, key_image)
         return SeenCloud(cloud, surface, {n: e.sees(cloud) for n, e in self.exposures.items()})
 
     def far(
         self, found: Standing, T_key_found: Float, stretch: Stretch, standing_only: bool
     ) -> SeenCloud:
-        """What sweeps beyond the window measured, see `densify.depth.far.far_cloud`."""
+        """What sweeps beyond the window measured, see `densify.depth.far.far_cloud`;
+        standing_only: for maps with visibility."""
         cloud, surface, views = far_cloud(
             found, T_key_found, stretch, self.key, self.exposures, standing_only
         )
-        if self.key_image is not None:
+        if self.key_image is not None and standing_only:
             free = vetoed(cloud.points, cloud.velocity_m_s, self.key_image, self.settings)
             surface = replace(surface, free=free)
         return SeenCloud(cloud, surface, views)
@@ -216,7 +216,7 @@ class Views:
         instances = np.unique(cloud.instance[cloud.moving])
         movers = {}
         for instance in instances.tolist():
-            part = self.see(cloud.select(cloud.moving & (cloud.instance == instance)))
+            part = self.see(cloud.select(cloud.moving & (cloud.instance == instance)), visible)
             depth = self.depth(part, visible)
             movers[instance] = Mover(self.coloured(part, depth, images), depth)
         return movers

@@ -14,7 +14,7 @@ import numpy as np
 from densify.depth.layers import Layers
 from densify.kernels import voting
 from densify.kernels.marching import DIRECTIONS, first_known
-from densify.types import Float32, Int
+from densify.types import Bool, Float32, Int
 
 RULES = voting.Rules(
     reach=6.0,
@@ -29,20 +29,47 @@ RULES = voting.Rules(
 
 
 def voters(layers: Layers, known_m: Float32) -> voting.Seeds:
-    """The pixels of ``known_m`` (H,W), 0 none, each with a whole vote."""
+    """The pixels of ``known_m`` (H,W), 0 none."""
     inverse = np.divide(1, known_m, out=np.zeros_like(known_m), where=known_m > 0)
-    steps = first_known(known_m > 0)
-    return voting.Seeds(steps, DIRECTIONS, inverse, layers.tilt, np.ones_like(inverse))
+    return voting.Seeds(first_known(known_m > 0), DIRECTIONS, inverse, layers.tilt)
 
 
-def shares(
-    layers: Layers, seeds: voting.Seeds, pixel: Int, depth_m: Float32, rules: voting.Rules
-) -> Float32:
-    """(P,) share of the votes for ``depth_m`` (P,) of the pixels ``pixel`` (P,). Without an image
-    that fits the seeds tell by distance alone."""
-    lab = layers.lab
-    if lab is None:
-        lab = np.zeros((*layers.depth_m.shape, 3), np.float32)
-    share = np.ones(len(pixel), np.float32)
-    voting.vote.over_rows(len(pixel), pixel, 1 / depth_m, seeds, lab, layers.gap_px, rules, share)
-    return share
+class Canvass:
+    """Who votes for the depths of pixels, so that votes can be counted again once they weigh
+    less."""
+
+    def __init__(self, layers: Layers, seeds: voting.Seeds, pixel: Int, depth_m: Float32) -> None:
+        """depth_m: (P,) of the pixels ``pixel`` (P,)."""
+        num, sides = len(pixel), (len(pixel), len(DIRECTIONS))
+        self._seed, self._agrees = np.zeros(sides, np.int32), np.zeros(sides, bool)
+        self._tie = np.zeros((num, voting.NUM_PLACES, len(DIRECTIONS)), np.float32)
+        voting.canvass.over_rows(
+            *(num, pixel, 1 / depth_m, seeds, _image(layers), layers.gap_px, RULES),
+            *(self._seed, self._agrees, self._tie),
+        )
+
+    def shares(self, weight: Float32) -> Float32:
+        """(P,) share of the votes for each pixel. weight: (H,W) of each seed's vote."""
+        share = np.ones(len(self._seed), np.float32)
+        voting.count.over_rows(
+            *(len(share), self._seed, self._agrees, self._tie, weight.ravel(), RULES.doubt, share)
+        )
+        return share
+
+
+def elected(
+    layers: Layers, seeds: voting.Seeds, pixel: Int, depth_m: Float32, share: float
+) -> Bool:
+    """(P,) whether ``share`` of the votes, or more, is for ``depth_m`` (P,) of the pixels ``pixel``
+    (P,), without doubt and with the image in its place."""
+    found = np.zeros(len(pixel), bool)
+    voting.elect.over_rows(
+        *(len(pixel), pixel, 1 / depth_m, seeds, _image(layers), layers.gap_px, RULES),
+        *(share, found),
+    )
+    return found
+
+
+def _image(layers: Layers) -> Float32:
+    """Without an image that fits the seeds tell by distance alone."""
+    return np.zeros((*layers.depth_m.shape, 3), np.float32) if layers.lab is None else layers.lab

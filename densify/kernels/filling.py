@@ -18,28 +18,53 @@ _MOST_PX = 60  # half a window's size: thin rays are not bridged at any price
 
 class Known(NamedTuple):
     """The measured pixels row by row, of which those of row r left of column c are before
-    ``before[r, c]``. before: (H,W+1) int32. column: (K,) int32. inverse: (K,) float64, 1/m.
+    ``before[r, c]``. before: (H,W+1) int32. num: (H+1,W+1) int32, of those above and to the left of
+    a pixel's corner. column: (K,) int32. inverse: (K,) float64, 1/m.
     confidence: (K,) float32."""
 
     before: NDArray[np.int32]
+    num: NDArray[np.int32]
     column: NDArray[np.int32]
     inverse: Float
     confidence: Float32
 
 
 @inlined
-def _sides(known, top, bottom, left, right, row, column):  # type: ignore[no-untyped-def]
-    """Bits for measured pixels to the left, to the right, above and below; the greatest and the
-    least inverse depth, how many pixels, and the least confidence."""
-    sides, num, near, far, least = 0, 0, 0.0, np.inf, np.float32(np.inf)
+def _any(num, top, bottom, left, right):  # type: ignore[no-untyped-def]
+    return num[bottom, right] - num[top, right] - num[bottom, left] + num[top, left] > 0
+
+
+@inlined
+def _all_round(num, top, bottom, left, right, row, column):  # type: ignore[no-untyped-def]
+    """Are there measured pixels to the left, to the right, above and below?"""
+    return (
+        _any(num, top, bottom, left, column)
+        and _any(num, top, bottom, column + 1, right)
+        and _any(num, top, row, left, right)
+        and _any(num, row + 1, bottom, left, right)
+    )
+
+
+@inlined
+def _extremes(known, top, bottom, left, right):  # type: ignore[no-untyped-def]
+    """The greatest and the least inverse depth, and how many pixels."""
+    num, near, far = 0, 0.0, np.inf
+    for r in range(top, bottom):
+        start, end = known.before[r, left], known.before[r, right]
+        num += end - start
+        for there in known.inverse[start:end]:
+            near, far = max(near, there), min(far, there)
+    return num, near, far
+
+
+@inlined
+def _least(known, top, bottom, left, right):  # type: ignore[no-untyped-def]
+    """The least confidence."""
+    least = np.float32(np.inf)
     for r in range(top, bottom):
         for k in range(known.before[r, left], known.before[r, right]):
-            c, there = known.column[k], known.inverse[k]
-            num += 1
-            near, far = max(near, there), min(far, there)
             least = min(least, known.confidence[k])
-            sides |= (c < column) + 2 * (c > column) + 4 * (r < row) + 8 * (r > row)
-    return sides, near, far, num, least
+    return least
 
 
 @inlined
@@ -110,9 +135,9 @@ def between(first, last, known, spacing_px, reaches, edge, filled_m, confidence,
             before_u, before_v = reach_u, reach_v
             top, bottom = max(row - reach_v, 0), min(row + reach_v + 1, height)
             left, right = max(column - reach_u, 0), min(column + reach_u + 1, width)
-            sides, near, far, num, least = _sides(known, top, bottom, left, right, row, column)
-            if sides != 15:
+            if not _all_round(known.num, top, bottom, left, right, row, column):
                 continue
+            num, near, far = _extremes(known, top, bottom, left, right)
             centre, slope_u, slope_v = _plane(
                 known, top, bottom, left, right, row, column, reach_u, reach_v
             )
@@ -126,6 +151,6 @@ def between(first, last, known, spacing_px, reaches, edge, filled_m, confidence,
                 spread_m = spread / (centre * centre)
             if spread_m <= allowed and centre > 0:
                 filled_m[row, column] = 1 / min(max(centre, far), near)
-                confidence[row, column] = least
+                confidence[row, column] = _least(known, top, bottom, left, right)
                 share[row, column] = (step + 1) / len(reaches)
                 break

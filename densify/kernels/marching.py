@@ -38,7 +38,7 @@ def first_known(known: Bool) -> NDArray[np.uint8]:
     itself, `NONE` where there is none."""
     padded = np.full((len(DIRECTIONS), known.shape[0] + 4, known.shape[1] + 4), NONE, np.uint8)
     steps = padded[:, 2:-2, 2:-2]
-    steps[:, known] = 0
+    steps[:] = np.where(known, np.uint8(0), np.uint8(NONE))
     _march(DIRECTIONS, padded)
     return steps
 

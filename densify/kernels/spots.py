@@ -5,8 +5,6 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numpy as np
-
 from densify.kernels import Kernel
 from densify.types import Float32
 
@@ -23,31 +21,30 @@ class Spots(NamedTuple):
 
 
 @Kernel
-def nearest_over(first, last, pixel, filled_m, spots, reach, agree, found):  # type: ignore[no-untyped-def]
+def cover(pixel, filled_m, spots, agree, found, nearest):  # type: ignore[no-untyped-def]
     """The measured pixel whose spot covers a filled one, nearest in the image, on its surface.
 
-    pixel: (P,) row by row. filled_m: (H,W) float32. spots: `Spots`. reach: pixels, the largest
-    radius. agree: (2,) metres, and a share of the depth, by which they may differ. found: (P,)
-    int64, stays where there is none.
+    pixel: (P,) the measured ones, row by row. filled_m: (H,W) float32, of the pixels that may be
+    covered, 0 elsewhere. spots: `Spots`. agree: (2,) metres, and a share of the depth, by which
+    they may differ. found: (H,W) int64, of each covered pixel the measured one. nearest: (H,W)
+    float64 inf, squared distance to its spot.
     """
     height, width = filled_m.shape
-    for p in range(first, last):
-        row, column = pixel[p] // width, pixel[p] % width
-        z = filled_m[row, column]
-        best = np.inf
-        for v in range(max(row - reach, 0), min(row + reach + 1, height)):
-            for u in range(max(column - reach, 0), min(column + reach + 1, width)):
-                radius_px = spots.radius_px[v, u]
-                if radius_px <= 0:
+    for p in pixel:
+        v, u = p // width, p % width
+        radius_px, here = spots.radius_px[v, u], spots.depth_m[v, u]
+        middle_u, middle_v = spots.middle_px[v, u, 0], spots.middle_px[v, u, 1]
+        reach = int(radius_px + 0.5)  # a spot's middle lies in its pixel
+        for row in range(max(v - reach, 0), min(v + reach + 1, height)):
+            for column in range(max(u - reach, 0), min(u + reach + 1, width)):
+                z = filled_m[row, column]
+                if z == 0:
                     continue
                 du, dv = column - u, row - v
-                away_u = du - spots.middle_px[v, u, 0]
-                away_v = dv - spots.middle_px[v, u, 1]
-                away = away_u * away_u + away_v * away_v
-                if away > radius_px * radius_px or away >= best:
+                away = (du - middle_u) ** 2 + (dv - middle_v) ** 2
+                if away > radius_px * radius_px or away >= nearest[row, column]:
                     continue
-                here = spots.depth_m[v, u]
                 inverse = 1 / here + du * spots.tilt[v, u, 0] + dv * spots.tilt[v, u, 1]
                 if abs(z * inverse - 1) <= (agree[0] + agree[1] * here) * abs(inverse):
-                    best = away
-                    found[p] = v * width + u
+                    nearest[row, column] = away
+                    found[row, column] = p

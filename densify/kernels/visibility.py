@@ -44,9 +44,11 @@ def paint(uv, inverse, slope, half_px, canvas):  # type: ignore[no-untyped-def]
         bottom = min(int(np.floor(uv[i, 1] + half_px[i, 1])), height - 1)
         for v in range(top, bottom + 1):
             tilt_v = slope[i, 1] * (v - uv[i, 1])
-            for u in range(left, right + 1):
-                there = w + min(max(tilt_v + slope[i, 0] * (u - uv[i, 0]), -0.5 * w), 0.0)
-                canvas[v, u] = max(canvas[v, u], np.float32(there))
+            covered = canvas[v, left : right + 1]
+            for k in range(len(covered)):
+                tilt = tilt_v + slope[i, 0] * (left + k - uv[i, 0])
+                there = w + min(max(tilt, -0.5 * w), 0.0)
+                covered[k] = max(covered[k], np.float32(there))
 
 
 @inlined
@@ -161,16 +163,15 @@ def _shortest(reach):  # type: ignore[no-untyped-def]
 
 
 class Visible(NamedTuple):
-    """K points in an image, by pixel.
+    """K points in an image, in the order of `by_pixel`, hidden ones last in each pixel.
 
-    start, order: of `by_pixel`, hidden points last. uv: (K,2) px. inverse: (K,) depth, 1/m. slope:
+    start: of `by_pixel`. uv: (K,2) px. inverse: (K,) depth, 1/m. slope:
     (K,2) of the tangent plane's inverse depth, 1/m per px. spacing_px: (K,2) between neighbouring
     rays. edge_px: (K,) added to the reach of a depth edge. sweep: (K,) from 0 to 62. hidden,
     moving: (K,). age_ns: (K,) from the key.
     """
 
     start: Int
-    order: Int
     uv: Float
     inverse: Float
     slope: Float
@@ -219,7 +220,7 @@ def _look_round(points, reaches, shape, i, u0, v0, centre, agree, inner, m, reac
     lies behind close by, and the squared distances in ray spacings to what the key sweep, on a
     mover, saw of its surface and behind it.
     """
-    start, order, uv = points.start, points.order, points.uv
+    start, uv = points.start, points.uv
     inverse, hidden, age_ns = points.inverse, points.hidden, points.age_ns
     across, along = points.spacing_px[i, 0], points.spacing_px[i, 1]
     su, sv, moving = points.slope[i, 0], points.slope[i, 1], points.moving[i]
@@ -238,8 +239,7 @@ def _look_round(points, reaches, shape, i, u0, v0, centre, agree, inner, m, reac
     now, now_behind = np.inf, np.inf
     left, right = max(u0 - wide_u, 0), min(u0 + wide_u, shape[1] - 1)
     for v in range(max(v0 - wide_v, 0), min(v0 + wide_v, shape[0] - 1) + 1):
-        for q in range(start[v * shape[1] + left], start[v * shape[1] + right + 1]):
-            j = order[q]
+        for j in range(start[v * shape[1] + left], start[v * shape[1] + right + 1]):
             du, dv = uv[j, 0] - u0, uv[j, 1] - v0
             off = inverse[j] - (centre + su * du + sv * dv)
             away = np.inf
@@ -284,7 +284,7 @@ def settle(first, last, points, reaches, shape, taken, found):  # type: ignore[n
     for p in range(first, last):
         if taken[p] or points.start[p] == points.start[p + 1]:
             continue
-        i = points.order[points.start[p]]
+        i = points.start[p]
         v0, u0 = p // shape[1], p % shape[1]
         w0, centre = points.inverse[i], _expected(points, i, u0, v0)
         agree = (reaches.agree_m + reaches.agree_fraction / w0) * w0 * w0
