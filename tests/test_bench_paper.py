@@ -23,8 +23,10 @@ from densify.bench.paper_pairs import (
 )
 from densify.cli import main
 from densify.errors import InputError
+from densify.files.images import read_image
 from densify.learning.model_file import Model, write_model
 from densify.learning.networks import build
+from densify.outputs.arrows import draw_arrows
 from densify.readers.kitti import scene_flow
 from densify.readers.street import Street
 from densify.writers import write_street
@@ -266,6 +268,37 @@ def test_the_command_measures_and_names_what_is_published(tmp_path: Path, capsys
     line = next(line for line in told.splitlines() if line.startswith("paper, as published"))
     assert line.split()[3:10] == ["0.093", "m", "64.8", "%", "82.1", "%", "0.137"]
     assert json.loads(out.read_text())["sets"]["kitti"]["methods"]["rest"]["epe_m"] > 0.3
+
+
+def test_arrows_are_as_long_as_the_flow_and_coloured_by_its_direction() -> None:
+    points = np.array([[10.0, 10, 0], [0, -10, 0], [-10, 0, 0]])
+    flow = np.array([[3.0, 0, 0], [0, 3.0, 0], [0.01, 0, 0]])
+    picture = draw_arrows(points, {"truth": flow, "nothing": np.zeros_like(flow)})
+    assert picture.shape == (506, 960, 3)
+    left, right = picture[28:-2, 2:478], picture[28:-2, 482:-2]
+    per_m = 240 / 35
+    assert (right.max(axis=2) - right.min(axis=2)).max() == 0  # dots are gray
+    coloured = (left.max(axis=2).astype(int) - left.min(axis=2)) > 60
+    y, x = np.nonzero(coloured)
+    ahead, sideways = x < 200, x > 200  # x up, y to the left: 10 m left is 69 px
+    up_px = 240 - 2 - 10 * per_m
+    assert abs(y[ahead].max() - up_px) < 3 and abs(y[ahead].min() - (up_px - 9 * per_m)) < 3
+    assert abs(np.ptp(x[sideways]) - 9 * per_m) < 4
+    assert (
+        left[y[ahead], x[ahead]].mean(axis=0).argmax()
+        != left[y[sideways], x[sideways]].mean(axis=0).argmax()
+    )
+
+
+def test_the_first_pair_is_drawn(tmp_path: Path, capsys) -> None:
+    kitti_file(tmp_path / "a.npz")
+    figure = tmp_path / "a.png"
+    command = ["bench", "paper", "--kitti", str(tmp_path), "--methods", "rest,icp"]
+    assert main([*command, "--figure", str(figure)]) == 0
+    assert read_image(figure).shape == (2 * 506, 960, 3)
+    assert str(figure) in capsys.readouterr().out
+    assert main([*command, "--figure", str(figure)]) == 2
+    assert f"--figure {figure}: already there and kept" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
