@@ -186,26 +186,32 @@ def test_labels_of_a_street_are_its_exact_flow(format, places, tmp_path: Path, c
     out, place, written = tmp_path / "labels", places(format), WRITTEN[format]
     num = len(written.frames) - 1
     assert main(["labels", "--data", str(place), "--out", str(out)]) == 0
-    assert f"{num} sweeps" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert f"{num} sweeps" in said
     files = [f"{i:06d}_{i + 1:06d}.npz" for i in range(num)]
     assert sorted(path.name for path in out.iterdir()) == files
     sequence = open_sequence(str(place))
-    found, true_m = [], []
+    found, true_m, step_s = [], [], []
     for i in range(num):
         with np.load(out / files[i]) as file:
             found.append(dict(file))
+        step_ns = sequence.stamp_ns(i + 1) - sequence.stamp_ns(i)
+        step_s.append(np.full(len(found[i]["row"]), step_ns * 1e-9))
         true_m.append(sequence.truth.displacement(i, i + 1)[found[i]["row"]])
     flow, moving, valid = (
         np.concatenate([f[name] for f in found]) for name in ("residual_flow", "moving", "valid")
     )
     true = np.concatenate(true_m)
     way_m, error_m = np.linalg.norm(true, axis=1), np.linalg.norm(flow - true, axis=1)
-    moves, stands = valid & (way_m > 0.1), valid & (way_m <= 0.1)
+    fast = way_m >= 1.0 * np.concatenate(step_s)
+    moves, stands = valid & fast, valid & ~fast
     assert moves.sum() > 100 and way_m[moves].mean() > 0.3
     assert np.median(error_m[moves]) < 0.05 and error_m[moves].mean() < 0.1 * way_m[moves].mean()
     assert moving[moves].mean() > 0.95
     # what stands and touches a box that moves
     assert (error_m[stands] > 0.05).sum() < 0.01 * len(valid)
+    assert f"{error_m[moves].mean() * 100:.1f} cm off" in said
+    assert f"{(error_m[stands] > 0.05).mean():.2%} of the standing points" in said
     assert written.least_valid <= valid.mean() <= written.most_valid
 
 
@@ -287,6 +293,14 @@ def test_damaged_waymo_boxes_are_refused(places, tmp_path: Path, capsys) -> None
     assert "not a whole parquet file" in refused(copy, tmp_path, capsys)
     path.unlink()
     assert "lidar_box/CONTEXT.parquet (waymo)" in refused(copy, tmp_path, capsys)
+
+
+def test_sweeps_of_which_none_can_be_labelled_are_refused(places, tmp_path: Path, capsys) -> None:
+    """The last one has no next one."""
+    command = ["labels", "--data", str(places("argoverse2")), "--out", str(tmp_path / "out")]
+    assert main([*command, "--keys", "2:3"]) == 2
+    assert "none of 1 sweeps has boxes and is followed by one" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
 
 
 def test_a_waymo_frame_without_boxes_has_no_label(places, tmp_path: Path) -> None:
