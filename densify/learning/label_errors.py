@@ -20,8 +20,8 @@ WRONG_M = 0.05
 
 
 class LabelErrors(NamedTuple):
-    """Of valid points. error_m: (M,) of those that really move, and way_m: (M,) how far they do to
-    the next sweep. found: (M,) bool, labelled as moving. num_standing: all others, of which
+    """Errors of valid points. error_m: (M,) of those that really move, and way_m: (M,) how far they
+    do to the next sweep. found: (M,) bool, labelled as moving. num_standing: all others, of which
     num_wrong have a label that is more than 5 cm off."""
 
     error_m: Float
