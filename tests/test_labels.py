@@ -106,6 +106,14 @@ def test_what_is_unsure_does_not_count() -> None:
     assert field.moving.tolist() == [False, False, True, False, False]
 
 
+def test_the_road_below_what_moves_is_unsure() -> None:
+    """A box 1.5 m high: within 0.1 m of its bottom, unless it stands."""
+    points = np.array([[0.0, 0, -0.8], [0, 0, -0.7], [0, 0, -0.6]])
+    for shift_m, expected in ((1, [False, False, True]), (0, [True, True, True])):
+        _, sure = flow(points, boxes((1, 0, 0, 0)), boxes((1, shift_m, 0, 0)))
+        assert sure.tolist() == expected
+
+
 def test_a_box_that_is_not_followed_is_unsure() -> None:
     here, there = boxes((1, 0, 0, 0)), boxes((1, 1, 0, 0))
     nowhere = replace(here, track=np.array([""])), replace(there, track=np.array([""]))
@@ -208,8 +216,8 @@ def test_labels_of_a_street_are_its_exact_flow(format, places, tmp_path: Path, c
     assert moves.sum() > 100 and way_m[moves].mean() > 0.3
     assert np.median(error_m[moves]) < 0.05 and error_m[moves].mean() < 0.1 * way_m[moves].mean()
     assert moving[moves].mean() > 0.95
-    # what stands and touches a box that moves
-    assert (error_m[stands] > 0.05).sum() < 0.01 * len(valid)
+    # what stands in a box that moves
+    assert (error_m[stands] > 0.05).sum() < 0.002 * len(valid)
     assert f"{error_m[moves].mean() * 100:.1f} cm off" in said
     assert f"{(error_m[stands] > 0.05).mean():.2%} of the standing points" in said
     assert written.least_valid <= valid.mean() <= written.most_valid
@@ -528,7 +536,7 @@ def test_real_boxes_carry_points_onto_the_next_sweep(test_data: Path, tmp_path: 
     ((_, label),) = label_sweeps(sequence, [103], GIVEN)
     moving = label.field.moving & label.sure
     points = label.registered.sweep.points[moving]
-    assert moving.sum() > 100 and 0.1 < label.sure.mean() < 0.2
+    assert moving.sum() > 50 and 0.1 < label.sure.mean() < 0.2
     after = cKDTree(sequence[104].points)
     standing_m, moved_m = (
         np.median(after.query(transform(label.T_next_here, p))[0])

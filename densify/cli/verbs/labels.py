@@ -30,10 +30,10 @@ def add(commands: Any) -> None:
         answer,
         "scene flow of every sweep to the next from tracked boxes and poses",
         "Flow files as --flow npz:DIR and bench flow --truth read them, with 'valid' (N,) bool: "
-        "False in two boxes, just outside one, in a box that the next sweep lacks, and where "
-        "nobody drew boxes. Poses are the recording's own (--set register.source=kiss-icp: "
-        "estimated). Where a recording has exact truth beside it, as simulated ones have, the "
-        "labels' errors are told too.",
+        "False in two boxes, just outside one, at the foot of one that moves, in a box that the "
+        "next sweep lacks, and where nobody drew boxes. Poses are the recording's own (--set "
+        "register.source=kiss-icp: estimated). Where a recording has exact truth beside it, as "
+        "simulated ones have, the labels' errors are told too.",
     )
     parser.add_argument("--data", metavar="SPEC", required=True, help="a recording with boxes")
     parser.add_argument("--out", metavar="DIR", type=Path, required=True, help="for the flow files")
