@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import cv2
@@ -15,7 +16,8 @@ from densify.bench.baselines import rigid_icp
 from densify.bench.paper import METHODS, SLOW, bench_paper
 from densify.bench.paper_pairs import (
     PaperPair,
-    pair_of_street,
+    has_truth,
+    pair_of_recording,
     pairs_of_boxes,
     pairs_of_files,
     pairs_of_kitti,
@@ -211,7 +213,7 @@ def test_cameras_the_wrong_way_round_are_refused(tmp_path: Path) -> None:
 
 
 def test_a_street_is_a_set() -> None:
-    pair = pair_of_street("street?seed=31&sensor=vlp16", 80)
+    pair = pair_of_recording("street?seed=31&sensor=vlp16", 80)
     assert isinstance(pair, PaperPair) and pair.moving is not None and pair.moving.any()
     assert not pair.flow[~pair.moving].any() and len(pair.sweeps) == 5
     assert pair.source.shape == pair.flow.shape == tuple(pair.sweeps[0].points.shape)
@@ -268,6 +270,14 @@ def test_the_command_measures_and_names_what_is_published(tmp_path: Path, capsys
     line = next(line for line in told.splitlines() if line.startswith("paper, as published"))
     assert line.split()[3:10] == ["0.093", "m", "64.8", "%", "82.1", "%", "0.137"]
     assert json.loads(out.read_text())["sets"]["kitti"]["methods"]["rest"]["epe_m"] > 0.3
+
+
+def test_without_truth_networks_are_held_against_the_engine(log: Path, tmp_path: Path) -> None:
+    bare = shutil.copytree(log, tmp_path / "log", ignore=shutil.ignore_patterns("truth"))
+    assert has_truth(str(log)) and not has_truth(str(bare))
+    exact, found = (pair_of_recording(str(place), 1) for place in (log, bare))
+    assert abs(len(exact.source) - len(found.source)) < 0.02 * len(exact.source)
+    assert found.flow.shape == found.source.shape and not found.flow[~found.moving].any()
 
 
 def test_arrows_are_as_long_as_the_flow_and_coloured_by_its_direction() -> None:

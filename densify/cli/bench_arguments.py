@@ -190,8 +190,9 @@ def _add_bench_paper(benches: Any) -> None:
         type=recording_keys,
         action="append",
         metavar="SPEC@KEYS",
-        help="streets and their frames (K,K,… or A:B[:S]), where no set is given (default: four "
-        "that nothing was tuned on)",
+        help="recordings and their frames (K,K,… or A:B[:S]), streets or, without truth, held "
+        "against what this package's engine finds (default: four streets that nothing was tuned "
+        "on, where no set is given)",
     )
     parser.add_argument(
         "--methods", type=words, metavar="NAME,…", help="(default: all but pointpwc, paper-adam)"

@@ -184,10 +184,12 @@ def bench_paper(options: argparse.Namespace) -> Iterator[Answer]:
             specs = [f"{reader}:{place}" for place in places]
             sets[name] = paper_pairs.pairs_of_boxes(specs, options.pairs)
     if options.data or not sets:
-        given = options.data or _UNSEEN
-        sets["streets"] = (
-            paper_pairs.pair_of_street(spec, key) for spec, keys in given for key in keys
-        )
+        chosen: dict[str, list[tuple[str, int]]] = {}
+        for spec, keys in options.data or _UNSEEN:
+            kind = "streets" if paper_pairs.has_truth(spec) else "against this package's engine"
+            chosen.setdefault(kind, []).extend((spec, key) for key in keys)
+        for kind, places in chosen.items():
+            sets[kind] = map(paper_pairs.pair_of_recording, *zip(*places, strict=True))
     methods = bench.DEFAULT_METHODS if options.methods is None else options.methods
     measured: dict[str, dict[str, Any]] = {}
     for name, pairs in sets.items():
