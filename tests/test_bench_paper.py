@@ -302,7 +302,7 @@ def test_arrows_are_as_long_as_the_flow_and_coloured_by_its_direction() -> None:
 
 def test_the_first_pair_is_drawn(tmp_path: Path, capsys) -> None:
     kitti_file(tmp_path / "a.npz")
-    figure = tmp_path / "a.png"
+    figure = tmp_path / "new" / "a.png"
     command = ["bench", "paper", "--kitti", str(tmp_path), "--methods", "rest,icp"]
     assert main([*command, "--figure", str(figure)]) == 0
     assert read_image(figure).shape == (2 * 506, 960, 3)

@@ -220,6 +220,7 @@ def _with_figure(
         if number == 0:
             points, flows = flows_of_pair(pair, methods, options.models, options.points)
             try:
+                options.figure.parent.mkdir(parents=True, exist_ok=True)
                 write_picture(options.figure, draw_arrows(points, flows))
             except OSError as error:
                 reason = error.strerror or error
