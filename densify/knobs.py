@@ -8,6 +8,7 @@ import math
 import types
 import typing
 from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 from densify.errors import InputError
@@ -42,7 +43,7 @@ class Section:
 def checked(section: type[Section], key: str, value: Any, where: str) -> Any:
     """The value as its knob's type; InputError if it has another type or is out of range."""
     field = section.__dataclass_fields__[key]
-    kind = typing.get_type_hints(section)[key]
+    kind = _kinds(section)[key]  # type: ignore[arg-type]  # a class is hashable
     optional = isinstance(kind, types.UnionType)
     if optional:
         kind = next(t for t in typing.get_args(kind) if t is not types.NoneType)
@@ -68,6 +69,12 @@ def checked(section: type[Section], key: str, value: Any, where: str) -> Any:
     raise InputError(
         f"{where}{name}: got {value!r}, expected {expected} ({field.metadata['help']})"
     )
+
+
+@cache
+def _kinds(section: type[Section]) -> dict[str, Any]:
+    """The knobs' types, which are texts until they are asked for."""
+    return typing.get_type_hints(section)
 
 
 def _as(kind: Any, value: Any) -> Any:

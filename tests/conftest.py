@@ -29,6 +29,20 @@ hypothesis.settings.register_profile("densify", deadline=None)
 hypothesis.settings.load_profile("densify")
 
 
+LONGEST = (
+    *("examples", "street", "dataset_survives", "notebooks", "recording", "learning_training"),
+    *("pipeline", "bench_depth", "far", "fuzz", "learning_engine", "memory", "cli", "faults"),
+    *("report_browser", "flow_sets", "bench_confidence", "dataset", "film", "doctor", "doubts"),
+)
+"""Files of tests that take long begin, so that no process works on one while the others wait at the
+end. What simulates stands beside what compiles."""
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    place = {f"test_{name}.py": number for number, name in enumerate(LONGEST)}
+    items.sort(key=lambda item: place.get(item.path.name, len(place)))
+
+
 @pytest.fixture(scope="session", autouse=True)
 def own_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     """Simulated sweeps go to a folder of this test session, never to the user's cache.

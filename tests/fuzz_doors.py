@@ -303,11 +303,14 @@ def _read_all(place: Path) -> None:
     """All that a run might read."""
     from densify.readers import open_sequence
     from densify.readers.describe import describe
+    from densify.types import KnowsBoxes
 
     sequence = open_sequence(_opened_as(place))
     steps: list[Callable[[], Any]] = [lambda: describe(sequence)]
     for frame in list(sequence.frames)[:4]:
         steps += [lambda f=frame: sequence[f], lambda f=frame: sequence.T_world_lidar(f)]
+        if isinstance(sequence, KnowsBoxes):
+            steps.append(lambda f=frame: sequence.boxes(f))
     for camera in list(sequence.cameras)[:2]:
         numbers = list(sequence.image_stamps_ns(camera))[:2]
         steps += [lambda c=camera, n=number: sequence.image(c, n) for number in numbers]

@@ -89,7 +89,8 @@ def test_table_has_a_row_per_variant(tmp_path: Path, capsys: pytest.CaptureFixtu
     spec = "street:static?sensor=vlp16"
     arguments = ["--window", "1", "--camera", "image_02", "--key", "40", "--out", str(out)]
     variant = ["--variant", "bare", "project.visibility=false"]
-    assert main(["bench", "depth", "--data", spec, *arguments, *variant]) == 0
+    chosen = ["--config", "fast", *variant]
+    assert main(["bench", "depth", "--data", spec, *arguments, *chosen]) == 0
     shown = capsys.readouterr().out
     assert "keys 40, against truth" in shown and "keys 40, against key held out" in shown
     numbers = json.loads(out.read_text())
@@ -98,4 +99,4 @@ def test_table_has_a_row_per_variant(tmp_path: Path, capsys: pytest.CaptureFixtu
     scores = {
         name: v["scores"]["truth"]["measured"]["all"] for name, v in numbers["variants"].items()
     }
-    assert scores["bare"]["coverage"] > scores["as configured"]["coverage"]
+    assert scores["bare"]["outliers"] > 2 * scores["as configured"]["outliers"]  # shines through

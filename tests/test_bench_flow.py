@@ -24,6 +24,7 @@ from densify.cli import main
 from densify.config import resolve
 from densify.errors import InputError
 from densify.flow.objective.solvers import SolverSettings, solve
+from densify.scores.segmentation import LEAST_POINTS
 from densify.types import FlowField, Stretch
 from tests.scenes import Arc, Scanner, Scene, TinySequence, World, car, street
 
@@ -253,6 +254,29 @@ def test_scores_follow_the_stamps():
         assert pair.duration_s == pytest.approx(duration_s)
 
 
+def test_objects_are_the_methods_own_or_what_moves_together():
+    """Two cars: told apart by the true labels, and by the space between them; one object if a
+    method calls them so."""
+    sequence = tiny()
+    window = Window.open(sequence, 4, 1, CONFIG)
+    scorer = Scorer.of(sequence, window, (3, 5))
+    still = {f: FlowField.zero(len(window.stretch[f].sweep)) for f in (3, 5)}
+    truths = {f: scorer.answers[f].segment for f in (3, 5)}
+    assert {len(np.unique(t[t >= 0])) for t in truths.values()} == {2}
+    loose = {f: replace(still[f], moving=t >= 0) for f, t in truths.items()}
+    told = {f: replace(loose[f], instance=(t + 7).astype(np.int32)) for f, t in truths.items()}
+    as_one = {f: replace(loose[f], instance=np.zeros(len(t), np.int32)) for f, t in truths.items()}
+    seen = [t[window.above[f] & (t >= 0)] for f, t in truths.items()]
+    large = sum(int((np.bincount(t) >= LEAST_POINTS).sum()) for t in seen)
+    assert large > 0
+    for steps in (loose, told):
+        scores = scorer.segmentation_scores(steps)
+        assert scores["moving_iou"] == scores["panoptic_quality"] == 1
+        assert (scores["num_found"], scores["num_missed"], scores["num_false"]) == (large, 0, 0)
+    assert scorer.segmentation_scores(as_one)["panoptic_quality"] < 0.95
+    assert scorer.segmentation_scores(still)["moving_iou"] == 0
+
+
 def test_a_cluster_may_move_as_far_as_its_time_allows():
     box = shell((4.0, 1.8, 1.4), 900)
     far = np.array([6.0, 0.0, 0.0])  # beyond 3.6 m, and beyond its own length
@@ -372,7 +396,7 @@ def test_the_command_prints_tables_and_writes_numbers(tmp_path: Path, capsys, mo
     assert main(command) == 0
     printed = capsys.readouterr().out
     assert printed.splitlines()[-1] == str(out)
-    assert printed.count("\nrigid ") == 8 and printed.count("\nours ") == 8
+    assert printed.count("\nrigid ") == 10 and printed.count("\nours ") == 10
     assert [s[1:] for s in seen] == [(k, ["rigid", "ours"], False, 300) for k in (3, 5)]
     numbers = json.loads(out.read_text("utf-8"))
     assert [len(run["methods"]) for run in numbers["runs"]] == [2, 2]

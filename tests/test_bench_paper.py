@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import cv2
@@ -15,7 +16,8 @@ from densify.bench.baselines import rigid_icp
 from densify.bench.paper import METHODS, SLOW, bench_paper
 from densify.bench.paper_pairs import (
     PaperPair,
-    pair_of_street,
+    has_truth,
+    pair_of_recording,
     pairs_of_boxes,
     pairs_of_files,
     pairs_of_kitti,
@@ -23,8 +25,10 @@ from densify.bench.paper_pairs import (
 )
 from densify.cli import main
 from densify.errors import InputError
+from densify.files.images import read_image
 from densify.learning.model_file import Model, write_model
 from densify.learning.networks import build
+from densify.outputs.arrows import draw_arrows
 from densify.readers.kitti import scene_flow
 from densify.readers.street import Street
 from densify.writers import write_street
@@ -209,7 +213,7 @@ def test_cameras_the_wrong_way_round_are_refused(tmp_path: Path) -> None:
 
 
 def test_a_street_is_a_set() -> None:
-    pair = pair_of_street("street?seed=31&sensor=vlp16", 80)
+    pair = pair_of_recording("street?seed=31&sensor=vlp16", 80)
     assert isinstance(pair, PaperPair) and pair.moving is not None and pair.moving.any()
     assert not pair.flow[~pair.moving].any() and len(pair.sweeps) == 5
     assert pair.source.shape == pair.flow.shape == tuple(pair.sweeps[0].points.shape)
@@ -266,6 +270,45 @@ def test_the_command_measures_and_names_what_is_published(tmp_path: Path, capsys
     line = next(line for line in told.splitlines() if line.startswith("paper, as published"))
     assert line.split()[3:10] == ["0.093", "m", "64.8", "%", "82.1", "%", "0.137"]
     assert json.loads(out.read_text())["sets"]["kitti"]["methods"]["rest"]["epe_m"] > 0.3
+
+
+def test_without_truth_networks_are_held_against_the_engine(log: Path, tmp_path: Path) -> None:
+    bare = shutil.copytree(log, tmp_path / "log", ignore=shutil.ignore_patterns("truth"))
+    assert has_truth(str(log)) and not has_truth(str(bare))
+    exact, found = (pair_of_recording(str(place), 1) for place in (log, bare))
+    assert abs(len(exact.source) - len(found.source)) < 0.02 * len(exact.source)
+    assert found.flow.shape == found.source.shape and not found.flow[~found.moving].any()
+
+
+def test_arrows_are_as_long_as_the_flow_and_coloured_by_its_direction() -> None:
+    points = np.array([[10.0, 10, 0], [0, -10, 0], [-10, 0, 0]])
+    flow = np.array([[3.0, 0, 0], [0, 3.0, 0], [0.01, 0, 0]])
+    picture = draw_arrows(points, {"truth": flow, "nothing": np.zeros_like(flow)})
+    assert picture.shape == (506, 960, 3)
+    left, right = picture[28:-2, 2:478], picture[28:-2, 482:-2]
+    per_m = 240 / 35
+    assert (right.max(axis=2) - right.min(axis=2)).max() == 0  # dots are gray
+    coloured = (left.max(axis=2).astype(int) - left.min(axis=2)) > 60
+    y, x = np.nonzero(coloured)
+    ahead, sideways = x < 200, x > 200  # x up, y to the left: 10 m left is 69 px
+    up_px = 240 - 2 - 10 * per_m
+    assert abs(y[ahead].max() - up_px) < 3 and abs(y[ahead].min() - (up_px - 9 * per_m)) < 3
+    assert abs(np.ptp(x[sideways]) - 9 * per_m) < 4
+    assert (
+        left[y[ahead], x[ahead]].mean(axis=0).argmax()
+        != left[y[sideways], x[sideways]].mean(axis=0).argmax()
+    )
+
+
+def test_the_first_pair_is_drawn(tmp_path: Path, capsys) -> None:
+    kitti_file(tmp_path / "a.npz")
+    figure = tmp_path / "new" / "a.png"
+    command = ["bench", "paper", "--kitti", str(tmp_path), "--methods", "rest,icp"]
+    assert main([*command, "--figure", str(figure)]) == 0
+    assert read_image(figure).shape == (2 * 506, 960, 3)
+    assert str(figure) in capsys.readouterr().out
+    assert main([*command, "--figure", str(figure)]) == 2
+    assert f"--figure {figure}: already there and kept" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

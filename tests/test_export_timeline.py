@@ -3,10 +3,14 @@
 
 from __future__ import annotations
 
+import os
 import socket
 import subprocess
+import sys
+import threading
 import time
 from collections import defaultdict
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +21,7 @@ from scipy.spatial.transform import Rotation
 
 from densify.errors import InputError
 from densify.outputs import export_run, read_cloud, write_result
+from densify.outputs.export import open3d_window
 from densify.outputs.export.finished_run import finished_runs
 from densify.outputs.export.timeline import timelines
 from densify.pipeline import run_keys
@@ -290,11 +295,81 @@ class TestRerun:
         np.testing.assert_array_equal(points, cloud.points[cloud.moving].astype(np.float32))
 
 
+class TestOpen3d:
+    """Where it is installed, with a screen: 430 MB, not among what tests install."""
+
+    def test_the_window_follows_its_controls(self, drive: Path) -> None:
+        """Two keys of a drive: what is drawn changes with every layer and with the time."""
+        reason = "open3d is not installed, or lacks a library of the system"
+        o3d = pytest.importorskip("open3d", reason=reason, exc_type=ImportError)
+        if "DISPLAY" not in os.environ:
+            pytest.skip("no screen")
+        application, told = o3d.visualization.gui.Application.instance, []
+
+        def look(viewer: open3d_window.Viewer) -> None:
+            def drawn() -> np.ndarray[Any, Any]:
+                scene = viewer.layers.widget.scene
+                return np.asarray(application.render_to_image(scene, 400, 300)).astype(int)
+
+            def changed(act: Callable[[], None]) -> int:
+                before = drawn()
+                act()
+                return int((np.abs(drawn() - before).max(axis=2) > 20).sum())
+
+            told.append(viewer.num_steps)
+            for layer in open3d_window.LAYERS:
+                shown = layer != "trails"
+                told.append(changed(lambda: viewer.layers.switch(layer, not shown)))  # noqa: B023
+                viewer.layers.switch(layer, shown)
+            told.append(changed(lambda: viewer.go_to(1)))
+            for picture in open3d_window.PICTURES:
+                viewer.choose("front", picture)
+            viewer.window.close()
+
+        def begun(viewer: open3d_window.Viewer) -> None:
+            later = threading.Timer(
+                2.0, lambda: application.post_to_main_thread(viewer.window, lambda: look(viewer))
+            )
+            later.start()
+
+        open3d_window.show(finished_runs(drive), begun)
+        num_steps, *changes = told
+        assert num_steps == 2 and len(changes) == 7 and min(changes) > 20, changes
+
+    def test_pictures_say_metres(self, street: Path) -> None:
+        """The depth's picture is the image's, with a scale below it."""
+        (timeline,) = timelines(finished_runs(street))
+        (shot,) = timeline.shots
+        image, measured, filled = (
+            open3d_window._picture(shot, picture) for picture in open3d_window.PICTURES
+        )
+        assert image.shape == (*shot.depth_m.shape, 3)
+        assert measured.shape == filled.shape and measured.shape[0] > image.shape[0]
+        assert (measured != filled).any()
+
+    def test_a_library_that_is_missing_is_named(
+        self, street: Path, tmp_path: Path, monkeypatch, capsys
+    ) -> None:
+        """As on machines without libusb."""
+        (tmp_path / "open3d.py").write_text("raise ImportError('libusb-1.0.so.0: no such file')")
+        monkeypatch.syspath_prepend(tmp_path)
+        monkeypatch.delitem(sys.modules, "open3d", raising=False)
+        line = refused(capsys, 2, "view", street, "--with", "open3d")
+        assert "open3d, which is installed and cannot be loaded here (libusb-1.0.so.0" in line
+
+
 @pytest.mark.parametrize(("to", "package"), [("rrd", "rerun"), ("mcap", "foxglove")])
 def test_without_the_package_a_line_says_what_to_install(
     to: str, package: str, street: Path, tmp_path: Path, monkeypatch, capsys
 ) -> None:
-    monkeypatch.setitem(__import__("sys").modules, package, None)
+    monkeypatch.setitem(sys.modules, package, None)
     line = refused(capsys, 2, "export", street, "--to", to, "--out", tmp_path / "out")
     assert f"pip install 'densify[{'rerun' if to == 'rrd' else 'mcap'}]'" in line
     assert not (tmp_path / "out").exists()
+
+
+def test_a_viewer_that_is_not_installed_is_named(street: Path, monkeypatch, capsys) -> None:
+    for package in ("rerun", "open3d"):
+        monkeypatch.setitem(sys.modules, package, None)
+        line = refused(capsys, 2, "view", street, "--with", package)
+        assert f"pip install 'densify[{package}]'" in line

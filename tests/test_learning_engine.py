@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import densify
-from densify.bench.paper_pairs import pair_of_street
+from densify.bench.paper_pairs import pair_of_recording
 from densify.cli import main
 from densify.config import Config, resolve
 from densify.errors import InputError
@@ -111,7 +111,7 @@ def test_a_run_takes_a_network(model: Path) -> None:
 
 def test_the_shipped_model_knows_moving_from_standing() -> None:
     """On a street that it was not trained on, as it comes, without any proof."""
-    pair = pair_of_street("street?seed=31&sensor=hdl32", 80)
+    pair = pair_of_recording("street?seed=31&sensor=hdl32", 80)
     model = read_model(Path("streets"))
     assert model.made["teacher"] == "truth" and model.made["data"] == ["streets"]
     error_m = np.linalg.norm(model.flow(pair.sweeps) - pair.flow, axis=1)

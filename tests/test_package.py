@@ -228,6 +228,7 @@ DOORS: dict[str, str | tuple[str, ...]] = {
     "pye57": "densify/outputs/export/e57.py",
     "shtab": "densify/cli/verbs/completion.py",
     "foxglove": "densify/outputs/export/mcap.py",
+    "open3d": "densify/outputs/export/open3d_window.py",
     "rerun": "densify/outputs/export/rrd.py",
     "embreex": "densify/street/world.py",
     "kiss_icp": "densify/registration/odometry.py",

@@ -125,6 +125,27 @@ def test_a_lidar_without_a_sweep_near_is_left_out(root):
     assert set(sweep.lidar) == {0} and len(sweep) == 49
 
 
+def test_boxes_are_in_the_vehicles_frame_between_key_frames(root):
+    """One that stands in the world, 30 m before where the vehicle is at first; key frames 0.2 s
+    apart."""
+    tables, box = root / "v1.0-mini", {"rotation": [1, 0, 0, 0], "size": [2.5, 12.0, 4.0]}
+    box |= {"instance_token": "truck", "translation": [600_030, 5_300_001, 2]}
+    samples = [
+        {"token": token, "scene_token": "scene", "timestamp": START_US + late_us}
+        for token, late_us in (("s", 0), ("t", 200_000))
+    ]
+    annotations = [{"token": f"a{s['token']}", "sample_token": s["token"], **box} for s in samples]
+    (tables / "sample.json").write_text(json.dumps(samples))
+    (tables / "sample_annotation.json").write_text(json.dumps(annotations))
+    sequence = open_sequence(root)
+    for number in range(3):
+        boxes = sequence.boxes(number)
+        assert boxes.track.tolist() == ["truck"]
+        place_m = [30 - number * SPEED_M_S * 0.1, 1, 2]
+        np.testing.assert_allclose(boxes.T_lidar_box[0, :3, 3], place_m, atol=1e-6)
+        np.testing.assert_array_equal(boxes.size_m, [[12.0, 2.5, 4.0]])
+
+
 def change(root, **columns):
     path = sorted((root / "samples/LIDAR_RIGHT").iterdir())[0]
     kept = {k: v for k, v in (points_of("LIDAR_RIGHT", 0) | columns).items() if v is not None}

@@ -10,18 +10,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-import densify
 from densify.errors import InputError
 from densify.geometry.poses import inverse, transform
 from densify.readers import open_sequence
 from densify.readers.describe import describe
 from densify.readers.street import Street
 from densify.readers.waymo.reader import Waymo
-from densify.scores.depth_metrics import depth_errors
 from densify.writers import write_street
 from densify.writers.excerpt import Excerpt
 from densify.writers.waymo import T_EGO_LIDAR, _pixels
-from tests.reader_checks import check_truth
+from tests.reader_checks import check_truth, depth_score, street_score
 
 parquet = pytest.importorskip("pyarrow.parquet")
 
@@ -117,17 +115,8 @@ def test_cameras_are_given_back(root, excerpt):
 
 
 def test_depth_is_that_of_the_street(root, excerpt):
-    scores = []
-    for recording, key, camera in (
-        (open_sequence(root), 1, "FRONT"),
-        (excerpt.street, FRAMES[1], "image_02"),
-    ):
-        config = {"register": {"source": "dataset"}, "accumulate": {"far_m": 0}}
-        maps = densify.run(recording, key, 1, cameras=[camera], config=config).depth[camera]
-        true_m = recording.truth.depth_m(camera, key)
-        focal_px = recording.cameras[camera].focal_px
-        scores.append(depth_errors(maps.depth_m, true_m, focal_px=focal_px))
-    read, true = scores
+    read = depth_score(open_sequence(root), 1, "FRONT")
+    true = street_score(excerpt.street.name, FRAMES[1], "image_02")
     assert true.num_compared > 5_000
     assert abs(read.num_compared / true.num_compared - 1) < 0.1
     assert read.mae_m < 1.5 * true.mae_m  # the columns' azimuths

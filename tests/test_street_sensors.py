@@ -228,12 +228,13 @@ def test_names_and_cached_frames_tell_rates_and_tilts_apart():
     assert other.name == "street:street?seed=0&sensor=hdl64&hz=20&tilt=-7.5"
     assert Street.from_spec(other.name).name == other.name
     assert other.simulator.tilt_deg == -7.5
-    folders = {
-        Street.from_spec(f"street{options}")._store._folder
-        for options in ("", "?hz=20", "?tilt=10", "?hz=20&tilt=10", "?sensor=os128")
-    }
-    assert len(folders) == 5
-    assert Street.from_spec("street?hz=10&tilt=0")._store._folder in folders
+    options = ("", "?hz=20", "?tilt=10", "?hz=20&tilt=10", "?sensor=os128")
+    streets = [Street.from_spec(f"street{option}") for option in options]
+    assert len({street._swept for street in streets}) == 5
+    assert Street.from_spec("street?hz=10&tilt=0")._swept == streets[0]._swept
+    images = [street._pictured for street in streets]
+    assert images == [images[0], images[1], images[0], images[1], images[0]]
+    assert len({images[0], images[1], Street.from_spec("street?seed=1")._pictured}) == 3
 
 
 # mounts
@@ -255,7 +256,10 @@ def test_a_tilted_mount_turns_the_lidar_and_leaves_the_cameras(level):
     p_cam = p_cam[p_cam[:, 2] > 1]
     u, v = np.rint((p_cam @ camera.K.T)[:, :2] / p_cam[:, 2:]).astype(int).T
     seen = (u >= 0) & (u < camera.width_px) & (v >= 0) & (v < camera.height_px)
-    depth_m = tilted.truth.depth_m("image_02", 120)[v[seen], u[seen]]
+    picture = tilted.simulator.picture("image_02", 120)  # anew: the cache shares them
+    np.testing.assert_array_equal(picture.depth_m, level.truth.depth_m("image_02", 120))
+    np.testing.assert_array_equal(picture.image, level.image("image_02", 120))
+    depth_m = picture.depth_m[v[seen], u[seen]]
     error = (depth_m - p_cam[seen, 2])[depth_m > 0]
     assert len(error) > 1000
     assert np.median(np.abs(error)) < 0.04 and np.mean(np.abs(error) < 0.3) > 0.85

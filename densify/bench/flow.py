@@ -194,6 +194,7 @@ def _measure(
         "energy_after": float(np.mean(after)),
         "step": scorer.step_scores(steps),
         "challenge": scorer.challenge_scores(steps),
+        "segmentation": scorer.segmentation_scores(steps),
         "window": None if pairs_only else scorer.window_scores(to_key),
     }
     return _Measured(row, traces)

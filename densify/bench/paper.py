@@ -30,7 +30,7 @@ from densify.flow.pairs.estimate import estimate_flow
 from densify.learning.losses.pointpwc import without_learning
 from densify.learning.model_file import read_model
 from densify.scores import flow_metrics as metrics
-from densify.types import Float, Progress
+from densify.types import Float, Int, Progress
 
 NUM_POINTS = 2048
 NEIGHBORS = (5, 10, 20, 50, 100)
@@ -153,14 +153,29 @@ def _learned(path: Path) -> Row:
     return Row(about, flow, whole=True)
 
 
-def _measured(row: Row, pair: PaperPair, num_points: int) -> dict[str, float]:
-    rng = np.random.default_rng(_SEED)
-    drawn, of_target = (_drawn(c, num_points, rng) for c in (pair.source, pair.target))
-    begun_s = time.perf_counter()
+def flows_of_pair(
+    pair: PaperPair, methods: Sequence[str], models: Sequence[Path], num_points: int
+) -> tuple[Float, dict[str, Float]]:
+    """The drawn points (n,3) and, by what a method is, (n,3) their flow, the truth first. Raises
+    InputError as `bench_paper` does."""
+    rows = _rows(methods, models)
+    drawn, _ = _both_drawn(pair, num_points)
+    flows = {row.about: _flow(row, pair, num_points) for row in rows.values()}
+    return pair.source[drawn], {"truth": pair.flow[drawn], **flows}
+
+
+def _flow(row: Row, pair: PaperPair, num_points: int) -> Float:
+    drawn, of_target = _both_drawn(pair, num_points)
     flow = row.flow(pair.source[drawn], pair.target[of_target], pair)
+    return flow[drawn] if row.whole else flow
+
+
+def _measured(row: Row, pair: PaperPair, num_points: int) -> dict[str, float]:
+    begun_s = time.perf_counter()
+    flow = _flow(row, pair, num_points)
     seconds = time.perf_counter() - begun_s
+    drawn, _ = _both_drawn(pair, num_points)
     true = pair.flow[drawn]
-    flow = flow[drawn] if row.whole else flow
     scores = {
         "epe_m": metrics.end_point_error(flow, true),
         "within_5": metrics.accuracy(flow, true, metrics.STRICT),
@@ -175,7 +190,13 @@ def _measured(row: Row, pair: PaperPair, num_points: int) -> dict[str, float]:
     return scores
 
 
-def _drawn(points: Float, count: int, rng: np.random.Generator) -> np.ndarray:
+def _both_drawn(pair: PaperPair, num_points: int) -> tuple[Int, Int]:
+    """Rows of the source and of the target."""
+    rng = np.random.default_rng(_SEED)
+    return _drawn(pair.source, num_points, rng), _drawn(pair.target, num_points, rng)
+
+
+def _drawn(points: Float, count: int, rng: np.random.Generator) -> Int:
     near = np.flatnonzero(np.linalg.norm(points[:, :2], axis=1) < FARTHEST_M)
     return np.sort(rng.permutation(near)[:count])
 

@@ -61,19 +61,26 @@ class PaperPair:
         return moved
 
 
-def pair_of_street(spec: str, key: int) -> PaperPair:
-    """A sweep and its next one, without ground and the motion of the vehicle. Raises InputError
-    for a recording without truth."""
+def has_truth(spec: str) -> bool:
+    """Whether a recording has exact truth."""
+    return open_sequence(spec).truth is not None
+
+
+def pair_of_recording(spec: str, key: int) -> PaperPair:
+    """A sweep and its next one, without ground and the motion of the vehicle. Where the recording
+    has no truth, the flow is what this package's engine finds in the sweeps around. Raises
+    InputError for a key without a next sweep, ComputationError where one cannot be placed."""
     sequence = open_sequence(spec)
-    if sequence.truth is None:
-        raise InputError(f"--data {spec}: no truth of what moves; expected a street")
-    clip = make_clip(sequence, key, resolve({"register": {"source": "dataset"}}), "truth")
+    labels, settings = "engine", resolve(None)
+    if sequence.truth is not None:
+        labels, settings = "truth", resolve({"register": {"source": "dataset"}})
+    clip = make_clip(sequence, key, settings, labels)
     here = next(i for i, s in enumerate(clip.sweeps) if not s.origin_m.any())
     if here + 1 == len(clip.sweeps):
         raise InputError(f"--data {spec}: no sweep after {key}; choose an earlier one")
-    sample = sample_of(clip, here, here + 1, _MOST_SWEEPS, "truth")
+    sample = sample_of(clip, here, here + 1, _MOST_SWEEPS, labels)
     if sample.flow is None or sample.moving is None:
-        raise InputError(f"--data {spec}: no truth of what moves; expected a street")
+        raise ValueError("expected a sample with labels")
     source, target = (clip.sweeps[n].points.astype(np.float64) for n in (here, here + 1))
     flow, moving = sample.flow.double().numpy(), sample.moving.numpy()
     return PaperPair(f"{spec}@{key}", source, target, flow, moving, sample.sweeps)

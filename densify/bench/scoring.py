@@ -15,14 +15,18 @@ from densify.bench.windows import Window
 from densify.depth.accumulate import accumulate
 from densify.geometry import poses
 from densify.geometry.range_image import RangeImage
+from densify.kernels.linking import link
 from densify.readers.true_flow import LabelledFlow, labelled_flow
 from densify.scores import flow_metrics as metrics
 from densify.scores.challenge import CLASSES, ChallengeScorer
 from densify.scores.ghosts import ghost_rate
-from densify.types import Bool, Float, FlowField, LidarSequence, Truth
+from densify.scores.segmentation import SegmentationScorer
+from densify.types import Bool, Float, FlowField, Int, LidarSequence, Truth
 
 _MIN_RETURNS = 30
 _LEAST_MOTION_M = 0.5
+_LINK_M = 0.6
+"""Moving points so near each other are one object, where a method says nothing of objects."""
 
 
 @dataclass(frozen=True)
@@ -32,6 +36,7 @@ class SweepAnswer:
     step, to_key: (N,3) flow to the neighbour towards the key and to the key. at_key: (N,3) key
     frame, where the points are at the key's moment. moving, foreground: (N,) moves now; belongs to
     an object. certain: (N,) moves, at least 0.5 m over the window, on an object of 30 returns.
+    segment: (N,) the moving object that the point belongs to now, -1 none.
     """
 
     step: Float
@@ -40,6 +45,7 @@ class SweepAnswer:
     moving: Bool
     foreground: Bool
     certain: Bool
+    segment: Int
 
     def label(self) -> LabelledFlow:
         """The step, and what belongs to an object."""
@@ -128,6 +134,19 @@ class Scorer:
             "falsely_moving": float(still.mean()) if len(still) else math.nan,
         }
         return {name: _plain(value) for name, value in scores.items()}
+
+    def segmentation_scores(self, steps: Mapping[int, FlowField]) -> dict[str, Any] | None:
+        """What moves above the ground, and which of it is one object, all pairs together, see
+        `densify.scores.segmentation`; None without exact truth. Moving points that a method puts
+        in no object are one where they lie within 0.6 m of each other."""
+        if self.answers is None:
+            return None
+        scorer = SegmentationScorer()
+        for frame in self.sources:
+            above = self.window.above[frame]
+            found = _segments(steps[frame], self.window.points(frame))
+            scorer.add(found[above], self.answers[frame].segment[above])
+        return scorer.scores()
 
     def window_scores(self, to_key: Mapping[int, FlowField]) -> dict[str, Any]:
         """Score the flow to the key, by frame. Accumulated movers, the key's own left out, are the
@@ -218,7 +237,17 @@ def _answer(truth: Truth, window: Window, frame: int) -> SweepAnswer:
         moving=moving,
         foreground=instance >= 0,
         certain=moving & many & far,
+        segment=np.where(moving, instance, -1).astype(np.int64),
     )
+
+
+def _segments(field: FlowField, points: Float) -> Int:
+    """(N,) the object of each moving point, -1 of what stands."""
+    found = np.where(field.moving, field.instance, -1).astype(np.int64)
+    loose = np.flatnonzero(field.moving & (found < 0))
+    _, group = link(points[loose], _LINK_M)
+    found[loose] = found.max(initial=-1) + 1 + group
+    return found
 
 
 def _plain(value: float) -> float | None:

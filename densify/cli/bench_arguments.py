@@ -190,8 +190,9 @@ def _add_bench_paper(benches: Any) -> None:
         type=recording_keys,
         action="append",
         metavar="SPEC@KEYS",
-        help="streets and their frames (K,K,… or A:B[:S]), where no set is given (default: four "
-        "that nothing was tuned on)",
+        help="recordings and their frames (K,K,… or A:B[:S]), streets or, without truth, held "
+        "against what this package's engine finds (default: four streets that nothing was tuned "
+        "on, where no set is given)",
     )
     parser.add_argument(
         "--methods", type=words, metavar="NAME,…", help="(default: all but pointpwc, paper-adam)"
@@ -218,6 +219,12 @@ def _add_bench_paper(benches: Any) -> None:
     parser.add_argument(
         "--curves", action="store_true", help="also over neighbours and over the number of points"
     )
+    parser.add_argument(
+        "--figure",
+        metavar="FILE.png",
+        type=Path,
+        help="draw the first pair from above: the true flow and each method's, 3 times as long",
+    )
     parser.add_argument("--out", metavar="FILE.json", type=Path, help="write every number there")
     add_overwrite(parser)
 
@@ -233,7 +240,7 @@ def _add_bench_readme(benches: Any) -> None:
         "tables",
         nargs="*",
         metavar="TABLE",
-        help="of methods, depth, parts, flow, rates (default: all)",
+        help="of methods, depth, parts, flow, rates, segmentation (default: all)",
     )
     parser.add_argument(
         "--kitti", metavar="DIR", type=Path, help="drive 2011_09_26_drive_0013_sync, for its rows"

@@ -40,6 +40,16 @@ _CHALLENGE_COLUMNS: tuple[Column, ...] = (
 )
 
 
+_SEGMENTATION_COLUMNS: tuple[Column, ...] = (
+    ("segmentation: IoU of moving", ("moving_iou",), ".3f"),
+    ("panoptic quality", ("panoptic_quality",), ".3f"),
+    ("recognition", ("recognition",), ".3f"),
+    ("found", ("num_found",), ",d"),
+    ("missed", ("num_missed",), ",d"),
+    ("false", ("num_false",), ",d"),
+)
+
+
 def flow_table(measured: Mapping[str, Any]) -> str:
     """One benchmark of flow: the methods on the pairs, and what they make of the window."""
     methods: Mapping[str, Any] = measured["methods"]
@@ -64,6 +74,9 @@ def flow_table(measured: Mapping[str, Any]) -> str:
         known = [c for c in _WINDOW_COLUMNS if c[1][0] in some]
         perfect = {"(truth)": measured["truth"]} if measured["truth"] else {}
         lines += ["", table({**windows, **perfect}, (*columns, *known))]
+    segments = {name: row["segmentation"] for name, row in methods.items()}
+    if any(segments.values()):
+        lines += ["", table(segments, _SEGMENTATION_COLUMNS)]
     lines += _challenge_lines({name: row["challenge"] for name, row in methods.items()})
     return "\n".join(lines)
 

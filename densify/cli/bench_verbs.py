@@ -4,13 +4,14 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from densify.cli.answer import Answer
 from densify.cli.progress import progress_on_stderr
 from densify.config import as_mapping, resolve
+from densify.errors import InputError
 
 if TYPE_CHECKING:
     from densify.bench.paper_pairs import PaperPair
@@ -171,6 +172,8 @@ def bench_paper(options: argparse.Namespace) -> Iterator[Answer]:
 
     if options.out is not None:
         check_new_file(options.out, options.overwrite, ".json")
+    if options.figure is not None:
+        check_new_file(options.figure, options.overwrite, ".png", "--figure")
     sets: dict[str, Iterable[PaperPair]] = {}
     if options.flyingthings is not None:
         sets["flyingthings"] = paper_pairs.pairs_of_files(options.flyingthings, options.pairs)
@@ -181,13 +184,17 @@ def bench_paper(options: argparse.Namespace) -> Iterator[Answer]:
             specs = [f"{reader}:{place}" for place in places]
             sets[name] = paper_pairs.pairs_of_boxes(specs, options.pairs)
     if options.data or not sets:
-        given = options.data or _UNSEEN
-        sets["streets"] = (
-            paper_pairs.pair_of_street(spec, key) for spec, keys in given for key in keys
-        )
+        chosen: dict[str, list[tuple[str, int]]] = {}
+        for spec, keys in options.data or _UNSEEN:
+            kind = "streets" if paper_pairs.has_truth(spec) else "against this package's engine"
+            chosen.setdefault(kind, []).extend((spec, key) for key in keys)
+        for kind, places in chosen.items():
+            sets[kind] = map(paper_pairs.pair_of_recording, *zip(*places, strict=True))
     methods = bench.DEFAULT_METHODS if options.methods is None else options.methods
-    measured = {}
+    measured: dict[str, dict[str, Any]] = {}
     for name, pairs in sets.items():
+        if options.figure is not None and not measured:
+            pairs = _with_figure(iter(pairs), options, methods)
         with progress_on_stderr() as progress:
             measured[name] = bench.bench_paper(
                 pairs, methods, options.models, options.points, options.curves, progress
@@ -197,7 +204,30 @@ def bench_paper(options: argparse.Namespace) -> Iterator[Answer]:
         yield Answer(text + "\n", {"sets": [{"set": name, **measured[name]}]})
     if options.out is not None:
         write_table(options.out, {"sets": measured, "published": bench.PUBLISHED})
-    yield Answer(files=_files(options))
+    figure = [] if options.figure is None else [options.figure]
+    yield Answer(files=[*figure, *_files(options)])
+
+
+def _with_figure(
+    pairs: Iterator[PaperPair], options: argparse.Namespace, methods: Sequence[str]
+) -> Iterator[PaperPair]:
+    """The same pairs; the first is drawn as it passes."""
+    from densify.bench.paper import flows_of_pair
+    from densify.outputs.arrows import draw_arrows
+    from densify.outputs.png import write_picture
+
+    for number, pair in enumerate(pairs):
+        if number == 0:
+            points, flows = flows_of_pair(pair, methods, options.models, options.points)
+            try:
+                options.figure.parent.mkdir(parents=True, exist_ok=True)
+                write_picture(options.figure, draw_arrows(points, flows))
+            except OSError as error:
+                reason = error.strerror or error
+                raise InputError(
+                    f"--figure {options.figure}: cannot be written: {reason}"
+                ) from error
+        yield pair
 
 
 def bench_readme(options: argparse.Namespace) -> Iterator[Answer]:

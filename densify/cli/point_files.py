@@ -54,19 +54,23 @@ def read_points(path: Path) -> PointFile:
     return PointFile(points, **_columns(path, beside, len(points)))
 
 
-def check_new_file(path: Path, overwrite: bool, suffix: str = ".npz") -> None:
+def check_new_file(
+    path: Path, overwrite: bool, suffix: str = ".npz", option: str = "--out"
+) -> None:
     """Raise InputError, before the computation, if ``path`` is there already or cannot be made."""
     if path.suffix != suffix:
-        raise InputError(f"--out {path}: expected a name that ends in {suffix}")
+        raise InputError(f"{option} {path}: expected a name that ends in {suffix}")
     if path.is_dir():
-        raise InputError(f"--out {path}: is a folder, expected the name of a {suffix} file")
+        raise InputError(f"{option} {path}: is a folder, expected the name of a {suffix} file")
     if path.exists() and not overwrite:
-        raise InputError(f"--out {path}: already there and kept; give --overwrite or another name")
+        raise InputError(
+            f"{option} {path}: already there and kept; give --overwrite or another name"
+        )
     place = path.parent
     while not os.path.lexists(place):
         place = place.parent
     if not (place.is_dir() and os.access(place, os.W_OK | os.X_OK)):
-        raise InputError(f"--out {path}: cannot write in {place}; choose another --out")
+        raise InputError(f"{option} {path}: cannot write in {place}; choose another")
 
 
 def write_flow(path: Path, field: FlowField) -> None:

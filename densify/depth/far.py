@@ -49,7 +49,9 @@ def standing(registered: RegisteredSweep, sensors: Sensors, travel_m: float) -> 
     """The points of one sweep, in the world. sensors: of the recording."""
     sweep, T_world_lidar = registered.sweep, registered.T_world_lidar
     one = np.zeros(len(sweep), np.int32)
-    normal, spacing_m = tangents(sweep.points, sweep.lidar, one, sensors, [sensors.origins_m])
+    normal, spacing_m = tangents(
+        sweep.points, sweep.lidar, one, np.ones(len(one), bool), sensors, [sensors.origins_m]
+    )
     return Standing(
         points=poses.transform(T_world_lidar, sweep.points).astype(np.float32),
         normal=poses.rotate(T_world_lidar, normal.astype(np.float64)).astype(np.float32),

@@ -26,11 +26,14 @@ def patches(
     sensors: Sensors,
     origins: Mapping[int, Float],
     key_image: RangeImage | None = None,
+    wanted: Bool | None = None,
 ) -> Patches:
     """The patches of ``cloud``, of any use to every camera.
 
     sensors: the scanners that measured it. origins: (S,3) where each of them stood in each source
     sweep, key frame, by frame. key_image: what the key sweep saw; without it nothing is ``free``.
+    wanted: (M,) the points that some camera sees, all if None; of others no more than ``sweep`` is
+    told.
 
     The tangent plane is from the neighbours in azimuth and elevation of the same scanner in the
     same sweep; where they tell of no single surface the patch faces the scanner. A point of another
@@ -40,11 +43,14 @@ def patches(
     """
     frames, inverse = np.unique(cloud.frame, return_inverse=True)
     sweep: NDArray[np.int32] = inverse.ravel().astype(np.int32)
+    if wanted is None:
+        wanted = np.ones(len(cloud), bool)
     normal, spacing_m = tangents(
-        cloud.rigid_points, cloud.lidar, sweep, sensors, [origins[int(f)] for f in frames]
+        *(cloud.rigid_points, cloud.lidar, sweep, wanted),
+        *(sensors, [origins[int(f)] for f in frames]),
     )
     free = np.zeros(len(cloud), bool)
-    other = np.flatnonzero(cloud.frame != key)
+    other = np.flatnonzero(wanted & (cloud.frame != key))
     if key_image is not None and len(other):
         free[other] = vetoed(cloud.points[other], cloud.velocity_m_s[other], key_image, settings)
     return Patches(normal, spacing_m, free, sweep, np.full(len(cloud), -1, np.int32))
@@ -68,10 +74,12 @@ def tangents(
     points: Float,
     lidar: NDArray[np.uint8],
     sweep: NDArray[np.int32],
+    wanted: Bool,
     sensors: Sensors,
     origins: Sequence[Float],
 ) -> tuple[Float32, Float32]:
-    """Normals (M,3) and spacings (M,2), scanner by scanner and sweep by sweep.
+    """Normals (M,3) and spacings (M,2) of the points ``wanted`` (M,), scanner by scanner and sweep
+    by sweep.
 
     points: (M,3), rigidly registered. lidar: (M,) which scanner. sweep: (M,) which of ``origins``,
     (S,3) each.
@@ -92,5 +100,6 @@ def tangents(
         find = kernels.tangents_anywhere if model.unordered else kernels.tangents_on_rings
         for mine in members[number::num_scanners]:
             kernels.nearest_in_cells(seen, mine, grid, cells)
+            mine = mine[wanted[mine]]
             find.over_rows(len(mine), mine, seen, model.table, grid, cells, normal, spacing_m)
     return normal, spacing_m

@@ -56,10 +56,7 @@ class SeenCloud(NamedTuple):
 
     def in_view(self) -> Bool:
         """(M,) the points that some map may show."""
-        found = np.zeros(len(self.cloud), bool)
-        for view in self.views.values():
-            found[view.rows] = True
-        return found
+        return _in_any(self.views, len(self.cloud))
 
     def joined(self, far: SeenCloud | None) -> SeenCloud:
         """With what sweeps beyond the window measured."""
@@ -67,6 +64,14 @@ class SeenCloud(NamedTuple):
             return self
         views = {n: view.joined(far.views[n], len(self.cloud)) for n, view in self.views.items()}
         return SeenCloud(self.cloud.joined(far.cloud), self.patches.joined(far.patches), views)
+
+
+def _in_any(views: Mapping[str, InView], num_points: int) -> Bool:
+    """(num_points,) the points that some map may show."""
+    found = np.zeros(num_points, bool)
+    for view in views.values():
+        found[view.rows] = True
+    return found
 
 
 @dataclass(frozen=True)
@@ -121,8 +126,12 @@ class Views:
     def see(self, cloud: Cloud, visible: bool = True) -> SeenCloud:
         """A cloud as the cameras see it. visible: and which of it the key sweep saw through."""
         key_image = self.key_image if visible else None
-        surface = patches(cloud, self.key, self.settings, self.sensors, self.origins, key_image)
-        return SeenCloud(cloud, surface, {n: e.sees(cloud) for n, e in self.exposures.items()})
+        views = {name: exposure.sees(cloud) for name, exposure in self.exposures.items()}
+        surface = patches(
+            *(cloud, self.key, self.settings, self.sensors, self.origins, key_image),
+            wanted=_in_any(views, len(cloud)),
+        )
+        return SeenCloud(cloud, surface, views)
 
     def far(
         self, found: Standing, T_key_found: Float, stretch: Stretch, standing_only: bool

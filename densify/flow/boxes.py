@@ -22,10 +22,13 @@ MOVES_M_S = 0.5
 @dataclass(frozen=True)
 class BoxMargins:
     """grown_m: boxes are larger by so much on each side; larger takes in mirrors and feet, and more
-    of the ground and of what stands beside. unsure_m: points so much farther outside are unsure."""
+    of the ground and of what stands beside. unsure_m: points so much farther outside are unsure.
+    foot_m: in a box that moves, points lower than so much above its bottom are unsure; larger keeps
+    out more of the road, which does not move, and more of tyres and feet."""
 
     grown_m: float = 0.1
     unsure_m: float = 0.3
+    foot_m: float = 0.1
 
 
 def flow_of_boxes(
@@ -41,8 +44,8 @@ def flow_of_boxes(
     next_boxes: of the two.
 
     Returns the field, whose ``instance`` is the box's row (-1 none), and (N,) bool: False in two
-    boxes, just outside one, in a box that is not there in the next sweep, and where nobody drew
-    boxes.
+    boxes, just outside one, at the foot of one that moves, in a box that is not there in the next
+    sweep, and where nobody drew boxes.
     """
     margins = margins or BoxMargins()
     points = here.sweep.points
@@ -80,6 +83,7 @@ def flow_of_boxes(
             continue
         field.displacement[rows] = poses.transform(T_here_there, in_box) - points[rows]
         field.moving[rows] = True
+        sure[rows[in_box[:, 2] < margins.foot_m - boxes.size_m[k, 2] / 2]] = False
     twice = num_inside > 1
     sure &= ~twice & ~(near & (num_inside == 0))
     field.displacement[twice] = 0.0

@@ -18,6 +18,7 @@ NUM_PLACES = 5
 
 _NONE = 1000  # steps, where there is no seed
 _STRIDE = 3.0  # the colours looked at on the way to a seed, by gap between rays
+_ROUNDED = 1 - 1e-9  # just the share needed is enough, whatever the rounding
 _LEAST, _MOST = 0.7, 1.4  # of a seed's inverse depth: how far its slope is followed
 
 
@@ -192,7 +193,8 @@ def elect(first, last, pixel, inverse, seeds, lab, gap_px, rules, share, elected
     """
     width, num = gap_px.shape[1], len(seeds.directions)
     steps, agrees, whole = np.zeros(num, np.int64), np.zeros(num, np.bool_), np.zeros(num)
-    counted, left, needed = np.zeros(2), np.zeros(2), share / (1 - share)
+    counted, left = np.zeros(2), np.zeros(2)
+    needed = _ROUNDED * share / (1 - share)
     for i in range(first, last):
         v, u = pixel[i] // width, pixel[i] % width
         gap = gap_px[v, u]

@@ -156,6 +156,7 @@ READERS = Table(
             "densify.readers.pandaset.reader",
             recognises=lambda path: (path / "lidar" / "poses.json").is_file(),
             holds="a PandaSet sequence (a folder that holds lidar/poses.json)",
+            boxes="annotations/cuboids/00.pkl.gz",
         ),
         Reader(
             "kitti-360",

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -37,9 +37,12 @@ def read_feather(path: Path, columns: Mapping[str, str], what: str) -> dict[str,
         raise InputError(f"{path}: no such file; expected the columns {', '.join(columns)} in it")
     try:
         table = feather.read_table(path, memory_map=False)
+        there = table.column_names  # decoded now
+        table.validate(full=True)  # columns may point beyond the file
     except Exception as error:  # a damaged schema raises anything
         reason = " ".join(str(error).split())
         raise InputError(f"{path}: not a whole feather file ({reason}); fetch it again") from error
+    _check_there(columns, there, path)
     return column_arrays(table, columns, path)
 
 
@@ -62,9 +65,7 @@ def read_parquet(
     except Exception as error:  # likewise
         reason = " ".join(str(error).split())
         raise InputError(f"{path}: not a whole parquet file ({reason}); fetch it again") from error
-    if len(present) < len(columns):
-        absent = [name for name in columns if name not in there]
-        raise InputError(f"{path}: no column {', '.join(absent)}; got {', '.join(there) or 'none'}")
+    _check_there(columns, there, path)
     return column_arrays(table, columns, path)
 
 
@@ -75,12 +76,14 @@ def column_arrays(table: Any, columns: Mapping[str, str], path: Path) -> dict[st
     "b" bytes, "t" truth values, "l" lists of numbers or None, as arrays in an array of objects.
     Raises InputError, which names the file, if one is absent, has gaps or holds something else.
     """
-    absent = [name for name in columns if name not in table.column_names]
-    if absent:
-        raise InputError(
-            f"{path}: no column {', '.join(absent)}; got {', '.join(table.column_names) or 'none'}"
-        )
+    _check_there(columns, table.column_names, path)
     return {name: _array(table[name], kind, f"{path}: {name}") for name, kind in columns.items()}
+
+
+def _check_there(columns: Mapping[str, str], there: Sequence[str], path: Path) -> None:
+    absent = [name for name in columns if name not in there]
+    if absent:
+        raise InputError(f"{path}: no column {', '.join(absent)}; got {', '.join(there) or 'none'}")
 
 
 def _array(column: Any, kind: str, where: str) -> NDArray[Any]:
@@ -94,7 +97,11 @@ def _array(column: Any, kind: str, where: str) -> NDArray[Any]:
             values = scalar.values
             lists[row] = None if values is None else values.to_numpy(zero_copy_only=False)
         return lists
-    array = column.to_numpy()
+    try:
+        array = column.to_numpy()
+    except Exception as error:  # a damaged column raises anything
+        what = " ".join(repr(error)[:80].split())
+        raise InputError(f"{where}: cannot be decoded ({what}); fetch the file again") from error
     if kind in _TYPES:
         right = type_name in _TYPES[kind] and not column.null_count
     else:

@@ -11,14 +11,20 @@ from densify.errors import InputError
 
 def needed(module: str, extra: str, what: str) -> Any:
     """The imported module. Raises InputError, with the command that installs it, if it is not
-    installed.
+    installed, or with what it lacks.
 
     extra: of densify, that brings it. what: is to be read, such as "Argoverse 2 recordings".
     """
+    package = module.partition(".")[0]
     try:
         return import_module(module)
+    except ModuleNotFoundError as error:
+        raise InputError(
+            f"{what} need the package {package} ({error}); install it with "
+            f"pip install 'densify[{extra}]'"
+        ) from None
     except ImportError as error:
         raise InputError(
-            f"{what} need the package {module.partition('.')[0]} ({error}); install it with "
-            f"pip install 'densify[{extra}]'"
+            f"{what} need the package {package}, which is installed and cannot be loaded here "
+            f"({error}); install the system's library that it names"
         ) from None

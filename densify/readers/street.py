@@ -92,7 +92,9 @@ class Street:
         self.frames = range(self.simulator.num_frames)
         self.cameras: Mapping[str, Camera] = cameras_beside(tilt_deg, cameras)
         self.truth = StreetTruth(self)
-        self._store = _Store(f"{VERSION} {preset} {seed} {sensor}{options}")
+        self._store = _Store()
+        self._swept = _digest(f"{VERSION} {preset} {seed} {sensor}{options}")
+        self._pictured = _digest(f"{VERSION} {preset} {seed} {hz} Hz, with any sensor")
 
     @staticmethod
     def from_spec(spec: str) -> Street:
@@ -160,7 +162,7 @@ class Street:
         self.check(frame)
         return Returns(
             **self._store.get(
-                f"sweep/{frame}",
+                f"{self._swept}/sweep/{frame}",
                 lambda: {
                     k: v for k, v in vars(self.simulator.returns(frame)).items() if v is not None
                 },
@@ -170,8 +172,8 @@ class Street:
     def prepare(self, frames: Sequence[int], images: Sequence[tuple[str, int]] = ()) -> None:
         """Render what is not in the cache yet, on all cores."""
         wanted: dict[str, Callable[[], object]] = {}
-        wanted |= {f"{c}/{number}": partial(self.picture, c, number) for c, number in images}
-        wanted |= {f"sweep/{frame}": partial(self.returns, frame) for frame in frames}
+        wanted |= {f"{self._pictured}/{c}/{n}": partial(self.picture, c, n) for c, n in images}
+        wanted |= {f"{self._swept}/sweep/{frame}": partial(self.returns, frame) for frame in frames}
         missing = [make for name, make in wanted.items() if name not in self._store]
         if missing:
             _ = self.simulator.scene  # else each thread might build one
@@ -188,7 +190,8 @@ class Street:
             )
         return Picture(
             **self._store.get(
-                f"{camera}/{number}", lambda: vars(self.simulator.picture(camera, number))
+                f"{self._pictured}/{camera}/{number}",
+                lambda: vars(self.simulator.picture(camera, number)),
             )
         )
 
@@ -260,6 +263,10 @@ def _degrees(text: str) -> float:
         ) from None
 
 
+def _digest(identity: str) -> str:
+    return hashlib.sha256(identity.encode()).hexdigest()[:16]
+
+
 class _Store:
     """Arrays made once and then kept, a few in memory and all in the cache folder.
 
@@ -267,9 +274,8 @@ class _Store:
     that cannot be read is made anew; a folder that cannot be written only costs time.
     """
 
-    def __init__(self, identity: str) -> None:
-        digest = hashlib.sha256(identity.encode()).hexdigest()[:16]
-        self._folder = own_folder("street") / digest
+    def __init__(self) -> None:
+        self._folder = own_folder("street")
         self._memory: OrderedDict[str, Arrays] = OrderedDict()
         self._lock = threading.Lock()
         self._rendered = False

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""``densify view``: a finished run live, in rerun's viewer."""
+"""``densify view``: a finished run live, in rerun's viewer or in a window of open3d's."""
 
 from __future__ import annotations
 
@@ -20,9 +20,10 @@ def add(commands: Any) -> None:
         commands,
         "view",
         answer,
-        "a run, or keys of a drive, in rerun's viewer: cloud, sweeps, images and movers over time",
-        "Needs pip install 'densify[rerun]' and a screen. Trails of registration alone are there "
-        "too, hidden at first. densify export --to rrd writes the same as a file.",
+        "a run, or keys of a drive, live: cloud, sweeps, images, depth and movers over time",
+        "Needs a screen, and pip install 'densify[rerun]' or 'densify[open3d]'. Trails of "
+        "registration alone are there too, hidden at first. densify export --to rrd writes what "
+        "rerun shows as a file; densify report needs nothing but a browser.",
     )
     parser.add_argument(
         "place",
@@ -31,22 +32,36 @@ def add(commands: Any) -> None:
         help="folder of one key, such as densify-out/000120, or of several of a drive",
     )
     parser.add_argument(
+        "--with",
+        dest="viewer",
+        choices=("rerun", "open3d"),
+        default="rerun",
+        help="rerun: its viewer, which stays open; open3d: a window, until it is closed (default: "
+        "rerun)",
+    )
+    parser.add_argument(
         "--port",
         type=natural,
         default=_PORT,
         metavar="N",
-        help="of a viewer that is open already; a new one is opened if none listens there "
+        help="of a rerun viewer that is open already; a new one is opened if none listens there "
         f"(default: {_PORT})",
     )
     add_camera(parser)
 
 
 def answer(options: argparse.Namespace) -> Iterator[Answer]:
-    """Show it, and leave the viewer open."""
+    """Show it. rerun's viewer is left open, open3d's window is waited for."""
     from densify.outputs.export.finished_run import finished_runs
-    from densify.outputs.export.rrd import show
 
     runs = finished_runs(options.place, chosen=options.cameras)
-    show(runs, options.port)
+    if options.viewer == "open3d":
+        from densify.outputs.export import open3d_window
+
+        open3d_window.show(runs)
+    else:
+        from densify.outputs.export import rrd
+
+        rrd.show(runs, options.port)
     keys = [run.key for run in runs]
     yield Answer(f"shown: key {', '.join(map(str, keys))}", {"keys": keys})

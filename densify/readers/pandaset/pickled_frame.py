@@ -21,7 +21,8 @@ from numpy.typing import NDArray
 from densify.errors import InputError
 from densify.files.content import gunzipped, read_bytes
 
-_NUMBERS = re.compile(r"[fiu][1248]")
+_NUMBERS = re.compile(r"[fiu][1248]|b1")
+_OBJECTS = "O8"
 
 
 class _Record:
@@ -69,7 +70,8 @@ class _Unpickler(pickle._Unpickler):
 
 
 def read_columns(path: Path) -> dict[str, NDArray[Any]]:
-    """Columns of a gzipped pickle of a data frame of numbers, by name, (N,) each.
+    """Columns of a gzipped pickle of a data frame of numbers and texts, by name, (N,) each; where
+    there are texts, of objects, each of which the caller must check.
 
     Raises InputError if the file is missing, damaged, or anything else than such a frame, above all
     if it names a function that frames do not need; nothing in it is run.
@@ -79,8 +81,9 @@ def read_columns(path: Path) -> dict[str, NDArray[Any]]:
         return _columns(_Unpickler(io.BytesIO(gunzipped(data, path))).load())
     except Exception as error:  # any kind: the file decides which
         raise InputError(
-            f"{path}: not a gzipped pandas data frame of numbers ({str(error) or repr(error)}); "
-            f"nothing in it was run; fetch the file again from where the data set is published"
+            f"{path}: not a gzipped pandas data frame of numbers and texts "
+            f"({str(error) or repr(error)}); nothing in it was run; fetch the file again from "
+            f"where the data set is published"
         ) from error
 
 
@@ -92,8 +95,9 @@ def _columns(frame: Any) -> dict[str, NDArray[Any]]:
     names = managed["axes"][0].args[1]["data"].state[-1]
     columns = {}
     for block in managed["blocks"]:
-        values = _array(block["values"])
-        for row, column in enumerate(range(*block["mgr_locs"].args)):
+        values, places = _array(block["values"]), block["mgr_locs"]
+        is_slice = isinstance(places, _RECORDS["builtins.slice"])
+        for row, column in enumerate(range(*places.args) if is_slice else _array(places).tolist()):
             columns[str(names[column])] = values[row]
     return columns
 
@@ -101,6 +105,10 @@ def _columns(frame: Any) -> dict[str, NDArray[Any]]:
 def _array(record: _Record) -> NDArray[Any]:
     _, shape, dtype, by_columns, data = record.state
     kind, order = dtype.args[0], dtype.state[1]
+    if kind == _OBJECTS and isinstance(data, list):
+        objects = np.empty(len(data), object)
+        objects[:] = data
+        return objects.reshape(shape, order="F" if by_columns else "C")
     if not _NUMBERS.fullmatch(kind):
         raise ValueError(f"a column of the kind {kind!r}")
     array = np.frombuffer(data, np.dtype(kind).newbyteorder(order))

@@ -4,6 +4,7 @@
 
     002/lidar/{00.pkl.gz, ..., poses.json, timestamps.json}
     002/camera/front_camera/{00.jpg, ..., poses.json, timestamps.json, intrinsics.json}
+    002/annotations/cuboids/{00.pkl.gz, ...}    optional: tracked boxes
 
 What the files say, and what was found where they are silent (sequence 002):
 
@@ -22,6 +23,10 @@ What the files say, and what was found where they are silent (sequence 002):
   swings lie on the smoothest curve (from three starts the same to 1 mm). They are constants below,
   and the same vehicle drove all sequences.
 - The lidar frame here is the Pandar64's: x forward, y left, z along its axis.
+- Boxes are in the world. What moves where both scanners see it has two, each drawn around the
+  points of one (``cuboids.sensor_id``) and under a name of its own, as the scanners meet it at
+  different times. ``dimensions`` are width, length, height, and ``yaw`` turns the front from the
+  world's y (the devkit's documentation; not tried on real boxes).
 - Cameras are pinholes without distortion, as the data set's own tools project; their size is that
   of the images. Each image has a pose and a stamp of its own, 19 to 100 ms before the sweep's;
   where a camera sits is taken from that of its images at which the vehicle moved least.
@@ -40,9 +45,10 @@ from densify.files.texts import read_json
 from densify.geometry import poses
 from densify.readers.file_sequence import FileSequence, Returns, quaternion_pose, truth_beside
 from densify.readers.files import numbered_files
+from densify.readers.pandaset.cuboids import read_cuboids
 from densify.readers.pandaset.pickled_frame import read_columns
 from densify.readers.pose_track import PoseTrack
-from densify.types import Camera, Float, Int
+from densify.types import Boxes, Camera, Float, Int
 
 _AXIS = np.array([-0.0157, 0.00045, 1.0])  # of the Pandar64, forward left up
 _PLACE_M = np.array([0.777, 0.002, 1.8593])
@@ -129,6 +135,15 @@ class PandaSet(FileSequence):
         """(4,4) the data set's own pose of an image."""
         self.check_image(camera, number)
         return self._T_world_cam[camera][number]
+
+    def boxes(self, frame: int) -> Boxes | None:
+        """See `densify.types.KnowsBoxes`; None without the frame's file. Raises InputError for one
+        that is malformed."""
+        self.check_frame(frame)
+        path = self.where / "annotations" / "cuboids" / f"{frame:02d}.pkl.gz"
+        if not path.is_file():
+            return None
+        return read_cuboids(path, self._pose(frame))
 
     def _way_m(self, stamp_ns: int) -> float:
         """How far the vehicle goes between the poses around that time: the nearer to nothing, the

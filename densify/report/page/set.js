@@ -111,7 +111,7 @@ function facts() {
   $("facts").replaceChildren(
     fact("keys done", whole(count("done")), page.num_left ? `${whole(page.num_left)} to be made` : " "),
     fact("put aside", whole(count("aside")), `${whole(count("failed"))} failed`),
-    fact("recordings", whole(new Set(page.rows.map((row) => row.drive)).size), `${page.cameras.length} cameras`),
+    fact("recordings", whole(new Set(page.rows.map((row) => row.drive)).size), `${page.cameras.length} camera${page.cameras.length === 1 ? "" : "s"}`),
     fact("measured pixels", percent(mean(of("density")), 1), `${percent(mean(of("density_filled")), 1)} filled; means`),
     fact("wrong, key held out", percent(mean(of("outliers"))), `ghosts ${percent(mean(of("ghost")))}; means`),
     fact("hours of computing", (seconds / 3600).toFixed(1), `${(seconds / Math.max(1, page.rows.length)).toFixed(1)} s a key`),
