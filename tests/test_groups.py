@@ -44,6 +44,7 @@ def test_a_static_world_has_no_flow_to_the_last_bit(extra, scanner, ego):
 
 
 CAR, FAST, WALKER = 1, 2, 3
+FLAT_BACK = Scanner(32, 540)
 
 
 @pytest.fixture(scope="module")
@@ -148,6 +149,16 @@ def test_the_trailer_of_a_turning_truck_is_found():
     assert np.median(found.errors_m(2)) < 0.05
     assert np.quantile(found.errors_m(2), 0.9) < 0.1
     assert found.false_share() < 1e-3
+
+
+def test_a_flat_back_that_is_followed_for_long_does_not_slide_aside():
+    """Nothing but its two ends tells where it is, and 13 sweeps add up what each is off."""
+    scene = Scene(World((*street(60.0), car(10, -1.5, 6, 1))), Arc(0, -1.5, 0, 4.0), FLAT_BACK)
+    found = Found.around(8, scene, 6)
+    assert found.share_moving(1) > 0.95
+    assert np.quantile(found.errors_m(1), 0.9) < 0.03
+    aside = [f.velocity_m_s[(s.instance == 1) & f.moving, 1] for _, s, f in found.near_key()]
+    assert np.abs(np.concatenate(aside)).max() < 0.25
 
 
 def test_cars_in_a_row_keep_their_own_motion():

@@ -19,7 +19,7 @@ from densify.flow.tracking.clock import Clock
 from densify.flow.tracking.evidence import FreeSpace, Standing
 from densify.flow.tracking.lone_rings import in_line, linked_in_line, single_rings
 from densify.flow.tracking.looks import Look, looks_of
-from densify.flow.tracking.radial import Radial
+from densify.flow.tracking.proof import proven_to_move
 from densify.flow.tracking.shapes import Shape
 from densify.flow.tracking.sightings import Track
 from densify.flow.tracking.vote import DistanceField, vote
@@ -40,15 +40,12 @@ _SHARE_UNSEEN = 0.5  # of the points a look usually shows
 _PREDICTION_STD, _PREDICTION_S = np.array([0.3, 0.3, 0.06]), 0.25
 _REFINED_STD = np.array([0.15, 0.15, 0.03])  # m, m, rad: of the smooth motion
 _RECENT_S = 0.4  # the states in so long tell a rate
+# What a track starts with tells it as states do of that sum of squared times, but no turning.
+_GIVEN_S2 = np.array([0.02, 0.02, 0.02, 0.0])
 _STEADY = np.array([1.0, 1.0, 1.0, 0.9])  # of what it was then: turns level out
-_ROUGH_M, _ROUGH_PER_GAP, _ROUGH_S = 0.04, 0.2, 0.003  # by gap of rings, by speed
-_LEAST_WAY_M, _LEAST_WAY_PER_RESIDUAL = 0.35, 8.0
-_NUM_ASKED = 60
 _MISSES_ALLOWED, _MISSED_S = 1, 0.2  # either: a track ends when both are exceeded
 _BESIDE_M = 1.0  # as far as what is towed is from what tows it
 _MAX_CONTRADICTED_PARTS = 0.05  # of the points of a part of an object
-_LEAST_STATES, _LEAST_S = 3, 0.15
-_MAX_CONTRADICTIONS = 0.3  # of those that standing still leaves
 
 
 def follow_groups(
@@ -82,7 +79,7 @@ def follow_groups(
             velocity = radial.rows(members).corrected(velocity)
         for start in (velocity, *_velocities_beside(looks[n], members, bodies, space)):
             track = _follow(members, n, start, looks, free, ground, clock)
-            proven = _prove(track, standing, space)
+            proven = proven_to_move(track, standing, space)
             if proven:
                 break
         if proven:
@@ -186,16 +183,18 @@ def _at_once(c: Standing, rows: np.ndarray, rate: Float, time_s: float) -> Float
 
 def _predict(track: Track, rate: Float, num: int, time_s: float) -> tuple[Float, Float, Float]:
     """State, its rate, and how far off (3,) the state may be in x y and yaw, by the constant
-    velocity of the ``num`` states nearest in time."""
+    velocity of the ``num`` states nearest in time. rate: given at the start."""
     nearest_first = sorted(track.sightings.items(), key=lambda s: (abs(s[1].seen_s - time_s), s[0]))
-    known = [sighting for _, sighting in nearest_first[:num]]
-    ahead_s = time_s - known[0].seen_s
-    if len(known) > 1:
-        t = np.array([sighting.seen_s for sighting in known])
+    known = dict(nearest_first[:num])
+    states = np.stack([sighting.state for sighting in known.values()])
+    t = np.array([sighting.seen_s for sighting in known.values()])
+    ahead_s = time_s - t[0]
+    if len(t) > 1:
         t -= t.mean()
-        rate = t @ np.stack([sighting.state for sighting in known]) / (t @ t) * _STEADY
+        given_s2 = _GIVEN_S2 * (next(iter(track.sightings)) in known)
+        rate = (t @ states + given_s2 * rate) / (t @ t + given_s2) * _STEADY
     std = _PREDICTION_STD * max(1.0, abs(ahead_s) / _PREDICTION_S)
-    return known[0].state + rate * ahead_s, rate, std
+    return states[0] + rate * ahead_s, rate, std
 
 
 def _find(
@@ -324,60 +323,3 @@ def _refine(track: Track, standing: Sequence[Standing], ground: HeightMap) -> No
     track.smooth()
     if track.path.residual_m > before[1].residual_m:
         track.sightings, track.path = before
-
-
-def _prove(track: Track, standing: Sequence[Standing], space: FreeSpace) -> bool:
-    """Fit the smooth motion; True if the track certainly moves.
-
-    The motion must be smooth, long enough to be told from noise, and must do away with the
-    contradictions that brought the group here: where the sweeps see through its points at their
-    rigid places, they must not see through them at the moved ones. Where radial velocities were
-    measured, it must have them.
-    """
-    seen_s = np.ptp([sighting.seen_s for sighting in track.sightings.values()])
-    if len(track.sightings) < _LEAST_STATES or seen_s < _LEAST_S:
-        return False
-    track.smooth()
-    residual_m = track.path.residual_m
-    begin, end = track.path(track.path.begin_s), track.path(track.path.end_s)
-    travelled = float(np.linalg.norm((end - begin)[:2]))
-    gap_m = space.gap_m(track.centre, next(iter(track.claimed)))
-    rough_m = _ROUGH_M + _ROUGH_PER_GAP * gap_m + _ROUGH_S * travelled / seen_s
-    if residual_m > rough_m or travelled < max(_LEAST_WAY_M, _LEAST_WAY_PER_RESIDUAL * residual_m):
-        return False
-    if not _as_fast_as_measured(track, standing):
-        return False
-    still, moved = _contradictions(track, standing, space)
-    return moved <= _MAX_CONTRADICTIONS * still
-
-
-def _as_fast_as_measured(track: Track, standing: Sequence[Standing]) -> bool:
-    """Whether the motion has the radial velocities that were measured, where any were."""
-    parts, velocities = [], []
-    for j, rows in track.claimed.items():
-        radial = standing[j].radial
-        if radial is not None:
-            at_s = float(standing[j].time_s[rows].mean())
-            parts.append(radial.rows(rows))
-            velocities.append(track.velocity_m_s(standing[j].points[rows], at_s))
-    return not parts or Radial.together(parts).agrees(np.concatenate(velocities))
-
-
-def _contradictions(
-    track: Track, standing: Sequence[Standing], space: FreeSpace
-) -> tuple[int, int]:
-    """How many looks through the track's points the sweeps have: standing still, and moved."""
-    asked = {i: rows[:: len(rows) // _NUM_ASKED + 1] for i, rows in track.claimed.items()}
-    points = {i: standing[i].points[rows] for i, rows in asked.items()}
-    body = {i: track.undo(points[i], standing[i].time_s[rows]) for i, rows in asked.items()}
-    still = moved = 0
-    for j, at_s in enumerate(space.clock.time_s):
-        from_others = [i for i in space.others(j) if i in asked]
-        if not from_others:
-            continue
-        carried = track.place(np.concatenate([body[i] for i in from_others]), at_s)
-        velocity_m_s = track.velocity_m_s(carried, at_s)
-        moved += int(space.seen_through(carried, j, velocity_m_s).sum())
-        standing_still = np.concatenate([points[i] for i in from_others])
-        still += int(space.seen_through(standing_still, j).sum())
-    return still, moved

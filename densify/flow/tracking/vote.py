@@ -18,6 +18,7 @@ _VOTE_NEAR_S = 0.1  # the nearer of the sweeps asked; the farther ones are twice
 _VOTE_STEP_M = 0.2
 _VOTE_REACH_M = 0.6
 _VOTE_POINTS = 60
+_FINE_S, _FINE_M_S = 0.5, 0.2  # asked last, so far away and in such steps
 
 
 @dataclass(frozen=True)
@@ -57,25 +58,47 @@ class DistanceField:
 
 def vote(points: Float, i: int, fields: Sequence[DistanceField], clock: Clock) -> Float:
     """(3,) m/s in the plane: where the group that sweep i saw is in four sweeps at once, about 0.1
-    and 0.2 s before and after, or as near to that as the rate allows."""
+    and 0.2 s before and after, or as near to that as the rate allows.
+
+    Along a flat side only its ends tell how fast it slides, by less than a voxel in so short a
+    time, and aligned with what it covers it slides on as it was started. So they are asked again
+    within 0.5 s.
+    """
     near_s = clock.num_in(_VOTE_NEAR_S) * clock.period_ns * 1e-9
-    asked = [clock.at(i, later_s) for later_s in (-2 * near_s, -near_s, near_s, 2 * near_s)]
-    around = sorted({j for j in asked if j is not None})
-    time_s = clock.time_s
     coarse = 2 * _VOTE_STEP_M / near_s
-
-    def best(velocities: Float, num_points: int) -> Float:
-        sample = points[:: len(points) // num_points + 1]
-        cost = np.zeros(len(velocities))
-        for j in around:
-            shift = velocities * (time_s[j] - time_s[i])
-            cost += fields[j](sample + shift[:, None, :]).mean(1)
-        return velocities[np.argmin(cost + 1e-3 * np.linalg.norm(velocities, axis=1))]
-
+    near = _sweeps_around(i, near_s, clock)
     n = int(_MAX_SPEED_M_S / coarse)
-    rough = best(_grid(n) * coarse, _VOTE_POINTS)
-    # Only the ends of a long flat side tell how fast it slides: now with more points.
-    return best(rough + _grid(6) * coarse / 3, 10 * _VOTE_POINTS)
+    rough = _best(points, i, fields, clock, near, _grid(n) * coarse, _VOTE_POINTS)
+    finer = rough + _grid(6) * coarse / 3
+    found = _best(points, i, fields, clock, near, finer, 10 * _VOTE_POINTS)
+    n = max(1, round(coarse / 3 / _FINE_M_S))
+    finest = found + _grid(n) * coarse / 3 / n
+    both = near + _sweeps_around(i, max(_FINE_S / 2, near_s), clock)
+    return _best(points, i, fields, clock, both, finest, 10 * _VOTE_POINTS)
+
+
+def _sweeps_around(i: int, step_s: float, clock: Clock) -> list[int]:
+    """The sweeps one and two steps before and after sweep i, as far as there are any."""
+    asked = [clock.at(i, later_s) for later_s in (-2 * step_s, -step_s, step_s, 2 * step_s)]
+    return sorted({j for j in asked if j is not None})
+
+
+def _best(
+    points: Float,
+    i: int,
+    fields: Sequence[DistanceField],
+    clock: Clock,
+    around: Sequence[int],
+    velocities: Float,
+    num_points: int,
+) -> Float:
+    """Which of (V,3) m/s brings some of the points nearest to what these sweeps saw."""
+    sample = points[:: len(points) // num_points + 1]
+    cost = np.zeros(len(velocities))
+    for j in around:
+        shift = velocities * (clock.time_s[j] - clock.time_s[i])
+        cost += fields[j](sample + shift[:, None, :]).mean(1)
+    return np.asarray(velocities[np.argmin(cost + 1e-3 * np.linalg.norm(velocities, axis=1))])
 
 
 def _grid(n: int) -> Float:

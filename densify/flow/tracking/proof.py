@@ -1,0 +1,80 @@
+# SPDX-License-Identifier: MIT
+"""The proof that what was followed moves: its smooth motion explains what was measured."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from densify.flow.tracking.evidence import FreeSpace, Standing
+from densify.flow.tracking.radial import Radial
+from densify.flow.tracking.sightings import Track
+
+_ROUGH_M, _ROUGH_PER_GAP, _ROUGH_S = 0.04, 0.2, 0.003  # by gap of rings, by speed
+_LEAST_WAY_M, _LEAST_WAY_PER_RESIDUAL = 0.35, 8.0
+_NUM_ASKED = 60
+_LEAST_STATES, _LEAST_S = 3, 0.15
+_MAX_CONTRADICTIONS = 0.3  # of those that standing still leaves,
+_LEAST_CONTRADICTIONS, _LEAST_SHARE = 20, 0.08  # which are so many, or so many of those asked
+
+
+def proven_to_move(track: Track, standing: Sequence[Standing], space: FreeSpace) -> bool:
+    """Fit the smooth motion of a track; True if it certainly moves.
+
+    The motion must be smooth, long enough to be told from noise, and must do away with the
+    contradictions that brought the group here: where the sweeps see through its points at their
+    rigid places, they must not see through them at the moved ones. A few looks through a piece of a
+    side that slides along itself prove nothing. Where radial velocities were measured, it must have
+    them.
+    """
+    seen_s = np.ptp([sighting.seen_s for sighting in track.sightings.values()])
+    if len(track.sightings) < _LEAST_STATES or seen_s < _LEAST_S:
+        return False
+    track.smooth()
+    residual_m = track.path.residual_m
+    begin, end = track.path(track.path.begin_s), track.path(track.path.end_s)
+    travelled = float(np.linalg.norm((end - begin)[:2]))
+    gap_m = space.gap_m(track.centre, next(iter(track.claimed)))
+    rough_m = _ROUGH_M + _ROUGH_PER_GAP * gap_m + _ROUGH_S * travelled / seen_s
+    if residual_m > rough_m or travelled < max(_LEAST_WAY_M, _LEAST_WAY_PER_RESIDUAL * residual_m):
+        return False
+    if not _as_fast_as_measured(track, standing):
+        return False
+    still, moved, num_asked = _contradictions(track, standing, space)
+    enough = still >= min(_LEAST_CONTRADICTIONS, _LEAST_SHARE * num_asked)
+    return enough and moved <= _MAX_CONTRADICTIONS * still
+
+
+def _as_fast_as_measured(track: Track, standing: Sequence[Standing]) -> bool:
+    """Whether the motion has the radial velocities that were measured, where any were."""
+    parts, velocities = [], []
+    for j, rows in track.claimed.items():
+        radial = standing[j].radial
+        if radial is not None:
+            at_s = float(standing[j].time_s[rows].mean())
+            parts.append(radial.rows(rows))
+            velocities.append(track.velocity_m_s(standing[j].points[rows], at_s))
+    return not parts or Radial.together(parts).agrees(np.concatenate(velocities))
+
+
+def _contradictions(
+    track: Track, standing: Sequence[Standing], space: FreeSpace
+) -> tuple[int, int, int]:
+    """How many looks through the track's points the sweeps have, standing still and moved, and how
+    many there may have been."""
+    asked = {i: rows[:: len(rows) // _NUM_ASKED + 1] for i, rows in track.claimed.items()}
+    points = {i: standing[i].points[rows] for i, rows in asked.items()}
+    body = {i: track.undo(points[i], standing[i].time_s[rows]) for i, rows in asked.items()}
+    still = moved = num_asked = 0
+    for j, at_s in enumerate(space.clock.time_s):
+        from_others = [i for i in space.others(j) if i in asked]
+        if not from_others:
+            continue
+        carried = track.place(np.concatenate([body[i] for i in from_others]), at_s)
+        velocity_m_s = track.velocity_m_s(carried, at_s)
+        moved += int(space.seen_through(carried, j, velocity_m_s).sum())
+        standing_still = np.concatenate([points[i] for i in from_others])
+        still += int(space.seen_through(standing_still, j).sum())
+        num_asked += len(carried)
+    return still, moved, num_asked
