@@ -44,6 +44,7 @@ _RECENT_S = 0.4  # the states in so long tell a rate
 _GIVEN_S2 = np.array([0.02, 0.02, 0.02, 0.0])
 _STEADY = np.array([1.0, 1.0, 1.0, 0.9])  # of what it was then: turns level out
 _MISSES_ALLOWED, _MISSED_S = 1, 0.2  # either: a track ends when both are exceeded
+_LEAST_WIDTH_M = 0.1
 _BESIDE_M = 1.0  # as far as what is towed is from what tows it
 _MAX_CONTRADICTED_PARTS = 0.05  # of the points of a part of an object
 
@@ -68,7 +69,7 @@ def follow_groups(
     bodies: list[tuple[Track, Float]] = []
     for n, group in _groups_to_start(seen, clock):
         members = group[looks[n].gather(free)[group] & looks[n].gather(untried)[group]]
-        if len(members) < _MIN_POINTS:
+        if len(members) < _MIN_POINTS or _is_line_on(bodies, looks[n], members):
             continue
         if velocities_m_s is None:
             velocity = vote(seen[n].points[members], n, fields, clock)
@@ -112,6 +113,17 @@ def _groups_to_start(standing: Sequence[Standing], clock: Clock) -> list[tuple[i
         good = np.flatnonzero((size >= _MIN_POINTS) & (seeds >= _MIN_SEED_SHARE * size))
         groups += [(i, np.flatnonzero(c.cluster == k)) for k in good]
     return sorted(groups, key=worth, reverse=True)
+
+
+def _is_line_on(bodies: Sequence[tuple[Track, Float]], look: Look, members: np.ndarray) -> bool:
+    """Whether a group is an upright line close to a proven track: rays one above the other that
+    meet a part of it. Followed by itself it would stay where the rays are."""
+    line = look.seen.points[members]
+    if np.linalg.norm(np.ptp(line[:, :2], axis=0)) >= _LEAST_WIDTH_M:
+        return False
+    tree = BoxTree(line)
+    there = (track.place(points, track.seen_at(look.time_ns)) for track, points in bodies)
+    return any(np.isfinite(tree.nearest(points, _BESIDE_M)[0]).any() for points in there)
 
 
 def _velocities_beside(
