@@ -48,7 +48,7 @@ function scoreTable(title, found, source, product, camera) {
 
 // curves: [{name, points: [[x, y], ...], rgb, dashed}]. Shares, y on a logarithmic scale.
 function chart({ title, note, xName, yName, curves, xLog = false, diagonal = false }) {
-  const [width, height, left, bottom, top, right] = [520, 300, 56, 36, 10, 12];
+  const [width, height, left, bottom, top, right] = [520, 300, 56, 36, 10, 24];
   const drawn = curves.map((c) => ({ ...c, points: c.points.filter(([x, y]) => isNumber(x) && isNumber(y) && y > 0 && (!xLog || x > 0)) })).filter((c) => c.points.length);
   const panel = element("div", { class: "panel" }, element("h3", {}, title));
   if (!drawn.length) return null;
