@@ -16,7 +16,8 @@ _LEAST_WAY_M, _LEAST_WAY_PER_RESIDUAL = 0.35, 8.0
 _NUM_ASKED = 60
 _LEAST_STATES, _LEAST_S = 3, 0.15
 _MAX_CONTRADICTIONS = 0.3  # of those that standing still leaves,
-_LEAST_CONTRADICTIONS, _LEAST_SHARE = 20, 0.08  # which are so many, or so many of those asked
+# which are so many, or of few looks this share, and of many at least that one.
+_LEAST_CONTRADICTIONS, _SHARE_OF_FEW, _LEAST_SHARE = 20, 0.08, 0.01
 
 
 def proven_to_move(track: Track, standing: Sequence[Standing], space: FreeSpace) -> bool:
@@ -42,8 +43,8 @@ def proven_to_move(track: Track, standing: Sequence[Standing], space: FreeSpace)
     if not _as_fast_as_measured(track, standing):
         return False
     still, moved, num_asked = _contradictions(track, standing, space)
-    enough = still >= min(_LEAST_CONTRADICTIONS, _LEAST_SHARE * num_asked)
-    return enough and moved <= _MAX_CONTRADICTIONS * still
+    least = min(_LEAST_CONTRADICTIONS, _SHARE_OF_FEW * num_asked)
+    return still >= max(least, _LEAST_SHARE * num_asked) and moved <= _MAX_CONTRADICTIONS * still
 
 
 def _as_fast_as_measured(track: Track, standing: Sequence[Standing]) -> bool:
