@@ -140,6 +140,10 @@ def test_what_is_under_the_pointer(opened: Opened, run: Path) -> None:
 
 def foreground(opened: Opened) -> np.ndarray:
     """(H,W) where the 3-D view is not background, without its border and the note in its corner."""
+    opened.value(  # until all points are drawn
+        """new Promise((done) => { const look = () => cloudPane.whole && !cloudPane.waiting
+        ? done() : requestAnimationFrame(look); look(); })"""
+    )
     shown = pixels(opened.picture("#space"))[20:-60, 20:-20]
     return np.abs(shown - [10, 7, 5]).max(axis=2) > 12
 
