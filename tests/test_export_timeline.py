@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import socket
 import subprocess
 import sys
@@ -277,6 +278,7 @@ class TestRerun:
             ["rerun", "--port", str(port), "--save", kept],
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
+            start_new_session=True,  # the command starts the server itself
         )
         try:
             for _ in range(100):
@@ -287,7 +289,7 @@ class TestRerun:
             assert exit_code("view", street, "--port", port) == 0
             time.sleep(2.0)
         finally:
-            server.terminate()
+            os.killpg(server.pid, signal.SIGTERM)
             server.wait(30)
         found = self.read(kept)
         cloud = read_cloud(street / "cloud.laz")
