@@ -40,7 +40,9 @@ def test_a_row_is_what_its_bench_measures(capsys, monkeypatch):
 def test_unknown_tables_are_refused_before_anything_is_measured(capsys):
     assert main(["bench", "readme", "flows"]) == 2
     said = capsys.readouterr().err
-    assert "flows" in said and "methods, depth, parts, flow, rates, segmentation, pairs" in said
+    assert (
+        "flows" in said and "methods, depth, parts, flow, rates, segmentation, pairs, prior" in said
+    )
 
 
 def test_real_rows_come_with_their_folders(tmp_path):

@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 from densify import pipeline
 from densify.bench.depth import bench_depth
 from densify.bench.flow import bench_flow
+from densify.bench.priors import FAULTS, Completed, bench_priors
 from densify.bench.two_clouds import bench_two_clouds
 from densify.config import Config, resolve
 from densify.errors import InputError
@@ -74,6 +75,12 @@ _PAIRS = tuple(
     for data, seed in zip(
         ("street", "street:crossing", "street:highway") * 2, range(61, 67), strict=True
     )
+)
+_PRIORS = (
+    Scene("street?seed=71", (60,)),
+    Scene("street:crossing?seed=72", (90,)),
+    Scene("street:highway?seed=73", (60,)),
+    Scene("street?seed=74", (100,), "image_03"),
 )
 _PARTS = {
     "all parts": (),
@@ -265,6 +272,20 @@ def _row_of_pairs(scene: Scene) -> list[list[str]]:
     ]
 
 
+def _row_of_priors(scene: Scene) -> list[list[str]]:
+    """Pixels that came from priors, by the right kind and scale alone and as fitted."""
+    made = bench_priors(open_sequence(scene.data), scene.keys[0], scene.camera)
+
+    def cell(found: Completed) -> str:
+        if not found.share:
+            return "not used"
+        outliers = _percent(found.scaled.outliers, 1), _percent(found.fitted.outliers, 1)
+        return f"{' → '.join(outliers)} %, {found.scaled.abs_rel:.3f} → {found.fitted.abs_rel:.3f}"
+
+    share = max(found.share for found in made.values())
+    return [[str(scene), f"{_percent(share, 0)} %", *map(cell, made.values())]]
+
+
 def _centimetres(value_m: float | None) -> str:
     return "–" if value_m is None else f"{100 * value_m:.1f} cm"
 
@@ -323,5 +344,12 @@ TABLES: Mapping[str, _Table] = {
         ("movers", "within 10 cm", "what stands", "falsely moving"),
         _PAIRS,
         _row_of_pairs,
+    ),
+    "prior": _Table(
+        "Exact depth as the prior, made worse: wrong pixels and mean relative error of what came "
+        "from it, with the right kind and scale alone → as fitted.",
+        ("of the image", *FAULTS),
+        _PRIORS,
+        _row_of_priors,
     ),
 }
