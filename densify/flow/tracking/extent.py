@@ -173,6 +173,8 @@ def lengthen(
         own = track.carry(seen.points[mine], seen.time_s[mine], at_s)[:, :2] @ ahead
         rows, along = rows[fits], along[fits, 0]
         linked = _without_hole(along, own)
+        if not linked.any():
+            continue
         rows, along = rows[linked], along[linked] - np.median(own)
         rows = rows[_uncontradicted(track, seen, rows, along, i, space)]
         if len(rows) and _leaves(track, seen, mine, rows, i, standing, space.clock):
@@ -204,10 +206,7 @@ def _uncontradicted(
     ends = np.zeros((2, num_steps), bool)
     body = track.undo(seen.points[rows], seen.time_s[rows])
     for j in space.others(i):
-        at_s = space.clock.time_s[j]
-        carried = track.place(body, at_s)
-        velocity_m_s = track.velocity_m_s(carried, at_s)
-        through = step[space.seen_through(carried, j, velocity_m_s)]
+        through = step[track.seen_through(body, j, space)]
         looks = np.bincount(through, minlength=2 * num_steps).reshape(2, num_steps).cumsum(axis=1)
         ends |= looks > _MAX_CONTRADICTED * size
     kept: Bool = ~np.logical_or.accumulate(ends, axis=1).ravel()[step]

@@ -9,11 +9,11 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from densify.flow.surface_matching import apply, undo
-from densify.flow.tracking.evidence import Standing
+from densify.flow.tracking.evidence import FreeSpace, Standing
 from densify.flow.tracking.looks import Look
 from densify.flow.tracking.paths import Path
 from densify.geometry.height_map import HeightMap
-from densify.types import Float
+from densify.types import Bool, Float
 
 _MANY_POINTS = 100  # more do not place a look better
 _BESIDE_M = 1.0
@@ -66,6 +66,13 @@ class Track:
         velocity_m_s[:, 0] -= rate[3] * (points[:, 1] - self.centre[1] - state[1])
         velocity_m_s[:, 1] += rate[3] * (points[:, 0] - self.centre[0] - state[0])
         return velocity_m_s
+
+    def seen_through(self, body: Float, j: int, space: FreeSpace) -> Bool:
+        """(N,) which of the points in the object's own frame sweep number j sees through, where
+        they are when it is taken."""
+        at_s = space.clock.time_s[j]
+        carried = self.place(body, at_s)
+        return space.seen_through(carried, j, self.velocity_m_s(carried, at_s))
 
     def seen_in(self, standing: Sequence[Standing], sweeps: Iterable[int]) -> Float:
         """(N,3) what these sweeps saw of the object, in its own frame."""

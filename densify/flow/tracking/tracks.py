@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from itertools import chain
 
 import numpy as np
 
@@ -78,7 +79,7 @@ def follow_groups(
         radial = seen[n].radial
         if radial is not None:
             velocity = radial.rows(members).corrected(velocity)
-        for start in (velocity, *_velocities_beside(looks[n], members, bodies, space)):
+        for start in chain([velocity], _velocities_beside(looks[n], members, bodies, space)):
             track = _follow(members, n, start, looks, free, ground, clock)
             proven = proven_to_move(track, standing, space)
             if proven:
@@ -147,12 +148,8 @@ def _velocities_beside(
 
 def _contradicted(track: Track, body: Float, space: FreeSpace) -> float:
     """The largest share that a sweep sees through of (N,3) points in the track's frame."""
-    shares = []
-    for j, at_s in enumerate(space.clock.time_s):
-        carried = track.place(body, at_s)
-        velocity_m_s = track.velocity_m_s(carried, at_s)
-        shares.append(float(space.seen_through(carried, j, velocity_m_s).mean()))
-    return max(shares)
+    sweeps = range(len(space.clock.time_s))
+    return max(float(track.seen_through(body, j, space).mean()) for j in sweeps)
 
 
 def _follow(
@@ -303,10 +300,8 @@ def _not_contradicted(
     """Those rows of sweep j that no sweep close in time sees through where they are carried to."""
     for i in space.others(j):
         if space.clock.near(i, j, _NEAR_S) and len(rows):
-            at_s = space.clock.time_s[i]
-            carried = track.carry(c.points[rows], c.time_s[rows], at_s)
-            velocity_m_s = track.velocity_m_s(carried, at_s)
-            rows = rows[~space.seen_through(carried, i, velocity_m_s)]
+            body = track.undo(c.points[rows], c.time_s[rows])
+            rows = rows[~track.seen_through(body, i, space)]
     return rows
 
 
