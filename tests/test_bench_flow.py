@@ -254,6 +254,38 @@ def test_scores_follow_the_stamps():
         assert pair.duration_s == pytest.approx(duration_s)
 
 
+def test_the_worst_object_is_the_one_with_most_error():
+    """Two cars: the near one, perfect, and the other, half as fast as it is and found in one of two
+    sweeps."""
+    sequence = tiny()
+    window = Window.open(sequence, 4, 1, CONFIG)
+    scorer = Scorer.of(sequence, window, (3, 5))
+    answers = scorer.answers
+    objects = np.unique(answers[3].segment[answers[3].segment >= 0])
+    assert len(objects) == 2
+    for worst in objects:
+        steps = {}
+        for frame in window.frames:
+            answer = answers[frame]
+            its = answer.segment == worst
+            steps[frame] = replace(
+                FlowField.zero(len(its)),
+                displacement=np.where(its[:, None], 0.5, 1.0) * answer.step,
+                moving=answer.moving & ~(its & (frame == 5)),
+            )
+        told = scorer.worst_object(steps)
+        speed_m_s = told["speed_m_s"]
+        assert min(abs(speed_m_s - 8), abs(speed_m_s - 9)) < 0.1
+        assert told["error_m"] == pytest.approx(0.05 * speed_m_s)
+        assert told["share_of_error"] == pytest.approx(1)
+        counts = [int(((answers[f].segment == worst) & window.above[f]).sum()) for f in (3, 5)]
+        assert told["num_returns"] == np.mean(counts)
+        assert told["found"] == pytest.approx(counts[0] / sum(counts))
+        assert (told["num_sweeps"], told["num_pairs"]) == (2, 2)
+        points = window.stretch[4].sweep.points[answers[4].segment == worst]
+        assert told["distance_m"] == pytest.approx(np.linalg.norm(points, axis=1).mean(), abs=0.5)
+
+
 def test_objects_are_the_methods_own_or_what_moves_together():
     """Two cars: told apart by the true labels, and by the space between them; one object if a
     method calls them so."""

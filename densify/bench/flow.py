@@ -195,6 +195,7 @@ def _measure(
         "step": scorer.step_scores(steps),
         "challenge": scorer.challenge_scores(steps),
         "segmentation": scorer.segmentation_scores(steps),
+        "worst_object": scorer.worst_object(steps),
         "window": None if pairs_only else scorer.window_scores(to_key),
     }
     return _Measured(row, traces)

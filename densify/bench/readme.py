@@ -217,18 +217,36 @@ def _depth_cells(scene: Scene, variants: Mapping[str, Config]) -> Iterator[tuple
 
 def _row_of_flow(scene: Scene) -> list[list[str]]:
     """Our flow: one sweep, and the same number of sweeps as the window has on each side."""
-    return [[str(scene), *_flow_cells(scene, scene.window)]]
+    ours = _ours(scene)
+    return [[str(scene), *_flow_cells(ours, scene.window), _worst(ours["worst_object"])]]
 
 
 def _row_of_rates(scene: Scene) -> list[list[str]]:
     """Our flow over 0.4 s at any rate."""
-    return [[str(scene), *_flow_cells(scene, round(0.8 * scene.window))]]
+    return [[str(scene), *_flow_cells(_ours(scene), round(0.8 * scene.window))]]
 
 
-def _flow_cells(scene: Scene, num_sweeps: int) -> list[str]:
+def _ours(scene: Scene) -> Mapping[str, Any]:
     sequence, key = open_sequence(scene.data), scene.keys[0]
     measured = bench_flow(sequence, key, scene.window, resolve(None), ["ours"])
-    ours = measured["methods"]["ours"]
+    ours: Mapping[str, Any] = measured["methods"]["ours"]
+    return ours
+
+
+def _worst(measured: Mapping[str, Any] | None) -> str:
+    """The object that most of the error is of, and what made it hard."""
+    if measured is None:
+        return ""
+    seen = f"{measured['num_sweeps']} of {measured['num_pairs']} sweeps"
+    return (
+        f"{measured['distance_m']:.0f} m away, {measured['speed_m_s']:.1f} m/s, "
+        f"{measured['num_returns']:.0f} returns in each of {seen}: "
+        f"{_percent(measured['found'], 0)} % found, {_centimetres(measured['error_m'])} off, "
+        f"{_percent(measured['share_of_error'], 0)} % of all error"
+    )
+
+
+def _flow_cells(ours: Mapping[str, Any], num_sweeps: int) -> list[str]:
     return [
         f"{_percent(ours['step']['found'], 1)} %",
         _centimetres(ours["step"]["movers_m"]),
@@ -316,8 +334,9 @@ TABLES: Mapping[str, _Table] = {
         "The same without each part of a map.", _DEPTH_TITLES, _DEPTH[:4], _rows_of_parts, real=True
     ),
     "flow": _Table(
-        "Moving points found, errors with missed points counted as standing still.",
-        ("found", "one sweep", "five sweeps", "falsely moving", "ghosts"),
+        "Moving points found, errors with missed points counted as standing still; the object that "
+        "most of the error over one sweep is of.",
+        ("found", "one sweep", "five sweeps", "falsely moving", "ghosts", "worst object"),
         _FLOW,
         _row_of_flow,
     ),

@@ -148,6 +148,40 @@ class Scorer:
             scorer.add(found[above], self.answers[frame].segment[above])
         return scorer.scores()
 
+    def worst_object(self, steps: Mapping[int, FlowField]) -> dict[str, Any] | None:
+        """The moving object whose points above the ground, all pairs together, sum the most error,
+        and what made it hard: sweeps of the window that see it, its returns in one of those, how
+        far away it is and how fast. None without exact truth, or where nothing moves."""
+        if self.answers is None:
+            return None
+        answers, sweeps = self.answers, self.window.stretch
+        segment = self._above(lambda f: answers[f].segment)
+        if not (segment >= 0).any():
+            return None
+        error_m = metrics.end_point_errors(
+            self._above(lambda f: steps[f].displacement), self._above(lambda f: answers[f].step)
+        )
+        moves = segment >= 0
+        summed_m = np.bincount(segment[moves], error_m[moves])
+        worst = int(np.argmax(summed_m))
+        its = segment == worst
+        speed_m_s = np.linalg.norm(self._above(lambda f: answers[f].step), axis=1) / self._above(
+            self._durations_s
+        )
+        distance_m = np.linalg.norm(self._above(lambda f: sweeps[f].sweep.points), axis=1)
+        frame = self._above(lambda f: np.full(len(sweeps[f].sweep), f))
+        num_sweeps = len(np.unique(frame[its]))
+        return {
+            "num_sweeps": num_sweeps,
+            "num_pairs": len(self.sources),
+            "num_returns": float(its.sum() / num_sweeps),
+            "distance_m": float(distance_m[its].mean()),
+            "speed_m_s": float(speed_m_s[its].mean()),
+            "found": float(self._above(lambda f: steps[f].moving)[its].mean()),
+            "error_m": float(error_m[its].mean()),
+            "share_of_error": float(summed_m[worst] / summed_m.sum()) if summed_m[worst] else 0.0,
+        }
+
     def window_scores(self, to_key: Mapping[int, FlowField]) -> dict[str, Any]:
         """Score the flow to the key, by frame. Accumulated movers, the key's own left out, are the
         true movers above the ground, without truth those that are called moving."""
