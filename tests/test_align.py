@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 
 from densify.flow.surface_matching import GATES_M, apply, undo
 from densify.flow.tracking.align import MIN_FIT, Model, align
-from densify.kernels.clouds import rows_inside, surface_information
+from densify.kernels.clouds import Strips, surface_information
 
 CENTRE = np.array([12.0, -3.0, 0.8])
 STD = np.array([0.3, 0.3, 0.06])
@@ -124,11 +124,14 @@ def test_surface_information_is_the_inverse_covariance(flat: bool) -> None:
     np.testing.assert_allclose(found, expected[:, rows, columns], rtol=1e-8, atol=1e-9)
 
 
-def test_rows_inside_a_box() -> None:
+@pytest.mark.parametrize("ordered", [False, True], ids=["shuffled", "in order"])
+def test_rows_inside_a_box(ordered: bool) -> None:
     rng = np.random.default_rng(5)
     points = rng.integers(-3, 4, (5000, 3)).astype(float)  # many exactly on the faces: outside
+    if ordered:  # most strips have nothing inside
+        points = points[np.lexsort(points.T)]
     low, high = np.array([-2.0, -1.0, -3.0]), np.array([2.0, np.inf, 1.0])
     expected = np.flatnonzero(((points > low) & (points < high)).all(1))
     assert 100 < len(expected) < 2000
-    np.testing.assert_array_equal(rows_inside(points, low, high), expected)
-    assert rows_inside(points[:0], low, high).shape == (0,)
+    np.testing.assert_array_equal(Strips(points).rows_inside(low, high), expected)
+    assert Strips(points[:0]).rows_inside(low, high).shape == (0,)

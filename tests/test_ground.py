@@ -159,6 +159,15 @@ def test_under_follows_a_plane_and_stays_at_the_edge_beyond_it():
     assert heights.under(np.array([[500.0, 0.0]])) == heights.under(np.array([[20.0, 0.0]]))
 
 
+def test_under_is_linear_between_the_middles_of_cells():
+    rng = np.random.default_rng(1)
+    heights = HeightMap(rng.normal(size=(12, 9)), np.array([-3.0, 7.0]), 0.7)
+    asked = rng.uniform([-6, 4], [9, 17], (5000, 2))
+    at = (asked - heights.low_m).T / heights.cell_m - 0.5
+    expected = ndimage.map_coordinates(heights.heights_m, at, order=1, mode="nearest")
+    np.testing.assert_allclose(heights.under(asked), expected, rtol=1e-12, atol=1e-12)
+
+
 def test_many_and_few_returns_find_the_same_ground():
     """The lowest of many is lower than that of few: who drives from near to far would climb."""
     rng = np.random.default_rng(1)

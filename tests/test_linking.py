@@ -6,9 +6,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scipy.cluster.hierarchy import fcluster, linkage
+from scipy.spatial.distance import cdist
 from scipy.spatial.transform import Rotation
 
-from densify.kernels.linking import link
+from densify.kernels.linking import close_to_seeds, link
 
 DISTANCE_M = 0.6
 
@@ -61,3 +62,22 @@ def test_points_on_one_place() -> None:
 def test_nothing() -> None:
     num, label = link(np.empty((0, 3)), DISTANCE_M)
     assert num == 0 and label.shape == (0,)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_close_to_seeds_as_counted_one_by_one(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    points = rng.uniform(-3, 3, (1500, 3)) * [3, 1, 0.3]
+    seeds = (points[:, 0] > 0) & (rng.random(1500) < 0.6) | (rng.random(1500) < 0.02)
+    distance_m = cdist(points, points)
+    within = distance_m <= 0.4
+    counts = seeds & (within[:, seeds].sum(axis=1) >= 0.3 * within.sum(axis=1))
+    expected = (distance_m[:, counts] < 0.4).any(axis=1)
+    assert 0 < counts.sum() < seeds.sum() and 0 < expected.sum() < len(points)
+    np.testing.assert_array_equal(close_to_seeds(points, seeds, 0.4, 0.3), expected)
+
+
+def test_close_to_no_seeds() -> None:
+    points = np.zeros((5, 3))
+    assert not close_to_seeds(points, np.zeros(5, bool), 0.4, 0.3).any()
+    assert not close_to_seeds(points[:0], np.zeros(0, bool), 0.4, 0.3).any()

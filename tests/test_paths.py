@@ -5,8 +5,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.interpolate import BSpline
 
+from densify.flow.surface_matching import apply, undo
 from densify.flow.tracking.paths import Path
+from densify.flow.tracking.sightings import Track
 
 STEP_S = 0.1
 NOISE_M = 0.03
@@ -199,3 +202,29 @@ def test_it_does_not_matter_when_time_begins():
     t = times_of(15)
     late = fitted(t + 500.0, from_rest(t))
     np.testing.assert_allclose(late(t + 500.0), fitted(t, from_rest(t))(t), atol=1e-6)
+
+
+# --- compiled -------------------------------------------------------------------------------------
+
+
+def test_within_and_beyond_as_scipy_evaluates_the_spline():
+    t = times_of(20)
+    path = fitted(t, np.random.default_rng(3).normal(size=(20, 4)).cumsum(axis=0))
+    spline = BSpline(path.knots_s, path.coefficients, 3)
+    asked = np.append(np.linspace(t[0] - 1, t[-1] + 1, 200), t)
+    inside = np.clip(asked, t[0], t[-1])
+    expected = spline(inside) + (asked - inside)[:, None] * spline.derivative()(inside)
+    np.testing.assert_allclose(path(asked), expected, rtol=1e-12)
+    np.testing.assert_allclose(path.rate(asked), spline.derivative()(inside), rtol=1e-12)
+
+
+def test_points_are_placed_each_at_its_time_and_brought_back():
+    rng, t = np.random.default_rng(4), times_of(15)
+    track = Track(rng.normal(size=3))
+    track.path = fitted(t, rng.normal(size=(15, 4)).cumsum(axis=0))
+    points, asked = rng.normal(size=(300, 3)), rng.uniform(t[0] - 0.5, t[-1] + 0.5, 300)
+    for when in (asked, 0.7):
+        state = track.path(when)
+        np.testing.assert_allclose(track.place(points, when), apply(state, points, track.centre))
+        np.testing.assert_allclose(track.undo(points, when), undo(state, points, track.centre))
+        np.testing.assert_allclose(track.undo(track.place(points, when), when), points)

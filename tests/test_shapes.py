@@ -51,8 +51,10 @@ def test_the_field_is_the_distance_between_voxels() -> None:
     distance_m = 0.2 * np.linalg.norm(voxel[:, None] - occupied[None], axis=2).min(1)
     share = np.round(255 * np.minimum(distance_m / 0.6, 1)) / 255
     assert (share < 1).mean() > 0.1
-    np.testing.assert_allclose(field(asked), share, atol=1e-12)
+    np.testing.assert_allclose(field(np.zeros((1, 3)), asked), share, atol=1e-12)
+    together = field(asked[:7] - asked[0], asked[:1])
+    np.testing.assert_allclose(together, share[:7].mean(), atol=1e-12)
 
 
 def test_a_field_of_nothing_is_far_everywhere() -> None:
-    assert (DistanceField.of(np.zeros((0, 3)))(np.zeros((4, 3))) == 1).all()
+    assert (DistanceField.of(np.zeros((0, 3)))(np.zeros((4, 3)), np.zeros((2, 3))) == 1).all()

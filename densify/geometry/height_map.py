@@ -10,7 +10,7 @@ import numpy as np
 from scipy import ndimage
 
 from densify.config import GroundSettings
-from densify.kernels.heights import add_near, two_lowest
+from densify.kernels.heights import add_near, heights_under, two_lowest
 from densify.types import Float, Float32
 
 _LOW_OUTLIER_M = 0.4
@@ -54,8 +54,10 @@ class HeightMap:
 
     def under(self, points: Float) -> Float:
         """(N,2) or (N,3) -> (N,) ground height there; beyond the map as at its nearest edge."""
-        at = (points[:, :2] - self.low_m).T / self.cell_m - 0.5
-        ground_m: Float = ndimage.map_coordinates(self.heights_m, at, order=1, mode="nearest")
+        ground_m = np.empty(len(points))
+        heights_under.over_rows(
+            len(points), points, self.low_m, self.cell_m, self.heights_m, ground_m
+        )
         return ground_m
 
     def above(self, points: Float) -> Float32:

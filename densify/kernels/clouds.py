@@ -11,11 +11,23 @@ from densify.types import Float, Float32, Int
 
 Bytes = NDArray[np.uint8]
 
+_STRIP = 32
 
-def rows_inside(points: Float, low: Float, high: Float) -> Int:
-    """The rows, ascending, of (N,3) points strictly between two corners (3,)."""
-    rows = np.empty(len(points), np.int64)
-    return rows[: _collect(points, low, high, rows)]
+
+class Strips:
+    """Points in the order of a scan, in which neighbours mostly follow each other: with the box
+    around every few of them, most need not be looked at to find those inside another box."""
+
+    def __init__(self, points: Float) -> None:
+        """points: (N,3)."""
+        self._points = points
+        self._boxes = np.empty((-(-len(points) // _STRIP), 6))
+        _box(points, self._boxes)
+
+    def rows_inside(self, low: Float, high: Float) -> Int:
+        """The rows, ascending, of the points strictly between two corners (3,)."""
+        rows = np.empty(len(self._points), np.int64)
+        return rows[: _collect(self._points, self._boxes, low, high, rows)].copy()
 
 
 def surface_information(
@@ -53,19 +65,63 @@ def spread(
 
 
 @Kernel
-def _collect(points: Float, low: Float, high: Float, rows: Int) -> int:
+def missed(
+    first: int,
+    last: int,
+    points: Float,
+    shifts: Float,
+    low: Float,
+    cells_per_m: float,
+    nearness: Bytes,
+    mean: Float,
+) -> None:
+    """mean: (V,), filled: how much less than 255 the cells hold in which (N,3) points are when
+    moved by each of (V,3) shifts.
+
+    nearness: (X,Y,Z) of the cells of a grid whose corner is ``low`` (3,); 0 outside.
+    """
+    num_x, num_y, num_z = nearness.shape
+    for v in range(first, last):
+        total = 0
+        for i in range(len(points)):
+            x = int((points[i, 0] + shifts[v, 0] - low[0]) * cells_per_m)
+            y = int((points[i, 1] + shifts[v, 1] - low[1]) * cells_per_m)
+            z = int((points[i, 2] + shifts[v, 2] - low[2]) * cells_per_m)
+            inside = 0 <= x < num_x and 0 <= y < num_y and 0 <= z < num_z
+            total += 255 - np.int64(nearness[x, y, z]) if inside else 255
+        mean[v] = total / len(points)
+
+
+@Kernel
+def _box(points: Float, boxes: Float) -> None:
+    for box in range(len(boxes)):
+        for axis in range(3):
+            low, high = np.inf, -np.inf
+            for i in range(box * _STRIP, min((box + 1) * _STRIP, len(points))):
+                low, high = min(low, points[i, axis]), max(high, points[i, axis])
+            boxes[box, axis], boxes[box, 3 + axis] = low, high
+
+
+@Kernel
+def _collect(points: Float, boxes: Float, low: Float, high: Float, rows: Int) -> int:
     num = 0
-    for i in range(len(points)):
-        x, y, z = points[i, 0], points[i, 1], points[i, 2]
-        rows[num] = i  # overwritten unless it is inside: without a branch, since none foresees it
-        num += (
-            (x > low[0])
-            & (x < high[0])
-            & (y > low[1])
-            & (y < high[1])
-            & (z > low[2])
-            & (z < high[2])
-        )
+    for box in range(len(boxes)):
+        apart = False
+        for axis in range(3):
+            apart |= boxes[box, axis] >= high[axis] or boxes[box, 3 + axis] <= low[axis]
+        if apart:
+            continue
+        for i in range(box * _STRIP, min((box + 1) * _STRIP, len(points))):
+            x, y, z = points[i, 0], points[i, 1], points[i, 2]
+            rows[num] = i  # overwritten unless it is inside: without a branch, none foresees it
+            num += (
+                (x > low[0])
+                & (x < high[0])
+                & (y > low[1])
+                & (y < high[1])
+                & (z > low[2])
+                & (z < high[2])
+            )
     return num
 
 

@@ -31,6 +31,33 @@ def two_lowest(points: Float, low_m: Float, cell_m: float, lowest: Float, second
 
 
 @Kernel
+def heights_under(
+    first: int,
+    last: int,
+    points: Float,
+    low_m: Float,
+    cell_m: float,
+    heights_m: Float,
+    ground_m: Float,
+) -> None:
+    """ground_m: (N,), filled: the heights (X,Y) of the cells' centres, linear between them, at the
+    points (N,2) or (N,3); beyond the grid as at its edge. The rest as in `two_lowest`."""
+    end_x, end_y = heights_m.shape[0] - 1, heights_m.shape[1] - 1
+    for i in range(first, last):
+        x = min(max((points[i, 0] - low_m[0]) / cell_m - 0.5, 0.0), float(end_x))
+        y = min(max((points[i, 1] - low_m[1]) / cell_m - 0.5, 0.0), float(end_y))
+        left, near = int(x), int(y)
+        right, far = min(left + 1, end_x), min(near + 1, end_y)
+        x, y = x - left, y - near
+        ground_m[i] = (
+            heights_m[left, near] * (1 - x) * (1 - y)
+            + heights_m[left, far] * (1 - x) * y
+            + heights_m[right, near] * x * (1 - y)
+            + heights_m[right, far] * x * y
+        )
+
+
+@Kernel
 def add_near(
     points: Float,
     over_m: Float,

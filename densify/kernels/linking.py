@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Groups of points linked by distance, compiled: single linkage, exact."""
+"""Groups of points by distance, compiled: single linkage, and what is close to seeds; exact."""
 
 from __future__ import annotations
 
@@ -7,9 +7,12 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from densify.kernels import Kernel, inlined
-from densify.types import Float, Int
+from densify.types import Bool, Float, Int
 
-_WITHIN = 1 - 1e-9  # a cell's points must be linked even where rounding makes its diagonal longer
+_WITHIN, _ABOVE = (
+    1 - 1e-9,
+    1 + 1e-9,
+)  # a cell's points must be linked even where rounding makes its diagonal longer
 
 
 def link(points: Float, distance_m: float) -> tuple[int, Int]:
@@ -37,6 +40,73 @@ def link(points: Float, distance_m: float) -> tuple[int, Int]:
     number = np.empty(len(first), np.int64)
     number[np.argsort(first)] = np.arange(len(first))
     return len(first), number[label.ravel()]
+
+
+def close_to_seeds(points: Float, seed: Bool, within_m: float, least_share: float) -> Bool:
+    """Which of (N,3) points are closer than ``within_m`` to a seed that counts: one of (N,) of
+    which at least so large a share of the points within that distance, itself one, are seeds."""
+    close = np.zeros(len(points), bool)
+    if not seed.any():
+        return close
+    # A little wider, or rounding could put two that are so close three cells apart.
+    cell = np.floor((points - points.min(axis=0)) / (_ABOVE * within_m)).astype(np.int64) + 1
+    _, wide, high = cell.max(axis=0) + 2
+    key = (cell[:, 0] * wide + cell[:, 1]) * high + cell[:, 2]
+    order = np.argsort(key, kind="stable")
+    key = key[order]
+    start = np.append(np.flatnonzero(np.diff(key, prepend=-1)), len(key))
+    cells = key[start[:-1]]
+    # The cells around one, three above each other at a time.
+    beside = np.array([x * wide + y for x in (-1, 0, 1) for y in (-1, 0, 1)]) * high
+    below = start[np.searchsorted(cells, cells[:, None] + beside - 1)]
+    above = start[np.searchsorted(cells, cells[:, None] + beside + 1, side="right")]
+    sorted_points = np.ascontiguousarray(points[order], float)
+    counts, close_in_order = np.zeros(len(points), bool), np.zeros(len(points), bool)
+    ranges = start, np.stack([below, above], axis=2)
+    _count_seeds(sorted_points, seed[order], *ranges, within_m**2, least_share, counts)
+    _spread_seeds(sorted_points, counts, *ranges, within_m**2, close_in_order)
+    close[order] = close_in_order
+    return close
+
+
+@inlined
+def _squared(points, i, j):  # type: ignore[no-untyped-def]
+    dx, dy, dz = (
+        points[i, 0] - points[j, 0],
+        points[i, 1] - points[j, 1],
+        points[i, 2] - points[j, 2],
+    )
+    return dx * dx + dy * dy + dz * dz
+
+
+@Kernel
+def _count_seeds(points, seed, start, around, squared, least_share, counts):  # type: ignore[no-untyped-def]
+    """counts: (N,) bool, set for the seeds that count. start: (C+1,) first point of each cell.
+    around: (C,9,2) first and end of the points in and around it, three cells at a time."""
+    for cell in range(len(start) - 1):
+        for i in range(start[cell], start[cell + 1]):
+            if not seed[i]:
+                continue
+            num, num_seeds = 0, 0
+            for k in range(around.shape[1]):
+                for j in range(around[cell, k, 0], around[cell, k, 1]):
+                    near = _squared(points, i, j) <= squared
+                    num += near
+                    num_seeds += near & seed[j]
+            counts[i] = num_seeds >= least_share * num
+
+
+@Kernel
+def _spread_seeds(points, counts, start, around, squared, close):  # type: ignore[no-untyped-def]
+    """close: (N,) bool, set for the points closer to one that counts. The rest as in
+    `_count_seeds`."""
+    for cell in range(len(start) - 1):
+        for k in range(around.shape[1]):
+            for j in range(around[cell, k, 0], around[cell, k, 1]):
+                if not counts[j]:
+                    continue
+                for i in range(start[cell], start[cell + 1]):
+                    close[i] |= _squared(points, i, j) < squared
 
 
 @Kernel

@@ -58,9 +58,10 @@ def _azimuth(x, y):  # type: ignore[no-untyped-def]
 def _column(azimuth, num_columns):  # type: ignore[no-untyped-def]
     """Columns start behind; what has no direction (NaN) comes to the first one."""
     if not abs(azimuth) <= _PI:
-        return 0
-    column = int((azimuth + _PI) * (np.float32(num_columns) / (_PI + _PI)))
-    return column - num_columns if column >= num_columns else column
+        return np.int32(0)
+    # 32 bits: many at once where it is called in a loop.
+    column = np.int32((azimuth + _PI) * (np.float32(num_columns) / (_PI + _PI)))
+    return column - np.int32(num_columns) if column >= num_columns else column
 
 
 @inlined
@@ -76,6 +77,34 @@ def _row(elevation, edges):  # type: ignore[no-untyped-def]
         else:
             low = middle
     return low
+
+
+@inlined
+def _all_from_scanner(x, y, z, size, origin, turned, axes):  # type: ignore[no-untyped-def]
+    """`_from_scanner` of the first ``size`` points, in place."""
+    for k in range(size):
+        x[k], y[k], z[k] = x[k] - origin[0], y[k] - origin[1], z[k] - origin[2]
+    if turned:
+        for k in range(size):
+            x[k], y[k], z[k] = _turn(x[k], y[k], z[k], axes)
+
+
+@inlined
+def _rows(elevation, size, edges, row):  # type: ignore[no-untyped-def]
+    """`_row` of the first ``size`` elevations at once: into ``row``, the step of the search outside
+    and the elevations inside."""
+    last, step = np.int32(len(edges) - 1), np.int32(1)
+    row[:size] = 0
+    while 2 * step < last:
+        step *= np.int32(2)
+    while step > 0:
+        for k in range(size):
+            at = min(row[k] + step, last)
+            row[k] = at if elevation[k] >= edges[at] else row[k]
+        step //= np.int32(2)
+    for k in range(size):
+        inside = elevation[k] >= edges[0] and elevation[k] < edges[last]
+        row[k] = row[k] if inside else np.int32(-1)
 
 
 @inlined
@@ -214,37 +243,45 @@ def see_through(begin, end, points, velocity, image, margins, min_filled, free):
     """
     num_columns = image.nearest_m.shape[1]
     moving, by_azimuth = len(velocity) > 0, len(image.offset_s) == 1
-    origin, row_edges_rad = image.origin_m, image.row_edges_rad
-    x, y, z, time_s = np.empty((4, _BLOCK), np.float32)
-    row, column = np.zeros((2, _BLOCK), np.int64)
+    row_edges_rad = image.row_edges_rad
+    x, y, z, time_s, elevation = np.empty((5, _BLOCK), np.float32)
+    row, column = np.zeros((2, _BLOCK), np.int32)
     # Each point is a long chain of steps; a block of them takes every step side by side.
     for start in range(begin, end, _BLOCK):
         size = min(_BLOCK, end - start)
         for k in range(size):
-            px, py, pz = points[start + k, 0], points[start + k, 1], points[start + k, 2]
-            x[k], y[k], z[k] = _from_scanner(px, py, pz, origin, image.turned, image.axes)
+            x[k], y[k], z[k] = points[start + k, 0], points[start + k, 1], points[start + k, 2]
+        _all_from_scanner(x, y, z, size, image.origin_m, image.turned, image.axes)
         for _ in range(2):  # when did the scanner face the point? converges in two steps
             for k in range(size):
                 column[k] = _column(_azimuth(x[k], y[k]), num_columns)
-            if not by_azimuth:
+            if by_azimuth:
                 for k in range(size):
-                    ground = np.sqrt(x[k] * x[k] + y[k] * y[k])
-                    row[k] = max(_row(_azimuth(ground, z[k]), row_edges_rad), 0)
+                    time_s[k] = image.offset_s[0, column[k]]
+            else:
+                for k in range(size):
+                    elevation[k] = _azimuth(np.sqrt(x[k] * x[k] + y[k] * y[k]), z[k])
+                _rows(elevation, size, row_edges_rad, row)
+                for k in range(size):
+                    time_s[k] = image.offset_s[max(row[k], 0), column[k]]
             for k in range(size):
-                i, t = start + k, image.offset_s[row[k], column[k]]
-                px, py, pz = points[i, 0], points[i, 1], points[i, 2]
-                if moving:
-                    px += t * velocity[i, 0]
-                    py += t * velocity[i, 1]
-                    pz += t * velocity[i, 2]
-                px, py, pz = _at_time(px, py, pz, t, image.twists)
-                time_s[k] = t
-                x[k], y[k], z[k] = _from_scanner(px, py, pz, origin, image.turned, image.axes)
+                x[k], y[k], z[k] = points[start + k, 0], points[start + k, 1], points[start + k, 2]
+            if moving:
+                for k in range(size):
+                    x[k] += time_s[k] * velocity[start + k, 0]
+                    y[k] += time_s[k] * velocity[start + k, 1]
+                    z[k] += time_s[k] * velocity[start + k, 2]
+            for k in range(size):
+                x[k], y[k], z[k] = _at_time(x[k], y[k], z[k], time_s[k], image.twists)
+            _all_from_scanner(x, y, z, size, image.origin_m, image.turned, image.axes)
         for k in range(size):
             column[k] = _column(_azimuth(x[k], y[k]), num_columns)
         for k in range(size):
+            elevation[k] = _azimuth(np.sqrt(x[k] * x[k] + y[k] * y[k]), z[k])
+        _rows(elevation, size, row_edges_rad, row)
+        for k in range(size):
             i, ground = start + k, np.sqrt(x[k] * x[k] + y[k] * y[k])
-            r, c = _row(_azimuth(ground, z[k]), row_edges_rad), column[k]
+            r, c = row[k], column[k]
             if r < 0 or image.num_filled[r, c] < min_filled:
                 continue
             range_m = np.sqrt(ground * ground + z[k] * z[k])

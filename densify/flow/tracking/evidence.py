@@ -6,9 +6,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from densify.flow.tracking.clock import Clock
 from densify.flow.tracking.radial import Radial
@@ -16,7 +16,8 @@ from densify.geometry import poses
 from densify.geometry.height_map import HeightMap
 from densify.geometry.range_image import RangeImage
 from densify.geometry.sensor import Sensors
-from densify.kernels.linking import link
+from densify.kernels.clouds import Strips
+from densify.kernels.linking import close_to_seeds, link
 from densify.types import Bool, Float, Int, Stretch
 
 _MARGIN_M = 0.4
@@ -123,7 +124,7 @@ class Standing:
         return Standing(
             row=found.row,
             points=points,
-            time_s=firing_times_s(stretch, i)[found.row],
+            time_s=firing_times_s(stretch, i, found.row),
             seed=found.seed,
             cluster=found.cluster,
             num_clusters=found.num_clusters,
@@ -133,6 +134,11 @@ class Standing:
     @property
     def candidate(self) -> Bool:
         return self.cluster >= 0
+
+    @cached_property
+    def strips(self) -> Strips:
+        """The points, to be found by boxes."""
+        return Strips(self.points)
 
 
 def find_candidates(
@@ -188,10 +194,11 @@ def closer_rings(points: Float, gap_m: Float) -> Float:
     return squeezed
 
 
-def firing_times_s(stretch: Stretch, i: int) -> Float:
-    """(N,) when each point of sweep number i was measured, since the first reference time."""
+def firing_times_s(stretch: Stretch, i: int, rows: Int) -> Float:
+    """(N,) when each of some points of sweep number i was measured, since the first reference
+    time."""
     sweep = stretch.sweeps[i].sweep
-    offset_ns = np.zeros(len(sweep), np.int64) if sweep.offset_ns is None else sweep.offset_ns
+    offset_ns = np.zeros(len(rows), np.int64) if sweep.offset_ns is None else sweep.offset_ns[rows]
     begin_ns = stretch.sweeps[0].sweep.stamp_ns
     return (sweep.stamp_ns - begin_ns + offset_ns).astype(np.float64) * 1e-9
 
@@ -200,17 +207,6 @@ def cluster_around(points: Float, seed: Bool) -> tuple[int, Int]:
     """Keep the seeds that are not alone among unseen points (a hedge's flicker is), add what is
     close to them, and link. Returns the number of clusters and (N,) labels."""
     cluster = np.full(len(points), -1, np.int64)
-    if not seed.any():
-        return 0, cluster
-    seeds = np.flatnonzero(seed)
-    num_near = cKDTree(points).query_ball_point(points[seeds], _NEAR_M, return_length=True)
-    num_near_seeds = cKDTree(points[seeds]).query_ball_point(
-        points[seeds], _NEAR_M, return_length=True
-    )
-    kept = seeds[num_near_seeds >= _MIN_SEED_SHARE * num_near]
-    if not len(kept):
-        return 0, cluster
-    distance, _ = cKDTree(points[kept]).query(points, distance_upper_bound=_NEAR_M)
-    near = np.flatnonzero(np.isfinite(distance))
+    near = np.flatnonzero(close_to_seeds(points, seed, _NEAR_M, _MIN_SEED_SHARE))
     num_clusters, cluster[near] = link(points[near], LINK_M)
     return num_clusters, cluster

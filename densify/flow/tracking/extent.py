@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +18,7 @@ from densify.flow.tracking.sightings import Track
 from densify.geometry import poses
 from densify.geometry.height_map import HeightMap
 from densify.geometry.sensor import Sensors
-from densify.kernels.clouds import rows_inside
+from densify.kernels.clouds import Strips
 from densify.kernels.nearest import BoxTree
 from densify.types import Bool, Float, Float32, Int, Stretch
 
@@ -27,6 +28,7 @@ _MIN_HEIGHT_M, _MIN_HEIGHT_OF_WALKERS_M = 0.08, 0.1
 _LENGTH_M = 15.0
 _SIDE_M = 0.1
 _LONGEST_HOLE_M = 0.6
+_CARRIED_SLACK_M = 0.5
 _MAX_CONTRADICTED = 0.05
 _WALKS_M_S, _FAST_M_S = 2.0, 8.0
 _LEFT_M = 0.6  # from all of the object
@@ -61,14 +63,22 @@ class Seen:
         points = poses.transform(registered.T_world_lidar, registered.sweep.points)
         height_m = ground.above(points)
         row = np.flatnonzero(height_m > _MIN_HEIGHT_M)
-        gap_m = sensors.gap_m(registered.sweep.points, registered.sweep.lidar)
-        reach_m = np.maximum(_ATTACH_UNSEEN_M, _GAPS_REACHED_UNSEEN * gap_m)
-        seeded = standing.row[standing.candidate]
-        reach_m[seeded] = np.maximum(_ATTACH_M, _GAPS_REACHED * gap_m[seeded])
-        seed = np.zeros(len(points), bool)
+        gap_m = sensors.gap_m(registered.sweep.points[row], registered.sweep.lidar[row])
+        seeded, seed = np.zeros((2, len(points)), bool)
+        seeded[standing.row[standing.candidate]] = True
         seed[standing.row[standing.seed]] = True
-        time_s = firing_times_s(stretch, i)
-        return Seen(row, points[row], time_s[row], height_m[row], reach_m[row], seed[row])
+        reach_m = np.where(
+            seeded[row],
+            np.maximum(_ATTACH_M, _GAPS_REACHED * gap_m),
+            np.maximum(_ATTACH_UNSEEN_M, _GAPS_REACHED_UNSEEN * gap_m),
+        )
+        time_s = firing_times_s(stretch, i, row)
+        return Seen(row, points[row], time_s, height_m[row], reach_m, seed[row])
+
+    @cached_property
+    def strips(self) -> Strips:
+        """The points, to be found by boxes."""
+        return Strips(self.points)
 
 
 def attach(
@@ -92,7 +102,7 @@ def attach(
         rim = track.place(shapes[k].rim, track.seen_at(clock.time_ns[i]))
         low, high = rim.min(0) - 2 * _ATTACH_M, rim.max(0) + 2 * _ATTACH_M
         low[2] -= 1.0  # down to the wheels
-        rows = rows_inside(seen.points, low, high)
+        rows = seen.strips.rows_inside(low, high)
         if not len(rows):
             continue
         in_shape = track.undo(seen.points[rows], seen.time_s[rows])
@@ -164,11 +174,15 @@ def lengthen(
         side = (rim[:, :2] @ axes)[:, 1]
         middle = track.place(shapes[k].points.mean(0, keepdims=True), at_s)[0]
         reach = np.array([1.5 * _LENGTH_M, 1.5 * _LENGTH_M, np.inf])
-        rows = rows_inside(seen.points, middle - reach, middle + reach)
+        rows = seen.strips.rows_inside(middle - reach, middle + reach)
         rows = rows[instance[rows] < 0]
+        right, left = side.min() - _SIDE_M, side.max() + _SIDE_M
+        # To carry them all would take longest: few come to lie beside it.
+        beside, slack_m = seen.points[rows, :2] @ axes[:, 1], _carried_m(track, seen, rows, at_s)
+        rows = rows[(beside > right - slack_m) & (beside < left + slack_m)]
         at_once = track.carry(seen.points[rows], seen.time_s[rows], at_s)
         along = at_once[:, :2] @ axes
-        fits = (along[:, 1] > side.min() - _SIDE_M) & (along[:, 1] < side.max() + _SIDE_M)
+        fits = (along[:, 1] > right) & (along[:, 1] < left)
         fits &= at_once[:, 2] < rim[:, 2].max() + _SIDE_M
         own = track.carry(seen.points[mine], seen.time_s[mine], at_s)[:, :2] @ ahead
         rows, along = rows[fits], along[fits, 0]
@@ -179,6 +193,16 @@ def lengthen(
         rows = rows[_uncontradicted(track, seen, rows, along, i, space)]
         if len(rows) and _leaves(track, seen, mine, rows, i, standing, space.clock):
             instance[rows] = k
+
+
+def _carried_m(track: Track, seen: Seen, rows: NDArray[np.int64], at_s: float) -> float:
+    """Certainly farther than any of the rows around the track is carried to where it is then."""
+    if not len(rows):
+        return 0.0
+    times_s = seen.time_s[rows]
+    ends = track.path(np.array([times_s.min(), times_s.max()])) - track.path(at_s)
+    shift_m, turn_rad = np.linalg.norm(ends[:, :2], axis=1).max(), np.abs(ends[:, 3]).max()
+    return float(_CARRIED_SLACK_M + 2 * (shift_m + 2 * _LENGTH_M * turn_rad))
 
 
 def _without_hole(along: Float, own: Float) -> Bool:
@@ -257,8 +281,9 @@ def _left_behind(
         if not len(away):
             continue
         gone[away] = True
-        places, stands = points[away], standing[j].points[~standing[j].candidate]
-        stands = stands[rows_inside(stands, places.min(0) - _THERE_M, places.max(0) + _THERE_M)]
+        places, c = points[away], standing[j]
+        rows = c.strips.rows_inside(places.min(0) - _THERE_M, places.max(0) + _THERE_M)
+        stands = c.points[rows[~c.candidate[rows]]]
         if len(stands):
             there[away] |= np.isfinite(BoxTree(stands).nearest(places, _THERE_M)[0])
     return gone, there

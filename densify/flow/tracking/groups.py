@@ -66,16 +66,15 @@ class GroupMotion:
         R_lidar_world = registered.T_world_lidar[:3, :3].T
         clock = Clock.of(self.stretch)
         here_s, there_s = clock.time_s[here], clock.time_s[there]
-        seen_s = firing_times_s(self.stretch, here)
         to_reference, displacement, velocity_m_s = np.zeros((3, len(instance), 3))
         lost = np.zeros(len(instance), bool)
-        for k in np.unique(instance[instance >= 0]):
-            track, mine = self.tracks[k], np.flatnonzero(instance == k)
+        for k, mine in _rows_of(instance):
+            track, seen_s = self.tracks[k], firing_times_s(self.stretch, here, mine)
             measured = poses.transform(registered.T_world_lidar, registered.sweep.points[mine])
-            body = track.undo(measured, seen_s[mine])
+            body = track.undo(measured, seen_s)
             at_reference, arrived = body, body
             if k in self.bendings:
-                at_reference, arrived = self.bendings[k].carry(here, there, clock, seen_s[mine])
+                at_reference, arrived = self.bendings[k].carry(here, there, clock, seen_s)
             at_reference = track.place(at_reference, here_s)
             arrived = track.place(arrived, there_s)
             to_reference[mine] = (at_reference - measured) @ R_lidar_world.T
@@ -167,7 +166,7 @@ def _bendings(
             mine = np.flatnonzero(instance[i] == k)
             if len(mine):
                 at = poses.transform(registered.T_world_lidar, registered.sweep.points[mine])
-                seen_s = firing_times_s(stretch, i)[mine]
+                seen_s = firing_times_s(stretch, i, mine)
                 parts.append(Part(tracks[k].undo(at, seen_s), float(seen_s.mean())))
                 sweeps.append(i)
         return Bending(tuple(sweeps), soften(parts))
@@ -176,3 +175,11 @@ def _bendings(
         seen_finely = np.flatnonzero(fine).tolist()
         found = dict(zip(seen_finely, pool.map(of_track, seen_finely), strict=True))
     return {k: bending for k, bending in found.items() if np.isfinite(bending.softened.alpha)}
+
+
+def _rows_of(instance: NDArray[np.int32]) -> list[tuple[int, NDArray[np.int64]]]:
+    """Each track of (N,) that there is, -1 for none, and its rows, ascending."""
+    rows = np.flatnonzero(instance >= 0)
+    rows = rows[np.argsort(instance[rows], kind="stable")]
+    tracks, begins = np.unique(instance[rows], return_index=True)
+    return list(zip(tracks.tolist(), np.split(rows, begins)[1:], strict=True))

@@ -14,6 +14,7 @@ from functools import cached_property
 import numpy as np
 from scipy.interpolate import BSpline
 
+from densify.kernels.paths import Spline, evaluate
 from densify.types import Float
 
 _KNOT_S = 0.1
@@ -74,24 +75,35 @@ class Path:
         return Path(knots, coefficients, begin_s, end_s, residual)
 
     @cached_property
-    def _spline(self) -> BSpline:
-        return BSpline(self.knots_s, self.coefficients, _DEGREE)
+    def spline(self) -> Spline:
+        """Between its begin and its end."""
+        return Spline(self.knots_s, np.ascontiguousarray(self.coefficients))
 
     @cached_property
-    def _derivative(self) -> BSpline:
-        return self._spline.derivative()
+    def derivative(self) -> Spline:
+        """The spline's, per second."""
+        t = self.knots_s
+        rise = self.coefficients[1:] - self.coefficients[:-1]
+        return Spline(
+            t[1:-1], rise * _DEGREE / (t[_DEGREE + 1 : -1] - t[1 : -_DEGREE - 1])[:, None]
+        )
 
     def __call__(self, time_s: float | Float) -> Float:
         """(..., d) at these times."""
         inside = np.clip(time_s, self.begin_s, self.end_s)
         beyond = np.asarray(time_s - inside)[..., None]
-        state: Float = self._spline(inside) + beyond * self._derivative(inside)
-        return state
+        return _evaluated(self.spline, inside) + beyond * _evaluated(self.derivative, inside)
 
     def rate(self, time_s: float | Float) -> Float:
         """(..., d) per second."""
-        rate: Float = self._derivative(np.clip(time_s, self.begin_s, self.end_s))
-        return rate
+        return _evaluated(self.derivative, np.clip(time_s, self.begin_s, self.end_s))
+
+
+def _evaluated(spline: Spline, time_s: float | Float) -> Float:
+    times_s = np.asarray(time_s, np.float64)
+    values = np.empty((times_s.size, spline.coefficients.shape[1]))
+    evaluate(times_s.ravel(), spline, values)
+    return values.reshape(*times_s.shape, -1)
 
 
 def _told(times_s: Float, least_number: int, least_s: float) -> bool:

@@ -8,11 +8,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from densify.flow.surface_matching import apply, undo
 from densify.flow.tracking.evidence import FreeSpace, Standing
 from densify.flow.tracking.looks import Look
 from densify.flow.tracking.paths import Path
 from densify.geometry.height_map import HeightMap
+from densify.kernels import paths as kernels
 from densify.types import Bool, Float
 
 _MANY_POINTS = 100  # more do not place a look better
@@ -53,11 +53,18 @@ class Track:
 
     def undo(self, points: Float, seen_s: float | Float) -> Float:
         """(N,3) points seen at a time -> in the object's own frame."""
-        return undo(self.path(seen_s), points, self.centre)
+        return self._moved(points, seen_s, forth=False)
 
     def place(self, points: Float, time_s: float | Float) -> Float:
         """Inverse of `undo`."""
-        return apply(self.path(time_s), points, self.centre)
+        return self._moved(points, time_s, forth=True)
+
+    def _moved(self, points: Float, time_s: float | Float, forth: bool) -> Float:
+        path, times_s = self.path, np.array(time_s, np.float64, ndmin=1)
+        along = kernels.Track(path.spline, path.derivative, path.begin_s, path.end_s, self.centre)
+        moved = np.empty(points.shape)
+        kernels.move.over_rows(len(points), points, times_s, along, forth, moved)
+        return moved
 
     def velocity_m_s(self, points: Float, time_s: float) -> Float:
         """(N,3) of the object's points where they are at that time."""

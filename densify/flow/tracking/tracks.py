@@ -25,7 +25,6 @@ from densify.flow.tracking.shapes import Shape
 from densify.flow.tracking.sightings import Track
 from densify.flow.tracking.vote import DistanceField, vote
 from densify.geometry.height_map import HeightMap
-from densify.kernels.clouds import rows_inside
 from densify.kernels.nearest import BoxTree
 from densify.types import Bool, Float
 
@@ -225,7 +224,7 @@ def _find(
     expected = apply(about, model.points, centre)
     slack_m = GATES_M[0] + look.half_s * np.abs(about_rate[:3])
     low, high = expected.min(0) - slack_m, expected.max(0) + slack_m
-    inside = rows_inside(c.points, low, high)
+    inside = c.strips.rows_inside(low, high)
     inside = inside[look.gather(free)[inside]]
     rows, enough = inside[c.cluster[inside] >= 0], float(MIN_FIT)
     if len(rows) < MIN_FIT:  # seen by nobody else, it may be there all the same
@@ -259,7 +258,7 @@ def _gather(
     for j, own in track.claimed.items():
         c = standing[j]
         there = track.place(shape.rim, track.seen_at(space.clock.time_ns[j]))
-        rows = rows_inside(c.points, there.min(0) - 2 * _FIT_M, there.max(0) + 2 * _FIT_M)
+        rows = c.strips.rows_inside(there.min(0) - 2 * _FIT_M, there.max(0) + 2 * _FIT_M)
         rows = rows[free[j][rows] & (c.cluster[rows] >= 0)]
         rows = np.setdiff1d(rows, own, assume_unique=True)
         in_shape = track.undo(c.points[rows], c.time_s[rows])
@@ -281,7 +280,7 @@ def _claim_rings(
     for j, own in track.claimed.items():
         c = standing[j]
         there = track.place(shape.rim, track.seen_at(space.clock.time_ns[j]))
-        rows = rows_inside(c.points, there.min(0) - _RINGS_M, there.max(0) + _RINGS_M)
+        rows = c.strips.rows_inside(there.min(0) - _RINGS_M, there.max(0) + _RINGS_M)
         rows = rows[free[j][rows] & (c.cluster[rows] >= 0)]
         rows = np.setdiff1d(rows, own, assume_unique=True)
         rows = rows[single_rings(c, rows, space.T_lidar_world[j], space.sensors)]

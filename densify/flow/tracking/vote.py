@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from densify.flow.tracking.clock import Clock
-from densify.kernels.clouds import spread
+from densify.kernels.clouds import missed, spread
 from densify.types import Float
 
 _MAX_SPEED_M_S = 38.0
@@ -47,13 +47,14 @@ class DistanceField:
         spread(points, low, step, offsets[far < 1], values, nearness)
         return DistanceField(nearness, low)
 
-    def __call__(self, points: Float) -> Float:
-        """(...,3) -> (...) distance to the nearest candidate as a share of the reach."""
-        at = ((points - self.low) * (1 / _VOTE_STEP_M)).astype(np.int32)
-        inside = ((at >= 0) & (at < self.nearness.shape)).all(-1)
-        at[~inside] = 0
-        near = self.nearness[at[..., 0], at[..., 1], at[..., 2]]
-        return np.where(inside, (255 - near) / 255, 1.0)
+    def __call__(self, points: Float, shifts: Float) -> Float:
+        """(N,3), (V,3) metres -> (V,) mean distance of the points, moved by each of the shifts, to
+        the nearest candidate, as a share of the reach."""
+        mean = np.empty(len(shifts))
+        missed.over_rows(
+            len(shifts), points, shifts, self.low, 1 / _VOTE_STEP_M, self.nearness, mean
+        )
+        return mean / 255
 
 
 def vote(points: Float, i: int, fields: Sequence[DistanceField], clock: Clock) -> Float:
@@ -97,7 +98,7 @@ def _best(
     cost = np.zeros(len(velocities))
     for j in around:
         shift = velocities * (clock.time_s[j] - clock.time_s[i])
-        cost += fields[j](sample + shift[:, None, :]).mean(1)
+        cost += fields[j](sample, shift)
     return np.asarray(velocities[np.argmin(cost + 1e-3 * np.linalg.norm(velocities, axis=1))])
 
 
