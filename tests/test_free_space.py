@@ -9,10 +9,11 @@ from test_project import KEY, T_CAM_LIDAR, make_camera, make_cloud, patches_of
 
 from densify.config import ProjectSettings
 from densify.depth.exposure import Exposure
-from densify.depth.free_space import Rays, crossings
+from densify.depth.free_space import Rays, crossings, without_seen_through
+from densify.depth.layers import Layers
 from densify.depth.project import project
 from densify.geometry.poses import exp, transform
-from densify.types import RegisteredSweep, Stretch, Sweep
+from densify.types import Reason, RegisteredSweep, Stretch, Sweep
 
 FRONT_M, WALL_M = 12.0, 20.0
 PICKET_M, STEP_M = 0.09, 0.17
@@ -32,11 +33,16 @@ def pole(y, z):
     return np.abs(y) < 0.06
 
 
-def scanned(solid):
+def legs(y, z):
+    return (np.abs(y) < 0.5) & (np.abs(y) > 0.12)
+
+
+def scanned(solid, of_others=None):
     """What eleven sweeps see of what is ``solid`` (y, z -> bool) in the plane x = 12 m before the
-    wall in x = 20 m, placed with 2 cm of error; and where the scanner stood."""
+    wall in x = 20 m, placed with 2 cm of error; and where the scanner stood. of_others: what is
+    solid for all but the key sweep; what is moves then."""
     rng = np.random.default_rng(3)
-    points, frames, origins, sweeps = [], [], {}, []
+    points, frames, origins, sweeps, moving = [], [], {}, [], []
     for frame in range(KEY - 5, KEY + 6):
         origin = np.array([0.7 * (frame - KEY), 0.15 * (frame - KEY), 0.0])
         azimuth = np.deg2rad(np.arange(-25, 25, 0.17) + rng.uniform(0, 0.17))
@@ -44,7 +50,8 @@ def scanned(solid):
         a, e = (g.ravel() for g in np.meshgrid(azimuth, elevation))
         ray = np.stack([np.ones_like(a), np.tan(a), np.tan(e) / np.cos(a)], axis=1)
         at = origin + ray * (FRONT_M - origin[0])
-        stops = solid(at[:, 1], at[:, 2])
+        stops = (solid if frame == KEY else of_others or solid)(at[:, 1], at[:, 2])
+        moving.append(stops)
         at[~stops] = (origin + ray * (WALL_M - origin[0]))[~stops]
         points.append(at + rng.normal(0, 0.02, 3))
         frames.append(np.full(len(at), frame))
@@ -52,6 +59,7 @@ def scanned(solid):
         pose[:3, 3] = origin
         sweeps.append(fired(frame, at, pose, np.zeros(6)))
     cloud = make_cloud(np.vstack(points), np.concatenate(frames))
+    cloud.moving[:] = np.concatenate(moving) & (of_others is not None)
     return cloud, origins, Rays(Stretch(tuple(sweeps)), KEY)
 
 
@@ -101,6 +109,30 @@ def test_solid_things_stay_though_sweeps_saw_what_is_behind_them(solid):
     lost = (before.filled_m > 0) & (after.filled_m == 0)
     assert lost[there].mean() < 0.001
     assert lost.mean() < 0.002
+
+
+def test_near_a_mover_the_rays_of_the_key_sweep_alone_tell():
+    """Legs swing: what lies between them is open now and shut at other times, or the other way
+    round; the map has it shut."""
+    for of_key, of_others, opens in ((legs, board, True), (board, legs, False)):
+        cloud, _, rays = scanned(of_key, of_others)
+        view = Exposure(CAMERA, T_CAM_LIDAR).sees(cloud)
+        shape = (CAMERA.height_px, CAMERA.width_px)
+        shut_m, none = np.full(shape, FRONT_M, np.float32), np.zeros(shape, np.float32)
+        layers = Layers(
+            *(none, none, none > 0, none > 0, shut_m, none + 1, np.full(shape, -1, np.int32)),
+            tilt=np.zeros((*shape, 2), np.float32),
+            spacing_px=np.broadcast_to(np.float32([2.1, 5.0]), (*shape, 2)),
+        )
+        front = cloud.points[:, 0] < 0.5 * (FRONT_M + WALL_M)
+        reason = np.where(front, Reason.KEPT, Reason.HIDDEN).astype(np.uint8)
+        made = without_seen_through(layers, cloud, view, rays, reason, SETTINGS)
+        u = np.arange(CAMERA.width_px)
+        y = -(u - CAMERA.K[0, 2]) / CAMERA.K[0, 0] * FRONT_M
+        lost = (made.filled_m == 0)[10:50]
+        between = np.abs(y) < 0.09
+        assert lost[:, between].mean() > 0.95 if opens else not lost[:, between].any()
+        assert not lost[:, (np.abs(y) > 0.16) & (np.abs(y) < 0.46)].any()
 
 
 @pytest.mark.parametrize("measure", ["z", "range"])

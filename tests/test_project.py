@@ -389,8 +389,11 @@ def test_what_few_sweeps_or_not_the_key_saw_is_unsupported():
     camera = make_camera(60, 40)
     knobs = ProjectSettings(support=4)
 
-    def kept(frames, others=()):
+    def kept(frames, others=(), lone=False):
         points, frame = wall(camera, 10.0, frames)
+        if lone:  # the key sweep has a single return of it
+            only = (frame != KEY) | (np.cumsum(frame == KEY) == 300)
+            points, frame = points[only], frame[only]
         aside = at_pixel(
             camera, [0] * len(others), [0] * len(others), 90.0
         )  # they exist, elsewhere
@@ -398,10 +401,30 @@ def test_what_few_sweeps_or_not_the_key_saw_is_unsupported():
         return (depth.reason[: len(points)] == Reason.KEPT).any()
 
     assert kept([KEY, KEY + 1, KEY + 2, KEY + 3], [KEY - 1, KEY - 2, KEY - 3, KEY - 4])
-    assert not kept([KEY, KEY + 1, KEY + 2], [KEY - 1, KEY - 2, KEY - 3, KEY - 4, KEY + 3])
+    three, others = [KEY, KEY + 1, KEY + 2], [KEY - 1, KEY - 2, KEY - 3, KEY - 4, KEY + 3]
+    assert kept(three, others)  # the key sweep has it all: what moves unnoticed
+    assert not kept(three, others, lone=True)
     assert not kept([KEY + 1, KEY + 2, KEY + 3, KEY + 4], [KEY, KEY - 1, KEY - 2, KEY - 3])
     assert kept([KEY + 1, KEY + 2, KEY - 1, KEY - 2])  # a key held out asks for its neighbours
     assert kept([KEY])  # a single sweep is enough where there is one
+
+
+def test_what_the_key_sweep_alone_saw_is_kept_where_it_has_several_returns():
+    """What moves and was not noticed hides the wall now, where other sweeps saw the wall."""
+    camera = make_camera(120, 90, 300.0)
+    back, back_frame = wall(camera, 20.0, SWEEPS)
+    front, front_frame = wall(camera, 10.0, [KEY])
+    panel = np.rint(front[:, 0] / front[:, 2] * 300 + camera.K[0, 2])
+    panel = (panel >= 40) & (panel < 80)
+    unseen = (back_frame != KEY) | ~np.isin(np.arange(len(back)), np.flatnonzero(panel))
+    lone = at_pixel(camera, [20], [30], 10.0)
+    points = np.vstack([front[panel], lone, back[unseen]])
+    frame = np.concatenate([front_frame[panel], [KEY], back_frame[unseen]])
+    depth = see(camera, points, frame, ProjectSettings(spot=0), (2.0, 2.0))
+    assert (np.abs(depth.depth_m[20:70:2, 44:76:2] - 10) < 0.01).all()
+    assert (np.abs(depth.depth_m[20:70, 40:80] - 20) > 1).all()
+    assert not (np.abs(depth.depth_m[:, :38] - 10) < 1).any()
+    assert depth.reason[panel.sum()] == Reason.UNSUPPORTED
 
 
 def test_no_point_is_believed_at_the_edge_of_its_surface():

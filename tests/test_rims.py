@@ -200,7 +200,7 @@ def test_a_mirrored_scene_has_mirrored_votes():
         *(
             np.ascontiguousarray(getattr(layers, name)[:, ::-1])
             for name in vars(layers)
-            if name not in ("lab", "warnings", "window", "glass")
+            if name not in ("lab", "warnings", "window", "glass", "alone")
         )
     )
     rims, mirrored = (np.flatnonzero(part.rim_m) for part in (layers, flipped))

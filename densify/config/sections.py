@@ -215,8 +215,9 @@ class ProjectSettings(Section):
     )
     support: int = knob(
         4,
-        "sweeps that must agree with a point, the one nearest to the key among them; at most half "
-        "of those there are; more removes what was badly registered and thins far surfaces",
+        "sweeps that must agree with a point, the one nearest to the key among them, at most half "
+        "of those there are, or else several returns of the key sweep; more removes what was badly "
+        "registered and thins far surfaces",
         1,
         20,
     )

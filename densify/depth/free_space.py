@@ -10,6 +10,7 @@ evidence as in occupancy grids: Thrun et al., "Probabilistic Robotics", 2005, ch
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,15 +20,24 @@ from densify.config import ProjectSettings
 from densify.depth.exposure import Exposure, InView
 from densify.depth.layers import Layers
 from densify.geometry import poses
+from densify.kernels.visibility import NOW_NS
 from densify.types import Bool, Cloud, Float, Float32, Reason, Stretch
 
 _NUM_STEPS = 6
 _SAME_M, _SAME_FRACTION = 0.05, 0.01  # from one step to the next: the crossing is found
-_BLUR = 0.25  # of the gap between rays, standard deviation: what rays tell of pixels around
 _LEAST_BLUR_PX = 1.0
-_LEAST_RAYS = 0.9  # through a pixel itself, or more of them around it
 # Gaps between rays to all sides of a mover: rays of other sweeps passed there before and after it.
 _MOVER_GAPS = 3.6
+
+
+class _Rule(NamedTuple):
+    """blur_px: down and across, standard deviation: what rays tell of pixels around. least: rays
+    through a pixel itself, or more of them around it. share: of the rays that went through; more
+    opens the pixel."""
+
+    blur_px: tuple[float, float]
+    least: float
+    share: float
 
 
 @dataclass(frozen=True)
@@ -68,37 +78,75 @@ def without_seen_through(
     """Without the pixels of which rays say that the place is open; what was measured there becomes
     a rim that is not accepted.
 
-    view: of the cloud. rays: those that tell; of other sweeps and of what moves they tell nothing.
-    reason: (M,) of the points, as far as the map is made.
+    view: of the cloud. rays: those that tell. reason: (M,) of the points, as far as the map is
+    made.
 
     A ray of a hidden point went through where it crosses the surface that the map shows, if the
     point lies behind by more than ``settings.hidden_m`` plus ``hidden_fraction``; a ray stopped at
     the pixel of a point that is not hidden. Both are blurred by a quarter of the gap between rays,
     and more than the share ``settings.seen_through`` of rays that went through takes a pixel away.
-    Closed windows stay (`densify.depth.glass`): lasers go through glass.
+    Near what moves, and what the key sweep alone saw, the rays of other sweeps tell nothing: there
+    only the key's own count, blurred by .7 gaps, and half of them take a pixel away. Closed windows
+    stay (`densify.depth.glass`): lasers go through glass.
     """
-    shape = layers.filled_m.shape
     told = np.isin(cloud.frame, rays.stretch.frames)
     told &= (reason != Reason.OUTSIDE) & (reason != Reason.VETOED)
-    hidden = reason == Reason.HIDDEN
-    passed = told & hidden & ~cloud.moving
-    if not passed.any():
-        return layers
+    stopped = told & (reason != Reason.HIDDEN)
+    passed = told & ~stopped & ~cloud.moving
     gap_px = float(np.median(layers.gap_px))
-    blur_px, around_px = max(_LEAST_BLUR_PX, _BLUR * gap_px), 2 * round(_MOVER_GAPS * gap_px) + 1
-    stopped = (told & ~hidden)[view.rows]
-    moving = stopped & cloud.moving[view.rows]
-    near_mover = ndimage.maximum_filter(_counts(view.uv[moving], shape), around_px) > 0
-    hits = cloud.select(passed)
-    through = crossings(layers.filled_m, rays.starts(hits), hits.points, view.exposure, settings)
-    num_through, num_stopped = (
-        _counts(uv, shape, blur_px) * (2 * np.pi * blur_px**2) for uv in (through, view.uv[stopped])
-    )
-    dropped = num_through > settings.seen_through * (num_through + num_stopped)
-    dropped &= (num_through >= _LEAST_RAYS) & (layers.filled_m > 0) & ~near_mover
+    near_mover = _near_movers(layers, cloud, view, stopped, round(_MOVER_GAPS * gap_px))
+    blur_px = max(_LEAST_BLUR_PX, 0.25 * gap_px)
+    usual = _Rule((blur_px, blur_px), least=0.9, share=settings.seen_through)
+    dropped = _opened(layers, cloud, view, rays, passed, stopped, usual, settings) & ~near_mover
+    if near_mover.any():
+        now = told & (np.abs(cloud.since_key_ns) <= NOW_NS)
+        column, row = np.rint(view.uv).astype(np.int64).T
+        passed = np.zeros(len(cloud), bool)
+        passed[view.rows] = near_mover[row, column]
+        passed &= now
+        across_px, down_px = np.median(layers.spacing_px, axis=(0, 1)).tolist()
+        of_key = _Rule((0.7 * down_px, 0.7 * across_px), least=0.3, share=0.5)
+        opened = _opened(layers, cloud, view, rays, passed, stopped & now, of_key, settings)
+        dropped |= opened & near_mover
     if layers.window is not None:
         dropped &= ~layers.window
     return _without(layers, dropped)
+
+
+def _near_movers(layers: Layers, cloud: Cloud, view: InView, seen: Bool, reach_px: int) -> Bool:
+    """(H,W) within ``reach_px`` of what moves. seen: (M,) points that are not hidden."""
+    moving = (seen & cloud.moving)[view.rows]
+    movers = _counts(view.uv[moving], layers.depth_m.shape) > 0
+    if layers.alone is not None:
+        movers |= layers.alone
+    near: Bool = ndimage.maximum_filter(movers, 2 * reach_px + 1)
+    return near
+
+
+def _opened(
+    layers: Layers,
+    cloud: Cloud,
+    view: InView,
+    rays: Rays,
+    passed: Bool,
+    stopped: Bool,
+    rule: _Rule,
+    settings: ProjectSettings,
+) -> Bool:
+    """(H,W) where more rays went through the map than stopped, by a rule. passed: (M,) points whose
+    rays may have gone through. stopped: (M,) those whose rays stopped where they show."""
+    shape = layers.filled_m.shape
+    if not passed.any():
+        return np.zeros(shape, bool)
+    hits = cloud.select(passed)
+    through = crossings(layers.filled_m, rays.starts(hits), hits.points, view.exposure, settings)
+    num_through, num_stopped = (
+        _counts(uv, shape, rule.blur_px) * (2 * np.pi * rule.blur_px[0] * rule.blur_px[1])
+        for uv in (through, view.uv[stopped[view.rows]])
+    )
+    opened: Bool = num_through > rule.share * (num_through + num_stopped)
+    opened &= (num_through >= rule.least) & (layers.filled_m > 0)
+    return opened
 
 
 def _without(layers: Layers, dropped: Bool) -> Layers:
@@ -110,8 +158,10 @@ def _without(layers: Layers, dropped: Bool) -> Layers:
     return replace(layers, rim_m=rim_m, depth_m=depth_m, filled_m=filled_m, confidence=confidence)
 
 
-def _counts(uv: Float, shape: tuple[int, ...], blur_px: float = 0.0) -> Float32:
-    """(K,2) px -> (H,W) how many in each pixel."""
+def _counts(
+    uv: Float, shape: tuple[int, ...], blur_px: tuple[float, float] = (0.0, 0.0)
+) -> Float32:
+    """(K,2) px -> (H,W) how many in each pixel. blur_px: of a `_Rule`."""
     column, row = np.rint(uv).astype(np.int64).T
     counts = np.bincount(row * shape[1] + column, minlength=shape[0] * shape[1])
     pixels = counts.reshape(shape).astype(np.float32)

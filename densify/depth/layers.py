@@ -27,6 +27,8 @@ class Layers:
     elevation, everywhere. lab: (H,W,3) float32 the image as `densify.depth.picture` makes it, None
     without one. warnings: what could not be done as asked. window: (H,W) True inside the windows of
     vehicles, and glass: where a measured pixel was taken out of one; None before they are closed.
+    alone: (H,W) measured by the key sweep alone, where others should have met the surface; None for
+    nowhere.
     """
 
     depth_m: Float32
@@ -42,6 +44,7 @@ class Layers:
     warnings: tuple[str, ...] = ()
     window: Bool | None = None
     glass: Bool | None = None
+    alone: Bool | None = None
 
     @property
     def gap_px(self) -> Float32:

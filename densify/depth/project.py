@@ -109,12 +109,14 @@ def _measured(
     confidence.flat[seen.pixel] = np.maximum(seen.confidence, _LEAST_CONFIDENCE)
     tilt.reshape(-1, 2)[seen.pixel] = seen.tilt
     point.flat[seen.pixel] = points.index[seen.winner]
-    veiled, refused = np.zeros(shape, bool), np.zeros(shape, bool)
+    veiled, refused, alone = (np.zeros(shape, bool) for _ in range(3))
     veiled.flat[seen.pixel] = seen.veiled
     refused.flat[seen.pixel] = seen.refused
+    alone.flat[seen.pixel] = seen.alone
     spacing_px = _spacing_px(points if points.far.all() else points.select(~points.far), shape)
     return Layers(
-        depth_m, rim_m, veiled, refused, depth_m, confidence, point, tilt, spacing_px, lab
+        *(depth_m, rim_m, veiled, refused, depth_m, confidence, point, tilt, spacing_px, lab),
+        alone=alone,
     )
 
 

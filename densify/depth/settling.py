@@ -26,13 +26,15 @@ _FAR_SUPPORT, _FAR_EDGE = 6, 1.5
 _DOUBTS = np.array([0.45, 0.25, 0.20, 0.10, 0.10])
 _MANY_POINTS = 20
 _ROUGH_M = 0.10
+_LEAST_ALONE = 4  # returns of the key sweep that agree around one, itself among them, of nine
 
 
 @dataclass(frozen=True)
 class MeasuredPixels:
     """P measured pixels. pixel: (P,) row by row. winner: (P,) which of the points in the image.
     depth_m, confidence: (P,). tilt: (P,2) of the inverse depth, 1/m per px. inside: (P,) no depth
-    edge near. veiled: (P,) behind another point's patch. refused: (P,) see `Layers`."""
+    edge near. veiled: (P,) behind another point's patch. refused, alone: (P,) see
+    `Layers`."""
 
     pixel: Int
     winner: Int
@@ -42,6 +44,7 @@ class MeasuredPixels:
     inside: Bool
     veiled: Bool
     refused: Bool
+    alone: Bool
 
     def select(self, keep: Bool | Int) -> MeasuredPixels:
         """Some of the pixels."""
@@ -89,22 +92,27 @@ def _settled(
     """The pixels that points measure, and of every point the `Reason`.
 
     taken: where given, pixels to leave alone; for the others the stricter rules hold of what sweeps
-    beyond the window measured.
+    beyond the window measured. Else what too few sweeps agree with is believed where the key sweep
+    has several returns of it: what moves unnoticed was elsewhere at other times.
     """
+    many = int(points.sweep.max(initial=0)) + 1
+    least = min(settings.support, max(1, many // 2))
+    reaches = _reaches(settings, least if taken is None else 0)
     behind = _behind(points, camera, settings)
     hidden = behind > 1
     reason = np.where(hidden, Reason.HIDDEN, Reason.NOT_CHOSEN).astype(np.uint8)
-    pixel, winner, found = _found(points, hidden, own, camera, settings, taken)
-    depth_m, num_sweeps, youngest_ns, num_points, residual_m, edge = found
+    pixel, winner, found = _found(points, hidden, own, camera, settings, reaches, taken)
+    depth_m, num_sweeps, youngest_ns, num_points, residual_m, edge, num_alone = found
     veiled = hidden[winner]
     refused = veiled & (points.age_ns[winner] > kernels.NOW_NS)
     if refused.any():
         refused &= _behind(points, camera, settings, points.moving)[winner] > 1
     refused |= edge < 0
+    alone = num_alone >= _LEAST_ALONE
     if taken is None:
-        many = int(points.sweep.max(initial=0)) + 1
-        supported = num_sweeps >= min(settings.support, max(1, many // 2))
+        supported = num_sweeps >= least
         supported &= youngest_ns <= np.float32(points.age_ns.min(initial=_NEVER_NS))
+        supported |= alone
         inside = edge >= 1
     else:
         many, supported, inside = 2 * _FAR_SUPPORT, num_sweeps >= _FAR_SUPPORT, edge >= _FAR_EDGE
@@ -123,7 +131,7 @@ def _settled(
     confidence, tilt = confidence.astype(np.float32), points.slope[winner]
     inside &= ~veiled
     every = MeasuredPixels(
-        pixel, winner, depth_m, confidence, tilt, inside, veiled, refused & ~inside
+        pixel, winner, depth_m, confidence, tilt, inside, veiled, refused & ~inside, alone
     )
     return every.select(supported), reason
 
@@ -134,16 +142,17 @@ def _found(
     own: Float32,
     camera: Camera,
     settings: ProjectSettings,
+    reaches: kernels.Reaches,
     taken: Int | None,
 ) -> tuple[Int, Int, Float32]:
     """The pixels (P,) with points, which point comes first in each (P,), and what
-    `densify.kernels.visibility.settle` finds around it, (6,P). taken: where given, neither these
+    `densify.kernels.visibility.settle` finds around it, (7,P). taken: where given, neither these
     nor those with hidden points alone."""
     last = int(points.age_ns.max(initial=0)) + 1
     late = points.age_ns > kernels.NOW_NS
     rank = np.where(hidden, last + late, points.age_ns)
     start, order = _by_pixel(points, rank, own, camera)
-    found = np.zeros((6, len(start) - 1), np.float32)
+    found = np.zeros((7, len(start) - 1), np.float32)
     done = np.zeros(len(start) - 1, bool)
     if taken is not None:
         some = np.flatnonzero(np.diff(start))
@@ -164,12 +173,12 @@ def _found(
         age_ns=points.age_ns[order],
     )
     shape = (camera.height_px, camera.width_px)
-    kernels.settle.over_rows(len(done), visible, _reaches(settings), shape, done, found)
+    kernels.settle.over_rows(len(done), visible, reaches, shape, done, found)
     pixel = np.flatnonzero(found[0])
     return pixel, order[start[pixel]], found[:, pixel]
 
 
-def _reaches(settings: ProjectSettings) -> kernels.Reaches:
+def _reaches(settings: ProjectSettings, few: int) -> kernels.Reaches:
     return kernels.Reaches(
         support=float(settings.support_reach),
         plane=float(settings.plane_reach),
@@ -179,6 +188,7 @@ def _reaches(settings: ProjectSettings) -> kernels.Reaches:
         behind_fraction=float(settings.hidden_fraction),
         edge=float(settings.edge_reach),
         edge_window_px=_EDGE_WINDOW_PX,
+        few=few,
     )
 
 
@@ -233,6 +243,7 @@ def nearest_pixels(
         own[nearest],
         tilt,
         everywhere,
+        ~everywhere,
         ~everywhere,
         ~everywhere,
     )

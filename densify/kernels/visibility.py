@@ -138,17 +138,23 @@ def _extend(reach, u, v):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def _write(found, centre, w0, agree, m, squares, num, seen, youngest):  # type: ignore[no-untyped-def]
-    """found: (6,) of `settle`, as if no depth edge were near. centre: expected inverse depth, w0:
-    the first point's. m, squares: moments of what lies off it, within ``agree``, of ``num`` points.
-    seen: a bit for each sweep."""
+def _count(seen):  # type: ignore[no-untyped-def]
+    """Bits of the sweeps seen."""
     num_sweeps = 0
     while seen:
         num_sweeps += seen & 1
         seen >>= 1
+    return num_sweeps
+
+
+@inlined
+def _write(found, centre, w0, agree, m, squares, num, seen, youngest):  # type: ignore[no-untyped-def]
+    """found: (7,) of `settle`, as if no depth edge were near. centre: expected inverse depth, w0:
+    the first point's. m, squares: moments of what lies off it, within ``agree``, of ``num`` points.
+    seen: a bit for each sweep."""
     best = min(max(_centre(m), -agree), agree)
     found[0] = 1 / (centre + best)
-    found[1], found[2], found[3] = num_sweeps, youngest, num
+    found[1], found[2], found[3] = _count(seen), youngest, num
     mean = m[6] / m[0]
     found[4] = np.sqrt(max(squares / m[0] - mean * mean, 0.0)) / (w0 * w0)
     found[5] = _ALL_ROUND
@@ -189,8 +195,8 @@ class Reaches(NamedTuple):
     support, plane: reach of the support and of the fitted plane, in ray spacings. agree_m,
     agree_fraction: metres and share of the depth within which points agree; behind_m,
     behind_fraction: the same beyond which one lies behind. edge: reach of a depth edge in ray
-    spacings, edge_window_px: px beyond it where is looked for what
-    goes on.
+    spacings, edge_window_px: px beyond it where is looked for what goes on. few: with fewer sweeps
+    that agree with it a return of the key sweep is judged by the key sweep alone.
     """
 
     support: float
@@ -201,6 +207,7 @@ class Reaches(NamedTuple):
     behind_fraction: float
     edge: float
     edge_window_px: float
+    few: int
 
 
 @inlined
@@ -212,31 +219,30 @@ def _expected(points, i, u0, v0):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def _look_round(points, reaches, shape, i, u0, v0, centre, agree, inner, m, reach):  # type: ignore[no-untyped-def]
+def _look_round(points, reaches, shape, i, u0, v0, centre, agree, inner, witness_ns, m, reach):  # type: ignore[no-untyped-def]
     """The points around a pixel beside point i's tangent plane, ``centre`` in the pixel.
 
-    Fills the moments m and how far the surface goes on, reach. Returns a bit for each sweep that
-    agrees, the age of the youngest, points in the fit, their weighted squares, whether something
-    lies behind close by, and the squared distances in ray spacings to what the key sweep, on a
-    mover, saw of its surface and behind it.
+    witness_ns: how long before or after the key what lies behind tells of an edge; `_ANY_AGE_NS`
+    for what stands. Fills the moments m and how far the surface goes on, reach. Returns a bit for
+    each sweep that agrees, the age of the youngest, points in the fit, their weighted squares,
+    whether something lies behind close by, and of a mover the squared distances in ray spacings to
+    what the key sweep saw of its surface and behind it, and how many returns of the key agree.
     """
     start, uv = points.start, points.uv
     inverse, hidden, age_ns = points.inverse, points.hidden, points.age_ns
     across, along = points.spacing_px[i, 0], points.spacing_px[i, 1]
-    su, sv, moving = points.slope[i, 0], points.slope[i, 1], points.moving[i]
-    w0 = inverse[i]
+    su, sv, w0 = points.slope[i, 0], points.slope[i, 1], inverse[i]
+    moving = witness_ns < _ANY_AGE_NS
     far = (reaches.behind_m + reaches.behind_fraction / w0) * w0 * w0
     outer = inner + reaches.edge_window_px
     # What moves is seen by its sweeps in the same rings.
     on_v = max(outer, _GOES_ON * along) if moving else outer
-    # Other sweeps saw the background where the mover was not yet, or no more.
-    witness_ns = _MOVING_WITNESS_NS if moving else _ANY_AGE_NS
     # Whether enough sweeps agree does not depend on how far edges are looked for.
     support_u, support_v = _window(reaches.support * across), _window(reaches.support * along)
     wide_u, wide_v = max(support_u, _window(outer)), max(support_v, _window(on_v))
     fit_u, fit_v = _fit(reaches.plane * across), _fit(reaches.plane * along)
     seen, num, youngest, behind, squares = np.int64(0), 0, age_ns[i], False, 0.0
-    now, now_behind = np.inf, np.inf
+    now, now_behind, num_now = np.inf, np.inf, 0
     left, right = max(u0 - wide_u, 0), min(u0 + wide_u, shape[1] - 1)
     for v in range(max(v0 - wide_v, 0), min(v0 + wide_v, shape[0] - 1) + 1):
         for j in range(start[v * shape[1] + left], start[v * shape[1] + right + 1]):
@@ -252,6 +258,8 @@ def _look_round(points, reaches, shape, i, u0, v0, centre, agree, inner, m, reac
                     now_behind = min(now_behind, away)
                 continue
             now = min(now, away)
+            around = abs(du) <= _GOES_ON * across and abs(dv) <= _GOES_ON * along
+            num_now += around and away < np.inf
             if abs(du) <= support_u + 0.5 and abs(v - v0) <= support_v:
                 seen |= np.int64(1) << np.int64(points.sweep[j])
                 youngest = min(youngest, age_ns[j])
@@ -262,7 +270,7 @@ def _look_round(points, reaches, shape, i, u0, v0, centre, agree, inner, m, reac
                 _add(m, weight, du, dv, off)
                 squares += weight * off * off
                 num += 1
-    return seen, youngest, num, squares, behind, now, now_behind
+    return seen, youngest, num, squares, behind, now, now_behind, num_now
 
 
 @Kernel
@@ -270,15 +278,19 @@ def settle(first, last, points, reaches, shape, taken, found):  # type: ignore[n
     """Each pixel's depth from the points around that agree with its first point.
 
     points: `Visible`. reaches: `Reaches`. shape: (height, width). taken: (P,) bool, pixels to leave
-    alone. found: (6,P) float32, filled where there is a point with depth, number of sweeps that
-    agree, age of the youngest of them, points in the fit, their root mean square residual (m), and
-    how far the surface goes on to all sides, as a share of the edges' reach. Hidden points agree
-    with a hidden one only.
+    alone. found: (7,P) float32, filled where there is a point with depth, number of sweeps that
+    agree, age of the youngest of them, points in the fit, their root mean square residual (m), how
+    far the surface goes on to all sides, as a share of the edges' reach, and see below. Hidden
+    points agree with a hidden one only.
 
     Limbs swing, so a mover's other sweeps tell less of its outline than the key sweep: where that
     saw past the mover nearer by than it saw the mover, an edge is near (0); at half the distance,
     or if it should have met the mover there and did not, the pixel shows what is behind (-1). An
     edge is near too where it should have met the mover and saw past it anywhere around.
+
+    What the key sweep saw and fewer than `Reaches.few` sweeps agree with may have moved unnoticed:
+    it is judged as a mover is, by the key sweep alone, and the last row says how many returns of
+    the key sweep agree within 1.2 spacings.
     """
     m, reach = np.zeros(9), np.zeros(8)
     for p in range(first, last):
@@ -291,9 +303,17 @@ def settle(first, last, points, reaches, shape, taken, found):  # type: ignore[n
         edge_px = points.edge_px[i] * (_MOVING_SLACK if points.moving[i] else 1.0)
         inner = reaches.edge * points.spacing_px[i, 0] + edge_px
         m[:], reach[:] = 0.0, 0.0
-        seen, youngest, num, squares, behind, now, now_behind = _look_round(
-            points, reaches, shape, i, u0, v0, centre, agree, inner, m, reach
+        # Other sweeps saw the background where the mover was not yet, or no more.
+        witness_ns = _MOVING_WITNESS_NS if points.moving[i] else _ANY_AGE_NS
+        seen, youngest, num, squares, behind, now, now_behind, num_now = _look_round(
+            points, reaches, shape, i, u0, v0, centre, agree, inner, witness_ns, m, reach
         )
+        if points.age_ns[i] <= NOW_NS and not points.hidden[i] and _count(seen) < reaches.few:
+            m[:], reach[:] = 0.0, 0.0
+            seen, youngest, num, squares, behind, now, now_behind, num_now = _look_round(
+                points, reaches, shape, i, u0, v0, centre, agree, inner, NOW_NS, m, reach
+            )
+            found[6, p] = num_now
         _write(found[:, p], centre, w0, agree, m, squares, num, seen, youngest)
         if behind and inner > 0:
             found[5, p] = _shortest(reach) / inner
