@@ -55,14 +55,15 @@ def register(
         `searched_twist`, since odometry takes every start for standing still.
 
     World is the first sweep's lidar frame. Raises SweepError naming the frames where a sweep
-    is too sparse to register, the stamps do not ascend or, in the second pass, the motion is none
-    a vehicle makes.
+    is too sparse to register or the stamps do not ascend. Whether the motion is one that a vehicle
+    makes say `check_plausible` and `check_overlap`; a first pass may stumble where it starts from
+    rest.
     """
     from kiss_icp.kiss_icp import KissICP
 
     frames = tuple(s.frame for s in sweeps)
     stamp_ns = np.array([s.stamp_ns for s in sweeps], np.int64)
-    _check_number_of_points(sweeps, settings)
+    check_number_of_points(sweeps, settings)
     _check_stamps(frames, stamp_ns)
     step_s = np.diff(stamp_ns) * 1e-9
     voxel_size_m = _voxel_size_m(sweeps, settings) * (2 if rough is None else 1)
@@ -81,11 +82,7 @@ def register(
             odometry.last_delta = poses.exp(twist * step_s[i - 1])
         odometry.register_frame(sweep.points, no_stamps)
         T_world_lidar.append(odometry.last_pose)
-    trajectory = Trajectory(frames, stamp_ns, np.stack(T_world_lidar))
-    if rough is not None:  # a first pass may stumble where it starts from rest
-        check_plausible(trajectory, settings)
-        check_overlap(sweeps, trajectory, settings)
-    return trajectory
+    return Trajectory(frames, stamp_ns, np.stack(T_world_lidar))
 
 
 def _voxel_size_m(sweeps: Sequence[Sweep], settings: RegisterSettings) -> float:
@@ -95,7 +92,8 @@ def _voxel_size_m(sweeps: Sequence[Sweep], settings: RegisterSettings) -> float:
     return settings.voxel_size_m * float(np.clip(num_points / _MANY_POINTS, _LEAST_VOXEL, 1.0))
 
 
-def _check_number_of_points(sweeps: Sequence[Sweep], settings: RegisterSettings) -> None:
+def check_number_of_points(sweeps: Sequence[Sweep], settings: RegisterSettings) -> None:
+    """Raise SweepError for a sweep too sparse to be placed."""
     for sweep in sweeps:
         if len(sweep) < settings.min_num_points:
             raise SweepError(

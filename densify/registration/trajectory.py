@@ -12,13 +12,18 @@ import numpy as np
 from densify.config import RegisterSettings
 from densify.geometry import poses
 from densify.registration.deskew import deskew
-from densify.registration.odometry import check_overlap, check_plausible, register
-from densify.registration.upright import upright
-from densify.types import Sweep, Trajectory
-
-_ROUGH_STEP_S = (
-    0.1  # within less the rings on the ground, that go with the scanner, hide its motion
+from densify.registration.odometry import (
+    check_number_of_points,
+    check_overlap,
+    check_plausible,
+    register,
 )
+from densify.registration.upright import upright
+from densify.types import Float, Int, Sweep, Trajectory
+
+_STEP_S = 0.1
+"""Sweeps closer in time: the rings on the ground, that go with the scanner, hide its motion, and
+few points of each tell little of it."""
 
 
 class LeftOut(NamedTuple):
@@ -53,27 +58,87 @@ def find_trajectory(
         check_overlap(sweeps, recorded, settings)
         found = recorded
     else:
+        check_number_of_points(sweeps, settings)
         rough = _rough(sweeps, settings)
         straight = [s.sweep for s in deskew(sweeps, rough).sweeps]
-        found = register(straight, settings, rough)
+        found = _fine(straight, rough, settings)
+        check_plausible(found, settings)
+        check_overlap(straight, found, settings)
     return replace(found, R_level_lidar=upright(sweeps))
 
 
 def _rough(sweeps: Sequence[Sweep], settings: RegisterSettings) -> Trajectory:
-    """The first pass, over sweeps no closer in time than it can tell them apart, with the poses
-    between them at constant velocity."""
-    stamp_ns = np.array([s.stamp_ns for s in sweeps], np.int64)
-    usual_s = float(np.median(np.diff(stamp_ns))) * 1e-9 if len(sweeps) > 1 else _ROUGH_STEP_S
-    stride = max(1, round(_ROUGH_STEP_S / usual_s))
-    if stride == 1:
+    """The first pass, of raw sweeps: those taken together are not laid on each other, as if they
+    were one raw sweep that takes longer."""
+    stamp_ns = _stamps_ns(sweeps)
+    together = _together(stamp_ns)
+    if len(together) in (1, len(sweeps)):
         return register(sweeps, settings)
-    last = len(sweeps) - 1
-    rows = np.array(sorted({*range(0, last, stride), last}))
-    sparse = register([sweeps[row] for row in rows], settings)
+    groups = [[sweeps[i] for i in rows] for rows in together]
+    joined = [_joined(group, np.concatenate([s.points for s in group])) for group in groups]
+    return _between(register(joined, settings), tuple(s.frame for s in sweeps), stamp_ns)
+
+
+def _fine(sweeps: Sequence[Sweep], rough: Trajectory, settings: RegisterSettings) -> Trajectory:
+    """The second pass, of deskewed sweeps: those taken together are laid on each other."""
+    stamp_ns = _stamps_ns(sweeps)
+    together = _together(stamp_ns)
+    if len(together) in (1, len(sweeps)):
+        return register(sweeps, settings, rough)
+    frames = tuple(sweeps[rows[0]].frame for rows in together)
+    start = _between(rough, frames, np.array([_middle_ns(stamp_ns[rows]) for rows in together]))
+    joined = []
+    for rows, T_world_joined in zip(together, start.T_world_lidar, strict=True):
+        T_joined_lidar = poses.inverse(T_world_joined) @ rough.T_world_lidar[rows]
+        points = [
+            poses.transform(T, sweeps[i].points) for i, T in zip(rows, T_joined_lidar, strict=True)
+        ]
+        joined.append(_joined([sweeps[i] for i in rows], np.concatenate(points)))
+    return _between(register(joined, settings, start), rough.frames, stamp_ns)
+
+
+def _together(stamp_ns: Int) -> list[list[int]]:
+    """The rows of sweeps that follow each other within less than 0.1 s, to the nearest sweep."""
+    usual_ns = float(np.median(np.diff(stamp_ns))) if len(stamp_ns) > 1 else _STEP_S * 1e9
+    together: list[list[int]] = []
+    for i, time_ns in enumerate(stamp_ns.tolist()):
+        since_ns = time_ns - stamp_ns[together[-1][0]] if together else np.inf
+        if since_ns + 0.5 * usual_ns < _STEP_S * 1e9:
+            together[-1].append(i)
+        else:
+            together.append([i])
+    return together
+
+
+def _joined(sweeps: Sequence[Sweep], points: Float) -> Sweep:
+    """All their points as one sweep, in the middle of their reference times."""
+    num = len(points)
+    return Sweep(
+        sweeps[0].frame,
+        _middle_ns(_stamps_ns(sweeps)),
+        points,
+        np.zeros(num, np.float32),
+        None,
+        np.zeros(num, np.uint8),
+        np.arange(num, dtype=np.int64),
+    )
+
+
+def _between(known: Trajectory, frames: tuple[int, ...], stamp_ns: Int) -> Trajectory:
+    """The poses at other times, at constant velocity between those known and beyond."""
     T_world_lidar = []
-    for i, time_ns in enumerate(stamp_ns):
-        k = min(int(np.searchsorted(rows, i, side="right")), len(rows) - 1) - 1
-        a_ns, b_ns = sparse.stamp_ns[k : k + 2]
-        a, b = sparse.T_world_lidar[k : k + 2]
+    for time_ns in stamp_ns:
+        later = int(np.searchsorted(known.stamp_ns, time_ns, side="right"))
+        k = min(max(later, 1), len(known.stamp_ns) - 1) - 1
+        a_ns, b_ns = known.stamp_ns[k : k + 2]
+        a, b = known.T_world_lidar[k : k + 2]
         T_world_lidar.append(poses.interpolate(a, b, (time_ns - a_ns) / (b_ns - a_ns)))
-    return Trajectory(tuple(s.frame for s in sweeps), stamp_ns, np.stack(T_world_lidar))
+    return Trajectory(frames, stamp_ns, np.stack(T_world_lidar))
+
+
+def _middle_ns(stamp_ns: Int) -> int:
+    return int(stamp_ns[0] + (stamp_ns[-1] - stamp_ns[0]) // 2)
+
+
+def _stamps_ns(sweeps: Sequence[Sweep]) -> Int:
+    return np.array([s.stamp_ns for s in sweeps], np.int64)
