@@ -4,9 +4,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Executor, Future
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +19,6 @@ from densify.depth.confidence import expected_outliers, reliability
 from densify.depth.exposure import Shot
 from densify.depth.views import HeldOut, SeenCloud, Views
 from densify.geometry.range_image import RangeImage
-from densify.kernels.threads import num_threads
 from densify.methods import METHODS
 from densify.recording import Beyond, Moment
 from densify.scores import depth_metrics
@@ -59,20 +58,30 @@ class Key:
 
 def key_results(
     key: Key,
-    moments: Mapping[str, Moment],
-    beyond: Beyond | None,
+    moments: Mapping[str, Future[Moment]],
+    beyond: Future[Beyond | None],
     priors: Mapping[str, Prior],
+    pool: Executor,
 ) -> dict[str, Result]:
-    """Results by method, each with those before it as its baselines, made side by side on as many
-    cores as there are.
+    """Results by method, each with those before it as its baselines.
 
-    moments: by method. beyond: None where nothing is known or wanted. priors: by map, they complete
-    the maps of the last of the methods.
+    moments: by method. beyond: None where nothing is known or wanted. Both, and what is made of
+    them here, are tasks of the ``pool``; those that need no flow go first, beside it. priors: by
+    map, they complete the maps of the last of the methods.
     """
-    shared = _Shared.of(key, moments, beyond)
-    with ThreadPoolExecutor(num_threads()) as pool:
-        made = list(pool.map(lambda name: shared.result(name, moments[name]), moments))
-    if priors and made:
+    shared, last = _Shared.of(key), [*moments][-1]
+    far = {
+        visible: pool.submit(shared.far, beyond, visible)
+        for visible in {METHODS[name].visible for name in moments if METHODS[name].far}
+    }
+    shown = {
+        name: pool.submit(shared.shown, name, moments[name], beyond, far)
+        for name in sorted(moments, key=lambda name: METHODS[name].engine is not None)
+    }
+    held_out = pool.submit(shared.held_out, moments[last])
+    scored = {name: pool.submit(shared.scored, shown[name], held_out) for name in moments}
+    made = [future.result() for future in scored.values()]
+    if priors:
         cameras, settings = key.sequence.cameras, key.settings.prior
         with key.watch.stage("prior"):
             made[-1] = completed(made[-1], priors, shared.truth, cameras, settings)
@@ -83,25 +92,30 @@ def key_results(
     return results
 
 
+class _Shown(NamedTuple):
+    """A result without its baselines, and without its score with the key held out; and all of its
+    cloud as the cameras see it."""
+
+    result: Result
+    seen: SeenCloud
+    visible: bool
+
+
 @dataclass(frozen=True)
 class _Shared:
     """What all methods of a key have in common.
 
-    key_image: what the key sweep saw. far: what sweeps beyond the window measured, with and without
-    visibility. truth: depth and what moves, by map.
+    key_image: what the key sweep saw. truth: depth and what moves, by map.
     """
 
     key: Key
     key_image: RangeImage
     views: Views
-    held_out: HeldOut
     truth: Mapping[str, tuple[Float32, Bool]]
-    beyond: Beyond | None
-    far: Mapping[bool, SeenCloud]
 
     @staticmethod
-    def of(key: Key, moments: Mapping[str, Moment], beyond: Beyond | None) -> _Shared:
-        sequence, stretch, watch = key.sequence, key.stretch, key.watch
+    def of(key: Key) -> _Shared:
+        sequence, stretch = key.sequence, key.stretch
         key_image = RangeImage.of(stretch[key.frame])
         views = Views.of(
             sequence, stretch, key.frame, key_image, key.shots, key.images, key.settings
@@ -109,39 +123,57 @@ class _Shared:
         truth = {}
         if key.with_images and sequence.truth is not None:
             truth = views.truth(sequence.truth)
-        with watch.stage("held out"):
-            held_out = HeldOut.of(views, moments[[*moments][-1]].cloud)
-        far = {}
-        if beyond is not None:
-            with watch.stage("far"):
-                for visible in {METHODS[name].visible for name in moments if METHODS[name].far}:
-                    far[visible] = views.far(*beyond, stretch, standing_only=visible)
-        return _Shared(key, key_image, views, held_out, truth, beyond, far)
+        return _Shared(key, key_image, views, truth)
 
-    def result(self, name: str, moment: Moment) -> Result:
-        """One method's, without its baselines."""
-        method, key, views = METHODS[name], self.key, self.views
+    def far(self, beyond: Future[Beyond | None], visible: bool) -> SeenCloud | None:
+        """What sweeps beyond the window measured."""
+        found = beyond.result()
+        if found is None:
+            return None
+        with self.key.watch.stage("far"):
+            return self.views.far(*found, self.key.stretch, standing_only=visible)
+
+    def held_out(self, moment: Future[Moment]) -> HeldOut:
+        """moment: says what moves in the key sweep."""
+        cloud = moment.result().cloud
+        with self.key.watch.stage("held out"):
+            return HeldOut.of(self.views, cloud)
+
+    def scored(self, shown: Future[_Shown], held_out: Future[HeldOut]) -> Result:
+        """With the score of what is made without the key sweep."""
+        result, seen, visible = shown.result()
+        alone = held_out.result()
+        with self.key.watch.stage("held out"):
+            scores = alone.scores(seen, visible)
+        return replace(result, metrics={**result.metrics, "held_out": scores})
+
+    def shown(
+        self,
+        name: str,
+        of_method: Future[Moment],
+        beyond: Future[Beyond | None],
+        far: Mapping[bool, Future[SeenCloud | None]],
+    ) -> _Shown:
+        """One method's."""
+        method, key, views, moment = METHODS[name], self.key, self.views, of_method.result()
         output, watch = key.settings.output, key.watch
         visible = method.visible and key.settings.project.visibility
-        far = self.far.get(method.visible) if method.far else None
+        beside = far[method.visible].result() if method.far else None
         with watch.stage("project"):
-            seen = views.see(moment.cloud, visible).joined(far)
-        with watch.stage("held out"):
-            held_out = self.held_out.scores(seen, visible)
-        with watch.stage("project"):
+            every = seen = views.see(moment.cloud, visible).joined(beside)
             movers, images = {}, key.images if key.with_images else {}
             if output.movers == "separate":
                 movers = views.movers(moment.cloud, visible, images)
             if output.movers != "keep":
                 standing = moment.cloud.select(~moment.cloud.moving)
-                seen = views.see(standing, visible).joined(far)
-            depth = self._depth(seen, visible)
+                seen = views.see(standing, visible).joined(beside)
+            depth = self._depth(seen, visible, beyond.result() if method.far else None)
         cloud = seen.cloud
         if key.with_images:
             with watch.stage("colour"):
                 cloud = views.coloured(seen, depth, images)
         with watch.stage("score"):
-            metrics = self._metrics(cloud, depth, visible, held_out)
+            metrics = self._metrics(cloud, depth, visible)
         result = Result(
             method=name,
             key=key.frame,
@@ -160,31 +192,28 @@ class _Shared:
             truth_m={name: true_m for name, (true_m, _) in self.truth.items()},
             T_key_lidar={f: key.stretch.T_target_source(key.frame, f) for f in key.stretch.frames},
         )
-        if far is None or self.beyond is None:
-            return result
-        return replace(
-            result,
-            far_frames=tuple(np.unique(far.cloud.frame).tolist()),
-            far_links=self.beyond.standing.links,
-            far_left_out=self.beyond.standing.left_out,
-        )
+        found = beyond.result() if beside is not None else None
+        if beside is not None and found is not None:
+            result = replace(
+                result,
+                far_frames=tuple(np.unique(beside.cloud.frame).tolist()),
+                far_links=found.standing.links,
+                far_left_out=found.standing.left_out,
+            )
+        return _Shown(result, every, visible)
 
-    def _depth(self, seen: SeenCloud, visible: bool) -> dict[str, DepthMap]:
+    def _depth(self, seen: SeenCloud, visible: bool, beyond: Beyond | None) -> dict[str, DepthMap]:
         frame, views = self.key.frame, self.views
         stamps_ns = {s.frame: s.sweep.stamp_ns for s in self.key.stretch.sweeps}
-        if self.beyond is not None:
-            stamps_ns |= self.beyond.standing.stamps_ns
+        if beyond is not None:
+            stamps_ns |= beyond.standing.stamps_ns
         return {
             name: with_ages(maps, stamps_ns, frame, views.exposures[name].late_s)
             for name, maps in views.depth(seen, visible).items()
         }
 
     def _metrics(
-        self,
-        cloud: Cloud,
-        depth: Mapping[str, DepthMap],
-        visible: bool,
-        held_out: Mapping[str, Any] | None,
+        self, cloud: Cloud, depth: Mapping[str, DepthMap], visible: bool
     ) -> dict[str, Any]:
         """What can be said of the result without truth, and against it where there is some."""
         cameras, near = self.key.sequence.cameras, cloud.select(~cloud.far)
@@ -215,7 +244,7 @@ class _Shared:
         if visible:
             metrics["expected_outliers"] = {n: expected_outliers(m) for n, m in depth.items()}
         metrics["measure"] = {name: maps.measure for name, maps in depth.items()}
-        metrics["held_out"] = held_out
+        metrics["held_out"] = None  # comes later
         if self.key.settings.output.rejected:
             metrics["rejected"] = {name: maps.counts() for name, maps in depth.items()}
         return metrics

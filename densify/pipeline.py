@@ -21,12 +21,13 @@ from densify.depth.exposure import key_shots, load_images
 from densify.doubts import with_doubts
 from densify.errors import ComputationError, InputError
 from densify.flow.engines import check_engine
+from densify.kernels.threads import tasks
 from densify.key_results import Key, key_results
 from densify.methods import COMPARED, METHODS, with_baselines
 from densify.readers.files import format_frames
 from densify.readers.prior_files import PriorFiles
 from densify.readers.window import choose_cameras
-from densify.recording import Recording
+from densify.recording import Beyond, Moment, Recording
 from densify.types import LidarSequence, Progress, Result, StretchFlow
 
 ConfigLike = Config | str | Path | Mapping[str, Any] | None
@@ -168,16 +169,20 @@ def densify(
     with watch.stage("images"):
         images = load_images(sequence, shots)
     priors_of_key = {} if priors is None else key_priors(priors, shots, key)
-    stretch, flow = recording.window(key), settings.output.flow
-    moments = {}
-    for name in methods:
-        method = METHODS[name]
-        moments[name] = recording.moment(key, method.all_sweeps, method.engine, flow)
-    beyond = None
-    if any(METHODS[name].far for name in methods):
-        beyond = recording.standing(key)
+    stretch = recording.window(key)
     this = Key(sequence, settings, key, stretch, shots, images, with_images, watch)
-    made = key_results(this, moments, beyond, priors_of_key)
+
+    def moment(name: str) -> Moment:
+        method = METHODS[name]
+        return recording.moment(key, method.all_sweeps, method.engine, settings.output.flow)
+
+    def beyond() -> Beyond | None:
+        return recording.standing(key) if any(METHODS[name].far for name in methods) else None
+
+    with tasks() as pool:  # what takes longest, the flow of the last method, begins
+        begun = {name: pool.submit(moment, name) for name in reversed(methods)}
+        moments = {name: begun[name] for name in methods}
+        made = key_results(this, moments, pool.submit(beyond), priors_of_key, pool)
     return with_doubts(made, sequence, stretch, shots, settings, cuts)
 
 

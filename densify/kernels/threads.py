@@ -8,8 +8,9 @@ in busy loops, which costs tenfold where cores are shared."""
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor, wait
+from collections.abc import Callable, Iterator
+from concurrent.futures import Executor, ThreadPoolExecutor, wait
+from contextlib import contextmanager
 from functools import cache
 from itertools import pairwise
 from typing import Any
@@ -22,6 +23,23 @@ _LEAST_ROWS = 4096  # to hand fewer to a second thread takes longer than most ke
 def num_threads() -> int:
     """The cores this process may use, or fewer where NUMBA_NUM_THREADS says so."""
     return int(numba.config.NUMBA_NUM_THREADS)  # type: ignore[attr-defined]
+
+
+@contextmanager
+def tasks() -> Iterator[Executor]:
+    """A pool of `num_threads` threads, of tasks that wait for none but those submitted before: so
+    one thread is enough. What has not begun when an error leaves the block never does; an
+    interruption does not wait for the rest either."""
+    pool = ThreadPoolExecutor(num_threads())
+    try:
+        yield pool
+    except KeyboardInterrupt:
+        pool.shutdown(wait=False, cancel_futures=True)
+        raise
+    except BaseException:
+        pool.shutdown(cancel_futures=True)
+        raise
+    pool.shutdown()
 
 
 def over_rows(function: Callable[..., None], num_rows: int, *arguments: Any) -> None:
