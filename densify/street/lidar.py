@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from densify.geometry.poses import rotate, transform
 from densify.street.materials import LASER_PASSES, REFLECTIVITY
-from densify.street.motion import Driving
+from densify.street.motion import Driving, poses_at
 from densify.street.sensors import Sensor, firings
 from densify.street.world import Hits, Rays, World
 from densify.types import Bool, Float, Float32, Int
@@ -72,7 +72,7 @@ def scan(
     fired = firings(sensor, time_s, mounted.period_ns)
     n = len(fired.offset_ns)
     times = at_offsets(time_s, fired.offset_ns)
-    ego_poses = ego.poses(times)
+    ego_poses = poses_at(ego, times)
     origin = ego_poses.apply(transform(T, sensor.origins_m)[fired.lidar])
     spot = [ego_poses.turn(rotate(T, ray)) for ray in _spot(fired.direction)]
     lucks = [rng.random(n) for _ in spot]

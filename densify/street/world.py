@@ -15,14 +15,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from densify.kernels import casting
 from densify.street.materials import GLASS_PASSES
 from densify.street.mesh import Mesh
 from densify.street.motion import Poses, Still, Trajectory, poses_at
-from densify.types import Bool, Float
+from densify.types import Bool, Float, Float32
 
 _MAX_LAYERS = 8  # of glass and leaves that one ray passes
-_STEP_M = 2e-3  # from a surface passed to where the ray goes on
-_GOLDEN = 0.6180339887498949
 
 
 @dataclass(frozen=True)
@@ -113,11 +112,14 @@ class World:
     ) -> list[Hits]:
         """`cast` for each of several sets of directions (N,3), which share origins and times and
         differ from the rays' own by at most ``spread`` rad."""
-        n = len(rays.time_s)
-        best = [Hits.none(n) for _ in directions]
+        surfaces = casting.Surfaces(self._corner, self.normal, passes[self.material])
+        best = [
+            self._cast_body(0, rays.origin, ray, surfaces, luck)
+            for ray, luck in zip(directions, lucks, strict=True)
+        ]
         lines = _Lines.of(rays, spread)
-        for index, body in enumerate(self.bodies):
-            rows = lines.near(*self._ball(index, rays.time_s)) if index else np.arange(n)
+        for index, body in enumerate(self.bodies[1:], start=1):
+            rows = lines.near(*self._ball(index, rays.time_s))
             if not len(rows):
                 continue
             still = isinstance(body.trajectory, Still)
@@ -125,7 +127,7 @@ class World:
             origin = rays.origin[rows] if still else poses.undo(rays.origin[rows])
             for hits, ray, luck in zip(best, directions, lucks, strict=True):
                 direction = ray[rows] if still else poses.unturn(ray[rows])
-                found = self._cast_body(index, origin, direction, passes, luck[rows])
+                found = self._cast_body(index, origin, direction, surfaces, luck[rows])
                 if not still:
                     found = found._replace(normal=poses.turn(found.normal))
                 nearer = np.flatnonzero(found.range_m < hits.range_m[rows])
@@ -149,30 +151,23 @@ class World:
         return ends.mean(axis=0), float(self._radius_m[index]) + 0.75 * moved_m + 0.1
 
     def _cast_body(
-        self, index: int, origin: Float, direction: Float, passes: Float, luck: Float
+        self, index: int, origin: Float, direction: Float, surfaces: casting.Surfaces, luck: Float
     ) -> Hits:
         n = len(origin)
-        hits = Hits.none(n)
-        rows, begin, luck = np.arange(n), np.zeros(n), luck.copy()
+        hits, rows = Hits.none(n), np.arange(n)
+        start, towards, begin, luck = origin, direction, np.zeros(n), luck.copy()
         for _ in range(_MAX_LAYERS):
             if not len(rows):
                 break
-            start = origin[rows] + begin[rows, None] * direction[rows]
-            which, uv = _first_hit(self._scenes[index], start, direction[rows])
-            hit = which >= 0
-            rows, which, uv = rows[hit], which[hit] + self._first[index], uv[hit]
-            # the exact distance to the triangle's plane, in double precision
-            normal = self.normal[which]
-            to_plane = np.einsum("ni,ni->n", normal, self._corner[which] - origin[rows])
-            distance = to_plane / np.einsum("ni,ni->n", normal, direction[rows])
-            stops = luck[rows] >= passes[self.material[which]]
-            done = rows[stops]
-            found = (distance, which, uv, normal)
-            for column, new in zip(hits, found, strict=True):
-                column[done] = new[stops]
-            begin[rows] = distance + _STEP_M
-            rows = rows[~stops]
-            luck[rows] = (luck[rows] + _GOLDEN) % 1.0
+            met = _first_hit(self._scenes[index], start, towards)
+            goes_on = np.empty(len(rows), bool)
+            casting.meet(
+                *(rows, *met, self._first[index], surfaces, origin, direction),
+                *(luck, begin, casting.Stops(*hits), goes_on),
+            )
+            rows = rows[goes_on]
+            towards = direction[rows]
+            start = origin[rows] + begin[rows, None] * towards
         return hits
 
 
@@ -226,10 +221,12 @@ def _raycasting_scene(mesh: Mesh) -> Any:
     return scene
 
 
-def _first_hit(scene: Any, origin: Float, direction: Float) -> tuple[NDArray[np.int64], Float]:
-    """(N,3), (N,3) -> index of the first triangle met (N,), -1 none, and where on it (N,2)."""
+def _first_hit(
+    scene: Any, origin: Float, direction: Float
+) -> tuple[NDArray[np.int32], Float32, Float32]:
+    """(N,3), (N,3) -> index of the first triangle met (N,), -1 none, and where on it, (N,) and
+    (N,)."""
     found = scene.run(
         origin.astype(np.float32), direction.astype(np.float32), query="INTERSECT", output=True
     )
-    where = np.stack([found["u"], found["v"]], axis=1)
-    return found["primID"].astype(np.int64), where.astype(np.float64)
+    return found["primID"], found["u"], found["v"]
