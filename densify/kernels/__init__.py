@@ -3,6 +3,9 @@
 
 A kernel takes arrays of fixed types, writes into arrays it is given and raises nothing. It lets go
 of the interpreter while it works, so that its rows can be shared out among threads.
+
+Compiling is most of a first run. Rows are assigned number by number: an array or a tuple at once
+takes 1.6 s to compile. A literal handed to an inlined function compiles it once more.
 """
 
 from __future__ import annotations

@@ -64,7 +64,8 @@ def meet(rows, which, u, v, first, surfaces, origin, direction, luck, begin, sto
         if luck[i] >= surfaces.passes[t]:
             stops.range_m[i], stops.triangle[i] = distance, t
             stops.barycentric[i, 0], stops.barycentric[i, 1] = u[k], v[k]
-            stops.normal[i] = normal[t]
+            for axis in range(3):
+                stops.normal[i, axis] = normal[t, axis]
         else:
             begin[i], luck[i] = distance + _STEP_M, (luck[i] + _GOLDEN) % 1.0
             goes_on[k] = True

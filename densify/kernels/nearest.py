@@ -210,8 +210,9 @@ def _nearest(
     waiting, squared_to = np.empty(_MAX_DEPTH, np.int64), np.empty(_MAX_DEPTH)
     for q in range(begin, end):
         x, y, z = queries[q, 0], queries[q, 1], queries[q, 2]
+        nobody = np.int64(-1)  # a number of this type, or the search is compiled twice
         squared, found = _closer(
-            points, starts, stops, boxes, x, y, z, within_m * within_m, -1, waiting, squared_to
+            points, starts, stops, boxes, x, y, z, within_m * within_m, nobody, waiting, squared_to
         )
         distance_m[q] = np.sqrt(squared) if found >= 0 else np.inf
         row[q] = order[found] if found >= 0 else -1

@@ -66,7 +66,8 @@ def slopes(first, last, pixel, inverse, spacing_px, fraction, slope):  # type: i
         row, column = pixel[p] // width, pixel[p] % width
         half_u = max(_LEAST_PX, int(spacing_px[row, column, 0]))
         half_v = max(_LEAST_PX, int(spacing_px[row, column, 1]))
-        slope[pixel[p]] = _slope(inverse, row, column, half_u, half_v, fraction)
+        slope_u, slope_v = _slope(inverse, row, column, half_u, half_v, fraction)
+        slope[pixel[p], 0], slope[pixel[p], 1] = slope_u, slope_v
 
 
 @inlined

@@ -310,8 +310,9 @@ def settle(first, last, points, reaches, shape, taken, found):  # type: ignore[n
         )
         if points.age_ns[i] <= NOW_NS and not points.hidden[i] and _count(seen) < reaches.few:
             m[:], reach[:] = 0.0, 0.0
+            now_ns = np.int64(NOW_NS)  # of the type of witness_ns, or this is compiled twice
             seen, youngest, num, squares, behind, now, now_behind, num_now = _look_round(
-                points, reaches, shape, i, u0, v0, centre, agree, inner, NOW_NS, m, reach
+                points, reaches, shape, i, u0, v0, centre, agree, inner, now_ns, m, reach
             )
             found[6, p] = num_now
         _write(found[:, p], centre, w0, agree, m, squares, num, seen, youngest)
