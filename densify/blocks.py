@@ -72,11 +72,16 @@ class Cut:
         return Cut(blocks, number_of, margin_s, 2 * window + 3)
 
     @staticmethod
-    def around(timeline: Timeline, window: int, keys: Collection[int]) -> Cut:
-        """The windows of the keys; those that overlap are one block, unless its keys then are more
-        than `BLOCK_S` apart. Raises InputError if a key does not exist."""
+    def around(
+        timeline: Timeline, window: int, keys: Collection[int], beyond_s: float = 0.0
+    ) -> Cut:
+        """The windows of the keys and ``beyond_s`` before and after them; those that overlap are
+        one block, unless its keys then are more than `BLOCK_S` apart. Raises InputError if a key
+        does not exist."""
         for key in keys:
             check_key(key)
+        check_window(window)
+        window += round(beyond_s * 1e9 / timeline.period_ns)
         groups: list[list[int]] = []
         spans: list[tuple[int, int]] = []
         for key in sorted(set(keys)):

@@ -14,9 +14,10 @@ from densify.errors import ComputationError, InputError
 from densify.readers.window import choose_cameras
 from densify.types import LidarSequence
 
-# Measured on streets: what is loaded; a point of the window; of one sweep, what comes from beyond
-# the window; a pixel of an image.
-_BASE_BYTES, _POINT_BYTES, _FAR_BYTES, _PIXEL_BYTES = 0.55e9, 850, 6000, 120
+# Measured on streets: what is loaded; a point of the window, and around it; of one sweep, what
+# comes from beyond the window; a pixel of an image.
+_BASE_BYTES, _POINT_BYTES, _AROUND_BYTES, _FAR_BYTES, _PIXEL_BYTES = 0.55e9, 850, 90, 6000, 120
+_USUAL_HZ = 10
 _CERTAIN = 0.8  # of the need, which is told a little too large rather than too small
 _GROUPS = Path("/sys/fs/cgroup")
 
@@ -54,9 +55,11 @@ def need_of_run(
     """
     num_points, chosen = len(sequence[key]), choose_cameras(sequence, cameras)
     num_sweeps = min(2 * window + 1, len(sequence.frames))
+    num_around = min(2 * _USUAL_HZ * config.flow.look_around_s, len(sequence.frames) - num_sweeps)
+    bytes_of_point = num_sweeps * _POINT_BYTES + num_around * _AROUND_BYTES
     return (
         _BASE_BYTES
-        + num_points * (num_sweeps * _POINT_BYTES + bool(config.accumulate.far_m) * _FAR_BYTES)
+        + num_points * (bytes_of_point + bool(config.accumulate.far_m) * _FAR_BYTES)
         + sum(camera.width_px * camera.height_px for camera in chosen) * _PIXEL_BYTES
     )
 

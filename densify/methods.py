@@ -51,3 +51,8 @@ def engines(methods: Sequence[str], configured: str) -> list[str]:
     """Which flow each method uses, "" for none. configured: ``flow.engine``."""
     used = [METHODS[name].engine for name in methods if name in METHODS]
     return ["" if engine is None else engine or configured for engine in used]
+
+
+def looks_around(methods: Sequence[str]) -> bool:
+    """Whether one of them asks what moves."""
+    return any(METHODS[name].engine is not None for name in methods if name in METHODS)

@@ -23,7 +23,7 @@ from densify.errors import ComputationError, InputError
 from densify.flow.engines import check_engine
 from densify.kernels.threads import tasks
 from densify.key_results import Key, key_results
-from densify.methods import COMPARED, METHODS, with_baselines
+from densify.methods import COMPARED, METHODS, looks_around, with_baselines
 from densify.readers.files import format_frames
 from densify.readers.prior_files import PriorFiles
 from densify.readers.window import choose_cameras
@@ -83,7 +83,8 @@ def run_keys(
     settings, methods, watch = resolve(config), with_baselines(method), Watch(progress)
     _check(sequence, settings, methods, cameras)
     priors = _open_priors(prior, sequence, cameras)
-    recording = Recording(sequence, settings, window, keys, cache, watch=watch)
+    looks = looks_around(methods)
+    recording = Recording(sequence, settings, window, keys, cache, None, watch, looks)
 
     def results() -> Iterator[tuple[int, Result | ComputationError | InputError]]:
         for key in sorted(set(keys)):
@@ -144,7 +145,8 @@ def compare(
     settings, watch = resolve(config), Watch(progress)
     _check(sequence, settings, methods, cameras)
     priors = _open_priors(prior, sequence, cameras)
-    recording = Recording(sequence, settings, window, [key], cache, watch=watch)
+    looks = looks_around(methods)
+    recording = Recording(sequence, settings, window, [key], cache, None, watch, looks)
     return densify(recording, key, methods, cameras, watch, priors=priors)
 
 

@@ -28,6 +28,7 @@ from __future__ import annotations
 from collections.abc import Collection, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache, partial
+from itertools import chain
 from typing import Any, NamedTuple, TypeVar, cast
 
 from densify.blocks import Cut
@@ -99,11 +100,14 @@ class Recording:
         cache: Cache | None = None,
         run: str | None = None,
         watch: Watch | None = None,
+        looks_around: bool = False,
     ) -> None:
         """window: sweeps on each side of a key. keys: work on their windows alone, see
         `Cut.around`; None for the whole recording, see `Cut.whole`. cache: keeps the steps' results
         on disk; None keeps nothing. run: the same for all processes between which no sweep changes;
         None for this object alone. watch: measures the steps.
+        looks_around: of keys, what moves is looked for ``flow.look_around_s`` beyond their windows
+        too, where the engine can make use of that.
 
         Raises InputError if a key does not exist.
         """
@@ -111,7 +115,9 @@ class Recording:
         self.timeline = Timeline.of(sequence)
         cut = Cut.whole(self.timeline, window)
         if keys is not None:
-            cut = Cut.around(self.timeline, window, keys)
+            looks_around = looks_around and engine_row(settings.flow.engine)[0].shared
+            beyond_s = settings.flow.look_around_s if looks_around else 0.0
+            cut = Cut.around(self.timeline, window, keys, beyond_s)
         self.cut = cut
         self._num_around, self._cache, self._watch = window, cache, watch or Watch()
         # What the next step, key or block is likely to ask for again is kept in memory.
@@ -161,6 +167,13 @@ class Recording:
         number = self.cut.number_of[key]
         frames = self.window_frames(key).frames
         return self._places.stretch(number, self.cut.margin_s, frames)
+
+    def around(self, key: int) -> Stretch:
+        """The sweeps that the motion in a key's window is found out from."""
+        number, (index, _) = self.cut.number_of[key], self._places.piece(key)
+        margin_s = self.cut.margin_s
+        frames = self._places.frames_within(number, margin_s)[index]
+        return self._places.stretch(number, margin_s, frames)
 
     def motion(self, key: int, engine: str | None = None) -> Motion:
         """How everything in a key's window moves. engine: None for that of ``flow.engine``."""
@@ -299,6 +312,7 @@ class Recording:
                 self.settings.flow.min_height_m,
                 make_space=partial(self._space, number, stretch),
                 make_candidates=partial(self._candidates, number, frames),
+                asked=self._in_windows(number),
             )
             with self._watch.stage("flow"):
                 motion = estimate_motion(scene, self.settings, engine)
@@ -312,7 +326,8 @@ class Recording:
             ]
             content = [self.sweeps.content(f) for f in frames]
             settings = [self.settings.flow, self.settings.objective]
-            return [engine, engine_row(engine)[0], settings, piece, evidence, content]
+            asked = sorted(self._in_windows(number) or ())
+            return [engine, engine_row(engine)[0], settings, piece, asked, evidence, content]
 
         found: list[tuple[Sequence[int], SharedMotion]] = []
         pieces = self._places.pieces(number, margin_s)
@@ -345,12 +360,24 @@ class Recording:
             return [settings, far_m, cameras, piece, list(frames), content]
 
         pieces = self._places.pieces(number, 0.0)
+        near_frames, inside = self._places.frames_within(number, 0.0), self._in_windows(number)
+        if inside:  # what is looked at beyond the windows is as far as the rest of the road
+            near_frames = [[f for f in frames if f in inside] or frames for frames in near_frames]
         return [
             kept(self._cache, "far", Standing, partial(inputs, pieces[i], f), partial(make, f))
-            for i, f in enumerate(self._places.frames_within(number, 0.0))
+            for i, f in enumerate(near_frames)
         ]
 
     # What they are made of
+
+    def _in_windows(self, number: int) -> frozenset[int] | None:
+        """The frames of the windows of a block's keys; None of a whole recording, whose motion
+        serves windows of any size."""
+        if self.cut.margin_s:
+            return None
+        keys = (key for key, n in self.cut.number_of.items() if n == number)
+        windows = (self.timeline.window(key, self._num_around).frames for key in keys)
+        return frozenset(chain.from_iterable(windows))
 
     def _space(self, number: int, stretch: Stretch) -> FreeSpace:
         images = {

@@ -40,6 +40,24 @@ def test_every_engine_has_the_one_interface(row) -> None:
     assert row.about and engine(row.usage)[0] is row
 
 
+def test_sweeps_that_are_not_asked_for_tell_what_moves_all_the_same(driving: Scene) -> None:
+    frames, config = driving.stretch.frames, resolve({"flow": {"soft": False}})
+    asked = frames[1:4]
+    whole, part = (
+        estimate_motion(replace(driving, asked=which), config) for which in (None, asked)
+    )
+    for frame in frames:
+        got, wanted = part.flow(frame, 5), whole.flow(frame, 5)
+        assert wanted.moving.any()
+        if frame in asked:
+            np.testing.assert_array_equal(got.displacement, wanted.displacement)
+        else:
+            assert not got.moving.any()
+    alone = Scene(Stretch(driving.stretch.sweeps[1:4]), driving.ground, driving.min_height_m)
+    few = estimate_motion(alone, config)
+    assert any((part.flow(f, 5).total != few.flow(f, 5).total).any() for f in asked)
+
+
 def test_what_a_scene_is_asked_for_is_made_once(driving: Scene) -> None:
     assert driving.space is driving.space and driving.candidates is driving.candidates
     space, candidates = driving.space, driving.candidates

@@ -385,10 +385,28 @@ def test_keys_whose_windows_overlap_share_what_they_can(counted: Counter[str], l
 
 
 def test_keys_far_apart_share_nothing_and_are_as_by_themselves(long_street) -> None:
-    results = dict(pipeline.run_keys(long_street, [2, 14], 2, config=GIVEN))
+    config = resolve({**POSES_GIVEN, "flow": {"look_around_s": 0.2}})
+    results = dict(pipeline.run_keys(long_street, [2, 14], 2, config=config))
     for key, result in results.items():
-        alone = pipeline.run(long_street, key, 2, config=GIVEN)
+        alone = pipeline.run(long_street, key, 2, config=config)
         assert_same_maps(result.depth, alone.depth)
+
+
+@pytest.mark.parametrize("bad", [None, 12], ids="sweep {} cannot be read".format)
+def test_looking_around_changes_no_window(bad: int | None, long_street) -> None:
+    """Motion is found out from sweeps 2 to 14, or to 11; what is accumulated, near and far, is from
+    the same sweeps as without."""
+    sequence = long_street if bad is None else Damaged(long_street, unreadable=[bad])
+    settings = [
+        resolve({"register": {"source": "dataset"}, "flow": {"look_around_s": s}}) for s in (0, 0.4)
+    ]
+    recording = shared.Recording(sequence, settings[1], 2, [8], looks_around=True)
+    assert recording.window(8).frames == (6, 7, 8, 9, 10)
+    last = 14 if bad is None else bad - 1
+    assert recording.around(8).frames == tuple(range(2, last + 1))
+    plain, looking = (pipeline.run(sequence, 8, 2, config=config) for config in settings)
+    assert looking.frames == plain.frames and looking.far_frames == plain.far_frames
+    assert looking.metrics["num_moving"] == pytest.approx(plain.metrics["num_moving"], rel=0.02)
 
 
 def test_a_key_that_cannot_be_made_costs_no_other(long_street) -> None:

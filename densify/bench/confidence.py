@@ -128,7 +128,7 @@ def _evidence(
 ) -> Iterator[Evidence]:
     """The maps of a key against exact truth, where there is some, and if asked for those made
     without the key sweep against its own returns."""
-    recording = Recording(sequence, config, window, [key])
+    recording = Recording(sequence, config, window, [key], looks_around=True)
     shots = key_shots(sequence, choose_cameras(sequence, cameras), key, config.project)
     stretch = recording.window(key)
     images = load_images(sequence, shots)

@@ -24,7 +24,7 @@ from densify.depth.exposure import Exposure, key_shots
 from densify.errors import InputError
 from densify.geometry import poses
 from densify.geometry.cameras import converted, depth_along, rays
-from densify.methods import METHODS
+from densify.methods import METHODS, looks_around
 from densify.readers.window import choose_cameras
 from densify.recording import Recording
 from densify.scores.depth_metrics import image_density, is_outlier_depth
@@ -86,7 +86,8 @@ def bench_depth(
             if scanner is not None and not returns:
                 returns = _returns_of(scanner, sequence, key, window, cameras, config, cache)
             watch = Watch()
-            recording = Recording(used, config, window, [key], cache, watch=watch)
+            looks = looks_around([method])
+            recording = Recording(used, config, window, [key], cache, None, watch, looks)
             made = pipeline.densify(recording, key, [method], cameras, watch)[method]
             exact = exact_truth(used, recording.window(key)[key].sweep, key, cameras, config)
             sums[name].add(made, {"truth": exact, "scanner": returns}, used.cameras)
@@ -125,7 +126,7 @@ def _returns_of(
     cache: Cache,
 ) -> dict[str, TruthMap]:
     """What one scanner of the key sweep measured, by map, without what is hidden."""
-    recording = Recording(sequence, config, window, [key], cache)
+    recording = Recording(sequence, config, window, [key], cache, looks_around=True)
     cloud = recording.moment(key, all_sweeps=True, engine="").cloud
     cloud = cloud.select((cloud.lidar == scanner) & (cloud.frame == key))
     stretch = recording.window(key)

@@ -9,7 +9,8 @@ the nearest three. The objective, which matches both ways, sees as many of the t
 all of it. The energy is always that of the paper's objective on the drawn points of both.
 
 Seconds are per pair: those of ``ours`` are its whole time, from the ground to the flow to the key,
-over the number of sweeps. Registration counts for none, nor does what is compiled when first used.
+with the sweeps around the window that it looks at, over the number of the window's. Registration
+counts for none, nor does what is compiled when first used.
 Errors are over the points above the ground of all pairs together; those of the Argoverse 2
 challenges as `densify.scores.challenge` says, with our ground left out.
 
@@ -214,7 +215,7 @@ def _warm_up(method: str, window: Window, pair: Pair, config: Config) -> None:
 
 def _ours(window: Window, config: Config) -> tuple[Motion, dict[int, FlowField]]:
     """From the ground to the flow to the key, by frame."""
-    motion = our_motion(window.stretch, config)
+    motion = our_motion(window.around, config, window.frames)
     return motion, {f: motion.flow(f, window.key) for f in window.frames}
 
 

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
 from densify.config import Config
@@ -17,20 +17,23 @@ from densify.types import Bool, Float, LidarSequence, Motion, Stretch
 
 @dataclass(frozen=True)
 class Window:
-    """Consecutive sweeps around the key. above: by frame (N,) above the ground."""
+    """Consecutive sweeps around the key. above: by frame (N,) above the ground. around: the
+    sweeps that our motion of it is found out from."""
 
     stretch: Stretch
     key: int
+    around: Stretch
     above: Mapping[int, Bool]
 
     @staticmethod
     def open(sequence: LidarSequence, key: int, size: int, config: Config) -> Window:
         """The key's window, as the pipeline has it. Raises InputError for a missing key,
         ComputationError where registration went wrong."""
-        stretch = Recording(sequence, config, size, [key]).window(key)
+        recording = Recording(sequence, config, size, [key], looks_around=True)
+        stretch, around = recording.window(key), recording.around(key)
         heights, least_m = ground(stretch, config.ground), config.flow.min_height_m
         above = {f: heights.above(_in_world(stretch, f)) >= least_m for f in stretch.frames}
-        return Window(stretch, key, above)
+        return Window(stretch, key, around, above)
 
     @property
     def frames(self) -> tuple[int, ...]:
@@ -51,9 +54,11 @@ class Window:
         return Stretch(self.stretch.sweeps[max(0, key - 1) : key + 2])
 
 
-def our_motion(stretch: Stretch, config: Config) -> Motion:
-    """This package's engine, or that of ``flow.engine``, from the ground on."""
-    scene = Scene(stretch, ground(stretch, config.ground), config.flow.min_height_m)
+def our_motion(stretch: Stretch, config: Config, asked: Collection[int] | None = None) -> Motion:
+    """This package's engine, or that of ``flow.engine``, from the ground on. asked: frames whose
+    flow will be asked for, all if None."""
+    heights = ground(stretch, config.ground)
+    scene = Scene(stretch, heights, config.flow.min_height_m, asked=asked)
     return estimate_motion(scene, config)
 
 

@@ -87,6 +87,13 @@ class FlowSettings(Section):
         0.02,
         2,
     )
+    look_around_s: float = knob(
+        0.0,
+        "[s] so far before and after the window sweeps are asked too what moves; 0.5 takes a "
+        "quarter to a half off the error, for 1.6 to 2 times the CPU seconds",
+        0,
+        5,
+    )
     soft: bool = knob(
         True,
         "objects bend about their rigid motion (swinging limbs) as far as held-out sweeps confirm",

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -18,7 +18,8 @@ class Scene:
     is first asked for and then kept.
 
     ground: under all sweeps. min_height_m: points lower above it start no motion.
-    make_space, make_candidates: where what they give is known already, as from a cache.
+    make_space, make_candidates: where what they give is known already, as from a cache. asked:
+    frames whose flow will be asked for, all if None; the others only tell what moves.
     """
 
     stretch: Stretch
@@ -26,6 +27,7 @@ class Scene:
     min_height_m: float
     make_space: Callable[[], FreeSpace] | None = None
     make_candidates: Callable[[], tuple[Candidates, ...]] | None = None
+    asked: Collection[int] | None = None
 
     @cached_property
     def space(self) -> FreeSpace:
@@ -38,3 +40,7 @@ class Scene:
         if self.make_candidates is not None:
             return self.make_candidates()
         return find_candidates(self.stretch, self.space, self.ground, self.min_height_m)
+
+    def is_asked(self, i: int) -> bool:
+        """Whether the flow of sweep number i will be asked for."""
+        return self.asked is None or self.stretch.sweeps[i].frame in self.asked

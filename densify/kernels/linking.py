@@ -100,13 +100,20 @@ def _count_seeds(points, seed, start, around, squared, least_share, counts):  # 
 def _spread_seeds(points, counts, start, around, squared, close):  # type: ignore[no-untyped-def]
     """close: (N,) bool, set for the points closer to one that counts. The rest as in
     `_count_seeds`."""
+    num_before = np.zeros(len(points) + 1, np.int64)
+    for i in range(len(points)):
+        num_before[i + 1] = num_before[i] + counts[i]
     for cell in range(len(start) - 1):
         for k in range(around.shape[1]):
-            for j in range(around[cell, k, 0], around[cell, k, 1]):
-                if not counts[j]:
-                    continue
-                for i in range(start[cell], start[cell + 1]):
-                    close[i] |= _squared(points, i, j) < squared
+            first, end = around[cell, k]
+            if num_before[first] == num_before[end]:
+                continue
+            for i in range(start[cell], start[cell + 1]):
+                close[i] |= counts[i]
+                j = first
+                while not close[i] and j < end:
+                    close[i] = counts[j] and _squared(points, i, j) < squared
+                    j += 1
 
 
 @Kernel

@@ -126,6 +126,9 @@ def motion_of(
     shapes = [Shape.of(t.seen_in(standing, sorted(t.claimed))) for t in tracks]
 
     def members(i: int) -> NDArray[np.int32]:
+        instance = np.full(len(stretch.sweeps[i].sweep), -1, np.int32)
+        if not scene.is_asked(i):
+            return instance
         seen = Seen.of(stretch, i, ground, standing[i], space.sensors)
         attached = attach(seen, i, tracks, shapes, space.clock, scene.min_height_m)
         detach(attached, seen, i, tracks, shapes, standing, space.clock)
@@ -133,7 +136,6 @@ def motion_of(
         radial = Radial.of(stretch.sweeps[i])
         if radial is not None:
             leave_out_slower(attached, seen, radial.rows(seen.row), tracks)
-        instance = np.full(len(stretch.sweeps[i].sweep), -1, np.int32)
         instance[seen.row] = attached
         return instance
 
