@@ -40,6 +40,7 @@ from densify.depth.object_tracks import object_tracks
 from densify.errors import InputError, SweepError
 from densify.flow.engines import SharedMotion, estimate_motion, motion_type
 from densify.flow.scene import Scene
+from densify.flow.tracking.clock import num_in_look
 from densify.flow.tracking.evidence import REACH_S, Candidates, FreeSpace, find_candidates
 from densify.geometry import poses
 from densify.geometry.ground import ground
@@ -240,19 +241,20 @@ class Recording:
 
     def _images(self, number: int) -> dict[int, RangeImage]:
         """Range images of the block's sweeps, by frame."""
-        places = self._places
+        places, num_together = self._places, num_in_look(self.timeline.period_ns * 1e-9)
         pieces = {f: p for p in places.pieces(number, 0.0) for f in places.within(p, number, 0.0)}
 
         def make() -> dict[int, RangeImage]:
             sweeps = [places.deskewed(number, 0.0, f) for f in pieces]
             with self._watch.stage("flow"), ThreadPoolExecutor() as pool:
-                return dict(zip(pieces, pool.map(RangeImage.of, sweeps), strict=True))
+                image = partial(RangeImage.of, num_together=num_together)
+                return dict(zip(pieces, pool.map(image, sweeps), strict=True))
 
         return kept(
             self._cache,
             "images",
             dict[int, RangeImage],
-            lambda: [(f, self.sweeps.content(f), p) for f, p in pieces.items()],
+            lambda: [num_together, *((f, self.sweeps.content(f), p) for f, p in pieces.items())],
             make,
         )
 

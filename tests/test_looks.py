@@ -10,12 +10,14 @@ import pytest
 
 from densify.config import GroundSettings
 from densify.flow.tracking.clock import Clock
-from densify.flow.tracking.evidence import Standing
+from densify.flow.tracking.evidence import FreeSpace, Standing
 from densify.flow.tracking.looks import looks_of
 from densify.geometry.ground import ground
+from densify.geometry.poses import transform
+from densify.geometry.range_image import RangeImage
 from densify.types import RegisteredSweep, Stretch
 from tests.found_motion import motion_in
-from tests.scenes import Arc, Scanner, Scene, World, car, street
+from tests.scenes import Arc, Box, Scanner, Scene, World, car, street
 
 MS = 1_000_000
 
@@ -111,3 +113,26 @@ def test_two_sweeps_show_what_is_too_small_in_one():
         off = np.linalg.norm(flow.displacement - scene.displacement(f, f + 1), axis=1)
         errors_m.append(off[on[f] & flow.moving])
     assert np.concatenate(errors_m).mean() < 0.1  # of 0.3
+
+
+def test_two_sweeps_of_half_the_columns_see_through_more_than_one_of_them():
+    """Beside a post in front of a wall, nearly as close to the post as one sweep of all columns."""
+    post, wall = Box((0.3, 0.3, 4.0), Arc(12, 0.7)), Box((0.5, 30, 8), Arc(20, 0))
+    y_m, z_m = np.meshgrid(np.linspace(0, 1.4, 400), np.linspace(-0.5, 1.0, 4))
+    beside = np.stack([np.full(y_m.size, 12.0), y_m.ravel(), z_m.ravel()], 1)
+    free = {}
+    for num_azimuths in (800, 400):
+        scanner = Scanner(num_beams=32, num_azimuths=num_azimuths, sigma_m=0.01)
+        scene = Scene(World((post, wall)), Arc(0, 0), scanner)
+        stretch = scene.stretch(2, 2)
+        if num_azimuths == 400:
+            stretch = at_20_hz(scene, range(5))
+        space = FreeSpace.of(stretch)
+        T_world_lidar = stretch.sweeps[2].T_world_lidar
+        free[num_azimuths] = space.seen_through(transform(T_world_lidar, beside), 2)
+        own = stretch.sweeps[0].sweep.points
+        standing = transform(stretch.sweeps[0].T_world_lidar, own)
+        assert not space.seen_through(standing, 2).any()
+    alone = RangeImage.of(stretch.sweeps[2]).sees_through(beside, 0.4, 0.015)
+    one, half_and_half = free[800].sum(), free[400].sum()
+    assert 1.05 * alone.sum() < half_and_half < one < 1.1 * half_and_half

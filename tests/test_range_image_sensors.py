@@ -77,7 +77,7 @@ def on_rings(elevation_deg, noise_deg=0.01, num_columns=600, seed=0):
 def cells(azimuth, elevation):
     """Edges of the rows and number of columns of the finest image."""
     nothing = np.zeros(len(azimuth), np.float32)
-    return range_image._cells(Aimed(azimuth, elevation, nothing, nothing))[0]
+    return range_image._cells(Aimed(azimuth, elevation, nothing, nothing), 1)[0]
 
 
 @pytest.mark.parametrize("name", TABLES)

@@ -41,11 +41,18 @@ class RangeImage:
     scanners: tuple[ScannerImage, ...]
 
     @staticmethod
-    def of(registered: RegisteredSweep) -> RangeImage:
-        """Build from a deskewed sweep (its rays are put back to their firing times)."""
+    def of(registered: RegisteredSweep, num_together: int = 1) -> RangeImage:
+        """Build from a deskewed sweep (its rays are put back to their firing times).
+
+        num_together: sweeps that will be asked together. Of scanners that turn the columns are so
+        many times as many: as many as returns of all these sweeps fill."""
         ids = np.unique(registered.sweep.lidar)
         return RangeImage(
-            tuple(image for i in ids for image in ScannerImage.all_of(registered, int(i)))
+            tuple(
+                image
+                for i in ids
+                for image in ScannerImage.all_of(registered, int(i), num_together)
+            )
         )
 
     def sees_through(
@@ -65,17 +72,32 @@ class RangeImage:
 
         velocity_m_s: (N,3) of the points, if they move: the scanner faced them earlier or later.
         """
+        margins_m = margin_m, margin_fraction
+        beyond = self.num_beyond(points, margins_m, min_filled, velocity_m_s)
+        return np.asarray((beyond >= min_filled).any(axis=0))
+
+    def num_beyond(
+        self,
+        points: Float,
+        margins_m: tuple[float, float],
+        least: int = 1,
+        velocity_m_s: Float | None = None,
+    ) -> NDArray[np.int16]:
+        """(S,N) for each image how many of the 3 x 3 cells around each point's direction hold a
+        return, where every return in them lies farther as `sees_through` has it; far below 0 where
+        one does not, 0 where fewer than ``least`` are filled. What several sweeps say may be added.
+        """
         points32 = np.ascontiguousarray(points, np.float32)
         velocity = np.zeros((0, 3), np.float32)
         if velocity_m_s is not None:
             velocity = np.ascontiguousarray(velocity_m_s, np.float32)
-        margins = np.array([margin_m, margin_fraction], np.float32)
-        free = np.zeros(len(points), bool)
-        for scanner in self.scanners:
-            kernels.see_through.over_rows(
-                len(points), points32, velocity, scanner.tables, margins, min_filled, free
+        margins = np.array(margins_m, np.float32)
+        beyond = np.zeros((len(self.scanners), len(points)), np.int16)
+        for scanner, own in zip(self.scanners, beyond, strict=True):
+            kernels.see_beyond.over_rows(
+                len(points), points32, velocity, scanner.tables, margins, least, own
             )
-        return free
+        return beyond
 
 
 @dataclass(frozen=True)
@@ -105,7 +127,9 @@ class ScannerImage:
     twists: Float32
 
     @staticmethod
-    def all_of(registered: RegisteredSweep, lidar: int) -> tuple[ScannerImage, ...]:
+    def all_of(
+        registered: RegisteredSweep, lidar: int, num_together: int = 1
+    ) -> tuple[ScannerImage, ...]:
         """One, or of an unordered scanner several with cells of different sizes, finest first."""
         rays = aimed(registered, lidar)
         order = measure.firing_order(rays.azimuth, rays.offset_s)
@@ -137,7 +161,7 @@ class ScannerImage:
             )
 
         images: list[ScannerImage] = []
-        for cells in _cells(rays):
+        for cells in _cells(rays, num_together):
             images.append(image(*cells))
             if images[-1].share_vouched(rays) >= _VOUCHED:
                 break
@@ -152,7 +176,7 @@ class ScannerImage:
 
     @property
     def tables(self) -> kernels.Tables:
-        """What `densify.kernels.rays.see_through` looks points up in."""
+        """What `densify.kernels.rays.see_beyond` looks points up in."""
         return kernels.Tables(
             self.offset_s,
             self.spread_s,
@@ -167,7 +191,7 @@ class ScannerImage:
         )
 
 
-def _cells(rays: Aimed) -> list[tuple[Float32, int]]:
+def _cells(rays: Aimed, num_together: int) -> list[tuple[Float32, int]]:
     """Edges of the rows (R+1,), rad, and the number of columns; of an unordered scanner several,
     finest first, of which as many are of use as it takes until cells are seldom empty."""
     if len(rays.azimuth) < FEW_POINTS:
@@ -177,12 +201,12 @@ def _cells(rays: Aimed) -> list[tuple[Float32, int]]:
     if rings is not None:
         edges = _edges_between(rings)
         step = measure.step_along(some.azimuth, np.searchsorted(edges, some.elevation))
-        return [_grid(_no_closer(edges, _MIN_ROW_RAD), _CELLS_PER_STEP * step)]
+        return [_grid(_no_closer(edges, _MIN_ROW_RAD), _CELLS_PER_STEP * step / num_together)]
     if in_lines(some):
         row_step = measure.step_between(some.azimuth, some.elevation)
         step = measure.step_along(some.azimuth, np.floor(some.elevation / row_step))
         rows = _uniform_edges(rays.elevation, _CELLS_PER_STEP * row_step)
-        return [_grid(rows, _CELLS_PER_STEP * step)]
+        return [_grid(rows, _CELLS_PER_STEP * step / num_together)]
     spacing = density_table([rays]).at(rays.azimuth, rays.elevation)[:, 1]
     finest = _CELLS_PER_STEP * float(np.percentile(spacing, _DENSEST))
     flatten = float(np.cos(np.median(rays.elevation)))

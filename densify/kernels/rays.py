@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 from densify.arrays import Float32
 from densify.kernels import Kernel, inlined
 
+HIDES = 1000
+"""More than all cells of all images hold that are asked together."""
 _BLOCK = 128
 _PI = np.float32(np.pi)
 _HALF_PI = np.float32(0.5 * np.pi)
@@ -235,11 +237,13 @@ def _speed(x, y, z, vx, vy, vz, twist):  # type: ignore[no-untyped-def]
 
 
 @Kernel
-def see_through(begin, end, points, velocity, image, margins, min_filled, free):  # type: ignore[no-untyped-def]
-    """Marks in ``free`` (N,) bool the points where one scanner certainly saw free space.
+def see_beyond(begin, end, points, velocity, image, margins, least, beyond):  # type: ignore[no-untyped-def]
+    """How much one scanner saw of what lies beyond points: adds to ``beyond`` (N,) int16 how many
+    of the 3 x 3 cells around each hold a return, or takes `HIDES` where one of these is not beyond.
 
     points: (N,3) lidar frame at the reference time; velocity: (N,3) m/s, or (0,3) if none moves.
-    image: `Tables`. margins: (2,) metres and share of the range. All float32.
+    image: `Tables`. margins: (2,) metres and share of the range. All float32. least: fewer filled
+    cells tell nothing.
     """
     num_columns = image.nearest_m.shape[1]
     moving, by_azimuth = len(velocity) > 0, len(image.offset_s) == 1
@@ -282,7 +286,7 @@ def see_through(begin, end, points, velocity, image, margins, min_filled, free):
         for k in range(size):
             i, ground = start + k, np.sqrt(x[k] * x[k] + y[k] * y[k])
             r, c = row[k], column[k]
-            if r < 0 or image.num_filled[r, c] < min_filled:
+            if r < 0 or image.num_filled[r, c] < least:
                 continue
             range_m = np.sqrt(ground * ground + z[k] * z[k])
             margin_m = max(margins[0], margins[1] * range_m)
@@ -301,4 +305,6 @@ def see_through(begin, end, points, velocity, image, margins, min_filled, free):
                     points[i, 0], points[i, 1], points[i, 2], vx, vy, vz, twist
                 )
             if image.nearest_m[r, c] > range_m + margin_m:
-                free[i] = True
+                beyond[i] += image.num_filled[r, c]
+            else:
+                beyond[i] -= HIDES

@@ -11,6 +11,8 @@ import numpy as np
 
 from densify.types import Float, Int, Stretch
 
+LOOK_S = 0.1
+
 
 @dataclass(frozen=True, eq=False)
 class Clock:
@@ -45,6 +47,18 @@ class Clock:
         """How many sweeps usually follow each other in that time, at least 1."""
         return max(1, round(duration_s * 1e9 / self.period_ns))
 
+    def looks(self) -> tuple[tuple[int, ...], ...]:
+        """The sweeps, those that follow each other within less than `LOOK_S` (to the nearest sweep)
+        together: at 10 Hz and below each is a look of its own."""
+        groups: list[list[int]] = []
+        for j, time_ns in enumerate(self.time_ns.tolist()):
+            since_ns = time_ns - self.time_ns[groups[-1][0]] if groups else np.inf
+            if since_ns + 0.5 * self.period_ns < LOOK_S * 1e9:
+                groups[-1].append(j)
+            else:
+                groups.append([j])
+        return tuple(map(tuple, groups))
+
     def around(self, i: int, reach_s: float, most: int) -> list[int]:
         """The sweeps before and after sweep i, to the nearest ``reach_s`` away from it, in order;
         where there are more than ``most`` on one side, so many of them, evenly."""
@@ -72,6 +86,11 @@ class Clock:
 
     def _slack_ns(self, reach_s: float) -> float:
         return reach_s * 1e9 + 0.5 * self.period_ns
+
+
+def num_in_look(period_s: float) -> int:
+    """How many sweeps so far apart are one look, see `Clock.looks`."""
+    return max(1, int(np.ceil(LOOK_S / period_s + 0.5)) - 1)
 
 
 def _thinned(side: range, most: int) -> list[int]:

@@ -6,11 +6,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 
-from densify.flow.tracking.clock import Clock
+from densify.flow.tracking.clock import Clock, num_in_look
 from densify.flow.tracking.radial import Radial
 from densify.geometry import poses
 from densify.geometry.height_map import HeightMap
@@ -22,6 +22,7 @@ from densify.types import Bool, Float, Int, Stretch
 
 _MARGIN_M = 0.4
 _MARGIN_FRACTION = 0.015
+_MIN_FILLED = 6  # of the 3 x 3 cells around a direction
 _NEAR_M = 0.4
 _MIN_SEED_SHARE = 0.3
 LINK_M = 0.6
@@ -37,25 +38,30 @@ class FreeSpace:
     """What each sweep of a stretch saw through.
 
     T_lidar_world: (4,4) per sweep. clock: when they were taken. sensors: how far apart their rays
-    are.
+    are. looks: the sweeps that are asked together, see `Clock.looks`.
     """
 
     images: tuple[RangeImage, ...]
     T_lidar_world: tuple[Float, ...]
     clock: Clock
     sensors: Sensors
+    looks: tuple[tuple[int, ...], ...]
 
     @staticmethod
     def of(stretch: Stretch, images: Sequence[RangeImage] | None = None) -> FreeSpace:
-        """images: of the sweeps, where they are known."""
+        """images: of the sweeps, where they are known, with cells for `num_in_look` together."""
+        clock = Clock.of(stretch)
+        looks = clock.looks()
         if images is None:
+            num = num_in_look(clock.period_ns * 1e-9)
             with ThreadPoolExecutor() as pool:
-                images = list(pool.map(RangeImage.of, stretch.sweeps))
+                images = list(pool.map(partial(RangeImage.of, num_together=num), stretch.sweeps))
         return FreeSpace(
             tuple(images),
             tuple(poses.inverse(s.T_world_lidar) for s in stretch.sweeps),
-            Clock.of(stretch),
+            clock,
             Sensors.of(stretch.sweeps),
+            looks,
         )
 
     def __len__(self) -> int:
@@ -67,23 +73,38 @@ class FreeSpace:
         return float(self.sensors.finest_gap_m(in_lidar)[0])
 
     def others(self, i: int) -> list[int]:
-        """The sweeps around sweep number i that tell about it."""
-        return self.clock.around(i, REACH_S, _MOST_ASKED)
+        """The looks around sweep number i that tell about it, by their first sweeps; its own does
+        not."""
+        most = _MOST_ASKED * max(map(len, self.looks))
+        around = self.clock.around(i, REACH_S, most)
+        return sorted({self._look_of[j][0] for j in around} - {self._look_of[i][0]})
+
+    @cached_property
+    def _look_of(self) -> dict[int, tuple[int, ...]]:
+        return {j: look for look in self.looks for j in look}
 
     def seen_through(self, points: Float, j: int, velocity_m_s: Float | None = None) -> Bool:
-        """(N,3) world -> (N,) True where sweep number j certainly saw free space.
+        """(N,3) world -> (N,) True where the look with sweep number j certainly saw free space:
+        none of its sweeps saw anything there, and all together looked there closely.
 
         points: at the sweep's reference time. velocity_m_s: (N,3) of those that move.
         """
-        T_lidar_world = self.T_lidar_world[j]
-        return self.images[j].sees_through(
-            poses.transform(T_lidar_world, points),
-            _MARGIN_M,
-            _MARGIN_FRACTION,
-            velocity_m_s=None
-            if velocity_m_s is None
-            else poses.rotate(T_lidar_world, velocity_m_s),
-        )
+        look, told = self._look_of[j], []
+        for k in look:
+            there, T_lidar_world = points, self.T_lidar_world[k]
+            if velocity_m_s is not None and k != j:
+                there = points + (self.clock.time_s[k] - self.clock.time_s[j]) * velocity_m_s
+            told.append(
+                self.images[k].num_beyond(
+                    poses.transform(T_lidar_world, there),
+                    (_MARGIN_M, _MARGIN_FRACTION),
+                    _MIN_FILLED if len(look) == 1 else 1,
+                    None if velocity_m_s is None else poses.rotate(T_lidar_world, velocity_m_s),
+                )
+            )
+        together = [t for t in told if len(t) == len(told[0])]  # images of the same scanners
+        free: Bool = (np.sum(together, axis=0) >= _MIN_FILLED).any(axis=0)
+        return free
 
 
 @dataclass(frozen=True)

@@ -23,8 +23,6 @@ from densify.kernels.linking import link
 
 T = TypeVar("T", bound=np.generic)
 
-_LOOK_NS = 100_000_000
-
 
 @dataclass(frozen=True)
 class Look:
@@ -61,16 +59,8 @@ class Look:
 
 
 def looks_of(standing: Sequence[Standing], clock: Clock) -> tuple[Look, ...]:
-    """The stretch's sweeps, those that follow each other within less than 0.1 s (to the nearest
-    sweep) together: at 10 Hz and below each is a look of its own."""
-    groups: list[list[int]] = []
-    for j, time_ns in enumerate(clock.time_ns.tolist()):
-        since_ns = time_ns - clock.time_ns[groups[-1][0]] if groups else np.inf
-        if since_ns + 0.5 * clock.period_ns < _LOOK_NS:
-            groups[-1].append(j)
-        else:
-            groups.append([j])
-    return tuple(Look.of(group, standing, clock) for group in groups)
+    """What the looks of the stretch saw, see `Clock.looks`."""
+    return tuple(Look.of(group, standing, clock) for group in clock.looks())
 
 
 def _together(parts: Sequence[Standing]) -> Standing:

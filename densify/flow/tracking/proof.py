@@ -20,8 +20,9 @@ _MAX_CONTRADICTIONS = 0.3  # of those that standing still leaves,
 _LEAST_CONTRADICTIONS, _SHARE_OF_FEW, _LEAST_SHARE = 20, 0.08, 0.01
 
 
-def proven_to_move(track: Track, standing: Sequence[Standing], space: FreeSpace) -> bool:
-    """Fit the smooth motion of a track; True if it certainly moves.
+def left_contradicted(track: Track, standing: Sequence[Standing], space: FreeSpace) -> float | None:
+    """Fit the smooth motion of a track; None unless it certainly moves, or the share of looks that
+    contradict even that motion, 0 at best: of two motions the one with less of them is the truth.
 
     The motion must be smooth, long enough to be told from noise, and must do away with the
     contradictions that brought the group here: where the sweeps see through its points at their
@@ -31,7 +32,7 @@ def proven_to_move(track: Track, standing: Sequence[Standing], space: FreeSpace)
     """
     seen_s = np.ptp([sighting.seen_s for sighting in track.sightings.values()])
     if len(track.sightings) < _LEAST_STATES or seen_s < _LEAST_S:
-        return False
+        return None
     track.smooth()
     residual_m = track.path.residual_m
     begin, end = track.path(track.path.begin_s), track.path(track.path.end_s)
@@ -39,12 +40,14 @@ def proven_to_move(track: Track, standing: Sequence[Standing], space: FreeSpace)
     gap_m = space.gap_m(track.centre, next(iter(track.claimed)))
     rough_m = _ROUGH_M + _ROUGH_PER_GAP * gap_m + _ROUGH_S * travelled / seen_s
     if residual_m > rough_m or travelled < max(_LEAST_WAY_M, _LEAST_WAY_PER_RESIDUAL * residual_m):
-        return False
+        return None
     if not _as_fast_as_measured(track, standing):
-        return False
+        return None
     still, moved, num_asked = _contradictions(track, standing, space)
     least = min(_LEAST_CONTRADICTIONS, _SHARE_OF_FEW * num_asked)
-    return still >= max(least, _LEAST_SHARE * num_asked) and moved <= _MAX_CONTRADICTIONS * still
+    if still < max(least, _LEAST_SHARE * num_asked) or moved > _MAX_CONTRADICTIONS * still:
+        return None
+    return moved / num_asked
 
 
 def _as_fast_as_measured(track: Track, standing: Sequence[Standing]) -> bool:
@@ -64,12 +67,19 @@ def _contradictions(
 ) -> tuple[int, int, int]:
     """How many looks through the track's points the sweeps have, standing still and moved, and how
     many there may have been."""
-    asked = {i: rows[:: len(rows) // _NUM_ASKED + 1] for i, rows in track.claimed.items()}
+    asked = {}
+    for look in space.looks:
+        num = _NUM_ASKED // len(look)
+        for i in look:
+            if i in track.claimed:
+                rows = track.claimed[i]
+                asked[i] = rows[:: len(rows) // num + 1]
+    others = {i: frozenset(space.others(i)) for i in asked}
     points = {i: standing[i].points[rows] for i, rows in asked.items()}
     body = {i: track.undo(points[i], standing[i].time_s[rows]) for i, rows in asked.items()}
     still = moved = num_asked = 0
-    for j in range(len(space.clock.time_s)):
-        from_others = [i for i in space.others(j) if i in asked]
+    for j, *_ in space.looks:
+        from_others = [i for i in asked if j in others[i]]
         if not from_others:
             continue
         of_others = np.concatenate([body[i] for i in from_others])

@@ -20,7 +20,7 @@ from densify.flow.tracking.clock import Clock
 from densify.flow.tracking.evidence import FreeSpace, Standing
 from densify.flow.tracking.lone_rings import in_line, linked_in_line, single_rings
 from densify.flow.tracking.looks import Look, looks_of
-from densify.flow.tracking.proof import proven_to_move
+from densify.flow.tracking.proof import left_contradicted
 from densify.flow.tracking.shapes import Shape
 from densify.flow.tracking.sightings import Track
 from densify.flow.tracking.vote import DistanceField, vote
@@ -45,8 +45,8 @@ _GIVEN_S2 = np.array([0.02, 0.02, 0.02, 0.0])
 _STEADY = np.array([1.0, 1.0, 1.0, 0.9])  # of what it was then: turns level out
 _MISSES_ALLOWED, _MISSED_S = 1, 0.2  # either: a track ends when both are exceeded
 _LEAST_WIDTH_M = 0.1
+_CLEARLY = 0.5  # of the looks that contradict the motion found before
 _BESIDE_M = 1.0  # as far as what is towed is from what tows it
-_MAX_CONTRADICTED_PARTS = 0.05  # of the points of a part of an object
 
 
 def follow_groups(
@@ -78,10 +78,15 @@ def follow_groups(
         radial = seen[n].radial
         if radial is not None:
             velocity = radial.rows(members).corrected(velocity)
-        for start in chain([velocity], _velocities_beside(looks[n], members, bodies, space)):
-            track = _follow(members, n, start, looks, free, ground, clock)
-            proven = proven_to_move(track, standing, space)
-            if proven:
+        left, proven = np.inf, False
+        for start in chain([velocity], _velocities_beside(looks[n], members, bodies)):
+            tried = _follow(members, n, start, looks, free, ground, clock)
+            contradicted = left_contradicted(tried, standing, space)
+            if contradicted is not None and contradicted < _CLEARLY * left:
+                track, left, proven = tried, contradicted, True
+            elif not proven:
+                track = tried
+            if left == 0:
                 break
         if proven:
             _gather(track, standing, free, space)
@@ -127,7 +132,7 @@ def _is_line_on(bodies: Sequence[tuple[Track, Float]], look: Look, members: np.n
 
 
 def _velocities_beside(
-    look: Look, members: np.ndarray, bodies: Sequence[tuple[Track, Float]], space: FreeSpace
+    look: Look, members: np.ndarray, bodies: Sequence[tuple[Track, Float]]
 ) -> Iterator[Float]:
     """The velocities (3,) that proven tracks close to a group have there, where the group cannot be
     a part of them: of what tows it, say. Little else tells how fast a long side slides.
@@ -140,15 +145,7 @@ def _velocities_beside(
         at_s = track.seen_at(look.time_ns)
         if not np.isfinite(tree.nearest(track.place(points, at_s), _BESIDE_M)[0]).any():
             continue
-        body = track.undo(c.points[members], c.time_s[members])
-        if _contradicted(track, body, space) > _MAX_CONTRADICTED_PARTS:
-            yield track.velocity_m_s(middle, at_s)[0]
-
-
-def _contradicted(track: Track, body: Float, space: FreeSpace) -> float:
-    """The largest share that a sweep sees through of (N,3) points in the track's frame."""
-    sweeps = range(len(space.clock.time_s))
-    return max(float(track.seen_through(body, j, space).mean()) for j in sweeps)
+        yield track.velocity_m_s(middle, at_s)[0]
 
 
 def _follow(
