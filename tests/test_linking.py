@@ -59,6 +59,14 @@ def test_points_on_one_place() -> None:
     assert num == 2 and (label == np.repeat([0, 1], 100)).all()
 
 
+def test_a_point_very_far_away_changes_no_other_group() -> None:
+    points = np.random.default_rng(8).uniform(-5, 5, (400, 3))
+    num, label = link(points, 0.9)
+    num_more, more = link(np.append(points, [[4e6, -5e6, 6e6]], axis=0), 0.9)
+    assert num_more == num + 1 and more[-1] == num
+    np.testing.assert_array_equal(more[:-1], label)
+
+
 def test_nothing() -> None:
     num, label = link(np.empty((0, 3)), DISTANCE_M)
     assert num == 0 and label.shape == (0,)

@@ -9,10 +9,10 @@ from scipy.spatial import cKDTree
 from densify.kernels import Kernel, inlined
 from densify.types import Bool, Float, Int
 
-_WITHIN, _ABOVE = (
-    1 - 1e-9,
-    1 + 1e-9,
-)  # a cell's points must be linked even where rounding makes its diagonal longer
+# Rounding must neither part the points of a cell, whose diagonal is the distance, nor put what is
+# closer than a cell's side three cells apart.
+_WITHIN, _ABOVE = 1 - 1e-9, 1 + 1e-9
+_MANY_CELLS = 1e18
 
 
 def link(points: Float, distance_m: float) -> tuple[int, Int]:
@@ -25,9 +25,9 @@ def link(points: Float, distance_m: float) -> tuple[int, Int]:
     if not len(points):
         return 0, np.zeros(0, np.int64)
     side_m = distance_m * _WITHIN / np.sqrt(3)
-    cells = np.floor((points - points.min(axis=0)) / side_m)
-    cells, of_point = np.unique(cells, axis=0, return_inverse=True)
-    of_point = of_point.ravel()
+    cells = np.floor((points - points.min(axis=0)) / side_m).astype(np.int64)
+    _, first, of_point = np.unique(_numbers(cells), return_index=True, return_inverse=True)
+    cells = cells[first]
     # Points of cells farther apart than (2, 2, 1) are farther apart than the distance.
     pairs = cKDTree(cells).query_pairs(3.0 + 1e-9, output_type="ndarray")
     apart = np.abs(cells[pairs[:, 0]] - cells[pairs[:, 1]]).sum(axis=1)
@@ -37,9 +37,18 @@ def link(points: Float, distance_m: float) -> tuple[int, Int]:
     nearest_first = pairs[np.argsort(apart, kind="stable")]
     _join(np.ascontiguousarray(points[order], float), start, nearest_first, distance_m**2, parent)
     _, first, label = np.unique(parent[of_point], return_index=True, return_inverse=True)
-    number = np.empty(len(first), np.int64)
-    number[np.argsort(first)] = np.arange(len(first))
-    return len(first), number[label.ravel()]
+    renumbered = np.empty(len(first), np.int64)
+    renumbered[np.argsort(first)] = np.arange(len(first))
+    return len(first), renumbered[label]
+
+
+def _numbers(cells: Int) -> Int:
+    """(N,3), none negative -> (N,) one number for each cell, which sorts as its coordinates do."""
+    if np.prod(cells.max(axis=0) + 1.0) > _MANY_CELLS:  # something lies very far away
+        ranks = [np.unique(column, return_inverse=True)[1] for column in cells.T]
+        cells = np.stack(ranks, axis=1)
+    _, wide, high = cells.max(axis=0) + 1
+    return np.asarray((cells[:, 0] * wide + cells[:, 1]) * high + cells[:, 2], np.int64)
 
 
 def close_to_seeds(points: Float, seed: Bool, within_m: float, least_share: float) -> Bool:
@@ -48,7 +57,6 @@ def close_to_seeds(points: Float, seed: Bool, within_m: float, least_share: floa
     close = np.zeros(len(points), bool)
     if not seed.any():
         return close
-    # A little wider, or rounding could put two that are so close three cells apart.
     cell = np.floor((points - points.min(axis=0)) / (_ABOVE * within_m)).astype(np.int64) + 1
     _, wide, high = cell.max(axis=0) + 2
     key = (cell[:, 0] * wide + cell[:, 1]) * high + cell[:, 2]
