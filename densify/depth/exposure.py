@@ -141,7 +141,10 @@ class InView(NamedTuple):
         """The view of ``cloud.select(keep)``."""
         kept = keep[self.rows]
         rows = (np.cumsum(keep) - 1)[self.rows[kept]]
-        return InView(self.exposure, rows, self.points_cam[kept], self.uv[kept])
+        mine = np.flatnonzero(kept)
+        return InView(
+            self.exposure, rows, self.points_cam.take(mine, axis=0), self.uv.take(mine, axis=0)
+        )
 
     def joined(self, other: InView, num_points: int) -> InView:
         """The view of two clouds as one. num_points: of this one's cloud."""
@@ -229,7 +232,8 @@ class Exposure:
         """What of a cloud at the key's moment is on the image."""
         sight = self.see(cloud.points, cloud.velocity_m_s)
         rows = np.flatnonzero(sight.inside)
-        return InView(self, rows, sight.points_cam[rows], sight.uv[rows])
+        points_cam, uv = (a.take(rows, axis=0) for a in (sight.points_cam, sight.uv))
+        return InView(self, rows, points_cam, uv)
 
     def depth_m(self, points_cam: Float) -> Float:
         """(N,3) -> (N,) as ``measure`` says."""

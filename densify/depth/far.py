@@ -147,9 +147,9 @@ def far_cloud(
     rows = np.flatnonzero(beyond[found.source])
     needed = np.zeros(len(rows), bool)
     for exposure in exposures.values():
-        needed[_seen(found.points[rows], T_key_found, exposure)] = True
+        needed[_seen(found.points.take(rows, axis=0), T_key_found, exposure)] = True
     rows = rows[needed]
-    points = poses.transform(T_key_found, found.points[rows].astype(np.float64))
+    points = poses.transform(T_key_found, found.points.take(rows, axis=0).astype(np.float64))
     if standing_only:
         ends = sorted({stretch.frames[0], stretch.frames[-1]} - {key})
         stands = ~_gone(points, stretch, key, ends)

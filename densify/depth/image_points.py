@@ -43,7 +43,10 @@ class PointsInImage:
     def select(self, keep: Bool) -> PointsInImage:
         if keep.all():
             return self
-        return PointsInImage(**{f.name: getattr(self, f.name)[keep] for f in fields(self)})
+        rows = np.flatnonzero(keep)
+        return PointsInImage(
+            **{f.name: getattr(self, f.name).take(rows, axis=0) for f in fields(self)}
+        )
 
     def at(self, rows: Int) -> Int:
         """Where rows of the cloud, all in the image, are among these."""
@@ -72,18 +75,19 @@ def in_image(cloud: Cloud, view: InView, patches: Patches, vetoed: bool) -> Poin
     kept = np.argsort(row, kind="stable")
     if vetoed:
         kept = kept[~patches.free[view.rows[kept]]]
-    exposure, index, points_cam = view.exposure, view.rows[kept], view.points_cam[kept]
+    exposure, index = view.exposure, view.rows[kept]
+    points_cam = view.points_cam.take(kept, axis=0)
     depth = exposure.depth_m(points_cam).astype(np.float32)
-    normal = rotate(exposure.T_cam_key, patches.normal[index].astype(np.float64))
+    normal = rotate(exposure.T_cam_key, patches.normal.take(index, axis=0).astype(np.float64))
     plain = exposure.camera.is_rectified and exposure.measure == "z"
     local = (_pinhole if plain else _any_lens)(
-        exposure, points_cam, depth, normal, patches.spacing_m[index]
+        exposure, points_cam, depth, normal, patches.spacing_m.take(index, axis=0)
     )
     most, far = _MAX_TILT / depth[:, None], patches.place >= 0
     slope = np.nan_to_num(local.slope, posinf=0.0, neginf=0.0)
     return PointsInImage(
         index=index,
-        uv=view.uv[kept],
+        uv=view.uv.take(kept, axis=0),
         depth=depth,
         focal_px=local.focal_px,
         slope=np.clip(slope, -most, most),

@@ -52,7 +52,9 @@ def patches(
     free = np.zeros(len(cloud), bool)
     other = np.flatnonzero(wanted & (cloud.frame != key))
     if key_image is not None and len(other):
-        free[other] = vetoed(cloud.points[other], cloud.velocity_m_s[other], key_image, settings)
+        points = cloud.points.take(other, axis=0)
+        velocity_m_s = cloud.velocity_m_s.take(other, axis=0)
+        free[other] = vetoed(points, velocity_m_s, key_image, settings)
     return Patches(normal, spacing_m, free, sweep, np.full(len(cloud), -1, np.int32))
 
 
@@ -66,7 +68,7 @@ def vetoed(
         settings.veto_m,
         settings.veto_fraction,
         _MIN_FILLED,
-        velocity_m_s.astype(np.float64),
+        velocity_m_s,
     )
 
 

@@ -162,10 +162,10 @@ def _found(
     edge_px = settings.edge_slack_m * points.focal_px[:, 0] * inverse
     visible = kernels.Visible(
         start=start,
-        uv=points.uv[order],
+        uv=points.uv.take(order, axis=0),
         inverse=inverse[order],
-        slope=points.slope[order],
-        spacing_px=points.spacing_px[order],
+        slope=points.slope.take(order, axis=0),
+        spacing_px=points.spacing_px.take(order, axis=0),
         edge_px=edge_px[order],
         sweep=points.sweep[order],
         hidden=hidden[order],

@@ -61,7 +61,7 @@ class RangeImage:
         margin_m: float,
         margin_fraction: float,
         min_filled: int = 6,
-        velocity_m_s: Float | None = None,
+        velocity_m_s: Float | Float32 | None = None,
     ) -> Bool:
         """(N,3) lidar frame at the reference time -> (N,) True where the space is certainly free.
 

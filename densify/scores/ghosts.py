@@ -27,13 +27,13 @@ def ghosts(cloud: Cloud, key_image: RangeImage, key: int) -> Bool:
     without a return say nothing, but six of the nine must have one.
     """
     ghost = np.zeros(len(cloud), bool)
-    other = cloud.frame != key
+    other = np.flatnonzero(cloud.frame != key)
     ghost[other] = key_image.sees_through(
-        cloud.points[other],
+        cloud.points.take(other, axis=0),
         _GHOST_MARGIN_M,
         _GHOST_MARGIN_FRACTION,
         min_filled=6,
-        velocity_m_s=cloud.velocity_m_s[other],
+        velocity_m_s=cloud.velocity_m_s.take(other, axis=0),
     )
     return ghost
 

@@ -63,7 +63,8 @@ class Cloud:
 
     def select(self, keep: Bool) -> Cloud:
         """The points where ``keep`` (M,) is True."""
-        return Cloud(**{f.name: getattr(self, f.name)[keep] for f in fields(self)})
+        rows = np.flatnonzero(keep)  # once for all columns
+        return Cloud(**{f.name: getattr(self, f.name).take(rows, axis=0) for f in fields(self)})
 
     def columns(self) -> dict[str, NDArray[Any]]:
         """Everything as (M,) columns in the types they have here, vectors by axis: x y z, rigid_x
@@ -148,14 +149,15 @@ class Patches:
 
     def select(self, keep: Bool) -> Patches:
         """The patches of ``cloud.select(keep)``."""
-        sweep = self.sweep[keep]
+        rows = np.flatnonzero(keep)
+        sweep = self.sweep[rows]
         number = np.cumsum(np.bincount(sweep) > 0) - 1
         return Patches(
-            self.normal[keep],
-            self.spacing_m[keep],
-            self.free[keep],
+            self.normal.take(rows, axis=0),
+            self.spacing_m.take(rows, axis=0),
+            self.free[rows],
             number[sweep].astype(np.int32),
-            self.place[keep],
+            self.place[rows],
         )
 
 
@@ -191,7 +193,9 @@ class Standing:
 
     def select(self, keep: Bool | Int) -> Standing:
         """Some of the points."""
-        return replace(self, **{name: getattr(self, name)[keep] for name in _COLUMNS_OF_STANDING})
+        rows = np.flatnonzero(keep) if keep.dtype == bool else keep
+        kept = {name: getattr(self, name).take(rows, axis=0) for name in _COLUMNS_OF_STANDING}
+        return replace(self, **kept)
 
     def __len__(self) -> int:
         return len(self.points)

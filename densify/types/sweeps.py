@@ -71,15 +71,16 @@ class Sweep:
 
     def select(self, keep: Bool | slice) -> Sweep:
         """The returns where ``keep`` (N,) is True, or of a slice."""
+        rows = np.arange(len(self))[keep]
         return replace(
             self,
-            points=self.points[keep],
-            intensity=self.intensity[keep],
-            offset_ns=None if self.offset_ns is None else self.offset_ns[keep],
-            lidar=self.lidar[keep],
-            row=self.row[keep],
+            points=self.points.take(rows, axis=0),
+            intensity=self.intensity[rows],
+            offset_ns=None if self.offset_ns is None else self.offset_ns[rows],
+            lidar=self.lidar[rows],
+            row=self.row[rows],
             radial_velocity_m_s=(
-                None if self.radial_velocity_m_s is None else self.radial_velocity_m_s[keep]
+                None if self.radial_velocity_m_s is None else self.radial_velocity_m_s[rows]
             ),
         )
 
