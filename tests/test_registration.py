@@ -15,8 +15,9 @@ from densify.errors import ComputationError
 from densify.geometry import poses
 from densify.readers.street import Street
 from densify.readers.window import read_sweep, recorded_trajectory
-from densify.registration import odometry, trajectory
+from densify.registration import neighbors, odometry, trajectory
 from densify.registration.deskew import deskew
+from densify.registration.neighbors import refine
 from densify.registration.odometry import check_overlap, check_plausible, register
 from densify.types import Trajectory
 from tests.scenes import SWEEP_S, Arc, Box, Scanner, Scene, World, street
@@ -133,6 +134,51 @@ def test_the_start_is_found_at_any_rate(fast_drive, period_s):
     frames = [round(i * period_s / SWEEP_S) for i in range(3)]
     twist = odometry.searched_twist([fast_drive.scan(f).sweep for f in frames], SETTINGS)
     assert np.abs(twist * period_s - [0, 0, 0, 36.0 * period_s, 0, 0]).max() < 0.6
+
+
+def jittered(true: Trajectory, seed: int, noise_m: float, noise_deg: float) -> Trajectory:
+    rng, num = np.random.default_rng(seed), len(true.frames)
+    noise = np.c_[
+        np.deg2rad(noise_deg) * rng.normal(size=(num, 3)), noise_m * rng.normal(size=(num, 3))
+    ]
+    T = [a @ poses.exp(twist) for a, twist in zip(true.T_world_lidar, noise, strict=True)]
+    return replace(true, T_world_lidar=np.stack(T))
+
+
+def test_sweeps_are_laid_on_those_around_them(drive, raw, second_pass):
+    true = drive.trajectory(FRAMES)
+    off_m, off_deg = errors(second_pass, true)
+    now_m, now_deg = errors(refine(raw, second_pass, SETTINGS), true)
+    assert now_m.mean() < 0.7 * off_m.mean() and now_deg.mean() < 0.7 * off_deg.mean()
+
+
+def test_what_odometry_leaves_is_mended_and_the_first_sweep_stays(drive, raw):
+    true = drive.trajectory(FRAMES)
+    off = jittered(true, 1, 0.03, 0.1)
+    found = refine(raw, off, SETTINGS)
+    (before_m, before_deg), (m, deg) = errors(off, true), errors(found, true)
+    assert m.mean() < 0.4 * before_m.mean() and deg.mean() < 0.7 * before_deg.mean()
+    np.testing.assert_allclose(found.T_world_lidar[0], off.T_world_lidar[0], atol=1e-9)
+    again = refine(raw, off, SETTINGS)
+    assert again.T_world_lidar.tobytes() == found.T_world_lidar.tobytes()
+    assert (found.frames, found.stamp_ns.tobytes()) == (off.frames, off.stamp_ns.tobytes())
+
+
+def test_a_sweep_that_does_not_lie_on_those_around_keeps_its_pose(drive, raw):
+    true = drive.trajectory(FRAMES)
+    astray = true.T_world_lidar.copy()
+    astray[4] = astray[4] @ poses.exp(np.array([0, 0, 0.3, 4, 0, 3]))
+    found = refine(raw, replace(true, T_world_lidar=astray), SETTINGS)
+    np.testing.assert_allclose(found.T_world_lidar[4], astray[4], atol=0.05)
+
+
+def test_only_sweeps_of_half_a_second_around_are_asked(drive):
+    near = neighbors._around(drive.trajectory(range(20)), 10)
+    assert near == [5, 6, 7, 8, 9, 11, 12, 13, 14, 15]
+    often = replace(drive.trajectory(range(40)), stamp_ns=np.arange(40) * 25_000_000)
+    near = neighbors._around(often, 20)
+    assert len(near) <= 10 and 20 not in near and all(abs(j - 20) % 4 == 0 for j in near)
+    assert neighbors._around(drive.trajectory(range(1)), 0) == []
 
 
 def test_same_bytes_every_time(raw, first_pass):

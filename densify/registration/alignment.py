@@ -12,20 +12,22 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from densify.geometry import poses
 from densify.types import Float, Sweep
 
 _MANY_POINTS = 30_000  # before they are thinned to voxels
 _GOLDEN = 0.6180339887498949  # its multiples, modulo 1, fall evenly whatever the order of the rings
 _VOXEL_M, _LEAF_M, _NUM_NEIGHBORS = 0.5, 1.0, 10
+_HELD_AT_M = 10.0
 _NORMAL_M = 0.0447  # two surfaces' spread along the normal, as small_gicp weighs: sqrt(2 · 1e-3)
 
 
-def some(sweep: Sweep) -> Sweep:
-    """Some of the points of a sweep that holds many, of all its rings alike."""
+def some(sweep: Sweep, most: int = _MANY_POINTS) -> Sweep:
+    """About ``most`` of the points of a sweep that holds more, of all its rings alike."""
     num = len(sweep)
-    if num <= _MANY_POINTS:
+    if num <= most:
         return sweep
-    return sweep.select(np.arange(num) * _GOLDEN % 1 < _MANY_POINTS / num)
+    return sweep.select(np.arange(num) * _GOLDEN % 1 < most / num)
 
 
 class Surface(NamedTuple):
@@ -35,11 +37,11 @@ class Surface(NamedTuple):
     tree: Any
 
     @staticmethod
-    def of(points: Float) -> Surface:
-        """points: (N,3)."""
+    def of(points: Float, voxel_m: float = _VOXEL_M) -> Surface:
+        """points: (N,3). voxel_m: smaller ones keep more of them, and cost more."""
         import small_gicp
 
-        return Surface(*small_gicp.preprocess_points(points, _VOXEL_M, _NUM_NEIGHBORS, 1))
+        return Surface(*small_gicp.preprocess_points(points, voxel_m, _NUM_NEIGHBORS, 1))
 
     def __len__(self) -> int:
         return int(self.points.size())
@@ -100,6 +102,32 @@ def lay(target: Surface, source: Surface, T_target_source: Float, match_m: float
         num_threads=1,
     )
     return _lay(found, source)
+
+
+def lay_on_planes(
+    target: Surface, source: Surface, match_m: float, hold: float
+) -> tuple[Float, float]:
+    """``T_target_source``, near the identity, that lays the source's points on the planes of the
+    target, and the share of them that met it. match_m: nothing farther apart is taken for the
+    same. hold: share of the matches that as many points, 10 m away, hold in place: where fewer
+    planes tell, as along a straight road, the source hardly moves; 0 lets it slide.
+    """
+    import small_gicp
+
+    found = small_gicp.align(
+        target.points,
+        source.points,
+        target.tree,
+        registration_type="PLANE_ICP",
+        max_correspondence_distance=match_m,
+        num_threads=1,
+    )
+    num = int(found.num_inliers)
+    told = np.asarray(found.H) / max(num, 1)
+    held = np.diag(hold * np.repeat([_HELD_AT_M**2, 1.0], 3))
+    slid = poses.log(np.asarray(found.T_target_source))
+    motion = np.linalg.solve(told + held, told @ slid)
+    return poses.exp(np.asarray(motion, np.float64)), num / max(len(source), 1)
 
 
 def _lay(found: Any, source: Surface) -> Lay:

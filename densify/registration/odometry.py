@@ -215,6 +215,15 @@ def check_plausible(trajectory: Trajectory, settings: RegisterSettings) -> None:
         previous_m_s = velocity_m_s
 
 
+def is_plausible(trajectory: Trajectory, settings: RegisterSettings) -> bool:
+    """Whether a vehicle moves so, see `check_plausible`."""
+    try:
+        check_plausible(trajectory, settings)
+    except SweepError:
+        return False
+    return True
+
+
 def check_overlap(
     sweeps: Sequence[Sweep], trajectory: Trajectory, settings: RegisterSettings
 ) -> None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Poses of consecutive sweeps: the recording's own, or odometry's in two passes."""
+"""Poses of consecutive sweeps: the recording's own, or odometry's, laid on their neighbours."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ import numpy as np
 from densify.config import RegisterSettings
 from densify.geometry import poses
 from densify.registration.deskew import deskew
+from densify.registration.neighbors import refine
 from densify.registration.odometry import (
     check_number_of_points,
     check_overlap,
@@ -49,7 +50,7 @@ def find_trajectory(
 
     sweeps: raw, ascending in time. recorded: the recording's own poses of them, which are checked
     and taken; None to register the sweeps in two passes, whose first finds the motion that bends
-    raw sweeps.
+    raw sweeps, and then to lay each on those around it (`densify.registration.neighbors`).
 
     Raises SweepError naming the frame where the poses cannot be right.
     """
@@ -61,7 +62,7 @@ def find_trajectory(
         check_number_of_points(sweeps, settings)
         rough = _rough(sweeps, settings)
         straight = [s.sweep for s in deskew(sweeps, rough).sweeps]
-        found = _fine(straight, rough, settings)
+        found = refine(sweeps, _fine(straight, rough, settings), settings)
         check_plausible(found, settings)
         check_overlap(straight, found, settings)
     return replace(found, R_level_lidar=upright(sweeps))
