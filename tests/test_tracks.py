@@ -3,13 +3,16 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 from densify.config import GroundSettings
+from densify.flow.tracking import proof
 from densify.flow.tracking.clock import Clock
 from densify.flow.tracking.evidence import Standing
-from densify.flow.tracking.sightings import Track
+from densify.flow.tracking.sightings import Sighting, Track
 from densify.flow.tracking.tracks import _groups_to_start
 from densify.geometry.height_map import HeightMap
 
@@ -67,3 +70,18 @@ def test_the_ground_rises_under_a_track():
     for dx, dy in ((10, 0), (-6, 3), (0, 5)):
         rise_m = track.rise_m(ground, np.array([dx, dy, 77.0, 0.3]))
         assert rise_m == pytest.approx(0.1 * dx, abs=0.005)
+
+
+def test_a_short_way_far_from_the_scanner_proves_nothing():
+    """Three places on a line may be chance where rings are a metre apart: a tree's leaves."""
+    sighted = {
+        n: Sighting(np.array([0.24 * n, 0, 0, 0]), 0.1 * n, n * 100_000_000, (n,)) for n in range(3)
+    }
+    track = Track(np.array([44.0, 0, 0]), sighted, {n: np.arange(8) for n in range(3)})
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(proof, "_contradictions", lambda *_: (100, 0, 300))
+        patch.setattr(proof, "_as_fast_as_measured", lambda *_: True)
+        for gap_m, proven in ((0.5, True), (1.8, False)):
+            space = SimpleNamespace(gap_m=lambda *_, gap_m=gap_m: gap_m)
+            left = proof.left_contradicted(track, [], space)
+            assert (left is not None) == proven

@@ -12,7 +12,7 @@ from densify.flow.tracking.radial import Radial
 from densify.flow.tracking.sightings import Track
 
 _ROUGH_M, _ROUGH_PER_GAP, _ROUGH_S = 0.04, 0.2, 0.003  # by gap of rings, by speed
-_LEAST_WAY_M, _LEAST_WAY_PER_RESIDUAL = 0.35, 8.0
+_LEAST_WAY_M, _LEAST_WAY_PER_RESIDUAL, _LEAST_WAY_PER_ROUGH = 0.35, 8.0, 1.5
 _NUM_ASKED = 60
 _LEAST_STATES, _LEAST_S = 3, 0.15
 _MAX_CONTRADICTIONS = 0.3  # of those that standing still leaves,
@@ -39,7 +39,9 @@ def left_contradicted(track: Track, standing: Sequence[Standing], space: FreeSpa
     travelled = float(np.linalg.norm((end - begin)[:2]))
     gap_m = space.gap_m(track.centre, next(iter(track.claimed)))
     rough_m = _ROUGH_M + _ROUGH_PER_GAP * gap_m + _ROUGH_S * travelled / seen_s
-    if residual_m > rough_m or travelled < max(_LEAST_WAY_M, _LEAST_WAY_PER_RESIDUAL * residual_m):
+    # Of few places far apart rings, which may be so rough, some lie on a line by chance.
+    least_m = max(_LEAST_WAY_PER_RESIDUAL * residual_m, _LEAST_WAY_PER_ROUGH * rough_m)
+    if residual_m > rough_m or travelled < max(_LEAST_WAY_M, least_m):
         return None
     if not _as_fast_as_measured(track, standing):
         return None
