@@ -6,9 +6,10 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-from densify.bench import readme
+from densify.bench import images, readme
 from densify.cli import main
 from densify.readers import open_sequence
 
@@ -55,3 +56,16 @@ def test_real_rows_come_with_their_folders(tmp_path):
 @pytest.mark.parametrize("name", readme.TABLES)
 def test_the_results_name_the_command_of_each_table(name):
     assert f"densify bench readme {name}" in RESULTS.read_text("utf-8")
+
+
+def test_wrong_images_are_measured_against_strict_maps(monkeypatch):
+    wrong = {name: images.FAULTS[name] for name in ("right", "noise instead")}
+    monkeypatch.setattr(images, "FAULTS", wrong)
+    found = images.bench_images(open_sequence("street:static?seed=5"), 30, "image_02", 1)
+    assert [*found] == ["right", "noise instead", "the next frame's"]
+    assert found["noise instead"] == [images.Compared(None, None)]
+    right = found["right"][0]
+    assert right.wrong is not None and 0 <= right.as_dense <= right.wrong
+    ramp = np.tile(np.arange(20, dtype=np.uint8)[:, None, None], (1, 30, 3))
+    shifted = images.moved(0, 2)(ramp)
+    assert (shifted[2:] == ramp[:-2]).all() and (shifted[:2] == 0).all()

@@ -15,6 +15,8 @@ from typing import Any, NamedTuple
 from densify import pipeline
 from densify.bench.depth import bench_depth
 from densify.bench.flow import bench_flow
+from densify.bench.images import FAULTS as WRONG_IMAGES
+from densify.bench.images import bench_images
 from densify.bench.priors import FAULTS, Completed, bench_priors
 from densify.bench.two_clouds import bench_two_clouds
 from densify.config import Config, resolve
@@ -82,13 +84,18 @@ _PRIORS = (
     Scene("street:highway?seed=73", (60,)),
     Scene("street?seed=74", (100,), "image_03"),
 )
+_IMAGES = (
+    Scene("street?seed=41", (70,)),
+    Scene("street:highway?seed=43", (60,)),
+    Scene("street?seed=61&sensor=hdl32", (80,)),
+)
 _PARTS = {
     "all parts": (),
     "no far range": ("accumulate.far_m=0",),
     "no rims": ("project.rims=strict",),
     "no windows": ("project.glass=keep",),
     "no star fill": ("project.star_reach=0",),
-    "fences closed": ("project.seen_through=1",),
+    "rays open nothing": ("project.seen_through=1",),
 }
 
 
@@ -290,6 +297,14 @@ def _row_of_pairs(scene: Scene) -> list[list[str]]:
     ]
 
 
+def _row_of_images(scene: Scene) -> list[list[str]]:
+    """Wrong pixels with wrong images, as multiples of those without rims."""
+    key = scene.keys[len(scene.keys) // 2]
+    made = bench_images(open_sequence(scene.data), key, scene.camera, scene.window)
+    cells = [", ".join(map(str, parts)) for parts in made.values()]
+    return [[str(scene._replace(keys=(key,))), *cells]]
+
+
 def _row_of_priors(scene: Scene) -> list[list[str]]:
     """Pixels that came from priors, by the right kind and scale alone and as fitted."""
     made = bench_priors(open_sequence(scene.data), scene.keys[0], scene.camera)
@@ -370,5 +385,14 @@ TABLES: Mapping[str, _Table] = {
         ("of the image", *FAULTS),
         _PRIORS,
         _row_of_priors,
+    ),
+    "images": _Table(
+        "Filled pixels that are wrong with wrong images, as a multiple of those with "
+        "project.rims=strict, and in brackets among the most certain ones, as many as it has; –: "
+        "the image is not listened to.",
+        (*WRONG_IMAGES, "the next frame's"),
+        _IMAGES,
+        _row_of_images,
+        real=True,
     ),
 }

@@ -19,6 +19,7 @@ from scipy import ndimage
 from densify.config import ProjectSettings
 from densify.depth.exposure import Exposure, InView
 from densify.depth.layers import Layers
+from densify.depth.picture import blurred
 from densify.geometry import poses
 from densify.kernels.visibility import NOW_NS
 from densify.types import Bool, Cloud, Float, Float32, Reason, Stretch
@@ -165,8 +166,7 @@ def _counts(
     column, row = np.rint(uv).astype(np.int64).T
     counts = np.bincount(row * shape[1] + column, minlength=shape[0] * shape[1])
     pixels = counts.reshape(shape).astype(np.float32)
-    blurred: Float32 = ndimage.gaussian_filter(pixels, blur_px, truncate=2.5)
-    return blurred
+    return blurred(pixels, blur_px) if max(blur_px) > 0 else pixels
 
 
 def crossings(

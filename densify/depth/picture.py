@@ -37,6 +37,16 @@ def lab(image: NDArray[np.uint8]) -> Float32:
     return colours * np.float32(max(1.0, _LEAST_LIGHT / max(light, 1.0)))
 
 
+def blurred(values: Float32, blur_px: tuple[float, float]) -> Float32:
+    """(H,W) blurred by a Gaussian, standard deviations down and across, out to 2.5 of them."""
+    down_px, across_px = blur_px
+    size = (2 * round(2.5 * across_px) + 1, 2 * round(2.5 * down_px) + 1)
+    made = cv2.GaussianBlur(
+        values, size, sigmaX=across_px, sigmaY=down_px, borderType=cv2.BORDER_REFLECT
+    )
+    return made.astype(np.float32, copy=False)
+
+
 class Laid(NamedTuple):
     """An image (H,W,3) moved to where it fits. right_px, down_px: by how much it lay aside.
     certain: more than right images are moved by chance."""

@@ -26,7 +26,7 @@ _FAR_SUPPORT, _FAR_EDGE = 6, 1.5
 _DOUBTS = np.array([0.45, 0.25, 0.20, 0.10, 0.10])
 _MANY_POINTS = 20
 _ROUGH_M = 0.10
-_LEAST_ALONE = 4  # returns of the key sweep that agree around one, itself among them, of nine
+_LEAST_ALONE = 5  # returns of the key sweep that agree around one, itself among them, of nine
 
 
 @dataclass(frozen=True)
