@@ -81,7 +81,7 @@ class RangeImage:
         points: Float,
         margins_m: tuple[float, float],
         least: int = 1,
-        velocity_m_s: Float | None = None,
+        velocity_m_s: Float | Float32 | None = None,
     ) -> NDArray[np.int16]:
         """(S,N) for each image how many of the 3 x 3 cells around each point's direction hold a
         return, where every return in them lies farther as `sees_through` has it; far below 0 where
