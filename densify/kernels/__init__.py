@@ -4,8 +4,8 @@
 A kernel takes arrays of fixed types, writes into arrays it is given and raises nothing. It lets go
 of the interpreter while it works, so that its rows can be shared out among threads.
 
-Compiling is most of a first run. Rows are assigned number by number: an array or a tuple at once
-takes 1.6 s to compile. A literal handed to an inlined function compiles it once more.
+Compiling takes a quarter of a first run. Rows are assigned number by number: an array or a tuple at
+once takes 1.6 s to compile. A literal handed to an inlined function compiles it once more.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class _Notice(event.Listener):
         if not self.said and str(event.data["dispatcher"].__module__).startswith("densify."):
             self.said = True
             _progress.info(
-                "compiling the inner loops, once for this installation: about a minute in all"
+                "compiling the inner loops, once for this installation: about half a minute in all"
             )
 
     def on_end(self, event: event.Event) -> None:
