@@ -75,7 +75,9 @@ _RATES = tuple(
 _PAIRS = tuple(
     Scene(f"{data}?seed={seed}&sensor=dual32", (30, 60, 90, 120))
     for data, seed in zip(
-        ("street", "street:crossing", "street:highway") * 2, range(61, 67), strict=True
+        ("street", "street:crossing", "street:highway") * 3 + ("street",),
+        (*range(61, 67), 81, 82, 83, 84),
+        strict=True,
     )
 )
 _PRIORS = (

@@ -19,7 +19,7 @@ _MAX_EXPLAINED_M = 0.5
 _NUM_SPACING = 8  # or one within the radius of so many neighbours
 _LINK_M = 0.6
 _NEAR_M = 0.4
-_MIN_SHARE = 0.2  # unexplained, of a group taken as a whole
+_MIN_SHARE = 0.1  # unexplained, of a group taken as a whole
 _MAX_EXTENT_M = 20.0
 _MIN_SEED_SHARE = 0.3
 _MIN_POINTS = 8
@@ -36,8 +36,8 @@ class Unexplained:
 
     def __init__(self, cloud: PairCloud, distance_m: Float, alone: Bool) -> None:
         self.cloud, self.distance_m = cloud, distance_m
-        self.unexplained = np.zeros(len(distance_m), bool)
-        far = np.flatnonzero(distance_m > EXPLAINED_M)
+        self.unexplained = distance_m > EXPLAINED_M
+        far = np.flatnonzero(self.unexplained & (distance_m < _MAX_EXPLAINED_M))
         self.unexplained[far] = distance_m[far] > self.tolerance_m(far)
         self.firmly = self.unexplained & alone
         self.group = self._grouped()

@@ -12,6 +12,7 @@ anew in every step, from whatever else was measured of the object, each point at
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -34,6 +35,7 @@ _REACH_M, _MAX_REACH_M, _WIDER = 0.4, 1.0, 1.5
 _MIN_PLANES = 0.6  # share of points that must have one
 _GATES_M, _LAST_GATES_M = np.array([0.3, 0.3, 0.3, 0.2, 0.2]), np.array([0.15, 0.15, 0.1, 0.1, 0.1])
 _NO_GATES = np.zeros(0)
+_STANDING = np.zeros(4)
 _LIMIT_M = 0.15
 _MAX_THICK_M = 0.09  # thicker ones are sparse or no surfaces: nothing is learnt from them
 _MAX_WEIGHT = 60.0
@@ -46,6 +48,15 @@ _NEAR_M = 0.5  # of where the object may arrive
 _ARRIVED_POINTS = 300
 
 
+class Refined(NamedTuple):
+    """A motion, and how thick it leaves the object's surfaces (m), as a share of how thick they are
+    if it stands besides; None where too few points lie on surfaces."""
+
+    motion: RigidMotion
+    thickness_m: float | None = None
+    of_standing: float | None = None
+
+
 def refined(
     motion: RigidMotion,
     members: Int,
@@ -54,7 +65,7 @@ def refined(
     candidates: Int,
     ground: HeightMap,
     timed: bool,
-) -> RigidMotion:
+) -> Refined:
     """The motion of the source's ``members`` where that makes the object thinner, else as it is.
 
     candidates: rows of the target that may be the object's. timed: lags are known: every scanner's
@@ -62,17 +73,16 @@ def refined(
     cloud's, of the same scanner if that is known.
     """
     if len(members) < _MIN_POINTS:
-        return motion
+        return Refined(motion)
     starts = _starts(motion, slope_of(ground, motion.centre), source, timed)
-    near = _arrivals(
-        [replace(motion, state=s) for s in starts], members, source, target, candidates
-    )
+    places = [replace(motion, state=s) for s in (*starts, _STANDING)]
+    near = _arrivals(places, members, source, target, candidates)
     if len(near) < _MIN_POINTS:
-        return motion
+        return Refined(motion)
     surfaces = _Surfaces.of(motion.centre, members, near, source, target, timed)
     while surfaces.settled(starts[0], _NO_GATES)[2] <= _MIN_PLANES:
         if surfaces.reach_m * _WIDER > _MAX_REACH_M:
-            return motion
+            return Refined(motion)
         surfaces = replace(surfaces, reach_m=surfaces.reach_m * _WIDER)
     best, thick_m = starts[0], np.inf
     for start in starts:
@@ -82,8 +92,10 @@ def refined(
     best, thick_m, _ = surfaces.settled(best, _LAST_GATES_M)
     _, before_m, _ = surfaces.settled(motion.state, _NO_GATES)
     enough_m = before_m if timed else _SURELY * before_m
-    better = thick_m < min(enough_m, _MAX_THICK_M)
-    return replace(motion, state=best) if better else motion
+    _, standing_m, _ = surfaces.settled(_STANDING, _NO_GATES)
+    if thick_m < min(enough_m, _MAX_THICK_M):
+        motion, before_m = replace(motion, state=best), thick_m
+    return Refined(motion, before_m, before_m / max(standing_m, _SIDE_M * 1e-3))
 
 
 def _starts(motion: RigidMotion, slope: Float, source: PairCloud, timed: bool) -> list[Float]:

@@ -1,0 +1,201 @@
+# SPDX-License-Identifier: MIT
+"""What motions of groups explain in two clouds, and whether that proves them.
+
+Nearest points alone cannot tell: a scanner's rings lie elsewhere on an object that has moved, the
+more the nearer it is. So each motion that may be right is refined until the object's surfaces are
+thin (`densify.flow.pairs.refine`) and judged by both: by what it explains, and by how thin the
+surfaces are, compared with those of the same points if they stand.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from densify.flow.pairs.evidence import EXPLAINED_M, MIN_UNEXPLAINED, Unexplained, distances_m
+from densify.flow.pairs.hypotheses import Hypotheses, RigidMotion, thinned, tree_of
+from densify.flow.pairs.refine import Refined
+from densify.types import Bool, Float, Int
+
+_MIN_TOGETHER, _MIN_TOGETHER_PER_M = 10, 3.5  # the farther, the more places fit by chance
+_MIN_MOTION_M = 0.1
+_MAX_RISE_M, _MAX_RISE = 0.12, 0.15  # and per metre
+_SAME_M, _SAME_RAD = 0.25, 0.06
+_LOOK_POINTS, _JUDGE_POINTS = 150, 2000
+_THIN_M, _ALONG = 0.05, 0.3
+_BAR_M, _LEVEL, _ACROSS = 0.12, 0.5, 0.2  # of a rail: its width (rms), its rise, its motion
+_MAX_BAR_M, _MAX_BAR_POINTS = 0.75, 60  # length (rms) of the back of a car, far away
+_AROUND_M = 0.5
+_MAX_LEFT = 0.4  # of what standing still leaves unexplained, in both clouds together
+_MAX_LEFT_EACH, _MAX_LEFT_START = 0.6, 0.75  # before a motion is refined
+_MAX_MISFIT = 0.82  # share left and mean distance in tolerances, together
+_MAX_MISFIT_THIN = 1.2  # where surfaces are so thin,
+_THIN_SURFACES_M, _THIN_OF_STANDING = 0.075, 0.65  # also compared with an object that stands
+_MAX_OF_STANDING = 0.82  # where much is left
+
+
+@dataclass(frozen=True, eq=False)
+class Trial:
+    """What a motion explains of a group, and of the target around where the group arrives.
+
+    group: its number. still: unexplained source points without the motion, left: with it, both of a
+    sample. misfit: mean distance to the target with it, as a share of the tolerance. still_there:
+    unexplained targets without it. firmly, firmly_there: those of all points that no scanner
+    explains. around: targets that are near. explained: those of them that it explains. own_gain_m:
+    by how much all distances from the group to the target become shorter, gain_m: and those from
+    the target around.
+    """
+
+    group: int
+    refined: Refined
+    still: int
+    firmly: int
+    left: int
+    misfit: float
+    still_there: int
+    firmly_there: int
+    around: Int
+    explained: Int
+    own_gain_m: float
+    gain_m: float
+
+    @staticmethod
+    def of(
+        group: int, members: Int, refined: Refined, ours: Unexplained, theirs: Unexplained
+    ) -> Trial:
+        """The motion of the source's ``members`` judged by nearest points."""
+        sample = thinned(members, _LOOK_POINTS)
+        place = ours.cloud.places(refined.motion.seen(ours.cloud.points[sample]), sample)
+        far, tolerance_m = distances_m(place, theirs.cloud.tree), ours.tolerance_m(sample)
+        around, explained, back_m = _looked_back(refined.motion, members, ours, theirs)
+        own_gain_m = float((ours.distance_m[sample] - far).mean() * len(members))
+        return Trial(
+            group=group,
+            refined=refined,
+            still=int(ours.unexplained[sample].sum()),
+            firmly=int(ours.firmly[members].sum()),
+            left=int((far > tolerance_m).sum()),
+            misfit=float((far / tolerance_m).mean()),
+            still_there=int(theirs.unexplained[around].sum()),
+            firmly_there=int(theirs.firmly[around].sum()),
+            around=around,
+            explained=explained,
+            own_gain_m=own_gain_m,
+            gain_m=own_gain_m + back_m,
+        )
+
+    def after(self, found: Refined, settled: Trial) -> Trial:
+        """With the motion that was found from this one, judged by nearest points where they fit
+        better: here, or as ``settled`` has it. A ring drawn onto another fits, but holds back."""
+        here, there = (t._off(len(t.around) - len(t.explained)) for t in (self, settled))
+        return replace(self, refined=found) if here < there else settled
+
+    def left_there(self, free: Bool) -> int:
+        """free: (M,) targets that no other motion explains."""
+        return len(self.around) - int(free[self.explained].sum())
+
+    def may_prove(self) -> bool:
+        """Whether it explains enough if its surfaces come out thin."""
+        far_m = float(np.linalg.norm(self.refined.motion.state[:2]))
+        return (
+            self.firmly >= MIN_UNEXPLAINED[0]
+            and self.firmly_there >= MIN_UNEXPLAINED[1]
+            and self.firmly + self.firmly_there >= _MIN_TOGETHER + _MIN_TOGETHER_PER_M * far_m
+            and self.left <= _MAX_LEFT_START * self.still
+            and self._off(len(self.around) - len(self.explained)) <= _MAX_MISFIT_THIN
+        )
+
+    def proves(self, free: Bool) -> bool:
+        """Whether that is enough: less need be explained where surfaces are thin, nearly all where
+        they are as thin without the motion."""
+        left_there = self.left_there(free)
+        off = self._off(left_there)
+        if (
+            not self.may_prove()
+            or self.left > _MAX_LEFT_EACH * self.still
+            or off > _MAX_MISFIT_THIN
+        ):
+            return False
+        thickness_m, of_standing = self.refined.thickness_m, self.refined.of_standing
+        if thickness_m is not None and of_standing is not None:
+            if of_standing > _MAX_OF_STANDING and 2 * off > _MAX_MISFIT:
+                return False
+            if of_standing <= _THIN_OF_STANDING and thickness_m <= _THIN_SURFACES_M:
+                return True
+        return (
+            left_there <= _MAX_LEFT_EACH * self.still_there
+            and self.left + left_there <= _MAX_LEFT * (self.still + self.still_there)
+            and off <= _MAX_MISFIT
+        )
+
+    def _off(self, left_there: int) -> float:
+        return (self.left + left_there) / (self.still + self.still_there) + self.misfit
+
+
+def promising(
+    hypotheses: Hypotheses, groups: list[Int], ours: Unexplained, theirs: Unexplained
+) -> list[tuple[int, RigidMotion]]:
+    """Groups and motions that pass a first look, in the source alone; of several that are the same
+    the one that leaves least."""
+    num = len(hypotheses.state)
+    row, of_point, state = hypotheses.row, hypotheses.of_point, hypotheses.state
+    place = ours.cloud.places(hypotheses.seen(hypotheses.share[of_point]), row)
+    far = distances_m(place, theirs.cloud.tree, workers=-1)
+    sampled, back = np.unique(row, return_inverse=True)
+    tolerance_m = ours.tolerance_m(sampled)[back.ravel()]
+    still = np.bincount(of_point, ours.unexplained[row], num)
+    left = np.bincount(of_point, far > tolerance_m, num)
+    misfit = np.bincount(of_point, far / tolerance_m, num)
+    length_m = np.linalg.norm(state[:, :2], axis=1)
+    level = np.abs(state[:, 2]) <= _MAX_RISE_M + _MAX_RISE * length_m
+    passed = level & (length_m >= _MIN_MOTION_M) & (left <= _MAX_LEFT_START * still)
+    found: dict[int, list[Float]] = {}
+    chosen = []
+    for h in np.flatnonzero(passed)[np.argsort(misfit[passed], kind="stable")]:
+        k = int(hypotheses.group[h])
+        off = [np.abs(other - state[h]) for other in found.get(k, [])]
+        if any(o[:2].max() < _SAME_M and o[3] < _SAME_RAD for o in off):
+            continue
+        if _ambiguous(ours.cloud.points[row[of_point == h]], state[h, :3]):
+            continue
+        found.setdefault(k, []).append(state[h])
+        share = float(hypotheses.share[h])
+        chosen.append((k, RigidMotion(state[h], hypotheses.centre[h], share)))
+    return chosen
+
+
+def _ambiguous(points: Float, way: Float) -> bool:
+    """Whether a flat group moves along itself, or it is but a line: so does the strip of a wall
+    that shows through a gap when the scanner moves, and its edge is any other's like. So does a
+    piece of a rail, that can be any other piece, also of the rail beside: a level bar is proven to
+    move only if it may be the back of a car, so far away that few rings meet it, and across itself.
+    """
+    _, scale, axes = np.linalg.svd(points - points.mean(0), full_matrices=False)
+    length_m, width_m, thickness_m = scale / np.sqrt(len(points))
+    far_m = np.linalg.norm(way)
+    if width_m < _BAR_M and abs(axes[0, 2]) < _LEVEL:
+        far_car = len(points) < _MAX_BAR_POINTS and length_m < _MAX_BAR_M
+        return bool(not far_car or abs(axes[0] @ way) > _ACROSS * far_m)
+    along = abs(axes[-1] @ way) < _ALONG * far_m
+    return bool(thickness_m < _THIN_M and (along or width_m < _THIN_M))
+
+
+def _looked_back(
+    motion: RigidMotion, members: Int, ours: Unexplained, theirs: Unexplained
+) -> tuple[Int, Int, float]:
+    """From the target to the group where it arrives: `_Trial`'s around, explained, and by how much
+    the distances become shorter (m)."""
+    sample = thinned(members, _JUDGE_POINTS)
+    arrived = motion.seen(ours.cloud.points[sample])
+    low, high = arrived.min(0) - _AROUND_M, arrived.max(0) + _AROUND_M
+    at = theirs.cloud.points
+    box = thinned(np.flatnonzero(((at > low) & (at < high)).all(1)), 2 * _JUDGE_POINTS)
+    tree = tree_of(ours.cloud.places(arrived, sample))
+    far = distances_m(theirs.cloud.places(at[box], box), tree)
+    around, far = box[far < _AROUND_M], far[far < _AROUND_M]
+    explained = far <= EXPLAINED_M
+    unsure = np.flatnonzero(~explained)
+    thinning = np.sqrt(len(members) / len(sample))
+    explained[unsure] = far[unsure] <= theirs.tolerance_m(around[unsure]) * thinning
+    return around, around[explained], float((theirs.distance_m[around] - far).sum())
