@@ -161,6 +161,20 @@ def test_a_flat_back_that_is_followed_for_long_does_not_slide_aside():
     assert np.abs(np.concatenate(aside)).max() < 0.25
 
 
+@pytest.mark.parametrize(("behind_m", "yaw_rad", "ego_m_s"), [(12, 0.0, 12), (14, 0.15, 10)])
+def test_a_flat_front_that_turns_does_not_slide_aside(behind_m, yaw_rad, ego_m_s):
+    """It goes where its heading does, and the front alone hardly tells where that is."""
+    middle, turn_rad_s = 8, 0.4
+    ego = Arc(0, -1.5, 0, ego_m_s)
+    turning = Arc(0, 0, yaw_rad - turn_rad_s * middle * SWEEP_S, 12, turn_rad_s)
+    x, y, _ = np.array(ego.at(middle * SWEEP_S)) - turning.at(middle * SWEEP_S)
+    box = Box((4.4, 1.8, 1.5), replace(turning, x=x - behind_m, y=y), 0.25, 1)
+    scene = Scene(World((*street(60.0), box)), ego, FLAT_BACK)
+    found = Found.around(middle, scene, 6)
+    assert found.share_moving(1, reach=6) > 0.9
+    assert np.quantile(found.errors_m(1, reach=6), 0.9) < 0.1
+
+
 def test_cars_in_a_row_keep_their_own_motion():
     found = Found.of([car(8, 2.0, 11, 1), car(23, 2.0, 8, 2)], Arc(0, -1.5, 0, 8.0))
     assert found.track_of(1) != found.track_of(2)

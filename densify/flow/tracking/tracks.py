@@ -187,19 +187,32 @@ def _at_once(c: Standing, rows: np.ndarray, rate: Float, time_s: float) -> Float
 
 
 def _predict(track: Track, rate: Float, num: int, time_s: float) -> tuple[Float, Float, Float]:
-    """State, its rate, and how far off (3,) the state may be in x y and yaw, by the constant
-    velocity of the ``num`` states nearest in time. rate: given at the start."""
+    """State, its rate, and how far off (3,) the state may be in x y and yaw, by the constant speed
+    and turn rate of the ``num`` states nearest in time. rate: given at the start.
+
+    The velocity turns as the object does (Schubert, Richter, Wanielik, "Comparison and Evaluation
+    of Advanced Motion Models for Vehicle Tracking", FUSION 2008): a flat front slides along itself
+    as it is foretold to.
+    """
     nearest_first = sorted(track.sightings.items(), key=lambda s: (abs(s[1].seen_s - time_s), s[0]))
     known = dict(nearest_first[:num])
     states = np.stack([sighting.state for sighting in known.values()])
     t = np.array([sighting.seen_s for sighting in known.values()])
-    ahead_s = time_s - t[0]
+    ahead_s, middle_s = time_s - t[0], t.mean()
     if len(t) > 1:
-        t -= t.mean()
+        t -= middle_s
         given_s2 = _GIVEN_S2 * (next(iter(track.sightings)) in known)
         rate = (t @ states + given_s2 * rate) / (t @ t + given_s2) * _STEADY
     std = _PREDICTION_STD * max(1.0, abs(ahead_s) / _PREDICTION_S)
-    return states[0] + rate * ahead_s, rate, std
+    on_the_way = _turned(rate, time_s - 0.5 * ahead_s - middle_s)
+    return states[0] + on_the_way * ahead_s, _turned(rate, time_s - middle_s), std
+
+
+def _turned(rate: Float, later_s: float) -> Float:
+    """The rate (4,) of a state so much later, of what keeps its speed and turn rate."""
+    cos, sin = np.cos(rate[3] * later_s), np.sin(rate[3] * later_s)
+    x, y = rate[:2]
+    return np.array([cos * x - sin * y, sin * x + cos * y, *rate[2:]])
 
 
 def _find(
