@@ -10,6 +10,7 @@ import numpy as np
 from densify.flow.tracking.evidence import FreeSpace, Standing
 from densify.flow.tracking.radial import Radial
 from densify.flow.tracking.sightings import Track
+from densify.geometry import poses
 
 _ROUGH_M, _ROUGH_PER_GAP, _ROUGH_S = 0.04, 0.2, 0.003  # by gap of rings, by speed
 _LEAST_WAY_M, _LEAST_WAY_PER_RESIDUAL, _LEAST_WAY_PER_ROUGH = 0.35, 8.0, 1.5
@@ -18,6 +19,7 @@ _LEAST_STATES, _LEAST_S = 3, 0.15
 _MAX_CONTRADICTIONS = 0.3  # of those that standing still leaves,
 # which are so many, or of few looks this share, and of many at least that one.
 _LEAST_CONTRADICTIONS, _SHARE_OF_FEW, _LEAST_SHARE = 20, 0.08, 0.01
+_AS_FAST, _RAIL_M, _SLENDER, _SHARE_OF_RAIL = 0.1, 2.0, 8.0, 0.3
 
 
 def left_contradicted(track: Track, standing: Sequence[Standing], space: FreeSpace) -> float | None:
@@ -49,7 +51,47 @@ def left_contradicted(track: Track, standing: Sequence[Standing], space: FreeSpa
     least = min(_LEAST_CONTRADICTIONS, _SHARE_OF_FEW * num_asked)
     if still < max(least, _LEAST_SHARE * num_asked) or moved > _MAX_CONTRADICTIONS * still:
         return None
+    if still < _SHARE_OF_RAIL * num_asked and _may_be_a_rail(track, standing, space):
+        return None
     return moved / num_asked
+
+
+def _goes_along(track: Track, space: FreeSpace) -> bool:
+    """Whether the object moves about as the scanner does."""
+    nearest = [
+        int(np.abs(space.clock.time_s - at_s).argmin())
+        for at_s in (track.path.begin_s, track.path.end_s)
+    ]
+    here, there = (poses.inverse(space.T_lidar_world[j])[:2, 3] for j in nearest)
+    seconds = max(float(np.ptp(space.clock.time_s[nearest])), 1e-6)
+    own_m_s = (there - here) / seconds
+    path = track.path
+    its_m_s = (path(path.end_s) - path(path.begin_s))[:2] / (path.end_s - path.begin_s)
+    apart_m_s = float(np.linalg.norm(its_m_s - own_m_s))
+    return apart_m_s < _AS_FAST * float(np.linalg.norm(own_m_s))
+
+
+def _may_be_a_rail(track: Track, standing: Sequence[Standing], space: FreeSpace) -> bool:
+    """Whether the object is much longer than high, and than wide or moving about as the scanner
+    does. Nothing of a guard rail tells its motion along itself; where it lies between two rings,
+    sweeps see through it; and rings go with the scanner, so that it seems to go with it too."""
+    parts = [
+        track.undo(standing[i].points[rows], standing[i].time_s[rows])
+        for i, rows in track.claimed.items()
+    ]
+    body = np.concatenate(parts)
+    body -= body.mean(axis=0)
+    _, axes = np.linalg.eigh(body[:, :2].T @ body[:, :2])
+    across_m, along_m = (body[:, :2] @ axes).T
+    slope = along_m @ body[:, 2] / max(float(along_m @ along_m), 1e-6)
+    high_m, wide_m = (
+        float(np.subtract(*np.percentile(spread, [90, 10])))
+        for spread in (body[:, 2] - slope * along_m, across_m)
+    )
+    long_m = float(np.ptp(along_m))
+    if long_m < _RAIL_M or long_m <= _SLENDER * high_m:
+        return False
+    return long_m > _SLENDER * wide_m or _goes_along(track, space)
 
 
 def _as_fast_as_measured(track: Track, standing: Sequence[Standing]) -> bool:
