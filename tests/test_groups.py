@@ -190,6 +190,16 @@ def test_a_flat_front_that_turns_does_not_slide_aside(behind_m, yaw_rad, ego_m_s
     assert np.quantile(found.errors_m(1, reach=6), 0.9) < 0.1
 
 
+def test_a_long_side_that_passes_does_not_slide_along_itself():
+    """Where most is seen of it nothing tells how fast it is: from farther away its front does."""
+    middle = 7
+    truck = car(24 * middle * SWEEP_S, 3, 24, 1, yaw=np.pi, size_m=(16.0, 2.5, 2.8))
+    scanner = Scanner(32, 540, (-24.8, 2.0), 0.01)
+    found = Found.around(middle, Scene(World((*street(), truck)), Arc(0, -1.5), scanner), 6)
+    assert found.share_moving(1, reach=6) > 0.95
+    assert np.quantile(found.errors_m(1, reach=6), 0.9) < 0.3
+
+
 def test_cars_in_a_row_keep_their_own_motion():
     found = Found.of([car(8, 2.0, 11, 1), car(23, 2.0, 8, 2)], Arc(0, -1.5, 0, 8.0))
     assert found.track_of(1) != found.track_of(2)

@@ -13,7 +13,7 @@ from densify.flow.tracking import proof
 from densify.flow.tracking.clock import Clock
 from densify.flow.tracking.evidence import Standing
 from densify.flow.tracking.sightings import Sighting, Track
-from densify.flow.tracking.tracks import _groups_to_start
+from densify.flow.tracking.starts import groups_to_start
 from densify.geometry.height_map import HeightMap
 
 PERIOD_NS = 100_000_000
@@ -31,7 +31,7 @@ def standing(sizes: list[int], seed_share: float = 1.0) -> Standing:
 
 def starts(sweeps: list[Standing]) -> list[tuple[int, int]]:
     """(sweep, size) in the order they are tried."""
-    found = _groups_to_start(sweeps, Clock(PERIOD_NS * np.arange(len(sweeps))))
+    found = groups_to_start(sweeps, Clock(PERIOD_NS * np.arange(len(sweeps))))
     for i, members in found:
         assert len(set(sweeps[i].cluster[members])) == 1 and sweeps[i].candidate[members].all()
     return [(i, len(members)) for i, members in found]

@@ -99,6 +99,10 @@ class Track:
         """How many points look n shows of it."""
         return sum(len(self.claimed[j]) for j in self.sightings[n].sweeps)
 
+    def total_points(self) -> int:
+        """How many points it has in all sweeps."""
+        return sum(map(len, self.claimed.values()))
+
     def rise_m(self, ground: HeightMap, state: Float) -> float:
         """How much higher the ground is in that state under the object and on both sides of it, in
         the median: nobody may ever have seen the road that it covers."""

@@ -8,7 +8,7 @@ model, is smoothed in time, and counts only if that smooth motion explains what 
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import chain
 
@@ -23,15 +23,17 @@ from densify.flow.tracking.looks import Look, looks_of
 from densify.flow.tracking.proof import left_contradicted
 from densify.flow.tracking.shapes import Shape
 from densify.flow.tracking.sightings import Track
+from densify.flow.tracking.starts import (
+    MIN_POINTS,
+    ends,
+    groups_to_start,
+    is_line_on,
+    velocities_beside,
+)
 from densify.flow.tracking.vote import DistanceField, vote
 from densify.geometry.height_map import HeightMap
-from densify.kernels.nearest import BoxTree
 from densify.types import Bool, Float
 
-_MIN_POINTS = 8
-_MIN_SEED_SHARE = 0.4
-_AROUND_S = 0.5  # before and after a start is as good as any time
-_NEARER_END, _NEARER_END_S = 0.7, 0.1  # each time a start is so much nearer it is worth less
 _FIT_M = 0.3
 _RINGS_M = 5.0
 _NEAR_S = 0.3
@@ -44,9 +46,9 @@ _RECENT_S = 0.4  # the states in so long tell a rate
 _GIVEN_S2 = np.array([0.02, 0.02, 0.02, 0.0])
 _STEADY = np.array([1.0, 1.0, 1.0, 0.9])  # of what it was then: turns level out
 _MISSES_ALLOWED, _MISSED_S = 1, 0.2  # either: a track ends when both are exceeded
-_LEAST_WIDTH_M = 0.1
 _CLEARLY = 0.5  # of the looks that contradict the motion found before
-_BESIDE_M = 1.0  # as far as what is towed is from what tows it
+_DOUBTFUL = 0.0025  # of the looks contradict it: it is followed again from its ends
+_AS_WHOLE = 0.9  # of the points it had
 
 
 def follow_groups(
@@ -63,31 +65,42 @@ def follow_groups(
     fields = []
     if velocities_m_s is None:
         fields = [DistanceField.of(c.points[c.candidate]) for c in seen]
-    free = [np.ones(len(c.points), bool) for c in standing]  # not yet part of a track
-    untried = [np.ones(len(c.points), bool) for c in standing]
-    tracks: list[Track] = []
-    bodies: list[tuple[Track, Float]] = []
-    for n, group in _groups_to_start(seen, clock):
-        members = group[looks[n].gather(free)[group] & looks[n].gather(untried)[group]]
-        if len(members) < _MIN_POINTS or _is_line_on(bodies, looks[n], members):
-            continue
+
+    def velocity_of(members: np.ndarray, n: int) -> Float:
         if velocities_m_s is None:
             velocity = vote(seen[n].points[members], n, fields, clock)
         else:
             velocity = np.median(looks[n].gather(velocities_m_s)[members], axis=0)
         radial = seen[n].radial
-        if radial is not None:
-            velocity = radial.rows(members).corrected(velocity)
+        return velocity if radial is None else radial.rows(members).corrected(velocity)
+
+    def follow(members: np.ndarray, n: int, velocity: Float) -> tuple[Track, float | None]:
+        track = _follow(members, n, velocity, looks, free, ground, clock)
+        return track, left_contradicted(track, standing, space)
+
+    free = [np.ones(len(c.points), bool) for c in standing]  # not yet part of a track
+    untried = [np.ones(len(c.points), bool) for c in standing]
+    tracks: list[Track] = []
+    bodies: list[tuple[Track, Float]] = []
+    for n, group in groups_to_start(seen, clock):
+        members = group[looks[n].gather(free)[group] & looks[n].gather(untried)[group]]
+        if len(members) < MIN_POINTS or is_line_on(bodies, looks[n], members):
+            continue
         left, proven = np.inf, False
-        for start in chain([velocity], _velocities_beside(looks[n], members, bodies)):
-            tried = _follow(members, n, start, looks, free, ground, clock)
-            contradicted = left_contradicted(tried, standing, space)
+        beside = velocities_beside(looks[n], members, bodies)
+        for start in chain([velocity_of(members, n)], beside):
+            tried, contradicted = follow(members, n, start)
             if contradicted is not None and contradicted < _CLEARLY * left:
                 track, left, proven = tried, contradicted, True
             elif not proven:
                 track = tried
             if left == 0:
                 break
+        for rows, k in ends(track, looks) if proven and left > _DOUBTFUL else ():
+            tried, contradicted = follow(rows, k, velocity_of(rows, k))
+            whole = tried.total_points() >= _AS_WHOLE * track.total_points()
+            if whole and contradicted is not None and contradicted < _CLEARLY * left:
+                track, left = tried, contradicted
         if proven:
             _gather(track, standing, free, space)
             _refine(track, standing, ground)
@@ -100,52 +113,6 @@ def follow_groups(
             tracks.append(track)
             bodies.append((track, track.seen_in(standing, sorted(track.claimed))))
     return tracks
-
-
-def _groups_to_start(standing: Sequence[Standing], clock: Clock) -> list[tuple[int, np.ndarray]]:
-    """Look and members of the clusters that are mostly seeds, the best start first: what is seen
-    well makes a good model, and far from the ends of the stretch both sides tell how it moves."""
-    groups = []
-
-    def worth(start: tuple[int, np.ndarray]) -> float:
-        i, members = start
-        nearer_s = max(0.0, _AROUND_S - clock.from_end_s(i))
-        return float(len(members) * _NEARER_END ** (nearer_s / _NEARER_END_S))
-
-    for i, c in enumerate(standing):
-        size = np.bincount(c.cluster[c.candidate], minlength=c.num_clusters)
-        seeds = np.bincount(c.cluster[c.candidate & c.seed], minlength=c.num_clusters)
-        good = np.flatnonzero((size >= _MIN_POINTS) & (seeds >= _MIN_SEED_SHARE * size))
-        groups += [(i, np.flatnonzero(c.cluster == k)) for k in good]
-    return sorted(groups, key=worth, reverse=True)
-
-
-def _is_line_on(bodies: Sequence[tuple[Track, Float]], look: Look, members: np.ndarray) -> bool:
-    """Whether a group is an upright line close to a proven track: rays one above the other that
-    meet a part of it. Followed by itself it would stay where the rays are."""
-    line = look.seen.points[members]
-    if np.linalg.norm(np.ptp(line[:, :2], axis=0)) >= _LEAST_WIDTH_M:
-        return False
-    tree = BoxTree(line)
-    there = (track.place(points, track.seen_at(look.time_ns)) for track, points in bodies)
-    return any(np.isfinite(tree.nearest(points, _BESIDE_M)[0]).any() for points in there)
-
-
-def _velocities_beside(
-    look: Look, members: np.ndarray, bodies: Sequence[tuple[Track, Float]]
-) -> Iterator[Float]:
-    """The velocities (3,) that proven tracks close to a group have there, where the group cannot be
-    a part of them: of what tows it, say. Little else tells how fast a long side slides.
-
-    bodies: the tracks with all their points.
-    """
-    c = look.seen
-    tree, middle = BoxTree(c.points[members]), c.points[members].mean(0, keepdims=True)
-    for track, points in bodies:
-        at_s = track.seen_at(look.time_ns)
-        if not np.isfinite(tree.nearest(track.place(points, at_s), _BESIDE_M)[0]).any():
-            continue
-        yield track.velocity_m_s(middle, at_s)[0]
 
 
 def _follow(
