@@ -85,3 +85,19 @@ def test_a_short_way_far_from_the_scanner_proves_nothing():
             space = SimpleNamespace(gap_m=lambda *_, gap_m=gap_m: gap_m)
             left = proof.left_contradicted(track, [], space)
             assert (left is not None) == proven
+
+
+@pytest.mark.parametrize(("num_seen", "proven"), [(3, False), (8, True)])
+def test_what_is_seen_for_long_may_be_contradicted_more(num_seen, proven):
+    sighted = {
+        n: Sighting(np.array([0.9 * n, 0, 0, 0]), 0.1 * n, n * 100_000_000, (n,))
+        for n in range(num_seen)
+    }
+    track = Track(np.array([14.0, 0, 0]), sighted, {n: np.arange(8) for n in range(num_seen)})
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(proof, "_as_fast_as_measured", lambda *_: True)
+        space = SimpleNamespace(gap_m=lambda *_: 0.1)
+        for moved in (2, 20):
+            patch.setattr(proof, "_contradictions", lambda *_, moved=moved: (100, moved, 300))
+            left = proof.left_contradicted(track, [], space)
+            assert (left is not None) == (proven or moved == 2)

@@ -16,6 +16,7 @@ _ROUGH_M, _ROUGH_PER_GAP, _ROUGH_S = 0.04, 0.2, 0.003  # by gap of rings, by spe
 _LEAST_WAY_M, _LEAST_WAY_PER_RESIDUAL, _LEAST_WAY_PER_ROUGH = 0.35, 8.0, 1.5
 _NUM_ASKED = 60
 _LEAST_STATES, _LEAST_S = 3, 0.15
+_SHORT_S, _MAX_OF_SHORT = 0.35, 0.03  # three places of a tree's crown may lie on a line
 _MAX_CONTRADICTIONS = 0.3  # of those that standing still leaves,
 # which are so many, or of few looks this share, and of many at least that one.
 _LEAST_CONTRADICTIONS, _SHARE_OF_FEW, _LEAST_SHARE = 20, 0.08, 0.01
@@ -49,7 +50,8 @@ def left_contradicted(track: Track, standing: Sequence[Standing], space: FreeSpa
         return None
     still, moved, num_asked = _contradictions(track, standing, space)
     least = min(_LEAST_CONTRADICTIONS, _SHARE_OF_FEW * num_asked)
-    if still < max(least, _LEAST_SHARE * num_asked) or moved > _MAX_CONTRADICTIONS * still:
+    most = _MAX_OF_SHORT if seen_s < _SHORT_S else _MAX_CONTRADICTIONS
+    if still < max(least, _LEAST_SHARE * num_asked) or moved > most * still:
         return None
     if still < _SHARE_OF_RAIL * num_asked and _may_be_a_rail(track, standing, space):
         return None
