@@ -87,8 +87,10 @@ def test_a_short_way_far_from_the_scanner_proves_nothing():
             assert (left is not None) == proven
 
 
-@pytest.mark.parametrize(("num_seen", "proven"), [(3, False), (8, True)])
-def test_what_is_seen_for_long_may_be_contradicted_more(num_seen, proven):
+@pytest.mark.parametrize(
+    ("num_seen", "num_sweeps", "proven"), [(3, 11, False), (8, 11, True), (3, 3, True)]
+)
+def test_what_is_seen_for_long_may_be_contradicted_more(num_seen, num_sweeps, proven):
     sighted = {
         n: Sighting(np.array([0.9 * n, 0, 0, 0]), 0.1 * n, n * 100_000_000, (n,))
         for n in range(num_seen)
@@ -96,7 +98,8 @@ def test_what_is_seen_for_long_may_be_contradicted_more(num_seen, proven):
     track = Track(np.array([14.0, 0, 0]), sighted, {n: np.arange(8) for n in range(num_seen)})
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(proof, "_as_fast_as_measured", lambda *_: True)
-        space = SimpleNamespace(gap_m=lambda *_: 0.1)
+        clock = SimpleNamespace(time_s=0.1 * np.arange(num_sweeps))
+        space = SimpleNamespace(gap_m=lambda *_: 0.1, clock=clock)
         for moved in (2, 20):
             patch.setattr(proof, "_contradictions", lambda *_, moved=moved: (100, moved, 300))
             left = proof.left_contradicted(track, [], space)

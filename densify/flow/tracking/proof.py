@@ -50,8 +50,9 @@ def left_contradicted(track: Track, standing: Sequence[Standing], space: FreeSpa
         return None
     still, moved, num_asked = _contradictions(track, standing, space)
     least = min(_LEAST_CONTRADICTIONS, _SHARE_OF_FEW * num_asked)
-    most = _MAX_OF_SHORT if seen_s < _SHORT_S else _MAX_CONTRADICTIONS
-    if still < max(least, _LEAST_SHARE * num_asked) or moved > most * still:
+    if still < max(least, _LEAST_SHARE * num_asked) or moved > _MAX_CONTRADICTIONS * still:
+        return None
+    if moved > _MAX_OF_SHORT * still and seen_s < min(_SHORT_S, np.ptp(space.clock.time_s) / 2):
         return None
     if still < _SHARE_OF_RAIL * num_asked and _may_be_a_rail(track, standing, space):
         return None
