@@ -21,10 +21,9 @@ def test_progress_names_every_stage():
     seen: list[tuple[str, int, int]] = []
     run(one_car(()), KEY, 1, "icp", config=POSES_GIVEN, progress=lambda *step: seen.append(step))
     names = list(dict.fromkeys(name for name, _, _ in seen))
-    assert names == [
-        *("read", "register", "images", "deskew", "accumulate"),
-        *("held out", "project", "colour", "score"),
-    ]
+    assert names[:5] == ["read", "register", "images", "deskew", "accumulate"]
+    # These are worked out side by side.
+    assert sorted(names[5:]) == ["colour", "held out", "project", "score"]
     assert all(0 <= done <= total for _, done, total in seen)
     for name in names:
         steps = [(done, total) for n, done, total in seen if n == name]
