@@ -9,8 +9,8 @@ import pytest
 from densify.config import GroundSettings
 from densify.flow.pairs.estimate import estimate_flow
 from densify.flow.pairs.hypotheses import PairCloud, RigidMotion
-from densify.flow.pairs.refine import refined
-from densify.flow.pairs.trials import _ambiguous
+from densify.flow.pairs.refine import Refined, refined
+from densify.flow.pairs.trials import Trial, _ambiguous
 from densify.geometry import poses
 from densify.geometry.height_map import HeightMap
 from tests.scenes import Arc, Scanner, Scene, World, car, street
@@ -102,3 +102,14 @@ def test_rings_that_lie_elsewhere_on_a_near_car_are_no_misfit(timed):
     error_m = np.linalg.norm(field.displacement - scene.displacement(2, 3), axis=1)
     assert mine.sum() > 300 and field.moving[mine].mean() > 0.9
     assert error_m[mine & field.moving].mean() < 0.03
+
+
+def test_a_motion_to_where_nothing_is_unexplained_proves_nothing():
+    """Of many points a sample may hold none of those that are unexplained."""
+    motion, nowhere = RigidMotion(np.zeros(4), np.zeros(3), 1.0), np.arange(0)
+    start, settled = (
+        Trial(0, Refined(motion), 0, 20, 0, 0.5, still_there, 20, around, nowhere, 1.0, 2.0)
+        for still_there, around in ((3, np.arange(3)), (0, np.arange(5)))
+    )
+    assert start.after(Refined(motion), settled).still_there == 3
+    assert not settled.proves(np.ones(5, bool))

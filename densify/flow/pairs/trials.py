@@ -130,7 +130,8 @@ class Trial:
         )
 
     def _off(self, left_there: int) -> float:
-        return (self.left + left_there) / (self.still + self.still_there) + self.misfit
+        # A sample of many points may hold none that are unexplained.
+        return (self.left + left_there) / max(self.still + self.still_there, 1) + self.misfit
 
 
 def promising(
@@ -184,7 +185,7 @@ def _ambiguous(points: Float, way: Float) -> bool:
 def _looked_back(
     motion: RigidMotion, members: Int, ours: Unexplained, theirs: Unexplained
 ) -> tuple[Int, Int, float]:
-    """From the target to the group where it arrives: `_Trial`'s around, explained, and by how much
+    """From the target to the group where it arrives: `Trial`'s around, explained, and by how much
     the distances become shorter (m)."""
     sample = thinned(members, _JUDGE_POINTS)
     arrived = motion.seen(ours.cloud.points[sample])

@@ -20,6 +20,7 @@ _AROUND_S = 0.5  # before and after a start is as good as any time
 _NEARER_END, _NEARER_END_S = 0.7, 0.1  # each time a start is so much nearer it is worth less
 _LEAST_WIDTH_M = 0.1
 _SLIDES_M = 1.5  # what is seen to be so long may slide along itself
+_HOLE_S = 0.25  # over longer ones, what starts at one end may miss the other
 _BESIDE_M = 1.0  # as far as what is towed is from what tows it
 
 
@@ -71,10 +72,12 @@ def velocities_beside(
 
 def ends(track: Track, looks: Sequence[Look]) -> Iterator[tuple[np.ndarray, int]]:
     """What the first and the last look saw of a track, but where it was started: rows and look.
-    From there more may be seen than a side that slides along itself; nothing short can."""
+    From there more may be seen than a side that slides along itself; nothing short can. None of
+    what was seen with a hole in time."""
     start, *_ = track.sightings
     side = looks[start].seen.points[_rows_in(track, looks[start])]
-    if np.linalg.norm(np.ptp(side[:, :2], axis=0)) < _SLIDES_M:
+    seen_s = np.sort([sighting.seen_s for sighting in track.sightings.values()])
+    if np.linalg.norm(np.ptp(side[:, :2], axis=0)) < _SLIDES_M or np.diff(seen_s).max() > _HOLE_S:
         return
     for n in sorted({min(track.sightings), max(track.sightings)} - {start}):
         if track.num_points(n) >= MIN_POINTS:

@@ -48,7 +48,6 @@ _STEADY = np.array([1.0, 1.0, 1.0, 0.9])  # of what it was then: turns level out
 _MISSES_ALLOWED, _MISSED_S = 1, 0.2  # either: a track ends when both are exceeded
 _CLEARLY = 0.5  # of the looks that contradict the motion found before
 _DOUBTFUL = 0.0025  # of the looks contradict it: it is followed again from its ends
-_HOLE_S = 0.25  # over longer ones, what starts at one end may miss the other
 _AS_WHOLE = 0.9  # of the points it had
 
 
@@ -97,8 +96,7 @@ def follow_groups(
                 track = tried
             if left == 0:
                 break
-        doubtful = proven and left > _DOUBTFUL and _seen_steadily(track)
-        for rows, k in ends(track, looks) if doubtful else ():
+        for rows, k in ends(track, looks) if proven and left > _DOUBTFUL else ():
             tried, contradicted = follow(rows, k, velocity_of(rows, k))
             whole = tried.total_points() >= _AS_WHOLE * track.total_points()
             if whole and contradicted is not None and contradicted < _CLEARLY * left:
@@ -223,12 +221,6 @@ def _find(
     if fit.sum() < enough:
         return None
     return state, seen_s, rows[fit], target[fit]
-
-
-def _seen_steadily(track: Track) -> bool:
-    """Whether it was seen without a hole in time."""
-    seen_s = np.sort([sighting.seen_s for sighting in track.sightings.values()])
-    return bool(np.diff(seen_s).max(initial=0.0) < _HOLE_S)
 
 
 def _gather(
