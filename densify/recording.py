@@ -33,6 +33,7 @@ from typing import Any, NamedTuple, TypeVar, cast
 
 from densify.blocks import Cut
 from densify.cache import Cache, kept
+from densify.clock import num_in_look
 from densify.config import Config
 from densify.costs import Watch
 from densify.depth.accumulate import accumulate
@@ -40,7 +41,6 @@ from densify.depth.object_tracks import object_tracks
 from densify.errors import InputError, SweepError
 from densify.flow.engines import SharedMotion, estimate_motion, motion_type
 from densify.flow.scene import Scene
-from densify.flow.tracking.clock import num_in_look
 from densify.flow.tracking.evidence import REACH_S, Candidates, FreeSpace, find_candidates
 from densify.geometry import poses
 from densify.geometry.ground import ground

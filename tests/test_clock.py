@@ -6,8 +6,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from densify.clock import Clock
 from densify.config import GroundSettings
-from densify.flow.tracking.clock import Clock
 from densify.flow.tracking.evidence import REACH_S
 from densify.geometry.ground import ground
 from densify.types import Stretch

@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from densify.clock import Clock
 from densify.config import GroundSettings
-from densify.flow.tracking.clock import Clock
 from densify.flow.tracking.evidence import FreeSpace, Standing
 from densify.flow.tracking.looks import looks_of
 from densify.geometry.ground import ground

@@ -190,7 +190,7 @@ FLOORS = (
     ("arrays", "errors", "version", "knobs", "plugins"),
     ("files",),
     ("cache", "types"),
-    ("config", "costs", "kernels"),
+    ("clock", "config", "costs", "kernels"),
     ("geometry",),
     ("registration", "depth", "flow", "scores", "street"),
     ("readers",),

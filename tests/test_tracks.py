@@ -8,9 +8,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from densify.clock import Clock
 from densify.config import GroundSettings
 from densify.flow.tracking import proof
-from densify.flow.tracking.clock import Clock
 from densify.flow.tracking.evidence import Standing
 from densify.flow.tracking.sightings import Sighting, Track
 from densify.flow.tracking.starts import groups_to_start

@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from densify.clock import Clock
 from densify.config import RegisterSettings
 from densify.geometry import poses
 from densify.registration.deskew import deskew
@@ -21,10 +22,6 @@ from densify.registration.odometry import (
 )
 from densify.registration.upright import upright
 from densify.types import Float, Int, Sweep, Trajectory
-
-_STEP_S = 0.1
-"""Sweeps closer in time: the rings on the ground, that go with the scanner, hide its motion, and
-few points of each tell little of it."""
 
 
 class LeftOut(NamedTuple):
@@ -72,7 +69,7 @@ def _rough(sweeps: Sequence[Sweep], settings: RegisterSettings) -> Trajectory:
     """The first pass, of raw sweeps: those taken together are not laid on each other, as if they
     were one raw sweep that takes longer."""
     stamp_ns = _stamps_ns(sweeps)
-    together = _together(stamp_ns)
+    together = [list(rows) for rows in Clock(stamp_ns).looks()]
     if len(together) in (1, len(sweeps)):
         return register(sweeps, settings)
     groups = [[sweeps[i] for i in rows] for rows in together]
@@ -83,7 +80,7 @@ def _rough(sweeps: Sequence[Sweep], settings: RegisterSettings) -> Trajectory:
 def _fine(sweeps: Sequence[Sweep], rough: Trajectory, settings: RegisterSettings) -> Trajectory:
     """The second pass, of deskewed sweeps: those taken together are laid on each other."""
     stamp_ns = _stamps_ns(sweeps)
-    together = _together(stamp_ns)
+    together = [list(rows) for rows in Clock(stamp_ns).looks()]
     if len(together) in (1, len(sweeps)):
         return register(sweeps, settings, rough)
     frames = tuple(sweeps[rows[0]].frame for rows in together)
@@ -96,19 +93,6 @@ def _fine(sweeps: Sequence[Sweep], rough: Trajectory, settings: RegisterSettings
         ]
         joined.append(_joined([sweeps[i] for i in rows], np.concatenate(points)))
     return _between(register(joined, settings, start), rough.frames, stamp_ns)
-
-
-def _together(stamp_ns: Int) -> list[list[int]]:
-    """The rows of sweeps that follow each other within less than 0.1 s, to the nearest sweep."""
-    usual_ns = float(np.median(np.diff(stamp_ns))) if len(stamp_ns) > 1 else _STEP_S * 1e9
-    together: list[list[int]] = []
-    for i, time_ns in enumerate(stamp_ns.tolist()):
-        since_ns = time_ns - stamp_ns[together[-1][0]] if together else np.inf
-        if since_ns + 0.5 * usual_ns < _STEP_S * 1e9:
-            together[-1].append(i)
-        else:
-            together.append([i])
-    return together
 
 
 def _joined(sweeps: Sequence[Sweep], points: Float) -> Sweep:

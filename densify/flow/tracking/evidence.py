@@ -10,7 +10,7 @@ from functools import cached_property, partial
 
 import numpy as np
 
-from densify.flow.tracking.clock import Clock, num_in_look
+from densify.clock import Clock, num_in_look
 from densify.flow.tracking.radial import Radial
 from densify.geometry import poses
 from densify.geometry.height_map import HeightMap

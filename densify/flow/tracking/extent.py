@@ -10,7 +10,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from densify.flow.tracking.clock import Clock
+from densify.clock import Clock
 from densify.flow.tracking.evidence import FreeSpace, Standing, firing_times_s
 from densify.flow.tracking.radial import Radial
 from densify.flow.tracking.shapes import Shape

@@ -10,9 +10,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from densify.clock import Clock
 from densify.config import Config
 from densify.flow.scene import Scene
-from densify.flow.tracking.clock import Clock
 from densify.flow.tracking.evidence import (
     Candidates,
     FreeSpace,

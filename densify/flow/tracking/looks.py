@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from densify.flow.tracking.clock import Clock
+from densify.clock import Clock
 from densify.flow.tracking.evidence import LINK_M, Standing
 from densify.flow.tracking.radial import Radial
 from densify.kernels.linking import link

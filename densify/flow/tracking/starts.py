@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from densify.flow.tracking.clock import Clock
+from densify.clock import Clock
 from densify.flow.tracking.evidence import Standing
 from densify.flow.tracking.looks import Look
 from densify.flow.tracking.sightings import Track

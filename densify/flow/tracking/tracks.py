@@ -14,9 +14,9 @@ from itertools import chain
 
 import numpy as np
 
+from densify.clock import Clock
 from densify.flow.surface_matching import GATES_M, apply, undo
 from densify.flow.tracking.align import MIN_FIT, Model, align
-from densify.flow.tracking.clock import Clock
 from densify.flow.tracking.evidence import FreeSpace, Standing
 from densify.flow.tracking.lone_rings import in_line, linked_in_line, single_rings
 from densify.flow.tracking.looks import Look, looks_of

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from densify.flow.tracking.clock import Clock
+from densify.clock import Clock
 from densify.kernels.clouds import missed, spread
 from densify.types import Float
 

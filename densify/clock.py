@@ -12,25 +12,28 @@ import numpy as np
 from densify.types import Float, Int, Stretch
 
 LOOK_S = 0.1
+"""Sweeps closer in time are taken together: in each of them few points tell little of motion, and
+the rings on the ground, that go with the scanner, hide its own."""
 
 
 @dataclass(frozen=True, eq=False)
 class Clock:
-    """The reference times of a stretch's sweeps. Sweeps are asked for by index.
+    """The reference times of sweeps, which are asked for by index.
 
-    time_ns: (W,) int64 since the first sweep, ascending, at any rate and with holes.
+    time_ns: (W,) int64, ascending, at any rate and with holes.
     """
 
     time_ns: Int
 
     @staticmethod
     def of(stretch: Stretch) -> Clock:
+        """The clock of a stretch, its times counted from the first sweep."""
         stamp_ns = np.array([s.sweep.stamp_ns for s in stretch.sweeps], np.int64)
         return Clock(stamp_ns - stamp_ns[:1])
 
     @cached_property
     def time_s(self) -> Float:
-        """(W,) since the first sweep."""
+        """(W,) `time_ns` in seconds."""
         return np.asarray(self.time_ns * 1e-9, np.float64)
 
     @cached_property
