@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from densify.config import ProjectSettings
@@ -172,6 +172,7 @@ def test_without_visibility_pixels_equal_those_of_a_slow_twin(seed, num):
 
 
 @given(st.integers(0, 2**32 - 1))
+@example(9816)  # a point measured twice
 @settings(max_examples=15, deadline=None)
 def test_order_of_the_points_changes_no_byte(seed):
     rng = np.random.default_rng(seed)

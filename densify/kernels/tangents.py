@@ -50,15 +50,24 @@ def _spacing(azimuth, elevation, table):  # type: ignore[no-untyped-def]
     return table.across[row, column], table.along[row, column]
 
 
+@inlined
+def _before(seen, i, j):  # type: ignore[no-untyped-def]
+    if seen[2, i] != seen[2, j]:
+        return seen[2, i] < seen[2, j]
+    if seen[0, i] != seen[0, j]:
+        return seen[0, i] < seen[0, j]
+    return seen[1, i] < seen[1, j]
+
+
 @Kernel
 def nearest_in_cells(seen, members, grid, cells):  # type: ignore[no-untyped-def]
     """cells: (R,C) int32 of the grid, filled with the nearest of ``members`` (indices) in each, -1
-    none."""
+    none. Of equally near ones the direction decides, not the order of the points."""
     cells[:] = -1
     for i in members:
         row, column = _cell(seen[0, i], seen[1, i], grid)
         there = cells[row, column]
-        if there < 0 or seen[2, i] < seen[2, there]:
+        if there < 0 or _before(seen, i, there):
             cells[row, column] = i
 
 
@@ -167,11 +176,13 @@ def tangents_anywhere(first, last, members, seen, table, grid, cells, normal, sp
             for r in range(max(row - reach, 0), min(row + reach, num_rows - 1) + 1):
                 for c in range(column - reach, column + reach + 1):
                     j = cells[r, c % num_columns]
-                    if j < 0 or j == i:
+                    if j < 0:
                         continue
                     u = seen[0, j] - seen[0, i]
                     u = (u - 2 * np.pi * np.rint(u / (2 * np.pi))) * flatten
                     v, w = seen[1, j] - seen[1, i], 1 / seen[2, j] - 1 / range_m
+                    if u == 0 and v == 0 and w == 0:
+                        continue  # the point itself, or its equal
                     num += 1
                     off_m = abs(w - level * u - rise * v) * range_m * range_m
                     if turn and off_m > _BEND_M + _BEND * abs(w) * range_m * range_m:
