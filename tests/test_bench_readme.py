@@ -53,6 +53,12 @@ def test_real_rows_come_with_their_folders(tmp_path):
     assert readme._scenes(readme.TABLES["flow"], tmp_path, tmp_path) == readme._FLOW
 
 
+def test_help_names_every_table(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main(["bench", "readme", "--help"])
+    assert f"of {', '.join(readme.TABLES)} (default" in " ".join(capsys.readouterr().out.split())
+
+
 @pytest.mark.parametrize("name", readme.TABLES)
 def test_the_results_name_the_command_of_each_table(name):
     assert f"densify bench readme {name}" in RESULTS.read_text("utf-8")

@@ -240,7 +240,8 @@ def _add_bench_readme(benches: Any) -> None:
         "tables",
         nargs="*",
         metavar="TABLE",
-        help="of methods, depth, parts, flow, rates, segmentation (default: all)",
+        help="of methods, depth, parts, flow, rates, segmentation, pairs, prior, images (default: "
+        "all)",
     )
     parser.add_argument(
         "--kitti", metavar="DIR", type=Path, help="drive 2011_09_26_drive_0013_sync, for its rows"
