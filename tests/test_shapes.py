@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The shape of an object: its outline, how far it reaches, and the field that votes use."""
+"""The shape of an object: its outline and how far it reaches."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ import pytest
 
 from densify.flow.surface_matching import apply
 from densify.flow.tracking.shapes import Shape
-from densify.flow.tracking.vote import DistanceField
 
 
 def test_the_outline_is_that_of_all_points_seen_from_above() -> None:
@@ -40,21 +39,3 @@ def test_the_rim_reaches_as_far_as_all_points_however_turned(yaw: float) -> None
     all_there, rim = apply(state, points, centre), apply(state, shape.rim, centre)
     np.testing.assert_array_equal(rim.min(0), all_there.min(0))
     np.testing.assert_array_equal(rim.max(0), all_there.max(0))
-
-
-def test_the_field_is_the_distance_between_voxels() -> None:
-    rng = np.random.default_rng(2)
-    points = rng.uniform(0, 4, (300, 3)) + [100, -50, 0]
-    field = DistanceField.of(points)
-    asked = rng.uniform(-2, 6, (3000, 3)) + [100, -50, 0]
-    voxel, occupied = (np.floor((p - field.low) / 0.2) for p in (asked, points))
-    distance_m = 0.2 * np.linalg.norm(voxel[:, None] - occupied[None], axis=2).min(1)
-    share = np.round(255 * np.minimum(distance_m / 0.6, 1)) / 255
-    assert (share < 1).mean() > 0.1
-    np.testing.assert_allclose(field(np.zeros((1, 3)), asked), share, atol=1e-12)
-    together = field(asked[:7] - asked[0], asked[:1])
-    np.testing.assert_allclose(together, share[:7].mean(), atol=1e-12)
-
-
-def test_a_field_of_nothing_is_far_everywhere() -> None:
-    assert (DistanceField.of(np.zeros((0, 3)))(np.zeros((4, 3)), np.zeros((2, 3))) == 1).all()

@@ -65,31 +65,32 @@ def spread(
 
 
 @Kernel
-def missed(
+def look_up(
     first: int,
     last: int,
     points: Float,
-    shifts: Float,
+    late_s: Float,
+    velocities: Float,
+    elapsed_s: Float,
     low: Float,
     cells_per_m: float,
     nearness: Bytes,
-    mean: Float,
+    found: Bytes,
 ) -> None:
-    """mean: (V,), filled: how much less than 255 the cells hold in which (N,3) points are when
-    moved by each of (V,3) shifts.
+    """Raise ``found`` (V,N), in place, to what the cells hold in which (N,3) points are that have
+    moved for ``elapsed_s`` (V,), ``late_s`` (N,) less, with each of (V,3) velocities.
 
     nearness: (X,Y,Z) of the cells of a grid whose corner is ``low`` (3,); 0 outside.
     """
     num_x, num_y, num_z = nearness.shape
     for v in range(first, last):
-        total = 0
         for i in range(len(points)):
-            x = int((points[i, 0] + shifts[v, 0] - low[0]) * cells_per_m)
-            y = int((points[i, 1] + shifts[v, 1] - low[1]) * cells_per_m)
-            z = int((points[i, 2] + shifts[v, 2] - low[2]) * cells_per_m)
-            inside = 0 <= x < num_x and 0 <= y < num_y and 0 <= z < num_z
-            total += 255 - np.int64(nearness[x, y, z]) if inside else 255
-        mean[v] = total / len(points)
+            moving_s = elapsed_s[v] - late_s[i]
+            x = int((points[i, 0] + velocities[v, 0] * moving_s - low[0]) * cells_per_m)
+            y = int((points[i, 1] + velocities[v, 1] * moving_s - low[1]) * cells_per_m)
+            z = int((points[i, 2] + velocities[v, 2] * moving_s - low[2]) * cells_per_m)
+            if 0 <= x < num_x and 0 <= y < num_y and 0 <= z < num_z:
+                found[v, i] = max(found[v, i], nearness[x, y, z])
 
 
 @Kernel

@@ -30,7 +30,7 @@ from densify.flow.tracking.starts import (
     is_line_on,
     velocities_beside,
 )
-from densify.flow.tracking.vote import DistanceField, vote
+from densify.flow.tracking.vote import DistanceField, Group, vote
 from densify.geometry.height_map import HeightMap
 from densify.types import Bool, Float
 
@@ -64,11 +64,15 @@ def follow_groups(
     seen = [look.seen for look in looks]
     fields = []
     if velocities_m_s is None:
-        fields = [DistanceField.of(c.points[c.candidate]) for c in seen]
+        of_sweeps = [
+            DistanceField.of(c.points[c.candidate], c.time_s[c.candidate]) for c in standing
+        ]
+        fields = [[of_sweeps[j] for j in look.sweeps] for look in looks]
 
     def velocity_of(members: np.ndarray, n: int) -> Float:
         if velocities_m_s is None:
-            velocity = vote(seen[n].points[members], n, fields, clock)
+            group = Group.of(seen[n].points[members], seen[n].time_s[members])
+            velocity = vote(group, n, fields, clock)
         else:
             velocity = np.median(looks[n].gather(velocities_m_s)[members], axis=0)
         radial = seen[n].radial

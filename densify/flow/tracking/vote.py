@@ -4,13 +4,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from densify.clock import Clock
-from densify.kernels.clouds import missed, spread
+from densify.kernels.clouds import look_up, spread
+from densify.kernels.nearest import BoxTree
 from densify.types import Float
 
 _MAX_SPEED_M_S = 38.0
@@ -18,24 +19,28 @@ _VOTE_NEAR_S = 0.1  # the nearer of the sweeps asked; the farther ones are twice
 _VOTE_STEP_M = 0.2
 _VOTE_REACH_M = 0.6
 _VOTE_POINTS = 60
+_TIMES_ASKED = 3  # when a sweep measures a place depends on where that is
 _FINE_S, _FINE_M_S = 0.5, 0.2  # asked last, so far away and in such steps
 
 
 @dataclass(frozen=True)
 class DistanceField:
-    """How near the nearest candidate is on a voxel grid: 255 there, 0 beyond the reach.
+    """How near the nearest candidate of a sweep is on a voxel grid: 255 there, 0 beyond the reach.
 
     Zeros take no memory until something is written beside them; a field is mostly zeros.
+    tree, time_s: the candidates, and when each was measured.
     """
 
     nearness: NDArray[np.uint8]
     low: Float
+    tree: BoxTree | None
+    time_s: Float
 
     @staticmethod
-    def of(points: Float) -> DistanceField:
+    def of(points: Float, time_s: Float) -> DistanceField:
         step, reach = _VOTE_STEP_M, _VOTE_REACH_M
         if not len(points):
-            return DistanceField(np.zeros((1, 1, 1), np.uint8), np.zeros(3))
+            return DistanceField(np.zeros((1, 1, 1), np.uint8), np.zeros(3), None, time_s)
         low = points.min(0) - 2 * reach
         shape = tuple(np.ceil((points.max(0) + 2 * reach - low) / step).astype(int) + 1)
         nearness = np.zeros(shape, np.uint8)
@@ -45,60 +50,87 @@ class DistanceField:
         far = np.linalg.norm(offsets, axis=1) * step / reach
         values = (255 - np.round(255 * far[far < 1])).astype(np.uint8)
         spread(points, low, step, offsets[far < 1], values, nearness)
-        return DistanceField(nearness, low)
+        return DistanceField(nearness, low, BoxTree(points), time_s)
 
-    def __call__(self, points: Float, shifts: Float) -> Float:
-        """(N,3), (V,3) metres -> (V,) mean distance of the points, moved by each of the shifts, to
-        the nearest candidate, as a share of the reach."""
-        mean = np.empty(len(shifts))
-        missed.over_rows(
-            len(shifts), points, shifts, self.low, 1 / _VOTE_STEP_M, self.nearness, mean
+    def raise_to(self, found: NDArray[np.uint8], group: Group, velocities: Float) -> None:
+        """Raise ``found`` (V,N), in place, to how near the group's points come to the candidates
+        with each of (V,3) velocities, when the sweep measures what is there."""
+        if self.tree is None:
+            return
+        elapsed_s = np.zeros(len(velocities))
+        for _ in range(_TIMES_ASKED):
+            _, row = self.tree.nearest(group.middle + elapsed_s[:, None] * velocities)
+            elapsed_s = self.time_s[row] - group.middle_s
+        look_up.over_rows(
+            len(velocities),
+            group.points,
+            group.late_s,
+            velocities,
+            elapsed_s,
+            self.low,
+            1 / _VOTE_STEP_M,
+            self.nearness,
+            found,
         )
-        return mean / 255
 
 
-def vote(points: Float, i: int, fields: Sequence[DistanceField], clock: Clock) -> Float:
-    """(3,) m/s in the plane: where the group that sweep i saw is in four sweeps at once, about 0.1
+@dataclass(frozen=True)
+class Group:
+    """What one look saw of something: (N,3) world, when each point was measured after the mean of
+    all (N,), that mean, and the middle of the points (3,)."""
+
+    points: Float
+    late_s: Float
+    middle_s: float
+    middle: Float
+
+    @staticmethod
+    def of(points: Float, time_s: Float) -> Group:
+        middle_s = float(time_s.mean())
+        return Group(points, time_s - middle_s, middle_s, points.mean(axis=0))
+
+    def some(self, most: int) -> Group:
+        """Some of the points, evenly."""
+        step = len(self.points) // most + 1
+        return replace(self, points=self.points[::step], late_s=self.late_s[::step])
+
+
+def vote(group: Group, n: int, fields: Sequence[Sequence[DistanceField]], clock: Clock) -> Float:
+    """(3,) m/s in the plane: where the group that look n saw is in four looks at once, about 0.1
     and 0.2 s before and after, or as near to that as the rate allows.
+
+    fields: of the sweeps of each look. clock: of the looks.
 
     Along a flat side only its ends tell how fast it slides, by less than a voxel in so short a
     time, and aligned with what it covers it slides on as it was started. So they are asked again
-    within 0.5 s.
+    within 0.5 s. A scanner measures what passes it earlier or later in each turn: all points have
+    times of their own.
     """
     near_s = clock.num_in(_VOTE_NEAR_S) * clock.period_ns * 1e-9
     coarse = 2 * _VOTE_STEP_M / near_s
-    near = _sweeps_around(i, near_s, clock)
-    n = int(_MAX_SPEED_M_S / coarse)
-    rough = _best(points, i, fields, clock, near, _grid(n) * coarse, _VOTE_POINTS)
-    finer = rough + _grid(6) * coarse / 3
-    found = _best(points, i, fields, clock, near, finer, 10 * _VOTE_POINTS)
-    n = max(1, round(coarse / 3 / _FINE_M_S))
-    finest = found + _grid(n) * coarse / 3 / n
-    both = near + _sweeps_around(i, max(_FINE_S / 2, near_s), clock)
-    return _best(points, i, fields, clock, both, finest, 10 * _VOTE_POINTS)
+    near = [fields[m] for m in _looks_around(n, near_s, clock)]
+    both = near + [fields[m] for m in _looks_around(n, max(_FINE_S / 2, near_s), clock)]
+    rough = _best(group.some(_VOTE_POINTS), near, _grid(int(_MAX_SPEED_M_S / coarse)) * coarse)
+    group = group.some(10 * _VOTE_POINTS)
+    found = _best(group, near, rough + _grid(6) * coarse / 3)
+    num = max(1, round(coarse / 3 / _FINE_M_S))
+    return _best(group, both, found + _grid(num) * coarse / 3 / num)
 
 
-def _sweeps_around(i: int, step_s: float, clock: Clock) -> list[int]:
-    """The sweeps one and two steps before and after sweep i, as far as there are any."""
-    asked = [clock.at(i, later_s) for later_s in (-2 * step_s, -step_s, step_s, 2 * step_s)]
-    return sorted({j for j in asked if j is not None})
+def _looks_around(n: int, step_s: float, clock: Clock) -> list[int]:
+    """The looks one and two steps before and after look n, as far as there are any."""
+    asked = [clock.at(n, later_s) for later_s in (-2 * step_s, -step_s, step_s, 2 * step_s)]
+    return sorted({m for m in asked if m is not None})
 
 
-def _best(
-    points: Float,
-    i: int,
-    fields: Sequence[DistanceField],
-    clock: Clock,
-    around: Sequence[int],
-    velocities: Float,
-    num_points: int,
-) -> Float:
-    """Which of (V,3) m/s brings some of the points nearest to what these sweeps saw."""
-    sample = points[:: len(points) // num_points + 1]
+def _best(group: Group, around: Sequence[Sequence[DistanceField]], velocities: Float) -> Float:
+    """Which of (V,3) m/s brings the group nearest to what these looks saw."""
     cost = np.zeros(len(velocities))
-    for j in around:
-        shift = velocities * (clock.time_s[j] - clock.time_s[i])
-        cost += fields[j](sample, shift)
+    for look in around:
+        nearness = np.zeros((len(velocities), len(group.points)), np.uint8)
+        for field in look:
+            field.raise_to(nearness, group, velocities)
+        cost += 1 - nearness.mean(axis=1) / 255
     return np.asarray(velocities[np.argmin(cost + 1e-3 * np.linalg.norm(velocities, axis=1))])
 
 
