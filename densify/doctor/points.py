@@ -71,7 +71,7 @@ def check_axes(sample: Sample) -> list[Finding]:
     values = {f"share_{name}": share for name, share in level.items()}
     text = (
         f"{100 * level[best]:.0f} % of the near returns lie in one layer below the scanner if "
-        f"{best} is up, {100 * level['z']:.0f} % if z is"
+        f"{best} is up" + (f", {100 * level['z']:.0f} % if z is" if best != "z" else "")
     )
     if level["z"] < _LEAST_LEVEL and level[best] < _LEAST_LEVEL:
         return [
@@ -121,11 +121,12 @@ def check_own_vehicle(sample: Sample, settings: RegisterSettings) -> list[Findin
         if spot.speed_m_s > 1.0 and (np.linalg.norm(spot.sweeps[0].points, axis=1) < _NEAR_M).any()
     ]
     if len(moving) < 2:
-        return [
-            Finding(
-                "own vehicle", Verdict.UNKNOWN, "the vehicle hardly moves where it was looked at"
-            )
-        ]
+        text = (
+            "the vehicle drives in one of the places looked at only, two are needed"
+            if moving
+            else "the vehicle hardly moves where it was looked at"
+        )
+        return [Finding("own vehicle", Verdict.UNKNOWN, text)]
     range_m, num = _own_returns(moving)
     values = {"farthest_m": range_m, "num_returns": num}
     if num < _LEAST_OWN:

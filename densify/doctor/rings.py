@@ -68,7 +68,9 @@ def _check_compensation(
 ) -> Finding:
     name = "motion compensation" + f" of scanner {lidar}" * (lidar > 0)
     spot = sample.fastest
-    if spot is None or spot.speed_m_s < _LEAST_SPEED_M_S:
+    if spot is None:
+        return Finding(name, Verdict.UNKNOWN, "no sweeps could be registered")
+    if spot.speed_m_s < _LEAST_SPEED_M_S:
         text = "the vehicle hardly moves where it was looked at"
         return Finding(name, Verdict.UNKNOWN, text)
     sweep = spot.sweeps[spot.middle]
