@@ -47,6 +47,14 @@ def test_a_folder_with_a_number_sign(tmp_path: Path) -> None:
     assert Spec.parse(f"kitti:{tmp_path}/run#3#4") == ("kitti", f"{tmp_path}/run#3", "4")
 
 
+def test_a_scene_of_a_place_whose_reader_is_guessed(border_drive: Path, tmp_path: Path) -> None:
+    parts = (None, f"{border_drive}", "night")
+    assert Spec.parse(f"{border_drive}#night") == parts
+    assert Spec.parse(Spec.parse(f"{border_drive}#night").absolute()) == parts
+    with pytest.raises(InputError, match="kitti recordings have no scenes; leave #night out"):
+        densify.open_sequence(f"{border_drive}#night")
+
+
 def test_home(monkeypatch, tmp_path: Path) -> None:
     monkeypatch.setenv("HOME", str(tmp_path))
     assert Spec.parse("kitti:~/0013").absolute() == f"kitti:{tmp_path}/0013"

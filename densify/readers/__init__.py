@@ -39,20 +39,21 @@ class Spec(NamedTuple):
 
     @staticmethod
     def parse(text: str | Path) -> Spec:
-        """``street[:PRESET][?...]``, ``READER:PATH[#SCENE]``, or else a path.
+        """``street[:PRESET][?...]`` or ``[READER:]PATH[#SCENE]``.
 
-        A path that exists as it stands, ``#`` included, has no scene.
+        A path that exists as it stands, ``#`` included, has no scene; nor has one without a reader
+        where nothing lies before the ``#``.
         """
         text = str(text)
         if text == "street" or text.startswith(("street:", "street?")):
             return Spec("street", text)
         name, colon, place = text.partition(":")
-        if not (colon and name in READERS):
-            return Spec(None, text)
+        reader = name if colon and name in READERS else None
+        place = text if reader is None else place
         path, mark, scene = place.rpartition("#")
-        if not mark or os.path.exists(Path(place).expanduser()):
-            return Spec(name, place)
-        return Spec(name, path, scene)
+        if not mark or _exists(place) or (reader is None and not _exists(path)):
+            return Spec(reader, place)
+        return Spec(reader, path, scene)
 
     @property
     def path(self) -> Path:
@@ -68,11 +69,15 @@ class Spec(NamedTuple):
         return f"{reader}{self.path.absolute()}{scene}"
 
 
+def _exists(place: str) -> bool:
+    return os.path.exists(Path(place).expanduser())
+
+
 def open_sequence(spec: str | Path = "street") -> LidarSequence:
     """Open a recording.
 
-    spec: ``READER:PATH``, or a path whose reader is guessed from what lies there, or the built-in
-    ``street[:PRESET][?seed=N&sensor=NAME]``.
+    spec: ``READER:PATH[#SCENE]``, or without ``READER:`` where it is guessed from what lies there,
+    or the built-in ``street[:PRESET][?seed=N&sensor=NAME]``.
 
     Raises InputError if there is nothing there or no reader knows it.
     """
