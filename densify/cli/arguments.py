@@ -36,12 +36,12 @@ _VERBS = (
 
 
 def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
-    """Options of one command; ``options.verb(options)`` runs it. Exits with 2 on a bad argument."""
-    return command_line().parse_args(arguments)
+    """Options of one command; ``options.verb(options)`` runs it, ``options.command_line`` is the
+    parser of all of them. Exits with 2 on a bad argument."""
+    return _command_line().parse_args(arguments)
 
 
-def command_line() -> argparse.ArgumentParser:
-    """All verbs with their options."""
+def _command_line() -> argparse.ArgumentParser:
     parser = _Parser(
         prog="densify",
         description="Dense depth maps from lidar recordings, with the moving objects kept sharp.",
@@ -52,6 +52,7 @@ def command_line() -> argparse.ArgumentParser:
     for verb in _VERBS:
         verb.add(commands)
     add_bench(commands)
+    parser.set_defaults(command_line=parser)
     return parser
 
 

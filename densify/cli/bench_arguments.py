@@ -171,29 +171,7 @@ def _add_bench_paper(benches: Any) -> None:
         "paper-adam take minutes a pair. On streets the motion of the vehicle is removed, in the "
         "published sets it is not; ours and networks know it where the recording has poses.",
     )
-    made = "as FlowNet3D's authors made them"
-    for name, what in (
-        ("flyingthings", f".npz files of FlyingThings3D {made}"),
-        ("kitti", f"KITTI's scene flow 2015 with its calibration, or .npz files {made}"),
-    ):
-        parser.add_argument(f"--{name}", metavar="DIR", type=Path, help=what)
-    for name, what in (("argoverse", "DIR[#LOG]"), ("nuscenes", "DIR[#SCENE]")):
-        parser.add_argument(
-            f"--{name}",
-            metavar=what,
-            action="append",
-            help="a recording with tracked boxes, whose flow densify labels makes; may be given "
-            "several times",
-        )
-    parser.add_argument(
-        "--data",
-        type=recording_keys,
-        action="append",
-        metavar="SPEC@KEYS",
-        help="recordings and their frames (K,K,… or A:B[:S]), streets or, without truth, held "
-        "against what this package's engine finds (default: four streets that nothing was tuned "
-        "on, where no set is given)",
-    )
+    _add_paper_sets(parser)
     parser.add_argument(
         "--methods", type=words, metavar="NAME,…", help="(default: all but pointpwc, paper-adam)"
     )
@@ -227,6 +205,33 @@ def _add_bench_paper(benches: Any) -> None:
     )
     parser.add_argument("--out", metavar="FILE.json", type=Path, help="write every number there")
     add_overwrite(parser)
+
+
+def _add_paper_sets(parser: argparse.ArgumentParser) -> None:
+    sets = parser.add_argument_group("pairs of clouds, a table for each set")
+    made = "as FlowNet3D's authors made them"
+    for name, what in (
+        ("flyingthings", f".npz files of FlyingThings3D {made}"),
+        ("kitti", f"KITTI's scene flow 2015 with its calibration, or .npz files {made}"),
+    ):
+        sets.add_argument(f"--{name}", metavar="DIR", type=Path, help=what)
+    for name, what in (("argoverse", "DIR[#LOG]"), ("nuscenes", "DIR[#SCENE]")):
+        sets.add_argument(
+            f"--{name}",
+            metavar=what,
+            action="append",
+            help="a recording with tracked boxes, whose flow densify labels makes; may be given "
+            "several times",
+        )
+    sets.add_argument(
+        "--data",
+        type=recording_keys,
+        action="append",
+        metavar="SPEC@KEYS",
+        help="recordings and their frames (K,K,… or A:B[:S]), streets or, without truth, held "
+        "against what this package's engine finds (default: four streets that nothing was tuned "
+        "on, where no set is given)",
+    )
 
 
 def _add_bench_readme(benches: Any) -> None:

@@ -32,11 +32,8 @@ def answer(options: argparse.Namespace) -> Iterator[Answer]:
     """The script, for all verbs and options there are."""
     import shtab
 
-    from densify.cli.arguments import command_line
-
-    parser = command_line()
-    _complete_paths(parser, shtab.FILE)
-    script = shtab.complete(parser, shell=options.shell)
+    _complete_paths(options.command_line, shtab.FILE)
+    script = shtab.complete(options.command_line, shell=options.shell)
     yield Answer(script, {"script": script})
 
 

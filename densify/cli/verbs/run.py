@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -23,11 +23,11 @@ from densify.cli.options import (
 )
 from densify.cli.progress import Course, course_on_stderr
 from densify.cli.screen import tell_doubts
-from densify.config import as_mapping
+from densify.config import Config, as_mapping
 from densify.errors import ComputationError, InputError
 
 if TYPE_CHECKING:
-    from densify.types import LidarSequence
+    from densify.types import LidarSequence, Result
 
 
 def add(commands: Any) -> None:
@@ -75,19 +75,14 @@ def answer(options: argparse.Namespace) -> Iterator[Answer]:
     from densify.cli.results import FIRST_OF_RUN, key_facts, summary
     from densify.memory import check_fits
     from densify.methods import engines, with_baselines
-    from densify.outputs import check_writable, write_result
+    from densify.outputs import check_writable
     from densify.readers import open_sequence
 
     sequence = open_sequence(options.data)
     keys = _keys_of(sequence, options)
     for key in keys:
         check_writable(options.out, key, options.overwrite, "run", config.output.also)
-    if options.film is not None:
-        from densify.report.film import check_film, write_film
-
-        if len(keys) > 1:
-            raise InputError(f"--film {options.film}: got {len(keys)} keys, expected one")
-        check_film(options.film, options.overwrite)
+    _check_film(options, keys)
     failed: dict[int, Exception] = {}
     doubts: list[tuple[str, str, int]] = []
     course = Course(engines(with_baselines(options.method), config.flow.engine), len(keys))
@@ -111,18 +106,7 @@ def answer(options: argparse.Namespace) -> Iterator[Answer]:
                 yield Answer(facts={"keys": [{"key": key, "error": str(result)}]})
                 continue
             course.step("write", 0, 1)
-            paths = write_result(
-                result,
-                result.images,
-                options.out,
-                config=as_mapping(config),
-                data=options.data,
-                overwrite=options.overwrite,
-                also=config.output.also,
-            )
-            if options.film is not None:
-                write_film(options.out / f"{key:06d}", options.film, overwrite=True)
-                paths.append(options.film)
+            paths = _written(result, options, config)
             first = first_of(paths, FIRST_OF_RUN)
             course.key_done()
             yield Answer(summary(result), {"keys": [key_facts(result)]}, paths, first)
@@ -133,6 +117,37 @@ def answer(options: argparse.Namespace) -> Iterator[Answer]:
     if failed:
         told = "; ".join(f"key {key}: {error}" for key, error in failed.items())
         raise ComputationError(f"{len(failed)} of {len(keys)} keys not made: {told}")
+
+
+def _check_film(options: argparse.Namespace, keys: Sequence[int]) -> None:
+    if options.film is None:
+        return
+    from densify.report.film import check_film
+
+    if len(keys) > 1:
+        raise InputError(f"--film {options.film}: got {len(keys)} keys, expected one")
+    check_film(options.film, options.overwrite)
+
+
+def _written(result: Result, options: argparse.Namespace, config: Config) -> list[Path]:
+    """The files written of a key."""
+    from densify.outputs import write_result
+
+    paths = write_result(
+        result,
+        result.images,
+        options.out,
+        config=as_mapping(config),
+        data=options.data,
+        overwrite=options.overwrite,
+        also=config.output.also,
+    )
+    if options.film is not None:
+        from densify.report.film import write_film
+
+        write_film(options.out / f"{result.key:06d}", options.film, overwrite=True)
+        paths.append(options.film)
+    return paths
 
 
 def _keys_of(sequence: LidarSequence, options: argparse.Namespace) -> list[int]:

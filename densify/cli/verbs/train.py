@@ -30,62 +30,72 @@ def add(commands: Any) -> None:
         "minute: go on with --resume.",
     )
     flow.add_argument(
+        "--out", metavar="MODEL", type=Path, required=True, help="the model; MODEL.png: its loss"
+    )
+    add_overwrite(flow)
+    _add_lesson(flow)
+    _add_course(flow)
+
+
+def _add_lesson(flow: argparse.ArgumentParser) -> None:
+    lesson = flow.add_argument_group("what is learned")
+    lesson.add_argument(
         "--data",
         metavar="SPEC",
         action="append",
         help="a recording as everywhere, may be given several times; streets[?sensor=NAME]: a new "
         "street for every clip of 7 sweeps, never the same twice (default: streets)",
     )
-    flow.add_argument(
-        "--out", metavar="MODEL", type=Path, required=True, help="the model; MODEL.png: its loss"
-    )
-    flow.add_argument(
+    lesson.add_argument(
         "--teacher",
         choices=("objective", "pointpwc", "cycle", "engine", "truth"),
         default="objective",
         help="where the loss comes from (default: objective)",
     )
-    flow.add_argument(
+    lesson.add_argument(
         "--model",
         choices=("voxels", "flownet3d"),
         default="voxels",
         help="voxels: whole sweeps in a fraction of a second; flownet3d: the paper's, of 8,192 "
         "points (default: voxels)",
     )
-    limit = flow.add_mutually_exclusive_group(required=True)
-    limit.add_argument("--minutes", type=positive, metavar="M", help="train so long")
-    limit.add_argument("--steps", type=natural, metavar="N", help="train so many pairs of sweeps")
-    flow.add_argument(
+    lesson.add_argument(
         "--start", metavar="MODEL", type=Path, help="begin with this model's weights: fine-tune it"
     )
-    flow.add_argument(
-        "--resume", action="store_true", help="go on from MODEL.checkpoint of a stopped training"
-    )
-    flow.add_argument(
+    lesson.add_argument(
         "--seed",
         type=natural,
         default=0,
         metavar="N",
         help="first weights, choice of sweeps (default: 0)",
     )
-    flow.add_argument(
+
+
+def _add_course(flow: argparse.ArgumentParser) -> None:
+    course = flow.add_argument_group("how long, and where")
+    limit = course.add_mutually_exclusive_group(required=True)
+    limit.add_argument("--minutes", type=positive, metavar="M", help="train so long")
+    limit.add_argument("--steps", type=natural, metavar="N", help="train so many pairs of sweeps")
+    course.add_argument(
+        "--resume", action="store_true", help="go on from MODEL.checkpoint of a stopped training"
+    )
+    course.add_argument(
         "--device", choices=("auto", "cpu", "cuda"), default="auto", help="(default: auto)"
     )
-    flow.add_argument(
+    course.add_argument(
         "--workers",
         type=natural,
         default=1,
         metavar="N",
         help="processes that make sweeps ready beside the training; 0: none (default: 1)",
     )
-    flow.add_argument(
+    course.add_argument(
         "--keep",
         metavar="DIR",
         type=Path,
         help="keep the sweeps made ready there, 6 MB a clip: another training with the same --data "
         "and --seed does not make them again",
     )
-    add_overwrite(flow)
 
 
 def answer(options: argparse.Namespace) -> Iterator[Answer]:

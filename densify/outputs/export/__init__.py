@@ -28,7 +28,7 @@ from densify.errors import InputError
 from densify.outputs.atomic import write_file
 from densify.outputs.export.finished_run import Density, FinishedRun, Kept, finished_runs
 from densify.outputs.store import writing
-from densify.plugins.exports import EXPORTS
+from densify.plugins.exports import EXPORTS, ExportFormat
 from densify.version import __version__
 
 _RECORD = "export.yaml"
@@ -91,8 +91,7 @@ def export_run(
     """
     _check_thresholds(min_confidence, max_age_ms)
     form = EXPORTS.row(to, "--to")
-    module = EXPORTS.module(form)
-    read = finished_runs if hasattr(module, "write_drive") else _one_run
+    read = finished_runs if hasattr(EXPORTS.module(form), "write_drive") else _one_run
     runs = read(run, min_confidence, max_age_ms, cameras)
     folder = out or (run / "export" if to == "png" else run / "export" / to)
     if (folder / "run.yaml").exists():
@@ -101,15 +100,7 @@ def export_run(
         )
     owned = (*form.owned, _RECORD)
     with writing(folder, owned, folder, overwrite) as staging:
-        if len(runs) > 1:
-            cast(DriveModule, module).write_drive(runs, staging)
-        else:
-            cast(ExportModule, module).write_export(runs[0], staging)
-        if strays := sorted({entry.name for entry in staging.iterdir()} - {*form.owned}):
-            raise InputError(
-                f"--to {to}: wrote {', '.join(strays)}, expected nothing but "
-                f"{', '.join(form.owned) or 'what OWNED names'}; mend {form.module}"
-            )
+        _write_form(form, runs, staging)
         asked = {
             "run": str(run),
             "to": to,
@@ -130,6 +121,19 @@ def export_run(
 
 def _one_run(run: Path, *thresholds: Any) -> list[FinishedRun]:
     return [FinishedRun(run, *thresholds)]
+
+
+def _write_form(form: ExportFormat, runs: Sequence[FinishedRun], staging: Path) -> None:
+    module = EXPORTS.module(form)
+    if len(runs) > 1:
+        cast(DriveModule, module).write_drive(runs, staging)
+    else:
+        cast(ExportModule, module).write_export(runs[0], staging)
+    if strays := sorted({entry.name for entry in staging.iterdir()} - {*form.owned}):
+        raise InputError(
+            f"--to {form.name}: wrote {', '.join(strays)}, expected nothing but "
+            f"{', '.join(form.owned) or 'what OWNED names'}; mend {form.module}"
+        )
 
 
 def _sum(counts: Sequence[Kept | None]) -> Kept | None:
