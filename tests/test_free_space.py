@@ -111,19 +111,43 @@ def test_solid_things_stay_though_sweeps_saw_what_is_behind_them(solid):
     assert lost.mean() < 0.002
 
 
+def shut(measured):
+    """The plane before the wall, without a hole."""
+    shape = (CAMERA.height_px, CAMERA.width_px)
+    shut_m, none = np.full(shape, FRONT_M, np.float32), np.zeros(shape, np.float32)
+    depth_m = shut_m if measured else none
+    return Layers(
+        *(depth_m, none, none > 0, none > 0, shut_m, none + 1, np.full(shape, -1, np.int32)),
+        tilt=np.zeros((*shape, 2), np.float32),
+        spacing_px=np.broadcast_to(np.float32([2.1, 5.0]), (*shape, 2)),
+    )
+
+
+def test_where_some_rays_go_through_what_is_filled_goes_before_what_is_measured():
+    """Among leaves rays stop and go through side by side."""
+    lost = {}
+    for share_open in (0.05, 0.2):
+        chance = np.random.default_rng(0)
+        cloud, _, rays = scanned(lambda y, z: chance.random(y.shape) > share_open)  # noqa: B023
+        view = Exposure(CAMERA, T_CAM_LIDAR).sees(cloud)
+        front = cloud.points[:, 0] < 0.5 * (FRONT_M + WALL_M)
+        reason = np.where(front, Reason.KEPT, Reason.HIDDEN).astype(np.uint8)
+        for measured in (True, False):
+            before = shut(measured)
+            made = without_seen_through(before, cloud, view, rays, reason, SETTINGS)
+            inside = (slice(10, 50), slice(40, 360))
+            lost[share_open, measured] = (made.filled_m == 0)[inside].mean()
+    assert lost[0.2, False] > 1.5 * lost[0.2, True]
+    assert lost[0.05, False] < 0.1
+
+
 def test_near_a_mover_the_rays_of_the_key_sweep_alone_tell():
     """Legs swing: what lies between them is open now and shut at other times, or the other way
     round; the map has it shut."""
     for of_key, of_others, opens in ((legs, board, True), (board, legs, False)):
         cloud, _, rays = scanned(of_key, of_others)
         view = Exposure(CAMERA, T_CAM_LIDAR).sees(cloud)
-        shape = (CAMERA.height_px, CAMERA.width_px)
-        shut_m, none = np.full(shape, FRONT_M, np.float32), np.zeros(shape, np.float32)
-        layers = Layers(
-            *(none, none, none > 0, none > 0, shut_m, none + 1, np.full(shape, -1, np.int32)),
-            tilt=np.zeros((*shape, 2), np.float32),
-            spacing_px=np.broadcast_to(np.float32([2.1, 5.0]), (*shape, 2)),
-        )
+        layers = shut(measured=False)
         front = cloud.points[:, 0] < 0.5 * (FRONT_M + WALL_M)
         reason = np.where(front, Reason.KEPT, Reason.HIDDEN).astype(np.uint8)
         made = without_seen_through(layers, cloud, view, rays, reason, SETTINGS)

@@ -214,7 +214,7 @@ class ProjectSettings(Section):
     )
     hidden_fraction: float = knob(0.06, "see hidden_m; share of the depth", 0, 1)
     seen_through: float = knob(
-        0.35,
+        0.25,
         "a pixel is left out if more than this share of the rays there went through its surface: "
         "the gaps of a fence; smaller opens more of them and thins hedges and outlines; 1: never",
         0,

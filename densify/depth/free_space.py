@@ -27,18 +27,39 @@ from densify.types import Bool, Cloud, Float, Float32, Reason, Stretch
 _NUM_STEPS = 6
 _SAME_M, _SAME_FRACTION = 0.05, 0.01  # from one step to the next: the crossing is found
 _LEAST_BLUR_PX = 1.0
+_GAPS, _GAPS_AROUND = 0.25, 0.7  # between rays, over which they tell of a pixel: standard deviation
+_LEAST_RAYS, _LEAST_OF_KEY = 0.9, 0.3  # through a pixel itself, or more of them around it
+_OF_FILLED = 0.5  # of the share of rays that may go through elsewhere
+_OF_KEY = 0.35
 # Gaps between rays to all sides of a mover: rays of other sweeps passed there before and after it.
 _MOVER_GAPS = 3.6
 
 
-class _Rule(NamedTuple):
-    """blur_px: down and across, standard deviation: what rays tell of pixels around. least: rays
-    through a pixel itself, or more of them around it. share: of the rays that went through; more
-    opens the pixel."""
+class _Told(NamedTuple):
+    """What rays tell of each pixel (H,W). num_through: how many went through the map, share: of
+    those that met it."""
 
-    blur_px: tuple[float, float]
-    least: float
-    share: float
+    num_through: Float32
+    share: Float32
+
+    @staticmethod
+    def by(
+        through: Float, stopped: Float, blur_px: tuple[float, float], shape: tuple[int, ...]
+    ) -> _Told:
+        """through, stopped: (K,2) px, where rays went through and where they ended. blur_px: down
+        and across, standard deviation."""
+        num_through, num_stopped = (
+            _counts(uv, shape, blur_px) * (2 * np.pi * blur_px[0] * blur_px[1])
+            for uv in (through, stopped)
+        )
+        met = num_through + num_stopped
+        share = np.divide(num_through, met, out=np.zeros_like(met), where=met > 0)
+        return _Told(num_through, share)
+
+    def opens(self, share: float, least: float = _LEAST_RAYS) -> Bool:
+        """(H,W) where more than ``share`` of the rays went through, and no fewer than ``least``."""
+        opened: Bool = (self.share > share) & (self.num_through >= least)
+        return opened
 
 
 @dataclass(frozen=True)
@@ -86,32 +107,39 @@ def without_seen_through(
     point lies behind by more than ``settings.hidden_m`` plus ``hidden_fraction``; a ray stopped at
     the pixel of a point that is not hidden. Both are blurred by a quarter of the gap between rays,
     and more than the share ``settings.seen_through`` of rays that went through takes a pixel away.
+    What is filled goes where half that share did, blurred by .7 gaps, and no less in the pixel
+    itself: among leaves a sixth to a half of that was wrong, of a fence's pickets hardly any.
     Near what moves, and what the key sweep alone saw, the rays of other sweeps tell nothing: there
-    only the key's own count, blurred by .7 gaps, and half of them take a pixel away. Closed windows
-    stay (`densify.depth.glass`): lasers go through glass.
+    only the key's own count, blurred by .7 gaps, and a third of them take a pixel away. Closed
+    windows stay (`densify.depth.glass`): lasers go through glass.
     """
     told = np.isin(cloud.frame, rays.stretch.frames)
     told &= (reason != Reason.OUTSIDE) & (reason != Reason.VETOED)
     stopped = told & (reason != Reason.HIDDEN)
     passed = told & ~stopped & ~cloud.moving
-    gap_px = float(np.median(layers.gap_px))
+    gap_px, shape = float(np.median(layers.gap_px)), layers.filled_m.shape
     near_mover = _near_movers(layers, cloud, view, stopped, round(_MOVER_GAPS * gap_px))
-    blur_px = max(_LEAST_BLUR_PX, 0.25 * gap_px)
-    usual = _Rule((blur_px, blur_px), least=0.9, share=settings.seen_through)
-    dropped = _opened(layers, cloud, view, rays, passed, stopped, usual, settings) & ~near_mover
+    through = _through(layers, cloud, view, rays, passed, settings)
+    here, around = (
+        _Told.by(through, view.uv[stopped[view.rows]], (blur_px, blur_px), shape)
+        for blur_px in (max(_LEAST_BLUR_PX, wide * gap_px) for wide in (_GAPS, _GAPS_AROUND))
+    )
+    gaps = around.opens(_OF_FILLED * settings.seen_through) & (here.share >= around.share)
+    dropped = here.opens(settings.seen_through) | (gaps & (layers.depth_m == 0))
+    dropped &= ~near_mover
     if near_mover.any():
         now = told & (np.abs(cloud.since_key_ns) <= NOW_NS)
         column, row = np.rint(view.uv).astype(np.int64).T
         passed = np.zeros(len(cloud), bool)
         passed[view.rows] = near_mover[row, column]
-        passed &= now
+        through = _through(layers, cloud, view, rays, passed & now, settings)
         across_px, down_px = np.median(layers.spacing_px, axis=(0, 1)).tolist()
-        of_key = _Rule((0.7 * down_px, 0.7 * across_px), least=0.3, share=0.5)
-        opened = _opened(layers, cloud, view, rays, passed, stopped & now, of_key, settings)
-        dropped |= opened & near_mover
+        blur_px = (_GAPS_AROUND * down_px, _GAPS_AROUND * across_px)
+        of_key = _Told.by(through, view.uv[(stopped & now)[view.rows]], blur_px, shape)
+        dropped |= of_key.opens(_OF_KEY, _LEAST_OF_KEY) & near_mover
     if layers.window is not None:
         dropped &= ~layers.window
-    return _without(layers, dropped)
+    return _without(layers, dropped & (layers.filled_m > 0))
 
 
 def _near_movers(layers: Layers, cloud: Cloud, view: InView, seen: Bool, reach_px: int) -> Bool:
@@ -124,30 +152,19 @@ def _near_movers(layers: Layers, cloud: Cloud, view: InView, seen: Bool, reach_p
     return near
 
 
-def _opened(
+def _through(
     layers: Layers,
     cloud: Cloud,
     view: InView,
     rays: Rays,
     passed: Bool,
-    stopped: Bool,
-    rule: _Rule,
     settings: ProjectSettings,
-) -> Bool:
-    """(H,W) where more rays went through the map than stopped, by a rule. passed: (M,) points whose
-    rays may have gone through. stopped: (M,) those whose rays stopped where they show."""
-    shape = layers.filled_m.shape
+) -> Float:
+    """(K,2) px where rays went through the map. passed: (M,) points whose rays may have."""
     if not passed.any():
-        return np.zeros(shape, bool)
+        return np.zeros((0, 2))
     hits = cloud.select(passed)
-    through = crossings(layers.filled_m, rays.starts(hits), hits.points, view.exposure, settings)
-    num_through, num_stopped = (
-        _counts(uv, shape, rule.blur_px) * (2 * np.pi * rule.blur_px[0] * rule.blur_px[1])
-        for uv in (through, view.uv[stopped[view.rows]])
-    )
-    opened: Bool = num_through > rule.share * (num_through + num_stopped)
-    opened &= (num_through >= rule.least) & (layers.filled_m > 0)
-    return opened
+    return crossings(layers.filled_m, rays.starts(hits), hits.points, view.exposure, settings)
 
 
 def _without(layers: Layers, dropped: Bool) -> Layers:
