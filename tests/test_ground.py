@@ -193,6 +193,46 @@ def test_the_slope_limit_against_a_slow_twin():
     np.testing.assert_allclose(height_map._slope_limited(heights, 0.15), expected, atol=1e-12)
 
 
+def test_under_a_vehicle_that_never_left_its_place_is_the_ground_around_it():
+    """Nothing was measured below it and close beside it: its sides begin half a metre above a
+    slope, and are the lowest that was seen there."""
+    rng = np.random.default_rng(3)
+    road = rng.uniform(-15, 15, (60000, 2))
+    along, across = road @ [np.cos(0.6), np.sin(0.6)], road @ [-np.sin(0.6), np.cos(0.6)]
+    vehicle = (np.abs(along) < 3.2) & (np.abs(across) < 1.2)
+    seen = vehicle | (np.abs(along) > 5.2) | (np.abs(across) > 3.2)
+    points = np.column_stack([road, np.where(vehicle, rng.uniform(0.5, 1.5, len(road)), 0.0)])
+    points[:, 2] += 0.1 * points[:, 0]
+    heights = HeightMap.of([points[seen]], SETTINGS)
+    off_m = heights.under(road[vehicle]) - 0.1 * road[vehicle, 0]
+    assert np.abs(off_m).max() < 0.2 and np.abs(np.median(off_m)) < 0.1
+
+
+def test_kerbs_islands_and_banks_are_ground():
+    rng = np.random.default_rng(4)
+    x, y = rng.uniform(-22, 22, (2, 200000))
+    step_m = np.where(y > 5, 0.15, 0.0) + np.where(np.abs(y) < 1.5, 0.15, 0.0)  # kerb, island
+    step_m += np.clip(0.12 * (x - 2), 0, 1.2)  # up a bank that stays up
+    heights = HeightMap.of([np.column_stack([x, y, step_m])], SETTINGS)
+    away = (np.abs(np.abs(y) - 1.5) > 1.2) & (np.abs(y - 5) > 1.2)  # from cells with a step
+    assert np.abs(heights.under(np.stack([x, y], 1)[away]) - step_m[away]).max() < 0.08
+
+
+def test_humps_against_a_slow_twin():
+    """Lower everything to the highest square of seven metres that fits below it."""
+    heights = np.random.default_rng(5).uniform(0, 1, (13, 16))
+    padded = np.pad(heights, 6, mode="symmetric")
+    lowest = np.full_like(padded, np.inf)
+    for row, column in np.ndindex(padded.shape):
+        around = padded[max(row - 3, 0) : row + 4, max(column - 3, 0) : column + 4]
+        lowest[row, column] = around.min()
+    opened = np.empty_like(heights)
+    for row, column in np.ndindex(heights.shape):
+        opened[row, column] = lowest[row + 3 : row + 10, column + 3 : column + 10].max()
+    expected = np.where(heights > opened + 0.2, opened, heights)
+    np.testing.assert_array_equal(height_map._without_humps(heights, 1.0), expected)
+
+
 def slow_map(points: np.ndarray, settings: GroundSettings) -> np.ndarray:
     """Two lowest and the mean, cell by cell, of one cloud; what is between them from the module."""
     cell_m = settings.cell_m
@@ -207,6 +247,7 @@ def slow_map(points: np.ndarray, settings: GroundSettings) -> np.ndarray:
     around = ndimage.median_filter(heights[tuple(nearest)], 5)
     heights = np.where(known & (heights < around - 0.4), around, heights)
     heights = height_map._slope_limited(heights, settings.max_slope * cell_m)[tuple(nearest)]
+    heights = height_map._without_humps(heights, cell_m)
     over_m = points[:, 2] - HeightMap(heights, low, cell_m).under(points)
     number, total_m = np.zeros((2, *heights.shape))
     for (x, y), over in zip(index, over_m, strict=True):

@@ -15,6 +15,7 @@ from densify.types import Float, Float32
 
 _LOW_OUTLIER_M = 0.4
 _GROUND_M = 0.15  # points this close to the lowest are the ground's
+_NARROW_M, _HUMP_M = 7.0, 0.2  # what rises higher on less is no ground
 _FEW = 3.0  # points in and around a cell do not tell its mean
 
 
@@ -33,7 +34,8 @@ class HeightMap:
 
         A cell's ground is its second lowest point (the lowest may be a stray reflection), repaired
         where it lies below the median of its neighbours, then bounded by the steepest slope from
-        every other cell, which cuts cars and walls away. What lies on that lower hull is averaged.
+        every other cell, which cuts cars and walls away, and without humps. What lies on that lower
+        hull is averaged.
         """
         cell_m = settings.cell_m
         low, shape = _grid(clouds, cell_m)
@@ -49,7 +51,7 @@ class HeightMap:
         around = ndimage.median_filter(heights[tuple(nearest)], 5)
         heights = np.where(known & (heights < around - _LOW_OUTLIER_M), around, heights)
         heights = _slope_limited(heights, settings.max_slope * cell_m)
-        hull = HeightMap(heights[tuple(nearest)], low, cell_m)
+        hull = HeightMap(_without_humps(heights[tuple(nearest)], cell_m), low, cell_m)
         return HeightMap(_averaged(hull, clouds), low, cell_m)
 
     def under(self, points: Float) -> Float:
@@ -90,6 +92,15 @@ def _averaged(hull: HeightMap, clouds: Iterable[Float]) -> Float:
     total = ndimage.uniform_filter(total, 3, mode="constant") * 9
     mean: Float = hull.heights_m + np.where(number >= _FEW, total / np.maximum(number, 1), 0.0)
     return mean
+
+
+def _without_humps(heights: Float, cell_m: float) -> Float:
+    """Without what rises out of its surroundings on little room: where a vehicle never left its
+    place bare, the lowest that was seen is the vehicle. Slopes and kerbs stay (morphological
+    opening; Zhang et al., "A Progressive Morphological Filter for Removing Nonground Measurements
+    from Airborne LIDAR Data", TGRS 2003)."""
+    opened = ndimage.grey_opening(heights, max(1, round(_NARROW_M / cell_m)))
+    return np.where(heights - opened > _HUMP_M, opened, heights)
 
 
 def _slope_limited(heights: Float, rise: float) -> Float:
