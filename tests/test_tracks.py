@@ -79,7 +79,7 @@ def test_a_short_way_far_from_the_scanner_proves_nothing():
     }
     track = Track(np.array([44.0, 0, 0]), sighted, {n: np.arange(8) for n in range(3)})
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(proof, "_contradictions", lambda *_: (100, 0, 300))
+        patch.setattr(proof, "contradictions", lambda *_: (100, 0, 300))
         patch.setattr(proof, "_as_fast_as_measured", lambda *_: True)
         for gap_m, proven in ((0.5, True), (1.8, False)):
             space = SimpleNamespace(gap_m=lambda *_, gap_m=gap_m: gap_m)
@@ -88,9 +88,17 @@ def test_a_short_way_far_from_the_scanner_proves_nothing():
 
 
 @pytest.mark.parametrize(
-    ("num_seen", "num_sweeps", "proven"), [(3, 11, False), (8, 11, True), (3, 3, True)]
+    ("num_seen", "num_sweeps", "still", "proven"),
+    [
+        (3, 11, 100, False),
+        (8, 11, 100, True),
+        (3, 3, 100, True),
+        (5, 11, 100, True),
+        (5, 11, 50, False),  # hardly anything says that it does not stand
+        (8, 11, 50, True),
+    ],
 )
-def test_what_is_seen_for_long_may_be_contradicted_more(num_seen, num_sweeps, proven):
+def test_what_is_seen_for_long_may_be_contradicted_more(num_seen, num_sweeps, still, proven):
     sighted = {
         n: Sighting(np.array([0.9 * n, 0, 0, 0]), 0.1 * n, n * 100_000_000, (n,))
         for n in range(num_seen)
@@ -100,7 +108,24 @@ def test_what_is_seen_for_long_may_be_contradicted_more(num_seen, num_sweeps, pr
         patch.setattr(proof, "_as_fast_as_measured", lambda *_: True)
         clock = SimpleNamespace(time_s=0.1 * np.arange(num_sweeps))
         space = SimpleNamespace(gap_m=lambda *_: 0.1, clock=clock)
-        for moved in (2, 20):
-            patch.setattr(proof, "_contradictions", lambda *_, moved=moved: (100, moved, 300))
+        patch.setattr(proof, "_may_be_a_rail", lambda *_: False)
+        for moved in (still // 50, still // 5):
+            patch.setattr(proof, "contradictions", lambda *_, moved=moved: (still, moved, 300))
             left = proof.left_contradicted(track, [], space)
-            assert (left is not None) == (proven or moved == 2)
+            assert (left is not None) == (proven or moved == still // 50)
+
+
+@pytest.mark.parametrize(("along_rad", "rail"), [(0.0, True), (0.6, True), (np.pi / 2, False)])
+def test_a_line_across_its_way_is_no_rail(along_rad, rail):
+    """One ring on the back of a car ahead: its ends do not tell more, but the line itself does."""
+    offset_m = np.linspace(-1.2, 1.2, 20)
+    way = np.array([np.cos(along_rad), np.sin(along_rad), 0])
+    sighted, standing = {}, []
+    for n in range(5):
+        state = np.append(2.5 * n * way, 0)
+        sighted[n] = Sighting(state, 0.1 * n, n * 100_000_000, (n,))
+        line = np.stack([offset_m, 0 * offset_m, 0 * offset_m], 1) + state[:3]
+        standing.append(SimpleNamespace(points=line, time_s=np.full(20, 0.1 * n)))
+    track = Track(np.zeros(3), sighted, {n: np.arange(20) for n in range(5)})
+    track.smooth()
+    assert proof._may_be_a_rail(track, standing, SimpleNamespace()) == rail

@@ -16,10 +16,12 @@ _ROUGH_M, _ROUGH_PER_GAP, _ROUGH_S = 0.04, 0.2, 0.003  # by gap of rings, by spe
 _LEAST_WAY_M, _LEAST_WAY_PER_RESIDUAL, _LEAST_WAY_PER_ROUGH = 0.35, 8.0, 1.5
 _NUM_ASKED = 60
 _LEAST_STATES, _LEAST_S = 3, 0.15
-_SHORT_S, _MAX_OF_SHORT = 0.35, 0.03  # three places of a tree's crown may lie on a line
+_SHORT_S, _MAX_OF_SHORT = 0.35, 0.03  # three places of a tree's crown may lie on a line,
+_SHORT_OF_FEW_S, _FEW = 0.6, 0.2  # and even more where few looks contradict its standing still
 _MAX_CONTRADICTIONS = 0.3  # of those that standing still leaves,
 # which are so many, or of few looks this share, and of many at least that one.
 _LEAST_CONTRADICTIONS, _SHARE_OF_FEW, _LEAST_SHARE = 20, 0.08, 0.01
+_ALONG = np.cos(np.deg2rad(45))
 _AS_FAST, _RAIL_M, _SLENDER, _SHARE_OF_RAIL = 0.1, 2.0, 8.0, 0.3
 
 
@@ -48,11 +50,12 @@ def left_contradicted(track: Track, standing: Sequence[Standing], space: FreeSpa
         return None
     if not _as_fast_as_measured(track, standing):
         return None
-    still, moved, num_asked = _contradictions(track, standing, space)
+    still, moved, num_asked = contradictions(track, standing, space)
     least = min(_LEAST_CONTRADICTIONS, _SHARE_OF_FEW * num_asked)
     if still < max(least, _LEAST_SHARE * num_asked) or moved > _MAX_CONTRADICTIONS * still:
         return None
-    if moved > _MAX_OF_SHORT * still and seen_s < min(_SHORT_S, np.ptp(space.clock.time_s) / 2):
+    short_s = _SHORT_OF_FEW_S if still < _FEW * num_asked else _SHORT_S
+    if moved > _MAX_OF_SHORT * still and seen_s < min(short_s, np.ptp(space.clock.time_s) / 2):
         return None
     if still < _SHARE_OF_RAIL * num_asked and _may_be_a_rail(track, standing, space):
         return None
@@ -75,9 +78,10 @@ def _goes_along(track: Track, space: FreeSpace) -> bool:
 
 
 def _may_be_a_rail(track: Track, standing: Sequence[Standing], space: FreeSpace) -> bool:
-    """Whether the object is much longer than high, and than wide or moving about as the scanner
-    does. Nothing of a guard rail tells its motion along itself; where it lies between two rings,
-    sweeps see through it; and rings go with the scanner, so that it seems to go with it too."""
+    """Whether the object goes about where it points, and is much longer than high, and than wide or
+    moving about as the scanner does. Nothing of a guard rail tells its motion along itself; where
+    it lies between two rings, sweeps see through it; and rings go with the scanner, so that it
+    seems to go with it too."""
     parts = [
         track.undo(standing[i].points[rows], standing[i].time_s[rows])
         for i, rows in track.claimed.items()
@@ -86,6 +90,9 @@ def _may_be_a_rail(track: Track, standing: Sequence[Standing], space: FreeSpace)
     body -= body.mean(axis=0)
     _, axes = np.linalg.eigh(body[:, :2].T @ body[:, :2])
     across_m, along_m = (body[:, :2] @ axes).T
+    way = (track.path(track.path.end_s) - track.path(track.path.begin_s))[:2]
+    if abs(way @ axes[:, 1]) < _ALONG * np.linalg.norm(way):
+        return False
     slope = along_m @ body[:, 2] / max(float(along_m @ along_m), 1e-6)
     high_m, wide_m = (
         float(np.subtract(*np.percentile(spread, [90, 10])))
@@ -109,7 +116,7 @@ def _as_fast_as_measured(track: Track, standing: Sequence[Standing]) -> bool:
     return not parts or Radial.together(parts).agrees(np.concatenate(velocities))
 
 
-def _contradictions(
+def contradictions(
     track: Track, standing: Sequence[Standing], space: FreeSpace
 ) -> tuple[int, int, int]:
     """How many looks through the track's points the sweeps have, standing still and moved, and how

@@ -23,6 +23,7 @@ from densify.flow.tracking.looks import Look, looks_of
 from densify.flow.tracking.proof import left_contradicted
 from densify.flow.tracking.shapes import Shape
 from densify.flow.tracking.sightings import Track
+from densify.flow.tracking.slides import take_back_slides
 from densify.flow.tracking.starts import (
     MIN_POINTS,
     ends,
@@ -108,6 +109,7 @@ def follow_groups(
         if proven:
             _gather(track, standing, free, space)
             _refine(track, standing, ground)
+            take_back_slides(track, standing, space)
             _claim_rings(track, standing, free, space)
         for j, rows in track.claimed.items():
             untried[j][rows] = False

@@ -61,10 +61,21 @@ class DistanceField:
         for _ in range(_TIMES_ASKED):
             _, row = self.tree.nearest(group.middle + elapsed_s[:, None] * velocities)
             elapsed_s = self.time_s[row] - group.middle_s
+        self.look_up(found, group.points, group.late_s, velocities, elapsed_s)
+
+    def look_up(
+        self,
+        found: NDArray[np.uint8],
+        points: Float,
+        late_s: Float,
+        velocities: Float,
+        elapsed_s: Float,
+    ) -> None:
+        """The same of (N,3) points that have moved for ``elapsed_s`` (V,), ``late_s`` (N,) less."""
         look_up.over_rows(
             len(velocities),
-            group.points,
-            group.late_s,
+            points,
+            late_s,
             velocities,
             elapsed_s,
             self.low,
@@ -110,11 +121,11 @@ def vote(group: Group, n: int, fields: Sequence[Sequence[DistanceField]], clock:
     coarse = 2 * _VOTE_STEP_M / near_s
     near = [fields[m] for m in _looks_around(n, near_s, clock)]
     both = near + [fields[m] for m in _looks_around(n, max(_FINE_S / 2, near_s), clock)]
-    rough = _best(group.some(_VOTE_POINTS), near, _grid(int(_MAX_SPEED_M_S / coarse)) * coarse)
+    rough = _best(group.some(_VOTE_POINTS), near, grid(int(_MAX_SPEED_M_S / coarse)) * coarse)
     group = group.some(10 * _VOTE_POINTS)
-    found = _best(group, near, rough + _grid(6) * coarse / 3)
+    found = _best(group, near, rough + grid(6) * coarse / 3)
     num = max(1, round(coarse / 3 / _FINE_M_S))
-    return _best(group, both, found + _grid(num) * coarse / 3 / num)
+    return _best(group, both, found + grid(num) * coarse / 3 / num)
 
 
 def _looks_around(n: int, step_s: float, clock: Clock) -> list[int]:
@@ -134,7 +145,8 @@ def _best(group: Group, around: Sequence[Sequence[DistanceField]], velocities: F
     return np.asarray(velocities[np.argmin(cost + 1e-3 * np.linalg.norm(velocities, axis=1))])
 
 
-def _grid(n: int) -> Float:
+def grid(n: int) -> Float:
+    """(V,3) all steps in the plane of up to n along x and y."""
     span = np.arange(-n, n + 1.0)
     x, y = np.meshgrid(span, span, indexing="ij")
     return np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], 1)
