@@ -45,8 +45,8 @@ class Cut:
 
     @property
     def num_blocks_around(self) -> int:
-        """On each side of a block, that its motion is made of. Steps look one sweep farther than
-        the margin, which may be as far as a hole in time is long."""
+        """How many blocks on each side of a block its motion is made of. Steps look one sweep
+        farther than the margin, which may be as far as a hole in time is long."""
         return math.ceil((self.margin_s + 0.5) / BLOCK_S)
 
     @property

@@ -83,7 +83,7 @@ class Clock:
         return min(among, key=lambda k: (abs(self.time_ns[k] - self.time_ns[j]), k))
 
     def from_end_s(self, i: int) -> float:
-        """To the nearer end of the stretch."""
+        """The time to the nearer end."""
         from_end_ns = min(self.time_ns[i] - self.time_ns[0], self.time_ns[-1] - self.time_ns[i])
         return float(from_end_ns) / 1e9
 

@@ -76,7 +76,7 @@ def _of_camera(camera: Camera) -> Iterator[str]:
 
 
 def _of_times(stretch: Stretch, settings: Config) -> Iterator[str]:
-    """Only where motion within sweeps is to be undone."""
+    """Doubts of the point times, where motion within sweeps is to be undone."""
     if not settings.register.deskew:
         return
     sweeps = [registered.sweep for registered in stretch.sweeps]

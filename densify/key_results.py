@@ -140,7 +140,7 @@ class _Shared:
             return HeldOut.of(self.views, cloud)
 
     def scored(self, shown: Future[_Shown], held_out: Future[HeldOut]) -> Result:
-        """With the score of what is made without the key sweep."""
+        """The result with the score of what is made without the key sweep."""
         result, seen, visible = shown.result()
         alone = held_out.result()
         with self.key.watch.stage("held out"):

@@ -30,9 +30,9 @@ METHODS = {
     "paper": Method(True, "paper", True, True),
     "flow": Method(True, "", True, True),
 }
-"""For `compare`: the key sweep alone; registration alone, of the window and of all sweeps within
+"""The key sweep alone; registration alone, of the window and of all sweeps within
 ``accumulate.far_m``; with visibility; our scene flow without visibility; the published scene flow;
-ours. `run` takes none, icp and flow."""
+ours. `compare` takes any, `run` none, icp and flow."""
 
 RUN = ("none", "icp", "flow")
 """What `run` takes, each with those before it as its baselines."""

@@ -50,7 +50,7 @@ class Sweeps:
         return found
 
     def content_if_readable(self, frame: int) -> str:
-        """The same, of a sweep that cannot be read why."""
+        """A digest of a sweep's content; of one that cannot be read, why."""
         try:
             return self.content(frame)
         except InputError as error:

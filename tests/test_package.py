@@ -160,7 +160,7 @@ def test_every_source_file_starts_with_its_license() -> None:
 
 def test_docstrings_are_sentences_with_a_subject() -> None:
     for path in (CHECKOUT / "densify").rglob("*.py"):
-        found = re.search(r'"""(Of|By) [^"]*', path.read_text("utf-8"))
+        found = re.search(r'"""(Of|By|With|Without|On|To|In|For|At) [^"]*', path.read_text("utf-8"))
         assert not found, f"{path}: {found and found.group()[:80]}"
 
 

@@ -214,7 +214,7 @@ def _warm_up(method: str, window: Window, pair: Pair, config: Config) -> None:
 
 
 def _ours(window: Window, config: Config) -> tuple[Motion, dict[int, FlowField]]:
-    """From the ground to the flow to the key, by frame."""
+    """The motion of our engine, and its flow to the key by frame."""
     motion = our_motion(window.around, config, window.frames)
     return motion, {f: motion.flow(f, window.key) for f in window.frames}
 
@@ -241,8 +241,8 @@ def _num_points(method: str, pairs: Mapping[int, Pair]) -> int:
 
 
 def _finished(measured: Mapping[str, _Measured]) -> dict[str, dict[str, Any]]:
-    """With seconds and movers' error as multiples of ours, where ours ran, and when the solvers of
-    the objective were how low."""
+    """The rows with seconds and movers' error as multiples of ours, where ours ran, and when the
+    solvers of the objective were how low."""
     rows = {method: m.row for method, m in measured.items()}
     if ADAM in measured:
         adam = measured[ADAM].traces

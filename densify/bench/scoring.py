@@ -285,7 +285,7 @@ def _segments(field: FlowField, points: Float) -> Int:
 
 
 def _plain(value: float) -> float | None:
-    """Not a number is None in JSON."""
+    """The value as JSON has it, None for not a number."""
     return None if math.isnan(value) else value
 
 

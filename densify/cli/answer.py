@@ -20,7 +20,7 @@ class Answer:
     first: Mapping[Path, str] = field(default_factory=dict)
 
     def lines(self) -> list[str]:
-        """For people: the text, every file, and those to open first."""
+        """What people read: the text, every file, and those to open first."""
         lines = [self.text] if self.text else []
         lines += map(str, self.files)
         if self.first:

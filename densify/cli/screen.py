@@ -129,8 +129,10 @@ def _log_warning(message: Warning | str, category: type[Warning], *where: Any) -
 
 
 def tell_doubts(doubts: Iterable[tuple[str, str, int]], most: int = 20) -> None:
-    """At the end, each once, what holds for most keys first; doubts: (warning, recording or "",
-    key)."""
+    """Say each doubt once, at the end, what holds for most keys first.
+
+    doubts: (warning, recording or "", key).
+    """
     from densify.readers.files import format_frames
 
     log = logging.getLogger("densify")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""From a preset, a file, a mapping and single knobs to a checked `Config`."""
+"""A checked `Config` is made of a preset, a file, a mapping and single knobs."""
 
 from __future__ import annotations
 

@@ -21,7 +21,7 @@ def packed(task: Task) -> bytes:
 
 
 def answer(work: bytes) -> bytes:
-    """In the worker: do what is packed; value or error, traceback and log records, packed."""
+    """Do what is packed, in the worker; value or error, traceback and log records, packed."""
     call, arguments, level = pickle.loads(work)
     kept = _Kept()
     _log.addHandler(kept)

@@ -260,7 +260,7 @@ def _read_drives(root: Path) -> dict[str, StoredDrive]:
 
 
 def _map_path(drive: StoredDrive, kind: str, camera: str, frame: int) -> str:
-    """In the set, as the manifest names it."""
+    """The map's path in the set, as the manifest names it."""
     return f"{drive.folder}/proj_depth/{kind}/{camera}/{frame:010d}.png"
 
 

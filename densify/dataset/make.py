@@ -75,7 +75,7 @@ class Summary:
 
     @property
     def seconds_left(self) -> float | None:
-        """At the rate so far; None before the first key."""
+        """The time that is left at the rate so far; None before the first key."""
         return self.seconds / self.num_made * self.num_left if self.num_made else None
 
     def mean(self, score: str) -> float | None:
@@ -341,7 +341,7 @@ def _bytes_per_key(recipe: Recipe, drive: PlannedDrive) -> float:
 
 
 def _line(record: KeyRecord, summary: Summary) -> str:
-    """For the log."""
+    """A line of the log."""
     left_s = summary.seconds_left or 0.0
     told = f" ({record.reason})" if record.reason else ""
     return (

@@ -69,7 +69,7 @@ class _Worker:
         return int(pages) * os.sysconf("SC_PAGE_SIZE")
 
     def end(self) -> None:
-        """At once, whatever it is at."""
+        """Stop it at once, whatever it is at."""
         self.process.kill()
         self.process.join()
         self.connection.close()

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: MIT
-"""From registered sweeps to what cameras see: accumulation, visibility, filling, colour, age."""
+"""What cameras see of registered sweeps: accumulation, visibility, filling, colour, age."""

@@ -36,7 +36,7 @@ def fill(layers: Layers, settings: ProjectSettings) -> Layers:
 
 
 def voted(layers: Layers, before_m: Float32, least_share: float) -> Layers:
-    """Without what has been filled since ``before_m`` (H,W) against the votes of the measured
+    """The layers without what was filled since ``before_m`` (H,W) against the votes of the measured
     pixels around.
 
     ``least_share`` of the votes (`densify.depth.votes`) must be in favour; what is filled has none,

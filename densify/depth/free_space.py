@@ -97,7 +97,7 @@ def without_seen_through(
     reason: NDArray[np.uint8],
     settings: ProjectSettings,
 ) -> Layers:
-    """Without the pixels of which rays say that the place is open; what was measured there becomes
+    """Take out the pixels of which rays say that the place is open; what was measured there becomes
     a rim that is not accepted.
 
     view: of the cloud. rays: those that tell. reason: (M,) of the points, as far as the map is

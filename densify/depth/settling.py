@@ -51,7 +51,7 @@ class MeasuredPixels:
         return MeasuredPixels(**{name: column[keep] for name, column in vars(self).items()})
 
     def replaced(self, others: MeasuredPixels) -> MeasuredPixels:
-        """With other pixels of the same points, which count where both know one."""
+        """The pixels and others of the same points, which count where both know one."""
         kept = self.select(~np.isin(self.pixel, others.pixel))
         more = vars(others)
         both = MeasuredPixels(**{n: np.concatenate([c, more[n]]) for n, c in vars(kept).items()})

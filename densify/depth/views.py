@@ -59,7 +59,7 @@ class SeenCloud(NamedTuple):
         return _in_any(self.views, len(self.cloud))
 
     def joined(self, far: SeenCloud | None) -> SeenCloud:
-        """With what sweeps beyond the window measured."""
+        """The same and what sweeps beyond the window measured."""
         if far is None or not len(far.cloud):
             return self
         views = {n: view.joined(far.views[n], len(self.cloud)) for n, view in self.views.items()}
@@ -166,7 +166,7 @@ class Views:
         depth: Mapping[str, DepthMap],
         images: Mapping[str, NDArray[np.uint8]],
     ) -> Cloud:
-        """With the colours of the images there are; depth: what `depth` made of the cloud."""
+        """The cloud with the colours of the images there are; depth: what `depth` made of it."""
         cloud = seen.cloud
         for name, image in images.items():
             rgb = colour(cloud, seen.views[name], depth[name], image)
@@ -174,7 +174,7 @@ class Views:
         return cloud
 
     def truth(self, truth: Truth) -> dict[str, tuple[Float32, Bool]]:
-        """For the maps that show an image: its true depth, measured as the map's, and (H,W) where
+        """The true depth, measured as the map's, of the maps that show an image, and (H,W) where
         something moves."""
         known = {}
         for name, e in self.exposures.items():
@@ -185,7 +185,7 @@ class Views:
         return known
 
     def cameras(self) -> dict[str, CameraView]:
-        """From where each map looks."""
+        """Where each map looks from."""
         return {
             name: CameraView(e.camera, e.T_cam_key, e.late_s, e.number)
             for name, e in self.exposures.items()

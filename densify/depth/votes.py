@@ -71,5 +71,5 @@ def elected(
 
 
 def _image(layers: Layers) -> Float32:
-    """Without an image that fits the seeds tell by distance alone."""
+    """The image; where none fits, one of a single colour: seeds then tell by distance alone."""
     return np.zeros((*layers.depth_m.shape, 3), np.float32) if layers.lab is None else layers.lab

@@ -49,7 +49,7 @@ def sharpness(points: Float, origin_m: Float, bins: int = 1) -> float:
 
 
 def check_rings(sample: Sample) -> list[Finding]:
-    """For each scanner: where it stands, and whether its sweeps are as they were fired."""
+    """Where each scanner stands, and whether its sweeps are as they were fired."""
     findings = []
     for lidar in sorted({int(n) for s in sample.spots for n in np.unique(s.sweeps[0].lidar)}):
         R = sample.spots[0].sweeps[0].axes(lidar)  # rings are level in the scanner's own axes

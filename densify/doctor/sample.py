@@ -105,7 +105,7 @@ def _chosen(timeline: Timeline) -> list[list[int]]:
 
 
 def within(sweep: Sweep, settings: RegisterSettings) -> Sweep:
-    """Without the own vehicle's returns and those too far to trust."""
+    """The sweep without the own vehicle's returns and those too far to trust."""
     range_m = np.linalg.norm(sweep.points, axis=1)
     return sweep.select((range_m >= settings.min_range_m) & (range_m <= settings.max_range_m))
 

@@ -132,7 +132,7 @@ class Order(NamedTuple):
 
 
 def firing_order(azimuth: Float32, offset_s: Float32) -> Order:
-    """From one sweep's returns and their firing times."""
+    """The order told by one sweep's returns and their firing times."""
     duration_s = float(np.ptp(offset_s)) if len(offset_s) else 0.0
     if duration_s == 0.0:
         return Order(True, 0, None)

@@ -293,7 +293,7 @@ def _uniform_table(across_rad: float, along_rad: float) -> RayTable:
 
 
 def _table_of_rings(rings: Float, step_rad: float) -> RayTable:
-    """At a ring the mean of the gaps to both its neighbours."""
+    """The spacing at a ring is the mean of the gaps to both its neighbours."""
     low = float(rings[0]) - _BEYOND_RAD
     num_bins = int((float(rings[-1]) + _BEYOND_RAD - low) / _RING_BIN_RAD) + 1
     elevation = low + (np.arange(num_bins) + 0.5) * _RING_BIN_RAD

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""To which of the surfaces around it a pixel belongs, by the image, compiled: see
+"""Which of the surfaces around it a pixel belongs to, by the image, compiled: see
 `densify.depth.rims`."""
 
 from __future__ import annotations

@@ -11,7 +11,7 @@ import torch
 
 
 def one_thread() -> None:
-    """From now on, in the calling thread."""
+    """Have the calling thread work alone from now on."""
     torch.set_num_threads(1)
 
 

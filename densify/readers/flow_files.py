@@ -102,7 +102,7 @@ class FlowFiles:
 def rows_in_file(
     path: Path, arrays: dict[str, NDArray[Any]], row: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-    """For each of the sweep's points that the file knows its place there, and which those are.
+    """Where in the file each of the sweep's points is that the file knows, and which those are.
 
     row: (N,) of the points in the sweep's file. Raises InputError where the file has too few.
     """

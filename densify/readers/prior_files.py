@@ -71,7 +71,7 @@ class PriorFiles:
         return PriorFiles(place, values, sky)
 
     def said_of(self, camera: str) -> str:
-        """For messages, which images of a camera there is a prior for."""
+        """Which images of a camera there is a prior for, for messages."""
         return f"there are {format_frames(self.values[camera])}"
 
     def prior(self, camera: Camera, number: int) -> Prior | None:
@@ -160,7 +160,7 @@ def _png(path: Path) -> NDArray[Any]:
 
 
 def _resized(value: Float32, camera: Camera, path: Path) -> Float32:
-    """At the camera's size; between two values linear, and none beside none."""
+    """The values at the camera's size: linear between two of them, none beside none."""
     size = (camera.width_px, camera.height_px)
     if value.shape == size[::-1]:
         return value

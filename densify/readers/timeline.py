@@ -107,14 +107,14 @@ class Timeline:
         return [[self.frames[row] for row in run] for run in runs]
 
     def before(self, frame: int, num: int) -> list[int]:
-        """At most ``num`` frames directly before this one, up to a hole in time."""
+        """The ``num`` frames directly before this one, fewer behind a hole in time."""
         row = first = self.row[frame]
         while first > 0 and row - first < num and not self._hole_before(first):
             first -= 1
         return list(self.frames[first:row])
 
     def after(self, frame: int, num: int) -> list[int]:
-        """At most ``num`` frames directly after this one, up to a hole in time."""
+        """The ``num`` frames directly after this one, fewer before a hole in time."""
         row = last = self.row[frame]
         while last + 1 < len(self.frames) and last - row < num and not self._hole_before(last + 1):
             last += 1

@@ -153,7 +153,7 @@ def _grid(center: Float, reach_m: float, step_m: float) -> Float:
 
 
 def _tree(points: Float) -> cKDTree:
-    """For few queries: built without balancing, which takes longer than they do."""
+    """A tree for few queries: they take less time than balancing it would."""
     return cKDTree(points, balanced_tree=False, compact_nodes=False)
 
 

@@ -52,7 +52,7 @@ class _View(NamedTuple):
     rgb: Picture
 
     def over(self, other: _View) -> _View:
-        """With another's points; the nearer ones are seen."""
+        """The view with another's points; the nearer ones are seen."""
         nearer = self.depth_m <= other.depth_m
         return _View(
             np.where(nearer, self.depth_m, other.depth_m),

@@ -68,7 +68,7 @@ CAMERAS = {
         _FISHEYE,
     )
 }
-"""With a level mount."""
+"""The cameras, beside a level mount."""
 
 SHUTTERS = {
     "image_02": Shutter(0),

@@ -44,7 +44,7 @@ class Simulator:
 
     @property
     def period_ns(self) -> int:
-        """From sweep to sweep."""
+        """The time from sweep to sweep."""
         return 1_000_000_000 // self.hz
 
     @property

@@ -141,7 +141,7 @@ def _people_street(
 
 
 def _turning_truck(ways: Ways, main: Curve, side: Curve, mouth_m: float) -> None:
-    """From the oncoming lane into the side road on its right."""
+    """A truck that turns from the oncoming lane into the side road on its right."""
     oncoming = Lane(main, _ONCOMING_M, forward=False).curve
     knots = np.arange(0.0, oncoming.length_m, 0.5)
     xy = oncoming(knots)

@@ -198,7 +198,7 @@ class _Lines(NamedTuple):
 
 
 def _solid(mesh: Mesh) -> Mesh:
-    """Without triangles of no area, with vertices as the ray caster rounds them."""
+    """The mesh without triangles of no area, its vertices as the ray caster rounds them."""
     vertices = mesh.vertices.astype(np.float32).astype(np.float64)
     a, b, c = (vertices[mesh.triangles[:, i]] for i in range(3))
     keep = np.linalg.norm(np.cross(b - a, c - a), axis=1) > 1e-7

@@ -57,7 +57,7 @@ class Cloud:
         return replace(self, points=self.points + seconds * self.velocity_m_s)
 
     def joined(self, other: Cloud) -> Cloud:
-        """With another's points behind these."""
+        """The cloud with another's points behind its own."""
         names = [f.name for f in fields(self)]
         return Cloud(**{n: np.concatenate([getattr(self, n), getattr(other, n)]) for n in names})
 
@@ -137,7 +137,7 @@ class Patches:
     place: NDArray[np.int32]
 
     def joined(self, other: Patches) -> Patches:
-        """With those of another cloud behind these; no sweep is in both."""
+        """The patches with those of another cloud behind them; no sweep is in both."""
         num_sweeps = np.int32(self.sweep.max(initial=-1) + 1)
         return Patches(
             np.concatenate([self.normal, other.normal]),
@@ -284,7 +284,7 @@ class Ranked(NamedTuple):
 
 @dataclass(frozen=True)
 class CameraView:
-    """From where a depth map looks.
+    """Where a depth map looks from.
 
     T_cam_key: (4,4) at the moment the map shows. late_s: seconds from the key's reference time to
     that moment. number: of the image, None where there is none.

@@ -116,7 +116,7 @@ class Trajectory:
         )
 
     def joined(self, following: Trajectory, frames: Sequence[int]) -> Trajectory:
-        """With these frames of another trajectory, which has this one's last frame too."""
+        """The trajectory with these frames of another one, which has its last frame too."""
         T_world_last = self.T_world_lidar[-1]
         T_other_last = following.T_world_lidar[following.frames.index(self.frames[-1])]
         T_world_other = T_world_last @ inverse(T_other_last)

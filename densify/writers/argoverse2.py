@@ -90,7 +90,7 @@ def write_tree(excerpt: Excerpt, out: Path, overwrite: bool, progress: Progress 
 
 
 def _put_boxes(path: Path, excerpt: Excerpt, half_ns: int) -> None:
-    """In the vehicle's frame at each sweep's stamp."""
+    """Write the boxes in the vehicle's frame at each sweep's stamp."""
     tables: list[dict[str, NDArray[Any]]] = []
     for frame in excerpt.frames:
         stamp_ns = excerpt.street.stamp_ns(frame) - half_ns

@@ -59,7 +59,8 @@ class PairCloud:
 
     @cached_property
     def even_tree(self) -> cKDTree:
-        """Without the density along the scan lines, which says nothing of that across."""
+        """The tree of one point per voxel: the density along scan lines says nothing of that
+        across."""
         places = self.places(self.points, np.arange(len(self.points)))
         return tree_of(places[one_per_voxel(places, _EVEN_M)])
 
@@ -275,7 +276,7 @@ def one_per_voxel(places: Float, side_m: float) -> Int:
 
 
 def thinned(rows: Int, num: int) -> Int:
-    """At most ``num`` of them, evenly."""
+    """The rows, or ``num`` of more, evenly."""
     return rows[:: (len(rows) - 1) // num + 1] if len(rows) else rows
 
 

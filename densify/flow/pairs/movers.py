@@ -78,7 +78,7 @@ def find_movers(
 def _choose(
     trials: list[Trial], groups: list[Int], ours: Unexplained, theirs: Unexplained
 ) -> tuple[list[RigidMotion], Int]:
-    """At most one motion per group; a target is explained once."""
+    """The motions that are taken, at most one per group; each target is explained once."""
     free = np.ones(len(theirs.unexplained), bool)
     trials = _thinnest([t for t in trials if t.proves(free)])
     assigned = _assigned(trials, theirs.group)
@@ -95,8 +95,8 @@ def _choose(
 
 
 def _thinnest(trials: list[Trial]) -> list[Trial]:
-    """Without those that leave an object's surfaces thicker than another motion close by does: that
-    tells better than nearest points, which are content with any ring."""
+    """The trials without those that leave an object's surfaces thicker than another motion close by
+    does: that tells better than nearest points, which are content with any ring."""
     kept = []
     for trial in trials:
         others_m = [

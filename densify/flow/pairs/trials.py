@@ -86,8 +86,9 @@ class Trial:
         )
 
     def after(self, found: Refined, settled: Trial) -> Trial:
-        """With the motion that was found from this one, judged by nearest points where they fit
-        better: here, or as ``settled`` has it. A ring drawn onto another fits, but holds back."""
+        """The trial with the motion that was found from this one, judged by nearest points where
+        they fit better: here, or as ``settled`` has it. A ring drawn onto another fits, but holds
+        back."""
         here, there = (t._off(len(t.around) - len(t.explained)) for t in (self, settled))
         return replace(self, refined=found) if here < there else settled
 
@@ -185,8 +186,8 @@ def _ambiguous(points: Float, way: Float) -> bool:
 def _looked_back(
     motion: RigidMotion, members: Int, ours: Unexplained, theirs: Unexplained
 ) -> tuple[Int, Int, float]:
-    """From the target to the group where it arrives: `Trial`'s around, explained, and by how much
-    the distances become shorter (m)."""
+    """What the target tells of the group where it arrives: `Trial`'s around, explained, and by how
+    much the distances become shorter (m)."""
     sample = thinned(members, _JUDGE_POINTS)
     arrived = motion.seen(ours.cloud.points[sample])
     low, high = arrived.min(0) - _AROUND_M, arrived.max(0) + _AROUND_M

@@ -229,7 +229,7 @@ class _Bending:
         self._solve(weight + anchor + self._steady, pull, _ALPHAS[level])
 
     def bring_beyond(self) -> None:
-        """To each hop's target add the part after it, brought there by the flow so far: gaps and
+        """Add to each hop's target the part after it, brought there by the flow so far: gaps and
         edges of one sweep are filled by the other."""
         flows = self._by_hop()
         targets = []
@@ -248,7 +248,7 @@ class _Bending:
         return np.concatenate([forth, self._nodes[i + 1] + (1 - share) * flows[i + 1, i]])
 
     def at_points(self) -> tuple[tuple[Float, ...], tuple[Float, ...]]:
-        """For each part (n,3) to the next and to the previous one, 0 where there is none."""
+        """Flow of each part (n,3) to the next and to the previous one, 0 where there is none."""
         to_next = [np.zeros_like(p.points) for p in self._parts]
         to_previous = [np.zeros_like(p.points) for p in self._parts]
         for (a, b), flow in self._by_hop().items():

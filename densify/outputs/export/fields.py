@@ -51,7 +51,7 @@ class Fields:
         return float(self.value(name, lambda v: is_number(v) and least <= v <= most, what))
 
     def whole(self, name: str) -> int:
-        """To the last digit, as stamps need it."""
+        """A whole number with all its digits, as stamps need it."""
         return int(
             self.value(name, lambda v: type(v) is int and abs(v) < 1 << 63, "a whole number")
         )

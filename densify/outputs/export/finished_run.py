@@ -136,7 +136,7 @@ class FinishedRun:
 
     @cached_property
     def chosen_views(self) -> dict[str, CameraView]:
-        """From where the chosen cameras' maps look."""
+        """Where the chosen cameras' maps look from."""
         return {name: view for name, view in self.scene.views.items() if name in self.cameras}
 
     @cached_property

@@ -23,7 +23,7 @@ def write_export(run: FinishedRun, folder: Path) -> None:
 
 
 def write_drive(runs: Sequence[FinishedRun], folder: Path) -> None:
-    """For each key, microseconds in the names::
+    """Write of each key, microseconds in the names::
 
     samples/LIDAR_TOP/000120__LIDAR_TOP__1532402927647951.pcd.bin
         the accumulated cloud: float32 x y z (metres, key frame), intensity 0 to 255, and ring,

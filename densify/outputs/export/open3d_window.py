@@ -198,7 +198,7 @@ class _Layers:
         self.widget.look_at(_AHEAD_M, _EYE_M, _UP)
 
     def _put(self, key: Timeline, layer: str, geometries: Sequence[Any]) -> None:
-        """In the place of what the layer had."""
+        """Show this in the place of what the layer had."""
         scene = self.widget.scene
         for name in self._names[layer]:
             scene.remove_geometry(name)

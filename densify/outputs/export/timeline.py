@@ -89,7 +89,7 @@ def timelines(runs: Sequence[FinishedRun]) -> Iterator[Timeline]:
 
 
 def _T_between(run: FinishedRun, other: FinishedRun) -> Float:
-    """From the other's key to the run's."""
+    """The pose (4,4) of the other's key in the run's."""
     if other.key in run.scene.T_key_lidar:
         return run.scene.T_key_lidar[other.key]
     if run.key in other.scene.T_key_lidar:

@@ -130,9 +130,9 @@ class KittiRaw(FileSequence):
         return {f: ns for f in self._images[camera] if (ns := exposed_ns(f)) is not None}
 
     def _pose(self, frame: int) -> Float:
-        """From GPS and inertial unit. An oxts record is up to 20 ms away from the sweep of the same
-        number, 0.3 m at 15 m/s, so the pose is interpolated between the records before and after
-        the sweep; at the end of the records it is extrapolated from the last two."""
+        """The pose by GPS and inertial unit. An oxts record is up to 20 ms away from the sweep of
+        the same number, 0.3 m at 15 m/s, so the pose is interpolated between the records before and
+        after the sweep; at the end of the records it is extrapolated from the last two."""
         if not self._oxts:
             return super()._pose(frame)
         of_frame(self._oxts, frame, "oxts record", self.where)

@@ -40,7 +40,7 @@ _RATES_HZ = (5, 10, 15, 20, 25)
 
 
 class Period(NamedTuple):
-    """From sweep to sweep, and how it was found; "" where the sweeps have stamps."""
+    """The time from sweep to sweep, and how it was found; "" where the sweeps have stamps."""
 
     ns: int
     told_by: str
@@ -127,7 +127,7 @@ class SweepColumns:
         )
 
     def _period_of_times(self) -> Period | None:
-        """From one sweep's first point to the next one's, or by how long a sweep takes."""
+        """The time from one sweep's first point to the next one's, or that a sweep takes."""
         if not self._fields.time:
             return None
         frame, _, columns = self._sample
