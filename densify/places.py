@@ -45,7 +45,7 @@ class Places:
 
     def _registration(self, number: int) -> Registration:
         frames = self._cut.blocks[number].frames
-        num_before = self._settings.num_lead_in
+        num_before = self._timeline.num_in(self._settings.lead_in_s)
         if self._cut.margin_s:  # without a sweep before it a block could not be joined to the last
             num_before = max(1, num_before)
         bad, known, frames = {}, {}, (*self._timeline.before(frames[0], num_before), *frames)

@@ -122,7 +122,8 @@ class Recording:
         self.cut = cut
         self._num_around, self._cache, self._watch = window, cache, watch or Watch()
         # What the next step, key or block is likely to ask for again is kept in memory.
-        num_raw = 1 if cut.margin_s else cut.num_kept + settings.register.num_lead_in
+        num_before = self.timeline.num_in(settings.register.lead_in_s)
+        num_raw = 1 if cut.margin_s else cut.num_kept + num_before
         self.sweeps = Sweeps(
             sequence, self.timeline, settings.register, num_raw, cache, run, self._watch
         )

@@ -132,16 +132,18 @@ def test_every_knob_takes_its_limits_and_refuses_what_is_beyond(section: str, fi
 
 
 def test_round_trip() -> None:
-    config = resolve("paper", ["register.num_lead_in=7", "objective.radius_m=0.5"])
+    config = resolve("paper", ["register.lead_in_s=0.7", "objective.radius_m=0.5"])
     text = yaml.safe_dump(as_mapping(config))
     assert resolve(yaml.safe_load(text)) == config != Config()
 
 
 @settings(max_examples=20)
-@given(st.integers(0, 50), st.floats(0, 1e6), st.booleans(), st.sampled_from(["rigid", "drop"]))
-def test_round_trip_through_yaml_text(lead_in: int, alpha: float, deskew: bool, word: str) -> None:
+@given(st.floats(0, 5), st.floats(0, 1e6), st.booleans(), st.sampled_from(["rigid", "drop"]))
+def test_round_trip_through_yaml_text(
+    lead_in_s: float, alpha: float, deskew: bool, word: str
+) -> None:
     changes = {
-        "register": {"num_lead_in": lead_in, "deskew": deskew},
+        "register": {"lead_in_s": lead_in_s, "deskew": deskew},
         "objective": {"alpha": alpha},
         "accumulate": {"unfollowed": word},
     }
@@ -254,8 +256,8 @@ def test_unknown_preset_suggests_one() -> None:
 
 def test_python_users_are_checked_too() -> None:
     assert RegisterSettings(voxel_size_m=2).voxel_size_m == 2.0
-    with pytest.raises(InputError, match=r"register\.num_lead_in: got -1"):
-        RegisterSettings(num_lead_in=-1)
+    with pytest.raises(InputError, match=r"register\.lead_in_s: got -1"):
+        RegisterSettings(lead_in_s=-1)
     with pytest.raises(InputError, match="min_range_m"):
         RegisterSettings(min_range_m=50, max_range_m=20)
     far = resolve(None, ["register.min_range_m=20", "register.max_range_m=300"])

@@ -127,7 +127,7 @@ class _Torn(TinySequence):
 def test_the_far_range_ends_at_a_sweep_that_cannot_be_read(source):
     whole = drive()
     torn = _Torn(whole.scene, range(NUM_FRAMES))
-    settings = {**FAR, "register": {"source": source, "num_lead_in": 2}}
+    settings = {**FAR, "register": {"source": source, "lead_in_s": 0.2}}
     far = pipeline.run(torn, KEY, WINDOW, config=settings)
     frames = np.unique(far.cloud.frame)
     assert frames.min() > KEY - 6 and frames.max() < KEY + 7

@@ -195,13 +195,22 @@ def test_sweeps_at_a_border_are_deskewed_by_their_neighbours_in_the_other_block(
         assert abs(here.twist_after - here.twist_before).max() > 0.05
 
 
-@pytest.mark.parametrize("num_lead_in", [0, 1, 5])
-def test_no_window_is_cut_at_a_border(num_lead_in: int, tmp_path: Path) -> None:
+@pytest.mark.parametrize("lead_in_s", [0.0, 0.1, 0.5])
+def test_no_window_is_cut_at_a_border(lead_in_s: float, tmp_path: Path) -> None:
     for source in ("dataset", "kiss-icp"):
-        config = resolve({"register": {"source": source, "num_lead_in": num_lead_in}})
+        config = resolve({"register": {"source": source, "lead_in_s": lead_in_s}})
         drive = drive_of(across_border(), tmp_path, 2, config)
         assert drive.window(BORDER - 1).frames == tuple(range(BORDER - 3, BORDER + 2))
         assert drive.window(BORDER).frames == tuple(range(BORDER - 2, BORDER + 3))
+
+
+@pytest.mark.parametrize(("step", "first"), [(1, -7), (2, -10)])
+def test_odometry_starts_half_a_second_before_the_window_at_any_rate(step: int, first: int) -> None:
+    frames = [f for f in range(BORDER - 12, BORDER + 5) if (f - BORDER) % step == 0]
+    recording = Recording(across_border(frames), GIVEN, 2, [BORDER])
+    (piece,) = recording.registration(0).pieces
+    assert piece.frames[0] - BORDER == first
+    assert recording.window(BORDER).frames[0] - BORDER == -2 * step
 
 
 def test_a_hole_in_time_ends_windows_and_begins_a_world(tmp_path: Path) -> None:

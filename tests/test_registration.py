@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from densify.config import RegisterSettings
-from densify.errors import ComputationError
+from densify.errors import ComputationError, SweepError
 from densify.geometry import poses
 from densify.readers.street import Street
 from densify.readers.window import read_sweep, recorded_trajectory
@@ -51,6 +51,17 @@ def second_pass(raw):
 def both_passes(raw) -> Trajectory:
     rough = register(raw, SETTINGS)
     return register([s.sweep for s in deskew(raw, rough).sweeps], SETTINGS, rough)
+
+
+@pytest.mark.parametrize("late_ms", [0, 20])
+def test_stamps_that_do_not_ascend_are_refused_before_anything_is_done(raw, late_ms, monkeypatch):
+    """Sweeps of one moment would count as one look."""
+    monkeypatch.setattr(trajectory, "register", None)
+    stamp_ns = raw[5].stamp_ns - late_ms * 1_000_000
+    wrong = [*raw[:6], replace(raw[6], stamp_ns=stamp_ns), *raw[7:]]
+    with pytest.raises(SweepError, match="stamp of frame 6 is not after that of frame 5") as error:
+        trajectory.find_trajectory(wrong, SETTINGS)
+    assert error.value.frame == 6
 
 
 def errors(found: Trajectory, true: Trajectory) -> tuple[np.ndarray, np.ndarray]:

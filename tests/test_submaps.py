@@ -178,7 +178,7 @@ def test_a_stretch_that_does_not_hold_is_left_out_with_a_warning(tmp_path, monke
     sequence = TinySequence(
         Scene(World(street(60.0)), EGO, Scanner(48, 720, sigma_m=0.01)), range(36)
     )
-    settings = {"accumulate": {"far_m": 14.0}, "register": {"num_lead_in": 2}}
+    settings = {"accumulate": {"far_m": 14.0}, "register": {"lead_in_s": 0.2}}
     result = pipeline.run(sequence, 15, 2, config=settings)
     assert result.far_left_out and set(result.far_left_out).isdisjoint(result.far_frames)
     assert any("left out of the far range" in text for text in result.warnings)

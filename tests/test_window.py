@@ -46,6 +46,11 @@ def test_every_second_sweep_is_a_recording_of_half_the_rate():
     assert there.runs(there.frames) == [list(range(0, 40, 2))]
 
 
+@pytest.mark.parametrize(("hz", "num"), [(5, 3), (9.66, 5), (10, 5), (10.3, 5), (20, 10), (0.9, 0)])
+def test_how_many_sweeps_follow_in_a_time(hz, num):
+    assert timeline(range(20), round(1e9 / hz)).num_in(0.5) == num
+
+
 @pytest.mark.parametrize("num_missing", [1, 2])
 def test_a_window_goes_on_over_a_few_missing_sweeps(num_missing):
     there = timeline([f for f in range(20) if not 8 <= f < 8 + num_missing])

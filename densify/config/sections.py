@@ -25,11 +25,12 @@ class RegisterSettings(Section):
         "kiss-icp: estimate the poses from the sweeps; dataset: take the recording's own",
         choices=("kiss-icp", "dataset"),
     )
-    num_lead_in: int = knob(
-        5,
-        "sweeps registered before the window so that odometry knows the speed; more is safer",
+    lead_in_s: float = knob(
+        0.5,
+        "[s] sweeps so far before the window are registered too, so that odometry knows the speed "
+        "and the first ones have neighbours; more is safer",
         0,
-        50,
+        5,
     )
     voxel_size_m: float = knob(
         0.5,

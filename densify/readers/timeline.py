@@ -81,6 +81,10 @@ class Timeline:
             return _NOMINAL_PERIOD_NS
         return max(1, int(np.median(np.diff(self.stamp_ns))))
 
+    def num_in(self, duration_s: float) -> int:
+        """How many sweeps usually follow each other in that time; half a one counts."""
+        return int(duration_s * 1e9 / self.period_ns + 0.5)
+
     @cached_property
     def row(self) -> Mapping[int, int]:
         """Frame -> where it stands in ``frames``."""

@@ -64,7 +64,7 @@ def register(
     frames = tuple(s.frame for s in sweeps)
     stamp_ns = np.array([s.stamp_ns for s in sweeps], np.int64)
     check_number_of_points(sweeps, settings)
-    _check_stamps(frames, stamp_ns)
+    check_stamps(frames, stamp_ns)
     step_s = np.diff(stamp_ns) * 1e-9
     voxel_size_m = _voxel_size_m(sweeps, settings) * (2 if rough is None else 1)
     odometry = KissICP(_kiss_icp_config(settings, voxel_size_m, rough is not None))
@@ -169,7 +169,7 @@ def _standing(points: Float) -> Float:
     return standing if len(standing) else points
 
 
-def _check_stamps(frames: Sequence[int], stamp_ns: Int) -> None:
+def check_stamps(frames: Sequence[int], stamp_ns: Int) -> None:
     """Raise SweepError where time does not go on."""
     for (a, b), step_ns in zip(pairwise(frames), np.diff(stamp_ns), strict=True):
         if step_ns <= 0:
@@ -183,7 +183,7 @@ def _check_stamps(frames: Sequence[int], stamp_ns: Int) -> None:
 
 def check_plausible(trajectory: Trajectory, settings: RegisterSettings) -> None:
     """Raise SweepError where the trajectory jumps as no vehicle does."""
-    _check_stamps(trajectory.frames, trajectory.stamp_ns)
+    check_stamps(trajectory.frames, trajectory.stamp_ns)
     step_s = np.diff(trajectory.stamp_ns) * 1e-9
     pairs = list(pairwise(trajectory.frames))
     T = trajectory.T_world_lidar

@@ -18,6 +18,7 @@ from densify.registration.odometry import (
     check_number_of_points,
     check_overlap,
     check_plausible,
+    check_stamps,
     register,
 )
 from densify.registration.upright import upright
@@ -57,6 +58,7 @@ def find_trajectory(
         found = recorded
     else:
         check_number_of_points(sweeps, settings)
+        check_stamps([s.frame for s in sweeps], _stamps_ns(sweeps))
         rough = _rough(sweeps, settings)
         straight = [s.sweep for s in deskew(sweeps, rough).sweeps]
         found = refine(sweeps, _fine(straight, rough, settings), settings)
