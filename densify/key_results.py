@@ -216,7 +216,7 @@ class _Shared:
         self, cloud: Cloud, depth: Mapping[str, DepthMap], visible: bool
     ) -> dict[str, Any]:
         """What can be said of the result without truth, and against it where there is some."""
-        cameras, near = self.key.sequence.cameras, cloud.select(~cloud.far)
+        cameras = self.key.sequence.cameras
         metrics: dict[str, Any] = {
             "num_points": len(cloud),
             "num_moving": int(cloud.moving.sum()),
@@ -227,9 +227,9 @@ class _Shared:
                 }
                 for name, maps in depth.items()
             },
-            "ghosts": scores.ghost_scores(near, self.key_image, self.key.frame),
+            "ghosts": scores.ghost_scores(cloud, self.key_image, self.key.frame),
         }
-        radial = radial_velocity_scores(near, self.key.stretch[self.key.frame])
+        radial = radial_velocity_scores(cloud, self.key.stretch[self.key.frame])
         if radial is not None:
             metrics["radial_velocity"] = radial
         if self.truth:

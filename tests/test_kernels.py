@@ -13,6 +13,7 @@ import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
 
+import numba
 import numpy as np
 import pytest
 
@@ -96,7 +97,7 @@ def test_code_that_others_could_have_put_there_is_not_loaded(
 
 
 def test_compiling_is_announced_once_and_loading_is_not(double, caplog, monkeypatch):
-    monkeypatch.setattr(kernels._notice, "said", False)
+    monkeypatch.setattr(kernels._compiling, "said", False)
     caplog.set_level("INFO", "densify.progress")
     double.__module__ = "densify.kernels.doubling"
     monkeypatch.setitem(sys.modules, double.__module__, sys.modules["doubling"])
@@ -104,10 +105,25 @@ def test_compiling_is_announced_once_and_loading_is_not(double, caplog, monkeypa
     assert [r.getMessage().split()[0] for r in caplog.records] == ["compiling"]
     kernels.Kernel(double)(0, 2, np.arange(2), np.zeros(2))  # other types
     assert len(caplog.records) == 1
-    monkeypatch.setattr(kernels._notice, "said", False)
+    monkeypatch.setattr(kernels._compiling, "said", False)
     gc.collect()  # what was compiled, or it lives on in memory
     check(kernels.Kernel(double))  # from the cache
     assert len(caplog.records) == 1
+
+
+def test_the_garbage_collector_rests_only_while_compiling(double, monkeypatch):
+    collects = []
+    compile_extra = numba.core.compiler.compile_extra
+    watched = lambda *a, **k: (collects.append(gc.isenabled()), compile_extra(*a, **k))[1]  # noqa: E731
+    monkeypatch.setattr("numba.core.compiler.compile_extra", watched)
+    check(kernels.Kernel(double))
+    assert collects == [False] and gc.isenabled()
+    gc.disable()
+    try:
+        kernels.Kernel(double)(0, 2, np.arange(2), np.zeros(2))
+        assert not gc.isenabled()  # as the caller has it
+    finally:
+        gc.enable()
 
 
 def test_without_any_place_for_a_cache():

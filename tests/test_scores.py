@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -117,3 +118,13 @@ def test_ghost_scores_by_kind_and_distance():
         "by_distance": {"1": 0.0, "2": 0.5},
         "by_seconds": {"0.10": 0.0, "0.20": 0.5},
     }
+
+
+def test_what_sweeps_beyond_the_window_saw_is_no_ghost_of_it():
+    key = room()
+    seen = RangeImage.of(key)
+    near = (panel(10.0), KEY - 2, True), (key.sweep.points, KEY + 1, False)
+    alone, beside = cloud_of(*near), cloud_of(*near, (panel(10.0), KEY + 2, False))
+    beside = replace(beside, far=beside.frame == KEY + 2)
+    assert ghost_scores(beside, seen, KEY) == ghost_scores(alone, seen, KEY)
+    assert ghost_rate(beside, seen, KEY) == ghost_rate(alone, seen, KEY)

@@ -105,18 +105,19 @@ def lay(target: Surface, source: Surface, T_target_source: Float, match_m: float
 
 
 def lay_on_planes(
-    target: Surface, source: Surface, match_m: float, hold: float
+    target: Surface, points: Float, voxel_m: float, match_m: float, hold: float
 ) -> tuple[Float, float]:
-    """``T_target_source``, near the identity, that lays the source's points on the planes of the
-    target, and the share of them that met it. match_m: nothing farther apart is taken for the
-    same. hold: share of the matches that as many points, 10 m away, hold in place: where fewer
-    planes tell, as along a straight road, the source hardly moves; 0 lets it slide.
+    """``T_target_source``, near the identity, that lays points (N,3), thinned to voxels, on the
+    planes of the target, and the share of them that met it. match_m: nothing farther apart is taken
+    for the same. hold: share of the matches that as many points, 10 m away, hold in place: where
+    fewer planes tell, as along a straight road, the source hardly moves; 0 lets it slide.
     """
     import small_gicp
 
+    source = small_gicp.voxelgrid_sampling(points, voxel_m)
     found = small_gicp.align(
         target.points,
-        source.points,
+        source,
         target.tree,
         registration_type="PLANE_ICP",
         max_correspondence_distance=match_m,
@@ -127,7 +128,7 @@ def lay_on_planes(
     held = np.diag(hold * np.repeat([_HELD_AT_M**2, 1.0], 3))
     slid = poses.log(np.asarray(found.T_target_source))
     motion = np.linalg.solve(told + held, told @ slid)
-    return poses.exp(np.asarray(motion, np.float64)), num / max(len(source), 1)
+    return poses.exp(np.asarray(motion, np.float64)), num / max(source.size(), 1)
 
 
 def _lay(found: Any, source: Surface) -> Lay:

@@ -67,8 +67,7 @@ def _round(
         T_own_world = poses.inverse(T[i])
         parts = [poses.transform(T_own_world @ T[j], points[j]) for j in around]
         target = Surface.of(np.concatenate(parts), _VOXEL_M)
-        source = Surface.of(points[i], _VOXEL_M)
-        T_found, overlap = lay_on_planes(target, source, match_m, _HOLD)
+        T_found, overlap = lay_on_planes(target, points[i], _VOXEL_M, match_m, _HOLD)
         held = overlap < min_overlap or np.linalg.norm(T_found[:3, 3]) > _MOST * match_m
         return T[i] if held else T[i] @ T_found
 

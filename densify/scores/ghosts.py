@@ -20,14 +20,14 @@ _GHOST_MARGIN_FRACTION = 0.02
 
 
 def ghosts(cloud: Cloud, key_image: RangeImage, key: int) -> Bool:
-    """(M,) bool: points of other sweeps standing where the key sweep saw through.
+    """(M,) bool: points of other sweeps of the window standing where the key sweep saw through.
 
     A point is a ghost when it lies clearly in front of what the key sweep measured in its direction
     and in all 8 neighbouring directions, by more than max(0.5 m, 2 % of its range); directions
     without a return say nothing, but six of the nine must have one.
     """
     ghost = np.zeros(len(cloud), bool)
-    other = np.flatnonzero(cloud.frame != key)
+    other = np.flatnonzero(_others(cloud, key))
     ghost[other] = key_image.sees_through(
         cloud.points.take(other, axis=0),
         _GHOST_MARGIN_M,
@@ -39,16 +39,17 @@ def ghosts(cloud: Cloud, key_image: RangeImage, key: int) -> Bool:
 
 
 def ghost_rate(cloud: Cloud, key_image: RangeImage, key: int) -> float | None:
-    """Fraction of the accumulated points that are `ghosts`, over all not from the key sweep."""
-    return _mean(ghosts(cloud, key_image, key)[cloud.frame != key])
+    """Fraction of the accumulated points that are `ghosts`, over all of the window's that are not
+    from the key sweep."""
+    return _mean(ghosts(cloud, key_image, key)[_others(cloud, key)])
 
 
 def ghost_scores(cloud: Cloud, key_image: RangeImage, key: int) -> dict[str, Any]:
-    """Needs no truth: ``num_points`` of other sweeps and the `ghost_rate` of ``all`` of them, of
-    those the flow calls ``moving`` and of the ``static`` rest, by distance in frames from the key
-    (``by_distance["3"]``: frames key-3 and key+3), and by time from the key, to 10 ms
+    """Needs no truth: ``num_points`` of other sweeps of the window and the `ghost_rate` of ``all``
+    of them, of those the flow calls ``moving`` and of the ``static`` rest, by distance in frames
+    from the key (``by_distance["3"]``: frames key-3 and key+3), and by time from the key, to 10 ms
     (``by_seconds["0.30"]``)."""
-    other = cloud.frame != key
+    other = _others(cloud, key)
     ghost = ghosts(cloud, key_image, key)
     distance = np.abs(cloud.frame - key)
     hundredths = np.rint(np.abs(cloud.since_key_ns) / 1e7).astype(np.int64)
@@ -58,13 +59,19 @@ def ghost_scores(cloud: Cloud, key_image: RangeImage, key: int) -> dict[str, Any
         "moving": _mean(ghost[other & cloud.moving]),
         "static": _mean(ghost[other & ~cloud.moving]),
         "by_distance": {
-            str(steps): _mean(ghost[distance == steps]) for steps in np.unique(distance[other])
+            str(steps): _mean(ghost[other & (distance == steps)])
+            for steps in np.unique(distance[other])
         },
         "by_seconds": {
             f"{h / 100:.2f}": _mean(ghost[other & (hundredths == h)])
             for h in np.unique(hundredths[other])
         },
     }
+
+
+def _others(cloud: Cloud, key: int) -> Bool:
+    """(M,) the points of the window that are not from the key sweep."""
+    return (cloud.frame != key) & ~cloud.far
 
 
 def _mean(values: np.ndarray) -> float | None:
