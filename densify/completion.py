@@ -58,7 +58,10 @@ def completed(
                 "key %d: the prior %s is not used, depth_full is as depth_filled: after the best "
                 "fit %.0f %% of measured pixels are off by more than 25 %%, and prior.max_wrong "
                 "is %.0f %%",
-                *(result.key, maps.source, 100 * maps.fit.wrong, 100 * settings.max_wrong),
+                result.key,
+                maps.source,
+                100 * maps.fit.wrong,
+                100 * settings.max_wrong,
             )
         alone_m = np.where(maps.from_prior, maps.depth_m, np.float32(0))
         for product, depth_m in (("full", maps.depth_m), ("prior", alone_m)):

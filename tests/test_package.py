@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import ast
 import json
 import os
 import re
@@ -253,3 +254,11 @@ def test_heavy_packages_have_few_doors(package: str) -> None:
             rf"^\s*(import|from) {package}\b", path.read_text("utf-8"), re.MULTILINE
         )
         assert not imports or where.startswith(DOORS[package]), where
+
+
+def test_no_arguments_are_packed() -> None:
+    for path in (CHECKOUT / "densify").rglob("*.py"):
+        for call in ast.walk(ast.parse(path.read_text("utf-8"))):
+            if isinstance(call, ast.Call):
+                packed = [a for a in call.args if isinstance(a, ast.Starred)]
+                assert not any(isinstance(a.value, ast.Tuple) for a in packed), (path, call.lineno)

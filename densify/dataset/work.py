@@ -140,7 +140,9 @@ def _made(job: Job, key: int) -> KeyRecord:
     result = results[recipe.method]
     scores = scores_of(result)
     record = KeyRecord(
-        *(job.source.name, key, "done"),
+        job.source.name,
+        key,
+        "done",
         frames=result.frames,
         scores=scores,
         warnings=result.warnings,

@@ -95,7 +95,7 @@ def fill_between(
         confidence=confidence[measured],
     )
     filling.between.over_rows(
-        *(depth_m.size, known, spacing_px, reaches, edge, filled_m, filled_confidence, share)
+        depth_m.size, known, spacing_px, reaches, edge, filled_m, filled_confidence, share
     )
     filled_confidence *= 1 - share * np.float32(1 - factor)
     return filled_m, filled_confidence

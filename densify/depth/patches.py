@@ -46,8 +46,12 @@ def patches(
     if wanted is None:
         wanted = np.ones(len(cloud), bool)
     normal, spacing_m = tangents(
-        *(cloud.rigid_points, cloud.lidar, sweep, wanted),
-        *(sensors, [origins[int(f)] for f in frames]),
+        cloud.rigid_points,
+        cloud.lidar,
+        sweep,
+        wanted,
+        sensors,
+        [origins[int(f)] for f in frames],
     )
     free = np.zeros(len(cloud), bool)
     other = np.flatnonzero(wanted & (cloud.frame != key))

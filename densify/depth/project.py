@@ -115,7 +115,16 @@ def _measured(
     alone.flat[seen.pixel] = seen.alone
     spacing_px = _spacing_px(points if points.far.all() else points.select(~points.far), shape)
     return Layers(
-        *(depth_m, rim_m, veiled, refused, depth_m, confidence, point, tilt, spacing_px, lab),
+        depth_m=depth_m,
+        rim_m=rim_m,
+        veiled=veiled,
+        refused=refused,
+        filled_m=depth_m,
+        confidence=confidence,
+        point=point,
+        tilt=tilt,
+        spacing_px=spacing_px,
+        lab=lab,
         alone=alone,
     )
 

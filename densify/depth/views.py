@@ -128,7 +128,12 @@ class Views:
         key_image = self.key_image if visible else None
         views = {name: exposure.sees(cloud) for name, exposure in self.exposures.items()}
         surface = patches(
-            *(cloud, self.key, self.settings, self.sensors, self.origins, key_image),
+            cloud,
+            self.key,
+            self.settings,
+            self.sensors,
+            self.origins,
+            key_image,
             wanted=_in_any(views, len(cloud)),
         )
         return SeenCloud(cloud, surface, views)
@@ -154,8 +159,13 @@ class Views:
         settings = replace(self.settings, visibility=visible)
         return {
             name: project(
-                *(seen.cloud, view, settings, seen.patches, filled),
-                *(self.lab.get(name), self.rays),
+                seen.cloud,
+                view,
+                settings,
+                seen.patches,
+                filled,
+                self.lab.get(name),
+                self.rays,
             )
             for name, view in seen.views.items()
         }

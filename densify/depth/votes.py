@@ -44,15 +44,23 @@ class Canvass:
         self._seed, self._agrees = np.zeros(sides, np.int32), np.zeros(sides, bool)
         self._tie = np.zeros((num, voting.NUM_PLACES, len(DIRECTIONS)), np.float32)
         voting.canvass.over_rows(
-            *(num, pixel, 1 / depth_m, seeds, _image(layers), layers.gap_px, RULES),
-            *(self._seed, self._agrees, self._tie),
+            num,
+            pixel,
+            1 / depth_m,
+            seeds,
+            _image(layers),
+            layers.gap_px,
+            RULES,
+            self._seed,
+            self._agrees,
+            self._tie,
         )
 
     def shares(self, weight: Float32) -> Float32:
         """(P,) share of the votes for each pixel. weight: (H,W) of each seed's vote."""
         share = np.ones(len(self._seed), np.float32)
         voting.count.over_rows(
-            *(len(share), self._seed, self._agrees, self._tie, weight.ravel(), RULES.doubt, share)
+            len(share), self._seed, self._agrees, self._tie, weight.ravel(), RULES.doubt, share
         )
         return share
 
@@ -64,8 +72,15 @@ def elected(
     (P,), without doubt and with the image in its place."""
     found = np.zeros(len(pixel), bool)
     voting.elect.over_rows(
-        *(len(pixel), pixel, 1 / depth_m, seeds, _image(layers), layers.gap_px, RULES),
-        *(share, found),
+        len(pixel),
+        pixel,
+        1 / depth_m,
+        seeds,
+        _image(layers),
+        layers.gap_px,
+        RULES,
+        share,
+        found,
     )
     return found
 

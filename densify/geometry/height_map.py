@@ -95,11 +95,12 @@ def _averaged(hull: HeightMap, clouds: Iterable[Float]) -> Float:
 
 
 def _without_humps(heights: Float, cell_m: float) -> Float:
-    """Without what rises out of its surroundings on little room: where a vehicle never left its
-    place bare, the lowest that was seen is the vehicle. Slopes and kerbs stay (morphological
+    """The map without what rises out of its surroundings on little room: where a vehicle never left
+    its place bare, the lowest that was seen is the vehicle. Slopes and kerbs stay (morphological
     opening; Zhang et al., "A Progressive Morphological Filter for Removing Nonground Measurements
     from Airborne LIDAR Data", TGRS 2003)."""
-    opened = ndimage.grey_opening(heights, max(1, round(_NARROW_M / cell_m)))
+    size = max(1, round(_NARROW_M / cell_m))
+    opened = ndimage.grey_opening(heights, (size, size))
     return np.where(heights - opened > _HUMP_M, opened, heights)
 
 

@@ -125,9 +125,13 @@ def _row(key: _Key, cameras: Sequence[str], shown_from: Path) -> dict[str, Any]:
 
 def _of_record(record: KeyRecord, root: Path) -> _Key:
     return _Key(
-        *(record.drive, record.key, record.status),
+        record.drive,
+        record.key,
+        record.status,
         record.reason or "; ".join(record.warnings),
-        *(len(record.frames), record.seconds, record.scores),
+        len(record.frames),
+        record.seconds,
+        record.scores,
         _shown_map(record, root),
     )
 
@@ -138,7 +142,9 @@ def _of_run(folder: Path) -> _Key:
         about, _ = read_yaml(folder / "run.yaml")
         stages = [_mapping(stage) for stage in about.get("stages") or ()]
         return _Key(
-            *(str(about.get("data")), int(about["key"]), "done"),
+            str(about.get("data")),
+            int(about["key"]),
+            "done",
             "; ".join(map(str, about.get("warnings") or ())),
             len(about.get("frames") or ()),
             sum(_number(stage.get("seconds")) or 0.0 for stage in stages),

@@ -134,7 +134,8 @@ SENSORS: dict[str, Sensor] = {
             (
                 Scanner(
                     Raster(110.0, 28.0, 900, 1_000_000),
-                    *(150.0, 0.02),
+                    150.0,
+                    0.02,
                     velocity_sigma_m_s=0.05,
                 ),
             ),

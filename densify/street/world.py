@@ -162,8 +162,16 @@ class World:
             met = _first_hit(self._scenes[index], start, towards)
             goes_on = np.empty(len(rows), bool)
             casting.meet(
-                *(rows, *met, self._first[index], surfaces, origin, direction),
-                *(luck, begin, casting.Stops(*hits), goes_on),
+                rows,
+                *met,
+                self._first[index],
+                surfaces,
+                origin,
+                direction,
+                luck,
+                begin,
+                casting.Stops(*hits),
+                goes_on,
             )
             rows = rows[goes_on]
             towards = direction[rows]
