@@ -11,10 +11,13 @@ import pytest
 from densify.clock import Clock
 from densify.config import GroundSettings
 from densify.flow.tracking import proof
-from densify.flow.tracking.evidence import Standing
+from densify.flow.tracking.evidence import FreeSpace, Standing, find_candidates
+from densify.flow.tracking.shapes import Body, Shape
 from densify.flow.tracking.sightings import Sighting, Track
 from densify.flow.tracking.starts import groups_to_start
+from densify.geometry.ground import ground
 from densify.geometry.height_map import HeightMap
+from tests.scenes import SWEEP_S, Arc, Box, Scanner, Scene, World, car, street
 
 PERIOD_NS = 100_000_000
 
@@ -81,9 +84,10 @@ def test_a_short_way_far_from_the_scanner_proves_nothing():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(proof, "contradictions", lambda *_: (100, 0, 300))
         patch.setattr(proof, "_as_fast_as_measured", lambda *_: True)
+        patch.setattr(proof, "_left_places", lambda *_: (0, 100))
         for gap_m, proven in ((0.5, True), (1.8, False)):
             space = SimpleNamespace(gap_m=lambda *_, gap_m=gap_m: gap_m)
-            left = proof.left_contradicted(track, [], space)
+            left = proof.left_contradicted(track, [], space, [])
             assert (left is not None) == proven
 
 
@@ -106,12 +110,13 @@ def test_what_is_seen_for_long_may_be_contradicted_more(num_seen, num_sweeps, st
     track = Track(np.array([14.0, 0, 0]), sighted, {n: np.arange(8) for n in range(num_seen)})
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(proof, "_as_fast_as_measured", lambda *_: True)
+        patch.setattr(proof, "_left_places", lambda *_: (0, 100))
         clock = SimpleNamespace(time_s=0.1 * np.arange(num_sweeps))
         space = SimpleNamespace(gap_m=lambda *_: 0.1, clock=clock)
         patch.setattr(proof, "_may_be_a_rail", lambda *_: False)
         for moved in (still // 50, still // 5):
             patch.setattr(proof, "contradictions", lambda *_, moved=moved: (still, moved, 300))
-            left = proof.left_contradicted(track, [], space)
+            left = proof.left_contradicted(track, [], space, [])
             assert (left is not None) == (proven or moved == still // 50)
 
 
@@ -129,3 +134,59 @@ def test_a_line_across_its_way_is_no_rail(along_rad, rail):
     track = Track(np.zeros(3), sighted, {n: np.arange(20) for n in range(5)})
     track.smooth()
     assert proof._may_be_a_rail(track, standing, SimpleNamespace()) == rail
+
+
+SPEED_M_S, KEY = 6.0, 6
+EGO = Arc(0.0, -1.5, 0.0, 9.0)
+FENCE = Box((60.0, 0.06, 1.6), Arc(0.0, -4.0), solid=0.5)
+CARS = [car(x, -4.0, SPEED_M_S, n) for n, x in enumerate((8.7, 2.0, -4.7))]
+
+
+class Seen:
+    """A scene as the proof sees it, and what seems to go through it at `SPEED_M_S`."""
+
+    def __init__(self, *boxes: Box) -> None:
+        self.scene = Scene(World((*street(), *boxes)), EGO, Scanner(sigma_m=0.01))
+        stretch = self.scene.stretch(KEY, 5)
+        heights = ground(stretch, GroundSettings())
+        self.space = FreeSpace.of(stretch)
+        found = find_candidates(stretch, self.space, heights, 0.2)
+        self.standing = [Standing.of(stretch, i, c) for i, c in enumerate(found)]
+
+    def track(self, boxes: list[int], begin_m: float) -> Track:
+        """What the sweeps saw of these boxes of the scene in a frame of 4.4 m that goes along;
+        begin_m: where it begins at time 0, world."""
+        track = Track(np.array([begin_m, -4.0, 1.0]))
+        for i, c in enumerate(self.standing):
+            scan, at_s = self.scene.scan(KEY - 5 + i), (KEY - 5 + i) * SWEEP_S
+            ahead_m = scan.world[c.row, 0] - begin_m - SPEED_M_S * at_s
+            on = np.isin(scan.box[c.row], np.array(boxes) + len(street()))
+            track.claimed[i] = np.flatnonzero(on & (ahead_m > 0) & (ahead_m < 4.4))
+            state = np.array([SPEED_M_S * SWEEP_S * i, 0.0, 0.0, 0.0])
+            track.sightings[i] = Sighting(state, SWEEP_S * i, i * PERIOD_NS, (i,))
+        track.smooth()
+        return track
+
+    def told(self, track: Track, *proven: Track) -> tuple[int, int]:
+        bodies = [Body(t, Shape.of(t.seen_in(self.standing, t.claimed))) for t in proven]
+        return proof._left_places(track, self.standing, self.space, bodies)
+
+
+def test_what_is_still_there_when_it_is_gone_does_not_move():
+    """A wire fence stops half of the rays, wherever a piece of it seems to be."""
+    fence = Seen(FENCE)
+    piece = fence.track([0], -7.0)
+    taken, empty = fence.told(piece)
+    assert taken > 10 * empty
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(proof, "contradictions", lambda *_: (1000, 0, 3000))
+        assert proof.left_contradicted(piece, fence.standing, fence.space, []) is None
+
+
+def test_what_leaves_its_places_moves_though_others_go_close_before_and_behind():
+    """Three cars in a row, 2.5 m from each other, none of them known."""
+    row = Seen(*CARS)
+    first, middle, last = (row.track([n], car.path.x - 2.1) for n, car in enumerate(CARS))
+    taken = [row.told(middle, *known)[0] for known in ((), (first,), (first, last))]
+    assert taken[0] > taken[1] > 20 * taken[2]
+    assert proof.left_contradicted(middle, row.standing, row.space, []) is not None

@@ -9,8 +9,11 @@ import numpy as np
 
 from densify.flow.tracking.evidence import FreeSpace, Standing
 from densify.flow.tracking.radial import Radial
+from densify.flow.tracking.shapes import Body
 from densify.flow.tracking.sightings import Track
 from densify.geometry import poses
+from densify.kernels.nearest import BoxTree
+from densify.types import Float
 
 _ROUGH_M, _ROUGH_PER_GAP, _ROUGH_S = 0.04, 0.2, 0.003  # by gap of rings, by speed
 _LEAST_WAY_M, _LEAST_WAY_PER_RESIDUAL, _LEAST_WAY_PER_ROUGH = 0.35, 8.0, 1.5
@@ -22,18 +25,25 @@ _MAX_CONTRADICTIONS = 0.3  # of those that standing still leaves,
 # which are so many, or of few looks this share, and of many at least that one.
 _LEAST_CONTRADICTIONS, _SHARE_OF_FEW, _LEAST_SHARE = 20, 0.08, 0.01
 _ALONG = np.cos(np.deg2rad(45))
+_LEFT_M = 0.6  # from all of the object: it is gone, or not there yet;
+_ROOM_M, _ROOM_S = 2.0, 0.5  # so far, and what it goes in that time, is left to who is in front
+_THERE_M, _THERE_PER_GAP = 0.2, 0.5  # between two rings
 _AS_FAST, _RAIL_M, _SLENDER, _SHARE_OF_RAIL = 0.1, 2.0, 8.0, 0.3
 
 
-def left_contradicted(track: Track, standing: Sequence[Standing], space: FreeSpace) -> float | None:
+def left_contradicted(
+    track: Track, standing: Sequence[Standing], space: FreeSpace, proven: Sequence[Body]
+) -> float | None:
     """Fit the smooth motion of a track; None unless it certainly moves, or the share of looks that
     contradict even that motion, 0 at best: of two motions the one with less of them is the truth.
 
     The motion must be smooth, long enough to be told from noise, and must do away with the
     contradictions that brought the group here: where the sweeps see through its points at their
     rigid places, they must not see through them at the moved ones. A few looks through a piece of a
-    side that slides along itself prove nothing. Where radial velocities were measured, it must have
-    them.
+    side that slides along itself prove nothing. What it has left must be empty. Where radial
+    velocities were measured, it must have them.
+
+    proven: other objects that certainly move.
     """
     seen_s = np.ptp([sighting.seen_s for sighting in track.sightings.values()])
     if len(track.sightings) < _LEAST_STATES or seen_s < _LEAST_S:
@@ -59,7 +69,58 @@ def left_contradicted(track: Track, standing: Sequence[Standing], space: FreeSpa
         return None
     if still < _SHARE_OF_RAIL * num_asked and _may_be_a_rail(track, standing, space):
         return None
+    taken, empty = _left_places(track, standing, space, proven)
+    if taken > empty:
+        return None
     return moved / num_asked
+
+
+def _left_places(
+    track: Track, standing: Sequence[Standing], space: FreeSpace, proven: Sequence[Body]
+) -> tuple[int, int]:
+    """How often something is where the object has just been or is just coming to, and how often
+    nothing is there.
+
+    A wire fence is seen through from beside and not from ahead: where one becomes the other goes
+    along it as the scanner does, and with it what seems to move; but the fence is still there.
+    Other objects that are proven to move do not count.
+    """
+    some = {i: rows[:: len(rows) // _NUM_ASKED + 1] for i, rows in track.claimed.items()}
+    tree = BoxTree(track.seen_in(standing, track.claimed))
+    gap_m = space.gap_m(track.centre, next(iter(track.claimed)))
+    rate = track.path.rate((track.path.begin_s + track.path.end_s) / 2)
+    room_m = _ROOM_M + _ROOM_S * float(np.linalg.norm(rate[:2]))
+    there_m = max(_THERE_M, _THERE_PER_GAP * gap_m)
+    taken = empty = 0
+    for look in space.looks:
+        from_others = [i for i in some if i not in look]
+        if not from_others:
+            continue
+        places = np.concatenate([standing[i].points[some[i]] for i in from_others])
+        body = track.undo(places, space.clock.time_s[look[0]])
+        away_m, _ = tree.nearest(body, room_m)
+        places = places[(away_m > _LEFT_M) & np.isfinite(away_m)]
+        if not len(places):
+            continue
+        there = np.concatenate([_there(places, there_m, standing[j], proven) for j in look])
+        is_taken = np.zeros(len(places), bool)
+        if len(there):
+            is_taken = np.isfinite(BoxTree(there).nearest(places, there_m)[0])
+        taken += int(is_taken.sum())
+        empty += int((space.seen_through(places, look[0]) & ~is_taken).sum())
+    return taken, empty
+
+
+def _there(places: Float, reach_m: float, c: Standing, proven: Sequence[Body]) -> Float:
+    """(N,3) what a sweep saw that close to some places, but of no object proven to move."""
+    rows = c.strips.rows_inside(places.min(0) - reach_m, places.max(0) + reach_m)
+    rows = rows[np.isfinite(BoxTree(places).nearest(c.points[rows], reach_m)[0])]
+    for track, shape in proven:
+        if len(rows):
+            body = track.undo(c.points[rows], c.time_s[rows])
+            near = np.isfinite(shape.tree.nearest(body, _LEFT_M)[0])
+            rows = rows[~(near | shape.within_outline(body))]
+    return c.points[rows]
 
 
 def _goes_along(track: Track, space: FreeSpace) -> bool:

@@ -4,10 +4,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
+from densify.flow.tracking.sightings import Track
 from densify.kernels.nearest import BoxTree
 from densify.types import Bool, Float
 
@@ -45,3 +47,10 @@ class Shape:
             return np.zeros(len(points), bool)
         inside: Bool = (points[:, :2] @ self.edges[:, :2].T + self.edges[:, 2] < _OUTLINE_M).all(1)
         return inside
+
+
+class Body(NamedTuple):
+    """An object proven to move, and all that was seen of it."""
+
+    track: Track
+    shape: Shape

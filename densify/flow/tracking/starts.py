@@ -10,6 +10,7 @@ import numpy as np
 from densify.clock import Clock
 from densify.flow.tracking.evidence import Standing
 from densify.flow.tracking.looks import Look
+from densify.flow.tracking.shapes import Body
 from densify.flow.tracking.sightings import Track
 from densify.kernels.nearest import BoxTree
 from densify.types import Float
@@ -42,30 +43,28 @@ def groups_to_start(standing: Sequence[Standing], clock: Clock) -> list[tuple[in
     return sorted(groups, key=worth, reverse=True)
 
 
-def is_line_on(bodies: Sequence[tuple[Track, Float]], look: Look, members: np.ndarray) -> bool:
+def is_line_on(bodies: Sequence[Body], look: Look, members: np.ndarray) -> bool:
     """Whether a group is an upright line close to a proven track: rays one above the other that
     meet a part of it. Followed by itself it would stay where the rays are."""
     line = look.seen.points[members]
     if np.linalg.norm(np.ptp(line[:, :2], axis=0)) >= _LEAST_WIDTH_M:
         return False
     tree = BoxTree(line)
-    there = (track.place(points, track.seen_at(look.time_ns)) for track, points in bodies)
+    there = (track.place(shape.points, track.seen_at(look.time_ns)) for track, shape in bodies)
     return any(np.isfinite(tree.nearest(points, _BESIDE_M)[0]).any() for points in there)
 
 
-def velocities_beside(
-    look: Look, members: np.ndarray, bodies: Sequence[tuple[Track, Float]]
-) -> Iterator[Float]:
+def velocities_beside(look: Look, members: np.ndarray, bodies: Sequence[Body]) -> Iterator[Float]:
     """The velocities (3,) that proven tracks close to a group have there, where the group cannot be
     a part of them: of what tows it, say. Little else tells how fast a long side slides.
 
-    bodies: the tracks with all their points.
+    bodies: the tracks with all that was seen of them.
     """
     c = look.seen
     tree, middle = BoxTree(c.points[members]), c.points[members].mean(0, keepdims=True)
-    for track, points in bodies:
+    for track, shape in bodies:
         at_s = track.seen_at(look.time_ns)
-        if not np.isfinite(tree.nearest(track.place(points, at_s), _BESIDE_M)[0]).any():
+        if not np.isfinite(tree.nearest(track.place(shape.points, at_s), _BESIDE_M)[0]).any():
             continue
         yield track.velocity_m_s(middle, at_s)[0]
 

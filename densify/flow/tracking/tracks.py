@@ -21,7 +21,7 @@ from densify.flow.tracking.evidence import FreeSpace, Standing
 from densify.flow.tracking.lone_rings import in_line, linked_in_line, single_rings
 from densify.flow.tracking.looks import Look, looks_of
 from densify.flow.tracking.proof import left_contradicted
-from densify.flow.tracking.shapes import Shape
+from densify.flow.tracking.shapes import Body, Shape
 from densify.flow.tracking.sightings import Track
 from densify.flow.tracking.slides import take_back_slides
 from densify.flow.tracking.starts import (
@@ -81,12 +81,12 @@ def follow_groups(
 
     def follow(members: np.ndarray, n: int, velocity: Float) -> tuple[Track, float | None]:
         track = _follow(members, n, velocity, looks, free, ground, clock)
-        return track, left_contradicted(track, standing, space)
+        return track, left_contradicted(track, standing, space, bodies)
 
     free = [np.ones(len(c.points), bool) for c in standing]  # not yet part of a track
     untried = [np.ones(len(c.points), bool) for c in standing]
     tracks: list[Track] = []
-    bodies: list[tuple[Track, Float]] = []
+    bodies: list[Body] = []
     for n, group in groups_to_start(seen, clock):
         members = group[looks[n].gather(free)[group] & looks[n].gather(untried)[group]]
         if len(members) < MIN_POINTS or is_line_on(bodies, looks[n], members):
@@ -117,7 +117,7 @@ def follow_groups(
                 free[j][rows] = False
         if proven:
             tracks.append(track)
-            bodies.append((track, track.seen_in(standing, sorted(track.claimed))))
+            bodies.append(Body(track, Shape.of(track.seen_in(standing, sorted(track.claimed)))))
     return tracks
 
 
