@@ -84,7 +84,7 @@ def test_a_short_way_far_from_the_scanner_proves_nothing():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(proof, "contradictions", lambda *_: (100, 0, 300))
         patch.setattr(proof, "_as_fast_as_measured", lambda *_: True)
-        patch.setattr(proof, "_left_places", lambda *_: (0, 100))
+        patch.setattr(proof, "_left_places", lambda *_: ((0, 100), (0, 100)))
         for gap_m, proven in ((0.5, True), (1.8, False)):
             space = SimpleNamespace(gap_m=lambda *_, gap_m=gap_m: gap_m)
             left = proof.left_contradicted(track, [], space, [])
@@ -110,7 +110,7 @@ def test_what_is_seen_for_long_may_be_contradicted_more(num_seen, num_sweeps, st
     track = Track(np.array([14.0, 0, 0]), sighted, {n: np.arange(8) for n in range(num_seen)})
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(proof, "_as_fast_as_measured", lambda *_: True)
-        patch.setattr(proof, "_left_places", lambda *_: (0, 100))
+        patch.setattr(proof, "_left_places", lambda *_: ((0, 100), (0, 100)))
         clock = SimpleNamespace(time_s=0.1 * np.arange(num_sweeps))
         space = SimpleNamespace(gap_m=lambda *_: 0.1, clock=clock)
         patch.setattr(proof, "_may_be_a_rail", lambda *_: False)
@@ -167,17 +167,18 @@ class Seen:
         track.smooth()
         return track
 
-    def told(self, track: Track, *proven: Track) -> tuple[int, int]:
+    def told(self, track: Track, *proven: Track) -> np.ndarray:
+        """[coming, gone] × [taken, empty]"""
         bodies = [Body(t, Shape.of(t.seen_in(self.standing, t.claimed))) for t in proven]
-        return proof._left_places(track, self.standing, self.space, bodies)
+        return np.array(proof._left_places(track, self.standing, self.space, bodies))
 
 
 def test_what_is_still_there_when_it_is_gone_does_not_move():
     """A wire fence stops half of the rays, wherever a piece of it seems to be."""
     fence = Seen(FENCE)
     piece = fence.track([0], -7.0)
-    taken, empty = fence.told(piece)
-    assert taken > 10 * empty
+    told = fence.told(piece)
+    assert (told[:, 0] > 10 * told[:, 1]).all()
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(proof, "contradictions", lambda *_: (1000, 0, 3000))
         assert proof.left_contradicted(piece, fence.standing, fence.space, []) is None
@@ -187,6 +188,6 @@ def test_what_leaves_its_places_moves_though_others_go_close_before_and_behind()
     """Three cars in a row, 2.5 m from each other, none of them known."""
     row = Seen(*CARS)
     first, middle, last = (row.track([n], car.path.x - 2.1) for n, car in enumerate(CARS))
-    taken = [row.told(middle, *known)[0] for known in ((), (first,), (first, last))]
-    assert taken[0] > taken[1] > 20 * taken[2]
+    taken = [row.told(middle, *known)[:, 0] for known in ((), (first,), (first, last))]
+    assert (taken[0] > 20 * taken[2]).all() and taken[1].sum() > 20 * taken[2].sum()
     assert proof.left_contradicted(middle, row.standing, row.space, []) is not None

@@ -13,7 +13,7 @@ from densify.flow.tracking.shapes import Body
 from densify.flow.tracking.sightings import Track
 from densify.geometry import poses
 from densify.kernels.nearest import BoxTree
-from densify.types import Float
+from densify.types import Float, Int
 
 _ROUGH_M, _ROUGH_PER_GAP, _ROUGH_S = 0.04, 0.2, 0.003  # by gap of rings, by speed
 _LEAST_WAY_M, _LEAST_WAY_PER_RESIDUAL, _LEAST_WAY_PER_ROUGH = 0.35, 8.0, 1.5
@@ -69,46 +69,48 @@ def left_contradicted(
         return None
     if still < _SHARE_OF_RAIL * num_asked and _may_be_a_rail(track, standing, space):
         return None
-    taken, empty = _left_places(track, standing, space, proven)
-    if taken > empty:
+    told = _left_places(track, standing, space, proven)
+    if any(taken > empty for taken, empty in told) and all(t >= e for t, e in told):
         return None
     return moved / num_asked
 
 
 def _left_places(
     track: Track, standing: Sequence[Standing], space: FreeSpace, proven: Sequence[Body]
-) -> tuple[int, int]:
-    """How often something is where the object has just been or is just coming to, and how often
-    nothing is there.
+) -> tuple[tuple[int, int], tuple[int, int]]:
+    """How often something is where the object is just coming to, and how often nothing is there;
+    and the same of where it has just been.
 
     A wire fence is seen through from beside and not from ahead: where one becomes the other goes
-    along it as the scanner does, and with it what seems to move; but the fence is still there.
-    Other objects that are proven to move do not count.
+    along it as the scanner does, and with it what seems to move; but the fence is still there, on
+    both sides. Beside the end of a long object there may be the rest of it on one. Other objects
+    that are proven to move do not count.
     """
     some = {i: rows[:: len(rows) // _NUM_ASKED + 1] for i, rows in track.claimed.items()}
     tree = BoxTree(track.seen_in(standing, track.claimed))
-    gap_m = space.gap_m(track.centre, next(iter(track.claimed)))
     rate = track.path.rate((track.path.begin_s + track.path.end_s) / 2)
     room_m = _ROOM_M + _ROOM_S * float(np.linalg.norm(rate[:2]))
+    gap_m = space.gap_m(track.centre, next(iter(track.claimed)))
     there_m = max(_THERE_M, _THERE_PER_GAP * gap_m)
-    taken = empty = 0
-    for look in space.looks:
-        from_others = [i for i in some if i not in look]
-        if not from_others:
-            continue
-        places = np.concatenate([standing[i].points[some[i]] for i in from_others])
-        body = track.undo(places, space.clock.time_s[look[0]])
-        away_m, _ = tree.nearest(body, room_m)
+
+    def told(look: tuple[int, ...], sweeps: Sequence[int]) -> Int:
+        places = np.concatenate([np.zeros((0, 3)), *(standing[i].points[some[i]] for i in sweeps)])
+        away_m, _ = tree.nearest(track.undo(places, space.clock.time_s[look[0]]), room_m)
         places = places[(away_m > _LEFT_M) & np.isfinite(away_m)]
         if not len(places):
-            continue
+            return np.zeros(2, np.int64)
         there = np.concatenate([_there(places, there_m, standing[j], proven) for j in look])
-        is_taken = np.zeros(len(places), bool)
+        taken = np.zeros(len(places), bool)
         if len(there):
-            is_taken = np.isfinite(BoxTree(there).nearest(places, there_m)[0])
-        taken += int(is_taken.sum())
-        empty += int((space.seen_through(places, look[0]) & ~is_taken).sum())
-    return taken, empty
+            taken = np.isfinite(BoxTree(there).nearest(places, there_m)[0])
+        empty = space.seen_through(places, look[0]) & ~taken
+        return np.array([taken.sum(), empty.sum()])
+
+    coming, gone = np.zeros((2, 2), np.int64)
+    for look in space.looks:
+        coming += told(look, [i for i in some if i > look[-1]])
+        gone += told(look, [i for i in some if i < look[0]])
+    return (int(coming[0]), int(coming[1])), (int(gone[0]), int(gone[1]))
 
 
 def _there(places: Float, reach_m: float, c: Standing, proven: Sequence[Body]) -> Float:
