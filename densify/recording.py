@@ -60,7 +60,7 @@ from densify.types import (
     Motion,
     ObjectTrack,
     RegisteredSweep,
-    Standing,
+    StandingWorld,
     Stretch,
     StretchFlow,
     Trajectory,
@@ -81,7 +81,7 @@ class Moment(NamedTuple):
 class Beyond(NamedTuple):
     """What stands along the road beyond a key's window, in a world of its own."""
 
-    standing: Standing
+    standing: StandingWorld
     T_key_standing: Float
 
 
@@ -345,14 +345,14 @@ class Recording:
             found.append((frames, motion))
         return found
 
-    def _far(self, number: int) -> list[Standing]:
+    def _far(self, number: int) -> list[StandingWorld]:
         """What stands along the road, for each piece of the block and in its world; of a whole
         recording with the block's own sweeps, of which a key leaves out those of its window."""
         cameras = list(self.sequence.cameras.values())
         far_m, settings = self.settings.accumulate.far_m, self.settings.register
         road = Road(self.timeline, self.sweeps, cameras, settings, far_m, self._watch)
 
-        def make(frames: Sequence[int]) -> Standing:
+        def make(frames: Sequence[int]) -> StandingWorld:
             keys = [k for k, n in self.cut.number_of.items() if n == number and k in frames]
             near = self._places.stretch(number, 0.0, frames)
             with self._watch.stage("far"):
@@ -367,7 +367,7 @@ class Recording:
         if inside:  # what is looked at beyond the windows is as far as the rest of the road
             near_frames = [[f for f in frames if f in inside] or frames for frames in near_frames]
         return [
-            kept(self._cache, "far", Standing, partial(inputs, pieces[i], f), partial(make, f))
+            kept(self._cache, "far", StandingWorld, partial(inputs, pieces[i], f), partial(make, f))
             for i, f in enumerate(near_frames)
         ]
 

@@ -31,7 +31,7 @@ from densify.types import (
     Int,
     Links,
     RegisteredSweep,
-    Standing,
+    StandingWorld,
     Stretch,
     Sweep,
     Trajectory,
@@ -73,7 +73,7 @@ class Road:
         before, after = self.timeline.before(frames[0], num), self.timeline.after(frames[-1], num)
         return [*before, *frames, *after]
 
-    def standing(self, near: Stretch, keys: Sequence[int], with_near: bool) -> Standing:
+    def standing(self, near: Stretch, keys: Sequence[int], with_near: bool) -> StandingWorld:
         """What stands along the road, in the world of ``near``; nothing where no other sweep can
         be used.
 
@@ -91,7 +91,7 @@ class Road:
             p for p in passed if (with_near or not p.known) and p.registered.frame not in left_out
         ]
 
-        def part(p: _Passed) -> Standing:
+        def part(p: _Passed) -> StandingWorld:
             sweep = p.registered
             if not p.known:
                 sweep = placed(

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from densify.errors import InputError
-from densify.learning.clouds import Cloud
+from densify.learning.clouds import NetworkCloud
 from densify.learning.losses import TEACHERS, teacher
 from densify.learning.losses.cycle import cycle_loss
 from densify.learning.losses.objective import ALPHA, NUM_NEIGHBORS, objective_loss
@@ -17,9 +17,9 @@ from densify.learning.losses.supervised import supervised_loss, weighted_error
 from densify.learning.samples import Sample
 
 
-def cloud(points: np.ndarray) -> Cloud:
+def cloud(points: np.ndarray) -> NetworkCloud:
     tensor = torch.from_numpy(np.asarray(points, np.float32))
-    return Cloud(tensor, tensor[:, 2])
+    return NetworkCloud(tensor, tensor[:, 2])
 
 
 def pair(source: np.ndarray, target: np.ndarray, flow: np.ndarray | None = None) -> Sample:

@@ -8,18 +8,18 @@ import pytest
 import torch
 
 from densify.errors import InputError
-from densify.learning.clouds import Cloud, order_for
+from densify.learning.clouds import NetworkCloud, order_for
 from densify.learning.networks import NETWORKS, build
 from densify.learning.networks.flownet3d import NUM_POINTS, farthest_points
 from densify.learning.networks.voxels import REACH_M, _SegmentSum
 from densify.learning.threads import on_one_thread
 
 
-def cloud(count: int, seed: int = 0, reach_m: float = 30.0) -> Cloud:
+def cloud(count: int, seed: int = 0, reach_m: float = 30.0) -> NetworkCloud:
     rng = np.random.default_rng(seed)
     points = rng.uniform(-reach_m, reach_m, (count, 3)).astype(np.float32)
     points[:, 2] = rng.uniform(-1.5, 1.0, count)
-    return Cloud(torch.from_numpy(points), torch.from_numpy(points[:, 2] + 1.7))
+    return NetworkCloud(torch.from_numpy(points), torch.from_numpy(points[:, 2] + 1.7))
 
 
 @pytest.fixture(params=NETWORKS)

@@ -29,7 +29,7 @@ _NUM_CARRIED = 3
 _SEED = 0
 
 
-class Cloud(NamedTuple):
+class GivenSweep(NamedTuple):
     """A registered sweep as the methods get it. points: (N,3) world. above: (N,) above the ground.
     drawn: rows of ``points[above]`` that the slow methods see."""
 
@@ -54,8 +54,8 @@ class Pair:
     drawn. duration_s: negative if backwards.
     """
 
-    here: Cloud
-    there: Cloud
+    here: GivenSweep
+    there: GivenSweep
 
     @cached_property
     def source(self) -> Float:
@@ -135,7 +135,7 @@ def pairs_of(window: Window, max_points: int) -> dict[int, Pair]:
             )
         count = num_above if max_points == 0 else min(max_points, num_above)
         drawn = np.sort(rng.permutation(num_above)[:count])
-        clouds[frame] = Cloud(registered, window.points(frame), above, drawn)
+        clouds[frame] = GivenSweep(registered, window.points(frame), above, drawn)
     others = [frame for frame in window.frames if frame != window.key]
     return {f: Pair(clouds[f], clouds[window.towards_key(f)]) for f in others}
 

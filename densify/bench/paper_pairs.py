@@ -23,7 +23,7 @@ from densify.files.arrays import read_arrays
 from densify.geometry import poses
 from densify.geometry.ground import ground
 from densify.learning.clips import make_clip
-from densify.learning.clouds import Standing, Sweeps
+from densify.learning.clouds import AboveGround, Sweeps
 from densify.learning.labels import Label, label_sweeps
 from densify.learning.samples import sample_of
 from densify.readers import open_sequence
@@ -104,15 +104,17 @@ def _pair_of_label(name: str, label: Label, config: Config) -> PaperPair:
     stretch = Stretch((label.registered, label.after))
     heights = ground(stretch, config.ground)
     least_m = config.flow.min_height_m
-    here, there = (Standing.of(s, heights, least_m) for s in stretch.sweeps)
+    here, there = (AboveGround.of(s, heights, least_m) for s in stretch.sweeps)
     known = label.sure[here.row]
     row, T = here.row[known], label.T_next_here
     source, target = label.registered.sweep.points[row], label.after.sweep.points[there.row]
     if not (len(source) and len(target)):
         raise InputError(f"{name}: no labelled point above the ground")
     moved = label.field.total[row]
-    placed = Standing(row, poses.transform(T, source), here.height_m[known])
-    sweeps = tuple(s.cloud(T[:3, 3]) for s in (placed, Standing(there.row, target, there.height_m)))
+    placed = AboveGround(row, poses.transform(T, source), here.height_m[known])
+    sweeps = tuple(
+        s.cloud(T[:3, 3]) for s in (placed, AboveGround(there.row, target, there.height_m))
+    )
     flow = poses.transform(T, source + moved) - source
     return PaperPair(name, source, target, flow, label.field.moving[row], sweeps, T)
 
@@ -186,6 +188,8 @@ def _pair(name: str, source: Float, target: Float, flow: Float, where: str) -> P
     lowest = min(source[:, 2].min(), target[:, 2].min())
     sweeps = []
     for points in (source, target):
-        given = Standing(np.arange(len(points)), points, (points[:, 2] - lowest).astype(np.float32))
+        given = AboveGround(
+            np.arange(len(points)), points, (points[:, 2] - lowest).astype(np.float32)
+        )
         sweeps.append(given.cloud(np.zeros(3)))
     return PaperPair(name, source, target, flow, None, tuple(sweeps))

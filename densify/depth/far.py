@@ -23,7 +23,7 @@ from densify.types import (
     Int,
     Patches,
     RegisteredSweep,
-    Standing,
+    StandingWorld,
     Stretch,
     Sweep,
 )
@@ -45,14 +45,14 @@ def in_reach(sweep: Sweep) -> Bool:
     return x * x + y * y + z * z < _MOST_RANGE_M**2
 
 
-def standing(registered: RegisteredSweep, sensors: Sensors, travel_m: float) -> Standing:
+def standing(registered: RegisteredSweep, sensors: Sensors, travel_m: float) -> StandingWorld:
     """The points of one sweep, in the world. sensors: of the recording."""
     sweep, T_world_lidar = registered.sweep, registered.T_world_lidar
     one = np.zeros(len(sweep), np.int32)
     normal, spacing_m = tangents(
         sweep.points, sweep.lidar, one, np.ones(len(one), bool), sensors, [sensors.origins_m]
     )
-    return Standing(
+    return StandingWorld(
         points=poses.transform(T_world_lidar, sweep.points).astype(np.float32),
         normal=poses.rotate(T_world_lidar, normal.astype(np.float64)).astype(np.float32),
         spacing_m=np.minimum(spacing_m, np.float32(_MOST_SPACING_M)),
@@ -66,13 +66,13 @@ def standing(registered: RegisteredSweep, sensors: Sensors, travel_m: float) -> 
     )
 
 
-def together(parts: Sequence[Standing]) -> Standing:
+def together(parts: Sequence[StandingWorld]) -> StandingWorld:
     """Parts of one world as one, by ascending frame."""
     if not parts:
         return _NOTHING
     parts = sorted(parts, key=lambda part: part.frames)
     counts = np.cumsum([0, *(len(part.frames) for part in parts)])
-    return Standing(
+    return StandingWorld(
         points=np.concatenate([p.points for p in parts]),
         normal=np.concatenate([p.normal for p in parts]),
         spacing_m=np.concatenate([p.spacing_m for p in parts]),
@@ -88,7 +88,7 @@ def together(parts: Sequence[Standing]) -> Standing:
     )
 
 
-_NOTHING = Standing(
+_NOTHING = StandingWorld(
     points=np.zeros((0, 3), np.float32),
     normal=np.zeros((0, 3), np.float32),
     spacing_m=np.zeros((0, 2), np.float32),
@@ -129,7 +129,7 @@ def _in_pyramid(camera: Camera, x: Float32, y: Float32, z: Float32, slack_m: flo
 
 
 def far_cloud(
-    found: Standing,
+    found: StandingWorld,
     T_key_found: Float,
     stretch: Stretch,
     key: int,

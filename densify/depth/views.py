@@ -36,7 +36,7 @@ from densify.types import (
     Mover,
     Patches,
     Reason,
-    Standing,
+    StandingWorld,
     Stretch,
     Truth,
 )
@@ -139,7 +139,7 @@ class Views:
         return SeenCloud(cloud, surface, views)
 
     def far(
-        self, found: Standing, T_key_found: Float, stretch: Stretch, standing_only: bool
+        self, found: StandingWorld, T_key_found: Float, stretch: Stretch, standing_only: bool
     ) -> SeenCloud:
         """What sweeps beyond the window measured, see `densify.depth.far.far_cloud`;
         standing_only: for maps with visibility."""

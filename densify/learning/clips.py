@@ -23,7 +23,7 @@ from densify.files.arrays import read_arrays
 from densify.flow.engines import estimate_motion
 from densify.flow.scene import Scene
 from densify.geometry.ground import ground
-from densify.learning.clouds import Standing
+from densify.learning.clouds import AboveGround
 from densify.outputs.atomic import write_file
 from densify.readers import open_sequence
 from densify.readers.street import Street
@@ -139,7 +139,7 @@ def make_clip(sequence: LidarSequence, key: int, settings: Config, labels: str) 
     stretch = Recording(sequence, settings, NUM_SWEEPS // 2, [key]).window(key)
     heights = ground(stretch, settings.ground)
     least_m = settings.flow.min_height_m
-    standing = [Standing.of(s, heights, least_m) for s in stretch.sweeps]
+    standing = [AboveGround.of(s, heights, least_m) for s in stretch.sweeps]
     truth: list[Labels | None] = [None] * len(standing)
     engine = list(truth)
     if sequence.truth is not None:

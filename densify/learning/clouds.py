@@ -18,21 +18,21 @@ from densify.geometry.height_map import HeightMap
 from densify.types import Float, Float32, Int, RegisteredSweep
 
 
-class Cloud(NamedTuple):
+class NetworkCloud(NamedTuple):
     """One sweep of n points. points: (n,3) float32 metres, axes of the world (z up), origin at the
     scanner when it took the *source* sweep. height_m: (n,) float32 above the ground."""
 
     points: Tensor
     height_m: Tensor
 
-    def rows(self, index: Tensor) -> Cloud:
-        return Cloud(self.points[index], self.height_m[index])
+    def rows(self, index: Tensor) -> NetworkCloud:
+        return NetworkCloud(self.points[index], self.height_m[index])
 
-    def to(self, device: torch.device) -> Cloud:
-        return Cloud(self.points.to(device), self.height_m.to(device))
+    def to(self, device: torch.device) -> NetworkCloud:
+        return NetworkCloud(self.points.to(device), self.height_m.to(device))
 
 
-class Standing(NamedTuple):
+class AboveGround(NamedTuple):
     """What stands above the ground in one sweep. row: (n,) in the sweep. points: (n,3) world.
     height_m: (n,)."""
 
@@ -41,16 +41,16 @@ class Standing(NamedTuple):
     height_m: Float32
 
     @staticmethod
-    def of(registered: RegisteredSweep, ground: HeightMap, min_height_m: float) -> Standing:
+    def of(registered: RegisteredSweep, ground: HeightMap, min_height_m: float) -> AboveGround:
         points = poses.transform(registered.T_world_lidar, registered.sweep.points)
         height_m = ground.above(points)
         row = np.flatnonzero(height_m >= min_height_m)
-        return Standing(row, points[row], height_m[row])
+        return AboveGround(row, points[row], height_m[row])
 
-    def cloud(self, origin: Float) -> Cloud:
+    def cloud(self, origin: Float) -> NetworkCloud:
         """As a network takes it, about the origin (3,)."""
         points = torch.from_numpy((self.points - origin).astype(np.float32))
-        return Cloud(points, torch.from_numpy(np.ascontiguousarray(self.height_m)))
+        return NetworkCloud(points, torch.from_numpy(np.ascontiguousarray(self.height_m)))
 
 
 def order_for(source: int, target: int, num_sweeps: int, num_wanted: int) -> list[int | None]:
@@ -62,5 +62,5 @@ def order_for(source: int, target: int, num_sweeps: int, num_wanted: int) -> lis
     return [n if 0 <= n < num_sweeps else None for n in wanted]
 
 
-Sweeps = Sequence[Cloud | None]
+Sweeps = Sequence[NetworkCloud | None]
 """Source, target, and any number of sweeps before the source; None where there is none."""

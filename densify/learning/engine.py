@@ -22,7 +22,7 @@ from densify.flow.tracking.evidence import Candidates, closer_rings, cluster_aro
 from densify.flow.tracking.groups import GroupMotion, motion_of
 from densify.geometry import poses
 from densify.kernels.threads import num_threads
-from densify.learning.clouds import Standing, order_for
+from densify.learning.clouds import AboveGround, order_for
 from densify.learning.model_file import read_model
 from densify.learning.threads import one_thread
 from densify.types import Float
@@ -53,7 +53,7 @@ def estimate_motion(scene: Scene, settings: Config, argument: str) -> GroupMotio
     return motion_of(scene, tuple(found), settings, velocities)
 
 
-def flows_of(network: nn.Module, standing: list[Standing], origins: list[Float]) -> list[Float]:
+def flows_of(network: nn.Module, standing: list[AboveGround], origins: list[Float]) -> list[Float]:
     """(n,3) metres for each sweep: to the next, of the last one to the one before; world.
 
     origins: (3,) world, the scanner at each sweep.
@@ -77,18 +77,18 @@ def _neighbor(i: int, count: int) -> int:
     return i + 1 if i + 1 < count else i - 1
 
 
-def _standing(scene: Scene) -> list[Standing]:
+def _standing(scene: Scene) -> list[AboveGround]:
     """The points of `Scene.candidates`, as in training."""
     found = []
     for registered, candidates in zip(scene.stretch.sweeps, scene.candidates, strict=True):
         row = candidates.row
         points = poses.transform(registered.T_world_lidar, registered.sweep.points[row])
-        found.append(Standing(row, points, scene.ground.above(points)))
+        found.append(AboveGround(row, points, scene.ground.above(points)))
     return found
 
 
 def _grouped(
-    scene: Scene, i: int, candidates: Candidates, standing: Standing, velocity_m_s: Float
+    scene: Scene, i: int, candidates: Candidates, standing: AboveGround, velocity_m_s: Float
 ) -> tuple[Candidates, Float]:
     """What of sweep number i may start a group, and (n,3) m/s with which.
 

@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from densify.learning.clips import Clip, ClipMaker
-from densify.learning.clouds import Cloud, Sweeps, order_for
+from densify.learning.clouds import NetworkCloud, Sweeps, order_for
 from densify.learning.networks.voxels import REACH_M
 from densify.types import Float32
 
@@ -38,8 +38,8 @@ class Sample:
 
     sweeps: Sweeps
     drawn: Tensor
-    drawn_source: Cloud
-    drawn_target: Cloud
+    drawn_source: NetworkCloud
+    drawn_target: NetworkCloud
     in_reach: Tensor
     duration_s: float
     flow: Tensor | None = None
@@ -110,7 +110,7 @@ def sample_of(
     sweeps = [
         None
         if n is None
-        else Cloud(
+        else NetworkCloud(
             torch.from_numpy((clip.sweeps[n].points - here.origin_m) @ change.T),
             torch.from_numpy(clip.sweeps[n].height_m * scale),
         )

@@ -17,7 +17,7 @@ from densify.types.depth import (
     Patches,
     Ranked,
     Reason,
-    Standing,
+    StandingWorld,
 )
 from densify.types.flow import FlowField, Motion, StretchFlow
 from densify.types.prior import FullDepth, Prior, PriorFit
@@ -71,7 +71,7 @@ __all__ = [
     "Result",
     "SaysWhatItFound",
     "StageCost",
-    "Standing",
+    "StandingWorld",
     "Stretch",
     "StretchFlow",
     "Sweep",

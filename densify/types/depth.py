@@ -162,7 +162,7 @@ class Patches:
 
 
 @dataclass(frozen=True)
-class Standing:
+class StandingWorld:
     """K points of the standing world, measured along a stretch of road.
 
     points: (K,3) float32 metres. normal: (K,3) float32 of any length, of the tangent plane.
@@ -191,7 +191,7 @@ class Standing:
         """Reference times by frame."""
         return dict(zip(self.frames, self.stamp_ns.tolist(), strict=True))
 
-    def select(self, keep: Bool | Int) -> Standing:
+    def select(self, keep: Bool | Int) -> StandingWorld:
         """Some of the points."""
         rows = np.flatnonzero(keep) if keep.dtype == bool else keep
         kept = {name: getattr(self, name).take(rows, axis=0) for name in _COLUMNS_OF_STANDING}

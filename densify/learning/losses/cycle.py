@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 from torch import Tensor
 
 from densify.flow.objective.neighbors import NeighborIndex
-from densify.learning.clouds import Cloud
+from densify.learning.clouds import NetworkCloud
 
 if TYPE_CHECKING:
     from densify.learning.losses import Predict
@@ -34,7 +34,7 @@ def cycle_loss(predict: Predict, sample: Sample) -> Tensor:
     moved = source.points + predict(sample.sweeps)[sample.drawn]
     nearest = target.points[NeighborIndex(target.points).nearest(moved).row[:, 0]]
     anchored = (1 - ANCHOR) * moved + ANCHOR * nearest
-    back = predict([Cloud(anchored, source.height_m), source])
+    back = predict([NetworkCloud(anchored, source.height_m), source])
     nearest_m2 = ((moved - nearest) ** 2).sum(dim=1).mean()
     cycle_m2 = ((anchored + back - source.points) ** 2).sum(dim=1).mean()
     return nearest_m2 + cycle_m2

@@ -12,7 +12,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from densify.learning.clouds import Cloud, Sweeps
+from densify.learning.clouds import NetworkCloud, Sweeps
 
 NUM_POINTS = 8192
 """A larger sweep is thinned to so many points; the others take the flow of the nearest three."""
@@ -54,7 +54,7 @@ class FlowNet3D(nn.Module):
             return flow
         return _carried(flow, few.points, source.points)
 
-    def _flow(self, source: Cloud, target: Cloud) -> Tensor:
+    def _flow(self, source: NetworkCloud, target: NetworkCloud) -> Tensor:
         p0, f0 = source.points, source.height_m[:, None]
         p1, f1 = self.set1(p0, f0)
         p2, f2 = self.set2(p1, f1)
@@ -191,7 +191,7 @@ def _carried(flow: Tensor, few: Tensor, many: Tensor) -> Tensor:
     return torch.cat([_interpolated(few, flow, some) for some in torch.split(many, _CHUNK)])
 
 
-def _thinned(cloud: Cloud) -> Cloud:
+def _thinned(cloud: NetworkCloud) -> NetworkCloud:
     """Every so many points, in the order of the sweep."""
     count = len(cloud.points)
     if count <= NUM_POINTS:

@@ -18,7 +18,7 @@ from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 from torch.nn import functional
 
-from densify.learning.clouds import Cloud, Sweeps
+from densify.learning.clouds import NetworkCloud, Sweeps
 
 CELL_M = 0.4
 NUM_CELLS = 256
@@ -126,7 +126,7 @@ class _Pillars:
         )
 
     @staticmethod
-    def of(cloud: Cloud) -> _Pillars:
+    def of(cloud: NetworkCloud) -> _Pillars:
         at = (cloud.points[:, :2] + REACH_M) / CELL_M
         row = torch.nonzero(((at >= 0) & (at < NUM_CELLS)).all(dim=1))[:, 0]
         cell = at[row].floor().long()
