@@ -509,13 +509,14 @@ def _bytes(street: Street, frame: int) -> tuple[bytes, ...]:
 def test_same_bytes_fresh_cached_damaged_and_without_a_cache(highway, tmp_path, monkeypatch):
     first = _bytes(highway, 30)
     again = Street.from_spec("street:highway?sensor=vlp16")
-    again.simulator.__dict__["scene"] = highway.simulator.scene
     monkeypatch.setattr(type(again.simulator), "returns", None)  # must come from the cache
     assert _bytes(again, 30) == first
     monkeypatch.undo()
 
     monkeypatch.setenv("DENSIFY_CACHE_DIR", str(tmp_path))
-    fresh = Street.from_spec("street:highway?sensor=vlp16")  # a scene of its own
+    build_scene.cache_clear()
+    fresh = Street.from_spec("street:highway?sensor=vlp16")
+    assert fresh.simulator.scene is not highway.simulator.scene
     assert _bytes(fresh, 30) == first
     files = sorted(tmp_path.rglob("*.npz"))
     assert len(files) == 2
@@ -523,15 +524,18 @@ def test_same_bytes_fresh_cached_damaged_and_without_a_cache(highway, tmp_path, 
     for file, damage in zip(files, (b"", files[1].read_bytes()[:5000]), strict=True):
         file.write_bytes(damage)
     repaired = Street.from_spec("street:highway?sensor=vlp16")
-    repaired.simulator.__dict__["scene"] = highway.simulator.scene
     assert _bytes(repaired, 30) == first
 
     blocked = tmp_path / "file"
     blocked.write_text("not a folder")
     monkeypatch.setenv("DENSIFY_CACHE_DIR", str(blocked))
     uncached = Street.from_spec("street:highway?sensor=vlp16")
-    uncached.simulator.__dict__["scene"] = highway.simulator.scene
     assert uncached[30].points.tobytes() == first[0]
+
+
+def test_scanners_and_rates_share_a_scene():
+    other = Street.from_spec("street?sensor=vlp16&hz=20")
+    assert other.simulator.scene is Street("street").simulator.scene
 
 
 def test_presets_seeds_and_frames_differ(street, static, highway):
