@@ -19,6 +19,7 @@ _LEAST_DENSITY = 0.001  # sixteen rings alone measure 0.5 % of an image
 _FARTHEST_M = 20.0  # a camera from the scanner, on the longest trucks
 _STEEPEST_DEG = 60.0  # a camera's view, up or down
 _LONGEST_SWEEP = 1.5  # of the usual time from sweep to sweep
+_OTHER_CLOCK_S = 1.0  # from a sweep to the nearest image; a camera that missed some is sooner back
 
 
 def with_doubts(
@@ -106,9 +107,10 @@ def _of_shots(
             yield f"{name}: the recording has no image of it: its map has no colour"
             continue
         nearest_s = min(abs(stamp_ns - shot.stamp_ns) for stamp_ns in stamps_ns) * 1e-9
+        clocks = "; are the stamps of both by one clock?" if nearest_s > _OTHER_CLOCK_S else ""
         yield (
-            f"{name}: no image belongs to the sweep, the nearest was taken {nearest_s:.3g} s away; "
-            f"are the stamps of both by one clock?"
+            f"{name}: no image belongs to the sweep, the nearest was taken {nearest_s:.3g} s away: "
+            f"its map has no colour{clocks}"
         )
 
 

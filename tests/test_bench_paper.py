@@ -238,7 +238,7 @@ def test_boxes_make_the_flow_that_the_sensor_sees(log: Path) -> None:
     assert np.linalg.norm(pair.of_vehicle(), axis=1).mean() > 0.1
     reached_m, _ = cKDTree(pair.target).query((pair.source + pair.flow)[pair.moving])
     before_m, _ = cKDTree(pair.target).query(pair.source[pair.moving])
-    assert np.median(reached_m) < 0.15 < 2 * np.median(before_m)
+    assert np.median(reached_m) < 0.1 and reached_m.mean() < 0.5 * before_m.mean()
     rows = bench_paper(pairs[:1], ["rest"])["methods"]["rest"]
     assert rows["static_m"] < 1e-6 and rows["moving_m"] > 0.2
 

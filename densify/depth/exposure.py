@@ -81,14 +81,13 @@ def key_shots(
             shots[camera.name] = Shot(camera, number, moment_ns)
         else:
             shots[camera.name] = Shot(camera, None, stamp_ns)
-        if not near:
+        if settings.per == "image" and not near:
             _log.warning(
-                "key %d: %s has no image of %s within %.0f ms of the sweep: %s",
+                "key %d: %s has no image of %s within %.0f ms of the sweep: no depth map",
                 key,
                 sequence.name,
                 camera.name,
                 (end_ns - begin_ns) / 2e6,
-                "no depth map" if settings.per == "image" else "its depth map has no colour",
             )
     return shots
 

@@ -38,7 +38,7 @@ def add(commands: Any) -> None:
     parser.add_argument(
         "--sensor",
         metavar="NAME",
-        help="the scanner: hdl64, hdl32, vlp16, os128, vls128, dual32, panda, pandaset, "
+        help="the scanner: hdl64, hdl32, vlp16, os128, vls128, dual32, panda, pandaset, fmcw, "
         "rosette (default: hdl64)",
     )
     parser.add_argument(
