@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from densify.flow.tracking import tracks
 from densify.geometry import poses
 from densify.types import FlowField
 from tests.found_motion import KEY, NOISE, Found, motion_in, toward_key
@@ -53,6 +54,20 @@ def test_guard_rails_seen_between_rings_stay(scanner):
     highway = Scene(World((*rails, *posts, *poles)), Arc(0, 0, 0, 25.0), scanner)
     found = Found.around(8, highway, 5)
     assert not any(flow.moving.any() for flow in found.fields)
+
+
+def test_what_turns_out_to_be_a_rail_stays(traffic, monkeypatch):
+    """A short piece of one may be proven to move; not the whole that it gathers."""
+    gathered = []
+
+    def is_rail(track, *_):
+        gathered.append(track)
+        return len(gathered) == 1
+
+    monkeypatch.setattr(tracks, "may_be_a_rail", is_rail)
+    motion = motion_in(traffic.stretch, traffic.ground)
+    assert len(motion.tracks) == len(gathered) - 1
+    assert all(track is not gathered[0] for track in motion.tracks)
 
 
 # --- movers ---------------------------------------------------------------------------------------

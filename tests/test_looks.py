@@ -10,7 +10,9 @@ import pytest
 
 from densify.clock import Clock
 from densify.config import GroundSettings
+from densify.flow.tracking import groups
 from densify.flow.tracking.evidence import FreeSpace, Standing
+from densify.flow.tracking.extent import Seen
 from densify.flow.tracking.looks import looks_of
 from densify.geometry.ground import ground
 from densify.geometry.poses import transform
@@ -136,3 +138,47 @@ def test_two_sweeps_of_half_the_columns_see_through_more_than_one_of_them():
     alone = RangeImage.of(stretch.sweeps[2]).sees_through(beside, 0.4, 0.015)
     one, half_and_half = free[800].sum(), free[400].sum()
     assert 1.05 * alone.sum() < half_and_half < one < 1.1 * half_and_half
+
+
+def test_what_sweeps_of_a_look_see_near_objects_is_put_together():
+    rng = np.random.default_rng(4)
+    parts = [
+        Seen(
+            row=np.arange(n),
+            points=rng.normal(size=(n, 3)),
+            time_s=rng.random(n),
+            height_m=rng.random(n).astype(np.float32),
+            reach_m=rng.random(n),
+            seed=rng.random(n) < 0.5,
+        )
+        for n in (3, 5)
+    ]
+    assert Seen.together(parts[:1]) is parts[0]
+    together = Seen.together(parts)
+    for name in ("row", "points", "time_s", "height_m", "reach_m", "seed"):
+        column = getattr(together, name)
+        np.testing.assert_array_equal(column[:3], getattr(parts[0], name))
+        np.testing.assert_array_equal(column[3:], getattr(parts[1], name))
+        assert column.dtype == getattr(parts[0], name).dtype
+    low = parts[1].points[2]
+    assert together.strips.rows_inside(low - 1e-9, low + 1e-9).tolist() == [5]
+
+
+def test_objects_are_lengthened_by_what_the_sweeps_of_a_look_see_together(monkeypatch):
+    asked = []
+
+    def lengthen(instance, seen, *_):
+        asked.append(len(seen.row))
+        assert len(instance) == len(seen.row)
+
+    scene = Scene(World((*street(), car(14, -1.6, 10, 1))), Arc(0, -1.5, 0, 6.0), Scanner(32, 360))
+    stretch = scene.stretch(3, 2)
+    heights = ground(stretch, GroundSettings())
+    monkeypatch.setattr(groups, "lengthen", lengthen)
+    motion_in(stretch, heights)
+    alone, asked = asked, []
+    monkeypatch.setattr(Clock, "looks", lambda _: ((0, 1), (2, 3), (4,)))
+    motion = motion_in(stretch, heights)
+    assert len(alone) == 5 and len(asked) == 3 and sum(asked) == sum(alone)
+    for sweep, instance in zip(stretch.sweeps, motion.instance, strict=True):
+        assert len(instance) == len(sweep.sweep) and (instance >= 0).any()

@@ -113,7 +113,7 @@ def test_what_is_seen_for_long_may_be_contradicted_more(num_seen, num_sweeps, st
         patch.setattr(proof, "_left_places", lambda *_: ((0, 100), (0, 100)))
         clock = SimpleNamespace(time_s=0.1 * np.arange(num_sweeps))
         space = SimpleNamespace(gap_m=lambda *_: 0.1, clock=clock)
-        patch.setattr(proof, "_may_be_a_rail", lambda *_: False)
+        patch.setattr(proof, "_like_a_rail", lambda *_: False)
         for moved in (still // 50, still // 5):
             patch.setattr(proof, "contradictions", lambda *_, moved=moved: (still, moved, 300))
             left = proof.left_contradicted(track, [], space, [])
@@ -133,7 +133,11 @@ def test_a_line_across_its_way_is_no_rail(along_rad, rail):
         standing.append(SimpleNamespace(points=line, time_s=np.full(20, 0.1 * n)))
     track = Track(np.zeros(3), sighted, {n: np.arange(20) for n in range(5)})
     track.smooth()
-    assert proof._may_be_a_rail(track, standing, SimpleNamespace()) == rail
+    for still in (25, 35):
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(proof, "contradictions", lambda *_, still=still: (still, 0, 100))
+            found = proof.may_be_a_rail(track, standing, SimpleNamespace())
+        assert found == (rail and still < 30)  # a third of all looks is no chance
 
 
 SPEED_M_S, KEY = 6.0, 6

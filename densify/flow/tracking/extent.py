@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property
 
 import numpy as np
@@ -74,6 +74,18 @@ class Seen:
         )
         time_s = firing_times_s(stretch, i, row)
         return Seen(row, points[row], time_s, height_m[row], reach_m, seed[row])
+
+    @staticmethod
+    def together(parts: Sequence[Seen]) -> Seen:
+        """What the sweeps of one look saw, one sweep's rows after the other's."""
+        if len(parts) == 1:
+            return parts[0]
+        return Seen(
+            *(
+                np.concatenate([getattr(part, column.name) for part in parts])
+                for column in fields(Seen)
+            )
+        )
 
     @cached_property
     def strips(self) -> Strips:

@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from itertools import chain
 
 import numpy as np
 from numpy.typing import NDArray
@@ -125,22 +126,29 @@ def motion_of(
     tracks = follow_groups(standing, space, ground, velocities_m_s)
     shapes = [Shape.of(t.seen_in(standing, sorted(t.claimed))) for t in tracks]
 
-    def members(i: int) -> NDArray[np.int32]:
-        instance = np.full(len(stretch.sweeps[i].sweep), -1, np.int32)
-        if not scene.is_asked(i):
-            return instance
-        seen = Seen.of(stretch, i, ground, standing[i], space.sensors)
-        attached = attach(seen, i, tracks, shapes, space.clock, scene.min_height_m)
-        detach(attached, seen, i, tracks, shapes, standing, space.clock)
-        lengthen(attached, seen, i, tracks, shapes, standing, space)
-        radial = Radial.of(stretch.sweeps[i])
-        if radial is not None:
-            leave_out_slower(attached, seen, radial.rows(seen.row), tracks)
-        instance[seen.row] = attached
-        return instance
+    def members(look: Sequence[int]) -> list[NDArray[np.int32]]:
+        instances = [np.full(len(stretch.sweeps[i].sweep), -1, np.int32) for i in look]
+        if not any(map(scene.is_asked, look)):
+            return instances
+        parts = [Seen.of(stretch, i, ground, standing[i], space.sensors) for i in look]
+        attached = [
+            attach(seen, i, tracks, shapes, space.clock, scene.min_height_m)
+            for i, seen in zip(look, parts, strict=True)
+        ]
+        for i, seen, mine in zip(look, parts, attached, strict=True):
+            detach(mine, seen, i, tracks, shapes, standing, space.clock)
+        together = np.concatenate(attached)
+        lengthen(together, Seen.together(parts), look[0], tracks, shapes, standing, space)
+        attached = np.split(together, np.cumsum([len(mine) for mine in attached])[:-1])
+        for i, seen, mine, instance in zip(look, parts, attached, instances, strict=True):
+            radial = Radial.of(stretch.sweeps[i])
+            if radial is not None:
+                leave_out_slower(mine, seen, radial.rows(seen.row), tracks)
+            instance[seen.row] = mine
+        return instances
 
     with ThreadPoolExecutor() as pool:
-        instance = tuple(pool.map(members, range(len(stretch.sweeps))))
+        instance = tuple(chain.from_iterable(pool.map(members, space.looks)))
     bendings = {}
     if settings.flow.soft:
         fine = [_is_fine(track, space) for track in tracks]

@@ -67,12 +67,18 @@ def left_contradicted(
     short_s = _SHORT_OF_FEW_S if still < _FEW * num_asked else _SHORT_S
     if moved > _MAX_OF_SHORT * still and seen_s < min(short_s, np.ptp(space.clock.time_s) / 2):
         return None
-    if still < _SHARE_OF_RAIL * num_asked and _may_be_a_rail(track, standing, space):
+    if still < _SHARE_OF_RAIL * num_asked and _like_a_rail(track, standing, space):
         return None
     told = _left_places(track, standing, space, proven)
     if any(taken > empty for taken, empty in told) and all(t >= e for t, e in told):
         return None
     return moved / num_asked
+
+
+def may_be_a_rail(track: Track, standing: Sequence[Standing], space: FreeSpace) -> bool:
+    """Whether few looks contradict that the track stands, which is shaped like a guard rail."""
+    still, _, num_asked = contradictions(track, standing, space)
+    return still < _SHARE_OF_RAIL * num_asked and _like_a_rail(track, standing, space)
 
 
 def _left_places(
@@ -140,7 +146,7 @@ def _goes_along(track: Track, space: FreeSpace) -> bool:
     return apart_m_s < _AS_FAST * float(np.linalg.norm(own_m_s))
 
 
-def _may_be_a_rail(track: Track, standing: Sequence[Standing], space: FreeSpace) -> bool:
+def _like_a_rail(track: Track, standing: Sequence[Standing], space: FreeSpace) -> bool:
     """Whether the object goes about where it points, and is much longer than high, and than wide or
     moving about as the scanner does. Nothing of a guard rail tells its motion along itself; where
     it lies between two rings, sweeps see through it; and rings go with the scanner, so that it

@@ -20,7 +20,7 @@ from densify.flow.tracking.align import MIN_FIT, Model, align
 from densify.flow.tracking.evidence import FreeSpace, Standing
 from densify.flow.tracking.lone_rings import in_line, linked_in_line, single_rings
 from densify.flow.tracking.looks import Look, looks_of
-from densify.flow.tracking.proof import left_contradicted
+from densify.flow.tracking.proof import left_contradicted, may_be_a_rail
 from densify.flow.tracking.shapes import Body, Shape
 from densify.flow.tracking.sightings import Track
 from densify.flow.tracking.slides import take_back_slides
@@ -108,6 +108,9 @@ def follow_groups(
                 track, left = tried, contradicted
         if proven:
             _gather(track, standing, free, space)
+            # A piece of a guard rail shows with the rest what it is of.
+            proven = not may_be_a_rail(track, standing, space)
+        if proven:
             _refine(track, standing, ground)
             take_back_slides(track, standing, space)
             _claim_rings(track, standing, free, space)
