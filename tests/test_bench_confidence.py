@@ -16,9 +16,10 @@ from densify.cli.options import recording_keys
 from densify.depth import confidence as scale
 
 NUM_GROUPS = len(scale.GROUPS)
+NUM_DRAWN = 135_000 * NUM_GROUPS
 
 
-def drawn(seed: int, log, num=2_000_000, source="truth") -> bench.Evidence:
+def drawn(seed: int, log, num=NUM_DRAWN, source="truth") -> bench.Evidence:
     """A map of ``num`` pixels, evenly of all groups and ranks, wrong as ``log`` (G,R) says."""
     rng = np.random.default_rng(seed)
     shown = rng.poisson(num / log.size, log.shape).astype(float)
@@ -61,7 +62,7 @@ def test_knots_say_the_whole_table():
 def test_reliability_is_that_of_the_maps_pixels(better):
     steps = bench._reliability([drawn(5, known() - better)], known())
     total = sum(step["num_compared"] for step in steps)
-    assert total == pytest.approx(2_000_000, rel=0.01)
+    assert total == pytest.approx(NUM_DRAWN, rel=0.01)
     expected, found = (
         sum(s[n] * s["num_compared"] for s in steps) for n in ("expected", "outliers")
     )

@@ -12,7 +12,11 @@ from densify.files.texts import read_json
 from densify.types import DepthMap, Ranked
 from tests.scenes import CAMERA
 
-GROUPS = ("window, smooth", "window, 0.25", "filled, 0.1")
+GROUPS = (
+    "window, rough from 0, contradicted from 0",
+    "window, rough from 0.1, contradicted from 0.03",
+    "filled, rough from 0.1, contradicted from 0",
+)
 
 
 def made(confidence, filled_m) -> DepthMap:
@@ -67,7 +71,7 @@ def test_a_map_expects_what_its_own_pixels_are_worth():
             assert scale.wrong(confidence[part]).mean() == pytest.approx(expected.mean(), rel=0.03)
 
 
-def test_groups_are_how_a_pixel_came_and_how_ragged_it_is_around():
+def test_groups_are_how_a_pixel_came_and_how_ragged_and_contradicted_it_is_around():
     shape = (60, 120)
     none, everywhere = np.zeros(shape, np.float32), np.ones(shape, np.float32)
     left = np.arange(shape[1]) < 60
@@ -87,19 +91,37 @@ def test_groups_are_how_a_pixel_came_and_how_ragged_it_is_around():
     )
     far = np.zeros(shape, bool)
     far[:10] = True
-    rank, group = scale.ranked(layers, far)
+    contradicted = np.where(np.arange(shape[1]) < 100, none, np.float32(0.05))
+    rank, group = scale.ranked(layers, far, contradicted)
     assert (rank == 0.5).all()
     names = np.array(scale.GROUPS)[group]
-    assert names[5, 11] == "beyond, 0.25" and names[20, 11] == "window, 0.25"
-    assert names[5, 90] == "beyond, smooth" and names[20, 90] == "window, smooth"
-    assert names[45, 11] == "filled, 0.5" and names[45, 90] == "filled, smooth"
+    for row, how in ((5, "beyond"), (20, "window"), (45, "filled")):
+        ragged = 0.5 if how == "filled" else 0.1
+        assert names[row, 11] == f"{how}, rough from {ragged}, contradicted from 0"
+        assert names[row, 90] == f"{how}, rough from 0, contradicted from 0"
+        assert names[row, 110] == f"{how}, rough from 0, contradicted from 0.03"
+
+
+def test_only_what_is_shown_tells_how_contradicted_it_is_around():
+    shape = (20, 20)
+    none = np.zeros(shape, np.float32)
+    shown = np.arange(shape[1]) % 2 == 0
+    filled_m = np.where(shown, np.ones(shape, np.float32), none)
+    layers = Layers(
+        *(none, none, none > 0, none > 0, filled_m, none + 1, np.full(shape, -1, np.int32)),
+        tilt=np.zeros((*shape, 2), np.float32),
+        spacing_px=np.ones((*shape, 2), np.float32),
+    )
+    contradicted = np.where(shown, np.full(shape, 0.015, np.float32), np.float32(1))
+    group = scale.ranked(layers, none > 0, contradicted).group
+    assert scale.GROUPS[group[10, 10]] == "filled, rough from 0, contradicted from 0.01"
 
 
 def test_the_packages_own_tables_fall_with_the_rank():
     own = scale.tables_of(read_json(scale.TABLES))
     assert own.shape == (len(scale.GROUPS), scale.NUM_RANKS)
     assert (np.diff(own) <= 1e-9).all() and own.max() <= 0 and own.min() >= -scale.DECADES
-    smooth, ragged = (own[k::5].mean() for k in (0, 4))
+    smooth, ragged = (own[k::12].mean() for k in (0, 11))
     assert ragged > smooth + 0.5
 
 

@@ -5,9 +5,10 @@ A map's stages rank its pixels: by sweeps and points that agree, nearness of an 
 far was filled, votes of the image. What a rank is worth depends on where it is had: among the
 leaves of a hedge far more pixels are wrong than on a road at the same rank. So the probability of a
 wrong depth was measured, where the truth is exact, by rank *and* group: how a pixel came to its
-depth (measured within the window, beyond it, or filled), and how ragged its surroundings are, the
-share of what is measured around it that lies at depth edges. ``densify bench confidence`` makes
-these tables, ``confidence.json`` beside this file, and says how far they hold elsewhere.
+depth (measured within the window, beyond it, or filled), how ragged its surroundings are, the
+share of what is measured around it that lies at depth edges, and how far they contradict each
+other (`densify.depth.agreement`): among leaves more than around a car. ``densify bench confidence``
+makes these tables, ``confidence.json`` beside this file, and says how far they hold elsewhere.
 
 Within a map the order of the ranks stays, of pixels measured and of pixels filled: each rank gets
 the mean probability of the map's own pixels at that rank, made to fall with the rank.
@@ -32,34 +33,45 @@ from densify.types import Bool, Camera, DepthMap, Float, Float32, Ranked
 DECADES = 5.0
 """Confidence 1 is one wrong pixel in 10^5, each fifth less ten times as many."""
 GROUPS = tuple(
-    f"{how}, {ragged}"
+    f"{how}, rough from {ragged:g}, contradicted from {off:g}"
     for how in ("window", "beyond", "filled")
-    for ragged in ("smooth", "rough from 0.02", "0.1", "0.25", "0.5")
+    for ragged in (0, 0.1, 0.5)
+    for off in (0, 0.01, 0.03, 0.08)
 )
-"""How pixels came to their depth, and the share of what is measured around that is at edges."""
+"""How pixels came to their depth, the share of what is measured around that is at edges, and the
+mean share of it by which pixels there are contradicted."""
 NUM_RANKS = 200
 TABLES = Path(__file__).with_name("confidence.json")
 
-_RAGGED = np.array([0.02, 0.1, 0.25, 0.5])
-_NUM_RAGGED = len(_RAGGED) + 1
-_NUM_MEASURED = 2 * _NUM_RAGGED  # groups; those behind are filled
+_RAGGED, _CONTRADICTED = np.array([0.1, 0.5]), np.array([0.01, 0.03, 0.08])
+_NUM_RAGGED, _NUM_CONTRADICTED = len(_RAGGED) + 1, len(_CONTRADICTED) + 1
+_NUM_MEASURED = 2 * _NUM_RAGGED * _NUM_CONTRADICTED  # groups; those behind are filled
 _AROUND = 4.0  # gaps between rays to all sides
 _TILT = 0.01  # decades over all ranks: pixels of different rank keep a different confidence
 _NUM_STEPS = 20
 
 
-def ranked(layers: Layers, far: Bool) -> Ranked:
-    """The rank and group of a map's pixels. far: (H,W) measured by sweeps beyond the window."""
-    reach = max(2, round(_AROUND * float(np.median(layers.gap_px))))
+def ranked(layers: Layers, far: Bool, contradicted: Float32) -> Ranked:
+    """The rank and group of a map's pixels. far: (H,W) measured by sweeps beyond the window.
+    contradicted: (H,W) of the filled map's pixels, see `densify.depth.agreement`."""
     rim, measured = layers.rim_m > 0, (layers.depth_m > 0) | (layers.rim_m > 0)
-    at_edges, around = (
-        ndimage.uniform_filter(part.astype(np.float32), 2 * reach + 1, mode="constant")
-        for part in (rim, measured)
+    shown, size = (
+        layers.filled_m > 0,
+        2 * max(2, round(_AROUND * float(np.median(layers.gap_px)))) + 1,
     )
-    ragged = at_edges / np.maximum(around, 1 / (2 * reach + 1) ** 2)
+
+    def mean(values: Float32 | Bool, of: Bool) -> Float32:
+        """(H,W) over the pixels ``of`` around."""
+        sums, num = (
+            ndimage.uniform_filter(part.astype(np.float32), size, mode="constant")
+            for part in (np.where(of, values, 0), of)
+        )
+        return sums / np.maximum(num, np.float32(1 / size**2))
+
     how = np.where(layers.depth_m > 0, far.astype(np.uint8), np.uint8(2))
-    group = how * _NUM_RAGGED + np.searchsorted(_RAGGED, ragged, side="right")
-    shown = layers.filled_m > 0
+    ragged = np.searchsorted(_RAGGED, mean(rim, measured), side="right")
+    off = np.searchsorted(_CONTRADICTED, mean(contradicted, shown), side="right")
+    group = (how * _NUM_RAGGED + ragged) * _NUM_CONTRADICTED + off
     rank = np.where(shown, np.clip(layers.confidence, 0, 1), np.float32(0))
     return Ranked(rank, np.where(shown, group, 0).astype(np.uint8))
 

@@ -9,7 +9,7 @@ evidence as in occupancy grids: Thrun et al., "Probabilistic Robotics", 2005, ch
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -139,7 +139,7 @@ def without_seen_through(
         dropped |= of_key.opens(_OF_KEY, _LEAST_OF_KEY) & near_mover
     if layers.window is not None:
         dropped &= ~layers.window
-    return _without(layers, dropped & (layers.filled_m > 0))
+    return layers.without(dropped)
 
 
 def _near_movers(layers: Layers, cloud: Cloud, view: InView, seen: Bool, reach_px: int) -> Bool:
@@ -165,15 +165,6 @@ def _through(
         return np.zeros((0, 2))
     hits = cloud.select(passed)
     return crossings(layers.filled_m, rays.starts(hits), hits.points, view.exposure, settings)
-
-
-def _without(layers: Layers, dropped: Bool) -> Layers:
-    rim_m = np.where(dropped & (layers.depth_m > 0), layers.depth_m, layers.rim_m)
-    depth_m, filled_m, confidence = (
-        np.where(dropped, np.float32(0), values)
-        for values in (layers.depth_m, layers.filled_m, layers.confidence)
-    )
-    return replace(layers, rim_m=rim_m, depth_m=depth_m, filled_m=filled_m, confidence=confidence)
 
 
 def _counts(

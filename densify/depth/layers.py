@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -55,3 +55,14 @@ class Layers:
     def strict(self) -> Bool:
         """(H,W) measured, and no depth edge near."""
         return (self.depth_m > 0) & (self.rim_m == 0)
+
+    def without(self, dropped: Bool) -> Layers:
+        """Without the pixels ``dropped`` (H,W) of the filled map; what was measured there becomes a
+        rim that is not accepted."""
+        dropped = dropped & (self.filled_m > 0)
+        rim_m = np.where(dropped & (self.depth_m > 0), self.depth_m, self.rim_m)
+        depth_m, filled_m, confidence = (
+            np.where(dropped, np.float32(0), values)
+            for values in (self.depth_m, self.filled_m, self.confidence)
+        )
+        return replace(self, rim_m=rim_m, depth_m=depth_m, filled_m=filled_m, confidence=confidence)

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from densify.config import ProjectSettings
+from densify.depth.agreement import contradicted, without_contradicted
 from densify.depth.confidence import calibrated, ranked
 from densify.depth.exposure import Exposure, InView
 from densify.depth.fill import fill
@@ -57,8 +58,9 @@ def project(
     Points nearer than 0.1 m, outside the image or outside the lens's valid field of view are
     dropped. Planes are fitted in inverse depth, or inverse range where depth is the range: linear
     over the image of a pinhole in the first case, nearly so over a surface's few pixels otherwise.
-    ``filled_m`` adds pixels interpolated between measured ones (`densify.depth.fill`); those that
-    the spot of a measured return covers count as measured too (`densify.depth.spot`).
+    ``filled_m`` adds pixels interpolated between measured ones (`densify.depth.fill`), less what
+    most around contradict (`densify.depth.agreement`); those that the spot of a measured return
+    covers count as measured too (`densify.depth.spot`).
     ``confidence`` starts from the point's own, less where few sweeps or points agree, a depth edge
     is close, the surface rough, or the point nearly hidden; that rank is turned into a probability
     (`densify.depth.confidence`), but with ``visibility`` off. ``reason`` says of every point why it
@@ -83,13 +85,18 @@ def project(
             layers = fill_stars(layers, settings)
     if settings.visibility and rays is not None and settings.seen_through < 1:
         layers = without_seen_through(layers, cloud, view, rays, reason, settings)
+    off = None
+    if settings.visibility:
+        off = contradicted(layers, camera.focal_px)
+        if filled:
+            layers = without_contradicted(layers, off)
     _tell(layers, reason)
     rank = None
-    if settings.visibility:
+    if off is not None:
         measured = layers.depth_m > 0
         far = np.zeros(measured.shape, bool)
         far[measured] = cloud.far[layers.point[measured]]
-        rank = ranked(layers, far)
+        rank = ranked(layers, far, off)
         layers = replace(layers, confidence=calibrated(rank, layers.filled_m > 0))
         if filled and settings.spot > 0:
             layers = measure_spots(layers, points, settings)

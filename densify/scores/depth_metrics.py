@@ -20,8 +20,8 @@ from densify.errors import InputError
 from densify.types import Bool, Camera, DepthMap, Float, Float32
 
 KITTI_BASELINE_M = 0.54
-_OUTLIER_PX = 3.0
-_OUTLIER_FRACTION = 0.05
+OUTLIER_PX = 3.0
+OUTLIER_FRACTION = 0.05
 _DELTA = 1.25
 _RANGES_M = (0, 10, 20, 30, 50, 80)
 _EDGE_PX = 3
@@ -228,7 +228,7 @@ def is_outlier_depth(
 
 def _is_outlier(disparity_px: Float, true_px: Float) -> Bool:
     off_px = np.abs(disparity_px - true_px)
-    wrong: Bool = (off_px > _OUTLIER_PX) & (off_px > _OUTLIER_FRACTION * true_px)
+    wrong: Bool = (off_px > OUTLIER_PX) & (off_px > OUTLIER_FRACTION * true_px)
     return wrong
 
 

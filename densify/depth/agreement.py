@@ -1,0 +1,44 @@
+# SPDX-License-Identifier: MIT
+"""How far the depths around agree with a pixel's: on a wall, a road or a car they lie on one
+surface; among leaves they lie at many depths, and which of them a pixel shows is often wrong."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from densify.depth.layers import Layers
+from densify.kernels import agreeing
+from densify.scores.depth_metrics import KITTI_BASELINE_M, OUTLIER_FRACTION, OUTLIER_PX
+from densify.types import Float32
+
+_GIVEN = 2  # pixels around that are taken to agree: few do not tell
+_MOST = 0.7  # of them; of what more contradicted, half to nine tenths was wrong
+
+
+def contradicted(layers: Layers, focal_px: float) -> Float32:
+    """(H,W) share of what is measured around each pixel of the filled map, at depth edges too, that
+    would make it wrong by KITTI's rule, within a gap between rays to all sides."""
+    measured_m = np.maximum(layers.depth_m, layers.rim_m)
+    inverse, known = (
+        np.divide(1, depth_m, out=np.zeros_like(depth_m), where=depth_m > 0)
+        for depth_m in (layers.filled_m, measured_m)
+    )
+    pixel = np.flatnonzero(layers.filled_m)
+    share = np.zeros(len(pixel), np.float32)
+    half_px = max(2, round(float(np.median(layers.gap_px))))
+    rule = np.array([_GIVEN, OUTLIER_PX / (focal_px * KITTI_BASELINE_M), OUTLIER_FRACTION])
+    agreeing.contradicted.over_rows(
+        *(len(pixel), pixel, inverse, known, layers.tilt, half_px, rule, share)
+    )
+    found = np.zeros_like(layers.filled_m)
+    found.flat[pixel] = share
+    return found
+
+
+def without_contradicted(layers: Layers, share: Float32) -> Layers:
+    """Without the pixels that most of what is measured around contradicts; share: (H,W) of it, see
+    `contradicted`. In closed windows (`densify.depth.glass`) what is behind them may."""
+    dropped = share > _MOST
+    if layers.window is not None:
+        dropped &= ~layers.window
+    return layers.without(dropped)
