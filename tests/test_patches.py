@@ -10,7 +10,7 @@ import pytest
 from test_project import KEY, make_cloud, patches_of
 
 from densify.config import ProjectSettings
-from densify.depth.patches import patches
+from densify.depth.patches import Tangents, patches, tangents
 from densify.geometry.range_image import RangeImage
 from densify.geometry.sensor import Sensors
 from densify.types import RegisteredSweep, Sweep
@@ -190,3 +190,30 @@ def test_spacings_are_of_the_scanner_that_measured_and_from_where_it_stands():
         expected = range_m[:, None] * model.table.at(azimuth, elevation)
         close = np.isclose(found.spacing_m[mine], expected, rtol=1e-3).all(axis=1)
         assert close.mean() > 0.97  # the others stand on the border of a bin
+
+
+def test_methods_share_tangents_and_each_finds_its_own(monkeypatch):
+    """The second method's are those that it finds alone, and only what the first did not want is
+    worked out for it."""
+    registered = in_a_room("panda")
+    sweep, sensors = registered.sweep, Sensors.of([registered])
+    cloud = replace(make_cloud(sweep.points), lidar=sweep.lidar)
+    rng, shared, asked = np.random.default_rng(5), Tangents(), []
+    usual = tangents
+    watched = lambda *a: (asked.append(int(a[3].sum())), usual(*a))[1]  # noqa: E731
+    monkeypatch.setattr("densify.depth.patches.tangents", watched)
+    known = np.zeros(len(cloud), bool)
+    for moved_m in (0.0, 0.3):
+        wanted = rng.random(len(cloud)) < 0.6
+        other = replace(cloud, points=cloud.points + moved_m)
+        given = ProjectSettings(), sensors, {KEY: sensors.origins_m}, None, wanted
+        found, alone = patches(other, KEY, *given, shared), patches(other, KEY, *given)
+        assert asked[-2:] == [(wanted & ~known).sum(), wanted.sum()]
+        assert found.normal.tobytes() == alone.normal.tobytes()
+        assert found.spacing_m.tobytes() == alone.spacing_m.tobytes()
+        known |= wanted
+    # other points, where registration puts them, have tangents of their own
+    turned = replace(cloud, rigid_points=cloud.rigid_points[:, [1, 0, 2]])
+    found, alone = patches(turned, KEY, *given, shared), patches(turned, KEY, *given)
+    assert asked[-2:] == [wanted.sum()] * 2
+    assert found.normal.tobytes() == alone.normal.tobytes()

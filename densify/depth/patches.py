@@ -6,6 +6,8 @@ the key sweep saw through the place."""
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from threading import Lock
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +21,40 @@ from densify.types import Bool, Cloud, Float, Float32, Patches
 _MIN_FILLED = 6
 
 
+class Tangents:
+    """What `tangents` finds, kept for those who ask again: methods differ in where they put what
+    moves, not in what was measured. The largest cloud is kept. May be asked by several threads."""
+
+    def __init__(self) -> None:
+        self._lock = Lock()
+        self._asked: tuple[NDArray[Any], ...] = (np.zeros((0, 3)),) * 3
+        self._wanted = np.zeros(0, bool)
+        self._normal, self._spacing_m = np.zeros((2, 0, 3), np.float32)
+
+    def of(
+        self,
+        cloud: Cloud,
+        sweep: NDArray[np.int32],
+        wanted: Bool,
+        sensors: Sensors,
+        origins: Sequence[Float],
+    ) -> tuple[Float32, Float32]:
+        """As `tangents`, of the rigidly registered points."""
+        asked = cloud.rigid_points, cloud.lidar, sweep
+        if len(cloud) < len(self._asked[0]):
+            return tangents(*asked, wanted, sensors, origins)
+        with self._lock:
+            again = all(map(np.array_equal, asked, self._asked))
+            known = wanted & self._wanted if again else np.zeros(len(cloud), bool)
+            normal, spacing_m = tangents(*asked, wanted & ~known, sensors, origins)
+            rows = np.flatnonzero(known)
+            if len(rows):
+                normal[rows], spacing_m[rows] = self._normal[rows], self._spacing_m[rows]
+            self._asked, self._wanted = asked, wanted
+            self._normal, self._spacing_m = normal, spacing_m
+        return normal, spacing_m
+
+
 def patches(
     cloud: Cloud,
     key: int,
@@ -27,13 +63,14 @@ def patches(
     origins: Mapping[int, Float],
     key_image: RangeImage | None = None,
     wanted: Bool | None = None,
+    shared: Tangents | None = None,
 ) -> Patches:
     """The patches of ``cloud``, of any use to every camera.
 
     sensors: the scanners that measured it. origins: (S,3) where each of them stood in each source
     sweep, key frame, by frame. key_image: what the key sweep saw; without it nothing is ``free``.
     wanted: (M,) the points that some camera sees, all if None; of others no more than ``sweep`` is
-    told.
+    told. shared: with other methods, by the same sensors and origins.
 
     The tangent plane is from the neighbours in azimuth and elevation of the same scanner in the
     same sweep; where they tell of no single surface the patch faces the scanner. A point of another
@@ -45,14 +82,8 @@ def patches(
     sweep: NDArray[np.int32] = inverse.ravel().astype(np.int32)
     if wanted is None:
         wanted = np.ones(len(cloud), bool)
-    normal, spacing_m = tangents(
-        cloud.rigid_points,
-        cloud.lidar,
-        sweep,
-        wanted,
-        sensors,
-        [origins[int(f)] for f in frames],
-    )
+    places = [origins[int(f)] for f in frames]
+    normal, spacing_m = (shared or Tangents()).of(cloud, sweep, wanted, sensors, places)
     free = np.zeros(len(cloud), bool)
     other = np.flatnonzero(wanted & (cloud.frame != key))
     if key_image is not None and len(other):

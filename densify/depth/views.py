@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,7 +17,7 @@ from densify.depth.exposure import Exposure, InView, Shot
 from densify.depth.far import far_cloud
 from densify.depth.free_space import Rays
 from densify.depth.optical_flow import optical_flow
-from densify.depth.patches import patches, vetoed
+from densify.depth.patches import Tangents, patches, vetoed
 from densify.depth.picture import lab
 from densify.depth.project import project
 from densify.geometry import poses
@@ -80,7 +80,7 @@ class Views:
 
     key_image: what the key sweep saw. sensors: the scanners. origins: (S,3) where they stood in
     each sweep, key frame, by frame. rays: of these sweeps. lab: of those that show an
-    image, see `densify.depth.picture`.
+    image, see `densify.depth.picture`. tangents: of what methods share.
     """
 
     key: int
@@ -91,6 +91,7 @@ class Views:
     rays: Rays
     settings: ProjectSettings
     lab: Mapping[str, Float32]
+    tangents: Tangents = field(default_factory=Tangents)
 
     @staticmethod
     def of(
@@ -135,6 +136,7 @@ class Views:
             self.origins,
             key_image,
             wanted=_in_any(views, len(cloud)),
+            shared=self.tangents,
         )
         return SeenCloud(cloud, surface, views)
 
