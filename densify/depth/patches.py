@@ -44,7 +44,7 @@ class Tangents:
         if len(cloud) < len(self._asked[0]):
             return tangents(*asked, wanted, sensors, origins)
         with self._lock:
-            again = all(map(np.array_equal, asked, self._asked))
+            again = all(np.array_equal(a, b) for a, b in zip(asked, self._asked, strict=True))
             known = wanted & self._wanted if again else np.zeros(len(cloud), bool)
             normal, spacing_m = tangents(*asked, wanted & ~known, sensors, origins)
             rows = np.flatnonzero(known)

@@ -79,10 +79,11 @@ class PoseTrack:
             turns = Rotation.from_matrix(T_ref_ego[:, :3, :3])
             shift_m = T_ref_ego[0, :3, 3]
         else:
-            turns = Slerp(since_ns, Rotation.from_matrix(T_ref_ego[:, :3, :3]))(offset_ns)
-            shift_m = np.stack(
-                [np.interp(offset_ns, since_ns, T_ref_ego[:, axis, 3]) for axis in range(3)], axis=1
-            )
+            fired_ns, row = np.unique(offset_ns, return_inverse=True)  # beams fire together
+            slerp = Slerp(since_ns, Rotation.from_matrix(T_ref_ego[:, :3, :3]))
+            places_m = T_ref_ego[:, :3, 3].T
+            turns = slerp(fired_ns)[row]
+            shift_m = np.stack([np.interp(fired_ns, since_ns, p) for p in places_m], 1)[row]
         if inverse:
             return turns.apply(points - shift_m, inverse=True)
         return turns.apply(points) + shift_m
