@@ -3,9 +3,15 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
+from densify.clock import Clock
+from densify.flow.tracking.evidence import Standing
+from densify.flow.tracking.extent import shape_of
+from densify.flow.tracking.sightings import Sighting, Track
 from tests.found_motion import KEY, NOISE, Found
 from tests.scenes import Arc, Box, Scene, World, car, street
 
@@ -57,6 +63,27 @@ def test_a_wall_that_somebody_walks_along_stays():
     still = marked(found, EXTRA)
     assert found.share_moving(1, 4) > 0.9
     assert len(still) > 20_000 and still.mean() < 0.04  # an arm's length of it
+
+
+@pytest.mark.parametrize(("speed_m_s", "num_kept"), [(1.4, 240), (5.0, 241)])
+def test_what_one_sweep_saw_far_from_who_walks_is_none_of_it(speed_m_s, num_kept):
+    """An echo that melted with that of a wall. Of what drives it may be a part that just came into
+    view."""
+    rng, time_s = np.random.default_rng(0), 0.1 * np.arange(6)
+    body = rng.uniform(-0.3, 0.3, (40, 3)) * [1, 1, 3]
+    track, standing = Track(np.zeros(3)), []
+    for i, at_s in enumerate(time_s):
+        state = np.array([speed_m_s * at_s, 0.0, 0.0, 0.0])
+        points = np.concatenate([body, np.tile([0.0, 0.9, 0.0], (int(i == 3), 1))]) + state[:3]
+        rows = np.arange(len(points))
+        seen = Standing(rows, points, np.full(len(rows), at_s), rows >= 0, 0 * rows, 1)
+        standing.append(seen)
+        track.claimed[i] = rows
+        track.sightings[i] = Sighting(state, at_s, round(at_s * 1e9), (i,))
+    track.smooth()
+    clock = Clock(np.rint(time_s * 1e9).astype(np.int64))
+    space = SimpleNamespace(clock=clock, gap_m=lambda *_: 0.1)
+    assert len(shape_of(track, standing, space).points) == num_kept
 
 
 @pytest.fixture(

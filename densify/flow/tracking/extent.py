@@ -93,6 +93,25 @@ class Seen:
         return Strips(self.points)
 
 
+def shape_of(track: Track, standing: Sequence[Standing], space: FreeSpace) -> Shape:
+    """All that the sweeps saw of an object; of those who walk, what is small and comes into view at
+    once, without what only even or only odd ones saw: echoes that melted with those of a wall
+    behind them, which would make parts of the wall theirs."""
+    sweeps = sorted(track.claimed)
+    halves = [track.seen_in(standing, some) for some in (sweeps[::2], sweeps[1::2])]
+    points = np.concatenate(halves)
+    if _speed_m_s(track, sweeps[len(sweeps) // 2], space.clock) > _WALKS_M_S:
+        return Shape.of(points)
+    reach_m = max(_ATTACH_M, _GAPS_REACHED * space.gap_m(track.centre, sweeps[0]))
+    again = np.concatenate(
+        [
+            np.isfinite(BoxTree(other).nearest(own, reach_m)[0])
+            for own, other in (halves, halves[::-1])
+        ]
+    )
+    return Shape.of(points[again] if again.any() else points)
+
+
 def attach(
     seen: Seen,
     i: int,

@@ -27,9 +27,9 @@ from densify.flow.tracking.extent import (
     foretold,
     leave_out_slower,
     lengthen,
+    shape_of,
 )
 from densify.flow.tracking.radial import Radial
-from densify.flow.tracking.shapes import Shape
 from densify.flow.tracking.sightings import Track
 from densify.flow.tracking.soften import Part, Softened, soften
 from densify.flow.tracking.tracks import follow_groups
@@ -124,7 +124,7 @@ def motion_of(
     stretch, space, ground = scene.stretch, scene.space, scene.ground
     standing = [Standing.of(stretch, i, found) for i, found in enumerate(candidates)]
     tracks = follow_groups(standing, space, ground, velocities_m_s)
-    shapes = [Shape.of(t.seen_in(standing, sorted(t.claimed))) for t in tracks]
+    shapes = [shape_of(track, standing, space) for track in tracks]
 
     def members(look: Sequence[int]) -> list[NDArray[np.int32]]:
         instances = [np.full(len(stretch.sweeps[i].sweep), -1, np.int32) for i in look]
