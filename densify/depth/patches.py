@@ -40,13 +40,15 @@ class Tangents:
         origins: Sequence[Float],
     ) -> tuple[Float32, Float32]:
         """As `tangents`, of the rigidly registered points."""
-        asked = cloud.rigid_points, cloud.lidar, sweep
-        if len(cloud) < len(self._asked[0]):
-            return tangents(*asked, wanted, sensors, origins)
+        points, lidar = cloud.rigid_points, cloud.lidar
+        asked: tuple[NDArray[Any], ...] = (points, lidar, sweep)
+        if len(points) < len(self._asked[0]):
+            return tangents(points, lidar, sweep, wanted, sensors, origins)
         with self._lock:
             again = all(np.array_equal(a, b) for a, b in zip(asked, self._asked, strict=True))
             known = wanted & self._wanted if again else np.zeros(len(cloud), bool)
-            normal, spacing_m = tangents(*asked, wanted & ~known, sensors, origins)
+            new = wanted & ~known
+            normal, spacing_m = tangents(points, lidar, sweep, new, sensors, origins)
             rows = np.flatnonzero(known)
             if len(rows):
                 normal[rows], spacing_m[rows] = self._normal[rows], self._spacing_m[rows]
