@@ -120,6 +120,23 @@ def test_what_is_seen_for_long_may_be_contradicted_more(num_seen, num_sweeps, st
             assert (left is not None) == (proven or moved == still // 50)
 
 
+@pytest.mark.parametrize(("num_asked", "proven"), [(930, True), (500, False)])
+def test_stray_looks_do_not_undo_what_is_seen_for_a_moment(num_asked, proven):
+    """A far car at 33 m/s that four sweeps see; at most one look of 200 is an echo at its rim."""
+    sighted = {
+        n: Sighting(np.array([-3.3 * n, 0, 0, 0]), 0.1 * n, n * 100_000_000, (n,)) for n in range(4)
+    }
+    track = Track(np.array([-33.0, 11, 0]), sighted, {n: np.arange(18) for n in range(4)})
+    clock = SimpleNamespace(time_s=0.1 * np.arange(11))
+    space = SimpleNamespace(gap_m=lambda *_: 0.3, clock=clock)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(proof, "_as_fast_as_measured", lambda *_: True)
+        patch.setattr(proof, "_like_a_rail", lambda *_: False)
+        patch.setattr(proof, "_left_places", lambda *_: ((0, 59), (0, 59)))
+        patch.setattr(proof, "contradictions", lambda *_: (59, 4, num_asked))
+        assert (proof.left_contradicted(track, [], space, []) is not None) == proven
+
+
 @pytest.mark.parametrize(("along_rad", "rail"), [(0.0, True), (0.6, True), (np.pi / 2, False)])
 def test_a_line_across_its_way_is_no_rail(along_rad, rail):
     """One ring on the back of a car ahead: its ends do not tell more, but the line itself does."""

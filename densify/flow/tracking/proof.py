@@ -21,6 +21,7 @@ _NUM_ASKED = 60
 _LEAST_STATES, _LEAST_S = 3, 0.15
 _SHORT_S, _MAX_OF_SHORT = 0.35, 0.03  # three places of a tree's crown may lie on a line,
 _SHORT_OF_FEW_S, _FEW = 0.6, 0.2  # and even more where few looks contradict its standing still
+_STRAY = 0.005  # so few of all looks are echoes at an object's rim
 _MAX_CONTRADICTIONS = 0.3  # of those that standing still leaves,
 # which are so many, or of few looks this share, and of many at least that one.
 _LEAST_CONTRADICTIONS, _SHARE_OF_FEW, _LEAST_SHARE = 20, 0.08, 0.01
@@ -65,7 +66,8 @@ def left_contradicted(
     if still < max(least, _LEAST_SHARE * num_asked) or moved > _MAX_CONTRADICTIONS * still:
         return None
     short_s = _SHORT_OF_FEW_S if still < _FEW * num_asked else _SHORT_S
-    if moved > _MAX_OF_SHORT * still and seen_s < min(short_s, np.ptp(space.clock.time_s) / 2):
+    allowed = max(_MAX_OF_SHORT * still, _STRAY * num_asked)
+    if moved > allowed and seen_s < min(short_s, np.ptp(space.clock.time_s) / 2):
         return None
     if still < _SHARE_OF_RAIL * num_asked and _like_a_rail(track, standing, space):
         return None
