@@ -1,4 +1,8 @@
 # SPDX-License-Identifier: MIT
+"""Pixels that what is measured around contradicts."""
+
+from __future__ import annotations
+
 from dataclasses import replace
 
 import numpy as np

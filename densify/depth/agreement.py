@@ -28,7 +28,7 @@ def contradicted(layers: Layers, focal_px: float) -> Float32:
     half_px = max(2, round(float(np.median(layers.gap_px))))
     rule = np.array([_GIVEN, OUTLIER_PX / (focal_px * KITTI_BASELINE_M), OUTLIER_FRACTION])
     agreeing.contradicted.over_rows(
-        *(len(pixel), pixel, inverse, known, layers.tilt, half_px, rule, share)
+        len(pixel), pixel, inverse, known, layers.tilt, half_px, rule, share
     )
     found = np.zeros_like(layers.filled_m)
     found.flat[pixel] = share
@@ -36,7 +36,7 @@ def contradicted(layers: Layers, focal_px: float) -> Float32:
 
 
 def without_contradicted(layers: Layers, share: Float32) -> Layers:
-    """Without the pixels that most of what is measured around contradicts; share: (H,W) of it, see
+    """Take out the pixels that most of what is measured around contradicts. share: (H,W) of it, see
     `contradicted`. In closed windows (`densify.depth.glass`) what is behind them may."""
     dropped = share > _MOST
     if layers.window is not None:
