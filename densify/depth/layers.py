@@ -57,8 +57,8 @@ class Layers:
         return (self.depth_m > 0) & (self.rim_m == 0)
 
     def without(self, dropped: Bool) -> Layers:
-        """Take out the pixels ``dropped`` (H,W) of the filled map; what was measured there becomes a
-        rim that is not accepted."""
+        """Take out the pixels ``dropped`` (H,W) of the filled map; what was measured there becomes
+        a rim that is not accepted."""
         dropped = dropped & (self.filled_m > 0)
         rim_m = np.where(dropped & (self.depth_m > 0), self.depth_m, self.rim_m)
         depth_m, filled_m, confidence = (

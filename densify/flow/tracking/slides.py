@@ -32,9 +32,9 @@ def take_back_slides(track: Track, standing: Sequence[Standing], space: FreeSpac
     then come to lie clearly nearer to each other, and no more looks contradict it: those that saw
     different parts of the object would come nearer, too."""
     looks = sorted(track.sightings)
-    if len(looks) < _LEAST_LOOKS:
-        return
     times_s = np.array([track.sightings[n].seen_s for n in looks])
+    if len(looks) < _LEAST_LOOKS or np.ptp(times_s) < 2 * _APART_S:
+        return
     times_s -= times_s.mean()
     bodies = [track.seen_in(standing, track.sightings[n].sweeps) for n in looks]
     slide_m_s = _slide_m_s(bodies, times_s)
@@ -57,14 +57,13 @@ def _slide_m_s(bodies: Sequence[Float], times_s: Float) -> Float:
 
     bodies: (N,3) each, what the looks saw in the object's own frame, at times (L,).
     """
-    apart_s = min(_APART_S, 0.5 * np.ptp(times_s))
     fields = [DistanceField.of(body, np.zeros(len(body))) for body in bodies]
     some = [body[:: len(body) // _MANY_POINTS + 1] for body in bodies]
     pairs = [
         (a, b)
         for a, first_s in enumerate(times_s)
         for b, second_s in enumerate(times_s)
-        if apart_s <= abs(first_s - second_s) <= _MOST_APART_S
+        if _APART_S <= abs(first_s - second_s) <= _MOST_APART_S
     ]
 
     def missed(slides_m_s: Float) -> Float:
