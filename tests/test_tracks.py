@@ -137,6 +137,28 @@ def test_stray_looks_do_not_undo_what_is_seen_for_a_moment(num_asked, proven):
         assert (proof.left_contradicted(track, [], space, []) is not None) == proven
 
 
+@pytest.mark.parametrize(
+    ("told", "proven"),
+    [
+        (((953, 34), (689, 0)), False),  # a fence goes on on both sides
+        (((92, 80), (0, 0)), True),  # others come and go where it was
+        (((100, 0), (0, 100)), True),  # the rest of a long object is on one side
+        (((0, 0), (0, 0)), True),
+    ],
+)
+def test_what_is_mostly_still_there_does_not_move(told, proven):
+    sighted = {
+        n: Sighting(np.array([0.9 * n, 0, 0, 0]), 0.1 * n, n * 100_000_000, (n,)) for n in range(8)
+    }
+    track = Track(np.array([14.0, 0, 0]), sighted, {n: np.arange(8) for n in range(8)})
+    space = SimpleNamespace(gap_m=lambda *_: 0.1, clock=SimpleNamespace(time_s=np.arange(8) / 10))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(proof, "_as_fast_as_measured", lambda *_: True)
+        patch.setattr(proof, "contradictions", lambda *_: (200, 0, 300))
+        patch.setattr(proof, "_left_places", lambda *_: told)
+        assert (proof.left_contradicted(track, [], space, []) is not None) == proven
+
+
 @pytest.mark.parametrize(("along_rad", "rail"), [(0.0, True), (0.6, True), (np.pi / 2, False)])
 def test_a_line_across_its_way_is_no_rail(along_rad, rail):
     """One ring on the back of a car ahead: its ends do not tell more, but the line itself does."""

@@ -55,10 +55,8 @@ def ranked(layers: Layers, far: Bool, contradicted: Float32) -> Ranked:
     """The rank and group of a map's pixels. far: (H,W) measured by sweeps beyond the window.
     contradicted: (H,W) of the filled map's pixels, see `densify.depth.agreement`."""
     rim, measured = layers.rim_m > 0, (layers.depth_m > 0) | (layers.rim_m > 0)
-    shown, size = (
-        layers.filled_m > 0,
-        2 * max(2, round(_AROUND * float(np.median(layers.gap_px)))) + 1,
-    )
+    shown = layers.filled_m > 0
+    size = 2 * max(2, round(_AROUND * float(np.median(layers.gap_px)))) + 1
 
     def mean(values: Float32 | Bool, of: Bool) -> Float32:
         """(H,W) over the pixels ``of`` around."""
