@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from densify.config import resolve
-from densify.dataset import cluster, make
+from densify.dataset import capacity, cluster, make
 from densify.dataset.gate import Gate
 from densify.dataset.manifest import Manifest
 from densify.dataset.plan import Recipe, plan, read_plan
@@ -272,6 +272,24 @@ def test_as_many_workers_as_fit(border_drive: Path, tmp_path: Path, monkeypatch,
     assert "instead of 40" in capsys.readouterr().err
     assert run(border_drive, tmp_path / "b", "--memory", "900G", "--workers", "40") == 0
     assert 1 <= opened[0] < 4 and opened[1] == 40
+
+
+def test_as_many_workers_as_cores_free_memory_and_keys_suffice_for(
+    border_drive: Path, monkeypatch
+) -> None:
+    recipe = Recipe(window=2)
+    drives = 32 * plan([str(border_drive)], slice(39, 41), recipe)  # 64 keys
+    monkeypatch.setattr(capacity, "num_threads", lambda: 6)
+    monkeypatch.setattr(capacity, "available_bytes", lambda: 900e9)
+    assert capacity.num_processes(None, None, recipe, drives) == 6
+    assert capacity.num_processes(None, None, recipe, drives[:16]) == 4
+    assert capacity.num_processes(None, None, recipe, drives[:1]) == 1
+    assert capacity.num_processes(3, None, recipe, drives) == 3
+    few = capacity.num_processes(None, int(4e9), recipe, drives)
+    monkeypatch.setattr(capacity, "available_bytes", lambda: 4e9 / 0.7)
+    assert capacity.num_processes(None, None, recipe, drives) == few and 1 <= few < 6
+    monkeypatch.setattr(capacity, "available_bytes", lambda: None)
+    assert capacity.num_processes(None, None, recipe, drives) == 6
 
 
 def test_memory_is_reckoned_from_a_sweep_that_can_be_read(

@@ -15,6 +15,7 @@ from uuid import uuid4
 
 from densify.cache import code, steps_folder
 from densify.config import as_mapping
+from densify.dataset.capacity import BASE_BYTES, num_processes
 from densify.dataset.links import make_links
 from densify.dataset.manifest import (
     Key,
@@ -38,10 +39,8 @@ from densify.dataset.work import Job, tasks
 from densify.dataset.workers import check_workers, open_workers
 from densify.errors import ComputationError, InputError, OutputError
 from densify.flow.engines import check_engine
-from densify.memory import check_free
 from densify.outputs.atomic import clear_leftovers
 from densify.outputs.kitti_tree import write_readme
-from densify.readers import open_sequence
 from densify.readers.files import format_frames
 
 _log = logging.getLogger("densify")
@@ -50,10 +49,6 @@ CACHE_BYTES = 10 * 1024**3
 """Bound of what is kept on disk for later runs."""
 _TREE_BYTES_PER_PIXEL = 1.8  # the four maps of a camera
 _RUN_BYTES_PER_PIXEL, _CLOUD_BYTES_PER_SWEEP = 8.0, 2.5e6
-# Of a process: what is loaded, and what a point takes in the shared steps, in a key's window, and,
-# of one sweep, for all beyond the window.
-_BASE_BYTES, _SHARED_BYTES_PER_POINT, _KEY_BYTES_PER_POINT = 0.55e9, 110, 500
-_FAR_BYTES_PER_POINT = 6000
 
 
 @dataclass(frozen=True)
@@ -94,7 +89,7 @@ def make_dataset(
     keys: slice | None = None,
     recipe: Recipe | None = None,
     *,
-    num_workers: int = 1,
+    num_workers: int | None = 1,
     scheduler: str | None = None,
     shard: tuple[int, int] | None = None,
     memory_bytes: int | None = None,
@@ -106,11 +101,13 @@ def make_dataset(
     """Every key of whole recordings, as a training set in ``out``.
 
     data: recordings, as `densify.open_sequence` takes them. keys: all if None, else those of frames
-    ``start`` to ``stop`` - 1 by ``step``. num_workers: processes; 1 works in this one. scheduler:
-    address of a Dask scheduler whose workers are used instead; they need the same files at the same
-    paths; ``tcp://`` trusts everybody on that network, ``tls://`` takes certificates. shard: (i,
-    n), the i-th of n parts of the work, from 1; parts may run at the same time on machines that
-    share ``out``. memory_bytes: of all processes together; fewer are started where it does not
+    ``start`` to ``stop`` - 1 by ``step``. num_workers: processes; 1 works in this one, None takes
+    as many as cores, free memory and keys suffice for (a script that starts several must be
+    importable: ``if __name__ == "__main__"``). scheduler: address of a Dask scheduler whose workers
+    are used instead; they need the same files at the same paths; ``tcp://`` trusts everybody on
+    that network, ``tls://`` takes certificates. shard: (i, n), the i-th of n parts of the work,
+    from 1; parts may run at the same time on machines that share ``out``. memory_bytes: of all
+    processes together; fewer are started where it does not
     suffice, and one of several that takes more than its share is replaced. cache_bytes: bound of
     what is kept on disk for later runs. verify: compare finished files with their recorded hashes,
     and make damaged ones anew. links: of the tree, for loaders of others, see
@@ -131,7 +128,7 @@ def make_dataset(
         raise InputError(f"--links: of --layout kitti-depth, got --layout {recipe.layout}")
     steps_folder()
     check_workers(num_workers, scheduler)
-    num_processes = _num_processes(num_workers, memory_bytes, recipe, drives)
+    num_started = num_processes(num_workers, memory_bytes, recipe, drives)
     with Manifest(out, shard) as manifest:
         write_plan(out, recipe, drives)
         with _log_file(out, shard):
@@ -142,14 +139,14 @@ def make_dataset(
             drives = _part(drives, shard)
             done = _Done(out, drives, report, verify)
             left = done.left(drives)
-            _announce(out, recipe, left, done.summary().num_keys, num_processes)
+            _announce(out, recipe, left, done.summary().num_keys, num_started)
             todo = _tasks(left, recipe, out, cache_bytes)
             if report is not None:
                 report(done.summary())
             with _kept_told(done):
                 if todo:
-                    of_workers = memory_bytes and memory_bytes - int(_BASE_BYTES)
-                    with open_workers(num_processes, scheduler, of_workers) as workers:
+                    of_workers = memory_bytes and memory_bytes - int(BASE_BYTES)
+                    with open_workers(num_started, scheduler, of_workers) as workers:
                         for record in _records(run_tasks(todo, workers)):
                             manifest.append(record)
                             done.add(record)
@@ -275,43 +272,6 @@ def _part(drives: Sequence[PlannedDrive], shard: tuple[int, int] | None) -> list
         for d in drives
     ]
     return [part for part in parts if part.keys]
-
-
-def _num_processes(
-    num_workers: int, memory_bytes: int | None, recipe: Recipe, drives: Sequence[PlannedDrive]
-) -> int:
-    """How many processes: as wanted, or fewer that fit into the memory. One more leads several.
-    Raises InputError if the memory does not suffice for a single one."""
-    if not drives:
-        return num_workers
-    num_points = _num_points(drives)
-    num_shared = max(drive.cut.num_sweeps_of_block for drive in drives)
-    shared = num_shared * _SHARED_BYTES_PER_POINT * num_points
-    key = (2 * recipe.window + 1) * _KEY_BYTES_PER_POINT * num_points
-    far = _FAR_BYTES_PER_POINT * num_points if recipe.config.accumulate.far_m else 0
-    need = _BASE_BYTES + shared + key + far
-    if memory_bytes is None:
-        check_free(need, f"--window {recipe.window}: a process")
-        return num_workers
-    num_fitting = max(int(memory_bytes >= need), int((memory_bytes - _BASE_BYTES) / need))
-    if num_fitting < 1:
-        raise InputError(
-            f"--memory: got {memory_bytes / 1e9:.1f} GB, expected at least {need / 1e9:.1f} GB "
-            f"for window {recipe.window} and sweeps of {num_points:,} points"
-        )
-    if num_fitting < num_workers:
-        _log.warning("%d workers instead of %d fit into the memory", num_fitting, num_workers)
-    return min(num_workers, num_fitting)
-
-
-def _num_points(drives: Sequence[PlannedDrive]) -> int:
-    """Number of points of the first sweep that can be read."""
-    for drive in drives:
-        sequence = open_sequence(drive.source.data)
-        for key in drive.keys:
-            with suppress(InputError):
-                return len(sequence[key])
-    return 0
 
 
 def _announce(

@@ -17,11 +17,11 @@ from densify.dataset.tasks import InThisProcess, Workers
 from densify.errors import InputError
 
 
-def check_workers(num_workers: int, scheduler: str | None) -> None:
+def check_workers(num_workers: int | None, scheduler: str | None) -> None:
     """Raise InputError, before anything is begun, for what `open_workers` would refuse."""
     if scheduler is not None:
         check_reached(scheduler)
-    elif num_workers < 1:
+    elif num_workers is not None and num_workers < 1:
         raise InputError(f"--workers {num_workers}: expected 1 or more processes")
 
 

@@ -117,9 +117,9 @@ def _add_workers(parser: argparse.ArgumentParser) -> None:
     work.add_argument(
         "--workers",
         type=natural,
-        default=1,
         metavar="N",
-        help="processes on this machine (default: 1)",
+        help="processes on this machine (default: one on each core, or as many as the free memory "
+        "suffices for and as have eight keys each)",
     )
     work.add_argument(
         "--scheduler",
