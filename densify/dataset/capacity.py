@@ -17,7 +17,7 @@ from densify.readers import open_sequence
 _log = logging.getLogger("densify")
 
 BASE_BYTES = 0.55e9
-"""Of a process: what is loaded."""
+"""What a process has loaded before it begins."""
 # What a point takes in the shared steps, in a key's window, and, of one sweep, for all beyond it.
 _SHARED_BYTES_PER_POINT, _KEY_BYTES_PER_POINT, _FAR_BYTES_PER_POINT = 110, 500, 6000
 _LEAST_KEYS = 8  # of a process; fewer are made before another one has begun
