@@ -159,6 +159,50 @@ def test_what_is_mostly_still_there_does_not_move(told, proven):
         assert (proof.left_contradicted(track, [], space, []) is not None) == proven
 
 
+@pytest.mark.parametrize(
+    ("told", "proven"),
+    [
+        (((0, 30), (0, 30)), True),  # legs swing; the walker comes from and leaves bare places
+        (((1, 30), (0, 30)), False),
+        (((0, 30), (0, 2)), False),  # hardly anybody looked there
+    ],
+)
+@pytest.mark.parametrize(("moved", "like_a_rail"), [(80, False), (0, True)])
+def test_what_leaves_all_its_places_bare_may_swing_or_look_like_a_rail(
+    told, proven, moved, like_a_rail
+):
+    sighted = {
+        n: Sighting(np.array([0.2 * n, 0, 0, 0]), 0.1 * n, n * 100_000_000, (n,)) for n in range(8)
+    }
+    track = Track(np.array([8.0, 0, 0]), sighted, {n: np.arange(8) for n in range(8)})
+    space = SimpleNamespace(gap_m=lambda *_: 0.05, clock=SimpleNamespace(time_s=np.arange(8) / 10))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(proof, "_as_fast_as_measured", lambda *_: True)
+        patch.setattr(proof, "_like_a_rail", lambda *_: like_a_rail)
+        patch.setattr(proof, "contradictions", lambda *_: (200, moved, 700))
+        patch.setattr(proof, "_left_places", lambda *_: told)
+        assert (proof.left_contradicted(track, [], space, []) is not None) == proven
+        assert proof.may_be_a_rail(track, [], space, []) == (like_a_rail and not proven)
+
+
+@pytest.mark.parametrize("still", [30, 80])
+@pytest.mark.parametrize("told", [((0, 0), (0, 0)), ((0, 30), (0, 0))])
+def test_a_ring_that_glides_over_a_bonnet_does_not_move_it(still, told):
+    """Half a metre in a second, which one look of twenty contradicts."""
+    sighted = {
+        n: Sighting(np.array([0.06 * n, 0, 0, 0]), 0.1 * n, n * 100_000_000, (n,)) for n in range(9)
+    }
+    track = Track(np.array([29.0, 0, 0]), sighted, {n: np.arange(20) for n in range(9)})
+    space = SimpleNamespace(gap_m=lambda *_: 0.6, clock=SimpleNamespace(time_s=np.arange(9) / 10))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(proof, "_as_fast_as_measured", lambda *_: True)
+        patch.setattr(proof, "_like_a_rail", lambda *_: False)
+        patch.setattr(proof, "contradictions", lambda *_: (still, 0, 700))
+        patch.setattr(proof, "_left_places", lambda *_: told)
+        proven = proof.left_contradicted(track, [], space, []) is not None
+        assert proven == (still == 80 or told[0] == (0, 30))
+
+
 @pytest.mark.parametrize(("along_rad", "rail"), [(0.0, True), (0.6, True), (np.pi / 2, False)])
 def test_a_line_across_its_way_is_no_rail(along_rad, rail):
     """One ring on the back of a car ahead: its ends do not tell more, but the line itself does."""
@@ -175,7 +219,8 @@ def test_a_line_across_its_way_is_no_rail(along_rad, rail):
     for still in (25, 35):
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(proof, "contradictions", lambda *_, still=still: (still, 0, 100))
-            found = proof.may_be_a_rail(track, standing, SimpleNamespace())
+            patch.setattr(proof, "_left_places", lambda *_: ((9, 30), (0, 30)))
+            found = proof.may_be_a_rail(track, standing, SimpleNamespace(), [])
         assert found == (rail and still < 30)  # a third of all looks is no chance
 
 

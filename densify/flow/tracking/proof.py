@@ -22,8 +22,9 @@ _LEAST_STATES, _LEAST_S = 3, 0.15
 _SHORT_S, _MAX_OF_SHORT = 0.35, 0.03  # three places of a tree's crown may lie on a line,
 _SHORT_OF_FEW_S, _FEW = 0.6, 0.2  # and even more where few looks contradict its standing still
 _STRAY = 0.005  # so few of all looks are echoes at an object's rim
-_MAX_CONTRADICTIONS = 0.3  # of those that standing still leaves,
-# which are so many, or of few looks this share, and of many at least that one.
+# Of those that standing still leaves; of what leaves all its places bare more: limbs swing.
+_MAX_CONTRADICTIONS, _MAX_OF_LIMBS = 0.3, 0.5
+# They are so many, or of few looks this share, and of many at least that one.
 _LEAST_CONTRADICTIONS, _SHARE_OF_FEW, _LEAST_SHARE = 20, 0.08, 0.01
 _ALONG = np.cos(np.deg2rad(45))
 _LEFT_M = 0.6  # from all of the object: it is gone, or not there yet;
@@ -41,9 +42,9 @@ def left_contradicted(
 
     The motion must be smooth, long enough to be told from noise, and must do away with the
     contradictions that brought the group here: where the sweeps see through its points at their
-    rigid places, they must not see through them at the moved ones. A few looks through a piece of a
-    side that slides along itself prove nothing. What it has left must be empty. Where radial
-    velocities were measured, it must have them.
+    rigid places, they must not see through them at the moved ones, but for limbs, which swing about
+    it. A few looks through a piece of a side that slides along itself prove nothing. What it has
+    left must be empty. Where radial velocities were measured, it must have them.
 
     proven: other objects that certainly move.
     """
@@ -64,24 +65,41 @@ def left_contradicted(
         return None
     still, moved, num_asked = contradictions(track, standing, space)
     least = min(_LEAST_CONTRADICTIONS, _SHARE_OF_FEW * num_asked)
-    if still < max(least, _LEAST_SHARE * num_asked) or moved > _MAX_CONTRADICTIONS * still:
+    if still < max(least, _LEAST_SHARE * num_asked) or moved > _MAX_OF_LIMBS * still:
         return None
     short_s = _SHORT_OF_FEW_S if still < _FEW * num_asked else _SHORT_S
     allowed = max(_MAX_OF_SHORT * still, _STRAY * num_asked)
     if moved > allowed and seen_s < min(short_s, np.ptp(space.clock.time_s) / 2):
         return None
-    if still < _SHARE_OF_RAIL * num_asked and _like_a_rail(track, standing, space):
-        return None
     told = _left_places(track, standing, space, proven)
     if any(t > 0 for t, _ in told) and all(t >= _MOSTLY * empty for t, empty in told):
         return None
+    # What never left its place may be a ring that glides over a bonnet: only contradictions tell.
+    if still < _SHARE_OF_FEW * num_asked and not np.any(told):
+        return None
+    if not _bare(told):
+        if moved > _MAX_CONTRADICTIONS * still:
+            return None
+        if still < _SHARE_OF_RAIL * num_asked and _like_a_rail(track, standing, space):
+            return None
     return moved / num_asked
 
 
-def may_be_a_rail(track: Track, standing: Sequence[Standing], space: FreeSpace) -> bool:
-    """Whether few looks contradict that the track stands, which is shaped like a guard rail."""
+def may_be_a_rail(
+    track: Track, standing: Sequence[Standing], space: FreeSpace, proven: Sequence[Body]
+) -> bool:
+    """Whether few looks contradict that the track stands, which is shaped like a guard rail, and
+    does not leave all its places bare."""
     still, _, num_asked = contradictions(track, standing, space)
-    return still < _SHARE_OF_RAIL * num_asked and _like_a_rail(track, standing, space)
+    if still >= _SHARE_OF_RAIL * num_asked or not _like_a_rail(track, standing, space):
+        return False
+    return not _bare(_left_places(track, standing, space, proven))
+
+
+def _bare(told: tuple[tuple[int, int], tuple[int, int]]) -> bool:
+    """Whether nothing was seen where an object had not come to yet, nor where it had been, see
+    `_left_places`: so it is of nothing that stands."""
+    return all(t <= _STRAY * empty and empty >= _LEAST_CONTRADICTIONS for t, empty in told)
 
 
 def _left_places(

@@ -109,7 +109,7 @@ def follow_groups(
         if proven:
             _gather(track, standing, free, space)
             # A piece of a guard rail shows with the rest what it is of.
-            proven = not may_be_a_rail(track, standing, space)
+            proven = not may_be_a_rail(track, standing, space, bodies)
         if proven:
             _refine(track, standing, ground)
             take_back_slides(track, standing, space)
