@@ -18,6 +18,7 @@ from typing import NoReturn, TextIO
 from densify.cli.arguments import parse
 from densify.cli.screen import Screen
 from densify.errors import ComputationError, InputError, is_out_of_memory
+from densify.heap import keep_freed_memory
 
 DONE, FAILED, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
 
@@ -61,6 +62,7 @@ def script() -> NoReturn:
     _open_what_is_closed()
     # Work is shared out among our own threads; OpenBLAS's would wait beside them in busy loops.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    keep_freed_memory()
     logging.getLogger("densify.progress").setLevel(logging.INFO)
     for number in (signal.SIGTERM, signal.SIGHUP):
         if signal.getsignal(number) == signal.SIG_DFL:  # nohup has it ignored

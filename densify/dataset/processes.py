@@ -27,6 +27,7 @@ from typing import Any, cast
 from densify.dataset.calls import answer, given_up, outcome, packed
 from densify.dataset.tasks import Outcome, Task, Workers, words
 from densify.errors import ComputationError
+from densify.heap import keep_freed_memory
 
 _log = logging.getLogger("densify")
 
@@ -185,6 +186,7 @@ class _Processes(Workers):
 def _serve(connection: Connection, environment: Mapping[str, str]) -> None:
     """All that a worker process does."""
     os.environ.update(environment)
+    keep_freed_memory()
     signal.signal(signal.SIGINT, signal.default_int_handler)
     works: queue.SimpleQueue[bytes | None] = queue.SimpleQueue()
     threading.Thread(target=_receive, args=(connection, works), daemon=True).start()

@@ -1,0 +1,24 @@
+# SPDX-License-Identifier: MIT
+"""How the C library keeps memory for arrays."""
+
+from __future__ import annotations
+
+import ctypes
+from contextlib import suppress
+
+# glibc's mallopt(3)
+_TRIM_THRESHOLD, _MMAP_THRESHOLD, _ARENA_MAX = -1, -3, -8
+_KEPT_BYTES = 2**30
+
+
+def keep_freed_memory() -> None:
+    """Have all threads of this process share one heap, and what one array gives back taken by the
+    next one, large ones too. Otherwise each thread has a heap of its own, and the system takes and
+    clears the pages of every large array anew. Call before threads are started; does nothing where
+    the C library is not glibc.
+    """
+    with suppress(OSError, AttributeError, TypeError):  # another library, or none by that name
+        mallopt = ctypes.CDLL(None).mallopt
+        mallopt(_ARENA_MAX, 1)
+        mallopt(_MMAP_THRESHOLD, _KEPT_BYTES)
+        mallopt(_TRIM_THRESHOLD, _KEPT_BYTES)
