@@ -10,7 +10,7 @@ import pytest
 
 from densify.clock import Clock
 from densify.flow.tracking.evidence import Standing
-from densify.flow.tracking.extent import shape_of
+from densify.flow.tracking.extent import Seen, leave_out_alone, shape_of
 from densify.flow.tracking.sightings import Sighting, Track
 from tests.found_motion import KEY, NOISE, Found
 from tests.scenes import Arc, Box, Scene, World, car, street
@@ -84,6 +84,35 @@ def test_what_one_sweep_saw_far_from_who_walks_is_none_of_it(speed_m_s, num_kept
     clock = Clock(np.rint(time_s * 1e9).astype(np.int64))
     space = SimpleNamespace(clock=clock, gap_m=lambda *_: 0.1)
     assert len(shape_of(track, standing, space).points) == num_kept
+
+
+@pytest.mark.parametrize(
+    ("speed_m_s", "left_out"), [(1.4, [False, True, True]), (5.0, [False] * 3)]
+)
+@pytest.mark.parametrize("height_m", [0.12, 0.3])
+def test_what_lies_off_all_of_an_object_in_its_sweep_is_left_out(speed_m_s, left_out, height_m):
+    """Within, off the rest, and two echoes one above the other, on a grid of rings 0.1 m apart. Of
+    what drives only on the road: a side that passes is seen in far apart columns."""
+    y, z = np.meshgrid(np.arange(6) * 0.03, np.arange(3) * 0.1)
+    body = np.stack([np.zeros(18), y.ravel(), z.ravel()], 1)
+    extra = np.array([[0.0, 0.1, 0.13], [0.0, 0.5, 0.1], [0.0, -0.4, 0.1]])
+    points = np.concatenate([body, extra, extra[2:] + [0, 0, 0.1]])
+    num = len(points)
+    heights_m = np.where(np.arange(num) < 18, 0.5, height_m).astype(np.float32)
+    gap_m = np.full(num, 0.1)
+    row = np.arange(num)
+    seen = Seen(row, points, np.zeros(num), heights_m, gap_m, 3 * gap_m, np.zeros(num, bool))
+    track = Track(np.zeros(3))
+    for i in range(3):
+        state = np.array([0.1 * speed_m_s * i, 0.0, 0.0, 0.0])
+        track.sightings[i] = Sighting(state, 0.1 * i, i * 100_000_000, (i,))
+        track.claimed[i] = row
+    track.smooth()
+    instance = np.zeros(num, np.int32)
+    leave_out_alone(instance, seen, 0, [track], Clock(np.arange(3) * 100_000_000))
+    assert (instance[:18] == 0).all()
+    expected = [False, True, True] if height_m == 0.12 else left_out
+    assert (instance[18:21] < 0).tolist() == expected and instance[21] == instance[20]
 
 
 @pytest.fixture(

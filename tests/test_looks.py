@@ -148,6 +148,7 @@ def test_what_sweeps_of_a_look_see_near_objects_is_put_together():
             points=rng.normal(size=(n, 3)),
             time_s=rng.random(n),
             height_m=rng.random(n).astype(np.float32),
+            gap_m=rng.random(n),
             reach_m=rng.random(n),
             seed=rng.random(n) < 0.5,
         )
@@ -155,7 +156,7 @@ def test_what_sweeps_of_a_look_see_near_objects_is_put_together():
     ]
     assert Seen.together(parts[:1]) is parts[0]
     together = Seen.together(parts)
-    for name in ("row", "points", "time_s", "height_m", "reach_m", "seed"):
+    for name in ("row", "points", "time_s", "height_m", "gap_m", "reach_m", "seed"):
         column = getattr(together, name)
         np.testing.assert_array_equal(column[:3], getattr(parts[0], name))
         np.testing.assert_array_equal(column[3:], getattr(parts[1], name))

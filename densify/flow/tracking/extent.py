@@ -24,13 +24,14 @@ from densify.types import Bool, Float, Float32, Int, Stretch
 
 _ATTACH_M = 0.3
 _ATTACH_UNSEEN_M = 0.15
-_MIN_HEIGHT_M, _MIN_HEIGHT_OF_WALKERS_M = 0.08, 0.1
+_MIN_HEIGHT_M, _MIN_HEIGHT_OF_WALKERS_M, _AS_LOW_AS_ROAD_M = 0.08, 0.1, 0.15
 _LENGTH_M = 15.0
 _SIDE_M = 0.1
 _LONGEST_HOLE_M = 0.6
 _CARRIED_SLACK_M = 0.5
 _MAX_CONTRADICTED = 0.05
 _WALKS_M_S, _FAST_M_S = 2.0, 8.0
+_ALONE_GAPS, _NUM_BESIDE = 2.0, 2  # of an object's points so many lie so close in the same sweep
 _LEFT_M = 0.6  # from all of the object
 _THERE_M = 0.2
 _MAX_STILL_THERE = 0.2
@@ -44,14 +45,15 @@ class Seen:
     """The points of a sweep that may belong to something.
 
     row: (N,) in the sweep. points: (N,3) world. time_s: (N,) when measured. height_m: (N,) above
-    the ground. reach_m: (N,) how close a point must be to an object's shape to belong to it. seed:
-    (N,) another sweep saw through it.
+    the ground. gap_m: (N,) between neighbouring rings there. reach_m: (N,) how close a point must
+    be to an object's shape to belong to it. seed: (N,) another sweep saw through it.
     """
 
     row: Int
     points: Float
     time_s: Float
     height_m: Float32
+    gap_m: Float
     reach_m: Float
     seed: Bool
 
@@ -73,7 +75,7 @@ class Seen:
             np.maximum(_ATTACH_UNSEEN_M, _GAPS_REACHED_UNSEEN * gap_m),
         )
         time_s = firing_times_s(stretch, i, row)
-        return Seen(row, points[row], time_s, height_m[row], reach_m, seed[row])
+        return Seen(row, points[row], time_s, height_m[row], gap_m, reach_m, seed[row])
 
     @staticmethod
     def together(parts: Sequence[Seen]) -> Seen:
@@ -166,6 +168,23 @@ def detach(
         if len(rows):
             _, there = _left_behind(track, shapes[k].tree, seen.points[rows], i, standing, clock)
             instance[rows[there]] = -1
+
+
+def leave_out_alone(
+    instance: NDArray[np.int32], seen: Seen, i: int, tracks: Sequence[Track], clock: Clock
+) -> None:
+    """Take from the tracks points that lie off all others of theirs, of those who walk and of what
+    is as low as the road: echoes that melt with those of a wall or the road behind an edge."""
+    low = seen.height_m < _AS_LOW_AS_ROAD_M
+    for k in np.unique(instance[instance >= 0]):
+        mine = np.flatnonzero(instance == k)
+        doubtful = mine
+        if _speed_m_s(tracks[k], i, clock) > _WALKS_M_S:
+            doubtful = mine[low[mine]]
+        if len(mine) <= _NUM_BESIDE or not len(doubtful):
+            continue
+        away_m, _ = BoxTree(seen.points[mine]).nearest_k(seen.points[doubtful], 1 + _NUM_BESIDE)
+        instance[doubtful[away_m[:, -1] > _ALONE_GAPS * seen.gap_m[doubtful]]] = -1
 
 
 def leave_out_slower(

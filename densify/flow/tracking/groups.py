@@ -25,6 +25,7 @@ from densify.flow.tracking.extent import (
     attach,
     detach,
     foretold,
+    leave_out_alone,
     leave_out_slower,
     lengthen,
     shape_of,
@@ -141,6 +142,7 @@ def motion_of(
         lengthen(together, Seen.together(parts), look[0], tracks, shapes, standing, space)
         attached = np.split(together, np.cumsum([len(mine) for mine in attached])[:-1])
         for i, seen, mine, instance in zip(look, parts, attached, instances, strict=True):
+            leave_out_alone(mine, seen, i, tracks, space.clock)
             radial = Radial.of(stretch.sweeps[i])
             if radial is not None:
                 leave_out_slower(mine, seen, radial.rows(seen.row), tracks)
