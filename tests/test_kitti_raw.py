@@ -472,14 +472,31 @@ def test_missing_imu_calibration(tree):
 @pytest.mark.parametrize(
     "text", ["yesterday", "2011-09-26 13:10:51.1234567890", "2011-13-26 13:10:51"]
 )
-def test_malformed_stamp_names_file_and_line(tree, text):
+def test_a_line_that_is_no_stamp_costs_its_frame_alone(tree, text):
     path = tree.drive / "velodyne_points" / "timestamps.txt"
     lines = path.read_text().splitlines()
-    lines[3] = text
-    path.write_text("\n".join(lines))
+    path.write_text("\n".join([*lines[:3], text, *lines[4:]]))
+    sequence = KittiRaw(tree.drive)
+    with pytest.raises(InputError) as error:
+        sequence.stamp_ns(3)
+    one_line(error, path, "line 4", repr(text), "2011-09-26 13:10:51.158069617")
+    assert sequence.stamp_ns(5) == KittiRaw(tree.drive).stamp_ns(5)
+
+
+def test_a_file_without_any_stamp_is_refused(tree):
+    path = tree.drive / "velodyne_points" / "timestamps.txt"
+    path.write_text("\n1317042651.1\n1317042651.2\n")
     with pytest.raises(InputError) as error:
         KittiRaw(tree.drive)
-    one_line(error, path, "line 4", repr(text), "2011-09-26 13:10:51.158069617")
+    one_line(error, path, "line 2", "'1317042651.1'", "2011-09-26 13:10:51.158069617")
+
+
+def test_an_oxts_record_without_its_stamp_is_gone_without(tree):
+    usual = KittiRaw(tree.drive).T_world_lidar(3)
+    path = tree.drive / "oxts" / "timestamps.txt"
+    lines = path.read_text().splitlines()
+    path.write_text("\n".join([*lines[:3], "yesterday", *lines[4:]]))
+    np.testing.assert_allclose(KittiRaw(tree.drive).T_world_lidar(3), usual, atol=1e-3)
 
 
 @pytest.mark.parametrize("name", ["timestamps.txt", "timestamps_start.txt", "timestamps_end.txt"])
@@ -543,6 +560,18 @@ def test_description_says_what_is_not_there(tree):
     assert "unknown, one sweep" in text
     assert "none: sweeps cannot be deskewed" in text
     assert "register.source=kiss-icp" in text and str(tree.drive) not in text
+
+
+def test_description_of_a_drive_with_sweeps_that_cannot_be_used(tree):
+    path = tree.drive / "velodyne_points" / "timestamps.txt"
+    lines = path.read_text().splitlines()
+    path.write_text("\n".join([*lines[:3], "yesterday", *lines[4:]]))
+    last = tree.drive / "velodyne_points" / "data" / "0000000005.bin"
+    last.write_bytes(last.read_bytes()[:-3])
+    text = describe(KittiRaw(tree.drive))
+    assert "2-3, 5 (3, 1 missing between them)" in text and "7 in frame 2\n" in text
+    assert "frame 3      cannot be used" in text and "yesterday" in text
+    assert "frame 5      cannot be used" in text and "truncated" in text
 
 
 # Real drives

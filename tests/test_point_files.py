@@ -269,3 +269,37 @@ def test_ply_names_its_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.setitem(__import__("sys").modules, "trimesh.exchange.ply", None)
     with pytest.raises(InputError, match=r"pip install 'densify\[ply\]'"):
         read_table(tmp_path / "1.ply")
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "x,y,z\r\n1,2,3\r\n4,,6\r\n",
+        "\ufeffx,y,z\n1,2,3\n4,,6\n",
+        "# made by hand\nx,y,z\n1,2,3\n4, ,6\n",
+        "# x,y,z\n1,2,3\n\n4,nan,6\n",
+        "x;y;z\n1,0;2,0;3,0\n4,0;;6,0\n",
+        "X\tY\tZ\n1.0\t2.0\t3.0\n4.0\t\t6.0\n",
+        '"x","y","z"\n1,2,3\n4,,6',
+    ],
+)
+def test_tables_of_every_habit(text: str, tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_bytes(text.encode())
+    columns = {name.lower(): c for name, c in read_table(tmp_path / "a.csv").columns.items()}
+    assert np.array_equal(columns["x"], [1, 4]) and np.array_equal(columns["z"], [3, 6])
+    assert columns["y"][0] == 2 and np.isnan(columns["y"][1])
+
+
+@pytest.mark.parametrize("dtype", ["<f8", ">f4", "text"])
+def test_a_scan_of_other_bytes_than_float32_is_refused(dtype: str, tmp_path: Path) -> None:
+    points = np.random.default_rng(0).uniform(-40, 40, (2000, 4))
+    data = b"not a scan. " * 4000 if dtype == "text" else points.astype(dtype).tobytes()
+    (tmp_path / "a.bin").write_bytes(data)
+    with pytest.raises(InputError, match="no places in metres"):
+        read_table(tmp_path / "a.bin")
+
+
+def test_an_array_lying_on_its_side_is_refused(tmp_path: Path) -> None:
+    np.save(tmp_path / "a.npy", np.zeros((4, 3000), np.float32))
+    with pytest.raises(InputError, match=r"shape \(4, 3000\).*expected numbers of shape \(N,3\)"):
+        read_table(tmp_path / "a.npy")

@@ -110,6 +110,21 @@ def test_numbered_files_alone_open(tmp_path):
     assert "assumed 10 Hz" in text and "intensity = intensity" in text
 
 
+@pytest.mark.parametrize("suffix", ["npy", "csv", "txt"])
+def test_numbered_tables_alone_open(suffix, tmp_path):
+    for number in (3, 4):
+        points = np.random.default_rng(number).uniform(-20, 20, (50, 4))
+        if suffix == "npy":
+            np.save(tmp_path / f"{number:06d}.npy", points)
+        else:
+            np.savetxt(tmp_path / f"{number:06d}.{suffix}", points, delimiter=",")
+    (tmp_path / "timestamps.txt").write_text("0.0\n0.1\n")
+    assert tuple(open_sequence(str(tmp_path)).frames) == (3, 4)
+    (tmp_path / "notes.md").write_text("not sweeps alone")
+    with pytest.raises(InputError, match="no known recording there"):
+        open_sequence(str(tmp_path))
+
+
 def test_pcd_files_open_with_times_and_viewpoints(tmp_path):
     for number in (1, 2):
         write_pcd(tmp_path / f"scan_{number:03d}.pcd", "binary")

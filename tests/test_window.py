@@ -114,6 +114,32 @@ def test_a_stamp_that_cannot_be_read_is_known_by_its_frame():
     np.testing.assert_allclose(found.stamp_ns, [stamp_ns(f) for f in range(5)], atol=2)
 
 
+@pytest.mark.parametrize(
+    ("stamps", "wrong"),
+    [
+        ([0, 1, 2, 3, 4], []),
+        ([0, 1, 2, -9, 4], [3]),
+        ([0, 1, 99, 3, 4], [2]),
+        ([0, 1, 1, 3, 4], [2]),
+        ([7, 1, 2, 3, 4], [0]),
+        ([0, 1, 2, 3, 1], [4]),
+        ([9, 1, 2, 0, 4], [0, 3]),
+        ([4, 3, 2, 1, 0], []),  # all of them may be wrong
+        ([5, 5], []),
+    ],
+)
+def test_stamps_past_which_most_others_ascend_are_unknown(stamps, wrong):
+    class Stamped(TinySequence):
+        def stamp_ns(self, frame):
+            return stamps[frame] * 100_000_000
+
+    found = Timeline.of(Stamped(tiny().scene, range(len(stamps))))
+    assert sorted(found.unknown) == wrong
+    if wrong:
+        assert np.all(np.diff(found.stamp_ns[1:-1]) > 0)
+        assert f"frame {wrong[0]} ({stamps[wrong[0]] * 100_000_000} ns)" in found.unknown[wrong[0]]
+
+
 def test_cameras_by_name():
     sequence = tiny(cameras=(CAMERA, replace(CAMERA, name="rear")))
     assert [c.name for c in choose_cameras(sequence, None)] == ["front", "rear"]

@@ -33,9 +33,9 @@ def check_stamps(sample: Sample) -> list[Finding]:
             Finding(
                 "stamps",
                 Verdict.WRONG,
-                f"{len(timeline.unknown)} of {len(timeline.frames)} sweeps have no stamp, the "
-                f"first of them frame {frame} ({reason})",
-                "give these sweeps stamps, or remove their files",
+                f"{len(timeline.unknown)} of {len(timeline.frames)} sweeps have no stamp that can "
+                f"be right, the first of them frame {frame} ({reason})",
+                "correct the stamps of these sweeps, or remove their files",
             )
         ]
     if len(timeline.frames) < 2:

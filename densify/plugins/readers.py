@@ -20,6 +20,8 @@ from densify.plugins.table import Table
 
 _BAGS = (".bag", ".db3", ".mcap")
 _SWEEP = re.compile(r".*\d.*\.(bin|pcd|ply|las|laz)", re.IGNORECASE)
+_TABLE = re.compile(r".*\d.*\.(npy|npz|csv|txt)", re.IGNORECASE)  # which may be anything
+_BESIDE = re.compile(r"\..*|(timestamps?|times|stamps|poses?|trajectory)\.\w+", re.IGNORECASE)
 
 
 @dataclass(frozen=True)
@@ -68,7 +70,7 @@ def _is_bag(path: Path) -> bool:
 
 
 def _holds_sweeps(path: Path) -> bool:
-    """Down to two folders below."""
+    """Down to two folders below; tables of numbers only where nothing else lies beside them."""
     if (path / "densify.yaml").is_file():
         return True
     for place, folders, files in os.walk(path):
@@ -76,7 +78,9 @@ def _holds_sweeps(path: Path) -> bool:
             return True
         if len(Path(place).relative_to(path).parts) == 2:
             folders.clear()
-    return False
+    names = [entry.name for entry in path.iterdir() if entry.is_file()] if path.is_dir() else []
+    names = [name for name in names if not _BESIDE.fullmatch(name)]
+    return bool(names) and all(_TABLE.fullmatch(name) for name in names)
 
 
 def _is_kitti_odometry(path: Path) -> bool:
@@ -219,7 +223,7 @@ READERS = Table(
             "folder",
             "densify.readers.folder.reader",
             recognises=_holds_sweeps,
-            holds="a folder of numbered sweeps (000120.bin, .pcd, .ply, .las, .laz)",
+            holds="a folder of numbered sweeps (000120.bin, .pcd, .ply, .npy, .csv, ...)",
             general=True,
         ),
     ),

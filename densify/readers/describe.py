@@ -3,13 +3,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
 from densify.errors import InputError
 from densify.readers.files import format_frames
-from densify.types import LidarSequence, SaysWhatItFound, Sweep
+from densify.readers.timeline import Timeline
+from densify.types import Int, LidarSequence, SaysWhatItFound, Sweep
+
+_MOST_NAMED = 3  # sweeps that cannot be used, each with its reason
 
 
 def describe(sequence: LidarSequence) -> str:
@@ -27,23 +30,46 @@ def findings(sequence: LidarSequence) -> list[tuple[str, str]]:
     """Frames, rate, points, cameras, stamps, poses and truth of a recording, by their names, and
     what its reader had to find out.
 
-    Loads the first and the last sweep and no image. Rates are those of the median time from one
-    sweep or image to the next.
+    Loads the first and the last sweep and no image; where one cannot be read, the next one that
+    can, and a line says so. Rates are those of the median time from one sweep or image to the next.
+    Raises InputError if no sweep can be read.
     """
-    first = sequence[sequence.frames[0]]
-    last = sequence[sequence.frames[-1]] if len(sequence.frames) > 1 else first
+    timeline = Timeline.of(sequence)
+    unreadable = dict(timeline.unknown)
+    first = _readable(sequence, timeline.frames, unreadable)
+    last = _readable(sequence, timeline.frames[::-1], unreadable)
     return [
         ("name", sequence.name),
         ("frames", _frames(sequence)),
-        ("rate", _rate(sequence)),
+        ("rate", _rate(timeline)),
         ("stamps", _stamps(first, last)),
         ("points", _points(first, last)),
         ("point times", _point_times(first)),
         *_cameras(sequence),
-        ("poses", _poses(sequence)),
+        ("poses", _poses(sequence, [f for f in timeline.frames if f not in unreadable])),
         ("truth", "none" if sequence.truth is None else "exact, simulated"),
         *(sequence.findings() if isinstance(sequence, SaysWhatItFound) else ()),
+        *_unreadable(unreadable),
     ]
+
+
+def _readable(sequence: LidarSequence, frames: Sequence[int], unreadable: dict[int, str]) -> Sweep:
+    """The first of these sweeps that can be read; adds those before it to ``unreadable``."""
+    for frame in frames:
+        if frame in unreadable:
+            continue
+        try:
+            return sequence[frame]
+        except InputError as error:
+            unreadable[frame] = str(error)
+    raise InputError(unreadable[frames[0]])
+
+
+def _unreadable(reasons: Mapping[int, str]) -> list[tuple[str, str]]:
+    frames = sorted(reasons)
+    lines = [(f"frame {f}", f"cannot be used: {reasons[f]}") for f in frames[:_MOST_NAMED]]
+    more = frames[_MOST_NAMED:]
+    return lines + [("frames", f"cannot be used either: {format_frames(more)}")] * bool(more)
 
 
 def _frames(sequence: LidarSequence) -> str:
@@ -53,14 +79,13 @@ def _frames(sequence: LidarSequence) -> str:
     return f"{format_frames(frames)} ({len(frames)}{gaps})"
 
 
-def _rate(sequence: LidarSequence) -> str:
-    frames = sequence.frames
-    if len(frames) < 2:
+def _rate(timeline: Timeline) -> str:
+    if len(timeline.frames) < 2:
         return "unknown, one sweep"
-    return _hertz([sequence.stamp_ns(frame) for frame in frames])
+    return _hertz(timeline.stamp_ns)
 
 
-def _hertz(stamps_ns: Sequence[int]) -> str:
+def _hertz(stamps_ns: Sequence[int] | Int) -> str:
     period_ns = sorted(np.diff(stamps_ns).tolist())[(len(stamps_ns) - 2) // 2]
     return f"{1e9 / period_ns:.2f} Hz" if period_ns > 0 else "unknown, stamps do not advance"
 
@@ -71,7 +96,7 @@ def _stamps(first: Sweep, last: Sweep) -> str:
 
 
 def _points(first: Sweep, last: Sweep) -> str:
-    if first is last:
+    if first.frame == last.frame:
         return f"{len(first):,} in frame {first.frame}"
     return f"{len(first):,} in frame {first.frame}, {len(last):,} in frame {last.frame}"
 
@@ -100,9 +125,9 @@ def _cameras(sequence: LidarSequence) -> list[tuple[str, str]]:
     return lines
 
 
-def _poses(sequence: LidarSequence) -> str:
+def _poses(sequence: LidarSequence, frames: Sequence[int]) -> str:
     try:
-        path = np.array([sequence.T_world_lidar(frame)[:3, 3] for frame in sequence.frames])
+        path = np.array([sequence.T_world_lidar(frame)[:3, 3] for frame in frames])
     except InputError as error:
         place = getattr(sequence, "where", None)
         return f"none: {str(error).removeprefix(f'{place}: ')}"

@@ -7,6 +7,7 @@ every second file is missing is one of half the rate.
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -48,8 +49,8 @@ def check_key(key: int) -> None:
 @dataclass(frozen=True)
 class Timeline:
     """name: of the recording. frames: (n,) of all its sweeps, ascending. stamp_ns: (n,) int64
-    reference times. unknown: frame -> why its stamp is not known; its row in ``stamp_ns`` is then
-    interpolated."""
+    reference times. unknown: frame -> why its stamp is not known, or cannot be right since those of
+    most others ascend past it; its row in ``stamp_ns`` is then interpolated."""
 
     name: str
     frames: tuple[int, ...]
@@ -67,6 +68,12 @@ class Timeline:
             except InputError as error:
                 unknown[frame] = str(error)
         known = np.array([f not in unknown for f in frames], bool)
+        for row in np.flatnonzero(known)[_out_of_order(stamps_ns[known])].tolist():
+            known[row] = False
+            unknown[frames[row]] = (
+                f"the stamp of frame {frames[row]} ({stamps_ns[row]} ns) is not between those of "
+                f"the sweeps before and after it; check the recording's timestamps"
+            )
         if unknown and known.any():
             rows = np.arange(len(frames))
             start_ns = stamps_ns[known][0]
@@ -165,3 +172,23 @@ class Timeline:
     def _hole_before(self, row: int) -> bool:
         gap_ns = int(self.stamp_ns[row] - self.stamp_ns[row - 1])
         return gap_ns > _HOLE_PERIODS * self.period_ns
+
+
+def _out_of_order(stamps_ns: Int) -> list[int]:
+    """Rows, ascending, that stand in the way of the longest series of ascending stamps; none where
+    that would be half of them or more: then it is not they that are wrong."""
+    if np.all(np.diff(stamps_ns) > 0):
+        return []
+    best: list[int] = []  # the row of the lowest stamp at which a series of each length ends
+    before: list[int] = []
+    for row, stamp_ns in enumerate(stamps_ns.tolist()):
+        length = bisect_left(best, stamp_ns, key=lambda end: int(stamps_ns[end]))
+        before.append(best[length - 1] if length else -1)
+        if length == len(best) or stamp_ns < stamps_ns[best[length]]:
+            best[length : length + 1] = [row]
+    row, series = best[-1], set[int]()
+    while row >= 0:
+        series.add(row)
+        row = before[row]
+    wrong = [row for row in range(len(stamps_ns)) if row not in series]
+    return wrong if 2 * len(wrong) < len(stamps_ns) else []

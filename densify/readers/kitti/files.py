@@ -25,6 +25,7 @@ NUM_OXTS_VALUES = 30
 _EARTH_RADIUS_M = 6_378_137.0  # of the devkit's Mercator projection
 _ENTRY = re.compile(r"\s*([^\s:]+)[:\s]\s*(.*)")
 _STAMP = re.compile(r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d(\.\d{1,9})?")
+_EXPECTED = "expected a stamp such as 2011-09-26 13:10:51.158069617, from 1970 to 2261"
 
 
 def parse_numbers(text: str, where: str, count: int) -> Float:
@@ -89,33 +90,24 @@ def T_mercator_imu(oxts: Float, scale: float) -> Float:
 
 @dataclass(frozen=True)
 class Stamps:
-    """A timestamps file: int64 nanoseconds by line number, None for a blank line."""
+    """A timestamps file: int64 nanoseconds by line number, None for a line that is blank or no
+    stamp. One such line costs the frame it is of, not the drive."""
 
     path: Path
     lines: tuple[int | None, ...]
+    texts: tuple[str, ...]
 
     @staticmethod
     def read(path: Path) -> Stamps | None:
-        """None if there is no such file."""
+        """None if there is no such file. Raises InputError if none of its lines is a stamp."""
         if not path.exists():
             return None
-        lines = read_text(path).splitlines()
-        return Stamps(path, tuple(Stamps._parse(path, i, line) for i, line in enumerate(lines)))
-
-    @staticmethod
-    def _parse(path: Path, index: int, line: str) -> int | None:
-        text = line.strip()
-        if not text:
-            return None
-        try:
-            if not _STAMP.fullmatch(text):
-                raise ValueError
-            return date_ns(text)
-        except ValueError:
-            raise InputError(
-                f"{path}: line {index + 1}: got {text!r}, "
-                f"expected a stamp such as 2011-09-26 13:10:51.158069617, from 1970 to 2261"
-            ) from None
+        texts = tuple(line.strip() for line in read_text(path).splitlines())
+        stamps = Stamps(path, tuple(_stamp_ns(text) for text in texts), texts)
+        wrong = next((row for row, text in enumerate(texts) if text), None)
+        if wrong is not None and not any(ns is not None for ns in stamps.lines):
+            raise InputError(f"{path}: line {wrong + 1}: got {texts[wrong]!r}, {_EXPECTED}")
+        return stamps
 
     def get(self, frame: int) -> int | None:
         return self.lines[frame] if 0 <= frame < len(self.lines) else None
@@ -123,12 +115,21 @@ class Stamps:
     def __getitem__(self, frame: int) -> int:
         stamp = self.get(frame)
         if stamp is None:
-            got = "a blank line" if frame < len(self.lines) else f"{len(self.lines)} lines"
+            got = f"{len(self.lines)} lines"
+            if 0 <= frame < len(self.lines):
+                got = repr(self.texts[frame]) if self.texts[frame] else "a blank line"
             raise InputError(
-                f"{self.path}: no stamp of frame {frame}: got {got}, expected the stamp on line "
+                f"{self.path}: no stamp of frame {frame}: got {got}, {_EXPECTED}, on line "
                 f"{frame + 1} (one line per frame number, from 0)"
             )
         return stamp
+
+
+def _stamp_ns(text: str) -> int | None:
+    try:
+        return date_ns(text) if _STAMP.fullmatch(text) else None
+    except ValueError:
+        return None
 
 
 @dataclass(frozen=True)

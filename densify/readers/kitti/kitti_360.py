@@ -139,8 +139,10 @@ class Kitti360(FileSequence):
             frame, *numbers = parse_numbers(line, where, 13)
             if not 0 <= frame < 1 << 31:
                 raise InputError(f"{where}: got {frame:g}, expected the number of a frame")
-            stamps_ns.append(self._stamps[int(frame)])
-            T_world_pose.append(rigid(np.reshape(numbers, (3, 4)), where))
+            stamp_ns = self._stamps.get(int(frame))
+            if stamp_ns is not None:
+                stamps_ns.append(stamp_ns)
+                T_world_pose.append(rigid(np.reshape(numbers, (3, 4)), where))
         return PoseTrack(
             str(self._poses_file),
             np.array(stamps_ns, np.int64),

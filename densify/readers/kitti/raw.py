@@ -155,11 +155,8 @@ class KittiRaw(FileSequence):
         if self._oxts_stamps is None or self._stamps is None:
             return self._T_world_imu(frame)
         stamp = self._stamps[frame]
-        records = [
-            (self._oxts_stamps[near], near)
-            for near in (frame - 1, frame, frame + 1)
-            if near in self._oxts
-        ]
+        near = [at for at in (frame - 1, frame, frame + 1) if at in self._oxts]
+        records = [(ns, at) for at in near if (ns := self._oxts_stamps.get(at)) is not None]
         # The two records that enclose the sweep, else the two nearest to it.
         pairs = [(a, b) for a in records for b in records if a[0] < b[0]]
         if not pairs:

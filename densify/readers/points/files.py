@@ -3,8 +3,8 @@
 
 from __future__ import annotations
 
-import csv
 import io
+import re
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -24,7 +24,9 @@ Columns = dict[str, NDArray[Any]]
 
 _UNNAMED = ("x", "y", "z", "intensity")  # KITTI's order, which most others follow
 _BIN_COLUMNS = range(3, 17)
+_MOST_COLUMNS = 100  # more are rows
 _ROWS_LOOKED_AT = 4000
+_PLACES_M = (1e-20, 1e8)  # sizes of coordinates that are not zero
 _ALIKE = 0.7  # of the variance that columns explain
 
 
@@ -52,7 +54,7 @@ def read_table(path: Path, names: Sequence[str] | None = None) -> PointTable:
     .bin                      float32 columns
     .npy, .npz                an (N,3 or more) array, in an .npz called ``points``; or structured;
                               or an .npz of x, y, z and others, (N,) each
-    .csv, .txt                numbers; a first line of words names the columns
+    .csv, .txt                numbers, NaN where blank; a first line of words names the columns
     .pcd                      ascii, binary, binary_compressed
     .ply                      properties of its vertices (extra ``ply``)
     .las, .laz                dimensions
@@ -75,6 +77,7 @@ def read_table(path: Path, names: Sequence[str] | None = None) -> PointTable:
         raise
     except Exception as error:  # a damaged file makes other people's parsers raise anything
         reason = " ".join(str(error).split()) or type(error).__name__
+        reason = f"it has no {reason}" if isinstance(error, KeyError) else reason
         raise InputError(f"{path}: not a readable {suffix} point file: {reason}") from error
     if not len(table):
         raise InputError(f"{path}: holds no points, expected at least one")
@@ -111,10 +114,11 @@ def _matrix(array: NDArray[Any], names: Sequence[str] | None, path: Path) -> Col
         return {name: array[name] for name in array.dtype.names if array[name].ndim == 1}
     if array.size == 0:
         return {}
-    if array.ndim != 2 or array.shape[1] < 3 or array.dtype.kind not in "fiu":
+    fits = array.ndim == 2 and 3 <= array.shape[1] <= _MOST_COLUMNS
+    if not fits or array.dtype.kind not in "fiu":
         raise InputError(
             f"{path}: got an array of shape {array.shape} and type {array.dtype}, expected numbers "
-            f"of shape (N,3) or more columns"
+            f"of shape (N,3) or more columns, {_MOST_COLUMNS} at most"
         )
     names = unnamed(array.shape[1]) if names is None else names
     if len(names) != array.shape[1]:
@@ -132,7 +136,18 @@ def _read_bin(path: Path, names: Sequence[str] | None) -> PointTable:
             f"got {len(data)} bytes, expected a multiple of {4 * num_columns} "
             f"({num_columns} float32 columns); it is cut off, or has another number of columns"
         )
-    return PointTable(_matrix(np.frombuffer(data, "<f4").reshape(-1, num_columns), names, path))
+    rows = np.frombuffer(data, "<f4").reshape(-1, num_columns)
+    if names is None and not _are_places(rows[:_ROWS_LOOKED_AT, :3]):
+        raise ValueError("its numbers are no places in metres, read as little-endian float32")
+    return PointTable(_matrix(rows, names, path))
+
+
+def _are_places(rows: NDArray[np.float32]) -> bool:
+    """Whether most of the rows that are finite may be: of other bytes, doubles for example, few
+    exponents lie between those of these."""
+    size = np.abs(rows[np.isfinite(rows).all(axis=1)])
+    likely = ((size == 0) | ((size > _PLACES_M[0]) & (size < _PLACES_M[1]))).all(axis=1)
+    return len(size) == 0 or float(likely.mean()) > 0.5
 
 
 def _num_columns(data: bytes) -> int:
@@ -179,23 +194,46 @@ def _read_npy(path: Path, names: Sequence[str] | None) -> PointTable:
 
 
 def _read_text(path: Path, names: Sequence[str] | None) -> PointTable:
-    text = read_bytes(path).decode("utf-8")
-    lines = text.splitlines()
-    first = next((line for line in lines if line.strip().lstrip("#").strip()), "")
-    delimiter = next((d for d in (",", ";", "\t") if d in first), None)
-    words = [word.strip() for word in next(csv.reader([first.strip().lstrip("#")]), [])]
-    if delimiter != ",":
-        words = [w.strip() for w in first.strip().lstrip("#").split(delimiter)]
-    header = bool(words) and not _are_numbers(words)
+    lines = read_bytes(path).decode("utf-8-sig").splitlines()
+    skip, words, delimiter = _header(lines)
+    rows = lines[skip:]
+    if delimiter and delimiter != ",":  # a comma is then a decimal point
+        rows = [line.replace(",", ".") for line in rows]
+    if delimiter:
+        blank = re.compile(f"(^|{delimiter}) *(?={delimiter}|$)")
+        rows = [blank.sub(r"\1nan", line) if line.strip() else "" for line in rows]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # an empty file is refused in our words
-        skip = lines.index(first) + 1 if header else 0
-        array = np.loadtxt(lines[skip:], delimiter=delimiter, ndmin=2)
-    if header and names is None:
-        if not any(word.strip('"').lower() in ("x", "y", "z") for word in words):
-            raise ValueError(f"got the first line {first[:60]!r}, expected names such as x,y,z")
-        names = [word.strip('"') for word in words]
+        try:
+            array = np.loadtxt(rows, delimiter=delimiter, ndmin=2)
+        except ValueError as error:
+            raise ValueError(str(error).partition("; use ")[0]) from None
+    if words and names is None:
+        if not _names_axes(words):
+            line = lines[skip - 1][:60]
+            raise ValueError(f"got the first line {line!r}, expected names such as x,y,z")
+        names = words
     return PointTable(_matrix(array, names, path))
+
+
+def _header(lines: Sequence[str]) -> tuple[int, list[str], str | None]:
+    """How many lines stand before the numbers, what the last of them calls the columns, and what
+    parts these; None for blanks. Comments before the names are passed over."""
+    for number, line in enumerate(lines, 1):
+        text = line.strip().lstrip("#").strip()
+        if not text:
+            continue
+        delimiter = next((d for d in (";", "\t", ",") if d in text), None)
+        words = [word.strip().strip('"') for word in text.split(delimiter)]
+        if _are_numbers([word.replace(",", ".") for word in words]):
+            return number - 1, [], delimiter
+        if not line.strip().startswith("#") or _names_axes(words):
+            return number, words, delimiter
+    return len(lines), [], None
+
+
+def _names_axes(words: Sequence[str]) -> bool:
+    return any(word.lower() in ("x", "y", "z") for word in words)
 
 
 def _are_numbers(words: Sequence[str]) -> bool:
