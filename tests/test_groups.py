@@ -215,6 +215,15 @@ def test_a_long_side_that_passes_does_not_slide_along_itself():
     assert np.quantile(found.errors_m(1, reach=6), 0.9) < 0.3
 
 
+def test_a_long_side_that_is_seen_in_far_apart_columns_is_one_object():
+    """Of a truck 25 m ahead in the next lane columns of rays lie more than a metre apart."""
+    truck = car(33, 2.2, 13, 1, size_m=(16.0, 2.5, 2.8))
+    scanner = Scanner(64, 1800, (-24.8, 2.0), 0.01)
+    found = Found.around(KEY, Scene(World((*street(), truck)), Arc(0, -1.5, 0, 12.0), scanner), 5)
+    assert found.share_moving(1) > 0.97
+    assert np.quantile(found.errors_m(1), 0.95) < 0.1
+
+
 def test_cars_in_a_row_keep_their_own_motion():
     found = Found.of([car(8, 2.0, 11, 1), car(23, 2.0, 8, 2)], Arc(0, -1.5, 0, 8.0))
     assert found.track_of(1) != found.track_of(2)

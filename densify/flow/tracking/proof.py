@@ -21,6 +21,7 @@ _NUM_ASKED = 60
 _LEAST_STATES, _LEAST_S = 3, 0.15
 _SHORT_S, _MAX_OF_SHORT = 0.35, 0.03  # three places of a tree's crown may lie on a line,
 _SHORT_OF_FEW_S, _FEW = 0.6, 0.2  # and even more where few looks contradict its standing still
+_MAX_OF_SHORT_BARE = 0.06  # but a crown does not leave its places bare
 _STRAY = 0.005  # so few of all looks are echoes at an object's rim
 # Of those that standing still leaves; of what leaves all its places bare more: limbs swing.
 _MAX_CONTRADICTIONS, _MAX_OF_LIMBS = 0.3, 0.5
@@ -30,7 +31,7 @@ _ALONG = np.cos(np.deg2rad(45))
 _LEFT_M = 0.6  # from all of the object: it is gone, or not there yet;
 _ROOM_M, _ROOM_S = 2.0, 0.5  # so far, and what it goes in that time, is left to who is in front
 _THERE_M, _THERE_PER_GAP = 0.2, 0.5  # between two rings
-_MOSTLY = 2  # as often taken as empty: what stands is there nearly always
+_MOSTLY, _SELDOM = 2, 0.03  # as often taken as empty: what stands is there nearly always
 _AS_FAST, _RAIL_M, _SLENDER, _SHARE_OF_RAIL = 0.1, 2.0, 8.0, 0.3
 
 
@@ -67,21 +68,21 @@ def left_contradicted(
     least = min(_LEAST_CONTRADICTIONS, _SHARE_OF_FEW * num_asked)
     if still < max(least, _LEAST_SHARE * num_asked) or moved > _MAX_OF_LIMBS * still:
         return None
-    short_s = _SHORT_OF_FEW_S if still < _FEW * num_asked else _SHORT_S
-    allowed = max(_MAX_OF_SHORT * still, _STRAY * num_asked)
-    if moved > allowed and seen_s < min(short_s, np.ptp(space.clock.time_s) / 2):
-        return None
     told = _left_places(track, standing, space, proven)
     if any(t > 0 for t, _ in told) and all(t >= _MOSTLY * empty for t, empty in told):
         return None
     # What never left its place may be a ring that glides over a bonnet: only contradictions tell.
     if still < _SHARE_OF_FEW * num_asked and not np.any(told):
         return None
-    if not _bare(told):
-        if moved > _MAX_CONTRADICTIONS * still:
-            return None
-        if still < _SHARE_OF_RAIL * num_asked and _like_a_rail(track, standing, space):
-            return None
+    bare = _bare(told)
+    if moved > (_MAX_OF_LIMBS if bare else _MAX_CONTRADICTIONS) * still:
+        return None
+    short_s = _SHORT_OF_FEW_S if still < _FEW * num_asked else _SHORT_S
+    allowed = max((_MAX_OF_SHORT_BARE if bare else _MAX_OF_SHORT) * still, _STRAY * num_asked)
+    if moved > allowed and seen_s < min(short_s, np.ptp(space.clock.time_s) / 2):
+        return None
+    if not bare and still < _SHARE_OF_RAIL * num_asked and _like_a_rail(track, standing, space):
+        return None
     return moved / num_asked
 
 
@@ -99,7 +100,7 @@ def may_be_a_rail(
 def _bare(told: tuple[tuple[int, int], tuple[int, int]]) -> bool:
     """Whether nothing was seen where an object had not come to yet, nor where it had been, see
     `_left_places`: so it is of nothing that stands."""
-    return all(t <= _STRAY * empty and empty >= _LEAST_CONTRADICTIONS for t, empty in told)
+    return all(t <= _SELDOM * empty and empty >= _LEAST_CONTRADICTIONS for t, empty in told)
 
 
 def _left_places(

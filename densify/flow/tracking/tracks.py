@@ -18,7 +18,7 @@ from densify.clock import Clock
 from densify.flow.surface_matching import GATES_M, apply, undo
 from densify.flow.tracking.align import MIN_FIT, Model, align
 from densify.flow.tracking.evidence import FreeSpace, Standing
-from densify.flow.tracking.lone_rings import in_line, linked_in_line, single_rings
+from densify.flow.tracking.lone_rays import few_rays, gap_in_line_m, in_line, linked_in_line
 from densify.flow.tracking.looks import Look, looks_of
 from densify.flow.tracking.proof import left_contradicted, may_be_a_rail
 from densify.flow.tracking.shapes import Body, Shape
@@ -36,7 +36,7 @@ from densify.geometry.height_map import HeightMap
 from densify.types import Bool, Float
 
 _FIT_M = 0.3
-_RINGS_M = 5.0
+_RAYS_M = 15.0
 _NEAR_S = 0.3
 _SHARE_UNSEEN = 0.5  # of the points a look usually shows
 # m, m, rad: of what is foretold by up to so long, and in proportion by longer.
@@ -113,7 +113,7 @@ def follow_groups(
         if proven:
             _refine(track, standing, ground)
             take_back_slides(track, standing, space)
-            _claim_rings(track, standing, free, space)
+            _claim_rays(track, standing, free, space)
         for j, rows in track.claimed.items():
             untried[j][rows] = False
             if proven:
@@ -254,27 +254,29 @@ def _gather(
         track.claimed[j] = np.concatenate([own, rows])
 
 
-def _claim_rings(
+def _claim_rays(
     track: Track, standing: Sequence[Standing], free: Sequence[Bool], space: FreeSpace
 ) -> None:
-    """Claim the free clusters of single rings ahead of and behind the object that its motion does
-    not contradict, see `densify.flow.tracking.lone_rings`. They do not place it: a ring stays where
-    the rays are."""
+    """Claim the free clusters of single rings and columns of rays ahead of and behind the object
+    that its motion does not contradict, see `densify.flow.tracking.lone_rays`. They do not place
+    it: they stay where the rays are."""
     shape = Shape.of(track.seen_in(standing, sorted(track.claimed)))
     ahead = track.path.rate(next(iter(track.sightings.values())).seen_s)[:2]
     found, bodies = [], []
     for j, own in track.claimed.items():
         c = standing[j]
         there = track.place(shape.rim, track.seen_at(space.clock.time_ns[j]))
-        rows = c.strips.rows_inside(there.min(0) - _RINGS_M, there.max(0) + _RINGS_M)
+        rows = c.strips.rows_inside(there.min(0) - _RAYS_M, there.max(0) + _RAYS_M)
         rows = rows[free[j][rows] & (c.cluster[rows] >= 0)]
         rows = np.setdiff1d(rows, own, assume_unique=True)
-        rows = rows[single_rings(c, rows, space.T_lidar_world[j], space.sensors)]
+        rows = rows[few_rays(c, rows, space.T_lidar_world[j], space.sensors)]
         rows = rows[in_line(shape, track.undo(c.points[rows], c.time_s[rows]), ahead)]
         rows = _not_contradicted(track, c, rows, j, space)
         found.append(rows)
         bodies.append(track.undo(c.points[rows], c.time_s[rows]))
-    linked = linked_in_line(shape, bodies, ahead)
+    j = next(iter(track.claimed))
+    gap_m = gap_in_line_m(track.centre, ahead, space.T_lidar_world[j], space.sensors)
+    linked = linked_in_line(shape, bodies, ahead, gap_m)
     for j, rows, together in zip(list(track.claimed), found, linked, strict=True):
         track.claimed[j] = np.concatenate([track.claimed[j], rows[together]])
 
