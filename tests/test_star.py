@@ -185,11 +185,13 @@ def test_stars_equal_those_of_a_slow_twin():
     assert 0.2 < (found[0] > 0).mean() < 0.8
 
 
-def test_slopes_are_those_of_the_surface_alone():
-    """A plane beside a step: what lies beyond does not tilt it."""
-    depth_m = np.where(COLUMN < 40, TILTED, 30.0)
+@pytest.mark.parametrize("beyond_m", [30.0, 0.02, 5e3])
+def test_slopes_are_those_of_the_surface_alone(beyond_m):
+    """A plane beside a step: what lies beyond does not tilt it, nor it what lies beyond."""
+    depth_m = np.where(COLUMN < 40, TILTED, beyond_m)
     inverse = (1 / depth_m).astype(np.float32)
-    pixel = np.flatnonzero((COLUMN == 39) & (ROW > 5) & (ROW < 55))
-    slope = np.zeros((inverse.size, 2), np.float32)
-    stars.slopes(0, len(pixel), pixel, inverse, np.ones((*SHAPE, 2), np.float32), 0.05, slope)
-    np.testing.assert_allclose(slope[pixel], [[5e-4, 8e-4]] * len(pixel), rtol=0.05)
+    slope, spacing_px = np.zeros((inverse.size, 2), np.float32), np.ones((*SHAPE, 2), np.float32)
+    for column, true in ((39, (5e-4, 8e-4)), (40, (0.0, 0.0))):
+        pixel = np.flatnonzero((column == COLUMN) & (ROW > 5) & (ROW < 55))
+        stars.slopes(0, len(pixel), pixel, inverse, spacing_px, 0.05, slope)
+        np.testing.assert_allclose(slope[pixel], [true] * len(pixel), rtol=0.05)

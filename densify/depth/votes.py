@@ -86,5 +86,5 @@ def elected(
 
 
 def _image(layers: Layers) -> Float32:
-    """The image; where none fits, one of a single colour: seeds then tell by distance alone."""
-    return np.zeros((*layers.depth_m.shape, 3), np.float32) if layers.lab is None else layers.lab
+    """The image; where none fits, an empty one: seeds then tell by distance alone."""
+    return np.zeros((0, 0, 3), np.float32) if layers.lab is None else layers.lab

@@ -14,6 +14,7 @@ from densify.kernels import Kernel, inlined
 _RIDGE = 1e-7  # gives the slope of least norm where the pixels lie on one line
 _MIN_PLANE_PX = 6  # fewer do not tell a plane from a step
 _MOST_PX = 60  # half a window's size: thin rays are not bridged at any price
+_ROWS = 8  # that are passed over together where none of them holds a measured pixel
 
 
 class Known(NamedTuple):
@@ -26,6 +27,16 @@ class Known(NamedTuple):
     num: NDArray[np.int32]
     column: NDArray[np.int32]
     inverse: Float
+    confidence: Float32
+
+
+class _Inside(NamedTuple):
+    """The measured pixels in a window, row by row. inverse: 1/m. right, down: columns and rows from
+    its middle."""
+
+    inverse: Float
+    right: Float
+    down: Float
     confidence: Float32
 
 
@@ -46,47 +57,43 @@ def _all_round(num, top, bottom, left, right, row, column):  # type: ignore[no-u
 
 
 @inlined
-def _extremes(known, top, bottom, left, right):  # type: ignore[no-untyped-def]
-    """The greatest and the least inverse depth, and how many pixels."""
+def _gather(known, top, bottom, left, right, row, column, inside):  # type: ignore[no-untyped-def]
+    """Collect the measured pixels of a window; returns how many there are, and the greatest and the
+    least inverse depth."""
     num, near, far = 0, 0.0, np.inf
-    for r in range(top, bottom):
-        start, end = known.before[r, left], known.before[r, right]
-        num += end - start
-        for there in known.inverse[start:end]:
-            near, far = max(near, there), min(far, there)
+    for first in range(top, bottom, _ROWS):
+        last = min(first + _ROWS, bottom)
+        if not _any(known.num, first, last, left, right):
+            continue
+        for r in range(first, last):
+            for k in range(known.before[r, left], known.before[r, right]):
+                there = known.inverse[k]
+                near, far = max(near, there), min(far, there)
+                inside.inverse[num] = there
+                inside.right[num] = known.column[k] - column
+                inside.down[num] = r - row
+                inside.confidence[num] = known.confidence[k]
+                num += 1
     return num, near, far
 
 
 @inlined
-def _least(known, top, bottom, left, right):  # type: ignore[no-untyped-def]
-    """The least confidence."""
-    least = np.float32(np.inf)
-    for r in range(top, bottom):
-        for k in range(known.before[r, left], known.before[r, right]):
-            least = min(least, known.confidence[k])
-    return least
-
-
-@inlined
-def _plane(known, top, bottom, left, right, row, column, reach_u, reach_v):  # type: ignore[no-untyped-def]
+def _plane(inside, num, reach_u, reach_v):  # type: ignore[no-untyped-def]
     """Inverse depth in the centre and its two slopes: weighted least squares, the weight falling
     linearly to zero just outside the window."""
     n = u = v = uu = uv = vv = w = uw = vw = 0.0
-    for r in range(top, bottom):
-        dv = float(r - row)
-        weight_v = 1 - abs(dv) / (reach_v + 1)
-        for k in range(known.before[r, left], known.before[r, right]):
-            there, du = known.inverse[k], float(known.column[k] - column)
-            weight = weight_v * (1 - abs(du) / (reach_u + 1))
-            n += weight
-            u += weight * du
-            v += weight * dv
-            uu += weight * du * du
-            uv += weight * du * dv
-            vv += weight * dv * dv
-            w += weight * there
-            uw += weight * du * there
-            vw += weight * dv * there
+    for i in range(num):
+        there, du, dv = inside.inverse[i], inside.right[i], inside.down[i]
+        weight = (1 - abs(dv) / (reach_v + 1)) * (1 - abs(du) / (reach_u + 1))
+        n += weight
+        u += weight * du
+        v += weight * dv
+        uu += weight * du * du
+        uv += weight * du * dv
+        vv += weight * dv * dv
+        w += weight * there
+        uw += weight * du * there
+        vw += weight * dv * there
     u, v, w = u / n, v / n, w / n
     uu, vv, uv = uu / n - u * u + _RIDGE, vv / n - v * v + _RIDGE, uv / n - u * v
     uw, vw = uw / n - u * w, vw / n - v * w
@@ -96,14 +103,13 @@ def _plane(known, top, bottom, left, right, row, column, reach_u, reach_v):  # t
 
 
 @inlined
-def _spread(known, top, bottom, left, right, row, column, centre, slope_u, slope_v):  # type: ignore[no-untyped-def]
+def _spread(inside, num, centre, slope_u, slope_v):  # type: ignore[no-untyped-def]
     """Between the least and the greatest deviation from a plane, 1/m."""
     low, high = np.inf, -np.inf
-    for r in range(top, bottom):
-        there = centre + (r - row) * slope_v
-        for k in range(known.before[r, left], known.before[r, right]):
-            off = known.inverse[k] - there - (known.column[k] - column) * slope_u
-            low, high = min(low, off), max(high, off)
+    for i in range(num):
+        there = centre + inside.down[i] * slope_v
+        off = inside.inverse[i] - there - inside.right[i] * slope_u
+        low, high = min(low, off), max(high, off)
     return high - low
 
 
@@ -118,6 +124,8 @@ def between(first, last, known, spacing_px, reaches, edge, filled_m, confidence,
     largest, 0 where nothing was filled.
     """
     height, width = filled_m.shape
+    most = (2 * _MOST_PX + 1) ** 2
+    inside = _Inside(np.empty(most), np.empty(most), np.empty(most), np.empty(most, np.float32))
     for p in range(first, last):
         row, column = p // width, p % width
         if filled_m[row, column] > 0:
@@ -137,20 +145,17 @@ def between(first, last, known, spacing_px, reaches, edge, filled_m, confidence,
             left, right = max(column - reach_u, 0), min(column + reach_u + 1, width)
             if not _all_round(known.num, top, bottom, left, right, row, column):
                 continue
-            num, near, far = _extremes(known, top, bottom, left, right)
-            centre, slope_u, slope_v = _plane(
-                known, top, bottom, left, right, row, column, reach_u, reach_v
-            )
+            num, near, far = _gather(known, top, bottom, left, right, row, column, inside)
             allowed = max(edge[0], edge[1] / near)
-            if num < _MIN_PLANE_PX:
-                spread_m = 1 / far - 1 / near
-            else:
-                spread = _spread(
-                    known, top, bottom, left, right, row, column, centre, slope_u, slope_v
-                )
-                spread_m = spread / (centre * centre)
-            if spread_m <= allowed and centre > 0:
+            if num < _MIN_PLANE_PX and 1 / far - 1 / near > allowed:
+                continue
+            centre, slope_u, slope_v = _plane(inside, num, reach_u, reach_v)
+            if num >= _MIN_PLANE_PX:
+                spread = _spread(inside, num, centre, slope_u, slope_v)
+                if spread / (centre * centre) > allowed:
+                    continue
+            if centre > 0:
                 filled_m[row, column] = 1 / min(max(centre, far), near)
-                confidence[row, column] = _least(known, top, bottom, left, right)
+                confidence[row, column] = inside.confidence[:num].min()
                 share[row, column] = (step + 1) / len(reaches)
                 break

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -12,6 +13,7 @@ from densify.kernels.marching import NONE
 
 _RIDGE_PX2 = 0.02  # keeps pixels that lie on one line, or nearly so, from tilting the plane
 _LEAST_PX = 3
+_BITS = 24  # of a float32's mantissa
 _LESS, _MORE = 0.7, 1.4  # of the inverse depth, once extended
 
 
@@ -28,29 +30,42 @@ class Rules(NamedTuple):
 
 @inlined
 def _slope(inverse, row, column, half_u, half_v, fraction):  # type: ignore[no-untyped-def]
-    """Slopes of the least-squares plane over the pixels around that are as deep."""
+    """Slopes of the least-squares plane over the pixels around that are as deep. These differ from
+    the one here by whole units, the last bit of half its inverse depth: sums of whole numbers are
+    the same in any order, so that several pixels are added up at once."""
     height, width = inverse.shape
     here = inverse[row, column]
-    n = mu = mv = mw = uu = vv = uv = uw = vw = 0.0
+    units = np.float32(math.ldexp(1.0, _BITS + 1 - math.frexp(here)[1]))
+    most = np.float32(math.floor(fraction * here * units))
+    left, right = max(column - half_u, 0), min(column + half_u + 1, width)
+    n = mu = mv = mw = uu = vv = uv = uw = vw = 0
     for r in range(max(row - half_v, 0), min(row + half_v + 1, height)):
-        for c in range(max(column - half_u, 0), min(column + half_u + 1, width)):
-            dw = inverse[r, c] - here
-            if inverse[r, c] > 0 and abs(dw) <= fraction * here:
-                du, dv = c - column, r - row
-                n += 1
-                mu += du
-                mv += dv
-                mw += dw
-                uu += du * du
-                uv += du * dv
-                vv += dv * dv
-                uw += du * dw
-                vw += dv * dw
-    mu, mv, mw = mu / n, mv / n, mw / n
-    uu, vv, uv = uu / n - mu * mu + _RIDGE_PX2, vv / n - mv * mv + _RIDGE_PX2, uv / n - mu * mv
-    uw, vw = uw / n - mu * mw, vw / n - mv * mw
-    determinant = uu * vv - uv * uv
-    return (vv * uw - uv * vw) / determinant, (uu * vw - uv * uw) / determinant
+        row_n = row_u = row_w = row_uu = row_uw = 0
+        for c in range(left, right):
+            off = (inverse[r, c] - here) * units
+            same = abs(off) <= most
+            du = np.int32(c - column) if same else np.int32(0)
+            dw = np.int32(off) if same else np.int32(0)
+            row_n += same
+            row_u += du
+            row_w += dw
+            row_uu += du * du
+            row_uw += du * np.int64(dw)
+        dv = r - row
+        n += row_n
+        mu += row_u
+        mv += dv * row_n
+        mw += row_w
+        uu += row_uu
+        vv += dv * dv * row_n
+        uv += dv * row_u
+        uw += row_uw
+        vw += dv * row_w
+    a, b, w, aw, bw = mu / n, mv / n, mw / units / n, uw / units / n, vw / units / n
+    aa, bb, ab = uu / n - a * a + _RIDGE_PX2, vv / n - b * b + _RIDGE_PX2, uv / n - a * b
+    aw, bw = aw - a * w, bw - b * w
+    determinant = aa * bb - ab * ab
+    return (bb * aw - ab * bw) / determinant, (aa * bw - ab * aw) / determinant
 
 
 @Kernel
@@ -58,7 +73,8 @@ def slopes(first, last, pixel, inverse, spacing_px, fraction, slope):  # type: i
     """How the surface in known pixels goes on, as far as rays lie apart and three pixels at least.
 
     pixel: (P,) row by row. inverse: (H,W) float32 depth, 1/m, 0 none. spacing_px: (H,W,2) float32
-    of rays, across and down. fraction: of the inverse depth, by which pixels of one surface differ.
+    of rays, across and down. fraction: of the inverse depth, by which pixels of one surface differ,
+    less than a half.
     slope: (H W,2) float32, 1/m per px, filled in for these pixels.
     """
     width = inverse.shape[1]

@@ -120,8 +120,10 @@ def _change(lab, v, u, directions, d, k, stride, most):  # type: ignore[no-untyp
 
 @inlined
 def _alike(lab, v, u, directions, d, k, gap, rules):  # type: ignore[no-untyped-def]
-    """What the image leaves of a vote: exp(-c² / 2 s²) + ``through``, c the largest distance in
-    colour on the way, s ``colours``."""
+    """What the image, if there is one, leaves of a vote: exp(-c² / 2 s²) + ``through``, c the
+    largest distance in colour on the way, s ``colours``."""
+    if lab.size == 0:
+        return 1 + rules.through
     narrow = -0.5 / (rules.colours * rules.colours)
     most = np.float32(np.log(0.01 * rules.through) / narrow)
     stride = max(np.int64(gap / _STRIDE), 1)
@@ -133,7 +135,8 @@ def _alike(lab, v, u, directions, d, k, gap, rules):  # type: ignore[no-untyped-
 def canvass(first, last, pixel, inverse, seeds, lab, gap_px, rules, seed, agrees, tie):  # type: ignore[no-untyped-def]
     """Who votes on each ``pixel`` (P,) of ``inverse`` depth (P,), how, and with how much of a vote.
 
-    seeds: `Seeds`. lab: (H,W,3) float32. gap_px: (H,W) float32 between rays. rules: `Rules`.
+    seeds: `Seeds`. lab: (H,W,3) float32, empty without an image. gap_px: (H,W) float32 between
+    rays. rules: `Rules`.
 
     The first seed in each direction votes, less the farther it is, and less the more colour changes
     on the way to it (`_alike`). Filled: seed (P,16) int32, which pixel that is, -1 none; agrees
