@@ -116,6 +116,7 @@ def test_warnings_of_others_are_not_shown(monkeypatch, capsys) -> None:
         (("export", "x" * 5000), "File name too long"),
         (("dataset", "--status", "x" * 5000), "File name too long"),
         (("dataset", "--out", "x" * 5000), "File name too long"),
+        (("run", "--key", "120", "--out", ""), "got an empty argument after '--out'"),
     ],
     ids=lambda value: " ".join(value)[:60] if isinstance(value, tuple) else "",
 )

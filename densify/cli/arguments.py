@@ -38,7 +38,12 @@ _VERBS = (
 def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     """Options of one command; ``options.verb(options)`` runs it, ``options.command_line`` is the
     parser of all of them. Exits with 2 on a bad argument."""
-    return _command_line().parse_args(arguments)
+    parser = _command_line()
+    given = list(sys.argv[1:] if arguments is None else arguments)
+    if "" in given:  # an empty path would be the current folder
+        before = " ".join(given[: given.index("")][-1:])
+        parser.error(f"got an empty argument after {before!r}; is a shell's variable not set?")
+    return parser.parse_args(given)
 
 
 def _command_line() -> argparse.ArgumentParser:

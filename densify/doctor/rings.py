@@ -118,6 +118,8 @@ def _check_compensation(
             "--set register.deskew=false",
             values,
         )
+    if as_stored < _CLEARLY * undone:
+        return Finding(name, Verdict.UNKNOWN, f"{text}: too alike to tell", values=values)
     if sweep.offset_ns is None:
         return _raw_without_times(name, text, values, spot, sample)
     return Finding(name, Verdict.FINE, f"{text}: as they were fired", values=values)
