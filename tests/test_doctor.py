@@ -72,7 +72,7 @@ WHO_NAMES = {
     "stamps": clocks.check_stamps,
     "point times": clocks.check_point_times,
     "intensity": points.check_intensity,
-    "scanner 0": points.check_sensors,
+    "scanner 0": lambda sample: points.check_sensors(sample, CONFIG.register),
     "calibration": cameras.check_cameras,
     "images": cameras.check_cameras,
 }
@@ -161,6 +161,21 @@ def test_own_vehicle_is_what_stays_beside_it(good: Sample) -> None:
     assert found.remedy in ("--set register.min_range_m=3.9", "--set register.min_range_m=4.0")
     (before,) = points.check_own_vehicle(good, CONFIG.register)
     assert before.verdict == Verdict.FINE
+
+
+def test_returns_of_the_own_vehicle_are_no_rings(good: Sample) -> None:
+    turn, down = np.linspace(-np.pi, np.pi, 400), np.deg2rad(np.repeat([-26.0, -21.0], 200))
+    roof = np.stack([np.cos(turn) * np.cos(down), np.sin(turn) * np.cos(down), np.sin(down)], 1)
+
+    def with_roof(sweep: Sweep) -> Sweep:
+        raw = sweep.points.copy()
+        raw[:400] = roof
+        return replace(sweep, points=raw)
+
+    spots = tuple(replace(s, sweeps=tuple(map(with_roof, s.sweeps))) for s in good.spots)
+    for sample in (good, replace(good, spots=spots)):
+        (found,) = points.check_sensors(sample, CONFIG.register)
+        assert "16 rings, -15.0 to 15.0 deg up" in found.evidence
 
 
 def test_a_sweep_that_cannot_be_read_is_named_and_the_rest_looked_at(street: Faulty) -> None:

@@ -25,7 +25,7 @@ CHECKS: tuple[Callable[[Sample, Config], list[Finding]], ...] = (
     lambda sample, _: clocks.check_point_times(sample),
     lambda sample, _: points.check_units(sample),
     lambda sample, _: points.check_axes(sample),
-    lambda sample, _: points.check_sensors(sample),
+    lambda sample, config: points.check_sensors(sample, config.register),
     lambda sample, config: points.check_own_vehicle(sample, config.register),
     lambda sample, _: points.check_intensity(sample),
     lambda sample, _: registration_of(sample),

@@ -3,12 +3,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from densify.config import RegisterSettings
 from densify.doctor.findings import Finding, Verdict
 from densify.doctor.sample import Sample, Spot
 from densify.geometry.sensor import Sensors
+from densify.readers.window import in_range
 from densify.types import Float
 
 _MEDIAN_RANGE_M = (1.5, 60.0)
@@ -185,13 +188,14 @@ def check_intensity(sample: Sample) -> list[Finding]:
     ]
 
 
-def check_sensors(sample: Sample) -> list[Finding]:
+def check_sensors(sample: Sample, settings: RegisterSettings) -> list[Finding]:
     """What each scanner is like, as the pipeline will take it."""
     spot = sample.fastest
     if spot is None:
         return []
     findings = []
-    for number, model in Sensors.of(spot.stretch.sweeps).models.items():
+    used = [replace(s, sweep=in_range(s.sweep, settings)) for s in spot.stretch.sweeps]
+    for number, model in Sensors.of(used).models.items():
         kind = "lines" if model.rings_rad is None else f"{len(model.rings_rad)} rings"
         kind = "no rings" if model.unordered else kind
         low, high = np.rad2deg(model.elevation_rad)

@@ -12,6 +12,7 @@ import numpy as np
 from densify.config import RegisterSettings
 from densify.errors import InputError, SweepError
 from densify.readers.timeline import Timeline
+from densify.readers.window import in_range
 from densify.registration.deskew import deskew
 from densify.registration.trajectory import find_trajectory
 from densify.types import Float, LidarSequence, Stretch, Sweep, Trajectory
@@ -104,18 +105,12 @@ def _chosen(timeline: Timeline) -> list[list[int]]:
     return [list(frames[start : start + length : stride]) for start in np.unique(starts)]
 
 
-def within(sweep: Sweep, settings: RegisterSettings) -> Sweep:
-    """The sweep without the own vehicle's returns and those too far to trust."""
-    range_m = np.linalg.norm(sweep.points, axis=1)
-    return sweep.select((range_m >= settings.min_range_m) & (range_m <= settings.max_range_m))
-
-
 def spot_of(sweeps: tuple[Sweep, ...], settings: RegisterSettings) -> Spot:
     """Registered by odometry, if they can be."""
     if len(sweeps) < 2:
         return Spot(sweeps, None, "one sweep alone cannot be registered")
     try:
-        trajectory = find_trajectory([within(s, settings) for s in sweeps], settings)
+        trajectory = find_trajectory([in_range(s, settings) for s in sweeps], settings)
     except SweepError as error:
         return Spot(sweeps, None, str(error))
     return Spot(sweeps, trajectory)

@@ -17,12 +17,17 @@ def read_sweep(sequence: LidarSequence, frame: int, settings: RegisterSettings) 
     """A sweep without the own vehicle's returns and those too far to trust, both measured from the
     scanner, and without per-point times where it is not to be deskewed. Raises InputError if it
     cannot be read."""
-    sweep = sequence[frame]
+    sweep = in_range(sequence[frame], settings)
+    return sweep if settings.deskew else replace(sweep, offset_ns=None)
+
+
+def in_range(sweep: Sweep, settings: RegisterSettings) -> Sweep:
+    """The sweep without the own vehicle's returns and those too far to trust, both measured from
+    the scanner."""
     origins_m = sweep.scanner_origins
     away = sweep.points if origins_m is None else sweep.points - origins_m[sweep.lidar]
     range_m = np.linalg.norm(away, axis=1)
-    sweep = sweep.select((range_m >= settings.min_range_m) & (range_m <= settings.max_range_m))
-    return sweep if settings.deskew else replace(sweep, offset_ns=None)
+    return sweep.select((range_m >= settings.min_range_m) & (range_m <= settings.max_range_m))
 
 
 def choose_cameras(sequence: LidarSequence, names: Sequence[str] | None) -> list[Camera]:
