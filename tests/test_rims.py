@@ -161,21 +161,43 @@ def test_an_image_that_does_not_belong_is_noticed(how):
     assert made.warnings and np.array_equal(made.depth_m, layers.depth_m)
 
 
+def hedge(layers, image, beyond_row=70):
+    """The same above a hedge: leaves at any depth, which no colour tells apart."""
+    rng = np.random.default_rng(3)
+    leaves = np.mgrid[0:HEIGHT, 0:WIDTH][0] >= beyond_row
+    known = leaves & (rng.uniform(size=leaves.shape) < 0.4)
+    depth = np.where(leaves, np.float32(0), layers.depth_m)
+    rim = np.where(leaves, known * rng.uniform(6, 14, leaves.shape), layers.rim_m)
+    colours = ndimage.gaussian_filter(rng.uniform(0, 255, image.shape), (1, 1, 0))
+    image = np.where(leaves[..., None], 127 + 3 * (colours - 127), image).clip(0, 255)
+    return replace(layers, depth_m=depth, rim_m=rim.astype(np.float32)), image.astype(np.uint8)
+
+
+@pytest.mark.parametrize("seed", [1, 5, 6])
+def test_a_right_image_stays_where_it_is_beside_a_hedge_too(seed):
+    layers, image, _ = scene(seed)
+    layers, image = hedge(layers, image)
+    assert pictured(image, layers)[1:] == (0, 0)
+    assert pictured(image[:, ::-1].copy(), layers) is None
+
+
+def pictured(image, layers):
+    return laid_over(replace(layers, lab=lab(image)))
+
+
 def test_a_dark_image_still_fits():
     layers, image, _ = scene()
-    at, dark = layers.rim_m > 0, (image // 4).astype(np.uint8)
-    known_m = np.maximum(layers.depth_m, layers.rim_m)
-    assert laid_over(lab(dark), known_m, at) is not None
+    dark = (image // 4).astype(np.uint8)
+    assert pictured(dark, layers) is not None
     assert np.percentile(lab(dark)[..., 0], 99) == pytest.approx(70, abs=1)
 
 
-@pytest.mark.parametrize(("right", "down"), [(0, 0), (2, 0), (-3, 0), (0, -2), (1, 2)])
+@pytest.mark.parametrize(("right", "down"), [(0, 0), (3, 0), (-3, 0), (0, -3), (2, 2)])
 def test_an_image_that_lies_aside_is_moved_back(right, down):
     layers, image, _ = scene()
-    at, known_m = layers.rim_m > 0, np.maximum(layers.depth_m, layers.rim_m)
-    straight, *unmoved = laid_over(lab(image), known_m, at)
-    moved, *by_px = laid_over(lab(np.roll(image, (down, right), (0, 1))), known_m, at)
-    assert (unmoved, by_px) == ([0, 0, False], [right, down, abs(right) == 3])
+    straight, *unmoved = pictured(image, layers)
+    moved, *by_px = pictured(np.roll(image, (down, right), (0, 1)), layers)
+    assert (unmoved, by_px) == ([0, 0], [right, down])
     inside = (slice(8, -8), slice(8, -8))
     off = [
         np.abs(np.roll(moved, by, axis)[inside] - straight[inside]).mean()

@@ -9,19 +9,25 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from densify.types import Bool, Float, Float32
+from densify.depth.layers import Layers
+from densify.types import Float, Float32, Int
 
 _BLUR_PX = 0.6  # standard deviation; noise and the colour filter's pattern
 _AROUND_PX = 20.0  # standard deviation; over which edges are compared
 _EDGE_PX = 1.5  # standard deviation of the blur that tells which way depth changes
-_MOST = 6000  # edges that are looked at
+_MOST = 6000  # edges of each kind that are looked at
 _STRONG = 4.0  # a stronger edge counts no more
+_ONE_SURFACE = (0.1, 0.02)  # metres plus share of the depth between neighbouring known pixels
+_JUMP = (0.3, 0.05)
+_GAP, _STRICT_GAP = 3, 10  # steps, at most, between neighbouring pixels, without rims
+_JUMPS_COUNT = 0.4  # of what rims count, each kind
 _REACH = 14  # steps to all sides in which the image is laid elsewhere
 _ASIDE, _ELSEWHERE = 3.2, 6.0  # steps; nearer and it fits, farther and it cannot
-_LEAST_SCORE = 2.2  # standard deviations above what it is elsewhere
-_LEAST_RATIO = 1.05  # to what it is elsewhere; noise reaches 1.03
-_LEAST_GAIN = 0.1  # of what edges stand out by, for which the image is moved
-_CERTAIN_GAIN = 1.0  # standard deviations elsewhere; right images reach 0.9
+_TREND = 3  # degree of what changes slowly with where the image is laid
+# In standard deviations elsewhere: right images reach 3.1 to 11 as they are and 1.9 more beside
+# that, mirrored ones 3.0.
+_LEAST, _LEAST_ASIDE = 3.05, 5.0
+_CLEARLY = 1.9
 _LEAST_LIGHT = 70.0  # L of the lightest hundredth; a darker image is lightened
 _REBLUR_PX = 1.5  # standard deviation
 _MOST_BLUR = 2.0  # steps, standard deviation
@@ -48,13 +54,11 @@ def blurred(values: Float32, blur_px: tuple[float, float]) -> Float32:
 
 
 class Laid(NamedTuple):
-    """An image (H,W,3) moved to where it fits. right_px, down_px: by how much it lay aside.
-    certain: more than right images are moved by chance."""
+    """An image (H,W,3) moved to where it fits. right_px, down_px: by how much it lay aside."""
 
     lab: Float32
     right_px: int = 0
     down_px: int = 0
-    certain: bool = False
 
     def __str__(self) -> str:
         """How it lay aside: "2 px to the left and 1 px too high"."""
@@ -64,55 +68,111 @@ class Laid(NamedTuple):
         return " and ".join(said for off_px, said in ways if off_px)
 
 
-def laid_over(lab: Float32, depth_m: Float32, at: Bool, step_px: int = 1) -> Laid | None:
-    """The image moved to where it has edges where depth has; None if it does not fit.
+def laid_over(layers: Layers) -> Laid | None:
+    """The image of ``layers``, moved if it has edges beside those of depth; None if it does not
+    fit, or is blurred.
 
-    lab: (H,W,3). depth_m: (H,W), 0 none, with edges ``at`` (H,W). How much the image changes there
-    across the edges of depth is summed up with the image as it is and laid elsewhere, by up to 14
-    steps of ``step_px`` to all sides. It fits if the sum is largest at most 3.2 steps away, and 2.2
-    standard deviations and a twentieth larger than 6 steps and more away, and if the image is not
-    blurred by more than 2 steps: the sharper an edge, the more another blur takes from its gradient
-    (Zhuo and Sim, "Defocus map estimation from a single image", 2011). It is moved if edges stand
-    out a tenth more there.
+    The image is laid as it is and elsewhere, in steps of a third of the gap between rays, and how
+    far its edges stand out there (`_standing_out`) compared. They must stand out most at most 3.2
+    steps away. The image stays as it is if they stand out by 3.05 there and by at most 1.9 less
+    than where most; else it is moved to there, if they stand out by 5. It is blurred if its edges
+    are by more than 2 steps: the sharper an edge, the more another blur takes from its gradient
+    (Zhuo and Sim, "Defocus map estimation from a single image", 2011).
     """
-    if _blur_px(lab) > _MOST_BLUR * step_px:
+    lab, step_px = layers.lab, max(1, round(0.3 * float(np.median(layers.gap_px))))
+    if lab is None or _blur_px(lab) > _MOST_BLUR * step_px:
         return None
-    sums = _edge_sums(lab, depth_m, at, step_px)
-    offsets = np.arange(-_REACH, _REACH + 1)
-    steps = np.hypot(*np.meshgrid(offsets, offsets))
-    elsewhere = sums[steps > _ELSEWHERE]
-    mean, here = elsewhere.mean(), sums[_REACH, _REACH]
-    best = sums[steps <= _ASIDE].max()
-    least = max(mean + _LEAST_SCORE * elsewhere.std(), _LEAST_RATIO * mean)
-    if best < sums.max() or best <= least:
+    found = _standing_out(_edge_sums(lab, layers, step_px))
+    here, most = found[_REACH, _REACH], found.max()
+    down, right = np.array(np.unravel_index(found.argmax(), found.shape)) - _REACH
+    if np.hypot(down, right) > _ASIDE:
         return None
-    if best - here <= _LEAST_GAIN * (best - mean):
+    if here >= _LEAST and most - here <= _CLEARLY:
         return Laid(lab)
-    down, right = step_px * (np.array(np.unravel_index(sums.argmax(), sums.shape)) - _REACH)
+    if most < _LEAST_ASIDE:
+        return None
+    down, right = step_px * down, step_px * right
     rows, columns = (
         np.clip(np.arange(size) + off, 0, size - 1)
         for size, off in zip(lab.shape[:2], (down, right), strict=True)
     )
     moved = np.ascontiguousarray(lab[rows[:, None], columns])
-    return Laid(moved, int(right), int(down), bool(best - here > _CERTAIN_GAIN * elsewhere.std()))
+    return Laid(moved, int(right), int(down))
 
 
-def _edge_sums(lab: Float32, depth_m: Float32, at: Bool, step_px: int) -> Float:
+def _standing_out(sums: Float) -> Float:
+    """(29,29) how far each of ``sums`` stands out of those more than 6 steps from the middle, in
+    standard deviations. What changes slowly among these is taken off: an image's lower half has
+    more to see than its upper one wherever its edges are."""
+    offsets = np.arange(-_REACH, _REACH + 1)
+    right, down = np.meshgrid(offsets, offsets)
+    elsewhere = np.hypot(right, down) > _ELSEWHERE
+    powers = [(i, j) for i in range(_TREND + 1) for j in range(_TREND + 1 - i)]
+    terms = np.stack([(right / _REACH) ** i * (down / _REACH) ** j for i, j in powers], axis=2)
+    trend = np.linalg.lstsq(terms[elsewhere], sums[elsewhere], rcond=None)[0]
+    left: Float = sums - terms @ trend
+    return left / max(float(left[elsewhere].std()), 1e-12)
+
+
+def _edge_sums(lab: Float32, layers: Layers, step_px: int) -> Float:
     """(29,29) how much the image laid so many steps down and to the right changes across the edges
-    of depth."""
-    row, column = (f[:: len(f) // _MOST + 1] // step_px for f in np.nonzero(at))
-    right, down = _across(depth_m, step_px)[:, row, column]
+    of depth: rims, jumps between neighbouring known pixels, and, by where surfaces are known for
+    sure, between what is no rim. Each as a multiple of its mean."""
+    known_m = np.maximum(layers.depth_m, layers.rim_m)
+    strict_m = np.where(layers.strict, layers.depth_m, np.float32(0))
+    clear_m = np.where(layers.veiled, np.float32(0), known_m)
+    row, column = (_some(f) // step_px for f in np.nonzero((clear_m > 0) & (layers.rim_m > 0)))
     changes = _changes(_reduced(lab, step_px))
     changes = np.pad(changes, ((0, 0), (_REACH, _REACH), (_REACH, _REACH)), "edge")
+    sums = _sums(changes, row, column, *_across(clear_m, step_px)[:, row, column])
+    total = sums / max(float(sums.mean()), 1e-12)
+    for depth_m, gap in ((known_m, _GAP), (strict_m, _STRICT_GAP)):
+        row, column = _jumps(depth_m, gap, step_px)
+        sums = _sums(changes, row, column, 1.0, 0.0)
+        column, row = _jumps(np.ascontiguousarray(depth_m.T), gap, step_px)
+        sums += _sums(changes, row, column, 0.0, 1.0)
+        total += _JUMPS_COUNT * sums / max(float(sums.mean()), 1e-12)
+    return total
+
+
+def _sums(
+    changes: Float32, row: Int, column: Int, right: float | Float32, down: float | Float32
+) -> Float:
+    """(29,29) of the edges at rows and columns (E,) across which depth changes to the ``right`` and
+    ``down``, (E,) or the same everywhere."""
     width, (x, y) = changes.shape[2], changes.reshape(2, -1)
     place = (row + _REACH) * width + column + _REACH
-    offsets = range(-_REACH, _REACH + 1)
+    offsets = np.arange(-_REACH, _REACH + 1)
+    beside = place + offsets[:, None]
 
-    def change(du: int, dv: int) -> float:
-        there = place + dv * width + du
-        return float(np.abs(x[there] * right + y[there] * down).mean())
+    def change(down_steps: int) -> Float:
+        there = beside + down_steps * width
+        changed: Float = np.abs(x.take(there) * right + y.take(there) * down)
+        return changed.sum(axis=1)
 
-    return np.array([[change(du, dv) for du in offsets] for dv in offsets])
+    return np.array([change(down_steps) for down_steps in range(-_REACH, _REACH + 1)], np.float64)
+
+
+def _some(values: Int) -> Int:
+    """The values, or 6000 of them, evenly."""
+    return values[:: len(values) // _MOST + 1]
+
+
+def _jumps(depth_m: Float32, gap: int, step_px: int) -> tuple[Int, Int]:
+    """Rows and columns, in steps, where depth (H,W) jumps between neighbouring known pixels of a
+    row, at most ``gap`` steps apart, from one surface to another: both go on, which leaves out most
+    of leaves."""
+    row, column = np.nonzero(depth_m)
+    known_m = depth_m[row, column]
+    off_m, least_m = np.abs(np.diff(known_m)), np.minimum(known_m[1:], known_m[:-1])
+    near = (np.diff(row) == 0) & (np.diff(column) <= gap * step_px)
+    on, jumps = (
+        near & ((off_m < part_m + share * least_m) == within)
+        for (part_m, share), within in ((_ONE_SURFACE, True), (_JUMP, False))
+    )
+    at = 1 + np.flatnonzero(on[:-2] & jumps[1:-1] & on[2:])
+    middle = (column[at] + column[at + 1]) // 2
+    return _some(row[at]) // step_px, _some(middle) // step_px
 
 
 def _blur_px(lab: Float32) -> float:

@@ -40,25 +40,23 @@ def decide(layers: Layers, settings: ProjectSettings) -> Layers:
     second round less the less they are believed. Kept is what has 97 % of the votes, but nothing
     that is ``refused``.
 
-    An image that lies up to 3 steps aside is moved, with a warning that says how far where that is
-    certain. To one that does not belong to the depth or is blurred
-    (`densify.depth.picture.laid_over`) nobody listens: as ``strict``, with a warning; without an
-    image as ``strict``. ``lab`` goes on only if it was listened to.
+    An image that lies up to 3 steps aside is moved, with a warning that says how far. To one that
+    does not belong to the depth or is blurred (`densify.depth.picture.laid_over`) nobody listens:
+    as ``strict``, with a warning; without an image as ``strict``. ``lab`` goes on only if it was
+    listened to.
 
     The ``confidence`` of rims becomes 0 to 0.2, by the share of the votes against.
     """
     rims = np.flatnonzero(layers.rim_m)
     share, lab, warnings = np.full(len(rims), np.float32(0.5)), None, layers.warnings
-    at_edge = (layers.rim_m > 0) & ~layers.veiled
-    known_m = np.where(layers.veiled, np.float32(0), np.maximum(layers.depth_m, layers.rim_m))
     if layers.lab is not None and settings.rims != "strict" and len(rims) >= _FEW:
-        laid = laid_over(layers.lab, known_m, at_edge, _scale(layers))
+        laid = laid_over(layers)
         if laid is None:
             warnings = (*warnings, _MISFIT)
         else:
             lab = laid.lab
             share = shares(replace(layers, lab=lab), rims)
-            if laid.certain:
+            if laid.right_px or laid.down_px:
                 warnings = (*warnings, _MOVED.format(laid=laid))
     believed = share >= _LEAST_SHARE
     if settings.rims == "strict":
@@ -92,8 +90,3 @@ def shares(layers: Layers, rims: Int) -> Float32:
         weight.flat[rims] = _RIM_WEIGHT * share**2
         share = canvass.shares(weight)
     return share
-
-
-def _scale(layers: Layers) -> int:
-    """Pixels to a third of the gap between rays, at least one."""
-    return max(1, round(0.3 * float(np.median(layers.gap_px))))
