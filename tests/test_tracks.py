@@ -14,7 +14,7 @@ from densify.flow.tracking import proof
 from densify.flow.tracking.evidence import FreeSpace, Standing, find_candidates
 from densify.flow.tracking.shapes import Body, Shape
 from densify.flow.tracking.sightings import Sighting, Track
-from densify.flow.tracking.starts import groups_to_start
+from densify.flow.tracking.starts import groups_to_start, velocities_of_traffic
 from densify.geometry.ground import ground
 from densify.geometry.height_map import HeightMap
 from tests.scenes import SWEEP_S, Arc, Box, Scanner, Scene, World, car, street
@@ -63,6 +63,21 @@ def test_few_points_or_few_seeds_start_nothing(size, seed_share, starts_one):
 
 def test_no_candidates_no_starts():
     assert starts([standing([]), standing([])]) == []
+
+
+def test_who_is_seen_well_once_only_may_drive_as_others_do():
+    """Each velocity once, and no walker's."""
+    bodies = []
+    for speed_m_s in (30.0, -22.0, 30.6, 1.4):
+        sighted = {
+            n: Sighting(np.array([0.1 * speed_m_s * n, 0, 0, 0]), 0.1 * n, n * 100_000_000, (n,))
+            for n in range(3)
+        }
+        track = Track(np.zeros(3), sighted, {n: np.arange(8) for n in range(3)})
+        track.smooth()
+        bodies.append(Body(track, Shape.of(np.eye(3))))
+    found = list(velocities_of_traffic(SimpleNamespace(time_ns=100_000_000), bodies))
+    np.testing.assert_allclose(found, [[30.0, 0, 0], [-22.0, 0, 0]], atol=1e-6)
 
 
 def test_the_ground_rises_under_a_track():

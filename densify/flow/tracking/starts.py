@@ -22,6 +22,7 @@ _NEARER_END, _NEARER_END_S = 0.7, 0.1  # each time a start is so much nearer it 
 _LEAST_WIDTH_M = 0.1
 _SLIDES_M = 1.5  # what is seen to be so long may slide along itself
 _HOLE_S = 0.25  # over longer ones, what starts at one end may miss the other
+_DRIVES_M_S, _APART_M_S = 8.0, 1.5
 _BESIDE_M = 1.0  # as far as what is towed is from what tows it
 
 
@@ -67,6 +68,18 @@ def velocities_beside(look: Look, members: np.ndarray, bodies: Sequence[Body]) -
         if not np.isfinite(tree.nearest(track.place(shape.points, at_s), _BESIDE_M)[0]).any():
             continue
         yield track.velocity_m_s(middle, at_s)[0]
+
+
+def velocities_of_traffic(look: Look, bodies: Sequence[Body]) -> Iterator[Float]:
+    """The different velocities (3,) that proven tracks have on the road then: who comes towards the
+    scanner and is seen well once only, seen through by few, drives about as others do."""
+    told: list[Float] = []
+    for track, _ in bodies:
+        velocity = track.path.rate(track.seen_at(look.time_ns))[:3]
+        apart_m_s = [np.linalg.norm(velocity - other) for other in told]
+        if np.linalg.norm(velocity) > _DRIVES_M_S and min(apart_m_s, default=np.inf) > _APART_M_S:
+            told.append(velocity)
+            yield velocity
 
 
 def ends(track: Track, looks: Sequence[Look]) -> Iterator[tuple[np.ndarray, int]]:

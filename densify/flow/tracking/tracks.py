@@ -8,7 +8,7 @@ model, is smoothed in time, and counts only if that smooth motion explains what 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from itertools import chain
 
@@ -30,6 +30,7 @@ from densify.flow.tracking.starts import (
     groups_to_start,
     is_line_on,
     velocities_beside,
+    velocities_of_traffic,
 )
 from densify.flow.tracking.vote import DistanceField, Group, vote
 from densify.geometry.height_map import HeightMap
@@ -48,6 +49,7 @@ _GIVEN_S2 = np.array([0.02, 0.02, 0.02, 0.0])
 _STEADY = np.array([1.0, 1.0, 1.0, 0.9])  # of what it was then: turns level out
 _MISSES_ALLOWED, _MISSED_S = 1, 0.2  # either: a track ends when both are exceeded
 _CLEARLY = 0.5  # of the looks that contradict the motion found before
+_HARDLY_FOLLOWED = 2  # looks: the velocity that it was started with was none of its
 _DOUBTFUL = 0.0025  # of the looks contradict it: it is followed again from its ends
 _AS_WHOLE = 0.9  # of the points it had
 
@@ -83,6 +85,20 @@ def follow_groups(
         track = _follow(members, n, velocity, looks, free, ground, clock)
         return track, left_contradicted(track, standing, space, bodies)
 
+    def best_of(members: np.ndarray, n: int, velocities: Iterable[Float]) -> tuple[Track, float]:
+        """The track that least contradicts, of those that are proven, and how much; if none is, the
+        last one and inf."""
+        best, left = Track(np.zeros(3)), np.inf
+        for velocity in velocities:
+            tried, contradicted = follow(members, n, velocity)
+            if contradicted is not None and contradicted < _CLEARLY * left:
+                best, left = tried, contradicted
+            elif np.isinf(left):
+                best = tried
+            if left == 0:
+                break
+        return best, left
+
     free = [np.ones(len(c.points), bool) for c in standing]  # not yet part of a track
     untried = [np.ones(len(c.points), bool) for c in standing]
     tracks: list[Track] = []
@@ -91,16 +107,12 @@ def follow_groups(
         members = group[looks[n].gather(free)[group] & looks[n].gather(untried)[group]]
         if len(members) < MIN_POINTS or is_line_on(bodies, looks[n], members):
             continue
-        left, proven = np.inf, False
         beside = velocities_beside(looks[n], members, bodies)
-        for start in chain([velocity_of(members, n)], beside):
-            tried, contradicted = follow(members, n, start)
-            if contradicted is not None and contradicted < _CLEARLY * left:
-                track, left, proven = tried, contradicted, True
-            elif not proven:
-                track = tried
-            if left == 0:
-                break
+        track, left = best_of(members, n, chain([velocity_of(members, n)], beside))
+        if np.isinf(left) and len(track.sightings) <= _HARDLY_FOLLOWED:
+            in_traffic = best_of(members, n, velocities_of_traffic(looks[n], bodies))
+            track, left = (track, left) if np.isinf(in_traffic[1]) else in_traffic
+        proven = bool(np.isfinite(left))
         for rows, k in ends(track, looks) if proven and left > _DOUBTFUL else ():
             tried, contradicted = follow(rows, k, velocity_of(rows, k))
             whole = tried.total_points() >= _AS_WHOLE * track.total_points()
