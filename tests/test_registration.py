@@ -16,15 +16,18 @@ from densify.geometry import poses
 from densify.readers.street import Street
 from densify.readers.window import read_sweep, recorded_trajectory
 from densify.registration import neighbors, odometry, trajectory
+from densify.registration.alignment import some
 from densify.registration.deskew import deskew
 from densify.registration.neighbors import refine
 from densify.registration.odometry import check_overlap, check_plausible, register
+from densify.registration.surfaces import register_on_surfaces
 from densify.types import Trajectory
 from tests.scenes import SWEEP_S, Arc, Box, Scanner, Scene, World, street
 
 SETTINGS = RegisterSettings()
 KEY = 5
 FRAMES = range(11)
+AROUND_NS = 550_000_000
 
 
 @pytest.fixture(scope="module")
@@ -159,18 +162,18 @@ def jittered(true: Trajectory, seed: int, noise_m: float, noise_deg: float) -> T
 def test_sweeps_are_laid_on_those_around_them(drive, raw, second_pass):
     true = drive.trajectory(FRAMES)
     off_m, off_deg = errors(second_pass, true)
-    now_m, now_deg = errors(refine(raw, second_pass, SETTINGS), true)
+    now_m, now_deg = errors(refine(raw, second_pass, AROUND_NS, SETTINGS), true)
     assert now_m.mean() < 0.7 * off_m.mean() and now_deg.mean() < 0.7 * off_deg.mean()
 
 
 def test_what_odometry_leaves_is_mended_and_the_first_sweep_stays(drive, raw):
     true = drive.trajectory(FRAMES)
     off = jittered(true, 1, 0.03, 0.1)
-    found = refine(raw, off, SETTINGS)
+    found = refine(raw, off, AROUND_NS, SETTINGS)
     (before_m, before_deg), (m, deg) = errors(off, true), errors(found, true)
     assert m.mean() < 0.4 * before_m.mean() and deg.mean() < 0.7 * before_deg.mean()
     np.testing.assert_allclose(found.T_world_lidar[0], off.T_world_lidar[0], atol=1e-9)
-    again = refine(raw, off, SETTINGS)
+    again = refine(raw, off, AROUND_NS, SETTINGS)
     assert again.T_world_lidar.tobytes() == found.T_world_lidar.tobytes()
     assert (found.frames, found.stamp_ns.tobytes()) == (off.frames, off.stamp_ns.tobytes())
 
@@ -179,17 +182,19 @@ def test_a_sweep_that_does_not_lie_on_those_around_keeps_its_pose(drive, raw):
     true = drive.trajectory(FRAMES)
     astray = true.T_world_lidar.copy()
     astray[4] = astray[4] @ poses.exp(np.array([0, 0, 0.3, 4, 0, 3]))
-    found = refine(raw, replace(true, T_world_lidar=astray), SETTINGS)
+    found = refine(raw, replace(true, T_world_lidar=astray), AROUND_NS, SETTINGS)
     np.testing.assert_allclose(found.T_world_lidar[4], astray[4], atol=0.05)
 
 
-def test_only_sweeps_of_half_a_second_around_are_asked(drive):
-    near = neighbors._around(drive.trajectory(range(20)), 10)
-    assert near == [5, 6, 7, 8, 9, 11, 12, 13, 14, 15]
+def test_only_sweeps_around_are_asked(drive):
+    def around(trajectory: Trajectory, i: int) -> list[int]:
+        return neighbors._around(trajectory.stamp_ns, i, AROUND_NS)
+
+    assert around(drive.trajectory(range(20)), 10) == [5, 6, 7, 8, 9, 11, 12, 13, 14, 15]
     often = replace(drive.trajectory(range(40)), stamp_ns=np.arange(40) * 25_000_000)
-    near = neighbors._around(often, 20)
+    near = around(often, 20)
     assert len(near) <= 10 and 20 not in near and all(abs(j - 20) % 4 == 0 for j in near)
-    assert neighbors._around(drive.trajectory(range(1)), 0) == []
+    assert around(drive.trajectory(range(1)), 0) == []
 
 
 def test_same_bytes_every_time(raw, first_pass):
@@ -378,22 +383,67 @@ def test_environment_variables_have_no_effect(raw, first_pass, monkeypatch):
     assert again.T_world_lidar.tobytes() == first_pass.T_world_lidar.tobytes()
 
 
-def test_sweeps_of_few_points_have_smaller_voxels(raw):
-    def of(*num_points: int) -> float:
-        sweeps = [raw[0].select(np.arange(len(raw[0])) < n) for n in num_points]
-        return odometry._voxel_size_m(sweeps, SETTINGS)
-
-    assert of(10_000) == 0.25
-    assert of(200, 10_000, 15_000) == 0.25
-    assert of(200) == pytest.approx(0.2)
-    assert odometry._voxel_size_m(raw, RegisterSettings(voxel_size_m=1)) <= 1
-
-
 def test_knobs_reach_kiss_icp(raw, first_pass):
     other = register(raw[:3], RegisterSettings(voxel_size_m=2.0))
     assert not np.array_equal(other.T_world_lidar, first_pass.T_world_lidar[:3])
     near = register(raw[:3], RegisterSettings(max_range_m=25.0))
     assert not np.array_equal(near.T_world_lidar, first_pass.T_world_lidar[:3])
+
+
+# --- sweeps of few points -------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def few(raw):
+    return [some(s, 12_000) for s in raw]
+
+
+def test_few_points_are_laid_on_the_surfaces_of_the_last_second(drive, few):
+    found = register_on_surfaces(few, SETTINGS)
+    assert (found.frames, found.T_world_lidar[0].tolist()) == (tuple(FRAMES), np.eye(4).tolist())
+    off_m, off_deg = errors(found, drive.trajectory(FRAMES))
+    assert off_m.max() < 0.04 and off_deg.max() < 0.1
+    again = register_on_surfaces(few, SETTINGS)
+    assert again.T_world_lidar.tobytes() == found.T_world_lidar.tobytes()
+
+
+def test_the_number_of_points_decides_on_the_odometry(raw, few, monkeypatch):
+    used = []
+    for name in ("register", "register_on_surfaces"):
+        found = getattr(trajectory, name)
+        monkeypatch.setattr(trajectory, name, lambda *a, f=found: used.append(f) or f(*a))
+    trajectory.find_trajectory(few, SETTINGS)
+    assert used == [register_on_surfaces]
+    used.clear()
+    trajectory.find_trajectory([raw[0], *few[1:3], *raw[3:]], SETTINGS)
+    assert used == [register, register]
+
+
+@pytest.mark.parametrize(
+    "frames", [(3,), (3, 4), (3, 4, 5), (0, 1, 2, 3, 9, 10)], ids=["one", "two", "three", "a hole"]
+)
+def test_few_sweeps_of_few_points_are_placed_too(drive, few, frames):
+    """A hole of 0.6 s is 7 m of travel in a bend of 9 degrees."""
+    found = register_on_surfaces([few[f] for f in frames], SETTINGS).T_world_lidar
+    true = drive.trajectory(frames).T_world_lidar
+    off = poses.log(poses.inverse(poses.inverse(true[0]) @ true[-1]) @ found[-1])
+    assert np.linalg.norm(off[3:]) < 0.1 and np.rad2deg(np.linalg.norm(off[:3])) < 0.3
+
+
+def test_a_hole_longer_than_the_memory_is_bridged_by_the_last_sweep(drive, few):
+    late = [*few[:6], *(replace(s, stamp_ns=s.stamp_ns + 1_500_000_000) for s in few[6:])]
+    assert np.isfinite(register_on_surfaces(late, SETTINGS).T_world_lidar).all()
+
+
+def test_a_pattern_that_turns_from_sweep_to_sweep_does_not_take_the_poses_with_it() -> None:
+    """Point to point, a rosette at a crossing where the vehicle stands turns by 2 to 7 degrees a
+    sweep."""
+    crossing, frames = Street("crossing", 302, "rosette"), range(85, 93)
+    raw = [read_sweep(crossing, f, SETTINGS) for f in frames]
+    found = trajectory.find_trajectory(raw, SETTINGS)
+    off = np.array([poses.log(T) for T in found.T_world_lidar])
+    assert np.linalg.norm(off[:, 3:], axis=1).max() < 0.08
+    assert np.rad2deg(np.linalg.norm(off[:, :3], axis=1)).max() < 1
 
 
 # --- what cannot be registered --------------------------------------------------------------------

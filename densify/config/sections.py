@@ -34,8 +34,8 @@ class RegisterSettings(Section):
     )
     voxel_size_m: float = knob(
         0.5,
-        "[m] cell of the local map; smaller is finer and slower, too small loses track. Sweeps of "
-        "fewer than 20,000 points get a smaller one in proportion, down to 0.4 of it",
+        "[m] cell of KISS-ICP's local map; smaller is finer and slower, too small loses track. "
+        "Sweeps of fewer than 30,000 points do without, laid point to plane on the last second",
         0.05,
         10,
     )

@@ -29,8 +29,6 @@ _SEARCH_RAYS_RAD = (
     0.01  # what stands along the road is met by the same rays, however fast one drives
 )
 _STANDING_M = 0.4
-_MANY_POINTS = 20_000  # in a sweep; with fewer the voxels are smaller
-_LEAST_VOXEL = 0.4
 _OVERLAP_POINTS = 2000
 _OVERLAP_M = 0.5
 _OVERLAP_NS = 350_000_000  # within it a pattern that does not repeat fills its view
@@ -68,7 +66,7 @@ def register(
     check_number_of_points(sweeps, settings)
     check_stamps(frames, stamp_ns)
     step_s = np.diff(stamp_ns) * 1e-9
-    voxel_size_m = _voxel_size_m(sweeps, settings) * (2 if rough is None else 1)
+    voxel_size_m = settings.voxel_size_m * (2 if rough is None else 1)
     odometry = KissICP(_kiss_icp_config(settings, voxel_size_m, rough is not None))
     # KISS-ICP aborts the process on equal stamps; sweeps are ours to deskew
     no_stamps = np.empty(0)
@@ -85,13 +83,6 @@ def register(
         odometry.register_frame(sweep.points, no_stamps)
         T_world_lidar.append(odometry.last_pose)
     return Trajectory(frames, stamp_ns, np.stack(T_world_lidar))
-
-
-def _voxel_size_m(sweeps: Sequence[Sweep], settings: RegisterSettings) -> float:
-    """The knob's, smaller where sweeps hold few points, so that enough of them are matched: few in
-    large voxels slide onto the pattern in which the sweep before was scanned."""
-    num_points = float(np.median([len(sweep) for sweep in sweeps]))
-    return settings.voxel_size_m * float(np.clip(num_points / _MANY_POINTS, _LEAST_VOXEL, 1.0))
 
 
 def check_number_of_points(sweeps: Sequence[Sweep], settings: RegisterSettings) -> None:

@@ -21,8 +21,12 @@ from densify.registration.odometry import (
     check_stamps,
     register,
 )
+from densify.registration.surfaces import register_on_surfaces
 from densify.registration.upright import upright
 from densify.types import Float, Int, Sweep, Trajectory
+
+_MANY_POINTS = 30_000  # in a sweep; fewer are matched with the pattern they were scanned in
+_AROUND_MANY_NS, _AROUND_FEW_NS = 550_000_000, 1_050_000_000
 
 
 class LeftOut(NamedTuple):
@@ -47,8 +51,8 @@ def find_trajectory(
     """Where the lidar was at every sweep.
 
     sweeps: raw, ascending in time. recorded: the recording's own poses of them, which are checked
-    and taken; None to register the sweeps in two passes, whose first finds the motion that bends
-    raw sweeps, and then to lay each on those around it (`densify.registration.neighbors`).
+    and taken; None to find them by odometry and then lay each sweep on those around it
+    (`densify.registration.neighbors`).
 
     Raises SweepError naming the frame where the poses cannot be right.
     """
@@ -59,12 +63,30 @@ def find_trajectory(
     else:
         check_number_of_points(sweeps, settings)
         check_stamps([s.frame for s in sweeps], _stamps_ns(sweeps))
-        rough = _rough(sweeps, settings)
-        straight = [s.sweep for s in deskew(sweeps, rough).sweeps]
-        found = refine(sweeps, _fine(straight, rough, settings), settings)
+        many = bool(np.median([len(sweep) for sweep in sweeps]) >= _MANY_POINTS)
+        odometry, straight = (_by_points if many else _by_surfaces)(sweeps, settings)
+        found = refine(sweeps, odometry, _AROUND_MANY_NS if many else _AROUND_FEW_NS, settings)
         check_plausible(found, settings)
         check_overlap(straight, found, settings)
     return replace(found, R_level_lidar=upright(sweeps))
+
+
+def _by_surfaces(
+    sweeps: Sequence[Sweep], settings: RegisterSettings
+) -> tuple[Trajectory, list[Sweep]]:
+    """Odometry for few points, and the sweeps deskewed by it."""
+    found = register_on_surfaces(sweeps, settings)
+    return found, [s.sweep for s in deskew(sweeps, found).sweeps]
+
+
+def _by_points(
+    sweeps: Sequence[Sweep], settings: RegisterSettings
+) -> tuple[Trajectory, list[Sweep]]:
+    """Odometry for many points in two passes, whose first finds the motion that bends raw sweeps;
+    and the sweeps deskewed by that."""
+    rough = _rough(sweeps, settings)
+    straight = [s.sweep for s in deskew(sweeps, rough).sweeps]
+    return _fine(straight, rough, settings), straight
 
 
 def _rough(sweeps: Sequence[Sweep], settings: RegisterSettings) -> Trajectory:
