@@ -9,6 +9,7 @@ from contextlib import suppress
 # glibc's mallopt(3)
 _TRIM_THRESHOLD, _MMAP_THRESHOLD, _ARENA_MAX = -1, -3, -8
 _KEPT_BYTES = 2**30
+_MOST_OF_OLDER_BYTES = 2**25  # older releases refuse a larger threshold of mmap
 
 
 def keep_freed_memory() -> None:
@@ -20,5 +21,6 @@ def keep_freed_memory() -> None:
     with suppress(OSError, AttributeError, TypeError):  # another library, or none by that name
         mallopt = ctypes.CDLL(None).mallopt
         mallopt(_ARENA_MAX, 1)
-        mallopt(_MMAP_THRESHOLD, _KEPT_BYTES)
+        if not mallopt(_MMAP_THRESHOLD, _KEPT_BYTES):
+            mallopt(_MMAP_THRESHOLD, _MOST_OF_OLDER_BYTES)
         mallopt(_TRIM_THRESHOLD, _KEPT_BYTES)
