@@ -200,6 +200,33 @@ def test_what_leaves_all_its_places_bare_may_swing_or_look_like_a_rail(
         assert proof.may_be_a_rail(track, [], space, []) == (like_a_rail and not proven)
 
 
+@pytest.mark.parametrize(
+    ("aside_m", "scattered", "told", "proven"),
+    [
+        (0.02, False, ((34, 37), (0, 0)), True),
+        (0.15, False, ((0, 900), (0, 900)), False),
+        (0.15, True, ((31, 0), (0, 410)), True),  # each sweep meets other places of a car
+        (0.15, True, ((34, 26), (0, 11)), False),  # or of a hedge
+        (0.4, True, ((0, 900), (0, 900)), False),
+    ],
+)
+def test_without_rings_what_leaves_its_places_may_waver(aside_m, scattered, told, proven):
+    sighted = {
+        n: Sighting(np.array([0.7 * n, aside_m * (-1) ** n, 0, 0]), 0.1 * n, n * 100_000_000, (n,))
+        for n in range(10)
+    }
+    track = Track(np.array([19.0, 4, 0]), sighted, {n: np.arange(8) for n in range(10)})
+    clock = SimpleNamespace(time_s=np.arange(10) / 10)
+    sensors = SimpleNamespace(scattered=scattered)
+    space = SimpleNamespace(gap_m=lambda *_: 0.17, clock=clock, sensors=sensors)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(proof, "_as_fast_as_measured", lambda *_: True)
+        patch.setattr(proof, "_like_a_rail", lambda *_: False)
+        patch.setattr(proof, "contradictions", lambda *_: (300, 0, 700))
+        patch.setattr(proof, "_left_places", lambda *_: told)
+        assert (proof.left_contradicted(track, [], space, []) is not None) == proven
+
+
 @pytest.mark.parametrize("still", [30, 80])
 @pytest.mark.parametrize("told", [((0, 0), (0, 0)), ((0, 30), (0, 0))])
 def test_a_ring_that_glides_over_a_bonnet_does_not_move_it(still, told):

@@ -233,6 +233,11 @@ class Sensors:
     models: Mapping[int, SensorModel]
 
     @property
+    def scattered(self) -> bool:
+        """Whether no scanner has rings or lines: each sweep meets other places of an object."""
+        return all(model.unordered for model in self.models.values())
+
+    @property
     def origins_m(self) -> Float:
         """(S,3) lidar frame, by number; zeros of numbers that no scanner has."""
         origins_m = np.zeros((1 + max(self.models, default=0), 3))

@@ -16,6 +16,9 @@ from densify.kernels.nearest import BoxTree
 from densify.types import Float, Int
 
 _ROUGH_M, _ROUGH_PER_GAP, _ROUGH_S = 0.04, 0.2, 0.003  # by gap of rings, by speed
+# Without rings each sweep meets other places of an object: so much more, if of the places that it
+# left or comes to so few as of those that are empty are taken.
+_ROUGHER, _TAKEN = 1.5, 0.1
 _LEAST_WAY_M, _LEAST_WAY_PER_RESIDUAL, _LEAST_WAY_PER_ROUGH = 0.35, 8.0, 1.5
 _NUM_ASKED = 60
 _LEAST_STATES, _LEAST_S = 3, 0.15
@@ -57,10 +60,13 @@ def left_contradicted(
     begin, end = track.path(track.path.begin_s), track.path(track.path.end_s)
     travelled = float(np.linalg.norm((end - begin)[:2]))
     gap_m = space.gap_m(track.centre, next(iter(track.claimed)))
-    rough_m = _ROUGH_M + _ROUGH_PER_GAP * gap_m + _ROUGH_S * travelled / seen_s
+    by_gap_m = _ROUGH_M + _ROUGH_PER_GAP * gap_m
+    rough_m = by_gap_m + _ROUGH_S * travelled / seen_s
     # Of few places far apart rings, which may be so rough, some lie on a line by chance.
     least_m = max(_LEAST_WAY_PER_RESIDUAL * residual_m, _LEAST_WAY_PER_ROUGH * rough_m)
-    if residual_m > rough_m or travelled < max(_LEAST_WAY_M, least_m):
+    if travelled < max(_LEAST_WAY_M, least_m) or residual_m > rough_m + _ROUGHER * by_gap_m:
+        return None
+    if residual_m > rough_m and not space.sensors.scattered:
         return None
     if not _as_fast_as_measured(track, standing):
         return None
@@ -70,6 +76,8 @@ def left_contradicted(
         return None
     told = _left_places(track, standing, space, proven)
     if any(t > 0 for t, _ in told) and all(t >= _MOSTLY * empty for t, empty in told):
+        return None
+    if residual_m > rough_m and not _mostly_bare(told):
         return None
     # What never left its place may be a ring that glides over a bonnet: only contradictions tell.
     if still < _SHARE_OF_FEW * num_asked and not np.any(told):
@@ -101,6 +109,12 @@ def _bare(told: tuple[tuple[int, int], tuple[int, int]]) -> bool:
     """Whether nothing was seen where an object had not come to yet, nor where it had been, see
     `_left_places`: so it is of nothing that stands."""
     return all(t <= _SELDOM * empty and empty >= _LEAST_CONTRADICTIONS for t, empty in told)
+
+
+def _mostly_bare(told: tuple[tuple[int, int], tuple[int, int]]) -> bool:
+    """Whether hardly anything was seen there, before or after."""
+    taken, empty = np.sum(told, axis=0)
+    return bool(taken <= _TAKEN * empty)
 
 
 def _left_places(
