@@ -155,7 +155,8 @@ def _num_columns(data: bytes) -> int:
     scanner's are, and a wrong number mixes x with y. Rings that fire by turns make every second or
     third row more alike still: the smallest of such numbers is right whose columns differ in their
     values as much."""
-    values = np.frombuffer(data[: len(data) // 4 * 4], "<f4").astype(np.float64)
+    with np.errstate(invalid="ignore"):  # other bytes may be any sort of NaN
+        values = np.frombuffer(data[: len(data) // 4 * 4], "<f4").astype(np.float64)
     fit = [k for k in _BIN_COLUMNS if len(values) % k == 0 and len(data) % 4 == 0]
     if len(fit) < 2 or len(values) < 16 * 20:
         return 4 if len(data) % 16 == 0 or not fit else fit[0]
