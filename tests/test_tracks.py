@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from types import SimpleNamespace
 
 import numpy as np
@@ -38,6 +39,16 @@ def starts(sweeps: list[Standing]) -> list[tuple[int, int]]:
     for i, members in found:
         assert len(set(sweeps[i].cluster[members])) == 1 and sweeps[i].candidate[members].all()
     return [(i, len(members)) for i, members in found]
+
+
+def followed(
+    pose: Callable[[int], list[float]], num_sweeps: int, place: list[float], num_points: int
+) -> Track:
+    """At 10 Hz, with so many points in each sweep. pose: of the sweep's number."""
+    sighted = {
+        n: Sighting(np.array(pose(n)), 0.1 * n, n * 100_000_000, (n,)) for n in range(num_sweeps)
+    }
+    return Track(np.array(place), sighted, {n: np.arange(num_points) for n in range(num_sweeps)})
 
 
 def test_starts_in_the_middle_of_the_stretch_come_before_larger_ones_at_its_ends():
@@ -92,10 +103,7 @@ def test_the_ground_rises_under_a_track():
 
 def test_a_short_way_far_from_the_scanner_proves_nothing():
     """Three places on a line may be chance where rings are a metre apart: a tree's leaves."""
-    sighted = {
-        n: Sighting(np.array([0.24 * n, 0, 0, 0]), 0.1 * n, n * 100_000_000, (n,)) for n in range(3)
-    }
-    track = Track(np.array([44.0, 0, 0]), sighted, {n: np.arange(8) for n in range(3)})
+    track = followed(lambda n: [0.24 * n, 0, 0, 0], 3, [44.0, 0, 0], 8)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(proof, "contradictions", lambda *_: (100, 0, 300))
         patch.setattr(proof, "_as_fast_as_measured", lambda *_: True)
@@ -118,11 +126,7 @@ def test_a_short_way_far_from_the_scanner_proves_nothing():
     ],
 )
 def test_what_is_seen_for_long_may_be_contradicted_more(num_seen, num_sweeps, still, proven):
-    sighted = {
-        n: Sighting(np.array([0.9 * n, 0, 0, 0]), 0.1 * n, n * 100_000_000, (n,))
-        for n in range(num_seen)
-    }
-    track = Track(np.array([14.0, 0, 0]), sighted, {n: np.arange(8) for n in range(num_seen)})
+    track = followed(lambda n: [0.9 * n, 0, 0, 0], num_seen, [14.0, 0, 0], 8)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(proof, "_as_fast_as_measured", lambda *_: True)
         patch.setattr(proof, "_left_places", lambda *_: ((0, 100), (0, 100)))
@@ -138,10 +142,7 @@ def test_what_is_seen_for_long_may_be_contradicted_more(num_seen, num_sweeps, st
 @pytest.mark.parametrize(("num_asked", "proven"), [(930, True), (500, False)])
 def test_stray_looks_do_not_undo_what_is_seen_for_a_moment(num_asked, proven):
     """A far car at 33 m/s that four sweeps see; at most one look of 200 is an echo at its rim."""
-    sighted = {
-        n: Sighting(np.array([-3.3 * n, 0, 0, 0]), 0.1 * n, n * 100_000_000, (n,)) for n in range(4)
-    }
-    track = Track(np.array([-33.0, 11, 0]), sighted, {n: np.arange(18) for n in range(4)})
+    track = followed(lambda n: [-3.3 * n, 0, 0, 0], 4, [-33.0, 11, 0], 18)
     clock = SimpleNamespace(time_s=0.1 * np.arange(11))
     space = SimpleNamespace(gap_m=lambda *_: 0.3, clock=clock)
     with pytest.MonkeyPatch.context() as patch:
@@ -162,10 +163,7 @@ def test_stray_looks_do_not_undo_what_is_seen_for_a_moment(num_asked, proven):
     ],
 )
 def test_what_is_mostly_still_there_does_not_move(told, proven):
-    sighted = {
-        n: Sighting(np.array([0.9 * n, 0, 0, 0]), 0.1 * n, n * 100_000_000, (n,)) for n in range(8)
-    }
-    track = Track(np.array([14.0, 0, 0]), sighted, {n: np.arange(8) for n in range(8)})
+    track = followed(lambda n: [0.9 * n, 0, 0, 0], 8, [14.0, 0, 0], 8)
     space = SimpleNamespace(gap_m=lambda *_: 0.1, clock=SimpleNamespace(time_s=np.arange(8) / 10))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(proof, "_as_fast_as_measured", lambda *_: True)
@@ -186,10 +184,7 @@ def test_what_is_mostly_still_there_does_not_move(told, proven):
 def test_what_leaves_all_its_places_bare_may_swing_or_look_like_a_rail(
     told, proven, moved, like_a_rail
 ):
-    sighted = {
-        n: Sighting(np.array([0.2 * n, 0, 0, 0]), 0.1 * n, n * 100_000_000, (n,)) for n in range(8)
-    }
-    track = Track(np.array([8.0, 0, 0]), sighted, {n: np.arange(8) for n in range(8)})
+    track = followed(lambda n: [0.2 * n, 0, 0, 0], 8, [8.0, 0, 0], 8)
     space = SimpleNamespace(gap_m=lambda *_: 0.05, clock=SimpleNamespace(time_s=np.arange(8) / 10))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(proof, "_as_fast_as_measured", lambda *_: True)
@@ -211,11 +206,7 @@ def test_what_leaves_all_its_places_bare_may_swing_or_look_like_a_rail(
     ],
 )
 def test_without_rings_what_leaves_its_places_may_waver(aside_m, scattered, told, proven):
-    sighted = {
-        n: Sighting(np.array([0.7 * n, aside_m * (-1) ** n, 0, 0]), 0.1 * n, n * 100_000_000, (n,))
-        for n in range(10)
-    }
-    track = Track(np.array([19.0, 4, 0]), sighted, {n: np.arange(8) for n in range(10)})
+    track = followed(lambda n: [0.7 * n, aside_m * (-1) ** n, 0, 0], 10, [19.0, 4, 0], 8)
     clock = SimpleNamespace(time_s=np.arange(10) / 10)
     sensors = SimpleNamespace(scattered=scattered)
     space = SimpleNamespace(gap_m=lambda *_: 0.17, clock=clock, sensors=sensors)
@@ -231,10 +222,7 @@ def test_without_rings_what_leaves_its_places_may_waver(aside_m, scattered, told
 @pytest.mark.parametrize("told", [((0, 0), (0, 0)), ((0, 30), (0, 0))])
 def test_a_ring_that_glides_over_a_bonnet_does_not_move_it(still, told):
     """Half a metre in a second, which one look of twenty contradicts."""
-    sighted = {
-        n: Sighting(np.array([0.06 * n, 0, 0, 0]), 0.1 * n, n * 100_000_000, (n,)) for n in range(9)
-    }
-    track = Track(np.array([29.0, 0, 0]), sighted, {n: np.arange(20) for n in range(9)})
+    track = followed(lambda n: [0.06 * n, 0, 0, 0], 9, [29.0, 0, 0], 20)
     space = SimpleNamespace(gap_m=lambda *_: 0.6, clock=SimpleNamespace(time_s=np.arange(9) / 10))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(proof, "_as_fast_as_measured", lambda *_: True)
