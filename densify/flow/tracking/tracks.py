@@ -8,7 +8,7 @@ model, is smoothed in time, and counts only if that smooth motion explains what 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from itertools import chain
 
@@ -85,20 +85,6 @@ def follow_groups(
         track = _follow(members, n, velocity, looks, free, ground, clock)
         return track, left_contradicted(track, standing, space, bodies)
 
-    def best_of(members: np.ndarray, n: int, velocities: Iterable[Float]) -> tuple[Track, float]:
-        """The track that least contradicts, of those that are proven, and how much; if none is, the
-        last one and inf."""
-        best, left = Track(np.zeros(3)), np.inf
-        for velocity in velocities:
-            tried, contradicted = follow(members, n, velocity)
-            if contradicted is not None and contradicted < _CLEARLY * left:
-                best, left = tried, contradicted
-            elif np.isinf(left):
-                best = tried
-            if left == 0:
-                break
-        return best, left
-
     free = [np.ones(len(c.points), bool) for c in standing]  # not yet part of a track
     untried = [np.ones(len(c.points), bool) for c in standing]
     tracks: list[Track] = []
@@ -108,9 +94,11 @@ def follow_groups(
         if len(members) < MIN_POINTS or is_line_on(bodies, looks[n], members):
             continue
         beside = velocities_beside(looks[n], members, bodies)
-        track, left = best_of(members, n, chain([velocity_of(members, n)], beside))
+        starts: Iterator[Float] = chain([velocity_of(members, n)], beside)
+        track, left = _best_of(follow(members, n, velocity) for velocity in starts)
         if np.isinf(left) and len(track.sightings) <= _HARDLY_FOLLOWED:
-            in_traffic = best_of(members, n, velocities_of_traffic(looks[n], bodies))
+            starts = velocities_of_traffic(looks[n], bodies)
+            in_traffic = _best_of(follow(members, n, velocity) for velocity in starts)
             track, left = (track, left) if np.isinf(in_traffic[1]) else in_traffic
         proven = bool(np.isfinite(left))
         for rows, k in ends(track, looks) if proven and left > _DOUBTFUL else ():
@@ -134,6 +122,23 @@ def follow_groups(
             tracks.append(track)
             bodies.append(Body(track, Shape.of(track.seen_in(standing, sorted(track.claimed)))))
     return tracks
+
+
+def _best_of(tried: Iterable[tuple[Track, float | None]]) -> tuple[Track, float]:
+    """The least contradicted of the proven tracks, and how much; the last one and inf if none is
+    proven. No more are tried after one that nothing contradicts.
+
+    tried: tracks and how much contradicts them, None if they are not proven.
+    """
+    best, least = Track(np.zeros(3)), np.inf
+    for track, contradicted in tried:
+        if contradicted is not None and contradicted < _CLEARLY * least:
+            best, least = track, contradicted
+        elif np.isinf(least):
+            best = track
+        if least == 0:
+            break
+    return best, least
 
 
 def _follow(
