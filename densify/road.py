@@ -91,16 +91,17 @@ class Road:
             p for p in passed if (with_near or not p.known) and p.registered.frame not in left_out
         ]
 
-        def part(p: _Passed) -> StandingWorld:
+        def straight(p: _Passed) -> RegisteredSweep:
             sweep = p.registered
-            if not p.known:
-                sweep = placed(
-                    sweep.sweep, sweep.T_world_lidar, sweep.twist_before, sweep.twist_after
-                )
-            return far.standing(sweep, sensors, p.travel_m)
+            if p.known:
+                return sweep
+            return placed(sweep.sweep, sweep.T_world_lidar, sweep.twist_before, sweep.twist_after)
 
+        travel_m = np.array([p.travel_m for p in shown])
         with ThreadPoolExecutor(num_threads()) as pool:
-            parts = list(pool.map(part, shown))
+            seen = list(pool.map(straight, shown))
+            gone = far.departed(seen, travel_m)
+            parts = list(pool.map(partial(far.standing, sensors), seen, travel_m.tolist(), gone))
         return replace(far.together(parts), links=links, left_out=tuple(sorted(left_out)))
 
     def _beyond(

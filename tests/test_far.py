@@ -24,6 +24,7 @@ from tests.scenes import CAMERA, Arc, Scanner, Scene, TinySequence, World, car, 
 KEY, WINDOW, NUM_FRAMES = 15, 2, 36
 EGO = Arc(0, -1.5, 0, 8.0, 0.02)
 LEAVES = car(22, 3.0, 6.0, 1)  # ahead of the vehicle in the lane beside it
+AHEAD = car(14, 0.0, EGO.speed_m_s, 1)
 # Without spots, which the fill decides upon.
 SETTINGS = {"register": {"source": "dataset"}, "project": {"spot": 0}}
 FAR = {**SETTINGS, "accumulate": {"far_m": 20.0}}
@@ -104,6 +105,16 @@ def test_a_car_that_drives_through_leaves_no_trail():
     apart_m = np.linalg.norm(shown[:, None, :2] - path[None, :, :2], axis=2).min(axis=1)
     in_the_way = (apart_m < 0.8) & (shown[:, 2] > -1.3) & (shown[:, 2] < -0.3)
     assert in_the_way.sum() <= 5
+
+
+def test_who_drives_ahead_all_the_way_leaves_no_trail_in_the_cloud():
+    """The window never sees past it; sweeps beyond do, once it has moved on."""
+    sequence = drive((AHEAD,))
+    cloud = pipeline.run(sequence, KEY, WINDOW, config=FAR).cloud
+    far = cloud.select(cloud.far)
+    moving = [sequence.truth.sweep(f).moving[far.row[far.frame == f]] for f in np.unique(far.frame)]
+    assert len(far) > 25_000
+    assert np.concatenate(moving).mean() < 0.008  # .038 as measured
 
 
 def test_a_vehicle_that_stands_has_no_far_range():

@@ -5,6 +5,7 @@ and brought to the key."""
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
@@ -14,6 +15,7 @@ from densify.geometry import poses
 from densify.geometry.range_image import RangeImage
 from densify.geometry.sensor import Sensors
 from densify.kernels import clouds as kernels
+from densify.kernels.threads import num_threads
 from densify.types import (
     Bool,
     Camera,
@@ -37,6 +39,9 @@ _SAME_DEPTH, _MOST_IN_PIXEL = 0.05, 1
 _PRIME = 2_654_435_761  # its multiples go through any smaller number of points in a mixed order
 _MIN_FILLED = 6
 _FREE_M, _FREE_FRACTION = 0.3, 0.015
+# Of travel, between sweeps that are asked, and from one that asks: most of a car, or its rear half.
+_WITNESSES_M, _WITNESS_M, _LEAST_WITNESS_M = 5.0, 3.5, 2.0
+_FEW_FILLED = 3
 
 
 def in_reach(sweep: Sweep) -> Bool:
@@ -45,8 +50,58 @@ def in_reach(sweep: Sweep) -> Bool:
     return x * x + y * y + z * z < _MOST_RANGE_M**2
 
 
-def standing(registered: RegisteredSweep, sensors: Sensors, travel_m: float) -> StandingWorld:
-    """The points of one sweep, in the world. sensors: of the recording."""
+def departed(sweeps: Sequence[RegisteredSweep], travel_m: Float) -> list[Bool]:
+    """(N,) of each sweep, True where another one saw through the place: what moves is elsewhere
+    when it comes by.
+
+    sweeps: deskewed, in the order of the road. travel_m: (S,) where along it they were, ascending.
+    What lies ahead of a sweep is asked of the next one at least 3.5 m on, what lies behind it of
+    the one before, so of the one that came nearer: by then even who drives along has left most of
+    the place. At the ends of the road it is the last sweep, 2 m away or more, or else the one on
+    the other side.
+    """
+    asked = [0] if sweeps else list[int]()
+    for i, at_m in enumerate(travel_m.tolist()):
+        if at_m - travel_m[asked[-1]] >= _WITNESSES_M or i == len(sweeps) - 1 > 0:
+            asked.append(i)
+    with ThreadPoolExecutor(num_threads()) as pool:
+        images = dict(zip(asked, pool.map(lambda i: RangeImage.of(sweeps[i]), asked), strict=True))
+
+    def gone(i: int) -> Bool:
+        one, witnesses = sweeps[i], _witnesses(i, asked, travel_m)
+        points, free = one.sweep.points, np.zeros(len(one.sweep), bool)
+        whose = np.zeros(len(points), np.int64)
+        T = [poses.inverse(sweeps[w].T_world_lidar) @ one.T_world_lidar for w in witnesses]
+        if len(witnesses) == 2:  # what lies ahead is the later one's
+            whose[points @ poses.inverse(T[1])[:3, 3] > 0] = 1
+        for number, witness in enumerate(witnesses):
+            rows = np.flatnonzero(whose == number)
+            there = poses.transform(T[number], points.take(rows, axis=0))
+            free[rows] = images[witness].sees_through(there, _FREE_M, _FREE_FRACTION, _FEW_FILLED)
+        return free
+
+    with ThreadPoolExecutor(num_threads()) as pool:
+        return list(pool.map(gone, range(len(sweeps))))
+
+
+def _witnesses(i: int, asked: Sequence[int], travel_m: Float) -> list[int]:
+    """The sweeps before and after one that say what of it has left, or only one of them."""
+    apart_m = np.array([travel_m[j] - travel_m[i] for j in asked])
+    sides = []
+    for off_m in (-apart_m, apart_m):
+        far_enough = np.flatnonzero(off_m >= _WITNESS_M)
+        if len(far_enough):
+            sides.append(asked[far_enough[np.argmin(off_m[far_enough])]])
+        elif off_m.max() >= _LEAST_WITNESS_M:
+            sides.append(asked[int(np.argmax(off_m))])
+    return sides
+
+
+def standing(
+    sensors: Sensors, registered: RegisteredSweep, travel_m: float, gone: Bool
+) -> StandingWorld:
+    """The points of one sweep, in the world. sensors: of the recording. gone: (N,) which of them
+    are left out, see `departed`."""
     sweep, T_world_lidar = registered.sweep, registered.T_world_lidar
     one = np.zeros(len(sweep), np.int32)
     normal, spacing_m = tangents(
@@ -63,7 +118,7 @@ def standing(registered: RegisteredSweep, sensors: Sensors, travel_m: float) -> 
         frames=(sweep.frame,),
         stamp_ns=np.array([sweep.stamp_ns], np.int64),
         travel_m=np.array([travel_m]),
-    )
+    ).select(~gone)
 
 
 def together(parts: Sequence[StandingWorld]) -> StandingWorld:
