@@ -4,7 +4,7 @@
 `densify` is the whole of it: the window of a key is registered and deskewed, everything in it is
 brought to the key's moment, and each camera looks at the accumulated cloud. How the steps before
 the cloud are made, once for all keys that share them, is told by `densify.recording`; what comes
-after it, by `densify.key_results`.
+after it, by `densify.results.key`.
 """
 
 from __future__ import annotations
@@ -14,20 +14,20 @@ from pathlib import Path
 from typing import Any
 
 from densify.cache import Cache
-from densify.completion import key_priors
 from densify.config import Config, resolve
-from densify.costs import Watch
 from densify.depth.exposure import key_shots, load_images
-from densify.doubts import with_doubts
 from densify.errors import ComputationError, InputError
 from densify.flow.engines import check_engine
 from densify.kernels.threads import tasks
-from densify.key_results import Key, key_results
 from densify.methods import COMPARED, METHODS, looks_around, with_baselines
+from densify.process.costs import Watch
 from densify.readers.files import format_frames
 from densify.readers.prior_files import PriorFiles
 from densify.readers.window import choose_cameras
 from densify.recording import Beyond, Moment, Recording
+from densify.results.completion import key_priors
+from densify.results.doubts import with_doubts
+from densify.results.key import Key, key_results
 from densify.types import LidarSequence, Progress, Result, StretchFlow
 
 ConfigLike = Config | str | Path | Mapping[str, Any] | None

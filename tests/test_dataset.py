@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from densify.blocks import Cut
 from densify.cache import Cache, steps_folder
 from densify.dataset import make, work
 from densify.dataset.loader import DepthDataset
@@ -18,6 +17,7 @@ from densify.dataset.plan import Recipe, Source
 from densify.dataset.work import Job, tasks
 from densify.errors import InputError
 from densify.readers.timeline import Timeline
+from densify.recording.blocks import Cut
 from tests.command import exit_code, files_in
 from tests.dataset_scenes import (
     BORDER,

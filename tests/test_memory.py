@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from densify import memory
 from densify.bench import peaks
 from densify.config import Config, resolve
 from densify.errors import InputError
+from densify.process import memory
 from tests.command import exit_code, refused
 from tests.small_street import KEY, one_car
 
@@ -56,7 +56,7 @@ def test_a_run_that_cannot_fit_is_not_begun(
 
 def test_limits_of_ulimit_count() -> None:
     code = (
-        "import resource; from densify import memory\n"
+        "import resource; from densify.process import memory\n"
         "resource.setrlimit(resource.RLIMIT_AS, (3 << 30, 3 << 30))\n"
         "print(memory.available_bytes())"
     )

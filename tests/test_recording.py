@@ -12,15 +12,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from densify import blocks, pipeline, places
-from densify import recording as shared
+from densify import pipeline
 from densify.cache import Cache
 from densify.config import Config, resolve
 from densify.errors import InputError, SweepError
 from densify.geometry import poses
 from densify.geometry.range_image import RangeImage
 from densify.readers.window import read_sweep
-from densify.recording import Recording
+from densify.recording import Recording, blocks, places
+from densify.recording import steps as block_steps
 from densify.registration.deskew import deskew
 from densify.registration.trajectory import find_trajectory
 from densify.types import Stretch, Sweep
@@ -37,7 +37,7 @@ def small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
     """Blocks of 6 sweeps that look 6 beyond, so that short recordings have many."""
     for name, seconds in (("BLOCK_S", 0.6), ("_MARGIN_S", 0.6), ("_BEYOND_WINDOW_S", 0.4)):
         monkeypatch.setattr(blocks, name, seconds)
-    monkeypatch.setattr(shared, "REACH_S", 0.4)
+    monkeypatch.setattr(block_steps, "REACH_S", 0.4)
 
 
 @pytest.fixture(scope="module")
@@ -208,7 +208,7 @@ def test_no_window_is_cut_at_a_border(lead_in_s: float, tmp_path: Path) -> None:
 def test_odometry_starts_half_a_second_before_the_window_at_any_rate(step: int, first: int) -> None:
     frames = [f for f in range(BORDER - 12, BORDER + 5) if (f - BORDER) % step == 0]
     recording = Recording(across_border(frames), GIVEN, 2, [BORDER])
-    (piece,) = recording.registration(0).pieces
+    (piece,) = recording.steps.registration(0).pieces
     assert piece.frames[0] - BORDER == first
     assert recording.window(BORDER).frames[0] - BORDER == -2 * step
 
@@ -313,7 +313,7 @@ def counted(monkeypatch: pytest.MonkeyPatch) -> Counter[str]:
         return count
 
     for name in ("find_trajectory", "ground", "find_candidates", "estimate_motion"):
-        room = places if hasattr(places, name) else shared
+        room = places if hasattr(places, name) else block_steps
         monkeypatch.setattr(room, name, counting(name, getattr(room, name)))
     monkeypatch.setattr(RangeImage, "of", staticmethod(counting("images", RangeImage.of)))
     return counts
@@ -409,7 +409,7 @@ def test_looking_around_changes_no_window(bad: int | None, long_street) -> None:
     settings = [
         resolve({"register": {"source": "dataset"}, "flow": {"look_around_s": s}}) for s in (0, 0.4)
     ]
-    recording = shared.Recording(sequence, settings[1], 2, [8], looks_around=True)
+    recording = Recording(sequence, settings[1], 2, [8], looks_around=True)
     assert recording.window(8).frames == (6, 7, 8, 9, 10)
     last = 14 if bad is None else bad - 1
     assert recording.around(8).frames == tuple(range(2, last + 1))
@@ -444,9 +444,9 @@ def test_a_cache_gives_the_same_bytes_and_saves_the_work(
 
 
 def test_a_long_row_of_keys_is_parted(long_street) -> None:
-    cut = shared.Recording(long_street, GIVEN, 1, range(2, 16)).cut
+    cut = Recording(long_street, GIVEN, 1, range(2, 16)).cut
     assert len(cut.blocks) == 1
-    timeline = shared.Recording(long_street, GIVEN, 1).timeline
+    timeline = Recording(long_street, GIVEN, 1).timeline
     long = replace(timeline, frames=tuple(range(100)), stamp_ns=10**8 * np.arange(100))
     parted = blocks.Cut.around(long, 3, range(10, 90))
     assert [len(b.frames) for b in parted.blocks] == [26, 26, 26, 26]

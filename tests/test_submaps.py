@@ -10,9 +10,10 @@ import pytest
 import yaml
 from scipy.optimize import minimize
 
-from densify import pipeline, road
+from densify import pipeline
 from densify.geometry import poses
 from densify.outputs import write_result
+from densify.recording import road
 from densify.registration import submaps
 from densify.registration.alignment import Lay, some
 from densify.registration.submaps import num_in_submap, relax

@@ -18,13 +18,13 @@ from scipy import ndimage
 from densify import pipeline
 from densify.cache import Cache
 from densify.config import Config
-from densify.costs import Watch
 from densify.depth.confidence import reliability
 from densify.depth.exposure import Exposure, key_shots
 from densify.errors import InputError
 from densify.geometry import poses
 from densify.geometry.cameras import converted, depth_along, rays
 from densify.methods import METHODS, looks_around
+from densify.process.costs import Watch
 from densify.readers.window import choose_cameras
 from densify.recording import Recording
 from densify.scores.depth_metrics import image_density, is_outlier_depth

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: MIT
-"""Peak memory of runs, each in a process of its own, beside what `densify.memory` says before."""
+"""Peak memory of runs, each in a process of its own, beside what `densify.process.memory` says
+before."""
 
 from __future__ import annotations
 
@@ -13,11 +14,12 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from densify import memory, pipeline
+from densify import pipeline
 from densify.config import Config, as_mapping, resolve
-from densify.costs import peak_memory_mb
 from densify.errors import ComputationError
 from densify.outputs import write_result
+from densify.process import memory
+from densify.process.costs import peak_memory_mb
 from densify.readers import open_sequence
 from densify.types import LidarSequence, MakesFrames
 

@@ -18,7 +18,7 @@ from typing import NoReturn, TextIO
 from densify.cli.arguments import parse
 from densify.cli.screen import Screen
 from densify.errors import ComputationError, InputError, is_out_of_memory
-from densify.heap import keep_freed_memory
+from densify.process.heap import keep_freed_memory
 
 DONE, FAILED, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
 

@@ -11,8 +11,8 @@ from __future__ import annotations
 import dataclasses
 from dataclasses import dataclass
 
+from densify.config.knobs import Section, knob
 from densify.errors import InputError
-from densify.knobs import Section, knob
 from densify.plugins import engines, outputs
 
 

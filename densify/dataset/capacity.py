@@ -11,7 +11,7 @@ from contextlib import suppress
 from densify.dataset.plan import PlannedDrive, Recipe
 from densify.errors import InputError
 from densify.kernels.threads import num_threads
-from densify.memory import available_bytes, check_free
+from densify.process.memory import available_bytes, check_free
 from densify.readers import open_sequence
 
 _log = logging.getLogger("densify")

@@ -21,7 +21,6 @@ from typing import Any
 
 import numpy as np
 
-from densify.blocks import Cut
 from densify.config import Config, as_mapping
 from densify.dataset.gate import Gate
 from densify.errors import InputError, OutputError
@@ -32,6 +31,7 @@ from densify.readers import Spec, open_sequence
 from densify.readers.files import format_frames, runs
 from densify.readers.timeline import Timeline, check_window
 from densify.readers.window import choose_cameras
+from densify.recording.blocks import Cut
 from densify.types import Camera, LidarSequence
 from densify.version import __version__
 

@@ -27,7 +27,7 @@ from typing import Any, cast
 from densify.dataset.calls import answer, given_up, outcome, packed
 from densify.dataset.tasks import Outcome, Task, Workers, words
 from densify.errors import ComputationError
-from densify.heap import keep_freed_memory
+from densify.process.heap import keep_freed_memory
 
 _log = logging.getLogger("densify")
 

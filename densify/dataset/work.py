@@ -15,7 +15,6 @@ from functools import lru_cache
 from pathlib import Path
 
 from densify import pipeline
-from densify.blocks import Cut
 from densify.cache import Cache, code
 from densify.config import as_mapping
 from densify.dataset.gate import scores_of
@@ -30,6 +29,7 @@ from densify.outputs.store import write_result
 from densify.plugins.engines import engine
 from densify.readers import open_sequence
 from densify.recording import Recording
+from densify.recording.blocks import Cut
 from densify.types import Result
 
 _MARGIN = 2
@@ -42,7 +42,7 @@ _NEEDS: dict[str, dict[str, int]] = {
     "far": {"registration": 1},
 }
 """Step of a block -> the steps it is made of, and how many blocks around: none, one on each side,
-or all within the margin. Steps are methods of `densify.recording.Recording`."""
+or all within the margin. Steps are methods of `densify.recording.steps.BlockSteps`."""
 _log = logging.getLogger("densify")
 
 
@@ -100,9 +100,9 @@ def share(job: Job, stage: str, block: int) -> float:
     start = time.perf_counter()
     recording, cache = _opened(job)
     if stage == "motion":
-        recording.block_motion(block, job.recipe.config.flow.engine)
+        recording.steps.motion(block, job.recipe.config.flow.engine)
     else:
-        getattr(recording, stage)(block)
+        getattr(recording.steps, stage)(block)
     cache.trim()
     return time.perf_counter() - start
 

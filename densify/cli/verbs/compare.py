@@ -49,9 +49,9 @@ def answer(options: argparse.Namespace) -> Iterator[Answer]:
     config = config_of(options)
     from densify import pipeline
     from densify.cli.results import FIRST_OF_COMPARISON, comparison, key_facts
-    from densify.memory import check_fits
     from densify.methods import COMPARED, engines
     from densify.outputs import check_writable, write_comparison
+    from densify.process.memory import check_fits
     from densify.readers import open_sequence
 
     check_writable(options.out, options.key, options.overwrite, "compare")

@@ -73,9 +73,9 @@ def answer(options: argparse.Namespace) -> Iterator[Answer]:
     config = config_of(options)
     from densify import pipeline
     from densify.cli.results import FIRST_OF_RUN, key_facts, summary
-    from densify.memory import check_fits
     from densify.methods import engines, with_baselines
     from densify.outputs import check_writable
+    from densify.process.memory import check_fits
     from densify.readers import open_sequence
 
     sequence = open_sequence(options.data)

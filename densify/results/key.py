@@ -11,16 +11,16 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from densify.completion import completed
 from densify.config import Config
-from densify.costs import Watch
 from densify.depth.age import with_ages
 from densify.depth.confidence import expected_outliers, reliability
 from densify.depth.exposure import Shot
 from densify.depth.views import HeldOut, SeenCloud, Views
 from densify.geometry.range_image import RangeImage
 from densify.methods import METHODS
+from densify.process.costs import Watch
 from densify.recording import Beyond, Moment
+from densify.results.completion import completed
 from densify.scores import depth_metrics
 from densify.scores import ghosts as scores
 from densify.scores.radial_velocity import radial_velocity_scores

@@ -7,16 +7,16 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping, Sequence
 from functools import lru_cache, partial
 
-from densify.blocks import Cut
 from densify.cache import Cache, kept
 from densify.config import RegisterSettings
-from densify.costs import Watch
 from densify.errors import InputError, SweepError
+from densify.process.costs import Watch
 from densify.readers.timeline import Timeline
 from densify.readers.window import recorded_trajectory
+from densify.recording.blocks import Cut
+from densify.recording.sweeps import Sweeps
 from densify.registration.deskew import deskew
 from densify.registration.trajectory import LeftOut, Registration, find_trajectory
-from densify.sweeps import Sweeps
 from densify.types import LidarSequence, RegisteredSweep, Stretch, Trajectory
 
 

@@ -12,18 +12,18 @@ from typing import NamedTuple, cast
 import numpy as np
 
 from densify.config import RegisterSettings
-from densify.costs import Watch
 from densify.depth import far
 from densify.errors import InputError
 from densify.geometry import poses
 from densify.geometry.sensor import Sensors
 from densify.kernels.threads import num_threads
+from densify.process.costs import Watch
 from densify.readers.timeline import Timeline
+from densify.recording.sweeps import Sweeps
 from densify.registration.alignment import some
 from densify.registration.chain import follow
 from densify.registration.deskew import placed, twists
 from densify.registration.submaps import num_in_submap, relax
-from densify.sweeps import Sweeps
 from densify.types import (
     Bool,
     Camera,

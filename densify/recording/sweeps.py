@@ -9,8 +9,8 @@ from uuid import uuid4
 
 from densify.cache import Cache, digest
 from densify.config import RegisterSettings
-from densify.costs import Watch
 from densify.errors import InputError
+from densify.process.costs import Watch
 from densify.readers.timeline import Timeline
 from densify.readers.window import read_sweep
 from densify.registration.trajectory import LeftOut

@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: MIT
+"""The results of a key: `densify.results.key` is the story."""
