@@ -58,6 +58,7 @@ class BlockSteps:
         self.evidence = lru_cache(maxsize=4)(self._evidence)
         self.motion = lru_cache(maxsize=2)(self._motion)
         self.far = lru_cache(maxsize=1)(self._far)
+        self._free_space = lru_cache(maxsize=1)(self._find_space)
 
     def _images(self, number: int) -> dict[int, RangeImage]:
         """Range images of the block's sweeps, by frame."""
@@ -104,7 +105,7 @@ class BlockSteps:
         def make(index: int, frames: Sequence[int]) -> dict[int, Candidates]:
             stretch = self.places.stretch(number, REACH_S, frames)
             heights = self.ground(number)[index]
-            space = self._space(number, stretch)
+            space = self._space(number, REACH_S, tuple(frames))
             own = [i for i, f in enumerate(frames) if f in self._cut.blocks[number].frames]
             with self._watch.stage("flow"):
                 found = find_candidates(stretch, space, heights, min_height_m, own)
@@ -132,7 +133,7 @@ class BlockSteps:
                 stretch,
                 self.ground(number)[index],
                 self._settings.flow.min_height_m,
-                make_space=partial(self._space, number, stretch),
+                make_space=partial(self._space, number, margin_s, tuple(frames)),
                 make_candidates=partial(self._candidates, number, frames),
                 asked=self._in_windows(number),
             )
@@ -201,13 +202,18 @@ class BlockSteps:
         windows = (self._timeline.window(key, self._num_around).frames for key in keys)
         return frozenset(chain.from_iterable(windows))
 
-    def _space(self, number: int, stretch: Stretch) -> FreeSpace:
+    def _space(self, number: int, around_s: float, frames: tuple[int, ...]) -> FreeSpace:
+        """What these sweeps of one piece saw through."""
+        return self._free_space(number, min(around_s, self._cut.margin_s), frames)
+
+    def _find_space(self, number: int, around_s: float, frames: tuple[int, ...]) -> FreeSpace:
         images = {
             f: image
-            for b in self.places.blocks_with(number, stretch.frames)
+            for b in self.places.blocks_with(number, frames)
             for f, image in self.images(b).items()
         }
-        return FreeSpace.of(stretch, [images[f] for f in stretch.frames])
+        stretch = self.places.stretch(number, around_s, frames)
+        return FreeSpace.of(stretch, [images[f] for f in frames])
 
     def _candidates(self, number: int, frames: Sequence[int]) -> tuple[Candidates, ...]:
         evidence = {

@@ -74,13 +74,17 @@ def key_results(
         visible: pool.submit(shared.far, beyond, visible)
         for visible in {METHODS[name].visible for name in moments if METHODS[name].far}
     }
-    shown = {
-        name: pool.submit(shared.shown, name, moments[name], beyond, far)
-        for name in sorted(moments, key=lambda name: METHODS[name].engine is not None)
-    }
+    flow_last = sorted(moments, key=lambda name: METHODS[name].engine is not None)
+    seen = {name: pool.submit(shared.seen, name, moments[name], far) for name in flow_last}
     held_out = pool.submit(shared.held_out, moments[last])
-    scored = {name: pool.submit(shared.scored, shown[name], held_out) for name in moments}
-    made = [future.result() for future in scored.values()]
+    shown, scored = {}, {}
+    for name in flow_last:
+        shown[name] = pool.submit(shared.shown, name, moments[name], seen[name], beyond)
+        scored[name] = pool.submit(shared.held_out_scores, seen[name], held_out)
+    made = [
+        replace(result, metrics={**result.metrics, "held_out": scored[name].result()})
+        for name, result in ((name, shown[name].result()) for name in moments)
+    ]
     if priors:
         cameras, settings = key.sequence.cameras, key.settings.prior
         with key.watch.stage("prior"):
@@ -92,12 +96,12 @@ def key_results(
     return results
 
 
-class _Shown(NamedTuple):
-    """A result without its baselines, and without its score with the key held out; and all of its
-    cloud as the cameras see it."""
+class _Seen(NamedTuple):
+    """A method's cloud as the cameras see it. far: the part of it from beyond the window. visible:
+    what is hidden, vetoed or doubtful is left out of its maps."""
 
-    result: Result
-    seen: SeenCloud
+    everything: SeenCloud
+    far: SeenCloud | None
     visible: bool
 
 
@@ -139,28 +143,39 @@ class _Shared:
         with self.key.watch.stage("held out"):
             return HeldOut.of(self.views, cloud)
 
-    def scored(self, shown: Future[_Shown], held_out: Future[HeldOut]) -> Result:
-        """The result with the score of what is made without the key sweep."""
-        result, seen, visible = shown.result()
-        alone = held_out.result()
+    def seen(
+        self,
+        name: str,
+        of_method: Future[Moment],
+        far: Mapping[bool, Future[SeenCloud | None]],
+    ) -> _Seen:
+        """One method's cloud."""
+        method, cloud = METHODS[name], of_method.result().cloud
+        visible = method.visible and self.key.settings.project.visibility
+        beside = far[method.visible].result() if method.far else None
+        with self.key.watch.stage("project"):
+            return _Seen(self.views.see(cloud, visible).joined(beside), beside, visible)
+
+    def held_out_scores(
+        self, of_method: Future[_Seen], held_out: Future[HeldOut]
+    ) -> dict[str, Any] | None:
+        """The score of what is made without the key sweep."""
+        seen, alone = of_method.result(), held_out.result()
         with self.key.watch.stage("held out"):
-            scores = alone.scores(seen, visible)
-        return replace(result, metrics={**result.metrics, "held_out": scores})
+            return alone.scores(seen.everything, seen.visible)
 
     def shown(
         self,
         name: str,
         of_method: Future[Moment],
+        of_cloud: Future[_Seen],
         beyond: Future[Beyond | None],
-        far: Mapping[bool, Future[SeenCloud | None]],
-    ) -> _Shown:
-        """One method's."""
+    ) -> Result:
+        """One method's result, without its baselines and its score with the key held out."""
         method, key, views, moment = METHODS[name], self.key, self.views, of_method.result()
         output, watch = key.settings.output, key.watch
-        visible = method.visible and key.settings.project.visibility
-        beside = far[method.visible].result() if method.far else None
+        seen, beside, visible = of_cloud.result()
         with watch.stage("project"):
-            every = seen = views.see(moment.cloud, visible).joined(beside)
             movers, images = {}, key.images if key.with_images else {}
             if output.movers == "separate":
                 movers = views.movers(moment.cloud, visible, images)
@@ -200,7 +215,7 @@ class _Shared:
                 far_links=found.standing.links,
                 far_left_out=found.standing.left_out,
             )
-        return _Shown(result, every, visible)
+        return result
 
     def _depth(self, seen: SeenCloud, visible: bool, beyond: Beyond | None) -> dict[str, DepthMap]:
         frame, views = self.key.frame, self.views
