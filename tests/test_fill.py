@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from densify.config import ProjectSettings
-from densify.depth.fill import fill, fill_between
+from densify.depth.fill import fill, fill_between, without_shreds
 from densify.depth.layers import Layers
 from densify.depth.picture import lab
 
@@ -91,3 +91,16 @@ def test_confidence_covers_what_is_filled():
     made = fill(replace(layers, confidence=layers.confidence), ProjectSettings())
     assert np.array_equal(made.confidence > 0, made.filled_m > 0)
     assert np.array_equal(made.depth_m, layers.depth_m)
+
+
+def test_streaks_go_and_surfaces_stay():
+    """Rays 12 px apart: of what is around lines 6 px apart less than a fifth is known."""
+    layers = layers_of(np.zeros(SHAPE), (12, 12))
+    layers.depth_m[40, 10] = layers.depth_m[60, 100] = 10
+    filled = np.where(layers.depth_m > 0, layers.depth_m, 0)
+    filled[5:35:6, 10:100] = 10
+    filled[50:80, 20:60] = 10
+    kept = without_shreds(replace(layers, filled_m=filled))
+    assert not kept.filled_m[:38].any()
+    assert (kept.filled_m[50:80, 20:60] > 0).all()
+    assert kept.depth_m[40, 10] and kept.filled_m[60, 100]  # what is measured may stand alone

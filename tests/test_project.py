@@ -244,6 +244,16 @@ def test_back_wall_does_not_shine_through_the_gaps_of_the_front_wall():
     assert (plain.depth_m[:88, :58] == 20).mean() > 0.5  # what the test removes
 
 
+def test_the_gap_below_the_last_of_dense_rings_is_closed():
+    """Rings 3 px apart, and 24 px apart from row 39 on: that ring's own patches are small."""
+    camera = make_camera(120, 90, 300.0)
+    rings, width = np.array([*range(0, 42, 3), 63, 87]), np.arange(120)
+    v, u = (part.ravel() for part in np.meshgrid(rings, width, indexing="ij"))
+    spacing = np.where((v < 40)[:, None], (1.0, 3.0), (1.0, 24.0))
+    filled = see(camera, at_pixel(camera, u, v, 10.0), KEY, PLAIN, spacing).filled_m
+    assert (filled[1:87, 5:-5] > 0).all()
+
+
 def test_patch_grows_with_the_spacing_and_slack():
     camera = make_camera(121, 91, 300.0)
     spot, back = at_pixel(camera, 60, 45, 10.0), on_every_pixel(camera, 20.0)

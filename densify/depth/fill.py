@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 
 from densify.config import ProjectSettings
@@ -18,6 +19,7 @@ from densify.types import Float32
 
 _GROWTH = (1 / 3, 2 / 3, 1.0)  # spacings
 _LEAST_SHARE = 0.9  # of the votes for a pixel that is kept
+_AROUND, _LEAST_KNOWN = 0.35, 0.3  # gaps between rays to all sides; share of what lies there
 
 
 def fill(layers: Layers, settings: ProjectSettings) -> Layers:
@@ -49,6 +51,27 @@ def voted(layers: Layers, before_m: Float32, least_share: float) -> Layers:
     filled_m.flat[dropped] = 0
     confidence.flat[dropped] = 0
     return replace(layers, filled_m=filled_m, confidence=confidence)
+
+
+def without_shreds(layers: Layers) -> Layers:
+    """The layers without what was filled where little else was.
+
+    Of what lies around such a pixel, a third of the gap between rays to all sides, at least three
+    tenths must be known. Else votes have left streaks between rays far apart, of which up to a
+    twelfth was wrong.
+    """
+    known = layers.filled_m > 0
+    row, column = np.nonzero(known & (layers.depth_m == 0))
+    gap_px = layers.spacing_px[row, column].max(axis=1)
+    half_px = np.maximum(np.rint(_AROUND * gap_px).astype(np.int64), 1)
+    height, width = known.shape
+    top, left = np.maximum(row - half_px, 0), np.maximum(column - half_px, 0)
+    low, right = np.minimum(row + half_px + 1, height), np.minimum(column + half_px + 1, width)
+    num = cv2.integral(known.astype(np.uint8))
+    num_known = num[low, right] - num[top, right] - num[low, left] + num[top, left]
+    dropped = np.zeros_like(known)
+    dropped[row, column] = num_known < _LEAST_KNOWN * (low - top) * (right - left)
+    return layers.without(dropped)
 
 
 def fill_between(

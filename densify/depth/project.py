@@ -21,7 +21,7 @@ from densify.config import ProjectSettings
 from densify.depth.agreement import contradicted, without_contradicted
 from densify.depth.confidence import calibrated, ranked
 from densify.depth.exposure import Exposure, InView
-from densify.depth.fill import fill
+from densify.depth.fill import fill, without_shreds
 from densify.depth.free_space import Rays, without_seen_through
 from densify.depth.glass import close_windows
 from densify.depth.image_points import PointsInImage, in_image
@@ -33,6 +33,7 @@ from densify.depth.star import fill_stars
 from densify.types import Camera, Cloud, DepthMap, Float32, Patches, Ranked, Reason
 
 _BLOCK_PX = 16  # over which rays lie about equally dense
+_JUMP = 1.6  # by which rays lie farther apart beyond the last of a scanner's denser rings
 _LEAST_CONFIDENCE = np.float32(1 / 255)  # 0 means no depth once written as 8 bits
 
 
@@ -83,6 +84,7 @@ def project(
             layers = close_windows(layers, camera.focal_px, settings)
         if settings.star_reach > 0:
             layers = fill_stars(layers, settings)
+        layers = without_shreds(layers)
     if settings.visibility and rays is not None and settings.seen_through < 1:
         layers = without_seen_through(layers, cloud, view, rays, reason, settings)
     off = None
@@ -138,7 +140,8 @@ def _measured(
 
 def _spacing_px(points: PointsInImage, shape: tuple[int, int]) -> Float32:
     """(H,W,2) between neighbouring rays: their mean over blocks, the nearest block's where there
-    are no points."""
+    are no points. Up and down it is that of the block above or below, where that is far larger: so
+    wide is the gap that begins at the last of a scanner's denser rings."""
     height, width = (-(-size // _BLOCK_PX) for size in shape)
     column, row = np.rint(points.uv).astype(np.int64).T // _BLOCK_PX
     block = row * width + column
@@ -150,6 +153,9 @@ def _spacing_px(points: PointsInImage, shape: tuple[int, int]) -> Float32:
     empty = (num == 0).reshape(height, width)
     nearest = ndimage.distance_transform_edt(empty, return_distances=False, return_indices=True)
     blocks = mean.reshape(height, width, 2)[tuple(nearest)]
+    down_px = blocks[..., 1]
+    widest_px = ndimage.maximum_filter1d(down_px, 3, axis=0)
+    blocks[..., 1] = np.where(widest_px > _JUMP * down_px, widest_px, down_px)
     every = blocks.repeat(_BLOCK_PX, axis=0).repeat(_BLOCK_PX, axis=1)
     return np.ascontiguousarray(every[: shape[0], : shape[1]])
 

@@ -13,7 +13,7 @@ from densify.kernels import Kernel, inlined
 
 _RIDGE = 1e-7  # gives the slope of least norm where the pixels lie on one line
 _MIN_PLANE_PX = 6  # fewer do not tell a plane from a step
-_MOST_PX = 60  # half a window's size: thin rays are not bridged at any price
+_MOST_PX = 120  # half a window's size: thin rays are not bridged at any price
 _ROWS = 8  # that are passed over together where none of them holds a measured pixel
 
 
