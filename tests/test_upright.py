@@ -29,9 +29,11 @@ def leaning(world: World, rotvec_deg, num: int = 2) -> tuple[list[Sweep], np.nda
 
 
 @pytest.mark.parametrize(
-    "rotvec_deg", [(0, 10, 0), (0, -10, 0), (12, 0, 0), (7, 30, 0)], ids=lambda r: str(r)
+    "rotvec_deg",
+    [(0, 10, 0), (0, -10, 0), (12, 0, 0), (7, 30, 0), (180, 0, 0), (0, 180, 0), (165, 20, 4)],
+    ids=lambda r: str(r),
 )
-def test_a_leaning_lidar_is_turned_upright(rotvec_deg):
+def test_a_lidar_that_leans_or_hangs_is_turned_upright(rotvec_deg):
     sweeps, R = leaning(STREET, rotvec_deg)
     found = upright(sweeps)
     np.testing.assert_allclose(found @ found.T, np.eye(3), atol=1e-12)

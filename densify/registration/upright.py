@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: MIT
-"""How a lidar is mounted: by how much its axes lean against the ground it stands on."""
+"""How a lidar is mounted: by how much its axes lean against the ground it stands on, and whether
+they are upside down."""
 
 from __future__ import annotations
 
@@ -16,6 +17,7 @@ _NUM_POINTS, _NUM_TRIES = 1000, 200
 _CLOSE_M, _BELOW_M = 0.1, 0.3
 _MAX_SHARE_BELOW = 0.03  # of the points; more lie below a wall's or a roof's plane
 _LEAST_SHARE = 0.1
+_UPSIDE_DOWN = np.diag([1.0, -1.0, -1.0])
 _MAX_RAD, _LEAST_RAD = np.deg2rad([50.0, 6.0])  # less is the road's slope, or load
 
 
@@ -24,15 +26,23 @@ def upright(sweeps: Sequence[Sweep]) -> Float:
 
     The ground is the plane that most points within 30 m of the lidar lie on and hardly any below
     (Fischler, Bolles, "Random sample consensus", 1981), the median over at most five of the sweeps,
-    evenly spread. The identity where the lidar leans by less than 6 degrees, or no sweep shows a
-    ground: a height map follows such slopes. Same input, same result.
+    evenly spread. A lidar hangs upside down, or its z axis points down, where no sweep shows a
+    ground below and some do above. The identity where the lidar leans by less than 6 degrees, or no
+    sweep shows a ground: a height map follows such slopes. Same input, same result.
     """
     chosen = sweeps[:: max(1, len(sweeps) // _NUM_SWEEPS)][:_NUM_SWEEPS]
-    normals = [n for n in (_ground_normal(sweep.points) for sweep in chosen) if n is not None]
-    if not normals:
-        return np.eye(3)
-    up = np.median(normals, axis=0)
-    up /= np.linalg.norm(up)
+    for R_hung_lidar in (np.eye(3), _UPSIDE_DOWN):
+        turned = (sweep.points @ R_hung_lidar.T for sweep in chosen)
+        normals = [n for n in map(_ground_normal, turned) if n is not None]
+        if normals:
+            return _level(np.median(normals, axis=0)) @ R_hung_lidar
+    return np.eye(3)
+
+
+def _level(up: Float) -> Float:
+    """(3,3) the smallest rotation that turns this direction (3,) to z; the identity for less than 6
+    degrees."""
+    up = up / np.linalg.norm(up)
     turn = np.cross(up, [0.0, 0.0, 1.0])
     lean_rad = float(np.arccos(np.clip(up[2], -1, 1)))
     if lean_rad < _LEAST_RAD:
