@@ -15,7 +15,7 @@ from densify.geometry.rings import find_rings
 from densify.geometry.sensor import Aimed
 from densify.street.sensors import SENSORS
 from densify.types import RegisteredSweep, Sweep
-from tests.scenes import ROOM, Arc, Scanner, Scene, World, on_sphere
+from tests.scenes import LIDAR_HEIGHT_M, ROOM, Arc, Box, Scanner, Scene, World, on_sphere
 
 MARGIN = (0.4, 0.015)
 
@@ -52,6 +52,31 @@ def test_cells_follow_the_sensor(num_beams, num_azimuths):
     assert not image.sees_through(wall * (20 / wall[:, :1]), *MARGIN).any()
 
 
+def test_far_away_dense_rings_tell_of_a_slit_between_them():
+    """What is seen over a wall close by, by few rings: far away each ring is a row, nearby two."""
+    wall = Box((0.4, 8.0, LIDAR_HEIGHT_M), Arc(5.0, 0.0))  # as high as the scanner: up to 0 degrees
+    low = Box((0.4, 4.0, LIDAR_HEIGHT_M + 0.6), Arc(18.0, 0.0))  # up to 1.93 degrees
+    scanner = Scanner(128, 900, elevation_deg=(-15.0, 15.0))  # 0.236 degrees apart
+    sweep = Scene(World((*ROOM, wall, low)), Arc(0, 0), scanner).stretch(2, 0).sweeps[0]
+    usual, finer = RangeImage.of(sweep), RangeImage.of(sweep, finer_far=True)
+    near, far = finer.scanners
+    assert len(usual.scanners) == 1
+    assert len(near.row_edges_rad) == len(usual.scanners[0].row_edges_rad) < len(far.row_edges_rad)
+    assert near.to_m == far.from_m == pytest.approx(0.1 / (1.5 * np.deg2rad(30 / 127)), rel=0.02)
+
+    def share(image: RangeImage, elevation_deg: float, range_m: float, azimuth_deg: float) -> float:
+        azimuths_deg = np.linspace(-azimuth_deg, azimuth_deg, 50)
+        hung = on_sphere(azimuths_deg, elevation_deg, range_m)
+        return float(image.sees_through(hung, *MARGIN).mean())
+
+    assert share(finer, 0.4, 17.0, 4) == 1 and share(usual, 0.4, 17.0, 4) == 0
+    assert share(finer, 0.4, 10.0, 4) == 0  # a slight error of registration is more than two rings
+    assert share(finer, 3.0, 10.0, 4) == share(usual, 3.0, 10.0, 4) == 1
+    highest_deg = 7.5 * 30 / 127  # of the rings that meet what stands there
+    for off_m in (-0.05, 0.0, 0.05):  # badly registered
+        assert share(finer, highest_deg + np.rad2deg(off_m / 17.8), 17.8, 4) == 0
+
+
 # --- rings ----------------------------------------------------------------------------------------
 
 TABLES = {
@@ -77,7 +102,8 @@ def on_rings(elevation_deg, noise_deg=0.01, num_columns=600, seed=0):
 def cells(azimuth, elevation):
     """Edges of the rows and number of columns of the finest image."""
     nothing = np.zeros(len(azimuth), np.float32)
-    return range_image._cells(Aimed(azimuth, elevation, nothing, nothing), 1)[0]
+    found, *_ = range_image._cells(Aimed(azimuth, elevation, nothing, nothing), 1, finer_far=False)
+    return found.row_edges_rad, found.num_columns
 
 
 @pytest.mark.parametrize("name", TABLES)

@@ -17,6 +17,7 @@ coarse as the one before, and each vouches for what it has enough returns around
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +29,9 @@ from densify.types import Bool, Float, Float32, RegisteredSweep
 
 _CELLS_PER_STEP = 1.15  # a cell a little larger than a step is rarely empty
 _MIN_ROW_RAD = np.deg2rad(0.45)
+# Rings closer than that are one row wherever they are; each other one has its own from as far away
+# on as three of them reach so far up and down, which errors of registration do not.
+_MIN_FAR_ROW_RAD, _SLACK_M = np.deg2rad(0.15), 0.1
 _SETTLED = 0.1  # of a turn
 _MIN_COLUMNS, _MAX_COLUMNS = 90, 8192
 _DENSEST = 10  # percent of an unordered scanner's returns: the finest cells
@@ -41,17 +45,21 @@ class RangeImage:
     scanners: tuple[ScannerImage, ...]
 
     @staticmethod
-    def of(registered: RegisteredSweep, num_together: int = 1) -> RangeImage:
+    def of(
+        registered: RegisteredSweep, num_together: int = 1, finer_far: bool = False
+    ) -> RangeImage:
         """Build from a deskewed sweep (its rays are put back to their firing times).
 
         num_together: sweeps that will be asked together. Of scanners that turn the columns are so
-        many times as many: as many as returns of all these sweeps fill."""
+        many times as many: as many as returns of all these sweeps fill. finer_far: rings that are
+        one row because they are dense have each their own for what is far away, where a slight
+        error of registration is less than they are apart."""
         ids = np.unique(registered.sweep.lidar)
         return RangeImage(
             tuple(
                 image
                 for i in ids
-                for image in ScannerImage.all_of(registered, int(i), num_together)
+                for image in ScannerImage.all_of(registered, int(i), num_together, finer_far)
             )
         )
 
@@ -94,9 +102,14 @@ class RangeImage:
         margins = np.array(margins_m, np.float32)
         beyond = np.zeros((len(self.scanners), len(points)), np.int16)
         for scanner, own in zip(self.scanners, beyond, strict=True):
+            told, in_reach, of_told = scanner.told(points32), points32, velocity
+            if not told.all():
+                in_reach, of_told = points32[told], velocity[told[: len(velocity)]]
+            num = np.zeros(len(in_reach), np.int16)
             kernels.see_beyond.over_rows(
-                len(points), points32, velocity, scanner.tables, margins, least, own
+                len(num), in_reach, of_told, scanner.tables, margins, least, num
             )
+            own[told] = num
         return beyond
 
 
@@ -112,7 +125,7 @@ class ScannerImage:
     uint8, how many of those nine hold a return. row_edges_rad: (R+1,) float32 ascending elevations.
     origin_m: (3,) float32 of the scanner in the lidar frame. axes: (3,3) float32 from the lidar
     frame's to its own, and whether they differ. twists: (2,6) float32, the sweep's
-    before and after its reference time.
+    before and after its reference time. from_m, to_m: how far away it tells of points.
     """
 
     offset_s: Float32
@@ -125,19 +138,23 @@ class ScannerImage:
     axes: Float32
     turned: np.bool_
     twists: Float32
+    from_m: float
+    to_m: float
 
     @staticmethod
     def all_of(
-        registered: RegisteredSweep, lidar: int, num_together: int = 1
+        registered: RegisteredSweep, lidar: int, num_together: int = 1, finer_far: bool = False
     ) -> tuple[ScannerImage, ...]:
-        """One, or of an unordered scanner several with cells of different sizes, finest first."""
+        """One, or of an unordered scanner several with cells of different sizes, finest first, or
+        of dense rings one for what is near and one for what is far, see `RangeImage.of`."""
         rays = aimed(registered, lidar)
         order = measure.firing_order(rays.azimuth, rays.offset_s)
         duration_s = order.period_s or float(np.ptp(rays.offset_s)) if len(rays.offset_s) else 0.0
         origin_m = registered.sweep.origin_m(lidar).astype(np.float32)
         twists = np.stack([registered.twist_before, registered.twist_after]).astype(np.float32)
 
-        def image(row_edges_rad: Float32, num_columns: int) -> ScannerImage:
+        def image(cells: _Cells) -> ScannerImage:
+            row_edges_rad, num_columns = cells.row_edges_rad, cells.num_columns
             shape = len(row_edges_rad) - 1, num_columns
             nearest_m, num_filled = np.empty(shape, np.float32), np.empty(shape, np.uint8)
             offset_s = np.zeros((1 if order.by_azimuth else shape[0], num_columns), np.float32)
@@ -158,14 +175,24 @@ class ScannerImage:
                 axes=registered.sweep.axes(lidar).astype(np.float32),
                 turned=np.bool_(registered.sweep.R_scanner_lidar is not None),
                 twists=twists,
+                from_m=cells.from_m,
+                to_m=cells.to_m,
             )
 
         images: list[ScannerImage] = []
-        for cells in _cells(rays, num_together):
-            images.append(image(*cells))
-            if images[-1].share_vouched(rays) >= _VOUCHED:
+        for cells in _cells(rays, num_together, finer_far):
+            images.append(image(cells))
+            if cells.to_m == np.inf and images[-1].share_vouched(rays) >= _VOUCHED:
                 break
         return tuple(images)
+
+    def told(self, points: Float32) -> Bool:
+        """(N,3) lidar frame -> (N,) whether it tells of points so far away."""
+        if self.from_m == 0 and self.to_m == np.inf:
+            return np.ones(len(points), bool)
+        away = points - self.origin_m
+        squared = np.einsum("ij,ij->i", away, away)
+        return np.asarray((squared >= self.from_m**2) & (squared < self.to_m**2))
 
     def share_vouched(self, rays: Aimed) -> float:
         """Share of the rays with enough filled cells around them to tell of free space."""
@@ -191,9 +218,18 @@ class ScannerImage:
         )
 
 
-def _cells(rays: Aimed, num_together: int) -> list[tuple[Float32, int]]:
-    """Edges of the rows (R+1,), rad, and the number of columns; of an unordered scanner several,
-    finest first, of which as many are of use as it takes until cells are seldom empty."""
+class _Cells(NamedTuple):
+    """Those of one image: edges of the rows (R+1,), and how far away they tell of points."""
+
+    row_edges_rad: Float32
+    num_columns: int
+    from_m: float = 0.0
+    to_m: float = np.inf
+
+
+def _cells(rays: Aimed, num_together: int, finer_far: bool) -> list[_Cells]:
+    """The cells of a scanner's images: of an unordered scanner's, finest first, as many are of use
+    as it takes until cells are seldom empty; dense rings have those for what is near and far."""
     if len(rays.azimuth) < FEW_POINTS:
         return [_grid(_uniform_edges(rays.elevation, np.deg2rad(2.0)), np.deg2rad(1.0))]
     some = some_sectors(rays)
@@ -201,7 +237,12 @@ def _cells(rays: Aimed, num_together: int) -> list[tuple[Float32, int]]:
     if rings is not None:
         edges = _edges_between(rings)
         step = measure.step_along(some.azimuth, np.searchsorted(edges, some.elevation))
-        return [_grid(_no_closer(edges, _MIN_ROW_RAD), _CELLS_PER_STEP * step / num_together)]
+        step *= _CELLS_PER_STEP / num_together
+        near, far = (_no_closer(edges, least) for least in (_MIN_ROW_RAD, _MIN_FAR_ROW_RAD))
+        if not finer_far or len(near) == len(far):
+            return [_grid(near, step)]
+        far_m = _SLACK_M / (1.5 * float(np.diff(far).min()))
+        return [_grid(near, step)._replace(to_m=far_m), _grid(far, step)._replace(from_m=far_m)]
     if in_lines(some):
         row_step = measure.step_between(some.azimuth, some.elevation)
         step = measure.step_along(some.azimuth, np.floor(some.elevation / row_step))
@@ -216,9 +257,9 @@ def _cells(rays: Aimed, num_together: int) -> list[tuple[Float32, int]]:
     ]
 
 
-def _grid(edges: NDArray[np.floating], step: float) -> tuple[Float32, int]:
+def _grid(edges: NDArray[np.floating], step: float) -> _Cells:
     num_columns = int(np.clip(round(2 * np.pi / step), _MIN_COLUMNS, _MAX_COLUMNS))
-    return edges.astype(np.float32), num_columns
+    return _Cells(edges.astype(np.float32), num_columns)
 
 
 def _edges_between(rings: Float) -> Float:

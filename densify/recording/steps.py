@@ -68,7 +68,7 @@ class BlockSteps:
         def make() -> dict[int, RangeImage]:
             sweeps = [places.deskewed(number, 0.0, f) for f in pieces]
             with self._watch.stage("flow"), ThreadPoolExecutor() as pool:
-                image = partial(RangeImage.of, num_together=num_together)
+                image = partial(RangeImage.of, num_together=num_together, finer_far=True)
                 return dict(zip(pieces, pool.map(image, sweeps), strict=True))
 
         return kept(

@@ -49,13 +49,15 @@ class FreeSpace:
 
     @staticmethod
     def of(stretch: Stretch, images: Sequence[RangeImage] | None = None) -> FreeSpace:
-        """images: of the sweeps, where they are known, with cells for `num_in_look` together."""
+        """images: of the sweeps, where they are known, with cells for `num_in_look` together, finer
+        far away."""
         clock = Clock.of(stretch)
         looks = clock.looks()
         if images is None:
             num = num_in_look(clock.period_ns * 1e-9)
+            image = partial(RangeImage.of, num_together=num, finer_far=True)
             with ThreadPoolExecutor() as pool:
-                images = list(pool.map(partial(RangeImage.of, num_together=num), stretch.sweeps))
+                images = list(pool.map(image, stretch.sweeps))
         return FreeSpace(
             tuple(images),
             tuple(poses.inverse(s.T_world_lidar) for s in stretch.sweeps),

@@ -23,7 +23,7 @@ from densify.flow.tracking.looks import Look, looks_of
 from densify.flow.tracking.proof import left_contradicted, may_be_a_rail
 from densify.flow.tracking.shapes import Body, Shape
 from densify.flow.tracking.sightings import Track
-from densify.flow.tracking.slides import take_back_slides
+from densify.flow.tracking.slides import go_with_the_rest, take_back_slides
 from densify.flow.tracking.starts import (
     MIN_POINTS,
     ends,
@@ -113,6 +113,7 @@ def follow_groups(
         if proven:
             _refine(track, standing, ground)
             take_back_slides(track, standing, space)
+            go_with_the_rest(track, bodies, standing, space)
             _claim_rays(track, standing, free, space)
         for j, rows in track.claimed.items():
             untried[j][rows] = False
