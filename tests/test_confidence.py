@@ -12,11 +12,8 @@ from densify.files.texts import read_json
 from densify.types import DepthMap, Ranked
 from tests.scenes import CAMERA
 
-GROUPS = (
-    "window, rough from 0, contradicted from 0",
-    "window, rough from 0.1, contradicted from 0.03",
-    "filled, rough from 0.1, contradicted from 0",
-)
+SMOOTH, FENCE, FILLED = 0, 1, 7
+"""Of `scale.GROUPS`: of the window, smooth and rough from .1; filled, rough from .1."""
 
 
 def made(confidence, filled_m) -> DepthMap:
@@ -30,16 +27,10 @@ def test_a_fifth_more_is_ten_times_less_wrong():
     assert scale.wrong(np.array([0, 0.2, 0.4, 1.0])) == pytest.approx([1, 0.1, 0.01, 1e-5])
 
 
-SMOOTH, FENCE, FILLED = (scale.GROUPS.index(name) for name in GROUPS)
-"""Of these groups; the tables of a test say what each is worth."""
-
-
-def tables(**worth) -> np.ndarray:
-    """(G,R) log10 P, which falls by a decade over the ranks; worth: at rank 0, by group."""
-    log = np.full((len(scale.GROUPS), scale.NUM_RANKS), -1.0)
-    for name, value in worth.items():
-        log[scale.GROUPS.index(name)] = value
-    return log - np.linspace(0, 1, scale.NUM_RANKS)
+def tables(anywhere: float, contradicted: float) -> np.ndarray:
+    """(G,2,R) shares at rank 0, which fall by a decade over the ranks."""
+    falling = 10.0 ** -np.linspace(0, 1, scale.NUM_RANKS)
+    return np.array([[anywhere * falling, contradicted * falling]] * len(scale.GROUPS))
 
 
 @pytest.mark.parametrize("groups", [(SMOOTH,), (SMOOTH, FENCE), (FILLED,)])
@@ -47,7 +38,8 @@ def test_calibration_keeps_the_order(groups):
     """Of pixels measured, and of pixels filled, wherever they are."""
     rng = np.random.default_rng(3)
     rank = np.linspace(0, 1, 4000, dtype=np.float32).reshape(40, 100)
-    ranked = Ranked(rank, rng.choice(groups, rank.shape).astype(np.uint8))
+    contradicted = rng.uniform(0, 0.3, rank.shape).astype(np.float32)
+    ranked = Ranked(rank, rng.choice(groups, rank.shape).astype(np.uint8), contradicted)
     confidence = scale.calibrated(ranked, np.ones(rank.shape, bool))
     assert confidence.dtype == np.float32
     assert (np.diff(confidence.ravel()) > 0).all()
@@ -55,32 +47,40 @@ def test_calibration_keeps_the_order(groups):
 
 
 def test_a_map_expects_what_its_own_pixels_are_worth():
-    """Rough places cost a map as much confidence as there are of them, and empty pixels nothing."""
+    """Hedges cost a map as much confidence as there are of them, and empty pixels nothing."""
     rng = np.random.default_rng(4)
-    worth = tables(**{GROUPS[0]: -3.0, GROUPS[1]: -1.0, GROUPS[2]: -2.0})
+    worth = tables(0.001, 0.5)
     rank = rng.uniform(size=(200, 300)).astype(np.float32)
     for share in (0.0, 0.2, 0.9):
-        rough, filled = rng.uniform(size=(2, *rank.shape)) < [[[share]], [[0.5]]]
-        group = np.where(filled, FILLED, np.where(rough, FENCE, SMOOTH)).astype(np.uint8)
+        hedge, filled = rng.uniform(size=(2, *rank.shape)) < [[[share]], [[0.5]]]
+        group = np.where(filled, FILLED, SMOOTH).astype(np.uint8)
+        contradicted = np.where(hedge, np.float32(0.2), np.float32(0))
         shown = rng.uniform(size=rank.shape) < 0.6
-        confidence = scale.calibrated(Ranked(rank, group), shown, worth)
+        confidence = scale.calibrated(Ranked(rank, group, contradicted), shown, worth)
         assert (confidence[~shown] == 0).all()
         step = np.minimum((rank * scale.NUM_RANKS).astype(int), scale.NUM_RANKS - 1)
         for part in (shown & filled, shown & ~filled):
-            expected = 10.0 ** worth[group[part], step[part]].astype(float)
+            anywhere, more = worth[group[part], :, step[part]].T
+            expected = anywhere + contradicted[part] * more
             assert scale.wrong(confidence[part]).mean() == pytest.approx(expected.mean(), rel=0.03)
 
 
-def test_groups_are_how_a_pixel_came_and_how_ragged_and_contradicted_it_is_around():
+def test_no_more_are_wrong_than_all():
+    rank = np.full((4, 5), 0.5, np.float32)
+    ranked = Ranked(rank, np.zeros(rank.shape, np.uint8), np.ones_like(rank))
+    confidence = scale.calibrated(ranked, rank > 0, tables(0.9, 5.0))
+    assert (confidence >= 0).all() and confidence.max() < 0.002
+
+
+def test_groups_are_how_a_pixel_came_and_how_ragged_it_is_around():
     shape = (60, 120)
     none, everywhere = np.zeros(shape, np.float32), np.ones(shape, np.float32)
-    left = np.arange(shape[1]) < 60
-    rim_m = np.where(left & (np.arange(shape[1]) % 2 == 0), everywhere, none)
+    column = np.arange(shape[1])
     depth_m = everywhere.copy()
     depth_m[30:] = 0
     layers = Layers(
         depth_m=depth_m,
-        rim_m=rim_m,
+        rim_m=np.where((column < 60) & (column % 2 == 0), everywhere, none),
         veiled=none > 0,
         refused=none > 0,
         filled_m=everywhere,
@@ -91,38 +91,40 @@ def test_groups_are_how_a_pixel_came_and_how_ragged_and_contradicted_it_is_aroun
     )
     far = np.zeros(shape, bool)
     far[:10] = True
-    contradicted = np.where(np.arange(shape[1]) < 100, none, np.float32(0.05))
-    rank, group = scale.ranked(layers, far, contradicted)
-    assert (rank == 0.5).all()
+    rank, group, contradicted = scale.ranked(layers, far, none)
+    assert (rank == 0.5).all() and not contradicted.any()
     names = np.array(scale.GROUPS)[group]
     for row, how in ((5, "beyond"), (20, "window"), (45, "filled")):
         ragged = 0.5 if how == "filled" else 0.1
-        assert names[row, 11] == f"{how}, rough from {ragged}, contradicted from 0"
-        assert names[row, 90] == f"{how}, rough from 0, contradicted from 0"
-        assert names[row, 110] == f"{how}, rough from 0, contradicted from 0.03"
+        assert names[row, 11] == f"{how}, rough from {ragged}"
+        assert names[row, 90] == f"{how}, rough from 0"
 
 
 def test_only_what_is_shown_tells_how_contradicted_it_is_around():
-    shape = (20, 20)
+    shape = (20, 60)
     none = np.zeros(shape, np.float32)
-    shown = np.arange(shape[1]) % 2 == 0
+    column = np.arange(shape[1])
+    shown = column % 2 == 0
     filled_m = np.where(shown, np.ones(shape, np.float32), none)
     layers = Layers(
         *(none, none, none > 0, none > 0, filled_m, none + 1, np.full(shape, -1, np.int32)),
         tilt=np.zeros((*shape, 2), np.float32),
         spacing_px=np.ones((*shape, 2), np.float32),
     )
-    contradicted = np.where(shown, np.full(shape, 0.015, np.float32), np.float32(1))
-    group = scale.ranked(layers, none > 0, contradicted).group
-    assert scale.GROUPS[group[10, 10]] == "filled, rough from 0, contradicted from 0.01"
+    contradicted = np.where(column >= 30, np.float32(0.05), none)
+    around = scale.ranked(layers, none > 0, np.where(shown, contradicted, 1)).contradicted
+    assert around[10, 20] == 0 and around[10, 40] == pytest.approx(0.05)
+    assert 0 < around[10, 28] < around[10, 30] < 0.05  # four gaps to all sides
+    assert around[10, 24] == 0 and around[10, 34] == pytest.approx(0.05)
+    assert (around[:, ~shown] == 0).all()
 
 
 def test_the_packages_own_tables_fall_with_the_rank():
     own = scale.tables_of(read_json(scale.TABLES))
-    assert own.shape == (len(scale.GROUPS), scale.NUM_RANKS)
-    assert (np.diff(own) <= 1e-9).all() and own.max() <= 0 and own.min() >= -scale.DECADES
-    smooth, ragged = (own[k::12].mean() for k in (0, 11))
-    assert ragged > smooth + 0.5
+    assert own.shape == (len(scale.GROUPS), len(scale.CAUSES), scale.NUM_RANKS)
+    assert (np.diff(own) <= 1e-9).all() and own.min() >= 0
+    smooth, ragged = (own[k::3].mean(axis=(0, 2)) for k in (0, 2))
+    assert ragged[0] > 3 * smooth[0] and 0.05 < own[:, 1].mean() < 3
 
 
 def test_reliability_counts_what_is_wrong():

@@ -19,7 +19,7 @@ from densify.geometry.range_image import RangeImage
 from densify.readers.window import choose_cameras
 from densify.recording import Recording
 from densify.scores.depth_metrics import is_outlier_depth
-from densify.types import DepthMap, Float, Float32, LidarSequence, Progress
+from densify.types import DepthMap, Float, Float32, Int, LidarSequence, Progress
 
 FITTED = (
     ("street?seed=51", (60,)),
@@ -52,17 +52,25 @@ CHECKED = (
 """Recordings and keys, unless others are asked for."""
 
 _STEPS = np.array([0.0, 0.2, 0.25, 0.3, 0.35, 0.4, 0.45, 0.5, 0.6, 0.7, 0.8, 0.9])
-_BORROWED = 3e-4  # of a map's pixels: what a group takes over from all that came the same way
-_LEAST = 1e-5  # share wrong where none was
-_NUM_WAYS = 3
+_TINY = 1e-30
+_NUM_ROUNDS = 300  # of expectation maximization
 _DIGITS = 4
 
 Asked = Sequence[tuple[LidarSequence, Sequence[int]]]
 
 
+class WrongPixels(NamedTuple):
+    """Pixels with a wrong depth, (B,) each: their group (`densify.depth.confidence.GROUPS`), the
+    step of their rank, and by how much the place is contradicted."""
+
+    group: Int
+    step: Int
+    contradicted: Float
+
+
 class Evidence(NamedTuple):
-    """One map, by group and step of the rank (G,R): the pixels ``shown``, those ``compared`` with
-    the truth, and those of them that are ``wrong``."""
+    """One map: its pixels ``shown`` and those ``compared`` with the truth, (G,2,R) as
+    `densify.depth.confidence.amounts` has them, and those that are ``wrong``."""
 
     data: str
     key: int
@@ -70,7 +78,7 @@ class Evidence(NamedTuple):
     source: str
     shown: Float
     compared: Float
-    wrong: Float
+    wrong: WrongPixels
 
 
 def bench_confidence(
@@ -84,9 +92,9 @@ def bench_confidence(
     """Fit the tables to maps of ``fitted``, recordings with the keys to make, and see how far they
     hold on those of ``checked``. The rest as `densify.pipeline.run`.
 
-    Returns plain numbers: ``maps`` that were fitted on, ``tables``: by group the rank and the share
-    that is wrong, and ``reliability`` by recording and truth, where ``fitted`` is all that was
-    fitted on together, and ``unseen`` all others against exact truth.
+    Returns plain numbers: ``maps`` that were fitted on, ``tables``: by group and cause the rank and
+    the share that is wrong, and ``reliability`` by recording and truth, where ``fitted`` is all
+    that was fitted on together, and ``unseen`` all others against exact truth.
 
     Raises InputError for what cannot be used, ComputationError where registration went wrong.
     """
@@ -103,7 +111,10 @@ def bench_confidence(
             if progress is not None:
                 progress("bench", done, num)
     fit_on = [e for part in found[: len(fitted)] for e in part]
-    knots = {name: _knots(log) for name, log in zip(scale.GROUPS, fit(fit_on), strict=True)}
+    knots = {
+        group: {cause: _knots(share) for cause, share in zip(scale.CAUSES, shares, strict=True)}
+        for group, shares in zip(scale.GROUPS, fit(fit_on), strict=True)
+    }
     tables = scale.tables_of({"tables": knots})
     unseen = [e for part in found[len(fitted) :] for e in part]
     exact = [e for e in unseen if e.source == "truth"]
@@ -157,40 +168,61 @@ def _counted(
     compared = shown & (truth_m > 0)
     bad = compared.copy()
     bad[compared] = is_outlier_depth(maps.filled_m[compared], truth_m[compared], focal_px)
-    rank, group = maps.ranked
-    num = [scale.counts(rank[part], group[part]) for part in (shown, compared, bad)]
-    return Evidence(sequence.name, key, maps.camera, source, *num)
+    wrong = WrongPixels(
+        maps.ranked.group[bad].astype(np.int64),
+        scale.steps_of(maps.ranked.rank[bad]),
+        maps.ranked.contradicted[bad].astype(np.float64),
+    )
+    all_shown, all_compared = (scale.amounts(maps.ranked, part) for part in (shown, compared))
+    return Evidence(sequence.name, key, maps.camera, source, all_shown, all_compared, wrong)
 
 
 def fit(evidence: Sequence[Evidence]) -> Float:
-    """(G,R) log10 of the share that is wrong by group and step of the rank.
+    """(G,2,R) share that is wrong by group, cause and step of the rank.
 
-    Every map counts alike, so that none decides alone. Within a group the share falls with the rank
-    (`densify.depth.confidence.falling`). Where a group has hardly any pixels, it takes the share of
-    all groups that came to their depth the same way.
+    The tables under which the wrong pixels are most likely (expectation maximization: which cause
+    a wrong pixel is owed to is not known), each made to fall with the rank
+    (`densify.depth.confidence.falling`). Every map counts alike, so that none decides alone.
     """
-    weights = [1 / max(e.compared.sum(), 1) for e in evidence]
-    num = sum(w * e.compared for w, e in zip(weights, evidence, strict=True))
-    wrong = sum(w * e.wrong for w, e in zip(weights, evidence, strict=True))
+    weights = [1 / max(e.compared[:, 0].sum(), 1) for e in evidence]
+    pixels: Float = np.sum([w * e.compared for w, e in zip(weights, evidence, strict=True)], axis=0)
+    group, step, contradicted = (
+        np.concatenate(c) for c in zip(*(e.wrong for e in evidence), strict=True)
+    )
+    weight = np.repeat(weights, [len(e.wrong.group) for e in evidence])
+    causes = np.stack([np.ones_like(contradicted), contradicted])
     tables = []
-    for same_way in np.split(np.arange(len(scale.GROUPS)), _NUM_WAYS):
-        all_num = num[same_way].sum(axis=0)
-        alike = scale.falling(all_num, wrong[same_way].sum(axis=0) + _LEAST * all_num)
-        borrowed = _BORROWED * all_num / max(all_num.sum(), 1e-9)
-        for group in same_way:
-            tables.append(
-                scale.falling(num[group] + borrowed, wrong[group] + borrowed * 10.0**alike)
-            )
+    for number, num in enumerate(pixels):
+        mine = group == number
+        tables.append(_fitted(num, step[mine], causes[:, mine], weight[mine]))
     return np.array(tables)
 
 
-def _knots(log: Float) -> list[list[float]]:
+def _fitted(num: Float, step: Int, causes: Float, weight: Float) -> Float:
+    """(2,R) shares by cause. num: (2,R) pixels, and how much they are contradicted. step, weight:
+    (B,) of those that are wrong. causes: (2,B) what each cause's share is multiplied by there."""
+    shares = np.repeat(
+        weight.sum() / np.maximum(num.sum(axis=1), _TINY)[:, None], scale.NUM_RANKS, 1
+    )
+    for _ in range(_NUM_ROUNDS):
+        owed = shares[:, step] * causes
+        owed *= weight / np.maximum(owed.sum(axis=0), _TINY)
+        shares = np.array(
+            [
+                scale.falling(n, np.bincount(step, part, scale.NUM_RANKS).astype(np.float64))
+                for n, part in zip(num, owed, strict=True)
+            ]
+        )
+    return shares
+
+
+def _knots(shares: Float) -> list[list[float]]:
     """(R,) -> rank and share wherever the curve bends."""
-    bends = np.abs(np.diff(log, 2)) > 1e-9
+    bends = np.abs(np.diff(shares, 2)) > 1e-12
     kept = np.concatenate([[True], bends, [True]])
     ranks = (np.flatnonzero(kept) + 0.5) / scale.NUM_RANKS
-    shares = [float(f"{10.0**value:.{_DIGITS}g}") for value in log[kept]]
-    return [[round(float(r), 4), s] for r, s in zip(ranks, shares, strict=True)]
+    digits = [float(f"{share:.{_DIGITS}g}") for share in shares[kept]]
+    return [[round(float(r), 4), s] for r, s in zip(ranks, digits, strict=True)]
 
 
 def _reliability(evidence: Sequence[Evidence], tables: Float) -> list[dict[str, Any]]:
@@ -198,11 +230,13 @@ def _reliability(evidence: Sequence[Evidence], tables: Float) -> list[dict[str, 
     sums = np.zeros((3, len(_STEPS)))
     for e in evidence:
         measured, filled = scale.curves(e.shown, tables)
-        filled_from = len(scale.GROUPS) * 2 // _NUM_WAYS
+        filled_from = len(scale.GROUPS) * 2 // 3
         log = np.where((np.arange(len(scale.GROUPS)) < filled_from)[:, None], measured, filled)
         step = np.searchsorted(_STEPS, np.clip(-log / scale.DECADES, 0, 1), side="right") - 1
-        for total, num in zip(sums, (e.compared, e.compared * 10.0**log, e.wrong), strict=True):
-            total += np.bincount(step.ravel(), num.ravel(), len(_STEPS))
+        num, bad = e.compared[:, 0], np.zeros(log.shape)
+        np.add.at(bad, (e.wrong.group, e.wrong.step), 1)
+        for total, part in zip(sums, (num, num * 10.0**log, bad), strict=True):
+            total += np.bincount(step.ravel(), part.ravel(), len(_STEPS))
     return [
         {
             "confidence": float(least),

@@ -2,13 +2,16 @@
 """What a confidence means: the probability that a pixel's depth is right.
 
 A map's stages rank its pixels: by sweeps and points that agree, nearness of an edge, roughness, how
-far was filled, votes of the image. What a rank is worth depends on where it is had: among the
-leaves of a hedge far more pixels are wrong than on a road at the same rank. So the probability of a
-wrong depth was measured, where the truth is exact, by rank *and* group: how a pixel came to its
-depth (measured within the window, beyond it, or filled), how ragged its surroundings are, the
-share of what is measured around it that lies at depth edges, and how far they contradict each
-other (`densify.depth.agreement`): among leaves more than around a car. ``densify bench confidence``
-makes these tables, ``confidence.json`` beside this file, and says how far they hold elsewhere.
+far was filled, votes of the image. What a rank is worth depends on where it is had. KITTI's rule
+forgives 0.4 m at 7 m and 3 m at 20 m: what is right among the leaves of a hedge far away is wrong
+among the same leaves close by, and on a road neither. So the probability of a wrong depth is
+taken as a sum of two: a share that pixels of this rank have anyway, and one in proportion to how
+far the surroundings contradict each other by that same rule (`densify.depth.agreement`): as if some
+of the pixels had the depth of a neighbour. Both fall with the rank, and were measured, where the
+truth is exact, by group: how a pixel came to its depth (measured within the window, beyond it, or
+filled), and how ragged its surroundings are, the share of what is measured around it that lies at
+depth edges. ``densify bench confidence`` makes these tables, ``confidence.json`` beside this file,
+and says how far they hold elsewhere.
 
 Within a map the order of the ranks stays, of pixels measured and of pixels filled: each rank gets
 the mean probability of the map's own pixels at that rank, made to fall with the rank.
@@ -33,27 +36,28 @@ from densify.types import Bool, Camera, DepthMap, Float, Float32, Ranked
 DECADES = 5.0
 """Confidence 1 is one wrong pixel in 10^5, each fifth less ten times as many."""
 GROUPS = tuple(
-    f"{how}, rough from {ragged:g}, contradicted from {off:g}"
+    f"{how}, rough from {ragged:g}"
     for how in ("window", "beyond", "filled")
     for ragged in (0, 0.1, 0.5)
-    for off in (0, 0.01, 0.03, 0.08)
 )
-"""How pixels came to their depth, the share of what is measured around that is at edges, and the
-mean share of it by which pixels there are contradicted."""
+"""How pixels came to their depth, and the share of what is measured around that is at edges."""
+CAUSES = ("anyway", "contradicted")
+"""Shares that are wrong: anyway, and for each whole by which a place is contradicted."""
 NUM_RANKS = 200
 TABLES = Path(__file__).with_name("confidence.json")
 
-_RAGGED, _CONTRADICTED = np.array([0.1, 0.5]), np.array([0.01, 0.03, 0.08])
-_NUM_RAGGED, _NUM_CONTRADICTED = len(_RAGGED) + 1, len(_CONTRADICTED) + 1
-_NUM_MEASURED = 2 * _NUM_RAGGED * _NUM_CONTRADICTED  # groups; those behind are filled
+_RAGGED = np.array([0.1, 0.5])
+_NUM_RAGGED = len(_RAGGED) + 1
+_NUM_MEASURED = 2 * _NUM_RAGGED  # groups; those behind are filled
 _AROUND = 4.0  # gaps between rays to all sides
 _TILT = 0.01  # decades over all ranks: pixels of different rank keep a different confidence
 _NUM_STEPS = 20
 
 
 def ranked(layers: Layers, far: Bool, contradicted: Float32) -> Ranked:
-    """The rank and group of a map's pixels. far: (H,W) measured by sweeps beyond the window.
-    contradicted: (H,W) of the filled map's pixels, see `densify.depth.agreement`."""
+    """What the confidence of a map's pixels is made from. far: (H,W) measured by sweeps beyond the
+    window. contradicted: (H,W) of the filled map's pixels, see `densify.depth.agreement`. It and
+    raggedness are means over four gaps between rays to all sides."""
     rim, measured = layers.rim_m > 0, (layers.depth_m > 0) | (layers.rim_m > 0)
     shown = layers.filled_m > 0
     size = 2 * max(2, round(_AROUND * float(np.median(layers.gap_px)))) + 1
@@ -64,14 +68,13 @@ def ranked(layers: Layers, far: Bool, contradicted: Float32) -> Ranked:
             ndimage.uniform_filter(part.astype(np.float32), size, mode="constant")
             for part in (np.where(of, values, 0), of)
         )
-        return sums / np.maximum(num, np.float32(1 / size**2))
+        return np.clip(sums / np.maximum(num, np.float32(1 / size**2)), 0, 1)
 
     how = np.where(layers.depth_m > 0, far.astype(np.uint8), np.uint8(2))
     ragged = np.searchsorted(_RAGGED, mean(rim, measured), side="right")
-    off = np.searchsorted(_CONTRADICTED, mean(contradicted, shown), side="right")
-    group = (how * _NUM_RAGGED + ragged) * _NUM_CONTRADICTED + off
+    group = np.where(shown, how * _NUM_RAGGED + ragged, 0).astype(np.uint8)
     rank = np.where(shown, np.clip(layers.confidence, 0, 1), np.float32(0))
-    return Ranked(rank, np.where(shown, group, 0).astype(np.uint8))
+    return Ranked(rank, group, np.where(shown, mean(contradicted, shown), np.float32(0)))
 
 
 def calibrated(found: Ranked, shown: Bool, tables: Float | None = None) -> Float32:
@@ -79,10 +82,10 @@ def calibrated(found: Ranked, shown: Bool, tables: Float | None = None) -> Float
     probability P that a depth is wrong by KITTI's rule, see
     `densify.scores.depth_metrics.DepthErrors`.
 
-    tables: (G,R) log10 P by group and step of the rank, else the package's own.
+    tables: (G,2,R) by group, cause and step of the rank, else the package's own.
     """
     rank, group = found.rank[shown], found.group[shown]
-    log_wrong = curves(counts(rank, group), _own_tables() if tables is None else tables)
+    log_wrong = curves(amounts(found, shown), _own_tables() if tables is None else tables)
     place = rank.astype(np.float64) * NUM_RANKS - 0.5
     steps = np.arange(NUM_RANKS)
     measured, filled = (np.interp(place, steps, curve) for curve in log_wrong)
@@ -92,35 +95,41 @@ def calibrated(found: Ranked, shown: Bool, tables: Float | None = None) -> Float
     return confidence
 
 
-def counts(rank: Float32, group: NDArray[np.uint8]) -> Float:
-    """(P,) and (P,) -> (G,R) pixels by group and step of the rank."""
-    step = np.minimum((rank * NUM_RANKS).astype(np.int64), NUM_RANKS - 1)
-    place = group.astype(np.int64) * NUM_RANKS + step
-    num = np.bincount(place, minlength=len(GROUPS) * NUM_RANKS)
-    return num.reshape(len(GROUPS), NUM_RANKS).astype(np.float64)
+def steps_of(rank: Float32) -> NDArray[np.int64]:
+    """The step that each rank falls into."""
+    return np.minimum((rank * NUM_RANKS).astype(np.int64), NUM_RANKS - 1)
 
 
-def curves(num: Float, tables: Float) -> Float:
+def amounts(found: Ranked, of: Bool) -> Float:
+    """(G,2,R) by group and step of the rank: how many of the pixels ``of`` (H,W) there are, and by
+    how much they are contradicted together. Times a table it is how many are wrong."""
+    place = found.group[of].astype(np.int64) * NUM_RANKS + steps_of(found.rank[of])
+    size = len(GROUPS) * NUM_RANKS
+    sums = [np.bincount(place, weights, size) for weights in (None, found.contradicted[of])]
+    return np.stack([s.reshape(len(GROUPS), NUM_RANKS) for s in sums], axis=1).astype(np.float64)
+
+
+def curves(pixels: Float, tables: Float) -> Float:
     """(2,R) log10 of the probability that a pixel is wrong by step of the rank, of those measured
-    and of those filled, in a map with ``num`` (G,R) of them. tables: (G,R) log10."""
-    wrong_num = num * 10.0**tables
-    found = [
+    and of those filled, in a map with ``pixels`` (G,2,R), `amounts`. tables: (G,2,R)."""
+    num = pixels[:, 0]
+    wrong_num = np.minimum((pixels * tables).sum(axis=1), num)
+    shares = [
         falling(num[part].sum(axis=0), wrong_num[part].sum(axis=0))
         for part in (slice(_NUM_MEASURED), slice(_NUM_MEASURED, None))
     ]
-    return np.array(found)
+    return np.log10(np.clip(shares, 10.0 ** (_TILT - DECADES), 1))
 
 
 def falling(num: Float, wrong_num: Float) -> Float:
-    """(R,) log10 of the share that is wrong, which falls with the rank (isotonic regression). num,
-    wrong_num: (R,) pixels, weighted or not; steps without any lie between their neighbours."""
+    """(R,) ``wrong_num`` over ``num``, (R,) pixels, made to fall with the rank (isotonic
+    regression); steps without any lie between their neighbours, 0 where no step has any."""
     some = num > 0
     if not some.any():
-        return np.full(len(num), _TILT - DECADES)
+        return np.zeros(len(num))
     share = isotonic_regression(wrong_num[some] / num[some], weights=num[some], increasing=False).x
-    log = np.log10(np.clip(share, 10.0 ** (_TILT - DECADES), 1))
     steps = np.arange(len(num))
-    between: Float = np.interp(steps, steps[some], log)
+    between: Float = np.interp(steps, steps[some], share)
     return between
 
 
@@ -130,12 +139,10 @@ def _own_tables() -> Float:
 
 
 def tables_of(written: dict[str, Any]) -> Float:
-    """(G,R) log10 of the share that is wrong, from what `densify.bench.confidence` wrote."""
-    steps, tables = np.arange(NUM_RANKS), []
-    for name in GROUPS:
-        ranks, shares = np.array(written["tables"][name]).T
-        tables.append(np.interp((steps + 0.5) / NUM_RANKS, ranks, np.log10(shares)))
-    return np.array(tables)
+    """(G,2,R) share that is wrong, from what `densify.bench.confidence` wrote."""
+    middle = (np.arange(NUM_RANKS) + 0.5) / NUM_RANKS
+    knots = [[np.array(written["tables"][g][c]).T for c in CAUSES] for g in GROUPS]
+    return np.array([[np.interp(middle, *ends) for ends in row] for row in knots])
 
 
 def wrong(confidence: Float | Float32) -> Float:

@@ -275,11 +275,13 @@ class Ranked(NamedTuple):
     """What the confidence of a map's pixels was made from (`densify.depth.confidence`); (H,W).
 
     rank: float32 0 to 1, the greater the surer, 0 where ``filled_m`` has none. group: uint8, which
-    pixels are alike.
+    pixels are alike. contradicted: float32 0 to 1, how far what is measured around contradicts
+    itself.
     """
 
     rank: Float32
     group: NDArray[np.uint8]
+    contradicted: Float32
 
 
 @dataclass(frozen=True)
