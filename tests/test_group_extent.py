@@ -69,21 +69,41 @@ def test_a_wall_that_somebody_walks_along_stays():
 def test_what_one_sweep_saw_far_from_who_walks_is_none_of_it(speed_m_s, num_kept):
     """An echo that melted with that of a wall. Of what drives it may be a part that just came into
     view."""
-    rng, time_s = np.random.default_rng(0), 0.1 * np.arange(6)
-    body = rng.uniform(-0.3, 0.3, (40, 3)) * [1, 1, 3]
+    body = np.random.default_rng(0).uniform(-0.3, 0.3, (40, 3)) * [1, 1, 3]
+    echo = np.array([[0.0, 0.9, 0.0]])
+    claimed = [np.concatenate([body, echo[: i == 3]]) for i in range(6)]
+    seeds = [np.ones(len(points), bool) for points in claimed]
+    assert num_in_shape(claimed, seeds, speed_m_s) == num_kept
+
+
+@pytest.mark.parametrize(
+    ("length_m", "speed_m_s", "num_kept"), [(0.6, 1.4, 240), (4.2, 1.4, 480), (0.6, 5.0, 480)]
+)
+def test_a_wall_beside_who_walks_is_no_part_of_his_shape(length_m, speed_m_s, num_kept):
+    """Though each sweep's candidates hold as much of it as of him: nothing is seen through it. A
+    car's side that slides along itself is no other, so what is long or drives keeps it."""
+    rng = np.random.default_rng(0)
+    body = rng.uniform(-0.5, 0.5, (40, 3)) * [length_m, 0.5, 1.8]
+    wall = rng.uniform(-0.5, 0.5, (40, 3)) * [2.0, 0.0, 1.8] + [0.0, 0.7, 0.0]
+    claimed, seeds = [np.concatenate([body, wall])] * 6, [np.arange(80) < 40] * 6
+    assert num_in_shape(claimed, seeds, speed_m_s) == num_kept
+
+
+def num_in_shape(claimed, seeds, speed_m_s) -> int:
+    """Points of the shape of a track that claims these points in the object's frame, (N,3) a sweep,
+    of which some are seeds, (N,)."""
     track, standing = Track(np.zeros(3)), []
-    for i, at_s in enumerate(time_s):
-        state = np.array([speed_m_s * at_s, 0.0, 0.0, 0.0])
-        points = np.concatenate([body, np.tile([0.0, 0.9, 0.0], (int(i == 3), 1))]) + state[:3]
-        rows = np.arange(len(points))
-        seen = Standing(rows, points, np.full(len(rows), at_s), rows >= 0, 0 * rows, 1)
-        standing.append(seen)
+    time_s = 0.1 * np.arange(len(claimed))
+    for i, (at_s, points, seed) in enumerate(zip(time_s, claimed, seeds, strict=True)):
+        state, rows = np.array([speed_m_s * at_s, 0.0, 0.0, 0.0]), np.arange(len(points))
+        placed = points + state[:3]
+        standing.append(Standing(rows, placed, np.full(len(rows), at_s), seed, 0 * rows, 1))
         track.claimed[i] = rows
         track.sightings[i] = Sighting(state, at_s, round(at_s * 1e9), (i,))
     track.smooth()
     clock = Clock(np.rint(time_s * 1e9).astype(np.int64))
     space = SimpleNamespace(clock=clock, gap_m=lambda *_: 0.1)
-    assert len(shape_of(track, standing, space).points) == num_kept
+    return len(shape_of(track, standing, space).points)
 
 
 @pytest.mark.parametrize(

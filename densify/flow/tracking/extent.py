@@ -19,6 +19,7 @@ from densify.geometry import poses
 from densify.geometry.height_map import HeightMap
 from densify.geometry.sensor import Sensors
 from densify.kernels.clouds import Strips
+from densify.kernels.linking import close_to_seeds
 from densify.kernels.nearest import BoxTree
 from densify.types import Bool, Float, Float32, Int, Stretch
 
@@ -31,6 +32,8 @@ _LONGEST_HOLE_M = 0.6
 _CARRIED_SLACK_M = 0.5
 _MAX_CONTRADICTED = 0.05
 _WALKS_M_S, _FAST_M_S = 2.0, 8.0
+# Of what all sweeps saw so close so many must be seeds; who walks is smaller.
+_AROUND_M, _LEAST_SEEDS, _WALKER_M = 0.3, 0.1, 1.5
 _ALONE_GAPS, _NUM_BESIDE = 2.0, 2  # of an object's points so many lie so close in the same sweep
 _LEFT_M = 0.6  # from all of the object
 _THERE_M = 0.2
@@ -98,9 +101,12 @@ class Seen:
 def shape_of(track: Track, standing: Sequence[Standing], space: FreeSpace) -> Shape:
     """All that the sweeps saw of an object; of those who walk, what is small and comes into view at
     once, without what only even or only odd ones saw: echoes that melted with those of a wall
-    behind them, which would make parts of the wall theirs."""
+    behind them, which would make parts of the wall theirs; and without what hardly any sweep saw
+    through, if they are small then: the wall itself. (A slow car has sides that are not seen
+    through either.)"""
     sweeps = sorted(track.claimed)
-    halves = [track.seen_in(standing, some) for some in (sweeps[::2], sweeps[1::2])]
+    evenly = sweeps[::2], sweeps[1::2]
+    halves = [track.seen_in(standing, some) for some in evenly]
     points = np.concatenate(halves)
     if _speed_m_s(track, sweeps[len(sweeps) // 2], space.clock) > _WALKS_M_S:
         return Shape.of(points)
@@ -111,6 +117,10 @@ def shape_of(track: Track, standing: Sequence[Standing], space: FreeSpace) -> Sh
             for own, other in (halves, halves[::-1])
         ]
     )
+    seed = np.concatenate([standing[j].seed[track.claimed[j]] for some in evenly for j in some])
+    theirs = again & close_to_seeds(points, seed, _AROUND_M, _LEAST_SEEDS)
+    if theirs.any() and np.linalg.norm(np.ptp(points[theirs, :2], axis=0)) < _WALKER_M:
+        return Shape.of(points[theirs])
     return Shape.of(points[again] if again.any() else points)
 
 
