@@ -104,3 +104,17 @@ def test_streaks_go_and_surfaces_stay():
     assert not kept.filled_m[:38].any()
     assert (kept.filled_m[50:80, 20:60] > 0).all()
     assert kept.depth_m[40, 10] and kept.filled_m[60, 100]  # what is measured may stand alone
+
+
+def test_a_pillar_of_which_little_was_measured_is_not_filled_over():
+    """Before a wall at 20 m: a few returns at 5 m, too near to its edges to be accepted."""
+    wall = np.where(np.arange(SHAPE[1]) % 3 == 0, 20.0, 0.0) * np.ones(SHAPE)
+    wall[:, 58:63] = 0
+    plain = layers_of(wall, (3, 3))
+    rims = np.zeros(SHAPE, np.float32)
+    rims[::4, 60] = 5
+    knobs = ProjectSettings()
+    assert (fill(plain, knobs).filled_m[10:80, 59:62] > 0).all()
+    assert not fill(replace(plain, rim_m=rims), knobs).filled_m[10:80, 60].any()
+    veiled = replace(plain, rim_m=rims, veiled=rims > 0)  # nobody knows which of the two it is
+    assert (fill(veiled, knobs).filled_m[10:80, 59:62] > 0).all()

@@ -42,14 +42,19 @@ def voted(layers: Layers, before_m: Float32, least_share: float) -> Layers:
     pixels around.
 
     ``least_share`` of the votes (`densify.depth.votes`) must be in favour; what is filled has none,
-    it would vote for itself.
+    it would vote for itself. Rims that were not accepted may only turn the vote down, those that
+    are not veiled: the pillar of a car of which little was measured is not filled over.
     """
-    pixel = np.flatnonzero((layers.filled_m > 0) & (before_m == 0))
-    depth_m, seeds = layers.filled_m.flat[pixel], voters(layers, layers.depth_m)
-    dropped = pixel[~elected(layers, seeds, pixel, depth_m, least_share)]
+    filled = (layers.filled_m > 0) & (before_m == 0)
+    pixel = np.flatnonzero(filled)
+    with_rims_m = np.where(layers.veiled, layers.depth_m, np.maximum(layers.depth_m, layers.rim_m))
+    for known_m in (with_rims_m, layers.depth_m):
+        seeds, depth_m = voters(layers, known_m), layers.filled_m.flat[pixel]
+        pixel = pixel[elected(layers, seeds, pixel, depth_m, least_share)]
+    filled.flat[pixel] = False
     filled_m, confidence = layers.filled_m.copy(), layers.confidence.copy()
-    filled_m.flat[dropped] = 0
-    confidence.flat[dropped] = 0
+    filled_m[filled] = 0
+    confidence[filled] = 0
     return replace(layers, filled_m=filled_m, confidence=confidence)
 
 
