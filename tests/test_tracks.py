@@ -233,6 +233,27 @@ def test_a_ring_that_glides_over_a_bonnet_does_not_move_it(still, told):
         assert proven == (still == 80 or told[0] == (0, 30))
 
 
+@pytest.mark.parametrize(
+    ("still", "moved", "told", "proven"),
+    [
+        (108, 16, ((14, 15), (42, 0)), False),
+        (108, 16, ((14, 15), (0, 42)), True),  # it has left its places
+        (108, 5, ((14, 15), (42, 0)), True),  # its motion explains what was seen
+        (300, 16, ((14, 15), (42, 0)), True),  # many looks contradict that it stands
+    ],
+)
+def test_rings_that_glide_over_a_parked_car_do_not_move_it(still, moved, told, proven):
+    """A metre in a second, two rings of a car of which the rest is still there."""
+    track = followed(lambda n: [0.12 * n, 0, 0, 0], 10, [18.0, 0, 0], 8)
+    space = SimpleNamespace(gap_m=lambda *_: 0.4, clock=SimpleNamespace(time_s=np.arange(10) / 10))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(proof, "_as_fast_as_measured", lambda *_: True)
+        patch.setattr(proof, "_like_a_rail", lambda *_: False)
+        patch.setattr(proof, "contradictions", lambda *_: (still, moved, 1920))
+        patch.setattr(proof, "_left_places", lambda *_: told)
+        assert (proof.left_contradicted(track, [], space, []) is not None) == proven
+
+
 @pytest.mark.parametrize(("along_rad", "rail"), [(0.0, True), (0.6, True), (np.pi / 2, False)])
 def test_a_line_across_its_way_is_no_rail(along_rad, rail):
     """One ring on the back of a car ahead: its ends do not tell more, but the line itself does."""

@@ -87,8 +87,11 @@ def left_contradicted(
         return None
     short_s = _SHORT_OF_FEW_S if still < _FEW * num_asked else _SHORT_S
     allowed = max((_MAX_OF_SHORT_BARE if bare else _MAX_OF_SHORT) * still, _STRAY * num_asked)
-    if moved > allowed and seen_s < min(short_s, np.ptp(space.clock.time_s) / 2):
-        return None
+    if moved > allowed:
+        # Nor may rings that glide over a parked car, which is still there behind them.
+        glides = still < _SHARE_OF_FEW * num_asked and any(t > _MOSTLY * e for t, e in told)
+        if glides or seen_s < min(short_s, np.ptp(space.clock.time_s) / 2):
+            return None
     if not bare and still < _SHARE_OF_RAIL * num_asked and _like_a_rail(track, standing, space):
         return None
     return moved / num_asked
