@@ -352,10 +352,14 @@ def dask_scheduler(folder: Path, *options: str) -> Iterator[tuple[str, subproces
         )
         return started[-1]
 
+    def written() -> bool:
+        """It is there, and empty, before it says where the scheduler is."""
+        return place.exists() and place.read_text().rstrip().endswith("}")
+
     process = start("scheduler", "--port", "0", "--no-dashboard", "--host", "127.0.0.1")
-    start("worker", "--nworkers", "2", "--nthreads", "1", "--no-dashboard")
     try:
-        until(place.exists)
+        until(written)
+        start("worker", "--nworkers", "2", "--nthreads", "1", "--no-dashboard")
         address = re.search(r"(tcp|tls)://[0-9.:]+", place.read_text())
         assert address is not None
         yield address.group(), process
