@@ -230,8 +230,9 @@ def _reliability(evidence: Sequence[Evidence], tables: Float) -> list[dict[str, 
     sums = np.zeros((3, len(_STEPS)))
     for e in evidence:
         measured, filled = scale.curves(e.shown, tables)
-        filled_from = len(scale.GROUPS) * 2 // 3
-        log = np.where((np.arange(len(scale.GROUPS)) < filled_from)[:, None], measured, filled)
+        log = np.where(
+            (np.arange(len(scale.GROUPS)) < scale.NUM_MEASURED)[:, None], measured, filled
+        )
         step = np.searchsorted(_STEPS, np.clip(-log / scale.DECADES, 0, 1), side="right") - 1
         num, bad = e.compared[:, 0], np.zeros(log.shape)
         np.add.at(bad, (e.wrong.group, e.wrong.step), 1)

@@ -48,7 +48,8 @@ TABLES = Path(__file__).with_name("confidence.json")
 
 _RAGGED = np.array([0.1, 0.5])
 _NUM_RAGGED = len(_RAGGED) + 1
-_NUM_MEASURED = 2 * _NUM_RAGGED  # groups; those behind are filled
+NUM_MEASURED = 2 * _NUM_RAGGED
+"""Groups of measured pixels; those behind are of filled ones."""
 _AROUND = 4.0  # gaps between rays to all sides
 _TILT = 0.01  # decades over all ranks: pixels of different rank keep a different confidence
 _NUM_STEPS = 20
@@ -90,7 +91,7 @@ def calibrated(found: Ranked, shown: Bool, tables: Float | None = None) -> Float
     steps = np.arange(NUM_RANKS)
     measured, filled = (np.interp(place, steps, curve) for curve in log_wrong)
     confidence = np.zeros(shown.shape, np.float32)
-    log = np.where(group < _NUM_MEASURED, measured, filled) + _TILT * (0.5 - rank)
+    log = np.where(group < NUM_MEASURED, measured, filled) + _TILT * (0.5 - rank)
     confidence[shown] = np.clip(-log / DECADES, 0, 1)
     return confidence
 
@@ -116,7 +117,7 @@ def curves(pixels: Float, tables: Float) -> Float:
     wrong_num = np.minimum((pixels * tables).sum(axis=1), num)
     shares = [
         falling(num[part].sum(axis=0), wrong_num[part].sum(axis=0))
-        for part in (slice(_NUM_MEASURED), slice(_NUM_MEASURED, None))
+        for part in (slice(NUM_MEASURED), slice(NUM_MEASURED, None))
     ]
     return np.log10(np.clip(shares, 10.0 ** (_TILT - DECADES), 1))
 
