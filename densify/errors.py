@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 
-_LONG_VALUE = re.compile(r"""'[^']{201,}'|"[^"]{201,}"|\S{301,}""")
+_LONG_VALUE = re.compile(r"""(?<!\w)'[^']{201,}'|"[^"]{201,}"|\S{301,}""")
 _BREAK = re.compile(r"[\x00-\x1f\x7f\x85\u2028\u2029]+")
 _MOST_CHARACTERS = 1000
 
@@ -43,7 +43,7 @@ class ComputationError(_ShortError):
     """A stage found that its result cannot be trusted. Exit code 1."""
 
 
-class SweepError(ComputationError):
+class SweepError(_ShortError):
     """One sweep is in the way: without ``frame`` the others could be used."""
 
     def __init__(self, message: str, frame: int) -> None:
@@ -52,6 +52,14 @@ class SweepError(ComputationError):
 
     def __str__(self) -> str:
         return str(self.args[0])
+
+
+class UnfitSweepError(SweepError, InputError):
+    """It holds too few points, or its stamp cannot be right."""
+
+
+class UnplacedSweepError(SweepError, ComputationError):
+    """Registration does not find where it is."""
 
 
 def is_out_of_memory(error: Exception) -> bool:

@@ -185,7 +185,7 @@ def test_overrides_win_over_the_file_and_later_over_earlier() -> None:
         ),
         ("flwo.alpha=3", ["unknown section flwo", "did you mean flow?", "register, ground"]),
         ("flow.voxel_size_m=3", ["did you mean register.voxel_size_m?"]),
-        ("flow.qqq=3", ["expected a flow key: "]),
+        ("flow.qqq=3", ["expected a key of flow: "]),
         (
             "objective.alpha=ten",
             ["--set objective.alpha=ten", "got 'ten'", "a number from 0 to 1e+06"],

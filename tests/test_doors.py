@@ -20,7 +20,7 @@ import numpy as np
 import pytest
 
 from densify.config import resolve
-from densify.errors import ComputationError, InputError, OutputError, SweepError
+from densify.errors import ComputationError, InputError, OutputError, UnplacedSweepError
 from densify.files import content
 from densify.files.arrays import read_array, read_arrays
 from densify.files.content import gunzipped, read_bytes
@@ -363,9 +363,11 @@ def test_messages_echo_no_more_than_a_line(kind: type[Exception]) -> None:
         assert len(line) <= 1000
         assert line.startswith("/a/path: got ") and line.endswith(", expected a number")
         assert "..." in line
+    told = f"the sensor's file: {'one, ' * 50}or the car's"  # two apostrophes quote nothing
+    assert str(kind(told)) == told
     path = "/" + "p" * 250
     assert str(kind(f"{path}: is 'as it is'")) == f"{path}: is 'as it is'"
-    error = pickle.loads(pickle.dumps(SweepError("y" * 400, 3)))
+    error = pickle.loads(pickle.dumps(UnplacedSweepError("y" * 400, 3)))
     assert error.frame == 3 and len(str(error)) == 200
 
 

@@ -168,7 +168,7 @@ class Sparse(TinySequence):
 def test_an_almost_empty_key_cannot_be_registered(num_points):
     sequence = Sparse(one_car(()).scene, range(7))
     sequence.num_points = num_points
-    with pytest.raises(ComputationError, match=rf"sweep {KEY} has {num_points} points"):
+    with pytest.raises(InputError, match=rf"sweep {KEY} has {num_points} points"):
         run(sequence, KEY, 1)
 
 

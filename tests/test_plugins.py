@@ -194,9 +194,11 @@ def test_a_reader_of_another_package(package, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no known recording there; expected a KITTI raw drive"):
         densify.open_sequence(tmp_path / "there")
     package("densify.readers", "marked", code)
-    with pytest.raises(InputError, match="or marks"):
+    with pytest.raises(InputError, match=", marks"):
         densify.open_sequence(tmp_path / "there")
     (tmp_path / "there" / "mark").touch()
+    with pytest.raises(InputError, match="no recording itself; one in it is "):
+        densify.open_sequence(tmp_path)
     assert densify.open_sequence(tmp_path / "there") == (tmp_path / "there", None)
     assert densify.open_sequence(f"marked:{tmp_path}#night") == (tmp_path, "night")
     assert Spec.parse("marked:here").absolute() == f"marked:{Path.cwd()}/here"

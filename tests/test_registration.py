@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from densify.config import RegisterSettings
-from densify.errors import ComputationError, SweepError
+from densify.errors import ComputationError, InputError, SweepError
 from densify.geometry import poses
 from densify.readers.street import Street
 from densify.readers.window import read_sweep, recorded_trajectory
@@ -452,7 +452,7 @@ def test_a_pattern_that_turns_from_sweep_to_sweep_does_not_take_the_poses_with_i
 @pytest.mark.parametrize("num_points", [0, 50, 999])
 def test_too_few_points_names_the_frame(raw, num_points):
     sparse = raw[2].select(np.arange(len(raw[2])) < num_points)
-    with pytest.raises(ComputationError, match=rf"sweep 2 has {num_points} points.*at least 1000"):
+    with pytest.raises(InputError, match=rf"sweep 2 has {num_points} points.*at least 1000"):
         register([raw[0], raw[1], sparse], SETTINGS)
 
 
@@ -543,7 +543,7 @@ def test_stamps_have_to_ascend(drive, stamps):
     trajectory = replace(
         drive.trajectory(range(4)), stamp_ns=np.array(stamps, np.int64) * 100_000_000
     )
-    with pytest.raises(ComputationError, match=r"stamp of frame 2 is .* that of frame 1"):
+    with pytest.raises(InputError, match=r"stamp of frame 2 is .* that of frame 1"):
         check_plausible(trajectory, SETTINGS)
 
 

@@ -17,13 +17,14 @@ from densify.cli.options import (
     add_window,
     natural,
     recording_keys,
+    sentence,
     words,
 )
 
 
 def add_bench(commands: Any) -> None:
     about = "measured tables: this package's methods beside published ones"
-    parser = commands.add_parser("bench", help=about, description=f"{about.capitalize()}.")
+    parser = commands.add_parser("bench", help=about, description=sentence(about))
     benches = parser.add_subparsers(title="benches", metavar="WHAT", required=True)
     _add_bench_flow(benches)
     _add_bench_depth(benches)

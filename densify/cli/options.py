@@ -41,12 +41,17 @@ def add_verb(
 ) -> argparse.ArgumentParser:
     """A verb of the command line, which calls ``verb`` with its options."""
     parser: argparse.ArgumentParser = commands.add_parser(
-        name, help=about, description=f"{about[0].upper()}{about[1:]}.", epilog=epilog or None
+        name, help=about, description=sentence(about), epilog=epilog or None
     )
     parser.set_defaults(verb=verb, name=name)
     parser.add_argument("--json", action="store_true", help="print one JSON object, nothing else")
     parser.add_argument("--quiet", action="store_true", help="say nothing but errors")
     return parser
+
+
+def sentence(about: str) -> str:
+    """What a verb is about, as it stands above its options."""
+    return f"{about[0].upper()}{about[1:]}."
 
 
 def config_epilog() -> str:
@@ -243,10 +248,8 @@ def frame_range(text: str) -> range:
     return range(int(first), int(end))
 
 
-def key_slice(text: str) -> slice | None:
-    """``all``, which is None, or ``A:B[:S]``."""
-    if text == "all":
-        return None
+def key_slice(text: str, other: str = "") -> slice:
+    """``A:B[:S]``; ``other``: what the option takes too, for the message."""
     numbers = text.split(":")
     if len(numbers) in (2, 3) and _are_digits(*numbers):
         first, end = int(numbers[0]), int(numbers[1])
@@ -254,9 +257,14 @@ def key_slice(text: str) -> slice | None:
         if first < end and step > 0:
             return slice(first, end, step)
     raise argparse.ArgumentTypeError(
-        f"got {text!r}, expected all, or A:B[:S] with A < B, for example 0:100:5 for frames 0, 5 "
+        f"got {text!r}, expected {other}A:B[:S] with A < B, for example 0:100:5 for frames 0, 5 "
         f"to 95"
     )
+
+
+def all_or_slice(text: str) -> slice | None:
+    """``all``, which is None, or ``A:B[:S]``."""
+    return None if text == "all" else key_slice(text, "all, or ")
 
 
 def recording_keys(text: str) -> tuple[str, list[int]]:

@@ -49,13 +49,13 @@ def checked(section: type[Section], key: str, value: Any, where: str) -> Any:
         kind = next(t for t in typing.get_args(kind) if t is not types.NoneType)
         if value is None:
             return None
-    checked = _as(kind, value)
+    typed = _as(kind, value)
     low, high, choices = (field.metadata[m] for m in ("low", "high", "choices"))
-    if checked is not None:
-        if choices is not None and checked in choices:
-            return checked
-        if choices is None and (kind in (bool, str) or low <= checked <= high):
-            return checked
+    if typed is not None:
+        if choices is not None and typed in choices:
+            return typed
+        if choices is None and (kind in (bool, str) or low <= typed <= high):
+            return typed
     if choices is not None:
         expected = f"one of {', '.join(choices)}"
     elif kind is bool:

@@ -120,7 +120,7 @@ def _key_suggestion(section: str, key: str, values: Mapping[str, Mapping[str, An
     for other, keys in values.items():
         if key in keys:
             return f"did you mean {other}.{key}?"
-    return _suggestion(key, list(values[section]), f"{section} key")
+    return _suggestion(key, list(values[section]), f"key of {section}")
 
 
 def _suggestion(got: str, known: Sequence[str], kind: str) -> str:

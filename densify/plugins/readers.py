@@ -118,13 +118,13 @@ READERS = Table(
             "kitti",
             "densify.readers.kitti.raw",
             recognises=lambda path: (path / "velodyne_points").is_dir(),
-            holds="a KITTI raw drive (a folder that holds velodyne_points/)",
+            holds="a KITTI raw drive (with velodyne_points/)",
         ),
         Reader(
             "argoverse2",
             "densify.readers.argoverse2",
             recognises=_is_argoverse2,
-            holds="an Argoverse 2 log (a folder that holds city_SE3_egovehicle.feather)",
+            holds="an Argoverse 2 log (with city_SE3_egovehicle.feather)",
             scenes=True,
             boxes="annotations.feather",
         ),
@@ -134,7 +134,7 @@ READERS = Table(
             recognises=lambda path: (
                 (path / "sample_data.json").is_file() or any(path.glob("v*/sample_data.json"))
             ),
-            holds="nuScenes or TruckScenes (a folder that holds v1.0-*/sample_data.json)",
+            holds="nuScenes or TruckScenes (with v1.0-*/sample_data.json)",
             scenes=True,
             boxes="v1.0-*/sample_annotation.json",
         ),
@@ -144,7 +144,7 @@ READERS = Table(
             recognises=lambda path: (
                 (path / "lidar_calibration").is_dir() and any((path / "lidar").glob("*.parquet"))
             ),
-            holds="Waymo's version 2 (a folder that holds lidar/*.parquet)",
+            holds="Waymo's version 2 (with lidar/*.parquet)",
             scenes=True,
             boxes="lidar_box/CONTEXT.parquet",
         ),
@@ -159,21 +159,21 @@ READERS = Table(
             "pandaset",
             "densify.readers.pandaset.reader",
             recognises=lambda path: (path / "lidar" / "poses.json").is_file(),
-            holds="a PandaSet sequence (a folder that holds lidar/poses.json)",
+            holds="a PandaSet sequence (with lidar/poses.json)",
             boxes="annotations/cuboids/00.pkl.gz",
         ),
         Reader(
             "kitti-360",
             "densify.readers.kitti.kitti_360",
             recognises=lambda path: (path / "data_3d_raw").is_dir(),
-            holds="KITTI-360 (a folder that holds data_3d_raw/)",
+            holds="KITTI-360 (with data_3d_raw/)",
             scenes=True,
         ),
         Reader(
             "kitti-tracking",
             "densify.readers.kitti.tracking",
             recognises=lambda path: any((path / "velodyne").glob("[0-9][0-9][0-9][0-9]/")),
-            holds="KITTI tracking (a folder that holds velodyne/0000/)",
+            holds="KITTI tracking (with velodyne/0000/)",
             scenes=True,
             boxes="label_02/0000.txt",
         ),
@@ -195,7 +195,7 @@ READERS = Table(
             "dgp",
             "densify.readers.dgp",
             recognises=_is_dgp,
-            holds="a DGP scene such as DDAD's (a folder that holds scene_<hash>.json)",
+            holds="a DGP scene such as DDAD's (with scene_<hash>.json)",
             scenes=True,
         ),
         Reader(

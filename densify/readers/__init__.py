@@ -4,12 +4,15 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple, Protocol, cast
 
 from densify.errors import InputError
 from densify.plugins.readers import READERS, Reader
 from densify.types import LidarSequence
+
+_MOST_FOLDERS = 50  # are looked into for a recording, where a place is none itself
 
 
 class ReaderModule(Protocol):
@@ -108,5 +111,18 @@ def _reader_of(parsed: Spec, text: str) -> Reader:
     for reader in readers:
         if reader.recognises(parsed.path):
             return reader
-    known = " or ".join(reader.holds for reader in readers)
+    inside = _recording_in(parsed.path, readers)
+    if inside is not None:
+        raise InputError(f"--data {text}: no recording itself; one in it is {inside}: name that")
+    *most, last = (reader.holds for reader in readers)
+    known = f"{', '.join(most)} or {last}"
     raise InputError(f"--data {text}: no known recording there; expected {known}")
+
+
+def _recording_in(path: Path, readers: Sequence[Reader]) -> Path | None:
+    """The first folder of a place that is a recording."""
+    folders = sorted(p for p in path.iterdir() if p.is_dir()) if path.is_dir() else []
+    for folder in folders[:_MOST_FOLDERS]:
+        if any(reader.recognises(folder) for reader in readers):
+            return folder
+    return None

@@ -33,7 +33,6 @@ from densify.cache import Cache
 from densify.config import Config
 from densify.depth.accumulate import accumulate
 from densify.depth.object_tracks import object_tracks
-from densify.errors import InputError, SweepError
 from densify.flow.engines import estimate_motion
 from densify.flow.scene import Scene
 from densify.geometry import poses
@@ -117,8 +116,8 @@ class Recording:
     def window_frames(self, key: int) -> WindowFrames:
         """The frames of a key's window, and where it is cut and why.
 
-        Raises InputError if the key does not exist or cannot be read, SweepError if it cannot be
-        registered, or none of its neighbours can.
+        Raises InputError if the key does not exist or cannot be used, UnplacedSweepError if it
+        cannot be registered; SweepError if none of its neighbours can.
         """
         found = self.timeline.window(key, self._num_around)
         number = self.cut.number_of[key]
@@ -126,17 +125,15 @@ class Recording:
         for b in self._places.blocks_with(number, found.frames):
             own = self.cut.blocks[b].frames
             bad |= {f: why for f, why in self.steps.registration(b).bad.items() if f in own}
-        if key in bad and bad[key].unreadable:
-            raise InputError(bad[key].reason)
         if key in bad:
-            raise SweepError(bad[key].reason, key)
+            raise bad[key].error(key)
         reasons = {f: why.reason for f, why in bad.items()}
         piece = self._places.piece(key)[1]
         window = self.timeline.window(key, self._num_around, reasons)
         window = WindowFrames(tuple(f for f in window.frames if f in piece.frames), window.cuts)
         failed = [f for f in found.frames if f in bad and not bad[f].unreadable]
         if failed and len(window.frames) == 1:
-            raise SweepError(bad[failed[0]].reason, failed[0])
+            raise bad[failed[0]].error(failed[0])
         return window
 
     def window(self, key: int) -> Stretch:

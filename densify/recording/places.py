@@ -9,7 +9,7 @@ from functools import lru_cache, partial
 
 from densify.cache import Cache, kept
 from densify.config import RegisterSettings
-from densify.errors import InputError, SweepError
+from densify.errors import InputError, SweepError, UnfitSweepError
 from densify.process.costs import Watch
 from densify.readers.timeline import Timeline
 from densify.readers.window import recorded_trajectory
@@ -76,7 +76,8 @@ class Places:
                 with self._watch.stage("register"):
                     pieces.append(find_trajectory(sweeps, self._settings, recorded))
             except SweepError as error:
-                bad[error.frame] = LeftOut(str(error), unreadable=False)
+                unfit = isinstance(error, UnfitSweepError)
+                bad[error.frame] = LeftOut(str(error), unreadable=False, unfit=unfit)
                 left += self._timeline.runs([f for f in run if f != error.frame])
         return Registration(tuple(sorted(pieces, key=lambda p: p.frames)), bad)
 

@@ -14,7 +14,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from densify.config import RegisterSettings
-from densify.errors import SweepError
+from densify.errors import SweepError, UnfitSweepError, UnplacedSweepError
 from densify.geometry import poses
 from densify.types import Float, Int, Sweep, Trajectory
 
@@ -54,7 +54,7 @@ def register(
         sweep is searched for where the vehicle would be if it kept its velocity; the first one by
         `searched_twist`, since odometry takes every start for standing still.
 
-    World is the first sweep's lidar frame. Raises SweepError naming the frames where a sweep
+    World is the first sweep's lidar frame. Raises UnfitSweepError naming the frame where a sweep
     is too sparse to register or the stamps do not ascend. Whether the motion is one that a vehicle
     makes say `check_plausible` and `check_overlap`; a first pass may stumble where it starts from
     rest.
@@ -86,10 +86,10 @@ def register(
 
 
 def check_number_of_points(sweeps: Sequence[Sweep], settings: RegisterSettings) -> None:
-    """Raise SweepError for a sweep too sparse to be placed."""
+    """Raise UnfitSweepError for a sweep too sparse to be placed."""
     for sweep in sweeps:
         if len(sweep) < settings.min_num_points:
-            raise SweepError(
+            raise UnfitSweepError(
                 f"registration: sweep {sweep.frame} has {len(sweep)} points, expected at least "
                 f"{settings.min_num_points}; choose another key or lower register.min_num_points",
                 sweep.frame,
@@ -163,26 +163,26 @@ def _standing(points: Float) -> Float:
 
 
 def check_stamps(frames: Sequence[int], stamp_ns: Int) -> None:
-    """Raise SweepError where time does not go on."""
+    """Raise UnfitSweepError where time does not go on."""
     for (a, b), step_ns in zip(pairwise(frames), np.diff(stamp_ns), strict=True):
         if step_ns <= 0:
-            raise SweepError(
+            found = f"{1e-6 * -step_ns:.1f} ms before it" if step_ns else "the same"
+            raise UnfitSweepError(
                 f"registration: the stamp of frame {b} is not after that of frame {a}, but "
-                f"{1e-6 * -step_ns:.1f} ms before it; expected ascending stamps; check the "
-                f"recording's timestamps",
+                f"{found}; expected ascending stamps; check the recording's timestamps",
                 b,
             )
 
 
 def check_plausible(trajectory: Trajectory, settings: RegisterSettings) -> None:
-    """Raise SweepError where the trajectory jumps as no vehicle does."""
+    """Raise UnplacedSweepError where the trajectory jumps as no vehicle does."""
     check_stamps(trajectory.frames, trajectory.stamp_ns)
     step_s = np.diff(trajectory.stamp_ns) * 1e-9
     pairs = list(pairwise(trajectory.frames))
     T = trajectory.T_world_lidar
     if not np.isfinite(T).all():
         bad = trajectory.frames[int(np.argmin(np.isfinite(T).all((1, 2))))]
-        raise SweepError(f"registration: the pose of frame {bad} is not finite", bad)
+        raise UnplacedSweepError(f"registration: the pose of frame {bad} is not finite", bad)
     steps = [poses.log(poses.inverse(a) @ b) for a, b in pairwise(T)]
     previous_m_s: Float | None = None
     for (a, b), step, seconds in zip(pairs, steps, step_s, strict=True):
@@ -191,7 +191,7 @@ def check_plausible(trajectory: Trajectory, settings: RegisterSettings) -> None:
         slack_m_s = _POSE_NOISE_M / seconds
         speed_m_s = float(np.linalg.norm(velocity_m_s))
         if speed_m_s > settings.max_speed_m_s + slack_m_s or turn_deg_s > _MAX_TURN_RATE_DEG_S:
-            raise SweepError(
+            raise UnplacedSweepError(
                 f"registration jumps from frame {a} to {b}: {speed_m_s:.0f} m/s and "
                 f"{turn_deg_s:.0f} deg/s, expected at most {settings.max_speed_m_s:g} m/s and "
                 f"{_MAX_TURN_RATE_DEG_S:.0f} deg/s; {_cure(settings)}",
@@ -200,7 +200,7 @@ def check_plausible(trajectory: Trajectory, settings: RegisterSettings) -> None:
         if previous_m_s is not None:
             change_m_s = float(np.linalg.norm(velocity_m_s - previous_m_s))
             if change_m_s > _MAX_ACCELERATION_M_S2 * seconds + slack_m_s:
-                raise SweepError(
+                raise UnplacedSweepError(
                     f"registration jumps at frame {a}: the speed changes by {change_m_s:.1f} m/s "
                     f"within {seconds:.2f} s, expected a vehicle's; {_cure(settings)}",
                     a,
@@ -220,11 +220,11 @@ def is_plausible(trajectory: Trajectory, settings: RegisterSettings) -> bool:
 def check_overlap(
     sweeps: Sequence[Sweep], trajectory: Trajectory, settings: RegisterSettings
 ) -> None:
-    """Raise SweepError where a sweep does not lie on those of the last third of a second: odometry
-    may glide on at the expected speed over sweeps that have nothing to do with each other. The one
-    sweep before would do for rings, but not for a pattern that does not repeat; where less than a
-    third of a second was before, the next third must lie there both ways. Sweeps too sparse to tell
-    are passed over."""
+    """Raise UnplacedSweepError where a sweep does not lie on those of the last third of a second:
+    odometry may glide on at the expected speed over sweeps that have nothing to do with each other.
+    The one sweep before would do for rings, but not for a pattern that does not repeat; where less
+    than a third of a second was before, the next third must lie there both ways. Sweeps too sparse
+    to tell are passed over."""
     frames, stamp_ns = trajectory.frames, trajectory.stamp_ns
 
     def standing(i: int) -> Float:
@@ -246,7 +246,7 @@ def check_overlap(
             )
             share = max(share, both_ways)
         if share < settings.min_overlap:
-            raise SweepError(
+            raise UnplacedSweepError(
                 f"registration fails from frame {frames[i - 1]} to {frames[i]}: only "
                 f"{100 * share:.1f} % of what stands there lies on the sweeps before, expected at "
                 f"least {100 * settings.min_overlap:.1f} %; lower register.min_overlap, or "

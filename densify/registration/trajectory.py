@@ -11,6 +11,7 @@ import numpy as np
 
 from densify.clock import Clock
 from densify.config import RegisterSettings
+from densify.errors import InputError, SweepError, UnfitSweepError, UnplacedSweepError
 from densify.geometry import poses
 from densify.registration.deskew import deskew
 from densify.registration.neighbors import refine
@@ -30,10 +31,18 @@ _AROUND_MANY_NS, _AROUND_FEW_NS = 550_000_000, 1_050_000_000
 
 
 class LeftOut(NamedTuple):
-    """Why a sweep is not used. unreadable: it could not be read; else not registered."""
+    """Why a sweep is not used. unreadable: it could not be read; else it was not registered,
+    because of what it holds if unfit."""
 
     reason: str
     unreadable: bool
+    unfit: bool = False
+
+    def error(self, frame: int) -> InputError | SweepError:
+        """What to raise where nothing can be made without the sweep."""
+        if self.unreadable:
+            return InputError(self.reason)
+        return (UnfitSweepError if self.unfit else UnplacedSweepError)(self.reason, frame)
 
 
 @dataclass(frozen=True)

@@ -17,9 +17,9 @@ from densify.cli.options import (
     add_short_options,
     add_verb,
     add_window,
+    all_or_slice,
     config_epilog,
     config_of,
-    key_slice,
     natural,
     shard,
     size_bytes,
@@ -44,7 +44,7 @@ def add(commands: Any) -> None:
     )
     parser.add_argument(
         "--keys",
-        type=key_slice,
+        type=all_or_slice,
         default="all",
         metavar="all|A:B[:S]",
         help="frames A to B-1, every S-th (default: all)",

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from densify.cli.answer import Answer
-from densify.cli.options import add_overwrite, add_verb, natural, positive
+from densify.cli.options import add_overwrite, add_verb, natural, positive, sentence
 from densify.cli.progress import steps_on_stderr
 from densify.errors import InputError
 
@@ -17,7 +17,7 @@ from densify.errors import InputError
 def add(commands: Any) -> None:
     """Its options."""
     about = "train a network for scene flow; a trained one is the engine network:MODEL"
-    parser = commands.add_parser("train", help=about, description=f"{about.capitalize()}.")
+    parser = commands.add_parser("train", help=about, description=sentence(about))
     kinds = parser.add_subparsers(title="trainings", metavar="WHAT", required=True)
     flow = add_verb(
         kinds,
