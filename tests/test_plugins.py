@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 
 import densify
+from densify.cli import main
 from densify.config import resolve
 from densify.errors import InputError
 from densify.flow.engines import check_engine
@@ -203,6 +204,20 @@ def test_a_reader_of_another_package(package, tmp_path: Path) -> None:
     assert densify.open_sequence(f"marked:{tmp_path}#night") == (tmp_path, "night")
     assert Spec.parse("marked:here").absolute() == f"marked:{Path.cwd()}/here"
     assert [row.name for row in READERS][-1] == "marked"
+
+
+def test_what_another_package_raises_is_not_our_bug(package, tmp_path, monkeypatch, capsys):
+    code = """
+        def recognises(path):
+            return False
+        def open_recording(path, scene):
+            raise KeyError("mark")
+    """
+    package("densify.readers", "marked", code)
+    monkeypatch.setenv("DENSIFY_CACHE_DIR", str(tmp_path / "cache"))
+    assert main(["info", "--data", "marked:here"]) == 1
+    said = capsys.readouterr().err
+    assert re.fullmatch(r"densify: reader marked of the package stranger: Key.*\.log\n", said)
 
 
 RESULT = SimpleNamespace(

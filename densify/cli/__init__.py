@@ -17,7 +17,7 @@ from typing import NoReturn, TextIO
 
 from densify.cli.arguments import parse
 from densify.cli.screen import Screen
-from densify.errors import ComputationError, InputError, is_out_of_memory
+from densify.errors import ComputationError, InputError, brief, is_out_of_memory
 from densify.process.heap import keep_freed_memory
 
 DONE, FAILED, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
@@ -51,10 +51,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 advice = "try a smaller --window, fewer --workers or one --camera"
                 return screen.end(FAILED, f"out of memory; {advice}")
             from densify.cli.bugs import kept
+            from densify.plugins.table import whose
 
-            log = kept(error)
+            blame, log = whose(error), kept(error)
             said = f"this is a bug in densify; please report it with the log at {log}"
-            return screen.end(FAILED, said)
+            if blame:
+                said = f"{blame}: {type(error).__name__}: {error}; its makers can use the log {log}"
+            return screen.end(FAILED, brief(said))
 
 
 def script() -> NoReturn:

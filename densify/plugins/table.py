@@ -9,6 +9,7 @@ A package adds a row by an entry point: the name is the row's, the value is a mo
 
 from __future__ import annotations
 
+import traceback
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from importlib import import_module
@@ -37,6 +38,16 @@ class Row(Protocol):
 
 
 R = TypeVar("R", bound=Row)
+_LOADED: dict[str, str] = {}  # other people's modules, by the name of the outermost: what they are
+
+
+def whose(error: BaseException) -> str:
+    """Which row of another package an exception went through, "" if none."""
+    for frame, _ in traceback.walk_tb(error.__traceback__):
+        module = str(frame.f_globals.get("__name__"))
+        if (found := module.partition(".")[0]) in _LOADED:
+            return _LOADED[found]
+    return ""
 
 
 @dataclass(frozen=True)
@@ -108,18 +119,20 @@ class Table(Generic[R]):
             raise InputError(
                 f"{self.kind} {name}: comes with the packages {packages}; uninstall all but one"
             )
+        what = f"{self.kind} {name} of the package {packages}"
         try:
             module = points[0].load()
         except Exception as error:  # whatever a stranger's import raises
             reason = " ".join(f"{type(error).__name__}: {error}".split())
             raise InputError(
-                f"{self.kind} {name} of the package {packages}: cannot be imported from "
-                f"{points[0].value} ({reason}); mend or uninstall the package"
+                f"{what}: cannot be imported from {points[0].value} ({reason}); mend or uninstall "
+                f"the package"
             ) from error
         missing = [m for m in self.members if not callable(getattr(module, m, None))]
         if missing or not isinstance(module, ModuleType):
             raise InputError(
-                f"{self.kind} {name} of the package {packages}: {points[0].value} is no module "
-                f"with {', '.join(self.members)}; mend or uninstall the package"
+                f"{what}: {points[0].value} is no module with {', '.join(self.members)}; mend or "
+                f"uninstall the package"
             )
+        _LOADED[module.__name__.partition(".")[0]] = what
         return self.row_of(name, module, points[0].dist.version if points[0].dist else "")

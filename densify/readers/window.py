@@ -38,10 +38,9 @@ def choose_cameras(sequence: LidarSequence, names: Sequence[str] | None) -> list
         raise InputError(f"cameras: got {names!r}, expected a list of names, such as {one}")
     for name in names or ():
         if name not in sequence.cameras:
-            known = ", ".join(sequence.cameras) or "none"
-            raise InputError(
-                f"--camera {name}: no such camera in {sequence.name}; expected one of {known}"
-            )
+            known = ", ".join(sequence.cameras)
+            expected = f"expected one of {known}" if known else "it has none; leave --camera out"
+            raise InputError(f"--camera {name}: no such camera in {sequence.name}; {expected}")
     if names is None:
         names = [n for n in sequence.cameras if sequence.image_stamps_ns(n)] or [*sequence.cameras]
     return [sequence.cameras[name] for name in names]
