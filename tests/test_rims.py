@@ -77,6 +77,21 @@ def test_rims_are_kept_on_the_side_where_the_image_has_them():
     assert np.array_equal(made.filled_m, made.depth_m)
 
 
+def test_of_what_moves_fewer_votes_are_enough():
+    layers, image, truth = scene()
+    still = decided(layers, image).depth_m > 0
+    panels = np.maximum(layers.depth_m, layers.rim_m) < WALL_M
+    moving = decided(replace(layers, moving=panels), image).depth_m > 0
+    more = moving & ~still
+    right = np.isclose(layers.rim_m, truth)
+    assert np.all(moving[still])
+    rims = layers.rim_m > 0
+    assert more.sum() > 0.2 * (right & rims).sum()
+    assert right[more].mean() > 0.7
+    strict = decided(replace(layers, moving=panels), None)
+    assert np.array_equal(strict.depth_m, layers.depth_m)
+
+
 def test_confidence_leads_from_the_strict_map_to_the_widest():
     layers, image, truth = scene()
     kept, all_of_them = decided(layers, image), decided(layers, image, "keep")
@@ -222,7 +237,7 @@ def test_a_mirrored_scene_has_mirrored_votes():
         *(
             np.ascontiguousarray(getattr(layers, name)[:, ::-1])
             for name in vars(layers)
-            if name not in ("lab", "warnings", "window", "glass", "alone")
+            if name not in ("lab", "warnings", "window", "glass", "alone", "moving")
         )
     )
     rims, mirrored = (np.flatnonzero(part.rim_m) for part in (layers, flipped))

@@ -27,8 +27,8 @@ class Layers:
     elevation, everywhere. lab: (H,W,3) float32 the image as `densify.depth.picture` makes it, None
     without one. warnings: what could not be done as asked. window: (H,W) True inside the windows of
     vehicles, and glass: where a measured pixel was taken out of one; None before they are closed.
-    alone: (H,W) measured by the key sweep alone, where others should have met the surface; None for
-    nowhere.
+    alone: (H,W) measured by the key sweep alone, where others should have met the surface; moving:
+    of what moves; None for nowhere.
     """
 
     depth_m: Float32
@@ -45,6 +45,7 @@ class Layers:
     window: Bool | None = None
     glass: Bool | None = None
     alone: Bool | None = None
+    moving: Bool | None = None
 
     @property
     def gap_px(self) -> Float32:

@@ -118,10 +118,11 @@ def _measured(
     confidence.flat[seen.pixel] = np.maximum(seen.confidence, _LEAST_CONFIDENCE)
     tilt.reshape(-1, 2)[seen.pixel] = seen.tilt
     point.flat[seen.pixel] = points.index[seen.winner]
-    veiled, refused, alone = (np.zeros(shape, bool) for _ in range(3))
+    veiled, refused, alone, moving = (np.zeros(shape, bool) for _ in range(4))
     veiled.flat[seen.pixel] = seen.veiled
     refused.flat[seen.pixel] = seen.refused
     alone.flat[seen.pixel] = seen.alone
+    moving.flat[seen.pixel] = points.moving[seen.winner]
     spacing_px = _spacing_px(points if points.far.all() else points.select(~points.far), shape)
     return Layers(
         depth_m=depth_m,
@@ -135,6 +136,7 @@ def _measured(
         spacing_px=spacing_px,
         lab=lab,
         alone=alone,
+        moving=moving,
     )
 
 

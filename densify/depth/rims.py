@@ -19,6 +19,8 @@ MOST_CONFIDENCE = 0.2
 _NUM_ROUNDS = 2
 _RIM_WEIGHT = 0.5  # of a rim's own vote, at most
 _LEAST_SHARE = 0.97  # of the votes for a pixel that is kept
+# Of what moves rims of fewer votes are right too: what the key sweep saw past is refused anyway.
+_LEAST_OF_MOVERS = 0.7
 _FEW = 100  # rims, of which nothing can be told
 _SUREST = 2.5  # -log10 of the share against
 _MISFIT = (
@@ -37,8 +39,8 @@ def decide(layers: Layers, settings: ProjectSettings) -> Layers:
     right beside a nearer surface, whose patches are larger than itself.
 
     Known pixels vote for or against them (`densify.depth.votes`); rims vote too, by half, in a
-    second round less the less they are believed. Kept is what has 97 % of the votes, but nothing
-    that is ``refused``.
+    second round less the less they are believed. Kept is what has 97 % of the votes, of
+    what moves 70 %, but nothing that is ``refused``.
 
     An image that lies up to 3 steps aside is moved, with a warning that says how far. To one that
     does not belong to the depth or is blurred (`densify.depth.picture.laid_over`) nobody listens:
@@ -59,6 +61,8 @@ def decide(layers: Layers, settings: ProjectSettings) -> Layers:
             if laid.right_px or laid.down_px:
                 warnings = (*warnings, _MOVED.format(laid=laid))
     believed = share >= _LEAST_SHARE
+    if layers.moving is not None:
+        believed |= layers.moving.flat[rims] & (share >= _LEAST_OF_MOVERS)
     if settings.rims == "strict":
         believed[:] = False
     elif settings.rims == "keep":
