@@ -96,7 +96,7 @@ def test_fits_and_checks_by_the_verb(tmp_path: Path, capsys: pytest.CaptureFixtu
     out = tmp_path / "table.json"
     street = "street:static?sensor=vlp16"
     arguments = ["--fit", f"{street}@40", "--check", f"{street}&seed=2@40", "--window", "1"]
-    chosen = ["--camera", "image_02", "--out", str(out)]
+    chosen = ["--config", "fast", "--camera", "image_02", "--out", str(out)]
     assert main(["bench", "confidence", *arguments, *chosen]) == 0
     written, shown = json.loads(out.read_text()), capsys.readouterr().out
     assert [m["camera"] for m in written["maps"]] == ["image_02"]

@@ -24,7 +24,7 @@ def test_every_scene_is_a_street_that_opens():
 
 
 def test_a_row_is_what_its_bench_measures(capsys, monkeypatch):
-    scene = readme.Scene("street:static?seed=5", (30,), window=1)
+    scene = readme.Scene("street:static?seed=5&sensor=vlp16", (30,), window=1)
     table = readme.TABLES["flow"]._replace(scenes=(scene,))
     monkeypatch.setattr(readme, "TABLES", {"flow": table, "none": table._replace(scenes=())})
     assert main(["bench", "readme", "flow", "none"]) == 0
@@ -34,7 +34,7 @@ def test_a_row_is_what_its_bench_measures(capsys, monkeypatch):
     assert about == table.about and rule.count("---") == titles.count("|") - 1
     cells = [cell.strip() for cell in row.strip("|").split("|")]
     # Nothing moves on this street, and nothing is said to.
-    assert cells[:5] == ["`street:static?seed=5`, key 30", "– %", "–", "–", "0.0000 %"]
+    assert cells[:5] == ["`street:static?seed=5&sensor=vlp16`, key 30", "– %", "–", "–", "0.0000 %"]
     assert re.fullmatch(r"0\.\d\d %", cells[5]) and cells[6] == ""
 
 
@@ -67,7 +67,9 @@ def test_the_results_name_the_command_of_each_table(name):
 def test_wrong_images_are_measured_against_strict_maps(monkeypatch):
     wrong = {name: images.FAULTS[name] for name in ("right", "noise instead")}
     monkeypatch.setattr(images, "FAULTS", wrong)
-    found = images.bench_images(open_sequence("street:static?seed=5"), 30, "image_02", 1)
+    found = images.bench_images(
+        open_sequence("street:static?seed=5&sensor=vlp16"), 30, "image_02", 1
+    )
     assert [*found] == ["right", "noise instead", "the next frame's"]
     assert found["noise instead"] == [images.Compared(None, None)]
     right = found["right"][0]

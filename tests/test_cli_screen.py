@@ -105,10 +105,10 @@ def test_the_published_flow_is_known_to_take_long() -> None:
     assert with_paper.at()[1] > 2 * without.at()[1]
 
 
-def test_a_run_shows_one_bar_on_a_terminal(tmp_path: Path) -> None:
+def test_a_run_shows_one_bar_on_a_terminal(border_drive: Path, tmp_path: Path) -> None:
     command = [
-        *("run", "--key", "120", "--window", "1", "--config", "fast", "--camera", "image_02"),
-        *("--data", "street?sensor=vlp16", "--out", str(tmp_path / "out")),
+        *("run", "--key", "40", "--window", "1", "--config", "fast", "--camera", "image_02"),
+        *("--data", str(border_drive), "--out", str(tmp_path / "out")),
     ]
     terminal, side = pty.openpty()
     fcntl.ioctl(side, termios.TIOCSWINSZ, struct.pack("HHHH", 24, 100, 0, 0))
@@ -131,7 +131,7 @@ def test_a_run_shows_one_bar_on_a_terminal(tmp_path: Path) -> None:
     lines = stdout.splitlines()
     first = [line.split()[0] for line in lines[lines.index("open first:") + 1 :]]
     names = ["figure.png", "depth_filled/image_02.png", "cloud.laz"]
-    assert first == [str(tmp_path / "out" / "000120" / name) for name in names]
+    assert first == [str(tmp_path / "out" / "000040" / name) for name in names]
     assert all(Path(path).is_file() for path in first)
 
 

@@ -155,12 +155,8 @@ def test_a_set_ends_with_its_warnings_and_keeps_them(layout, border_drive, tmp_p
 
 class TestKitti:
     @pytest.fixture
-    def drive(self, tmp_path):
-        from densify.readers.street import Street
-        from densify.writers import write_street
-
-        street = Street()
-        return write_street("kitti", street, tmp_path, [0, 1], ["image_02"])
+    def drive(self, border_drive, tmp_path):
+        return copy_drive(border_drive, tmp_path / "2011_09_26")
 
     def test_gaps(self, drive):
         assert KittiRaw(drive).gaps() == []

@@ -52,9 +52,8 @@ def test_street(tmp_path: Path) -> None:
     assert f"depth in {np.mean(depth_m > 0):.1%} of the pixels" in text
 
 
-def test_kitti(test_data, tmp_path: Path) -> None:
-    drive = test_data / "kitti/2011_09_26/2011_09_26_drive_0013_sync"
-    text = output_of("kitti.py", tmp_path, str(drive), "120")
+def test_kitti(short_drive: Path, tmp_path: Path) -> None:
+    text = output_of("kitti.py", tmp_path, str(short_drive), "120")
     assert text.startswith("key 120: sweeps 118 to 122, ")
     assert number_before(text, "points\n") > 5 * 100_000
     assert number_before(text, "points moved") > 100
@@ -63,7 +62,7 @@ def test_kitti(test_data, tmp_path: Path) -> None:
 
 def test_train_completion(tmp_path: Path) -> None:
     street = Street("street", 0, "vlp16")
-    drive = write_street("kitti", street, tmp_path, range(110, 113), ["image_02"])
+    drive = write_street("kitti", street, tmp_path, range(117, 120), ["image_02"])
     text = output_of(
         "train_completion.py",
         tmp_path,
@@ -73,9 +72,9 @@ def test_train_completion(tmp_path: Path) -> None:
             "--test",
             str(drive),
             "--keys",
-            "111:112",
+            "118:119",
             "--test-keys",
-            "111:112",
+            "118:119",
         ),
         *("--window", "1", "--steps", "2"),
     )

@@ -45,10 +45,8 @@ def test_street(tmp_path: Path) -> None:
 @pytest.mark.parametrize("real", [False, True], ids=["simulated", "KITTI"])
 def test_your_data(real: bool, tmp_path: Path, monkeypatch, request) -> None:
     if real:
-        test_data = request.getfixturevalue("test_data")
-        drive = test_data / "kitti/2011_09_26/2011_09_26_drive_0013_sync"
-        monkeypatch.setenv("DENSIFY_DATA", str(drive))
-        monkeypatch.setenv("DENSIFY_KEY", "115")
+        monkeypatch.setenv("DENSIFY_DATA", str(request.getfixturevalue("short_drive")))
+        monkeypatch.setenv("DENSIFY_KEY", "119")
     else:
         monkeypatch.delenv("DENSIFY_DATA", raising=False)
         monkeypatch.delenv("DENSIFY_KEY", raising=False)

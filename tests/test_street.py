@@ -47,6 +47,8 @@ def highway() -> Street:
     return Street.from_spec("street:highway?sensor=vlp16")
 
 
+# The last two scenes that were built are kept: tests of one scene stand together.
+
 # truth
 
 
@@ -72,6 +74,23 @@ def test_static_points_have_exactly_no_flow_and_movers_that_of_their_body(street
         there = T_lidar_world @ T_world_body(street.stamp_ns(KEY + 3)) @ p_body
         np.testing.assert_allclose(truth.points[row], here[:3], atol=1e-6)
         np.testing.assert_allclose(displacement[row], (there - here)[:3], atol=1e-6)
+
+
+def test_scanners_and_rates_share_a_scene():
+    other = Street.from_spec("street?sensor=vlp16&hz=20")
+    assert other.simulator.scene is Street("street").simulator.scene
+
+
+def test_frames_made_side_by_side_are_those_made_one_by_one(tmp_path, monkeypatch):
+    monkeypatch.setenv("DENSIFY_CACHE_DIR", str(tmp_path))
+    street, wanted = Street.from_spec("street?sensor=vlp16"), (70, 71, 72)
+    street.prepare(wanted)
+    alone = [street.simulator.returns(frame) for frame in wanted]
+    monkeypatch.setattr(Simulator, "returns", None)  # nothing is left to be made
+    for frame, expected in zip(wanted, alone, strict=True):
+        for name, column in vars(street.returns(frame)).items():
+            made = getattr(expected, name)
+            assert column is made is None or column.tobytes() == made.tobytes()
 
 
 def test_raw_sweep_is_distorted_and_truth_undoes_it(static):
@@ -192,6 +211,45 @@ def test_sweeps_are_as_large_as_a_real_one(street):
 def test_sweeps_are_those_that_were_always_made(request, fixture, first):
     points = request.getfixturevalue(fixture)[KEY].points
     np.testing.assert_allclose(points[:2], first, atol=1e-4)
+
+
+def _bytes(street: Street, frame: int) -> tuple[bytes, ...]:
+    sweep, truth = street[frame], street.truth.sweep(frame)
+    return (
+        sweep.points.tobytes(),
+        sweep.intensity.tobytes(),
+        sweep.offset_ns.tobytes(),
+        truth.points.tobytes(),
+        street.image("image_03", frame).tobytes(),
+        street.truth.depth_m("image_03", frame).tobytes(),
+    )
+
+
+def test_same_bytes_fresh_cached_damaged_and_without_a_cache(highway, tmp_path, monkeypatch):
+    first = _bytes(highway, 30)
+    again = Street.from_spec("street:highway?sensor=vlp16")
+    monkeypatch.setattr(type(again.simulator), "returns", None)  # must come from the cache
+    assert _bytes(again, 30) == first
+    monkeypatch.undo()
+
+    monkeypatch.setenv("DENSIFY_CACHE_DIR", str(tmp_path))
+    build_scene.cache_clear()
+    fresh = Street.from_spec("street:highway?sensor=vlp16")
+    assert fresh.simulator.scene is not highway.simulator.scene
+    assert _bytes(fresh, 30) == first
+    files = sorted(tmp_path.rglob("*.npz"))
+    assert len(files) == 2
+    assert not list(tmp_path.rglob(".*"))
+    for file, damage in zip(files, (b"", files[1].read_bytes()[:5000]), strict=True):
+        file.write_bytes(damage)
+    repaired = Street.from_spec("street:highway?sensor=vlp16")
+    assert _bytes(repaired, 30) == first
+
+    blocked = tmp_path / "file"
+    blocked.write_text("not a folder")
+    monkeypatch.setenv("DENSIFY_CACHE_DIR", str(blocked))
+    uncached = Street.from_spec("street:highway?sensor=vlp16")
+    assert uncached[30].points.tobytes() == first[0]
 
 
 def _room(half_m: float) -> World:
@@ -320,6 +378,19 @@ def test_nobody_touches_anybody_in_other_scenes(preset, seed):
     scene = build_scene(preset, seed)
     _check_cast(preset, scene)
     _check_no_contact(scene)
+
+
+def test_presets_seeds_and_frames_differ(street, static, highway):
+    assert not np.array_equal(street[KEY].points[:1000], static[KEY].points[:1000])
+    other = Street("street", 7).simulator.scene
+    ours = street.simulator.scene
+    assert not np.array_equal(other.footprints.centre[:20], ours.footprints.centre[:20])
+    assert not np.array_equal(highway[30].points[:50], highway[31].points[:50])
+    # static is the same street
+    still = static.simulator.scene
+    np.testing.assert_array_equal(still.footprints.centre, ours.footprints.centre)
+    assert len(still.actors) == 0
+    assert SPAN_S[0] < 0 < 16 < SPAN_S[1]
 
 
 def test_all_stand_on_the_ground(street, crossing):
@@ -491,64 +562,7 @@ def test_overlap_of_rectangles_is_that_of_their_points():
     assert 50 < sum(seen) < len(seen) - 50
 
 
-# reproducible, seeded, cached
-
-
-def _bytes(street: Street, frame: int) -> tuple[bytes, ...]:
-    sweep, truth = street[frame], street.truth.sweep(frame)
-    return (
-        sweep.points.tobytes(),
-        sweep.intensity.tobytes(),
-        sweep.offset_ns.tobytes(),
-        truth.points.tobytes(),
-        street.image("image_03", frame).tobytes(),
-        street.truth.depth_m("image_03", frame).tobytes(),
-    )
-
-
-def test_same_bytes_fresh_cached_damaged_and_without_a_cache(highway, tmp_path, monkeypatch):
-    first = _bytes(highway, 30)
-    again = Street.from_spec("street:highway?sensor=vlp16")
-    monkeypatch.setattr(type(again.simulator), "returns", None)  # must come from the cache
-    assert _bytes(again, 30) == first
-    monkeypatch.undo()
-
-    monkeypatch.setenv("DENSIFY_CACHE_DIR", str(tmp_path))
-    build_scene.cache_clear()
-    fresh = Street.from_spec("street:highway?sensor=vlp16")
-    assert fresh.simulator.scene is not highway.simulator.scene
-    assert _bytes(fresh, 30) == first
-    files = sorted(tmp_path.rglob("*.npz"))
-    assert len(files) == 2
-    assert not list(tmp_path.rglob(".*"))
-    for file, damage in zip(files, (b"", files[1].read_bytes()[:5000]), strict=True):
-        file.write_bytes(damage)
-    repaired = Street.from_spec("street:highway?sensor=vlp16")
-    assert _bytes(repaired, 30) == first
-
-    blocked = tmp_path / "file"
-    blocked.write_text("not a folder")
-    monkeypatch.setenv("DENSIFY_CACHE_DIR", str(blocked))
-    uncached = Street.from_spec("street:highway?sensor=vlp16")
-    assert uncached[30].points.tobytes() == first[0]
-
-
-def test_scanners_and_rates_share_a_scene():
-    other = Street.from_spec("street?sensor=vlp16&hz=20")
-    assert other.simulator.scene is Street("street").simulator.scene
-
-
-def test_presets_seeds_and_frames_differ(street, static, highway):
-    assert not np.array_equal(street[KEY].points[:1000], static[KEY].points[:1000])
-    other = Street("street", 7).simulator.scene
-    ours = street.simulator.scene
-    assert not np.array_equal(other.footprints.centre[:20], ours.footprints.centre[:20])
-    assert not np.array_equal(highway[30].points[:50], highway[31].points[:50])
-    # static is the same street
-    still = static.simulator.scene
-    np.testing.assert_array_equal(still.footprints.centre, ours.footprints.centre)
-    assert len(still.actors) == 0
-    assert SPAN_S[0] < 0 < 16 < SPAN_S[1]
+# specifications
 
 
 @pytest.mark.parametrize(
@@ -592,15 +606,3 @@ def test_frames_and_cameras_that_do_not_exist_are_named(street):
         street.image_stamps_ns("left")
     with pytest.raises(InputError, match="no frame -1"):
         street.T_world_lidar(-1)
-
-
-def test_frames_made_side_by_side_are_those_made_one_by_one(tmp_path, monkeypatch):
-    monkeypatch.setenv("DENSIFY_CACHE_DIR", str(tmp_path))
-    street, wanted = Street.from_spec("street?sensor=vlp16"), (70, 71, 72)
-    street.prepare(wanted)
-    alone = [street.simulator.returns(frame) for frame in wanted]
-    monkeypatch.setattr(Simulator, "returns", None)  # nothing is left to be made
-    for frame, expected in zip(wanted, alone, strict=True):
-        for name, column in vars(street.returns(frame)).items():
-            made = getattr(expected, name)
-            assert column is made is None or column.tobytes() == made.tobytes()
