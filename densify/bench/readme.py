@@ -46,8 +46,13 @@ class Scene(NamedTuple):
 _PRESETS = tuple(
     Scene(data, (120,))
     for data in (
-        *("street", "street:crossing", "street:highway", "street:static"),
-        *("street?seed=31", "street:crossing?seed=32", "street:highway?seed=33"),
+        "street",
+        "street:crossing",
+        "street:highway",
+        "street:static",
+        "street?seed=31",
+        "street:crossing?seed=32",
+        "street:highway?seed=33",
     )
 )
 _DEPTH = (
@@ -326,7 +331,12 @@ def _centimetres(value_m: float | None) -> str:
 
 
 _DEPTH_TITLES = (
-    *("measured", "wrong", "filled", "wrong", "movers, filled", "wrong"),
+    "measured",
+    "wrong",
+    "filled",
+    "wrong",
+    "movers, filled",
+    "wrong",
     "seconds after the cloud",
 )
 TABLES: Mapping[str, _Table] = {
@@ -334,8 +344,12 @@ TABLES: Mapping[str, _Table] = {
         "One sweep, ICP, ICP over 40 m of road each way, ours; measured depth but where it says "
         "filled (seeds 31 to 33: looked at).",
         (
-            *("density", "outliers", "on moving objects", "movers' coverage"),
-            *("ours, filled: outliers at density", "ghosts: ICP, ours"),
+            "density",
+            "outliers",
+            "on moving objects",
+            "movers' coverage",
+            "ours, filled: outliers at density",
+            "ghosts: ICP, ours",
         ),
         _PRESETS,
         _row_of_methods,
@@ -367,8 +381,13 @@ TABLES: Mapping[str, _Table] = {
         "What moves in each of eleven sweeps, above the ground, and which of it is one object (50 "
         "points or more; methods that know none link what moves within 0.6 m).",
         (
-            *("IoU of moving", "panoptic quality", "recognition", "segmentation"),
-            *("found", "missed", "false"),
+            "IoU of moving",
+            "panoptic quality",
+            "recognition",
+            "segmentation",
+            "found",
+            "missed",
+            "false",
         ),
         _FLOW[:3],
         _rows_of_segmentation,

@@ -30,8 +30,20 @@ from densify.errors import brief
 from densify.version import __version__
 
 _VERBS = (
-    *(run, compare, dataset, flow, train, labels, info, doctor, simulate),
-    *(export, report, view, evaluate, completion),
+    run,
+    compare,
+    dataset,
+    flow,
+    train,
+    labels,
+    info,
+    doctor,
+    simulate,
+    export,
+    report,
+    view,
+    evaluate,
+    completion,
 )
 
 

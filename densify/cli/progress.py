@@ -22,12 +22,20 @@ _TICK_S = 0.5
 # Only their ratios matter. "maps" are what is made without flow, beside it, and the others; "held
 # out" is what then follows for each method.
 _FIRST_KEY_S = {
-    **{"register": 3.8, "ground": 0.4, "flow": 9.2},
-    **{"maps": 5.5, "held out": 2.0, "write": 2.3},
+    "register": 3.8,
+    "ground": 0.4,
+    "flow": 9.2,
+    "maps": 5.5,
+    "held out": 2.0,
+    "write": 2.3,
 }
 _NEXT_KEY_S = {
-    **{"register": 0.0, "ground": 0.0, "flow": 2.0},
-    **{"maps": 2.5, "held out": 2.0, "write": 2.3},
+    "register": 0.0,
+    "ground": 0.0,
+    "flow": 2.0,
+    "maps": 2.5,
+    "held out": 2.0,
+    "write": 2.3,
 }
 _PAPER_S = 40.0
 _PART_OF = {"read": "register", "far": "flow", "project": "maps", "prior": "held out"}

@@ -19,8 +19,16 @@ from densify.types import Result
 from densify.version import __version__
 
 _PACKAGES = (
-    *("numpy", "scipy", "torch", "embreex", "kiss-icp", "small-gicp"),
-    *("opencv-python-headless", "laspy", "lazrs", "PyYAML"),
+    "numpy",
+    "scipy",
+    "torch",
+    "embreex",
+    "kiss-icp",
+    "small-gicp",
+    "opencv-python-headless",
+    "laspy",
+    "lazrs",
+    "PyYAML",
 )
 
 

@@ -25,8 +25,15 @@ _COARSEST = 8
 _FEWEST_POINTS = 10_000
 _OF_THE_PAGE = 300_000  # scores, scripts
 _SCRIPTS = (
-    *("unpack.js", "dom.js", "colours.js", "maps.js", "matrices.js", "gl.js", "cloud.js"),
-    *("charts.js", "key.js"),
+    "unpack.js",
+    "dom.js",
+    "colours.js",
+    "maps.js",
+    "matrices.js",
+    "gl.js",
+    "cloud.js",
+    "charts.js",
+    "key.js",
 )
 
 

@@ -85,8 +85,10 @@ def intrinsics(camera: Camera) -> dict[str, float]:
     padded = [*lens, *[0.0] * len(names)]
     K = camera.K
     return {
-        **{"fx": float(K[0, 0]), "fy": float(K[1, 1])},
-        **{"cx": float(K[0, 2]) + 0.5, "cy": float(K[1, 2]) + 0.5},
+        "fx": float(K[0, 0]),
+        "fy": float(K[1, 1]),
+        "cx": float(K[0, 2]) + 0.5,
+        "cy": float(K[1, 2]) + 0.5,
         **dict(zip(names[:num_given], padded, strict=False)),
     }
 

@@ -17,8 +17,23 @@ from densify.outputs.plain import write_json
 from densify.types import ObjectTrack
 
 _COLUMNS = (
-    *("object", "frame", "stamp_ns", "x_m", "y_m", "z_m", "qw", "qx", "qy", "qz"),
-    *("length_m", "width_m", "height_m", "vx_m_s", "vy_m_s", "vz_m_s", "num_points"),
+    "object",
+    "frame",
+    "stamp_ns",
+    "x_m",
+    "y_m",
+    "z_m",
+    "qw",
+    "qx",
+    "qy",
+    "qz",
+    "length_m",
+    "width_m",
+    "height_m",
+    "vx_m_s",
+    "vy_m_s",
+    "vz_m_s",
+    "num_points",
 )
 
 

@@ -23,8 +23,18 @@ _STAMP_FILES = tuple(
     for suffix in ("txt", "csv")
 )
 _POSE_FILES = (
-    *("poses.txt", "poses.csv", "poses.tum", "pose.txt", "trajectory.txt", "trajectory.csv"),
-    *("traj.txt", "odometry.txt", "odom.txt", "groundtruth.txt", "gt_poses.txt", "slam_poses.txt"),
+    "poses.txt",
+    "poses.csv",
+    "poses.tum",
+    "pose.txt",
+    "trajectory.txt",
+    "trajectory.csv",
+    "traj.txt",
+    "odometry.txt",
+    "odom.txt",
+    "groundtruth.txt",
+    "gt_poses.txt",
+    "slam_poses.txt",
 )
 
 

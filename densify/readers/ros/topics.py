@@ -27,12 +27,31 @@ POSES = (
 _OPTIONS = ("points", "images", "poses")
 _USAGE = "#points=/topic,/topic&images=/topic,/topic&poses=/topic, tf or none"
 _PACKETS = (
-    *("VelodyneScan", "VelodynePacket", "PacketMsg", "PandarScan", "HesaiPacket", "UdpFrame"),
-    *("NebulaPackets", "RslidarPacket", "RslidarScan", "LivoxPacket", "BlickfeldPackets"),
+    "VelodyneScan",
+    "VelodynePacket",
+    "PacketMsg",
+    "PandarScan",
+    "HesaiPacket",
+    "UdpFrame",
+    "NebulaPackets",
+    "RslidarPacket",
+    "RslidarScan",
+    "LivoxPacket",
+    "BlickfeldPackets",
 )
 _NO_SWEEPS = (
-    *("map", "depth", "filtered", "obstacle", "ground", "cluster", "voxel", "radar", "local"),
-    *("global", "accumulated", "registered"),
+    "map",
+    "depth",
+    "filtered",
+    "obstacle",
+    "ground",
+    "cluster",
+    "voxel",
+    "radar",
+    "local",
+    "global",
+    "accumulated",
+    "registered",
 )
 _NO_PICTURES = ("depth", "disparity", "theora", "mask", "confidence")
 _BEST_IMAGES = ("image_rect_color", "image_rect", "image_color", "image_raw", "image")
