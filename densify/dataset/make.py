@@ -107,11 +107,11 @@ def make_dataset(
     are used instead; they need the same files at the same paths; ``tcp://`` trusts everybody on
     that network, ``tls://`` takes certificates. shard: (i, n), the i-th of n parts of the work,
     from 1; parts may run at the same time on machines that share ``out``. memory_bytes: of all
-    processes together; fewer are started where it does not
-    suffice, and one of several that takes more than its share is replaced. cache_bytes: bound of
-    what is kept on disk for later runs. verify: compare finished files with their recorded hashes,
-    and make damaged ones anew. links: of the tree, for loaders of others, see
-    `densify.dataset.links`. report: called before the first key and after every one.
+    processes together; fewer are started where it does not suffice, and one of several that takes
+    more than its share is replaced. cache_bytes: bound of what is kept on disk for later runs.
+    verify: compare finished files with their recorded hashes, and make damaged ones anew. links: of
+    the tree, for loaders of others, see `densify.dataset.links`. report: called before the first
+    key and after every one.
 
     Run again, it goes on where it was stopped, however that happened: finished keys are kept, keys
     that failed are tried again. The files do not depend on the number of processes, on shards or on
@@ -129,6 +129,7 @@ def make_dataset(
     steps_folder()
     check_workers(num_workers, scheduler)
     num_started = num_processes(num_workers, memory_bytes, recipe, drives)
+    of_workers = memory_bytes and memory_bytes - int(BASE_BYTES)
     with Manifest(out, shard) as manifest:
         write_plan(out, recipe, drives)
         with _log_file(out, shard):
@@ -145,7 +146,6 @@ def make_dataset(
                 report(done.summary())
             with _kept_told(done):
                 if todo:
-                    of_workers = memory_bytes and memory_bytes - int(BASE_BYTES)
                     with open_workers(num_started, scheduler, of_workers) as workers:
                         for record in _records(run_tasks(todo, workers)):
                             manifest.append(record)

@@ -170,7 +170,8 @@ def _through(
 def _counts(
     uv: Float, shape: tuple[int, ...], blur_px: tuple[float, float] = (0.0, 0.0)
 ) -> Float32:
-    """(K,2) px -> (H,W) how many in each pixel. blur_px: of a `_Rule`."""
+    """(K,2) px -> (H,W) how many in each pixel. blur_px: standard
+    deviation down and across."""
     column, row = np.rint(uv).astype(np.int64).T
     counts = np.bincount(row * shape[1] + column, minlength=shape[0] * shape[1])
     pixels = counts.reshape(shape).astype(np.float32)

@@ -30,7 +30,7 @@ from densify.depth.rims import decide
 from densify.depth.settling import MeasuredPixels, nearest_pixels, visible_pixels
 from densify.depth.spot import measure_spots
 from densify.depth.star import fill_stars
-from densify.types import Camera, Cloud, DepthMap, Float32, Patches, Ranked, Reason
+from densify.types import Bool, Camera, Cloud, DepthMap, Float32, Patches, Ranked, Reason
 
 _BLOCK_PX = 16  # over which rays lie about equally dense
 _JUMP = 1.6  # by which rays lie farther apart beyond the last of a scanner's denser rings
@@ -79,30 +79,39 @@ def project(
 
     layers = decide(_measured(seen, points, camera, lab), settings)
     if filled:
-        layers = fill(layers, settings)
-        if settings.visibility and settings.glass == "plane":
-            layers = close_windows(layers, camera.focal_px, settings)
-        if settings.star_reach > 0:
-            layers = fill_stars(layers, settings)
-        layers = without_shreds(layers)
-    if settings.visibility and rays is not None and settings.seen_through < 1:
+        layers = _filled(layers, camera, settings)
+    if not settings.visibility:
+        _tell(layers, reason)
+        return _finished(layers, cloud, view.exposure, reason, rank=None)
+    if rays is not None and settings.seen_through < 1:
         layers = without_seen_through(layers, cloud, view, rays, reason, settings)
-    off = None
-    if settings.visibility:
-        off = contradicted(layers, camera.focal_px)
-        if filled:
-            layers = without_contradicted(layers, off)
+    off = contradicted(layers, camera.focal_px)
+    if filled:
+        layers = without_contradicted(layers, off)
     _tell(layers, reason)
-    rank = None
-    if off is not None:
-        measured = layers.depth_m > 0
-        far = np.zeros(measured.shape, bool)
-        far[measured] = cloud.far[layers.point[measured]]
-        rank = ranked(layers, far, off)
-        layers = replace(layers, confidence=calibrated(rank, layers.filled_m > 0))
-        if filled and settings.spot > 0:
-            layers = measure_spots(layers, points, settings)
+    rank = ranked(layers, _far(layers, cloud), off)
+    layers = replace(layers, confidence=calibrated(rank, layers.filled_m > 0))
+    if filled and settings.spot > 0:
+        layers = measure_spots(layers, points, settings)
     return _finished(layers, cloud, view.exposure, reason, rank)
+
+
+def _filled(layers: Layers, camera: Camera, settings: ProjectSettings) -> Layers:
+    """The same, and what lies between measured pixels."""
+    layers = fill(layers, settings)
+    if settings.visibility and settings.glass == "plane":
+        layers = close_windows(layers, camera.focal_px, settings)
+    if settings.star_reach > 0:
+        layers = fill_stars(layers, settings)
+    return without_shreds(layers)
+
+
+def _far(layers: Layers, cloud: Cloud) -> Bool:
+    """(H,W) the measured pixels whose point sweeps beyond the window saw."""
+    measured = layers.depth_m > 0
+    far = np.zeros(measured.shape, bool)
+    far[measured] = cloud.far[layers.point[measured]]
+    return far
 
 
 def _measured(

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache, partial
 from itertools import chain
 from typing import Any, cast
@@ -14,7 +13,13 @@ from densify.clock import num_in_look
 from densify.config import Config
 from densify.flow.engines import SharedMotion, estimate_motion, motion_type
 from densify.flow.scene import Scene
-from densify.flow.tracking.evidence import REACH_S, Candidates, FreeSpace, find_candidates
+from densify.flow.tracking.evidence import (
+    REACH_S,
+    Candidates,
+    FreeSpace,
+    find_candidates,
+    range_images,
+)
 from densify.geometry.ground import ground
 from densify.geometry.height_map import HeightMap
 from densify.geometry.range_image import RangeImage
@@ -67,9 +72,8 @@ class BlockSteps:
 
         def make() -> dict[int, RangeImage]:
             sweeps = [places.deskewed(number, 0.0, f) for f in pieces]
-            with self._watch.stage("flow"), ThreadPoolExecutor() as pool:
-                image = partial(RangeImage.of, num_together=num_together, finer_far=True)
-                return dict(zip(pieces, pool.map(image, sweeps), strict=True))
+            with self._watch.stage("flow"):
+                return dict(zip(pieces, range_images(sweeps, num_together), strict=True))
 
         return kept(
             self._cache,

@@ -18,7 +18,7 @@ from densify.geometry.range_image import RangeImage
 from densify.geometry.sensor import Sensors
 from densify.kernels.clouds import Strips
 from densify.kernels.linking import close_to_seeds, link
-from densify.types import Bool, Float, Int, Stretch
+from densify.types import Bool, Float, Int, RegisteredSweep, Stretch
 
 _MARGIN_M = 0.4
 _MARGIN_FRACTION = 0.015
@@ -31,6 +31,14 @@ REACH_S = 1.0
 """Sweeps up to so long before and after one tell about it: from where others were taken, little of
 what it saw is in view."""
 _MOST_ASKED = 10  # of them on each side: more in the same time cost more and tell the same
+
+
+def range_images(sweeps: Sequence[RegisteredSweep], num_together: int) -> list[RangeImage]:
+    """What sweeps saw, finer far away. num_together: as many are asked together, see
+    `densify.clock.num_in_look`."""
+    image = partial(RangeImage.of, num_together=num_together, finer_far=True)
+    with ThreadPoolExecutor() as pool:
+        return list(pool.map(image, sweeps))
 
 
 @dataclass(frozen=True)
@@ -49,15 +57,11 @@ class FreeSpace:
 
     @staticmethod
     def of(stretch: Stretch, images: Sequence[RangeImage] | None = None) -> FreeSpace:
-        """images: of the sweeps, where they are known, with cells for `num_in_look` together, finer
-        far away."""
+        """images: of the sweeps, where they are known, as `range_images` makes them."""
         clock = Clock.of(stretch)
         looks = clock.looks()
         if images is None:
-            num = num_in_look(clock.period_ns * 1e-9)
-            image = partial(RangeImage.of, num_together=num, finer_far=True)
-            with ThreadPoolExecutor() as pool:
-                images = list(pool.map(image, stretch.sweeps))
+            images = range_images(stretch.sweeps, num_in_look(clock.period_ns * 1e-9))
         return FreeSpace(
             tuple(images),
             tuple(poses.inverse(s.T_world_lidar) for s in stretch.sweeps),

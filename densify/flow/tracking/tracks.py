@@ -62,67 +62,115 @@ def follow_groups(
 ) -> list[Track]:
     """All proven moving objects of the stretch. velocities_m_s: (C,3) of each sweep's points, with
     which groups of them start; None has the sweeps around vote."""
-    looks = looks_of(standing, space.clock)
-    clock = Clock(np.array([look.time_ns for look in looks]))
-    seen = [look.seen for look in looks]
-    fields = []
-    if velocities_m_s is None:
-        of_sweeps = [
-            DistanceField.of(c.points[c.candidate], c.time_s[c.candidate]) for c in standing
-        ]
-        fields = [[of_sweeps[j] for j in look.sweeps] for look in looks]
-
-    def velocity_of(members: np.ndarray, n: int) -> Float:
-        if velocities_m_s is None:
-            group = Group.of(seen[n].points[members], seen[n].time_s[members])
-            velocity = vote(group, n, fields, clock)
-        else:
-            velocity = np.median(looks[n].gather(velocities_m_s)[members], axis=0)
-        radial = seen[n].radial
-        return velocity if radial is None else radial.rows(members).corrected(velocity)
-
-    def follow(members: np.ndarray, n: int, velocity: Float) -> tuple[Track, float | None]:
-        track = _follow(members, n, velocity, looks, free, ground, clock)
-        return track, left_contradicted(track, standing, space, bodies)
-
-    free = [np.ones(len(c.points), bool) for c in standing]  # not yet part of a track
-    untried = [np.ones(len(c.points), bool) for c in standing]
+    search = _Search(standing, space, ground, velocities_m_s)
+    looks, untried = search.looks, search.all_points()
     tracks: list[Track] = []
-    bodies: list[Body] = []
-    for n, group in groups_to_start(seen, clock):
-        members = group[looks[n].gather(free)[group] & looks[n].gather(untried)[group]]
-        if len(members) < MIN_POINTS or is_line_on(bodies, looks[n], members):
+    for n, group in groups_to_start([look.seen for look in looks], search.clock):
+        untaken = looks[n].gather(search.free)[group] & looks[n].gather(untried)[group]
+        members = group[untaken]
+        if len(members) < MIN_POINTS or is_line_on(search.bodies, looks[n], members):
             continue
-        beside = velocities_beside(looks[n], members, bodies)
-        starts: Iterator[Float] = chain([velocity_of(members, n)], beside)
-        track, left = _best_of(follow(members, n, velocity) for velocity in starts)
-        if np.isinf(left) and len(track.sightings) <= _HARDLY_FOLLOWED:
-            starts = velocities_of_traffic(looks[n], bodies)
-            in_traffic = _best_of(follow(members, n, velocity) for velocity in starts)
-            track, left = (track, left) if np.isinf(in_traffic[1]) else in_traffic
+        track, proven = search.track_of(members, n)
+        for j, rows in track.claimed.items():
+            untried[j][rows] = False
+        if proven:
+            search.take(track)
+            tracks.append(track)
+    return tracks
+
+
+class _Search:
+    """What is there to be tracked, and the tracks found so far.
+
+    looks, clock: of the sweeps taken together, and when. free: (C,) of each sweep's points, which
+    are part of no track yet. bodies: of the tracks.
+    """
+
+    def __init__(
+        self,
+        standing: Sequence[Standing],
+        space: FreeSpace,
+        ground: HeightMap,
+        velocities_m_s: Sequence[Float] | None,
+    ) -> None:
+        self._standing, self._space, self._ground = standing, space, ground
+        self._velocities_m_s = velocities_m_s
+        self.looks = looks_of(standing, space.clock)
+        self.clock = Clock(np.array([look.time_ns for look in self.looks]))
+        self.free, self.bodies = self.all_points(), list[Body]()
+        self._fields: list[list[DistanceField]] = []
+        if velocities_m_s is None:
+            of_sweeps = [
+                DistanceField.of(c.points[c.candidate], c.time_s[c.candidate]) for c in standing
+            ]
+            self._fields = [[of_sweeps[j] for j in look.sweeps] for look in self.looks]
+
+    def all_points(self) -> list[Bool]:
+        """(C,) of each sweep's points, all True."""
+        return [np.ones(len(c.points), bool) for c in self._standing]
+
+    def track_of(self, members: np.ndarray, n: int) -> tuple[Track, bool]:
+        """The track of a group of look n, whole if it is proven, and whether it is."""
+        track, left = self._started(members, n)
         proven = bool(np.isfinite(left))
-        for rows, k in ends(track, looks) if proven and left > _DOUBTFUL else ():
-            tried, contradicted = follow(rows, k, velocity_of(rows, k))
+        if proven:
+            track = self._again_from_its_ends(track, left)
+            _gather(track, self._standing, self.free, self._space)
+            # A piece of a guard rail shows with the rest what it is of.
+            proven = not may_be_a_rail(track, self._standing, self._space, self.bodies)
+        if proven:
+            _refine(track, self._standing, self._ground)
+            take_back_slides(track, self._standing, self._space)
+            go_with_the_rest(track, self.bodies, self._standing, self._space)
+            _claim_rays(track, self._standing, self.free, self._space)
+        return track, proven
+
+    def take(self, track: Track) -> None:
+        """Its points are no others'."""
+        for j, rows in track.claimed.items():
+            self.free[j][rows] = False
+        points = track.seen_in(self._standing, sorted(track.claimed))
+        self.bodies.append(Body(track, Shape.of(points)))
+
+    def _started(self, members: np.ndarray, n: int) -> tuple[Track, float]:
+        """The best track by the velocity that the sweeps tell, or else by that of what moves beside
+        or of the other traffic; as `_best_of`."""
+        beside = velocities_beside(self.looks[n], members, self.bodies)
+        starts: Iterator[Float] = chain([self._velocity_of(members, n)], beside)
+        track, left = _best_of(self._follow(members, n, velocity) for velocity in starts)
+        if np.isinf(left) and len(track.sightings) <= _HARDLY_FOLLOWED:
+            starts = velocities_of_traffic(self.looks[n], self.bodies)
+            in_traffic = _best_of(self._follow(members, n, velocity) for velocity in starts)
+            track, left = (track, left) if np.isinf(in_traffic[1]) else in_traffic
+        return track, left
+
+    def _again_from_its_ends(self, track: Track, left: float) -> Track:
+        """The same, or followed from one of its ends, if as much of it is contradicted less.
+
+        left: how much contradicts it.
+        """
+        for rows, k in ends(track, self.looks) if left > _DOUBTFUL else ():
+            tried, contradicted = self._follow(rows, k, self._velocity_of(rows, k))
             whole = tried.total_points() >= _AS_WHOLE * track.total_points()
             if whole and contradicted is not None and contradicted < _CLEARLY * left:
                 track, left = tried, contradicted
-        if proven:
-            _gather(track, standing, free, space)
-            # A piece of a guard rail shows with the rest what it is of.
-            proven = not may_be_a_rail(track, standing, space, bodies)
-        if proven:
-            _refine(track, standing, ground)
-            take_back_slides(track, standing, space)
-            go_with_the_rest(track, bodies, standing, space)
-            _claim_rays(track, standing, free, space)
-        for j, rows in track.claimed.items():
-            untried[j][rows] = False
-            if proven:
-                free[j][rows] = False
-        if proven:
-            tracks.append(track)
-            bodies.append(Body(track, Shape.of(track.seen_in(standing, sorted(track.claimed)))))
-    return tracks
+        return track
+
+    def _velocity_of(self, members: np.ndarray, n: int) -> Float:
+        """(3,) m/s that a group of look n may have."""
+        seen = self.looks[n].seen
+        if self._velocities_m_s is None:
+            group = Group.of(seen.points[members], seen.time_s[members])
+            velocity = vote(group, n, self._fields, self.clock)
+        else:
+            velocity = np.median(self.looks[n].gather(self._velocities_m_s)[members], axis=0)
+        return velocity if seen.radial is None else seen.radial.rows(members).corrected(velocity)
+
+    def _follow(self, members: np.ndarray, n: int, velocity: Float) -> tuple[Track, float | None]:
+        """A group of look n from that velocity on, and how much contradicts its track, None if that
+        is not proven."""
+        track = _follow(members, n, velocity, self.looks, self.free, self._ground, self.clock)
+        return track, left_contradicted(track, self._standing, self._space, self.bodies)
 
 
 def _best_of(tried: Iterable[tuple[Track, float | None]]) -> tuple[Track, float]:
