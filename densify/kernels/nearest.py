@@ -4,6 +4,8 @@ boxes are fitted anew, in a tenth of the time that building takes."""
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from densify.kernels import Kernel, inlined
@@ -14,6 +16,18 @@ _MAX_DEPTH = 64
 _ABOVE, _TINY = 1.0 + 1e-9, 1e-300  # rounding must not cut the k-th neighbour off, nor 0 do it
 
 
+class _Tree(NamedTuple):
+    """points: (m,3) in the tree's order. order: (m,) the row that each was given as. starts, stops,
+    boxes: of each node, its points and their least and greatest x y z; node i has the children
+    2i+1 and 2i+2."""
+
+    points: Float
+    order: Int
+    starts: Int
+    stops: Int
+    boxes: Float
+
+
 class BoxTree:
     """Search in (m,3) points, m at least 1, finite."""
 
@@ -21,17 +35,16 @@ class BoxTree:
         depth = 0
         while (len(points) - 1) >> depth >= _MAX_LEAF:
             depth += 1
-        self._starts = np.zeros((2 << depth) - 1, np.int64)
-        self._stops = np.zeros_like(self._starts)
-        self._order = np.arange(len(points))
-        _split(points, depth, self._starts, self._stops, self._order)
-        self._boxes = np.empty((len(self._starts), 6))
+        starts = np.zeros((2 << depth) - 1, np.int64)
+        stops, order = np.zeros_like(starts), np.arange(len(points))
+        _split(points, depth, starts, stops, order)
+        self._tree = _Tree(points, order, starts, stops, np.empty((len(starts), 6)))
         self.move(points)
 
     def move(self, points: Float) -> None:
         """The same points elsewhere. Always exact; the less they stay neighbours, the slower."""
-        self._points = points[self._order]
-        _fit_boxes(self._points, self._starts, self._stops, self._boxes)
+        self._tree = self._tree._replace(points=points[self._tree.order])
+        _fit_boxes(self._tree)
 
     def nearest(self, queries: Float, within_m: float = np.inf) -> tuple[Float, Int]:
         """(q,) metres to the nearest point, and (q,) its row; inf and -1 where none is closer than
@@ -40,7 +53,7 @@ class BoxTree:
         queries: (q,3).
         """
         distance_m, row = np.empty(len(queries)), np.empty(len(queries), np.int64)
-        _nearest.over_rows(len(queries), queries, *self._search, float(within_m), distance_m, row)
+        _nearest.over_rows(len(queries), queries, self._tree, float(within_m), distance_m, row)
         return distance_m, row
 
     def nearest_k(self, queries: Float, k: int) -> tuple[Float, Int]:
@@ -50,7 +63,7 @@ class BoxTree:
         """
         distance_m = np.empty((len(queries), k))
         row = np.empty((len(queries), k), np.int64)
-        _nearest_k.over_rows(len(queries), queries, *self._search, distance_m, row)
+        _nearest_k.over_rows(len(queries), queries, self._tree, distance_m, row)
         return distance_m, row
 
     def align(
@@ -78,7 +91,7 @@ class BoxTree:
         state = predicted.copy()
         matched = _align(
             queries,
-            *self._search,
+            self._tree,
             information,
             centre,
             prior,
@@ -89,14 +102,10 @@ class BoxTree:
         )
         return state if matched else None
 
-    @property
-    def _search(self) -> tuple[Float, Int, Int, Int, Float]:
-        return self._points, self._order, self._starts, self._stops, self._boxes
-
 
 @Kernel
 def _split(points: Float, depth: int, starts: Int, stops: Int, order: Int) -> None:
-    """Halve every node's points along its longest side; node i has the children 2i+1 and 2i+2."""
+    """Halve every node's points along its longest side, see `_Tree`."""
     starts[0], stops[0] = 0, len(order)
     for node in range((1 << depth) - 1):
         start, stop = starts[node], stops[node]
@@ -138,17 +147,18 @@ def _select(values: Float, order: Int, left: int, right: int, middle: int) -> No
 
 
 @Kernel
-def _fit_boxes(points: Float, starts: Int, stops: Int, boxes: Float) -> None:
-    first_leaf = len(starts) // 2
-    for node in range(len(starts) - 1, -1, -1):
+def _fit_boxes(tree: _Tree) -> None:
+    boxes, first_leaf = tree.boxes, len(tree.starts) // 2
+    for node in range(len(tree.starts) - 1, -1, -1):
         for axis in range(3):
             if node < first_leaf:
                 low = min(boxes[2 * node + 1, axis], boxes[2 * node + 2, axis])
                 high = max(boxes[2 * node + 1, 3 + axis], boxes[2 * node + 2, 3 + axis])
             else:
                 low, high = np.inf, -np.inf
-                for i in range(starts[node], stops[node]):
-                    low, high = min(low, points[i, axis]), max(high, points[i, axis])
+                for i in range(tree.starts[node], tree.stops[node]):
+                    value = tree.points[i, axis]
+                    low, high = min(low, value), max(high, value)
             boxes[node, axis], boxes[node, 3 + axis] = low, high
 
 
@@ -161,32 +171,39 @@ def _squared_to_box(boxes: Float, node: int, x: float, y: float, z: float) -> fl
 
 
 @inlined
-def _closer(points, starts, stops, boxes, x, y, z, best, found, waiting, squared_to):  # type: ignore[no-untyped-def]
+def _descend(boxes, node, x, y, z, best, waiting, squared_to, top):  # type: ignore[no-untyped-def]
+    """From a box down to the leaf nearest to a point, -1 where none is closer than ``best``; the
+    boxes passed by that are wait, with their squared distances. Returns how many wait, too."""
+    first_leaf = len(boxes) // 2
+    while node < first_leaf:
+        near, far = 2 * node + 1, 2 * node + 2
+        to_near = _squared_to_box(boxes, near, x, y, z)
+        to_far = _squared_to_box(boxes, far, x, y, z)
+        if to_far < to_near:
+            near, far, to_near, to_far = far, near, to_far, to_near
+        if to_far < best:
+            waiting[top], squared_to[top] = far, to_far
+            top += 1
+        if to_near >= best:
+            return -1, top
+        node = near
+    return node, top
+
+
+@inlined
+def _closer(tree, x, y, z, best, found, waiting, squared_to):  # type: ignore[no-untyped-def]
     """The squared distance and the place of the nearest point, or ``best`` and ``found`` where none
     is closer. waiting, squared_to: (_MAX_DEPTH,) to work in."""
-    first_leaf = len(starts) // 2
     waiting[0], squared_to[0], top = 0, 0.0, 1
     while top > 0:
         top -= 1
         if squared_to[top] >= best:
             continue
-        node = waiting[top]
-        while node < first_leaf:
-            near, far = 2 * node + 1, 2 * node + 2
-            to_near = _squared_to_box(boxes, near, x, y, z)
-            to_far = _squared_to_box(boxes, far, x, y, z)
-            if to_far < to_near:
-                near, far, to_near, to_far = far, near, to_far, to_near
-            if to_far < best:
-                waiting[top], squared_to[top] = far, to_far
-                top += 1
-            if to_near >= best:
-                break
-            node = near
-        if node < first_leaf:
+        leaf, top = _descend(tree.boxes, waiting[top], x, y, z, best, waiting, squared_to, top)
+        if leaf < 0:
             continue
-        for i in range(starts[node], stops[node]):
-            dx, dy, dz = points[i, 0] - x, points[i, 1] - y, points[i, 2] - z
+        for i in range(tree.starts[leaf], tree.stops[leaf]):
+            dx, dy, dz = tree.points[i, 0] - x, tree.points[i, 1] - y, tree.points[i, 2] - z
             squared = dx * dx + dy * dy + dz * dz
             if squared < best:
                 best, found = squared, i
@@ -198,11 +215,7 @@ def _nearest(
     begin: int,
     end: int,
     queries: Float,
-    points: Float,
-    order: Int,
-    starts: Int,
-    stops: Int,
-    boxes: Float,
+    tree: _Tree,
     within_m: float,
     distance_m: Float,
     row: Int,
@@ -211,32 +224,18 @@ def _nearest(
     for q in range(begin, end):
         x, y, z = queries[q, 0], queries[q, 1], queries[q, 2]
         nobody = np.int64(-1)  # a number of this type, or the search is compiled twice
-        squared, found = _closer(
-            points, starts, stops, boxes, x, y, z, within_m * within_m, nobody, waiting, squared_to
-        )
+        squared, found = _closer(tree, x, y, z, within_m * within_m, nobody, waiting, squared_to)
         distance_m[q] = np.sqrt(squared) if found >= 0 else np.inf
-        row[q] = order[found] if found >= 0 else -1
+        row[q] = tree.order[found] if found >= 0 else -1
 
 
 @Kernel
 def _nearest_k(
-    begin: int,
-    end: int,
-    queries: Float,
-    points: Float,
-    order: Int,
-    starts: Int,
-    stops: Int,
-    boxes: Float,
-    distance_m: Float,
-    row: Int,
+    begin: int, end: int, queries: Float, tree: _Tree, distance_m: Float, row: Int
 ) -> None:
-    first_leaf = len(starts) // 2
     k = distance_m.shape[1]
-    waiting = np.empty(_MAX_DEPTH, np.int64)
-    squared_to = np.empty(_MAX_DEPTH)
-    nearest = np.empty(k)
-    found = np.empty(k, np.int64)
+    waiting, squared_to = np.empty(_MAX_DEPTH, np.int64), np.empty(_MAX_DEPTH)
+    nearest, found = np.empty(k), np.empty(k, np.int64)
     for q in range(begin, end):
         x, y, z = queries[q, 0], queries[q, 1], queries[q, 2]
         # The k neighbours of the query before are no farther than its k-th and the way from there.
@@ -250,31 +249,26 @@ def _nearest_k(
             top -= 1
             if squared_to[top] >= nearest[k - 1]:
                 continue
-            node = waiting[top]
-            while node < first_leaf:
-                near, far = 2 * node + 1, 2 * node + 2
-                to_near = _squared_to_box(boxes, near, x, y, z)
-                to_far = _squared_to_box(boxes, far, x, y, z)
-                if to_far < to_near:
-                    near, far, to_near, to_far = far, near, to_far, to_near
-                waiting[top], squared_to[top] = far, to_far
-                top += 1
-                node = near
-            for i in range(starts[node], stops[node]):
-                dx, dy, dz = points[i, 0] - x, points[i, 1] - y, points[i, 2] - z
+            leaf, top = _descend(
+                tree.boxes, waiting[top], x, y, z, nearest[k - 1], waiting, squared_to, top
+            )
+            if leaf < 0:
+                continue
+            for i in range(tree.starts[leaf], tree.stops[leaf]):
+                dx, dy, dz = tree.points[i, 0] - x, tree.points[i, 1] - y, tree.points[i, 2] - z
                 squared = dx * dx + dy * dy + dz * dz
                 if squared < nearest[k - 1]:
                     j = k - 1
                     while j > 0 and nearest[j - 1] > squared:
                         nearest[j], found[j] = nearest[j - 1], found[j - 1]
                         j -= 1
-                    nearest[j], found[j] = squared, order[i]
+                    nearest[j], found[j] = squared, tree.order[i]
         for j in range(k):
             distance_m[q, j], row[q, j] = np.sqrt(nearest[j]), found[j]
 
 
 @inlined
-def _match(queries, points, starts, stops, boxes, centre, state, gate_m, found, at, squared):  # type: ignore[no-untyped-def]
+def _match(queries, tree, centre, state, gate_m, found, at, squared):  # type: ignore[no-untyped-def]
     """Undo the state: ``at``, and find the nearest points closer than the gate: ``found``, -1 for
     none, and ``squared``. Returns how many there are. found: as the step before left it."""
     waiting, squared_to = np.empty(_MAX_DEPTH, np.int64), np.empty(_MAX_DEPTH)
@@ -285,24 +279,25 @@ def _match(queries, points, starts, stops, boxes, centre, state, gate_m, found, 
         z = queries[q, 2] - state[2]
         best, last = gate_m * gate_m, found[q]
         if last >= 0:  # mostly still the nearest: little is left to search
-            dx, dy, dz = points[last, 0] - x, points[last, 1] - y, points[last, 2] - z
+            dx = tree.points[last, 0] - x
+            dy, dz = tree.points[last, 1] - y, tree.points[last, 2] - z
             known = dx * dx + dy * dy + dz * dz
             best, last = (known, last) if known < best else (best, -1)
-        best, last = _closer(points, starts, stops, boxes, x, y, z, best, last, waiting, squared_to)
+        best, last = _closer(tree, x, y, z, best, last, waiting, squared_to)
         at[q, 0], at[q, 1], at[q, 2], squared[q], found[q] = x, y, z, best, last
         num += last >= 0
     return num
 
 
 @inlined
-def _add_up(H, g, at, found, squared, points, order, information, centre, yaw, gate_m):  # type: ignore[no-untyped-def]
+def _add_up(H, g, at, found, squared, tree, information, centre, yaw, gate_m):  # type: ignore[no-untyped-def]
     """The normal equations ``H step = g`` of what was matched, by Tukey's weights."""
     cos, sin = np.cos(yaw), np.sin(yaw)
     H[:], g[:] = 0.0, 0.0
     for q in range(len(found)):
         if found[q] < 0:
             continue
-        A, i = information[order[found[q]]], found[q]
+        A, i = information[tree.order[found[q]]], found[q]
         weight = (1 - squared[q] / (gate_m * gate_m)) ** 2
         u, v = at[q, 0] - centre[0], at[q, 1] - centre[1]
         for k in range(3):
@@ -317,18 +312,14 @@ def _add_up(H, g, at, found, squared, points, order, information, centre, yaw, g
             H[k, 0] += ax * cos - ay * sin
             H[k, 1] += ax * sin + ay * cos
             H[k, 2] += ay * u - ax * v
-            g[k] += ax * (at[q, 0] - points[i, 0]) + ay * (at[q, 1] - points[i, 1])
-            g[k] += (px * A[3] + py * A[4]) * (at[q, 2] - points[i, 2])
+            g[k] += ax * (at[q, 0] - tree.points[i, 0]) + ay * (at[q, 1] - tree.points[i, 1])
+            g[k] += (px * A[3] + py * A[4]) * (at[q, 2] - tree.points[i, 2])
 
 
 @Kernel
 def _align(
     queries: Float,
-    points: Float,
-    order: Int,
-    starts: Int,
-    stops: Int,
-    boxes: Float,
+    tree: _Tree,
     information: Float,
     centre: Float,
     prior: Float,
@@ -342,12 +333,10 @@ def _align(
     at, squared = np.empty((len(queries), 3)), np.empty(len(queries))
     H, g = np.empty((3, 3)), np.empty(3)
     for gate_m in gates_m:
-        num = _match(
-            queries, points, starts, stops, boxes, centre, state, gate_m, found, at, squared
-        )
+        num = _match(queries, tree, centre, state, gate_m, found, at, squared)
         if num < min_matches:
             return False
-        _add_up(H, g, at, found, squared, points, order, information, centre, state[3], gate_m)
+        _add_up(H, g, at, found, squared, tree, information, centre, state[3], gate_m)
         scale = min(1.0, max_weight / num)
         for k in range(3):
             axis = k + k // 2  # x, y, yaw
