@@ -4,6 +4,8 @@ are seen from where it stood, as they were fired."""
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from densify.doctor.findings import Finding, Verdict
@@ -77,32 +79,14 @@ def _check_compensation(
     sweep = sweep.select(sweep.lidar == lidar)
     offset_s = _turning_s(sweep, sample) if sweep.offset_ns is None else sweep.offset_ns * 1e-9
     near = _sample_of(sweep, _COMPENSATED_M)
-    points, offset_s = sweep.points[near], offset_s[near]
-
-    def sharpest(*variants: Float) -> float:
-        return max(sharpness(moved, origin_m) for moved in variants for origin_m in origins_m)
-
-    def carried(since_s: Float) -> Float:
-        return poses.transform_each(since_s[:, None] * spot.twist, points) @ R.T
-
-    # The moment they were compensated to may be any of the sweep's.
-    moments_s = {
-        "its stamp": 0.0,
-        "its first point": float(offset_s.min()),
-        "its last point": float(offset_s.max()),
-    }
-    as_stored = sharpest(points @ R.T)
-    undone_to = {name: sharpest(carried(at_s - offset_s)) for name, at_s in moments_s.items()}
-    moment = max(undone_to, key=lambda name: undone_to[name])
-    undone = undone_to[moment]
-    done = sharpest(carried(offset_s))
-    if max(as_stored, undone) < _LEAST_SHARPNESS:  # the origin was looked for in smeared rings
-        straight = carried(-offset_s)
-        undone = sharpness(straight, found_origin(straight, origins_m[0]))
-    values = {"as_stored": as_stored, "undone": undone, "done": done}
+    found, moment = _sharpness_by_motion(
+        sweep.points[near], offset_s[near], spot.twist, R, origins_m
+    )
+    as_stored, undone = found.as_stored, found.undone
+    values = found._asdict()
     text = (
         f"at {spot.speed_m_s:.1f} m/s the rings' sharpness is {as_stored:.2f} as stored, "
-        f"{undone:.2f} with a compensation undone, {done:.2f} with the motion compensated"
+        f"{undone:.2f} with a compensation undone, {found.done:.2f} with the motion compensated"
     )
     if max(as_stored, undone) < _LEAST_SHARPNESS:
         return Finding(name, Verdict.UNKNOWN, f"{text}; no distinct rings", values=values)
@@ -123,6 +107,46 @@ def _check_compensation(
     if sweep.offset_ns is None:
         return _raw_without_times(name, text, values, spot, sample)
     return Finding(name, Verdict.FINE, f"{text}: as they were fired", values=values)
+
+
+class _Sharpness(NamedTuple):
+    """Sharpness of rings as they are, with a compensation of motion undone, and with one done."""
+
+    as_stored: float
+    undone: float
+    done: float
+
+
+def _sharpness_by_motion(
+    points: Float, offset_s: Float, twist: Float, R: Float, origins_m: tuple[Float, Float]
+) -> tuple[_Sharpness, str]:
+    """How sharp the rings are, and the moment that they would be compensated to.
+
+    points: (N,3) raw, fired at offset_s: (N,). twist: (6,) of the lidar, per second. R: into the
+    scanner's axes. origins_m: where the scanner may be.
+    """
+
+    def sharpest(*variants: Float) -> float:
+        return max(sharpness(moved, origin_m) for moved in variants for origin_m in origins_m)
+
+    def carried(since_s: Float) -> Float:
+        return poses.transform_each(since_s[:, None] * twist, points) @ R.T
+
+    # The moment they were compensated to may be any of the sweep's.
+    moments_s = {
+        "its stamp": 0.0,
+        "its first point": float(offset_s.min()),
+        "its last point": float(offset_s.max()),
+    }
+    as_stored = sharpest(points @ R.T)
+    undone_to = {name: sharpest(carried(at_s - offset_s)) for name, at_s in moments_s.items()}
+    moment = max(undone_to, key=lambda name: undone_to[name])
+    undone = undone_to[moment]
+    done = sharpest(carried(offset_s))
+    if max(as_stored, undone) < _LEAST_SHARPNESS:  # the origin was looked for in smeared rings
+        straight = carried(-offset_s)
+        undone = sharpness(straight, found_origin(straight, origins_m[0]))
+    return _Sharpness(as_stored, undone, done), moment
 
 
 def _raw_without_times(

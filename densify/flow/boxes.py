@@ -7,6 +7,7 @@ Jund et al., RA-L 2022).
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -56,17 +57,8 @@ def flow_of_boxes(
     T_here_next = poses.inverse(here.T_world_lidar) @ after.T_world_lidar
     T_there = T_here_next @ _at_reference(next_boxes, after)
     row_of = {track: row for row, track in enumerate(next_boxes.track) if track}
-    reach_m = np.linalg.norm(boxes.size_m / 2 + margins.grown_m + margins.unsure_m, axis=1)
-    x, y = np.ascontiguousarray(points[:, 0]), np.ascontiguousarray(points[:, 1])
-    for k, (track, T_here_box) in enumerate(
-        zip(boxes.track, _at_reference(boxes, here), strict=True)
-    ):
-        rows: Int = np.flatnonzero(
-            (np.abs(x - T_here_box[0, 3]) <= reach_m[k])
-            & (np.abs(y - T_here_box[1, 3]) <= reach_m[k])
-        )
-        if boxes.lidar is not None and boxes.lidar[k] >= 0:
-            rows = rows[here.sweep.lidar[rows] == boxes.lidar[k]]
+    for k, (rows, T_here_box) in enumerate(_about(boxes, here, margins)):
+        track = boxes.track[k]
         in_box = poses.transform(poses.inverse(T_here_box), points[rows])
         outside_m = (np.abs(in_box) - boxes.size_m[k] / 2).max(axis=1)
         near[rows] |= outside_m <= margins.grown_m + margins.unsure_m
@@ -89,6 +81,22 @@ def flow_of_boxes(
     field.displacement[twice] = 0.0
     field.moving[twice] = False
     return field, sure
+
+
+def _about(boxes: Boxes, here: RegisteredSweep, margins: BoxMargins) -> Iterator[tuple[Int, Float]]:
+    """Rows of the points in and around each box, of its scanner if it is one scanner's, and where
+    it is."""
+    points = here.sweep.points
+    reach_m = np.linalg.norm(boxes.size_m / 2 + margins.grown_m + margins.unsure_m, axis=1)
+    x, y = np.ascontiguousarray(points[:, 0]), np.ascontiguousarray(points[:, 1])
+    for k, T_here_box in enumerate(_at_reference(boxes, here)):
+        rows: Int = np.flatnonzero(
+            (np.abs(x - T_here_box[0, 3]) <= reach_m[k])
+            & (np.abs(y - T_here_box[1, 3]) <= reach_m[k])
+        )
+        if boxes.lidar is not None and boxes.lidar[k] >= 0:
+            rows = rows[here.sweep.lidar[rows] == boxes.lidar[k]]
+        yield rows, T_here_box
 
 
 def _at_reference(boxes: Boxes, registered: RegisteredSweep) -> Float:

@@ -153,24 +153,29 @@ def _add_workers(parser: argparse.ArgumentParser) -> None:
 
 def answer(options: argparse.Namespace) -> Iterator[Answer]:
     """Every key of whole recordings, or how far that is."""
-    from densify.cli.sets import FIRST_OF_SET, set_facts, set_status, set_summary
+    yield from _made(options) if options.status is None else _so_far(options)
 
-    if options.status is not None:
-        from densify.dataset.make import damaged, status
 
-        so_far, last_lines = status(options.status)
-        files = damaged(options.status) if options.verify else []
-        text = "\n".join([set_status(so_far, last_lines), *(f"damaged: {name}" for name in files)])
-        yield Answer(text, {**set_facts(so_far), "damaged": files})
-        if files:
-            raise ComputationError(
-                f"--verify: {len(files)} damaged or missing files in {options.status}; run the "
-                f"command that made the set again with --verify, which makes them anew"
-            )
-        return
+def _so_far(options: argparse.Namespace) -> Iterator[Answer]:
+    from densify.cli.sets import set_facts, set_status
+    from densify.dataset.make import damaged, status
+
+    so_far, last_lines = status(options.status)
+    files = damaged(options.status) if options.verify else []
+    text = "\n".join([set_status(so_far, last_lines), *(f"damaged: {name}" for name in files)])
+    yield Answer(text, {**set_facts(so_far), "damaged": files})
+    if files:
+        raise ComputationError(
+            f"--verify: {len(files)} damaged or missing files in {options.status}; run the "
+            f"command that made the set again with --verify, which makes them anew"
+        )
+
+
+def _made(options: argparse.Namespace) -> Iterator[Answer]:
     if options.out is None:
         raise InputError("--out DIR: expected the set's folder, a new one or one to go on with")
     config = config_of(options)
+    from densify.cli.sets import FIRST_OF_SET, set_facts, set_summary
     from densify.dataset.gate import Gate
     from densify.dataset.make import make_dataset
     from densify.dataset.plan import Recipe

@@ -56,17 +56,8 @@ def left_contradicted(
     if len(track.sightings) < _LEAST_STATES or seen_s < _LEAST_S:
         return None
     track.smooth()
-    residual_m = track.path.residual_m
-    begin, end = track.path(track.path.begin_s), track.path(track.path.end_s)
-    travelled = float(np.linalg.norm((end - begin)[:2]))
-    gap_m = space.gap_m(track.centre, next(iter(track.claimed)))
-    by_gap_m = _ROUGH_M + _ROUGH_PER_GAP * gap_m
-    rough_m = by_gap_m + _ROUGH_S * travelled / seen_s
-    # Of few places far apart rings, which may be so rough, some lie on a line by chance.
-    least_m = max(_LEAST_WAY_PER_RESIDUAL * residual_m, _LEAST_WAY_PER_ROUGH * rough_m)
-    if travelled < max(_LEAST_WAY_M, least_m) or residual_m > rough_m + _ROUGHER * by_gap_m:
-        return None
-    if residual_m > rough_m and not space.sensors.scattered:
+    over_m = _over_noise_m(track, space, seen_s)
+    if over_m is None or (over_m > 0 and not space.sensors.scattered):
         return None
     if not _as_fast_as_measured(track, standing):
         return None
@@ -77,7 +68,7 @@ def left_contradicted(
     told = _left_places(track, standing, space, proven)
     if any(t > 0 for t, _ in told) and all(t >= _MOSTLY * empty for t, empty in told):
         return None
-    if residual_m > rough_m and not _mostly_bare(told):
+    if over_m > 0 and not _mostly_bare(told):
         return None
     # What never left its place may be a ring that glides over a bonnet: only contradictions tell.
     if still < _SHARE_OF_FEW * num_asked and not np.any(told):
@@ -95,6 +86,22 @@ def left_contradicted(
     if not bare and still < _SHARE_OF_RAIL * num_asked and _like_a_rail(track, standing, space):
         return None
     return moved / num_asked
+
+
+def _over_noise_m(track: Track, space: FreeSpace, seen_s: float) -> float | None:
+    """How much farther off the smooth motion its places lie than noise makes them; None where they
+    lie too far off, or the way is too short, to tell of any motion. seen_s: how long it is."""
+    residual_m = track.path.residual_m
+    begin, end = track.path(track.path.begin_s), track.path(track.path.end_s)
+    travelled = float(np.linalg.norm((end - begin)[:2]))
+    gap_m = space.gap_m(track.centre, next(iter(track.claimed)))
+    by_gap_m = _ROUGH_M + _ROUGH_PER_GAP * gap_m
+    rough_m = by_gap_m + _ROUGH_S * travelled / seen_s
+    # Of few places far apart rings, which may be so rough, some lie on a line by chance.
+    least_m = max(_LEAST_WAY_PER_RESIDUAL * residual_m, _LEAST_WAY_PER_ROUGH * rough_m)
+    if travelled < max(_LEAST_WAY_M, least_m) or residual_m > rough_m + _ROUGHER * by_gap_m:
+        return None
+    return max(0.0, residual_m - rough_m)
 
 
 def may_be_a_rail(

@@ -75,14 +75,14 @@ def export_run(
     """Write a finished run in another form, or with fewer pixels; nothing is computed again.
 
     run: the folder of one key, such as ``densify-out/000120``; of forms that take drives also one
-    with several keys in it. min_confidence: 0 to 1; higher keeps
-    fewer pixels, and points by their own, relative confidence. max_age_ms: 0 or more, between the
-    exposure and the sweep that measured the pixel, or the key and the sweep that measured the
-    point; lower keeps fewer; None for any age. Both are compared as the maps store them, in steps
-    of 1/254 and 1 ms. A filled pixel goes by its own confidence and the age of the measured pixel
-    nearest to it, and stays even if those around it go. out: the folder to make; if None,
-    ``export`` in ``run``, and ``export/FORM`` for all but png. overwrite: replace an earlier
-    export. to: a name of `densify.plugins.exports.EXPORTS`. cameras: only these, all if None.
+    with several keys in it. min_confidence: 0 to 1; higher keeps fewer pixels, and points by their
+    own, relative confidence. max_age_ms: 0 or more, between the exposure and the sweep that
+    measured the pixel, or the key and the sweep that measured the point; lower keeps fewer; None
+    for any age. Both are compared as the maps store them, in steps of 1/254 and 1 ms. A filled
+    pixel goes by its own confidence and the age of the measured pixel nearest to it, and stays even
+    if those around it go. out: the folder to make; if None, ``export`` in ``run``, and
+    ``export/FORM`` for all but png. overwrite: replace an earlier export. to: a name of
+    `densify.plugins.exports.EXPORTS`. cameras: only these, all if None.
 
     The folder is complete or not there. Raises InputError for a folder that is no run, thresholds
     out of range, files that are missing, damaged or do not belong together, a form that is none or
