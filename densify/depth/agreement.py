@@ -11,7 +11,7 @@ from densify.kernels import agreeing
 from densify.scores.depth_metrics import KITTI_BASELINE_M, OUTLIER_FRACTION, OUTLIER_PX
 from densify.types import Float32
 
-_GIVEN = 2  # pixels around that are taken to agree: few do not tell
+_GIVEN = 2.0  # pixels around that are taken to agree: few do not tell
 _MOST = 0.7  # of them; of what more contradicted, half to nine tenths was wrong
 
 
@@ -26,7 +26,8 @@ def contradicted(layers: Layers, focal_px: float) -> Float32:
     pixel = np.flatnonzero(layers.filled_m)
     share = np.zeros(len(pixel), np.float32)
     half_px = max(2, round(float(np.median(layers.gap_px))))
-    rule = np.array([_GIVEN, OUTLIER_PX / (focal_px * KITTI_BASELINE_M), OUTLIER_FRACTION])
+    apart = OUTLIER_PX / (focal_px * KITTI_BASELINE_M)
+    rule = agreeing.Rule(_GIVEN, float(apart), OUTLIER_FRACTION)
     agreeing.contradicted.over_rows(
         len(pixel), pixel, inverse, known, layers.tilt, half_px, rule, share
     )

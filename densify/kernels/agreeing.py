@@ -4,9 +4,20 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 from densify.kernels import Kernel
 
 _LEAST, _MOST = 0.7, 1.4  # of the inverse depth around: how far its slope is followed
+
+
+class Rule(NamedTuple):
+    """What is elsewhere: off by both ``apart``, an inverse depth (1/m), and ``fraction`` of it.
+    num_given: so many more are taken to agree."""
+
+    num_given: float
+    apart: float
+    fraction: float
 
 
 @Kernel
@@ -16,8 +27,7 @@ def contradicted(first, last, pixel, inverse, known, tilt, half_px, rule, share)
 
     inverse: (H,W) float32 depth of the pixels, 1/m. known: (H,W) float32, of those around, 0 none.
     tilt: (H,W,2) float32 its slope, 1/m per px. half_px: how far around, to all sides; every pixel
-    is looked at, or every n-th, up to 11 across. rule: (3,) how many more are taken to agree;
-    the inverse depth, and the share of it, by both of which what is elsewhere is off.
+    is looked at, or every n-th, up to 11 across. rule: `Rule`.
     """
     height, width = known.shape
     step = max(1, -(-half_px // 5))
@@ -25,7 +35,7 @@ def contradicted(first, last, pixel, inverse, known, tilt, half_px, rule, share)
     for i in range(first, last):
         v, u = pixel[i] // width, pixel[i] % width
         here = inverse[v, u]
-        least = max(rule[1], rule[2] * here)
+        least = max(rule.apart, rule.fraction * here)
         num = against = 0
         for dv in range(-half_px, half_px + 1, step):
             row = v + dv
@@ -42,4 +52,4 @@ def contradicted(first, last, pixel, inverse, known, tilt, half_px, rule, share)
                 on = min(max(on, _LEAST * there), _MOST * there)
                 num += 1
                 against += abs(on - here) > least
-        share[i] = against / (num + rule[0])
+        share[i] = against / (num + rule.num_given)

@@ -222,12 +222,6 @@ def fill_times(rays, row_edges_rad, offset_s, spread_s):  # type: ignore[no-unty
 
 
 @inlined
-def _cell_time(row, column, offset_s):  # type: ignore[no-untyped-def]
-    """When a cell was faced; outside the rows, when the nearest one was."""
-    return offset_s[min(max(row, 0), len(offset_s) - 1), column]
-
-
-@inlined
 def _speed(x, y, z, vx, vy, vz, twist):  # type: ignore[no-untyped-def]
     """m/s at which the lidar sees a point with a velocity of its own go by."""
     vx -= twist[3] + twist[1] * z - twist[2] * y

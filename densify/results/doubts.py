@@ -44,7 +44,7 @@ def with_doubts(
         *_left_out(sequence, chosen),
         *(doubt for camera in chosen.values() for doubt in _of_camera(camera)),
         *_of_times(stretch, settings),
-        *_of_shots(sequence, stretch, shots),
+        *_of_shots(sequence, shots),
     ]
     own = {name: [*_of_far(result), *_of_maps(result)] for name, result in results.items()}
     return {
@@ -96,9 +96,7 @@ def _of_times(stretch: Stretch, settings: Config) -> Iterator[str]:
         )
 
 
-def _of_shots(
-    sequence: LidarSequence, stretch: Stretch, shots: Mapping[str, Shot]
-) -> Iterator[str]:
+def _of_shots(sequence: LidarSequence, shots: Mapping[str, Shot]) -> Iterator[str]:
     for name, shot in shots.items():
         stamps_ns = list(sequence.image_stamps_ns(shot.camera.name).values())
         if shot.number is not None:

@@ -123,7 +123,7 @@ def _people_street(
     ways.car(slow, here + 20.0, brake, 1.0)
     ways.car(fast, here + 9.0, Speed((0.0, 13.5 * jitter(rng, 0.06))), 1.5)
     ways.car(fast, here - 42.0, Speed((0.0, 12.0)), 6.0)
-    _turning_truck(ways, main, side, mouth_m)
+    _turning_truck(ways, main, side)
     ways.car(oncoming, here + 12.0, Speed((0.0, 8.8), (9.0, 8.4), (16.0, 9.0)), 1.0)
     ways.car(oncoming, mouth_m + 30.0, Speed((0, 9.0), (8.5, 8.0), (12.0, 2.4), (17.0, 5.5)), 2.0)
     ways.car(oncoming, here - 22.0, Speed((0.0, 10.0)), 4.0)
@@ -140,7 +140,7 @@ def _people_street(
         ways.walker(main, (low, high), forward, here + ahead)
 
 
-def _turning_truck(ways: Ways, main: Curve, side: Curve, mouth_m: float) -> None:
+def _turning_truck(ways: Ways, main: Curve, side: Curve) -> None:
     """A truck that turns from the oncoming lane into the side road on its right."""
     oncoming = Lane(main, _ONCOMING_M, forward=False).curve
     knots = np.arange(0.0, oncoming.length_m, 0.5)

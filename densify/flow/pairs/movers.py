@@ -67,7 +67,7 @@ def find_movers(
             return replace(trial, refined=found)
         return trial.after(found, Trial.of(k, groups[k], found, ours, theirs))
 
-    starts = promising(hypotheses, groups, ours, theirs)
+    starts = promising(hypotheses, ours, theirs)
     with ThreadPoolExecutor(2) as pool:
         trials = [trial for trial in pool.map(tried, starts) if trial is not None]
     motions, instance = _choose(trials, groups, ours, theirs)

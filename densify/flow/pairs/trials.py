@@ -136,7 +136,7 @@ class Trial:
 
 
 def promising(
-    hypotheses: Hypotheses, groups: list[Int], ours: Unexplained, theirs: Unexplained
+    hypotheses: Hypotheses, ours: Unexplained, theirs: Unexplained
 ) -> list[tuple[int, RigidMotion]]:
     """Groups and motions that pass a first look, in the source alone; of several that are the same
     the one that leaves least."""
