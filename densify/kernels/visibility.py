@@ -246,30 +246,34 @@ def _look_round(points, reaches, shape, i, u0, v0, centre, agree, inner, witness
     left, right = max(u0 - wide_u, 0), min(u0 + wide_u, shape[1] - 1)
     for v in range(max(v0 - wide_v, 0), min(v0 + wide_v, shape[0] - 1) + 1):
         for j in range(start[v * shape[1] + left], start[v * shape[1] + right + 1]):
-            du, dv = uv[j, 0] - u0, uv[j, 1] - v0
-            off = inverse[j] - (centre + su * du + sv * dv)
+            k = np.uint64(j)  # no place from the end on, which would be looked for at each access
+            du, dv = uv[k, 0] - u0, uv[k, 1] - v0
+            off = inverse[k] - (centre + su * du + sv * dv)
             away = np.inf
-            if moving and age_ns[j] <= NOW_NS:
+            if moving and age_ns[k] <= NOW_NS:
                 away = (du / across) ** 2 + (dv / along) ** 2
-            if (hidden[j] and not hidden[i]) or abs(off) > agree:
+            if (hidden[k] and not hidden[i]) or abs(off) > agree:
+                if off >= -far:
+                    continue
                 close = abs(du) <= outer and abs(dv) <= outer
-                behind |= close and off < -far and age_ns[j] <= witness_ns
-                if off < -far:
+                behind |= close and age_ns[k] <= witness_ns
+                if moving:
                     now_behind = min(now_behind, away)
                 continue
-            now = min(now, away)
-            around = abs(du) <= _GOES_ON * across and abs(dv) <= _GOES_ON * along
-            num_now += around and away < np.inf
-            if abs(du) <= support_u + 0.5 and abs(v - v0) <= support_v:
-                seen |= np.int64(1) << np.int64(points.sweep[j])
-                youngest = min(youngest, age_ns[j])
-            if abs(du) <= outer and abs(dv) <= on_v:
-                _extend(reach, du, dv)
-            if abs(du) < fit_u and abs(dv) < fit_v:
-                weight = (1 - abs(du) / fit_u) * (1 - abs(dv) / fit_v)
-                _add(m, weight, du, dv, off)
-                squares += weight * off * off
-                num += 1
+            if moving:
+                now = min(now, away)
+                around = abs(du) <= _GOES_ON * across and abs(dv) <= _GOES_ON * along
+                num_now += around and away < np.inf
+            # Without branches, of which half would be foretold wrongly.
+            vouches = abs(du) <= support_u + 0.5 and abs(v - v0) <= support_v
+            seen |= np.int64(vouches) << np.int64(points.sweep[k])
+            youngest = min(youngest, age_ns[k]) if vouches else youngest
+            goes_on = abs(du) <= outer and abs(dv) <= on_v
+            _extend(reach, du if goes_on else 0.0, dv if goes_on else 0.0)
+            weight = max(1 - abs(du) / fit_u, 0.0) * max(1 - abs(dv) / fit_v, 0.0)
+            _add(m, weight, du, dv, off)
+            squares += weight * off * off
+            num += abs(du) < fit_u and abs(dv) < fit_v
     return seen, youngest, num, squares, behind, now, now_behind, num_now
 
 
