@@ -51,13 +51,16 @@ def image_points(camera: Camera, points_cam: Float) -> tuple[Float, Bool]:
     another number of coefficients than it has.
     """
     lens = _lens(camera)
-    uv = np.full((len(points_cam), 2), np.nan)
+    uv, seen = np.full((len(points_cam), 2), np.nan), np.zeros(len(points_cam), bool)
     away = points_cam[:, 2] if camera.model == "pinhole" else np.linalg.norm(points_cam, axis=1)
-    ahead = np.flatnonzero((away > NEAREST_M) & _in_view(camera, lens, points_cam))
-    uv[ahead] = _pixels(camera, lens, *_plane(camera, points_cam[ahead]))
+    ahead = np.flatnonzero(away > NEAREST_M)
+    there = points_cam.take(ahead, axis=0)
+    in_view = np.flatnonzero(_in_view(camera, lens, there))
+    ahead, there = ahead[in_view], there.take(in_view, axis=0)
+    uv[ahead] = _pixels(camera, lens, *_plane(camera, there))
+    u, v = np.rint(uv.take(ahead, axis=0)).T
     with np.errstate(invalid="ignore"):
-        pixel = np.rint(uv)
-        seen = ((pixel >= 0) & (pixel < (camera.width_px, camera.height_px))).all(axis=1)
+        seen[ahead] = (u >= 0) & (u < camera.width_px) & (v >= 0) & (v < camera.height_px)
     return uv, seen
 
 

@@ -18,7 +18,9 @@ _ROWS = 8192  # at once: for more, OpenBLAS wakes threads that spin longer than 
 
 def transform(T_a_b: Float, points_b: Float) -> Float:
     """(4,4), (N,3) -> (N,3) points in a."""
-    return _product(points_b, T_a_b[:3, :3]) + T_a_b[:3, 3]
+    points_a = _product(points_b, T_a_b[:3, :3])
+    points_a += T_a_b[:3, 3]
+    return points_a
 
 
 def rotate(T_a_b: Float, vectors_b: Float) -> Float:
@@ -60,7 +62,9 @@ def carried(T_a_b: Float, twist_b: Float) -> Float:
 
 def transform_each(twist: Float, points: Float) -> Float:
     """(N,6), (N,3) -> (N,3): every point moved by its own ``exp(twist)``."""
-    return Rotation.from_rotvec(twist[:, :3]).apply(points) + twist[:, 3:]
+    moved: Float = Rotation.from_rotvec(twist[:, :3]).apply(points)
+    moved += twist[:, 3:]
+    return moved
 
 
 def interpolate(T_world_a: Float, T_world_b: Float, fraction: float) -> Float:

@@ -110,7 +110,8 @@ class FileSequence(ABC):
         """
         self.check_frame(frame)
         path, returns = self._returns(frame)
-        valid = np.isfinite(returns.points).all(axis=1) & returns.points.any(axis=1)
+        x, y, z = returns.points.T  # by columns: sums over rows of three take several times as long
+        valid = np.isfinite(x) & np.isfinite(y) & np.isfinite(z) & ((x != 0) | (y != 0) | (z != 0))
         row = np.flatnonzero(valid)
         if not len(row):
             raise InputError(
@@ -122,13 +123,17 @@ class FileSequence(ABC):
         return Sweep(
             frame=int(frame),
             stamp_ns=self.stamp_ns(frame),
-            points=returns.points[row].astype(np.float64),
-            intensity=(np.zeros(len(row)) if intensity is None else intensity[row]).astype(
-                np.float32
+            points=np.asarray(returns.points.take(row, axis=0), np.float64),
+            intensity=(
+                np.zeros(len(row), np.float32)
+                if intensity is None
+                else np.asarray(intensity[row], np.float32)
             ),
             offset_ns=None if returns.offset_ns is None else returns.offset_ns[row],
-            lidar=(np.zeros(len(row)) if lidar is None else lidar[row]).astype(np.uint8),
-            row=row.astype(np.int64),
+            lidar=(
+                np.zeros(len(row), np.uint8) if lidar is None else np.asarray(lidar[row], np.uint8)
+            ),
+            row=row.astype(np.int64, copy=False),
             scanner_origins=returns.scanner_origins,
             R_scanner_lidar=returns.R_scanner_lidar,
             radial_velocity_m_s=(

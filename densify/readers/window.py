@@ -25,8 +25,8 @@ def in_range(sweep: Sweep, settings: RegisterSettings) -> Sweep:
     """The sweep without the own vehicle's returns and those too far to trust, both measured from
     the scanner."""
     origins_m = sweep.scanner_origins
-    away = sweep.points if origins_m is None else sweep.points - origins_m[sweep.lidar]
-    range_m = np.linalg.norm(away, axis=1)
+    x, y, z = (sweep.points if origins_m is None else sweep.points - origins_m[sweep.lidar]).T
+    range_m = np.sqrt(x * x + y * y + z * z)
     return sweep.select((range_m >= settings.min_range_m) & (range_m <= settings.max_range_m))
 
 

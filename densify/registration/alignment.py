@@ -27,7 +27,9 @@ def some(sweep: Sweep, most: int = _MANY_POINTS) -> Sweep:
     num = len(sweep)
     if num <= most:
         return sweep
-    return sweep.select(np.arange(num) * _GOLDEN % 1 < most / num)
+    place = np.arange(num) * _GOLDEN
+    place -= np.floor(place)
+    return sweep.select(place < most / num)
 
 
 class Surface(NamedTuple):

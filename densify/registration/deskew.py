@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from densify.geometry import poses
+from densify.kernels import deskewing as kernels
 from densify.types import Float, RegisteredSweep, Stretch, Sweep, Trajectory
 
 
@@ -31,9 +32,10 @@ def placed(sweep: Sweep, T_world_lidar: Float, before: Float, after: Float) -> R
     """The raw sweep deskewed, by the (6,) twists per second before and after its reference time."""
     points: Float = sweep.points
     if sweep.offset_ns is not None:
-        offset_s = sweep.offset_ns[:, None] * 1e-9
-        twist = offset_s * np.where(offset_s < 0, before, after)
-        points = poses.transform_each(twist.astype(np.float64), points)
+        points = np.empty(points.shape)
+        kernels.move.over_rows(
+            len(points), sweep.points, sweep.offset_ns * 1e-9, np.stack([before, after]), points
+        )
     straight = RegisteredSweep(replace(sweep, points=points), T_world_lidar, before, after)
     if sweep.radial_velocity_m_s is None:
         return straight

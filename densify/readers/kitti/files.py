@@ -51,7 +51,9 @@ def read_points(path: Path) -> Float32:
             f"reflectance as float32), {len(data) % 16} too many; fetch the file again"
         )
     columns = np.frombuffer(data, "<f4").reshape(-1, 4).astype(np.float32)
-    columns[~np.isfinite(columns).all(axis=1)] = 0
+    finite = np.isfinite(columns)
+    if not finite.all():
+        columns[~finite.all(axis=1)] = 0
     return columns
 
 
