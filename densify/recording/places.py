@@ -42,6 +42,7 @@ class Places:
         self.registration = lru_cache(maxsize=8)(self._registration)
         self.pieces = lru_cache(maxsize=8)(self._find_pieces)
         self.deskewed = lru_cache(maxsize=cut.num_kept)(self._deskew)
+        self._stretch = lru_cache(maxsize=1)(self._make_stretch)  # steps often ask for it again
 
     def _registration(self, number: int) -> Registration:
         frames = self._cut.blocks[number].frames
@@ -134,7 +135,9 @@ class Places:
 
     def stretch(self, number: int, around_s: float, frames: Sequence[int]) -> Stretch:
         """These sweeps of one piece, deskewed, in its world."""
-        around_s = min(around_s, self._cut.margin_s)
+        return self._stretch(number, min(around_s, self._cut.margin_s), tuple(frames))
+
+    def _make_stretch(self, number: int, around_s: float, frames: tuple[int, ...]) -> Stretch:
         return Stretch(tuple(self.deskewed(number, around_s, f) for f in frames))
 
     def _deskew(self, number: int, around_s: float, frame: int) -> RegisteredSweep:
