@@ -209,7 +209,7 @@ class Exposure:
     def see(self, points: Float, velocity_m_s: Float | Float32) -> Sight:
         """(N,3) points and velocities at the key's moment, key frame. A rolling shutter sees each
         point at the time of the row or column it lands on, where camera and point have moved on."""
-        late = points + self.late_s * velocity_m_s
+        late = points + self.late_s * velocity_m_s if velocity_m_s.any() else points
         points_cam = poses.transform(self.T_cam_key, late)
         uv, inside = image_points(self.camera, points_cam)
         if not self.camera.is_rolling:

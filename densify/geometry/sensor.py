@@ -58,14 +58,18 @@ class Aimed(NamedTuple):
 def aimed(registered: RegisteredSweep, lidar: int) -> Aimed:
     """The rays of one scanner, whose points deskewing has moved, back at their firing times."""
     sweep = registered.sweep
-    mine = np.flatnonzero(sweep.lidar == lidar)
-    offset_s = np.zeros(len(mine), np.float32)
-    if sweep.offset_ns is not None:
-        offset_s = (sweep.offset_ns[mine] * 1e-9).astype(np.float32)
-    seen = np.empty((3, len(mine)), np.float32)
+    mine, points, offset_ns = sweep.lidar == lidar, sweep.points, sweep.offset_ns
+    if not mine.all():
+        rows = np.flatnonzero(mine)
+        points = points.take(rows, axis=0)
+        offset_ns = None if offset_ns is None else offset_ns[rows]
+    offset_s = np.zeros(len(points), np.float32)
+    if offset_ns is not None:
+        offset_s = (offset_ns * 1e-9).astype(np.float32)
+    seen = np.empty((3, len(points)), np.float32)
     kernels.aim.over_rows(
-        len(mine),
-        sweep.points[mine].astype(np.float32),
+        len(points),
+        points.astype(np.float32),
         offset_s,
         sweep.origin_m(lidar).astype(np.float32),
         sweep.axes(lidar).astype(np.float32),

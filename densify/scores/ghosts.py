@@ -11,6 +11,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from densify.geometry.range_image import RangeImage
 from densify.types import Bool, Cloud
@@ -49,29 +50,29 @@ def ghost_scores(cloud: Cloud, key_image: RangeImage, key: int) -> dict[str, Any
     of them, of those the flow calls ``moving`` and of the ``static`` rest, by distance in frames
     from the key (``by_distance["3"]``: frames key-3 and key+3), and by time from the key, to 10 ms
     (``by_seconds["0.30"]``)."""
-    other = _others(cloud, key)
-    ghost = ghosts(cloud, key_image, key)
-    distance = np.abs(cloud.frame - key)
-    hundredths = np.rint(np.abs(cloud.since_key_ns) / 1e7).astype(np.int64)
+    other = np.flatnonzero(_others(cloud, key))
+    ghost, moving = ghosts(cloud, key_image, key)[other], cloud.moving[other]
+    distance = np.abs(cloud.frame[other] - key)
+    hundredths = np.rint(np.abs(cloud.since_key_ns[other]) / 1e7).astype(np.int64)
     return {
-        "num_points": int(other.sum()),
-        "all": _mean(ghost[other]),
-        "moving": _mean(ghost[other & cloud.moving]),
-        "static": _mean(ghost[other & ~cloud.moving]),
-        "by_distance": {
-            str(steps): _mean(ghost[other & (distance == steps)])
-            for steps in np.unique(distance[other])
-        },
-        "by_seconds": {
-            f"{h / 100:.2f}": _mean(ghost[other & (hundredths == h)])
-            for h in np.unique(hundredths[other])
-        },
+        "num_points": len(other),
+        "all": _mean(ghost),
+        "moving": _mean(ghost[moving]),
+        "static": _mean(ghost[~moving]),
+        "by_distance": {str(steps): rate for steps, rate in _rates(ghost, distance).items()},
+        "by_seconds": {f"{h / 100:.2f}": rate for h, rate in _rates(ghost, hundredths).items()},
     }
 
 
 def _others(cloud: Cloud, key: int) -> Bool:
     """(M,) the points of the window that are not from the key sweep."""
     return (cloud.frame != key) & ~cloud.far
+
+
+def _rates(ghost: Bool, group: NDArray[np.integer]) -> dict[int, float]:
+    """The share of ghosts in every group (N,) that has points, ascending."""
+    num, num_ghosts = np.bincount(group), np.bincount(group, ghost)
+    return {g: float(num_ghosts[g] / num[g]) for g in np.flatnonzero(num).tolist()}
 
 
 def _mean(values: np.ndarray) -> float | None:
