@@ -185,7 +185,8 @@ def _tilt(tau_x: float, tau_y: float) -> Float:
 
 def _in_view(camera: Camera, lens: _Lens, points_cam: Float) -> Bool:
     """(N,) whether the lens sees that way, in the image or not."""
-    z, range_m = points_cam[:, 2], np.linalg.norm(points_cam, axis=1)
+    x, y, z = points_cam.T
+    range_m = np.sqrt(x * x + y * y + z * z)  # norm takes three times as long over rows of three
     seen: Bool = z >= range_m * np.cos(np.radians(camera.max_angle_deg))
     if camera.model == "pinhole":
         seen &= z > 0

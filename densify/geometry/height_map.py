@@ -73,8 +73,9 @@ def _grid(clouds: Iterable[Float], cell_m: float) -> tuple[Float, tuple[int, int
     low, high = np.full(2, np.inf), np.full(2, -np.inf)
     for points in clouds:
         if len(points):
-            low = np.minimum(low, points[:, :2].min(0))
-            high = np.maximum(high, points[:, :2].max(0))
+            x, y, _ = points.T
+            low = np.minimum(low, [x.min(), y.min()])
+            high = np.maximum(high, [x.max(), y.max()])
     low = np.floor(low / cell_m) * cell_m
     num_x, num_y = ((high - low) / cell_m).astype(np.int64) + 1
     return low, (int(num_x), int(num_y))

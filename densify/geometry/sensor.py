@@ -289,7 +289,7 @@ def _step_rad(rays: Aimed, rings: Float | None) -> float:
 def _view(azimuth: Float32) -> tuple[float, float]:
     """The rightmost and the leftmost direction: the ends of the widest gap without returns; all
     round unless that is wider than what a building hides."""
-    angles = np.unique(azimuth.astype(np.float64))
+    angles = np.unique(azimuth).astype(np.float64)
     gap = np.diff(angles, append=angles[0] + 2 * np.pi)
     widest = int(np.argmax(gap))
     if gap[widest] < _HOLE_RAD:

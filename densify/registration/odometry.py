@@ -154,11 +154,13 @@ def _standing(points: Float) -> Float:
     """The points above the ground: its rings go with the scanner and hide the motion."""
     if not len(points):
         return points
-    cell = np.floor(points[:, :2]).astype(np.int64)
-    cell -= cell.min(0)
-    lowest = np.full(cell.max(0) + 1, np.inf)
-    np.minimum.at(lowest, (cell[:, 0], cell[:, 1]), points[:, 2])
-    standing = points[points[:, 2] > lowest[cell[:, 0], cell[:, 1]] + _STANDING_M]
+    x, y, z = points.T
+    row, column = (np.floor(along).astype(np.int64) for along in (x, y))
+    row, column = row - row.min(), column - column.min()
+    cell = row * (column.max() + 1) + column
+    lowest = np.full(int(cell.max()) + 1, np.inf)
+    np.minimum.at(lowest, cell, z)
+    standing = points.take(np.flatnonzero(z > lowest[cell] + _STANDING_M), axis=0)
     return standing if len(standing) else points
 
 

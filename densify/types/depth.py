@@ -50,7 +50,8 @@ class Cloud:
     @property
     def displaced(self) -> Float32:
         """(M,) metres moved beyond the rigid alignment."""
-        return np.linalg.norm(self.points - self.rigid_points, axis=1).astype(np.float32)
+        x, y, z = (self.points - self.rigid_points).T
+        return np.sqrt(x * x + y * y + z * z).astype(np.float32)
 
     def after(self, seconds: float) -> Cloud:
         """Shortly after (or before) the key's moment: what moves goes on at its velocity."""
