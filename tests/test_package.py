@@ -159,6 +159,13 @@ def test_every_source_file_starts_with_its_license() -> None:
             assert len(lines) == 1 or lines[1].startswith('"""'), f"{path}: no module docstring"
 
 
+def test_every_room_is_on_the_map_of_contributors() -> None:
+    rows = re.findall(r"^\| (`densify/.*?) \|", (CHECKOUT / "CONTRIBUTING.md").read_text(), re.M)
+    named = {name.removeprefix("densify/") for row in rows for name in re.findall("`(.*?)`", row)}
+    rooms = {path.parent.name for path in (CHECKOUT / "densify").glob("*/__init__.py")}
+    assert named - {"pipeline.py"} == rooms
+
+
 def test_docstrings_are_sentences_with_a_subject() -> None:
     for path in (CHECKOUT / "densify").rglob("*.py"):
         found = re.search(r'"""(Of|By|With|Without|On|To|In|For|At) [^"]*', path.read_text("utf-8"))
