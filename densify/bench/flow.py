@@ -113,16 +113,8 @@ def bench_flow(
     if len(opened.frames) < 2:
         raise InputError(f"--key {key}: no neighbour in {sequence.name}; choose another key")
     pairs = pairs_of(opened, max_points)
-    here = opened.frames.index(key)
-    if truth is not None:
-        if here == 0:
-            raise InputError(
-                f"--key {key}: no sweep before it, whose flow --truth could tell; choose another"
-            )
-        pairs = {f: pairs[f] for f in opened.frames[:here]}
-    if pairs_only:
-        one = opened.frames[here - 1 if here else 1]
-        pairs = {one: pairs[one]}
+    scored = _scored_frames(opened.frames, key, pairs_only, truth is not None)
+    pairs = {f: pair for f, pair in pairs.items() if f in scored}
     scorer = Scorer.of(sequence, opened, tuple(pairs), truth)
     measured: dict[str, _Measured] = {}
     chosen = [name for name in METHODS if name in methods]
@@ -141,6 +133,20 @@ def bench_flow(
         "truth": None if pairs_only else scorer.truth_scores(),
         "methods": _finished(measured),
     }
+
+
+def _scored_frames(
+    frames: Sequence[int], key: int, pairs_only: bool, forwards: bool
+) -> Sequence[int]:
+    """Those whose pairs with the key are scored. forwards: only those before the key."""
+    here = frames.index(key)
+    if forwards and here == 0:
+        raise InputError(
+            f"--key {key}: no sweep before it, whose flow --truth could tell; choose another"
+        )
+    if pairs_only:
+        return [frames[here - 1 if here else 1]]
+    return frames[:here] if forwards else frames
 
 
 def _check(methods: Sequence[str], window: int, max_points: int) -> None:

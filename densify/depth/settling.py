@@ -128,10 +128,17 @@ def _settled(
         ]
     )
     confidence = np.maximum(own[winner] * (1 - _DOUBTS @ doubts), MOST_CONFIDENCE)
-    confidence, tilt = confidence.astype(np.float32), points.slope[winner]
     inside &= ~veiled
     every = MeasuredPixels(
-        pixel, winner, depth_m, confidence, tilt, inside, veiled, refused & ~inside, alone
+        pixel=pixel,
+        winner=winner,
+        depth_m=depth_m,
+        confidence=confidence.astype(np.float32),
+        tilt=points.slope[winner],
+        inside=inside,
+        veiled=veiled,
+        refused=refused & ~inside,
+        alone=alone,
     )
     return every.select(supported), reason
 
