@@ -210,6 +210,12 @@ def _check(
     cameras: Sequence[str] | None,
 ) -> None:
     """Raise InputError before anything is read."""
+    if isinstance(sequence, str | Path):
+        raise InputError(
+            f"sequence: got {str(sequence)!r}, expected what densify.open_sequence makes of it"
+        )
+    if isinstance(methods, str):
+        raise InputError(f"methods: got {methods!r}, expected a list of names, such as ['flow']")
     for name in methods:
         if name not in METHODS:
             raise InputError(f"--methods {name}: expected some of {', '.join(METHODS)}")

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from densify.config import RegisterSettings
+from densify.dataset.make import make_dataset
 from densify.errors import ComputationError, InputError
 from densify.geometry import poses
 from densify.pipeline import compare, run
@@ -150,6 +151,17 @@ def test_unknown_methods_are_refused_before_anything_is_read():
     sequence = one_car(())
     with pytest.raises(InputError, match="--methods magic: expected some of none, icp, "):
         compare(sequence, KEY, 1, methods=("icp", "magic"))
+    assert not sequence.read
+
+
+def test_texts_are_no_lists_and_no_recordings() -> None:
+    sequence = one_car(())
+    with pytest.raises(InputError, match="sequence: got 'street', expected what densify"):
+        run("street", KEY, 1)
+    with pytest.raises(InputError, match="methods: got 'flow', expected a list of names"):
+        compare(sequence, KEY, 1, methods="flow")
+    with pytest.raises(InputError, match="data: got 'street', expected a list of recordings"):
+        make_dataset("street", "nowhere")
     assert not sequence.read
 
 

@@ -85,7 +85,7 @@ class Summary:
 
 def make_dataset(
     data: Sequence[str],
-    out: Path,
+    out: str | Path,
     keys: slice | None = None,
     recipe: Recipe | None = None,
     *,
@@ -120,7 +120,9 @@ def make_dataset(
     Raises InputError for what cannot be used, and where another run is at work on the same part;
     ComputationError where the disk is full or the workers are lost: what is finished is kept.
     """
-    recipe = recipe or Recipe()
+    if isinstance(data, str):
+        raise InputError(f"data: got {data!r}, expected a list of recordings, such as [{data!r}]")
+    out, recipe = Path(out), recipe or Recipe()
     check_engine(recipe.config.flow.engine)
     drives = plan(data, keys, recipe)
     check_place(out)
