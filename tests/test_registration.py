@@ -16,7 +16,7 @@ from densify.geometry import poses
 from densify.readers.street import Street
 from densify.readers.window import read_sweep, recorded_trajectory
 from densify.registration import neighbors, odometry, trajectory
-from densify.registration.alignment import some
+from densify.registration.alignment import subsample
 from densify.registration.deskew import deskew
 from densify.registration.neighbors import refine
 from densify.registration.odometry import check_overlap, check_plausible, register
@@ -395,7 +395,7 @@ def test_knobs_reach_kiss_icp(raw, first_pass):
 
 @pytest.fixture(scope="module")
 def few(raw):
-    return [some(s, 12_000) for s in raw]
+    return [subsample(s, 12_000) for s in raw]
 
 
 def test_few_points_are_laid_on_the_surfaces_of_the_last_second(drive, few):

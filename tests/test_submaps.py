@@ -15,7 +15,7 @@ from densify.geometry import poses
 from densify.outputs import write_result
 from densify.recording import road
 from densify.registration import submaps
-from densify.registration.alignment import Lay, some
+from densify.registration.alignment import Lay, subsample
 from densify.registration.submaps import num_in_submap, relax
 from densify.types import Sweep
 from tests.scenes import Arc, Scanner, Scene, TinySequence, World, street
@@ -158,7 +158,7 @@ def test_thinning_takes_of_every_ring_alike(num_rings):
     num = 200_000
     nothing = np.zeros(num)
     sweep = Sweep(0, 0, np.zeros((num, 3)), nothing, None, nothing.astype(np.uint8), np.arange(num))
-    kept = some(sweep)
+    kept = subsample(sweep)
     assert abs(len(kept) - 30_000) < 10
     of_ring = np.bincount(kept.row % num_rings, minlength=num_rings)
     assert of_ring.min() > 0.9 * of_ring.max()

@@ -52,9 +52,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 advice = "try a smaller --window, fewer --workers or one --camera"
                 return screen.end(FAILED, f"out of memory; {advice}")
             from densify.cli.bugs import kept
-            from densify.plugins.table import whose
+            from densify.plugins.table import owner_of
 
-            blame, log = whose(error), kept(error)
+            blame, log = owner_of(error), kept(error)
             said = f"this is a bug in densify; please report it with the log at {log}"
             if blame:
                 said = f"{blame}: {type(error).__name__}: {error}; its makers can use the log {log}"

@@ -121,7 +121,7 @@ def standing(
     ).select(~gone)
 
 
-def together(parts: Sequence[StandingWorld]) -> StandingWorld:
+def joined(parts: Sequence[StandingWorld]) -> StandingWorld:
     """Parts of one world as one, by ascending frame."""
     if not parts:
         return _NOTHING

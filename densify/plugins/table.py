@@ -41,7 +41,7 @@ R = TypeVar("R", bound=Row)
 _LOADED: dict[str, str] = {}  # other people's modules, by the name of the outermost: what they are
 
 
-def whose(error: BaseException) -> str:
+def owner_of(error: BaseException) -> str:
     """Which row of another package an exception went through, "" if none."""
     for frame, _ in traceback.walk_tb(error.__traceback__):
         module = str(frame.f_globals.get("__name__"))

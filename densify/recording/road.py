@@ -20,7 +20,7 @@ from densify.kernels.threads import num_threads
 from densify.process.costs import Watch
 from densify.readers.timeline import Timeline
 from densify.recording.sweeps import Sweeps
-from densify.registration.alignment import some
+from densify.registration.alignment import subsample
 from densify.registration.chain import follow
 from densify.registration.deskew import placed, twists
 from densify.registration.submaps import num_in_submap, relax
@@ -102,7 +102,7 @@ class Road:
             seen = list(pool.map(straight, shown))
             gone = far.departed(seen, travel_m)
             parts = list(pool.map(partial(far.standing, sensors), seen, travel_m.tolist(), gone))
-        return replace(far.together(parts), links=links, left_out=tuple(sorted(left_out)))
+        return replace(far.joined(parts), links=links, left_out=tuple(sorted(left_out)))
 
     def _beyond(
         self, near: Stretch, views: Sequence[tuple[Camera, Float]], side: int
@@ -118,7 +118,7 @@ class Road:
                 continue
             last_m = travel_m
             seen = sweep.select(_in_view(sweep, T_world_lidar, views))
-            sample = placed(some(sweep), T_world_lidar, before, after).sweep.points
+            sample = placed(subsample(sweep), T_world_lidar, before, after).sweep.points
             registered = RegisteredSweep(seen, T_world_lidar, before, after)
             found.append(_Passed(registered, sample, begin_m + side * travel_m, known=False))
         return found
@@ -208,7 +208,7 @@ def _within(near: Stretch, views: Sequence[tuple[Camera, Float]]) -> list[_Passe
         if at_m - last_m >= _LEAST_STEP_M:
             last_m = at_m
             seen = replace(s, sweep=s.sweep.select(_in_view(s.sweep, s.T_world_lidar, views)))
-            found.append(_Passed(seen, some(s.sweep).points, at_m, known=True))
+            found.append(_Passed(seen, subsample(s.sweep).points, at_m, known=True))
     return found
 
 

@@ -22,7 +22,7 @@ _HELD_AT_M = 10.0
 _NORMAL_M = 0.0447  # two surfaces' spread along the normal, as small_gicp weighs: sqrt(2 · 1e-3)
 
 
-def some(sweep: Sweep, most: int = _MANY_POINTS) -> Sweep:
+def subsample(sweep: Sweep, most: int = _MANY_POINTS) -> Sweep:
     """About ``most`` of the points of a sweep that holds more, of all its rings alike."""
     num = len(sweep)
     if num <= most:

@@ -10,7 +10,7 @@ import numpy as np
 from densify.config import RegisterSettings
 from densify.errors import InputError
 from densify.geometry import poses
-from densify.registration.alignment import Surface, SurfaceMap, some
+from densify.registration.alignment import Surface, SurfaceMap, subsample
 from densify.registration.deskew import placed
 from densify.types import Float, Int, RegisteredSweep, Sweep
 
@@ -71,7 +71,7 @@ class _End:
     ) -> None:
         self._settings, self._map, last = settings, SurfaceMap(), known[-1]
         for s in known[-_NUM_KNOWN:]:
-            self._map.insert(Surface.of(some(s.sweep).points), s.T_world_lidar)
+            self._map.insert(Surface.of(subsample(s.sweep).points), s.T_world_lidar)
         self.T_world_lidar, self.stamp_ns = last.T_world_lidar, last.sweep.stamp_ns
         self.twist = last.twist_before if backwards else last.twist_after
 
@@ -85,7 +85,7 @@ class _End:
         if len(sweep) < settings.min_num_points:
             return False
         step_s = (sweep.stamp_ns - self.stamp_ns) * 1e-9
-        straight = placed(some(sweep), self.T_world_lidar, self.twist, self.twist).sweep
+        straight = placed(subsample(sweep), self.T_world_lidar, self.twist, self.twist).sweep
         surface = Surface.of(straight.points)
         guess = self.T_world_lidar @ poses.exp(self.twist * step_s)
         found = self._map.lay(surface, guess, _MATCH_M)

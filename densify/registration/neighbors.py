@@ -18,7 +18,7 @@ import numpy as np
 from densify.config import RegisterSettings
 from densify.geometry import poses
 from densify.kernels.threads import num_threads
-from densify.registration.alignment import Surface, lay_on_planes, some
+from densify.registration.alignment import Surface, lay_on_planes, subsample
 from densify.registration.deskew import deskew
 from densify.registration.odometry import is_plausible
 from densify.types import Float, Int, Sweep, Trajectory
@@ -42,7 +42,7 @@ def refine(
     their pose; all do if the vehicle would move as none does. The first one stays.
     """
     T = trajectory.T_world_lidar
-    chosen = [some(sweep, _NUM_POINTS) for sweep in sweeps]
+    chosen = [subsample(sweep, _NUM_POINTS) for sweep in sweeps]
     points = [s.sweep.points for s in deskew(chosen, trajectory).sweeps]
 
     def found(i: int) -> Float:

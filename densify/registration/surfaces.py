@@ -15,7 +15,7 @@ import numpy as np
 
 from densify.config import RegisterSettings
 from densify.geometry import poses
-from densify.registration.alignment import Surface, lay_on_planes, some
+from densify.registration.alignment import Surface, lay_on_planes, subsample
 from densify.registration.deskew import placed
 from densify.registration.odometry import searched_twist
 from densify.types import Float, Int, Sweep, Trajectory
@@ -37,7 +37,7 @@ def register_on_surfaces(sweeps: Sequence[Sweep], settings: RegisterSettings) ->
     velocity. The first second is registered twice, from `searched_twist`, which is some metres per
     second off, and from the twist found by that.
     """
-    chosen = [some(sweep, _NUM_POINTS) for sweep in sweeps]
+    chosen = [subsample(sweep, _NUM_POINTS) for sweep in sweeps]
     frames = tuple(s.frame for s in sweeps)
     stamp_ns = np.array([s.stamp_ns for s in sweeps], np.int64)
     twist = np.zeros(6)
