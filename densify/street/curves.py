@@ -34,6 +34,12 @@ class Curve:
         xy: Float = self._spline(inside)
         return xy + beyond * self.tangent(inside) if np.any(beyond) else xy
 
+    def with_tangent(self, station_m: Float) -> tuple[Float, Float]:
+        """The curve and its `tangent` there; quicker than one by one."""
+        inside = np.clip(station_m, 0.0, self.length_m)
+        tangent = self.tangent(inside)
+        return self._spline(inside) + (station_m - inside)[..., None] * tangent, tangent
+
     def tangent(self, station_m: Float) -> Float:
         """(N,) -> (N,2) unit direction of travel."""
         slope = self._slope(np.clip(station_m, 0.0, self.length_m))

@@ -61,9 +61,9 @@ def overlap(a: Rectangles, b: Rectangles) -> Bool:
     apart = np.zeros(away.shape[:-1], bool)
     for p, q in ((a, b), (b, a)):
         for side, axis in enumerate((p.forward, _left(p.forward))):
-            reach = p.half_m[..., side] + q.half_m[..., 0] * np.abs((axis * q.forward).sum(-1))
-            reach = reach + q.half_m[..., 1] * np.abs((axis * _left(q.forward)).sum(-1))
-            apart |= np.abs((axis * away).sum(-1)) > reach
+            reach = p.half_m[..., side] + q.half_m[..., 0] * np.abs(_dot(axis, q.forward))
+            reach = reach + q.half_m[..., 1] * np.abs(_dot(axis, _left(q.forward)))
+            apart |= np.abs(_dot(axis, away)) > reach
     return ~apart
 
 
@@ -74,6 +74,12 @@ def tracks(actor: Actor, times_s: Float) -> list[Rectangles]:
         Rectangles.moving(b.mesh, b.trajectory, times_s, slack_m)
         for b in actor.bodies[: actor.num_solid]
     ]
+
+
+def _dot(a: Float, b: Float) -> Float:
+    """Of (...,2); quicker than a sum over two."""
+    product: Float = a[..., 0] * b[..., 0] + a[..., 1] * b[..., 1]
+    return product
 
 
 def _left(forward: Float) -> Float:

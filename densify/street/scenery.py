@@ -26,6 +26,7 @@ class Scenery:
         self.rng = rng
         self.meshes: list[Mesh] = []
         self.footprints: list[Rectangles] = []
+        self._known = Rectangles(*np.empty((3, 0, 2)))
 
     def put(self, mesh: Mesh, xy: Float, heading: float = 0.0, solid: Mesh | None = None) -> None:
         """Stand a mesh (origin on the ground) somewhere. solid: the part one can run into."""
@@ -36,13 +37,25 @@ class Scenery:
     def is_free(self, mesh: Mesh, xy: Float, heading: float, kerb_gap_m: float) -> bool:
         """Whether the mesh would stand clear of the carriageway and of everything else."""
         place = Rectangles.standing(mesh, xy, heading, 0.3)
-        if self.footprints and overlap(Rectangles.stack(self.footprints), place).any():
+        if self.footprints and overlap(self._stacked(), place).any():
             return False
         forward = place.forward * place.half_m[0]
         left = np.array([-place.forward[1], place.forward[0]]) * place.half_m[1]
         around = np.array([place.centre + i * forward + j * left
                            for i in (-1, 0, 1) for j in (-1, 0, 1)])  # fmt: skip
         return float(self.ground.distance(around).min()) >= kerb_gap_m
+
+    def _stacked(self) -> Rectangles:
+        """All footprints; only the new ones are stacked."""
+        first = len(self._known.centre)
+        if first < len(self.footprints):
+            known, new = self._known, Rectangles.stack(self.footprints[first:])
+            self._known = Rectangles(
+                np.concatenate([known.centre, new.centre]),
+                np.concatenate([known.forward, new.forward]),
+                np.concatenate([known.half_m, new.half_m]),
+            )
+        return self._known
 
     def put_if_free(self, mesh: Mesh, xy: Float, heading: float, kerb_gap_m: float) -> None:
         if self.is_free(mesh, xy, heading, kerb_gap_m):

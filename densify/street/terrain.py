@@ -74,8 +74,8 @@ class Road:
         stations, tree = self._samples
         station = stations[tree.query(xy)[1]]
         for _ in range(3):  # from the nearest sample to the foot of the perpendicular
-            tangent = self.curve.tangent(station)
-            away = xy - self.curve(station)
+            foot, tangent = self.curve.with_tangent(station)
+            away = xy - foot
             station = station + np.einsum("ni,ni->n", away, tangent)
         return station, away[:, 1] * tangent[:, 0] - away[:, 0] * tangent[:, 1]
 
