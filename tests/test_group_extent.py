@@ -89,6 +89,17 @@ def test_a_wall_beside_who_walks_is_no_part_of_his_shape(length_m, speed_m_s, nu
     assert num_in_shape(claimed, seeds, speed_m_s) == num_kept
 
 
+@pytest.mark.parametrize(("stands", "num_kept"), [(True, 440), (False, 704)])
+def test_a_bush_that_is_seen_through_beside_who_walks_is_no_part_of_his_shape(stands, num_kept):
+    """Its places are taken sweep after sweep; those of what he carries go with him."""
+    rng = np.random.default_rng(0)
+    body = rng.uniform(-0.5, 0.5, (40, 3)) * [0.5, 0.5, 1.8]
+    bush = rng.uniform(-0.5, 0.5, (24, 3)) * [0.8, 0.3, 1.0] + [0.0, 0.6, 0.0]
+    shifts = [[0.14 * n * stands, 0.0, 0.0] for n in range(11)]
+    claimed = [np.concatenate([body, bush - shift]) for shift in shifts]
+    assert num_in_shape(claimed, [np.ones(64, bool)] * 11, 1.4) == num_kept
+
+
 def num_in_shape(claimed, seeds, speed_m_s) -> int:
     """Points of the shape of a track that claims these points in the object's frame, (N,3) a sweep,
     of which some are seeds, (N,)."""

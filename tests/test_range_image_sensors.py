@@ -58,7 +58,7 @@ def test_far_away_dense_rings_tell_of_a_slit_between_them():
     low = Box((0.4, 4.0, LIDAR_HEIGHT_M + 0.6), Arc(18.0, 0.0))  # up to 1.93 degrees
     scanner = Scanner(128, 900, elevation_deg=(-15.0, 15.0))  # 0.236 degrees apart
     sweep = Scene(World((*ROOM, wall, low)), Arc(0, 0), scanner).stretch(2, 0).sweeps[0]
-    usual, finer = RangeImage.of(sweep), RangeImage.of(sweep, finer_far=True)
+    usual, finer = RangeImage.of(sweep), RangeImage.of(sweep, by_ring=True)
     near, far = finer.scanners
     assert len(usual.scanners) == 1
     assert len(near.row_edges_rad) == len(usual.scanners[0].row_edges_rad) < len(far.row_edges_rad)
@@ -75,6 +75,23 @@ def test_far_away_dense_rings_tell_of_a_slit_between_them():
     highest_deg = 7.5 * 30 / 127  # of the rings that meet what stands there
     for off_m in (-0.05, 0.0, 0.05):  # badly registered
         assert share(finer, highest_deg + np.rad2deg(off_m / 17.8), 17.8, 4) == 0
+
+
+def test_a_ring_far_from_all_others_tells_of_what_is_on_its_rays():
+    """The next one below meets the road before it."""
+    scanner = Scanner(16, 900, elevation_deg=(-15.0, 15.0))  # 2 degrees apart
+    sweep = Scene(World(ROOM), Arc(0, 0), scanner).stretch(2, 0).sweeps[0]
+    usual, by_ring = RangeImage.of(sweep), RangeImage.of(sweep, by_ring=True)
+    road_m = LIDAR_HEIGHT_M / np.sin(np.deg2rad(5.0))
+
+    def share(image: RangeImage, elevation_deg: float, range_m: float) -> float:
+        hung = on_sphere(np.linspace(-10, 10, 50), elevation_deg, range_m)
+        return float(image.sees_through(hung, *MARGIN).mean())
+
+    assert share(by_ring, -5.0, road_m - 1.5) == 1 and share(usual, -5.0, road_m - 1.5) == 0
+    assert share(by_ring, -5.0, road_m - 0.1) == share(by_ring, -5.0, road_m + 1.0) == 0
+    assert share(by_ring, -4.5, road_m - 1.5) == share(usual, -4.5, road_m - 1.5) == 0
+    assert share(by_ring, 4.0, 8.0) == share(usual, 4.0, 8.0) == 1
 
 
 # --- rings ----------------------------------------------------------------------------------------
@@ -102,7 +119,7 @@ def on_rings(elevation_deg, noise_deg=0.01, num_columns=600, seed=0):
 def cells(azimuth, elevation):
     """Edges of the rows and number of columns of the finest image."""
     nothing = np.zeros(len(azimuth), np.float32)
-    found, *_ = range_image._cells(Aimed(azimuth, elevation, nothing, nothing), 1, finer_far=False)
+    found, *_ = range_image._cells(Aimed(azimuth, elevation, nothing, nothing), 1, by_ring=False)
     return found.row_edges_rad, found.num_columns
 
 

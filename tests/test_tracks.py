@@ -139,6 +139,29 @@ def test_what_is_seen_for_long_may_be_contradicted_more(num_seen, num_sweeps, st
             assert (left is not None) == (proven or moved == still // 50)
 
 
+@pytest.mark.parametrize(
+    ("still", "moved", "told", "proven"),
+    [
+        (185, 10, ((0, 12), (2, 9)), True),
+        (185, 12, ((0, 12), (2, 9)), False),
+        (168, 18, ((0, 140), (0, 4)), True),  # nothing was in a hundred of its places
+        (168, 18, ((20, 140), (0, 4)), False),
+        (168, 24, ((0, 140), (0, 4)), False),
+    ],
+)
+def test_what_leaves_bare_places_may_be_seen_for_a_moment(still, moved, told, proven):
+    """An oncoming car of which three sweeps see a few rings."""
+    track = followed(lambda n: [-3.0 * n, 0, 0, 0], 3, [-14.0, 11, 0], 40)
+    clock = SimpleNamespace(time_s=0.1 * np.arange(11))
+    space = SimpleNamespace(gap_m=lambda *_: 0.3, clock=clock)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(proof, "_as_fast_as_measured", lambda *_: True)
+        patch.setattr(proof, "_like_a_rail", lambda *_: False)
+        patch.setattr(proof, "_left_places", lambda *_: told)
+        patch.setattr(proof, "contradictions", lambda *_: (still, moved, 800))
+        assert (proof.left_contradicted(track, [], space, []) is not None) == proven
+
+
 @pytest.mark.parametrize(("num_asked", "proven"), [(930, True), (500, False)])
 def test_stray_looks_do_not_undo_what_is_seen_for_a_moment(num_asked, proven):
     """A far car at 33 m/s that four sweeps see; at most one look of 200 is an echo at its rim."""
@@ -148,7 +171,7 @@ def test_stray_looks_do_not_undo_what_is_seen_for_a_moment(num_asked, proven):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(proof, "_as_fast_as_measured", lambda *_: True)
         patch.setattr(proof, "_like_a_rail", lambda *_: False)
-        patch.setattr(proof, "_left_places", lambda *_: ((0, 59), (0, 59)))
+        patch.setattr(proof, "_left_places", lambda *_: ((0, 45), (0, 45)))
         patch.setattr(proof, "contradictions", lambda *_: (59, 4, num_asked))
         assert (proof.left_contradicted(track, [], space, []) is not None) == proven
 
@@ -173,16 +196,18 @@ def test_what_is_mostly_still_there_does_not_move(told, proven):
 
 
 @pytest.mark.parametrize(
-    ("told", "proven"),
+    ("told", "moved", "like_a_rail", "proven"),
     [
-        (((0, 30), (0, 30)), True),  # legs swing; the walker comes from and leaves bare places
-        (((1, 30), (0, 30)), False),
-        (((0, 30), (0, 2)), False),  # hardly anybody looked there
+        (((0, 30), (0, 30)), 80, False, True),  # legs swing; the walker comes from and leaves bare
+        (((1, 30), (0, 30)), 80, False, False),  # places
+        (((0, 30), (0, 2)), 80, False, False),  # hardly anybody looked there
+        (((0, 216), (8, 113)), 0, True, True),  # a long car that comes towards the scanner
+        (((7, 30), (0, 30)), 0, True, False),
+        (((0, 15), (0, 2)), 0, True, False),
     ],
 )
-@pytest.mark.parametrize(("moved", "like_a_rail"), [(80, False), (0, True)])
-def test_what_leaves_all_its_places_bare_may_swing_or_look_like_a_rail(
-    told, proven, moved, like_a_rail
+def test_what_leaves_its_places_bare_may_swing_or_look_like_a_rail(
+    told, moved, like_a_rail, proven
 ):
     track = followed(lambda n: [0.2 * n, 0, 0, 0], 8, [8.0, 0, 0], 8)
     space = SimpleNamespace(gap_m=lambda *_: 0.05, clock=SimpleNamespace(time_s=np.arange(8) / 10))
@@ -237,7 +262,8 @@ def test_a_ring_that_glides_over_a_bonnet_does_not_move_it(still, told):
     ("still", "moved", "told", "proven"),
     [
         (108, 16, ((14, 15), (42, 0)), False),
-        (108, 16, ((14, 15), (0, 42)), True),  # it has left its places
+        (108, 16, ((2, 15), (0, 42)), True),  # it has left its places
+        (293, 50, ((0, 0), (41, 73)), False),  # which something takes as often as not
         (108, 5, ((14, 15), (42, 0)), True),  # its motion explains what was seen
         (300, 16, ((14, 15), (42, 0)), True),  # many looks contradict that it stands
     ],

@@ -32,6 +32,8 @@ _MIN_ROW_RAD = np.deg2rad(0.45)
 # Rings closer than that are one row wherever they are; each other one has its own from as far away
 # on as three of them reach so far up and down, which errors of registration do not.
 _MIN_FAR_ROW_RAD, _SLACK_M = np.deg2rad(0.15), 0.1
+# A ring so far from all others tells of what is so close to its rays; three full cells are enough.
+_LONE_RAD, _ON_RING_RAD, _OF_ONE_RING = np.deg2rad(1.0), np.deg2rad(0.15), 2
 _SETTLED = 0.1  # of a turn
 _MIN_COLUMNS, _MAX_COLUMNS = 90, 8192
 _DENSEST = 10  # percent of an unordered scanner's returns: the finest cells
@@ -45,21 +47,20 @@ class RangeImage:
     scanners: tuple[ScannerImage, ...]
 
     @staticmethod
-    def of(
-        registered: RegisteredSweep, num_together: int = 1, finer_far: bool = False
-    ) -> RangeImage:
+    def of(registered: RegisteredSweep, num_together: int = 1, by_ring: bool = False) -> RangeImage:
         """Build from a deskewed sweep (its rays are put back to their firing times).
 
         num_together: sweeps that will be asked together. Of scanners that turn the columns are so
-        many times as many: as many as returns of all these sweeps fill. finer_far: rings that are
-        one row because they are dense have each their own for what is far away, where a slight
-        error of registration is less than they are apart."""
+        many times as many: as many as returns of all these sweeps fill. by_ring: rings tell by
+        themselves too. Dense ones, which are one row, have each their own for what is far away,
+        where a slight error of registration is less than they are apart. One far from all others
+        tells of what is right on its rays: the ring below it meets the road before it."""
         ids = np.unique(registered.sweep.lidar)
         return RangeImage(
             tuple(
                 image
                 for i in ids
-                for image in ScannerImage.all_of(registered, int(i), num_together, finer_far)
+                for image in ScannerImage.all_of(registered, int(i), num_together, by_ring)
             )
         )
 
@@ -143,7 +144,7 @@ class ScannerImage:
 
     @staticmethod
     def all_of(
-        registered: RegisteredSweep, lidar: int, num_together: int = 1, finer_far: bool = False
+        registered: RegisteredSweep, lidar: int, num_together: int = 1, by_ring: bool = False
     ) -> tuple[ScannerImage, ...]:
         """One, or of an unordered scanner several with cells of different sizes, finest first, or
         of dense rings one for what is near and one for what is far, see `RangeImage.of`."""
@@ -160,6 +161,9 @@ class ScannerImage:
             offset_s = np.zeros((1 if order.by_azimuth else shape[0], num_columns), np.float32)
             spread_s = np.zeros_like(offset_s)
             kernels.fill(rays, row_edges_rad, nearest_m, num_filled)
+            if cells.lone:
+                num_filled[::2] *= _OF_ONE_RING
+                num_filled[1::2] = 0  # between two rings neither tells
             if order.by_azimuth:
                 offset_s[0] = _offset_per_column(rays, num_columns)
             else:
@@ -180,10 +184,10 @@ class ScannerImage:
             )
 
         images: list[ScannerImage] = []
-        for cells in _cells(rays, num_together, finer_far):
-            images.append(image(cells))
-            if cells.to_m == np.inf and images[-1].share_vouched(rays) >= _VOUCHED:
+        for cells in _cells(rays, num_together, by_ring):
+            if cells.coarser and images and images[-1].share_vouched(rays) >= _VOUCHED:
                 break
+            images.append(image(cells))
         return tuple(images)
 
     def told(self, points: Float32) -> Bool:
@@ -219,17 +223,21 @@ class ScannerImage:
 
 
 class _Cells(NamedTuple):
-    """Those of one image: edges of the rows (R+1,), and how far away they tell of points."""
+    """Those of one image: edges of the rows (R+1,), and how far away they tell of points. lone:
+    every other row is a ring, the others lie between two. coarser: of use where the image before
+    has too many empty ones."""
 
     row_edges_rad: Float32
     num_columns: int
     from_m: float = 0.0
     to_m: float = np.inf
+    lone: bool = False
+    coarser: bool = False
 
 
-def _cells(rays: Aimed, num_together: int, finer_far: bool) -> list[_Cells]:
+def _cells(rays: Aimed, num_together: int, by_ring: bool) -> list[_Cells]:
     """The cells of a scanner's images: of an unordered scanner's, finest first, as many are of use
-    as it takes until cells are seldom empty; dense rings have those for what is near and far."""
+    as it takes until cells are seldom empty; rings that tell by themselves too have two."""
     if len(rays.azimuth) < FEW_POINTS:
         return [_grid(_uniform_edges(rays.elevation, np.deg2rad(2.0)), np.deg2rad(1.0))]
     some = some_sectors(rays)
@@ -239,8 +247,11 @@ def _cells(rays: Aimed, num_together: int, finer_far: bool) -> list[_Cells]:
         step = measure.step_along(some.azimuth, np.searchsorted(edges, some.elevation))
         step *= _CELLS_PER_STEP / num_together
         near, far = (_no_closer(edges, least) for least in (_MIN_ROW_RAD, _MIN_FAR_ROW_RAD))
-        if not finer_far or len(near) == len(far):
+        if not by_ring:
             return [_grid(near, step)]
+        if len(near) == len(far):
+            lone = _lone(rings)
+            return [_grid(near, step)] + [_grid(lone, step)._replace(lone=True)] * (len(lone) > 0)
         far_m = _SLACK_M / (1.5 * float(np.diff(far).min()))
         return [_grid(near, step)._replace(to_m=far_m), _grid(far, step)._replace(from_m=far_m)]
     if in_lines(some):
@@ -252,7 +263,7 @@ def _cells(rays: Aimed, num_together: int, finer_far: bool) -> list[_Cells]:
     finest = _CELLS_PER_STEP * float(np.percentile(spacing, _DENSEST))
     flatten = float(np.cos(np.median(rays.elevation)))
     return [
-        _grid(_uniform_edges(rays.elevation, size), size / flatten)
+        _grid(_uniform_edges(rays.elevation, size), size / flatten)._replace(coarser=True)
         for size in finest * 2.0 ** np.arange(_MAX_SIZES)
     ]
 
@@ -267,6 +278,14 @@ def _edges_between(rings: Float) -> Float:
     middle = 0.5 * (rings[1:] + rings[:-1])
     outer: Float = 2 * rings[[0, -1]] - middle[[0, -1]]
     edges: Float = np.concatenate([outer[:1], middle, outer[1:]])
+    return edges
+
+
+def _lone(rings: Float) -> Float:
+    """Edges below and above each ring that is far from all others, (2R,); none if no ring is."""
+    gaps = np.diff(rings, prepend=-np.inf, append=np.inf)
+    lone = rings[np.minimum(gaps[:-1], gaps[1:]) >= _LONE_RAD]
+    edges: Float = (lone[:, None] + [-_ON_RING_RAD, _ON_RING_RAD]).ravel()
     return edges
 
 

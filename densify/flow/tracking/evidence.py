@@ -34,9 +34,9 @@ _MOST_ASKED = 10  # of them on each side: more in the same time cost more and te
 
 
 def range_images(sweeps: Sequence[RegisteredSweep], num_together: int) -> list[RangeImage]:
-    """What sweeps saw, finer far away. num_together: as many are asked together, see
-    `densify.clock.num_in_look`."""
-    image = partial(RangeImage.of, num_together=num_together, finer_far=True)
+    """What sweeps saw, ring by ring too where that is safe. num_together: as many are asked
+    together, see `densify.clock.num_in_look`."""
+    image = partial(RangeImage.of, num_together=num_together, by_ring=True)
     with ThreadPoolExecutor() as pool:
         return list(pool.map(image, sweeps))
 

@@ -101,9 +101,9 @@ class Seen:
 def shape_of(track: Track, standing: Sequence[Standing], space: FreeSpace) -> Shape:
     """All that the sweeps saw of an object; of those who walk, what is small and comes into view at
     once, without what only even or only odd ones saw: echoes that melted with those of a wall
-    behind them, which would make parts of the wall theirs; and without what hardly any sweep saw
-    through, if they are small then: the wall itself. (A slow car has sides that are not seen
-    through either.)"""
+    behind them, which would make parts of the wall theirs; without what stays where it is; and
+    without what hardly any sweep saw through, if they are small then: the wall itself. (A slow car
+    has sides that are not seen through either.)"""
     sweeps = sorted(track.claimed)
     evenly = sweeps[::2], sweeps[1::2]
     halves = [track.seen_in(standing, some) for some in evenly]
@@ -118,10 +118,32 @@ def shape_of(track: Track, standing: Sequence[Standing], space: FreeSpace) -> Sh
         ]
     )
     seed = np.concatenate([standing[j].seed[track.claimed[j]] for some in evenly for j in some])
+    again &= ~np.concatenate([_stay(track, standing, j, space) for some in evenly for j in some])
     theirs = again & close_to_seeds(points, seed, _AROUND_M, _LEAST_SEEDS)
     if theirs.any() and np.linalg.norm(np.ptp(points[theirs, :2], axis=0)) < _WALKER_M:
         return Shape.of(points[theirs])
     return Shape.of(points[again] if again.any() else points)
+
+
+def _stay(track: Track, standing: Sequence[Standing], i: int, space: FreeSpace) -> Bool:
+    """(N,) those of the track's points in sweep number i whose places are taken in more of the
+    other sweeps that saw it than the places that they would have moved to: of a bush beside who
+    walks."""
+    c = standing[i]
+    places = c.points[track.claimed[i]]
+    body = track.undo(places, c.time_s[track.claimed[i]])
+    reach_m = max(_THERE_M, _GAPS_REACHED_UNSEEN * space.gap_m(track.centre, i))
+    stands, moves = np.zeros((2, len(places)), np.int64)
+    for j, rows in track.claimed.items():
+        if j == i:
+            continue
+        others = standing[j]
+        own = BoxTree(track.undo(others.points[rows], others.time_s[rows]))
+        moves += np.isfinite(own.nearest(body, reach_m)[0])
+        rows = others.strips.rows_inside(places.min(0) - reach_m, places.max(0) + reach_m)
+        if len(rows):
+            stands += np.isfinite(BoxTree(others.points[rows]).nearest(places, reach_m)[0])
+    return np.asarray(stands > moves)
 
 
 def attach(

@@ -23,8 +23,10 @@ _LEAST_WAY_M, _LEAST_WAY_PER_RESIDUAL, _LEAST_WAY_PER_ROUGH = 0.35, 8.0, 1.5
 _NUM_ASKED = 60
 _LEAST_STATES, _LEAST_S = 3, 0.15
 _SHORT_S, _MAX_OF_SHORT = 0.35, 0.03  # three places of a tree's crown may lie on a line,
-_SHORT_OF_FEW_S, _FEW = 0.6, 0.2  # and even more where few looks contradict its standing still
-_MAX_OF_SHORT_BARE = 0.06  # but a crown does not leave its places bare
+_SHORT_OF_FEW_S, _FEW = 0.6, 0.2  # and even more where few looks contradict its standing still,
+_MAX_OF_FEW = 0.1  # of which its motion may leave so many, unless it left its places bare
+# But a crown does not leave its places bare, least of all so many.
+_MAX_OF_SHORT_BARE, _MAX_OF_SHORT_MANY_BARE, _MANY = 0.06, 0.12, 100
 _STRAY = 0.005  # so few of all looks are echoes at an object's rim
 # Of those that standing still leaves; of what leaves all its places bare more: limbs swing.
 _MAX_CONTRADICTIONS, _MAX_OF_LIMBS = 0.3, 0.5
@@ -76,14 +78,18 @@ def left_contradicted(
     bare = _bare(told)
     if moved > (_MAX_OF_LIMBS if bare else _MAX_CONTRADICTIONS) * still:
         return None
-    short_s = _SHORT_OF_FEW_S if still < _FEW * num_asked else _SHORT_S
-    allowed = max((_MAX_OF_SHORT_BARE if bare else _MAX_OF_SHORT) * still, _STRAY * num_asked)
-    if moved > allowed:
+    few, left_bare = still < _FEW * num_asked, _mostly_bare(told)
+    # Where something is still there, few contradictions of which many are left prove nothing.
+    if few and not left_bare and moved > _MAX_OF_FEW * still:
+        return None
+    short_s = _SHORT_OF_FEW_S if few else _SHORT_S
+    if moved > max(_most_of_short(told) * still, _STRAY * num_asked):
         # Nor may rings that glide over a parked car, which is still there behind them.
         glides = still < _SHARE_OF_FEW * num_asked and any(t > _MOSTLY * e for t, e in told)
         if glides or seen_s < min(short_s, np.ptp(space.clock.time_s) / 2):
             return None
-    if not bare and still < _SHARE_OF_RAIL * num_asked and _like_a_rail(track, standing, space):
+    as_few_as_a_rail = still < _SHARE_OF_RAIL * num_asked
+    if as_few_as_a_rail and not left_bare and _like_a_rail(track, standing, space):
         return None
     return moved / num_asked
 
@@ -112,7 +118,7 @@ def may_be_a_rail(
     still, _, num_asked = contradictions(track, standing, space)
     if still >= _SHARE_OF_RAIL * num_asked or not _like_a_rail(track, standing, space):
         return False
-    return not _bare(_left_places(track, standing, space, proven))
+    return not _mostly_bare(_left_places(track, standing, space, proven))
 
 
 def _bare(told: tuple[tuple[int, int], tuple[int, int]]) -> bool:
@@ -124,7 +130,15 @@ def _bare(told: tuple[tuple[int, int], tuple[int, int]]) -> bool:
 def _mostly_bare(told: tuple[tuple[int, int], tuple[int, int]]) -> bool:
     """Whether hardly anything was seen there, before or after."""
     taken, empty = np.sum(told, axis=0)
-    return bool(taken <= _TAKEN * empty)
+    return bool(taken <= _TAKEN * empty and empty >= _LEAST_CONTRADICTIONS)
+
+
+def _most_of_short(told: tuple[tuple[int, int], tuple[int, int]]) -> float:
+    """The share of its contradictions that a motion seen for a short time may leave."""
+    if not _mostly_bare(told):
+        return _MAX_OF_SHORT
+    many = sum(empty for _, empty in told) >= _MANY
+    return _MAX_OF_SHORT_MANY_BARE if many else _MAX_OF_SHORT_BARE
 
 
 def _left_places(
