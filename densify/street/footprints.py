@@ -77,7 +77,7 @@ def tracks(actor: Actor, times_s: Float) -> list[Rectangles]:
 
 
 def _dot(a: Float, b: Float) -> Float:
-    """Of (...,2); quicker than a sum over two."""
+    """Inner product of (...,2) vectors; quicker than a sum over two."""
     product: Float = a[..., 0] * b[..., 0] + a[..., 1] * b[..., 1]
     return product
 
