@@ -326,7 +326,7 @@ BAD_DRIVES: dict[str, tuple[str, int | None, int, list[str]]] = {
     "truncated sweep": (SWEEP.format(2), 1601, 2, ["0000000002.bin", "1601"]),
     "missing key": (SWEEP.format(2), None, 2, ["--key 2", "no such frame"]),
     "sweep of no points": (SWEEP.format(2), 0, 2, ["0000000002.bin", "no points"]),
-    "sweep of few points": (SWEEP.format(2), 50 * 16, 1, ["sweep 2", "50 points"]),
+    "sweep of few points": (SWEEP.format(2), 50 * 16, 2, ["sweep 2", "50 points"]),
     "missing calibration": (CALIB.format("velo_to_cam"), None, 2, ["velo_to_cam.txt: missing"]),
     "malformed calibration": (CALIB.format("velo_to_cam"), 9, 2, ["velo_to_cam.txt: R", "9"]),
 }
