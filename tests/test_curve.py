@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import cv2
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from densify.outputs import curve, figure
@@ -115,6 +115,7 @@ def test_a_line_goes_through_its_points():
     assert np.abs(picture[y, x].astype(int) - curve._COLOURS[1]).max() < 60
 
 
+@example([[(0.125, 0.5)], [(0.125, 0.5), (0.171875, 0.125), (0.5, 0.5)]])  # no room off the lines
 @given(
     st.lists(
         st.lists(st.tuples(st.floats(0.01, 0.6), st.floats(1e-4, 0.5)), min_size=1, max_size=5),

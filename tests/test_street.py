@@ -303,6 +303,17 @@ def test_each_ray_meets_a_moving_body_where_it_is_then():
     np.testing.assert_allclose(at[far, 0], 29.0, atol=1e-9)
 
 
+def test_a_world_may_have_thousands_of_bodies():
+    """As has a process that opens many streets."""
+    bodies = [
+        Body(box((2 * n + 5, -1, -1), (2 * n + 6, 1, 1), Material.CONCRETE), Still())
+        for n in range(3000)
+    ]
+    rays = Rays(np.zeros((1, 3)), np.array([[1.0, 0.0, 0.0]]), np.zeros(1))
+    hits = World(bodies[::-1]).cast(rays, np.zeros(len(Material)), np.zeros(1))
+    np.testing.assert_allclose(hits.range_m, 5.0, atol=1e-5)
+
+
 def test_glass_and_leaves_let_their_share_of_rays_through():
     n = 4000
     wall = box((5, -9, -9), (6, 9, 9), Material.CONCRETE)

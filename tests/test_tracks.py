@@ -11,7 +11,7 @@ import pytest
 
 from densify.clock import Clock
 from densify.config import GroundSettings
-from densify.flow.tracking import proof
+from densify.flow.tracking import proof, tracks
 from densify.flow.tracking.evidence import FreeSpace, Standing, find_candidates
 from densify.flow.tracking.shapes import Body, Shape
 from densify.flow.tracking.sightings import Sighting, Track
@@ -89,6 +89,34 @@ def test_who_is_seen_well_once_only_may_drive_as_others_do():
         bodies.append(Body(track, Shape.of(np.eye(3))))
     found = list(velocities_of_traffic(SimpleNamespace(time_ns=100_000_000), bodies))
     np.testing.assert_allclose(found, [[30.0, 0, 0], [-22.0, 0, 0]], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("left", "tried", "found"), [(np.inf, [4], 0.01), (0.1, [0, 4], 0.01), (0.001, [], 0.001)]
+)
+def test_a_front_that_slides_is_followed_from_where_its_side_shows(left, tried, found):
+    """An unproven one from there only: 20 points where it starts, 8 in its first look, 30 in its
+    last."""
+    claimed = {2: np.arange(20), 0: np.arange(8), 1: np.arange(9), 3: np.arange(20)}
+    claimed[4] = np.arange(30)
+    sighted = {
+        n: Sighting(np.array([1.3 * n, 0, 0, 0]), 0.1 * n, round(0.1 * n * 1e9), (n,))
+        for n in claimed
+    }
+    side = np.stack([np.linspace(0, 3, 30), np.zeros(30), np.zeros(30)], 1)
+    looks = [
+        SimpleNamespace(seen=SimpleNamespace(points=side), sweeps=[n], begins=[0]) for n in range(5)
+    ]
+    asked = []
+
+    def follow(rows, n, velocity):
+        asked.append(n)
+        return Track(np.zeros(3), sighted, claimed), 0.01 if n == 4 else None
+
+    search = SimpleNamespace(looks=looks, _follow=follow, _velocity_of=lambda *_: np.zeros(3))
+    track = Track(np.zeros(3), sighted, claimed)
+    _, contradicted = tracks._Search._again_from_its_ends(search, track, left)
+    assert asked == tried and contradicted == found
 
 
 def test_the_ground_rises_under_a_track():

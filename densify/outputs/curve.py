@@ -161,8 +161,10 @@ def _draw_line(canvas: Picture, line: _Line) -> None:
 
 
 def _label_places(lines: Sequence[_Line]) -> list[tuple[int, int]]:
-    """Left end and baseline of each line's name: at its first point, on no line and no name."""
-    taken = np.concatenate([_along(line.points) for line in lines]) if lines else np.zeros((0, 2))
+    """Left end and baseline of each line's name: at its first point, on no name, and on no line
+    where there is room."""
+    drawn = np.concatenate([np.zeros((0, 2)), *(_along(line.points) for line in lines)])
+    named = np.zeros((0, 2))
     places = []
     for line in lines:
         (width, height), _ = cv2.getTextSize(line.name, _FONT, _SIZE, 1)
@@ -177,12 +179,16 @@ def _label_places(lines: Sequence[_Line]) -> list[tuple[int, int]]:
                 (-width / 2, height + 12 * away),
             )
         ]
-        left, baseline = next(
-            ((x, y) for x, y in tried if _is_free(x, y, width, height, taken)), tried[0]
+        free = (
+            (x, y)
+            for taken in (np.concatenate([drawn, named]), named)
+            for x, y in tried
+            if _is_free(x, y, width, height, taken)
         )
+        left, baseline = next(free, tried[0])
         spread = np.linspace(left, left + width, max(2, width // 6))
         rows = [np.stack([spread, np.full_like(spread, baseline - h)], 1) for h in (0, height)]
-        taken = np.concatenate([taken, *rows])
+        named = np.concatenate([named, *rows])
         places.append((round(left), round(baseline)))
     return places
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -225,12 +226,20 @@ def _solid(mesh: Mesh) -> tuple[Mesh, Float, Float]:
     return solid, corners[keep], normal[keep] / length[keep, None]
 
 
+@cache
+def _device() -> Any:
+    """One for all scenes: each of them would open its own, and Embree fails after a thousand."""
+    from embreex.rtcore import EmbreeDevice
+
+    return EmbreeDevice()
+
+
 def _raycasting_scene(corners: Float) -> Any:
     """corners: (T,3,3) of triangles."""
     from embreex.mesh_construction import TriangleMesh
     from embreex.rtcore_scene import EmbreeScene
 
-    scene = EmbreeScene()
+    scene = EmbreeScene(_device())
     TriangleMesh(scene, corners.astype(np.float32))
     return scene
 

@@ -89,7 +89,8 @@ def ends(track: Track, looks: Sequence[Look]) -> Iterator[tuple[np.ndarray, int]
     start, *_ = track.sightings
     side = looks[start].seen.points[_rows_in(track, looks[start])]
     seen_s = np.sort([sighting.seen_s for sighting in track.sightings.values()])
-    if np.linalg.norm(np.ptp(side[:, :2], axis=0)) < _SLIDES_M or np.diff(seen_s).max() > _HOLE_S:
+    holes_s = np.diff(seen_s)
+    if np.linalg.norm(np.ptp(side[:, :2], axis=0)) < _SLIDES_M or (holes_s > _HOLE_S).any():
         return
     for n in sorted({min(track.sightings), max(track.sightings)} - {start}):
         if track.num_points(n) >= MIN_POINTS:

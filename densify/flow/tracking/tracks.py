@@ -112,9 +112,9 @@ class _Search:
     def track_of(self, members: np.ndarray, n: int) -> tuple[Track, bool]:
         """The track of a group of look n, whole if it is proven, and whether it is."""
         track, left = self._started(members, n)
+        track, left = self._again_from_its_ends(track, left)
         proven = bool(np.isfinite(left))
         if proven:
-            track = self._again_from_its_ends(track, left)
             _gather(track, self._standing, self.free, self._space)
             # A piece of a guard rail shows with the rest what it is of.
             proven = not may_be_a_rail(track, self._standing, self._space, self.bodies)
@@ -144,17 +144,21 @@ class _Search:
             track, left = (track, left) if np.isinf(in_traffic[1]) else in_traffic
         return track, left
 
-    def _again_from_its_ends(self, track: Track, left: float) -> Track:
-        """The same, or followed from one of its ends, if as much of it is contradicted less.
+    def _again_from_its_ends(self, track: Track, left: float) -> tuple[Track, float]:
+        """The same, or followed from one of its ends, if as much of it is contradicted less; what
+        is not proven only from where more of it is seen.
 
-        left: how much contradicts it.
+        left: how much contradicts it, inf if it is not proven.
         """
+        least = track.num_points(next(iter(track.sightings))) if np.isinf(left) else 0
         for rows, k in ends(track, self.looks) if left > _DOUBTFUL else ():
+            if len(rows) <= least:
+                continue
             tried, contradicted = self._follow(rows, k, self._velocity_of(rows, k))
             whole = tried.total_points() >= _AS_WHOLE * track.total_points()
             if whole and contradicted is not None and contradicted < _CLEARLY * left:
                 track, left = tried, contradicted
-        return track
+        return track, left
 
     def _velocity_of(self, members: np.ndarray, n: int) -> Float:
         """(3,) m/s that a group of look n may have."""
