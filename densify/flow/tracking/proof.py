@@ -114,7 +114,7 @@ def may_be_a_rail(
     track: Track, standing: Sequence[Standing], space: FreeSpace, proven: Sequence[Body]
 ) -> bool:
     """Whether few looks contradict that the track stands, which is shaped like a guard rail, and
-    does not leave all its places bare."""
+    does not leave nearly all its places bare."""
     still, _, num_asked = contradictions(track, standing, space)
     if still >= _SHARE_OF_RAIL * num_asked or not _like_a_rail(track, standing, space):
         return False
