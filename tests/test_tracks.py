@@ -51,6 +51,23 @@ def followed(
     return Track(np.array(place), sighted, {n: np.arange(num_points) for n in range(num_sweeps)})
 
 
+def is_proven(
+    track: Track,
+    space: SimpleNamespace,
+    looks: tuple[int, int, int],
+    told: tuple[tuple[int, int], tuple[int, int]],
+    like_a_rail: bool = False,
+) -> bool:
+    """Whether a track is proven by so many looks, through it standing still, moved, and asked, and
+    of places taken and empty, before it came and after it left."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(proof, "_as_fast_as_measured", lambda *_: True)
+        patch.setattr(proof, "_like_a_rail", lambda *_: like_a_rail)
+        patch.setattr(proof, "contradictions", lambda *_: looks)
+        patch.setattr(proof, "_left_places", lambda *_: told)
+        return proof.left_contradicted(track, [], space, []) is not None
+
+
 def test_starts_in_the_middle_of_the_stretch_come_before_larger_ones_at_its_ends():
     """A factor 0.7 for every sweep nearer than five to an end."""
     rng = np.random.default_rng(0)
@@ -132,14 +149,9 @@ def test_the_ground_rises_under_a_track():
 def test_a_short_way_far_from_the_scanner_proves_nothing():
     """Three places on a line may be chance where rings are a metre apart: a tree's leaves."""
     track = followed(lambda n: [0.24 * n, 0, 0, 0], 3, [44.0, 0, 0], 8)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(proof, "contradictions", lambda *_: (100, 0, 300))
-        patch.setattr(proof, "_as_fast_as_measured", lambda *_: True)
-        patch.setattr(proof, "_left_places", lambda *_: ((0, 100), (0, 100)))
-        for gap_m, proven in ((0.5, True), (1.8, False)):
-            space = SimpleNamespace(gap_m=lambda *_, gap_m=gap_m: gap_m)
-            left = proof.left_contradicted(track, [], space, [])
-            assert (left is not None) == proven
+    for gap_m, proven in ((0.5, True), (1.8, False)):
+        space = SimpleNamespace(gap_m=lambda *_, gap_m=gap_m: gap_m)
+        assert is_proven(track, space, (100, 0, 300), ((0, 100), (0, 100))) == proven
 
 
 @pytest.mark.parametrize(
@@ -155,16 +167,11 @@ def test_a_short_way_far_from_the_scanner_proves_nothing():
 )
 def test_what_is_seen_for_long_may_be_contradicted_more(num_seen, num_sweeps, still, proven):
     track = followed(lambda n: [0.9 * n, 0, 0, 0], num_seen, [14.0, 0, 0], 8)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(proof, "_as_fast_as_measured", lambda *_: True)
-        patch.setattr(proof, "_left_places", lambda *_: ((0, 100), (0, 100)))
-        clock = SimpleNamespace(time_s=0.1 * np.arange(num_sweeps))
-        space = SimpleNamespace(gap_m=lambda *_: 0.1, clock=clock)
-        patch.setattr(proof, "_like_a_rail", lambda *_: False)
-        for moved in (still // 50, still // 5):
-            patch.setattr(proof, "contradictions", lambda *_, moved=moved: (still, moved, 300))
-            left = proof.left_contradicted(track, [], space, [])
-            assert (left is not None) == (proven or moved == still // 50)
+    clock = SimpleNamespace(time_s=0.1 * np.arange(num_sweeps))
+    space = SimpleNamespace(gap_m=lambda *_: 0.1, clock=clock)
+    for moved in (still // 50, still // 5):
+        found = is_proven(track, space, (still, moved, 300), ((0, 100), (0, 100)))
+        assert found == (proven or moved == still // 50)
 
 
 @pytest.mark.parametrize(
@@ -182,12 +189,7 @@ def test_what_leaves_bare_places_may_be_seen_for_a_moment(still, moved, told, pr
     track = followed(lambda n: [-3.0 * n, 0, 0, 0], 3, [-14.0, 11, 0], 40)
     clock = SimpleNamespace(time_s=0.1 * np.arange(11))
     space = SimpleNamespace(gap_m=lambda *_: 0.3, clock=clock)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(proof, "_as_fast_as_measured", lambda *_: True)
-        patch.setattr(proof, "_like_a_rail", lambda *_: False)
-        patch.setattr(proof, "_left_places", lambda *_: told)
-        patch.setattr(proof, "contradictions", lambda *_: (still, moved, 800))
-        assert (proof.left_contradicted(track, [], space, []) is not None) == proven
+    assert is_proven(track, space, (still, moved, 800), told) == proven
 
 
 @pytest.mark.parametrize(("num_asked", "proven"), [(930, True), (500, False)])
@@ -196,12 +198,7 @@ def test_stray_looks_do_not_undo_what_is_seen_for_a_moment(num_asked, proven):
     track = followed(lambda n: [-3.3 * n, 0, 0, 0], 4, [-33.0, 11, 0], 18)
     clock = SimpleNamespace(time_s=0.1 * np.arange(11))
     space = SimpleNamespace(gap_m=lambda *_: 0.3, clock=clock)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(proof, "_as_fast_as_measured", lambda *_: True)
-        patch.setattr(proof, "_like_a_rail", lambda *_: False)
-        patch.setattr(proof, "_left_places", lambda *_: ((0, 45), (0, 45)))
-        patch.setattr(proof, "contradictions", lambda *_: (59, 4, num_asked))
-        assert (proof.left_contradicted(track, [], space, []) is not None) == proven
+    assert is_proven(track, space, (59, 4, num_asked), ((0, 45), (0, 45))) == proven
 
 
 @pytest.mark.parametrize(
@@ -216,11 +213,7 @@ def test_stray_looks_do_not_undo_what_is_seen_for_a_moment(num_asked, proven):
 def test_what_is_mostly_still_there_does_not_move(told, proven):
     track = followed(lambda n: [0.9 * n, 0, 0, 0], 8, [14.0, 0, 0], 8)
     space = SimpleNamespace(gap_m=lambda *_: 0.1, clock=SimpleNamespace(time_s=np.arange(8) / 10))
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(proof, "_as_fast_as_measured", lambda *_: True)
-        patch.setattr(proof, "contradictions", lambda *_: (200, 0, 300))
-        patch.setattr(proof, "_left_places", lambda *_: told)
-        assert (proof.left_contradicted(track, [], space, []) is not None) == proven
+    assert is_proven(track, space, (200, 0, 300), told) == proven
 
 
 @pytest.mark.parametrize(
@@ -239,12 +232,11 @@ def test_what_leaves_its_places_bare_may_swing_or_look_like_a_rail(
 ):
     track = followed(lambda n: [0.2 * n, 0, 0, 0], 8, [8.0, 0, 0], 8)
     space = SimpleNamespace(gap_m=lambda *_: 0.05, clock=SimpleNamespace(time_s=np.arange(8) / 10))
+    assert is_proven(track, space, (200, moved, 700), told, like_a_rail) == proven
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(proof, "_as_fast_as_measured", lambda *_: True)
         patch.setattr(proof, "_like_a_rail", lambda *_: like_a_rail)
         patch.setattr(proof, "contradictions", lambda *_: (200, moved, 700))
         patch.setattr(proof, "_left_places", lambda *_: told)
-        assert (proof.left_contradicted(track, [], space, []) is not None) == proven
         assert proof.may_be_a_rail(track, [], space, []) == (like_a_rail and not proven)
 
 
@@ -263,12 +255,7 @@ def test_without_rings_what_leaves_its_places_may_waver(aside_m, scattered, told
     clock = SimpleNamespace(time_s=np.arange(10) / 10)
     sensors = SimpleNamespace(scattered=scattered)
     space = SimpleNamespace(gap_m=lambda *_: 0.17, clock=clock, sensors=sensors)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(proof, "_as_fast_as_measured", lambda *_: True)
-        patch.setattr(proof, "_like_a_rail", lambda *_: False)
-        patch.setattr(proof, "contradictions", lambda *_: (300, 0, 700))
-        patch.setattr(proof, "_left_places", lambda *_: told)
-        assert (proof.left_contradicted(track, [], space, []) is not None) == proven
+    assert is_proven(track, space, (300, 0, 700), told) == proven
 
 
 @pytest.mark.parametrize("still", [30, 80])
@@ -277,13 +264,8 @@ def test_a_ring_that_glides_over_a_bonnet_does_not_move_it(still, told):
     """Half a metre in a second, which one look of twenty contradicts."""
     track = followed(lambda n: [0.06 * n, 0, 0, 0], 9, [29.0, 0, 0], 20)
     space = SimpleNamespace(gap_m=lambda *_: 0.6, clock=SimpleNamespace(time_s=np.arange(9) / 10))
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(proof, "_as_fast_as_measured", lambda *_: True)
-        patch.setattr(proof, "_like_a_rail", lambda *_: False)
-        patch.setattr(proof, "contradictions", lambda *_: (still, 0, 700))
-        patch.setattr(proof, "_left_places", lambda *_: told)
-        proven = proof.left_contradicted(track, [], space, []) is not None
-        assert proven == (still == 80 or told[0] == (0, 30))
+    proven = still == 80 or told[0] == (0, 30)
+    assert is_proven(track, space, (still, 0, 700), told) == proven
 
 
 @pytest.mark.parametrize(
@@ -300,12 +282,7 @@ def test_rings_that_glide_over_a_parked_car_do_not_move_it(still, moved, told, p
     """A metre in a second, two rings of a car of which the rest is still there."""
     track = followed(lambda n: [0.12 * n, 0, 0, 0], 10, [18.0, 0, 0], 8)
     space = SimpleNamespace(gap_m=lambda *_: 0.4, clock=SimpleNamespace(time_s=np.arange(10) / 10))
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(proof, "_as_fast_as_measured", lambda *_: True)
-        patch.setattr(proof, "_like_a_rail", lambda *_: False)
-        patch.setattr(proof, "contradictions", lambda *_: (still, moved, 1920))
-        patch.setattr(proof, "_left_places", lambda *_: told)
-        assert (proof.left_contradicted(track, [], space, []) is not None) == proven
+    assert is_proven(track, space, (still, moved, 1920), told) == proven
 
 
 @pytest.mark.parametrize(("along_rad", "rail"), [(0.0, True), (0.6, True), (np.pi / 2, False)])

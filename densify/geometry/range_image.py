@@ -250,8 +250,8 @@ def _cells(rays: Aimed, num_together: int, by_ring: bool) -> list[_Cells]:
         if not by_ring:
             return [_grid(near, step)]
         if len(near) == len(far):
-            lone = _lone(rings)
-            return [_grid(near, step)] + [_grid(lone, step)._replace(lone=True)] * (len(lone) > 0)
+            lone, cells = _lone(rings), [_grid(near, step)]
+            return [*cells, _grid(lone, step)._replace(lone=True)] if len(lone) else cells
         far_m = _SLACK_M / (1.5 * float(np.diff(far).min()))
         return [_grid(near, step)._replace(to_m=far_m), _grid(far, step)._replace(from_m=far_m)]
     if in_lines(some):

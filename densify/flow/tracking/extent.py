@@ -118,31 +118,38 @@ def shape_of(track: Track, standing: Sequence[Standing], space: FreeSpace) -> Sh
         ]
     )
     seed = np.concatenate([standing[j].seed[track.claimed[j]] for some in evenly for j in some])
-    again &= ~np.concatenate([_stay(track, standing, j, space) for some in evenly for j in some])
+    again &= ~_staying(track, standing, [j for some in evenly for j in some], space)
     theirs = again & close_to_seeds(points, seed, _AROUND_M, _LEAST_SEEDS)
     if theirs.any() and np.linalg.norm(np.ptp(points[theirs, :2], axis=0)) < _WALKER_M:
         return Shape.of(points[theirs])
     return Shape.of(points[again] if again.any() else points)
 
 
-def _stay(track: Track, standing: Sequence[Standing], i: int, space: FreeSpace) -> Bool:
-    """(N,) those of the track's points in sweep number i whose places are taken in more of the
-    other sweeps that saw it than the places that they would have moved to: of a bush beside who
-    walks."""
-    c = standing[i]
-    places = c.points[track.claimed[i]]
-    body = track.undo(places, c.time_s[track.claimed[i]])
-    reach_m = max(_THERE_M, _GAPS_REACHED_UNSEEN * space.gap_m(track.centre, i))
+def _staying(
+    track: Track, standing: Sequence[Standing], sweeps: Sequence[int], space: FreeSpace
+) -> Bool:
+    """(N,) those of the track's points in these sweeps, one sweep's after the other's, whose places
+    are taken in more of the other sweeps than the places that they would have moved to: of a bush
+    beside who walks."""
+    of = np.repeat(sweeps, [len(track.claimed[j]) for j in sweeps])
+    body = track.seen_in(standing, sweeps)
+    places = np.concatenate([standing[j].points[track.claimed[j]] for j in sweeps])
+    reach_of = {
+        j: max(_THERE_M, _GAPS_REACHED_UNSEEN * space.gap_m(track.centre, j)) for j in sweeps
+    }
+    reach_m = np.array([reach_of[j] for j in of])
+    low, high = places.min(0) - reach_m.max(), places.max(0) + reach_m.max()
     stands, moves = np.zeros((2, len(places)), np.int64)
-    for j, rows in track.claimed.items():
-        if j == i:
-            continue
-        others = standing[j]
-        own = BoxTree(track.undo(others.points[rows], others.time_s[rows]))
-        moves += np.isfinite(own.nearest(body, reach_m)[0])
-        rows = others.strips.rows_inside(places.min(0) - reach_m, places.max(0) + reach_m)
-        if len(rows):
-            stands += np.isfinite(BoxTree(others.points[rows]).nearest(places, reach_m)[0])
+
+    def count(num: Int, points: Float, among: Float, asked: Bool) -> None:
+        if len(among):
+            away_m, _ = BoxTree(among).nearest(points[asked], float(reach_m.max()))
+            num[asked] += away_m < reach_m[asked]
+
+    for j in sweeps:
+        c, others = standing[j], of != j
+        count(moves, body, body[~others], others)
+        count(stands, places, c.points[c.strips.rows_inside(low, high)], others)
     return np.asarray(stands > moves)
 
 
