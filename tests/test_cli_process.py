@@ -209,6 +209,21 @@ def test_a_reader_that_stops_reading_is_no_error(command: str) -> None:
     assert (done.returncode, done.stderr) == (0, "")
 
 
+def test_leaving_says_nothing_and_does_what_others_registered() -> None:
+    pytest.importorskip("velodyne_decoder")  # whose binding reports what is not given back
+    code = (
+        "import atexit, sys, velodyne_decoder; from densify import cli\n"
+        "from densify.cli.verbs import info\n"
+        "def answer(options):\n"
+        "    atexit.register(print, 'registered', flush=True)\n"
+        "    raise cli.InputError('bad')\n"
+        "info.answer = answer; cli.script()"
+    )
+    command = [sys.executable, "-c", code, "info"]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert (done.returncode, done.stdout, done.stderr) == (2, "registered\n", "densify: bad\n")
+
+
 def test_interrupt_leaves_nothing(tmp_path: Path) -> None:
     out = tmp_path / "out"
     command = ["run", "--key", "60", "--window", "5", "--out", str(out)]

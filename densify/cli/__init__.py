@@ -7,7 +7,7 @@ load numpy and heavier things are imported by the verb that needs them, so that 
 
 from __future__ import annotations
 
-import gc
+import atexit
 import io
 import logging
 import os
@@ -71,14 +71,17 @@ def script() -> NoReturn:
     for number in (signal.SIGTERM, signal.SIGHUP):
         if signal.getsignal(number) == signal.SIG_DFL:  # nohup has it ignored
             signal.signal(number, signal.default_int_handler)
+    code: int | None = None
+    # The last to be called at exit: Python would search all that it is about to give back, half a
+    # second after a run, and of what is kept from that search (gc.freeze) packages say it leaked.
+    atexit.register(lambda: None if code is None else os._exit(code))
     code = main()
+    for stream in (sys.stdout, sys.stderr):
+        _let_go_of(stream)
     if code == INTERRUPTED:
         # Python dies of the signal, not with 130, where an extension module was being imported,
         # and waits for threads that are at work.
-        sys.stderr.flush()
         os._exit(code)
-    _let_go_of(sys.stderr)
-    gc.freeze()  # or Python searches all that it is about to give back: half a second after a run
     sys.exit(code)
 
 
