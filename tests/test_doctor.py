@@ -98,6 +98,16 @@ def test_a_fault_is_named(good: Sample, street: Faulty, name: str) -> None:
     assert max((f.verdict for f in named), default=Verdict.FINE) >= Verdict.SUSPICIOUS, found
 
 
+def test_points_on_a_map_are_not_taken_for_another_unit(good: Sample) -> None:
+    def on_a_map(spot: Spot) -> Spot:
+        moved = (replace(s, points=s.points + [5e5, 5.4e6, 200.0]) for s in spot.sweeps)
+        return Spot(tuple(moved), spot.trajectory)
+
+    sample = replace(good, spots=tuple(on_a_map(spot) for spot in good.spots))
+    (found,) = points.check_units(sample)
+    assert found.verdict == Verdict.WRONG and found.remedy.startswith("bring each sweep into")
+
+
 def test_compensated_sweeps_are_told_from_fired_ones(good: Sample) -> None:
     def compensated(spot: Spot) -> Spot:
         straight = tuple(

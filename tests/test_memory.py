@@ -28,7 +28,7 @@ def test_more_of_everything_takes_more() -> None:
     assert memory.need_of_run(sequence, KEY, 2, [], near) < usual
     # there are seven sweeps
     few, many = (memory.need_of_run(sequence, KEY, w, None, near) for w in (3, 2 * 10**9))
-    assert few == many
+    assert few == many == memory.need_of_run(sequence, KEY, 3, None, Config())  # none is beyond
 
 
 def test_a_run_that_cannot_fit_is_not_begun(

@@ -191,17 +191,25 @@ def test_a_reader_of_another_package(package, tmp_path: Path) -> None:
         def open_recording(path, scene):
             return path, scene
     """
-    (tmp_path / "there").mkdir()
+    data = tmp_path / "data"
+    there = data / "there"
+    there.mkdir(parents=True)
     with pytest.raises(InputError, match="no known recording there; expected a KITTI raw drive"):
-        densify.open_sequence(tmp_path / "there")
+        densify.open_sequence(there)
     package("densify.readers", "marked", code)
     with pytest.raises(InputError, match=", marks"):
-        densify.open_sequence(tmp_path / "there")
-    (tmp_path / "there" / "mark").touch()
+        densify.open_sequence(there)
+    (there / "mark").touch()
     with pytest.raises(InputError, match="no recording itself; one in it is "):
+        densify.open_sequence(data)
+    (data / "labels").mkdir()  # numbered, and named before it
+    (data / "labels" / "0013.txt").touch()
+    with pytest.raises(InputError, match=f"one in it is {there}: name that"):
+        densify.open_sequence(data)
+    with pytest.raises(InputError, match=f"one in it is {there}: name that"):
         densify.open_sequence(tmp_path)
-    assert densify.open_sequence(tmp_path / "there") == (tmp_path / "there", None)
-    assert densify.open_sequence(f"marked:{tmp_path}#night") == (tmp_path, "night")
+    assert densify.open_sequence(there) == (there, None)
+    assert densify.open_sequence(f"marked:{data}#night") == (data, "night")
     assert Spec.parse("marked:here").absolute() == f"marked:{Path.cwd()}/here"
     assert [row.name for row in READERS][-1] == "marked"
 

@@ -104,6 +104,7 @@ def test_numbered_files_alone_open(tmp_path):
     sweep = sequence[4]
     np.testing.assert_array_equal(sweep.points, scan())
     assert sweep.offset_ns is None and set(sweep.intensity) == {0.5}
+    assert re.search(r"^poses +none$", describe(sequence), re.M)
     with pytest.raises(InputError, match="no poses; let the sweeps register themselves"):
         sequence.T_world_lidar(3)
     text = describe(sequence)

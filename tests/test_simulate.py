@@ -165,6 +165,15 @@ def test_another_calibration_is_kept(street, tmp_path):
     assert path.read_bytes() == ours
 
 
+@pytest.mark.parametrize(
+    ("name", "images"), [("kitti-odometry", {"image_2"}), ("kitti-tracking", {"image_02"})]
+)
+def test_a_camera_that_a_format_has_no_room_for_is_left_out(tmp_path, name, images):
+    answer = ("simulate", "--sensor", "vlp16", "--format", name, "--frames", "60:62")
+    assert exit_code(*answer, "--out", tmp_path / "out") == 0
+    assert {p.name for p in tmp_path.rglob("image_*") if "truth" not in p.parts} == images
+
+
 def test_what_cannot_be_written_is_one_clear_line(street, tmp_path):
     file = tmp_path / "file"
     file.write_text("")

@@ -77,9 +77,8 @@ def check_cameras(sample: Sample) -> list[Finding]:
         findings += _check_images(sample, camera)
         pairs, broken = image_pairs(sample, camera)
         if broken:
-            findings.append(
-                Finding(f"{camera.name}: images", Verdict.WRONG, broken, "fetch the image again")
-            )
+            remedy = "fetch the image again, or give size and calibration of images like it"
+            findings.append(Finding(f"{camera.name}: images", Verdict.WRONG, broken, remedy))
         if pairs:
             findings += _check_calibration(camera, pairs)
     return findings

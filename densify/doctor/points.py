@@ -36,12 +36,13 @@ _UP_MEANS = {
 _LAYER_M, _LEAST_LEVEL, _FEW_BELOW = 0.3, 0.08, 0.2
 _HIGHEST_M = 0.3  # where points are in a vehicle's frame the road is at 0
 _CLEARLY = 1.5
+_FAR_OFF = 10.0  # times as far as the points are apart
 
 
 def check_units(sample: Sample) -> list[Finding]:
     """Metres, or not."""
     middle = [spot.sweeps[spot.middle].points for spot in sample.spots]
-    range_m = float(np.median([np.median(np.linalg.norm(points, axis=1)) for points in middle]))
+    range_m = float(np.median([_median_range_m(points) for points in middle]))
     values = {"median_range_m": range_m}
     if _MEDIAN_RANGE_M[0] <= range_m <= _MEDIAN_RANGE_M[1]:
         return [
@@ -50,6 +51,18 @@ def check_units(sample: Sample) -> list[Finding]:
                 Verdict.FINE,
                 f"half of the returns within {range_m:.1f} m",
                 values=values,
+            )
+        ]
+    around_m = float(np.median([_median_range_m(p - np.median(p, axis=0)) for p in middle]))
+    if _MEDIAN_RANGE_M[0] <= around_m <= _MEDIAN_RANGE_M[1] and range_m > _FAR_OFF * around_m:
+        return [
+            Finding(
+                "unit of points",
+                Verdict.WRONG,
+                f"half of the returns are farther than {range_m:.4g} m, and within {around_m:.1f} m"
+                f" of each other's middle, as if they were in a map's coordinates",
+                "bring each sweep into its scanner's frame, by the inverse of its pose",
+                values,
             )
         ]
     fits = [u for u, f in _UNITS.items() if _MEDIAN_RANGE_M[0] <= range_m * f <= _MEDIAN_RANGE_M[1]]
@@ -66,6 +79,10 @@ def check_units(sample: Sample) -> list[Finding]:
     ]
 
 
+def _median_range_m(points: Float) -> float:
+    return float(np.median(np.linalg.norm(points, axis=1)))
+
+
 def check_axes(sample: Sample) -> list[Finding]:
     """Which axis points up: the one along which a layer holds most returns and hardly any lie
     below."""
@@ -74,7 +91,7 @@ def check_axes(sample: Sample) -> list[Finding]:
     values = {f"share_{name}": share for name, share in level.items()}
     text = (
         f"{100 * level[best]:.0f} % of the near returns lie in one layer below the scanner if "
-        f"{best} is up" + (f", {100 * level['z']:.0f} % if z is" if best != "z" else "")
+        f"{best} is up" + (f", {100 * max(level['z'], 0):.0f} % if z is" if best != "z" else "")
     )
     if level["z"] < _LEAST_LEVEL and level[best] < _LEAST_LEVEL:
         return [

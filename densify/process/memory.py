@@ -56,10 +56,11 @@ def need_of_run(
     num_points, chosen = len(sequence[key]), choose_cameras(sequence, cameras)
     num_sweeps = min(2 * window + 1, len(sequence.frames))
     num_around = min(2 * _USUAL_HZ * config.flow.look_around_s, len(sequence.frames) - num_sweeps)
-    bytes_of_point = num_sweeps * _POINT_BYTES + num_around * _AROUND_BYTES
+    far = config.accumulate.far_m > 0 and len(sequence.frames) > num_sweeps
+    bytes_of_point = num_sweeps * _POINT_BYTES + num_around * _AROUND_BYTES + far * _FAR_BYTES
     return (
         _BASE_BYTES
-        + num_points * (bytes_of_point + bool(config.accumulate.far_m) * _FAR_BYTES)
+        + num_points * bytes_of_point
         + sum(camera.width_px * camera.height_px for camera in chosen) * _PIXEL_BYTES
     )
 

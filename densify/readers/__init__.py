@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
+from itertools import chain
 from pathlib import Path
 from typing import NamedTuple, Protocol, cast
 
@@ -12,7 +13,7 @@ from densify.errors import InputError
 from densify.plugins.readers import READERS, Reader
 from densify.types import LidarSequence
 
-_MOST_FOLDERS = 50  # are looked into for a recording, where a place is none itself
+_MOST_PLACES = 200  # are looked at for a recording, where the one named is none itself
 
 
 class ReaderModule(Protocol):
@@ -120,9 +121,17 @@ def _reader_of(parsed: Spec, text: str) -> Reader:
 
 
 def _recording_in(path: Path, readers: Sequence[Reader]) -> Path | None:
-    """The first folder of a place that is a recording."""
-    folders = sorted(p for p in path.iterdir() if p.is_dir()) if path.is_dir() else []
-    for folder in folders[:_MOST_FOLDERS]:
-        if any(reader.recognises(folder) for reader in readers):
-            return folder
+    """The first recording in a folder or in those that it holds; one of a known form, or else a
+    folder of sweeps."""
+    near = _entries(path)
+    places = [*near, *chain.from_iterable(map(_entries, near))][:_MOST_PLACES]
+    for general in (False, True):
+        asked = [reader for reader in readers if reader.general == general]
+        for place in places:
+            if any(reader.recognises(place) for reader in asked):
+                return place
     return None
+
+
+def _entries(path: Path) -> list[Path]:
+    return sorted(path.iterdir()) if path.is_dir() else []

@@ -129,7 +129,7 @@ def _poses(sequence: LidarSequence, frames: Sequence[int]) -> str:
     try:
         path = np.array([sequence.T_world_lidar(frame)[:3, 3] for frame in frames])
     except InputError as error:
-        place = getattr(sequence, "where", None)
-        return f"none: {str(error).removeprefix(f'{place}: ')}"
+        why = str(error).removeprefix(f"{getattr(sequence, 'where', None)}: ")
+        return "none" if why.startswith("no poses") else f"none: {why}"
     length_m = np.linalg.norm(np.diff(path, axis=0), axis=1).sum()
     return f"yes, a path of {length_m:.1f} m"

@@ -90,8 +90,10 @@ def check_number_of_points(sweeps: Sequence[Sweep], settings: RegisterSettings) 
     for sweep in sweeps:
         if len(sweep) < settings.min_num_points:
             raise UnfitSweepError(
-                f"registration: sweep {sweep.frame} has {len(sweep)} points, expected at least "
-                f"{settings.min_num_points}; choose another key or lower register.min_num_points",
+                f"registration: sweep {sweep.frame} has {len(sweep)} points from "
+                f"{settings.min_range_m:g} to {settings.max_range_m:g} m away, expected at least "
+                f"{settings.min_num_points}; choose another key or lower register.min_num_points, "
+                f"or ask densify doctor whether they are in metres",
                 sweep.frame,
             )
 

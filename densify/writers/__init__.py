@@ -36,7 +36,8 @@ FORMATS = {
 
 
 class TreeWriter(Protocol):
-    """What the module of a format has."""
+    """What the module of a format has; and ``CAMERA_NAMES``, which of the street's cameras it has
+    room for, where that is not all of them."""
 
     def write_tree(
         self, excerpt: Excerpt, out: Path, overwrite: bool, progress: Progress | None
@@ -61,14 +62,17 @@ def write_street(
 ) -> Path:
     """Write frames of a street in a data set's format and return the place that ``--data`` opens.
 
-    format: a row of `FORMATS`. frames: absolute numbers. cameras: names, those of the street if
-    None. Raises InputError as `TreeWriter.write_tree`, and for a format, frame or camera that does
-    not exist.
+    format: a row of `FORMATS`. frames: absolute numbers. cameras: names; None for all that the
+    format has room for. Raises InputError as `TreeWriter.write_tree`, and for a format, frame or
+    camera that does not exist.
     """
     if format not in FORMATS:
         raise InputError(f"--format {format}: expected one of {', '.join(FORMATS)}")
-    excerpt = Excerpt.of(street, frames, cameras)
-    writer = cast(TreeWriter, import_module(FORMATS[format]))
+    module = import_module(FORMATS[format])
+    if cameras is None:
+        room = getattr(module, "CAMERA_NAMES", street.cameras)
+        cameras = [name for name in street.cameras if name in room] or [*street.cameras]
+    excerpt, writer = Excerpt.of(street, frames, cameras), cast(TreeWriter, module)
     try:
         return writer.write_tree(excerpt, out, overwrite, progress)
     except OSError as error:

@@ -27,7 +27,7 @@ from densify.writers.kitti_raw import (
     velodyne_bytes,
 )
 
-NAMES = {"image_02": "image_00", "image_03": "image_01"}
+CAMERA_NAMES = {"image_02": "image_00", "image_03": "image_01"}
 """The street's cameras, and what the format calls them."""
 
 _DRIVE = "2026_06_12_drive_0000_sync"
@@ -38,7 +38,7 @@ def write_tree(excerpt: Excerpt, out: Path, overwrite: bool, progress: Progress 
     which become image_00 and image_01, and for a sensor whose points' times follow from their
     azimuth."""
     street = excerpt.street
-    check_cameras_fit(excerpt, "KITTI-360", NAMES)
+    check_cameras_fit(excerpt, "KITTI-360", CAMERA_NAMES)
     check_azimuth_tells_time(street, "KITTI-360")
     stamps_ns = np.array([street.stamp_ns(frame) for frame in excerpt.frames])
     T_lidar_pose = poses.inverse(T_level_lidar(street.simulator.tilt_deg)) @ T_LEVEL_IMU
@@ -52,13 +52,13 @@ def write_tree(excerpt: Excerpt, out: Path, overwrite: bool, progress: Progress 
             put(drive / "velodyne_points" / "data" / f"{number:010d}.bin", data)
         put(drive / "velodyne_points" / "timestamps.txt", stamp_lines(stamps_ns))
         for name in excerpt.cameras:
-            _write_images(folder / "data_2d_raw" / _DRIVE / NAMES[name], excerpt, name)
+            _write_images(folder / "data_2d_raw" / _DRIVE / CAMERA_NAMES[name], excerpt, name)
         for name, text in _calibration(T_lidar_pose, street.simulator.tilt_deg).items():
             put(folder / "calibration" / name, text.encode())
         T_world_pose = excerpt.T_world_ego(stamps_ns, T_lidar_pose)
         lines = [f"{number} {numbers(T[:3])}\n" for number, T in enumerate(T_world_pose)]
         put(folder / "data_poses" / _DRIVE / "poses.txt", "".join(lines).encode())
-        excerpt.write_truth(drive / "truth", stamps_ns.tolist(), names=NAMES)
+        excerpt.write_truth(drive / "truth", stamps_ns.tolist(), names=CAMERA_NAMES)
         if progress:
             progress("simulate", len(excerpt.frames), len(excerpt.frames))
     return out
@@ -77,7 +77,7 @@ def _calibration(T_lidar_pose: Float, tilt_deg: float) -> dict[str, str]:
     to_pose, perspective = "", ""
     T_rect_cam = np.eye(4)
     T_rect_cam[:3, :3] = Rotation.from_rotvec([0.004, -0.006, 0.002]).as_matrix()
-    for own, name in NAMES.items():
+    for own, name in CAMERA_NAMES.items():
         camera = CAMERAS[own]
         T_cam_lidar = poses.inverse(T_rect_cam) @ camera.T_cam_lidar @ T_level_lidar(tilt_deg)
         to_pose += f"{name}: {numbers(poses.inverse(T_cam_lidar @ T_lidar_pose)[:3])}\n"

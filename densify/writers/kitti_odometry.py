@@ -21,7 +21,7 @@ from densify.types import Progress
 from densify.writers.excerpt import Excerpt, check_cameras_fit, new_folder, put
 from densify.writers.kitti_raw import numbers, projections, velodyne_bytes
 
-NAMES = {"image_02": "image_2"}
+CAMERA_NAMES = {"image_02": "image_2"}
 """The street's camera that exposes with the scanner, and what the format calls it."""
 
 _SEQUENCE = "00"
@@ -31,7 +31,7 @@ def write_tree(excerpt: Excerpt, out: Path, overwrite: bool, progress: Progress 
     """See `densify.writers.TreeWriter`. The format has room for the camera image_02 and for one
     scanner."""
     street = excerpt.street
-    check_cameras_fit(excerpt, "KITTI odometry", NAMES)
+    check_cameras_fit(excerpt, "KITTI odometry", CAMERA_NAMES)
     if len(street.simulator.sensor.scanners) > 1:
         raise InputError(
             f"{street.name}: cannot be written as KITTI odometry, whose points do not say which "
@@ -54,7 +54,7 @@ def write_tree(excerpt: Excerpt, out: Path, overwrite: bool, progress: Progress 
             data = velodyne_bytes(points, returns.intensity)
             put(sequence / "velodyne" / f"{number:06d}.bin", data)
             for name in excerpt.cameras:
-                image = sequence / NAMES[name] / f"{number:06d}.png"
+                image = sequence / CAMERA_NAMES[name] / f"{number:06d}.png"
                 put(image, excerpt.encoded_image(name, frame))
         since_s = [f"{(ns - stamps_ns[0]) * 1e-9:.6e}\n" for ns in stamps_ns]
         put(sequence / "times.txt", "".join(since_s).encode())
@@ -62,7 +62,7 @@ def write_tree(excerpt: Excerpt, out: Path, overwrite: bool, progress: Progress 
         put(sequence / "calib.txt", "".join(calibration).encode())
         lines = [numbers(T[:3]) + "\n" for T in T_first_now]
         put(folder / "poses" / f"{_SEQUENCE}.txt", "".join(lines).encode())
-        excerpt.write_truth(sequence / "truth", stamps_ns, names=NAMES)
+        excerpt.write_truth(sequence / "truth", stamps_ns, names=CAMERA_NAMES)
         if progress:
             progress("simulate", len(excerpt.frames), len(excerpt.frames))
     return out / "sequences" / _SEQUENCE

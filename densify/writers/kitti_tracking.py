@@ -29,6 +29,9 @@ from densify.writers.kitti_raw import (
     velodyne_bytes,
 )
 
+CAMERA_NAMES = ("image_02",)
+"""Those of the street that the format has room for."""
+
 _SEQUENCE = "0000"
 _NEAREST_M = 0.5  # of corners before the camera
 
@@ -37,7 +40,7 @@ def write_tree(excerpt: Excerpt, out: Path, overwrite: bool, progress: Progress 
     """See `densify.writers.TreeWriter`. The format has room for the camera image_02, for a sensor
     whose points' times follow from their azimuth, and for sweeps of 10 Hz without gaps."""
     street = excerpt.street
-    check_cameras_fit(excerpt, "KITTI tracking", ("image_02",))
+    check_cameras_fit(excerpt, "KITTI tracking", CAMERA_NAMES)
     check_azimuth_tells_time(street, "KITTI tracking")
     stamps_ns = [street.stamp_ns(frame) for frame in excerpt.frames]
     if np.any(np.diff(stamps_ns) != NOMINAL_PERIOD_NS):

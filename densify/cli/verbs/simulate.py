@@ -65,14 +65,13 @@ def answer(options: argparse.Namespace) -> Iterator[Answer]:
 
     street = Street.from_spec(_street_spec(options))
     frames = _frames_of(street, options.frames)
-    cameras = _cameras_of(street, options.cameras)
     with progress_on_stderr() as progress:
         place = write_street(
             options.format,
             street,
             options.out,
             frames,
-            cameras,
+            options.cameras,
             progress,
             overwrite=options.overwrite,
         )
@@ -98,10 +97,3 @@ def _frames_of(street: LidarSequence, wanted: range | None) -> list[int]:
             f"{frames[0]}:{frames[-1] + 1}"
         )
     return list(wanted)
-
-
-def _cameras_of(street: LidarSequence, wanted: list[str] | None) -> list[str]:
-    for name in wanted or ():
-        if name not in street.cameras:
-            raise InputError(f"--camera {name}: expected one of {', '.join(street.cameras)}")
-    return list(street.cameras) if wanted is None else wanted
