@@ -121,6 +121,14 @@ def test_point_files_of_every_kind_agree(tmp_path: Path) -> None:
         assert np.array_equal(read, points[:, :3])
 
 
+def test_columns_of_a_scan_beyond_kittis_four(tmp_path: Path) -> None:
+    turn = np.linspace(0, 2 * np.pi, 240)
+    scan = [9 * np.cos(turn), 9 * np.sin(turn), 0.1 * turn - 1.7, turn % 1, turn / 70, turn > 3]
+    table = np.stack(scan, axis=1).astype("<f4")
+    table.tofile(tmp_path / "p.bin")
+    assert np.array_equal(read_points(tmp_path / "p.bin").points, table[:, :3])
+
+
 def test_times_and_scanners_beside_the_points(tmp_path: Path) -> None:
     points, time_s, lidar = (
         np.ones((3, 3)),

@@ -15,8 +15,6 @@ from densify.errors import InputError
 from densify.readers.points.files import read_table
 from densify.types import Float, FlowField, Int
 
-KITTI_COLUMNS = ("x", "y", "z", "reflectance")
-
 
 @dataclass(frozen=True)
 class PointFile:
@@ -32,11 +30,10 @@ def read_points(path: Path) -> PointFile:
     """Every row of the file in its order: any format of `densify.readers.points.files`.
 
     An .npz file may hold, beside ``points``, ``offset_ns`` or ``time`` (seconds) and ``lidar``,
-    (N,) each; a .bin file is KITTI's float32 x y z reflectance. Raises InputError if the file is
-    missing, has another form, or holds no point or one that is not finite (rows are not dropped:
-    the flow lines up with them).
+    (N,) each. Raises InputError if the file is missing, has another form, or holds no point or one
+    that is not finite (rows are not dropped: the flow lines up with them).
     """
-    table = read_table(path, KITTI_COLUMNS if path.suffix == ".bin" else None)
+    table = read_table(path)
     for name in "xyz":
         if name not in table.columns:
             raise InputError(

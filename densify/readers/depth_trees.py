@@ -215,4 +215,4 @@ def _others(files: Sequence[_File], paired: set[Path]) -> tuple[Path, ...]:
 def _example(files: Sequence[_File], place: Path) -> str:
     first = files[0]
     says = [f"{n} {v}" for n in ("drive", "camera", "frame") if (v := getattr(first, n))]
-    return f"{place} has {len(files)} files such as {' '.join(says)}"
+    return f"{place} has {len(files)} file{'s' * (len(files) != 1)} such as {' '.join(says)}"

@@ -32,7 +32,7 @@ def add(commands: Any) -> None:
         answer,
         about,
         "Point files: .npy (N,3 or more columns), .npz (array 'points'), .txt and .csv (columns), "
-        ".bin (KITTI: float32 x y z reflectance), .pcd, .ply, .las, .laz. Where both are .npz and "
+        ".bin (float32 columns, as KITTI's), .pcd, .ply, .las, .laz. Where both are .npz and "
         "hold when each point was measured ('offset_ns', or 'time' in seconds) or by which "
         "scanner ('lidar'), that is used. "
         "The result holds 'residual_flow' (N,3) float32 metres, "
