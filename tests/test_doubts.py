@@ -138,7 +138,7 @@ def test_a_set_ends_with_its_warnings_and_keeps_them(layout, border_drive, tmp_p
     assert exit_code("dataset", "--data", drive, *settings, *keys, "--out", out) == 0
     told = [line for line in capsys.readouterr().err.splitlines() if "warning" in line]
     untimed = "the points have no times of their own: motion within a sweep is not undone"
-    ends = f"the recording ends at frame {first}"
+    ends = f"the recording begins at frame {first}"
     assert told[:2] == [
         f"densify: warning: {drive.name} key 36-38: {drive / 'velodyne_points'} has no "
         f"timestamps_start.txt",

@@ -29,7 +29,7 @@ def test_a_window_has_as_many_sweeps_on_each_side():
 
 @pytest.mark.parametrize(
     ("key", "frames", "words"),
-    [(1, (0, 1, 2, 3, 4), "ends at frame 0"), (19, (16, 17, 18, 19), "ends at frame 19")],
+    [(1, (0, 1, 2, 3, 4), "begins at frame 0"), (19, (16, 17, 18, 19), "ends at frame 19")],
 )
 def test_a_window_is_cut_where_the_recording_ends(key, frames, words):
     found = timeline(range(20)).window(key, 3)

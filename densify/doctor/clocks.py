@@ -131,7 +131,7 @@ def check_point_times(sample: Sample) -> list[Finding]:
         values = {"first_s": low_s, "last_s": high_s, "speed_m_s": speed_m_s}
         text = (
             f"{low_s * 1e3:+.1f} to {high_s * 1e3:+.1f} ms around the stamp, {span:.3g} periods; "
-            f"the stamp is at {100 * where:.0f} % of the sweep"
+            f"the stamp is at {round(100 * where)} % of the sweep"
         )
         if _WHOLE_SWEEP[0] <= span <= _WHOLE_SWEEP[1]:
             verdict, remedy = Verdict.FINE, ""

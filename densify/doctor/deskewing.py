@@ -29,7 +29,10 @@ def check_deskewing(sample: Sample, settings: RegisterSettings) -> list[Finding]
     if spot is None or spot.sweeps[0].offset_ns is None:
         return []
     if spot.speed_m_s < _LEAST_SPEED_M_S:
-        text = "the vehicle hardly moves where it was looked at"
+        text = (
+            f"the vehicle drives at {spot.speed_m_s:.1f} m/s where it was looked at, "
+            f"{_LEAST_SPEED_M_S:g} are needed"
+        )
         return [Finding("deskewing", Verdict.UNKNOWN, text)]
     given_m = apart_m(spot)
     others = {

@@ -73,7 +73,10 @@ def _check_compensation(
     if spot is None:
         return Finding(name, Verdict.UNKNOWN, "no sweeps could be registered")
     if spot.speed_m_s < _LEAST_SPEED_M_S:
-        text = "the vehicle hardly moves where it was looked at"
+        text = (
+            f"the vehicle drives at {spot.speed_m_s:.1f} m/s where it was looked at, "
+            f"{_LEAST_SPEED_M_S:g} are needed"
+        )
         return Finding(name, Verdict.UNKNOWN, text)
     sweep = spot.sweeps[spot.middle]
     sweep = sweep.select(sweep.lidar == lidar)

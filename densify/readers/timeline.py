@@ -159,7 +159,8 @@ class Timeline:
         while len(side) < window:
             here, row = row, row + step
             if not 0 <= row < len(self.frames):
-                return side, f"the recording ends at frame {self.frames[here]}"
+                verb = "begins" if step < 0 else "ends"
+                return side, f"the recording {verb} at frame {self.frames[here]}"
             if self._hole_before(max(here, row)):
                 gap_s = abs(int(self.stamp_ns[row] - self.stamp_ns[here])) * 1e-9
                 pair = sorted((self.frames[here], self.frames[row]))
