@@ -95,7 +95,7 @@ def test_a_window_of_the_key_alone():
 def test_at_the_start_of_the_recording():
     result = run(one_car(), 0, 2, "flow", config=POSES_GIVEN)
     assert result.frames == (0, 1, 2)
-    assert result.warnings[0] == ("the window is cut to frames 0-2: the recording begins at frame 0")
+    assert result.warnings[0] == "the window is cut to frames 0-2: the recording begins at frame 0"
 
 
 def test_a_sweep_without_times_is_not_deskewed():
