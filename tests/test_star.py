@@ -71,11 +71,26 @@ def test_slopes_of_filled_pixels_come_from_those_around():
 
 
 def test_the_comb_at_the_lower_border_is_closed_and_nothing_below_it():
-    teeth = np.where(COLUMN % 6 == 0, 56, 48)
+    teeth = np.where(COLUMN % 6 == 0, 50, 42)
     filled = fill_stars(layers_of(np.where(teeth > ROW, TILTED, 0), tilt=TILT), SETTINGS)
-    between = (ROW < 54) & (COLUMN > 0) & (COLUMN < 78)
+    between = (ROW < 48) & (COLUMN > 0) & (COLUMN < 78)
     np.testing.assert_allclose(filled.filled_m[between], TILTED[between], rtol=5e-3)
-    assert not filled.filled_m[ROW >= 56].any()
+    assert not filled.filled_m[ROW >= 50].any()
+
+
+@pytest.mark.parametrize("height_px", [1, 3, 6])
+def test_a_strip_along_the_lower_border_is_closed_and_none_along_the_others(height_px):
+    around = np.minimum(np.minimum(ROW, COLUMN), COLUMN[:, ::-1]) < height_px
+    strip = (ROW[::-1] < height_px) & (COLUMN > 20) & (COLUMN < 60)
+    layers = layers_of(np.where((ROW[::-1] < height_px) | around, 0, TILTED), tilt=TILT)
+    filled = fill_stars(layers, SETTINGS).filled_m
+    np.testing.assert_allclose(filled[strip], TILTED[strip], rtol=2e-3)
+    assert not filled[around & (ROW < 50)].any()
+
+
+def test_a_higher_strip_stays_empty():
+    layers = layers_of(np.where(ROW < 53, TILTED, 0), tilt=TILT)
+    np.testing.assert_array_equal(fill_stars(layers, SETTINGS).filled_m, layers.filled_m)
 
 
 @pytest.mark.parametrize("edge", ["column", "row", "diagonal"])
@@ -155,10 +170,14 @@ def twin(row, column, inverse, slope, known, rules, spacing_px):
                     w = np.clip(w, 0.7 * there, 1.4 * there)
                     given.append((w, 1 / k, known[row + dv, column + du]))
                 break
-    runs = "".join("01"[m] for m in met) * 2
-    if len(given) < rules.met or "0" * (rules.gap + 1) in runs:
+    if not given:
         return 0.0, 0.0
     w, weight, confidence = np.array(given).T
+    above = inverse[row::-1, column] > 0
+    along = 2 * (above.any() and SHAPE[0] - 1 - row + above.argmax() <= rules.strip_px)
+    runs = "".join("01"[m] for m in met) * 2
+    if len(given) < rules.met - along or "0" * (rules.gap + along + 1) in runs:
+        return 0.0, 0.0
     mean = np.average(w, weights=weight)
     if np.ptp(w) > rules.fraction * mean:
         return 0.0, 0.0
@@ -174,7 +193,7 @@ def test_stars_equal_those_of_a_slow_twin():
     spacing_px = np.broadcast_to(np.float32([2, 3]), (*SHAPE, 2)).copy()
     pixel = np.flatnonzero(depth_m == 0)
     found = np.zeros((2, len(pixel)), np.float32)
-    rules = stars.Rules(reach=3.0, met=9, gap=5, fraction=0.04)
+    rules = stars.Rules(reach=3.0, met=9, gap=5, fraction=0.04, strip_px=4)
     stars.between(
         0, len(pixel), pixel, first_known(depth_m > 0), DIRECTIONS, inverse,
         slope.reshape(-1, 2), known, spacing_px, rules, found,

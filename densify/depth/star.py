@@ -14,7 +14,7 @@ from densify.depth.layers import Layers
 from densify.kernels import stars
 from densify.kernels.marching import DIRECTIONS, first_known
 
-_RULES = stars.Rules(reach=0.0, met=8, gap=7, fraction=0.1)
+_RULES = stars.Rules(reach=0.0, met=8, gap=7, fraction=0.1, strip_px=6)
 _LEAST_SHARE = 0.8  # of the votes for a pixel that is kept
 _ONE_SURFACE = 0.05  # share of the inverse depth
 
@@ -27,8 +27,9 @@ def fill_stars(layers: Layers, settings: ProjectSettings) -> Layers:
     steps. A pixel is filled if it meets known ones within ``settings.star_reach`` spacings of the
     rays in at least 8 directions with no more than 7 neighbouring ones without, so that it lies
     between them, if all give the same depth to 10 %, and if eight of ten votes of the measured
-    pixels around are in favour (`densify.depth.fill.voted`): no depth edge, then, runs through. Its
-    confidence is the least of theirs, times ``settings.fill_confidence``.
+    pixels around are in favour (`densify.depth.fill.voted`): no depth edge, then, runs through. In
+    an empty strip of up to six rows along the lower border of the image two directions fewer are
+    enough. The confidence is the least of theirs, times ``settings.fill_confidence``.
     """
     known, measured = layers.filled_m > 0, layers.depth_m > 0
     inverse = np.divide(1, layers.filled_m, out=np.zeros_like(layers.filled_m), where=known)

@@ -14,18 +14,22 @@ from densify.kernels.marching import NONE
 _RIDGE_PX2 = 0.02  # keeps pixels that lie on one line, or nearly so, from tilting the plane
 _LEAST_PX = 3
 _BITS = 24  # of a float32's mantissa
+_ABOVE = 12  # of the directions
 _LESS, _MORE = 0.7, 1.4  # of the inverse depth, once extended
 
 
 class Rules(NamedTuple):
     """What `between` asks of the pixels around. reach: how far they may be, in spacings of the
     rays. met: in how many directions there must be one, at least. gap: most neighbouring directions
-    without. fraction: of the depth, between the nearest and the farthest they give."""
+    without. fraction: of the depth, between the nearest and the farthest they give. strip_px: in an
+    empty strip no higher than that along the image's lower border the two directions along it may
+    be without too."""
 
     reach: float
     met: int
     gap: int
     fraction: float
+    strip_px: int
 
 
 @inlined
@@ -106,7 +110,7 @@ def between(  # type: ignore[no-untyped-def]
     1/m. slope: (H W,2) of `slopes`. known: (H,W) float32 confidence. spacing_px: (H,W,2). rules:
     `Rules`. found: (2,P) float32: depth in m and least confidence, 0 where they do not agree.
     """
-    width = inverse.shape[1]
+    height, width = inverse.shape
     met = np.zeros(len(directions), np.bool_)
     for p in range(first, last):
         row, column = pixel[p] // width, pixel[p] % width
@@ -130,7 +134,9 @@ def between(  # type: ignore[no-untyped-def]
                 near, far = max(near, w), min(far, w)
                 least = min(least, known[v, u])
                 num += 1
-        if num < rules.met or _widest_gap(met) > rules.gap:
+        strip_px = height - 1 - row + np.int64(steps[_ABOVE, row, column])
+        along = 2 if strip_px <= rules.strip_px else 0
+        if num < rules.met - along or _widest_gap(met) > rules.gap + along:
             continue
         w = sum_w / weight
         if near - far <= rules.fraction * w:
