@@ -39,14 +39,12 @@ class TreeWriter(Protocol):
     """What the module of a format has; and ``CAMERA_NAMES``, which of the street's cameras it has
     room for, where that is not all of them."""
 
-    def write_tree(
-        self, excerpt: Excerpt, out: Path, overwrite: bool, progress: Progress | None
-    ) -> Path:
+    def write_tree(self, excerpt: Excerpt, out: Path, overwrite: bool) -> Path:
         """Write the excerpt below ``out``; return the place that ``--data`` opens, which is
         complete or not there. The truth lies beside the data, as `Excerpt.write_truth` makes it.
 
-        progress: called with "simulate", frames done, frames in all. Raises InputError for what
-        the format cannot hold, and for a place that is there already unless ``overwrite`` is set.
+        Raises InputError for what the format cannot hold, and for a place that is there already
+        unless ``overwrite`` is set.
         """
         ...
 
@@ -63,8 +61,8 @@ def write_street(
     """Write frames of a street in a data set's format and return the place that ``--data`` opens.
 
     format: a row of `FORMATS`. frames: absolute numbers. cameras: names; None for all that the
-    format has room for. Raises InputError as `TreeWriter.write_tree`, and for a format, frame or
-    camera that does not exist.
+    format has room for. progress: called with "simulate", frames done, frames in all. Raises
+    InputError as `TreeWriter.write_tree`, and for a format, frame or camera that does not exist.
     """
     if format not in FORMATS:
         raise InputError(f"--format {format}: expected one of {', '.join(FORMATS)}")
@@ -72,8 +70,10 @@ def write_street(
     if cameras is None:
         room = getattr(module, "CAMERA_NAMES", street.cameras)
         cameras = [name for name in street.cameras if name in room] or [*street.cameras]
-    excerpt, writer = Excerpt.of(street, frames, cameras), cast(TreeWriter, module)
+    excerpt, writer = Excerpt.of(street, frames, cameras, progress), cast(TreeWriter, module)
     try:
-        return writer.write_tree(excerpt, out, overwrite, progress)
+        place = writer.write_tree(excerpt, out, overwrite)
     except OSError as error:
         raise InputError(f"{out}: cannot be written: {error.strerror or error}") from error
+    excerpt.tell(len(excerpt.frames))
+    return place

@@ -30,7 +30,7 @@ from densify.readers.argoverse2 import (
 )
 from densify.readers.extras import needed
 from densify.street.patterns import Spinning
-from densify.types import Float, Progress
+from densify.types import Float
 from densify.writers.boxes import drawn_boxes
 from densify.writers.excerpt import Excerpt, check_plain_cameras, new_folder, put, quaternion
 
@@ -39,7 +39,7 @@ T_EGO_LIDAR[:3, 3] = [1.35, 0.0, 1.64]
 LOG = "street"
 
 
-def write_tree(excerpt: Excerpt, out: Path, overwrite: bool, progress: Progress | None) -> Path:
+def write_tree(excerpt: Excerpt, out: Path, overwrite: bool) -> Path:
     """See `densify.writers.TreeWriter`. The format has room for two scanners of up to 32 rings, and
     for rectified cameras."""
     street = excerpt.street
@@ -61,9 +61,7 @@ def write_tree(excerpt: Excerpt, out: Path, overwrite: bool, progress: Progress 
         )
         _put_calibration(log / "calibration", excerpt)
         _put_boxes(log / ANNOTATIONS, excerpt, half_ns)
-        for done, frame in enumerate(excerpt.frames):
-            if progress:
-                progress("simulate", done, len(excerpt.frames))
+        for _, frame in excerpt.numbered():
             returns = excerpt.returns(frame)
             stamp_ns = street.stamp_ns(frame) - half_ns
             laser = returns.lidar * LASERS_PER_SCANNER + excerpt.rings(returns)
@@ -84,8 +82,6 @@ def write_tree(excerpt: Excerpt, out: Path, overwrite: bool, progress: Progress 
                 put(path, excerpt.jpeg_image(name, number))
         stamps_ns = [street.stamp_ns(frame) - half_ns for frame in excerpt.frames]
         excerpt.write_truth(log / "truth", stamps_ns, inverse(T_EGO_LIDAR))
-        if progress:
-            progress("simulate", len(excerpt.frames), len(excerpt.frames))
     return out / LOG
 
 

@@ -23,7 +23,7 @@ import numpy as np
 
 from densify.errors import InputError
 from densify.geometry import poses
-from densify.types import Float, Progress
+from densify.types import Float
 from densify.writers.excerpt import Excerpt, check_plain_cameras, new_folder, put, quaternion
 
 _T_EGO_LIDAR = np.eye(4)
@@ -31,7 +31,7 @@ _T_EGO_LIDAR[:3, 3] = [1.1, 0.0, 1.73]
 _LIDAR = "LIDAR"
 
 
-def write_tree(excerpt: Excerpt, out: Path, overwrite: bool, progress: Progress | None) -> Path:
+def write_tree(excerpt: Excerpt, out: Path, overwrite: bool) -> Path:
     """See `densify.writers.TreeWriter`. The format has room for rectified cameras and for one
     scanner."""
     street = excerpt.street
@@ -48,9 +48,7 @@ def write_tree(excerpt: Excerpt, out: Path, overwrite: bool, progress: Progress 
         calibration = _calibration(excerpt)
         calibration_key = hashlib.sha1(calibration).hexdigest()
         put(folder / "calibration" / f"{calibration_key}.json", calibration)
-        for done, frame in enumerate(excerpt.frames):
-            if progress:
-                progress("simulate", done, len(excerpt.frames))
+        for done, frame in excerpt.numbered():
             returns = excerpt.returns(frame)
             fired = returns.points.astype(np.float64)
             points = path.compensated(fired, stamps_ns[done], returns.offset_ns)
@@ -71,8 +69,6 @@ def write_tree(excerpt: Excerpt, out: Path, overwrite: bool, progress: Progress 
         text = json.dumps(scene).encode()
         put(folder / f"scene_{hashlib.sha1(text).hexdigest()}.json", text)
         excerpt.write_truth(folder / "truth", stamps_ns)
-        if progress:
-            progress("simulate", len(excerpt.frames), len(excerpt.frames))
     return out / "scene_01"
 
 

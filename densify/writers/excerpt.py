@@ -21,7 +21,7 @@ from densify.readers.truth_files import write_bodies, write_depth, write_points
 from densify.street.lidar import Returns
 from densify.street.patterns import Spinning
 from densify.street.sensors import SENSORS
-from densify.types import Float, Int
+from densify.types import Float, Int, Progress
 
 _POSE_STEP_NS = 5_000_000
 _MARGIN_NS = 150_000_000  # poses reach so far beyond the first and the last sweep
@@ -29,14 +29,21 @@ _MARGIN_NS = 150_000_000  # poses reach so far beyond the first and the last swe
 
 @dataclass(frozen=True)
 class Excerpt:
-    """street: whose. frames: ascending, of the street. cameras: names."""
+    """street: whose. frames: ascending, of the street. cameras: names. progress: told of what is
+    written."""
 
     street: Street
     frames: tuple[int, ...]
     cameras: tuple[str, ...]
+    progress: Progress | None = None
 
     @staticmethod
-    def of(street: Street, frames: Sequence[int], cameras: Sequence[str] | None) -> Excerpt:
+    def of(
+        street: Street,
+        frames: Sequence[int],
+        cameras: Sequence[str] | None,
+        progress: Progress | None = None,
+    ) -> Excerpt:
         """cameras: all of the street if None. Raises InputError for what does not exist."""
         names = tuple(street.cameras if cameras is None else cameras)
         for name in names:
@@ -47,7 +54,18 @@ class Excerpt:
                 f"{street.name}: frames to write: got {unknown[:5] or 'none'}, expected some of 0 "
                 f"to {street.frames[-1]}"
             )
-        return Excerpt(street, tuple(sorted(frames)), names)
+        return Excerpt(street, tuple(sorted(frames)), names, progress)
+
+    def numbered(self) -> Iterator[tuple[int, int]]:
+        """Each sweep's number, from 0, and its frame, as it is about to be written."""
+        for number, frame in enumerate(self.frames):
+            self.tell(number)
+            yield number, frame
+
+    def tell(self, num_done: int) -> None:
+        """Tell that so many sweeps are written."""
+        if self.progress:
+            self.progress("simulate", num_done, len(self.frames))
 
     def returns(self, frame: int) -> Returns:
         """A sweep's returns as they were fired, in the scanner's frame."""

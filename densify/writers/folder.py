@@ -18,21 +18,19 @@ from typing import Any
 import numpy as np
 
 from densify.readers.folder.config import NAME
-from densify.types import Camera, Progress
+from densify.types import Camera
 from densify.writers.excerpt import Excerpt, new_folder, put, quaternion
 
 FOLDER = "street"
 COLUMNS = ("x", "y", "z", "intensity", "time", "lidar")
 
 
-def write_tree(excerpt: Excerpt, out: Path, overwrite: bool, progress: Progress | None) -> Path:
+def write_tree(excerpt: Excerpt, out: Path, overwrite: bool) -> Path:
     """See `densify.writers.TreeWriter`. The format has room for everything."""
     street = excerpt.street
     with new_folder(out / FOLDER, overwrite) as folder:
         stamps_ns = [street.stamp_ns(frame) for frame in excerpt.frames]
-        for done, frame in enumerate(excerpt.frames):
-            if progress:
-                progress("simulate", done, len(excerpt.frames))
+        for done, frame in excerpt.numbered():
             returns = excerpt.returns(frame)
             columns = [returns.intensity, returns.offset_ns * 1e-9, returns.lidar]
             if returns.radial_velocity_m_s is not None:
@@ -48,8 +46,6 @@ def write_tree(excerpt: Excerpt, out: Path, overwrite: bool, progress: Progress 
                 put(folder / "images" / name / f"{exposed_ns[number]}.png", image)
         put(folder / NAME, config_text(excerpt).encode())
         excerpt.write_truth(folder / "truth", stamps_ns)
-        if progress:
-            progress("simulate", len(excerpt.frames), len(excerpt.frames))
     return out / FOLDER
 
 

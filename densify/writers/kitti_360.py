@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from densify.geometry import poses
 from densify.street.rig import CAMERAS, T_level_lidar
-from densify.types import Float, Int, Progress
+from densify.types import Float, Int
 from densify.writers.excerpt import Excerpt, check_cameras_fit, new_folder, put
 from densify.writers.kitti_raw import (
     T_LEVEL_IMU,
@@ -33,7 +33,7 @@ CAMERA_NAMES = {"image_02": "image_00", "image_03": "image_01"}
 _DRIVE = "2026_06_12_drive_0000_sync"
 
 
-def write_tree(excerpt: Excerpt, out: Path, overwrite: bool, progress: Progress | None) -> Path:
+def write_tree(excerpt: Excerpt, out: Path, overwrite: bool) -> Path:
     """See `densify.writers.TreeWriter`. The format has room for the cameras image_02 and image_03,
     which become image_00 and image_01, and for a sensor whose points' times follow from their
     azimuth."""
@@ -44,9 +44,7 @@ def write_tree(excerpt: Excerpt, out: Path, overwrite: bool, progress: Progress 
     T_lidar_pose = poses.inverse(T_level_lidar(street.simulator.tilt_deg)) @ T_LEVEL_IMU
     with new_folder(out, overwrite) as folder:
         drive = folder / "data_3d_raw" / _DRIVE
-        for number, frame in enumerate(excerpt.frames):
-            if progress:
-                progress("simulate", number, len(excerpt.frames))
+        for number, frame in excerpt.numbered():
             returns = excerpt.returns(frame)
             data = velodyne_bytes(returns.points, returns.intensity)
             put(drive / "velodyne_points" / "data" / f"{number:010d}.bin", data)
@@ -59,8 +57,6 @@ def write_tree(excerpt: Excerpt, out: Path, overwrite: bool, progress: Progress 
         lines = [f"{number} {numbers(T[:3])}\n" for number, T in enumerate(T_world_pose)]
         put(folder / "data_poses" / _DRIVE / "poses.txt", "".join(lines).encode())
         excerpt.write_truth(drive / "truth", stamps_ns.tolist(), names=CAMERA_NAMES)
-        if progress:
-            progress("simulate", len(excerpt.frames), len(excerpt.frames))
     return out
 
 

@@ -17,7 +17,6 @@ import numpy as np
 from densify.errors import InputError
 from densify.geometry import poses
 from densify.street.rig import T_RECTIFIED_LIDAR, T_level_lidar
-from densify.types import Progress
 from densify.writers.excerpt import Excerpt, check_cameras_fit, new_folder, put
 from densify.writers.kitti_raw import numbers, projections, velodyne_bytes
 
@@ -27,7 +26,7 @@ CAMERA_NAMES = {"image_02": "image_2"}
 _SEQUENCE = "00"
 
 
-def write_tree(excerpt: Excerpt, out: Path, overwrite: bool, progress: Progress | None) -> Path:
+def write_tree(excerpt: Excerpt, out: Path, overwrite: bool) -> Path:
     """See `densify.writers.TreeWriter`. The format has room for the camera image_02 and for one
     scanner."""
     street = excerpt.street
@@ -45,9 +44,7 @@ def write_tree(excerpt: Excerpt, out: Path, overwrite: bool, progress: Progress 
     path = excerpt.poses()
     with new_folder(out, overwrite) as folder:
         sequence = folder / "sequences" / _SEQUENCE
-        for number, frame in enumerate(excerpt.frames):
-            if progress:
-                progress("simulate", number, len(excerpt.frames))
+        for number, frame in excerpt.numbered():
             returns = excerpt.returns(frame)
             fired = returns.points.astype(np.float64)
             points = path.compensated(fired, stamps_ns[number], returns.offset_ns)
@@ -63,6 +60,4 @@ def write_tree(excerpt: Excerpt, out: Path, overwrite: bool, progress: Progress 
         lines = [numbers(T[:3]) + "\n" for T in T_first_now]
         put(folder / "poses" / f"{_SEQUENCE}.txt", "".join(lines).encode())
         excerpt.write_truth(sequence / "truth", stamps_ns, names=CAMERA_NAMES)
-        if progress:
-            progress("simulate", len(excerpt.frames), len(excerpt.frames))
     return out / "sequences" / _SEQUENCE

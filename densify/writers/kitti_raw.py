@@ -30,7 +30,7 @@ from densify.readers.truth_files import write_bodies, write_depth, write_points
 from densify.street.rig import CAMERAS, T_RECTIFIED_LIDAR, USUAL, T_level_lidar
 from densify.street.sensors import SENSORS
 from densify.street.simulator import EPOCH_NS
-from densify.types import Float, Float32, Int, Progress
+from densify.types import Float, Float32, Int
 from densify.writers.excerpt import Excerpt, put
 
 _DATE = np.datetime64(EPOCH_NS, "ns").astype("datetime64[D]").astype(str).replace("-", "_")
@@ -48,7 +48,7 @@ _OXTS_FORMAT = (
 )
 
 
-def write_tree(excerpt: Excerpt, out: Path, overwrite: bool, progress: Progress | None) -> Path:
+def write_tree(excerpt: Excerpt, out: Path, overwrite: bool) -> Path:
     """See `densify.writers.TreeWriter`. The format has room for the cameras image_02 and image_03,
     and for a sensor whose points' times follow from their azimuth."""
     street = excerpt.street
@@ -65,12 +65,8 @@ def write_tree(excerpt: Excerpt, out: Path, overwrite: bool, progress: Progress 
             put(staging / name, data)
         _write_stamps(staging / DRIVE, street, names)
         write_bodies(staging / DRIVE / "truth", street.simulator.bodies)
-        for done, frame in enumerate(excerpt.frames):
-            if progress:
-                progress("simulate", done, len(excerpt.frames))
+        for _, frame in excerpt.numbered():
             _write_frame(staging / DRIVE, excerpt, frame)
-        if progress:
-            progress("simulate", len(excerpt.frames), len(excerpt.frames))
     return folder / DRIVE
 
 

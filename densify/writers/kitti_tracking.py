@@ -17,7 +17,7 @@ from densify.errors import InputError
 from densify.geometry import poses
 from densify.readers.kitti.files import NOMINAL_PERIOD_NS
 from densify.street.rig import CAMERAS, T_RECTIFIED_LIDAR, T_level_lidar
-from densify.types import Camera, Float, Progress
+from densify.types import Camera, Float
 from densify.writers.boxes import drawn_boxes
 from densify.writers.excerpt import Excerpt, check_cameras_fit, new_folder, put
 from densify.writers.kitti_raw import (
@@ -36,7 +36,7 @@ _SEQUENCE = "0000"
 _NEAREST_M = 0.5  # of corners before the camera
 
 
-def write_tree(excerpt: Excerpt, out: Path, overwrite: bool, progress: Progress | None) -> Path:
+def write_tree(excerpt: Excerpt, out: Path, overwrite: bool) -> Path:
     """See `densify.writers.TreeWriter`. The format has room for the camera image_02, for a sensor
     whose points' times follow from their azimuth, and for sweeps of 10 Hz without gaps."""
     street = excerpt.street
@@ -50,9 +50,7 @@ def write_tree(excerpt: Excerpt, out: Path, overwrite: bool, progress: Progress 
         )
     T_level = T_level_lidar(street.simulator.tilt_deg)
     with new_folder(out / "training", overwrite) as folder:
-        for number, frame in enumerate(excerpt.frames):
-            if progress:
-                progress("simulate", number, len(excerpt.frames))
+        for number, frame in excerpt.numbered():
             returns = excerpt.returns(frame)
             data = velodyne_bytes(returns.points, returns.intensity)
             put(folder / "velodyne" / _SEQUENCE / f"{number:06d}.bin", data)
@@ -71,8 +69,6 @@ def write_tree(excerpt: Excerpt, out: Path, overwrite: bool, progress: Progress 
         lines = [line for n, f in enumerate(excerpt.frames) for line in _labels(excerpt, f, n)]
         put(folder / "label_02" / f"{_SEQUENCE}.txt", "".join(lines).encode())
         excerpt.write_truth(folder / "truth", stamps_ns)
-        if progress:
-            progress("simulate", len(excerpt.frames), len(excerpt.frames))
     return out / "training"
 
 

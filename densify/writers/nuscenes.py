@@ -24,7 +24,7 @@ from densify.errors import InputError
 from densify.geometry.poses import inverse, transform
 from densify.readers.nuscenes.reader import COLUMN_NS, NUM_RINGS
 from densify.street.patterns import Spinning
-from densify.types import Float, Int, Progress
+from densify.types import Float, Int
 from densify.writers.boxes import drawn_boxes
 from densify.writers.excerpt import Excerpt, check_plain_cameras, new_folder, put, quaternion
 
@@ -38,7 +38,7 @@ _LIDAR = "LIDAR_TOP"
 _KEY_FRAME_NS = 500_000_000
 
 
-def write_tree(excerpt: Excerpt, out: Path, overwrite: bool, progress: Progress | None) -> Path:
+def write_tree(excerpt: Excerpt, out: Path, overwrite: bool) -> Path:
     """See `densify.writers.TreeWriter`. The format's point times are those of an HDL-32E; cameras
     are rectified."""
     street = excerpt.street
@@ -59,9 +59,7 @@ def write_tree(excerpt: Excerpt, out: Path, overwrite: bool, progress: Progress 
         )
     tables, row_of, stamps_ns = _Tables(excerpt), {}, []
     with new_folder(out / "street", overwrite) as root:
-        for done, frame in enumerate(excerpt.frames):
-            if progress:
-                progress("simulate", done, len(excerpt.frames))
+        for _, frame in excerpt.numbered():
             stamp_ns = last_column_ns(excerpt, frame)
             row_of[frame], data = _sweep(excerpt, frame, stamp_ns)
             put(root / tables.add(_LIDAR, stamp_ns, ".pcd.bin"), data)
@@ -76,8 +74,6 @@ def write_tree(excerpt: Excerpt, out: Path, overwrite: bool, progress: Progress 
         for name, records in tables.finished().items():
             put(root / VERSION / f"{name}.json", json.dumps(records, indent=0).encode())
         excerpt.write_truth(root / "truth", stamps_ns, T_LIDAR_POINTS, row_of)
-        if progress:
-            progress("simulate", len(excerpt.frames), len(excerpt.frames))
     return out / "street"
 
 

@@ -21,23 +21,20 @@ import numpy as np
 
 from densify.geometry.poses import inverse, transform
 from densify.readers.extras import needed
-from densify.types import Progress
 from densify.writers.excerpt import Excerpt, new_folder, put
 
 _GROUND_M = 0.25
 _REGULAR_VEHICLE = 19  # of Argoverse 2's categories, which the files use
 
 
-def write_tree(excerpt: Excerpt, out: Path, overwrite: bool, progress: Progress | None) -> Path:
+def write_tree(excerpt: Excerpt, out: Path, overwrite: bool) -> Path:
     """See `densify.writers.TreeWriter`. Cameras are left out."""
     h5py = needed("h5py", "opensceneflow", "OpenSceneFlow recordings")
     excerpt = replace(excerpt, cameras=())
     with new_folder(out / "street", overwrite) as folder:
         buffer = io.BytesIO()
         with h5py.File(buffer, "w") as file:
-            for number, frame in enumerate(excerpt.frames):
-                if progress:
-                    progress("simulate", number, len(excerpt.frames))
+            for number, frame in excerpt.numbered():
                 group = file.create_group(str(excerpt.street.stamp_ns(frame)))
                 for name, array in _sweep(excerpt, frame).items():
                     group.create_dataset(name, data=array)
@@ -46,8 +43,6 @@ def write_tree(excerpt: Excerpt, out: Path, overwrite: bool, progress: Progress 
                         group.create_dataset(name, data=array)
         put(folder / "street.h5", buffer.getvalue())
         excerpt.write_truth(folder / "truth", [excerpt.street.stamp_ns(f) for f in excerpt.frames])
-        if progress:
-            progress("simulate", len(excerpt.frames), len(excerpt.frames))
     return out / "street"
 
 

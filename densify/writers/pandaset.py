@@ -34,7 +34,7 @@ from densify.readers.pandaset.cuboids import (
 )
 from densify.readers.pandaset.reader import PANDAR_GT_M, T_POSE_LIDAR
 from densify.readers.pose_track import PoseTrack
-from densify.types import Camera, Float, Int, Progress
+from densify.types import Camera, Float, Int
 from densify.writers.boxes import drawn_boxes
 from densify.writers.excerpt import (
     Excerpt,
@@ -47,7 +47,7 @@ from densify.writers.excerpt import (
 _FLOATS = ("x", "y", "z", "i", "t")
 
 
-def write_tree(excerpt: Excerpt, out: Path, overwrite: bool, progress: Progress | None) -> Path:
+def write_tree(excerpt: Excerpt, out: Path, overwrite: bool) -> Path:
     """See `densify.writers.TreeWriter`. The format has room for two or more sweeps of a single
     scanner or of the street's pandaset, and for rectified cameras."""
     _check(excerpt)
@@ -56,9 +56,7 @@ def write_tree(excerpt: Excerpt, out: Path, overwrite: bool, progress: Progress 
     stamps_ns = np.array([street.stamp_ns(f) + half_ns for f in excerpt.frames])
     track = PoseTrack(street.name, stamps_ns, excerpt.T_world_ego(stamps_ns))
     with new_folder(out / "002", overwrite) as folder:
-        for number, frame in enumerate(excerpt.frames):
-            if progress:
-                progress("simulate", number, len(excerpt.frames))
+        for number, frame in excerpt.numbered():
             stamp_ns, returns = int(stamps_ns[number]), excerpt.returns(frame)
             fired = returns.points.astype(np.float64)
             offset_ns = returns.offset_ns - half_ns
@@ -74,8 +72,6 @@ def write_tree(excerpt: Excerpt, out: Path, overwrite: bool, progress: Progress 
         for name in excerpt.cameras:
             _write_camera(folder / "camera" / name, excerpt, street.cameras[name])
         excerpt.write_truth(folder / "truth", stamps_ns.tolist())
-        if progress:
-            progress("simulate", len(excerpt.frames), len(excerpt.frames))
     return out / "002"
 
 

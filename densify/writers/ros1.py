@@ -5,12 +5,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from densify.types import Progress
 from densify.writers.excerpt import Excerpt
 from densify.writers.ros_bag import write_bag
 
 
-def write_tree(excerpt: Excerpt, out: Path, overwrite: bool, progress: Progress | None) -> Path:
+def write_tree(excerpt: Excerpt, out: Path, overwrite: bool) -> Path:
     """See `densify.writers.TreeWriter`."""
     place = out / "street_ros1"
-    return write_bag(excerpt, place, overwrite, progress, is_ros2=False)
+    return write_bag(excerpt, place, overwrite, is_ros2=False)

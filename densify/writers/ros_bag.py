@@ -24,7 +24,7 @@ from densify.geometry.poses import inverse
 from densify.readers.extras import needed
 from densify.readers.ros.bag import message_types
 from densify.street.sensors import SENSORS
-from densify.types import Camera, Float, Progress
+from densify.types import Camera, Float
 from densify.writers.excerpt import Excerpt, new_folder, quaternion
 
 T_BASE_LIDAR = np.eye(4)
@@ -50,9 +50,7 @@ class _Message(NamedTuple):
     content: Any
 
 
-def write_bag(
-    excerpt: Excerpt, place: Path, overwrite: bool, progress: Progress | None, is_ros2: bool
-) -> Path:
+def write_bag(excerpt: Excerpt, place: Path, overwrite: bool, is_ros2: bool) -> Path:
     """See `densify.writers.TreeWriter`; the bag and its truth are in the folder ``place``. The
     format has room for a single scanner, and for cameras without rolling shutters."""
     _check(excerpt)
@@ -63,9 +61,7 @@ def write_bag(
     frames = excerpt.frames
     with new_folder(place, overwrite) as folder:
         found = [*messages.frames(), *messages.odometry()]
-        for done, frame in enumerate(frames):
-            if progress:
-                progress("simulate", done, len(frames))
+        for _, frame in excerpt.numbered():
             found.append(messages.sweep(frame, street.stamp_ns(frame) - half_ns))
         for name in excerpt.cameras:
             found += messages.images(name)
@@ -73,8 +69,6 @@ def write_bag(
         _write(folder, found, types, is_ros2)
         stamps_ns = [street.stamp_ns(frame) - half_ns for frame in frames]
         excerpt.write_truth(folder / "truth", stamps_ns)
-        if progress:
-            progress("simulate", len(frames), len(frames))
     return place
 
 

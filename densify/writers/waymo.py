@@ -36,7 +36,7 @@ from densify.readers.waymo.components import (
     UP,
 )
 from densify.street.patterns import Spinning
-from densify.types import Camera, Float, Float32, Int, Progress
+from densify.types import Camera, Float, Float32, Int
 from densify.writers.boxes import drawn_boxes
 from densify.writers.excerpt import Excerpt, new_folder, put
 
@@ -49,7 +49,7 @@ _GLOBAL_SHUTTER = 5
 _TOP = 1
 
 
-def write_tree(excerpt: Excerpt, out: Path, overwrite: bool, progress: Progress | None) -> Path:
+def write_tree(excerpt: Excerpt, out: Path, overwrite: bool) -> Path:
     """See `densify.writers.TreeWriter`. The format has times for a single spinning lidar only, and
     room for five pinholes with an image for each sweep."""
     street = excerpt.street
@@ -67,9 +67,7 @@ def write_tree(excerpt: Excerpt, out: Path, overwrite: bool, progress: Progress 
         _put(root, "lidar_calibration", [_laser(excerpt, pattern)])
         _put(root, "vehicle_pose", [_vehicle(excerpt, ns) for ns in stamps_ns])
         ranges, poses = [], []
-        for done, frame in enumerate(excerpt.frames):
-            if progress:
-                progress("simulate", done, len(excerpt.frames))
+        for _, frame in excerpt.numbered():
             image, pose = _range_image(excerpt, frame, pattern, row_of[frame])
             ranges.append(image)
             poses.append(pose)
@@ -85,8 +83,6 @@ def write_tree(excerpt: Excerpt, out: Path, overwrite: bool, progress: Progress 
         excerpt.write_truth(root / "truth", stamps_ns, inverse(T_EGO_LIDAR), row_of)
         for name, theirs in zip(excerpt.cameras, CAMERAS, strict=False):
             (root / "truth" / "depth" / name).rename(root / "truth" / "depth" / theirs)
-        if progress:
-            progress("simulate", len(excerpt.frames), len(excerpt.frames))
     return out / "street"
 
 
