@@ -228,11 +228,12 @@ def test_what_poses_mean(tmp_path):
     np.testing.assert_allclose(sequence.T_world_lidar(0), POSE @ T_cam_lidar, atol=1e-12)
 
 
-def test_units_and_axes_are_mended(tmp_path):
+@pytest.mark.parametrize("scale_m", ["0.001", "1e-3"])
+def test_units_and_axes_are_mended(tmp_path, scale_m):
     """A camera's axes in millimetres: x to the right, y down, z forward."""
     stored = scan()[:, [1, 2, 0]] * [-1000, -1000, 1000]
     bare(tmp_path, ["0.bin"], lambda i: np.column_stack([stored, np.zeros(600)]))
-    sequence = Folder(config(tmp_path, "sweeps: {axes: [z, -x, -y], scale_m: 0.001}\n"))
+    sequence = Folder(config(tmp_path, f"sweeps: {{axes: [z, -x, -y], scale_m: {scale_m}}}\n"))
     np.testing.assert_allclose(sequence[0].points, scan(), atol=1e-5)
 
 

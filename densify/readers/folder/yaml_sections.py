@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -59,6 +60,9 @@ class Section:
         value = self._take(key, None)
         if value is None:
             return default
+        if isinstance(value, str):
+            with suppress(ValueError):
+                value = float(value)  # YAML 1.1 reads 1e-3 as text
         if not _is_number(value) or not value > above:
             beyond = "" if above == -np.inf else f" above {above:g}"
             raise self.wrong(key, f"a finite number{beyond}")
