@@ -274,6 +274,12 @@ def test_as_many_workers_as_fit(border_drive: Path, tmp_path: Path, monkeypatch,
     assert 1 <= opened[0] < 4 and opened[1] == 40
 
 
+def test_a_recipe_wants_a_configuration_and_no_name_of_one() -> None:
+    for config in ("fast", {"flow": {"soft": False}}, None):
+        with pytest.raises(InputError, match=r"expected a Config; densify.config.resolve makes"):
+            Recipe(config=config)  # type: ignore[arg-type]
+
+
 def test_as_many_workers_as_cores_free_memory_and_keys_suffice_for(
     border_drive: Path, monkeypatch
 ) -> None:

@@ -101,17 +101,18 @@ def make_dataset(
     """Every key of whole recordings, as a training set in ``out``.
 
     data: recordings, as `densify.open_sequence` takes them. keys: all if None, else those of frames
-    ``start`` to ``stop`` - 1 by ``step``. num_workers: processes; 1 works in this one, None takes
-    as many as cores, free memory and keys suffice for (a script that starts several must be
-    importable: ``if __name__ == "__main__"``). scheduler: address of a Dask scheduler whose workers
-    are used instead; they need the same files at the same paths; ``tcp://`` trusts everybody on
-    that network, ``tls://`` takes certificates. shard: (i, n), the i-th of n parts of the work,
-    from 1; parts may run at the same time on machines that share ``out``. memory_bytes: of all
-    processes together; fewer are started where it does not suffice, and one of several that takes
-    more than its share is replaced. cache_bytes: bound of what is kept on disk for later runs.
-    verify: compare finished files with their recorded hashes, and make damaged ones anew. links: of
-    the tree, for loaders of others, see `densify.dataset.links`. report: called before the first
-    key and after every one.
+    ``start`` to ``stop`` - 1 by ``step``. recipe: window, method, cameras and the like, the usual
+    ones if None. num_workers: processes; 1 works in this one, None takes as many as cores, free
+    memory and keys suffice for (a script that starts several must be importable:
+    ``if __name__ == "__main__"``). scheduler: address of a Dask scheduler whose workers are used
+    instead; they need the same files at the same paths; ``tcp://`` trusts everybody on that
+    network, ``tls://`` takes certificates. shard: (i, n), the i-th of n parts of the work, from 1;
+    parts may run at the same time on machines that share ``out``. memory_bytes: of all processes
+    together; fewer are started where it does not suffice, and one of several that takes more than
+    its share is replaced. cache_bytes: bound of what is kept on disk for later runs. verify:
+    compare finished files with their recorded hashes, and make damaged ones anew. links: of the
+    tree, for loaders of others, see `densify.dataset.links`. report: called before the first key
+    and after every one.
 
     Run again, it goes on where it was stopped, however that happened: finished keys are kept, keys
     that failed are tried again. The files do not depend on the number of processes, on shards or on

@@ -51,7 +51,8 @@ class Recipe:
 
     window: sweeps on each side of a key. method: flow, icp or none. layout: ``kitti-depth``,
     KITTI's depth tree, or ``densify``, what ``densify run`` writes. cameras: names, None for all.
-    split: train or val, None for KITTI's official one. gate: what puts keys aside.
+    split: train or val, None for KITTI's official one. gate: what puts keys aside. config: such as
+    `densify.config.resolve` makes of a preset's name, a file or a mapping.
     """
 
     window: int = 5
@@ -63,6 +64,11 @@ class Recipe:
     config: Config = field(default_factory=Config)
 
     def __post_init__(self) -> None:
+        if not isinstance(self.config, Config):
+            raise InputError(
+                f"config: got {self.config!r}, expected a Config; densify.config.resolve makes one "
+                f"of a preset's name, a file or a mapping"
+            )
         check_window(self.window)
         if self.window > _LARGEST_WINDOW:
             raise InputError(f"--window {self.window}: expected 0 to {_LARGEST_WINDOW} sweeps")
