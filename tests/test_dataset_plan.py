@@ -14,6 +14,7 @@ from densify.dataset import capacity, cluster, make
 from densify.dataset.gate import Gate
 from densify.dataset.manifest import Manifest
 from densify.dataset.plan import Recipe, plan, read_plan
+from densify.errors import InputError
 from tests.command import exit_code, files_in, refused
 from tests.dataset_scenes import (
     DRIVE,
