@@ -228,6 +228,17 @@ def test_what_poses_mean(tmp_path):
     np.testing.assert_allclose(sequence.T_world_lidar(0), POSE @ T_cam_lidar, atol=1e-12)
 
 
+def test_links_to_nowhere_and_to_themselves_are_passed_over(tmp_path):
+    drive, empty = bare(tmp_path / "drive", ["0.bin", "1.bin"]), tmp_path / "empty"
+    empty.mkdir()
+    for place in (drive, empty):
+        for name, target in (("a.bin", "nowhere"), ("b.bin", "b.bin"), ("again", ".")):
+            (place / name).symlink_to(target)
+    assert list(open_sequence(drive).frames) == [0, 1]
+    with pytest.raises(InputError, match="no known recording there"):
+        open_sequence(empty)
+
+
 @pytest.mark.parametrize("scale_m", ["0.001", "1e-3"])
 def test_units_and_axes_are_mended(tmp_path, scale_m):
     """A camera's axes in millimetres: x to the right, y down, z forward."""

@@ -134,4 +134,5 @@ def _recording_in(path: Path, readers: Sequence[Reader]) -> Path | None:
 
 
 def _entries(path: Path) -> list[Path]:
-    return sorted(path.iterdir()) if path.is_dir() else []
+    """What lies in a folder, links to nowhere and to themselves left out."""
+    return sorted(p for p in path.iterdir() if p.exists()) if path.is_dir() else []

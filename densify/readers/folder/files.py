@@ -208,16 +208,23 @@ def _stamp_file(root: Path, folder: Path, name: str, shared: bool) -> Path | Non
 
 
 def _folders(root: Path) -> Iterator[Path]:
-    """The folder and those below it, by name."""
-    level = [root]
+    """The folder and those below it, by name; each once, whatever links lead to it."""
+    level, met = [root], set[Path]()
     for _ in range(_DEPTH + 1):
-        yield from level
-        level = [
-            Path(entry.path)
-            for place in level
-            for entry in sorted(_entries(place), key=lambda entry: entry.name)
-            if entry.is_dir() and not entry.name.startswith(".") and entry.name not in _NO_SWEEPS
-        ]
+        below = []
+        for place in level:
+            if place.resolve() in met:
+                continue
+            met.add(place.resolve())
+            yield place
+            below += [
+                Path(entry.path)
+                for entry in sorted(_entries(place), key=lambda entry: entry.name)
+                if entry.is_dir()
+                and not entry.name.startswith(".")
+                and entry.name not in _NO_SWEEPS
+            ]
+        level = below
 
 
 def _files(folder: Path) -> Iterator[Path]:
@@ -227,9 +234,10 @@ def _files(folder: Path) -> Iterator[Path]:
 
 
 def _entries(folder: Path) -> list[os.DirEntry[str]]:
+    """What lies in a folder, links to nowhere and to themselves left out."""
     try:
         with os.scandir(folder) as entries:
-            return list(entries)
+            return [e for e in entries if not e.is_symlink() or os.path.exists(e.path)]
     except OSError:
         return []
 
