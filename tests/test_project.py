@@ -15,6 +15,7 @@ from densify.depth.exposure import Exposure
 from densify.depth.fill import fill_between as fill_by_spacing
 from densify.depth.patches import patches
 from densify.depth.project import project
+from densify.depth.rims import decide
 from densify.geometry.poses import exp
 from densify.geometry.sensor import Sensors
 from densify.kernels import visibility as kernels
@@ -351,6 +352,24 @@ def test_depth_is_the_planes_in_the_middle_of_the_pixel():
     truth = 1 / (at_pixel(camera, column, row, 1.0) @ n)
     assert len(row) > 1500
     np.testing.assert_allclose(depth[row, column], truth, rtol=1e-5)
+
+
+def test_unsure_rims_are_in_the_filled_map_alone(monkeypatch):
+    camera = make_camera(80, 60, 100.0)
+    points, frame = wall(camera, 10.0, SWEEPS, step=3)
+    knobs = ProjectSettings(spot=0)
+    unsure = np.broadcast_to(np.arange(80) % 8 < 3, (60, 80))
+    sure = see(camera, points, frame, knobs, (3.0, 3.0))
+    monkeypatch.setattr(
+        "densify.depth.project.decide",
+        lambda layers, settings: replace(decide(layers, settings), unsure=unsure),
+    )
+    made = see(camera, points, frame, knobs, (3.0, 3.0))
+    assert (sure.depth_m[unsure] > 0).mean() > 0.2
+    np.testing.assert_array_equal(made.filled_m, sure.filled_m)
+    np.testing.assert_array_equal(made.confidence, sure.confidence)
+    np.testing.assert_array_equal(made.depth_m, np.where(unsure, 0, sure.depth_m))
+    assert (made.frame[unsure] == -1).all()
 
 
 def test_noise_is_averaged():

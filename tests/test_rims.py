@@ -77,12 +77,14 @@ def test_rims_are_kept_on_the_side_where_the_image_has_them():
     assert np.array_equal(made.filled_m, made.depth_m)
 
 
-def test_of_what_moves_fewer_votes_are_enough():
+def test_of_what_moves_fewer_votes_are_enough_but_unsure():
     layers, image, truth = scene()
     still = decided(layers, image).depth_m > 0
     panels = np.maximum(layers.depth_m, layers.rim_m) < WALL_M
-    moving = decided(replace(layers, moving=panels), image).depth_m > 0
+    made = decided(replace(layers, moving=panels), image)
+    moving = made.depth_m > 0
     more = moving & ~still
+    assert np.array_equal(made.unsure, more)
     right = np.isclose(layers.rim_m, truth)
     assert np.all(moving[still])
     rims = layers.rim_m > 0
@@ -235,9 +237,9 @@ def test_a_mirrored_scene_has_mirrored_votes():
     layers, image, _ = scene()
     flipped = Layers(
         *(
-            np.ascontiguousarray(getattr(layers, name)[:, ::-1])
-            for name in vars(layers)
-            if name not in ("lab", "warnings", "window", "glass", "alone", "moving")
+            np.ascontiguousarray(values[:, ::-1])
+            for values in vars(layers).values()
+            if isinstance(values, np.ndarray)
         )
     )
     rims, mirrored = (np.flatnonzero(part.rim_m) for part in (layers, flipped))

@@ -78,6 +78,13 @@ def test_what_is_open_or_of_another_surface_stays_so():
     np.testing.assert_array_equal(made.depth_m > 0, expected)
 
 
+def test_unsure_rims_stay_so():
+    layers, points = measured_at([[16, 12]], 6.0)
+    made = measure_spots(replace(layers, unsure=COLUMN > 16), points, SETTINGS)
+    covered = measure_spots(layers, points, SETTINGS).depth_m > 0
+    np.testing.assert_array_equal(made.depth_m > 0, covered & (COLUMN <= 16))
+
+
 def test_a_spot_within_its_pixel_covers_no_other():
     layers, points = measured_at([[16.2, 12.1], [0, 0]], 1.2)
     made = measure_spots(layers, points, SETTINGS)

@@ -28,7 +28,8 @@ class Layers:
     without one. warnings: what could not be done as asked. window: (H,W) True inside the windows of
     vehicles, and glass: where a measured pixel was taken out of one; None before they are closed.
     alone: (H,W) measured by the key sweep alone, where others should have met the surface; moving:
-    of what moves; None for nowhere.
+    of what moves; unsure: an accepted rim that the image gives too few votes to count as measured;
+    None for nowhere.
     """
 
     depth_m: Float32
@@ -46,6 +47,7 @@ class Layers:
     glass: Bool | None = None
     alone: Bool | None = None
     moving: Bool | None = None
+    unsure: Bool | None = None
 
     @property
     def gap_px(self) -> Float32:

@@ -60,8 +60,8 @@ def project(
     dropped. Planes are fitted in inverse depth, or inverse range where depth is the range: linear
     over the image of a pinhole in the first case, nearly so over a surface's few pixels otherwise.
     ``filled_m`` adds pixels interpolated between measured ones (`densify.depth.fill`), less what
-    most around contradict (`densify.depth.agreement`); those that the spot of a measured return
-    covers count as measured too (`densify.depth.spot`).
+    most around contradict (`densify.depth.agreement`), and rims that are unsure; what the spot of a
+    measured return covers counts as measured too (`densify.depth.spot`).
     ``confidence`` starts from the point's own, less where few sweeps or points agree, a depth edge
     is close, the surface rough, or the point nearly hidden; that rank is turned into a probability
     (`densify.depth.confidence`), but with ``visibility`` off. ``reason`` says of every point why it
@@ -88,9 +88,11 @@ def project(
     off = contradicted(layers, camera.focal_px)
     if filled:
         layers = without_contradicted(layers, off)
-    _tell(layers, reason)
     rank = ranked(layers, _far(layers, cloud), off)
     layers = replace(layers, confidence=calibrated(rank, layers.filled_m > 0))
+    if layers.unsure is not None:
+        layers = replace(layers, depth_m=np.where(layers.unsure, np.float32(0), layers.depth_m))
+    _tell(layers, reason)
     if filled and settings.spot > 0:
         layers = measure_spots(layers, points, settings)
     return _finished(layers, cloud, view.exposure, reason, rank)

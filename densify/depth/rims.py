@@ -19,7 +19,8 @@ MOST_CONFIDENCE = 0.2
 _NUM_ROUNDS = 2
 _RIM_WEIGHT = 0.5  # of a rim's own vote, at most
 _LEAST_SHARE = 0.97  # of the votes for a pixel that is kept
-# Of what moves rims of fewer votes are right too: what the key sweep saw past is refused anyway.
+# Of what moves most rims of fewer votes are right too, since what the key sweep saw past is refused
+# anyway; not as many as of what is measured elsewhere.
 _LEAST_OF_MOVERS = 0.7
 _FEW = 100  # rims, of which nothing can be told
 _SUREST = 2.5  # -log10 of the share against
@@ -40,7 +41,7 @@ def decide(layers: Layers, settings: ProjectSettings) -> Layers:
 
     Known pixels vote for or against them (`densify.depth.votes`); rims vote too, by half, in a
     second round less the less they are believed. Kept is what has 97 % of the votes, of
-    what moves 70 %, but nothing that is ``refused``.
+    what moves 70 %, but nothing that is ``refused``. What has less than 97 % is ``unsure``.
 
     An image that lies up to 3 steps aside is moved, with a warning that says how far. To one that
     does not belong to the depth or is blurred (`densify.depth.picture.laid_over`) nobody listens:
@@ -69,6 +70,9 @@ def decide(layers: Layers, settings: ProjectSettings) -> Layers:
         believed |= ~layers.veiled.flat[rims]
     believed &= ~layers.refused.flat[rims]
     kept = rims[believed]
+    unsure = np.zeros(layers.rim_m.shape, bool)
+    if settings.rims == "image":
+        unsure.flat[kept] = share[believed] < _LEAST_SHARE
     depth_m = layers.depth_m.copy()
     depth_m.flat[kept] = layers.rim_m.flat[kept]
     confidence = layers.confidence.copy()
@@ -82,6 +86,7 @@ def decide(layers: Layers, settings: ProjectSettings) -> Layers:
         confidence=confidence,
         lab=lab,
         warnings=warnings,
+        unsure=unsure,
     )
 
 

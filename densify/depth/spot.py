@@ -23,7 +23,8 @@ def measure_spots(layers: Layers, points: PointsInImage, settings: ProjectSettin
 
     Of several returns the nearest one's ``point`` is taken. The fill there must agree with the
     return's surface (``project.agree_m``, ``agree_fraction``): what the fill left open, because an
-    edge is near or the image says otherwise, stays open. Depth and confidence remain the fill's.
+    edge is near or the image says otherwise, stays open, and so do unsure rims. Depth and
+    confidence remain the fill's.
     """
     shape = layers.depth_m.shape
     measured = np.flatnonzero(layers.depth_m > 0)
@@ -40,7 +41,10 @@ def measure_spots(layers: Layers, points: PointsInImage, settings: ProjectSettin
     middle = np.stack(np.divmod(measured, shape[1])[::-1], axis=1)
     known.middle_px.reshape(-1, 2)[measured] = points.uv[point] - middle
     known.radius_px.flat[measured] = radius_px
-    open_m = np.where(layers.depth_m == 0, layers.filled_m, np.float32(0))
+    fills = layers.depth_m == 0
+    if layers.unsure is not None:
+        fills &= ~layers.unsure
+    open_m = np.where(fills, layers.filled_m, np.float32(0))
     found, agree = np.full(shape, -1), np.array([settings.agree_m, settings.agree_fraction])
     nearest = np.full(shape, np.inf)
     spots.cover(measured, open_m, known, agree, found, nearest)
