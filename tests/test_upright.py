@@ -13,7 +13,7 @@ from densify.config import GroundSettings
 from densify.geometry import poses
 from densify.geometry.ground import ground
 from densify.registration.deskew import deskew
-from densify.registration.upright import upright
+from densify.registration.upright import ground_aside, upright
 from densify.types import Sweep
 from tests.scenes import ROOM, Arc, Scanner, Scene, World, on_sphere, street
 
@@ -48,6 +48,21 @@ def test_what_leans_little_is_left_alone(rotvec_deg):
     assert np.array_equal(upright(sweeps), np.eye(3))
 
 
+@pytest.mark.parametrize(
+    ("R", "name"),
+    [
+        (np.array([[0, -1, 0], [0, 0, -1], [1, 0, 0]]), "-y"),  # a camera's axes
+        (np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]]), "y"),
+        (np.diag([1, -1, -1]), ""),  # upside down, which is turned
+        (np.eye(3), ""),
+    ],
+    ids=["camera", "y up", "hung", "upright"],
+)
+def test_axes_that_do_not_stand_on_the_ground_are_named(R, name):
+    (sweep,), _ = leaning(STREET, (0, 0, 0), 1)
+    assert ground_aside(replace(sweep, points=sweep.points @ R.T)) == name
+
+
 def test_where_no_ground_is_seen_nothing_is_turned():
     one = leaning(STREET, (0, 0, 0), 1)[0][0]
     rng = np.random.default_rng(0)
@@ -59,6 +74,7 @@ def test_where_no_ground_is_seen_nothing_is_turned():
     nothing = one.select(np.zeros(len(one), bool))
     for sweeps in ([strewn], [nothing], []):
         assert np.array_equal(upright(sweeps), np.eye(3))
+    assert ground_aside(strewn) == ground_aside(nothing) == ""
 
 
 def test_walls_and_roofs_are_no_ground():

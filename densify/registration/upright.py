@@ -18,6 +18,7 @@ _CLOSE_M, _BELOW_M = 0.1, 0.3
 _MAX_SHARE_BELOW = 0.03  # of the points; more lie below a wall's or a roof's plane
 _LEAST_SHARE = 0.1
 _UPSIDE_DOWN = np.diag([1.0, -1.0, -1.0])
+_ASIDE = {s + a: (-1.0 if s else 1.0) * np.eye(3)["xyz".index(a)] for a in "yx" for s in ("-", "")}
 _MAX_RAD, _LEAST_RAD = np.deg2rad([50.0, 6.0])  # less is the road's slope, or load
 
 
@@ -49,6 +50,19 @@ def _level(up: Float) -> Float:
         return np.eye(3)
     R: Float = Rotation.from_rotvec(turn / np.linalg.norm(turn) * lean_rad).as_matrix()
     return R
+
+
+def ground_aside(sweep: Sweep) -> str:
+    """Which axis points up, such as ``-y`` of a camera's, where a ground is seen from it and none
+    from z or -z; "" otherwise."""
+    if any(_ground_normal(sweep.points @ R.T) is not None for R in (np.eye(3), _UPSIDE_DOWN)):
+        return ""
+    for name, up in _ASIDE.items():
+        forward = np.roll(up, 1)
+        R_hung_lidar = np.stack([forward, np.cross(up, forward), up])
+        if _ground_normal(sweep.points @ R_hung_lidar.T) is not None:
+            return name
+    return ""
 
 
 def _ground_normal(points: Float) -> Float | None:

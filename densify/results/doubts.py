@@ -12,6 +12,7 @@ import numpy as np
 from densify.config import Config
 from densify.depth.exposure import Shot
 from densify.readers.files import format_frames
+from densify.registration.upright import ground_aside
 from densify.scores.depth_metrics import image_density
 from densify.types import Camera, KnowsItsGaps, LidarSequence, Result, Stretch
 
@@ -33,9 +34,10 @@ def with_doubts(
     """The results of a key's methods with `Result.warnings`, each a sentence.
 
     shots: what the maps show. cuts: of the window, sentences that come first. Checked: what the
-    reader had to assume, cameras left out for want of images, where cameras stand and look, point
-    times that are absent or longer than a sweep, images too far in time, sweeps left out of the
-    far range, what maps could not be made as asked, maps with next to nothing in them.
+    reader had to assume, cameras left out for want of images, where cameras stand and look, axes
+    that do not stand on the ground, point times that are absent or longer than a sweep, images too
+    far in time, sweeps left out of the far range, what maps could not be made as asked, maps with
+    next to nothing in them.
     """
     chosen = {shot.camera.name: shot.camera for shot in shots.values()}
     shared = [
@@ -43,6 +45,7 @@ def with_doubts(
         *(sequence.gaps() if isinstance(sequence, KnowsItsGaps) else ()),
         *_left_out(sequence, chosen),
         *(doubt for camera in chosen.values() for doubt in _of_camera(camera)),
+        *_of_axes(stretch),
         *_of_times(stretch, settings),
         *_of_shots(sequence, shots),
     ]
@@ -73,6 +76,15 @@ def _of_camera(camera: Camera) -> Iterator[str]:
             f"{camera.name} looks {'up' if steepness_deg > 0 else 'down'} by "
             f"{abs(steepness_deg):.0f} deg by its calibration; is the rotation from the scanner's "
             f"axes (x forward, z up) to the camera's (z forward, y down)?"
+        )
+
+
+def _of_axes(stretch: Stretch) -> Iterator[str]:
+    up = ground_aside(stretch.sweeps[len(stretch.sweeps) // 2].sweep)
+    if up:
+        yield (
+            f"the ground lies as if {up} pointed up, not z: what moves is hardly found so; densify "
+            f"doctor says which axes the points have"
         )
 
 
