@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial import cKDTree
 
 from densify.flow.surface_matching import GATES_M, apply, undo
-from densify.flow.tracking.align import MIN_FIT, Model, align
+from densify.flow.tracking.align import MIN_FIT, Model
 from densify.kernels.clouds import Strips, surface_information
 
 CENTRE = np.array([12.0, -3.0, 0.8])
@@ -68,7 +68,7 @@ def test_the_compiled_loop_is_its_slow_twin(num_points: int, seed: int) -> None:
     points = apply(true, corner(num_points, seed + 50), CENTRE)
     predicted = true + [*rng.normal(0, 0.2, 2), 0.0, rng.normal(0, 0.04)]
     found, expected = (
-        align(model, points, CENTRE, predicted, STD),
+        model.align(points, CENTRE, predicted, STD),
         slow_align(model, points, predicted),
     )
     assert (found is None) == (expected is None)
@@ -80,7 +80,7 @@ def test_a_known_motion_is_found_and_the_height_is_kept() -> None:
     true = np.array([1.4, -0.6, 0.25, 0.3])
     predicted = true + [0.15, -0.1, 0.0, 0.03]
     points = apply(true, corner(500, 1), CENTRE)
-    found = align(Model(corner(900, 2)), points, CENTRE, predicted, STD)
+    found = Model(corner(900, 2)).align(points, CENTRE, predicted, STD)
     np.testing.assert_allclose(found, true, atol=0.02)
     assert found[2] == predicted[2]
     np.testing.assert_array_equal(predicted, true + [0.15, -0.1, 0.0, 0.03])  # not changed
@@ -92,15 +92,29 @@ def test_the_prediction_holds_what_the_points_leave_open() -> None:
     wall = CENTRE + np.column_stack([rng.uniform(-9, 9, 800), np.zeros(800), np.zeros(800)])
     seen = CENTRE + np.column_stack([rng.uniform(-1, 1, 80), np.zeros(80), np.zeros(80)])
     predicted = np.array([0.3, 0.2, 0.0, 0.0])
-    found = align(Model(wall), seen, CENTRE, predicted, np.array([0.01, 0.3, 0.06]))
+    found = Model(wall).align(seen, CENTRE, predicted, np.array([0.01, 0.3, 0.06]))
     assert abs(found[0] - 0.3) < 0.02 and abs(found[1]) < 0.02
+
+
+def test_rings_at_other_heights_fit_where_heights_count_less() -> None:
+    """One ring half a metre above the next, each on both sides of the car."""
+    true = np.array([1.4, -0.6, 0.25, 0.1])
+    ring, other = (corner(60, seed) for seed in (1, 2))
+    ring[:, 2], other[:, 2] = CENTRE[2] + 0.3, CENTRE[2] + 0.8
+    points, predicted = apply(true, other, CENTRE), true + [0.15, -0.1, 0.0, 0.03]
+    assert Model(ring).align(points, CENTRE, predicted, STD) is None
+    model = Model(ring, height_weight=0.25)
+    found = model.align(points, CENTRE, predicted, STD)
+    assert found is not None
+    np.testing.assert_allclose(found, true, atol=0.05)
+    assert model.covers(undo(found, points, CENTRE), 0.3).mean() > 0.9
 
 
 def test_too_few_partners_are_none() -> None:
     model, still = Model(corner(300, 0)), np.zeros(4)
-    assert align(model, corner(300, 1) + [50.0, 0, 0], CENTRE, still, STD) is None
-    assert align(model, corner(MIN_FIT - 1, 1), CENTRE, still, STD) is None
-    assert align(model, corner(MIN_FIT, 1), CENTRE, still, STD) is not None
+    assert model.align(corner(300, 1) + [50.0, 0, 0], CENTRE, still, STD) is None
+    assert model.align(corner(MIN_FIT - 1, 1), CENTRE, still, STD) is None
+    assert model.align(corner(MIN_FIT, 1), CENTRE, still, STD) is not None
 
 
 def test_a_model_of_few_and_of_many_points() -> None:

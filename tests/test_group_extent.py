@@ -100,6 +100,15 @@ def test_a_bush_that_is_seen_through_beside_who_walks_is_no_part_of_his_shape(st
     assert num_in_shape(claimed, [np.ones(64, bool)] * 11, 1.4) == num_kept
 
 
+def test_a_bush_that_every_sweep_sees_at_other_places_is_no_part_of_who_walks_by():
+    """Some of its points are seen where they would have moved to, but not most around them."""
+    rng = np.random.default_rng(0)
+    body = rng.uniform(-0.5, 0.5, (40, 3)) * [0.5, 0.5, 1.8]
+    bushes = rng.uniform(-0.5, 0.5, (11, 12, 3)) * [1.2, 0.6, 1.0] + [0.0, 0.9, 0.0]
+    claimed = [np.concatenate([body, b - [0.14 * n, 0, 0]]) for n, b in enumerate(bushes)]
+    assert num_in_shape(claimed, [np.ones(52, bool)] * 11, 1.4) == 440
+
+
 def num_in_shape(claimed, seeds, speed_m_s) -> int:
     """Points of the shape of a track that claims these points in the object's frame, (N,3) a sweep,
     of which some are seeds, (N,)."""

@@ -15,7 +15,7 @@ from densify.flow.tracking import proof, tracks
 from densify.flow.tracking.evidence import FreeSpace, Standing, find_candidates
 from densify.flow.tracking.shapes import Body, Shape
 from densify.flow.tracking.sightings import Sighting, Track
-from densify.flow.tracking.starts import groups_to_start, velocities_of_traffic
+from densify.flow.tracking.starts import groups_to_start, is_part, velocities_of_traffic
 from densify.geometry.ground import ground
 from densify.geometry.height_map import HeightMap
 from tests.scenes import SWEEP_S, Arc, Box, Scanner, Scene, World, car, street
@@ -126,14 +126,68 @@ def test_a_front_that_slides_is_followed_from_where_its_side_shows(left, tried, 
     ]
     asked = []
 
-    def follow(rows, n, velocity):
+    def follow(rows, n, velocity, weight):
         asked.append(n)
         return Track(np.zeros(3), sighted, claimed), 0.01 if n == 4 else None
 
     search = SimpleNamespace(looks=looks, _follow=follow, _velocity_of=lambda *_: np.zeros(3))
     track = Track(np.zeros(3), sighted, claimed)
-    _, contradicted = tracks._Search._again_from_its_ends(search, track, left)
+    _, contradicted = tracks._Search._again_from_its_ends(search, track, left, 1.0)
     assert asked == tried and contradicted == found
+
+
+@pytest.mark.parametrize(
+    ("gap_m", "scattered", "weights"),
+    [(0.2, False, [1.0]), (0.7, False, [1.0, 0.5]), (0.7, True, [1.0])],
+)
+def test_heights_count_less_where_rings_lie_far_apart(gap_m, scattered, weights):
+    sensors = SimpleNamespace(scattered=scattered)
+    search = SimpleNamespace(_space=SimpleNamespace(sensors=sensors))
+    np.testing.assert_allclose(tracks._Search._height_weights(search, gap_m), weights)
+
+
+@pytest.mark.parametrize(("aside_m", "part"), [(0.0, True), (0.6, True), (1.4, False)])
+def test_what_lies_close_to_a_proven_track_is_a_part_of_it(aside_m, part):
+    """In half a second the body has gone 5 m; its points 0.5 m apart, what is close 0.7 m away."""
+    body = np.stack([0.5 * np.arange(6), np.zeros(6), np.zeros(6)], 1)
+    track = followed(lambda n: [1.0 * n, 0, 0, 0], 8, [0.0, 0, 0], 6)
+    track.smooth()
+    seen = SimpleNamespace(points=body + [5.0, aside_m, 0.0], time_s=np.full(6, 0.5))
+    bodies = [Body(track, Shape.of(body))]
+    assert is_part(bodies, SimpleNamespace(seen=seen), np.arange(6), 0.7) == part
+
+
+@pytest.mark.parametrize(
+    ("left", "bare", "asked", "proven"),
+    [
+        ({1.0: 0.001, 0.5: 0.0}, True, [1.0], 1.0),  # hardly contradicted
+        ({1.0: 0.1, 0.5: 0.01}, True, [1.0, 0.5], 0.5),
+        ({1.0: 0.1, 0.5: 0.09}, True, [1.0, 0.5], 1.0),  # about as well as before
+        ({1.0: np.inf, 0.5: 0.0}, True, [1.0], None),  # left over for later
+        ({0.5: 0.1}, True, [0.5], 0.5),
+        ({0.5: 0.0}, False, [0.5], None),  # rings that glide over something parked
+    ],
+)
+def test_doubtful_tracks_are_followed_again_with_heights_that_count_less(
+    left, bare, asked, proven, monkeypatch
+):
+    tried, which = [], {}
+
+    def follow(members, n, weight):
+        tried.append(weight)
+        track = Track(np.zeros(3), {}, {0: np.arange(20)})
+        which[id(track)] = weight, track
+        return track, left[weight]
+
+    for name in ("_gather", "_refine", "take_back_slides", "go_with_the_rest", "_claim_rays"):
+        monkeypatch.setattr(tracks, name, lambda *_: None)
+    monkeypatch.setattr(tracks, "may_be_a_rail", lambda *_: False)
+    monkeypatch.setattr(tracks, "leaves_bare", lambda *_: bare)
+    parts = dict.fromkeys(("_standing", "_space", "_ground", "free", "bodies"))
+    search = SimpleNamespace(_followed=follow, **parts)
+    track, found = tracks._Search._track_of(search, np.arange(8), 0, list(left))
+    assert tried == asked and found == (proven is not None)
+    assert not found or which[id(track)][0] == proven
 
 
 def test_the_ground_rises_under_a_track():
@@ -238,6 +292,22 @@ def test_what_leaves_its_places_bare_may_swing_or_look_like_a_rail(
         patch.setattr(proof, "contradictions", lambda *_: (200, moved, 700))
         patch.setattr(proof, "_left_places", lambda *_: told)
         assert proof.may_be_a_rail(track, [], space, []) == (like_a_rail and not proven)
+
+
+@pytest.mark.parametrize(
+    ("speed_m_s", "told", "proven"),
+    [
+        (12.0, ((0, 1639), (2, 11)), True),  # a long car beside the scanner, which turns
+        (12.0, ((0, 80), (2, 11)), False),
+        (12.0, ((0, 120), (9, 11)), False),
+        (0.6, ((4, 0), (0, 276)), False),  # a bush
+    ],
+)
+def test_bare_places_on_one_side_tell_of_what_goes_far(speed_m_s, told, proven):
+    """A third of the looks that contradict standing still contradict its motion, too."""
+    track = followed(lambda n: [0.1 * speed_m_s * n, 0, 0, 0], 8, [8.0, 0, 0], 8)
+    space = SimpleNamespace(gap_m=lambda *_: 0.1, clock=SimpleNamespace(time_s=np.arange(8) / 10))
+    assert is_proven(track, space, (280, 98, 700), told) == proven
 
 
 @pytest.mark.parametrize(

@@ -217,8 +217,13 @@ def closer_rings(points: Float, gap_m: Float) -> Float:
     not stay one, for the compression grows with the range.
     """
     squeezed = points.copy()
-    squeezed[:, 2] *= np.minimum(1.0, _RING_GAP_M / np.maximum(gap_m, 1e-6))
+    squeezed[:, 2] *= height_weight(gap_m)
     return squeezed
+
+
+def height_weight(gap_m: float | Float) -> Float:
+    """How much heights count where rings lie so far apart, 1 at most."""
+    return np.minimum(1.0, _RING_GAP_M / np.maximum(gap_m, 1e-6))
 
 
 def firing_times_s(stretch: Stretch, i: int, rows: Int) -> Float:

@@ -34,6 +34,7 @@ _MAX_CONTRADICTED = 0.05
 _WALKS_M_S, _FAST_M_S = 2.0, 8.0
 # Of what all sweeps saw so close so many must be seeds; who walks is smaller.
 _AROUND_M, _LEAST_SEEDS, _WALKER_M = 0.3, 0.1, 1.5
+_WIDER_M, _MOSTLY = 0.5, 0.5  # of what is so close so much goes along
 _ALONE_GAPS, _NUM_BESIDE = 2.0, 2  # of an object's points so many lie so close in the same sweep
 _LEFT_M = 0.6  # from all of the object
 _THERE_M = 0.2
@@ -101,9 +102,9 @@ class Seen:
 def shape_of(track: Track, standing: Sequence[Standing], space: FreeSpace) -> Shape:
     """All that the sweeps saw of an object; of those who walk, what is small and comes into view at
     once, without what only even or only odd ones saw: echoes that melted with those of a wall
-    behind them, which would make parts of the wall theirs; without what stays where it is; and
-    without what hardly any sweep saw through, if they are small then: the wall itself. (A slow car
-    has sides that are not seen through either.)"""
+    behind them, which would make parts of the wall theirs; without what stays where it is, or lies
+    mostly among such; and without what hardly any sweep saw through, if they are small then: the
+    wall itself. (A slow car has sides that are not seen through either.)"""
     sweeps = sorted(track.claimed)
     evenly = sweeps[::2], sweeps[1::2]
     halves = [track.seen_in(standing, some) for some in evenly]
@@ -118,7 +119,8 @@ def shape_of(track: Track, standing: Sequence[Standing], space: FreeSpace) -> Sh
         ]
     )
     seed = np.concatenate([standing[j].seed[track.claimed[j]] for some in evenly for j in some])
-    again &= ~_staying(track, standing, [j for some in evenly for j in some], space)
+    moves = ~_staying(track, standing, [j for some in evenly for j in some], space)
+    again &= moves & close_to_seeds(points, moves, _WIDER_M, _MOSTLY)
     theirs = again & close_to_seeds(points, seed, _AROUND_M, _LEAST_SEEDS)
     if theirs.any() and np.linalg.norm(np.ptp(points[theirs, :2], axis=0)) < _WALKER_M:
         return Shape.of(points[theirs])

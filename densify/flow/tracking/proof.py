@@ -29,7 +29,7 @@ _MAX_OF_FEW = 0.1  # of which its motion may leave so many, unless it left its p
 _MAX_OF_SHORT_BARE, _MAX_OF_SHORT_MANY_BARE, _MANY = 0.06, 0.12, 100
 _STRAY = 0.005  # so few of all looks are echoes at an object's rim
 # Of those that standing still leaves; of what leaves all its places bare more: limbs swing.
-_MAX_CONTRADICTIONS, _MAX_OF_LIMBS = 0.3, 0.5
+_MAX_CONTRADICTIONS, _MAX_OF_LIMBS, _FAR_M = 0.3, 0.5, 3.0
 # They are so many, or of few looks this share, and of many at least that one.
 _LEAST_CONTRADICTIONS, _SHARE_OF_FEW, _LEAST_SHARE = 20, 0.08, 0.01
 _ALONG = np.cos(np.deg2rad(45))
@@ -75,7 +75,7 @@ def left_contradicted(
     # What never left its place may be a ring that glides over a bonnet: only contradictions tell.
     if still < _SHARE_OF_FEW * num_asked and not np.any(told):
         return None
-    bare = _bare(told)
+    bare = _bare(told, far=_travelled_m(track) >= _FAR_M)
     if moved > (_MAX_OF_LIMBS if bare else _MAX_CONTRADICTIONS) * still:
         return None
     few, left_bare = still < _FEW * num_asked, _mostly_bare(told)
@@ -98,8 +98,7 @@ def _over_noise_m(track: Track, space: FreeSpace, seen_s: float) -> float | None
     """How much farther off the smooth motion its places lie than noise makes them; None where they
     lie too far off, or the way is too short, to tell of any motion. seen_s: how long it is."""
     residual_m = track.path.residual_m
-    begin, end = track.path(track.path.begin_s), track.path(track.path.end_s)
-    travelled = float(np.linalg.norm((end - begin)[:2]))
+    travelled = _travelled_m(track)
     gap_m = space.gap_m(track.centre, next(iter(track.claimed)))
     by_gap_m = _ROUGH_M + _ROUGH_PER_GAP * gap_m
     rough_m = by_gap_m + _ROUGH_S * travelled / seen_s
@@ -110,6 +109,11 @@ def _over_noise_m(track: Track, space: FreeSpace, seen_s: float) -> float | None
     return max(0.0, residual_m - rough_m)
 
 
+def _travelled_m(track: Track) -> float:
+    begin, end = track.path(track.path.begin_s), track.path(track.path.end_s)
+    return float(np.linalg.norm((end - begin)[:2]))
+
+
 def may_be_a_rail(
     track: Track, standing: Sequence[Standing], space: FreeSpace, proven: Sequence[Body]
 ) -> bool:
@@ -118,13 +122,24 @@ def may_be_a_rail(
     still, _, num_asked = contradictions(track, standing, space)
     if still >= _SHARE_OF_RAIL * num_asked or not _like_a_rail(track, standing, space):
         return False
-    return not _mostly_bare(_left_places(track, standing, space, proven))
+    return not leaves_bare(track, standing, space, proven)
 
 
-def _bare(told: tuple[tuple[int, int], tuple[int, int]]) -> bool:
+def leaves_bare(
+    track: Track, standing: Sequence[Standing], space: FreeSpace, proven: Sequence[Body]
+) -> bool:
+    """Whether hardly anything else was seen where the track has just been or is coming to."""
+    return _mostly_bare(_left_places(track, standing, space, proven))
+
+
+def _bare(told: tuple[tuple[int, int], tuple[int, int]], far: bool) -> bool:
     """Whether nothing was seen where an object had not come to yet, nor where it had been, see
-    `_left_places`: so it is of nothing that stands."""
-    return all(t <= _SELDOM * empty and empty >= _LEAST_CONTRADICTIONS for t, empty in told)
+    `_left_places`: so it is of nothing that stands. far: it goes so far that many places on one
+    side tell enough."""
+    taken, empty = np.sum(told, axis=0)
+    if far and empty >= _MANY and taken <= _SELDOM * empty:
+        return True
+    return all(t <= _SELDOM * e and e >= _LEAST_CONTRADICTIONS for t, e in told)
 
 
 def _mostly_bare(told: tuple[tuple[int, int], tuple[int, int]]) -> bool:

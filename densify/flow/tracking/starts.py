@@ -24,6 +24,7 @@ _SLIDES_M = 1.5  # what is seen to be so long may slide along itself
 _HOLE_S = 0.25  # over longer ones, what starts at one end may miss the other
 _DRIVES_M_S, _APART_M_S = 8.0, 1.5
 _BESIDE_M = 1.0  # as far as what is towed is from what tows it
+_MOSTLY = 0.5
 
 
 def groups_to_start(standing: Sequence[Standing], clock: Clock) -> list[tuple[int, np.ndarray]]:
@@ -53,6 +54,17 @@ def is_line_on(bodies: Sequence[Body], look: Look, members: np.ndarray) -> bool:
     tree = BoxTree(line)
     there = (track.place(shape.points, track.seen_at(look.time_ns)) for track, shape in bodies)
     return any(np.isfinite(tree.nearest(points, _BESIDE_M)[0]).any() for points in there)
+
+
+def is_part(bodies: Sequence[Body], look: Look, members: np.ndarray, reach_m: float) -> bool:
+    """Whether most of a group lies within a proven track, or so close to it: it goes with that."""
+    points, time_s = look.seen.points[members], look.seen.time_s[members]
+    for track, shape in bodies:
+        body = track.undo(points, time_s)
+        near = np.isfinite(shape.tree.nearest(body, reach_m)[0]) | shape.within_outline(body)
+        if near.mean() > _MOSTLY:
+            return True
+    return False
 
 
 def velocities_beside(look: Look, members: np.ndarray, bodies: Sequence[Body]) -> Iterator[Float]:

@@ -16,11 +16,11 @@ import numpy as np
 
 from densify.clock import Clock
 from densify.flow.surface_matching import GATES_M, apply, undo
-from densify.flow.tracking.align import MIN_FIT, Model, align
-from densify.flow.tracking.evidence import FreeSpace, Standing
+from densify.flow.tracking.align import MIN_FIT, Model
+from densify.flow.tracking.evidence import FreeSpace, Standing, height_weight
 from densify.flow.tracking.lone_rays import few_rays, gap_in_line_m, in_line, linked_in_line
 from densify.flow.tracking.looks import Look, looks_of
-from densify.flow.tracking.proof import left_contradicted, may_be_a_rail
+from densify.flow.tracking.proof import leaves_bare, left_contradicted, may_be_a_rail
 from densify.flow.tracking.shapes import Body, Shape
 from densify.flow.tracking.sightings import Track
 from densify.flow.tracking.slides import go_with_the_rest, take_back_slides
@@ -29,6 +29,7 @@ from densify.flow.tracking.starts import (
     ends,
     groups_to_start,
     is_line_on,
+    is_part,
     velocities_beside,
     velocities_of_traffic,
 )
@@ -63,20 +64,8 @@ def follow_groups(
     """All proven moving objects of the stretch. velocities_m_s: (C,3) of each sweep's points, with
     which groups of them start; None has the sweeps around vote."""
     search = _Search(standing, space, ground, velocities_m_s)
-    looks, untried = search.looks, search.all_points()
-    tracks: list[Track] = []
-    for n, group in groups_to_start([look.seen for look in looks], search.clock):
-        untaken = looks[n].gather(search.free)[group] & looks[n].gather(untried)[group]
-        members = group[untaken]
-        if len(members) < MIN_POINTS or is_line_on(search.bodies, looks[n], members):
-            continue
-        track, proven = search.track_of(members, n)
-        for j, rows in track.claimed.items():
-            untried[j][rows] = False
-        if proven:
-            search.take(track)
-            tracks.append(track)
-    return tracks
+    groups = groups_to_start([look.seen for look in search.looks], search.clock)
+    return search.tracks_of(groups) + search.tracks_of(groups, left_over=True)
 
 
 class _Search:
@@ -109,15 +98,59 @@ class _Search:
         """(C,) of each sweep's points, all True."""
         return [np.ones(len(c.points), bool) for c in self._standing]
 
-    def track_of(self, members: np.ndarray, n: int) -> tuple[Track, bool]:
-        """The track of a group of look n, whole if it is proven, and whether it is."""
-        track, left = self._started(members, n)
-        track, left = self._again_from_its_ends(track, left)
+    def tracks_of(
+        self, groups: Sequence[tuple[int, np.ndarray]], left_over: bool = False
+    ) -> list[Track]:
+        """Those of groups, each a look and its members, that are proven to move. left_over: what no
+        track was found of where rings lie far apart is followed with heights that count less,
+        unless it may be a part of what is found."""
+        looks, untried = self.looks, self.all_points()
+        tracks: list[Track] = []
+        for n, group in groups:
+            untaken = looks[n].gather(self.free)[group] & looks[n].gather(untried)[group]
+            members = group[untaken]
+            if len(members) < MIN_POINTS or is_line_on(self.bodies, looks[n], members):
+                continue
+            gap_m = self._gap_m(members, n)
+            weights = self._height_weights(gap_m)[left_over:]
+            if not weights or (left_over and is_part(self.bodies, looks[n], members, gap_m)):
+                continue
+            track, proven = self._track_of(members, n, weights)
+            for j, rows in track.claimed.items():
+                untried[j][rows] = False
+            if proven:
+                self._take(track)
+                tracks.append(track)
+        return tracks
+
+    def _gap_m(self, members: np.ndarray, n: int) -> float:
+        """Between neighbouring rings at a group of look n."""
+        look = self.looks[n]
+        return self._space.gap_m(look.seen.points[members].mean(axis=0), look.sweeps[0])
+
+    def _height_weights(self, gap_m: float) -> list[float]:
+        """How much heights count while a group is followed, all at first. Where rings lie far apart
+        each meets what comes nearer at another height than the sweep before."""
+        less = float(height_weight(gap_m))
+        return [1.0, less] if less < 1.0 and not self._space.sensors.scattered else [1.0]
+
+    def _track_of(
+        self, members: np.ndarray, n: int, weights: Sequence[float]
+    ) -> tuple[Track, bool]:
+        """The track of a group of look n, whole if it is proven, and whether it is. weights: of
+        heights, see `_height_weights`; others than the first where the track is doubtful."""
+        track, left = self._followed(members, n, weights[0])
+        for weight in weights[1:] if _DOUBTFUL < left < np.inf else ():
+            tried, contradicted = self._followed(members, n, weight)
+            if contradicted < _CLEARLY * left and _as_whole(tried, track):
+                track, left = tried, contradicted
         proven = bool(np.isfinite(left))
         if proven:
             _gather(track, self._standing, self.free, self._space)
             # A piece of a guard rail shows with the rest what it is of.
             proven = not may_be_a_rail(track, self._standing, self._space, self.bodies)
+        if proven and weights[0] < 1.0:  # rings glide over what is parked the more easily then
+            proven = leaves_bare(track, self._standing, self._space, self.bodies)
         if proven:
             _refine(track, self._standing, self._ground)
             take_back_slides(track, self._standing, self._space)
@@ -125,26 +158,31 @@ class _Search:
             _claim_rays(track, self._standing, self.free, self._space)
         return track, proven
 
-    def take(self, track: Track) -> None:
+    def _take(self, track: Track) -> None:
         """Its points are no others'."""
         for j, rows in track.claimed.items():
             self.free[j][rows] = False
         points = track.seen_in(self._standing, sorted(track.claimed))
         self.bodies.append(Body(track, Shape.of(points)))
 
-    def _started(self, members: np.ndarray, n: int) -> tuple[Track, float]:
+    def _followed(self, members: np.ndarray, n: int, weight: float) -> tuple[Track, float]:
+        """The best track of a group of look n, from there or its ends on; as `_best_of`."""
+        track, left = self._started(members, n, weight)
+        return self._again_from_its_ends(track, left, weight)
+
+    def _started(self, members: np.ndarray, n: int, weight: float) -> tuple[Track, float]:
         """The best track by the velocity that the sweeps tell, or else by that of what moves beside
         or of the other traffic; as `_best_of`."""
         beside = velocities_beside(self.looks[n], members, self.bodies)
         starts: Iterator[Float] = chain([self._velocity_of(members, n)], beside)
-        track, left = _best_of(self._follow(members, n, velocity) for velocity in starts)
+        track, left = _best_of(self._follow(members, n, velocity, weight) for velocity in starts)
         if np.isinf(left) and len(track.sightings) <= _HARDLY_FOLLOWED:
             starts = velocities_of_traffic(self.looks[n], self.bodies)
-            in_traffic = _best_of(self._follow(members, n, velocity) for velocity in starts)
+            in_traffic = _best_of(self._follow(members, n, velocity, weight) for velocity in starts)
             track, left = (track, left) if np.isinf(in_traffic[1]) else in_traffic
         return track, left
 
-    def _again_from_its_ends(self, track: Track, left: float) -> tuple[Track, float]:
+    def _again_from_its_ends(self, track: Track, left: float, weight: float) -> tuple[Track, float]:
         """The same, or followed from one of its ends, if as much of it is contradicted less; what
         is not proven only from where more of it is seen.
 
@@ -154,8 +192,8 @@ class _Search:
         for rows, k in ends(track, self.looks) if left > _DOUBTFUL else ():
             if len(rows) <= least:
                 continue
-            tried, contradicted = self._follow(rows, k, self._velocity_of(rows, k))
-            whole = tried.total_points() >= _AS_WHOLE * track.total_points()
+            tried, contradicted = self._follow(rows, k, self._velocity_of(rows, k), weight)
+            whole = _as_whole(tried, track)
             if whole and contradicted is not None and contradicted < _CLEARLY * left:
                 track, left = tried, contradicted
         return track, left
@@ -170,11 +208,18 @@ class _Search:
             velocity = np.median(self.looks[n].gather(self._velocities_m_s)[members], axis=0)
         return velocity if seen.radial is None else seen.radial.rows(members).corrected(velocity)
 
-    def _follow(self, members: np.ndarray, n: int, velocity: Float) -> tuple[Track, float | None]:
+    def _follow(
+        self, members: np.ndarray, n: int, velocity: Float, weight: float
+    ) -> tuple[Track, float | None]:
         """A group of look n from that velocity on, and how much contradicts its track, None if that
-        is not proven."""
-        track = _follow(members, n, velocity, self.looks, self.free, self._ground, self.clock)
+        is not proven. weight: of heights."""
+        looks, free, ground, clock = self.looks, self.free, self._ground, self.clock
+        track = _follow(members, n, velocity, looks, free, ground, clock, weight)
         return track, left_contradicted(track, self._standing, self._space, self.bodies)
+
+
+def _as_whole(track: Track, other: Track) -> bool:
+    return track.total_points() >= _AS_WHOLE * other.total_points()
 
 
 def _best_of(tried: Iterable[tuple[Track, float | None]]) -> tuple[Track, float]:
@@ -202,15 +247,17 @@ def _follow(
     free: Sequence[Bool],
     ground: HeightMap,
     clock: Clock,
+    weight: float,
 ) -> Track:
-    """Forwards, then backwards, with everything seen so far as the model. clock: of the looks."""
+    """Forwards, then backwards, with everything seen so far as the model. clock: of the looks.
+    weight: of heights."""
     here = looks[start].seen
     rate = np.append(velocity, 0.0)
     seen_s = float(here.time_s[members].mean())
     points = _at_once(here, members, rate, seen_s)
     track = Track(points.mean(0))
     track.add(start, looks[start], np.zeros(4), seen_s, members)
-    model = Model(points)
+    model = Model(points, weight)
     recent = clock.num_in(_RECENT_S)
     for direction in (1, -1):
         last, n = start, start + direction
@@ -291,12 +338,11 @@ def _find(
     predicted, rate, std = _predict(track, rate, num_recent, seen_s)
     predicted[2] = track.rise_m(ground, predicted)
     target = _at_once(c, rows, rate, seen_s)
-    state = align(model, target, centre, predicted, std)
+    state = model.align(target, centre, predicted, std)
     if state is None:
         return None
     state[2] = track.rise_m(ground, state)
-    distance, _ = model.tree.nearest(undo(state, target, centre), _FIT_M)
-    fit = np.isfinite(distance)
+    fit = model.covers(undo(state, target, centre), _FIT_M)
     if fit.sum() < enough:
         return None
     return state, seen_s, rows[fit], target[fit]
@@ -380,7 +426,7 @@ def _refine(track: Track, standing: Sequence[Standing], ground: HeightMap) -> No
     for n, sighting in track.sightings.items():
         at_s = sighting.seen_s
         points = track.place(track.seen_in(standing, sighting.sweeps), at_s)
-        state = align(models[1 - n % 2], points, track.centre, track.path(at_s), _REFINED_STD)
+        state = models[1 - n % 2].align(points, track.centre, track.path(at_s), _REFINED_STD)
         if state is not None:
             state[2] = track.rise_m(ground, state)
             track.sightings[n] = replace(sighting, state=state)
