@@ -123,7 +123,8 @@ def _of_recording(options: argparse.Namespace, config: Config) -> Iterator[Answe
             paths[write(frame, flow)] = None
             num_moving += sum(int(field.moving.sum()) for field in flow.steps.values())
     num_made = len(frames) - len(failed)
-    text = f"{num_made:,} sweeps, {num_moving:,} points moving"
+    sweeps = "sweep" if num_made == 1 else "sweeps"
+    text = f"{num_made:,} {sweeps}, {num_moving:,} points moving"
     facts = {"num_sweeps": num_made, "num_moving": num_moving}
     yield Answer(text, facts, list(dict.fromkeys(path.parent for path in paths)))
     if failed:

@@ -91,7 +91,8 @@ def answer(options: argparse.Namespace) -> Iterator[Answer]:
         )
     share = num_sure / max(num_points, 1)
     facts: dict[str, Any] = {"num_sweeps": num_made, "num_moving": num_moving, "share_valid": share}
-    text = f"{num_made:,} sweeps, {num_moving:,} points moving, {share:.1%} valid"
+    sweeps = "sweep" if num_made == 1 else "sweeps"
+    text = f"{num_made:,} {sweeps}, {num_moving:,} points moving, {100 * share:.1f} % valid"
     if errors:
         exact = LabelErrors.joined(errors).summary()
         facts["exact"] = exact
@@ -108,7 +109,7 @@ def _against_truth(exact: Mapping[str, Any]) -> Iterator[str]:
         yield (
             f"against the exact flow: {exact['error_m'] * 100:.1f} cm off (median "
             f"{exact['median_error_m'] * 100:.1f} cm) where {exact['num_moving']:,} points move by "
-            f"{exact['way_m'] * 100:.0f} cm, {exact['missed']:.1%} of them missed"
+            f"{exact['way_m'] * 100:.0f} cm, {100 * exact['missed']:.1f} % of them missed"
         )
     if exact["wrong"] is not None:
-        yield f"{exact['wrong']:.2%} of the standing points more than 5 cm off"
+        yield f"{100 * exact['wrong']:.2f} % of the standing points more than 5 cm off"
