@@ -13,6 +13,7 @@ from densify.clock import Clock
 from densify.config import GroundSettings
 from densify.flow.tracking import proof, tracks
 from densify.flow.tracking.evidence import FreeSpace, Standing, find_candidates
+from densify.flow.tracking.left_places import LeftPlaces, Places, left_places
 from densify.flow.tracking.shapes import Body, Shape
 from densify.flow.tracking.sightings import Sighting, Track
 from densify.flow.tracking.starts import groups_to_start, is_part, velocities_of_traffic
@@ -51,6 +52,11 @@ def followed(
     return Track(np.array(place), sighted, {n: np.arange(num_points) for n in range(num_sweeps)})
 
 
+def places_left(told: tuple[tuple[int, int], tuple[int, int]]) -> LeftPlaces:
+    """Places taken and empty, before an object came and after it left."""
+    return LeftPlaces(*(Places(*side) for side in told))
+
+
 def is_proven(
     track: Track,
     space: SimpleNamespace,
@@ -64,7 +70,7 @@ def is_proven(
         patch.setattr(proof, "_as_fast_as_measured", lambda *_: True)
         patch.setattr(proof, "_like_a_rail", lambda *_: like_a_rail)
         patch.setattr(proof, "contradictions", lambda *_: looks)
-        patch.setattr(proof, "_left_places", lambda *_: told)
+        patch.setattr(proof, "left_places", lambda *_: places_left(told))
         return proof.left_contradicted(track, [], space, []) is not None
 
 
@@ -182,7 +188,8 @@ def test_doubtful_tracks_are_followed_again_with_heights_that_count_less(
     for name in ("_gather", "_refine", "take_back_slides", "go_with_the_rest", "_claim_rays"):
         monkeypatch.setattr(tracks, name, lambda *_: None)
     monkeypatch.setattr(tracks, "may_be_a_rail", lambda *_: False)
-    monkeypatch.setattr(tracks, "leaves_bare", lambda *_: bare)
+    places = LeftPlaces(Places(0 if bare else 9, 30), Places(0, 30))
+    monkeypatch.setattr(tracks, "left_places", lambda *_: places)
     parts = dict.fromkeys(("_standing", "_space", "_ground", "free", "bodies"))
     search = SimpleNamespace(_followed=follow, **parts)
     track, found = tracks._Search._track_of(search, np.arange(8), 0, list(left))
@@ -290,7 +297,7 @@ def test_what_leaves_its_places_bare_may_swing_or_look_like_a_rail(
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(proof, "_like_a_rail", lambda *_: like_a_rail)
         patch.setattr(proof, "contradictions", lambda *_: (200, moved, 700))
-        patch.setattr(proof, "_left_places", lambda *_: told)
+        patch.setattr(proof, "left_places", lambda *_: places_left(told))
         assert proof.may_be_a_rail(track, [], space, []) == (like_a_rail and not proven)
 
 
@@ -371,7 +378,7 @@ def test_a_line_across_its_way_is_no_rail(along_rad, rail):
     for still in (25, 35):
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(proof, "contradictions", lambda *_, still=still: (still, 0, 100))
-            patch.setattr(proof, "_left_places", lambda *_: ((9, 30), (0, 30)))
+            patch.setattr(proof, "left_places", lambda *_: places_left(((9, 30), (0, 30))))
             found = proof.may_be_a_rail(track, standing, SimpleNamespace(), [])
         assert found == (rail and still < 30)  # a third of all looks is no chance
 
@@ -410,7 +417,7 @@ class Seen:
     def told(self, track: Track, *proven: Track) -> np.ndarray:
         """[coming, gone] × [taken, empty]"""
         bodies = [Body(t, Shape.of(t.seen_in(self.standing, t.claimed))) for t in proven]
-        return np.array(proof._left_places(track, self.standing, self.space, bodies))
+        return np.array(left_places(track, self.standing, self.space, bodies))
 
 
 def test_what_is_still_there_when_it_is_gone_does_not_move():

@@ -8,17 +8,16 @@ from collections.abc import Sequence
 import numpy as np
 
 from densify.flow.tracking.evidence import FreeSpace, Standing
+from densify.flow.tracking.left_places import LeftPlaces, left_places
 from densify.flow.tracking.radial import Radial
 from densify.flow.tracking.shapes import Body
 from densify.flow.tracking.sightings import Track
 from densify.geometry import poses
-from densify.kernels.nearest import BoxTree
-from densify.types import Float, Int
 
 _ROUGH_M, _ROUGH_PER_GAP, _ROUGH_S = 0.04, 0.2, 0.003  # by gap of rings, by speed
-# Without rings each sweep meets other places of an object: so much more, if of the places that it
-# left or comes to so few as of those that are empty are taken.
-_ROUGHER, _TAKEN = 1.5, 0.1
+# Without rings each sweep meets other places of an object: so much more, if those that it left or
+# comes to are mostly bare.
+_ROUGHER = 1.5
 _LEAST_WAY_M, _LEAST_WAY_PER_RESIDUAL, _LEAST_WAY_PER_ROUGH = 0.35, 8.0, 1.5
 _NUM_ASKED = 60
 _LEAST_STATES, _LEAST_S = 3, 0.15
@@ -26,17 +25,13 @@ _SHORT_S, _MAX_OF_SHORT = 0.35, 0.03  # three places of a tree's crown may lie o
 _SHORT_OF_FEW_S, _FEW = 0.6, 0.2  # and even more where few looks contradict its standing still,
 _MAX_OF_FEW = 0.1  # of which its motion may leave so many, unless it left its places bare
 # But a crown does not leave its places bare, least of all so many.
-_MAX_OF_SHORT_BARE, _MAX_OF_SHORT_MANY_BARE, _MANY = 0.06, 0.12, 100
+_MAX_OF_SHORT_BARE, _MAX_OF_SHORT_MANY_BARE = 0.06, 0.12
 _STRAY = 0.005  # so few of all looks are echoes at an object's rim
 # Of those that standing still leaves; of what leaves all its places bare more: limbs swing.
 _MAX_CONTRADICTIONS, _MAX_OF_LIMBS, _FAR_M = 0.3, 0.5, 3.0
 # They are so many, or of few looks this share, and of many at least that one.
 _LEAST_CONTRADICTIONS, _SHARE_OF_FEW, _LEAST_SHARE = 20, 0.08, 0.01
 _ALONG = np.cos(np.deg2rad(45))
-_LEFT_M = 0.6  # from all of the object: it is gone, or not there yet;
-_ROOM_M, _ROOM_S = 2.0, 0.5  # so far, and what it goes in that time, is left to who is in front
-_THERE_M, _THERE_PER_GAP = 0.2, 0.5  # between two rings
-_MOSTLY, _SELDOM = 2, 0.03  # as often taken as empty: what stands is there nearly always
 _AS_FAST, _RAIL_M, _SLENDER, _SHARE_OF_RAIL = 0.1, 2.0, 8.0, 0.3
 
 
@@ -67,29 +62,27 @@ def left_contradicted(
     least = min(_LEAST_CONTRADICTIONS, _SHARE_OF_FEW * num_asked)
     if still < max(least, _LEAST_SHARE * num_asked) or moved > _MAX_OF_LIMBS * still:
         return None
-    told = _left_places(track, standing, space, proven)
-    if any(t > 0 for t, _ in told) and all(t >= _MOSTLY * empty for t, empty in told):
-        return None
-    if over_m > 0 and not _mostly_bare(told):
+    left = left_places(track, standing, space, proven)
+    if left.still_there() or (over_m > 0 and not left.mostly_bare()):
         return None
     # What never left its place may be a ring that glides over a bonnet: only contradictions tell.
-    if still < _SHARE_OF_FEW * num_asked and not np.any(told):
+    if still < _SHARE_OF_FEW * num_asked and left.unknown():
         return None
-    bare = _bare(told, far=_travelled_m(track) >= _FAR_M)
+    bare = left.bare(far=_travelled_m(track) >= _FAR_M)
     if moved > (_MAX_OF_LIMBS if bare else _MAX_CONTRADICTIONS) * still:
         return None
-    few, left_bare = still < _FEW * num_asked, _mostly_bare(told)
+    few, mostly_bare = still < _FEW * num_asked, left.mostly_bare()
     # Where something is still there, few contradictions of which many are left prove nothing.
-    if few and not left_bare and moved > _MAX_OF_FEW * still:
+    if few and not mostly_bare and moved > _MAX_OF_FEW * still:
         return None
     short_s = _SHORT_OF_FEW_S if few else _SHORT_S
-    if moved > max(_most_of_short(told) * still, _STRAY * num_asked):
+    if moved > max(_most_of_short(left) * still, _STRAY * num_asked):
         # Nor may rings that glide over a parked car, which is still there behind them.
-        glides = still < _SHARE_OF_FEW * num_asked and any(t > _MOSTLY * e for t, e in told)
+        glides = still < _SHARE_OF_FEW * num_asked and left.one_still_there()
         if glides or seen_s < min(short_s, np.ptp(space.clock.time_s) / 2):
             return None
     as_few_as_a_rail = still < _SHARE_OF_RAIL * num_asked
-    if as_few_as_a_rail and not left_bare and _like_a_rail(track, standing, space):
+    if as_few_as_a_rail and not mostly_bare and _like_a_rail(track, standing, space):
         return None
     return moved / num_asked
 
@@ -122,88 +115,14 @@ def may_be_a_rail(
     still, _, num_asked = contradictions(track, standing, space)
     if still >= _SHARE_OF_RAIL * num_asked or not _like_a_rail(track, standing, space):
         return False
-    return not leaves_bare(track, standing, space, proven)
+    return not left_places(track, standing, space, proven).mostly_bare()
 
 
-def leaves_bare(
-    track: Track, standing: Sequence[Standing], space: FreeSpace, proven: Sequence[Body]
-) -> bool:
-    """Whether hardly anything else was seen where the track has just been or is coming to."""
-    return _mostly_bare(_left_places(track, standing, space, proven))
-
-
-def _bare(told: tuple[tuple[int, int], tuple[int, int]], far: bool) -> bool:
-    """Whether nothing was seen where an object had not come to yet, nor where it had been, see
-    `_left_places`: so it is of nothing that stands. far: it goes so far that many places on one
-    side tell enough."""
-    taken, empty = np.sum(told, axis=0)
-    if far and empty >= _MANY and taken <= _SELDOM * empty:
-        return True
-    return all(t <= _SELDOM * e and e >= _LEAST_CONTRADICTIONS for t, e in told)
-
-
-def _mostly_bare(told: tuple[tuple[int, int], tuple[int, int]]) -> bool:
-    """Whether hardly anything was seen there, before or after."""
-    taken, empty = np.sum(told, axis=0)
-    return bool(taken <= _TAKEN * empty and empty >= _LEAST_CONTRADICTIONS)
-
-
-def _most_of_short(told: tuple[tuple[int, int], tuple[int, int]]) -> float:
+def _most_of_short(left: LeftPlaces) -> float:
     """The share of its contradictions that a motion seen for a short time may leave."""
-    if not _mostly_bare(told):
+    if not left.mostly_bare():
         return _MAX_OF_SHORT
-    many = sum(empty for _, empty in told) >= _MANY
-    return _MAX_OF_SHORT_MANY_BARE if many else _MAX_OF_SHORT_BARE
-
-
-def _left_places(
-    track: Track, standing: Sequence[Standing], space: FreeSpace, proven: Sequence[Body]
-) -> tuple[tuple[int, int], tuple[int, int]]:
-    """How often something is where the object is just coming to, and how often nothing is there;
-    and the same of where it has just been.
-
-    A wire fence is seen through from beside and not from ahead: where one becomes the other goes
-    along it as the scanner does, and with it what seems to move; but the fence is still there, on
-    both sides. Beside the end of a long object there may be the rest of it on one. Other objects
-    that are proven to move do not count.
-    """
-    some = {i: rows[:: len(rows) // _NUM_ASKED + 1] for i, rows in track.claimed.items()}
-    tree = BoxTree(track.seen_in(standing, track.claimed))
-    rate = track.path.rate((track.path.begin_s + track.path.end_s) / 2)
-    room_m = _ROOM_M + _ROOM_S * float(np.linalg.norm(rate[:2]))
-    gap_m = space.gap_m(track.centre, next(iter(track.claimed)))
-    there_m = max(_THERE_M, _THERE_PER_GAP * gap_m)
-
-    def told(look: tuple[int, ...], sweeps: Sequence[int]) -> Int:
-        places = np.concatenate([np.zeros((0, 3)), *(standing[i].points[some[i]] for i in sweeps)])
-        away_m, _ = tree.nearest(track.undo(places, space.clock.time_s[look[0]]), room_m)
-        places = places[(away_m > _LEFT_M) & np.isfinite(away_m)]
-        if not len(places):
-            return np.zeros(2, np.int64)
-        there = np.concatenate([_there(places, there_m, standing[j], proven) for j in look])
-        taken = np.zeros(len(places), bool)
-        if len(there):
-            taken = np.isfinite(BoxTree(there).nearest(places, there_m)[0])
-        empty = space.seen_through(places, look[0]) & ~taken
-        return np.array([taken.sum(), empty.sum()])
-
-    coming, gone = np.zeros((2, 2), np.int64)
-    for look in space.looks:
-        coming += told(look, [i for i in some if i > look[-1]])
-        gone += told(look, [i for i in some if i < look[0]])
-    return (int(coming[0]), int(coming[1])), (int(gone[0]), int(gone[1]))
-
-
-def _there(places: Float, reach_m: float, c: Standing, proven: Sequence[Body]) -> Float:
-    """(N,3) what a sweep saw that close to some places, but of no object proven to move."""
-    rows = c.strips.rows_inside(places.min(0) - reach_m, places.max(0) + reach_m)
-    rows = rows[np.isfinite(BoxTree(places).nearest(c.points[rows], reach_m)[0])]
-    for track, shape in proven:
-        if len(rows):
-            body = track.undo(c.points[rows], c.time_s[rows])
-            near = np.isfinite(shape.tree.nearest(body, _LEFT_M)[0])
-            rows = rows[~(near | shape.within_outline(body))]
-    return c.points[rows]
+    return _MAX_OF_SHORT_MANY_BARE if left.many_empty() else _MAX_OF_SHORT_BARE
 
 
 def _goes_along(track: Track, space: FreeSpace) -> bool:

@@ -18,9 +18,10 @@ from densify.clock import Clock
 from densify.flow.surface_matching import GATES_M, apply, undo
 from densify.flow.tracking.align import MIN_FIT, Model
 from densify.flow.tracking.evidence import FreeSpace, Standing, height_weight
+from densify.flow.tracking.left_places import left_places
 from densify.flow.tracking.lone_rays import few_rays, gap_in_line_m, in_line, linked_in_line
 from densify.flow.tracking.looks import Look, looks_of
-from densify.flow.tracking.proof import leaves_bare, left_contradicted, may_be_a_rail
+from densify.flow.tracking.proof import left_contradicted, may_be_a_rail
 from densify.flow.tracking.shapes import Body, Shape
 from densify.flow.tracking.sightings import Track
 from densify.flow.tracking.slides import go_with_the_rest, take_back_slides
@@ -150,7 +151,8 @@ class _Search:
             # A piece of a guard rail shows with the rest what it is of.
             proven = not may_be_a_rail(track, self._standing, self._space, self.bodies)
         if proven and weights[0] < 1.0:  # rings glide over what is parked the more easily then
-            proven = leaves_bare(track, self._standing, self._space, self.bodies)
+            places = left_places(track, self._standing, self._space, self.bodies)
+            proven = places.mostly_bare()
         if proven:
             _refine(track, self._standing, self._ground)
             take_back_slides(track, self._standing, self._space)
