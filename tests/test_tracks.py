@@ -168,6 +168,7 @@ def test_what_lies_close_to_a_proven_track_is_a_part_of_it(aside_m, part):
     [
         ({1.0: 0.001, 0.5: 0.0}, True, [1.0], 1.0),  # hardly contradicted
         ({1.0: 0.1, 0.5: 0.01}, True, [1.0, 0.5], 0.5),
+        ({1.0: 0.1, 0.4: 0.01}, True, [1.0, 0.4], 1.0),  # which loses a point
         ({1.0: 0.1, 0.5: 0.09}, True, [1.0, 0.5], 1.0),  # about as well as before
         ({1.0: np.inf, 0.5: 0.0}, True, [1.0], None),  # left over for later
         ({0.5: 0.1}, True, [0.5], 0.5),
@@ -181,7 +182,7 @@ def test_doubtful_tracks_are_followed_again_with_heights_that_count_less(
 
     def follow(members, n, weight):
         tried.append(weight)
-        track = Track(np.zeros(3), {}, {0: np.arange(20)})
+        track = Track(np.zeros(3), {}, {0: np.arange(19 if weight == 0.4 else 20)})
         which[id(track)] = weight, track
         return track, left[weight]
 

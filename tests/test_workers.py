@@ -85,7 +85,7 @@ def until(what: Callable[[], bool]) -> None:
 def is_gone(pid: int) -> bool:
     try:
         state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
-    except FileNotFoundError:
+    except (FileNotFoundError, ProcessLookupError):  # before or while it is read
         return True
     return state == "Z"
 

@@ -139,11 +139,13 @@ class _Search:
         self, members: np.ndarray, n: int, weights: Sequence[float]
     ) -> tuple[Track, bool]:
         """The track of a group of look n, whole if it is proven, and whether it is. weights: of
-        heights, see `_height_weights`; others than the first where the track is doubtful."""
+        heights, see `_height_weights`; others than the first where the track is doubtful and no
+        fewer points go with theirs."""
         track, left = self._followed(members, n, weights[0])
         for weight in weights[1:] if _DOUBTFUL < left < np.inf else ():
             tried, contradicted = self._followed(members, n, weight)
-            if contradicted < _CLEARLY * left and _as_whole(tried, track):
+            as_many = tried.total_points() >= track.total_points()
+            if as_many and contradicted < _CLEARLY * left:
                 track, left = tried, contradicted
         proven = bool(np.isfinite(left))
         if proven:
@@ -195,7 +197,7 @@ class _Search:
             if len(rows) <= least:
                 continue
             tried, contradicted = self._follow(rows, k, self._velocity_of(rows, k), weight)
-            whole = _as_whole(tried, track)
+            whole = tried.total_points() >= _AS_WHOLE * track.total_points()
             if whole and contradicted is not None and contradicted < _CLEARLY * left:
                 track, left = tried, contradicted
         return track, left
@@ -218,10 +220,6 @@ class _Search:
         looks, free, ground, clock = self.looks, self.free, self._ground, self.clock
         track = _follow(members, n, velocity, looks, free, ground, clock, weight)
         return track, left_contradicted(track, self._standing, self._space, self.bodies)
-
-
-def _as_whole(track: Track, other: Track) -> bool:
-    return track.total_points() >= _AS_WHOLE * other.total_points()
 
 
 def _best_of(tried: Iterable[tuple[Track, float | None]]) -> tuple[Track, float]:
