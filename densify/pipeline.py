@@ -9,6 +9,7 @@ after it, by `densify.results.key`.
 
 from __future__ import annotations
 
+import reprlib
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -210,9 +211,9 @@ def _check(
     cameras: Sequence[str] | None,
 ) -> None:
     """Raise InputError before anything is read."""
-    if isinstance(sequence, str | Path):
+    if not hasattr(sequence, "frames"):
         raise InputError(
-            f"sequence: got {str(sequence)!r}, expected what densify.open_sequence makes of it"
+            f"sequence: got {reprlib.repr(sequence)}, expected what densify.open_sequence returns"
         )
     if isinstance(methods, str):
         raise InputError(f"methods: got {methods!r}, expected a list of names, such as ['flow']")

@@ -156,8 +156,9 @@ def test_unknown_methods_are_refused_before_anything_is_read():
 
 def test_texts_are_no_lists_and_no_recordings() -> None:
     sequence = one_car(())
-    with pytest.raises(InputError, match="sequence: got 'street', expected what densify"):
-        run("street", KEY, 1)
+    for other in ("street", None, 3):
+        with pytest.raises(InputError, match=f"sequence: got {other!r}, expected what densify"):
+            run(other, KEY, 1)
     with pytest.raises(InputError, match="methods: got 'flow', expected a list of names"):
         compare(sequence, KEY, 1, methods="flow")
     with pytest.raises(InputError, match="data: got 'street', expected a list of recordings"):
