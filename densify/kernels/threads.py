@@ -47,7 +47,10 @@ def over_rows(function: Callable[..., None], num_rows: int, *arguments: Any) -> 
 
     function: what it writes for a row must depend on that row alone. It may not call this one.
     """
-    num_parts = min(num_threads(), max(1, num_rows // _LEAST_ROWS))
+    num_parts = min(num_threads(), num_rows // _LEAST_ROWS)
+    if num_parts <= 1:
+        function(0, num_rows, *arguments)
+        return
     bounds = [num_rows * part // num_parts for part in range(num_parts + 1)]
     parts = list(pairwise(bounds))
     others = [_pool().submit(function, begin, end, *arguments) for begin, end in parts[1:]]
