@@ -11,7 +11,9 @@ import pytest
 from densify.clock import Clock
 from densify.flow.tracking.evidence import Standing
 from densify.flow.tracking.extent import Seen, leave_out_alone, shape_of
+from densify.flow.tracking.lone_rays import columns_apart_m
 from densify.flow.tracking.sightings import Sighting, Track
+from densify.geometry import poses
 from tests.found_motion import KEY, NOISE, Found
 from tests.scenes import Arc, Box, Scene, World, car, street
 
@@ -32,6 +34,14 @@ def test_a_long_side_that_slides_along_itself_belongs_to_its_object():
         assert on.sum() > 10_000 and flow.moving[on].mean() > 0.99
     assert np.quantile(found.errors_m(1), 0.99) < 0.08
     assert found.false_share() < 1e-4
+
+
+def test_a_long_side_that_falls_away_is_seen_in_columns_far_apart():
+    """A truck 30 m ahead: the farther along it, the fewer columns meet its side."""
+    found = Found.of([car(30, 5, 6, 1, size_m=(16.0, 2.5, 3.2))])
+    assert found.share_moving(1, 4) > 0.98
+    assert np.quantile(found.errors_m(1, 4), 0.9) < 0.02
+    assert found.false_share() < 3e-4
 
 
 @pytest.mark.parametrize("gap_m", [1.0, 0.4])
@@ -107,6 +117,24 @@ def test_a_bush_that_every_sweep_sees_at_other_places_is_no_part_of_who_walks_by
     bushes = rng.uniform(-0.5, 0.5, (11, 12, 3)) * [1.2, 0.6, 1.0] + [0.0, 0.9, 0.0]
     claimed = [np.concatenate([body, b - [0.14 * n, 0, 0]]) for n, b in enumerate(bushes)]
     assert num_in_shape(claimed, [np.ones(52, bool)] * 11, 1.4) == 440
+
+
+def test_columns_of_rays_lie_the_farther_apart_the_more_a_side_falls_away():
+    """Seen along a wall 3 m aside, from a lidar that has turned and moved."""
+    step_rad, to_right = np.deg2rad(0.2), np.array([3.0, 0.0, 1.0])
+    azimuth = np.arctan2(3.0, 50.0) + np.arange(-40, 41) * step_rad
+    meets_m = 3.0 / np.tan(azimuth)
+    models = {0: SimpleNamespace(azimuth_step_rad=step_rad)}
+    T_lidar_world = poses.exp(np.array([0, 0, 0.7, 0, 0, 0])) @ poses.exp(
+        np.append(np.zeros(3), -to_right)
+    )
+    apart_m = columns_apart_m(
+        np.array([50.0, 3.0, 0.0]) + to_right,
+        np.array([2.0, 0.0]),
+        T_lidar_world,
+        SimpleNamespace(models=models),
+    )
+    assert apart_m == pytest.approx(-np.gradient(meets_m)[40], rel=0.02)
 
 
 def num_in_shape(claimed, seeds, speed_m_s) -> int:

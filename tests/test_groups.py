@@ -160,9 +160,13 @@ def test_no_part_of_a_turning_truck_goes_its_own_way(truck):
     assert np.quantile(truck.errors_m(1), 0.9) < 0.08
 
 
-def test_the_trailer_of_a_turning_truck_is_found():
-    """Its long side slides along itself: nothing but the tractor tells how fast."""
-    tractor, lag_rad, wheelbase_m = Arc(20, 1.0, np.pi * 0.75, 4.0, 0.4), 0.45, 9.0
+@pytest.mark.parametrize(
+    ("x", "least_share", "median_m", "most_m"), [(20, 0.8, 0.05, 0.1), (30, 0.88, 0.2, 0.3)]
+)
+def test_the_trailer_of_a_turning_truck_is_found(x, least_share, median_m, most_m):
+    """Its long side slides along itself: nothing but the tractor tells how fast. Half of it is seen
+    to move and goes where it does not point; the other half lies where it points."""
+    tractor, lag_rad, wheelbase_m = Arc(x, 1.0, np.pi * 0.75, 4.0, 0.4), 0.45, 9.0
     at_key_s = KEY * SWEEP_S
     x, y, yaw = tractor.at(at_key_s)
     kingpin = np.array([x - 1.5 * np.cos(yaw), y - 1.5 * np.sin(yaw)])
@@ -175,9 +179,9 @@ def test_the_trailer_of_a_turning_truck_is_found():
     boxes = [Box((5.5, 2.5, 3.2), tractor, 0.5, 1), Box((10.5, 2.5, 3.0), trailer, 0.9, 2)]
     found = Found.of(boxes, Arc(0, -1.5, 0, 2.0), 5, Scanner(64, 1800, (-24.8, 2.0), 0.01))
     assert found.share_moving(1) > 0.9
-    assert found.share_moving(2) > 0.7
-    assert np.median(found.errors_m(2)) < 0.05
-    assert np.quantile(found.errors_m(2), 0.9) < 0.1
+    assert found.share_moving(2) > least_share
+    assert np.median(found.errors_m(2)) < median_m
+    assert np.quantile(found.errors_m(2), 0.9) < most_m
     assert found.false_share() < 1e-3
 
 

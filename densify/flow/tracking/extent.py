@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 
 from densify.clock import Clock
 from densify.flow.tracking.evidence import FreeSpace, Standing, firing_times_s
+from densify.flow.tracking.lone_rays import columns_apart_m
 from densify.flow.tracking.radial import Radial
-from densify.flow.tracking.shapes import Shape
+from densify.flow.tracking.shapes import Body, Shape
 from densify.flow.tracking.sightings import Track
 from densify.geometry import poses
 from densify.geometry.height_map import HeightMap
@@ -28,7 +29,8 @@ _ATTACH_UNSEEN_M = 0.15
 _MIN_HEIGHT_M, _MIN_HEIGHT_OF_WALKERS_M, _AS_LOW_AS_ROAD_M = 0.08, 0.1, 0.15
 _LENGTH_M = 15.0
 _SIDE_M = 0.1
-_LONGEST_HOLE_M = 0.6
+# Along a side that falls away from the scanner so many columns of rays, at the most.
+_LONGEST_HOLE_M, _COLUMNS_IN_HOLE, _WIDEST_HOLE_M = 0.6, 2.0, 2.0
 _CARRIED_SLACK_M = 0.5
 _MAX_CONTRADICTED = 0.05
 _WALKS_M_S, _FAST_M_S = 2.0, 8.0
@@ -258,8 +260,7 @@ def lengthen(
         if not len(mine) or _speed_m_s(track, i, space.clock) <= _WALKS_M_S:
             continue
         at_s = track.seen_at(space.clock.time_ns[i])
-        ahead = track.path.rate(at_s)[:2]
-        ahead = ahead / max(float(np.linalg.norm(ahead)), 1e-6)
+        ahead = Body(track, shapes[k]).pointing(at_s)
         axes = np.stack([ahead, [-ahead[1], ahead[0]]], axis=1)
         rim = track.place(shapes[k].rim, at_s)
         side = (rim[:, :2] @ axes)[:, 1]
@@ -277,7 +278,9 @@ def lengthen(
         fits &= at_once[:, 2] < rim[:, 2].max() + _SIDE_M
         own = track.carry(seen.points[mine], seen.time_s[mine], at_s)[:, :2] @ ahead
         rows, along = rows[fits], along[fits, 0]
-        linked = _without_hole(along, own)
+        columns_m = columns_apart_m(middle, ahead, space.T_lidar_world[i], space.sensors)
+        hole_m = float(np.clip(_COLUMNS_IN_HOLE * columns_m, _LONGEST_HOLE_M, _WIDEST_HOLE_M))
+        linked = _without_hole(along, own, hole_m)
         if not linked.any():
             continue
         rows, along = rows[linked], along[linked] - np.median(own)
@@ -296,12 +299,12 @@ def _carried_m(track: Track, seen: Seen, rows: NDArray[np.int64], at_s: float) -
     return float(_CARRIED_SLACK_M + 2 * (shift_m + 2 * _LENGTH_M * turn_rad))
 
 
-def _without_hole(along: Float, own: Float) -> Bool:
-    """(N,) those of ``along`` that reach (M,) ``own`` by steps below ``_LONGEST_HOLE_M``."""
+def _without_hole(along: Float, own: Float, hole_m: float) -> Bool:
+    """(N,) those of ``along`` that reach (M,) ``own`` by steps of up to ``hole_m``."""
     everything = np.concatenate([along, own])
     order = np.argsort(everything, kind="stable")
     run = np.zeros(len(everything), np.int64)
-    run[order[1:]] = np.cumsum(np.diff(everything[order]) > _LONGEST_HOLE_M)
+    run[order[1:]] = np.cumsum(np.diff(everything[order]) > hole_m)
     return np.isin(run[: len(along)], run[len(along) :])
 
 

@@ -48,16 +48,22 @@ def few_rays(c: Standing, rows: np.ndarray, T_lidar_world: Float, sensors: Senso
 
 
 def gap_in_line_m(place: Float, ahead: Float, T_lidar_world: Float, sensors: Sensors) -> float:
-    """How far apart along its way parts of one object may be seen: columns of rays that meet a side
-    lie the farther apart the more it falls away from the scanner.
+    """How far apart along its way parts of one object may be seen that no ring links. Arguments as
+    `columns_apart_m`."""
+    columns_m = _COLUMNS_IN_GAP * columns_apart_m(place, ahead, T_lidar_world, sensors)
+    return float(np.clip(columns_m, _GAP_IN_LINE_M, _LONGEST_GAP_M))
 
-    place: (3,) of the object, world. ahead: (2,) where it moves to. T_lidar_world: of the sweep.
+
+def columns_apart_m(place: Float, ahead: Float, T_lidar_world: Float, sensors: Sensors) -> float:
+    """How far apart columns of rays meet a side: the farther the more it falls away from the
+    scanner.
+
+    place: (3,) of the side, world. ahead: (2,) along it. T_lidar_world: (4,4) of the sweep.
     """
     in_lidar = transform(T_lidar_world, place[None])[0, :2]
     x, y = _unit(T_lidar_world[:2, :2] @ ahead)
     aside_m = max(abs(float(in_lidar @ [-y, x])), 1e-3)
-    column_m = _column_rad(sensors) * float(in_lidar @ in_lidar) / aside_m
-    return float(np.clip(_COLUMNS_IN_GAP * column_m, _GAP_IN_LINE_M, _LONGEST_GAP_M))
+    return _column_rad(sensors) * float(in_lidar @ in_lidar) / aside_m
 
 
 def in_line(shape: Shape, points: Float, ahead: Float) -> Bool:

@@ -377,7 +377,7 @@ def _claim_rays(
     that its motion does not contradict, see `densify.flow.tracking.lone_rays`. They do not place
     it: they stay where the rays are."""
     shape = Shape.of(track.seen_in(standing, sorted(track.claimed)))
-    ahead = track.path.rate(next(iter(track.sightings.values())).seen_s)[:2]
+    ahead = Body(track, shape).pointing(next(iter(track.sightings.values())).seen_s)
     found, bodies = [], []
     for j, own in track.claimed.items():
         c = standing[j]
