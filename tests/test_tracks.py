@@ -208,6 +208,29 @@ def test_the_ground_rises_under_a_track():
         assert rise_m == pytest.approx(0.1 * dx, abs=0.005)
 
 
+@pytest.mark.parametrize(
+    ("looks", "told", "num_seen", "proven"),
+    [
+        ((18, 0, 600), ((0, 0), (0, 18)), 10, True),  # a car far away, behind which there is sky
+        ((18, 0, 600), ((1, 0), (0, 18)), 10, False),  # something stands where it was
+        ((18, 0, 600), ((0, 0), (0, 7)), 10, False),
+        ((18, 0, 600), ((0, 0), (0, 18)), 4, False),  # for a third of a second
+        ((7, 0, 600), ((0, 0), (0, 18)), 10, False),
+        ((18, 0, 2000), ((0, 0), (0, 18)), 10, False),  # of a hundred looks not one
+        ((96, 20, 1480), ((0, 6), (0, 5)), 10, True),  # limbs of a walker
+        ((96, 20, 1480), ((1, 6), (0, 5)), 10, False),
+        ((96, 40, 1480), ((0, 6), (0, 5)), 10, False),
+    ],
+)
+def test_less_proves_where_nothing_was_ever_seen_before_or_after(looks, told, num_seen, proven):
+    track = followed(lambda n: [0.9 * n, 0, 0, 0], num_seen, [60.0, 0, 0], 8)
+    clock = SimpleNamespace(time_s=0.1 * np.arange(11))
+    space = SimpleNamespace(
+        gap_m=lambda *_: 0.1, clock=clock, sensors=SimpleNamespace(scattered=False)
+    )
+    assert is_proven(track, space, looks, told) == proven
+
+
 def test_a_short_way_far_from_the_scanner_proves_nothing():
     """Three places on a line may be chance where rings are a metre apart: a tree's leaves."""
     track = followed(lambda n: [0.24 * n, 0, 0, 0], 3, [44.0, 0, 0], 8)

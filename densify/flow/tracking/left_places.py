@@ -23,6 +23,7 @@ _MOSTLY = 2  # times as often taken as empty: what stands is there nearly always
 # So many empty places tell, and of what goes far so many on one side; taken as often as empty.
 _LEAST, _MANY = 20, 100
 _SELDOM, _HARDLY = 0.03, 0.1
+_SOME = 8  # empty places tell, if none is taken
 
 
 class Places(NamedTuple):
@@ -62,9 +63,13 @@ class LeftPlaces(NamedTuple):
         """Whether something certainly stands at those before or at those after."""
         return any(p.taken > _MOSTLY * p.empty for p in self)
 
+    def none_taken(self) -> bool:
+        """Whether some are empty and nothing at all was seen at any."""
+        return self.both.taken == 0 and self.both.empty >= _SOME
+
     def bare(self, far: bool) -> bool:
-        """Whether nothing was seen at any of them: so they are of nothing that stands. far: it goes
-        so far that many places on one side tell enough."""
+        """Whether next to nothing was seen at any of them: so they are of nothing that stands. far:
+        it goes so far that many places on one side tell enough."""
         return (far and self.both.bare(_MANY)) or all(p.bare(_LEAST) for p in self)
 
     def mostly_bare(self) -> bool:

@@ -31,6 +31,7 @@ _STRAY = 0.005  # so few of all looks are echoes at an object's rim
 _MAX_CONTRADICTIONS, _MAX_OF_LIMBS, _FAR_M = 0.3, 0.5, 3.0
 # They are so many, or of few looks this share, and of many at least that one.
 _LEAST_CONTRADICTIONS, _SHARE_OF_FEW, _LEAST_SHARE = 20, 0.08, 0.01
+_LEAST_OF_BARE = 8  # are enough if nothing was ever seen at its places before or after
 _ALONG = np.cos(np.deg2rad(45))
 _AS_FAST, _RAIL_M, _SLENDER, _SHARE_OF_RAIL = 0.1, 2.0, 8.0, 0.3
 
@@ -60,9 +61,13 @@ def left_contradicted(
         return None
     still, moved, num_asked = contradictions(track, standing, space)
     least = min(_LEAST_CONTRADICTIONS, _SHARE_OF_FEW * num_asked)
-    if still < max(least, _LEAST_SHARE * num_asked) or moved > _MAX_OF_LIMBS * still:
+    least_of_bare = max(min(least, _LEAST_OF_BARE), _LEAST_SHARE * num_asked)
+    if still < least_of_bare or moved > _MAX_OF_LIMBS * still:
         return None
     left = left_places(track, standing, space, proven)
+    none_taken = seen_s >= _SHORT_S and left.none_taken()
+    if still < max(least, _LEAST_SHARE * num_asked) and not none_taken:
+        return None
     if left.still_there() or (over_m > 0 and not left.mostly_bare()):
         return None
     # What never left its place may be a ring that glides over a bonnet: only contradictions tell.
@@ -73,7 +78,7 @@ def left_contradicted(
         return None
     few, mostly_bare = still < _FEW * num_asked, left.mostly_bare()
     # Where something is still there, few contradictions of which many are left prove nothing.
-    if few and not mostly_bare and moved > _MAX_OF_FEW * still:
+    if few and not (mostly_bare or none_taken) and moved > _MAX_OF_FEW * still:
         return None
     short_s = _SHORT_OF_FEW_S if few else _SHORT_S
     if moved > max(_most_of_short(left) * still, _STRAY * num_asked):
