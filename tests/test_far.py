@@ -4,6 +4,7 @@ what must not be."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -17,8 +18,10 @@ from densify.geometry import poses
 from densify.kernels.clouds import thinned
 from densify.readers.timeline import Timeline
 from densify.recording import Recording
+from densify.registration import chain
 from densify.registration.chain import follow
 from densify.scores.depth_metrics import depth_scores
+from densify.types import RegisteredSweep
 from tests.scenes import CAMERA, Arc, Scanner, Scene, TinySequence, World, car, street
 
 KEY, WINDOW, NUM_FRAMES = 15, 2, 36
@@ -176,6 +179,19 @@ def test_the_chain_finds_the_true_poses(side):
         assert np.rad2deg(np.linalg.norm(error[:3])) < 0.1, sweep.frame
     again = found()
     assert all(a[1].tobytes() == b[1].tobytes() for a, b in zip(first, again, strict=True))
+
+
+@pytest.mark.parametrize(("period_s", "num_known"), [(0.05, 12), (0.1, 6), (0.2, 3)])
+def test_the_chain_begins_with_half_a_second_at_any_rate(period_s, num_known, monkeypatch):
+    inserted = []
+    monkeypatch.setattr(chain.SurfaceMap, "insert", lambda _, surface, T: inserted.append(T[0, 3]))
+    raw, known = drive()[KEY], []
+    for i in range(20):
+        sweep = replace(raw, stamp_ns=round(period_s * i * 1e9))
+        T_world_lidar = poses.exp(np.array([0, 0, 0, float(i), 0, 0]))
+        known.append(RegisteredSweep(sweep, T_world_lidar, np.zeros(6), np.zeros(6)))
+    list(follow(known, [], np.zeros(0, np.int64), *(None, None, 12.0, 2.0), resolve(None).register))
+    assert inserted == list(range(20 - num_known, 20))
 
 
 def whole(folder, settings=FAR) -> Recording:

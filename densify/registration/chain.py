@@ -15,7 +15,7 @@ from densify.registration.deskew import placed
 from densify.types import Float, Int, RegisteredSweep, Sweep
 
 _MATCH_M = 2.0
-_NUM_KNOWN = 6  # sweeps of the window that the map starts with
+_KNOWN_NS = 550_000_000  # the sweeps of the window within it make the map to begin with
 _LONGEST_GAP_S = 0.4  # between two sweeps of the chain
 _TOGETHER = 6  # sweeps that are chosen at the same speed
 _MAX_ACCELERATION_M_S2, _POSE_NOISE_M = 30.0, 0.5
@@ -70,7 +70,7 @@ class _End:
         self, known: Sequence[RegisteredSweep], backwards: bool, settings: RegisterSettings
     ) -> None:
         self._settings, self._map, last = settings, SurfaceMap(), known[-1]
-        for s in known[-_NUM_KNOWN:]:
+        for s in (s for s in known if abs(s.sweep.stamp_ns - last.sweep.stamp_ns) <= _KNOWN_NS):
             self._map.insert(Surface.of(subsample(s.sweep).points), s.T_world_lidar)
         self.T_world_lidar, self.stamp_ns = last.T_world_lidar, last.sweep.stamp_ns
         self.twist = last.twist_before if backwards else last.twist_after
