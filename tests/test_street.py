@@ -298,7 +298,7 @@ def test_each_ray_meets_a_moving_body_where_it_is_then():
     at = hits.range_m[:, None] * direction
     on_face = np.abs(y - 10 * times) < 1 - 1e-6
     np.testing.assert_allclose(at[on_face, 0], 9.0, atol=1e-9)
-    assert np.all(world.body[hits.triangle[on_face]] == 1)
+    assert np.all(world.triangles.body[hits.triangle[on_face]] == 1)
     far = np.abs(y - 10 * times) > 1 + 0.3  # its side faces are seen close by
     np.testing.assert_allclose(at[far, 0], 29.0, atol=1e-9)
 

@@ -32,6 +32,26 @@ class Stops(NamedTuple):
     normal: Float
 
 
+@Kernel
+def pass_by(origin, direction, spread, centre, radius_m, passes):  # type: ignore[no-untyped-def]
+    """passes: (B,N), filled: whether rays pass each of B balls, or begin in it.
+
+    origin, direction: (3,N) of the rays. spread: rad to either side that count as the same ray.
+    centre: (B,3). radius_m: (B,).
+    """
+    for b in range(len(centre)):
+        for n in range(origin.shape[1]):
+            x, y, z = (
+                centre[b, 0] - origin[0, n],
+                centre[b, 1] - origin[1, n],
+                centre[b, 2] - origin[2, n],
+            )
+            along = x * direction[0, n] + y * direction[1, n] + z * direction[2, n]
+            reach_m = radius_m[b] + spread * abs(along)
+            is_near = x * x + y * y + z * z - along * along < reach_m * reach_m
+            passes[b, n] = is_near & (along > -reach_m)
+
+
 @inlined
 def _dot(x, y, z, a, i):  # type: ignore[no-untyped-def]
     # In the order in which numpy's einsum adds three with AVX-512: streets keep their bytes.

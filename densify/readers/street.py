@@ -176,7 +176,7 @@ class Street:
         wanted |= {f"{self._swept}/sweep/{frame}": partial(self.returns, frame) for frame in frames}
         missing = [make for name, make in wanted.items() if name not in self._store]
         if missing:
-            _ = self.simulator.scene  # else each thread might build one
+            _ = self.simulator.scene.world.triangles  # else each thread might make them
             with ThreadPoolExecutor(num_threads()) as pool:
                 for made in [pool.submit(make) for make in missing]:
                     made.result()

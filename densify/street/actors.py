@@ -239,11 +239,12 @@ def walker(motion: Driving, instance: int, rng: np.random.Generator) -> Actor:
     hair = (0.25 * rng.random(), 0.18 * rng.random(), 0.1 * rng.random())
     swing, stride = 0.50, 1.45
     bodies = [Body(Mesh.join(_upper_body(hip, cloth, hair)), motion, instance)]
+    leg_mesh, arm_mesh = _leg(hip - 0.06, 0.085, trousers), _arm(cloth)
     for side, phase in ((1, 0.0), (-1, np.pi)):
         leg = Limb(motion, (0.0, 0.10 * side, hip), swing, stride, phase)
         arm = Limb(motion, (0.0, 0.25 * side, hip + 0.50), 0.8 * swing, stride, phase + np.pi)
-        bodies.append(Body(_leg(hip - 0.06, 0.085, trousers), leg, instance))
-        bodies.append(Body(_arm(cloth), arm, instance))
+        bodies.append(Body(leg_mesh, leg, instance))
+        bodies.append(Body(arm_mesh, arm, instance))
     return Actor("walker", tuple(bodies))
 
 

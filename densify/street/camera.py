@@ -64,7 +64,7 @@ def expose(world: World, ego: Driving, camera: Camera, time_s: float) -> Picture
     body = np.full(h * w, -1, np.int32)
     image[seen] = np.rint(255 * np.clip(colour, 0, 1) ** (1 / 2.2)).astype(np.uint8)
     depth[seen] = np.where(solid, depth_m, 0.0)
-    body[seen] = np.where(hits.triangle >= 0, world.body[hits.triangle], -1)
+    body[seen] = np.where(hits.triangle >= 0, world.triangles.body[hits.triangle], -1)
     return Picture(image.reshape(h, w, 3), depth.reshape(h, w), body.reshape(h, w))
 
 
@@ -81,7 +81,9 @@ def _in_world(ego: Driving, camera: Camera, ray: Float, time_s: float, row: Floa
 
 
 def _is_glass(world: World, hits: Hits) -> Bool:
-    is_glass: Bool = (hits.triangle >= 0) & (world.material[hits.triangle] == Material.GLASS)
+    is_glass: Bool = (hits.triangle >= 0) & (
+        world.triangles.material[hits.triangle] == Material.GLASS
+    )
     return is_glass
 
 
@@ -90,11 +92,13 @@ def _colours(world: World, rays: Rays, hits: Hits) -> Float:
     colour = _sky(rays.direction)
     rows = np.flatnonzero(hits.triangle >= 0)
     triangle = hits.triangle[rows]
-    material = world.material[triangle]
+    material = world.triangles.material[triangle]
     a, b = hits.barycentric[rows, 0, None], hits.barycentric[rows, 1, None]
-    uv = world.uv[triangle]
+    uv = world.triangles.uv[triangle]
     at = uv[:, 0] * (1 - a - b) + uv[:, 1] * a + uv[:, 2] * b
-    painted = COLOUR[material] * world.tint[triangle] * shade_factor(material, at)[:, None]
+    painted = (
+        COLOUR[material] * world.triangles.tint[triangle] * shade_factor(material, at)[:, None]
+    )
     direction = rays.direction[rows]
     normal = hits.normal[rows]
     facing = np.einsum("ni,ni->n", normal, direction)

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -32,6 +33,7 @@ from densify.street.motion import Driving, Still
 from densify.street.scenery import Scenery
 from densify.street.terrain import Ground
 from densify.street.world import Body, World
+from densify.types import Float
 
 DURATION_S = 16
 MEETING_S = 12.0  # when the cast is around the ego vehicle
@@ -64,7 +66,7 @@ class Traffic:
         self._rng = rng
         self._times = np.arange(SPAN_S[0], SPAN_S[1], 0.1)
         self._standing = Rectangles.stack(scenery.footprints)
-        self._moving = [Rectangles.moving(EGO_BOX, ego, self._times, 0.2)]
+        self._moving = Rectangles.moving(EGO_BOX, ego, self._times, 0.2)[None]
 
     def add(self, recipe: Recipe) -> None:
         """recipe: draws an actor; drawn again until one fits, and left out if none does."""
@@ -73,14 +75,14 @@ class Traffic:
             new = tracks(actor, self._times)
             if not any(self._meets(track) for track in new):
                 self.actors.append(actor)
-                self._moving += new
+                self._moving = Rectangles.joined([self._moving, *(track[None] for track in new)])
                 return
 
     def _meets(self, track: Rectangles) -> bool:
-        if any(overlap(track, other).any() for other in self._moving):
+        if overlap(track, self._moving).any():
             return True
-        away = self._standing.centre - track.centre[:, None]
-        time, which = np.nonzero((away**2).sum(axis=-1) < _NEAR_M**2)
+        x, y = (self._standing.centre[:, i] - track.centre[:, i, None] for i in (0, 1))
+        time, which = np.nonzero(x * x + y * y < _NEAR_M**2)
         return bool(overlap(track[time], self._standing[which]).any())
 
     @property
@@ -133,14 +135,29 @@ class Ways:
         def recipe(rng: np.random.Generator) -> Actor:
             lane = Lane(road, rng.uniform(*offset_m), forward)
             at = lane.at(station_m + rng.uniform(-slack_m, slack_m))
-            from_kerb = self.ground.distance(lane.curve(lane.curve.knots_m))
-            lift_m = self.ground.kerb_m * np.clip(from_kerb / 0.25, 0, 1)
             speed = Speed((0.0, rng.uniform(1.1, 1.6)))
             way = Driving(lane.curve, speed, at, MEETING_S, self.ground.terrain, WALKER_BASE_M,
-                          (lane.curve.knots_m, lift_m), upright=True)  # fmt: skip
+                          _Kerbs(self.ground, lane.curve), upright=True)  # fmt: skip
             return walker(way, self.traffic.next_instance, rng)
 
         self.traffic.add(recipe)
+
+
+@dataclass(frozen=True)
+class _Kerbs:
+    """How much higher than the road one walks along a curve; worked out for whoever stays."""
+
+    ground: Ground
+    curve: Curve
+
+    @cached_property
+    def _height_m(self) -> Float:
+        """Heights at the curve's knots."""
+        from_kerb = self.ground.distance(self.curve(self.curve.knots_m))
+        return self.ground.kerb_m * np.clip(from_kerb / 0.25, 0, 1)
+
+    def __call__(self, station_m: Float) -> Float:
+        return np.interp(station_m, self.curve.knots_m, self._height_m)
 
 
 def assemble(scenery: Scenery, parts: Sequence[Mesh], ego: Driving, traffic: Traffic) -> Scene:

@@ -43,7 +43,8 @@ class Curve:
     def tangent(self, station_m: Float) -> Float:
         """(N,) -> (N,2) unit direction of travel."""
         slope = self._slope(np.clip(station_m, 0.0, self.length_m))
-        unit: Float = slope / np.linalg.norm(slope, axis=-1, keepdims=True)
+        squared = slope * slope  # quicker than np.linalg.norm
+        unit: Float = slope / np.sqrt(squared[..., :1] + squared[..., 1:])
         return unit
 
     def normal(self, station_m: Float) -> Float:

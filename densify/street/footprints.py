@@ -10,7 +10,7 @@ import numpy as np
 
 from densify.street.actors import Actor
 from densify.street.mesh import Mesh
-from densify.street.motion import Trajectory
+from densify.street.motion import Driving, Trajectory
 from densify.types import Bool, Float, Int
 
 
@@ -51,7 +51,13 @@ class Rectangles:
         columns = ((r.centre, r.forward, r.half_m) for r in single)
         return Rectangles(*(np.array(c).reshape(-1, 2) for c in zip(*columns, strict=True)))
 
-    def __getitem__(self, rows: Int) -> Rectangles:
+    @staticmethod
+    def joined(parts: Sequence[Rectangles]) -> Rectangles:
+        """All of them, along the first axis."""
+        columns = ((p.centre, p.forward, p.half_m) for p in parts)
+        return Rectangles(*(np.concatenate(c) for c in zip(*columns, strict=True)))
+
+    def __getitem__(self, rows: Int | None) -> Rectangles:
         return Rectangles(self.centre[rows], self.forward[rows], self.half_m[rows])
 
 
@@ -70,9 +76,13 @@ def overlap(a: Rectangles, b: Rectangles) -> Bool:
 def tracks(actor: Actor, times_s: Float) -> list[Rectangles]:
     """(T,) rectangles of each solid body of an actor; swinging limbs get room."""
     slack_m = 0.3 if len(actor.bodies) > actor.num_solid else 0.1
+    ways = (
+        b.trajectory.from_above() if isinstance(b.trajectory, Driving) else b.trajectory
+        for b in actor.bodies
+    )
     return [
-        Rectangles.moving(b.mesh, b.trajectory, times_s, slack_m)
-        for b in actor.bodies[: actor.num_solid]
+        Rectangles.moving(b.mesh, way, times_s, slack_m)
+        for b, way in zip(actor.bodies[: actor.num_solid], ways, strict=False)
     ]
 
 
@@ -83,4 +93,7 @@ def _dot(a: Float, b: Float) -> Float:
 
 
 def _left(forward: Float) -> Float:
-    return np.stack([-forward[..., 1], forward[..., 0]], axis=-1)
+    left = np.empty(forward.shape)
+    np.negative(forward[..., 1], out=left[..., 0])
+    left[..., 1] = forward[..., 0]
+    return left

@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from densify.geometry.poses import rotate, transform
 from densify.street.materials import LASER_PASSES, REFLECTIVITY
+from densify.street.mesh import across, lengths
 from densify.street.motion import Driving, poses_at
 from densify.street.sensors import Sensor, firings
 from densify.street.world import Hits, Rays, World
@@ -79,8 +80,10 @@ def scan(
     beams = Rays(origin, spot[0], times)
     echoes = world.cast_bundle(beams, spot, LASER_PASSES, lucks, spread=2 * _SPOT_RAD)
     range_m, hit, edge = _echo(echoes, spot, rng)
-    surface = world.material[hit.triangle]
-    reflectivity = REFLECTIVITY[surface] * (0.6 + 0.4 * world.tint[hit.triangle].mean(axis=1))
+    surface = world.triangles.material[hit.triangle]
+    reflectivity = REFLECTIVITY[surface] * (
+        0.6 + 0.4 * world.triangles.tint[hit.triangle].mean(axis=1)
+    )
     grazing = np.abs(np.einsum("ni,ni->n", hit.normal, spot[0]))
     signal = reflectivity * np.sqrt(grazing) * (60.0 / np.maximum(range_m, 5.0)) ** 2
     heard = 0.995 * (1 - np.exp(-8.0 * signal)) * np.where(edge, 0.85, 1.0)
@@ -93,7 +96,7 @@ def scan(
     origin_m = sensor.origins_m[fired.lidar]
     np.add(points, origin_m, out=points, where=origin_m != 0)  # a coordinate of -0.0 stays one
     brightness = reflectivity * (0.35 + 0.65 * grazing) * (1 + 0.05 * rng.normal(size=n))
-    body = world.body[hit.triangle[keep]]
+    body = world.triangles.body[hit.triangle[keep]]
     radial_m_s = None
     if sensor.measures_velocity:
         sigmas_m_s = [scanner.velocity_sigma_m_s for scanner in sensor.scanners]
@@ -109,7 +112,7 @@ def scan(
         fired.offset_ns[keep],
         fired.lidar[keep],
         body,
-        world.instance[hit.triangle[keep]],
+        world.triangles.instance[hit.triangle[keep]],
         radial_m_s,
     )
 
@@ -144,12 +147,12 @@ def at_offsets(time_s: float, offset_ns: Int) -> Float:
 def _spot(direction: Float) -> list[Float]:
     """(N,3) beams -> the rays of each beam's spot: its centre, then four around it."""
     level = np.stack([-direction[:, 1], direction[:, 0], np.zeros(len(direction))], axis=1)
-    level /= np.linalg.norm(level, axis=1, keepdims=True)
-    across = np.cross(direction, level)
+    level /= lengths(level)
+    upward = across(direction, level)
     rays = [direction]
     for a, b in ((1, 1), (1, -1), (-1, 1), (-1, -1)):
-        ray = direction + _SPOT_RAD * (a * level + b * across)
-        rays.append(ray / np.linalg.norm(ray, axis=1, keepdims=True))
+        ray = direction + _SPOT_RAD * (a * level + b * upward)
+        rays.append(ray / lengths(ray))
     return rays
 
 

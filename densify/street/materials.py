@@ -9,6 +9,7 @@ from enum import IntEnum
 
 import numpy as np
 
+from densify.kernels import texture
 from densify.types import Float, Int
 
 
@@ -70,24 +71,16 @@ GLASS_PASSES: Float = np.where(np.arange(len(Material)) == Material.GLASS, 1.0, 
 
 def noise(cell: Int) -> Float:
     """(N,2) integers -> (N,) repeatable random numbers in [0, 1)."""
-    h = cell[:, 0].astype(np.uint64) * np.uint64(0x9E3779B97F4A7C15)
-    h ^= cell[:, 1].astype(np.uint64) * np.uint64(0xC2B2AE3D27D4EB4F)
-    h ^= h >> np.uint64(29)
-    h *= np.uint64(0xBF58476D1CE4E5B9)
-    h ^= h >> np.uint64(32)
-    return (h >> np.uint64(11)).astype(np.float64) / 2.0**53
+    number = np.empty(len(cell))
+    texture.of_cells(cell, number)
+    return number
 
 
 def smooth_noise(uv: Float, cell_m: float) -> Float:
     """(N,2) -> (N,) in [0, 1), smooth over cells of that size."""
-    scaled = uv / cell_m
-    base = np.floor(scaled).astype(np.int64)
-    f = scaled - base
-    f = f * f * (3 - 2 * f)
-    n00, n10, n01, n11 = (noise(base + d) for d in ([0, 0], [1, 0], [0, 1], [1, 1]))
-    low, high = n00 + (n10 - n00) * f[:, 0], n01 + (n11 - n01) * f[:, 0]
-    value: Float = low + (high - low) * f[:, 1]
-    return value
+    number = np.empty(len(uv))
+    texture.between_cells(uv, cell_m, number)
+    return number
 
 
 def _courses(uv: Float, length_m: float, height_m: float, joint_m: float) -> tuple[Float, Float]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cache, cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,14 +15,18 @@ from densify.types import Float
 
 Tint = tuple[float, float, float]
 WHITE: Tint = (1.0, 1.0, 1.0)
-_BOX_FACES = (
-    ((0, 0, 0), (1, 0, 0), (1, 0, 1), (0, 0, 1)),
-    ((1, 0, 0), (1, 1, 0), (1, 1, 1), (1, 0, 1)),
-    ((1, 1, 0), (0, 1, 0), (0, 1, 1), (1, 1, 1)),
-    ((0, 1, 0), (0, 0, 0), (0, 0, 1), (0, 1, 1)),
-    ((0, 1, 0), (1, 1, 0), (1, 0, 0), (0, 0, 0)),
-    ((0, 0, 1), (1, 0, 1), (1, 1, 1), (0, 1, 1)),
+_IS_HIGH = np.array(  # (6,4,3) of a box's corners, side by side
+    (
+        ((0, 0, 0), (1, 0, 0), (1, 0, 1), (0, 0, 1)),
+        ((1, 0, 0), (1, 1, 0), (1, 1, 1), (1, 0, 1)),
+        ((1, 1, 0), (0, 1, 0), (0, 1, 1), (1, 1, 1)),
+        ((0, 1, 0), (0, 0, 0), (0, 0, 1), (0, 1, 1)),
+        ((0, 1, 0), (1, 1, 0), (1, 0, 0), (0, 0, 0)),
+        ((0, 0, 1), (1, 0, 1), (1, 1, 1), (0, 1, 1)),
+    ),
+    bool,
 )
+_HALVES = np.array([0, 1, 2, 0, 2, 3])  # the triangles of a quad
 
 
 @dataclass(frozen=True)
@@ -54,21 +59,20 @@ class Mesh:
         """(K,4,3) corners in order round each quad; uv are metres along its first side and away
         from it."""
         k = len(corners)
-        first = np.arange(k)[:, None] * 4
-        triangles = np.concatenate([first + [0, 1, 2], first + [0, 2, 3]], axis=1).reshape(-1, 3)
+        axes = np.empty((k, 2, 3))  # along the first side, and away from it
         side = corners[:, 1] - corners[:, 0]
-        along = side / np.maximum(np.linalg.norm(side, axis=1, keepdims=True), 1e-9)
+        along = np.divide(side, np.maximum(lengths(side), 1e-9), out=axes[:, 0])
         away = corners[:, 3] - corners[:, 0]
         up = away - np.einsum("ki,ki->k", away, along)[:, None] * along
-        up /= np.maximum(np.linalg.norm(up, axis=1, keepdims=True), 1e-9)
-        uv = np.einsum("kci,kai->kca", corners, np.stack([along, up], axis=1))
-        tints = np.broadcast_to(np.asarray(tint, float), (k, 3))
+        np.divide(up, np.maximum(lengths(up), 1e-9), out=axes[:, 1])
+        tints = np.empty((k, 2, 3))
+        tints[:] = np.asarray(tint, float).reshape(-1, 1, 3)
         return Mesh(
             corners.reshape(-1, 3),
-            triangles,
-            uv.reshape(-1, 2),
+            (np.arange(0, 4 * k, 4)[:, None] + _HALVES).reshape(-1, 3),
+            np.einsum("kci,kai->kca", corners, axes).reshape(-1, 2),
             np.full(2 * k, material, np.int16),
-            np.repeat(tints, 2, axis=0),
+            tints.reshape(-1, 3),
             np.full(2 * k, -1, np.int32),
         )
 
@@ -87,10 +91,12 @@ class Mesh:
     def of_instance(self, instance: int) -> Mesh:
         return replace(self, instance=np.full(len(self.triangles), instance, np.int32))
 
-    @property
+    @cached_property
     def bounds(self) -> tuple[Float, Float]:
         """Lowest and highest corner, (3,) each."""
-        return self.vertices.min(axis=0), self.vertices.max(axis=0)
+        # Column by column, which is quicker than along an axis of the whole.
+        low, high = zip(*((c.min(), c.max()) for c in self.vertices.T), strict=True)
+        return np.array(low), np.array(high)
 
 
 def box(
@@ -105,8 +111,7 @@ def boxes(
 ) -> Mesh:
     """Upright boxes, each between its lowest and its highest corner."""
     span = np.array(spans, float).reshape(-1, 2, 3)
-    which = np.array(_BOX_FACES)  # (6,4,3) of 0 low, 1 high
-    faces = np.where(which[None] == 1, span[:, None, None, 1], span[:, None, None, 0])
+    faces = np.where(_IS_HIGH, span[:, None, None, 1], span[:, None, None, 0])
     return Mesh.quads(faces.reshape(-1, 4, 3), material, tint)
 
 
@@ -145,20 +150,40 @@ def tube(
     radii = radius_m if isinstance(radius_m, tuple) else (radius_m, radius_m)
     axis = (b - a) / np.linalg.norm(b - a)
     helper = np.array([0.0, 0.0, 1.0]) if abs(axis[2]) < 0.9 else np.array([1.0, 0.0, 0.0])
-    u = np.cross(helper, axis)
+    u = across(helper, axis)
     u /= np.linalg.norm(u)
-    v = np.cross(axis, u)
-    angle = 2 * np.pi * np.arange(num_sides) / num_sides
-    ring = np.cos(angle)[:, None] * u + np.sin(angle)[:, None] * v
+    v = across(axis, u)
+    cos, sin, after = _circle(num_sides)
+    ring = cos * u + sin * v
     low, high = a + radii[0] * ring, b + radii[1] * ring
-    after = np.roll(np.arange(num_sides), -1)
-    sides = np.stack([low, low[after], high[after], high], axis=1)
-    centre_a, centre_b = (np.broadcast_to(c, low.shape) for c in (a, b))
-    caps = [
-        np.stack([centre_a, low[after], low, centre_a], axis=1),
-        np.stack([centre_b, high, high[after], centre_b], axis=1),
-    ]
-    return Mesh.quads(np.concatenate([sides, *caps]), material, tint)
+    around = (low, low[after], high[after], high)
+    caps = ((a, around[1], low, a), (b, high, around[2], b))
+    corners = np.empty((3, num_sides, 4, 3))
+    for part, quads in zip(corners, (around, *caps), strict=True):
+        for i, corner in enumerate(quads):
+            part[:, i] = corner
+    return Mesh.quads(corners.reshape(-1, 4, 3), material, tint)
+
+
+@cache
+def _circle(num_sides: int) -> tuple[Float, Float, NDArray[np.int64]]:
+    """Cosines and sines (N,1) around it, and which corner comes after each (N,)."""
+    angle = 2 * np.pi * np.arange(num_sides)[:, None] / num_sides
+    return np.cos(angle), np.sin(angle), np.roll(np.arange(num_sides), -1)
+
+
+def across(a: Float, b: Float) -> Float:
+    """(...,3) each -> (...,3) their cross products; quicker than np.cross."""
+    product = np.empty(a.shape)
+    for axis, (i, j) in enumerate(((1, 2), (2, 0), (0, 1))):
+        np.subtract(a[..., i] * b[..., j], a[..., j] * b[..., i], out=product[..., axis])
+    return product
+
+
+def lengths(vectors: Float) -> Float:
+    """(N,3) -> (N,1); quicker than np.linalg.norm."""
+    squared = vectors * vectors
+    return np.sqrt(squared[:, :1] + squared[:, 1:2] + squared[:, 2:])
 
 
 def ball(
@@ -178,9 +203,9 @@ def leaves(centres: Float, size_m: float, rng: np.random.Generator, tint: Tint =
     """(K,3) -> a square leaf (a bunch of them) at each centre, turned at random."""
     k = len(centres)
     u = rng.normal(size=(k, 3))
-    u /= np.linalg.norm(u, axis=1, keepdims=True)
-    v = np.cross(u, rng.normal(size=(k, 3)))
-    v /= np.linalg.norm(v, axis=1, keepdims=True)
+    u /= lengths(u)
+    v = across(u, rng.normal(size=(k, 3)))
+    v /= lengths(v)
     half = (size_m * rng.uniform(0.35, 0.65, k))[:, None]
     corners = [centres + half * (i * u + j * v) for i, j in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
     tints = np.asarray(tint) * rng.uniform(0.65, 1.35, (k, 1))

@@ -3,7 +3,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -11,6 +12,7 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
 from densify.street.curves import Curve, Speed
+from densify.street.mesh import across, lengths
 from densify.street.terrain import Terrain
 from densify.types import Float, Int
 
@@ -76,8 +78,8 @@ class Driving:
 
     curve, speed: the way, and how fast along it. station_m: arc length at time ``at_s``.
     wheelbase_m: distance of the two points that touch the curve; the body's origin is the middle
-    between them, x forward, z up. lift_m: stations (K,) and heights (K,) above the bare ground.
-    upright: stands vertical whatever the slope, as walkers do.
+    between them, x forward, z up. lift_m: stations (N,) -> heights (N,) above the bare ground, none
+    if None. upright: stands vertical whatever the slope, as walkers do.
     """
 
     curve: Curve
@@ -86,7 +88,7 @@ class Driving:
     at_s: float
     terrain: Terrain
     wheelbase_m: float
-    lift_m: tuple[Float, Float] = (np.zeros(1), np.zeros(1))
+    lift_m: Callable[[Float], Float] | None = None
     upright: bool = False
 
     def station(self, times_s: Float) -> Float:
@@ -98,8 +100,12 @@ class Driving:
         station = self.station(times_s)
         half = self.wheelbase_m / 2
         rear, front = self.curve(station - half), self.curve(station + half)
-        lift = np.interp(station, *self.lift_m)
+        lift = np.zeros(len(station)) if self.lift_m is None else self.lift_m(station)
         return on_ground(self.terrain, rear, front, lift, self.upright)
+
+    def from_above(self) -> Driving:
+        """One that is at the same places of a map, where heights do not matter."""
+        return replace(self, lift_m=None) if self.upright else self
 
 
 def on_ground(
@@ -109,16 +115,18 @@ def on_ground(
     a = np.column_stack([rear, terrain.height(rear) + lift_m])
     b = np.column_stack([front, terrain.height(front) + lift_m])
     middle = (a + b) / 2
+    forward, up = b - a, np.zeros(a.shape)
+    up[:, 2] = 1.0
     if upright:
-        forward = np.column_stack([front - rear, np.zeros(len(rear))])
-        up = np.broadcast_to([0.0, 0.0, 1.0], forward.shape)
+        forward[:, 2] = 0.0
     else:
-        forward = b - a
-        up = np.column_stack([-terrain.slope(middle[:, :2]), np.ones(len(rear))])
-    x = forward / np.linalg.norm(forward, axis=1, keepdims=True)
-    y = np.cross(up, x)
-    y /= np.linalg.norm(y, axis=1, keepdims=True)
-    return Poses(np.stack([x, y, np.cross(x, y)], axis=2), middle)
+        np.negative(terrain.slope(middle[:, :2]), out=up[:, :2])
+    axes = np.empty((len(rear), 3, 3))
+    x = np.divide(forward, lengths(forward), out=axes[:, :, 0])
+    y = across(up, x)
+    y = np.divide(y, lengths(y), out=axes[:, :, 1])
+    axes[:, :, 2] = across(x, y)
+    return Poses(axes, middle)
 
 
 class Towed:

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cache
 
 import numpy as np
 
@@ -49,12 +50,8 @@ class Scenery:
         """All footprints; only the new ones are stacked."""
         first = len(self._known.centre)
         if first < len(self.footprints):
-            known, new = self._known, Rectangles.stack(self.footprints[first:])
-            self._known = Rectangles(
-                np.concatenate([known.centre, new.centre]),
-                np.concatenate([known.forward, new.forward]),
-                np.concatenate([known.half_m, new.half_m]),
-            )
+            new = Rectangles.stack(self.footprints[first:])
+            self._known = Rectangles.joined([self._known, new])
         return self._known
 
     def put_if_free(self, mesh: Mesh, xy: Float, heading: float, kerb_gap_m: float) -> None:
@@ -179,6 +176,7 @@ def hedge(rng: np.random.Generator, height_m: float) -> Callable[[float], Mesh]:
 
 
 def wall(height_m: float, material: Material) -> Callable[[float], Mesh]:
+    @cache
     def panel(length_m: float) -> Mesh:
         half = length_m / 2 + 0.02
         top = box((-half, -0.16, height_m), (half, 0.16, height_m + 0.07), Material.CONCRETE)
@@ -188,6 +186,7 @@ def wall(height_m: float, material: Material) -> Callable[[float], Mesh]:
 
 
 def picket_fence(height_m: float, tint: tuple[float, float, float]) -> Callable[[float], Mesh]:
+    @cache
     def panel(length_m: float) -> Mesh:
         half = length_m / 2
         rails = [((-half, -0.02, z), (half, 0.02, z + 0.08))
@@ -200,6 +199,7 @@ def picket_fence(height_m: float, tint: tuple[float, float, float]) -> Callable[
     return panel
 
 
+@cache
 def guard_rail(length_m: float) -> Mesh:
     half = length_m / 2 + 0.02
     post = box((-0.05, -0.05, -0.3), (0.05, 0.05, 0.72), Material.METAL)
@@ -208,6 +208,7 @@ def guard_rail(length_m: float) -> Mesh:
     return Mesh.join([post, *beams])
 
 
+@cache
 def noise_barrier(length_m: float) -> Mesh:
     half = length_m / 2
     return Mesh.join(
@@ -218,6 +219,7 @@ def noise_barrier(length_m: float) -> Mesh:
     )
 
 
+@cache
 def lamp_post() -> Mesh:
     """The arm reaches out along -y."""
     return Mesh.join(
@@ -240,5 +242,6 @@ def sign_post(rng: np.random.Generator) -> Mesh:
     )
 
 
+@cache
 def litter_bin() -> Mesh:
     return tube((0, 0, 0.0), (0, 0, 0.9), (0.22, 0.25), Material.METAL, (0.45, 0.6, 0.45), 10)

@@ -24,7 +24,7 @@ PRESETS: dict[str, Callable[[np.random.Generator], Scene]] = {
 
 @lru_cache(maxsize=2)
 def build_scene(preset: str, seed: int) -> Scene:
-    """The same scene for the same preset and seed, always; it takes 2 to 3 s, and the last ones are
+    """The same scene for the same preset and seed, always; it takes 1 to 2 s, and the last ones are
     shared by all scanners and rates. Raises InputError for an unknown preset."""
     if preset not in PRESETS:
         raise InputError(

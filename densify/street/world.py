@@ -8,9 +8,9 @@ imports Embree.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -63,34 +63,47 @@ class Hits(NamedTuple):
         )
 
 
-class World:
-    """All bodies; body 0 stands still.
+class Triangles:
+    """Those of all bodies in a row: ``body[k]``, ``material[k]``, ``instance[k]``, ``corner[k]``,
+    ``normal[k]``, ``uv[k]`` and ``tint[k]`` belong to triangle k.
 
-    Concretely, ``body[k]``, ``material[k]``, ``instance[k]``, ``normal[k]``, ``uv[k]`` and
-    ``tint[k]`` belong to triangle k of all bodies' triangles in a row.
+    first: of each body. scenes: each body's as the ray caster has them. centre, radius_m: of a ball
+    around each.
     """
 
     def __init__(self, bodies: Sequence[Body]) -> None:
-        self.bodies = tuple(bodies)
-        meshes, corners, normals = zip(*(_solid(b.mesh) for b in self.bodies), strict=True)
+        meshes, corners, normals = zip(*(_solid(b.mesh) for b in bodies), strict=True)
         self.material = np.concatenate([m.material for m in meshes]).astype(np.int64)
         self.tint: Float = np.concatenate([m.tint for m in meshes])
         self.uv: Float = np.concatenate([m.uv[m.triangles] for m in meshes])
         self.instance = np.concatenate(
             [
                 np.full(len(m.triangles), b.instance, np.int32) if b.instance >= 0 else m.instance
-                for b, m in zip(self.bodies, meshes, strict=True)
+                for b, m in zip(bodies, meshes, strict=True)
             ]
         )
         counts = [len(m.triangles) for m in meshes]
         self.body = np.repeat(np.arange(len(meshes), dtype=np.int32), counts)
-        self._first = np.cumsum([0, *counts])
-        self._corner: Float = np.concatenate([c[:, 0] for c in corners])
+        self.first = np.cumsum([0, *counts])
+        self.corner: Float = np.concatenate([c[:, 0] for c in corners])
         self.normal: Float = np.concatenate(normals)
-        self._scenes = [_raycasting_scene(c) for c in corners]
+        self.scenes = [_raycasting_scene(c) for c in corners]
         low, high = zip(*(m.bounds for m in meshes), strict=True)
-        self._centre = (np.array(low) + np.array(high)) / 2
-        self._radius_m = np.linalg.norm(np.array(high) - np.array(low), axis=1) / 2
+        self.centre = (np.array(low) + np.array(high)) / 2
+        self.radius_m = np.linalg.norm(np.array(high) - np.array(low), axis=1) / 2
+
+
+class World:
+    """All bodies; body 0 stands still."""
+
+    def __init__(self, bodies: Sequence[Body]) -> None:
+        self.bodies = tuple(bodies)
+
+    @cached_property
+    def triangles(self) -> Triangles:
+        """Made when first asked for: poses need none, and they take a third of the time that a
+        scene takes."""
+        return Triangles(self.bodies)
 
     def cast(self, rays: Rays, passes: Float, luck: Float) -> Hits:
         """The first surface that stops each ray.
@@ -110,14 +123,15 @@ class World:
     ) -> list[Hits]:
         """`cast` for each of several sets of directions (N,3), which share origins and times and
         differ from the rays' own by at most ``spread`` rad."""
-        surfaces = casting.Surfaces(self._corner, self.normal, passes[self.material])
+        surfaces = casting.Surfaces(
+            self.triangles.corner, self.triangles.normal, passes[self.triangles.material]
+        )
         best = [
             self._cast_body(0, rays.origin, ray, surfaces, luck)
             for ray, luck in zip(directions, lucks, strict=True)
         ]
-        lines = _Lines.of(rays, spread)
-        for index, body in enumerate(self.bodies[1:], start=1):
-            rows = lines.near(*self._ball(index, rays.time_s))
+        for index, rows in enumerate(self._near(rays, spread), start=1):
+            body = self.bodies[index]
             if not len(rows):
                 continue
             still = isinstance(body.trajectory, Still)
@@ -141,12 +155,20 @@ class World:
     def poses(self, body: int, times_s: Float) -> Poses:
         return self.bodies[body].trajectory.poses(times_s)
 
-    def _ball(self, index: int, times_s: Float) -> tuple[Float, float]:
-        """Centre (3,) and radius of a sphere that holds the body at all times between these."""
-        ends_s = np.array([times_s.min(), times_s.max()])
-        ends = self.poses(index, ends_s).apply(np.broadcast_to(self._centre[index], (2, 3)))
-        moved_m = float(np.linalg.norm(ends[1] - ends[0]))
-        return ends.mean(axis=0), float(self._radius_m[index]) + 0.75 * moved_m + 0.1
+    def _near(self, rays: Rays, spread: float) -> Iterator[NDArray[np.int64]]:
+        """The rays that may meet each body but the first: those that pass, or begin in, a ball that
+        holds it at all of their times."""
+        if len(self.bodies) == 1:
+            return
+        ends_s = np.array([rays.time_s.min(), rays.time_s.max()])
+        around = [np.broadcast_to(centre, (2, 3)) for centre in self.triangles.centre[1:]]
+        ends = np.stack([self.poses(i, ends_s).apply(a) for i, a in enumerate(around, start=1)])
+        moved_m = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)
+        radius_m = self.triangles.radius_m[1:] + 0.75 * moved_m + 0.1
+        passes = np.empty((len(ends), len(rays.time_s)), bool)
+        origin, direction = rays.origin.T.copy(), rays.direction.T.copy()
+        casting.pass_by(origin, direction, spread, ends.mean(axis=1), radius_m, passes)
+        yield from map(np.flatnonzero, passes)
 
     def _cast_body(
         self, index: int, origin: Float, direction: Float, surfaces: casting.Surfaces, luck: Float
@@ -157,12 +179,12 @@ class World:
         for _ in range(_MAX_LAYERS):
             if not len(rows):
                 break
-            met = _first_hit(self._scenes[index], start, towards)
+            met = _first_hit(self.triangles.scenes[index], start, towards)
             goes_on = np.empty(len(rows), bool)
             casting.meet(
                 rows,
                 *met,
-                self._first[index],
+                self.triangles.first[index],
                 surfaces,
                 origin,
                 direction,
@@ -175,32 +197,6 @@ class World:
             towards = direction[rows]
             start = origin[rows] + begin[rows, None] * towards
         return hits
-
-
-class _Lines(NamedTuple):
-    """Rays, asked about many balls. origin, direction: (3,N). along: (N,) their product. squared:
-    (N,) of the origin. spread: rad to either side that count as the same ray."""
-
-    origin: Float
-    direction: Float
-    along: Float
-    squared: Float
-    spread: float
-
-    @staticmethod
-    def of(rays: Rays, spread: float) -> _Lines:
-        origin, direction = rays.origin.T.copy(), rays.direction.T.copy()
-        along, squared = (np.einsum("in,in->n", origin, a) for a in (direction, origin))
-        return _Lines(origin, direction, along, squared, spread)
-
-    def near(self, centre: Float, radius_m: float) -> NDArray[np.int64]:
-        """Rows of the rays that pass a ball, or begin in it."""
-        along = np.einsum("in,i->n", self.direction, centre)
-        along -= self.along
-        squared = np.einsum("in,i->n", self.origin, -2 * centre)
-        squared += self.squared + centre @ centre - along**2
-        reach_m = radius_m + self.spread * np.abs(along)
-        return np.flatnonzero((squared < reach_m**2) & (along > -reach_m))
 
 
 def _solid(mesh: Mesh) -> tuple[Mesh, Float, Float]:
