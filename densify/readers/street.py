@@ -16,7 +16,7 @@ import threading
 from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qsl
@@ -28,6 +28,7 @@ from densify.cache.folder import own_folder
 from densify.errors import InputError
 from densify.files.arrays import read_arrays
 from densify.kernels.threads import num_threads
+from densify.street.bodies import Bodies
 from densify.street.camera import Picture
 from densify.street.lidar import Returns
 from densify.street.rig import CAMERAS, USUAL, cameras_beside
@@ -93,6 +94,7 @@ class Street:
         self.cameras: Mapping[str, Camera] = cameras_beside(tilt_deg, cameras)
         self.truth = StreetTruth(self)
         self._store = _Store()
+        self._posed = _digest(f"{VERSION} {preset} {seed}{options}, with any sensor")
         self._swept = _digest(f"{VERSION} {preset} {seed} {sensor}{options}")
         self._pictured = _digest(f"{VERSION} {preset} {seed} {hz} Hz, with any sensor")
 
@@ -204,10 +206,16 @@ class Street:
         _choice("camera", camera, tuple(self.cameras))
         return self.simulator.image_stamps_ns(camera)
 
+    @cached_property
+    def bodies(self) -> Bodies:
+        """Where every body is at every frame's reference time, kept as frames are."""
+        name = f"{self._posed}/bodies"
+        return Bodies(**self._store.get(name, lambda: vars(self.simulator.bodies), is_frame=False))
+
     def T_world_lidar(self, frame: int) -> Float:
         """(4,4) true pose at the sweep's reference time."""
         self.check(frame)
-        return self.simulator.bodies.T_world_lidar[frame]
+        return self.bodies.T_world_lidar[frame]
 
     def check(self, frame: int) -> None:
         """Raises InputError for a frame that does not exist."""
@@ -227,7 +235,7 @@ class StreetTruth:
         returns = self._street.returns(frame)
         simulator = self._street.simulator
         points = simulator.in_bodies(frame, returns)
-        return simulator.bodies.sweep(frame, returns.body, returns.instance, points)
+        return self._street.bodies.sweep(frame, returns.body, returns.instance, points)
 
     def displacement(self, frame: int, target: int) -> Float:
         """(N,3), exactly 0 for everything that stands still between the two frames."""
@@ -235,7 +243,7 @@ class StreetTruth:
         returns = self._street.returns(frame)
         simulator = self._street.simulator
         points = simulator.in_bodies(frame, returns)
-        return simulator.bodies.displacement(frame, target, returns.body, points)
+        return self._street.bodies.displacement(frame, target, returns.body, points)
 
     def depth_m(self, camera: str, number: int) -> Float32:
         return self._street.picture(camera, number).depth_m
@@ -245,7 +253,7 @@ class StreetTruth:
         simulator, frames = self._street.simulator, self._street.frames
         since_ns = simulator.image_stamps_ns(camera)[number] - simulator.stamp_ns(0)
         frame = min(max(round(since_ns / simulator.period_ns), 0), frames[-1])
-        moving: Bool = (body >= 0) & simulator.bodies.moving[frame][body]
+        moving: Bool = (body >= 0) & self._street.bodies.moving[frame][body]
         return moving
 
 
@@ -278,33 +286,35 @@ class _Store:
         self._folder = own_folder("street")
         self._memory: OrderedDict[str, Arrays] = OrderedDict()
         self._lock = threading.Lock()
-        self._rendered = False
+        self._told = False
         self.on_disk = True
 
     def __contains__(self, name: str) -> bool:
         return name in self._memory or (self.on_disk and self._path(name).exists())
 
-    def get(self, name: str, make: Callable[[], Arrays]) -> Arrays:
-        """May be called by several threads, each for another name."""
+    def get(self, name: str, make: Callable[[], Arrays], is_frame: bool = True) -> Arrays:
+        """May be called by several threads, each for another name. is_frame: takes long to make,
+        which is said before the first."""
         with self._lock:
             arrays = self._memory.pop(name, None)
         if arrays is None:
-            arrays = self._read_or_make(name, make)
+            arrays = self._read_or_make(name, make, is_frame)
         with self._lock:
             self._memory[name] = arrays
             if len(self._memory) > _KEPT_IN_MEMORY:
                 self._memory.popitem(last=False)
         return arrays
 
-    def _read_or_make(self, name: str, make: Callable[[], Arrays]) -> Arrays:
+    def _read_or_make(self, name: str, make: Callable[[], Arrays], is_frame: bool) -> Arrays:
         if not self.on_disk:
             return make()
         path = self._path(name)
         arrays = _read(path)
         if arrays is None:
             with self._lock:
-                said, self._rendered = self._rendered, True
-            if not said:
+                tell = is_frame and not self._told
+                self._told |= is_frame
+            if tell:
                 _progress.info("rendering the street, 1 to 2 s a sweep; kept in %s", self._folder)
             arrays = make()
             _write(path, arrays)

@@ -20,6 +20,7 @@ from densify.street.lidar import Mounted, Returns, T_ego_lidar, at_offsets, scan
 from densify.street.rig import CAMERAS, SHUTTERS
 from densify.street.scenes import build_scene
 from densify.street.sensors import Sensor
+from densify.street.world import Body
 from densify.types import Bool, Float
 
 VERSION = 3  # raise it whenever the same frame would come out differently
@@ -85,10 +86,12 @@ class Simulator:
         """Where every body is at every frame's reference time."""
         return self.bodies_at([self.stamp_ns(frame) for frame in range(self.num_frames)])
 
-    def bodies_at(self, stamps_ns: Sequence[int]) -> Bodies:
-        """Where every body is at these times."""
+    def bodies_at(self, stamps_ns: Sequence[int], which: Sequence[int] | None = None) -> Bodies:
+        """Where every body, or each of ``which``, is at these times. which: all of an object's."""
         times = np.array([seconds(stamp) for stamp in stamps_ns])
         bodies = self.scene.world.bodies
+        if which is not None:
+            bodies = tuple(bodies[index] for index in which)
         T_world_body = np.tile(np.eye(4), (len(times), len(bodies), 1, 1))
         for index, body in enumerate(bodies):
             poses = body.trajectory.poses(times)
@@ -97,22 +100,8 @@ class Simulator:
         return Bodies(
             np.stack([self.T_world_lidar_at(stamp) for stamp in stamps_ns]),
             T_world_body,
-            self._moving(times),
+            _moving(bodies, times),
         )
-
-    def _moving(self, times_s: Float) -> Bool:
-        """(F,B) whether the body is part of an object that moves around that time."""
-        bodies = self.scene.world.bodies
-        moving = np.zeros((len(times_s), len(bodies)), bool)
-        for index, body in enumerate(bodies):
-            here = body.trajectory.poses(times_s).position
-            for shift in (-_MOVING_S, -_MOVING_S / 2, _MOVING_S / 2, _MOVING_S):
-                there = body.trajectory.poses(times_s + shift).position
-                moving[:, index] |= np.linalg.norm(there - here, axis=1) >= _MOVING_M
-        instance = np.array([body.instance for body in bodies])
-        for one in np.unique(instance[instance >= 0]):
-            moving[:, instance == one] = moving[:, instance == one].any(axis=1, keepdims=True)
-        return moving
 
     def in_bodies(self, frame: int, returns: Returns) -> Float:
         """(N,3) the measured points in the frame of the body each belongs to.
@@ -131,3 +120,17 @@ class Simulator:
 
 def seconds(time_ns: int) -> float:
     return (time_ns - EPOCH_NS) * 1e-9
+
+
+def _moving(bodies: Sequence[Body], times_s: Float) -> Bool:
+    """(F,B) whether the body is part of an object that moves around that time."""
+    moving = np.zeros((len(times_s), len(bodies)), bool)
+    for index, body in enumerate(bodies):
+        here = body.trajectory.poses(times_s).position
+        for shift in (-_MOVING_S, -_MOVING_S / 2, _MOVING_S / 2, _MOVING_S):
+            there = body.trajectory.poses(times_s + shift).position
+            moving[:, index] |= np.linalg.norm(there - here, axis=1) >= _MOVING_M
+    instance = np.array([body.instance for body in bodies])
+    for one in np.unique(instance[instance >= 0]):
+        moving[:, instance == one] = moving[:, instance == one].any(axis=1, keepdims=True)
+    return moving

@@ -45,19 +45,19 @@ def drawn_boxes(excerpt: Excerpt, frame: int, lidar: int | None = None) -> Drawn
     T_world_box, size_m = np.zeros((len(instances), 4, 4)), np.zeros((len(instances), 3))
     moving = np.zeros(len(instances), bool)
     for k, instance in enumerate(instances):
-        then = street.simulator.bodies_at([int(met_ns[k])])
         parts = [i for i, b in enumerate(bodies) if b.instance == instance]
-        T_world_main = then.T_world_body[0, parts[0]]
+        then = street.simulator.bodies_at([int(met_ns[k])], parts)
+        T_world_main = then.T_world_body[0, 0]
         T_main_world = poses.inverse(T_world_main)
         corners = np.concatenate(
             [
-                poses.transform(T_main_world @ then.T_world_body[0, i], bodies[i].mesh.vertices)
-                for i in parts
+                poses.transform(T_main_world @ T_world_part, bodies[i].mesh.vertices)
+                for i, T_world_part in zip(parts, then.T_world_body[0], strict=True)
             ]
         )
         low, high = corners.min(axis=0), corners.max(axis=0)
         T_main_box = np.eye(4)
         T_main_box[:3, 3] = (low + high) / 2
         T_world_box[k], size_m[k] = T_world_main @ T_main_box, high - low
-        moving[k] = then.moving[0, parts[0]]
+        moving[k] = then.moving[0, 0]
     return DrawnBoxes(instances, T_world_box, size_m, met_ns, moving)

@@ -64,7 +64,7 @@ def write_tree(excerpt: Excerpt, out: Path, overwrite: bool) -> Path:
         for name, data in calibration.items():
             put(staging / name, data)
         _write_stamps(staging / DRIVE, street, names)
-        write_bodies(staging / DRIVE / "truth", street.simulator.bodies)
+        write_bodies(staging / DRIVE / "truth", street.bodies)
         for _, frame in excerpt.numbered():
             _write_frame(staging / DRIVE, excerpt, frame)
     return folder / DRIVE
