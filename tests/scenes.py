@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 
 import numpy as np
 
@@ -149,7 +150,6 @@ class Scene:
     ego: Arc = field(default_factory=lambda: Arc(0.0, -1.5))
     scanner: Scanner = Scanner()
     seed: int = 0
-    _scans: dict[int, Scan] = field(default_factory=dict)
 
     def T_world_lidar(self, time_s: float) -> np.ndarray:
         x, y, yaw = self.ego.at(time_s)
@@ -159,11 +159,10 @@ class Scene:
         return T
 
     def scan(self, frame: int) -> Scan:
-        if frame not in self._scans:
-            self._scans[frame] = self._cast(frame)
-        return self._scans[frame]
+        return _scan(self.world, self.ego, self.scanner, self.seed, frame)
 
-    def _cast(self, frame: int) -> Scan:
+    def cast(self, frame: int) -> Scan:
+        """As `scan`, which remembers."""
         s, rng = self.scanner, np.random.default_rng([self.seed, frame])
         offset_s = ((np.arange(s.num_azimuths) + 0.5) / s.num_azimuths - 0.5) * SWEEP_S
         azimuth = -2 * np.pi * offset_s / SWEEP_S  # clockwise
@@ -237,6 +236,12 @@ class Scene:
         frames = list(range(middle - size, middle + size + 1))
         sweeps = [self.scan(f).sweep for f in frames]
         return deskew(sweeps, self.trajectory([frames[0] - 1, *frames, frames[-1] + 1]))
+
+
+@lru_cache(maxsize=128)
+def _scan(world: World, ego: Arc, scanner: Scanner, seed: int, frame: int) -> Scan:
+    """The same for all scenes that are alike: tests make them anew."""
+    return Scene(world, ego, scanner, seed).cast(frame)
 
 
 def stamp_ns(frame: int) -> int:
@@ -324,6 +329,7 @@ class TinySequence:
 @dataclass(frozen=True)
 class TinyTruth:
     sequence: TinySequence
+    _seen: dict[tuple[str, int, float], tuple[np.ndarray, np.ndarray]] = field(default_factory=dict)
 
     def sweep(self, frame: int) -> SweepTruth:
         scan = self.sequence.scene.scan(frame)
@@ -335,10 +341,16 @@ class TinyTruth:
         return self.sequence.scene.displacement(frame, target)
 
     def depth_m(self, camera: str, frame: int) -> np.ndarray:
-        return self._cast(camera, frame)[0]
+        return self._view(camera, frame)[0]
 
     def moving_mask(self, camera: str, frame: int) -> np.ndarray:
-        return self._cast(camera, frame)[1]
+        return self._view(camera, frame)[1]
+
+    def _view(self, camera: str, frame: int) -> tuple[np.ndarray, np.ndarray]:
+        moment = camera, frame, self.sequence.late_s
+        if moment not in self._seen:
+            self._seen[moment] = self._cast(camera, frame)
+        return self._seen[moment]
 
     def _cast(self, name: str, frame: int) -> tuple[np.ndarray, np.ndarray]:
         camera, scene = self.sequence.cameras[name], self.sequence.scene

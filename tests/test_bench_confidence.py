@@ -15,7 +15,7 @@ from densify.cli import main
 from densify.cli.options import recording_keys
 from densify.depth import confidence as scale
 
-NUM_DRAWN = 4_800_000
+NUM_DRAWN = 1_200_000
 
 
 def drawn(seed: int, tables, num=NUM_DRAWN, source="truth") -> bench.Evidence:
@@ -94,12 +94,12 @@ def test_recordings_and_keys_of_the_command_line():
 
 def test_fits_and_checks_by_the_verb(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     out = tmp_path / "table.json"
-    street = "street:static?sensor=vlp16"
-    arguments = ["--fit", f"{street}@40", "--check", f"{street}&seed=2@40", "--window", "1"]
-    chosen = ["--config", "fast", "--camera", "image_02", "--out", str(out)]
+    street = "street:static?sensor=vlp16&cameras=rolling"
+    arguments = ["--fit", f"{street}@40", "--check", f"{street}&seed=5@30", "--window", "1"]
+    chosen = ["--config", "fast", "--camera", "rolling", "--out", str(out)]
     assert main(["bench", "confidence", *arguments, *chosen]) == 0
     written, shown = json.loads(out.read_text()), capsys.readouterr().out
-    assert [m["camera"] for m in written["maps"]] == ["image_02"]
+    assert [m["camera"] for m in written["maps"]] == ["rolling"]
     own = scale.tables_of(written)
     assert (np.diff(own) <= 1e-9).all() and own.min() >= 0
     sources = list(written["reliability"])

@@ -86,8 +86,8 @@ def test_bad_input():
 
 def test_table_has_a_row_per_variant(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     out = tmp_path / "depth.json"
-    spec = "street:static?sensor=vlp16"
-    arguments = ["--window", "1", "--camera", "image_02", "--key", "40", "--out", str(out)]
+    spec = "street:static?sensor=vlp16&cameras=fast"
+    arguments = ["--window", "1", "--camera", "fast", "--key", "40", "--out", str(out)]
     variant = ["--variant", "bare", "project.visibility=false"]
     chosen = ["--config", "fast", *variant]
     assert main(["bench", "depth", "--data", spec, *arguments, *chosen]) == 0

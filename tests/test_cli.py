@@ -21,7 +21,9 @@ from densify.errors import ComputationError
 from tests.command import exit_code, files_in, refused
 
 STREET = "street?sensor=vlp16"
-FAST = ["--window", "1", "--config", "fast", "--camera", "image_02", "--data", STREET]
+SMALL = f"{STREET}&cameras=fast"
+"""With a ninth of the pixels."""
+FAST = ["--window", "1", "--config", "fast", "--camera", "fast", "--data", SMALL]
 
 
 @pytest.fixture(scope="module")
@@ -50,10 +52,10 @@ def densified(tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
 
 def test_run_writes_exactly_the_tree_and_names_every_file(densified: SimpleNamespace) -> None:
     expected = {
-        "000120/depth/image_02.png",
-        "000120/depth_filled/image_02.png",
-        "000120/confidence/image_02.png",
-        "000120/age/image_02.png",
+        "000120/depth/fast.png",
+        "000120/depth_filled/fast.png",
+        "000120/confidence/fast.png",
+        "000120/age/fast.png",
         "000120/cloud.laz",
         "000120/metrics.json",
         "000120/figure.png",
@@ -61,8 +63,8 @@ def test_run_writes_exactly_the_tree_and_names_every_file(densified: SimpleNames
         "000120/run.yaml",
         "000120/movers.json",
         "000120/scene/scene.json",
-        "000120/scene/image/image_02.jpg",
-        *(f"000120/scene/{k}/image_02.png" for k in ("none", "icp", "truth", "sweep")),
+        "000120/scene/image/fast.jpg",
+        *(f"000120/scene/{k}/fast.png" for k in ("none", "icp", "truth", "sweep")),
     }
     assert set(files_in(densified.out)) == expected
     named = {line for line in densified.stdout.splitlines() if line.startswith(str(densified.out))}
@@ -73,7 +75,7 @@ def test_run_prints_results_on_stdout_and_no_progress_off_a_terminal(
     densified: SimpleNamespace,
 ) -> None:
     assert densified.stdout.startswith("key 120, flow: ")
-    assert "image_02: depth in " in densified.stdout
+    assert "fast: depth in " in densified.stdout
     assert "%|" not in densified.stderr and "\r" not in densified.stderr
     strangers = [x for x in densified.stderr.splitlines() if not x.startswith("densify: ")]
     assert strangers == []
@@ -84,7 +86,7 @@ def test_run_yaml_gives_back_the_configuration(densified: SimpleNamespace) -> No
     expected = resolve("fast", ["objective.num_neighbors=40"])
     assert resolve(record["config"]) == expected
     assert record["config"] == as_mapping(expected)
-    assert record["data"] == STREET
+    assert record["data"] == SMALL
     assert record["frames"] == [119, 120, 121]
 
 
@@ -118,13 +120,13 @@ def test_export_says_what_is_left_and_names_every_file(
     line, *paths = capsys.readouterr().out.splitlines()
     shares = [
         100
-        * np.count_nonzero(cv2.imread(str(folder / product / "image_02.png"), -1))
-        / (375 * 1242)
+        * np.count_nonzero(cv2.imread(str(folder / product / "fast.png"), -1))
+        / (125 * 414)
         for product in ("depth", "depth_filled")
         for folder in (run, out)
     ]
     named = [float(share) for share in re.findall(r"([\d.]+) %", line)]
-    assert line.startswith("image_02: depth in ")
+    assert line.startswith("fast: depth in ")
     np.testing.assert_allclose(named, shares, atol=0.0501)
     assert shares[0] > shares[1] > 0 and shares[2] > shares[3] >= shares[1]
     assert sorted(paths) == sorted(str(out / name) for name in files_in(out))
@@ -160,14 +162,14 @@ def test_compare_prints_a_table_and_writes_it(
     lines = capsys.readouterr().out.splitlines()
     assert lines[0].split() == ["none", "icp", "flow"]
     for row in (
-        *("points", "image_02 density, measured", "ghost rate"),
-        *("image_02 truth, moving, outliers", "image_02 key held out, all, coverage"),
+        *("points", "fast density, measured", "ghost rate"),
+        *("fast truth, moving, outliers", "fast key held out, all, coverage"),
     ):
         assert any(line.startswith(row) for line in lines), row
     files = set(files_in(tmp_path / "out"))
     beside = {name for name in files if name.startswith("000120/compare/")}
     assert files - beside == {"000120/compare.json", "000120/compare.png"}
-    assert {"000120/compare/depth/image_02.png", "000120/compare/cloud.laz"} < beside
+    assert {"000120/compare/depth/fast.png", "000120/compare/cloud.laz"} < beside
     table = json.loads((tmp_path / "out" / "000120" / "compare.json").read_text("utf-8"))
     assert list(table["methods"]) == ["none", "icp", "flow"]
     num_points = int(next(x for x in lines if x.startswith("points")).split()[3].replace(",", ""))

@@ -46,7 +46,7 @@ def test_street(tmp_path: Path) -> None:
 def test_your_data(real: bool, tmp_path: Path, monkeypatch, request) -> None:
     if real:
         monkeypatch.setenv("DENSIFY_DATA", str(request.getfixturevalue("short_drive")))
-        monkeypatch.setenv("DENSIFY_KEY", "119")
+        monkeypatch.setenv("DENSIFY_KEY", "120")
     else:
         monkeypatch.delenv("DENSIFY_DATA", raising=False)
         monkeypatch.delenv("DENSIFY_KEY", raising=False)

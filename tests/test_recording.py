@@ -94,7 +94,7 @@ def test_a_recording_within_the_window_is_what_run_makes(
 def test_more_sweeps_around_make_it_no_worse(small_blocks, long_street, tmp_path: Path) -> None:
     drive = drive_of(long_street, tmp_path)
     wrong = Counter()
-    for key in range(4, 14):  # of two keys the wrong pixels differ by their number's own noise
+    for key in range(4, 14, 2):  # of two keys the wrong pixels differ by their number's own noise
         alone = pipeline.run(long_street, key, 2, config=GIVEN)
         here = maps_of(drive, key)
         assert here.frames == alone.frames
@@ -356,9 +356,11 @@ def test_other_settings_and_other_sweeps_make_anew(counted: Counter[str], tmp_pa
     use(whole, tmp_path)
     assert counted == {}
     last = sequence.frames[-1]
-    scan = sequence.scene.scan(last)
-    nudged = replace(scan.sweep, points=scan.sweep.points + [0, 0, 1e-3])
-    sequence.scene._scans[last] = replace(scan, sweep=nudged)
+    scans = {frame: sequence.scene.scan(frame) for frame in sequence.frames}
+    sweep = scans[last].sweep
+    nudged = replace(sweep, points=sweep.points + [0, 0, 1e-3])
+    scans[last] = replace(scans[last], sweep=nudged)
+    sequence.scene.scan = scans.__getitem__
     use(whole, tmp_path)
     assert counted == {
         "find_trajectory": 1,

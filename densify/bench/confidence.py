@@ -206,7 +206,7 @@ def _fitted(num: Float, step: Int, causes: Float, weight: Float) -> Float:
     )
     for _ in range(_NUM_ROUNDS):
         owed = shares[:, step] * causes
-        owed *= weight / np.maximum(owed.sum(axis=0), _TINY)
+        owed *= weight / np.maximum(owed[0] + owed[1], _TINY)
         shares = np.array(
             [
                 scale.falling(n, np.bincount(step, part, scale.NUM_RANKS).astype(np.float64))
