@@ -238,7 +238,7 @@ class Scene:
         return deskew(sweeps, self.trajectory([frames[0] - 1, *frames, frames[-1] + 1]))
 
 
-@lru_cache(maxsize=128)
+@lru_cache(maxsize=64)
 def _scan(world: World, ego: Arc, scanner: Scanner, seed: int, frame: int) -> Scan:
     """The same for all scenes that are alike: tests make them anew."""
     return Scene(world, ego, scanner, seed).cast(frame)

@@ -119,9 +119,7 @@ def test_export_says_what_is_left_and_names_every_file(
     assert exit_code(*command) == 0
     line, *paths = capsys.readouterr().out.splitlines()
     shares = [
-        100
-        * np.count_nonzero(cv2.imread(str(folder / product / "fast.png"), -1))
-        / (125 * 414)
+        100 * np.count_nonzero(cv2.imread(str(folder / product / "fast.png"), -1)) / (125 * 414)
         for product in ("depth", "depth_filled")
         for folder in (run, out)
     ]

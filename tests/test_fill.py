@@ -53,7 +53,7 @@ def test_filling_does_not_know_how_large_pixels_are():
     wide[::2, ::2] = depth
 
     def share(of, spacing):
-        spacing_px = np.broadcast_to(np.float32(spacing), (*of.shape, 2))
+        spacing_px = np.full((*of.shape, 2), spacing, np.float32)
         filled, _ = fill_between(of, of / 10, spacing_px, 1.5, 0.2, 0.05, 0.5)
         return (filled > 0).mean()
 

@@ -176,7 +176,7 @@ class ScannerImage:
                 num_filled=num_filled,
                 row_edges_rad=row_edges_rad,
                 origin_m=origin_m,
-                axes=registered.sweep.axes(lidar).astype(np.float32),
+                axes=registered.sweep.axes(lidar).astype(np.float32, order="C"),
                 turned=np.bool_(registered.sweep.R_scanner_lidar is not None),
                 twists=twists,
                 from_m=cells.from_m,

@@ -72,7 +72,7 @@ def aimed(registered: RegisteredSweep, lidar: int) -> Aimed:
         points.astype(np.float32),
         offset_s,
         sweep.origin_m(lidar).astype(np.float32),
-        sweep.axes(lidar).astype(np.float32),
+        sweep.axes(lidar).astype(np.float32, order="C"),
         sweep.R_scanner_lidar is not None,
         np.stack([registered.twist_before, registered.twist_after]).astype(np.float32),
         seen,
