@@ -8,12 +8,12 @@ from functools import cache
 
 import numpy as np
 
-import densify
 from densify.geometry.poses import inverse, transform
 from densify.readers.street import Street
 from densify.scores.depth_metrics import DepthErrors, depth_errors
 from densify.types import LidarSequence
 from densify.writers.excerpt import Excerpt
+from tests.scenes import by_flow
 
 MEASURED_ALONE = {"fill_reach": 0.1, "star_reach": 0}
 """Knobs of the projection for tests that look at what is measured: filling takes most of the time,
@@ -131,7 +131,7 @@ def depth_score(recording: LidarSequence, key: int, camera: str) -> DepthErrors:
         "accumulate": {"far_m": 0},
         "project": {"spot": 0, **MEASURED_ALONE},
     }
-    result = densify.run(recording, key, 1, cameras=[camera], config=config)
+    result = by_flow(recording, key, 1, [camera], config)
     depth_m, true_m = result.depth[camera].depth_m, recording.truth.depth_m(camera, key)
     return depth_errors(depth_m, true_m, focal_px=recording.cameras[camera].focal_px)
 

@@ -10,13 +10,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from densify import pipeline
 from densify.bench.depth import bench_depth
 from densify.cli import bench_tables as tables
 from densify.cli import main
 from densify.config import resolve
 from densify.errors import InputError
-from tests.scenes import TinySequence
+from tests.scenes import TinySequence, by_flow
 from tests.small_street import KEY, one_car
 
 CONFIG = resolve({"register": {"source": "dataset"}})
@@ -39,7 +38,7 @@ def test_counts_are_those_of_an_image_of_truth():
     sequence = one_car()
     sparse = resolve({"register": {"source": "dataset"}}, ["project.edge_reach=2"])
     found = bench_depth(sequence, [KEY], 2, {"usual": CONFIG, "sparse": sparse})["variants"]
-    made = pipeline.run(sequence, KEY, 2, config=CONFIG)
+    made = by_flow(sequence, KEY, 2, config=CONFIG)
     camera = sequence.cameras["front"]
     true_m = sequence.truth.depth_m("front", KEY)
     # Straight ahead of a level scanner the top ring is a curve of constant elevation.

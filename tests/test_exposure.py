@@ -7,7 +7,18 @@ import numpy as np
 import pytest
 
 from densify.pipeline import run
-from tests.scenes import SWEEP_S, Arc, Box, Scanner, Scene, TinySequence, World, car, street
+from tests.scenes import (
+    SWEEP_S,
+    Arc,
+    Box,
+    Scanner,
+    Scene,
+    TinySequence,
+    World,
+    by_flow,
+    car,
+    street,
+)
 from tests.small_street import KEY, POSES_GIVEN, one_car
 
 
@@ -46,7 +57,7 @@ def test_a_mover_is_shown_where_it_was_at_the_exposure():
         Scanner(num_azimuths=1200, sigma_m=0.01),
     )
     sequence = TinySequence(scene, range(13), late_s=0.05)
-    found = run(sequence, 6, 2, config=POSES_GIVEN).depth["front"].depth_m
+    found = by_flow(sequence, 6, 2, config=POSES_GIVEN).depth["front"].depth_m
     truth = sequence.truth.depth_m("front", 6)
     on = sequence.truth.moving_mask("front", 6) & (found > 0)
     assert on.sum() > 50
@@ -72,7 +83,7 @@ def test_the_cameras_pose_turns_with_the_vehicle():
 def test_at_the_sweeps_time_the_shutter_does_not_matter():
     def depth(late_s: float, at: str) -> np.ndarray:
         config = POSES_GIVEN | {"project": {"at": at}}
-        return run(one_car(late_s=late_s), KEY, 1, config=config).depth["front"].depth_m
+        return by_flow(one_car(late_s=late_s), KEY, 1, config=config).depth["front"].depth_m
 
     at_sweep, at_camera = depth(0.05, "sweep"), depth(0.05, "camera")
     assert at_sweep.tobytes() == depth(0.0, "sweep").tobytes() == depth(0.0, "camera").tobytes()

@@ -22,7 +22,7 @@ from densify.registration import chain
 from densify.registration.chain import follow
 from densify.scores.depth_metrics import depth_scores
 from densify.types import RegisteredSweep
-from tests.scenes import CAMERA, Arc, Scanner, Scene, TinySequence, World, car, street
+from tests.scenes import CAMERA, Arc, Scanner, Scene, TinySequence, World, by_flow, car, street
 
 KEY, WINDOW, NUM_FRAMES = 15, 2, 36
 EGO = Arc(0, -1.5, 0, 8.0, 0.02)
@@ -43,9 +43,7 @@ def drive(movers=(), ego=EGO, **options) -> TinySequence:
 def results(movers: bool = False, ego: Arc = EGO):
     """With the far range and without it."""
     sequence = drive((LEAVES,) if movers else (), ego)
-    return sequence, *(
-        pipeline.run(sequence, KEY, WINDOW, config=settings) for settings in (FAR, OFF)
-    )
+    return sequence, *(by_flow(sequence, KEY, WINDOW, config=settings) for settings in (FAR, OFF))
 
 
 def scores(sequence, result, product="measured"):
@@ -113,7 +111,7 @@ def test_a_car_that_drives_through_leaves_no_trail():
 def test_who_drives_ahead_all_the_way_leaves_no_trail_in_the_cloud():
     """The window never sees past it; sweeps beyond do, once it has moved on."""
     sequence = drive((AHEAD,))
-    cloud = pipeline.run(sequence, KEY, WINDOW, config=FAR).cloud
+    cloud = by_flow(sequence, KEY, WINDOW, config=FAR).cloud
     far = cloud.select(cloud.far)
     moving = [sequence.truth.sweep(f).moving[far.row[far.frame == f]] for f in np.unique(far.frame)]
     assert len(far) > 25_000
@@ -142,7 +140,7 @@ def test_the_far_range_ends_at_a_sweep_that_cannot_be_read(source):
     whole = drive()
     torn = _Torn(whole.scene, range(NUM_FRAMES))
     settings = {**FAR, "register": {"source": source, "lead_in_s": 0.2}}
-    far = pipeline.run(torn, KEY, WINDOW, config=settings)
+    far = by_flow(torn, KEY, WINDOW, config=settings)
     frames = np.unique(far.cloud.frame)
     assert frames.min() > KEY - 6 and frames.max() < KEY + 7
     assert far.cloud.far.any()

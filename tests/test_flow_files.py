@@ -11,10 +11,10 @@ import pytest
 from densify.errors import InputError
 from densify.geometry import poses
 from densify.outputs.flow_npz import write_flow_files
-from densify.pipeline import run
 from densify.readers.flow_files import MOVES_M, FlowFiles
 from densify.types import FlowField, Result, Stretch, StretchFlow
 from tests.exact_motion import registered
+from tests.scenes import by_flow
 from tests.small_street import KEY, POSES_GIVEN, one_car
 
 STEP = (100, 101)
@@ -27,14 +27,14 @@ PLAIN = POSES_GIVEN | {"project": {"visibility": False}}  # no point has a say i
 @pytest.fixture(scope="module")
 def ours(tmp_path_factory) -> tuple[Result, Path]:
     """A run with the flow it found, and the folder of its flow files."""
-    result = run(one_car(), KEY, 1, config=PLAIN | {"output": {"flow": True}})
+    result = by_flow(one_car(), KEY, 1, config=PLAIN | {"output": {"flow": True}})
     folder = tmp_path_factory.mktemp("flow")
     write_flow_files(folder, result.flow)
     return result, folder
 
 
 def depth_from(folder: Path) -> Result:
-    return run(one_car(), KEY, 1, config=PLAIN | {"flow": {"engine": f"npz:{folder}"}})
+    return by_flow(one_car(), KEY, 1, config=PLAIN | {"flow": {"engine": f"npz:{folder}"}})
 
 
 def assert_same(found: Result, ours: Result, of_key: bool = True) -> None:
@@ -88,10 +88,10 @@ def test_other_forms_of_the_same_flow(ours, dropped, tmp_path):
 
 
 def test_chained_over_more_steps_it_is_nearly_the_same(tmp_path):
-    ours = run(one_car(), KEY, 2, config=POSES_GIVEN | {"output": {"flow": True}})
+    ours = by_flow(one_car(), KEY, 2, config=POSES_GIVEN | {"output": {"flow": True}})
     assert sorted(ours.flow.steps) == [(1, 2), (2, 3), (3, 4), (4, 3), (5, 4)]
     write_flow_files(tmp_path, ours.flow)
-    found = run(one_car(), KEY, 2, config=POSES_GIVEN | {"flow": {"engine": f"npz:{tmp_path}"}})
+    found = by_flow(one_car(), KEY, 2, config=POSES_GIVEN | {"flow": {"engine": f"npz:{tmp_path}"}})
     row = {key: i for i, key in enumerate(zip(found.cloud.frame, found.cloud.row, strict=True))}
     place = [row.get(key, -1) for key in zip(ours.cloud.frame, ours.cloud.row, strict=True)]
     both = (np.array(place) >= 0) & ours.cloud.moving

@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import densify
 from densify.bench.paper_pairs import pair_of_recording
 from densify.cli import main
 from densify.config import Config, resolve
@@ -108,8 +107,8 @@ def test_a_run_takes_a_network(model: Path) -> None:
     """Untrained, but whole: no static point leaves its rigid place."""
     sequence = one_car()
     settings = {**POSES_GIVEN, "flow": {"engine": f"network:{model}"}}
-    result = densify.run(sequence, KEY, 2, config=settings)
-    again = densify.run(one_car(), KEY, 2, config=settings)
+    result = scenes.by_flow(sequence, KEY, 2, config=settings)
+    again = scenes.by_flow(one_car(), KEY, 2, config=settings)
     assert len(result.cloud.points) and not result.cloud.displaced[~result.cloud.moving].any()
     np.testing.assert_array_equal(result.cloud.points, again.cloud.points)
 

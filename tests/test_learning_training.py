@@ -35,7 +35,7 @@ def test_a_network_learns_what_moves() -> None:
     """One pair by heart: most of the motion, and that the rest stands."""
     sample, network = sample_of(clip(0), 1, 2, 3, "truth"), build("voxels")
     optimizer = torch.optim.Adam(network.parameters(), 5e-3)
-    for _ in range(40):
+    for _ in range(20):
         optimizer.zero_grad()
         supervised_loss(network, sample).backward()
         optimizer.step()

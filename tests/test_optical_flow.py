@@ -13,7 +13,7 @@ from densify.geometry import poses
 from densify.outputs.depth_png import write_flow_png
 from densify.pipeline import run
 from densify.types import Camera, Cloud, DepthMap, Reason
-from tests.scenes import CAMERA, SWEEP_S
+from tests.scenes import CAMERA, SWEEP_S, by_flow
 from tests.small_street import CAR, KEY, POSES_GIVEN, one_car
 
 SMALL = Camera("cam", 8, 6, np.array([[10.0, 0, 3.5], [0, 11.0, 2.5], [0, 0, 1]]), np.eye(4))
@@ -117,7 +117,7 @@ def true_flow(sequence, other: int) -> tuple[np.ndarray, np.ndarray]:
 @pytest.mark.parametrize("late_s", [0.0, 0.04])
 def test_flow_to_both_neighbours_is_that_of_the_street(late_s):
     sequence = one_car(late_s=late_s)
-    result = run(sequence, KEY, 1, config=POSES_GIVEN | {"output": {"optical_flow": True}})
+    result = by_flow(sequence, KEY, 1, config=POSES_GIVEN | {"output": {"optical_flow": True}})
     assert set(result.optical_flow["front"]) == {"previous", "next"}
     for name, other in (("previous", KEY - 1), ("next", KEY + 1)):
         found = result.optical_flow["front"][name]

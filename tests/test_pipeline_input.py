@@ -14,7 +14,7 @@ from densify.errors import ComputationError, InputError
 from densify.geometry import poses
 from densify.pipeline import compare, run
 from densify.readers.window import read_sweep
-from tests.scenes import TinySequence
+from tests.scenes import TinySequence, by_flow
 from tests.small_street import KEY, POSES_GIVEN, one_car
 
 
@@ -93,7 +93,7 @@ def test_a_window_of_the_key_alone():
 
 
 def test_at_the_start_of_the_recording():
-    result = run(one_car(), 0, 2, "flow", config=POSES_GIVEN)
+    result = by_flow(one_car(), 0, 2, config=POSES_GIVEN)
     assert result.frames == (0, 1, 2)
     assert result.warnings[0] == "the window is cut to frames 0-2: the recording begins at frame 0"
 
@@ -105,7 +105,7 @@ def test_a_sweep_without_times_is_not_deskewed():
 
     good = one_car()
     sequence = Timeless(good.scene, good.frames)
-    result = run(sequence, KEY, 1, "flow", config=POSES_GIVEN)
+    result = by_flow(sequence, KEY, 1, config=POSES_GIVEN)
     own = result.cloud.frame == KEY
     kept = read_sweep(sequence, KEY, RegisterSettings())
     np.testing.assert_allclose(result.cloud.points[own], kept.points, atol=1e-9)
@@ -198,6 +198,6 @@ def test_an_almost_empty_sweep_beside_the_key_ends_its_window():
 def test_an_almost_empty_sweep_of_known_pose_does_no_harm(num_points, sparse):
     sequence = Sparse(one_car().scene, range(7))
     sequence.sparse, sequence.num_points = sparse, num_points
-    cloud = run(sequence, KEY, 1, config=POSES_GIVEN).cloud
+    cloud = by_flow(sequence, KEY, 1, config=POSES_GIVEN).cloud
     assert (cloud.frame == sparse).sum() <= num_points
     assert np.isfinite(cloud.points).all() and not cloud.moving[cloud.frame == sparse].any()

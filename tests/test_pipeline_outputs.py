@@ -13,13 +13,14 @@ import pytest
 from densify.outputs import read_cloud, read_depth_png, write_result
 from densify.pipeline import compare, run
 from densify.types import Cloud, Reason, Result
-from tests.scenes import ROOM, Arc, Scanner, Scene, TinySequence, World
+from tests.scenes import ROOM, Arc, Scanner, Scene, TinySequence, World, by_flow
 from tests.small_street import CAR, KEY, POSES_GIVEN, one_car
 from tests.tiny_street import same_points
 
 
 def with_movers(word: str, **output) -> Result:
-    return run(one_car(), KEY, 1, config=POSES_GIVEN | {"output": {"movers": word, **output}})
+    config = POSES_GIVEN | {"output": {"movers": word, **output}}
+    return by_flow(one_car(), KEY, 1, config=config)
 
 
 NPZ = {"output": {"flow_as": "npz"}}
@@ -27,7 +28,8 @@ NPZ = {"output": {"flow_as": "npz"}}
 
 @pytest.fixture(scope="module")
 def kept() -> Result:
-    return with_movers("keep")
+    """With its baselines."""
+    return run(one_car(), KEY, 1, config=POSES_GIVEN | {"output": {"movers": "keep"}})
 
 
 @pytest.fixture(scope="module")
@@ -175,7 +177,7 @@ def test_what_counts_as_moving_does_not_hang_on_the_method_scored(kept):
 def test_every_point_is_accounted_for_and_the_picture_shows_what_was_left_out(tmp_path):
     # Without spots each measured pixel has a point of its own.
     settings = POSES_GIVEN | {"output": {"rejected": True}, "project": {"spot": 0}}
-    result = run(one_car(), KEY, 1, config=settings)
+    result = by_flow(one_car(), KEY, 1, config=settings)
     counts, maps = result.metrics["rejected"]["front"], result.depth["front"]
     assert sum(counts.values()) == len(result.cloud)
     assert counts["kept"] == (maps.depth_m > 0).sum()

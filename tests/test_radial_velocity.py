@@ -20,7 +20,7 @@ from densify.registration.deskew import placed, twists
 from densify.scores.radial_velocity import radial_velocity_scores
 from densify.types import Stretch, Sweep, Trajectory
 from densify.writers import write_street
-from tests.scenes import Arc, Scanner, Scene, World, car, street
+from tests.scenes import Arc, Scanner, Scene, World, by_flow, car, street
 from tests.small_street import one_car
 
 KEY = 60
@@ -133,9 +133,7 @@ def test_columns_are_found_and_read(fmcw, tmp_path):
 
 
 def test_what_flow_leaves_of_them_is_a_score():
-    from densify import run
-
-    result = run(one_car(), 3, 1, "flow", config={"register": {"source": "dataset"}})
+    result = by_flow(one_car(), 3, 1, config={"register": {"source": "dataset"}})
     assert "radial_velocity" not in result.metrics
     registered, cloud = one_car().scene.stretch(3, 0).sweeps[0], result.cloud
     sweep, (ray, _) = registered.sweep, registered.rays()

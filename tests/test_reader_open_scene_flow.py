@@ -21,6 +21,7 @@ from densify.types import Trajectory
 from densify.writers import write_street
 from densify.writers.excerpt import Excerpt
 from tests.reader_checks import check_sweeps, check_truth
+from tests.scenes import by_flow
 from tests.small_street import KEY, one_car
 
 h5py = pytest.importorskip("h5py")
@@ -157,7 +158,7 @@ def test_densified_with_the_labels_movers_lie_on_each_other(folder, excerpt):
     file = folder / "street.h5"
     config = POSES_GIVEN | {"flow": {"engine": f"opensceneflow:{file}"}}
     sequence = open_sequence(file)
-    cloud = densify.run(sequence, 1, 1, config=config).cloud
+    cloud = by_flow(sequence, 1, 1, config=config).cloud
     rigid = densify.run(sequence, 1, 1, method="icp", config=POSES_GIVEN).cloud
     truth = excerpt.street.truth
     T = [sequence.T_world_lidar(n) for n in range(3)]
@@ -173,7 +174,7 @@ def test_densified_with_the_labels_movers_lie_on_each_other(folder, excerpt):
 def test_our_flow_is_written_as_such_a_file_and_read_again(tmp_path):
     sequence = one_car()
     config = POSES_GIVEN | {"output": {"flow": True}, "project": {"visibility": False}}
-    ours = densify.run(sequence, KEY, 2, config=config)
+    ours = by_flow(sequence, KEY, 2, config=config)
     write_flow_h5(tmp_path, KEY, ours.flow)
     path = tmp_path / f"{KEY:06d}.h5"
     with h5py.File(path, "r+") as file:

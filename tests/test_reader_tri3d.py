@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-import densify
 from densify.errors import InputError
 from densify.geometry.cameras import image_points
 from densify.geometry.poses import inverse
@@ -23,6 +22,7 @@ from densify.readers import open_sequence
 from densify.readers.street import Street
 from densify.readers.tri3d import Tri3d
 from densify.writers.excerpt import Excerpt
+from tests.scenes import by_flow
 from tests.small_street import POSES_GIVEN
 
 # Importing it compiles for three seconds: nothing for processes that run other tests.
@@ -103,7 +103,7 @@ def test_once_is_given_back(once, excerpt):
 
 
 def test_depth_is_that_of_the_street(once, excerpt):
-    result = densify.run(open_sequence(once), 1, 1, cameras=["cam01"], config=POSES_GIVEN)
+    result = by_flow(open_sequence(once), 1, 1, ["cam01"], POSES_GIVEN)
     depth_m = result.depth["cam01"].depth_m
     true_m = excerpt.street.truth.depth_m(CAMERA, excerpt.image_numbers(CAMERA)[1])
     both = (depth_m > 0) & (true_m > 0)

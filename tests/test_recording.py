@@ -25,7 +25,7 @@ from densify.registration.deskew import deskew
 from densify.registration.trajectory import find_trajectory
 from densify.types import Stretch, Sweep
 from tests.dataset_scenes import BORDER, across_border
-from tests.scenes import SWEEP_S, Arc, Scanner, Scene, TinySequence, World, car, street
+from tests.scenes import SWEEP_S, Arc, Scanner, Scene, TinySequence, World, by_flow, car, street
 from tests.small_street import POSES_GIVEN
 
 LIMIT = 10**9
@@ -94,8 +94,8 @@ def test_a_recording_within_the_window_is_what_run_makes(
 def test_more_sweeps_around_make_it_no_worse(small_blocks, long_street, tmp_path: Path) -> None:
     drive = drive_of(long_street, tmp_path)
     wrong = Counter()
-    for key in range(4, 14, 2):  # of two keys the wrong pixels differ by their number's own noise
-        alone = pipeline.run(long_street, key, 2, config=GIVEN)
+    for key in range(4, 14):  # of two keys the wrong pixels differ by their number's own noise
+        alone = by_flow(long_street, key, 2, config=GIVEN)
         here = maps_of(drive, key)
         assert here.frames == alone.frames
         for who, result in (("alone", alone), ("here", here)):
@@ -399,7 +399,7 @@ def test_keys_far_apart_share_nothing_and_are_as_by_themselves(long_street) -> N
     config = resolve({**POSES_GIVEN, "flow": {"look_around_s": 0.2}})
     results = dict(pipeline.run_keys(long_street, [2, 14], 2, config=config))
     for key, result in results.items():
-        alone = pipeline.run(long_street, key, 2, config=config)
+        alone = by_flow(long_street, key, 2, config=config)
         assert_same_maps(result.depth, alone.depth)
 
 
@@ -415,7 +415,7 @@ def test_looking_around_changes_no_window(bad: int | None, long_street) -> None:
     assert recording.window(8).frames == (6, 7, 8, 9, 10)
     last = 14 if bad is None else bad - 1
     assert recording.around(8).frames == tuple(range(2, last + 1))
-    plain, looking = (pipeline.run(sequence, 8, 2, config=config) for config in settings)
+    plain, looking = (by_flow(sequence, 8, 2, config=config) for config in settings)
     assert looking.frames == plain.frames and looking.far_frames == plain.far_frames
     assert looking.metrics["num_moving"] == pytest.approx(plain.metrics["num_moving"], rel=0.02)
 

@@ -33,7 +33,7 @@ AROUND_NS = 550_000_000
 @pytest.fixture(scope="module")
 def drive() -> Scene:
     """12 m/s in a left bend."""
-    return Scene(World(street()), Arc(0, -1.5, 0, 12.0, 0.25), Scanner(num_azimuths=1800))
+    return Scene(World(street()), Arc(0, -1.5, 0, 12.0, 0.25), Scanner(num_azimuths=900))
 
 
 @pytest.fixture(scope="module")

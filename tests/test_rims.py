@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-import densify
 from densify.config import ProjectSettings
 from densify.depth.layers import Layers
 from densify.depth.picture import lab, laid_over
@@ -17,6 +16,7 @@ from densify.depth.rims import decide, shares
 from densify.depth.votes import RULES, Canvass, elected
 from densify.kernels import voting
 from densify.kernels.marching import DIRECTIONS, first_known
+from tests.scenes import by_flow
 from tests.small_street import KEY, POSES_GIVEN, one_car
 
 HEIGHT, WIDTH = 200, 320
@@ -332,8 +332,8 @@ def test_elections_stop_early_without_another_outcome(least):
 
 
 def test_the_run_says_that_an_image_does_not_fit():
-    grey = densify.run(one_car(), KEY, 2, config=POSES_GIVEN)  # its images show nothing
-    strict = densify.run(one_car(), KEY, 2, config={**POSES_GIVEN, "project": {"rims": "strict"}})
+    grey = by_flow(one_car(), KEY, 2, config=POSES_GIVEN)  # its images show nothing
+    strict = by_flow(one_car(), KEY, 2, config={**POSES_GIVEN, "project": {"rims": "strict"}})
     (name,) = grey.depth
     assert any(w.startswith(f"{name}: image edges") for w in grey.warnings)
     assert grey.depth[name].warnings and not strict.depth[name].warnings

@@ -16,7 +16,7 @@ from densify.geometry import poses
 from densify.geometry.cameras import image_points
 from densify.pipeline import compare, run
 from densify.readers.street import Street
-from tests.scenes import CAMERA, SWEEP_S, TinySequence, stamp_ns
+from tests.scenes import CAMERA, SWEEP_S, TinySequence, by_flow, stamp_ns
 from tests.small_street import KEY, POSES_GIVEN, one_car
 
 SWEEP = ProjectSettings()
@@ -110,7 +110,7 @@ def test_maps_between_two_sweeps_are_the_streets():
     sequence = OtherClock({n: 100 * n + 5 + k * 30 for k in range(3) for n in [KEY * 3 + k]})
     sequence.images_ms = {30 + k: 100 * KEY - 30 + 30 * k for k in range(3)}
     config = POSES_GIVEN | {"project": {"per": "image"}}
-    result = run(sequence, KEY, 2, config=config)
+    result = by_flow(sequence, KEY, 2, config=config)
     assert list(result.depth) == [f"front/{n:06d}" for n in (30, 31, 32)]
     assert [im[0, 0, 0] for im in result.images.values()] == [30, 31, 32]
     assert set(result.metrics["density"]) == set(result.depth)

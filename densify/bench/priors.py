@@ -61,7 +61,8 @@ def bench_priors(sequence: LidarSequence, key: int, camera: str) -> dict[str, Co
             "priors are made of exact truth: got a recording without, expected a street"
         )
     config = resolve(None)
-    maps = pipeline.run(sequence, key, cameras=[camera], config=config).depth[camera]
+    made = pipeline.compare(sequence, key, cameras=[camera], config=config, methods=["flow"])
+    maps = made["flow"].depth[camera]
     true_m = sequence.truth.depth_m(camera, key).astype(float)
     sky = true_m == 0
     safe_m = np.where(sky, true_m.max(), true_m)
