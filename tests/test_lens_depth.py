@@ -52,29 +52,30 @@ def ground(camera, down_m=1.6, step=2, reach_m=30.0):
 def test_ground_hides_itself_nowhere_in_a_fisheye(measure):
     """As it would if its slope were taken for that in a pinhole's image."""
     points = ground(FISHEYE)
-    if measure == "z":
-        points = points[points[:, 2] > 1.0]
     knobs = {"footprint": 0.0, "slack_m": 0.1, "hidden_m": 0.01, "hidden_fraction": 0.01}
     maps = seen_from(FISHEYE, points, [0, 1.0, 0], (0.1, 0.1), measure, **knobs)
     assert maps.measure == measure
-    hidden = maps.reason == Reason.HIDDEN
+    ahead = points[:, 2] > 1.0 if measure == "z" else np.ones(len(points), bool)
+    hidden = maps.reason[ahead] == Reason.HIDDEN
     assert hidden.mean() < 0.002
     facing = points / np.sum(points**2, axis=1, keepdims=True)
     steep = seen_from(FISHEYE, points, facing, (0.1, 0.1), measure, **knobs)
-    assert (steep.reason == Reason.HIDDEN).mean() > 0.3  # what the slope prevents
+    assert (steep.reason[ahead] == Reason.HIDDEN).mean() > 0.3  # what the slope prevents
 
 
 @pytest.mark.parametrize("measure", ["range", "z"])
 def test_depth_of_a_plane_is_that_in_the_middle_of_the_pixel(measure):
     rng = np.random.default_rng(3)
     points = np.column_stack([rng.uniform(-9, 9, 120_000), np.full(120_000, 1.6)])
-    points = np.column_stack([points, rng.uniform(-1 if measure == "range" else 1, 9, 120_000)])
+    points = np.column_stack([points, rng.uniform(-1, 9, 120_000)])
     maps = seen_from(FISHEYE, points, [0, 1.0, 0], (0.05, 0.05), measure)
     row, column = np.nonzero(maps.depth_m)
     assert len(row) > 15_000
     ray = rays(FISHEYE, np.column_stack([column, row]).astype(float))
     truth = 1.6 / ray[:, 1] * (ray[:, 2] if measure == "z" else 1.0)
-    error = np.abs(maps.depth_m[row, column] - truth) / truth
+    assert (maps.depth_m >= 0).all() and np.isfinite(maps.depth_m).all()
+    # z vanishes towards the side: what is near in it is not near
+    error = np.abs(maps.depth_m[row, column] - truth) / np.maximum(truth, 1.0)
     error = error[np.isfinite(error)]  # the middle of a pixel at the rim may lie beyond the lens
     assert len(error) > 0.99 * len(row)
     assert np.median(error) < 1e-3 and np.quantile(error, 0.99) < 0.02

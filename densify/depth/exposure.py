@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from densify.config import Config, ProjectSettings
 from densify.errors import InputError
 from densify.geometry import poses
-from densify.geometry.cameras import depth_along, image_points
+from densify.geometry.cameras import NEAREST_M, depth_along, image_points
 from densify.types import (
     Bool,
     Camera,
@@ -157,7 +157,7 @@ class InView(NamedTuple):
 
 class Sight(NamedTuple):
     """Points as a camera sees them. points_cam: (N,3) metres, camera frame, when they are seen.
-    uv: (N,2) px, NaN where there is no pixel. inside: (N,) on the image."""
+    uv: (N,2) px, NaN where there is no pixel. inside: (N,) on the image, with a depth."""
 
     points_cam: Float
     uv: Float
@@ -208,12 +208,14 @@ class Exposure:
 
     def see(self, points: Float, velocity_m_s: Float | Float32) -> Sight:
         """(N,3) points and velocities at the key's moment, key frame. A rolling shutter sees each
-        point at the time of the row or column it lands on, where camera and point have moved on."""
+        point at the time of the row or column it lands on, where camera and point have moved on.
+        What has no depth as ``measure`` says, beside or behind a wide lens that is asked for z, is
+        not inside."""
         late = points + self.late_s * velocity_m_s if velocity_m_s.any() else points
         points_cam = poses.transform(self.T_cam_key, late)
         uv, inside = image_points(self.camera, points_cam)
         if not self.camera.is_rolling:
-            return Sight(points_cam, uv, inside)
+            return self._sight(points_cam, uv, inside)
         velocity_cam = poses.rotate(self.T_cam_key, velocity_m_s.astype(np.float64))
         last = np.array([self.camera.width_px - 1, self.camera.height_px - 1])
         time_s = np.array([self.camera.column_time_s, self.camera.row_time_s])
@@ -225,7 +227,10 @@ class Exposure:
             ahead = points_cam + row_s * (velocity_cam - self.twist[3:])
             there = poses.transform_each(turn, ahead)
             uv, inside = image_points(self.camera, there)
-        return Sight(there, uv, inside)
+        return self._sight(there, uv, inside)
+
+    def _sight(self, points_cam: Float, uv: Float, on_image: Bool) -> Sight:
+        return Sight(points_cam, uv, on_image & (self.depth_m(points_cam) > NEAREST_M))
 
     def sees(self, cloud: Cloud) -> InView:
         """What of a cloud at the key's moment is on the image."""
