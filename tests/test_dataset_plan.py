@@ -84,18 +84,16 @@ def test_more_shards_than_work(border_drive: Path, tmp_path: Path) -> None:
     in_order(out)
 
 
-def test_a_frame_that_is_missing_is_a_key_that_failed(
-    border_drive: Path, tmp_path: Path, capsys
-) -> None:
+def test_keys_are_the_frames_that_exist(border_drive: Path, tmp_path: Path) -> None:
     drive = copy_drive(border_drive, tmp_path / "2011_09_26")
     sweep_file(drive, 40).unlink()
     out = tmp_path / "out"
-    assert run(drive, out) == 1
-    assert statuses(out) == {39: "done", 40: "failed"}
-    assert "has no sweep for frame 40" in capsys.readouterr().out
-    # All are those that are there.
+    assert run(drive, out) == 0
+    assert statuses(out) == {39: "done"}
     (planned,) = plan([str(drive)], None, Recipe())
     assert list(planned.keys) == [f for f in FRAMES if f != 40]
+    with pytest.raises(InputError, match="--keys 40:41"):
+        plan([str(drive)], slice(40, 41), Recipe())
 
 
 def test_recordings_of_one_name(border_drive: Path, tmp_path: Path, capsys) -> None:

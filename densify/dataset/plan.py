@@ -110,8 +110,8 @@ class PlannedDrive:
 def plan(data: Sequence[str], keys: slice | None, recipe: Recipe) -> list[PlannedDrive]:
     """Open every recording and choose its keys.
 
-    data: what ``--data`` takes. keys: all if None, else those of the frames ``start`` to ``stop``
-    - 1 by ``step``, of every recording.
+    data: what ``--data`` takes. keys: all if None, else of the frames ``start`` to ``stop`` - 1 by
+    ``step`` those that exist, of every recording.
 
     Raises InputError for recordings that cannot be opened, have equal names, no such camera, or
     none of the keys.
@@ -144,7 +144,7 @@ def _keys(sequence: LidarSequence, keys: slice | None, spec: str) -> tuple[int, 
         return tuple(sequence.frames)
     wanted = range(keys.start, keys.stop, keys.step or 1)
     first, last = min(sequence.frames), max(sequence.frames)
-    chosen = tuple(f for f in wanted if first <= f <= last)
+    chosen = tuple(f for f in sequence.frames if f in wanted)
     if not chosen or (keys.start < first or wanted[-1] > last):
         text = f"{keys.start}:{keys.stop}" + ("" if keys.step in (None, 1) else f":{keys.step}")
         raise InputError(

@@ -131,9 +131,6 @@ def make_key(job: Job, key: int) -> KeyRecord:
 def _made(job: Job, key: int) -> KeyRecord:
     recipe = job.recipe
     recording, _ = _opened(job)
-    sequence = recording.sequence
-    if key not in sequence.frames:
-        raise InputError(f"{sequence.name} has no sweep for frame {key}")
     pictures = recipe.layout == "densify"
     cameras = job.source.cameras
     results = pipeline.densify(recording, key, _methods(recipe), cameras, with_images=pictures)

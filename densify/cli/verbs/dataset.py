@@ -47,7 +47,7 @@ def add(commands: Any) -> None:
         type=all_or_slice,
         default="all",
         metavar="all|A:B[:S]",
-        help="frames A to B-1, every S-th (default: all)",
+        help="frames A to B-1, every S-th, those that exist (default: all)",
     )
     add_window(parser)
     parser.add_argument(
