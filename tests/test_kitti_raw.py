@@ -259,6 +259,18 @@ def test_a_drive_of_sweeps_alone_opens(tree):
     assert "cameras" in describe(sequence)
 
 
+def test_without_any_image_all_calibrated_cameras_have_maps(tree):
+    with_images = KittiRaw(tree.drive).cameras["image_02"]
+    for folder in tree.drive.glob("image_*"):
+        folder.rename(tree.date / folder.name)
+    sequence = KittiRaw(tree.drive)
+    calibrated = re.findall(r"P_rect_(\d\d)", tree.calib.read_text())
+    assert [*sequence.cameras] == [f"image_{number}" for number in calibrated] != []
+    assert not any(sequence.image_stamps_ns(name) for name in sequence.cameras)
+    np.testing.assert_array_equal(sequence.cameras["image_02"].K, with_images.K)
+    np.testing.assert_array_equal(sequence.cameras["image_02"].T_cam_lidar, with_images.T_cam_lidar)
+
+
 # Poses
 
 

@@ -191,18 +191,20 @@ def camera_folders(drive: Path) -> list[str]:
 
 
 def read_cameras(drive: Path) -> dict[str, Camera]:
-    """Cameras by name: those with a folder in the drive and a rectified calibration in its parent.
+    """Cameras by name: those with a folder in the drive and a rectified calibration in its parent;
+    of a drive without any image folder all that are calibrated.
 
     K and the size come from ``P_rect`` and ``S_rect``, the images being rectified;
     ``T_cam_lidar`` is camera 0's rectification after ``calib_velo_to_cam``, moved by the camera's
-    offset in ``P_rect``. Empty for a drive without image folders.
+    offset in ``P_rect``. Empty where there are neither image folders nor a calibration.
     """
-    names = camera_folders(drive)
-    if not names:
+    folder, names = drive.resolve().parent, camera_folders(drive)
+    files = [folder / "calib_cam_to_cam.txt", folder / "calib_velo_to_cam.txt"]
+    if not names and not all(file.is_file() for file in files):
         return {}
-    folder = drive.resolve().parent
-    calibration = Calibration.read(folder / "calib_cam_to_cam.txt")
-    T_rect_lidar = Calibration.read(folder / "calib_velo_to_cam.txt").pose()
+    calibration, to_lidar = map(Calibration.read, files)
+    names = names or [f"image_{key[-2:]}" for key in calibration.entries if key[:-2] == "P_rect_"]
+    T_rect_lidar = to_lidar.pose()
     R = np.eye(4)
     R[:3, :3] = calibration.rotation("R_rect_00")
     T_rect_lidar = R @ T_rect_lidar
