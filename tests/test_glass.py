@@ -4,6 +4,8 @@ twin, and on a real car."""
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 
@@ -80,6 +82,30 @@ def test_a_window_gets_the_plane_of_its_frame():
         np.testing.assert_array_equal(after[~WINDOW], before[~WINDOW])
 
 
+def test_so_does_one_through_which_the_street_beyond_is_seen():
+    rng = np.random.default_rng(6)
+    depth_m = np.where(WINDOW, street_behind(), car(rng))
+    layers = layers_of(np.where(rng.random(SHAPE) < 0.5, depth_m, 0))
+    closed = close_windows(layers, FOCAL_PX, SETTINGS)
+    right = np.abs(closed.filled_m / side_m() - 1) < 0.01
+    assert right[WINDOW].mean() > 0.98
+    known = ~WINDOW & (layers.filled_m > 0)
+    np.testing.assert_array_equal(closed.filled_m[known], layers.filled_m[known])
+
+
+def test_a_window_without_a_measured_roof_is_closed_between_its_pillars():
+    """Thin roofs are seldom measured over their whole length."""
+    rng = np.random.default_rng(7)
+    roof = box(-9, 9, -9, -0.38) & ~box(-0.62, -0.45, -9, 9) & ~box(0.4, 0.57, -9, 9)
+    layers = layers_of(np.where(roof & BODY, 0, car(rng)))
+    closed = close_windows(layers, FOCAL_PX, SETTINGS)
+    right = np.abs(closed.filled_m / side_m() - 1) < 0.01
+    assert right[WINDOW].mean() > 0.7 > (layers.filled_m > 0)[WINDOW].mean()
+    assert not closed.filled_m[box(-9, 9, -9, -0.53)][
+        layers.filled_m[box(-9, 9, -9, -0.53)] == 0
+    ].any()
+
+
 def test_what_glass_itself_sent_back_stays_measured():
     rng = np.random.default_rng(2)
     depth_m = car(rng)
@@ -91,8 +117,8 @@ def test_what_glass_itself_sent_back_stays_measured():
 
 
 def no_window(kind, rng):
-    if kind == "a wall behind":
-        return np.where(BODY & ~WINDOW, side_m(), street_behind())
+    if kind == "a wall far behind":
+        return np.where(BODY & ~WINDOW, side_m(), side_m() + 35)
     if kind == "a truck's open bed":
         return np.where(BODY & ~box(-1.3, 1.3, -9, 0.3), side_m(), side_m() + 1.5)
     if kind == "an open door":
@@ -109,7 +135,7 @@ def no_window(kind, rng):
 
 @pytest.mark.parametrize(
     "kind",
-    ["a wall behind", "a truck's open bed", "an open door", "a gap between two cars"]
+    ["a wall far behind", "a truck's open bed", "an open door", "a gap between two cars"]
     + ["a tree's crown", "a shallow recess", "the plain street"],
 )
 def test_what_is_no_window_is_left(kind):
@@ -151,6 +177,31 @@ def fitted(parts):
     return np.linalg.lstsq(design, parts[:, 2], rcond=None)[0]
 
 
+def in_plane(parts, off_m, rules):
+    """The parts, by direction, without those farthest off their plane, and that; None if too few
+    are left."""
+    parts = dict(parts)
+    while (
+        len(parts) >= rules.least
+        and len(parts.keys() & {2, 3, 4, 5, 6}) >= rules.below
+        and 4 in parts
+        and parts.keys() & {8, 9}
+        and parts.keys() & {15, 0}
+    ):
+        plane = fitted(np.array([*parts.values()]))
+        off = {d: off_plane(plane, part) for d, part in parts.items()}
+        worst = max(off, key=off.get)
+        if off[worst] <= off_m:
+            return parts, plane
+        del parts[worst]
+    return None
+
+
+def off_plane(plane, part):
+    at = plane[0] + part[:2] @ plane[1:]
+    return abs(1 / at - 1 / part[2]) if at > 0 else np.inf
+
+
 def twin(row, column, near, far, rules):
     """The plane of the frame around a pixel, None if there is none."""
     if far[row, column] > 0:
@@ -161,42 +212,60 @@ def twin(row, column, near, far, rules):
         if not first:
             return None
         depth = 1 / min(first) + rules.empty_m
-    reach_px = int(min(rules.reach_m * rules.focal_px / depth, rules.reach_px))
-    rays = [on_ray(row, column, d, near, reach_px) for d in range(16)]
-    nearest = [ray[ray[:, 2].argmax()] for ray in rays if len(ray) and ray[:, 2].any()]
-    good = [
-        i
-        for i, part in enumerate(nearest)
+    whole = {d: on_ray(row, column, d, near, rules.reach_px) for d in range(16)}
+    close = {
+        d: ray[np.arange(1, len(ray) + 1) <= rules.reach_m * rules.focal_px * ray[:, 2]]
+        for d, ray in whole.items()
+    }
+    nearest = {d: ray[ray[:, 2].argmax()] for d, ray in close.items() if ray[:, 2].any()}
+    parts = {
+        d: part
+        for d, part in nearest.items()
         if rules.each_m < depth - 1 / part[2] and depth - 1 / part[2] <= rules.most_m
-    ]
-    rays, parts = [rays[i] for i in good], np.array([nearest[i] for i in good])
+    }
     for off_m in (rules.rough_m, rules.off_m):
-        if len(parts) < 16 - rules.open:
+        found = in_plane(parts, off_m, rules)
+        if found is None:
             return None
-        plane = fitted(parts)
+        _, plane = found
         before = depth - 1 / plane[0]
         if not (plane[0] > 0 and rules.behind_m < before <= rules.most_m):
             return None
         if abs(plane[2]) * rules.focal_px > rules.lean * plane[0]:
             return None
-        at = plane[0] + parts[:, :2] @ plane[1:]
-        if (np.abs(1 / at - 1 / parts[:, 2]) <= off_m).sum() < 16 - rules.open:
-            return None
-        touching = []
-        for ray in rays:
-            known = ray[ray[:, 2] > 0]
-            there = 1 / known[:, 2] < 1 / (plane[0] + known[:, :2] @ plane[1:]) + rules.touch_m
-            touching += [known[there.argmax()]] if there.any() else []
-        parts = np.array(touching)
-    return plane
+        parts = {}
+        reach_px = int(min(rules.reach_m * rules.focal_px * plane[0], rules.reach_px))
+        rays = {d: ray[:reach_px] for d, ray in whole.items()}
+        for d, ray in rays.items():
+            for part in ray[ray[:, 2] > 0]:
+                at_m = 1 / (plane[0] + part[:2] @ plane[1:])
+                if 1 / part[2] < at_m + rules.touch_m:
+                    if at_m - rules.rough_m < 1 / part[2] < depth - rules.each_m:
+                        parts[d] = part
+                    break
+    plates = {d for d in range(2, 7) if has_plate(rays[d], plane, rules)}
+    return plane if 4 in plates and len(plates) >= rules.below - 1 else None
+
+
+def has_plate(ray, plane, rules):
+    """Whether somewhere on a ray cells are in the plane for as long as a plate is: half of them
+    known or more, the first of them, and none off it."""
+    size = int(rules.plate_m * rules.focal_px * plane[0]) + 1
+    off = [off_plane(plane, part) if part[2] > 0 else np.nan for part in ray]
+    ends = [-1, *np.flatnonzero(np.array(off) > rules.plate_off_m), len(off)]
+    for before, after in pairwise(ends):
+        known = [k for k in range(before + 1, after) if np.isfinite(off[k])]
+        if known and after - known[0] >= size:
+            return 2 * sum(k < known[0] + size for k in known) > size
+    return False
 
 
 def test_frames_equal_those_of_a_slow_twin():
     rng = np.random.default_rng(5)
-    depth_m = car(rng)[22:96:2, 110:210:2]
+    depth_m = car(rng)[22:130:2, 110:210:2]
     depth_m[rng.random(depth_m.shape) < 0.1] = 0
     near = np.divide(1, depth_m, out=np.zeros_like(depth_m), where=depth_m > 0).astype(np.float32)
-    rules, found = glass._rules(FOCAL_PX / 2), np.zeros((4, *near.shape), np.float32)
+    rules, found = glass._rules(FOCAL_PX / 2), np.zeros((6, *near.shape), np.float32)
     known = np.where(near > 0, np.float32(0.5), np.float32(0))
     steps = first_known(near > 0)
     framed.over_rows(near.size, near, near, known, steps, DIRECTIONS, rules, found)

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: MIT
 """Windows of vehicles closed.
 
-Lasers go through glass: what they measure in a window are seats and headrests, which no camera is
-asked for and most uses of a depth map (and KITTI's stereo benchmark) count as wrong. A window is
-told by its frame: around it, in all directions, a surface that lies in one plane.
+Lasers go through glass: what they measure in a window are seats, headrests and what lies beyond,
+which no camera is asked for and most uses of a depth map (and KITTI's stereo benchmark) count as
+wrong. A window is told by its frame: below, to both sides and in most directions besides a surface
+that lies in one plane, of which roofs and pillars are thin and often not measured.
 """
 
 from __future__ import annotations
@@ -22,14 +23,15 @@ from densify.kernels.marching import DIRECTIONS, first_known
 from densify.types import Bool, Float32, Int
 
 _CELL_RAD = 1 / 360  # frames are looked for in cells of about that size
-_REACH_RAD = 0.1
-_BEHIND_M, _MOST_M = 0.2, 3.0  # of the plane: where what is seen through a window lies
+_REACH_RAD = 0.16
+_BEHIND_M, _MOST_M = 0.2, 30.0  # of the plane: where what is seen through a window lies
 _TAKEN_M = 0.1  # behind the plane: nearer is part of the vehicle
-_AREA_M2 = (0.06, 1.5)
+_AREA_M2 = (0.06, 2.5)
 _LEAST_CELLS = 16
 _LEAST_SOLID = 0.25  # of the rectangle around a window
-_MEASURED = (0.02, 0.92)  # share of its cells
+_MEASURED = (0.02, 0.97)  # share of its cells
 _MOST_IN_PLANE = 0.33  # share of its cells that are part of frames: hedges have more
+_LEAST_AROUND = np.array([0.5, 0.1])  # shares of its cells with a frame above, and to both sides
 _EIGHT = np.ones((3, 3), bool)
 
 
@@ -37,12 +39,14 @@ def close_windows(layers: Layers, focal_px: float, settings: ProjectSettings) ->
     """Put the plane of its frame into each window of a vehicle and take out what was measured
     behind it.
 
-    A cell belongs to a window if in at least 15 of 16 directions, within 0.9 m, the nearest surface
-    lies before it, these surfaces lie in one upright plane to 0.08 m, and the cell 0.2 to 3 m
-    behind it; an empty cell counts as 0.18 m behind what is around it. The plane is fitted in
-    inverse depth, first through the nearest surfaces, then through where each direction first
-    comes to it. Connected cells make a window if they have a window's size and shape, if some of
-    them but not all are measured, and if few among them lie in the plane, as in a hedge.
+    A cell belongs to a window if in at least 11 of 16 directions, within 1.2 m, the nearest surface
+    lies before it: 3 of the 5 downwards and one to each side among them; if these surfaces lie in
+    one upright plane to 0.1 m, which goes on below for 0.2 m, as a door does and ground does not;
+    and if the cell lies 0.2 to 30 m behind it, an empty one as if 0.18 m behind what is around it.
+    The plane is fitted in inverse depth, first through the nearest surfaces, then through where
+    each direction first comes to it, and again without what lies farthest off it. Connected cells
+    make a window if they have a window's size and shape, if half of them have a frame above too,
+    and if few among them lie in the plane, as in a hedge.
 
     focal_px: pixels per radian. The planes are as certain as the least certain part of their
     frames, times ``settings.fill_confidence``. ``layers.window`` says where windows are,
@@ -50,7 +54,7 @@ def close_windows(layers: Layers, focal_px: float, settings: ProjectSettings) ->
     """
     size = max(1, round(focal_px * _CELL_RAD))
     cells = _cells(layers, size)
-    found = np.zeros((4, *cells.near.shape), np.float32)
+    found = np.zeros((6, *cells.near.shape), np.float32)
     framed.over_rows(
         cells.near.size,
         cells.near,
@@ -61,8 +65,8 @@ def close_windows(layers: Layers, focal_px: float, settings: ProjectSettings) ->
         _rules(focal_px / size),
         found,
     )
-    source = _windows(found[0], cells, focal_px / size)
-    row, column, plane_m, confidence = _planes(found, source, size, layers.filled_m.shape)
+    source = _windows(found[0], found[4:] > 0, cells, focal_px / size)
+    row, column, plane_m, confidence = _planes(found[:4], source, size, layers.filled_m.shape)
     window = np.zeros(layers.filled_m.shape, bool)
     window[row, column] = True
     seen_m = layers.filled_m[row, column]
@@ -121,23 +125,27 @@ def _blocks(values: Float32, size: int) -> Float32:
 def _rules(focal_px: float) -> Rules:
     return Rules(
         focal_px=focal_px,
-        reach_m=0.9,
+        reach_m=1.2,
         reach_px=round(_REACH_RAD * focal_px),
         behind_m=_BEHIND_M,
         most_m=_MOST_M,
         each_m=0.05,
         empty_m=0.18,
-        open=1,
-        rough_m=0.3,
+        least=11,
+        below=3,
+        plate_m=0.2,
+        plate_off_m=0.15,
+        rough_m=0.35,
         touch_m=0.06,
-        off_m=0.08,
+        off_m=0.1,
         lean=2.5,
     )
 
 
-def _windows(inverse: Float32, cells: _Cells, focal_px: float) -> NDArray[np.int64]:
+def _windows(inverse: Float32, around: Bool, cells: _Cells, focal_px: float) -> NDArray[np.int64]:
     """(H,W) index of the cell whose plane a cell takes, -1 outside windows. inverse: of the planes,
-    0 none. Gaps of a cell or two in a window are closed."""
+    0 none. around: (2,H,W) whose frame has parts above, and to both sides. Gaps of a cell or two in
+    a window are closed."""
     framed = inverse > 0
     label, num = ndimage.label(ndimage.binary_closing(framed, _EIGHT), _EIGHT)
     area_m2 = np.divide(1, (inverse * focal_px) ** 2, out=np.zeros_like(inverse), where=framed)
@@ -146,11 +154,12 @@ def _windows(inverse: Float32, cells: _Cells, focal_px: float) -> NDArray[np.int
         region = label[box] == number
         whole = ndimage.binary_fill_holes(region)
         in_plane = whole & ~framed[box] & (cells.near[box] > 0)
-        num_framed = (region & framed[box]).sum()
+        own = region & framed[box]
         good[number] = (
-            num_framed >= max(_LEAST_CELLS, _LEAST_SOLID * region.size)
+            own.sum() >= max(_LEAST_CELLS, _LEAST_SOLID * region.size)
             and _AREA_M2[0] < area_m2[box][region].sum() < _AREA_M2[1]
-            and _MEASURED[0] < cells.measured[box][region & framed[box]].mean() < _MEASURED[1]
+            and _MEASURED[0] < cells.measured[box][own].mean() < _MEASURED[1]
+            and (around[:, box[0], box[1]][:, own].mean(axis=1) >= _LEAST_AROUND).all()
             and in_plane.sum() <= _MOST_IN_PLANE * whole.sum()
         )
     row, column = ndimage.distance_transform_edt(

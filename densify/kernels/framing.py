@@ -17,10 +17,11 @@ class Rules(NamedTuple):
     """What makes a frame. focal_px: of the map. reach_m, reach_px: how far from the pixel it may
     be, the less of both. behind_m, most_m: how far the pixel lies behind its plane, at least and at
     most; each_m: behind each of its parts. empty_m: an empty pixel counts as so far behind the
-    farthest of the first known pixels around. open: most directions in which there is no frame, or
-    one off the plane. rough_m, off_m: by more than this, of a frame roughly found and found again.
-    touch_m: a ray comes to the plane where a surface is at most so far behind it. lean: most metres
-    of depth per metre of height."""
+    farthest of the first known pixels around. least: of sixteen directions in which there is a
+    frame; below: of the five downwards, one more than those where a plate must stand, a surface
+    that lies in the plane to plate_off_m for plate_m. rough_m, off_m: what lies farther from the
+    plane is no part of a frame roughly found and found again. touch_m: a ray comes to the plane
+    where a surface is at most so far behind it. lean: most metres of depth per metre of height."""
 
     focal_px: float
     reach_m: float
@@ -29,7 +30,10 @@ class Rules(NamedTuple):
     most_m: float
     each_m: float
     empty_m: float
-    open: int
+    least: int
+    below: int
+    plate_m: float
+    plate_off_m: float
     rough_m: float
     touch_m: float
     off_m: float
@@ -67,19 +71,57 @@ def _plane(parts):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def _is_before(depth, plane, parts, off_m, rules):  # type: ignore[no-untyped-def]
-    """Whether the plane stands upright before what is ``depth`` metres away, and the frame in it:
-    in all but ``rules.open`` of the sixteen directions."""
-    centre, slope_u, slope_v = plane
+def _at(plane, du, dv):  # type: ignore[no-untyped-def]
+    """Inverse depth of the plane, (3,) of `_plane`, beside the origin."""
+    return plane[0] + plane[1] * du + plane[2] * dv
+
+
+@inlined
+def _off_m(plane, du, dv, inverse):  # type: ignore[no-untyped-def]
+    """How far a surface lies from the plane along its ray."""
+    there = _at(plane, du, dv)
+    return abs(1 / there - 1 / inverse) if there > 0 else np.inf
+
+
+@inlined
+def _is_before(depth, plane, rules):  # type: ignore[no-untyped-def]
+    """Whether the plane stands upright before what is ``depth`` metres away."""
+    centre, _, slope_v = plane
     if centre * (depth - rules.behind_m) <= 1 or centre * (depth - rules.most_m) > 1:
         return False
-    if abs(slope_v) * rules.focal_px > rules.lean * centre:
-        return False
-    num = 0
-    for part in parts:
-        there = centre + slope_u * part[0] + slope_v * part[1]
-        num += there > 0 and abs(1 / there - 1 / part[2]) <= off_m
-    return num >= 16 - rules.open
+    return abs(slope_v) * rules.focal_px <= rules.lean * centre
+
+
+@inlined
+def _is_around(which, num, rules):  # type: ignore[no-untyped-def]
+    """Whether directions, from the right by way of below, are as many as a frame has: straight
+    down, around that, to the left and to the right."""
+    down, below, left, right = 0, 0, 0, 0
+    for i in range(num):
+        down += which[i] == 4
+        below += 2 <= which[i] <= 6
+        left += 7 <= which[i] <= 9
+        right += which[i] <= 1 or which[i] == 15
+    some = min(down, left, right) > 0
+    return some and num >= rules.least and below >= rules.below
+
+
+@inlined
+def _in_plane(parts, which, num, off_m, rules):  # type: ignore[no-untyped-def]
+    """How many parts are left, moved to the front, once none lies farther than ``off_m`` from the
+    plane through all; what does most goes first. 0 where too few are left."""
+    while _is_around(which, num, rules):
+        plane = _plane(parts[:num])
+        most, worst = 0.0, 0
+        for i in range(num):
+            off = _off_m(plane, parts[i, 0], parts[i, 1], parts[i, 2])
+            if off > most:
+                most, worst = off, i
+        if most <= off_m:
+            return num
+        num -= 1
+        parts[worst], which[worst] = parts[num], which[num]
+    return 0
 
 
 @inlined
@@ -97,48 +139,75 @@ def _depth(row, column, near, far, steps, directions, rules):  # type: ignore[no
 
 
 @inlined
-def _nearest_parts(row, column, depth, reach_px, near, directions, rules, parts, which):  # type: ignore[no-untyped-def]
+def _nearest_parts(row, column, depth, near, directions, rules, parts, which):  # type: ignore[no-untyped-def]
     """The nearest surface on the way in each direction, where it lies before the pixel: how many;
     gives up once too many directions are open."""
     height, width = near.shape
+    reach = rules.reach_m * rules.focal_px
     num = 0
     for i in range(len(directions)):
         d = i * 5 % len(directions)  # sides far apart first
         parts[num, 2] = 0.0
-        for k in range(1, reach_px + 1):
+        for k in range(1, rules.reach_px + 1):
             du, dv = _offset(directions, d, k)
             u, v = column + du, row + dv
             if not (0 <= u < width and 0 <= v < height):
                 break
-            if near[v, u] > parts[num, 2]:
+            if near[v, u] > parts[num, 2] and k <= reach * near[v, u]:
                 parts[num, 0], parts[num, 1], parts[num, 2] = du, dv, near[v, u]
         if parts[num, 2] * (depth - rules.each_m) > 1 >= parts[num, 2] * (depth - rules.most_m):
             which[num] = d
             num += 1
-        elif i - num >= rules.open:
+        elif i - num >= len(directions) - rules.least:
             return 0
     return num
 
 
 @inlined
-def _touching_parts(row, column, reach_px, near, directions, rules, plane, which, num, parts):  # type: ignore[no-untyped-def]
-    """Where each ray first comes to a surface that touches the plane: how many do."""
+def _touching_parts(row, column, depth, reach_px, near, directions, rules, plane, parts, which):  # type: ignore[no-untyped-def]
+    """Where the ray in each direction first comes to a surface before the pixel that touches the
+    plane, unless one far before it is in the way: how many do."""
     height, width = near.shape
-    centre, slope_u, slope_v = plane
-    hits = 0
-    for i in range(num):
+    num = 0
+    for d in range(len(directions)):
         for k in range(1, reach_px + 1):
-            du, dv = _offset(directions, which[i], k)
+            du, dv = _offset(directions, d, k)
             u, v = column + du, row + dv
             if not (0 <= u < width and 0 <= v < height):
                 break
-            there = near[v, u]
-            fitted = centre + slope_u * du + slope_v * dv
+            there, fitted = near[v, u], _at(plane, du, dv)
             if there > 0 and fitted > 0 and 1 / there < 1 / fitted + rules.touch_m:
-                parts[hits, 0], parts[hits, 1], parts[hits, 2] = du, dv, there
-                hits += 1
+                if 1 / fitted - rules.rough_m < 1 / there < depth - rules.each_m:
+                    parts[num, 0], parts[num, 1], parts[num, 2], which[num] = du, dv, there, d
+                    num += 1
                 break
-    return hits
+    return num
+
+
+@inlined
+def _stands_on_plates(row, column, reach_px, near, directions, rules, plane):  # type: ignore[no-untyped-def]
+    """Whether a surface goes on in the plane straight below and in all but one of the other
+    directions downwards that are asked for, as a door does and ground does not."""
+    height, width = near.shape
+    length = rules.plate_m * rules.focal_px * plane[0]
+    plates = 0
+    for d in range(2, 7):
+        run, seen = 0, 0
+        for k in range(1, reach_px + 1):
+            du, dv = _offset(directions, d, k)
+            u, v = column + du, row + dv
+            if run > length or not (0 <= u < width and 0 <= v < height):
+                break
+            if near[v, u] > 0:
+                flat = _off_m(plane, du, dv, near[v, u]) <= rules.plate_off_m
+                run, seen = (run + 1, seen + 1) if flat else (0, 0)
+            elif run > 0:
+                run += 1
+        if run > length and 2 * seen > run:
+            plates += 1
+        elif d == 4:
+            return False
+    return plates >= rules.below - 1
 
 
 @Kernel
@@ -147,33 +216,43 @@ def framed(first, last, near, far, known, steps, directions, rules, found):  # t
 
     near, far: (H,W) inverse depth of the nearest and of the farthest surface seen in a pixel, 1/m,
     0 none. known: (H,W) float32 confidence. steps: (16,H,W) of `marching.first_known` of ``near``.
-    rules: `Rules`. found: (4,H,W) float32: the plane's inverse depth in the pixel, its slopes to
-    the right and down, and the frame's least confidence; stays 0 where there is no frame.
+    rules: `Rules`. found: (6,H,W) float32: the plane's inverse depth in the pixel, its slopes to
+    the right and down, the frame's least confidence, and 1 where it has a part upwards, and parts
+    on both sides that do not lie lower; stays 0 where there is no frame.
     """
     width = near.shape[1]
-    parts, which = np.zeros((len(directions) + 1, 3)), np.zeros(len(directions), np.int64)
+    parts = np.zeros((len(directions) + 1, 3))
+    which = np.zeros(len(directions) + 1, np.int64)
     for p in range(first, last):
         row, column = p // width, p % width
         depth = _depth(row, column, near, far, steps, directions, rules)
         if depth <= rules.behind_m:
             continue
-        reach_px = int(min(rules.reach_m * rules.focal_px / depth, float(rules.reach_px)))
-        num = _nearest_parts(row, column, depth, reach_px, near, directions, rules, parts, which)
-        if num < len(directions) - rules.open:
+        num = _nearest_parts(row, column, depth, near, directions, rules, parts, which)
+        num = _in_plane(parts, which, num, rules.rough_m, rules)
+        if num == 0:
             continue
         plane = _plane(parts[:num])
-        if not _is_before(depth, plane, parts[:num], rules.rough_m, rules):
+        if not _is_before(depth, plane, rules):
             continue
+        reach_px = int(min(rules.reach_m * rules.focal_px * plane[0], float(rules.reach_px)))
         num = _touching_parts(
-            row, column, reach_px, near, directions, rules, plane, which, num, parts
+            row, column, depth, reach_px, near, directions, rules, plane, parts, which
         )
-        if num < len(directions) - rules.open:
+        num = _in_plane(parts, which, num, rules.off_m, rules)
+        if num == 0:
             continue
         plane = _plane(parts[:num])
-        if not _is_before(depth, plane, parts[:num], rules.off_m, rules):
+        if not _is_before(depth, plane, rules) or not _stands_on_plates(
+            row, column, reach_px, near, directions, rules, plane
+        ):
             continue
-        least = np.float32(np.inf)
+        least, above, left, right = np.float32(np.inf), False, False, False
         for i in range(num):
             least = min(least, known[row + int(parts[i, 1]), column + int(parts[i, 0])])
+            above |= 11 <= which[i] <= 13
+            left |= 8 <= which[i] <= 9
+            right |= which[i] == 0 or which[i] == 15
         found[0, row, column], found[1, row, column], found[2, row, column] = plane
         found[3, row, column] = least
+        found[4, row, column], found[5, row, column] = above, left and right
