@@ -18,10 +18,11 @@ from densify.readers.window import read_sweep, recorded_trajectory
 from densify.registration import neighbors, odometry, trajectory
 from densify.registration.alignment import subsample
 from densify.registration.deskew import deskew
+from densify.registration.doppler import measured_velocity
 from densify.registration.neighbors import refine
 from densify.registration.odometry import check_overlap, check_plausible, register
 from densify.registration.surfaces import register_on_surfaces
-from densify.types import Trajectory
+from densify.types import Sweep, Trajectory
 from tests.scenes import SWEEP_S, Arc, Box, Scanner, Scene, World, street
 
 SETTINGS = RegisterSettings()
@@ -354,7 +355,7 @@ def test_sweeps_of_equal_or_no_stamps_do_not_abort(drive, tmp_path):
 import numpy as np
 from densify.config import RegisterSettings
 from densify.registration.odometry import register
-from densify.types import Sweep
+from densify.types import Sweep, Sweep
 p = np.load({str(tmp_path / "sweep.npz")!r})["points"]
 n = len(p)
 def sweep(frame, offset_ns):
@@ -398,12 +399,16 @@ def few(raw):
     return [subsample(s, 12_000) for s in raw]
 
 
+def on_surfaces(sweeps):
+    return register_on_surfaces(sweeps, SETTINGS, [None] * len(sweeps))
+
+
 def test_few_points_are_laid_on_the_surfaces_of_the_last_second(drive, few):
-    found = register_on_surfaces(few, SETTINGS)
+    found = on_surfaces(few)
     assert (found.frames, found.T_world_lidar[0].tolist()) == (tuple(FRAMES), np.eye(4).tolist())
     off_m, off_deg = errors(found, drive.trajectory(FRAMES))
     assert off_m.max() < 0.04 and off_deg.max() < 0.1
-    again = register_on_surfaces(few, SETTINGS)
+    again = on_surfaces(few)
     assert again.T_world_lidar.tobytes() == found.T_world_lidar.tobytes()
 
 
@@ -424,7 +429,7 @@ def test_the_number_of_points_decides_on_the_odometry(raw, few, monkeypatch):
 )
 def test_few_sweeps_of_few_points_are_placed_too(drive, few, frames):
     """A hole of 0.6 s is 7 m of travel in a bend of 9 degrees."""
-    found = register_on_surfaces([few[f] for f in frames], SETTINGS).T_world_lidar
+    found = on_surfaces([few[f] for f in frames]).T_world_lidar
     true = drive.trajectory(frames).T_world_lidar
     off = poses.log(poses.inverse(poses.inverse(true[0]) @ true[-1]) @ found[-1])
     assert np.linalg.norm(off[3:]) < 0.1 and np.rad2deg(np.linalg.norm(off[:3])) < 0.3
@@ -432,7 +437,7 @@ def test_few_sweeps_of_few_points_are_placed_too(drive, few, frames):
 
 def test_a_hole_longer_than_the_memory_is_bridged_by_the_last_sweep(drive, few):
     late = [*few[:6], *(replace(s, stamp_ns=s.stamp_ns + 1_500_000_000) for s in few[6:])]
-    assert np.isfinite(register_on_surfaces(late, SETTINGS).T_world_lidar).all()
+    assert np.isfinite(on_surfaces(late).T_world_lidar).all()
 
 
 def test_a_pattern_that_turns_from_sweep_to_sweep_does_not_take_the_poses_with_it() -> None:
@@ -444,6 +449,44 @@ def test_a_pattern_that_turns_from_sweep_to_sweep_does_not_take_the_poses_with_i
     off = np.array([poses.log(T) for T in found.T_world_lidar])
     assert np.linalg.norm(off[:, 3:], axis=1).max() < 0.08
     assert np.rad2deg(np.linalg.norm(off[:, :3], axis=1)).max() < 1
+
+
+def test_measured_velocities_hold_along_a_road_where_nothing_else_tells() -> None:
+    """A forward scanner sees rails and the traffic that it goes with: point to point, it stays 2 m
+    behind from each sweep to the next but one."""
+    highway, frames = Street("highway", 2026, "fmcw"), range(75, 83)
+    raw = [read_sweep(highway, f, SETTINGS) for f in frames]
+    true = [highway.T_world_lidar(f) for f in frames]
+    found = trajectory.find_trajectory(raw, SETTINGS).T_world_lidar
+    away = [poses.inverse(true[0]) @ T for T in true] - found
+    assert np.linalg.norm(away[:, :3, 3], axis=1).max() < 0.05
+    for sweep in raw[::3]:
+        assert measured_velocity(sweep) == pytest.approx([25, 0, 0], abs=0.05)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.4, 0.7], ids=["all stands", "traffic", "most moves"])
+def test_the_velocity_is_that_of_what_stands(share):
+    rng = np.random.default_rng(9)
+    points, own = 30 * rng.normal(size=(4000, 3)), np.array([12.0, -1.5, 0.4])
+    origins = np.array([[0.0, 0.0, 0.0], [1.2, 0.3, -0.8]])
+    lidar = rng.integers(0, 2, 4000)
+    away = points - origins[lidar]
+    moves = (rng.random(4000) < share)[:, None] * rng.uniform(5, 30, (4000, 3))
+    ray = away / np.linalg.norm(away, axis=1, keepdims=True)
+    radial_m_s = np.einsum("ni,ni->n", ray, moves - own) + 0.03 * rng.normal(size=4000)
+    radial_m_s[::7] = np.nan
+    sweep = Sweep(
+        *(0, 0, points, np.zeros(4000, np.float32), None, lidar.astype(np.uint8), np.arange(4000)),
+        scanner_origins=origins,
+        radial_velocity_m_s=radial_m_s.astype(np.float32),
+    )
+    found = measured_velocity(sweep)
+    if share > 0.5:
+        assert found is None
+    else:
+        np.testing.assert_allclose(found, own, atol=0.02)
+    assert measured_velocity(replace(sweep, radial_velocity_m_s=None)) is None
+    assert measured_velocity(sweep.select(np.arange(100))) is None
 
 
 # --- what cannot be registered --------------------------------------------------------------------

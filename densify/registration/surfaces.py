@@ -30,12 +30,16 @@ _MATCH_M = (0.9, 0.6, 0.3)  # in turn; a guess at constant velocity is up to 0.3
 _HOLD = 0.01
 
 
-def register_on_surfaces(sweeps: Sequence[Sweep], settings: RegisterSettings) -> Trajectory:
+def register_on_surfaces(
+    sweeps: Sequence[Sweep], settings: RegisterSettings, measured: Sequence[Float | None]
+) -> Trajectory:
     """Poses of sweeps by lidar odometry, see `densify.registration.odometry.register`.
 
-    sweeps: raw, ascending in time. Each is searched for where the vehicle would be if it kept its
-    velocity. The first second is registered twice, from `searched_twist`, which is some metres per
-    second off, and from the twist found by that.
+    sweeps: raw, ascending in time. measured: (3,) m/s of each, see
+    `densify.registration.doppler.measured_velocity`. Each is searched for where the vehicle would
+    be if it kept its velocity, or went as fast as was measured: along a road where nothing else
+    tells, that decides. The first second is registered twice, from `searched_twist`, which is some
+    metres per second off, and from the twist found by that.
     """
     chosen = [subsample(sweep, _NUM_POINTS) for sweep in sweeps]
     frames = tuple(s.frame for s in sweeps)
@@ -43,17 +47,28 @@ def register_on_surfaces(sweeps: Sequence[Sweep], settings: RegisterSettings) ->
     twist = np.zeros(6)
     if len(sweeps) > 1:
         start = slice(int(np.searchsorted(stamp_ns, stamp_ns[0] + _START_NS, side="right")))
-        T = _follow(chosen[start], stamp_ns[start], searched_twist(sweeps, settings))
+        twist = _as_measured(searched_twist(sweeps, settings), measured[:2])
+        T = _follow(chosen[start], stamp_ns[start], twist, measured)
         twist = _twist(T, stamp_ns, min(_NUM_START + 1, len(T) - 1))  # between two that were laid
-    return Trajectory(frames, stamp_ns, np.stack(_follow(chosen, stamp_ns, twist)))
+    return Trajectory(frames, stamp_ns, np.stack(_follow(chosen, stamp_ns, twist, measured)))
 
 
-def _follow(sweeps: Sequence[Sweep], stamp_ns: Int, twist: Float) -> list[Float]:
+def _as_measured(twist: Float, measured: Sequence[Float | None]) -> Float:
+    """The (6,) twist per second with the mean of the measured velocities, where all are known."""
+    if any(velocity is None for velocity in measured):
+        return twist
+    return np.append(twist[:3], np.mean(measured, axis=0))
+
+
+def _follow(
+    sweeps: Sequence[Sweep], stamp_ns: Int, twist: Float, measured: Sequence[Float | None]
+) -> list[Float]:
     """``T_world_lidar`` of each sweep, from the (6,) twist per second at the start."""
     T_world_lidar = [np.eye(4)]
     points = [_straight(sweeps[0], twist)]  # in the world
     num_start = min(_NUM_START, len(sweeps) - 1)
     for i in range(1, len(sweeps)):
+        twist = _as_measured(twist, measured[i - 1 : i + 1])
         T_guess = T_world_lidar[-1] @ poses.exp(twist * (stamp_ns[i] - stamp_ns[i - 1]) * 1e-9)
         T_world_lidar.append(T_guess)
         if i >= num_start:

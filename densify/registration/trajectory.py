@@ -14,6 +14,7 @@ from densify.config import RegisterSettings
 from densify.errors import InputError, SweepError, UnfitSweepError, UnplacedSweepError
 from densify.geometry import poses
 from densify.registration.deskew import deskew
+from densify.registration.doppler import measured_velocity
 from densify.registration.neighbors import refine
 from densify.registration.odometry import (
     check_number_of_points,
@@ -73,7 +74,11 @@ def find_trajectory(
         check_number_of_points(sweeps, settings)
         check_stamps([s.frame for s in sweeps], _stamps_ns(sweeps))
         many = bool(np.median([len(sweep) for sweep in sweeps]) >= _MANY_POINTS)
-        odometry, straight = (_by_points if many else _by_surfaces)(sweeps, settings)
+        measured = [measured_velocity(sweep) for sweep in sweeps]
+        if many and any(velocity is None for velocity in measured):
+            odometry, straight = _by_points(sweeps, settings)
+        else:
+            odometry, straight = _by_surfaces(sweeps, settings, measured)
         found = refine(sweeps, odometry, _AROUND_MANY_NS if many else _AROUND_FEW_NS, settings)
         check_plausible(found, settings)
         check_overlap(straight, found, settings)
@@ -81,10 +86,10 @@ def find_trajectory(
 
 
 def _by_surfaces(
-    sweeps: Sequence[Sweep], settings: RegisterSettings
+    sweeps: Sequence[Sweep], settings: RegisterSettings, measured: Sequence[Float | None]
 ) -> tuple[Trajectory, list[Sweep]]:
-    """Odometry for few points, and the sweeps deskewed by it."""
-    found = register_on_surfaces(sweeps, settings)
+    """Odometry for few points, or by measured velocities, and the sweeps deskewed by it."""
+    found = register_on_surfaces(sweeps, settings, measured)
     return found, [s.sweep for s in deskew(sweeps, found).sweeps]
 
 
