@@ -167,7 +167,7 @@ def densify(
     of the last of the methods. Errors as `run`.
     """
     watch, sequence, settings = watch or Watch(), recording.sequence, recording.settings
-    cuts = _cuts(recording, key)
+    cuts = _cuts(recording, key, any(METHODS[name].engine is not None for name in methods))
     shots = key_shots(sequence, choose_cameras(sequence, cameras), key, settings.project)
     with watch.stage("images"):
         images = load_images(sequence, shots)
@@ -197,11 +197,17 @@ def _open_priors(
     return PriorFiles.open(Path(place), [c.name for c in choose_cameras(sequence, cameras)])
 
 
-def _cuts(recording: Recording, key: int) -> list[str]:
-    """Why a key's window has fewer sweeps than asked for, a sentence each."""
+def _cuts(recording: Recording, key: int, with_flow: bool) -> list[str]:
+    """Why a key's window has fewer sweeps than asked for, and that it has too few to follow
+    anything, a sentence each."""
     window = recording.window_frames(key)
     frames = format_frames(window.frames)
-    return [f"the window is cut to frames {frames}: {cut}" for cut in window.cuts]
+    told = [f"the window is cut to frames {frames}: {cut}" for cut in window.cuts]
+    if with_flow and recording.is_pair(key):
+        told.append(
+            "two sweeps show what moves less well than three or more, which can be followed"
+        )
+    return told
 
 
 def _check(

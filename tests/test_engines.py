@@ -108,3 +108,31 @@ def test_an_engine_that_cannot_work_is_known_before_anything_is_computed() -> No
         check_engine("magic")
     with pytest.raises(InputError, match="npz:nowhere: no such folder"):
         check_engine("npz:nowhere")
+
+
+@pytest.mark.parametrize("backward", [False, True])
+def test_two_sweeps_show_what_moves_to_either_side(driving: Scene, backward: bool) -> None:
+    """Both turned by 90 degrees: flow is in each sweep's own axes."""
+    turned = np.array([[0.0, -1, 0, 3], [1, 0, 0, -2], [0, 0, 1, 0], [0, 0, 0, 1]])
+    sweeps = [
+        replace(
+            s,
+            T_world_lidar=s.T_world_lidar @ turned,
+            sweep=replace(s.sweep, points=(s.sweep.points - turned[:3, 3]) @ turned[:3, :3]),
+        )
+        for s in driving.stretch.sweeps[2:4]
+    ]
+    pair = replace(driving, stretch=Stretch(tuple(sweeps)))
+    here, there = pair.stretch.frames[:: -1 if backward else 1]
+    found = estimate_motion(pair, Config(), "pairs").flow(here, there)
+    followed = estimate_motion(driving, Config()).flow(here, there)
+    both = found.moving & followed.moving
+    assert both.sum() > 0.8 * followed.moving.sum() > 100
+    for wanted, got in (
+        (followed.displacement, found.displacement),
+        (followed.to_reference, found.to_reference),
+        (followed.velocity_m_s * 0.1, found.velocity_m_s * 0.1),
+    ):
+        off_m = np.linalg.norm(got[both] - wanted[both] @ turned[:3, :3], axis=1)
+        assert np.median(off_m) < 0.03
+    assert not found.displacement[~found.moving].any()

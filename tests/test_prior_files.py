@@ -162,14 +162,25 @@ def test_torn_files_are_refused(name, tmp_path):
         read(tmp_path)
 
 
+def test_one_file_is_of_one_camera_and_image(tmp_path):
+    put(tmp_path / "120.npy")
+    put(tmp_path / "121.npy")
+    found = PriorFiles.open(tmp_path / "120.npy", ["left"])
+    assert found.values == {"left": {120: tmp_path / "120.npy"}} and found.sky == {"left": {}}
+
+
 def test_places_that_cannot_be_right(tmp_path):
     with pytest.raises(InputError, match="no such folder"):
         PriorFiles.open(tmp_path / "nowhere", ["left"])
     with pytest.raises(InputError, match="no depth images named by frame"):
         PriorFiles.open(tmp_path, ["left"])
     put(tmp_path / "120.npy")
-    with pytest.raises(InputError, match="one camera, and there are left, right"):
-        PriorFiles.open(tmp_path, ["left", "right"])
+    put(tmp_path / "mine.npy")
+    with pytest.raises(InputError, match=r"mine\.npy: names no frame; expected 0000000120\.npy"):
+        PriorFiles.open(tmp_path / "mine.npy", ["left"])
+    for place in (tmp_path, tmp_path / "120.npy"):
+        with pytest.raises(InputError, match="one camera, and there are left, right"):
+            PriorFiles.open(place, ["left", "right"])
     put(tmp_path / "000120.npy")
     with pytest.raises(InputError, match="both of image 120"):
         PriorFiles.open(tmp_path, ["left"])

@@ -18,6 +18,7 @@ from densify.config import Config, resolve
 from densify.errors import InputError, SweepError
 from densify.geometry import poses
 from densify.geometry.range_image import RangeImage
+from densify.readers.street import Street
 from densify.readers.window import read_sweep
 from densify.recording import Recording, blocks, places
 from densify.recording import steps as block_steps
@@ -453,3 +454,28 @@ def test_a_long_row_of_keys_is_parted(long_street) -> None:
     parted = blocks.Cut.around(long, 3, range(10, 90))
     assert [len(b.frames) for b in parted.blocks] == [26, 26, 26, 26]
     assert all(parted.blocks[n].frames[0] + 3 <= k for k, n in parted.number_of.items())
+
+
+def test_of_two_sweeps_the_pair_alone_tells_what_moves() -> None:
+    """A track shows itself in three."""
+
+    class Two:
+        frames = (60, 61)
+
+        def __getattr__(self, name):
+            return getattr(simulated, name)
+
+        def __getitem__(self, frame):
+            return simulated[frame]
+
+    simulated = Street("street", 4711, "dual32", cameras=())
+    recording = Recording(Two(), Config(), 1)
+    assert recording.is_pair(60)
+    found = recording.step(60)
+    field, row = found.steps[60, 61], found.stretch[60].sweep.row
+    true_m = simulated.truth.displacement(60, 61)[row]
+    moves = np.linalg.norm(true_m, axis=1) > 0.05
+    assert np.mean(field.moving[moves]) > 0.9 and field.moving[~moves].sum() < 10
+    assert np.linalg.norm((field.displacement - true_m)[moves], axis=1).mean() < 0.1
+    told = pipeline.run(Two(), 60, 1, config={"accumulate": {"far_m": 0}}).warnings
+    assert any("two sweeps" in warning for warning in told)

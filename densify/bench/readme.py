@@ -236,8 +236,10 @@ def _row_of_flow(scene: Scene) -> list[list[str]]:
 
 
 def _row_of_rates(scene: Scene) -> list[list[str]]:
-    """Our flow over 0.4 s at any rate."""
-    return [[str(scene), *_flow_cells(_ours(scene), round(0.8 * scene.window))]]
+    """Our flow over 0.4 s at any rate, and the maps made of it."""
+    flow = _flow_cells(_ours(scene), round(0.8 * scene.window))
+    ((_, depth),) = _depth_cells(scene, {"": resolve(None)})
+    return [[str(scene), *flow, *depth[:4]]]
 
 
 def _ours(scene: Scene) -> Mapping[str, Any]:
@@ -373,7 +375,7 @@ TABLES: Mapping[str, _Table] = {
     ),
     "rates": _Table(
         "The same streets at 5, 10 and 20 Hz, half a second on each side (looked at).",
-        ("found", "one sweep", "0.4 s", "falsely moving", "ghosts"),
+        ("found", "one sweep", "0.4 s", "falsely moving", "ghosts", *_DEPTH_TITLES[:4]),
         _RATES,
         _row_of_rates,
     ),

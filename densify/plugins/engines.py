@@ -57,6 +57,11 @@ ENGINES = Table(
             shared=True,
         ),
         Engine(
+            "pairs",
+            "densify.flow.pairs.engine",
+            about="two sweeps at a time, as estimate_flow",
+        ),
+        Engine(
             "paper",
             "densify.flow.objective.engine",
             about="the published objective, see the section objective",

@@ -3,6 +3,7 @@
 
     DIR/CAMERA/FRAME.npy, .exr or .png   (or DIR/CAMERA/data/..., as KITTI has its images)
     DIR/FRAME.npy, .exr or .png          of a single camera
+    FRAME.npy, .exr or .png              a file alone: of one camera and one image
     DIR/sky/CAMERA/FRAME.png, DIR/sky/FRAME.png    optional masks, not 0 where there is sky
 
 FRAME is the image's number: 120, 000120, 0000000120, 0000000120_depth or _disp. Arrays are (H,W) of
@@ -46,12 +47,12 @@ class PriorFiles:
 
     @staticmethod
     def open(place: Path, cameras: Sequence[str]) -> PriorFiles:
-        """What lies in a folder for some cameras. Raises InputError if there is nothing, or it is
-        not clear for which of several cameras it is."""
-        if not place.is_dir():
+        """What lies in a folder for some cameras, or one file. Raises InputError if there is
+        nothing, or it is not clear for which of several cameras it is."""
+        if not place.exists():
             raise InputError(
-                f"--prior {place}: no such folder; expected depth images DIR/CAMERA/FRAME.npy, "
-                f".exr or .png"
+                f"--prior {place}: no such folder or file; expected depth images "
+                f"DIR/CAMERA/FRAME.npy, .exr or .png"
             )
         values = {camera: _in(place / camera) for camera in cameras}
         sky = {camera: _in(place / "sky" / camera) for camera in cameras}
@@ -67,6 +68,8 @@ class PriorFiles:
             raise InputError(
                 f"--prior {place}: holds no depth images named by frame; expected "
                 f"{place / (cameras[0] if cameras else 'CAMERA')}/0000000120.npy, .exr or .png"
+                if place.is_dir()
+                else f"--prior {place}: names no frame; expected 0000000120.npy, .exr or .png"
             )
         return PriorFiles(place, values, sky)
 
@@ -90,10 +93,14 @@ class PriorFiles:
 
 
 def _in(folder: Path) -> dict[int, Path]:
-    """Number -> file, in the folder or its ``data``."""
-    for place in (folder, folder / "data"):
+    """Number -> file, in the folder or its ``data``; of a file, itself."""
+    if folder.is_file():
+        groups = [[folder]]
+    else:
+        groups = [sorted(f.iterdir()) for f in (folder, folder / "data") if f.is_dir()]
+    for paths in groups:
         found: dict[int, Path] = {}
-        for path in sorted(place.iterdir()) if place.is_dir() else ():
+        for path in paths:
             stem = _STEM.fullmatch(path.stem)
             if stem is None or path.suffix.lower() not in _SUFFIXES:
                 continue

@@ -149,11 +149,19 @@ class Recording:
         frames = self._places.frames_within(number, margin_s)[index]
         return self._places.stretch(number, margin_s, frames)
 
+    def is_pair(self, key: int) -> bool:
+        """Whether nothing can be followed around a key: a track shows itself in three sweeps."""
+        number, (index, _) = self.cut.number_of[key], self._places.piece(key)
+        return len(self._places.frames_within(number, self.cut.margin_s)[index]) == 2
+
     def motion(self, key: int, engine: str | None = None) -> Motion:
-        """How everything in a key's window moves. engine: None for that of ``flow.engine``."""
+        """How everything in a key's window moves. engine: None for that of ``flow.engine``; of two
+        sweeps ``pairs`` takes the place of ``groups``."""
         engine = engine or self.settings.flow.engine
         number, (index, piece) = self.cut.number_of[key], self._places.piece(key)
         window = self.window(key)
+        if engine == "groups" and self.is_pair(key):
+            engine = "pairs"
         if not engine_row(engine)[0].shared:
             scene = Scene(window, self.steps.ground(number)[index], self.settings.flow.min_height_m)
             return estimate_motion(scene, self.settings, engine)

@@ -55,9 +55,8 @@ def register_on_surfaces(
 
 def _as_measured(twist: Float, measured: Sequence[Float | None]) -> Float:
     """The (6,) twist per second with the mean of the measured velocities, where all are known."""
-    if any(velocity is None for velocity in measured):
-        return twist
-    return np.append(twist[:3], np.mean(measured, axis=0))
+    known = [velocity for velocity in measured if velocity is not None]
+    return np.append(twist[:3], np.mean(known, axis=0)) if len(known) == len(measured) else twist
 
 
 def _follow(

@@ -53,10 +53,11 @@ def add(commands: Any) -> None:
     parser.add_argument(
         "--prior",
         type=Path,
-        metavar="DIR",
+        metavar="DIR|FILE",
         help="depth images of your own, as of a monocular network: DIR/CAMERA/FRAME.npy, .exr or "
-        ".png (16 bit), of any scale, depth or inverse depth; fitted to what is measured they make "
-        "depth_full/, where nothing is measured or filled; masks in DIR/sky/CAMERA/FRAME.png",
+        ".png (16 bit), or one FRAME.npy of one camera; of any scale, depth or inverse depth; "
+        "fitted to what is measured they make depth_full/, where nothing is measured or filled; "
+        "masks in DIR/sky/CAMERA/FRAME.png",
     )
     parser.add_argument(
         "--film",
