@@ -196,7 +196,7 @@ def test_overrides_win_over_the_file_and_later_over_earlier() -> None:
         ("objective.radius_m=0", ["got 0", "or null"]),
         ("register.deskew=maybe", ["got 'maybe'", "true or false"]),
         ("register.source=oxts", ["got 'oxts'", "one of kiss-icp, dataset"]),
-        ("flow.engine=magic", ["got 'magic'", "one of groups, paper, network:MODEL"]),
+        ("flow.engine=magic", ["got 'magic'", "one of groups, pairs, paper, network:MODEL"]),
         ("project.at=noon", ["got 'noon'", "one of camera, sweep"]),
         ("output.also=rainbow", ["output.also: got 'rainbow'", "one of depth, full, flow"]),
         ("output.movers=hide", ["got 'hide'", "one of keep, drop, separate"]),
