@@ -218,6 +218,8 @@ def twin(row, column, near, far, rules):
         for d, ray in whole.items()
     }
     nearest = {d: ray[ray[:, 2].argmax()] for d, ray in close.items() if ray[:, 2].any()}
+    if not upright_below(whole[4], depth, rules):
+        return None
     parts = {
         d: part
         for d, part in nearest.items()
@@ -245,6 +247,25 @@ def twin(row, column, near, far, rules):
                     break
     plates = {d for d in range(2, 7) if has_plate(rays[d], plane, rules)}
     return plane if 4 in plates and len(plates) >= rules.below - 1 else None
+
+
+def upright_below(ray, depth, rules):
+    """Whether somewhere on the ray straight down cells before the pixel keep together for as long
+    as a plate is."""
+    begin = None
+    for k, inverse in enumerate(ray[:, 2], start=1):
+        if inverse == 0:
+            continue
+        if inverse * (depth - rules.each_m) <= 1:
+            begin = None
+            continue
+        gone_m = (k - begin[0]) / (rules.focal_px * begin[1]) if begin else 0
+        most_m = rules.lean * gone_m + 2 * rules.plate_off_m
+        if begin is None or abs(1 / inverse - 1 / begin[1]) > most_m:
+            begin = k, inverse
+        elif gone_m >= rules.plate_m:
+            return True
+    return False
 
 
 def has_plate(ray, plane, rules):

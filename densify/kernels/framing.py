@@ -139,26 +139,61 @@ def _depth(row, column, near, far, steps, directions, rules):  # type: ignore[no
 
 
 @inlined
+def _steps_inside(row, column, d, shape, directions, most):  # type: ignore[no-untyped-def]
+    """One more than the steps in a direction, up to ``most``, that stay in the image."""
+    right, down = directions[d, 1]
+    across = column if right < 0 else shape[1] - 1 - column if right > 0 else most
+    along = row if down < 0 else shape[0] - 1 - row if down > 0 else most
+    steps = most
+    if right:
+        steps = min(steps, 2 * across + 1 if abs(right) == 1 else across)  # the second of two goes
+    if down:
+        steps = min(steps, 2 * along + 1 if abs(down) == 1 else along)
+    return steps + 1
+
+
+@inlined
+def _upright_below(row, column, depth, near, rules):  # type: ignore[no-untyped-def]
+    """Whether straight below something before the pixel, as long as a plate, may lie in an upright
+    plane: told by the depth of its cells, without a plane yet. Ground seen from afar does not."""
+    begin, first = 0, 0.0
+    for k in range(1, min(rules.reach_px, near.shape[0] - 1 - row) + 1):
+        there = near[row + k, column]
+        if there == 0:
+            continue
+        if there * (depth - rules.each_m) <= 1:
+            first = 0.0
+            continue
+        gone = (k - begin) / (rules.focal_px * first) if first > 0 else 0.0  # metres downwards
+        if first == 0 or abs(1 / there - 1 / first) > rules.lean * gone + 2 * rules.plate_off_m:
+            begin, first = k, there
+        elif gone >= rules.plate_m:
+            return True
+    return False
+
+
+@inlined
 def _nearest_parts(row, column, depth, near, directions, rules, parts, which):  # type: ignore[no-untyped-def]
     """The nearest surface on the way in each direction, where it lies before the pixel: how many;
-    gives up once too many directions are open."""
-    height, width = near.shape
+    gives up once too many directions are open, or the one straight down."""
     reach = rules.reach_m * rules.focal_px
     num = 0
     for i in range(len(directions)):
-        d = i * 5 % len(directions)  # sides far apart first
-        parts[num, 2] = 0.0
-        for k in range(1, rules.reach_px + 1):
+        d = (4 + i * 8 + i // 2 * 5) % len(directions)  # straight down and up, then other sides
+        most, at = np.float32(0), 0
+        for k in range(1, _steps_inside(row, column, d, near.shape, directions, rules.reach_px)):
             du, dv = _offset(directions, d, k)
-            u, v = column + du, row + dv
-            if not (0 <= u < width and 0 <= v < height):
-                break
-            if near[v, u] > parts[num, 2] and k <= reach * near[v, u]:
-                parts[num, 0], parts[num, 1], parts[num, 2] = du, dv, near[v, u]
+            there = near[np.uint64(row + dv), np.uint64(column + du)]
+            if there > most and k <= reach * there:
+                most, at = there, k
+        du, dv = _offset(directions, d, at)
+        parts[num, 0], parts[num, 1], parts[num, 2] = du, dv, most
         if parts[num, 2] * (depth - rules.each_m) > 1 >= parts[num, 2] * (depth - rules.most_m):
             which[num] = d
             num += 1
         elif i - num >= len(directions) - rules.least:
+            return 0
+        if i == 0 and (num == 0 or not _upright_below(row, column, depth, near, rules)):
             return 0
     return num
 
