@@ -106,6 +106,14 @@ def shifted(*by_m: float) -> np.ndarray:
     return T
 
 
+def test_sweeps_far_apart_follow_less_well():
+    usual = one_car()
+    every_second = TinySequence(usual.scene, usual.frames[1::2])
+    for method, says in (("flow", True), ("icp", False)):
+        found = run(every_second, KEY, 1, method, config=POSES_GIVEN).warnings
+        assert any("sweeps are 0.2 s apart" in warning for warning in found) == says
+
+
 def test_times_that_were_not_wanted_are_not_missed():
     config = {**POSES_GIVEN, "register": {"source": "dataset", "deskew": False}}
     sequence = Changed(times=lambda sweep: None)

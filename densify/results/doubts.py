@@ -11,6 +11,7 @@ import numpy as np
 
 from densify.config import Config
 from densify.depth.exposure import Shot
+from densify.methods import METHODS
 from densify.readers.files import format_frames
 from densify.registration.upright import ground_aside
 from densify.scores.depth_metrics import image_density
@@ -20,6 +21,7 @@ _LEAST_DENSITY = 0.001  # sixteen rings alone measure 0.5 % of an image
 _FARTHEST_M = 20.0  # a camera from the scanner, on the longest trucks
 _STEEPEST_DEG = 60.0  # a camera's view, up or down
 _LONGEST_SWEEP = 1.5  # of the usual time from sweep to sweep
+_SLOW_S = 0.15  # from sweep to sweep; at 5 Hz trucks slide along their own sides
 _OTHER_CLOCK_S = 1.0  # from a sweep to the nearest image; a camera that missed some is sooner back
 
 
@@ -35,9 +37,9 @@ def with_doubts(
 
     shots: what the maps show. cuts: of the window, sentences that come first. Checked: what the
     reader had to assume, cameras left out for want of images, where cameras stand and look, axes
-    that do not stand on the ground, point times that are absent or longer than a sweep, images too
-    far in time, sweeps left out of the far range, what maps could not be made as asked, maps with
-    next to nothing in them.
+    that do not stand on the ground, point times that are absent or longer than a sweep, sweeps too
+    far apart to follow what is fast, images too far in time, sweeps left out of the far range, what
+    maps could not be made as asked, maps with next to nothing in them.
     """
     chosen = {shot.camera.name: shot.camera for shot in shots.values()}
     shared = [
@@ -49,7 +51,10 @@ def with_doubts(
         *_of_times(stretch, settings),
         *_of_shots(sequence, shots),
     ]
-    own = {name: [*_of_far(result), *_of_maps(result)] for name, result in results.items()}
+    own = {
+        name: [*_of_rate(name, stretch), *_of_far(result), *_of_maps(result)]
+        for name, result in results.items()
+    }
     return {
         name: replace(result, warnings=tuple(dict.fromkeys([*shared, *own[name]])))
         for name, result in results.items()
@@ -105,6 +110,17 @@ def _of_times(stretch: Stretch, settings: Config) -> Iterator[str]:
         yield (
             f"a sweep takes {longest_ns * 1e-6:.0f} ms by the times of its points, and the next "
             f"comes after {period_ns * 1e-6:.0f} ms; are their stamps right?"
+        )
+
+
+def _of_rate(method: str, stretch: Stretch) -> Iterator[str]:
+    if METHODS[method].engine is None or len(stretch.sweeps) < 2:
+        return
+    period_s = float(np.median(np.diff([s.sweep.stamp_ns for s in stretch.sweeps]))) * 1e-9
+    if period_s > _SLOW_S:
+        yield (
+            f"sweeps are {period_s:.2g} s apart: what is fast is followed less exactly than at "
+            f"10 Hz, and lost where it turns or hides between two"
         )
 
 
