@@ -464,6 +464,22 @@ def test_measured_velocities_hold_along_a_road_where_nothing_else_tells() -> Non
         assert measured_velocity(sweep) == pytest.approx([25, 0, 0], abs=0.05)
 
 
+@pytest.mark.parametrize("wrong", ["the sign", "without the own motion"])
+def test_radial_velocities_that_are_none_are_refused(wrong) -> None:
+    highway = Street("highway", 2026, "fmcw")
+    raw = []
+    for sweep in (read_sweep(highway, f, SETTINGS) for f in range(75, 79)):
+        own_m_s = [25.0, 0, 0] @ (sweep.points / np.linalg.norm(sweep.points, axis=1)[:, None]).T
+        radial_m_s = sweep.radial_velocity_m_s
+        changed = -radial_m_s if wrong == "the sign" else radial_m_s + own_m_s
+        raw.append(replace(sweep, radial_velocity_m_s=changed.astype(np.float32)))
+    with pytest.raises(
+        InputError, match="radial velocities of sweep 75 the scanner goes at"
+    ) as told:
+        trajectory.find_trajectory(raw, SETTINGS)
+    assert ("the opposite" if wrong == "the sign" else "at 25 m/s") in str(told.value)
+
+
 @pytest.mark.parametrize("share", [0.0, 0.4, 0.7], ids=["all stands", "traffic", "most moves"])
 def test_the_velocity_is_that_of_what_stands(share):
     rng = np.random.default_rng(9)

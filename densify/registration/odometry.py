@@ -7,14 +7,14 @@ Vizzo et al., "KISS-ICP: In Defense of Point-to-Point ICP", RA-L 2023.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import pairwise
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from densify.config import RegisterSettings
-from densify.errors import SweepError, UnfitSweepError, UnplacedSweepError
+from densify.errors import InputError, SweepError, UnfitSweepError, UnplacedSweepError
 from densify.geometry import poses
 from densify.types import Float, Int, Sweep, Trajectory
 
@@ -28,6 +28,7 @@ _SEARCH_CLOSE_M = 1.0
 _SEARCH_RAYS_RAD = (
     0.01  # what stands along the road is met by the same rays, however fast one drives
 )
+_STANDS_M_S, _DRIVES_M_S, _MUCH_BETTER = 2.0, 5.0, 0.6  # by radial velocities, by the search
 _STANDING_M = 0.4
 _OVERLAP_POINTS = 2000
 _OVERLAP_M = 0.5
@@ -114,6 +115,18 @@ def searched_twist(sweeps: Sequence[Sweep], settings: RegisterSettings) -> Float
     Tried on a grid whose steps move the second sweep by 1 m, and around the best by 0.5 m, or less
     where it follows within 0.1 s.
     """
+    cost = _misfit(sweeps)
+    first_s = (sweeps[1].stamp_ns - sweeps[0].stamp_ns) * 1e-9
+    step_m = _SEARCH_STEP_M * min(1.0, first_s / _SEARCH_STEP_S)
+    coarse_m = _grid(np.zeros(2), settings.max_speed_m_s * first_s, 2 * step_m)
+    coarse = coarse_m[np.argmin(cost(coarse_m))]
+    fine_m = _grid(coarse[:2], 2 * step_m, step_m)
+    return np.append(np.zeros(3), fine_m[np.argmin(cost(fine_m))] / first_s)
+
+
+def _misfit(sweeps: Sequence[Sweep]) -> Callable[[Float], Float]:
+    """Of (n,3) motions between the first two sweeps, how badly each lays what stands on the ground
+    in the first three upon each other; of equal ones the slowest is best."""
     standing = [_standing(s.points) for s in sweeps[:3]]
     first_s = (sweeps[1].stamp_ns - sweeps[0].stamp_ns) * 1e-9
     pairs = []
@@ -124,20 +137,44 @@ def searched_twist(sweeps: Sequence[Sweep], settings: RegisterSettings) -> Float
         apart_m = _SEARCH_RAYS_RAD * np.linalg.norm(sample, axis=1)
         pairs.append((_tree(earlier), sample, ratio, apart_m))
 
-    def best(steps_m: Float) -> Float:
-        """The best of (n,3) motions between the first two sweeps; among equal ones the slowest."""
+    def cost(steps_m: Float) -> Float:
         cost = 1e-3 * np.linalg.norm(steps_m, axis=1)
         for tree, sample, ratio, apart_m in pairs:
             moved = (sample + ratio * steps_m[:, None, :]).reshape(-1, 3)
             distance_m, _ = tree.query(moved, distance_upper_bound=_SEARCH_CLOSE_M, workers=-1)
             distance_m = np.minimum(distance_m, _SEARCH_CLOSE_M).reshape(len(steps_m), -1)
             cost += np.maximum(distance_m - apart_m, 0.0).mean(1)
-        return steps_m[np.argmin(cost)]
+        return cost
 
-    step_m = _SEARCH_STEP_M * min(1.0, first_s / _SEARCH_STEP_S)
-    coarse = best(_grid(np.zeros(2), settings.max_speed_m_s * first_s, 2 * step_m))
-    fine = best(_grid(coarse[:2], 2 * step_m, step_m))
-    return np.append(np.zeros(3), fine / first_s)
+    return cost
+
+
+def check_measured(
+    sweeps: Sequence[Sweep], velocity_m_s: Float, settings: RegisterSettings
+) -> None:
+    """Raise InputError where the first sweeps say that radial velocities are no such: the other way
+    round they lie better on each other, or the vehicle drives where (3,) says that it stands, as if
+    its own motion had been taken out."""
+    if len(sweeps) < 2:
+        return
+    first_s = (sweeps[1].stamp_ns - sweeps[0].stamp_ns) * 1e-9
+    searched_m_s = searched_twist(sweeps, settings)[3:]
+    own, opposite, searched = _misfit(sweeps)(
+        np.stack([velocity_m_s, -velocity_m_s, searched_m_s]) * first_s
+    )
+    speed_m_s, searched_speed_m_s = (float(np.linalg.norm(v)) for v in (velocity_m_s, searched_m_s))
+    if speed_m_s >= _STANDS_M_S:
+        wrong = opposite < own
+    else:
+        wrong = searched_speed_m_s > _DRIVES_M_S and searched < _MUCH_BETTER * own
+    if wrong:
+        seen = "the opposite" if speed_m_s >= _STANDS_M_S else f"{searched_speed_m_s:.0f} m/s"
+        raise InputError(
+            f"registration: by the radial velocities of sweep {sweeps[0].frame} the scanner goes "
+            f"at {speed_m_s:.1f} m/s, by what stands at {seen}; expected m/s away from the scanner "
+            f"and relative to it, as measured; change their sign, leave the vehicle's own motion "
+            f"in, or leave the column out"
+        )
 
 
 def _grid(center: Float, reach_m: float, step_m: float) -> Float:

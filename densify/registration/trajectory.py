@@ -17,6 +17,7 @@ from densify.registration.deskew import deskew
 from densify.registration.doppler import measured_velocity
 from densify.registration.neighbors import refine
 from densify.registration.odometry import (
+    check_measured,
     check_number_of_points,
     check_overlap,
     check_plausible,
@@ -64,7 +65,8 @@ def find_trajectory(
     and taken; None to find them by odometry and then lay each sweep on those around it
     (`densify.registration.neighbors`).
 
-    Raises SweepError naming the frame where the poses cannot be right.
+    Raises SweepError naming the frame where the poses cannot be right, InputError where radial
+    velocities cannot.
     """
     if recorded is not None:
         check_plausible(recorded, settings)
@@ -78,6 +80,8 @@ def find_trajectory(
         if many and any(velocity is None for velocity in measured):
             odometry, straight = _by_points(sweeps, settings)
         else:
+            if measured[0] is not None:
+                check_measured(sweeps, measured[0], settings)
             odometry, straight = _by_surfaces(sweeps, settings, measured)
         found = refine(sweeps, odometry, _AROUND_MANY_NS if many else _AROUND_FEW_NS, settings)
         check_plausible(found, settings)
