@@ -125,8 +125,8 @@ def searched_twist(sweeps: Sequence[Sweep], settings: RegisterSettings) -> Float
 
 
 def _misfit(sweeps: Sequence[Sweep]) -> Callable[[Float], Float]:
-    """Of (n,3) motions between the first two sweeps, how badly each lays what stands on the ground
-    in the first three upon each other; of equal ones the slowest is best."""
+    """How badly (n,3) motions between the first two sweeps lay what stands on the ground in the
+    first three upon each other; of equal ones the slowest is best."""
     standing = [_standing(s.points) for s in sweeps[:3]]
     first_s = (sweeps[1].stamp_ns - sweeps[0].stamp_ns) * 1e-9
     pairs = []
