@@ -46,7 +46,8 @@ def close_windows(layers: Layers, focal_px: float, settings: ProjectSettings) ->
     The plane is fitted in inverse depth, first through the nearest surfaces, then through where
     each direction first comes to it, and again without what lies farthest off it. Connected cells
     make a window if they have a window's size and shape, if half of them have a frame above too,
-    and if few among them lie in the plane, as in a hedge.
+    and a tenth one to both sides that does not lie lower, and if few among them lie in the plane,
+    as in a hedge.
 
     focal_px: pixels per radian. The planes are as certain as the least certain part of their
     frames, times ``settings.fill_confidence``. ``layers.window`` says where windows are,

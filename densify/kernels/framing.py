@@ -202,15 +202,11 @@ def _nearest_parts(row, column, depth, near, directions, rules, parts, which):  
 def _touching_parts(row, column, depth, reach_px, near, directions, rules, plane, parts, which):  # type: ignore[no-untyped-def]
     """Where the ray in each direction first comes to a surface before the pixel that touches the
     plane, unless one far before it is in the way: how many do."""
-    height, width = near.shape
     num = 0
     for d in range(len(directions)):
-        for k in range(1, reach_px + 1):
+        for k in range(1, _steps_inside(row, column, d, near.shape, directions, reach_px)):
             du, dv = _offset(directions, d, k)
-            u, v = column + du, row + dv
-            if not (0 <= u < width and 0 <= v < height):
-                break
-            there, fitted = near[v, u], _at(plane, du, dv)
+            there, fitted = near[row + dv, column + du], _at(plane, du, dv)
             if there > 0 and fitted > 0 and 1 / there < 1 / fitted + rules.touch_m:
                 if 1 / fitted - rules.rough_m < 1 / there < depth - rules.each_m:
                     parts[num, 0], parts[num, 1], parts[num, 2], which[num] = du, dv, there, d
@@ -223,18 +219,17 @@ def _touching_parts(row, column, depth, reach_px, near, directions, rules, plane
 def _stands_on_plates(row, column, reach_px, near, directions, rules, plane):  # type: ignore[no-untyped-def]
     """Whether a surface goes on in the plane straight below and in all but one of the other
     directions downwards that are asked for, as a door does and ground does not."""
-    height, width = near.shape
     length = rules.plate_m * rules.focal_px * plane[0]
     plates = 0
     for d in range(2, 7):
         run, seen = 0, 0
-        for k in range(1, reach_px + 1):
-            du, dv = _offset(directions, d, k)
-            u, v = column + du, row + dv
-            if run > length or not (0 <= u < width and 0 <= v < height):
+        for k in range(1, _steps_inside(row, column, d, near.shape, directions, reach_px)):
+            if run > length:
                 break
-            if near[v, u] > 0:
-                flat = _off_m(plane, du, dv, near[v, u]) <= rules.plate_off_m
+            du, dv = _offset(directions, d, k)
+            there = near[row + dv, column + du]
+            if there > 0:
+                flat = _off_m(plane, du, dv, there) <= rules.plate_off_m
                 run, seen = (run + 1, seen + 1) if flat else (0, 0)
             elif run > 0:
                 run += 1

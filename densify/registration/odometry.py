@@ -138,13 +138,13 @@ def _misfit(sweeps: Sequence[Sweep]) -> Callable[[Float], Float]:
         pairs.append((_tree(earlier), sample, ratio, apart_m))
 
     def cost(steps_m: Float) -> Float:
-        cost = 1e-3 * np.linalg.norm(steps_m, axis=1)
+        sums = 1e-3 * np.linalg.norm(steps_m, axis=1)
         for tree, sample, ratio, apart_m in pairs:
             moved = (sample + ratio * steps_m[:, None, :]).reshape(-1, 3)
             distance_m, _ = tree.query(moved, distance_upper_bound=_SEARCH_CLOSE_M, workers=-1)
             distance_m = np.minimum(distance_m, _SEARCH_CLOSE_M).reshape(len(steps_m), -1)
-            cost += np.maximum(distance_m - apart_m, 0.0).mean(1)
-        return cost
+            sums += np.maximum(distance_m - apart_m, 0.0).mean(1)
+        return sums
 
     return cost
 
@@ -158,17 +158,17 @@ def check_measured(
     if len(sweeps) < 2:
         return
     first_s = (sweeps[1].stamp_ns - sweeps[0].stamp_ns) * 1e-9
-    searched_m_s = searched_twist(sweeps, settings)[3:]
-    own, opposite, searched = _misfit(sweeps)(
-        np.stack([velocity_m_s, -velocity_m_s, searched_m_s]) * first_s
-    )
-    speed_m_s, searched_speed_m_s = (float(np.linalg.norm(v)) for v in (velocity_m_s, searched_m_s))
+    speed_m_s = float(np.linalg.norm(velocity_m_s))
     if speed_m_s >= _STANDS_M_S:
-        wrong = opposite < own
+        other_m_s, seen, share = -velocity_m_s, "the opposite", 1.0
     else:
-        wrong = searched_speed_m_s > _DRIVES_M_S and searched < _MUCH_BETTER * own
-    if wrong:
-        seen = "the opposite" if speed_m_s >= _STANDS_M_S else f"{searched_speed_m_s:.0f} m/s"
+        other_m_s, share = searched_twist(sweeps, settings)[3:], _MUCH_BETTER
+        other_speed_m_s = float(np.linalg.norm(other_m_s))
+        if other_speed_m_s <= _DRIVES_M_S:
+            return
+        seen = f"{other_speed_m_s:.0f} m/s"
+    own, other = _misfit(sweeps)(np.stack([velocity_m_s, other_m_s]) * first_s)
+    if other < share * own:
         raise InputError(
             f"registration: by the radial velocities of sweep {sweeps[0].frame} the scanner goes "
             f"at {speed_m_s:.1f} m/s, by what stands at {seen}; expected m/s away from the scanner "

@@ -47,7 +47,8 @@ def register_on_surfaces(
     twist = np.zeros(6)
     if len(sweeps) > 1:
         start = slice(int(np.searchsorted(stamp_ns, stamp_ns[0] + _START_NS, side="right")))
-        twist = _as_measured(searched_twist(sweeps, settings), measured[:2])
+        known = all(velocity is not None for velocity in measured[:2])
+        twist = _as_measured(twist, measured[:2]) if known else searched_twist(sweeps, settings)
         T = _follow(chosen[start], stamp_ns[start], twist, measured)
         twist = _twist(T, stamp_ns, min(_NUM_START + 1, len(T) - 1))  # between two that were laid
     return Trajectory(frames, stamp_ns, np.stack(_follow(chosen, stamp_ns, twist, measured)))
