@@ -28,7 +28,7 @@ from densify.scores.segmentation import LEAST_POINTS
 from densify.types import FlowField, Stretch
 from tests.scenes import Arc, Scanner, Scene, TinySequence, World, car, street
 
-CONFIG = resolve({"register": {"source": "dataset"}})
+CONFIG = resolve({"register": {"source": "dataset"}, "flow": {"look_around_s": 0.0}})
 FAST = ("ours", "rigid", "cluster-icp", "nicp")
 
 
@@ -130,6 +130,7 @@ def test_every_method_has_every_number(measured):
             assert row[key] > 0, (name, key)
         assert 0 <= row["step"]["found"] <= 1 and row["step"]["movers_m"] >= 0
         assert set(row["window"]["movers_m_by_hops"]) == {"1", "2"}
+        assert row["window"]["radial_velocity"] is None
         assert 0 <= row["window"]["coverage"] <= 1
         assert (
             row["times_seconds"]
@@ -152,6 +153,7 @@ def test_rigid_is_the_motion_itself(measured):
     assert step["background_m"] == step["static_objects_m"] or step["static_objects_m"] is None
     assert step["found"] == step["falsely_moving"] == step["dynamic_iou"] == 0
     assert step["bucketed_dynamic"] == pytest.approx(1)
+    assert step["found_movers_m"] is None and rigid["window"]["found_movers_m_by_hops"] == {}
     hops = rigid["window"]["movers_m_by_hops"]
     assert hops["2"] == pytest.approx(2 * hops["1"], rel=0.02)
 
@@ -162,6 +164,10 @@ def test_methods_do_what_they_are_for(measured):
         assert rows[name]["step"]["movers_m"] < 0.5 * rows["rigid"]["step"]["movers_m"], name
         assert rows[name]["window"]["coverage"] > rows["rigid"]["window"]["coverage"], name
     assert rows["ours"]["step"]["background_m"] == 0
+    assert 0 < rows["ours"]["step"]["found_movers_m"] <= rows["ours"]["step"]["movers_m"]
+    hops = rows["ours"]["window"]
+    for n, error_m in hops["found_movers_m_by_hops"].items():
+        assert error_m <= hops["movers_m_by_hops"][n] + 1e-9
     assert rows["ours"]["times_error"] == rows["ours"]["times_seconds"] == 1
 
 

@@ -9,8 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from densify.bench import images, readme
+from densify.bench import images, readme, registration
 from densify.cli import main
+from densify.config import resolve
 from densify.readers import open_sequence
 
 RESULTS = Path(__file__).parents[1] / "docs" / "results.md"
@@ -34,7 +35,13 @@ def test_a_row_is_what_its_bench_measures(capsys, monkeypatch):
     assert about == table.about and rule.count("---") == titles.count("|") - 1
     cells = [cell.strip() for cell in row.strip("|").split("|")]
     # Nothing moves on this street, and nothing is said to.
-    assert cells[:5] == ["`street:static?seed=5&sensor=vlp16`, key 30", "– %", "–", "–", "0.0000 %"]
+    assert cells[:5] == [
+        "`street:static?seed=5&sensor=vlp16`, key 30",
+        "– %",
+        "– (–)",
+        "– (–)",
+        "0.0000 %",
+    ]
     assert re.fullmatch(r"0\.\d\d %", cells[5]) and cells[6] == ""
 
 
@@ -42,7 +49,9 @@ def test_unknown_tables_are_refused_before_anything_is_measured(capsys):
     assert main(["bench", "readme", "flows"]) == 2
     said = capsys.readouterr().err
     assert (
-        "flows" in said and "methods, depth, parts, flow, rates, segmentation, pairs, prior" in said
+        "flows" in said
+        and "methods, depth, parts, flow, rings, registration, rates, segmentation, pairs, prior"
+        in said
     )
 
 
@@ -77,3 +86,14 @@ def test_wrong_images_are_measured_against_strict_maps(monkeypatch):
     ramp = np.tile(np.arange(20, dtype=np.uint8)[:, None, None], (1, 30, 3))
     shifted = images.moved(0, 2)(ramp)
     assert (shifted[2:] == ramp[:-2]).all() and (shifted[:2] == 0).all()
+
+
+def test_poses_are_held_against_exact_ones(monkeypatch) -> None:
+    street, settings = open_sequence("street:static?seed=5&sensor=vlp16"), resolve(None)
+    given = resolve(None, ["register.source=dataset"])
+    monkeypatch.setattr(registration, "resolve", lambda _: given)
+    exact = registration.bench_registration(street, 30, 2)
+    assert exact.rms_m < 1e-9 and exact.rms_deg < 1e-6
+    monkeypatch.setattr(registration, "resolve", lambda _: settings)
+    off = registration.bench_registration(street, 30, 2)
+    assert 1e-4 < off.rms_m < 0.05 and 1e-4 < off.rms_deg < 0.2

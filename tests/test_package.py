@@ -148,7 +148,9 @@ def test_the_pages_name_knobs_that_exist() -> None:
     named = [(*name.split("."), value) for name, value in knobs if name.split(".")[0] in sections]
     assert len(named) >= 4
     for section, key, value in named:
-        resolve(None, [f"{section}.{key}{value or '=' + str(sections[section][key])}"])
+        default = sections[section][key]
+        said = "null" if default is None else default
+        resolve(None, [f"{section}.{key}{value or f'={said}'}"])
 
 
 def test_every_source_file_starts_with_its_license() -> None:

@@ -475,7 +475,8 @@ def test_of_two_sweeps_the_pair_alone_tells_what_moves() -> None:
     field, row = found.steps[60, 61], found.stretch[60].sweep.row
     true_m = simulated.truth.displacement(60, 61)[row]
     moves = np.linalg.norm(true_m, axis=1) > 0.05
-    assert np.mean(field.moving[moves]) > 0.9 and field.moving[~moves].sum() < 10
-    assert np.linalg.norm((field.displacement - true_m)[moves], axis=1).mean() < 0.1
+    assert np.mean(field.moving[moves]) > 0.85 and field.moving[~moves].sum() < 10
+    off_m = np.linalg.norm(field.displacement - true_m, axis=1)
+    assert off_m[moves].mean() < 0.08 and off_m[moves & field.moving].mean() < 0.03
     told = pipeline.run(Two(), 60, 1, config={"accumulate": {"far_m": 0}}).warnings
     assert any("two sweeps" in warning for warning in told)

@@ -57,6 +57,9 @@ def places_left(told: tuple[tuple[int, int], tuple[int, int]]) -> LeftPlaces:
     return LeftPlaces(*(Places(*side) for side in told))
 
 
+RINGS = SimpleNamespace(scattered=False)
+
+
 def is_proven(
     track: Track,
     space: SimpleNamespace,
@@ -167,6 +170,7 @@ def test_what_lies_close_to_a_proven_track_is_a_part_of_it(aside_m, part):
     ("left", "bare", "asked", "proven"),
     [
         ({1.0: 0.001, 0.5: 0.0}, True, [1.0], 1.0),  # hardly contradicted
+        ({1.0: 0.1, 0.3: 0.01}, True, [1.0, 0.3], None),  # not with all that it gathers
         ({1.0: 0.1, 0.5: 0.01}, True, [1.0, 0.5], 0.5),
         ({1.0: 0.1, 0.4: 0.01}, True, [1.0, 0.4], 1.0),  # which loses a point
         ({1.0: 0.1, 0.5: 0.09}, True, [1.0, 0.5], 1.0),  # about as well as before
@@ -189,6 +193,10 @@ def test_doubtful_tracks_are_followed_again_with_heights_that_count_less(
     for name in ("_gather", "_refine", "take_back_slides", "go_with_the_rest", "_claim_rays"):
         monkeypatch.setattr(tracks, name, lambda *_: None)
     monkeypatch.setattr(tracks, "may_be_a_rail", lambda *_: False)
+    held = {0.3: None}
+    monkeypatch.setattr(
+        tracks, "share_contradicted", lambda track, *_: held.get(which[id(track)][0], 0.0)
+    )
     places = LeftPlaces(Places(0 if bare else 9, 30), Places(0, 30))
     monkeypatch.setattr(tracks, "left_places", lambda *_: places)
     parts = dict.fromkeys(("_standing", "_space", "_ground", "free", "bodies"))
@@ -225,17 +233,26 @@ def test_the_ground_rises_under_a_track():
 def test_less_proves_where_nothing_was_ever_seen_before_or_after(looks, told, num_seen, proven):
     track = followed(lambda n: [0.9 * n, 0, 0, 0], num_seen, [60.0, 0, 0], 8)
     clock = SimpleNamespace(time_s=0.1 * np.arange(11))
-    space = SimpleNamespace(
-        gap_m=lambda *_: 0.1, clock=clock, sensors=SimpleNamespace(scattered=False)
-    )
+    space = SimpleNamespace(gap_m=lambda *_: 0.1, clock=clock, sensors=RINGS)
     assert is_proven(track, space, looks, told) == proven
+
+
+@pytest.mark.parametrize(("num_seen", "proven"), [(3, False), (4, True)])
+def test_three_places_prove_nothing_where_no_sweep_meets_the_points_of_the_last(num_seen, proven):
+    """Crowns of trees far up, seen in every second look, may lie on a line."""
+    track = followed(lambda n: [0.9 * n, 0, 0, 0], num_seen, [30.0, 0, 0], 8)
+    sensors = SimpleNamespace(scattered=True)
+    space = SimpleNamespace(
+        gap_m=lambda *_: 0.1, clock=SimpleNamespace(time_s=0.1 * np.arange(11)), sensors=sensors
+    )
+    assert is_proven(track, space, (100, 0, 300), ((0, 100), (0, 100))) == proven
 
 
 def test_a_short_way_far_from_the_scanner_proves_nothing():
     """Three places on a line may be chance where rings are a metre apart: a tree's leaves."""
     track = followed(lambda n: [0.24 * n, 0, 0, 0], 3, [44.0, 0, 0], 8)
     for gap_m, proven in ((0.5, True), (1.8, False)):
-        space = SimpleNamespace(gap_m=lambda *_, gap_m=gap_m: gap_m)
+        space = SimpleNamespace(gap_m=lambda *_, gap_m=gap_m: gap_m, sensors=RINGS)
         assert is_proven(track, space, (100, 0, 300), ((0, 100), (0, 100))) == proven
 
 
@@ -253,7 +270,7 @@ def test_a_short_way_far_from_the_scanner_proves_nothing():
 def test_what_is_seen_for_long_may_be_contradicted_more(num_seen, num_sweeps, still, proven):
     track = followed(lambda n: [0.9 * n, 0, 0, 0], num_seen, [14.0, 0, 0], 8)
     clock = SimpleNamespace(time_s=0.1 * np.arange(num_sweeps))
-    space = SimpleNamespace(gap_m=lambda *_: 0.1, clock=clock)
+    space = SimpleNamespace(gap_m=lambda *_: 0.1, clock=clock, sensors=RINGS)
     for moved in (still // 50, still // 5):
         found = is_proven(track, space, (still, moved, 300), ((0, 100), (0, 100)))
         assert found == (proven or moved == still // 50)
@@ -273,7 +290,7 @@ def test_what_leaves_bare_places_may_be_seen_for_a_moment(still, moved, told, pr
     """An oncoming car of which three sweeps see a few rings."""
     track = followed(lambda n: [-3.0 * n, 0, 0, 0], 3, [-14.0, 11, 0], 40)
     clock = SimpleNamespace(time_s=0.1 * np.arange(11))
-    space = SimpleNamespace(gap_m=lambda *_: 0.3, clock=clock)
+    space = SimpleNamespace(gap_m=lambda *_: 0.3, clock=clock, sensors=RINGS)
     assert is_proven(track, space, (still, moved, 800), told) == proven
 
 
@@ -282,7 +299,7 @@ def test_stray_looks_do_not_undo_what_is_seen_for_a_moment(num_asked, proven):
     """A far car at 33 m/s that four sweeps see; at most one look of 200 is an echo at its rim."""
     track = followed(lambda n: [-3.3 * n, 0, 0, 0], 4, [-33.0, 11, 0], 18)
     clock = SimpleNamespace(time_s=0.1 * np.arange(11))
-    space = SimpleNamespace(gap_m=lambda *_: 0.3, clock=clock)
+    space = SimpleNamespace(gap_m=lambda *_: 0.3, clock=clock, sensors=RINGS)
     assert is_proven(track, space, (59, 4, num_asked), ((0, 45), (0, 45))) == proven
 
 

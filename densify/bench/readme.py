@@ -18,6 +18,7 @@ from densify.bench.flow import bench_flow
 from densify.bench.images import FAULTS as WRONG_IMAGES
 from densify.bench.images import bench_images
 from densify.bench.priors import FAULTS, Completed, bench_priors
+from densify.bench.registration import bench_registration
 from densify.bench.two_clouds import bench_two_clouds
 from densify.config import Config, resolve
 from densify.errors import InputError
@@ -71,6 +72,37 @@ _FLOW = (
     Scene("street?seed=25&sensor=hdl32", (70,)),
     Scene("street:crossing?seed=26&sensor=vlp16", (90,)),
     Scene("street?seed=27&sensor=dual32", (60,)),
+)
+_RINGS = (
+    Scene("street:highway?seed=28&sensor=hdl32", (70,)),
+    Scene("street:crossing?seed=52&sensor=hdl32", (80,)),
+    Scene("street:highway?seed=53&sensor=hdl32", (80,)),
+    Scene("street:highway?seed=57&sensor=hdl32", (80,)),
+    Scene("street:crossing?seed=60&sensor=hdl32", (80,)),
+    Scene("street?seed=63&sensor=hdl32", (80,)),
+    Scene("street:highway?seed=29&sensor=vlp16", (70,)),
+    Scene("street?seed=51&sensor=vlp16", (80,)),
+    Scene("street:highway?seed=54&sensor=vlp16", (80,)),
+    Scene("street:crossing?seed=55&sensor=vlp16", (80,)),
+    Scene("street:highway?seed=58&sensor=vlp16", (80,)),
+    Scene("street?seed=59&sensor=vlp16", (80,)),
+    Scene("street:crossing?seed=64&sensor=vlp16", (80,)),
+    Scene("street?seed=207&sensor=rosette", (82,)),
+    Scene("street?seed=421&sensor=rosette", (70,)),
+    Scene("street:crossing?seed=422&sensor=rosette", (70,)),
+)
+_REGISTERED = (
+    Scene("street", (120,)),
+    Scene("street:crossing", (120,)),
+    Scene("street:highway", (120,)),
+    Scene("street:highway?seed=43", (60,)),
+    Scene("street?seed=59", (80,)),
+    Scene("street:highway?seed=30&sensor=dual32", (70,)),
+    *_RINGS[:3],
+    _RINGS[5],
+    *_RINGS[6:10],
+    _RINGS[11],
+    Scene("street:crossing?seed=304&sensor=rosette", (90,)),
 )
 _RATES = tuple(
     Scene(f"{data}{'&' if '?' in data else '?'}hz={hz}", (12 * hz,), window=hz // 2)
@@ -262,11 +294,22 @@ def _worst(measured: Mapping[str, Any] | None) -> str:
     )
 
 
+def _row_of_registration(scene: Scene) -> list[list[str]]:
+    """Poses against exact ones."""
+    off = bench_registration(open_sequence(scene.data), scene.keys[0], scene.window)
+    return [[str(scene), f"{1000 * off.rms_m:.0f} mm", f"{off.rms_deg:.3f}°"]]
+
+
 def _flow_cells(ours: Mapping[str, Any], num_sweeps: int) -> list[str]:
+    step, window, hops = ours["step"], ours["window"], str(num_sweeps)
+
+    def cell(of_all: float | None, of_found: float | None) -> str:
+        return f"{_centimetres(of_all)} ({_centimetres(of_found)})"
+
     return [
-        f"{_percent(ours['step']['found'], 1)} %",
-        _centimetres(ours["step"]["movers_m"]),
-        _centimetres(ours["window"]["movers_m_by_hops"].get(str(num_sweeps))),
+        f"{_percent(step['found'], 1)} %",
+        cell(step["movers_m"], step["found_movers_m"]),
+        cell(window["movers_m_by_hops"].get(hops), window["found_movers_m_by_hops"].get(hops)),
         f"{_percent(ours['step']['falsely_moving'], 4)} %",
         f"{_percent(ours['window']['ghost_rate'])} %",
     ]
@@ -332,6 +375,7 @@ def _centimetres(value_m: float | None) -> str:
     return "–" if value_m is None else f"{100 * value_m:.1f} cm"
 
 
+_FLOW_TITLES = ("found", "one sweep", "five sweeps", "falsely moving", "ghosts", "worst object")
 _DEPTH_TITLES = (
     "measured",
     "wrong",
@@ -367,11 +411,20 @@ TABLES: Mapping[str, _Table] = {
         "The same without each part of a map.", _DEPTH_TITLES, _DEPTH[:4], _rows_of_parts, real=True
     ),
     "flow": _Table(
-        "Moving points found, errors with missed points counted as standing still; the object that "
-        "most of the error over one sweep is of.",
-        ("found", "one sweep", "five sweeps", "falsely moving", "ghosts", "worst object"),
+        "Moving points found, errors with missed points counted as standing still, and in brackets "
+        "of those found; the object that most of the error over one sweep is of.",
+        _FLOW_TITLES,
         _FLOW,
         _row_of_flow,
+    ),
+    "rings": _Table(
+        "The same with 32 and 16 rings, and a rosette.", _FLOW_TITLES, _RINGS, _row_of_flow
+    ),
+    "registration": _Table(
+        "Poses of eleven sweeps off the exact ones, relative to the key's, root mean square.",
+        ("metres", "degrees"),
+        _REGISTERED,
+        _row_of_registration,
     ),
     "rates": _Table(
         "The same streets at 5, 10 and 20 Hz, half a second on each side (looked at).",

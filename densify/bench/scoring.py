@@ -20,6 +20,7 @@ from densify.readers.true_flow import LabelledFlow, labelled_flow
 from densify.scores import flow_metrics as metrics
 from densify.scores.challenge import CLASSES, ChallengeScorer
 from densify.scores.ghosts import ghost_rate
+from densify.scores.radial_velocity import radial_velocity_scores
 from densify.scores.segmentation import SegmentationScorer
 from densify.types import Bool, Float, FlowField, Int, LidarSequence, Truth
 
@@ -102,7 +103,8 @@ class Scorer:
 
     def step_scores(self, steps: Mapping[int, FlowField]) -> dict[str, Any]:
         """Score the flow to the next sweep, by frame, all pairs together. found: of the ``certain``
-        movers above the ground; falsely_moving: of all that stands still, ground too."""
+        movers above the ground; found_movers_m: error of the movers that are called moving;
+        falsely_moving: of all that stands still, ground too."""
         if self.answers is None:
             moving = np.concatenate([steps[f].moving for f in self.sources])
             return {"called_moving": _plain(float(moving.mean()))}
@@ -120,6 +122,7 @@ class Scorer:
         scores = {
             "num_movers": int(moving.sum()),
             "movers_m": parts.foreground_dynamic_m,
+            "found_movers_m": metrics.end_point_error(flow, true, moving & called),
             "static_objects_m": parts.foreground_static_m,
             "background_m": parts.background_static_m,
             "three_way_m": parts.mean_m,
@@ -184,7 +187,8 @@ class Scorer:
 
     def window_scores(self, to_key: Mapping[int, FlowField]) -> dict[str, Any]:
         """Score the flow to the key, by frame. Accumulated movers, the key's own left out, are the
-        true movers above the ground, without truth those that are called moving."""
+        true movers above the ground, without truth those that are called moving. radial_velocity:
+        what the flow leaves of measured velocities, see `densify.scores.radial_velocity`."""
         stretch, key = self.window.stretch, self.window.key
         cloud = accumulate(stretch, [to_key[f] for f in stretch.frames], key, drop_lost=True)
         others = self._others()
@@ -200,19 +204,31 @@ class Scorer:
             "lost": _plain(1 - len(points) / num_movers if num_movers else math.nan),
             "plane_residual_m": _plain(metrics.plane_residual_m(points)),
             "extent_m2": _plain(metrics.extent_m2(points)),
+            "radial_velocity": radial_velocity_scores(cloud, stretch[key]),
         }
         if self.answers is None:
             return scores
         answers = self.answers
         true = np.concatenate([answers[f].at_key[movers[f]] for f in others])
-        errors = metrics.errors_by_hops(
-            np.concatenate([to_key[f].displacement[kept[f]] for f in others]),
-            np.concatenate([answers[f].to_key[kept[f]] for f in others]),
-            np.concatenate([np.full(int(kept[f].sum()), self._hops(f)) for f in others]),
-        )
-        scores["movers_m_by_hops"] = {str(n): _plain(error) for n, error in errors.items()}
+        found = {f: kept[f] & to_key[f].moving for f in others}
+        scores["movers_m_by_hops"] = self._errors_by_hops(answers, to_key, kept)
+        scores["found_movers_m_by_hops"] = self._errors_by_hops(answers, to_key, found)
         scores["coverage"] = _plain(metrics.coverage(points, true))
         return scores
+
+    def _errors_by_hops(
+        self,
+        answers: Mapping[int, SweepAnswer],
+        to_key: Mapping[int, FlowField],
+        counted: Mapping[int, Bool],
+    ) -> dict[str, float | None]:
+        """Mean errors of the flow to the key, by sweeps from it. counted: the points, by frame."""
+        errors = metrics.errors_by_hops(
+            np.concatenate([to_key[f].displacement[mine] for f, mine in counted.items()]),
+            np.concatenate([answers[f].to_key[mine] for f, mine in counted.items()]),
+            np.concatenate([np.full(mine.sum(), self._hops(f)) for f, mine in counted.items()]),
+        )
+        return {str(n): _plain(error) for n, error in errors.items()}
 
     def truth_scores(self) -> dict[str, Any] | None:
         """What perfect flow gets in the scores of accumulated movers; None without truth."""

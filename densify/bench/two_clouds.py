@@ -12,6 +12,7 @@ from densify.bench.windows import Window
 from densify.config import resolve
 from densify.errors import InputError
 from densify.flow.pairs.estimate import estimate_flow
+from densify.geometry import poses
 from densify.types import Bool, Float, LidarSequence, RegisteredSweep, Truth
 
 _CONFIG = {"register": {"source": "dataset"}}  # the flow's own errors, not registration's
@@ -59,9 +60,10 @@ def _scored(
 ) -> dict[str, tuple[Float, Bool, Bool]]:
     """What was given -> (n,) end-point errors in metres, what moves, and what is moved."""
     here, there = window.stretch[frame], window.stretch[target]
-    clouds = window.points(frame), window.points(target)
+    T_here_there = window.stretch.T_target_source(frame, target)
+    clouds = here.sweep.points, poses.transform(T_here_there, there.sweep.points)
     rows = here.sweep.row
-    true = truth.displacement(frame, target)[rows] @ here.T_world_lidar[:3, :3].T
+    true = truth.displacement(frame, target)[rows]
     moves = truth.sweep(frame).moving[rows]
     range_m = np.linalg.norm(here.sweep.points, axis=1)
     asked = window.above[frame] & (range_m <= _WITHIN_M)

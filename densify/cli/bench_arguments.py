@@ -246,7 +246,8 @@ def _add_bench_readme(benches: Any) -> None:
         "tables",
         nargs="*",
         metavar="TABLE",
-        help="of methods, depth, parts, flow, rates, segmentation, pairs, prior, images (default: "
+        help="of methods, depth, parts, flow, rings, registration, rates, segmentation, pairs, "
+        "prior, images (default: "
         "all)",
     )
     parser.add_argument(

@@ -55,7 +55,8 @@ def need_of_run(
     """
     num_points, chosen = len(sequence[key]), choose_cameras(sequence, cameras)
     num_sweeps = min(2 * window + 1, len(sequence.frames))
-    num_around = min(2 * _USUAL_HZ * config.flow.look_around_s, len(sequence.frames) - num_sweeps)
+    around_s = config.flow.around_s(_USUAL_HZ * num_points)
+    num_around = min(2 * _USUAL_HZ * around_s, len(sequence.frames) - num_sweeps)
     far = config.accumulate.far_m > 0 and len(sequence.frames) > num_sweeps
     bytes_of_point = num_sweeps * _POINT_BYTES + num_around * _AROUND_BYTES + far * _FAR_BYTES
     return (

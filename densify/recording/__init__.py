@@ -33,6 +33,7 @@ from densify.cache import Cache
 from densify.config import Config
 from densify.depth.accumulate import accumulate
 from densify.depth.object_tracks import object_tracks
+from densify.errors import InputError
 from densify.flow.engines import estimate_motion
 from densify.flow.scene import Scene
 from densify.geometry import poses
@@ -103,15 +104,27 @@ class Recording:
         self.timeline = Timeline.of(sequence)
         cut = Cut.whole(self.timeline, window)
         if keys is not None:
-            looks_around = looks_around and engine_row(settings.flow.engine)[0].shared
-            beyond_s = settings.flow.look_around_s if looks_around else 0.0
-            cut = Cut.around(self.timeline, window, keys, beyond_s)
+            cut = Cut.around(self.timeline, window, keys)
+            if looks_around and engine_row(settings.flow.engine)[0].shared:
+                cut = Cut.around(self.timeline, window, keys, self._around_s(keys))
         self.cut = cut
         self._num_around, self._watch = window, watch or Watch()
         self.steps = BlockSteps(
             sequence, settings, self.timeline, cut, window, cache, run, self._watch
         )
         self._places = self.steps.places
+
+    def _around_s(self, keys: Collection[int]) -> float:
+        """How far beyond the windows of keys what moves is looked for, by the points that the first
+        one's sweep has; 0 where that says nothing."""
+        settings = self.settings.flow
+        if settings.look_around_s is not None or not keys:
+            return settings.look_around_s or 0.0
+        try:
+            num_points = len(self.sequence[min(keys)])
+        except InputError:  # whoever works on it says why
+            return 0.0
+        return settings.around_s(num_points / (self.timeline.period_ns * 1e-9))
 
     def window_frames(self, key: int) -> WindowFrames:
         """The frames of a key's window, and where it is cut and why.

@@ -39,11 +39,14 @@ class Surface(NamedTuple):
     tree: Any
 
     @staticmethod
-    def of(points: Float, voxel_m: float = _VOXEL_M) -> Surface:
-        """points: (N,3). voxel_m: smaller ones keep more of them, and cost more."""
+    def of(
+        points: Float, voxel_m: float = _VOXEL_M, num_neighbors: int = _NUM_NEIGHBORS
+    ) -> Surface:
+        """points: (N,3). voxel_m: smaller ones keep more of them, and cost more. num_neighbors:
+        that tell the covariance; of few, such as lie on one ring, it is that of their noise."""
         import small_gicp
 
-        return Surface(*small_gicp.preprocess_points(points, voxel_m, _NUM_NEIGHBORS, 1))
+        return Surface(*small_gicp.preprocess_points(points, voxel_m, num_neighbors, 1))
 
     def __len__(self) -> int:
         return int(self.points.size())

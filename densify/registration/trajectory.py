@@ -15,7 +15,6 @@ from densify.errors import InputError, SweepError, UnfitSweepError, UnplacedSwee
 from densify.geometry import poses
 from densify.registration.deskew import deskew
 from densify.registration.doppler import measured_velocity
-from densify.registration.neighbors import refine
 from densify.registration.odometry import (
     check_measured,
     check_number_of_points,
@@ -24,12 +23,11 @@ from densify.registration.odometry import (
     check_stamps,
     register,
 )
-from densify.registration.surfaces import register_on_surfaces
+from densify.registration.surfaces import refine, register_on_surfaces
 from densify.registration.upright import upright
 from densify.types import Float, Int, Sweep, Trajectory
 
 _MANY_POINTS = 30_000  # in a sweep; fewer are matched with the pattern they were scanned in
-_AROUND_MANY_NS, _AROUND_FEW_NS = 550_000_000, 1_050_000_000
 
 
 class LeftOut(NamedTuple):
@@ -62,8 +60,8 @@ def find_trajectory(
     """Where the lidar was at every sweep.
 
     sweeps: raw, ascending in time. recorded: the recording's own poses of them, which are checked
-    and taken; None to find them by odometry and then lay each sweep on those around it
-    (`densify.registration.neighbors`).
+    and taken; None to find them by odometry, point to point, and then lay each sweep on the
+    surfaces of those before it (`densify.registration.surfaces`).
 
     Raises SweepError naming the frame where the poses cannot be right, InputError where radial
     velocities cannot.
@@ -78,33 +76,21 @@ def find_trajectory(
         many = bool(np.median([len(sweep) for sweep in sweeps]) >= _MANY_POINTS)
         measured = [measured_velocity(sweep) for sweep in sweeps]
         if many and any(velocity is None for velocity in measured):
-            odometry, straight = _by_points(sweeps, settings)
+            found = refine(sweeps, _by_points(sweeps, settings))
         else:
             if measured[0] is not None:
                 check_measured(sweeps, measured[0], settings)
-            odometry, straight = _by_surfaces(sweeps, settings, measured)
-        found = refine(sweeps, odometry, _AROUND_MANY_NS if many else _AROUND_FEW_NS, settings)
+            found = register_on_surfaces(sweeps, settings, measured)
         check_plausible(found, settings)
-        check_overlap(straight, found, settings)
+        check_overlap([s.sweep for s in deskew(sweeps, found).sweeps], found, settings)
     return replace(found, R_level_lidar=upright(sweeps))
 
 
-def _by_surfaces(
-    sweeps: Sequence[Sweep], settings: RegisterSettings, measured: Sequence[Float | None]
-) -> tuple[Trajectory, list[Sweep]]:
-    """Odometry for few points, or by measured velocities, and the sweeps deskewed by it."""
-    found = register_on_surfaces(sweeps, settings, measured)
-    return found, [s.sweep for s in deskew(sweeps, found).sweeps]
-
-
-def _by_points(
-    sweeps: Sequence[Sweep], settings: RegisterSettings
-) -> tuple[Trajectory, list[Sweep]]:
-    """Odometry for many points in two passes, whose first finds the motion that bends raw sweeps;
-    and the sweeps deskewed by that."""
+def _by_points(sweeps: Sequence[Sweep], settings: RegisterSettings) -> Trajectory:
+    """Odometry for many points in two passes, whose first finds the motion that bends raw
+    sweeps."""
     rough = _rough(sweeps, settings)
-    straight = [s.sweep for s in deskew(sweeps, rough).sweeps]
-    return _fine(straight, rough, settings), straight
+    return _fine([s.sweep for s in deskew(sweeps, rough).sweeps], rough, settings)
 
 
 def _rough(sweeps: Sequence[Sweep], settings: RegisterSettings) -> Trajectory:

@@ -59,7 +59,7 @@ def estimate_flow(
     source_lidar, target_lidar: (N,), (M,) whole numbers, which scanner measured each point, both or
     neither: each scanner's points are compared with its own, for each sees a mover at another time;
     with the times, with the others' too, each at its own. Times alone tell two scanners that spin
-    half a turn apart.
+    half a turn apart about the frame's origin, as the source's own frame has them.
 
     With ``objective.static_prior`` only groups of points move whose motion explains in both clouds
     what standing still leaves unexplained; the flow of all others is exactly 0, as it is farther

@@ -29,7 +29,7 @@ from densify.kernels.thinness import settle
 from densify.types import Bool, Float, Int
 
 _MIN_POINTS = 40  # fewer show no surfaces
-_MAX_POINTS = 400  # of each cloud
+_MAX_POINTS = 600  # of each cloud; of 400 the thickness hangs on how the axes lie
 _SIDE_M = 0.06
 _REACH_M, _MAX_REACH_M, _WIDER = 0.4, 1.0, 1.5
 _MIN_PLANES = 0.6  # share of points that must have one

@@ -21,6 +21,8 @@ _ROUGHER = 1.5
 _LEAST_WAY_M, _LEAST_WAY_PER_RESIDUAL, _LEAST_WAY_PER_ROUGH = 0.35, 8.0, 1.5
 _NUM_ASKED = 60
 _LEAST_STATES, _LEAST_S = 3, 0.15
+# Where no sweep meets the points of the one before, three crowns of trees may lie on a line.
+_LEAST_STATES_SCATTERED = 4
 _SHORT_S, _MAX_OF_SHORT = 0.35, 0.03  # three places of a tree's crown may lie on a line,
 _SHORT_OF_FEW_S, _FEW = 0.6, 0.2  # and even more where few looks contradict its standing still,
 _MAX_OF_FEW = 0.1  # of which its motion may leave so many, unless it left its places bare
@@ -39,8 +41,22 @@ _AS_FAST, _RAIL_M, _SLENDER, _SHARE_OF_RAIL = 0.1, 2.0, 8.0, 0.3
 def left_contradicted(
     track: Track, standing: Sequence[Standing], space: FreeSpace, proven: Sequence[Body]
 ) -> float | None:
-    """Fit the smooth motion of a track; None unless it certainly moves, or the share of looks that
-    contradict even that motion, 0 at best: of two motions the one with less of them is the truth.
+    """Fit the smooth motion of a track; None unless it certainly moves, or how much contradicts
+    that, see `share_contradicted`."""
+    num_states = len(track.sightings)
+    if num_states < _LEAST_STATES:
+        return None
+    if num_states < _LEAST_STATES_SCATTERED and space.sensors.scattered:
+        return None
+    track.smooth()
+    return share_contradicted(track, standing, space, proven)
+
+
+def share_contradicted(
+    track: Track, standing: Sequence[Standing], space: FreeSpace, proven: Sequence[Body]
+) -> float | None:
+    """None unless a track's smooth motion certainly is one, or the share of looks that contradict
+    even that motion, 0 at best: of two motions the one with less of them is the truth.
 
     The motion must be smooth, long enough to be told from noise, and must do away with the
     contradictions that brought the group here: where the sweeps see through its points at their
@@ -51,9 +67,8 @@ def left_contradicted(
     proven: other objects that certainly move.
     """
     seen_s = np.ptp([sighting.seen_s for sighting in track.sightings.values()])
-    if len(track.sightings) < _LEAST_STATES or seen_s < _LEAST_S:
+    if seen_s < _LEAST_S:
         return None
-    track.smooth()
     over_m = _over_noise_m(track, space, seen_s)
     if over_m is None or (over_m > 0 and not space.sensors.scattered):
         return None

@@ -21,7 +21,7 @@ from densify.flow.tracking.following import follow
 from densify.flow.tracking.left_places import left_places
 from densify.flow.tracking.lone_rays import few_rays, gap_in_line_m, in_line, linked_in_line
 from densify.flow.tracking.looks import looks_of
-from densify.flow.tracking.proof import left_contradicted, may_be_a_rail
+from densify.flow.tracking.proof import left_contradicted, may_be_a_rail, share_contradicted
 from densify.flow.tracking.shapes import Body, Shape
 from densify.flow.tracking.sightings import Track
 from densify.flow.tracking.slides import go_with_the_rest, take_back_slides
@@ -144,6 +144,9 @@ class _Search:
             _gather(track, self._standing, self.free, self._space)
             # A piece of a guard rail shows with the rest what it is of.
             proven = not may_be_a_rail(track, self._standing, self._space, self.bodies)
+            if proven and len(weights) > 1:  # rings glide over a roof, but not over all of the car
+                still = share_contradicted(track, self._standing, self._space, self.bodies)
+                proven = still is not None
         if proven and weights[0] < 1.0:  # rings glide over what is parked the more easily then
             places = left_places(track, self._standing, self._space, self.bodies)
             proven = places.mostly_bare()
