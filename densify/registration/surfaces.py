@@ -114,12 +114,14 @@ class _Row:
         for i in range(1, num):
             twist = expected(i, twist)
             T_guess = self._T[i - 1] @ poses.exp(twist * self._seconds(i))
-            before = range(max(0, i - 1), self._first(i) - 1, -1) if i >= num_start else ()
+            before = range(i - 1, self._first(i) - 1, -1) if i >= num_start else ()
             twist = self._lay(i, i, T_guess, twist, before)
-        for i in range(num_start - 1, -1, -1) if num > 2 else ():
-            twist = expected(i + 1, twist)
-            T_guess = self._T[i + 1] @ poses.exp(-twist * self._seconds(i + 1))
-            twist = self._lay(i, i + 1, T_guess, twist, range(i + 1, self._last(i) + 1))
+        if num > 2:
+            twist = _twist(self._T, self.stamp_ns, num_start + 1)
+            for i in range(num_start - 1, -1, -1):
+                twist = expected(i + 1, twist)
+                T_guess = self._T[i + 1] @ poses.exp(-twist * self._seconds(i + 1))
+                twist = self._lay(i, i + 1, T_guess, twist, range(i + 1, self._last(i) + 1))
         return np.stack([np.eye(4), *(poses.inverse(self._T[0]) @ T for T in self._T[1:])])
 
     def _lay(self, i: int, step: int, T_guess: Float, twist: Float, on: Iterable[int]) -> Float:
