@@ -235,8 +235,8 @@ class TestPage:
         data = data_of((run / "report.html").read_bytes())
         assert data["command"] == (
             "densify run --data 'tiny street' --key 3 --window 2 --method flow "
-            "--set register.source=dataset --set accumulate.far_m=0.0 --set output.rejected=true "
-            "--set output.report=true"
+            "--set register.source=dataset --set flow.look_around_s=0.0 "
+            "--set accumulate.far_m=0.0 --set output.rejected=true --set output.report=true"
         )
 
     def test_a_comparison_has_all_methods(self, tmp_path: Path) -> None:
@@ -247,7 +247,7 @@ class TestPage:
         assert list(data["methods"]) == ["none", "icp", "flow"] and data["method"] == "flow"
         assert list(data["cameras"]["front"]["others"]) == ["none", "icp"]
         assert data["cloud"]["displaced"] and data["about"]["stages"]
-        assert data["command"].endswith("--methods none,icp,flow --set register.source=dataset "
+        assert data["command"].endswith("--methods none,icp,flow --set register.source=dataset --set flow.look_around_s=0.0 "
                                         "--set accumulate.far_m=0.0")  # fmt: skip
 
     def test_a_run_of_before_has_what_is_there(self, run: Path, tmp_path: Path) -> None:
