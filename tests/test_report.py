@@ -247,8 +247,9 @@ class TestPage:
         assert list(data["methods"]) == ["none", "icp", "flow"] and data["method"] == "flow"
         assert list(data["cameras"]["front"]["others"]) == ["none", "icp"]
         assert data["cloud"]["displaced"] and data["about"]["stages"]
-        assert data["command"].endswith("--methods none,icp,flow --set register.source=dataset --set flow.look_around_s=0.0 "
-                                        "--set accumulate.far_m=0.0")  # fmt: skip
+        knobs = "register.source=dataset", "flow.look_around_s=0.0", "accumulate.far_m=0.0"
+        said = "".join(f" --set {knob}" for knob in knobs)
+        assert data["command"].endswith(f"--methods none,icp,flow{said}")
 
     def test_a_run_of_before_has_what_is_there(self, run: Path, tmp_path: Path) -> None:
         for name in ("run.yaml", "metrics.json"):
