@@ -310,8 +310,8 @@ def _flow_cells(ours: Mapping[str, Any], num_sweeps: int) -> list[str]:
         f"{_percent(step['found'], 1)} %",
         cell(step["movers_m"], step["found_movers_m"]),
         cell(window["movers_m_by_hops"].get(hops), window["found_movers_m_by_hops"].get(hops)),
-        f"{_percent(ours['step']['falsely_moving'], 4)} %",
-        f"{_percent(ours['window']['ghost_rate'])} %",
+        f"{_percent(step['falsely_moving'], 4)} %",
+        f"{_percent(window['ghost_rate'])} %",
     ]
 
 

@@ -34,9 +34,8 @@ _OVERLAP_POINTS = 2000
 _OVERLAP_M = 0.5
 _OVERLAP_NS = 350_000_000  # within it a pattern that does not repeat fills its view
 # Change of a sweep's pose (rad and m) below which it counts as found. The first pass only has to
-# find the motion within a sweep: 3 mm over 0.1 s bend its ends by 1.5 mm. After the second one each
-# sweep is laid on its neighbours; with twice as much left, highways come out 1 mm farther off, and
-# two of a hundred moving points of sixteen rings are lost.
+# find the motion within a sweep: 3 mm over 0.1 s bend its ends by 1.5 mm. The second one starts
+# `densify.registration.surfaces`: with 3 mm left there too, a highway of 32 rings slides by 0.1 m.
 _ROUGHLY_CONVERGED = 3e-3
 _CONVERGED = 5e-4
 

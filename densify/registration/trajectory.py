@@ -76,21 +76,26 @@ def find_trajectory(
         many = bool(np.median([len(sweep) for sweep in sweeps]) >= _MANY_POINTS)
         measured = [measured_velocity(sweep) for sweep in sweeps]
         if many and any(velocity is None for velocity in measured):
-            found = refine(sweeps, _by_points(sweeps, settings))
+            odometry, straight = _by_points(sweeps, settings)
+            found = refine(sweeps, odometry)
         else:
             if measured[0] is not None:
                 check_measured(sweeps, measured[0], settings)
             found = register_on_surfaces(sweeps, settings, measured)
+            straight = [s.sweep for s in deskew(sweeps, found).sweeps]
         check_plausible(found, settings)
-        check_overlap([s.sweep for s in deskew(sweeps, found).sweeps], found, settings)
+        check_overlap(straight, found, settings)
     return replace(found, R_level_lidar=upright(sweeps))
 
 
-def _by_points(sweeps: Sequence[Sweep], settings: RegisterSettings) -> Trajectory:
-    """Odometry for many points in two passes, whose first finds the motion that bends raw
-    sweeps."""
+def _by_points(
+    sweeps: Sequence[Sweep], settings: RegisterSettings
+) -> tuple[Trajectory, list[Sweep]]:
+    """Odometry for many points in two passes, whose first finds the motion that bends raw sweeps;
+    and the sweeps deskewed by that."""
     rough = _rough(sweeps, settings)
-    return _fine([s.sweep for s in deskew(sweeps, rough).sweeps], rough, settings)
+    straight = [s.sweep for s in deskew(sweeps, rough).sweeps]
+    return _fine(straight, rough, settings), straight
 
 
 def _rough(sweeps: Sequence[Sweep], settings: RegisterSettings) -> Trajectory:
