@@ -115,6 +115,28 @@ def test_fits_and_checks_by_the_verb(tmp_path: Path, capsys: pytest.CaptureFixtu
     assert expected == pytest.approx(found, rel=0.3, abs=20)
 
 
+def test_shipped_tables_are_checked_as_maps_have_them(capsys: pytest.CaptureFixture[str]):
+    street = "street:static?sensor=vlp16&cameras=rolling&seed=5"
+    chosen = ["--window", "1", "--config", "fast", "--camera", "rolling"]
+    assert (
+        main(["bench", "confidence", "--shipped", "--check", f"{street}@30", *chosen, "--json"])
+        == 0
+    )
+    measured = json.loads(capsys.readouterr().out)
+    assert measured["tables"] == scale.own_file()["tables"]
+    assert "fitted" not in measured["reliability"]
+    steps = measured["reliability"]["unseen"]
+    run = ["--data", street, "--key", "30", *chosen, "--json"]
+    assert main(["bench", "depth", *run]) == 0
+    (variant,) = json.loads(capsys.readouterr().out)["variants"].values()
+    of_maps = variant["reliability"]["truth"]
+    for name in ("expected", "outliers"):
+        mine, theirs = (sum(s[name] * s["num_compared"] for s in r) for r in (steps, of_maps))
+        assert mine == pytest.approx(theirs, rel=0.05)
+    with pytest.raises(SystemExit):
+        main(["bench", "confidence", "--shipped", "--fit", f"{street}@30"])
+
+
 def test_without_truth_there_is_nothing_to_fit(capsys: pytest.CaptureFixture[str]):
     from densify.config import resolve
     from densify.errors import InputError

@@ -8,7 +8,6 @@ import pytest
 
 from densify.depth import confidence as scale
 from densify.depth.layers import Layers
-from densify.files.texts import read_json
 from densify.types import DepthMap, Ranked
 from tests.scenes import CAMERA
 
@@ -120,7 +119,7 @@ def test_only_what_is_shown_tells_how_contradicted_it_is_around():
 
 
 def test_the_packages_own_tables_fall_with_the_rank():
-    own = scale.tables_of(read_json(scale.TABLES))
+    own = scale.tables_of(scale.own_file())
     assert own.shape == (len(scale.GROUPS), len(scale.CAUSES), scale.NUM_RANKS)
     assert (np.diff(own) <= 1e-9).all() and own.min() >= 0
     smooth, ragged = (own[k::3].mean(axis=(0, 2)) for k in (0, 2))

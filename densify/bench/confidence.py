@@ -82,7 +82,7 @@ class Evidence(NamedTuple):
 
 
 def bench_confidence(
-    fitted: Asked,
+    fitted: Asked | None,
     checked: Asked,
     window: int,
     config: Config,
@@ -90,7 +90,8 @@ def bench_confidence(
     progress: Progress | None = None,
 ) -> dict[str, Any]:
     """Fit the tables to maps of ``fitted``, recordings with the keys to make, and see how far they
-    hold on those of ``checked``. The rest as `densify.pipeline.run`.
+    hold on those of ``checked``; ``fitted`` None: see how far the package's own tables do. The rest
+    as `densify.pipeline.run`.
 
     Returns plain numbers: ``maps`` that were fitted on, ``tables``: by group and cause the rank and
     the share that is wrong, and ``reliability`` by recording and truth, where ``fitted`` is all
@@ -98,35 +99,40 @@ def bench_confidence(
 
     Raises InputError for what cannot be used, ComputationError where registration went wrong.
     """
-    for sequence, _ in fitted:
+    to_fit = fitted or ()
+    for sequence, _ in to_fit:
         if sequence.truth is None:
             raise InputError(f"--fit {sequence.name}: no exact truth; expected a simulated one")
-    num, done = sum(len(keys) for _, keys in (*fitted, *checked)), 0
+    num, done = sum(len(keys) for _, keys in (*to_fit, *checked)), 0
     found: list[list[Evidence]] = []
-    for number, (sequence, keys) in enumerate((*fitted, *checked)):
+    for number, (sequence, keys) in enumerate((*to_fit, *checked)):
         found.append([])
         for key in keys:
-            found[-1] += _evidence(sequence, key, window, config, cameras, number >= len(fitted))
+            found[-1] += _evidence(sequence, key, window, config, cameras, number >= len(to_fit))
             done += 1
             if progress is not None:
                 progress("bench", done, num)
-    fit_on = [e for part in found[: len(fitted)] for e in part]
-    knots = {
-        group: {cause: _knots(share) for cause, share in zip(scale.CAUSES, shares, strict=True)}
-        for group, shares in zip(scale.GROUPS, fit(fit_on), strict=True)
-    }
-    tables = scale.tables_of({"tables": knots})
-    unseen = [e for part in found[len(fitted) :] for e in part]
+    fit_on = [e for part in found[: len(to_fit)] for e in part]
+    written = scale.own_file() if fitted is None else _written(fit_on)
+    tables = scale.tables_of(written)
+    unseen = [e for part in found[len(to_fit) :] for e in part]
     exact = [e for e in unseen if e.source == "truth"]
-    rows = {"fitted": _reliability(fit_on, tables), "unseen": _reliability(exact, tables)}
+    together = {"fitted": fit_on, "unseen": exact}
+    rows = {name: _reliability(part, tables) for name, part in together.items() if part}
     for data, source in dict.fromkeys((e.data, e.source) for e in unseen):
         part = [e for e in unseen if (e.data, e.source) == (data, source)]
         rows[f"{data}, {source}"] = _reliability(part, tables)
-    return {
-        "maps": [{"data": e.data, "key": e.key, "camera": e.camera} for e in fit_on],
-        "tables": knots,
-        "reliability": rows,
+    return {"maps": written["maps"], "tables": written["tables"], "reliability": rows}
+
+
+def _written(fit_on: Sequence[Evidence]) -> dict[str, Any]:
+    """Tables fitted to these maps, as ``confidence.json`` has them."""
+    tables = {
+        group: {cause: _knots(share) for cause, share in zip(scale.CAUSES, shares, strict=True)}
+        for group, shares in zip(scale.GROUPS, fit(fit_on), strict=True)
     }
+    maps = [{"data": e.data, "key": e.key, "camera": e.camera} for e in fit_on]
+    return {"maps": maps, "tables": tables}
 
 
 def _evidence(

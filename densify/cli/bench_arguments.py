@@ -128,7 +128,13 @@ def _add_bench_confidence(benches: Any) -> None:
         "against exact truth, where there is some, and maps made without the key sweep "
         "against its returns. Hold means: expected and found differ by at most a fifth or 0.05 %.",
     )
-    parser.add_argument(
+    source = parser.add_mutually_exclusive_group()
+    source.add_argument(
+        "--shipped",
+        action="store_true",
+        help="fit nothing: check the tables that come with the package",
+    )
+    source.add_argument(
         "--fit",
         type=recording_keys,
         action="append",

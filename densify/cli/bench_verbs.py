@@ -37,13 +37,14 @@ def bench_confidence(options: argparse.Namespace) -> Iterator[Answer]:
 
     if options.out is not None:
         check_new_file(options.out, options.overwrite, ".json")
+    asked = [] if options.shipped else options.fit or bench.FITTED
     fitted, checked = (
         [(open_sequence(spec), keys) for spec, keys in given]
-        for given in (options.fit or bench.FITTED, options.check or bench.CHECKED)
+        for given in (asked, options.check or bench.CHECKED)
     )
     with progress_on_stderr() as progress:
         measured = bench.bench_confidence(
-            fitted, checked, options.window, config, options.cameras, progress
+            fitted or None, checked, options.window, config, options.cameras, progress
         )
     if options.out is not None:
         write_table(options.out, {**measured, "config": as_mapping(config)})

@@ -44,8 +44,8 @@ GROUPS = tuple(
 CAUSES = ("anyway", "contradicted")
 """Shares that are wrong: anyway, and for each whole by which a place is contradicted."""
 NUM_RANKS = 200
-TABLES = Path(__file__).with_name("confidence.json")
 
+_FILE = Path(__file__).with_name("confidence.json")
 _RAGGED = np.array([0.1, 0.5])
 _NUM_RAGGED = len(_RAGGED) + 1
 NUM_MEASURED = 2 * _NUM_RAGGED
@@ -136,7 +136,12 @@ def falling(num: Float, wrong_num: Float) -> Float:
 
 @cache
 def _own_tables() -> Float:
-    return tables_of(read_json(TABLES))
+    return tables_of(own_file())
+
+
+def own_file() -> dict[str, Any]:
+    """The package's own tables, as `densify.bench.confidence` wrote them."""
+    return read_json(_FILE)
 
 
 def tables_of(written: dict[str, Any]) -> Float:
