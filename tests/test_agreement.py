@@ -72,9 +72,23 @@ def test_what_most_around_contradicts_is_left_out():
     assert np.array_equal(np.argwhere(lost), [SPOT])
     assert made.depth_m[SPOT] == made.confidence[SPOT] == 0
     assert made.rim_m[SPOT] == depth_m[SPOT]
-    closed = replace(before, window=np.ones(SHAPE, bool))
-    kept = without_contradicted(closed, contradicted(closed, FOCAL_PX))
-    assert np.array_equal(kept.filled_m, before.filled_m)
+
+
+def test_what_is_behind_a_closed_window_does_not_contradict_it():
+    depth_m = wall()
+    filled_m, window = depth_m.copy(), np.zeros(SHAPE, bool)
+    window[SPOT[0] - 4 : SPOT[0] + 5, 20:40] = True
+    filled_m[window] = WALL_M / 2
+    open_ = replace(layers_of(depth_m), filled_m=filled_m)
+    share = contradicted(open_, FOCAL_PX)
+    assert share[window].min() > 0.7
+    closed = replace(open_, window=window)
+    of_closed = contradicted(closed, FOCAL_PX)
+    assert not of_closed[window].any()
+    assert np.array_equal(of_closed[~window], share[~window])
+    assert not without_contradicted(open_, share).filled_m[window].any()
+    kept = without_contradicted(closed, of_closed)
+    assert np.array_equal(kept.filled_m[window], filled_m[window])
 
 
 def test_a_few_around_tell_nothing():

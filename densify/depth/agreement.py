@@ -17,7 +17,8 @@ _MOST = 0.7  # of them; of what more contradicted, half to nine tenths was wrong
 
 def contradicted(layers: Layers, focal_px: float) -> Float32:
     """(H,W) share of what is measured around each pixel of the filled map, at depth edges too, that
-    would make it wrong by KITTI's rule, within a gap between rays to all sides."""
+    would make it wrong by KITTI's rule, within a gap between rays to all sides. Nothing contradicts
+    closed windows (`densify.depth.glass`): what is behind them may be measured too."""
     measured_m = np.maximum(layers.depth_m, layers.rim_m)
     inverse, known = (
         np.divide(1, depth_m, out=np.zeros_like(depth_m), where=depth_m > 0)
@@ -33,13 +34,12 @@ def contradicted(layers: Layers, focal_px: float) -> Float32:
     )
     found = np.zeros_like(layers.filled_m)
     found.flat[pixel] = share
+    if layers.window is not None:
+        found[layers.window] = 0
     return found
 
 
 def without_contradicted(layers: Layers, share: Float32) -> Layers:
     """Take out the pixels that most of what is measured around contradicts. share: (H,W) of it, see
-    `contradicted`. In closed windows (`densify.depth.glass`) what is behind them may."""
-    dropped = share > _MOST
-    if layers.window is not None:
-        dropped &= ~layers.window
-    return layers.without(dropped)
+    `contradicted`."""
+    return layers.without(share > _MOST)
