@@ -116,25 +116,24 @@ def test_fits_and_checks_by_the_verb(tmp_path: Path, capsys: pytest.CaptureFixtu
 
 
 def test_shipped_tables_are_checked_as_maps_have_them(capsys: pytest.CaptureFixture[str]):
-    street = "street:static?sensor=vlp16&cameras=rolling&seed=5"
-    chosen = ["--window", "1", "--config", "fast", "--camera", "rolling"]
-    assert (
-        main(["bench", "confidence", "--shipped", "--check", f"{street}@30", *chosen, "--json"])
-        == 0
-    )
-    measured = json.loads(capsys.readouterr().out)
+    from densify.bench.depth import bench_depth
+    from densify.config import resolve
+    from tests.small_street import KEY, one_car
+
+    sequence, config = one_car(), resolve(None)
+    measured = bench.bench_confidence(None, [(sequence, [KEY])], 2, config)
     assert measured["tables"] == scale.own_file()["tables"]
     assert "fitted" not in measured["reliability"]
-    steps = measured["reliability"]["unseen"]
-    run = ["--data", street, "--key", "30", *chosen, "--json"]
-    assert main(["bench", "depth", *run]) == 0
-    (variant,) = json.loads(capsys.readouterr().out)["variants"].values()
-    of_maps = variant["reliability"]["truth"]
-    for name in ("expected", "outliers"):
-        mine, theirs = (sum(s[name] * s["num_compared"] for s in r) for r in (steps, of_maps))
-        assert mine == pytest.approx(theirs, rel=0.05)
-    with pytest.raises(SystemExit):
-        main(["bench", "confidence", "--shipped", "--fit", f"{street}@30"])
+    of_maps = bench_depth(sequence, [KEY], 2, {"own": config})["variants"]["own"]["reliability"]
+    for source, mine in (("truth", "unseen"), ("key held out", f"{sequence.name}, key held out")):
+        steps, theirs = measured["reliability"][mine], of_maps[source]
+        assert sum(s["num_compared"] for s in steps) == sum(s["num_compared"] for s in theirs) > 100
+        for name, within in (("expected", 0.05), ("outliers", 1e-9)):
+            wrong, same = (sum(s[name] * s["num_compared"] for s in r) for r in (steps, theirs))
+            assert wrong == pytest.approx(same, rel=within)
+    with pytest.raises(SystemExit, match="2"):
+        main(["bench", "confidence", "--shipped", "--fit", "street@30"])
+    assert "not allowed with argument --shipped" in capsys.readouterr().err
 
 
 def test_without_truth_there_is_nothing_to_fit(capsys: pytest.CaptureFixture[str]):
