@@ -121,7 +121,7 @@ def test_shipped_tables_are_checked_as_maps_have_them(capsys: pytest.CaptureFixt
     from tests.small_street import KEY, one_car
 
     sequence, config = one_car(), resolve(None)
-    measured = bench.bench_confidence(None, [(sequence, [KEY])], 2, config)
+    measured = bench.bench_confidence([], [(sequence, [KEY])], 2, config)
     assert measured["tables"] == scale.own_file()["tables"]
     assert "fitted" not in measured["reliability"]
     of_maps = bench_depth(sequence, [KEY], 2, {"own": config})["variants"]["own"]["reliability"]

@@ -82,7 +82,7 @@ class Evidence(NamedTuple):
 
 
 def bench_confidence(
-    fitted: Asked | None,
+    fitted: Asked,
     checked: Asked,
     window: int,
     config: Config,
@@ -90,8 +90,8 @@ def bench_confidence(
     progress: Progress | None = None,
 ) -> dict[str, Any]:
     """Fit the tables to maps of ``fitted``, recordings with the keys to make, and see how far they
-    hold on those of ``checked``; ``fitted`` None: see how far the package's own tables do. The rest
-    as `densify.pipeline.run`.
+    hold on those of ``checked``; with nothing ``fitted``, how far the package's own tables do. The
+    rest as `densify.pipeline.run`.
 
     Returns plain numbers: ``maps`` that were fitted on, ``tables``: by group and cause the rank and
     the share that is wrong, and ``reliability`` by recording and truth, where ``fitted`` is all
@@ -99,23 +99,22 @@ def bench_confidence(
 
     Raises InputError for what cannot be used, ComputationError where registration went wrong.
     """
-    to_fit = fitted or ()
-    for sequence, _ in to_fit:
+    for sequence, _ in fitted:
         if sequence.truth is None:
             raise InputError(f"--fit {sequence.name}: no exact truth; expected a simulated one")
-    num, done = sum(len(keys) for _, keys in (*to_fit, *checked)), 0
+    num, done = sum(len(keys) for _, keys in (*fitted, *checked)), 0
     found: list[list[Evidence]] = []
-    for number, (sequence, keys) in enumerate((*to_fit, *checked)):
+    for number, (sequence, keys) in enumerate((*fitted, *checked)):
         found.append([])
         for key in keys:
-            found[-1] += _evidence(sequence, key, window, config, cameras, number >= len(to_fit))
+            found[-1] += _evidence(sequence, key, window, config, cameras, number >= len(fitted))
             done += 1
             if progress is not None:
                 progress("bench", done, num)
-    fit_on = [e for part in found[: len(to_fit)] for e in part]
-    written = scale.own_file() if fitted is None else _written(fit_on)
+    fit_on = [e for part in found[: len(fitted)] for e in part]
+    written = _written(fit_on) if fitted else scale.own_file()
     tables = scale.tables_of(written)
-    unseen = [e for part in found[len(to_fit) :] for e in part]
+    unseen = [e for part in found[len(fitted) :] for e in part]
     exact = [e for e in unseen if e.source == "truth"]
     together = {"fitted": fit_on, "unseen": exact}
     rows = {name: _reliability(part, tables) for name, part in together.items() if part}

@@ -44,7 +44,7 @@ def bench_confidence(options: argparse.Namespace) -> Iterator[Answer]:
     )
     with progress_on_stderr() as progress:
         measured = bench.bench_confidence(
-            fitted or None, checked, options.window, config, options.cameras, progress
+            fitted, checked, options.window, config, options.cameras, progress
         )
     if options.out is not None:
         write_table(options.out, {**measured, "config": as_mapping(config)})
