@@ -17,45 +17,45 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from densify.config import Config as Config
+    from densify.config.errors import ComputationError as ComputationError
+    from densify.config.errors import InputError as InputError
     from densify.dataset.gate import Gate as Gate
     from densify.dataset.loader import DepthDataset as DepthDataset
     from densify.dataset.make import make_dataset as make_dataset
     from densify.dataset.plan import Recipe as Recipe
-    from densify.errors import ComputationError as ComputationError
-    from densify.errors import InputError as InputError
     from densify.flow.pairs.estimate import estimate_flow as estimate_flow
-    from densify.pipeline import compare as compare
-    from densify.pipeline import run as run
+    from densify.geometry.types import Camera as Camera
+    from densify.geometry.types import Cloud as Cloud
+    from densify.geometry.types import DepthMap as DepthMap
+    from densify.geometry.types import FlowField as FlowField
+    from densify.geometry.types import LidarSequence as LidarSequence
+    from densify.geometry.types import Result as Result
+    from densify.geometry.types import Sweep as Sweep
+    from densify.pipeline.run import compare as compare
+    from densify.pipeline.run import run as run
     from densify.readers import open_sequence as open_sequence
-    from densify.types import Camera as Camera
-    from densify.types import Cloud as Cloud
-    from densify.types import DepthMap as DepthMap
-    from densify.types import FlowField as FlowField
-    from densify.types import LidarSequence as LidarSequence
-    from densify.types import Result as Result
-    from densify.types import Sweep as Sweep
 
-from densify.version import __version__ as __version__
+__version__ = "0.1.0"
 
 _HOME = {
     "open_sequence": "densify.readers",
-    "run": "densify.pipeline",
-    "compare": "densify.pipeline",
+    "run": "densify.pipeline.run",
+    "compare": "densify.pipeline.run",
     "estimate_flow": "densify.flow.pairs.estimate",
     "make_dataset": "densify.dataset.make",
     "Recipe": "densify.dataset.plan",
     "Gate": "densify.dataset.gate",
     "Config": "densify.config",
-    "InputError": "densify.errors",
-    "ComputationError": "densify.errors",
-    "Camera": "densify.types",
-    "Cloud": "densify.types",
+    "InputError": "densify.config.errors",
+    "ComputationError": "densify.config.errors",
+    "Camera": "densify.geometry.types",
+    "Cloud": "densify.geometry.types",
     "DepthDataset": "densify.dataset.loader",
-    "DepthMap": "densify.types",
-    "FlowField": "densify.types",
-    "LidarSequence": "densify.types",
-    "Result": "densify.types",
-    "Sweep": "densify.types",
+    "DepthMap": "densify.geometry.types",
+    "FlowField": "densify.geometry.types",
+    "LidarSequence": "densify.geometry.types",
+    "Result": "densify.geometry.types",
+    "Sweep": "densify.geometry.types",
 }
 
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from densify.flow.chained import ChainedMotion
 from densify.geometry import poses
-from densify.types import FlowField, RegisteredSweep, Stretch, Sweep
+from densify.geometry.types import FlowField, RegisteredSweep, Stretch, Sweep
 
 FRAMES = range(100, 107)
 KEY = 103

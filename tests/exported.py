@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from densify.geometry.types import Camera, CameraView, Result
 from densify.outputs import write_result
-from densify.pipeline import run
-from densify.types import Camera, CameraView, Result
+from densify.pipeline.run import run
 from tests.small_street import KEY, POSES_GIVEN, one_car
 from tests.test_export import KEY_NS, H, W, map_of
 from tests.test_export_formats import cloud_of

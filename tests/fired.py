@@ -7,8 +7,8 @@ from __future__ import annotations
 import numpy as np
 
 from densify.geometry import poses
+from densify.geometry.types import RegisteredSweep, Sweep
 from densify.street.sensors import SENSORS, firings
-from densify.types import RegisteredSweep, Sweep
 from tests.scenes import World
 
 PERIOD_NS = 100_000_000

@@ -11,9 +11,9 @@ from densify.config import Config, GroundSettings
 from densify.flow import scene as engine_scene
 from densify.flow.engines import estimate_motion
 from densify.flow.tracking.groups import GroupMotion
-from densify.geometry.ground import ground
-from densify.geometry.height_map import HeightMap
-from densify.types import FlowField, Motion, Stretch
+from densify.free_space.ground import ground
+from densify.free_space.height_map import HeightMap
+from densify.geometry.types import FlowField, Motion, Stretch
 from tests.scenes import Arc, Scanner, Scene, World, street
 
 CONFIG = Config()

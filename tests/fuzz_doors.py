@@ -21,8 +21,8 @@ from typing import Any
 import cv2
 import numpy as np
 
-from densify.cache.codec import DamagedError, decode, encode
-from densify.errors import ComputationError, InputError
+from densify.config.cache_codec import DamagedError, decode, encode
+from densify.config.errors import ComputationError, InputError
 
 ALLOWED = (InputError, ComputationError)
 FRAMES = (59, 60, 61)  # as in the tests of readers: rendered once for all
@@ -64,19 +64,19 @@ class Door:
 
 
 def _image(path: Path) -> None:
-    from densify.files.images import read_image
+    from densify.readers.image_files import read_image
 
     read_image(path, as_stored=path.suffix == ".png")
 
 
 def _npy(path: Path) -> None:
-    from densify.files.arrays import read_array
+    from densify.readers.array_files import read_array
 
     read_array(path)
 
 
 def _npz(path: Path) -> None:
-    from densify.files.arrays import read_arrays
+    from densify.readers.array_files import read_arrays
 
     read_arrays(path)
 
@@ -100,15 +100,15 @@ def _flow(path: Path) -> None:
 
 
 def _prior(path: Path) -> None:
+    from densify.geometry.types import Camera
     from densify.readers.prior_files import PriorFiles
-    from densify.types import Camera
 
     camera = Camera("cam", 12, 8, np.eye(3), np.eye(4))
     PriorFiles.open(path.parent, ["cam"]).prior(camera, 5)
 
 
 def _json(path: Path) -> None:
-    from densify.files.texts import read_json
+    from densify.config.text_files import read_json
 
     read_json(path)
 
@@ -182,7 +182,7 @@ def _movers(path: Path) -> None:
 
 
 def _gzip(path: Path) -> None:
-    from densify.files.content import gunzipped, read_bytes
+    from densify.config.file_content import gunzipped, read_bytes
 
     gunzipped(read_bytes(path), path, 1 << 24)
 
@@ -301,9 +301,9 @@ def _laz(points: np.ndarray, compressed: bool = True) -> bytes:
 
 def _read_all(place: Path) -> None:
     """All that a run might read."""
+    from densify.geometry.types import KnowsBoxes
     from densify.readers import open_sequence
     from densify.readers.describe import describe
-    from densify.types import KnowsBoxes
 
     sequence = open_sequence(_opened_as(place))
     steps: list[Callable[[], Any]] = [lambda: describe(sequence)]
@@ -353,8 +353,8 @@ def _samples(data: Any) -> None:
 
 def _run(place: Path) -> None:
     """A finished run: its page, and what is exported of it."""
+    from densify.config.plugins.exports import EXPORTS
     from densify.outputs import export_run
-    from densify.plugins.exports import EXPORTS
 
     out = place.with_name("exported")
     try:
@@ -372,7 +372,7 @@ def _run(place: Path) -> None:
 
 
 def _page(place: Path) -> None:
-    from densify.report import write_report
+    from densify.dataset.report import write_report
 
     write_report(place, place.with_name("report.html"), overwrite=True)
 
@@ -413,8 +413,8 @@ def real_trees() -> list[str]:
 
 
 def _written(format: str, root: Path) -> Door:
+    from densify.outputs.writers import write_street
     from densify.readers.street import Street
-    from densify.writers import write_street
 
     sensor, hz, frames = {
         "nuscenes": ("hdl32", 20, (119, 120, 121)),

@@ -9,10 +9,10 @@ from functools import cache
 import numpy as np
 
 from densify.geometry.poses import inverse, transform
+from densify.geometry.types import LidarSequence
+from densify.outputs.writers.excerpt import Excerpt
 from densify.readers.street import Street
 from densify.scores.depth_metrics import DepthErrors, depth_errors
-from densify.types import LidarSequence
-from densify.writers.excerpt import Excerpt
 from tests.scenes import by_flow
 
 MEASURED_ALONE = {"fill_reach": 0.1, "star_reach": 0}

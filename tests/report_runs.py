@@ -7,9 +7,9 @@ from functools import cache
 from pathlib import Path
 
 from densify.config import as_mapping, resolve
+from densify.geometry.types import Result
 from densify.outputs import write_comparison, write_result
-from densify.pipeline import compare
-from densify.types import Result
+from densify.pipeline.run import compare
 from tests.small_street import KEY, POSES_GIVEN, one_car
 
 CONFIG = POSES_GIVEN | {"output": {"report": True, "rejected": True}}

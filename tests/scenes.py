@@ -13,9 +13,7 @@ import numpy as np
 
 from densify.config import Config
 from densify.geometry import poses
-from densify.pipeline import compare
-from densify.registration.deskew import deskew
-from densify.types import (
+from densify.geometry.types import (
     Camera,
     LidarSequence,
     Result,
@@ -24,6 +22,8 @@ from densify.types import (
     SweepTruth,
     Trajectory,
 )
+from densify.pipeline.run import compare
+from densify.registration.deskew import deskew
 
 SWEEP_S = 0.1
 EPOCH_NS = 1_317_000_000_000_000_789  # stamps of 19 digits, as real ones are

@@ -138,7 +138,7 @@ def test_shipped_tables_are_checked_as_maps_have_them(capsys: pytest.CaptureFixt
 
 def test_without_truth_there_is_nothing_to_fit(capsys: pytest.CaptureFixture[str]):
     from densify.config import resolve
-    from densify.errors import InputError
+    from densify.config.errors import InputError
     from tests.small_street import KEY, one_car
 
     sequence = one_car()

@@ -14,7 +14,7 @@ from densify.bench.depth import bench_depth
 from densify.cli import bench_tables as tables
 from densify.cli import main
 from densify.config import resolve
-from densify.errors import InputError
+from densify.config.errors import InputError
 from tests.scenes import TinySequence, by_flow
 from tests.small_street import KEY, one_car
 

@@ -22,10 +22,10 @@ from densify.bench.windows import Window
 from densify.cli import bench_tables as tables
 from densify.cli import main
 from densify.config import resolve
-from densify.errors import InputError
+from densify.config.errors import InputError
 from densify.flow.objective.solvers import SolverSettings, solve
+from densify.geometry.types import FlowField, Stretch
 from densify.scores.segmentation import LEAST_POINTS
-from densify.types import FlowField, Stretch
 from tests.scenes import Arc, Scanner, Scene, TinySequence, World, car, street
 
 CONFIG = resolve({"register": {"source": "dataset"}, "flow": {"look_around_s": 0.0}})

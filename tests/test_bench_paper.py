@@ -24,14 +24,14 @@ from densify.bench.paper_pairs import (
     read_pair,
 )
 from densify.cli import main
-from densify.errors import InputError
-from densify.files.images import read_image
+from densify.config.errors import InputError
 from densify.learning.model_file import Model, write_model
 from densify.learning.networks import build
 from densify.outputs.arrows import draw_arrows
+from densify.outputs.writers import write_street
+from densify.readers.image_files import read_image
 from densify.readers.kitti import scene_flow
 from densify.readers.street import Street
-from densify.writers import write_street
 
 STEP = np.array([0.3, 0.1, 0.0])
 

@@ -7,7 +7,7 @@ import pytest
 
 from densify.bench import priors
 from densify.bench.priors import bench_priors
-from densify.errors import InputError
+from densify.config.errors import InputError
 from tests.small_street import KEY, one_car
 
 

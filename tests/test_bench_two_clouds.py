@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from densify.bench.two_clouds import bench_two_clouds
-from densify.errors import InputError
+from densify.config.errors import InputError
 from densify.flow.pairs.estimate import estimate_flow
 from tests.scenes import Arc, Scanner, Scene, TinySequence, World, car, street
 from tests.small_street import one_car

@@ -16,9 +16,9 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 from numpy.typing import NDArray
 
-from densify.arrays import Bool, Float, Float32, Int
-from densify.cache import codec
-from densify.cache.codec import DamagedError, decode, encode
+from densify.config import cache_codec as codec
+from densify.config.cache_codec import DamagedError, decode, encode
+from densify.geometry.arrays import Bool, Float, Float32, Int
 
 
 class Why(NamedTuple):

@@ -9,9 +9,9 @@ import cv2
 import numpy as np
 import pytest
 
-from densify.errors import InputError
+from densify.config.errors import InputError
 from densify.geometry.cameras import image_points, pixels_per_metre, rays
-from densify.types import Camera
+from densify.geometry.types import Camera
 
 PINHOLES = [
     (),

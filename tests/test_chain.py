@@ -8,7 +8,7 @@ import pytest
 
 from densify.flow.chained import ChainedMotion
 from densify.geometry import poses
-from densify.types import FlowField
+from densify.geometry.types import FlowField
 from tests.exact_motion import (
     CAR,
     FRAMES,

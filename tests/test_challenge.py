@@ -8,7 +8,7 @@ import math
 import numpy as np
 import pytest
 
-from densify.errors import InputError
+from densify.config.errors import InputError
 from densify.readers.true_flow import CATEGORIES
 from densify.scores.challenge import CLASSES, IGNORED, ChallengeScorer
 

@@ -17,7 +17,7 @@ import pytest
 import yaml
 
 from densify.config import Config, as_mapping, resolve
-from densify.errors import ComputationError
+from densify.config.errors import ComputationError
 from tests.command import exit_code, files_in, refused
 
 STREET = "street?sensor=vlp16"
@@ -178,7 +178,7 @@ def test_compare_prints_a_table_and_writes_it(
 def test_short_options_are_knobs(
     verb: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from densify import pipeline
+    from densify.pipeline import run as pipeline
 
     seen: list[Any] = []
 
@@ -355,7 +355,7 @@ def test_bad_drive(case: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 def test_unwritable_output_is_found_before_the_computation(
     verb: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from densify import pipeline
+    from densify.pipeline import run as pipeline
 
     (tmp_path / "file").write_text("kept")
     computes = {"run": "run_keys"}.get(verb, verb)

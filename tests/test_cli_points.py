@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from densify.cli.point_files import read_points
-from densify.errors import InputError
+from densify.config.errors import InputError
 from tests.command import exit_code, refused
 
 

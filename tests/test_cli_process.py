@@ -20,7 +20,7 @@ import pytest
 
 from densify.cli.answer import Answer
 from densify.cli.verbs import info
-from densify.errors import ComputationError
+from densify.config.errors import ComputationError
 from tests.command import exit_code, refused
 
 
@@ -144,7 +144,7 @@ def test_a_set_is_not_begun_before_all_is_known_to_fit(option, says, capsys, tmp
 
 def test_arguments_of_python_of_a_wrong_kind() -> None:
     import densify
-    from densify.errors import InputError
+    from densify.config.errors import InputError
 
     street = densify.open_sequence("street")
     with pytest.raises(InputError, match=r"--window '1': expected a whole number"):

@@ -22,8 +22,8 @@ from densify.cli.answer import Answer, first_of
 from densify.cli.progress import Course
 from densify.cli.results import FIRST_OF_COMPARISON, FIRST_OF_RUN
 from densify.cli.verbs import info
-from densify.errors import ComputationError, InputError
-from densify.methods import engines
+from densify.config.errors import ComputationError, InputError
+from densify.pipeline.methods import engines
 from tests.command import exit_code
 from tests.dataset_scenes import BORDER, FRAMES, copy_drive, sweep_file
 

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from densify import types
 from densify.cli import results as said
+from densify.geometry import types
 
 
 def result_with(metrics: dict[str, Any], method: str, num_points: int) -> types.Result:

@@ -6,11 +6,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from densify.clock import Clock
 from densify.config import GroundSettings
 from densify.flow.tracking.evidence import REACH_S
-from densify.geometry.ground import ground
-from densify.types import Stretch
+from densify.free_space.ground import ground
+from densify.geometry.clock import Clock
+from densify.geometry.types import Stretch
 from tests.found_motion import KEY, NOISE, motion_in
 from tests.scenes import Arc, Scene, World, car, street
 

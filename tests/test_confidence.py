@@ -8,7 +8,7 @@ import pytest
 
 from densify.depth import confidence as scale
 from densify.depth.layers import Layers
-from densify.types import DepthMap, Ranked
+from densify.geometry.types import DepthMap, Ranked
 from tests.scenes import CAMERA
 
 SMOOTH, FENCE, FILLED = 0, 1, 7

@@ -23,7 +23,7 @@ from densify.config import (
     presets,
     resolve,
 )
-from densify.errors import InputError
+from densify.config.errors import InputError
 
 KNOBS = [
     (section.name, field)

@@ -11,9 +11,9 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
+from densify.geometry.types import FullDepth, PriorFit
 from densify.outputs import curve, figure
 from densify.outputs.context import Context
-from densify.types import FullDepth, PriorFit
 from tests.test_output import H, W, result_of
 
 SHARE = st.one_of(st.just(0.0), st.floats(2e-5, 1.0))

@@ -10,14 +10,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from densify.cache import Cache, steps_folder
+from densify.config.cache import Cache, steps_folder
+from densify.config.errors import InputError
 from densify.dataset import make, work
 from densify.dataset.loader import DepthDataset
 from densify.dataset.plan import Recipe, Source
 from densify.dataset.work import Job, tasks
-from densify.errors import InputError
+from densify.pipeline.blocks import Cut
 from densify.readers.timeline import Timeline
-from densify.recording.blocks import Cut
 from tests.command import exit_code, files_in
 from tests.dataset_scenes import (
     BORDER,

@@ -20,8 +20,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 import densify
-from densify.cache import Cache, digest, steps_folder
-from densify.errors import InputError
+from densify.config.cache import Cache, digest, steps_folder
+from densify.config.errors import InputError
 from tests.command import exit_code
 
 LIMIT = 10**9

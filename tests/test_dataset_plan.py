@@ -10,11 +10,11 @@ from pathlib import Path
 import pytest
 
 from densify.config import resolve
+from densify.config.errors import InputError
 from densify.dataset import capacity, cluster, make
 from densify.dataset.gate import Gate
 from densify.dataset.manifest import Manifest
 from densify.dataset.plan import Recipe, plan, read_plan
-from densify.errors import InputError
 from tests.command import exit_code, files_in, refused
 from tests.dataset_scenes import (
     DRIVE,

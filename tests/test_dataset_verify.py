@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 import densify
-from densify.errors import InputError
+from densify.config.errors import InputError
 from tests.command import exit_code, files_in
 from tests.dataset_scenes import OPTIONS, in_order, maps_in
 

@@ -16,8 +16,8 @@ import torch
 from torch.utils.data import DataLoader
 
 import densify
+from densify.config.errors import InputError
 from densify.dataset.loader import DepthDataset
-from densify.errors import InputError
 from densify.outputs.depth_png import stored_confidence, write_confidence_png, write_depth_png
 
 W, H = 60, 24

@@ -12,7 +12,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from densify.errors import InputError
+from densify.config.errors import InputError
+from densify.geometry.types import Camera, DepthMap
 from densify.scores.depth_metrics import (
     DepthErrors,
     depth_edges,
@@ -22,7 +23,6 @@ from densify.scores.depth_metrics import (
     image_density,
     mean_errors,
 )
-from densify.types import Camera, DepthMap
 
 KEY = 7
 

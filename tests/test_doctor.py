@@ -13,12 +13,12 @@ import pytest
 
 from densify.bench.faults import FAULTS, Faulty
 from densify.config import Config
+from densify.config.errors import InputError
 from densify.doctor import CHECKS, Sample, Spot, Verdict, cameras, clocks, paths, points, rings
-from densify.errors import InputError
 from densify.geometry import poses
+from densify.geometry.types import RegisteredSweep, Sweep, Trajectory
 from densify.readers.street import Street
 from densify.readers.timeline import Timeline
-from densify.types import RegisteredSweep, Sweep, Trajectory
 from tests.command import exit_code, refused
 
 FRAMES = range(112, 125)

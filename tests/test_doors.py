@@ -19,13 +19,13 @@ import cv2
 import numpy as np
 import pytest
 
+from densify.config import file_content as content
 from densify.config import resolve
-from densify.errors import ComputationError, InputError, OutputError, UnplacedSweepError
-from densify.files import content
-from densify.files.arrays import read_array, read_arrays
-from densify.files.content import gunzipped, read_bytes
-from densify.files.images import decode_image
-from densify.files.texts import parse_json, parse_yaml
+from densify.config.errors import ComputationError, InputError, OutputError, UnplacedSweepError
+from densify.config.file_content import gunzipped, read_bytes
+from densify.config.text_files import parse_json, parse_yaml
+from densify.readers.array_files import read_array, read_arrays
+from densify.readers.image_files import decode_image
 from densify.readers.kitti.files import Stamps
 from densify.readers.kitti.odometry import _read_times_ns
 from densify.readers.stamp_files import StampFile, named
@@ -400,4 +400,4 @@ def test_there_are_no_other_doors() -> None:
         if name in OTHER_PLACES or name.startswith("files/"):
             continue
         found = re.search(UNGUARDED, path.read_text("utf-8"))
-        assert not found, f"{name}: {found and found.group()}: by densify.files"
+        assert not found, f"{name}: {found and found.group()}: by densify.config"

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 import yaml
 
+from densify.geometry.types import Camera
 from densify.outputs import write_result
-from densify.pipeline import run
+from densify.pipeline.run import run
 from densify.readers.kitti.raw import KittiRaw
 from densify.readers.window import choose_cameras
-from densify.types import Camera
 from tests.command import exit_code
 from tests.dataset_scenes import FRAMES, OPTIONS, copy_drive, records
 from tests.scenes import CAMERA, TinySequence, stamp_ns
@@ -181,7 +181,7 @@ class TestKitti:
         assert camera == "image_03 is left out: calib_cam_to_cam.txt has no P_rect_03"
 
     def test_a_stamps_file_that_is_no_file_is_not_an_absent_one(self, drive):
-        from densify.errors import InputError
+        from densify.config.errors import InputError
 
         (drive / "velodyne_points" / "timestamps_start.txt").unlink()
         (drive / "velodyne_points" / "timestamps_start.txt").mkdir()

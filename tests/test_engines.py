@@ -9,15 +9,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from densify.cache.codec import decode, encode
 from densify.config import Config, resolve
-from densify.errors import InputError
+from densify.config.cache_codec import decode, encode
+from densify.config.errors import InputError
+from densify.config.plugins.engines import ENGINES, engine
 from densify.flow.engines import check_engine, estimate_motion, motion_type
 from densify.flow.scene import Scene
 from densify.flow.tracking.evidence import FreeSpace, find_candidates
-from densify.geometry.ground import ground
-from densify.plugins.engines import ENGINES, engine
-from densify.types import Stretch
+from densify.free_space.ground import ground
+from densify.geometry.types import Stretch
 from tests import scenes
 
 

@@ -8,10 +8,10 @@ import pytest
 
 from densify.config import FlowSettings, GroundSettings
 from densify.flow.tracking.evidence import FreeSpace, Standing, find_candidates
+from densify.free_space.ground import ground
+from densify.free_space.height_map import HeightMap
 from densify.geometry import poses
-from densify.geometry.ground import ground
-from densify.geometry.height_map import HeightMap
-from densify.types import Stretch
+from densify.geometry.types import Stretch
 from tests.scenes import SWEEP_S, Arc, Scanner, Scene, World, car, street
 
 MIN_HEIGHT_M = FlowSettings().min_height_m

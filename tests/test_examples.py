@@ -10,8 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
+from densify.outputs.writers import write_street
 from densify.readers.street import Street
-from densify.writers import write_street
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 

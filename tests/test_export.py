@@ -13,11 +13,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import densify
+from densify.config.errors import InputError
 from densify.depth.age import with_ages
-from densify.errors import InputError
+from densify.geometry.types import Cloud, DepthMap, Result
 from densify.outputs import export_run, read_depth_png, write_result
 from densify.outputs.atomic import staged_folder
-from densify.types import Cloud, DepthMap, Result
 
 H, W = 12, 20
 CAMERAS = ("image_02", "image_03")

@@ -8,10 +8,10 @@ import pytest
 import yaml
 from PIL import Image
 
+from densify.config.plugins.exports import EXPORTS
+from densify.geometry.types import Cloud
 from densify.outputs import export_run, read_cloud, read_depth_png, write_cloud
 from densify.outputs.depth_png import stored_age, stored_confidence
-from densify.plugins.exports import EXPORTS
-from densify.types import Cloud
 from tests.command import exit_code
 from tests.test_export import CAMERAS, KEY_NS, STAMPS_NS, map_of, refused, stored, tree, written
 

@@ -20,12 +20,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from densify.errors import InputError
+from densify.config.errors import InputError
 from densify.outputs import export_run, read_cloud, write_result
 from densify.outputs.export import open3d_window
 from densify.outputs.export.finished_run import finished_runs
 from densify.outputs.export.timeline import timelines
-from densify.pipeline import run_keys
+from densify.pipeline.run import run_keys
 from tests.command import exit_code, refused
 from tests.exported import write_street, write_views
 from tests.small_street import KEY, POSES_GIVEN, one_car

@@ -12,8 +12,8 @@ from plyfile import PlyData
 from scipy.spatial.transform import Rotation
 
 from densify.geometry import poses
+from densify.geometry.types import ObjectTrack
 from densify.outputs import export_run, read_cloud, write_cloud
-from densify.types import ObjectTrack
 from tests.exported import street_result, write_street, write_views
 from tests.small_street import KEY
 from tests.test_export import KEY_NS, H, W, refused

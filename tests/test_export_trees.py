@@ -14,7 +14,7 @@ import pye57
 import pytest
 from laspy.copc import CopcReader
 
-from densify.errors import InputError
+from densify.config.errors import InputError
 from densify.outputs import export_run, read_cloud, read_depth_png
 from densify.outputs.export.copc import _nodes
 from densify.outputs.export.finished_run import FinishedRun

@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from densify.pipeline import run
+from densify.pipeline.run import run
 from tests.scenes import (
     SWEEP_S,
     Arc,

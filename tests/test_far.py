@@ -10,18 +10,18 @@ from functools import cache
 import numpy as np
 import pytest
 
-from densify import pipeline
-from densify.cache import Cache
 from densify.config import resolve
-from densify.errors import InputError
+from densify.config.cache import Cache
+from densify.config.errors import InputError
 from densify.geometry import poses
-from densify.kernels.clouds import thinned
+from densify.geometry.clouds import thinned
+from densify.geometry.types import RegisteredSweep
+from densify.pipeline import run as pipeline
+from densify.pipeline.recording import Recording
 from densify.readers.timeline import Timeline
-from densify.recording import Recording
 from densify.registration import chain
 from densify.registration.chain import follow
 from densify.scores.depth_metrics import depth_scores
-from densify.types import RegisteredSweep
 from tests.scenes import CAMERA, Arc, Scanner, Scene, TinySequence, World, by_flow, car, street
 
 KEY, WINDOW, NUM_FRAMES = 15, 2, 36

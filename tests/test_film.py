@@ -10,9 +10,9 @@ import cv2
 import numpy as np
 import pytest
 
-from densify.errors import InputError
+from densify.config.errors import InputError
 from densify.outputs import read_cloud, write_cloud
-from densify.report import film
+from densify.outputs.report import film
 from tests.command import refused
 from tests.report_runs import results, write_run
 

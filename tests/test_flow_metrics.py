@@ -8,7 +8,7 @@ import math
 import numpy as np
 import pytest
 
-from densify.errors import InputError
+from densify.config.errors import InputError
 from densify.scores import flow_metrics as metrics
 
 NOTHING = np.zeros((0, 3))

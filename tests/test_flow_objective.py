@@ -11,7 +11,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from densify.errors import InputError
+from densify.config.errors import InputError
 from densify.flow.objective import graph
 from densify.flow.objective.energy import energy
 from densify.flow.objective.neighbors import NeighborIndex, nearest_by_brute_force

@@ -13,11 +13,11 @@ import pytest
 from densify.bench.flow import bench_flow
 from densify.cli import main
 from densify.config import resolve
-from densify.errors import InputError
+from densify.config.errors import InputError
+from densify.outputs.writers import write_street
 from densify.readers import open_sequence
 from densify.readers.street import Street
 from densify.readers.true_flow import labelled_flow
-from densify.writers import write_street
 from tests.exact_motion import registered
 
 feather = pytest.importorskip("pyarrow.feather")
@@ -193,7 +193,7 @@ def test_what_is_there_is_kept(log, submission, capsys):
 def test_bad_labels_are_named(log, tmp_path):
     points = open_sequence(log)[0].points[:5]
     stretch_of = [registered(frame, points) for frame in (0, 1)]
-    from densify.types import Stretch
+    from densify.geometry.types import Stretch
 
     stretch = Stretch(tuple(stretch_of))
     with pytest.raises(InputError, match="no such folder"):

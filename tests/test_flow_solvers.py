@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 import torch
 
-from densify.errors import InputError
+from densify.config.errors import InputError
 from densify.flow.objective import graph
 from densify.flow.objective.energy import energy
 from densify.flow.objective.solvers import SolverSettings, solve
-from densify.kernels import threads
+from densify.geometry import threads
 
 ADAM = SolverSettings(solver="adam", adam_num_steps=60)
 

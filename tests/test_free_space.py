@@ -13,7 +13,7 @@ from densify.depth.free_space import Rays, crossings, without_seen_through
 from densify.depth.layers import Layers
 from densify.depth.project import project
 from densify.geometry.poses import exp, transform
-from densify.types import Reason, RegisteredSweep, Stretch, Sweep
+from densify.geometry.types import Reason, RegisteredSweep, Stretch, Sweep
 
 FRONT_M, WALL_M = 12.0, 20.0
 PICKET_M, STEP_M = 0.09, 0.17

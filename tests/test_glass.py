@@ -11,11 +11,11 @@ import pytest
 
 from densify.config import ProjectSettings
 from densify.depth import glass
+from densify.depth.framing import framed
 from densify.depth.glass import close_windows
 from densify.depth.layers import Layers
-from densify.kernels import threads
-from densify.kernels.framing import framed
-from densify.kernels.marching import DIRECTIONS, first_known
+from densify.depth.marching import DIRECTIONS, first_known
+from densify.geometry import threads
 
 FOCAL_PX, SHAPE = 720.0, (240, 320)
 SETTINGS = ProjectSettings()

@@ -10,10 +10,11 @@ import pytest
 from scipy import ndimage
 
 from densify.config import FlowSettings, GroundSettings
-from densify.geometry import height_map, poses
-from densify.geometry.ground import ground
-from densify.geometry.height_map import HeightMap
-from densify.types import Stretch
+from densify.free_space import height_map
+from densify.free_space.ground import ground
+from densify.free_space.height_map import HeightMap
+from densify.geometry import poses
+from densify.geometry.types import Stretch
 from tests.scenes import GROUND, KERB_M, KERB_Y_M, Arc, Box, Scanner, Scene, World, car, street
 
 SETTINGS = GroundSettings()

@@ -8,12 +8,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from densify.clock import Clock
 from densify.flow.tracking.evidence import Standing
 from densify.flow.tracking.extent import Seen, leave_out_alone, shape_of
 from densify.flow.tracking.lone_rays import columns_apart_m
 from densify.flow.tracking.sightings import Sighting, Track
 from densify.geometry import poses
+from densify.geometry.clock import Clock
 from tests.found_motion import KEY, NOISE, Found
 from tests.scenes import Arc, Box, Scene, World, car, street
 

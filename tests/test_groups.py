@@ -10,7 +10,7 @@ import pytest
 
 from densify.flow.tracking import tracks
 from densify.geometry import poses
-from densify.types import FlowField
+from densify.geometry.types import FlowField
 from tests.found_motion import KEY, NOISE, Found, motion_in, toward_key
 from tests.scenes import SWEEP_S, Arc, Box, Scanner, Scene, World, car, street
 

@@ -13,7 +13,7 @@ _PAGES = 64 << 8  # 64 MiB
 _FAULTS = f"""
 import resource
 from concurrent.futures import ThreadPoolExecutor
-from densify.process.heap import keep_freed_memory
+from densify.pipeline.heap import keep_freed_memory
 
 def faults():
     bytearray({_PAGES} << 12)

@@ -17,8 +17,8 @@ import numba
 import numpy as np
 import pytest
 
-from densify import kernels
-from densify.kernels import threads
+from densify.geometry import compiled as kernels
+from densify.geometry import threads
 
 SOURCE = """
 def double(first, last, values, out):
@@ -99,7 +99,7 @@ def test_code_that_others_could_have_put_there_is_not_loaded(
 def test_compiling_is_announced_once_and_loading_is_not(double, caplog, monkeypatch):
     monkeypatch.setattr(kernels._compiling, "said", False)
     caplog.set_level("INFO", "densify.progress")
-    double.__module__ = "densify.kernels.doubling"
+    double.__module__ = "densify.geometry.compiled.doubling"
     monkeypatch.setitem(sys.modules, double.__module__, sys.modules["doubling"])
     check(kernels.Kernel(double))
     assert [r.getMessage().split()[0] for r in caplog.records] == ["compiling"]

@@ -17,12 +17,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import densify
-from densify.errors import InputError
+from densify.config.errors import InputError
+from densify.geometry.types import DepthMap
 from densify.outputs.atomic import FileRecord
 from densify.outputs.depth_png import read_depth_png
 from densify.outputs.kitti_tree import drive_folder, split_of, write_key, write_readme
 from densify.readers.depth_trees import pair_depth_files
-from densify.types import DepthMap
 
 H, W = 9, 14
 CAMERAS = ("image_02", "image_03")
@@ -212,7 +212,7 @@ def test_a_full_disk_leaves_no_part_of_a_file(tmp_path: Path) -> None:
 import resource, sys
 from pathlib import Path
 from test_kitti_tree import FOLDER, maps
-from densify.errors import InputError
+from densify.config.errors import InputError
 from densify.outputs.kitti_tree import write_key
 resource.setrlimit(resource.RLIMIT_FSIZE, 2 * (int(sys.argv[2]),))
 try:

@@ -18,18 +18,18 @@ from scipy.spatial import cKDTree
 
 from densify.cli import main
 from densify.config import resolve
-from densify.errors import InputError
+from densify.config.errors import InputError
 from densify.flow.boxes import BoxMargins, flow_of_boxes
 from densify.geometry.poses import transform
+from densify.geometry.types import Boxes, BoxView, Camera, RegisteredSweep, Sweep
 from densify.learning.labels import label_sweeps
+from densify.outputs.writers import write_street
+from densify.outputs.writers.pandaset import _pickled
 from densify.readers import open_sequence
 from densify.readers.kitti.files import Calibration
 from densify.readers.nuscenes.annotations import Annotations
 from densify.readers.street import Street
 from densify.readers.waymo.components import BOX_HEADING, BOX_SIZE, STAMP
-from densify.types import Boxes, BoxView, Camera, RegisteredSweep, Sweep
-from densify.writers import write_street
-from densify.writers.pandaset import _pickled
 
 pyarrow = pytest.importorskip("pyarrow")
 FRAMES = range(60, 63)

@@ -11,10 +11,10 @@ import pytest
 from densify.bench.paper_pairs import pair_of_recording
 from densify.cli import main
 from densify.config import Config, resolve
-from densify.errors import InputError
+from densify.config.errors import InputError
 from densify.flow.engines import check_engine, estimate_motion
 from densify.flow.scene import Scene
-from densify.geometry.ground import ground
+from densify.free_space.ground import ground
 from densify.learning import engine
 from densify.learning.model_file import Model, read_model, write_model
 from densify.learning.networks import build

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from densify.errors import InputError
+from densify.config.errors import InputError
 from densify.learning.clouds import NetworkCloud
 from densify.learning.losses import TEACHERS, teacher
 from densify.learning.losses.cycle import cycle_loss

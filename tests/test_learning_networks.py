@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from densify.errors import InputError
+from densify.config.errors import InputError
 from densify.learning.clouds import NetworkCloud, order_for
 from densify.learning.networks import NETWORKS, build
 from densify.learning.networks.flownet3d import NUM_POINTS, farthest_points

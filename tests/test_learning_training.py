@@ -15,7 +15,7 @@ import pytest
 import torch
 
 from densify.cli import main
-from densify.errors import ComputationError, InputError
+from densify.config.errors import ComputationError, InputError
 from densify.learning.clips import ClipMaker
 from densify.learning.losses.supervised import supervised_loss
 from densify.learning.model_file import Model, read_model, write_model

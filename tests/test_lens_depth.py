@@ -10,7 +10,7 @@ from densify.config import ProjectSettings
 from densify.depth.exposure import Exposure
 from densify.depth.project import project
 from densify.geometry.cameras import converted, image_points, rays
-from densify.types import Camera, Patches, Reason
+from densify.geometry.types import Camera, Patches, Reason
 from tests.test_project import make_camera, make_cloud
 
 K = np.array([[124.0, 0, 199.5], [0, 124.0, 199.5], [0, 0, 1]])

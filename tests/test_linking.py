@@ -9,7 +9,7 @@ from scipy.cluster.hierarchy import fcluster, linkage
 from scipy.spatial.distance import cdist
 from scipy.spatial.transform import Rotation
 
-from densify.kernels.linking import close_to_seeds, link
+from densify.geometry.linking import close_to_seeds, link
 
 DISTANCE_M = 0.6
 

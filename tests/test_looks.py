@@ -8,16 +8,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from densify.clock import Clock
 from densify.config import GroundSettings
 from densify.flow.tracking import groups
 from densify.flow.tracking.evidence import FreeSpace, Standing
 from densify.flow.tracking.extent import Seen
 from densify.flow.tracking.looks import looks_of
-from densify.geometry.ground import ground
+from densify.free_space.ground import ground
+from densify.free_space.range_image import RangeImage
+from densify.geometry.clock import Clock
 from densify.geometry.poses import transform
-from densify.geometry.range_image import RangeImage
-from densify.types import RegisteredSweep, Stretch
+from densify.geometry.types import RegisteredSweep, Stretch
 from tests.found_motion import motion_in
 from tests.scenes import Arc, Box, Scanner, Scene, World, car, street
 

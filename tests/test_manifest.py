@@ -13,6 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from key_records import DRIVE, keys, record, write_files, write_lines
 
+from densify.config.errors import InputError
 from densify.dataset.manifest import (
     KeyRecord,
     Manifest,
@@ -21,7 +22,6 @@ from densify.dataset.manifest import (
     is_whole,
     read_manifests,
 )
-from densify.errors import InputError
 from densify.outputs.atomic import FileRecord
 
 # One record

@@ -15,11 +15,11 @@ import numpy as np
 import pytest
 from key_records import DRIVE, keys, record, write_lines
 
+from densify.config.errors import InputError, OutputError
 from densify.dataset.manifest import (
     Manifest,
     read_manifests,
 )
-from densify.errors import InputError, OutputError
 
 # Writing
 
@@ -73,7 +73,7 @@ import resource, sys
 from pathlib import Path
 from key_records import record
 from densify.dataset.manifest import Manifest
-from densify.errors import OutputError
+from densify.config.errors import OutputError
 with Manifest(Path(sys.argv[1])) as manifest:
     size = len(record(1).to_line())
     hard = resource.getrlimit(resource.RLIMIT_FSIZE)[1]

@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from densify.kernels.marching import DIRECTIONS, NONE, first_known
+from densify.depth.marching import DIRECTIONS, NONE, first_known
 
 
 def twin(known, row, column, direction):

@@ -12,8 +12,8 @@ import pytest
 
 from densify.bench import peaks
 from densify.config import Config, resolve
-from densify.errors import InputError
-from densify.process import memory
+from densify.config.errors import InputError
+from densify.pipeline import memory
 from tests.command import exit_code, refused
 from tests.small_street import KEY, one_car
 

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from densify.kernels.nearest import BoxTree
+from densify.geometry.nearest import BoxTree
 
 
 def cloud(num_points: int, seed: int, far_m: float = 0.0) -> np.ndarray:

@@ -10,7 +10,7 @@ import pytest
 
 from densify.depth.object_tracks import object_tracks
 from densify.geometry import poses
-from densify.types import FlowField, Stretch
+from densify.geometry.types import FlowField, Stretch
 from tests.exact_motion import CAR, FRAMES, KEY, T_world_lidar, scene, turning
 from tests.exported import street_result
 from tests.small_street import CAR as STREET_CAR

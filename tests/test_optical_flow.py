@@ -10,9 +10,9 @@ import pytest
 from densify.depth.exposure import Exposure
 from densify.depth.optical_flow import optical_flow
 from densify.geometry import poses
+from densify.geometry.types import Camera, Cloud, DepthMap, Reason
 from densify.outputs.depth_png import write_flow_png
-from densify.pipeline import run
-from densify.types import Camera, Cloud, DepthMap, Reason
+from densify.pipeline.run import run
 from tests.scenes import CAMERA, SWEEP_S, by_flow
 from tests.small_street import CAR, KEY, POSES_GIVEN, one_car
 

@@ -10,8 +10,8 @@ import pytest
 
 from densify.config import GroundSettings
 from densify.flow.tracking.evidence import FreeSpace, find_candidates
-from densify.geometry.ground import ground
-from densify.types import Stretch
+from densify.free_space.ground import ground
+from densify.geometry.types import Stretch
 from tests.dataset_scenes import COARSE
 from tests.found_motion import motion_in
 from tests.scenes import Arc, Scene, World, car, street

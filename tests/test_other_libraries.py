@@ -9,8 +9,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from densify.errors import InputError
-from densify.types import Cloud
+from densify.config.errors import InputError
+from densify.geometry.types import Cloud
 from tests.exported import camera_of, street_result, view_of
 from tests.test_export import map_of
 from tests.test_export_formats import cloud_of

@@ -17,7 +17,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from densify.errors import InputError
+from densify.config.errors import InputError
+from densify.geometry.types import Cloud, DepthMap, Result, StageCost
 from densify.outputs import (
     check_writable,
     cloud_laz,
@@ -35,7 +36,6 @@ from densify.outputs import (
     write_result,
 )
 from densify.outputs.atomic import staged_folder
-from densify.types import Cloud, DepthMap, Result, StageCost
 
 H, W = 12, 20
 CONFIG = {"objective": {"alpha": 10.0, "radius_m": None}, "register": {"source": "kiss-icp"}}

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 import densify
-from densify.errors import InputError
+from densify.config.errors import InputError
 from densify.flow.pairs import estimate as pair_module
 from densify.flow.pairs.estimate import estimate_flow
 

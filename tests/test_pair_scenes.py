@@ -10,7 +10,7 @@ import pytest
 
 from densify import open_sequence
 from densify.config import RegisterSettings
-from densify.errors import InputError
+from densify.config.errors import InputError
 from densify.flow.pairs.estimate import estimate_flow
 from densify.geometry import poses
 from densify.readers.window import read_sweep

@@ -12,8 +12,8 @@ import pytest
 from densify import open_sequence
 from densify.flow.pairs.estimate import estimate_flow
 from densify.flow.pairs.scanners import scanners_told
+from densify.flow.pairs.thinness import settle
 from densify.geometry import poses
-from densify.kernels.thinness import settle
 from densify.readers.street import Street
 from densify.street.lidar import T_ego_lidar, at_offsets
 from densify.street.simulator import seconds

@@ -11,8 +11,8 @@ from densify.flow.pairs.estimate import estimate_flow
 from densify.flow.pairs.hypotheses import PairCloud, RigidMotion
 from densify.flow.pairs.refine import Refined, refined
 from densify.flow.pairs.trials import Trial, _ambiguous
+from densify.free_space.height_map import HeightMap
 from densify.geometry import poses
-from densify.geometry.height_map import HeightMap
 from tests.scenes import Arc, Scanner, Scene, World, car, street
 
 WAY = np.array([1.3, -0.2, 0.0])

@@ -11,9 +11,9 @@ from test_project import KEY, make_cloud, patches_of
 
 from densify.config import ProjectSettings
 from densify.depth.patches import Tangents, patches, tangents
-from densify.geometry.range_image import RangeImage
-from densify.geometry.sensor import Sensors
-from densify.types import RegisteredSweep, Sweep
+from densify.free_space.range_image import RangeImage
+from densify.free_space.sensor import Sensors
+from densify.geometry.types import RegisteredSweep, Sweep
 from tests.fired import fired
 from tests.scenes import Arc, Box, World
 

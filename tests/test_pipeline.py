@@ -10,13 +10,13 @@ import pytest
 
 import densify
 from densify.config import RegisterSettings
+from densify.free_space.range_image import RangeImage
 from densify.geometry import poses
-from densify.geometry.range_image import RangeImage
-from densify.methods import METHODS
-from densify.pipeline import compare, run
+from densify.geometry.types import Result
+from densify.pipeline.methods import METHODS
+from densify.pipeline.run import compare, run
 from densify.readers.window import read_sweep
 from densify.scores.ghosts import ghosts
-from densify.types import Result
 from tests.scenes import CAMERA, SWEEP_S, Arc, Scanner, Scene, TinySequence, World, street
 from tests.small_street import one_car
 from tests.tiny_street import KEY, MOVERS, POSES_GIVEN, WINDOW, same_points, tiny

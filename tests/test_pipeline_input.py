@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from densify.config import RegisterSettings
+from densify.config.errors import ComputationError, InputError
 from densify.dataset.make import make_dataset
-from densify.errors import ComputationError, InputError
 from densify.geometry import poses
-from densify.pipeline import compare, run
+from densify.pipeline.run import compare, run
 from densify.readers.window import read_sweep
 from tests.scenes import TinySequence, by_flow
 from tests.small_street import KEY, POSES_GIVEN, one_car

@@ -10,9 +10,9 @@ import cv2
 import numpy as np
 import pytest
 
+from densify.geometry.types import Cloud, Reason, Result
 from densify.outputs import read_cloud, read_depth_png, write_result
-from densify.pipeline import compare, run
-from densify.types import Cloud, Reason, Result
+from densify.pipeline.run import compare, run
 from tests.scenes import ROOM, Arc, Scanner, Scene, TinySequence, World, by_flow
 from tests.small_street import CAR, KEY, POSES_GIVEN, one_car
 from tests.tiny_street import same_points

@@ -18,14 +18,14 @@ import pytest
 import densify
 from densify.cli import main
 from densify.config import resolve
-from densify.errors import InputError
+from densify.config.errors import InputError
+from densify.config.plugins.engines import ENGINES, engine
+from densify.config.plugins.outputs import OUTPUTS, chosen
+from densify.config.plugins.readers import READERS
 from densify.flow.engines import check_engine
+from densify.geometry.types import Links
 from densify.outputs.store import check_writable, write_result
-from densify.plugins.engines import ENGINES, engine
-from densify.plugins.outputs import OUTPUTS, chosen
-from densify.plugins.readers import READERS
 from densify.readers import Spec
-from densify.types import Links
 from tests.tiny_street import MOVERS, tiny
 
 EXAMPLE = Path(__file__).parents[1] / "examples" / "plugin"
@@ -125,7 +125,7 @@ STILL = """
     def estimate_motion(scene, settings, argument) -> Still:
         return Still(int(argument))
     def check_argument(argument):
-        from densify.errors import InputError
+        from densify.config.errors import InputError
         if not argument.isdigit():
             raise InputError(f"flow.engine still:{argument}: expected a number")
 """

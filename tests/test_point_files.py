@@ -12,7 +12,7 @@ import lzf
 import numpy as np
 import pytest
 
-from densify.errors import InputError
+from densify.config.errors import InputError
 from densify.readers.points.files import read_table, read_viewpoint
 
 rng = np.random.default_rng(5)

@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from densify.errors import InputError
+from densify.config.errors import InputError
 from densify.geometry.poses import exp, inverse, transform
 from densify.readers.pose_track import PoseTrack
 

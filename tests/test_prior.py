@@ -10,7 +10,7 @@ import pytest
 from densify.config import PriorSettings
 from densify.depth import prior as stage
 from densify.depth.prior import complete, fit_prior
-from densify.types import DepthMap, Prior
+from densify.geometry.types import DepthMap, Prior
 
 H, W, FOCAL_PX, HEIGHT_M = 150, 240, 200.0, 1.6
 AUTO = PriorSettings()

@@ -14,12 +14,12 @@ import pytest
 import yaml
 
 import densify
-from densify import pipeline
-from densify.errors import InputError
+from densify.config.errors import InputError
+from densify.geometry.types import Camera
 from densify.outputs import read_depth_png, write_result
 from densify.outputs.depth_png import read_stored
+from densify.pipeline import run as pipeline
 from densify.readers.prior_files import PriorFiles
-from densify.types import Camera
 from tests.command import refused
 from tests.small_street import KEY, POSES_GIVEN, one_car
 

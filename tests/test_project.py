@@ -11,15 +11,15 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from densify.config import ProjectSettings
+from densify.depth import visibility as kernels
 from densify.depth.exposure import Exposure
 from densify.depth.fill import fill_between as fill_by_spacing
 from densify.depth.patches import patches
 from densify.depth.project import project
 from densify.depth.rims import decide
+from densify.free_space.sensor import Sensors
 from densify.geometry.poses import exp
-from densify.geometry.sensor import Sensors
-from densify.kernels import visibility as kernels
-from densify.types import Camera, Cloud, Patches, Reason, RegisteredSweep, Sweep
+from densify.geometry.types import Camera, Cloud, Patches, Reason, RegisteredSweep, Sweep
 
 KEY, PERIOD_NS = 10, 100_000_000
 PLAIN = ProjectSettings(visibility=False)

@@ -11,15 +11,15 @@ import pytest
 from densify.config import FlowSettings, GroundSettings
 from densify.flow.tracking.evidence import FreeSpace, find_candidates
 from densify.flow.tracking.radial import Radial
+from densify.free_space.ground import ground
 from densify.geometry import poses
-from densify.geometry.ground import ground
+from densify.geometry.types import Stretch, Sweep, Trajectory
+from densify.outputs.writers import write_street
 from densify.readers import open_sequence
 from densify.readers.points.fields import find_fields, radial_velocities
 from densify.readers.street import Street
 from densify.registration.deskew import placed, twists
 from densify.scores.radial_velocity import radial_velocity_scores
-from densify.types import Stretch, Sweep, Trajectory
-from densify.writers import write_street
 from tests.scenes import Arc, Scanner, Scene, World, by_flow, car, street
 from tests.small_street import one_car
 

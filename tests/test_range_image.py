@@ -10,10 +10,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from densify.geometry import poses
-from densify.geometry.range_image import RangeImage, ScannerImage
-from densify.kernels import threads
-from densify.types import RegisteredSweep, Sweep
+from densify.free_space.range_image import RangeImage, ScannerImage
+from densify.geometry import poses, threads
+from densify.geometry.types import RegisteredSweep, Sweep
 from tests.scenes import ROOM, Arc, Box, Scanner, Scene, World, on_sphere
 
 MARGIN = (0.4, 0.015)

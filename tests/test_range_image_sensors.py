@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from scipy import ndimage, signal
 
-from densify.geometry import range_image, rings, sensor
-from densify.geometry.range_image import RangeImage
-from densify.geometry.rings import find_rings
-from densify.geometry.sensor import Aimed
+from densify.free_space import range_image, rings, sensor
+from densify.free_space.range_image import RangeImage
+from densify.free_space.rings import find_rings
+from densify.free_space.sensor import Aimed
+from densify.geometry.types import RegisteredSweep, Sweep
 from densify.street.sensors import SENSORS
-from densify.types import RegisteredSweep, Sweep
 from tests.scenes import LIDAR_HEIGHT_M, ROOM, Arc, Box, Scanner, Scene, World, on_sphere
 
 MARGIN = (0.4, 0.015)

@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from densify.free_space.range_image import RangeImage, ScannerImage
 from densify.geometry import poses
-from densify.geometry.range_image import RangeImage, ScannerImage
-from densify.types import RegisteredSweep
+from densify.geometry.types import RegisteredSweep
 from tests.fired import fired
 from tests.scenes import Arc, Box, World, on_sphere
 

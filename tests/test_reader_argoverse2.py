@@ -8,18 +8,18 @@ import shutil
 import numpy as np
 import pytest
 
-from densify.errors import InputError
+from densify.config.errors import InputError
+from densify.free_space.sensor import Sensors
 from densify.geometry.poses import inverse, transform
-from densify.geometry.sensor import Sensors
+from densify.outputs.writers import write_street
+from densify.outputs.writers.argoverse2 import T_EGO_LIDAR
+from densify.outputs.writers.excerpt import Excerpt
 from densify.readers import open_sequence
 from densify.readers.argoverse2 import Argoverse2
 from densify.readers.street import Street
 from densify.readers.window import recorded_trajectory
 from densify.registration.deskew import deskew
 from densify.street.sensors import SENSORS
-from densify.writers import write_street
-from densify.writers.argoverse2 import T_EGO_LIDAR
-from densify.writers.excerpt import Excerpt
 from tests.reader_checks import check_cameras, check_depth, check_sweeps, check_truth
 
 feather = pytest.importorskip("pyarrow.feather")

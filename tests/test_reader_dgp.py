@@ -12,13 +12,13 @@ import cv2
 import numpy as np
 import pytest
 
-from densify.errors import InputError
+from densify.config.errors import InputError
 from densify.geometry.poses import inverse
+from densify.outputs.writers import write_street
+from densify.outputs.writers.excerpt import Excerpt
 from densify.readers import open_sequence
 from densify.readers.dgp import Dgp
 from densify.readers.street import Street
-from densify.writers import write_street
-from densify.writers.excerpt import Excerpt
 from tests.reader_checks import check_cameras, check_depth, check_truth
 
 FRAMES, CAMERA = (59, 60, 61), "image_02"

@@ -14,17 +14,17 @@ import pytest
 import yaml
 from scipy.spatial.transform import Rotation
 
-from densify.errors import InputError
+from densify.config.errors import InputError
 from densify.geometry.poses import inverse, transform
+from densify.outputs.writers import write_street
+from densify.outputs.writers.excerpt import Excerpt
+from densify.outputs.writers.folder import config_text
 from densify.readers import open_sequence
 from densify.readers.describe import describe
 from densify.readers.folder.config import FolderConfig
 from densify.readers.folder.draft import draft_config
 from densify.readers.folder.reader import Folder
 from densify.readers.street import Street
-from densify.writers import write_street
-from densify.writers.excerpt import Excerpt
-from densify.writers.folder import config_text
 from tests.reader_checks import check_cameras, check_depth, check_sweeps, check_truth
 from tests.test_point_files import write_pcd
 

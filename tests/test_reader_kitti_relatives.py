@@ -10,16 +10,16 @@ import cv2
 import numpy as np
 import pytest
 
-from densify.errors import InputError
+from densify.config.errors import InputError
 from densify.geometry import cameras
 from densify.geometry.poses import inverse
+from densify.outputs.writers import write_street
+from densify.outputs.writers.excerpt import Excerpt
 from densify.readers import open_sequence
 from densify.readers.kitti.kitti_360 import Kitti360
 from densify.readers.kitti.odometry import KittiOdometry
 from densify.readers.kitti.tracking import KittiTracking
 from densify.readers.street import Street
-from densify.writers import write_street
-from densify.writers.excerpt import Excerpt
 from tests.reader_checks import check_cameras, check_depth, check_sweeps, check_truth
 
 FRAMES, CAMERA = (59, 60, 61), "image_02"

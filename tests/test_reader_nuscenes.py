@@ -10,15 +10,15 @@ import tracemalloc
 import numpy as np
 import pytest
 
-from densify.errors import InputError
+from densify.config.errors import InputError
 from densify.geometry.poses import inverse
+from densify.outputs.writers import write_street
+from densify.outputs.writers.excerpt import Excerpt
+from densify.outputs.writers.nuscenes import T_LIDAR_POINTS, last_column_ns
 from densify.readers import open_sequence
 from densify.readers.nuscenes.reader import NuScenes
 from densify.readers.nuscenes.tables import find_records
 from densify.readers.street import Street
-from densify.writers import write_street
-from densify.writers.excerpt import Excerpt
-from densify.writers.nuscenes import T_LIDAR_POINTS, last_column_ns
 from tests.reader_checks import check_cameras, check_depth, check_truth
 
 FRAMES, CAMERA = (119, 120, 121), "image_02"

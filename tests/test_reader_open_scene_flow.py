@@ -9,17 +9,17 @@ import numpy as np
 import pytest
 
 import densify
-from densify.errors import InputError
+from densify.config.errors import InputError
 from densify.geometry.poses import transform
+from densify.geometry.types import Trajectory
 from densify.outputs.flow_h5 import write_flow_h5
+from densify.outputs.writers import write_street
+from densify.outputs.writers.excerpt import Excerpt
 from densify.readers import open_sequence
 from densify.readers.open_scene_flow.labels import FlowLabels
 from densify.readers.open_scene_flow.reader import OpenSceneFlow, SweepFile
 from densify.readers.street import Street
 from densify.registration.deskew import deskew
-from densify.types import Trajectory
-from densify.writers import write_street
-from densify.writers.excerpt import Excerpt
 from tests.reader_checks import check_sweeps, check_truth
 from tests.scenes import by_flow
 from tests.small_street import KEY, one_car

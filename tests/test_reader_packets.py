@@ -10,8 +10,8 @@ import sys
 import numpy as np
 import pytest
 
-from densify.errors import InputError
-from densify.geometry.rings import find_rings
+from densify.config.errors import InputError
+from densify.free_space.rings import find_rings
 from densify.readers import open_sequence
 from densify.readers.ouster import Ouster
 from densify.readers.velodyne import MODELS, Velodyne

@@ -12,15 +12,15 @@ import shutil
 import numpy as np
 import pytest
 
-from densify.errors import InputError
+from densify.config.errors import InputError
+from densify.free_space.rings import find_rings
 from densify.geometry.poses import inverse, transform
-from densify.geometry.rings import find_rings
+from densify.outputs.writers import write_street
+from densify.outputs.writers.excerpt import Excerpt
 from densify.readers import open_sequence
 from densify.readers.pandaset.pickled_frame import read_columns
 from densify.readers.pandaset.reader import PANDAR_GT_M, T_POSE_LIDAR, PandaSet
 from densify.readers.street import Street
-from densify.writers import write_street
-from densify.writers.excerpt import Excerpt
 from tests.reader_checks import check_cameras, check_depth, check_sweeps, check_truth
 
 FRAMES, CAMERA = (59, 60, 61), "image_03"

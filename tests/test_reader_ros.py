@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from densify.errors import InputError
+from densify.config.errors import InputError
 from densify.geometry.poses import inverse, transform
+from densify.outputs.writers import write_street
+from densify.outputs.writers.excerpt import Excerpt
 from densify.readers import open_sequence
 from densify.readers.ros.reader import RosBag
 from densify.readers.street import Street
-from densify.writers import write_street
-from densify.writers.excerpt import Excerpt
 from tests.reader_checks import check_cameras, check_depth, check_sweeps, check_truth
 from tests.ros_bags import PERIOD_NS, STAMP_NS, Maker, scan
 

@@ -14,14 +14,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from densify.errors import InputError
+from densify.config.errors import InputError
 from densify.geometry.cameras import image_points
 from densify.geometry.poses import inverse
 from densify.outputs.png import encode_png
+from densify.outputs.writers.excerpt import Excerpt
 from densify.readers import open_sequence
 from densify.readers.street import Street
 from densify.readers.tri3d import Tri3d
-from densify.writers.excerpt import Excerpt
 from tests.scenes import by_flow
 from tests.small_street import POSES_GIVEN
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from densify.errors import InputError
+from densify.config.errors import InputError
 from densify.geometry.poses import transform
 from densify.readers import open_sequence
 from densify.readers.nuscenes.truckscenes import TruckScenes

@@ -10,15 +10,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from densify.errors import InputError
+from densify.config.errors import InputError
 from densify.geometry.poses import inverse, transform
+from densify.outputs.writers import write_street
+from densify.outputs.writers.excerpt import Excerpt
+from densify.outputs.writers.waymo import T_EGO_LIDAR, _pixels
 from densify.readers import open_sequence
 from densify.readers.describe import describe
 from densify.readers.street import Street
 from densify.readers.waymo.reader import Waymo
-from densify.writers import write_street
-from densify.writers.excerpt import Excerpt
-from densify.writers.waymo import T_EGO_LIDAR, _pixels
 from tests.reader_checks import check_truth, depth_score, street_score
 
 parquet = pytest.importorskip("pyarrow.parquet")

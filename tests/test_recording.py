@@ -12,19 +12,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from densify import pipeline
-from densify.cache import Cache
 from densify.config import Config, resolve
-from densify.errors import InputError, SweepError
+from densify.config.cache import Cache
+from densify.config.errors import InputError, SweepError
+from densify.free_space.range_image import RangeImage
 from densify.geometry import poses
-from densify.geometry.range_image import RangeImage
+from densify.geometry.types import Stretch, Sweep
+from densify.pipeline import block_steps, blocks, places
+from densify.pipeline import run as pipeline
+from densify.pipeline.recording import Recording
 from densify.readers.street import Street
 from densify.readers.window import read_sweep
-from densify.recording import Recording, blocks, places
-from densify.recording import steps as block_steps
 from densify.registration.deskew import deskew
 from densify.registration.trajectory import find_trajectory
-from densify.types import Stretch, Sweep
 from tests.dataset_scenes import BORDER, across_border
 from tests.scenes import SWEEP_S, Arc, Scanner, Scene, TinySequence, World, by_flow, car, street
 from tests.small_street import POSES_GIVEN

@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 
 from densify.config import RegisterSettings
-from densify.errors import ComputationError, InputError, SweepError
+from densify.config.errors import ComputationError, InputError, SweepError
 from densify.geometry import poses
+from densify.geometry.types import Sweep, Trajectory
 from densify.readers.street import Street
 from densify.readers.window import read_sweep, recorded_trajectory
 from densify.registration import odometry, trajectory
@@ -21,7 +22,6 @@ from densify.registration.deskew import deskew
 from densify.registration.doppler import measured_velocity
 from densify.registration.odometry import check_overlap, check_plausible, register
 from densify.registration.surfaces import refine, register_on_surfaces
-from densify.types import Sweep, Trajectory
 from tests.scenes import SWEEP_S, Arc, Box, Scanner, Scene, World, street
 
 SETTINGS = RegisterSettings()
@@ -356,7 +356,7 @@ def test_sweeps_of_equal_or_no_stamps_do_not_abort(drive, tmp_path):
 import numpy as np
 from densify.config import RegisterSettings
 from densify.registration.odometry import register
-from densify.types import Sweep, Sweep
+from densify.geometry.types import Sweep, Sweep
 p = np.load({str(tmp_path / "sweep.npz")!r})["points"]
 n = len(p)
 def sweep(frame, offset_ns):

@@ -14,17 +14,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from densify.errors import InputError
+from densify.config.errors import InputError
+from densify.dataset.report import write_report
 from densify.outputs import StoredCloud, read_cloud
 from densify.outputs.depth_png import read_stored
 from densify.outputs.png import encode_png
-from densify.report import key_page, write_report
-from densify.report.camera_maps import packed_camera
-from densify.report.cloud_points import packed_cloud
-from densify.report.key_files import KeyFiles
-from densify.report.pack import Blobs, smallest
-from densify.report.page_file import page_file
-from densify.report.thinning import in_space_order, thinned
+from densify.outputs.report import key_page
+from densify.outputs.report.camera_maps import packed_camera
+from densify.outputs.report.cloud_points import packed_cloud
+from densify.outputs.report.key_files import KeyFiles
+from densify.outputs.report.pack import Blobs, smallest
+from densify.outputs.report.page_file import page_file
+from densify.outputs.report.thinning import in_space_order, thinned
 from tests.command import refused
 from tests.report_runs import write_compared, write_run
 
@@ -221,8 +222,8 @@ class TestPage:
         assert abs(speed - 8) < 0.3
 
     def test_too_large_maps_lose_pixels_and_points(self, run: Path, monkeypatch) -> None:
-        monkeypatch.setattr("densify.report.key_page._MOST_FOR_MAPS", 30_000)
-        monkeypatch.setattr("densify.report.key_page.MOST_BYTES", 460_000)
+        monkeypatch.setattr("densify.outputs.report.key_page._MOST_FOR_MAPS", 30_000)
+        monkeypatch.setattr("densify.outputs.report.key_page.MOST_BYTES", 460_000)
         page = key_page.key_page(KeyFiles.of_run(run), "x")
         camera = data_of(page)["cameras"]["front"]
         assert camera["every"] > 1 and len(page) < 460_000

@@ -17,13 +17,13 @@ import cv2
 import numpy as np
 import pytest
 
+from densify.config.errors import InputError
 from densify.dataset.manifest import KeyRecord, read_manifests
-from densify.errors import InputError
+from densify.dataset.report import write_report
 from densify.outputs import write_depth_png
 from densify.outputs.atomic import FileRecord
-from densify.report import write_report
-from densify.report.pack import Blobs
-from densify.report.thumbnails import HEIGHT_PX, WIDTH_PX, sheets
+from densify.outputs.report.pack import Blobs
+from densify.outputs.report.thumbnails import HEIGHT_PX, WIDTH_PX, sheets
 from tests.browser import Opened, chromium
 from tests.command import refused
 from tests.report_runs import FOLDER, write_run

@@ -10,12 +10,12 @@ import pytest
 from scipy import ndimage
 
 from densify.config import ProjectSettings
+from densify.depth import voting
 from densify.depth.layers import Layers
+from densify.depth.marching import DIRECTIONS, first_known
 from densify.depth.picture import lab, laid_over
 from densify.depth.rims import decide, shares
 from densify.depth.votes import RULES, Canvass, elected
-from densify.kernels import voting
-from densify.kernels.marching import DIRECTIONS, first_known
 from tests.scenes import by_flow
 from tests.small_street import KEY, POSES_GIVEN, one_car
 

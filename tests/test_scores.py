@@ -9,9 +9,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from densify.geometry.range_image import RangeImage
+from densify.free_space.range_image import RangeImage
+from densify.geometry.types import Cloud, RegisteredSweep, Sweep
 from densify.scores.ghosts import ghost_rate, ghost_scores
-from densify.types import Cloud, RegisteredSweep, Sweep
 
 KEY = 7
 

@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from densify.errors import InputError
-from densify.geometry.range_image import RangeImage
-from densify.geometry.sensor import SensorModel, Sensors, aimed
+from densify.config.errors import InputError
+from densify.free_space.range_image import RangeImage
+from densify.free_space.sensor import SensorModel, Sensors, aimed
+from densify.geometry.types import RegisteredSweep, Sweep
 from densify.readers.file_sequence import scanner_axes
 from densify.street.patterns import Spinning
 from densify.street.sensors import SENSORS
-from densify.types import RegisteredSweep, Sweep
 from tests.fired import fired
 from tests.scenes import on_sphere
 

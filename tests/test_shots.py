@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from densify.config import ProjectSettings
+from densify.config.errors import InputError
 from densify.depth.exposure import Exposure, key_shots, load_images
-from densify.errors import InputError
 from densify.geometry import poses
 from densify.geometry.cameras import image_points
-from densify.pipeline import compare, run
+from densify.pipeline.run import compare, run
 from densify.readers.street import Street
 from tests.scenes import CAMERA, SWEEP_S, TinySequence, by_flow, stamp_ns
 from tests.small_street import KEY, POSES_GIVEN, one_car

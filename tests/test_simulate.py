@@ -8,13 +8,13 @@ import shutil
 import numpy as np
 import pytest
 
-from densify.errors import InputError
+from densify.config.errors import InputError
 from densify.geometry.poses import inverse
+from densify.outputs.writers import FORMATS, write_street
 from densify.readers.kitti.raw import KittiRaw
 from densify.readers.street import Street
 from densify.readers.truth_files import FileTruth, write_bodies, write_points
 from densify.street.bodies import Bodies
-from densify.writers import FORMATS, write_street
 from tests.command import exit_code
 
 FRAMES = [58, 60]

@@ -11,7 +11,7 @@ import pytest
 from densify.flow.surface_matching import apply
 from densify.flow.tracking import slides
 from densify.flow.tracking.sightings import Sighting, Track
-from densify.types import Float
+from densify.geometry.types import Float
 
 SPEED_M_S = 10.0
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from densify.errors import InputError
+from densify.config.errors import InputError
 from densify.flow.objective.solvers import SolverSettings, solve
 from densify.flow.tracking import soften as module
 from densify.flow.tracking.soften import Part, Softened, soften

@@ -10,9 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.sparse import csr_array
 
-from densify.flow.objective import graph
+from densify.flow.objective import graph, sparse
 from densify.flow.objective.solvers import _conjugate_gradients
-from densify.kernels import sparse
 
 
 @given(n=st.integers(1, 40), k=st.integers(1, 12), seed=st.integers(0, 99))

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 import densify
+from densify.config.errors import InputError
 from densify.dataset.plan import Recipe, plan, read_plan
-from densify.errors import InputError
 from densify.readers import Spec
 from tests.command import exit_code
 from tests.dataset_scenes import DRIVE, FRAMES, maps_in, statuses

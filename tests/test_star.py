@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 
 from densify.config import ProjectSettings
+from densify.depth import stars
 from densify.depth.layers import Layers
+from densify.depth.marching import DIRECTIONS, first_known
 from densify.depth.star import fill_stars
-from densify.kernels import stars, threads
-from densify.kernels.marching import DIRECTIONS, first_known
+from densify.geometry import threads
 
 SHAPE = (60, 80)
 SETTINGS = ProjectSettings(star_reach=4)

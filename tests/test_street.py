@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from densify.errors import InputError
+from densify.config.errors import InputError
 from densify.geometry.poses import inverse, transform
 from densify.readers.street import Street
 from densify.street.actors import TRAILER_WHEELBASE_M

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from densify.geometry.poses import inverse, transform
+from densify.outputs.writers import write_street
 from densify.readers.describe import describe
 from densify.readers.kitti.raw import KittiRaw
 from densify.readers.street import Street
@@ -21,7 +22,6 @@ from densify.street.sensors import SENSORS, firings
 from densify.street.simulator import Simulator
 from densify.street.terrain import Ground, Terrain
 from densify.street.world import Body, World
-from densify.writers import write_street
 
 PERIOD_NS = 100_000_000
 ROOM_M = 15.0

@@ -10,14 +10,14 @@ import pytest
 import yaml
 from scipy.optimize import minimize
 
-from densify import pipeline
 from densify.geometry import poses
+from densify.geometry.types import Sweep
 from densify.outputs import write_result
-from densify.recording import road
+from densify.pipeline import road
+from densify.pipeline import run as pipeline
 from densify.registration import submaps
 from densify.registration.alignment import Lay, subsample
 from densify.registration.submaps import num_in_submap, relax
-from densify.types import Sweep
 from tests.scenes import Arc, Scanner, Scene, TinySequence, World, street
 
 NUM, KNOWN = 14, np.arange(14) < 4

@@ -9,7 +9,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from densify.clock import Clock
 from densify.config import GroundSettings
 from densify.flow.tracking import proof, tracks
 from densify.flow.tracking.evidence import FreeSpace, Standing, find_candidates
@@ -17,8 +16,9 @@ from densify.flow.tracking.left_places import LeftPlaces, Places, left_places
 from densify.flow.tracking.shapes import Body, Shape
 from densify.flow.tracking.sightings import Sighting, Track
 from densify.flow.tracking.starts import groups_to_start, is_part, velocities_of_traffic
-from densify.geometry.ground import ground
-from densify.geometry.height_map import HeightMap
+from densify.free_space.ground import ground
+from densify.free_space.height_map import HeightMap
+from densify.geometry.clock import Clock
 from tests.scenes import SWEEP_S, Arc, Box, Scanner, Scene, World, car, street
 
 PERIOD_NS = 100_000_000

@@ -10,11 +10,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from densify.config import GroundSettings
+from densify.free_space.ground import ground
 from densify.geometry import poses
-from densify.geometry.ground import ground
+from densify.geometry.types import Sweep
 from densify.registration.deskew import deskew
 from densify.registration.upright import ground_aside, upright
-from densify.types import Sweep
 from tests.scenes import ROOM, Arc, Scanner, Scene, World, on_sphere, street
 
 STREET = World(street(60.0))

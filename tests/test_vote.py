@@ -6,9 +6,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from densify.clock import Clock
 from densify.flow.tracking.vote import DistanceField, Group, vote
-from densify.types import Float
+from densify.geometry.clock import Clock
+from densify.geometry.types import Float
 
 
 def _nearness(field: DistanceField, group: Group, velocities: Float) -> Float:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from densify.config import RegisterSettings
-from densify.errors import InputError
+from densify.config.errors import InputError
 from densify.readers.timeline import Timeline
 from densify.readers.window import choose_cameras, read_sweep, recorded_trajectory
 from tests.scenes import CAMERA, TinySequence, stamp_ns

@@ -24,10 +24,10 @@ import pytest
 import worker_tasks
 
 import densify
+from densify.config.errors import ComputationError, InputError
 from densify.dataset import calls, cluster, processes
 from densify.dataset.tasks import Outcome, Task, Workers, run_tasks
 from densify.dataset.workers import open_workers
-from densify.errors import ComputationError, InputError
 
 PATIENCE_S = 60  # before a test that hangs fails
 

@@ -7,7 +7,7 @@ from dataclasses import fields
 
 import numpy as np
 
-from densify.types import Cloud
+from densify.geometry.types import Cloud
 from tests.scenes import Arc, Scanner, Scene, TinySequence, World, car, street
 
 KEY, WINDOW = 8, 3

@@ -16,9 +16,9 @@ from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import splu
 from scipy.spatial import cKDTree
 
-from densify.errors import InputError
-from densify.kernels.linking import link
-from densify.types import Float, Int
+from densify.config.errors import InputError
+from densify.geometry.linking import link
+from densify.geometry.types import Float, Int
 
 _LINK_M = 0.6
 _FASTEST_M_S = 36.0

@@ -11,15 +11,15 @@ import numpy as np
 
 from densify.bench.depth import exact_truth
 from densify.config import Config
+from densify.config.errors import InputError
 from densify.depth import confidence as scale
 from densify.depth.exposure import key_shots, load_images
 from densify.depth.views import HeldOut, Views
-from densify.errors import InputError
-from densify.geometry.range_image import RangeImage
+from densify.free_space.range_image import RangeImage
+from densify.geometry.types import DepthMap, Float, Float32, Int, LidarSequence, Progress
+from densify.pipeline.recording import Recording
 from densify.readers.window import choose_cameras
-from densify.recording import Recording
 from densify.scores.depth_metrics import is_outlier_depth
-from densify.types import DepthMap, Float, Float32, Int, LidarSequence, Progress
 
 FITTED = (
     ("street?seed=51", (60,)),
@@ -91,7 +91,7 @@ def bench_confidence(
 ) -> dict[str, Any]:
     """Fit the tables to maps of ``fitted``, recordings with the keys to make, and see how far they
     hold on those of ``checked``; with nothing ``fitted``, how far the package's own tables do. The
-    rest as `densify.pipeline.run`.
+    rest as `densify.pipeline.run.run`.
 
     Returns plain numbers: ``maps`` that were fitted on, ``tables``: by group and cause the rank and
     the share that is wrong, and ``reliability`` by recording and truth, where ``fitted`` is all

@@ -15,20 +15,20 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from densify import pipeline
-from densify.cache import Cache
 from densify.config import Config
+from densify.config.cache import Cache
+from densify.config.errors import InputError
 from densify.depth.confidence import reliability
 from densify.depth.exposure import Exposure, key_shots
-from densify.errors import InputError
 from densify.geometry import poses
 from densify.geometry.cameras import converted, depth_along, rays
-from densify.methods import METHODS, looks_around
-from densify.process.costs import Watch
+from densify.geometry.types import Bool, Camera, Float32, LidarSequence, Progress, Result, Sweep
+from densify.pipeline import run as pipeline
+from densify.pipeline.costs import Watch
+from densify.pipeline.methods import METHODS, looks_around
+from densify.pipeline.recording import Recording
 from densify.readers.window import choose_cameras
-from densify.recording import Recording
 from densify.scores.depth_metrics import image_density, is_outlier_depth
-from densify.types import Bool, Camera, Float32, LidarSequence, Progress, Result, Sweep
 
 PRODUCTS = ("measured", "filled")
 _REACH_M = 80.0
@@ -63,7 +63,7 @@ def bench_depth(
     """Make the keys with each variant and score the pixels of all keys and cameras together.
 
     variants: configurations by name. scanner: number of the one whose returns are the truth. The
-    rest as `densify.pipeline.run`.
+    rest as `densify.pipeline.run.run`.
 
     Returns plain numbers: by variant ``density`` (mean share of the image) of each product,
     ``seconds`` a key of the stages that make the maps, and ``scores`` by truth, product and part

@@ -9,7 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from densify.errors import InputError
+from densify.config.errors import InputError
+from densify.geometry.types import Bool, Float32, Progress
 from densify.outputs.depth_png import read_depth_png, read_mask_png
 from densify.readers.depth_trees import DepthPair, DepthPairs
 from densify.scores.depth_metrics import (
@@ -19,7 +20,6 @@ from densify.scores.depth_metrics import (
     image_density,
     mean_errors,
 )
-from densify.types import Bool, Float32, Progress
 
 SCHEMA_VERSION = 1
 """Version of `evaluate`'s dictionary; grows when a key changes its meaning or goes."""

@@ -15,19 +15,19 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from densify.config import Config
+from densify.config.errors import InputError
 from densify.doctor import Verdict, examine
 from densify.doctor.paths import scaled, with_rotation
-from densify.errors import InputError
 from densify.geometry import poses
+from densify.geometry.types import Camera, Float, LidarSequence, Sweep
 from densify.registration.deskew import deskew
 from densify.registration.trajectory import find_trajectory
-from densify.types import Camera, Float, LidarSequence, Sweep
 
 _BODY_CAM = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 
 
 class Faulty:
-    """A recording with one mistake: members as in `densify.types.LidarSequence`, each passed
+    """A recording with one mistake: members as in `LidarSequence`, each passed
     through a change if one is given."""
 
     def __init__(

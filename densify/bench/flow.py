@@ -34,10 +34,10 @@ from densify.bench.pairs import NUM_NEIGHBORS, Pair, Trace, flow_of_pair, pairs_
 from densify.bench.scoring import Scorer
 from densify.bench.windows import Window, our_motion
 from densify.config import Config
-from densify.errors import InputError
+from densify.config.errors import InputError
 from densify.flow.chained import ChainedMotion
 from densify.flow.objective.solvers import solve
-from densify.types import FlowField, LidarSequence, Motion, Progress
+from densify.geometry.types import FlowField, LidarSequence, Motion, Progress
 
 OURS, OURS_PAIR, PAPER, ADAM = "ours", "ours-pair", "paper", "paper-adam"
 METHODS = {

@@ -16,11 +16,11 @@ from densify.config import resolve
 from densify.depth.exposure import key_shots, load_images
 from densify.depth.picture import lab
 from densify.depth.views import HeldOut, SeenCloud, Views
-from densify.geometry.range_image import RangeImage
+from densify.free_space.range_image import RangeImage
+from densify.geometry.types import DepthMap, Float32, LidarSequence
+from densify.pipeline.recording import Recording
 from densify.readers.window import choose_cameras
-from densify.recording import Recording
 from densify.scores.depth_metrics import is_outlier_depth
-from densify.types import DepthMap, Float32, LidarSequence
 
 Image = NDArray[np.uint8]
 

@@ -8,7 +8,7 @@ import gc
 from pathlib import Path
 from typing import NamedTuple
 
-from densify.process.costs import status_mb
+from densify.pipeline.costs import status_mb
 
 _CLEAR_REFS = Path("/proc/self/clear_refs")
 _RESET_PEAK = "5"  # proc(5): sets the peak resident set size to the current one

@@ -14,11 +14,11 @@ from scipy.spatial import cKDTree
 from densify.bench.baselines import cluster_icp, nonrigid_icp
 from densify.bench.windows import Window
 from densify.config import Config
-from densify.errors import InputError
+from densify.config.errors import InputError
 from densify.flow.objective.graph import knn_graph, laplacian
 from densify.flow.objective.solvers import SolverSettings, solve
 from densify.flow.pairs.estimate import estimate_flow
-from densify.types import Bool, Float, FlowField, Int, RegisteredSweep
+from densify.geometry.types import Bool, Float, FlowField, Int, RegisteredSweep
 
 NUM_NEIGHBORS = 50
 """k of the paper's graph; no pair is smaller."""

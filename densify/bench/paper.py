@@ -24,13 +24,13 @@ import numpy as np
 from densify.bench.baselines import nonrigid_icp, rigid_icp
 from densify.bench.paper_pairs import FARTHEST_M, PaperPair
 from densify.config import Config
-from densify.errors import InputError
+from densify.config.errors import InputError
 from densify.flow.objective.solvers import SolverSettings, solve
 from densify.flow.pairs.estimate import estimate_flow
+from densify.geometry.types import Float, Int, Progress
 from densify.learning.losses.pointpwc import without_learning
 from densify.learning.model_file import read_model
 from densify.scores import flow_metrics as metrics
-from densify.types import Float, Int, Progress
 
 NUM_POINTS = 2048
 NEIGHBORS = (5, 10, 20, 50, 100)

@@ -18,17 +18,17 @@ from pathlib import Path
 import numpy as np
 
 from densify.config import Config, resolve
-from densify.errors import InputError
-from densify.files.arrays import read_arrays
+from densify.config.errors import InputError
+from densify.free_space.ground import ground
 from densify.geometry import poses
-from densify.geometry.ground import ground
+from densify.geometry.types import Bool, Float, Stretch
 from densify.learning.clips import make_clip
 from densify.learning.clouds import AboveGround, Sweeps
 from densify.learning.labels import Label, label_sweeps
 from densify.learning.samples import sample_of
 from densify.readers import open_sequence
+from densify.readers.array_files import read_arrays
 from densify.readers.kitti import scene_flow
-from densify.types import Bool, Float, Stretch
 
 FARTHEST_M = 35.0
 _MOST_SWEEPS = 5

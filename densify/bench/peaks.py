@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Peak memory of runs, each in a process of its own, beside what `densify.process.memory` says
+"""Peak memory of runs, each in a process of its own, beside what `densify.pipeline.memory` says
 before."""
 
 from __future__ import annotations
@@ -14,14 +14,14 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from densify import pipeline
 from densify.config import Config, as_mapping, resolve
-from densify.errors import ComputationError
+from densify.config.errors import ComputationError
+from densify.geometry.types import LidarSequence, MakesFrames
 from densify.outputs import write_result
-from densify.process import memory
-from densify.process.costs import peak_memory_mb
+from densify.pipeline import memory
+from densify.pipeline import run as pipeline
+from densify.pipeline.costs import peak_memory_mb
 from densify.readers import open_sequence
-from densify.types import LidarSequence, MakesFrames
 
 SENSORS = {16: "vlp16", 32: "hdl32", 64: "hdl64", 128: "vls128"}
 """Rings -> the street's scanner with so many."""

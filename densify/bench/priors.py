@@ -9,12 +9,12 @@ from typing import NamedTuple
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
-from densify import pipeline
 from densify.config import resolve
+from densify.config.errors import InputError
 from densify.depth.prior import complete
-from densify.errors import InputError
+from densify.geometry.types import Float, LidarSequence, Prior
+from densify.pipeline import run as pipeline
 from densify.scores.depth_metrics import DepthErrors, depth_errors
-from densify.types import Float, LidarSequence, Prior
 
 _BLUR_PX, _WANDER_PX = 3.0, 60.0
 _SEED = 0

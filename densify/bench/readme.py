@@ -12,7 +12,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from densify import pipeline
 from densify.bench.depth import bench_depth
 from densify.bench.flow import bench_flow
 from densify.bench.images import FAULTS as WRONG_IMAGES
@@ -21,9 +20,10 @@ from densify.bench.priors import FAULTS, Completed, bench_priors
 from densify.bench.registration import bench_registration
 from densify.bench.two_clouds import bench_two_clouds
 from densify.config import Config, resolve
-from densify.errors import InputError
+from densify.config.errors import InputError
+from densify.geometry.types import Progress
+from densify.pipeline import run as pipeline
 from densify.readers import open_sequence
-from densify.types import Progress
 
 _METHODS = ("none", "icp", "icp-far", "flow")
 

@@ -9,8 +9,8 @@ import numpy as np
 
 from densify.config import resolve
 from densify.geometry import poses
-from densify.recording import Recording
-from densify.types import LidarSequence
+from densify.geometry.types import LidarSequence
+from densify.pipeline.recording import Recording
 
 
 class PoseErrors(NamedTuple):

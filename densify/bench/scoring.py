@@ -13,16 +13,16 @@ import numpy as np
 
 from densify.bench.windows import Window
 from densify.depth.accumulate import accumulate
+from densify.free_space.range_image import RangeImage
 from densify.geometry import poses
-from densify.geometry.range_image import RangeImage
-from densify.kernels.linking import link
+from densify.geometry.linking import link
+from densify.geometry.types import Bool, Float, FlowField, Int, LidarSequence, Truth
 from densify.readers.true_flow import LabelledFlow, labelled_flow
 from densify.scores import flow_metrics as metrics
 from densify.scores.challenge import CLASSES, ChallengeScorer
 from densify.scores.ghosts import ghost_rate
 from densify.scores.radial_velocity import radial_velocity_scores
 from densify.scores.segmentation import SegmentationScorer
-from densify.types import Bool, Float, FlowField, Int, LidarSequence, Truth
 
 _MIN_RETURNS = 30
 _LEAST_MOTION_M = 0.5

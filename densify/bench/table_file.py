@@ -10,9 +10,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from densify.errors import InputError
+from densify import __version__
+from densify.config.errors import InputError
 from densify.outputs.atomic import write_file
-from densify.version import __version__
 
 
 def write_table(path: Path, numbers: Mapping[str, Any]) -> None:

@@ -10,10 +10,10 @@ import numpy as np
 
 from densify.bench.windows import Window
 from densify.config import resolve
-from densify.errors import InputError
+from densify.config.errors import InputError
 from densify.flow.pairs.estimate import estimate_flow
 from densify.geometry import poses
-from densify.types import Bool, Float, LidarSequence, RegisteredSweep, Truth
+from densify.geometry.types import Bool, Float, LidarSequence, RegisteredSweep, Truth
 
 _CONFIG = {"register": {"source": "dataset"}}  # the flow's own errors, not registration's
 _WITHIN_M = 35.0

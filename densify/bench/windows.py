@@ -9,10 +9,10 @@ from dataclasses import dataclass
 from densify.config import Config
 from densify.flow.engines import estimate_motion
 from densify.flow.scene import Scene
+from densify.free_space.ground import ground
 from densify.geometry import poses
-from densify.geometry.ground import ground
-from densify.recording import Recording
-from densify.types import Bool, Float, LidarSequence, Motion, Stretch
+from densify.geometry.types import Bool, Float, LidarSequence, Motion, Stretch
+from densify.pipeline.recording import Recording
 
 
 @dataclass(frozen=True)

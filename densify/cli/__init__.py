@@ -18,8 +18,8 @@ from typing import NoReturn, TextIO
 
 from densify.cli.arguments import parse
 from densify.cli.screen import Screen
-from densify.errors import ComputationError, InputError, brief, is_out_of_memory
-from densify.process.heap import keep_freed_memory
+from densify.config.errors import ComputationError, InputError, brief, is_out_of_memory
+from densify.pipeline.heap import keep_freed_memory
 
 DONE, FAILED, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
 
@@ -52,7 +52,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 advice = "try a smaller --window, fewer --workers or one --camera"
                 return screen.end(FAILED, f"out of memory; {advice}")
             from densify.cli.bugs import kept
-            from densify.plugins.table import owner_of
+            from densify.config.plugins.table import owner_of
 
             blame, log = owner_of(error), kept(error)
             said = f"this is a bug in densify; please report it with the log at {log}"

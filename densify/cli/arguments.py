@@ -9,6 +9,7 @@ import sys
 from collections.abc import Sequence
 from typing import Any, NoReturn
 
+from densify import __version__
 from densify.cli.bench_arguments import add_bench
 from densify.cli.verbs import (
     compare,
@@ -26,8 +27,7 @@ from densify.cli.verbs import (
     train,
     view,
 )
-from densify.errors import brief
-from densify.version import __version__
+from densify.config.errors import brief
 
 _VERBS = (
     run,

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from densify.cli.answer import Answer
 from densify.cli.progress import progress_on_stderr
 from densify.config import as_mapping, resolve
-from densify.errors import InputError
+from densify.config.errors import InputError
 
 if TYPE_CHECKING:
     from densify.bench.paper_pairs import PaperPair

@@ -11,8 +11,8 @@ import time
 import traceback
 from pathlib import Path
 
-from densify.errors import InputError
-from densify.version import __version__
+from densify import __version__
+from densify.config.errors import InputError
 
 
 def kept(error: BaseException) -> Path:
@@ -32,7 +32,7 @@ def kept(error: BaseException) -> Path:
 
 
 def _folder() -> Path | None:
-    from densify.cache.folder import own_folder
+    from densify.config.user_folder import own_folder
 
     try:
         folder = own_folder("bugs")

@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING, Any
 
 from densify.cli.answer import Answer
 from densify.config import Config, presets, resolve
-from densify.errors import InputError
-from densify.plugins.engines import described
+from densify.config.errors import InputError
+from densify.config.plugins.engines import described
 
 if TYPE_CHECKING:
-    from densify.cache import Cache
-    from densify.types import LidarSequence
+    from densify.config.cache import Cache
+    from densify.geometry.types import LidarSequence
 
 _MOST_DIGITS = 18
 _UNITS = ("K", "M", "G", "T")
@@ -196,7 +196,7 @@ def cache_of(options: argparse.Namespace) -> Cache | None:
     """What ``--cache`` keeps."""
     if not options.cache:
         return None
-    from densify.cache import Cache
+    from densify.config.cache import Cache
 
     return Cache(options.cache_size)
 

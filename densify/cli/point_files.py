@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from densify.errors import InputError
+from densify.config.errors import InputError
+from densify.geometry.types import Float, FlowField, Int
 from densify.readers.points.files import read_table
-from densify.types import Float, FlowField, Int
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from densify.dataset.make import Summary
-    from densify.types import Progress
+    from densify.geometry.types import Progress
 
 _LINE_EVERY_S = 30.0
 _TICK_S = 0.5

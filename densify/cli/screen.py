@@ -14,7 +14,7 @@ from types import TracebackType
 from typing import Any
 
 from densify.cli.answer import Answer
-from densify.errors import brief
+from densify.config.errors import brief
 
 _SCHEMA = 1
 """Version of what ``--json`` prints; grows when a key changes its meaning or goes."""

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
-from densify.errors import InputError
+from densify.config.errors import InputError
 
 
 def knob(

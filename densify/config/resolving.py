@@ -10,10 +10,10 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from densify.config.errors import InputError
 from densify.config.knobs import checked
 from densify.config.sections import REPLACED, Config
-from densify.errors import InputError
-from densify.files.texts import parse_yaml, read_yaml
+from densify.config.text_files import parse_yaml, read_yaml
 
 
 def resolve(

@@ -11,9 +11,9 @@ from __future__ import annotations
 import dataclasses
 from dataclasses import dataclass
 
+from densify.config.errors import InputError
 from densify.config.knobs import Section, knob
-from densify.errors import InputError
-from densify.plugins import engines, outputs
+from densify.config.plugins import engines, outputs
 
 _FEW_POINTS_PER_S = 800_000  # 64 rings have 1.2 million, 32 have 700,000
 _AROUND_FEW_S = 0.5

@@ -9,8 +9,8 @@ import pickle
 import queue
 import threading
 
+from densify.config.errors import ComputationError
 from densify.dataset.tasks import Outcome, Task, called, outcome_of, words
-from densify.errors import ComputationError
 
 _log = logging.getLogger("densify")
 

@@ -8,10 +8,10 @@ import math
 from collections.abc import Sequence
 from contextlib import suppress
 
+from densify.config.errors import InputError
 from densify.dataset.plan import PlannedDrive, Recipe
-from densify.errors import InputError
-from densify.kernels.threads import num_threads
-from densify.process.memory import available_bytes, check_free
+from densify.geometry.threads import num_threads
+from densify.pipeline.memory import available_bytes, check_free
 from densify.readers import open_sequence
 
 _log = logging.getLogger("densify")

@@ -15,10 +15,10 @@ from concurrent.futures import CancelledError, Future
 from contextlib import ExitStack, contextmanager
 from typing import Any
 
+from densify.config.errors import ComputationError, InputError
 from densify.dataset.calls import answer, given_up, outcome, packed
 from densify.dataset.processes import interrupts_held
 from densify.dataset.tasks import Outcome, Task, Workers
-from densify.errors import ComputationError, InputError
 
 _log = logging.getLogger("densify")
 

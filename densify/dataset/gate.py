@@ -7,8 +7,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import Any
 
-from densify.errors import InputError
-from densify.types import Result
+from densify.config.errors import InputError
+from densify.geometry.types import Result
 
 
 @dataclass(frozen=True)

@@ -17,8 +17,8 @@ import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+from densify.config.errors import InputError, OutputError
 from densify.dataset.plan import PlannedDrive
-from densify.errors import InputError, OutputError
 from densify.outputs.atomic import make_folder
 from densify.readers import open_sequence
 from densify.readers.kitti.raw import KittiRaw

@@ -17,13 +17,13 @@ import torch
 from numpy.typing import NDArray
 from torch.utils.data import Dataset
 
+from densify.config.errors import InputError
 from densify.dataset.manifest import read_manifests
 from densify.dataset.plan import StoredDrive, read_plan, stored_drives
 from densify.depth.exposure import key_shots
-from densify.errors import InputError
+from densify.geometry.types import Camera, Float, Float32, LidarSequence
 from densify.outputs.depth_png import read_depth_png, read_stored
 from densify.readers import open_sequence
-from densify.types import Camera, Float, Float32, LidarSequence
 
 LAYOUT = "kitti-depth"
 _SPLITS = ("train", "val")

@@ -13,8 +13,9 @@ from pathlib import Path
 from typing import Any
 from uuid import uuid4
 
-from densify.cache import code, steps_folder
 from densify.config import as_mapping
+from densify.config.cache import code, steps_folder
+from densify.config.errors import ComputationError, InputError, OutputError
 from densify.dataset.capacity import BASE_BYTES, num_processes
 from densify.dataset.links import make_links
 from densify.dataset.manifest import (
@@ -37,7 +38,6 @@ from densify.dataset.plan import (
 from densify.dataset.tasks import Outcome, Task, run_tasks
 from densify.dataset.work import Job, tasks
 from densify.dataset.workers import check_workers, open_workers
-from densify.errors import ComputationError, InputError, OutputError
 from densify.flow.engines import check_engine
 from densify.outputs.atomic import clear_leftovers
 from densify.outputs.kitti_tree import write_readme

@@ -21,19 +21,19 @@ from typing import Any
 
 import numpy as np
 
+from densify import __version__
 from densify.config import Config, as_mapping
+from densify.config.errors import InputError, OutputError
+from densify.config.text_files import read_json
 from densify.dataset.gate import Gate
-from densify.errors import InputError, OutputError
-from densify.files.texts import read_json
+from densify.geometry.types import Camera, LidarSequence
 from densify.outputs.atomic import make_folder, write_file
 from densify.outputs.kitti_tree import drive_folder, split_of
+from densify.pipeline.blocks import Cut
 from densify.readers import Spec, open_sequence
 from densify.readers.files import format_frames, runs
 from densify.readers.timeline import Timeline, check_window
 from densify.readers.window import choose_cameras
-from densify.recording.blocks import Cut
-from densify.types import Camera, LidarSequence
-from densify.version import __version__
 
 SCHEMA_VERSION = 1
 LAYOUTS = ("kitti-depth", "densify")

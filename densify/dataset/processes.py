@@ -24,10 +24,10 @@ from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from typing import Any, cast
 
+from densify.config.errors import ComputationError
 from densify.dataset.calls import answer, given_up, outcome, packed
 from densify.dataset.tasks import Outcome, Task, Workers, words
-from densify.errors import ComputationError
-from densify.process.heap import keep_freed_memory
+from densify.pipeline.heap import keep_freed_memory
 
 _log = logging.getLogger("densify")
 

@@ -14,23 +14,23 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 
-from densify import pipeline
-from densify.cache import Cache, code
 from densify.config import as_mapping
+from densify.config.cache import Cache, code
+from densify.config.errors import ComputationError, InputError, OutputError, is_out_of_memory
+from densify.config.plugins.engines import engine
 from densify.dataset.gate import scores_of
 from densify.dataset.manifest import KeyRecord
 from densify.dataset.plan import Recipe, Source
 from densify.dataset.tasks import Task
-from densify.errors import ComputationError, InputError, OutputError, is_out_of_memory
-from densify.methods import METHODS, with_baselines
+from densify.geometry.types import Result
 from densify.outputs.atomic import FileRecord
 from densify.outputs.kitti_tree import write_key
 from densify.outputs.store import write_result
-from densify.plugins.engines import engine
+from densify.pipeline import run as pipeline
+from densify.pipeline.blocks import Cut
+from densify.pipeline.methods import METHODS, with_baselines
+from densify.pipeline.recording import Recording
 from densify.readers import open_sequence
-from densify.recording import Recording
-from densify.recording.blocks import Cut
-from densify.types import Result
 
 _MARGIN = 2
 _NEEDS: dict[str, dict[str, int]] = {
@@ -42,7 +42,7 @@ _NEEDS: dict[str, dict[str, int]] = {
     "far": {"registration": 1},
 }
 """Step of a block -> the steps it is made of, and how many blocks around: none, one on each side,
-or all within the margin. Steps are methods of `densify.recording.steps.BlockSteps`."""
+or all within the margin. Steps are methods of `densify.pipeline.block_steps.BlockSteps`."""
 _log = logging.getLogger("densify")
 
 

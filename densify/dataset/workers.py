@@ -11,10 +11,10 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+from densify.config.errors import InputError
 from densify.dataset.cluster import check_reached, connected
 from densify.dataset.processes import open_processes
 from densify.dataset.tasks import InThisProcess, Workers
-from densify.errors import InputError
 
 
 def check_workers(num_workers: int | None, scheduler: str | None) -> None:

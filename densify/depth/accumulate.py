@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from densify.geometry import poses
-from densify.types import Cloud, FlowField, Int, Stretch
+from densify.geometry.types import Cloud, FlowField, Int, Stretch
 
 _CONFIDENCE_PER_S = 0.7
 _CONFIDENCE_MOVED = 0.8

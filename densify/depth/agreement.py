@@ -6,10 +6,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from densify.depth import agreeing
 from densify.depth.layers import Layers
-from densify.kernels import agreeing
+from densify.geometry.types import Float32
 from densify.scores.depth_metrics import KITTI_BASELINE_M, OUTLIER_FRACTION, OUTLIER_PX
-from densify.types import Float32
 
 _GIVEN = 2.0  # pixels around that are taken to agree: few do not tell
 _MOST = 0.7  # of them; of what more contradicted, half to nine tenths was wrong

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from densify.depth.exposure import InView
-from densify.types import Cloud, DepthMap
+from densify.geometry.types import Cloud, DepthMap
 
 _BEHIND_M = 0.15
 _BEHIND_FRACTION = 0.02

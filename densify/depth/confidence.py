@@ -28,10 +28,10 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.optimize import isotonic_regression
 
+from densify.config.text_files import read_json
 from densify.depth.layers import Layers
-from densify.files.texts import read_json
+from densify.geometry.types import Bool, Camera, DepthMap, Float, Float32, Ranked
 from densify.scores.depth_metrics import is_outlier_depth
-from densify.types import Bool, Camera, DepthMap, Float, Float32, Ranked
 
 DECADES = 5.0
 """Confidence 1 is one wrong pixel in 10^5, each fifth less ten times as many."""

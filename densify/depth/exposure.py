@@ -16,10 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from densify.config import Config, ProjectSettings
-from densify.errors import InputError
+from densify.config.errors import InputError
 from densify.geometry import poses
 from densify.geometry.cameras import NEAREST_M, depth_along, image_points
-from densify.types import (
+from densify.geometry.types import (
     Bool,
     Camera,
     Cloud,

@@ -11,12 +11,12 @@ import numpy as np
 
 from densify.depth.exposure import Exposure, InView
 from densify.depth.patches import tangents
+from densify.free_space.range_image import RangeImage
+from densify.free_space.sensor import Sensors
+from densify.geometry import clouds as kernels
 from densify.geometry import poses
-from densify.geometry.range_image import RangeImage
-from densify.geometry.sensor import Sensors
-from densify.kernels import clouds as kernels
-from densify.kernels.threads import num_threads
-from densify.types import (
+from densify.geometry.threads import num_threads
+from densify.geometry.types import (
     Bool,
     Camera,
     Cloud,

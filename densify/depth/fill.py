@@ -12,10 +12,10 @@ import cv2
 import numpy as np
 
 from densify.config import ProjectSettings
+from densify.depth import filling
 from densify.depth.layers import Layers
 from densify.depth.votes import elected, voters
-from densify.kernels import filling
-from densify.types import Float32
+from densify.geometry.types import Float32
 
 _GROWTH = (1 / 3, 2 / 3, 1.0)  # spacings
 _LEAST_SHARE = 0.9  # of the votes for a pixel that is kept

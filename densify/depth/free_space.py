@@ -20,9 +20,9 @@ from densify.config import ProjectSettings
 from densify.depth.exposure import Exposure, InView
 from densify.depth.layers import Layers
 from densify.depth.picture import blurred
+from densify.depth.visibility import NOW_NS
 from densify.geometry import poses
-from densify.kernels.visibility import NOW_NS
-from densify.types import Bool, Cloud, Float, Float32, Reason, Stretch
+from densify.geometry.types import Bool, Cloud, Float, Float32, Reason, Stretch
 
 _NUM_STEPS = 6
 _SAME_M, _SAME_FRACTION = 0.05, 0.01  # from one step to the next: the crossing is found

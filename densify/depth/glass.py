@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from densify.config import ProjectSettings
+from densify.depth.framing import Rules, framed
 from densify.depth.layers import Layers
-from densify.kernels.framing import Rules, framed
-from densify.kernels.marching import DIRECTIONS, first_known
-from densify.types import Bool, Float32, Int
+from densify.depth.marching import DIRECTIONS, first_known
+from densify.geometry.types import Bool, Float32, Int
 
 _CELL_RAD = 1 / 360  # frames are looked for in cells of about that size
 _REACH_RAD = 0.16
@@ -174,7 +174,7 @@ def _planes(
     found: Float32, source: NDArray[np.int64], size: int, shape: tuple[int, ...]
 ) -> tuple[Int, Int, Float32, Float32]:
     """Row, column, depth in m and confidence of the pixels in windows. found: of
-    `densify.kernels.framing.framed`. source: of `_windows`."""
+    `densify.depth.framing.framed`. source: of `_windows`."""
     row, column = np.nonzero(
         source.repeat(size, axis=0).repeat(size, axis=1)[: shape[0], : shape[1]] >= 0
     )

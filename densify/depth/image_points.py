@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from densify.depth.exposure import Exposure, InView
 from densify.geometry.cameras import pixels_per_metre
 from densify.geometry.poses import rotate
-from densify.types import Bool, Cloud, Float, Float32, Int, Patches
+from densify.geometry.types import Bool, Cloud, Float, Float32, Int, Patches
 
 _MAX_TILT = 0.25  # of the inverse depth per pixel; a plane seen edge-on has no slope
 _SAME_AGE_NS = 10_000_000

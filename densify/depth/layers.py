@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from densify.types import Bool, Float32
+from densify.geometry.types import Bool, Float32
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from densify.geometry import poses
-from densify.types import Float, FlowField, ObjectTrack, Stretch
+from densify.geometry.types import Float, FlowField, ObjectTrack, Stretch
 
 _LEAST_POINTS = 10  # of an object in all sweeps
 _LEAST_SEEN = 3  # of it in one sweep: fewer do not tell how it is turned

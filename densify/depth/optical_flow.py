@@ -7,7 +7,7 @@ import numpy as np
 from scipy import ndimage
 
 from densify.depth.exposure import Exposure
-from densify.types import Cloud, DepthMap, Float32, Reason
+from densify.geometry.types import Cloud, DepthMap, Float32, Reason
 
 
 def optical_flow(cloud: Cloud, depth: DepthMap, exposure: Exposure, other: Exposure) -> Float32:

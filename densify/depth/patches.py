@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from densify.config import ProjectSettings
-from densify.geometry.range_image import RangeImage
-from densify.geometry.sensor import Sensors
-from densify.kernels import tangents as kernels
-from densify.types import Bool, Cloud, Float, Float32, Patches
+from densify.depth import tangents as kernels
+from densify.free_space.range_image import RangeImage
+from densify.free_space.sensor import Sensors
+from densify.geometry.types import Bool, Cloud, Float, Float32, Patches
 
 _MIN_FILLED = 6
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from densify.depth.layers import Layers
-from densify.types import Float, Float32, Int
+from densify.geometry.types import Float, Float32, Int
 
 _BLUR_PX = 0.6  # standard deviation; noise and the colour filter's pattern
 _AROUND_PX = 20.0  # standard deviation; over which edges are compared

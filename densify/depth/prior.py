@@ -20,7 +20,7 @@ from scipy import ndimage, optimize, sparse
 from scipy.sparse import linalg
 
 from densify.config import PriorSettings
-from densify.types import Bool, DepthMap, Float, Float32, FullDepth, Int, Prior, PriorFit
+from densify.geometry.types import Bool, DepthMap, Float, Float32, FullDepth, Int, Prior, PriorFit
 
 _FORMS = {"auto": ("depth", "log", "inverse"), "depth": ("depth", "log"), "inverse": ("inverse",)}
 _MIN_FITTED = 100

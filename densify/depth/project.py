@@ -30,7 +30,7 @@ from densify.depth.rims import decide
 from densify.depth.settling import MeasuredPixels, nearest_pixels, visible_pixels
 from densify.depth.spot import measure_spots
 from densify.depth.star import fill_stars
-from densify.types import Bool, Camera, Cloud, DepthMap, Float32, Patches, Ranked, Reason
+from densify.geometry.types import Bool, Camera, Cloud, DepthMap, Float32, Patches, Ranked, Reason
 
 _BLOCK_PX = 16  # over which rays lie about equally dense
 _JUMP = 1.6  # by which rays lie farther apart beyond the last of a scanner's denser rings

@@ -12,7 +12,7 @@ from densify.config import ProjectSettings
 from densify.depth.layers import Layers
 from densify.depth.picture import laid_over
 from densify.depth.votes import Canvass, voters
-from densify.types import Float32, Int
+from densify.geometry.types import Float32, Int
 
 MOST_CONFIDENCE = 0.2
 """A rim has no more, what is no rim no less."""

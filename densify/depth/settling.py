@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from densify.config import ProjectSettings
+from densify.depth import visibility as kernels
 from densify.depth.image_points import PointsInImage
 from densify.depth.rims import MOST_CONFIDENCE
-from densify.kernels import visibility as kernels
-from densify.types import Bool, Camera, Float, Float32, Int, Reason
+from densify.geometry.types import Bool, Camera, Float, Float32, Int, Reason
 
 _NEVER_NS = np.iinfo(np.int64).max
 _MAX_HALF_PX = 24.0  # a point just before the lens must not hide the whole image
@@ -153,7 +153,7 @@ def _found(
     taken: Int | None,
 ) -> tuple[Int, Int, Float32]:
     """The pixels (P,) with points, which point comes first in each (P,), and what
-    `densify.kernels.visibility.settle` finds around it, (7,P). taken: where given, neither these
+    `densify.depth.visibility.settle` finds around it, (7,P). taken: where given, neither these
     nor those with hidden points alone."""
     last = int(points.age_ns.max(initial=0)) + 1
     late = points.age_ns > kernels.NOW_NS

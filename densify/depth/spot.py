@@ -11,9 +11,9 @@ from dataclasses import replace
 import numpy as np
 
 from densify.config import ProjectSettings
+from densify.depth import spots
 from densify.depth.image_points import PointsInImage
 from densify.depth.layers import Layers
-from densify.kernels import spots
 
 _MOST_PX = 4  # of a spot's radius
 

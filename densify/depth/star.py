@@ -9,10 +9,10 @@ import numpy as np
 from scipy import ndimage
 
 from densify.config import ProjectSettings
+from densify.depth import stars
 from densify.depth.fill import voted
 from densify.depth.layers import Layers
-from densify.kernels import stars
-from densify.kernels.marching import DIRECTIONS, first_known
+from densify.depth.marching import DIRECTIONS, first_known
 
 _RULES = stars.Rules(reach=0.0, met=8, gap=7, fraction=0.1, strip_px=6)
 _LEAST_SHARE = 0.8  # of the votes for a pixel that is kept

@@ -20,12 +20,11 @@ from densify.depth.optical_flow import optical_flow
 from densify.depth.patches import Tangents, patches, vetoed
 from densify.depth.picture import lab
 from densify.depth.project import project
+from densify.free_space.range_image import RangeImage
+from densify.free_space.sensor import Sensors
 from densify.geometry import poses
 from densify.geometry.cameras import converted
-from densify.geometry.range_image import RangeImage
-from densify.geometry.sensor import Sensors
-from densify.scores import depth_metrics
-from densify.types import (
+from densify.geometry.types import (
     Bool,
     CameraView,
     Cloud,
@@ -40,6 +39,7 @@ from densify.types import (
     Stretch,
     Truth,
 )
+from densify.scores import depth_metrics
 
 
 class SeenCloud(NamedTuple):

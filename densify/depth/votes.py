@@ -2,7 +2,7 @@
 """Votes of the pixels whose depth is known for the depth that another pixel is thought to have.
 
 Every known pixel that is seen first in one of 16 directions votes, for it as far as its surface
-goes on to there, and against it otherwise (`densify.kernels.voting`): the less the more the
+goes on to there, and against it otherwise (`densify.depth.voting`): the less the more the
 image's colour changes on the way. The idea is that of a bilateral grid or a geodesic matting:
 without an edge of the image between them, two pixels show the same surface.
 """
@@ -11,10 +11,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from densify.depth import voting
 from densify.depth.layers import Layers
-from densify.kernels import voting
-from densify.kernels.marching import DIRECTIONS, first_known
-from densify.types import Bool, Float32, Int
+from densify.depth.marching import DIRECTIONS, first_known
+from densify.geometry.types import Bool, Float32, Int
 
 RULES = voting.Rules(
     reach=6.0,

@@ -15,7 +15,7 @@ from densify.config import Config
 from densify.doctor import cameras, clocks, deskewing, files, paths, points, rings
 from densify.doctor.findings import Finding, Verdict
 from densify.doctor.sample import Sample, Spot
-from densify.types import LidarSequence
+from densify.geometry.types import LidarSequence
 
 __all__ = ["CHECKS", "Diagnosis", "Finding", "Sample", "Spot", "Verdict", "examine"]
 

@@ -16,13 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from densify.config.errors import InputError
 from densify.doctor.findings import Finding, Verdict
 from densify.doctor.sample import Sample, Spot
-from densify.errors import InputError
 from densify.geometry import poses
 from densify.geometry.cameras import image_points
+from densify.geometry.types import Bool, Camera, Float, Float32
 from densify.readers.files import format_frames
-from densify.types import Bool, Camera, Float, Float32
 
 _EDGE_M, _EDGE_SHARE = 0.6, 0.08
 _NEAREST_M, _FARTHEST_M = 3.0, 50.0

@@ -13,7 +13,7 @@ from densify.config import RegisterSettings
 from densify.doctor.findings import Finding, Verdict
 from densify.doctor.sample import Sample, Spot, spot_of
 from densify.geometry import poses
-from densify.types import Float, Sweep
+from densify.geometry.types import Float, Sweep
 
 _LEAST_SPEED_M_S = 3.0
 _NEAR_M = 25.0

@@ -8,12 +8,12 @@ from collections.abc import Callable, Mapping
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from densify.config.errors import InputError
 from densify.doctor.findings import Finding, Verdict
 from densify.doctor.sample import Sample, Spot
-from densify.errors import InputError
 from densify.geometry import poses
+from densify.geometry.types import Float
 from densify.readers.pose_track import PoseTrack
-from densify.types import Float
 
 _LEAST_WAY_M = 1.0
 _OFF_M, _OFF_PER_M, _OFF_DEG = 0.3, 0.1, 2.0  # over a spot of five sweeps

@@ -8,12 +8,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from densify.config.errors import InputError
 from densify.doctor.cameras import image_pairs
 from densify.doctor.sample import Sample, Spot
-from densify.errors import InputError
 from densify.geometry import poses
 from densify.geometry.cameras import image_points
-from densify.types import Camera, Float
+from densify.geometry.types import Camera, Float
 
 Picture = NDArray[np.uint8]
 _SIZE_PX, _REACH_M = 700, 35.0

@@ -10,9 +10,9 @@ import numpy as np
 from densify.config import RegisterSettings
 from densify.doctor.findings import Finding, Verdict
 from densify.doctor.sample import Sample, Spot
-from densify.geometry.sensor import Sensors
+from densify.free_space.sensor import Sensors
+from densify.geometry.types import Float
 from densify.readers.window import in_range
-from densify.types import Float
 
 _MEDIAN_RANGE_M = (1.5, 60.0)
 _UNITS = {"millimetres": 1e-3, "centimetres": 1e-2, "kilometres": 1e3}

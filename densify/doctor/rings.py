@@ -11,7 +11,7 @@ import numpy as np
 from densify.doctor.findings import Finding, Verdict
 from densify.doctor.sample import Sample, Spot
 from densify.geometry import poses
-from densify.types import Float, Sweep
+from densify.geometry.types import Float, Sweep
 
 _NEAR_M, _FAR_M = 3.0, 60.0
 _COMPENSATED_M = 25.0  # nearer returns show a motion within the sweep

@@ -10,12 +10,12 @@ from functools import cached_property
 import numpy as np
 
 from densify.config import RegisterSettings
-from densify.errors import InputError, SweepError
+from densify.config.errors import InputError, SweepError
+from densify.geometry.types import Float, LidarSequence, Stretch, Sweep, Trajectory
 from densify.readers.timeline import Timeline
 from densify.readers.window import in_range
 from densify.registration.deskew import deskew
 from densify.registration.trajectory import find_trajectory
-from densify.types import Float, LidarSequence, Stretch, Sweep, Trajectory
 
 _NUM_SPOTS = 3
 _NUM_SWEEPS = 5  # of a spot

@@ -14,7 +14,7 @@ import numpy as np
 
 from densify.geometry import poses
 from densify.geometry.cameras import image_points
-from densify.types import Bool, Boxes, BoxView, Float, FlowField, Int, RegisteredSweep
+from densify.geometry.types import Bool, Boxes, BoxView, Float, FlowField, Int, RegisteredSweep
 
 MOVES_M_S = 0.5
 """Slower boxes stand still: nobody draws a box to the centimetre (Chodosh et al., WACV 2024)."""

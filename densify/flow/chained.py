@@ -10,14 +10,14 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from densify.geometry import poses
-from densify.types import Float, FlowField, Int, Stretch
+from densify.geometry.types import Float, FlowField, Int, Stretch
 
 _NUM_NEIGHBORS = 3
 
 
 @dataclass(frozen=True)
 class ChainedMotion:
-    """What moves in a stretch by flows between neighbours: a `densify.types.Motion`.
+    """What moves in a stretch by flows between neighbours: a `Motion`.
 
     step: makes the flow of sweep number i to number j = i ± 1; each is asked for once, when needed.
     max_gap_m: a moved point farther than this from all moving points of the next sweep is lost.

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """How everything in a stretch moves: all engines behind one call.
 
-The table of engines, and how to add one, is `densify.plugins.engines`.
+The table of engines, and how to add one, is `densify.config.plugins.engines`.
 """
 
 from __future__ import annotations
@@ -10,16 +10,16 @@ from dataclasses import is_dataclass
 from typing import Protocol, cast, get_type_hints
 
 from densify.config import Config
-from densify.errors import InputError
+from densify.config.errors import InputError
+from densify.config.plugins.engines import ENGINES, engine
 from densify.flow.scene import Scene
-from densify.plugins.engines import ENGINES, engine
-from densify.types import Motion, Stretch
+from densify.geometry.types import Motion, Stretch
 
 
 class SharedMotion(Motion, Protocol):
     """Motion of a long stretch that serves every key in it.
 
-    A dataclass that is kept without points, by the types of its fields (`densify.cache.codec`).
+    A dataclass that is kept without points, by the types of its fields (`config.cache_codec`).
     """
 
     def with_stretch(self, stretch: Stretch) -> SharedMotion:

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from functools import cached_property
 
 from densify.flow.tracking.evidence import Candidates, FreeSpace, find_candidates
-from densify.geometry.height_map import HeightMap
-from densify.types import Stretch
+from densify.free_space.height_map import HeightMap
+from densify.geometry.types import Stretch
 
 
 @dataclass(frozen=True, eq=False)

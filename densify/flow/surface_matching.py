@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from densify.types import Float
+from densify.geometry.types import Float
 
 GATES_M = (0.8, 0.5, 0.3, 0.2, 0.2)  # distances of partners, in turn, twice each
 SURFACE_M = 0.05  # noise of a surface point

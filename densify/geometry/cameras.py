@@ -24,8 +24,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.polynomial import Polynomial
 
-from densify.errors import InputError
-from densify.types import Bool, Camera, Float, Float32
+from densify.config.errors import InputError
+from densify.geometry.types import Bool, Camera, Float, Float32
 
 NEAREST_M = 0.1
 _COEFFICIENTS = {"pinhole": (0, 4, 5, 8, 12, 14), "fisheye": (4,), "mei": (5,)}

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from densify.types.rigid import inverse as inverse
+from densify.geometry.types.rigid import inverse as inverse
 
 if TYPE_CHECKING:
-    from densify.arrays import Float
+    from densify.geometry.arrays import Float
 
 _ROWS = 8192  # at once: for more, OpenBLAS wakes threads that spin longer than the work takes
 

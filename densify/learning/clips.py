@@ -18,17 +18,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from densify.config import Config, resolve
-from densify.errors import ComputationError, InputError
-from densify.files.arrays import read_arrays
+from densify.config.errors import ComputationError, InputError
 from densify.flow.engines import estimate_motion
 from densify.flow.scene import Scene
-from densify.geometry.ground import ground
+from densify.free_space.ground import ground
+from densify.geometry.types import Bool, Float32, LidarSequence, Stretch
 from densify.learning.clouds import AboveGround
 from densify.outputs.atomic import write_file
+from densify.pipeline.recording import Recording
 from densify.readers import open_sequence
+from densify.readers.array_files import read_arrays
 from densify.readers.street import Street
-from densify.recording import Recording
-from densify.types import Bool, Float32, LidarSequence, Stretch
 
 STREETS = "streets"
 """Recording specification: a new street for every clip; a sensor may follow as of ``street``."""

@@ -13,9 +13,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from densify.free_space.height_map import HeightMap
 from densify.geometry import poses
-from densify.geometry.height_map import HeightMap
-from densify.types import Float, Float32, Int, RegisteredSweep
+from densify.geometry.types import Float, Float32, Int, RegisteredSweep
 
 
 class NetworkCloud(NamedTuple):

@@ -21,11 +21,11 @@ from densify.flow.scene import Scene
 from densify.flow.tracking.evidence import Candidates, closer_rings, cluster_around
 from densify.flow.tracking.groups import GroupMotion, motion_of
 from densify.geometry import poses
-from densify.kernels.threads import num_threads
+from densify.geometry.threads import num_threads
+from densify.geometry.types import Float
 from densify.learning.clouds import AboveGround, order_for
 from densify.learning.model_file import read_model
 from densify.learning.threads import one_thread
-from densify.types import Float
 
 MOVES_M_S = 0.5
 """What the network sees move more slowly starts no group (Chodosh et al., WACV 2024)."""

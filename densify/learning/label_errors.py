@@ -8,9 +8,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from densify.geometry.types import Bool, Float, Truth
 from densify.learning.labels import Label
 from densify.scores.flow_metrics import end_point_errors
-from densify.types import Bool, Float, Truth
 
 MOVES_M_S = 1.0
 """Points at that speed or faster count as moving."""

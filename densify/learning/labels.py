@@ -10,15 +10,22 @@ from pathlib import Path
 import numpy as np
 
 from densify.config import Config
-from densify.errors import ComputationError, InputError, OutputError
+from densify.config.errors import ComputationError, InputError, OutputError
+from densify.config.plugins.readers import READERS
 from densify.flow.boxes import BoxMargins, flow_of_boxes
+from densify.free_space.ground import ground
 from densify.geometry import poses
-from densify.geometry.ground import ground
+from densify.geometry.types import (
+    Bool,
+    FlowField,
+    KnowsBoxes,
+    LidarSequence,
+    Progress,
+    RegisteredSweep,
+)
 from densify.outputs.atomic import write_file
 from densify.outputs.flow_npz import flow_npz
-from densify.plugins.readers import READERS
-from densify.recording import Recording
-from densify.types import Bool, FlowField, KnowsBoxes, LidarSequence, Progress, RegisteredSweep
+from densify.pipeline.recording import Recording
 
 
 @dataclass(frozen=True)

@@ -19,14 +19,14 @@ import torch
 from numpy.typing import NDArray
 from torch import nn
 
-from densify.errors import InputError
-from densify.files.arrays import read_arrays
-from densify.files.texts import parse_json
+from densify.config.errors import InputError
+from densify.config.text_files import parse_json
+from densify.geometry.types import Float
 from densify.learning.clouds import Sweeps
 from densify.learning.networks import NETWORKS, build
 from densify.learning.threads import on_one_thread
 from densify.outputs.atomic import write_file
-from densify.types import Float
+from densify.readers.array_files import read_arrays
 
 FORMAT, VERSION = "densify model", 1
 SHIPPED = {"streets": Path(__file__).parent / "streets.model"}

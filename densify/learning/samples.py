@@ -18,10 +18,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from densify.geometry.types import Float32
 from densify.learning.clips import Clip, ClipMaker
 from densify.learning.clouds import NetworkCloud, Sweeps, order_for
 from densify.learning.networks.voxels import REACH_M
-from densify.types import Float32
 
 NUM_DRAWN = 4096
 """Points of source and target that self-supervised losses look at."""

@@ -19,7 +19,7 @@ import torch
 from numpy.typing import NDArray
 from torch import nn
 
-from densify.errors import ComputationError, InputError
+from densify.config.errors import ComputationError, InputError
 from densify.learning.clips import ClipMaker
 from densify.learning.losses import teacher
 from densify.learning.model_file import Model, read_model, write_model

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: MIT
 """The files of a result, each whole or not there. What else is written to disk: the flow between
-two point files (`densify.cli.point_files`), and simulated recordings (`densify.writers`)
+two point files (`densify.cli.point_files`), and simulated recordings (`densify.outputs.writers`)
 with their truth (`densify.readers.truth_files`).
 """
 

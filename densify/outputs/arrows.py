@@ -8,8 +8,8 @@ from collections.abc import Mapping
 import cv2
 import numpy as np
 
+from densify.geometry.types import Float
 from densify.outputs.png import Picture
-from densify.types import Float
 
 HALF_M = 35.0
 """Shown to each side of the origin."""

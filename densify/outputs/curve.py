@@ -15,9 +15,9 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 
+from densify.geometry.types import Float, Result
 from densify.outputs.context import Context
 from densify.outputs.png import Picture, write_picture
-from densify.types import Float, Result
 
 Curve = Sequence[Mapping[str, Any]]
 """`densify.scores.depth_metrics.precision_density`."""

@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from densify.errors import InputError
-from densify.files.images import read_image
+from densify.config.errors import InputError
+from densify.geometry.types import Bool, Float32
 from densify.outputs.atomic import write_file
 from densify.outputs.png import encode_png
-from densify.types import Bool, Float32
+from densify.readers.image_files import read_image
 
 _STEPS_PER_M = 256.0
 _STEPS_OF_CONFIDENCE = 254.0

@@ -12,9 +12,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from densify.geometry.types import Float32, Reason, Result
 from densify.outputs.context import Context
 from densify.outputs.png import Picture, write_picture
-from densify.types import Float32, Reason, Result
 
 # Fixed, so that pictures of different keys compare; logarithmic, as accuracy and density are.
 _NEAR_M, _FAR_M = 3.0, 80.0
@@ -99,7 +99,7 @@ def draw_figure(
 
 
 def draw_rejected(image: Picture, reason: NDArray[np.uint8]) -> Picture:
-    """Draw over an image in gray what was left out, in a colour for each `densify.types.Reason`.
+    """Draw over an image in gray what was left out, in a colour for each `Reason`.
 
     image: (H,W,3) uint8 RGB. reason: (H,W), 0 none. Returns (H',W,3) with the legend below.
     """

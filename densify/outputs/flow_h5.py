@@ -22,9 +22,9 @@ from typing import Any
 import numpy as np
 
 from densify.geometry import poses
+from densify.geometry.types import StretchFlow
 from densify.outputs.atomic import write_file
 from densify.readers.extras import needed
-from densify.types import StretchFlow
 
 
 def write_flow_h5(folder: Path, key: int, flow: StretchFlow) -> None:

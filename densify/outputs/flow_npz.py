@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 
 from densify.geometry import poses
+from densify.geometry.types import FlowField, Result, StretchFlow
 from densify.outputs.atomic import write_file
 from densify.outputs.context import Context
 from densify.outputs.flow_h5 import write_flow_h5
-from densify.types import FlowField, Result, StretchFlow
 
 
 def write_output(result: Result, context: Context, folder: Path) -> None:

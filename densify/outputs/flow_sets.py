@@ -20,12 +20,12 @@ from pathlib import Path
 
 import numpy as np
 
-from densify.errors import InputError, OutputError
+from densify.config.errors import InputError, OutputError
+from densify.geometry.types import KnowsRows, LidarSequence, StretchFlow
 from densify.outputs.atomic import file_aside, write_file
 from densify.outputs.flow_h5 import flow_h5
 from densify.outputs.flow_npz import write_flow_files
 from densify.readers.extras import needed
-from densify.types import KnowsRows, LidarSequence, StretchFlow
 
 FORMATS = ("npz", "av2", "opensceneflow")
 

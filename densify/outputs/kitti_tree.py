@@ -18,12 +18,12 @@ from typing import Any, Literal
 
 import yaml
 
-from densify.errors import OutputError
+from densify import __version__
+from densify.config.errors import OutputError
+from densify.geometry.types import DepthMap
 from densify.outputs.atomic import FileRecord, make_folder, write_file
 from densify.outputs.depth_png import encode_confidence, encode_depth
 from densify.outputs.plain import plain
-from densify.types import DepthMap
-from densify.version import __version__
 
 Split = Literal["train", "val"]
 

@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from densify.geometry.types import Float
 from densify.outputs.png import Picture
-from densify.types import Float
 
 _WIDTH_PX, _HEIGHT_PX = 860, 420
 _LEFT_PX, _RIGHT_PX, _TOP_PX, _BOTTOM_PX = 84, 24, 52, 52

@@ -30,9 +30,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+from densify.geometry.types import Result
 from densify.outputs.context import Context
 from densify.outputs.plain import write_json
-from densify.types import Result
 
 SCHEMA_VERSION = 1
 """Version of metrics.json and compare.json; grows when a key changes its meaning or goes."""

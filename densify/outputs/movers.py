@@ -5,10 +5,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from densify.geometry.types import Result
 from densify.outputs.cloud_laz import write_cloud
 from densify.outputs.context import Context
 from densify.outputs.depth_png import write_depth_png
-from densify.types import Result
 
 
 def write_output(result: Result, context: Context, folder: Path) -> None:

@@ -5,10 +5,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from densify.geometry.types import Result
 from densify.outputs.context import Context
 from densify.outputs.figure import draw_rejected
 from densify.outputs.png import write_picture
-from densify.types import Result
 
 
 def write_output(result: Result, context: Context, folder: Path) -> None:

@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 import yaml
 
+from densify import __version__
+from densify.geometry.types import Result
 from densify.outputs.atomic import write_file
 from densify.outputs.context import Context
 from densify.outputs.plain import plain
-from densify.types import Result
-from densify.version import __version__
 
 _PACKAGES = (
     "numpy",
@@ -57,7 +57,7 @@ def write_output(result: Result, context: Context, folder: Path) -> None:
 
 
 def _far_links(result: Result) -> dict[str, Any]:
-    """A row for each pair of submaps, and the names of its columns (`densify.types.Links`)."""
+    """A row for each pair of submaps, and the names of its columns (`Links`)."""
     links = result.far_links
     names = ("overlap", "rms_m", "num_matches", "correction_m", "correction_deg", "left_m")
     columns = [*links.frames.T, *(np.round(getattr(links, name), 4) for name in names)]

@@ -9,7 +9,7 @@ tools.
     scene/truth/CAMERA.png             true depth where there is some, as in ``depth``
     scene/sweep/CAMERA.png             16 bit: of measured pixels 1 + place of the source sweep in
                                        ``sweeps`` of scene.json; 0 none
-    scene/reason/CAMERA.png            8 bit `densify.types.Reason` why a pixel's nearest point was
+    scene/reason/CAMERA.png            8 bit `Reason` why a pixel's nearest point was
                                        left out (``output.rejected``)
     scene/scene.json                   key, and
       sweeps    of the window and beyond it: frame, since_key_s, far, and of the window's
@@ -26,12 +26,12 @@ from typing import Any
 
 import numpy as np
 
+from densify.geometry.types import Camera, CameraView, Result
 from densify.outputs.atomic import write_file
 from densify.outputs.context import Context
 from densify.outputs.depth_png import write_depth_png
 from densify.outputs.plain import write_json
 from densify.outputs.png import encode_jpeg, encode_png
-from densify.types import Camera, CameraView, Result
 
 SCHEMA_VERSION = 1
 

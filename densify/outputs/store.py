@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: MIT
 """The files of one key, ``OUT/000120/...``: results of ``run`` and tables of ``compare``, whole or
-not at all. What ``run`` writes is the table `densify.plugins.outputs`; each module says what its
+not at all. What ``run`` writes is the table `config.plugins.outputs`; each module says what its
 files hold.
 """
 
@@ -12,7 +12,9 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Literal, Protocol, cast
 
-from densify.errors import InputError, OutputError
+from densify.config.errors import InputError, OutputError
+from densify.config.plugins.outputs import OUTPUTS, Output, chosen
+from densify.geometry.types import Result
 from densify.outputs import cloud_laz, depth_maps, scene, tracks
 from densify.outputs.atomic import staged_folder
 from densify.outputs.context import Context
@@ -21,8 +23,6 @@ from densify.outputs.metrics import SCHEMA_VERSION, scores_of
 from densify.outputs.plain import write_json
 from densify.outputs.png import Picture
 from densify.outputs.run_yaml import stages, versions
-from densify.plugins.outputs import OUTPUTS, Output, chosen
-from densify.types import Result
 
 Verb = Literal["run", "compare"]
 

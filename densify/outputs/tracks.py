@@ -4,7 +4,7 @@
 ::
 
     schema_version, key
-    objects     each a `densify.types.ObjectTrack`:
+    objects     each a `ObjectTrack`:
       instance  as in cloud.laz and movers/
       size_m    length, width, height of the box around its points, in its own frame: x to where it
                 moves at the key's moment, y to its left, z along the key's, origin in the box's
@@ -20,9 +20,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from densify.geometry.types import ObjectTrack, Result
 from densify.outputs.context import Context
 from densify.outputs.plain import write_json
-from densify.types import ObjectTrack, Result
 
 SCHEMA_VERSION = 1
 

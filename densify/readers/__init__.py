@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Opening recordings. The table of readers, and how to add one, is `densify.plugins.readers`."""
+"""Opening recordings. The table of readers, and how to add one, is `config.plugins.readers`."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from itertools import chain
 from pathlib import Path
 from typing import NamedTuple, Protocol, cast
 
-from densify.errors import InputError
-from densify.plugins.readers import READERS, Reader
-from densify.types import LidarSequence
+from densify.config.errors import InputError
+from densify.config.plugins.readers import READERS, Reader
+from densify.geometry.types import LidarSequence
 
 _MOST_PLACES = 200  # are looked at for a recording, where the one named is none itself
 

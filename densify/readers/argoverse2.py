@@ -30,9 +30,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from densify.errors import InputError
-from densify.files.content import read_bytes
+from densify.config.errors import InputError
+from densify.config.file_content import read_bytes
 from densify.geometry.poses import inverse
+from densify.geometry.types import Boxes, Camera, Float
 from densify.readers.arrow_columns import read_feather
 from densify.readers.boxes import checked_boxes
 from densify.readers.file_sequence import (
@@ -45,7 +46,6 @@ from densify.readers.file_sequence import (
 )
 from densify.readers.files import numbered_files
 from densify.readers.pose_track import PoseTrack
-from densify.types import Boxes, Camera, Float
 
 POSES = "city_SE3_egovehicle.feather"
 ANNOTATIONS = "annotations.feather"
@@ -77,7 +77,7 @@ def _logs(path: Path) -> list[Path]:
 
 
 class Argoverse2(FileSequence):
-    """A log as a `densify.types.LidarSequence`; the lidar frame is the vehicle's."""
+    """A log as a `LidarSequence`; the lidar frame is the vehicle's."""
 
     def __init__(self, log: Path) -> None:
         """Reads poses and calibration. Raises InputError if there are no sweeps, or a table is
@@ -151,7 +151,7 @@ class Argoverse2(FileSequence):
         return self._track.at(self._stamps_ns[frame])
 
     def boxes(self, frame: int) -> Boxes | None:
-        """See `densify.types.KnowsBoxes`; the test split has none. Raises InputError for a table
+        """See `KnowsBoxes`; the test split has none. Raises InputError for a table
         that is malformed."""
         table = self._annotations
         if table is None:

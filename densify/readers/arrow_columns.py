@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from densify.errors import InputError
+from densify.config.errors import InputError
 from densify.readers.extras import needed
 
 _EXPECTED = {

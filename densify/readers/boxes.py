@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from densify.errors import InputError
-from densify.types import Boxes, Float, Int
+from densify.config.errors import InputError
+from densify.geometry.types import Boxes, Float, Int
 
 
 def upright_poses(centre_m: Float, heading_rad: Float) -> Float:

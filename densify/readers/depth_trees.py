@@ -20,7 +20,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from densify.errors import InputError
+from densify.config.errors import InputError
 
 _DRIVE = re.compile(r"(?P<drive>\d{4}_\d\d_\d\d_drive_\d{4})(?:_sync|_extract)?")
 _CAMERA = re.compile(r"(?<![^/])(?P<camera>image_\d\d)(?![^/])")

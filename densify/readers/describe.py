@@ -7,10 +7,10 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from densify.errors import InputError
+from densify.config.errors import InputError
+from densify.geometry.types import Int, LidarSequence, SaysWhatItFound, Sweep
 from densify.readers.files import format_frames
 from densify.readers.timeline import Timeline
-from densify.types import Int, LidarSequence, SaysWhatItFound, Sweep
 
 _MOST_NAMED = 3  # sweeps that cannot be used, each with its reason
 

@@ -32,11 +32,12 @@ from typing import Any
 
 import numpy as np
 
-from densify.errors import InputError
-from densify.files.arrays import read_arrays
-from densify.files.content import read_bytes
-from densify.files.texts import read_json
+from densify.config.errors import InputError
+from densify.config.file_content import read_bytes
+from densify.config.text_files import read_json
 from densify.geometry import poses
+from densify.geometry.types import Camera, Float
+from densify.readers.array_files import read_arrays
 from densify.readers.file_sequence import (
     FileSequence,
     Returns,
@@ -44,7 +45,6 @@ from densify.readers.file_sequence import (
     quaternion_pose,
     truth_beside,
 )
-from densify.types import Camera, Float
 
 _BOGUS_YEAR = 2200
 _FIELDS = ("X", "Y", "Z")
@@ -78,7 +78,7 @@ class _Datum:
 
 
 class Dgp(FileSequence):
-    """A scene as a `densify.types.LidarSequence` with poses of its images."""
+    """A scene as a `LidarSequence` with poses of its images."""
 
     def __init__(self, path: Path) -> None:
         """path: the scene's folder. Raises InputError if its description or calibration is missing

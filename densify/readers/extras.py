@@ -6,7 +6,7 @@ from __future__ import annotations
 from importlib import import_module
 from typing import Any
 
-from densify.errors import InputError
+from densify.config.errors import InputError
 
 
 def needed(module: str, extra: str, what: str) -> Any:

@@ -17,9 +17,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from densify.errors import InputError
+from densify.config.errors import InputError
+from densify.geometry.types import Camera, Float, Float32, Int, Sweep, Truth
 from densify.readers.files import camera_named, decoded_image, of_frame
-from densify.types import Camera, Float, Float32, Int, Sweep, Truth
 
 _ORTHONORMAL_TOLERANCE = 1e-3  # text files carry seven digits, float32 files as many
 
@@ -47,7 +47,7 @@ class Returns:
 
 
 class FileSequence(ABC):
-    """A `densify.types.LidarSequence` read from files.
+    """A `LidarSequence` read from files.
 
     name: for people and outputs. where: the recording's place, for messages. frames: numbers of the
     sweeps that exist, ascending. cameras: by name. exposed_ns: of each camera, when its images that
@@ -83,7 +83,7 @@ class FileSequence(ABC):
         """The rows of an existing sweep, and the file for messages."""
 
     def sweep_bytes(self) -> dict[int, int]:
-        """See `densify.types.KnowsFiles`; empty where sweeps share files."""
+        """See `KnowsFiles`; empty where sweeps share files."""
         return {frame: path.stat().st_size for frame, path in self._files.items()}
 
     def _image(self, camera: Camera, number: int) -> NDArray[np.uint8]:
@@ -142,7 +142,7 @@ class FileSequence(ABC):
         )
 
     def num_rows(self, frame: int) -> int:
-        """See `densify.types.KnowsRows`."""
+        """See `KnowsRows`."""
         self.check_frame(frame)
         return len(self._returns(frame)[1].points)
 

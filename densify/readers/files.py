@@ -12,9 +12,9 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from densify.errors import InputError
-from densify.files.images import decode_image
-from densify.types import Camera
+from densify.config.errors import InputError
+from densify.geometry.types import Camera
+from densify.readers.image_files import decode_image
 
 T = TypeVar("T")
 

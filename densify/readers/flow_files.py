@@ -24,12 +24,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from densify.config import Config
-from densify.errors import InputError
-from densify.files.arrays import read_arrays
+from densify.config.errors import InputError
 from densify.flow.chained import ChainedMotion
 from densify.flow.scene import Scene
 from densify.geometry import poses
-from densify.types import FlowField, Motion, Stretch
+from densify.geometry.types import FlowField, Motion, Stretch
+from densify.readers.array_files import read_arrays
 
 MOVES_M = 0.05
 FARTHEST_M = 1000.0

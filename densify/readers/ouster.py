@@ -23,11 +23,11 @@ from typing import Any
 
 import numpy as np
 
-from densify.errors import InputError
-from densify.files.texts import read_json
+from densify.config.errors import InputError
+from densify.config.text_files import read_json
+from densify.geometry.types import Float32
 from densify.readers.extras import needed
 from densify.readers.file_sequence import FileSequence, Returns
-from densify.types import Float32
 
 _WHAT = "Ouster captures"
 
@@ -56,7 +56,7 @@ def find_metadata(path: Path) -> Path | None:
 
 
 class Ouster(FileSequence):
-    """A capture as a `densify.types.LidarSequence`."""
+    """A capture as a `LidarSequence`."""
 
     def __init__(self, path: Path, metadata: Path) -> None:
         """Raises InputError if the file is no capture, the metadata no Ouster's, or they do not

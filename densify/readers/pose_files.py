@@ -11,12 +11,12 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from densify.errors import InputError
-from densify.files.texts import read_text
+from densify.config.errors import InputError
+from densify.config.text_files import read_text
+from densify.geometry.types import Float
 from densify.readers.file_sequence import rigid
 from densify.readers.pose_track import PoseTrack
 from densify.readers.stamp_files import in_ns, unit_of
-from densify.types import Float
 
 _TIMES = ("timestamp", "time", "stamp", "t")
 _PLACES = tuple((a, f"t{a}", f"p{a}", f"pos_{a}", f"position_{a}") for a in "xyz")

@@ -13,9 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
-from densify.errors import InputError
+from densify.config.errors import InputError
 from densify.geometry import poses
-from densify.types import Float, Int
+from densify.geometry.types import Float, Int
 
 _MAX_BEYOND_NS = 200_000_000  # a pose is extrapolated at constant velocity for so long
 

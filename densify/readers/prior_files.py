@@ -23,13 +23,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from densify.errors import InputError
-from densify.files.arrays import read_array
-from densify.files.content import open_file, reason
-from densify.files.images import check_pixels, read_image
+from densify.config.errors import InputError
+from densify.config.file_content import open_file, reason
+from densify.geometry.types import Bool, Camera, Float32, Prior
+from densify.readers.array_files import read_array
 from densify.readers.extras import needed
 from densify.readers.files import format_frames
-from densify.types import Bool, Camera, Float32, Prior
+from densify.readers.image_files import check_pixels, read_image
 
 _SUFFIXES = (".npy", ".exr", ".png")  # the finest first
 _STEM = re.compile(r"(\d+)(?:[_-](?:depth|disp|disparity|pred|prior))?", re.IGNORECASE)

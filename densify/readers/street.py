@@ -24,10 +24,11 @@ from urllib.parse import parse_qsl
 import numpy as np
 from numpy.typing import NDArray
 
-from densify.cache.folder import own_folder
-from densify.errors import InputError
-from densify.files.arrays import read_arrays
-from densify.kernels.threads import num_threads
+from densify.config.errors import InputError
+from densify.config.user_folder import own_folder
+from densify.geometry.threads import num_threads
+from densify.geometry.types import Bool, Camera, Float, Float32, Sweep, SweepTruth
+from densify.readers.array_files import read_arrays
 from densify.street.bodies import Bodies
 from densify.street.camera import Picture
 from densify.street.lidar import Returns
@@ -35,7 +36,6 @@ from densify.street.rig import CAMERAS, USUAL, cameras_beside
 from densify.street.scenes import PRESETS
 from densify.street.sensors import SENSORS
 from densify.street.simulator import VERSION, Simulator
-from densify.types import Bool, Camera, Float, Float32, Sweep, SweepTruth
 
 Arrays = dict[str, NDArray[Any]]
 _log = logging.getLogger("densify")
@@ -48,7 +48,7 @@ _NO_CAMERA = "none"
 
 
 class Street:
-    """The built-in street; members as in `densify.types.LidarSequence`.
+    """The built-in street; members as in `LidarSequence`.
 
     preset: street, static (nothing else moves), crossing (the ego vehicle stands) or highway.
     seed: another number is another scene of that kind. sensor: a row of
@@ -224,7 +224,7 @@ class Street:
 
 
 class StreetTruth:
-    """Exact truth of a street; members as in `densify.types.Truth`."""
+    """Exact truth of a street; members as in `Truth`."""
 
     def __init__(self, street: Street) -> None:
         self._street = street

@@ -15,9 +15,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from densify.errors import InputError
+from densify.config.errors import InputError
+from densify.geometry.types import Int, LidarSequence
 from densify.readers.files import format_frames
-from densify.types import Int, LidarSequence
 
 _HOLE_PERIODS = 3.1  # three periods and some jitter
 _NOMINAL_PERIOD_NS = 100_000_000  # of a recording of one sweep

@@ -39,13 +39,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from densify.errors import InputError
-from densify.files.content import read_bytes
-from densify.files.texts import read_json
+from densify.config.errors import InputError
+from densify.config.file_content import read_bytes
+from densify.config.text_files import read_json
+from densify.geometry.types import Camera, Float, Int
 from densify.readers.extras import needed
 from densify.readers.file_sequence import FileSequence, Returns, chosen_scene, rigid
 from densify.readers.pose_track import PoseTrack
-from densify.types import Camera, Float, Int
 
 _MODELS = {"pinhole": "pinhole", "kannala": "fisheye"}
 _ANONYMIZED = ("dnat", "blur", "original")
@@ -80,7 +80,7 @@ def open_recording(path: Path, scene: str | None) -> Tri3d:
 
 
 class Tri3d(FileSequence):
-    """A sequence of tri3d as a `densify.types.LidarSequence`."""
+    """A sequence of tri3d as a `LidarSequence`."""
 
     def __init__(self, path: Path, scene: str, options: Mapping[str, Any]) -> None:
         """path: the data set's. scene: CLASS/SEQUENCE. options: the class is made with.
@@ -113,7 +113,7 @@ class Tri3d(FileSequence):
         super().__init__(name, path, range(len(stamp_ns)), cameras, exposed_ns)
 
     def findings(self) -> Sequence[tuple[str, str]]:
-        """See `densify.types.SaysWhatItFound`."""
+        """See `SaysWhatItFound`."""
         return [("compensated", self._class.compensation)]
 
     def stamp_ns(self, frame: int) -> int:

@@ -23,14 +23,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from densify.errors import InputError
+from densify.config.errors import InputError
 from densify.geometry import poses
+from densify.geometry.types import Bool, Float, Stretch
 from densify.readers.arrow_columns import read_feather
 from densify.readers.flow_files import load_flow_file, rows_in_file
 from densify.readers.open_scene_flow.labels import FlowLabels
 from densify.readers.open_scene_flow.reader import SweepFile
 from densify.scores.challenge import CLASSES, IGNORED
-from densify.types import Bool, Float, Stretch
 
 CATEGORIES = {
     "ANIMAL": None,

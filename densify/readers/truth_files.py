@@ -19,10 +19,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from densify.errors import InputError
-from densify.files.arrays import read_arrays
+from densify.config.errors import InputError
+from densify.geometry.types import Bool, Float, Float32, SweepTruth
+from densify.readers.array_files import read_arrays
 from densify.street.bodies import Bodies
-from densify.types import Bool, Float, Float32, SweepTruth
 
 
 def write_bodies(folder: Path, bodies: Bodies) -> None:
@@ -53,7 +53,7 @@ def write_depth(folder: Path, camera: str, frame: int, depth_m: Float32, moving:
 
 
 class FileTruth:
-    """`densify.types.Truth` from a truth folder."""
+    """`Truth` from a truth folder."""
 
     def __init__(self, folder: Path) -> None:
         """Raises InputError if the folder's bodies.npz is missing or malformed."""

@@ -24,11 +24,11 @@ from typing import Any
 
 import numpy as np
 
-from densify.errors import InputError
-from densify.files.content import open_file
+from densify.config.errors import InputError
+from densify.config.file_content import open_file
+from densify.geometry.types import Int
 from densify.readers.extras import needed
 from densify.readers.file_sequence import FileSequence, Returns
-from densify.types import Int
 
 MODELS = {
     "VLP-16": "VLP16",
@@ -78,7 +78,7 @@ class _Packets:
 
 
 class Velodyne(FileSequence):
-    """A capture as a `densify.types.LidarSequence`."""
+    """A capture as a `LidarSequence`."""
 
     def __init__(self, path: Path, model: str) -> None:
         """model: a row of `MODELS`. Raises InputError if the file is no capture, or holds less than

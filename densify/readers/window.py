@@ -9,8 +9,8 @@ from dataclasses import replace
 import numpy as np
 
 from densify.config import RegisterSettings
-from densify.errors import InputError
-from densify.types import Camera, LidarSequence, Sweep, Trajectory
+from densify.config.errors import InputError
+from densify.geometry.types import Camera, LidarSequence, Sweep, Trajectory
 
 
 def read_sweep(sequence: LidarSequence, frame: int, settings: RegisterSettings) -> Sweep:

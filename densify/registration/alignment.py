@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from densify.geometry import poses
-from densify.types import Float, Sweep
+from densify.geometry.types import Float, Sweep
 
 _MANY_POINTS = 30_000  # before they are thinned to voxels
 _GOLDEN = 0.6180339887498949  # its multiples, modulo 1, fall evenly whatever the order of the rings

@@ -8,11 +8,11 @@ from collections.abc import Callable, Iterator, Sequence
 import numpy as np
 
 from densify.config import RegisterSettings
-from densify.errors import InputError
+from densify.config.errors import InputError
 from densify.geometry import poses
+from densify.geometry.types import Float, Int, RegisteredSweep, Sweep
 from densify.registration.alignment import Surface, SurfaceMap, subsample
 from densify.registration.deskew import placed
-from densify.types import Float, Int, RegisteredSweep, Sweep
 
 _MATCH_M = 2.0
 _KNOWN_NS = 550_000_000  # the sweeps of the window within it make the map to begin with

@@ -9,8 +9,8 @@ from dataclasses import replace
 import numpy as np
 
 from densify.geometry import poses
-from densify.kernels import deskewing as kernels
-from densify.types import Float, RegisteredSweep, Stretch, Sweep, Trajectory
+from densify.geometry.types import Float, RegisteredSweep, Stretch, Sweep, Trajectory
+from densify.registration import deskewing as kernels
 
 
 def deskew(sweeps: Sequence[Sweep], trajectory: Trajectory) -> Stretch:

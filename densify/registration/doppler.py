@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from densify.types import Float, Sweep
+from densify.geometry.types import Float, Sweep
 
 _NUM_ROUNDS, _NUM_LAST = 30, 3
 _NOISE_M_S = 0.2

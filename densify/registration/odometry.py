@@ -14,9 +14,9 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from densify.config import RegisterSettings
-from densify.errors import InputError, SweepError, UnfitSweepError, UnplacedSweepError
+from densify.config.errors import InputError, SweepError, UnfitSweepError, UnplacedSweepError
 from densify.geometry import poses
-from densify.types import Float, Int, Sweep, Trajectory
+from densify.geometry.types import Float, Int, Sweep, Trajectory
 
 _MAX_ACCELERATION_M_S2 = 30.0  # three times what tyres can do; the rest is noise of the stamps
 _MAX_TURN_RATE_DEG_S = 150.0

@@ -18,9 +18,9 @@ from scipy.sparse.linalg import spsolve
 from scipy.spatial.transform import Rotation
 
 from densify.geometry import poses
-from densify.kernels.threads import num_threads
+from densify.geometry.threads import num_threads
+from densify.geometry.types import Bool, Float, Int, Links
 from densify.registration.alignment import Lay, Surface, lay
-from densify.types import Bool, Float, Int, Links
 
 _LEAST_POINTS = 80_000  # of a submap: rings of fewer slide onto each other
 _MOST_SWEEPS = 5

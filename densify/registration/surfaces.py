@@ -17,10 +17,10 @@ import numpy as np
 
 from densify.config import RegisterSettings
 from densify.geometry import poses
+from densify.geometry.types import Float, Int, Sweep, Trajectory
 from densify.registration.alignment import Surface, lay_on_planes, subsample
 from densify.registration.deskew import placed
 from densify.registration.odometry import searched_twist
-from densify.types import Float, Int, Sweep, Trajectory
 
 _REACH_NS = 1_050_000_000
 _NUM_IN_REACH = 10  # sweeps; of more every second one, third, ...

@@ -9,10 +9,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from densify.clock import Clock
 from densify.config import RegisterSettings
-from densify.errors import InputError, SweepError, UnfitSweepError, UnplacedSweepError
+from densify.config.errors import InputError, SweepError, UnfitSweepError, UnplacedSweepError
 from densify.geometry import poses
+from densify.geometry.clock import Clock
+from densify.geometry.types import Float, Int, Sweep, Trajectory
 from densify.registration.deskew import deskew
 from densify.registration.doppler import measured_velocity
 from densify.registration.odometry import (
@@ -25,7 +26,6 @@ from densify.registration.odometry import (
 )
 from densify.registration.surfaces import refine, register_on_surfaces
 from densify.registration.upright import upright
-from densify.types import Float, Int, Sweep, Trajectory
 
 _MANY_POINTS = 30_000  # in a sweep; fewer are matched with the pattern they were scanned in
 

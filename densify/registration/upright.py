@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from densify.types import Float, Sweep
+from densify.geometry.types import Float, Sweep
 
 _NUM_SWEEPS = 5
 _NEAR_M = 30.0

@@ -24,8 +24,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from densify.arrays import Bool, Float
-from densify.errors import InputError
+from densify.config.errors import InputError
+from densify.geometry.arrays import Bool, Float
 from densify.scores.flow_metrics import BucketedError, ThreeWayError, end_point_errors
 
 CLASSES = ("BACKGROUND", "CAR", "OTHER_VEHICLES", "PEDESTRIAN", "WHEELED_VRU", "OBJECT")

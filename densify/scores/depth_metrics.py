@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 from scipy import ndimage
 
-from densify.errors import InputError
-from densify.types import Bool, Camera, DepthMap, Float, Float32
+from densify.config.errors import InputError
+from densify.geometry.types import Bool, Camera, DepthMap, Float, Float32
 
 KITTI_BASELINE_M = 0.54
 OUTLIER_PX = 3.0

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
-from densify.errors import InputError
-from densify.types import Bool, Float, Int
+from densify.config.errors import InputError
+from densify.geometry.types import Bool, Float, Int
 
 STRICT, RELAXED = 0.05, 0.1
 """Metres, and parts of the true flow: the two limits of `accuracy`."""

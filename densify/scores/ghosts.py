@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from densify.geometry.range_image import RangeImage
-from densify.types import Bool, Cloud
+from densify.free_space.range_image import RangeImage
+from densify.geometry.types import Bool, Cloud
 
 _GHOST_MARGIN_M = 0.5
 _GHOST_MARGIN_FRACTION = 0.02

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from densify.types import Cloud, RegisteredSweep
+from densify.geometry.types import Cloud, RegisteredSweep
 
 _LEAST_M_S = 0.5
 

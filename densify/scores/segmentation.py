@@ -20,8 +20,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from densify.arrays import Int
-from densify.errors import InputError
+from densify.config.errors import InputError
+from densify.geometry.arrays import Int
 
 LEAST_POINTS = 50
 

@@ -14,11 +14,11 @@ from itertools import pairwise
 
 import numpy as np
 
+from densify.geometry.types import Float
 from densify.street.materials import Material
 from densify.street.mesh import Mesh, Tint, ball, box, boxes, frustum, tube
 from densify.street.motion import Driving, Limb, Towed
 from densify.street.world import Body
-from densify.types import Float
 
 CAR_WHEELBASE_M = 2.6
 TRACTOR_WHEELBASE_M = 3.4

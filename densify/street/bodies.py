@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from densify.errors import InputError
-from densify.types import Bool, Float, SweepTruth
+from densify.config.errors import InputError
+from densify.geometry.types import Bool, Float, SweepTruth
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class Bodies:
     def displacement(
         self, frame: int, target: int, body: NDArray[np.int32], points: Float
     ) -> Float:
-        """(N,3) as `densify.types.Truth.displacement`; exactly 0 in the static world."""
+        """(N,3) as `densify.geometry.types.Truth.displacement`; exactly 0 in the static world."""
         self.check(target)
         there, here = (self.place(f, body, points) for f in (target, frame))
         return (there - here) @ self.T_world_lidar[frame][:3, :3]

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from densify.geometry.cameras import rays
 from densify.geometry.poses import inverse
+from densify.geometry.types import Bool, Camera, Float, Float32
 from densify.street.lidar import T_ego_lidar
 from densify.street.materials import (
     COLOUR,
@@ -21,7 +22,6 @@ from densify.street.materials import (
 )
 from densify.street.motion import Driving
 from densify.street.world import Hits, Rays, World
-from densify.types import Bool, Camera, Float, Float32
 
 MAX_DEPTH_M = 120.0
 _SUN = np.array([-0.45, 0.55, 0.70]) / np.linalg.norm([-0.45, 0.55, 0.70])

@@ -14,6 +14,7 @@ from functools import cached_property
 
 import numpy as np
 
+from densify.geometry.types import Float
 from densify.street.actors import (
     BICYCLE_WHEELBASE_M,
     CAR_WHEELBASE_M,
@@ -33,7 +34,6 @@ from densify.street.motion import Driving, Still
 from densify.street.scenery import Scenery
 from densify.street.terrain import Ground
 from densify.street.world import Body, World
-from densify.types import Float
 
 DURATION_S = 16
 MEETING_S = 12.0  # when the cast is around the ego vehicle

@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from densify.types import Float
+from densify.geometry.types import Float
 
 _STEP_M = 0.5
 

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from densify.geometry.types import Bool, Float, Int
 from densify.street.actors import Actor
 from densify.street.mesh import Mesh
 from densify.street.motion import Driving, Trajectory
-from densify.types import Bool, Float, Int
 
 
 @dataclass(frozen=True)

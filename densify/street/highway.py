@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from densify.geometry.types import Float
 from densify.street.casting import MEETING_S, Scene, Traffic, Ways, assemble, jitter
 from densify.street.curves import Curve, Lane, Speed
 from densify.street.motion import Driving
@@ -19,7 +20,6 @@ from densify.street.scenery import (
     tree,
 )
 from densify.street.terrain import Ground, Road, Terrain
-from densify.types import Float
 
 _LANE_M = 3.6
 _MEDIAN_M = 1.6

@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from densify.geometry.poses import rotate, transform
+from densify.geometry.types import Bool, Float, Float32, Int
 from densify.street.materials import LASER_PASSES, REFLECTIVITY
 from densify.street.mesh import across, lengths
 from densify.street.motion import Driving, poses_at
 from densify.street.sensors import Sensor, firings
 from densify.street.world import Hits, Rays, World
-from densify.types import Bool, Float, Float32, Int
 
 LIDAR_HEIGHT_M = 1.73
 _MIN_RANGE_M = 1.0

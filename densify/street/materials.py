@@ -9,8 +9,8 @@ from enum import IntEnum
 
 import numpy as np
 
-from densify.kernels import texture
-from densify.types import Float, Int
+from densify.geometry.types import Float, Int
+from densify.street import texture
 
 
 class Material(IntEnum):

@@ -10,8 +10,8 @@ from functools import cache, cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from densify.geometry.types import Float
 from densify.street.materials import Material
-from densify.types import Float
 
 Tint = tuple[float, float, float]
 WHITE: Tint = (1.0, 1.0, 1.0)

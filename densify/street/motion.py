@@ -11,10 +11,10 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
+from densify.geometry.types import Float, Int
 from densify.street.curves import Curve, Speed
 from densify.street.mesh import across, lengths
 from densify.street.terrain import Terrain
-from densify.types import Float, Int
 
 
 class Poses(NamedTuple):

@@ -12,7 +12,7 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from densify.types import Float, Int
+from densify.geometry.types import Float, Int
 
 
 class Slots(NamedTuple):

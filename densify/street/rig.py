@@ -10,8 +10,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from densify.geometry.poses import inverse
+from densify.geometry.types import Camera, Float
 from densify.street.lidar import T_ego_lidar
-from densify.types import Camera, Float
 
 # how KITTI's cameras sit: axes turned, a little off true, below and before the scanner
 _AXES = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from densify.geometry.types import Float
 from densify.street.materials import Material
 from densify.street.mesh import Mesh
 from densify.street.scenery import (
@@ -22,7 +23,6 @@ from densify.street.scenery import (
     wall,
 )
 from densify.street.terrain import Ground, Road, strip
-from densify.types import Float
 
 Span = tuple[float, float]
 

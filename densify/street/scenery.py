@@ -8,13 +8,13 @@ from functools import cache
 
 import numpy as np
 
+from densify.geometry.types import Float
 from densify.street.actors import CAR_WHEELBASE_M, any_paint, car_mesh
 from densify.street.footprints import Rectangles, overlap
 from densify.street.materials import Material
 from densify.street.mesh import Mesh, box, boxes, frustum, leaves, tube
 from densify.street.motion import on_ground
 from densify.street.terrain import Ground
-from densify.types import Float
 
 _PANEL_M = 2.0
 

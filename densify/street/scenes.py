@@ -8,7 +8,7 @@ from functools import lru_cache, partial
 
 import numpy as np
 
-from densify.errors import InputError
+from densify.config.errors import InputError
 from densify.street.casting import Scene
 from densify.street.crossing import crossing
 from densify.street.highway import highway

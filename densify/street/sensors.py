@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from densify.geometry.types import Float, Int
 from densify.street.patterns import Pattern, Raster, Rosette, Slots, Spinning
-from densify.types import Float, Int
 
 
 @dataclass(frozen=True)

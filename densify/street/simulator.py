@@ -13,6 +13,7 @@ from functools import cached_property
 import numpy as np
 
 from densify.geometry.poses import transform
+from densify.geometry.types import Bool, Float
 from densify.street.bodies import Bodies
 from densify.street.camera import Picture, T_world_lidar, expose
 from densify.street.casting import DURATION_S, Scene
@@ -21,7 +22,6 @@ from densify.street.rig import CAMERAS, SHUTTERS
 from densify.street.scenes import build_scene
 from densify.street.sensors import Sensor
 from densify.street.world import Body
-from densify.types import Bool, Float
 
 VERSION = 3  # raise it whenever the same frame would come out differently
 EPOCH_NS = 1_781_258_400_000_000_000  # 2026-06-12 10:00:00 UTC, frame 0

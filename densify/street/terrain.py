@@ -16,10 +16,10 @@ from functools import cached_property
 import numpy as np
 from scipy.spatial import cKDTree
 
+from densify.geometry.types import Float
 from densify.street.curves import Curve
 from densify.street.materials import Material
 from densify.street.mesh import Mesh
-from densify.types import Float
 
 _CORNER_RADIUS_M = 9.0
 _COARSE_M = 8.0  # cells of the ground far from roads

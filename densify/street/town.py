@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from densify.geometry.types import Float
 from densify.street.actors import TRACTOR_WHEELBASE_M, Actor, truck
 from densify.street.casting import (
     FIRST_PARKED,
@@ -23,7 +24,6 @@ from densify.street.motion import Driving
 from densify.street.roadside import Side, furnish, line_with_plots, mark_lanes, park_cars
 from densify.street.scenery import Scenery
 from densify.street.terrain import Ground, Road, Terrain
-from densify.types import Float
 
 # Offsets from the middle line of a road driven on the right: one lane against the ego vehicle's
 # direction, two with it, cycle lanes and parked cars on both sides.

@@ -16,11 +16,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from densify.kernels import casting
+from densify.geometry.types import Bool, Float, Float32
+from densify.street import ray_hits as casting
 from densify.street.materials import GLASS_PASSES
 from densify.street.mesh import Mesh
 from densify.street.motion import Poses, Still, Trajectory, poses_at
-from densify.types import Bool, Float, Float32
 
 _MAX_LAYERS = 8  # of glass and leaves that one ray passes
 

@@ -47,11 +47,11 @@ def add(commands: Any) -> None:
 def answer(options: argparse.Namespace) -> Iterator[Answer]:
     """Methods side by side."""
     config = config_of(options)
-    from densify import pipeline
     from densify.cli.results import FIRST_OF_COMPARISON, comparison, key_facts
-    from densify.methods import COMPARED, engines
     from densify.outputs import check_writable, write_comparison
-    from densify.process.memory import check_fits
+    from densify.pipeline import run as pipeline
+    from densify.pipeline.memory import check_fits
+    from densify.pipeline.methods import COMPARED, engines
     from densify.readers import open_sequence
 
     check_writable(options.out, options.key, options.overwrite, "compare")
@@ -80,7 +80,7 @@ def answer(options: argparse.Namespace) -> Iterator[Answer]:
             overwrite=options.overwrite,
         )
         if config.output.report:
-            from densify.report import write_comparison_page
+            from densify.dataset.report import write_comparison_page
 
             paths.append(write_comparison_page(paths[0].parent))
     facts = {"key": options.key, "methods": {n: key_facts(r) for n, r in results.items()}}

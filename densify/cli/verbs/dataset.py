@@ -26,7 +26,7 @@ from densify.cli.options import (
 )
 from densify.cli.progress import keys_on_stderr
 from densify.cli.screen import tell_doubts
-from densify.errors import ComputationError, InputError
+from densify.config.errors import ComputationError, InputError
 
 
 def add(commands: Any) -> None:

@@ -11,7 +11,7 @@ from typing import Any
 from densify.cli.answer import Answer
 from densify.cli.options import DATA_HELP, add_config_options, add_overwrite, add_verb
 from densify.config import resolve
-from densify.errors import InputError
+from densify.config.errors import InputError
 
 
 def add(commands: Any) -> None:

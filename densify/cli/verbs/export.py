@@ -10,7 +10,7 @@ from typing import Any
 
 from densify.cli.answer import Answer
 from densify.cli.options import add_camera, add_overwrite, add_verb
-from densify.plugins.exports import EXPORTS
+from densify.config.plugins.exports import EXPORTS
 
 
 def add(commands: Any) -> None:

@@ -20,7 +20,7 @@ from densify.cli.options import (
 )
 from densify.cli.progress import progress_on_stderr
 from densify.config import Config, resolve
-from densify.errors import ComputationError, InputError
+from densify.config.errors import ComputationError, InputError
 
 
 def add(commands: Any) -> None:
@@ -98,7 +98,7 @@ def answer(options: argparse.Namespace) -> Iterator[Answer]:
 
 def _of_recording(options: argparse.Namespace, config: Config) -> Iterator[Answer]:
     from densify.outputs.flow_sets import flow_writer
-    from densify.pipeline import flow_steps
+    from densify.pipeline.run import flow_steps
     from densify.readers import open_sequence
 
     if options.source is not None or options.all == (options.keys is not None):

@@ -19,7 +19,7 @@ from densify.cli.options import (
 )
 from densify.cli.progress import progress_on_stderr
 from densify.config import resolve
-from densify.errors import ComputationError, InputError
+from densify.config.errors import ComputationError, InputError
 
 
 def add(commands: Any) -> None:

@@ -43,7 +43,7 @@ def add(commands: Any) -> None:
 
 def answer(options: argparse.Namespace) -> Iterator[Answer]:
     """A page of what is in a folder."""
-    from densify.report import write_report
+    from densify.dataset.report import write_report
 
     with progress_on_stderr() as progress:
         paths = write_report(options.place, options.out, options.overwrite, progress)

@@ -24,10 +24,10 @@ from densify.cli.options import (
 from densify.cli.progress import Course, course_on_stderr
 from densify.cli.screen import tell_doubts
 from densify.config import Config, as_mapping
-from densify.errors import ComputationError, InputError
+from densify.config.errors import ComputationError, InputError
 
 if TYPE_CHECKING:
-    from densify.types import LidarSequence, Result
+    from densify.geometry.types import LidarSequence, Result
 
 
 def add(commands: Any) -> None:
@@ -72,11 +72,11 @@ def add(commands: Any) -> None:
 def answer(options: argparse.Namespace) -> Iterator[Answer]:
     """Densify one key or several."""
     config = config_of(options)
-    from densify import pipeline
     from densify.cli.results import FIRST_OF_RUN, key_facts, summary
-    from densify.methods import engines, with_baselines
     from densify.outputs import check_writable
-    from densify.process.memory import check_fits
+    from densify.pipeline import run as pipeline
+    from densify.pipeline.memory import check_fits
+    from densify.pipeline.methods import engines, with_baselines
     from densify.readers import open_sequence
 
     sequence = open_sequence(options.data)
@@ -123,7 +123,7 @@ def answer(options: argparse.Namespace) -> Iterator[Answer]:
 def _check_film(options: argparse.Namespace, keys: Sequence[int]) -> None:
     if options.film is None:
         return
-    from densify.report.film import check_film
+    from densify.outputs.report.film import check_film
 
     if len(keys) > 1:
         raise InputError(f"--film {options.film}: got {len(keys)} keys, expected one")
@@ -144,7 +144,7 @@ def _written(result: Result, options: argparse.Namespace, config: Config) -> lis
         also=config.output.also,
     )
     if options.film is not None:
-        from densify.report.film import write_film
+        from densify.outputs.report.film import write_film
 
         write_film(options.out / f"{result.key:06d}", options.film, overwrite=True)
         paths.append(options.film)

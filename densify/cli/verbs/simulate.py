@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Any
 from densify.cli.answer import Answer
 from densify.cli.options import add_camera, add_overwrite, add_verb, frame_range, natural
 from densify.cli.progress import progress_on_stderr
-from densify.errors import InputError
+from densify.config.errors import InputError
 
 if TYPE_CHECKING:
-    from densify.types import LidarSequence
+    from densify.geometry.types import LidarSequence
 
 
 def add(commands: Any) -> None:
@@ -60,8 +60,8 @@ def add(commands: Any) -> None:
 
 def answer(options: argparse.Namespace) -> Iterator[Answer]:
     """The built-in street in a data set's format, with truth."""
+    from densify.outputs.writers import write_street
     from densify.readers.street import Street
-    from densify.writers import write_street
 
     street = Street.from_spec(_street_spec(options))
     frames = _frames_of(street, options.frames)

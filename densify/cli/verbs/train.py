@@ -11,7 +11,7 @@ from typing import Any
 from densify.cli.answer import Answer
 from densify.cli.options import add_overwrite, add_verb, natural, positive, sentence
 from densify.cli.progress import steps_on_stderr
-from densify.errors import InputError
+from densify.config.errors import InputError
 
 
 def add(commands: Any) -> None:

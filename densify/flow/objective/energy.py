@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from densify.errors import InputError
+from densify.config.errors import InputError
 from densify.flow.objective.graph import multiply
 from densify.flow.objective.neighbors import NeighborIndex, require_points
 

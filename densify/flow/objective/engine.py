@@ -8,7 +8,7 @@ from densify.flow.chained import ChainedMotion
 from densify.flow.pairs.estimate import flow_between
 from densify.flow.scene import Scene
 from densify.geometry import poses
-from densify.types import FlowField, Motion
+from densify.geometry.types import FlowField, Motion
 
 
 def estimate_motion(scene: Scene, settings: Config, argument: str) -> Motion:

@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.sparse import csr_array
 
-from densify.errors import InputError
-from densify.kernels import sparse
-from densify.kernels.nearest import BoxTree
-from densify.types import Float
+from densify.config.errors import InputError
+from densify.flow.objective import sparse
+from densify.geometry.nearest import BoxTree
+from densify.geometry.types import Float
 
 if TYPE_CHECKING:  # who needs the graph alone does not wait for torch
     import torch

@@ -9,9 +9,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from densify.errors import InputError
-from densify.kernels.nearest import BoxTree
-from densify.types import Float
+from densify.config.errors import InputError
+from densify.geometry.nearest import BoxTree
+from densify.geometry.types import Float
 
 _MAX_CHUNK = 1 << 24  # distances held at once by brute force: two float32 buffers of 64 MB
 

@@ -14,12 +14,12 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
-from densify.errors import InputError
+from densify.config.errors import InputError
 from densify.flow.objective import graph
 from densify.flow.objective.energy import Energy, energy, match, matched_energy
 from densify.flow.objective.neighbors import NeighborIndex, require_points
-from densify.kernels.sparse import conjugate_gradients
-from densify.types import Float
+from densify.flow.objective.sparse import conjugate_gradients
+from densify.geometry.types import Float
 
 SOLVERS = ("pcg", "adam")
 _LEVEL_FACTOR = 10 ** (2 / 3)  # the most alpha falls from one level to the next
@@ -242,7 +242,7 @@ def _minimize_quadratic(problem: _Problem, rhs: Tensor, data: Tensor, alpha: flo
 def _conjugate_gradients(
     laplacian: Tensor, alpha: float, data: Tensor, preconditioner: Tensor, rhs: Tensor
 ) -> Tensor:
-    """`densify.kernels.sparse.conjugate_gradients` on any device."""
+    """`densify.flow.objective.sparse.conjugate_gradients` on any device."""
     solution = torch.zeros_like(rhs)
     residual = rhs
     enough = _RESIDUAL_DROP**2 * (rhs * rhs).sum(dim=0)

@@ -15,7 +15,7 @@ from densify.flow.chained import ChainedMotion
 from densify.flow.pairs.estimate import estimate_flow
 from densify.flow.scene import Scene
 from densify.geometry import poses
-from densify.types import FlowField, Int, Motion, Stretch, Sweep
+from densify.geometry.types import FlowField, Int, Motion, Stretch, Sweep
 
 
 def estimate_motion(scene: Scene, settings: Config, argument: str) -> Motion:

@@ -15,15 +15,15 @@ from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
 from densify.config import Config, ObjectiveSettings, resolve
-from densify.errors import InputError
+from densify.config.errors import InputError
 from densify.flow.objective.neighbors import require_points
 from densify.flow.objective.solvers import SolverSettings, solve
 from densify.flow.pairs.hypotheses import PairCloud
 from densify.flow.pairs.movers import find_movers
 from densify.flow.pairs.scanners import scanners_told
-from densify.geometry.height_map import HeightMap
-from densify.kernels.linking import link
-from densify.types import Float, FlowField, Int
+from densify.free_space.height_map import HeightMap
+from densify.geometry.linking import link
+from densify.geometry.types import Float, FlowField, Int
 
 _LEAST_MOTION_M = 0.15
 _LINK_M = 0.6

@@ -8,9 +8,9 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from densify.flow.pairs.hypotheses import PairCloud, tree_of
-from densify.geometry.height_map import HeightMap
-from densify.kernels.linking import link
-from densify.types import Bool, Float, Float32, Int
+from densify.free_space.height_map import HeightMap
+from densify.geometry.linking import link
+from densify.geometry.types import Bool, Float, Float32, Int
 
 EXPLAINED_M = 0.1  # a nearer point is a counterpart,
 MIN_UNEXPLAINED = 5, 3  # in the source, in the target

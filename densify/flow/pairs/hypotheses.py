@@ -22,8 +22,8 @@ from densify.flow.surface_matching import (
     SURFACE_M,
     apply,
 )
-from densify.geometry.height_map import HeightMap
-from densify.types import Float, Int
+from densify.free_space.height_map import HeightMap
+from densify.geometry.types import Float, Int
 
 _EVEN_M = 0.06
 _MAX_SPEED_M_S = 38.0

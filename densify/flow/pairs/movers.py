@@ -25,8 +25,8 @@ from densify.flow.pairs.hypotheses import (
 )
 from densify.flow.pairs.refine import Refined, refined
 from densify.flow.pairs.trials import Trial, promising
-from densify.geometry.height_map import HeightMap
-from densify.types import Float, Int
+from densify.free_space.height_map import HeightMap
+from densify.geometry.types import Float, Int
 
 _CLOSE_BY_M = 1.0
 _ATTACH_M = 0.3

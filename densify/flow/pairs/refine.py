@@ -24,9 +24,9 @@ from densify.flow.pairs.hypotheses import (
     thinned,
     tree_of,
 )
-from densify.geometry.height_map import HeightMap
-from densify.kernels.thinness import settle
-from densify.types import Bool, Float, Int
+from densify.flow.pairs.thinness import settle
+from densify.free_space.height_map import HeightMap
+from densify.geometry.types import Bool, Float, Int
 
 _MIN_POINTS = 40  # fewer show no surfaces
 _MAX_POINTS = 600  # of each cloud; of 400 the thickness hangs on how the axes lie
@@ -130,7 +130,7 @@ def _arrivals(
 
 @dataclass(frozen=True)
 class _Surfaces:
-    """An object's points in both clouds, see `densify.kernels.thinness.settle`."""
+    """An object's points in both clouds, see `densify.flow.pairs.thinness.settle`."""
 
     points: Float
     share: Float

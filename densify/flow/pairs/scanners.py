@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from densify.types import Float, Int
+from densify.geometry.types import Float, Int
 
 _NEAR_M = 3.0  # of the middle, where the direction is not that from a scanner
 _MIN_AGREEMENT, _MAX_SINGLE = 0.8, 0.3

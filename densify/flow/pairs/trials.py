@@ -16,7 +16,7 @@ import numpy as np
 from densify.flow.pairs.evidence import EXPLAINED_M, MIN_UNEXPLAINED, Unexplained, distances_m
 from densify.flow.pairs.hypotheses import Hypotheses, RigidMotion, thinned, tree_of
 from densify.flow.pairs.refine import Refined
-from densify.types import Bool, Float, Int
+from densify.geometry.types import Bool, Float, Int
 
 _MIN_TOGETHER, _MIN_TOGETHER_PER_M = 10, 3.5  # the farther, the more places fit by chance
 _MIN_MOTION_M = 0.1

@@ -11,9 +11,9 @@ from __future__ import annotations
 import numpy as np
 
 from densify.flow.surface_matching import GATES_M, MAX_WEIGHT, NUM_NEAR, RIDGE, SURFACE_M
-from densify.kernels.clouds import surface_information
-from densify.kernels.nearest import BoxTree
-from densify.types import Bool, Float
+from densify.geometry.clouds import surface_information
+from densify.geometry.nearest import BoxTree
+from densify.geometry.types import Bool, Float
 
 MIN_FIT = 5  # points
 _MAX_MODEL_POINTS = 1500

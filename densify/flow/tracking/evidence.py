@@ -10,15 +10,15 @@ from functools import cached_property, partial
 
 import numpy as np
 
-from densify.clock import Clock, num_in_look
 from densify.flow.tracking.radial import Radial
+from densify.free_space.height_map import HeightMap
+from densify.free_space.range_image import RangeImage
+from densify.free_space.sensor import Sensors
 from densify.geometry import poses
-from densify.geometry.height_map import HeightMap
-from densify.geometry.range_image import RangeImage
-from densify.geometry.sensor import Sensors
-from densify.kernels.clouds import Strips
-from densify.kernels.linking import close_to_seeds, link
-from densify.types import Bool, Float, Int, RegisteredSweep, Stretch
+from densify.geometry.clock import Clock, num_in_look
+from densify.geometry.clouds import Strips
+from densify.geometry.linking import close_to_seeds, link
+from densify.geometry.types import Bool, Float, Int, RegisteredSweep, Stretch
 
 _MARGIN_M = 0.4
 _MARGIN_FRACTION = 0.015
@@ -35,7 +35,7 @@ _MOST_ASKED = 10  # of them on each side: more in the same time cost more and te
 
 def range_images(sweeps: Sequence[RegisteredSweep], num_together: int) -> list[RangeImage]:
     """What sweeps saw, ring by ring too where that is safe. num_together: as many are asked
-    together, see `densify.clock.num_in_look`."""
+    together, see `densify.geometry.clock.num_in_look`."""
     image = partial(RangeImage.of, num_together=num_together, by_ring=True)
     with ThreadPoolExecutor() as pool:
         return list(pool.map(image, sweeps))

@@ -10,19 +10,19 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from densify.clock import Clock
 from densify.flow.tracking.evidence import FreeSpace, Standing, firing_times_s
 from densify.flow.tracking.lone_rays import columns_apart_m
 from densify.flow.tracking.radial import Radial
 from densify.flow.tracking.shapes import Body, Shape
 from densify.flow.tracking.sightings import Track
+from densify.free_space.height_map import HeightMap
+from densify.free_space.sensor import Sensors
 from densify.geometry import poses
-from densify.geometry.height_map import HeightMap
-from densify.geometry.sensor import Sensors
-from densify.kernels.clouds import Strips
-from densify.kernels.linking import close_to_seeds
-from densify.kernels.nearest import BoxTree
-from densify.types import Bool, Float, Float32, Int, Stretch
+from densify.geometry.clock import Clock
+from densify.geometry.clouds import Strips
+from densify.geometry.linking import close_to_seeds
+from densify.geometry.nearest import BoxTree
+from densify.geometry.types import Bool, Float, Float32, Int, Stretch
 
 _ATTACH_M = 0.3
 _ATTACH_UNSEEN_M = 0.15

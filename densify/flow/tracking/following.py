@@ -11,14 +11,14 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from densify.clock import Clock
 from densify.flow.surface_matching import GATES_M, apply, undo
 from densify.flow.tracking.align import MIN_FIT, Model
 from densify.flow.tracking.evidence import Standing
 from densify.flow.tracking.looks import Look
 from densify.flow.tracking.sightings import Track
-from densify.geometry.height_map import HeightMap
-from densify.types import Bool, Float
+from densify.free_space.height_map import HeightMap
+from densify.geometry.clock import Clock
+from densify.geometry.types import Bool, Float
 
 _FIT_M = 0.3
 _SHARE_UNSEEN = 0.5  # of the points a look usually shows

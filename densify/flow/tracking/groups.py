@@ -11,7 +11,6 @@ from itertools import chain
 import numpy as np
 from numpy.typing import NDArray
 
-from densify.clock import Clock
 from densify.config import Config
 from densify.flow.scene import Scene
 from densify.flow.tracking.evidence import (
@@ -35,14 +34,15 @@ from densify.flow.tracking.sightings import Track
 from densify.flow.tracking.soften import Part, Softened, soften
 from densify.flow.tracking.tracks import follow_groups
 from densify.geometry import poses
-from densify.types import Float, FlowField, Stretch
+from densify.geometry.clock import Clock
+from densify.geometry.types import Float, FlowField, Stretch
 
 _FINE_M = 0.3
 
 
 @dataclass(frozen=True)
 class GroupMotion:
-    """What moves in a stretch: a `densify.types.Motion`.
+    """What moves in a stretch: a `Motion`.
 
     instance: per sweep (N,) int32, index of the point's track, -1 none. bendings: of the tracks
     that are not rigid, by index.

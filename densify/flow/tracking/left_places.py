@@ -12,8 +12,8 @@ import numpy as np
 from densify.flow.tracking.evidence import FreeSpace, Standing
 from densify.flow.tracking.shapes import Body
 from densify.flow.tracking.sightings import Track
-from densify.kernels.nearest import BoxTree
-from densify.types import Float
+from densify.geometry.nearest import BoxTree
+from densify.geometry.types import Float
 
 _NUM_ASKED = 60  # places of each sweep
 _LEFT_M = 0.6  # from all of the object: it is gone, or not there yet;

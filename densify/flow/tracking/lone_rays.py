@@ -13,10 +13,10 @@ import numpy as np
 
 from densify.flow.tracking.evidence import LINK_M, Standing
 from densify.flow.tracking.shapes import Shape
+from densify.free_space.sensor import Sensors
+from densify.geometry.linking import link
 from densify.geometry.poses import transform
-from densify.geometry.sensor import Sensors
-from densify.kernels.linking import link
-from densify.types import Bool, Float, Int
+from densify.geometry.types import Bool, Float, Int
 
 _GAP_IN_LINE_M, _LONGEST_GAP_M = 1.5, 4.0
 _COLUMNS_IN_GAP = 2.0

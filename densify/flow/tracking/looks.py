@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from densify.clock import Clock
 from densify.flow.tracking.evidence import LINK_M, Standing
 from densify.flow.tracking.radial import Radial
-from densify.kernels.linking import link
+from densify.geometry.clock import Clock
+from densify.geometry.linking import link
 
 T = TypeVar("T", bound=np.generic)
 

@@ -14,8 +14,8 @@ from functools import cached_property
 import numpy as np
 from scipy.interpolate import BSpline
 
-from densify.kernels.paths import Spline, evaluate
-from densify.types import Float
+from densify.flow.tracking.path_kernels import Spline, evaluate
+from densify.geometry.types import Float
 
 _KNOT_S = 0.1
 # (Noise of a sweep's place / jerk · knot³)²: of 3 cm, a jerk of 0.03, 2 and 10 m/s³.

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from densify.geometry import poses
-from densify.types import Bool, Float, Float32, Int, RegisteredSweep
+from densify.geometry.types import Bool, Float, Float32, Int, RegisteredSweep
 
 _LEAST_M_S = 0.5
 _SPREADS = 6.0  # of what stands: its noise, and what registration leaves of the scanner's motion

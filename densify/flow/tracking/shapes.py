@@ -11,8 +11,8 @@ import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
 from densify.flow.tracking.sightings import Track
-from densify.kernels.nearest import BoxTree
-from densify.types import Bool, Float
+from densify.geometry.nearest import BoxTree
+from densify.geometry.types import Bool, Float
 
 _OUTLINE_M = 0.05
 _LONG_M = 3.0

@@ -8,12 +8,12 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from densify.flow.tracking import path_kernels as kernels
 from densify.flow.tracking.evidence import FreeSpace, Standing
 from densify.flow.tracking.looks import Look
 from densify.flow.tracking.paths import Path
-from densify.geometry.height_map import HeightMap
-from densify.kernels import paths as kernels
-from densify.types import Bool, Float
+from densify.free_space.height_map import HeightMap
+from densify.geometry.types import Bool, Float
 
 _MANY_POINTS = 100  # more do not place a look better
 _BESIDE_M = 1.0

@@ -19,7 +19,7 @@ from densify.flow.tracking.proof import contradictions
 from densify.flow.tracking.shapes import Body
 from densify.flow.tracking.sightings import Track
 from densify.flow.tracking.vote import DistanceField, grid
-from densify.types import Float
+from densify.geometry.types import Float
 
 _APART_S, _MOST_APART_S = 0.25, 1.0
 _MANY_POINTS = 60  # of a look

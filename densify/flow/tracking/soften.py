@@ -19,9 +19,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from densify.errors import InputError
+from densify.config.errors import InputError
 from densify.flow.objective.graph import laplacian, radius_graph
-from densify.types import Float, Int
+from densify.geometry.types import Float, Int
 
 _ALPHAS = tuple(np.geomspace(100.0, 0.5, 7).tolist())  # from stiff to soft
 _REACHES_M = np.geomspace(0.5, 0.25, len(_ALPHAS))  # farther targets do not pull

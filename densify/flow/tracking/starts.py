@@ -7,13 +7,13 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from densify.clock import Clock
 from densify.flow.tracking.evidence import Standing
 from densify.flow.tracking.looks import Look
 from densify.flow.tracking.shapes import Body
 from densify.flow.tracking.sightings import Track
-from densify.kernels.nearest import BoxTree
-from densify.types import Float
+from densify.geometry.clock import Clock
+from densify.geometry.nearest import BoxTree
+from densify.geometry.types import Float
 
 MIN_POINTS = 8
 _MIN_SEED_SHARE = 0.4

@@ -14,7 +14,6 @@ from itertools import chain
 
 import numpy as np
 
-from densify.clock import Clock
 from densify.flow.tracking.align import Model
 from densify.flow.tracking.evidence import FreeSpace, Standing, height_weight
 from densify.flow.tracking.following import follow
@@ -35,8 +34,9 @@ from densify.flow.tracking.starts import (
     velocities_of_traffic,
 )
 from densify.flow.tracking.vote import DistanceField, Group, vote
-from densify.geometry.height_map import HeightMap
-from densify.types import Bool, Float
+from densify.free_space.height_map import HeightMap
+from densify.geometry.clock import Clock
+from densify.geometry.types import Bool, Float
 
 _FIT_M = 0.3
 _RAYS_M = 15.0

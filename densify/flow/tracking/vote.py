@@ -9,10 +9,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from densify.clock import Clock
-from densify.kernels.clouds import look_up, spread
-from densify.kernels.nearest import BoxTree
-from densify.types import Float
+from densify.geometry.clock import Clock
+from densify.geometry.clouds import look_up, spread
+from densify.geometry.nearest import BoxTree
+from densify.geometry.types import Float
 
 _MAX_SPEED_M_S = 38.0
 _VOTE_NEAR_S = 0.1  # the nearer of the sweeps asked; the farther ones are twice as far

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 from torch import Tensor
 
-from densify.errors import InputError
+from densify.config.errors import InputError
 from densify.learning.clouds import Sweeps
 from densify.learning.losses.cycle import cycle_loss
 from densify.learning.losses.objective import objective_loss

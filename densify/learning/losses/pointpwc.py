@@ -20,7 +20,7 @@ from torch import Tensor
 
 from densify.flow.objective.energy import take
 from densify.flow.objective.neighbors import NeighborIndex
-from densify.types import Float
+from densify.geometry.types import Float
 
 if TYPE_CHECKING:
     from densify.learning.losses import Predict

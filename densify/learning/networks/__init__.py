@@ -9,7 +9,7 @@ from collections.abc import Callable
 import torch
 from torch import nn
 
-from densify.errors import InputError
+from densify.config.errors import InputError
 from densify.learning.networks.flownet3d import FlowNet3D
 from densify.learning.networks.voxels import Voxels
 

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """A finished run once more, in another form or with only what is certain and fresh enough.
 
-`densify.plugins.exports` is the table of forms, a module each. The folder holds what the form owns,
+The table of forms, a module each, is `config.plugins.exports`. The folder holds what the form owns,
 and export.yaml::
 
     run             the folder of the run, as the user named it
@@ -24,12 +24,12 @@ from typing import Any, Protocol, cast
 import numpy as np
 import yaml
 
-from densify.errors import InputError
+from densify import __version__
+from densify.config.errors import InputError
+from densify.config.plugins.exports import EXPORTS, ExportFormat
 from densify.outputs.atomic import write_file
 from densify.outputs.export.finished_run import Density, FinishedRun, Kept, finished_runs
 from densify.outputs.store import writing
-from densify.plugins.exports import EXPORTS, ExportFormat
-from densify.version import __version__
 
 _RECORD = "export.yaml"
 
@@ -82,7 +82,7 @@ def export_run(
     pixel goes by its own confidence and the age of the measured pixel nearest to it, and stays even
     if those around it go. out: the folder to make; if None, ``export`` in ``run``, and
     ``export/FORM`` for all but png. overwrite: replace an earlier export. to: a name of
-    `densify.plugins.exports.EXPORTS`. cameras: only these, all if None.
+    `densify.config.plugins.exports.EXPORTS`. cameras: only these, all if None.
 
     The folder is complete or not there. Raises InputError for a folder that is no run, thresholds
     out of range, files that are missing, damaged or do not belong together, a form that is none or

@@ -14,12 +14,12 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from densify.arrays import table
+from densify.geometry.arrays import table
+from densify.geometry.types import Camera, Float
 from densify.outputs.atomic import write_file
 from densify.outputs.cloud_laz import StoredCloud
 from densify.outputs.export.finished_run import FinishedRun
 from densify.outputs.export.pictures import Picture, intrinsics, seen, write_pictures
-from densify.types import Camera, Float
 
 _MODELS = {"PINHOLE": 1, "OPENCV": 4, "OPENCV_FISHEYE": 5, "FULL_OPENCV": 6}
 

@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from densify.errors import InputError
+from densify.config.errors import InputError
+from densify.geometry.types import Int
 from densify.outputs.cloud_laz import StoredCloud
 from densify.outputs.export.finished_run import FinishedRun
 from densify.readers.extras import needed
-from densify.types import Int
 
 _SCALE_M = 0.001
 _CELLS = 64  # of a node, along each axis: one point of each is shown first

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from densify.errors import InputError
+from densify.config.errors import InputError
 from densify.outputs.export.finished_run import FinishedRun
 from densify.readers.extras import needed
 

@@ -6,10 +6,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from densify.geometry.types import Float32
 from densify.outputs.export.finished_run import FinishedRun
 from densify.outputs.export.float_maps import write_maps
 from densify.readers.extras import needed
-from densify.types import Float32
 
 
 def write_export(run: FinishedRun, folder: Path) -> None:

@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from densify.errors import InputError, brief
-from densify.files.texts import read_json
-from densify.types import Float
+from densify.config.errors import InputError, brief
+from densify.config.text_files import read_json
+from densify.geometry.types import Float
 
 
 @dataclass(frozen=True)

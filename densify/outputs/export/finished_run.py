@@ -12,13 +12,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from densify.errors import InputError
-from densify.files.texts import read_json, read_yaml
+from densify.config.errors import InputError
+from densify.config.text_files import read_json, read_yaml
+from densify.geometry.types import Bool, CameraView, ObjectTrack
 from densify.outputs.cloud_laz import StoredCloud, read_cloud
 from densify.outputs.depth_png import read_stored, stored_age, stored_confidence
 from densify.outputs.export.scene_file import SceneFile, read_scene
 from densify.outputs.export.tracks_file import read_tracks
-from densify.types import Bool, CameraView, ObjectTrack
 
 KINDS: Mapping[str, type[np.uint8] | type[np.uint16]] = {
     "depth": np.uint16,

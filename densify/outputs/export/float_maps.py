@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from densify.geometry.types import Float32
 from densify.outputs.export.finished_run import FinishedRun
-from densify.types import Float32
 
 
 def write_maps(run: FinishedRun, folder: Path, suffix: str, write: Callable[..., None]) -> None:

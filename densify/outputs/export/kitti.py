@@ -7,15 +7,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from densify.errors import InputError
-from densify.files.content import read_bytes
-from densify.files.images import decode_image
-from densify.files.texts import read_yaml
+from densify.config.errors import InputError
+from densify.config.file_content import read_bytes
+from densify.config.text_files import read_yaml
 from densify.outputs.atomic import write_file
 from densify.outputs.export.finished_run import FinishedRun
 from densify.outputs.export.pictures import jpeg_of
 from densify.outputs.kitti_tree import drive_folder, split_of
 from densify.outputs.png import encode_png
+from densify.readers.image_files import decode_image
 
 _TREE = {
     "groundtruth": "depth",

@@ -11,9 +11,9 @@ import numpy as np
 
 from densify.geometry import poses
 from densify.geometry.cameras import image_points
+from densify.geometry.types import Camera, Float, ObjectTrack
 from densify.outputs.atomic import write_file
 from densify.outputs.export.finished_run import FinishedRun
-from densify.types import Camera, Float, ObjectTrack
 
 _CLASS = "Misc"  # what an object is nobody looked at
 _OCCLUSION = 3  # unknown

@@ -23,11 +23,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from densify.geometry.types import Camera, Float, ObjectTrack
+from densify.geometry.types.rigid import inverse
 from densify.outputs.export.finished_run import FinishedRun
 from densify.outputs.export.timeline import Shot, Timeline, timelines
 from densify.readers.extras import needed
-from densify.types import Camera, Float, ObjectTrack
-from densify.types.rigid import inverse
 
 _UNSEEN = np.array([140, 140, 140], np.uint8)
 _PATH = {"r": 0.84, "g": 0.37, "b": 0.0, "a": 1.0}

@@ -13,13 +13,13 @@ from typing import Any
 
 import numpy as np
 
-from densify.errors import InputError
+from densify.config.errors import InputError
+from densify.geometry.types.rigid import inverse
 from densify.outputs.export.finished_run import FinishedRun
 from densify.outputs.export.npy import write_array
 from densify.outputs.export.pictures import Picture, intrinsics, seen, write_pictures
 from densify.outputs.export.ply import write_ply
 from densify.outputs.plain import write_json
-from densify.types.rigid import inverse
 
 _MM_PER_STEP = np.float32(1000 / 256)
 _OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
+from densify.geometry.types import Float32
 from densify.outputs.atomic import write_file
 from densify.outputs.export.finished_run import FinishedRun
 from densify.outputs.export.float_maps import write_maps
-from densify.types import Float32
 
 
 def write_export(run: FinishedRun, folder: Path) -> None:

@@ -9,10 +9,10 @@ from pathlib import Path
 
 import numpy as np
 
+from densify.geometry.types import Float32
 from densify.outputs.atomic import write_file
 from densify.outputs.export.finished_run import FinishedRun
 from densify.outputs.export.timeline import Timeline, timelines
-from densify.types import Float32
 
 _LIDAR = "LIDAR_TOP"
 

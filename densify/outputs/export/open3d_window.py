@@ -20,14 +20,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from densify.errors import InputError
-from densify.files.images import decode_image
+from densify.config.errors import InputError
+from densify.geometry.types import Float, ObjectTrack
 from densify.outputs.export.finished_run import FinishedRun
 from densify.outputs.export.timeline import Shot, SweepShown, Timeline, timelines
 from densify.outputs.figure import draw_figure
 from densify.outputs.png import Picture
 from densify.readers.extras import needed
-from densify.types import Float, ObjectTrack
+from densify.readers.image_files import decode_image
 
 LAYERS = ("standing", "moving", "trails", "sweep", "movers", "cameras")
 PICTURES = ("image", "measured", "filled")

@@ -9,7 +9,7 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from densify.arrays import table
+from densify.geometry.arrays import table
 from densify.outputs.atomic import write_file
 from densify.outputs.export.finished_run import FinishedRun
 

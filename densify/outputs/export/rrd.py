@@ -23,11 +23,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from densify.geometry.types import Float, ObjectTrack
+from densify.geometry.types.rigid import inverse
 from densify.outputs.export.finished_run import FinishedRun
 from densify.outputs.export.timeline import Shot, Timeline, timelines
 from densify.readers.extras import needed
-from densify.types import Float, ObjectTrack
-from densify.types.rigid import inverse
 
 if TYPE_CHECKING:
     import rerun

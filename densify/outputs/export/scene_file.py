@@ -7,9 +7,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from densify.errors import InputError
+from densify.config.errors import InputError
+from densify.geometry.types import Camera, CameraView, Float
 from densify.outputs.export.fields import Fields, is_number
-from densify.types import Camera, CameraView, Float
 
 _MODELS = ("pinhole", "fisheye", "mei")
 _MOST_PX = 1 << 16

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from densify.geometry import poses
+from densify.geometry.types import Float
 from densify.outputs.atomic import write_file
 from densify.outputs.export.colmap import packed_points, write_cameras
 from densify.outputs.export.finished_run import FinishedRun
@@ -19,7 +20,6 @@ from densify.outputs.export.pictures import seen, write_pictures
 from densify.outputs.export.ply import write_ply
 from densify.outputs.plain import write_json
 from densify.outputs.tracks import tracks_table
-from densify.types import Float
 
 
 def write_export(run: FinishedRun, folder: Path) -> None:

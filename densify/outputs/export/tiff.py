@@ -7,10 +7,10 @@ from pathlib import Path
 
 import cv2
 
+from densify.geometry.types import Float32
 from densify.outputs.atomic import write_file
 from densify.outputs.export.finished_run import FinishedRun
 from densify.outputs.export.float_maps import write_maps
-from densify.types import Float32
 
 _DEFLATE = [cv2.IMWRITE_TIFF_COMPRESSION, cv2.IMWRITE_TIFF_COMPRESSION_ADOBE_DEFLATE]
 

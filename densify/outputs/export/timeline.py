@@ -10,12 +10,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from densify.errors import InputError
+from densify.config.errors import InputError
+from densify.geometry.types import Bool, CameraView, Float, Float32, ObjectTrack
+from densify.geometry.types.rigid import inverse
 from densify.outputs.cloud_laz import StoredCloud
 from densify.outputs.export.finished_run import FinishedRun
 from densify.outputs.export.pictures import jpeg_of
-from densify.types import Bool, CameraView, Float, Float32, ObjectTrack
-from densify.types.rigid import inverse
 
 _M_PER_STEP = np.float32(1 / 256)
 

@@ -11,10 +11,10 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from densify.geometry.types import ObjectTrack
 from densify.outputs.atomic import write_file
 from densify.outputs.export.finished_run import FinishedRun
 from densify.outputs.plain import write_json
-from densify.types import ObjectTrack
 
 _COLUMNS = (
     "object",
@@ -40,7 +40,7 @@ _COLUMNS = (
 def write_export(run: FinishedRun, folder: Path) -> None:
     """``tracks.csv``, a row for each object and moment, and ``tracks.json``, a list of the same
     rows by name: the middle of the object's box, the turn of its axes as a quaternion, size and
-    velocity in key coordinates, see `densify.types.ObjectTrack`.
+    velocity in key coordinates, see `ObjectTrack`.
 
     Raises InputError where thresholds are given, which say nothing of objects.
     """

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from densify.errors import InputError
+from densify.config.errors import InputError
+from densify.geometry.types import ObjectTrack
 from densify.outputs.export.fields import Fields
-from densify.types import ObjectTrack
 
 
 def read_tracks(path: Path) -> list[ObjectTrack]:

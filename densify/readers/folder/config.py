@@ -11,11 +11,11 @@ from pathlib import Path
 
 import numpy as np
 
-from densify.errors import InputError
+from densify.config.errors import InputError
+from densify.geometry.types import Camera, Float
 from densify.readers.file_sequence import rigid
 from densify.readers.folder.yaml_sections import Section, read_sections
 from densify.readers.points.fields import REFERENCES, UNIT_NS
-from densify.types import Camera, Float
 
 NAME = "densify.yaml"
 _MODELS = {"pinhole": (0, 4, 5, 8, 12, 14), "fisheye": (4,), "mei": (5,)}

@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from densify.files.images import image_size_px
 from densify.readers.folder.files import (
     IMAGE_SUFFIXES,
     find_images,
@@ -20,6 +19,7 @@ from densify.readers.folder.files import (
     in_time,
     sweep_folders,
 )
+from densify.readers.image_files import image_size_px
 from densify.readers.points.fields import find_fields, find_times, full_scale
 from densify.readers.points.files import read_table, unnamed
 from densify.readers.pose_files import PoseFile

@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from densify.errors import InputError
+from densify.config.errors import InputError
 from densify.readers.folder.config import NAME
 from densify.readers.points.files import SUFFIXES
 from densify.readers.stamp_files import Named, StampFile, named

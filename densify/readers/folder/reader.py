@@ -32,9 +32,10 @@ from pathlib import Path
 
 import numpy as np
 
-from densify.errors import InputError
-from densify.files.content import read_bytes
+from densify.config.errors import InputError
+from densify.config.file_content import read_bytes
 from densify.geometry import poses
+from densify.geometry.types import Float
 from densify.readers.file_sequence import (
     FileSequence,
     Returns,
@@ -55,7 +56,6 @@ from densify.readers.points.columns import SweepColumns
 from densify.readers.points.files import read_viewpoint
 from densify.readers.pose_files import PoseFile
 from densify.readers.pose_track import PoseTrack
-from densify.types import Float
 
 _NO_VIEWPOINT = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
 
@@ -66,7 +66,7 @@ def open_recording(path: Path, scene: str | None) -> Folder:
 
 
 class Folder(FileSequence):
-    """A folder of sweeps as a `densify.types.LidarSequence`; `findings` says what was found."""
+    """A folder of sweeps as a `LidarSequence`; `findings` says what was found."""
 
     def __init__(self, path: Path | str) -> None:
         """Reads names, densify.yaml, stamps and poses at once, sweeps and images on demand. Raises
@@ -99,7 +99,7 @@ class Folder(FileSequence):
         return self._sweeps.stamps_ns[frame]
 
     def findings(self) -> Sequence[tuple[str, str]]:
-        """See `densify.types.SaysWhatItFound`."""
+        """See `SaysWhatItFound`."""
         layout, first = self._columns.layout, self._sweeps.paths[self.frames[0]]
         fields = [f"{part} = {name}" for part, name in vars(layout.fields).items() if name]
         unused = f"; not used: {', '.join(layout.unused)}" if layout.unused else ""

@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from densify.errors import InputError
-from densify.files.texts import read_yaml
-from densify.types import Float
+from densify.config.errors import InputError
+from densify.config.text_files import read_yaml
+from densify.geometry.types import Float
 
 
 @dataclass

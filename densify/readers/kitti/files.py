@@ -11,11 +11,11 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from densify.errors import InputError
-from densify.files.content import read_bytes
-from densify.files.texts import read_text
+from densify.config.errors import InputError
+from densify.config.file_content import read_bytes
+from densify.config.text_files import read_text
+from densify.geometry.types import Camera, Float, Float32, Int
 from densify.readers.stamp_files import date_ns
-from densify.types import Camera, Float, Float32, Int
 
 _ORTHONORMAL_TOLERANCE = 1e-3  # calibration files carry seven digits
 NOMINAL_PERIOD_NS = 100_000_000

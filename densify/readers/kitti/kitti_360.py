@@ -25,10 +25,11 @@ from pathlib import Path
 
 import numpy as np
 
-from densify.errors import InputError
-from densify.files.content import read_bytes
-from densify.files.texts import parse_yaml, read_text
+from densify.config.errors import InputError
+from densify.config.file_content import read_bytes
+from densify.config.text_files import parse_yaml, read_text
 from densify.geometry import poses
+from densify.geometry.types import Camera, Float
 from densify.readers.file_sequence import (
     FileSequence,
     Returns,
@@ -48,7 +49,6 @@ from densify.readers.kitti.files import (
     turned_ns,
 )
 from densify.readers.pose_track import PoseTrack
-from densify.types import Camera, Float
 
 _FOLDERS = {
     "image_00": "data_rect",
@@ -71,7 +71,7 @@ def open_recording(path: Path, scene: str | None) -> Kitti360:
 
 
 class Kitti360(FileSequence):
-    """A drive as a `densify.types.LidarSequence`."""
+    """A drive as a `LidarSequence`."""
 
     def __init__(self, path: Path, drive: str) -> None:
         """path: the folder that holds data_3d_raw/. Raises InputError if the drive holds no sweeps,

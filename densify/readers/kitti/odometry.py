@@ -25,11 +25,11 @@ from pathlib import Path
 
 import numpy as np
 
-from densify.errors import InputError
-from densify.files.content import read_bytes
-from densify.files.images import image_size_px
-from densify.files.texts import read_text
+from densify.config.errors import InputError
+from densify.config.file_content import read_bytes
+from densify.config.text_files import read_text
 from densify.geometry import poses
+from densify.geometry.types import Camera, Float
 from densify.readers.file_sequence import (
     FileSequence,
     Returns,
@@ -38,6 +38,7 @@ from densify.readers.file_sequence import (
     truth_beside,
 )
 from densify.readers.files import numbered_files, of_frame
+from densify.readers.image_files import image_size_px
 from densify.readers.kitti.files import (
     NOMINAL_PERIOD_NS,
     Calibration,
@@ -48,7 +49,6 @@ from densify.readers.kitti.files import (
 )
 from densify.readers.pose_track import PoseTrack
 from densify.readers.stamp_files import in_ns
-from densify.types import Camera, Float
 
 _NUM_ROUNDS = 3  # the azimuth changes by degrees at most
 
@@ -69,7 +69,7 @@ def open_recording(path: Path, scene: str | None) -> KittiOdometry:
 
 
 class KittiOdometry(FileSequence):
-    """A sequence as a `densify.types.LidarSequence`."""
+    """A sequence as a `LidarSequence`."""
 
     def __init__(self, path: Path) -> None:
         """path: the sequence's folder. Raises InputError if it holds no sweeps, or times, or the

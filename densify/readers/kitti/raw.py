@@ -12,10 +12,11 @@ from pathlib import Path
 
 import numpy as np
 
-from densify.errors import InputError
-from densify.files.content import read_bytes
-from densify.files.texts import read_text
+from densify.config.errors import InputError
+from densify.config.file_content import read_bytes
+from densify.config.text_files import read_text
 from densify.geometry import poses
+from densify.geometry.types import Float, Int
 from densify.readers.file_sequence import FileSequence, Returns, truth_beside
 from densify.readers.files import numbered_files, of_frame
 from densify.readers.kitti.files import (
@@ -32,7 +33,6 @@ from densify.readers.kitti.files import (
     read_points,
     turned_ns,
 )
-from densify.types import Float, Int
 
 KITTI_TRIGGER_LATENCY_NS = 10_500_000
 """How much KITTI's recorded image stamps lag the exposure. The cameras are triggered when the
@@ -46,7 +46,7 @@ def open_recording(path: Path, scene: str | None) -> KittiRaw:
 
 
 class KittiRaw(FileSequence):
-    """A KITTI raw drive as a `densify.types.LidarSequence`.
+    """A KITTI raw drive as a `LidarSequence`.
 
     Reference time of a sweep: ``velodyne_points/timestamps.txt``, the middle of the revolution,
     when the scanner faces forward. There are no stamps per point: the scanner turns clockwise, so a
@@ -86,7 +86,7 @@ class KittiRaw(FileSequence):
         )
 
     def gaps(self) -> list[str]:
-        """See `densify.types.KnowsItsGaps`."""
+        """See `KnowsItsGaps`."""
         velodyne = self.where / "velodyne_points"
         stamps = (self._stamps, self._start_stamps, self._end_stamps)
         names = [f"timestamps{part}.txt" for part in ("", "_start", "_end")]

@@ -17,10 +17,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from densify.errors import InputError
-from densify.files.images import read_image
+from densify.config.errors import InputError
+from densify.geometry.types import Bool, Float
+from densify.readers.image_files import read_image
 from densify.readers.kitti.files import Calibration, rectified_camera
-from densify.types import Bool, Float
 
 _PER_PX, _FLOW_PER_PX, _FLOW_ZERO = 256.0, 64.0, 2**15
 _IMAGES = ("disp_occ_0", "disp_occ_1", "flow_occ")

@@ -22,13 +22,14 @@ from pathlib import Path
 
 import numpy as np
 
-from densify.errors import InputError
-from densify.files.content import read_bytes
-from densify.files.images import image_size_px
-from densify.files.texts import read_text
+from densify.config.errors import InputError
+from densify.config.file_content import read_bytes
+from densify.config.text_files import read_text
 from densify.geometry import poses
+from densify.geometry.types import Boxes, BoxView, Camera, Float
 from densify.readers.file_sequence import FileSequence, Returns, chosen_scene, truth_beside
 from densify.readers.files import numbered_files, of_frame
+from densify.readers.image_files import image_size_px
 from densify.readers.kitti.files import (
     NOMINAL_PERIOD_NS,
     NUM_OXTS_VALUES,
@@ -42,7 +43,6 @@ from densify.readers.kitti.files import (
     turned_ns,
 )
 from densify.readers.kitti.tracking_labels import LabelFile
-from densify.types import Boxes, BoxView, Camera, Float
 
 _SMALLEST_IMAGE_PX = (1224, 370)
 
@@ -58,7 +58,7 @@ def open_recording(path: Path, scene: str | None) -> KittiTracking:
 
 
 class KittiTracking(FileSequence):
-    """A sequence as a `densify.types.LidarSequence`."""
+    """A sequence as a `LidarSequence`."""
 
     def __init__(self, path: Path, scene: str) -> None:
         """path: the folder that holds velodyne/. scene: the sequence. Raises InputError if it holds
@@ -123,7 +123,7 @@ class KittiTracking(FileSequence):
         return path, read_text(path).splitlines()
 
     def boxes(self, frame: int) -> Boxes | None:
-        """See `densify.types.KnowsBoxes`; ``testing`` has none. Without images their size is taken
+        """See `KnowsBoxes`; ``testing`` has none. Without images their size is taken
         for the smallest of KITTI's. Raises InputError for labels or a calibration that are missing
         or malformed."""
         self.check_frame(frame)

@@ -17,11 +17,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from densify.errors import InputError
-from densify.files.texts import read_text
+from densify.config.errors import InputError
+from densify.config.text_files import read_text
+from densify.geometry.types import Float, Int
 from densify.readers.boxes import checked_boxes, upright_poses
 from densify.readers.kitti.files import parse_numbers
-from densify.types import Float, Int
 
 T_CAM_UPRIGHT = np.array(  # x right, y forward, z up
     [[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]]

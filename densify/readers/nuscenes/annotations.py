@@ -17,12 +17,12 @@ from pathlib import Path
 
 import numpy as np
 
-from densify.errors import InputError
+from densify.config.errors import InputError
 from densify.geometry import poses
+from densify.geometry.types import Boxes, Float, Int
 from densify.readers.boxes import checked_boxes
 from densify.readers.file_sequence import quaternion_pose
 from densify.readers.nuscenes.tables import Record, find_records
-from densify.types import Boxes, Float, Int
 
 TABLE = "sample_annotation.json"
 _LENGTH_WIDTH_HEIGHT = [1, 0, 2]  # of the table's width, length, height

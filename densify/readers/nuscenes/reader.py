@@ -28,13 +28,13 @@ from pathlib import Path
 
 import numpy as np
 
-from densify.errors import InputError
-from densify.files.content import read_bytes
+from densify.config.errors import InputError
+from densify.config.file_content import read_bytes
+from densify.geometry.types import Int
 from densify.readers.file_sequence import Returns, chosen_scene
 from densify.readers.nuscenes.scene import Scene, SceneSequence
 from densify.readers.nuscenes.tables import read_table
 from densify.readers.pose_track import PoseTrack
-from densify.types import Int
 
 NUM_RINGS = 32
 COLUMN_NS = 46_080
@@ -78,7 +78,7 @@ def _versions(path: Path) -> list[Path]:
 
 
 class NuScenes(SceneSequence):
-    """A scene of nuScenes as a `densify.types.LidarSequence`."""
+    """A scene of nuScenes as a `LidarSequence`."""
 
     def __init__(self, scene: Scene) -> None:
         """Raises InputError if the scene's sweeps are not there, or a camera is malformed."""

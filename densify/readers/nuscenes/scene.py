@@ -13,14 +13,14 @@ from pathlib import Path
 
 import numpy as np
 
-from densify.errors import InputError
-from densify.files.content import read_bytes
+from densify.config.errors import InputError
+from densify.config.file_content import read_bytes
 from densify.geometry.poses import inverse
+from densify.geometry.types import Boxes, Camera, Float
 from densify.readers.file_sequence import FileSequence, quaternion_pose, truth_beside
 from densify.readers.nuscenes.annotations import Annotations
 from densify.readers.nuscenes.tables import Record, find_records, read_table
 from densify.readers.pose_track import PoseTrack
-from densify.types import Boxes, Camera, Float
 
 _LIDARS, _CAMERAS = "lidar", "camera"
 
@@ -122,7 +122,7 @@ class SceneSequence(FileSequence):
         return self._scene.track.at(self._lidar.stamps_ns[frame]) @ self._T_ego_frame
 
     def boxes(self, frame: int) -> Boxes | None:
-        """See `densify.types.KnowsBoxes`; the test split has none. Raises InputError for a table
+        """See `KnowsBoxes`; the test split has none. Raises InputError for a table
         that is malformed."""
         self.check_frame(frame)
         if self._annotations is None:

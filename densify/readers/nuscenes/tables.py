@@ -16,10 +16,10 @@ from typing import Any
 
 import numpy as np
 
-from densify.errors import InputError
-from densify.files.content import open_file, reason
-from densify.files.texts import parse_json, read_json
-from densify.types import Float
+from densify.config.errors import InputError
+from densify.config.file_content import open_file, reason
+from densify.config.text_files import parse_json, read_json
+from densify.geometry.types import Float
 
 _RECORD = re.compile(rb"\{[^{}]*\}")
 

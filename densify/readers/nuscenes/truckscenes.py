@@ -20,13 +20,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from densify.errors import InputError
+from densify.config.errors import InputError
 from densify.geometry.poses import transform
+from densify.geometry.types import Bool, Float, Float32, Int
 from densify.readers.file_sequence import Returns, scanner_axes
 from densify.readers.nuscenes.scene import Channel, Scene, SceneSequence
 from densify.readers.points.fields import full_scale, scaled
 from densify.readers.points.files import read_table
-from densify.types import Bool, Float, Float32, Int
 
 _FIELDS = ("x", "y", "z", "intensity", "timestamp")
 _NOMINAL_PERIOD_NS = 100_000_000
@@ -34,7 +34,7 @@ _MOST_LATE_NS = 500_000_000
 
 
 class TruckScenes(SceneSequence):
-    """A scene of TruckScenes as a `densify.types.LidarSequence`."""
+    """A scene of TruckScenes as a `LidarSequence`."""
 
     def __init__(self, scene: Scene) -> None:
         """Raises InputError if the scene's sweeps are not there, or a camera is malformed."""

@@ -17,13 +17,13 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from densify.config import Config
-from densify.errors import InputError
+from densify.config.errors import InputError
 from densify.flow.chained import ChainedMotion
 from densify.flow.scene import Scene
 from densify.geometry import poses
+from densify.geometry.types import Bool, Float, FlowField, Stretch
 from densify.readers.flow_files import MOVES_M
 from densify.readers.open_scene_flow.reader import SweepFile
-from densify.types import Bool, Float, FlowField, Stretch
 
 _ARRIVES_M = 0.5
 

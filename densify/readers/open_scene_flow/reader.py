@@ -30,7 +30,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from densify.errors import InputError
+from densify.config.errors import InputError
+from densify.geometry.types import Float, Float32
 from densify.readers.extras import needed
 from densify.readers.file_sequence import (
     FileSequence,
@@ -41,7 +42,6 @@ from densify.readers.file_sequence import (
     truth_beside,
 )
 from densify.readers.pose_track import PoseTrack
-from densify.types import Float, Float32
 
 _UNITS_NS = (1, 1_000, 1_000_000, 1_000_000_000)
 _LEAST_STEP_NS, _MOST_STEP_NS = 10_000_000, 2_000_000_000
@@ -145,7 +145,7 @@ class SweepFile:
 
 
 class OpenSceneFlow(FileSequence):
-    """A file as a `densify.types.LidarSequence`; the lidar frame is that of its points."""
+    """A file as a `LidarSequence`; the lidar frame is that of its points."""
 
     def __init__(self, path: Path) -> None:
         """Reads the names of the sweeps. Raises InputError if there are none."""

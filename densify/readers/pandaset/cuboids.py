@@ -7,11 +7,11 @@ from pathlib import Path
 
 import numpy as np
 
-from densify.errors import InputError
+from densify.config.errors import InputError
 from densify.geometry.poses import inverse
+from densify.geometry.types import Boxes, Float
 from densify.readers.boxes import checked_boxes, upright_poses
 from densify.readers.pandaset.pickled_frame import read_columns
-from densify.types import Boxes, Float
 
 CENTRE = tuple(f"position.{axis}" for axis in "xyz")
 WIDTH_LENGTH_HEIGHT = tuple(f"dimensions.{axis}" for axis in "xyz")

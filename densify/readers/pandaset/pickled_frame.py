@@ -18,8 +18,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from densify.errors import InputError
-from densify.files.content import gunzipped, read_bytes
+from densify.config.errors import InputError
+from densify.config.file_content import gunzipped, read_bytes
 
 _NUMBERS = re.compile(r"[fiu][1248]|b1")
 _OBJECTS = "O8"

@@ -38,17 +38,17 @@ from pathlib import Path
 
 import numpy as np
 
-from densify.errors import InputError
-from densify.files.content import read_bytes
-from densify.files.images import image_size_px
-from densify.files.texts import read_json
+from densify.config.errors import InputError
+from densify.config.file_content import read_bytes
+from densify.config.text_files import read_json
 from densify.geometry import poses
+from densify.geometry.types import Boxes, Camera, Float, Int
 from densify.readers.file_sequence import FileSequence, Returns, quaternion_pose, truth_beside
 from densify.readers.files import numbered_files
+from densify.readers.image_files import image_size_px
 from densify.readers.pandaset.cuboids import read_cuboids
 from densify.readers.pandaset.pickled_frame import read_columns
 from densify.readers.pose_track import PoseTrack
-from densify.types import Boxes, Camera, Float, Int
 
 _AXIS = np.array([-0.0157, 0.00045, 1.0])  # of the Pandar64, forward left up
 _PLACE_M = np.array([0.777, 0.002, 1.8593])
@@ -80,7 +80,7 @@ def open_recording(path: Path, scene: str | None) -> PandaSet:
 
 
 class PandaSet(FileSequence):
-    """A sequence as a `densify.types.LidarSequence` with poses of its images."""
+    """A sequence as a `LidarSequence` with poses of its images."""
 
     def __init__(self, path: Path) -> None:
         """path: the sequence's folder. Raises InputError if it holds no sweeps, or poses, stamps or
@@ -137,7 +137,7 @@ class PandaSet(FileSequence):
         return self._T_world_cam[camera][number]
 
     def boxes(self, frame: int) -> Boxes | None:
-        """See `densify.types.KnowsBoxes`; None without the frame's file. Raises InputError for one
+        """See `KnowsBoxes`; None without the frame's file. Raises InputError for one
         that is malformed."""
         self.check_frame(frame)
         path = self.where / "annotations" / "cuboids" / f"{frame:02d}.pkl.gz"

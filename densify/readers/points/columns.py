@@ -13,7 +13,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from densify.errors import InputError
+from densify.config.errors import InputError
+from densify.geometry.types import Bool, Int
 from densify.readers.file_sequence import Returns
 from densify.readers.folder.config import SweepFiles
 from densify.readers.folder.files import Series
@@ -29,7 +30,6 @@ from densify.readers.points.fields import (
     widened,
 )
 from densify.readers.points.files import read_table
-from densify.types import Bool, Int
 
 Columns = Mapping[str, NDArray[Any]]
 

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from densify.types import Float32, Int
+from densify.geometry.types import Float32, Int
 
 UNIT_NS = {"s": 1_000_000_000, "ms": 1_000_000, "us": 1_000, "ns": 1}
 REFERENCES = ("start", "middle", "end")

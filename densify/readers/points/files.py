@@ -14,11 +14,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from densify.errors import InputError
-from densify.files.arrays import read_array, read_arrays
-from densify.files.content import check_size, open_file, read_bytes
-from densify.files.las import read_las
+from densify.config.errors import InputError
+from densify.config.file_content import check_size, open_file, read_bytes
+from densify.readers.array_files import read_array, read_arrays
 from densify.readers.extras import needed
+from densify.readers.las_files import read_las
 
 Columns = dict[str, NDArray[Any]]
 

@@ -17,9 +17,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from densify.errors import InputError
+from densify.config.errors import InputError
+from densify.geometry.types import Int
 from densify.readers.extras import needed
-from densify.types import Int
 
 _LARGE_BYTES = 2**28
 _KEPT_BYTES = 2**30
@@ -95,7 +95,7 @@ class Bag:
         if size < _LARGE_BYTES:
             found = self._read_index(names)
         else:
-            from densify.cache import Cache
+            from densify.config.cache import Cache
 
             state = [(str(f.absolute()), f.stat().st_size, f.stat().st_mtime_ns) for f in files]
             found = Cache(_KEPT_BYTES).get(

@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from densify.errors import InputError
+from densify.config.errors import InputError
 from densify.geometry.poses import inverse
+from densify.geometry.types import Float
 from densify.readers.file_sequence import quaternion_pose
 from densify.readers.pose_track import PoseTrack
 from densify.readers.ros.bag import Bag
-from densify.types import Float
 
 _TF = "tf2_msgs/msg/TFMessage"
 _OLD_TF = "tf/msg/tfMessage"

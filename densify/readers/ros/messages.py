@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from densify.errors import InputError
-from densify.files.images import decode_image
+from densify.config.errors import InputError
+from densify.geometry.types import Camera, Float
 from densify.readers.file_sequence import rigid
-from densify.types import Camera, Float
+from densify.readers.image_files import decode_image
 
 _DATATYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 # of a lens's model: how densify calls it, and how many coefficients it has

@@ -33,8 +33,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from densify.errors import InputError
+from densify.config.errors import InputError
 from densify.geometry import poses
+from densify.geometry.types import Camera, Float, Float32
 from densify.readers.file_sequence import FileSequence, Returns, truth_beside
 from densify.readers.files import check_image_size
 from densify.readers.points.fields import (
@@ -52,7 +53,6 @@ from densify.readers.ros.bag import Bag, Entry
 from densify.readers.ros.frames import Frames, plain, recorded_track
 from densify.readers.ros.messages import camera_of, cloud_columns, image_rgb
 from densify.readers.ros.topics import POSES, Images, Topics
-from densify.types import Camera, Float, Float32
 
 _NUM_TRIED = 5  # sweeps, until one holds points
 _USUAL_PERIOD_NS = 100_000_000
@@ -78,7 +78,7 @@ class Lidar(NamedTuple):
 
 
 class RosBag(FileSequence):
-    """A bag as a `densify.types.LidarSequence`; `findings` says what was found."""
+    """A bag as a `LidarSequence`; `findings` says what was found."""
 
     def __init__(self, path: Path, options: str | None = None) -> None:
         """Reads the bag through once, for the stamps of its messages. Raises InputError if it is
@@ -115,7 +115,7 @@ class RosBag(FileSequence):
         return self._sweeps[frame].stamp_ns
 
     def findings(self) -> Sequence[tuple[str, str]]:
-        """See `densify.types.SaysWhatItFound`."""
+        """See `SaysWhatItFound`."""
         lines = []
         for lidar in self._lidars:
             used = [f"{part} = {name}" for part, name in vars(lidar.fields).items() if name]

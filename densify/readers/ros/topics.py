@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 from urllib.parse import parse_qsl
 
-from densify.errors import InputError
+from densify.config.errors import InputError
 from densify.readers.ros.bag import Bag, Topic
 
 CLOUD = "sensor_msgs/msg/PointCloud2"

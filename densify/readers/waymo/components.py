@@ -13,12 +13,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from densify.errors import InputError
+from densify.config.errors import InputError
 from densify.geometry.poses import inverse
+from densify.geometry.types import Boxes, Camera, Float, Int
 from densify.readers.arrow_columns import read_parquet
 from densify.readers.boxes import checked_boxes, upright_poses
 from densify.readers.file_sequence import rigid
-from densify.types import Boxes, Camera, Float, Int
 
 OBJECT = "key.laser_object_id"
 _BOX = "[LiDARBoxComponent].box"

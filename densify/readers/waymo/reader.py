@@ -37,8 +37,9 @@ from pathlib import Path
 
 import numpy as np
 
-from densify.errors import InputError
+from densify.config.errors import InputError
 from densify.geometry.poses import inverse, transform
+from densify.geometry.types import Bool, Boxes, Float, Int
 from densify.readers.file_sequence import (
     FileSequence,
     Returns,
@@ -62,7 +63,6 @@ from densify.readers.waymo.components import (
     read_lasers,
     transform_of,
 )
-from densify.types import Bool, Boxes, Float, Int
 
 _NOMINAL_PERIOD_NS = 100_000_000
 _LEAST_WAY_M = 0.3  # of the vehicle in a sweep, from which its poses tell time
@@ -81,7 +81,7 @@ def open_recording(path: Path, scene: str | None) -> Waymo:
 
 
 class Waymo(FileSequence):
-    """A segment as a `densify.types.LidarSequence`; the lidar frame is the vehicle's."""
+    """A segment as a `LidarSequence`; the lidar frame is the vehicle's."""
 
     def __init__(self, root: Path, context: str) -> None:
         """Reads stamps, poses and calibration. Raises InputError if a component is missing or
@@ -120,7 +120,7 @@ class Waymo(FileSequence):
         return self._T_world_vehicle[frame]
 
     def boxes(self, frame: int) -> Boxes | None:
-        """See `densify.types.KnowsBoxes`; the test split has none. Raises InputError if they are
+        """See `KnowsBoxes`; the test split has none. Raises InputError if they are
         malformed."""
         self.check_frame(frame)
         return self._boxes.get(int(self._starts_us[frame]))

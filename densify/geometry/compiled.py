@@ -1,0 +1,126 @@
+# SPDX-License-Identifier: MIT
+"""Compiled inner loops; the only door to numba.
+
+A kernel takes arrays of fixed types, writes into arrays it is given and raises nothing. It lets go
+of the interpreter while it works, so that its rows can be shared out among threads.
+
+Compiling takes a quarter of a first run. Rows are assigned number by number: an array or a tuple at
+once takes 1.6 s to compile. A literal handed to an inlined function compiles it once more.
+"""
+
+from __future__ import annotations
+
+import gc
+import logging
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numba
+from numba.core import event
+
+from densify.config.user_folder import others_can_write
+from densify.geometry import threads
+
+_log = logging.getLogger("densify")
+_progress = logging.getLogger("densify.progress")
+_Function = TypeVar("_Function", bound=Callable[..., Any])
+
+# No fastmath, and divisions as numpy has them: a result is the same on every machine. Wrappers for
+# callers that there are none of would take a tenth of the time that compiling takes.
+_OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
+_NOT_FROM_PYTHON: dict[str, Any] = {"no_cpython_wrapper": True}
+
+
+class _Compiling(event.Listener):
+    """Says once that the first run takes longer; numba tells what it has to compile. The garbage
+    collector rests meanwhile: it would go through all that the compiler builds, again and again,
+    which takes a sixth of the time and finds next to nothing.
+
+    Numba compiles one function at a time, and what that one calls within it.
+    """
+
+    said = False
+    _depth, _collects = 0, False
+
+    def on_start(self, event: event.Event) -> None:
+        if not self.said and str(event.data["dispatcher"].__module__).startswith("densify."):
+            self.said = True
+            _progress.info(
+                "compiling the inner loops, once for this installation: about half a minute in all"
+            )
+        if not self._depth:
+            self._collects = gc.isenabled()
+            gc.disable()
+        self._depth += 1
+
+    def on_end(self, event: event.Event) -> None:
+        self._depth -= 1
+        if not self._depth and self._collects:
+            gc.enable()
+
+
+_compiling = _Compiling()
+event.register("numba:compile", _compiling)
+
+
+def inlined(function: _Function) -> _Function:
+    """Compiled as a part of the kernels that call it; they must stand in the same file, or a change
+    would not be seen by their cached code."""
+    compiled: _Function = numba.njit(**_OPTIONS, **_NOT_FROM_PYTHON)(function)
+    return compiled
+
+
+@cache
+def _is_open(folder: Path) -> bool:
+    """Whether others can write to it or to the folder it is in; says so."""
+    found = next((f for f in (folder, folder.parent) if others_can_write(f)), None)
+    if found is not None:
+        _log.warning(
+            "%s: others can write to it; compiled code is not kept there: chmod 700 it, or name "
+            "another folder by NUMBA_CACHE_DIR",
+            found,
+        )
+    return found is not None
+
+
+class Kernel:
+    """A function that is compiled when first called with new types, and kept for later runs.
+
+    The cache lies beside the source file, else in the user's cache directory, or where the
+    environment variable NUMBA_CACHE_DIR says. Where none can be written, what lies there is
+    damaged, or others than those who can change the source could have put it there (it is loaded as
+    code), it is compiled anew in every run.
+    """
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        self.__doc__ = function.__doc__
+        self._function = function
+        try:
+            self._compiled = numba.njit(function, cache=True, **_OPTIONS)
+        except RuntimeError as error:  # no place for a cache
+            self._do_without_cache(error)
+            return
+        folder = Path(self._compiled.stats.cache_path or "")
+        if folder.parent != Path(function.__code__.co_filename).parent and _is_open(folder):
+            self._do_without_cache(f"others can write to {folder}")
+
+    def __call__(self, *arguments: Any) -> Any:
+        try:
+            return self._compiled(*arguments)
+        except Exception as error:  # a full disk, a damaged file: unpickling can raise anything
+            self._do_without_cache(error)
+            return self._compiled(*arguments)
+
+    def over_rows(self, num_rows: int, *arguments: Any) -> None:
+        """Call with (begin, end, *arguments) for parts of the rows, on all cores.
+
+        The parts do not change the result where a kernel treats every row by itself.
+        NUMBA_NUM_THREADS limits the threads.
+        """
+        threads.over_rows(self, num_rows, *arguments)
+
+    def _do_without_cache(self, error: Exception | str) -> None:
+        _log.debug("%s is compiled without a cache: %s", self._function.__name__, error)
+        self._compiled = numba.njit(self._function, **_OPTIONS)

@@ -1,0 +1,81 @@
+# SPDX-License-Identifier: MIT
+"""What the stages hand to each other. All are frozen; columns stay aligned row by row.
+
+Poses are named ``T_target_source``: ``p_target = T_target_source @ p_source``. Frames of reference:
+``world`` (the first sweep's lidar), ``lidar`` (at the sweep's reference time), ``key`` (the key
+sweep's lidar), ``cam``.
+"""
+
+from densify.geometry.arrays import Bool, Float, Float32, Int
+from densify.geometry.types.boxes import Boxes, BoxView
+from densify.geometry.types.depth import (
+    Camera,
+    CameraView,
+    Cloud,
+    DepthMap,
+    Mover,
+    Patches,
+    Ranked,
+    Reason,
+    StandingWorld,
+)
+from densify.geometry.types.flow import FlowField, Motion, StretchFlow
+from densify.geometry.types.prior import FullDepth, Prior, PriorFit
+from densify.geometry.types.recordings import (
+    KnowsBoxes,
+    KnowsFiles,
+    KnowsImagePoses,
+    KnowsItsGaps,
+    KnowsRows,
+    LidarSequence,
+    MakesFrames,
+    SaysWhatItFound,
+    SweepTruth,
+    Truth,
+)
+from densify.geometry.types.results import Progress, Result, StageCost
+from densify.geometry.types.sweeps import Links, RegisteredSweep, Stretch, Sweep, Trajectory
+from densify.geometry.types.tracks import ObjectTrack
+
+__all__ = [
+    "Bool",
+    "BoxView",
+    "Boxes",
+    "Camera",
+    "CameraView",
+    "Cloud",
+    "DepthMap",
+    "Float",
+    "Float32",
+    "FlowField",
+    "FullDepth",
+    "Int",
+    "KnowsBoxes",
+    "KnowsFiles",
+    "KnowsImagePoses",
+    "KnowsItsGaps",
+    "KnowsRows",
+    "LidarSequence",
+    "Links",
+    "MakesFrames",
+    "Motion",
+    "Mover",
+    "ObjectTrack",
+    "Patches",
+    "Prior",
+    "PriorFit",
+    "Progress",
+    "Ranked",
+    "Reason",
+    "RegisteredSweep",
+    "Result",
+    "SaysWhatItFound",
+    "StageCost",
+    "StandingWorld",
+    "Stretch",
+    "StretchFlow",
+    "Sweep",
+    "SweepTruth",
+    "Trajectory",
+    "Truth",
+]

@@ -1,0 +1,359 @@
+# SPDX-License-Identifier: MIT
+"""Accumulated clouds and what cameras see of them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields, replace
+from enum import IntEnum
+from importlib import import_module
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from densify.config.errors import InputError
+from densify.geometry.arrays import Bool, Float, Float32, Int, table
+from densify.geometry.types.rigid import inverse
+from densify.geometry.types.sweeps import Links
+
+
+@dataclass(frozen=True)
+class Cloud:
+    """M accumulated points at the key's moment.
+
+    points: (M,3) metres, key frame.
+    rigid_points: (M,3) where registration alone puts them.
+    frame: (M,) int32 source sweep. since_key_ns: (M,) int64 from the key's reference time to the
+    source sweep's. row: (M,) int64 in the source sweep's file. lidar: (M,) uint8, which of its
+    scanners measured the point.
+    moving: (M,) bool. instance: (M,) int32, -1 none. velocity_m_s: (M,3) float32 at the key's
+    moment, ego-motion removed, 0 where nothing moves. confidence: (M,) float32, 0 to 1.
+    intensity: (M,) float32. rgb: (M,3) uint8, black where no camera saw the point. far: (M,) bool,
+    from a sweep beyond the window (``accumulate.far_m``).
+    """
+
+    points: Float
+    rigid_points: Float
+    frame: NDArray[np.int32]
+    since_key_ns: Int
+    row: Int
+    lidar: NDArray[np.uint8]
+    moving: Bool
+    instance: NDArray[np.int32]
+    velocity_m_s: Float32
+    confidence: Float32
+    intensity: Float32
+    rgb: NDArray[np.uint8]
+    far: Bool
+
+    @property
+    def displaced(self) -> Float32:
+        """(M,) metres moved beyond the rigid alignment."""
+        x, y, z = (self.points - self.rigid_points).T
+        return np.sqrt(x * x + y * y + z * z).astype(np.float32)
+
+    def after(self, seconds: float) -> Cloud:
+        """Shortly after (or before) the key's moment: what moves goes on at its velocity."""
+        return replace(self, points=self.points + seconds * self.velocity_m_s)
+
+    def joined(self, other: Cloud) -> Cloud:
+        """The cloud with another's points behind its own."""
+        names = [f.name for f in fields(self)]
+        return Cloud(**{n: np.concatenate([getattr(self, n), getattr(other, n)]) for n in names})
+
+    def select(self, keep: Bool) -> Cloud:
+        """The points where ``keep`` (M,) is True."""
+        rows = np.flatnonzero(keep)  # once for all columns
+        return Cloud(**{f.name: getattr(self, f.name).take(rows, axis=0) for f in fields(self)})
+
+    def columns(self) -> dict[str, NDArray[Any]]:
+        """Everything as (M,) columns in the types they have here, vectors by axis: x y z, rigid_x
+        rigid_y rigid_z, velocity_x velocity_y velocity_z (m/s), red green blue, and the rest by the
+        names above."""
+        by_axis = {
+            "points": ("x", "y", "z"),
+            "rigid_points": ("rigid_x", "rigid_y", "rigid_z"),
+            "velocity_m_s": ("velocity_x", "velocity_y", "velocity_z"),
+            "rgb": ("red", "green", "blue"),
+        }
+        columns: dict[str, NDArray[Any]] = {}
+        for f in fields(self):
+            values = getattr(self, f.name)
+            names = by_axis.get(f.name)
+            columns |= dict(zip(names, values.T, strict=True)) if names else {f.name: values}
+        return columns
+
+    def to_numpy(self) -> NDArray[Any]:
+        """(M,) structured, a field for each of `columns`."""
+        return table(self.columns())
+
+    def to_pandas(self) -> Any:
+        """A ``pandas.DataFrame`` of M rows with `columns`. Raises InputError without pandas."""
+        return _needed("pandas", "to_pandas()").DataFrame(self.columns())
+
+    def to_open3d(self) -> Any:
+        """An ``open3d.t.geometry.PointCloud``: positions (float64) and colors (0 to 1, float32),
+        and the other `columns` as attributes (M,1) by their names. Raises InputError without
+        open3d."""
+        open3d = _needed("open3d", "to_open3d()")
+        cloud = open3d.t.geometry.PointCloud()
+        cloud.point.positions = open3d.core.Tensor(np.ascontiguousarray(self.points))
+        cloud.point.colors = open3d.core.Tensor(self.rgb.astype(np.float32) / np.float32(255))
+        for name, values in self.columns().items():
+            if name not in ("x", "y", "z", "red", "green", "blue"):
+                column = values.astype(np.uint8) if values.dtype == bool else values
+                cloud.point[name] = open3d.core.Tensor(np.ascontiguousarray(column[:, None]))
+        return cloud
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+
+def _needed(package: str, what: str) -> Any:
+    """The imported module."""
+    try:
+        return import_module(package)
+    except ImportError as error:
+        raise InputError(
+            f"{what} needs the package {package} ({error}); install it with pip install {package}"
+        ) from None
+
+
+@dataclass(frozen=True)
+class Patches:
+    """What each of a cloud's M points stands for; see `densify.depth.patches`.
+
+    normal: (M,3) float32 key frame, of any length, of the tangent plane. spacing_m: (M,2) float32
+    to the neighbouring rays of the same sweep, across and along elevation. free: (M,) bool, the key
+    sweep saw through the place. sweep: (M,) int32, which of the cloud's sweeps, counted by
+    frame, those beyond the window last. place: (M,) int32, number of the stretch of road from which
+    a sweep beyond the window measured the point; -1 of those within.
+    """
+
+    normal: Float32
+    spacing_m: Float32
+    free: Bool
+    sweep: NDArray[np.int32]
+    place: NDArray[np.int32]
+
+    def joined(self, other: Patches) -> Patches:
+        """The patches with those of another cloud behind them; no sweep is in both."""
+        num_sweeps = np.int32(self.sweep.max(initial=-1) + 1)
+        return Patches(
+            np.concatenate([self.normal, other.normal]),
+            np.concatenate([self.spacing_m, other.spacing_m]),
+            np.concatenate([self.free, other.free]),
+            np.concatenate([self.sweep, num_sweeps + other.sweep]),
+            np.concatenate([self.place, other.place]),
+        )
+
+    def select(self, keep: Bool) -> Patches:
+        """The patches of ``cloud.select(keep)``."""
+        rows = np.flatnonzero(keep)
+        sweep = self.sweep[rows]
+        number = np.cumsum(np.bincount(sweep) > 0) - 1
+        return Patches(
+            self.normal.take(rows, axis=0),
+            self.spacing_m.take(rows, axis=0),
+            self.free[rows],
+            number[sweep].astype(np.int32),
+            self.place[rows],
+        )
+
+
+@dataclass(frozen=True)
+class StandingWorld:
+    """K points of the standing world, measured along a stretch of road.
+
+    points: (K,3) float32 metres. normal: (K,3) float32 of any length, of the tangent plane.
+    spacing_m: (K,2) float32 to the neighbouring rays of the same sweep. source: (K,) int32, which
+    of the sweeps ``frames`` measured it. row, lidar, intensity: as in `Cloud`. frames: n sweeps.
+    stamp_ns: (n,) int64. travel_m: (n,) float64, where along the road they were: 0 at the key's
+    window, negative behind it. links: pairs of submaps, by which the sweeps were placed. left_out:
+    sweeps beyond that hang on bad pairs only.
+    """
+
+    points: Float32
+    normal: Float32
+    spacing_m: Float32
+    source: NDArray[np.int32]
+    row: Int
+    lidar: NDArray[np.uint8]
+    intensity: Float32
+    frames: tuple[int, ...]
+    stamp_ns: Int
+    travel_m: Float
+    links: Links = field(default_factory=Links.none)
+    left_out: tuple[int, ...] = ()
+
+    @property
+    def stamps_ns(self) -> dict[int, int]:
+        """Reference times by frame."""
+        return dict(zip(self.frames, self.stamp_ns.tolist(), strict=True))
+
+    def select(self, keep: Bool | Int) -> StandingWorld:
+        """Some of the points."""
+        rows = np.flatnonzero(keep) if keep.dtype == bool else keep
+        kept = {name: getattr(self, name).take(rows, axis=0) for name in _COLUMNS_OF_STANDING}
+        return replace(self, **kept)
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+
+_COLUMNS_OF_STANDING = ("points", "normal", "spacing_m", "source", "row", "lidar", "intensity")
+
+
+class Reason(IntEnum):
+    """Why a point is not in a depth map; the first that applies."""
+
+    KEPT = 0  # its pixel's depth is from it
+    VETOED = 1  # the key sweep saw through its place
+    OUTSIDE = 2  # not in the image
+    HIDDEN = 3  # behind another point's patch
+    NOT_CHOSEN = 4  # its pixel's depth is from a point nearer in time to the key, or nearer
+    UNSUPPORTED = 5  # too few sweeps agree with it, or not the one nearest to the key
+    EDGE = 6  # so close to a depth edge that its pixel may lie beyond it
+    GLASS = 7  # inside a vehicle, seen through a window
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A camera, rectified or with its lens; `densify.geometry.cameras` has the models.
+
+    width_px, height_px: image size. K: (3,3) pixels; pixel (u,v) is an integer at its centre.
+    T_cam_lidar: (4,4). model: pinhole, fisheye (Kannala-Brandt) or mei. distortion: the lens's
+    coefficients: of a pinhole OpenCV's (k1 k2 p1 p2 k3 ...), empty if rectified; of a fisheye k1 k2
+    k3 k4; of mei xi k1 k2 p1 p2. max_angle_deg: beyond this angle off its axis the lens sees
+    nothing. row_time_s: seconds from the exposure of a row of the image to that of the row below,
+    negative if it is read from the bottom, 0 for all at once. column_time_s: the same from a column
+    to the one on its right, of a shutter that runs sideways. The stamp is that of the image's
+    middle.
+    """
+
+    name: str
+    width_px: int
+    height_px: int
+    K: Float
+    T_cam_lidar: Float
+    distortion: tuple[float, ...] = ()
+    model: str = "pinhole"
+    max_angle_deg: float = 180.0
+    row_time_s: float = 0.0
+    column_time_s: float = 0.0
+
+    @property
+    def is_rolling(self) -> bool:
+        """Whether its rows or columns are exposed one after another."""
+        return bool(self.row_time_s or self.column_time_s)
+
+    @property
+    def readout_s(self) -> float:
+        """Between the exposures of the first and the last row or column, about."""
+        along = abs(self.row_time_s) * self.height_px
+        return along + abs(self.column_time_s) * self.width_px
+
+    @property
+    def is_rectified(self) -> bool:
+        """A pinhole without distortion."""
+        return self.model == "pinhole" and not self.distortion
+
+    @property
+    def measure(self) -> str:
+        """What depth is unless asked otherwise: camera ``z``; the ``range`` of a lens that may see
+        behind its image plane, where z is negative."""
+        return "z" if self.model == "pinhole" else "range"
+
+    @property
+    def focal_px(self) -> float:
+        """Pixels to the right per radian, in the middle of the image."""
+        xi = self.distortion[0] if self.model == "mei" else 0.0
+        return float(self.K[0, 0] / (1 + xi))
+
+
+class Ranked(NamedTuple):
+    """What the confidence of a map's pixels was made from (`densify.depth.confidence`); (H,W).
+
+    rank: float32 0 to 1, the greater the surer, 0 where ``filled_m`` has none. group: uint8, which
+    pixels are alike. contradicted: float32 0 to 1, how far what is measured around contradicts
+    itself.
+    """
+
+    rank: Float32
+    group: NDArray[np.uint8]
+    contradicted: Float32
+
+
+@dataclass(frozen=True)
+class CameraView:
+    """Where a depth map looks from.
+
+    T_cam_key: (4,4) at the moment the map shows. late_s: seconds from the key's reference time to
+    that moment. number: of the image, None where there is none.
+    """
+
+    camera: Camera
+    T_cam_key: Float
+    late_s: float
+    number: int | None
+
+
+@dataclass(frozen=True)
+class DepthMap:
+    """Dense depth of one camera; (H,W) everywhere.
+
+    depth_m: float32 of measured pixels, 0 none; as measure says camera ``z``, or ``range`` from the
+    lens. filled_m: the same plus pixels interpolated between measured ones. confidence: float32 0
+    to 1, of every pixel in ``filled_m``. frame: int32 source sweep of measured pixels, -1
+    elsewhere. age_s: float32 seconds between the moment the map shows and the reference time of the
+    sweep that measured the pixel, of every pixel in ``filled_m``, nan elsewhere; None until
+    `densify.depth.age` has worked it out. reason: (M,) uint8, a `Reason` for each point of the
+    cloud; empty if the cloud is not at hand. warnings: what could not be done as asked. ranked:
+    what a calibrated confidence was made from, None of another one.
+    """
+
+    camera: str
+    depth_m: Float32
+    filled_m: Float32
+    confidence: Float32
+    frame: NDArray[np.int32]
+    reason: NDArray[np.uint8] = field(default_factory=lambda: np.zeros(0, np.uint8))
+    age_s: Float32 | None = None
+    measure: str = "z"
+    warnings: tuple[str, ...] = ()
+    ranked: Ranked | None = None
+
+    def to_points(self, view: CameraView, filled: bool = True) -> Float:
+        """(K,3) the map's pixels as points in the key frame, metres, row by row.
+
+        view: ``Result.views`` of the same name. filled: with the interpolated pixels, else the
+        measured ones alone. What moves is where it was when the image was exposed. Raises
+        InputError for a camera that is not rectified, or a map of ranges.
+        """
+        camera = view.camera
+        if not camera.is_rectified or self.measure != "z":
+            raise InputError(
+                f"{self.camera}: to_points() needs a rectified pinhole and depth along its axis, "
+                f"got {camera.model} with {len(camera.distortion)} coefficients and depth as "
+                f"{self.measure}; take result.cloud"
+            )
+        depth_m = (self.filled_m if filled else self.depth_m).astype(np.float64)
+        v, u = np.nonzero(depth_m)
+        rays = np.column_stack([u, v, np.ones(len(u))]) @ np.linalg.inv(camera.K).T
+        points_cam = rays * depth_m[v, u][:, None]
+        T_key_cam = inverse(view.T_cam_key)
+        return np.asarray(points_cam @ T_key_cam[:3, :3].T + T_key_cam[:3, 3])
+
+    def counts(self) -> dict[str, int]:
+        """Points of the cloud by what became of them."""
+        counts = np.bincount(self.reason, minlength=len(Reason))
+        return {which.name.lower(): int(counts[which]) for which in Reason}
+
+
+@dataclass(frozen=True)
+class Mover:
+    """One moving object by itself: its points, and the depth it has in each camera."""
+
+    cloud: Cloud
+    depth: Mapping[str, DepthMap]

@@ -1,0 +1,243 @@
+# SPDX-License-Identifier: MIT
+"""Sweeps as measured, and registered: the input of every later step."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from densify.geometry.arrays import Bool, Float, Float32, Int
+from densify.geometry.types.rigid import inverse
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """One lidar revolution of N returns.
+
+    points: (N,3) metres, lidar frame; as read, each at its own firing time, and after deskewing all
+        at ``stamp_ns``.
+    stamp_ns: the reference time, as the data set stamps its sweeps: begin, middle or end.
+    intensity: (N,) float32, 0 to 1.
+    offset_ns: (N,) int64, firing time minus ``stamp_ns``; None where the data cannot tell.
+    lidar: (N,) uint8, which of several scanners in one sweep fired.
+    row: (N,) int64, row of the return in the source file (invalid rows are dropped on reading).
+    scanner_origins: (S,3) metres, lidar frame, where the rays of each scanner start; None where all
+        start at the frame's origin.
+    R_scanner_lidar: (S,3,3) turns the lidar frame's axes into each scanner's, z along the one it
+        spins about, upwards; None where they are the frame's.
+    radial_velocity_m_s: (N,) float32, away from the scanner, as FMCW lidars measure it, NaN where
+        it was not; as read, relative to the scanner, and after deskewing with the scanner's own
+        motion removed, so that what stands has 0. None for scanners that do not measure it.
+    """
+
+    frame: int
+    stamp_ns: int
+    points: Float
+    intensity: Float32
+    offset_ns: Int | None
+    lidar: NDArray[np.uint8]
+    row: Int
+    scanner_origins: Float | None = None
+    R_scanner_lidar: Float | None = None
+    radial_velocity_m_s: Float32 | None = None
+
+    def __post_init__(self) -> None:
+        n = len(self.points)
+        for name in ("intensity", "offset_ns", "lidar", "row", "radial_velocity_m_s"):
+            column = getattr(self, name)
+            if column is not None and column.shape != (n,):
+                raise ValueError(f"Sweep.{name}: expected ({n},), got {column.shape}")
+        num_scanners = int(self.lidar.max(initial=0)) + 1
+        if self.R_scanner_lidar is not None:
+            shape = self.R_scanner_lidar.shape
+            if len(shape) != 3 or shape[1:] != (3, 3) or shape[0] < num_scanners:
+                raise ValueError(
+                    f"Sweep.R_scanner_lidar: expected a rotation (3,3) for each of {num_scanners} "
+                    f"scanners, got {shape}"
+                )
+        if self.scanner_origins is not None:
+            shape = self.scanner_origins.shape
+            if len(shape) != 2 or shape[1] != 3 or shape[0] < num_scanners:
+                raise ValueError(
+                    f"Sweep.scanner_origins: expected a row (3,) for each of {num_scanners} "
+                    f"scanners, got {shape}"
+                )
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    def select(self, keep: Bool | slice) -> Sweep:
+        """The returns where ``keep`` (N,) is True, or of a slice."""
+        rows = np.arange(len(self))[keep]
+        return replace(
+            self,
+            points=self.points.take(rows, axis=0),
+            intensity=self.intensity[rows],
+            offset_ns=None if self.offset_ns is None else self.offset_ns[rows],
+            lidar=self.lidar[rows],
+            row=self.row[rows],
+            radial_velocity_m_s=(
+                None if self.radial_velocity_m_s is None else self.radial_velocity_m_s[rows]
+            ),
+        )
+
+    def axes(self, lidar: int) -> Float:
+        """(3,3) from the lidar frame's axes to that scanner's."""
+        return np.eye(3) if self.R_scanner_lidar is None else self.R_scanner_lidar[lidar]
+
+    def origin_m(self, lidar: int) -> Float:
+        """(3,) where the rays of that scanner start, lidar frame."""
+        return np.zeros(3) if self.scanner_origins is None else self.scanner_origins[lidar]
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """Where the lidar was: frames ascending, stamp_ns (n,) int64, T_world_lidar (n,4,4).
+
+    R_level_lidar: (3,3) turns the lidar's axes so that z is up; not the identity where it leans.
+    """
+
+    frames: tuple[int, ...]
+    stamp_ns: Int
+    T_world_lidar: Float
+    R_level_lidar: Float = field(default_factory=lambda: np.eye(3))
+
+    def part(self, frames: Sequence[int]) -> Trajectory:
+        """The poses of these frames alone."""
+        rows = [self.frames.index(f) for f in frames]
+        return replace(
+            self,
+            frames=tuple(frames),
+            stamp_ns=self.stamp_ns[rows],
+            T_world_lidar=self.T_world_lidar[rows],
+        )
+
+    def joined(self, following: Trajectory, frames: Sequence[int]) -> Trajectory:
+        """The trajectory with these frames of another one, which has its last frame too."""
+        T_world_last = self.T_world_lidar[-1]
+        T_other_last = following.T_world_lidar[following.frames.index(self.frames[-1])]
+        T_world_other = T_world_last @ inverse(T_other_last)
+        part = following.part(frames)
+        return replace(
+            self,
+            frames=self.frames + part.frames,
+            stamp_ns=np.concatenate([self.stamp_ns, part.stamp_ns]),
+            T_world_lidar=np.concatenate([self.T_world_lidar, T_world_other @ part.T_world_lidar]),
+        )
+
+    def seen_from(self, frame: int) -> Trajectory:
+        """The same in the world of that frame's lidar, upright."""
+        T_new_lidar = np.eye(4)
+        T_new_lidar[:3, :3] = self.R_level_lidar
+        T_new_old = T_new_lidar @ inverse(self.T_world_lidar[self.frames.index(frame)])
+        return replace(self, T_world_lidar=T_new_old @ self.T_world_lidar)
+
+
+@dataclass(frozen=True)
+class RegisteredSweep:
+    """A deskewed sweep with its place in the world.
+
+    sweep: points in the lidar frame at ``sweep.stamp_ns``.
+    T_world_lidar: (4,4).
+    twist_before, twist_after: (6,) rotation vector and translation per second (rad/s, m/s) of the
+        lidar before and after its reference time, in the lidar frame: a raw point fired at offset t
+        lies at ``exp(t · twist) @ p_raw``.
+    """
+
+    sweep: Sweep
+    T_world_lidar: Float
+    twist_before: Float
+    twist_after: Float
+
+    @property
+    def frame(self) -> int:
+        return self.sweep.frame
+
+    def rays(self) -> tuple[Float, Float]:
+        """Unit vectors (N,3) from where each scanner was when it fired to the points, and its
+        velocity (N,3) in m/s then; lidar frame at the reference time."""
+        sweep = self.sweep
+        start = np.zeros((len(sweep), 3))
+        if sweep.scanner_origins is not None:
+            start = sweep.scanner_origins[sweep.lidar]
+        twist = np.broadcast_to((self.twist_before + self.twist_after) / 2, (len(sweep), 6))
+        arm = start
+        if sweep.offset_ns is not None:
+            offset_s = sweep.offset_ns[:, None] * 1e-9
+            twist = np.where(offset_s < 0, self.twist_before, self.twist_after)
+            arm = start + offset_s * np.cross(twist[:, :3], start)
+            start = arm + offset_s * twist[:, 3:]
+        away = sweep.points - start
+        length_m = np.linalg.norm(away, axis=1, keepdims=True)
+        velocity_m_s: Float = twist[:, 3:] + np.cross(twist[:, :3], arm)
+        return away / np.maximum(length_m, 1e-9), velocity_m_s
+
+    @staticmethod
+    def without_points(trajectory: Trajectory, frame: int) -> RegisteredSweep:
+        """The place and time of a sweep of the trajectory."""
+        i, nothing = trajectory.frames.index(frame), np.zeros(0)
+        sweep = Sweep(
+            frame=frame,
+            stamp_ns=int(trajectory.stamp_ns[i]),
+            points=np.zeros((0, 3)),
+            intensity=nothing.astype(np.float32),
+            offset_ns=None,
+            lidar=nothing.astype(np.uint8),
+            row=nothing.astype(np.int64),
+        )
+        return RegisteredSweep(sweep, trajectory.T_world_lidar[i], np.zeros(6), np.zeros(6))
+
+
+@dataclass(frozen=True)
+class Stretch:
+    """Registered sweeps of a drive in one world, by ascending frame."""
+
+    sweeps: tuple[RegisteredSweep, ...]
+
+    @property
+    def frames(self) -> tuple[int, ...]:
+        return tuple(s.frame for s in self.sweeps)
+
+    def __getitem__(self, frame: int) -> RegisteredSweep:
+        return self.sweeps[self.frames.index(frame)]
+
+    def T_target_source(self, target: int, source: int) -> Float:
+        """(4,4) from the lidar frame of one sweep to that of another, by frame number."""
+        if target == source:
+            return np.eye(4)
+        return inverse(self[target].T_world_lidar) @ self[source].T_world_lidar
+
+
+@dataclass(frozen=True)
+class Links:
+    """Pairs of submaps laid on each other, and how well they agree once all poses are found.
+
+    frames: (p,2) int32 of the sweep in the middle of the target and the source. overlap: (p,) share
+    of the source's points that met the target. rms_m: (p,) left between those. num_matches: (p,) of
+    them. correction_m, correction_deg: (p,) by which the graph changed how they stand to each
+    other. left_m: (p,) how far that still lifts the source's surface off where it was laid.
+    """
+
+    frames: NDArray[np.int32]
+    overlap: Float
+    rms_m: Float
+    num_matches: Int
+    correction_m: Float
+    correction_deg: Float
+    left_m: Float
+
+    @staticmethod
+    def none() -> Links:
+        nothing = np.zeros(0)
+        return Links(
+            frames=np.zeros((0, 2), np.int32),
+            overlap=nothing,
+            rms_m=nothing,
+            num_matches=np.zeros(0, np.int64),
+            correction_m=nothing,
+            correction_deg=nothing,
+            left_m=nothing,
+        )

@@ -1,2 +1,0 @@
-# SPDX-License-Identifier: MIT
-"""The results of a key: `densify.results.key` is the story."""
