@@ -15,8 +15,7 @@ from densify.free_space.range_image import RangeImage
 from densify.free_space.sensor import SensorModel, Sensors, aimed
 from densify.geometry.types import RegisteredSweep, Sweep
 from densify.readers.file_sequence import scanner_axes
-from densify.street.patterns import Spinning
-from densify.street.sensors import SENSORS
+from densify.street.sensors import SENSORS, Spinning
 from tests.fired import fired
 from tests.scenes import on_sphere
 

@@ -14,7 +14,7 @@ from densify.outputs.writers import FORMATS, write_street
 from densify.readers.kitti.raw import KittiRaw
 from densify.readers.street import Street
 from densify.readers.truth_files import FileTruth, write_bodies, write_points
-from densify.street.bodies import Bodies
+from densify.street.simulator import Bodies
 from tests.command import exit_code
 
 FRAMES = [58, 60]

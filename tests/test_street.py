@@ -10,8 +10,6 @@ from densify.config.errors import InputError
 from densify.geometry.poses import inverse, transform
 from densify.readers.street import Street
 from densify.street.actors import TRAILER_WHEELBASE_M
-from densify.street.casting import EGO_BOX, SPAN_S, Scene
-from densify.street.curves import Curve, Lane, Speed, polyline
 from densify.street.footprints import Rectangles, overlap
 from densify.street.lidar import Mounted, scan
 from densify.street.materials import GLASS_PASSES, LASER_PASSES, Material
@@ -20,7 +18,8 @@ from densify.street.motion import Driving, Poses, Still, Towed
 from densify.street.scenes import build_scene
 from densify.street.sensors import SENSORS, firings
 from densify.street.simulator import Simulator, seconds
-from densify.street.terrain import Road, Terrain
+from densify.street.terrain import Curve, Lane, Road, Speed, Terrain, polyline
+from densify.street.traffic import EGO_BOX, SPAN_S, Scene
 from densify.street.world import Body, Rays, World
 
 KEY = 120

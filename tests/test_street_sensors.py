@@ -11,16 +11,14 @@ from densify.outputs.writers import write_street
 from densify.readers.describe import describe
 from densify.readers.kitti.raw import KittiRaw
 from densify.readers.street import Street
-from densify.street.casting import Scene
-from densify.street.curves import Curve, Speed
 from densify.street.footprints import Rectangles
 from densify.street.materials import Material
 from densify.street.mesh import box
 from densify.street.motion import Driving, Still
-from densify.street.patterns import Raster, Rosette, Slots, Spinning
-from densify.street.sensors import SENSORS, firings
+from densify.street.sensors import SENSORS, Raster, Rosette, Slots, Spinning, firings
 from densify.street.simulator import Simulator
-from densify.street.terrain import Ground, Terrain
+from densify.street.terrain import Curve, Ground, Speed, Terrain
+from densify.street.traffic import Scene
 from densify.street.world import Body, World
 
 PERIOD_NS = 100_000_000

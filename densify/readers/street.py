@@ -29,13 +29,11 @@ from densify.config.user_folder import own_folder
 from densify.geometry.threads import num_threads
 from densify.geometry.types import Bool, Camera, Float, Float32, Sweep, SweepTruth
 from densify.readers.array_files import read_arrays
-from densify.street.bodies import Bodies
-from densify.street.camera import Picture
+from densify.street.cameras import CAMERAS, USUAL, Picture, cameras_beside
 from densify.street.lidar import Returns
-from densify.street.rig import CAMERAS, USUAL, cameras_beside
 from densify.street.scenes import PRESETS
 from densify.street.sensors import SENSORS
-from densify.street.simulator import VERSION, Simulator
+from densify.street.simulator import VERSION, Bodies, Simulator
 
 Arrays = dict[str, NDArray[Any]]
 _log = logging.getLogger("densify")

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from densify.config.errors import InputError
 from densify.geometry.types import Bool, Float, Float32, SweepTruth
 from densify.readers.array_files import read_arrays
-from densify.street.bodies import Bodies
+from densify.street.simulator import Bodies
 
 
 def write_bodies(folder: Path, bodies: Bodies) -> None:

@@ -6,7 +6,18 @@ from __future__ import annotations
 import numpy as np
 
 from densify.street.actors import TRACTOR_WHEELBASE_M, Actor, truck
-from densify.street.casting import (
+from densify.street.motion import Driving
+from densify.street.scenery import (
+    Scenery,
+    Side,
+    furnish,
+    line_with_plots,
+    mark_lanes,
+    park_cars,
+    zebra,
+)
+from densify.street.terrain import Curve, Ground, Lane, Road, Speed, Terrain, polyline
+from densify.street.traffic import (
     FIRST_PARKED,
     MEETING_S,
     PAVEMENT_M,
@@ -17,11 +28,6 @@ from densify.street.casting import (
     assemble,
     jitter,
 )
-from densify.street.curves import Curve, Lane, Speed, polyline
-from densify.street.motion import Driving
-from densify.street.roadside import Side, furnish, line_with_plots, mark_lanes, park_cars, zebra
-from densify.street.scenery import Scenery
-from densify.street.terrain import Ground, Road, Terrain
 
 _CROSS_X_M = 17.0
 

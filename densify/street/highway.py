@@ -6,20 +6,20 @@ from __future__ import annotations
 import numpy as np
 
 from densify.geometry.types import Float
-from densify.street.casting import MEETING_S, Scene, Traffic, Ways, assemble, jitter
-from densify.street.curves import Curve, Lane, Speed
 from densify.street.motion import Driving
-from densify.street.roadside import Side, mark_lanes
 from densify.street.scenery import (
     Scenery,
+    Side,
     guard_rail,
     hedge,
     lamp_post,
+    mark_lanes,
     noise_barrier,
     sign_post,
     tree,
 )
-from densify.street.terrain import Ground, Road, Terrain
+from densify.street.terrain import Curve, Ground, Lane, Road, Speed, Terrain
+from densify.street.traffic import MEETING_S, Scene, Traffic, Ways, assemble, jitter
 
 _LANE_M = 3.6
 _MEDIAN_M = 1.6

@@ -12,9 +12,8 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
 from densify.geometry.types import Float, Int
-from densify.street.curves import Curve, Speed
 from densify.street.mesh import across, lengths
-from densify.street.terrain import Terrain
+from densify.street.terrain import Curve, Speed, Terrain
 
 
 class Poses(NamedTuple):

@@ -1,33 +1,36 @@
 # SPDX-License-Identifier: MIT
-"""The presets by name."""
+"""The presets of the street by name; each lies in a module of its own, imported when asked for."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from functools import lru_cache, partial
+from functools import lru_cache
+from importlib import import_module
 
 import numpy as np
 
 from densify.config.errors import InputError
-from densify.street.casting import Scene
-from densify.street.crossing import crossing
-from densify.street.highway import highway
-from densify.street.town import street
+from densify.street.traffic import Scene
 
-PRESETS: dict[str, Callable[[np.random.Generator], Scene]] = {
-    "street": partial(street, alive=True),
-    "static": partial(street, alive=False),
-    "crossing": crossing,
-    "highway": highway,
+PRESETS = {
+    "street": ("densify.street.town", "street"),
+    "static": ("densify.street.town", "static_street"),
+    "crossing": ("densify.street.crossing", "crossing"),
+    "highway": ("densify.street.highway", "highway"),
 }
+"""Module and function that builds the scene from a random generator."""
 
 
 @lru_cache(maxsize=2)
 def build_scene(preset: str, seed: int) -> Scene:
-    """The same scene for the same preset and seed, always; it takes 1 to 2 s, and the last ones are
-    shared by all scanners and rates. Raises InputError for an unknown preset."""
+    """Return the scene of a preset and seed, always the same one.
+
+    Building takes 1 to 2 s; the last two scenes are shared by all sensors and rates.
+    Raises InputError for an unknown preset.
+    """
     if preset not in PRESETS:
         raise InputError(
             f"street preset {preset!r}: no such preset; there are {', '.join(PRESETS)}"
         )
-    return PRESETS[preset](np.random.default_rng([seed, 0]))
+    module, function = PRESETS[preset]
+    scene: Scene = getattr(import_module(module), function)(np.random.default_rng([seed, 0]))
+    return scene

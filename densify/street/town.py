@@ -7,7 +7,11 @@ import numpy as np
 
 from densify.geometry.types import Float
 from densify.street.actors import TRACTOR_WHEELBASE_M, Actor, truck
-from densify.street.casting import (
+from densify.street.mesh import Mesh
+from densify.street.motion import Driving
+from densify.street.scenery import Scenery, Side, furnish, line_with_plots, mark_lanes, park_cars
+from densify.street.terrain import Curve, Ground, Lane, Road, Speed, Terrain
+from densify.street.traffic import (
     FIRST_PARKED,
     MEETING_S,
     PAVEMENT_M,
@@ -18,12 +22,6 @@ from densify.street.casting import (
     assemble,
     jitter,
 )
-from densify.street.curves import Curve, Lane, Speed
-from densify.street.mesh import Mesh
-from densify.street.motion import Driving
-from densify.street.roadside import Side, furnish, line_with_plots, mark_lanes, park_cars
-from densify.street.scenery import Scenery
-from densify.street.terrain import Ground, Road, Terrain
 
 # Offsets from the middle line of a road driven on the right: one lane against the ego vehicle's
 # direction, two with it, cycle lanes and parked cars on both sides.
@@ -33,8 +31,13 @@ _ROAD_LEFT_M, _ROAD_RIGHT_M = 7.2, 10.3
 _EGO_START_M = 170.0
 
 
-def street(rng: np.random.Generator, alive: bool) -> Scene:
-    """A street in town. alive: with traffic; otherwise only the ego vehicle moves."""
+def static_street(rng: np.random.Generator) -> Scene:
+    """Build the street in town in which only the ego vehicle moves."""
+    return street(rng, with_traffic=False)
+
+
+def street(rng: np.random.Generator, with_traffic: bool = True) -> Scene:
+    """Build the street in town."""
     bend = 1 / (36.0 * jitter(rng, 0.08))
     mild = jitter(rng, 0.3) / 190.0
     wiggle, phase = jitter(rng, 0.5) / 260.0, rng.uniform(0, 2 * np.pi)
@@ -66,7 +69,7 @@ def street(rng: np.random.Generator, alive: bool) -> Scene:
     at_zero = slow.at(_EGO_START_M)
     ego = Driving(slow.curve, ego_speed, at_zero, 0.0, ground.terrain, 2.7)
     traffic = Traffic(ego, scenery, rng)
-    if alive:
+    if with_traffic:
         _people_street(Ways(ground, traffic), roads, mouth_m, ego, slow, rng)
     return assemble(scenery, parts, ego, traffic)
 

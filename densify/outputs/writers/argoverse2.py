@@ -38,7 +38,7 @@ from densify.readers.argoverse2 import (
     SCANNERS,
 )
 from densify.readers.extras import needed
-from densify.street.patterns import Spinning
+from densify.street.sensors import Spinning
 
 T_EGO_LIDAR = np.eye(4)  # where Argoverse's up_lidar stands
 T_EGO_LIDAR[:3, 3] = [1.35, 0.0, 1.64]

@@ -20,8 +20,7 @@ from densify.readers.pose_track import PoseTrack
 from densify.readers.street import Street
 from densify.readers.truth_files import write_bodies, write_depth, write_points
 from densify.street.lidar import Returns
-from densify.street.patterns import Spinning
-from densify.street.sensors import SENSORS
+from densify.street.sensors import SENSORS, Spinning
 
 _POSE_STEP_NS = 5_000_000
 _MARGIN_NS = 150_000_000  # poses reach so far beyond the first and the last sweep

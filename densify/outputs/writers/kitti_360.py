@@ -25,7 +25,7 @@ from densify.outputs.writers.kitti_raw import (
     stamp_lines,
     velodyne_bytes,
 )
-from densify.street.rig import CAMERAS, T_level_lidar
+from densify.street.cameras import CAMERAS, T_level_lidar
 
 CAMERA_NAMES = {"image_02": "image_00", "image_03": "image_01"}
 """The street's cameras, and what the format calls them."""

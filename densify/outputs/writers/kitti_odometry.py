@@ -18,7 +18,7 @@ from densify.config.errors import InputError
 from densify.geometry import poses
 from densify.outputs.writers.excerpt import Excerpt, check_cameras_fit, new_folder, put
 from densify.outputs.writers.kitti_raw import numbers, projections, velodyne_bytes
-from densify.street.rig import T_RECTIFIED_LIDAR, T_level_lidar
+from densify.street.cameras import T_RECTIFIED_LIDAR, T_level_lidar
 
 CAMERA_NAMES = {"image_02": "image_2"}
 """The street's camera that exposes with the scanner, and what the format calls it."""

@@ -29,7 +29,7 @@ from densify.readers.files import camera_named
 from densify.readers.kitti.raw import KITTI_TRIGGER_LATENCY_NS
 from densify.readers.street import Street
 from densify.readers.truth_files import write_bodies, write_depth, write_points
-from densify.street.rig import CAMERAS, T_RECTIFIED_LIDAR, USUAL, T_level_lidar
+from densify.street.cameras import CAMERAS, T_RECTIFIED_LIDAR, USUAL, T_level_lidar
 from densify.street.sensors import SENSORS
 from densify.street.simulator import EPOCH_NS
 

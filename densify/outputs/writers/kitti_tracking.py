@@ -27,7 +27,7 @@ from densify.outputs.writers.kitti_raw import (
     velodyne_bytes,
 )
 from densify.readers.kitti.files import NOMINAL_PERIOD_NS
-from densify.street.rig import CAMERAS, T_RECTIFIED_LIDAR, T_level_lidar
+from densify.street.cameras import CAMERAS, T_RECTIFIED_LIDAR, T_level_lidar
 
 CAMERA_NAMES = ("image_02",)
 """Those of the street that the format has room for."""

@@ -32,7 +32,7 @@ from densify.outputs.writers.excerpt import (
     quaternion,
 )
 from densify.readers.nuscenes.reader import COLUMN_NS, NUM_RINGS
-from densify.street.patterns import Spinning
+from densify.street.sensors import Spinning
 
 T_LIDAR_POINTS = np.eye(4)  # x right, y forward
 T_LIDAR_POINTS[:3, :3] = [[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]

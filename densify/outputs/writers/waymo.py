@@ -38,7 +38,7 @@ from densify.readers.waymo.components import (
     T_OPTICAL_WAYMO,
     UP,
 )
-from densify.street.patterns import Spinning
+from densify.street.sensors import Spinning
 
 T_EGO_LIDAR = np.eye(4)  # where Waymo's TOP stands
 T_EGO_LIDAR[:3, 3] = [1.43, 0.0, 2.18]

@@ -26,13 +26,12 @@ from densify.street.actors import (
     truck,
     walker,
 )
-from densify.street.curves import Curve, Lane, Speed
 from densify.street.footprints import Rectangles, overlap, tracks
 from densify.street.materials import Material
 from densify.street.mesh import Mesh, box
 from densify.street.motion import Driving, Still
 from densify.street.scenery import Scenery
-from densify.street.terrain import Ground
+from densify.street.terrain import Curve, Ground, Lane, Speed
 from densify.street.world import Body, World
 
 DURATION_S = 16
