@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from densify.config import Config, GroundSettings
-from densify.flow import scene as engine_scene
+from densify.flow import engines as engine_scene
 from densify.flow.engines import estimate_motion
 from densify.flow.tracking.groups import GroupMotion
 from densify.free_space.ground import ground
@@ -82,7 +82,7 @@ class Found:
 
 def motion_in(stretch: Stretch, heights: HeightMap) -> Motion:
     """By the default engine."""
-    scene = engine_scene.Scene(stretch, heights, CONFIG.flow.min_height_m)
+    scene = engine_scene.Scene(stretch, heights)
     return estimate_motion(scene, CONFIG)
 
 

@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 
 from densify.flow.surface_matching import GATES_M, apply, undo
 from densify.flow.tracking.align import MIN_FIT, Model
-from densify.geometry.clouds import Strips, surface_information
+from densify.flow.tracking.candidates import Strips, surface_information
 
 CENTRE = np.array([12.0, -3.0, 0.8])
 STD = np.array([0.3, 0.3, 0.06])

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from densify.config import GroundSettings
-from densify.flow.tracking.evidence import REACH_S
 from densify.free_space.ground import ground
+from densify.free_space.seen_through import REACH_S
 from densify.geometry.clock import Clock
 from densify.geometry.types import Stretch
 from tests.found_motion import KEY, NOISE, motion_in

@@ -190,7 +190,7 @@ def test_a_plan_without_its_parts(table: str, border_drive: Path, tmp_path: Path
         (["--layout", "densify"], "layout = kitti-depth, got densify"),
         (["--camera", "image_02"], "cameras = None, got ['image_02']"),
         (["--split", "train"], "folder"),
-        (["--set", "flow.soft=false"], "config.flow.soft = True, got False"),
+        (["--set", "flow.look_around_s=0.1"], "config.flow.look_around_s = None, got 0.1"),
     ],
     ids=lambda value: value[0] if isinstance(value, list) else "",
 )

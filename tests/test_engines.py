@@ -13,10 +13,10 @@ from densify.config import Config, resolve
 from densify.config.cache_codec import decode, encode
 from densify.config.errors import InputError
 from densify.config.plugins.engines import ENGINES, engine
-from densify.flow.engines import check_engine, estimate_motion, motion_type
-from densify.flow.scene import Scene
-from densify.flow.tracking.evidence import FreeSpace, find_candidates
+from densify.flow.engines import Scene, check_engine, estimate_motion, motion_type
+from densify.flow.tracking.candidates import find_candidates
 from densify.free_space.ground import ground
+from densify.free_space.seen_through import FreeSpace
 from densify.geometry.types import Stretch
 from tests import scenes
 
@@ -26,7 +26,7 @@ def driving() -> Scene:
     movers = (*scenes.street(), scenes.car(14, -1.6, 10, 1))
     stretch = scenes.Scene(scenes.World(movers), scenes.Arc(0, -1.5, 0, 6.0, 0.0)).stretch(5, 2)
     config = Config()
-    return Scene(stretch, ground(stretch, config.ground), config.flow.min_height_m)
+    return Scene(stretch, ground(stretch, config.ground))
 
 
 @pytest.mark.parametrize("row", ENGINES.built_in, ids=lambda row: row.name)
@@ -41,7 +41,7 @@ def test_every_engine_has_the_one_interface(row) -> None:
 
 
 def test_sweeps_that_are_not_asked_for_tell_what_moves_all_the_same(driving: Scene) -> None:
-    frames, config = driving.stretch.frames, resolve({"flow": {"soft": False}})
+    frames, config = driving.stretch.frames, Config()
     asked = frames[1:4]
     whole, part = (
         estimate_motion(replace(driving, asked=which), config) for which in (None, asked)
@@ -53,7 +53,7 @@ def test_sweeps_that_are_not_asked_for_tell_what_moves_all_the_same(driving: Sce
             np.testing.assert_array_equal(got.displacement, wanted.displacement)
         else:
             assert not got.moving.any()
-    alone = Scene(Stretch(driving.stretch.sweeps[1:4]), driving.ground, driving.min_height_m)
+    alone = Scene(Stretch(driving.stretch.sweeps[1:4]), driving.ground)
     few = estimate_motion(alone, config)
     assert any((part.flow(f, 5).total != few.flow(f, 5).total).any() for f in asked)
 
@@ -66,7 +66,7 @@ def test_what_a_scene_is_asked_for_is_made_once(driving: Scene) -> None:
     def of(found):
         return lambda: (made.append(found), found)[1]
 
-    handed = Scene(driving.stretch, driving.ground, driving.min_height_m, of(space), of(candidates))
+    handed = Scene(driving.stretch, driving.ground, of(space), of(candidates))
     motion = estimate_motion(handed, Config())
     assert handed.space is space and handed.candidates is candidates and len(made) == 2
     expected = estimate_motion(driving, Config())
@@ -74,7 +74,7 @@ def test_what_a_scene_is_asked_for_is_made_once(driving: Scene) -> None:
         got, wanted = motion.flow(frame, 5), expected.flow(frame, 5)
         np.testing.assert_array_equal(got.displacement, wanted.displacement)
         assert wanted.moving.any()
-    fresh = find_candidates(driving.stretch, FreeSpace.of(driving.stretch), driving.ground, 0.2)
+    fresh = find_candidates(driving.stretch, FreeSpace.of(driving.stretch), driving.ground)
     for found, again in zip(candidates, fresh, strict=True):
         np.testing.assert_array_equal(found.cluster, again.cluster)
 

@@ -9,16 +9,16 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from densify.config import FlowSettings, GroundSettings
+from densify.config import GroundSettings
 from densify.free_space import height_map
 from densify.free_space.ground import ground
-from densify.free_space.height_map import HeightMap
+from densify.free_space.height_map import ABOVE_GROUND_M, HeightMap
 from densify.geometry import poses
 from densify.geometry.types import Stretch
 from tests.scenes import GROUND, KERB_M, KERB_Y_M, Arc, Box, Scanner, Scene, World, car, street
 
 SETTINGS = GroundSettings()
-LOW_M = FlowSettings().min_height_m
+LOW_M = ABOVE_GROUND_M
 TRAILER = Box((9.0, 2.5, 1.2), Arc(14.0, 1.0, 0.2))  # lower than the scanner: its roof is seen
 
 

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from densify.flow.tracking.evidence import Standing
+from densify.flow.tracking.candidates import Obstacles
 from densify.flow.tracking.extent import Seen, leave_out_alone, shape_of
 from densify.flow.tracking.lone_rays import columns_apart_m
 from densify.flow.tracking.sightings import Sighting, Track
@@ -145,7 +145,7 @@ def num_in_shape(claimed, seeds, speed_m_s) -> int:
     for i, (at_s, points, seed) in enumerate(zip(time_s, claimed, seeds, strict=True)):
         state, rows = np.array([speed_m_s * at_s, 0.0, 0.0, 0.0]), np.arange(len(points))
         placed = points + state[:3]
-        standing.append(Standing(rows, placed, np.full(len(rows), at_s), seed, 0 * rows, 1))
+        standing.append(Obstacles(rows, placed, np.full(len(rows), at_s), seed, 0 * rows, 1))
         track.claimed[i] = rows
         track.sightings[i] = Sighting(state, at_s, round(at_s * 1e9), (i,))
     track.smooth()

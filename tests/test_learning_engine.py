@@ -12,8 +12,7 @@ from densify.bench.paper_pairs import pair_of_recording
 from densify.cli import main
 from densify.config import Config, resolve
 from densify.config.errors import InputError
-from densify.flow.engines import check_engine, estimate_motion
-from densify.flow.scene import Scene
+from densify.flow.engines import Scene, check_engine, estimate_motion
 from densify.free_space.ground import ground
 from densify.learning import engine
 from densify.learning.model_file import Model, read_model, write_model
@@ -33,7 +32,7 @@ def drive() -> scenes.Scene:
 def driving(drive: scenes.Scene) -> Scene:
     stretch = drive.stretch(5, 2)
     config = Config()
-    return Scene(stretch, ground(stretch, config.ground), config.flow.min_height_m)
+    return Scene(stretch, ground(stretch, config.ground))
 
 
 @pytest.fixture(scope="module")

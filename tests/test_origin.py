@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from densify.config import GroundSettings
-from densify.flow.tracking.evidence import FreeSpace, find_candidates
+from densify.flow.tracking.candidates import find_candidates
 from densify.free_space.ground import ground
+from densify.free_space.seen_through import FreeSpace
 from densify.geometry.types import Stretch
 from tests.dataset_scenes import COARSE
 from tests.found_motion import motion_in

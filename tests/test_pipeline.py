@@ -207,7 +207,7 @@ def test_run_is_compare_up_to_its_method():
 def test_the_published_engine_runs_too():
     scene = Scene(World(street()), Arc(0, -1.5, 0, 5.0), Scanner(32, 300, (-15.0, 5.0)))
     sequence = TinySequence(scene, range(9))
-    config = {**POSES_GIVEN, "flow": {"min_height_m": 0.5}, "objective": {"num_neighbors": 10}}
+    config = {**POSES_GIVEN, "objective": {"num_neighbors": 10}}
     results = compare(sequence, 4, 1, config=config, methods=("none", "paper", "flow"))
     assert tuple(results["flow"].baselines) == ("none", "paper")
     assert len(results["flow"].cloud) == len(results["paper"].cloud)

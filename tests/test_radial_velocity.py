@@ -8,10 +8,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from densify.config import FlowSettings, GroundSettings
-from densify.flow.tracking.evidence import FreeSpace, find_candidates
+from densify.config import GroundSettings
+from densify.flow.tracking.candidates import find_candidates
 from densify.flow.tracking.radial import Radial
 from densify.free_space.ground import ground
+from densify.free_space.seen_through import FreeSpace
 from densify.geometry import poses
 from densify.geometry.types import Stretch, Sweep, Trajectory
 from densify.outputs.writers import write_street
@@ -86,9 +87,7 @@ def test_they_are_evidence_without_any_other_sweep():
         seen = replace(stretch.sweeps[0], sweep=replace(sweep, radial_velocity_m_s=radial))
         alone = Stretch((seen,))
         heights = ground(alone, GroundSettings())
-        return find_candidates(
-            alone, FreeSpace.of(alone), heights, FlowSettings().min_height_m
-        )[0]  # fmt: skip
+        return find_candidates(alone, FreeSpace.of(alone), heights)[0]
 
     assert candidates(None).num_clusters == 0
     found = candidates(m_s)

@@ -11,30 +11,31 @@ import pytest
 
 from densify.config import GroundSettings
 from densify.flow.tracking import proof, tracks
-from densify.flow.tracking.evidence import FreeSpace, Standing, find_candidates
+from densify.flow.tracking.candidates import Obstacles, find_candidates
 from densify.flow.tracking.left_places import LeftPlaces, Places, left_places
 from densify.flow.tracking.shapes import Body, Shape
 from densify.flow.tracking.sightings import Sighting, Track
 from densify.flow.tracking.starts import groups_to_start, is_part, velocities_of_traffic
 from densify.free_space.ground import ground
 from densify.free_space.height_map import HeightMap
+from densify.free_space.seen_through import FreeSpace
 from densify.geometry.clock import Clock
 from tests.scenes import SWEEP_S, Arc, Box, Scanner, Scene, World, car, street
 
 PERIOD_NS = 100_000_000
 
 
-def standing(sizes: list[int], seed_share: float = 1.0) -> Standing:
+def standing(sizes: list[int], seed_share: float = 1.0) -> Obstacles:
     """Clusters of these sizes, and as many points again that are no candidates."""
     cluster = np.repeat([*range(len(sizes)), -1], [*sizes, sum(sizes)])
     n = len(cluster)
     nth = np.concatenate([np.arange(s) for s in [*sizes, sum(sizes)]])
     size = np.repeat([*sizes, 1], [*sizes, sum(sizes)])
     seed = (cluster >= 0) & (nth < seed_share * size)
-    return Standing(np.arange(n), np.zeros((n, 3)), np.zeros(n), seed, cluster, len(sizes))
+    return Obstacles(np.arange(n), np.zeros((n, 3)), np.zeros(n), seed, cluster, len(sizes))
 
 
-def starts(sweeps: list[Standing]) -> list[tuple[int, int]]:
+def starts(sweeps: list[Obstacles]) -> list[tuple[int, int]]:
     """(sweep, size) in the order they are tried."""
     found = groups_to_start(sweeps, Clock(PERIOD_NS * np.arange(len(sweeps))))
     for i, members in found:
@@ -439,7 +440,7 @@ class Seen:
         heights = ground(stretch, GroundSettings())
         self.space = FreeSpace.of(stretch)
         found = find_candidates(stretch, self.space, heights, 0.2)
-        self.standing = [Standing.of(stretch, i, c) for i, c in enumerate(found)]
+        self.standing = [Obstacles.of(stretch, i, c) for i, c in enumerate(found)]
 
     def track(self, boxes: list[int], begin_m: float) -> Track:
         """What the sweeps saw of these boxes of the scene in a frame of 4.4 m that goes along;

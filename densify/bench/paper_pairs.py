@@ -103,8 +103,7 @@ def pairs_of_boxes(specs: Sequence[str], most: int) -> Iterator[PaperPair]:
 def _pair_of_label(name: str, label: Label, config: Config) -> PaperPair:
     stretch = Stretch((label.registered, label.after))
     heights = ground(stretch, config.ground)
-    least_m = config.flow.min_height_m
-    here, there = (AboveGround.of(s, heights, least_m) for s in stretch.sweeps)
+    here, there = (AboveGround.of(s, heights) for s in stretch.sweeps)
     known = label.sure[here.row]
     row, T = here.row[known], label.T_next_here
     source, target = label.registered.sweep.points[row], label.after.sweep.points[there.row]

@@ -7,9 +7,9 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
 from densify.config import Config
-from densify.flow.engines import estimate_motion
-from densify.flow.scene import Scene
+from densify.flow.engines import Scene, estimate_motion
 from densify.free_space.ground import ground
+from densify.free_space.height_map import ABOVE_GROUND_M
 from densify.geometry import poses
 from densify.geometry.types import Bool, Float, LidarSequence, Motion, Stretch
 from densify.pipeline.recording import Recording
@@ -31,8 +31,8 @@ class Window:
         ComputationError where registration went wrong."""
         recording = Recording(sequence, config, size, [key], looks_around=True)
         stretch, around = recording.window(key), recording.around(key)
-        heights, least_m = ground(stretch, config.ground), config.flow.min_height_m
-        above = {f: heights.above(_in_world(stretch, f)) >= least_m for f in stretch.frames}
+        heights = ground(stretch, config.ground)
+        above = {f: heights.above(_in_world(stretch, f)) >= ABOVE_GROUND_M for f in stretch.frames}
         return Window(stretch, key, around, above)
 
     @property
@@ -58,7 +58,7 @@ def our_motion(stretch: Stretch, config: Config, asked: Collection[int] | None =
     """This package's engine, or that of ``flow.engine``, from the ground on. asked: frames whose
     flow will be asked for, all if None."""
     heights = ground(stretch, config.ground)
-    scene = Scene(stretch, heights, config.flow.min_height_m, asked=asked)
+    scene = Scene(stretch, heights, asked=asked)
     return estimate_motion(scene, config)
 
 

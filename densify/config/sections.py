@@ -84,13 +84,6 @@ class FlowSettings(Section):
         "groups",
         f"{engines.described()}; others by name where their package is installed",
     )
-    min_height_m: float = knob(
-        0.2,
-        "[m] points lower above the ground start no motion; smaller sees kerbs move, larger loses "
-        "what is flat",
-        0.02,
-        2,
-    )
     look_around_s: float | None = knob(
         None,
         "[s] so far before and after the window sweeps are asked too what moves; none: 0.5 for "
@@ -98,10 +91,6 @@ class FlowSettings(Section):
         "off the error, for twice the CPU seconds",
         0,
         5,
-    )
-    soft: bool = knob(
-        True,
-        "objects bend about their rigid motion (swinging limbs) as far as held-out sweeps confirm",
     )
 
     def __post_init__(self) -> None:

@@ -1,47 +1,79 @@
 # SPDX-License-Identifier: MIT
-"""How everything in a stretch moves: all engines behind one call.
-
-The table of engines, and how to add one, is `densify.config.plugins.engines`.
-"""
+"""One call for all engines of scene flow; `densify.config.plugins.engines` has their table."""
 
 from __future__ import annotations
 
-from dataclasses import is_dataclass
+from collections.abc import Callable, Collection
+from dataclasses import dataclass, is_dataclass
+from functools import cached_property
 from typing import Protocol, cast, get_type_hints
 
 from densify.config import Config
 from densify.config.errors import InputError
 from densify.config.plugins.engines import ENGINES, engine
-from densify.flow.scene import Scene
+from densify.flow.tracking.candidates import Candidates, find_candidates
+from densify.free_space.height_map import HeightMap
+from densify.free_space.seen_through import FreeSpace
 from densify.geometry.types import Motion, Stretch
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """The input of an engine: registered sweeps in one world, their ground and free space.
+
+    ground: under all sweeps. make_space, make_candidates: return what is known already, as from a
+    cache. asked: frames whose flow will be asked for, None for all; the other sweeps only help to
+    find what moves.
+    """
+
+    stretch: Stretch
+    ground: HeightMap
+    make_space: Callable[[], FreeSpace] | None = None
+    make_candidates: Callable[[], tuple[Candidates, ...]] | None = None
+    asked: Collection[int] | None = None
+
+    @cached_property
+    def space(self) -> FreeSpace:
+        """The free space that each sweep observed."""
+        return FreeSpace.of(self.stretch) if self.make_space is None else self.make_space()
+
+    @cached_property
+    def candidates(self) -> tuple[Candidates, ...]:
+        """The points of each sweep that may move."""
+        if self.make_candidates is not None:
+            return self.make_candidates()
+        return find_candidates(self.stretch, self.space, self.ground)
+
+    def is_asked(self, i: int) -> bool:
+        """Return True if the flow of sweep number i will be asked for."""
+        return self.asked is None or self.stretch.sweeps[i].frame in self.asked
 
 
 class SharedMotion(Motion, Protocol):
     """Motion of a long stretch that serves every key in it.
 
-    A dataclass that is kept without points, by the types of its fields (`config.cache_codec`).
+    A dataclass that is kept on disk without points, by the types of its fields.
     """
 
     def with_stretch(self, stretch: Stretch) -> SharedMotion:
-        """The same motion with the sweeps that it was estimated from, where any may lack their
-        points; an empty stretch where it is to be kept without."""
+        """Return the same motion with other copies of its sweeps, which may lack their points; an
+        empty stretch before it is written to disk."""
         ...
 
 
 class EngineModule(Protocol):
-    """What the module of an engine has.
+    """The functions of an engine's module.
 
-    It may have ``check_argument(argument: str) -> None`` too, called before anything is computed,
+    It may also have ``check_argument(argument: str) -> None``, called before anything is computed,
     which raises InputError for an argument that cannot be used.
     """
 
     def estimate_motion(self, scene: Scene, settings: Config, argument: str) -> Motion:
-        """How everything in the scene's stretch moves.
+        """Return how everything in the scene's stretch moves; same input, same bytes.
 
-        argument: what follows the engine's name and a colon in ``flow.engine``, "" for nothing.
-        May estimate at once or when the motion's ``flow`` is called; same input, same bytes. A
-        `SharedMotion` where the engine's row says ``shared``, and then annotated as returning
-        the very type of it.
+        argument: the part of ``flow.engine`` after the colon, "" for none. Work may be postponed
+        until the motion's ``flow`` is called. If the engine's row says ``shared``, this function
+        is annotated as returning a dataclass that is a `SharedMotion`.
         """
         ...
 
@@ -54,8 +86,8 @@ def estimate_motion(scene: Scene, settings: Config, spec: str | None = None) -> 
 
 
 def motion_type(spec: str) -> type[SharedMotion]:
-    """What the engine's ``estimate_motion`` is annotated to return. Raises InputError if that is no
-    dataclass."""
+    """Return the dataclass that the engine's ``estimate_motion`` is annotated to return. Raises
+    InputError if it is none."""
     row, _ = engine(spec)
     found = get_type_hints(ENGINES.module(row).estimate_motion).get("return")
     if not (isinstance(found, type) and is_dataclass(found)):
@@ -67,8 +99,7 @@ def motion_type(spec: str) -> type[SharedMotion]:
 
 
 def check_engine(spec: str) -> None:
-    """Find out before a computation whether the engine is there and can use its argument; imports
-    it. Raises InputError."""
+    """Raise InputError if the engine is not there or cannot use its argument; imports it."""
     row, argument = engine(spec)
     if row.shared:
         motion_type(spec)

@@ -13,6 +13,8 @@ from densify.config import GroundSettings
 from densify.free_space.heights import add_near, heights_under, two_lowest
 from densify.geometry.types import Float, Float32
 
+ABOVE_GROUND_M = 0.2
+"""Points lower than this above the ground are part of it: they start no motion."""
 _LOW_OUTLIER_M = 0.4
 _GROUND_M = 0.15  # points this close to the lowest are the ground's
 _NARROW_M, _HUMP_M = 7.0, 0.2  # what rises higher on less is no ground

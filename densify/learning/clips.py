@@ -19,8 +19,7 @@ from numpy.typing import NDArray
 
 from densify.config import Config, resolve
 from densify.config.errors import ComputationError, InputError
-from densify.flow.engines import estimate_motion
-from densify.flow.scene import Scene
+from densify.flow.engines import Scene, estimate_motion
 from densify.free_space.ground import ground
 from densify.geometry.types import Bool, Float32, LidarSequence, Stretch
 from densify.learning.clouds import AboveGround
@@ -138,14 +137,13 @@ def make_clip(sequence: LidarSequence, key: int, settings: Config, labels: str) 
     what this package's engine finds."""
     stretch = Recording(sequence, settings, NUM_SWEEPS // 2, [key]).window(key)
     heights = ground(stretch, settings.ground)
-    least_m = settings.flow.min_height_m
-    standing = [AboveGround.of(s, heights, least_m) for s in stretch.sweeps]
+    standing = [AboveGround.of(s, heights) for s in stretch.sweeps]
     truth: list[Labels | None] = [None] * len(standing)
     engine = list(truth)
     if sequence.truth is not None:
         truth = [_truth(sequence, stretch, i, s.row) for i, s in enumerate(standing)]
     if labels == "engine":
-        motion = estimate_motion(Scene(stretch, heights, least_m), settings, "groups")
+        motion = estimate_motion(Scene(stretch, heights), settings, "groups")
         frames = stretch.frames
 
         def found(i: int, row: NDArray[np.int64]) -> Labels:

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from densify.free_space.height_map import HeightMap
+from densify.free_space.height_map import ABOVE_GROUND_M, HeightMap
 from densify.geometry import poses
 from densify.geometry.types import Float, Float32, Int, RegisteredSweep
 
@@ -41,10 +41,10 @@ class AboveGround(NamedTuple):
     height_m: Float32
 
     @staticmethod
-    def of(registered: RegisteredSweep, ground: HeightMap, min_height_m: float) -> AboveGround:
+    def of(registered: RegisteredSweep, ground: HeightMap) -> AboveGround:
         points = poses.transform(registered.T_world_lidar, registered.sweep.points)
         height_m = ground.above(points)
-        row = np.flatnonzero(height_m >= min_height_m)
+        row = np.flatnonzero(height_m >= ABOVE_GROUND_M)
         return AboveGround(row, points[row], height_m[row])
 
     def cloud(self, origin: Float) -> NetworkCloud:

@@ -17,8 +17,8 @@ import torch
 from torch import nn
 
 from densify.config import Config
-from densify.flow.scene import Scene
-from densify.flow.tracking.evidence import Candidates, closer_rings, cluster_around
+from densify.flow.engines import Scene
+from densify.flow.tracking.candidates import Candidates, closer_rings, cluster_around
 from densify.flow.tracking.groups import GroupMotion, motion_of
 from densify.geometry import poses
 from densify.geometry.threads import num_threads

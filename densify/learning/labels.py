@@ -14,6 +14,7 @@ from densify.config.errors import ComputationError, InputError, OutputError
 from densify.config.plugins.readers import READERS
 from densify.flow.boxes import BoxMargins, flow_of_boxes
 from densify.free_space.ground import ground
+from densify.free_space.height_map import ABOVE_GROUND_M
 from densify.geometry import poses
 from densify.geometry.types import (
     Bool,
@@ -52,7 +53,7 @@ def label_sweeps(
     that nobody drew boxes in.
 
     config: says where poses come from, and how deep the ground lies. without_ground: points below
-    ``flow.min_height_m`` above it do not count. Raises InputError for a recording without boxes.
+    0.2 m above it do not count. Raises InputError for a recording without boxes.
     """
     if not isinstance(sequence, KnowsBoxes) or all(
         sequence.boxes(frame) is None for frame in sequence.frames
@@ -96,7 +97,7 @@ def _label(
         settings = recording.settings
         heights = ground(stretch, settings.ground)
         in_world = poses.transform(registered.T_world_lidar, registered.sweep.points)
-        sure &= heights.above(in_world) >= settings.flow.min_height_m
+        sure &= heights.above(in_world) >= ABOVE_GROUND_M
     T_next_here = stretch.T_target_source(following[0], frame)
     return Label(registered, after, field, sure, T_next_here)
 

@@ -11,19 +11,13 @@ from typing import Any, cast
 from densify.config import Config
 from densify.config.cache import Cache, kept
 from densify.config.plugins.engines import engine as engine_row
-from densify.flow.engines import SharedMotion, estimate_motion, motion_type
-from densify.flow.scene import Scene
-from densify.flow.tracking.evidence import (
-    REACH_S,
-    Candidates,
-    FreeSpace,
-    find_candidates,
-    range_images,
-)
+from densify.flow.engines import Scene, SharedMotion, estimate_motion, motion_type
+from densify.flow.tracking.candidates import Candidates, find_candidates
 from densify.free_space.ground import ground
 from densify.free_space.height_map import HeightMap
 from densify.free_space.range_image import RangeImage
-from densify.geometry.clock import num_in_look
+from densify.free_space.seen_through import REACH_S, FreeSpace, range_images
+from densify.geometry.clock import num_in_batch
 from densify.geometry.types import LidarSequence, StandingWorld, Stretch, Trajectory
 from densify.pipeline.blocks import Cut
 from densify.pipeline.costs import Watch
@@ -67,7 +61,7 @@ class BlockSteps:
 
     def _images(self, number: int) -> dict[int, RangeImage]:
         """Range images of the block's sweeps, by frame."""
-        places, num_together = self.places, num_in_look(self._timeline.period_ns * 1e-9)
+        places, num_together = self.places, num_in_batch(self._timeline.period_ns * 1e-9)
         pieces = {f: p for p in places.pieces(number, 0.0) for f in places.within(p, number, 0.0)}
 
         def make() -> dict[int, RangeImage]:
@@ -104,7 +98,6 @@ class BlockSteps:
 
     def _evidence(self, number: int) -> list[dict[int, Candidates]]:
         """What may move in the block's sweeps, by frame, for each of its pieces."""
-        min_height_m = self._settings.flow.min_height_m
 
         def make(index: int, frames: Sequence[int]) -> dict[int, Candidates]:
             stretch = self.places.stretch(number, REACH_S, frames)
@@ -112,7 +105,7 @@ class BlockSteps:
             space = self._space(number, REACH_S, tuple(frames))
             own = [i for i, f in enumerate(frames) if f in self._cut.blocks[number].frames]
             with self._watch.stage("flow"):
-                found = find_candidates(stretch, space, heights, min_height_m, own)
+                found = find_candidates(stretch, space, heights, own)
             return {frames[i]: c for i, c in zip(own, found, strict=True)}
 
         return [
@@ -136,7 +129,6 @@ class BlockSteps:
             scene = Scene(
                 stretch,
                 self.ground(number)[index],
-                self._settings.flow.min_height_m,
                 make_space=partial(self._space, number, margin_s, tuple(frames)),
                 make_candidates=partial(self._candidates, number, frames),
                 asked=self._in_windows(number),
@@ -237,4 +229,4 @@ class BlockSteps:
         return [self._settings.ground, number, piece, content]
 
     def _evidence_inputs(self, number: int, index: int) -> Any:
-        return [self._settings.flow.min_height_m, self._near(number, index)]
+        return [self._near(number, index)]

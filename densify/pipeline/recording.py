@@ -35,8 +35,7 @@ from densify.config.errors import InputError
 from densify.config.plugins.engines import engine as engine_row
 from densify.depth.accumulate import accumulate
 from densify.depth.object_tracks import object_tracks
-from densify.flow.engines import estimate_motion
-from densify.flow.scene import Scene
+from densify.flow.engines import Scene, estimate_motion
 from densify.geometry import poses
 from densify.geometry.types import (
     Cloud,
@@ -176,7 +175,7 @@ class Recording:
         if engine == "groups" and self.is_pair(key):
             engine = "pairs"
         if not engine_row(engine)[0].shared:
-            scene = Scene(window, self.steps.ground(number)[index], self.settings.flow.min_height_m)
+            scene = Scene(window, self.steps.ground(number)[index])
             return estimate_motion(scene, self.settings, engine)
         frames, motion = self.steps.motion(number, engine)[index]
         # All poses, but the points of the window only.

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from densify.config import Config
 from densify.config.errors import InputError
 from densify.flow.chained import ChainedMotion
-from densify.flow.scene import Scene
+from densify.flow.engines import Scene
 from densify.geometry import poses
 from densify.geometry.types import FlowField, Motion, Stretch
 from densify.readers.array_files import read_arrays

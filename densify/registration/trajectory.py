@@ -102,7 +102,7 @@ def _rough(sweeps: Sequence[Sweep], settings: RegisterSettings) -> Trajectory:
     """The first pass, of raw sweeps: those taken together are not laid on each other, as if they
     were one raw sweep that takes longer."""
     stamp_ns = _stamps_ns(sweeps)
-    together = [list(rows) for rows in Clock(stamp_ns).looks()]
+    together = [list(rows) for rows in Clock(stamp_ns).batches()]
     if len(together) in (1, len(sweeps)):
         return register(sweeps, settings)
     groups = [[sweeps[i] for i in rows] for rows in together]
@@ -113,7 +113,7 @@ def _rough(sweeps: Sequence[Sweep], settings: RegisterSettings) -> Trajectory:
 def _fine(sweeps: Sequence[Sweep], rough: Trajectory, settings: RegisterSettings) -> Trajectory:
     """The second pass, of deskewed sweeps: those taken together are laid on each other."""
     stamp_ns = _stamps_ns(sweeps)
-    together = [list(rows) for rows in Clock(stamp_ns).looks()]
+    together = [list(rows) for rows in Clock(stamp_ns).batches()]
     if len(together) in (1, len(sweeps)):
         return register(sweeps, settings, rough)
     frames = tuple(sweeps[rows[0]].frame for rows in together)

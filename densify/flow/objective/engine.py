@@ -5,8 +5,9 @@ from __future__ import annotations
 
 from densify.config import Config
 from densify.flow.chained import ChainedMotion
+from densify.flow.engines import Scene
 from densify.flow.pairs.estimate import flow_between
-from densify.flow.scene import Scene
+from densify.free_space.height_map import ABOVE_GROUND_M
 from densify.geometry import poses
 from densify.geometry.types import FlowField, Motion
 
@@ -26,7 +27,7 @@ def _step(scene: Scene, here: int, there: int, settings: Config) -> FlowField:
         poses.transform(s.T_world_lidar, s.sweep.points)
         for s in (scene.stretch.sweeps[here], scene.stretch.sweeps[there])
     ]
-    above, above_there = (scene.ground.above(c) >= scene.min_height_m for c in clouds)
+    above, above_there = (scene.ground.above(c) >= ABOVE_GROUND_M for c in clouds)
     field = FlowField.zero(len(above))
     if above.any() and above_there.any():
         pair = flow_between(clouds[0][above], clouds[1][above_there], settings.objective)

@@ -12,8 +12,8 @@ import numpy as np
 
 from densify.config import Config
 from densify.flow.chained import ChainedMotion
+from densify.flow.engines import Scene
 from densify.flow.pairs.estimate import estimate_flow
-from densify.flow.scene import Scene
 from densify.geometry import poses
 from densify.geometry.types import FlowField, Int, Motion, Stretch, Sweep
 

@@ -21,7 +21,7 @@ from densify.flow.objective.solvers import SolverSettings, solve
 from densify.flow.pairs.hypotheses import PairCloud
 from densify.flow.pairs.movers import find_movers
 from densify.flow.pairs.scanners import scanners_told
-from densify.free_space.height_map import HeightMap
+from densify.free_space.height_map import ABOVE_GROUND_M, HeightMap
 from densify.geometry.linking import link
 from densify.geometry.types import Float, FlowField, Int
 
@@ -124,9 +124,7 @@ def _flow_of_groups(
     near = [p[rows] for p, rows in zip(points, inside, strict=True)]
     ground = HeightMap.of(near, settings.ground)
     heights_m = [ground.above(p) for p in near]
-    above = [
-        rows[h >= settings.flow.min_height_m] for rows, h in zip(inside, heights_m, strict=True)
-    ]
+    above = [rows[h >= ABOVE_GROUND_M] for rows, h in zip(inside, heights_m, strict=True)]
     field = FlowField.zero(len(clouds[0]))
     if not (len(above[0]) and len(above[1])):
         return field
@@ -138,7 +136,7 @@ def _flow_of_groups(
     start = None if initial is None else initial[above[0]]
     apart_s = times.apart_s if times else None
     motions, field.instance[above[0]] = find_movers(source, target, ground, start, apart_s)
-    low = (heights_m[0] < settings.flow.min_height_m) & (heights_m[0] > _MIN_LOW_M)
+    low = (heights_m[0] < ABOVE_GROUND_M) & (heights_m[0] > _MIN_LOW_M)
     _attach_below(points[0], field, inside[0][low])
     to_reference = np.zeros_like(clouds[0])
     for k, motion in enumerate(motions):

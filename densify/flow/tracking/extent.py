@@ -10,16 +10,16 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from densify.flow.tracking.evidence import FreeSpace, Standing, firing_times_s
+from densify.flow.tracking.candidates import Obstacles, Strips, firing_times_s
 from densify.flow.tracking.lone_rays import columns_apart_m
 from densify.flow.tracking.radial import Radial
 from densify.flow.tracking.shapes import Body, Shape
 from densify.flow.tracking.sightings import Track
-from densify.free_space.height_map import HeightMap
+from densify.free_space.height_map import ABOVE_GROUND_M, HeightMap
+from densify.free_space.seen_through import FreeSpace
 from densify.free_space.sensor import Sensors
 from densify.geometry import poses
 from densify.geometry.clock import Clock
-from densify.geometry.clouds import Strips
 from densify.geometry.linking import close_to_seeds
 from densify.geometry.nearest import BoxTree
 from densify.geometry.types import Bool, Float, Float32, Int, Stretch
@@ -65,7 +65,7 @@ class Seen:
 
     @staticmethod
     def of(
-        stretch: Stretch, i: int, ground: HeightMap, standing: Standing, sensors: Sensors
+        stretch: Stretch, i: int, ground: HeightMap, obstacles: Obstacles, sensors: Sensors
     ) -> Seen:
         registered = stretch.sweeps[i]
         points = poses.transform(registered.T_world_lidar, registered.sweep.points)
@@ -73,8 +73,8 @@ class Seen:
         row = np.flatnonzero(height_m > _MIN_HEIGHT_M)
         gap_m = sensors.gap_m(registered.sweep.points[row], registered.sweep.lidar[row])
         seeded, seed = np.zeros((2, len(points)), bool)
-        seeded[standing.row[standing.candidate]] = True
-        seed[standing.row[standing.seed]] = True
+        seeded[obstacles.row[obstacles.candidate]] = True
+        seed[obstacles.row[obstacles.seed]] = True
         reach_m = np.where(
             seeded[row],
             np.maximum(_ATTACH_M, _GAPS_REACHED * gap_m),
@@ -101,7 +101,7 @@ class Seen:
         return Strips(self.points)
 
 
-def shape_of(track: Track, standing: Sequence[Standing], space: FreeSpace) -> Shape:
+def shape_of(track: Track, obstacles: Sequence[Obstacles], space: FreeSpace) -> Shape:
     """All that the sweeps saw of an object; of those who walk, what is small and comes into view at
     once, without what only even or only odd ones saw: echoes that melted with those of a wall
     behind them, which would make parts of the wall theirs; without what stays where it is, or lies
@@ -109,7 +109,7 @@ def shape_of(track: Track, standing: Sequence[Standing], space: FreeSpace) -> Sh
     wall itself. (A slow car has sides that are not seen through either.)"""
     sweeps = sorted(track.claimed)
     evenly = sweeps[::2], sweeps[1::2]
-    halves = [track.seen_in(standing, some) for some in evenly]
+    halves = [track.seen_in(obstacles, some) for some in evenly]
     points = np.concatenate(halves)
     if _speed_m_s(track, sweeps[len(sweeps) // 2], space.clock) > _WALKS_M_S:
         return Shape.of(points)
@@ -120,8 +120,8 @@ def shape_of(track: Track, standing: Sequence[Standing], space: FreeSpace) -> Sh
             for own, other in (halves, halves[::-1])
         ]
     )
-    seed = np.concatenate([standing[j].seed[track.claimed[j]] for some in evenly for j in some])
-    moves = ~_staying(track, standing, [j for some in evenly for j in some], space)
+    seed = np.concatenate([obstacles[j].seed[track.claimed[j]] for some in evenly for j in some])
+    moves = ~_staying(track, obstacles, [j for some in evenly for j in some], space)
     again &= moves & close_to_seeds(points, moves, _WIDER_M, _MOSTLY)
     theirs = again & close_to_seeds(points, seed, _AROUND_M, _LEAST_SEEDS)
     if theirs.any() and np.linalg.norm(np.ptp(points[theirs, :2], axis=0)) < _WALKER_M:
@@ -130,14 +130,14 @@ def shape_of(track: Track, standing: Sequence[Standing], space: FreeSpace) -> Sh
 
 
 def _staying(
-    track: Track, standing: Sequence[Standing], sweeps: Sequence[int], space: FreeSpace
+    track: Track, obstacles: Sequence[Obstacles], sweeps: Sequence[int], space: FreeSpace
 ) -> Bool:
     """(N,) those of the track's points in these sweeps, one sweep's after the other's, whose places
     are taken in more of the other sweeps than the places that they would have moved to: of a bush
     beside who walks."""
     of = np.repeat(sweeps, [len(track.claimed[j]) for j in sweeps])
-    body = track.seen_in(standing, sweeps)
-    places = np.concatenate([standing[j].points[track.claimed[j]] for j in sweeps])
+    body = track.seen_in(obstacles, sweeps)
+    places = np.concatenate([obstacles[j].points[track.claimed[j]] for j in sweeps])
     reach_of = {
         j: max(_THERE_M, _GAPS_REACHED_UNSEEN * space.gap_m(track.centre, j)) for j in sweeps
     }
@@ -151,7 +151,7 @@ def _staying(
             num[asked] += away_m < reach_m[asked]
 
     for j in sweeps:
-        c, others = standing[j], of != j
+        c, others = obstacles[j], of != j
         count(moves, body, body[~others], others)
         count(stands, places, c.points[c.strips.rows_inside(low, high)], others)
     return np.asarray(stands > moves)
@@ -163,7 +163,6 @@ def attach(
     tracks: Sequence[Track],
     shapes: Sequence[Shape],
     clock: Clock,
-    min_height_m: float,
 ) -> NDArray[np.int32]:
     """(N,): the track each of the points seen by sweep number i belongs to, -1 none.
 
@@ -183,7 +182,7 @@ def attach(
             continue
         in_shape = track.undo(seen.points[rows], seen.time_s[rows])
         distance, _ = shapes[k].tree.nearest(in_shape)
-        belongs = (distance < seen.reach_m[rows]) & (seen.height_m[rows] >= min_height_m)
+        belongs = (distance < seen.reach_m[rows]) & (seen.height_m[rows] >= ABOVE_GROUND_M)
         belongs |= shapes[k].within_outline(in_shape)
         closer = belongs & (distance < nearest[rows])
         instance[rows[closer]] = k
@@ -197,7 +196,7 @@ def detach(
     i: int,
     tracks: Sequence[Track],
     shapes: Sequence[Shape],
-    standing: Sequence[Standing],
+    obstacles: Sequence[Obstacles],
     clock: Clock,
 ) -> None:
     """Take from those who walk what no sweep saw through and what is still there when they are
@@ -209,7 +208,7 @@ def detach(
         instance[(instance == k) & (seen.height_m < _MIN_HEIGHT_OF_WALKERS_M)] = -1
         rows = np.flatnonzero((instance == k) & ~seen.seed)
         if len(rows):
-            _, there = _left_behind(track, shapes[k].tree, seen.points[rows], i, standing, clock)
+            _, there = _left_behind(track, shapes[k].tree, seen.points[rows], i, obstacles, clock)
             instance[rows[there]] = -1
 
 
@@ -248,7 +247,7 @@ def lengthen(
     i: int,
     tracks: Sequence[Track],
     shapes: Sequence[Shape],
-    standing: Sequence[Standing],
+    obstacles: Sequence[Obstacles],
     space: FreeSpace,
 ) -> None:
     """Give the tracks what goes on ahead of and behind their points without a hole, as wide and as
@@ -285,7 +284,7 @@ def lengthen(
             continue
         rows, along = rows[linked], along[linked] - np.median(own)
         rows = rows[_uncontradicted(track, seen, rows, along, i, space)]
-        if len(rows) and _leaves(track, seen, mine, rows, i, standing, space.clock):
+        if len(rows) and _leaves(track, seen, mine, rows, i, obstacles, space.clock):
             instance[rows] = k
 
 
@@ -337,7 +336,7 @@ def _leaves(
     mine: NDArray[np.int64],
     rows: NDArray[np.int64],
     i: int,
-    standing: Sequence[Standing],
+    obstacles: Sequence[Obstacles],
     clock: Clock,
 ) -> bool:
     """Whether the rows leave their places empty when the object with them is gone; asked of what is
@@ -348,7 +347,7 @@ def _leaves(
         return True
     both = np.concatenate([mine, rows])
     tree = BoxTree(track.undo(seen.points[both], seen.time_s[both]))
-    gone, there = _left_behind(track, tree, seen.points[rows], i, standing, clock)
+    gone, there = _left_behind(track, tree, seen.points[rows], i, obstacles, clock)
     return bool(gone.any() and there.sum() <= _MAX_STILL_THERE * gone.sum())
 
 
@@ -362,7 +361,7 @@ def _left_behind(
     tree: BoxTree,
     points: Float,
     i: int,
-    standing: Sequence[Standing],
+    obstacles: Sequence[Obstacles],
     clock: Clock,
 ) -> tuple[Bool, Bool]:
     """From which of the places (N,3) that sweep number i shows the object is gone in the first or
@@ -375,7 +374,7 @@ def _left_behind(
         if not len(away):
             continue
         gone[away] = True
-        places, c = points[away], standing[j]
+        places, c = points[away], obstacles[j]
         rows = c.strips.rows_inside(places.min(0) - _THERE_M, places.max(0) + _THERE_M)
         stands = c.points[rows[~c.candidate[rows]]]
         if len(stands):

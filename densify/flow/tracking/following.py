@@ -13,8 +13,7 @@ import numpy as np
 
 from densify.flow.surface_matching import GATES_M, apply, undo
 from densify.flow.tracking.align import MIN_FIT, Model
-from densify.flow.tracking.evidence import Standing
-from densify.flow.tracking.looks import Look
+from densify.flow.tracking.candidates import Batch, Obstacles
 from densify.flow.tracking.sightings import Track
 from densify.free_space.height_map import HeightMap
 from densify.geometry.clock import Clock
@@ -35,7 +34,7 @@ def follow(
     members: np.ndarray,
     start: int,
     velocity: Float,
-    looks: Sequence[Look],
+    looks: Sequence[Batch],
     free: Sequence[Bool],
     ground: HeightMap,
     clock: Clock,
@@ -43,7 +42,7 @@ def follow(
 ) -> Track:
     """Forwards, then backwards, with everything seen so far as the model. clock: of the looks.
     weight: of heights."""
-    here = looks[start].seen
+    here = looks[start].obstacles
     rate = np.append(velocity, 0.0)
     seen_s = float(here.time_s[members].mean())
     points = _at_once(here, members, rate, seen_s)
@@ -66,7 +65,7 @@ def follow(
     return track
 
 
-def _at_once(c: Standing, rows: np.ndarray, rate: Float, time_s: float) -> Float:
+def _at_once(c: Obstacles, rows: np.ndarray, rate: Float, time_s: float) -> Float:
     """(N,3) candidates of one look, seen one after the other, where they all were at one time."""
     return c.points[rows] + (time_s - c.time_s[rows])[:, None] * rate[:3]
 
@@ -105,7 +104,7 @@ def _find(
     track: Track,
     rate: Float,
     num_recent: int,
-    look: Look,
+    look: Batch,
     free: Sequence[Bool],
     ground: HeightMap,
 ) -> tuple[Float, float, np.ndarray, Float] | None:
@@ -114,7 +113,7 @@ def _find(
     Returns the state, when it held, the rows that fit and where those points were at that time;
     None where too few fit.
     """
-    c, centre = look.seen, track.centre
+    c, centre = look.obstacles, track.centre
     about, about_rate, _ = _predict(track, rate, num_recent, track.seen_at(look.time_ns))
     expected = apply(about, model.points, centre)
     slack_m = GATES_M[0] + look.half_s * np.abs(about_rate[:3])

@@ -12,13 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from densify.config import Config
-from densify.flow.scene import Scene
-from densify.flow.tracking.evidence import (
-    Candidates,
-    FreeSpace,
-    Standing,
-    firing_times_s,
-)
+from densify.flow.engines import Scene
+from densify.flow.tracking.candidates import Candidates, Obstacles, firing_times_s
 from densify.flow.tracking.extent import (
     Seen,
     attach,
@@ -33,6 +28,7 @@ from densify.flow.tracking.radial import Radial
 from densify.flow.tracking.sightings import Track
 from densify.flow.tracking.soften import Part, Softened, soften
 from densify.flow.tracking.tracks import follow_groups
+from densify.free_space.seen_through import FreeSpace
 from densify.geometry import poses
 from densify.geometry.clock import Clock
 from densify.geometry.types import Float, FlowField, Stretch
@@ -105,7 +101,7 @@ class Bending:
 
 
 def estimate_motion(scene: Scene, settings: Config, argument: str) -> GroupMotion:
-    """Find everything in the stretch that certainly moves; ``flow.soft``: objects may bend.
+    """Find everything in the stretch that certainly moves.
 
     As `densify.flow.engines.EngineModule`; takes no argument. At any rate: what is near in time is
     asked of the stamps. Below 10 Hz what turns, bends or is hidden between two sweeps is followed
@@ -123,23 +119,23 @@ def motion_of(
     """The same with what may move given, and how fast it may: (C,3) of each sweep's candidates,
     world; None has the sweeps vote."""
     stretch, space, ground = scene.stretch, scene.space, scene.ground
-    standing = [Standing.of(stretch, i, found) for i, found in enumerate(candidates)]
-    tracks = follow_groups(standing, space, ground, velocities_m_s)
-    shapes = [shape_of(track, standing, space) for track in tracks]
+    obstacles = [Obstacles.of(stretch, i, found) for i, found in enumerate(candidates)]
+    tracks = follow_groups(obstacles, space, ground, velocities_m_s)
+    shapes = [shape_of(track, obstacles, space) for track in tracks]
 
     def members(look: Sequence[int]) -> list[NDArray[np.int32]]:
         instances = [np.full(len(stretch.sweeps[i].sweep), -1, np.int32) for i in look]
         if not any(map(scene.is_asked, look)):
             return instances
-        parts = [Seen.of(stretch, i, ground, standing[i], space.sensors) for i in look]
+        parts = [Seen.of(stretch, i, ground, obstacles[i], space.sensors) for i in look]
         attached = [
-            attach(seen, i, tracks, shapes, space.clock, scene.min_height_m)
+            attach(seen, i, tracks, shapes, space.clock)
             for i, seen in zip(look, parts, strict=True)
         ]
         for i, seen, mine in zip(look, parts, attached, strict=True):
-            detach(mine, seen, i, tracks, shapes, standing, space.clock)
+            detach(mine, seen, i, tracks, shapes, obstacles, space.clock)
         together = np.concatenate(attached)
-        lengthen(together, Seen.together(parts), look[0], tracks, shapes, standing, space)
+        lengthen(together, Seen.together(parts), look[0], tracks, shapes, obstacles, space)
         attached = np.split(together, np.cumsum([len(mine) for mine in attached])[:-1])
         for i, seen, mine, instance in zip(look, parts, attached, instances, strict=True):
             leave_out_alone(mine, seen, i, tracks, space.clock)
@@ -150,11 +146,9 @@ def motion_of(
         return instances
 
     with ThreadPoolExecutor() as pool:
-        instance = tuple(chain.from_iterable(pool.map(members, space.looks)))
-    bendings = {}
-    if settings.flow.soft:
-        fine = [_is_fine(track, space) for track in tracks]
-        bendings = _bendings(stretch, tracks, fine, instance)
+        instance = tuple(chain.from_iterable(pool.map(members, space.batches)))
+    fine = [_is_fine(track, space) for track in tracks]
+    bendings = _bendings(stretch, tracks, fine, instance)
     return GroupMotion(stretch, tuple(tracks), instance, bendings)
 
 

@@ -9,9 +9,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from densify.flow.tracking.evidence import FreeSpace, Standing
+from densify.flow.tracking.candidates import Obstacles
 from densify.flow.tracking.shapes import Body
 from densify.flow.tracking.sightings import Track
+from densify.free_space.seen_through import FreeSpace
 from densify.geometry.nearest import BoxTree
 from densify.geometry.types import Float
 
@@ -81,7 +82,7 @@ class LeftPlaces(NamedTuple):
 
 
 def left_places(
-    track: Track, standing: Sequence[Standing], space: FreeSpace, proven: Sequence[Body]
+    track: Track, obstacles: Sequence[Obstacles], space: FreeSpace, proven: Sequence[Body]
 ) -> LeftPlaces:
     """What the sweeps saw at the places that a track comes to or has left.
 
@@ -91,27 +92,27 @@ def left_places(
     that are proven to move do not count.
     """
     some = {i: rows[:: len(rows) // _NUM_ASKED + 1] for i, rows in track.claimed.items()}
-    tree = BoxTree(track.seen_in(standing, track.claimed))
+    tree = BoxTree(track.seen_in(obstacles, track.claimed))
     rate = track.path.rate((track.path.begin_s + track.path.end_s) / 2)
     room_m = _ROOM_M + _ROOM_S * float(np.linalg.norm(rate[:2]))
     gap_m = space.gap_m(track.centre, next(iter(track.claimed)))
     there_m = max(_THERE_M, _THERE_PER_GAP * gap_m)
 
     def seen(look: tuple[int, ...], sweeps: Sequence[int]) -> Places:
-        places = np.concatenate([np.zeros((0, 3)), *(standing[i].points[some[i]] for i in sweeps)])
+        places = np.concatenate([np.zeros((0, 3)), *(obstacles[i].points[some[i]] for i in sweeps)])
         away_m, _ = tree.nearest(track.undo(places, space.clock.time_s[look[0]]), room_m)
         places = places[(away_m > _LEFT_M) & np.isfinite(away_m)]
         if not len(places):
             return Places(0, 0)
-        there = np.concatenate([_there(places, there_m, standing[j], proven) for j in look])
+        there = np.concatenate([_there(places, there_m, obstacles[j], proven) for j in look])
         taken = np.zeros(len(places), bool)
         if len(there):
             taken = np.isfinite(BoxTree(there).nearest(places, there_m)[0])
         empty = space.seen_through(places, look[0]) & ~taken
         return Places(int(taken.sum()), int(empty.sum()))
 
-    coming = [seen(look, [i for i in some if i > look[-1]]) for look in space.looks]
-    gone = [seen(look, [i for i in some if i < look[0]]) for look in space.looks]
+    coming = [seen(look, [i for i in some if i > look[-1]]) for look in space.batches]
+    gone = [seen(look, [i for i in some if i < look[0]]) for look in space.batches]
     return LeftPlaces(_total(coming), _total(gone))
 
 
@@ -119,7 +120,7 @@ def _total(parts: Sequence[Places]) -> Places:
     return Places(sum(p.taken for p in parts), sum(p.empty for p in parts))
 
 
-def _there(places: Float, reach_m: float, c: Standing, proven: Sequence[Body]) -> Float:
+def _there(places: Float, reach_m: float, c: Obstacles, proven: Sequence[Body]) -> Float:
     """(N,3) what a sweep saw that close to some places, but of no object proven to move."""
     rows = c.strips.rows_inside(places.min(0) - reach_m, places.max(0) + reach_m)
     rows = rows[np.isfinite(BoxTree(places).nearest(c.points[rows], reach_m)[0])]

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from densify.flow.tracking.evidence import LINK_M, Standing
+from densify.flow.tracking.candidates import LINK_M, Obstacles
 from densify.flow.tracking.shapes import Shape
 from densify.free_space.sensor import Sensors
 from densify.geometry.linking import link
@@ -25,7 +25,7 @@ _ONE_RING = 0.5  # steps of rings between its lowest and highest return
 _ONE_COLUMN = 2.5  # steps of columns between its rightmost and leftmost return
 
 
-def few_rays(c: Standing, rows: np.ndarray, T_lidar_world: Float, sensors: Sensors) -> Bool:
+def few_rays(c: Obstacles, rows: np.ndarray, T_lidar_world: Float, sensors: Sensors) -> Bool:
     """(N,) whether the clusters of these rows of candidates, not far from each other, are each seen
     by one ring, or by one column of rays, only.
 

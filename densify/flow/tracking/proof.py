@@ -7,11 +7,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from densify.flow.tracking.evidence import FreeSpace, Standing
+from densify.flow.tracking.candidates import Obstacles
 from densify.flow.tracking.left_places import LeftPlaces, left_places
 from densify.flow.tracking.radial import Radial
 from densify.flow.tracking.shapes import Body
 from densify.flow.tracking.sightings import Track
+from densify.free_space.seen_through import FreeSpace
 from densify.geometry import poses
 
 _ROUGH_M, _ROUGH_PER_GAP, _ROUGH_S = 0.04, 0.2, 0.003  # by gap of rings, by speed
@@ -24,12 +25,12 @@ _LEAST_STATES, _LEAST_S = 3, 0.15
 # Where no sweep meets the points of the one before, three crowns of trees may lie on a line.
 _LEAST_STATES_SCATTERED = 4
 _SHORT_S, _MAX_OF_SHORT = 0.35, 0.03  # three places of a tree's crown may lie on a line,
-_SHORT_OF_FEW_S, _FEW = 0.6, 0.2  # and even more where few looks contradict its standing still,
+_SHORT_OF_FEW_S, _FEW = 0.6, 0.2  # and even more where few looks contradict its obstacles still,
 _MAX_OF_FEW = 0.1  # of which its motion may leave so many, unless it left its places bare
 # But a crown does not leave its places bare, least of all so many.
 _MAX_OF_SHORT_BARE, _MAX_OF_SHORT_MANY_BARE = 0.06, 0.12
 _STRAY = 0.005  # so few of all looks are echoes at an object's rim
-# Of those that standing still leaves; of what leaves all its places bare more: limbs swing.
+# Of those that obstacles still leaves; of what leaves all its places bare more: limbs swing.
 _MAX_CONTRADICTIONS, _MAX_OF_LIMBS, _FAR_M = 0.3, 0.5, 3.0
 # They are so many, or of few looks this share, and of many at least that one.
 _LEAST_CONTRADICTIONS, _SHARE_OF_FEW, _LEAST_SHARE = 20, 0.08, 0.01
@@ -39,7 +40,7 @@ _AS_FAST, _RAIL_M, _SLENDER, _SHARE_OF_RAIL = 0.1, 2.0, 8.0, 0.3
 
 
 def left_contradicted(
-    track: Track, standing: Sequence[Standing], space: FreeSpace, proven: Sequence[Body]
+    track: Track, obstacles: Sequence[Obstacles], space: FreeSpace, proven: Sequence[Body]
 ) -> float | None:
     """Fit the smooth motion of a track; None unless it certainly moves, or how much contradicts
     that, see `share_contradicted`."""
@@ -49,11 +50,11 @@ def left_contradicted(
     if num_states < _LEAST_STATES_SCATTERED and space.sensors.scattered:
         return None
     track.smooth()
-    return share_contradicted(track, standing, space, proven)
+    return share_contradicted(track, obstacles, space, proven)
 
 
 def share_contradicted(
-    track: Track, standing: Sequence[Standing], space: FreeSpace, proven: Sequence[Body]
+    track: Track, obstacles: Sequence[Obstacles], space: FreeSpace, proven: Sequence[Body]
 ) -> float | None:
     """None unless a track's smooth motion certainly is one, or the share of looks that contradict
     even that motion, 0 at best: of two motions the one with less of them is the truth.
@@ -72,14 +73,14 @@ def share_contradicted(
     over_m = _over_noise_m(track, space, seen_s)
     if over_m is None or (over_m > 0 and not space.sensors.scattered):
         return None
-    if not _as_fast_as_measured(track, standing):
+    if not _as_fast_as_measured(track, obstacles):
         return None
-    still, moved, num_asked = contradictions(track, standing, space)
+    still, moved, num_asked = contradictions(track, obstacles, space)
     least = min(_LEAST_CONTRADICTIONS, _SHARE_OF_FEW * num_asked)
     least_of_bare = max(min(least, _LEAST_OF_BARE), _LEAST_SHARE * num_asked)
     if still < least_of_bare or moved > _MAX_OF_LIMBS * still:
         return None
-    left = left_places(track, standing, space, proven)
+    left = left_places(track, obstacles, space, proven)
     none_taken = seen_s >= _SHORT_S and left.none_taken()
     if still < max(least, _LEAST_SHARE * num_asked) and not none_taken:
         return None
@@ -102,7 +103,7 @@ def share_contradicted(
         if glides or seen_s < min(short_s, np.ptp(space.clock.time_s) / 2):
             return None
     as_few_as_a_rail = still < _SHARE_OF_RAIL * num_asked
-    if as_few_as_a_rail and not mostly_bare and _like_a_rail(track, standing, space):
+    if as_few_as_a_rail and not mostly_bare and _like_a_rail(track, obstacles, space):
         return None
     return moved / num_asked
 
@@ -128,14 +129,14 @@ def _travelled_m(track: Track) -> float:
 
 
 def may_be_a_rail(
-    track: Track, standing: Sequence[Standing], space: FreeSpace, proven: Sequence[Body]
+    track: Track, obstacles: Sequence[Obstacles], space: FreeSpace, proven: Sequence[Body]
 ) -> bool:
     """Whether few looks contradict that the track stands, which is shaped like a guard rail, and
     does not leave nearly all its places bare."""
-    still, _, num_asked = contradictions(track, standing, space)
-    if still >= _SHARE_OF_RAIL * num_asked or not _like_a_rail(track, standing, space):
+    still, _, num_asked = contradictions(track, obstacles, space)
+    if still >= _SHARE_OF_RAIL * num_asked or not _like_a_rail(track, obstacles, space):
         return False
-    return not left_places(track, standing, space, proven).mostly_bare()
+    return not left_places(track, obstacles, space, proven).mostly_bare()
 
 
 def _most_of_short(left: LeftPlaces) -> float:
@@ -160,13 +161,13 @@ def _goes_along(track: Track, space: FreeSpace) -> bool:
     return apart_m_s < _AS_FAST * float(np.linalg.norm(own_m_s))
 
 
-def _like_a_rail(track: Track, standing: Sequence[Standing], space: FreeSpace) -> bool:
+def _like_a_rail(track: Track, obstacles: Sequence[Obstacles], space: FreeSpace) -> bool:
     """Whether the object goes about where it points, and is much longer than high, and than wide or
     moving about as the scanner does. Nothing of a guard rail tells its motion along itself; where
     it lies between two rings, sweeps see through it; and rings go with the scanner, so that it
     seems to go with it too."""
     parts = [
-        track.undo(standing[i].points[rows], standing[i].time_s[rows])
+        track.undo(obstacles[i].points[rows], obstacles[i].time_s[rows])
         for i, rows in track.claimed.items()
     ]
     body = np.concatenate(parts)
@@ -187,35 +188,35 @@ def _like_a_rail(track: Track, standing: Sequence[Standing], space: FreeSpace) -
     return long_m > _SLENDER * wide_m or _goes_along(track, space)
 
 
-def _as_fast_as_measured(track: Track, standing: Sequence[Standing]) -> bool:
+def _as_fast_as_measured(track: Track, obstacles: Sequence[Obstacles]) -> bool:
     """Whether the motion has the radial velocities that were measured, where any were."""
     parts, velocities = [], []
     for j, rows in track.claimed.items():
-        radial = standing[j].radial
+        radial = obstacles[j].radial
         if radial is not None:
-            at_s = float(standing[j].time_s[rows].mean())
+            at_s = float(obstacles[j].time_s[rows].mean())
             parts.append(radial.rows(rows))
-            velocities.append(track.velocity_m_s(standing[j].points[rows], at_s))
+            velocities.append(track.velocity_m_s(obstacles[j].points[rows], at_s))
     return not parts or Radial.together(parts).agrees(np.concatenate(velocities))
 
 
 def contradictions(
-    track: Track, standing: Sequence[Standing], space: FreeSpace
+    track: Track, obstacles: Sequence[Obstacles], space: FreeSpace
 ) -> tuple[int, int, int]:
-    """How many looks through the track's points the sweeps have, standing still and moved, and how
+    """How many looks through the track's points the sweeps have, obstacles still and moved, and how
     many there may have been."""
     asked = {}
-    for look in space.looks:
+    for look in space.batches:
         num = _NUM_ASKED // len(look)
         for i in look:
             if i in track.claimed:
                 rows = track.claimed[i]
                 asked[i] = rows[:: len(rows) // num + 1]
     others = {i: frozenset(space.others(i)) for i in asked}
-    points = {i: standing[i].points[rows] for i, rows in asked.items()}
-    body = {i: track.undo(points[i], standing[i].time_s[rows]) for i, rows in asked.items()}
+    points = {i: obstacles[i].points[rows] for i, rows in asked.items()}
+    body = {i: track.undo(points[i], obstacles[i].time_s[rows]) for i, rows in asked.items()}
     still = moved = num_asked = 0
-    for j, *_ in space.looks:
+    for j, *_ in space.batches:
         from_others = [i for i in asked if j in others[i]]
         if not from_others:
             continue

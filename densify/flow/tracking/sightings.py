@@ -9,10 +9,10 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from densify.flow.tracking import path_kernels as kernels
-from densify.flow.tracking.evidence import FreeSpace, Standing
-from densify.flow.tracking.looks import Look
+from densify.flow.tracking.candidates import Batch, Obstacles
 from densify.flow.tracking.paths import Path
 from densify.free_space.height_map import HeightMap
+from densify.free_space.seen_through import FreeSpace
 from densify.geometry.types import Bool, Float
 
 _MANY_POINTS = 100  # more do not place a look better
@@ -39,7 +39,7 @@ class Track:
     """One rigid object in the stretch.
 
     centre: (3,) about which it turns, world. sightings: by the look's index, in the order they were
-    made. claimed: sweep index -> rows of `Standing` that are its. path: the smooth motion.
+    made. claimed: sweep index -> rows of `Obstacles` that are its. path: the smooth motion.
     """
 
     centre: Float
@@ -81,15 +81,15 @@ class Track:
         carried = self.place(body, at_s)
         return space.seen_through(carried, j, self.velocity_m_s(carried, at_s))
 
-    def seen_in(self, standing: Sequence[Standing], sweeps: Iterable[int]) -> Float:
+    def seen_in(self, obstacles: Sequence[Obstacles], sweeps: Iterable[int]) -> Float:
         """(N,3) what these sweeps saw of the object, in its own frame."""
         parts = [np.zeros((0, 3))]
         for j in sweeps:
-            c, rows = standing[j], self.claimed[j]
+            c, rows = obstacles[j], self.claimed[j]
             parts.append(self.undo(c.points[rows], c.time_s[rows]))
         return np.concatenate(parts)
 
-    def add(self, n: int, look: Look, state: Float, seen_s: float, rows: np.ndarray) -> None:
+    def add(self, n: int, look: Batch, state: Float, seen_s: float, rows: np.ndarray) -> None:
         """What look n saw of the object: ascending rows."""
         mine = look.split(rows)
         self.sightings[n] = Sighting(state, seen_s, look.time_ns, tuple(mine))

@@ -14,11 +14,12 @@ from dataclasses import replace
 import numpy as np
 
 from densify.flow.surface_matching import apply
-from densify.flow.tracking.evidence import LINK_M, FreeSpace, Standing
+from densify.flow.tracking.candidates import LINK_M, Obstacles
 from densify.flow.tracking.proof import contradictions
 from densify.flow.tracking.shapes import Body
 from densify.flow.tracking.sightings import Track
 from densify.flow.tracking.vote import DistanceField, grid
+from densify.free_space.seen_through import FreeSpace
 from densify.geometry.types import Float
 
 _APART_S, _MOST_APART_S = 0.25, 1.0
@@ -30,7 +31,7 @@ _LONG_M, _SLIDES_M_S, _ABOUT_AS_WELL = 1.5, (0.3, 2.5), 1.25
 _CLEARLY = 0.95  # of the distance between looks
 
 
-def take_back_slides(track: Track, standing: Sequence[Standing], space: FreeSpace) -> None:
+def take_back_slides(track: Track, obstacles: Sequence[Obstacles], space: FreeSpace) -> None:
     """Change the velocity of a track's states, and lay its path anew, where looks far apart in time
     then come to lie clearly nearer to each other, and no more looks contradict it: those that saw
     different parts of the object would come nearer, too."""
@@ -39,7 +40,7 @@ def take_back_slides(track: Track, standing: Sequence[Standing], space: FreeSpac
     if len(looks) < _LEAST_LOOKS or np.ptp(times_s) < 2 * _APART_S:
         return
     times_s -= times_s.mean()
-    bodies = [track.seen_in(standing, track.sightings[n].sweeps) for n in looks]
+    bodies = [track.seen_in(obstacles, track.sightings[n].sweeps) for n in looks]
     slide_m_s = _slide_m_s(bodies, times_s)
     if not slide_m_s.any():
         return
@@ -48,11 +49,11 @@ def take_back_slides(track: Track, standing: Sequence[Standing], space: FreeSpac
         state = track.sightings[n].state
         moved = apply(state, track.centre[None] - at_s * slide_m_s, track.centre)[0]
         states.append(np.append(moved - track.centre, state[3]))
-    _lay_anew(track, states, standing, space)
+    _lay_anew(track, states, obstacles, space)
 
 
 def go_with_the_rest(
-    track: Track, proven: Sequence[Body], standing: Sequence[Standing], space: FreeSpace
+    track: Track, proven: Sequence[Body], obstacles: Sequence[Obstacles], space: FreeSpace
 ) -> None:
     """Give a long track the motion of the object that it touches and slides along, where that fits
     about as well and no more looks contradict it: what is solid does not, but a side seen in pieces
@@ -63,7 +64,7 @@ def go_with_the_rest(
     looks = sorted(track.sightings)
     times_s = np.array([track.sightings[n].seen_s for n in looks])
     middle_s = float(times_s.mean())
-    there = track.place(track.seen_in(standing, sorted(track.claimed)), middle_s)
+    there = track.place(track.seen_in(obstacles, sorted(track.claimed)), middle_s)
     if np.linalg.norm(np.ptp(there[:, :2], axis=0)) < _LONG_M:
         return
     middle, own = (
@@ -76,36 +77,36 @@ def go_with_the_rest(
             continue
         if not np.isfinite(shape.tree.nearest(body.undo(there, middle_s), LINK_M)[0]).any():
             continue
-        before, missed = (dict(track.sightings), track.path), _missed(track, looks, standing)
+        before, missed = (dict(track.sightings), track.path), _missed(track, looks, obstacles)
         centre, yaw = track.place(track.centre[None], middle_s), track.path(middle_s)[3]
         states = []
         for at_s in times_s:
             turned = body.path(at_s)[3] - body.path(middle_s)[3]
             moved = body.carry(centre, middle_s, at_s)[0] - track.centre
             states.append(np.append(moved, yaw + turned))
-        _lay_anew(track, states, standing, space)
-        if _missed(track, looks, standing) <= _ABOUT_AS_WELL * missed:
+        _lay_anew(track, states, obstacles, space)
+        if _missed(track, looks, obstacles) <= _ABOUT_AS_WELL * missed:
             return
         track.sightings, track.path = before
 
 
-def _missed(track: Track, looks: Sequence[int], standing: Sequence[Standing]) -> float:
+def _missed(track: Track, looks: Sequence[int], obstacles: Sequence[Obstacles]) -> float:
     """How far looks far apart in time lie from each other as the track moves, see `_distance`."""
     times_s = np.array([track.sightings[n].seen_s for n in looks])
-    bodies = [track.seen_in(standing, track.sightings[n].sweeps) for n in looks]
+    bodies = [track.seen_in(obstacles, track.sightings[n].sweeps) for n in looks]
     return float(_distance(bodies, times_s)(np.zeros((1, 3)))[0])
 
 
 def _lay_anew(
-    track: Track, states: Sequence[Float], standing: Sequence[Standing], space: FreeSpace
+    track: Track, states: Sequence[Float], obstacles: Sequence[Obstacles], space: FreeSpace
 ) -> None:
     """Give the track's looks, in order, other states, unless more looks contradict it then."""
     before = dict(track.sightings), track.path
-    _, contradicted, _ = contradictions(track, standing, space)
+    _, contradicted, _ = contradictions(track, obstacles, space)
     for n, state in zip(sorted(before[0]), states, strict=True):
         track.sightings[n] = replace(track.sightings[n], state=state)
     track.smooth()
-    if contradictions(track, standing, space)[1] > contradicted:
+    if contradictions(track, obstacles, space)[1] > contradicted:
         track.sightings, track.path = before
 
 

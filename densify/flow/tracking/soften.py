@@ -216,7 +216,7 @@ class _Bending:
         self._target = self._side_by_side([self._nodes[b] for _, b in self._hops])
 
     def refine(self, level: int) -> None:
-        """Look for the targets anew and solve, at the stiffness of a level."""
+        """Batch for the targets anew and solve, at the stiffness of a level."""
         moved = self._source + self._flow
         blur_m, reach_m = _BLURS_M[level], _REACHES_M[level]
         near = _nearest(self._target, moved, _NUM_BLURRED)

@@ -15,11 +15,10 @@ from itertools import chain
 import numpy as np
 
 from densify.flow.tracking.align import Model
-from densify.flow.tracking.evidence import FreeSpace, Standing, height_weight
+from densify.flow.tracking.candidates import Batch, Obstacles, height_weight
 from densify.flow.tracking.following import follow
 from densify.flow.tracking.left_places import left_places
 from densify.flow.tracking.lone_rays import few_rays, gap_in_line_m, in_line, linked_in_line
-from densify.flow.tracking.looks import looks_of
 from densify.flow.tracking.proof import left_contradicted, may_be_a_rail, share_contradicted
 from densify.flow.tracking.shapes import Body, Shape
 from densify.flow.tracking.sightings import Track
@@ -35,6 +34,7 @@ from densify.flow.tracking.starts import (
 )
 from densify.flow.tracking.vote import DistanceField, Group, vote
 from densify.free_space.height_map import HeightMap
+from densify.free_space.seen_through import FreeSpace
 from densify.geometry.clock import Clock
 from densify.geometry.types import Bool, Float
 
@@ -49,15 +49,15 @@ _AS_WHOLE = 0.9  # of the points it had
 
 
 def follow_groups(
-    standing: Sequence[Standing],
+    obstacles: Sequence[Obstacles],
     space: FreeSpace,
     ground: HeightMap,
     velocities_m_s: Sequence[Float] | None = None,
 ) -> list[Track]:
     """All proven moving objects of the stretch. velocities_m_s: (C,3) of each sweep's points, with
     which groups of them start; None has the sweeps around vote."""
-    search = _Search(standing, space, ground, velocities_m_s)
-    groups = groups_to_start([look.seen for look in search.looks], search.clock)
+    search = _Search(obstacles, space, ground, velocities_m_s)
+    groups = groups_to_start([look.obstacles for look in search.looks], search.clock)
     return search.tracks_of(groups) + search.tracks_of(groups, left_over=True)
 
 
@@ -70,20 +70,20 @@ class _Search:
 
     def __init__(
         self,
-        standing: Sequence[Standing],
+        obstacles: Sequence[Obstacles],
         space: FreeSpace,
         ground: HeightMap,
         velocities_m_s: Sequence[Float] | None,
     ) -> None:
-        self._standing, self._space, self._ground = standing, space, ground
+        self._standing, self._space, self._ground = obstacles, space, ground
         self._velocities_m_s = velocities_m_s
-        self.looks = looks_of(standing, space.clock)
+        self.looks = [Batch.of(b, obstacles, space.clock) for b in space.batches]
         self.clock = Clock(np.array([look.time_ns for look in self.looks]))
         self.free, self.bodies = self.all_points(), list[Body]()
         self._fields: list[list[DistanceField]] = []
         if velocities_m_s is None:
             of_sweeps = [
-                DistanceField.of(c.points[c.candidate], c.time_s[c.candidate]) for c in standing
+                DistanceField.of(c.points[c.candidate], c.time_s[c.candidate]) for c in obstacles
             ]
             self._fields = [[of_sweeps[j] for j in look.sweeps] for look in self.looks]
 
@@ -119,7 +119,7 @@ class _Search:
     def _gap_m(self, members: np.ndarray, n: int) -> float:
         """Between neighbouring rings at a group of look n."""
         look = self.looks[n]
-        return self._space.gap_m(look.seen.points[members].mean(axis=0), look.sweeps[0])
+        return self._space.gap_m(look.obstacles.points[members].mean(axis=0), look.sweeps[0])
 
     def _height_weights(self, gap_m: float) -> list[float]:
         """How much heights count while a group is followed, all at first. Where rings lie far apart
@@ -199,7 +199,7 @@ class _Search:
 
     def _velocity_of(self, members: np.ndarray, n: int) -> Float:
         """(3,) m/s that a group of look n may have."""
-        seen = self.looks[n].seen
+        seen = self.looks[n].obstacles
         if self._velocities_m_s is None:
             group = Group.of(seen.points[members], seen.time_s[members])
             velocity = vote(group, n, self._fields, self.clock)
@@ -236,15 +236,15 @@ def _best_of(tried: Iterable[tuple[Track, float | None]]) -> tuple[Track, float]
 
 def _gather(
     track: Track,
-    standing: Sequence[Standing],
+    obstacles: Sequence[Obstacles],
     free: Sequence[Bool],
     space: FreeSpace,
 ) -> None:
     """Claim the free candidates beside or within the object that its motion does not contradict,
     before a part of it starts a track of its own."""
-    shape = Shape.of(track.seen_in(standing, sorted(track.claimed)))
+    shape = Shape.of(track.seen_in(obstacles, sorted(track.claimed)))
     for j, own in track.claimed.items():
-        c = standing[j]
+        c = obstacles[j]
         there = track.place(shape.rim, track.seen_at(space.clock.time_ns[j]))
         rows = c.strips.rows_inside(there.min(0) - 2 * _FIT_M, there.max(0) + 2 * _FIT_M)
         rows = rows[free[j][rows] & (c.cluster[rows] >= 0)]
@@ -257,16 +257,16 @@ def _gather(
 
 
 def _claim_rays(
-    track: Track, standing: Sequence[Standing], free: Sequence[Bool], space: FreeSpace
+    track: Track, obstacles: Sequence[Obstacles], free: Sequence[Bool], space: FreeSpace
 ) -> None:
     """Claim the free clusters of single rings and columns of rays ahead of and behind the object
     that its motion does not contradict, see `densify.flow.tracking.lone_rays`. They do not place
     it: they stay where the rays are."""
-    shape = Shape.of(track.seen_in(standing, sorted(track.claimed)))
+    shape = Shape.of(track.seen_in(obstacles, sorted(track.claimed)))
     ahead = Body(track, shape).pointing(next(iter(track.sightings.values())).seen_s)
     found, bodies = [], []
     for j, own in track.claimed.items():
-        c = standing[j]
+        c = obstacles[j]
         there = track.place(shape.rim, track.seen_at(space.clock.time_ns[j]))
         rows = c.strips.rows_inside(there.min(0) - _RAYS_M, there.max(0) + _RAYS_M)
         rows = rows[free[j][rows] & (c.cluster[rows] >= 0)]
@@ -284,7 +284,7 @@ def _claim_rays(
 
 
 def _not_contradicted(
-    track: Track, c: Standing, rows: np.ndarray, j: int, space: FreeSpace
+    track: Track, c: Obstacles, rows: np.ndarray, j: int, space: FreeSpace
 ) -> np.ndarray:
     """Those rows of sweep j that no sweep close in time sees through where they are carried to."""
     for i in space.others(j):
@@ -294,7 +294,7 @@ def _not_contradicted(
     return rows
 
 
-def _refine(track: Track, standing: Sequence[Standing], ground: HeightMap) -> None:
+def _refine(track: Track, obstacles: Sequence[Obstacles], ground: HeightMap) -> None:
     """Align every look once more, with what others saw, if that makes the motion smoother.
 
     Followed look by look, an object whose other side comes into view drifts: the first shape is
@@ -304,14 +304,14 @@ def _refine(track: Track, standing: Sequence[Standing], ground: HeightMap) -> No
     sweeps: tuple[list[int], list[int]] = [], []
     for n, sighting in sorted(track.sightings.items()):
         sweeps[n % 2].extend(sighting.sweeps)
-    shapes = [track.seen_in(standing, some) for some in sweeps]
+    shapes = [track.seen_in(obstacles, some) for some in sweeps]
     if not all(map(len, shapes)):
         return
     models = [Model(x) for x in shapes]
     before = dict(track.sightings), track.path
     for n, sighting in track.sightings.items():
         at_s = sighting.seen_s
-        points = track.place(track.seen_in(standing, sighting.sweeps), at_s)
+        points = track.place(track.seen_in(obstacles, sighting.sweeps), at_s)
         state = models[1 - n % 2].align(points, track.centre, track.path(at_s), _REFINED_STD)
         if state is not None:
             state[2] = track.rise_m(ground, state)

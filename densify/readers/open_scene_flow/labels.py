@@ -19,7 +19,7 @@ from scipy.spatial import cKDTree
 from densify.config import Config
 from densify.config.errors import InputError
 from densify.flow.chained import ChainedMotion
-from densify.flow.scene import Scene
+from densify.flow.engines import Scene
 from densify.geometry import poses
 from densify.geometry.types import Bool, Float, FlowField, Stretch
 from densify.readers.flow_files import MOVES_M

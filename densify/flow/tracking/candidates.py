@@ -1,0 +1,239 @@
+# SPDX-License-Identifier: MIT
+"""Candidates: the points that may move, because other sweeps saw through them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from densify.flow.tracking.radial import Radial
+from densify.free_space.height_map import ABOVE_GROUND_M, HeightMap
+from densify.free_space.seen_through import FreeSpace
+from densify.geometry import poses
+from densify.geometry.clock import Clock
+from densify.geometry.linking import close_to_seeds, link
+from densify.geometry.types import Bool, Float, Int, Stretch
+
+LINK_M = 0.6  # candidates closer to each other are one cluster
+_NEAR_M, _MIN_SEED_SHARE = 0.4, 0.3
+_RING_GAP_M = 0.35
+_STRIP = 32
+
+T = TypeVar("T", bound=np.generic)
+
+
+class Strips:
+    """Points in scan order, searched by boxes: neighbours in a scan mostly follow each other."""
+
+    def __init__(self, points: Float) -> None:
+        """points: (N,3)."""
+        self._points = points
+        begins = np.arange(0, len(points), _STRIP)
+        if len(points):
+            self._low = np.minimum.reduceat(points, begins)
+            self._high = np.maximum.reduceat(points, begins)
+
+    def rows_inside(self, low: Float, high: Float) -> Int:
+        """Return the ascending rows of the points strictly between two corners (3,)."""
+        if not len(self._points):
+            return np.zeros(0, np.int64)
+        strips = np.flatnonzero(((self._low < high) & (self._high > low)).all(axis=1))
+        rows = (strips[:, None] * _STRIP + np.arange(_STRIP)).ravel()
+        rows = rows[rows < len(self._points)]
+        points = self._points[rows]
+        return np.asarray(rows[((points > low) & (points < high)).all(axis=1)], np.int64)
+
+
+@dataclass(frozen=True)
+class Candidates:
+    """The columns of `Obstacles` that do not depend on the world's origin."""
+
+    row: Int
+    seed: Bool
+    cluster: Int
+    num_clusters: int
+
+
+@dataclass(frozen=True)
+class Obstacles:
+    """The C points of one sweep, or of a batch, that lie above the ground.
+
+    row: (C,) index into the sweep's points. points: (C,3) world, rigidly registered.
+    time_s: (C,) firing time since the first sweep's reference time.
+    seed: (C,) True if another sweep saw through the point, or its radial velocity is not static.
+    cluster: (C,) label of the cluster of candidates, -1 for points that are no candidates.
+    radial: None where no scanner measures radial velocity.
+    """
+
+    row: Int
+    points: Float
+    time_s: Float
+    seed: Bool
+    cluster: Int
+    num_clusters: int
+    radial: Radial | None = None
+
+    @staticmethod
+    def of(stretch: Stretch, i: int, found: Candidates) -> Obstacles:
+        """Place the candidates of sweep i in the world."""
+        registered = stretch.sweeps[i]
+        radial = Radial.of(registered)
+        return Obstacles(
+            row=found.row,
+            points=poses.transform(registered.T_world_lidar, registered.sweep.points[found.row]),
+            time_s=firing_times_s(stretch, i, found.row),
+            seed=found.seed,
+            cluster=found.cluster,
+            num_clusters=found.num_clusters,
+            radial=None if radial is None else radial.rows(found.row),
+        )
+
+    @property
+    def candidate(self) -> Bool:
+        return self.cluster >= 0
+
+    @cached_property
+    def strips(self) -> Strips:
+        return Strips(self.points)
+
+
+@dataclass(frozen=True)
+class Batch:
+    """The obstacles of the sweeps of one batch, see `Clock.batches`.
+
+    sweeps: indices. time_ns: middle of their reference times, since the first sweep. half_s: from
+    there to the first and the last. obstacles: of all sweeps, sweep by sweep. begins: first row of
+    each sweep.
+    """
+
+    sweeps: tuple[int, ...]
+    time_ns: int
+    half_s: float
+    obstacles: Obstacles
+    begins: tuple[int, ...]
+
+    @staticmethod
+    def of(sweeps: Sequence[int], obstacles: Sequence[Obstacles], clock: Clock) -> Batch:
+        """obstacles: of all sweeps of the stretch."""
+        parts = [obstacles[j] for j in sweeps]
+        first_ns, last_ns = clock.time_ns[[sweeps[0], sweeps[-1]]].tolist()
+        begins = np.cumsum([0] + [len(part.points) for part in parts[:-1]]).tolist()
+        middle_ns, half_s = (first_ns + last_ns) // 2, (last_ns - first_ns) * 0.5e-9
+        return Batch(tuple(sweeps), middle_ns, half_s, _merged(parts), tuple(begins))
+
+    def gather(self, columns: Sequence[NDArray[T]]) -> NDArray[T]:
+        """Return the rows of this batch from a column of each sweep of the stretch."""
+        return np.concatenate([columns[j] for j in self.sweeps])
+
+    def split(self, rows: Int) -> dict[int, Int]:
+        """Return for each sweep its own rows among ascending rows of the batch."""
+        parts = np.split(rows, np.searchsorted(rows, self.begins[1:]))
+        own = zip(self.sweeps, parts, self.begins, strict=True)
+        return {j: part - begin for j, part, begin in own if len(part)}
+
+
+def _merged(parts: Sequence[Obstacles]) -> Obstacles:
+    """Merge clusters of different sweeps whose points come within `LINK_M` of each other."""
+    if len(parts) == 1:
+        return parts[0]
+    first = np.cumsum([0] + [part.num_clusters for part in parts]).tolist()
+    label = np.concatenate(
+        [np.where(p.candidate, p.cluster + k, -1) for p, k in zip(parts, first[:-1], strict=True)]
+    )
+    points = np.concatenate([part.points for part in parts])
+    candidate = np.flatnonzero(label >= 0)
+    num_groups, group = link(points[candidate], LINK_M)
+    num = first[-1] + num_groups
+    ends = label[candidate], first[-1] + group
+    together = coo_array((np.ones(len(candidate), bool), ends), shape=(num, num))
+    num_clusters, cluster = connected_components(together, directed=False)
+    label[candidate] = cluster[label[candidate]]
+    radial = [part.radial for part in parts if part.radial is not None]
+    return Obstacles(
+        row=np.concatenate([part.row for part in parts]),
+        points=points,
+        time_s=np.concatenate([part.time_s for part in parts]),
+        seed=np.concatenate([part.seed for part in parts]),
+        cluster=label,
+        num_clusters=int(num_clusters),
+        radial=Radial.together(radial) if len(radial) == len(parts) else None,
+    )
+
+
+def find_candidates(
+    stretch: Stretch, space: FreeSpace, ground: HeightMap, among: Sequence[int] | None = None
+) -> tuple[Candidates, ...]:
+    """Return the points above the ground of each sweep, and which of them may move.
+
+    A point is a seed if another sweep saw through it. Points close to seeds are candidates too,
+    since a moving object's points are not all seen through. Where radial velocity is measured, the
+    other points that move along their ray form clusters of their own.
+
+    among: sweeps to work on; None for all.
+    """
+
+    def of_sweep(i: int) -> Candidates:
+        registered = stretch.sweeps[i]
+        points = poses.transform(registered.T_world_lidar, registered.sweep.points)
+        above = np.flatnonzero(ground.above(points) >= ABOVE_GROUND_M)
+        points = points[above]
+        seed = np.zeros(len(above), bool)
+        for j in space.others(i):
+            rest = np.flatnonzero(~seed)
+            seed[rest] = space.seen_through(points[rest], j)
+        gap_m = space.sensors.gap_m(registered.sweep.points[above], registered.sweep.lidar[above])
+        close = closer_rings(points - registered.T_world_lidar[:3, 3], gap_m)
+        num_clusters, cluster = cluster_around(close, seed)
+        radial = Radial.of(registered)
+        if radial is not None:
+            fast = np.flatnonzero(radial.moving()[above] & (cluster < 0))
+            num_more, more = link(close[fast], LINK_M)
+            seed[fast], cluster[fast] = True, num_clusters + more
+            num_clusters += num_more
+        return Candidates(above, seed, cluster, num_clusters)
+
+    with ThreadPoolExecutor() as pool:
+        return tuple(pool.map(of_sweep, range(len(stretch.sweeps)) if among is None else among))
+
+
+def closer_rings(points: Float, gap_m: Float) -> Float:
+    """Return the (N,3) points with heights compressed where rings lie too far apart to be linked.
+
+    points: relative to the scanner, z up, so that level surfaces stay level.
+    gap_m: (N,) between neighbouring rings.
+    """
+    squeezed = points.copy()
+    squeezed[:, 2] *= height_weight(gap_m)
+    return squeezed
+
+
+def height_weight(gap_m: float | Float) -> Float:
+    """Return the factor for heights where rings lie ``gap_m`` apart, at most 1."""
+    return np.minimum(1.0, _RING_GAP_M / np.maximum(gap_m, 1e-6))
+
+
+def firing_times_s(stretch: Stretch, i: int, rows: Int) -> Float:
+    """Return (N,) firing times of rows of sweep i, since the first sweep's reference time."""
+    sweep = stretch.sweeps[i].sweep
+    offset_ns = np.zeros(len(rows), np.int64) if sweep.offset_ns is None else sweep.offset_ns[rows]
+    begin_ns = stretch.sweeps[0].sweep.stamp_ns
+    return (sweep.stamp_ns - begin_ns + offset_ns).astype(np.float64) * 1e-9
+
+
+def cluster_around(points: Float, seed: Bool) -> tuple[int, Int]:
+    """Link the seeds and the points close to them; return the number of clusters and (N,) labels.
+
+    Seeds with few other seeds around, as in a hedge, do not count. -1 for points in no cluster.
+    """
+    cluster = np.full(len(points), -1, np.int64)
+    near = np.flatnonzero(close_to_seeds(points, seed, _NEAR_M, _MIN_SEED_SHARE))
+    num_clusters, cluster[near] = link(points[near], LINK_M)
+    return num_clusters, cluster
