@@ -132,7 +132,7 @@ def test_every_knob_takes_its_limits_and_refuses_what_is_beyond(section: str, fi
 
 
 def test_round_trip() -> None:
-    config = resolve("paper", ["register.lead_in_s=0.7", "objective.radius_m=0.5"])
+    config = resolve("paper", ["register.lead_in_s=0.7", "flow.look_around_s=0.5"])
     text = yaml.safe_dump(as_mapping(config))
     assert resolve(yaml.safe_load(text)) == config != Config()
 
@@ -172,7 +172,7 @@ def test_overrides_win_over_the_file_and_later_over_earlier() -> None:
     )
     assert isinstance(config.objective.alpha, float)
     assert resolve(None, ["objective.alpha=1e1"]).objective.alpha == 10.0
-    assert resolve(None, ["objective.radius_m=null"]).objective.radius_m is None
+    assert resolve(None, ["flow.look_around_s=null"]).flow.look_around_s is None
 
 
 @pytest.mark.parametrize(
@@ -193,7 +193,7 @@ def test_overrides_win_over_the_file_and_later_over_earlier() -> None:
         ("objective.alpha=-1", ["got -1", "from 0"]),
         ("objective.alpha=", ["got ''"]),
         ("objective.num_neighbors=2.5", ["got 2.5", "a whole number from 1 to 500"]),
-        ("objective.radius_m=0", ["got 0", "or null"]),
+        ("flow.look_around_s=-1", ["got -1", "or null"]),
         ("register.deskew=maybe", ["got 'maybe'", "true or false"]),
         ("register.source=oxts", ["got 'oxts'", "one of kiss-icp, dataset"]),
         ("flow.engine=magic", ["got 'magic'", "one of groups, pairs, paper, network:MODEL"]),

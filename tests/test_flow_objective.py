@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-import warnings
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,9 +14,6 @@ from hypothesis import strategies as st
 from densify.config.errors import InputError
 from densify.flow.objective import graph
 from densify.flow.objective.energy import energy
-from densify.flow.objective.neighbors import NeighborIndex, nearest_by_brute_force
-
-NO_CUDA = not torch.cuda.is_available()
 
 
 def cloud(num_points: int, seed: int = 0, spread_m: float = 2.0) -> np.ndarray:
@@ -54,13 +51,13 @@ def slow_energy(
 
 def problem(
     n: int, m: int, kind: str, dtype: torch.dtype = torch.float64, seed: int = 0
-) -> tuple[torch.Tensor, ...]:
+) -> tuple[Any, ...]:
     source, target = cloud(n, seed), cloud(m, seed + 1)
     flow = cloud(n, seed + 2, 0.3)
     matrix = graph.laplacian(graph.knn_graph(source, 5), kind)
     return (
         *(torch.from_numpy(x).to(dtype) for x in (flow, source, target)),
-        graph.sparse_tensor(matrix, dtype, "cpu"),
+        matrix,
     )
 
 
@@ -71,8 +68,6 @@ def test_energy_equals_its_slow_twin(n: int, m: int, kind: str) -> None:
     dense = slow_laplacian(slow_weights(source.numpy(), min(5, n - 1)), kind)
     expected = slow_energy(flow.numpy(), source.numpy(), target.numpy(), dense, 10.0)
     np.testing.assert_allclose(energy(flow, source, target, matrix, 10.0), expected, rtol=1e-12)
-    indexed = energy(flow, source, NeighborIndex(target), matrix, 10.0)
-    np.testing.assert_array_equal(indexed, energy(flow, source, target, matrix, 10.0))
 
 
 def test_float32_agrees_with_float64() -> None:
@@ -90,16 +85,6 @@ def test_gradient_equals_finite_differences(kind: str) -> None:
         assert torch.autograd.gradcheck(
             lambda f, term=term: energy(f, source, target, matrix, 3.0)[term], flow, eps=1e-6
         )
-
-
-def test_gradient_is_the_same_to_the_byte() -> None:
-    flow, source, target, matrix = problem(3000, 9000, "symmetric", torch.float32)
-    flow.requires_grad_()
-    gradients = [
-        torch.autograd.grad(energy(flow, source, target, matrix, 4.0).total, flow)[0]
-        for _ in range(5)
-    ]
-    assert all(torch.equal(gradients[0], other) for other in gradients[1:])
 
 
 def test_as_a_training_loss_it_reaches_the_parameters_of_a_network() -> None:
@@ -166,54 +151,6 @@ def test_degree_contains_the_self_weight() -> None:
     np.testing.assert_allclose(graph.laplacian(weights).toarray(), expected)
 
 
-def test_sparse_tensor_multiplies_like_the_matrix_without_a_warning() -> None:
-    matrix = graph.laplacian(graph.knn_graph(cloud(200), 8))
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        tensor = graph.sparse_tensor(matrix, torch.float64, "cpu")
-    flow = cloud(200, 5)
-    np.testing.assert_allclose(tensor @ torch.from_numpy(flow), matrix @ flow, atol=1e-13)
-
-
-@pytest.mark.parametrize("k", [1, 4])
-@pytest.mark.parametrize("max_chunk", [1, 700, 1 << 20])
-def test_brute_force_finds_what_the_tree_finds(k: int, max_chunk: int) -> None:
-    # Far from the origin, where float32 coordinates alone would be off by decimetres.
-    points = torch.from_numpy(cloud(300) + [4e6, 5e5, 100.0])
-    queries = torch.from_numpy(cloud(170, 1) + [4e6, 5e5, 100.0])
-    tree = NeighborIndex(points).nearest(queries, k)
-    brute = nearest_by_brute_force(queries, points, k, max_chunk)
-    assert torch.equal(tree.row, brute.row)
-    np.testing.assert_allclose(brute.distance_m, tree.distance_m, atol=1e-5)
-    distance = torch.linalg.norm(queries[:, None] - points[None], dim=2)
-    assert torch.equal(tree.row, distance.topk(k, dim=1, largest=False).indices)
-
-
-def test_a_moved_index_answers_like_a_new_one() -> None:
-    points, moved, queries = (torch.from_numpy(cloud(400, seed)) for seed in (0, 1, 2))
-    index = NeighborIndex(points)
-    index.move(moved)
-    for k in (1, 6):
-        found, expected = index.nearest(queries, k), NeighborIndex(moved).nearest(queries, k)
-        assert torch.equal(found.row, expected.row)
-        assert torch.equal(found.distance_m, expected.distance_m)
-    with pytest.raises(InputError, match="points: got 399, expected the 400"):
-        index.move(moved[1:])
-
-
-@pytest.mark.skipif(NO_CUDA, reason="no CUDA device")
-def test_cuda_finds_the_same_energy_and_gradient_as_the_cpu() -> None:
-    results = []
-    for device in ("cpu", "cuda"):
-        flow, source, target, matrix = (x.to(device) for x in problem(2000, 2500, "symmetric"))
-        flow.requires_grad_()
-        value = energy(flow, source, target, matrix, 10.0)
-        value.total.backward()
-        results.append((value.total.item(), flow.grad.cpu()))
-    np.testing.assert_allclose(results[0][0], results[1][0], rtol=1e-9)
-    np.testing.assert_allclose(results[0][1], results[1][1], atol=1e-9)
-
-
 def test_bad_input_is_one_clear_line() -> None:
     flow, source, target, matrix = problem(10, 12, "symmetric")
     broken = target.clone()
@@ -221,17 +158,15 @@ def test_bad_input_is_one_clear_line() -> None:
     cases = {
         "flow: got shape (9, 3)": (flow[:9], source, target, matrix),
         "laplacian: got shape": (flow[:9], source[:9], target, matrix),
-        "expected one dtype": (flow.float(), source, target, matrix),
-        "points: got no points": (flow, source, target[:0], matrix),
-        "source: got no points": (flow[:0], source[:0], target, matrix),
-        "points: 1 of 12 rows are NaN or infinite, the first is row 3": (
+        "target: got no points": (flow, source, target[:0], matrix),
+        "source: got no points": (flow[:0], source[:0], target, matrix[:0, :0]),
+        "target: 1 of 12 rows are NaN or infinite, the first is row 3": (
             flow,
             source,
             broken,
             matrix,
         ),
-        "points: got shape (12, 2)": (flow, source, target[:, :2], matrix),
-        "points: got shape (12, 3) of torch.int64": (flow, source, target.long(), matrix),
+        "target: got shape (12, 2)": (flow, source, target[:, :2], matrix),
     }
     for message, arguments in cases.items():
         with pytest.raises(InputError) as raised:
@@ -239,7 +174,7 @@ def test_bad_input_is_one_clear_line() -> None:
         assert message in str(raised.value) and "\n" not in str(raised.value)
 
 
-def test_bad_graphs_and_searches_are_refused() -> None:
+def test_bad_graphs_are_refused() -> None:
     points = cloud(5)
     with pytest.raises(InputError, match="num_neighbors: got 0"):
         graph.knn_graph(points, 0)
@@ -248,7 +183,3 @@ def test_bad_graphs_and_searches_are_refused() -> None:
             graph.radius_graph(points, radius_m, 3)
     with pytest.raises(InputError, match="'random-walk', expected one of symmetric"):
         graph.laplacian(graph.knn_graph(points, 2), "random-walk")
-    index = NeighborIndex(torch.from_numpy(points))
-    for k in (0, 6):
-        with pytest.raises(InputError, match=f"got {k}, expected 1 to 5"):
-            index.nearest(torch.from_numpy(points), k)

@@ -13,7 +13,6 @@ from densify.config.errors import InputError
 from densify.flow.objective import graph
 from densify.flow.objective.energy import energy
 from densify.flow.objective.solvers import SolverSettings, solve
-from densify.geometry import threads
 
 ADAM = SolverSettings(solver="adam", adam_num_steps=60)
 
@@ -45,12 +44,8 @@ def street(seed: int, num_points: int = 1000) -> tuple[np.ndarray, np.ndarray]:
 
 def reported_equals_recomputed(source, target, settings, solution) -> None:
     weights = graph.knn_graph(source, settings.num_neighbors)
-    matrix = graph.laplacian(weights, settings.laplacian)
-    value = energy(
-        *(torch.from_numpy(x) for x in (solution.flow, source, target)),
-        graph.sparse_tensor(matrix, torch.float64, "cpu"),
-        settings.alpha,
-    )
+    clouds = (torch.from_numpy(x) for x in (solution.flow, source, target))
+    value = energy(*clouds, graph.laplacian(weights), settings.alpha)
     reported = (solution.energy, solution.data, solution.smoothness)
     np.testing.assert_allclose(reported, value, rtol=1e-9)
 
@@ -64,53 +59,38 @@ def test_identical_clouds_do_not_move_at_all(settings: SolverSettings) -> None:
 
 
 @pytest.mark.parametrize("shift", [(0.4, 0.0, 0.0), (0.9, -0.5, 0.2), (30.0, -10.0, 5.0)])
-def test_a_translated_body_is_recovered_to_the_millimetre(shift: tuple[float, ...]) -> None:
+def test_a_translated_body_is_followed(shift: tuple[float, ...]) -> None:
     source = box(800, 1)
-    settings = SolverSettings(laplacian="row-sum-zero", pcg_tolerance=1e-6)
-    solution = solve(source, source + shift, settings)
-    np.testing.assert_allclose(solution.flow, np.broadcast_to(shift, (800, 3)), atol=1e-3)
+    solution = solve(source, source + shift)
+    # A constant flow costs a little smoothness: the symmetric Laplacian's null space is another.
+    error_m = np.linalg.norm(solution.flow.mean(axis=0) - shift)
+    assert error_m < 0.02 * np.linalg.norm(shift)
 
 
-def test_two_bodies_move_their_own_ways() -> None:
-    bodies = np.concatenate([box(600, 2), box(600, 3) + [12.0, 0, 0]])
-    truth = np.repeat([[0.7, 0.0, 0.0], [0.0, -0.6, 0.1]], 600, axis=0)
-    settings = SolverSettings(laplacian="row-sum-zero", pcg_tolerance=1e-6)
-    solution = solve(bodies, bodies + truth, settings)
-    np.testing.assert_allclose(solution.flow, truth, atol=1e-3)
-
-
-@pytest.mark.parametrize("kind", graph.LAPLACIANS)
-def test_pcg_and_adam_reach_the_same_minimum(kind: str) -> None:
-    source, target = street(4)
-    common = SolverSettings(laplacian=kind, adam_num_steps=250, pcg_tolerance=1e-4)
+def test_pcg_and_adam_reach_the_same_minimum() -> None:
+    source, target = street(4, 500)
+    common = SolverSettings(adam_num_steps=250)
     pcg = solve(source, target, common)
     adam = solve(source, target, dataclasses.replace(common, solver="adam"))
     assert abs(pcg.energy - adam.energy) < 0.02 * adam.energy
     assert pcg.energy < 0.5 * pcg.energies[0]
-    assert pcg.num_steps < adam.num_steps / 3
     for solution in (pcg, adam):
         assert solution.energy == min(solution.energies)
-        assert len(solution.energies) == len(solution.seconds) == solution.num_steps + 1
-        assert (np.diff([0.0, *solution.seconds]) > 0).all()
         assert solution.flow.shape == source.shape and solution.flow.dtype == np.float64
         reported_equals_recomputed(source, target, common, solution)
 
 
-def test_pcg_never_rises_without_continuation() -> None:
-    source, target = street(5)
-    settings = SolverSettings(pcg_alpha_start=0.0, pcg_tolerance=0.0)
-    energies = np.array(solve(source, target, settings).energies)
+def test_pcg_never_rises_from_a_given_flow() -> None:
+    source, target = street(5, 500)
+    energies = np.array(solve(source, target, initial=np.zeros_like(source)).energies)
     assert len(energies) > 5
     assert (np.diff(energies) <= 1e-12 * energies[:-1]).all()
-    # At tolerance 0 it ends at a fixed point, not at some limit of steps.
-    assert energies[-2] - energies[-1] < 1e-6 * energies[-1]
 
 
 def test_continuation_finds_a_lower_minimum_than_starting_at_the_final_alpha() -> None:
     source, target = box(800, 6), box(800, 7) + [2.0, 0.5, 0.0]
-    stiff_first = solve(source, target, SolverSettings(laplacian="row-sum-zero"))
-    at_once = SolverSettings(laplacian="row-sum-zero", pcg_alpha_start=0.0)
-    assert stiff_first.energy < 0.95 * solve(source, target, at_once).energy
+    stiff_first = solve(source, target)
+    assert stiff_first.energy < 0.95 * solve(source, target, initial=0 * source).energy
 
 
 @pytest.mark.parametrize("settings", [SolverSettings(), ADAM])
@@ -121,7 +101,7 @@ def test_an_initial_flow_is_where_it_starts(settings: SolverSettings) -> None:
     np.testing.assert_allclose(warm.energies[0], cold.energy, rtol=1e-12)
     assert warm.energy <= cold.energy
     if settings.solver == "pcg":
-        assert warm.num_steps < cold.num_steps / 2
+        assert len(warm.energies) < len(cold.energies) / 2
 
 
 @pytest.mark.parametrize("settings", [SolverSettings(), ADAM])
@@ -132,22 +112,17 @@ def test_same_input_gives_the_same_bytes(settings: SolverSettings) -> None:
     assert first.energies == second.energies
 
 
-@pytest.mark.parametrize("solver", ["pcg", "adam"])
-def test_the_number_of_threads_leaves_no_trace(monkeypatch, solver: str) -> None:
-    """Clouds so large that torch, too, shares them out."""
+def test_the_number_of_threads_leaves_no_trace() -> None:
+    """Clouds so large that torch, too, would share them out."""
     rng = np.random.default_rng(0)
     source = rng.uniform(0, 20, (12000, 3)) * [1, 1, 0.1]
     target = rng.uniform(0, 20, (12500, 3)) * [1, 1, 0.1] + [0.3, 0, 0]
-    settings = SolverSettings(
-        solver=solver, num_neighbors=4, adam_num_steps=2, pcg_alpha_start=10.0
-    )
+    settings = SolverSettings(solver="adam", num_neighbors=4, adam_num_steps=2)
     before, found = torch.get_num_threads(), []
     try:
         for cores in (1, 3):
-            monkeypatch.setattr(threads, "num_threads", lambda cores=cores: cores)
             torch.set_num_threads(cores)
-            solution = solve(source, target, settings)
-            found.append((solution.flow.tobytes(), solution.energies))
+            found.append(solve(source, target, settings).flow.tobytes())
     finally:
         torch.set_num_threads(before)
     assert found[0] == found[1]
@@ -172,10 +147,9 @@ def test_map_coordinates_lose_nothing() -> None:
 
 
 @pytest.mark.parametrize("solver", ["pcg", "adam"])
-@pytest.mark.parametrize("kind", graph.LAPLACIANS)
 @pytest.mark.parametrize(("n", "m"), [(1, 1), (1, 40), (40, 1), (3, 2000), (2000, 3)])
-def test_any_sizes(n: int, m: int, kind: str, solver: str) -> None:
-    settings = SolverSettings(solver=solver, laplacian=kind, adam_num_steps=20)
+def test_any_sizes(n: int, m: int, solver: str) -> None:
+    settings = SolverSettings(solver=solver, adam_num_steps=20)
     solution = solve(box(n, 0), box(m, 1) + [1.0, 0, 0], settings)
     assert np.isfinite(solution.flow).all()
     assert solution.energy <= solution.energies[0]
@@ -188,30 +162,10 @@ def test_one_point_moves_to_the_mean_of_what_pulls_it() -> None:
     np.testing.assert_allclose(solution.energy, 1 + 1 + 4)
 
 
-def test_a_far_target_is_reached() -> None:
-    source = box(300, 1)
-    solution = solve(source, source + [5000.0, 0, 0], SolverSettings(laplacian="row-sum-zero"))
-    np.testing.assert_allclose(solution.flow.mean(axis=0), [5000.0, 0, 0], atol=1.0)
-
-
-def test_alpha_zero_and_a_radius_graph_work() -> None:
+def test_alpha_zero_leaves_the_points_free() -> None:
     source, target = street(11, 300)
     free = solve(source, target, SolverSettings(alpha=0.0))
     assert free.data < solve(source, target, SolverSettings(alpha=1.0)).data
-    short = solve(source, target, SolverSettings(radius_m=0.3, num_neighbors=20))
-    assert short.energy < short.energies[0]
-
-
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
-@pytest.mark.parametrize("settings", [SolverSettings(), ADAM])
-def test_cuda_agrees_with_the_cpu(settings: SolverSettings) -> None:
-    source, target = street(12)
-    cpu = solve(source, target, settings)
-    cuda = solve(source, target, settings, device="cuda")
-    np.testing.assert_allclose(cuda.energies[0], cpu.energies[0], rtol=1e-9)
-    np.testing.assert_allclose(cuda.energy, cpu.energy, rtol=5e-3)
-    again = solve(source, target, settings, device="cuda")
-    assert cuda.flow.tobytes() == again.flow.tobytes()
 
 
 @pytest.mark.parametrize(
@@ -224,7 +178,6 @@ def test_cuda_agrees_with_the_cpu(settings: SolverSettings) -> None:
         ("source: got shape (5, 4)", (np.zeros((5, 4)), [[0.0, 0, 0]])),
         ("source: expected (n,3) numbers", ([["a", "b", "c"]], [[0.0, 0, 0]])),
         ("initial: got shape (4, 3)", (np.zeros((5, 3)), np.zeros((5, 3)), None, np.zeros((4, 3)))),
-        ("device: got 'tpu'", (np.zeros((5, 3)), np.zeros((5, 3)), None, None, "tpu")),
     ],
 )
 def test_bad_clouds_are_refused(message: str, arguments: tuple) -> None:
@@ -233,23 +186,12 @@ def test_bad_clouds_are_refused(message: str, arguments: tuple) -> None:
     assert message in str(raised.value) and "\n" not in str(raised.value)
 
 
-@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a CUDA device")
-def test_an_absent_cuda_device_is_refused() -> None:
-    with pytest.raises(InputError, match="finds no CUDA device; use cpu"):
-        solve(np.zeros((5, 3)), np.zeros((5, 3)), device="cuda")
-
-
 @pytest.mark.parametrize(
     ("name", "value"),
     [
         ("solver", "newton"),
-        ("laplacian", "cotangent"),
         ("alpha", -1.0),
         ("alpha", np.nan),
-        ("pcg_alpha_start", np.inf),
-        ("pcg_tolerance", -1e-3),
-        ("adam_learning_rate", 0.0),
-        ("radius_m", 0.0),
         ("num_neighbors", 0),
         ("adam_num_steps", 0),
     ],

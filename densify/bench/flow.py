@@ -231,7 +231,8 @@ def _chained(
     """Flow to the key, by frame, of any method's steps."""
     frames = window.frames
     chained = ChainedMotion(
-        window.stretch, lambda here, there: steps[frames[here]], config.objective.max_gap_m
+        window.stretch,
+        lambda here, there: steps[frames[here]],
     )
     still = FlowField.zero(len(window.stretch[window.key].sweep))
     return {f: still if f == window.key else chained.flow(f, window.key) for f in frames}

@@ -156,7 +156,7 @@ def flow_of_pair(method: str, pair: Pair, config: Config) -> tuple[FlowField, Tr
         solver = "adam" if method == "paper-adam" else "pcg"
         solution = solve(pair.drawn, pair.target_drawn, SolverSettings(solver=solver))
         flow = pair.carried(solution.flow)
-        trace = Trace(solution.energies, solution.seconds)
+        trace = Trace(solution.energies, (0.0,) * len(solution.energies))
     return pair.as_field(flow), trace
 
 

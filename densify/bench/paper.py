@@ -28,7 +28,6 @@ from densify.config.errors import InputError
 from densify.flow.objective.solvers import SolverSettings, solve
 from densify.flow.pairs.estimate import estimate_flow
 from densify.geometry.types import Float, Int, Progress
-from densify.learning.losses.pointpwc import without_learning
 from densify.learning.model_file import read_model
 from densify.scores import flow_metrics as metrics
 
@@ -80,15 +79,12 @@ METHODS = {
     "rest": Row("nothing moves but the vehicle, where poses tell", _at_rest, whole=True),
     "icp": Row("rigid ICP of the whole cloud", lambda s, t, pair: rigid_icp(s, t)),
     "nicp": Row("non-rigid ICP", lambda s, t, pair: nonrigid_icp(s, t)),
-    "pointpwc": Row(
-        "PointPWC-Net's loss without learning, Adam", lambda s, t, pair: without_learning(s, t)
-    ),
     "paper-adam": Row("the objective as published: Adam, 1,500 steps", _objective("adam")),
     "paper": Row("the objective, this package's solver", _objective("pcg")),
     "no-laplacian": Row("Table 2: without the Laplacian", _objective("pcg", alpha=0.0)),
     "ours": Row("this package on two whole clouds", _ours, whole=True),
 }
-SLOW = ("pointpwc", "paper-adam")
+SLOW = ("paper-adam",)
 DEFAULT_METHODS = tuple(name for name in METHODS if name not in SLOW)
 
 
@@ -145,7 +141,7 @@ def _rows(methods: Sequence[str], models: Sequence[Path]) -> dict[str, Row]:
 
 def _learned(path: Path) -> Row:
     model = read_model(path)
-    about = f"{model.name}, teacher {model.made.get('teacher')}, {model.made.get('steps')} steps"
+    about = f"network, teacher {model.made.get('teacher')}, {model.made.get('steps')} steps"
 
     def flow(source: Float, target: Float, pair: PaperPair) -> Float:
         return pair.of_vehicle() + model.flow(pair.sweeps)

@@ -118,30 +118,11 @@ class ObjectiveSettings(Section):
     num_neighbors: int = knob(
         50, "neighbours of a point in the graph; more is stiffer and slower", 1, 500
     )
-    radius_m: float | None = knob(
-        None,
-        "[m] join the points within this radius, at most the num_neighbors nearest; null: off",
-        0.01,
-        20,
-    )
-    laplacian: str = knob(
-        "symmetric",
-        "of the graph. symmetric: as published; row-sum-zero: leaves a constant flow free",
-        choices=("symmetric", "row-sum-zero"),
-    )
     static_prior: bool = knob(
         True,
         "points not proven to move keep exactly their rigid place; off moves every point, with "
         "engine paper and in the flow of two files",
     )
-    max_gap_m: float = knob(
-        0.5,
-        "[m] where flow between neighbouring sweeps is chained (not the engine groups): a moved "
-        "point farther than this from the next sweep's moving points is lost",
-        0.01,
-        10,
-    )
-    device: str = knob("auto", "auto: CUDA where there is one", choices=("auto", "cpu", "cuda"))
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,7 @@ from densify.geometry import poses
 from densify.geometry.types import Float, FlowField, Int, Stretch
 
 _NUM_NEIGHBORS = 3
+MAX_GAP_M = 0.5
 
 
 @dataclass(frozen=True)
@@ -25,7 +26,7 @@ class ChainedMotion:
 
     stretch: Stretch
     step: Callable[[int, int], FlowField]
-    max_gap_m: float
+    max_gap_m: float = MAX_GAP_M
     _found: dict[tuple[int, int], FlowField] = field(default_factory=dict, repr=False)
 
     def flow(self, frame: int, target: int) -> FlowField:

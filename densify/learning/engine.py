@@ -14,7 +14,6 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from torch import nn
 
 from densify.config import Config
 from densify.flow.engines import Scene
@@ -25,7 +24,7 @@ from densify.geometry.threads import num_threads
 from densify.geometry.types import Float
 from densify.learning.clouds import AboveGround, order_for
 from densify.learning.model_file import read_model
-from densify.learning.threads import one_thread
+from densify.learning.network import NUM_SWEEPS, Voxels
 
 MOVES_M_S = 0.5
 """What the network sees move more slowly starts no group (Chodosh et al., WACV 2024)."""
@@ -53,23 +52,24 @@ def estimate_motion(scene: Scene, settings: Config, argument: str) -> GroupMotio
     return motion_of(scene, tuple(found), settings, velocities)
 
 
-def flows_of(network: nn.Module, standing: list[AboveGround], origins: list[Float]) -> list[Float]:
+def flows_of(network: Voxels, standing: list[AboveGround], origins: list[Float]) -> list[Float]:
     """(n,3) metres for each sweep: to the next, of the last one to the one before; world.
 
     origins: (3,) world, the scanner at each sweep.
     """
-    num_wanted = int(network.num_sweeps)  # type: ignore[arg-type]
 
     def of_sweep(i: int) -> Float:
         if len(standing) < 2 or not len(standing[i].row):
             return np.zeros((len(standing[i].row), 3))
-        numbers = order_for(i, _neighbor(i, len(standing)), len(standing), num_wanted)
+        numbers = order_for(i, _neighbor(i, len(standing)), len(standing), NUM_SWEEPS)
         sweeps = [None if n is None else standing[n].cloud(origins[i]) for n in numbers]
         with torch.inference_mode():
             flow: Float = network(sweeps).double().numpy()
         return flow
 
-    with ThreadPoolExecutor(num_threads(), initializer=one_thread) as pool:
+    with ThreadPoolExecutor(
+        num_threads(), initializer=torch.set_num_threads, initargs=(1,)
+    ) as pool:
         return list(pool.map(of_sweep, range(len(standing))))
 
 

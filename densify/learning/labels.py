@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Labels from boxes: the flow of a recording's sweeps to the next ones."""
+"""Scene flow labels from tracked boxes: the flow of each sweep to the next one."""
 
 from __future__ import annotations
 
@@ -31,8 +31,11 @@ from densify.pipeline.recording import Recording
 
 @dataclass(frozen=True)
 class Label:
-    """One sweep's. after: the next one. sure: (N,) which points count. T_next_here: (4,4) from its
-    lidar frame to the next sweep's."""
+    """The label of one sweep.
+
+    after: the next sweep. sure: (N,) mask of the points that count. T_next_here: (4,4) from the
+    sweep's lidar frame to the next sweep's.
+    """
 
     registered: RegisteredSweep
     after: RegisteredSweep
@@ -49,11 +52,11 @@ def label_sweeps(
     without_ground: bool = False,
     progress: Progress | None = None,
 ) -> Iterator[tuple[int, Label | ComputationError | InputError]]:
-    """Label sweeps; the last one before a hole has no next one and is passed over, as are sweeps
-    that nobody drew boxes in.
+    """Yield the label of each sweep, or the error that prevents it, with its frame.
 
-    config: says where poses come from, and how deep the ground lies. without_ground: points below
-    0.2 m above it do not count. Raises InputError for a recording without boxes.
+    Sweeps without a next sweep or without boxes are left out. config: where poses come from.
+    without_ground: points of the ground do not count. Raises InputError for a recording without
+    boxes.
     """
     if not isinstance(sequence, KnowsBoxes) or all(
         sequence.boxes(frame) is None for frame in sequence.frames
@@ -102,16 +105,13 @@ def _label(
     return Label(registered, after, field, sure, T_next_here)
 
 
-def label_path(folder: Path, frame: int, next_frame: int) -> Path:
-    """As flow files are named."""
-    return folder / f"{frame:06d}_{next_frame:06d}.npz"
-
-
 def write_label(folder: Path, label: Label, overwrite: bool) -> Path:
-    """A flow file with ``valid``, complete or not at all. Raises InputError for one that is there,
-    OutputError where it cannot be written."""
+    """Write a flow file with ``valid``, complete or not at all.
+
+    Raises InputError for a file that exists, OutputError where it cannot be written.
+    """
     sweep, field = label.registered.sweep, label.field
-    path = label_path(folder, sweep.frame, label.after.frame)
+    path = folder / f"{sweep.frame:06d}_{label.after.frame:06d}.npz"
     if path.exists() and not overwrite:
         raise InputError(f"{path}: there already, kept; give --overwrite to replace it")
     arrived = poses.transform(label.T_next_here, sweep.points + field.total)

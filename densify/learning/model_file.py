@@ -17,45 +17,47 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import nn
 
 from densify.config.errors import InputError
 from densify.config.text_files import parse_json
+from densify.flow.objective.energy import on_one_thread
 from densify.geometry.types import Float
 from densify.learning.clouds import Sweeps
-from densify.learning.networks import NETWORKS, build
-from densify.learning.threads import on_one_thread
+from densify.learning.network import Voxels, build
 from densify.outputs.atomic import write_file
 from densify.readers.array_files import read_arrays
 
 FORMAT, VERSION = "densify model", 1
-SHIPPED = {"streets": Path(__file__).parent / "streets.model"}
-"""Models that come with the package, by what stands in the place of a path. ``streets``: voxels, of
-simulated streets only, by ``densify train flow --teacher truth --steps 768 --out FILE``."""
+NETWORK = "voxels"
 _HEADER, _WEIGHTS = "header", "weights/"
 
 
 @dataclass(frozen=True)
 class Model:
-    """A network by name with its weights. made: how it was trained, plain values for JSON. beside:
-    what a checkpoint keeps beside the weights, arrays by name."""
+    """A network with its weights.
 
-    name: str
-    network: nn.Module
+    made: how it was trained, plain values for JSON. beside: arrays that a checkpoint keeps beside
+    the weights, by name.
+    """
+
+    network: Voxels
     made: Mapping[str, Any] = field(default_factory=dict)
     beside: Mapping[str, NDArray[Any]] = field(default_factory=dict)
 
     def flow(self, sweeps: Sweeps) -> Float:
-        """(n,3) metres of the first sweep to the second; the same bytes on any number of cores."""
+        """Return the (n,3) flow of the first sweep to the second, metres; the same bytes on any
+        number of cores."""
         with on_one_thread(), torch.inference_mode():
             found: Float = self.network(sweeps).double().numpy()
         return found
 
 
 def write_model(path: Path, model: Model) -> None:
-    """The same bytes for the same model; the file appears when it is complete. Raises InputError
-    where it cannot be written."""
-    header = {"format": FORMAT, "version": VERSION, "network": model.name, "made": model.made}
+    """Write a model file: the same bytes for the same model.
+
+    The file appears when it is complete. Raises InputError where it cannot be written.
+    """
+    header = {"format": FORMAT, "version": VERSION, "network": NETWORK, "made": model.made}
     text = json.dumps(header, sort_keys=True).encode()
     arrays: dict[str, NDArray[Any]] = {_HEADER: np.frombuffer(text, np.uint8)}
     for name, tensor in model.network.state_dict().items():
@@ -71,15 +73,12 @@ def write_model(path: Path, model: Model) -> None:
 
 
 def read_model(path: Path) -> Model:
-    """path: or the name of one of `SHIPPED`, where no such file is. Raises InputError for a file
-    that is none, is damaged, or is of another version."""
-    if not path.exists():
-        path = SHIPPED.get(str(path), path)
+    """Read a model file. Raises InputError for another file, a damaged one, or another version."""
     if not path.is_file():
         raise InputError(f"{path}: no such file; expected a model that densify train flow wrote")
     arrays = read_arrays(path)
     header = _header(path, arrays)
-    network = build(header["network"])
+    network = build()
     expected = network.state_dict()
     weights = {n.removeprefix(_WEIGHTS): a for n, a in arrays.items() if n.startswith(_WEIGHTS)}
     for name, tensor in expected.items():
@@ -93,28 +92,24 @@ def read_model(path: Path) -> Model:
         if not np.isfinite(array).all():
             raise InputError(f"{path}: weights {name}: not all finite; train again")
     if extra := set(weights) - set(expected):
-        raise InputError(f"{path}: weights {min(extra)}: {header['network']} has none so called")
+        raise InputError(f"{path}: weights {min(extra)}: the network has none of that name")
     network.load_state_dict({name: torch.from_numpy(weights[name]) for name in expected})
     beside = {n: a for n, a in arrays.items() if n != _HEADER and not n.startswith(_WEIGHTS)}
-    return Model(header["network"], network.train(False), header["made"], beside)
+    return Model(network.train(False), header["made"], beside)
 
 
 def _header(path: Path, arrays: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
     try:
-        header = parse_json(bytes(arrays[_HEADER].astype(np.uint8)), path)
-        found = header["format"], header["version"], header["network"], header["made"]
-    except (KeyError, ValueError, TypeError, InputError) as error:
-        raise InputError(f"{path}: no model that densify train flow wrote") from error
-    if found[0] != FORMAT or not isinstance(found[3], dict):
+        header = dict(parse_json(bytes(arrays[_HEADER].astype(np.uint8)), path))
+        known = header["format"] == FORMAT and isinstance(header["made"], dict)
+        found = header["version"], header["network"]
+    except (KeyError, ValueError, TypeError, InputError):
+        known = False
+    if not known:
         raise InputError(f"{path}: no model that densify train flow wrote")
-    if found[1] != VERSION:
+    if found != (VERSION, NETWORK):
         raise InputError(
-            f"{path}: a model of version {found[1]}, expected {VERSION}; train again, or use the "
-            f"densify that wrote it"
+            f"{path}: version {found[0]} of a network {found[1]!r}, expected version {VERSION} of "
+            f"{NETWORK!r}; train it again"
         )
-    if found[2] not in NETWORKS:
-        raise InputError(
-            f"{path}: a network {found[2]!r}, expected one of {', '.join(NETWORKS)}; use a newer "
-            f"densify"
-        )
-    return dict(header)
+    return header

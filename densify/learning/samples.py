@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Pairs of sweeps to train on, in an order that follows from a seed alone.
 
-Several clips are mixed: their pairs, both ways in time, come in random order and several times,
-each time turned about the vertical, mirrored and scaled anew. Clips are made ahead by worker
-processes.
+The pairs of several clips come mixed, in both directions of time, and several times. Each time they
+are turned about the vertical, mirrored and scaled at random.
 """
 
 from __future__ import annotations
@@ -21,10 +20,10 @@ from torch import Tensor
 from densify.geometry.types import Float32
 from densify.learning.clips import Clip, ClipMaker
 from densify.learning.clouds import NetworkCloud, Sweeps, order_for
-from densify.learning.networks.voxels import REACH_M
+from densify.learning.network import REACH_M
 
 NUM_DRAWN = 4096
-"""Points of source and target that self-supervised losses look at."""
+"""Points of source and target that the objective is computed for."""
 _NUM_MIXED = 4  # clips
 _PAIRS_OF_CLIP = 48
 _SCALES = (0.95, 1.05)
@@ -32,9 +31,12 @@ _SCALES = (0.95, 1.05)
 
 @dataclass(frozen=True)
 class Sample:
-    """One pair. sweeps: source, target, and those before. drawn: (d,) rows of the source;
-    drawn_source, drawn_target: what is drawn. in_reach: (n,) of the source's points, which count.
-    flow, moving: (n,3), (n,), None without labels."""
+    """One pair of sweeps.
+
+    sweeps: source, target, and those before the source. drawn: (d,) rows of the source that the
+    objective is computed for; drawn_source, drawn_target: the drawn points. in_reach: (n,) mask of
+    the source's points that count. flow: (n,3), moving: (n,), None without labels.
+    """
 
     sweeps: Sweeps
     drawn: Tensor
@@ -46,8 +48,7 @@ class Sample:
     moving: Tensor | None = None
 
     def to(self, device: torch.device) -> Sample:
-        if device.type == "cpu":
-            return self
+        """Return the sample on another device."""
         return Sample(
             tuple(None if s is None else s.to(device) for s in self.sweeps),
             self.drawn.to(device),
@@ -63,18 +64,19 @@ class Sample:
 def samples(
     make: ClipMaker, num_wanted: int, num_workers: int, first: int = 0
 ) -> Generator[Sample, None, None]:
-    """Samples from number ``first`` on, without end. num_wanted: sweeps that the network takes.
-    num_workers: processes that make clips; 0 makes them here."""
-    per_group = _NUM_MIXED * _PAIRS_OF_CLIP
-    group, skip = divmod(first, per_group)
+    """Yield samples from number ``first`` on, without end.
+
+    num_wanted: sweeps that the network takes. num_workers: processes that make clips ahead; 0 makes
+    them in this process.
+    """
+    group, skip = divmod(first, _NUM_MIXED * _PAIRS_OF_CLIP)
     clips = _clips(make, group * _NUM_MIXED, num_workers)
     try:
         while True:
             mixed = [next(clips) for _ in range(_NUM_MIXED)]
             rng = np.random.default_rng([make.seed, group, 1])
             pairs = [pair for c, clip in enumerate(mixed) for pair in _pairs(c, clip, rng)]
-            order = rng.permutation(len(pairs))[skip:]
-            for place in order:
+            for place in rng.permutation(len(pairs))[skip:]:
                 own = np.random.default_rng([make.seed, group, 2, int(place)])
                 c, source, target = pairs[place]
                 yield sample_of(mixed[c], source, target, num_wanted, make.labels, own)
@@ -84,11 +86,11 @@ def samples(
 
 
 def _pairs(c: int, clip: Clip, rng: np.random.Generator) -> list[tuple[int, int, int]]:
-    """As many of every clip, in rounds of all it has."""
+    """Return as many (clip, source, target) of every clip, in rounds of all its pairs."""
     count = len(clip.sweeps)
     found = [(c, i, j) for i in range(count) for j in (i - 1, i + 1) if 0 <= j < count]
-    times = -(-_PAIRS_OF_CLIP // len(found))
-    order = [place for _ in range(times) for place in rng.permutation(len(found))]
+    num_rounds = -(-_PAIRS_OF_CLIP // len(found))
+    order = [place for _ in range(num_rounds) for place in rng.permutation(len(found))]
     return [found[place] for place in order[:_PAIRS_OF_CLIP]]
 
 
@@ -100,25 +102,23 @@ def sample_of(
     labels: str,
     rng: np.random.Generator | None = None,
 ) -> Sample:
-    """One pair of a clip. rng: changes it at random and draws; None leaves it as it is and draws
-    evenly."""
+    """Return the sample of two neighbouring sweeps of a clip, by their numbers in it.
+
+    labels: as of `ClipMaker`. rng: turns, mirrors, scales and draws at random; None leaves the
+    clouds as they are and draws evenly.
+    """
     here, there = clip.sweeps[source], clip.sweeps[target]
-    change = np.eye(3, dtype=np.float32)
-    if rng is not None:
-        change = _change(rng)
+    change = np.eye(3, dtype=np.float32) if rng is None else _random_change(rng)
     scale = np.float32(np.linalg.norm(change[2]))
-    sweeps = [
-        None
-        if n is None
-        else NetworkCloud(
-            torch.from_numpy((clip.sweeps[n].points - here.origin_m) @ change.T),
-            torch.from_numpy(clip.sweeps[n].height_m * scale),
-        )
-        for n in order_for(source, target, len(clip.sweeps), num_wanted)
-    ]
-    first, second = sweeps[0], sweeps[1]
-    if first is None or second is None:
-        raise ValueError("expected neighbouring sweeps")
+
+    def cloud(number: int) -> NetworkCloud:
+        sweep = clip.sweeps[number]
+        points = torch.from_numpy((sweep.points - here.origin_m) @ change.T)
+        return NetworkCloud(points, torch.from_numpy(sweep.height_m * scale))
+
+    numbers = order_for(source, target, len(clip.sweeps), num_wanted)
+    sweeps = [None if n is None else cloud(n) for n in numbers]
+    first, second = cloud(source), cloud(target)
     in_reach = [(c.points[:, :2].abs() < REACH_M).all(dim=1) for c in (first, second)]
     drawn = [_draw(within.numpy(), rng) for within in in_reach]
     flow = moving = None
@@ -126,21 +126,20 @@ def sample_of(
         found = getattr(here, labels)
         flow = torch.from_numpy(found.flow[int(target > source)] @ change.T)
         moving = torch.from_numpy(found.moving)
-    duration_s = abs(there.time_s - here.time_s)
     return Sample(
         tuple(sweeps),
         drawn[0],
         first.rows(drawn[0]),
         second.rows(drawn[1]),
         in_reach[0],
-        duration_s,
+        abs(there.time_s - here.time_s),
         flow,
         moving,
     )
 
 
-def _change(rng: np.random.Generator) -> Float32:
-    """(3,3) turns about z, mirrors half the time, and scales."""
+def _random_change(rng: np.random.Generator) -> Float32:
+    """Return a (3,3) matrix that turns about z, mirrors half the time, and scales."""
     angle = rng.uniform(0, 2 * np.pi)
     cosine, sine = np.cos(angle), np.sin(angle)
     turn = np.array([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1]])
@@ -149,29 +148,28 @@ def _change(rng: np.random.Generator) -> Float32:
 
 
 def _draw(within: np.ndarray, rng: np.random.Generator | None) -> Tensor:
+    """Return at most `NUM_DRAWN` rows of a mask, at random or evenly spaced."""
     rows = np.flatnonzero(within)
     if len(rows) > NUM_DRAWN:
-        if rng is None:
-            rows = rows[np.arange(NUM_DRAWN) * len(rows) // NUM_DRAWN]
-        else:
-            rows = np.sort(rng.choice(rows, NUM_DRAWN, replace=False))
+        every = np.arange(NUM_DRAWN) * len(rows) // NUM_DRAWN
+        rows = rows[every] if rng is None else np.sort(rng.choice(rows, NUM_DRAWN, replace=False))
     return torch.from_numpy(rows)
 
 
-def _clips(make: ClipMaker, first: int, num_workers: int) -> Generator[Clip, None, None]:
+def _clips(make: ClipMaker, number: int, num_workers: int) -> Generator[Clip, None, None]:
+    """Yield clips from a number on, made ahead by worker processes."""
     if num_workers == 0:
         while True:
-            yield make(first)
-            first += 1
+            yield make(number)
+            number += 1
     # A forked process would inherit torch's threads, which it does not have.
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(num_workers, context) as pool:
+    with ProcessPoolExecutor(num_workers, multiprocessing.get_context("spawn")) as pool:
         waiting: deque[Future[Clip]] = deque()
         try:
             while True:
                 while len(waiting) < num_workers + _NUM_MIXED:
-                    waiting.append(pool.submit(make, first))
-                    first += 1
+                    waiting.append(pool.submit(make, number))
+                    number += 1
                 yield waiting.popleft().result()
         finally:
             for one in waiting:

@@ -44,7 +44,7 @@ def estimate_motion(scene: Scene, settings: Config, argument: str) -> Motion:
     argument: the folder.
     """
     files = FlowFiles(Path(argument), scene.stretch)
-    return ChainedMotion(scene.stretch, files.step, settings.objective.max_gap_m)
+    return ChainedMotion(scene.stretch, files.step)
 
 
 def check_argument(argument: str) -> None:

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -32,8 +32,7 @@ def add(commands: Any) -> None:
         "Flow files as --flow npz:DIR and bench flow --truth read them, with 'valid' (N,) bool: "
         "False in two boxes, just outside one, at the foot of one that moves, in a box that the "
         "next sweep lacks, and where nobody drew boxes. Poses are the recording's own (--set "
-        "register.source=kiss-icp: estimated). Where a recording has exact truth beside it, as "
-        "simulated ones have, the labels' errors are told too.",
+        "register.source=kiss-icp: estimated).",
     )
     parser.add_argument("--data", metavar="SPEC", required=True, help="a recording with boxes")
     parser.add_argument("--out", metavar="DIR", type=Path, required=True, help="for the flow files")
@@ -59,7 +58,6 @@ def answer(options: argparse.Namespace) -> Iterator[Answer]:
     given = ["register.source=dataset", *options.overrides]
     config = resolve(options.config, given)
     from densify.flow.boxes import BoxMargins
-    from densify.learning.label_errors import LabelErrors
     from densify.learning.labels import Label, label_sweeps, write_label
     from densify.readers import open_sequence
 
@@ -68,7 +66,6 @@ def answer(options: argparse.Namespace) -> Iterator[Answer]:
     if options.keys is not None:
         frames = sliced(sequence, options.keys)
     failed: dict[int, Exception] = {}
-    errors: list[LabelErrors] = []
     num_made = num_points = num_moving = num_sure = 0
     with progress_on_stderr() as progress:
         margins = BoxMargins(grown_m=options.grown)
@@ -82,8 +79,6 @@ def answer(options: argparse.Namespace) -> Iterator[Answer]:
             num_points += len(label.sure)
             num_sure += int(label.sure.sum())
             num_moving += int(label.field.moving.sum())
-            if sequence.truth is not None:
-                errors.append(LabelErrors.of(label, sequence.truth))
     if not num_made and not failed:
         raise InputError(
             f"--data {options.data}: none of {len(frames)} sweeps has boxes and is followed by one "
@@ -93,23 +88,7 @@ def answer(options: argparse.Namespace) -> Iterator[Answer]:
     facts: dict[str, Any] = {"num_sweeps": num_made, "num_moving": num_moving, "share_valid": share}
     sweeps = "sweep" if num_made == 1 else "sweeps"
     text = f"{num_made:,} {sweeps}, {num_moving:,} points moving, {100 * share:.1f} % valid"
-    if errors:
-        exact = LabelErrors.joined(errors).summary()
-        facts["exact"] = exact
-        text += "".join(f"\n{line}" for line in _against_truth(exact))
     yield Answer(text, facts, [options.out] if num_made else [])
     if failed:
         told = "; ".join(f"sweep {frame}: {error}" for frame, error in failed.items())
         raise ComputationError(f"{len(failed)} of {len(frames)} sweeps not labelled: {told}")
-
-
-def _against_truth(exact: Mapping[str, Any]) -> Iterator[str]:
-    """What the labels of a simulated recording are off by."""
-    if exact["num_moving"]:
-        yield (
-            f"against the exact flow: {exact['error_m'] * 100:.1f} cm off (median "
-            f"{exact['median_error_m'] * 100:.1f} cm) where {exact['num_moving']:,} points move by "
-            f"{exact['way_m'] * 100:.0f} cm, {100 * exact['missed']:.1f} % of them missed"
-        )
-    if exact["wrong"] is not None:
-        yield f"{100 * exact['wrong']:.2f} % of the standing points more than 5 cm off"

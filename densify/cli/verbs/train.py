@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from densify.cli.answer import Answer
-from densify.cli.options import add_overwrite, add_verb, natural, positive, sentence
+from densify.cli.options import add_overwrite, add_verb, natural, sentence
 from densify.cli.progress import steps_on_stderr
 from densify.config.errors import InputError
 
@@ -24,10 +24,9 @@ def add(commands: Any) -> None:
         "flow",
         answer,
         "train a network for scene flow, with labels or without",
-        "Teachers: objective (the published one), pointpwc (PointPWC-Net's self-supervised loss), "
-        "cycle (nearest neighbours and anchored cycles), engine (this package's engine makes the "
-        "labels), truth (where the recording has some: streets). Ctrl-C or a kill loses at most a "
-        "minute: go on with --resume.",
+        "Teachers: objective (the published one, without labels), engine (this package's engine "
+        "makes the labels), truth (where the recording has some: streets). Ctrl-C or a kill loses "
+        "at most 50 steps: go on with --resume.",
     )
     flow.add_argument(
         "--out", metavar="MODEL", type=Path, required=True, help="the model; MODEL.png: its loss"
@@ -48,19 +47,9 @@ def _add_lesson(flow: argparse.ArgumentParser) -> None:
     )
     lesson.add_argument(
         "--teacher",
-        choices=("objective", "pointpwc", "cycle", "engine", "truth"),
+        choices=("objective", "engine", "truth"),
         default="objective",
         help="where the loss comes from (default: objective)",
-    )
-    lesson.add_argument(
-        "--model",
-        choices=("voxels", "flownet3d"),
-        default="voxels",
-        help="voxels: whole sweeps in a fraction of a second; flownet3d: the paper's, of 8,192 "
-        "points (default: voxels)",
-    )
-    lesson.add_argument(
-        "--start", metavar="MODEL", type=Path, help="begin with this model's weights: fine-tune it"
     )
     lesson.add_argument(
         "--seed",
@@ -73,9 +62,9 @@ def _add_lesson(flow: argparse.ArgumentParser) -> None:
 
 def _add_course(flow: argparse.ArgumentParser) -> None:
     course = flow.add_argument_group("how long, and where")
-    limit = course.add_mutually_exclusive_group(required=True)
-    limit.add_argument("--minutes", type=positive, metavar="M", help="train so long")
-    limit.add_argument("--steps", type=natural, metavar="N", help="train so many pairs of sweeps")
+    course.add_argument(
+        "--steps", type=natural, required=True, metavar="N", help="train on N pairs of sweeps"
+    )
     course.add_argument(
         "--resume", action="store_true", help="go on from MODEL.checkpoint of a stopped training"
     )
@@ -89,13 +78,6 @@ def _add_course(flow: argparse.ArgumentParser) -> None:
         metavar="N",
         help="processes that make sweeps ready beside the training; 0: none (default: 1)",
     )
-    course.add_argument(
-        "--keep",
-        metavar="DIR",
-        type=Path,
-        help="keep the sweeps made ready there, 6 MB a clip: another training with the same --data "
-        "and --seed does not make them again",
-    )
 
 
 def answer(options: argparse.Namespace) -> Iterator[Answer]:
@@ -104,22 +86,16 @@ def answer(options: argparse.Namespace) -> Iterator[Answer]:
 
     if options.out.exists() and not options.overwrite:
         raise InputError(f"{options.out}: there already, kept; give --overwrite to replace it")
-    if options.steps == 0:
-        raise InputError("--steps 0: expected 1 or more")
     training = Training(
         data=tuple(options.data or ["streets"]),
         teacher=options.teacher,
-        model=options.model,
         seed=options.seed,
         steps=options.steps,
-        minutes=options.minutes,
         device=options.device,
-        start=options.start,
-        keep=options.keep,
         num_workers=options.workers,
     )
     with steps_on_stderr() as report:
         trained = train(training, options.out, options.resume, report)
-    text = f"{trained.num_steps:,} steps, loss {trained.loss:.4g}"
-    facts = {"num_steps": trained.num_steps, "loss": trained.loss}
+    text = f"{training.steps:,} steps, loss {trained.loss:.4g}"
+    facts = {"num_steps": training.steps, "loss": trained.loss}
     yield Answer(text, facts, trained.files)

@@ -18,7 +18,7 @@ def estimate_motion(scene: Scene, settings: Config, argument: str) -> Motion:
     def step(here: int, there: int) -> FlowField:
         return _step(scene, here, there, settings)
 
-    return ChainedMotion(scene.stretch, step, settings.objective.max_gap_m)
+    return ChainedMotion(scene.stretch, step)
 
 
 def _step(scene: Scene, here: int, there: int, settings: Config) -> FlowField:

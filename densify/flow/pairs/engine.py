@@ -25,7 +25,7 @@ def estimate_motion(scene: Scene, settings: Config, argument: str) -> Motion:
     def step(here: int, there: int) -> FlowField:
         return _step(scene.stretch, here, there, of_groups)
 
-    return ChainedMotion(scene.stretch, step, settings.objective.max_gap_m)
+    return ChainedMotion(scene.stretch, step)
 
 
 def _step(stretch: Stretch, here: int, there: int, settings: Config) -> FlowField:

@@ -10,13 +10,12 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import torch
 from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
 from densify.config import Config, ObjectiveSettings, resolve
 from densify.config.errors import InputError
-from densify.flow.objective.neighbors import require_points
+from densify.flow.objective.graph import checked_cloud
 from densify.flow.objective.solvers import SolverSettings, solve
 from densify.flow.pairs.hypotheses import PairCloud
 from densify.flow.pairs.movers import find_movers
@@ -74,14 +73,14 @@ def estimate_flow(
             f"flow.engine: got {settings.flow.engine!r}, expected groups or paper: two clouds "
             "alone are no recording"
         )
-    clouds = _as_cloud(source, "source"), _as_cloud(target, "target")
+    clouds = checked_cloud(source, "source"), checked_cloud(target, "target")
     times = _times(_columns(source_offset_ns, target_offset_ns, clouds, "offset_ns"))
     lidars = _columns(source_lidar, target_lidar, clouds, "lidar")
     if lidars is None and times is not None:
         lidars = scanners_told(clouds, times.lag)
     if not settings.objective.static_prior or settings.flow.engine == "paper":
         return flow_between(*clouds, settings.objective, initial)
-    start = None if initial is None else _as_cloud(initial, "initial")
+    start = None if initial is None else checked_cloud(initial, "initial")
     if start is not None and start.shape != clouds[0].shape:
         raise InputError(
             f"initial: got shape {start.shape}, expected the source's {clouds[0].shape}"
@@ -101,10 +100,8 @@ def flow_between(
         solver=settings.solver,
         alpha=settings.alpha,
         num_neighbors=settings.num_neighbors,
-        radius_m=settings.radius_m,
-        laplacian=settings.laplacian,
     )
-    flow = solve(source, target, objective, initial, _device(settings)).flow
+    flow = solve(source, target, objective, initial).flow
     if settings.static_prior:
         return _only_proven(np.asarray(source, float), np.asarray(target, float), flow)
     still = FlowField.zero(len(flow))
@@ -160,17 +157,6 @@ def _attach_below(points: Float, field: FlowField, low: Int) -> None:
     field.instance[low[close]] = field.instance[members[np.asarray(nearest)[close]]]
 
 
-def _as_cloud(values: ArrayLike, name: str) -> Float:
-    """(N,3) float64. Raises InputError."""
-    try:
-        cloud = np.array(values, dtype=np.float64, order="C")
-    except (TypeError, ValueError) as error:
-        raise InputError(f"{name}: expected (n,3) numbers, metres; {error}") from error
-    if cloud.ndim != 2 or cloud.shape[1] != 3 or not (len(cloud) and np.isfinite(cloud).all()):
-        require_points(torch.from_numpy(cloud), name)  # says what is wrong
-    return cloud
-
-
 def _columns(
     source: ArrayLike | None, target: ArrayLike | None, clouds: tuple[Float, Float], name: str
 ) -> tuple[Int, Int] | None:
@@ -217,12 +203,6 @@ def _times(times_ns: tuple[Int, Int] | None) -> _Times | None:
         return None
     first, second = ((times - m) / gap for times, m in zip(times_ns, middle, strict=True))
     return _Times((first, second), abs(gap) * 1e-9)
-
-
-def _device(settings: ObjectiveSettings) -> str:
-    if settings.device != "auto":
-        return settings.device
-    return "cuda" if torch.cuda.is_available() else "cpu"
 
 
 def _only_proven(source: Float, target: Float, flow: Float) -> FlowField:

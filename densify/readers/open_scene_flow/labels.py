@@ -35,7 +35,7 @@ def estimate_motion(scene: Scene, settings: Config, argument: str) -> ChainedMot
     """
     path, _, name = argument.partition("#")
     labels = FlowLabels(SweepFile(Path(path)), name or "flow", scene.stretch)
-    return ChainedMotion(scene.stretch, labels.step, settings.objective.max_gap_m)
+    return ChainedMotion(scene.stretch, labels.step)
 
 
 def check_argument(argument: str) -> None:

@@ -1,21 +1,19 @@
 # SPDX-License-Identifier: MIT
 """A network for whole sweeps: points to a grid of pillars, a U-Net over it, and back to points.
 
-As FastFlow3D (Jund et al., "Scalable Scene Flow from Point Clouds in the Real World", RA-L 2022)
-and DeFlow (Zhang et al., ICRA 2024), small enough for a CPU. Each sweep's points are encoded one by
-one and averaged over the cells of a grid of 0.4 m; the grids of all sweeps go through a U-Net
-together, so that it can compare them; each point of the source reads what lies at its place in the
-result, joined to its own encoding, and two more layers make its flow.
+It follows FastFlow3D (Jund et al., "Scalable Scene Flow from Point Clouds in the Real World", RA-L
+2022) and DeFlow (Zhang et al., ICRA 2024) and is small enough for a CPU. The points of each sweep
+are encoded one by one and averaged over the cells of a grid of 0.4 m. The grids of all sweeps go
+through one U-Net, which can compare them. Each source point reads the result at its position,
+joined to its own code, and two more layers give its flow.
 """
 
 from __future__ import annotations
 
 from itertools import pairwise
-from typing import Any
 
 import torch
 from torch import Tensor, nn
-from torch.autograd.function import once_differentiable
 from torch.nn import functional
 
 from densify.learning.clouds import NetworkCloud, Sweeps
@@ -32,7 +30,7 @@ _LARGEST_HEIGHT_M = 4.0
 
 
 class Voxels(nn.Module):
-    """0.5 million weights."""
+    """The network, 0.5 million weights."""
 
     num_sweeps = NUM_SWEEPS
 
@@ -55,7 +53,7 @@ class Voxels(nn.Module):
             self.decode[-1].bias.zero_()  # type: ignore[operator, union-attr]
 
     def forward(self, sweeps: Sweeps) -> Tensor:
-        """Flow (n,3) of the first sweep; 0 for points out of reach."""
+        """Return the flow (n,3) of the first sweep to the second, metres; 0 out of reach."""
         given = [*sweeps[:NUM_SWEEPS], *[None] * (NUM_SWEEPS - len(sweeps))]
         source = given[0]
         if source is None:
@@ -92,6 +90,13 @@ class Voxels(nn.Module):
         return x
 
 
+def build(seed: int = 0) -> Voxels:
+    """Return a network with random weights, the same for the same seed."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        return Voxels()
+
+
 class _Block(nn.Module):
     """Two convolutions; groups are normalised, which needs no batch."""
 
@@ -112,11 +117,11 @@ class _Block(nn.Module):
 
 
 class _Pillars:
-    """Points of one sweep in reach, sorted by the cell they lie in.
+    """The points of one sweep in reach, sorted by the cell they lie in.
 
-    row: (m,) of the sweep. cell: (m,) number. features: (m,6): from the cell's middle in cells,
-    height, and from the scanner in hundreds of metres. starts, filled: (f,) of the cells that hold
-    points, the first row and the number; of_point: (m,) which of them.
+    row: (m,) of the sweep. cell: (m,) number of the cell. features: (m,6) offset from the cell's
+    middle in cells, height, and offset from the scanner in hundreds of metres. filled, size: (f,)
+    number and point count of each cell that holds points; of_point: (m,) which of them.
     """
 
     def __init__(self, row: Tensor, cell: Tensor, features: Tensor) -> None:
@@ -139,31 +144,17 @@ class _Pillars:
         return _Pillars(row, number, features)
 
     def as_grid(self, encoded: Tensor) -> Tensor:
-        """(cells, C+1): mean of what the points are encoded as, and how many there are."""
-        sums = _SegmentSum.apply(encoded, self.size, self.of_point)
+        """Return (cells, C+1): the mean code of the points in each cell, and their number."""
+        zeros = encoded.new_zeros(len(self.size), encoded.shape[1])
+        sums = zeros.index_add(0, self.of_point, encoded)
         size = self.size[:, None].to(sums.dtype)
         columns = torch.cat([sums / size, torch.log1p(size) / 3], dim=1)
         grid = columns.new_zeros(NUM_CELLS**2, columns.shape[1])
         return grid.index_copy(0, self.filled, columns)
 
 
-class _SegmentSum(torch.autograd.Function):
-    """Sums of consecutive rows, in their order: the same bytes with any number of threads."""
-
-    @staticmethod
-    def forward(ctx: Any, values: Tensor, sizes: Tensor, of_row: Tensor) -> Tensor:
-        ctx.save_for_backward(of_row)
-        return torch.segment_reduce(values.detach(), "sum", lengths=sizes, axis=0, unsafe=True)
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None, None]:
-        (of_row,) = ctx.saved_tensors
-        return gradient[of_row], None, None
-
-
 def _at(image: Tensor, pillars: _Pillars) -> Tensor:
-    """(1,C,128,128) -> (m,C): what lies at each point's place, of the four nearest pixels."""
+    """Interpolate an image (1,C,128,128) at each point: (m,C)."""
     cell = torch.stack([pillars.cell % NUM_CELLS, pillars.cell // NUM_CELLS], dim=1)
     at = (cell + pillars.features[:, :2] + 0.5) * (2.0 / NUM_CELLS) - 1.0
     found = functional.grid_sample(

@@ -1,0 +1,353 @@
+# SPDX-License-Identifier: MIT
+"""Learning: losses against slow twins, the network, training that can be resumed, model files."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from densify.cli import main
+from densify.config.errors import ComputationError, InputError
+from densify.flow.objective.energy import on_one_thread
+from densify.learning import training
+from densify.learning.clips import ClipMaker
+from densify.learning.clouds import NetworkCloud, order_for
+from densify.learning.losses import (
+    ALPHA,
+    NUM_NEIGHBORS,
+    TEACHERS,
+    Teacher,
+    balanced_error,
+    objective_loss,
+    supervised_loss,
+    teacher,
+)
+from densify.learning.model_file import Model, read_model, write_model
+from densify.learning.network import REACH_M, Voxels, build
+from densify.learning.samples import NUM_DRAWN, Sample, sample_of, samples
+from tests.learning_scenes import SmallClips, clip, train_small
+
+
+def cloud(count: int, seed: int = 0, reach_m: float = 30.0) -> NetworkCloud:
+    rng = np.random.default_rng(seed)
+    points = rng.uniform(-reach_m, reach_m, (count, 3)).astype(np.float32)
+    points[:, 2] = rng.uniform(-1.5, 1.0, count)
+    return NetworkCloud(torch.from_numpy(points), torch.from_numpy(points[:, 2] + 1.7))
+
+
+def pair(source: np.ndarray, target: np.ndarray, flow: np.ndarray | None = None) -> Sample:
+    points = (torch.from_numpy(np.asarray(p, np.float32)) for p in (source, target))
+    first, second = (NetworkCloud(p, p[:, 2]) for p in points)
+    everything = torch.arange(len(source))
+    in_reach = torch.ones(len(source), dtype=torch.bool)
+    labels: tuple = (None, None)
+    if flow is not None:
+        moving = torch.from_numpy(np.abs(flow).sum(1) > 0)
+        labels = (torch.from_numpy(np.asarray(flow, np.float32)), moving)
+    return Sample((first, second), everything, first, second, in_reach, 0.1, *labels)
+
+
+def squared(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    return ((a[:, None] - b[None]) ** 2).sum(-1)
+
+
+def test_the_objective_equals_its_slow_twin() -> None:
+    rng = np.random.default_rng(4)
+    source, target = rng.uniform(-2, 2, (80, 3)), rng.uniform(-2, 2, (70, 3))
+    flow = rng.normal(0, 0.2, (80, 3))
+    between = squared(source, source)
+    near = np.zeros_like(between, bool)
+    np.put_along_axis(near, np.argsort(between, axis=1)[:, : NUM_NEIGHBORS + 1], True, axis=1)
+    weights = np.where(near | near.T, np.exp(-between), 0.0)
+    degree = weights.sum(1)
+    matrix = (np.diag(degree) - weights) / np.sqrt(np.outer(degree, degree))
+    apart = squared(source + flow, target)
+    data = apart.min(1).sum() + apart.min(0).sum()
+    expected = (data + ALPHA * np.trace(flow.T @ matrix @ flow)) / len(source)
+    assert ALPHA == 4.0 and NUM_NEIGHBORS == 50
+    tensor = torch.from_numpy(flow.astype(np.float32))
+    got = objective_loss(lambda sweeps: tensor, pair(source, target))
+    assert float(got) == pytest.approx(expected, rel=1e-5)
+
+
+def test_static_slow_and_fast_points_weigh_the_same() -> None:
+    true = np.zeros((100, 3))
+    true[98], true[99] = [0.05, 0, 0], [2.0, 0, 0]  # 0.5 and 20 m/s
+    sample = pair(np.zeros((100, 3)), np.zeros((5, 3)), true)
+    off = torch.zeros(100, 3)
+    off[:98, 1], off[98], off[99] = 0.01, torch.tensor([0.05, 0.2, 0]), torch.tensor([2, 0, 0.5])
+    assert float(supervised_loss(lambda sweeps: off, sample)) == pytest.approx(0.71, abs=1e-3)
+
+
+def test_points_out_of_reach_do_not_count() -> None:
+    nothing = torch.zeros(4, dtype=torch.bool)
+    flow = torch.ones(4, 3, requires_grad=True)
+    loss = balanced_error(flow, torch.zeros(4, 3), nothing, nothing, nothing)
+    loss.backward()
+    assert float(loss.detach()) == 0 and not flow.grad.any()
+
+
+@pytest.mark.parametrize("name", TEACHERS)
+def test_every_loss_has_finite_gradients_at_its_minimum(name: str) -> None:
+    source = np.random.default_rng(0).uniform(-3, 3, (70, 3))
+    flow = torch.zeros(70, 3, requires_grad=True)
+    loss = teacher(name).loss(lambda sweeps: flow, pair(source, source.copy(), np.zeros((70, 3))))
+    loss.backward()
+    assert float(loss.detach()) < 0.01 and torch.isfinite(flow.grad).all()
+
+
+@pytest.fixture(scope="module")
+def network() -> Voxels:
+    return build().eval()
+
+
+def test_flow_has_a_row_for_every_point_and_depends_on_the_target(network: Voxels) -> None:
+    with torch.inference_mode():
+        for given in ([cloud(500), cloud(300, 1)], [cloud(500), cloud(40, 1), None]):
+            flow = network(given)
+            assert flow.shape == (500, 3) and torch.isfinite(flow).all() and flow.any()
+        assert network([cloud(0), cloud(9)]).shape == (0, 3)
+        one, other = (network([cloud(500), cloud(300, seed)]) for seed in (1, 2))
+    assert (one != other).any()
+
+
+def test_weights_follow_from_the_seed_alone(network: Voxels) -> None:
+    state = torch.random.get_rng_state()
+    again, other = build(), build(seed=1)
+    assert torch.equal(torch.random.get_rng_state(), state)
+    pairs = list(zip(network.parameters(), again.parameters(), other.parameters(), strict=True))
+    assert all(torch.equal(a, b) for a, b, _ in pairs)
+    assert any(not torch.equal(a, c) for a, _, c in pairs)
+
+
+def test_the_order_of_points_does_not_matter(network: Voxels) -> None:
+    source, target = cloud(2000), cloud(1500, 1)
+    order = torch.randperm(2000, generator=torch.Generator().manual_seed(3))
+    with torch.inference_mode():
+        flow = network([source, target])
+        shuffled = network([source.rows(order), target])
+    torch.testing.assert_close(shuffled, flow[order], atol=1e-5, rtol=1e-4)
+
+
+def test_points_out_of_reach_have_no_flow(network: Voxels) -> None:
+    source = cloud(2000, reach_m=2 * REACH_M)
+    beyond = (source.points[:, :2].abs() > REACH_M).any(dim=1)
+    with torch.inference_mode():
+        flow = network([source, cloud(100, 1)])
+    assert not flow[beyond].any() and flow[~beyond].any(dim=1).all()
+
+
+def test_a_whole_sweep_gives_the_same_bytes_with_any_number_of_threads(network: Voxels) -> None:
+    given, found, before = [cloud(60_000, n) for n in range(3)], [], torch.get_num_threads()
+    for threads in (1, 2):
+        torch.set_num_threads(threads)
+        with on_one_thread(), torch.inference_mode():
+            found.append(network(given))
+    torch.set_num_threads(before)
+    assert torch.equal(*found)
+
+
+def test_sweeps_before_the_source_come_in_the_direction_of_time() -> None:
+    assert order_for(3, 4, 7, 4) == [3, 4, 2, 1]
+    assert order_for(3, 2, 5, 4) == [3, 2, 4, None]
+    assert order_for(0, 1, 5, 3) == [0, 1, None]
+
+
+def test_the_network_learns_what_moves() -> None:
+    """One pair by heart: most of the motion, and that the rest is static."""
+    sample, network = sample_of(clip(0), 1, 2, 3, "truth"), build()
+    optimizer = torch.optim.Adam(network.parameters(), 5e-3)
+    with on_one_thread():
+        for _ in range(20):
+            optimizer.zero_grad()
+            supervised_loss(network, sample).backward()
+            optimizer.step()
+    with torch.inference_mode():
+        error_m = (network(sample.sweeps) - sample.flow).norm(dim=1)
+    static, moving = error_m[~sample.moving].mean(), error_m[sample.moving].mean()
+    assert moving < 0.3 and static < 0.15  # a flow of 0 has an error of 1 m
+
+
+@pytest.mark.parametrize("name", ["objective", "engine"])
+def test_every_teacher_trains(tmp_path: Path, name: str) -> None:
+    paths = train_small(str(tmp_path / "model"), teacher=name, steps=1)
+    changed = zip(build().parameters(), read_model(paths[0]).network.parameters(), strict=True)
+    assert any(not torch.equal(a, b) for a, b in changed)
+    assert paths[1].read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_stopped_training_goes_on_to_the_same_bytes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole, again, other = (
+        train_small(str(tmp_path / f"{name}.pt"), steps=7, seed=seed)[0].read_bytes()
+        for name, seed in (("whole", 0), ("again", 0), ("other", 1))
+    )
+    assert whole == again != other
+
+    def stop(checkpoint: Path, model: Model) -> None:
+        write_model(checkpoint, model)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("densify.learning.training.write_model", stop)
+    with pytest.raises(KeyboardInterrupt):
+        train_small(str(tmp_path / "stopped.pt"), steps=7)
+    monkeypatch.undo()
+    checkpoint = tmp_path / "stopped.pt.checkpoint"
+    assert len(read_model(checkpoint).beside["losses"]) == 5
+    with pytest.raises(InputError, match="was begun with teacher truth, got engine"):
+        train_small(str(tmp_path / "stopped.pt"), resume=True, steps=7, teacher="engine")
+    resumed = train_small(str(tmp_path / "stopped.pt"), resume=True, steps=7)[0]
+    assert resumed.read_bytes() == whole and not checkpoint.exists()
+
+
+def test_a_loss_that_is_no_number_stops_the_training(tmp_path: Path, monkeypatch) -> None:
+    def broken(predict, sample) -> torch.Tensor:
+        return torch.tensor(float("nan"), requires_grad=True)
+
+    monkeypatch.setattr(training, "teacher", lambda name: Teacher(broken, ""))
+    with pytest.raises(ComputationError, match="the loss of step 0 is nan"):
+        train_small(str(tmp_path / "m.pt"), steps=3)
+    assert not list(tmp_path.iterdir())
+
+
+def test_samples_follow_from_their_number() -> None:
+    maker = SmallClips(("streets",), 3, "truth")
+    stream = samples(maker, 3, 0)
+    everything = [next(stream) for _ in range(200)]  # more than one group of clips
+    late = next(samples(maker, 3, 0, first=195))
+    for one, other in zip(late.sweeps, everything[195].sweeps, strict=True):
+        assert (one is None) == (other is None)
+        assert one is None or torch.equal(one.points, other.points)
+    assert len({tuple(s.sweeps[0].points[0].tolist()) for s in everything}) == 200
+
+
+def test_a_random_change_moves_points_and_flow_alike() -> None:
+    """Turned, mirrored and scaled, a point plus its flow is where it was seen next."""
+    small, rng = clip(0), np.random.default_rng(2)
+    for source, target in ((1, 2), (2, 1)):
+        plain = sample_of(small, source, target, 2, "truth")
+        changed = sample_of(small, source, target, 2, "truth", rng)
+        a, b = plain.sweeps[0].points, changed.sweeps[0].points
+        change, *_ = np.linalg.lstsq(a.numpy(), b.numpy(), rcond=None)
+        np.testing.assert_allclose(plain.flow.numpy() @ change, changed.flow.numpy(), atol=1e-4)
+        there = plain.sweeps[1].points.numpy() @ change
+        np.testing.assert_allclose(there, changed.sweeps[1].points.numpy(), atol=1e-3)
+        sign = 1 if target > source else -1
+        assert plain.flow[plain.moving][:, 0].numpy() == pytest.approx(sign, abs=1e-6)
+        assert plain.duration_s == pytest.approx(0.1)
+
+
+def test_many_points_are_drawn_once_each() -> None:
+    sample = sample_of(clip(0, num_points=NUM_DRAWN), 1, 2, 2, "")
+    assert len(sample.drawn) == NUM_DRAWN == len(set(sample.drawn.tolist()))
+    assert torch.equal(sample.drawn_source.points, sample.sweeps[0].points[sample.drawn])
+
+
+def changed_model(path: Path, header: dict | None = None, weights: dict | None = None) -> None:
+    """Write a model file with another header or other weights; None takes an array away."""
+    write_model(path, Model(build()))
+    with np.load(path) as file:
+        arrays = dict(file)
+    told = {**json.loads(bytes(arrays["header"])), **(header or {})}
+    arrays["header"] = np.frombuffer(json.dumps(told).encode(), np.uint8)
+    arrays = {k: v for k, v in (arrays | (weights or {})).items() if v is not None}
+    with path.open("wb") as out:
+        np.savez(out, **arrays)
+
+
+def test_a_model_comes_back(tmp_path: Path) -> None:
+    model = Model(build(3), {"teacher": "truth"})
+    for name in ("a.pt", "b"):
+        write_model(tmp_path / name, model)
+    assert (tmp_path / "a.pt").read_bytes() == (tmp_path / "b").read_bytes()
+    found = read_model(tmp_path / "b")
+    assert found.made == {"teacher": "truth"}
+    for name, tensor in model.network.state_dict().items():
+        assert torch.equal(tensor, found.network.state_dict()[name])
+
+
+BIAS = "weights/decode.4.bias"
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"header": {"version": 2}}, "version 2 of a network 'voxels', expected version 1"),
+        ({"header": {"network": "resnet"}}, "a network 'resnet', expected version 1 of 'voxels'"),
+        ({"header": {"format": "other"}}, "no model that densify train flow wrote"),
+        ({"weights": {BIAS: None}}, "got nothing, expected float32 of shape"),
+        ({"weights": {BIAS: np.zeros(4, np.float32)}}, r"got float32 of shape \(4,\)"),
+        ({"weights": {BIAS: np.full(3, np.nan, np.float32)}}, "not all finite"),
+    ],
+)
+def test_other_models_are_refused(tmp_path: Path, change: dict, message: str) -> None:
+    changed_model(tmp_path / "m.pt", **change)
+    with pytest.raises(InputError, match=message):
+        read_model(tmp_path / "m.pt")
+
+
+def test_a_pickle_is_no_model(tmp_path: Path) -> None:
+    torch.save({"weights": torch.zeros(3)}, tmp_path / "m.pt")
+    with pytest.raises(InputError, match="no model that densify train flow wrote"):
+        read_model(tmp_path / "m.pt")
+
+
+def test_the_command_trains_on_a_street(tmp_path: Path, capsys, monkeypatch) -> None:
+    """A recording is registered and labelled by our engine, and a network learns from it."""
+    monkeypatch.setattr("densify.learning.samples._NUM_MIXED", 1)  # clips made ahead
+    out, spec = tmp_path / "m.pt", "street?seed=31&sensor=vlp16"
+    command = ["train", "flow", "--data", spec, "--out", str(out), "--teacher", "engine"]
+    command += ["--steps", "2", "--workers", "0"]
+    assert main(command) == 0
+    told = capsys.readouterr().out.splitlines()
+    assert told[0].startswith("2 steps, loss") and told[1:] == [str(out), f"{out}.png"]
+    assert read_model(out).made["teacher"] == "engine"
+    assert main(command) == 2
+    assert "there already, kept; give --overwrite" in capsys.readouterr().err
+    moving = [s for s in ClipMaker((spec,), 0, "engine")(0).sweeps if s.engine.moving.any()]
+    assert moving, "a clip without moving points says nothing"
+    for sweep in moving:
+        own = sweep.engine.moving & sweep.truth.moving
+        error_m = np.linalg.norm(sweep.engine.flow - sweep.truth.flow, axis=2)[:, own]
+        assert np.median(error_m) < 0.1
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--steps", "0"], "--steps 0: expected 1 or more"),
+        (["--steps", "1", "--data", "nowhere"], "nowhere"),
+        (["--steps", "1", "--data", "streets?seed=3"], "seeds are drawn"),
+        (["--steps", "1", "--resume"], "checkpoint; leave --resume out"),
+    ],
+    ids=str,
+)
+def test_bad_input_is_one_line(tmp_path: Path, capsys, options, message: str) -> None:
+    out = str(tmp_path / "m.pt")
+    assert main(["train", "flow", "--out", out, "--workers", "0", *options]) == 2
+    lines = capsys.readouterr().err.strip().splitlines()
+    assert len(lines) == 1 and message in lines[0]
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a CUDA device")
+def test_an_absent_cuda_device_is_refused() -> None:
+    with pytest.raises(InputError, match="finds no CUDA device here; use --device cpu"):
+        training.chosen_device("cuda")
+
+
+def test_a_recording_without_truth_cannot_be_the_teacher(tmp_path: Path, monkeypatch) -> None:
+    class Plain:
+        truth, frames, name = None, range(20), "plain"
+
+    monkeypatch.setattr("densify.learning.clips.open_sequence", lambda spec: Plain())
+    with pytest.raises(InputError, match=r"--data x: has no true flow; choose another"):
+        ClipMaker(("x",), 0, "truth")(0)
+    monkeypatch.setattr(Plain, "frames", range(3))
+    with pytest.raises(InputError, match="--data x: 3 sweeps, expected 7 or more"):
+        ClipMaker(("x",), 0)(0)
