@@ -64,26 +64,26 @@ class Door:
 
 
 def _image(path: Path) -> None:
-    from densify.readers.image_files import read_image
+    from densify.readers.decoded_files import read_image
 
     read_image(path, as_stored=path.suffix == ".png")
 
 
 def _npy(path: Path) -> None:
-    from densify.readers.array_files import read_array
+    from densify.readers.decoded_files import read_array
 
     read_array(path)
 
 
 def _npz(path: Path) -> None:
-    from densify.readers.array_files import read_arrays
+    from densify.readers.decoded_files import read_arrays
 
     read_arrays(path)
 
 
 def _points(path: Path) -> None:
     from densify.cli.point_files import read_points
-    from densify.readers.points.files import read_table, read_viewpoint
+    from densify.readers.point_files import read_table, read_viewpoint
 
     for read in (read_table, read_viewpoint, read_points):
         try:
@@ -108,7 +108,7 @@ def _prior(path: Path) -> None:
 
 
 def _json(path: Path) -> None:
-    from densify.config.text_files import read_json
+    from densify.config.file_content import read_json
 
     read_json(path)
 
@@ -146,7 +146,7 @@ def _spec(path: Path) -> None:
 
 
 def _stamps(path: Path) -> None:
-    from densify.readers.kitti.files import Stamps
+    from densify.readers.kitti.calibration import Stamps
     from densify.readers.stamp_files import StampFile
 
     for read in (Stamps.read, StampFile.read):

@@ -10,6 +10,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from densify.learning.networks import build
 from scipy.spatial import cKDTree
 
 from densify.bench.baselines import rigid_icp
@@ -26,10 +27,9 @@ from densify.bench.paper_pairs import (
 from densify.cli import main
 from densify.config.errors import InputError
 from densify.learning.model_file import Model, write_model
-from densify.learning.networks import build
 from densify.outputs.arrows import draw_arrows
 from densify.outputs.writers import write_street
-from densify.readers.image_files import read_image
+from densify.readers.decoded_files import read_image
 from densify.readers.kitti import scene_flow
 from densify.readers.street import Street
 

@@ -13,8 +13,8 @@ from densify.config.errors import InputError
 from densify.geometry import poses
 from densify.readers import open_sequence
 from densify.readers.describe import describe
-from densify.readers.files import format_frames, runs
 from densify.readers.kitti.raw import KITTI_TRIGGER_LATENCY_NS, KittiRaw
+from densify.readers.timeline import format_frames, runs
 
 # The epoch nanoseconds of this text do not survive a float64 (multiples of 256 there).
 BASE_TEXT, BASE_NS = "2011-09-26 13:10:51", 1317042651_000_000_000

@@ -26,7 +26,7 @@ from densify.learning.labels import label_sweeps
 from densify.outputs.writers import write_street
 from densify.outputs.writers.pandaset import _pickled
 from densify.readers import open_sequence
-from densify.readers.kitti.files import Calibration
+from densify.readers.kitti.calibration import Calibration
 from densify.readers.nuscenes.annotations import Annotations
 from densify.readers.street import Street
 from densify.readers.waymo.components import BOX_HEADING, BOX_SIZE, STAMP

@@ -235,14 +235,14 @@ DOORS: dict[str, str | tuple[str, ...]] = {
     "rerun": "densify/outputs/export/rrd.py",
     "embreex": "densify/street/world.py",
     "kiss_icp": "densify/registration/odometry.py",
-    "laspy": ("densify/readers/las_files.py", "densify/outputs/cloud_laz.py"),
+    "laspy": ("densify/readers/decoded_files.py", "densify/outputs/cloud_laz.py"),
     "numba": ("densify/geometry/compiled.py", "densify/geometry/threads.py"),
     "pickle": (
         "densify/dataset/calls.py",
         "densify/readers/pandaset/pickled_frame.py",
         "densify/outputs/writers/pandaset.py",
     ),
-    "simplejpeg": "densify/readers/image_files.py",
+    "simplejpeg": "densify/readers/decoded_files.py",
     "small_gicp": "densify/registration/alignment.py",
     "torch": ("densify/flow/", "densify/dataset/loader.py", "densify/learning/"),
 }

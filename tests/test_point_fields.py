@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from densify.readers.points.fields import find_fields, find_times, full_scale, scaled
+from densify.readers.point_fields import find_fields, find_times, full_scale, scaled
 
 STAMP_NS = 1_317_042_661_099_997_611
 PERIOD_NS = 100_000_000

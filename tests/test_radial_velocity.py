@@ -17,7 +17,7 @@ from densify.geometry import poses
 from densify.geometry.types import Stretch, Sweep, Trajectory
 from densify.outputs.writers import write_street
 from densify.readers import open_sequence
-from densify.readers.points.fields import find_fields, radial_velocities
+from densify.readers.point_fields import find_fields, radial_velocities
 from densify.readers.street import Street
 from densify.registration.deskew import placed, twists
 from densify.scores.radial_velocity import radial_velocity_scores

@@ -16,7 +16,7 @@ import yaml
 from densify.dataset.report import write_report
 from densify.outputs import export_run
 from densify.outputs.depth_png import read_stored
-from densify.readers.image_files import decode_image
+from densify.readers.decoded_files import decode_image
 from tests.browser import Opened, chromium
 from tests.report_runs import results, write_compared, write_run
 

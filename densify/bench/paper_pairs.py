@@ -27,7 +27,7 @@ from densify.learning.clouds import AboveGround, Sweeps
 from densify.learning.labels import Label, label_sweeps
 from densify.learning.samples import sample_of
 from densify.readers import open_sequence
-from densify.readers.array_files import read_arrays
+from densify.readers.decoded_files import read_arrays
 from densify.readers.kitti import scene_flow
 
 FARTHEST_M = 35.0

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from densify.cli.tables import Column, aligned, look_up, percent, table, written
-from densify.readers.files import format_frames
+from densify.readers.timeline import format_frames
 
 _METHOD_COLUMNS: tuple[Column, ...] = (
     ("points", ("num_points",), ",d"),

@@ -203,7 +203,7 @@ def cache_of(options: argparse.Namespace) -> Cache | None:
 
 def sliced(sequence: LidarSequence, keys: slice) -> list[int]:
     """The frames of ``--keys``. Raises InputError if there is none."""
-    from densify.readers.files import format_frames
+    from densify.readers.timeline import format_frames
 
     chosen = frozenset(range(keys.start, keys.stop, keys.step or 1))
     there = [frame for frame in sequence.frames if frame in chosen]

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from densify.config.errors import InputError
 from densify.geometry.types import Float, FlowField, Int
-from densify.readers.points.files import read_table
+from densify.readers.point_files import read_table
 
 
 @dataclass(frozen=True)
@@ -27,7 +27,7 @@ class PointFile:
 
 
 def read_points(path: Path) -> PointFile:
-    """Every row of the file in its order: any format of `densify.readers.points.files`.
+    """Every row of the file in its order: any format of `densify.readers.point_files`.
 
     An .npz file may hold, beside ``points``, ``offset_ns`` or ``time`` (seconds) and ``lidar``,
     (N,) each. Raises InputError if the file is missing, has another form, or holds no point or one

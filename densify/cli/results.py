@@ -18,7 +18,7 @@ from densify.cli.tables import NONE, aligned, look_up, percent
 from densify.geometry.types import Result
 from densify.outputs import Export
 from densify.outputs.plain import plain
-from densify.readers.files import format_frames
+from densify.readers.timeline import format_frames
 
 FIRST_OF_RUN = {
     "report.html": "all of it, in a browser",

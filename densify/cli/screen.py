@@ -133,7 +133,7 @@ def tell_doubts(doubts: Iterable[tuple[str, str, int]], most: int = 20) -> None:
 
     doubts: (warning, recording or "", key).
     """
-    from densify.readers.files import format_frames
+    from densify.readers.timeline import format_frames
 
     log = logging.getLogger("densify")
     keys: dict[tuple[str, str], list[int]] = {}

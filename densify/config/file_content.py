@@ -1,30 +1,29 @@
 # SPDX-License-Identifier: MIT
-"""The bytes of a file: an ordinary one, and not too many of them."""
+"""Bounded reading of files: bytes, text, JSON and YAML."""
 
 from __future__ import annotations
 
-import errno
+import json
 import os
 import stat
-import time
 import zlib
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 from densify.config.errors import InputError
 
 MOST_BYTES = 1 << 30
-"""No file is larger in memory, compressed or not; a sweep has 2 to 10 MB."""
-_PASSING = (errno.EIO, errno.ESTALE, errno.ETIMEDOUT, errno.EAGAIN)
-_PAUSES_S = (0.05, 0.5)
+"""Largest content that is read into memory, unpacked. A sweep has 2 to 10 MB."""
+_MOST_YAML_BYTES = 1 << 22
+_MOST_ALIASES = 30  # nested aliases multiply: 30 of them make at most 60,000 values of one
 
 
 def open_file(path: Path) -> BinaryIO:
-    """A file for reading, that of whom it is to be closed by. Raises InputError if it is missing
-    or unreadable, and at once for pipes and devices, which are not waited for."""
+    """Open a file for reading; the caller closes it. Raises InputError at once if it is missing,
+    unreadable, or a folder, pipe or device."""
     try:
         number = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
-    except (OSError, ValueError) as error:  # ValueError: a name with a NUL
+    except (OSError, ValueError) as error:  # ValueError: a NUL in the name
         raise InputError(f"{path}: cannot be read: {reason(error)}") from error
     if not stat.S_ISREG(os.fstat(number).st_mode):
         os.close(number)
@@ -33,33 +32,17 @@ def open_file(path: Path) -> BinaryIO:
 
 
 def read_bytes(path: Path, most_bytes: int = MOST_BYTES) -> bytes:
-    """The whole content. Raises InputError if it is missing, unreadable, no ordinary file, or has
-    more bytes than that."""
+    """Return a file's content. Raises InputError if it cannot be read or is larger than that."""
     with open_file(path) as file:
-        num_bytes = os.fstat(file.fileno()).st_size
-        check_size(num_bytes, path, most_bytes)
+        check_size(os.fstat(file.fileno()).st_size, path, most_bytes)
         try:
-            return _read(file, num_bytes)
+            return file.read(most_bytes)
         except OSError as error:
             raise InputError(f"{path}: cannot be read: {reason(error)}") from error
 
 
-def _read(file: BinaryIO, num_bytes: int) -> bytes:
-    """Tried again after what disks and network folders recover from: a sweep that is missing only
-    now would be missing for good from what is made of its neighbours."""
-    for pause_s in _PAUSES_S:
-        try:
-            return file.read(num_bytes)
-        except OSError as error:
-            if error.errno not in _PASSING:
-                raise
-        time.sleep(pause_s)
-        file.seek(0)
-    return file.read(num_bytes)
-
-
 def gunzipped(data: bytes, where: Path | str, most_bytes: int = MOST_BYTES) -> bytes:
-    """What gzipped bytes hold. Raises InputError if they are damaged or hold more than that."""
+    """Unpack gzip data. Raises InputError if it is damaged or its content larger than that."""
     unpack = zlib.decompressobj(16 + zlib.MAX_WBITS)
     try:
         content = unpack.decompress(data, most_bytes + 1)
@@ -79,7 +62,70 @@ def check_size(num_bytes: int, where: Path | str, most_bytes: int = MOST_BYTES) 
         )
 
 
-def reason(error: Exception) -> str:
-    """What an exception says, on one line."""
+def reason(error: BaseException) -> str:
+    """Return what an exception says, on one line."""
     said = error.strerror if isinstance(error, OSError) else None
     return said or " ".join(str(error).split()) or type(error).__name__
+
+
+def read_text(path: Path, most_bytes: int = MOST_BYTES) -> str:
+    """Return a file's text. Raises InputError if it cannot be read, is too large or no text."""
+    try:
+        return read_bytes(path, most_bytes).decode("utf-8")
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: cannot be read: not a text file") from error
+
+
+def read_json(path: Path) -> Any:
+    """Return the content of a JSON file. Raises InputError if it cannot be read or is broken."""
+    return parse_json(read_bytes(path), path)
+
+
+def parse_json(data: bytes, where: Path | str) -> Any:
+    """Return the content of JSON text. Raises InputError, which begins with ``where``."""
+    try:
+        return json.loads(data)
+    except (ValueError, RecursionError) as error:
+        raise InputError(
+            f"{where}: not a whole JSON file ({reason(error)}); fetch it again"
+        ) from error
+
+
+def read_yaml(path: Path) -> tuple[Any, dict[str, int]]:
+    """`parse_yaml` of a file."""
+    return parse_yaml(read_text(path, _MOST_YAML_BYTES), path)
+
+
+def parse_yaml(text: str, where: Path | str) -> tuple[Any, dict[str, int]]:
+    """Return the content of YAML text, None if empty, and the line of each key by its dotted name.
+
+    Raises InputError, which begins with ``where``, for broken YAML, tags other than YAML's own, a
+    key that is given twice, or more than 30 aliases.
+    """
+    import yaml
+
+    try:
+        aliases = sum(isinstance(e, yaml.AliasEvent) for e in yaml.parse(text, yaml.SafeLoader))
+        loader = yaml.SafeLoader(text)
+        root = loader.get_single_node()
+        if root is None:
+            return None, {}
+        if aliases > _MOST_ALIASES:
+            raise ValueError(f"expected {_MOST_ALIASES} aliases at most, got {aliases}")
+        lines: dict[str, int] = {}
+        _note_lines(root, "", lines)
+        return loader.construct_document(root), lines
+    except RecursionError as error:
+        raise InputError(f"{where}: not YAML: nested too deeply") from error
+    except Exception as error:  # a tag on a value that does not fit it raises anything
+        raise InputError(f"{where}: not YAML: {reason(error)}") from error
+
+
+def _note_lines(node: Any, name: str, lines: dict[str, int]) -> None:
+    for key, value in node.value if node.id == "mapping" else ():
+        full = f"{name}.{key.value}" if name else str(key.value)
+        line = key.start_mark.line + 1
+        if full in lines:
+            raise ValueError(f"line {line}: {full} is given twice; keep one")
+        lines[full] = line
+        _note_lines(value, full, lines)

@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import Any
 
 from densify.config.errors import InputError
+from densify.config.file_content import parse_yaml, read_yaml
 from densify.config.knobs import checked
 from densify.config.sections import REPLACED, Config
-from densify.config.text_files import parse_yaml, read_yaml
 
 
 def resolve(

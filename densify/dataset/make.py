@@ -41,7 +41,7 @@ from densify.dataset.workers import check_workers, open_workers
 from densify.flow.engines import check_engine
 from densify.outputs.atomic import clear_leftovers
 from densify.outputs.kitti_tree import write_readme
-from densify.readers.files import format_frames
+from densify.readers.timeline import format_frames
 
 _log = logging.getLogger("densify")
 

@@ -32,8 +32,7 @@ from types import TracebackType
 from typing import Any, Literal, get_args
 
 from densify.config.errors import InputError, OutputError
-from densify.config.file_content import open_file, read_bytes
-from densify.config.text_files import parse_json
+from densify.config.file_content import open_file, parse_json, read_bytes
 from densify.outputs.atomic import FileRecord, make_folder, sync_folder, write_file
 from densify.outputs.plain import plain
 

@@ -24,15 +24,14 @@ import numpy as np
 from densify import __version__
 from densify.config import Config, as_mapping
 from densify.config.errors import InputError, OutputError
-from densify.config.text_files import read_json
+from densify.config.file_content import read_json
 from densify.dataset.gate import Gate
 from densify.geometry.types import Camera, LidarSequence
 from densify.outputs.atomic import make_folder, write_file
 from densify.outputs.kitti_tree import drive_folder, split_of
 from densify.pipeline.blocks import Cut
 from densify.readers import Spec, open_sequence
-from densify.readers.files import format_frames, runs
-from densify.readers.timeline import Timeline, check_window
+from densify.readers.timeline import Timeline, check_window, format_frames, runs
 from densify.readers.window import choose_cameras
 
 SCHEMA_VERSION = 1

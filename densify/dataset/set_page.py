@@ -13,7 +13,7 @@ from typing import Any
 
 from densify import __version__
 from densify.config.errors import InputError
-from densify.config.text_files import read_json, read_yaml
+from densify.config.file_content import read_json, read_yaml
 from densify.dataset.gate import scores_of_metrics
 from densify.dataset.manifest import KeyRecord, read_manifests
 from densify.dataset.plan import planned_keys, read_plan

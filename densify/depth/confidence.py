@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.optimize import isotonic_regression
 
-from densify.config.text_files import read_json
+from densify.config.file_content import read_json
 from densify.depth.layers import Layers
 from densify.geometry.types import Bool, Camera, DepthMap, Float, Float32, Ranked
 from densify.scores.depth_metrics import is_outlier_depth

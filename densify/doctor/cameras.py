@@ -22,7 +22,7 @@ from densify.doctor.sample import Sample, Spot
 from densify.geometry import poses
 from densify.geometry.cameras import image_points
 from densify.geometry.types import Bool, Camera, Float, Float32
-from densify.readers.files import format_frames
+from densify.readers.timeline import format_frames
 
 _EDGE_M, _EDGE_SHARE = 0.6, 0.08
 _NEAREST_M, _FARTHEST_M = 3.0, 50.0

@@ -7,7 +7,7 @@ import numpy as np
 
 from densify.doctor.findings import Finding, Verdict
 from densify.doctor.sample import Sample
-from densify.readers.files import format_frames
+from densify.readers.timeline import format_frames
 
 _PERIODS_S = (0.015, 1.1)  # of scanners that are built: 50 Hz to 1 Hz
 _HOLE_PERIODS = 3.1

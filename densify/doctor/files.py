@@ -12,7 +12,7 @@ import numpy as np
 from densify.doctor.findings import Finding, Verdict
 from densify.doctor.sample import Sample
 from densify.geometry.types import KnowsFiles
-from densify.readers.files import format_frames
+from densify.readers.timeline import format_frames
 
 _BYTES_PER_KEY = 3_000_000  # one camera and the cloud; two thirds of that without
 _SHORT = 0.3  # of the usual size

@@ -19,13 +19,13 @@ import torch
 from numpy.typing import NDArray
 
 from densify.config.errors import InputError
-from densify.config.text_files import parse_json
+from densify.config.file_content import parse_json
 from densify.flow.objective.energy import on_one_thread
 from densify.geometry.types import Float
 from densify.learning.clouds import Sweeps
 from densify.learning.network import Voxels, build
 from densify.outputs.atomic import write_file
-from densify.readers.array_files import read_arrays
+from densify.readers.decoded_files import read_arrays
 
 FORMAT, VERSION = "densify model", 1
 NETWORK = "voxels"

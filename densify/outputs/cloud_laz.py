@@ -16,7 +16,7 @@ from densify.config.errors import InputError
 from densify.geometry.types import Bool, Cloud, Float, Float32, Int, Result
 from densify.outputs.atomic import write_file
 from densify.outputs.context import Context
-from densify.readers.las_files import read_las
+from densify.readers.decoded_files import read_las
 
 _SCALE_M = 0.001
 _UNIX_DAY_0, _DAY_NS = datetime.date(1970, 1, 1), 86400 * 10**9

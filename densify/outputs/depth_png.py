@@ -16,7 +16,7 @@ from densify.config.errors import InputError
 from densify.geometry.types import Bool, Float32
 from densify.outputs.atomic import write_file
 from densify.outputs.png import encode_png
-from densify.readers.image_files import read_image
+from densify.readers.decoded_files import read_image
 
 _STEPS_PER_M = 256.0
 _STEPS_OF_CONFIDENCE = 254.0

@@ -13,7 +13,7 @@ from densify.config import Config
 from densify.depth.exposure import Shot
 from densify.geometry.types import Camera, KnowsItsGaps, LidarSequence, Result, Stretch
 from densify.pipeline.methods import METHODS
-from densify.readers.files import format_frames
+from densify.readers.timeline import format_frames
 from densify.registration.upright import ground_aside
 from densify.scores.depth_metrics import image_density
 

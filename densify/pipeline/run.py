@@ -27,8 +27,8 @@ from densify.pipeline.doubts import with_doubts
 from densify.pipeline.key_results import Key, key_results
 from densify.pipeline.methods import COMPARED, METHODS, looks_around, with_baselines
 from densify.pipeline.recording import Beyond, Moment, Recording
-from densify.readers.files import format_frames
 from densify.readers.prior_files import PriorFiles
+from densify.readers.timeline import format_frames
 from densify.readers.window import choose_cameras
 
 ConfigLike = Config | str | Path | Mapping[str, Any] | None

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Opening recordings. The table of readers, and how to add one, is `config.plugins.readers`."""
+"""Opening recordings. `densify.config.plugins.readers` is the table of readers."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from typing import NamedTuple, Protocol, cast
 
 from densify.config.errors import InputError
 from densify.config.plugins.readers import READERS, Reader
+from densify.config.plugins.table import did_you_mean
 from densify.geometry.types import LidarSequence
 
 _MOST_PLACES = 200  # are looked at for a recording, where the one named is none itself
@@ -20,10 +21,10 @@ class ReaderModule(Protocol):
     """What the module of a reader has."""
 
     def open_recording(self, path: Path, scene: str | None) -> LidarSequence:
-        """The recording there, lazily: nothing but small files is read before a sweep is asked for.
+        """Open the recording there lazily: only small files are read before a sweep is asked for.
 
         path: what follows ``READER:``, or a place that the reader recognises. scene: what follows
-        ``#``, None for nothing; always None for readers without scenes.
+        ``#``, None for nothing and for readers without scenes.
         Raises InputError, which names the place, if there is no such recording.
         """
         ...
@@ -90,7 +91,7 @@ def open_sequence(spec: str | Path = "street") -> LidarSequence:
         from densify.readers.street import Street
 
         return Street.from_spec(parsed.place)
-    reader = _reader_of(parsed, str(spec))
+    reader = _reader_of(parsed, f"--data {spec}")
     if parsed.scene is not None and not reader.scenes:
         raise InputError(
             f"--data {spec}: {reader.name} recordings have no scenes; leave #{parsed.scene} out"
@@ -99,14 +100,16 @@ def open_sequence(spec: str | Path = "street") -> LidarSequence:
     return module.open_recording(parsed.path, parsed.scene)
 
 
-def _reader_of(parsed: Spec, text: str) -> Reader:
-    """The one named, or the first that recognises the place."""
+def _reader_of(parsed: Spec, where: str) -> Reader:
+    """Return the reader that is named, or the first that recognises the place."""
     if parsed.reader is not None:
-        return READERS.row(parsed.reader, f"--data {text}")
+        return READERS.row(parsed.reader, where)
     if not parsed.path.exists():
+        name, _, _ = parsed.place.partition(":")
+        hint = did_you_mean(name, [*READERS.names(), "street"])
         raise InputError(
-            f"--data {text}: no such folder; expected a recording's folder, READER:PATH with "
-            f"READER one of {', '.join(READERS.usages())}, or street[:PRESET]"
+            f"{where}: no such folder; {hint}expected a recording's folder, READER:PATH with "
+            f"READER one of {', '.join(READERS.names())}, or street[:PRESET]"
         )
     readers = sorted(READERS, key=lambda reader: reader.general)
     for reader in readers:
@@ -114,15 +117,14 @@ def _reader_of(parsed: Spec, text: str) -> Reader:
             return reader
     inside = _recording_in(parsed.path, readers)
     if inside is not None:
-        raise InputError(f"--data {text}: no recording itself; one in it is {inside}: name that")
+        raise InputError(f"{where}: no recording itself; one in it is {inside}: name that")
     *most, last = (reader.holds for reader in readers)
-    known = f"{', '.join(most)} or {last}"
-    raise InputError(f"--data {text}: no known recording there; expected {known}")
+    raise InputError(f"{where}: no known recording there; expected {', '.join(most)} or {last}")
 
 
 def _recording_in(path: Path, readers: Sequence[Reader]) -> Path | None:
-    """The first recording in a folder or in those that it holds; one of a known form, or else a
-    folder of sweeps."""
+    """Return the first recording in a folder or its folders: one of a known form, or else a folder
+    of sweeps."""
     near = _entries(path)
     places = [*near, *chain.from_iterable(map(_entries, near))][:_MOST_PLACES]
     for general in (False, True):
@@ -134,5 +136,5 @@ def _recording_in(path: Path, readers: Sequence[Reader]) -> Path | None:
 
 
 def _entries(path: Path) -> list[Path]:
-    """What lies in a folder, links to nowhere and to themselves left out."""
+    """Return what lies in a folder, without links to nowhere and to themselves."""
     return sorted(p for p in path.iterdir() if p.exists()) if path.is_dir() else []

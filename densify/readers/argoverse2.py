@@ -35,16 +35,16 @@ from densify.config.file_content import read_bytes
 from densify.geometry.poses import inverse
 from densify.geometry.types import Boxes, Camera, Float
 from densify.readers.arrow_columns import read_feather
-from densify.readers.boxes import checked_boxes
 from densify.readers.file_sequence import (
     FileSequence,
     Returns,
+    checked_boxes,
     chosen_scene,
+    numbered_files,
     quaternion_pose,
     scanner_axes,
     truth_beside,
 )
-from densify.readers.files import numbered_files
 from densify.readers.pose_track import PoseTrack
 
 POSES = "city_SE3_egovehicle.feather"

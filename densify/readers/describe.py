@@ -9,8 +9,7 @@ import numpy as np
 
 from densify.config.errors import InputError
 from densify.geometry.types import Int, LidarSequence, SaysWhatItFound, Sweep
-from densify.readers.files import format_frames
-from densify.readers.timeline import Timeline
+from densify.readers.timeline import Timeline, format_frames
 
 _MOST_NAMED = 3  # sweeps that cannot be used, each with its reason
 

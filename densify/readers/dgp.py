@@ -33,11 +33,10 @@ from typing import Any
 import numpy as np
 
 from densify.config.errors import InputError
-from densify.config.file_content import read_bytes
-from densify.config.text_files import read_json
+from densify.config.file_content import read_bytes, read_json
 from densify.geometry import poses
 from densify.geometry.types import Camera, Float
-from densify.readers.array_files import read_arrays
+from densify.readers.decoded_files import read_arrays
 from densify.readers.file_sequence import (
     FileSequence,
     Returns,

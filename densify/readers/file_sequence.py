@@ -2,9 +2,8 @@
 """What readers of recorded files share: a sequence that checks what is asked for and what is read.
 
 A reader derives from `FileSequence`, says in ``__init__`` what there is, and reads one sweep's
-returns, one image's bytes and one pose at a time. Everything a caller can ask for wrongly (a frame,
-camera or image that does not exist) and everything a file can hold wrongly (no valid returns, no
-image, another size, a pose that is no rigid motion) is refused here, in one sentence.
+returns, one image and one pose at a time. Requests for a frame, camera or image that does not exist
+and files that hold no valid returns, an image of another size or no rigid motion are refused here.
 """
 
 from __future__ import annotations
@@ -13,13 +12,18 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from densify.config.errors import InputError
-from densify.geometry.types import Camera, Float, Float32, Int, Sweep, Truth
-from densify.readers.files import camera_named, decoded_image, of_frame
+from densify.config.file_content import read_bytes
+from densify.geometry.types import Boxes, Camera, Float, Float32, Int, Sweep, Truth
+from densify.readers.decoded_files import decode_image
+from densify.readers.timeline import format_frames
+
+T = TypeVar("T")
 
 _ORTHONORMAL_TOLERANCE = 1e-3  # text files carry seven digits, float32 files as many
 
@@ -29,12 +33,11 @@ class Returns:
     """The N rows of a sweep's file, each as it was measured, none left out.
 
     points: (N,3) metres, lidar frame, each at its own firing time. intensity: (N,) 0 to 1, None if
-    there is none. offset_ns: (N,) int64 since the sweep's reference time, None where the data
-    cannot tell. lidar: (N,) uint8, which of several scanners fired, None if there is one.
-    scanner_origins: (S,3) metres, lidar frame, None where all rays start at the frame's origin.
-    R_scanner_lidar: (S,3,3) from the lidar frame's axes to each scanner's, z upwards along the one
-    it spins about, None where they are the frame's. radial_velocity_m_s: (N,) float32, relative to
-    the scanner and away from it, None if it was not measured.
+    there is none. offset_ns: (N,) int64 since the sweep's reference time, None if unknown. lidar:
+    (N,) uint8, which of several scanners fired, None if there is one. scanner_origins: (S,3)
+    metres, lidar frame, None where all rays start at the frame's origin. R_scanner_lidar: (S,3,3)
+    from the lidar frame's axes to each scanner's, z along the axis it spins about, None where they
+    are the frame's. radial_velocity_m_s: (N,) float32, away from the scanner, None if not measured.
     """
 
     points: Float
@@ -52,7 +55,8 @@ class FileSequence(ABC):
     name: for people and outputs. where: the recording's place, for messages. frames: numbers of the
     sweeps that exist, ascending. cameras: by name. exposed_ns: of each camera, when its images that
     exist were exposed, by image number. truth: exact truth where there is some. files: of the
-    sweeps, where each has one of its own.
+    sweeps, where each has one of its own. images: PNG or JPEG files by camera and image number;
+    a reader without them overrides `_encoded_image`.
     """
 
     def __init__(
@@ -64,6 +68,7 @@ class FileSequence(ABC):
         exposed_ns: Mapping[str, Mapping[int, int]] | None = None,
         truth: Truth | None = None,
         files: Mapping[int, Path] | None = None,
+        images: Mapping[str, Mapping[int, Path]] | None = None,
     ) -> None:
         self.name = name
         self.where = where
@@ -73,38 +78,40 @@ class FileSequence(ABC):
         self._frames = frozenset(frames)
         self._exposed_ns = exposed_ns or {}
         self._files = files or {}
+        self._image_files = images or {}
 
     @abstractmethod
     def stamp_ns(self, frame: int) -> int:
-        """Reference time of a sweep, without reading its points."""
+        """Return the reference time of a sweep without reading its points."""
 
     @abstractmethod
     def _returns(self, frame: int) -> tuple[Path, Returns]:
-        """The rows of an existing sweep, and the file for messages."""
+        """Return the rows of an existing sweep, and the file for messages."""
 
     def sweep_bytes(self) -> dict[int, int]:
         """See `KnowsFiles`; empty where sweeps share files."""
         return {frame: path.stat().st_size for frame, path in self._files.items()}
 
     def _image(self, camera: Camera, number: int) -> NDArray[np.uint8]:
-        """(H,W,3) RGB of an existing image."""
+        """Return the (H,W,3) RGB of an existing image."""
         path, data = self._encoded_image(camera.name, number)
         return decoded_image(data, camera, path)
 
     def _encoded_image(self, camera: str, number: int) -> tuple[Path, bytes]:
-        """A PNG or JPEG file's bytes of an existing image, and the file for messages."""
-        raise InputError(f"{self.where}: holds no images of {camera}")
+        """Return the file of an existing image, for messages, and its bytes."""
+        path = self._image_files[camera][number]
+        return path, read_bytes(path)
 
     def _pose(self, frame: int) -> Float:
-        """(4,4) T_world_lidar of an existing sweep."""
+        """Return the (4,4) T_world_lidar of an existing sweep."""
         raise InputError(
             f"{self.where}: no poses; let the sweeps register themselves with "
             f"--set register.source=kiss-icp"
         )
 
     def __getitem__(self, frame: int) -> Sweep:
-        """The sweep's valid returns, in file order: rows that are not finite or lie at the frame's
-        origin (many formats pad with zeros) are dropped.
+        """Return the sweep's valid returns in file order. Rows that are not finite or lie at the
+        frame's origin (many formats pad with zeros) are dropped.
 
         Raises InputError if the frame does not exist, or its file is damaged or holds no returns.
         """
@@ -118,27 +125,18 @@ class FileSequence(ABC):
                 f"{path}: holds no points (frame {frame}: {len(returns.points)} rows, none valid); "
                 f"choose a key or window without this frame"
             )
-        intensity = returns.intensity
-        lidar = returns.lidar
+        intensity, lidar = _rows(returns.intensity, row), _rows(returns.lidar, row)
         return Sweep(
             frame=int(frame),
             stamp_ns=self.stamp_ns(frame),
             points=np.asarray(returns.points.take(row, axis=0), np.float64),
-            intensity=(
-                np.zeros(len(row), np.float32)
-                if intensity is None
-                else np.asarray(intensity[row], np.float32)
-            ),
-            offset_ns=None if returns.offset_ns is None else returns.offset_ns[row],
-            lidar=(
-                np.zeros(len(row), np.uint8) if lidar is None else np.asarray(lidar[row], np.uint8)
-            ),
+            intensity=np.asarray(np.zeros(len(row)) if intensity is None else intensity, "f4"),
+            offset_ns=_rows(returns.offset_ns, row),
+            lidar=np.asarray(np.zeros(len(row)) if lidar is None else lidar, np.uint8),
             row=row.astype(np.int64, copy=False),
             scanner_origins=returns.scanner_origins,
             R_scanner_lidar=returns.R_scanner_lidar,
-            radial_velocity_m_s=(
-                None if returns.radial_velocity_m_s is None else returns.radial_velocity_m_s[row]
-            ),
+            radial_velocity_m_s=_rows(returns.radial_velocity_m_s, row),
         )
 
     def num_rows(self, frame: int) -> int:
@@ -147,36 +145,97 @@ class FileSequence(ABC):
         return len(self._returns(frame)[1].points)
 
     def image_stamps_ns(self, camera: str) -> Mapping[int, int]:
-        """When each image that exists was exposed, by its number."""
+        """Return when each image that exists was exposed, by its number."""
         camera_named(self.cameras, camera, self.where)
         return self._exposed_ns.get(camera, {})
 
     def image(self, camera: str, number: int) -> NDArray[np.uint8]:
-        """(H,W,3) RGB. Raises InputError for an unknown camera, a missing or unfit image."""
+        """Return (H,W,3) RGB. Raises InputError for an unknown camera, a missing or unfit image."""
         calibrated = self.check_image(camera, number)
         return self._image(calibrated, number)
 
     def T_world_lidar(self, frame: int) -> Float:
-        """(4,4) the data set's own pose at the sweep's reference time. Raises InputError if there
-        is none, or it is no rigid motion."""
+        """Return the data set's own (4,4) pose at the sweep's reference time. Raises InputError if
+        there is none, or it is no rigid motion."""
         self.check_frame(frame)
         return rigid(self._pose(frame), f"{self.where}: pose of frame {frame}")
 
     def check_frame(self, frame: int) -> None:
-        """Raises InputError, which names the frames that exist, for one that does not."""
+        """Raise InputError, which names the frames that exist, for one that does not."""
         if frame not in self._frames:
             of_frame(dict.fromkeys(self.frames), frame, "sweep", self.where)
 
     def check_image(self, camera: str, number: int) -> Camera:
-        """The camera. Raises InputError, which names those that exist, for a camera or an image
-        that does not."""
+        """Return the camera. Raises InputError, which names those that exist, for a camera or an
+        image that does not."""
         calibrated = camera_named(self.cameras, camera, self.where)
         of_frame(self._exposed_ns.get(camera, {}), number, f"{camera} image", self.where)
         return calibrated
 
 
+def _rows(column: NDArray[Any] | None, row: Int) -> NDArray[Any] | None:
+    return None if column is None else column[row]
+
+
+def numbered_files(folder: Path, *suffixes: str) -> dict[int, Path]:
+    """Return the files of a folder that are named by a frame number, by ascending frame. Empty if
+    there is no such folder.
+
+    suffixes: those accepted, with the dot and in lower case.
+    """
+    if not folder.is_dir():
+        return {}
+    found = {
+        int(path.stem): path
+        for path in folder.iterdir()
+        if path.stem.isdecimal() and path.suffix.lower() in suffixes
+    }
+    return dict(sorted(found.items()))
+
+
+def of_frame(entries: Mapping[int, T], frame: int, what: str, where: Path) -> T:
+    """Return the entry of a frame, or raise InputError that names the frames that exist.
+
+    what, where: for the message, such as ``"sweep"`` and the recording's folder.
+    """
+    if frame not in entries:
+        raise InputError(
+            f"{where}: no {what} of frame {frame}; frames that exist: {format_frames(entries)}"
+        )
+    return entries[frame]
+
+
+def camera_named(cameras: Mapping[str, Camera], name: str, where: Path) -> Camera:
+    """Return the camera, or raise InputError that names those that exist."""
+    if name not in cameras:
+        raise InputError(
+            f"{where}: no camera {name!r}; cameras that exist: {', '.join(cameras) or 'none'}"
+        )
+    return cameras[name]
+
+
+def decoded_image(data: bytes, camera: Camera, where: Path) -> NDArray[np.uint8]:
+    """Return (H,W,3) uint8 RGB of an image file's bytes, gray in three equal channels.
+
+    Raises InputError, which names the place, if it is no whole image or not of the camera's size.
+    """
+    bgr = decode_image(data, where)
+    check_image_size(bgr.shape, camera, where)
+    return np.ascontiguousarray(bgr[:, :, ::-1], dtype=np.uint8)
+
+
+def check_image_size(shape: tuple[int, ...], camera: Camera, where: Path | str) -> None:
+    """Raise InputError if an image (H,W,...) is not of the camera's size."""
+    height, width = shape[:2]
+    if (width, height) != (camera.width_px, camera.height_px):
+        raise InputError(
+            f"{where}: got an image of {width} x {height} px; expected "
+            f"{camera.width_px} x {camera.height_px}, as the calibration of {camera.name} says"
+        )
+
+
 def chosen_scene(reader: str, path: Path, scene: str | None, names: Sequence[str]) -> str:
-    """Which of the recordings of one place is meant: the one named, or the only one.
+    """Return which recording of a place is meant: the one named, or the only one.
 
     Raises InputError, which lists them, if that does not tell.
     """
@@ -192,12 +251,12 @@ def chosen_scene(reader: str, path: Path, scene: str | None, names: Sequence[str
 
 
 def truth_beside(recording: Path) -> Truth | None:
-    """Exact truth, in the folder ``truth`` of a simulated recording."""
+    """Return the exact truth in the folder ``truth`` of a simulated recording."""
     if not (recording / "truth").is_dir():
         return None
     from densify.readers.truth_files import FileTruth
 
-    return FileTruth.open(recording / "truth")
+    return FileTruth(recording / "truth")
 
 
 def rigid(T: Float, where: str) -> Float:
@@ -208,19 +267,25 @@ def rigid(T: Float, where: str) -> Float:
         raise InputError(f"{where}: got a matrix of shape {T.shape}, expected (4, 4)")
     if not np.isfinite(T).all():
         raise InputError(f"{where}: got a value that is not finite, expected a rigid motion")
-    R = T[:3, :3]
+    check_rotation(T[:3, :3], where)
+    return np.vstack([T[:3], [0.0, 0.0, 0.0, 1.0]])
+
+
+def check_rotation(R: Float, where: str) -> Float:
+    """Return the (3,3) matrix. Raises InputError, which starts with ``where``, if it is no
+    rotation."""
     error = np.abs(R @ R.T - np.eye(3)).max()
     if error > _ORTHONORMAL_TOLERANCE or np.linalg.det(R) < 0:
         raise InputError(
             f"{where}: got a matrix that is not a rotation (R Rᵀ is off by {error:.2g}, "
             f"determinant {np.linalg.det(R):.3f}), expected an orthonormal one"
         )
-    return np.vstack([T[:3], [0.0, 0.0, 0.0, 1.0]])
+    return R
 
 
 def scanner_axes(T_lidar_scanner: Float) -> Float:
-    """(S,4,4) how scanners are mounted -> (S,3,3) `Returns.R_scanner_lidar`: one that hangs upside
-    down is turned about its x axis, so that z is upwards."""
+    """(S,4,4) mounting poses of scanners -> (S,3,3) `Returns.R_scanner_lidar`. A scanner that hangs
+    upside down is turned about its x axis, so that z points upwards."""
     R = T_lidar_scanner[:, :3, :3]
     upright = np.where(R[:, 2:, 2:] < 0, R * [1.0, -1.0, -1.0], R)
     return np.ascontiguousarray(upright.transpose(0, 2, 1))
@@ -229,9 +294,9 @@ def scanner_axes(T_lidar_scanner: Float) -> Float:
 def quaternion_pose(
     w_x_y_z: Sequence[float] | Float, translation_m: Sequence[float] | Float, where: str
 ) -> Float:
-    """(4,4) of a unit quaternion and a translation. Raises InputError, which starts with ``where``,
-    unless there are four and three finite numbers and the quaternion's length is 1 to a hundredth
-    (it is made 1 exactly)."""
+    """Return the (4,4) pose of a unit quaternion and a translation. Raises InputError, which starts
+    with ``where``, unless there are four and three finite numbers and the quaternion's length is 1
+    to 0.01 (it is made 1 exactly)."""
     from scipy.spatial.transform import Rotation
 
     try:
@@ -255,3 +320,37 @@ def quaternion_pose(
     T[:3, :3] = Rotation.from_quat(quaternion[[1, 2, 3, 0]]).as_matrix()
     T[:3, 3] = translation
     return T
+
+
+def upright_poses(centre_m: Float, heading_rad: Float) -> Float:
+    """Return the (K,4,4) poses of boxes whose z axis is the frame's.
+
+    centre_m: (K,3). heading_rad: (K,) of the boxes' fronts, from x towards y.
+    """
+    T = np.tile(np.eye(4), (len(centre_m), 1, 1))
+    c, s = np.cos(heading_rad), np.sin(heading_rad)
+    T[:, 0, 0], T[:, 0, 1], T[:, 1, 0], T[:, 1, 1] = c, -s, s, c
+    T[:, :3, 3] = centre_m
+    return T
+
+
+def checked_boxes(
+    track: Sequence[str] | NDArray[Any],
+    T_lidar_box: Float | Sequence[Float],
+    size_m: Float,
+    where: str,
+    lidar: Int | None = None,
+) -> Boxes:
+    """Return boxes as they were read. Raises InputError, which starts with ``where``, for a box
+    that has no size, or is there twice."""
+    bad = np.flatnonzero(~((size_m > 0) & (size_m < np.inf)).all(axis=1))
+    if len(bad):
+        raise InputError(
+            f"{where}: a box has no size: got {size_m[bad[0]].tolist()}, expected length, width "
+            f"and height in metres above 0"
+        )
+    names = np.array(track, np.str_)
+    found, times = np.unique(names[names != ""], return_counts=True)
+    if (times > 1).any():
+        raise InputError(f"{where}: the box {found[times > 1][0]} is there twice, expected once")
+    return Boxes(names, np.reshape(T_lidar_box, (-1, 4, 4)), size_m.reshape(-1, 3), lidar=lidar)

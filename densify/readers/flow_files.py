@@ -29,7 +29,7 @@ from densify.flow.chained import ChainedMotion
 from densify.flow.engines import Scene
 from densify.geometry import poses
 from densify.geometry.types import FlowField, Motion, Stretch
-from densify.readers.array_files import read_arrays
+from densify.readers.decoded_files import read_arrays
 
 MOVES_M = 0.05
 FARTHEST_M = 1000.0

@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 
 from densify.config.errors import InputError
-from densify.config.text_files import read_json
+from densify.config.file_content import read_json
 from densify.geometry.types import Float32
 from densify.readers.extras import needed
 from densify.readers.file_sequence import FileSequence, Returns

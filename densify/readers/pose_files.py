@@ -12,7 +12,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from densify.config.errors import InputError
-from densify.config.text_files import read_text
+from densify.config.file_content import read_text
 from densify.geometry.types import Float
 from densify.readers.file_sequence import rigid
 from densify.readers.pose_track import PoseTrack

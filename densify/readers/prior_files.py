@@ -26,10 +26,9 @@ from numpy.typing import NDArray
 from densify.config.errors import InputError
 from densify.config.file_content import open_file, reason
 from densify.geometry.types import Bool, Camera, Float32, Prior
-from densify.readers.array_files import read_array
+from densify.readers.decoded_files import check_pixels, read_array, read_image
 from densify.readers.extras import needed
-from densify.readers.files import format_frames
-from densify.readers.image_files import check_pixels, read_image
+from densify.readers.timeline import format_frames
 
 _SUFFIXES = (".npy", ".exr", ".png")  # the finest first
 _STEM = re.compile(r"(\d+)(?:[_-](?:depth|disp|disparity|pred|prior))?", re.IGNORECASE)

@@ -13,8 +13,8 @@ from typing import NamedTuple
 import numpy as np
 
 from densify.config.errors import InputError
-from densify.config.text_files import read_text
-from densify.readers.points.fields import UNIT_NS
+from densify.config.file_content import read_text
+from densify.readers.point_fields import UNIT_NS
 
 _EPOCH_S = (946_684_800, 4_102_444_800)  # what counts as a time since 1970: the years 2000 to 2099
 _STEP_S = (0.002, 3.9)  # from sweep to sweep, or image to image

@@ -28,7 +28,7 @@ from densify.config.errors import InputError
 from densify.config.user_folder import own_folder
 from densify.geometry.threads import num_threads
 from densify.geometry.types import Bool, Camera, Float, Float32, Sweep, SweepTruth
-from densify.readers.array_files import read_arrays
+from densify.readers.decoded_files import read_arrays
 from densify.street.cameras import CAMERAS, USUAL, Picture, cameras_beside
 from densify.street.lidar import Returns
 from densify.street.scenes import PRESETS

@@ -8,7 +8,7 @@ every second file is missing is one of half the rate.
 from __future__ import annotations
 
 from bisect import bisect_left
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
@@ -17,9 +17,9 @@ import numpy as np
 
 from densify.config.errors import InputError
 from densify.geometry.types import Int, LidarSequence
-from densify.readers.files import format_frames
 
 _HOLE_PERIODS = 3.1  # three periods and some jitter
+_MOST_RANGES = 8
 _NOMINAL_PERIOD_NS = 100_000_000  # of a recording of one sweep
 
 
@@ -29,6 +29,25 @@ class WindowFrames(NamedTuple):
 
     frames: tuple[int, ...]
     cuts: tuple[str, ...]
+
+
+def runs(frames: Iterable[int]) -> list[range]:
+    """Cut ascending frames where a number is missing."""
+    found: list[range] = []
+    for frame in frames:
+        if found and frame == found[-1].stop:
+            found[-1] = range(found[-1].start, frame + 1)
+        else:
+            found.append(range(frame, frame + 1))
+    return found
+
+
+def format_frames(frames: Iterable[int]) -> str:
+    """Write frame numbers for people: ``96-135, 140``; long lists are cut in the middle."""
+    texts = [f"{run[0]}-{run[-1]}" if len(run) > 1 else f"{run[0]}" for run in runs(sorted(frames))]
+    if len(texts) > _MOST_RANGES:
+        texts = [*texts[: _MOST_RANGES - 1], "...", texts[-1]]
+    return ", ".join(texts) if texts else "none"
 
 
 def check_window(window: int) -> None:

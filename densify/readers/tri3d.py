@@ -40,8 +40,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from densify.config.errors import InputError
-from densify.config.file_content import read_bytes
-from densify.config.text_files import read_json
+from densify.config.file_content import read_bytes, read_json
 from densify.geometry.types import Camera, Float, Int
 from densify.readers.extras import needed
 from densify.readers.file_sequence import FileSequence, Returns, chosen_scene, rigid

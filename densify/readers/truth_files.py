@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from densify.config.errors import InputError
 from densify.geometry.types import Bool, Float, Float32, SweepTruth
-from densify.readers.array_files import read_arrays
+from densify.readers.decoded_files import read_arrays
 from densify.street.simulator import Bodies
 
 

@@ -153,7 +153,7 @@ def _written(result: Result, options: argparse.Namespace, config: Config) -> lis
 
 def _keys_of(sequence: LidarSequence, options: argparse.Namespace) -> list[int]:
     """``--key`` and ``--keys`` together, ascending."""
-    from densify.readers.files import format_frames
+    from densify.readers.timeline import format_frames
 
     frames = frozenset(sequence.frames)
     wanted = {*options.key}

@@ -1,76 +1,59 @@
 # SPDX-License-Identifier: MIT
-"""The outputs: each writes some of the files of one densified key.
-
-To add one, write a module with the function that `densify.outputs.store.OutputModule` describes and
-one row here. In a package of your own an entry point in the group ``densify.outputs`` takes the
-row's place, and ``OWNED`` of the module says what the row's ``owned`` says; it is written where
-``output.also`` names it.
-"""
+"""The outputs, each of which writes some files of one key. Each has the function
+`densify.outputs.store.OutputModule`; the module of another package also has OWNED."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from types import ModuleType
 
 from densify.config.errors import InputError
-from densify.config.plugins.table import Table
+from densify.config.plugins.table import Row, Table
 
 
 @dataclass(frozen=True)
-class Output:
-    """owned: the files and folders in the key's folder that it may write, nobody else's."""
+class Output(Row):
+    """owned: the files and folders in the key's folder that it alone may write."""
 
-    name: str
-    module: str
-    owned: tuple[str, ...]
-
-    @property
-    def usage(self) -> str:
-        """How ``output.also`` names it."""
-        return self.name
+    owned: tuple[str, ...] = ()
 
 
-def _row(name: str, module: ModuleType, version: str) -> Output:
-    return Output(name, module.__name__, tuple(getattr(module, "OWNED", ())))
+def _built_in(name: str, *owned: str, module: str = "") -> Output:
+    return Output(name, module or f"densify.outputs.{name}", owned=owned)
 
 
 OUTPUTS = Table(
-    kind="output",
-    group="densify.outputs",
-    built_in=(
-        Output(
-            "depth",
-            "densify.outputs.depth_maps",
-            owned=("depth", "depth_filled", "confidence", "age"),
-        ),
-        Output("full", "densify.outputs.full_maps", owned=("depth_full", "confidence_full")),
-        Output("flow", "densify.outputs.flow_npz", owned=("flow",)),
-        Output("movers", "densify.outputs.movers", owned=("movers",)),
-        Output("tracks", "densify.outputs.tracks", owned=("movers.json",)),
-        Output("optical_flow", "densify.outputs.optical_flow", owned=("optical_flow",)),
-        Output("rejected", "densify.outputs.rejected", owned=("rejected",)),
-        Output("cloud", "densify.outputs.cloud_laz", owned=("cloud.laz",)),
-        Output("scene", "densify.outputs.scene", owned=("scene",)),
-        Output("metrics", "densify.outputs.metrics", owned=("metrics.json",)),
-        Output("figure", "densify.outputs.figure", owned=("figure.png",)),
-        Output("curve", "densify.outputs.curve", owned=("curve.png",)),
-        Output("run", "densify.outputs.run_yaml", owned=("run.yaml",)),
+    "output",
+    "densify.outputs",
+    ("write_output",),
+    (
+        _built_in("depth", "depth", "depth_filled", "confidence", "age",
+                  module="densify.outputs.depth_maps"),
+        _built_in("full", "depth_full", "confidence_full", module="densify.outputs.full_maps"),
+        _built_in("flow", "flow", module="densify.outputs.flow_npz"),
+        _built_in("movers", "movers"),
+        _built_in("tracks", "movers.json"),
+        _built_in("optical_flow", "optical_flow"),
+        _built_in("rejected", "rejected"),
+        _built_in("cloud", "cloud.laz", module="densify.outputs.cloud_laz"),
+        _built_in("scene", "scene"),
+        _built_in("metrics", "metrics.json"),
+        _built_in("figure", "figure.png"),
+        _built_in("curve", "curve.png"),
+        _built_in("run", "run.yaml", module="densify.outputs.run_yaml"),
         # Last, for it reads what the others wrote.
-        Output("report", "densify.dataset.report", owned=("report.html",)),
+        _built_in("report", "report.html", module="densify.dataset.report"),
     ),
-    members=("write_output",),
-    row_of=_row,
-)
+)  # fmt: skip
 
 
 def check_also(also: str) -> None:
-    """Raise InputError unless ``also`` names outputs, parted by commas. Imports none."""
+    """Raise InputError unless ``also`` is a list of outputs, parted by commas. Imports none."""
     for name in _names(also):
         OUTPUTS.require(name, "output.also")
 
 
 def chosen(also: str) -> list[Output]:
-    """The built-in outputs, then those that ``also`` names; imports these.
+    """Return the built-in outputs, then those that ``also`` names, which are imported.
 
     Raises InputError for a name that is none, and for outputs that own the same file.
     """
@@ -82,7 +65,7 @@ def chosen(also: str) -> list[Output]:
         if not row.owned:
             raise InputError(f"output {name}: {row.module} says no OWNED; mend its package")
         for other in rows:
-            if both := sorted(set(row.owned) & set(other.owned)):
+            if both := sorted({*row.owned} & {*other.owned}):
                 raise InputError(
                     f"output.also: {name} would write {', '.join(both)} of the output "
                     f"{other.name}; leave one of them out"

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""A table of modules with one interface: the built-in ones, and those of other people's packages.
+"""Tables of plug-ins: the built-in ones, and those that other packages add by entry points.
 
-A package adds a row by an entry point: the name is the row's, the value is a module::
+The entry point's name is the plug-in's, its value a module::
 
     [project.entry-points."densify.readers"]
     npy = "densify_npy.reader"
@@ -9,79 +9,89 @@ A package adds a row by an entry point: the name is the row's, the value is a mo
 
 from __future__ import annotations
 
+import difflib
 import traceback
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, fields
 from importlib import import_module
 from types import ModuleType
-from typing import TYPE_CHECKING, Generic, Protocol, TypeVar
+from typing import TYPE_CHECKING, Generic, TypeVar
 
 from densify.config.errors import InputError
 
 if TYPE_CHECKING:
     from importlib.metadata import EntryPoint
 
+_LOADED: dict[str, str] = {}  # outermost module of another package -> what it is, for messages
 
-class Row(Protocol):
-    """name: as users write it. module: import path of the module that does the work."""
 
-    @property
-    def name(self) -> str: ...
+@dataclass(frozen=True)
+class Row:
+    """One plug-in. The fields that kinds of plug-in add are read from the attributes of another
+    package's module: ``owned`` from OWNED, a function from its own name.
 
-    @property
-    def module(self) -> str: ...
+    name: as users write it. module: import path. about: a sentence for the help. version: of the
+    other package, "" if built in.
+    """
+
+    name: str
+    module: str
+    about: str = ""
+    version: str = ""
 
     @property
     def usage(self) -> str:
-        """How users write it, what may follow the name included."""
-        ...
+        """How users write it."""
+        return self.name
 
 
 R = TypeVar("R", bound=Row)
-_LOADED: dict[str, str] = {}  # other people's modules, by the name of the outermost: what they are
+
+
+def did_you_mean(name: str, known: Iterable[str]) -> str:
+    """Return "did you mean X? " for the known name that is like this one, "" if none is."""
+    close = difflib.get_close_matches(name, [*known], n=1)
+    return f"did you mean {close[0]}? " if close else ""
 
 
 def owner_of(error: BaseException) -> str:
-    """Which row of another package an exception went through, "" if none."""
+    """Return the plug-in of another package that an exception went through, "" if none."""
     for frame, _ in traceback.walk_tb(error.__traceback__):
-        module = str(frame.f_globals.get("__name__"))
-        if (found := module.partition(".")[0]) in _LOADED:
-            return _LOADED[found]
+        module = str(frame.f_globals.get("__name__")).partition(".")[0]
+        if module in _LOADED:
+            return _LOADED[module]
     return ""
 
 
 @dataclass(frozen=True)
 class Table(Generic[R]):
-    """kind: what a row is, for messages. group: of the entry points. members: functions that every
-    module must have. row_of: name, module and version of another package -> row."""
+    """kind: for messages. group: of the entry points. members: functions that each module has."""
 
     kind: str
     group: str
-    built_in: tuple[R, ...]
     members: tuple[str, ...]
-    row_of: Callable[[str, ModuleType, str], R]
+    built_in: tuple[R, ...]
 
-    def usages(self) -> list[str]:
-        """How the rows are written: the built-in ones, then other packages' names, sorted."""
-        return [row.usage for row in self.built_in] + sorted(self._added())
+    def names(self) -> list[str]:
+        """Return the built-in names, then those of other packages."""
+        return [row.name for row in self.built_in] + sorted(self._added())
 
     def __contains__(self, name: str) -> bool:
-        return self._is_built_in(name) or name in self._added()
+        return name in self.names()
 
     def require(self, name: str, where: str) -> None:
-        """Raise InputError unless there is such a row. Imports nothing.
-
-        where: what the name was given to, for the message.
-        """
+        """Raise InputError, which begins with ``where``, unless there is such a plug-in. Imports
+        none."""
         if name not in self:
+            usages = [row.usage for row in self.built_in] + sorted(self._added())
             raise InputError(
-                f"{where}: got {name!r}, expected one of {', '.join(self.usages())} (others come "
-                f"with packages that have an entry point in {self.group})"
+                f"{where}: got {name!r}, {did_you_mean(name, self.names())}expected one of "
+                f"{', '.join(usages)} (packages add others by entry points in {self.group})"
             )
 
     def row(self, name: str, where: str) -> R:
-        """The row of that name. Imports the module of another package. Raises InputError if there
-        is none, several packages have one, or the package is broken."""
+        """Return the row of that name; imports the module of another package. Raises InputError if
+        there is none, two packages bring one, or the package is broken."""
         self.require(name, where)
         for row in self.built_in:
             if row.name == name:
@@ -89,50 +99,53 @@ class Table(Generic[R]):
         return self._load(name, self._added()[name])
 
     def __iter__(self) -> Iterator[R]:
-        """The built-in rows, then those of other packages, each imported when its turn comes."""
+        """Yield the built-in rows, then those of other packages, imported one by one."""
         yield from self.built_in
         for name, points in sorted(self._added().items()):
             yield self._load(name, points)
 
     def module(self, row: R) -> ModuleType:
-        """That does the work; imported when asked for."""
+        """Import the module that does the work."""
         return import_module(row.module)
 
-    def _is_built_in(self, name: str) -> bool:
-        return any(row.name == name for row in self.built_in)
-
     def _added(self) -> dict[str, list[EntryPoint]]:
-        """Entry points of other packages by name; no built-in row can be replaced."""
+        """Return the entry points of other packages by name, without the built-in names."""
         from importlib.metadata import entry_points
 
         found: dict[str, list[EntryPoint]] = {}
+        built_in = {row.name for row in self.built_in}
         for point in entry_points(group=self.group):
-            if not self._is_built_in(point.name) and point not in found.get(point.name, []):
+            if point.name not in built_in and point not in found.get(point.name, []):
                 found.setdefault(point.name, []).append(point)
         return found
 
     def _load(self, name: str, points: list[EntryPoint]) -> R:
-        packages = " and ".join(
-            sorted({point.dist.name if point.dist else "?" for point in points})
-        )
+        packages = " and ".join(sorted({p.dist.name if p.dist else "?" for p in points}))
         if len(points) > 1:
             raise InputError(
                 f"{self.kind} {name}: comes with the packages {packages}; uninstall all but one"
             )
-        what = f"{self.kind} {name} of the package {packages}"
+        what, point = f"{self.kind} {name} of the package {packages}", points[0]
         try:
-            module = points[0].load()
-        except Exception as error:  # whatever a stranger's import raises
-            reason = " ".join(f"{type(error).__name__}: {error}".split())
+            module = point.load()
+        except Exception as error:  # an import raises anything
             raise InputError(
-                f"{what}: cannot be imported from {points[0].value} ({reason}); mend or uninstall "
-                f"the package"
+                f"{what}: cannot be imported from {point.value} ({type(error).__name__}: {error}); "
+                f"mend or uninstall the package"
             ) from error
-        missing = [m for m in self.members if not callable(getattr(module, m, None))]
-        if missing or not isinstance(module, ModuleType):
+        if not all(callable(getattr(module, m, None)) for m in self.members):
             raise InputError(
-                f"{what}: {points[0].value} is no module with {', '.join(self.members)}; mend or "
+                f"{what}: {point.value} is no module with {', '.join(self.members)}; mend or "
                 f"uninstall the package"
             )
         _LOADED[module.__name__.partition(".")[0]] = what
-        return self.row_of(name, module, points[0].dist.version if points[0].dist else "")
+        row_type = type(self.built_in[0])
+        own = {f.name for f in fields(row_type)} - {f.name for f in fields(Row)}
+        values = {n: getattr(module, n, getattr(module, n.upper(), None)) for n in own}
+        return row_type(
+            name,
+            module.__name__,
+            (module.__doc__ or "").strip().partition("\n")[0],
+            point.dist.version if point.dist else "",
+            **{n: value for n, value in values.items() if value is not None},
+        )

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from densify.config.errors import InputError, brief
-from densify.config.text_files import read_json
+from densify.config.file_content import read_json
 from densify.geometry.types import Float
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from densify.config.errors import InputError
-from densify.config.text_files import read_json, read_yaml
+from densify.config.file_content import read_json, read_yaml
 from densify.geometry.types import Bool, CameraView, ObjectTrack
 from densify.outputs.cloud_laz import StoredCloud, read_cloud
 from densify.outputs.depth_png import read_stored, stored_age, stored_confidence

@@ -8,14 +8,13 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from densify.config.errors import InputError
-from densify.config.file_content import read_bytes
-from densify.config.text_files import read_yaml
+from densify.config.file_content import read_bytes, read_yaml
 from densify.outputs.atomic import write_file
 from densify.outputs.export.finished_run import FinishedRun
 from densify.outputs.export.pictures import jpeg_of
 from densify.outputs.kitti_tree import drive_folder, split_of
 from densify.outputs.png import encode_png
-from densify.readers.image_files import decode_image
+from densify.readers.decoded_files import decode_image
 
 _TREE = {
     "groundtruth": "depth",

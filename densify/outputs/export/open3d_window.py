@@ -26,8 +26,8 @@ from densify.outputs.export.finished_run import FinishedRun
 from densify.outputs.export.timeline import Shot, SweepShown, Timeline, timelines
 from densify.outputs.figure import draw_figure
 from densify.outputs.png import Picture
+from densify.readers.decoded_files import decode_image
 from densify.readers.extras import needed
-from densify.readers.image_files import decode_image
 
 LAYERS = ("standing", "moving", "trails", "sweep", "movers", "cameras")
 PICTURES = ("image", "measured", "filled")

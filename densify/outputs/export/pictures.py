@@ -15,7 +15,7 @@ from densify.geometry.types import Camera, CameraView
 from densify.outputs.atomic import write_file
 from densify.outputs.cloud_laz import StoredCloud
 from densify.outputs.export.finished_run import FinishedRun
-from densify.readers.image_files import decode_image
+from densify.readers.decoded_files import decode_image
 
 _NAMES = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 _FISHEYE_NAMES = ("k1", "k2", "k3", "k4")

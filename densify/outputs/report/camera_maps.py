@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from densify.outputs.png import encode_jpeg
 from densify.outputs.report.pack import Blobs, smallest
-from densify.readers.image_files import decode_image
+from densify.readers.decoded_files import decode_image
 
 Maps = Mapping[str, NDArray[Any]]
 

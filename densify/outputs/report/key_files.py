@@ -12,13 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from densify.config.errors import InputError
-from densify.config.file_content import read_bytes
-from densify.config.text_files import read_json, read_yaml
+from densify.config.file_content import read_bytes, read_json, read_yaml
 from densify.geometry.types import ObjectTrack
 from densify.outputs.cloud_laz import StoredCloud, read_cloud
 from densify.outputs.depth_png import read_stored
 from densify.outputs.export.tracks_file import read_tracks
-from densify.readers.image_files import decode_image
+from densify.readers.decoded_files import decode_image
 
 T = TypeVar("T")
 

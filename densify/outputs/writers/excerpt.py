@@ -15,7 +15,7 @@ from densify.config.errors import InputError
 from densify.geometry.types import Float, Int, Progress
 from densify.outputs.atomic import staged_folder
 from densify.outputs.png import encode_png
-from densify.readers.files import camera_named
+from densify.readers.file_sequence import camera_named
 from densify.readers.pose_track import PoseTrack
 from densify.readers.street import Street
 from densify.readers.truth_files import write_bodies, write_depth, write_points

@@ -25,7 +25,7 @@ from densify.geometry import poses
 from densify.geometry.types import Float, Float32, Int
 from densify.outputs.atomic import staged_folder
 from densify.outputs.writers.excerpt import Excerpt, put
-from densify.readers.files import camera_named
+from densify.readers.file_sequence import camera_named
 from densify.readers.kitti.raw import KITTI_TRIGGER_LATENCY_NS
 from densify.readers.street import Street
 from densify.readers.truth_files import write_bodies, write_depth, write_points

@@ -26,7 +26,7 @@ from densify.outputs.writers.kitti_raw import (
     projections,
     velodyne_bytes,
 )
-from densify.readers.kitti.files import NOMINAL_PERIOD_NS
+from densify.readers.kitti.calibration import NOMINAL_PERIOD_NS
 from densify.street.cameras import CAMERAS, T_RECTIFIED_LIDAR, T_level_lidar
 
 CAMERA_NAMES = ("image_02",)

@@ -15,7 +15,7 @@ from densify.config.errors import InputError
 from densify.geometry.types import Camera, Float
 from densify.readers.file_sequence import rigid
 from densify.readers.folder.yaml_sections import Section, read_sections
-from densify.readers.points.fields import REFERENCES, UNIT_NS
+from densify.readers.point_fields import REFERENCES, UNIT_NS
 
 NAME = "densify.yaml"
 _MODELS = {"pinhole": (0, 4, 5, 8, 12, 14), "fisheye": (4,), "mei": (5,)}
@@ -30,7 +30,7 @@ class SweepFiles:
     stored points to the lidar's frame, x forward, y left, z up; None leaves them. intensity,
     time, lidar, radial_velocity: which column plays that part, "" to find it by its name.
     intensity_scale: what is full brightness, 0 to find it. time_unit, absolute, reference: as
-    `densify.readers.points.fields.find_times`. stamps: ``names`` (of the files) or a file with one
+    `densify.readers.point_fields.find_times`. stamps: ``names`` (of the files) or a file with one
     time for each sweep, "" to look for them; stamps_unit: theirs. rate_hz: of sweeps without
     stamps, 0 to take it from the points' times. compensated: the points were carried to the
     stamp by the vehicle's motion. scanner_origins: (S,3) metres, None where rays start at 0 0 0.

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from densify.readers.decoded_files import image_size_px
 from densify.readers.folder.files import (
     IMAGE_SUFFIXES,
     find_images,
@@ -19,9 +20,8 @@ from densify.readers.folder.files import (
     in_time,
     sweep_folders,
 )
-from densify.readers.image_files import image_size_px
-from densify.readers.points.fields import find_fields, find_times, full_scale
-from densify.readers.points.files import read_table, unnamed
+from densify.readers.point_fields import find_fields, find_times, full_scale
+from densify.readers.point_files import read_table, unnamed
 from densify.readers.pose_files import PoseFile
 from densify.readers.stamp_files import named
 

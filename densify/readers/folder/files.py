@@ -10,7 +10,7 @@ from pathlib import Path
 
 from densify.config.errors import InputError
 from densify.readers.folder.config import NAME
-from densify.readers.points.files import SUFFIXES
+from densify.readers.point_files import SUFFIXES
 from densify.readers.stamp_files import Named, StampFile, named
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")

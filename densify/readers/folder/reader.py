@@ -42,7 +42,7 @@ from densify.readers.file_sequence import (
     quaternion_pose,
     truth_beside,
 )
-from densify.readers.files import format_frames
+from densify.readers.folder.columns import SweepColumns
 from densify.readers.folder.config import CameraFiles, FolderConfig
 from densify.readers.folder.files import (
     IMAGE_SUFFIXES,
@@ -52,10 +52,10 @@ from densify.readers.folder.files import (
     find_sweeps,
     in_time,
 )
-from densify.readers.points.columns import SweepColumns
-from densify.readers.points.files import read_viewpoint
+from densify.readers.point_files import read_viewpoint
 from densify.readers.pose_files import PoseFile
 from densify.readers.pose_track import PoseTrack
+from densify.readers.timeline import format_frames
 
 _NO_VIEWPOINT = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
 

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from densify.config.errors import InputError
-from densify.config.text_files import read_yaml
+from densify.config.file_content import read_yaml
 from densify.geometry.types import Float
 
 

@@ -26,19 +26,18 @@ from pathlib import Path
 import numpy as np
 
 from densify.config.errors import InputError
-from densify.config.file_content import read_bytes
-from densify.config.text_files import parse_yaml, read_text
+from densify.config.file_content import parse_yaml, read_bytes, read_text
 from densify.geometry import poses
 from densify.geometry.types import Camera, Float
 from densify.readers.file_sequence import (
     FileSequence,
     Returns,
     chosen_scene,
+    numbered_files,
     rigid,
     truth_beside,
 )
-from densify.readers.files import numbered_files
-from densify.readers.kitti.files import (
+from densify.readers.kitti.calibration import (
     NOMINAL_PERIOD_NS,
     Calibration,
     Stamps,

@@ -26,20 +26,20 @@ from pathlib import Path
 import numpy as np
 
 from densify.config.errors import InputError
-from densify.config.file_content import read_bytes
-from densify.config.text_files import read_text
+from densify.config.file_content import read_bytes, read_text
 from densify.geometry import poses
 from densify.geometry.types import Camera, Float
+from densify.readers.decoded_files import image_size_px
 from densify.readers.file_sequence import (
     FileSequence,
     Returns,
     chosen_scene,
+    numbered_files,
+    of_frame,
     rigid,
     truth_beside,
 )
-from densify.readers.files import numbered_files, of_frame
-from densify.readers.image_files import image_size_px
-from densify.readers.kitti.files import (
+from densify.readers.kitti.calibration import (
     NOMINAL_PERIOD_NS,
     Calibration,
     parse_numbers,

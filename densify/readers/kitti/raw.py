@@ -13,13 +13,17 @@ from pathlib import Path
 import numpy as np
 
 from densify.config.errors import InputError
-from densify.config.file_content import read_bytes
-from densify.config.text_files import read_text
+from densify.config.file_content import read_bytes, read_text
 from densify.geometry import poses
 from densify.geometry.types import Float, Int
-from densify.readers.file_sequence import FileSequence, Returns, truth_beside
-from densify.readers.files import numbered_files, of_frame
-from densify.readers.kitti.files import (
+from densify.readers.file_sequence import (
+    FileSequence,
+    Returns,
+    numbered_files,
+    of_frame,
+    truth_beside,
+)
+from densify.readers.kitti.calibration import (
     NOMINAL_PERIOD_NS,
     NUM_OXTS_VALUES,
     Calibration,

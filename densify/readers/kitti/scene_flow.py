@@ -19,8 +19,8 @@ import numpy as np
 
 from densify.config.errors import InputError
 from densify.geometry.types import Bool, Float
-from densify.readers.image_files import read_image
-from densify.readers.kitti.files import Calibration, rectified_camera
+from densify.readers.decoded_files import read_image
+from densify.readers.kitti.calibration import Calibration, rectified_camera
 
 _PER_PX, _FLOW_PER_PX, _FLOW_ZERO = 256.0, 64.0, 2**15
 _IMAGES = ("disp_occ_0", "disp_occ_1", "flow_occ")

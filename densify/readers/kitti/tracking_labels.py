@@ -18,10 +18,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from densify.config.errors import InputError
-from densify.config.text_files import read_text
+from densify.config.file_content import read_text
 from densify.geometry.types import Float, Int
-from densify.readers.boxes import checked_boxes, upright_poses
-from densify.readers.kitti.files import parse_numbers
+from densify.readers.file_sequence import checked_boxes, upright_poses
+from densify.readers.kitti.calibration import parse_numbers
 
 T_CAM_UPRIGHT = np.array(  # x right, y forward, z up
     [[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]]

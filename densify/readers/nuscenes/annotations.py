@@ -20,8 +20,7 @@ import numpy as np
 from densify.config.errors import InputError
 from densify.geometry import poses
 from densify.geometry.types import Boxes, Float, Int
-from densify.readers.boxes import checked_boxes
-from densify.readers.file_sequence import quaternion_pose
+from densify.readers.file_sequence import checked_boxes, quaternion_pose
 from densify.readers.nuscenes.tables import Record, find_records
 
 TABLE = "sample_annotation.json"

@@ -17,8 +17,7 @@ from typing import Any
 import numpy as np
 
 from densify.config.errors import InputError
-from densify.config.file_content import open_file, reason
-from densify.config.text_files import parse_json, read_json
+from densify.config.file_content import open_file, parse_json, read_json, reason
 from densify.geometry.types import Float
 
 _RECORD = re.compile(rb"\{[^{}]*\}")

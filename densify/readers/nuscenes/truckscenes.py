@@ -25,8 +25,8 @@ from densify.geometry.poses import transform
 from densify.geometry.types import Bool, Float, Float32, Int
 from densify.readers.file_sequence import Returns, scanner_axes
 from densify.readers.nuscenes.scene import Channel, Scene, SceneSequence
-from densify.readers.points.fields import full_scale, scaled
-from densify.readers.points.files import read_table
+from densify.readers.point_fields import full_scale, scaled
+from densify.readers.point_files import read_table
 
 _FIELDS = ("x", "y", "z", "intensity", "timestamp")
 _NOMINAL_PERIOD_NS = 100_000_000

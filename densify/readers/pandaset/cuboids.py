@@ -10,7 +10,7 @@ import numpy as np
 from densify.config.errors import InputError
 from densify.geometry.poses import inverse
 from densify.geometry.types import Boxes, Float
-from densify.readers.boxes import checked_boxes, upright_poses
+from densify.readers.file_sequence import checked_boxes, upright_poses
 from densify.readers.pandaset.pickled_frame import read_columns
 
 CENTRE = tuple(f"position.{axis}" for axis in "xyz")

@@ -39,13 +39,17 @@ from pathlib import Path
 import numpy as np
 
 from densify.config.errors import InputError
-from densify.config.file_content import read_bytes
-from densify.config.text_files import read_json
+from densify.config.file_content import read_bytes, read_json
 from densify.geometry import poses
 from densify.geometry.types import Boxes, Camera, Float, Int
-from densify.readers.file_sequence import FileSequence, Returns, quaternion_pose, truth_beside
-from densify.readers.files import numbered_files
-from densify.readers.image_files import image_size_px
+from densify.readers.decoded_files import image_size_px
+from densify.readers.file_sequence import (
+    FileSequence,
+    Returns,
+    numbered_files,
+    quaternion_pose,
+    truth_beside,
+)
 from densify.readers.pandaset.cuboids import read_cuboids
 from densify.readers.pandaset.pickled_frame import read_columns
 from densify.readers.pose_track import PoseTrack

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from densify.config.errors import InputError
 from densify.geometry.types import Camera, Float
+from densify.readers.decoded_files import decode_image
 from densify.readers.file_sequence import rigid
-from densify.readers.image_files import decode_image
 
 _DATATYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 # of a lens's model: how densify calls it, and how many coefficients it has

@@ -12,7 +12,7 @@ points
     origin, by /tf_static.
 stamps
     of the header (when it was recorded, if that is 0): the reference time. Times of points count
-    from it, or are absolute; field, unit and clock are found out (`densify.readers.points.fields`).
+    from it, or are absolute; field, unit and clock are found out (`densify.readers.point_fields`).
     Sweeps and images are numbered from 0 in the order of their stamps.
 images
     Image or CompressedImage with the CameraInfo beside them: raw ones with K and D, ``image_rect``
@@ -36,9 +36,8 @@ from numpy.typing import NDArray
 from densify.config.errors import InputError
 from densify.geometry import poses
 from densify.geometry.types import Camera, Float, Float32
-from densify.readers.file_sequence import FileSequence, Returns, truth_beside
-from densify.readers.files import check_image_size
-from densify.readers.points.fields import (
+from densify.readers.file_sequence import FileSequence, Returns, check_image_size, truth_beside
+from densify.readers.point_fields import (
     Fields,
     PointTimes,
     find_fields,

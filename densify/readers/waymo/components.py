@@ -17,8 +17,7 @@ from densify.config.errors import InputError
 from densify.geometry.poses import inverse
 from densify.geometry.types import Boxes, Camera, Float, Int
 from densify.readers.arrow_columns import read_parquet
-from densify.readers.boxes import checked_boxes, upright_poses
-from densify.readers.file_sequence import rigid
+from densify.readers.file_sequence import checked_boxes, rigid, upright_poses
 
 OBJECT = "key.laser_object_id"
 _BOX = "[LiDARBoxComponent].box"

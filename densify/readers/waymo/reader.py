@@ -44,10 +44,10 @@ from densify.readers.file_sequence import (
     FileSequence,
     Returns,
     chosen_scene,
+    of_frame,
     scanner_axes,
     truth_beside,
 )
-from densify.readers.files import of_frame
 from densify.readers.pose_track import PoseTrack
 from densify.readers.waymo.components import (
     CAMERA,

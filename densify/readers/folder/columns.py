@@ -18,7 +18,7 @@ from densify.geometry.types import Bool, Int
 from densify.readers.file_sequence import Returns
 from densify.readers.folder.config import SweepFiles
 from densify.readers.folder.files import Series
-from densify.readers.points.fields import (
+from densify.readers.point_fields import (
     Fields,
     PointTimes,
     find_fields,
@@ -29,7 +29,7 @@ from densify.readers.points.fields import (
     scaled,
     widened,
 )
-from densify.readers.points.files import read_table
+from densify.readers.point_files import read_table
 
 Columns = Mapping[str, NDArray[Any]]
 

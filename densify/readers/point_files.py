@@ -16,9 +16,8 @@ from numpy.typing import NDArray
 
 from densify.config.errors import InputError
 from densify.config.file_content import check_size, open_file, read_bytes
-from densify.readers.array_files import read_array, read_arrays
+from densify.readers.decoded_files import read_array, read_arrays, read_las
 from densify.readers.extras import needed
-from densify.readers.las_files import read_las
 
 Columns = dict[str, NDArray[Any]]
 

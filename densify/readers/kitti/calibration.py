@@ -12,8 +12,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from densify.config.errors import InputError
-from densify.config.file_content import read_bytes
-from densify.config.text_files import read_text
+from densify.config.file_content import read_bytes, read_text
 from densify.geometry.types import Camera, Float, Float32, Int
 from densify.readers.stamp_files import date_ns
 

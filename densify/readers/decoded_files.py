@@ -1,0 +1,169 @@
+# SPDX-License-Identifier: MIT
+"""Arrays, images and LAS files, decoded by libraries. Each function checks the sizes that a header
+claims before memory is taken, and turns whatever the library raises into one InputError."""
+
+from __future__ import annotations
+
+import io
+import math
+import struct
+import zipfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from densify.config.errors import InputError
+from densify.config.file_content import MOST_BYTES, check_size, read_bytes, reason
+
+Arrays = dict[str, NDArray[Any]]
+
+MOST_PIXELS = 1 << 27
+_LAS_HEADER = struct.Struct("<96xIIxHI")  # begin of points, records, bytes of a point, points
+_LAS_EXTENDED = struct.Struct("<235xQIQ")  # of version 1.4: further records, points
+_RECORD_BYTES = 54  # the least that a record of variable length takes
+
+
+def read_array(path: Path) -> NDArray[Any]:
+    """Return the array of a .npy file. Raises InputError if it is missing, too large, damaged, or
+    holds Python objects."""
+    data = read_bytes(path)
+    try:
+        return _array(data)
+    except Exception as error:  # a damaged header raises anything
+        raise InputError(f"{path}: not a whole .npy file: {reason(error)}") from error
+
+
+def read_arrays(
+    path: Path, names: Sequence[str] | None = None, most_bytes: int = MOST_BYTES
+) -> Arrays:
+    """Return the arrays of a .npz file by name; names: only those of them that it holds.
+
+    Raises InputError if it is missing or damaged, holds Python objects, or the arrays together have
+    more bytes than that. Members that are no arrays are passed over.
+    """
+    data = read_bytes(path)
+    try:
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            there = {m.filename[:-4]: m for m in archive.infolist() if m.filename[-4:] == ".npy"}
+            wanted = {n: m for n, m in there.items() if names is None or n in names}
+            check_size(sum(member.file_size for member in wanted.values()), path, most_bytes)
+            return {name: _array(archive.read(member)) for name, member in wanted.items()}
+    except InputError:
+        raise
+    except Exception as error:
+        raise InputError(f"{path}: not a readable .npz file: {reason(error)}") from error
+
+
+def _array(data: bytes) -> NDArray[Any]:
+    file = io.BytesIO(data)
+    version = np.lib.format.read_magic(file)
+    header = np.lib.format
+    read = header.read_array_header_1_0 if version == (1, 0) else header.read_array_header_2_0
+    shape, _, dtype = read(file)
+    num_bytes = len(data) - file.tell()
+    if math.prod(shape) * dtype.itemsize > num_bytes and not dtype.hasobject:
+        raise ValueError(f"it claims {dtype} of shape {shape}, and {num_bytes} bytes follow")
+    file.seek(0)
+    array: NDArray[Any] = np.load(file, allow_pickle=False)
+    return array
+
+
+def read_image(path: Path, as_stored: bool = False) -> NDArray[Any]:
+    """`decode_image` of a file."""
+    return decode_image(read_bytes(path), path, as_stored)
+
+
+def decode_image(data: bytes, where: Path | str, as_stored: bool = False) -> NDArray[Any]:
+    """Return (H,W,3) uint8 blue, green, red; as_stored: any depth, (H,W) if gray.
+
+    Raises InputError, which begins with ``where``, if it is no whole PNG or JPEG file, is damaged,
+    or has more than `MOST_PIXELS`.
+    """
+    import cv2
+
+    try:
+        if _checked_format(data, where) == "JPEG" and not as_stored:
+            import simplejpeg
+
+            # OpenCV and Pillow decode damaged JPEG data to wrong colours.
+            return simplejpeg.decode_jpeg(data, "BGR", strict=True)
+        flags = cv2.IMREAD_UNCHANGED if as_stored else cv2.IMREAD_COLOR
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+        if image is None:
+            raise ValueError("OpenCV cannot decode it")
+        return image
+    except InputError:
+        raise
+    except Exception as error:
+        raise InputError(
+            f"{where}: not a complete image ({len(data)} bytes; {reason(error)}); expected a PNG "
+            f"or JPEG file"
+        ) from error
+
+
+def _checked_format(data: bytes, where: Path | str) -> str:
+    """Return PNG or JPEG. Raises unless it is one of them, not too large, and (PNG) undamaged."""
+    from PIL import Image
+
+    with Image.open(io.BytesIO(data), formats=("PNG", "JPEG")) as image:
+        check_pixels(image.size, where)
+        image.verify()
+        return str(image.format)
+
+
+def image_size_px(path: Path) -> tuple[int, int]:
+    """Return width and height of an image file. Raises InputError if it is no whole image."""
+    height, width = read_image(path).shape[:2]
+    return width, height
+
+
+def check_pixels(size_px: tuple[int, int], where: Path | str) -> None:
+    """Raise InputError for an image (width, height) that is empty or too large."""
+    width, height = size_px
+    if min(size_px) < 1 or width * height > MOST_PIXELS:
+        raise InputError(
+            f"{where}: got an image of {width} x {height} px, expected {MOST_PIXELS:,} pixels at "
+            f"most"
+        )
+
+
+def read_las(path: Path) -> Any:
+    """Return a `laspy.LasData` with all points of a LAS or LAZ file. Raises InputError if it is
+    missing, too large or damaged."""
+    import laspy
+
+    data = read_bytes(path)
+    try:
+        _check_las(data, path)
+        # The parallel backend would allocate what a chunk claims.
+        with laspy.open(io.BytesIO(data), laz_backend=laspy.LazBackend.Lazrs) as file:
+            num_points, cloud = file.header.point_count, file.read()
+        if len(cloud) != num_points:
+            raise ValueError(f"got {len(cloud)} points, expected {num_points}; it is cut off")
+        return cloud
+    except (InputError, KeyboardInterrupt, SystemExit):
+        raise
+    except BaseException as error:  # lazrs, written in Rust, panics
+        raise InputError(f"{path}: not a readable {path.suffix} file: {reason(error)}") from error
+
+
+def _check_las(data: bytes, path: Path) -> None:
+    """Raise unless the numbers of points, records and chunks that it claims fit into the file."""
+    begin, num_records, num_bytes, num_points = _LAS_HEADER.unpack_from(data)
+    kind, version = data[104], data[25]
+    if version >= 4:
+        _, num_late, num_points = _LAS_EXTENDED.unpack_from(data)
+        num_records += num_late
+    check_size(num_points * num_bytes, path)
+    if num_records * _RECORD_BYTES > len(data):
+        raise ValueError(f"its header claims {num_records:,} records; it is damaged")
+    if kind & 0x80 and num_points:  # compressed
+        (table,) = struct.unpack_from("<q", data, begin)
+        if table == -1:
+            (table,) = struct.unpack_from("<q", data, len(data) - 8)
+        (num_chunks,) = struct.unpack_from("<I", data, table + 4)
+        if num_chunks * num_bytes > len(data):
+            raise ValueError(f"it claims {num_chunks:,} chunks; it is cut off or damaged")
