@@ -13,7 +13,7 @@ from pathlib import Path
 
 from densify.config import Config
 from densify.doctor import cameras, clocks, deskewing, files, paths, points, rings
-from densify.doctor.findings import Finding, Verdict
+from densify.doctor.findings import Finding, Verdict, fine, unknown, wrong
 from densify.doctor.sample import Sample, Spot
 from densify.geometry.types import LidarSequence
 
@@ -67,14 +67,13 @@ def registration_of(sample: Sample) -> list[Finding]:
     """Whether odometry can lay the sweeps upon each other."""
     failures = [spot.failure for spot in sample.spots if spot.trajectory is None]
     if len(sample.timeline.frames) < 2:
-        return [Finding("registration", Verdict.UNKNOWN, failures[0])]
+        return [unknown("registration", failures[0])]
     if not failures:
         speeds = ", ".join(f"{spot.speed_m_s:.1f}" for spot in sample.spots)
-        return [Finding("registration", Verdict.FINE, f"odometry finds {speeds} m/s")]
+        return [fine("registration", f"odometry finds {speeds} m/s")]
     return [
-        Finding(
+        wrong(
             "registration",
-            Verdict.WRONG,
             f"{len(failures)} of {len(sample.spots)} places cannot be registered: {failures[0]}",
             f"mend what is wrong above first ({', '.join(_CAUSES)})",
         )

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from densify.config.errors import InputError
-from densify.doctor.findings import Finding, Verdict
+from densify.doctor.findings import Finding, Verdict, fine, suspicious, unknown, wrong
 from densify.doctor.sample import Sample, Spot
 from densify.geometry import poses
 from densify.geometry.cameras import image_points
@@ -71,14 +71,14 @@ class Pair:
 def check_cameras(sample: Sample) -> list[Finding]:
     """Every camera of the recording."""
     if not sample.sequence.cameras:
-        return [Finding("cameras", Verdict.FINE, "none: the cloud and the scores alone")]
+        return [fine("cameras", "none: the cloud and the scores alone")]
     findings = []
     for camera in sample.sequence.cameras.values():
         findings += _check_images(sample, camera)
         pairs, broken = image_pairs(sample, camera)
         if broken:
             remedy = "fetch the image again, or give size and calibration of images like it"
-            findings.append(Finding(f"{camera.name}: images", Verdict.WRONG, broken, remedy))
+            findings.append(wrong(f"{camera.name}: images", broken, remedy))
         if pairs:
             findings += _check_calibration(camera, pairs)
     return findings
@@ -89,9 +89,8 @@ def _check_images(sample: Sample, camera: Camera) -> list[Finding]:
     exposed_ns = np.array(sorted(sample.sequence.image_stamps_ns(camera.name).values()), np.int64)
     if not len(exposed_ns):
         return [
-            Finding(
+            suspicious(
                 name,
-                Verdict.SUSPICIOUS,
                 "not a single image",
                 f"leave the camera out (--camera with the others), or fetch {camera.name}",
             )
@@ -107,7 +106,7 @@ def _check_images(sample: Sample, camera: Camera) -> list[Finding]:
     values = {"num_images": len(exposed_ns), "num_without": len(without), "apart_ms": apart_ms}
     text = f"{len(exposed_ns)}, usually {apart_ms:.1f} ms from a sweep's reference time"
     if not without:
-        return [Finding(name, Verdict.FINE, text, values=values)]
+        return [fine(name, text, **values)]
     all_of_them = len(without) == len(stamp_ns)
     return [
         Finding(
@@ -256,20 +255,20 @@ def _check_calibration(camera: Camera, pairs: list[Pair]) -> list[Finding]:
     late = clock is not None and at_clock == most and clock.is_off and most > clearly
     if others[other] == most > clearly:
         text += f", by {most:.1f} with {other}"
-        finding = Finding(name, Verdict.WRONG, text, "correct T_cam_lidar", values)
+        finding = wrong(name, text, "correct T_cam_lidar", **values)
     elif at_shift == most > clearly and abs(shift_deg) > _OFF_DEG:
         side = "right" if shift_deg > 0 else "left"
         text += f", by {most:.1f} if they were {abs(shift_deg):.1f} deg farther to the {side}"
         remedy = "look at the overlay; correct T_cam_lidar or K"
-        finding = Finding(name, Verdict.SUSPICIOUS, text, remedy, values)
+        finding = suspicious(name, text, remedy, **values)
     elif most < _CLEAR:
         text += f", and nowhere around by more than {most:.1f}: images and sweeps do not show the"
         text += " same, or too little"
         remedy = "look at the overlay; check T_cam_lidar, K and the clocks"
-        finding = Finding(name, Verdict.SUSPICIOUS, text, remedy, values)
+        finding = suspicious(name, text, remedy, **values)
     else:
         text += f", by {at_shift:.1f} {abs(shift_deg):.1f} deg beside"
-        finding = Finding(name, Verdict.FINE, text, values=values)
+        finding = fine(name, text, **values)
     if clock is None:
         return [finding]
     remedy = f"shift the stamps of {camera.name} by {clock.late_s * 1e3:+.0f} ms" if late else ""
@@ -283,8 +282,8 @@ def _check_calibration(camera: Camera, pairs: list[Pair]) -> list[Finding]:
 
 def _one_image(name: str, text: str, given: float, values: dict[str, float]) -> Finding:
     if given >= _CLEAR:
-        return Finding(name, Verdict.FINE, text, values=values)
-    return Finding(name, Verdict.UNKNOWN, f"{text}: one image is too little to tell", values=values)
+        return fine(name, text, **values)
+    return unknown(name, f"{text}: one image is too little to tell", **values)
 
 
 def _best_shift(camera: Camera, pairs: list[Pair]) -> tuple[float, float]:

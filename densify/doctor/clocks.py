@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from densify.doctor.findings import Finding, Verdict
+from densify.doctor.findings import Finding, Verdict, fine, suspicious, unknown, wrong
 from densify.doctor.sample import Sample
 from densify.readers.timeline import format_frames
 
@@ -30,16 +30,15 @@ def check_stamps(sample: Sample) -> list[Finding]:
     if timeline.unknown:
         frame, reason = next(iter(timeline.unknown.items()))
         return [
-            Finding(
+            wrong(
                 "stamps",
-                Verdict.WRONG,
                 f"{len(timeline.unknown)} of {len(timeline.frames)} sweeps have no stamp that can "
                 f"be right, the first of them frame {frame} ({reason})",
                 "correct the stamps of these sweeps, or remove their files",
             )
         ]
     if len(timeline.frames) < 2:
-        return [Finding("stamps", Verdict.UNKNOWN, "one sweep tells no rate")]
+        return [unknown("stamps", "one sweep tells no rate")]
     step_ns = np.diff(timeline.stamp_ns)
     backward = np.flatnonzero(step_ns <= 0)
     if len(backward):
@@ -47,13 +46,12 @@ def check_stamps(sample: Sample) -> list[Finding]:
         pair = timeline.frames[row], timeline.frames[row + 1]
         what = "the same as" if step_ns[row] == 0 else f"{-step_ns[row] * 1e-6:.1f} ms before"
         return [
-            Finding(
+            wrong(
                 "stamps",
-                Verdict.WRONG,
                 f"{len(backward)} of {len(step_ns)} steps do not go on in time; the first: the "
                 f"stamp of frame {pair[1]} is {what} that of frame {pair[0]}",
                 "sort the sweeps by their stamps, or correct the file of stamps",
-                {"num_backward": len(backward)},
+                num_backward=len(backward),
             )
         ]
     return [_rate(sample), *_holes(sample), *_year(sample)]
@@ -63,7 +61,7 @@ def _rate(sample: Sample) -> Finding:
     period_s = sample.timeline.period_ns * 1e-9
     values = {"period_s": period_s}
     if _PERIODS_S[0] <= period_s <= _PERIODS_S[1]:
-        return Finding("stamps", Verdict.FINE, f"{1 / period_s:.2f} Hz, ascending", values=values)
+        return fine("stamps", f"{1 / period_s:.2f} Hz, ascending", **values)
     fits = [name for name, f in _UNITS.items() if _PERIODS_S[0] <= period_s * f <= _PERIODS_S[1]]
     guess = f"; it would be {1 / (period_s * _UNITS[fits[0]]):.1f} Hz with {fits[0]}" * bool(fits)
     verdict = Verdict.WRONG if fits else Verdict.SUSPICIOUS
@@ -85,14 +83,13 @@ def _holes(sample: Sample) -> list[Finding]:
         return []
     longest = int(rows[np.argmax(step_ns[rows])])
     return [
-        Finding(
+        suspicious(
             "holes in time",
-            Verdict.SUSPICIOUS,
             f"{len(rows)} of more than three periods, the longest of {step_ns[longest] * 1e-9:.1f} "
             f"s after frame {timeline.frames[longest]}; windows end there (after frames "
             f"{format_frames(timeline.frames[row] for row in rows)})",
             "nothing, if the sweeps were never recorded; else fetch them again",
-            {"num_holes": len(rows)},
+            num_holes=len(rows),
         )
     ]
 
@@ -102,13 +99,12 @@ def _year(sample: Sample) -> list[Finding]:
     if years < 1 or _YEARS[0] <= years <= _YEARS[1]:  # counted from power-on, or a date
         return []
     return [
-        Finding(
+        suspicious(
             "date",
-            Verdict.SUSPICIOUS,
             f"the first sweep is stamped in the year {1970 + years:.0f}, expected a date from 1980 "
             f"to 2040 or a clock that starts at 0",
             "nothing, as long as sweeps, images and poses share the clock",
-            {"year": 1970 + years},
+            year=1970 + years,
         )
     ]
 

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from densify.config import RegisterSettings
-from densify.doctor.findings import Finding, Verdict
+from densify.doctor.findings import Finding, Verdict, unknown, wrong
 from densify.doctor.sample import Sample, Spot, spot_of
 from densify.geometry import poses
 from densify.geometry.types import Float, Sweep
@@ -33,7 +33,7 @@ def check_deskewing(sample: Sample, settings: RegisterSettings) -> list[Finding]
             f"the vehicle drives at {spot.speed_m_s:.1f} m/s where it was looked at, "
             f"{_LEAST_SPEED_M_S:g} are needed"
         )
-        return [Finding("deskewing", Verdict.UNKNOWN, text)]
+        return [unknown("deskewing", text)]
     given_m = apart_m(spot)
     others = {
         "with the times reversed": apart_m(_changed(spot, -1, settings)),
@@ -48,12 +48,11 @@ def check_deskewing(sample: Sample, settings: RegisterSettings) -> list[Finding]
     )
     if others[best] * _CLEARLY < given_m:
         return [
-            Finding(
+            wrong(
                 "deskewing",
-                Verdict.WRONG,
                 f"{text}: best {best}",
                 "correct the sign of the point times, or --set register.deskew=false",
-                values,
+                **values,
             )
         ]
     told = given_m * _TOLD < min(others.values())

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from densify.doctor.findings import Finding, Verdict
+from densify.doctor.findings import Finding, Verdict, fine, wrong
 from densify.doctor.sample import Sample
 from densify.geometry.types import KnowsFiles
 from densify.readers.timeline import format_frames
@@ -24,13 +24,12 @@ def check_sweep_files(sample: Sample) -> list[Finding]:
     if sample.unreadable:
         frame, reason = next(iter(sample.unreadable.items()))
         findings.append(
-            Finding(
+            wrong(
                 "reading",
-                Verdict.WRONG,
                 f"{len(sample.unreadable)} of the sweeps looked at cannot be read: frames "
                 f"{format_frames(sample.unreadable)}; frame {frame}: {reason}",
                 "fetch these files again; windows end before them",
-                {"num_unreadable": len(sample.unreadable)},
+                num_unreadable=len(sample.unreadable),
             )
         )
     if isinstance(sample.sequence, KnowsFiles):
@@ -46,7 +45,7 @@ def _sizes(sizes: Mapping[int, int]) -> Finding:
     values = {"num_empty": len(empty), "num_short": len(short), "usual_bytes": int(usual)}
     if not empty and not short:
         text = f"{len(sizes)} sweeps of {usual / 1e6:.2f} MB, none empty or much shorter"
-        return Finding("files", Verdict.FINE, text, values=values)
+        return fine("files", text, **values)
     return Finding(
         "files",
         Verdict.WRONG if empty else Verdict.SUSPICIOUS,

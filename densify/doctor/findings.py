@@ -9,7 +9,8 @@ from enum import IntEnum
 
 
 class Verdict(IntEnum):
-    """How bad it is. UNKNOWN: the recording does not show it, for instance because it stands."""
+    """How bad a finding is. UNKNOWN: the recording does not show it, for instance because the
+    vehicle stands still."""
 
     FINE = 0
     UNKNOWN = 1
@@ -20,14 +21,40 @@ class Verdict(IntEnum):
         return self.name.lower()
 
 
+Value = float | int | str | list[float]
+
+
 @dataclass(frozen=True)
 class Finding:
-    """check: what was looked at, such as "stamps". evidence: one sentence with the number that the
-    verdict rests on. remedy: the option or line that mends it; empty where nothing is wrong.
-    values: the numbers by name, with units in the names."""
+    """The result of one check.
+
+    check: the subject, such as "stamps". evidence: one sentence with the number that the verdict
+    rests on. remedy: the option or line that mends it; empty where nothing is wrong. values: the
+    numbers by name, with units in the names.
+    """
 
     check: str
     verdict: Verdict
     evidence: str
     remedy: str = ""
-    values: Mapping[str, float | int | str | list[float]] = field(default_factory=dict)
+    values: Mapping[str, Value] = field(default_factory=dict)
+
+
+def fine(check: str, evidence: str, **values: Value) -> Finding:
+    """Return a finding that nothing is wrong."""
+    return Finding(check, Verdict.FINE, evidence, values=values)
+
+
+def unknown(check: str, evidence: str, **values: Value) -> Finding:
+    """Return a finding that the recording does not show."""
+    return Finding(check, Verdict.UNKNOWN, evidence, values=values)
+
+
+def suspicious(check: str, evidence: str, remedy: str, **values: Value) -> Finding:
+    """Return a finding that may be wrong."""
+    return Finding(check, Verdict.SUSPICIOUS, evidence, remedy, values)
+
+
+def wrong(check: str, evidence: str, remedy: str, **values: Value) -> Finding:
+    """Return a finding that is wrong."""
+    return Finding(check, Verdict.WRONG, evidence, remedy, values)

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from densify.config.errors import InputError
-from densify.doctor.findings import Finding, Verdict
+from densify.doctor.findings import Finding, Verdict, fine, suspicious, unknown, wrong
 from densify.doctor.sample import Sample, Spot
 from densify.geometry import poses
 from densify.geometry.types import Float
@@ -83,10 +83,10 @@ def check_poses(sample: Sample) -> list[Finding]:
         given = [_given(sample, spot) for spot in spots]
     except InputError as error:
         if "no poses" in str(error):
-            return [Finding("poses", Verdict.FINE, "none; the sweeps register themselves")]
-        return [Finding("poses", Verdict.WRONG, str(error), "--set register.source=kiss-icp")]
+            return [fine("poses", "none; the sweeps register themselves")]
+        return [wrong("poses", str(error), "--set register.source=kiss-icp")]
     if not spots:
-        return [Finding("poses", Verdict.UNKNOWN, "no sweeps could be registered to compare with")]
+        return [unknown("poses", "no sweeps could be registered to compare with")]
     found = [_step(spot) for spot in spots]
     way_m = max(float(np.linalg.norm(T[:3, 3])) for T in found)
     off = _off([_between(T) for T in given], found)
@@ -101,12 +101,11 @@ def check_poses(sample: Sample) -> list[Finding]:
     if other < _MUCH_BETTER * cost and cost > _EXACT and other < 1:
         better = f"{others[best][0]:.2f} m and {others[best][1]:.2f} deg"
         return [
-            Finding(
+            wrong(
                 "poses",
-                Verdict.WRONG,
                 f"{text}, but only by {better} if {best}",
                 "correct the poses, or leave them out with --set register.source=kiss-icp",
-                values,
+                **values,
             )
         ]
     if cost <= 1:
@@ -115,13 +114,12 @@ def check_poses(sample: Sample) -> list[Finding]:
         text += "; the vehicle hardly moves" if slow else ""
         return [Finding("poses", verdict, text, values=values), *_check_clock(sample, found)]
     return [
-        Finding(
+        suspicious(
             "poses",
-            Verdict.SUSPICIOUS,
             f"{text}; no usual mistake explains it (another frame than the points', another "
             f"clock, or noise)",
             "leave them out with --set register.source=kiss-icp",
-            values,
+            **values,
         ),
         *_check_clock(sample, found),
     ]
@@ -152,11 +150,11 @@ def _check_clock(sample: Sample, found: list[Float]) -> list[Finding]:
     )
     if high_s - low_s > _CLOCK_S:
         text += "; the vehicle drives too evenly to tell"
-        return [Finding("clock of poses", Verdict.UNKNOWN, text, values=values)]
+        return [unknown("clock of poses", text, **values)]
     if low_s > _CLOCK_OFF_S or high_s < -_CLOCK_OFF_S:
         remedy = f"shift the poses' stamps by {-best_s * 1e3:+.0f} ms"
-        return [Finding("clock of poses", Verdict.SUSPICIOUS, text, remedy, values)]
-    return [Finding("clock of poses", Verdict.FINE, text, values=values)]
+        return [suspicious("clock of poses", text, remedy, **values)]
+    return [fine("clock of poses", text, **values)]
 
 
 def _track(sample: Sample, first_ns: int, last_ns: int) -> PoseTrack | None:

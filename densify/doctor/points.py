@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from densify.config import RegisterSettings
-from densify.doctor.findings import Finding, Verdict
+from densify.doctor.findings import Finding, Verdict, fine, suspicious, unknown, wrong
 from densify.doctor.sample import Sample, Spot
 from densify.free_space.sensor import Sensors
 from densify.geometry.types import Float
@@ -45,24 +45,16 @@ def check_units(sample: Sample) -> list[Finding]:
     range_m = float(np.median([_median_range_m(points) for points in middle]))
     values = {"median_range_m": range_m}
     if _MEDIAN_RANGE_M[0] <= range_m <= _MEDIAN_RANGE_M[1]:
-        return [
-            Finding(
-                "unit of points",
-                Verdict.FINE,
-                f"half of the returns within {range_m:.1f} m",
-                values=values,
-            )
-        ]
+        return [fine("unit of points", f"half of the returns within {range_m:.1f} m", **values)]
     around_m = float(np.median([_median_range_m(p - np.median(p, axis=0)) for p in middle]))
     if _MEDIAN_RANGE_M[0] <= around_m <= _MEDIAN_RANGE_M[1] and range_m > _FAR_OFF * around_m:
         return [
-            Finding(
+            wrong(
                 "unit of points",
-                Verdict.WRONG,
                 f"half of the returns are farther than {range_m:.4g} m, and within {around_m:.1f} m"
                 f" of each other's middle, as if they were in a map's coordinates",
                 "bring each sweep into its scanner's frame, by the inverse of its pose",
-                values,
+                **values,
             )
         ]
     fits = [u for u, f in _UNITS.items() if _MEDIAN_RANGE_M[0] <= range_m * f <= _MEDIAN_RANGE_M[1]]
@@ -94,19 +86,16 @@ def check_axes(sample: Sample) -> list[Finding]:
         f"{best} is up" + (f", {100 * max(level['z'], 0):.0f} % if z is" if best != "z" else "")
     )
     if level["z"] < _LEAST_LEVEL and level[best] < _LEAST_LEVEL:
-        return [
-            Finding("axes", Verdict.UNKNOWN, "no ground was found along any axis", values=values)
-        ]
+        return [unknown("axes", "no ground was found along any axis", **values)]
     if level["z"] >= _LEAST_LEVEL or level[best] < _CLEARLY * level["z"]:
-        return [Finding("axes", Verdict.FINE, text, values=values)]
+        return [fine("axes", text, **values)]
     means = f" ({_UP_MEANS[best]})" if best in _UP_MEANS else ""
     return [
-        Finding(
+        wrong(
             "axes",
-            Verdict.WRONG,
             f"{text}{means}",
             "turn the points so that z is up (sweeps: axes in densify.yaml)",
-            values,
+            **values,
         )
     ]
 
@@ -146,22 +135,21 @@ def check_own_vehicle(sample: Sample, settings: RegisterSettings) -> list[Findin
             if moving
             else "the vehicle hardly moves where it was looked at"
         )
-        return [Finding("own vehicle", Verdict.UNKNOWN, text)]
+        return [unknown("own vehicle", text)]
     range_m, num = _own_returns(moving)
     values = {"farthest_m": range_m, "num_returns": num}
     if num < _LEAST_OWN:
-        return [Finding("own vehicle", Verdict.FINE, "no returns of it", values=values)]
+        return [fine("own vehicle", "no returns of it", **values)]
     text = f"{num} returns a sweep, at most {range_m:.1f} m away"
     if range_m <= settings.min_range_m:
         text += f", all within register.min_range_m = {settings.min_range_m:g}"
-        return [Finding("own vehicle", Verdict.FINE, text, values=values)]
+        return [fine("own vehicle", text, **values)]
     return [
-        Finding(
+        suspicious(
             "own vehicle",
-            Verdict.SUSPICIOUS,
             f"{text}, beyond register.min_range_m = {settings.min_range_m:g}",
             f"--set register.min_range_m={np.ceil(10 * range_m) / 10:.1f}",
-            values,
+            **values,
         )
     ]
 
@@ -193,14 +181,13 @@ def check_intensity(sample: Sample) -> list[Finding]:
     low = min(float(spot.sweeps[spot.middle].intensity.min()) for spot in sample.spots)
     text, values = f"{low:g} to {high:g}", {"lowest": low, "highest": high}
     if low >= 0 and high <= 1:
-        return [Finding("intensity", Verdict.FINE, text, values=values)]
+        return [fine("intensity", text, **values)]
     return [
-        Finding(
+        suspicious(
             "intensity",
-            Verdict.SUSPICIOUS,
             f"{text}, expected 0 to 1; only pictures and the clouds' column suffer",
             "scale the intensities (sweeps: intensity_scale in densify.yaml)",
-            values,
+            **values,
         )
     ]
 

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from densify.doctor.findings import Finding, Verdict
+from densify.doctor.findings import Finding, fine, suspicious, unknown, wrong
 from densify.doctor.sample import Sample, Spot
 from densify.geometry import poses
 from densify.geometry.types import Float, Sweep
@@ -71,13 +71,13 @@ def _check_compensation(
     name = "motion compensation" + f" of scanner {lidar}" * (lidar > 0)
     spot = sample.fastest
     if spot is None:
-        return Finding(name, Verdict.UNKNOWN, "no sweeps could be registered")
+        return unknown(name, "no sweeps could be registered")
     if spot.speed_m_s < _LEAST_SPEED_M_S:
         text = (
             f"the vehicle drives at {spot.speed_m_s:.1f} m/s where it was looked at, "
             f"{_LEAST_SPEED_M_S:g} are needed"
         )
-        return Finding(name, Verdict.UNKNOWN, text)
+        return unknown(name, text)
     sweep = spot.sweeps[spot.middle]
     sweep = sweep.select(sweep.lidar == lidar)
     offset_s = _turning_s(sweep, sample) if sweep.offset_ns is None else sweep.offset_ns * 1e-9
@@ -92,24 +92,21 @@ def _check_compensation(
         f"{undone:.2f} with a compensation undone, {found.done:.2f} with the motion compensated"
     )
     if max(as_stored, undone) < _LEAST_SHARPNESS:
-        return Finding(name, Verdict.UNKNOWN, f"{text}; no distinct rings", values=values)
+        return unknown(name, f"{text}; no distinct rings", **values)
     if undone > _CLEARLY * as_stored:
         if sweep.offset_ns is None:
-            return Finding(
-                name, Verdict.FINE, f"{text}: compensated to {moment}, without times", values=values
-            )
-        return Finding(
+            return fine(name, f"{text}: compensated to {moment}, without times", **values)
+        return wrong(
             name,
-            Verdict.WRONG,
             f"{text}: the sweeps are compensated already, to {moment}, and would be a second time",
             "--set register.deskew=false",
-            values,
+            **values,
         )
     if as_stored < _CLEARLY * undone:
-        return Finding(name, Verdict.UNKNOWN, f"{text}: too alike to tell", values=values)
+        return unknown(name, f"{text}: too alike to tell", **values)
     if sweep.offset_ns is None:
         return _raw_without_times(name, text, values, spot, sample)
-    return Finding(name, Verdict.FINE, f"{text}: as they were fired", values=values)
+    return fine(name, f"{text}: as they were fired", **values)
 
 
 class _Sharpness(NamedTuple):
@@ -156,13 +153,12 @@ def _raw_without_times(
     name: str, text: str, values: dict[str, float], spot: Spot, sample: Sample
 ) -> Finding:
     stretched_m = spot.speed_m_s * sample.timeline.period_ns * 1e-9
-    return Finding(
+    return suspicious(
         name,
-        Verdict.SUSPICIOUS,
         f"{text}: the sweeps are as they were fired and no point has a time, so they stay "
         f"stretched by {stretched_m:.2f} m",
         "give the points times (a column t in the files)",
-        values,
+        **values,
     )
 
 
@@ -201,12 +197,12 @@ def _check_origin(lidar: int, points: Float, R: Float, given_m: Float, found_m: 
         f"{_text(given_m)}: {given:.2f}"
     )
     if found < _LEAST_SHARPNESS:
-        return Finding(name, Verdict.UNKNOWN, f"{text}; no distinct rings", values=values)
+        return unknown(name, f"{text}; no distinct rings", **values)
     if off_m > _OFF_M and found > _CLEARLY * given:
         line = f"scanner_origins: {[[round(float(v), 2) for v in found_m]]}"
         remedy = f"give the scanner's place in the points' frame ({line})"
-        return Finding(name, Verdict.WRONG, text, remedy, values)
-    return Finding(name, Verdict.FINE, text, values=values)
+        return wrong(name, text, remedy, **values)
+    return fine(name, text, **values)
 
 
 def _text(place_m: Float) -> str:
