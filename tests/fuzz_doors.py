@@ -413,7 +413,8 @@ def real_trees() -> list[str]:
 
 
 def _written(format: str, root: Path) -> Door:
-    from densify.outputs.writers import write_street
+    from writers import write_street
+
     from densify.readers.street import Street
 
     sensor, hz, frames = {

@@ -7,10 +7,10 @@ from collections.abc import Mapping
 from functools import cache
 
 import numpy as np
+from writers.excerpt import Excerpt
 
 from densify.geometry.poses import inverse, transform
 from densify.geometry.types import LidarSequence
-from densify.outputs.writers.excerpt import Excerpt
 from densify.readers.street import Street
 from densify.scores.depth_metrics import DepthErrors, depth_errors
 from tests.scenes import by_flow

@@ -84,7 +84,13 @@ class Maker:
             self.cloud(scan(), STAMP_NS + i * PERIOD_NS, **options)
 
     def image(
-        self, data: np.ndarray, encoding: str, topic: str = "/front/image_raw", step: int = 0
+        self,
+        data: np.ndarray,
+        encoding: str,
+        topic: str = "/front/image_raw",
+        step: int = 0,
+        stamp_ns: int = STAMP_NS + 1,
+        frame: str = "front_optical",
     ) -> None:
         """data: (H,W,...) as stored; step: bytes of a row, more than it needs."""
         raw = np.ascontiguousarray(data)
@@ -92,20 +98,32 @@ class Maker:
         rows = raw.view(np.uint8).reshape(height, -1)
         step = step or rows.shape[1]
         rows = np.pad(rows, ((0, 0), (0, step - rows.shape[1])))
-        header = self.header(STAMP_NS + 1, "front_optical")
+        header = self.header(stamp_ns, frame)
         values = (header, height, width, encoding, 0, step, rows.reshape(-1))
         type_ = "sensor_msgs/msg/Image"
-        self.put(topic, type_, self.make(type_, *values), STAMP_NS + 2)
+        self.put(topic, type_, self.make(type_, *values), stamp_ns + 1)
+
+    def compressed(
+        self,
+        data: bytes,
+        topic: str = "/front/image_rect_color/compressed",
+        stamp_ns: int = STAMP_NS + 5,
+        frame: str = "front_optical",
+    ) -> None:
+        """data: of a PNG file."""
+        type_, header = "sensor_msgs/msg/CompressedImage", self.header(stamp_ns, frame)
+        message = self.make(type_, header, "png", np.frombuffer(data, np.uint8))
+        self.put(topic, type_, message, stamp_ns + 1)
 
     def info(self, topic: str = "/front/camera_info", size=(6, 8), **changes: Any) -> None:
-        """changes: model, d, k, r, p, binning, roi (x, y, height, width)."""
+        """changes: frame, model, d, k, r, p, binning, roi (x, y, height, width)."""
         K = changes.get("k", [100.0, 0, 3.5, 0, 110, 2.5, 0, 0, 1])
         P = changes.get("p", [90.0, 0, 3, 0, 0, 90, 2, 0, 0, 0, 1, 0])
         R = changes.get("r", np.eye(3).ravel())
         region = changes.get("roi", (0, 0, 0, 0))
         roi = self.make("sensor_msgs/msg/RegionOfInterest", *region, False)
         arrays = [np.array(a, float) for a in (changes.get("d", []), K, R, P)]
-        header = self.header(STAMP_NS + 1, "front_optical")
+        header = self.header(STAMP_NS + 1, changes.get("frame", "front_optical"))
         values = (header, *size, changes.get("model", "plumb_bob"), *arrays)
         message = self.make(
             "sensor_msgs/msg/CameraInfo", *values, *changes.get("binning", (0, 0)), roi

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from densify.learning.networks import build
 from scipy.spatial import cKDTree
+from writers import write_street
 
 from densify.bench.baselines import rigid_icp
 from densify.bench.paper import METHODS, SLOW, bench_paper
@@ -28,7 +29,6 @@ from densify.cli import main
 from densify.config.errors import InputError
 from densify.learning.model_file import Model, write_model
 from densify.outputs.arrows import draw_arrows
-from densify.outputs.writers import write_street
 from densify.readers.decoded_files import read_image
 from densify.readers.kitti import scene_flow
 from densify.readers.street import Street

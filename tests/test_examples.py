@@ -9,8 +9,8 @@ import sys
 from pathlib import Path
 
 import numpy as np
+from writers import write_street
 
-from densify.outputs.writers import write_street
 from densify.readers.street import Street
 
 EXAMPLES = Path(__file__).parents[1] / "examples"

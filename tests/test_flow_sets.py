@@ -9,12 +9,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from writers import write_street
 
 from densify.bench.flow import bench_flow
 from densify.cli import main
 from densify.config import resolve
 from densify.config.errors import InputError
-from densify.outputs.writers import write_street
 from densify.readers import open_sequence
 from densify.readers.street import Street
 from densify.readers.true_flow import labelled_flow

@@ -15,6 +15,8 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
+from writers import write_street
+from writers.pandaset import put_frame
 
 from densify.cli import main
 from densify.config import resolve
@@ -23,8 +25,6 @@ from densify.flow.boxes import BoxMargins, flow_of_boxes
 from densify.geometry.poses import transform
 from densify.geometry.types import Boxes, BoxView, Camera, RegisteredSweep, Sweep
 from densify.learning.labels import label_sweeps
-from densify.outputs.writers import write_street
-from densify.outputs.writers.pandaset import _pickled
 from densify.readers import open_sequence
 from densify.readers.kitti.calibration import Calibration
 from densify.readers.nuscenes.annotations import Annotations
@@ -408,7 +408,7 @@ def write_cuboids(sequence: Path, rows: list[dict]) -> None:
         values = [row[name] for row in rows]
         is_text = name in texts or any(isinstance(value, str) for value in values)
         columns[name] = np.array(values, object if is_text else None)
-    (sequence / CUBOIDS).write_bytes(gzip.compress(_pickled(columns)))
+    put_frame(sequence / CUBOIDS, columns)
 
 
 # nuScenes

@@ -240,7 +240,6 @@ DOORS: dict[str, str | tuple[str, ...]] = {
     "pickle": (
         "densify/dataset/calls.py",
         "densify/readers/pandaset/pickled_frame.py",
-        "densify/outputs/writers/pandaset.py",
     ),
     "simplejpeg": "densify/readers/decoded_files.py",
     "small_gicp": "densify/registration/alignment.py",

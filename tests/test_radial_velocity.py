@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from writers import write_street
 
 from densify.config import GroundSettings
 from densify.flow.tracking.candidates import find_candidates
@@ -15,7 +16,6 @@ from densify.free_space.ground import ground
 from densify.free_space.seen_through import FreeSpace
 from densify.geometry import poses
 from densify.geometry.types import Stretch, Sweep, Trajectory
-from densify.outputs.writers import write_street
 from densify.readers import open_sequence
 from densify.readers.point_fields import find_fields, radial_velocities
 from densify.readers.street import Street

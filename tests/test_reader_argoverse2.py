@@ -7,13 +7,13 @@ import shutil
 
 import numpy as np
 import pytest
+from writers import write_street
+from writers.argoverse2 import T_EGO_LIDAR
+from writers.excerpt import Excerpt
 
 from densify.config.errors import InputError
 from densify.free_space.sensor import Sensors
 from densify.geometry.poses import inverse, transform
-from densify.outputs.writers import write_street
-from densify.outputs.writers.argoverse2 import T_EGO_LIDAR
-from densify.outputs.writers.excerpt import Excerpt
 from densify.readers import open_sequence
 from densify.readers.argoverse2 import Argoverse2
 from densify.readers.street import Street
@@ -93,14 +93,6 @@ def test_logs_are_scenes(log):
             open_sequence(f"argoverse2:{place}#other")
     with pytest.raises(InputError, match="no Argoverse 2 log"):
         open_sequence(f"argoverse2:{log / 'sensors'}")
-
-
-def test_what_the_format_cannot_hold_is_refused(tmp_path):
-    for spec in ("street?sensor=os128", "street?sensor=rosette", "street?cameras=fisheye"):
-        with pytest.raises(InputError, match="cannot be written") as error:
-            write_street("argoverse2", Street.from_spec(spec), tmp_path / "out", [60])
-        assert "choose" in str(error.value)
-    assert not (tmp_path / "out").exists()
 
 
 # Damage

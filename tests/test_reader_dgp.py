@@ -11,11 +11,11 @@ import shutil
 import cv2
 import numpy as np
 import pytest
+from writers import write_street
+from writers.excerpt import Excerpt
 
 from densify.config.errors import InputError
 from densify.geometry.poses import inverse
-from densify.outputs.writers import write_street
-from densify.outputs.writers.excerpt import Excerpt
 from densify.readers import open_sequence
 from densify.readers.dgp import Dgp
 from densify.readers.street import Street
@@ -81,13 +81,6 @@ def test_what_is_not_on_the_disk_leaves_a_gap(broken):
     assert list(sequence.image_stamps_ns(CAMERA)) == [0, 1]
     with pytest.raises(InputError, match="frames that exist: 1-2"):
         sequence[0]
-
-
-def test_what_the_format_cannot_hold_is_refused(tmp_path):
-    for spec in ("street?sensor=dual32", "street?cameras=fisheye", "street?cameras=rolling"):
-        with pytest.raises(InputError, match=r"cannot be written as DGP.*; choose|choose among"):
-            write_street("dgp", Street.from_spec(spec), tmp_path / "out", [60])
-    assert not (tmp_path / "out").exists()
 
 
 # Damage

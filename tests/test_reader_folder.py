@@ -13,12 +13,12 @@ import numpy as np
 import pytest
 import yaml
 from scipy.spatial.transform import Rotation
+from writers import write_street
+from writers.excerpt import Excerpt
 
 from densify.config.errors import InputError
 from densify.geometry.poses import inverse, transform
-from densify.outputs.writers import write_street
-from densify.outputs.writers.excerpt import Excerpt
-from densify.outputs.writers.folder import config_text
+from densify.outputs.simulated_street import config_text
 from densify.readers import open_sequence
 from densify.readers.describe import describe
 from densify.readers.folder.config import FolderConfig

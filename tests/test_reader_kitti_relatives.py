@@ -9,12 +9,12 @@ import shutil
 import cv2
 import numpy as np
 import pytest
+from writers import write_street
+from writers.excerpt import Excerpt
 
 from densify.config.errors import InputError
 from densify.geometry import cameras
 from densify.geometry.poses import inverse
-from densify.outputs.writers import write_street
-from densify.outputs.writers.excerpt import Excerpt
 from densify.readers import open_sequence
 from densify.readers.kitti.kitti_360 import Kitti360
 from densify.readers.kitti.odometry import KittiOdometry
@@ -123,19 +123,6 @@ def test_scenes(written):
             open_sequence(f"{reader}:{spec}#77")
         with pytest.raises(InputError, match=r"no KITTI.* expected"):
             open_sequence(f"{reader}:{spec.parent}")
-
-
-def test_what_a_format_cannot_hold_is_refused(tmp_path):
-    for name, spec, frames in (
-        ("kitti-odometry", "street?sensor=dual32", FRAMES),
-        ("kitti-odometry", "street?cameras=image_03", FRAMES),
-        ("kitti-tracking", "street?sensor=rosette&cameras=none", FRAMES),
-        ("kitti-tracking", "street?cameras=image_02", (59, 61)),
-        ("kitti-360", "street?cameras=fast", FRAMES),
-    ):
-        with pytest.raises(InputError, match=r"cannot be written as KITTI.*; choose"):
-            write_street(name, Street.from_spec(spec), tmp_path / "out", frames)
-    assert not (tmp_path / "out").exists()
 
 
 def test_semantic_kittis_poses_are_found_too(copied):

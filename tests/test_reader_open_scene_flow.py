@@ -7,14 +7,14 @@ import shutil
 
 import numpy as np
 import pytest
+from writers import write_street
+from writers.excerpt import Excerpt
 
 import densify
 from densify.config.errors import InputError
 from densify.geometry.poses import transform
 from densify.geometry.types import Trajectory
 from densify.outputs.flow_h5 import write_flow_h5
-from densify.outputs.writers import write_street
-from densify.outputs.writers.excerpt import Excerpt
 from densify.readers import open_sequence
 from densify.readers.open_scene_flow.labels import FlowLabels
 from densify.readers.open_scene_flow.reader import OpenSceneFlow, SweepFile

@@ -9,17 +9,17 @@ import shutil
 import cv2
 import numpy as np
 import pytest
+from ros_bags import PERIOD_NS, STAMP_NS, Maker, scan
 from scipy.spatial.transform import Rotation
+from writers import write_street
+from writers.excerpt import Excerpt
 
 from densify.config.errors import InputError
 from densify.geometry.poses import inverse, transform
-from densify.outputs.writers import write_street
-from densify.outputs.writers.excerpt import Excerpt
 from densify.readers import open_sequence
 from densify.readers.ros.reader import RosBag
 from densify.readers.street import Street
 from tests.reader_checks import check_cameras, check_depth, check_sweeps, check_truth
-from tests.ros_bags import PERIOD_NS, STAMP_NS, Maker, scan
 
 pytest.importorskip("rosbags")
 
@@ -49,13 +49,6 @@ def test_the_street_is_given_back(format, written, excerpt):
 
 def test_depth_is_that_of_the_street(written, excerpt):
     check_depth(open_sequence(written["ros2"]), excerpt, worse=0.02)
-
-
-def test_what_has_no_place_in_a_bag_is_refused(tmp_path):
-    for spec in ("street?sensor=dual32", "street?sensor=vlp16&cameras=rolling"):
-        with pytest.raises(InputError, match="cannot be written as a ROS bag"):
-            write_street("ros1", Street.from_spec(spec), tmp_path / "out", [60])
-    assert not (tmp_path / "out").exists()
 
 
 # Points

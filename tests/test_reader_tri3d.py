@@ -13,12 +13,12 @@ from importlib.util import find_spec
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from writers.excerpt import Excerpt
 
 from densify.config.errors import InputError
 from densify.geometry.cameras import image_points
 from densify.geometry.poses import inverse
 from densify.outputs.png import encode_png
-from densify.outputs.writers.excerpt import Excerpt
 from densify.readers import open_sequence
 from densify.readers.street import Street
 from densify.readers.tri3d import Tri3d

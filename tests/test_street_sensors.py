@@ -5,9 +5,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from writers import write_street
 
 from densify.geometry.poses import inverse, transform
-from densify.outputs.writers import write_street
 from densify.readers.describe import describe
 from densify.readers.kitti.raw import KittiRaw
 from densify.readers.street import Street

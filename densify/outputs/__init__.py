@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""The files of a result, each whole or not there. What else is written to disk: the flow between
-two point files (`densify.cli.point_files`), and simulated recordings (`densify.outputs.writers`)
-with their truth (`densify.readers.truth_files`).
+"""The files of a result, each whole or not there.
+
+Written elsewhere: the flow between two point files (`densify.cli.point_files`) and the truth of
+simulated recordings (`densify.readers.truth_files`).
 """
 
 from densify.outputs.cloud_laz import StoredCloud, read_cloud, write_cloud

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""``densify simulate``: the built-in street in a data set's own format."""
+"""``densify simulate``: write the built-in street as a recording."""
 
 from __future__ import annotations
 
@@ -19,15 +19,14 @@ if TYPE_CHECKING:
 
 def add(commands: Any) -> None:
     """Its options."""
-    about = "write the built-in street in a data set's format with exact ground truth"
+    about = "write the built-in street as a recording with exact ground truth"
     parser = add_verb(commands, "simulate", answer, about)
     parser.add_argument("--out", metavar="DIR", type=Path, required=True, help="folder to make")
     parser.add_argument(
         "--format",
         default="kitti",
         metavar="NAME",
-        help="the format to write: kitti (default), folder, ros1, ros2, argoverse2, "
-        "kitti-odometry, kitti-tracking, kitti-360, nuscenes, opensceneflow, waymo, dgp, pandaset",
+        help="kitti (a raw drive, default) or folder (numbered sweeps with densify.yaml)",
     )
     parser.add_argument(
         "--preset",
@@ -59,8 +58,8 @@ def add(commands: Any) -> None:
 
 
 def answer(options: argparse.Namespace) -> Iterator[Answer]:
-    """The built-in street in a data set's format, with truth."""
-    from densify.outputs.writers import write_street
+    """Write the street and say where it is."""
+    from densify.outputs.simulated_street import write_street
     from densify.readers.street import Street
 
     street = Street.from_spec(_street_spec(options))
