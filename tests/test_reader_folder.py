@@ -65,9 +65,9 @@ def test_scanners_lenses_and_rolling_shutters_are_kept(tmp_path):
     read = FolderConfig.read(tmp_path)
     np.testing.assert_allclose(read.sweeps.scanner_origins, street.simulator.sensor.origins_m)
     assert read.sweeps.columns[-1] == "lidar"
-    for files in read.cameras:
-        camera = street.cameras[files.camera.name]
-        for key, value in vars(files.camera).items():
+    for name, (given, _) in read.cameras.items():
+        camera = street.cameras[name]
+        for key, value in vars(given).items():
             np.testing.assert_array_equal(value, getattr(camera, key))
     origins = "scanner_origins: [[0, 0, 0], [1, 0, -0.5]]"
     config(tmp_path, f"sweeps: {{columns: [x, y, z, lidar], {origins}}}\n")
@@ -306,7 +306,7 @@ def test_the_documented_example_is_right(tmp_path):
     text = (Path(__file__).parents[1] / "docs" / "formats.md").read_text("utf-8")
     read = FolderConfig.read(config(tmp_path, text.split("```yaml\n")[1].split("```")[0]))
     assert read.sweeps.compensated and read.poses.T_frame_lidar[2, 3] == 1.6
-    assert read.cameras[0].camera.K[0, 0] == 1000
+    assert next(iter(read.cameras.values()))[0].K[0, 0] == 1000
 
 
 # Drafts

@@ -259,6 +259,21 @@ def truth_beside(recording: Path) -> Truth | None:
     return FileTruth(recording / "truth")
 
 
+def parse_numbers(text: str, where: str, count: int) -> Float:
+    """Return the (count,) finite numbers of a line or file. Raises InputError that starts with
+    ``where``."""
+    words = text.split()
+    if len(words) != count:
+        raise InputError(f"{where}: got {len(words)} values, expected {count} numbers")
+    try:
+        values = np.array(words, np.float64)
+    except ValueError as error:
+        raise InputError(f"{where}: {error}; expected {count} numbers") from None
+    if not np.isfinite(values).all():
+        raise InputError(f"{where}: got a value that is not finite, expected {count} numbers")
+    return values
+
+
 def rigid(T: Float, where: str) -> Float:
     """(4,4) or (3,4) -> (4,4) float64. Raises InputError, which starts with ``where``, if it is not
     finite or its upper left is no rotation."""

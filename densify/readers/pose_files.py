@@ -9,28 +9,27 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from densify.config.errors import InputError
 from densify.config.file_content import read_text
 from densify.geometry.types import Float
-from densify.readers.file_sequence import rigid
-from densify.readers.pose_track import PoseTrack
+from densify.readers.file_sequence import parse_numbers, quaternion_pose, rigid
 from densify.readers.stamp_files import in_ns, unit_of
+
+Line = tuple[int, list[str]]  # number and words
 
 _TIMES = ("timestamp", "time", "stamp", "t")
 _PLACES = tuple((a, f"t{a}", f"p{a}", f"pos_{a}", f"position_{a}") for a in "xyz")
 _TURNS = tuple((f"q{a}", f"q_{a}", f"rot_{a}", f"orientation_{a}") for a in "wxyz")
 _NUMBERS = ("frame", "index", "number", "id")
-_UNIT_LENGTH = 0.01  # how far a quaternion's length may be from 1
 
 
 @dataclass(frozen=True)
 class PoseFile:
     """Poses as they are written, T_world_body if nothing else is known.
 
-    form: for people. T: (n,4,4). stamps: when each was, None if the file has no times. numbers: of
-    the frames that they are of, None if the file does not say.
+    form: for people. T: (n,4,4). stamps_ns: when each was, None if the file has no times. numbers:
+    of the frames that they belong to, None if the file does not say.
     """
 
     path: Path
@@ -49,7 +48,7 @@ class PoseFile:
         ]
         names = _header(lines)
         lines = [(number, words) for number, words in lines if not words[0].startswith("#")]
-        if names and lines and not _is_number(lines[0][1][0]):
+        if names and lines and lines[0][1][0].strip('"').lower() in names:
             lines = lines[1:]
         if not lines:
             raise InputError(f"{path}: holds no poses")
@@ -61,43 +60,29 @@ class PoseFile:
         if num_columns == 4 and len(table) % 4 == 0:
             return PoseFile(path, "4x4 blocks", _rigid(path, table.reshape(-1, 4, 4), at[::4]))
         if num_columns in (12, 13, 16, 17):
-            values = table[:, num_columns % 4 :]
+            values = table[:, num_columns % 4 :].reshape(len(table), -1, 4)
             form = "KITTI 3x4" if num_columns < 16 else "4x4 rows"
-            T = _rigid(path, values.reshape(len(table), -1, 4), at)
             numbers = tuple(int(n) for n in table[:, 0]) if num_columns % 4 else None
-            return PoseFile(path, form, T, None, numbers)
+            return PoseFile(path, form, _rigid(path, values, at), None, numbers)
         if num_columns == 8:
             T = _of_quaternions(path, table[:, [7, 4, 5, 6]], table[:, 1:4], at)
-            stamps_ns = _stamps(path, [words[0] for _, words in lines], unit)
-            return PoseFile(path, "TUM", T, stamps_ns)
+            return PoseFile(path, "TUM", T, _stamps(path, [words[0] for _, words in lines], unit))
         raise InputError(
             f"{path}: line {at[0]}: got {num_columns} numbers, expected 12 (KITTI), 16 (4x4), 8 "
             f"(TUM: time x y z qx qy qz qw), 4 in blocks of four lines, or a first line of names"
         )
 
-    def track(self) -> PoseTrack | None:
-        """The poses by time, None without times. Raises InputError unless they ascend."""
-        if self.stamps_ns is None:
-            return None
-        return PoseTrack(str(self.path), np.array(self.stamps_ns, np.int64), self.T)
 
-
-def _header(lines: Sequence[tuple[int, list[str]]]) -> list[str] | None:
-    """The names of the columns in lower case, if the first line has them."""
-    if not lines:
-        return None
-    words = [word.strip('"').lower() for word in lines[0][1]]
+def _header(lines: Sequence[Line]) -> list[str] | None:
+    """Return the names of the columns in lower case, if the first line has them."""
+    words = [word.strip('"').lower() for word in lines[0][1]] if lines else []
     words = [word.lstrip("#") for word in words if word != "#"]
     named = [word for word in words if any(word in one for one in _TURNS)]
     return words if len(named) == 4 else None
 
 
 def _of_columns(
-    path: Path,
-    names: Sequence[str],
-    table: Float,
-    lines: Sequence[tuple[int, list[str]]],
-    unit: str,
+    path: Path, names: Sequence[str], table: Float, lines: Sequence[Line], unit: str
 ) -> PoseFile:
     def column(choices: Sequence[str]) -> int | None:
         return next((names.index(name) for name in choices if name in names), None)
@@ -132,7 +117,7 @@ def _stamps(path: Path, times: Sequence[str], unit: str) -> tuple[int, ...]:
         ) from None
 
 
-def _numbers(path: Path, lines: Sequence[tuple[int, list[str]]]) -> Float:
+def _numbers(path: Path, lines: Sequence[Line]) -> Float:
     width = len(lines[0][1])
     rows = []
     for number, words in lines:
@@ -141,40 +126,15 @@ def _numbers(path: Path, lines: Sequence[tuple[int, list[str]]]) -> Float:
                 f"{path}: line {number}: got {len(words)} numbers, expected {width} as in the "
                 f"lines before; it may be cut off"
             )
-        try:
-            rows.append([float(word) for word in words])
-        except ValueError as error:
-            raise InputError(f"{path}: line {number}: {error}; expected numbers") from None
-    table = np.array(rows)
-    bad = np.flatnonzero(~np.isfinite(table).all(axis=1))
-    if len(bad):
-        raise InputError(
-            f"{path}: line {lines[bad[0]][0]}: got a value that is not finite, expected a pose"
-        )
-    return table
+        rows.append(parse_numbers(" ".join(words), f"{path}: line {number}", width))
+    return np.array(rows)
 
 
 def _of_quaternions(path: Path, w_x_y_z: Float, places: Float, at: Sequence[int]) -> Float:
     """(n,4) and (n,3) -> (n,4,4)."""
-    length = np.linalg.norm(w_x_y_z, axis=1)
-    bad = np.flatnonzero(np.abs(length - 1) > _UNIT_LENGTH)
-    if len(bad):
-        raise InputError(
-            f"{path}: line {at[bad[0]]}: got a quaternion of length {length[bad[0]]:.4g}, expected "
-            f"a unit one"
-        )
-    T = np.tile(np.eye(4), (len(places), 1, 1))
-    T[:, :3, :3] = Rotation.from_quat(w_x_y_z[:, [1, 2, 3, 0]]).as_matrix()
-    T[:, :3, 3] = places
-    return T
+    rows = zip(w_x_y_z, places, at, strict=True)
+    return np.stack([quaternion_pose(q, place, f"{path}: line {n}") for q, place, n in rows])
 
 
 def _rigid(path: Path, T: Float, at: Sequence[int]) -> Float:
     return np.stack([rigid(one, f"{path}: line {n}") for one, n in zip(T, at, strict=True)])
-
-
-def _is_number(word: str) -> bool:
-    try:
-        return bool(np.isfinite(float(word)))
-    except ValueError:
-        return False

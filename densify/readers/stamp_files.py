@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Times in the names of files and in text files, whatever their unit."""
+"""Times in the names of files and in text files, in any unit."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _SECONDS_AND_NS = re.compile(r"(?<!\d)(\d{10})[_-](\d{9})(?!\d)")
 _NUMBER = re.compile(r"\d+(?:\.\d+)?")
 _FILE_COLUMNS = ("filename", "file", "name", "image", "sweep", "path")
 _TIME_COLUMNS = ("timestamp", "time", "stamp", "t")
-_MAX_NUMBER_DIGITS = 18  # beyond, a name is no frame's number
+_MAX_NUMBER_DIGITS = 18  # a longer number is no frame's
 _MOST_NS = 2**63
 
 
@@ -36,17 +36,19 @@ class Named(NamedTuple):
 
 
 def named(path: Path, unit: str = "") -> Named:
-    """What a file's name says: ``0000000120``, ``cloud_12``, ``1317042651.468569638``,
-    ``1317042651_468569638`` and ``1317042651468`` are numbers or times since 1970 in a unit that
-    their size tells. unit: the last number in the name is a time in this unit."""
-    stem = path.stem
-    words = _NUMBER.findall(stem)
+    """Return what a file's name says: ``0000000120`` and ``cloud_12`` are numbers;
+    ``1317042651.468569638``, ``1317042651_468569638`` and ``1317042651468`` are times since 1970 in
+    a unit that their size tells.
+
+    unit: the last number in the name is a time in this unit.
+    """
+    words = _NUMBER.findall(path.stem)
     if unit:
         try:
             return Named(path, None, in_ns(words[-1], unit) if words else None)
         except ValueError:
             return Named(path, None, None)
-    split = _SECONDS_AND_NS.search(stem)
+    split = _SECONDS_AND_NS.search(path.stem)
     if split and _epoch_unit(Decimal(split[1])) == "s":
         return Named(path, None, in_ns(f"{split[1]}.{split[2]}", "s"))
     for word in reversed(words):
@@ -54,12 +56,12 @@ def named(path: Path, unit: str = "") -> Named:
         # ten digits without a fraction are a number with zeros before it, as KITTI's
         if epoch and (epoch != "s" or "." in word) and not word.startswith("0"):
             return Named(path, None, in_ns(word, epoch))
-    digits = [word for word in re.findall(r"\d+", stem) if len(word) <= _MAX_NUMBER_DIGITS]
+    digits = [word for word in re.findall(r"\d+", path.stem) if len(word) <= _MAX_NUMBER_DIGITS]
     return Named(path, int(digits[-1]) if digits else None, None)
 
 
 def in_ns(text: str, unit: str) -> int:
-    """A decimal number of this unit as nanoseconds, every digit kept. Raises ValueError."""
+    """Return a decimal number of this unit as nanoseconds, every digit kept. Raises ValueError."""
     try:
         value = Decimal(text)
     except InvalidOperation:
@@ -73,8 +75,8 @@ def in_ns(text: str, unit: str) -> int:
 
 
 def date_ns(text: str) -> int:
-    """A date and time in UTC as nanoseconds since 1970, every digit kept. Raises ValueError, also
-    for years that nanoseconds in 64 bits do not reach, of which numpy makes others."""
+    """Return a date and time in UTC as nanoseconds since 1970, every digit kept. Raises ValueError,
+    also for years that 64 bits do not reach, of which numpy makes others."""
     day = np.datetime64(text, "D")
     if not np.datetime64("1970-01-01") <= day < np.datetime64("2262-01-01"):
         raise ValueError(f"got {text!r}, expected a year from 1970 to 2261")
@@ -82,7 +84,7 @@ def date_ns(text: str) -> int:
 
 
 def unit_of(times: Sequence[str]) -> str:
-    """The unit in which these are times since 1970, or else that in which the usual step between
+    """Return the unit in which these are times since 1970, or else in which the usual step between
     them is one of sweeps or images; "" if there is none. Raises ValueError for no numbers."""
     try:
         values = sorted(Decimal(text) for text in times)
@@ -99,9 +101,16 @@ def unit_of(times: Sequence[str]) -> str:
     return fit[0] if fit else ""
 
 
+def _epoch_unit(value: Decimal) -> str:
+    for unit, ns in UNIT_NS.items():
+        if _EPOCH_S[0] <= value * ns / 1_000_000_000 < _EPOCH_S[1]:
+            return unit
+    return ""
+
+
 class StampFile(NamedTuple):
     """Times of a text file, line by line. unit: what was found or given. names: the file that each
-    line is of, where it says so."""
+    line belongs to, where it says so."""
 
     path: Path
     stamp_ns: tuple[int, ...]
@@ -110,8 +119,8 @@ class StampFile(NamedTuple):
 
     @staticmethod
     def read(path: Path, unit: str = "") -> StampFile:
-        """One time a line, or columns of which one is the time and another may be a file's name;
-        numbers, or dates such as 2011-09-26 13:10:51.158069617.
+        """Read one time a line, or columns of which one is the time and another may be a file's
+        name; numbers, or dates such as 2011-09-26 13:10:51.158069617.
 
         unit: "" finds it out. Raises InputError that names file and line.
         """
@@ -119,25 +128,27 @@ class StampFile(NamedTuple):
         header = [word.lower().split("[")[0].strip() for word in rows[0][1]] if rows else []
         at_time = next((header.index(n) for n in _TIME_COLUMNS if n in header), None)
         at_name = next((header.index(n) for n in _FILE_COLUMNS if n in header), None)
-        if at_time is None and at_name is None:
-            rows = rows[1:] if rows and rows[0][0] < 0 else rows
-            at_time, at_name = _columns(rows[0][1]) if rows else (0, None)
-        else:
+        if at_time is not None or at_name is not None or (rows and rows[0][0] < 0):
             rows = rows[1:]
-            at_time = 0 if at_time is None else at_time
+        if at_time is None and at_name is None and rows:
+            words = rows[0][1]
+            names = [i for i, word in enumerate(words) if Path(word).suffix[1:2].isalpha()]
+            at_time = next((i for i in range(len(words)) if i not in names), 0)
+            at_name = names[0] if names else None
         if not rows:
             raise InputError(f"{path}: holds no times, expected one in each line")
+        at_time = at_time or 0
         width = 1 + max(at_time, at_name or 0)
         for line, words in rows:
             if len(words) < width:
                 raise InputError(f"{path}: line {line}: got {len(words)} columns, expected {width}")
         times = [words[at_time] for _, words in rows]
-        names = None if at_name is None else tuple(Path(words[at_name]).name for _, words in rows)
-        return StampFile(path, *_parse(path, rows, times, unit), names)
+        files = None if at_name is None else tuple(Path(words[at_name]).name for _, words in rows)
+        return StampFile(path, *_parse(path, [line for line, _ in rows], times, unit), files)
 
 
 def _parse(
-    path: Path, rows: Sequence[tuple[int, list[str]]], times: Sequence[str], unit: str
+    path: Path, lines: Sequence[int], times: Sequence[str], unit: str
 ) -> tuple[tuple[int, ...], str]:
     dates = "-" in times[0][1:] and ":" in times[0]
     if not (dates or unit):
@@ -151,12 +162,9 @@ def _parse(
                 f"in densify.yaml: stamps_unit: s, ms, us or ns"
             )
     found = []
-    for (line, _), text in zip(rows, times, strict=True):
+    for line, text in zip(lines, times, strict=True):
         try:
-            if dates:
-                found.append(date_ns(text.rstrip("Z")))
-            else:
-                found.append(in_ns(text, unit))
+            found.append(date_ns(text.rstrip("Z")) if dates else in_ns(text, unit))
         except ValueError:
             raise InputError(
                 f"{path}: line {line}: got {text!r}, expected "
@@ -166,9 +174,9 @@ def _parse(
 
 
 def _rows(path: Path) -> list[tuple[int, list[str]]]:
-    """Line number and words of each line that is neither empty nor a comment; of a comment in the
-    first line too, which may name the columns, with the number -1. A blank between date and time
-    does not part words."""
+    """Return line number and words of each line that is neither empty nor a comment. A comment in
+    the first line may name the columns and has the number -1. A blank between date and time does
+    not part words."""
     rows: list[tuple[int, list[str]]] = []
     lines = read_text(path).splitlines()
     delimiter = next((d for d in (",", ";", "\t") if lines and d in lines[0]), None)
@@ -182,17 +190,3 @@ def _rows(path: Path) -> list[tuple[int, list[str]]]:
             words = re.sub(r"(\d-\d\d) (\d\d:)", r"\1T\2", text.lstrip("# ")).split()
         rows.append((-1 if text.startswith("#") else number, words))
     return rows
-
-
-def _columns(words: Sequence[str]) -> tuple[int, int | None]:
-    """Which column is the time and which a file's name, by what the first line holds."""
-    names = [i for i, word in enumerate(words) if Path(word).suffix.lower()[1:2].isalpha()]
-    times = [i for i in range(len(words)) if i not in names]
-    return (times[0] if times else 0), (names[0] if names else None)
-
-
-def _epoch_unit(value: Decimal) -> str:
-    for unit, ns in UNIT_NS.items():
-        if _EPOCH_S[0] <= value * ns / 1_000_000_000 < _EPOCH_S[1]:
-            return unit
-    return ""

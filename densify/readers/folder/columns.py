@@ -17,7 +17,7 @@ from densify.config.errors import InputError
 from densify.geometry.types import Bool, Int
 from densify.readers.file_sequence import Returns
 from densify.readers.folder.config import SweepFiles
-from densify.readers.folder.files import Series
+from densify.readers.folder.series import Series
 from densify.readers.point_fields import (
     Fields,
     PointTimes,
@@ -77,8 +77,8 @@ class SweepColumns:
                     f"{path}: no column {name}, which other sweeps have; got {', '.join(columns)}"
                 )
         points = self.settings.scale_m * points_of(columns, layout.fields)
-        if self.settings.R_lidar_stored is not None:
-            points = points @ self.settings.R_lidar_stored.T
+        if self.settings.axes is not None:
+            points = points @ self.settings.axes.T
         intensity = None
         if layout.fields.intensity:
             intensity = scaled(columns[layout.fields.intensity], layout.intensity_scale)
@@ -200,7 +200,7 @@ class SweepColumns:
             period_ns,
             stamp_ns,
             known.time_unit,
-            known.absolute,
+            known.time_is == "absolute" if known.time_is else None,
             known.reference,
         )
 

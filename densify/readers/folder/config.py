@@ -1,24 +1,172 @@
 # SPDX-License-Identifier: MIT
-"""``densify.yaml`` beside a recording of no known form: what its files cannot say themselves. Every
-key may be left out; `densify.readers.folder.reader` says what is then found or assumed.
-"""
+"""``densify.yaml`` beside a recording of no known form: what its files do not say themselves. Every
+key may be left out; `densify.readers.folder.reader` says what is then found or assumed. Whatever is
+wrong is named by file, line and key."""
 
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass, field
+import reprlib
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, fields
 from pathlib import Path
+from typing import Any, TypeVar
 
 import numpy as np
 
 from densify.config.errors import InputError
+from densify.config.file_content import read_yaml
+from densify.config.plugins.table import did_you_mean
 from densify.geometry.types import Camera, Float
 from densify.readers.file_sequence import rigid
-from densify.readers.folder.yaml_sections import Section, read_sections
 from densify.readers.point_fields import REFERENCES, UNIT_NS
 
 NAME = "densify.yaml"
 _MODELS = {"pinhole": (0, 4, 5, 8, 12, 14), "fisheye": (4,), "mei": (5,)}
+_AXES = {s + a: (-1.0 if s else 1.0) * np.eye(3)[i] for s in ("", "-") for i, a in enumerate("xyz")}
+
+C = TypeVar("C")
+
+
+@dataclass(frozen=True)
+class Section:
+    """A mapping in the file. name: keys down to it, "" for the whole. lines: of all keys."""
+
+    path: Path
+    name: str
+    values: Mapping[str, Any]
+    lines: Mapping[str, int]
+
+    def place(self, key: str) -> str:
+        """Return file, line and key, to begin a message with."""
+        full = f"{self.name}.{key}" if self.name else key
+        line = f"line {self.lines[full]}: " if full in self.lines else ""
+        return f"{self.path}: {line}{full}"
+
+    def wrong(self, key: str, expected: str) -> InputError:
+        """Return the error that the value of this key is not what was expected."""
+        got = self.values.get(key)
+        shown = "nothing" if got is None else reprlib.repr(got)
+        return InputError(f"{self.place(key)}: got {shown}, expected {expected}")
+
+    def section(self, key: str) -> Section:
+        """Return the mapping below this key, empty if it is not there."""
+        value = self.values.get(key)
+        value = {} if value is None else value
+        if not isinstance(value, dict) or not all(isinstance(k, str) for k in value):
+            raise self.wrong(key, "a mapping of keys to values")
+        name = f"{self.name}.{key}" if self.name else key
+        return Section(self.path, name, value, self.lines)
+
+    def fill(self, kind: type[C]) -> C:
+        """Return the dataclass whose fields, made by `_key`, are the keys of this section."""
+        readers = {f.name: f.metadata["read"] for f in fields(kind)}  # type: ignore[arg-type]
+        self.check_keys(readers)
+        given = [key for key in readers if self.values.get(key) is not None]
+        return kind(**{key: readers[key](self, key) for key in given})
+
+    def check_keys(self, known: Mapping[str, Any] | Sequence[str]) -> None:
+        """Raise InputError for a key that is none of these."""
+        for key in self.values:
+            if key not in known:
+                raise InputError(
+                    f"{self.place(key)}: unknown key; {did_you_mean(key, known)}expected some of "
+                    f"{', '.join(sorted(known))}"
+                )
+
+
+Read = Callable[[Section, str], Any]
+
+
+def _key(read: Read, default: Any = "") -> Any:
+    return field(default=default, metadata={"read": read})
+
+
+def _text(section: Section, key: str) -> str:
+    value = section.values[key]
+    if not isinstance(value, str):
+        raise section.wrong(key, "a text")
+    return value
+
+
+def _choice(*choices: str) -> Read:
+    def read(section: Section, key: str) -> str:
+        if section.values[key] not in choices:
+            raise section.wrong(key, f"one of {', '.join(choices)}")
+        return str(section.values[key])
+
+    return read
+
+
+def _flag(section: Section, key: str) -> bool:
+    value = section.values[key]
+    if not isinstance(value, bool):
+        raise section.wrong(key, "true or false")
+    return value
+
+
+def _number(above: float = -np.inf) -> Read:
+    def read(section: Section, key: str) -> float:
+        value = section.values[key]
+        try:  # YAML 1.1 reads 1e-3 as text
+            number = float("nan" if isinstance(value, bool) else value)
+        except (TypeError, ValueError, OverflowError):
+            number = np.nan
+        if not (np.isfinite(number) and number > above):
+            beyond = "" if above == -np.inf else f" above {above:g}"
+            raise section.wrong(key, f"a finite number{beyond}")
+        return number
+
+    return read
+
+
+def _names(section: Section, key: str) -> tuple[str, ...]:
+    value = section.values[key]
+    if not (isinstance(value, list) and value and all(isinstance(v, str) for v in value)):
+        raise section.wrong(key, "a list of names")
+    return tuple(value)
+
+
+def _array(*shapes: tuple[int, ...]) -> Read:
+    """An array of one of these shapes (-1: any number of rows), also written as one long list."""
+    texts = ["(" + ", ".join("N" if n < 0 else str(n) for n in shape) + ")" for shape in shapes]
+    expected = f"finite numbers of shape {' or '.join(texts)}"
+
+    def read(section: Section, key: str) -> Float:
+        try:
+            array = np.array(section.values[key], dtype=np.float64)
+        except (ValueError, TypeError, OverflowError):
+            raise section.wrong(key, expected) from None
+        for shape in shapes:
+            size = int(np.prod(shape))
+            fits = array.size == size if size > 0 else array.size % -size == 0
+            if fits and array.ndim in (1, len(shape)) and np.isfinite(array).all():
+                return array.reshape(shape)
+        raise section.wrong(key, expected)
+
+    return read
+
+
+def _axes(section: Section, key: str) -> Float:
+    """(3,3) of three names such as [z, -x, -y]: where the lidar's x, y and z are in the file."""
+    R = np.array([_AXES.get(name, np.zeros(3)) for name in _names(section, key)])
+    if R.shape != (3, 3) or not np.allclose(R @ R.T, np.eye(3)):
+        raise section.wrong(key, "x, y and z in some order, some with a -, such as [z, -x, -y]")
+    return R
+
+
+def _pose(section: Section, key: str) -> Float:
+    return rigid(_array((4, 4), (3, 4))(section, key), section.place(key))
+
+
+def _intrinsics(section: Section, key: str) -> Float:
+    K = _array((3, 3), (4,))(section, key)
+    if K.shape == (4,):
+        fx, fy, cx, cy = K
+        K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
+    if min(K[0, 0], K[1, 1]) <= 0 or not np.allclose(K[[1, 2, 2, 2], [0, 0, 1, 2]], [0, 0, 0, 1]):
+        raise section.wrong(key, _REQUIRED["K"])
+    return K
 
 
 @dataclass(frozen=True)
@@ -26,58 +174,33 @@ class SweepFiles:
     """Section ``sweeps``.
 
     files: folder of the sweeps, "" to look for it. columns: of files without names. scale_m:
-    metres of a unit of the points. R_lidar_stored: (3,3), from key ``axes``, turns (or mirrors)
-    stored points to the lidar's frame, x forward, y left, z up; None leaves them. intensity,
-    time, lidar, radial_velocity: which column plays that part, "" to find it by its name.
-    intensity_scale: what is full brightness, 0 to find it. time_unit, absolute, reference: as
-    `densify.readers.point_fields.find_times`. stamps: ``names`` (of the files) or a file with one
-    time for each sweep, "" to look for them; stamps_unit: theirs. rate_hz: of sweeps without
-    stamps, 0 to take it from the points' times. compensated: the points were carried to the
-    stamp by the vehicle's motion. scanner_origins: (S,3) metres, None where rays start at 0 0 0.
+    metres of a unit of the points. axes: (3,3) turns (or mirrors) stored points to the lidar's
+    frame, x forward, y left, z up; None leaves them. intensity, time, lidar, radial_velocity: which
+    column plays that part, "" to find it by its name. intensity_scale: what is full brightness, 0
+    to find it. time_unit, time_is, reference: see `densify.readers.point_fields.find_times`.
+    stamps: ``names`` (of the files) or a file with one time for each sweep, "" to look for them;
+    stamps_unit: theirs. rate_hz: of sweeps without stamps, 0 to take it from the points' times.
+    compensated: the points were carried to the stamp by the vehicle's motion. scanner_origins:
+    (S,3) metres, None where rays start at 0 0 0.
     """
 
-    files: str = ""
-    columns: tuple[str, ...] | None = None
-    scale_m: float = 1.0
-    R_lidar_stored: Float | None = None
-    intensity: str = ""
-    intensity_scale: float = 0.0
-    time: str = ""
-    time_unit: str = ""
-    absolute: bool | None = None
-    reference: str = ""
-    lidar: str = ""
-    radial_velocity: str = ""
-    stamps: str = ""
-    stamps_unit: str = ""
-    rate_hz: float = 0.0
-    compensated: bool = False
-    scanner_origins: Float | None = None
-
-    @staticmethod
-    def of(section: Section) -> SweepFiles:
-        kind = section.choice("time_is", ("relative", "absolute"))
-        found = SweepFiles(
-            files=section.text("files"),
-            columns=section.names("columns"),
-            scale_m=section.number("scale_m", 1.0, above=0.0),
-            R_lidar_stored=_axes(section),
-            intensity=section.text("intensity"),
-            intensity_scale=section.number("intensity_scale", 0.0, above=0.0),
-            time=section.text("time"),
-            time_unit=section.choice("time_unit", tuple(UNIT_NS)),
-            absolute=None if not kind else kind == "absolute",
-            reference=section.choice("reference", REFERENCES),
-            lidar=section.text("lidar"),
-            radial_velocity=section.text("radial_velocity"),
-            stamps=section.text("stamps"),
-            stamps_unit=section.choice("stamps_unit", tuple(UNIT_NS)),
-            rate_hz=section.number("rate_hz", 0.0, above=0.0),
-            compensated=bool(section.flag("compensated", False)),
-            scanner_origins=section.numbers("scanner_origins", (-1, 3)),
-        )
-        section.done()
-        return found
+    files: str = _key(_text)
+    columns: tuple[str, ...] | None = _key(_names, None)
+    scale_m: float = _key(_number(above=0.0), 1.0)
+    axes: Float | None = _key(_axes, None)
+    intensity: str = _key(_text)
+    intensity_scale: float = _key(_number(above=0.0), 0.0)
+    time: str = _key(_text)
+    time_unit: str = _key(_choice(*UNIT_NS))
+    time_is: str = _key(_choice("relative", "absolute"))
+    reference: str = _key(_choice(*REFERENCES))
+    lidar: str = _key(_text)
+    radial_velocity: str = _key(_text)
+    stamps: str = _key(_text)
+    stamps_unit: str = _key(_choice(*UNIT_NS))
+    rate_hz: float = _key(_number(above=0.0), 0.0)
+    compensated: bool = _key(_flag, False)
+    scanner_origins: Float | None = _key(_array((-1, 3)), None)
 
 
 @dataclass(frozen=True)
@@ -85,70 +208,48 @@ class Poses:
     """Section ``poses``. file: "" to look for it. T_frame_lidar: (4,4) the lidar in the frame whose
     poses these are. inverse: the file has T_lidar_world, not T_world_lidar."""
 
-    file: str = ""
-    stamps_unit: str = ""
-    T_frame_lidar: Float | None = None
-    inverse: bool = False
-
-    @staticmethod
-    def of(section: Section) -> Poses:
-        found = Poses(
-            file=section.text("file"),
-            stamps_unit=section.choice("stamps_unit", tuple(UNIT_NS)),
-            T_frame_lidar=_pose(section, "T_frame_lidar"),
-            inverse=bool(section.flag("inverse", False)),
-        )
-        section.done()
-        return found
+    file: str = _key(_text)
+    stamps_unit: str = _key(_choice(*UNIT_NS))
+    T_frame_lidar: Float | None = _key(_pose, None)
+    inverse: bool = _key(_flag, False)
 
 
 @dataclass(frozen=True)
 class CameraFiles:
-    """One of the section ``cameras``. files: folder of its images. stamps: ``names``, ``sweeps``
-    (an image is exposed when the sweep of its number is stamped), or a file, "" to look for them.
-    clock_offset_s: is added to the stamps, to bring them to the sweeps' clock."""
+    """One of the section ``cameras``. files: folder of its images. size: width, height in pixels.
+    K: (3,3). T_cam_lidar: (4,4). stamps: ``names``, ``sweeps`` (an image is exposed when the sweep
+    of its number is stamped), or a file, "" to look for them. clock_offset_s: is added to the
+    stamps, to bring them to the sweeps' clock."""
 
-    camera: Camera
-    files: str
-    stamps: str = ""
-    stamps_unit: str = ""
-    clock_offset_s: float = 0.0
+    files: str = _key(_text)
+    size: Float | None = _key(_array((2,)), None)
+    K: Float | None = _key(_intrinsics, None)
+    T_cam_lidar: Float | None = _key(_pose, None)
+    model: str = _key(_choice(*_MODELS), "pinhole")
+    distortion: Float | tuple[float, ...] = _key(_array((-1,)), ())
+    max_angle_deg: float = _key(_number(above=0.0), 180.0)
+    row_time_s: float = _key(_number(), 0.0)
+    stamps: str = _key(_text)
+    stamps_unit: str = _key(_choice(*UNIT_NS))
+    clock_offset_s: float = _key(_number(), 0.0)
 
-    @staticmethod
-    def of(section: Section, name: str) -> CameraFiles:
-        if not re.fullmatch(r"[\w.-]+", name) or name.startswith("."):
-            raise InputError(
-                f"{section.where}: cameras: got the name {name!r}, expected letters, digits, _ - ."
-            )
-        for key in ("files", "size", "K", "T_cam_lidar"):
-            if not section.has(key):
-                expected = {
-                    "files": "the folder of its images",
-                    "size": "[width, height] in pixels",
-                    "K": "[fx, fy, cx, cy] or three rows",
-                    "T_cam_lidar": "four rows, from the lidar's frame to the camera's (x right, "
-                    "y down, z forward)",
-                }[key]
-                raise section.wrong(key, expected)
-        found = CameraFiles(
-            camera=_camera(section, name),
-            files=section.text("files"),
-            stamps=section.text("stamps"),
-            stamps_unit=section.choice("stamps_unit", tuple(UNIT_NS)),
-            clock_offset_s=section.number("clock_offset_s", 0.0),
-        )
-        section.done()
-        return found
+
+_REQUIRED = {
+    "files": "the folder of its images",
+    "size": "[width, height] in whole pixels",
+    "K": "[fx, fy, cx, cy] or three rows, the last one 0 0 1, with fx and fy above 0",
+    "T_cam_lidar": "four rows, from the lidar's frame to the camera's (x right, y down, z forward)",
+}
 
 
 @dataclass(frozen=True)
 class FolderConfig:
-    """path: of the file, None where there is none."""
+    """path: of the file, None where there is none. cameras: each with its files, by name."""
 
     path: Path | None = None
     sweeps: SweepFiles = field(default_factory=SweepFiles)
     poses: Poses = field(default_factory=Poses)
-    cameras: tuple[CameraFiles, ...] = ()
+    cameras: Mapping[str, tuple[Camera, CameraFiles]] = field(default_factory=dict)
 
     @staticmethod
     def read(folder: Path) -> FolderConfig:
@@ -156,71 +257,51 @@ class FolderConfig:
         path = folder / NAME
         if not path.is_file():
             return FolderConfig()
-        root = read_sections(path)
-        cameras = root.section("cameras").sections()
-        found = FolderConfig(
+        values, lines = read_yaml(path)
+        values = {} if values is None else values
+        if not isinstance(values, dict) or not all(isinstance(key, str) for key in values):
+            raise InputError(
+                f"{path}: got {reprlib.repr(values)}, expected a mapping such as sweeps: {{...}}"
+            )
+        root = Section(path, "", values, lines)
+        root.check_keys(("sweeps", "poses", "cameras"))
+        cameras = root.section("cameras")
+        return FolderConfig(
             path,
-            SweepFiles.of(root.section("sweeps")),
-            Poses.of(root.section("poses")),
-            tuple(CameraFiles.of(section, name) for name, section in cameras.items()),
+            root.section("sweeps").fill(SweepFiles),
+            root.section("poses").fill(Poses),
+            {name: _camera(cameras.section(name), name) for name in cameras.values},
         )
-        root.done()
-        return found
 
 
-def _camera(section: Section, name: str) -> Camera:
-    size = section.numbers("size", (2,))
-    if size is None or min(size) < 1 or any(size % 1):
-        raise section.wrong("size", "[width, height] in whole pixels")
-    model = section.choice("model", tuple(_MODELS), "pinhole")
-    distortion = section.numbers("distortion", (-1,))
-    coefficients = () if distortion is None else tuple(float(d) for d in distortion)
-    if model == "pinhole" and not any(coefficients):
+def _camera(section: Section, name: str) -> tuple[Camera, CameraFiles]:
+    if not re.fullmatch(r"[\w.-]+", name) or name.startswith("."):
+        raise InputError(
+            f"{section.path}: cameras: got the name {name!r}, expected letters, digits, _ - ."
+        )
+    given = section.fill(CameraFiles)
+    for key, expected in _REQUIRED.items():
+        if section.values.get(key) is None:
+            raise section.wrong(key, expected)
+    size, K, T_cam_lidar = given.size, given.K, given.T_cam_lidar
+    assert size is not None and K is not None and T_cam_lidar is not None
+    if min(size) < 1 or any(size % 1):
+        raise section.wrong("size", _REQUIRED["size"])
+    coefficients = tuple(float(d) for d in given.distortion)
+    if given.model == "pinhole" and not any(coefficients):
         coefficients = ()
-    if len(coefficients) not in _MODELS[model]:
-        counts = ", ".join(str(n) for n in _MODELS[model])
-        raise section.wrong("distortion", f"{counts} coefficients for a {model} camera")
-    K, T = _K(section), _pose(section, "T_cam_lidar")
-    return Camera(
+    if len(coefficients) not in _MODELS[given.model]:
+        counts = ", ".join(str(n) for n in _MODELS[given.model])
+        raise section.wrong("distortion", f"{counts} coefficients for a {given.model} camera")
+    camera = Camera(
         name=name,
         width_px=int(size[0]),
         height_px=int(size[1]),
         K=K,
-        T_cam_lidar=np.eye(4) if T is None else T,
+        T_cam_lidar=T_cam_lidar,
         distortion=coefficients,
-        model=model,
-        max_angle_deg=section.number("max_angle_deg", 180.0, above=0.0),
-        row_time_s=section.number("row_time_s", 0.0),
+        model=given.model,
+        max_angle_deg=given.max_angle_deg,
+        row_time_s=given.row_time_s,
     )
-
-
-def _axes(section: Section) -> Float | None:
-    """(3,3) of three names such as [z, -x, -y]: where the lidar's x, y and z stand in the file."""
-    names = section.names("axes")
-    if names is None:
-        return None
-    signed = {
-        s + a: (-1.0 if s else 1.0) * np.eye(3)["xyz".index(a)] for s in ("", "-") for a in "xyz"
-    }
-    R = np.array([signed.get(name, np.zeros(3)) for name in names])
-    if R.shape != (3, 3) or not np.allclose(R @ R.T, np.eye(3)):
-        raise section.wrong("axes", "x, y and z in some order, some with a -, such as [z, -x, -y]")
-    return R
-
-
-def _K(section: Section) -> Float:
-    expected = "[fx, fy, cx, cy] or three rows, the last one 0 0 1, with fx and fy above 0"
-    K = section.numbers("K", (3, 3), (4,))
-    if K is None:
-        raise section.wrong("K", expected)
-    if K.shape == (4,):
-        fx, fy, cx, cy = K
-        K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
-    if min(K[0, 0], K[1, 1]) <= 0 or not np.allclose(K[[1, 2, 2, 2], [0, 0, 1, 2]], [0, 0, 0, 1]):
-        raise section.wrong("K", expected)
-    return K
-
-
-def _pose(section: Section, key: str) -> Float | None:
-    T = section.numbers(key, (4, 4), (3, 4))
-    return None if T is None else rigid(T, section.place(key))
+    return camera, given

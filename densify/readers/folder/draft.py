@@ -12,14 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from densify.readers.decoded_files import image_size_px
-from densify.readers.folder.files import (
-    IMAGE_SUFFIXES,
-    find_images,
-    find_pose_file,
-    find_sweeps,
-    in_time,
-    sweep_folders,
-)
+from densify.readers.folder.series import find_images, find_pose_file, in_time, sweep_folders
 from densify.readers.point_fields import find_fields, find_times, full_scale
 from densify.readers.point_files import read_table, unnamed
 from densify.readers.pose_files import PoseFile
@@ -53,18 +46,14 @@ _CAMERA = """\
 
 
 def draft_config(folder: Path) -> str:
-    """The text of a commented densify.yaml that opens as it is. Reads one sweep and one image of
-    each folder. Raises InputError if there are no sweeps, or the first cannot be read."""
+    """Return the text of a commented densify.yaml that opens as it is. Reads one sweep and one
+    image of each folder. Raises InputError if there are no sweeps, or the first cannot be read."""
     groups = sweep_folders(folder)
-    choice = next(iter(groups), "")
-    paths = find_sweeps(folder, choice)
-    parts = [
-        _HEAD,
-        _sweeps(folder, choice, paths, [name for name in groups if name != choice]),
-        _poses(folder),
-        _cameras(folder),
-    ]
-    return "\n".join(parts)
+    choice, paths = next(iter(groups.items()))
+    others = [name for name in groups if name != choice]
+    return "\n".join(
+        [_HEAD, _sweeps(folder, choice, paths, others), _poses(folder), _cameras(folder)]
+    )
 
 
 def _sweeps(folder: Path, files: str, paths: Sequence[Path], others: Sequence[str]) -> str:
@@ -165,9 +154,8 @@ def _poses(folder: Path) -> str:
 
 def _cameras(folder: Path) -> str:
     text = _CAMERAS
-    for files in find_images(folder):
-        place = folder / files
-        first = min(p for p in place.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES)
+    for files, images in find_images(folder).items():
+        place, first = folder / files, images[0]
         width, height = image_size_px(first)
         text += _CAMERA.format(
             name=place.parent.name if place.name in ("data", "images") else place.name,

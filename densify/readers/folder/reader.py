@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Any folder of sweeps: numbered files of points, and beside them whatever there is of stamps,
-poses and images. What the files cannot say stands in a small ``densify.yaml`` in the folder
-(`densify.readers.folder.config`); a folder without one opens as far as can be told.
+poses and images. A small ``densify.yaml`` in the folder (`densify.readers.folder.config`) says what
+the files cannot; a folder without one opens as far as can be told.
 
 points
     in the lidar's frame, as fired. ``sweeps: {compensated: true}`` says that they were carried to
@@ -33,23 +33,17 @@ from pathlib import Path
 import numpy as np
 
 from densify.config.errors import InputError
-from densify.config.file_content import read_bytes
 from densify.geometry import poses
 from densify.geometry.types import Float
-from densify.readers.file_sequence import (
-    FileSequence,
-    Returns,
-    quaternion_pose,
-    truth_beside,
-)
+from densify.readers.file_sequence import FileSequence, Returns, quaternion_pose, truth_beside
 from densify.readers.folder.columns import SweepColumns
 from densify.readers.folder.config import CameraFiles, FolderConfig
-from densify.readers.folder.files import (
-    IMAGE_SUFFIXES,
+from densify.readers.folder.series import (
     Series,
     find_images,
     find_pose_file,
     find_sweeps,
+    images_in,
     in_time,
 )
 from densify.readers.point_files import read_viewpoint
@@ -79,20 +73,23 @@ class Folder(FileSequence):
         files = find_sweeps(folder, known.files)
         self._sweeps = in_time(folder, files, known.stamps, known.stamps_unit)
         self._columns = SweepColumns(self._sweeps, known, self._config.path)
-        self._images = {c.camera.name: _images(folder, c) for c in cameras}
+        images = {name: _images(folder, name, given) for name, (_, given) in cameras.items()}
         super().__init__(
             folder.resolve().name,
             folder,
             tuple(self._sweeps.paths),
-            {c.camera.name: c.camera for c in cameras},
+            {name: camera for name, (camera, _) in cameras.items()},
             truth=truth_beside(folder),
             files=self._sweeps.paths,
+            images={name: series.paths for name, series in images.items()},
         )
-        self._exposed_ns = {c.camera.name: self._exposures(c) for c in cameras}
+        self._exposed_ns = {
+            name: self._exposures(images[name], given) for name, (_, given) in cameras.items()
+        }
         self._poses = self._read_poses()
 
     def stamp_ns(self, frame: int) -> int:
-        """Reference time of a sweep."""
+        """Return the reference time of a sweep."""
         self.check_frame(frame)
         if self._sweeps.stamps_ns is None:
             return int(frame) * self._columns.period.ns
@@ -119,10 +116,11 @@ class Folder(FileSequence):
             lines.append(("poses from", f"{self._poses.path.name} ({self._poses.form})"))
         elif self._has_viewpoints:
             lines.append(("poses from", "VIEWPOINT of the sweeps"))
-        used = {str(Path(c.files)) for c in self._config.cameras}
-        for name, count in find_images(self.where).items():
+        used = {str(Path(given.files)) for _, given in self._config.cameras.values()}
+        for name, images in find_images(self.where).items():
             if name not in used:
-                lines.append(("no camera", f"{name} holds {count} images without a calibration"))
+                text = f"{name} holds {len(images)} images without a calibration"
+                lines.append(("no camera", text))
         return lines
 
     def _returns(self, frame: int) -> tuple[Path, Returns]:
@@ -136,10 +134,6 @@ class Folder(FileSequence):
         points = found.points.copy()
         points[valid] = self._track.as_fired(points[valid], stamp_ns, found.offset_ns[valid])
         return path, replace(found, points=points)
-
-    def _encoded_image(self, camera: str, number: int) -> tuple[Path, bytes]:
-        path = self._images[camera].paths[number]
-        return path, read_bytes(path)
 
     def _pose(self, frame: int) -> Float:
         if self._track is not None:
@@ -196,21 +190,19 @@ class Folder(FileSequence):
         found = [read_viewpoint(self._sweeps.paths[frame]) for frame in sorted(tried)]
         return any(one not in (None, _NO_VIEWPOINT) for one in found)
 
-    def _exposures(self, files: CameraFiles) -> dict[int, int]:
-        images = self._images[files.camera.name]
-        shift_ns = round(files.clock_offset_s * 1e9)
-        if images.stamps_ns is not None:
-            return {n: ns + shift_ns for n, ns in images.stamps_ns.items()}
-        return {n: self.stamp_ns(n) + shift_ns for n in images.paths if n in self._frames}
+    def _exposures(self, images: Series, given: CameraFiles) -> dict[int, int]:
+        shift_ns = round(given.clock_offset_s * 1e9)
+        stamps_ns = images.stamps_ns
+        if stamps_ns is None:
+            stamps_ns = {n: self.stamp_ns(n) for n in images.paths if n in self._frames}
+        return {number: ns + shift_ns for number, ns in stamps_ns.items()}
 
 
-def _images(folder: Path, files: CameraFiles) -> Series:
-    place = folder / files.files
-    paths = list(place.iterdir()) if place.is_dir() else []
-    paths = [path for path in paths if path.suffix.lower() in IMAGE_SUFFIXES]
+def _images(folder: Path, name: str, given: CameraFiles) -> Series:
+    paths = images_in(folder / given.files)
     if not paths:
         raise InputError(
-            f"{place}: no images, though densify.yaml names it: cameras: {{{files.camera.name}: "
-            f"{{files: {files.files}}}}}"
+            f"{folder / given.files}: no images, though densify.yaml names it: cameras: {{{name}: "
+            f"{{files: {given.files}}}}}"
         )
-    return in_time(folder, paths, files.stamps, files.stamps_unit, shared=False)
+    return in_time(folder, paths, given.stamps, given.stamps_unit, shared=False)

@@ -26,7 +26,7 @@ from pathlib import Path
 import numpy as np
 
 from densify.config.errors import InputError
-from densify.config.file_content import parse_yaml, read_bytes, read_text
+from densify.config.file_content import parse_yaml, read_text
 from densify.geometry import poses
 from densify.geometry.types import Camera, Float
 from densify.readers.file_sequence import (
@@ -34,18 +34,16 @@ from densify.readers.file_sequence import (
     Returns,
     chosen_scene,
     numbered_files,
+    parse_numbers,
     rigid,
     truth_beside,
 )
 from densify.readers.kitti.calibration import (
-    NOMINAL_PERIOD_NS,
     Calibration,
     Stamps,
-    parse_numbers,
     read_points,
-    read_size_px,
-    rectified_camera,
     turned_ns,
+    usual_period_ns,
 )
 from densify.readers.pose_track import PoseTrack
 
@@ -83,14 +81,13 @@ class Kitti360(FileSequence):
             )
         self._stamps = _stamps(velodyne)
         self._poses_file = path / "data_poses" / drive / "poses.txt"
-        self._images: dict[str, dict[int, Path]] = {}
-        cameras, exposed_ns = {}, {}
+        cameras, exposed_ns, image_files = {}, {}, {}
         for name, folder in _FOLDERS.items():
             around = path / "data_2d_raw" / drive / name
             images = numbered_files(around / folder, ".png", ".jpg")
             if images:
                 stamps = _stamps(around)
-                self._images[name] = images
+                image_files[name] = images
                 cameras[name] = _camera(path / "calibration", name)
                 exposed_ns[name] = {f: ns for f in images if (ns := stamps.get(f)) is not None}
         super().__init__(
@@ -101,6 +98,7 @@ class Kitti360(FileSequence):
             exposed_ns,
             truth_beside(velodyne.parent),
             self._sweeps,
+            image_files,
         )
 
     def stamp_ns(self, frame: int) -> int:
@@ -114,10 +112,6 @@ class Kitti360(FileSequence):
         offset_ns = turned_ns(points, self._revolution_ns)
         return self._sweeps[frame], Returns(points, columns[:, 3], offset_ns)
 
-    def _encoded_image(self, camera: str, number: int) -> tuple[Path, bytes]:
-        path = self._images[camera][number]
-        return path, read_bytes(path)
-
     def _pose(self, frame: int) -> Float:
         if not self._poses_file.exists():
             return super()._pose(frame)
@@ -126,8 +120,7 @@ class Kitti360(FileSequence):
 
     @cached_property
     def _revolution_ns(self) -> int:
-        known = [ns for ns in self._stamps.lines if ns is not None]
-        return int(np.median(np.diff(known))) if len(known) > 1 else NOMINAL_PERIOD_NS
+        return usual_period_ns(self._stamps.lines)
 
     @cached_property
     def _track(self) -> PoseTrack:
@@ -171,11 +164,9 @@ def _camera(folder: Path, name: str) -> Camera:
     if _FOLDERS[name] == "data_rgb":
         return _fisheye(folder / f"{name}.yaml", name, T_cam_lidar)
     perspective = Calibration.read(folder / "perspective.txt")
-    number = name[-2:]
-    R = np.eye(4)
-    R[:3, :3] = perspective.rotation(f"R_rect_{number}")
-    size_px = read_size_px(perspective, f"S_rect_{number}")
-    camera = rectified_camera(perspective, f"P_rect_{number}", name, size_px, np.eye(4))
+    size_px = perspective.size_px(f"S_rect_{name[-2:]}")
+    camera = perspective.rectified_camera(f"P_rect_{name[-2:]}", name, size_px, np.eye(4))
+    R = perspective.rotation(f"R_rect_{name[-2:]}")
     return Camera(name, *size_px, camera.K, R @ T_cam_lidar)
 
 

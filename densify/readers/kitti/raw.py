@@ -13,9 +13,9 @@ from pathlib import Path
 import numpy as np
 
 from densify.config.errors import InputError
-from densify.config.file_content import read_bytes, read_text
+from densify.config.file_content import read_text
 from densify.geometry import poses
-from densify.geometry.types import Float, Int
+from densify.geometry.types import Camera, Float, Int
 from densify.readers.file_sequence import (
     FileSequence,
     Returns,
@@ -25,23 +25,17 @@ from densify.readers.file_sequence import (
 )
 from densify.readers.kitti.calibration import (
     NOMINAL_PERIOD_NS,
-    NUM_OXTS_VALUES,
     Calibration,
     Stamps,
     T_mercator_imu,
-    camera_folders,
-    check_oxts,
-    mercator_scale,
-    parse_numbers,
-    read_cameras,
+    parse_oxts,
     read_points,
     turned_ns,
 )
 
 KITTI_TRIGGER_LATENCY_NS = 10_500_000
-"""How much KITTI's recorded image stamps lag the exposure. The cameras are triggered when the
-scanner faces forward, at the sweep's reference time; drives 0002 and 0013 of 2011_09_26 record
-10.50 ms (image_02) and 9.96 ms (image_03) after it."""
+"""Lag of KITTI's recorded image stamps behind the exposure, which the scanner triggers as it faces
+forward. Drives 0002 and 0013 of 2011_09_26 record 10.50 ms (image_02) and 9.96 ms (image_03)."""
 
 
 def open_recording(path: Path, scene: str | None) -> KittiRaw:
@@ -75,7 +69,7 @@ class KittiRaw(FileSequence):
         self._end_stamps = Stamps.read(velodyne / "timestamps_end.txt")
         self._oxts_stamps = Stamps.read(drive / "oxts" / "timestamps.txt")
         self._oxts = numbered_files(drive / "oxts" / "data", ".txt")
-        cameras = read_cameras(drive)
+        cameras = _read_cameras(drive)
         self._images = {
             name: numbered_files(drive / name / "data", ".png", ".jpg", ".jpeg") for name in cameras
         }
@@ -87,6 +81,7 @@ class KittiRaw(FileSequence):
             {name: self._exposures_ns(drive, name) for name in cameras},
             truth_beside(drive),
             self._sweeps,
+            self._images,
         )
 
     def gaps(self) -> list[str]:
@@ -98,14 +93,14 @@ class KittiRaw(FileSequence):
         told = [f"{velodyne} has no {', '.join(missing)}"] if missing else []
         if self._stamps is None:
             told.append(f"{velodyne} has no timestamps.txt: sweeps are taken for 100 ms apart")
-        left_out = [name for name in camera_folders(self.where) if name not in self.cameras]
+        left_out = [name for name in _camera_folders(self.where) if name not in self.cameras]
         return told + [
             f"{name} is left out: calib_cam_to_cam.txt has no P_rect_{name[-2:]}"
             for name in left_out
         ]
 
     def stamp_ns(self, frame: int) -> int:
-        """Reference time of a sweep. Raises InputError for a frame without a stamp."""
+        """Return a sweep's reference time. Raises InputError for a frame without a stamp."""
         if self._stamps is None:
             return int(frame) * NOMINAL_PERIOD_NS
         return self._stamps[frame]
@@ -116,12 +111,8 @@ class KittiRaw(FileSequence):
         points = columns[:, :3].astype(np.float64)
         return path, Returns(points, columns[:, 3], self._offset_ns(frame, points))
 
-    def _encoded_image(self, camera: str, number: int) -> tuple[Path, bytes]:
-        path = self._images[camera][number]
-        return path, read_bytes(path)
-
     def _exposures_ns(self, drive: Path, camera: str) -> dict[int, int]:
-        """When the images that exist were exposed: the recorded stamp less
+        """Return when the images that exist were exposed: the recorded stamp less
         `KITTI_TRIGGER_LATENCY_NS`, or the sweep's reference time where none is recorded."""
         stamps = Stamps.read(drive / camera / "timestamps.txt")
 
@@ -134,9 +125,9 @@ class KittiRaw(FileSequence):
         return {f: ns for f in self._images[camera] if (ns := exposed_ns(f)) is not None}
 
     def _pose(self, frame: int) -> Float:
-        """The pose by GPS and inertial unit. An oxts record is up to 20 ms away from the sweep of
-        the same number, 0.3 m at 15 m/s, so the pose is interpolated between the records before and
-        after the sweep; at the end of the records it is extrapolated from the last two."""
+        """Return the pose by GPS and inertial unit. An oxts record is up to 20 ms away from the
+        sweep of its number, 0.3 m at 15 m/s: the pose is interpolated between the records around
+        the sweep, and extrapolated from the last two at their end."""
         if not self._oxts:
             return super()._pose(frame)
         of_frame(self._oxts, frame, "oxts record", self.where)
@@ -175,15 +166,15 @@ class KittiRaw(FileSequence):
         return poses.inverse(self._T_mercator_world) @ self._T_mercator_imu(frame)
 
     def _T_mercator_imu(self, frame: int) -> Float:
-        return T_mercator_imu(_read_oxts(self._oxts[frame]), self._mercator_scale)
+        return T_mercator_imu(_read_oxts(self._oxts[frame]), self._first_oxts)
 
     @cached_property
-    def _mercator_scale(self) -> float:
-        return mercator_scale(_read_oxts(next(iter(self._oxts.values()))))
+    def _first_oxts(self) -> Float:
+        return _read_oxts(next(iter(self._oxts.values())))
 
     @cached_property
     def _T_mercator_world(self) -> Float:
-        return self._T_mercator_imu(next(iter(self._oxts)))
+        return T_mercator_imu(self._first_oxts, self._first_oxts)
 
     @cached_property
     def _T_lidar_imu(self) -> Float:
@@ -205,4 +196,31 @@ def _find_sweeps(drive: Path) -> dict[int, Path]:
 
 
 def _read_oxts(path: Path) -> Float:
-    return check_oxts(parse_numbers(read_text(path), str(path), NUM_OXTS_VALUES), str(path))
+    return parse_oxts(read_text(path), str(path))
+
+
+def _camera_folders(drive: Path) -> list[str]:
+    return sorted(p.name for p in drive.glob("image_[0-9][0-9]") if p.is_dir())
+
+
+def _read_cameras(drive: Path) -> dict[str, Camera]:
+    """Return the cameras that have a folder in the drive and a rectified calibration in its parent;
+    of a drive without image folders all that are calibrated, if any.
+
+    ``T_cam_lidar`` is camera 0's rectification after ``calib_velo_to_cam``, moved by the camera's
+    offset in ``P_rect``.
+    """
+    folder, names = drive.resolve().parent, _camera_folders(drive)
+    files = [folder / "calib_cam_to_cam.txt", folder / "calib_velo_to_cam.txt"]
+    if not names and not all(file.is_file() for file in files):
+        return {}
+    calibration, to_lidar = map(Calibration.read, files)
+    names = names or [f"image_{key[-2:]}" for key in calibration.entries if key[:-2] == "P_rect_"]
+    T_rect_lidar = calibration.rotation("R_rect_00") @ to_lidar.pose()
+    cameras = {}
+    for name in names:
+        key = f"P_rect_{name[-2:]}"
+        if key in calibration.entries:
+            size_px = calibration.size_px(f"S_rect_{name[-2:]}")
+            cameras[name] = calibration.rectified_camera(key, name, size_px, T_rect_lidar)
+    return cameras

@@ -20,7 +20,7 @@ import numpy as np
 from densify.config.errors import InputError
 from densify.geometry.types import Bool, Float
 from densify.readers.decoded_files import read_image
-from densify.readers.kitti.calibration import Calibration, rectified_camera
+from densify.readers.kitti.calibration import Calibration
 
 _PER_PX, _FLOW_PER_PX, _FLOW_ZERO = 256.0, 64.0, 2**15
 _IMAGES = ("disp_occ_0", "disp_occ_1", "flow_occ")
@@ -64,7 +64,7 @@ def read_moments(training: Path, name: str) -> TwoMoments:
     first, second, flow = (_image(training / kind / f"{name}.png") for kind in _IMAGES)
     path = training / "calib_cam_to_cam" / f"{name.partition('_')[0]}.txt"
     calibration = Calibration.read(path)
-    cameras = [rectified_camera(calibration, k, k, (1, 1), np.eye(4)) for k in (_LEFT, _RIGHT)]
+    cameras = [calibration.rectified_camera(k, k, (1, 1), np.eye(4)) for k in (_LEFT, _RIGHT)]
     baseline_m = cameras[0].T_cam_lidar[0, 3] - cameras[1].T_cam_lidar[0, 3]
     if baseline_m <= 0:
         raise InputError(

@@ -13,7 +13,7 @@ from densify.readers.folder.config import NAME
 from densify.readers.point_files import SUFFIXES
 from densify.readers.stamp_files import Named, StampFile, named
 
-IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
+_IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 _SURE_SUFFIXES = (".pcd", ".bin", ".ply", ".las", ".laz")
 _DEPTH = 2  # folders below the one named
 _NO_SWEEPS = ("truth", "labels", "label", "poses", "calib", "calibration")
@@ -23,18 +23,8 @@ _STAMP_FILES = tuple(
     for suffix in ("txt", "csv")
 )
 _POSE_FILES = (
-    "poses.txt",
-    "poses.csv",
-    "poses.tum",
-    "pose.txt",
-    "trajectory.txt",
-    "trajectory.csv",
-    "traj.txt",
-    "odometry.txt",
-    "odom.txt",
-    "groundtruth.txt",
-    "gt_poses.txt",
-    "slam_poses.txt",
+    *("poses.txt", "poses.csv", "poses.tum", "pose.txt", "trajectory.txt", "trajectory.csv"),
+    *("traj.txt", "odometry.txt", "odom.txt", "groundtruth.txt", "gt_poses.txt", "slam_poses.txt"),
 )
 
 
@@ -48,22 +38,37 @@ class Series:
     told_by: str
 
 
-def find_sweeps(folder: Path, files: str) -> list[Path]:
-    """The files of the sweeps. files: the folder they are in, "" to look for it.
+def sweep_folders(folder: Path, files: str = "") -> dict[str, list[Path]]:
+    """Return the folders with numbered files of points, and those files of the surest suffix.
 
-    Raises InputError if there are none, or several folders of them.
+    files: the folder they are in, "" to look in this one and two folders down. Raises InputError if
+    there are none.
     """
     if files and not (folder / files).is_dir():
         raise InputError(
             f"{folder / files}: no such folder, though densify.yaml names it: sweeps: {{files: "
             f"{files}}}"
         )
-    groups = sweep_folders(folder, files)
-    if not groups:
+    order = (*_SURE_SUFFIXES, *(suffix for suffix in SUFFIXES if suffix not in _SURE_SUFFIXES))
+    found: dict[int, dict[str, list[Path]]] = {}
+    for place in [folder / files] if files else _folders(folder):
+        for path in _files(place, SUFFIXES):
+            name = named(path)
+            if name.number is not None or name.stamp_ns is not None:
+                groups = found.setdefault(order.index(path.suffix.lower()), {})
+                groups.setdefault(place.relative_to(folder).as_posix(), []).append(path)
+    if not found:
         raise InputError(
             f"{folder / files}: no sweeps; expected numbered files such as 000120.bin "
             f"({', '.join(SUFFIXES)}) in the folder or below it"
         )
+    return found[min(found)]
+
+
+def find_sweeps(folder: Path, files: str) -> list[Path]:
+    """Return the files of the sweeps. Raises InputError if there are none, or several folders of
+    them."""
+    groups = sweep_folders(folder, files)
     if len(groups) > 1:
         raise InputError(
             f"{folder}: several folders hold sweeps: {', '.join(groups)}; name one in "
@@ -72,34 +77,18 @@ def find_sweeps(folder: Path, files: str) -> list[Path]:
     return next(iter(groups.values()))
 
 
-def sweep_folders(folder: Path, files: str = "") -> dict[str, list[Path]]:
-    """Folders with numbered files of points and those files: the one named, or else it and those
-    down to two folders below; only those of the surest suffix."""
-    found: dict[int, dict[str, list[Path]]] = {}
-    for place in [folder / files] if files else _folders(folder):
-        for path in _files(place):
-            suffix = path.suffix.lower()
-            if suffix in SUFFIXES and _is_numbered(path):
-                sure = suffix in _SURE_SUFFIXES
-                rank = (_SURE_SUFFIXES if sure else SUFFIXES).index(suffix) + 10 * (not sure)
-                name = place.relative_to(folder).as_posix()
-                found.setdefault(rank, {}).setdefault(name, []).append(path)
-    return found[min(found)] if found else {}
+def find_images(folder: Path) -> dict[str, list[Path]]:
+    """Return the folders with images, this one and those two folders down, and their images."""
+    found = {str(p.relative_to(folder)): images_in(p) for p in _folders(folder)}
+    return {name: images for name, images in found.items() if images}
 
 
-def find_images(folder: Path) -> dict[str, int]:
-    """Folders with images, below the one named, and how many they hold."""
-    counts = {
-        str(place.relative_to(folder)): sum(
-            path.suffix.lower() in IMAGE_SUFFIXES for path in _files(place)
-        )
-        for place in _folders(folder)
-    }
-    return {name: count for name, count in counts.items() if count}
+def images_in(folder: Path) -> list[Path]:
+    return sorted(_files(folder, _IMAGE_SUFFIXES))
 
 
 def find_pose_file(folder: Path, name: str) -> Path | None:
-    """The one named, or a file of a usual name; None if there is none."""
+    """Return the file that is named, or one of a usual name; None if there is none."""
     if not name:
         return next((folder / n for n in _POSE_FILES if (folder / n).is_file()), None)
     if not (folder / name).is_file():
@@ -119,21 +108,18 @@ def in_time(
     are times are numbered from 0, others as their names say. Raises InputError if a name or a line
     is missing, two files have one number, or the stamps do not ascend.
     """
-    by_names = stamps == "names"
-    names = [named(path, unit if by_names else "") for path in paths]
-    if by_names:
-        for name in names:
-            if name.stamp_ns is None:
-                raise InputError(
-                    f"{name.path}: its name is no time; expected such as 1317042651.468569638, or "
-                    f"a stamps_unit beside stamps: names in densify.yaml"
-                )
+    names = [named(path, unit if stamps == "names" else "") for path in paths]
+    unnamed = [name.path for name in names if name.stamp_ns is None]
+    if stamps == "names" and unnamed:
+        raise InputError(
+            f"{unnamed[0]}: its name is no time; expected such as 1317042651.468569638, or a "
+            f"stamps_unit beside stamps: names in densify.yaml"
+        )
     if stamps == "sweeps":
         return Series(_numbered(names), None, "")
-    file = None if by_names else _stamp_file(root, paths[0].parent, stamps, shared)
-    timed = [(name.stamp_ns, name) for name in names if name.stamp_ns is not None]
-    if file is None and len(timed) == len(names):
-        ordered = [name for _, name in sorted(timed)]
+    file = None if stamps == "names" else _stamp_file(root, paths[0].parent, stamps, shared)
+    if file is None and not unnamed:
+        ordered = sorted(names, key=lambda name: (name.stamp_ns or 0, name))
         found = {number: name.stamp_ns or 0 for number, name in enumerate(ordered)}
         _check_ascending(found, [name.path for name in ordered])
         return Series({n: o.path for n, o in enumerate(ordered)}, found, "the names of the files")
@@ -147,11 +133,11 @@ def in_time(
 
 
 def _numbered(names: Sequence[Named]) -> dict[int, Path]:
-    if any(name.number is None for name in names):  # times in a file: the names need none
+    if any(name.number is None for name in names):  # a file of times: the names need none
         ordered = sorted(names, key=lambda name: (name.stamp_ns or 0, name.path.name))
         return {number: name.path for number, name in enumerate(ordered)}
     found: dict[int, Path] = {}
-    for name in sorted(names):
+    for name in sorted(names, key=lambda name: name.path):
         number = name.number or 0
         if number in found:
             raise InputError(
@@ -163,17 +149,17 @@ def _numbered(names: Sequence[Named]) -> dict[int, Path]:
 
 
 def _matched(file: StampFile, paths: Mapping[int, Path]) -> dict[int, int]:
-    """The time of each file: by its name, or its row in the order of numbers, or its number."""
+    """Return the time of each file: by its name, or its row in the order of numbers, or its
+    number."""
     if file.names is not None:
         by_name = dict(zip(file.names, file.stamp_ns, strict=True))
-        by_stem = {Path(name).stem: ns for name, ns in by_name.items()}
-        found = {}
-        for number, path in paths.items():
-            stamp_ns = by_name.get(path.name, by_stem.get(path.stem))
-            if stamp_ns is None:
-                raise InputError(f"{file.path}: no line of {path.name}; expected one of each file")
-            found[number] = stamp_ns
-        return found
+        by_name |= {Path(name).stem: ns for name, ns in by_name.items()}
+        missing = [p for p in paths.values() if not {p.name, p.stem} & by_name.keys()]
+        if missing:
+            raise InputError(
+                f"{file.path}: no line of {missing[0].name}; expected one of each file"
+            )
+        return {n: by_name.get(p.name, by_name.get(p.stem, 0)) for n, p in paths.items()}
     if len(file.stamp_ns) == len(paths):
         return dict(zip(paths, file.stamp_ns, strict=True))
     if len(file.stamp_ns) > max(paths):
@@ -196,52 +182,28 @@ def _check_ascending(stamps_ns: Mapping[int, int], where: Sequence[Path]) -> Non
 
 def _stamp_file(root: Path, folder: Path, name: str, shared: bool) -> Path | None:
     if name:
-        place = next((p / name for p in (root, folder) if (p / name).is_file()), None)
-        if place is None:
+        places = [place / name for place in (root, folder) if (place / name).is_file()]
+        if not places:
             raise InputError(
                 f"{root / name}: no such file, though densify.yaml names it under stamps"
             )
-        return place
-    places = [folder] + [folder.parent] * (folder != root and (shared or folder.parent != root))
-    files = (place / file for place in places for file in _STAMP_FILES)
+        return places[0]
+    near = [folder] + [folder.parent] * (folder != root and (shared or folder.parent != root))
+    files = (place / file for place in near for file in _STAMP_FILES)
     return next((file for file in files if file.is_file()), None)
 
 
 def _folders(root: Path) -> Iterator[Path]:
-    """The folder and those below it, by name; each once, whatever links lead to it."""
-    level, met = [root], set[Path]()
-    for _ in range(_DEPTH + 1):
-        below = []
-        for place in level:
-            if place.resolve() in met:
-                continue
-            met.add(place.resolve())
-            yield place
-            below += [
-                Path(entry.path)
-                for entry in sorted(_entries(place), key=lambda entry: entry.name)
-                if entry.is_dir()
-                and not entry.name.startswith(".")
-                and entry.name not in _NO_SWEEPS
-            ]
-        level = below
+    """Yield the folder and those below it, by name; links to folders are not followed."""
+    for place, folders, _ in os.walk(root):
+        folders[:] = sorted(f for f in folders if f[0] != "." and f not in _NO_SWEEPS)
+        if len(Path(place).relative_to(root).parts) == _DEPTH:
+            folders.clear()
+        yield Path(place)
 
 
-def _files(folder: Path) -> Iterator[Path]:
-    for entry in _entries(folder):
-        if not entry.name.startswith(".") and entry.is_file():
-            yield Path(entry.path)
-
-
-def _entries(folder: Path) -> list[os.DirEntry[str]]:
-    """What lies in a folder, links to nowhere and to themselves left out."""
-    try:
-        with os.scandir(folder) as entries:
-            return [e for e in entries if not e.is_symlink() or os.path.exists(e.path)]
-    except OSError:
-        return []
-
-
-def _is_numbered(path: Path) -> bool:
-    name = named(path)
-    return name.number is not None or name.stamp_ns is not None
+def _files(folder: Path, suffixes: Sequence[str]) -> Iterator[Path]:
+    """Yield visible files of these suffixes; links to nowhere and to themselves are none."""
+    for path in folder.iterdir() if folder.is_dir() else ():
+        if path.name[0] != "." and path.suffix.lower() in suffixes and os.path.isfile(path):
+            yield path
