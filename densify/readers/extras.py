@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Packages that only some readers need, imported where they are used."""
+"""Optional packages, imported where they are used."""
 
 from __future__ import annotations
 
@@ -10,10 +10,9 @@ from densify.config.errors import InputError
 
 
 def needed(module: str, extra: str, what: str) -> Any:
-    """The imported module. Raises InputError, with the command that installs it, if it is not
-    installed, or with what it lacks.
+    """Return the imported module. Raises InputError, with what mends it, if that fails.
 
-    extra: of densify, that brings it. what: is to be read, such as "Argoverse 2 recordings".
+    extra: of densify, that brings it. what: needs it, such as "Argoverse 2 recordings".
     """
     package = module.partition(".")[0]
     try:

@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""What the fields of a point cloud mean: found by their names, and the times by their values.
+"""The meaning of a point cloud's fields, found by their names, and of times also by their values.
 
-Every driver has names and units of its own: Velodyne's ``time`` are seconds since the stamp,
-Ouster's ``t`` nanoseconds, Hesai's and RoboSense's ``timestamp`` seconds since 1970, Livox's
-``offset_time`` nanoseconds. The span of a sweep's times tells the unit, since the units lie a
-factor of 1000 apart and a sweep takes about one period.
+Velodyne's ``time`` are seconds since the stamp, Ouster's ``t`` nanoseconds, Hesai's and RoboSense's
+``timestamp`` seconds since 1970, Livox's ``offset_time`` nanoseconds. The span of a sweep's times
+tells the unit: units lie a factor of 1000 apart and a sweep takes about one period.
 """
 
 from __future__ import annotations
@@ -22,57 +21,17 @@ UNIT_NS = {"s": 1_000_000_000, "ms": 1_000_000, "us": 1_000, "ns": 1}
 REFERENCES = ("start", "middle", "end")
 
 _NAMES = {
-    "x": ("x",),
-    "y": ("y",),
-    "z": ("z",),
-    "intensity": (
-        "intensity",
-        "intensities",
-        "reflectance",
-        "reflectivity",
-        "remission",
-        "i",
-        "signal",
-        "scalar_intensity",
-        "amplitude",
-    ),
-    "time": (
-        "time",
-        "t",
-        "timestamp",
-        "time_stamp",
-        "offset_time",
-        "time_offset",
-        "timeoffset",
-        "offset_ns",
-        "offset_us",
-        "time_us",
-        "time_ns",
-        "stamp",
-        "gps_time",
-        "scalar_time",
-    ),
-    "ring": (
-        "ring",
-        "line",
-        "channel",
-        "laser_id",
-        "laser_number",
-        "laserid",
-        "beam",
-        "scalar_ring",
-    ),
-    "radial_velocity": (
-        "radial_velocity",
-        "radial_speed",
-        "doppler",
-        "doppler_velocity",
-        "velocity",
-        "v_r",
-        "vr",
-        "radial_velocity_m_s",
-    ),
-    "lidar": ("lidar", "lidar_id", "scanner", "sensor_id", "scanner_channel"),
+    "x": "x",
+    "y": "y",
+    "z": "z",
+    "intensity": "intensity intensities reflectance reflectivity remission i signal "
+    "scalar_intensity amplitude",
+    "time": "time t timestamp time_stamp offset_time time_offset timeoffset offset_ns offset_us "
+    "time_us time_ns stamp gps_time scalar_time",
+    "ring": "ring line channel laser_id laser_number laserid beam scalar_ring",
+    "radial_velocity": "radial_velocity radial_speed doppler doppler_velocity velocity v_r vr "
+    "radial_velocity_m_s",
+    "lidar": "lidar lidar_id scanner sensor_id scanner_channel",
 }
 _SHORTEST_SHARE, _LONGEST_SHARE = 0.08, 4.0  # of a period that the times of a sweep span
 _SAME_CLOCK_NS = 2_000_000_000
@@ -96,10 +55,10 @@ class Fields:
 
 
 def find_fields(names: Collection[str]) -> Fields:
-    """Found by their names, whatever their case; the first of several that could play a part."""
+    """Find fields by their names, in any case; the first of several that could play a part."""
     lower = {name.lower(): name for name in reversed(list(names))}
     found = {
-        part: next((lower[name] for name in known if name in lower), "")
+        part: next((lower[name] for name in known.split() if name in lower), "")
         for part, known in _NAMES.items()
     }
     return Fields(**found)
@@ -143,7 +102,7 @@ class PointTimes:
 
 
 def widened(values: NDArray[Any]) -> NDArray[Any]:
-    """int64 or float64, whichever holds them."""
+    """Return int64 or float64, whichever holds the values."""
     return values.astype(np.float64 if values.dtype.kind == "f" else np.int64)
 
 
@@ -156,15 +115,14 @@ def find_times(
     absolute: bool | None = None,
     reference: str = "",
 ) -> tuple[PointTimes | None, str]:
-    """How this field tells the times of a sweep's points, and in words what was found; None, and
-    why, where it does not tell them.
+    """Return how a field tells the times of a sweep's points, and what was found in words; None,
+    and why, where it does not tell them.
 
     values: (N,) of one sweep. period_ns: from sweep to sweep. stamp_ns: of the sweep, None if it
     has none. unit, absolute, reference: what is known already.
     """
     times = widened(values)
-    if times.dtype.kind == "f":
-        times = times[np.isfinite(times)]
+    times = times[np.isfinite(times)]
     span = times.max() - times.min() if len(times) else 0
     if not span:
         return None, f"{field} is the same for all points, so it does not tell their times"
@@ -194,27 +152,25 @@ def find_times(
 
 
 def full_scale(intensity: NDArray[Any]) -> float:
-    """What a sweep's intensities are to be divided by for 0 to 1: 1, 255, 65535, or the greatest
-    of them."""
+    """Return what brings a sweep's intensities to 0 to 1 by division: 1, 255, 65535, or the
+    greatest of them."""
     greatest = float(np.nanmax(intensity, initial=0.0))
     return next((scale for scale in _FULL_SCALES if greatest <= scale), greatest)
 
 
 def scaled(intensity: NDArray[Any], scale: float) -> Float32:
-    """0 to 1, what is brighter than ``scale`` too; 0 where it is not finite."""
+    """Return intensities of 0 to 1, clipped; 0 where they are not finite."""
     share = np.nan_to_num(intensity.astype(np.float64), nan=0.0, posinf=0.0, neginf=0.0) / scale
     return np.clip(share, 0, 1).astype(np.float32)
 
 
 def points_of(columns: Mapping[str, NDArray[Any]], fields: Fields) -> NDArray[np.float64]:
-    """(N,3) metres."""
-    return np.column_stack([columns[name] for name in (fields.x, fields.y, fields.z)]).astype(
-        np.float64
-    )
+    """Return (N,3) float64, in the file's unit."""
+    return np.column_stack([columns[n] for n in (fields.x, fields.y, fields.z)]).astype(np.float64)
 
 
 def radial_velocities(columns: Mapping[str, NDArray[Any]], fields: Fields) -> Float32 | None:
-    """(N,) m/s away from the scanner, NaN where it was not measured; None without such a field."""
+    """Return (N,) m/s away from the scanner, NaN where not measured; None without such a field."""
     if not fields.radial_velocity:
         return None
     found = columns[fields.radial_velocity].astype(np.float32)

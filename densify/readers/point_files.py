@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Files of points: one door for each format, whoever reads it. Nothing in them is run as code."""
+"""Files of points: the columns of every format. Nothing in them is run as code."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from densify.config.errors import InputError
-from densify.config.file_content import check_size, open_file, read_bytes
+from densify.config.file_content import check_size, open_file, read_bytes, reason
 from densify.readers.decoded_files import read_array, read_arrays, read_las
 from densify.readers.extras import needed
 
@@ -31,11 +31,11 @@ _ALIKE = 0.7  # of the variance that columns explain
 
 @dataclass(frozen=True)
 class PointTable:
-    """What a file holds of its N points.
+    """The N points of a file.
 
-    columns: by name, (N,) numbers each, as they are stored; those without names are called as
-    `unnamed` calls them. viewpoint: where the sensor stood as tx ty tz qw qx qy qz, of a .pcd file.
-    beside: the other arrays of an .npz file.
+    columns: by name, (N,) numbers each, as they are stored; `unnamed` names those without names.
+    viewpoint: pose of the sensor as tx ty tz qw qx qy qz, of a .pcd file. beside: the other arrays
+    of an .npz file.
     """
 
     columns: Columns
@@ -47,7 +47,7 @@ class PointTable:
 
 
 def read_table(path: Path, names: Sequence[str] | None = None) -> PointTable:
-    """Every row of the file in its order.
+    """Return every row of the file in its order.
 
     ========================= ==================================================================
     .bin                      float32 columns
@@ -66,33 +66,32 @@ def read_table(path: Path, names: Sequence[str] | None = None) -> PointTable:
     if not path.is_file():
         raise InputError(f"{path}: no such file; expected a point file ({', '.join(SUFFIXES)})")
     suffix = path.suffix.lower()
-    if suffix not in _DOORS:
+    if suffix not in SUFFIXES:
         raise InputError(
             f"{path}: got {path.suffix or 'no suffix'}, expected one of {', '.join(SUFFIXES)}"
         )
     try:
-        table = _DOORS[suffix](path, names)
+        table = _READERS[suffix](path, names)
     except InputError:
         raise
-    except Exception as error:  # a damaged file makes other people's parsers raise anything
-        reason = " ".join(str(error).split()) or type(error).__name__
-        reason = f"it has no {reason}" if isinstance(error, KeyError) else reason
-        raise InputError(f"{path}: not a readable {suffix} point file: {reason}") from error
+    except Exception as error:  # parsers raise anything on a damaged file
+        said = f"it has no {error}" if isinstance(error, KeyError) else reason(error)
+        raise InputError(f"{path}: not a readable {suffix} point file: {said}") from error
     if not len(table):
         raise InputError(f"{path}: holds no points, expected at least one")
     return table
 
 
 def read_viewpoint(path: Path) -> tuple[float, ...] | None:
-    """tx ty tz qw qx qy qz in a .pcd file's header; None of other files. Raises InputError if the
-    header is damaged."""
+    """Return tx ty tz qw qx qy qz of a .pcd file's header, None of other files. Raises InputError
+    if the header is damaged."""
     if path.suffix.lower() != ".pcd":
         return None
     try:
         with open_file(path) as file:
             lines = _pcd_header(file)
-        values = next((line.split()[1:] for line in lines if line.startswith("VIEWPOINT")), None)
-        found = None if values is None else tuple(float(v) for v in values)
+        values = [line.split()[1:] for line in lines if line.startswith("VIEWPOINT")]
+        found = tuple(float(v) for v in values[0]) if values else None
     except (OSError, ValueError) as error:
         raise InputError(f"{path}: not a readable .pcd point file: {error}") from error
     if found is not None and len(found) != 7:
@@ -103,12 +102,12 @@ def read_viewpoint(path: Path) -> tuple[float, ...] | None:
 
 
 def unnamed(num_columns: int) -> tuple[str, ...]:
-    """What the columns of a file without names are taken for: x y z intensity, then numbers."""
+    """Return the names given to columns without names: x y z intensity, then numbers."""
     return tuple(_UNNAMED[i] if i < len(_UNNAMED) else f"column{i}" for i in range(num_columns))
 
 
 def _matrix(array: NDArray[Any], names: Sequence[str] | None, path: Path) -> Columns:
-    """Columns of an (N,k) array, or the fields of a structured one."""
+    """Return the columns of an (N,k) array, or the fields of a structured one."""
     if array.dtype.names and array.ndim == 1:
         return {name: array[name] for name in array.dtype.names if array[name].ndim == 1}
     if array.size == 0:
@@ -142,18 +141,18 @@ def _read_bin(path: Path, names: Sequence[str] | None) -> PointTable:
 
 
 def _are_places(rows: NDArray[np.float32]) -> bool:
-    """Whether most of the rows that are finite may be: of other bytes, doubles for example, few
-    exponents lie between those of these."""
+    """Return True if most finite rows may be positions. Of other bytes, such as doubles, few have
+    such exponents."""
     size = np.abs(rows[np.isfinite(rows).all(axis=1)])
     likely = ((size == 0) | ((size > _PLACES_M[0]) & (size < _PLACES_M[1]))).all(axis=1)
     return len(size) == 0 or float(likely.mean()) > 0.5
 
 
 def _num_columns(data: bytes) -> int:
-    """The number of float32 columns for which the places of neighbouring rows are most alike: a
-    scanner's are, and a wrong number mixes x with y. Rings that fire by turns make every second or
-    third row more alike still: the smallest of such numbers is right whose columns differ in their
-    values as much."""
+    """Return the number of float32 columns that makes the positions of neighbouring rows most
+    alike; a wrong number mixes x with y. Rings that fire by turns make every second or third row
+    more alike still: then the smallest divisor wins whose columns differ in their values as
+    much."""
     with np.errstate(invalid="ignore"):  # other bytes may be any sort of NaN
         values = np.frombuffer(data[: len(data) // 4 * 4], "<f4").astype(np.float64)
     fit = [k for k in _BIN_COLUMNS if len(values) % k == 0 and len(data) % 4 == 0]
@@ -166,14 +165,14 @@ def _num_columns(data: bytes) -> int:
 
 
 def _steps(rows: NDArray[np.float64]) -> float:
-    """How far the places of neighbouring rows are apart, in proportion to their distance."""
+    """Return the mean step between neighbouring rows, in proportion to their distance."""
     places = rows[:, :3]
     size = np.abs(places[1:]).sum(axis=1) + np.abs(places[:-1]).sum(axis=1) + 1e-9
     return float(np.mean(np.abs(np.diff(places, axis=0)).sum(axis=1) / size))
 
 
 def _told_by_column(rows: NDArray[np.float64]) -> float:
-    """Which share of the variance of the values' sizes their columns explain."""
+    """Return the share of the variance of the values' sizes that the columns explain."""
     size = np.arcsinh(np.abs(rows))
     return float(size.mean(axis=0).var() / max(size.var(), 1e-12))
 
@@ -217,8 +216,8 @@ def _read_text(path: Path, names: Sequence[str] | None) -> PointTable:
 
 
 def _header(lines: Sequence[str]) -> tuple[int, list[str], str | None]:
-    """How many lines stand before the numbers, what the last of them calls the columns, and what
-    parts these; None for blanks. Comments before the names are passed over."""
+    """Return the number of lines before the numbers, the column names of the last of them, and the
+    delimiter, None for blanks. Comments before the names are passed over."""
     for number, line in enumerate(lines, 1):
         text = line.strip().lstrip("#").strip()
         if not text:
@@ -244,10 +243,9 @@ def _are_numbers(words: Sequence[str]) -> bool:
 
 
 def _pcd_header(file: Any) -> list[str]:
-    """The lines up to DATA, without comments; the file then stands where the points begin.
-
-    Some writers have padding fields with a COUNT of 0, and old files have no COUNT: both are put
-    in the form that parsers take."""
+    """Return the lines up to DATA, without comments; the file then stands where the points begin.
+    Padding fields with a COUNT of 0 and old headers without COUNT are put in the form that parsers
+    take."""
     lines: list[str] = []
     while len(lines) < 20:
         raw = file.readline(65536)
@@ -327,7 +325,7 @@ def _read_las(path: Path, names: Sequence[str] | None) -> PointTable:
     return PointTable(places | {name: np.asarray(cloud[name]) for name in others})
 
 
-_DOORS: Mapping[str, Callable[[Path, Sequence[str] | None], PointTable]] = {
+_READERS: Mapping[str, Callable[[Path, Sequence[str] | None], PointTable]] = {
     ".npy": _read_npy,
     ".npz": _read_npy,
     ".txt": _read_text,
@@ -339,4 +337,4 @@ _DOORS: Mapping[str, Callable[[Path, Sequence[str] | None], PointTable]] = {
     ".laz": _read_las,
 }
 
-SUFFIXES = tuple(_DOORS)
+SUFFIXES = tuple(_READERS)
