@@ -193,7 +193,7 @@ def test_displacement_is_written_in_the_frames_own_axes(tmp_path):
     write_bodies(tmp_path, _bodies())
     body, point = np.array([0, 1], np.int32), np.array([[5.0, 0, 0], [5.0, 0, 0]])
     write_points(tmp_path, 1, body, np.array([-1, 0], np.int32), point)
-    truth = FileTruth.open(tmp_path)
+    truth = FileTruth(tmp_path)
     assert truth is not None
     # the lidar of frame 1 looks along +y of the world, where +x is its right
     np.testing.assert_array_equal(truth.displacement(1, 2), [[0, 0, 0], [0, -1.5, 0]])
@@ -202,18 +202,17 @@ def test_displacement_is_written_in_the_frames_own_axes(tmp_path):
 
 
 def test_missing_or_malformed_truth_files_are_named(tmp_path):
-    assert FileTruth.open(tmp_path / "none") is None
     with pytest.raises(InputError, match=r"bodies\.npz: no such truth file"):
-        FileTruth.open(tmp_path)
+        FileTruth(tmp_path)
     np.savez(tmp_path / "bodies.npz", T_world_lidar=np.eye(4))
     with pytest.raises(InputError, match=r"bodies\.npz: holds no T_world_body, moving"):
-        FileTruth.open(tmp_path)
+        FileTruth(tmp_path)
     bodies = _bodies()
     write_bodies(tmp_path, Bodies(bodies.T_world_lidar[:2], bodies.T_world_body, bodies.moving))
     with pytest.raises(InputError, match=r"expected T_world_lidar \(F,4,4\)"):
-        FileTruth.open(tmp_path)
+        FileTruth(tmp_path)
     write_bodies(tmp_path, bodies)
-    truth = FileTruth.open(tmp_path)
+    truth = FileTruth(tmp_path)
     assert truth is not None
     with pytest.raises(InputError, match="0 to 2"):
         truth.sweep(3)
@@ -249,7 +248,7 @@ def test_flipped_bytes_in_a_truth_file_are_one_clear_line(tmp_path):
     for i in range(len(whole)):
         path.write_bytes(whole[:i] + bytes([whole[i] ^ 0xFF]) + whole[i + 1 :])
         try:
-            FileTruth.open(tmp_path)  # some bytes, such as dates, mean nothing
+            FileTruth(tmp_path)  # some bytes, such as dates, mean nothing
         except InputError as error:
             num_refused += 1
             assert str(path) in str(error) and "\n" not in str(error)
@@ -257,4 +256,4 @@ def test_flipped_bytes_in_a_truth_file_are_one_clear_line(tmp_path):
     np.save(tmp_path / "array.npy", np.eye(4))
     (tmp_path / "array.npy").rename(path)
     with pytest.raises(InputError, match=r"bodies\.npz: not a readable \.npz file"):
-        FileTruth.open(tmp_path)
+        FileTruth(tmp_path)

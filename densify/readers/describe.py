@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What a recording holds, in a few aligned lines for a person."""
+"""A recording in a few aligned lines for people."""
 
 from __future__ import annotations
 
@@ -15,23 +15,22 @@ _MOST_NAMED = 3  # sweeps that cannot be used, each with its reason
 
 
 def describe(sequence: LidarSequence) -> str:
-    """What `findings` says, a line each."""
+    """Return what `findings` says, a line each."""
     return in_lines(findings(sequence))
 
 
 def in_lines(lines: Sequence[tuple[str, str]]) -> str:
-    """A name and what is said of it to a line."""
+    """Return lines of a name and a text, aligned."""
     width = max(len(label) for label, _ in lines) + 2
     return "\n".join(f"{label:<{width}}{text}" for label, text in lines)
 
 
 def findings(sequence: LidarSequence) -> list[tuple[str, str]]:
-    """Frames, rate, points, cameras, stamps, poses and truth of a recording, by their names, and
+    """Return frames, rate, points, cameras, stamps, poses and truth of a recording by name, and
     what its reader had to find out.
 
-    Loads the first and the last sweep and no image; where one cannot be read, the next one that
-    can, and a line says so. Rates are those of the median time from one sweep or image to the next.
-    Raises InputError if no sweep can be read.
+    Loads the first and the last sweep that can be read and no image. Rates are those of the median
+    time from one sweep or image to the next. Raises InputError if no sweep can be read.
     """
     timeline = Timeline.of(sequence)
     unreadable = dict(timeline.unknown)
@@ -40,7 +39,7 @@ def findings(sequence: LidarSequence) -> list[tuple[str, str]]:
     return [
         ("name", sequence.name),
         ("frames", _frames(sequence)),
-        ("rate", _rate(timeline)),
+        ("rate", _hertz(timeline.stamp_ns) if len(timeline.frames) > 1 else "unknown, one sweep"),
         ("stamps", _stamps(first, last)),
         ("points", _points(first, last)),
         ("point times", _point_times(first)),
@@ -53,7 +52,7 @@ def findings(sequence: LidarSequence) -> list[tuple[str, str]]:
 
 
 def _readable(sequence: LidarSequence, frames: Sequence[int], unreadable: dict[int, str]) -> Sweep:
-    """The first of these sweeps that can be read; adds those before it to ``unreadable``."""
+    """Return the first of these sweeps that can be read; adds those before it to ``unreadable``."""
     for frame in frames:
         if frame in unreadable:
             continue
@@ -76,12 +75,6 @@ def _frames(sequence: LidarSequence) -> str:
     num_missing = frames[-1] - frames[0] + 1 - len(frames)
     gaps = f", {num_missing} missing between them" if num_missing else ", no gaps"
     return f"{format_frames(frames)} ({len(frames)}{gaps})"
-
-
-def _rate(timeline: Timeline) -> str:
-    if len(timeline.frames) < 2:
-        return "unknown, one sweep"
-    return _hertz(timeline.stamp_ns)
 
 
 def _hertz(stamps_ns: Sequence[int] | Int) -> str:

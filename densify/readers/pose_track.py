@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""Where a vehicle was at any time, from poses recorded at a rate of their own.
+"""The pose of a vehicle at any time, from poses recorded at a rate of their own.
 
-Many data sets store each sweep as if it had been measured at one moment: every point was carried
-there by the vehicle's own motion (ego-motion compensation). What moves by itself is then smeared
-and its own time is hidden, and rings are no longer rings; `PoseTrack.as_fired` undoes it.
+Many data sets store each sweep as if it had been measured at one moment: ego-motion compensation
+carried every point there. That smears moving objects, hides their times, and bends rings;
+`PoseTrack.as_fired` undoes it.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class PoseTrack:
             )
 
     def at(self, time_ns: int) -> Float:
-        """(4,4) T_world_ego: turned evenly and moved straight between two poses.
+        """Return (4,4) T_world_ego, interpolated between two poses.
 
         Raises InputError for a time more than 0.2 s before the first pose or after the last.
         """
@@ -72,18 +72,13 @@ class PoseTrack:
         T_ref_world = poses.inverse(self.at(stamp_ns))
         low, high = stamp_ns + int(offset_ns.min()), stamp_ns + int(offset_ns.max())
         inside = self.stamp_ns[(self.stamp_ns > low) & (self.stamp_ns < high)].tolist()
-        times_ns = sorted({low, *inside, high})
+        times_ns = [low, *inside, max(high, low + 1)]
         T_ref_ego = np.stack([T_ref_world @ self.at(t) for t in times_ns])
         since_ns = np.array([t - stamp_ns for t in times_ns], np.float64)
-        if len(times_ns) == 1:
-            turns = Rotation.from_matrix(T_ref_ego[:, :3, :3])
-            shift_m = T_ref_ego[0, :3, 3]
-        else:
-            fired_ns, row = np.unique(offset_ns, return_inverse=True)  # beams fire together
-            slerp = Slerp(since_ns, Rotation.from_matrix(T_ref_ego[:, :3, :3]))
-            places_m = T_ref_ego[:, :3, 3].T
-            turns = slerp(fired_ns)[row]
-            shift_m = np.stack([np.interp(fired_ns, since_ns, p) for p in places_m], 1)[row]
+        fired_ns, row = np.unique(offset_ns, return_inverse=True)  # beams fire together
+        turns = Slerp(since_ns, Rotation.from_matrix(T_ref_ego[:, :3, :3]))(fired_ns)[row]
+        places_m = T_ref_ego[:, :3, 3].T
+        shift_m = np.stack([np.interp(fired_ns, since_ns, p) for p in places_m], 1)[row]
         if inverse:
             return turns.apply(points - shift_m, inverse=True)
         return turns.apply(points) + shift_m

@@ -8,7 +8,7 @@
 
 FRAME is the image's number: 120, 000120, 0000000120, 0000000120_depth or _disp. Arrays are (H,W) of
 any number type, with further axes of length 1; EXR files have one channel, or one called Z, Y or
-depth; PNG files are 16 bit gray. What is not finite or not above 0 is no value.
+depth; PNG files are 16 bit gray. A number that is not finite or not above 0 is no value.
 """
 
 from __future__ import annotations
@@ -19,7 +19,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -46,40 +45,38 @@ class PriorFiles:
 
     @staticmethod
     def open(place: Path, cameras: Sequence[str]) -> PriorFiles:
-        """What lies in a folder for some cameras, or one file. Raises InputError if there is
+        """Find the files of some cameras in a folder, or one file. Raises InputError if there is
         nothing, or it is not clear for which of several cameras it is."""
+        where, example = f"--prior {place}", "0000000120.npy, .exr or .png"
         if not place.exists():
-            raise InputError(
-                f"--prior {place}: no such folder or file; expected depth images "
-                f"DIR/CAMERA/FRAME.npy, .exr or .png"
-            )
+            raise InputError(f"{where}: no such folder or file; expected DIR/CAMERA/{example}")
         values = {camera: _in(place / camera) for camera in cameras}
         sky = {camera: _in(place / "sky" / camera) for camera in cameras}
         if not any(values.values()) and (flat := _in(place)):
             if len(cameras) > 1:
                 raise InputError(
-                    f"--prior {place}: holds depth images of one camera, and there are "
+                    f"{where}: holds depth images of one camera, and there are "
                     f"{', '.join(cameras)}; choose one with --camera, or put them into "
                     f"{place / 'CAMERA'}"
                 )
             values, sky = {cameras[0]: flat}, {cameras[0]: _in(place / "sky")}
         if not any(values.values()):
+            inside = place / (cameras[0] if cameras else "CAMERA")
             raise InputError(
-                f"--prior {place}: holds no depth images named by frame; expected "
-                f"{place / (cameras[0] if cameras else 'CAMERA')}/0000000120.npy, .exr or .png"
+                f"{where}: holds no depth images named by frame; expected {inside}/{example}"
                 if place.is_dir()
-                else f"--prior {place}: names no frame; expected 0000000120.npy, .exr or .png"
+                else f"{where}: names no frame; expected {example}"
             )
         return PriorFiles(place, values, sky)
 
     def said_of(self, camera: str) -> str:
-        """Which images of a camera there is a prior for, for messages."""
+        """Return the numbers of a camera's images that have a prior, for messages."""
         return f"there are {format_frames(self.values[camera])}"
 
     def prior(self, camera: Camera, number: int) -> Prior | None:
-        """The prior of an image, at the camera's size; None if there is none.
+        """Return the prior of an image at the camera's size; None if there is none.
 
-        One of another size is resized if its aspect agrees. Raises InputError for files that
+        A prior of another size is resized if its aspect agrees. Raises InputError for files that
         cannot be read or are something else.
         """
         path = self.values[camera.name].get(number)
@@ -92,34 +89,33 @@ class PriorFiles:
 
 
 def _in(folder: Path) -> dict[int, Path]:
-    """Number -> file, in the folder or its ``data``; of a file, itself."""
-    if folder.is_file():
-        groups = [[folder]]
-    else:
-        groups = [sorted(f.iterdir()) for f in (folder, folder / "data") if f.is_dir()]
-    for paths in groups:
+    """Return number -> file, in the folder or its ``data``; of a file, itself."""
+    places = (folder, folder / "data")
+    groups = [sorted(f.iterdir()) for f in places if f.is_dir()]
+    for paths in [[folder]] if folder.is_file() else groups:
         found: dict[int, Path] = {}
-        for path in paths:
-            stem = _STEM.fullmatch(path.stem)
-            if stem is None or path.suffix.lower() not in _SUFFIXES:
-                continue
-            other = found.setdefault(int(stem[1]), path)
-            rank, other_rank = (_SUFFIXES.index(p.suffix.lower()) for p in (path, other))
-            if rank == other_rank and other != path:
-                raise InputError(
-                    f"--prior: {other} and {path.name} are both of image {int(stem[1])}; "
-                    f"leave one there"
-                )
-            if rank < other_rank:
-                found[int(stem[1])] = path
+        # The finest first: a coarser file of the same number may be a picture of it.
+        for suffix in _SUFFIXES:
+            here: dict[int, Path] = {}
+            for path in paths:
+                stem = _STEM.fullmatch(path.stem)
+                if stem is None or path.suffix.lower() != suffix:
+                    continue
+                if int(stem[1]) in here:
+                    raise InputError(
+                        f"--prior: {here[int(stem[1])]} and {path.name} are both of image "
+                        f"{int(stem[1])}; leave one there"
+                    )
+                here[int(stem[1])] = path
+            found = here | found
         if found:
             return dict(sorted(found.items()))
     return {}
 
 
 def _value(path: Path) -> Float32:
-    """(H,W), 0 none."""
-    read = {".npy": read_array, ".exr": _exr, ".png": _png}[path.suffix.lower()]
+    """Return (H,W), 0 where there is none."""
+    read = {".npy": read_array, ".exr": _read_exr, ".png": _read_png}[path.suffix.lower()]
     image = np.asarray(read(path))
     image = image.reshape([n for n in image.shape if n != 1]) if image.ndim > 2 else image
     if image.ndim != 2 or image.dtype.kind not in "fui":
@@ -135,26 +131,25 @@ def _value(path: Path) -> Float32:
     return value
 
 
-def _exr(path: Path) -> NDArray[Any]:
+def _read_exr(path: Path) -> NDArray[Any]:
     library = needed("OpenEXR", "exr", "EXR files")
     open_file(path).close()
     try:
-        (left, top), (right, bottom) = library.File(str(path), header_only=True).header()[
-            "dataWindow"
-        ]
+        header = library.File(str(path), header_only=True).header()
+        (left, top), (right, bottom) = header["dataWindow"]
         check_pixels((int(right) - int(left) + 1, int(bottom) - int(top) + 1), path)
         channels = library.File(str(path)).channels()
     except (RuntimeError, KeyError, TypeError, ValueError) as error:
         raise InputError(f"{path}: not a whole EXR file ({reason(error)})") from error
-    named = [name for name in _CHANNELS if name in channels]
-    if not named and len(channels) > 1:
+    named = [name for name in (*_CHANNELS, *channels) if name in channels]
+    if named[0] not in _CHANNELS and len(channels) > 1:
         raise InputError(
             f"{path}: has the channels {', '.join(channels)}, expected one, or Z, Y or depth"
         )
-    return np.asarray(channels[named[0] if named else next(iter(channels))].pixels)
+    return np.asarray(channels[named[0]].pixels)
 
 
-def _png(path: Path) -> NDArray[Any]:
+def _read_png(path: Path) -> NDArray[Any]:
     image = read_image(path, as_stored=True)
     if image.dtype != np.uint16 or image.ndim != 2:
         bits = 8 * image.dtype.itemsize
@@ -166,30 +161,33 @@ def _png(path: Path) -> NDArray[Any]:
 
 
 def _resized(value: Float32, camera: Camera, path: Path) -> Float32:
-    """The values at the camera's size: linear between two of them, none beside none."""
-    size = (camera.width_px, camera.height_px)
-    if value.shape == size[::-1]:
+    """Return the values at the camera's size: linear between two of them, none beside none."""
+    import cv2
+
+    size_px = _size_px(value, camera, path)
+    if value.shape == size_px[::-1]:
         return value
-    _check_aspect(value.shape, camera, path)
-    known = cv2.resize((value > 0).astype(np.float32), size, interpolation=cv2.INTER_LINEAR)
-    resized = cv2.resize(value, size, interpolation=cv2.INTER_LINEAR)
+    known = cv2.resize((value > 0).astype(np.float32), size_px, interpolation=cv2.INTER_LINEAR)
+    resized = cv2.resize(value, size_px, interpolation=cv2.INTER_LINEAR)
     return np.where(known > 1 - 1e-3, resized, np.float32(0)).astype(np.float32)
 
 
 def _sky(path: Path, camera: Camera) -> Bool:
+    import cv2
+
     mask = read_image(path, as_stored=True)
     mask = mask if mask.ndim == 2 else mask[:, :, :3].max(axis=2)
-    size = (camera.width_px, camera.height_px)
-    if mask.shape != size[::-1]:
-        _check_aspect(mask.shape, camera, path)
-    sky: Bool = cv2.resize((mask > 0).astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
+    size_px, is_sky = _size_px(mask, camera, path), (mask > 0).astype(np.uint8)
+    sky: Bool = cv2.resize(is_sky, size_px, interpolation=cv2.INTER_NEAREST) > 0
     return sky
 
 
-def _check_aspect(shape: tuple[int, ...], camera: Camera, path: Path) -> None:
-    scale = shape[1] / camera.width_px, shape[0] / camera.height_px
-    if abs(scale[0] / scale[1] - 1) > _SAME_ASPECT:
+def _size_px(image: NDArray[Any], camera: Camera, path: Path) -> tuple[int, int]:
+    """Return the camera's width and height. Raises InputError for an image of another aspect."""
+    height, width = image.shape
+    if abs(width * camera.height_px / (height * camera.width_px) - 1) > _SAME_ASPECT:
         raise InputError(
-            f"{path}: got {shape[1]} x {shape[0]} px, expected {camera.width_px} x "
+            f"{path}: got {width} x {height} px, expected {camera.width_px} x "
             f"{camera.height_px} as {camera.name} has, or another size of that aspect"
         )
+    return camera.width_px, camera.height_px

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""When the sweeps of a recording were measured, and which of them are neighbours.
+"""The times of a recording's sweeps, and which sweeps are neighbours.
 
-Sweeps are neighbours because of their stamps, not because their numbers follow: a drive of which
-every second file is missing is one of half the rate.
+Neighbours are told by stamps, not by numbers: a drive of which every second file is missing has
+half the rate.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ _NOMINAL_PERIOD_NS = 100_000_000  # of a recording of one sweep
 
 
 class WindowFrames(NamedTuple):
-    """Sweeps around a key. frames: ascending, the key among them. cuts: why there are fewer of them
-    than asked for, a clause each."""
+    """Sweeps around a key. frames: ascending, with the key. cuts: why there are fewer than asked
+    for, a clause each."""
 
     frames: tuple[int, ...]
     cuts: tuple[str, ...]
@@ -68,8 +68,8 @@ def check_key(key: int) -> None:
 @dataclass(frozen=True)
 class Timeline:
     """name: of the recording. frames: (n,) of all its sweeps, ascending. stamp_ns: (n,) int64
-    reference times. unknown: frame -> why its stamp is not known, or cannot be right since those of
-    most others ascend past it; its row in ``stamp_ns`` is then interpolated."""
+    reference times. unknown: frame -> why its stamp is not known, or out of order among those of
+    most others; its row in ``stamp_ns`` is then interpolated."""
 
     name: str
     frames: tuple[int, ...]
@@ -102,32 +102,32 @@ class Timeline:
 
     @cached_property
     def period_ns(self) -> int:
-        """The usual time from one sweep to the next: the median."""
+        """Return the median time from one sweep to the next."""
         if len(self.frames) < 2:
             return _NOMINAL_PERIOD_NS
         return max(1, int(np.median(np.diff(self.stamp_ns))))
 
     def num_in(self, duration_s: float) -> int:
-        """How many sweeps usually follow each other in that time; half a one counts."""
+        """Return the number of sweeps that usually follow in that time; half a sweep counts."""
         return int(duration_s * 1e9 / self.period_ns + 0.5)
 
     @cached_property
     def row(self) -> Mapping[int, int]:
-        """Frame -> where it stands in ``frames``."""
+        """Return frame -> index in ``frames``."""
         return {frame: row for row, frame in enumerate(self.frames)}
 
     def stamp_of(self, frame: int) -> int:
-        """Reference time of a sweep (ns)."""
+        """Return the reference time of a sweep (ns)."""
         return int(self.stamp_ns[self.row[frame]])
 
     def within(self, begin_ns: int, end_ns: int) -> list[int]:
-        """Frames with begin_ns <= stamp < end_ns."""
+        """Return the frames with begin_ns <= stamp < end_ns."""
         inside = (self.stamp_ns >= begin_ns) & (self.stamp_ns < end_ns)
         return [self.frames[row] for row in np.flatnonzero(inside)]
 
     def runs(self, frames: Collection[int]) -> list[list[int]]:
-        """The frames, ascending, parted where a sweep between them is missing from ``frames`` or a
-        hole in time lies between them (more than three usual periods)."""
+        """Return the frames, ascending, parted where a sweep between them is missing from
+        ``frames`` or there is a hole in time (more than three usual periods)."""
         runs: list[list[int]] = []
         for row in sorted(self.row[f] for f in frames):
             if runs and runs[-1][-1] == row - 1 and not self._hole_before(row):
@@ -137,14 +137,14 @@ class Timeline:
         return [[self.frames[row] for row in run] for run in runs]
 
     def before(self, frame: int, num: int) -> list[int]:
-        """The ``num`` frames directly before this one, fewer behind a hole in time."""
+        """Return the ``num`` frames directly before this one, fewer behind a hole in time."""
         row = first = self.row[frame]
         while first > 0 and row - first < num and not self._hole_before(first):
             first -= 1
         return list(self.frames[first:row])
 
     def after(self, frame: int, num: int) -> list[int]:
-        """The ``num`` frames directly after this one, fewer before a hole in time."""
+        """Return the ``num`` frames directly after this one, fewer before a hole in time."""
         row = last = self.row[frame]
         while last + 1 < len(self.frames) and last - row < num and not self._hole_before(last + 1):
             last += 1
@@ -153,8 +153,8 @@ class Timeline:
     def window(
         self, key: int, window: int, left_out: Mapping[int, str] | None = None
     ) -> WindowFrames:
-        """The key and ``window`` sweeps on each side of it, of those that exist. A side ends early
-        at the end of the recording, at a hole in time, and at a sweep that is left out.
+        """Return the key and ``window`` existing sweeps on each side of it. A side ends early at
+        the end of the recording, at a hole in time, and at a sweep that is left out.
 
         left_out: frame -> why it cannot be used. Raises InputError if the key does not exist.
         """
@@ -195,8 +195,8 @@ class Timeline:
 
 
 def _out_of_order(stamps_ns: Int) -> list[int]:
-    """Rows, ascending, that stand in the way of the longest series of ascending stamps; none where
-    that would be half of them or more: then it is not they that are wrong."""
+    """Return the rows, ascending, that are not part of the longest series of ascending stamps; none
+    if those are half of all or more."""
     if np.all(np.diff(stamps_ns) > 0):
         return []
     best: list[int] = []  # the row of the lowest stamp at which a series of each length ends

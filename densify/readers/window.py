@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Reading the sweeps, cameras and poses that are used."""
+"""The sweeps, cameras and poses of a recording that a run uses."""
 
 from __future__ import annotations
 
@@ -14,16 +14,15 @@ from densify.geometry.types import Camera, LidarSequence, Sweep, Trajectory
 
 
 def read_sweep(sequence: LidarSequence, frame: int, settings: RegisterSettings) -> Sweep:
-    """A sweep without the own vehicle's returns and those too far to trust, both measured from the
-    scanner, and without per-point times where it is not to be deskewed. Raises InputError if it
-    cannot be read."""
+    """Return a sweep of the returns `in_range`, without times if it is not to be deskewed. Raises
+    InputError if it cannot be read."""
     sweep = in_range(sequence[frame], settings)
     return sweep if settings.deskew else replace(sweep, offset_ns=None)
 
 
 def in_range(sweep: Sweep, settings: RegisterSettings) -> Sweep:
-    """The sweep without the own vehicle's returns and those too far to trust, both measured from
-    the scanner."""
+    """Return the sweep without the own vehicle's returns and those too far to trust, both measured
+    from the scanner."""
     origins_m = sweep.scanner_origins
     x, y, z = (sweep.points if origins_m is None else sweep.points - origins_m[sweep.lidar]).T
     range_m = np.sqrt(x * x + y * y + z * z)
@@ -31,7 +30,7 @@ def in_range(sweep: Sweep, settings: RegisterSettings) -> Sweep:
 
 
 def choose_cameras(sequence: LidarSequence, names: Sequence[str] | None) -> list[Camera]:
-    """The cameras of these names; if None all with images, or simply all where none has any.
+    """Return the cameras of these names; if None all with images, or all where none has any.
     Raises InputError naming those that exist."""
     if isinstance(names, str) or not isinstance(names, Iterable | None):
         one = [*sequence.cameras][:1]
@@ -47,7 +46,7 @@ def choose_cameras(sequence: LidarSequence, names: Sequence[str] | None) -> list
 
 
 def recorded_trajectory(sequence: LidarSequence, sweeps: Sequence[Sweep]) -> Trajectory:
-    """The data set's own poses of the sweeps."""
+    """Return the data set's own poses of the sweeps."""
     return Trajectory(
         frames=tuple(s.frame for s in sweeps),
         stamp_ns=np.array([s.stamp_ns for s in sweeps], np.int64),
