@@ -19,9 +19,9 @@ if TYPE_CHECKING:
     from densify.config import Config as Config
     from densify.config.errors import ComputationError as ComputationError
     from densify.config.errors import InputError as InputError
-    from densify.dataset.gate import Gate as Gate
     from densify.dataset.loader import DepthDataset as DepthDataset
     from densify.dataset.make import make_dataset as make_dataset
+    from densify.dataset.plan import Gate as Gate
     from densify.dataset.plan import Recipe as Recipe
     from densify.flow.pairs.estimate import estimate_flow as estimate_flow
     from densify.geometry.types import Camera as Camera
@@ -44,7 +44,7 @@ _HOME = {
     "estimate_flow": "densify.flow.pairs.estimate",
     "make_dataset": "densify.dataset.make",
     "Recipe": "densify.dataset.plan",
-    "Gate": "densify.dataset.gate",
+    "Gate": "densify.dataset.plan",
     "Config": "densify.config",
     "InputError": "densify.config.errors",
     "ComputationError": "densify.config.errors",

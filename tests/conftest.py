@@ -16,7 +16,7 @@ from pathlib import Path
 import hypothesis
 import pytest
 
-from densify.dataset.processes import share_of_cores
+from densify.dataset.executor import share_of_cores
 
 NUM_PROCESSES = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
 if NUM_PROCESSES > 1:  # libraries read it when imported: the tests' own modules come after it

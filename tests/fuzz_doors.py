@@ -21,7 +21,6 @@ from typing import Any
 import cv2
 import numpy as np
 
-from densify.config.cache_codec import DamagedError, decode, encode
 from densify.config.errors import ComputationError, InputError
 
 ALLOWED = (InputError, ComputationError)
@@ -187,16 +186,6 @@ def _gzip(path: Path) -> None:
     gunzipped(read_bytes(path), path, 1 << 24)
 
 
-_ENTRY = dict[int, tuple[np.ndarray, str]]
-
-
-def _entry(path: Path) -> None:
-    try:
-        decode(path.read_bytes(), dict[int, tuple[np.ndarray, str]])
-    except DamagedError as error:
-        raise InputError(str(error)) from error
-
-
 def _saved(save: Callable[..., None], *arrays: Any, **named: Any) -> bytes:
     buffer = io.BytesIO()
     save(buffer, *arrays, **named)
@@ -246,13 +235,11 @@ def _file_doors() -> Iterator[Door]:
     track = {"instance": 2, "size_m": [4, 2, 1.5], "poses": [{**pose, "velocity_m_s": [1, 2, 0]}]}
     yield Door("movers", _movers, {"movers.json": json.dumps({"objects": [track]}).encode()})
     yield Door("gzip", _gzip, {"a.gz": gzip.compress(points.tobytes())})
-    entry = encode({1: (points, "x"), 2: (deep, "y")}, _ENTRY)
-    yield Door("cache entry", _entry, {"a.entry": entry})
 
 
 _COMMANDS = (
     ("run", "--key", "12", "--keys", "3:9:2", "--window", "5", "--set", "a.b=1", "--cache"),
-    ("dataset", "--keys", "1:5", "--workers", "2", "--memory", "8G", "--shard", "1/4"),
+    ("dataset", "--keys", "1:5", "--workers", "2", "--shard", "1/4"),
     ("flow", "a.npz", "b.npz", "--out", "c.npz"),
     ("simulate", "--out", "x", "--frames", "1:5", "--tilt", "10", "--seed", "3"),
     ("evaluate", "a", "b", "--focal-px", "700"),

@@ -5,12 +5,13 @@ from __future__ import annotations
 
 import inspect
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from densify.config import Config, resolve
-from densify.config.cache_codec import decode, encode
+from densify.config.cache import Cache
 from densify.config.errors import InputError
 from densify.config.plugins.engines import ENGINES, engine
 from densify.flow.engines import Scene, check_engine, estimate_motion, motion_type
@@ -80,10 +81,12 @@ def test_what_a_scene_is_asked_for_is_made_once(driving: Scene) -> None:
 
 
 @pytest.mark.parametrize("row", [r for r in ENGINES.built_in if r.shared], ids=lambda r: r.name)
-def test_shared_motion_is_kept_without_points(driving: Scene, row) -> None:
+def test_shared_motion_is_kept_without_points(driving: Scene, row, tmp_path: Path) -> None:
     motion = estimate_motion(driving, Config(), row.usage)
     kind = motion_type(row.usage)
-    kept = decode(encode(motion.with_stretch(Stretch(())), kind), kind)
+    cache, bare = Cache(folder=tmp_path), motion.with_stretch(Stretch(()))
+    cache.get("motion", kind, 1, lambda: bare)
+    kept = cache.get("motion", kind, 1, lambda: pytest.fail("not kept"))
     nobody = replace(
         driving.stretch.sweeps[0],
         sweep=driving.stretch.sweeps[0].sweep.select(

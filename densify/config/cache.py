@@ -1,117 +1,93 @@
 # SPDX-License-Identifier: MIT
-"""What was made once is kept on disk, found again by all that it was made from.
-
-Entries are written aside and renamed, so that several processes can share the folder; one that is
-damaged or foreign is made anew; a folder that cannot be written, or a full disk, only costs time.
-Entries hold arrays and plain numbers (`config.cache_codec`), and lie where nobody else can put
-any (`config.user_folder`). The cache can be deleted at any time.
-"""
+"""The cache on disk: results of pipeline steps, found again by all that they were made from. An
+entry is an ``.npz`` file without pickles: the arrays, and the rest as JSON. Its folder belongs to
+the user alone (`densify.config.user_folder`). A damaged entry is made again."""
 
 from __future__ import annotations
 
+import functools
 import hashlib
+import json
 import logging
 import os
 import tempfile
-import time
-from collections.abc import Callable
+import types
+import typing
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import fields, is_dataclass
-from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
 
 from densify import __version__
-from densify.config.cache_codec import MOST_BYTES, DamagedError, decode, encode
-from densify.config.errors import InputError
-from densify.config.file_content import read_bytes
 from densify.config.user_folder import own_folder
 
 T = TypeVar("T")
 _log = logging.getLogger("densify")
-
-_ENTRY, _ASIDE = ".entry", ".tmp"
-_LEFT_S = 3600.0  # what is aside for longer was left by a killed process
-
-
-def steps_folder() -> Path:
-    """Where a `Cache` keeps its entries. Raises InputError if others can write to it."""
-    return own_folder("steps")
+# Raise a step's number when it makes something else of the same inputs. Steps build on each other,
+# so an entry depends on all of them.
+_STEPS = "bag 1, digests 1, registration 1, images 1, ground 1, evidence 1, motion 1, far 1"
+_field_types = functools.cache(typing.get_type_hints)
 
 
 class Cache:
-    """limit_bytes: when it holds more, what was used longest ago is removed (`trim`)."""
+    """A folder of entries. limit_bytes: bound of its size, kept by `trim`. folder: the user's own
+    if None. Raises InputError if others can write to that."""
 
-    def __init__(self, limit_bytes: int, folder: Path | None = None) -> None:
-        """folder: None for the user's. Raises InputError if others can write to that."""
-        self._folder = folder or steps_folder()
-        self._limit_bytes = limit_bytes
+    def __init__(self, limit_bytes: int = 10 * 1024**3, folder: Path | None = None) -> None:
+        self._folder, self._limit_bytes = folder or own_folder("steps"), limit_bytes
         try:
             self._folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             _log.warning("%s: %s; nothing is kept for later", self._folder, error.strerror or error)
 
-    def get(self, stage: str, kind: type[T], inputs: Any, make: Callable[[], T]) -> T:
-        """What ``make`` returns, made now or at any earlier time.
-
-        kind: its type, by which it is read again, such as ``dict[int, Registration]``; see
-        `config.cache_codec`. inputs: everything that the outcome depends on beside the package's
-        own code; see `digest`.
-        """
-        path = self._folder / f"{stage}-{digest((code(), inputs))}{_ENTRY}"
+    def get(self, step: str, kind: type[T], inputs: Any, make: Callable[[], T]) -> T:
+        """Return what ``make`` returns, now or when it was made of the same inputs before. kind:
+        its type, by which an entry is read. inputs: all that it depends on, as `digest` takes."""
+        path = self._folder / f"{step}-{digest((__version__, _STEPS, inputs))}.npz"
         try:
-            value: T = decode(self._read(path), kind)
+            with np.load(path, allow_pickle=False) as arrays:
+                value: T = _unpacked(json.loads(arrays["json"].tobytes()), kind, arrays)
+            os.utime(path)  # the entry was used
             return value
-        except (InputError, DamagedError) as error:
-            _log.debug("%s: made anew: %s", path, error)
+        except FileNotFoundError:
+            pass
+        except Exception as error:  # a damaged file raises anything
+            _log.debug("%s: made again: %s", path, error)
         value = make()
         try:
-            _write(path, encode(value, kind))
-        except (OSError, TypeError, ValueError) as error:
+            text, arrays = _packed(value)
+            save_arrays(path, {"json": np.frombuffer(text, np.uint8), **arrays})
+        except (OSError, TypeError) as error:
             _log.debug("%s: not kept: %s", path, error)
         return value
 
     def trim(self) -> None:
-        """Keep the bound. Other processes may go on reading and writing meanwhile."""
-        found = []
-        with suppress(OSError):
-            for entry in os.scandir(self._folder):
-                with suppress(OSError):  # another process was first
-                    status = entry.stat(follow_symlinks=False)
-                    if entry.name.endswith(_ENTRY):
-                        found.append((status.st_mtime_ns, status.st_size, entry.path))
-                    elif entry.name.endswith(_ASIDE) and status.st_mtime < time.time() - _LEFT_S:
-                        os.unlink(entry.path)
-        left = sum(num_bytes for _, num_bytes, _ in found)
-        for _, num_bytes, path in sorted(found):
-            if left <= self._limit_bytes:
-                return
-            with suppress(OSError):
-                os.unlink(path)
-            left -= num_bytes
-
-    def _read(self, path: Path) -> bytes:
-        data = read_bytes(path, MOST_BYTES)
-        with suppress(OSError):
-            os.utime(path)  # it was used
-        return data
+        """Delete what was used longest ago until the rest keeps the bound."""
+        with suppress(OSError):  # another process deletes too
+            entries = [(e.stat().st_mtime_ns, e, e.stat().st_size) for e in self._folder.iterdir()]
+            left = sum(num_bytes for *_, num_bytes in entries)
+            for _, entry, num_bytes in sorted(entries):
+                if left > self._limit_bytes:
+                    entry.unlink()
+                    left -= num_bytes
 
 
 def kept(
-    cache: Cache | None, stage: str, kind: type[T], inputs: Callable[[], Any], make: Callable[[], T]
+    cache: Cache | None, step: str, kind: type[T], inputs: Callable[[], Any], make: Callable[[], T]
 ) -> T:
-    """What ``make`` returns, now or when it was made of the same inputs before."""
-    return make() if cache is None else cache.get(stage, kind, inputs(), make)
+    """Return what ``make`` returns, by the cache if there is one."""
+    return make() if cache is None else cache.get(step, kind, inputs(), make)
 
 
-def _write(path: Path, data: bytes) -> None:
-    """Complete or not at all."""
-    number, aside = tempfile.mkstemp(_ASIDE, dir=path.parent)
+def save_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
+    """Write an ``.npz`` file that appears when it is whole."""
+    number, aside = tempfile.mkstemp(".tmp", dir=path.parent)
     try:
         with open(number, "wb") as file:
-            file.write(data)
+            np.savez(file, **arrays)  # type: ignore[arg-type]
         os.replace(aside, path)
     except BaseException:
         os.unlink(aside)
@@ -119,34 +95,53 @@ def _write(path: Path, data: bytes) -> None:
 
 
 def digest(value: Any) -> str:
-    """Digest of anything made of arrays, numbers, text, dataclasses, sequences and mappings."""
-    state = hashlib.blake2b(digest_size=20)
-    _feed(state, value)
+    """Return a digest of arrays, numbers, text, dataclasses, sequences and mappings."""
+    text, arrays = _packed(value)
+    state = hashlib.blake2b(text, digest_size=20)
+    for array in arrays.values():
+        state.update(f"{array.dtype} {array.shape} ".encode())
+        state.update(np.ascontiguousarray(array).data)
     return state.hexdigest()
 
 
-def _feed(state: Any, value: Any) -> None:
-    if isinstance(value, np.ndarray):
-        state.update(f"array {value.dtype} {value.shape} ".encode())
-        state.update(np.ascontiguousarray(value).data)
-    elif is_dataclass(value):
-        _feed(state, [(f.name, getattr(value, f.name)) for f in fields(value)])
-    elif isinstance(value, dict):
-        _feed(state, sorted(value.items()))
-    elif isinstance(value, tuple | list):
-        state.update(f"{len(value)} of ".encode())
-        for item in value:
-            _feed(state, item)
-    elif value is None or isinstance(value, str | int | float | bool):
-        state.update(f"{type(value).__name__} {value!r} ".encode())
-    else:
-        raise TypeError(f"cannot be told from others: {type(value).__name__}")
+def _packed(value: Any) -> tuple[bytes, dict[str, np.ndarray]]:
+    """Return the value as JSON, and the arrays in it by the names that stand for them there.
+    Raises TypeError for other parts."""
+    arrays: dict[str, np.ndarray] = {}
+
+    def tree(value: Any) -> Any:
+        if isinstance(value, np.ndarray | np.generic) and not value.dtype.hasobject:
+            arrays[name := str(len(arrays))] = np.asarray(value)
+            return {"array" if isinstance(value, np.ndarray) else "scalar": name}
+        if is_dataclass(value):
+            return [tree(getattr(value, f.name)) for f in fields(value)]
+        if isinstance(value, Mapping):
+            return [[tree(key), tree(item)] for key, item in value.items()]
+        return [tree(item) for item in value] if isinstance(value, tuple | list) else value
+
+    return json.dumps(tree(value)).encode(), arrays
 
 
-@cache
-def code() -> str:
-    """Digest of this package's code: another version may make something else of the same inputs."""
-    package = Path(__file__).parents[1]
-    sources = sorted(package.rglob("*.py"))
-    texts = [(str(path.relative_to(package)), path.read_text("utf-8")) for path in sources]
-    return digest([__version__, texts])
+def _unpacked(tree: Any, kind: Any, arrays: Mapping[str, np.ndarray]) -> Any:
+    """Return the value of this type of `_packed`'s parts."""
+    if isinstance(tree, dict):
+        ((what, name),) = tree.items()
+        return arrays[name] if what == "array" else arrays[name][()]
+    if not isinstance(tree, list):
+        return tree
+    if typing.get_origin(kind) in (typing.Union, types.UnionType):
+        kind = next(k for k in typing.get_args(kind) if k not in (str, int, float, type(None)))
+    made, of = typing.get_origin(kind) or kind, typing.get_args(kind)
+    if issubclass(made, Mapping):
+        return {_unpacked(k, of[0], arrays): _unpacked(v, of[1], arrays) for k, v in tree}
+    names = [f.name for f in fields(made)] if is_dataclass(made) else getattr(made, "_fields", ())
+    if names:
+        of = tuple(_field_types(made)[name] for name in names)
+    elif len(of) == 1 or of[1] is ...:
+        of = (of[0],) * len(tree)
+    parts = [_unpacked(part, k, arrays) for part, k in zip(tree, of, strict=True)]
+    if not is_dataclass(made):
+        return made(*parts) if names else parts if made is list else tuple(parts)
+    value: Any = object.__new__(typing.cast(type, made))
+    value.__dict__.update(zip(names, parts, strict=True))  # init=False fields too
+    return value

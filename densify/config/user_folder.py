@@ -14,27 +14,26 @@ from densify.config.errors import InputError
 
 
 def own_folder(name: str) -> Path:
-    """That folder of the cache: in the user's cache directory, or in the folder named by the
-    environment variable DENSIFY_CACHE_DIR. It is made, for the user alone, where that is possible.
+    """Return that folder of the user's cache directory, or of the one that the environment variable
+    DENSIFY_CACHE_DIR names. It is made with mode 0700 where that is possible.
 
     Raises InputError if others can write to it.
     """
     named = os.environ.get("DENSIFY_CACHE_DIR")
     root = Path(named or platformdirs.user_cache_dir("densify"))
     for folder in (root, root / name):
-        with suppress(OSError):  # who writes to it will say so
+        with suppress(OSError):  # whoever writes to it reports that
             folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         if others_can_write(folder):
             raise InputError(
-                f"cache {folder}: others can write to it, and what they put there would be "
-                f"used; expected a folder of yours alone: chmod 700 {folder}, or name another "
-                "by DENSIFY_CACHE_DIR"
+                f"cache {folder}: others can write to it, expected a folder of yours alone; "
+                f"chmod 700 {folder}, or name another by DENSIFY_CACHE_DIR"
             )
     return root / name
 
 
 def others_can_write(folder: Path) -> bool:
-    """Whether anybody but this user and root can; no if it does not exist."""
+    """Return True if anybody but this user and root can write to an existing folder."""
     try:
         found = folder.stat()
     except OSError:

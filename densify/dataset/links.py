@@ -5,9 +5,9 @@
     OUT/data_rgb/val/2011_09_26_drive_0013_sync          the recording's folder, with
     OUT/data_rgb/2011_09_26/2011_09_26_drive_0013_sync   image_02/data/0000000120.png
 
-The first form is that of fangchangma/self-supervised-depth-completion and its many relatives; the
-second that of JUGGHM/PENet_ICRA2021, whose ``--data-folder-rgb`` is OUT/data_rgb. Both take only
-drives whose names end in ``_sync``.
+fangchangma/self-supervised-depth-completion and its relatives use the first form,
+JUGGHM/PENet_ICRA2021 the second (``--data-folder-rgb`` is OUT/data_rgb). Both take only drives
+whose names end in ``_sync``.
 """
 
 from __future__ import annotations
@@ -19,7 +19,6 @@ from pathlib import Path
 
 from densify.config.errors import InputError, OutputError
 from densify.dataset.plan import PlannedDrive
-from densify.outputs.atomic import make_folder
 from densify.readers import open_sequence
 from densify.readers.kitti.raw import KittiRaw
 
@@ -27,16 +26,25 @@ _log = logging.getLogger("densify")
 
 
 def make_links(out: Path, drives: Sequence[PlannedDrive]) -> None:
-    """Make them where they are missing, for the recordings that are KITTI raw drives; warns of the
-    others, whose images lie otherwise.
+    """Make the links that are missing. Warns of recordings that are no KITTI raw drives, because
+    their images lie otherwise.
 
     Raises OutputError if one cannot be made, InputError if something else has its place.
     """
     for drive in drives:
         for place, target in _links(out, drive):
+            if os.path.lexists(place):
+                if place.is_symlink() and os.readlink(place) == target:
+                    continue
+                raise InputError(
+                    f"--links: {place} is there already and leads elsewhere; expected nothing, or "
+                    f"a link to {target}; move it away"
+                )
             try:
-                make_folder(place.parent)
-                _link(place, target)
+                place.parent.mkdir(parents=True, exist_ok=True)
+                os.symlink(target, place)
+            except FileExistsError:  # a shard beside this one was faster
+                pass
             except OSError as error:
                 raise OutputError(
                     f"--links: {place} cannot be made: {error.strerror or error}"
@@ -44,7 +52,7 @@ def make_links(out: Path, drives: Sequence[PlannedDrive]) -> None:
 
 
 def _links(out: Path, drive: PlannedDrive) -> Iterator[tuple[Path, str]]:
-    """Where, and to what."""
+    """Yield the path and the target of each link."""
     split, name = drive.source.folder.split("/", 1)
     for product in ("data_depth_velodyne", "data_depth_annotated"):
         yield out / product / split, f"../{split}"
@@ -55,17 +63,3 @@ def _links(out: Path, drive: PlannedDrive) -> Iterator[tuple[Path, str]]:
     folder = str(sequence.where.resolve())
     yield out / "data_rgb" / split / name, folder
     yield out / "data_rgb" / name[:10] / name, folder
-
-
-def _link(place: Path, target: str) -> None:
-    if place.is_symlink() and os.readlink(place) == target:
-        return
-    try:
-        os.symlink(target, place)
-    except FileExistsError as error:
-        if place.is_symlink() and os.readlink(place) == target:  # by a shard beside this one
-            return
-        raise InputError(
-            f"--links: {place} is there already and leads elsewhere; expected nothing, or a link "
-            f"to {target}; move it away"
-        ) from error

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: MIT
-"""A training set, as a story: plan, see what is finished, make the rest, record every key."""
+"""Make a training set: plan it, see what is finished, make the rest, record every key."""
 
 from __future__ import annotations
 
 import logging
+import math
 import shutil
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -14,9 +15,10 @@ from typing import Any
 from uuid import uuid4
 
 from densify.config import as_mapping
-from densify.config.cache import code, steps_folder
+from densify.config.cache import Cache
 from densify.config.errors import ComputationError, InputError, OutputError
-from densify.dataset.capacity import BASE_BYTES, num_processes
+from densify.dataset.executor import call_all, check_scheduler
+from densify.dataset.key import Job, make_key
 from densify.dataset.links import make_links
 from densify.dataset.manifest import (
     Key,
@@ -35,18 +37,17 @@ from densify.dataset.plan import (
     read_plan,
     write_plan,
 )
-from densify.dataset.tasks import Outcome, Task, run_tasks
-from densify.dataset.work import Job, tasks
-from densify.dataset.workers import check_workers, open_workers
 from densify.flow.engines import check_engine
+from densify.geometry.threads import num_threads
 from densify.outputs.atomic import clear_leftovers
 from densify.outputs.kitti_tree import write_readme
+from densify.pipeline.memory import available_bytes, check_free, need_of_run
+from densify.readers import open_sequence
 from densify.readers.timeline import format_frames
 
 _log = logging.getLogger("densify")
-
-CACHE_BYTES = 10 * 1024**3
-"""Bound of what is kept on disk for later runs."""
+_LEAST_KEYS = 8  # of a process; fewer are made before another one has begun
+_SHARE_OF_FREE = 0.7  # of the memory; files that are read want some too
 _TREE_BYTES_PER_PIXEL = 1.8  # the four maps of a camera
 _RUN_BYTES_PER_PIXEL, _CLOUD_BYTES_PER_SWEEP = 8.0, 2.5e6
 
@@ -74,7 +75,7 @@ class Summary:
         return self.seconds / self.num_made * self.num_left if self.num_made else None
 
     def mean(self, score: str) -> float | None:
-        """Over the keys that are done, and their cameras."""
+        """Return the mean over the keys that are done, and their cameras."""
         values: list[Any] = []  # a manifest of others may hold anything
         for record in self.records.values():
             value = record.scores.get(score) if record.status == "done" else None
@@ -92,76 +93,138 @@ def make_dataset(
     num_workers: int | None = 1,
     scheduler: str | None = None,
     shard: tuple[int, int] | None = None,
-    memory_bytes: int | None = None,
-    cache_bytes: int = CACHE_BYTES,
     verify: bool = False,
     links: bool = False,
     report: Callable[[Summary], None] | None = None,
 ) -> Summary:
-    """Every key of whole recordings, as a training set in ``out``.
+    """Make every key of whole recordings, as a training set in the folder ``out``.
 
-    data: recordings, as `densify.open_sequence` takes them. keys: all if None, else those of frames
-    ``start`` to ``stop`` - 1 by ``step``. recipe: window, method, cameras and the like, the usual
-    ones if None. num_workers: processes; 1 works in this one, None takes as many as cores, free
-    memory and keys suffice for (a script that starts several must be importable:
-    ``if __name__ == "__main__"``). scheduler: address of a Dask scheduler whose workers are used
-    instead; they need the same files at the same paths; ``tcp://`` trusts everybody on that
-    network, ``tls://`` takes certificates. shard: (i, n), the i-th of n parts of the work, from 1;
-    parts may run at the same time on machines that share ``out``. memory_bytes: of all processes
-    together; fewer are started where it does not suffice, and one of several that takes more than
-    its share is replaced. cache_bytes: bound of what is kept on disk for later runs. verify:
-    compare finished files with their recorded hashes, and make damaged ones anew. links: of the
-    tree, for loaders of others, see `densify.dataset.links`. report: called before the first key
-    and after every one.
+    data: recordings, as `densify.open_sequence` takes them.
+    keys: the frames ``start`` to ``stop`` - 1 by ``step`` that exist; all if None.
+    recipe: window, method, cameras and the like; the usual ones if None.
+    num_workers: processes; 1 works in this one, None takes as many as cores, free memory and keys
+        suffice for. A script that starts several needs ``if __name__ == "__main__"``.
+    scheduler: address of a Dask scheduler whose workers are used instead; they need the same files
+        at the same paths. ``tcp://`` trusts everybody on that network, ``tls://`` takes
+        certificates.
+    shard: (i, n), the i-th of n parts of the work, from 1. Parts may run at the same time on
+        machines that share ``out``.
+    verify: compare finished files with their recorded hashes, and make damaged ones again.
+    links: for loaders of others, see `densify.dataset.links`.
+    report: called before the first key and after every one.
 
-    Run again, it goes on where it was stopped, however that happened: finished keys are kept, keys
-    that failed are tried again. The files do not depend on the number of processes, on shards or on
-    interruptions. What became of a key is in the manifest (`densify.dataset.manifest`).
+    Run again, it goes on where it was stopped: finished keys are kept, keys that failed are tried
+    again. The files do not depend on the number of processes, on shards or on interruptions. The
+    manifest says what became of every key (`densify.dataset.manifest`).
 
     Raises InputError for what cannot be used, and where another run is at work on the same part;
     ComputationError where the disk is full or the workers are lost: what is finished is kept.
     """
-    if isinstance(data, str):
-        raise InputError(f"data: got {data!r}, expected a list of recordings, such as [{data!r}]")
+    if isinstance(data, str) or not data:
+        raise InputError(f"data: got {data!r}, expected a list of recordings, such as ['street']")
     out, recipe = Path(out), recipe or Recipe()
     check_engine(recipe.config.flow.engine)
     drives = plan(data, keys, recipe)
     check_place(out)
     if links and recipe.layout != "kitti-depth":
         raise InputError(f"--links: of --layout kitti-depth, got --layout {recipe.layout}")
-    steps_folder()
-    check_workers(num_workers, scheduler)
-    num_started = num_processes(num_workers, memory_bytes, recipe, drives)
-    of_workers = memory_bytes and memory_bytes - int(BASE_BYTES)
+    Cache()  # refuses a folder that others can write to
+    if scheduler is not None:
+        check_scheduler(scheduler)
+    num_workers = _num_processes(num_workers, recipe, drives)
     with Manifest(out, shard) as manifest:
         write_plan(out, recipe, drives)
         with _log_file(out, shard):
             clear_leftovers(out)
-            _explain(out, recipe)
+            if recipe.layout == "kitti-depth":
+                settings = as_mapping(recipe.config)
+                write_readme(out, method=recipe.method, window=recipe.window, settings=settings)
             if links:
                 make_links(out, drives)
             drives = _part(drives, shard)
             done = _Done(out, drives, report, verify)
             left = done.left(drives)
-            _announce(out, recipe, left, done.summary().num_keys, num_started)
-            todo = _tasks(left, recipe, out, cache_bytes)
+            _announce(out, recipe, left, done.summary().num_keys, num_workers)
             if report is not None:
                 report(done.summary())
-            with _kept_told(done):
-                if todo:
-                    with open_workers(num_started, scheduler, of_workers) as workers:
-                        for record in _records(run_tasks(todo, workers)):
-                            manifest.append(record)
-                            done.add(record)
-                    clear_leftovers(out)  # of workers that were killed
+            with _tell_kept(done):
+                for record in _made(left, recipe, out, num_workers, scheduler):
+                    manifest.append(record)
+                    done.add(record)
+            clear_leftovers(out)  # of workers that were killed
     return done.summary()
 
 
-def _explain(out: Path, recipe: Recipe) -> None:
-    """Write the README of a tree whose layout is not ours."""
-    if recipe.layout == "kitti-depth":
-        settings = as_mapping(recipe.config)
-        write_readme(out, method=recipe.method, window=recipe.window, settings=settings)
+def status(out: Path) -> tuple[Summary, list[str]]:
+    """Return how far a set is, finished or not, and the last line of each of its logs.
+
+    Raises InputError if ``out`` holds none.
+    """
+    table = read_plan(out)
+    if table is None:
+        raise InputError(f"--status {out}: no dataset.json in it; expected a set's folder")
+    keys = planned_keys(table)
+    records = {name: r for name, r in read_manifests(out).items() if name in keys}
+    lines = []
+    for path in sorted(out.glob("densify*.log")):
+        text = path.read_text("utf-8", errors="replace").splitlines()
+        lines += [line.replace(" DEBUG ", " ", 1) for line in text[-1:]]
+    return Summary(records, len(keys)), lines
+
+
+def damaged(out: Path) -> list[str]:
+    """Return the files of finished keys, relative to ``out``, that are missing or hold something
+    else than was written, by the hashes in the manifest."""
+    records = read_manifests(out).values()
+    return [name for r in records if r.status != "failed" for name in damaged_files(r, out)]
+
+
+def _num_processes(wanted: int | None, recipe: Recipe, drives: Sequence[PlannedDrive]) -> int:
+    """Return the number wanted; if None, as many as cores, free memory and keys suffice for.
+    Raises InputError if the memory does not suffice for one."""
+    if wanted is not None and wanted < 1:
+        raise InputError(f"--workers {wanted}: expected 1 or more processes")
+    need_bytes = _need_bytes(recipe, drives[0])
+    check_free(need_bytes, f"--window {recipe.window}: a process")
+    if wanted is not None:
+        return wanted
+    num_keys = sum(len(drive.keys) for drive in drives)
+    free_bytes = available_bytes() or float("inf")
+    fitting = [_SHARE_OF_FREE * free_bytes // need_bytes, num_threads(), num_keys // _LEAST_KEYS]
+    return max(1, int(min(fitting)))
+
+
+def _need_bytes(recipe: Recipe, drive: PlannedDrive) -> float:
+    """Return about what a process takes at its peak, by the first sweep that can be read."""
+    sequence = open_sequence(drive.source.data)
+    for key in drive.keys:
+        with suppress(InputError):
+            cameras = drive.source.cameras
+            return need_of_run(sequence, key, recipe.window, cameras, recipe.config)
+    return 1.0
+
+
+def _made(
+    drives: Sequence[PlannedDrive],
+    recipe: Recipe,
+    out: Path,
+    num_workers: int,
+    scheduler: str | None,
+) -> Iterator[KeyRecord]:
+    """Make the keys; a block's first key makes what all its keys share."""
+    run, groups = uuid4().hex, []
+    for drive in drives:
+        job = Job(drive.source, recipe, out.absolute(), run)
+        for block in sorted({drive.cut.number_near(key) for key in drive.keys}):
+            keys = [key for key in drive.keys if drive.cut.number_near(key) == block]
+            groups.append([(job, key) for key in keys])
+    # Workers begin far from each other, because neighbouring blocks share steps too.
+    step = math.ceil(len(groups) / num_workers)
+    spread = [group for start in range(step) for group in groups[start::step]]
+    for (job, key), outcome in call_all(make_key, spread, num_workers, scheduler):
+        if isinstance(outcome, Exception):
+            outcome = KeyRecord(job.source.name, key, "failed", str(outcome))
+        yield outcome
 
 
 class _Done:
@@ -179,7 +242,7 @@ class _Done:
         whole = finished(before.values(), out, verify)
         self._records = {name: before[name] for name in sorted(wanted & whole)}
         self._num_keys, self._report = len(wanted), report
-        self._num_made, self._started = 0, time.monotonic()
+        self._num_made, self._start_s = 0, time.monotonic()
 
     def left(self, drives: Sequence[PlannedDrive]) -> list[PlannedDrive]:
         rest = [
@@ -197,74 +260,27 @@ class _Done:
             self._report(summary)
 
     def summary(self) -> Summary:
-        seconds = time.monotonic() - self._started
+        seconds = time.monotonic() - self._start_s
         return Summary(self._records, self._num_keys, self._num_made, seconds)
-
-    def kept(self) -> str:
-        num_kept = sum(record.status != "failed" for record in self._records.values())
-        return f"{num_kept} of {self._num_keys} keys are finished and kept"
 
 
 @contextmanager
-def _kept_told(done: _Done) -> Iterator[None]:
-    """However the block ends early, it is said what is kept; a full disk is a ComputationError."""
+def _tell_kept(done: _Done) -> Iterator[None]:
+    """Say what is kept if the block ends early; a full disk is a ComputationError."""
     try:
         yield
-    except OutputError as error:
-        raise ComputationError(f"{error}; {done.kept()}") from error
-    except BaseException:
-        _log.info(done.kept())
+    except BaseException as error:
+        summary = done.summary()
+        num_kept = summary.count("done") + summary.count("aside")
+        told = f"{num_kept} of {summary.num_keys} keys are finished and kept"
+        if isinstance(error, OutputError):
+            raise ComputationError(f"{error}; {told}") from error
+        _log.info(told)
         raise
 
 
-def _tasks(
-    drives: Sequence[PlannedDrive], recipe: Recipe, out: Path, cache_bytes: int
-) -> list[Task]:
-    run, place = uuid4().hex, out.absolute()
-    jobs = [Job(d.source, recipe, place, cache_bytes, code(), run) for d in drives]
-    return [task for job, d in zip(jobs, drives, strict=True) for task in tasks(job, d.keys, d.cut)]
-
-
-def status(out: Path) -> tuple[Summary, list[str]]:
-    """How far a set is, finished or not, and the last line of each of its logs.
-
-    Raises InputError if ``out`` holds none.
-    """
-    table = read_plan(out)
-    if table is None:
-        raise InputError(f"--status {out}: no dataset.json in it; expected a set's folder")
-    keys = planned_keys(table)
-    records = {name: r for name, r in read_manifests(out).items() if name in keys}
-    lines = []
-    for path in sorted(out.glob("densify*.log")):
-        text = path.read_text("utf-8", errors="replace").splitlines()
-        lines += [line.replace(" DEBUG ", " ", 1) for line in text[-1:]]
-    return Summary(records, len(keys)), lines
-
-
-def damaged(out: Path) -> list[str]:
-    """Files of finished keys, relative to ``out``, that are missing or hold something else than was
-    written, by the hashes in the manifest."""
-    records = read_manifests(out).values()
-    return [name for r in records if r.status != "failed" for name in damaged_files(r, out)]
-
-
-def _records(outcomes: Iterator[Outcome]) -> Iterator[KeyRecord]:
-    for outcome in outcomes:
-        what, *where = outcome.name
-        if what == "key":
-            if isinstance(outcome.error, OutputError):
-                raise outcome.error
-            failed = KeyRecord(where[0], where[1], "failed", str(outcome.error))
-            yield failed if outcome.error is not None else outcome.value
-        elif outcome.error is not None:
-            _log.warning("%s of block %d of %s: %s", what, where[1], where[0], outcome.error)
-        else:
-            _log.debug("%s of block %d of %s: %.1f s", what, where[1], where[0], outcome.value)
-
-
 def _part(drives: Sequence[PlannedDrive], shard: tuple[int, int] | None) -> list[PlannedDrive]:
-    """The blocks of a shard, of all drives: neighbours together, because they share work."""
+    """Return the blocks of a shard, of all drives: neighbours together, because they share work."""
     i, n = shard or (1, 1)
     blocks = [
         (d.source.name, b) for d in drives for b in sorted({d.cut.number_near(k) for k in d.keys})
@@ -278,7 +294,7 @@ def _part(drives: Sequence[PlannedDrive], shard: tuple[int, int] | None) -> list
 
 
 def _announce(
-    out: Path, recipe: Recipe, left: Sequence[PlannedDrive], num_keys: int, num_processes: int
+    out: Path, recipe: Recipe, left: Sequence[PlannedDrive], num_keys: int, num_workers: int
 ) -> None:
     num_left = sum(len(d.keys) for d in left)
     need = sum(len(d.keys) * _bytes_per_key(recipe, d) for d in left)
@@ -288,7 +304,7 @@ def _announce(
         num_keys,
         num_keys - num_left,
         num_left,
-        num_processes,
+        num_workers,
         need / 1e9,
         free / 1e9,
     )
@@ -304,25 +320,25 @@ def _bytes_per_key(recipe: Recipe, drive: PlannedDrive) -> float:
 
 
 def _line(record: KeyRecord, summary: Summary) -> str:
-    """A line of the log."""
-    left_s = summary.seconds_left or 0.0
+    """Return a line of the log."""
     told = f" ({record.reason})" if record.reason else ""
     return (
         f"key {record.key} of {record.drive}: {record.status}{told}, "
         f"frames {format_frames(record.frames) or 'none'}, {record.seconds:.1f} s; "
         f"{len(summary.records)} of {summary.num_keys}, "
-        f"{summary.seconds / summary.num_made:.2f} s a key, {left_s / 60:.1f} min left"
+        f"{summary.seconds / summary.num_made:.2f} s a key, "
+        f"{(summary.seconds_left or 0.0) / 60:.1f} min left"
     )
 
 
 class _LogFile(logging.FileHandler):
     def handleError(self, record: logging.LogRecord) -> None:
-        """A full disk is told of by those who write what counts."""
+        """Ignore a full disk: whoever writes maps reports it."""
 
 
 @contextmanager
 def _log_file(out: Path, shard: tuple[int, int] | None) -> Iterator[None]:
-    """What is logged goes to ``OUT/densify.log`` too, behind what earlier runs logged."""
+    """Append what is logged to ``OUT/densify.log``, or a shard's own."""
     name = "densify.log" if shard is None else f"densify-{shard[0]}of{shard[1]}.log"
     try:
         handler = _LogFile(out / name, encoding="utf-8")

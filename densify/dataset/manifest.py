@@ -9,11 +9,10 @@ of four shards, one JSON line per key::
     files        path relative to OUT, with slashes -> bytes, sha256
     scores       numbers; null where nothing can be said
     seconds      of computing
-    warnings     what was assumed or looks wrong, sentences
+    warnings     sentences about what was assumed or looks wrong
 
-A line is on the disk before the next one is begun, so whatever kills the writer damages at most the
-last one. A damaged line counts as none, and its key is made again. A later line of a key replaces
-an earlier one.
+A line is on the disk before the next one is begun. A killed writer damages at most the last line.
+The key of a damaged line is made again. A later line of a key replaces an earlier one.
 """
 
 from __future__ import annotations
@@ -28,21 +27,17 @@ from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Literal, get_args
 
 from densify.config.errors import InputError, OutputError
 from densify.config.file_content import open_file, parse_json, read_bytes
-from densify.outputs.atomic import FileRecord, make_folder, sync_folder, write_file
+from densify.outputs.atomic import FileRecord, write_file
 from densify.outputs.plain import plain
 
 Status = Literal["done", "aside", "failed"]
 Key = tuple[str, int]
 """A recording's name and a frame number."""
-
-log = logging.getLogger("densify")
-
-_PATTERN = "manifest*.jsonl"
+_log = logging.getLogger("densify")
 
 
 @dataclass(frozen=True)
@@ -78,82 +73,67 @@ class KeyRecord:
         return self.drive, self.key
 
     def to_line(self) -> bytes:
-        """One line of JSON with its end; the same record gives the same bytes."""
-        record = {
-            "drive": self.drive,
-            "key": self.key,
-            "status": self.status,
-            "reason": self.reason,
-            "frames": self.frames,
-            "files": {
-                name: {"bytes": file.num_bytes, "sha256": file.sha256}
-                for name, file in sorted(self.files.items())
-            },
-            "scores": self.scores,
-            "seconds": round(self.seconds, 3),
-            "warnings": self.warnings,
+        """Return one line of JSON with its end; the same record gives the same bytes."""
+        files = {
+            name: {"bytes": file.num_bytes, "sha256": file.sha256}
+            for name, file in sorted(self.files.items())
         }
+        record = {**vars(self), "files": files, "seconds": round(self.seconds, 3)}
         return (json.dumps(plain(record), allow_nan=False) + "\n").encode()
 
     @staticmethod
     def from_line(line: bytes) -> KeyRecord:
-        """Fields of later versions are passed over. Raises ValueError for a damaged line."""
+        """Read a line, without fields of later versions. Raises ValueError if it is damaged."""
         try:
-            return _record(parse_json(line, "a line"))
-        except (
-            InputError,
-            KeyError,
-            TypeError,
-            AttributeError,
-            OverflowError,
-            RecursionError,
-        ) as error:
+            fields = parse_json(line, "a line")
+            return KeyRecord(
+                drive=fields["drive"],
+                key=fields["key"],
+                status=fields["status"],
+                reason=fields["reason"],
+                frames=tuple(fields["frames"]),
+                files={n: FileRecord(f["bytes"], f["sha256"]) for n, f in fields["files"].items()},
+                scores=dict(fields["scores"].items()),
+                seconds=float(fields["seconds"]),
+                warnings=tuple(fields.get("warnings", ())),
+            )
+        except Exception as error:  # damaged text raises anything
             raise ValueError(f"no record of a key: {error!r}") from error
 
 
 def read_manifests(root: Path) -> dict[Key, KeyRecord]:
-    """The records of all manifests in a folder, ordered by drive and key.
+    """Return the records of all manifests in a folder, ordered by drive and key.
 
     Of several lines of a key in one file the last one counts; between the files of shards one that
-    is done, else one put aside. A torn last line is passed over, any other damaged line too, with a
-    warning. Raises InputError if a manifest cannot be read.
+    is done, else one put aside. Warns of damaged lines before the last. Raises InputError if a
+    manifest cannot be read.
     """
+    rank = ("failed", "aside", "done").index
     records: dict[Key, KeyRecord] = {}
-    for path in sorted(root.glob(_PATTERN)):
+    for path in sorted(root.glob("manifest*.jsonl")):
         for name, (record, _) in _read(path).items():
-            if name not in records or _rank(record) >= _rank(records[name]):
+            if name not in records or rank(record.status) >= rank(records[name].status):
                 records[name] = record
     return dict(sorted(records.items()))
 
 
-def _rank(record: KeyRecord) -> int:
-    return ("failed", "aside", "done").index(record.status)
-
-
-def is_whole(record: KeyRecord, root: Path) -> bool:
-    """Whether all files of a record are there with their size; of a done one, at least one file.
-
-    Looks at no content, see `damaged_files`.
-    """
-    if record.status == "done" and not record.files:
-        return False
-    return all(_size(root / name) == file.num_bytes for name, file in record.files.items())
-
-
 def damaged_files(record: KeyRecord, root: Path) -> list[str]:
-    """Paths relative to ``root`` of a record's files that are missing or hold something else."""
+    """Return the record's files, relative to ``root``, that are missing or hold something else."""
     return [name for name, file in record.files.items() if _content(root / name) != file]
 
 
 def finished(records: Iterable[KeyRecord], root: Path, verify: bool = False) -> set[Key]:
-    """Keys that need not be made again: done or put aside, and their files are whole.
+    """Return the keys that need not be made again: done or put aside, with all their files.
 
-    verify: whether their contents are compared with the recorded hashes too, which reads them all.
+    verify: compare the files' contents with the recorded hashes too, else only their sizes.
     """
     return {
         r.name
         for r in records
-        if r.status != "failed" and is_whole(r, root) and not (verify and damaged_files(r, root))
+        if r.status != "failed"
+        and (r.files or r.status == "aside")
+        and all(_size(root / name) == file.num_bytes for name, file in r.files.items())
+        and not (verify and damaged_files(r, root))
     }
 
 
@@ -162,10 +142,9 @@ class Manifest:
 
     root: the folder of the set, made if it is not there. shard: (k, n) for the k-th of n, from 1.
 
-    Only one process at a time can have it open. The lock goes with its process, however that ends;
-    its hidden file stays: who removes a lock's file takes it from under one who has just opened it,
-    and a third then locks a new one. On opening and on closing the file is put in order: one line
-    per key, by drive and key, and nothing torn.
+    Only one process at a time can have it open. Its hidden lock file stays: to remove it would take
+    the lock from another process that has just opened it. On opening and on closing, the lines are
+    put in order: one per key, by drive and key.
 
     Raises InputError if another process has it open or it cannot be read, OutputError if it cannot
     be written.
@@ -176,97 +155,64 @@ class Manifest:
             raise ValueError(f"shard: got {shard}, expected (k, n) with 1 <= k <= n")
         stem = "manifest" if shard is None else f"manifest-{shard[0]}of{shard[1]}"
         self.path = root / f"{stem}.jsonl"
-        self._root = root
         try:
-            make_folder(root)
-            self._lock = _locked(root / f".{stem}.lock", root)
+            root.mkdir(parents=True, exist_ok=True)
+            self._lock = os.open(root / f".{stem}.lock", os.O_RDWR | os.O_CREAT, 0o666)
+            try:
+                _lock(self._lock, root)
+                self._lines = {name: line for name, (_, line) in _read(self.path).items()}
+                self._put_in_order()
+            except BaseException:
+                os.close(self._lock)
+                raise
         except OSError as error:
             raise self._not_written(error) from error
-        try:
-            self._lines = {name: line for name, (_, line) in _read(self.path).items()}
-            self._put_in_order()
-            self._file = os.open(self.path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o666)
-            sync_folder(root)
-        except OSError as error:
-            os.close(self._lock)
-            raise self._not_written(error) from error
-        except BaseException:
-            os.close(self._lock)
-            raise
 
     def __enter__(self) -> Manifest:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        if error is None:
-            self.close()
-        else:  # what came before says more; the file goes on without the order
-            with suppress(OutputError):
-                self.close()
+    def __exit__(self, kind: object, error: object, traceback: object) -> None:
+        try:
+            self._put_in_order()
+        except OSError as failure:  # the file keeps all records without the order
+            if error is None:
+                raise self._not_written(failure) from failure
+        finally:
+            os.close(self._lock)
 
     def append(self, record: KeyRecord) -> None:
-        """Add a key's record, or replace it. It is on the disk when this returns; where that fails
-        the manifest is as before, and OutputError is raised."""
+        """Add a key's record, or replace it. It is on the disk when this returns. Raises
+        OutputError, and leaves the manifest as before, if it cannot be written."""
         line = record.to_line()
         try:
-            size = os.fstat(self._file).st_size
-            try:
-                written = 0
-                while written < len(line):
-                    written += os.write(self._file, line[written:])
-                os.fsync(self._file)
-            except BaseException:
-                os.ftruncate(self._file, size)  # else the next line would go on behind half of this
-                raise
+            with self.path.open("ab", buffering=0) as file:
+                size = file.tell()
+                try:
+                    if file.write(line) != len(line):
+                        raise OSError(0, "no space for a whole line")
+                    os.fsync(file.fileno())
+                except BaseException:
+                    file.truncate(size)
+                    raise
         except OSError as error:
             raise self._not_written(error) from error
         self._lines[record.name] = line
 
-    def close(self) -> None:
-        """Put the file in order and let the next one have it. Raises OutputError if the file
-        cannot be rewritten; it then is as it was, with all records."""
-        os.close(self._file)
-        try:
-            self._put_in_order()
-        except OSError as error:
-            raise self._not_written(error) from error
-        finally:
-            os.close(self._lock)
-
     def _put_in_order(self) -> None:
         data = b"".join(line for _, line in sorted(self._lines.items()))
-        if _bytes_of(self.path) != data:
+        if not self.path.exists() or read_bytes(self.path) != data:
             write_file(self.path, data, durable=True)
 
     def _not_written(self, error: OSError) -> OutputError:
         return OutputError(
-            f"--out {self._root}: {self.path.name} cannot be written: {error.strerror or error}; "
-            f"see to it and run the same command again"
+            f"--out {self.path.parent}: {self.path.name} cannot be written: "
+            f"{error.strerror or error}; see to it and run the same command again"
         )
 
 
-def _record(fields: Mapping[str, Any]) -> KeyRecord:
-    return KeyRecord(
-        drive=fields["drive"],
-        key=fields["key"],
-        status=fields["status"],
-        reason=fields["reason"],
-        frames=tuple(fields["frames"]),
-        files={n: FileRecord(f["bytes"], f["sha256"]) for n, f in fields["files"].items()},
-        scores=dict(fields["scores"].items()),
-        seconds=float(fields["seconds"]),
-        warnings=tuple(fields.get("warnings", ())),
-    )
-
-
 def _read(path: Path) -> dict[Key, tuple[KeyRecord, bytes]]:
-    """The last record of each key with its line; empty if there is no such file."""
-    *lines, tail = (_bytes_of(path) or b"").split(b"\n")
+    """Return the last record of each key with its line; {} if there is no such file."""
+    lines = read_bytes(path).split(b"\n") if path.exists() else [b""]
     records, damaged = {}, []
     for number, line in enumerate(lines, start=1):
         try:
@@ -274,24 +220,17 @@ def _read(path: Path) -> dict[Key, tuple[KeyRecord, bytes]]:
             records[record.name] = (record, line + b"\n")
         except ValueError:
             damaged.append(number)
+    if damaged[-1:] == [len(lines)]:  # the end: nothing, or what a killed writer left
+        del damaged[-1]
     if damaged:
-        log.warning(
-            "%s: damaged lines passed over: %d of %d, the first is line %d; their keys are made "
-            "again",
+        _log.warning(
+            "%s: %d of %d lines are damaged, the first is line %d; their keys are made again",
             path,
             len(damaged),
-            len(lines),
+            len(lines) - 1,
             damaged[0],
         )
-    with suppress(ValueError):  # torn, unless only its end is missing
-        record = KeyRecord.from_line(tail)
-        records[record.name] = (record, tail + b"\n")
     return records
-
-
-def _bytes_of(path: Path) -> bytes | None:
-    """None if there is no such file."""
-    return read_bytes(path) if path.exists() else None
 
 
 def _size(path: Path) -> int | None:
@@ -302,30 +241,21 @@ def _size(path: Path) -> int | None:
 
 
 def _content(path: Path) -> FileRecord | None:
-    try:
-        with open_file(path) as file:
-            digest = hashlib.sha256()
-            while block := file.read(1 << 20):
-                digest.update(block)
-            return FileRecord(file.tell(), digest.hexdigest())
-    except (InputError, OSError):
-        return None
+    with suppress(InputError, OSError), open_file(path) as file:
+        digest = hashlib.sha256()
+        while block := file.read(1 << 20):
+            digest.update(block)
+        return FileRecord(file.tell(), digest.hexdigest())
+    return None
 
 
-def _locked(path: Path, root: Path) -> int:
-    """The descriptor of the lock's file, to be closed."""
-    lock = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
+def _lock(lock: int, root: Path) -> None:
+    """Take the lock, which goes with the process however that ends."""
     try:
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError as error:
-        os.close(lock)
         raise InputError(
             f"--out {root}: another run is at work there; wait for it, or use another --out"
         ) from error
     except OSError as error:
-        log.warning(
-            "%s: this file system has no locks (%s); see that no second run writes there",
-            root,
-            error.strerror or error,
-        )
-    return lock
+        _log.warning("%s: no locks here (%s); start no second run there", root, error.strerror)

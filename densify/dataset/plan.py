@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: MIT
 """What a training set is to be: which keys of which recordings, and how they are made.
 
-It is written down as ``OUT/dataset.json``, so that a later run goes on with the same set and no
-other, and readers find cameras and recordings:
+``OUT/dataset.json`` holds it, so that a later run goes on with the same set:
 
     schema_version, densify (version)
     layout, method, window, cameras, gate, config    of every key
@@ -15,9 +14,9 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -25,10 +24,10 @@ from densify import __version__
 from densify.config import Config, as_mapping
 from densify.config.errors import InputError, OutputError
 from densify.config.file_content import read_json
-from densify.dataset.gate import Gate
 from densify.geometry.types import Camera, LidarSequence
-from densify.outputs.atomic import make_folder, write_file
+from densify.outputs.atomic import write_file
 from densify.outputs.kitti_tree import drive_folder, split_of
+from densify.outputs.plain import plain
 from densify.pipeline.blocks import Cut
 from densify.readers import Spec, open_sequence
 from densify.readers.timeline import Timeline, check_window, format_frames, runs
@@ -42,6 +41,49 @@ _LARGEST_WINDOW = 50
 _MOST_FRAMES = 10_000_000
 _SAME = ("densify", "layout", "method", "window", "cameras", "gate", "config")
 """Entries of dataset.json in which all runs of a set must agree."""
+_CAMERA = [f.name for f in fields(Camera) if f.name != "name"]
+
+
+@dataclass(frozen=True)
+class Gate:
+    """Limits beyond which a key is put aside, by scores that need no truth; None is no limit.
+
+    max_ghost: share of the accumulated points that the key sweep saw through.
+    min_density: share of the image's pixels with a measured depth, in every camera.
+    max_outliers: share of the key sweep's returns, held out, that are outliers by KITTI's rule, in
+        every camera.
+    min_sweeps: number of sweeps in the window, which ends and gaps of the recording cut.
+    """
+
+    max_ghost: float | None = None
+    min_density: float | None = None
+    max_outliers: float | None = None
+    min_sweeps: int | None = None
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            option = f"--{name.replace('_', '-')}"
+            if value is None:
+                continue
+            if name == "min_sweeps" and value < 1:
+                raise InputError(f"{option} {value}: expected 1 sweep or more")
+            if name != "min_sweeps" and not 0 <= value <= 1:
+                raise InputError(f"{option} {value:g}: expected a share, 0 to 1, not per cent")
+
+    def reason(self, scores: Mapping[str, Any], num_sweeps: int) -> str | None:
+        """Return why a key with these `scores` is put aside; None if it is not."""
+        if self.min_sweeps is not None and num_sweeps < self.min_sweeps:
+            return f"{num_sweeps} sweeps, expected at least {self.min_sweeps}"
+        ghost = scores["ghost"]
+        if self.max_ghost is not None and ghost is not None and ghost > self.max_ghost:
+            return f"ghost rate {ghost:.5f}, expected at most {self.max_ghost:g}"
+        for camera, density in scores["density"].items():
+            if self.min_density is not None and density < self.min_density:
+                return f"density {density:.4f} in {camera}, expected at least {self.min_density:g}"
+        for camera, share in scores["outliers"].items():
+            if self.max_outliers is not None and (share or 0) > self.max_outliers:
+                return f"outliers {share:.5f} in {camera}, expected at most {self.max_outliers:g}"
+        return None
 
 
 @dataclass(frozen=True)
@@ -155,7 +197,9 @@ def _keys(sequence: LidarSequence, keys: slice | None, spec: str) -> tuple[int, 
 
 def check_place(out: Path) -> None:
     """Raise InputError if anything but a set, or the beginnings of one, is there."""
-    if read_plan(out) is None and out.is_dir() and any(not _begun(p.name) for p in out.iterdir()):
+    begun = (".", "manifest")  # files of a run before there is a dataset.json
+    names = [path.name for path in out.iterdir()] if out.is_dir() else []
+    if read_plan(out) is None and not all(name.startswith(begun) for name in names):
         raise InputError(f"--out {out}: not empty, and no dataset.json in it; choose another")
 
 
@@ -172,7 +216,7 @@ def write_plan(out: Path, recipe: Recipe, drives: Sequence[PlannedDrive]) -> Non
     if before is None or table != before:
         text = json.dumps(table, indent=1) + "\n"
         try:
-            make_folder(out)
+            out.mkdir(parents=True, exist_ok=True)
             write_file(out / _FILE, text.encode(), durable=True)
         except OSError as error:
             raise OutputError(
@@ -204,8 +248,7 @@ def read_plan(out: Path) -> dict[str, Any] | None:
     )
 
 
-@dataclass(frozen=True)
-class StoredDrive:
+class StoredDrive(NamedTuple):
     """A recording of dataset.json. data: what ``--data`` takes. folder: of its files, relative to
     the set's."""
 
@@ -215,9 +258,17 @@ class StoredDrive:
 
 
 def stored_drives(out: Path, table: Mapping[str, Any]) -> dict[str, StoredDrive]:
-    """The recordings of what `read_plan` gave, by name. Raises InputError if it is damaged."""
+    """Return the recordings of what `read_plan` gave, by name. Raises InputError for damaged
+    cameras."""
     try:
-        return {name: _stored_drive(drive) for name, drive in table["drives"].items()}
+        return {
+            name: StoredDrive(
+                drive["data"],
+                drive["folder"],
+                {n: _camera(n, camera) for n, camera in drive["cameras"].items()},
+            )
+            for name, drive in table["drives"].items()
+        }
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise InputError(
             f"{out / _FILE}: damaged or no description of a training set ({type(error).__name__}: "
@@ -226,23 +277,18 @@ def stored_drives(out: Path, table: Mapping[str, Any]) -> dict[str, StoredDrive]
 
 
 def planned_keys(table: Mapping[str, Any]) -> set[tuple[str, int]]:
-    """(drive, frame) of every key in a dataset.json."""
+    """Return (drive, frame) of every key in a dataset.json."""
     return {(n, f) for n, drive in table["drives"].items() for f in _frames(drive["frames"])}
 
 
 def _check_kinds(table: Mapping[str, Any]) -> None:
-    """Raise TypeError unless what is looked up in later is there to be looked up in."""
-    drives = table["drives"]
-    parts = [table["config"], table["gate"], drives, *drives.values()]
-    if not all(isinstance(part, dict) for part in (*parts, *(d["cameras"] for d in parts[3:]))):
+    """Raise TypeError unless mappings and texts are where they are expected."""
+    drives = list(table["drives"].values())
+    parts = [table["config"], table["gate"], *drives, *(d["cameras"] for d in drives)]
+    if not all(isinstance(part, dict) for part in parts):
         raise TypeError("got no mapping where one is expected")
-    if not all(isinstance(d[part], str) for d in parts[3:] for part in ("data", "folder")):
+    if not all(isinstance(d[part], str) for d in drives for part in ("data", "folder")):
         raise TypeError("got no text where one is expected")
-
-
-def _begun(name: str) -> bool:
-    """Whether a run leaves that before there is a dataset.json."""
-    return name.startswith((".", "manifest"))
 
 
 def _table(recipe: Recipe, drives: Sequence[PlannedDrive]) -> dict[str, Any]:
@@ -252,7 +298,7 @@ def _table(recipe: Recipe, drives: Sequence[PlannedDrive]) -> dict[str, Any]:
         "layout": recipe.layout,
         "method": recipe.method,
         "window": recipe.window,
-        "cameras": None if recipe.cameras is None else list(recipe.cameras),
+        "cameras": recipe.cameras,
         "gate": asdict(recipe.gate),
         "config": as_mapping(recipe.config),
         "drives": {
@@ -260,29 +306,26 @@ def _table(recipe: Recipe, drives: Sequence[PlannedDrive]) -> dict[str, Any]:
                 "data": d.source.data,
                 "folder": d.source.folder,
                 "frames": _as_runs(d.keys),
-                "cameras": {c.name: _as_plain(c) for c in d.cameras},
+                "cameras": {c.name: {n: getattr(c, n) for n in _CAMERA} for c in d.cameras},
             }
             for d in drives
         },
     }
-    return dict(json.loads(json.dumps(table)))
+    return dict(plain(table))
 
 
 def _check_same(out: Path, before: Mapping[str, Any], now: Mapping[str, Any]) -> None:
     for name in _SAME:
-        if before[name] != now[name]:
-            got, expected = now[name], before[name]
-            where = name
-            while isinstance(got, dict) and isinstance(
-                expected, dict
-            ):  # down to the one that differs
-                parts = {**expected, **got}  # a set of another version may have knobs of its own
-                part = next(k for k in parts if got.get(k) != expected.get(k))
-                got, expected, where = got.get(part), expected.get(part), f"{where}.{part}"
-            raise InputError(
-                f"--out {out}: the set in it was made with {where} = {expected}, got {got}; "
-                f"choose another --out, or go on with the same options"
-            )
+        got, expected, where = now[name], before[name], name
+        if got == expected:
+            continue
+        while isinstance(got, dict) and isinstance(expected, dict):  # down to the one that differs
+            part = next(k for k in {**expected, **got} if got.get(k) != expected.get(k))
+            got, expected, where = got.get(part), expected.get(part), f"{where}.{part}"
+        raise InputError(
+            f"--out {out}: the set in it was made with {where} = {expected}, got {got}; "
+            f"choose another --out, or go on with the same options"
+        )
 
 
 def _united(out: Path, before: dict[str, Any], now: dict[str, Any]) -> dict[str, Any]:
@@ -301,37 +344,12 @@ def _united(out: Path, before: dict[str, Any], now: dict[str, Any]) -> dict[str,
     return dict(sorted(united.items()))
 
 
-def _stored_drive(entry: Mapping[str, Any]) -> StoredDrive:
-    cameras = {
-        name: Camera(
-            name=name,
-            width_px=int(camera["width_px"]),
-            height_px=int(camera["height_px"]),
-            K=np.array(camera["K"], np.float64).reshape(3, 3),
-            T_cam_lidar=np.array(camera["T_cam_lidar"], np.float64).reshape(4, 4),
-            distortion=tuple(camera["distortion"]),
-            model=str(camera.get("model", "pinhole")),  # sets of before name none
-            max_angle_deg=float(camera.get("max_angle_deg", 180.0)),
-            row_time_s=float(camera.get("row_time_s", 0.0)),
-            column_time_s=float(camera.get("column_time_s", 0.0)),
-        )
-        for name, camera in entry["cameras"].items()
-    }
-    return StoredDrive(str(entry["data"]), str(entry["folder"]), cameras)
-
-
-def _as_plain(camera: Camera) -> dict[str, Any]:
-    return {
-        "width_px": camera.width_px,
-        "height_px": camera.height_px,
-        "K": camera.K.tolist(),
-        "T_cam_lidar": camera.T_cam_lidar.tolist(),
-        "distortion": list(camera.distortion),
-        "model": camera.model,
-        "max_angle_deg": camera.max_angle_deg,
-        "row_time_s": camera.row_time_s,
-        "column_time_s": camera.column_time_s,
-    }
+def _camera(name: str, stored: Mapping[str, Any]) -> Camera:
+    given = {part: stored[part] for part in _CAMERA if part in stored}
+    given["K"] = np.array(stored["K"], np.float64).reshape(3, 3)
+    given["T_cam_lidar"] = np.array(stored["T_cam_lidar"], np.float64).reshape(4, 4)
+    given["distortion"] = tuple(stored["distortion"])
+    return Camera(name=name, **given)
 
 
 def _as_runs(frames: Iterable[int]) -> list[list[int]]:

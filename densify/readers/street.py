@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import hashlib
 import logging
-import os
 import threading
 from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
@@ -24,6 +23,7 @@ from urllib.parse import parse_qsl
 import numpy as np
 from numpy.typing import NDArray
 
+from densify.config.cache import save_arrays
 from densify.config.errors import InputError
 from densify.config.user_folder import own_folder
 from densify.geometry.threads import num_threads
@@ -330,14 +330,8 @@ def _read(path: Path) -> Arrays | None:
 
 
 def _write(path: Path, arrays: Arrays) -> None:
-    aside = path.with_name(f".{path.stem}.{os.getpid()}.{threading.get_ident()}.npz")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        try:
-            with aside.open("wb") as file:
-                np.savez(file, **arrays)  # type: ignore[arg-type]
-            os.replace(aside, path)
-        finally:
-            aside.unlink(missing_ok=True)
+        save_arrays(path, arrays)
     except OSError as error:
         _log.debug("street frame not kept in the cache: %s", error)

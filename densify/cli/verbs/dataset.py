@@ -22,7 +22,6 @@ from densify.cli.options import (
     config_of,
     natural,
     shard,
-    size_bytes,
 )
 from densify.cli.progress import keys_on_stderr
 from densify.cli.screen import tell_doubts
@@ -135,20 +134,6 @@ def _add_workers(parser: argparse.ArgumentParser) -> None:
         metavar="i/n",
         help="the i-th of n parts of the work, for machines that share DIR",
     )
-    work.add_argument(
-        "--memory",
-        type=size_bytes,
-        metavar="SIZE",
-        help="of all processes together, such as 8G: no more workers are started than fit, and one "
-        "of several that takes more than its share is started anew",
-    )
-    work.add_argument(
-        "--cache-size",
-        type=size_bytes,
-        default="10G",
-        metavar="SIZE",
-        help="of what is kept on disk for later runs (default: 10G)",
-    )
 
 
 def answer(options: argparse.Namespace) -> Iterator[Answer]:
@@ -176,9 +161,8 @@ def _made(options: argparse.Namespace) -> Iterator[Answer]:
         raise InputError("--out DIR: expected the set's folder, a new one or one to go on with")
     config = config_of(options)
     from densify.cli.sets import FIRST_OF_SET, set_facts, set_summary
-    from densify.dataset.gate import Gate
     from densify.dataset.make import make_dataset
-    from densify.dataset.plan import Recipe
+    from densify.dataset.plan import Gate, Recipe
 
     limits = ("max_ghost", "min_density", "max_outliers", "min_sweeps")
     recipe = Recipe(
@@ -199,8 +183,6 @@ def _made(options: argparse.Namespace) -> Iterator[Answer]:
             num_workers=options.workers,
             scheduler=options.scheduler,
             shard=options.shard,
-            memory_bytes=options.memory,
-            cache_bytes=options.cache_size,
             verify=options.verify,
             links=options.links,
             report=report,

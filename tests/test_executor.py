@@ -1,0 +1,190 @@
+# SPDX-License-Identifier: MIT
+"""Calls done here, by processes of this machine, and by the workers of a Dask scheduler."""
+
+from __future__ import annotations
+
+import logging
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import worker_calls
+
+from densify.config.errors import ComputationError, InputError
+from densify.dataset import executor
+from densify.dataset.executor import call_all, check_scheduler
+
+PATIENCE_S = 60  # before a test that hangs fails
+
+
+def until(what: Callable[[], bool]) -> None:
+    end = time.monotonic() + PATIENCE_S
+    while not what():
+        assert time.monotonic() < end, "did not happen"
+        time.sleep(0.02)
+
+
+def is_gone(pid: int) -> bool:
+    try:
+        state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
+    except (FileNotFoundError, ProcessLookupError):  # before or while it is read
+        return True
+    return state == "Z"
+
+
+@pytest.fixture(scope="module", params=["here", "processes", "dask"])
+def where(request: pytest.FixtureRequest):
+    if request.param != "dask":
+        yield {"num_workers": 1 if request.param == "here" else 2}
+        return
+    distributed = pytest.importorskip("distributed")
+    options = {"dashboard_address": "127.0.0.1:0", "threads_per_worker": 1}
+    with distributed.LocalCluster(n_workers=2, **options) as cluster:
+        yield {"scheduler": cluster.scheduler_address}
+
+
+def test_every_outcome_is_yielded_once(where: dict, caplog: pytest.LogCaptureFixture) -> None:
+    groups = [[1, 2, 3], [4], [-1, 5], [1000, 1001]]
+    found = list(call_all(worker_calls.square, groups, **where))
+    outcomes = dict(found)
+    assert len(found) == len(outcomes) == 8
+    error = outcomes.pop(-1)
+    assert isinstance(error, ComputationError) and "KeyError: 'negative'" in str(error)
+    assert outcomes == {n: n * n for n in (1, 2, 3, 4, 5, 1000, 1001)}
+    told = [r for r in caplog.records if r.name == "densify.dataset"]
+    assert sorted(r.getMessage() for r in told) == ["large: 1000", "large: 1001"]
+    assert {r.levelno for r in told} == {logging.WARNING}
+    assert list(call_all(worker_calls.square, [], **where)) == []
+
+
+def test_the_first_of_a_group_is_over_before_the_others(where: dict, tmp_path: Path) -> None:
+    groups = [[(tmp_path, 10 * g + n, n == 0) for n in range(5)] for g in range(6)]
+    for (_, _, is_first), there in call_all(worker_calls.note, groups, **where):
+        assert there is not is_first
+
+
+def test_a_death_costs_its_item_alone(tmp_path: Path) -> None:
+    groups = [[(tmp_path, 10 * g + n) for n in range(10)] for g in range(2)]
+    found = {item[1]: out for item, out in call_all(worker_calls.die_once, groups, 2)}
+    error = found.pop(7)
+    assert isinstance(error, ComputationError) and "died of it twice" in str(error)
+    assert found == {n: n for n in range(20) if n != 7}
+
+
+def test_cores_are_shared_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(7)))
+    before = dict(os.environ)
+    told = [outcome for _, outcome in call_all(worker_calls.threads, [[0], [1]], 2)]
+    assert set(told) == {("3", 3, False)}
+    assert dict(os.environ) == before
+    assert executor.share_of_cores(8)["OMP_NUM_THREADS"] == "1"
+
+
+def test_a_script_without_its_guard_is_told_so(tmp_path: Path) -> None:
+    script = tmp_path / "unguarded.py"
+    script.write_text(
+        "from densify.dataset.executor import call_all\nprint(list(call_all(abs, [[1]], 2)))\n"
+    )
+    path = os.pathsep.join([str(Path(executor.__file__).parents[2])])
+    environment = {**os.environ, "PYTHONPATH": path}
+    done = subprocess.run(
+        [sys.executable, script], env=environment, capture_output=True, text=True, timeout=60
+    )
+    assert done.returncode == 1 and "before they have begun; a script" in done.stderr
+
+
+MAIN = """
+import sys
+from pathlib import Path
+sys.path.insert(0, sys.argv[2])
+import worker_calls
+from densify.dataset.executor import call_all
+if __name__ == "__main__":
+    list(call_all(worker_calls.wait, [[Path(sys.argv[1]) / f"{n}.pid"] for n in range(4)], 2))
+"""
+
+
+@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGINT])
+def test_workers_end_with_the_command(how: signal.Signals, tmp_path: Path) -> None:
+    script = tmp_path / "main.py"
+    script.write_text(MAIN)
+    arguments = [sys.executable, str(script), str(tmp_path), str(Path(__file__).parent)]
+    path = str(Path(executor.__file__).parents[2])
+    with subprocess.Popen(
+        arguments,
+        env={**os.environ, "PYTHONPATH": path},
+        stderr=subprocess.DEVNULL,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
+    ) as process:
+        places = [tmp_path / f"{n}.pid" for n in range(2)]
+        until(lambda: all(place.exists() for place in places))
+        process.send_signal(how)
+        until(lambda: all(is_gone(int(place.read_text())) for place in places))
+
+
+# Schedulers
+
+
+@pytest.mark.parametrize("address", ["tcp://127.0.0.1:9", "localhost", "tls://127.0.0.1:9"])
+def test_a_scheduler_that_is_not_reached(address: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(executor, "_CONNECT_S", 0.5)
+    with pytest.raises(InputError, match=f"scheduler {address}: not reached .* expected") as error:
+        check_scheduler(address)
+    assert ("certificates that the scheduler trusts" in str(error.value)) == ("tls" in address)
+
+
+def test_a_scheduler_needs_dask(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    with pytest.raises(InputError, match=r"pip install 'densify\[cluster\]'"):
+        check_scheduler("tcp://127.0.0.1:9")
+
+
+def test_a_scheduler_that_ends(tmp_path: Path) -> None:
+    """In the middle of a call; and whoever has no certificate is not let in."""
+    distributed = pytest.importorskip("distributed")
+    place, openssl = tmp_path / "scheduler.json", shutil.which("openssl")
+    if openssl is None:
+        pytest.skip("no openssl here to make certificates")
+    pem, key = tmp_path / "certificate.pem", tmp_path / "key.pem"
+    new = [openssl, "req", "-x509", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:P-256"]
+    new += ["-nodes", "-days", "2", "-subj", "/CN=densify", "-keyout", str(key), "-out", str(pem)]
+    subprocess.run(new, check=True, capture_output=True)
+    pem.write_text(pem.read_text() + key.read_text())
+    tls = ["--protocol", "tls", "--tls-ca-file", str(pem), "--tls-cert", str(pem)]
+    dask = [sys.executable, "-m", "dask"]
+    common = ["--scheduler-file", str(place), *tls]
+    options = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "cwd": tmp_path}
+    path = os.pathsep.join([str(Path(executor.__file__).parents[2]), str(Path(__file__).parent)])
+    options |= {"env": {**os.environ, "PYTHONPATH": path}, "start_new_session": True}
+    host = ["--host", "127.0.0.1", "--port", "0", "--no-dashboard"]
+    scheduler = subprocess.Popen([*dask, "scheduler", *host, *common], **options)
+    until(lambda: place.exists() and place.read_text().rstrip().endswith("}"))
+    worker = [*dask, "worker", "--nthreads", "1", "--no-dashboard", *common]
+    worker_process = subprocess.Popen(worker, **options)
+    try:
+        address = distributed.utils.json.loads(place.read_text())["address"]
+        with pytest.raises(InputError, match="certificates that the scheduler trusts"):
+            check_scheduler(address)
+        names = ("ca-file", "client.cert", "client.key")
+        with distributed.utils.dask.config.set(
+            {f"distributed.comm.tls.{name}": str(pem) for name in names}
+        ):
+            outcomes = call_all(worker_calls.square, [[3]], scheduler=address)
+            assert next(outcomes) == (3, 9)
+            left = call_all(worker_calls.wait, [[tmp_path / "long.pid"]], scheduler=address)
+            os.killpg(worker_process.pid, 0)
+            import threading
+
+            threading.Timer(1.0, scheduler.kill).start()
+            with pytest.raises(ComputationError, match="scheduler was lost; run the same command"):
+                next(left)
+    finally:
+        for process in (scheduler, worker_process):
+            os.killpg(process.pid, signal.SIGKILL)
+            process.wait()
