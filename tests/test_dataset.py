@@ -1,23 +1,26 @@
 # SPDX-License-Identifier: MIT
-"""`densify dataset` from end to end: the same set however it is made."""
+"""`densify dataset` from end to end: the same set however it is made, and whatever happens."""
 
 from __future__ import annotations
 
+import errno
 import json
+import os
 import shutil
+import signal
+import time
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from densify.config.cache import Cache, steps_folder
+from densify.config import resolve
 from densify.config.errors import InputError
-from densify.dataset import make, work
+from densify.dataset import key as one_key
+from densify.dataset import make
 from densify.dataset.loader import DepthDataset
-from densify.dataset.plan import Recipe, Source
-from densify.dataset.work import Job, tasks
-from densify.pipeline.blocks import Cut
-from densify.readers.timeline import Timeline
+from densify.dataset.make import make_dataset
+from densify.dataset.plan import Recipe
 from tests.command import exit_code, files_in
 from tests.dataset_scenes import (
     BORDER,
@@ -25,6 +28,7 @@ from tests.dataset_scenes import (
     FRAMES,
     OPTIONS,
     across_border,
+    command,
     copy_drive,
     in_order,
     keys_of,
@@ -34,16 +38,29 @@ from tests.dataset_scenes import (
     story,
     sweep_file,
     write_drive,
+    write_sweep,
 )
 
 PATIENCE_S = 120
 CAMERA = "image_02"
+CHEAP = (*OPTIONS, "--method", "none")
+GIVEN = {"register": {"source": "dataset"}}
+
+
+def times(out: Path) -> dict[Path, int]:
+    return {path: path.stat().st_mtime_ns for path in out.rglob("*.png")}
+
+
+def is_whole(out: Path, whole: Path) -> None:
+    in_order(out)
+    assert maps_in(out) == maps_in(whole)
+    assert story(out) == story(whole)
 
 
 # The same set
 
 
-def test_a_set_is_what_it_says(border_set: Path) -> None:
+def test_a_set_is_what_it_says(border_set: Path, tmp_path: Path, capsys) -> None:
     in_order(border_set)
     assert keys_of(maps_in(border_set)) == set(FRAMES)
     products = {Path(name).parts[:5] for name in maps_in(border_set)}
@@ -52,183 +69,105 @@ def test_a_set_is_what_it_says(border_set: Path) -> None:
     for record in records(border_set):
         near = [f for f in FRAMES if abs(f - record["key"]) <= 2]
         assert (record["status"], record["frames"]) == ("done", near)
-        assert len(record["files"]) == 4
         assert record["scores"]["ghost"] < 0.01
         assert record["scores"]["num_moving"] > 100
     assert {p.name for p in border_set.iterdir()} == {
         *("val", "dataset.json", "manifest.jsonl", ".manifest.lock", "densify.log", "README.txt")
     }
+    data = DepthDataset(border_set)
+    assert [sample["frame"] for sample in data] == list(FRAMES)
+    dense, sparse = data[3]["dense_depth_m"], data[3]["sparse_depth_m"]
+    assert (dense > 0).sum() > 2 * (sparse > 0).sum() > 1000
+    scores, maps = tmp_path / "scores.json", border_set / "val" / DRIVE / "proj_depth"
+    assert exit_code("evaluate", maps / "groundtruth", border_set, "--out", scores) == 0
+    assert json.dumps(json.loads(scores.read_text())).count('"outliers": 0.0') > 0
 
 
-@pytest.mark.parametrize(
-    "how",
-    [
-        ["--keys", "38:41"],
-        ["--keys", "36:45:4"],
-        ["--keys", "41:42", "--cache-size", "1K"],
-    ],
-    ids=" ".join,
-)
 def test_keys_do_not_depend_on_which_are_asked_for(
-    how: list[str], border_drive: Path, border_set: Path, empty_cache: Path, tmp_path: Path
+    border_drive: Path, border_set: Path, empty_cache: Path, tmp_path: Path
 ) -> None:
-    out = tmp_path / "out"
-    assert exit_code("dataset", "--data", border_drive, *OPTIONS, *how, "--out", out) == 0
+    out, keys = tmp_path / "out", ("--keys", "36:45:4")
+    assert exit_code("dataset", "--data", border_drive, *OPTIONS, *keys, "--out", out) == 0
     in_order(out)
     asked = keys_of(maps_in(out))
-    assert asked == set(range(*map(int, how[1].split(":"))))
+    assert asked == {36, 40, 44}
     assert maps_in(out) == {n: d for n, d in maps_in(border_set).items() if keys_of([n]) <= asked}
 
 
-def test_two_workers_make_what_one_makes(
-    border_drive: Path, border_set: Path, tmp_path: Path
+def test_workers_and_shards_make_what_one_makes(
+    border_drive: Path, border_set: Path, empty_cache: Path, tmp_path: Path, monkeypatch
 ) -> None:
-    out = tmp_path / "out"
-    assert exit_code("dataset", "--data", border_drive, *OPTIONS, "--workers", 2, "--out", out) == 0
-    in_order(out)
-    assert maps_in(out) == maps_in(border_set)
-    assert story(out) == story(border_set)
+    out, made = tmp_path / "out", []
+    arguments = ["dataset", "--data", border_drive, *OPTIONS, "--out", out]
+    for shard, workers in (("1/2", 2), ("2/2", 1)):
+        assert exit_code(*arguments, "--shard", shard, "--workers", workers) == 0
+        made.append(keys_of(maps_in(out)))
+    assert made[0] < made[1] == set(FRAMES)
+    is_whole(out, border_set)
+    assert (out / "dataset.json").read_bytes() == (border_set / "dataset.json").read_bytes()
+    # Another run makes nothing again.
+    before = times(out)
+    monkeypatch.setattr(make, "call_all", lambda _, groups, *rest: iter(groups))
+    assert exit_code(*arguments) == 0
+    assert times(out) == before
 
 
-def test_a_scheduler_whose_workers_live_on(
+def test_a_killed_run_that_goes_on_makes_the_same_set(
     border_drive: Path, border_set: Path, empty_cache: Path, tmp_path: Path
 ) -> None:
-    """What they remember of one run is nothing to the next."""
-    distributed = pytest.importorskip("distributed")
-    drive, out = copy_drive(border_drive, tmp_path / "2011_09_26"), tmp_path / "out"
-    torn = sweep_file(drive, 40)
-    sweep = torn.read_bytes()
-    torn.write_bytes(sweep[:-1])
-    options = {"dashboard_address": "127.0.0.1:0", "threads_per_worker": 1}
-    with distributed.LocalCluster(n_workers=1, **options) as cluster:
-        arguments = ["--data", drive, *OPTIONS, "--scheduler", cluster.scheduler_address]
-        assert exit_code("dataset", *arguments, "--keys", "39:41", "--out", out) == 1
-        assert statuses(out) == {39: "done", 40: "failed"}
-        torn.write_bytes(sweep)
-        assert exit_code("dataset", *arguments, "--keys", "39:41", "--out", out) == 0
-    in_order(out)
-    again = {n: d for n, d in maps_in(out).items() if keys_of([n]) == {40}}
-    assert again == {n: d for n, d in maps_in(border_set).items() if keys_of([n]) == {40}}
-
-
-def test_shards_make_what_one_makes(border_drive: Path, border_set: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
-    made = []
-    for shard in ("1/3", "2/3", "3/3"):
-        arguments = ["--data", border_drive, *OPTIONS, "--shard", shard, "--out", out]
-        assert exit_code("dataset", *arguments) == 0
-        made.append(keys_of(maps_in(out)))
-    assert made[0] <= made[1] <= made[2] == set(FRAMES)
-    in_order(out)
-    assert maps_in(out) == maps_in(border_set)
-    assert story(out) == story(border_set)
-    assert (out / "dataset.json").read_bytes() == (border_set / "dataset.json").read_bytes()
-    # Who goes on without shards keeps all that.
-    before = {path: path.stat().st_mtime_ns for path in out.rglob("*.png")}
-    assert exit_code("dataset", "--data", border_drive, *OPTIONS, "--out", out) == 0
-    assert {path: path.stat().st_mtime_ns for path in out.rglob("*.png")} == before
+    arguments = ["--data", border_drive, *OPTIONS, "--workers", "2", "--out", out]
+    with command(*arguments) as process:
+        end = time.monotonic() + PATIENCE_S
+        while len(list(out.rglob("*.png"))) < 13 and process.poll() is None:
+            assert time.monotonic() < end
+            time.sleep(0.002)
+        os.killpg(process.pid, signal.SIGKILL)
+        process.communicate(timeout=PATIENCE_S)
+    finished, before = [key for key, how in statuses(out).items() if how == "done"], times(out)
+    assert finished
+    assert exit_code("dataset", *arguments[:-4], "--out", out) == 0
+    is_whole(out, border_set)
+    kept = {path for path in before if int(path.stem) in finished}
+    assert {path: times(out)[path] for path in kept} == {path: before[path] for path in kept}
 
 
-def test_another_run_makes_nothing_again(
-    border_drive: Path, border_set: Path, monkeypatch: pytest.MonkeyPatch
+def test_damaged_files_are_made_again(
+    border_drive: Path, border_set: Path, tmp_path: Path, capsys
 ) -> None:
-    monkeypatch.setattr(make, "open_workers", None)
-    before = {p: p.stat().st_mtime_ns for p in border_set.rglob("*") if p.name != "densify.log"}
-    assert exit_code("dataset", "--data", border_drive, *OPTIONS, "--out", border_set) == 0
-    after = {p: p.stat().st_mtime_ns for p in border_set.rglob("*") if p.name != "densify.log"}
-    assert {p: t for p, t in after.items() if before[p] != t}.keys() <= {
-        border_set,
-        border_set / "README.txt",
-        border_set / ".manifest.lock",
-    }
-
-
-def test_a_damaged_set_is_made_whole(border_drive: Path, border_set: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     shutil.copytree(border_set, out)
     maps = out / "val" / DRIVE / "proj_depth"
     (maps / "confidence" / CAMERA / "0000000038.png").unlink()
+    changed = maps / "groundtruth" / CAMERA / "0000000040.png"
+    changed.write_bytes(changed.read_bytes()[:-20] + bytes(20))  # of the right size
     path = maps / "groundtruth" / CAMERA / "0000000042.png"
     path.write_bytes(path.read_bytes()[:-1])
     manifest = out / "manifest.jsonl"
     lines = manifest.read_bytes().splitlines(keepends=True)
-    lines[5] = lines[5][:40] + b"\n"
     manifest.write_bytes(b"".join(lines[:-1]) + lines[-1][:50])
-    before = {p: p.stat().st_mtime_ns for p in out.rglob("*.png")}
-    assert exit_code("dataset", "--data", border_drive, *OPTIONS, "--out", out) == 0
-    in_order(out)
-    assert maps_in(out) == maps_in(border_set)
-    assert story(out) == story(border_set)
-    changed = {p for p in out.rglob("*.png") if p.stat().st_mtime_ns != before.get(p)}
-    assert keys_of(map(str, changed)) == {38, 41, 42, 44}
+    before = times(out)
+    arguments = ["dataset", "--data", border_drive, *OPTIONS, "--out", out]
+    assert exit_code(*arguments) == 0
+    assert {int(p.stem) for p, at in times(out).items() if at != before.get(p)} == {38, 42, 44}
+    with pytest.raises(InputError, match=r"0000000040.png.*again with --verify"):
+        list(DepthDataset(out))
+    capsys.readouterr()
+    assert exit_code("dataset", "--status", out) == 0  # looks at no content
+    assert exit_code("dataset", "--status", out, "--verify") == 1
+    captured = capsys.readouterr()
+    told = [line for line in captured.out.splitlines() if line.startswith("damaged: ")]
+    assert told == [f"damaged: {changed.relative_to(out)}"]
+    assert "1 damaged or missing files" in captured.err
+    assert exit_code(*arguments, "--verify") == 0
+    is_whole(out, border_set)
+    assert exit_code("dataset", "--status", out, "--verify") == 0
 
 
-@pytest.mark.parametrize(
-    "options",
-    [[], ["--method", "icp"], ["--set", "flow.engine=paper", "--window", "1"]],
-    ids=" ".join,
-)
-def test_no_task_makes_what_another_is_for(
-    options: list[str], border_drive: Path, empty_cache: Path, tmp_path: Path, monkeypatch
-) -> None:
-    """Else workers would do it several times."""
-    made, get, run_tasks = [], Cache.get, make.run_tasks
-
-    def watched(self, stage, kind, inputs, make):
-        return get(self, stage, kind, inputs, lambda: made.append(stage) or make())
-
-    def watched_tasks(tasks, workers):
-        for outcome in run_tasks(tasks, workers):
-            what = outcome.name[0]
-            own = {what, "digests"} if what == "registration" else {what}
-            assert outcome.error is None and set(made) <= own
-            assert sum(task.name == outcome.name for task in tasks) == 1
-            made.clear()
-            yield outcome
-
-    monkeypatch.setattr(Cache, "get", watched)
-    monkeypatch.setattr(make, "run_tasks", watched_tasks)
-    arguments = [*OPTIONS, *options, "--keys", "39:41", "--out", tmp_path / "out"]
-    assert exit_code("dataset", "--data", border_drive, *arguments) == 0
-    assert statuses(tmp_path / "out") == {39: "done", 40: "done"}
-    kept = {path.name.partition("-")[0] for path in steps_folder().iterdir()}
-    wanted = {"digests", "registration"}
-    if "icp" not in options:
-        wanted |= {"ground", "far"} if "flow.engine=paper" in options else {*work._NEEDS}
-    assert kept == wanted
-
-
-@pytest.mark.parametrize("window", [5, 14, 15, 30, 50])
-def test_tasks_wait_for_all_that_they_look_at(window: int) -> None:
-    job = Job(Source("a", "a", "a", ()), Recipe(window), Path("out"), 0, "", "")
-    stamps_ns = 10**8 * np.arange(400)
-    cut = Cut.whole(Timeline("a", tuple(range(400)), stamps_ns, {}), window)
-    listed = list(tasks(job, [210, 231], cut))
-    done = set()
-    for task in listed:
-        assert task.needs <= done
-        done.add(task.name)
-    assert len(done) == len(listed)
-    found = {task.name: task.needs for task in listed}
-    farthest = max(15, window + 5) + 1  # sweeps beyond a block
-    blocks = range((200 - farthest) // 20, (219 + farthest) // 20 + 1)
-    assert {("evidence", "a", b) for b in blocks} <= found["motion", "a", 10]
-    assert {("registration", "a", b) for b in blocks} <= found["key", "a", 210]
-    assert ("motion", "a", 11) in found["key", "a", 231]
-    assert listed[-1].name == ("key", "a", 231)
-    assert found.keys() > {("key", "a", 210), ("motion", "a", 11)}
-
-
-# As `run`
-
-
-@pytest.mark.parametrize("source", ["dataset", "kiss-icp"])
-def test_the_densify_layout_is_what_run_writes(source: str, tmp_path: Path) -> None:
+def test_the_densify_layout_is_what_run_writes(tmp_path: Path) -> None:
     """In a recording within the window, to the last byte but for what the run has cost."""
     short = write_drive(across_border(range(BORDER, BORDER + 4)), tmp_path / "2011_09_26")
-    method = "flow" if source == "dataset" else "icp"
-    given = ["--data", short, "--window", 4, "--method", method]
-    given += ["--set", f"register.source={source}"]
+    given = ["--data", short, "--window", 4, "--set", "register.source=dataset"]
     keys = ["--keys", f"{BORDER + 1}:{BORDER + 2}", "--layout", "densify"]
     out, run = tmp_path / "set", tmp_path / "run"
     assert exit_code("dataset", *given, *keys, "--out", out) == 0
@@ -237,21 +176,131 @@ def test_the_densify_layout_is_what_run_writes(source: str, tmp_path: Path) -> N
     made, alone = files_in(out / "000041"), files_in(run / "000041")
     assert made.keys() == alone.keys() == {n.removeprefix("000041/") for n in record["files"]}
     assert [name for name in made if made[name] != alone[name]] == ["run.yaml"]
-    with pytest.raises(InputError, match="layout") as error:
+    with pytest.raises(InputError, match="layout"):
         DepthDataset(out)
-    assert "\n" not in str(error.value)
 
 
-def test_the_tree_is_read_back(
-    border_set: Path, border_drive: Path, tmp_path: Path, capsys
+# What goes wrong
+
+
+@pytest.mark.parametrize(("bad", "how"), [(BORDER - 1, "torn"), (BORDER + 1, "noise")])
+def test_a_corrupt_sweep_costs_its_key_alone(
+    bad: int, how: str, border_drive: Path, tmp_path: Path, capsys
 ) -> None:
-    data = DepthDataset(border_set)
-    assert [sample["frame"] for sample in data] == list(FRAMES)
-    sample = data[3]
-    dense, sparse = sample["dense_depth_m"], sample["sparse_depth_m"]
-    assert (dense > 0).sum() > 2 * (sparse > 0).sum() > 1000
-    assert ((sample["confidence"] > 0) == (dense > 0)).all()
-    scores = tmp_path / "scores.json"
-    maps = border_set / "val" / DRIVE / "proj_depth"
-    assert exit_code("evaluate", maps / "groundtruth", border_set, "--out", scores) == 0
-    assert json.dumps(json.loads(scores.read_text())).count('"outliers": 0.0') > 0
+    drive, out = copy_drive(border_drive, tmp_path / "2011_09_26"), tmp_path / "out"
+    path, reason = sweep_file(drive, bad), "registration fails"
+    if how == "torn":
+        path.write_bytes(path.read_bytes()[:-5])
+        reason = str(path)
+    else:
+        noise = np.random.default_rng(1).uniform(-40, 40, (8000, 4))
+        path.write_bytes(noise.astype("<f4").tobytes())
+    arguments = ["--data", drive, *OPTIONS, "--method", "icp", "--out", out]
+    assert exit_code("dataset", *arguments) == 1
+    said, errors = capsys.readouterr()
+    assert f"{drive.name} {bad} failed: " in said and reason in said
+    assert errors.splitlines()[-1] == "densify: 1 of 9 keys not made"
+    assert "Traceback" not in errors
+    assert statuses(out) == {f: "failed" if f == bad else "done" for f in FRAMES}
+    for record in records(out):
+        if record["key"] != bad:
+            near = [f for f in FRAMES if abs(f - record["key"]) <= 2 and f != bad]
+            assert record["frames"] == [f for f in near if (f < bad) == (record["key"] < bad)]
+    in_order(out)
+    before = times(out)
+    # The same process goes on after it has been mended.
+    write_sweep(across_border(), drive, bad)
+    assert exit_code("dataset", *arguments) == 0
+    assert set(statuses(out).values()) == {"done"}
+    in_order(out)
+    assert before.items() <= times(out).items()
+
+
+@pytest.mark.parametrize(
+    ("error", "told"),
+    [
+        (
+            ZeroDivisionError("by zero"),
+            "this is a bug in densify; please report it with densify.log: ZeroDivisionError",
+        ),
+        (RuntimeError("can't start new thread"), "out of memory ("),
+    ],
+    ids=["bug", "memory"],
+)
+def test_an_error_in_one_key_costs_that_key(
+    error: Exception, told: str, border_drive: Path, tmp_path: Path, monkeypatch
+) -> None:
+    made = one_key._made
+
+    def failing(job, key):
+        if key == 40:
+            raise error
+        return made(job, key)
+
+    monkeypatch.setattr(one_key, "_made", failing)
+    recipe = Recipe(2, "none", config=resolve(GIVEN))
+    summary = make_dataset([str(border_drive)], tmp_path / "out", slice(39, 42), recipe)
+    assert (summary.count("done"), summary.count("failed"), summary.num_left) == (2, 1, 0)
+    (failed,) = [r for r in records(tmp_path / "out") if r["status"] == "failed"]
+    assert failed["key"] == 40 and failed["reason"].startswith(told)
+    assert "in failing" in (tmp_path / "out" / "densify.log").read_text()  # the traceback
+
+
+def test_interrupted(border_drive: Path, tmp_path: Path, monkeypatch, capsys) -> None:
+    made = one_key._made
+
+    def interrupted(job, key):
+        if key == 38:
+            raise KeyboardInterrupt
+        return made(job, key)
+
+    out = tmp_path / "out"
+    arguments = ["dataset", "--data", border_drive, *CHEAP, "--out", out]
+    with monkeypatch.context() as patch:
+        patch.setattr(one_key, "_made", interrupted)
+        assert exit_code(*arguments) == 130
+    first, last = told_on(capsys)
+    assert first.endswith("2 of 9 keys are finished and kept") and "interrupted" in last
+    assert statuses(out) == {36: "done", 37: "done"}
+    assert exit_code(*arguments) == 0
+    in_order(out)
+
+
+def test_a_disk_that_fills_up(border_drive: Path, tmp_path: Path, monkeypatch, capsys) -> None:
+    out = tmp_path / "out"
+    replace, num_pngs = os.replace, 0
+
+    def full(source: Path, target: Path) -> None:
+        nonlocal num_pngs
+        num_pngs += str(target).endswith(".png")
+        if num_pngs > 6:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        replace(source, target)
+
+    arguments = ["dataset", "--data", border_drive, *CHEAP, "--out", out]
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "replace", full)
+        assert exit_code(*arguments) == 1
+    error = told_on(capsys)[-1]
+    assert "No space left on device" in error
+    assert error.endswith("1 of 9 keys are finished and kept")
+    assert statuses(out) == {FRAMES[0]: "done"}
+    assert exit_code(*arguments) == 0
+    in_order(out)
+
+
+def test_a_cache_that_cannot_be_made_only_costs_time(
+    border_drive: Path, border_set: Path, empty_cache: Path, tmp_path: Path, capsys
+) -> None:
+    empty_cache.write_text("in the way")
+    keys = ("--keys", "39:41")
+    arguments = ["--data", border_drive, *OPTIONS, *keys, "--out", tmp_path / "out"]
+    assert exit_code("dataset", *arguments) == 0
+    assert all("warning: " in line and str(empty_cache) in line for line in told_on(capsys))
+    assert maps_in(tmp_path / "out").items() <= maps_in(border_set).items()
+
+
+def told_on(capsys: pytest.CaptureFixture[str]) -> list[str]:
+    """Lines on stderr but for those before the work and of windows that are cut."""
+    lines = capsys.readouterr().err.splitlines()
+    return [line for line in lines if "to make with" not in line and "is cut to" not in line]

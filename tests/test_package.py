@@ -225,8 +225,8 @@ def test_no_arrow_runs_upward() -> None:
 
 
 DOORS: dict[str, str | tuple[str, ...]] = {
-    "dask": "densify/dataset/cluster.py",
-    "distributed": "densify/dataset/cluster.py",
+    "dask": "densify/dataset/executor.py",
+    "distributed": "densify/dataset/executor.py",
     "copclib": "densify/outputs/export/copc.py",
     "pye57": "densify/outputs/export/e57.py",
     "shtab": "densify/cli/verbs/completion.py",
@@ -238,7 +238,6 @@ DOORS: dict[str, str | tuple[str, ...]] = {
     "laspy": ("densify/readers/decoded_files.py", "densify/outputs/cloud_laz.py"),
     "numba": ("densify/geometry/compiled.py", "densify/geometry/threads.py"),
     "pickle": (
-        "densify/dataset/calls.py",
         "densify/readers/pandaset/pickled_frame.py",
     ),
     "simplejpeg": "densify/readers/decoded_files.py",

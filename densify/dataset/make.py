@@ -190,7 +190,7 @@ def _num_processes(wanted: int | None, recipe: Recipe, drives: Sequence[PlannedD
         return wanted
     num_keys = sum(len(drive.keys) for drive in drives)
     free_bytes = available_bytes() or float("inf")
-    fitting = [_SHARE_OF_FREE * free_bytes // need_bytes, num_threads(), num_keys // _LEAST_KEYS]
+    fitting = [_SHARE_OF_FREE * free_bytes / need_bytes, num_threads(), num_keys // _LEAST_KEYS]
     return max(1, int(min(fitting)))
 
 
