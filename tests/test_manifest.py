@@ -244,10 +244,13 @@ def test_a_disk_that_fills_up_costs_only_the_line(tmp_path: Path, monkeypatch) -
     def full(*_, **__) -> None:
         raise OSError(28, "No space left on device")
 
-    with monkeypatch.context() as patch, pytest.raises(OutputError, match="No space left"):
-        with Manifest(tmp_path) as manifest:
-            manifest.append(record(0))
-            patch.setattr(manifest_module, "write_file", full)
+    with (
+        monkeypatch.context() as patch,
+        pytest.raises(OutputError, match="No space left"),
+        Manifest(tmp_path) as manifest,
+    ):
+        manifest.append(record(0))
+        patch.setattr(manifest_module, "write_file", full)
     assert keys(tmp_path) == [0, 1, 3]
     with Manifest(tmp_path):  # the lock was let go
         pass
