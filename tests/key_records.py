@@ -6,7 +6,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from densify.dataset.manifest import KeyRecord, read_manifests
-from densify.outputs.atomic import FileRecord
+from densify.outputs.kitti_tree import FileRecord
 
 DRIVE = "2011_09_26_drive_0013_sync"
 

@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import pytest
 from densify.learning.networks import build
+from densify.outputs.arrows import draw_arrows
 from scipy.spatial import cKDTree
 from writers import write_street
 
@@ -28,7 +29,6 @@ from densify.bench.paper_pairs import (
 from densify.cli import main
 from densify.config.errors import InputError
 from densify.learning.model_file import Model, write_model
-from densify.outputs.arrows import draw_arrows
 from densify.readers.decoded_files import read_image
 from densify.readers.kitti import scene_flow
 from densify.readers.street import Street

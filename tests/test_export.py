@@ -1,343 +1,321 @@
 # SPDX-License-Identifier: MIT
-"""Export of a finished run: exactly the pixels that thresholds leave, the run itself untouched."""
+"""Exports of a finished run: what thresholds leave, read back by other libraries."""
 
 from __future__ import annotations
 
-import os
+import sys
+from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 import yaml
-from hypothesis import given
-from hypothesis import strategies as st
+from plyfile import PlyData
 
 import densify
-from densify.config.errors import InputError
-from densify.depth.age import with_ages
-from densify.geometry.types import Cloud, DepthMap, Result
-from densify.outputs import export_run, read_depth_png, write_result
-from densify.outputs.atomic import staged_folder
+from densify.config.plugins.exports import EXPORTS
+from densify.outputs import export_run, read_cloud, read_depth_png, write_cloud
+from densify.outputs.depth_png import stored_age, stored_confidence
+from densify.readers.depth_trees import pair_depth_files
+from tests.command import exit_code
+from tests.command import refused as refused_command
+from tests.exported import (
+    CAMERAS,
+    KEY_NS,
+    NUM_POINTS,
+    STAMPS_NS,
+    cloud_of,
+    refused,
+    tree,
+    write_street,
+    write_views,
+)
 
-H, W = 12, 20
-CAMERAS = ("image_02", "image_03")
-PRODUCTS = ("depth", "depth_filled", "confidence", "age")
-KEY_NS = 1_782_500_000_123_456_789
-LATE_S = 0.01
-AGE_S = {119: 0.11, 120: 0.01, 121: 0.09}
-STAMPS_NS = {119: KEY_NS - 100_000_000, 120: KEY_NS, 121: KEY_NS + 100_000_000}
-
-
-def map_of(camera, seed):
-    rng = np.random.default_rng(seed)
-    depth = np.where(rng.random((H, W)) < 0.4, rng.uniform(2, 300, (H, W)), 0).astype(np.float32)
-    filled = np.where(depth > 0, depth, np.float32(rng.random() * 30))
-    filled[0] = depth[0]
-    frame = np.where(depth > 0, rng.integers(119, 122, (H, W)), -1).astype(np.int32)
-    return with_ages(
-        DepthMap(camera, depth, filled, rng.random((H, W), dtype=np.float32), frame),
-        STAMPS_NS,
-        120,
-        LATE_S,
-    )
-
-
-@pytest.fixture
-def maps():
-    return {name: map_of(name, i) for i, name in enumerate(CAMERAS)}
+COLUMNS = {
+    **dict.fromkeys(("x", "y", "z", "intensity", "confidence", "displaced"), np.float32),
+    **dict.fromkeys(("displaced_x", "displaced_y", "displaced_z"), np.float32),
+    **dict.fromkeys(("frame", "instance"), np.int32),
+    **dict.fromkeys(("red", "green", "blue", "moving", "far"), np.uint8),
+    "gps_time": np.float64,
+}
+PACKAGES = {"exr": "OpenEXR", "rrd": "rerun", "mcap": "foxglove"}
 
 
 @pytest.fixture
-def run(tmp_path, maps):
-    """A finished run's folder."""
-    return written(tmp_path, maps)
+def run(tmp_path: Path) -> Path:
+    return write_views(tmp_path / "run", {"image_02": "plain", "image_03": "bent"})[0]
 
 
-def written(out, maps):
-    cloud = Cloud(
-        points=np.zeros((1, 3)),
-        rigid_points=np.zeros((1, 3)),
-        frame=np.array([120], np.int32),
-        since_key_ns=np.zeros(1, np.int64),
-        row=np.zeros(1, np.int64),
-        lidar=np.zeros(1, np.uint8),
-        moving=np.zeros(1, bool),
-        instance=np.full(1, -1, np.int32),
-        velocity_m_s=np.zeros((1, 3), np.float32),
-        confidence=np.ones(1, np.float32),
-        intensity=np.ones(1, np.float32),
-        rgb=np.zeros((1, 3), np.uint8),
-        far=np.zeros(1, bool),
-    )
-    write_result(Result("flow", 120, tuple(AGE_S), cloud, maps), {}, out, config={}, data="street")
-    return out / "000120"
-
-
-def tree(folder):
-    return {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
-
-
-def maps_in(folder):
-    return {name: data for name, data in tree(folder).items() if name.split("/")[0] in PRODUCTS}
-
-
-def stored(folder, product, camera="image_02"):
+def stored(folder: Path, product: str, camera: str = "image_02") -> np.ndarray:
     return cv2.imread(str(folder / product / f"{camera}.png"), cv2.IMREAD_UNCHANGED)
 
 
-def refused(*parts, run, **arguments):
-    """In one line that names these parts, and the run stays as it was."""
+def expected_columns(run: Path) -> dict[str, np.ndarray]:
+    cloud = read_cloud(run / "cloud.laz")
+    values = {n: getattr(cloud, n) for n in COLUMNS if hasattr(cloud, n)}
+    values |= dict(zip("xyz", cloud.points.T, strict=True))
+    values |= dict(zip(("red", "green", "blue"), cloud.rgb.T, strict=True))
+    values |= {f"displaced_{axis}": cloud.displacement[:, i] for i, axis in enumerate("xyz")}
+    return {name: values[name].astype(kind) for name, kind in COLUMNS.items()}
+
+
+# --- every form -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("to", [form.name for form in EXPORTS.built_in])
+def test_a_form_is_whole_repeatable_and_leaves_the_run_alone(to: str, run: Path) -> None:
+    pytest.importorskip(PACKAGES.get(to, "numpy"), reason=f"{PACKAGES.get(to)} is not installed")
     before = tree(run)
-    with pytest.raises(InputError) as error:
-        export_run(run, **arguments)
-    message = str(error.value)
-    assert "\n" not in message
-    for part in parts:
-        assert str(part) in message, message
-    assert tree(run) == before
-
-
-# What is kept
-
-
-def test_maps_of_single_images_lie_in_folders_of_their_cameras(tmp_path):
-    names = ("fast/000359", "fast/000360", "fisheye/000120")
-    run = written(tmp_path, {name: map_of(name.split("/")[0], i) for i, name in enumerate(names)})
-    assert set(maps_in(run)) == {f"{p}/{name}.png" for p in PRODUCTS for name in names}
-    export = export_run(run)
-    assert set(export.density) == set(names)
-    assert maps_in(run / "export") == maps_in(run)
-
-
-def test_nothing_asked_for_gives_the_same_bytes_and_leaves_the_run_alone(run):
-    before = tree(run)
-    exported = export_run(run)
+    exported = export_run(run, to)
+    folder, form = run / "export" / to, EXPORTS.row(to, "--to")
+    assert {p.relative_to(folder).parts[0] for p in exported.paths} <= {*form.owned, "export.yaml"}
     after = tree(run)
     assert {n: d for n, d in after.items() if not n.startswith("export/")} == before
-    assert maps_in(run / "export") == maps_in(run)
-    assert set(maps_in(run)) == {f"{p}/{c}.png" for p in PRODUCTS for c in CAMERAS}
-    assert sorted(exported.paths) == sorted(run / "export" / name for name in tree(run / "export"))
-    assert export_run(run, 0.0, 1e6, run.parent / "other").density == exported.density
-    assert maps_in(run.parent / "other") == maps_in(run)
+    refused(folder, "--overwrite", run=run, to=to)
+    (folder / "notes.txt").write_text("mine")
+    export_run(run, to, overwrite=True)
+    again = tree(run)
+    assert again.pop(f"export/{to}/notes.txt") == b"mine"
+    assert set(again) == set(after)
+    if to not in ("exr", "rrd"):  # may hold the moment or the process that wrote it
+        assert again == after
+
+
+@pytest.mark.parametrize("to", PACKAGES)
+def test_a_package_that_is_not_installed_is_named(to: str, run: Path, monkeypatch) -> None:
+    monkeypatch.setitem(sys.modules, PACKAGES[to], None)
+    refused(f"pip install 'densify[{'rerun' if to == 'rrd' else to}]'", run=run, to=to)
+
+
+def test_the_record(run: Path) -> None:
+    exported = export_run(run, "npy", min_confidence=0.5, max_age_ms=100)
+    record = yaml.safe_load((run / "export" / "npy" / "export.yaml").read_text())
+    density = {
+        camera: {product: kept._asdict() for product, kept in products.items()}
+        for camera, products in exported.density.items()
+    }
+    assert record == {
+        "run": str(run),
+        "to": "npy",
+        "min_confidence": 0.5,
+        "max_age_ms": 100.0,
+        "density": density,
+        "version": densify.__version__,
+    }
+    assert all(0 < p["after"] < p["before"] < 1 for c in density.values() for p in c.values())
+
+
+def test_the_command(run: Path, capsys) -> None:
+    command = ["export", run, "--to", "ply", "--min-confidence", "0.5"]
+    assert exit_code(*command) == 0
+    line, *paths = capsys.readouterr().out.splitlines()
+    kept = (read_cloud(run / "cloud.laz").confidence >= 0.499).sum()
+    assert abs(int(line.split()[1]) - kept) <= 2 and line.endswith(f"of {NUM_POINTS} points")
+    folder = run / "export" / "ply"
+    assert paths == [str(folder / "cloud.ply"), str(folder / "export.yaml")]
+    assert "expected one of npy" in refused_command(capsys, 2, "export", run, "--to", "obj")
+    assert exit_code("export", run, "--to", "npy", "--camera", "image_03") == 0
+    named = [line for line in capsys.readouterr().out.splitlines() if line.endswith(".npy")]
+    assert len(named) == 3 and all("image_03" in name for name in named)
+
+
+def test_forms_of_other_packages(run: Path, tmp_path: Path, monkeypatch) -> None:
+    package, about = (tmp_path / "site" / n for n in ("xyz_export", "xyz_export-1.dist-info"))
+    for folder in (package, about):
+        folder.mkdir(parents=True)
+    code = """
+OWNED = ("cloud.xyz",)
+name = "cloud.xyz"
+
+
+def write_export(run, folder):
+    lines = [f"{x} {y} {z}" for x, y, z in run.cloud().points.tolist()]
+    (folder / name).write_text("\\n".join(lines))
+"""
+    (package / "__init__.py").write_text(code)
+    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: xyz-export\nVersion: 1\n")
+    (about / "entry_points.txt").write_text("[densify.exports]\nxyz = xyz_export\n")
+    monkeypatch.syspath_prepend(tmp_path / "site")
+    path = export_run(run, "xyz").paths[0]
+    np.testing.assert_array_equal(np.loadtxt(path), read_cloud(run / "cloud.laz").points)
+    monkeypatch.setattr("xyz_export.name", "points.xyz")
+    refused("wrote points.xyz, expected nothing but cloud.xyz", run=run, to="xyz", overwrite=True)
+
+
+# --- maps -----------------------------------------------------------------------------------------
+
+
+def read_map(path: Path) -> np.ndarray:
+    if path.suffix == ".npy":
+        return np.load(path, allow_pickle=False)
+    channels = pytest.importorskip("OpenEXR").File(str(path)).channels()
+    assert set(channels) == {"Y" if "confidence" in path.parts else "Z"}
+    return next(iter(channels.values())).pixels
+
+
+@pytest.mark.parametrize("to", ["npy", "exr"])
+def test_maps_of_floats_are_exact(to: str, run: Path) -> None:
+    pytest.importorskip(PACKAGES.get(to, "numpy"))
+    export_run(run, to)
+    for camera in CAMERAS:
+        for product in ("depth", "depth_filled", "confidence"):
+            values = read_map(run / "export" / to / product / f"{camera}.{to}")
+            assert values.dtype == np.float32 and values.any()
+            if product == "confidence":
+                levels = np.maximum(stored(run, product, camera).astype(np.float32) - 1, 0)
+                np.testing.assert_array_equal(values, levels / np.float32(254))
+            else:
+                depth_m = read_depth_png(run / product / f"{camera}.png")
+                np.testing.assert_array_equal(values, depth_m)
 
 
 @pytest.mark.parametrize(
-    ("confidence", "age_ms"), [(0.5, None), (0.8, 100.0), (0.0, 50), (1.0, 0.0), (0.0, 90)]
+    ("confidence", "age_ms"), [(0.5, None), (0.8, 100.0), (0.0, 50), (1.0, 0.0), (0.0, 10)]
 )
-def test_what_is_kept_is_told_by_the_maps_in_memory(run, maps, confidence, age_ms):
-    exported = export_run(run, confidence, age_ms)
-    for camera, depth in maps.items():
-        keep = np.rint(254 * depth.confidence.astype(float)) >= np.rint(254 * confidence)
+def test_thresholds_leave_exactly_these_pixels(run: Path, confidence: float, age_ms) -> None:
+    exported = export_run(run, "npy", min_confidence=confidence, max_age_ms=age_ms)
+    for camera in CAMERAS:
+        keep = stored(run, "confidence", camera) >= stored_confidence(confidence)
         if age_ms is not None:
-            assert depth.age_s is not None
-            keep &= np.rint(1000 * depth.age_s.astype(float)) <= age_ms
-        for product in PRODUCTS:
-            before = stored(run, product, camera)
-            after = stored(run / "export", product, camera)
-            assert after.dtype == before.dtype
-            np.testing.assert_array_equal(after, np.where(keep, before, 0))
-        for product, name in (("measured", "depth"), ("filled", "depth_filled")):
-            density = exported.density[camera][product]
-            assert density.before == np.count_nonzero(stored(run, name, camera)) / (H * W)
-            assert density.after == (
-                np.count_nonzero(stored(run / "export", name, camera)) / (H * W)
-            )
+            keep &= stored(run, "age", camera) <= stored_age(age_ms / 1000)
+        for name, product in (("depth", "measured"), ("depth_filled", "filled")):
+            whole_m = read_depth_png(run / name / f"{camera}.png")
+            left_m = np.load(run / "export" / "npy" / name / f"{camera}.npy")
+            np.testing.assert_array_equal(left_m, np.where(keep, whole_m, 0))
+            kept = exported.density[camera][product]
+            assert kept == (np.mean(whole_m > 0), np.mean(left_m > 0))
 
 
-def test_density_falls_with_each_threshold(run, tmp_path):
-    for name, steps in (
-        ("min_confidence", np.linspace(0, 1, 9)),
-        ("max_age_ms", (200, 110, 109, 90, 89, 10, 9)),
-    ):
-        kept = []
-        for value in steps:
-            exported = export_run(run, **{name: value}, out=tmp_path / "x", overwrite=True)
-            kept.append([d.after for p in exported.density.values() for d in p.values()])
-        falls = np.diff(np.array(kept), axis=0)
-        assert (falls <= 0).all()
-        assert (falls < 0).any(axis=0).all()
+def test_kitti_is_what_readers_of_the_benchmark_expect(tmp_path: Path) -> None:
+    run, result = write_views(tmp_path, {"image_02": "plain", "image_03/0000000241": "bent"})
+    name = "2011_09_26_drive_0013_sync"
+    record = run / "run.yaml"
+    record.write_text(record.read_text().replace("data: street", f"data: /some/where/{name}/"))
+    export_run(run, "kitti", tmp_path / "a")
+    drive = tmp_path / "a" / "val" / name
+    pairs = pair_depth_files(run, tmp_path / "a", None, filled=False)
+    assert len(pairs.pairs) == 2
+    assert [len(pairs.without_truth), len(pairs.without_prediction)] == [0, 0]
+    for view, file in (("image_02", "0000000120"), ("image_03/0000000241", "0000000241")):
+        camera = view.partition("/")[0]
+        mine = read_depth_png(run / "depth_filled" / f"{view}.png")
+        theirs = drive / "proj_depth" / "groundtruth_filled" / camera / f"{file}.png"
+        np.testing.assert_array_equal(read_depth_png(theirs), mine)
+        image = cv2.imread(str(drive / camera / "data" / f"{file}.png"))
+        np.testing.assert_array_equal(image, cv2.imread(str(run / f"scene/image/{view}.jpg")))
+        K = np.loadtxt(drive / "intrinsics" / camera / f"{file}.txt").reshape(3, 3)
+        np.testing.assert_allclose(K, result.views[view].camera.K, atol=1e-6)
 
 
-def test_a_pixel_exactly_at_the_threshold_is_kept(run, maps):
-    confidence = float(maps["image_02"].confidence[maps["image_02"].filled_m > 0].max())
-    assert export_run(run, confidence).density["image_02"]["filled"].after > 0
-    exported = export_run(run, 0, 10, run.parent / "x")
-    assert stored(run.parent / "x", "age").max() == 11
-    assert exported.density["image_02"]["measured"].after > 0
+def test_kitti_has_the_key_sweep_alone(tmp_path: Path) -> None:
+    street = write_street(tmp_path / "run")
+    export_run(street, "kitti", tmp_path / "a")
+    (raw,) = (tmp_path / "a" / "train").glob("tiny*/proj_depth/velodyne_raw/*/*.png")
+    (alone,) = (street / "scene" / "none").glob("*.png")
+    assert raw.read_bytes() == alone.read_bytes()
 
 
-def test_the_record(run):
-    exported = export_run(run, 0.5, 100)
-    record = yaml.safe_load((run / "export" / "export.yaml").read_text("utf-8"))
-    density = record.pop("density")
-    assert record == {
-        "run": str(run),
-        "to": "png",
-        "min_confidence": 0.5,
-        "max_age_ms": 100.0,
-        "version": densify.__version__,
-    }
-    assert set(density) == set(CAMERAS)
-    for camera, products in density.items():
-        for product, there in products.items():
-            of = exported.density[camera][product]
-            assert there == {"before": of.before, "after": of.after}
-            assert 0 < of.after < of.before < 1
-    export_run(run, 0.5, out=run.parent / "x")
-    assert yaml.safe_load((run.parent / "x" / "export.yaml").read_text())["max_age_ms"] is None
+# --- clouds ---------------------------------------------------------------------------------------
 
 
-# Whole or not at all
+def test_ply_by_plyfile_and_trimesh(run: Path) -> None:
+    path = export_run(run, "ply").paths[0]
+    ply = PlyData.read(path)
+    assert not ply.text and ply.byte_order == "<" and [e.name for e in ply.elements] == ["vertex"]
+    vertex, expected = ply["vertex"].data, expected_columns(run)
+    assert set(vertex.dtype.names) == set(COLUMNS)
+    for name, values in expected.items():
+        assert vertex[name].dtype.base == np.dtype(COLUMNS[name]), name
+        np.testing.assert_array_equal(vertex[name], values, err_msg=name)
+    loaded = pytest.importorskip("trimesh").load(path)
+    np.testing.assert_array_equal(loaded.vertices, np.stack([vertex[a] for a in "xyz"], axis=1))
+    np.testing.assert_array_equal(loaded.colors[:, 1], vertex["green"])
 
 
-def test_an_export_is_kept_or_replaced_whole(run):
-    export_run(run, 0.9)
-    (run / "export" / "notes.txt").write_text("mine")
-    before = tree(run)
-    refused(run / "export", "--overwrite", run=run, min_confidence=0.1)
-    assert tree(run) == before
-    export_run(run, 0.1, overwrite=True)
-    assert (run / "export" / "notes.txt").read_text() == "mine"
-    assert tree(run / "export") != before
+def test_pcd_by_pypcd4(run: Path) -> None:
+    from pypcd4 import Encoding, PointCloud
+
+    cloud = PointCloud.from_path(export_run(run, "pcd").paths[0])
+    expected = expected_columns(run)
+    assert cloud.metadata.data == Encoding.BINARY and cloud.points == NUM_POINTS
+    rgb = [expected.pop(name) for name in ("red", "green", "blue")]
+    assert set(cloud.fields) == {*expected, "rgb"}
+    for name, column in expected.items():
+        assert cloud.pc_data[name].dtype == column.dtype, name
+        np.testing.assert_array_equal(cloud.pc_data[name], column, err_msg=name)
+    packed = cloud.pc_data["rgb"].view(np.uint32)  # as the Point Cloud Library packs it
+    for column, bits in zip(rgb, (16, 8, 0), strict=True):
+        np.testing.assert_array_equal(packed >> bits & 255, column)
 
 
-def test_a_damaged_map_leaves_nothing_behind(run):
-    path = run / "age" / "image_03.png"  # the last one read
-    path.write_bytes(path.read_bytes()[:-20])
-    before = tree(run)
-    refused(path, "not a complete image", run=run)
-    assert tree(run) == before
-    refused(path, run=run, out=run.parent / "new" / "x")
-    assert not (run.parent / "new").exists()
+@pytest.mark.parametrize(("confidence", "age_ms"), [(0.5, None), (0.0, 95), (0.3, 0.0)])
+def test_thresholds_leave_exactly_these_points(run: Path, confidence: float, age_ms) -> None:
+    exported = export_run(run, "ply", min_confidence=confidence, max_age_ms=age_ms)
+    cloud = read_cloud(run / "cloud.laz")
+    keep = stored_confidence(cloud.confidence) >= stored_confidence(confidence)
+    if age_ms is not None:
+        age_ns = np.array([abs(STAMPS_NS[f] - KEY_NS) for f in cloud.frame.tolist()])
+        keep &= age_ns <= age_ms * 1e6
+    vertex = PlyData.read(exported.paths[0])["vertex"].data
+    np.testing.assert_array_equal(vertex["confidence"], cloud.confidence[keep])
+    assert exported.num_points == (NUM_POINTS, keep.sum()) and 0 < keep.sum() < NUM_POINTS
 
 
-def test_no_run_is_written_over(run, maps):
-    before = tree(run)
-    refused("maps would be lost", run=run, out=run, overwrite=True)
-    assert tree(run) == before
+@pytest.mark.parametrize("to", ["ply", "pcd"])
+def test_a_cloud_of_no_points(to: str, run: Path) -> None:
+    write_cloud(run / "cloud.laz", cloud_of(0), KEY_NS)
+    assert export_run(run, to).num_points == (0, 0)
+
+
+# --- bad input ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ({"min_confidence": 1.01}, "--min-confidence 1.01"),
+        ({"min_confidence": float("nan")}, "--min-confidence nan"),
+        ({"max_age_ms": -1}, "--max-age-ms -1"),
+        ({"max_age_ms": float("inf")}, "--max-age-ms inf"),
+        ({"cameras": ["image_09"]}, "--camera image_09: expected one of image_02, image_03"),
+    ],
+)
+def test_arguments_out_of_range(arguments, words: str, run: Path) -> None:
+    refused(words, run=run, to="npy", **arguments)
+
+
+def test_folders_that_are_no_run_and_places_that_hold_one(run: Path, tmp_path: Path) -> None:
+    refused("no run.yaml", run=tmp_path / "absent", to="npy")
+    refused("holds a run and is kept", run=run, to="npy", out=run, overwrite=True)
     (run / "link").symlink_to(run)
-    refused("maps would be lost", run=run, out=run / "link", overwrite=True)
+    refused("holds a run and is kept", run=run, to="npy", out=run / "link", overwrite=True)
+    refused("not a folder", run=run, to="npy", out=run / "run.yaml" / "x")
 
 
-def test_a_place_that_cannot_be_written_to(run, monkeypatch):
-    refused("not a folder", run=run, out=run / "run.yaml" / "x")
-    before = tree(run)
-
-    def full(*_):
-        raise OSError(28, os.strerror(28))
-
-    monkeypatch.setattr("densify.outputs.export.write_file", full)
-    refused(os.strerror(28), "nothing was kept", run=run)
-    assert tree(run) == before
-
-
-# Bad input
-
-
-@pytest.mark.parametrize("value", [-0.01, 1.01, float("nan"), float("inf")])
-def test_confidences_out_of_range(run, value):
-    refused("--min-confidence", value, "0 to 1", run=run, min_confidence=value)
-
-
-@pytest.mark.parametrize("value", [-1, float("nan"), float("inf")])
-def test_ages_out_of_range(run, value):
-    refused("--max-age-ms", value, run=run, max_age_ms=value)
+@pytest.mark.parametrize("product", ["depth", "depth_filled", "confidence", "age"])
+def test_maps_that_are_damaged_or_missing_or_of_another_run(product: str, run: Path) -> None:
+    path = run / product / "image_03.png"
+    values, data = stored(run, product, "image_03"), path.read_bytes()
+    path.write_bytes(data[: len(data) // 2])
+    refused(path, "not a complete image", run=run, to="npy")
+    cv2.imwrite(str(path), values[:, :-1])
+    refused("does not belong to the others", run=run, to="npy")
+    other = np.uint16 if product == "confidence" else np.uint8
+    cv2.imwrite(str(path), values.astype(other))
+    refused(path, f"expected a map of {product}", run=run, to="npy")
+    if product in ("confidence", "age"):
+        cv2.imwrite(str(path), np.where(values > 0, 0, values))
+        refused(path, "does not belong to the others", run=run, to="npy")
+    path.unlink()
+    if product != "depth":
+        refused(path, run=run, to="npy")
 
 
-def test_folders_that_are_no_run(run, tmp_path):
-    for place in (tmp_path, tmp_path / "absent", run / "run.yaml"):
-        refused(place, "no run.yaml", run=place)
-    bare = tmp_path / "bare"
-    with staged_folder(bare, ()) as folder:
-        (folder / "run.yaml").write_text("key: 1\n")
-    refused(bare, "no depth maps", run=bare)
-
-
-@pytest.mark.parametrize("product", PRODUCTS)
-def test_a_missing_map_is_named(run, product):
-    (run / product / "image_03.png").unlink()
-    refused(f"{product}/image_03.png missing", run=run)
-    assert not (run / "export").exists()
-
-
-@pytest.mark.parametrize("product", PRODUCTS)
-@pytest.mark.parametrize("damage", ["cut", "flipped", "empty", "text", "colour", "depth"])
-def test_a_damaged_map_is_named_and_nothing_else_is_said(run, product, damage, capfd):
-    path = run / product / "image_02.png"
-    data = path.read_bytes()
-    if damage == "colour":
-        cv2.imwrite(str(path), np.zeros((H, W, 3), np.uint8))
-    elif damage == "depth":
-        wrong = np.uint16 if product == "confidence" else np.uint8
-        cv2.imwrite(str(path), np.ones((H, W), wrong))
-    else:
-        flipped = bytearray(data)
-        flipped[len(data) // 2] ^= 4
-        other = {"cut": data[: len(data) // 2], "flipped": bytes(flipped), "empty": b""}
-        path.write_bytes(other.get(damage, b"hello"))
-    whole = damage in ("colour", "depth")
-    refused(path, f"expected a map of {product}" if whole else "not a complete image", run=run)
-    assert capfd.readouterr() == ("", "")
-
-
-@given(cut=st.integers(0, 400), flip=st.integers(0, 399), bit=st.integers(0, 7))
-def test_any_damage_is_found(cut, flip, bit, tmp_path_factory):
-    folder = tmp_path_factory.mktemp("png")
-    values = np.random.default_rng(0).integers(0, 65536, (9, 11), np.uint16)
-    data = bytearray(cv2.imencode(".png", values)[1].tobytes())
-    data[flip % len(data)] ^= 1 << bit
-    path = folder / "a.png"
-    path.write_bytes(bytes(data)[: max(cut, len(data) // 2)])
-    with pytest.raises(InputError, match="not a complete image"):
-        read_depth_png(path)
-
-
-def test_maps_that_do_not_belong_together(run):
-    confidence = stored(run, "confidence")
-    path = run / "confidence" / "image_02.png"
-    cv2.imwrite(str(path), confidence[:, :-1])
-    refused(path, f"{W - 1} x {H} px", f"{W} x {H}", run=run)
-    row, column = np.argwhere(confidence > 0)[0]
-    confidence[row, column] = 0
-    cv2.imwrite(str(path), confidence)
-    refused(path, "1 pixels", run=run)
-    confidence[row, column] = 9
-    cv2.imwrite(str(path), confidence)
-    depth = stored(run, "depth")
-    row, column = np.argwhere(stored(run, "depth_filled") == 0)[0]
-    depth[row, column] = 7
-    cv2.imwrite(str(run / "depth" / "image_02.png"), depth)
-    refused(run / "depth" / "image_02.png", "1 pixels", run=run)
-
-
-# Ages
-
-
-@given(seed=st.integers(0, 10**6), share=st.sampled_from([0.02, 0.2, 0.9]))
-def test_a_pixel_is_as_old_as_the_nearest_measured_one(seed, share):
-    rng = np.random.default_rng(seed)
-    depth = np.where(rng.random((H, W)) < share, 5, 0).astype(np.float32)
-    depth[rng.integers(H), rng.integers(W)] = 5
-    filled = np.where(rng.random((H, W)) < 0.7, 5, depth).astype(np.float32)
-    frame = np.where(depth > 0, rng.integers(119, 122, (H, W)), -1).astype(np.int32)
-    bare = DepthMap("cam", depth, filled, filled / 5, frame)
-    aged = with_ages(bare, STAMPS_NS, 120, LATE_S)
-    assert bare.age_s is None and aged.age_s is not None
-    assert aged.age_s.dtype == np.float32
-    np.testing.assert_array_equal(np.isnan(aged.age_s), filled == 0)
-    measured = np.argwhere(depth > 0)
-    for row, column in np.argwhere(filled > 0):
-        squared = ((measured - (row, column)) ** 2).sum(axis=1)
-        near = measured[squared == squared.min()]
-        allowed = np.array([AGE_S[int(frame[r, c])] for r, c in near])
-        assert abs(allowed - aged.age_s[row, column]).min() < 1e-6
-    again = with_ages(bare, STAMPS_NS, 120, LATE_S).age_s
-    np.testing.assert_array_equal(again, aged.age_s)
-
-
-def test_a_map_without_depth_has_no_ages():
-    empty = np.zeros((H, W), np.float32)
-    aged = with_ages(
-        DepthMap("cam", empty, empty, empty, np.full((H, W), -1, np.int32)), STAMPS_NS, 120, 0
-    )
-    assert aged.age_s is not None and np.isnan(aged.age_s).all()
+def test_clouds_that_are_damaged_or_missing_or_without_the_key(run: Path) -> None:
+    cloud, whole = cloud_of(), (run / "cloud.laz").read_bytes()
+    write_cloud(run / "cloud.laz", cloud.select(cloud.frame != 120), KEY_NS)
+    refused("no point of the key sweep 120", run=run, max_age_ms=50, to="ply")
+    (run / "cloud.laz").write_bytes(whole[: len(whole) // 2])
+    refused("cloud.laz", run=run, to="ply")
+    (run / "cloud.laz").unlink()
+    refused("cloud.laz", run=run, to="ply")

@@ -1,9 +1,11 @@
 # SPDX-License-Identifier: MIT
-"""Exports with cameras: COLMAP's own reader, nerfstudio's format, and where points land."""
+"""Exports with cameras: COLMAP's own reader, nerfstudio's format, splats, and where points land."""
 
 from __future__ import annotations
 
 import json
+from dataclasses import replace
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -11,10 +13,21 @@ import pytest
 from plyfile import PlyData
 from scipy.ndimage import map_coordinates
 
+from densify.geometry import poses
 from densify.geometry.cameras import image_points
-from densify.outputs import export_run, read_cloud, read_depth_png
-from tests.exported import street_result, write_street, write_views
-from tests.test_export import H, W, refused
+from densify.geometry.types import ObjectTrack, Result
+from densify.outputs import export_run, read_cloud, read_depth_png, write_result
+from tests.exported import (
+    STAMPS_NS,
+    H,
+    W,
+    cloud_of,
+    refused,
+    street_result,
+    write_street,
+    write_views,
+)
+from tests.small_street import KEY
 
 TWO = {"image_02": "plain", "image_03": "bent"}
 
@@ -25,132 +38,73 @@ def put(tmp_path):
 
 
 @pytest.fixture(scope="module")
-def street(tmp_path_factory):
+def street(tmp_path_factory) -> Path:
     return write_street(tmp_path_factory.mktemp("street"))
 
 
-def colmap(run, **arguments):
-    export_run(run, to="colmap", **arguments)
-    return run / "export" / "colmap"
+def colmap(run: Path, to: str = "colmap", **arguments):
+    """The model, by COLMAP's own reader."""
+    pycolmap = pytest.importorskip("pycolmap")
+    export_run(run, to, **arguments)
+    return pycolmap.Reconstruction(str(run / "export" / to / "sparse" / "0"))
 
 
-def transforms(run, **arguments):
-    export_run(run, to="nerfstudio", **arguments)
+def transforms(run: Path, **arguments) -> dict:
+    export_run(run, "nerfstudio", **arguments)
     return json.loads((run / "export" / "nerfstudio" / "transforms.json").read_text())
 
 
-def read_text(folder):
-    """COLMAP's text format by its description: cameras, images and points by number."""
-
-    def lines(name):
-        return (folder / f"{name}.txt").read_text().splitlines()
-
-    cameras = {}
-    for line in lines("cameras"):
-        number, model, width, height, *params = line.split()
-        cameras[int(number)] = (model, int(width), int(height), [float(p) for p in params])
-    images, rows = {}, lines("images")
-    for line, points in zip(rows[::2], rows[1::2], strict=True):
-        number, *pose, camera, name = line.split()
-        assert points == ""
-        images[int(number)] = ([float(p) for p in pose], int(camera), name)
-    points = np.array([line.split() for line in lines("points3D")], float)
-    return cameras, images, points
+def places_of(model) -> np.ndarray:
+    return np.array([model.points3D[i].xyz for i in sorted(model.points3D)])
 
 
 # --- COLMAP ---------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("lens", ["plain", "bent", "bent5", "bent8", "fisheye"])
-def test_a_model_by_colmaps_own_reader(put, lens):
-    pycolmap = pytest.importorskip("pycolmap")
-    run, result = put({"image_02": lens, "image_03": "plain"})
-    folder = colmap(run)
-    for place in (folder / "sparse" / "0", folder / "text"):
-        model = pycolmap.Reconstruction(str(place))
-        assert sorted(image.name for image in model.images.values()) == [
-            "image_02.jpg",
-            "image_03.jpg",
-        ]
-        for image in model.images.values():
-            view = result.views[image.name.removesuffix(".jpg")]
-            T_cam_world = image.cam_from_world().matrix()
-            np.testing.assert_allclose(T_cam_world, view.T_cam_key[:3], atol=1e-12)
-            ours, camera = view.camera, model.cameras[image.camera_id]
-            assert (camera.width, camera.height) == (W, H)
-            rng = np.random.default_rng(0)
-            points_cam = rng.uniform([-0.4, -0.3, 1], [0.4, 0.3, 1], (50, 3)) * 7
-            uv, _ = image_points(ours, points_cam)
-            np.testing.assert_allclose(camera.img_from_cam(points_cam), uv + 0.5, atol=1e-6)
-        cloud = read_cloud(run / "cloud.laz")
-        seen = cloud.rgb.any(axis=1)
-        assert 0 < seen.sum() == len(model.points3D)
-        places = np.array([model.points3D[i].xyz for i in sorted(model.points3D)])
-        colours = np.array([model.points3D[i].color for i in sorted(model.points3D)])
-        np.testing.assert_allclose(places, cloud.points[seen], atol=1e-9)
-        np.testing.assert_array_equal(colours, cloud.rgb[seen])
-
-
-def test_the_text_by_its_description(put):
-    run, result = put()
-    cameras, images, points = read_text(colmap(run) / "text")
-    assert [model for model, *_ in cameras.values()] == ["PINHOLE", "OPENCV"]
-    assert cameras[1] == ("PINHOLE", W, H, [17.25, 18.5, 9.625, 6.25])
-    assert cameras[2][3][4:] == [-0.31, 0.12, 0.001, -0.002]
-    for pose, camera, name in images.values():
-        w, x, y, z = pose[:4]
-        R = np.array(
-            [
-                [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-                [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-                [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-            ]
-        )
-        T_cam_key = result.views[name.removesuffix(".jpg")].T_cam_key
-        np.testing.assert_allclose(R, T_cam_key[:3, :3], atol=1e-12)
-        np.testing.assert_allclose(pose[4:], T_cam_key[:3, 3], atol=1e-12)
-        assert cameras[camera][0] == ("PINHOLE" if name == "image_02.jpg" else "OPENCV")
+def test_a_model_by_colmaps_own_reader(put, lens: str) -> None:
+    run, result = put({"fast/000359": lens, "fast/000360": lens, "image_03": "plain"})
+    model = colmap(run)
+    assert len(model.cameras) == 2
+    names = sorted(image.name for image in model.images.values())
+    assert names == ["fast/000359.jpg", "fast/000360.jpg", "image_03.jpg"]
+    for image in model.images.values():
+        view = result.views[image.name.removesuffix(".jpg")]
+        T_cam_world = image.cam_from_world().matrix()
+        np.testing.assert_allclose(T_cam_world, view.T_cam_key[:3], atol=1e-12)
+        camera = model.cameras[image.camera_id]
+        assert (camera.width, camera.height) == (W, H)
+        rng = np.random.default_rng(0)
+        points_cam = rng.uniform([-0.4, -0.3, 1], [0.4, 0.3, 1], (50, 3)) * 7
+        uv, _ = image_points(view.camera, points_cam)
+        np.testing.assert_allclose(camera.img_from_cam(points_cam), uv + 0.5, atol=1e-6)
     cloud = read_cloud(run / "cloud.laz")
-    seen = cloud.rgb.any(axis=1)
-    np.testing.assert_allclose(points[:, 1:4], cloud.points[seen], atol=1e-9)
-    np.testing.assert_array_equal(points[:, 4:7], cloud.rgb[seen])
-    assert not points[:, 7].any()
-
-
-def test_images_of_one_camera_share_it(put):
-    run, _ = put({"fast/000359": "bent", "fast/000360": "bent"})
-    cameras, images, _ = read_text(colmap(run) / "text")
-    assert len(cameras) == 1
-    assert [(c, name) for _, c, name in images.values()] == [
-        (1, "fast/000359.jpg"),
-        (1, "fast/000360.jpg"),
-    ]
+    observed = cloud.rgb.any(axis=1)
+    assert 0 < observed.sum() < len(observed)
+    colours = np.array([model.points3D[i].color for i in sorted(model.points3D)])
+    np.testing.assert_allclose(places_of(model), cloud.points[observed], atol=1e-9)
+    np.testing.assert_array_equal(colours, cloud.rgb[observed])
 
 
 @pytest.mark.parametrize("lens", ["prism", "mei"])
-def test_lenses_that_colmap_lacks(put, lens):
+def test_lenses_that_colmap_lacks(put, lens: str) -> None:
     run, _ = put({"image_02": "plain", "image_03": lens})
     refused("image_03: its lens", "--camera", run=run, to="colmap")
-    refused("--camera image_09: expected one of image_02, image_03", run=run, cameras=["image_09"])
-    cameras, *_ = read_text(colmap(run, cameras=["image_02"]) / "text")
-    assert len(cameras) == 1
-    assert [p.name for p in (run / "export" / "colmap" / "images").iterdir()] == ["image_02.jpg"]
+    assert len(colmap(run, cameras=["image_02"]).images) == 1
 
 
-def test_points_land_on_their_depth_by_colmaps_own_camera(street):
+def test_points_land_on_their_depth_by_colmaps_own_camera(street: Path) -> None:
     """Pixel centres, axes and poses at once: what COLMAP projects is where our maps have it."""
-    pycolmap = pytest.importorskip("pycolmap")
-    model = pycolmap.Reconstruction(str(colmap(street) / "sparse" / "0"))
-    points = np.array([model.points3D[i].xyz for i in sorted(model.points3D)])
+    model = colmap(street)
     (image,) = model.images.values()
-    points_cam = image.cam_from_world() * points
+    points_cam = image.cam_from_world() * places_of(model)
     uv = model.cameras[image.camera_id].img_from_cam(points_cam)
     check_depth(street, uv, points_cam[:, 2])
 
 
-def check_depth(run, uv, z_m):
+def check_depth(run: Path, uv: np.ndarray, z_m: np.ndarray) -> None:
     """Points lie on the map's surface, better than a third of a pixel beside: pixel (0, 0) has its
-    middle at (0.5, 0.5)."""
+    centre at (0.5, 0.5)."""
     depth_m = read_depth_png(run / "depth_filled" / "front.png")
 
     def off_m(aside_px):
@@ -167,129 +121,181 @@ def check_depth(run, uv, z_m):
 # --- nerfstudio -----------------------------------------------------------------------------------
 
 
-def test_nerfstudio_frames(put):
+def test_nerfstudio_frames(put) -> None:
     run, result = put()
     table = transforms(run)
     folder = run / "export" / "nerfstudio"
     assert table["camera_model"] == "OPENCV" and len(table["frames"]) == 2
     for frame, (name, view) in zip(table["frames"], result.views.items(), strict=True):
-        assert frame["file_path"] == f"images/{name}.jpg"
-        image = folder / frame["file_path"]
-        assert image.read_bytes() == (run / "scene" / "image" / f"{name}.jpg").read_bytes()
-        assert cv2.imread(str(image)).shape == (frame["h"], frame["w"], 3) == (H, W, 3)
+        assert cv2.imread(str(folder / frame["file_path"])).shape == (frame["h"], frame["w"], 3)
         lens = [*view.camera.distortion, 0, 0, 0, 0][:4]
         assert [frame[k] for k in ("k1", "k2", "p1", "p2")] == lens and frame["k3"] == 0
         assert [frame[k] for k in ("fl_x", "fl_y", "cx", "cy")] == [17.25, 18.5, 9.625, 6.25]
-        T_world_eye = np.array(frame["transform_matrix"])
         # OpenGL's camera: x right, y up, z back
-        T_cam_world = np.diag([1, -1, -1, 1]) @ np.linalg.inv(T_world_eye)
+        T_cam_world = np.diag([1, -1, -1, 1]) @ np.linalg.inv(frame["transform_matrix"])
         np.testing.assert_allclose(T_cam_world, view.T_cam_key, atol=1e-12)
         # As nerfstudio's get_depth_image_from_path reads it with its usual scale
         depth_m = np.load(folder / frame["depth_file_path"]) * 1e-3
-        np.testing.assert_allclose(depth_m, read_depth_png(run / "depth" / f"{name}.png"), 1e-7)
+        np.testing.assert_allclose(depth_m, read_depth_png(run / "depth" / f"{name}.png"), 1e-6)
     vertex = PlyData.read(folder / table["ply_file_path"])["vertex"].data
     assert vertex.dtype.names == ("x", "y", "z", "red", "green", "blue")
-    cloud = read_cloud(run / "cloud.laz")
-    assert len(vertex) == cloud.rgb.any(axis=1).sum() < len(cloud.points) + 1
+    assert len(vertex) == read_cloud(run / "cloud.laz").rgb.any(axis=1).sum()
 
 
-def test_points_land_on_their_depth_by_opengls_camera(street):
-    table = transforms(street)
-    (frame,) = table["frames"]
+def test_points_land_on_their_depth_by_opengls_camera(street: Path) -> None:
+    (frame,) = transforms(street)["frames"]
     vertex = PlyData.read(street / "export" / "nerfstudio" / "cloud.ply")["vertex"].data
     points = np.stack([vertex[a] for a in "xyz"] + [np.ones(len(vertex))], axis=1)
     x, y, back, _ = (points.astype(float) @ np.linalg.inv(frame["transform_matrix"]).T).T
-    z_m = -back
-    u = frame["fl_x"] * x / z_m + frame["cx"]
-    v = frame["cy"] - frame["fl_y"] * y / z_m
-    check_depth(street, np.stack([u, v], axis=1), z_m)
-
-
-def test_thresholds_and_cameras_reach_nerfstudio(put):
-    run, _ = put()
-    exported = export_run(run, 0.5, to="nerfstudio", cameras=["image_03"])
-    assert [*exported.density] == ["image_03"] and exported.num_points is not None
-    depth = np.load(run / "export" / "nerfstudio" / "depth" / "image_03.npy")
-    assert np.mean(depth > 0) == exported.density["image_03"]["measured"].after < 0.4
+    u = frame["cx"] - frame["fl_x"] * x / back
+    v = frame["cy"] + frame["fl_y"] * y / back
+    check_depth(street, np.stack([u, v], axis=1), -back)
 
 
 @pytest.mark.parametrize(
-    ("lenses", "words"),
+    ("lenses", "measure", "words"),
     [
-        ({"image_02": "plain", "image_03": "fisheye"}, ("one camera model", "--camera")),
-        ({"image_02": "bent8"}, ("no lens with k4, k5, k6", "--camera")),
-        ({"image_02": "mei"}, ("its lens (mei", "--camera")),
+        ({"image_02": "plain", "image_03": "fisheye"}, "z", "one camera model"),
+        ({"image_02": "bent8"}, "z", "no lens with k4, k5, k6"),
+        ({"image_02": "mei"}, "z", "its lens (mei"),
+        ({"image_02": "fisheye"}, "range", "image_02: its depth is the range"),
     ],
 )
-def test_cameras_that_nerfstudio_lacks(put, lenses, words):
-    run, _ = put(lenses)
-    refused(*words, run=run, to="nerfstudio")
+def test_cameras_that_nerfstudio_lacks(put, lenses, measure: str, words: str) -> None:
+    run, _ = put(lenses, measure=measure)
+    refused(words, "--camera" if measure == "z" else "project.depth=z", run=run, to="nerfstudio")
 
 
-def test_a_fisheye_in_nerfstudio(put):
-    run, _ = put({"image_02": "fisheye"})
-    table = transforms(run)
+def test_a_fisheye_in_nerfstudio(put) -> None:
+    table = transforms(put({"image_02": "fisheye"})[0])
     assert table["camera_model"] == "OPENCV_FISHEYE"
-    (frame,) = table["frames"]
-    assert [frame[k] for k in ("k1", "k2", "k3", "k4")] == [0.02, -0.01, 0.003, -0.0004]
+    lens = [table["frames"][0][k] for k in ("k1", "k2", "k3", "k4")]
+    assert lens == [0.02, -0.01, 0.003, -0.0004]
 
 
-def test_ranges_are_no_depth_for_nerfstudio(put):
-    run, _ = put({"image_02": "fisheye"}, measure="range")
-    refused("image_02: its depth is the range", "project.depth=z", run=run, to="nerfstudio")
-    colmap(run)  # has no depth
+# --- splats ---------------------------------------------------------------------------------------
+
+
+def track_of(instance: int, heading: float = 0.3) -> ObjectTrack:
+    T = poses.exp(np.array([0, 0, heading, 12.0, 1.0, -0.8]))
+    return ObjectTrack(
+        instance=instance,
+        size_m=np.array([4.0, 1.75, 1.5]),
+        frames=(120, 121),
+        stamp_ns=np.array([STAMPS_NS[120], STAMPS_NS[121] + 1]),
+        T_key_object=np.stack([T, T @ poses.exp(np.array([0, 0, 0, 0.5, 0.25, 0]))]),
+        velocity_m_s=np.array([[5.0, 2.5, 0.0]] * 2),
+        num_points=np.array([33, 20]),
+    )
+
+
+@pytest.fixture
+def tracked(put) -> tuple[Path, Result]:
+    return put(tracks=(track_of(3), track_of(5, heading=2.0)))
+
+
+def test_splats_keep_objects_apart_in_their_own_frames(tracked) -> None:
+    run, result = tracked
+    model = colmap(run, "splats")
+    folder, cloud = run / "export" / "splats", read_cloud(run / "cloud.laz")
+    static = PlyData.read(folder / "sparse" / "0" / "points3D.ply")["vertex"].data
+    assert static.dtype.names == ("x", "y", "z", "nx", "ny", "nz", "red", "green", "blue")
+    assert len(static) == (~cloud.moving & cloud.rgb.any(axis=1)).sum() == len(model.points3D)
+    np.testing.assert_allclose(places_of(model)[:, 0], static["x"], atol=1e-5)
+    of_tracks = np.zeros(len(cloud.points), bool)
+    for track in result.tracks:
+        own = PlyData.read(folder / "movers" / f"{track.instance:04d}.ply")["vertex"].data
+        in_object = np.stack([own[a] for a in "xyz"], axis=1).astype(float)
+        mine = cloud.instance == track.instance
+        points = poses.transform(track.T_key_object[0], in_object)
+        np.testing.assert_allclose(points, cloud.points[mine], atol=1e-4)
+        np.testing.assert_array_equal(own["green"], cloud.rgb[mine, 1])
+        of_tracks |= mine
+    others = PlyData.read(folder / "movers" / "others.ply")["vertex"].data
+    rest = cloud.moving & ~of_tracks
+    np.testing.assert_array_equal(others["x"], cloud.points[rest, 0].astype(np.float32))
+    assert (folder / "tracks.json").read_bytes() == (run / "movers.json").read_bytes()
+
+
+def test_objects_that_the_run_has_apart_are_there(tmp_path: Path) -> None:
+    cloud = cloud_of()
+    movers = {i: cloud.select(cloud.instance == i) for i in (3, 4)}
+    run, result = write_views(tmp_path, TWO, tracks=(track_of(3),))
+    parts = {i: type("Mover", (), {"cloud": c, "depth": {}}) for i, c in movers.items()}
+    apart = replace(result, cloud=cloud.select(~cloud.moving), movers=parts)
+    write_result(apart, result.images, tmp_path, config={}, data="street", overwrite=True)
+    export_run(run, "splats", min_confidence=0.5)
+    folder = run / "export" / "splats" / "movers"
+    found = [len(PlyData.read(folder / n)["vertex"].data) for n in ("0003.ply", "others.ply")]
+    assert found == [int((c.confidence >= 0.499).sum()) for c in movers.values()]
+
+
+def test_a_run_writes_the_tracks_that_were_found(street: Path) -> None:
+    tracks, table = street_result().tracks, json.loads((street / "movers.json").read_text())
+    assert (table["schema_version"], table["key"]) == (1, KEY) and tracks
+    for entry, track in zip(table["objects"], tracks, strict=True):
+        assert entry["instance"] == track.instance
+        np.testing.assert_array_equal(entry["size_m"], track.size_m)
+        for name in ("T_key_object", "velocity_m_s", "stamp_ns", "num_points"):
+            values = [pose[name] for pose in entry["poses"]]
+            np.testing.assert_array_equal(values, getattr(track, name))
 
 
 # --- damaged runs ---------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("to", ["nerfstudio", "colmap"])
-def test_runs_without_images_or_scene(put, to):
+def test_runs_without_images_or_scene(put) -> None:
     run, _ = put()
     image = run / "scene" / "image" / "image_02.jpg"
     image.write_bytes(image.read_bytes()[:-40])
-    refused(image, "not a complete image", run=run, to=to)
+    refused(image, "not a complete image", run=run, to="colmap")
     cv2.imwrite(str(image), np.zeros((H, W + 1, 3), np.uint8))
-    refused(f"got {W + 1} x {H} px, expected {W} x {H}", run=run, to=to)
+    refused(f"got {W + 1} x {H} px, expected {W} x {H}", run=run, to="colmap")
     for path in (run / "scene" / "image").iterdir():
         path.unlink()
-    refused("no images in scene/image of image_02, image_03", run=run, to=to)
+    refused("no images in scene/image of image_02, image_03", run=run, to="nerfstudio")
     (run / "scene" / "scene.json").unlink()
-    refused("scene.json: not there", run=run, to=to)
+    refused("scene.json: cannot be read", run=run, to="nerfstudio")
 
 
 DAMAGE = {
-    "views": 3,
-    "views.image_02": [],
-    "views.image_02.K": [[1, 0, 0], [0, 1, 0]],
-    "views.image_02.T_cam_key": [[1, 0, 0, "x"]] * 4,
-    "views.image_02.T_cam_lidar": (2 * np.eye(4)).tolist(),
-    "views.image_03.T_cam_key": np.diag([1, 1, -1, 1]).tolist(),
-    "views.image_02.model": "cone",
-    "views.image_02.distortion": [True],
-    "views.image_02.width_px": 0,
-    "views.image_02.row_time_s": None,
-    "sweeps": {},
+    "scene/scene.json": {
+        "views": 3,
+        "views image_02": [],
+        "views image_02 K": [[1, 0, 0], [0, 1, 0]],
+        "views image_02 T_cam_key": [[1, 0, 0, "x"]] * 4,
+        "views image_02 T_cam_lidar": (2 * np.eye(4)).tolist(),
+        "views image_03 T_cam_key": np.diag([1, 1, -1, 1]).tolist(),
+        "views image_02 model": "cone",
+        "views image_02 width_px": 0,
+        "views image_02 row_time_s": None,
+        "sweeps": {"frame": 1},
+    },
+    "movers.json": {
+        "objects": {"x": 1},
+        "objects 0 size_m": [1, 2],
+        "objects 0 poses": [],
+        "objects 0 poses 0 stamp_ns": 1.5,
+        "objects 0 poses 1 T_key_object": np.zeros((4, 4)).tolist(),
+        "objects 0 poses 0 velocity_m_s": "fast",
+        "objects 0 poses 0 frame": 7,
+    },
 }
 
 
-@pytest.mark.parametrize("place", DAMAGE)
-def test_damaged_scenes_are_named(put, place):
-    run, _ = put()
-    path = run / "scene" / "scene.json"
+@pytest.mark.parametrize(
+    ("file", "place"), [(file, place) for file, places in DAMAGE.items() for place in places]
+)
+def test_damaged_tables_are_named(tracked, file: str, place: str) -> None:
+    run, _ = tracked
+    path = run / file
     table = json.loads(path.read_text())
-    *way, last = place.split(".")
+    *way, last = place.split()
     inner = table
     for name in way:
-        inner = inner[name]
-    inner[last] = DAMAGE[place]
+        inner = inner[int(name) if name.isdigit() else name]
+    inner[last] = DAMAGE[file][place]
     path.write_text(json.dumps(table))
-    refused(path, place, "expected", run=run, to="colmap")
-    path.write_text("[]")
-    refused(path, "the file: expected a mapping", run=run, to="colmap")
+    refused(path, "densify", run=run, to="splats")
     path.write_text("{")
-    refused(path, "not a whole JSON file", run=run, to="colmap")
-
-
-def test_the_street_moves():
-    assert street_result().cloud.moving.sum() > 100
+    refused(path, "not a whole JSON file", run=run, to="splats")

@@ -7,11 +7,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from densify.outputs.flow_npz import write_flow_files
 
 from densify.config.errors import InputError
 from densify.geometry import poses
 from densify.geometry.types import FlowField, Result, Stretch, StretchFlow
-from densify.outputs.flow_npz import write_flow_files
 from densify.readers.flow_files import MOVES_M, FlowFiles
 from tests.exact_motion import registered
 from tests.scenes import by_flow

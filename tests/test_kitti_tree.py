@@ -19,9 +19,8 @@ from hypothesis import strategies as st
 import densify
 from densify.config.errors import InputError
 from densify.geometry.types import DepthMap
-from densify.outputs.atomic import FileRecord
 from densify.outputs.depth_png import read_depth_png
-from densify.outputs.kitti_tree import drive_folder, split_of, write_key, write_readme
+from densify.outputs.kitti_tree import FileRecord, drive_folder, split_of, write_key, write_readme
 from densify.readers.depth_trees import pair_depth_files
 
 H, W = 9, 14

@@ -25,7 +25,7 @@ from densify.dataset.manifest import (
     finished,
     read_manifests,
 )
-from densify.outputs.atomic import FileRecord
+from densify.outputs.kitti_tree import FileRecord
 
 # One record
 

@@ -11,9 +11,7 @@ import pytest
 
 from densify.config.errors import InputError
 from densify.geometry.types import Cloud
-from tests.exported import camera_of, street_result, view_of
-from tests.test_export import map_of
-from tests.test_export_formats import cloud_of
+from tests.exported import camera_of, cloud_of, map_of, street_result, view_of
 
 NAMES = (
     *("x", "y", "z", "rigid_x", "rigid_y", "rigid_z", "frame", "since_key_ns", "row", "lidar"),

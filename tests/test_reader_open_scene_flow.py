@@ -7,6 +7,7 @@ import shutil
 
 import numpy as np
 import pytest
+from densify.outputs.flow_h5 import write_flow_h5
 from writers import write_street
 from writers.excerpt import Excerpt
 
@@ -14,7 +15,6 @@ import densify
 from densify.config.errors import InputError
 from densify.geometry.poses import transform
 from densify.geometry.types import Trajectory
-from densify.outputs.flow_h5 import write_flow_h5
 from densify.readers import open_sequence
 from densify.readers.open_scene_flow.labels import FlowLabels
 from densify.readers.open_scene_flow.reader import OpenSceneFlow, SweepFile

@@ -13,6 +13,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from densify.outputs.report.camera_maps import packed_camera
+from densify.outputs.report.cloud_points import packed_cloud
+from densify.outputs.report.pack import Blobs, smallest
+from densify.outputs.report.thinning import in_space_order, thinned
 
 from densify.config.errors import InputError
 from densify.dataset.report import write_report
@@ -20,12 +24,8 @@ from densify.outputs import StoredCloud, read_cloud
 from densify.outputs.depth_png import read_stored
 from densify.outputs.png import encode_png
 from densify.outputs.report import key_page
-from densify.outputs.report.camera_maps import packed_camera
-from densify.outputs.report.cloud_points import packed_cloud
 from densify.outputs.report.key_files import KeyFiles
-from densify.outputs.report.pack import Blobs, smallest
 from densify.outputs.report.page_file import page_file
-from densify.outputs.report.thinning import in_space_order, thinned
 from tests.command import refused
 from tests.report_runs import write_compared, write_run
 

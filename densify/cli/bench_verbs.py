@@ -214,15 +214,14 @@ def _with_figure(
 ) -> Iterator[PaperPair]:
     """The same pairs; the first is drawn as it passes."""
     from densify.bench.paper import flows_of_pair
-    from densify.outputs.arrows import draw_arrows
-    from densify.outputs.png import write_picture
+    from densify.outputs.plots import draw_arrows, write_plot
 
     for number, pair in enumerate(pairs):
         if number == 0:
             points, flows = flows_of_pair(pair, methods, options.models, options.points)
             try:
                 options.figure.parent.mkdir(parents=True, exist_ok=True)
-                write_picture(options.figure, draw_arrows(points, flows))
+                write_plot(options.figure, draw_arrows(points, flows))
             except OSError as error:
                 reason = error.strerror or error
                 raise InputError(

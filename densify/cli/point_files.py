@@ -71,13 +71,13 @@ def check_new_file(
 
 
 def write_flow(path: Path, field: FlowField) -> None:
-    """Write the flow as `densify.outputs.flow_npz.flow_npz` does, row by row as the source file.
+    """Write `densify.outputs.flow_writers.flow_npz`, row by row as the source file.
     Appears only when complete.
 
     Raises InputError if it cannot be written.
     """
     from densify.outputs.atomic import write_file
-    from densify.outputs.flow_npz import flow_npz
+    from densify.outputs.flow_writers import flow_npz
 
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

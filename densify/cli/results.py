@@ -9,7 +9,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -24,7 +23,6 @@ FIRST_OF_RUN = {
     "report.html": "all of it, in a browser",
     "*.webp": "the film",
     "*.gif": "the film",
-    "*.mp4": "the film",
     "figure.png": "what was gained, at a glance",
     "depth_filled/*.png": "a depth map: 256 x metres",
     "depth_filled/*/*.png": "a depth map: 256 x metres",
@@ -130,19 +128,6 @@ def key_facts(result: Result) -> dict[str, Any]:
         "error": None,
     }
     return dict(plain({**facts, **known}))
-
-
-def export_facts(exported: Export) -> dict[str, Any]:
-    """The same as `export_summary`, for programs."""
-    facts: dict[str, Any] = {
-        "density": {
-            camera: {product: asdict(density) for product, density in products.items()}
-            for camera, products in exported.density.items()
-        }
-    }
-    if exported.num_points is not None:
-        facts["num_points"] = asdict(exported.num_points)
-    return facts
 
 
 def comparison(results: Mapping[str, Result]) -> str:

@@ -317,12 +317,11 @@ class PriorSettings(Section):
 class OutputSettings(Section):
     """What is written beside the files that every run writes."""
 
-    flow: bool = knob(False, "flow/: scene flow of every sweep to the next one, as flow files")
-    flow_as: str = knob(
-        "npz",
-        "flow files. npz: as docs/formats.md says, towards the key; opensceneflow: an .h5 file as "
-        "OpenSceneFlow has them, up to the key",
-        choices=("npz", "opensceneflow"),
+    flow: str = knob(
+        "none",
+        "flow/: scene flow of every sweep to the next one. npz: flow files as docs/formats.md "
+        "says, towards the key; opensceneflow: an .h5 file for OpenSceneFlow, up to the key",
+        choices=("none", "npz", "opensceneflow"),
     )
     optical_flow: bool = knob(
         False,

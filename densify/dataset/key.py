@@ -20,8 +20,7 @@ from densify.config.errors import ComputationError, InputError, OutputError, is_
 from densify.dataset.manifest import KeyRecord
 from densify.dataset.plan import Recipe, Source
 from densify.geometry.types import Result
-from densify.outputs.atomic import FileRecord
-from densify.outputs.kitti_tree import write_key
+from densify.outputs.kitti_tree import FileRecord, write_key
 from densify.outputs.store import write_result
 from densify.pipeline import run as pipeline
 from densify.pipeline.methods import with_baselines

@@ -39,7 +39,7 @@ from densify.dataset.plan import (
 )
 from densify.flow.engines import check_engine
 from densify.geometry.threads import num_threads
-from densify.outputs.atomic import clear_leftovers
+from densify.outputs.atomic import LEFT_AFTER_S, clear_leftovers
 from densify.outputs.kitti_tree import write_readme
 from densify.pipeline.memory import available_bytes, check_free, need_of_run
 from densify.readers import open_sequence
@@ -132,10 +132,11 @@ def make_dataset(
     if scheduler is not None:
         check_scheduler(scheduler)
     num_workers = _num_processes(num_workers, recipe, drives)
+    leftover_age_s = 0.0 if shard is None else LEFT_AFTER_S
     with Manifest(out, shard) as manifest:
         write_plan(out, recipe, drives)
         with _log_file(out, shard):
-            clear_leftovers(out)
+            clear_leftovers(out, leftover_age_s)
             if recipe.layout == "kitti-depth":
                 settings = as_mapping(recipe.config)
                 write_readme(out, method=recipe.method, window=recipe.window, settings=settings)
@@ -151,7 +152,7 @@ def make_dataset(
                 for record in _made(left, recipe, out, num_workers, scheduler):
                     manifest.append(record)
                     done.add(record)
-            clear_leftovers(out)  # of workers that were killed
+            clear_leftovers(out, leftover_age_s)  # of workers that were killed
     return done.summary()
 
 

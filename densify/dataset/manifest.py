@@ -31,7 +31,8 @@ from typing import Any, Literal, get_args
 
 from densify.config.errors import InputError, OutputError
 from densify.config.file_content import open_file, parse_json, read_bytes
-from densify.outputs.atomic import FileRecord, write_file
+from densify.outputs.atomic import write_file
+from densify.outputs.kitti_tree import FileRecord
 from densify.outputs.plain import plain
 
 Status = Literal["done", "aside", "failed"]
@@ -201,7 +202,7 @@ class Manifest:
     def _put_in_order(self) -> None:
         data = b"".join(line for _, line in sorted(self._lines.items()))
         if not self.path.exists() or read_bytes(self.path) != data:
-            write_file(self.path, data, durable=True)
+            write_file(self.path, data)
 
     def _not_written(self, error: OSError) -> OutputError:
         return OutputError(

@@ -217,7 +217,7 @@ def write_plan(out: Path, recipe: Recipe, drives: Sequence[PlannedDrive]) -> Non
         text = json.dumps(table, indent=1) + "\n"
         try:
             out.mkdir(parents=True, exist_ok=True)
-            write_file(out / _FILE, text.encode(), durable=True)
+            write_file(out / _FILE, text.encode())
         except OSError as error:
             raise OutputError(
                 f"--out {out}: {_FILE} cannot be written: {error.strerror or error}"

@@ -23,8 +23,7 @@ from densify.outputs.atomic import write_file
 from densify.outputs.context import Context
 from densify.outputs.report.key_files import KeyFiles
 from densify.outputs.report.key_page import key_page
-from densify.outputs.report.pack import Blobs
-from densify.outputs.report.page_file import page_file
+from densify.outputs.report.page_file import Blobs, page_file
 from densify.outputs.report.thumbnails import sheets
 
 _SCRIPTS = ("unpack.js", "dom.js", "colours.js", "rows.js", "set.js")

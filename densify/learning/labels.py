@@ -25,7 +25,7 @@ from densify.geometry.types import (
     RegisteredSweep,
 )
 from densify.outputs.atomic import write_file
-from densify.outputs.flow_npz import flow_npz
+from densify.outputs.flow_writers import flow_npz
 from densify.pipeline.recording import Recording
 
 

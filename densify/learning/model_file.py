@@ -67,7 +67,7 @@ def write_model(path: Path, model: Model) -> None:
     np.savez(buffer, **arrays)  # type: ignore[arg-type]
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        write_file(path, buffer.getvalue(), durable=True)
+        write_file(path, buffer.getvalue())
     except OSError as error:
         raise InputError(f"{path}: cannot be written: {error.strerror or error}") from error
 

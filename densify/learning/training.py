@@ -24,8 +24,7 @@ from densify.learning.losses import teacher
 from densify.learning.model_file import Model, read_model, write_model
 from densify.learning.network import NUM_SWEEPS, Voxels, build
 from densify.learning.samples import samples
-from densify.outputs.loss_curve import draw_losses
-from densify.outputs.png import write_picture
+from densify.outputs.plots import draw_losses, write_plot
 
 _LEARNING_RATE = 2e-3
 _LARGEST_GRADIENT = 1.0
@@ -117,7 +116,7 @@ def train(
     write_model(out, Model(network, training.identity()))
     picture = out.with_name(out.name + ".png")
     title = f"teacher {training.teacher}, {', '.join(training.data)}"
-    write_picture(picture, draw_losses(np.array(losses), title))
+    write_plot(picture, draw_losses(np.array(losses), title))
     checkpoint.unlink(missing_ok=True)
     return Trained([out, picture], float(np.mean(losses[-_NUM_AVERAGED:])))
 

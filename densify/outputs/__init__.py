@@ -1,9 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The files of a result, each whole or not there.
-
-Written elsewhere: the flow between two point files (`densify.cli.point_files`) and the truth of
-simulated recordings (`densify.readers.truth_files`).
-"""
+"""The files of a result, each whole or not there, their exports and the report page."""
 
 from densify.outputs.cloud_laz import StoredCloud, read_cloud, write_cloud
 from densify.outputs.depth_png import (
@@ -13,17 +9,14 @@ from densify.outputs.depth_png import (
     write_confidence_png,
     write_depth_png,
 )
-from densify.outputs.export import Density, Export, export_run
-from densify.outputs.figure import draw_figure
+from densify.outputs.export import Export, export_run
 from densify.outputs.png import write_picture
 from densify.outputs.store import check_writable, write_comparison, write_result
 
 __all__ = [
-    "Density",
     "Export",
     "StoredCloud",
     "check_writable",
-    "draw_figure",
     "export_run",
     "read_cloud",
     "read_depth_png",

@@ -33,18 +33,16 @@ _EXTRA_DIMENSIONS = (
     ("displaced_y", "float32", "m"),
     ("displaced_z", "float32", "m"),
 )
-_OF_THE_FORMAT = {"intensity", "gps_time", "red", "green", "blue"}
-_SINCE = {"far", "displaced_x", "displaced_y", "displaced_z"}
-"""Dimensions that older clouds lack."""
+_STANDARD_DIMENSIONS = {"intensity", "gps_time", "red", "green", "blue"}
 
 
 @dataclass(frozen=True)
 class StoredCloud:
-    """A cloud as it was written: M points, key frame, metres, rounded to the millimetre.
+    """M points as they were written, key frame, metres, rounded to the millimetre.
 
     frame, instance: (M,) int32. moving, far: (M,) bool. confidence, displaced, intensity: (M,)
-    float32. rgb: (M,3) uint8. displacement: (M,3) float32 metres, by which a point was moved beyond
-    the rigid alignment; None in clouds of older versions. gps_time: (M,) as `write_cloud` has it.
+    float32. rgb: (M,3) uint8, 0 where no camera observed the point. displacement: (M,3) float32
+    metres beyond the rigid alignment. gps_time: (M,) seconds, see `write_cloud`.
     """
 
     points: Float
@@ -56,38 +54,33 @@ class StoredCloud:
     intensity: Float32
     rgb: NDArray[np.uint8]
     far: Bool
-    displacement: Float32 | None
+    displacement: Float32
     gps_time: Float
 
     @property
     def rigid_points(self) -> Float:
-        """(M,3) where registration alone puts them; as ``points`` in clouds of older versions."""
-        return self.points if self.displacement is None else self.points - self.displacement
+        """(M,3) positions by registration alone."""
+        return self.points - self.displacement
 
     @property
     def stamp_ns(self) -> Int:
         """(M,) reference time of the sweep that measured the point, to the microsecond."""
         return np.rint(self.gps_time * 1e6).astype(np.int64) * 1000 + _LAS_EPOCH_NS
 
-    def select(self, keep: Bool) -> StoredCloud:
-        """The points where ``keep`` (M,) is True."""
-        columns = {f.name: getattr(self, f.name) for f in fields(self)}
-        kept: dict[str, Any] = {n: None if c is None else c[keep] for n, c in columns.items()}
-        return StoredCloud(**kept)
+    def select(self, keep: Bool | Int) -> StoredCloud:
+        """Return the points where ``keep`` (M,) is True, or those of these rows."""
+        return StoredCloud(**{f.name: getattr(self, f.name)[keep] for f in fields(self)})
 
     def columns(self) -> dict[str, NDArray[Any]]:
-        """Everything as (M,) columns, for formats of named columns: x y z red green blue intensity
-        confidence frame instance moving far displaced displaced_x displaced_y displaced_z gps_time.
-        What is true or false as uint8, places as float32, which keeps the millimetre up to
-        8 km."""
-        by_axis = {"": self.points, "displaced_": self.displacement}
-        vectors = {
+        """Return (M,) columns: x y z red green blue intensity confidence frame instance moving far
+        displaced displaced_x displaced_y displaced_z gps_time. Booleans are uint8. Positions are
+        float32, which keeps the millimetre up to 8 km."""
+        vectors: dict[str, NDArray[Any]] = {
             f"{name}{axis}": np.ascontiguousarray(values[:, i], np.float32)
-            for name, values in by_axis.items()
-            if values is not None
+            for name, values in (("", self.points), ("displaced_", self.displacement))
             for i, axis in enumerate("xyz")
         }
-        columns: dict[str, NDArray[Any]] = {name: vectors.pop(name) for name in "xyz"}
+        columns = {name: vectors.pop(name) for name in "xyz"}
         columns |= {n: self.rgb[:, i].copy() for i, n in enumerate(("red", "green", "blue"))}
         columns |= {n: getattr(self, n) for n in ("intensity", "confidence", "frame", "instance")}
         columns |= {n: getattr(self, n).astype(np.uint8) for n in ("moving", "far")}
@@ -95,21 +88,19 @@ class StoredCloud:
 
 
 def write_output(result: Result, context: Context, folder: Path) -> None:
-    """``cloud.laz``."""
+    """Write ``cloud.laz``."""
     write_cloud(folder / "cloud.laz", result.cloud, result.stamp_ns)
 
 
 def write_cloud(path: Path, cloud: Cloud, stamp_ns: int = 0) -> None:
-    """Write a cloud with the extra dimensions frame, moving, instance, confidence, displaced, far,
-    displaced_x, displaced_y and displaced_z.
+    """Write a cloud with the extra dimensions of `_EXTRA_DIMENSIONS`.
 
-    stamp_ns: the key's reference time. ``gps_time`` is the reference time of the sweep that
-    measured the point, as LAS 1.4 has it: seconds since 1980-01-06, less 10^9, by the recording's
-    clock taken as UNIX time, without leap seconds. The header's date is the key's.
+    stamp_ns: the key's reference time; the header's date is its day. ``gps_time`` is the reference
+        time of the sweep that measured the point, as LAS 1.4 has it: seconds since 1980-01-06 less
+        10^9, by the recording's clock taken as UNIX time, without leap seconds.
 
-    Coordinates are rounded to 1 mm, intensity and colour widened to the format's 16 bits. The same
-    cloud gives the same bytes. Raises ValueError for coordinates that are not finite or beyond
-    2,147 km.
+    Coordinates are rounded to 1 mm, intensity and colour are widened to 16 bits. The same cloud
+    gives the same bytes. Raises ValueError for coordinates that are not finite or beyond 2,147 km.
     """
     import laspy
 
@@ -142,19 +133,16 @@ def write_cloud(path: Path, cloud: Cloud, stamp_ns: int = 0) -> None:
 
 
 def read_cloud(path: Path) -> StoredCloud:
-    """Read back what `write_cloud` wrote. Raises InputError for any other file."""
+    """Read what `write_cloud` wrote. Raises InputError for any other file."""
     las = read_las(path)
-    names = set(las.point_format.dimension_names)
-    missing = {*_OF_THE_FORMAT, *(n for n, _, _ in _EXTRA_DIMENSIONS)} - names - _SINCE
-    if missing:
+    known = {*_STANDARD_DIMENSIONS, *(name for name, _, _ in _EXTRA_DIMENSIONS)}
+    if missing := known - set(las.point_format.dimension_names):
         raise InputError(
-            f"{path}: no dimension {', '.join(sorted(missing))}; expected a cloud densify wrote"
+            f"{path}: no dimension {', '.join(sorted(missing))}; expected a cloud of this version "
+            f"of densify; densify the key again"
         )
     rgb = np.stack([las.red, las.green, las.blue], axis=1)
-    displacement = None
-    if names >= _SINCE:
-        vector = [np.array(las[f"displaced_{axis}"], np.float32) for axis in "xyz"]
-        displacement = np.stack(vector, axis=1)
+    displacement = [np.array(las[f"displaced_{axis}"], np.float32) for axis in "xyz"]
     return StoredCloud(
         points=np.array(las.xyz),
         frame=np.array(las["frame"], np.int32),
@@ -164,7 +152,7 @@ def read_cloud(path: Path) -> StoredCloud:
         displaced=np.array(las["displaced"], np.float32),
         intensity=np.array(las.intensity, np.float32) / np.float32(65535),
         rgb=(rgb // 257).astype(np.uint8),
-        far=np.array(las["far"], bool) if "far" in names else np.zeros(len(rgb), bool),
-        displacement=displacement,
+        far=np.array(las["far"], bool),
+        displacement=np.stack(displacement, axis=1),
         gps_time=np.array(las.gps_time),
     )

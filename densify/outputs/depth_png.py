@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Depth, confidence, age and optical flow as PNG. Depth is exactly that of KITTI's depth-completion
-benchmark (Uhrig et al., "Sparsity Invariant CNNs", 3DV 2017): 16 bit, one channel, ``value / 256``
-metres, 0 = none.
+"""Depth, confidence, age and optical flow as PNG.
+
+Depth is in the format of KITTI's depth completion benchmark (Uhrig et al., "Sparsity Invariant
+CNNs", 3DV 2017): 16 bit, one channel, ``value / 256`` metres, 0 = none.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from densify.readers.decoded_files import read_image
 _STEPS_PER_M = 256.0
 _STEPS_OF_CONFIDENCE = 254.0
 _STEPS_PER_S = 1000.0
+_STEPS_PER_PX = 64.0
 _MAX_VALUE = np.iinfo(np.uint16).max
 
 
@@ -30,11 +32,10 @@ def write_depth_png(path: Path, depth_m: Float32) -> None:
 
 
 def encode_depth(depth_m: Float32) -> bytes:
-    """The PNG of ``rint(256 * depth_m)``.
+    """Return the PNG of ``rint(256 * depth_m)``.
 
-    depth_m: (H,W) metres, 0 none. What the format cannot say becomes 0, none, never another depth:
-    beyond 65535/256 = 256 m (a cast would wrap 256.5 m to 0.5 m) and nearer than half a step, 2 mm.
-    Raises ValueError for depths that are negative or not finite.
+    depth_m: (H,W) metres, 0 none. Depths beyond 65535/256 = 256 m and below half a step, 2 mm,
+        become 0, none. Raises ValueError for depths that are negative or not finite.
     """
     return encode_png(_quantised(depth_m))
 
@@ -45,7 +46,7 @@ def write_confidence_png(path: Path, confidence: Float32, depth_m: Float32) -> N
 
 
 def encode_confidence(confidence: Float32, depth_m: Float32) -> bytes:
-    """The PNG of `stored_confidence`, 8 bit, 0 where `encode_depth` says no depth.
+    """Return the 8-bit PNG of `stored_confidence`, 0 where `encode_depth` has no depth.
 
     confidence: (H,W), 0 to 1. depth_m: (H,W) metres, the depth it belongs to.
     """
@@ -58,10 +59,9 @@ def encode_confidence(confidence: Float32, depth_m: Float32) -> bytes:
 
 
 def write_age_png(path: Path, age_s: Float32, depth_m: Float32) -> None:
-    """Write `stored_age` as 16 bit, 0 where `write_depth_png` writes no depth.
+    """Write `stored_age` as 16 bit, 0 where `encode_depth` has no depth.
 
-    age_s: (H,W) seconds, 0 or more wherever there is depth. depth_m: (H,W) metres, the depth it
-    belongs to.
+    age_s: (H,W) seconds, 0 or more wherever there is depth. depth_m: (H,W) metres.
     """
     has_depth = _has_depth("age_s", age_s, depth_m)
     if not (np.isfinite(age_s[has_depth]) & (age_s[has_depth] >= 0)).all():
@@ -72,26 +72,24 @@ def write_age_png(path: Path, age_s: Float32, depth_m: Float32) -> None:
 
 
 def stored_confidence(confidence: ArrayLike) -> NDArray[np.uint8]:
-    """``1 + rint(254 * confidence)``: 255 is most certain, 0 is left for pixels without depth."""
+    """Return ``1 + rint(254 * confidence)``. 255 is most certain; 0 is left for no depth."""
     levels = np.rint(_STEPS_OF_CONFIDENCE * np.asarray(confidence, np.float64))
     return (1 + levels).astype(np.uint8)
 
 
 def stored_age(age_s: ArrayLike) -> NDArray[np.uint16]:
-    """``1 + rint(1000 * age_s)``, milliseconds; 0 is left for pixels without depth, and 65535 says
-    65.5 s or more."""
+    """Return ``1 + rint(1000 * age_s)``. 0 is left for no depth; 65535 is 65.5 s or more."""
     steps = np.rint(_STEPS_PER_S * np.asarray(age_s, np.float64))
     return (1 + np.minimum(steps, _MAX_VALUE - 1)).astype(np.uint16)
 
 
 def write_flow_png(path: Path, flow_px: Float32) -> None:
-    """Write optical flow as KITTI's flow benchmark does (Menze and Geiger, CVPR 2015): 16 bit, red
-    and green ``rint(64 * flow) + 2^15`` to the right and down, blue 1 where it is known, else 0.
+    """Write optical flow in the format of KITTI's flow benchmark (Menze and Geiger, CVPR 2015):
+    16 bit, red and green ``rint(64 * flow) + 2^15`` to the right and down, blue 1 where known.
 
-    flow_px: (H,W,2) pixels, NaN where unknown. What the format cannot say, beyond 512 pixels, is
-    unknown too.
+    flow_px: (H,W,2) pixels, NaN where unknown. Flow beyond 512 pixels is written as unknown.
     """
-    levels = np.rint(64.0 * flow_px.astype(np.float64)) + 2**15
+    levels = np.rint(_STEPS_PER_PX * flow_px.astype(np.float64)) + 2**15
     with np.errstate(invalid="ignore"):
         known = ((levels >= 0) & (levels <= _MAX_VALUE)).all(axis=2)
     image = np.zeros((*flow_px.shape[:2], 3), np.uint16)
@@ -101,14 +99,14 @@ def write_flow_png(path: Path, flow_px: Float32) -> None:
 
 
 def read_depth_png(path: Path) -> Float32:
-    """(H,W) float32 metres, 0 none. Raises InputError for anything but a 16-bit gray PNG."""
+    """Return (H,W) metres, 0 none. Raises InputError for anything but a 16-bit gray PNG."""
     stored = read_stored(path, np.uint16, "a depth map")
     return stored.astype(np.float32) / np.float32(_STEPS_PER_M)
 
 
 def read_stored(path: Path, kind: type[np.uint8] | type[np.uint16], what: str) -> NDArray[Any]:
-    """(H,W) of a depth, confidence or age map as it is stored. Raises InputError for anything but
-    a whole gray PNG of that many bits; what: for the message."""
+    """Return (H,W) of a map as it is stored. Raises InputError for anything but a whole gray PNG
+    of that many bits. what: the map, for the message."""
     image = read_image(path, as_stored=True)
     if image.dtype != kind or image.ndim != 2:
         got = f"{image.dtype} of shape {image.shape}"
@@ -118,7 +116,7 @@ def read_stored(path: Path, kind: type[np.uint8] | type[np.uint16], what: str) -
 
 
 def read_mask_png(path: Path) -> Bool:
-    """(H,W) bool, True where any colour is not 0; transparency says nothing. Raises InputError if
+    """Return (H,W), True where any colour is not 0; transparency is ignored. Raises InputError if
     it is no image."""
     image = read_image(path, as_stored=True)
     colours = image if image.ndim == 2 else image[:, :, :3].max(axis=2)

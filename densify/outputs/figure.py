@@ -1,12 +1,11 @@
 # SPDX-License-Identifier: MIT
-"""The picture of a result: depth maps one below the other, each over the darkened image, distances
-in colour with a scale.
-"""
+"""Pictures of depth maps over the camera's image: figure.png, compare.png and rejected/."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -14,19 +13,24 @@ from numpy.typing import NDArray
 
 from densify.geometry.types import Float32, Reason, Result
 from densify.outputs.context import Context
-from densify.outputs.png import Picture, write_picture
+from densify.outputs.map_outputs import map_path
+from densify.outputs.plots import DPI, write_plot
+from densify.outputs.png import Picture
 
-# Fixed, so that pictures of different keys compare; logarithmic, as accuracy and density are.
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.figure import Figure
+
+# Fixed, so that the pictures of different keys compare.
 _NEAR_M, _FAR_M = 3.0, 80.0
 _TICKS_M = (3, 5, 10, 20, 40, 80)
-_TURBO_LEVELS = 20, 238  # without the map's two dark ends, lost on a dark image
 _BRIGHTNESS = 0.45
-_REFERENCE_WIDTH_PX = 1242
 _MIN_WIDTH_PX = 480
 _POINT_SIZE_PX = 3
-_FONT = cv2.FONT_HERSHEY_SIMPLEX
+_TITLE_PX, _SCALE_PX = 36, 60
+_FONT_PT, _LETTER_PX = 13.0, 0.85  # width of a letter, per point of the font
 _TITLES = {"none": "sparse"}
-_LEGEND_PX = 38
 _REASON_COLOURS = {
     Reason.VETOED: (255, 70, 70),
     Reason.HIDDEN: (80, 140, 255),
@@ -36,141 +40,127 @@ _REASON_COLOURS = {
 }
 
 
-def write_output(result: Result, context: Context, folder: Path) -> None:
-    """``figure.png``: the result's baselines from top to bottom, then the result."""
+def write_key_figure(result: Result, context: Context, folder: Path) -> None:
+    """Write ``figure.png``: the baselines from top to bottom, then the result."""
     methods = {**result.baselines, result.method: result}
     write_figure(folder / "figure.png", methods, context)
 
 
 def write_figure(path: Path, results: Mapping[str, Result], context: Context) -> None:
-    """The measured depth of each method in the first camera, if there is one, and the last one's
-    completed with a prior, if there was one."""
+    """Write the measured depth of each method in the first camera, and the last method's depth
+    completed with a prior, if there is one. Without a camera nothing is written."""
     depth = next(iter(results.values())).depth
     if not depth:
         return
     camera = next(iter(depth))
     image = context.image(camera, depth[camera].depth_m.shape)
     panels = {_TITLES.get(m, m): r.depth[camera].depth_m for m, r in results.items()}
-    said = {_TITLES.get(m, m): _error(r, camera, "measured") for m, r in results.items()}
+    notes = {_TITLES.get(m, m): _error(r, camera, "measured") for m, r in results.items()}
     method, result = list(results.items())[-1]
     if camera in result.full:
         title = f"{method} and prior"
-        panels[title], said[title] = result.full[camera].depth_m, _error(result, camera, "full")
-    write_picture(path, draw_figure(image, panels, said))
+        panels[title], notes[title] = result.full[camera].depth_m, _error(result, camera, "full")
+    write_plot(path, draw_figure(image, panels, notes))
 
 
 def _error(result: Result, camera: str, product: str) -> str:
-    """How much is wrong, against the truth where there is some, else with the key held out."""
+    """Return the fraction of outliers, against the truth if there is one, else the held-out key."""
     for source, against in (("depth", "truth"), ("held_out", "key held out")):
         scores = (result.metrics.get(source) or {}).get(camera, {}).get(product)
         if scores and scores["all"]["outliers"] is not None:
-            return f", {scores['all']['outliers']:.2%} wrong ({against})"
+            return f", {scores['all']['outliers']:.2%} outliers ({against})"
     return ""
 
 
 def draw_figure(
-    image: Picture, panels: Mapping[str, Float32], said: Mapping[str, str] | None = None
-) -> Picture:
+    image: Picture, panels: Mapping[str, Float32], notes: Mapping[str, str] | None = None
+) -> Figure:
     """Draw depth maps over an image, from top to bottom in the mapping's order.
 
-    image: (H,W,3) uint8 RGB. panels: title to (H,W) depth in metres, 0 none. Each is drawn over
-    the image in gray; a depth covers 3 x 3 pixels (the nearest wins) so that single returns are
-    seen; the share of pixels that have one stands beside the title, and behind it what is said of
-    that title. Near is red, far is blue, logarithmic from 3 to 80 m, clamped beyond.
-
-    Returns (H',W',3) uint8 RGB, at least 480 pixels wide.
+    image: (H,W,3) uint8 RGB, drawn in gray.
+    panels: title -> (H,W) depth in metres, 0 none. A depth covers 3 x 3 pixels, and the nearest
+        wins. Near is red, far is blue, logarithmic from 3 to 80 m.
+    notes: title -> what stands behind the title and the fraction of pixels with a depth.
     """
-    if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8:
-        raise ValueError(f"image: expected (H,W,3) uint8, got {image.dtype} {image.shape}")
     for title, depth_m in panels.items():
         if depth_m.shape != image.shape[:2]:
             raise ValueError(f"panel {title}: expected {image.shape[:2]}, got {depth_m.shape}")
-    enlarge = -(-_MIN_WIDTH_PX // image.shape[1])  # whole factors keep pixels square and sharp
-    width = image.shape[1] * enlarge
-    rows = []
-    for title, depth_m in panels.items():
+    figure, scale = _panels(image, len(panels)), _depth_scale()
+    for axes, (title, depth_m) in zip(figure.axes, panels.items(), strict=True):
         density = np.count_nonzero(depth_m) / depth_m.size
-        beside = (said or {}).get(title, "")
-        rows.append(_title(f"{title}: {density:.1%} of pixels{beside}", width))
-        panel = _overlay(image, depth_m)
-        rows.append(panel.repeat(enlarge, axis=0).repeat(enlarge, axis=1))
-    rows.append(_colour_scale(width))
-    return np.concatenate(rows)
+        text = f"{title}: {density:.1%} of pixels{(notes or {}).get(title, '')}"
+        _set_title(axes, text, figure.bbox.width)
+        axes.imshow(_overlay(image, depth_m, scale), interpolation="nearest", aspect="auto")
+    height = figure.bbox.height
+    bar = figure.add_axes((0.05, 0.6 * _SCALE_PX / height, 0.9, 0.25 * _SCALE_PX / height))
+    colours = figure.colorbar(scale, bar, orientation="horizontal", ticks=_TICKS_M, format="%d m")
+    colours.minorticks_off()
+    return figure
 
 
-def draw_rejected(image: Picture, reason: NDArray[np.uint8]) -> Picture:
-    """Draw over an image in gray what was left out, in a colour for each `Reason`.
+def write_rejected(result: Result, context: Context, folder: Path) -> None:
+    """Write ``rejected/CAMERA.png``, if it was asked for."""
+    for camera, reason in result.rejected.items():
+        figure = draw_rejected(context.image(camera, reason.shape), reason)
+        write_plot(map_path(folder, "rejected", camera), figure)
 
-    image: (H,W,3) uint8 RGB. reason: (H,W), 0 none. Returns (H',W,3) with the legend below.
+
+def draw_rejected(image: Picture, reason: NDArray[np.uint8]) -> Figure:
+    """Draw over an image in gray what was rejected, in a colour for each `Reason`.
+
+    image: (H,W,3) uint8 RGB. reason: (H,W), 0 none.
     """
-    gray = _BRIGHTNESS * (image @ np.array([0.299, 0.587, 0.114]))
-    canvas = np.repeat(np.rint(gray).astype(np.uint8)[:, :, None], 3, axis=2)
-    legend = np.full((_LEGEND_PX, image.shape[1], 3), 20, np.uint8)
-    left = 12
+    from matplotlib.patches import Patch
+
+    figure, canvas = _panels(image, 1), _darkened(image)
     for which, colour in _REASON_COLOURS.items():
         canvas[reason == which] = colour
-        text = which.name.lower()
-        cv2.putText(legend, text, (left, 26), _FONT, 0.6, colour, 1, cv2.LINE_AA)
-        left += 20 + cv2.getTextSize(text, _FONT, 0.6, 1)[0][0]
-    return np.concatenate([canvas, legend])
+    figure.axes[0].imshow(canvas, interpolation="nearest", aspect="auto")
+    handles = [
+        Patch(color="#{:02x}{:02x}{:02x}".format(*colour), label=which.name.lower())
+        for which, colour in _REASON_COLOURS.items()
+    ]
+    figure.legend(handles=handles, loc="lower center", ncols=len(handles), frameon=False)
+    return figure
 
 
-def _overlay(image: Picture, depth_m: Float32) -> Picture:
-    gray = _BRIGHTNESS * (image @ np.array([0.299, 0.587, 0.114]))
-    canvas = np.repeat(np.rint(gray).astype(np.uint8)[:, :, None], 3, axis=2)
+def _panels(image: Picture, number: int) -> Figure:
+    """Return a figure with axes of the image's size, a title's room above each."""
+    from matplotlib.figure import Figure
+
+    height_px, width_px = image.shape[:2]
+    enlarge = max(1.0, _MIN_WIDTH_PX / width_px)
+    width, panel = enlarge * width_px, enlarge * height_px
+    height = number * (panel + _TITLE_PX) + _SCALE_PX
+    figure = Figure(figsize=(width / DPI, height / DPI), dpi=DPI)
+    for i in range(number):
+        bottom = height - (i + 1) * (panel + _TITLE_PX)
+        figure.add_axes((0, bottom / height, 1, panel / height)).set_axis_off()
+    return figure
+
+
+def _set_title(axes: Axes, text: str, width_px: float) -> None:
+    size = min(_FONT_PT, width_px / (_LETTER_PX * len(text)))
+    axes.set_title(text, loc="left", x=0.01, fontsize=size)
+
+
+def _depth_scale() -> ScalarMappable:
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import LogNorm
+
+    return ScalarMappable(LogNorm(_NEAR_M, _FAR_M, clip=True), "turbo_r")
+
+
+def _overlay(image: Picture, depth_m: Float32, scale: ScalarMappable) -> Picture:
     empty = np.float32(np.finfo(np.float32).max)
-    nearest = cv2.erode(
-        np.where(depth_m > 0, depth_m, empty).astype(np.float32),
-        np.ones((_POINT_SIZE_PX, _POINT_SIZE_PX), np.uint8),
-    )
+    kernel = np.ones((_POINT_SIZE_PX, _POINT_SIZE_PX), np.uint8)
+    nearest = cv2.erode(np.where(depth_m > 0, depth_m, empty).astype(np.float32), kernel)
     drawn = nearest < empty
-    canvas[drawn] = _colours(nearest[drawn])
+    canvas = _darkened(image)
+    canvas[drawn] = scale.to_rgba(nearest[drawn], bytes=True)[:, :3]
     return canvas
 
 
-def _colours(depth_m: Float32) -> Picture:
-    """(N,) metres -> (N,3) RGB."""
-    near, far = np.log(_NEAR_M), np.log(_FAR_M)
-    nearness = (far - np.log(depth_m.astype(np.float64))) / (far - near)
-    dark, bright = _TURBO_LEVELS
-    levels = np.rint(dark + (bright - dark) * np.clip(nearness, 0, 1)).astype(np.uint8)
-    bgr = cv2.applyColorMap(np.arange(256, dtype=np.uint8), cv2.COLORMAP_TURBO)
-    turbo: Picture = bgr.reshape(256, 3)[:, ::-1].astype(np.uint8)
-    return turbo[levels]
-
-
-def _title(text: str, width: int) -> Picture:
-    size = max(width / _REFERENCE_WIDTH_PX, 0.5)
-    bar = np.full((round(38 * size), width, 3), 20, np.uint8)
-    scale = 0.85 * size
-    room = width - round(24 * size)
-    wide = cv2.getTextSize(text, _FONT, scale, _thickness(scale))[0][0]
-    _write(bar, text, round(12 * size), round(27 * size), scale * min(1, room / wide))
-    return bar
-
-
-def _colour_scale(width: int) -> Picture:
-    size = max(width / _REFERENCE_WIDTH_PX, 0.5)
-    margin, top, bottom = round(60 * size), round(14 * size), round(34 * size)
-    bar = np.full((round(68 * size), width, 3), 20, np.uint8)
-    columns = np.arange(margin, width - margin)
-    span = columns[-1] - columns[0]
-    depth_m = _NEAR_M * (_FAR_M / _NEAR_M) ** ((columns - columns[0]) / span)
-    bar[top:bottom, columns] = _colours(depth_m.astype(np.float32))
-    for tick_m in _TICKS_M:
-        fraction = np.log(tick_m / _NEAR_M) / np.log(_FAR_M / _NEAR_M)
-        column = columns[0] + round(float(fraction * span))
-        bar[bottom : bottom + round(6 * size), column - 1 : column + 1] = 255
-        text = f"{tick_m} m"
-        text_width = cv2.getTextSize(text, _FONT, 0.65 * size, _thickness(size))[0][0]
-        _write(bar, text, column - text_width // 2, round(60 * size), 0.65 * size)
-    return bar
-
-
-def _write(canvas: Picture, text: str, left: int, baseline: int, font_scale: float) -> None:
-    white, thickness = (255, 255, 255), _thickness(font_scale)
-    cv2.putText(canvas, text, (left, baseline), _FONT, font_scale, white, thickness, cv2.LINE_AA)
-
-
-def _thickness(font_scale: float) -> int:
-    return 2 if font_scale > 0.8 else 1
+def _darkened(image: Picture) -> Picture:
+    gray = _BRIGHTNESS * (image @ np.array([0.299, 0.587, 0.114]))
+    return np.repeat(np.rint(gray).astype(np.uint8)[:, :, None], 3, axis=2)

@@ -13,6 +13,7 @@ from __future__ import annotations
 import hashlib
 import re
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -21,7 +22,7 @@ import yaml
 from densify import __version__
 from densify.config.errors import OutputError
 from densify.geometry.types import DepthMap
-from densify.outputs.atomic import FileRecord, make_folder, write_file
+from densify.outputs.atomic import write_file
 from densify.outputs.depth_png import encode_confidence, encode_depth
 from densify.outputs.plain import plain
 
@@ -29,19 +30,23 @@ Split = Literal["train", "val"]
 
 README = "README.txt"
 
+
+@dataclass(frozen=True)
+class FileRecord:
+    """What a file must hold. sha256: of its content, hexadecimal."""
+
+    num_bytes: int
+    sha256: str
+
+    @staticmethod
+    def of(data: bytes) -> FileRecord:
+        """Return the record of a file with this content."""
+        return FileRecord(len(data), hashlib.sha256(data).hexdigest())
+
+
 _VALIDATION = {
-    "2011_09_26_drive_0002",
-    "2011_09_26_drive_0005",
-    "2011_09_26_drive_0013",
-    "2011_09_26_drive_0020",
-    "2011_09_26_drive_0023",
-    "2011_09_26_drive_0036",
-    "2011_09_26_drive_0079",
-    "2011_09_26_drive_0095",
-    "2011_09_26_drive_0113",
-    "2011_09_28_drive_0037",
-    "2011_09_29_drive_0026",
-    "2011_09_30_drive_0016",
+    *(f"2011_09_26_drive_{n:04d}" for n in (2, 5, 13, 20, 23, 36, 79, 95, 113)),
+    *("2011_09_28_drive_0037", "2011_09_29_drive_0026", "2011_09_30_drive_0016"),
     "2011_10_03_drive_0047",
 }
 _KITTI_DRIVE = re.compile(r"(\d{4}_\d\d_\d\d_drive_\d{4})(?:_sync|_extract)?", re.ASCII)
@@ -50,21 +55,18 @@ _FOLDER_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,99}")
 
 
 def split_of(drive: str) -> Split:
-    """Split of KITTI's depth benchmark: "val" for its 13 validation drives, "train" for every other
-    recording.
-
-    drive: a recording's name, such as ``2011_09_26_drive_0013_sync``.
-    """
+    """Return "val" for the 13 validation drives of KITTI's depth benchmark, "train" for any other
+    recording, by its name, such as ``2011_09_26_drive_0013_sync``."""
     match = _KITTI_DRIVE.fullmatch(drive)
     return "val" if match and match[1] in _VALIDATION else "train"
 
 
 def drive_folder(name: str) -> str:
-    """A recording's name as the name of a folder.
+    """Return a recording's name as the name of a folder.
 
-    Names that can be one, as KITTI's, stay; of the built-in street's only the punctuation goes:
-    ``street:street?seed=0&sensor=hdl64`` is ``street-street_seed-0_sensor-hdl64``. Other names lose
-    what is neither ASCII letter nor digit and end in a digest, so that they stay different.
+    A name that can be one, as KITTI's, stays. ``street:street?seed=0&sensor=hdl64`` becomes
+    ``street-street_seed-0_sensor-hdl64``. Another name loses what is neither ASCII letter nor digit
+    and ends in a digest, which keeps it different from others.
     """
     folder = name.translate(_PUNCTUATION)
     if _FOLDER_NAME.fullmatch(folder):
@@ -80,13 +82,15 @@ def write_key(
     sparse: Mapping[str, DepthMap],
     dense: Mapping[str, DepthMap],
 ) -> dict[str, FileRecord]:
-    """Write the maps of one key, each file whole or not there, and on the disk on return.
+    """Write the maps of one key, each file whole or not there.
 
-    root: of the tree. folder: of the drive, relative to it: ``val/2011_09_26_drive_0013_sync``.
-    frame: file number. sparse, dense: camera to map, of the key sweep alone and of all sweeps.
+    root: of the tree.
+    folder: of the drive, relative to root: ``val/2011_09_26_drive_0013_sync``.
+    frame: the key's number.
+    sparse, dense: camera -> map, of the key sweep alone and of all sweeps.
 
-    Returns path relative to ``root``, with slashes, to what the file holds; the same maps give the
-    same bytes. Raises OutputError if the files cannot be written, ValueError if the cameras differ.
+    Returns path relative to root -> what the file holds. The same maps give the same bytes. Raises
+    OutputError if the files cannot be written, ValueError if the cameras differ.
     """
     if sparse.keys() != dense.keys():
         raise ValueError(f"cameras: got {sorted(sparse)} sparse and {sorted(dense)} dense")
@@ -106,11 +110,10 @@ def write_key(
 
 
 def write_readme(root: Path, *, method: str, window: int, settings: Mapping[str, Any]) -> None:
-    """Write ``README.txt``, which says what lies beside it and how it was made.
+    """Write ``README.txt``, which describes the files beside it and how they were made.
 
-    window: sweeps before and after the key. settings: all others, plain mappings; they should say
-    nothing of the machine. The text depends on the arguments and densify's version alone. Raises
-    OutputError if it cannot be written.
+    window: sweeps before and after the key. settings: all others, plain mappings. The text depends
+    on the arguments and densify's version alone. Raises OutputError if it cannot be written.
     """
     text = _README.format(
         version=__version__,
@@ -125,8 +128,8 @@ def write_readme(root: Path, *, method: str, window: int, settings: Mapping[str,
 def _put(root: Path, name: str, data: bytes) -> None:
     path = root / name
     try:
-        make_folder(path.parent)
-        write_file(path, data, durable=True)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_file(path, data)
     except OSError as error:
         raise OutputError(
             f"--out {root}: {name} cannot be written: {error.strerror or error}"

@@ -177,7 +177,9 @@ def densify(
 
     def moment(name: str) -> Moment:
         method = METHODS[name]
-        return recording.moment(key, method.all_sweeps, method.engine, settings.output.flow)
+        return recording.moment(
+            key, method.all_sweeps, method.engine, settings.output.flow != "none"
+        )
 
     def beyond() -> Beyond | None:
         return recording.standing(key) if any(METHODS[name].far for name in methods) else None

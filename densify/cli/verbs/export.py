@@ -14,12 +14,12 @@ from densify.config.plugins.exports import EXPORTS
 
 
 def add(commands: Any) -> None:
-    """Its options."""
+    """Add its options."""
     parser = add_verb(
         commands,
         "export",
         answer,
-        "a finished run in other tools' formats, or with only the certain and fresh pixels",
+        "a finished run in other tools' formats, optionally with only the certain, recent pixels",
         "Nothing is computed again and the run stays as it is. A filled pixel has the age of the "
         "measured pixel nearest to it. FORMAT is "
         + "; ".join(f"{form.name}: {form.about}" for form in EXPORTS.built_in)
@@ -28,7 +28,7 @@ def add(commands: Any) -> None:
     parser.add_argument(
         "run", metavar="RUN", type=Path, help="folder of one key, such as densify-out/000120"
     )
-    parser.add_argument("--to", metavar="FORMAT", default="png", help="(default: png)")
+    parser.add_argument("--to", metavar="FORMAT", required=True, help="see above")
     parser.add_argument(
         "--min-confidence",
         type=float,
@@ -42,25 +42,23 @@ def add(commands: Any) -> None:
         metavar="MS",
         help="drop pixels and points measured longer before or after (default: keep all)",
     )
-    parser.add_argument(
-        "--out", metavar="DIR", type=Path, help="(default: RUN/export, RUN/export/FORMAT)"
-    )
+    parser.add_argument("--out", metavar="DIR", type=Path, help="(default: RUN/export/FORMAT)")
     add_camera(parser)
     add_overwrite(parser)
 
 
 def answer(options: argparse.Namespace) -> Iterator[Answer]:
-    """A finished run in another form, or with fewer pixels."""
-    from densify.cli.results import export_facts, export_summary
-    from densify.outputs import export_run
+    """Export the run."""
+    from densify.cli.results import export_summary
+    from densify.outputs.export import export_run, facts
 
     exported = export_run(
         options.run,
-        options.min_confidence,
-        options.max_age_ms,
-        options.out,
-        options.overwrite,
         options.to,
-        options.cameras,
+        options.out,
+        min_confidence=options.min_confidence,
+        max_age_ms=options.max_age_ms,
+        cameras=options.cameras,
+        overwrite=options.overwrite,
     )
-    yield Answer(export_summary(exported), export_facts(exported), exported.paths)
+    yield Answer(export_summary(exported), facts(exported), exported.paths)

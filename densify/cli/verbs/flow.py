@@ -97,7 +97,7 @@ def answer(options: argparse.Namespace) -> Iterator[Answer]:
 
 
 def _of_recording(options: argparse.Namespace, config: Config) -> Iterator[Answer]:
-    from densify.outputs.flow_sets import flow_writer
+    from densify.outputs.flow_writers import flow_writer
     from densify.pipeline.run import flow_steps
     from densify.readers import open_sequence
 

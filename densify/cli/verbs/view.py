@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""``densify view``: a finished run live, in rerun's viewer or in a window of open3d's."""
+"""``densify view``: a finished run live, in rerun's or in open3d's viewer."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ _PORT = 9876  # rerun's own
 
 
 def add(commands: Any) -> None:
-    """Its options."""
+    """Add its options."""
     parser = add_verb(
         commands,
         "view",
         answer,
-        "a run, or keys of a drive, live: cloud, sweeps, images, depth and movers over time",
-        "Needs a screen, and pip install 'densify[rerun]' or 'densify[open3d]'. Trails of "
-        "registration alone are there too, hidden at first. densify export --to rrd writes what "
-        "rerun shows as a file; densify report needs nothing but a browser.",
+        "a run, or keys of a drive, live: cloud, sweeps, images, depth and objects over time",
+        "Needs a screen, and pip install 'densify[rerun]' or 'densify[open3d]', which shows cloud "
+        "and moving objects alone. densify export --to rrd writes what rerun shows as a file; "
+        "densify report needs nothing but a browser.",
     )
     parser.add_argument(
         "place",
@@ -51,10 +51,10 @@ def add(commands: Any) -> None:
 
 
 def answer(options: argparse.Namespace) -> Iterator[Answer]:
-    """Show it. rerun's viewer is left open, open3d's window is waited for."""
+    """Show it. rerun's viewer stays open; the verb ends when open3d's window is closed."""
     from densify.outputs.export.finished_run import finished_runs
 
-    runs = finished_runs(options.place, chosen=options.cameras)
+    runs = finished_runs(options.place, cameras=options.cameras)
     if options.viewer == "open3d":
         from densify.outputs.export import open3d_window
 

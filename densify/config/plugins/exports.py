@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""The forms in which `densify export` writes a finished run. Each has the function
-`densify.outputs.export.ExportModule`; the module of another package also has OWNED."""
+"""The forms in which `densify export` writes a finished run: a function each, as
+`densify.outputs.export.WriteExport`. The module of another package has ``write_export`` and OWNED.
+"""
 
 from __future__ import annotations
 
@@ -11,68 +12,43 @@ from densify.config.plugins.table import Row, Table
 
 @dataclass(frozen=True)
 class ExportFormat(Row):
-    """owned: the files and folders in the export's folder that it may write."""
+    """function: of the module. owned: the files and folders in the export's folder that it may
+    write. of_drive: takes several keys of a drive too."""
 
+    function: str = "write_export"
     owned: tuple[str, ...] = ()
+    of_drive: bool = False
 
 
-def _built_in(name: str, about: str, *owned: str) -> ExportFormat:
-    module = f"densify.outputs.export.{name.replace('-', '_')}"
-    return ExportFormat(name, module, about, owned=owned)
+def _built_in(
+    name: str, module: str, about: str, *owned: str, of_drive: bool = False
+) -> ExportFormat:
+    path = f"densify.outputs.export.{module}"
+    return ExportFormat(name, path, about, "", f"write_{name}", owned, of_drive)
 
 
-_FLOATS = ("depth", "depth_filled", "confidence")
+_MAPS = ("depth", "depth_filled", "confidence")
+_SPLATS = "what Gaussian splatting starts from, moving objects in their own frames"
+_KITTI = "maps, images and intrinsics in the tree of KITTI depth completion"
+_RRD = "one key or several over time, for rerun's viewer"
 
 EXPORTS = Table(
     "export",
     "densify.exports",
     ("write_export",),
     (
+        _built_in("npy", "array_files", "maps, float32 metres", *_MAPS),
+        _built_in("exr", "array_files", "maps, float32 metres", *_MAPS),
+        _built_in("ply", "cloud_files", "the cloud, all columns", "cloud.ply"),
+        _built_in("pcd", "cloud_files", "the cloud, all columns", "cloud.pcd"),
         _built_in(
-            "png", "the maps as the run has them", "depth", "depth_filled", "confidence", "age"
+            *("nerfstudio", "nerfstudio", "images, cameras, depth and cloud"),
+            *("transforms.json", "images", "depth", "cloud.ply"),
         ),
-        _built_in("npy", "maps, float32 metres", *_FLOATS),
-        _built_in("tiff", "maps, float32 metres", *_FLOATS),
-        _built_in("exr", "maps, float32 metres", *_FLOATS),
-        _built_in("ply", "the cloud, all columns", "cloud.ply"),
-        _built_in("pcd", "the cloud, all columns", "cloud.pcd"),
-        _built_in("copc", "the cloud for viewers in a browser", "cloud.copc.laz"),
-        _built_in("e57", "the cloud with colour and intensity", "cloud.e57"),
-        _built_in(
-            "nerfstudio",
-            "images, cameras, depth and cloud",
-            "transforms.json",
-            "images",
-            "depth",
-            "cloud.ply",
-        ),
-        _built_in(
-            "colmap", "images, cameras and points, binary and text", "images", "sparse", "text"
-        ),
-        _built_in(
-            "splats",
-            "what Gaussian splatting starts from, movers apart in their own frames",
-            "images",
-            "sparse",
-            "movers",
-            "tracks.json",
-        ),
-        _built_in("tracks", "where moving objects were, CSV and JSON", "tracks.csv", "tracks.json"),
-        _built_in("kitti-tracking", "the same as label lines", "label"),
-        _built_in(
-            "kitti",
-            "maps, images and intrinsics in the tree of KITTI depth completion",
-            "train",
-            "val",
-        ),
-        _built_in(
-            "nuscenes",
-            "cloud, images and depth as detectors on nuScenes read them",
-            "samples",
-            "depth_gt",
-            "depth_gt_filled",
-        ),
-        _built_in("rrd", "one key or several over time, for rerun's viewer", "recording.rrd"),
-        _built_in("mcap", "the same for Foxglove", "recording.mcap"),
+        _built_in("colmap", "colmap", "images, cameras and points", "images", "sparse"),
+        _built_in("splats", "colmap", _SPLATS, "images", "sparse", "movers", "tracks.json"),
+        _built_in("kitti", "kitti", _KITTI, "train", "val", of_drive=True),
+        _built_in("rrd", "rrd", _RRD, "recording.rrd", of_drive=True),
+        _built_in("mcap", "mcap", "the same for Foxglove", "recording.mcap", of_drive=True),
     ),
 )

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""The outputs, each of which writes some files of one key. Each has the function
-`densify.outputs.store.OutputModule`; the module of another package also has OWNED."""
+"""The outputs, each of which writes some files of one key: a function each, as
+`densify.outputs.store.WriteOutput`. The module of another package has ``write_output`` and OWNED.
+"""
 
 from __future__ import annotations
 
@@ -12,38 +13,41 @@ from densify.config.plugins.table import Row, Table
 
 @dataclass(frozen=True)
 class Output(Row):
-    """owned: the files and folders in the key's folder that it alone may write."""
+    """function: of the module. owned: the files and folders in the key's folder that it alone may
+    write."""
 
+    function: str = "write_output"
     owned: tuple[str, ...] = ()
 
 
-def _built_in(name: str, *owned: str, module: str = "") -> Output:
-    return Output(name, module or f"densify.outputs.{name}", owned=owned)
+def _built_in(name: str, module: str, function: str, *owned: str) -> Output:
+    return Output(name, f"densify.{module}", "", "", function, owned)
 
+
+_MAPS, _TABLES = "outputs.map_outputs", "outputs.table_outputs"
 
 OUTPUTS = Table(
     "output",
     "densify.outputs",
     ("write_output",),
     (
-        _built_in("depth", "depth", "depth_filled", "confidence", "age",
-                  module="densify.outputs.depth_maps"),
-        _built_in("full", "depth_full", "confidence_full", module="densify.outputs.full_maps"),
-        _built_in("flow", "flow", module="densify.outputs.flow_npz"),
-        _built_in("movers", "movers"),
-        _built_in("tracks", "movers.json"),
-        _built_in("optical_flow", "optical_flow"),
-        _built_in("rejected", "rejected"),
-        _built_in("cloud", "cloud.laz", module="densify.outputs.cloud_laz"),
-        _built_in("scene", "scene"),
-        _built_in("metrics", "metrics.json"),
-        _built_in("figure", "figure.png"),
-        _built_in("curve", "curve.png"),
-        _built_in("run", "run.yaml", module="densify.outputs.run_yaml"),
-        # Last, for it reads what the others wrote.
-        _built_in("report", "report.html", module="densify.dataset.report"),
+        _built_in("depth", _MAPS, "write_depth", "depth", "depth_filled", "confidence", "age"),
+        _built_in("full", _MAPS, "write_full", "depth_full", "confidence_full"),
+        _built_in("flow", "outputs.flow_writers", "write_flow", "flow"),
+        _built_in("movers", _MAPS, "write_movers", "movers"),
+        _built_in("tracks", _TABLES, "write_tracks", "movers.json"),
+        _built_in("optical_flow", _MAPS, "write_optical_flow", "optical_flow"),
+        _built_in("rejected", "outputs.figure", "write_rejected", "rejected"),
+        _built_in("cloud", "outputs.cloud_laz", "write_output", "cloud.laz"),
+        _built_in("scene", _TABLES, "write_scene", "scene"),
+        _built_in("metrics", _TABLES, "write_metrics", "metrics.json"),
+        _built_in("figure", "outputs.figure", "write_key_figure", "figure.png"),
+        _built_in("curve", "outputs.plots", "write_curve", "curve.png"),
+        _built_in("run", _TABLES, "write_run_yaml", "run.yaml"),
+        # Last, because it reads what the others wrote.
+        _built_in("report", "dataset.report", "write_output", "report.html"),
     ),
-)  # fmt: skip
+)
 
 
 def check_also(also: str) -> None:

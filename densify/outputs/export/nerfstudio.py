@@ -2,8 +2,7 @@
 """A folder that nerfstudio opens (``ns-train depth-nerfacto --data DIR``, ``splatfacto``).
 
 The world is the key frame. Poses are camera to world with OpenGL's axes: x right, y up, the camera
-looks along -z. Depth is in millimetres, which its reader's usual ``depth_unit_scale_factor`` of
-0.001 makes metres.
+looks along -z. Depth is in millimetres, the unit that nerfstudio expects.
 """
 
 from __future__ import annotations
@@ -14,26 +13,27 @@ from typing import Any
 import numpy as np
 
 from densify.config.errors import InputError
-from densify.geometry.types.rigid import inverse
+from densify.geometry import poses
+from densify.outputs.export.array_files import metres
+from densify.outputs.export.cloud_files import save_ply
+from densify.outputs.export.colmap import Picture, intrinsics, observed, write_pictures
 from densify.outputs.export.finished_run import FinishedRun
-from densify.outputs.export.npy import write_array
-from densify.outputs.export.pictures import Picture, intrinsics, seen, write_pictures
-from densify.outputs.export.ply import write_ply
+from densify.outputs.map_outputs import map_path
 from densify.outputs.plain import write_json
 
-_MM_PER_STEP = np.float32(1000 / 256)
 _OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
-_LENS = ("k1", "k2", "k3", "p1", "p2")
+_LENS, _FISHEYE_LENS = ("k1", "k2", "k3", "p1", "p2"), ("k1", "k2", "k3", "k4")
+_COLUMNS = ("x", "y", "z", "red", "green", "blue")
 
 
-def write_export(run: FinishedRun, folder: Path) -> None:
-    """``transforms.json``, ``images/``, ``depth/CAMERA.npy`` (measured, float32 millimetres, 0
-    none) and ``cloud.ply`` (what a camera saw).
+def write_nerfstudio(run: FinishedRun, folder: Path) -> None:
+    """Write ``transforms.json``, ``images/``, ``depth/CAMERA.npy`` (measured, float32 millimetres,
+    0 none) and ``cloud.ply``, the points that a camera observed.
 
-    Raises InputError for cameras that cannot be said there: maps of ranges, lenses other than
-    OpenCV's with k1 k2 k3 p1 p2, fisheyes together with others.
+    Raises InputError for maps of ranges, lenses other than OpenCV's with k1 k2 k3 p1 p2, and
+    fisheyes together with others.
     """
-    pictures = write_pictures(run, folder / "images")
+    pictures = write_pictures(run, folder)
     models = {_model(picture) for picture in pictures}
     if len(models) > 1:
         raise InputError(
@@ -41,12 +41,10 @@ def write_export(run: FinishedRun, folder: Path) -> None:
             "others; choose among them with --camera"
         )
     for picture in pictures:
-        path = folder / "depth" / f"{picture.name}.npy"
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_array(path, run.maps(picture.name)["depth"] * _MM_PER_STEP)
-    columns = seen(run.cloud()).columns()
-    names = ("x", "y", "z", "red", "green", "blue")
-    write_ply(folder / "cloud.ply", {name: columns[name] for name in names})
+        path = map_path(folder, "depth", picture.name, ".npy")
+        np.save(path, metres(run.maps(picture.name)["depth"]) * np.float32(1000))
+    columns = observed(run.cloud()).columns()
+    save_ply(folder / "cloud.ply", {name: columns[name] for name in _COLUMNS})
     transforms = {
         "camera_model": models.pop(),
         "ply_file_path": "cloud.ply",
@@ -68,7 +66,7 @@ def _frame(run: FinishedRun, picture: Picture) -> dict[str, Any]:
         )
     lens = intrinsics(camera)
     K = {"fl_x": lens.pop("fx"), "fl_y": lens.pop("fy"), "cx": lens.pop("cx"), "cy": lens.pop("cy")}
-    known = _LENS if camera.model == "pinhole" else ("k1", "k2", "k3", "k4")
+    known = _FISHEYE_LENS if camera.model == "fisheye" else _LENS
     if unknown := [n for n, value in lens.items() if value and n not in known]:
         raise InputError(
             f"{name}: nerfstudio has no lens with {', '.join(unknown)}; leave it out by naming the "
@@ -81,5 +79,5 @@ def _frame(run: FinishedRun, picture: Picture) -> dict[str, Any]:
         "w": camera.width_px,
         "h": camera.height_px,
         **{n: lens.get(n, 0.0) for n in known},
-        "transform_matrix": inverse(picture.view.T_cam_key) @ _OPENGL,
+        "transform_matrix": poses.inverse(picture.view.T_cam_key) @ _OPENGL,
     }

@@ -1,30 +1,27 @@
 # SPDX-License-Identifier: MIT
-"""What finished runs show when, for viewers with a time line: sweeps as they were measured, images
-with their depth, and the accumulated cloud, all in their key's coordinates, and where those are."""
+"""Finished runs over time, for viewers with a time line."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from densify.config.errors import InputError
+from densify.geometry import poses
 from densify.geometry.types import Bool, CameraView, Float, Float32, ObjectTrack
-from densify.geometry.types.rigid import inverse
 from densify.outputs.cloud_laz import StoredCloud
+from densify.outputs.export.array_files import metres
 from densify.outputs.export.finished_run import FinishedRun
-from densify.outputs.export.pictures import jpeg_of
 
-_M_PER_STEP = np.float32(1 / 256)
+_UNOBSERVED = np.array([140, 140, 140], np.uint8)
 
 
-@dataclass(frozen=True)
-class SweepShown:
-    """One sweep of the window. stamp_ns: its reference time. T_key_lidar: (4,4). points: (N,3)
-    metres, key frame, where registration alone puts them, which is where they were then. rgb: (N,3)
-    uint8, black where no camera saw the point. moving: (N,)."""
+class ShownSweep(NamedTuple):
+    """A sweep as it was measured, in the key frame. stamp_ns: its reference time. T_key_lidar:
+    (4,4). points: (N,3) metres. rgb: (N,3) uint8. moving: (N,)."""
 
     frame: int
     stamp_ns: int
@@ -34,11 +31,9 @@ class SweepShown:
     moving: Bool
 
 
-@dataclass(frozen=True)
-class Shot:
-    """One map. stamp_ns: of its exposure. jpeg: its image, if there is one. depth_m, filled_m:
-    (H,W) metres, 0 none. is_pinhole: without a lens' distortion and with depth along the axis, so
-    that viewers may lay it into the scene."""
+class Shot(NamedTuple):
+    """A map. stamp_ns: of its exposure. jpeg: its image or None. depth_m, filled_m: (H,W), 0 none.
+    is_pinhole: without distortion and with depth along the axis."""
 
     name: str
     view: CameraView
@@ -49,90 +44,69 @@ class Shot:
     is_pinhole: bool
 
 
-@dataclass(frozen=True)
-class Timeline:
-    """One key. T_world_key: (4,4), world: the first key. cloud: at the key's moment. sweeps: one or
-    more, by time. tracks: of moving objects."""
+class Timeline(NamedTuple):
+    """A key. T_world_key: (4,4), the world is the first key's frame. cloud: at the key's time.
+    sweeps: one or more, by time."""
 
     key: int
     T_world_key: Float
     cloud: StoredCloud
-    sweeps: tuple[SweepShown, ...]
-    shots: tuple[Shot, ...]
-    tracks: tuple[ObjectTrack, ...]
+    sweeps: list[ShownSweep]
+    shots: list[Shot]
+    tracks: list[ObjectTrack]
 
 
 def timelines(runs: Sequence[FinishedRun]) -> Iterator[Timeline]:
-    """One key with all sweeps of its window, or several keys of a drive, ascending, with their own
-    sweeps.
+    """Yield one key with all sweeps of its window, or several keys with their own sweeps.
 
-    Raises InputError where a run lacks what this needs, or is damaged, and where the windows of two
-    keys in a row have no sweep in common that is the key of one, so that nothing says how they lie
-    to each other.
+    runs: ascending by key. Raises InputError where the windows of two consecutive keys have no
+    sweep in common that is one of the keys, because their relative pose is then unknown.
     """
-    T_world_key, before = np.eye(4), None
-    for run in runs:
+    T_world_key = np.eye(4)
+    for before, run in zip([None, *runs], runs, strict=False):
         if before is not None:
-            T_world_key = T_world_key @ _T_between(before, run)
-        before = run
-        cloud = run.cloud()
-        stamps_ns = _stamps_ns(run, cloud)
-        shown = stamps_ns if len(runs) == 1 else {run.key: stamps_ns[run.key]}
-        yield Timeline(
-            run.key,
-            T_world_key,
-            cloud,
-            tuple(_sweeps(run, cloud, shown)),
-            tuple(_shot(run, name, stamps_ns[run.key]) for name in run.chosen_views),
-            tuple(run.tracks),
-        )
+            T_world_key = T_world_key @ _relative_pose(before, run)
+        cloud, stamps_ns = run.cloud(), {}
+        frames, rows = np.unique(cloud.frame, return_index=True)
+        stamps_ns = dict(zip(frames.tolist(), cloud.stamp_ns[rows].tolist(), strict=True))
+        for track in run.tracks:  # exact, and of sweeps without a point that is left
+            stamps_ns |= dict(zip(track.frames, track.stamp_ns.tolist(), strict=True))
+        key_ns = stamps_ns.setdefault(run.key, 0)
+        shown = {*run.scene.T_key_lidar, run.key} if len(runs) == 1 else {run.key}
+        sweeps = [_sweep(run, cloud, f, ns) for f, ns in stamps_ns.items() if f in shown]
+        sweeps.sort(key=lambda sweep: sweep.stamp_ns)
+        shots = [_shot(run, name, key_ns) for name in run.views]
+        yield Timeline(run.key, T_world_key, cloud, sweeps, shots, run.tracks)
 
 
-def _T_between(run: FinishedRun, other: FinishedRun) -> Float:
-    """The pose (4,4) of the other's key in the run's."""
+def colours(rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Return (N,3) colours, gray for points that no camera observed."""
+    return np.where(rgb.any(axis=1, keepdims=True), rgb, _UNOBSERVED)
+
+
+def _relative_pose(run: FinishedRun, other: FinishedRun) -> Float:
+    """Return (4,4), the other's key frame in the run's."""
     if other.key in run.scene.T_key_lidar:
         return run.scene.T_key_lidar[other.key]
     if run.key in other.scene.T_key_lidar:
-        return inverse(other.scene.T_key_lidar[run.key])
+        return poses.inverse(other.scene.T_key_lidar[run.key])
     raise InputError(
         f"{other.folder}: key {other.key} is in no window of key {run.key}, nor the other way "
-        f"round: nothing says how they lie to each other; densify keys nearer to each other, or "
-        f"export them one by one"
+        f"round, and their relative pose is unknown; densify keys nearer to each other, or export "
+        f"them one by one"
     )
 
 
-def _stamps_ns(run: FinishedRun, cloud: StoredCloud) -> dict[int, int]:
-    """Reference times of the window's frames, and of the key in any case."""
-    frames, rows = np.unique(cloud.frame, return_index=True)
-    stamps_ns = dict(zip(frames.tolist(), cloud.stamp_ns[rows].tolist(), strict=True))
-    for track in run.tracks:  # exact, and of sweeps of which no point is left
-        stamps_ns |= dict(zip(track.frames, track.stamp_ns.tolist(), strict=True))
-    stamps_ns.setdefault(run.key, 0)
-    return {f: ns for f, ns in stamps_ns.items() if f in run.scene.T_key_lidar or f == run.key}
-
-
-def _sweeps(run: FinishedRun, cloud: StoredCloud, stamps_ns: dict[int, int]) -> list[SweepShown]:
-    points, shown = cloud.rigid_points.astype(np.float32), []
-    for frame in sorted(stamps_ns, key=lambda f: stamps_ns[f]):
-        own = (cloud.frame == frame) & ~cloud.far
-        pose = run.scene.T_key_lidar.get(frame, np.eye(4))
-        shown.append(
-            SweepShown(
-                frame, stamps_ns[frame], pose, points[own], cloud.rgb[own], cloud.moving[own]
-            )
-        )
-    return shown
+def _sweep(run: FinishedRun, cloud: StoredCloud, frame: int, stamp_ns: int) -> ShownSweep:
+    own = cloud.select((cloud.frame == frame) & ~cloud.far)
+    T_key_lidar = run.scene.T_key_lidar.get(frame, np.eye(4))
+    points = own.rigid_points.astype(np.float32)
+    return ShownSweep(frame, stamp_ns, T_key_lidar, points, own.rgb, own.moving)
 
 
 def _shot(run: FinishedRun, name: str, key_ns: int) -> Shot:
-    view, maps = run.chosen_views[name], run.maps(name)
-    camera = view.camera
-    return Shot(
-        name,
-        view,
-        key_ns + round(1e9 * view.late_s),
-        jpeg_of(run, name),
-        maps["depth"] * _M_PER_STEP,
-        maps["depth_filled"] * _M_PER_STEP,
-        camera.is_rectified and run.measure(name) == "z",
-    )
+    view, maps = run.views[name], run.maps(name)
+    stamp_ns = key_ns + round(1e9 * view.late_s)
+    depth_m, filled_m = metres(maps["depth"]), metres(maps["depth_filled"])
+    is_pinhole = view.camera.is_rectified and run.measure(name) == "z"
+    return Shot(name, view, stamp_ns, run.jpeg(name), depth_m, filled_m, is_pinhole)

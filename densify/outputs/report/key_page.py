@@ -13,70 +13,57 @@ from densify.config import Config, as_mapping
 from densify.config.errors import InputError
 from densify.geometry.types import ObjectTrack
 from densify.outputs.cloud_laz import StoredCloud
-from densify.outputs.report.camera_maps import packed_camera
-from densify.outputs.report.cloud_points import MOST_POINTS, packed_cloud
-from densify.outputs.report.key_files import KeyFiles
-from densify.outputs.report.pack import Blobs
-from densify.outputs.report.page_file import page_file
+from densify.outputs.report.key_files import KeyFiles, mapping
+from densify.outputs.report.page_data import packed_camera, packed_cloud
+from densify.outputs.report.page_file import Blobs, page_file
 
 MOST_BYTES = 12_000_000
 _MOST_FOR_MAPS = 7_500_000
 _COARSEST = 8
-_FEWEST_POINTS = 10_000
+_MOST_POINTS, _FEWEST_POINTS = 500_000, 10_000
 _OF_THE_PAGE = 300_000  # scores, scripts
 _SCRIPTS = (
-    "unpack.js",
-    "dom.js",
-    "colours.js",
-    "maps.js",
-    "matrices.js",
-    "gl.js",
-    "cloud.js",
-    "charts.js",
-    "key.js",
+    *("unpack.js", "dom.js", "colours.js", "maps.js", "matrices.js", "gl.js", "cloud.js"),
+    *("charts.js", "key.js"),
 )
 
 
 def key_page(files: KeyFiles, folder: str) -> bytes:
-    """The page, 12 MB at most.
+    """Return the page, 12 MB at most.
 
-    files: of the key. folder: of a run, as the user names it; "" of a comparison. Maps that are too
-    large together are shown with fewer pixels, and the cloud with as many points as there is room
-    for; the page says so. Raises InputError if there is neither a depth map nor a cloud.
+    files: of the key. folder: of a run, as the user names it; "" of a comparison. Maps and points
+    that are too many are thinned, and the page says it. Raises InputError if there is neither a
+    depth map nor a cloud.
     """
-    scene, blobs = files.scene(), Blobs()
-    views = _mapping(scene.get("views"))
-    cameras, blobs = _cameras(files, views)
+    scene = files.scene()
+    cameras, blobs = _cameras(files, mapping(scene.get("views")))
     stored = files.cloud()
     if not cameras and stored is None:
         raise InputError(f"{files.maps}: no depth map and no cloud in it that can be read")
+    about, methods = files.about, list(files.methods)
     sweeps = _sweeps(files, scene, stored)
-    movers = [_mover(track, files.about.get("key")) for track in files.tracks()]
-    cloud = None
-    if stored is not None and len(stored.points):
-        cloud = _cloud(blobs, stored, sweeps, movers)
-    about = files.about
+    movers = [_mover(track, about.get("key")) for track in files.tracks()]
     key, data = about.get("key"), str(about.get("data"))
     name = data.rstrip("/").rpartition("/")[2] or data
     compared = not folder
-    title = f"{name}, key {key}" + (f": {', '.join(files.methods)}" if compared else "")
+    title = f"{name}, key {key}" + (f": {', '.join(methods)}" if compared else "")
     page = {
         "title": title,
         "subtitle": f"{name}, key {key}",
         "footer": f"densify {__version__}; this file needs nothing but itself.",
         "folder": shlex.quote(folder) if folder else "",
         "key": key,
-        "method": files.method if files.methods else "",
+        "method": methods[-1] if methods else "",
         "methods": files.methods,
         "cameras": cameras,
-        "views": views,
+        "views": mapping(scene.get("views")),
         "sweeps": sweeps,
         "movers": movers,
-        "cloud": cloud,
+        "cloud": _cloud(blobs, stored, sweeps, movers) if stored is not None else None,
         "about": {name: about.get(name) for name in ("stages", "versions")},
         "input": _input(about),
-        "config": _settings(about),
-        "command": command(about, list(files.methods) if compared else None),
+        "config": [(knob, str(value)) for knob, value in _knobs(about.get("config")).items()],
+        "command": command(about, methods if compared else None),
         "warnings": [str(w) for w in about.get("warnings") or ()],
         "missing": files.missing,
     }
@@ -84,14 +71,14 @@ def key_page(files: KeyFiles, folder: str) -> bytes:
 
 
 def _cameras(files: KeyFiles, views: Mapping[str, Any]) -> tuple[dict[str, Any], Blobs]:
-    """All cameras, with as many of their pixels as there is room for."""
+    """Return all cameras, with as many of their pixels as there is room for."""
     loaded = {name: (files.camera(name), files.image(name)) for name in files.names()}
     loaded = {name: some for name, some in loaded.items() if some[0]}
     every = 1
     while True:
         blobs = Blobs()
         cameras = {
-            name: packed_camera(blobs, maps, jpeg, _mapping(views.get(name)), every)
+            name: packed_camera(blobs, maps, jpeg, mapping(views.get(name)), every)
             for name, (maps, jpeg) in loaded.items()
         }
         if blobs.num_bytes <= _MOST_FOR_MAPS or every == _COARSEST:
@@ -101,10 +88,12 @@ def _cameras(files: KeyFiles, views: Mapping[str, Any]) -> tuple[dict[str, Any],
 
 def _cloud(
     blobs: Blobs, stored: StoredCloud, sweeps: list[dict[str, Any]], movers: list[dict[str, Any]]
-) -> dict[str, Any]:
-    """The cloud with as many of its points as there is room for."""
+) -> dict[str, Any] | None:
+    """Return the cloud, with as many of its points as there is room for. None if it is empty."""
+    if not len(stored.points):
+        return None
     frames, instances = [s["frame"] for s in sweeps], [m["instance"] for m in movers]
-    room, most = MOST_BYTES - _OF_THE_PAGE - blobs.num_bytes, MOST_POINTS
+    room, most = MOST_BYTES - _OF_THE_PAGE - blobs.num_bytes, _MOST_POINTS
     while True:
         own = Blobs(first=len(blobs.texts))
         cloud = packed_cloud(own, stored, frames, instances, most)
@@ -117,9 +106,9 @@ def _cloud(
 def _sweeps(
     files: KeyFiles, scene: Mapping[str, Any], stored: StoredCloud | None
 ) -> list[dict[str, Any]]:
-    """Those of the scene; of older runs the frames of the cloud, without their times."""
+    """Return the sweeps of the scene; without a scene the cloud's frames, without their times."""
     sweeps = scene.get("sweeps")
-    if isinstance(sweeps, list) and all(isinstance(s, dict) and "frame" in s for s in sweeps):
+    if isinstance(sweeps, list) and all("frame" in mapping(sweep) for sweep in sweeps):
         return sweeps
     frames = sorted({*stored.frame.tolist()}) if stored is not None else []
     far = {*(files.about.get("far_frames") or ())}
@@ -129,14 +118,14 @@ def _sweeps(
 def _mover(track: ObjectTrack, key: Any) -> dict[str, Any]:
     at = track.frames.index(key) if key in track.frames else len(track.frames) // 2
     places_m = track.T_key_object[:, :3, 3]
-    way = zip(track.frames, places_m, strict=True)
+    path = zip(track.frames, places_m, strict=True)
     return {
         "instance": track.instance,
         "num_points": track.num_points.sum(),
         "centre_m": places_m[at],
         "size_m": track.size_m,
         "velocity_m_s": track.velocity_m_s[at],
-        "path": [{"frame": frame, "position_m": place_m} for frame, place_m in way],
+        "path": [{"frame": frame, "position_m": place_m} for frame, place_m in path],
     }
 
 
@@ -145,48 +134,38 @@ def _input(about: Mapping[str, Any]) -> list[tuple[str, str]]:
         "recording": about.get("data"),
         "key": about.get("key"),
         "method": about.get("method"),
-        "sweeps of the window": _listed(about.get("frames")),
-        "sweeps beyond it": _listed(about.get("far_frames")),
-        "cameras": ", ".join(map(str, about.get("cameras") or ())),
+        "sweeps of the window": about.get("frames"),
+        "sweeps beyond it": about.get("far_frames"),
+        "cameras": about.get("cameras"),
     }
-    return [(name, str(value)) for name, value in entries.items() if value not in (None, "")]
+    lists = {n: ", ".join(map(str, v)) for n, v in entries.items() if isinstance(v, list)}
+    return [(n, str(v)) for n, v in {**entries, **lists}.items() if v not in (None, "")]
 
 
-def _listed(frames: Any) -> str:
-    return ", ".join(map(str, frames)) if isinstance(frames, list) else ""
-
-
-def _settings(about: Mapping[str, Any]) -> list[tuple[str, str]]:
-    return [
-        (f"{section}.{knob}", str(value))
-        for section, knobs in _mapping(about.get("config")).items()
-        for knob, value in _mapping(knobs).items()
-    ]
+def _knobs(config: Any) -> dict[str, Any]:
+    """Return section.knob -> value."""
+    return {
+        f"{section}.{knob}": value
+        for section, knobs in mapping(config).items()
+        for knob, value in mapping(knobs).items()
+    }
 
 
 def command(about: Mapping[str, Any], methods: list[str] | None) -> str:
-    """The command that makes it again. methods: of a comparison, None for a run."""
+    """Return the command that makes the result again. methods: of a comparison, None for a run."""
     frames, key = about.get("frames"), about.get("key")
     words = ["densify", "compare" if methods else "run"]
     words += ["--data", str(about.get("data")), "--key", str(key)]
-    if isinstance(frames, list) and isinstance(key, int) and key in frames:
+    if isinstance(frames, list) and key in frames:
         at = frames.index(key)
         words += ["--window", str(max(at, len(frames) - 1 - at))]
     if methods:
         words += ["--methods", ",".join(methods)]
     elif about.get("method"):
         words += ["--method", str(about["method"])]
-    usual = as_mapping(Config())
-    for section, knobs in _mapping(about.get("config")).items():
-        for knob, value in _mapping(knobs).items():
-            if _mapping(usual.get(section)).get(knob) != value:
-                words += ["--set", f"{section}.{knob}={_written(value)}"]
+    usual = _knobs(as_mapping(Config()))
+    for knob, value in _knobs(about.get("config")).items():
+        if usual.get(knob) != value:
+            text = str(value).lower() if isinstance(value, bool) or value is None else str(value)
+            words += ["--set", f"{knob}={text}"]
     return shlex.join(words)
-
-
-def _written(value: Any) -> str:
-    return str(value).lower() if isinstance(value, bool) or value is None else str(value)
-
-
-def _mapping(value: Any) -> Mapping[str, Any]:
-    return value if isinstance(value, dict) else {}

@@ -10,13 +10,12 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from densify.config.errors import InputError
-from densify.geometry.types import Float32, Progress
+from densify.geometry.types import Progress
 from densify.outputs.depth_png import read_depth_png
-from densify.outputs.png import encode_webp
-from densify.outputs.report.pack import Blobs
+from densify.outputs.png import Picture, encode_webp
+from densify.outputs.report.page_file import Blobs
 
 WIDTH_PX, HEIGHT_PX = 112, 36
 _COLUMNS, _ROWS = 16, 32
@@ -27,7 +26,7 @@ NEAR_M, FAR_M = 3.0, 80.0
 def sheets(
     blobs: Blobs, paths: Sequence[Path], progress: Progress | None = None
 ) -> tuple[Mapping[str, Any], list[bool]]:
-    """Pictures of depth maps in their order, and of which there is one.
+    """Return the entry of the pictures in their order, and which of the maps can be read.
 
     The entry has the sheets, ``columns`` and ``per_sheet``. A map that cannot be read is black.
     """
@@ -50,7 +49,7 @@ def sheets(
     return entry, found
 
 
-def _sheet(pictures: Sequence[NDArray[np.uint8] | None]) -> NDArray[np.uint8]:
+def _sheet(pictures: Sequence[Picture | None]) -> Picture:
     rows = -(-len(pictures) // _COLUMNS)
     sheet = np.zeros((rows * HEIGHT_PX, _COLUMNS * WIDTH_PX, 3), np.uint8)
     for place, picture in enumerate(pictures):
@@ -61,8 +60,8 @@ def _sheet(pictures: Sequence[NDArray[np.uint8] | None]) -> NDArray[np.uint8]:
     return sheet
 
 
-def _picture(path: Path) -> NDArray[np.uint8] | None:
-    """RGB, as large as fits; None where there is no depth map."""
+def _picture(path: Path) -> Picture | None:
+    """Return RGB of the mean depth in each pixel, as large as fits; None if it cannot be read."""
     try:
         depth_m = read_depth_png(path)
     except InputError:
@@ -70,23 +69,13 @@ def _picture(path: Path) -> NDArray[np.uint8] | None:
     height, width = depth_m.shape
     scale = min(WIDTH_PX / width, HEIGHT_PX / height)
     size_px = max(1, int(width * scale)), max(1, int(height * scale))
-    return _coloured(_shrunk(depth_m, size_px))
-
-
-def _shrunk(depth_m: Float32, size_px: tuple[int, int]) -> Float32:
-    """The mean of the depths in each cell, 0 where there is none."""
-    known = (depth_m > 0).astype(np.float32)
-    total = cv2.resize(depth_m, size_px, interpolation=cv2.INTER_AREA)
-    share = cv2.resize(known, size_px, interpolation=cv2.INTER_AREA)
-    mean: Float32 = np.where(share > 0, total / np.maximum(share, 1e-6), 0).astype(np.float32)
-    return mean
-
-
-def _coloured(depth_m: Float32) -> NDArray[np.uint8]:
-    near, far = np.log(NEAR_M), np.log(FAR_M)
-    nearness = (far - np.log(np.maximum(depth_m, 1e-3))) / (far - near)
+    total, known = (
+        cv2.resize(values, size_px, interpolation=cv2.INTER_AREA)
+        for values in (depth_m, (depth_m > 0).astype(np.float32))
+    )
+    mean_m = np.maximum(total / np.maximum(known, 1e-6), 1e-3)
+    nearness = np.log(FAR_M / mean_m) / np.log(FAR_M / NEAR_M)
     levels = np.rint(255 * np.clip(nearness, 0, 1)).astype(np.uint8)
-    rgb = cv2.applyColorMap(levels, cv2.COLORMAP_VIRIDIS)[:, :, ::-1].copy()
-    rgb[depth_m == 0] = 0
-    coloured: NDArray[np.uint8] = rgb.astype(np.uint8)
-    return coloured
+    rgb = cv2.applyColorMap(levels, cv2.COLORMAP_VIRIDIS)[:, :, ::-1].astype(np.uint8)
+    rgb[known == 0] = 0
+    return rgb

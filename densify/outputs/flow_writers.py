@@ -1,0 +1,187 @@
+# SPDX-License-Identifier: MIT
+"""Scene flow as files: of a key, and of a whole recording in the forms that other programs take.
+
+NAME is the recording's::
+
+    npz            OUT/000119_000120.npz: flow files, see `densify.readers.flow_files`
+    av2            OUT/NAME/STAMP.feather, of the Argoverse 2 scene flow challenge of 2024: is_valid
+                   bool, flow_tx_m flow_ty_m flow_tz_m float16, to the next sweep without the
+                   ego-motion, in the frame of the sweep's file; a row for each of the file's
+    opensceneflow  OUT/NAME.h5, a group for each sweep, named by its stamp in ns
+                   (`densify.readers.open_scene_flow.reader`): lidar (N,4) deskewed to the stamp,
+                   pose (4,4), lidar_id, ground_mask (all False), row (N,) in the sweep's file;
+                   where flow to the next sweep is known, with the ego-motion: flow (N,3),
+                   flow_is_valid, flow_instance_id (0 none), ego_motion (4,4)
+
+The challenge takes every fifth sweep, zipped as NAME/0000000000.feather, NAME/0000000005.feather
+and so on. The masks that it publishes say which points count.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from densify.config.errors import InputError, OutputError
+from densify.geometry import poses
+from densify.geometry.types import FlowField, KnowsRows, LidarSequence, Result, StretchFlow
+from densify.outputs.atomic import file_aside, write_file
+from densify.outputs.context import Context
+from densify.readers.extras import needed
+
+FORMATS = ("npz", "av2", "opensceneflow")
+
+FlowWriter = Callable[[int, StretchFlow], Path]
+"""Writes a sweep and its flow to the next, the only step it is given (none: the last sweep), and
+returns the file."""
+
+
+def write_flow(result: Result, context: Context, folder: Path) -> None:
+    """Write ``flow/`` in the form of ``output.flow``: npz or opensceneflow."""
+    if result.flow is None:
+        return
+    (folder / "flow").mkdir()
+    if context.config["output"]["flow"] == "opensceneflow":
+        write_flow_h5(folder / "flow" / f"{result.key:06d}.h5", result.flow)
+    else:
+        write_flow_npz(folder / "flow", result.flow)
+
+
+def write_flow_npz(folder: Path, flow: StretchFlow) -> list[Path]:
+    """Write ``folder/000119_000120.npz`` and so on, one for each step, and return the paths."""
+    paths = []
+    for (frame, target), field in flow.steps.items():
+        sweep = flow.stretch[frame].sweep
+        total_flow = _total_flow(flow, frame, target)
+        data = flow_npz(field, row=sweep.row, total_flow=total_flow, object=field.instance)
+        paths.append(folder / f"{frame:06d}_{target:06d}.npz")
+        write_file(paths[-1], data)
+    return paths
+
+
+def _total_flow(flow: StretchFlow, frame: int, target: int) -> np.ndarray:
+    """Return (N,3) metres, from each point to its position at the target's time in the target's
+    frame; the ego-motion is included."""
+    points, field = flow.stretch[frame].sweep.points, flow.steps[frame, target]
+    T = flow.stretch.T_target_source(target, frame)
+    return poses.transform(T, points + field.total) - points
+
+
+def flow_npz(field: FlowField, **beside: Any) -> bytes:
+    """Return a file with ``residual_flow`` float32, ``moving``, ``instance`` (-1 none), ``lost``,
+    ``to_reference`` float32 if it is known, and the arrays given beside."""
+    if field.to_reference is not None:
+        beside["to_reference"] = field.to_reference
+    arrays = {
+        "residual_flow": field.displacement,
+        "moving": field.moving,
+        "instance": field.instance,
+        "lost": field.lost,
+        **beside,
+    }
+    for name, array in arrays.items():
+        if array.dtype == np.float64:
+            arrays[name] = array.astype(np.float32)
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, **arrays)
+    return buffer.getvalue()
+
+
+def write_flow_h5(path: Path, flow: StretchFlow) -> None:
+    """Write all sweeps of a window in OpenSceneFlow's form. Raises InputError without h5py."""
+    with file_aside(path) as aside, _flow_h5(aside) as put:
+        for frame in flow.stretch.frames:
+            put(frame, flow)
+
+
+@contextmanager
+def _flow_h5(path: Path) -> Iterator[Callable[[int, StretchFlow], None]]:
+    """Yield a function that adds a sweep, with its flow to the next one where that is known."""
+    h5py = needed("h5py", "opensceneflow", "OpenSceneFlow's files")
+    with h5py.File(path, "w") as file:
+
+        def put(frame: int, flow: StretchFlow) -> None:
+            registered = flow.stretch[frame]
+            sweep = registered.sweep
+            lidar = np.column_stack([sweep.points, 255 * sweep.intensity]).astype(np.float32)
+            arrays = {
+                "lidar": lidar,
+                "pose": registered.T_world_lidar,
+                "lidar_id": sweep.lidar,
+                "ground_mask": np.zeros(len(sweep), bool),
+                "row": sweep.row,
+            }
+            for (here, following), field in flow.steps.items():
+                if here == frame < following:
+                    arrays |= {
+                        "flow": _total_flow(flow, frame, following).astype(np.float32),
+                        "flow_is_valid": ~field.lost,
+                        "flow_instance_id": (field.instance + 1).astype(np.int16),
+                        "ego_motion": flow.stretch.T_target_source(following, frame).astype("f4"),
+                    }
+            group = file.create_group(str(sweep.stamp_ns))
+            for name, array in arrays.items():
+                group.create_dataset(name, data=array)
+
+        yield put
+
+
+@contextmanager
+def flow_writer(
+    form: str, sequence: LidarSequence, out: Path, frames: Sequence[int], overwrite: bool
+) -> Iterator[FlowWriter]:
+    """Yield a writer for these sweeps. Each file appears when it is complete, opensceneflow's with
+    all sweeps in it.
+
+    form: of `FORMATS`. Raises InputError for a package that is not installed and for files that are
+    there and not to be overwritten, OutputError if nothing can be written.
+    """
+    name = "".join(c if c.isalnum() or c in "-_." else "_" for c in sequence.name)
+    folder = out / name if form == "av2" else out
+    if form == "av2":
+        paths = [folder / f"{sequence.stamp_ns(frame)}.feather" for frame in frames]
+        needed("pyarrow.feather", "argoverse", "Argoverse 2's flow files")
+    elif form == "opensceneflow":
+        paths = [folder / f"{name}.h5"]
+    else:
+        steps = dict(zip(sequence.frames[:-1], sequence.frames[1:], strict=True))
+        paths = [folder / f"{f:06d}_{steps[f]:06d}.npz" for f in frames if f in steps]
+    there = [path.name for path in paths if path.exists()]
+    if there and not overwrite:
+        others = f" and {len(there) - 1} more" if len(there) > 1 else ""
+        raise InputError(
+            f"{folder}: {there[0]}{others} already there and kept; give --overwrite to replace "
+            f"them or another --out DIR"
+        )
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        if form == "opensceneflow":
+            with file_aside(paths[0]) as aside, _flow_h5(aside) as put:
+                yield lambda frame, flow: put(frame, flow) or paths[0]
+        elif form == "av2":
+            yield lambda frame, flow: _write_feather(folder, sequence, frame, flow)
+        else:
+            yield lambda frame, flow: next(iter(write_flow_npz(folder, flow)), folder)
+    except OSError as error:
+        raise OutputError(f"--out {out}: cannot be written: {error.strerror or error}") from error
+
+
+def _write_feather(folder: Path, sequence: LidarSequence, frame: int, flow: StretchFlow) -> Path:
+    """Rows without a valid return are static, as the ground is."""
+    arrow, feather = (needed(m, "argoverse", "") for m in ("pyarrow", "pyarrow.feather"))
+    sweep = flow.stretch[frame].sweep
+    num_rows = sequence.num_rows(frame) if isinstance(sequence, KnowsRows) else len(sequence[frame])
+    residual = np.zeros((num_rows, 3), np.float16)
+    for field in flow.steps.values():
+        residual[sweep.row] = field.displacement
+    columns = {"is_valid": np.ones(num_rows, bool)}
+    columns |= dict(zip(("flow_tx_m", "flow_ty_m", "flow_tz_m"), residual.T.copy(), strict=True))
+    path = folder / f"{sequence.stamp_ns(frame)}.feather"
+    with file_aside(path) as aside:
+        feather.write_feather(arrow.table(columns), aside)
+    return path

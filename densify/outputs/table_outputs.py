@@ -1,0 +1,235 @@
+# SPDX-License-Identifier: MIT
+"""The outputs that are tables, for programs: metrics.json, movers.json, run.yaml, scene.json.
+
+metrics.json. compare.json holds the fields from ``frames`` on, by method, under ``methods``::
+
+    schema_version, key, method
+    frames      of the window, absolute numbers
+    num_points  of the cloud; num_moving of those
+    density     camera -> measured, filled: fraction of the pixels with a depth; with --prior also
+                full, and prior, the fraction that came from it
+    ghosts      `densify.scores.ghosts.ghost_scores`: num_points, all, moving, static, by_distance
+    depth       where there is truth: camera -> measured, filled -> all, moving, static -> the
+                fields of `densify.scores.depth_metrics.DepthErrors`; with --prior also full, prior
+    measure     map -> z, depth along the camera's axis, or range, distance from the lens
+    held_out    camera -> the same fields as depth: the key densified from its neighbours alone
+                against its own returns; curve, `densify.scores.depth_metrics.precision_density`;
+                reliability, `densify.depth.confidence.reliability`. null for the key sweep alone
+    reliability where there is truth: map -> the same list against it
+    expected_outliers  map -> measured, filled: the fraction of outliers that confidence expects
+    baselines   the same from ``frames`` on for each simpler method on the same registration
+
+A score is null where nothing is known.
+
+movers.json, by `ObjectTrack`::
+
+    schema_version, key
+    objects     instance, as in cloud.laz
+                size_m, length, width, height
+                poses: frame, stamp_ns, num_points, T_key_object (4,4), velocity_m_s (3,) in key
+                coordinates without the ego-motion; at each sweep that observed it, and at the key
+
+scene/, for pages, viewers and other tools::
+
+    image/CAMERA.jpg   the image that the map shows
+    none/CAMERA.png, icp/…   measured depth of the simpler methods, as in ``depth``
+    truth/CAMERA.png   true depth where there is some, as in ``depth``
+    sweep/CAMERA.png   uint16, measured pixels: 1 + row of the source sweep in ``sweeps``; 0 none
+    reason/CAMERA.png  uint8 `Reason` that the nearest point of a pixel was rejected
+    scene.json         schema_version, key
+      sweeps           of the window and beyond it: frame, since_key_s, far, T_key_lidar (4,4)
+      views            map -> camera (width_px, height_px, K, model, distortion, ...), T_cam_key
+                       (4,4), late_s after the key, number of its image
+"""
+
+from __future__ import annotations
+
+import platform
+from collections.abc import Sequence
+from dataclasses import asdict, fields
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from densify import __version__
+from densify.geometry.types import Camera, CameraView, ObjectTrack, Result
+from densify.outputs.atomic import write_file
+from densify.outputs.context import Context
+from densify.outputs.depth_png import write_depth_png
+from densify.outputs.map_outputs import map_path
+from densify.outputs.plain import plain, write_json
+from densify.outputs.png import encode_jpeg, encode_png
+
+SCHEMA_VERSION = 1
+"""Version of each JSON file; grows when a field changes its meaning or goes."""
+_PACKAGES = (
+    "numpy",
+    "scipy",
+    "torch",
+    "embreex",
+    "kiss-icp",
+    "small-gicp",
+    "opencv-python-headless",
+    "laspy",
+    "lazrs",
+    "PyYAML",
+)
+
+
+def write_metrics(result: Result, context: Context, folder: Path) -> None:
+    """Write ``metrics.json``."""
+    table = {
+        "schema_version": SCHEMA_VERSION,
+        "key": result.key,
+        "method": result.method,
+        **scores_of(result),
+        "baselines": {m: scores_of(baseline) for m, baseline in result.baselines.items()},
+    }
+    write_json(folder / "metrics.json", table)
+
+
+def scores_of(result: Result) -> dict[str, Any]:
+    """Return frames and scores of one method."""
+    return {"frames": result.frames, **result.metrics}
+
+
+def write_tracks(result: Result, context: Context, folder: Path) -> None:
+    """Write ``movers.json``, if the result has poses."""
+    if result.T_key_lidar:
+        write_json(folder / "movers.json", tracks_table(result.key, result.tracks))
+
+
+def tracks_table(key: int, tracks: Sequence[ObjectTrack]) -> dict[str, Any]:
+    """Return the content of movers.json."""
+    objects = []
+    for track in tracks:
+        poses = [
+            {
+                "frame": frame,
+                "stamp_ns": track.stamp_ns[i],
+                "num_points": track.num_points[i],
+                "T_key_object": track.T_key_object[i],
+                "velocity_m_s": track.velocity_m_s[i],
+            }
+            for i, frame in enumerate(track.frames)
+        ]
+        objects.append({"instance": track.instance, "size_m": track.size_m, "poses": poses})
+    return {"schema_version": SCHEMA_VERSION, "key": key, "objects": objects}
+
+
+def write_run_yaml(result: Result, context: Context, folder: Path) -> None:
+    """Write ``run.yaml``: data, key, frames, cameras, warnings, configuration, cost of each stage,
+    versions, and how the submaps beyond the window were registered."""
+    record = {
+        "data": context.data,
+        "key": result.key,
+        "method": result.method,
+        "frames": result.frames,
+        "far_frames": result.far_frames,
+        "cameras": list(result.depth),
+        "prior": {
+            name: {"source": full.source, **asdict(full.fit), "share": full.share}
+            for name, full in result.full.items()
+        },
+        "warnings": result.warnings,
+        "config": context.config,
+        "stages": stages(result),
+        "versions": versions(),
+    }
+    text = yaml.safe_dump(plain(record), sort_keys=False, allow_unicode=True)
+    text += yaml.safe_dump({"far_links": _far_links(result)}, default_flow_style=None, width=200)
+    write_file(folder / "run.yaml", text.encode())
+
+
+def _far_links(result: Result) -> dict[str, Any]:
+    """Return a row for each pair of submaps, and the names of its columns (`Links`)."""
+    links = result.far_links
+    names = ("overlap", "rms_m", "num_matches", "correction_m", "correction_deg", "left_m")
+    columns = [*links.frames.T, *(np.round(getattr(links, name), 4) for name in names)]
+    return {
+        "left_out": list(result.far_left_out),
+        "columns": ["target", "source", *names],
+        "pairs": [list(row) for row in zip(*(c.tolist() for c in columns), strict=True)],
+    }
+
+
+def stages(result: Result) -> list[dict[str, Any]]:
+    """Return name, seconds and peak_memory_mb of each stage."""
+    return [
+        {
+            "name": cost.name,
+            "seconds": round(cost.seconds, 3),
+            "peak_memory_mb": round(cost.peak_memory_mb, 1),
+        }
+        for cost in result.costs
+    ]
+
+
+def versions() -> dict[str, str | None]:
+    """Return the versions of densify, Python, the platform and the packages that results depend
+    on. A package that goes by another name, as in system builds, has None."""
+    found: dict[str, str | None] = {
+        "densify": __version__,
+        "python": platform.python_version(),
+        "platform": platform.platform(),
+    }
+    for package in _PACKAGES:
+        try:
+            found[package] = version(package)
+        except PackageNotFoundError:
+            found[package] = None
+    return found
+
+
+def write_scene(result: Result, context: Context, folder: Path) -> None:
+    """Write ``scene/``, if the result has poses."""
+    if not result.T_key_lidar:
+        return
+    place = folder / "scene"
+    place.mkdir()
+    sweeps = _sweeps(result)
+    row_of = {sweep["frame"]: row for row, sweep in enumerate(sweeps)}
+    for name, maps in result.depth.items():
+        if name in context.images:
+            path = map_path(place, "image", name, ".jpg")
+            write_file(path, encode_jpeg(context.images[name]))
+        for method, baseline in result.baselines.items():
+            write_depth_png(map_path(place, method, name), baseline.depth[name].depth_m)
+        if name in result.truth_m:
+            write_depth_png(map_path(place, "truth", name), result.truth_m[name])
+        lookup = np.zeros(max(row_of) + 2, np.uint16)
+        lookup[[*row_of]] = 1 + np.arange(len(row_of))
+        write_file(map_path(place, "sweep", name), encode_png(lookup[maps.frame]))
+        if name in result.rejected:
+            write_file(map_path(place, "reason", name), encode_png(result.rejected[name]))
+    table = {
+        "schema_version": SCHEMA_VERSION,
+        "key": result.key,
+        "sweeps": sweeps,
+        "views": {name: _view(view) for name, view in result.views.items()},
+    }
+    write_json(place / "scene.json", table)
+
+
+def _sweeps(result: Result) -> list[dict[str, Any]]:
+    """Return the sweeps of the window and those that the cloud has points of, by frame."""
+    frames, rows = np.unique(result.cloud.frame, return_index=True)
+    since_s = dict(zip(frames.tolist(), 1e-9 * result.cloud.since_key_ns[rows], strict=True))
+    far = {*result.far_frames} - {*result.T_key_lidar}
+    return [
+        {
+            "frame": frame,
+            "since_key_s": since_s.get(frame),
+            "far": frame in far,
+            "T_key_lidar": result.T_key_lidar.get(frame),
+        }
+        for frame in sorted({*since_s, *result.T_key_lidar})
+    ]
+
+
+def _view(view: CameraView) -> dict[str, Any]:
+    camera = {f.name: getattr(view.camera, f.name) for f in fields(Camera)}
+    return {**camera, "T_cam_key": view.T_cam_key, "late_s": view.late_s, "number": view.number}
