@@ -169,13 +169,13 @@ def _cloud(path: Path) -> None:
 
 
 def _scene(path: Path) -> None:
-    from densify.outputs.export.scene_file import read_scene
+    from densify.outputs.scene_file import read_scene
 
     read_scene(path)
 
 
 def _movers(path: Path) -> None:
-    from densify.outputs.export.tracks_file import read_tracks
+    from densify.outputs.scene_file import read_tracks
 
     read_tracks(path)
 
@@ -349,7 +349,7 @@ def _run(place: Path) -> None:
             [
                 lambda: _page(place),
                 *(
-                    lambda to=n: export_run(place, 0.3, None, out / to, to=to)
+                    lambda to=n: export_run(place, to, out / to, min_confidence=0.3)
                     for n in [row.name for row in EXPORTS]
                 ),
             ]

@@ -280,26 +280,6 @@ def test_without_truth_networks_are_held_against_the_engine(log: Path, tmp_path:
     assert found.flow.shape == found.source.shape and not found.flow[~found.moving].any()
 
 
-def test_arrows_are_as_long_as_the_flow_and_coloured_by_its_direction() -> None:
-    points = np.array([[10.0, 10, 0], [0, -10, 0], [-10, 0, 0]])
-    flow = np.array([[3.0, 0, 0], [0, 3.0, 0], [0.01, 0, 0]])
-    picture = draw_arrows(points, {"truth": flow, "nothing": np.zeros_like(flow)})
-    assert picture.shape == (506, 960, 3)
-    left, right = picture[28:-2, 2:478], picture[28:-2, 482:-2]
-    per_m = 240 / 35
-    assert (right.max(axis=2) - right.min(axis=2)).max() == 0  # dots are gray
-    coloured = (left.max(axis=2).astype(int) - left.min(axis=2)) > 60
-    y, x = np.nonzero(coloured)
-    ahead, sideways = x < 200, x > 200  # x up, y to the left: 10 m left is 69 px
-    up_px = 240 - 2 - 10 * per_m
-    assert abs(y[ahead].max() - up_px) < 3 and abs(y[ahead].min() - (up_px - 9 * per_m)) < 3
-    assert abs(np.ptp(x[sideways]) - 9 * per_m) < 4
-    assert (
-        left[y[ahead], x[ahead]].mean(axis=0).argmax()
-        != left[y[sideways], x[sideways]].mean(axis=0).argmax()
-    )
-
-
 def test_the_first_pair_is_drawn(tmp_path: Path, capsys) -> None:
     kitti_file(tmp_path / "a.npz")
     figure = tmp_path / "new" / "a.png"

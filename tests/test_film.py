@@ -28,11 +28,6 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def frames_of(path: Path) -> list[np.ndarray]:
-    if path.suffix == ".mp4":
-        video, frames = cv2.VideoCapture(str(path)), []
-        while (read := video.read())[0]:
-            frames.append(read[1])
-        return frames
     done, animation = cv2.imreadanimation(str(path))
     assert done
     return [frame[:, :, :3] for frame in animation.frames]
@@ -54,37 +49,33 @@ def test_the_trail_collapses_and_sweeps_fill(run: Path) -> None:
     assert 4 < sum(seconds for _, seconds in pictures) < 12
 
 
-@pytest.mark.parametrize(
-    "suffix", [pytest.param(s, marks=animated) for s in (".gif", ".webp")] + [".mp4"]
-)
-def test_every_kind_can_be_played(suffix: str, run: Path, tmp_path: Path) -> None:
+@animated
+@pytest.mark.parametrize(("suffix", "coarse"), [(".gif", 15), (".webp", 6)])  # 256 colours
+def test_every_kind_can_be_played(suffix: str, coarse: float, run: Path, tmp_path: Path) -> None:
     path = tmp_path / "new" / f"film{suffix}"
     film.write_film(run, path)
     frames = frames_of(path)
     first = next(film._pictures(read_cloud(run / "cloud.laz")))[0]
     assert frames[0].shape == first.shape and len(frames) >= 20
-    coarse = 15 if suffix == ".gif" else 6  # 256 colours
     assert np.abs(frames[0].astype(int) - first).mean() < coarse
     assert path.stat().st_size < 3_000_000
-    if suffix != ".mp4":  # whose encoder notes the time
-        film.write_film(run, tmp_path / f"again{suffix}")
-        assert path.read_bytes() == (tmp_path / f"again{suffix}").read_bytes()
 
 
 def test_what_cannot_be_filmed(run: Path, tmp_path: Path, capsys) -> None:
-    (tmp_path / "there.mp4").touch()
-    for name, words in (("film.avi", "ends in .gif, .mp4, .webp"), ("there.mp4", "already there")):
+    (tmp_path / "there.gif").touch()
+    for name, words in (("film.mp4", "ends in .gif or .webp"), ("there.gif", "already there")):
         said = refused(capsys, 2, "run", "--key", 3, "--film", tmp_path / name)
         assert words in said
-    said = refused(capsys, 2, "run", "--keys", "3:5", "--film", tmp_path / "film.mp4")
+    said = refused(capsys, 2, "run", "--keys", "3:5", "--film", tmp_path / "film.gif")
     assert "got 2 keys, expected one" in said
     with pytest.raises(InputError, match="cannot be read"):
-        film.write_film(tmp_path, tmp_path / "film.mp4")
-    assert not (tmp_path / "film.mp4").exists()
+        film.write_film(tmp_path, tmp_path / "film.gif")
+    assert not (tmp_path / "film.gif").exists()
 
 
+@animated
 def test_a_run_in_which_nothing_moves(tmp_path: Path) -> None:
     cloud = results()["flow"].cloud
     write_cloud(tmp_path / "cloud.laz", cloud.select(~cloud.moving))
-    film.write_film(tmp_path, tmp_path / "film.mp4")
-    assert len(frames_of(tmp_path / "film.mp4")) > 20
+    film.write_film(tmp_path, tmp_path / "film.webp")
+    assert frames_of(tmp_path / "film.webp")

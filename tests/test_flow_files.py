@@ -7,11 +7,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from densify.outputs.flow_npz import write_flow_files
 
 from densify.config.errors import InputError
 from densify.geometry import poses
 from densify.geometry.types import FlowField, Result, Stretch, StretchFlow
+from densify.outputs.flow_writers import write_flow_npz
 from densify.readers.flow_files import MOVES_M, FlowFiles
 from tests.exact_motion import registered
 from tests.scenes import by_flow
@@ -29,7 +29,7 @@ def ours(tmp_path_factory) -> tuple[Result, Path]:
     """A run with the flow it found, and the folder of its flow files."""
     result = by_flow(one_car(), KEY, 1, config=PLAIN | {"output": {"flow": True}})
     folder = tmp_path_factory.mktemp("flow")
-    write_flow_files(folder, result.flow)
+    write_flow_npz(folder, result.flow)
     return result, folder
 
 
@@ -90,7 +90,7 @@ def test_other_forms_of_the_same_flow(ours, dropped, tmp_path):
 def test_chained_over_more_steps_it_is_nearly_the_same(tmp_path):
     ours = by_flow(one_car(), KEY, 2, config=POSES_GIVEN | {"output": {"flow": True}})
     assert sorted(ours.flow.steps) == [(1, 2), (2, 3), (3, 4), (4, 3), (5, 4)]
-    write_flow_files(tmp_path, ours.flow)
+    write_flow_npz(tmp_path, ours.flow)
     found = by_flow(one_car(), KEY, 2, config=POSES_GIVEN | {"flow": {"engine": f"npz:{tmp_path}"}})
     row = {key: i for i, key in enumerate(zip(found.cloud.frame, found.cloud.row, strict=True))}
     place = [row.get(key, -1) for key in zip(ours.cloud.frame, ours.cloud.row, strict=True)]
@@ -160,7 +160,7 @@ def test_total_flow_holds_the_way_to_the_reference_time_once(stretch, tmp_path):
     sweep = stretch[STEP[0]].sweep
     one = np.ones((10, 3))
     field = FlowField(2 * one, one[:, 0] > 0, np.zeros(10, np.int32), one[:, 0] < 0, 0.25 * one)
-    write_flow_files(tmp_path, StretchFlow(stretch, {STEP: field}))
+    write_flow_npz(tmp_path, StretchFlow(stretch, {STEP: field}))
     path = tmp_path / f"{STEP[0]:06d}_{STEP[1]:06d}.npz"
     with np.load(path) as arrays:
         known = {name: arrays[name] for name in ("total_flow", "to_reference", "row")}

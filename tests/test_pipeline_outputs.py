@@ -23,7 +23,7 @@ def with_movers(word: str, **output) -> Result:
     return by_flow(one_car(), KEY, 1, config=config)
 
 
-NPZ = {"output": {"flow_as": "npz"}}
+NPZ = {"output": {"flow": "npz"}}
 
 
 @pytest.fixture(scope="module")
@@ -34,7 +34,7 @@ def kept() -> Result:
 
 @pytest.fixture(scope="module")
 def apart() -> Result:
-    return with_movers("separate", flow=True, optical_flow=True)
+    return with_movers("separate", flow="npz", optical_flow=True)
 
 
 def rows_of(*clouds: Cloud) -> list[tuple[int, int]]:

@@ -7,7 +7,6 @@ import shutil
 
 import numpy as np
 import pytest
-from densify.outputs.flow_h5 import write_flow_h5
 from writers import write_street
 from writers.excerpt import Excerpt
 
@@ -15,6 +14,7 @@ import densify
 from densify.config.errors import InputError
 from densify.geometry.poses import transform
 from densify.geometry.types import Trajectory
+from densify.outputs.flow_writers import write_flow_h5
 from densify.readers import open_sequence
 from densify.readers.open_scene_flow.labels import FlowLabels
 from densify.readers.open_scene_flow.reader import OpenSceneFlow, SweepFile
@@ -173,10 +173,10 @@ def test_densified_with_the_labels_movers_lie_on_each_other(folder, excerpt):
 
 def test_our_flow_is_written_as_such_a_file_and_read_again(tmp_path):
     sequence = one_car()
-    config = POSES_GIVEN | {"output": {"flow": True}, "project": {"visibility": False}}
+    config = POSES_GIVEN | {"output": {"flow": "opensceneflow"}, "project": {"visibility": False}}
     ours = by_flow(sequence, KEY, 2, config=config)
-    write_flow_h5(tmp_path, KEY, ours.flow)
-    path = tmp_path / f"{KEY:06d}.h5"
+    path = tmp_path / "flow.h5"
+    write_flow_h5(path, ours.flow)
     with h5py.File(path, "r+") as file:
         groups = [file[name] for name in sorted(file, key=int)]
         assert ["flow" in group for group in groups] == [True, True, True, False, False]

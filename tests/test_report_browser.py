@@ -94,7 +94,9 @@ def test_sliders_keep_what_export_keeps(
     opened.set("confidence", confidence)
     if age_ms is not None:
         opened.set("age", age_ms)
-    exported = export_run(run, confidence, age_ms, tmp_path / "export").density["front"]
+    exported = export_run(
+        run, "npy", tmp_path / "a", min_confidence=confidence, max_age_ms=age_ms
+    ).density["front"]
     for product, row in zip(("measured", "filled"), kept(opened), strict=True):
         assert row[0] == pytest.approx(100 * exported[product].after, abs=0.006)
         assert exported[product].after < exported[product].before

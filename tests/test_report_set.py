@@ -16,13 +16,13 @@ from urllib.parse import unquote
 import cv2
 import numpy as np
 import pytest
-from densify.outputs.report.pack import Blobs
 
 from densify.config.errors import InputError
 from densify.dataset.manifest import KeyRecord, read_manifests
 from densify.dataset.report import write_report
 from densify.outputs import write_depth_png
 from densify.outputs.kitti_tree import FileRecord
+from densify.outputs.report.page_file import Blobs
 from densify.outputs.report.thumbnails import HEIGHT_PX, WIDTH_PX, sheets
 from tests.browser import Opened, chromium
 from tests.command import refused

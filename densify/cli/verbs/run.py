@@ -63,7 +63,7 @@ def add(commands: Any) -> None:
         "--film",
         type=Path,
         metavar="FILE",
-        help="of one key: a film of 8 s, .webp (half a megabyte), .gif or .mp4: registration alone "
+        help="of one key: a film of 8 s, .webp (half a megabyte) or .gif: registration alone "
         "turns into ours, then sweep by sweep",
     )
     add_output_options(parser)

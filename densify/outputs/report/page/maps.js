@@ -337,7 +337,7 @@ class ImagePane {
     $("kept-note").textContent = part + held;
     const age = ageMs === Infinity ? "" : ` --max-age-ms ${ageMs}`;
     $("export-command").parentElement.hidden = !page.folder;
-    $("export-command").textContent = page.folder ? `densify export ${page.folder} --min-confidence ${confidence}${age}` : "";
+    $("export-command").textContent = page.folder ? `densify export ${page.folder} --to npy --min-confidence ${confidence}${age}` : "";
   }
 }
 
