@@ -11,7 +11,6 @@ import cv2
 import numpy as np
 import pytest
 from densify.learning.networks import build
-from densify.outputs.arrows import draw_arrows
 from scipy.spatial import cKDTree
 from writers import write_street
 

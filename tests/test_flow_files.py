@@ -27,7 +27,7 @@ PLAIN = POSES_GIVEN | {"project": {"visibility": False}}  # no point has a say i
 @pytest.fixture(scope="module")
 def ours(tmp_path_factory) -> tuple[Result, Path]:
     """A run with the flow it found, and the folder of its flow files."""
-    result = by_flow(one_car(), KEY, 1, config=PLAIN | {"output": {"flow": True}})
+    result = by_flow(one_car(), KEY, 1, config=PLAIN | {"output": {"flow": "npz"}})
     folder = tmp_path_factory.mktemp("flow")
     write_flow_npz(folder, result.flow)
     return result, folder
@@ -88,7 +88,7 @@ def test_other_forms_of_the_same_flow(ours, dropped, tmp_path):
 
 
 def test_chained_over_more_steps_it_is_nearly_the_same(tmp_path):
-    ours = by_flow(one_car(), KEY, 2, config=POSES_GIVEN | {"output": {"flow": True}})
+    ours = by_flow(one_car(), KEY, 2, config=POSES_GIVEN | {"output": {"flow": "npz"}})
     assert sorted(ours.flow.steps) == [(1, 2), (2, 3), (3, 4), (4, 3), (5, 4)]
     write_flow_npz(tmp_path, ours.flow)
     found = by_flow(one_car(), KEY, 2, config=POSES_GIVEN | {"flow": {"engine": f"npz:{tmp_path}"}})

@@ -37,23 +37,30 @@ def staged_folder(folder: Path, owned: Collection[str]) -> Iterator[Path]:
     owned: names of entries that belong to the writer. Where ``folder`` exists, these are replaced
         or vanish, and every other entry is kept. Where it is a link, the link stays.
 
-    On any exception ``folder`` stays as it was.
+    On any exception ``folder`` and the folders above it are as they were before.
     """
     folder = Path(os.path.realpath(folder))
+    missing = [place for place in folder.parents if not place.exists()]
     folder.parent.mkdir(parents=True, exist_ok=True)
-    with _hidden_folder(folder) as hidden:
-        staging, old = hidden / "new", hidden / "old"
-        staging.mkdir()
-        yield staging
-        if folder.exists():
-            _copy_others(folder, staging, owned)
-            os.rename(folder, old)
-        try:
-            os.rename(staging, folder)
-        except BaseException:
-            if old.exists():
-                os.rename(old, folder)
-            raise
+    try:
+        with _hidden_folder(folder) as hidden:
+            staging = hidden / "new"
+            staging.mkdir()
+            yield staging
+            if folder.exists():
+                _copy_others(folder, staging, owned)
+                os.rename(folder, hidden / "old")
+            try:
+                os.rename(staging, folder)
+            except BaseException:
+                if (hidden / "old").exists():
+                    os.rename(hidden / "old", folder)
+                raise
+    except BaseException:
+        for place in missing:  # from the deepest up
+            with suppress(OSError):  # others wrote into it meanwhile
+                place.rmdir()
+        raise
 
 
 def clear_leftovers(root: Path, age_s: float = LEFT_AFTER_S) -> None:

@@ -104,7 +104,11 @@ def draw_arrows(points: Float, flows: Mapping[str, Float]) -> Figure:
         axes.scatter(points[~moves, 1], points[~moves, 0], s=2, color="0.6", linewidths=0)
         x, y, u, v = points[moves, 1], points[moves, 0], flow[moves, 1], flow[moves, 0]
         arrows = axes.quiver(
-            *(x, y, u, v, np.arctan2(v, u)),
+            x,
+            y,
+            u,
+            v,
+            np.arctan2(v, u),
             angles="xy",
             scale_units="xy",
             scale=1 / _ARROW_LENGTH,

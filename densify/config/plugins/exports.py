@@ -28,6 +28,7 @@ def _built_in(
 
 
 _MAPS = ("depth", "depth_filled", "confidence")
+_NERFSTUDIO = ("transforms.json", "images", "depth", "cloud.ply")
 _SPLATS = "what Gaussian splatting starts from, moving objects in their own frames"
 _KITTI = "maps, images and intrinsics in the tree of KITTI depth completion"
 _RRD = "one key or several over time, for rerun's viewer"
@@ -41,10 +42,7 @@ EXPORTS = Table(
         _built_in("exr", "array_files", "maps, float32 metres", *_MAPS),
         _built_in("ply", "cloud_files", "the cloud, all columns", "cloud.ply"),
         _built_in("pcd", "cloud_files", "the cloud, all columns", "cloud.pcd"),
-        _built_in(
-            *("nerfstudio", "nerfstudio", "images, cameras, depth and cloud"),
-            *("transforms.json", "images", "depth", "cloud.ply"),
-        ),
+        _built_in("nerfstudio", "nerfstudio", "images, cameras, depth and cloud", *_NERFSTUDIO),
         _built_in("colmap", "colmap", "images, cameras and points", "images", "sparse"),
         _built_in("splats", "colmap", _SPLATS, "images", "sparse", "movers", "tracks.json"),
         _built_in("kitti", "kitti", _KITTI, "train", "val", of_drive=True),
