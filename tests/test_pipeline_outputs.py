@@ -188,7 +188,8 @@ def test_every_point_is_accounted_for_and_the_picture_shows_what_was_left_out(tm
         assert (left_out == Reason[name.upper()]).sum() <= counts[name]
     write_result(result, {}, tmp_path, config=NPZ, data="street")
     picture = cv2.imread(str(tmp_path / f"{KEY:06d}" / "rejected" / "front.png"))
-    assert picture.shape[1] == left_out.shape[1] and picture.shape[0] > left_out.shape[0]
+    assert picture.shape[1] == 480 == 2 * left_out.shape[1]  # small images are enlarged
+    assert picture.shape[0] > 2 * left_out.shape[0]
 
 
 # --- precision over density -----------------------------------------------------------------------
