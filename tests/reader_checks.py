@@ -15,7 +15,6 @@ from densify.readers.street import Street
 from densify.scores.depth_metrics import DepthErrors, depth_errors
 from tests.scenes import by_flow
 
-MEASURED_ALONE = {"fill_reach": 0.1, "star_reach": 0}
 """Knobs of the projection for tests that look at what is measured: filling takes most of the time,
 and changes nothing of it."""
 
@@ -124,12 +123,11 @@ def check_depth(
 
 def depth_score(recording: LidarSequence, key: int, camera: str) -> DepthErrors:
     """Of the map of a key that is densified with one neighbour to either side."""
-    # The excerpt ends where the street goes on: nothing from beyond the window. Spots would count
-    # the same returns several times.
+    # The excerpt ends where the street goes on: nothing from beyond the window.
     config = {
         "register": {"source": "dataset"},
         "accumulate": {"far_m": 0},
-        "project": {"spot": 0, **MEASURED_ALONE},
+        "project": {"fill_reach": 0.1},
     }
     result = by_flow(recording, key, 1, [camera], config)
     depth_m, true_m = result.depth[camera].depth_m, recording.truth.depth_m(camera, key)

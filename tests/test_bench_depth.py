@@ -36,7 +36,7 @@ class TwoScanners(TinySequence):
 
 def test_counts_are_those_of_an_image_of_truth():
     sequence = one_car()
-    sparse = resolve({"register": {"source": "dataset"}}, ["project.edge_reach=2"])
+    sparse = resolve({"register": {"source": "dataset"}}, ["project.fill_reach=0.3"])
     found = bench_depth(sequence, [KEY], 2, {"usual": CONFIG, "sparse": sparse})["variants"]
     made = by_flow(sequence, KEY, 2, config=CONFIG)
     camera = sequence.cameras["front"]
@@ -62,7 +62,7 @@ def test_counts_are_those_of_an_image_of_truth():
         wrong = (off_px > 3) & (off_px > 0.05 * true_px)
         assert score["outliers"] == pytest.approx(wrong.mean(), abs=0.002)
         assert found["usual"]["density"][product] == np.mean(depth_m > 0)
-    assert found["sparse"]["density"]["measured"] < found["usual"]["density"]["measured"]
+    assert found["sparse"]["density"]["filled"] < found["usual"]["density"]["filled"]
 
 
 @pytest.mark.parametrize(("off_m", "wrong"), [(0.0, (0, 0.02)), (2.5, (0.7, 1))])

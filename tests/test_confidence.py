@@ -3,12 +3,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from densify.depth import confidence as scale
-from densify.depth.layers import Layers
+from densify.depth import project as stage
 from densify.geometry.types import DepthMap, Ranked
+from tests.depth_layers import layers_of
 from tests.scenes import CAMERA
 
 SMOOTH, FENCE, FILLED = 0, 1, 7
@@ -77,20 +80,11 @@ def test_groups_are_how_a_pixel_came_and_how_ragged_it_is_around():
     column = np.arange(shape[1])
     depth_m = everywhere.copy()
     depth_m[30:] = 0
-    layers = Layers(
-        depth_m=depth_m,
-        rim_m=np.where((column < 60) & (column % 2 == 0), everywhere, none),
-        veiled=none > 0,
-        refused=none > 0,
-        filled_m=everywhere,
-        confidence=everywhere / 2,
-        point=np.zeros(shape, np.int32),
-        tilt=np.zeros((*shape, 2), np.float32),
-        spacing_px=np.ones((*shape, 2), np.float32),
-    )
+    rim_m = np.where((column < 60) & (column % 2 == 0), everywhere, none)
+    layers = layers_of(everywhere, depth_m > 0, rim_m, 0.5, (1, 1))
     far = np.zeros(shape, bool)
     far[:10] = True
-    rank, group, contradicted = scale.ranked(layers, far, none)
+    rank, group, contradicted = scale.rank_pixels(layers, far, none)
     assert (rank == 0.5).all() and not contradicted.any()
     names = np.array(scale.GROUPS)[group]
     for row, how in ((5, "beyond"), (20, "window"), (45, "filled")):
@@ -105,13 +99,9 @@ def test_only_what_is_shown_tells_how_contradicted_it_is_around():
     column = np.arange(shape[1])
     shown = column % 2 == 0
     filled_m = np.where(shown, np.ones(shape, np.float32), none)
-    layers = Layers(
-        *(none, none, none > 0, none > 0, filled_m, none + 1, np.full(shape, -1, np.int32)),
-        tilt=np.zeros((*shape, 2), np.float32),
-        spacing_px=np.ones((*shape, 2), np.float32),
-    )
+    layers = layers_of(filled_m, shown < 0, confidence=1.0, spacing_px=(1, 1))
     contradicted = np.where(column >= 30, np.float32(0.05), none)
-    around = scale.ranked(layers, none > 0, np.where(shown, contradicted, 1)).contradicted
+    around = scale.rank_pixels(layers, none > 0, np.where(shown, contradicted, 1)).contradicted
     assert around[10, 20] == 0 and around[10, 40] == pytest.approx(0.05)
     assert 0 < around[10, 28] < around[10, 30] < 0.05  # four gaps to all sides
     assert around[10, 24] == 0 and around[10, 34] == pytest.approx(0.05)
@@ -148,3 +138,93 @@ def test_nothing_is_expected_of_an_empty_map():
     maps = made(empty, empty)
     assert scale.expected_outliers(maps) == {"measured": None, "filled": None}
     assert scale.reliability(maps, empty, CAMERA) == []
+
+
+# --- agreement with pixels around -----------------------------------------------------------------
+
+FOCAL_PX, GAP_PX, WALL_M = 700.0, 3.0, 12.0
+SHAPE = (40, 60)
+SPOT = (20, 30)
+
+
+def wall():
+    return np.full(SHAPE, WALL_M, np.float32)
+
+
+def gapped(filled_m, measured_m=None, **more):
+    """measured_m: (H,W), all that is filled if None."""
+    layers = layers_of(filled_m, spacing_px=(GAP_PX, GAP_PX), confidence=1.0, **more)
+    return layers if measured_m is None else replace(layers, depth_m=measured_m)
+
+
+@pytest.mark.parametrize(("there_m", "wrong"), [(WALL_M / 2, True), (0.96 * WALL_M, False)])
+def test_a_pixel_is_contradicted_by_surfaces_that_would_make_it_wrong(there_m, wrong):
+    depth_m = wall()
+    depth_m[SPOT] = there_m
+    share = scale.contradicted(gapped(depth_m), FOCAL_PX)
+    assert share[SPOT] == (pytest.approx(48 / 50) if wrong else 0)
+    assert share[SPOT[0], SPOT[1] + 3] == (pytest.approx(1 / 50) if wrong else 0)
+    assert share[SPOT[0], SPOT[1] + 4] == 0
+
+
+def test_what_is_measured_at_depth_edges_tells_too_and_fill_does_not():
+    filled_m, none = wall(), np.zeros(SHAPE, np.float32)
+    filled_m[SPOT] = WALL_M / 2
+    layers = gapped(filled_m, none, rim_m=wall())
+    assert scale.contradicted(layers, FOCAL_PX)[SPOT] == pytest.approx(48 / 50)
+    assert not scale.contradicted(replace(layers, rim_m=none), FOCAL_PX).any()
+
+
+def test_surfaces_go_on_with_their_slope():
+    """A road that recedes contradicts nothing."""
+    slope = 0.004
+    inverse = 1 / WALL_M + slope * (np.arange(SHAPE[0]) - SPOT[0])[:, None]
+    depth_m = np.broadcast_to(1 / np.clip(inverse, 0.02, None), SHAPE).astype(np.float32).copy()
+    flat = gapped(depth_m)
+    tilt = np.zeros((*SHAPE, 2), np.float32)
+    tilt[..., 1] = slope
+    sloped = replace(flat, tilt=tilt)
+    inside = (slice(SPOT[0] - 5, SPOT[0] + 5), slice(10, 50))
+    assert scale.contradicted(flat, FOCAL_PX)[inside].min() > 0.2
+    assert not scale.contradicted(sloped, FOCAL_PX)[inside].any()
+
+
+def test_what_most_around_contradicts_is_left_out():
+    depth_m = wall()
+    depth_m[SPOT] = WALL_M / 2  # one pixel alone
+    depth_m[:, 10:14] = WALL_M / 2  # a post
+    before = gapped(depth_m)
+    made = before.without(scale.contradicted(before, FOCAL_PX) > stage._MOST_CONTRADICTED)
+    lost = made.filled_m == 0
+    assert np.array_equal(np.argwhere(lost), [SPOT])
+    assert made.depth_m[SPOT] == made.confidence[SPOT] == 0
+    assert made.rim_m[SPOT] == depth_m[SPOT]
+
+
+def test_what_is_behind_a_closed_window_does_not_contradict_it():
+    depth_m = wall()
+    filled_m, window = depth_m.copy(), np.zeros(SHAPE, bool)
+    window[SPOT[0] - 4 : SPOT[0] + 5, 20:40] = True
+    filled_m[window] = WALL_M / 2
+    open_ = gapped(filled_m, depth_m)
+    share = scale.contradicted(open_, FOCAL_PX)
+    assert share[window].min() > 0.7
+    closed = replace(open_, window=window)
+    of_closed = scale.contradicted(closed, FOCAL_PX)
+    assert not of_closed[window].any()
+    assert np.array_equal(of_closed[~window], share[~window])
+    assert not open_.without(share > stage._MOST_CONTRADICTED).filled_m[window].any()
+    kept = closed.without(of_closed > stage._MOST_CONTRADICTED)
+    assert np.array_equal(kept.filled_m[window], filled_m[window])
+
+
+def test_a_few_around_tell_nothing():
+    """A single sweep measures one pixel in twenty."""
+    for num, lost in ((4, False), (6, True)):
+        depth_m = np.zeros(SHAPE, np.float32)
+        depth_m[SPOT[0] - 2, SPOT[1] - 3 : SPOT[1] - 3 + num] = WALL_M
+        filled_m = depth_m.copy()
+        filled_m[SPOT] = WALL_M / 2
+        layers = gapped(filled_m, depth_m)
+        made = layers.without(scale.contradicted(layers, FOCAL_PX) > stage._MOST_CONTRADICTED)
+        assert (made.filled_m[SPOT] == 0) == lost

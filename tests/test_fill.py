@@ -1,51 +1,40 @@
 # SPDX-License-Identifier: MIT
-"""Filling as far as rays lie apart, and what the image says of it; the window's rules are tested in
-test_project.py."""
+"""The fill between measured pixels: exact on planes, never across a step, by slow twins, and what
+it must leave empty. The rules of its windows are tested in test_project.py."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
-from densify.config import ProjectSettings
-from densify.depth.fill import fill, fill_between, without_shreds
-from densify.depth.layers import Layers
-from densify.depth.picture import lab
+from densify.depth import fill as stage
+from densify.depth.fill import FILL_CONFIDENCE, fill, fill_between, fill_stars, without_shreds
+from densify.depth.neighbours import DIRECTIONS, first_known
+from densify.geometry import threads
+from tests.depth_layers import layers_of
 
-SHAPE = (90, 120)
-
-
-def layers_of(depth, spacing_px, image=None):
-    depth = depth.astype(np.float32)
-    return Layers(
-        depth_m=depth,
-        rim_m=np.zeros_like(depth),
-        veiled=np.zeros(SHAPE, bool),
-        refused=np.zeros(SHAPE, bool),
-        filled_m=depth,
-        confidence=(depth > 0) * np.float32(0.8),
-        point=np.where(depth > 0, 0, -1).astype(np.int32),
-        tilt=np.zeros((*depth.shape, 2), np.float32),
-        spacing_px=np.ascontiguousarray(np.broadcast_to(np.float32(spacing_px), (*SHAPE, 2))),
-        lab=None if image is None else lab(image),
-    )
+SHAPE = (60, 80)
+ROW, COLUMN = np.mgrid[: SHAPE[0], : SHAPE[1]].astype(float)
+TILT = (5e-4, 8e-4)
+TILTED = 1 / (0.1 + TILT[0] * (COLUMN - 40) + TILT[1] * (ROW - 30))  # m, a plane
+WIDE = (8.0, 16.0)  # spacings of rays, px
 
 
 def test_windows_reach_as_far_as_rays_lie_apart_there():
     """Rings 3 px apart on the left and 12 px on the right: both are closed, neither beyond."""
-    v, u = np.mgrid[0 : SHAPE[0], 0 : SHAPE[1]]
-    left = u < 60
-    rings = np.where(left, v % 3 == 0, v % 12 == 0) & (v < 61)
+    left = COLUMN < 40
+    rings = np.where(left, ROW % 3 == 0, ROW % 12 == 0) & (ROW < 49)
     spacing = np.where(left[..., None], [1, 3], [1, 12])
-    filled = fill(layers_of(rings * 10.0, spacing), ProjectSettings(fill_reach=1.0)).filled_m
-    assert (filled[1:60, 2:58] > 0).all() and (filled[1:60, 62:-2] > 0).all()
-    assert not filled[61:].any()
-    narrow = fill(layers_of(rings * 10.0, (1, 3)), ProjectSettings(fill_reach=1.0)).filled_m
-    assert (narrow[1:60, 62:-2] > 0).mean() < 0.6
+    filled = fill(layers_of(rings * 10.0, spacing_px=spacing), 1.0).filled_m
+    assert (filled[1:48, 2:38] > 0).all() and (filled[1:48, 42:-2] > 0).all()
+    assert not filled[49:].any()
+    narrow = fill(layers_of(rings * 10.0, spacing_px=(1, 3)), 1.0).filled_m
+    assert (narrow[1:48, 42:-2] > 0).mean() < 0.6
 
 
-def test_filling_does_not_know_how_large_pixels_are():
+def test_filling_does_not_depend_on_the_size_of_pixels():
     """Twice the resolution, twice the spacing: the same is filled."""
     rng = np.random.default_rng(2)
     depth = np.where(rng.uniform(size=(40, 50)) < 0.15, 10.0, 0).astype(np.float32)
@@ -53,68 +42,198 @@ def test_filling_does_not_know_how_large_pixels_are():
     wide[::2, ::2] = depth
 
     def share(of, spacing):
-        spacing_px = np.full((*of.shape, 2), spacing, np.float32)
-        filled, _ = fill_between(of, of / 10, spacing_px, 1.5, 0.2, 0.05, 0.5)
-        return (filled > 0).mean()
+        two = (*of.shape, 2)
+        spacing_px, tilt = np.full(two, spacing, np.float32), np.zeros(two, np.float32)
+        return (fill_between(of, of / 10, tilt, spacing_px, 1.5)[0] > 0).mean()
 
     assert abs(share(depth, (2, 4)) - share(wide, (4, 8))) < 0.06
 
 
 def test_the_image_lets_the_fill_come_closer_to_an_edge():
     """A post before a wall: without an image the other surface's votes keep the edge empty."""
-    depth = np.full(SHAPE, 20.0)
-    depth[:, 50:70] = 10.0
+    post = (COLUMN >= 30) & (COLUMN < 50)
     known = np.random.default_rng(0).uniform(size=SHAPE) < 0.3
-    sparse = np.where(known, depth, 0)
-    image = np.full((*SHAPE, 3), 200, np.uint8)
-    image[:, 50:70] = (40, 60, 90)
-    settings = ProjectSettings(edge_m=10.0)  # planes through both surfaces are tried
+    sparse = np.where(known, np.where(post, 10.0, 20.0), 0)
+    image = np.where(post[..., None], (40, 60, 90), 200).astype(np.uint8)
+    edges = np.isin(COLUMN, [28, 29, 30, 31, 48, 49, 50, 51]) & ~known & (ROW > 3) & (ROW < 56)
 
-    def closed(image):
-        """Shares of the empty pixels at the edges that are filled, and of those the wrong ones."""
-        filled = fill(layers_of(sparse, (4, 4), image), settings).filled_m
+    def share(image):
+        filled = fill(layers_of(sparse, spacing_px=(4, 4), image=image), 1.5).filled_m
         assert np.array_equal(filled[known], sparse[known].astype(np.float32))
-        edges = np.zeros(SHAPE, bool)
-        edges[4:-4, [47, 48, 49, 50, 51, 52, 67, 68, 69, 70, 71, 72]] = True
-        here = edges & ~known
-        wrong = np.abs(filled - depth) > 1.5
-        return (filled[here] > 0).mean(), wrong[here & (filled > 0)].mean()
+        return (filled[edges] > 0).mean()
 
-    (share, wrong), (share_without, wrong_without) = closed(image), closed(None)
-    assert share > 1.5 * share_without
-    assert wrong < 0.01 and wrong_without < 0.05
+    assert share(image) > share(None)
 
 
 def test_confidence_covers_what_is_filled():
-    rng = np.random.default_rng(1)
-    layers = layers_of(np.where(rng.uniform(size=SHAPE) < 0.1, 12.0, 0), (3, 6))
-    made = fill(replace(layers, confidence=layers.confidence), ProjectSettings())
+    sparse = np.where(np.random.default_rng(1).uniform(size=SHAPE) < 0.1, 12.0, 0)
+    layers = layers_of(sparse, spacing_px=(3, 6))
+    made = fill(layers, 1.5)
     assert np.array_equal(made.confidence > 0, made.filled_m > 0)
     assert np.array_equal(made.depth_m, layers.depth_m)
 
 
+def test_slopes_of_filled_pixels_are_the_planes():
+    sparse = np.random.default_rng(8).random(SHAPE) < 0.3
+    made = fill(layers_of(np.where(sparse, TILTED, 0), spacing_px=(4, 4)), 1.5)
+    inside = (made.filled_m > 0) & ~sparse
+    assert inside.mean() > 0.5
+    np.testing.assert_allclose(np.median(made.tilt[inside], axis=0), TILT, rtol=1e-3)
+
+
 def test_streaks_go_and_surfaces_stay():
-    """Rays 12 px apart: of what is around lines 6 px apart less than a fifth is known."""
-    layers = layers_of(np.zeros(SHAPE), (12, 12))
-    layers.depth_m[40, 10] = layers.depth_m[60, 100] = 10
-    filled = np.where(layers.depth_m > 0, layers.depth_m, 0)
-    filled[5:35:6, 10:100] = 10
-    filled[50:80, 20:60] = 10
-    kept = without_shreds(replace(layers, filled_m=filled))
-    assert not kept.filled_m[:38].any()
-    assert (kept.filled_m[50:80, 20:60] > 0).all()
-    assert kept.depth_m[40, 10] and kept.filled_m[60, 100]  # what is measured may stand alone
+    """Rays 12 px apart: of the pixels around lines 6 px apart less than a fifth is known."""
+    filled = np.where((ROW % 6 == 5) & (ROW < 30) & (COLUMN > 5), 10.0, 0)
+    filled[38:, 20:60] = 10
+    filled[35, 5] = filled[50, 75] = 10
+    measured = np.isin(ROW, [35, 50]) & np.isin(COLUMN, [5, 75])
+    kept = without_shreds(layers_of(filled, measured, spacing_px=(12, 12)))
+    assert not kept.filled_m[:31].any()
+    assert (kept.filled_m[38:, 20:60] > 0).all()
+    assert kept.depth_m[35, 5] and kept.filled_m[50, 75]  # a measured pixel may stand alone
 
 
-def test_a_pillar_of_which_little_was_measured_is_not_filled_over():
+def test_a_pillar_with_few_measured_pixels_is_not_filled_over():
     """Before a wall at 20 m: a few returns at 5 m, too near to its edges to be accepted."""
     wall = np.where(np.arange(SHAPE[1]) % 3 == 0, 20.0, 0.0) * np.ones(SHAPE)
-    wall[:, 58:63] = 0
-    plain = layers_of(wall, (3, 3))
+    wall[:, 40:45] = 0
     rims = np.zeros(SHAPE, np.float32)
-    rims[::4, 60] = 5
-    knobs = ProjectSettings()
-    assert (fill(plain, knobs).filled_m[10:80, 59:62] > 0).all()
-    assert not fill(replace(plain, rim_m=rims), knobs).filled_m[10:80, 60].any()
+    rims[::4, 42] = 5
+    plain = layers_of(wall)
+    inside, pillar = np.s_[10:50, 41:44], np.s_[10:50, 42]
+    assert (fill(plain, 1.5).filled_m[inside] > 0).all()
+    assert not fill(replace(plain, rim_m=rims), 1.5).filled_m[pillar].any()
     veiled = replace(plain, rim_m=rims, veiled=rims > 0)  # nobody knows which of the two it is
-    assert (fill(veiled, knobs).filled_m[10:80, 59:62] > 0).all()
+    assert (fill(veiled, 1.5).filled_m[inside] > 0).all()
+
+
+# --- stars ----------------------------------------------------------------------------------------
+
+
+def star(depth_m, **more):
+    return fill_stars(layers_of(depth_m, **{"tilt": TILT, "spacing_px": WIDE, **more}))
+
+
+def disc(radius_px, row=30, column=40):
+    return (ROW - row) ** 2 + (COLUMN - column) ** 2 <= radius_px**2
+
+
+def test_a_hole_in_a_plane_gets_the_planes_depth():
+    hole = disc(9) | ((ROW == 44) & (COLUMN > 10))  # such as between a scanner's two blocks
+    filled = star(np.where(hole, 0, TILTED))
+    assert (filled.filled_m > 0).all()
+    np.testing.assert_allclose(filled.filled_m, TILTED, rtol=2e-3)
+    assert not filled.depth_m[hole].any()
+    np.testing.assert_allclose(filled.confidence[hole], 0.8 * FILL_CONFIDENCE)
+
+
+def test_the_comb_at_the_lower_border_is_closed_and_nothing_below_it():
+    teeth = np.where(COLUMN % 6 == 0, 50, 42)
+    filled = star(np.where(teeth > ROW, TILTED, 0)).filled_m
+    between = (ROW < 48) & (COLUMN > 0) & (COLUMN < 78)
+    np.testing.assert_allclose(filled[between], TILTED[between], rtol=5e-3)
+    assert not filled[ROW >= 50].any()
+
+
+@pytest.mark.parametrize("height_px", [1, 6])
+def test_a_strip_along_the_lower_border_is_closed_and_none_along_the_others(height_px):
+    around = np.minimum(np.minimum(ROW, COLUMN), COLUMN[:, ::-1]) < height_px
+    strip = (ROW[::-1] < height_px) & (COLUMN > 20) & (COLUMN < 60)
+    filled = star(np.where((ROW[::-1] < height_px) | around, 0, TILTED)).filled_m
+    np.testing.assert_allclose(filled[strip], TILTED[strip], rtol=2e-3)
+    assert not filled[around & (ROW < 50)].any()
+
+
+@pytest.mark.parametrize("edge", ["column", "row", "diagonal"])
+@pytest.mark.parametrize("width_px", [1, 3, 8])
+def test_no_depth_edge_is_crossed(edge, width_px):
+    along = {"column": COLUMN - 40, "row": ROW - 30, "diagonal": (COLUMN - 40 + ROW - 30) / 1.4}
+    side = along[edge]
+    depth_m = np.where(side < 0, 8.0, 9.0)
+    strip = np.abs(side + 0.1) < width_px / 2 + 0.5
+    filled = star(np.where(strip, 0, depth_m), tilt=(0, 0)).filled_m
+    new = strip & (filled > 0)
+    inner = (ROW > 12) & (ROW < 48) & (COLUMN > 12) & (COLUMN < 68)
+    assert not (new & inner).any()
+    assert not (new & (np.abs(filled / depth_m - 1) > 0.05)).any()
+
+
+@pytest.mark.parametrize("known", [ROW < 30, ROW < 53])
+def test_what_known_pixels_do_not_surround_stays_empty(known):
+    assert not star(np.where(known, TILTED, 0)).filled_m[~known].any()
+
+
+def test_holes_wider_than_the_reach_stay_empty():
+    assert not star(np.where(disc(20), 0, TILTED), spacing_px=(6, 12)).filled_m[disc(6)].any()
+
+
+def test_a_fence_is_no_wall():
+    """Wires 6 m away, and between them something 11 m away."""
+    wire = (COLUMN % 8 < 2) | (ROW % 10 < 2)
+    behind = (COLUMN % 8 == 5) & (ROW % 10 == 6)
+    hole = ~wire & ~behind & (ROW > 5) & (ROW < 55) & (COLUMN > 5) & (COLUMN < 75)
+    filled = star(np.where(wire, 6.0, np.where(behind, 11.0, 0)), tilt=(0, 0)).filled_m
+    assert (filled[hole] > 0).mean() < 0.25
+    assert (star(np.where(wire, 6.0, 0), tilt=(0, 0)).filled_m[hole] > 0).all()
+
+
+def ragged(rng):
+    """A plane, a nearer block, and holes of all sizes."""
+    depth_m = np.where((COLUMN > 50) & (ROW > 20), 6.0, TILTED * rng.uniform(0.99, 1.01, SHAPE))
+    return np.where((rng.random(SHAPE) < 0.5) | disc(8), 0, depth_m)
+
+
+def test_threads_change_no_byte(monkeypatch):
+    layers, results = layers_of(ragged(np.random.default_rng(6)), spacing_px=WIDE), []
+    for cores in (1, 3):
+        monkeypatch.setattr(threads, "num_threads", lambda cores=cores: cores)
+        monkeypatch.setattr(threads, "_LEAST_ROWS", 64)
+        filled = fill_stars(fill(layers, 0.2))
+        results.append(filled.filled_m.tobytes() + filled.confidence.tobytes())
+    assert results[0] == results[1]
+
+
+def star_twin(row, column, inverse, slope, known, spacing_px):
+    """Depth and confidence of one pixel, zeros where the known ones around do not agree."""
+    met, given = [], []
+    for single, double in DIRECTIONS:
+        met.append(False)
+        for k in range(1, 255):
+            du, dv = (k // 2) * double + (k % 2) * single
+            if not (0 <= row + dv < SHAPE[0] and 0 <= column + du < SHAPE[1]):
+                break
+            there = inverse[row + dv, column + du]
+            if there > 0:
+                if np.hypot(du, dv) <= max(spacing_px):
+                    met[-1] = True
+                    w = there - slope[row + dv, column + du] @ (du, dv)
+                    w = np.clip(w, 0.7 * there, 1.4 * there)
+                    given.append((w, 1 / k, known[row + dv, column + du]))
+                break
+    if not given:
+        return 0.0, 0.0
+    w, weight, confidence = np.array(given).T
+    above = inverse[row::-1, column] > 0
+    along = 2 * (above.any() and SHAPE[0] - 1 - row + above.argmax() <= 6)
+    runs = "".join("01"[m] for m in met) * 2
+    mean = np.average(w, weights=weight)
+    if len(given) < 8 - along or "0" * (8 + along) in runs or np.ptp(w) > 0.1 * mean:
+        return 0.0, 0.0
+    return 1 / mean, confidence.min()
+
+
+def test_stars_equal_those_of_a_slow_twin():
+    rng = np.random.default_rng(7)
+    depth_m = ragged(rng)
+    known = np.where(depth_m > 0, rng.random(SHAPE), 0).astype(np.float32)
+    inverse = np.divide(1, depth_m, out=np.zeros(SHAPE), where=depth_m > 0).astype(np.float32)
+    slope = rng.normal(0, 2e-4, (*SHAPE, 2)).astype(np.float32)
+    spacing_px = np.broadcast_to(np.float32([3, 7]), (*SHAPE, 2)).copy()
+    pixel = np.flatnonzero(depth_m == 0)
+    found = np.zeros((2, len(pixel)), np.float32)
+    steps = first_known(depth_m > 0)
+    stage._star(0, len(pixel), pixel, steps, inverse, slope, known, spacing_px, found)
+    for p, got in zip(pixel, found.T, strict=True):
+        expected = star_twin(*divmod(p, SHAPE[1]), inverse, slope, known, (3, 7))
+        np.testing.assert_allclose(got, expected, rtol=1e-4, err_msg=str(p))
+    assert 0.2 < (found[0] > 0).mean() < 0.9

@@ -19,7 +19,7 @@ FISHEYE = Camera(
 )
 
 
-def seen_from(camera, points, normal, spacing_m, measure, **knobs):
+def seen_from(camera, points, normal, spacing_m, measure):
     """Points in the camera's own frame, each with its patch."""
     n = len(points)
     patches = Patches(
@@ -29,10 +29,8 @@ def seen_from(camera, points, normal, spacing_m, measure, **knobs):
         np.zeros(n, np.int32),
         np.full(n, -1, np.int32),
     )
-    settings = ProjectSettings(support=1, **knobs)
-    cloud = make_cloud(points)
-    view = Exposure(camera, np.eye(4), measure=measure).sees(cloud)
-    return project(cloud, view, settings, patches)
+    exposure = Exposure(camera, np.eye(4), measure=measure)
+    return project(make_cloud(points), exposure, ProjectSettings(support=1), patches, filled=False)
 
 
 def pixels(camera, step=1):
@@ -52,14 +50,13 @@ def ground(camera, down_m=1.6, step=2, reach_m=30.0):
 def test_ground_hides_itself_nowhere_in_a_fisheye(measure):
     """As it would if its slope were taken for that in a pinhole's image."""
     points = ground(FISHEYE)
-    knobs = {"footprint": 0.0, "slack_m": 0.1, "hidden_m": 0.01, "hidden_fraction": 0.01}
-    maps = seen_from(FISHEYE, points, [0, 1.0, 0], (0.1, 0.1), measure, **knobs)
+    maps = seen_from(FISHEYE, points, [0, 1.0, 0], (0.5, 0.5), measure)
     assert maps.measure == measure
     ahead = points[:, 2] > 1.0 if measure == "z" else np.ones(len(points), bool)
     hidden = maps.reason[ahead] == Reason.HIDDEN
     assert hidden.mean() < 0.002
     facing = points / np.sum(points**2, axis=1, keepdims=True)
-    steep = seen_from(FISHEYE, points, facing, (0.1, 0.1), measure, **knobs)
+    steep = seen_from(FISHEYE, points, facing, (0.5, 0.5), measure)
     assert (steep.reason[ahead] == Reason.HIDDEN).mean() > 0.3  # what the slope prevents
 
 
@@ -85,7 +82,7 @@ def test_depth_of_a_plane_is_that_in_the_middle_of_the_pixel(measure):
 
 @pytest.mark.parametrize("angle_deg", [0.0, 50.0, 90.0])
 def test_patches_are_as_large_as_the_lens_shows_them(angle_deg):
-    """A panel of 0.6 m x 0.4 m at 6 m: along the image's middle row 0.1 rad aside."""
+    """A panel at 6 m of 0.4 times the spacing, and 0.05 m, to each side."""
     there = np.radians(angle_deg)
     spot = 6.0 * np.array([[np.sin(there), 0.0, np.cos(there)]])
     back = 20 * rays(FISHEYE, pixels(FISHEYE))
@@ -96,7 +93,7 @@ def test_patches_are_as_large_as_the_lens_shows_them(angle_deg):
     exposure[:3, :3] = [[1, 0, 0], [0, 0, -1], [0, 1, 0]]  # key z up
     n = len(points)
     spacing = np.zeros((n, 2), np.float32)
-    spacing[0] = 0.6, 0.4
+    spacing[0] = (0.6 - 0.1) / 0.8, (0.4 - 0.1) / 0.8
     patches = Patches(
         (facing @ exposure[:3, :3]).astype(np.float32),
         spacing,
@@ -105,8 +102,8 @@ def test_patches_are_as_large_as_the_lens_shows_them(angle_deg):
         np.full(n, -1, np.int32),
     )
     cloud = make_cloud(points @ exposure[:3, :3])
-    knobs = ProjectSettings(support=1, footprint=0.5, slack_m=0.0)
-    maps = project(cloud, Exposure(FISHEYE, exposure, measure="range").sees(cloud), knobs, patches)
+    seen = Exposure(FISHEYE, exposure, measure="range")
+    maps = project(cloud, seen, ProjectSettings(support=1), patches, filled=False)
     uv, inside = image_points(FISHEYE, points)
     assert inside.all()
     hidden = np.rint(uv[1:][maps.reason[1:] == Reason.HIDDEN])

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from densify.depth.object_tracks import object_tracks
+from densify.depth.accumulate import object_tracks
 from densify.geometry import poses
 from densify.geometry.types import FlowField, Stretch
 from tests.exact_motion import CAR, FRAMES, KEY, T_world_lidar, scene, turning
@@ -112,7 +112,7 @@ def test_what_cannot_be_followed_has_no_track(what):
 def test_points_on_a_line_turn_no_more_than_they_tell():
     rng = np.random.default_rng(2)
     along = np.outer(rng.uniform(-2, 2, 30), [1.0, 0.2, 0.0])
-    from densify.depth.object_tracks import _rigid
+    from densify.depth.accumulate import _rigid
 
     T = poses.exp(np.array([0, 0, 0.2, 1.0, 2.0, 0.1]))
     found = _rigid(along, poses.transform(T, along))

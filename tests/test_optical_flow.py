@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from densify.depth.exposure import Exposure
-from densify.depth.optical_flow import optical_flow
+from densify.depth.views import optical_flow
 from densify.geometry import poses
 from densify.geometry.types import Camera, Cloud, DepthMap, Reason
 from densify.outputs.depth_png import write_flow_png

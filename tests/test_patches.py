@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 from test_project import KEY, make_cloud, patches_of
 
-from densify.config import ProjectSettings
-from densify.depth.patches import Tangents, patches, tangents
+from densify.depth.patches import patches
 from densify.free_space.range_image import RangeImage
 from densify.free_space.sensor import Sensors
 from densify.geometry.types import RegisteredSweep, Sweep
@@ -58,7 +57,7 @@ def test_spacing_is_the_sensors_own(sensor):
     ray = ray[ray[:, 0] > 0.2]
     points, _ = scanned(ray, origin)
     cloud = make_cloud(points, KEY + 1)
-    found = patches_of(cloud, ProjectSettings(), {KEY + 1: origin[None]})
+    found = patches_of(cloud, {KEY + 1: origin[None]})
     range_m = np.linalg.norm(points - origin, axis=1)
     level_m = range_m * np.hypot(ray[:, 0], ray[:, 1])
     across = found.spacing_m[:, 0] / level_m / np.radians(azimuth_deg)
@@ -75,7 +74,7 @@ def test_normals_of_ground_and_wall(sensor):
     ray = directions(*SENSORS[sensor])
     ray = ray[ray[:, 0] > 0.3]
     points, on_ground = scanned(ray)
-    normal = patches_of(make_cloud(points), ProjectSettings()).normal.astype(float)
+    normal = patches_of(make_cloud(points)).normal.astype(float)
     np.testing.assert_allclose(np.einsum("ij,ij->i", normal, points), 1, rtol=1e-3)
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
     truth = np.where(on_ground[:, None], [0, 0, -1.0], [1.0, 0, 0])
@@ -89,7 +88,7 @@ def test_a_post_before_a_wall_faces_the_scanner():
     points = ray * (30 / ray[:, :1])
     post = np.abs(ray[:, 1]) < 0.002
     points[post] *= 1 / 3
-    normal = patches_of(make_cloud(points), ProjectSettings()).normal.astype(float)
+    normal = patches_of(make_cloud(points)).normal.astype(float)
     assert post.sum() > 10
     towards = np.einsum("ij,ij->i", normal, ray) / np.linalg.norm(normal, axis=1)
     assert towards[post].min() > 0.99
@@ -99,8 +98,8 @@ def test_order_of_the_points_does_not_matter():
     rng = np.random.default_rng(3)
     points, _ = scanned(directions(*SENSORS["16 beams"])[:4000] + [1e-3, 0, 0])
     order = rng.permutation(len(points))
-    one = patches_of(make_cloud(points), ProjectSettings())
-    other = patches_of(make_cloud(points[order]), ProjectSettings())
+    one = patches_of(make_cloud(points))
+    other = patches_of(make_cloud(points[order]))
     assert one.normal[order].tobytes() == other.normal.tobytes()
     assert one.spacing_m[order].tobytes() == other.spacing_m.tobytes()
 
@@ -111,7 +110,7 @@ def test_equal_points_have_equal_patches(name):
     sweep, sensors = registered.sweep, Sensors.of([registered])
     rows = np.random.default_rng(4).permutation(np.repeat(np.arange(len(sweep)), 2))
     cloud = replace(make_cloud(sweep.points[rows]), lidar=sweep.lidar[rows])
-    found = patches(cloud, KEY, ProjectSettings(), sensors, {KEY: sensors.origins_m})
+    found = patches(cloud, KEY, sensors, {KEY: sensors.origins_m})
     one, other = np.argsort(rows, kind="stable").reshape(-1, 2).T
     assert found.normal[one].tobytes() == found.normal[other].tobytes()
 
@@ -129,19 +128,14 @@ def test_veto_of_what_the_key_saw_through():
     spots = np.array([[20, 0.5, 0.4], [29.9, 0.5, 0.4], [33, 0.5, 0.4], [20, 0.5, 0.4]])
     cloud = make_cloud(np.vstack([points, spots]), [KEY] * n + [KEY + 2] * 3 + [KEY])
 
-    def free(knobs, image):
-        return patches_of(cloud, knobs, None, image).free
-
-    found = free(ProjectSettings(), key_image)
+    found = patches_of(cloud, None, key_image).free
     assert found[n:].tolist() == [True, False, False, False] and not found[:n].any()
-    assert not free(ProjectSettings(veto_m=10.0), key_image).any()
-    assert not free(ProjectSettings(veto_m=10.0, veto_fraction=1.0), key_image).any()
-    assert not free(ProjectSettings(), None).any()
+    assert not patches_of(cloud).free.any()
 
 
 def test_empty_and_tiny_clouds():
     for n in (0, 1, 3):
-        found = patches_of(make_cloud(np.ones((n, 3))), ProjectSettings())
+        found = patches_of(make_cloud(np.ones((n, 3))))
         assert found.normal.shape == (n, 3) and found.spacing_m.shape == (n, 2)
         assert found.free.shape == (n,) and found.sweep.shape == (n,)
         assert np.isfinite(found.normal).all() and (found.spacing_m > 0).all()
@@ -160,7 +154,7 @@ def patches_of_sweep(registered: RegisteredSweep):
     sweep = registered.sweep
     cloud = replace(make_cloud(sweep.points), lidar=sweep.lidar)
     sensors = Sensors.of([registered])
-    found = patches(cloud, KEY, ProjectSettings(), sensors, {KEY: sensors.origins_m})
+    found = patches(cloud, KEY, sensors, {KEY: sensors.origins_m})
     return found, sensors
 
 
@@ -190,30 +184,3 @@ def test_spacings_are_of_the_scanner_that_measured_and_from_where_it_stands():
         expected = range_m[:, None] * model.table.at(azimuth, elevation)
         close = np.isclose(found.spacing_m[mine], expected, rtol=1e-3).all(axis=1)
         assert close.mean() > 0.97  # the others stand on the border of a bin
-
-
-def test_methods_share_tangents_and_each_finds_its_own(monkeypatch):
-    """The second method's are those that it finds alone, and only what the first did not want is
-    worked out for it."""
-    registered = in_a_room("panda")
-    sweep, sensors = registered.sweep, Sensors.of([registered])
-    cloud = replace(make_cloud(sweep.points), lidar=sweep.lidar)
-    rng, shared, asked = np.random.default_rng(5), Tangents(), []
-    usual = tangents
-    watched = lambda *a: (asked.append(int(a[3].sum())), usual(*a))[1]  # noqa: E731
-    monkeypatch.setattr("densify.depth.patches.tangents", watched)
-    known = np.zeros(len(cloud), bool)
-    for moved_m in (0.0, 0.3):
-        wanted = rng.random(len(cloud)) < 0.6
-        other = replace(cloud, points=cloud.points + moved_m)
-        given = ProjectSettings(), sensors, {KEY: sensors.origins_m}, None, wanted
-        found, alone = patches(other, KEY, *given, shared), patches(other, KEY, *given)
-        assert asked[-2:] == [(wanted & ~known).sum(), wanted.sum()]
-        assert found.normal.tobytes() == alone.normal.tobytes()
-        assert found.spacing_m.tobytes() == alone.spacing_m.tobytes()
-        known |= wanted
-    # other points, where registration puts them, have tangents of their own
-    turned = replace(cloud, rigid_points=cloud.rigid_points[:, [1, 0, 2]])
-    found, alone = patches(turned, KEY, *given, shared), patches(turned, KEY, *given)
-    assert asked[-2:] == [wanted.sum()] * 2
-    assert found.normal.tobytes() == alone.normal.tobytes()

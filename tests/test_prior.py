@@ -7,13 +7,12 @@ import cv2
 import numpy as np
 import pytest
 
-from densify.config import PriorSettings
 from densify.depth import prior as stage
 from densify.depth.prior import complete, fit_prior
 from densify.geometry.types import DepthMap, Prior
 
 H, W, FOCAL_PX, HEIGHT_M = 150, 240, 200.0, 1.6
-AUTO = PriorSettings()
+AUTO = "auto"
 
 
 def scene():
@@ -99,7 +98,7 @@ def test_what_is_known_stays_as_it_is(name):
 
 def test_smooth_errors_are_taken_off():
     value = SAFE * smooth(3)
-    full = complete(measured(), prior(value), PriorSettings(kind="depth"))
+    full = complete(measured(), prior(value), "depth")
     where = full.from_prior
     p = value[where] if full.fit.kind == "depth" else np.log(value[where])
     by_curve = full.fit.scale * p + full.fit.shift
@@ -175,9 +174,6 @@ def test_sky_stays_empty_by_mask_and_by_distance():
     unmasked = complete(measured(), Prior(value.astype(np.float32), ~(SKY | ~SKY), "test"), AUTO)
     for full in (masked, unmasked):
         assert not full.depth_m[SKY].any() and full.from_prior.sum() > 3000
-    nearer = complete(measured(), prior(value), PriorSettings(far_m=25))
-    assert nearer.from_prior.any() and nearer.depth_m[nearer.from_prior].max() < 25
-    assert not nearer.from_prior[TRUE_M > 25.5].any()
 
 
 @pytest.mark.parametrize("inverse", [False, True])
@@ -220,8 +216,7 @@ def test_pixels_between_two_surfaces_are_left_out():
 )
 def test_what_does_not_fit_is_not_used(value):
     maps = measured()
-    settings = PriorSettings(kind="depth")
-    full = complete(maps, prior(np.maximum(value, 0.01)), settings)
+    full = complete(maps, prior(np.maximum(value, 0.01)), "depth")
     assert not full.fit.used and not full.from_prior.any() and full.share == 0
     assert full.depth_m.tobytes() == maps.filled_m.tobytes()
     assert (full.confidence[maps.filled_m > 0] > 0.2).all()
@@ -230,8 +225,7 @@ def test_what_does_not_fit_is_not_used(value):
 
 def test_a_kind_can_be_forced():
     fits = {
-        kind: complete(measured(), prior(7 / SAFE + 0.4), PriorSettings(kind=kind)).fit
-        for kind in ("inverse", "depth")
+        kind: complete(measured(), prior(7 / SAFE + 0.4), kind).fit for kind in ("inverse", "depth")
     }
     assert fits["inverse"].used and not fits["depth"].used
     assert fits["depth"].kind in ("depth", "log")
@@ -260,5 +254,5 @@ def test_octaves_count_alike():
     """A prior that is right on the road alone does not fit."""
     z = np.concatenate([np.full(8000, 6.0), np.full(900, 30.0), np.full(1100, 50.0)])
     p = np.concatenate([z[:8000], np.full(2000, 12.0)]) * (1 + 1e-3 * np.sin(np.arange(10_000)))
-    fit = fit_prior(p.astype(np.float32), z.astype(np.float32), PriorSettings(kind="depth"))
+    fit = fit_prior(p.astype(np.float32), z.astype(np.float32), "depth")
     assert fit.wrong > 0.25 and not fit.used

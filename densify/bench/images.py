@@ -14,7 +14,7 @@ from scipy import ndimage
 from densify.bench.depth import exact_truth
 from densify.config import resolve
 from densify.depth.exposure import key_shots, load_images
-from densify.depth.picture import lab
+from densify.depth.image_alignment import lab
 from densify.depth.views import HeldOut, SeenCloud, Views
 from densify.free_space.range_image import RangeImage
 from densify.geometry.types import DepthMap, Float32, LidarSequence

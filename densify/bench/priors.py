@@ -76,7 +76,7 @@ def bench_priors(sequence: LidarSequence, key: int, camera: str) -> dict[str, Co
         value = _blurred(fault.value(safe_m * np.exp(fault.wanders * wander)), ~sky)
         value = value * np.exp(fault.noise * noise)
         prior = Prior(np.where(sky, 0, value).astype(np.float32), sky, name)
-        full = complete(maps, prior, config.prior)
+        full = complete(maps, prior, config.prior.kind)
         scaled_m = np.where(sky, 0, fault.scaled(np.where(sky, 1, value)))
         scaled, fitted = (
             depth_errors(depth_m, true_m, full.from_prior, focal_px=focal_px)

@@ -134,8 +134,6 @@ _PARTS = {
     "no rims": ("project.rims=strict",),
     "no windows": ("project.glass=keep",),
     "no two-sided fill": ("project.fill_reach=0.1",),
-    "no star fill": ("project.star_reach=0",),
-    "rays open nothing": ("project.seen_through=1",),
 }
 
 

@@ -169,81 +169,16 @@ class ProjectSettings(Section):
     visibility: bool = knob(
         True, "off: each pixel's nearest point as it is; what is hidden shines through (a baseline)"
     )
-    veto_m: float = knob(
-        0.3,
-        "[m] a point of another sweep this much or veto_fraction of its range (the larger) before "
-        "what the key sweep saw there is left out; smaller finds more ghosts and loses thin things",
-        0,
-        10,
-    )
-    veto_fraction: float = knob(0.015, "see veto_m; share of the range", 0, 1)
-    footprint: float = knob(
-        0.4,
-        "half size of the patch a point stands for, in spacings of neighbouring rays; larger hides "
-        "more of what shines through gaps and eats background beside near objects",
-        0,
-        5,
-    )
-    slack_m: float = knob(
-        0.05, "[m] added to that half size, for errors of registration and flow", 0, 1
-    )
-    hidden_m: float = knob(
-        0.2,
-        "[m] a point this much plus hidden_fraction behind the nearest patch is hidden; smaller "
-        "removes more ghosts and more of rough and slanted surfaces",
-        0,
-        10,
-    )
-    hidden_fraction: float = knob(0.06, "see hidden_m; share of the depth", 0, 1)
-    seen_through: float = knob(
-        0.25,
-        "a pixel is left out if more than this share of the rays there went through its surface: "
-        "the gaps of a fence; smaller opens more of them and thins hedges and outlines; 1: never",
-        0,
-        1,
-    )
     support: int = knob(
         4,
         "sweeps that must agree with a point, the one nearest to the key among them, at most half "
-        "of those there are, or else several returns of the key sweep; more removes what was badly "
-        "registered and thins far surfaces",
+        "of all; more removes what was badly registered and thins far surfaces",
         1,
         20,
     )
-    support_reach: float = knob(
-        0.8, "how far around a pixel they are looked for, in spacings of neighbouring rays", 0.1, 5
-    )
-    plane_reach: float = knob(
-        0.5,
-        "how far a pixel's depth is averaged, in spacings; larger is smoother and rounds what is "
-        "curved",
-        0,
-        5,
-    )
-    agree_m: float = knob(
-        0.1, "[m] points agree that deviate less than this plus agree_fraction", 0.001, 5
-    )
-    agree_fraction: float = knob(0.01, "see agree_m; share of the depth", 0, 1)
-    edge_reach: float = knob(
-        0.35,
-        "a point nearer than this to the edge of its surface is left out, in spacings along the "
-        "azimuth: beams are about as wide; smaller fattens outlines, larger eats thin things",
-        0,
-        5,
-    )
-    edge_slack_m: float = knob(
-        0.015, "[m] added to that, for errors of registration and flow", 0, 1
-    )
-    spot: float = knob(
-        0.35,
-        "half width of a laser's spot, in spacings along the azimuth: filled pixels of the same "
-        "surface that a return's spot covers count as measured; 0: only the pixel it falls into",
-        0,
-        2,
-    )
     rims: str = knob(
         "image",
-        "pixels measured that close to a depth edge. image: keep those that the camera's image "
+        "pixels measured close to a depth edge. image: keep those that the camera's image "
         "puts on the measured surface (strict without an image, or with one that does not fit); "
         "strict: leave them out; keep: keep them all, which fattens outlines",
         choices=("image", "strict", "keep"),
@@ -255,32 +190,11 @@ class ProjectSettings(Section):
         0.1,
         5,
     )
-    edge_m: float = knob(
-        0.2,
-        "[m] no pixel is filled where depths around it deviate more from a plane; larger fills "
-        "hedges and ragged edges, often wrongly",
-        0,
-        10,
-    )
-    edge_fraction: float = knob(0.05, "the same as a share of the depth; the larger counts", 0, 1)
     glass: str = knob(
         "plane",
         "windows of vehicles. plane: what is measured behind them is taken out, and the filled map "
         "has the plane of their frames; keep: it stays",
         choices=("plane", "keep"),
-    )
-    star_reach: float = knob(
-        1.0,
-        "how far, in spacings of neighbouring rays, known pixels all round may be from a hole that "
-        "the two-sided fill leaves; 0: it is left",
-        0,
-        20,
-    )
-    fill_confidence: float = knob(
-        0.5,
-        "confidence of a pixel filled from afar as a share of the least around it",
-        0,
-        1,
     )
 
     def __post_init__(self) -> None:
@@ -301,15 +215,6 @@ class PriorSettings(Section):
         "what their values are. depth; inverse: inverse depth, disparity; auto: whichever fits the "
         "measured pixels better",
         choices=("auto", "depth", "inverse"),
-    )
-    far_m: float = knob(120.0, "[m] what is farther by the prior stays empty, as sky", 1, 250)
-    max_wrong: float = knob(
-        0.2,
-        "a prior is not used if its best fit is off by more than 25 % at a larger share of the "
-        "measured pixels, each octave of depth counted alike; good ones had up to 0.11, those of "
-        "other images 0.25 to 0.6 where the vehicle moves",
-        0,
-        1,
     )
 
 

@@ -1,20 +1,15 @@
 # SPDX-License-Identifier: MIT
-"""What a confidence means: the probability that a pixel's depth is right.
+"""What a confidence means: the probability that a pixel's depth is wrong by KITTI's rule.
 
-A map's stages rank its pixels: by sweeps and points that agree, nearness of an edge, roughness, how
-far was filled, votes of the image. What a rank is worth depends on where it is had. KITTI's rule
-forgives 0.4 m at 7 m and 3 m at 20 m: what is right among the leaves of a hedge far away is wrong
-among the same leaves close by, and on a road neither. So the probability of a wrong depth is
-taken as a sum of two: a share that pixels of this rank have anyway, and one in proportion to how
-far the surroundings contradict each other by that same rule (`densify.depth.agreement`): as if some
-of the pixels had the depth of a neighbour. Both fall with the rank, and were measured, where the
-truth is exact, by group: how a pixel came to its depth (measured within the window, beyond it, or
-filled), and how ragged its surroundings are, the share of what is measured around it that lies at
-depth edges. ``densify bench confidence`` makes these tables, ``confidence.json`` beside this file,
-and says how far they hold elsewhere.
+The stages of a map rank its pixels: by sweeps and points that agree, distance to an edge,
+roughness, how far was filled, votes of the image. The probability that a pixel is wrong is a sum:
+a share for its rank, and another in proportion to how far the surroundings contradict each other.
+Both fall with the rank. They were measured against exact truth by group: how a pixel came to its
+depth, and how ragged its surroundings are. ``densify bench confidence`` makes these tables,
+``confidence.json`` beside this file.
 
-Within a map the order of the ranks stays, of pixels measured and of pixels filled: each rank gets
-the mean probability of the map's own pixels at that rank, made to fall with the rank.
+Within a map the order of the ranks stays, of measured and of filled pixels. Each rank gets the mean
+probability of the map's own pixels at that rank, made to fall with the rank.
 """
 
 from __future__ import annotations
@@ -30,8 +25,15 @@ from scipy.optimize import isotonic_regression
 
 from densify.config.file_content import read_json
 from densify.depth.layers import Layers
+from densify.depth.neighbours import extended
+from densify.geometry.compiled import Kernel
 from densify.geometry.types import Bool, Camera, DepthMap, Float, Float32, Ranked
-from densify.scores.depth_metrics import is_outlier_depth
+from densify.scores.depth_metrics import (
+    KITTI_BASELINE_M,
+    OUTLIER_FRACTION,
+    OUTLIER_PX,
+    is_outlier_depth,
+)
 
 DECADES = 5.0
 """Confidence 1 is one wrong pixel in 10^5, each fifth less ten times as many."""
@@ -44,21 +46,74 @@ GROUPS = tuple(
 CAUSES = ("anyway", "contradicted")
 """Shares that are wrong: anyway, and for each whole by which a place is contradicted."""
 NUM_RANKS = 200
+NUM_MEASURED = 6
+"""Groups of measured pixels; the others are of filled ones."""
 
 _FILE = Path(__file__).with_name("confidence.json")
 _RAGGED = np.array([0.1, 0.5])
-_NUM_RAGGED = len(_RAGGED) + 1
-NUM_MEASURED = 2 * _NUM_RAGGED
-"""Groups of measured pixels; those behind are of filled ones."""
 _AROUND = 4.0  # gaps between rays to all sides
 _TILT = 0.01  # decades over all ranks: pixels of different rank keep a different confidence
 _NUM_STEPS = 20
+_GIVEN = 2.0  # pixels around that are taken to agree: few do not tell
 
 
-def ranked(layers: Layers, far: Bool, contradicted: Float32) -> Ranked:
-    """What the confidence of a map's pixels is made from. far: (H,W) measured by sweeps beyond the
-    window. contradicted: (H,W) of the filled map's pixels, see `densify.depth.agreement`. It and
-    raggedness are means over four gaps between rays to all sides."""
+def contradicted(layers: Layers, focal_px: float) -> Float32:
+    """Return (H,W) the share of the measured pixels around each filled pixel whose surface would
+    make it wrong by KITTI's rule, within a gap between rays to all sides.
+
+    Boundary pixels count too. Nothing contradicts closed car windows: what is behind them may be
+    measured.
+    """
+    measured_m = np.maximum(layers.depth_m, layers.rim_m)
+    inverse, known = (
+        np.divide(1, depth_m, out=np.zeros_like(depth_m), where=depth_m > 0)
+        for depth_m in (layers.filled_m, measured_m)
+    )
+    pixel = np.flatnonzero(layers.filled_m)
+    share = np.zeros_like(layers.filled_m)
+    half_px = max(2, round(float(np.median(layers.gap_px))))
+    apart = OUTLIER_PX / (focal_px * KITTI_BASELINE_M)
+    _contradicted.over_rows(len(pixel), pixel, inverse, known, layers.tilt, half_px, apart, share)
+    if layers.window is not None:
+        share[layers.window] = 0
+    return share
+
+
+@Kernel
+def _contradicted(first, last, pixel, inverse, known, tilt, half_px, apart, share):  # type: ignore[no-untyped-def]
+    """share: (H,W) float32, filled for each ``pixel`` (P,).
+
+    inverse, known: (H,W) float32, 1/m, of the pixels and of those around, 0 none. half_px: how far
+    around; every pixel is looked at, or every n-th, up to 11 across. apart: inverse depth, 1/m.
+    """
+    height, width = known.shape
+    step = max(1, -(-half_px // 5))
+    half_px = half_px // step * step
+    for i in range(first, last):
+        v, u = pixel[i] // width, pixel[i] % width
+        here = inverse[v, u]
+        least = max(apart, OUTLIER_FRACTION * here)
+        num = against = 0
+        for dv in range(-half_px, half_px + 1, step):
+            row = v + dv
+            if row < 0 or row >= height:
+                continue
+            for du in range(-half_px, half_px + 1, step):
+                column = u + du
+                if column < 0 or column >= width or (du == 0 and dv == 0):
+                    continue
+                if known[row, column] > 0:
+                    num += 1
+                    against += abs(extended(known, tilt, row, column, du, dv) - here) > least
+        share[v, u] = against / (num + _GIVEN)
+
+
+def rank_pixels(layers: Layers, far: Bool, contradicted: Float32) -> Ranked:
+    """Return the rank and the group of a map's pixels, and how contradicted their places are.
+
+    far: (H,W) measured by sweeps beyond the window. contradicted: (H,W). It and raggedness are
+    means over four gaps between rays to all sides.
+    """
     rim, measured = layers.rim_m > 0, (layers.depth_m > 0) | (layers.rim_m > 0)
     shown = layers.filled_m > 0
     size = 2 * max(2, round(_AROUND * float(np.median(layers.gap_px)))) + 1
@@ -73,17 +128,16 @@ def ranked(layers: Layers, far: Bool, contradicted: Float32) -> Ranked:
 
     how = np.where(layers.depth_m > 0, far.astype(np.uint8), np.uint8(2))
     ragged = np.searchsorted(_RAGGED, mean(rim, measured), side="right")
-    group = np.where(shown, how * _NUM_RAGGED + ragged, 0).astype(np.uint8)
+    group = np.where(shown, how * (len(_RAGGED) + 1) + ragged, 0).astype(np.uint8)
     rank = np.where(shown, np.clip(layers.confidence, 0, 1), np.float32(0))
     return Ranked(rank, group, np.where(shown, mean(contradicted, shown), np.float32(0)))
 
 
 def calibrated(found: Ranked, shown: Bool, tables: Float | None = None) -> Float32:
-    """(H,W) confidence, 0 to 1, 0 where nothing is ``shown`` (H,W): ``-log10(P) / 5`` with the
-    probability P that a depth is wrong by KITTI's rule, see
-    `densify.scores.depth_metrics.DepthErrors`.
+    """Return (H,W) confidence, ``-log10(P) / 5`` with the probability P that a depth is wrong.
 
-    tables: (G,2,R) by group, cause and step of the rank, else the package's own.
+    shown: (H,W); 0 elsewhere. tables: (G,2,R) by group, cause and step of the rank, else the
+    package's own.
     """
     rank, group = found.rank[shown], found.group[shown]
     log_wrong = curves(amounts(found, shown), _own_tables() if tables is None else tables)
@@ -97,13 +151,13 @@ def calibrated(found: Ranked, shown: Bool, tables: Float | None = None) -> Float
 
 
 def steps_of(rank: Float32) -> NDArray[np.int64]:
-    """The step that each rank falls into."""
+    """Return the step that each rank falls into."""
     return np.minimum((rank * NUM_RANKS).astype(np.int64), NUM_RANKS - 1)
 
 
 def amounts(found: Ranked, of: Bool) -> Float:
-    """(G,2,R) by group and step of the rank: how many of the pixels ``of`` (H,W) there are, and by
-    how much they are contradicted together. Times a table it is how many are wrong."""
+    """Return (G,2,R) by group and step of the rank: the number of the pixels ``of`` (H,W), and by
+    how much they are contradicted together. Times a table it is the number of wrong ones."""
     place = found.group[of].astype(np.int64) * NUM_RANKS + steps_of(found.rank[of])
     size = len(GROUPS) * NUM_RANKS
     sums = [np.bincount(place, weights, size) for weights in (None, found.contradicted[of])]
@@ -111,8 +165,8 @@ def amounts(found: Ranked, of: Bool) -> Float:
 
 
 def curves(pixels: Float, tables: Float) -> Float:
-    """(2,R) log10 of the probability that a pixel is wrong by step of the rank, of those measured
-    and of those filled, in a map with ``pixels`` (G,2,R), `amounts`. tables: (G,2,R)."""
+    """Return (2,R) log10 of the probability that a measured and that a filled pixel is wrong, by
+    step of the rank. pixels: (G,2,R) of `amounts`. tables: (G,2,R)."""
     num = pixels[:, 0]
     wrong_num = np.minimum((pixels * tables).sum(axis=1), num)
     shares = [
@@ -123,8 +177,8 @@ def curves(pixels: Float, tables: Float) -> Float:
 
 
 def falling(num: Float, wrong_num: Float) -> Float:
-    """(R,) ``wrong_num`` over ``num``, (R,) pixels, made to fall with the rank (isotonic
-    regression); steps without any lie between their neighbours, 0 where no step has any."""
+    """Return (R,) ``wrong_num / num``, made to fall with the rank by isotonic regression; steps
+    without pixels lie between their neighbours."""
     some = num > 0
     if not some.any():
         return np.zeros(len(num))
@@ -140,26 +194,25 @@ def _own_tables() -> Float:
 
 
 def own_file() -> dict[str, Any]:
-    """The package's own tables, as `densify.bench.confidence` wrote them."""
+    """Return the package's own tables, as `densify.bench.confidence` wrote them."""
     return read_json(_FILE)
 
 
 def tables_of(written: dict[str, Any]) -> Float:
-    """(G,2,R) share that is wrong, from what `densify.bench.confidence` wrote."""
+    """Return (G,2,R) the share that is wrong, from what `densify.bench.confidence` wrote."""
     middle = (np.arange(NUM_RANKS) + 0.5) / NUM_RANKS
     knots = [[np.array(written["tables"][g][c]).T for c in CAUSES] for g in GROUPS]
     return np.array([[np.interp(middle, *ends) for ends in row] for row in knots])
 
 
 def wrong(confidence: Float | Float32) -> Float:
-    """Confidence -> the probability that a depth is wrong, as `calibrated` has it."""
+    """Return the probability that a depth is wrong."""
     probability: Float = 10.0 ** (-DECADES * np.asarray(confidence, np.float64))
     return probability
 
 
 def expected_outliers(maps: DepthMap) -> dict[str, float | None]:
-    """The expected share of wrong pixels of the ``measured`` and the ``filled`` map; None of a map
-    without any."""
+    """Return the expected share of wrong pixels of the ``measured`` and the ``filled`` map."""
     shares: dict[str, float | None] = {}
     for name, depth_m in (("measured", maps.depth_m), ("filled", maps.filled_m)):
         some = depth_m > 0
@@ -168,11 +221,10 @@ def expected_outliers(maps: DepthMap) -> dict[str, float | None]:
 
 
 def reliability(maps: DepthMap, truth_m: Float32, camera: Camera) -> list[dict[str, Any]]:
-    """How far confidence keeps what it promises, over the pixels of ``filled_m`` with a truth.
+    """Compare expected with true outliers by confidence, over the filled pixels with a truth.
 
-    truth_m: (H,W) metres, 0 none. By confidence, in steps of 0.05: ``confidence`` where the step
-    begins, ``num_compared`` pixels, the share of them ``expected`` to be wrong, and the share that
-    is (``outliers``). Steps without a pixel are left out.
+    truth_m: (H,W) metres, 0 none. Returns for each step of 0.05 with pixels: ``confidence`` where
+    it begins, ``num_compared``, the ``expected`` share of wrong pixels, and the true ``outliers``.
     """
     compared = (truth_m > 0) & (maps.filled_m > 0)
     confidence = maps.confidence[compared]

@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""Which images belong to a key, and where a camera sees points at an image's exposure.
+"""The images of a key, and where a camera sees points at the exposure of an image.
 
-Images have a clock of their own. A key takes the image exposed nearest to its sweep, or, one by
-one, every image that is nearer to its sweep than to any other.
+A key takes the image exposed nearest to its sweep, or every image nearer to it than to any other.
 """
 
 from __future__ import annotations
@@ -34,15 +33,15 @@ from densify.geometry.types import (
 
 _log = logging.getLogger("densify")
 _USUAL = ProjectSettings()
-_NUM_NEIGHBOURS = 5  # sweeps on each side of a key that tell the usual period
-_JITTER = 1.5  # half a period is at most so much longer
-_NUM_ROW_STEPS = 4  # in which the row that sees a point is found
+_NUM_NEIGHBOURS = 5  # sweeps on each side of a key that give the usual period
+_JITTER = 1.5  # half a period is at most this much longer
+_NUM_ROW_STEPS = 4  # of the search for the row that sees a point
 
 
 @dataclass(frozen=True)
 class Shot:
-    """What a depth map is to show. number: of the image, None for the moment of the key sweep.
-    stamp_ns: when."""
+    """What a depth map shows: the image with this number, None for the time of the key sweep, at
+    ``stamp_ns``."""
 
     camera: Camera
     number: int | None
@@ -55,13 +54,12 @@ def key_shots(
     key: int,
     settings: ProjectSettings = _USUAL,
 ) -> dict[str, Shot]:
-    """The depth maps of a key by name: of each camera the image exposed nearest to the key's sweep,
-    named as the camera; with ``project.per=image`` all its images that are nearer to this sweep
-    than to any other, named CAMERA/NUMBER.
+    """Return the depth maps of a key by name.
 
-    A camera without such an image shows the moment of the sweep, with a warning. A recording's
-    images are nearer than about half the usual period between two sweeps; of two equally near ones
-    the earlier is taken.
+    A camera's map is named like the camera and shows the image exposed nearest to the key's sweep,
+    of two equally near ones the earlier. With ``project.per=image`` there is a map CAMERA/NUMBER of
+    each image nearer to this sweep than to any other. Without an image within about half a period
+    the map shows the time of the sweep.
     """
     stamp_ns = sequence.stamp_ns(key)
     begin_ns, end_ns = _own_time_ns(sequence, key)
@@ -93,7 +91,7 @@ def key_shots(
 
 
 def load_images(sequence: LidarSequence, shots: Mapping[str, Shot]) -> dict[str, NDArray[np.uint8]]:
-    """(H,W,3) RGB of the shots that are images."""
+    """Return (H,W,3) RGB of the shots that are images, by name."""
     images = {n: (s.camera.name, s.number) for n, s in shots.items() if s.number is not None}
     if isinstance(sequence, MakesFrames):
         sequence.prepare((), list(images.values()))
@@ -101,8 +99,7 @@ def load_images(sequence: LidarSequence, shots: Mapping[str, Shot]) -> dict[str,
 
 
 def _own_time_ns(sequence: LidarSequence, key: int) -> tuple[int, int]:
-    """Begin and end of the time that is nearer to the key's sweep than to another; what lies
-    between two belongs to the earlier."""
+    """Return begin and end of the time that is nearer to the key's sweep than to another."""
     frames = list(sequence.frames)
     at = frames.index(key)
     around = frames[max(0, at - _NUM_NEIGHBOURS) : at + _NUM_NEIGHBOURS + 1]
@@ -128,36 +125,18 @@ def _own_time_ns(sequence: LidarSequence, key: int) -> tuple[int, int]:
 
 
 class InView(NamedTuple):
-    """The K of a cloud's points that are on the image, as the camera sees them. rows: (K,) of the
-    cloud, ascending. points_cam, uv: as of a `Sight`."""
+    """The K points of a cloud that are on the image: their ascending ``rows`` (K,) of the cloud,
+    and ``points_cam``, ``uv`` of a `Sight`."""
 
     exposure: Exposure
     rows: Int
     points_cam: Float
     uv: Float
 
-    def select(self, keep: Bool) -> InView:
-        """The view of ``cloud.select(keep)``."""
-        kept = keep[self.rows]
-        rows = (np.cumsum(keep) - 1)[self.rows[kept]]
-        mine = np.flatnonzero(kept)
-        return InView(
-            self.exposure, rows, self.points_cam.take(mine, axis=0), self.uv.take(mine, axis=0)
-        )
-
-    def joined(self, other: InView, num_points: int) -> InView:
-        """The view of two clouds as one. num_points: of this one's cloud."""
-        return InView(
-            self.exposure,
-            np.concatenate([self.rows, num_points + other.rows]),
-            np.concatenate([self.points_cam, other.points_cam]),
-            np.concatenate([self.uv, other.uv]),
-        )
-
 
 class Sight(NamedTuple):
-    """Points as a camera sees them. points_cam: (N,3) metres, camera frame, when they are seen.
-    uv: (N,2) px, NaN where there is no pixel. inside: (N,) on the image, with a depth."""
+    """Points as a camera sees them: ``points_cam`` (N,3) metres, camera frame, when seen; ``uv``
+    (N,2) px, NaN where there is no pixel; ``inside`` (N,) on the image, with a depth."""
 
     points_cam: Float
     uv: Float
@@ -166,12 +145,11 @@ class Sight(NamedTuple):
 
 @dataclass(frozen=True)
 class Exposure:
-    """A camera at the moment of a shot.
+    """A camera at the time of a shot.
 
-    T_cam_key: (4,4), with the ego motion from the key's reference time. late_s: after it. twist:
-    (6,) of the camera, rad/s and m/s in its own frame. number: of the image. measure: what depth
-    is, camera ``z`` or ``range``. others: "previous" and "next" image, where the stretch reaches
-    them.
+    T_cam_key: (4,4), with the ego motion from the key's reference time. late_s: seconds after it.
+    twist: (6,) of the camera, rad/s and m/s in its own frame. number: of the image. measure: depth
+    is camera ``z`` or ``range``. others: "previous" and "next" image, if the window reaches them.
     """
 
     camera: Camera
@@ -186,8 +164,8 @@ class Exposure:
     def of(
         sequence: LidarSequence, stretch: Stretch, key: int, shot: Shot, settings: Config
     ) -> Exposure:
-        """The vehicle moves on from the sweep nearest in time with that sweep's own twist; where
-        the recording knows the pose of the image itself, that is taken."""
+        """Return the exposure of a shot: the vehicle moves on from the nearest sweep with that
+        sweep's twist, or the recording knows the pose of the image itself."""
         others: dict[str, Exposure] = {}
         if settings.output.optical_flow and shot.number is not None:
             stamps_ns = sequence.image_stamps_ns(shot.camera.name)
@@ -207,10 +185,11 @@ class Exposure:
         return _exposure(sequence, stretch, key, key, shot, settings, others)
 
     def see(self, points: Float, velocity_m_s: Float | Float32) -> Sight:
-        """(N,3) points and velocities at the key's moment, key frame. A rolling shutter sees each
-        point at the time of the row or column it lands on, where camera and point have moved on.
-        What has no depth as ``measure`` says, beside or behind a wide lens that is asked for z, is
-        not inside."""
+        """Project points (N,3) with velocities (N,3), key frame, at the key's reference time.
+
+        A rolling shutter sees each point at the time of the row or column it lands on, where camera
+        and point have moved on. Points beside or behind a wide lens have no z: they are not inside.
+        """
         late = points + self.late_s * velocity_m_s if velocity_m_s.any() else points
         points_cam = poses.transform(self.T_cam_key, late)
         uv, inside = image_points(self.camera, points_cam)
@@ -233,19 +212,19 @@ class Exposure:
         return Sight(points_cam, uv, on_image & (self.depth_m(points_cam) > NEAREST_M))
 
     def sees(self, cloud: Cloud) -> InView:
-        """What of a cloud at the key's moment is on the image."""
+        """Return the part of a cloud, at the key's reference time, that is on the image."""
         sight = self.see(cloud.points, cloud.velocity_m_s)
         rows = np.flatnonzero(sight.inside)
         points_cam, uv = (a.take(rows, axis=0) for a in (sight.points_cam, sight.uv))
         return InView(self, rows, points_cam, uv)
 
     def depth_m(self, points_cam: Float) -> Float:
-        """(N,3) -> (N,) as ``measure`` says."""
+        """Return (N,) depth of points (N,3), as ``measure`` says."""
         return depth_along(points_cam, self.measure)
 
 
 def _nearest(stretch: Stretch, stamp_ns: int) -> int:
-    """Frame of the sweep nearest in time."""
+    """Return the frame of the sweep nearest in time."""
     return min(stretch.sweeps, key=lambda s: abs(s.sweep.stamp_ns - stamp_ns)).frame
 
 

@@ -1,6 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What stands still, as sweeps beyond a key's window measured it: before and after it is thinned
-and brought to the key."""
+"""The static world as sweeps beyond a key's window measured it, and the part of it a key needs."""
 
 from __future__ import annotations
 
@@ -9,7 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
-from densify.depth.exposure import Exposure, InView
+from densify.depth.exposure import Exposure
 from densify.depth.patches import tangents
 from densify.free_space.range_image import RangeImage
 from densify.free_space.sensor import Sensors
@@ -35,30 +34,27 @@ _MOST_SPACING_M = 0.05  # surfaces are met by many sweeps' rays; larger patches 
 _GROUP_M = 2.5  # of travel: what is nearer sees the same, and errs alike
 _CONFIDENCE = 0.5
 _SLACK_M = 0.5
-_SAME_DEPTH, _MOST_IN_PIXEL = 0.05, 1
+_SAME_DEPTH = 0.05  # of the depth: a pixel needs one point of each such step
 _PRIME = 2_654_435_761  # its multiples go through any smaller number of points in a mixed order
-_MIN_FILLED = 6
-_FREE_M, _FREE_FRACTION = 0.3, 0.015
-# Of travel, between sweeps that are asked, and from one that asks: most of a car, or its rear half.
+_FREE_M, _FREE_FRACTION = 0.3, 0.015  # before what a sweep saw; the larger counts
+_MIN_FILLED, _FEW_FILLED = 6, 3  # of nine cells: of the window's sweeps, of a sweep beyond it
+# Of travel, between witnesses, and from the sweep that asks: most of a car, or its rear half.
 _WITNESSES_M, _WITNESS_M, _LEAST_WITNESS_M = 5.0, 3.5, 2.0
-_FEW_FILLED = 3
 
 
 def in_reach(sweep: Sweep) -> Bool:
-    """(N,) the returns that are not too far away to be placed well."""
+    """Return (N,) True for returns near enough to be placed well."""
     x, y, z = sweep.points.T
     return x * x + y * y + z * z < _MOST_RANGE_M**2
 
 
 def departed(sweeps: Sequence[RegisteredSweep], travel_m: Float) -> list[Bool]:
-    """(N,) of each sweep, True where another one saw through the place: what moves is elsewhere
-    when it comes by.
+    """Return (N,) of each sweep, True where another one saw through the point.
 
     sweeps: deskewed, in the order of the road. travel_m: (S,) where along it they were, ascending.
-    What lies ahead of a sweep is asked of the next one at least 3.5 m on, what lies behind it of
-    the one before, so of the one that came nearer: by then even who drives along has left most of
-    the place. At the ends of the road it is the last sweep, 2 m away or more, or else the one on
-    the other side.
+    Points ahead of a sweep are compared with the next witness at least 3.5 m on, points behind it
+    with the one before: by then even a vehicle that drives along has left most of the place. At the
+    ends of the road it is the last sweep, 2 m away or more, or the one on the other side.
     """
     asked = [0] if sweeps else list[int]()
     for i, at_m in enumerate(travel_m.tolist()):
@@ -85,7 +81,7 @@ def departed(sweeps: Sequence[RegisteredSweep], travel_m: Float) -> list[Bool]:
 
 
 def _witnesses(i: int, asked: Sequence[int], travel_m: Float) -> list[int]:
-    """The sweeps before and after one that say what of it has left, or only one of them."""
+    """Return the witnesses before and after a sweep, or only one of them."""
     apart_m = np.array([travel_m[j] - travel_m[i] for j in asked])
     sides = []
     for off_m in (-apart_m, apart_m):
@@ -100,8 +96,7 @@ def _witnesses(i: int, asked: Sequence[int], travel_m: Float) -> list[int]:
 def standing(
     sensors: Sensors, registered: RegisteredSweep, travel_m: float, gone: Bool
 ) -> StandingWorld:
-    """The points of one sweep, in the world. sensors: of the recording. gone: (N,) which of them
-    are left out, see `departed`."""
+    """Return the points of one sweep in the world, without those ``gone`` (N,), see `departed`."""
     sweep, T_world_lidar = registered.sweep, registered.T_world_lidar
     one = np.zeros(len(sweep), np.int32)
     normal, spacing_m = tangents(
@@ -122,18 +117,15 @@ def standing(
 
 
 def joined(parts: Sequence[StandingWorld]) -> StandingWorld:
-    """Parts of one world as one, by ascending frame."""
-    if not parts:
-        return _NOTHING
-    parts = sorted(parts, key=lambda part: part.frames)
+    """Return parts of one world as one, by ascending frame."""
+    parts = [_NOTHING, *sorted(parts, key=lambda part: part.frames)]
     counts = np.cumsum([0, *(len(part.frames) for part in parts)])
+    sources = [p.source + np.int32(first) for p, first in zip(parts, counts, strict=False)]
     return StandingWorld(
         points=np.concatenate([p.points for p in parts]),
         normal=np.concatenate([p.normal for p in parts]),
         spacing_m=np.concatenate([p.spacing_m for p in parts]),
-        source=np.concatenate(
-            [p.source + np.int32(first) for p, first in zip(parts, counts, strict=False)]
-        ),
+        source=np.concatenate(sources),
         row=np.concatenate([p.row for p in parts]),
         lidar=np.concatenate([p.lidar for p in parts]),
         intensity=np.concatenate([p.intensity for p in parts]),
@@ -158,22 +150,12 @@ _NOTHING = StandingWorld(
 
 
 def may_see(camera: Camera, T_cam_world: Float, points: Float32, slack_m: float) -> Bool:
-    """(N,3) world -> (N,) False where a camera certainly does not see a point, were it up to
-    ``slack_m`` elsewhere. All of a lens that is no pinhole."""
+    """Return (N,) False where a camera certainly does not see a point (N,3), world, were it up to
+    ``slack_m`` elsewhere; True for all of a lens that is no pinhole."""
     if camera.model != "pinhole":
         return np.ones(len(points), bool)
-    x, y, z = _from_camera(T_cam_world, points)
-    return _in_pyramid(camera, x, y, z, slack_m)
-
-
-def _from_camera(T_cam_world: Float, points: Float32) -> Float32:
-    """(N,3) -> (3,N) camera frame."""
     T = T_cam_world.astype(np.float32)
-    there: Float32 = T[:3, :3] @ points.T + T[:3, 3:]
-    return there
-
-
-def _in_pyramid(camera: Camera, x: Float32, y: Float32, z: Float32, slack_m: float) -> Bool:
+    x, y, z = T[:3, :3] @ points.T + T[:3, 3:]
     K, slack_m = camera.K.astype(np.float32), np.float32(slack_m)
     bent = np.float32(1.2 if camera.distortion else 1.0)
     right, left = bent * (camera.width_px - K[0, 2]) / K[0, 0], -bent * K[0, 2] / K[0, 0]
@@ -190,13 +172,12 @@ def far_cloud(
     key: int,
     exposures: Mapping[str, Exposure],
     standing_only: bool,
-) -> tuple[Cloud, Patches, dict[str, InView]]:
-    """What sweeps beyond the window measured that a camera sees: in the key frame, with patches as
-    `densify.depth.patches` makes them of the others.
+) -> tuple[Cloud, Patches]:
+    """Return the points beyond the window that a camera sees, in the key frame, and their patches.
 
-    T_key_found: (4,4) to the key from the world of ``found``. stretch: the window.
-    standing_only: without what is not there at the time of the window, for its first or its last
-    sweep saw through the place. Of the points in a pixel a few of every depth are enough.
+    T_key_found: (4,4) to the key from the world of ``found``. stretch: the window. standing_only:
+    without points that the first or the last sweep of the window saw through. In a pixel one point
+    of every depth is enough.
     """
     beyond = ~np.isin(found.frames, stretch.frames)
     rows = np.flatnonzero(beyond[found.source])
@@ -234,35 +215,28 @@ def far_cloud(
         sweep=source,
         place=(group - group.min(initial=0))[source],
     )
-    return cloud, surface, {name: e.sees(cloud) for name, e in exposures.items()}
+    return cloud, surface
 
 
 def _seen(points: Float32, T_key_world: Float, exposure: Exposure) -> Int:
-    """(N,3) world -> rows, ascending, of the points that a camera needs: in every pixel and share
-    of the depth the first few, in an order that mixes the sweeps."""
-    camera, T_cam_world = exposure.camera, exposure.T_cam_key @ T_key_world
-    if camera.is_rectified and not camera.is_rolling:
-        x, y, z = _from_camera(T_cam_world, points)
-        rows = np.flatnonzero(_in_pyramid(camera, x, y, z, _SLACK_M))
-        depth = np.maximum(z[rows], np.float32(0.1))
-        K = camera.K.astype(np.float32)
-        u = (K[0, 0] * x[rows] + K[0, 1] * y[rows]) / depth + K[0, 2]
-        v = K[1, 1] * y[rows] / depth + K[1, 2]
-    else:
-        there = poses.transform(T_key_world, points.astype(np.float64))
-        sight = exposure.see(there, np.zeros((len(points), 3), np.float32))
-        rows = np.flatnonzero(sight.inside)
-        depth = np.maximum(exposure.depth_m(sight.points_cam[rows]), 0.1)
-        u, v = sight.uv[rows].T
-    cell = np.rint(np.column_stack([u, v, np.log(depth) / _SAME_DEPTH]).astype(np.float32))
+    """Return the rows, ascending, of the points (N,3), world, that a camera needs: one in every
+    pixel and step of depth, in an order that mixes the sweeps."""
+    T_cam_world = exposure.T_cam_key @ T_key_world
+    near = np.flatnonzero(may_see(exposure.camera, T_cam_world, points, _SLACK_M))
+    there = poses.transform(T_key_world, points[near].astype(np.float64))
+    sight = exposure.see(there, np.zeros(there.shape, np.float32))
+    rows = near[sight.inside]
+    depth = exposure.depth_m(sight.points_cam[sight.inside])
+    place = np.column_stack([sight.uv[sight.inside], np.log(depth) / _SAME_DEPTH])
+    cell = np.rint(place.astype(np.float32))
     # Neighbouring pixels are to be from many sweeps: these have to agree.
     mixed = np.arange(len(rows)) * _PRIME % max(1, len(rows))
-    return rows[kernels.thinned(cell, mixed, 1.0, _MOST_IN_PIXEL)]
+    return rows[kernels.thinned(cell, mixed, 1.0, 1)]
 
 
 def _gone(points: Float, stretch: Stretch, key: int, witnesses: Sequence[int]) -> Bool:
-    """(M,) where one of these sweeps of the window saw through a place: what stood there has left,
-    or has not come yet. points: (M,3) key frame."""
+    """Return (M,) True where one of these sweeps of the window saw through a point (M,3), key
+    frame."""
     free = np.zeros(len(points), bool)
     for frame in witnesses:
         there = poses.transform(stretch.T_target_source(frame, key), points)

@@ -1,70 +1,75 @@
 # SPDX-License-Identifier: MIT
 """Interpolation between the measured pixels of a depth map.
 
-A plane in space is linear in *inverse* depth over the image, so planes are fitted there.
+First the two-sided fill: planes through the measured pixels of a window. Then the star fill: holes
+that known pixels surround. The votes of measured pixels decide what stays of both.
 """
 
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import NamedTuple
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
-from densify.config import ProjectSettings
-from densify.depth import filling
+from densify.depth.boundary_pixels import voted_for
 from densify.depth.layers import Layers
-from densify.depth.votes import elected, voters
-from densify.geometry.types import Float32
+from densify.depth.neighbours import DIRECTIONS, NONE, extended, first_known, offset, plane
+from densify.geometry.arrays import Float, Float32
+from densify.geometry.compiled import Kernel, inlined
 
-_GROWTH = (1 / 3, 2 / 3, 1.0)  # spacings
-_LEAST_SHARE = 0.9  # of the votes for a pixel that is kept
-_AROUND, _LEAST_KNOWN = 0.35, 0.3  # gaps between rays to all sides; share of what lies there
+FILL_CONFIDENCE = 0.5
+"""Confidence of a pixel filled from afar, as a share of the least around it."""
+_GROWTH = (1 / 3, 2 / 3, 1.0)  # half sizes of the windows, in spacings of rays
+_EDGE_M, _EDGE_FRACTION = 0.2, 0.05  # most deviation from a plane; the larger counts
+_LEAST_SHARE, _LEAST_STAR_SHARE = 0.9, 0.8  # of the votes
+_AROUND, _LEAST_KNOWN = 0.35, 0.3  # gaps between rays to all sides; share of the pixels there
+_RIDGE_PX2 = 1e-7
+_MIN_PLANE_PX = 6  # fewer do not tell a plane from a step
+_MOST_PX = 120  # half a window's size
+_ROWS = 8  # rows that are skipped together if they hold no measured pixel
+_STAR_REACH = 1.0  # spacings of rays
+_STAR_MET, _STAR_GAP = 8, 7  # directions with a known pixel; neighbouring ones without
+_STAR_SPREAD = 0.1  # of the inverse depth, between the predictions
+_STRIP_PX = 6  # height of an empty strip along the image's lower border
+_ABOVE = 12  # index of the direction upwards
 
 
-def fill(layers: Layers, settings: ProjectSettings) -> Layers:
-    """Interpolate as `fill_between`, and keep what is `voted` for."""
-    filled_m, confidence = fill_between(
-        layers.depth_m,
-        np.where(layers.depth_m > 0, layers.confidence, np.float32(0)),
-        layers.spacing_px,
-        settings.fill_reach,
-        settings.edge_m,
-        settings.edge_fraction,
-        settings.fill_confidence,
+def fill(layers: Layers, reach: float) -> Layers:
+    """Return the layers with the two-sided fill, as far as nine tenths of the votes are for it.
+
+    reach: half size of the largest window, in spacings of rays.
+    """
+    measured = np.where(layers.depth_m > 0, layers.confidence, np.float32(0))
+    filled_m, confidence, tilt = fill_between(
+        layers.depth_m, measured, layers.tilt, layers.spacing_px, reach
     )
-    filled = replace(layers, filled_m=filled_m, confidence=confidence)
-    return voted(filled, layers.depth_m, _LEAST_SHARE)
+    filled = replace(layers, filled_m=filled_m, confidence=confidence, tilt=tilt)
+    return _voted(filled, layers.depth_m, _LEAST_SHARE)
 
 
-def voted(layers: Layers, before_m: Float32, least_share: float) -> Layers:
-    """The layers without what was filled since ``before_m`` (H,W) against the votes of the measured
-    pixels around.
+def _voted(layers: Layers, before_m: Float32, least_share: float) -> Layers:
+    """Drop pixels filled since ``before_m`` (H,W) for which fewer than ``least_share`` vote.
 
-    ``least_share`` of the votes (`densify.depth.votes`) must be in favour; what is filled has none,
-    it would vote for itself. Rims that were not accepted may only turn the vote down, those that
-    are not veiled: the pillar of a car of which little was measured is not filled over.
+    Measured pixels vote; filled ones would vote for themselves. Boundary pixels that were not
+    accepted may only turn a vote down, unless they are occluded: so the pillar of a car with few
+    measured pixels is not filled over.
     """
     filled = (layers.filled_m > 0) & (before_m == 0)
     pixel = np.flatnonzero(filled)
-    with_rims_m = np.where(layers.veiled, layers.depth_m, np.maximum(layers.depth_m, layers.rim_m))
-    for known_m in (with_rims_m, layers.depth_m):
-        seeds, depth_m = voters(layers, known_m), layers.filled_m.flat[pixel]
-        pixel = pixel[elected(layers, seeds, pixel, depth_m, least_share)]
+    accepted_m = layers.depth_m
+    with_rims_m = np.where(layers.veiled, accepted_m, np.maximum(accepted_m, layers.rim_m))
+    for known_m in (with_rims_m, accepted_m):
+        depth_m = layers.filled_m.flat[pixel]
+        pixel = pixel[voted_for(layers, known_m, pixel, depth_m, least_share)]
     filled.flat[pixel] = False
-    filled_m, confidence = layers.filled_m.copy(), layers.confidence.copy()
-    filled_m[filled] = 0
-    confidence[filled] = 0
-    return replace(layers, filled_m=filled_m, confidence=confidence)
+    return layers.without(filled)
 
 
 def without_shreds(layers: Layers) -> Layers:
-    """The layers without what was filled where little else was.
-
-    Of what lies around such a pixel, a third of the gap between rays to all sides, at least three
-    tenths must be known. Else votes have left streaks between rays far apart, of which up to a
-    twelfth was wrong.
-    """
+    """Drop filled pixels where fewer than three tenths of the pixels around are known."""
     known = layers.filled_m > 0
     row, column = np.nonzero(known & (layers.depth_m == 0))
     gap_px = layers.spacing_px[row, column].max(axis=1)
@@ -79,34 +84,48 @@ def without_shreds(layers: Layers) -> Layers:
     return layers.without(dropped)
 
 
+class _Known(NamedTuple):
+    """Measured pixels row by row; those of row r left of column c come before ``before[r, c]``.
+
+    before: (H,W+1) int32. num: (H+1,W+1) int32 integral image. column: (K,) int32. inverse: (K,)
+    float64, 1/m. confidence: (K,) float32.
+    """
+
+    before: NDArray[np.int32]
+    num: NDArray[np.int32]
+    column: NDArray[np.int32]
+    inverse: Float
+    confidence: Float32
+
+
+class _Inside(NamedTuple):
+    """The measured pixels in a window: inverse depth (1/m), columns and rows from its middle."""
+
+    inverse: Float
+    right: Float
+    down: Float
+    confidence: Float32
+
+
 def fill_between(
-    depth_m: Float32,
-    confidence: Float32,
-    spacing_px: Float32,
-    reach: float,
-    edge_m: float,
-    edge_fraction: float,
-    factor: float,
-) -> tuple[Float32, Float32]:
+    depth_m: Float32, confidence: Float32, tilt: Float32, spacing_px: Float32, reach: float
+) -> tuple[Float32, Float32, Float32]:
     """Interpolate empty pixels that have measured pixels on both sides.
 
-    Concretely, an empty pixel is filled when, within a window around it, measured pixels lie in a
-    column to the left and one to the right and in a row above and one below, and no depth edge runs
-    through them: they deviate from a plane by no more than max(``edge_m``, ``edge_fraction`` * the
-    nearest), between the farthest and the nearest deviation; of fewer than six their depths
-    themselves. It gets the plane's depth (weighted least squares in inverse depth, the weight
-    falling to zero just outside the window), held between the least and the greatest depth measured
-    in the window: nothing is extrapolated, in the image or in depth. The window grows to the half
-    size ``reach`` in thirds of the spacing of rays there, and the smallest that serves is taken.
+    An empty pixel is filled if its window holds measured pixels in a column to the left, in one to
+    the right, in a row above and in one below, and if no depth edge runs through them. There is an
+    edge if deviations from a plane differ by more than 0.2 m and 5 % of the nearest depth; of
+    fewer than six pixels the depths themselves. The pixel gets the depth of the plane, held between
+    the least and the greatest in the window: nothing is extrapolated. Weights fall to zero just
+    outside the window. The window grows in thirds of the spacing of rays, up to ``reach`` of it,
+    and the smallest that serves is taken.
 
-    depth_m, confidence: (H,W), 0 none. spacing_px: (H,W,2) between rays, horizontally and
-    vertically. Returns both with the filled pixels added; a filled pixel's confidence is the least
-    of the measured ones in its window, times ``factor`` in the largest window, less lowered in
-    smaller ones.
+    depth_m, confidence: (H,W), 0 none. tilt: (H,W,2) slope of inverse depth, 1/m per px.
+    spacing_px: (H,W,2) between rays, across and down. Returns the first three with the filled
+    pixels; their confidence is the least in the window, and less the larger the window is.
     """
-    filled_m, filled_confidence = depth_m.copy(), confidence.copy()
+    filled_m, filled_confidence, tilt = depth_m.copy(), confidence.copy(), tilt.copy()
     share = np.zeros(depth_m.shape, np.float32)
-    edge = np.array([edge_m, edge_fraction])
     reaches = np.array([*(min(reach, 1.0) * step for step in _GROWTH), *([reach] * (reach > 1))])
     measured = depth_m > 0
     height, width = depth_m.shape
@@ -115,15 +134,186 @@ def fill_between(
     num = np.zeros((height + 1, width + 1), np.int32)
     np.cumsum(before, axis=0, out=num[1:])
     before += num[:-1, -1:]
-    known = filling.Known(
+    known = _Known(
         before=before,
         num=num,
         column=np.nonzero(measured)[1].astype(np.int32),
         inverse=1 / depth_m[measured].astype(np.float64),
         confidence=confidence[measured],
     )
-    filling.between.over_rows(
-        depth_m.size, known, spacing_px, reaches, edge, filled_m, filled_confidence, share
+    _fill.over_rows(
+        depth_m.size, known, spacing_px, reaches, filled_m, filled_confidence, tilt, share
     )
-    filled_confidence *= 1 - share * np.float32(1 - factor)
-    return filled_m, filled_confidence
+    filled_confidence *= 1 - share * np.float32(1 - FILL_CONFIDENCE)
+    return filled_m, filled_confidence, tilt
+
+
+@inlined
+def _any(num, top, bottom, left, right):  # type: ignore[no-untyped-def]
+    return num[bottom, right] - num[top, right] - num[bottom, left] + num[top, left] > 0
+
+
+@inlined
+def _surrounded(num, top, bottom, left, right, row, column):  # type: ignore[no-untyped-def]
+    """Return True if there are measured pixels to the left, to the right, above and below."""
+    return (
+        _any(num, top, bottom, left, column)
+        and _any(num, top, bottom, column + 1, right)
+        and _any(num, top, row, left, right)
+        and _any(num, row + 1, bottom, left, right)
+    )
+
+
+@inlined
+def _gather(known, top, bottom, left, right, row, column, inside):  # type: ignore[no-untyped-def]
+    """Collect a window's measured pixels; return their number, greatest and least inverse depth."""
+    num, near, far = 0, 0.0, np.inf
+    for first in range(top, bottom, _ROWS):
+        last = min(first + _ROWS, bottom)
+        if not _any(known.num, first, last, left, right):
+            continue
+        for r in range(first, last):
+            for k in range(known.before[r, left], known.before[r, right]):
+                there = known.inverse[k]
+                near, far = max(near, there), min(far, there)
+                inside.inverse[num] = there
+                inside.right[num] = known.column[k] - column
+                inside.down[num] = r - row
+                inside.confidence[num] = known.confidence[k]
+                num += 1
+    return num, near, far
+
+
+@inlined
+def _fit(inside, num, reach_u, reach_v):  # type: ignore[no-untyped-def]
+    """Return the plane's inverse depth in the middle, its slopes, and the range of deviations."""
+    n = u = v = uu = uv = vv = w = uw = vw = 0.0
+    for i in range(num):
+        there, du, dv = inside.inverse[i], inside.right[i], inside.down[i]
+        weight = (1 - abs(dv) / (reach_v + 1)) * (1 - abs(du) / (reach_u + 1))
+        n += weight
+        u += weight * du
+        v += weight * dv
+        uu += weight * du * du
+        uv += weight * du * dv
+        vv += weight * dv * dv
+        w += weight * there
+        uw += weight * du * there
+        vw += weight * dv * there
+    centre, slope_u, slope_v = plane(n, u, v, uu, uv, vv, w, uw, vw, _RIDGE_PX2)
+    low, high = np.inf, -np.inf
+    for i in range(num):
+        there = centre + inside.down[i] * slope_v
+        off = inside.inverse[i] - there - inside.right[i] * slope_u
+        low, high = min(low, off), max(high, off)
+    return centre, slope_u, slope_v, high - low
+
+
+@Kernel
+def _fill(first, last, known, spacing_px, reaches, filled_m, confidence, tilt, share):  # type: ignore[no-untyped-def]
+    """Fill the empty pixels from ``first`` to ``last`` as `fill_between` says.
+
+    known: `_Known`. reaches: (n,) half sizes of the windows in spacings, ascending. share: (H,W)
+    float32, set to the size of the window as a share of the largest.
+    """
+    height, width = filled_m.shape
+    most = (2 * _MOST_PX + 1) ** 2
+    inside = _Inside(np.empty(most), np.empty(most), np.empty(most), np.empty(most, np.float32))
+    for p in range(first, last):
+        row, column = p // width, p % width
+        if filled_m[row, column] > 0:
+            continue
+        before_u, before_v = 0, 0
+        for step in range(len(reaches)):
+            across_px = reaches[step] * spacing_px[row, column, 0]
+            down_px = reaches[step] * spacing_px[row, column, 1]
+            reach_u = min(max(int(np.rint(across_px)), 1), _MOST_PX)
+            reach_v = min(max(int(np.rint(down_px)), 1), _MOST_PX)
+            if reach_u == before_u and reach_v == before_v:
+                continue
+            before_u, before_v = reach_u, reach_v
+            top, bottom = max(row - reach_v, 0), min(row + reach_v + 1, height)
+            left, right = max(column - reach_u, 0), min(column + reach_u + 1, width)
+            if not _surrounded(known.num, top, bottom, left, right, row, column):
+                continue
+            num, near, far = _gather(known, top, bottom, left, right, row, column, inside)
+            allowed = max(_EDGE_M, _EDGE_FRACTION / near)
+            if num < _MIN_PLANE_PX and 1 / far - 1 / near > allowed:
+                continue
+            centre, slope_u, slope_v, spread = _fit(inside, num, reach_u, reach_v)
+            if num >= _MIN_PLANE_PX and spread / (centre * centre) > allowed:
+                continue
+            if centre > 0:
+                filled_m[row, column] = 1 / min(max(centre, far), near)
+                confidence[row, column] = inside.confidence[:num].min()
+                tilt[row, column, 0], tilt[row, column, 1] = slope_u, slope_v
+                share[row, column] = (step + 1) / len(reaches)
+                break
+
+
+def fill_stars(layers: Layers) -> Layers:
+    """Fill holes from the first known pixel, measured or filled, in each of 16 directions.
+
+    The inverse depth of each known pixel is extended along its surface, and weighted by one over
+    its steps. A hole is filled if known pixels lie within a spacing of the rays in at least eight
+    directions, with at most seven neighbouring directions without, if all predict the same depth to
+    10 %, and if eight of ten votes are for it. In an empty strip of up to six rows along the lower
+    border of the image two directions fewer are enough. The confidence is half the least of theirs.
+    """
+    known = layers.filled_m > 0
+    inverse = np.divide(1, layers.filled_m, out=np.zeros_like(layers.filled_m), where=known)
+    pixel = np.flatnonzero(~known)
+    found = np.zeros((2, len(pixel)), np.float32)
+    steps, sure = first_known(known), layers.confidence
+    _star.over_rows(len(pixel), pixel, steps, inverse, layers.tilt, sure, layers.spacing_px, found)
+    filled_m, confidence = layers.filled_m.copy(), layers.confidence.copy()
+    pixel, found = pixel[found[0] > 0], found[:, found[0] > 0]
+    filled_m.flat[pixel] = found[0]
+    confidence.flat[pixel] = found[1] * np.float32(FILL_CONFIDENCE)
+    filled = replace(layers, filled_m=filled_m, confidence=confidence)
+    return _voted(filled, layers.filled_m, _LEAST_STAR_SHARE)
+
+
+@inlined
+def _widest_gap(met):  # type: ignore[no-untyped-def]
+    """Return the largest number of neighbouring directions that are not met."""
+    widest = run = 0
+    for d in range(2 * len(met)):
+        run = 0 if met[d % len(met)] else run + 1
+        widest = max(widest, run)
+    return min(widest, len(met))
+
+
+@Kernel
+def _star(first, last, pixel, steps, inverse, tilt, known, spacing_px, found):  # type: ignore[no-untyped-def]
+    """Predict the depth of empty pixels from the first known ones around them.
+
+    pixel: (P,) row by row. steps: (16,H,W) of `first_known`. inverse: (H,W) 1/m. known: (H,W)
+    confidence. found: (2,P) float32, depth in m and least confidence, 0 where they do not agree.
+    """
+    height, width = inverse.shape
+    met = np.zeros(len(DIRECTIONS), np.bool_)
+    for p in range(first, last):
+        row, column = pixel[p] // width, pixel[p] % width
+        reach_px = _STAR_REACH * max(spacing_px[row, column, 0], spacing_px[row, column, 1])
+        num, near, far = 0, 0.0, np.inf
+        least = np.float32(np.inf)
+        sum_w, weight = 0.0, 0.0
+        for d in range(len(DIRECTIONS)):
+            k = np.int64(steps[d, row, column])
+            du, dv = offset(d, k)
+            met[d] = k != NONE and du * du + dv * dv <= reach_px * reach_px
+            if met[d]:
+                w = extended(inverse, tilt, row + dv, column + du, du, dv)
+                sum_w += w / k
+                weight += 1 / k
+                near, far = max(near, w), min(far, w)
+                least = min(least, known[row + dv, column + du])
+                num += 1
+        strip_px = height - 1 - row + np.int64(steps[_ABOVE, row, column])
+        along = 2 if strip_px <= _STRIP_PX else 0
+        if num < _STAR_MET - along or _widest_gap(met) > _STAR_GAP + along:
+            continue
+        w = sum_w / weight
+        if near - far <= _STAR_SPREAD * w:
+            found[0, p], found[1, p] = 1 / w, least

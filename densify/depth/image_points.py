@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Points as one image has them: where they are, and how the surface around each of them shows."""
+"""The accumulated points in one image, the surface around each, and what hides them."""
 
 from __future__ import annotations
 
@@ -12,9 +12,15 @@ from numpy.typing import NDArray
 
 from densify.depth.exposure import Exposure, InView
 from densify.geometry.cameras import pixels_per_metre
+from densify.geometry.compiled import Kernel, inlined
 from densify.geometry.poses import rotate
-from densify.geometry.types import Bool, Cloud, Float, Float32, Int, Patches
+from densify.geometry.types import Bool, Camera, Cloud, Float, Float32, Int, Patches
 
+HIDDEN_M, HIDDEN_FRACTION = 0.2, 0.06
+"""A point this much behind the nearest surface, both added, is hidden."""
+_FOOTPRINT = 0.4  # half size of a patch, in spacings of rays
+_SLACK_M = 0.05  # added to it, for errors of registration and flow
+_MAX_HALF_PX = 24.0  # a point just before the lens must not hide the whole image
 _MAX_TILT = 0.25  # of the inverse depth per pixel; a plane seen edge-on has no slope
 _SAME_AGE_NS = 10_000_000
 _MOST_SWEEPS = 63  # that are told apart when they are counted
@@ -22,11 +28,13 @@ _MOST_SWEEPS = 63  # that are told apart when they are counted
 
 @dataclass(frozen=True)
 class PointsInImage:
-    """The K points in the image. index: rows of the cloud. uv: (K,2) px. depth: (K,) m, as it is
-    stored. focal_px: (K,2) local scale, px per metre at a depth of 1 m. slope: (K,2) of the tangent
-    plane's inverse depth, 1/m per px. spacing_px: (K,2) between neighbouring rays. moving: (K,).
-    frame, sweep: (K,) source, see `_witness`. age_ns: (K,) see `_ages_ns`. far: (K,) from a sweep
-    beyond the window."""
+    """The K points in the image.
+
+    index: rows of the cloud. uv: (K,2) px. depth: (K,) m. focal_px: (K,2) local scale, px per metre
+    at a depth of 1 m. slope: (K,2) of the tangent plane's inverse depth, 1/m per px. spacing_px:
+    (K,2) between neighbouring rays. moving: (K,). frame, sweep: (K,) source, see `_witness`.
+    age_ns: (K,) see `_ages_ns`. far: (K,) from a sweep beyond the window.
+    """
 
     index: Int
     uv: Float
@@ -49,7 +57,7 @@ class PointsInImage:
         )
 
     def at(self, rows: Int) -> Int:
-        """Where rows of the cloud, all in the image, are among these."""
+        """Return where rows of the cloud, all in the image, are among these."""
         place = np.zeros(int(self.index.max(initial=-1)) + 1, np.int64)
         place[self.index] = np.arange(len(self.index))
         found: Int = place[rows]
@@ -68,9 +76,9 @@ class _Local(NamedTuple):
     spacing_px: Float
 
 
-def in_image(cloud: Cloud, view: InView, patches: Patches, vetoed: bool) -> PointsInImage:
-    """The points of ``cloud`` that are in the ``view``. vetoed: without those that the key sweep
-    saw through."""
+def points_in_image(cloud: Cloud, view: InView, patches: Patches, vetoed: bool) -> PointsInImage:
+    """Return the points of the cloud in the view; vetoed: without those the key sweep saw
+    through."""
     row = np.rint(view.uv[:, 1]).astype(np.uint16)
     kept = np.argsort(row, kind="stable")
     if vetoed:
@@ -103,8 +111,7 @@ def in_image(cloud: Cloud, view: InView, patches: Patches, vetoed: bool) -> Poin
 def _pinhole(
     exposure: Exposure, points_cam: Float, depth: Float32, normal: Float, spacing_m: Float32
 ) -> _Local:
-    """Scale for the camera z of a rectified image, where patches count as facing the image
-    plane."""
+    """Scale for the camera z of a rectified image, where patches count as facing it."""
     focal_px = exposure.camera.K[[0, 1], [0, 1]]
     # On the plane n · p = d the inverse depth is n · ray / d: linear over the image.
     d = np.einsum("ij,ij->i", normal, points_cam)
@@ -126,7 +133,7 @@ def _any_lens(
     focal_px = np.linalg.norm(J, axis=2) * depth[:, None]
     d = np.einsum("ij,ij->i", normal, points_cam)
     with np.errstate(divide="ignore", invalid="ignore"):
-        across = _pseudo_inverse(J)
+        across = J.transpose(0, 2, 1) @ np.linalg.inv(J @ J.transpose(0, 2, 1))
         along = -np.einsum("ij,ijk->ik", normal, across) / d[:, None]
         if exposure.measure == "z":
             z = points_cam[:, 2:]
@@ -143,26 +150,20 @@ def _any_lens(
     return _Local(focal_px, slope, spacing_px)
 
 
-def _pseudo_inverse(J: Float) -> Float:
-    """(K,2,3) -> (K,3,2) of full rank, Jᵀ (J Jᵀ)⁻¹."""
-    u, v = J[:, 0], J[:, 1]
-    uu, uv, vv = (np.einsum("ij,ij->i", a, b)[:, None] for a, b in ((u, u), (u, v), (v, v)))
-    across: Float = np.stack([vv * u - uv * v, uu * v - uv * u], axis=2)
-    return across / (uu * vv - uv**2)[:, :, None]
-
-
 def _witness(patches: Patches, far: Bool) -> NDArray[np.int32]:
-    """(M,) which of 63 a point's sweep is when those that agree are counted: a number for each
-    sweep of the window, and for each stretch of road beyond it; distant stretches may share one."""
+    """Return (M,) the number, of 63, by which a point's sweep is counted: one for each sweep of the
+    window, and for each part of the road beyond it; distant parts may share one."""
     num_near = min(int(patches.sweep[~far].max(initial=-1)) + 1, _MOST_SWEEPS - 1)
     shared = num_near + patches.place % (_MOST_SWEEPS - num_near)
     return np.where(far, shared, np.minimum(patches.sweep, _MOST_SWEEPS - 1)).astype(np.int32)
 
 
 def _ages_ns(since_key_ns: Int, sweep: NDArray[np.int32], far: Bool) -> Int:
-    """(K,) times between the key and the points' sweeps. Sweeps of the window less than 10 ms
-    apart count as equally old: clocks that jitter do not decide between the sweeps before and after
-    the key."""
+    """Return (K,) times between the key and the points' sweeps.
+
+    Sweeps of the window less than 10 ms apart count as equally old: clocks that jitter do not
+    decide between the sweeps before and after the key.
+    """
     near = ~far
     of_sweep = np.zeros(int(sweep[near].max(initial=-1)) + 1, np.int64)
     of_sweep[sweep[near]] = np.abs(since_key_ns[near])
@@ -172,3 +173,93 @@ def _ages_ns(since_key_ns: Int, sweep: NDArray[np.int32], far: Bool) -> Int:
     ages_ns = np.abs(since_key_ns)
     ages_ns[near] = of_sweep[sweep[near]]
     return ages_ns
+
+
+def distance_behind(
+    points: PointsInImage, camera: Camera, who: Bool | slice = slice(None)
+) -> Float:
+    """Return (K,) how far each point lies behind the nearest patch over its pixel, as a share of
+    what is allowed; above 1 it is hidden. who: (K,) the points whose patches hide."""
+    slack_px = _SLACK_M * points.focal_px / points.depth[:, None]
+    half_px = np.clip(_FOOTPRINT * points.spacing_px + slack_px, 0.5, _MAX_HALF_PX)
+    nearest = np.zeros((camera.height_px, camera.width_px), np.float32)
+    paint(points.uv[who], points.inverse[who], points.slope[who], half_px[who], nearest)
+    column, row = np.rint(points.uv).astype(np.int64).T
+    occluder = nearest[row, column].astype(np.float64)
+    covered = occluder > 0
+    np.divide(1, occluder, out=occluder, where=covered)
+    off = np.where(covered, points.depth - occluder, 0.0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.nan_to_num(off / (HIDDEN_M + HIDDEN_FRACTION * occluder), posinf=np.inf)
+
+
+@Kernel
+def paint(uv, inverse, slope, half_px, canvas):  # type: ignore[no-untyped-def]
+    """Raise canvas (H,W) float32 to the greatest inverse depth of the patches over a pixel.
+
+    uv, slope, half_px: (K,2); inverse: (K,). A patch covers the pixel centres within ``half_px`` of
+    its point, with inverse depth ``inverse + slope · offset``, between half of ``inverse`` and all
+    of it: a patch is never nearer than its point.
+    """
+    height, width = canvas.shape
+    for i in range(len(inverse)):
+        w = inverse[i]
+        left = max(int(np.ceil(uv[i, 0] - half_px[i, 0])), 0)
+        right = min(int(np.floor(uv[i, 0] + half_px[i, 0])), width - 1)
+        top = max(int(np.ceil(uv[i, 1] - half_px[i, 1])), 0)
+        bottom = min(int(np.floor(uv[i, 1] + half_px[i, 1])), height - 1)
+        for v in range(top, bottom + 1):
+            tilt_v = slope[i, 1] * (v - uv[i, 1])
+            covered = canvas[v, left : right + 1]
+            for k in range(len(covered)):
+                tilt = tilt_v + slope[i, 0] * (left + k - uv[i, 0])
+                there = w + min(max(tilt, -0.5 * w), 0.0)
+                covered[k] = max(covered[k], np.float32(there))
+
+
+def sorted_by_pixel(
+    points: PointsInImage, rank: Int, confidence: Float32, camera: Camera
+) -> tuple[Int, Int]:
+    """Return ``start`` and ``order``: the points of pixel p are ``order[start[p]:start[p + 1]]``,
+    the least in rank (K,) first, then the nearest."""
+    column, row = np.rint(points.uv).astype(np.int64).T
+    start = np.empty(camera.height_px * camera.width_px + 1, np.int64)
+    order = np.empty(len(rank), np.int64)
+    pixel = row * camera.width_px + column
+    _by_pixel(pixel, rank, points.depth, points.frame, points.uv, confidence, start, order)
+    return start, order
+
+
+@inlined
+def _before(a, b, rank, depth, frame, uv, confidence):  # type: ignore[no-untyped-def]
+    """Return True if point a wins a pixel over b. Equal points may come in any order."""
+    if rank[a] != rank[b]:
+        return rank[a] < rank[b]
+    if depth[a] != depth[b]:
+        return depth[a] < depth[b]
+    if frame[a] != frame[b]:
+        return frame[a] < frame[b]
+    if uv[a, 0] != uv[b, 0]:
+        return uv[a, 0] < uv[b, 0]
+    if uv[a, 1] != uv[b, 1]:
+        return uv[a, 1] < uv[b, 1]
+    return confidence[a] > confidence[b]
+
+
+@Kernel
+def _by_pixel(pixel, rank, depth, frame, uv, confidence, start, order):  # type: ignore[no-untyped-def]
+    """Fill start (num_pixels + 1,) and order (K,) of `sorted_by_pixel`."""
+    start[:] = 0
+    for p in pixel:
+        start[p + 1] += 1
+    for p in range(len(start) - 1):
+        start[p + 1] += start[p]
+    filled = np.zeros(len(start) - 1, np.int32)
+    for i in range(len(pixel)):
+        p = pixel[i]
+        at = start[p] + filled[p]
+        while at > start[p] and _before(i, order[at - 1], rank, depth, frame, uv, confidence):
+            order[at] = order[at - 1]
+            at -= 1
+        order[at] = i
+        filled[p] += 1

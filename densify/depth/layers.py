@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A depth map while it is being made: what the stages of `densify.depth.project` pass on."""
+"""A depth map in the making: what the stages of `densify.depth.project` hand on."""
 
 from __future__ import annotations
 
@@ -13,23 +13,18 @@ from densify.geometry.types import Bool, Float32
 
 @dataclass(frozen=True)
 class Layers:
-    """One camera's map with all that is known of its pixels; (H,W) everywhere.
+    """One camera's map with all that is known of its pixels; (H,W) everywhere, depths in m, 0 none.
 
-    depth_m: float32, accepted as measured, 0 none. rim_m: float32, measured so near to a depth edge
-    that the pixel may show what lies beyond, 0 where not; it stays when the pixel is accepted.
-    veiled: (H,W) such a pixel is measured behind the patch of a nearer point, and not at all else.
-    refused: (H,W) such a pixel is never accepted: on a mover, where the key sweep saw past it, or
-    behind the patch of one, seen at another time.
-    filled_m: float32, the accepted ones plus interpolated ones. confidence: float32 0 to 1, of
-    every pixel in any of the three. point: int32 row of the cloud that measured the pixel, -1 none.
-    tilt: (H,W,2) float32 slope of the measured surface's inverse depth to the right and down, 1/m
-    per px. spacing_px: (H,W,2) float32 between neighbouring rays of one sweep, across and along
-    elevation, everywhere. lab: (H,W,3) float32 the image as `densify.depth.picture` makes it, None
-    without one. warnings: what could not be done as asked. window: (H,W) True inside the windows of
-    vehicles, and glass: where a measured pixel was taken out of one; None before they are closed.
-    alone: (H,W) measured by the key sweep alone, where others should have met the surface; moving:
-    of what moves; unsure: an accepted rim that the image gives too few votes to count as measured;
-    None for nowhere.
+    depth_m: accepted as measured. rim_m: measured so close to a depth discontinuity that the pixel
+    may show what lies beyond; it stays when the pixel is accepted. veiled: this boundary pixel is
+    measured behind the patch of a nearer point. refused: it is never accepted, because the key
+    sweep saw past the moving object there. filled_m: accepted and interpolated pixels. confidence:
+    0 to 1. point: row of the cloud that measured the pixel, -1 none. tilt: (H,W,2) slope of the
+    surface's inverse depth to the right and down, 1/m per px. spacing_px: (H,W,2) between
+    neighbouring rays of one sweep, across and down, everywhere. lab: (H,W,3) the image in L*a*b*,
+    if there is one. warnings: what could not be done as asked. window: inside car windows. glass:
+    where a measured pixel was taken out of one. alone: measured by the key sweep alone. moving: of
+    a moving object. unsure: an accepted boundary pixel with too few votes to count as measured.
     """
 
     depth_m: Float32
@@ -54,14 +49,9 @@ class Layers:
         """(H,W) between neighbouring rays, whichever way."""
         return np.sqrt(self.spacing_px[..., 0] * self.spacing_px[..., 1])
 
-    @property
-    def strict(self) -> Bool:
-        """(H,W) measured, and no depth edge near."""
-        return (self.depth_m > 0) & (self.rim_m == 0)
-
     def without(self, dropped: Bool) -> Layers:
         """Take out the pixels ``dropped`` (H,W) of the filled map; what was measured there becomes
-        a rim that is not accepted."""
+        a boundary pixel that is not accepted."""
         dropped = dropped & (self.filled_m > 0)
         rim_m = np.where(dropped & (self.depth_m > 0), self.depth_m, self.rim_m)
         depth_m, filled_m, confidence = (

@@ -1,112 +1,69 @@
 # SPDX-License-Identifier: MIT
-"""What each accumulated point stands for, before any camera looks: a patch of surface as large as
-the gap to the neighbouring rays of its own sweep, slanted as its neighbours there tell; and whether
-the key sweep saw through the place."""
+"""The patch of surface that each accumulated point stands for.
+
+It is as large as the gap to the neighbouring rays of its own sweep, and slanted as its neighbours
+there tell. On a plane the inverse range is normal · direction, so its derivatives by azimuth and
+elevation give the normal.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from threading import Lock
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from densify.config import ProjectSettings
-from densify.depth import tangents as kernels
+from densify.depth.neighbours import slopes
 from densify.free_space.range_image import RangeImage
 from densify.free_space.sensor import Sensors
+from densify.geometry.compiled import Kernel, inlined
 from densify.geometry.types import Bool, Cloud, Float, Float32, Patches
 
-_MIN_FILLED = 6
-
-
-class Tangents:
-    """What `tangents` finds, kept for those who ask again: methods differ in where they put what
-    moves, not in what was measured. The largest cloud is kept. May be asked by several threads."""
-
-    def __init__(self) -> None:
-        self._lock = Lock()
-        self._asked: tuple[NDArray[Any], ...] = (np.zeros((0, 3)),) * 3
-        self._wanted = np.zeros(0, bool)
-        self._normal, self._spacing_m = np.zeros((2, 0, 3), np.float32)
-
-    def of(
-        self,
-        cloud: Cloud,
-        sweep: NDArray[np.int32],
-        wanted: Bool,
-        sensors: Sensors,
-        origins: Sequence[Float],
-    ) -> tuple[Float32, Float32]:
-        """As `tangents`, of the rigidly registered points."""
-        points, lidar = cloud.rigid_points, cloud.lidar
-        asked: tuple[NDArray[Any], ...] = (points, lidar, sweep)
-        if len(points) < len(self._asked[0]):
-            return tangents(points, lidar, sweep, wanted, sensors, origins)
-        with self._lock:
-            again = all(np.array_equal(a, b) for a, b in zip(asked, self._asked, strict=True))
-            known = wanted & self._wanted if again else np.zeros(len(cloud), bool)
-            new = wanted & ~known
-            normal, spacing_m = tangents(points, lidar, sweep, new, sensors, origins)
-            rows = np.flatnonzero(known)
-            if len(rows):
-                normal[rows], spacing_m[rows] = self._normal[rows], self._spacing_m[rows]
-            self._asked, self._wanted = asked, wanted
-            self._normal, self._spacing_m = normal, spacing_m
-        return normal, spacing_m
+_VETO_M, _VETO_FRACTION = 0.3, 0.015  # before what the key sweep saw; the larger counts
+_MIN_FILLED = 6  # of the nine cells around
+_STEEP = 5.7  # metres farther per metre across, 10 degrees: a surface steeper on one side is a step
+_BEND_M, _BEND = 0.10, 0.25  # most change of the slope, and as a share of the change itself
+_AROUND, _MOST_CELLS = 5.0, 20  # spacings within which rays without order have neighbours
+_RIDGE = 0.005  # of the neighbours' mean square distance
 
 
 def patches(
     cloud: Cloud,
     key: int,
-    settings: ProjectSettings,
     sensors: Sensors,
     origins: Mapping[int, Float],
     key_image: RangeImage | None = None,
     wanted: Bool | None = None,
-    shared: Tangents | None = None,
 ) -> Patches:
-    """The patches of ``cloud``, of any use to every camera.
+    """Return the patches of a cloud.
 
-    sensors: the scanners that measured it. origins: (S,3) where each of them stood in each source
-    sweep, key frame, by frame. key_image: what the key sweep saw; without it nothing is ``free``.
-    wanted: (M,) the points that some camera sees, all if None; of others no more than ``sweep`` is
-    told. shared: with other methods, by the same sensors and origins.
+    key: its frame. sensors: the scanners. origins: (S,3) of the scanners, key frame, by frame.
+    key_image: of the key sweep; without it nothing is ``free``. wanted: (M,) the points that some
+    camera sees, all if None; of others only ``sweep`` is set.
 
-    The tangent plane is from the neighbours in azimuth and elevation of the same scanner in the
-    same sweep; where they tell of no single surface the patch faces the scanner. A point of another
-    sweep is free where the key sweep saw through it and all around (`RangeImage.sees_through`): by
-    more than ``veto_m`` and ``veto_fraction`` in at least six of the nine cells around. Only the
-    key's rays count: other sweeps rightly saw through the place where a mover was not yet.
+    A patch is tangent to the neighbours of the same scanner and sweep; where they show no single
+    surface it faces the scanner. A point of another sweep is free if the key sweep saw through it.
+    Only the key's rays count: others rightly saw through the position that a moving object reached
+    later.
     """
     frames, inverse = np.unique(cloud.frame, return_inverse=True)
     sweep: NDArray[np.int32] = inverse.ravel().astype(np.int32)
     if wanted is None:
         wanted = np.ones(len(cloud), bool)
-    places = [origins[int(f)] for f in frames]
-    normal, spacing_m = (shared or Tangents()).of(cloud, sweep, wanted, sensors, places)
+    normal, spacing_m = tangents(
+        cloud.rigid_points, cloud.lidar, sweep, wanted, sensors, [origins[int(f)] for f in frames]
+    )
     free = np.zeros(len(cloud), bool)
     other = np.flatnonzero(wanted & (cloud.frame != key))
     if key_image is not None and len(other):
-        points = cloud.points.take(other, axis=0)
-        velocity_m_s = cloud.velocity_m_s.take(other, axis=0)
-        free[other] = vetoed(points, velocity_m_s, key_image, settings)
+        points, velocity_m_s = cloud.points[other], cloud.velocity_m_s[other]
+        free[other] = seen_through_by_key(points, velocity_m_s, key_image)
     return Patches(normal, spacing_m, free, sweep, np.full(len(cloud), -1, np.int32))
 
 
-def vetoed(
-    points: Float, velocity_m_s: Float32, key_image: RangeImage, settings: ProjectSettings
-) -> Bool:
-    """(N,3) of other sweeps at the key's moment, key frame -> (N,) where the key sweep saw through
-    them."""
-    return key_image.sees_through(
-        points,
-        settings.veto_m,
-        settings.veto_fraction,
-        _MIN_FILLED,
-        velocity_m_s,
-    )
+def seen_through_by_key(points: Float, velocity_m_s: Float32, key_image: RangeImage) -> Bool:
+    """Return (N,) True for the points (N,3), key frame, that the key sweep saw through."""
+    return key_image.sees_through(points, _VETO_M, _VETO_FRACTION, _MIN_FILLED, velocity_m_s)
 
 
 def tangents(
@@ -117,11 +74,11 @@ def tangents(
     sensors: Sensors,
     origins: Sequence[Float],
 ) -> tuple[Float32, Float32]:
-    """Normals (M,3) and spacings (M,2) of the points ``wanted`` (M,), scanner by scanner and sweep
-    by sweep.
+    """Return normals (M,3) and spacings (M,2) of the points ``wanted`` (M,).
 
     points: (M,3), rigidly registered. lidar: (M,) which scanner. sweep: (M,) which of ``origins``,
-    (S,3) each.
+    (S,3) each. A normal has any length: the plane is normal · (p - origin) = 1. Spacings are metres
+    between neighbouring rays, across and along elevation.
     """
     normal = np.zeros((len(points), 3), np.float32)
     spacing_m = np.zeros((len(points), 2), np.float32)
@@ -130,15 +87,187 @@ def tangents(
     num_scanners = len(origins[0])
     place = (sweep * num_scanners + lidar).astype(np.int32)
     seen = np.empty((3, len(points)), np.float32)
-    kernels.look.over_rows(len(points), points, np.concatenate(origins), place, seen)
+    _look.over_rows(len(points), points, np.concatenate(origins), place, seen)
     size = np.bincount(place, minlength=num_scanners * len(origins))
     members = np.split(np.argsort(place, kind="stable"), np.cumsum(size)[:-1])
     for number, model in sensors.models.items():
         grid = model.grid
         cells = np.empty((grid.num_rows, grid.num_columns), np.int32)
-        find = kernels.tangents_anywhere if model.unordered else kernels.tangents_on_rings
+        find = _tangents_anywhere if model.unordered else _tangents_on_rings
         for mine in members[number::num_scanners]:
-            kernels.nearest_in_cells(seen, mine, grid, cells)
+            _nearest_in_cells(seen, mine, grid, cells)
             mine = mine[wanted[mine]]
             find.over_rows(len(mine), mine, seen, model.table, grid, cells, normal, spacing_m)
     return normal, spacing_m
+
+
+@Kernel
+def _look(first, last, points, origins, place, seen):  # type: ignore[no-untyped-def]
+    """seen: (3,N) float32, filled with azimuth, elevation (rad) and range (m) of the points (N,3)
+    from origins (P,3), the one numbered ``place`` (N,)."""
+    for i in range(first, last):
+        x = points[i, 0] - origins[place[i], 0]
+        y = points[i, 1] - origins[place[i], 1]
+        z = points[i, 2] - origins[place[i], 2]
+        level = np.sqrt(x * x + y * y)
+        seen[0, i] = np.arctan2(y, x)
+        seen[1, i] = np.arctan2(z, level)
+        seen[2, i] = np.sqrt(level * level + z * z)
+
+
+@inlined
+def _cell(azimuth, elevation, grid):  # type: ignore[no-untyped-def]
+    """Return row and column of a direction in a `densify.free_space.sensor.RayGrid`."""
+    place = (elevation - grid.low_rad) / grid.bin_rad
+    k = min(max(int(place), 0), len(grid.row_of) - 2)
+    at = grid.row_of[k] + (place - k) * (grid.row_of[k + 1] - grid.row_of[k])
+    row = min(max(int(at), 0), grid.num_rows - 1)
+    column = int((azimuth + np.pi) * (grid.num_columns / (2 * np.pi)))
+    return row, min(max(column, 0), grid.num_columns - 1)
+
+
+@inlined
+def _spacing(azimuth, elevation, table):  # type: ignore[no-untyped-def]
+    """Return spacings in rad, across and along, of a `densify.free_space.sensor.RayTable`."""
+    row = min(max(int((elevation - table.low_rad) / table.bin_rad), 0), table.along.shape[0] - 1)
+    columns = table.along.shape[1]
+    column = int((azimuth + np.pi) * (columns / (2 * np.pi))) % columns
+    return table.across[row, column], table.along[row, column]
+
+
+@inlined
+def _before(seen, i, j):  # type: ignore[no-untyped-def]
+    if seen[2, i] != seen[2, j]:
+        return seen[2, i] < seen[2, j]
+    if seen[0, i] != seen[0, j]:
+        return seen[0, i] < seen[0, j]
+    return seen[1, i] < seen[1, j]
+
+
+@Kernel
+def _nearest_in_cells(seen, members, grid, cells):  # type: ignore[no-untyped-def]
+    """cells: (R,C) int32, filled with the nearest of ``members`` (indices) in each, -1 none. Of
+    equally near ones the direction decides, not the order of the points."""
+    cells[:] = -1
+    for i in members:
+        row, column = _cell(seen[0, i], seen[1, i], grid)
+        there = cells[row, column]
+        if there < 0 or _before(seen, i, there):
+            cells[row, column] = i
+
+
+@inlined
+def _first(cells, row, column, rows, columns):  # type: ignore[no-untyped-def]
+    """Return the point in the first filled cell of those at the given distances, -1 none."""
+    for k in range(len(rows)):
+        r = row + rows[k]
+        if 0 <= r < cells.shape[0]:
+            there = cells[r, (column + columns[k]) % cells.shape[1]]
+            if there >= 0:
+                return there
+    return -1
+
+
+@inlined
+def _slope(one, other, step, range_m):  # type: ignore[no-untyped-def]
+    """Return the slope from the changes of inverse range per radian on both sides (NaN: none).
+
+    Where both show one surface it is their mean; else the lesser, unless that is a step in depth.
+    """
+    metres = step * range_m * range_m  # of range per step, by a unit of slope
+    if abs(one - other) * metres <= _BEND_M + _BEND * abs(one + other) * metres:
+        return 0.5 * (one + other)
+    if not abs(one) <= abs(other):  # NaN too
+        one = other
+    return one if abs(one) * range_m <= _STEEP else 0.0
+
+
+@inlined
+def _change(seen, i, there, axis, across, slope_across):  # type: ignore[no-untyped-def]
+    """Return the change of inverse range per radian along one angle, without that along the other;
+    NaN if there is no point."""
+    if there < 0:
+        return np.nan
+    apart = seen[axis, there] - seen[axis, i]
+    if axis == 0:
+        apart -= 2 * np.pi * np.rint(apart / (2 * np.pi))
+    if abs(apart) < 1e-5:
+        return np.nan
+    beside = seen[across, there] - seen[across, i]
+    return (1 / seen[2, there] - 1 / seen[2, i] - slope_across * beside) / apart
+
+
+@inlined
+def _put(i, seen, table, level, rise, normal, spacing):  # type: ignore[no-untyped-def]
+    """Fill a point's row from the change of inverse range per radian of azimuth and elevation."""
+    azimuth, elevation, range_m = seen[0, i], seen[1, i], seen[2, i]
+    across, along = _spacing(azimuth, elevation, table)
+    ca, sa, ce, se = np.cos(azimuth), np.sin(azimuth), np.cos(elevation), np.sin(elevation)
+    aside = level / max(ce, 1e-3)
+    normal[i, 0] = ce * ca / range_m - aside * sa - rise * se * ca
+    normal[i, 1] = ce * sa / range_m + aside * ca - rise * se * sa
+    normal[i, 2] = se / range_m + rise * ce
+    spacing[i, 0] = range_m * across
+    spacing[i, 1] = range_m * along
+
+
+@Kernel
+def _tangents_on_rings(first, last, members, seen, table, grid, cells, normal, spacing):  # type: ignore[no-untyped-def]
+    """Fill normal (N,3) and spacing (N,2) of points from their neighbours on the ring, above and
+    below. members: (n,) indices. seen: (3,N). cells: of `_nearest_in_cells`."""
+    right, left = np.array([-2, -1, -3]), np.array([2, 1, 3])
+    same = np.zeros(3, np.int64)
+    up, down = np.array([1, 1, 1, 2]), np.array([-1, -1, -1, -2])
+    straight = np.array([0, 1, -1, 0])
+    for k in range(first, last):
+        i = members[k]
+        across, along = _spacing(seen[0, i], seen[1, i], table)
+        step = across / max(np.cos(seen[1, i]), 1e-3)
+        row, column = _cell(seen[0, i], seen[1, i], grid)
+        one = _change(seen, i, _first(cells, row, column, same, right), 0, 1, 0.0)
+        other = _change(seen, i, _first(cells, row, column, same, left), 0, 1, 0.0)
+        level = _slope(one, other, 2 * step, seen[2, i])
+        level = 0.0 if np.isnan(level) else level
+        above = _first(cells, row, column, up, straight)
+        below = _first(cells, row, column, down, straight)
+        one, other = _change(seen, i, above, 1, 0, level), _change(seen, i, below, 1, 0, level)
+        rise = _slope(one, other, along, seen[2, i])
+        _put(i, seen, table, level, 0.0 if np.isnan(rise) else rise, normal, spacing)
+
+
+@Kernel
+def _tangents_anywhere(first, last, members, seen, table, grid, cells, normal, spacing):  # type: ignore[no-untyped-def]
+    """As `_tangents_on_rings`, of rays without order: least squares over the points around, then
+    over those that the first plane fits. If half of them do not, the patch faces the scanner."""
+    num_rows, num_columns = cells.shape
+    for k in range(first, last):
+        i = members[k]
+        range_m, flatten = seen[2, i], np.cos(seen[1, i])
+        row, column = _cell(seen[0, i], seen[1, i], grid)
+        spacing_rad = _spacing(seen[0, i], seen[1, i], table)[1]
+        reach = min(1 + int(_AROUND * spacing_rad / grid.bin_rad), _MOST_CELLS)
+        level, rise = 0.0, 0.0
+        for turn in range(2):
+            uu, uv, vv, uw, vw = 0.0, 0.0, 0.0, 0.0, 0.0
+            num, num_kept = 0, 0
+            for r in range(max(row - reach, 0), min(row + reach, num_rows - 1) + 1):
+                for c in range(column - reach, column + reach + 1):
+                    j = cells[r, c % num_columns]
+                    if j < 0:
+                        continue
+                    u = seen[0, j] - seen[0, i]
+                    u = (u - 2 * np.pi * np.rint(u / (2 * np.pi))) * flatten
+                    v, w = seen[1, j] - seen[1, i], 1 / seen[2, j] - 1 / range_m
+                    if u == 0 and v == 0 and w == 0:
+                        continue  # the point itself, or its equal
+                    num += 1
+                    off_m = abs(w - level * u - rise * v) * range_m * range_m
+                    if turn and off_m > _BEND_M + _BEND * abs(w) * range_m * range_m:
+                        continue
+                    num_kept += 1
+                    uu, uv, vv, uw, vw = uu + u * u, uv + u * v, vv + v * v, uw + u * w, vw + v * w
+            ridge = _RIDGE * (uu + vv) + 1e-12
+            level, rise = slopes(uu + ridge, uv, vv + ridge, uw, vw)
+            if 2 * num_kept < num:
+                level, rise = 0.0, 0.0
+        _put(i, seen, table, level * flatten, rise, normal, spacing)

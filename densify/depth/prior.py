@@ -2,12 +2,10 @@
 """Depth where nothing is measured, from a depth image that the user brings, such as a monocular
 network's.
 
-First one curve takes the prior's values to metres (`PriorFit`), by robust least squares on their
-medians in steps of measured depth. What it leaves differs from place to place: that correction of
-the logarithm of depth is spread over the image as a membrane that is tied to the known pixels and
-torn at the prior's own depth edges (random walks on the image, Grady, "Random walks for image
-segmentation", PAMI 2006; as edge-aware interpolation Barron and Poole, "The fast bilateral solver",
-ECCV 2016).
+One curve takes the prior's values to metres, by robust least squares. What it leaves differs from
+place to place: that correction of the logarithm of depth is spread over the image as a membrane
+that is tied to the known pixels and torn at the prior's own depth edges (random walks, Grady,
+"Random walks for image segmentation", PAMI 2006).
 """
 
 from __future__ import annotations
@@ -19,9 +17,14 @@ import numpy as np
 from scipy import ndimage, optimize, sparse
 from scipy.sparse import linalg
 
-from densify.config import PriorSettings
 from densify.geometry.types import Bool, DepthMap, Float, Float32, FullDepth, Int, Prior, PriorFit
 
+FAR_M = 120.0
+"""Farther values of a prior count as sky."""
+MAX_WRONG = 0.2
+"""A prior is not used if its best fit is off by more than 25 % at a larger share of the measured
+pixels, each octave of depth counted alike. Good ones had up to 0.11, those of other images 0.25 to
+0.6."""
 _FORMS = {"auto": ("depth", "log", "inverse"), "depth": ("depth", "log"), "inverse": ("inverse",)}
 _MIN_FITTED = 100
 _STEP, _LEAST_OF_STEP = 0.05, 0.002  # of depth's logarithm; share of the pixels that it must hold
@@ -42,38 +45,34 @@ _HIGHEST = 0.2  # confidence of the prior's pixels; known ones have more
 _EMPTY = 10.0  # logarithm of a depth that is farther than all
 
 
-def complete(maps: DepthMap, prior: Prior, settings: PriorSettings) -> FullDepth:
+def complete(maps: DepthMap, prior: Prior, kind: str = "auto") -> FullDepth:
     """Add the prior's pixels where a depth map has neither measured nor filled ones.
 
-    maps: is not changed, nor is any of its pixels. prior: of the same shape, its depth measured as
-    the map's (``z``, or ``range`` from the lens).
+    maps: none of its pixels is changed. prior: of the same shape, its depth measured as the map's.
+    kind: of its values, ``depth``, ``inverse`` or ``auto``.
 
-    Left empty: what has no value, the mask's sky, what is farther than ``far_m``, the prior's own
-    far limit (its farthest value where it is that of many pixels that the lidar did not see), and
-    pixels between two surfaces, as blurred priors have them. Of a prior that does not fit
-    (``max_wrong``) nothing is used.
-
-    Confidences are a ranking, not calibrated. A pixel of the prior has at most 0.2, less the more
-    the prior deviates from known pixels nearby on the same surface and the steeper it is. All known
-    pixels have more: 0.2 + 0.8 times the map's.
+    Pixels stay empty without a value, in the mask's sky, beyond ``FAR_M``, at the prior's own far
+    limit, and between two surfaces, as blurred priors have them. A prior that does not fit is not
+    used. Confidences are a ranking: a pixel of the prior has at most 0.2, less the more the prior
+    deviates from known pixels nearby and the steeper it is; all known pixels have more.
     """
     known = (prior.value > 0) & ~prior.sky
     above = np.where(maps.filled_m > 0, _HIGHEST + (1 - _HIGHEST) * maps.confidence, 0)
     confidence = above.astype(np.float32)
     measured = known & (maps.depth_m > 0)
-    fit = fit_prior(prior.value[measured], maps.depth_m[measured], settings)
+    fit = fit_prior(prior.value[measured], maps.depth_m[measured], kind)
     if not fit.used:
         nothing = np.zeros(known.shape, bool)
         return FullDepth(maps.filled_m, confidence, nothing, fit, prior.source)
     log_depth = _log_depth(prior.value, fit)
-    usable = known & (log_depth < np.log(settings.far_m))
+    usable = known & (log_depth < np.log(FAR_M))
     usable &= ~_far_limit(prior.value, known, measured, fit)
     guide = np.where(usable, log_depth, _EMPTY).astype(np.float32)
     guide = cv2.medianBlur(guide, 5).astype(np.float32)
     farther, nearer = cv2.dilate(guide, _AROUND) - guide, guide - cv2.erode(guide, _AROUND)
     correction, spread = _correction(maps.filled_m, log_depth, guide, farther + nearer, usable)
     full_m = np.exp(np.minimum(log_depth + correction, _EMPTY)).astype(np.float32)
-    usable &= (np.minimum(farther, nearer) < _MIXED) & (full_m < settings.far_m)
+    usable &= (np.minimum(farther, nearer) < _MIXED) & (full_m < FAR_M)
     from_prior = usable & (maps.filled_m == 0)
     error = np.hypot(spread, farther + nearer) / _TOLERANCE
     return FullDepth(
@@ -85,20 +84,18 @@ def complete(maps: DepthMap, prior: Prior, settings: PriorSettings) -> FullDepth
     )
 
 
-def fit_prior(value: Float32, depth_m: Float32, settings: PriorSettings) -> PriorFit:
-    """The curve from a prior's values to depth that leaves the least ``residual``.
+def fit_prior(value: Float32, depth_m: Float32, kind: str) -> PriorFit:
+    """Return the curve from a prior's values to depth with the least ``residual``.
 
     value, depth_m: (N,) above 0, of measured pixels. A curve that turns near into far is none.
     """
-    fits = [
-        _fitted(form, value.astype(np.float64), depth_m.astype(np.float64), settings.max_wrong)
-        for form in _FORMS[settings.kind]
-    ]
+    p, z = value.astype(np.float64), depth_m.astype(np.float64)
+    fits = [_fitted(form, p, z) for form in _FORMS[kind]]
     return min(fits, key=lambda fit: (not fit.scale > 0, fit.residual))
 
 
-def _fitted(form: str, p: Float, z: Float, max_wrong: float) -> PriorFit:
-    """One form's, through the medians of the values in steps of depth: measured depth is exact,
+def _fitted(form: str, p: Float, z: Float) -> PriorFit:
+    """Fit one form through the medians of the values in steps of depth: measured depth is exact,
     values are not, and a wrong tenth of them moves no median."""
     if len(z) < _MIN_FITTED:
         return PriorFit(form, 0.0, 0.0, np.inf, 1.0, False)
@@ -106,18 +103,17 @@ def _fitted(form: str, p: Float, z: Float, max_wrong: float) -> PriorFit:
     steps = np.flatnonzero(np.bincount(step) >= _LEAST_OF_STEP * len(z))
     middle_p = ndimage.median(p, step, steps)
     scale, shift = _line(form, middle_p, ndimage.median(z, step, steps))
-    fit = PriorFit(form, scale, shift, np.inf, 1.0, False)
-    off = np.abs(_log_depth(p, fit) - np.log(z))
+    off = np.abs(_log_depth(p, PriorFit(form, scale, shift, np.inf, 1.0, False)) - np.log(z))
     octave = np.floor(np.log2(z / z.min())).astype(np.int64)
     weight = 1 / np.maximum(np.bincount(octave), _LEAST_OF_OCTAVE * len(z))[octave]
     residual = float(np.average(np.minimum(off, _WRONG), weights=weight))
     wrong = float(np.average(off > _WRONG, weights=weight))
-    return PriorFit(form, scale, shift, residual, wrong, scale > 0 and wrong <= max_wrong)
+    return PriorFit(form, scale, shift, residual, wrong, scale > 0 and wrong <= MAX_WRONG)
 
 
 def _line(form: str, p: Float, z: Float) -> tuple[float, float]:
-    """Scale and shift. Linear in both, weighted so that residuals are about those of the logarithm
-    of depth, and convex: there is one optimum, wherever the search starts."""
+    """Return scale and shift. The form is linear in both, weighted so that residuals are about
+    those of the logarithm of depth, and convex."""
     unit, one = float(np.median(p)), np.ones(len(z))
     if form == "log":
         columns, target = [np.log(p / unit), one], np.log(z)
@@ -129,17 +125,14 @@ def _line(form: str, p: Float, z: Float) -> tuple[float, float]:
     def residual(x: Float) -> Float:
         return A @ x - target
 
-    def slope(x: Float) -> Float:
-        return A
-
     start = np.linalg.lstsq(A, target, rcond=None)[0]
-    found = optimize.least_squares(residual, start, slope, loss="soft_l1", f_scale=_TOLERANCE)
+    found = optimize.least_squares(residual, start, loss="soft_l1", f_scale=_TOLERANCE)
     scale, shift = (float(x) for x in found.x)
     return (scale, shift - scale * np.log(unit)) if form == "log" else (scale / unit, shift)
 
 
 def _log_depth(value: Float | Float32, fit: PriorFit) -> Float:
-    """The logarithm of depth in metres by the curve alone; far where the curve ends."""
+    """Return the logarithm of depth in metres by the curve alone; far where the curve ends."""
     value = value.astype(np.float64)
     if fit.kind == "log":
         return fit.scale * np.log(np.maximum(value, np.finfo(np.float64).tiny)) + fit.shift
@@ -148,7 +141,8 @@ def _log_depth(value: Float | Float32, fit: PriorFit) -> Float:
 
 
 def _far_limit(value: Float32, known: Bool, measured: Bool, fit: PriorFit) -> Bool:
-    """(H,W) where the prior says no more than that it is far."""
+    """Return (H,W) True where the prior has its farthest value, if many pixels have it and the
+    lidar saw few of these."""
     if not known.any():
         return known
     limit = value[known].min() if fit.kind == "inverse" else value[known].max()
@@ -161,10 +155,8 @@ def _far_limit(value: Float32, known: Bool, measured: Bool, fit: PriorFit) -> Bo
 
 
 class _Cells(NamedTuple):
-    """The image in squares of ``size`` pixels; each has the guide of its middle pixel.
-
-    guide: (R,C) logarithm of depth. of: (H,W) number of each pixel's cell, row by row.
-    """
+    """The image in squares of ``size`` pixels. guide: (R,C) logarithm of depth of their middle
+    pixels. of: (H,W) number of each pixel's cell, row by row."""
 
     size: int
     guide: Float
@@ -182,21 +174,20 @@ class _Cells(NamedTuple):
         return _Cells(size, guide[np.ix_(rows, columns)].astype(np.float64), of)
 
     def membrane(self) -> sparse.csr_array:
-        """The (RC,RC) matrix whose quadratic form is the squared difference between neighbouring
-        cells, which counts less the more their guides differ."""
+        """Return the (RC,RC) matrix whose quadratic form is the squared difference between
+        neighbouring cells, which counts less the more their guides differ."""
         number = np.arange(self.guide.size).reshape(self.guide.shape)
         first = np.concatenate([number[:, :-1].ravel(), number[:-1].ravel()])
         second = np.concatenate([number[:, 1:].ravel(), number[1:].ravel()])
         step = (self.guide.ravel()[first] - self.guide.ravel()[second]) / _EDGE
         tied = _SMOOTHNESS * np.exp(-(step**2))
-        shape = (number.size, number.size)
-        half = sparse.coo_array((tied, (first, second)), shape=shape)
+        half = sparse.coo_array((tied, (first, second)), shape=(number.size, number.size))
         both = (half + half.T).tocsr()
         return sparse.diags_array(both.sum(axis=1)) - both
 
     def at_pixels(self, values: Float, guide: Float32) -> Float:
-        """(K,RC) values of cells -> (K,H,W), between the four cells around each pixel; those whose
-        guide is another surface's hardly count."""
+        """Return (K,H,W) values (K,RC) of cells, between the four cells around each pixel; those
+        with another surface's guide hardly count."""
         grid = values.reshape(-1, *self.guide.shape)
         down, right = ((np.arange(length) - self.size // 2) / self.size for length in guide.shape)
         total, result = np.zeros(guide.shape), np.zeros((len(grid), *guide.shape))
@@ -211,32 +202,29 @@ class _Cells(NamedTuple):
 
 
 def _both_ways(place: Float, num: int) -> list[tuple[Int, Float]]:
-    """The cells before and behind fractional places, and their weights."""
+    """Return the cells before and behind fractional places, and their weights."""
     before = np.clip(np.floor(place), 0, num - 1).astype(np.int64)
-    behind = np.minimum(before + 1, num - 1)
     share = np.clip(place - before, 0, 1)
-    return [(before, 1 - share), (behind, share)]
+    return [(before, 1 - share), (np.minimum(before + 1, num - 1), share)]
 
 
 def _correction(
     filled_m: Float32, log_depth: Float, guide: Float32, steepness: Float32, usable: Bool
 ) -> tuple[Float, Float]:
-    """(H,W) to be added to the logarithm of depth, and how far known pixels nearby on the same
-    surface still are from it; where none are near, no correction and what they lack on average."""
+    """Return (H,W) what to add to the logarithm of depth, and how far known pixels nearby on the
+    same surface still are from it; where none are near, no correction and the usual error."""
     cells = _Cells.over(guide)
     area, num = cells.size**2, cells.guide.size
     near = usable & (filled_m > 0) & (np.abs(guide - cells.guide.ravel()[cells.of]) < _EDGE)
     cell = cells.of[near]
     lacking = np.log(filled_m[near].astype(np.float64)) - log_depth[near]
-    # Where the prior is steep it may be blurred, and what it lacks there says little.
+    # Where the prior is steep it may be blurred, and a difference there says little.
     flat = 1 / (1 + (steepness[near].astype(np.float64) / _DOUBTFUL) ** 2)
     membrane, off, trust = cells.membrane(), np.abs(lacking), flat
     usual = float(np.average(off, weights=flat)) if len(off) else 0.0
     for _ in range(_NUM_PASSES):
-        tied = np.bincount(cell, trust, num) / area
-        correction = _settled(
-            membrane, tied + _TOWARDS_NONE, np.bincount(cell, trust * lacking, num) / area
-        )
+        tied = np.bincount(cell, trust, num) / area + _TOWARDS_NONE
+        correction = _settled(membrane, tied, np.bincount(cell, trust * lacking, num) / area)
         off = np.abs(lacking - correction[cell])
         trust = flat / (1 + (off / _DOUBTFUL) ** 2)
     tied, deviation = (np.bincount(cell, w, num) / area for w in (trust, trust * off))
@@ -246,7 +234,7 @@ def _correction(
 
 
 def _settled(membrane: sparse.csr_array, tied: Float, pulled: Float) -> Float:
-    """Where the membrane comes to rest: cell by cell it is pulled to ``pulled / tied``."""
+    """Return where the membrane comes to rest if each cell is pulled to ``pulled / tied``."""
     solver = linalg.splu(
         (membrane + sparse.diags_array(tied)).tocsc(),
         permc_spec="MMD_AT_PLUS_A",

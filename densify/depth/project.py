@@ -1,12 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""The accumulated cloud seen from a camera: which points it sees, and the depth map they make.
+"""One depth map from the accumulated cloud: the steps in order.
 
-Points that the camera cannot see are found by occlusion: every point hides what lies clearly behind
-its patch (`densify.depth.patches`). Of the points left in a pixel the one measured nearest in time
-to the key is taken, if enough sweeps agree with it and no depth edge is too close to tell on which
-side of it the pixel lies: those are its rims, which `densify.depth.rims` decides upon. Its depth is
-that of the plane through the points that agree, in the middle of the pixel. Nothing depends on the
-order of the points.
+Nothing depends on the order of the points. Planes are fitted in inverse depth, or in inverse range
+where depth is the range.
 """
 
 from __future__ import annotations
@@ -18,143 +14,109 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from densify.config import ProjectSettings
-from densify.depth.agreement import contradicted, without_contradicted
-from densify.depth.confidence import calibrated, ranked
-from densify.depth.exposure import Exposure, InView
-from densify.depth.fill import fill, without_shreds
-from densify.depth.free_space import Rays, without_seen_through
-from densify.depth.glass import close_windows
-from densify.depth.image_points import PointsInImage, in_image
+from densify.depth.boundary_pixels import accept_boundary_pixels
+from densify.depth.car_windows import close_windows
+from densify.depth.confidence import calibrated, contradicted, rank_pixels
+from densify.depth.exposure import Exposure
+from densify.depth.fill import fill, fill_stars, without_shreds
+from densify.depth.image_points import PointsInImage, points_in_image
 from densify.depth.layers import Layers
-from densify.depth.rims import decide
-from densify.depth.settling import MeasuredPixels, nearest_pixels, visible_pixels
-from densify.depth.spot import measure_spots
-from densify.depth.star import fill_stars
+from densify.depth.measured_pixels import MeasuredPixels, nearest_pixels, visible_pixels
+from densify.depth.seen_through import Rays, without_seen_through
+from densify.depth.spots import measure_spots
 from densify.geometry.types import Bool, Camera, Cloud, DepthMap, Float32, Patches, Ranked, Reason
 
 _BLOCK_PX = 16  # over which rays lie about equally dense
 _JUMP = 1.6  # by which rays lie farther apart beyond the last of a scanner's denser rings
+_MOST_CONTRADICTED = 0.7  # of the pixels around; of what more contradicted, half or more was wrong
 _LEAST_CONFIDENCE = np.float32(1 / 255)  # 0 means no depth once written as 8 bits
 
 
 def project(
     cloud: Cloud,
-    view: InView,
+    exposure: Exposure,
     settings: ProjectSettings,
     patches: Patches,
     filled: bool = True,
     lab: Float32 | None = None,
     rays: Rays | None = None,
 ) -> DepthMap:
-    """The depth map of ``cloud``, at the key's moment, as a camera sees it at its exposure.
+    """Return the depth map of a cloud as a camera sees it.
 
-    view: of the cloud (`densify.depth.exposure.Exposure.sees`).
-    settings: knobs, see `densify.config.ProjectSettings`; with ``visibility`` off the nearest point
-    of each pixel is taken as it is; else the source sweep nearest in time to the key wins a pixel.
-    patches: of the cloud, at the key's moment (`densify.depth.patches.patches`). filled: False
-    leaves out the filling, which takes its time. lab: (H,W,3) the image, as `densify.depth.picture`
-    makes it; without it nothing that needs one is done. rays: tell where the map is open
-    (`densify.depth.free_space`); without them nothing is taken out.
-
-    Points nearer than 0.1 m, outside the image or outside the lens's valid field of view are
-    dropped. Planes are fitted in inverse depth, or inverse range where depth is the range: linear
-    over the image of a pinhole in the first case, nearly so over a surface's few pixels otherwise.
-    ``filled_m`` adds pixels interpolated between measured ones (`densify.depth.fill`), less what
-    most around contradict (`densify.depth.agreement`), and rims that are unsure; what the spot of a
-    measured return covers counts as measured too (`densify.depth.spot`).
-    ``confidence`` starts from the point's own, less where few sweeps or points agree, a depth edge
-    is close, the surface rough, or the point nearly hidden; that rank is turned into a probability
-    (`densify.depth.confidence`), but with ``visibility`` off. ``reason`` says of every point why it
-    is not in the map.
+    cloud: at the key's reference time. exposure: of the camera; what moves is shown where it was
+    then. settings: knobs; without ``visibility`` the nearest point of each pixel is taken as it is.
+    patches: of the cloud. filled: False leaves out the fill. lab: (H,W,3) the image in L*a*b*;
+    without it no boundary pixel is accepted. rays: of the window; without them no pixel is taken
+    out as seen through.
     """
-    camera = view.exposure.camera
-    points = in_image(cloud, view, patches, settings.visibility)
+    view, camera, visible = exposure.sees(cloud), exposure.camera, settings.visibility
+    points = points_in_image(cloud, view, patches, vetoed=visible)
     own = np.clip(cloud.confidence[points.index], _LEAST_CONFIDENCE, 1.0)
     reason = np.full(len(cloud), Reason.OUTSIDE, np.uint8)
-    if settings.visibility:
+    if visible:
         reason[patches.free] = Reason.VETOED
-        seen = visible_pixels(points, own, camera, settings, reason)
+        pixels = visible_pixels(points, own, camera, settings.support, reason)
     else:
-        seen = nearest_pixels(points, own, camera, reason)
-
-    layers = decide(_measured(seen, points, camera, lab), settings)
+        pixels = nearest_pixels(points, own, camera, reason)
+    layers = accept_boundary_pixels(_layers_of(pixels, points, camera, lab), settings.rims)
     if filled:
-        layers = _filled(layers, camera, settings)
-    if not settings.visibility:
-        _tell(layers, reason)
-        return _finished(layers, cloud, view.exposure, reason, rank=None)
-    if rays is not None and settings.seen_through < 1:
-        layers = without_seen_through(layers, cloud, view, rays, reason, settings)
-    off = contradicted(layers, camera.focal_px)
-    if filled:
-        layers = without_contradicted(layers, off)
-    rank = ranked(layers, _far(layers, cloud), off)
-    layers = replace(layers, confidence=calibrated(rank, layers.filled_m > 0))
-    if layers.unsure is not None:
-        layers = replace(layers, depth_m=np.where(layers.unsure, np.float32(0), layers.depth_m))
-    _tell(layers, reason)
-    if filled and settings.spot > 0:
-        layers = measure_spots(layers, points, settings)
-    return _finished(layers, cloud, view.exposure, reason, rank)
+        layers = fill(layers, settings.fill_reach)
+        if visible and settings.glass == "plane":
+            layers = close_windows(layers, camera.focal_px)
+        layers = without_shreds(fill_stars(layers))
+    rank = None
+    if visible:
+        if rays is not None:
+            layers = without_seen_through(layers, cloud, view, rays, reason)
+        against = contradicted(layers, camera.focal_px)
+        if filled:
+            layers = layers.without(against > _MOST_CONTRADICTED)
+        rank = rank_pixels(layers, _far(layers, cloud), against)
+        layers = replace(layers, confidence=calibrated(rank, layers.filled_m > 0))
+        if layers.unsure is not None:
+            layers = replace(layers, depth_m=np.where(layers.unsure, 0, layers.depth_m))
+    _set_reasons(layers, reason)
+    if visible and filled:
+        layers = measure_spots(layers, points)
+    return _finished(layers, cloud, exposure, reason, rank)
 
 
-def _filled(layers: Layers, camera: Camera, settings: ProjectSettings) -> Layers:
-    """The same, and what lies between measured pixels."""
-    layers = fill(layers, settings)
-    if settings.visibility and settings.glass == "plane":
-        layers = close_windows(layers, camera.focal_px, settings)
-    if settings.star_reach > 0:
-        layers = fill_stars(layers, settings)
-    return without_shreds(layers)
-
-
-def _far(layers: Layers, cloud: Cloud) -> Bool:
-    """(H,W) the measured pixels whose point sweeps beyond the window saw."""
-    measured = layers.depth_m > 0
-    far = np.zeros(measured.shape, bool)
-    far[measured] = cloud.far[layers.point[measured]]
-    return far
-
-
-def _measured(
-    seen: MeasuredPixels, points: PointsInImage, camera: Camera, lab: Float32 | None
+def _layers_of(
+    pixels: MeasuredPixels, points: PointsInImage, camera: Camera, lab: Float32 | None
 ) -> Layers:
-    """What is measured away from depth edges is accepted, what is at them to be decided."""
+    """Return measured pixels as layers, those at depth edges as boundary pixels."""
     shape = (camera.height_px, camera.width_px)
-    depth_m, rim_m, confidence = (np.zeros(shape, np.float32) for _ in range(3))
-    tilt = np.zeros((*shape, 2), np.float32)
-    point = np.full(shape, -1, np.int32)
-    depth_m.flat[seen.pixel] = np.where(seen.inside, seen.depth_m, 0)
-    rim_m.flat[seen.pixel] = np.where(seen.inside, 0, seen.depth_m)
-    confidence.flat[seen.pixel] = np.maximum(seen.confidence, _LEAST_CONFIDENCE)
-    tilt.reshape(-1, 2)[seen.pixel] = seen.tilt
-    point.flat[seen.pixel] = points.index[seen.winner]
-    veiled, refused, alone, moving = (np.zeros(shape, bool) for _ in range(4))
-    veiled.flat[seen.pixel] = seen.veiled
-    refused.flat[seen.pixel] = seen.refused
-    alone.flat[seen.pixel] = seen.alone
-    moving.flat[seen.pixel] = points.moving[seen.winner]
-    spacing_px = _spacing_px(points if points.far.all() else points.select(~points.far), shape)
+
+    def image(values: np.ndarray, none: float = 0) -> np.ndarray:
+        """(P,…) -> (H,W,…)."""
+        made = np.full((shape[0] * shape[1], *values.shape[1:]), none, values.dtype)
+        made[pixels.pixel] = values
+        return made.reshape(*shape, *values.shape[1:])
+
+    depth_m = image(np.where(pixels.inside, pixels.depth_m, np.float32(0)))
+    near = points if points.far.all() else points.select(~points.far)
     return Layers(
         depth_m=depth_m,
-        rim_m=rim_m,
-        veiled=veiled,
-        refused=refused,
+        rim_m=image(np.where(pixels.inside, np.float32(0), pixels.depth_m)),
+        veiled=image(pixels.veiled),
+        refused=image(pixels.refused),
         filled_m=depth_m,
-        confidence=confidence,
-        point=point,
-        tilt=tilt,
-        spacing_px=spacing_px,
+        confidence=image(np.maximum(pixels.confidence, _LEAST_CONFIDENCE)),
+        point=image(points.index[pixels.winner].astype(np.int32), -1),
+        tilt=image(pixels.tilt.astype(np.float32)),
+        spacing_px=_spacing_px(near, shape),
         lab=lab,
-        alone=alone,
-        moving=moving,
+        alone=image(pixels.alone),
+        moving=image(points.moving[pixels.winner]),
     )
 
 
 def _spacing_px(points: PointsInImage, shape: tuple[int, int]) -> Float32:
-    """(H,W,2) between neighbouring rays: their mean over blocks, the nearest block's where there
-    are no points. Up and down it is that of the block above or below, where that is far larger: so
-    wide is the gap that begins at the last of a scanner's denser rings."""
+    """Return (H,W,2) the spacing of rays across and down, the mean over blocks of pixels.
+
+    Blocks without points take the nearest block's. Down, a block takes that of the block above or
+    below if it is far larger: the gap below the last of a scanner's denser rings is as wide.
+    """
     height, width = (-(-size // _BLOCK_PX) for size in shape)
     column, row = np.rint(points.uv).astype(np.int64).T // _BLOCK_PX
     block = row * width + column
@@ -173,8 +135,16 @@ def _spacing_px(points: PointsInImage, shape: tuple[int, int]) -> Float32:
     return np.ascontiguousarray(every[: shape[0], : shape[1]])
 
 
-def _tell(layers: Layers, reason: NDArray[np.uint8]) -> None:
-    """Fill in the ``reason`` of the points that are in the map, or were taken out of it."""
+def _far(layers: Layers, cloud: Cloud) -> Bool:
+    """Return (H,W) the measured pixels whose point is from beyond the window."""
+    measured = layers.depth_m > 0
+    far = np.zeros(measured.shape, bool)
+    far[measured] = cloud.far[layers.point[measured]]
+    return far
+
+
+def _set_reasons(layers: Layers, reason: NDArray[np.uint8]) -> None:
+    """Set the ``reason`` of points in the map, and of those taken out of it."""
     reason[layers.point[(layers.rim_m > 0) & ~layers.veiled]] = Reason.EDGE
     reason[layers.point[layers.depth_m > 0]] = Reason.KEPT
     if layers.glass is not None:

@@ -1,18 +1,29 @@
 # SPDX-License-Identifier: MIT
-"""Pixels covered by the spots of lasers, compiled: see `densify.depth.spot`."""
+"""The pixels that a laser's spot covers, not only the one that its middle falls into.
+
+A camera with a long focal length has several pixels to a beam: a return measures all of them.
+"""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
+import numpy as np
+
+from densify.depth.image_points import PointsInImage
+from densify.depth.layers import Layers
+from densify.depth.measured_pixels import AGREE_FRACTION, AGREE_M
 from densify.geometry.compiled import Kernel
 from densify.geometry.types import Float32
 
+_SPOT = 0.35  # half width, in spacings of rays along the azimuth
+_MOST_PX = 4  # of it
 
-class Spots(NamedTuple):
-    """What measured pixels know, (H,W) everywhere. middle_px: (H,W,2) float32 from the pixel's to
-    the return's, across and down. radius_px: float32, 0 where nothing is measured. depth_m: float32
-    and tilt: (H,W,2) float32 slope of its inverse, 1/m per px."""
+
+class _Spots(NamedTuple):
+    """The measured pixels, (H,W): from their middles to the returns' (H,W,2) px, radius in px (0
+    none), depth in m, and (H,W,2) slope of inverse depth, 1/m per px."""
 
     middle_px: Float32
     radius_px: Float32
@@ -20,14 +31,46 @@ class Spots(NamedTuple):
     tilt: Float32
 
 
-@Kernel
-def cover(pixel, filled_m, spots, agree, found, nearest):  # type: ignore[no-untyped-def]
-    """The measured pixel whose spot covers a filled one, nearest in the image, on its surface.
+def measure_spots(layers: Layers, points: PointsInImage) -> Layers:
+    """Count filled pixels as measured where the spot of a measured return covers them.
 
-    pixel: (P,) the measured ones, row by row. filled_m: (H,W) float32, of the pixels that may be
-    covered, 0 elsewhere. spots: `Spots`. agree: (2,) metres, and a share of the depth, by which
-    they may differ. found: (H,W) int64, of each covered pixel the measured one. nearest: (H,W)
-    float64 inf, squared distance to its spot.
+    The ``point`` of the nearest return is taken. The fill must lie on the return's surface: what
+    the fill left empty stays empty, and boundary pixels that are unsure stay so. Depth and
+    confidence remain the fill's.
+    """
+    shape = layers.depth_m.shape
+    measured = np.flatnonzero(layers.depth_m > 0)
+    if not len(measured):
+        return layers
+    point = points.at(layers.point.flat[measured])
+    spots = _Spots(
+        middle_px=np.zeros((*shape, 2), np.float32),
+        radius_px=np.zeros(shape, np.float32),
+        depth_m=layers.depth_m,
+        tilt=layers.tilt,
+    )
+    middle = np.stack(np.divmod(measured, shape[1])[::-1], axis=1)
+    spots.middle_px.reshape(-1, 2)[measured] = points.uv[point] - middle
+    spots.radius_px.flat[measured] = np.minimum(_SPOT * points.spacing_px[point, 0], _MOST_PX)
+    fills = layers.depth_m == 0
+    if layers.unsure is not None:
+        fills &= ~layers.unsure
+    filled_m = np.where(fills, layers.filled_m, np.float32(0))
+    found = np.full(shape, -1)
+    _cover(measured, filled_m, spots, found, np.full(shape, np.inf))
+    covered = np.flatnonzero(found >= 0)
+    depth_m, of_point = layers.depth_m.copy(), layers.point.copy()
+    depth_m.flat[covered] = layers.filled_m.flat[covered]
+    of_point.flat[covered] = layers.point.flat[found.flat[covered]]
+    return replace(layers, depth_m=depth_m, point=of_point)
+
+
+@Kernel
+def _cover(pixel, filled_m, spots, found, nearest):  # type: ignore[no-untyped-def]
+    """Find the measured pixel whose spot covers a filled one, nearest in the image.
+
+    pixel: (P,) the measured ones. filled_m: (H,W) of the pixels that may be covered, 0 elsewhere.
+    found: (H,W) int64, set to the measured pixel. nearest: (H,W) inf, squared distance to its spot.
     """
     height, width = filled_m.shape
     for p in pixel:
@@ -45,6 +88,6 @@ def cover(pixel, filled_m, spots, agree, found, nearest):  # type: ignore[no-unt
                 if away > radius_px * radius_px or away >= nearest[row, column]:
                     continue
                 inverse = 1 / here + du * spots.tilt[v, u, 0] + dv * spots.tilt[v, u, 1]
-                if abs(z * inverse - 1) <= (agree[0] + agree[1] * here) * abs(inverse):
+                if abs(z * inverse - 1) <= (AGREE_M + AGREE_FRACTION * here) * abs(inverse):
                     nearest[row, column] = away
                     found[row, column] = p

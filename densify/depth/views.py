@@ -1,25 +1,24 @@
 # SPDX-License-Identifier: MIT
-"""The accumulated cloud as the cameras see it, each at its own exposure."""
+"""All depth maps of a key: what its cameras see of the accumulated cloud, each at its exposure."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 
 from densify.config import Config, ProjectSettings
-from densify.depth.colour import colour
 from densify.depth.confidence import reliability
-from densify.depth.exposure import Exposure, InView, Shot
+from densify.depth.exposure import Exposure, Shot
 from densify.depth.far import far_cloud
-from densify.depth.free_space import Rays
-from densify.depth.optical_flow import optical_flow
-from densify.depth.patches import Tangents, patches, vetoed
-from densify.depth.picture import lab
+from densify.depth.image_alignment import lab
+from densify.depth.patches import patches, seen_through_by_key
 from densify.depth.project import project
+from densify.depth.seen_through import Rays
 from densify.free_space.range_image import RangeImage
 from densify.free_space.sensor import Sensors
 from densify.geometry import poses
@@ -41,46 +40,28 @@ from densify.geometry.types import (
 )
 from densify.scores import depth_metrics
 
+_BEHIND_M, _BEHIND_FRACTION = 0.15, 0.02  # the map's surface; a point farther behind has no colour
+
 
 class SeenCloud(NamedTuple):
-    """A cloud with what every map of it needs. views: by the maps' names."""
+    """A cloud with its patches."""
 
     cloud: Cloud
     patches: Patches
-    views: Mapping[str, InView]
-
-    def select(self, keep: Bool) -> SeenCloud:
-        """Some of the points, each seen as before."""
-        views = {name: view.select(keep) for name, view in self.views.items()}
-        return SeenCloud(self.cloud.select(keep), self.patches.select(keep), views)
-
-    def in_view(self) -> Bool:
-        """(M,) the points that some map may show."""
-        return _in_any(self.views, len(self.cloud))
 
     def joined(self, far: SeenCloud | None) -> SeenCloud:
-        """The same and what sweeps beyond the window measured."""
+        """Return it with what sweeps beyond the window measured."""
         if far is None or not len(far.cloud):
             return self
-        views = {n: view.joined(far.views[n], len(self.cloud)) for n, view in self.views.items()}
-        return SeenCloud(self.cloud.joined(far.cloud), self.patches.joined(far.patches), views)
-
-
-def _in_any(views: Mapping[str, InView], num_points: int) -> Bool:
-    """(num_points,) the points that some map may show."""
-    found = np.zeros(num_points, bool)
-    for view in views.values():
-        found[view.rows] = True
-    return found
+        return SeenCloud(self.cloud.joined(far.cloud), self.patches.joined(far.patches))
 
 
 @dataclass(frozen=True)
 class Views:
-    """What one key's depth maps show, by their names (`densify.depth.exposure.key_shots`).
+    """Where the depth maps of a key look from, by their names.
 
-    key_image: what the key sweep saw. sensors: the scanners. origins: (S,3) where they stood in
-    each sweep, key frame, by frame. rays: of these sweeps. lab: of those that show an
-    image, see `densify.depth.picture`. tangents: of what methods share.
+    key_image: of the key sweep. sensors: the scanners. origins: (S,3) of them in each sweep, key
+    frame, by frame. rays: of the window. lab: (H,W,3) L*a*b* of the maps that show an image.
     """
 
     key: int
@@ -91,7 +72,6 @@ class Views:
     rays: Rays
     settings: ProjectSettings
     lab: Mapping[str, Float32]
-    tangents: Tangents = field(default_factory=Tangents)
 
     @staticmethod
     def of(
@@ -103,73 +83,64 @@ class Views:
         images: Mapping[str, NDArray[np.uint8]],
         settings: Config,
     ) -> Views:
-        exposures = {
-            name: Exposure.of(sequence, stretch, key, shot, settings)
-            for name, shot in shots.items()
-        }
         sensors = Sensors.of(stretch.sweeps)
-        origins = {
-            f: poses.transform(stretch.T_target_source(key, f), sensors.origins_m)
-            for f in stretch.frames
-        }
-        pictures = {name: lab(image) for name, image in images.items()}
         return Views(
-            key,
-            key_image,
-            exposures,
-            sensors,
-            origins,
-            Rays(stretch, key),
-            settings.project,
-            pictures,
+            key=key,
+            key_image=key_image,
+            exposures={
+                name: Exposure.of(sequence, stretch, key, shot, settings)
+                for name, shot in shots.items()
+            },
+            sensors=sensors,
+            origins={
+                f: poses.transform(stretch.T_target_source(key, f), sensors.origins_m)
+                for f in stretch.frames
+            },
+            rays=Rays(stretch, key),
+            settings=settings.project,
+            lab={name: lab(image) for name, image in images.items()},
         )
 
     def see(self, cloud: Cloud, visible: bool = True) -> SeenCloud:
-        """A cloud as the cameras see it. visible: and which of it the key sweep saw through."""
+        """Return a cloud with its patches; visible: and which of it the key sweep saw through."""
         key_image = self.key_image if visible else None
-        views = {name: exposure.sees(cloud) for name, exposure in self.exposures.items()}
-        surface = patches(
-            cloud,
-            self.key,
-            self.settings,
-            self.sensors,
-            self.origins,
-            key_image,
-            wanted=_in_any(views, len(cloud)),
-            shared=self.tangents,
+        wanted = np.zeros(len(cloud), bool)
+        for exposure in self.exposures.values():
+            wanted[exposure.sees(cloud).rows] = True
+        return SeenCloud(
+            cloud, patches(cloud, self.key, self.sensors, self.origins, key_image, wanted)
         )
-        return SeenCloud(cloud, surface, views)
 
     def far(
         self, found: StandingWorld, T_key_found: Float, stretch: Stretch, standing_only: bool
     ) -> SeenCloud:
-        """What sweeps beyond the window measured, see `densify.depth.far.far_cloud`;
+        """Return what sweeps beyond the window measured, see `densify.depth.far.far_cloud`;
         standing_only: for maps with visibility."""
-        cloud, surface, views = far_cloud(
+        cloud, surface = far_cloud(
             found, T_key_found, stretch, self.key, self.exposures, standing_only
         )
         if self.key_image is not None and standing_only:
-            free = vetoed(cloud.points, cloud.velocity_m_s, self.key_image, self.settings)
+            free = seen_through_by_key(cloud.points, cloud.velocity_m_s, self.key_image)
             surface = replace(surface, free=free)
-        return SeenCloud(cloud, surface, views)
+        return SeenCloud(cloud, surface)
 
     def depth(
         self, seen: SeenCloud, visible: bool = True, filled: bool = True
     ) -> dict[str, DepthMap]:
-        """Depth maps by name. visible: leave out what is hidden, vetoed or doubtful. filled: and
-        fill between what is measured."""
+        """Return depth maps by name; visible: without what is hidden, seen through or unsupported;
+        filled: with the fill."""
         settings = replace(self.settings, visibility=visible)
         return {
             name: project(
                 seen.cloud,
-                view,
+                exposure,
                 settings,
                 seen.patches,
                 filled,
                 self.lab.get(name),
                 self.rays,
             )
-            for name, view in seen.views.items()
+            for name, exposure in self.exposures.items()
         }
 
     def coloured(
@@ -178,16 +149,23 @@ class Views:
         depth: Mapping[str, DepthMap],
         images: Mapping[str, NDArray[np.uint8]],
     ) -> Cloud:
-        """The cloud with the colours of the images there are; depth: what `depth` made of it."""
-        cloud = seen.cloud
+        """Return the cloud with the colours of the images where a camera sees it.
+
+        depth: the maps made of it. A point is seen unless it is clearly behind its pixel's depth;
+        pixels without depth colour nothing.
+        """
+        rgb = seen.cloud.rgb.copy()
         for name, image in images.items():
-            rgb = colour(cloud, seen.views[name], depth[name], image)
-            cloud = replace(cloud, rgb=rgb)
-        return cloud
+            view = self.exposures[name].sees(seen.cloud)
+            u, v = np.rint(view.uv).astype(np.int64).T
+            surface_m = depth[name].filled_m[v, u]
+            reach_m = surface_m + _BEHIND_M + _BEHIND_FRACTION * surface_m
+            shows = (surface_m > 0) & (view.exposure.depth_m(view.points_cam) <= reach_m)
+            rgb[view.rows[shows]] = image[v[shows], u[shows]]
+        return replace(seen.cloud, rgb=rgb)
 
     def truth(self, truth: Truth) -> dict[str, tuple[Float32, Bool]]:
-        """The true depth, measured as the map's, of the maps that show an image, and (H,W) where
-        something moves."""
+        """Return true depth and (H,W) what moves, of the maps that show an image."""
         known = {}
         for name, e in self.exposures.items():
             if e.number is not None:
@@ -197,7 +175,7 @@ class Views:
         return known
 
     def cameras(self) -> dict[str, CameraView]:
-        """Where each map looks from."""
+        """Return where each map looks from."""
         return {
             name: CameraView(e.camera, e.T_cam_key, e.late_s, e.number)
             for name, e in self.exposures.items()
@@ -206,7 +184,7 @@ class Views:
     def optical_flow(
         self, cloud: Cloud, depth: Mapping[str, DepthMap]
     ) -> dict[str, dict[str, Float32]]:
-        """Name -> "previous" and "next" image -> (H,W,2) pixels."""
+        """Return (H,W,2) pixels by name, to the "previous" and to the "next" image."""
         return {
             name: {
                 which: optical_flow(cloud, depth[name], exposure, other)
@@ -216,8 +194,10 @@ class Views:
         }
 
     def rejected(self, cloud: Cloud, depth: Mapping[str, DepthMap]) -> dict[str, NDArray[np.uint8]]:
-        """Name -> (H,W): the `Reason` why the nearest point that was left out of a pixel was,
-        0 where none was; points that another one outdid in their pixel do not count."""
+        """Return (H,W) by name: the `Reason` of the nearest rejected point of a pixel, 0 none.
+
+        Points that another one outdid in their pixel do not count.
+        """
         maps = {}
         for name, e in self.exposures.items():
             reason = depth[name].reason
@@ -233,22 +213,62 @@ class Views:
     def movers(
         self, cloud: Cloud, visible: bool, images: Mapping[str, NDArray[np.uint8]]
     ) -> dict[int, Mover]:
-        """Every moving object by itself, and as -1 together what moves without one."""
-        instances = np.unique(cloud.instance[cloud.moving])
+        """Return every moving object by itself, and as -1 all moving points without one."""
         movers = {}
-        for instance in instances.tolist():
+        for instance in np.unique(cloud.instance[cloud.moving]).tolist():
             part = self.see(cloud.select(cloud.moving & (cloud.instance == instance)), visible)
             depth = self.depth(part, visible)
             movers[instance] = Mover(self.coloured(part, depth, images), depth)
         return movers
 
 
+def optical_flow(cloud: Cloud, depth: DepthMap, exposure: Exposure, other: Exposure) -> Float32:
+    """Return (H,W,2) pixels to the right and down from one exposure to another, NaN if unknown.
+
+    cloud: at the key's reference time. depth: the map made of it. What moves goes on at its
+    velocity. Known are the measured pixels; those that only spots cover go with the nearest.
+    """
+    chosen = np.flatnonzero(depth.reason == Reason.KEPT)
+    points, velocity_m_s = cloud.points[chosen], cloud.velocity_m_s[chosen]
+    uv = exposure.see(points, velocity_m_s).uv
+    column, row = np.rint(uv).astype(np.int64).T
+    flow = np.full((*depth.depth_m.shape, 2), np.nan, np.float32)
+    flow[row, column] = other.see(points, velocity_m_s).uv - uv
+    hit = np.zeros(depth.depth_m.shape, bool)
+    hit[row, column] = True
+    covered = (depth.depth_m > 0) & ~hit
+    if covered.any():
+        nearest = ndimage.distance_transform_edt(~hit, return_distances=False, return_indices=True)
+        flow[covered] = flow[tuple(nearest)][covered]
+    return flow
+
+
+def with_ages(depth: DepthMap, stamps_ns: Mapping[int, int], key: int, late_s: float) -> DepthMap:
+    """Return the map with ``age_s``, seconds between its time and each pixel's source sweep.
+
+    stamps_ns: reference times of the sweeps, by frame. late_s: from the key's reference time to the
+    map's. A filled pixel has the age of the measured pixel nearest to it in the image.
+    """
+    shown_ns = stamps_ns[key] + round(1e9 * late_s)
+    age_s = {frame: abs(stamp_ns - shown_ns) * 1e-9 for frame, stamp_ns in stamps_ns.items()}
+    measured = depth.depth_m > 0
+    frames, which = np.unique(depth.frame[measured], return_inverse=True)
+    ages = np.full(measured.shape, np.nan, np.float32)
+    ages[measured] = np.array([age_s[int(f)] for f in frames])[which]
+    filled = (depth.filled_m > 0) & ~measured
+    if len(frames) and filled.any():
+        row, column = ndimage.distance_transform_edt(
+            ~measured, return_distances=False, return_indices=True
+        )[:, filled]
+        ages[filled] = ages[row, column]
+    return replace(depth, age_s=ages)
+
+
 @dataclass(frozen=True)
 class HeldOut:
     """The key sweep's own returns as the truth for the key densified from its neighbours alone.
 
-    key_alone: maps of the key sweep, without rims. moving: (H,W) where its returns are something's
-    that moves.
+    key_alone: maps of the key sweep, without boundary pixels. moving: (H,W) its moving returns.
     """
 
     views: Views
@@ -259,30 +279,36 @@ class HeldOut:
     def of(views: Views, cloud: Cloud) -> HeldOut:
         """cloud: says what moves in the key sweep, and how fast."""
         views = replace(views, key_image=None)  # what is held out must not help
-        alone = replace(views.settings, rims="strict", seen_through=1.0)
-        sure = replace(views, settings=alone)
+        settings = replace(views.settings, rims="strict", visibility=True)
         own = cloud.select(cloud.frame == views.key)
-        key_alone = sure.depth(sure.see(own), filled=False)
-        movers = sure.depth(sure.see(own.select(own.moving)), filled=False)
+
+        def alone(part: Cloud) -> dict[str, DepthMap]:
+            """Maps of returns of the key sweep."""
+            surface = views.see(part).patches
+            return {
+                name: project(part, exposure, settings, surface, filled=False)
+                for name, exposure in views.exposures.items()
+            }
+
+        key_alone = alone(own)
         moving = {
             name: (maps.depth_m > 0) & (maps.depth_m == key_alone[name].depth_m)
-            for name, maps in movers.items()
+            for name, maps in alone(own.select(own.moving)).items()
         }
         return HeldOut(views, key_alone, moving)
 
     def depth(self, seen: SeenCloud, visible: bool) -> dict[str, DepthMap]:
-        """Depth maps by name without the key sweep; none for a cloud of the key sweep alone."""
+        """Return depth maps without the key sweep; none for a cloud of the key sweep alone."""
         others = seen.cloud.frame != self.views.key
         if not others.any():
             return {}
-        rest = seen.select(others & seen.in_view())
-        rest = rest._replace(patches=replace(rest.patches, free=np.zeros(len(rest.cloud), bool)))
-        return self.views.depth(rest, visible)
+        surface = seen.patches.select(others)
+        surface = replace(surface, free=np.zeros(len(surface.free), bool))
+        return self.views.depth(SeenCloud(seen.cloud.select(others), surface), visible)
 
     def scores(self, seen: SeenCloud, visible: bool) -> dict[str, Any] | None:
-        """Scores by name, as `densify.scores.depth_metrics.depth_scores`, the ``curve`` of
-        precision over density, and the confidence's ``reliability``; None for a cloud of the key
-        sweep alone."""
+        """Return scores by name, with the ``curve`` of precision over density, and ``reliability``;
+        None for a cloud of the key sweep alone."""
         made = self.depth(seen, visible)
         if not made:
             return None

@@ -11,6 +11,7 @@ once takes 1.6 s to compile. A literal handed to an inlined function compiles it
 from __future__ import annotations
 
 import gc
+import hashlib
 import logging
 from collections.abc import Callable
 from functools import cache
@@ -19,6 +20,7 @@ from typing import Any, TypeVar
 
 import numba
 from numba.core import event
+from numba.core.dispatcher import Dispatcher
 
 from densify.config.user_folder import others_can_write
 from densify.geometry import threads
@@ -66,10 +68,22 @@ event.register("numba:compile", _compiling)
 
 
 def inlined(function: _Function) -> _Function:
-    """Compiled as a part of the kernels that call it; they must stand in the same file, or a change
-    would not be seen by their cached code."""
+    """Compile a function as a part of the kernels that call it, from this or another file."""
     compiled: _Function = numba.njit(**_OPTIONS, **_NOT_FROM_PYTHON)(function)
     return compiled
+
+
+def _imported_code(function: Callable[..., Any]) -> str:
+    """Return a digest of the files of inlined functions that the function's own file imports.
+
+    Numba's cache notices changes of the function's own file only.
+    """
+    files = {
+        f.__code__.co_filename for f in function.__globals__.values() if isinstance(f, Dispatcher)
+    }
+    others = sorted(files - {function.__code__.co_filename})
+    code = b"".join(Path(file).read_bytes() for file in others)
+    return hashlib.sha256(code).hexdigest()[:12] if others else ""
 
 
 @cache
@@ -96,6 +110,7 @@ class Kernel:
 
     def __init__(self, function: Callable[..., Any]) -> None:
         self.__doc__ = function.__doc__
+        function.__qualname__ += _imported_code(function)  # a part of the cache file's name
         self._function = function
         try:
             self._compiled = numba.njit(function, cache=True, **_OPTIONS)

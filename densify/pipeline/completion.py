@@ -10,10 +10,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from densify.config import PriorSettings
 from densify.config.errors import InputError
 from densify.depth.exposure import Shot
-from densify.depth.prior import complete
 from densify.geometry.types import Bool, Camera, Float32, Prior, Result
 from densify.readers.prior_files import PriorFiles
 from densify.scores import depth_metrics
@@ -44,24 +42,26 @@ def completed(
     priors: Mapping[str, Prior],
     truth: Mapping[str, tuple[Float32, Bool]],
     cameras: Mapping[str, Camera],
-    settings: PriorSettings,
+    kind: str,
 ) -> Result:
     """The result with ``full`` and its scores added; a prior that does not fit gets a warning.
 
     priors, truth: by the maps' names; truth: depth and what moves, (H,W) each, where known.
     """
-    full = {name: complete(result.depth[name], p, settings) for name, p in priors.items()}
+    from densify.depth.prior import MAX_WRONG, complete  # SciPy's solvers, for this alone
+
+    full = {name: complete(result.depth[name], p, kind) for name, p in priors.items()}
     metrics = copy.deepcopy(dict(result.metrics))
     for name, maps in full.items():
         if not maps.fit.used:
             _log.warning(
                 "key %d: the prior %s is not used, depth_full is as depth_filled: after the best "
-                "fit %.0f %% of measured pixels are off by more than 25 %%, and prior.max_wrong "
-                "is %.0f %%",
+                "fit %.0f %% of measured pixels are off by more than 25 %%, expected at most "
+                "%.0f %%",
                 result.key,
                 maps.source,
                 100 * maps.fit.wrong,
-                100 * settings.max_wrong,
+                100 * MAX_WRONG,
             )
         alone_m = np.where(maps.from_prior, maps.depth_m, np.float32(0))
         for product, depth_m in (("full", maps.depth_m), ("prior", alone_m)):

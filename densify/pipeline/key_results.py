@@ -12,10 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from densify.config import Config
-from densify.depth.age import with_ages
 from densify.depth.confidence import expected_outliers, reliability
 from densify.depth.exposure import Shot
-from densify.depth.views import HeldOut, SeenCloud, Views
+from densify.depth.views import HeldOut, SeenCloud, Views, with_ages
 from densify.free_space.range_image import RangeImage
 from densify.geometry.types import (
     Bool,
@@ -86,9 +85,9 @@ def key_results(
         for name, result in ((name, shown[name].result()) for name in moments)
     ]
     if priors:
-        cameras, settings = key.sequence.cameras, key.settings.prior
+        cameras, kind = key.sequence.cameras, key.settings.prior.kind
         with key.watch.stage("prior"):
-            made[-1] = completed(made[-1], priors, shared.truth, cameras, settings)
+            made[-1] = completed(made[-1], priors, shared.truth, cameras, kind)
     results: dict[str, Result] = {}
     for result in made:
         linked = replace(result, costs=key.watch.costs(), baselines=dict(results))

@@ -33,8 +33,7 @@ from densify.config import Config
 from densify.config.cache import Cache
 from densify.config.errors import InputError
 from densify.config.plugins.engines import engine as engine_row
-from densify.depth.accumulate import accumulate
-from densify.depth.object_tracks import object_tracks
+from densify.depth.accumulate import accumulate, object_tracks
 from densify.flow.engines import Scene, estimate_motion
 from densify.geometry import poses
 from densify.geometry.types import (

@@ -307,10 +307,10 @@ class DepthMap:
     lens. filled_m: the same plus pixels interpolated between measured ones. confidence: float32 0
     to 1, of every pixel in ``filled_m``. frame: int32 source sweep of measured pixels, -1
     elsewhere. age_s: float32 seconds between the moment the map shows and the reference time of the
-    sweep that measured the pixel, of every pixel in ``filled_m``, nan elsewhere; None until
-    `densify.depth.age` has worked it out. reason: (M,) uint8, a `Reason` for each point of the
-    cloud; empty if the cloud is not at hand. warnings: what could not be done as asked. ranked:
-    what a calibrated confidence was made from, None of another one.
+    sweep that measured the pixel, of every pixel in ``filled_m``, nan elsewhere; None before
+    `densify.depth.views.with_ages`. reason: (M,) uint8, a `Reason` for each point of the cloud;
+    empty if the cloud is not at hand. warnings: what could not be done as asked. ranked: what a
+    calibrated confidence was made from, None of another one.
     """
 
     camera: str

@@ -1,5 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""A camera's image as depth maps look at it."""
+"""A camera's image in L*a*b*, and where it lies over the depth map.
+
+The image is shifted in steps of a third of the gap between rays. Where it fits, its edges lie on
+the edges of depth, and the sum of its changes there stands out from that of all other shifts.
+"""
 
 from __future__ import annotations
 
@@ -13,71 +17,55 @@ from densify.depth.layers import Layers
 from densify.geometry.types import Float, Float32, Int
 
 _BLUR_PX = 0.6  # standard deviation; noise and the colour filter's pattern
-_AROUND_PX = 20.0  # standard deviation; over which edges are compared
-_EDGE_PX = 1.5  # standard deviation of the blur that tells which way depth changes
-_MOST = 6000  # edges of each kind that are looked at
-_STRONG = 4.0  # a stronger edge counts no more
-_ONE_SURFACE = (0.1, 0.02)  # metres plus share of the depth between neighbouring known pixels
-_JUMP = (0.3, 0.05)
-_GAP, _STRICT_GAP = 3, 10  # steps, at most, between neighbouring pixels, without rims
-_JUMPS_COUNT = 0.4  # of what rims count, each kind
-_REACH = 14  # steps to all sides in which the image is laid elsewhere
-_ASIDE, _ELSEWHERE = 3.2, 6.0  # steps; nearer and it fits, farther and it cannot
-_TREND = 3  # degree of what changes slowly with where the image is laid
-# In standard deviations elsewhere: right images reach 3.1 to 11 as they are and 1.9 more beside
-# that, mirrored ones 3.0.
-_LEAST, _LEAST_ASIDE = 3.05, 5.0
-_CLEARLY = 1.9
 _LEAST_LIGHT = 70.0  # L of the lightest hundredth; a darker image is lightened
-_REBLUR_PX = 1.5  # standard deviation
-_MOST_BLUR = 2.0  # steps, standard deviation
-_EDGES_LOOKED_AT = 0.03  # of the pixels
+_REACH = 14  # steps to all sides
+_ASIDE, _ELSEWHERE = 3.2, 6.0  # steps; nearer and it fits, farther and it cannot
+# Standard deviations of the shifts elsewhere. Right images reach 3.1 to 11 where they are, and at
+# most 1.9 more beside that; mirrored ones reach 3.0.
+_LEAST, _LEAST_ASIDE, _CLEARLY = 3.05, 5.0, 1.9
+_TREND = 3  # degree of what changes slowly with the shift
+_MOST = 6000  # edges of each kind that are looked at
+_JUMPS_COUNT = 0.4  # of what boundary pixels count, each kind
+_ONE_SURFACE, _JUMP = (0.1, 0.02), (0.3, 0.05)  # metres plus share of the depth
+_GAP, _STRICT_GAP = 3, 10  # steps between neighbouring pixels, without boundary pixels
+_EDGE_PX = 1.5  # standard deviation of the blur that tells which way depth changes
+_AROUND_PX, _STRONG = 20.0, 4.0  # over which image edges are compared; stronger ones count no more
+_REBLUR_PX, _MOST_BLUR, _EDGES_LOOKED_AT = 1.5, 2.0, 0.03  # px; steps; share of the pixels
 
 
 def lab(image: NDArray[np.uint8]) -> Float32:
-    """(H,W,3) RGB -> (H,W,3) float32 CIE L*a*b*, L from 0 to 100, slightly blurred: distances tell
-    about how different two colours look. A dark image is lightened until they do."""
+    """Return (H,W,3) float32 CIE L*a*b*, L from 0 to 100, of an (H,W,3) RGB image.
+
+    It is slightly blurred, and lightened if it is dark: distances say how different colours look.
+    """
     blurred = cv2.GaussianBlur(image.astype(np.float32) / 255, (0, 0), _BLUR_PX)
     colours = cv2.cvtColor(blurred, cv2.COLOR_RGB2LAB).astype(np.float32, copy=False)
     light = float(np.percentile(colours[..., 0], 99))
     return colours * np.float32(max(1.0, _LEAST_LIGHT / max(light, 1.0)))
 
 
-def blurred(values: Float32, blur_px: tuple[float, float]) -> Float32:
-    """(H,W) blurred by a Gaussian, standard deviations down and across, out to 2.5 of them."""
-    down_px, across_px = blur_px
-    size = (2 * round(2.5 * across_px) + 1, 2 * round(2.5 * down_px) + 1)
-    made = cv2.GaussianBlur(
-        values, size, sigmaX=across_px, sigmaY=down_px, borderType=cv2.BORDER_REFLECT
-    )
-    return made.astype(np.float32, copy=False)
-
-
-class Laid(NamedTuple):
-    """An image (H,W,3) moved to where it fits. right_px, down_px: by how much it lay aside."""
+class Aligned(NamedTuple):
+    """An image (H,W,3) moved to where it fits, and by how much it lay aside."""
 
     lab: Float32
     right_px: int = 0
     down_px: int = 0
 
     def __str__(self) -> str:
-        """How it lay aside: "2 px to the left and 1 px too high"."""
+        """Return where it lay, such as "2 px to the left and 1 px too high"."""
         across = f"{abs(self.right_px)} px to the {'right' if self.right_px > 0 else 'left'}"
         along = f"{abs(self.down_px)} px too {'low' if self.down_px > 0 else 'high'}"
         ways = ((self.right_px, across), (self.down_px, along))
         return " and ".join(said for off_px, said in ways if off_px)
 
 
-def laid_over(layers: Layers) -> Laid | None:
-    """The image of ``layers``, moved if it has edges beside those of depth; None if it does not
-    fit, or is blurred.
+def align_image(layers: Layers) -> Aligned | None:
+    """Return the image of the layers, moved to where it fits; None if it does not, or is blurred.
 
-    The image is laid as it is and elsewhere, in steps of a third of the gap between rays, and how
-    far its edges stand out there (`_standing_out`) compared. They must stand out most at most 3.2
-    steps away. The image stays as it is if they stand out by 3.05 there and by at most 1.9 less
-    than where most; else it is moved to there, if they stand out by 5. It is blurred if its edges
-    are by more than 2 steps: the sharper an edge, the more another blur takes from its gradient
-    (Zhuo and Sim, "Defocus map estimation from a single image", 2011).
+    Its edges must stand out most at most 3.2 steps away. It stays if they stand out by 3.05 as it
+    is, and by at most 1.9 less than where most; else it is moved, if they stand out by 5 there. It
+    is blurred if its edges are by more than two steps: the sharper an edge, the more another blur
+    takes from its gradient (Zhuo and Sim, "Defocus map estimation from a single image", 2011).
     """
     lab, step_px = layers.lab, max(1, round(0.3 * float(np.median(layers.gap_px))))
     if lab is None or _blur_px(lab) > _MOST_BLUR * step_px:
@@ -88,7 +76,7 @@ def laid_over(layers: Layers) -> Laid | None:
     if np.hypot(down, right) > _ASIDE:
         return None
     if here >= _LEAST and most - here <= _CLEARLY:
-        return Laid(lab)
+        return Aligned(lab)
     if most < _LEAST_ASIDE:
         return None
     down, right = step_px * down, step_px * right
@@ -96,14 +84,12 @@ def laid_over(layers: Layers) -> Laid | None:
         np.clip(np.arange(size) + off, 0, size - 1)
         for size, off in zip(lab.shape[:2], (down, right), strict=True)
     )
-    moved = np.ascontiguousarray(lab[rows[:, None], columns])
-    return Laid(moved, int(right), int(down))
+    return Aligned(np.ascontiguousarray(lab[rows[:, None], columns]), int(right), int(down))
 
 
 def _standing_out(sums: Float) -> Float:
-    """(29,29) how far each of ``sums`` stands out of those more than 6 steps from the middle, in
-    standard deviations. What changes slowly among these is taken off: an image's lower half has
-    more to see than its upper one wherever its edges are."""
+    """Return (29,29) how far each of the sums stands out, in standard deviations of those
+    elsewhere, once their slow trend is taken off."""
     offsets = np.arange(-_REACH, _REACH + 1)
     right, down = np.meshgrid(offsets, offsets)
     elsewhere = np.hypot(right, down) > _ELSEWHERE
@@ -115,11 +101,14 @@ def _standing_out(sums: Float) -> Float:
 
 
 def _edge_sums(lab: Float32, layers: Layers, step_px: int) -> Float:
-    """(29,29) how much the image laid so many steps down and to the right changes across the edges
-    of depth: rims, jumps between neighbouring known pixels, and, by where surfaces are known for
-    sure, between what is no rim. Each as a multiple of its mean."""
+    """Return (29,29) how much the image, shifted so many steps down and to the right, changes
+    across the edges of depth.
+
+    These are boundary pixels, and jumps between neighbouring known pixels, with boundary pixels and
+    without. Each kind counts as a multiple of its mean.
+    """
     known_m = np.maximum(layers.depth_m, layers.rim_m)
-    strict_m = np.where(layers.strict, layers.depth_m, np.float32(0))
+    strict_m = np.where(layers.rim_m == 0, layers.depth_m, np.float32(0))
     clear_m = np.where(layers.veiled, np.float32(0), known_m)
     row, column = (_some(f) // step_px for f in np.nonzero((clear_m > 0) & (layers.rim_m > 0)))
     changes = _changes(_reduced(lab, step_px))
@@ -138,45 +127,39 @@ def _edge_sums(lab: Float32, layers: Layers, step_px: int) -> Float:
 def _sums(
     changes: Float32, row: Int, column: Int, right: float | Float32, down: float | Float32
 ) -> Float:
-    """(29,29) of the edges at rows and columns (E,) across which depth changes to the ``right`` and
-    ``down``, (E,) or the same everywhere."""
+    """Return (29,29) the changes at rows and columns (E,) along ``right`` and ``down``, (E,) or the
+    same everywhere."""
     width, (x, y) = changes.shape[2], changes.reshape(2, -1)
-    place = (row + _REACH) * width + column + _REACH
     offsets = np.arange(-_REACH, _REACH + 1)
-    beside = place + offsets[:, None]
-
-    def change(down_steps: int) -> Float:
-        there = beside + down_steps * width
-        changed: Float = np.abs(x.take(there) * right + y.take(there) * down)
-        return changed.sum(axis=1)
-
-    return np.array([change(down_steps) for down_steps in range(-_REACH, _REACH + 1)], np.float64)
+    beside = (row + _REACH) * width + column + _REACH + offsets[:, None]
+    rows = []
+    for there in (beside + down_steps * width for down_steps in offsets):
+        rows.append(np.abs(x.take(there) * right + y.take(there) * down).sum(axis=1))
+    return np.array(rows, np.float64)
 
 
 def _some(values: Int) -> Int:
-    """The values, or 6000 of them, evenly."""
+    """Return the values, or 6,000 of them, evenly."""
     return values[:: len(values) // _MOST + 1]
 
 
 def _jumps(depth_m: Float32, gap: int, step_px: int) -> tuple[Int, Int]:
-    """Rows and columns, in steps, where depth (H,W) jumps between neighbouring known pixels of a
-    row, at most ``gap`` steps apart, from one surface to another: both go on, which leaves out most
-    of leaves."""
+    """Return rows and columns, in steps, where depth (H,W) jumps from one surface to another
+    between neighbouring known pixels of a row, at most ``gap`` steps apart. Both surfaces go on,
+    which leaves out most of leaves."""
     row, column = np.nonzero(depth_m)
     known_m = depth_m[row, column]
     off_m, least_m = np.abs(np.diff(known_m)), np.minimum(known_m[1:], known_m[:-1])
     near = (np.diff(row) == 0) & (np.diff(column) <= gap * step_px)
-    on, jumps = (
-        near & ((off_m < part_m + share * least_m) == within)
-        for (part_m, share), within in ((_ONE_SURFACE, True), (_JUMP, False))
-    )
+    on = near & (off_m < _ONE_SURFACE[0] + _ONE_SURFACE[1] * least_m)
+    jumps = near & (off_m >= _JUMP[0] + _JUMP[1] * least_m)
     at = 1 + np.flatnonzero(on[:-2] & jumps[1:-1] & on[2:])
     middle = (column[at] + column[at + 1]) // 2
     return _some(row[at]) // step_px, _some(middle) // step_px
 
 
 def _blur_px(lab: Float32) -> float:
-    """Standard deviation of the blur that the image's strongest edges have."""
+    """Return the standard deviation of the blur of the image's strongest edges."""
     light = lab[..., 0]
     again = cv2.GaussianBlur(light, (0, 0), _REBLUR_PX).astype(np.float32, copy=False)
     before, after = (np.hypot(*_gradient(image)) for image in (light, again))
@@ -188,7 +171,7 @@ def _blur_px(lab: Float32) -> float:
 
 
 def _reduced(image: Float32, step_px: int) -> Float32:
-    """(H,W,…), each pixel the mean of ``step_px`` by ``step_px``."""
+    """Return an image each pixel of which is the mean of ``step_px`` by ``step_px``."""
     if step_px == 1:
         return image
     size = (-(-image.shape[1] // step_px), -(-image.shape[0] // step_px))
@@ -196,7 +179,7 @@ def _reduced(image: Float32, step_px: int) -> Float32:
 
 
 def _across(depth_m: Float32, step_px: int) -> Float32:
-    """(2,H,W) direction right and down in which depth changes most, of the reduced map."""
+    """Return (2,H,W) the direction right and down in which depth changes most, reduced."""
     known = depth_m > 0
     inverse = np.divide(1, depth_m, out=np.zeros_like(depth_m), where=known)
     sums, weight = (
@@ -208,7 +191,7 @@ def _across(depth_m: Float32, step_px: int) -> Float32:
 
 
 def _changes(lab: Float32) -> Float32:
-    """(2,H,W) gradient of the channel that changes most, against the changes around."""
+    """Return (2,H,W) the gradient of the channel that changes most, against those around."""
     change, size = _gradient(lab[..., 0]), np.zeros(lab.shape[:2], np.float32)
     for channel in np.moveaxis(lab, 2, 0):
         gradient = _gradient(channel)
@@ -220,6 +203,5 @@ def _changes(lab: Float32) -> Float32:
 
 
 def _gradient(image: Float32) -> Float32:
-    """(2,H,W) right and down."""
-    orders = ((1, 0), (0, 1))
-    return np.stack([cv2.Sobel(image, cv2.CV_32F, *order) for order in orders])
+    """Return (2,H,W) the gradient right and down."""
+    return np.stack([cv2.Sobel(image, cv2.CV_32F, *order) for order in ((1, 0), (0, 1))])

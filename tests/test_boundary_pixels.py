@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Rims by the image: panels before a wall, known exactly; images that do not belong to them."""
+"""Boundary pixels by the image: panels before a wall, known exactly, and wrong images."""
 
 from __future__ import annotations
 
@@ -9,13 +9,11 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from densify.config import ProjectSettings
-from densify.depth import voting
-from densify.depth.layers import Layers
-from densify.depth.marching import DIRECTIONS, first_known
-from densify.depth.picture import lab, laid_over
-from densify.depth.rims import decide, shares
-from densify.depth.votes import RULES, Canvass, elected
+from densify.depth import boundary_pixels as stage
+from densify.depth.boundary_pixels import Voters, accept_boundary_pixels, shares, vote
+from densify.depth.image_alignment import align_image, lab
+from densify.depth.neighbours import DIRECTIONS, first_known
+from tests.depth_layers import layers_of
 from tests.scenes import by_flow
 from tests.small_street import KEY, POSES_GIVEN, one_car
 
@@ -45,24 +43,14 @@ def scene(seed=0):
         depth[beyond <= -FAT_PX] = z
     known = rng.uniform(size=truth.shape) < 0.33
     depth, rim = (np.where(known, part, 0).astype(np.float32) for part in (depth, rim))
-    layers = Layers(
-        depth_m=depth,
-        rim_m=rim,
-        veiled=np.zeros(truth.shape, bool),
-        refused=np.zeros(truth.shape, bool),
-        filled_m=depth,
-        confidence=np.where(known, np.float32(0.6), np.float32(0)),
-        point=np.where(known, 0, -1).astype(np.int32),
-        tilt=np.zeros((HEIGHT, WIDTH, 2), np.float32),
-        spacing_px=np.broadcast_to(np.float32([2, 5]), (HEIGHT, WIDTH, 2)),
-    )
+    layers = layers_of(depth, rim_m=rim, confidence=0.6, spacing_px=(2, 5))
     image += rng.normal(0, 3, image.shape)
     return layers, image.clip(0, 255).astype(np.uint8), truth
 
 
 def decided(layers, image, rims="image"):
     pictured = replace(layers, lab=None if image is None else lab(image))
-    return decide(pictured, ProjectSettings(rims=rims))
+    return accept_boundary_pixels(pictured, rims)
 
 
 def test_rims_are_kept_on_the_side_where_the_image_has_them():
@@ -199,7 +187,7 @@ def test_a_right_image_stays_where_it_is_beside_a_hedge_too(seed):
 
 
 def pictured(image, layers):
-    return laid_over(replace(layers, lab=lab(image)))
+    return align_image(replace(layers, lab=lab(image)))
 
 
 def test_a_dark_image_still_fits():
@@ -235,12 +223,13 @@ def test_a_blurred_image_is_noticed(blur_px):
 
 def test_a_mirrored_scene_has_mirrored_votes():
     layers, image, _ = scene()
-    flipped = Layers(
-        *(
-            np.ascontiguousarray(values[:, ::-1])
-            for values in vars(layers).values()
+    flipped = replace(
+        layers,
+        **{
+            name: np.ascontiguousarray(values[:, ::-1])
+            for name, values in vars(layers).items()
             if isinstance(values, np.ndarray)
-        )
+        },
     )
     rims, mirrored = (np.flatnonzero(part.rim_m) for part in (layers, flipped))
     share = np.zeros((2, HEIGHT, WIDTH), np.float32)
@@ -250,18 +239,18 @@ def test_a_mirrored_scene_has_mirrored_votes():
     np.testing.assert_allclose(share[0], share[1][:, ::-1], atol=1e-4)
 
 
-def vote_twin(pixel, inverse, known, seeds, weight, colours, gap_px, rules):
+def vote_twin(pixel, depth_m, known_m, tilt, weight, colours, gap_px, surely):
     """One pixel, one direction, one step at a time."""
     height, width = gap_px.shape
     v, u = divmod(pixel, width)
-    gap, least = gap_px[v, u], 1.0
-    aside = round(rules.aside * gap)
+    gap, least, doubt = gap_px[v, u], 1.0, stage._DOUBT if surely else 0.0
+    aside = round(stage._ASIDE * gap) if surely else 0
 
     def colour(row, column):
         return colours[np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)].astype(float)
 
     for right, down in ((0, 0), (aside, 0), (-aside, 0), (0, aside), (0, -aside)):
-        votes_for, votes = rules.doubt / 2, rules.doubt
+        votes_for, votes = doubt / 2, doubt
         for (u1, v1), (u2, v2) in DIRECTIONS.tolist():
             change, step = 0.0, 0
             while True:
@@ -269,66 +258,45 @@ def vote_twin(pixel, inverse, known, seeds, weight, colours, gap_px, rules):
                 du, dv = step // 2 * u2 + step % 2 * u1, step // 2 * v2 + step % 2 * v1
                 if not (0 <= u + du < width and 0 <= v + dv < height):
                     break
-                if max(abs(du), abs(dv)) > rules.reach * gap:
+                if max(abs(du), abs(dv)) > stage._REACH * gap:
                     break
                 off = colour(v + down + dv, u + right + du) - colour(v + down, u + right)
                 change = max(change, off @ off)
-                if known[v + dv, u + du]:
-                    there = seeds.inverse[v + dv, u + du]
-                    here = there - seeds.tilt[v + dv, u + du] @ (du, dv)
+                if known_m[v + dv, u + du]:
+                    there = 1 / known_m[v + dv, u + du]
+                    here = there - tilt[v + dv, u + du] @ (du, dv)
                     here = min(max(here, 0.7 * there), 1.4 * there)
-                    vote = weight[v + dv, u + du] / (1 + step / (rules.decay * gap))
-                    vote *= np.exp(-change / (2 * rules.colours**2)) + rules.through
-                    votes += vote
-                    near = abs(1 / here - 1 / inverse)
-                    votes_for += vote * (near <= rules.same_m + rules.same_fraction / inverse)
+                    one = weight[v + dv, u + du] / (1 + step / (stage._DECAY * gap))
+                    one *= np.exp(-change / (2 * stage._COLOURS**2)) + stage._THROUGH
+                    votes += one
+                    same_m = stage._SAME_M + stage._SAME_FRACTION * depth_m
+                    votes_for += one * (abs(1 / here - depth_m) <= same_m)
                     break
         least = min(least, votes_for / votes if votes else 0.0)
     return least
 
 
-def vote_scene():
-    """Seeds, the weights of their votes, an image and gaps; pixels and their inverse depth."""
+@pytest.mark.parametrize("surely", [True, False])
+def test_votes_equal_those_of_a_slow_twin(surely):
     rng = np.random.default_rng(3)
     shape = (24, 30)
     known = rng.uniform(size=shape) < 0.2
-    inverse = np.where(known, rng.choice([0.05, 0.052, 0.1], shape), 0).astype(np.float32)
+    known_m = np.where(known, 1 / rng.choice([0.05, 0.052, 0.1], shape), 0).astype(np.float32)
     tilt = rng.normal(0, 0.001, (*shape, 2)).astype(np.float32)
     weight = rng.uniform(0.2, 1, shape).astype(np.float32)
-    seeds = voting.Seeds(first_known(known), DIRECTIONS, inverse, tilt)
-    colours = (50 + np.cumsum(rng.normal(0, 1, (*shape, 3)), axis=1)).astype(np.float32)
     gap_px = rng.uniform(1, 3, shape).astype(np.float32)
-    layers = Layers(
-        *(inverse, inverse, known, known, inverse, inverse, np.zeros(shape, np.int32), tilt),
-        *(np.repeat(gap_px[..., None], 2, axis=2), colours),
-    )
+    colours = (50 + np.cumsum(rng.normal(0, 1, (*shape, 3)), axis=1)).astype(np.float32)
+    layers = layers_of(known_m, tilt=tilt, spacing_px=np.repeat(gap_px[..., None], 2, axis=2))
+    layers = replace(layers, lab=colours)
     pixel = np.concatenate([np.flatnonzero(known), np.flatnonzero(~known)[::5]])
-    here = np.where(known.flat[pixel], inverse.flat[pixel], np.float32(0.05)).astype(np.float32)
-    return layers, seeds, weight, pixel, here
-
-
-def twins(layers, seeds, weight, pixel, here, rules):
-    known = seeds.inverse > 0
-    rest = (known, seeds, weight, layers.lab, layers.gap_px, rules)
-    return np.array([vote_twin(p, w, *rest) for p, w in zip(pixel, here, strict=True)])
-
-
-def test_votes_equal_those_of_a_slow_twin():
-    layers, seeds, weight, pixel, here = vote_scene()
-    share = Canvass(layers, seeds, pixel, 1 / here).shares(weight)
-    np.testing.assert_allclose(share, twins(*vote_scene(), RULES), rtol=1e-4)
+    depth_m = np.where(known.flat[pixel], known_m.flat[pixel], np.float32(20)).astype(np.float32)
+    inverse = np.divide(1, known_m, out=np.zeros_like(known_m), where=known)
+    voters = Voters(first_known(known), inverse, tilt)
+    share = vote(layers, voters, pixel, depth_m, weight, surely)
+    rest = (known_m, tilt, weight, colours, gap_px, surely)
+    expected = [vote_twin(p, z, *rest) for p, z in zip(pixel, depth_m, strict=True)]
+    np.testing.assert_allclose(share, expected, rtol=1e-4)
     assert np.ptp(share) > 0.5
-
-
-@pytest.mark.parametrize("least", [0.5, 0.8, 0.9])
-def test_elections_stop_early_without_another_outcome(least):
-    layers, seeds, weight, pixel, here = vote_scene()
-    rules = RULES._replace(doubt=0.0, aside=0.0)
-    share = twins(layers, seeds, np.ones_like(weight), pixel, here, rules)
-    made = elected(layers, seeds, pixel, 1 / here, least)
-    told = abs(share - least) > 1e-4
-    assert np.array_equal(made[told], (share >= least)[told])
-    assert 0.05 < made.mean() < 0.95 and told.mean() > 0.95
 
 
 def test_the_run_says_that_an_image_does_not_fit():

@@ -1,6 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Windows of vehicles: closed on an analytic car, left open where it only looks like one, by a slow
-twin, and on a real car."""
+"""Car windows: closed on an analytic car, left open elsewhere, by a slow twin."""
 
 from __future__ import annotations
 
@@ -9,36 +8,15 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from densify.config import ProjectSettings
-from densify.depth import glass
-from densify.depth.framing import framed
-from densify.depth.glass import close_windows
-from densify.depth.layers import Layers
-from densify.depth.marching import DIRECTIONS, first_known
+from densify.depth import car_windows as stage
+from densify.depth.car_windows import close_windows
+from densify.depth.neighbours import DIRECTIONS, first_known
 from densify.geometry import threads
+from tests.depth_layers import layers_of
 
 FOCAL_PX, SHAPE = 720.0, (240, 320)
-SETTINGS = ProjectSettings()
 ROW, COLUMN = np.mgrid[: SHAPE[0], : SHAPE[1]].astype(float)
 RIGHT, DOWN = (COLUMN - 160) / FOCAL_PX, (ROW - 80) / FOCAL_PX  # of rays, per metre of depth
-
-
-def layers_of(depth_m, measured=None, confidence=0.8):
-    """As after the fill. measured: (H,W) bool, all if None."""
-    filled_m = np.ascontiguousarray(depth_m, np.float32)
-    known = filled_m > 0
-    depth_m = np.where(known if measured is None else known & measured, filled_m, 0)
-    return Layers(
-        depth_m=depth_m.astype(np.float32),
-        rim_m=np.zeros(SHAPE, np.float32),
-        veiled=np.zeros(SHAPE, bool),
-        refused=np.zeros(SHAPE, bool),
-        filled_m=filled_m,
-        confidence=np.where(known, np.float32(confidence), np.float32(0)),
-        point=np.where(depth_m > 0, np.arange(depth_m.size).reshape(SHAPE), -1).astype(np.int32),
-        tilt=np.zeros((*SHAPE, 2), np.float32),
-        spacing_px=np.full((*SHAPE, 2), 3, np.float32),
-    )
 
 
 def street_behind():
@@ -71,13 +49,13 @@ def car(rng, behind_m=0.6, seen=0.5):
 
 def test_a_window_gets_the_plane_of_its_frame():
     layers = layers_of(car(np.random.default_rng(1)))
-    closed = close_windows(layers, FOCAL_PX, SETTINGS)
+    closed = close_windows(layers, FOCAL_PX)
     right = np.abs(closed.filled_m / side_m() - 1) < 0.01
     assert right[WINDOW].mean() > 0.98  # a few corners of two pixels are left
     assert closed.glass is not None
     np.testing.assert_array_equal(closed.glass, (layers.depth_m > 0) & (closed.depth_m == 0))
     assert (closed.glass == (layers.depth_m > 0))[WINDOW].mean() > 0.98
-    np.testing.assert_allclose(closed.confidence[right & WINDOW], 0.8 * SETTINGS.fill_confidence)
+    np.testing.assert_allclose(closed.confidence[right & WINDOW], 0.4)
     for before, after in ((layers.depth_m, closed.depth_m), (layers.filled_m, closed.filled_m)):
         np.testing.assert_array_equal(after[~WINDOW], before[~WINDOW])
 
@@ -86,7 +64,7 @@ def test_so_does_one_through_which_the_street_beyond_is_seen():
     rng = np.random.default_rng(6)
     depth_m = np.where(WINDOW, street_behind(), car(rng))
     layers = layers_of(np.where(rng.random(SHAPE) < 0.5, depth_m, 0))
-    closed = close_windows(layers, FOCAL_PX, SETTINGS)
+    closed = close_windows(layers, FOCAL_PX)
     right = np.abs(closed.filled_m / side_m() - 1) < 0.01
     assert right[WINDOW].mean() > 0.98
     known = ~WINDOW & (layers.filled_m > 0)
@@ -98,7 +76,7 @@ def test_a_window_without_a_measured_roof_is_closed_between_its_pillars():
     rng = np.random.default_rng(7)
     roof = box(-9, 9, -9, -0.38) & ~box(-0.62, -0.45, -9, 9) & ~box(0.4, 0.57, -9, 9)
     layers = layers_of(np.where(roof & BODY, 0, car(rng)))
-    closed = close_windows(layers, FOCAL_PX, SETTINGS)
+    closed = close_windows(layers, FOCAL_PX)
     right = np.abs(closed.filled_m / side_m() - 1) < 0.01
     assert right[WINDOW].mean() > 0.7 > (layers.filled_m > 0)[WINDOW].mean()
     assert not closed.filled_m[box(-9, 9, -9, -0.53)][
@@ -111,7 +89,7 @@ def test_what_glass_itself_sent_back_stays_measured():
     depth_m = car(rng)
     pane = WINDOW & (rng.random(SHAPE) < 0.12)
     depth_m[pane] = side_m()[pane]
-    closed = close_windows(layers_of(depth_m), FOCAL_PX, SETTINGS)
+    closed = close_windows(layers_of(depth_m), FOCAL_PX)
     np.testing.assert_array_equal(closed.depth_m[pane], depth_m[pane].astype(np.float32))
     assert (closed.depth_m[WINDOW & ~pane] == 0).mean() > 0.98
 
@@ -142,14 +120,9 @@ def test_what_is_no_window_is_left(kind):
     rng = np.random.default_rng(3)
     depth_m = np.where(rng.random(SHAPE) < 0.6, no_window(kind, rng), 0)
     layers = layers_of(depth_m)
-    closed = close_windows(layers, FOCAL_PX, SETTINGS)
+    closed = close_windows(layers, FOCAL_PX)
     np.testing.assert_array_equal(closed.depth_m, layers.depth_m)
     np.testing.assert_array_equal(closed.filled_m, layers.filled_m)
-
-
-def test_an_empty_map_stays_empty():
-    closed = close_windows(layers_of(np.zeros(SHAPE)), FOCAL_PX, SETTINGS)
-    assert not closed.filled_m.any()
 
 
 def test_threads_change_no_byte(monkeypatch):
@@ -157,8 +130,12 @@ def test_threads_change_no_byte(monkeypatch):
     results = []
     for cores in (1, 3):
         monkeypatch.setattr(threads, "num_threads", lambda cores=cores: cores)
-        results.append(close_windows(layers, FOCAL_PX, SETTINGS).filled_m.tobytes())
+        results.append(close_windows(layers, FOCAL_PX).filled_m.tobytes())
     assert results[0] == results[1]
+
+
+CELL_FOCAL_PX = FOCAL_PX / 2
+REACH_PX = round(0.16 * CELL_FOCAL_PX)
 
 
 def on_ray(row, column, d, near, reach_px):
@@ -177,13 +154,13 @@ def fitted(parts):
     return np.linalg.lstsq(design, parts[:, 2], rcond=None)[0]
 
 
-def in_plane(parts, off_m, rules):
+def in_plane(parts, off_m):
     """The parts, by direction, without those farthest off their plane, and that; None if too few
     are left."""
     parts = dict(parts)
     while (
-        len(parts) >= rules.least
-        and len(parts.keys() & {2, 3, 4, 5, 6}) >= rules.below
+        len(parts) >= stage._LEAST
+        and len(parts.keys() & {2, 3, 4, 5, 6}) >= stage._BELOW
         and 4 in parts
         and parts.keys() & {8, 9}
         and parts.keys() & {15, 0}
@@ -202,78 +179,78 @@ def off_plane(plane, part):
     return abs(1 / at - 1 / part[2]) if at > 0 else np.inf
 
 
-def twin(row, column, near, far, rules):
+def twin(row, column, near, far):
     """The plane of the frame around a pixel, None if there is none."""
     if far[row, column] > 0:
         depth = 1 / float(far[row, column])
     else:
-        first = [on_ray(row, column, d, near, rules.reach_px) for d in range(16)]
+        first = [on_ray(row, column, d, near, REACH_PX) for d in range(16)]
         first = [ray[ray[:, 2] > 0][0, 2] for ray in first if (ray[:, 2] > 0).any()]
         if not first:
             return None
-        depth = 1 / min(first) + rules.empty_m
-    whole = {d: on_ray(row, column, d, near, rules.reach_px) for d in range(16)}
+        depth = 1 / min(first) + stage._EMPTY_M
+    whole = {d: on_ray(row, column, d, near, REACH_PX) for d in range(16)}
     close = {
-        d: ray[np.arange(1, len(ray) + 1) <= rules.reach_m * rules.focal_px * ray[:, 2]]
+        d: ray[np.arange(1, len(ray) + 1) <= stage._REACH_M * CELL_FOCAL_PX * ray[:, 2]]
         for d, ray in whole.items()
     }
     nearest = {d: ray[ray[:, 2].argmax()] for d, ray in close.items() if ray[:, 2].any()}
-    if not upright_below(whole[4], depth, rules):
+    if not upright_below(whole[4], depth):
         return None
     parts = {
         d: part
         for d, part in nearest.items()
-        if rules.each_m < depth - 1 / part[2] and depth - 1 / part[2] <= rules.most_m
+        if depth - 1 / part[2] > stage._EACH_M and depth - 1 / part[2] <= stage._MOST_M
     }
-    for off_m in (rules.rough_m, rules.off_m):
-        found = in_plane(parts, off_m, rules)
+    for off_m in (stage._ROUGH_M, stage._OFF_M):
+        found = in_plane(parts, off_m)
         if found is None:
             return None
         _, plane = found
         before = depth - 1 / plane[0]
-        if not (plane[0] > 0 and rules.behind_m < before <= rules.most_m):
+        if not (plane[0] > 0 and stage._BEHIND_M < before <= stage._MOST_M):
             return None
-        if abs(plane[2]) * rules.focal_px > rules.lean * plane[0]:
+        if abs(plane[2]) * CELL_FOCAL_PX > stage._LEAN * plane[0]:
             return None
         parts = {}
-        reach_px = int(min(rules.reach_m * rules.focal_px * plane[0], rules.reach_px))
+        reach_px = int(min(stage._REACH_M * CELL_FOCAL_PX * plane[0], REACH_PX))
         rays = {d: ray[:reach_px] for d, ray in whole.items()}
         for d, ray in rays.items():
             for part in ray[ray[:, 2] > 0]:
                 at_m = 1 / (plane[0] + part[:2] @ plane[1:])
-                if 1 / part[2] < at_m + rules.touch_m:
-                    if at_m - rules.rough_m < 1 / part[2] < depth - rules.each_m:
+                if 1 / part[2] < at_m + stage._TOUCH_M:
+                    if at_m - stage._ROUGH_M < 1 / part[2] < depth - stage._EACH_M:
                         parts[d] = part
                     break
-    plates = {d for d in range(2, 7) if has_plate(rays[d], plane, rules)}
-    return plane if 4 in plates and len(plates) >= rules.below - 1 else None
+    plates = {d for d in range(2, 7) if has_plate(rays[d], plane)}
+    return plane if 4 in plates and len(plates) >= stage._BELOW - 1 else None
 
 
-def upright_below(ray, depth, rules):
+def upright_below(ray, depth):
     """Whether somewhere on the ray straight down cells before the pixel keep together for as long
     as a plate is."""
     begin = None
     for k, inverse in enumerate(ray[:, 2], start=1):
         if inverse == 0:
             continue
-        if inverse * (depth - rules.each_m) <= 1:
+        if inverse * (depth - stage._EACH_M) <= 1:
             begin = None
             continue
-        gone_m = (k - begin[0]) / (rules.focal_px * begin[1]) if begin else 0
-        most_m = rules.lean * gone_m + 2 * rules.plate_off_m
+        gone_m = (k - begin[0]) / (CELL_FOCAL_PX * begin[1]) if begin else 0
+        most_m = stage._LEAN * gone_m + 2 * stage._PLATE_OFF_M
         if begin is None or abs(1 / inverse - 1 / begin[1]) > most_m:
             begin = k, inverse
-        elif gone_m >= rules.plate_m:
+        elif gone_m >= stage._PLATE_M:
             return True
     return False
 
 
-def has_plate(ray, plane, rules):
+def has_plate(ray, plane):
     """Whether somewhere on a ray cells are in the plane for as long as a plate is: half of them
     known or more, the first of them, and none off it."""
-    size = int(rules.plate_m * rules.focal_px * plane[0]) + 1
+    size = int(stage._PLATE_M * CELL_FOCAL_PX * plane[0]) + 1
     off = [off_plane(plane, part) if part[2] > 0 else np.nan for part in ray]
-    ends = [-1, *np.flatnonzero(np.array(off) > rules.plate_off_m), len(off)]
+    ends = [-1, *np.flatnonzero(np.array(off) > stage._PLATE_OFF_M), len(off)]
     for before, after in pairwise(ends):
         known = [k for k in range(before + 1, after) if np.isfinite(off[k])]
         if known and after - known[0] >= size:
@@ -286,13 +263,13 @@ def test_frames_equal_those_of_a_slow_twin():
     depth_m = car(rng)[22:130:2, 110:210:2]
     depth_m[rng.random(depth_m.shape) < 0.1] = 0
     near = np.divide(1, depth_m, out=np.zeros_like(depth_m), where=depth_m > 0).astype(np.float32)
-    rules, found = glass._rules(FOCAL_PX / 2), np.zeros((6, *near.shape), np.float32)
+    found = np.zeros((6, *near.shape), np.float32)
     known = np.where(near > 0, np.float32(0.5), np.float32(0))
     steps = first_known(near > 0)
-    framed.over_rows(near.size, near, near, known, steps, DIRECTIONS, rules, found)
+    stage.find_frames.over_rows(near.size, near, near, known, steps, CELL_FOCAL_PX, REACH_PX, found)
     num = 0
     for row, column in np.ndindex(near.shape):
-        plane = twin(row, column, near, near, rules)
+        plane = twin(row, column, near, near)
         assert (found[0, row, column] > 0) == (plane is not None), (row, column)
         if plane is not None:
             num += 1

@@ -8,16 +8,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from densify.config import ProjectSettings
 from densify.depth.image_points import PointsInImage
-from densify.depth.layers import Layers
-from densify.depth.spot import measure_spots
+from densify.depth.spots import measure_spots
+from tests.depth_layers import layers_of
 
 HEIGHT, WIDTH = 24, 32
 ROW, COLUMN = np.mgrid[:HEIGHT, :WIDTH].astype(float)
 TILT = (2e-4, -3e-4)
 PLANE = (1 / (0.1 + TILT[0] * COLUMN + TILT[1] * ROW)).astype(np.float32)
-SETTINGS = ProjectSettings(spot=0.4)
 
 
 def measured_at(uv, spacing_px):
@@ -35,12 +33,8 @@ def measured_at(uv, spacing_px):
         np.stack([spacing, 9 * spacing], 1),
         *(nothing > 0, nothing, nothing, nothing, nothing > 0),
     )
-    empty = np.zeros_like(PLANE)
-    layers = Layers(
-        *(depth_m, empty, empty > 0, empty > 0, PLANE, empty + np.float32(0.5), point),
-        tilt=np.broadcast_to(np.float32(TILT), (HEIGHT, WIDTH, 2)).copy(),
-        spacing_px=np.ones((HEIGHT, WIDTH, 2), np.float32),
-    )
+    layers = layers_of(PLANE, depth_m > 0, confidence=0.5, tilt=TILT)
+    layers = replace(layers, point=point)
     return layers, points
 
 
@@ -49,8 +43,8 @@ def test_pixels_whose_middle_the_spot_covers_are_measured():
     cells = np.stack(np.meshgrid(np.arange(2, WIDTH - 2, 4), np.arange(2, HEIGHT - 2, 5)), -1)
     uv = cells.reshape(-1, 2) + rng.uniform(-0.5, 0.5, (cells.size // 2, 2))
     layers, points = measured_at(uv, rng.uniform(1, 8, len(uv)))
-    made = measure_spots(layers, points, SETTINGS)
-    radius_px = 0.4 * points.spacing_px[:, 0]
+    made = measure_spots(layers, points)
+    radius_px = 0.35 * points.spacing_px[:, 0]
     for v in range(HEIGHT):
         for u in range(WIDTH):
             away_px = np.hypot(*(points.uv - [u, v]).T)
@@ -73,32 +67,32 @@ def test_what_is_open_or_of_another_surface_stays_so():
     filled_m[:, 17:] = 0  # an edge, which nothing was filled across
     filled_m[:, :16] += np.float32(0.5)  # and another surface
     filled_m[12, 16] = PLANE[12, 16]
-    made = measure_spots(replace(layers, filled_m=filled_m), points, SETTINGS)
+    made = measure_spots(replace(layers, filled_m=filled_m), points)
     expected = (np.abs(ROW - 12) <= 2) & (COLUMN == 16)
     np.testing.assert_array_equal(made.depth_m > 0, expected)
 
 
 def test_unsure_rims_stay_so():
     layers, points = measured_at([[16, 12]], 6.0)
-    made = measure_spots(replace(layers, unsure=COLUMN > 16), points, SETTINGS)
-    covered = measure_spots(layers, points, SETTINGS).depth_m > 0
+    made = measure_spots(replace(layers, unsure=COLUMN > 16), points)
+    covered = measure_spots(layers, points).depth_m > 0
     np.testing.assert_array_equal(made.depth_m > 0, covered & (COLUMN <= 16))
 
 
 def test_a_spot_within_its_pixel_covers_no_other():
     layers, points = measured_at([[16.2, 12.1], [0, 0]], 1.2)
-    made = measure_spots(layers, points, SETTINGS)
+    made = measure_spots(layers, points)
     np.testing.assert_array_equal(made.depth_m, layers.depth_m)
 
 
 def test_at_the_border_and_with_nothing_measured():
     layers, points = measured_at([[0, 0], [WIDTH - 1, HEIGHT - 1]], 3.0)
-    assert (measure_spots(layers, points, SETTINGS).depth_m > 0).sum() == 6
+    assert (measure_spots(layers, points).depth_m > 0).sum() == 6
     none = replace(layers, depth_m=np.zeros_like(PLANE), point=np.full(PLANE.shape, -1, np.int32))
-    assert not measure_spots(none, points, SETTINGS).depth_m.any()
+    assert not measure_spots(none, points).depth_m.any()
 
 
 @pytest.mark.parametrize("spacing_px", [50.0, 1e6])
 def test_right_before_the_lens_a_spot_does_not_fill_the_image(spacing_px):
     layers, points = measured_at([[16, 12]], spacing_px)
-    assert (measure_spots(layers, points, SETTINGS).depth_m > 0).sum() == 49  # radius 4
+    assert (measure_spots(layers, points).depth_m > 0).sum() == 49  # radius 4

@@ -1,0 +1,246 @@
+# SPDX-License-Identifier: MIT
+"""Which pixels measured close to a depth discontinuity are kept: the image decides.
+
+Every known pixel that is seen first in one of 16 directions votes on the depth of a pixel: for it
+if its surface goes on to there, else against it. A vote weighs less the more colours change on the
+way, as in a bilateral grid or in geodesic matting: without an edge of the image between them, two
+pixels show the same surface.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from densify.depth.image_alignment import align_image
+from densify.depth.layers import Layers
+from densify.depth.neighbours import DIRECTIONS, NONE, extended, first_known, offset
+from densify.geometry.arrays import Bool, Float32, Int
+from densify.geometry.compiled import Kernel, inlined
+
+MOST_CONFIDENCE = 0.2
+"""A boundary pixel has no more, any other measured pixel no less."""
+_NUM_ROUNDS = 2
+_RIM_WEIGHT = 0.5  # of a boundary pixel's own vote, at most
+_LEAST_SHARE = 0.97  # of the votes for a pixel that is kept
+_LEAST_OF_MOVERS = 0.7  # most of these are right too, since what the key sweep saw past is refused
+_FEW = 100  # boundary pixels, of which nothing can be told
+_SUREST = 2.5  # -log10 of the share against
+_REACH, _DECAY = 6.0, 1.2  # gaps between rays: of a vote, and at which it counts half
+_SAME_M, _SAME_FRACTION = 0.2, 0.05  # within which a surface agrees with a depth
+_COLOURS = 6.0  # standard deviation of a surface's, in L*a*b*
+_THROUGH = 0.001  # what is left of a vote across an edge of the image
+_DOUBT = 0.04  # a vote that is always there, half of it for
+_ASIDE = 0.6  # gaps by which the image may lie beside the depth
+_STRIDE = 3.0  # colours looked at on the way to a voter, by gap between rays
+_ROUNDED = 1 - 1e-6  # just the share needed is enough, whatever the rounding
+_MISFIT = (
+    "image edges do not lie where depth has edges (calibration, clock, blur?): pixels at depth "
+    "edges are left out as with project.rims=strict"
+)
+_MOVED = (
+    "image edges lie {place} of where depth has edges: the image is moved for "
+    "project.rims; are calibration and clock right?"
+)
+
+
+def accept_boundary_pixels(layers: Layers, rims: str) -> Layers:
+    """Accept boundary pixels (``rim_m``) as the knob ``project.rims`` says.
+
+    rims: ``image`` accepts those that the image puts on the measured surface, ``keep`` also all
+    others that are not occluded, ``strict`` none. Accepted are 97 % of the votes, 70 % on moving
+    objects (those below 97 % become ``unsure``), but never a pixel that is ``refused``. Boundary
+    pixels vote too, by half, and in a second round less the less they are believed.
+
+    An image that lies up to three steps aside is moved, with a warning. One that does not fit or is
+    blurred is not used, with a warning. ``lab`` goes on only if it is used. The ``confidence`` of
+    boundary pixels becomes 0 to 0.2, by the share of the votes against.
+    """
+    pixel = np.flatnonzero(layers.rim_m)
+    share, lab, warnings = np.full(len(pixel), np.float32(0.5)), None, layers.warnings
+    if layers.lab is not None and rims != "strict" and len(pixel) >= _FEW:
+        aligned = align_image(layers)
+        if aligned is None:
+            warnings = (*warnings, _MISFIT)
+        else:
+            lab = aligned.lab
+            share = shares(replace(layers, lab=lab), pixel)
+            if aligned.right_px or aligned.down_px:
+                warnings = (*warnings, _MOVED.format(place=aligned))
+    believed = share >= _LEAST_SHARE
+    if layers.moving is not None:
+        believed |= layers.moving.flat[pixel] & (share >= _LEAST_OF_MOVERS)
+    if rims == "strict":
+        believed[:] = False
+    elif rims == "keep":
+        believed |= ~layers.veiled.flat[pixel]
+    believed &= ~layers.refused.flat[pixel]
+    kept = pixel[believed]
+    unsure = np.zeros(layers.rim_m.shape, bool)
+    if rims == "image":
+        unsure.flat[kept] = share[believed] < _LEAST_SHARE
+    depth_m = layers.depth_m.copy()
+    depth_m.flat[kept] = layers.rim_m.flat[kept]
+    confidence = layers.confidence.copy()
+    sure = np.clip(-np.log10(np.maximum(1 - share, 1e-9)) / _SUREST, 0, 1)
+    confidence.flat[pixel] = sure * np.float32(MOST_CONFIDENCE)
+    return replace(
+        layers,
+        depth_m=depth_m,
+        filled_m=depth_m,
+        confidence=np.where(depth_m > 0, confidence, np.float32(0)),
+        lab=lab,
+        warnings=warnings,
+        unsure=unsure,
+    )
+
+
+def shares(layers: Layers, pixel: Int) -> Float32:
+    """Return the (R,) share of the votes for each of the boundary pixels ``pixel`` (R,)."""
+    voters = _voters(layers, np.maximum(layers.depth_m, layers.rim_m))
+    share, weight = np.ones(len(pixel), np.float32), np.ones_like(layers.depth_m)
+    for _ in range(_NUM_ROUNDS):
+        weight.flat[pixel] = _RIM_WEIGHT * share**2
+        share = vote(layers, voters, pixel, layers.rim_m.flat[pixel], weight, surely=True)
+    return share
+
+
+def voted_for(
+    layers: Layers, known_m: Float32, pixel: Int, depth_m: Float32, least_share: float
+) -> Bool:
+    """Return (P,) True where ``least_share`` of the votes or more is for ``depth_m`` (P,) of the
+    pixels ``pixel`` (P,); known_m: (H,W) depth of those that vote, 0 none."""
+    weight = np.ones_like(known_m)
+    share = vote(layers, _voters(layers, known_m), pixel, depth_m, weight, surely=False)
+    return share >= _ROUNDED * least_share
+
+
+class Voters(NamedTuple):
+    """Pixels whose depth is known.
+
+    steps: (16,H,W) of `densify.depth.neighbours.first_known`. inverse: (H,W) 1/m. tilt: (H,W,2)
+    slope of it, 1/m per px.
+    """
+
+    steps: NDArray[np.uint8]
+    inverse: Float32
+    tilt: Float32
+
+
+def _voters(layers: Layers, known_m: Float32) -> Voters:
+    inverse = np.divide(1, known_m, out=np.zeros_like(known_m), where=known_m > 0)
+    return Voters(first_known(known_m > 0), inverse, layers.tilt)
+
+
+def vote(
+    layers: Layers, voters: Voters, pixel: Int, depth_m: Float32, weight: Float32, surely: bool
+) -> Float32:
+    """Return the (P,) share of the votes for the depths of pixels.
+
+    pixel: (P,). depth_m: (P,). weight: (H,W) of each voter. surely: take the least share wherever
+    the image lies, as it is or 0.6 gaps to any side, and with a doubt; else without voters it is 0.
+    """
+    share = np.zeros(len(pixel), np.float32)
+    lab = np.zeros((0, 0, 3), np.float32) if layers.lab is None else layers.lab
+    _vote.over_rows(
+        len(pixel), pixel, 1 / depth_m, voters, weight, lab, layers.gap_px, surely, share
+    )
+    return share
+
+
+@inlined
+def _steps_to(steps, d, v, u):  # type: ignore[no-untyped-def]
+    """Return the steps from a pixel, which may be known itself, to the first other known one."""
+    here = np.int64(steps[d, v, u])
+    height, width = steps.shape[1:]
+    for k in range(1, 3 if here == 0 else 1):
+        du, dv = offset(d, k)
+        if not (0 <= u + du < width and 0 <= v + dv < height):
+            return NONE
+        here = k + np.int64(steps[d, v + dv, u + du])
+        if here == k:
+            return here
+    return min(here, NONE)
+
+
+@inlined
+def _agree(voters, v, u, depth, gap, steps, agrees):  # type: ignore[no-untyped-def]
+    """Fill the steps to the voter in each direction, 0 where none is near, and whether its surface
+    goes on to the pixel; return how many do, and how many do not."""
+    same = _SAME_M + _SAME_FRACTION * depth
+    num_for, num_against = 0, 0
+    for d in range(len(steps)):
+        k = _steps_to(voters.steps, d, v, u)
+        du, dv = offset(d, k)
+        steps[d], agrees[d] = 0, False
+        if k == NONE or max(abs(du), abs(dv)) > _REACH * gap:
+            continue
+        steps[d] = k
+        here = extended(voters.inverse, voters.tilt, v + dv, u + du, du, dv)
+        agrees[d] = abs(1 / here - depth) <= same
+        num_for += agrees[d]
+        num_against += not agrees[d]
+    return num_for, num_against
+
+
+@inlined
+def _alike(lab, v, u, d, k, gap):  # type: ignore[no-untyped-def]
+    """Return what the image, if there is one, leaves of a vote: exp(-c² / 2 s²) + ``_THROUGH``.
+
+    c is the largest distance in colour on the way of k steps, s is ``_COLOURS``. The image goes on
+    at its border.
+    """
+    if lab.size == 0:
+        return 1 + _THROUGH
+    narrow = -0.5 / (_COLOURS * _COLOURS)
+    most = np.float32(np.log(0.01 * _THROUGH) / narrow)  # more makes no difference
+    stride = max(np.int64(gap / _STRIDE), 1)
+    height, width = lab.shape[:2]
+    row, column = min(max(v, 0), height - 1), min(max(u, 0), width - 1)
+    light, a, b = lab[row, column, 0], lab[row, column, 1], lab[row, column, 2]
+    change = np.float32(0)
+    for step in range((k - 1) % stride + 1, k + 1, stride):
+        du, dv = offset(d, step)
+        row, column = min(max(v + dv, 0), height - 1), min(max(u + du, 0), width - 1)
+        off_light, off_a = lab[row, column, 0] - light, lab[row, column, 1] - a
+        off_b = lab[row, column, 2] - b
+        change = max(change, off_light * off_light + off_a * off_a + off_b * off_b)
+        if change > most:
+            break
+    return np.exp(narrow * change) + _THROUGH
+
+
+@Kernel
+def _vote(first, last, pixel, inverse, voters, weight, lab, gap_px, surely, share):  # type: ignore[no-untyped-def]
+    """share: (P,) float32, filled as `vote` says. inverse: (P,) depth, 1/m. lab: (H,W,3), empty
+    without an image. gap_px: (H,W) between rays."""
+    width, num = gap_px.shape[1], len(DIRECTIONS)
+    steps, agrees = np.zeros(num, np.int64), np.zeros(num, np.bool_)
+    doubt = _DOUBT if surely else 0.0
+    for i in range(first, last):
+        v, u = pixel[i] // width, pixel[i] % width
+        gap = gap_px[v, u]
+        num_for, num_against = _agree(voters, v, u, 1 / inverse[i], gap, steps, agrees)
+        if not surely and (num_for == 0 or num_against == 0):
+            share[i] = num_for > 0
+            continue
+        aside = np.int64(np.rint(_ASIDE * gap)) if surely else 0
+        least = 1.0
+        for side in range(5 if aside else 1):
+            down = aside * ((side == 3) - (side == 4))
+            right = aside * ((side == 1) - (side == 2))
+            votes_for, votes = 0.5 * doubt, doubt
+            for d in range(num):
+                k = steps[d]
+                if k == 0:
+                    continue
+                du, dv = offset(d, k)
+                one = weight[v + dv, u + du] / (1 + k / (_DECAY * gap))
+                one *= _alike(lab, v + down, u + right, d, k, gap)
+                votes += one
+                votes_for += one * agrees[d]
+            least = min(least, votes_for / votes)
+        share[i] = least

@@ -1,0 +1,402 @@
+# SPDX-License-Identifier: MIT
+"""The depth that the points of an image give its pixels.
+
+Of the points in a pixel that are not hidden, the one measured nearest in time to the key wins. Its
+depth is that of the plane through the points around that agree with it, in the middle of the pixel.
+It counts if enough sweeps agree; if a depth edge is near, it is a boundary pixel.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from densify.depth.boundary_pixels import MOST_CONFIDENCE
+from densify.depth.image_points import (
+    HIDDEN_FRACTION,
+    HIDDEN_M,
+    PointsInImage,
+    distance_behind,
+    sorted_by_pixel,
+)
+from densify.depth.neighbours import plane
+from densify.geometry.arrays import Bool, Float, Float32, Int
+from densify.geometry.compiled import Kernel, inlined
+from densify.geometry.types import Camera, Reason
+
+NOW_NS = 60_000_000
+"""Older is not the key sweep."""
+AGREE_M, AGREE_FRACTION = 0.1, 0.01
+"""Points on one surface deviate less than this, both added."""
+_SUPPORT_REACH, _PLANE_REACH = 0.8, 0.5  # of sweeps that agree, of the plane; in spacings of rays
+_EDGE_REACH, _EDGE_SLACK_M = 0.35, 0.015  # of a depth edge: spacings along the azimuth, both added
+_EDGE_WINDOW_PX = 1.5  # beyond the edge, where points must show that a surface goes on
+# Points beyond the window make a surface go on where something nearer begins: both are stricter.
+_FAR_SUPPORT, _FAR_EDGE = 6, 1.5
+# Most confidence lost by few sweeps, few points, a near edge, a rough fit, being nearly hidden.
+_DOUBTS = np.array([0.45, 0.25, 0.20, 0.10, 0.10])
+_MANY_POINTS, _ROUGH_M = 20, 0.10
+_RIDGE_PX2 = 0.02
+_LEAST_WINDOW_PX, _LEAST_FIT_PX, _MOST_PX = 3, 2.0, 24
+_MOVING_SLACK = 4.0  # motion is known less well than static surfaces
+_MOVING_WITNESS_NS = 120_000_000  # from the key
+_CLEARLY = 0.25  # of the squared distance
+_ALONE = 0.5  # squared spacings; a ray of each sweep falls nearer to every point of a surface
+_GOES_ON = 1.2  # spacings within which a surface shows again
+_ANY_AGE_NS = 1 << 62
+_ALL_ROUND = 3.0  # edges' reaches: no edge near
+_DIAGONAL = np.sqrt(0.5)
+_LEAST_ALONE = 5  # returns of the key sweep that agree around one, itself among them, of nine
+_NEVER_NS = np.iinfo(np.int64).max
+
+
+@dataclass(frozen=True)
+class MeasuredPixels:
+    """P measured pixels: ``pixel`` (P,) row by row, ``winner`` (P,) which of the points in the
+    image, ``depth_m``, ``confidence`` (P,), ``tilt`` (P,2) of the inverse depth, 1/m per px,
+    ``inside`` no depth edge near; the others as in `densify.depth.layers.Layers`."""
+
+    pixel: Int
+    winner: Int
+    depth_m: Float32
+    confidence: Float32
+    tilt: Float
+    inside: Bool
+    veiled: Bool
+    refused: Bool
+    alone: Bool
+
+    def select(self, keep: Bool | Int) -> MeasuredPixels:
+        """Return some of the pixels."""
+        return MeasuredPixels(**{name: column[keep] for name, column in vars(self).items()})
+
+    def replaced(self, others: MeasuredPixels) -> MeasuredPixels:
+        """Return the pixels with others of the same points, which count where both know one."""
+        kept = self.select(~np.isin(self.pixel, others.pixel))
+        more = vars(others)
+        both = MeasuredPixels(**{n: np.concatenate([c, more[n]]) for n, c in vars(kept).items()})
+        return both.select(np.argsort(both.pixel))
+
+
+def nearest_pixels(
+    points: PointsInImage, own: Float32, camera: Camera, reason: NDArray[np.uint8]
+) -> MeasuredPixels:
+    """Return each pixel's nearest point as it is; fill in the ``reason`` of the others."""
+    start, order = sorted_by_pixel(points, np.zeros(len(own), np.int64), own, camera)
+    pixel = np.flatnonzero(np.diff(start))
+    nearest = order[start[pixel]]
+    reason[points.index] = Reason.NOT_CHOSEN
+    nowhere = np.zeros(len(pixel), bool)
+    return MeasuredPixels(
+        pixel=pixel,
+        winner=nearest,
+        depth_m=points.depth[nearest],
+        confidence=own[nearest],
+        tilt=points.slope[nearest],
+        inside=~nowhere,
+        veiled=nowhere,
+        refused=nowhere,
+        alone=nowhere,
+    )
+
+
+def visible_pixels(
+    points: PointsInImage,
+    own: Float32,
+    camera: Camera,
+    support: int,
+    reason: NDArray[np.uint8],
+) -> MeasuredPixels:
+    """Return the pixels that visible points measure; fill in the ``reason`` of the others.
+
+    own: (K,) confidence of the points. support: sweeps that must agree.
+
+    Points beyond the window come second. They give pixels where the window has none away from depth
+    edges, and support there what the window saw too rarely.
+    """
+    near = ~points.far
+    pixels, why = _settled(points.select(near), own[near], camera, support)
+    pixels = replace(pixels, winner=np.flatnonzero(near)[pixels.winner])
+    reason[points.index[near]] = why
+    if near.all():
+        return pixels
+    taken = pixels.pixel[pixels.inside]
+    others, why = _settled(points, own, camera, support, taken)
+    reason[points.index[~near]] = why[~near]
+    return pixels.replaced(others.select(others.inside))
+
+
+def _settled(
+    points: PointsInImage,
+    own: Float32,
+    camera: Camera,
+    support: int,
+    taken: Int | None = None,
+) -> tuple[MeasuredPixels, NDArray[np.uint8]]:
+    """Return the pixels that points measure, and the `Reason` of every point.
+
+    taken: where given, pixels to leave alone; the others get the stricter rules of points beyond
+    the window. Else too little support is enough where the key sweep has several returns of the
+    surface: what moves unnoticed was elsewhere at other times.
+    """
+    many = int(points.sweep.max(initial=0)) + 1
+    least = min(support, max(1, many // 2))
+    behind = distance_behind(points, camera)
+    hidden = behind > 1
+    reason = np.where(hidden, Reason.HIDDEN, Reason.NOT_CHOSEN).astype(np.uint8)
+    pixel, winner, found = _found(points, hidden, own, camera, least, taken)
+    depth_m, num_sweeps, youngest_ns, num_points, residual_m, edge, num_alone = found
+    veiled = hidden[winner]
+    refused = veiled & (points.age_ns[winner] > NOW_NS)
+    if refused.any():
+        refused &= distance_behind(points, camera, points.moving)[winner] > 1
+    refused |= edge < 0
+    alone = num_alone >= _LEAST_ALONE
+    if taken is None:
+        supported = num_sweeps >= least
+        supported &= youngest_ns <= np.float32(points.age_ns.min(initial=_NEVER_NS))
+        supported |= alone
+        inside = edge >= 1
+    else:
+        many, supported, inside = 2 * _FAR_SUPPORT, num_sweeps >= _FAR_SUPPORT, edge >= _FAR_EDGE
+        reason[winner[~inside & ~veiled]] = Reason.EDGE
+    reason[winner[~supported & ~veiled]] = Reason.UNSUPPORTED
+    doubts = np.stack(
+        [
+            1 - np.minimum(num_sweeps / many, 1),
+            1 - np.minimum(num_points / _MANY_POINTS, 1),
+            np.clip(3 - edge, 0, 2) / 2,
+            np.minimum(residual_m / _ROUGH_M, 1),
+            np.clip(behind[winner], 0, 1),
+        ]
+    )
+    confidence = np.maximum(own[winner] * (1 - _DOUBTS @ doubts), MOST_CONFIDENCE)
+    inside &= ~veiled
+    every = MeasuredPixels(
+        pixel=pixel,
+        winner=winner,
+        depth_m=depth_m,
+        confidence=confidence.astype(np.float32),
+        tilt=points.slope[winner],
+        inside=inside,
+        veiled=veiled,
+        refused=refused & ~inside,
+        alone=alone,
+    )
+    return every.select(supported), reason
+
+
+class _Visible(NamedTuple):
+    """K points in an image, sorted by pixel, hidden ones last in each pixel.
+
+    start: of `sorted_by_pixel`. uv: (K,2) px. inverse: (K,) depth, 1/m. slope: (K,2) of it, 1/m per
+    px. spacing_px: (K,2) between rays. edge_px: (K,) added to the reach of a depth edge. sweep:
+    (K,) 0 to 62. hidden, moving: (K,). age_ns: (K,) from the key.
+    """
+
+    start: Int
+    uv: Float
+    inverse: Float
+    slope: Float
+    spacing_px: Float
+    edge_px: Float
+    sweep: NDArray[np.integer]
+    hidden: Bool
+    moving: Bool
+    age_ns: Int
+
+
+def _found(
+    points: PointsInImage,
+    hidden: Bool,
+    own: Float32,
+    camera: Camera,
+    least: int,
+    taken: Int | None,
+) -> tuple[Int, Int, Float32]:
+    """Return the pixels (P,) with points, the first point of each (P,), and (7,P) what `_settle`
+    finds around it; with pixels ``taken`` neither these nor those with hidden points alone."""
+    last = int(points.age_ns.max(initial=0)) + 1
+    late = points.age_ns > NOW_NS
+    rank = np.where(hidden, last + late, points.age_ns)
+    start, order = sorted_by_pixel(points, rank, own, camera)
+    found = np.zeros((7, len(start) - 1), np.float32)
+    done = np.zeros(len(start) - 1, bool)
+    if taken is not None:
+        some = np.flatnonzero(np.diff(start))
+        done[some[hidden[order[start[some]]]]] = True
+        done[taken] = True
+    inverse = points.inverse
+    edge_px = _EDGE_SLACK_M * points.focal_px[:, 0] * inverse
+    visible = _Visible(
+        start,
+        points.uv.take(order, axis=0),
+        inverse[order],
+        points.slope.take(order, axis=0),
+        points.spacing_px.take(order, axis=0),
+        edge_px[order],
+        points.sweep[order],
+        hidden[order],
+        points.moving[order],
+        points.age_ns[order],
+    )
+    shape, few = (camera.height_px, camera.width_px), least if taken is None else 0
+    _settle.over_rows(len(done), visible, few, shape, done, found)
+    pixel = np.flatnonzero(found[0])
+    return pixel, order[start[pixel]], found[:, pixel]
+
+
+@inlined
+def _window(reach_px):  # type: ignore[no-untyped-def]
+    return int(min(max(np.rint(reach_px), _LEAST_WINDOW_PX), _MOST_PX))
+
+
+@inlined
+def _fit(reach_px):  # type: ignore[no-untyped-def]
+    """Return where the weight has fallen to zero."""
+    return min(max(reach_px, _LEAST_FIT_PX), _MOST_PX) + 1
+
+
+@inlined
+def _extend(reach, u, v):  # type: ignore[no-untyped-def]
+    """Raise how far points lie in eight directions."""
+    reach[0], reach[1] = max(reach[0], u), max(reach[1], -u)
+    reach[2], reach[3] = max(reach[2], v), max(reach[3], -v)
+    a, b = _DIAGONAL * (u + v), _DIAGONAL * (u - v)
+    reach[4], reach[5] = max(reach[4], a), max(reach[5], -a)
+    reach[6], reach[7] = max(reach[6], b), max(reach[7], -b)
+
+
+@inlined
+def _count(seen):  # type: ignore[no-untyped-def]
+    """Return the number of sweeps, bits of ``seen``."""
+    num_sweeps = 0
+    while seen:
+        num_sweeps += seen & 1
+        seen >>= 1
+    return num_sweeps
+
+
+@inlined
+def _look_round(points, shape, i, u0, v0, centre, agree, inner, witness_ns, m, reach):  # type: ignore[no-untyped-def]
+    """Compare the points around a pixel with point i's tangent plane, ``centre`` in the pixel.
+
+    witness_ns: how long before or after the key a point behind shows an edge; `_ANY_AGE_NS` for
+    static points. Fills the moments m (9,) and how far the surface goes on, reach (8,). Returns a
+    bit for each sweep that agrees, the age of the youngest, the number of points in the fit, their
+    weighted squares, True if something lies behind close by, and of a moving point the squared
+    distances in spacings to the key sweep's returns of its surface and behind it, and the number of
+    its returns that agree.
+    """
+    start, uv = points.start, points.uv
+    inverse, hidden, age_ns = points.inverse, points.hidden, points.age_ns
+    across, along = points.spacing_px[i, 0], points.spacing_px[i, 1]
+    su, sv, w0 = points.slope[i, 0], points.slope[i, 1], inverse[i]
+    moving = witness_ns < _ANY_AGE_NS
+    far = (HIDDEN_M + HIDDEN_FRACTION / w0) * w0 * w0
+    outer = inner + _EDGE_WINDOW_PX
+    # Sweeps see a moving object in the same rings.
+    on_v = max(outer, _GOES_ON * along) if moving else outer
+    support_u, support_v = _window(_SUPPORT_REACH * across), _window(_SUPPORT_REACH * along)
+    wide_u, wide_v = max(support_u, _window(outer)), max(support_v, _window(on_v))
+    fit_u, fit_v = _fit(_PLANE_REACH * across), _fit(_PLANE_REACH * along)
+    seen, num, youngest, behind, squares = np.int64(0), 0, age_ns[i], False, 0.0
+    now, now_behind, num_now = np.inf, np.inf, 0
+    left, right = max(u0 - wide_u, 0), min(u0 + wide_u, shape[1] - 1)
+    for v in range(max(v0 - wide_v, 0), min(v0 + wide_v, shape[0] - 1) + 1):
+        for j in range(start[v * shape[1] + left], start[v * shape[1] + right + 1]):
+            k = np.uint64(j)  # unsigned, so that no access checks for a negative index
+            du, dv = uv[k, 0] - u0, uv[k, 1] - v0
+            off = inverse[k] - (centre + su * du + sv * dv)
+            away = np.inf
+            if moving and age_ns[k] <= NOW_NS:
+                away = (du / across) ** 2 + (dv / along) ** 2
+            if (hidden[k] and not hidden[i]) or abs(off) > agree:
+                if off >= -far:
+                    continue
+                close = abs(du) <= outer and abs(dv) <= outer
+                behind |= close and age_ns[k] <= witness_ns
+                if moving:
+                    now_behind = min(now_behind, away)
+                continue
+            if moving:
+                now = min(now, away)
+                around = abs(du) <= _GOES_ON * across and abs(dv) <= _GOES_ON * along
+                num_now += around and away < np.inf
+            # No branches: half of them would be predicted wrongly.
+            vouches = abs(du) <= support_u + 0.5 and abs(v - v0) <= support_v
+            seen |= np.int64(vouches) << np.int64(points.sweep[k])
+            youngest = min(youngest, age_ns[k]) if vouches else youngest
+            goes_on = abs(du) <= outer and abs(dv) <= on_v
+            _extend(reach, du if goes_on else 0.0, dv if goes_on else 0.0)
+            weight = max(1 - abs(du) / fit_u, 0.0) * max(1 - abs(dv) / fit_v, 0.0)
+            m[0] += weight
+            m[1] += weight * du
+            m[2] += weight * dv
+            m[3] += weight * du * du
+            m[4] += weight * du * dv
+            m[5] += weight * dv * dv
+            m[6] += weight * off
+            m[7] += weight * du * off
+            m[8] += weight * dv * off
+            squares += weight * off * off
+            num += abs(du) < fit_u and abs(dv) < fit_v
+    return seen, youngest, num, squares, behind, now, now_behind, num_now
+
+
+@Kernel
+def _settle(first, last, points, few, shape, taken, found):  # type: ignore[no-untyped-def]
+    """Find each pixel's depth from the points around that agree with its first point.
+
+    points: `_Visible`. few: with fewer sweeps that agree a return of the key sweep is judged by the
+    key sweep alone, as a moving point is. taken: (P,) pixels to leave alone. found: (7,P) float32,
+    filled with depth, number of sweeps that agree, age of the youngest of them, points in the fit,
+    their root mean square residual (m), how far the surface goes on to all sides as a share of the
+    reach of edges, and the number of returns of the key sweep alone that agree. Hidden points agree
+    with a hidden one only.
+
+    Limbs swing, so the key sweep says more of a moving object's outline than others. Where it saw
+    past the object nearer by than it saw the object, an edge is near (0). At half the distance, or
+    if it should have met the object there and did not, the pixel shows what is behind (-1).
+    """
+    m, reach = np.zeros(9), np.zeros(8)
+    for p in range(first, last):
+        if taken[p] or points.start[p] == points.start[p + 1]:
+            continue
+        i = points.start[p]
+        v0, u0 = p // shape[1], p % shape[1]
+        w0, uv, slope = points.inverse[i], points.uv[i], points.slope[i]
+        centre = w0 + slope[0] * (u0 - uv[0]) + slope[1] * (v0 - uv[1])
+        centre = min(max(centre, 0.8 * w0), 1.25 * w0)
+        agree = (AGREE_M + AGREE_FRACTION / w0) * w0 * w0
+        edge_px = points.edge_px[i] * (_MOVING_SLACK if points.moving[i] else 1.0)
+        inner = _EDGE_REACH * points.spacing_px[i, 0] + edge_px
+        m[:], reach[:] = 0.0, 0.0
+        # Other sweeps saw the background where the moving object was not yet, or no more.
+        witness_ns = _MOVING_WITNESS_NS if points.moving[i] else _ANY_AGE_NS
+        seen, youngest, num, squares, behind, now, now_behind, num_now = _look_round(
+            points, shape, i, u0, v0, centre, agree, inner, witness_ns, m, reach
+        )
+        if points.age_ns[i] <= NOW_NS and not points.hidden[i] and _count(seen) < few:
+            m[:], reach[:] = 0.0, 0.0
+            now_ns = np.int64(NOW_NS)  # of the type of witness_ns, or this is compiled twice
+            seen, youngest, num, squares, behind, now, now_behind, num_now = _look_round(
+                points, shape, i, u0, v0, centre, agree, inner, now_ns, m, reach
+            )
+            found[6, p] = num_now
+        off, _, _ = plane(m[0], m[1], m[2], m[3], m[4], m[5], m[6], m[7], m[8], _RIDGE_PX2)
+        found[0, p] = 1 / (centre + min(max(off, -agree), agree))
+        found[1, p], found[2, p], found[3, p] = _count(seen), youngest, num
+        mean = m[6] / m[0]
+        found[4, p] = np.sqrt(max(squares / m[0] - mean * mean, 0.0)) / (w0 * w0)
+        found[5, p] = _ALL_ROUND
+        if behind and inner > 0:
+            found[5, p] = reach.min() / inner
+        alone = now > _ALONE
+        if now_behind < now:
+            found[5, p] = -1.0 if alone or now_behind < _CLEARLY * now else 0.0
+        elif alone and now_behind < np.inf:
+            found[5, p] = 0.0

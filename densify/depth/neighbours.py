@@ -1,0 +1,104 @@
+# SPDX-License-Identifier: MIT
+"""Known pixels around a pixel: the first one in sixteen directions, and the plane through them.
+
+A plane in space is linear in inverse depth over the image, so planes are fitted in inverse depth.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from densify.geometry.arrays import Bool
+from densify.geometry.compiled import Kernel, inlined
+
+NONE = 255
+"""Steps where there is no known pixel within 254."""
+_LEAST, _MOST = 0.7, 1.4  # of the inverse depth: how far a slope is followed
+
+
+def _directions() -> NDArray[np.int64]:
+    """(16,2,2) columns and rows: see `DIRECTIONS`."""
+    axis, diagonal = (1, 0), (1, 1)
+    quarter = [(axis, (2, 0)), (axis, (2, 1)), (diagonal, (2, 2)), ((0, 1), (1, 2))]
+    turn = np.array([[0, -1], [1, 0]])
+    table = [np.array(quarter) @ np.linalg.matrix_power(turn, k).T for k in range(4)]
+    return np.concatenate(table).astype(np.int64)
+
+
+DIRECTIONS = _directions()
+"""(16,2,2) (columns, rows) of the first step and of the first two together, clockwise from the
+right. Each step goes to one of the eight neighbours."""
+
+
+def first_known(known: Bool) -> NDArray[np.uint8]:
+    """(H,W) -> (16,H,W) steps to the first known pixel in each of `DIRECTIONS`, 0 at a known pixel
+    itself, `NONE` where there is none."""
+    padded = np.full((len(DIRECTIONS), known.shape[0] + 4, known.shape[1] + 4), NONE, np.uint8)
+    steps = padded[:, 2:-2, 2:-2]
+    steps[:] = np.where(known, np.uint8(0), np.uint8(NONE))
+    _march(padded)
+    return steps
+
+
+@Kernel
+def _march(steps):  # type: ignore[no-untyped-def]
+    """steps: (16,H,W), 0 where known, with a border of two pixels that stays as it is."""
+    height, width = steps.shape[1:]
+    for d in range(len(DIRECTIONS)):
+        u1, v1, u2, v2 = DIRECTIONS[d].ravel()
+        for i in range(2, height - 2):
+            row = height - 1 - i if v2 > 0 else i  # rows two steps on are done before
+            here = steps[d, row, 2 : width - 2]
+            if v2 == 0:
+                for j in range(len(here)):
+                    column = len(here) - 1 - j if u2 > 0 else j
+                    before = steps[d, row, 2 + column + u1]
+                    here[column] = 0 if here[column] == 0 else min(before, 254) + 1
+                continue
+            first = steps[d, row + v1, 2 + u1 : width - 2 + u1]
+            second = steps[d, row + v2, 2 + u2 : width - 2 + u2]
+            for j in range(len(here)):
+                beyond = min(second[j], np.uint8(253)) + np.uint8(2)
+                beyond = np.uint8(1) if first[j] == 0 else np.uint8(beyond)
+                here[j] = np.uint8(0) if here[j] == 0 else beyond
+
+
+@inlined
+def offset(d, k):  # type: ignore[no-untyped-def]
+    """Columns and rows after k steps in direction d."""
+    du = (k // 2) * DIRECTIONS[d, 1, 0] + (k % 2) * DIRECTIONS[d, 0, 0]
+    dv = (k // 2) * DIRECTIONS[d, 1, 1] + (k % 2) * DIRECTIONS[d, 0, 1]
+    return du, dv
+
+
+@inlined
+def extended(inverse, tilt, v, u, du, dv):  # type: ignore[no-untyped-def]
+    """Inverse depth of the surface in pixel (v, u), seen ``du`` columns and ``dv`` rows before it.
+
+    inverse: (H,W) 1/m. tilt: (H,W,2) slope of it, 1/m per px.
+    """
+    there = inverse[v, u]
+    here = there - tilt[v, u, 0] * du - tilt[v, u, 1] * dv
+    return min(max(here, _LEAST * there), _MOST * there)
+
+
+@inlined
+def slopes(uu, uv, vv, uw, vw):  # type: ignore[no-untyped-def]
+    """Slopes of the least-squares plane from centred second moments."""
+    determinant = uu * vv - uv * uv
+    return (vv * uw - uv * vw) / determinant, (uu * vw - uv * uw) / determinant
+
+
+@inlined
+def plane(n, u, v, uu, uv, vv, w, uw, vw, ridge):  # type: ignore[no-untyped-def]
+    """Inverse depth in the origin and both slopes of the weighted least-squares plane.
+
+    The arguments are sums over the pixels of the weight and of its products with columns u, rows v
+    and inverse depths w. ridge: px² added to both variances, so that pixels on one line do not tilt
+    the plane across it.
+    """
+    u, v, w = u / n, v / n, w / n
+    uu, vv, uv = uu / n - u * u + ridge, vv / n - v * v + ridge, uv / n - u * v
+    slope_u, slope_v = slopes(uu, uv, vv, uw / n - u * w, vw / n - v * w)
+    return w - slope_u * u - slope_v * v, slope_u, slope_v

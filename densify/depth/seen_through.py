@@ -1,0 +1,206 @@
+# SPDX-License-Identifier: MIT
+"""Pixels through whose surface more rays went than stopped at it: the gaps of a fence.
+
+The image alone cannot tell: what a scanner saw elsewhere behind a car shows on the car too. So
+every ray is followed to where it crosses the map's own surface, and counts there (free-space
+evidence as in occupancy grids: Thrun et al., "Probabilistic Robotics", 2005, ch. 9).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from densify.depth.exposure import Exposure, InView
+from densify.depth.image_points import HIDDEN_FRACTION, HIDDEN_M
+from densify.depth.layers import Layers
+from densify.depth.measured_pixels import NOW_NS
+from densify.geometry import poses
+from densify.geometry.types import Bool, Cloud, Float, Float32, Reason, Stretch
+
+_SHARE = 0.25  # of the rays that went through a pixel that is taken out
+_OF_FILLED = 0.5  # of that share, around a filled pixel
+_OF_KEY = 0.35  # share of the key sweep's rays, near moving objects
+_LEAST_RAYS, _LEAST_OF_KEY = 0.9, 0.3  # through a pixel itself, or more of them around it
+_GAPS, _GAPS_AROUND = 0.25, 0.7  # between rays, over which they count: standard deviation
+_LEAST_BLUR_PX = 1.0
+_MOVER_GAPS = 3.6  # between rays, around a moving object: others passed there before and after it
+_NUM_STEPS = 6
+_SAME_M, _SAME_FRACTION = 0.05, 0.01  # from one step to the next: the crossing is found
+
+
+@dataclass(frozen=True)
+class Rays:
+    """The rays of the sweeps of a window, for a key of it."""
+
+    stretch: Stretch
+    key: int
+
+    def starts(self, cloud: Cloud) -> Float:
+        """Return (M,3) key frame, where the ray of each point started when it was fired."""
+        starts = np.empty((len(cloud), 3))
+        for frame in np.unique(cloud.frame).tolist():
+            mine, registered = np.flatnonzero(cloud.frame == frame), self.stretch[frame]
+            sweep = registered.sweep
+            origin = np.stack([sweep.origin_m(n) for n in range(int(sweep.lidar.max()) + 1)])
+            start = origin[cloud.lidar[mine]]
+            if sweep.offset_ns is not None:
+                order = np.argsort(sweep.row, kind="stable")
+                found = order[np.searchsorted(sweep.row, cloud.row[mine], sorter=order)]
+                offset_s = sweep.offset_ns[found, None] * 1e-9
+                twist: Float = np.where(
+                    offset_s < 0, registered.twist_before, registered.twist_after
+                )
+                start = poses.transform_each(offset_s * twist, start)
+            starts[mine] = poses.transform(self.stretch.T_target_source(self.key, frame), start)
+        return starts
+
+
+def without_seen_through(
+    layers: Layers, cloud: Cloud, view: InView, rays: Rays, reason: NDArray[np.uint8]
+) -> Layers:
+    """Take out the pixels that rays went through.
+
+    view: of the cloud. reason: (M,) `Reason` of each point so far.
+
+    A ray of a hidden point went through where it crosses the surface of the map, clearly before its
+    end. A ray of another point stopped in its pixel. Both are blurred by a quarter of the gap
+    between rays; a pixel goes if a quarter of the rays went through. A filled pixel also goes if
+    an eighth did, blurred by 0.7 gaps, and no less in the pixel itself. Near moving objects, and
+    near what the key sweep alone saw, only the key's own rays count. Closed car windows stay.
+    """
+    counts = np.isin(cloud.frame, rays.stretch.frames)
+    counts &= (reason != Reason.OUTSIDE) & (reason != Reason.VETOED)
+    stopped = counts & (reason != Reason.HIDDEN)
+    passed = counts & ~stopped & ~cloud.moving
+    gap_px, shape = float(np.median(layers.gap_px)), layers.filled_m.shape
+    near_mover = _near_movers(layers, cloud, view, stopped, round(_MOVER_GAPS * gap_px))
+
+    def through(hits: Bool) -> Float:
+        """(K,2) px where rays of these points (M,) went through the map."""
+        if not hits.any():
+            return np.zeros((0, 2))
+        ends = cloud.select(hits)
+        return crossings(layers.filled_m, rays.starts(ends), ends.points, view.exposure)
+
+    by_all, ends_px = through(passed), view.uv[stopped[view.rows]]
+    here, around = (
+        _Passed.by(by_all, ends_px, (blur_px, blur_px), shape)
+        for blur_px in (max(_LEAST_BLUR_PX, wide * gap_px) for wide in (_GAPS, _GAPS_AROUND))
+    )
+    gaps = around.opens(_OF_FILLED * _SHARE) & (here.share >= around.share)
+    dropped = here.opens(_SHARE) | (gaps & (layers.depth_m == 0))
+    dropped &= ~near_mover
+    if near_mover.any():
+        now = counts & (np.abs(cloud.since_key_ns) <= NOW_NS)
+        column, row = np.rint(view.uv).astype(np.int64).T
+        near = np.zeros(len(cloud), bool)
+        near[view.rows] = near_mover[row, column]
+        across_px, down_px = np.median(layers.spacing_px, axis=(0, 1)).tolist()
+        blur_px = (_GAPS_AROUND * down_px, _GAPS_AROUND * across_px)
+        ends_px = view.uv[(stopped & now)[view.rows]]
+        of_key = _Passed.by(through(near & now), ends_px, blur_px, shape)
+        dropped |= of_key.opens(_OF_KEY, _LEAST_OF_KEY) & near_mover
+    if layers.window is not None:
+        dropped &= ~layers.window
+    return layers.without(dropped)
+
+
+class _Passed(NamedTuple):
+    """Rays through each pixel (H,W): their number, and their share of those that met it."""
+
+    num: Float32
+    share: Float32
+
+    @staticmethod
+    def by(
+        through: Float, stopped: Float, blur_px: tuple[float, float], shape: tuple[int, ...]
+    ) -> _Passed:
+        """through, stopped: (K,2) px. blur_px: down and across, standard deviation."""
+        num, num_stopped = (
+            _counts(uv, shape, blur_px) * (2 * np.pi * blur_px[0] * blur_px[1])
+            for uv in (through, stopped)
+        )
+        met = num + num_stopped
+        return _Passed(num, np.divide(num, met, out=np.zeros_like(met), where=met > 0))
+
+    def opens(self, share: float, least: float = _LEAST_RAYS) -> Bool:
+        """Return (H,W) True where more than ``share`` of the rays went through, and at least
+        ``least``."""
+        opened: Bool = (self.share > share) & (self.num >= least)
+        return opened
+
+
+def _near_movers(layers: Layers, cloud: Cloud, view: InView, seen: Bool, reach_px: int) -> Bool:
+    """Return (H,W) True within ``reach_px`` of moving points that are not hidden. seen: (M,)."""
+    moving = (seen & cloud.moving)[view.rows]
+    movers = _counts(view.uv[moving], layers.depth_m.shape) > 0
+    if layers.alone is not None:
+        movers |= layers.alone
+    near: Bool = ndimage.maximum_filter(movers, 2 * reach_px + 1)
+    return near
+
+
+def _counts(
+    uv: Float, shape: tuple[int, ...], blur_px: tuple[float, float] | None = None
+) -> Float32:
+    """Return (H,W) the number of places (K,2) px in each pixel, blurred out to 2.5 deviations."""
+    column, row = np.rint(uv).astype(np.int64).T
+    counts = np.bincount(row * shape[1] + column, minlength=shape[0] * shape[1])
+    pixels = counts.reshape(shape).astype(np.float32)
+    if blur_px is None:
+        return pixels
+    down_px, across_px = blur_px
+    size = (2 * round(2.5 * across_px) + 1, 2 * round(2.5 * down_px) + 1)
+    made = cv2.GaussianBlur(
+        pixels, size, sigmaX=across_px, sigmaY=down_px, borderType=cv2.BORDER_REFLECT
+    )
+    return made.astype(np.float32, copy=False)
+
+
+def crossings(surface_m: Float32, from_key: Float, to_key: Float, exposure: Exposure) -> Float:
+    """Return (P,2) px where rays from ``from_key`` to ``to_key`` (K,3), key frame, cross the
+    surface (H,W) clearly before they end.
+
+    The search starts from the ray's end: at the depth of the surface in its pixel the ray shows in
+    another pixel, and so on until the depth stays the same.
+    """
+    start = poses.transform(exposure.T_cam_key, from_key)
+    end = poses.transform(exposure.T_cam_key, to_key)
+    end_m, still = exposure.depth_m(end), np.zeros(to_key.shape, np.float32)
+    sight = exposure.see(to_key, still)
+    uv, good = sight.uv, sight.inside
+    depth_m = np.full(len(to_key), np.inf)
+    for _ in range(_NUM_STEPS):
+        column, row = np.rint(np.where(good[:, None], uv, 0)).astype(np.int64).T
+        there_m = surface_m[row, column].astype(np.float64)
+        with np.errstate(invalid="ignore"):
+            same = abs(there_m - depth_m) <= _SAME_M + _SAME_FRACTION * depth_m
+        depth_m = there_m
+        share = _share(start, end, depth_m, exposure.measure)
+        good &= (depth_m > 0) & (share > 0) & (share < 1)
+        share = np.where(good, share, 1.0)[:, None]
+        sight = exposure.see(from_key + share * (to_key - from_key), still)
+        uv, good = sight.uv, good & sight.inside
+    allowed_m = HIDDEN_M + HIDDEN_FRACTION * depth_m
+    crosses: Float = uv[good & same & (end_m - depth_m > allowed_m)]
+    return crosses
+
+
+def _share(start: Float, end: Float, depth_m: Float, measure: str) -> Float:
+    """Return (P,) the share of the ways from start to end (P,3), camera frame, at which they have
+    this depth; NaN: nowhere."""
+    way = end - start
+    with np.errstate(divide="ignore", invalid="ignore"):
+        if measure == "z":
+            share: Float = (depth_m - start[:, 2]) / way[:, 2]
+            return share
+        square, along = (way**2).sum(axis=1), (start * way).sum(axis=1)
+        within = along**2 - square * ((start**2).sum(axis=1) - depth_m**2)
+        share = (np.sqrt(within) - along) / square
+        return share
