@@ -13,7 +13,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from densify.config.errors import InputError
-from densify.depth.age import with_ages
+from densify.depth.views import with_ages
 from densify.geometry.types import Camera, CameraView, Cloud, DepthMap, Result, StageCost
 from densify.outputs import export_run, write_result
 from densify.pipeline.run import run

@@ -20,7 +20,7 @@ from densify.readers import open_sequence
 from densify.readers.point_fields import find_fields, radial_velocities
 from densify.readers.street import Street
 from densify.registration.deskew import placed, twists
-from densify.scores.radial_velocity import radial_velocity_scores
+from densify.scores.cloud_scores import radial_velocity_scores
 from tests.scenes import Arc, Scanner, Scene, World, by_flow, car, street
 from tests.small_street import one_car
 

@@ -11,7 +11,7 @@ import pytest
 
 from densify.free_space.range_image import RangeImage
 from densify.geometry.types import Cloud, RegisteredSweep, Sweep
-from densify.scores.ghosts import ghost_rate, ghost_scores
+from densify.scores.cloud_scores import ghost_rate, ghost_scores
 
 KEY = 7
 

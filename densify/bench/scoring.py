@@ -20,8 +20,7 @@ from densify.geometry.types import Bool, Float, FlowField, Int, LidarSequence, T
 from densify.readers.true_flow import LabelledFlow, labelled_flow
 from densify.scores import flow_metrics as metrics
 from densify.scores.challenge import CLASSES, ChallengeScorer
-from densify.scores.ghosts import ghost_rate
-from densify.scores.radial_velocity import radial_velocity_scores
+from densify.scores.cloud_scores import ghost_rate, radial_velocity_scores
 from densify.scores.segmentation import SegmentationScorer
 
 _MIN_RETURNS = 30
@@ -188,7 +187,7 @@ class Scorer:
     def window_scores(self, to_key: Mapping[int, FlowField]) -> dict[str, Any]:
         """Score the flow to the key, by frame. Accumulated movers, the key's own left out, are the
         true movers above the ground, without truth those that are called moving. radial_velocity:
-        what the flow leaves of measured velocities, see `densify.scores.radial_velocity`."""
+        what the flow leaves of measured velocities, see `densify.scores.cloud_scores`."""
         stretch, key = self.window.stretch, self.window.key
         cloud = accumulate(stretch, [to_key[f] for f in stretch.frames], key, drop_lost=True)
         others = self._others()

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """What is said of results and exports. Reads `Result.metrics`:
 
-- ``ghosts``: `densify.scores.ghosts.ghost_scores`;
+- ``ghosts``: `densify.scores.cloud_scores.ghost_scores`;
 - ``held_out``: camera -> the same for the key densified from its neighbours alone;
 - ``depth``: camera -> `densify.scores.depth_metrics.depth_scores`, where there is truth.
 """

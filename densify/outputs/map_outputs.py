@@ -27,7 +27,7 @@ def write_depth(result: Result, context: Context, folder: Path) -> None:
     """
     for camera, depth in result.depth.items():
         if depth.age_s is None:
-            raise ValueError(f"depth map of {camera}: expected ages, see densify.depth.age")
+            raise ValueError(f"depth map of {camera}: expected ages (with_ages)")
         write_depth_png(map_path(folder, "depth", camera), depth.depth_m)
         write_depth_png(map_path(folder, "depth_filled", camera), depth.filled_m)
         path = map_path(folder, "confidence", camera)

@@ -8,7 +8,8 @@ metrics.json. compare.json holds the fields from ``frames`` on, by method, under
     num_points  of the cloud; num_moving of those
     density     camera -> measured, filled: fraction of the pixels with a depth; with --prior also
                 full, and prior, the fraction that came from it
-    ghosts      `densify.scores.ghosts.ghost_scores`: num_points, all, moving, static, by_distance
+    ghosts      `densify.scores.cloud_scores.ghost_scores`: num_points, all, moving, static,
+                by_distance
     depth       where there is truth: camera -> measured, filled -> all, moving, static -> the
                 fields of `densify.scores.depth_metrics.DepthErrors`; with --prior also full, prior
     measure     map -> z, depth along the camera's axis, or range, distance from the lens

@@ -31,8 +31,7 @@ from densify.pipeline.costs import Watch
 from densify.pipeline.methods import METHODS
 from densify.pipeline.recording import Beyond, Moment
 from densify.scores import depth_metrics
-from densify.scores import ghosts as scores
-from densify.scores.radial_velocity import radial_velocity_scores
+from densify.scores.cloud_scores import ghost_scores, radial_velocity_scores
 
 Image = NDArray[np.uint8]
 
@@ -241,7 +240,7 @@ class _Shared:
                 }
                 for name, maps in depth.items()
             },
-            "ghosts": scores.ghost_scores(cloud, self.key_image, self.key.frame),
+            "ghosts": ghost_scores(cloud, self.key_image, self.key.frame),
         }
         radial = radial_velocity_scores(cloud, self.key.stretch[self.key.frame])
         if radial is not None:

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: MIT
-"""How good it is: depth maps, scene flow, ghosts, with and without truth."""
+"""Scores of depth maps, scene flow and clouds, with and without truth."""

@@ -1,18 +1,14 @@
 # SPDX-License-Identifier: MIT
-"""Scene flow scored as the Argoverse 2 scene flow challenges score it, over many pairs of sweeps.
+"""Scene flow as the Argoverse 2 scene flow challenges score it, over many pairs of sweeps.
 
-Within a square of 35 m on each side of the vehicle and without the ground, flow from a sweep to the
-next, ego-motion removed:
+Within 35 m on each side of the vehicle and without the ground, flow from a sweep to the next,
+ego-motion removed:
 
-- three-way end-point error (Chodosh, Ramanan, Lucey, "Re-Evaluating LiDAR Scene Flow", WACV 2024;
-  `av2.evaluation.scene_flow.eval` of the package av2): means over the points of objects that move
-  by 0.05 m a sweep or more, of objects that move less, and of the background that moves less;
-- bucket normalised error (Khatri et al., "I Can't Believe It's Not Scene Flow!", ECCV 2024;
-  `BucketedEPEEvaluator` of the package bucketed-scene-flow-eval, which adds frames up as here):
-  per class, points sorted by the length of their true flow into ``linspace(0, 2.0, 51)`` metres a
-  sweep and one bucket beyond. The first is static: its mean error, metres. In every other one the
-  mean error is divided by the mean length of the true flow; these quotients are averaged over the
-  buckets that hold points, and the classes' averages once more over the classes.
+- three-way end-point error (Chodosh, Ramanan, Lucey, WACV 2024; the package av2): means over points
+  of objects that move by 0.05 m a sweep or more, of other objects, and of static background;
+- bucket normalised error (Khatri et al., ECCV 2024; the package bucketed-scene-flow-eval): as
+  `densify.scores.flow_metrics.bucketed_error`, per class, by the length of the true flow in
+  ``linspace(0, 2.0, 51)`` metres a sweep, averaged over the classes.
 """
 
 from __future__ import annotations
@@ -38,8 +34,8 @@ EDGES_M = np.linspace(0, 2.0, 51)
 
 
 class ChallengeScores(NamedTuple):
-    """three_way: metres. by_class: of the classes that have points. mean: over these; where none
-    has a point that stands or moves, NaN. num_points: that were scored."""
+    """three_way: metres. by_class: of the classes that have points. mean: over these. num_points:
+    that were scored."""
 
     three_way: ThreeWayError
     by_class: dict[str, BucketedError]
@@ -49,7 +45,7 @@ class ChallengeScores(NamedTuple):
 
 @dataclass
 class ChallengeScorer:
-    """Adds up pairs of sweeps. within_m: half a side of the square that counts; inf for all."""
+    """Sums over pairs of sweeps. within_m: half a side of the square that counts."""
 
     within_m: float = WITHIN_M
     _three_way: Float = field(default_factory=lambda: np.zeros((3, 2)), repr=False)
@@ -60,11 +56,10 @@ class ChallengeScorer:
     def add(
         self, points: ArrayLike, estimated: ArrayLike, true: ArrayLike, classes: ArrayLike
     ) -> None:
-        """Count one pair. Leave out before what has no label, and the ground.
+        """Add one pair, without unlabelled points and the ground.
 
-        points: (N,3) metres, vehicle frame. estimated, true: (N,3) metres to the next sweep,
-        ego-motion removed. classes: (N,) indices in `CLASSES`, or `IGNORED`. Raises InputError
-        where these do not fit each other.
+        points: (N,3) metres, vehicle frame. estimated, true: (N,3) metres to the next sweep.
+        classes: (N,) indices in `CLASSES`, or `IGNORED`. Raises InputError if these do not fit.
         """
         error_m = end_point_errors(estimated, true)
         length_m = np.linalg.norm(np.asarray(true, np.float64), axis=1)
@@ -82,7 +77,7 @@ class ChallengeScorer:
             self._buckets[row] += sums.reshape(self._buckets[row].shape)
 
     def scores(self) -> ChallengeScores:
-        """Those of all pairs together; NaN for what has no points."""
+        """Return the scores of all pairs together; NaN over no points."""
         dynamic_m, static_m, background_m = (_ratio(e, num) for e, num in self._three_way)
         mean_m = (dynamic_m + static_m + background_m) / 3
         three_way = ThreeWayError(dynamic_m, static_m, background_m, mean_m)
@@ -94,15 +89,9 @@ class ChallengeScorer:
                 filled = num[1:] > 0
                 quotients = error_m[1:][filled] / length_m[1:][filled]
                 by_class[name] = BucketedError(_ratio(error_m[0], num[0]), _mean(quotients))
-        static, dynamic = (
-            np.array([getattr(b, kind) for b in by_class.values()])
-            for kind in ("static_m", "dynamic")
-        )
-        mean = BucketedError(
-            _mean(static[np.isfinite(static)]), _mean(dynamic[np.isfinite(dynamic)])
-        )
-        num_points = int(self._buckets[0].sum())
-        return ChallengeScores(three_way, by_class, mean, num_points)
+        columns = np.array([*by_class.values()]).reshape(-1, 2).T
+        mean = BucketedError(*(_mean(column[np.isfinite(column)]) for column in columns))
+        return ChallengeScores(three_way, by_class, mean, int(self._buckets[0].sum()))
 
 
 def _checked(points: ArrayLike, classes: ArrayLike, num: int) -> tuple[Float, NDArray[np.intp]]:

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""How good depth is against the truth: numbers of pixel lists or whole maps.
+"""Depth against truth, of lists of pixels or whole maps.
 
 Definitions are those of KITTI's depth development kit (``evaluate_depth.cpp``; Uhrig et al.,
-"Sparsity Invariant CNNs", 3DV 2017) where it has them, with one difference: the kit fills holes of
-a prediction before it scores, here a missing pixel costs coverage and is no error.
+"Sparsity Invariant CNNs", 3DV 2017), except that the kit fills holes of a prediction before it
+scores; here a missing pixel costs coverage and is no error.
 """
 
 from __future__ import annotations
@@ -30,20 +30,14 @@ _LEAST_CONFIDENCES = tuple(round(0.05 * step, 2) for step in range(20))
 
 @dataclass(frozen=True)
 class DepthErrors:
-    """Depth against truth; what is undefined (an error over no pixels) is None, never NaN.
+    """Errors of depth; an error over no pixels is None.
 
-    num_pixels: with a truth. num_compared: of those, with a predicted depth too; all the errors are
-    over these. coverage: num_compared / num_pixels.
-
-    With z the predicted and t the true depth, from the kit: mae_m, rmse_m: mean absolute and root
-    mean square of z - t (its web table shows mm); imae_per_km, irmse_per_km: the same of
-    1/z - 1/t, in 1/km; abs_rel: mean of |z - t| / t; sq_rel: mean of (z - t)² / t² (others divide
-    by t once).
-
-    delta_1, delta_2, delta_3: fraction with max(z/t, t/z) < 1.25, 1.25², 1.25³ (Eigen et al.,
-    "Depth Map Prediction from a Single Image using a Multi-Scale Deep Network", NIPS 2014).
-    outliers: fraction that is wrong by the rule of KITTI's 2015 stereo benchmark (Menze and Geiger,
-    "Object Scene Flow for Autonomous Vehicles", CVPR 2015). Fractions are 0 to 1.
+    num_pixels: with a truth. num_compared: of those, with a predicted depth; the errors are over
+    these. coverage: num_compared / num_pixels. With z the predicted and t the true depth: mae_m,
+    rmse_m of z - t; imae_per_km, irmse_per_km of 1/z - 1/t; abs_rel: mean of |z - t| / t; sq_rel:
+    mean of (z - t)² / t². delta_1, delta_2, delta_3: fraction with max(z/t, t/z) < 1.25, 1.25²,
+    1.25³ (Eigen et al., NIPS 2014). outliers: fraction that is wrong by the rule of KITTI's 2015
+    stereo benchmark (Menze and Geiger, "Object Scene Flow for Autonomous Vehicles", CVPR 2015).
     """
 
     num_pixels: int
@@ -69,12 +63,11 @@ def depth_errors(
     focal_px: float,
     baseline_m: float = KITTI_BASELINE_M,
 ) -> DepthErrors:
-    """Errors of depths where truth exists and ``mask`` (all if None) is True.
+    """Return the errors of depths where truth exists and ``mask`` (all if None) is True.
 
     predicted_m, truth_m: camera z in metres, 0 none; maps (H,W) or lists of pixels (N,). A depth is
-    an outlier when its disparity d = focal_px · baseline_m / z is off by more than 3 px *and* by
-    more than 5 % of the true one. ``focal_px`` is the camera's fx; the default baseline is KITTI's,
-    so that numbers compare. Raises InputError if the shapes differ.
+    an outlier if its disparity focal_px · baseline_m / z is off by more than 3 px *and* by more
+    than 5 % of the true one. focal_px: the camera's fx. Raises InputError if the shapes differ.
     """
     _check_shapes(predicted_m, truth=truth_m, mask=mask)
     known = truth_m > 0 if mask is None else (truth_m > 0) & mask
@@ -104,9 +97,9 @@ def depth_errors(
 def precision_density(
     maps: DepthMap, truth_m: Float32, camera: Camera
 ) -> list[dict[str, float | None]]:
-    """What a least confidence buys: for each of 0, 0.05, … 0.95 the fraction of all pixels that
-    keep a depth (``density``), and of those with a truth the fraction that is wrong
-    (``outliers``), for ``measured`` and ``filled`` depth."""
+    """Return for each least confidence 0, 0.05, … 0.95 the fraction of all pixels that keep a depth
+    (``density``), and the fraction of those with a truth that is wrong (``outliers``), for
+    ``measured`` and ``filled`` depth."""
     curve = []
     for least in _LEAST_CONFIDENCES:
         kept = maps.confidence >= least
@@ -128,12 +121,9 @@ def errors_by_part(
     focal_px: float,
     baseline_m: float = KITTI_BASELINE_M,
 ) -> dict[str, DepthErrors]:
-    """`depth_errors` of ``all`` pixels, by true depth (``0-10 m`` … ``over 80 m``, the nearer end
-    included), on `depth_edges` (``edge``) and off them (``not edge``), and, with a mask of what
-    moves, ``moving`` and ``static``.
-
-    predicted_m, truth_m: (H,W) metres, 0 none. moving: (H,W). Raises InputError if shapes differ.
-    """
+    """Return `depth_errors` of ``all`` pixels, by true depth (``0-10 m`` … ``over 80 m``), on
+    `depth_edges` (``edge``) and off them (``not edge``), and, with a mask of moving pixels (H,W),
+    of ``moving`` and ``static`` ones. Raises InputError if shapes differ."""
     _check_shapes(predicted_m, truth=truth_m, mask=moving)
     known = truth_m > 0
     z, t = predicted_m[known], truth_m[known]
@@ -152,11 +142,11 @@ def errors_by_part(
 
 
 def depth_edges(truth_m: Float32, *, focal_px: float, baseline_m: float = KITTI_BASELINE_M) -> Bool:
-    """(H,W) bool: pixels where depth jumps, by no knob but the outlier rule: with a true depth
-    within 3 px (a 7 × 7 window) that would be an outlier if it stood here.
+    """Return (H,W) True where depth jumps: within 3 px there is a true depth that would be an
+    outlier here.
 
-    truth_m: (H,W) metres, 0 none; never True where there is none. The ground is no edge: seen from
-    1.65 m up, its disparity grows by 0.54/1.65 px from row to row.
+    truth_m: (H,W) metres, 0 none. The ground is no edge: seen from 1.65 m up, its disparity grows
+    by 0.54/1.65 px from row to row.
     """
     known = truth_m > 0
     disparity_px = np.zeros(truth_m.shape)
@@ -172,8 +162,8 @@ def depth_edges(truth_m: Float32, *, focal_px: float, baseline_m: float = KITTI_
 
 
 def mean_errors(images: Sequence[DepthErrors]) -> DepthErrors:
-    """Average several images: the mean of each image's value, as the kit has it, over the images
-    where it is defined, whatever their number of pixels; counts are added up."""
+    """Return the mean of each image's values, over the images where they are defined; counts are
+    added up."""
     means: dict[str, Any] = {}
     for field in fields(DepthErrors):
         values = [value for image in images if (value := getattr(image, field.name)) is not None]
@@ -183,19 +173,15 @@ def mean_errors(images: Sequence[DepthErrors]) -> DepthErrors:
 
 
 def image_density(depth_m: Float32) -> float:
-    """Fraction (0 to 1) of all the image's pixels that have a depth."""
+    """Return the fraction (0 to 1) of the image's pixels that have a depth."""
     return float(np.mean(depth_m > 0)) if depth_m.size else 0.0
 
 
 def depth_scores(
     depth: DepthMap, truth_depth_m: Float32, moving_mask: Bool, camera: Camera
 ) -> dict[str, dict[str, dict[str, Any]]]:
-    """`depth_errors` as ``scores["measured"|"filled"]["all"|"moving"|"static"]``, plain numbers
-    ready for JSON.
-
-    truth_depth_m: (H,W) metres, 0 none. moving_mask: (H,W), True where a moving thing shows.
-    Measured and filled stay apart: a filled pixel costs little and says less.
-    """
+    """Return `depth_errors` as ``scores["measured"|"filled"]["all"|"moving"|"static"]``, plain
+    numbers. truth_depth_m: (H,W) metres, 0 none. moving_mask: (H,W)."""
     return {
         product: scores_by_motion(image, truth_depth_m, moving_mask, camera)
         for product, image in (("measured", depth.depth_m), ("filled", depth.filled_m))
@@ -205,8 +191,7 @@ def depth_scores(
 def scores_by_motion(
     depth_m: Float32, truth_depth_m: Float32, moving_mask: Bool, camera: Camera
 ) -> dict[str, dict[str, Any]]:
-    """`depth_errors` of one image as ``scores["all"|"moving"|"static"]``; the rest as
-    `depth_scores`."""
+    """Return `depth_errors` of one image as ``scores["all"|"moving"|"static"]``."""
     masks = {"all": None, "moving": moving_mask, "static": ~moving_mask}
     return {
         part: asdict(depth_errors(depth_m, truth_depth_m, mask, focal_px=camera.focal_px))
@@ -220,7 +205,7 @@ def is_outlier_depth(
     focal_px: float,
     baseline_m: float = KITTI_BASELINE_M,
 ) -> Bool:
-    """(N,) True where a depth is wrong by KITTI's rule, see `DepthErrors`. Both: (N,) above 0."""
+    """Return (N,) True where a depth (N,) above 0 is wrong by KITTI's rule."""
     disparity_m_px = focal_px * baseline_m
     predicted_px = disparity_m_px / predicted_m.astype(np.float64)
     return _is_outlier(predicted_px, disparity_m_px / truth_m.astype(np.float64))

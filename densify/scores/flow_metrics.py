@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""How good a scene flow is: every metric with its definition, unit and source.
+"""Metrics of scene flow, each with its definition, unit and source.
 
 Flow is (N,3) metres from one time to another, ego-motion removed; masks are (N,) bool. A mean over
-nothing is NaN, never an error. Functions raise InputError where shapes do not fit.
+nothing is NaN. Functions raise InputError where shapes do not fit.
 """
 
 from __future__ import annotations
@@ -35,32 +35,31 @@ class ThreeWayError(NamedTuple):
 
 
 class BucketedError(NamedTuple):
-    """static_m: metres. dynamic: error as a part of the speed; 1 is what doing nothing earns."""
+    """static_m: metres. dynamic: error as a part of the speed; zero flow has 1."""
 
     static_m: float
     dynamic: float
 
 
 def end_point_errors(estimated: ArrayLike, true: ArrayLike) -> Float:
-    """(N,) metres: the length of what the estimate is off by at each point."""
+    """Return (N,) metres, the length of the error at each point."""
     flow, truth = _flows(estimated, true)
     return np.linalg.norm(flow - truth, axis=1)
 
 
 def end_point_error(estimated: ArrayLike, true: ArrayLike, mask: ArrayLike | None = None) -> float:
-    """EPE, metres: the mean of `end_point_errors`, over ``mask`` if given (Liu, Qi, Guibas,
+    """Return EPE, metres: the mean of `end_point_errors`, over ``mask`` if given (Liu, Qi, Guibas,
     "FlowNet3D", CVPR 2019)."""
     error_m = end_point_errors(estimated, true)
     return _mean(error_m if mask is None else error_m[_mask(mask, len(error_m), "mask")])
 
 
 def accuracy(estimated: ArrayLike, true: ArrayLike, limit: float) -> float:
-    """Share (0 to 1) of the points whose error is below ``limit`` metres *or* below ``limit`` times
-    the length of the true flow.
+    """Return the share (0 to 1) of the points with an error below ``limit`` metres *or* below
+    ``limit`` times the length of the true flow.
 
-    limit: `STRICT` (0.05 m or 5 %) or `RELAXED` (0.1 m or 10 %), as FlowNet3D (CVPR 2019),
-    HPLFlowNet (Gu et al., CVPR 2019) and PointPWC-Net (Wu et al., ECCV 2020) count; Pontes et al.
-    (3DV 2020) and av2's ``compute_accuracy`` do the same.
+    limit: `STRICT` (0.05 m or 5 %) or `RELAXED` (0.1 m or 10 %), as FlowNet3D (CVPR 2019) and
+    Pontes et al. (3DV 2020) count.
     """
     flow, truth = _flows(estimated, true)
     error_m = np.linalg.norm(flow - truth, axis=1)
@@ -68,11 +67,8 @@ def accuracy(estimated: ArrayLike, true: ArrayLike, limit: float) -> float:
 
 
 def angle_error_rad(estimated: ArrayLike, true: ArrayLike) -> float:
-    """Mean angle between the estimated and the true flow, radians (Pontes et al., 3DV 2020).
-
-    Over the points whose true flow is not 0, since 0 has no direction; an estimate of 0 there
-    counts as a right angle.
-    """
+    """Return the mean angle between the estimated and the true flow, radians (Pontes et al., 3DV
+    2020), over the points whose true flow is not 0; an estimate of 0 counts as a right angle."""
     flow, truth = _flows(estimated, true)
     moves = np.linalg.norm(truth, axis=1) > 0
     return _mean(_angles_rad(flow[moves], truth[moves]))
@@ -81,10 +77,10 @@ def angle_error_rad(estimated: ArrayLike, true: ArrayLike) -> float:
 def space_time_angle_error_rad(
     estimated: ArrayLike, true: ArrayLike, duration_s: ArrayLike
 ) -> float:
-    """Mean angle between (flow, duration_s) and (true flow, duration_s), radians: defined where
-    nothing moves too. duration_s: of the flow, one or (N,). As ``compute_angle_error`` of the
-    Argoverse 2 API (av2.evaluation.scene_flow) has it, where the fourth component is 0.1 s: one
-    second weighs as much as one metre.
+    """Return the mean angle between (flow, duration_s) and (true flow, duration_s), radians.
+
+    duration_s: of the flow, one or (N,). One second weighs as much as one metre, as in
+    ``compute_angle_error`` of the Argoverse 2 API (av2.evaluation.scene_flow).
     """
     flow, truth = _flows(estimated, true)
     time = _durations_s(duration_s, len(flow))[:, None]
@@ -94,42 +90,38 @@ def space_time_angle_error_rad(
 def three_way_error(
     estimated: ArrayLike, true: ArrayLike, moving: ArrayLike, foreground: ArrayLike
 ) -> ThreeWayError:
-    """Mean end-point error of what moves, of objects that stand, and of the rest of the world
+    """Return the mean end-point error of moving objects, static objects and static background
     (Chodosh, Ramanan, Lucey, "Re-Evaluating LiDAR Scene Flow", WACV 2024).
 
-    moving: truly moves. foreground: belongs to an object that could. Their mean keeps the many
-    points of the background from hiding the few that matter. A moving background point counts
-    nowhere.
+    moving: (N,). foreground: (N,) belongs to an object that could move. A moving background point
+    counts nowhere.
     """
     error_m = end_point_errors(estimated, true)
-    moves, objects = (
-        _mask(m, len(error_m), name) for m, name in ((moving, "moving"), (foreground, "foreground"))
-    )
+    moves = _mask(moving, len(error_m), "moving")
+    objects = _mask(foreground, len(error_m), "foreground")
     parts = [_mean(error_m[m]) for m in (objects & moves, objects & ~moves, ~objects & ~moves)]
     return ThreeWayError(parts[0], parts[1], parts[2], sum(parts) / 3)
 
 
 def dynamic_iou(estimated_moving: ArrayLike, moving: ArrayLike) -> float:
-    """Points rightly called moving over those that move or are called so, 0 to 1 (intersection over
-    union; from the counts of av2.evaluation.scene_flow). NaN where neither finds any."""
+    """Return the intersection over union (0 to 1) of estimated and truly moving points."""
     found, true = _two_masks(estimated_moving, moving)
     return _ratio((found & true).sum(), (found | true).sum())
 
 
 def share_found(estimated_moving: ArrayLike, moving: ArrayLike) -> float:
-    """Share (0 to 1) of the points of ``moving`` that are called moving (recall)."""
+    """Return the recall (0 to 1): the share of the moving points that are called moving."""
     found, true = _two_masks(estimated_moving, moving)
     return _ratio((found & true).sum(), true.sum())
 
 
 def bucketed_error(estimated: ArrayLike, true: ArrayLike, duration_s: ArrayLike) -> BucketedError:
-    """Bucket normalised end-point error of one class of points (Khatri et al., "I Can't Believe
-    It's Not Scene Flow!", ECCV 2024; buckets as in their BucketedSceneFlowEval).
+    """Return the bucket normalised end-point error of one class of points (Khatri et al., "I Can't
+    Believe It's Not Scene Flow!", ECCV 2024).
 
     Points are sorted by true speed into buckets of 0.4 m/s up to 20 m/s and one beyond. The first
     is static: its mean error, metres. In every other one the mean error is divided by the mean
-    length of the true flow, and those quotients are averaged over the buckets that hold points, so
-    a walker's weigh as much as a car's. For several classes take the mean over the classes.
+    length of the true flow, and the quotients are averaged over the buckets that hold points.
     duration_s: of the flow, one or (N,).
     """
     flow, truth = _flows(estimated, true)
@@ -146,8 +138,8 @@ def bucketed_error(estimated: ArrayLike, true: ArrayLike, duration_s: ArrayLike)
 
 
 def errors_by_hops(estimated: ArrayLike, true: ArrayLike, hops: ArrayLike) -> dict[int, float]:
-    """Mean end-point error, metres, of the points that lie so many sweeps from the target, by that
-    number: how much error a chain of steps gathers. hops: (N,) whole numbers."""
+    """Return the mean end-point error, metres, by the number of sweeps between a point and the
+    target. hops: (N,) whole numbers."""
     error_m = end_point_errors(estimated, true)
     steps: Int = np.asarray(hops)
     if steps.shape != error_m.shape or steps.dtype.kind not in "iu":
@@ -159,15 +151,14 @@ def errors_by_hops(estimated: ArrayLike, true: ArrayLike, hops: ArrayLike) -> di
 
 
 def plane_residual_m(points: ArrayLike, radius_m: float = 0.3) -> float:
-    """Thickness of accumulated surfaces, metres: mean over points of the standard deviation, across
-    the best plane, of all points within ``radius_m``.
+    """Return the thickness of accumulated surfaces, metres: the mean over points of the standard
+    deviation, across the best plane, of all points within ``radius_m``.
 
-    points: (M,3) of moving objects brought to one moment. Edges and curvature add to it, the same
-    for every flow of the same objects; it is to be read together with `coverage`, since points
-    drawn onto a few lines look thin. A larger radius adds more curvature. Patches of fewer than 8
-    points say nothing; at most 3,000 patches are looked at, evenly over the rows. (The smallest
-    eigenvalue of the local covariance; Hoppe et al., "Surface reconstruction from unorganized
-    points", SIGGRAPH 1992, section 3.)
+    points: (M,3) of moving objects brought to one time. Edges and curvature add to it, the same for
+    every flow of the same objects. Points drawn onto a few lines look thin: read it together with
+    `coverage`. Patches of fewer than 8 points are left out; at most 3,000 are looked at. (The
+    smallest eigenvalue of the local covariance; Hoppe et al., "Surface reconstruction from
+    unorganized points", SIGGRAPH 1992.)
     """
     cloud = _points(points, "points")
     if not len(cloud):
@@ -183,30 +174,24 @@ def plane_residual_m(points: ArrayLike, radius_m: float = 0.3) -> float:
 
 
 def extent_m2(points: ArrayLike, cell_m: float = 0.1) -> float:
-    """How much surface accumulated points occupy, square metres: occupied cells of a grid, times
-    ``cell_m`` squared. Needs no truth; drawing points onto scan lines lowers it, noise and wrong
-    motion raise it, so read it together with `plane_residual_m`."""
+    """Return the surface that accumulated points occupy, square metres: occupied cells of a grid
+    times ``cell_m`` squared. Points drawn onto scan lines lower it, wrong motion raises it."""
     cells = np.unique(np.floor(_points(points, "points") / cell_m), axis=0)
     return len(cells) * cell_m**2
 
 
 def coverage(points: ArrayLike, true_points: ArrayLike, reach_m: float = 0.1) -> float:
-    """Share (0 to 1) of the true accumulated points that have an estimated one within ``reach_m``:
-    low where the flow is wrong, and where it draws points onto scan lines.
-
-    points: (M,3), true_points: (K,3), metres, one frame. A larger reach forgives more.
-    """
+    """Return the share (0 to 1) of the true accumulated points (K,3) that have an estimated one of
+    (M,3) within ``reach_m``, metres, one frame."""
     cloud, truth = _points(points, "points"), _points(true_points, "true_points")
-    if not len(truth):
-        return float("nan")
-    if not len(cloud):
-        return 0.0
+    if not len(truth) or not len(cloud):
+        return 0.0 if len(truth) else float("nan")
     distance_m, _ = cKDTree(cloud).query(truth, distance_upper_bound=reach_m)
     return _mean(np.isfinite(distance_m))
 
 
 def _angles_rad(a: Float, b: Float) -> Float:
-    """(N,) between the rows of two (N,D) arrays; a right angle where one of them is 0."""
+    """Return (N,) angles between the rows (N,D); a right angle where one of them is 0."""
     lengths = np.linalg.norm(a, axis=1) * np.linalg.norm(b, axis=1)
     dot = np.einsum("nd,nd->n", a, b)
     cosine = np.divide(dot, lengths, out=np.zeros(len(a)), where=lengths > 0)

@@ -1,15 +1,12 @@
 # SPDX-License-Identifier: MIT
-"""Motion segmentation scored over many sweeps: which points move, and which of them are one object.
+"""Motion segmentation over many sweeps: which points move, and which of them are one object.
 
-- intersection over union of the moving points (`densify.scores.flow_metrics.dynamic_iou`), all
-  sweeps together;
+- intersection over union of the moving points, all sweeps together;
 - panoptic quality of the moving objects (Kirillov et al., "Panoptic Segmentation", CVPR 2019): an
-  estimated and a true object are the same if the intersection of their points is more than half of
-  the union, which no second one can be. PQ = Σ IoU of those / (found + (missed + false) / 2), the
-  product of recognition quality, found / (found + (missed + false) / 2), and segmentation quality,
-  the mean IoU of those found. Objects of fewer than 50 points count nowhere, neither as found nor
-  as missed or false (SemanticKITTI, Behley et al., ICRA 2021, has the same 50, and counts those
-  found).
+  estimated and a true object are the same if the IoU of their points is above half. PQ = Σ IoU of
+  those / (found + (missed + false) / 2), the product of recognition quality, found / (found +
+  (missed + false) / 2), and segmentation quality, the mean IoU of those found. Objects of fewer
+  than 50 points count nowhere (SemanticKITTI, Behley et al., ICRA 2021, has the same 50).
 """
 
 from __future__ import annotations
@@ -28,8 +25,7 @@ LEAST_POINTS = 50
 
 @dataclass
 class SegmentationScorer:
-    """Sums over sweeps. least_points: of an object that counts; more forgives what is small or
-    far."""
+    """Sums over sweeps. least_points: of an object that counts."""
 
     least_points: int = LEAST_POINTS
     _num_both: int = 0
@@ -40,9 +36,8 @@ class SegmentationScorer:
     _sum_iou: float = 0.0
 
     def add(self, estimated: ArrayLike, true: ArrayLike) -> None:
-        """One sweep. estimated, true: (N,) whole numbers, which moving object each point belongs
-        to, -1 for what stands; the numbers of the two need not agree. Raises InputError for other
-        shapes or types."""
+        """Add one sweep. estimated, true: (N,) whole numbers of the moving object of each point, -1
+        static; the numbers of the two need not agree. Raises InputError for other types."""
         found, real = _labels(estimated, "estimated"), _labels(true, "true")
         if found.shape != real.shape:
             raise InputError(
@@ -66,8 +61,7 @@ class SegmentationScorer:
         self._num_missed += int((large & ~same.any(axis=0)).sum())
 
     def scores(self) -> dict[str, Any]:
-        """``moving_iou``, ``panoptic_quality``, ``recognition``, ``segmentation`` (0 to 1, None of
-        nothing), ``num_found``, ``num_missed``, ``num_false``."""
+        """Return all scores, 0 to 1 or None of nothing, and the numbers of objects."""
         counted = self._num_found + (self._num_missed + self._num_false) / 2
         return {
             "moving_iou": _ratio(self._num_both, self._num_either),
@@ -81,7 +75,7 @@ class SegmentationScorer:
 
 
 def _labels(values: ArrayLike, name: str) -> Int:
-    """(N,) numbered anew from 0, so that they are as few as there are objects; -1 stays."""
+    """Return the labels (N,) numbered anew from 0; -1 stays."""
     labels = np.asarray(values)
     if labels.ndim != 1 or labels.dtype.kind not in "iu":
         raise InputError(

@@ -1,0 +1,106 @@
+# SPDX-License-Identifier: MIT
+"""Scores of an accumulated cloud without truth: its ghosts, and measured radial velocities.
+
+Every ``*_scores`` dictionary holds plain numbers ready for JSON; what is undefined is None.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from densify.free_space.range_image import RangeImage
+from densify.geometry.types import Bool, Cloud, RegisteredSweep
+
+_GHOST_MARGIN_M, _GHOST_MARGIN_FRACTION, _MIN_FILLED = 0.5, 0.02, 6
+_LEAST_M_S = 0.5
+
+
+def ghosts(cloud: Cloud, key_image: RangeImage, key: int) -> Bool:
+    """Return (M,) True for points of other sweeps of the window that the key sweep saw through.
+
+    A ghost lies in front of all that the key sweep measured in its direction and in the eight
+    around, by more than max(0.5 m, 2 % of its range); six of the nine must have a return.
+    """
+    ghost = np.zeros(len(cloud), bool)
+    other = np.flatnonzero(_others(cloud, key))
+    points, velocity_m_s = cloud.points[other], cloud.velocity_m_s[other]
+    ghost[other] = key_image.sees_through(
+        points, _GHOST_MARGIN_M, _GHOST_MARGIN_FRACTION, _MIN_FILLED, velocity_m_s
+    )
+    return ghost
+
+
+def ghost_rate(cloud: Cloud, key_image: RangeImage, key: int) -> float | None:
+    """Return the fraction of the other sweeps' points in the window that are `ghosts`."""
+    return _mean(ghosts(cloud, key_image, key)[_others(cloud, key)])
+
+
+def ghost_scores(cloud: Cloud, key_image: RangeImage, key: int) -> dict[str, Any]:
+    """Return the rate of `ghosts` among the ``num_points`` of other sweeps of the window.
+
+    It is given for ``all``, for ``moving`` and ``static`` points, by distance from the key in
+    frames (``by_distance["3"]``), and in seconds to 10 ms (``by_seconds["0.30"]``).
+    """
+    other = np.flatnonzero(_others(cloud, key))
+    ghost, moving = ghosts(cloud, key_image, key)[other], cloud.moving[other]
+    distance = np.abs(cloud.frame[other] - key)
+    hundredths = np.rint(np.abs(cloud.since_key_ns[other]) / 1e7).astype(np.int64)
+    return {
+        "num_points": len(other),
+        "all": _mean(ghost),
+        "moving": _mean(ghost[moving]),
+        "static": _mean(ghost[~moving]),
+        "by_distance": {str(steps): rate for steps, rate in _rates(ghost, distance).items()},
+        "by_seconds": {f"{h / 100:.2f}": rate for h, rate in _rates(ghost, hundredths).items()},
+    }
+
+
+def radial_velocity_scores(cloud: Cloud, registered: RegisteredSweep) -> dict[str, Any] | None:
+    """Compare the velocities of a key's own points with its measured radial velocities (FMCW
+    lidars); None where none were measured.
+
+    cloud: at the key's reference time, in its frame. registered: the key's sweep. Returns
+    ``num_points`` with a velocity; ``num_moving`` that move by the flow or by more than 0.5 m/s
+    along their rays; over these ``rms_m_s`` of measured minus estimated, ``rms_standing_m_s`` if
+    nothing moved, and ``unexplained``, the share that is off by more than 0.5 m/s.
+    """
+    sweep = registered.sweep
+    if sweep.radial_velocity_m_s is None:
+        return None
+    own = np.flatnonzero((cloud.frame == sweep.frame) & ~cloud.far)
+    order = np.argsort(sweep.row)
+    at = order[np.searchsorted(sweep.row, cloud.row[own], sorter=order)]
+    measured = sweep.radial_velocity_m_s[at].astype(np.float64)
+    estimated = np.einsum("ni,ni->n", registered.rays()[0][at], cloud.velocity_m_s[own])
+    known = np.isfinite(measured)
+    moving = known & (cloud.moving[own] | (np.abs(measured) > _LEAST_M_S))
+    off_m_s = np.abs(measured - estimated)[moving]
+    return {
+        "num_points": int(known.sum()),
+        "num_moving": int(moving.sum()),
+        "rms_m_s": _rms(off_m_s),
+        "rms_standing_m_s": _rms(measured[moving]),
+        "unexplained": _mean(off_m_s > _LEAST_M_S),
+    }
+
+
+def _others(cloud: Cloud, key: int) -> Bool:
+    """Return (M,) True for points of the window that are not from the key sweep."""
+    return (cloud.frame != key) & ~cloud.far
+
+
+def _rates(ghost: Bool, group: NDArray[np.integer]) -> dict[int, float]:
+    """Return the share of ghosts in every group (N,) that has points, ascending."""
+    num, num_ghosts = np.bincount(group), np.bincount(group, ghost)
+    return {g: float(num_ghosts[g] / num[g]) for g in np.flatnonzero(num).tolist()}
+
+
+def _mean(values: np.ndarray) -> float | None:
+    return float(np.mean(values)) if len(values) else None
+
+
+def _rms(values: np.ndarray) -> float | None:
+    return float(np.sqrt(np.mean(values**2))) if len(values) else None
