@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: MIT
-"""Sweeps in files of columns that nobody described: what the columns mean is told by their names,
-by the values of the first sweep that can be read, and by what is known already."""
+"""Sweeps in files of columns that nobody described. The meaning of columns is found by their names,
+by the values of the first sweep that can be read, and by what densify.yaml says."""
 
 from __future__ import annotations
 
@@ -48,8 +48,8 @@ class Period(NamedTuple):
 
 @dataclass(frozen=True)
 class Layout:
-    """What the columns of all sweeps mean. times: None where none tells them. time_words: what was
-    found of times. unused: columns that play no part, with their ranges."""
+    """The meaning of the columns of all sweeps. times: None where no column tells them. time_words:
+    what was found of times. unused: columns that play no part, with their ranges."""
 
     fields: Fields
     times: PointTimes | None
@@ -60,28 +60,28 @@ class Layout:
 
 @dataclass(frozen=True)
 class SweepColumns:
-    """series: the files. settings: what is known already; config: the file that says so."""
+    """series: the files. settings: what densify.yaml says; config: its path."""
 
     series: Series
     settings: SweepFiles
     config: Path | None
 
     def returns(self, frame: int, stamp_ns: int) -> tuple[Path, Returns]:
-        """A sweep's rows as they stand in its file. Raises InputError if the file is damaged or has
-        other columns than the first."""
+        """Return a sweep's file and its rows. Raises InputError if the file is damaged or lacks
+        columns of the first."""
         path = self.series.paths[frame]
-        columns, layout = self._columns(path), self.layout
-        for name in vars(layout.fields).values():
+        columns, fields = self._columns(path), self.layout.fields
+        for name in vars(fields).values():
             if name and name not in columns:
                 raise InputError(
                     f"{path}: no column {name}, which other sweeps have; got {', '.join(columns)}"
                 )
-        points = self.settings.scale_m * points_of(columns, layout.fields)
+        points = self.settings.scale_m * points_of(columns, fields)
         if self.settings.axes is not None:
             points = points @ self.settings.axes.T
         intensity = None
-        if layout.fields.intensity:
-            intensity = scaled(columns[layout.fields.intensity], layout.intensity_scale)
+        if fields.intensity:
+            intensity = scaled(columns[fields.intensity], self.layout.intensity_scale)
         valid = np.logical_and(np.isfinite(points).all(axis=1), points.any(axis=1))
         return path, Returns(
             points,
@@ -89,19 +89,18 @@ class SweepColumns:
             self._offset_ns(path, columns, stamp_ns, valid),
             self._lidar(path, columns, valid),
             self.settings.scanner_origins,
-            radial_velocity_m_s=radial_velocities(columns, layout.fields),
+            radial_velocity_m_s=radial_velocities(columns, fields),
         )
 
     @cached_property
     def layout(self) -> Layout:
-        """Found by the names, and by the values of the first sweep that can be read."""
+        """Find the meaning of the columns in the first sweep that can be read."""
         frame, _, columns = self._sample
         fields, times, words = self._fields, None, "none: no column of that kind"
         if fields.time:
             stamps_ns = self.series.stamps_ns
-            times, words = self._times(
-                columns, self.period.ns, None if stamps_ns is None else stamps_ns[frame]
-            )
+            stamp_ns = None if stamps_ns is None else stamps_ns[frame]
+            times, words = self._times(columns, self.period.ns, stamp_ns)
             if times is not None and times.absolute and stamps_ns is None:
                 times = replace(times, other_clock=True)  # numbers for stamps are no clock
         scale = self.settings.intensity_scale
@@ -116,18 +115,17 @@ class SweepColumns:
 
     @cached_property
     def period(self) -> Period:
-        """Told by the stamps, the rate that is known, or the points' own times."""
+        """Find the period by the stamps, the rate that is known, or the points' own times."""
         stamps_ns, rate_hz = self.series.stamps_ns, self.settings.rate_hz
         if stamps_ns is not None and len(stamps_ns) > 1:
             return Period(max(1, int(np.median(np.diff(list(stamps_ns.values()))))), "")
         if rate_hz:
             return Period(round(1e9 / rate_hz), f"number, at the {rate_hz:g} Hz of densify.yaml")
-        return self._period_of_times() or Period(
-            _ASSUMED_PERIOD_NS, "number, at an assumed 10 Hz; say rate_hz in densify.yaml"
-        )
+        assumed = "number, at an assumed 10 Hz; say rate_hz in densify.yaml"
+        return self._period_of_times() or Period(_ASSUMED_PERIOD_NS, assumed)
 
     def _period_of_times(self) -> Period | None:
-        """The time from one sweep's first point to the next one's, or that a sweep takes."""
+        """Return the time from one sweep's first point to the next one's, or that a sweep takes."""
         if not self._fields.time:
             return None
         frame, _, columns = self._sample
@@ -136,45 +134,41 @@ class SweepColumns:
             return None
         values = widened(columns[times.field])
         if not times.absolute:
-            offset_ns = times.offset_ns(values, 0)
-            share = float(offset_ns.max() - offset_ns.min()) * 1e-9
-            fit = next((hz for hz in _RATES_HZ if abs(share * hz - 1) < 0.05), None)
-            if fit is None:
-                return None
-            return Period(10**9 // fit, f"number, at {fit} Hz: a sweep takes 1/{fit} s")
-        following = [number for number in self.series.paths if number > frame][:1]
-        for number in following:
-            later = self._columns(self.series.paths[number]).get(times.field)
-            if later is None or not len(later):
-                return None
-            first = np.array([np.nanmin(values), np.nanmin(widened(later))])
-            step_ns = int(np.diff(times.offset_ns(first, 0))[0]) // (number - frame)
-            if step_ns > 0:
-                return Period(step_ns, "number, at the rate of the points' times")
-        return None
+            share_s = float(np.ptp(times.offset_ns(values, 0))) * 1e-9
+            for hz in _RATES_HZ:
+                if abs(share_s * hz - 1) < 0.05:
+                    return Period(10**9 // hz, f"number, at {hz} Hz: a sweep takes 1/{hz} s")
+            return None
+        number = next((n for n in self.series.paths if n > frame), frame)
+        later = self._columns(self.series.paths[number]).get(times.field)
+        if number == frame or later is None:
+            return None
+        first = np.array([np.nanmin(values), np.nanmin(widened(later))])
+        step_ns = int(np.diff(times.offset_ns(first, 0))[0]) // (number - frame)
+        return Period(step_ns, "number, at the rate of the points' times") if step_ns > 0 else None
 
     @cached_property
     def _sample(self) -> tuple[int, Path, Columns]:
-        """The first sweep that can be read: its number, file and columns."""
-        first_error: InputError | None = None
+        """Read the first sweep that can be read: its number, file and columns."""
+        errors = []
         for number, path in list(self.series.paths.items())[:_NUM_TRIED]:
             try:
                 return number, path, self._columns(path)
             except InputError as error:
-                first_error = first_error or error
-        raise first_error or InputError("no sweeps")
+                errors.append(error)
+        raise errors[0]
 
     @cached_property
     def _fields(self) -> Fields:
         _, path, columns = self._sample
-        named = {part: getattr(self.settings, part) for part in _NAMED}
+        named = {part: name for part in _NAMED if (name := getattr(self.settings, part))}
         for part, name in named.items():
-            if name and name not in columns:
+            if name not in columns:
                 raise InputError(
                     f"{self.config}: sweeps.{part}: got {name!r}, expected a column of "
                     f"{path.name}: {', '.join(columns)}"
                 )
-        found = vars(find_fields(columns)) | {part: name for part, name in named.items() if name}
+        found = vars(find_fields(columns)) | named
         missing = [axis for axis in "xyz" if not found[axis]]
         if missing:
             raise InputError(
@@ -184,7 +178,7 @@ class SweepColumns:
         return Fields(**found)
 
     def _columns(self, path: Path) -> Columns:
-        """All columns of numbers, (N,) each; those beside the points of an .npz file too."""
+        """Read all columns of numbers, (N,) each, also those beside the points of an .npz file."""
         table = read_table(path, self.settings.columns)
         beside = {n: a for n, a in table.beside.items() if a.shape == (len(table),)}
         columns = {**table.columns, **beside}
@@ -194,14 +188,9 @@ class SweepColumns:
         self, columns: Columns, period_ns: int, stamp_ns: int | None
     ) -> tuple[PointTimes | None, str]:
         known, field = self.settings, self._fields.time
+        absolute = known.time_is == "absolute" if known.time_is else None
         return find_times(
-            columns[field],
-            field,
-            period_ns,
-            stamp_ns,
-            known.time_unit,
-            known.time_is == "absolute" if known.time_is else None,
-            known.reference,
+            columns[field], field, period_ns, stamp_ns, known.time_unit, absolute, known.reference
         )
 
     def _offset_ns(self, path: Path, columns: Columns, stamp_ns: int, valid: Bool) -> Int | None:
@@ -209,7 +198,7 @@ class SweepColumns:
         if times is None:
             return None
         values = columns[times.field]
-        if values.dtype.kind == "f" and not np.isfinite(values[valid]).all():
+        if not np.isfinite(values[valid]).all():
             raise InputError(f"{path}: {times.field}: got a time that is not finite beside a point")
         offset_ns = np.zeros(len(values), np.int64)
         offset_ns[valid] = times.offset_ns(values[valid], stamp_ns)

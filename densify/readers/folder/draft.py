@@ -22,6 +22,26 @@ _PERIOD_NS = 100_000_000
 _HEAD = """\
 # What the files of this folder cannot say themselves; every key may be left out. Lines with a # in
 # front are examples or guesses: take the # away where they are right.
+
+"""
+_MORE_OF_SWEEPS = """\
+  # scale_m: 0.001       # metres of a unit of the points
+  # axes: [z, -x, -y]    # which stored axes are x (forward), y (left) and z (up)
+  # reference: start     # the stamp is the sweep's start, middle or end; without it the
+  #                      # points' times are since the stamp
+  # compensated: true    # the vehicle's own motion in a sweep was taken out already
+  # scanner_origins: [[0, 0, 0]]  # where rays start, metres, if not at 0 0 0
+
+"""
+_NO_POSES = """\
+# poses:
+#   file: poses.txt       # KITTI 3x4, 4x4, TUM, or a table with qw qx qy qz
+"""
+_MORE_OF_POSES = """\
+#   inverse: true         # the file has world-to-lidar, not lidar-to-world
+#   T_frame_lidar: [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
+#                         # the lidar in the frame whose poses these are
+
 """
 _CAMERAS = """\
 # Cameras: K and T_cam_lidar are to be filled in (p_cam = T_cam_lidar p_lidar; the camera looks
@@ -49,23 +69,23 @@ def draft_config(folder: Path) -> str:
     """Return the text of a commented densify.yaml that opens as it is. Reads one sweep and one
     image of each folder. Raises InputError if there are no sweeps, or the first cannot be read."""
     groups = sweep_folders(folder)
-    choice, paths = next(iter(groups.items()))
-    others = [name for name in groups if name != choice]
-    return "\n".join(
-        [_HEAD, _sweeps(folder, choice, paths, others), _poses(folder), _cameras(folder)]
-    )
+    sweeps = "\n".join(_sweep_lines(folder, groups)) + "\n" + _MORE_OF_SWEEPS
+    path = find_pose_file(folder, "")
+    poses = _NO_POSES
+    if path is not None:
+        poses = f"poses:\n  file: {path.name}  # {PoseFile.read(path).form}\n"
+    return _HEAD + sweeps + poses + _MORE_OF_POSES + _cameras(folder)
 
 
-def _sweeps(folder: Path, files: str, paths: Sequence[Path], others: Sequence[str]) -> str:
+def _sweep_lines(folder: Path, groups: Mapping[str, Sequence[Path]]) -> list[str]:
+    (choice, paths), *others = groups.items()
     series = in_time(folder, paths, "", "")
-    first = next(iter(series.paths.values()))
-    columns = read_table(first).columns
-    either = f"  # or: {', '.join(others)}" if others else f"  # {len(paths)} sweeps"
-    lines = ["sweeps:", f"  files: {files}{either}"]
-    stamps_ns, period_ns = series.stamps_ns, _PERIOD_NS
+    columns = read_table(next(iter(series.paths.values()))).columns
+    names, stamps_ns, period_ns = list(columns), series.stamps_ns, _PERIOD_NS
+    either = f"or: {', '.join(name for name, _ in others)}" if others else f"{len(paths)} sweeps"
+    lines = ["sweeps:", f"  files: {choice}  # {either}"]
     if stamps_ns is not None and len(stamps_ns) > 1:
         period_ns = int(np.median(np.diff(list(stamps_ns.values()))))
-    names = list(columns)
     if tuple(names) == unnamed(len(names)):
         names = _guessed(columns, period_ns)
         lines.append(f"  columns: [{', '.join(names)}]  # guessed by their values: check them")
@@ -83,29 +103,19 @@ def _sweeps(folder: Path, files: str, paths: Sequence[Path], others: Sequence[st
         lines.append("  stamps: names")
     else:
         lines.append(f"  # stamps are taken from {series.told_by}")
-    lines += [
-        "  # scale_m: 0.001       # metres of a unit of the points",
-        "  # axes: [z, -x, -y]    # which stored axes are x (forward), y (left) and z (up)",
-        "  # reference: start     # the stamp is the sweep's start, middle or end; without it the",
-        "  #                      # points' times are since the stamp",
-        "  # compensated: true    # the vehicle's own motion in a sweep was taken out already",
-        "  # scanner_origins: [[0, 0, 0]]  # where rays start, metres, if not at 0 0 0",
-    ]
-    return "\n".join(lines) + "\n"
+    return lines
 
 
 def _guessed(columns: Mapping[str, NDArray[Any]], period_ns: int) -> list[str]:
-    """Names for the columns of a file without names: by their values, from the fifth on."""
+    """Guess names for the columns of a file without names by their values, from the fifth on."""
     names: list[str] = []
     for name, column in columns.items():
+        whole = np.isfinite(column).all() and not (column % 1).any()
         if not name.startswith("column"):
             names.append(name)
-            continue
-        whole = np.isfinite(column).all() and not (column % 1).any()
-        times = find_times(column, name, period_ns, None)[0]
-        if whole and column.min() >= 0 and 0 < column.max() < 256 and "ring" not in names:
+        elif whole and column.min() >= 0 and 0 < column.max() < 256 and "ring" not in names:
             names.append("ring")
-        elif times is not None and "time" not in names:
+        elif find_times(column, name, period_ns, None)[0] is not None and "time" not in names:
             names.append("time")
         else:
             names.append(f"unknown{len(names)}")
@@ -124,32 +134,12 @@ def _time_lines(
     times, words = find_times(columns[field], field, period_ns, stamp_ns)
     if times is None:
         return [f"  # time_unit: ns        # {words}"]
+    other = "  # by another clock than the stamps" if times.other_clock else ""
     return [
         f"  time: {field}",
         f"  time_unit: {times.unit}  # a sweep takes about a period in this unit",
-        f"  time_is: {'absolute' if times.absolute else 'relative'}"
-        + ("  # by another clock than the stamps" if times.other_clock else ""),
+        f"  time_is: {'absolute' if times.absolute else 'relative'}{other}",
     ]
-
-
-def _poses(folder: Path) -> str:
-    path = find_pose_file(folder, "")
-    lines = [
-        "# poses:",
-        "#   file: poses.txt       # KITTI 3x4, 4x4, TUM, or a table with qw qx qy qz",
-    ]
-    if path is not None:
-        form = PoseFile.read(path).form
-        lines = ["poses:", f"  file: {path.name}  # {form}"]
-    return "\n".join(
-        [
-            *lines,
-            "#   inverse: true         # the file has world-to-lidar, not lidar-to-world",
-            "#   T_frame_lidar: [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]",
-            "#                         # the lidar in the frame whose poses these are",
-            "",
-        ]
-    )
 
 
 def _cameras(folder: Path) -> str:
