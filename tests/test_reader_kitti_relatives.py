@@ -44,7 +44,7 @@ def written(excerpt, tmp_path_factory):
 
 @pytest.fixture
 def copied(written, tmp_path):
-    """Makes a copy to be damaged."""
+    """Makes a copy to be damaged, of the first sweep and image alone the bytes."""
 
     def copy(name):
         whole = written[name].parent.parent if name == "kitti-odometry" else written[name]
@@ -52,12 +52,6 @@ def copied(written, tmp_path):
         return copy / written[name].relative_to(whole)
 
     return copy
-
-
-@pytest.mark.parametrize("name", FORMATS)
-def test_the_place_tells_the_reader(written, name):
-    sequence = open_sequence(written[name])
-    assert isinstance(sequence, FORMATS[name][1])
 
 
 def test_odometry_is_given_back(written, excerpt):
@@ -211,153 +205,70 @@ def test_a_fisheye_projects_as_the_data_sets_tools_do(fisheye):
     np.testing.assert_allclose(uv[0], [1336 * x * bent + 716.9, 1335 * y * bent + 705.7])
 
 
-# Damage
-
-
-def cut(path):
-    path.write_bytes(path.read_bytes()[:-5])
+# --- damage ---------------------------------------------------------------------------------------
 
 
 def swap(old, new):
-    return lambda p: p.write_text(p.read_text().replace(old, new, 1))
+    return lambda path: path.write_text(path.read_text().replace(old, new, 1))
 
 
-def shrink(path):
-    cv2.imwrite(str(path), np.zeros((4, 6, 3), np.uint8))
+def write(text):
+    return lambda path: path.write_text(text)
 
 
-TR = "Tr: "
-CALIBRATION, PERSPECTIVE = "calib.txt", "calibration/perspective.txt"
+def short(length):
+    return lambda path: path.write_bytes(path.read_bytes()[:length])
+
+
+def remove(path):
+    path.unlink()
+
+
+ODOMETRY, TRACKING, DRIVE_360 = FORMATS
+POSES, CALIBRATION, PERSPECTIVE = (
+    "../../poses/00.txt",
+    "calib/0000.txt",
+    "calibration/perspective.txt",
+)
 STAMPS = f"data_3d_raw/{DRIVE}/velodyne_points/timestamps.txt"
 POSES_360 = f"data_poses/{DRIVE}/poses.txt"
-FISHEYE_YAML = "calibration/image_02.yaml"
-DAMAGE = {
-    "odometry: calibration missing": (
-        "kitti-odometry",
-        CALIBRATION,
-        lambda p: p.unlink(),
-        "missin",
-    ),
-    "odometry: no Tr": ("kitti-odometry", CALIBRATION, swap(TR, "Rt: "), "no key Tr"),
-    "odometry: Tr cut": (
-        "kitti-odometry",
-        CALIBRATION,
-        lambda p: p.write_text(p.read_text()[:-99]),
-        "Tr: got",
-    ),
-    "odometry: Tr is no rotation": (
-        "kitti-odometry",
-        CALIBRATION,
-        swap(TR + "-0.0", TR + "-9.0"),
-        "rotation",
-    ),
-    "odometry: a projection of text": (
-        "kitti-odometry",
-        CALIBRATION,
-        swap("P2: 7", "P2: x7"),
-        "x7",
-    ),
-    "odometry: times as text": ("kitti-odometry", "times.txt", swap("0.0", "now"), "line 1"),
-    "odometry: times that stand": (
-        "kitti-odometry",
+TO_POSE, TO_VELO = "calibration/calib_cam_to_pose.txt", "calibration/calib_cam_to_velo.txt"
+DAMAGE = [
+    (ODOMETRY, "calib.txt", remove, "missing"),
+    (ODOMETRY, "calib.txt", swap("Tr: ", "Rt: "), "no key Tr"),
+    (ODOMETRY, "calib.txt", short(-99), "Tr: got"),
+    (ODOMETRY, "calib.txt", swap("Tr: -0.0", "Tr: -9.0"), "rotation"),
+    (ODOMETRY, "times.txt", swap("0.0", "now"), "line 1"),
+    (
+        ODOMETRY,
         "times.txt",
-        swap("2.0", "1.0"),
-        "line 3: got",
+        swap("0.0", "1e999999999"),
+        "line 1: got .* beyond the year",
     ),
-    "odometry: too few times": (
-        "kitti-odometry",
-        "times.txt",
-        lambda p: p.write_text("0\n"),
-        "time",
-    ),
-    "odometry: pose not finite": (
-        "kitti-odometry",
-        "../../poses/00.txt",
-        lambda p: p.write_text("nan " + p.read_text().split(" ", 1)[1]),
-        "line 1: got a value that is not finite",
-    ),
-    "odometry: too few poses": (
-        "kitti-odometry",
-        "../../poses/00.txt",
-        lambda p: p.write_text(""),
-        "no pose of frame 0",
-    ),
-    "odometry: pose is no rotation": (
-        "kitti-odometry",
-        "../../poses/00.txt",
-        lambda p: p.write_text("9" + p.read_text()[1:]),
-        "not a rotation",
-    ),
-    "odometry: sweep cut": ("kitti-odometry", "velodyne/000000.bin", cut, "truncated"),
-    "odometry: no sweeps": (
-        "kitti-odometry",
-        "velodyne",
-        lambda p: [f.unlink() for f in p.iterdir()],
-        "no sweeps",
-    ),
-    "odometry: first image cut": (
-        "kitti-odometry",
-        "image_2/000000.png",
-        lambda p: p.write_bytes(b"x"),
-        "not a complete image",
-    ),
-    "tracking: calibration missing": (
-        "kitti-tracking",
-        "calib/0000.txt",
-        lambda p: p.unlink(),
-        "missing",
-    ),
-    "tracking: no R_rect": (
-        "kitti-tracking",
-        "calib/0000.txt",
-        swap("R_rect", "R"),
-        "no key R_rect",
-    ),
-    "tracking: oxts cut": (
-        "kitti-tracking",
-        "oxts/0000.txt",
-        lambda p: p.write_text(p.read_text()[:70] + "\n"),
-        "line 1: got",
-    ),
-    "tracking: latitude": ("kitti-tracking", "oxts/0000.txt", swap("49.0", "149.0"), "149 deg"),
-    "tracking: sweep cut": ("kitti-tracking", "velodyne/0000/000000.bin", cut, "truncated"),
-    "360: stamps missing": ("kitti-360", STAMPS, lambda p: p.unlink(), "missing"),
-    "360: stamps as text": ("kitti-360", STAMPS, swap("2026", "now"), "got 'now.*on line 1"),
-    "360: too few stamps": ("kitti-360", STAMPS, lambda p: p.write_text(""), "no stamp of frame 0"),
-    "360: size not whole": ("kitti-360", PERSPECTIVE, swap("1242.0", "1242.5"), "whole pixels"),
-    "360: size of another": (
-        "kitti-360",
-        PERSPECTIVE,
-        swap("1242.0", "1240"),
-        "expected 1240 x 375",
-    ),
-    "360: pose cut": ("kitti-360", POSES_360, lambda p: p.write_text("0 1 0\n"), "got 3 values"),
-    "360: one pose": (
-        "kitti-360",
-        POSES_360,
-        lambda p: p.write_text(p.read_text().split("\n")[0]),
-        "two",
-    ),
-    "360: pose is no rotation": ("kitti-360", POSES_360, swap("0 ", "0 9"), "not a rotation"),
-    "360: pose too long": ("kitti-360", POSES_360, swap("0 0.", "0 nan 0."), "got 14 values"),
-    "360: cut calibration": (
-        "kitti-360",
-        "calibration/calib_cam_to_velo.txt",
-        lambda p: p.write_text(p.read_text()[:99]),
-        "scanner: got",
-    ),
-    "360: no camera": (
-        "kitti-360",
-        "calibration/calib_cam_to_pose.txt",
-        swap("image_00", "image_04"),
-        "no key image_00",
-    ),
-}
+    (ODOMETRY, "times.txt", swap("2.0", "1.0"), "line 3: got"),
+    (ODOMETRY, "times.txt", write("0\n"), "no time of frame"),
+    (ODOMETRY, POSES, swap(" ", " nan "), "line 1: got 13 values"),
+    (ODOMETRY, POSES, swap("1", "9"), "not a rotation"),
+    (ODOMETRY, POSES, write(""), "no pose of frame 0"),
+    (ODOMETRY, "velodyne/000000.bin", short(-5), "truncated"),
+    (ODOMETRY, "image_2/000000.png", write("x"), "not a complete image"),
+    (TRACKING, CALIBRATION, swap("R_rect", "R"), "no key R_rect"),
+    (TRACKING, "oxts/0000.txt", short(70), "line 1: got"),
+    (TRACKING, "velodyne/0000/000000.bin", short(-5), "truncated"),
+    (DRIVE_360, STAMPS, remove, "missing"),
+    (DRIVE_360, STAMPS, swap("2026", "now"), "got 'now.*on line 1"),
+    (DRIVE_360, PERSPECTIVE, swap("1242.0", "1242.5"), "whole pixels"),
+    (DRIVE_360, PERSPECTIVE, swap("1242.0", "1240"), "expected 1240 x 375"),
+    (DRIVE_360, POSES_360, write("0 1 0\n"), "got 3 values"),
+    (DRIVE_360, POSES_360, swap("0 ", "0 9"), "not a rotation"),
+    (DRIVE_360, POSES_360, lambda p: p.write_text(p.read_text().split("\n")[0]), "two"),
+    (DRIVE_360, TO_VELO, short(99), "scanner: got"),
+    (DRIVE_360, TO_POSE, swap("image_00", "image_04"), "no key image_00"),
+]
 
 
-@pytest.mark.parametrize("damage", DAMAGE)
-def test_damage_is_refused_in_a_line(copied, damage):
-    name, file, harm, says = DAMAGE[damage]
+@pytest.mark.parametrize(("name", "file", "harm", "says"), DAMAGE, ids=range(len(DAMAGE)))
+def test_damage_is_refused_in_a_line(copied, name, file, harm, says):
     place = copied(name)
     harm(place / file)
     with pytest.raises(InputError, match=says) as error:
@@ -375,17 +286,11 @@ def test_damage_is_refused_in_a_line(copied, damage):
         ("1336.0", "-3", "not positive"),
         ("k1: 0.016", "k1: abc", "abc"),
         ("model_type: MEI", "model_type: [", "not YAML"),
-        (
-            "model_type: MEI",
-            "model_type: !!python/object/apply:os.system ['true']",
-            "could not det",
-        ),
         ("1400", "140", "expected 140 x 1400"),
     ],
 )
 def test_a_broken_fisheye_is_refused_in_a_line(fisheye, old, new, says):
-    path = fisheye / FISHEYE_YAML
-    path.write_text(path.read_text().replace(old, new, 1))
+    swap(old, new)(fisheye / "calibration/image_02.yaml")
     with pytest.raises(InputError, match=says) as error:
         Kitti360(fisheye, DRIVE).image("image_02", 1)
     assert "\n" not in str(error.value) and "image_02" in str(error.value)

@@ -99,8 +99,8 @@ def decode_image(data: bytes, where: Path | str, as_stored: bool = False) -> NDA
         raise
     except Exception as error:
         raise InputError(
-            f"{where}: not a complete image ({len(data)} bytes; {reason(error)}); expected a PNG "
-            f"or JPEG file"
+            f"{where}: not a complete image, or damaged ({len(data)} bytes); expected a PNG or "
+            f"JPEG file"
         ) from error
 
 

@@ -10,7 +10,7 @@ import reprlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import numpy as np
 
@@ -283,8 +283,7 @@ def _camera(section: Section, name: str) -> tuple[Camera, CameraFiles]:
     for key, expected in _REQUIRED.items():
         if section.values.get(key) is None:
             raise section.wrong(key, expected)
-    size, K, T_cam_lidar = given.size, given.K, given.T_cam_lidar
-    assert size is not None and K is not None and T_cam_lidar is not None
+    size, K, T_cam_lidar = (cast(Float, v) for v in (given.size, given.K, given.T_cam_lidar))
     if min(size) < 1 or any(size % 1):
         raise section.wrong("size", _REQUIRED["size"])
     coefficients = tuple(float(d) for d in given.distortion)
