@@ -7,12 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from densify.config import Config, GroundSettings
+from densify.config import Config
 from densify.flow import engines as engine_scene
 from densify.flow.engines import estimate_motion
 from densify.flow.tracking.groups import GroupMotion
-from densify.free_space.ground import ground
-from densify.free_space.height_map import HeightMap
+from densify.free_space.ground import HeightMap, ground
 from densify.geometry.types import FlowField, Motion, Stretch
 from tests.scenes import Arc, Scanner, Scene, World, street
 
@@ -40,7 +39,7 @@ class Found:
     @staticmethod
     def around(middle: int, scene: Scene, size: int) -> Found:
         stretch = scene.stretch(middle, size)
-        heights = ground(stretch, GroundSettings())
+        heights = ground(stretch)
         motion = motion_in(stretch, heights)
         assert isinstance(motion, GroupMotion)
         fields = tuple(motion.flow(f, toward_key(f)) for f in stretch.frames)

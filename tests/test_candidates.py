@@ -8,10 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from densify.config import GroundSettings
 from densify.flow.tracking.candidates import Batch, Obstacles, Strips, find_candidates
-from densify.free_space.ground import ground
-from densify.free_space.height_map import ABOVE_GROUND_M, HeightMap
+from densify.free_space.ground import ABOVE_GROUND_M, HeightMap, ground
 from densify.free_space.range_image import RangeImage
 from densify.free_space.seen_through import FreeSpace
 from densify.geometry import poses
@@ -37,7 +35,7 @@ def stretch(scene) -> Stretch:
 
 @pytest.fixture(scope="module")
 def heights(stretch) -> HeightMap:
-    return ground(stretch, GroundSettings())
+    return ground(stretch)
 
 
 @pytest.fixture(scope="module")
@@ -171,7 +169,7 @@ def test_two_sweeps_show_what_is_too_small_in_one():
     on = {f: scene.scan(f).instance == 1 for f in frames}
     assert np.median([rows.sum() for rows in on.values()]) == 6
     stretch = at_20_hz(scene, frames)
-    motion = motion_in(stretch, ground(stretch, GroundSettings()))
+    motion = motion_in(stretch, ground(stretch))
     errors_m = []
     for f in frames[:-1]:
         flow = motion.flow(f, f + 1)

@@ -6,7 +6,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from densify.config import GroundSettings
 from densify.free_space.ground import ground
 from densify.free_space.seen_through import REACH_S
 from densify.geometry.clock import Clock
@@ -72,7 +71,7 @@ def scene() -> Scene:
 def test_a_recording_with_sweeps_missing_is_one_that_is_slower_there(scene, frames):
     whole = scene.stretch(KEY, 5)
     stretch = Stretch(tuple(whole[f] for f in frames))
-    motion = motion_in(stretch, ground(stretch, GroundSettings()))
+    motion = motion_in(stretch, ground(stretch))
     for frame in frames:
         flow, scan = motion.flow(frame, KEY), scene.scan(frame)
         for mover in (1, 2):

@@ -132,18 +132,18 @@ def test_every_knob_takes_its_limits_and_refuses_what_is_beyond(section: str, fi
 
 
 def test_round_trip() -> None:
-    config = resolve("paper", ["register.lead_in_s=0.7", "flow.look_around_s=0.5"])
+    config = resolve("paper", ["register.voxel_size_m=0.7", "flow.look_around_s=0.5"])
     text = yaml.safe_dump(as_mapping(config))
     assert resolve(yaml.safe_load(text)) == config != Config()
 
 
 @settings(max_examples=20)
-@given(st.floats(0, 5), st.floats(0, 1e6), st.booleans(), st.sampled_from(["rigid", "drop"]))
+@given(st.floats(0.05, 10), st.floats(0, 1e6), st.booleans(), st.sampled_from(["rigid", "drop"]))
 def test_round_trip_through_yaml_text(
-    lead_in_s: float, alpha: float, deskew: bool, word: str
+    voxel_size_m: float, alpha: float, deskew: bool, word: str
 ) -> None:
     changes = {
-        "register": {"lead_in_s": lead_in_s, "deskew": deskew},
+        "register": {"voxel_size_m": voxel_size_m, "deskew": deskew},
         "objective": {"alpha": alpha},
         "accumulate": {"unfollowed": word},
     }
@@ -183,7 +183,7 @@ def test_overrides_win_over_the_file_and_later_over_earlier() -> None:
             "flow.alpha=3",
             ["--set flow.alpha=3", "unknown key flow.alpha; it is objective.alpha now"],
         ),
-        ("flwo.alpha=3", ["unknown section flwo", "did you mean flow?", "register, ground"]),
+        ("flwo.alpha=3", ["unknown section flwo", "did you mean flow?", "register, flow"]),
         ("flow.voxel_size_m=3", ["did you mean register.voxel_size_m?"]),
         ("flow.qqq=3", ["expected a key of flow: "]),
         (
@@ -220,7 +220,7 @@ def test_bad_override(override: str, parts: list[str]) -> None:
         ("- flow\n", ["got ['flow']", "mapping of sections"]),
         ("objective: {alpha: [}\n", ["not YAML"]),
         (
-            "objective: {alpha: 1}\nground: {}\nobjective: {solver: adam}\n",
+            "objective: {alpha: 1}\nregister: {}\nobjective: {solver: adam}\n",
             ["objective is given twice"],
         ),
         ("objective: {alpha: .nan}\n", ["objective.alpha: got nan"]),
@@ -256,8 +256,8 @@ def test_unknown_preset_suggests_one() -> None:
 
 def test_python_users_are_checked_too() -> None:
     assert RegisterSettings(voxel_size_m=2).voxel_size_m == 2.0
-    with pytest.raises(InputError, match=r"register\.lead_in_s: got -1"):
-        RegisterSettings(lead_in_s=-1)
+    with pytest.raises(InputError, match=r"register\.voxel_size_m: got -1"):
+        RegisterSettings(voxel_size_m=-1)
     with pytest.raises(InputError, match="min_range_m"):
         RegisterSettings(min_range_m=50, max_range_m=20)
     far = resolve(None, ["register.min_range_m=20", "register.max_range_m=300"])

@@ -26,8 +26,7 @@ from tests import scenes
 def driving() -> Scene:
     movers = (*scenes.street(), scenes.car(14, -1.6, 10, 1))
     stretch = scenes.Scene(scenes.World(movers), scenes.Arc(0, -1.5, 0, 6.0, 0.0)).stretch(5, 2)
-    config = Config()
-    return Scene(stretch, ground(stretch, config.ground))
+    return Scene(stretch, ground(stretch))
 
 
 @pytest.mark.parametrize("row", ENGINES.built_in, ids=lambda row: row.name)

@@ -19,8 +19,8 @@ from densify.geometry.types import RegisteredSweep
 from densify.pipeline import run as pipeline
 from densify.pipeline.recording import Recording
 from densify.readers.timeline import Timeline
-from densify.registration import chain
-from densify.registration.chain import follow
+from densify.registration import road_poses
+from densify.registration.road_poses import follow_road
 from densify.scores.depth_metrics import depth_scores
 from tests.scenes import CAMERA, Arc, Scanner, Scene, TinySequence, World, by_flow, car, street
 
@@ -138,7 +138,7 @@ class _Torn(TinySequence):
 def test_the_far_range_ends_at_a_sweep_that_cannot_be_read(source):
     whole = drive()
     torn = _Torn(whole.scene, range(NUM_FRAMES))
-    settings = {**FAR, "register": {"source": source, "lead_in_s": 0.2}}
+    settings = {**FAR, "register": {"source": source}}
     far = by_flow(torn, KEY, WINDOW, config=settings)
     frames = np.unique(far.cloud.frame)
     assert frames.min() > KEY - 6 and frames.max() < KEY + 7
@@ -146,9 +146,10 @@ def test_the_far_range_ends_at_a_sweep_that_cannot_be_read(source):
 
 
 @pytest.mark.parametrize("side", [-1, 1])
-def test_the_chain_finds_the_true_poses(side):
+def test_the_chain_finds_the_true_poses(side, monkeypatch):
     """Within 3 cm and a tenth of a degree after 12 m, raw sweeps, from a window that is known."""
-    sequence, settings = drive(), resolve({"register": {"min_num_points": 100}}).register
+    monkeypatch.setattr(road_poses, "MIN_NUM_POINTS", 100)
+    sequence = drive()
     stretch, timeline = sequence.scene.stretch(KEY, WINDOW), Timeline.of(sequence)
     known = stretch.sweeps[::side]
     frames = range(known[-1].frame + side, NUM_FRAMES if side > 0 else -1, side)
@@ -156,12 +157,11 @@ def test_the_chain_finds_the_true_poses(side):
 
     def found():
         return list(
-            follow(
+            follow_road(
                 known,
                 list(frames),
                 stamp_ns,
                 *(sequence.__getitem__, lambda _: None, 12.0, 2.0),
-                settings,
             )
         )
 
@@ -181,13 +181,15 @@ def test_the_chain_finds_the_true_poses(side):
 @pytest.mark.parametrize(("period_s", "num_known"), [(0.05, 12), (0.1, 6), (0.2, 3)])
 def test_the_chain_begins_with_half_a_second_at_any_rate(period_s, num_known, monkeypatch):
     inserted = []
-    monkeypatch.setattr(chain.SurfaceMap, "insert", lambda _, surface, T: inserted.append(T[0, 3]))
+    monkeypatch.setattr(
+        road_poses.SurfaceMap, "insert", lambda _, surface, T: inserted.append(T[0, 3])
+    )
     raw, known = drive()[KEY], []
     for i in range(20):
         sweep = replace(raw, stamp_ns=round(period_s * i * 1e9))
         T_world_lidar = poses.exp(np.array([0, 0, 0, float(i), 0, 0]))
         known.append(RegisteredSweep(sweep, T_world_lidar, np.zeros(6), np.zeros(6)))
-    list(follow(known, [], np.zeros(0, np.int64), *(None, None, 12.0, 2.0), resolve(None).register))
+    list(follow_road(known, [], np.zeros(0, np.int64), *(None, None, 12.0, 2.0)))
     assert inserted == list(range(20 - num_known, 20))
 
 

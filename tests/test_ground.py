@@ -9,22 +9,19 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from densify.config import GroundSettings
-from densify.free_space import height_map
-from densify.free_space.ground import ground
-from densify.free_space.height_map import ABOVE_GROUND_M, HeightMap
+from densify.free_space import ground as module
+from densify.free_space.ground import ABOVE_GROUND_M, CELL_M, MAX_SLOPE, HeightMap, ground
 from densify.geometry import poses
 from densify.geometry.types import Stretch
 from tests.scenes import GROUND, KERB_M, KERB_Y_M, Arc, Box, Scanner, Scene, World, car, street
 
-SETTINGS = GroundSettings()
 LOW_M = ABOVE_GROUND_M
 TRAILER = Box((9.0, 2.5, 1.2), Arc(14.0, 1.0, 0.2))  # lower than the scanner: its roof is seen
 
 
-def heights_above(stretch: Stretch, settings: GroundSettings = SETTINGS) -> list[np.ndarray]:
+def heights_above(stretch: Stretch) -> list[np.ndarray]:
     """(N,) of every sweep's points."""
-    heights = ground(stretch, settings)
+    heights = ground(stretch)
     return [heights.above(in_world(stretch, f)) for f in stretch.frames]
 
 
@@ -116,17 +113,6 @@ def test_stray_low_points_do_not_dig_holes():
     assert dirty[1][-36:].max() < -1.5  # they are below it, not it
 
 
-def test_the_slope_limit_is_a_knob():
-    """A wide flat roof becomes ground only where the ground may rise that steeply."""
-    scene = Scene(World((Box((12, 12, 1.2), Arc(16, 0)),)), Arc(0, 0), Scanner())
-    stretch = scene.stretch(2, 0)
-    roof = (scene.scan(2).box == 0) & (scene.height_m(2) > 1.15)
-    strict = heights_above(stretch, GroundSettings(max_slope=0.02))[0][roof]
-    loose = heights_above(stretch, GroundSettings(max_slope=1.0))[0][roof]
-    assert np.median(strict) > 1.0
-    assert np.median(loose) < 0.3
-
-
 def test_the_stretch_counts_not_the_sweep_alone():
     """What hides the road in one sweep has left it in another."""
     scene = Scene(World((car(9, 0, 20, 1, size_m=(4.2, 3.6, 1.4)),)), Arc(0, 0))
@@ -137,12 +123,6 @@ def test_the_stretch_counts_not_the_sweep_alone():
     assert np.median(error) < 0.1 and error.max() < 0.2
 
 
-def test_same_bytes_every_time():
-    scene = Scene(World(street(), 0.02), Arc(0, -1.5), Scanner(sigma_m=0.01))
-    a, b = (heights_above(scene.stretch(2, 1)) for _ in range(2))
-    assert all(x.tobytes() == y.tobytes() for x, y in zip(a, b, strict=True))
-
-
 # --- the map itself -------------------------------------------------------------------------------
 
 
@@ -150,7 +130,7 @@ def test_under_follows_a_plane_and_stays_at_the_edge_beyond_it():
     rng = np.random.default_rng(0)
     points = rng.uniform(-20, 20, (40000, 3))
     points[:, 2] = 2 + 0.1 * points[:, 0] - 0.05 * points[:, 1]
-    heights = HeightMap.of([points], SETTINGS)
+    heights = HeightMap.of([points])
     inside = rng.uniform(-18, 18, (500, 2))
     plane_m = 2 + 0.1 * inside[:, 0] - 0.05 * inside[:, 1]
     off_m = np.abs(heights.under(inside) - plane_m)
@@ -176,7 +156,7 @@ def test_many_and_few_returns_find_the_same_ground():
     many = xy[:, 0] < 0
     kept = many | (rng.random(len(xy)) < 0.04)  # 100 returns in a cell, or 4
     points = np.column_stack([xy, rng.normal(0, 0.03, len(xy))])[kept]
-    heights = HeightMap.of([points], SETTINGS)
+    heights = HeightMap.of([points])
     x, y = np.meshgrid(np.arange(-13, 13.5, 0.5), np.arange(-8, 8.5, 0.5), indexing="ij")
     found = heights.under(np.stack([x.ravel(), y.ravel()], 1)).reshape(x.shape)
     near_m, far_m = found[x[:, 0] < -1], found[x[:, 0] > 1]
@@ -191,7 +171,7 @@ def test_the_slope_limit_against_a_slow_twin():
     steps = np.sort(np.abs(at[:, None] - at[None]), axis=2)
     distance = steps[..., 1] - steps[..., 0] + np.sqrt(2) * steps[..., 0]  # straight and diagonal
     expected = (heights.ravel() + 0.15 * distance).min(1).reshape(heights.shape)
-    np.testing.assert_allclose(height_map._slope_limited(heights, 0.15), expected, atol=1e-12)
+    np.testing.assert_allclose(module._slope_limited(heights, 0.15), expected, atol=1e-12)
 
 
 def test_under_a_vehicle_that_never_left_its_place_is_the_ground_around_it():
@@ -204,7 +184,7 @@ def test_under_a_vehicle_that_never_left_its_place_is_the_ground_around_it():
     seen = vehicle | (np.abs(along) > 5.2) | (np.abs(across) > 3.2)
     points = np.column_stack([road, np.where(vehicle, rng.uniform(0.5, 1.5, len(road)), 0.0)])
     points[:, 2] += 0.1 * points[:, 0]
-    heights = HeightMap.of([points[seen]], SETTINGS)
+    heights = HeightMap.of([points[seen]])
     off_m = heights.under(road[vehicle]) - 0.1 * road[vehicle, 0]
     assert np.abs(off_m).max() < 0.2 and np.abs(np.median(off_m)) < 0.1
 
@@ -214,7 +194,7 @@ def test_kerbs_islands_and_banks_are_ground():
     x, y = rng.uniform(-22, 22, (2, 200000))
     step_m = np.where(y > 5, 0.15, 0.0) + np.where(np.abs(y) < 1.5, 0.15, 0.0)  # kerb, island
     step_m += np.clip(0.12 * (x - 2), 0, 1.2)  # up a bank that stays up
-    heights = HeightMap.of([np.column_stack([x, y, step_m])], SETTINGS)
+    heights = HeightMap.of([np.column_stack([x, y, step_m])])
     away = (np.abs(np.abs(y) - 1.5) > 1.2) & (np.abs(y - 5) > 1.2)  # from cells with a step
     assert np.abs(heights.under(np.stack([x, y], 1)[away]) - step_m[away]).max() < 0.08
 
@@ -231,12 +211,12 @@ def test_humps_against_a_slow_twin():
     for row, column in np.ndindex(heights.shape):
         opened[row, column] = lowest[row + 3 : row + 10, column + 3 : column + 10].max()
     expected = np.where(heights > opened + 0.2, opened, heights)
-    np.testing.assert_array_equal(height_map._without_humps(heights, 1.0), expected)
+    np.testing.assert_array_equal(module._without_humps(heights), expected)
 
 
-def slow_map(points: np.ndarray, settings: GroundSettings) -> np.ndarray:
+def slow_map(points: np.ndarray) -> np.ndarray:
     """Two lowest and the mean, cell by cell, of one cloud; what is between them from the module."""
-    cell_m = settings.cell_m
+    cell_m = CELL_M
     low = np.floor(points[:, :2].min(0) / cell_m) * cell_m
     index = ((points[:, :2] - low) / cell_m).astype(int)
     heights = np.full(index.max(0) + 1, np.inf)
@@ -247,8 +227,8 @@ def slow_map(points: np.ndarray, settings: GroundSettings) -> np.ndarray:
     nearest = ndimage.distance_transform_edt(~known, return_distances=False, return_indices=True)
     around = ndimage.median_filter(heights[tuple(nearest)], 5)
     heights = np.where(known & (heights < around - 0.4), around, heights)
-    heights = height_map._slope_limited(heights, settings.max_slope * cell_m)[tuple(nearest)]
-    heights = height_map._without_humps(heights, cell_m)
+    heights = module._slope_limited(heights, MAX_SLOPE * cell_m)[tuple(nearest)]
+    heights = module._without_humps(heights)
     over_m = points[:, 2] - HeightMap(heights, low, cell_m).under(points)
     number, total_m = np.zeros((2, *heights.shape))
     for (x, y), over in zip(index, over_m, strict=True):
@@ -267,13 +247,13 @@ def test_sweep_by_sweep_it_is_the_map_of_all_points_together(num_clouds: int) ->
     points[::3, 2] = 0.25  # the lowest more than once
     points[::50, 2] -= 3.0
     clouds = [*np.array_split(points, num_clouds), points[:0]]
-    found = HeightMap.of(clouds, SETTINGS)
-    np.testing.assert_array_equal(found.heights_m, slow_map(points, SETTINGS))
+    found = HeightMap.of(clouds)
+    np.testing.assert_array_equal(found.heights_m, slow_map(points))
 
 
 def test_the_ground_of_a_stretch_is_that_of_its_sweeps_together() -> None:
     stretch = Scene(World(street(), 0.03), Arc(0, -1.5), Scanner(sigma_m=0.01)).stretch(2, 1)
     together = np.concatenate([in_world(stretch, f) for f in stretch.frames])
-    found, expected = ground(stretch, SETTINGS), HeightMap.of([together], SETTINGS)
+    found, expected = ground(stretch), HeightMap.of([together])
     np.testing.assert_array_equal(found.heights_m, expected.heights_m)
     np.testing.assert_array_equal(found.low_m, expected.low_m)

@@ -29,8 +29,7 @@ def drive() -> scenes.Scene:
 @pytest.fixture(scope="module")
 def driving(drive: scenes.Scene) -> Scene:
     stretch = drive.stretch(5, 2)
-    config = Config()
-    return Scene(stretch, ground(stretch, config.ground))
+    return Scene(stretch, ground(stretch))
 
 
 @pytest.fixture(scope="module")

@@ -8,7 +8,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from densify.config import GroundSettings
 from densify.flow.tracking.candidates import find_candidates
 from densify.free_space.ground import ground
 from densify.free_space.seen_through import FreeSpace
@@ -45,13 +44,13 @@ def seen_from(stretch: Stretch, shift_m=(0.0, 0.0, 0.0), yaw_deg: float = 0.0) -
 
 
 def moving(stretch: Stretch) -> np.ndarray:
-    motion = motion_in(stretch, ground(stretch, GroundSettings()))
+    motion = motion_in(stretch, ground(stretch))
     return np.concatenate([instance >= 0 for instance in motion.instance])
 
 
 def test_candidates_are_the_same_groups(stretch: Stretch) -> None:
     def found(there: Stretch):
-        heights = ground(there, GroundSettings())
+        heights = ground(there)
         return find_candidates(there, FreeSpace.of(there), heights, 0.3)
 
     here = found(stretch)

@@ -6,12 +6,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from densify.config import GroundSettings
 from densify.flow.pairs.estimate import estimate_flow
 from densify.flow.pairs.hypotheses import PairCloud, RigidMotion
 from densify.flow.pairs.refine import Refined, refined
 from densify.flow.pairs.trials import Trial, _ambiguous
-from densify.free_space.height_map import HeightMap
+from densify.free_space.ground import HeightMap
 from densify.geometry import poses
 from tests.scenes import Arc, Scanner, Scene, World, car, street
 
@@ -66,9 +65,7 @@ def test_surfaces_tell_whether_it_moved(moved):
     source = PairCloud(corner(600, 1), np.zeros(600))
     target = PairCloud(corner(600, 2) + way, np.zeros(600))
     x, y = np.meshgrid(np.arange(-10, 10, 0.3), np.arange(-10, 10, 0.3))
-    ground = HeightMap.of(
-        [np.column_stack([x.ravel(), y.ravel(), 0 * x.ravel()])], GroundSettings()
-    )
+    ground = HeightMap.of([np.column_stack([x.ravel(), y.ravel(), 0 * x.ravel()])])
     start = RigidMotion(np.append(way + [0.1, 0, 0], 0.0), source.points.mean(0), 1.0)
     rows = np.arange(600)
     found = refined(start, rows, source, target, rows, ground, timed=False)
@@ -81,7 +78,7 @@ def test_surfaces_tell_whether_it_moved(moved):
 def test_few_points_tell_no_thickness():
     points = corner(30, 1)
     cloud = PairCloud(points, np.zeros(30))
-    ground = HeightMap.of([points], GroundSettings())
+    ground = HeightMap.of([points])
     start = RigidMotion(np.zeros(4), points.mean(0), 1.0)
     rows = np.arange(30)
     found = refined(start, rows, cloud, cloud, rows, ground, timed=True)

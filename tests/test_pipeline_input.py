@@ -33,7 +33,7 @@ def test_progress_names_every_stage():
 
 def test_only_the_frames_needed_are_read():
     sequence = one_car(())
-    run(sequence, KEY, 1, "icp", config={"register": {"source": "dataset", "lead_in_s": 0.2}})
+    run(sequence, KEY, 1, "icp", config={"register": {"source": "dataset"}})
     assert set(sequence.read) == set(range(KEY - 3, KEY + 2))
     assert len(sequence.read) == 5
 

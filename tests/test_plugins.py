@@ -23,7 +23,6 @@ from densify.config.plugins.engines import ENGINES, engine
 from densify.config.plugins.outputs import OUTPUTS, chosen
 from densify.config.plugins.readers import READERS
 from densify.flow.engines import check_engine
-from densify.geometry.types import Links
 from densify.outputs.store import check_writable, write_result
 from densify.readers import Spec
 from tests.tiny_street import MOVERS, tiny
@@ -232,7 +231,7 @@ RESULT = SimpleNamespace(
     **{name: {} for name in ("depth", "full", "movers", "optical_flow", "rejected", "metrics")},
     **{"baselines": {}, "flow": None, "key": 3, "method": "flow", "frames": (3,), "costs": ()},
     **{"far_frames": (), "warnings": (), "stamp_ns": 0, "T_key_lidar": {}},
-    **{"far_links": Links.none(), "far_left_out": ()},
+    far_left_out=(),
     cloud=None,
 )
 

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from writers import write_street
 
-from densify.config import GroundSettings
 from densify.flow.tracking.candidates import find_candidates
 from densify.flow.tracking.radial import Radial
 from densify.free_space.ground import ground
@@ -19,7 +18,7 @@ from densify.geometry.types import Stretch, Sweep, Trajectory
 from densify.readers import open_sequence
 from densify.readers.point_fields import find_fields, radial_velocities
 from densify.readers.street import Street
-from densify.registration.deskew import placed, twists
+from densify.registration.deskew import deskew_sweep, twists
 from densify.scores.cloud_scores import radial_velocity_scores
 from tests.scenes import Arc, Scanner, Scene, World, by_flow, car, street
 from tests.small_street import one_car
@@ -37,7 +36,7 @@ def test_a_street_has_those_of_its_bodies(fmcw):
     frames = (KEY - 1, KEY, KEY + 1)
     stamps_ns = np.array([fmcw.stamp_ns(f) for f in frames])
     track = Trajectory(frames, stamps_ns, np.stack([fmcw.T_world_lidar(f) for f in frames]))
-    registered = placed(fmcw[KEY], fmcw.T_world_lidar(KEY), *twists(track, 1))
+    registered = deskew_sweep(fmcw[KEY], fmcw.T_world_lidar(KEY), *twists(track, 1))
     sweep, (ray, _) = registered.sweep, registered.rays()
     moving = fmcw.truth.sweep(KEY).moving
     assert moving.sum() > 500
@@ -70,7 +69,7 @@ def test_own_motion_is_removed_wherever_scanners_stand():
         radial_velocity_m_s=measured,
     )  # fmt: skip
     assert np.abs(measured).max() > 5
-    left = placed(sweep, np.eye(4), twist, twist).sweep.radial_velocity_m_s
+    left = deskew_sweep(sweep, np.eye(4), twist, twist).sweep.radial_velocity_m_s
     np.testing.assert_allclose(left, 0, atol=1e-3)
 
 
@@ -86,7 +85,7 @@ def test_they_are_evidence_without_any_other_sweep():
     def candidates(radial):
         seen = replace(stretch.sweeps[0], sweep=replace(sweep, radial_velocity_m_s=radial))
         alone = Stretch((seen,))
-        heights = ground(alone, GroundSettings())
+        heights = ground(alone)
         return find_candidates(alone, FreeSpace.of(alone), heights)[0]
 
     assert candidates(None).num_clusters == 0

@@ -3,8 +3,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from dataclasses import replace
 
 import numpy as np
@@ -16,12 +14,12 @@ from densify.geometry import poses
 from densify.geometry.types import Sweep, Trajectory
 from densify.readers.street import Street
 from densify.readers.window import read_sweep, recorded_trajectory
-from densify.registration import odometry, trajectory
 from densify.registration.alignment import subsample
 from densify.registration.deskew import deskew
-from densify.registration.doppler import measured_velocity
-from densify.registration.odometry import check_overlap, check_plausible, register
+from densify.registration.odometry import find_odometry, register
+from densify.registration.start_speed import measure_velocity, search_twist
 from densify.registration.surfaces import refine, register_on_surfaces
+from densify.registration.trajectory import check_overlap, check_plausible, find_trajectory
 from tests.scenes import SWEEP_S, Arc, Box, Scanner, Scene, World, street
 
 SETTINGS = RegisterSettings()
@@ -47,22 +45,15 @@ def first_pass(raw):
 
 @pytest.fixture(scope="module")
 def second_pass(raw):
-    return both_passes(raw)
-
-
-def both_passes(raw) -> Trajectory:
-    rough = register(raw, SETTINGS)
-    return register([s.sweep for s in deskew(raw, rough).sweeps], SETTINGS, rough)
+    return find_odometry(raw, SETTINGS)[0]
 
 
 @pytest.mark.parametrize("late_ms", [0, 20])
-def test_stamps_that_do_not_ascend_are_refused_before_anything_is_done(raw, late_ms, monkeypatch):
-    """Sweeps of one moment would count as one look."""
-    monkeypatch.setattr(trajectory, "register", None)
+def test_stamps_have_to_ascend(raw, late_ms):
     stamp_ns = raw[5].stamp_ns - late_ms * 1_000_000
     wrong = [*raw[:6], replace(raw[6], stamp_ns=stamp_ns), *raw[7:]]
     with pytest.raises(SweepError, match="stamp of frame 6 is not after that of frame 5") as error:
-        trajectory.find_trajectory(wrong, SETTINGS)
+        find_trajectory(wrong, SETTINGS)
     assert error.value.frame == 6
 
 
@@ -81,44 +72,17 @@ def errors(found: Trajectory, true: Trajectory) -> tuple[np.ndarray, np.ndarray]
 # --- the analytic drive ---------------------------------------------------------------------------
 
 
-def test_the_drive_is_recovered(drive, second_pass):
-    off_m, off_deg = errors(second_pass, drive.trajectory(FRAMES))
-    # the drive is 6 m to either side of the key
-    assert off_m.max() < 0.15 and off_m.mean() < 0.06
-    assert off_deg.max() < 0.2
-
-
-def test_a_drive_at_twice_the_rate_is_recovered_from_two_sweeps_at_a_time(drive, raw):
-    """The same sweeps in half the time: 24 m/s at 20 Hz."""
+@pytest.mark.parametrize("rate", [1, 2])
+def test_the_drive_is_recovered(drive, raw, second_pass, rate):
+    """At twice the rate, 24 m/s at 20 Hz, two sweeps are registered together."""
     fast = [replace(s, stamp_ns=s.stamp_ns // 2, offset_ns=s.offset_ns // 2) for s in raw]
-    with pytest.MonkeyPatch.context() as patch:
-        passes = []
-        patch.setattr(trajectory, "register", lambda *a, **k: passes.append(a) or register(*a, **k))
-        found = trajectory.find_trajectory(fast, SETTINGS)
-    pairs = [raw[i : i + 2] for i in range(0, len(raw), 2)]
-    for joined, *_ in passes:
-        assert [len(s) for s in joined] == [sum(map(len, pair)) for pair in pairs]
-        assert [s.frame for s in joined] == [pair[0].frame for pair in pairs]
-    rough = passes[1][2]
-    assert rough.stamp_ns.tolist() == [s.stamp_ns for s in passes[1][0]]
+    found = second_pass if rate == 1 else find_odometry(fast, SETTINGS)[0]
     assert found.frames == tuple(FRAMES)
     off_m, off_deg = errors(found, drive.trajectory(FRAMES))
+    # the drive is 6 m to either side of the key
     assert off_m.max() < 0.15 and off_m.mean() < 0.06 and off_deg.max() < 0.2
-
-
-def test_stamps_and_frames_are_handed_on_exactly(drive, second_pass):
-    assert second_pass.frames == tuple(FRAMES)
-    assert second_pass.stamp_ns.dtype == np.int64
-    assert np.array_equal(second_pass.stamp_ns, drive.trajectory(FRAMES).stamp_ns)
-
-
-def test_speed_is_known_from_the_first_step_on(drive, second_pass):
-    """Odometry alone takes the vehicle to start from rest."""
-    true = drive.trajectory(FRAMES).T_world_lidar
-    for i in range(3):
-        found = poses.inverse(second_pass.T_world_lidar[i]) @ second_pass.T_world_lidar[i + 1]
-        step = poses.log(poses.inverse(poses.inverse(true[i]) @ true[i + 1]) @ found)
-        assert np.linalg.norm(step[3:]) < 0.12
+    refined_m, _ = errors(refine(raw, second_pass), drive.trajectory(FRAMES))
+    assert refined_m.mean() < 0.02
 
 
 @pytest.fixture(scope="module")
@@ -132,7 +96,7 @@ def fast_drive() -> Scene:
 )
 def test_sweeps_may_be_missing(fast_drive, frames):
     """A hole of three periods at 36 m/s is 7 m longer than the step before it."""
-    found = both_passes([fast_drive.scan(f).sweep for f in frames])
+    found, _ = find_odometry([fast_drive.scan(f).sweep for f in frames], SETTINGS)
     true = fast_drive.trajectory(frames).T_world_lidar
     for i in range(len(frames) - 1):
         step = poses.inverse(true[i]) @ true[i + 1]
@@ -145,7 +109,7 @@ def test_sweeps_may_be_missing(fast_drive, frames):
 @pytest.mark.parametrize("period_s", [0.1, 0.2, 0.3])
 def test_the_start_is_found_at_any_rate(fast_drive, period_s):
     frames = [round(i * period_s / SWEEP_S) for i in range(3)]
-    twist = odometry.searched_twist([fast_drive.scan(f).sweep for f in frames], SETTINGS)
+    twist = search_twist([fast_drive.scan(f).sweep for f in frames])
     assert np.abs(twist * period_s - [0, 0, 0, 36.0 * period_s, 0, 0]).max() < 0.6
 
 
@@ -156,13 +120,6 @@ def jittered(true: Trajectory, seed: int, noise_m: float, noise_deg: float) -> T
     ]
     T = [a @ poses.exp(twist) for a, twist in zip(true.T_world_lidar, noise, strict=True)]
     return replace(true, T_world_lidar=np.stack(T))
-
-
-def test_sweeps_are_laid_on_the_surfaces_of_those_before(drive, raw, second_pass):
-    true = drive.trajectory(FRAMES)
-    off_m, off_deg = errors(second_pass, true)
-    now_m, now_deg = errors(refine(raw, second_pass), true)
-    assert now_m.mean() < 0.5 * off_m.mean() and now_deg.mean() < 0.5 * off_deg.mean()
 
 
 def test_what_odometry_leaves_is_mended_and_the_first_sweep_stays(drive, raw):
@@ -183,30 +140,6 @@ def test_a_sweep_that_does_not_lie_on_those_before_keeps_its_pose(drive, raw):
     astray[4] = astray[4] @ poses.exp(np.array([0, 0, 0.3, 4, 0, 3]))
     found = refine(raw, replace(true, T_world_lidar=astray))
     np.testing.assert_allclose(found.T_world_lidar[4], astray[4], atol=0.05)
-
-
-def test_one_sweep_and_two_are_laid_too(drive, raw):
-    for frames in ((3,), (3, 4)):
-        off = jittered(drive.trajectory(frames), 1, 0.03, 0.1)
-        found = refine([raw[f] for f in frames], off)
-        assert np.array_equal(found.frames, frames)
-        true = drive.trajectory(frames).T_world_lidar
-        last = poses.log(
-            poses.inverse(poses.inverse(true[0]) @ true[-1])
-            @ poses.inverse(found.T_world_lidar[0])
-            @ found.T_world_lidar[-1]
-        )
-        assert np.linalg.norm(last[3:]) < 0.02
-
-
-def test_same_bytes_every_time(raw, first_pass):
-    again = register(raw, SETTINGS)
-    assert again.T_world_lidar.tobytes() == first_pass.T_world_lidar.tobytes()
-
-
-def test_sweeps_are_left_as_they_were(drive, raw, first_pass):
-    fresh = Scene(drive.world, drive.ego, drive.scanner).scan(KEY).sweep
-    assert raw[KEY].points.tobytes() == fresh.points.tobytes()
 
 
 # --- deskewing ------------------------------------------------------------------------------------
@@ -251,14 +184,6 @@ def test_static_points_come_to_where_they_are_at_the_reference_time(walled):
         assert error.max() < 0.01  # the arc within a sweep is taken for a straight line
 
 
-def test_the_found_motion_straightens_too(drive, raw, second_pass):
-    stretch = deskew(raw, second_pass)
-    T = drive.T_world_lidar(KEY * SWEEP_S)
-    true = poses.transform(poses.inverse(T), drive.scan(KEY).world)
-    error = np.linalg.norm(stretch[KEY].sweep.points - true, axis=1)
-    assert np.quantile(error, 0.95) < 0.08
-
-
 def test_each_half_moves_with_its_own_twist():
     """Braking: before the reference time faster than after it."""
     scene = Scene(World(()), Arc(0, 0))
@@ -273,15 +198,6 @@ def test_each_half_moves_with_its_own_twist():
     moved = registered.sweep.points - sweep.points
     np.testing.assert_allclose(moved[:, 0], t * np.where(t < 0, 15, 5), atol=1e-9)
     assert np.abs(moved[:, 1:]).max() < 1e-9
-
-
-def test_at_an_end_the_only_twist_serves_both_halves(drive, raw, second_pass):
-    stretch = deskew(raw, second_pass)
-    for end in (stretch.sweeps[0], stretch.sweeps[-1]):
-        assert np.array_equal(end.twist_before, end.twist_after)
-        assert np.linalg.norm(end.twist_after[3:]) == pytest.approx(12, abs=1.5)
-    inner = stretch[KEY]
-    assert not np.array_equal(inner.twist_before, inner.twist_after)
 
 
 def test_columns_follow_their_points(walled):
@@ -311,16 +227,6 @@ def test_without_times_points_stay_to_the_last_bit(walled):
     assert registered.twist_after.any()  # the lidar moves all the same
 
 
-def test_the_sweeps_are_placed_in_the_world(walled):
-    stretch = walled.stretch(KEY, 2)
-    assert stretch.frames == (3, 4, 5, 6, 7)
-    trajectory = walled.trajectory(stretch.frames)
-    for registered, T_world_lidar in zip(stretch.sweeps, trajectory.T_world_lidar, strict=True):
-        assert registered.T_world_lidar.tobytes() == T_world_lidar.tobytes()
-        world = poses.transform(T_world_lidar, registered.sweep.points)
-        assert np.abs(world - walled.scan(registered.frame).world).max() < 0.02
-
-
 def test_from_one_sweep_to_another_by_frame_number(walled):
     stretch = walled.stretch(KEY, 2)
     p = stretch[3].sweep.points[::500]
@@ -346,30 +252,6 @@ def test_a_single_sweep_cannot_be_deskewed_and_stays(walled):
 
 
 # --- KISS-ICP's traps -----------------------------------------------------------------------------
-
-
-def test_sweeps_of_equal_or_no_stamps_do_not_abort(drive, tmp_path):
-    """In a process of its own: the abort cannot be caught."""
-    scan = drive.scan(0).sweep
-    np.savez(tmp_path / "sweep.npz", points=scan.points)
-    code = f"""
-import numpy as np
-from densify.config import RegisterSettings
-from densify.registration.odometry import register
-from densify.geometry.types import Sweep, Sweep
-p = np.load({str(tmp_path / "sweep.npz")!r})["points"]
-n = len(p)
-def sweep(frame, offset_ns):
-    return Sweep(frame, frame * 100_000_000, p, np.zeros(n, np.float32), offset_ns,
-                 np.zeros(n, np.uint8), np.arange(n))
-for offset_ns in (np.zeros(n, np.int64), np.full(n, 7, np.int64), None):
-    T = register([sweep(f, offset_ns) for f in range(3)], RegisterSettings()).T_world_lidar
-    print(float(np.abs(T - np.eye(4)).max()))
-"""
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    moved = [float(line) for line in done.stdout.split()]
-    assert len(moved) == 3 and max(moved) < 0.01
 
 
 def test_environment_variables_have_no_effect(raw, first_pass, monkeypatch):
@@ -401,7 +283,7 @@ def few(raw):
 
 
 def on_surfaces(sweeps):
-    return register_on_surfaces(sweeps, SETTINGS, [None] * len(sweeps))
+    return register_on_surfaces(sweeps, [None] * len(sweeps))
 
 
 def test_few_points_are_laid_on_the_surfaces_of_the_last_second(drive, few):
@@ -425,18 +307,6 @@ def test_the_road_ahead_does_not_tip_a_scanner_of_few_rings() -> None:
         assert np.rad2deg(np.linalg.norm(off[:3])) < 0.2 and np.linalg.norm(off[3:]) < 0.03
 
 
-def test_the_number_of_points_decides_on_the_odometry(raw, few, monkeypatch):
-    used = []
-    for name in ("register", "register_on_surfaces"):
-        found = getattr(trajectory, name)
-        monkeypatch.setattr(trajectory, name, lambda *a, f=found: used.append(f) or f(*a))
-    trajectory.find_trajectory(few, SETTINGS)
-    assert used == [register_on_surfaces]
-    used.clear()
-    trajectory.find_trajectory([raw[0], *few[1:3], *raw[3:]], SETTINGS)
-    assert used == [register, register]
-
-
 @pytest.mark.parametrize(
     "frames", [(3,), (3, 4), (3, 4, 5), (0, 1, 2, 3, 9, 10)], ids=["one", "two", "three", "a hole"]
 )
@@ -458,7 +328,7 @@ def test_a_pattern_that_turns_from_sweep_to_sweep_does_not_take_the_poses_with_i
     sweep."""
     crossing, frames = Street("crossing", 302, "rosette"), range(85, 93)
     raw = [read_sweep(crossing, f, SETTINGS) for f in frames]
-    found = trajectory.find_trajectory(raw, SETTINGS)
+    found = find_trajectory(raw, SETTINGS)
     off = np.array([poses.log(T) for T in found.T_world_lidar])
     assert np.linalg.norm(off[:, 3:], axis=1).max() < 0.08
     assert np.rad2deg(np.linalg.norm(off[:, :3], axis=1)).max() < 1
@@ -470,11 +340,11 @@ def test_measured_velocities_hold_along_a_road_where_nothing_else_tells() -> Non
     highway, frames = Street("highway", 2026, "fmcw"), range(75, 83)
     raw = [read_sweep(highway, f, SETTINGS) for f in frames]
     true = [highway.T_world_lidar(f) for f in frames]
-    found = trajectory.find_trajectory(raw, SETTINGS).T_world_lidar
+    found = find_trajectory(raw, SETTINGS).T_world_lidar
     away = [poses.inverse(true[0]) @ T for T in true] - found
     assert np.linalg.norm(away[:, :3, 3], axis=1).max() < 0.05
     for sweep in raw[::3]:
-        assert measured_velocity(sweep) == pytest.approx([25, 0, 0], abs=0.05)
+        assert measure_velocity(sweep) == pytest.approx([25, 0, 0], abs=0.05)
 
 
 @pytest.mark.parametrize("wrong", ["the sign", "without the own motion"])
@@ -489,7 +359,7 @@ def test_radial_velocities_that_are_none_are_refused(wrong) -> None:
     with pytest.raises(
         InputError, match="radial velocities of sweep 75 the scanner goes at"
     ) as told:
-        trajectory.find_trajectory(raw, SETTINGS)
+        find_trajectory(raw, SETTINGS)
     assert ("the opposite" if wrong == "the sign" else "at 25 m/s") in str(told.value)
 
 
@@ -509,44 +379,33 @@ def test_the_velocity_is_that_of_what_stands(share):
         scanner_origins=origins,
         radial_velocity_m_s=radial_m_s.astype(np.float32),
     )
-    found = measured_velocity(sweep)
+    found = measure_velocity(sweep)
     if share > 0.5:
         assert found is None
     else:
         np.testing.assert_allclose(found, own, atol=0.02)
-    assert measured_velocity(replace(sweep, radial_velocity_m_s=None)) is None
-    assert measured_velocity(sweep.select(np.arange(100))) is None
+    assert measure_velocity(replace(sweep, radial_velocity_m_s=None)) is None
+    assert measure_velocity(sweep.select(np.arange(100))) is None
 
 
 # --- what cannot be registered --------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("num_points", [0, 50, 999])
+@pytest.mark.parametrize("num_points", [0, 999])
 def test_too_few_points_names_the_frame(raw, num_points):
     sparse = raw[2].select(np.arange(len(raw[2])) < num_points)
     with pytest.raises(InputError, match=rf"sweep 2 has {num_points} points.*at least 1000"):
-        register([raw[0], raw[1], sparse], SETTINGS)
+        find_trajectory([raw[0], raw[1], sparse], SETTINGS)
 
 
-def test_a_lowered_limit_is_obeyed(raw):
-    sparse = [s.select(np.arange(len(s)) % 40 == 0) for s in raw[:2]]
-    assert len(sparse[0]) > 600
-    register(sparse, RegisterSettings(min_num_points=600))
-
-
-@pytest.mark.parametrize("rate", [1, 2])
-def test_one_sweep_of_another_place_is_a_jump(drive, raw, rate):
-    """At twice the rate too, where it is registered with the sweep before."""
+def test_one_sweep_of_another_place_is_a_jump(drive, raw):
     x, y, yaw = (float(value) for value in drive.ego.at(5 * SWEEP_S))
     elsewhere = Scene(drive.world, Arc(x + 20, y, yaw)).scan(0).sweep
     swapped = [
         replace(elsewhere, frame=5, stamp_ns=s.stamp_ns) if s.frame == 5 else s for s in raw[:9]
     ]
-    swapped = [
-        replace(s, stamp_ns=s.stamp_ns // rate, offset_ns=s.offset_ns // rate) for s in swapped
-    ]
     with pytest.raises(ComputationError, match=r"frame [456]\b"):
-        trajectory.find_trajectory(swapped, SETTINGS)
+        find_trajectory(swapped, SETTINGS)
 
 
 def test_a_recording_that_goes_on_at_another_place_is_noticed(drive, raw):
@@ -555,7 +414,7 @@ def test_a_recording_that_goes_on_at_another_place_is_noticed(drive, raw):
     elsewhere = Scene(drive.world, replace(drive.ego, x=drive.ego.x - 10), drive.scanner)
     joined = [*raw[:5], *(elsewhere.scan(f).sweep for f in range(5, 9))]
     with pytest.raises(ComputationError, match=r"frame [456]\b"):
-        trajectory.find_trajectory(joined, SETTINGS)
+        find_trajectory(joined, SETTINGS)
 
 
 def moved(trajectory: Trajectory, index: int, twist) -> Trajectory:
@@ -580,11 +439,6 @@ def test_a_pattern_that_does_not_repeat_lies_on_several_sweeps_before() -> None:
             check_overlap(sweeps, moved(true, 1, twist), SETTINGS)
 
 
-def test_a_true_drive_is_plausible(drive):
-    check_plausible(drive.trajectory(FRAMES), SETTINGS)
-    check_plausible(drive.trajectory([3]), SETTINGS)
-
-
 @pytest.mark.parametrize(
     ("twist", "what"),
     [
@@ -596,27 +450,11 @@ def test_a_true_drive_is_plausible(drive):
     ],
 )
 def test_jumps_name_their_frames(drive, twist, what):
+    check_plausible(drive.trajectory(FRAMES), SETTINGS)
+    check_plausible(moved(drive.trajectory(FRAMES), 6, [0, 0, 0.02, 0.2, -0.1, 0.1]), SETTINGS)
     with pytest.raises(ComputationError, match=what) as caught:
         check_plausible(moved(drive.trajectory(FRAMES), 6, twist), SETTINGS)
     assert "\n" not in str(caught.value)
-
-
-def test_noise_of_registration_is_no_jump(drive):
-    check_plausible(moved(drive.trajectory(FRAMES), 6, [0, 0, 0.02, 0.2, -0.1, 0.1]), SETTINGS)
-
-
-def test_the_speed_limit_is_a_knob(drive):
-    with pytest.raises(ComputationError, match=r"frame 0 to 1: 12 m/s.*at most 5 m/s"):
-        check_plausible(drive.trajectory(FRAMES), RegisterSettings(max_speed_m_s=5))
-
-
-@pytest.mark.parametrize("stamps", [(0, 2, 1, 3), (0, 1, 1, 2)])
-def test_stamps_have_to_ascend(drive, stamps):
-    trajectory = replace(
-        drive.trajectory(range(4)), stamp_ns=np.array(stamps, np.int64) * 100_000_000
-    )
-    with pytest.raises(InputError, match=r"stamp of frame 2 is .* that of frame 1"):
-        check_plausible(trajectory, SETTINGS)
 
 
 def test_a_pose_that_is_not_finite_names_its_frame(drive):
@@ -632,6 +470,6 @@ def test_guard_rails_do_not_look_like_standing_still() -> None:
     0.05 s apart do not tell 20 m/s from the 25 that are driven."""
     street, settings = Street("highway", 23, "hdl64", hz=20), RegisterSettings()
     sweeps = [read_sweep(street, frame, settings) for frame in range(205, 210)]
-    found = trajectory.find_trajectory(sweeps, settings)
+    found = find_trajectory(sweeps, settings)
     driven_m = np.linalg.norm(found.T_world_lidar[-1][:3, 3] - found.T_world_lidar[0][:3, 3])
     assert driven_m / 0.2 == pytest.approx(25, abs=1)

@@ -7,17 +7,15 @@ from functools import cache
 
 import numpy as np
 import pytest
-import yaml
 from scipy.optimize import minimize
 
 from densify.geometry import poses
 from densify.geometry.types import Sweep
-from densify.outputs import write_result
 from densify.pipeline import road
 from densify.pipeline import run as pipeline
-from densify.registration import submaps
-from densify.registration.alignment import Lay, subsample
-from densify.registration.submaps import num_in_submap, relax
+from densify.registration import road_poses
+from densify.registration.alignment import Alignment, subsample
+from densify.registration.road_poses import num_in_submap, relax_poses
 from tests.scenes import Arc, Scanner, Scene, TinySequence, World, street
 
 NUM, KNOWN = 14, np.arange(14) < 4
@@ -58,9 +56,9 @@ def errors(T_world_lidar):
 
 @pytest.mark.parametrize("num_sweeps", [1, 2])
 def test_drift_is_mended(num_sweeps):
-    frames, points, _ = true()
+    _, points, _ = true()
     given = displaced(0.0)
-    found = relax(frames, points, given, KNOWN, num_sweeps)
+    found = relax_poses(points, given, KNOWN, num_sweeps)
     before, after = errors(given), errors(found.T_world_lidar)
     if num_sweeps == 1:
         assert before[0].max() > 0.08 and after[0].max() < 0.02
@@ -71,40 +69,34 @@ def test_drift_is_mended(num_sweeps):
     assert found.T_world_lidar[KNOWN].tobytes() == given[KNOWN].tobytes()
 
 
-def test_a_step_is_mended_and_told():
-    frames, points, _ = true()
-    found = relax(frames, points, displaced(0.7), KNOWN, 1)
+def test_a_step_is_corrected():
+    _, points, _ = true()
+    found = relax_poses(points, displaced(0.7), KNOWN, 1)
     assert errors(found.T_world_lidar)[0].max() < 0.02
     assert found.holds.all()
-    links = found.links
-    over = (links.frames[:, 0] < frames[9]) & (links.frames[:, 1] >= frames[9])
-    assert (links.correction_m[over] > 0.6).all() and (links.correction_m[~over] < 0.15).all()
-    assert links.left_m.max() < 0.03 and links.rms_m.max() < 0.05
-    assert (links.num_matches > 500).all() and (links.overlap <= 1).all()
 
 
 def test_what_cannot_be_mended_is_left_out():
-    frames, points, _ = true()
-    found = relax(frames, points, displaced(7.0), KNOWN, 1)
+    _, points, _ = true()
+    found = relax_poses(points, displaced(7.0), KNOWN, 1)
     assert found.holds[:9].all() and not found.holds[9:].any()
     assert errors(found.T_world_lidar)[0][:9].max() < 0.02
 
 
 def test_the_same_bytes_by_any_number_of_threads(monkeypatch):
-    frames, points, _ = true()
+    _, points, _ = true()
     found = []
     for num in (1, 3):
-        monkeypatch.setattr(submaps, "num_threads", lambda num=num: num)
-        found.append(relax(frames, points, displaced(0.3), KNOWN, 1))
+        monkeypatch.setattr(road_poses, "num_threads", lambda num=num: num)
+        found.append(relax_poses(points, displaced(0.3), KNOWN, 1))
     assert found[0].T_world_lidar.tobytes() == found[1].T_world_lidar.tobytes()
-    assert found[0].links.left_m.tobytes() == found[1].links.left_m.tobytes()
 
 
 @pytest.mark.parametrize("known", [[0], [3, 4, 5], [9], list(range(10))])
 @pytest.mark.parametrize("num_sweeps", [1, 3, 5])
 def test_submaps_part_the_sweeps(known, num_sweeps):
     is_known = np.isin(np.arange(10), known)
-    member, middle = submaps._submaps(is_known, num_sweeps)
+    member, middle = road_poses._submaps(is_known, num_sweeps)
     assert (np.diff(member) >= 0).all() and (np.diff(member) <= 1).all() and member[0] == 0
     assert (member[middle] == np.arange(member[-1] + 1)).all()
     for i in range(member[-1] + 1):
@@ -129,8 +121,8 @@ def test_the_solver_finds_what_a_slow_one_does():
         noise = np.append(rng.normal(0, 2e-3, 3), rng.normal(0, 0.02, 3))
         root = rng.normal(0, 1, (6, 6)) + np.diag([5.0] * 3 + [2.0] * 3)
         M = poses.inverse(T[i]) @ T[j] @ poses.exp(noise)
-        lays.append(Lay(M, 1.0, 0.02, 1000, root.T @ root))
-    graph = submaps._Graph(ends, np.array([True, False, False, False]), lays)
+        lays.append(Alignment(M, 1.0, root.T @ root))
+    graph = road_poses._Graph(ends, np.array([True, False, False, False]), lays)
 
     def moved(x):
         return [T[0], *(a @ poses.exp(m) for a, m in zip(T[1:], x.reshape(3, 6), strict=True))]
@@ -139,7 +131,7 @@ def test_the_solver_finds_what_a_slow_one_does():
         now, total = moved(x), 0.0
         for (i, j), a in zip(ends, lays, strict=True):
             off = poses.log(poses.inverse(a.T_target_source) @ poses.inverse(now[i]) @ now[j])
-            total += np.log1p(off @ a.information @ off / submaps._USUAL_M**2)
+            total += np.log1p(off @ a.information @ off / road_poses._USUAL_M**2)
         return total
 
     found = graph.relaxed(T)
@@ -164,27 +156,21 @@ def test_thinning_takes_of_every_ring_alike(num_rings):
     assert of_ring.min() > 0.9 * of_ring.max()
 
 
-def test_a_stretch_that_does_not_hold_is_left_out_with_a_warning(tmp_path, monkeypatch):
-    usual = road.follow
+def test_sweeps_that_do_not_agree_are_left_out_with_a_warning(monkeypatch):
+    usual = road.follow_road
 
     def torn(*arguments):
-        for i, (sweep, T_world_lidar, *twists) in enumerate(usual(*arguments)):
-            yield (
-                sweep,
-                T_world_lidar @ poses.exp(np.array([0, 0, 0, 6.0, 5, 0]) * (i >= 3)),
-                *twists,
-            )
+        for i, (sweep, T_world_lidar, twist) in enumerate(usual(*arguments)):
+            step = poses.exp(np.array([0, 0, 0, 6.0, 5, 0]) * (i >= 3))
+            yield sweep, T_world_lidar @ step, twist
 
-    monkeypatch.setattr(road, "follow", torn)
+    monkeypatch.setattr(road, "follow_road", torn)
     sequence = TinySequence(
         Scene(World(street(60.0)), EGO, Scanner(48, 720, sigma_m=0.01)), range(36)
     )
-    settings = {"accumulate": {"far_m": 14.0}, "register": {"lead_in_s": 0.2}}
-    result = pipeline.run(sequence, 15, 2, config=settings)
+    results = pipeline.compare(
+        sequence, 15, 2, config={"accumulate": {"far_m": 14.0}}, methods=["icp-far"]
+    )
+    result = results["icp-far"]
     assert result.far_left_out and set(result.far_left_out).isdisjoint(result.far_frames)
     assert any("left out of the far range" in text for text in result.warnings)
-    write_result(result, {}, tmp_path, config={}, data="a drive")
-    record = yaml.safe_load((tmp_path / "000015" / "run.yaml").read_text())["far_links"]
-    assert record["left_out"] == list(result.far_left_out)
-    assert len(record["pairs"]) == len(result.far_links.overlap) > 5
-    assert all(len(row) == len(record["columns"]) for row in record["pairs"])

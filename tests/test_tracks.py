@@ -9,15 +9,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from densify.config import GroundSettings
 from densify.flow.tracking import proof, tracks
 from densify.flow.tracking.candidates import Obstacles, find_candidates
 from densify.flow.tracking.left_places import LeftPlaces, Places, left_places
 from densify.flow.tracking.shapes import Body, Shape
 from densify.flow.tracking.sightings import Sighting, Track
 from densify.flow.tracking.starts import groups_to_start, is_part, velocities_of_traffic
-from densify.free_space.ground import ground
-from densify.free_space.height_map import HeightMap
+from densify.free_space.ground import HeightMap, ground
 from densify.free_space.seen_through import FreeSpace
 from densify.geometry.clock import Clock
 from tests.scenes import SWEEP_S, Arc, Box, Scanner, Scene, World, car, street
@@ -210,7 +208,7 @@ def test_doubtful_tracks_are_followed_again_with_heights_that_count_less(
 def test_the_ground_rises_under_a_track():
     x, y = np.meshgrid(np.arange(-20, 20, 0.25), np.arange(-20, 20, 0.25))
     points = np.stack([x.ravel(), y.ravel(), 0.1 * x.ravel()], 1)
-    ground = HeightMap.of([points], GroundSettings())
+    ground = HeightMap.of([points])
     track = Track(np.array([-5.0, 2.0, 9.0]))
     for dx, dy in ((10, 0), (-6, 3), (0, 5)):
         rise_m = track.rise_m(ground, np.array([dx, dy, 77.0, 0.3]))
@@ -437,7 +435,7 @@ class Seen:
     def __init__(self, *boxes: Box) -> None:
         self.scene = Scene(World((*street(), *boxes)), EGO, Scanner(sigma_m=0.01))
         stretch = self.scene.stretch(KEY, 5)
-        heights = ground(stretch, GroundSettings())
+        heights = ground(stretch)
         self.space = FreeSpace.of(stretch)
         found = find_candidates(stretch, self.space, heights, 0.2)
         self.standing = [Obstacles.of(stretch, i, c) for i, c in enumerate(found)]

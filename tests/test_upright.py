@@ -9,12 +9,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from densify.config import GroundSettings
-from densify.free_space.ground import ground
+from densify.free_space.ground import find_up_axis, find_upright, ground
 from densify.geometry import poses
 from densify.geometry.types import Sweep
 from densify.registration.deskew import deskew
-from densify.registration.upright import ground_aside, upright
 from tests.scenes import ROOM, Arc, Scanner, Scene, World, on_sphere, street
 
 STREET = World(street(60.0))
@@ -35,17 +33,17 @@ def leaning(world: World, rotvec_deg, num: int = 2) -> tuple[list[Sweep], np.nda
 )
 def test_a_lidar_that_leans_or_hangs_is_turned_upright(rotvec_deg):
     sweeps, R = leaning(STREET, rotvec_deg)
-    found = upright(sweeps)
+    found = find_upright(sweeps)
     np.testing.assert_allclose(found @ found.T, np.eye(3), atol=1e-12)
     up = found @ R.T @ [0, 0, 1]  # what is up, after the turn that was found
     assert np.rad2deg(np.arccos(up[2])) < 1.0  # kerbs
-    assert np.array_equal(found, upright(sweeps))
+    assert np.array_equal(found, find_upright(sweeps))
 
 
 @pytest.mark.parametrize("rotvec_deg", [(0, 0, 0), (0, 4, 0), (-3, 2, 0)], ids=lambda r: str(r))
 def test_what_leans_little_is_left_alone(rotvec_deg):
     sweeps, _ = leaning(STREET, rotvec_deg)
-    assert np.array_equal(upright(sweeps), np.eye(3))
+    assert np.array_equal(find_upright(sweeps), np.eye(3))
 
 
 @pytest.mark.parametrize(
@@ -60,7 +58,7 @@ def test_what_leans_little_is_left_alone(rotvec_deg):
 )
 def test_axes_that_do_not_stand_on_the_ground_are_named(R, name):
     (sweep,), _ = leaning(STREET, (0, 0, 0), 1)
-    assert ground_aside(replace(sweep, points=sweep.points @ R.T)) == name
+    assert find_up_axis(replace(sweep, points=sweep.points @ R.T)) == name
 
 
 def test_where_no_ground_is_seen_nothing_is_turned():
@@ -73,13 +71,13 @@ def test_where_no_ground_is_seen_nothing_is_turned():
     strewn = Sweep(0, 0, cloud, np.zeros(n, np.float32), None, np.zeros(n, np.uint8), np.arange(n))
     nothing = one.select(np.zeros(len(one), bool))
     for sweeps in ([strewn], [nothing], []):
-        assert np.array_equal(upright(sweeps), np.eye(3))
-    assert ground_aside(strewn) == ground_aside(nothing) == ""
+        assert np.array_equal(find_upright(sweeps), np.eye(3))
+    assert find_up_axis(strewn) == find_up_axis(nothing) == ""
 
 
 def test_walls_and_roofs_are_no_ground():
     sweeps, _ = leaning(World(ROOM), (0, 0, 0), 1)
-    assert np.array_equal(upright(sweeps), np.eye(3))
+    assert np.array_equal(find_upright(sweeps), np.eye(3))
 
 
 def test_the_world_of_a_leaning_lidar_is_level():
@@ -91,10 +89,10 @@ def test_the_world_of_a_leaning_lidar_is_level():
     T_level_lidar = np.eye(4)
     T_level_lidar[:3, :3] = R
     leant = replace(trajectory, T_world_lidar=trajectory.T_world_lidar @ T_level_lidar)
-    for R_level_lidar, expected in ((upright(sweeps), True), (np.eye(3), False)):
+    for R_level_lidar, expected in ((find_upright(sweeps), True), (np.eye(3), False)):
         seen = replace(leant, R_level_lidar=R_level_lidar).part([0, 1, 2]).seen_from(1)
         stretch = deskew(sweeps, seen)
-        heights = ground(stretch, GroundSettings())
+        heights = ground(stretch)
         points = poses.transform(stretch[1].T_world_lidar, stretch[1].sweep.points)
         true_m = scene.height_m(1)
         low = true_m < 0.05

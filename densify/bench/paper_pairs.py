@@ -102,7 +102,7 @@ def pairs_of_boxes(specs: Sequence[str], most: int) -> Iterator[PaperPair]:
 
 def _pair_of_label(name: str, label: Label, config: Config) -> PaperPair:
     stretch = Stretch((label.registered, label.after))
-    heights = ground(stretch, config.ground)
+    heights = ground(stretch)
     here, there = (AboveGround.of(s, heights) for s in stretch.sweeps)
     known = label.sure[here.row]
     row, T = here.row[known], label.T_next_here

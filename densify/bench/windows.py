@@ -8,8 +8,7 @@ from dataclasses import dataclass
 
 from densify.config import Config
 from densify.flow.engines import Scene, estimate_motion
-from densify.free_space.ground import ground
-from densify.free_space.height_map import ABOVE_GROUND_M
+from densify.free_space.ground import ABOVE_GROUND_M, ground
 from densify.geometry import poses
 from densify.geometry.types import Bool, Float, LidarSequence, Motion, Stretch
 from densify.pipeline.recording import Recording
@@ -31,7 +30,7 @@ class Window:
         ComputationError where registration went wrong."""
         recording = Recording(sequence, config, size, [key], looks_around=True)
         stretch, around = recording.window(key), recording.around(key)
-        heights = ground(stretch, config.ground)
+        heights = ground(stretch)
         above = {f: heights.above(_in_world(stretch, f)) >= ABOVE_GROUND_M for f in stretch.frames}
         return Window(stretch, key, around, above)
 
@@ -57,7 +56,7 @@ class Window:
 def our_motion(stretch: Stretch, config: Config, asked: Collection[int] | None = None) -> Motion:
     """This package's engine, or that of ``flow.engine``, from the ground on. asked: frames whose
     flow will be asked for, all if None."""
-    heights = ground(stretch, config.ground)
+    heights = ground(stretch)
     scene = Scene(stretch, heights, asked=asked)
     return estimate_motion(scene, config)
 

@@ -15,9 +15,6 @@ from densify.config.sections import (
     FlowSettings as FlowSettings,
 )
 from densify.config.sections import (
-    GroundSettings as GroundSettings,
-)
-from densify.config.sections import (
     ObjectiveSettings as ObjectiveSettings,
 )
 from densify.config.sections import (

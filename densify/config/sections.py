@@ -28,13 +28,6 @@ class RegisterSettings(Section):
         "kiss-icp: estimate the poses from the sweeps; dataset: take the recording's own",
         choices=("kiss-icp", "dataset"),
     )
-    lead_in_s: float = knob(
-        0.5,
-        "[s] sweeps so far before the window are registered too, so that odometry knows the speed "
-        "and the first ones have neighbours; more is safer",
-        0,
-        5,
-    )
     voxel_size_m: float = knob(
         0.5,
         "[m] cell of KISS-ICP's local map; smaller is finer and slower, too small loses track. "
@@ -45,17 +38,6 @@ class RegisterSettings(Section):
     min_range_m: float = knob(2.8, "[m] nearer returns, the own vehicle's, are left out", 0, 50)
     max_range_m: float = knob(120.0, "[m] farther returns are left out", 5, 500)
     deskew: bool = knob(True, "undo the motion within each sweep; off only for compensated sweeps")
-    max_speed_m_s: float = knob(
-        60.0, "[m/s] a faster step between two sweeps is an error of registration", 1, 200
-    )
-    min_overlap: float = knob(
-        0.55,
-        "share of what stands in a sweep that must lie on the sweeps of a third of a second "
-        "before; right poses gave 0.73 (16 beams, 25 m/s) to 0.98, 0.42 to 0.95 (rosette, 8 m/s)",
-        0,
-        1,
-    )
-    min_num_points: int = knob(1000, "a sweep with fewer points cannot be registered", 1, 1_000_000)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -64,16 +46,6 @@ class RegisterSettings(Section):
                 f"register.min_range_m: got {self.min_range_m:g}, expected less than "
                 f"register.max_range_m = {self.max_range_m:g}"
             )
-
-
-@dataclass(frozen=True)
-class GroundSettings(Section):
-    """How high every point is above the ground."""
-
-    cell_m: float = knob(1.0, "[m] grid cell; smaller follows kerbs, larger bridges holes", 0.1, 10)
-    max_slope: float = knob(
-        0.15, "rise per metre; steeper is taken for an object, less for ground", 0.01, 1
-    )
 
 
 @dataclass(frozen=True)
@@ -261,7 +233,6 @@ class Config:
     """The whole configuration; ``Config()`` is the default one. Sections mirror the stages."""
 
     register: RegisterSettings = dataclasses.field(default_factory=RegisterSettings)
-    ground: GroundSettings = dataclasses.field(default_factory=GroundSettings)
     flow: FlowSettings = dataclasses.field(default_factory=FlowSettings)
     objective: ObjectiveSettings = dataclasses.field(default_factory=ObjectiveSettings)
     accumulate: AccumulateSettings = dataclasses.field(default_factory=AccumulateSettings)

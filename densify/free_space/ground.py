@@ -1,28 +1,279 @@
 # SPDX-License-Identifier: MIT
-"""Ground: one height map of a stretch."""
+"""The ground: its height under a stretch of sweeps, and how a lidar is mounted above it."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
-from densify.config import GroundSettings
-from densify.free_space.height_map import HeightMap
+import numpy as np
+from scipy import ndimage
+from scipy.spatial.transform import Rotation
+
 from densify.geometry import poses
-from densify.geometry.types import Float, Stretch
+from densify.geometry.compiled import Kernel, inlined
+from densify.geometry.types import Float, Float32, Int, Stretch, Sweep
+
+ABOVE_GROUND_M = 0.2
+"""Points lower than this above the ground are part of it: they start no motion."""
+CELL_M = 1.0  # smaller cells follow kerbs, larger ones bridge holes
+MAX_SLOPE = 0.15  # rise per metre; steeper surfaces are objects
+_LOW_OUTLIER_M = 0.4
+_GROUND_M = 0.15  # points this close to the lowest point belong to the ground
+_NARROW_M, _HUMP_M = 7.0, 0.2  # a hump that is narrower and higher is not ground
+_FEW = 3.0  # points in and around a cell are too few for a mean
+
+_NUM_SWEEPS = 5
+_NEAR_M = 30.0
+_NUM_POINTS, _NUM_TRIES = 1000, 200
+_CLOSE_M, _BELOW_M = 0.1, 0.3
+_MAX_SHARE_BELOW = 0.03  # of the points; more lie below the plane of a wall or a roof
+_LEAST_SHARE = 0.1
+_UPSIDE_DOWN = np.diag([1.0, -1.0, -1.0])
+_MAX_LEAN_RAD, _MIN_LEAN_RAD = np.deg2rad([50.0, 6.0])  # less is the road's slope, or load
 
 
-def ground(stretch: Stretch, settings: GroundSettings) -> HeightMap:
-    """All sweeps together fill a grid in the world, whose z is taken for up."""
-    return HeightMap.of(_InWorld(stretch), settings)
+def ground(stretch: Stretch) -> HeightMap:
+    """Return the ground height under all sweeps, in the world frame with z up."""
+    return HeightMap.of(_WorldPoints(stretch))
 
 
 @dataclass(frozen=True)
-class _InWorld:
-    """The sweeps' points, one sweep at a time: together they would need as much memory again as the
-    stretch."""
+class _WorldPoints:
+    """The (N,3) points of each sweep, world frame, made one sweep at a time to save memory."""
 
     stretch: Stretch
 
     def __iter__(self) -> Iterator[Float]:
         return (poses.transform(s.T_world_lidar, s.sweep.points) for s in self.stretch.sweeps)
+
+
+@dataclass(frozen=True)
+class HeightMap:
+    """Ground heights on a grid.
+
+    heights_m: (X,Y) at the cells' centres. low_m: (2,) the grid's lower corner.
+    """
+
+    heights_m: Float
+    low_m: Float
+    cell_m: float
+
+    @staticmethod
+    def of(clouds: Iterable[Float]) -> HeightMap:
+        """Find the ground under point clouds.
+
+        The second lowest point of a cell is its ground (the lowest may be a stray reflection). A
+        cell far below the median of its neighbours is repaired. The slope limit then cuts cars and
+        walls away, and humps are removed. The points near this lower hull are averaged.
+
+        clouds: (N,3) each, metres, z up, at least one point in all; iterated three times.
+        """
+        low, shape = _grid(clouds)
+        lowest, second = np.full((2, *shape), np.inf)
+        for points in clouds:
+            _two_lowest(points, low, CELL_M, lowest, second)
+        heights = np.where(np.isfinite(second), second, lowest)
+
+        known = np.isfinite(heights)
+        nearest = ndimage.distance_transform_edt(
+            ~known, return_distances=False, return_indices=True
+        )
+        around = ndimage.median_filter(heights[tuple(nearest)], 5)
+        heights = np.where(known & (heights < around - _LOW_OUTLIER_M), around, heights)
+        heights = _slope_limited(heights, MAX_SLOPE * CELL_M)
+        hull = HeightMap(_without_humps(heights[tuple(nearest)]), low, CELL_M)
+        return HeightMap(_averaged(hull, clouds), low, CELL_M)
+
+    def under(self, points: Float) -> Float:
+        """Return the (N,) ground height in metres at points (N,2) or (N,3).
+
+        Beyond the grid the height is that of the nearest edge.
+        """
+        ground_m = np.empty(len(points))
+        _heights_under.over_rows(
+            len(points), points, self.low_m, self.cell_m, self.heights_m, ground_m
+        )
+        return ground_m
+
+    def above(self, points: Float) -> Float32:
+        """Return the (N,) height in metres of points (N,3) above the ground."""
+        height_m: Float32 = (points[:, 2] - self.under(points)).astype(np.float32)
+        return height_m
+
+
+def _grid(clouds: Iterable[Float]) -> tuple[Float, tuple[int, int]]:
+    """Return the (2,) lower corner of a grid that holds all points, and its numbers of cells."""
+    low, high = np.full(2, np.inf), np.full(2, -np.inf)
+    for points in clouds:
+        if len(points):
+            low = np.minimum(low, points[:, :2].min(axis=0))
+            high = np.maximum(high, points[:, :2].max(axis=0))
+    low = np.floor(low / CELL_M) * CELL_M
+    num_x, num_y = ((high - low) / CELL_M).astype(np.int64) + 1
+    return low, (int(num_x), int(num_y))
+
+
+def _averaged(hull: HeightMap, clouds: Iterable[Float]) -> Float:
+    """Return the (X,Y) mean height of the points close to the hull, around each cell.
+
+    The hull itself is lower where more points were measured; an object that drives from one such
+    place to another must not climb.
+    """
+    number = np.zeros(hull.heights_m.shape, np.int64)
+    total = np.zeros(hull.heights_m.shape)
+    for points in clouds:
+        over_m = points[:, 2] - hull.under(points)
+        _add_near(points, over_m, hull.low_m, hull.cell_m, number, total)
+    number = ndimage.uniform_filter(number.astype(float), 3, mode="constant") * 9
+    total = ndimage.uniform_filter(total, 3, mode="constant") * 9
+    mean: Float = hull.heights_m + np.where(number >= _FEW, total / np.maximum(number, 1), 0.0)
+    return mean
+
+
+def _without_humps(heights: Float) -> Float:
+    """Remove narrow humps, such as a vehicle that never left its place; slopes and kerbs stay.
+
+    Morphological opening: Zhang et al., "A Progressive Morphological Filter for Removing Nonground
+    Measurements from Airborne LIDAR Data", TGRS 2003.
+    """
+    size = round(_NARROW_M / CELL_M)
+    opened = ndimage.grey_opening(heights, (size, size))
+    return np.where(heights - opened > _HUMP_M, opened, heights)
+
+
+def _slope_limited(heights: Float, rise: float) -> Float:
+    """Return the largest map below ``heights`` that rises by at most ``rise`` per cell."""
+    cone = -rise * np.hypot(*np.meshgrid([-1.0, 0.0, 1.0], [-1.0, 0.0, 1.0]))
+    while True:
+        lower = ndimage.grey_erosion(heights, structure=cone, mode="nearest")
+        if np.array_equal(lower, heights):
+            return lower
+        heights = lower
+
+
+@inlined
+def _cell(points, i, low_m, cell_m):  # type: ignore[no-untyped-def]
+    return int((points[i, 0] - low_m[0]) / cell_m), int((points[i, 1] - low_m[1]) / cell_m)
+
+
+@Kernel
+def _two_lowest(points: Float, low_m: Float, cell_m: float, lowest: Float, second: Float) -> None:
+    """Lower the two lowest different heights of each cell to those of the points, in place.
+
+    points: (N,3) inside the grid. lowest, second: (X,Y), inf where there is none.
+    """
+    for i in range(len(points)):
+        x, y = _cell(points, i, low_m, cell_m)
+        z = points[i, 2]
+        if z < lowest[x, y]:
+            lowest[x, y], second[x, y] = z, lowest[x, y]
+        elif lowest[x, y] < z < second[x, y]:
+            second[x, y] = z
+
+
+@Kernel
+def _heights_under(
+    first: int,
+    last: int,
+    points: Float,
+    low_m: Float,
+    cell_m: float,
+    heights_m: Float,
+    ground_m: Float,
+) -> None:
+    """Fill ``ground_m`` (N,) with the grid's heights at the points, linear between the cells."""
+    end_x, end_y = heights_m.shape[0] - 1, heights_m.shape[1] - 1
+    for i in range(first, last):
+        x = min(max((points[i, 0] - low_m[0]) / cell_m - 0.5, 0.0), float(end_x))
+        y = min(max((points[i, 1] - low_m[1]) / cell_m - 0.5, 0.0), float(end_y))
+        left, near = int(x), int(y)
+        right, far = min(left + 1, end_x), min(near + 1, end_y)
+        x, y = x - left, y - near
+        ground_m[i] = (
+            heights_m[left, near] * (1 - x) * (1 - y)
+            + heights_m[left, far] * (1 - x) * y
+            + heights_m[right, near] * x * (1 - y)
+            + heights_m[right, far] * x * y
+        )
+
+
+@Kernel
+def _add_near(
+    points: Float, over_m: Float, low_m: Float, cell_m: float, number: Int, total_m: Float
+) -> None:
+    """Count and add up, by cell and in place, the heights ``over_m`` (N,) close to 0.
+
+    points: (N,3) inside the grid. number, total_m: (X,Y).
+    """
+    for i in range(len(points)):
+        if np.abs(over_m[i]) < _GROUND_M:
+            x, y = _cell(points, i, low_m, cell_m)
+            number[x, y] += 1
+            total_m[x, y] += over_m[i]
+
+
+def find_upright(sweeps: Sequence[Sweep]) -> Float:
+    """Return (3,3) ``R_level_lidar``, which turns the lidar's axes so that z is up.
+
+    The ground plane is found by RANSAC within 30 m (Fischler, Bolles, "Random sample consensus",
+    1981), as the median over at most five of the sweeps. A lidar is upside down where no sweep has
+    a ground below and some have one above. The identity is returned for less than 6 degrees, or
+    where no sweep shows a ground: a height map follows such slopes.
+    """
+    chosen = sweeps[:: max(1, len(sweeps) // _NUM_SWEEPS)][:_NUM_SWEEPS]
+    for R_hung_lidar in (np.eye(3), _UPSIDE_DOWN):
+        turned = (sweep.points @ R_hung_lidar.T for sweep in chosen)
+        normals = [n for n in map(_ground_normal, turned) if n is not None]
+        if normals:
+            return _level(np.median(normals, axis=0)) @ R_hung_lidar
+    return np.eye(3)
+
+
+def find_up_axis(sweep: Sweep) -> str:
+    """Return the axis that points up, such as ``-y``; "" where it is z or -z, or not known."""
+    if any(_ground_normal(sweep.points @ R.T) is not None for R in (np.eye(3), _UPSIDE_DOWN)):
+        return ""
+    for name in ("-y", "y", "-x", "x"):
+        up = np.eye(3)["xyz".index(name[-1])] * (-1.0 if name[0] == "-" else 1.0)
+        forward = np.roll(up, 1)
+        R_hung_lidar = np.stack([forward, np.cross(up, forward), up])
+        if _ground_normal(sweep.points @ R_hung_lidar.T) is not None:
+            return name
+    return ""
+
+
+def _level(up: Float) -> Float:
+    """Return the smallest rotation (3,3) that turns this direction (3,) to z."""
+    up = up / np.linalg.norm(up)
+    axis = np.cross(up, [0.0, 0.0, 1.0])
+    lean_rad = float(np.arccos(np.clip(up[2], -1, 1)))
+    if lean_rad < _MIN_LEAN_RAD:
+        return np.eye(3)
+    R: Float = Rotation.from_rotvec(axis / np.linalg.norm(axis) * lean_rad).as_matrix()
+    return R
+
+
+def _ground_normal(points: Float) -> Float | None:
+    """Return the (3,) unit normal of the ground plane, upwards; None where there is none."""
+    points = points[np.linalg.norm(points, axis=1) < _NEAR_M]
+    points = points[:: len(points) // _NUM_POINTS + 1]
+    if len(points) < 3:
+        return None
+    rng = np.random.default_rng(0)
+    a, b, c = points[rng.integers(len(points), size=(_NUM_TRIES, 3))].transpose(1, 0, 2)
+    normal = np.cross(b - a, c - a)
+    length = np.linalg.norm(normal, axis=1)
+    normal, a = normal[length > 0] / length[length > 0, None], a[length > 0]
+    normal *= np.where(normal[:, 2] < 0, -1, 1)[:, None]
+    level = normal[:, 2] > np.cos(_MAX_LEAN_RAD)
+    normal, a = normal[level], a[level]
+    above = points @ normal.T - np.einsum("ij,ij->i", normal, a)
+    close = (np.abs(above) < _CLOSE_M).mean(axis=0)
+    close[(above < -_BELOW_M).mean(axis=0) > _MAX_SHARE_BELOW] = 0.0
+    if not len(close) or close.max() < _LEAST_SHARE:
+        return None
+    on_plane = points[np.abs(above[:, int(np.argmax(close))]) < _CLOSE_M]
+    _, _, axes = np.linalg.svd(on_plane - on_plane.mean(axis=0), full_matrices=False)
+    fitted: Float = axes[2] * np.sign(axes[2, 2])
+    return fitted

@@ -25,8 +25,8 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from densify.config.errors import InputError
-from densify.free_space import rays as kernels
 from densify.free_space import rings as measure
+from densify.free_space.rays import aim
 from densify.geometry.arrays import Bool, Float, Float32
 from densify.geometry.types import RegisteredSweep
 
@@ -67,13 +67,12 @@ def aimed(registered: RegisteredSweep, lidar: int) -> Aimed:
     if offset_ns is not None:
         offset_s = (offset_ns * 1e-9).astype(np.float32)
     seen = np.empty((3, len(points)), np.float32)
-    kernels.aim.over_rows(
+    aim.over_rows(
         len(points),
         points.astype(np.float32),
         offset_s,
         sweep.origin_m(lidar).astype(np.float32),
         sweep.axes(lidar).astype(np.float32, order="C"),
-        sweep.R_scanner_lidar is not None,
         np.stack([registered.twist_before, registered.twist_after]).astype(np.float32),
         seen,
     )

@@ -129,7 +129,7 @@ def make_clip(sequence: LidarSequence, key: int, settings: Config, labels: str) 
     package's engine too.
     """
     stretch = Recording(sequence, settings, NUM_SWEEPS // 2, [key]).window(key)
-    heights = ground(stretch, settings.ground)
+    heights = ground(stretch)
     above = [AboveGround.of(s, heights) for s in stretch.sweeps]
     frames, indices = stretch.frames, range(len(stretch.frames))
     truth: list[Labels | None] = [None] * len(frames)

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from densify.free_space.height_map import ABOVE_GROUND_M, HeightMap
+from densify.free_space.ground import ABOVE_GROUND_M, HeightMap
 from densify.geometry import poses
 from densify.geometry.types import Float, Float32, Int, RegisteredSweep
 

@@ -13,8 +13,7 @@ from densify.config import Config
 from densify.config.errors import ComputationError, InputError, OutputError
 from densify.config.plugins.readers import READERS
 from densify.flow.boxes import BoxMargins, flow_of_boxes
-from densify.free_space.ground import ground
-from densify.free_space.height_map import ABOVE_GROUND_M
+from densify.free_space.ground import ABOVE_GROUND_M, ground
 from densify.geometry import poses
 from densify.geometry.types import (
     Bool,
@@ -97,8 +96,7 @@ def _label(
     registered, after = stretch[frame], stretch[following[0]]
     field, sure = flow_of_boxes(registered, after, own, others, margins)
     if without_ground:
-        settings = recording.settings
-        heights = ground(stretch, settings.ground)
+        heights = ground(stretch)
         in_world = poses.transform(registered.T_world_lidar, registered.sweep.points)
         sure &= heights.above(in_world) >= ABOVE_GROUND_M
     T_next_here = stretch.T_target_source(following[0], frame)

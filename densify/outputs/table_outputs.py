@@ -123,13 +123,14 @@ def tracks_table(key: int, tracks: Sequence[ObjectTrack]) -> dict[str, Any]:
 
 def write_run_yaml(result: Result, context: Context, folder: Path) -> None:
     """Write ``run.yaml``: data, key, frames, cameras, warnings, configuration, cost of each stage,
-    versions, and how the submaps beyond the window were registered."""
+    and versions."""
     record = {
         "data": context.data,
         "key": result.key,
         "method": result.method,
         "frames": result.frames,
         "far_frames": result.far_frames,
+        "far_left_out": result.far_left_out,
         "cameras": list(result.depth),
         "prior": {
             name: {"source": full.source, **asdict(full.fit), "share": full.share}
@@ -141,20 +142,7 @@ def write_run_yaml(result: Result, context: Context, folder: Path) -> None:
         "versions": versions(),
     }
     text = yaml.safe_dump(plain(record), sort_keys=False, allow_unicode=True)
-    text += yaml.safe_dump({"far_links": _far_links(result)}, default_flow_style=None, width=200)
     write_file(folder / "run.yaml", text.encode())
-
-
-def _far_links(result: Result) -> dict[str, Any]:
-    """Return a row for each pair of submaps, and the names of its columns (`Links`)."""
-    links = result.far_links
-    names = ("overlap", "rms_m", "num_matches", "correction_m", "correction_deg", "left_m")
-    columns = [*links.frames.T, *(np.round(getattr(links, name), 4) for name in names)]
-    return {
-        "left_out": list(result.far_left_out),
-        "columns": ["target", "source", *names],
-        "pairs": [list(row) for row in zip(*(c.tolist() for c in columns), strict=True)],
-    }
 
 
 def stages(result: Result) -> list[dict[str, Any]]:

@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""How the sweeps of a recording are cut into blocks that are worked on together."""
+"""The blocks of sweeps that a recording is cut into; each step works on one block."""
 
 from __future__ import annotations
 
-import math
 from bisect import bisect_right
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
@@ -12,8 +11,8 @@ from typing import NamedTuple
 from densify.readers.timeline import Timeline, check_key, check_window
 
 BLOCK_S = 2.0
-_MARGIN_S = 1.5  # beyond a block within which its motion is found,
-_BEYOND_WINDOW_S = 0.5  # and at least so far beyond the windows of its keys
+MARGIN_S = 1.5  # around a block within which its motion is found,
+BEYOND_WINDOW_S = 0.5  # and at least this far beyond the windows of its keys
 
 
 class Block(NamedTuple):
@@ -26,11 +25,11 @@ class Block(NamedTuple):
 
 @dataclass(frozen=True)
 class Cut:
-    """How a recording is cut.
+    """A recording cut into blocks.
 
-    blocks: ascending in time. number_of: frame of a key -> its block. margin_s: how far the motion
-    of a block is followed beyond it; no step looks farther. 0: blocks know nothing of each other,
-    and may overlap. num_kept: deskewed sweeps that are worth keeping in memory.
+    blocks: ascending in time. number_of: frame of a key -> its block. margin_s: how far around a
+    block its steps look; 0: blocks are independent and may overlap. num_kept: deskewed sweeps that
+    are worth keeping in memory.
     """
 
     blocks: tuple[Block, ...]
@@ -39,25 +38,20 @@ class Cut:
     num_kept: int
 
     def number_near(self, frame: int) -> int:
-        """The block of a frame, or of the last sweep before it where it has none."""
+        """Return the block of a frame, or of the last sweep before it where it has none."""
         frames = sorted(self.number_of)
         return self.number_of[frames[max(0, bisect_right(frames, frame) - 1)]]
 
-    @property
-    def num_blocks_around(self) -> int:
-        """How many blocks on each side of a block its motion is made of. Steps look one sweep
-        farther than the margin, which may be as far as a hole in time is long."""
-        return math.ceil((self.margin_s + 0.5) / BLOCK_S)
-
-    @property
-    def num_sweeps_of_block(self) -> int:
-        """Sweeps that the motion of a block is made of, at the most."""
-        most = max((len(block.frames) for block in self.blocks), default=0)
-        return math.ceil(most * (1 + 2 * self.margin_s / BLOCK_S))
+    def keys_of(self, number: int) -> list[int]:
+        """Return the keys of a block."""
+        return [key for key, n in self.number_of.items() if n == number]
 
     @staticmethod
     def whole(timeline: Timeline, window: int) -> Cut:
-        """Blocks of `BLOCK_S`, counted from time 0, of every sweep that has a stamp."""
+        """Cut all sweeps into blocks of `BLOCK_S`, counted from time 0.
+
+        The same sweeps make the same maps, whatever keys are asked for.
+        """
         check_window(window)
         length_ns = round(BLOCK_S * 1e9)
         members: dict[int, list[int]] = {}
@@ -68,16 +62,18 @@ class Cut:
             for at, frames in sorted(members.items())
         )
         number_of = {f: number for number, block in enumerate(blocks) for f in block.frames}
-        margin_s = max(_MARGIN_S, window * timeline.period_ns * 1e-9 + _BEYOND_WINDOW_S)
+        margin_s = max(MARGIN_S, window * timeline.period_ns * 1e-9 + BEYOND_WINDOW_S)
         return Cut(blocks, number_of, margin_s, 2 * window + 3)
 
     @staticmethod
     def around(
         timeline: Timeline, window: int, keys: Collection[int], beyond_s: float = 0.0
     ) -> Cut:
-        """The windows of the keys and ``beyond_s`` before and after them; those that overlap are
-        one block, unless its keys then are more than `BLOCK_S` apart. Raises InputError if a key
-        does not exist."""
+        """Take the windows of a few keys, and ``beyond_s`` around them, and nothing else.
+
+        Windows that overlap are one block, unless its keys are more than `BLOCK_S` apart. Raises
+        InputError if a key does not exist.
+        """
         for key in keys:
             check_key(key)
         check_window(window)
@@ -103,5 +99,4 @@ class Cut:
             end_ns = timeline.stamp_of(frames[-1]) + 1
             blocks.append(Block(frames, timeline.stamp_of(frames[0]), end_ns))
         number_of = {key: number for number, group in enumerate(groups) for key in group}
-        most = max((len(block.frames) for block in blocks), default=0)
-        return Cut(tuple(blocks), number_of, 0.0, most)
+        return Cut(tuple(blocks), number_of, 0.0, max((len(b.frames) for b in blocks), default=0))

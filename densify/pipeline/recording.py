@@ -1,27 +1,10 @@
 # SPDX-License-Identifier: MIT
-"""A recording and what is worked out about it, each step made once and asked for by name
-(`densify.pipeline.block_steps`)::
+"""A recording, and what is known around each of its keys.
 
-    sweeps         read, without the own vehicle's returns
-    registration   poses of the sweeps
-    images         range images: what each sweep saw, and therefore saw through
-    ground         height of the ground
-    evidence       what may move, told by all sweeps around
-    motion         how everything moves
-    moment         all sweeps of a key's window as they stand at the key's moment
-    far            what stands along the road around, as sweeps beyond the window saw it
-
-The sweeps are cut into blocks, and each step works on one block. How far it looks beyond its block
-is a number of seconds, 0 at the least. Two ways to cut serve all users:
-
-* `Cut.around` (`densify.pipeline.blocks`): the windows of a few keys, which look at nothing else.
-  `run` and `compare` use it: no key costs more than it must.
-* `Cut.whole`: blocks of two seconds, counted from time 0 whatever keys are wanted, that look well
-  into the blocks around. The same sweeps make the same maps, whatever else is asked for: `dataset`
-  uses it.
-
-Sweeps that cannot be read or registered are left out and split the recording: windows end there,
-as they do at holes in time (`densify.readers.timeline`).
+The sweeps are cut into blocks (`densify.pipeline.blocks`), and the steps that keys share are made
+block by block (`densify.pipeline.steps`). `run` and `compare` cut around a few keys, which look at
+nothing else; `dataset` and `flow_steps` cut the whole recording, so that the same sweeps make the
+same maps whatever else is asked for.
 """
 
 from __future__ import annotations
@@ -48,16 +31,15 @@ from densify.geometry.types import (
     Stretch,
     StretchFlow,
 )
-from densify.pipeline.block_steps import BlockSteps
 from densify.pipeline.blocks import Cut
 from densify.pipeline.costs import Watch
+from densify.pipeline.steps import Steps
 from densify.readers.timeline import Timeline, WindowFrames
 from densify.registration.trajectory import LeftOut
 
 
 class Moment(NamedTuple):
-    """What is measured around a key, as it stands at the key's moment. flow: where asked for.
-    tracks: of what moves; none without flow."""
+    """All points around a key at the key's moment. flow: where asked for. tracks: of what moves."""
 
     cloud: Cloud
     flow: StretchFlow | None
@@ -65,18 +47,14 @@ class Moment(NamedTuple):
 
 
 class Beyond(NamedTuple):
-    """What stands along the road beyond a key's window, in a world of its own."""
+    """Static surfaces along the road beyond a key's window, in a world of their own."""
 
     standing: StandingWorld
     T_key_standing: Float
 
 
 class Recording:
-    """A sequence, settings, and the steps. Holds little: what was read and made last.
-
-    `window`, `motion`, `moment` and `standing` answer for a key; `steps` for a block, with what its
-    keys share.
-    """
+    """A sequence with settings, and what the steps find in it."""
 
     def __init__(
         self,
@@ -89,102 +67,99 @@ class Recording:
         watch: Watch | None = None,
         looks_around: bool = False,
     ) -> None:
-        """window: sweeps on each side of a key. keys: work on their windows alone, see
-        `Cut.around`; None for the whole recording, see `Cut.whole`. cache: keeps the steps' results
-        on disk; None keeps nothing. run: the same for all processes between which no sweep changes;
-        None for this object alone. watch: measures the steps.
-        looks_around: of keys, what moves is looked for ``flow.look_around_s`` beyond their windows
-        too, where the engine can make use of that.
+        """Read the stamps, nothing else.
+
+        window: sweeps on each side of a key. keys: work on their windows alone; None for the whole
+        recording. cache: keeps the results of steps on disk. run: the same text for all processes
+        between which no sweep changes; None for this object alone. watch: measures the steps.
+        looks_around: find motion ``flow.look_around_s`` beyond the windows of the keys too.
 
         Raises InputError if a key does not exist.
         """
         self.sequence, self.settings = sequence, settings
         self.timeline = Timeline.of(sequence)
-        cut = Cut.whole(self.timeline, window)
-        if keys is not None:
-            cut = Cut.around(self.timeline, window, keys)
-            if looks_around and engine_row(settings.flow.engine)[0].shared:
-                cut = Cut.around(self.timeline, window, keys, self._around_s(keys))
-        self.cut = cut
         self._num_around, self._watch = window, watch or Watch()
-        self.steps = BlockSteps(
-            sequence, settings, self.timeline, cut, window, cache, run, self._watch
+        if keys is None:
+            self.cut = Cut.whole(self.timeline, window)
+        else:
+            self.cut = Cut.around(self.timeline, window, keys)
+            if looks_around and engine_row(settings.flow.engine)[0].shared:
+                self.cut = Cut.around(self.timeline, window, keys, self._around_s(keys))
+        self.steps = Steps(
+            sequence, settings, self.timeline, self.cut, window, cache, run, self._watch
         )
-        self._places = self.steps.places
 
     def _around_s(self, keys: Collection[int]) -> float:
-        """How far beyond the windows of keys what moves is looked for, by the points that the first
-        one's sweep has; 0 where that says nothing."""
+        """Return how far beyond the windows to look, by the number of points of the first key."""
         settings = self.settings.flow
         if settings.look_around_s is not None or not keys:
             return settings.look_around_s or 0.0
         try:
             num_points = len(self.sequence[min(keys)])
-        except InputError:  # whoever works on it says why
+        except InputError:  # raised again where the key is made
             return 0.0
         return settings.around_s(num_points / (self.timeline.period_ns * 1e-9))
 
     def window_frames(self, key: int) -> WindowFrames:
-        """The frames of a key's window, and where it is cut and why.
+        """Return the frames of a key's window, and where it is cut and why.
 
         Raises InputError if the key does not exist or cannot be used, UnplacedSweepError if it
         cannot be registered; SweepError if none of its neighbours can.
         """
-        found = self.timeline.window(key, self._num_around)
-        number = self.cut.number_of[key]
+        whole = self.timeline.window(key, self._num_around)
         bad: dict[int, LeftOut] = {}
-        for b in self._places.blocks_with(number, found.frames):
+        for b in self.steps.blocks_around(self.cut.number_of[key]):
             own = self.cut.blocks[b].frames
             bad |= {f: why for f, why in self.steps.registration(b).bad.items() if f in own}
         if key in bad:
             raise bad[key].error(key)
         reasons = {f: why.reason for f, why in bad.items()}
-        piece = self._places.piece(key)[1]
         window = self.timeline.window(key, self._num_around, reasons)
+        piece = self.steps.pieces(self.cut.number_of[key])[self._piece(key)]
         window = WindowFrames(tuple(f for f in window.frames if f in piece.frames), window.cuts)
-        failed = [f for f in found.frames if f in bad and not bad[f].unreadable]
+        failed = [f for f in whole.frames if f in bad and not bad[f].unreadable]
         if failed and len(window.frames) == 1:
             raise bad[failed[0]].error(failed[0])
         return window
 
     def window(self, key: int) -> Stretch:
-        """The sweeps of a key's window, registered and deskewed. Errors as `window_frames`."""
-        number = self.cut.number_of[key]
-        frames = self.window_frames(key).frames
-        return self._places.stretch(number, self.cut.margin_s, frames)
+        """Return the registered, deskewed sweeps of a key's window. Errors as `window_frames`."""
+        return self.steps.stretch(self.cut.number_of[key], self.window_frames(key).frames)
 
     def around(self, key: int) -> Stretch:
-        """The sweeps that the motion in a key's window is found out from."""
-        number, (index, _) = self.cut.number_of[key], self._places.piece(key)
-        margin_s = self.cut.margin_s
-        frames = self._places.frames_within(number, margin_s)[index]
-        return self._places.stretch(number, margin_s, frames)
+        """Return the sweeps in which the motion in a key's window is found."""
+        return self.steps.stretch(self.cut.number_of[key], self._frames_around(key))
 
     def is_pair(self, key: int) -> bool:
-        """Whether nothing can be followed around a key: a track shows itself in three sweeps."""
-        number, (index, _) = self.cut.number_of[key], self._places.piece(key)
-        return len(self._places.frames_within(number, self.cut.margin_s)[index]) == 2
+        """Return True if there are two sweeps around a key: a track needs three."""
+        return len(self._frames_around(key)) == 2
 
     def motion(self, key: int, engine: str | None = None) -> Motion:
-        """How everything in a key's window moves. engine: None for that of ``flow.engine``; of two
-        sweeps ``pairs`` takes the place of ``groups``."""
-        engine = engine or self.settings.flow.engine
-        number, (index, piece) = self.cut.number_of[key], self._places.piece(key)
-        window = self.window(key)
+        """Return the motion of everything in a key's window.
+
+        engine: None for that of ``flow.engine``; for two sweeps ``pairs`` replaces ``groups``.
+        """
+        engine, number = engine or self.settings.flow.engine, self.cut.number_of[key]
+        window, index = self.window(key), self._piece(key)
         if engine == "groups" and self.is_pair(key):
             engine = "pairs"
         if not engine_row(engine)[0].shared:
             scene = Scene(window, self.steps.ground(number)[index])
             return estimate_motion(scene, self.settings, engine)
-        frames, motion = self.steps.motion(number, engine)[index]
+        motion = self.steps.motion(number, engine)[index]
         # All poses, but the points of the window only.
-        at_hand = {s.frame: s for s in window.sweeps}
-        sweeps = [at_hand.get(f) or RegisteredSweep.without_points(piece, f) for f in frames]
+        at_hand, piece = {s.frame: s for s in window.sweeps}, self.steps.pieces(number)[index]
+        sweeps = [
+            at_hand.get(f) or RegisteredSweep.without_points(piece, f)
+            for f in self._frames_around(key)
+        ]
         return motion.with_stretch(Stretch(tuple(sweeps)))
 
     def step(self, frame: int) -> StretchFlow:
-        """The flow of a sweep to the next; no step where none follows. Errors as `window_frames`,
-        but a sweep may be alone."""
+        """Return the flow of a sweep to the next; no step where none follows.
+
+        Errors as `window_frames`, but a sweep may be alone.
+        """
         window = self.window(frame)
         following = [f for f in window.frames if f > frame][:1]
         motion = self.motion(frame) if following else None
@@ -195,11 +170,11 @@ class Recording:
     def moment(
         self, key: int, all_sweeps: bool, engine: str | None, with_flow: bool = False
     ) -> Moment:
-        """What is measured around a key, as it stands at the key's moment.
+        """Accumulate the sweeps around a key at the key's moment.
 
-        all_sweeps: of the window; else the key sweep alone. engine: which flow moves the points,
-        "" for the configured one; None leaves them where registration puts them. with_flow: and
-        the flow of every sweep to the next one on the way to the key.
+        all_sweeps: of the window; else the key sweep alone. engine: of the flow that moves the
+        points, "" for the configured one; None for rigid accumulation. with_flow: return the flow
+        of every sweep to the next one on the way to the key too.
         """
         stretch, flow = self.window(key), None
         tracks: tuple[ObjectTrack, ...] = ()
@@ -217,14 +192,22 @@ class Recording:
             return Moment(accumulate(used, fields, key, drop_lost), flow, tracks)
 
     def standing(self, key: int) -> Beyond | None:
-        """What stands along the road before and behind the key's window; None where nothing beyond
-        it is known, or wanted (``accumulate.far_m``)."""
+        """Return the static surfaces before and behind the key's window.
+
+        None where nothing is known there, or wanted (``accumulate.far_m``).
+        """
         if not self.settings.accumulate.far_m:
             return None
-        number = self.cut.number_of[key]
-        pieces = self._places.pieces(number, 0.0)
-        index, piece = next((i, p) for i, p in enumerate(pieces) if key in p.frames)
-        found = self.steps.far(number)[index]
+        number, index = self.cut.number_of[key], self._piece(key)
+        found, piece = self.steps.far(number)[index], self.steps.pieces(number)[index]
         if not len(found.frames):
             return None
         return Beyond(found, poses.inverse(piece.T_world_lidar[piece.frames.index(key)]))
+
+    def _piece(self, key: int) -> int:
+        """Return which of the pieces of its block holds the key."""
+        pieces = self.steps.pieces(self.cut.number_of[key])
+        return next(i for i, piece in enumerate(pieces) if key in piece.frames)
+
+    def _frames_around(self, key: int) -> tuple[int, ...]:
+        return self.steps.frames(self.cut.number_of[key])[self._piece(key)]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The road before and after a window: what stands along it, as sweeps beyond the window saw it."""
+"""The road before and behind a window: static surfaces that sweeps beyond the window measured."""
 
 from __future__ import annotations
 
@@ -21,33 +21,34 @@ from densify.geometry.types import (
     Bool,
     Camera,
     Float,
-    Int,
-    Links,
     RegisteredSweep,
     StandingWorld,
     Stretch,
     Sweep,
     Trajectory,
 )
-from densify.pipeline.costs import Watch
 from densify.pipeline.sweeps import Sweeps
 from densify.readers.timeline import Timeline
 from densify.registration.alignment import subsample
-from densify.registration.chain import follow
-from densify.registration.deskew import placed, twists
-from densify.registration.submaps import num_in_submap, relax
+from densify.registration.deskew import deskew_sweep, twists
+from densify.registration.road_poses import follow_road, num_in_submap, relax_poses
 
 _STEP_M = 2.0
-_MOST_S = 15.0  # on each side: who stands, or crawls, sees nothing new
+_MOST_S = 15.0  # on each side: a vehicle that stands or crawls sees nothing new
 _LEAST_STEP_M = 0.5 * _STEP_M
 _SAME_VIEW_M = 3.0
 _SLACK_M = 4.0  # that a lidar moves within a sweep, and a camera until its exposure
 
+_View = tuple[Camera, Float]
+"""A camera and its ``T_cam_world``."""
+
 
 class _Passed(NamedTuple):
-    """A sweep along the road. registered: what a camera may see of it; raw, unless it was known.
-    sample: (N,3) deskewed, some of all its points. travel_m: since the first sweep of the window.
-    known: of the window."""
+    """A sweep along the road.
+
+    registered: its points that a camera may see; raw, unless it is known. sample: (N,3) some of
+    its points, deskewed. travel_m: since the first sweep of the window. known: of the window.
+    """
 
     registered: RegisteredSweep
     sample: Float
@@ -57,74 +58,61 @@ class _Passed(NamedTuple):
 
 @dataclass(frozen=True)
 class Road:
-    """far_m: how far back and ahead. cameras: what none of them can see is left out."""
+    """far_m: travel before and behind a window. cameras: points that none can see are dropped."""
 
     timeline: Timeline
     sweeps: Sweeps
     cameras: Sequence[Camera]
     settings: RegisterSettings
     far_m: float
-    watch: Watch
 
-    def frames(self, piece: Trajectory, frames: Sequence[int]) -> list[int]:
-        """Which sweeps may be read for a piece with these neighbouring frames."""
-        at = np.searchsorted(piece.frames, [frames[0], frames[-1]])
-        num = self._most_sweeps(piece.T_world_lidar[at], piece.stamp_ns[at])
-        before, after = self.timeline.before(frames[0], num), self.timeline.after(frames[-1], num)
-        return [*before, *frames, *after]
+    def frames(self, near: Sequence[int]) -> list[int]:
+        """Return the sweeps that may be read for these neighbouring frames."""
+        num = int(_MOST_S * 1e9 / self.timeline.period_ns)
+        return [*self.timeline.before(near[0], num), *near, *self.timeline.after(near[-1], num)]
 
-    def standing(self, near: Stretch, keys: Sequence[int], with_near: bool) -> StandingWorld:
-        """What stands along the road, in the world of ``near``; nothing where no other sweep can
-        be used.
+    def find_standing(self, near: Stretch, keys: Sequence[int], with_near: bool) -> StandingWorld:
+        """Return the static surfaces along the road, in the world of ``near``.
 
-        near: registered, deskewed sweeps, those of the keys among them. with_near: what they saw
-        too.
+        near: registered, deskewed sweeps, those of the keys among them. with_near: use their
+        points too.
         """
         sensors, views = Sensors.of(near.sweeps), self._views(near, keys)
         with ThreadPoolExecutor(2) as pool:
             behind, ahead = pool.map(partial(self._beyond, near, views), (-1, 1))
-        passed = [*behind[::-1], *_within(near, views), *ahead]
-        links, left_out = Links.none(), frozenset[int]()
+        passed, left_out = [*behind[::-1], *_within(near, views), *ahead], frozenset[int]()
         if self.settings.source != "dataset" and len(passed) > 1:
-            passed, links, left_out = _relaxed(passed, near)
-        shown = [
+            passed, left_out = _relaxed(passed, near)
+        used = [
             p for p in passed if (with_near or not p.known) and p.registered.frame not in left_out
         ]
-
-        def straight(p: _Passed) -> RegisteredSweep:
-            sweep = p.registered
-            if p.known:
-                return sweep
-            return placed(sweep.sweep, sweep.T_world_lidar, sweep.twist_before, sweep.twist_after)
-
-        travel_m = np.array([p.travel_m for p in shown])
+        travel_m = np.array([p.travel_m for p in used])
         with ThreadPoolExecutor(num_threads()) as pool:
-            seen = list(pool.map(straight, shown))
-            gone = far.departed(seen, travel_m)
-            parts = list(pool.map(partial(far.standing, sensors), seen, travel_m.tolist(), gone))
-        return replace(far.joined(parts), links=links, left_out=tuple(sorted(left_out)))
+            deskewed = list(pool.map(_deskewed, used))
+            gone = far.departed(deskewed, travel_m)
+            standing = partial(far.standing, sensors)
+            parts = list(pool.map(standing, deskewed, travel_m.tolist(), gone))
+        return replace(far.joined(parts), left_out=tuple(sorted(left_out)))
 
-    def _beyond(
-        self, near: Stretch, views: Sequence[tuple[Camera, Float]], side: int
-    ) -> list[_Passed]:
-        """Sweeps before (-1) or behind (1) those near, the nearest first."""
+    def _beyond(self, near: Stretch, views: Sequence[_View], side: int) -> list[_Passed]:
+        """Return sweeps before (-1) or behind (1) those near, the nearest first."""
         last = near.sweeps[0 if side < 0 else -1].T_world_lidar[:3, 3]
-        begin_m = 0.0 if side < 0 else _along_m(near)[-1]
+        begin_m = 0.0 if side < 0 else _travel_m(near)[-1]
         found, last_m, travel_m = list[_Passed](), 0.0, 0.0
-        for sweep, T_world_lidar, before, after in self._sweeps(near, side):
+        for sweep, T_world_lidar, before, after in self._sweeps_beyond(near, side):
             travel_m += float(np.linalg.norm(T_world_lidar[:3, 3] - last))
             last = T_world_lidar[:3, 3]
             if travel_m - last_m < _LEAST_STEP_M:
                 continue
             last_m = travel_m
             seen = sweep.select(_in_view(sweep, T_world_lidar, views))
-            sample = placed(subsample(sweep), T_world_lidar, before, after).sweep.points
+            sample = deskew_sweep(subsample(sweep), T_world_lidar, before, after).sweep.points
             registered = RegisteredSweep(seen, T_world_lidar, before, after)
             found.append(_Passed(registered, sample, begin_m + side * travel_m, known=False))
         return found
 
-    def _views(self, near: Stretch, keys: Sequence[int]) -> list[tuple[Camera, Float]]:
-        """Cameras and ``T_cam_world`` of the keys; of keys close to each other of one."""
+    def _views(self, near: Stretch, keys: Sequence[int]) -> list[_View]:
+        """Return the views of the cameras at the keys; keys close to each other share one."""
         chosen: list[Float] = []
         for key in keys:
             T_world_lidar = near[key].T_world_lidar
@@ -137,38 +125,40 @@ class Road:
             for T in chosen
         ]
 
-    def _most_sweeps(self, T_world_lidar: Float, stamp_ns: Int) -> int:
-        """How many on each side, at half the speed between two poses (2,4,4); stamp_ns: (2,)."""
-        most_s = _MOST_S
-        if stamp_ns[1] > stamp_ns[0]:
-            travel_m = float(np.linalg.norm(T_world_lidar[1, :3, 3] - T_world_lidar[0, :3, 3]))
-            speed_m_s = travel_m / (1e-9 * float(stamp_ns[1] - stamp_ns[0]))
-            most_s = min(most_s, 2 * self.far_m / max(speed_m_s, 1e-3))
-        return int(most_s * 1e9 / self.timeline.period_ns)
-
-    def _sweeps(self, near: Stretch, side: int) -> Iterator[tuple[Sweep, Float, Float, Float]]:
-        """Raw sweeps before (-1) or behind (1) the known ones, the nearest first, their poses, and
-        their twists before and after their reference times."""
-        ends = near.sweeps[0], near.sweeps[-1]
-        num = self._most_sweeps(
-            np.stack([s.T_world_lidar for s in ends]), np.array([s.sweep.stamp_ns for s in ends])
-        )
+    def _sweeps_beyond(
+        self, near: Stretch, side: int
+    ) -> Iterator[tuple[Sweep, Float, Float, Float]]:
+        """Yield raw sweeps, the nearest first, their poses, and twists before and after."""
+        known = near.sweeps[::side]
+        num = self._most_sweeps(near)
         if side < 0:
-            known = near.sweeps[::-1]
             frames = self.timeline.before(known[-1].frame, num)[::-1]
         else:
-            known = near.sweeps
             frames = self.timeline.after(known[-1].frame, num)
         if self.settings.source == "dataset":
-            return self._recorded(known[-1], frames)
+            yield from self._recorded(known[-1], frames)
+            return
         stamp_ns = np.array([self.timeline.stamp_of(f) for f in frames], np.int64)
         read, prepare = self.sweeps.read, self.sweeps.prepare
-        return follow(known, frames, stamp_ns, read, prepare, self.far_m, _STEP_M, self.settings)
+        for sweep, T_world_lidar, twist in follow_road(
+            known, frames, stamp_ns, read, prepare, self.far_m, _STEP_M
+        ):
+            yield sweep, T_world_lidar, twist, twist
+
+    def _most_sweeps(self, near: Stretch) -> int:
+        """Return how many sweeps on each side may be needed, at half the window's speed."""
+        first, last = near.sweeps[0], near.sweeps[-1]
+        most_s, step_ns = _MOST_S, last.sweep.stamp_ns - first.sweep.stamp_ns
+        if step_ns > 0:
+            step = last.T_world_lidar[:3, 3] - first.T_world_lidar[:3, 3]
+            speed_m_s = float(np.linalg.norm(step)) / (1e-9 * step_ns)
+            most_s = min(most_s, 2 * self.far_m / max(speed_m_s, 1e-3))
+        return int(most_s * 1e9 / self.timeline.period_ns)
 
     def _recorded(
         self, known: RegisteredSweep, frames: Sequence[int]
     ) -> Iterator[tuple[Sweep, Float, Float, Float]]:
-        """The same by the recording's own poses."""
+        """Yield the same by the recording's own poses."""
         chosen, T_recorded = [], []
         for frame in (known.frame, *frames):
             try:
@@ -195,16 +185,23 @@ class Road:
             yield sweep, T[i], *twists(trajectory, trajectory.frames.index(chosen[i]))
 
 
-def _along_m(near: Stretch) -> Float:
-    """(n,) metres of travel since the first of these sweeps."""
-    places = np.stack([s.T_world_lidar[:3, 3] for s in near.sweeps])
-    return np.append(0.0, np.linalg.norm(np.diff(places, axis=0), axis=1).cumsum())
+def _deskewed(p: _Passed) -> RegisteredSweep:
+    sweep = p.registered
+    if p.known:
+        return sweep
+    return deskew_sweep(sweep.sweep, sweep.T_world_lidar, sweep.twist_before, sweep.twist_after)
 
 
-def _within(near: Stretch, views: Sequence[tuple[Camera, Float]]) -> list[_Passed]:
-    """Sweeps of a stretch that is registered already."""
+def _travel_m(near: Stretch) -> Float:
+    """Return (n,) metres of travel since the first of these sweeps."""
+    positions = np.stack([s.T_world_lidar[:3, 3] for s in near.sweeps])
+    return np.append(0.0, np.linalg.norm(np.diff(positions, axis=0), axis=1).cumsum())
+
+
+def _within(near: Stretch, views: Sequence[_View]) -> list[_Passed]:
+    """Return registered sweeps at some distance from each other."""
     found, last_m = list[_Passed](), -np.inf
-    for s, at_m in zip(near.sweeps, _along_m(near).tolist(), strict=True):
+    for s, at_m in zip(near.sweeps, _travel_m(near).tolist(), strict=True):
         if at_m - last_m >= _LEAST_STEP_M:
             last_m = at_m
             seen = replace(s, sweep=s.sweep.select(_in_view(s.sweep, s.T_world_lidar, views)))
@@ -212,35 +209,27 @@ def _within(near: Stretch, views: Sequence[tuple[Camera, Float]]) -> list[_Passe
     return found
 
 
-def _relaxed(
-    passed: Sequence[_Passed], near: Stretch
-) -> tuple[list[_Passed], Links, frozenset[int]]:
-    """The same with poses that agree, the pairs that say so, and the frames not to be used."""
+def _relaxed(passed: Sequence[_Passed], near: Stretch) -> tuple[list[_Passed], frozenset[int]]:
+    """Return the same with poses that agree, and the frames that cannot be used."""
     frames = tuple(p.registered.frame for p in passed)
-    found = relax(
-        frames,
+    found = relax_poses(
         [p.sample for p in passed],
         np.stack([p.registered.T_world_lidar for p in passed]),
         np.array([p.known for p in passed]),
         num_in_submap(float(np.median([len(s.sweep) for s in near.sweeps]))),
     )
     stamp_ns = np.array([p.registered.sweep.stamp_ns for p in passed], np.int64)
-    trajectory = Trajectory(frames, stamp_ns, found.T_world_lidar)
-
-    def moved(i: int, p: _Passed) -> _Passed:
-        if p.known:
-            return p
-        sweep = RegisteredSweep(
-            p.registered.sweep, trajectory.T_world_lidar[i], *twists(trajectory, i)
-        )
-        return p._replace(registered=sweep)
-
-    left_out = frozenset(f for f, holds in zip(frames, found.holds, strict=True) if not holds)
-    return [moved(i, p) for i, p in enumerate(passed)], found.links, left_out
+    trajectory, moved = Trajectory(frames, stamp_ns, found.T_world_lidar), []
+    for i, p in enumerate(passed):
+        if not p.known:
+            T_world_lidar, sweep = found.T_world_lidar[i], p.registered.sweep
+            p = p._replace(registered=RegisteredSweep(sweep, T_world_lidar, *twists(trajectory, i)))
+        moved.append(p)
+    return moved, frozenset(f for f, holds in zip(frames, found.holds, strict=True) if not holds)
 
 
-def _in_view(sweep: Sweep, T_world_lidar: Float, views: Sequence[tuple[Camera, Float]]) -> Bool:
-    """(N,) the returns of a raw sweep that one of the views may show."""
+def _in_view(sweep: Sweep, T_world_lidar: Float, views: Sequence[_View]) -> Bool:
+    """Return (N,) the returns of a raw sweep that one of the views may show."""
     keep = np.zeros(len(sweep), bool)
     rows = np.flatnonzero(far.in_reach(sweep))
     points = sweep.points[rows].astype(np.float32)

@@ -1,35 +1,42 @@
 # SPDX-License-Identifier: MIT
-"""The pipeline, as a story: what is asked of a recording, for one key or for a thousand.
+"""The pipeline in order. `densify` is the whole of it for one key::
 
-`densify` is the whole of it: the window of a key is registered and deskewed, everything in it is
-brought to the key's moment, and each camera looks at the accumulated cloud. How the steps before
-the cloud are made, once for all keys that share them, is told by `pipeline.recording`; what comes
-after it, by `densify.pipeline.key_results`.
+    register and deskew the window     recording.window
+    accumulate rigidly, or with flow   recording.moment   (free space, ground, motion)
+    find static surfaces beyond it     recording.standing
+    see, project, fill, score          densify.pipeline.key_result, method by method
+    complete with a prior              densify.pipeline.prior
+    warn                               densify.pipeline.warnings
+
+`run`, `run_keys`, `compare` and `flow_steps` check what they are given, then call it.
 """
 
 from __future__ import annotations
 
 import reprlib
 from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from densify.config import Config, resolve
 from densify.config.cache import Cache
 from densify.config.errors import ComputationError, InputError
 from densify.depth.exposure import key_shots, load_images
 from densify.flow.engines import check_engine
-from densify.geometry.threads import tasks
+from densify.geometry.threads import num_threads
 from densify.geometry.types import LidarSequence, Progress, Result, StretchFlow
-from densify.pipeline.completion import key_priors
 from densify.pipeline.costs import Watch
-from densify.pipeline.doubts import with_doubts
-from densify.pipeline.key_results import Key, key_results
+from densify.pipeline.key_result import KeyScene, result_of_method
 from densify.pipeline.methods import COMPARED, METHODS, looks_around, with_baselines
-from densify.pipeline.recording import Beyond, Moment, Recording
-from densify.readers.prior_files import PriorFiles
-from densify.readers.timeline import format_frames
+from densify.pipeline.recording import Recording
+from densify.pipeline.warnings import add_warnings, warn_of_window
 from densify.readers.window import choose_cameras
+
+if TYPE_CHECKING:
+    from densify.readers.prior_files import PriorFiles
 
 ConfigLike = Config | str | Path | Mapping[str, Any] | None
 
@@ -46,16 +53,18 @@ def run(
 ) -> Result:
     """Densify one key.
 
-    key: absolute frame number. window: sweeps on each side of it, of those that exist; it is cut,
-    with a warning, at the ends of the recording, at a hole in time of more than three usual
-    periods, and at a sweep that cannot be read or registered. method: none, icp or flow, see
-    `METHODS`. cameras: names, all if None. config: what `densify.config.resolve` takes. progress:
-    called with (stage, done, total). prior: a folder of depth images that complete the maps where
-    nothing is measured or filled, see `densify.readers.prior_files`; what is measured and filled
-    does not depend on it.
+    key: absolute frame number.
+    window: sweeps on each side of it. It is cut, with a warning, at the ends of the recording, at
+        a hole in time of more than three usual periods, and at a sweep that cannot be used.
+    method: none, icp or flow, see `METHODS`.
+    cameras: names, all if None.
+    config: what `densify.config.resolve` takes.
+    progress: called with (stage, done, total).
+    prior: a folder of depth images that complete the maps where nothing is measured or filled, see
+        `densify.readers.prior_files`.
 
-    The result carries its baselines. Raises InputError for what cannot be used, ComputationError
-    where registration went wrong.
+    Returns the result with its baselines. Raises InputError for what cannot be used,
+    ComputationError where registration fails.
     """
     methods = with_baselines(method)
     made = compare(sequence, key, window, cameras, config, progress, methods, prior=prior)
@@ -73,17 +82,17 @@ def run_keys(
     cache: Cache | None = None,
     prior: str | Path | None = None,
 ) -> Iterator[tuple[int, Result | ComputationError | InputError]]:
-    """Densify several keys, ascending, and yield each with its result, or with what went wrong.
+    """Densify several keys, ascending, and yield each with its result or its error.
 
-    Keys whose windows overlap share registration, ground and motion, which is then followed over
-    all their sweeps: a key may come out a little better than by itself, and a second key near the
-    first costs a fraction of it. cache: keeps what is shared on disk. The rest as `run`.
+    Keys whose windows overlap share registration, ground and motion. Motion is then followed over
+    all their sweeps, which may make a key a little better than by itself.
 
-    Raises InputError at once for what no key could be made with.
+    cache: keeps on disk what is shared. The rest as `run`. Raises InputError at once for what no
+    key could be made with.
     """
     settings, methods, watch = resolve(config), with_baselines(method), Watch(progress)
     _check(sequence, settings, methods, cameras)
-    priors = _open_priors(prior, sequence, cameras)
+    priors = _open_prior(prior, sequence, cameras)
     looks = looks_around(methods)
     recording = Recording(sequence, settings, window, keys, cache, None, watch, looks)
 
@@ -97,6 +106,30 @@ def run_keys(
     return results()
 
 
+def compare(
+    sequence: LidarSequence,
+    key: int,
+    window: int = 5,
+    cameras: Sequence[str] | None = None,
+    config: ConfigLike = None,
+    progress: Progress | None = None,
+    methods: Sequence[str] = COMPARED,
+    cache: Cache | None = None,
+    prior: str | Path | None = None,
+) -> dict[str, Result]:
+    """Return results by method on the same registration, each with those before as its baselines.
+
+    methods: some of `METHODS`. cache: keeps the results of steps. prior: completes the maps of the
+    last method. The rest as `run`.
+    """
+    settings, watch = resolve(config), Watch(progress)
+    _check(sequence, settings, methods, cameras)
+    priors = _open_prior(prior, sequence, cameras)
+    looks = looks_around(methods)
+    recording = Recording(sequence, settings, window, [key], cache, None, watch, looks)
+    return densify(recording, key, methods, cameras, watch, priors=priors)
+
+
 def flow_steps(
     sequence: LidarSequence,
     frames: Sequence[int],
@@ -104,16 +137,16 @@ def flow_steps(
     progress: Progress | None = None,
     cache: Cache | None = None,
 ) -> Iterator[tuple[int, StretchFlow | ComputationError | InputError]]:
-    """The flow of sweeps of a whole recording to the next ones; motion is followed over all sweeps
-    around, as for a training set.
+    """Yield sweeps of a whole recording with their flow to the next sweep, or with their error.
 
-    frames: ascending. cache: keeps what is shared on disk. Yields each sweep with the one step that
-    leads from it, none where no sweep follows (the last one, before a hole in time), or with what
-    went wrong. Raises InputError at once for what nothing can be made with.
+    A sweep that none follows (the last one, or before a hole in time) has no step.
+
+    frames: ascending. cache: keeps the results of steps. Raises InputError at once for what nothing
+    can be made with.
     """
-    settings, watch = resolve(config), Watch()
+    settings = resolve(config)
     _check(sequence, settings, ["flow"], None)
-    recording = Recording(sequence, settings, 1, cache=cache, watch=watch)
+    recording = Recording(sequence, settings, 1, cache=cache)
 
     def steps() -> Iterator[tuple[int, StretchFlow | ComputationError | InputError]]:
         for done, frame in enumerate(frames):
@@ -127,30 +160,6 @@ def flow_steps(
     return steps()
 
 
-def compare(
-    sequence: LidarSequence,
-    key: int,
-    window: int = 5,
-    cameras: Sequence[str] | None = None,
-    config: ConfigLike = None,
-    progress: Progress | None = None,
-    methods: Sequence[str] = COMPARED,
-    cache: Cache | None = None,
-    prior: str | Path | None = None,
-) -> dict[str, Result]:
-    """Methods by name on the same registration, each with those before it as its baselines.
-
-    methods: some of `METHODS`. cache: keeps what the steps before the cloud make. prior: completes
-    the maps of the last of the methods. The rest as `run`.
-    """
-    settings, watch = resolve(config), Watch(progress)
-    _check(sequence, settings, methods, cameras)
-    priors = _open_priors(prior, sequence, cameras)
-    looks = looks_around(methods)
-    recording = Recording(sequence, settings, window, [key], cache, None, watch, looks)
-    return densify(recording, key, methods, cameras, watch, priors=priors)
-
-
 def densify(
     recording: Recording,
     key: int,
@@ -160,56 +169,56 @@ def densify(
     with_images: bool = True,
     priors: PriorFiles | None = None,
 ) -> dict[str, Result]:
-    """One key of a recording by several methods, each with those before it as its baselines.
+    """Return the results of one key by method, each with those before as its baselines.
 
-    methods: of `METHODS`. with_images: the cloud takes the images' colours, and depth is compared
-    with the truth where there is some; the maps are the same either way. priors: complete the maps
-    of the last of the methods. Errors as `run`.
+    methods: of `METHODS`. with_images: colour the cloud, and compare depth with the truth where
+    there is some; the maps are the same either way. priors: complete the maps of the last method.
+    Errors as `run`.
     """
     watch, sequence, settings = watch or Watch(), recording.sequence, recording.settings
-    cuts = _cuts(recording, key, any(METHODS[name].engine is not None for name in methods))
+    window = recording.window_frames(key)
     shots = key_shots(sequence, choose_cameras(sequence, cameras), key, settings.project)
     with watch.stage("images"):
         images = load_images(sequence, shots)
-    priors_of_key = {} if priors is None else key_priors(priors, shots, key)
     stretch = recording.window(key)
-    this = Key(sequence, settings, key, stretch, shots, images, with_images, watch)
 
-    def moment(name: str) -> Moment:
-        method = METHODS[name]
-        return recording.moment(
-            key, method.all_sweeps, method.engine, settings.output.flow != "none"
+    with ThreadPoolExecutor(num_threads()) as pool:
+        wants_far = any(METHODS[name].far for name in methods)
+        far = pool.submit(recording.standing, key) if wants_far else None
+        moments = {}
+        for name in methods:
+            method = METHODS[name]
+            moments[name] = recording.moment(
+                key, method.all_sweeps, method.engine, settings.output.flow != "none"
+            )
+        beyond = far.result() if far is not None else None
+        scene = KeyScene.of(
+            recording, key, stretch, shots, images, moments[methods[-1]], beyond, with_images, watch
         )
+        made = list(pool.map(partial(result_of_method, scene), methods, moments.values()))
 
-    def beyond() -> Beyond | None:
-        return recording.standing(key) if any(METHODS[name].far for name in methods) else None
+    if priors is not None:
+        from densify.pipeline.prior import complete_with_prior
 
-    with tasks() as pool:  # what takes longest, the flow of the last method, begins
-        begun = {name: pool.submit(moment, name) for name in reversed(methods)}
-        moments = {name: begun[name] for name in methods}
-        made = key_results(this, moments, pool.submit(beyond), priors_of_key, pool)
-    return with_doubts(made, sequence, stretch, shots, settings, cuts)
+        with watch.stage("prior"):
+            made[-1] = complete_with_prior(
+                made[-1], priors, shots, scene.truth, settings.prior.kind
+            )
+    results: dict[str, Result] = {}
+    for result in made:
+        results[result.method] = replace(result, costs=watch.costs(), baselines=dict(results))
+    pair = looks_around(methods) and recording.is_pair(key)
+    return add_warnings(results, sequence, stretch, shots, settings, warn_of_window(window, pair))
 
 
-def _open_priors(
-    place: str | Path | None, sequence: LidarSequence, cameras: Sequence[str] | None
+def _open_prior(
+    prior: str | Path | None, sequence: LidarSequence, cameras: Sequence[str] | None
 ) -> PriorFiles | None:
-    if place is None:
+    if prior is None:
         return None
-    return PriorFiles.open(Path(place), [c.name for c in choose_cameras(sequence, cameras)])
+    from densify.readers.prior_files import PriorFiles
 
-
-def _cuts(recording: Recording, key: int, with_flow: bool) -> list[str]:
-    """Why a key's window has fewer sweeps than asked for, and that it has too few to follow
-    anything, a sentence each."""
-    window = recording.window_frames(key)
-    frames = format_frames(window.frames)
-    told = [f"the window is cut to frames {frames}: {cut}" for cut in window.cuts]
-    if with_flow and recording.is_pair(key):
-        told.append(
-            "two sweeps show what moves less well than three or more, which can be followed"
-        )
-    return told
+    return PriorFiles.open(Path(prior), [c.name for c in choose_cameras(sequence, cameras)])
 
 
 def _check(

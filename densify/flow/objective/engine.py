@@ -7,7 +7,7 @@ from densify.config import Config
 from densify.flow.chained import ChainedMotion
 from densify.flow.engines import Scene
 from densify.flow.pairs.estimate import flow_between
-from densify.free_space.height_map import ABOVE_GROUND_M
+from densify.free_space.ground import ABOVE_GROUND_M
 from densify.geometry import poses
 from densify.geometry.types import FlowField, Motion
 

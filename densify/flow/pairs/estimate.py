@@ -20,7 +20,7 @@ from densify.flow.objective.solvers import SolverSettings, solve
 from densify.flow.pairs.hypotheses import PairCloud
 from densify.flow.pairs.movers import find_movers
 from densify.flow.pairs.scanners import scanners_told
-from densify.free_space.height_map import ABOVE_GROUND_M, HeightMap
+from densify.free_space.ground import ABOVE_GROUND_M, HeightMap
 from densify.geometry.linking import link
 from densify.geometry.types import Float, FlowField, Int
 
@@ -119,7 +119,7 @@ def _flow_of_groups(
     points = [cloud - middle for cloud in clouds]
     inside = [np.flatnonzero((np.abs(p[:, :2]) < _MAX_EXTENT_M).all(1)) for p in points]
     near = [p[rows] for p, rows in zip(points, inside, strict=True)]
-    ground = HeightMap.of(near, settings.ground)
+    ground = HeightMap.of(near)
     heights_m = [ground.above(p) for p in near]
     above = [rows[h >= ABOVE_GROUND_M] for rows, h in zip(inside, heights_m, strict=True)]
     field = FlowField.zero(len(clouds[0]))

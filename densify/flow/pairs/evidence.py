@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from densify.flow.pairs.hypotheses import PairCloud, tree_of
-from densify.free_space.height_map import HeightMap
+from densify.free_space.ground import HeightMap
 from densify.geometry.linking import link
 from densify.geometry.types import Bool, Float, Float32, Int
 

@@ -22,7 +22,7 @@ from densify.flow.surface_matching import (
     SURFACE_M,
     apply,
 )
-from densify.free_space.height_map import HeightMap
+from densify.free_space.ground import HeightMap
 from densify.geometry.types import Float, Int
 
 _EVEN_M = 0.06

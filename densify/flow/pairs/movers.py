@@ -25,7 +25,7 @@ from densify.flow.pairs.hypotheses import (
 )
 from densify.flow.pairs.refine import Refined, refined
 from densify.flow.pairs.trials import Trial, promising
-from densify.free_space.height_map import HeightMap
+from densify.free_space.ground import HeightMap
 from densify.geometry.types import Float, Int
 
 _CLOSE_BY_M = 1.0

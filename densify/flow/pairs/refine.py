@@ -25,7 +25,7 @@ from densify.flow.pairs.hypotheses import (
     tree_of,
 )
 from densify.flow.pairs.thinness import settle
-from densify.free_space.height_map import HeightMap
+from densify.free_space.ground import HeightMap
 from densify.geometry.types import Bool, Float, Int
 
 _MIN_POINTS = 40  # fewer show no surfaces

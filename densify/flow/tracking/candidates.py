@@ -15,7 +15,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from densify.flow.tracking.radial import Radial
-from densify.free_space.height_map import ABOVE_GROUND_M, HeightMap
+from densify.free_space.ground import ABOVE_GROUND_M, HeightMap
 from densify.free_space.seen_through import FreeSpace
 from densify.geometry import poses
 from densify.geometry.clock import Clock

@@ -15,7 +15,7 @@ from densify.flow.tracking.lone_rays import columns_apart_m
 from densify.flow.tracking.radial import Radial
 from densify.flow.tracking.shapes import Body, Shape
 from densify.flow.tracking.sightings import Track
-from densify.free_space.height_map import ABOVE_GROUND_M, HeightMap
+from densify.free_space.ground import ABOVE_GROUND_M, HeightMap
 from densify.free_space.seen_through import FreeSpace
 from densify.free_space.sensor import Sensors
 from densify.geometry import poses

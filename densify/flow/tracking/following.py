@@ -15,7 +15,7 @@ from densify.flow.surface_matching import GATES_M, apply, undo
 from densify.flow.tracking.align import MIN_FIT, Model
 from densify.flow.tracking.candidates import Batch, Obstacles
 from densify.flow.tracking.sightings import Track
-from densify.free_space.height_map import HeightMap
+from densify.free_space.ground import HeightMap
 from densify.geometry.clock import Clock
 from densify.geometry.types import Bool, Float
 

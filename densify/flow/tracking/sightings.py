@@ -11,7 +11,7 @@ import numpy as np
 from densify.flow.tracking import path_kernels as kernels
 from densify.flow.tracking.candidates import Batch, Obstacles
 from densify.flow.tracking.paths import Path
-from densify.free_space.height_map import HeightMap
+from densify.free_space.ground import HeightMap
 from densify.free_space.seen_through import FreeSpace
 from densify.geometry.types import Bool, Float
 

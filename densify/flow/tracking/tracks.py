@@ -33,7 +33,7 @@ from densify.flow.tracking.starts import (
     velocities_of_traffic,
 )
 from densify.flow.tracking.vote import DistanceField, Group, vote
-from densify.free_space.height_map import HeightMap
+from densify.free_space.ground import HeightMap
 from densify.free_space.seen_through import FreeSpace
 from densify.geometry.clock import Clock
 from densify.geometry.types import Bool, Float

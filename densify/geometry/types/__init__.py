@@ -34,7 +34,7 @@ from densify.geometry.types.recordings import (
     Truth,
 )
 from densify.geometry.types.results import Progress, Result, StageCost
-from densify.geometry.types.sweeps import Links, RegisteredSweep, Stretch, Sweep, Trajectory
+from densify.geometry.types.sweeps import RegisteredSweep, Stretch, Sweep, Trajectory
 from densify.geometry.types.tracks import ObjectTrack
 
 __all__ = [
@@ -56,7 +56,6 @@ __all__ = [
     "KnowsItsGaps",
     "KnowsRows",
     "LidarSequence",
-    "Links",
     "MakesFrames",
     "Motion",
     "Mover",

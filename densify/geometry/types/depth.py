@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 
 from densify.config.errors import InputError
 from densify.geometry.arrays import Bool, Float, Float32, Int, table
-from densify.geometry.types.rigid import inverse
-from densify.geometry.types.sweeps import Links
+from densify.geometry.poses import inverse
 
 
 @dataclass(frozen=True)
@@ -170,7 +169,7 @@ class StandingWorld:
     spacing_m: (K,2) float32 to the neighbouring rays of the same sweep. source: (K,) int32, which
     of the sweeps ``frames`` measured it. row, lidar, intensity: as in `Cloud`. frames: n sweeps.
     stamp_ns: (n,) int64. travel_m: (n,) float64, where along the road they were: 0 at the key's
-    window, negative behind it. links: pairs of submaps, by which the sweeps were placed. left_out:
+    window, negative behind it. left_out:
     sweeps beyond that hang on bad pairs only.
     """
 
@@ -184,7 +183,6 @@ class StandingWorld:
     frames: tuple[int, ...]
     stamp_ns: Int
     travel_m: Float
-    links: Links = field(default_factory=Links.none)
     left_out: tuple[int, ...] = ()
 
     @property

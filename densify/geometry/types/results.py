@@ -14,7 +14,6 @@ from densify.geometry.arrays import Float, Float32
 from densify.geometry.types.depth import CameraView, Cloud, DepthMap, Mover
 from densify.geometry.types.flow import StretchFlow
 from densify.geometry.types.prior import FullDepth
-from densify.geometry.types.sweeps import Links
 from densify.geometry.types.tracks import ObjectTrack
 
 Progress = Callable[[str, int, int], None]
@@ -35,7 +34,7 @@ class Result:
     """One densified key.
 
     frames: of the window. far_frames: sweeps beyond it of which the cloud holds what stands still.
-    far_links: how those lie on each other; far_left_out: sweeps beyond that could not be placed.
+    far_left_out: sweeps beyond that could not be placed.
     depth: by name: the camera's, or CAMERA/NUMBER of each image (``project.per=image``). metrics:
     plain numbers, ready for JSON. baselines: the results of the simpler methods on the same
     registration, by method. flow: of every sweep to the next one on the way to the key, where
@@ -63,7 +62,6 @@ class Result:
     full: Mapping[str, FullDepth] = field(default_factory=dict)
     images: Mapping[str, NDArray[np.uint8]] = field(default_factory=dict)
     far_frames: tuple[int, ...] = ()
-    far_links: Links = field(default_factory=Links.none)
     far_left_out: tuple[int, ...] = ()
     warnings: tuple[str, ...] = ()
     stamp_ns: int = 0

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from densify.geometry.arrays import Bool, Float, Float32, Int
-from densify.geometry.types.rigid import inverse
+from densify.geometry.poses import inverse
 
 
 @dataclass(frozen=True)
@@ -209,35 +209,3 @@ class Stretch:
         if target == source:
             return np.eye(4)
         return inverse(self[target].T_world_lidar) @ self[source].T_world_lidar
-
-
-@dataclass(frozen=True)
-class Links:
-    """Pairs of submaps laid on each other, and how well they agree once all poses are found.
-
-    frames: (p,2) int32 of the sweep in the middle of the target and the source. overlap: (p,) share
-    of the source's points that met the target. rms_m: (p,) left between those. num_matches: (p,) of
-    them. correction_m, correction_deg: (p,) by which the graph changed how they stand to each
-    other. left_m: (p,) how far that still lifts the source's surface off where it was laid.
-    """
-
-    frames: NDArray[np.int32]
-    overlap: Float
-    rms_m: Float
-    num_matches: Int
-    correction_m: Float
-    correction_deg: Float
-    left_m: Float
-
-    @staticmethod
-    def none() -> Links:
-        nothing = np.zeros(0)
-        return Links(
-            frames=np.zeros((0, 2), np.int32),
-            overlap=nothing,
-            rms_m=nothing,
-            num_matches=np.zeros(0, np.int64),
-            correction_m=nothing,
-            correction_deg=nothing,
-            left_m=nothing,
-        )

@@ -1,6 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What was assumed for a result, or looks wrong about it: a run of a wrong calibration or clock has
-no other way to tell."""
+"""Warnings about a result: what was assumed for it, or looks wrong, a sentence each."""
 
 from __future__ import annotations
 
@@ -11,10 +10,10 @@ import numpy as np
 
 from densify.config import Config
 from densify.depth.exposure import Shot
+from densify.free_space.ground import find_up_axis
 from densify.geometry.types import Camera, KnowsItsGaps, LidarSequence, Result, Stretch
 from densify.pipeline.methods import METHODS
-from densify.readers.timeline import format_frames
-from densify.registration.upright import ground_aside
+from densify.readers.timeline import WindowFrames, format_frames
 from densify.scores.depth_metrics import image_density
 
 _LEAST_DENSITY = 0.001  # sixteen rings alone measure 0.5 % of an image
@@ -22,49 +21,49 @@ _FARTHEST_M = 20.0  # a camera from the scanner, on the longest trucks
 _STEEPEST_DEG = 60.0  # a camera's view, up or down
 _LONGEST_SWEEP = 1.5  # of the usual time from sweep to sweep
 _SLOW_S = 0.15  # from sweep to sweep; at 5 Hz trucks slide along their own sides
-_OTHER_CLOCK_S = 1.0  # from a sweep to the nearest image; a camera that missed some is sooner back
+_OTHER_CLOCK_S = 1.0  # from a sweep to the nearest image
 
 
-def with_doubts(
+def warn_of_window(window: WindowFrames, is_pair: bool) -> list[str]:
+    """Say why a key's window has fewer sweeps than asked for, or too few to follow anything."""
+    frames = format_frames(window.frames)
+    warnings = [f"the window is cut to frames {frames}: {cut}" for cut in window.cuts]
+    if is_pair:
+        warnings.append(
+            "two sweeps show what moves less well than three or more, which can be followed"
+        )
+    return warnings
+
+
+def add_warnings(
     results: Mapping[str, Result],
     sequence: LidarSequence,
     stretch: Stretch,
     shots: Mapping[str, Shot],
     settings: Config,
-    cuts: Sequence[str] = (),
+    first: Sequence[str],
 ) -> dict[str, Result]:
-    """The results of a key's methods with `Result.warnings`, each a sentence.
-
-    shots: what the maps show. cuts: of the window, sentences that come first. Checked: what the
-    reader had to assume, cameras left out for want of images, where cameras stand and look, axes
-    that do not stand on the ground, point times that are absent or longer than a sweep, sweeps too
-    far apart to follow what is fast, images too far in time, sweeps left out of the far range, what
-    maps could not be made as asked, maps with next to nothing in them.
-    """
-    chosen = {shot.camera.name: shot.camera for shot in shots.values()}
+    """Return the results of a key's methods with `Result.warnings`, ``first`` among them."""
+    cameras = {shot.camera.name: shot.camera for shot in shots.values()}
     shared = [
-        *cuts,
+        *first,
         *(sequence.gaps() if isinstance(sequence, KnowsItsGaps) else ()),
-        *_left_out(sequence, chosen),
-        *(doubt for camera in chosen.values() for doubt in _of_camera(camera)),
+        *(
+            f"{name} is left out: the recording has no images of it; ask with --camera {name}"
+            for name in sequence.cameras
+            if name not in cameras and not sequence.image_stamps_ns(name)
+        ),
+        *(warning for camera in cameras.values() for warning in _of_camera(camera)),
         *_of_axes(stretch),
         *_of_times(stretch, settings),
-        *_of_shots(sequence, shots),
+        *_of_images(sequence, shots),
     ]
-    own = {
-        name: [*_of_rate(name, stretch), *_of_far(result), *_of_maps(result)]
-        for name, result in results.items()
-    }
     return {
-        name: replace(result, warnings=tuple(dict.fromkeys([*shared, *own[name]])))
+        name: replace(
+            result, warnings=tuple(dict.fromkeys([*shared, *_of_result(result, stretch)]))
+        )
         for name, result in results.items()
     }
-
-
-def _left_out(sequence: LidarSequence, chosen: Mapping[str, Camera]) -> Iterator[str]:
-    for name in sequence.cameras:
-        if name not in chosen and not sequence.image_stamps_ns(name):
-            yield f"{name} is left out: the recording has no images of it; ask with --camera {name}"
 
 
 def _of_camera(camera: Camera) -> Iterator[str]:
@@ -85,27 +84,25 @@ def _of_camera(camera: Camera) -> Iterator[str]:
 
 
 def _of_axes(stretch: Stretch) -> Iterator[str]:
-    up = ground_aside(stretch.sweeps[len(stretch.sweeps) // 2].sweep)
+    up = find_up_axis(stretch.sweeps[len(stretch.sweeps) // 2].sweep)
     if up:
         yield (
-            f"the ground lies as if {up} pointed up, not z: what moves is hardly found so; densify "
-            f"doctor says which axes the points have"
+            f"the ground lies as if {up} pointed up, not z: moving objects are hardly found so; "
+            f"densify doctor says which axes the points have"
         )
 
 
 def _of_times(stretch: Stretch, settings: Config) -> Iterator[str]:
-    """Doubts of the point times, where motion within sweeps is to be undone."""
+    sweeps = [registered.sweep for registered in stretch.sweeps]
     if not settings.register.deskew:
         return
-    sweeps = [registered.sweep for registered in stretch.sweeps]
     if any(sweep.offset_ns is None for sweep in sweeps):
         yield "the points have no times of their own: motion within a sweep is not undone"
-    stamps_ns = [sweep.stamp_ns for sweep in sweeps]
-    if len(stamps_ns) < 2:
+    if len(sweeps) < 2:
         return
-    period_ns = float(np.median(np.diff(stamps_ns)))
+    period_ns = float(np.median(np.diff([sweep.stamp_ns for sweep in sweeps])))
     times = [s.offset_ns for s in sweeps if s.offset_ns is not None and len(s.offset_ns)]
-    longest_ns = max((int(offset_ns.max() - offset_ns.min()) for offset_ns in times), default=0)
+    longest_ns = max((int(np.ptp(offset_ns)) for offset_ns in times), default=0)
     if longest_ns > _LONGEST_SWEEP * period_ns:
         yield (
             f"a sweep takes {longest_ns * 1e-6:.0f} ms by the times of its points, and the next "
@@ -113,22 +110,11 @@ def _of_times(stretch: Stretch, settings: Config) -> Iterator[str]:
         )
 
 
-def _of_rate(method: str, stretch: Stretch) -> Iterator[str]:
-    if METHODS[method].engine is None or len(stretch.sweeps) < 2:
-        return
-    period_s = float(np.median(np.diff([s.sweep.stamp_ns for s in stretch.sweeps]))) * 1e-9
-    if period_s > _SLOW_S:
-        yield (
-            f"sweeps are {period_s:.2g} s apart: what is fast is followed less exactly than at "
-            f"10 Hz, and lost where it turns or hides between two"
-        )
-
-
-def _of_shots(sequence: LidarSequence, shots: Mapping[str, Shot]) -> Iterator[str]:
+def _of_images(sequence: LidarSequence, shots: Mapping[str, Shot]) -> Iterator[str]:
     for name, shot in shots.items():
-        stamps_ns = list(sequence.image_stamps_ns(shot.camera.name).values())
         if shot.number is not None:
             continue
+        stamps_ns = list(sequence.image_stamps_ns(shot.camera.name).values())
         if not stamps_ns:
             yield f"{name}: the recording has no image of it: its map has no colour"
             continue
@@ -140,15 +126,20 @@ def _of_shots(sequence: LidarSequence, shots: Mapping[str, Shot]) -> Iterator[st
         )
 
 
-def _of_far(result: Result) -> Iterator[str]:
+def _of_result(result: Result, stretch: Stretch) -> Iterator[str]:
+    stamps_ns = [s.sweep.stamp_ns for s in stretch.sweeps]
+    if METHODS[result.method].engine is not None and len(stamps_ns) > 1:
+        period_s = float(np.median(np.diff(stamps_ns))) * 1e-9
+        if period_s > _SLOW_S:
+            yield (
+                f"sweeps are {period_s:.2g} s apart: fast objects are followed less exactly than "
+                f"at 10 Hz, and lost where they turn or are occluded between two"
+            )
     if result.far_left_out:
         yield (
             f"sweeps {format_frames(result.far_left_out)} are left out of the far range: surfaces "
-            f"there do not lie well on those nearer to the window; run.yaml has the pairs"
+            f"there do not agree with those nearer to the window"
         )
-
-
-def _of_maps(result: Result) -> Iterator[str]:
     for name, maps in result.depth.items():
         yield from (f"{name}: {warning}" for warning in maps.warnings)
         density = image_density(maps.depth_m)

@@ -1,0 +1,192 @@
+# SPDX-License-Identifier: MIT
+"""One method's result for a key: see the cloud, project, fill, score."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from densify.depth.confidence import expected_outliers, reliability
+from densify.depth.exposure import Shot
+from densify.depth.views import HeldOut, SeenCloud, Views, with_ages
+from densify.free_space.range_image import RangeImage
+from densify.geometry.types import Bool, Cloud, DepthMap, Float32, Result, Stretch
+from densify.pipeline.costs import Watch
+from densify.pipeline.methods import METHODS, Method
+from densify.pipeline.recording import Beyond, Moment, Recording
+from densify.scores import depth_metrics
+from densify.scores.cloud_scores import ghost_scores, radial_velocity_scores
+
+Image = NDArray[np.uint8]
+
+
+@dataclass(frozen=True)
+class KeyScene:
+    """What all methods of a key share.
+
+    stretch: the key's window. images: (H,W,3) RGB of the maps that show one. beyond: None where
+    nothing is known or wanted. with_images: colour the cloud, and compare depth with the truth.
+    key_image: range image of the key sweep. views: of the maps. truth: depth and what moves, by
+    map. held_out: the key sweep as the truth of what is made without it.
+    """
+
+    recording: Recording
+    key: int
+    stretch: Stretch
+    images: Mapping[str, Image]
+    beyond: Beyond | None
+    with_images: bool
+    watch: Watch
+    key_image: RangeImage
+    views: Views
+    truth: Mapping[str, tuple[Float32, Bool]]
+    held_out: HeldOut
+
+    @staticmethod
+    def of(
+        recording: Recording,
+        key: int,
+        stretch: Stretch,
+        shots: Mapping[str, Shot],
+        images: Mapping[str, Image],
+        moment: Moment,
+        beyond: Beyond | None,
+        with_images: bool,
+        watch: Watch,
+    ) -> KeyScene:
+        """moment: of the last method, which says what moves in the key sweep."""
+        sequence, settings = recording.sequence, recording.settings
+        key_image = RangeImage.of(stretch[key])
+        views = Views.of(sequence, stretch, key, key_image, shots, images, settings)
+        truth = {}
+        if with_images and sequence.truth is not None:
+            truth = views.truth(sequence.truth)
+        with watch.stage("held out"):
+            held_out = HeldOut.of(views, moment.cloud)
+        return KeyScene(
+            recording=recording,
+            key=key,
+            stretch=stretch,
+            images=images if with_images else {},
+            beyond=beyond,
+            with_images=with_images,
+            watch=watch,
+            key_image=key_image,
+            views=views,
+            truth=truth,
+            held_out=held_out,
+        )
+
+
+def result_of_method(scene: KeyScene, name: str, moment: Moment) -> Result:
+    """Return the result of one method, without its baselines.
+
+    moment: the points at the key's moment, as the method accumulates them.
+    """
+    method, output = METHODS[name], scene.recording.settings.output
+    views, watch, stretch = scene.views, scene.watch, scene.stretch
+    visible = method.visible and scene.recording.settings.project.visibility
+
+    far = _see_far(scene, method)
+    with watch.stage("project"):
+        seen = views.see(moment.cloud, visible).joined(far)
+    with watch.stage("held out"):
+        held_out = scene.held_out.scores(seen, visible)
+    with watch.stage("project"):
+        movers = {}
+        if output.movers == "separate":
+            movers = views.movers(moment.cloud, visible, scene.images)
+        if output.movers != "keep":
+            static = moment.cloud.select(~moment.cloud.moving)
+            seen = views.see(static, visible).joined(far)
+        depth = _add_ages(scene, method, views.depth(seen, visible))
+    cloud = seen.cloud
+    if scene.with_images:
+        with watch.stage("colour"):
+            cloud = views.coloured(seen, depth, scene.images)
+    with watch.stage("score"):
+        metrics = _metrics(scene, cloud, depth, visible) | {"held_out": held_out}
+    return Result(
+        method=name,
+        key=scene.key,
+        frames=stretch.frames if method.all_sweeps else (scene.key,),
+        cloud=cloud,
+        depth=depth,
+        metrics=metrics,
+        flow=moment.flow,
+        tracks=moment.tracks,
+        movers=movers,
+        optical_flow=views.optical_flow(cloud, depth) if output.optical_flow else {},
+        rejected=views.rejected(cloud, depth) if output.rejected else {},
+        images=scene.images,
+        stamp_ns=stretch[scene.key].sweep.stamp_ns,
+        views=views.cameras(),
+        truth_m={name: true_m for name, (true_m, _) in scene.truth.items()},
+        T_key_lidar={f: stretch.T_target_source(scene.key, f) for f in stretch.frames},
+        far_frames=() if far is None else tuple(np.unique(far.cloud.frame).tolist()),
+        far_left_out=scene.beyond.standing.left_out if far and scene.beyond else (),
+    )
+
+
+def _see_far(scene: KeyScene, method: Method) -> SeenCloud | None:
+    """Return the static surfaces beyond the window as the cameras see them."""
+    if not method.far or scene.beyond is None:
+        return None
+    with scene.watch.stage("far"):
+        return scene.views.far(*scene.beyond, scene.stretch, standing_only=method.visible)
+
+
+def _add_ages(
+    scene: KeyScene, method: Method, depth: Mapping[str, DepthMap]
+) -> dict[str, DepthMap]:
+    """Add to each pixel the time between the exposure and its sweep."""
+    stamps_ns = {s.frame: s.sweep.stamp_ns for s in scene.stretch.sweeps}
+    if method.far and scene.beyond is not None:
+        stamps_ns |= scene.beyond.standing.stamps_ns
+    exposures = scene.views.exposures
+    return {
+        name: with_ages(maps, stamps_ns, scene.key, exposures[name].late_s)
+        for name, maps in depth.items()
+    }
+
+
+def _metrics(
+    scene: KeyScene, cloud: Cloud, depth: Mapping[str, DepthMap], visible: bool
+) -> dict[str, Any]:
+    """Return the scores that need no truth, and those against it where there is some."""
+    metrics: dict[str, Any] = {
+        "num_points": len(cloud),
+        "num_moving": int(cloud.moving.sum()),
+        "density": {
+            name: {
+                "measured": depth_metrics.image_density(maps.depth_m),
+                "filled": depth_metrics.image_density(maps.filled_m),
+            }
+            for name, maps in depth.items()
+        },
+        "ghosts": ghost_scores(cloud, scene.key_image, scene.key),
+    }
+    radial = radial_velocity_scores(cloud, scene.stretch[scene.key])
+    if radial is not None:
+        metrics["radial_velocity"] = radial
+    if scene.truth:
+        cameras = {name: scene.views.exposures[name].camera for name in depth}
+        metrics["depth"] = {
+            name: depth_metrics.depth_scores(depth[name], *true, cameras[name])
+            for name, true in scene.truth.items()
+        }
+        metrics["reliability"] = {
+            name: reliability(depth[name], true_m, cameras[name])
+            for name, (true_m, _) in scene.truth.items()
+        }
+    if visible:
+        metrics["expected_outliers"] = {n: expected_outliers(m) for n, m in depth.items()}
+    metrics["measure"] = {name: maps.measure for name, maps in depth.items()}
+    metrics["held_out"] = None  # its place; the scores come later
+    if scene.recording.settings.output.rejected:
+        metrics["rejected"] = {name: maps.counts() for name, maps in depth.items()}
+    return metrics

@@ -1,0 +1,302 @@
+# SPDX-License-Identifier: MIT
+"""Poses of the sweeps along the road before and behind a window: a chain, and a pose graph.
+
+The chain registers one sweep after another on a map of Gaussian voxels. The graph then aligns
+submaps with several before them: Grisetti et al., "A Tutorial on Graph-Based SLAM", IEEE
+Intelligent Transportation Systems Magazine 2010. A Cauchy weight keeps a wrong pair from bending
+the others.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import NamedTuple
+
+import numpy as np
+from scipy import sparse
+from scipy.sparse.linalg import spsolve
+
+from densify.config.errors import InputError
+from densify.geometry import poses
+from densify.geometry.threads import num_threads
+from densify.geometry.types import Bool, Float, Int, RegisteredSweep, Sweep
+from densify.registration.alignment import Alignment, Surface, SurfaceMap, align, subsample
+from densify.registration.deskew import deskew_sweep
+from densify.registration.start_speed import MAX_SPEED_M_S
+from densify.registration.trajectory import (
+    MAX_ACCELERATION_M_S2,
+    MIN_NUM_POINTS,
+    MIN_OVERLAP,
+    POSE_NOISE_M,
+)
+
+_CHAIN_MATCH_M = 2.0
+_MAP_NS = 550_000_000  # the known sweeps within it make the first map
+_LONGEST_GAP_S = 0.4  # between two sweeps of the chain
+_TOGETHER = 6  # sweeps that are chosen at the same speed
+
+_LEAST_POINTS = 80_000  # of a submap: rings of fewer slide onto each other
+_MOST_SWEEPS = 5
+_APART = (1, 2, 4, 8)  # submaps from one to the other of a pair
+_MATCH_M = 0.6
+_USUAL_M = 0.02  # between pairs; a pair that is far more off counts less
+_MOST_STEPS, _CONVERGED = 10, 1e-6
+_LEAST_OVERLAP, _MOST_LEFT_M, _MOST_WRONG = 0.5, 0.1, 0.25
+
+
+def follow_road(
+    known: Sequence[RegisteredSweep],
+    frames: Sequence[int],
+    stamp_ns: Int,
+    read: Callable[[int], Sweep],
+    prepare: Callable[[Sequence[int]], None],
+    reach_m: float,
+    step_m: float,
+) -> Iterator[tuple[Sweep, Float, Float]]:
+    """Yield raw sweeps along the road, ``T_world_lidar`` (4,4), and the (6,) twist per second.
+
+    Each sweep is aligned with a map of the sweeps before it, from where it would be at constant
+    velocity. The chain ends where a sweep cannot be read, is too sparse, does not lie on the map,
+    or moves as no vehicle does.
+
+    known: registered sweeps, the nearest to the others last. frames, stamp_ns: the others,
+        ascending or descending in time, beginning beside the last known one.
+    read: returns a raw sweep. prepare: called with the frames that are read next.
+    reach_m: of travel. step_m: between sweeps, about; those between are not read.
+    """
+    backwards = len(frames) > 0 and int(stamp_ns[0]) < known[-1].sweep.stamp_ns
+    end, travel_m, row = _ChainEnd(known, backwards), 0.0, 0
+    while travel_m < reach_m and row < len(frames):
+        rows = _next_rows(stamp_ns, row, end.stamp_ns, step_m, end.speed_m_s)
+        prepare([frames[r] for r in rows])
+        for r in rows:
+            try:
+                sweep = read(frames[r])
+            except InputError:
+                return
+            before_ns = end.stamp_ns
+            if not end.move_to(sweep):
+                return
+            travel_m += end.speed_m_s * abs(end.stamp_ns - before_ns) * 1e-9
+            yield sweep, end.T_world_lidar, end.twist
+            if travel_m >= reach_m:
+                return
+        row = rows[-1] + 1
+
+
+class _ChainEnd:
+    """The map of all sweeps of the chain, and pose, time and twist of the last."""
+
+    def __init__(self, known: Sequence[RegisteredSweep], backwards: bool) -> None:
+        self._map, last = SurfaceMap(), known[-1]
+        for s in known:
+            if abs(s.sweep.stamp_ns - last.sweep.stamp_ns) <= _MAP_NS:
+                self._map.insert(Surface.of(subsample(s.sweep).points), s.T_world_lidar)
+        self.T_world_lidar, self.stamp_ns = last.T_world_lidar, last.sweep.stamp_ns
+        self.twist = last.twist_before if backwards else last.twist_after
+
+    @property
+    def speed_m_s(self) -> float:
+        return float(np.linalg.norm(self.twist[3:]))
+
+    def move_to(self, sweep: Sweep) -> bool:
+        """Align the next sweep with the map; return False where that fails."""
+        if len(sweep) < MIN_NUM_POINTS:
+            return False
+        step_s = (sweep.stamp_ns - self.stamp_ns) * 1e-9
+        deskewed = deskew_sweep(subsample(sweep), self.T_world_lidar, self.twist, self.twist)
+        surface = Surface.of(deskewed.sweep.points)
+        guess = self.T_world_lidar @ poses.exp(self.twist * step_s)
+        found = self._map.align(surface, guess, _CHAIN_MATCH_M)
+        twist = poses.twist_between(self.T_world_lidar, found.T_target_source, step_s)
+        if found.overlap < MIN_OVERLAP or not _plausible(self.twist, twist, abs(step_s)):
+            return False
+        self.T_world_lidar, self.stamp_ns = found.T_target_source, sweep.stamp_ns
+        self.twist = twist
+        self._map.insert(surface, self.T_world_lidar)
+        return True
+
+
+def _next_rows(stamp_ns: Int, row: int, last_ns: int, step_m: float, speed_m_s: float) -> list[int]:
+    """Choose the next few sweeps, about ``step_m`` apart at this speed."""
+    gap_ns = 1e9 * min(_LONGEST_GAP_S, step_m / max(speed_m_s, 1e-3))
+    rows: list[int] = []
+    for r in range(row, len(stamp_ns)):
+        # One more sweep would be nearer to the gap wanted than this one.
+        beyond = abs(int(stamp_ns[min(r + 1, len(stamp_ns) - 1)]) - last_ns)
+        if (abs(int(stamp_ns[r]) - last_ns) + beyond) / 2 >= gap_ns:
+            rows.append(r)
+            last_ns = int(stamp_ns[r])
+        if len(rows) == _TOGETHER:
+            break
+    return rows or [len(stamp_ns) - 1]
+
+
+def _plausible(before: Float, after: Float, step_s: float) -> bool:
+    slack_m_s = POSE_NOISE_M / step_s
+    change_m_s = float(np.linalg.norm(after[3:] - before[3:]))
+    return bool(
+        np.isfinite(after).all()
+        and np.linalg.norm(after[3:]) <= MAX_SPEED_M_S + slack_m_s
+        and change_m_s <= MAX_ACCELERATION_M_S2 * step_s + slack_m_s
+    )
+
+
+class Relaxed(NamedTuple):
+    """Poses that agree. T_world_lidar: (n,4,4). holds: (n,) False for sweeps that only bad pairs
+    join to the known ones."""
+
+    T_world_lidar: Float
+    holds: Bool
+
+
+def num_in_submap(num_points: float) -> int:
+    """Return how many sweeps of that many points make a submap."""
+    return int(np.clip(np.ceil(_LEAST_POINTS / max(num_points, 1)), 1, _MOST_SWEEPS))
+
+
+def relax_poses(
+    points: Sequence[Float], T_world_lidar: Float, known: Bool, num_sweeps: int
+) -> Relaxed:
+    """Correct the poses of n neighbouring sweeps so that their surfaces agree.
+
+    A submap is joined to the known ones up to where neighbours overlap by less than half, or more
+    than a quarter of the pairs across are off by more than 0.1 m. Right poses are off by up to
+    0.03 m. A slide along a road without landmarks cannot be told.
+
+    points: (N,3) of each sweep, deskewed, lidar frame; a sample suffices.
+    T_world_lidar: (n,4,4), about. known: (n,) poses that stay, one or more neighbours.
+    num_sweeps: of a submap; within it, poses keep their distances.
+    """
+    member, middle = _submaps(known, num_sweeps)
+    T, fixed = T_world_lidar[middle], known[middle]
+    pairs = [
+        (i, i + apart)
+        for i in range(len(middle))
+        for apart in _APART
+        if i + apart < len(middle) and not (fixed[i] and fixed[i + apart])
+    ]
+    used = sorted({i for pair in pairs for i in pair})
+
+    def surface(i: int) -> Surface:
+        T_submap_world = poses.inverse(T[i])
+        rows = np.flatnonzero(member == i).tolist()
+        parts = [poses.transform(T_submap_world @ T_world_lidar[r], points[r]) for r in rows]
+        return Surface.of(np.concatenate(parts))
+
+    with ThreadPoolExecutor(num_threads()) as pool:
+        surfaces = dict(zip(used, pool.map(surface, used), strict=True))
+
+        def aligned(pair: tuple[int, int]) -> Alignment:
+            i, j = pair
+            return align(surfaces[i], surfaces[j], poses.inverse(T[i]) @ T[j], _MATCH_M)
+
+        graph = _Graph(np.array(pairs, int).reshape(-1, 2), fixed, list(pool.map(aligned, pairs)))
+    relaxed = graph.relaxed(T)
+    change = relaxed @ poses.inverse(T)
+    found = np.where(known[:, None, None], T_world_lidar, change[member] @ T_world_lidar)
+    return Relaxed(found, graph.holds(relaxed)[member])
+
+
+def _submaps(known: Bool, num_sweeps: int) -> tuple[Int, Int]:
+    """Return (n,) the submap of each sweep, ascending, and (m,) the middle sweep of each.
+
+    No submap holds known sweeps and others; the incomplete ones are the farthest from the known.
+    """
+    begin, end = np.flatnonzero(known)[[0, -1]] + (0, 1)
+    row = np.arange(len(known))
+    before, after = begin - 1 - row[:begin], row[end:] - end
+    part = np.concatenate(
+        [
+            -1 - before // num_sweeps,
+            row[: end - begin] // num_sweeps,
+            (end - begin - 1) // num_sweeps + 1 + after // num_sweeps,
+        ]
+    )
+    member = part - part[0]
+    middle = [int(np.median(np.flatnonzero(member == i))) for i in range(member[-1] + 1)]
+    return member, np.array(middle)
+
+
+class _Graph:
+    """Submaps and the pairs of them that were aligned.
+
+    ends: (p,2) target and source of each pair. fixed: (m,) submaps that stay.
+    """
+
+    def __init__(self, ends: Int, fixed: Bool, pairs: Sequence[Alignment]) -> None:
+        self._ends, self._fixed = ends, fixed
+        T_target_source = np.array([a.T_target_source for a in pairs]).reshape(-1, 4, 4)
+        self._T_source_target = np.linalg.inv(T_target_source)
+        self._information = np.array([a.information for a in pairs]).reshape(-1, 6, 6)
+        self._overlap = np.array([a.overlap for a in pairs])
+
+    def relaxed(self, T_world_submap: Float) -> Float:
+        """Return the poses (m,4,4) that agree best, by Gauss-Newton."""
+        T, free = T_world_submap.copy(), ~self._fixed
+        if not free.any():
+            return T
+        for _ in range(_MOST_STEPS):
+            step = self._step(T)
+            T[free] = T[free] @ poses.exp(step)
+            if abs(step).max() < _CONVERGED:
+                break
+        return T
+
+    def holds(self, T: Float) -> Bool:
+        """Return (m,) which submaps good pairs join to fixed ones, by poses (m,4,4)."""
+        target, source = self._ends.T
+        wrong = self.off_m(self._apart(T)) > _MOST_LEFT_M
+        across = np.zeros((2, len(self._fixed)))
+        for gap in range(len(self._fixed) - 1):  # from this submap to the next
+            spans = (target <= gap) & (source > gap)
+            across[:, gap] = wrong[spans].sum(), spans.sum()
+        good = across[0] <= _MOST_WRONG * across[1]
+        beside = source - target == 1
+        good[target[beside]] &= self._overlap[beside] >= _LEAST_OVERLAP
+        first, last = np.flatnonzero(self._fixed)[[0, -1]]
+        found = np.ones(len(self._fixed), bool)
+        found[:first] = np.logical_and.accumulate(good[:first][::-1])[::-1]
+        found[last + 1 :] = np.logical_and.accumulate(good[last:-1])
+        return found
+
+    def _between(self, T: Float) -> Float:
+        """Return (p,4,4) from each source to its target, by poses (m,4,4)."""
+        return poses.inverse(T[self._ends[:, 0]]) @ T[self._ends[:, 1]]
+
+    def _apart(self, T: Float) -> Float:
+        """Return (p,6) how far each source is off where its pair was aligned."""
+        return poses.log(self._T_source_target @ self._between(T))
+
+    def off_m(self, apart: Float) -> Float:
+        """Return (p,) how far that is for the surfaces, root mean square."""
+        square = np.einsum("pi,pij,pj->p", apart, self._information, apart)
+        return np.sqrt(np.maximum(square, 0))
+
+    def _step(self, T: Float) -> Float:
+        """Return the (free,6) next motion of every free submap, in its own frame."""
+        apart = self._apart(T)
+        weight = 1 / (1 + (self.off_m(apart) / _USUAL_M) ** 2)
+        slope = np.zeros((len(apart), 6, 12))  # by the motions of target and source
+        slope[:, :, :6], slope[:, :, 6:] = -_adjoints(poses.inverse(self._between(T))), np.eye(6)
+        pull = slope.transpose(0, 2, 1) @ (weight[:, None, None] * self._information)
+        # A fixed submap's unknowns are put behind all others, and cut off.
+        num = 6 * int((~self._fixed).sum())
+        first = np.where(self._fixed, num, 6 * (np.cumsum(~self._fixed) - 1))
+        at = (first[self._ends][:, :, None] + np.arange(6)).reshape(-1, 12)
+        row, column = np.broadcast_arrays(at[:, :, None], at[:, None, :])
+        left = sparse.csc_matrix(((pull @ slope).ravel(), (row.ravel(), column.ravel())))
+        right = np.bincount(at.ravel(), (pull @ apart[:, :, None]).ravel())
+        return -spsolve(left[:num, :num], right[:num]).reshape(-1, 6)
+
+
+def _adjoints(T: Float) -> Float:
+    """Return (n,6,6) that carry twists along (n,4,4), as `densify.geometry.poses.carried`."""
+    R, t = T[:, :3, :3], T[:, :3, 3]
+    cross = np.zeros_like(R)
+    cross[:, 0, 1], cross[:, 0, 2], cross[:, 1, 2] = -t[:, 2], t[:, 1], -t[:, 0]
+    cross -= cross.transpose(0, 2, 1)
+    found = np.zeros((len(T), 6, 6))
+    found[:, :3, :3], found[:, 3:, 3:], found[:, 3:, :3] = R, R, cross @ R
+    return found
