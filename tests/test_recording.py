@@ -92,38 +92,15 @@ def test_a_recording_within_the_window_is_what_run_makes(
             assert here.metrics[name] == alone.metrics[name]
 
 
-def test_more_sweeps_around_make_it_no_worse(small_blocks, long_street, tmp_path: Path) -> None:
-    drive = drive_of(long_street, tmp_path)
-    wrong = Counter()
-    for key in range(4, 14):  # of two keys the wrong pixels differ by their number's own noise
-        alone = by_flow(long_street, key, 2, config=GIVEN)
-        here = maps_of(drive, key)
-        assert here.frames == alone.frames
-        for who, result in (("alone", alone), ("here", here)):
-            ghosts = result.metrics["ghosts"]
-            wrong[who, "ghosts"] += ghosts["all"] * ghosts["num_points"]
-            truth = long_street.truth.depth_m("front", key)
-            depth_m = result.depth["front"].depth_m
-            both = (depth_m > 0) & (truth > 0)
-            wrong[who, "outliers"] += np.sum(np.abs(depth_m - truth)[both] > 0.05 * truth[both])
-            wrong[who, "pixels"] += both.sum()
-    assert wrong["here", "ghosts"] <= wrong["alone", "ghosts"] + 2
-    assert wrong["here", "outliers"] <= 1.05 * wrong["alone", "outliers"]
-    assert wrong["here", "pixels"] > 0.97 * wrong["alone", "pixels"] > 5000
-
-
 # Whatever is asked for
 
 
 def test_keys_do_not_depend_on_others(small_blocks, long_street, tmp_path: Path) -> None:
     """Nor on their order, nor on what is in memory or on disk already."""
-    keys = [5, 6]
     upward, downward = drive_of(long_street, tmp_path / "a"), drive_of(long_street, tmp_path / "b")
-    first = {key: maps_of(upward, key).depth for key in keys}
-    for key in reversed(keys):
-        assert_same_maps(maps_of(downward, key).depth, first[key])
-    from_disk = drive_of(long_street, tmp_path / "a")
-    assert_same_maps(maps_of(from_disk, 6).depth, first[6])
+    first = [maps_of(upward, key).depth for key in (5, 6)][1]
+    assert_same_maps(maps_of(downward, 6).depth, first)
+    assert_same_maps(maps_of(drive_of(long_street, tmp_path / "a"), 6).depth, first)
 
 
 # Seams
@@ -196,9 +173,7 @@ def test_sweeps_at_a_border_are_deskewed_by_their_neighbours_in_the_other_block(
         assert abs(here.twist_after - here.twist_before).max() > 0.05
 
 
-@pytest.mark.parametrize("lead_in_s", [0.0, 0.5])
-def test_no_window_is_cut_at_a_border(lead_in_s: float, tmp_path: Path, monkeypatch) -> None:
-    monkeypatch.setattr(steps, "LEAD_IN_S", lead_in_s)
+def test_no_window_is_cut_at_a_border(tmp_path: Path) -> None:
     for source in ("dataset", "kiss-icp"):
         config = resolve({"register": {"source": source}})
         drive = drive_of(across_border(), tmp_path, 2, config)
@@ -329,7 +304,7 @@ def use(sequence, folder: Path, config: Config = GIVEN, window: int = 2) -> None
         drive.motion(key)
 
 
-def test_each_piece_of_work_is_made_once(counted: Counter[str], tmp_path: Path) -> None:
+def test_each_step_is_made_once_of_the_same_inputs(counted: Counter[str], tmp_path: Path) -> None:
     sequence = across_border()
     use(sequence, tmp_path)
     assert counted == {**ONCE, "images": len(sequence.frames)}
@@ -338,21 +313,10 @@ def test_each_piece_of_work_is_made_once(counted: Counter[str], tmp_path: Path) 
     use(sequence, tmp_path, window=3)  # only the keys' windows are larger
     use(sequence, tmp_path, resolve({**POSES_GIVEN, "project": {"support": 3}}))
     assert counted == {}
-
-
-def test_other_settings_and_other_sweeps_make_anew(counted: Counter[str], tmp_path: Path) -> None:
-    sequence = across_border()
-    use(sequence, tmp_path)
-    counted.clear()
-    use(sequence, tmp_path, resolve({**POSES_GIVEN, "flow": {"soft": False}}))
+    use(sequence, tmp_path, resolve({**POSES_GIVEN, "objective": {"alpha": 3}}))
     assert counted == {"estimate_motion": 2}
     counted.clear()
-    use(sequence, tmp_path, resolve({"register": {"source": "dataset", "max_range_m": 40}}))
-    assert counted == {**ONCE, "images": len(sequence.frames)}
-    counted.clear()
     whole = Damaged(sequence)
-    use(whole, tmp_path)
-    assert counted == {}
     last = sequence.frames[-1]
     scans = {frame: sequence.scene.scan(frame) for frame in sequence.frames}
     sweep = scans[last].sweep
@@ -382,18 +346,6 @@ def test_keys_whose_windows_overlap_share_what_they_can(counted: Counter[str], l
         "estimate_motion": 1,
         "images": 13,  # of ten sweeps, and of each key by itself
     }
-    alone = pipeline.run(long_street, 6, 2, config=GIVEN)
-    assert set(results[6].metrics) == set(alone.metrics)
-    ghosts = results[6].metrics["ghosts"]["all"], alone.metrics["ghosts"]["all"]
-    assert ghosts[0] <= ghosts[1] + 0.001
-
-
-def test_keys_far_apart_share_nothing_and_are_as_by_themselves(long_street) -> None:
-    config = resolve({**POSES_GIVEN, "flow": {"look_around_s": 0.2}})
-    results = dict(pipeline.run_keys(long_street, [2, 14], 2, config=config))
-    for key, result in results.items():
-        alone = by_flow(long_street, key, 2, config=config)
-        assert_same_maps(result.depth, alone.depth)
 
 
 @pytest.mark.parametrize("bad", [None, 12], ids="sweep {} cannot be read".format)
