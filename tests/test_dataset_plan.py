@@ -264,17 +264,16 @@ def test_status(border_drive: Path, tmp_path: Path, capsys) -> None:
     assert not out.exists()
 
     def look(summary) -> None:
-        here, lines = make.status(out)
+        here = make.status(out)
         seen.append((here.count("done"), here.num_keys, here.num_left))
-        assert len(seen) == 1 or f"{len(seen) - 1} of 2" in lines[0]
 
     recipe = Recipe(2, "none", config=resolve({"register": {"source": "dataset"}}))
     make.make_dataset([str(border_drive)], out, slice(39, 41), recipe, report=look)
     assert seen == [(0, 2, 2), (1, 2, 1), (2, 2, 0)]
     before = {p: p.stat().st_mtime_ns for p in out.rglob("*")}
     assert exit_code("dataset", "--status", out) == 0
-    first, second, last, *_ = capsys.readouterr().out.splitlines()
-    assert (first, second[:8], last[:5]) == ("2 keys: 2 done", "density ", "log: ")
+    first, second = capsys.readouterr().out.splitlines()
+    assert (first, second[:8]) == ("2 keys: 2 done", "density ")
     assert {p: p.stat().st_mtime_ns for p in out.rglob("*")} == before
     (out / "manifest.jsonl").write_text("")
     assert exit_code("dataset", "--status", out) == 0

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -36,11 +35,6 @@ def set_summary(summary: Summary) -> str:
     if len(missing) > _MOST_SHOWN:
         lines.append(f"... and {len(missing) - _MOST_SHOWN} more, see the manifest")
     return "\n".join(line for line in lines if line)
-
-
-def set_status(summary: Summary, last_lines: Sequence[str]) -> str:
-    """Describe a set that may still be at work; last_lines: of its logs."""
-    return "\n".join([set_summary(summary), *(f"log: {line}" for line in last_lines)])
 
 
 def set_facts(summary: Summary) -> dict[str, Any]:

@@ -1,16 +1,13 @@
 # SPDX-License-Identifier: MIT
-"""A training set read back: what `densify dataset --layout kitti-depth` wrote, as a torch dataset.
-
-Images are not in the set: they come from the recordings it was made of.
-"""
+"""A training set of `densify dataset --layout kitti-depth`, read back as a torch dataset. Images
+come from the recordings it was made of."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -30,10 +27,16 @@ _SPLITS = ("train", "val")
 _MOST_CERTAIN, _LEAST_CERTAIN = 255, 1  # as stored; 0 is no depth
 
 
+class _Sample(NamedTuple):
+    drive: str
+    camera: str
+    frame: int
+
+
 class DepthDataset(Dataset[dict[str, Any]]):
     """One sample for each finished key and camera, ordered by drive, camera and frame.
 
-    A sample is a dict of float32 tensors with what belongs to them; H and W as cropped::
+    A sample is a dict of float32 tensors and their names; H and W as cropped::
 
         image           (3,H,W) RGB, 0 to 1
         sparse_depth_m  (1,H,W) camera z of the key sweep alone, metres, 0 none
@@ -42,11 +45,11 @@ class DepthDataset(Dataset[dict[str, Any]]):
         intrinsics      (3,3) K in pixels, of the image as it is here; integers at pixel centres
         frame           int, absolute; drive, camera: str
 
-    A flipped sample is a mirrored world: what was at camera x is at -x, the focal lengths stay
-    positive. Where a recording is not rectified, ``intrinsics`` leave the lens's distortion out.
+    A flipped sample is a mirrored world: camera x becomes -x, the focal lengths stay positive. Of a
+    recording that is not rectified, ``intrinsics`` leave the lens's distortion out.
 
-    Recordings are opened when a process first needs them, so the set can be handed to the workers
-    of a DataLoader. What is random follows from seed, epoch and index alone, whoever loads it.
+    Each process opens recordings when it first needs them, so the set can be handed to the workers
+    of a DataLoader. Seed, epoch and index alone decide what is random.
     """
 
     def __init__(
@@ -60,15 +63,15 @@ class DepthDataset(Dataset[dict[str, Any]]):
         data: Mapping[str, str | Path] | None = None,
         split: Literal["train", "val"] | None = None,
     ) -> None:
-        """root: ``--out`` of `densify dataset`. cameras: names, all if None. filled: dense depth
-        has the pixels interpolated between measured ones too.
-
-        crop: (height_px, width_px), cut out at the bottom of the image, where the depth is, and
-            at a random place from left to right.
+        """root: ``--out`` of `densify dataset`.
+        cameras: names, all if None.
+        filled: dense depth has the pixels interpolated between measured ones too.
+        crop: (height_px, width_px), cut out at the bottom of the image, where the depth is, and at
+            a random place from left to right.
         flip: mirror every other sample, at random.
         seed: from 0; see `set_epoch`.
-        data: drive -> where its recording is now, what `densify.open_sequence` takes; needed for
-            those that have moved since the set was made.
+        data: drive -> where its recording is now, for `densify.open_sequence`; needed for those
+            that have moved since the set was made.
         split: "train" or "val", KITTI's; both if None.
 
         Raises InputError if there is no set of this layout, nothing in it is left to load, or a
@@ -76,56 +79,48 @@ class DepthDataset(Dataset[dict[str, Any]]):
         """
         self._root = Path(root)
         self._filled, self._crop, self._flip, self._seed = filled, crop, flip, seed
-        self._check_options(split)
-        drives = _read_drives(self._root)
-        self._drives = {
-            name: drive
-            for name, drive in drives.items()
-            if split is None or drive.folder.startswith(f"{split}/")
-        }
-        self._check_cameras(cameras)
-        self._specs = {name: drive.data for name, drive in drives.items()}
+        if split is not None and split not in _SPLITS:
+            raise InputError(f"split: got {split!r}, expected None, {' or '.join(_SPLITS)}")
+        if seed < 0:
+            raise InputError(f"seed: got {seed}, expected a whole number from 0")
+        self._drives = _read_drives(self._root)
+        self._specs = {name: drive.data for name, drive in self._drives.items()}
         for name, spec in (data or {}).items():
-            if name not in drives:
-                raise InputError(
-                    f"data: no drive {name!r} in {self._root}; it has {', '.join(drives)}"
-                )
+            if name not in self._drives:
+                known = ", ".join(self._drives)
+                raise InputError(f"data: no drive {name!r} in {self._root}; it has {known}")
             self._specs[name] = str(spec)
-        self._samples = self._find_samples(cameras)
+        self._samples = self._find_samples(cameras, split)
         self._check_crop()
         # Shared: workers that live on from epoch to epoch see it change.
         self._epoch = torch.zeros((), dtype=torch.int64).share_memory_()
         self._opened: dict[tuple[int, str], LidarSequence] = {}
 
     def set_epoch(self, epoch: int) -> None:
-        """Draw new crops and flips: call it before each epoch with its number, from 0. Two runs
-        with the same seed get the same ones."""
+        """Draw new crops and flips: call it before each epoch with its number, from 0."""
         self._epoch.fill_(epoch)
 
     def __len__(self) -> int:
         return len(self._samples)
 
     def __getitem__(self, index: int) -> dict[str, Any]:
-        """The sample; see the class. Raises InputError for what is missing or damaged."""
+        """Return the sample; see the class. Raises InputError for what is missing or damaged."""
         sample = self._samples[index]
-        drive = self._drives[sample.drive]
-        camera = drive.cameras[sample.camera]
+        camera = self._drives[sample.drive].cameras[sample.camera]
         maps = self._read_maps(sample, camera)
         maps["image"] = self._read_image(sample, camera)
         rows, columns, mirrored = self._view(camera, index % len(self))
-        K = _viewed_K(camera.K, rows.start, columns, mirrored)
         step = -1 if mirrored else 1
         tensors = {
             name: torch.from_numpy(np.ascontiguousarray(array[..., rows, columns][..., ::step]))
             for name, array in maps.items()
         }
         tensors["image"] = tensors["image"].to(torch.float32).div_(255)
+        K = _viewed_K(camera.K, rows.start, columns, mirrored)
         return {
             **tensors,
             "intrinsics": torch.from_numpy(K.astype(np.float32)),
-            "frame": sample.frame,
-            "drive": sample.drive,
-            "camera": sample.camera,
+            **sample._asdict(),
         }
 
     def __getstate__(self) -> dict[str, Any]:
@@ -135,39 +130,18 @@ class DepthDataset(Dataset[dict[str, Any]]):
         self.__dict__.update(state)
         self._epoch.share_memory_()
 
-    def _check_options(self, split: str | None) -> None:
-        if split is not None and split not in _SPLITS:
-            raise InputError(f"split: got {split!r}, expected None, {' or '.join(_SPLITS)}")
-        if self._seed < 0:
-            raise InputError(f"seed: got {self._seed}, expected a whole number from 0")
-        if self._crop is not None and (len(self._crop) != 2 or min(self._crop) < 1):
-            raise InputError(f"crop: got {self._crop}, expected (height_px, width_px)")
-
-    def _check_cameras(self, cameras: Sequence[str] | None) -> None:
-        there = sorted({name for drive in self._drives.values() for name in drive.cameras})
+    def _find_samples(self, cameras: Sequence[str] | None, split: str | None) -> list[_Sample]:
+        there = {name for drive in self._drives.values() for name in drive.cameras}
         for name in cameras or ():
             if name not in there:
-                raise InputError(
-                    f"{self._root}: no camera {name!r}; it has {', '.join(there) or 'none'}"
-                )
-
-    def _check_crop(self) -> None:
-        if self._crop is None:
-            return
-        for name, camera in sorted({(s.drive, s.camera) for s in self._samples}):
-            size = self._drives[name].cameras[camera]
-            if self._crop[0] > size.height_px or self._crop[1] > size.width_px:
-                raise InputError(
-                    f"crop: got {self._crop[0]} x {self._crop[1]} px (height x width), expected at "
-                    f"most the {size.height_px} x {size.width_px} of {camera} in {name}"
-                )
-
-    def _find_samples(self, cameras: Sequence[str] | None) -> list[_Sample]:
+                known = ", ".join(sorted(there)) or "none"
+                raise InputError(f"{self._root}: no camera {name!r}; it has {known}")
         done = [r for r in read_manifests(self._root).values() if r.status == "done"]
         samples = [
             _Sample(record.drive, camera, record.key)
             for record in done
             if (drive := self._drives.get(record.drive)) is not None
+            if split is None or drive.folder.startswith(f"{split}/")
             for camera in drive.cameras
             if cameras is None or camera in cameras
             if _map_path(drive, "groundtruth", camera, record.key) in record.files
@@ -179,8 +153,21 @@ class DepthDataset(Dataset[dict[str, Any]]):
             )
         return sorted(samples)
 
+    def _check_crop(self) -> None:
+        if self._crop is None:
+            return
+        if len(self._crop) != 2 or min(self._crop) < 1:
+            raise InputError(f"crop: got {self._crop}, expected (height_px, width_px)")
+        for name, camera in sorted({(s.drive, s.camera) for s in self._samples}):
+            size = self._drives[name].cameras[camera]
+            if self._crop[0] > size.height_px or self._crop[1] > size.width_px:
+                raise InputError(
+                    f"crop: got {self._crop[0]} x {self._crop[1]} px (height x width), expected at "
+                    f"most the {size.height_px} x {size.width_px} of {camera} in {name}"
+                )
+
     def _read_maps(self, sample: _Sample, camera: Camera) -> dict[str, NDArray[Any]]:
-        """(1,H,W) each."""
+        """Return the maps, (1,H,W) each."""
 
         def read(kind: str, reader: Callable[[Path], NDArray[Any]]) -> NDArray[Any]:
             drive = self._drives[sample.drive]
@@ -204,7 +191,7 @@ class DepthDataset(Dataset[dict[str, Any]]):
         }
 
     def _read_image(self, sample: _Sample, camera: Camera) -> NDArray[np.uint8]:
-        """(3,H,W)."""
+        """Return the image, (3,H,W)."""
         recording = self._recording(sample.drive)
         where = f"{self._specs[sample.drive]}: {sample.camera} of frame {sample.frame}"
         number = key_shots(recording, [camera], sample.frame)[sample.camera].number
@@ -227,7 +214,7 @@ class DepthDataset(Dataset[dict[str, Any]]):
         return self._opened[here]
 
     def _view(self, camera: Camera, index: int) -> tuple[slice, slice, bool]:
-        """Rows and columns that are cut out, and whether they are mirrored."""
+        """Return the rows and columns that are cut out, and whether they are mirrored."""
         height_px, width_px = self._crop or (camera.height_px, camera.width_px)
         random = np.random.default_rng([self._seed, int(self._epoch), index])
         left = int(random.integers(camera.width_px - width_px + 1))
@@ -236,31 +223,18 @@ class DepthDataset(Dataset[dict[str, Any]]):
         return rows, slice(left, left + width_px), mirrored
 
 
-@dataclass(frozen=True, order=True)
-class _Sample:
-    drive: str
-    camera: str
-    frame: int
-
-
 def _read_drives(root: Path) -> dict[str, StoredDrive]:
-    """Recordings of dataset.json, by name."""
     table = read_plan(root)
+    wanted = f"expected a set that densify dataset --layout {LAYOUT} made"
     if table is None:
-        raise InputError(
-            f"{root / 'dataset.json'}: no such file; expected the folder that densify dataset "
-            f"--layout {LAYOUT} wrote"
-        )
+        raise InputError(f"{root / 'dataset.json'}: no such file; {wanted}")
     if table["layout"] != LAYOUT:
-        raise InputError(
-            f"{root / 'dataset.json'}: got a set of layout {table['layout']!r}, expected "
-            f"{LAYOUT!r}; make it with densify dataset --layout {LAYOUT}"
-        )
-    return stored_drives(root, table)
+        raise InputError(f"{root / 'dataset.json'}: got layout {table['layout']!r}; {wanted}")
+    return stored_drives(table)
 
 
 def _map_path(drive: StoredDrive, kind: str, camera: str, frame: int) -> str:
-    """The map's path in the set, as the manifest names it."""
+    """Return the map's path in the set, as the manifest names it."""
     return f"{drive.folder}/proj_depth/{kind}/{camera}/{frame:010d}.png"
 
 
@@ -274,17 +248,16 @@ def _check_size(where: str, image: NDArray[Any], camera: Camera) -> None:
 
 
 def _confidence(levels: NDArray[np.uint8], depth_m: Float32) -> Float32:
-    """0 to 1, of what `densify.outputs.depth_png.stored_confidence` gave."""
+    """Return 0 to 1, of what `densify.outputs.depth_png.stored_confidence` gave."""
     known = (levels > 0) & (depth_m > 0)
     scale = np.float32(1 / (_MOST_CERTAIN - _LEAST_CERTAIN))
     return np.where(known, (levels.astype(np.float32) - _LEAST_CERTAIN) * scale, np.float32(0))
 
 
 def _viewed_K(K: Float, top: int, columns: slice, mirrored: bool) -> Float:
-    """(3,3) after the crop and then the flip, which takes pixel u to width - 1 - u."""
+    """Return K (3,3) after the crop and then the flip, which takes pixel u to width - 1 - u."""
     viewed = K.copy()
-    viewed[0, 2] -= columns.start
-    viewed[1, 2] -= top
+    viewed[:2, 2] -= columns.start, top
     if mirrored:
         viewed[0, 1] = -viewed[0, 1]
         viewed[0, 2] = columns.stop - columns.start - 1 - viewed[0, 2]

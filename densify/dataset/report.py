@@ -8,7 +8,6 @@ import os
 import re
 import urllib.parse
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -33,14 +32,14 @@ _WHOLE = ("num_points", "num_moving", "ghost")
 
 
 def write_output(result: Result, context: Context, folder: Path) -> None:
-    """``report.html``, of the files that the other outputs wrote, where ``output.report`` asks."""
+    """Write ``report.html`` of the files of the other outputs, where ``output.report`` asks."""
     if context.config.get("output", {}).get("report"):
         page = key_page(KeyFiles.of_run(folder), f"{result.key:06d}")
         write_file(folder / "report.html", page)
 
 
 def write_comparison_page(folder: Path) -> Path:
-    """``compare.html`` of a key's folder."""
+    """Write ``compare.html`` of a key's folder."""
     page = folder / "compare.html"
     write_file(page, key_page(KeyFiles.of_comparison(folder), ""))
     return page
@@ -52,16 +51,16 @@ def write_report(
     overwrite: bool = False,
     progress: Progress | None = None,
 ) -> list[Path]:
-    """Make the page or pages of what lies in a folder; returns them.
+    """Make the page or pages of what lies in a folder; return them.
 
     place: a key's folder of ``run`` or ``compare``, such as densify-out/000120, the folder above
-    some of them, or a training set. out: the file to write; ``report.html`` of a run or a set,
-    ``compare.html`` of a comparison, beside their files, if None. overwrite: replace an earlier
-    page.
+        some of them, or a training set.
+    out: the file to write; if None ``report.html`` of a run or a set, ``compare.html`` of a
+        comparison, beside their files. overwrite: replace an earlier page.
 
-    What is damaged or missing is said on the page. Raises InputError for a folder that is none of
-    these, one whose main files are damaged, and a page that is there already, OutputError if it
-    cannot be written.
+    The page tells what is damaged or missing. Raises InputError for a folder that is none of these,
+    one whose main files are damaged, and a page that is there already, OutputError if it cannot be
+    written.
     """
     pages = _pages(place, progress)
     if out is not None and len(pages) > 1:
@@ -84,7 +83,7 @@ def write_report(
 
 
 def _pages(place: Path, progress: Progress | None) -> dict[Path, Callable[[Path], bytes]]:
-    """Path -> what makes the page for the folder it will be in."""
+    """Return path -> what makes the page for the folder it will be in."""
     if not place.is_dir():
         raise InputError(
             f"{place}: no such folder; expected what densify run, compare or dataset wrote"
@@ -112,23 +111,8 @@ def _pages(place: Path, progress: Progress | None) -> dict[Path, Callable[[Path]
     return {place / "report.html": lambda there: _runs_page(place, runs, there, progress)}
 
 
-@dataclass(frozen=True)
-class _Key:
-    """A row. status, reason, scores: as of a `KeyRecord`. shown: its first depth map."""
-
-    drive: str
-    key: int
-    status: str
-    reason: str
-    num_sweeps: int = 0
-    seconds: float = 0.0
-    scores: Mapping[str, Any] = field(default_factory=dict)
-    shown: Path | None = None
-
-
-def _set_page(root: Path, shown_from: Path, progress: Progress | None = None) -> bytes:
-    """The page of a training set. root: its folder. shown_from: the page's, to which links are
-    relative. Raises InputError where there is no set, or its description is damaged."""
+def _set_page(root: Path, shown_from: Path, progress: Progress | None) -> bytes:
+    """Return the page of a training set. shown_from: the folder to which links are relative."""
     table = read_plan(root)
     if table is None:
         raise InputError(f"{root}: no dataset.json in it; expected a training set's folder")
@@ -139,123 +123,102 @@ def _set_page(root: Path, shown_from: Path, progress: Progress | None = None) ->
         "quality gate": ", ".join(limits) or "none",
         "recordings": ", ".join(table["drives"]),
     }
+    config = [
+        (f"{section}.{knob}", str(value))
+        for section, knobs in table["config"].items()
+        for knob, value in _mapping(knobs).items()
+    ]
     num_left = len(planned_keys(table) - records.keys())
-    keys = [_of_record(record, root) for record in records.values()]
-    return _page(root, shown_from, keys, about, num_left, table["config"], progress)
+    more = {"about": list(about.items()), "config": config, "num_left": num_left}
+    return _page(root, shown_from, list(records.values()), more, progress)
 
 
 def _runs_page(
-    root: Path, folders: Sequence[Path], shown_from: Path, progress: Progress | None = None
+    root: Path, folders: Sequence[Path], shown_from: Path, progress: Progress | None
 ) -> bytes:
-    """The page of several keys that ``run`` wrote into one folder. folders: the keys'. The rest as
-    `set_page`."""
-    keys = [_of_run(folder) for folder in folders]
-    about = {"recordings": ", ".join(sorted({key.drive for key in keys}))}
-    return _page(root, shown_from, keys, about, 0, {}, progress)
+    """Return the page of several keys that ``run`` wrote into folders of one folder."""
+    records = [_record_of_run(folder) for folder in folders]
+    drives = ", ".join(sorted({record.drive for record in records}))
+    more = {"about": [("recordings", drives)], "config": [], "num_left": 0}
+    return _page(root, shown_from, records, more, progress)
 
 
 def _page(
     root: Path,
     shown_from: Path,
-    keys: Sequence[_Key],
-    about: Mapping[str, Any],
-    num_left: int,
-    config: Mapping[str, Any],
+    records: Sequence[KeyRecord],
+    more: Mapping[str, Any],
     progress: Progress | None,
 ) -> bytes:
-    cameras = sorted({c for key in keys for c in _mapping(key.scores.get("density"))})
-    shown = {row: key.shown for row, key in enumerate(keys) if key.shown is not None}
+    cameras = sorted({c for r in records for c in _mapping(r.scores.get("density"))})
+    maps = [_first_map(record, root) for record in records]
+    shown = {row: path for row, path in enumerate(maps) if path is not None}
     blobs = Blobs()
     pictures, found = sheets(blobs, list(shown.values()), progress)
     places = {row: at for at, (row, there) in enumerate(zip(shown, found, strict=True)) if there}
-    title = f"{root.resolve().name}: {len(keys):,} keys"
-    data = {
-        "title": title,
-        "footer": f"densify {__version__}; links lead to the files beside this page.",
-        "about": list(about.items()),
-        "config": [
-            (f"{section}.{knob}", str(value))
-            for section, knobs in config.items()
-            for knob, value in _mapping(knobs).items()
-        ],
-        "cameras": cameras,
-        "num_left": num_left,
-        "pictures": pictures,
-        "rows": [
-            {**_row(key, cameras, shown_from), "picture": places.get(row)}
-            for row, key in enumerate(keys)
-        ],
-    }
-    return page_file("set.html", _SCRIPTS, title, data, blobs)
+    title = f"{root.resolve().name}: {len(records):,} keys"
+    rows = [
+        {**_row(record, path, cameras, shown_from), "picture": places.get(row)}
+        for row, (record, path) in enumerate(zip(records, maps, strict=True))
+    ]
+    footer = f"densify {__version__}; links lead to the files beside this page."
+    data = {**more, "title": title, "footer": footer, "cameras": cameras, "pictures": pictures}
+    return page_file("set.html", _SCRIPTS, title, {**data, "rows": rows}, blobs)
 
 
-def _row(key: _Key, cameras: Sequence[str], shown_from: Path) -> dict[str, Any]:
-    per_camera = {name: _mapping(key.scores.get(name)) for name in _PER_CAMERA}
-    page = None if key.shown is None else _key_page(key.shown)
-    linked = page or key.shown
+def _row(
+    record: KeyRecord, shown: Path | None, cameras: Sequence[str], shown_from: Path
+) -> dict[str, Any]:
+    """Return a row of the table. shown: the key's depth map, to which the row leads unless the key
+    has a page of its own."""
+    per_camera = {name: _mapping(record.scores.get(name)) for name in _PER_CAMERA}
+    folders = [place for place in shown.parents if place.name == "depth"] if shown else []
+    page = folders[0].parent / "report.html" if folders else None
+    is_page = page is not None and page.is_file()
+    linked = page if is_page else shown
+    link = ""
+    if linked is not None:
+        relative = os.path.relpath(linked.resolve(), shown_from.resolve())
+        link = urllib.parse.quote(Path(relative).as_posix())
     return {
-        "drive": key.drive,
-        "key": key.key,
-        "status": key.status,
-        "reason": key.reason,
-        "sweeps": key.num_sweeps,
-        "seconds": key.seconds,
-        **{name: _number(key.scores.get(name)) for name in _WHOLE},
+        "drive": record.drive,
+        "key": record.key,
+        "status": record.status,
+        "reason": record.reason or "; ".join(record.warnings),
+        "sweeps": len(record.frames),
+        "seconds": record.seconds,
+        **{name: _number(record.scores.get(name)) for name in _WHOLE},
         **{n: [_number(values.get(c)) for c in cameras] for n, values in per_camera.items()},
-        "link": "" if linked is None else _link(linked, shown_from),
-        "is_page": page is not None,
+        "link": link,
+        "is_page": is_page,
     }
 
 
-def _of_record(record: KeyRecord, root: Path) -> _Key:
-    return _Key(
-        record.drive,
-        record.key,
-        record.status,
-        record.reason or "; ".join(record.warnings),
-        len(record.frames),
-        record.seconds,
-        record.scores,
-        _shown_map(record, root),
-    )
-
-
-def _of_run(folder: Path) -> _Key:
-    """One that is damaged counts as failed."""
+def _record_of_run(folder: Path) -> KeyRecord:
+    """Return the record of a key that ``run`` wrote; a damaged one counts as failed."""
     try:
         about, _ = read_yaml(folder / "run.yaml")
         stages = [_mapping(stage) for stage in about.get("stages") or ()]
-        return _Key(
+        maps = [p.relative_to(folder.parent) for p in (folder / "depth").rglob("*.png")]
+        return KeyRecord(
             str(about.get("data")),
             int(about["key"]),
             "done",
-            "; ".join(map(str, about.get("warnings") or ())),
-            len(about.get("frames") or ()),
-            sum(_number(stage.get("seconds")) or 0.0 for stage in stages),
-            scores_of_metrics(read_json(folder / "metrics.json")),
-            next(iter(sorted((folder / "depth").rglob("*.png"))), None),
+            frames=tuple(about.get("frames") or ()),
+            files={path.as_posix(): FileRecord(0, 64 * "0") for path in maps},
+            scores=scores_of_metrics(read_json(folder / "metrics.json")),
+            seconds=sum(_number(stage.get("seconds")) or 0.0 for stage in stages),
+            warnings=tuple(map(str, about.get("warnings") or ())),
         )
     except (InputError, KeyError, TypeError, ValueError, AttributeError) as error:
-        return _Key(folder.name, 0, "failed", str(error) or type(error).__name__)
+        return KeyRecord(folder.name, 0, "failed", str(error) or type(error).__name__)
 
 
-def _shown_map(record: KeyRecord, root: Path) -> Path | None:
-    """The depth map of the first camera; names that lead out of the set are none."""
+def _first_map(record: KeyRecord, root: Path) -> Path | None:
+    """Return the depth map of the first camera; names that lead out of the set are none."""
     names = sorted(name for name in record.files if _SHOWN_MAP.search(name))
     inside = [n for n in names if not PurePosixPath(n).is_absolute() and ".." not in Path(n).parts]
     return root / inside[0] if inside else None
-
-
-def _key_page(shown: Path) -> Path | None:
-    """The key's own page, where it has one."""
-    folders = [place for place in shown.parents if place.name == "depth"]
-    page = folders[0].parent / "report.html" if folders else None
-    return page if page is not None and page.is_file() else None
-
-
-def _link(path: Path, shown_from: Path) -> str:
-    relative = os.path.relpath(path.resolve(), shown_from.resolve())
-    return urllib.parse.quote(Path(relative).as_posix())
 
 
 def _number(value: Any) -> float | None:

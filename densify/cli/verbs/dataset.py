@@ -66,12 +66,6 @@ def add(commands: Any) -> None:
         choices=("train", "val"),
         help="of the tree (default: KITTI's official one, train for other recordings)",
     )
-    parser.add_argument(
-        "--links",
-        action="store_true",
-        help="make data_depth_velodyne, data_depth_annotated and data_rgb, links by which loaders "
-        "of others find the tree and its images",
-    )
     _add_gate(parser)
     _add_workers(parser)
     parser.add_argument(
@@ -142,12 +136,12 @@ def answer(options: argparse.Namespace) -> Iterator[Answer]:
 
 
 def _so_far(options: argparse.Namespace) -> Iterator[Answer]:
-    from densify.cli.sets import set_facts, set_status
+    from densify.cli.sets import set_facts, set_summary
     from densify.dataset.make import damaged, status
 
-    so_far, last_lines = status(options.status)
+    so_far = status(options.status)
     files = damaged(options.status) if options.verify else []
-    text = "\n".join([set_status(so_far, last_lines), *(f"damaged: {name}" for name in files)])
+    text = "\n".join([set_summary(so_far), *(f"damaged: {name}" for name in files)])
     yield Answer(text, {**set_facts(so_far), "damaged": files})
     if files:
         raise ComputationError(
@@ -184,7 +178,6 @@ def _made(options: argparse.Namespace) -> Iterator[Answer]:
             scheduler=options.scheduler,
             shard=options.shard,
             verify=options.verify,
-            links=options.links,
             report=report,
         )
     told = [options.out / name for name in FIRST_OF_SET if (options.out / name).is_file()]
