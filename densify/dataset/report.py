@@ -20,6 +20,7 @@ from densify.dataset.plan import planned_keys, read_plan
 from densify.geometry.types import Progress, Result
 from densify.outputs.atomic import write_file
 from densify.outputs.context import Context
+from densify.outputs.kitti_tree import FileRecord
 from densify.outputs.report.key_files import KeyFiles
 from densify.outputs.report.key_page import key_page
 from densify.outputs.report.page_file import Blobs, page_file
