@@ -191,55 +191,36 @@ def swap(path: Path, old: bytes, new: bytes) -> None:
     path.write_bytes(data.replace(old, new, 1))
 
 
-DAMAGE = {
-    "pcd cut between points": ("padded.pcd", lambda p: cut(p, 26), "59 points, expected 60"),
-    "pcd cut within a point": ("padded.pcd", lambda p: cut(p, 5), "not a readable .pcd"),
-    "pcd of words cut": (
-        "words.pcd",
-        lambda p: p.write_bytes(b"".join(p.open("rb").readlines()[:-9])),
-        "51 points, expected",
-    ),
-    "packed pcd cut": ("packed.pcd", lambda p: cut(p, 40), "not a readable .pcd"),
-    "packed pcd without points": ("packed.pcd", lambda p: cut(p, 10**4), "header ends before"),
-    "pcd header cut": ("padded.pcd", lambda p: p.write_text(HEADER[:80]), "header ends before"),
-    "pcd without sizes": ("padded.pcd", lambda p: swap(p, b"SIZE", b"SIDE"), "has no SIZE"),
-    "pcd with fewer types": (
-        "padded.pcd",
-        lambda p: swap(p, b"F F F U", b"F F F"),
-        "8 TYPE",
-    ),
-    "pcd of another form": ("padded.pcd", lambda p: swap(p, b"DATA binary", b"DATA zipped"), "pcd"),
-    "ply cut": ("little.ply", lambda p: cut(p, 17), "not a readable .ply"),
-    "ply of words cut": ("words.ply", lambda p: cut(p, 200), "fewer than the 60 vertices"),
-    "ply header cut": ("little.ply", lambda p: p.write_bytes(b"ply\nformat ascii"), ".ply"),
-    "ply without vertices": (
-        "words.ply",
-        lambda p: swap(p, b"element vertex", b"element corner"),
-        "expected vertices",
-    ),
-    "las cut": ("one.las", lambda p: cut(p, 30), "not a readable .las"),
-    "las header cut": ("one.las", lambda p: p.write_bytes(p.read_bytes()[:100]), ".las"),
-    "laz cut": ("one.laz", lambda p: cut(p, 300), "not a readable .laz"),
-    "csv with a short line": ("comma.csv", lambda p: swap(p, b"\n", b"\n1,2\n"), ".csv"),
-    "csv with a word": ("comma.csv", lambda p: swap(p, b"\n", b"\n1,2,x,4,5\n"), ".csv"),
-    "csv not of text": ("comma.csv", lambda p: p.write_bytes(b"\xff\xfe\x00"), ".csv"),
-    "no points": ("comma.csv", lambda p: p.write_text("x,y,z\n"), "holds no points"),
-    "npz of other lengths": (
-        "arrays.npz",
-        lambda p: np.savez(p, x=np.ones(3), y=np.ones(3), z=np.ones(2)),
-        "other shapes",
-    ),
-    "npy of objects": (
-        "records.npy",
-        lambda p: np.save(p, np.array([{}]), allow_pickle=True),
-        "allow_pickle=False",
-    ),
-}
+def write(text: str | bytes):
+    return lambda p: p.write_bytes(text if isinstance(text, bytes) else text.encode())
 
 
-@pytest.mark.parametrize("damage", DAMAGE)
-def test_damaged_files_are_refused_in_a_line(damage: str, tmp_path: Path) -> None:
-    name, harm, says = DAMAGE[damage]
+DAMAGE = [
+    ("padded.pcd", lambda p: cut(p, 26), "59 points, expected 60"),
+    ("padded.pcd", lambda p: cut(p, 5), "not a readable .pcd"),
+    ("words.pcd", lambda p: cut(p, 400), "not a readable .pcd"),
+    ("packed.pcd", lambda p: cut(p, 40), "not a readable .pcd"),
+    ("packed.pcd", lambda p: cut(p, 10**4), "header ends before"),
+    ("padded.pcd", lambda p: swap(p, b"SIZE", b"SIDE"), "has no SIZE"),
+    ("padded.pcd", lambda p: swap(p, b"F F F U", b"F F F"), "8 TYPE"),
+    ("padded.pcd", lambda p: swap(p, b"DATA binary", b"DATA zipped"), "pcd"),
+    ("little.ply", lambda p: cut(p, 17), "not a readable .ply"),
+    ("words.ply", lambda p: cut(p, 200), "fewer than the 60 vertices"),
+    ("words.ply", lambda p: swap(p, b"element vertex", b"element corner"), "expected vertices"),
+    ("one.las", lambda p: cut(p, 30), "not a readable .las"),
+    ("one.laz", lambda p: cut(p, 300), "not a readable .laz"),
+    ("comma.csv", lambda p: swap(p, b"\n", b"\n1,2\n"), ".csv"),
+    ("comma.csv", lambda p: swap(p, b"\n", b"\n1,2,x,4,5\n"), ".csv"),
+    ("comma.csv", write(b"\xff\xfe\x00"), ".csv"),
+    ("comma.csv", write("x,y,z\n"), "holds no points"),
+    ("arrays.npz", lambda p: np.savez(p, x=np.ones(3), y=np.ones(3), z=np.ones(2)), "other shapes"),
+    ("records.npy", lambda p: np.save(p, np.zeros((4, 3000))), "expected numbers of shape (N,3)"),
+    ("records.npy", lambda p: np.save(p, np.array([{}]), allow_pickle=True), "allow_pickle=False"),
+]
+
+
+@pytest.mark.parametrize(("name", "harm", "says"), DAMAGE, ids=range(len(DAMAGE)))
+def test_damaged_files_are_refused_in_a_line(name: str, harm, says: str, tmp_path: Path) -> None:
     if name.endswith(".ply"):
         pytest.importorskip("trimesh")
     path = tmp_path / name
@@ -262,13 +243,6 @@ def test_a_pickle_in_an_array_file_is_not_run(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="allow_pickle=False"):
         read_table(tmp_path / "1.npy")
     assert not (tmp_path / "run").exists()
-
-
-def test_ply_names_its_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    write_ply(tmp_path / "1.ply", "ascii")
-    monkeypatch.setitem(__import__("sys").modules, "trimesh.exchange.ply", None)
-    with pytest.raises(InputError, match=r"pip install 'densify\[ply\]'"):
-        read_table(tmp_path / "1.ply")
 
 
 @pytest.mark.parametrize(
@@ -297,9 +271,3 @@ def test_a_scan_of_other_bytes_than_float32_is_refused(dtype: str, tmp_path: Pat
     (tmp_path / "a.bin").write_bytes(data)
     with pytest.raises(InputError, match="no places in metres"):
         read_table(tmp_path / "a.bin")
-
-
-def test_an_array_lying_on_its_side_is_refused(tmp_path: Path) -> None:
-    np.save(tmp_path / "a.npy", np.zeros((4, 3000), np.float32))
-    with pytest.raises(InputError, match=r"shape \(4, 3000\).*expected numbers of shape \(N,3\)"):
-        read_table(tmp_path / "a.npy")

@@ -242,8 +242,8 @@ DAMAGE = [
     (
         ODOMETRY,
         "times.txt",
-        swap("0.0", "1e999999999"),
-        "line 1: got .* beyond the year",
+        write("1e999999999\n"),
+        "line 1: got .* 2262",
     ),
     (ODOMETRY, "times.txt", swap("2.0", "1.0"), "line 3: got"),
     (ODOMETRY, "times.txt", write("0\n"), "no time of frame"),

@@ -55,16 +55,6 @@ def test_a_scene_of_a_place_whose_reader_is_guessed(border_drive: Path, tmp_path
         densify.open_sequence(f"{border_drive}#night")
 
 
-def test_home(monkeypatch, tmp_path: Path) -> None:
-    monkeypatch.setenv("HOME", str(tmp_path))
-    assert Spec.parse("kitti:~/0013").absolute() == f"kitti:{tmp_path}/0013"
-
-
-def test_a_scene_of_a_reader_that_has_none(border_drive: Path) -> None:
-    with pytest.raises(InputError, match="kitti recordings have no scenes; leave #night out"):
-        densify.open_sequence(f"kitti:{border_drive}#night")
-
-
 def test_a_set_of_a_recording_with_its_reader(
     border_drive: Path, tmp_path: Path, monkeypatch
 ) -> None:

@@ -138,17 +138,18 @@ class Timeline:
 
     def before(self, frame: int, num: int) -> list[int]:
         """Return the ``num`` frames directly before this one, fewer behind a hole in time."""
-        row = first = self.row[frame]
-        while first > 0 and row - first < num and not self._hole_before(first):
-            first -= 1
-        return list(self.frames[first:row])
+        return [self.frames[row] for row in self._next_to(frame, -1, num)[::-1]]
 
     def after(self, frame: int, num: int) -> list[int]:
         """Return the ``num`` frames directly after this one, fewer before a hole in time."""
-        row = last = self.row[frame]
-        while last + 1 < len(self.frames) and last - row < num and not self._hole_before(last + 1):
-            last += 1
-        return list(self.frames[row + 1 : last + 1])
+        return [self.frames[row] for row in self._next_to(frame, 1, num)]
+
+    def _next_to(self, frame: int, step: int, num: int) -> list[int]:
+        """Return up to ``num`` rows on one side of a frame, from it to a hole in time."""
+        start, end = self.row[frame], len(self.frames) if step > 0 else -1
+        rows = range(start + step, end, step)[:num]
+        holes = (n for n, row in enumerate(rows) if self._hole_before(max(row, row - step)))
+        return list(rows[: next(holes, len(rows))])
 
     def window(
         self, key: int, window: int, left_out: Mapping[int, str] | None = None
@@ -163,31 +164,30 @@ class Timeline:
             raise InputError(
                 f"--key {key}: no such frame in {self.name}; it has {format_frames(self.frames)}"
             )
-        sides, cuts = [], []
-        for step in (-1, 1):
-            side, cut = self._side(self.row[key], step, window, left_out or {})
-            sides.append(side)
-            cuts += [cut] if cut else []
-        frames = (*reversed(sides[0]), key, *sides[1])
-        return WindowFrames(frames, tuple(cuts))
+        sides = [self._side(key, step, window, left_out or {}) for step in (-1, 1)]
+        (before, cut_before), (after, cut_after) = sides
+        cuts = tuple(cut for cut in (cut_before, cut_after) if cut)
+        return WindowFrames((*reversed(before), key, *after), cuts)
 
     def _side(
-        self, row: int, step: int, window: int, left_out: Mapping[int, str]
+        self, key: int, step: int, window: int, left_out: Mapping[int, str]
     ) -> tuple[list[int], str]:
-        side: list[int] = []
-        while len(side) < window:
-            here, row = row, row + step
-            if not 0 <= row < len(self.frames):
-                verb = "begins" if step < 0 else "ends"
-                return side, f"the recording {verb} at frame {self.frames[here]}"
-            if self._hole_before(max(here, row)):
-                gap_s = abs(int(self.stamp_ns[row] - self.stamp_ns[here])) * 1e-9
-                pair = sorted((self.frames[here], self.frames[row]))
-                return side, f"{gap_s:.1f} s lie between frames {pair[0]} and {pair[1]}"
-            if self.frames[row] in left_out:
-                return side, left_out[self.frames[row]]
-            side.append(self.frames[row])
-        return side, ""
+        """Return the frames on one side of the key, outwards, and why there are fewer than
+        ``window``, "" if there are not."""
+        side = [self.frames[row] for row in self._next_to(key, step, window)]
+        for n, frame in enumerate(side):
+            if frame in left_out:
+                return side[:n], left_out[frame]
+        if len(side) == window:
+            return side, ""
+        here = self.row[key] + step * len(side)
+        row = here + step
+        if not 0 <= row < len(self.frames):
+            verb = "begins" if step < 0 else "ends"
+            return side, f"the recording {verb} at frame {self.frames[here]}"
+        gap_s = abs(int(self.stamp_ns[row] - self.stamp_ns[here])) * 1e-9
+        first, second = sorted((self.frames[here], self.frames[row]))
+        return side, f"{gap_s:.1f} s lie between frames {first} and {second}"
 
     def _hole_before(self, row: int) -> bool:
         gap_ns = int(self.stamp_ns[row] - self.stamp_ns[row - 1])

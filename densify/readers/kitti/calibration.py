@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from densify.config.errors import InputError
 from densify.config.file_content import read_bytes, read_text
 from densify.geometry.types import Camera, Float, Float32, Int
-from densify.readers.file_sequence import check_rotation, parse_numbers, rigid
+from densify.readers.file_sequence import check_rotation, numbered_files, parse_numbers, rigid
 from densify.readers.stamp_files import date_ns
 
 NOMINAL_PERIOD_NS = 100_000_000
@@ -26,6 +26,14 @@ _EARTH_RADIUS_M = 6_378_137.0  # of the devkit's Mercator projection
 _ENTRY = re.compile(r"\s*([^\s:]+)[:\s]\s*(.*)")
 _STAMP = re.compile(r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d(\.\d{1,9})?")
 _EXPECTED = "expected a stamp such as 2011-09-26 13:10:51.158069617, from 1970 to 2261"
+
+
+def find_sweeps(folder: Path, example: str) -> dict[int, Path]:
+    """Return the sweeps of a folder by number. Raises InputError if there are none."""
+    sweeps = numbered_files(folder, ".bin")
+    if not sweeps:
+        raise InputError(f"{folder}: no sweeps; expected files such as {example}")
+    return sweeps
 
 
 def read_points(path: Path) -> Float32:

@@ -41,6 +41,7 @@ from densify.readers.file_sequence import (
 from densify.readers.kitti.calibration import (
     Calibration,
     Stamps,
+    find_sweeps,
     read_points,
     turned_ns,
     usual_period_ns,
@@ -74,11 +75,7 @@ class Kitti360(FileSequence):
         """path: the folder that holds data_3d_raw/. Raises InputError if the drive holds no sweeps,
         or stamps, or the calibration of cameras with images, are missing or malformed."""
         velodyne = path / "data_3d_raw" / drive / "velodyne_points"
-        self._sweeps = numbered_files(velodyne / "data", ".bin")
-        if not self._sweeps:
-            raise InputError(
-                f"{velodyne / 'data'}: no sweeps; expected files such as 0000000000.bin"
-            )
+        sweeps = find_sweeps(velodyne / "data", "0000000000.bin")
         self._stamps = _stamps(velodyne)
         self._poses_file = path / "data_poses" / drive / "poses.txt"
         cameras, exposed_ns, image_files = {}, {}, {}
@@ -93,11 +90,11 @@ class Kitti360(FileSequence):
         super().__init__(
             drive,
             path,
-            tuple(self._sweeps),
+            tuple(sweeps),
             cameras,
             exposed_ns,
             truth_beside(velodyne.parent),
-            self._sweeps,
+            sweeps,
             image_files,
         )
 
@@ -107,10 +104,10 @@ class Kitti360(FileSequence):
         return self._stamps[frame]
 
     def _returns(self, frame: int) -> tuple[Path, Returns]:
-        columns = read_points(self._sweeps[frame])
+        columns = read_points(self._files[frame])
         points = columns[:, :3].astype(np.float64)
         offset_ns = turned_ns(points, self._revolution_ns)
-        return self._sweeps[frame], Returns(points, columns[:, 3], offset_ns)
+        return self._files[frame], Returns(points, columns[:, 3], offset_ns)
 
     def _pose(self, frame: int) -> Float:
         if not self._poses_file.exists():

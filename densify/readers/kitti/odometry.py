@@ -42,6 +42,7 @@ from densify.readers.file_sequence import (
 from densify.readers.kitti.calibration import (
     NOMINAL_PERIOD_NS,
     Calibration,
+    find_sweeps,
     read_points,
     turned_ns,
     usual_period_ns,
@@ -73,9 +74,7 @@ class KittiOdometry(FileSequence):
     def __init__(self, path: Path) -> None:
         """path: the sequence's folder. Raises InputError if it holds no sweeps, or times, or the
         calibration where there are images, are missing or malformed."""
-        self._sweeps = numbered_files(path / "velodyne", ".bin")
-        if not self._sweeps:
-            raise InputError(f"{path / 'velodyne'}: no sweeps; expected files such as 000000.bin")
+        sweeps = find_sweeps(path / "velodyne", "000000.bin")
         times = path / "times.txt"
         self._times_ns = _read_times_ns(times) if times.exists() else None
         found = {
@@ -86,11 +85,11 @@ class KittiOdometry(FileSequence):
         super().__init__(
             path.resolve().name,
             path,
-            tuple(self._sweeps),
+            tuple(sweeps),
             {name: self._camera(path, name) for name in self._images},
             {n: {f: self._time_ns(f, times) for f in files} for n, files in self._images.items()},
             truth_beside(path),
-            self._sweeps,
+            sweeps,
             self._images,
         )
 
@@ -100,7 +99,7 @@ class KittiOdometry(FileSequence):
         return self._time_ns(frame, self.where / "times.txt")
 
     def _returns(self, frame: int) -> tuple[Path, Returns]:
-        path, columns = self._sweeps[frame], read_points(self._sweeps[frame])
+        path, columns = self._files[frame], read_points(self._files[frame])
         stored = columns[:, :3].astype(np.float64)
         track = self._track_around(frame)
         if track is None:

@@ -28,6 +28,7 @@ from densify.readers.kitti.calibration import (
     Calibration,
     Stamps,
     T_mercator_imu,
+    find_sweeps,
     parse_oxts,
     read_points,
     turned_ns,
@@ -56,14 +57,18 @@ class KittiRaw(FileSequence):
     """
 
     def __init__(self, path: Path | str) -> None:
-        """path: the drive's folder, ``.../2011_09_26/2011_09_26_drive_0013_sync``.
+        """Read calibration and stamps; everything else is read on demand.
 
-        Reads calibration and stamps at once, everything else on demand. Raises InputError if the
-        folder holds no sweeps, or calibration or stamps are malformed.
+        path: the drive's folder, ``.../2011_09_26/2011_09_26_drive_0013_sync``. Raises InputError
+        if it holds no sweeps, or calibration or stamps are malformed.
         """
         drive = Path(path)
-        self._sweeps = _find_sweeps(drive)
         velodyne = drive / "velodyne_points"
+        if not (velodyne / "data").is_dir():
+            raise InputError(
+                f"{drive}: no KITTI raw drive; expected the folder velodyne_points/data"
+            )
+        sweeps = find_sweeps(velodyne / "data", "0000000120.bin")
         self._stamps = Stamps.read(velodyne / "timestamps.txt")
         self._start_stamps = Stamps.read(velodyne / "timestamps_start.txt")
         self._end_stamps = Stamps.read(velodyne / "timestamps_end.txt")
@@ -76,11 +81,11 @@ class KittiRaw(FileSequence):
         super().__init__(
             drive.resolve().name,
             drive,
-            tuple(self._sweeps),
+            tuple(sweeps),
             cameras,
             {name: self._exposures_ns(drive, name) for name in cameras},
             truth_beside(drive),
-            self._sweeps,
+            sweeps,
             self._images,
         )
 
@@ -106,7 +111,7 @@ class KittiRaw(FileSequence):
         return self._stamps[frame]
 
     def _returns(self, frame: int) -> tuple[Path, Returns]:
-        path = self._sweeps[frame]
+        path = self._files[frame]
         columns = read_points(path)
         points = columns[:, :3].astype(np.float64)
         return path, Returns(points, columns[:, 3], self._offset_ns(frame, points))
@@ -179,20 +184,6 @@ class KittiRaw(FileSequence):
     @cached_property
     def _T_lidar_imu(self) -> Float:
         return Calibration.read(self.where.resolve().parent / "calib_imu_to_velo.txt").pose()
-
-
-def _find_sweeps(drive: Path) -> dict[int, Path]:
-    if not drive.is_dir():
-        raise InputError(f"{drive}: no such folder; expected a KITTI raw drive")
-    data = drive / "velodyne_points" / "data"
-    if not data.is_dir():
-        raise InputError(
-            f"{drive}: not a KITTI raw drive; expected the folder velodyne_points/data in it"
-        )
-    sweeps = numbered_files(data, ".bin")
-    if not sweeps:
-        raise InputError(f"{data}: no sweeps; expected files such as 0000000120.bin")
-    return sweeps
 
 
 def _read_oxts(path: Path) -> Float:

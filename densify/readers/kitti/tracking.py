@@ -48,6 +48,7 @@ from densify.readers.kitti.calibration import (
     NOMINAL_PERIOD_NS,
     Calibration,
     T_mercator_imu,
+    find_sweeps,
     parse_oxts,
     read_points,
     turned_ns,
@@ -79,11 +80,7 @@ class KittiTracking(FileSequence):
         self._calibration_file = path / "calib" / f"{scene}.txt"
         self._oxts_file = path / "oxts" / f"{scene}.txt"
         self._label_file = path / "label_02" / f"{scene}.txt"
-        sweeps = numbered_files(path / "velodyne" / scene, ".bin")
-        if not sweeps:
-            raise InputError(
-                f"{path / 'velodyne' / scene}: no sweeps; expected files such as 000000.bin"
-            )
+        sweeps = find_sweeps(path / "velodyne" / scene, "000000.bin")
         found = {
             folder.name: numbered_files(folder / scene, ".png", ".jpg")
             for folder in sorted(path.glob("image_0[0-3]"))
