@@ -76,10 +76,13 @@ def test_options_that_cannot_be(border_drive: Path, tmp_path: Path, capsys) -> N
         *((f"--keys={keys}", "expected all, or A:B[:S]") for keys in ("5:", "6:5", "5:6:0", "a:b")),
         *((f"--shard={shard}", "expected i/n") for shard in ("1", "0/2", "3/2", "a/b")),
         *(
-            (f"--max-ghost={share}", f"--max-ghost {share}: expected a share")
-            for share in ("1.5", "nan")
+            (f"--set=dataset.max_ghost={share}", f"dataset.max_ghost: got {share}, expected")
+            for share in ("1.5", "-0.1")
         ),
-        ("--per=image", "--per image, expected --per sweep; to get one for every image, add"),
+        (
+            "--set=project.per=image",
+            "project.per=image, expected sweep; to get one",
+        ),
     ):
         assert exit_code("dataset", "--data", border_drive, option, "--out", out) == 2
         assert told in capsys.readouterr().err
@@ -149,9 +152,9 @@ def test_foreign_and_damaged_folders_stay(
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        (["--max-ghost", "0.5"], "gate.max_ghost = None, got 0.5"),
+        (["--set", "dataset.max_ghost=0.5"], "gate.max_ghost = None, got 0.5"),
         (["--window", "3"], "window = 2, got 3"),
-        (["--split", "train"], "folder"),
+        (["--set", "dataset.split=train"], "folder"),
         (["--set", "flow.engine=paper"], "config.flow.engine = groups, got paper"),
         ([], "config.flow.gone = 10.0, got None"),
     ],
@@ -220,7 +223,8 @@ def test_as_many_workers_as_cores_free_memory_and_keys_suffice_for(
 
 def test_a_key_beyond_a_limit_is_put_aside(border_drive: Path, tmp_path: Path, capsys) -> None:
     out = tmp_path / "out"
-    arguments = ["--data", border_drive, *CHEAP, "--keys", "36:37", "--min-sweeps", 5, "--out", out]
+    arguments = ["--data", border_drive, *CHEAP, "--keys", "36:37", "--out", out]
+    arguments += ["--set", "dataset.min_sweeps=5"]
     assert exit_code("dataset", *arguments) == 0
     (record,) = records(out)
     assert record["status"] == "aside" and "sweeps, expected at least 5" in record["reason"]

@@ -11,7 +11,6 @@ import cv2
 import numpy as np
 import pytest
 
-from densify.bench.faults import FAULTS, Faulty
 from densify.config import Config
 from densify.config.errors import InputError
 from densify.doctor import CHECKS, Sample, Spot, Verdict, cameras, clocks, paths, points, rings
@@ -20,6 +19,7 @@ from densify.geometry.types import RegisteredSweep, Sweep, Trajectory
 from densify.readers.street import Street
 from densify.readers.timeline import Timeline
 from tests.command import exit_code, refused
+from tests.recording_faults import FAULTS, Faulty
 
 FRAMES = range(112, 125)
 CONFIG = Config()

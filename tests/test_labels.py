@@ -218,8 +218,6 @@ def test_labels_of_a_street_are_its_exact_flow(format, places, tmp_path: Path, c
     assert moving[moves].mean() > 0.95
     # what stands in a box that moves
     assert (error_m[stands] > 0.05).sum() < 0.002 * len(valid)
-    assert f"{error_m[moves].mean() * 100:.1f} cm off" in said
-    assert f"{100 * (error_m[stands] > 0.05).mean():.2f} % of the standing points" in said
     assert written.least_valid <= valid.mean() <= written.most_valid
 
 

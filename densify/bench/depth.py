@@ -1,24 +1,22 @@
 # SPDX-License-Identifier: MIT
-"""Depth maps of several configurations side by side, against every truth that there is.
+"""``densify bench depth``: depth maps of several configurations against every truth there is.
 
-``truth``: a simulated recording's, where a scanner in the key sweep can reach: below its top ring
-and within 80 m. ``key held out``: the key sweep's own returns, for the key densified from the other
-sweeps. ``scanner``: the returns of one of several scanners, none of which goes into the maps.
+``truth``: exact depth of a simulated recording within a scanner's reach, that is below its top ring
+and within 80 m. ``key held out``: the key sweep's returns, for the map made from the other sweeps.
+``scanner``: the returns of one of several scanners, none of which goes into the maps.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import ndimage
 
 from densify.config import Config
-from densify.config.cache import Cache
 from densify.config.errors import InputError
-from densify.depth.confidence import reliability
 from densify.depth.exposure import Exposure, key_shots
 from densify.geometry import poses
 from densify.geometry.cameras import converted, depth_along, rays
@@ -31,19 +29,22 @@ from densify.readers.window import choose_cameras
 from densify.scores.depth_metrics import image_density, is_outlier_depth
 
 PRODUCTS = ("measured", "filled")
+_PARTS = ("all", "moving")
 _REACH_M = 80.0
 _TOP_QUANTILE = 0.999
-_HIDING_PX = 11  # a second scanner stands elsewhere: what it sees behind a near return is hidden
+_HIDING_PX = 11  # a second scanner stands elsewhere: its returns behind a near one may be hidden
 _HIDING_FRACTION, _HIDING_M = 0.03, 0.2
 _WRONG_M, _WRONG_FRACTION = 0.3, 0.05
-_CACHE_BYTES = 8 << 30
-_STAGE = "project"
 
 
 class TruthMap(NamedTuple):
-    """depth_m: (H,W), 0 none. moving: (H,W). by_disparity: what is wrong is told by KITTI's rule,
-    more than 3 px of disparity and 5 %; else by more than 0.3 m and 5 %, whatever the camera. What
-    confidence promises is always compared by KITTI's rule."""
+    """True depth of an image.
+
+    depth_m: (H,W), 0 none.
+    moving: (H,W) of moving objects.
+    by_disparity: outliers are those of KITTI's rule (more than 3 px of disparity and 5 %); else
+        they are off by more than 0.3 m and 5 %.
+    """
 
     depth_m: Float32
     moving: Bool
@@ -62,14 +63,13 @@ def bench_depth(
 ) -> dict[str, Any]:
     """Make the keys with each variant and score the pixels of all keys and cameras together.
 
-    variants: configurations by name. scanner: number of the one whose returns are the truth. The
-    rest as `densify.pipeline.run.run`.
+    variants: configurations by name.
+    scanner: number of the scanner whose returns are the truth.
+    The other parameters are those of `densify.pipeline.run.run`.
 
     Returns plain numbers: by variant ``density`` (mean share of the image) of each product,
-    ``seconds`` a key of the stages that make the maps, and ``scores`` by truth, product and part
-    (``all``, ``moving``): num_pixels, coverage, outliers; and ``reliability`` by truth, as
-    `densify.depth.confidence.reliability`.
-
+    ``seconds`` a key of the stages after the cloud, and ``scores`` by truth, product and part
+    (``all``, ``moving``): num_pixels, coverage, outliers.
     Raises InputError for what cannot be used, ComputationError where registration went wrong.
     """
     choose_cameras(sequence, cameras)
@@ -79,21 +79,20 @@ def bench_depth(
         raise InputError(f"--scanner {scanner}: no returns of it in sweep {keys[0]}")
     used = sequence if scanner is None else _Without(sequence, scanner)
     sums = {name: _Sums() for name in variants}
-    cache, done = Cache(_CACHE_BYTES), 0
-    for key in keys:
-        returns: dict[str, TruthMap] = {}
+    for number, key in enumerate(keys):
         for name, config in variants.items():
-            if scanner is not None and not returns:
-                returns = _returns_of(scanner, sequence, key, window, cameras, config, cache)
+            truths = {}
+            if scanner is not None:
+                truths["scanner"] = _returns_of(scanner, sequence, key, window, cameras, config)
             watch = Watch()
             looks = looks_around([method])
-            recording = Recording(used, config, window, [key], cache, None, watch, looks)
+            recording = Recording(used, config, window, [key], None, None, watch, looks)
             made = pipeline.densify(recording, key, [method], cameras, watch)[method]
-            exact = exact_truth(used, recording.window(key)[key].sweep, key, cameras, config)
-            sums[name].add(made, {"truth": exact, "scanner": returns}, used.cameras)
-            done += 1
-            if progress is not None:
-                progress("bench", done, len(keys) * len(variants))
+            key_sweep = recording.window(key)[key].sweep
+            truths["truth"] = exact_truth(used, key_sweep, key, cameras, config)
+            sums[name].add(made, truths, used.cameras)
+        if progress is not None:
+            progress("bench", number + 1, len(keys))
     return {
         "data": sequence.name,
         "keys": list(keys),
@@ -123,10 +122,9 @@ def _returns_of(
     window: int,
     cameras: Sequence[str] | None,
     config: Config,
-    cache: Cache,
 ) -> dict[str, TruthMap]:
-    """What one scanner of the key sweep measured, by map, without what is hidden."""
-    recording = Recording(sequence, config, window, [key], cache, looks_around=True)
+    """Return the depth that one scanner of the key sweep measured, by map."""
+    recording = Recording(sequence, config, window, [key], looks_around=True)
     cloud = recording.moment(key, all_sweeps=True, engine="").cloud
     cloud = cloud.select((cloud.lidar == scanner) & (cloud.frame == key))
     stretch = recording.window(key)
@@ -156,15 +154,14 @@ def exact_truth(
     cameras: Sequence[str] | None,
     config: Config,
 ) -> dict[str, TruthMap]:
-    """The exact truth by map, where a scanner can reach it."""
+    """Return the exact depth within a scanner's reach by map, none of a real recording."""
     maps: dict[str, TruthMap] = {}
     if sequence.truth is None:
         return maps
     away = key_sweep.points
     if key_sweep.scanner_origins is not None:
         away = away - key_sweep.scanner_origins[key_sweep.lidar]
-    rise = away[:, 2] / np.linalg.norm(away[:, :2], axis=1)
-    top = np.quantile(rise, _TOP_QUANTILE)
+    top = np.quantile(away[:, 2] / np.linalg.norm(away[:, :2], axis=1), _TOP_QUANTILE)
     shots = key_shots(sequence, choose_cameras(sequence, cameras), key, config.project)
     for name, shot in shots.items():
         if shot.number is None:
@@ -186,12 +183,12 @@ def exact_truth(
 
 
 class _Sums:
-    """Pixels counted over keys and cameras."""
+    """Pixels counted over keys and cameras, by truth, product and part: those with a true depth,
+    those compared, the outliers."""
 
     def __init__(self) -> None:
-        self._counts: dict[tuple[str, str, str], NDArray[np.int64]] = {}
+        self._counts: defaultdict[tuple[str, str, str], Any] = defaultdict(lambda: np.zeros(3, int))
         self._densities: dict[str, list[float]] = {product: [] for product in PRODUCTS}
-        self._steps: dict[str, dict[float, NDArray[np.float64]]] = {}
         self._seconds = 0.0
 
     def add(
@@ -200,87 +197,44 @@ class _Sums:
         truths: Mapping[str, Mapping[str, TruthMap]],
         cameras: Mapping[str, Camera],
     ) -> None:
-        self._seconds += sum(cost.seconds for cost in made.costs if cost.name == _STAGE)
+        self._seconds += sum(cost.seconds for cost in made.costs if cost.name == "project")
         for name, maps in made.depth.items():
-            camera = cameras[maps.camera]
-            products = dict(zip(PRODUCTS, (maps.depth_m, maps.filled_m), strict=True))
-            for product, depth_m in products.items():
+            focal_px = cameras[maps.camera].focal_px
+            for product, depth_m in zip(PRODUCTS, (maps.depth_m, maps.filled_m), strict=True):
                 self._densities[product].append(image_density(depth_m))
-            for source, truth in [(s, t[name]) for s, t in truths.items() if name in t]:
-                movers = truth._replace(depth_m=np.where(truth.moving, truth.depth_m, 0))
-                for product, depth_m in products.items():
-                    self._count(source, product, "all", depth_m, truth, camera.focal_px)
-                    self._count(source, product, "moving", depth_m, movers, camera.focal_px)
-                self._rely(source, reliability(maps, truth.depth_m, camera))
-        held_out = made.metrics.get("held_out") or {}
-        for scores in held_out.values():
-            self._rely("key held out", scores["reliability"])
+                for source, truth in [(s, t[name]) for s, t in truths.items() if name in t]:
+                    for part, counts in _counted(depth_m, truth, focal_px):
+                        self._counts[source, product, part] += counts
+        for scores in (made.metrics.get("held_out") or {}).values():
             for product in PRODUCTS:
-                for part in ("all", "moving"):
+                for part in _PARTS:
                     score = scores[product][part]
-                    wrong = round((score["outliers"] or 0.0) * score["num_compared"])
-                    self._sum(
-                        "key held out",
-                        product,
-                        part,
-                        score["num_pixels"],
-                        score["num_compared"],
-                        wrong,
-                    )
+                    outliers = round((score["outliers"] or 0.0) * score["num_compared"])
+                    counts = (score["num_pixels"], score["num_compared"], outliers)
+                    self._counts["key held out", product, part] += counts
 
-    def _count(
-        self,
-        source: str,
-        product: str,
-        part: str,
-        depth_m: Float32,
-        truth: TruthMap,
-        focal_px: float,
-    ) -> None:
-        known = truth.depth_m > 0
+    def numbers(self, num_keys: int) -> dict[str, Any]:
+        scores: dict[str, Any] = {}
+        for (source, product, part), (num, compared, outliers) in self._counts.items():
+            scores.setdefault(source, {}).setdefault(product, {})[part] = {
+                "num_pixels": int(num),
+                "coverage": compared / num if num else None,
+                "outliers": outliers / compared if compared else None,
+            }
+        density = {p: float(np.mean(d)) for p, d in self._densities.items() if d}
+        return {"density": density, "seconds": self._seconds / num_keys, "scores": scores}
+
+
+def _counted(
+    depth_m: Float32, truth: TruthMap, focal_px: float
+) -> Iterator[tuple[str, tuple[int, int, int]]]:
+    """Yield each part with its counts, see `_Sums`."""
+    for part in _PARTS:
+        known = (truth.depth_m > 0) & (truth.moving if part == "moving" else True)
         both = known & (depth_m > 0)
         z, t = depth_m[both].astype(np.float64), truth.depth_m[both].astype(np.float64)
         if truth.by_disparity:
             wrong = is_outlier_depth(z, t, focal_px)
         else:
             wrong = (np.abs(z - t) > _WRONG_M) & (np.abs(z - t) > _WRONG_FRACTION * t)
-        self._sum(source, product, part, int(known.sum()), int(both.sum()), int(wrong.sum()))
-
-    def _rely(self, source: str, steps: list[dict[str, Any]]) -> None:
-        so_far = self._steps.setdefault(source, {})
-        for step in steps:
-            num = step["num_compared"]
-            counts = np.array([num, num * step["expected"], num * step["outliers"]])
-            so_far[step["confidence"]] = so_far.get(step["confidence"], 0) + counts
-
-    def _sum(self, source: str, product: str, part: str, *counts: int) -> None:
-        so_far = self._counts.setdefault((source, product, part), np.zeros(3, np.int64))
-        so_far += counts
-
-    def numbers(self, num_keys: int) -> dict[str, Any]:
-        scores: dict[str, Any] = {}
-        for (source, product, part), (num, compared, wrong) in self._counts.items():
-            scores.setdefault(source, {}).setdefault(product, {})[part] = {
-                "num_pixels": int(num),
-                "coverage": compared / num if num else None,
-                "outliers": wrong / compared if compared else None,
-            }
-        steps = {
-            source: [
-                {
-                    "confidence": least,
-                    "num_compared": round(num),
-                    "expected": expected / num,
-                    "outliers": wrong / num,
-                }
-                for least, (num, expected, wrong) in sorted(found.items())
-            ]
-            for source, found in self._steps.items()
-        }
-        density = {p: float(np.mean(d)) for p, d in self._densities.items() if d}
-        return {
-            "density": density,
-            "seconds": self._seconds / num_keys,
-            "scores": scores,
-            "reliability": steps,
-        }
+        yield part, (int(known.sum()), int(both.sum()), int(wrong.sum()))

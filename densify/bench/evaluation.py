@@ -1,16 +1,23 @@
 # SPDX-License-Identifier: MIT
-"""Depth maps on disk against the truth on disk: every pair read, scored, and averaged."""
+"""Depth maps on disk against true ones: every pair is read and scored, and the scores averaged."""
 
 from __future__ import annotations
 
+import json
+import os
+import platform
 from collections import defaultdict
+from collections.abc import Mapping
 from dataclasses import asdict
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from densify import __version__
 from densify.config.errors import InputError
 from densify.geometry.types import Bool, Float32, Progress
+from densify.outputs.atomic import write_file
 from densify.outputs.depth_png import read_depth_png, read_mask_png
 from densify.readers.depth_trees import DepthPair, DepthPairs
 from densify.scores.depth_metrics import (
@@ -25,7 +32,7 @@ SCHEMA_VERSION = 1
 """Version of `evaluate`'s dictionary; grows when a key changes its meaning or goes."""
 
 KITTI_FOCAL_PX = 721.5377
-"""fx of KITTI's rectified cameras on 2011_09_26; of its other days 707 to 719."""
+"""fx of KITTI's rectified cameras on 2011_09_26; on its other days 707 to 719."""
 
 
 def evaluate(
@@ -35,18 +42,17 @@ def evaluate(
     baseline_m: float = KITTI_BASELINE_M,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
-    """Score pairs of depth maps; as KITTI's kit does, the mean over images of each image's value.
+    """Score pairs of depth maps: the mean over images of each image's value, as in KITTI's kit.
 
-    focal_px, baseline_m: turn depth into the disparity by which outliers and depth edges are told.
+    focal_px, baseline_m: turn depth into the disparity that defines outliers and depth edges.
 
     Returns plain numbers ready for JSON, None where undefined::
 
         schema_version, focal_px, baseline_m
         num_images   pairs
-        density      predicted, truth: mean fraction of all the pixels that have a depth
-        parts        `errors_by_part` name -> num_images (those that compare any pixel of it, which
-                     the errors are means over) and the `DepthErrors` of `mean_errors`; moving and
-                     static over the pairs with a mask
+        density      predicted, truth: mean share of all the pixels that have a depth
+        parts        `errors_by_part` name -> num_images (with any pixel of the part compared) and
+                     the `DepthErrors` of `mean_errors`; moving and static over pairs with a mask
         images       of each pair: predicted, truth, mask (paths or None), density, and the
                      `DepthErrors` of all its pixels
         without_truth, without_prediction, without_mask   paths
@@ -61,35 +67,28 @@ def evaluate(
         parts = errors_by_part(predicted_m, truth_m, moving, **stereo)
         for name, errors in parts.items():
             by_part[name].append(errors)
+        paths = {side: None if path is None else str(path) for side, path in vars(pair).items()}
         densities = {"predicted": image_density(predicted_m), "truth": image_density(truth_m)}
-        images.append({**_paths(pair), "density": densities, **asdict(parts["all"])})
+        images.append({**paths, "density": densities, **asdict(parts["all"])})
         if progress is not None:
             progress("evaluate", number + 1, len(pairs.pairs))
-    return {
-        "schema_version": SCHEMA_VERSION,
-        **stereo,
-        "num_images": len(images),
-        "density": {
-            side: float(np.mean([image["density"][side] for image in images]))
-            for side in ("predicted", "truth")
-        },
-        "parts": {
-            name: {
-                "num_images": sum(errors.num_compared > 0 for errors in several),
-                **asdict(mean_errors(several)),
-            }
-            for name, several in by_part.items()
-        },
-        "images": images,
-        **{
-            name: [str(path) for path in getattr(pairs, name)]
-            for name in ("without_truth", "without_prediction", "without_mask")
-        },
+    density = {
+        side: float(np.mean([image["density"][side] for image in images]))
+        for side in ("predicted", "truth")
     }
-
-
-def _paths(pair: DepthPair) -> dict[str, str | None]:
-    return {name: None if path is None else str(path) for name, path in vars(pair).items()}
+    means = {
+        name: {
+            "num_images": sum(errors.num_compared > 0 for errors in several),
+            **asdict(mean_errors(several)),
+        }
+        for name, several in by_part.items()
+    }
+    alone = {
+        name: [str(path) for path in getattr(pairs, name)]
+        for name in ("without_truth", "without_prediction", "without_mask")
+    }
+    found = {"num_images": len(images), "density": density, "parts": means, "images": images}
+    return {"schema_version": SCHEMA_VERSION, **stereo, **found, **alone}
 
 
 def _read(pair: DepthPair) -> tuple[Float32, Float32, Bool | None]:
@@ -103,3 +102,17 @@ def _read(pair: DepthPair) -> tuple[Float32, Float32, Bool | None]:
                 f"the same camera, neither cropped nor scaled"
             )
     return predicted_m, truth_m, moving
+
+
+def write_numbers(path: Path, numbers: Mapping[str, Any]) -> None:
+    """Write numbers as JSON, with the version and the machine; the file appears when complete.
+
+    Raises InputError if it cannot be written.
+    """
+    machine = {"python": platform.python_version(), "num_cores": os.cpu_count()}
+    whole = {"densify": __version__, "machine": machine, **numbers}
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_file(path, (json.dumps(whole, indent=2, allow_nan=False) + "\n").encode())
+    except OSError as error:
+        raise InputError(f"--out {path}: cannot be written: {error.strerror or error}") from error

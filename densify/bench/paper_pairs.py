@@ -4,9 +4,9 @@
 Sets of others are folders of .npz files as FlowNet3D's authors made them (Liu et al., CVPR 2019):
 ``points1``, ``points2``, ``flow`` and ``valid_mask1`` (FlyingThings3D; camera axes, z forward), or
 ``pos1``, ``pos2`` and ``gt`` (KITTI without ground; z up). KITTI's own scene flow 2015 is lifted as
-`densify.readers.kitti.scene_flow` says, without the road. Recordings with boxes are labelled as
-`densify.learning.labels` does, without ground and without what is unsure; as in the paper, flow
-there is what the sensor sees, motion of the vehicle included.
+in `densify.readers.kitti.scene_flow`, without the road. Recordings with boxes are labelled as in
+`densify.learning.labels`, without the ground and uncertain labels; as in the paper, flow there
+includes the motion of the vehicle.
 """
 
 from __future__ import annotations
@@ -42,10 +42,15 @@ _R_FLU_CAMERA = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
 
 @dataclass(frozen=True)
 class PaperPair:
-    """Two clouds and the true flow between them. source, target: (n,3), (m,3) metres, z up. flow:
-    (n,3). moving: (n,), None where the set does not tell. sweeps: what networks get of it.
-    T_target_source: (4,4) the vehicle's motion that is part of the flow, where poses tell: methods
-    of registered sweeps, networks among them, see clouds without it."""
+    """Two clouds and the true flow between them.
+
+    source, target: (n,3), (m,3) metres, z up.
+    flow: (n,3) metres.
+    moving: (n,), None where the set does not tell.
+    sweeps: the input of networks.
+    T_target_source: (4,4) the vehicle's motion that is part of the flow, where poses are known;
+        methods of registered sweeps see clouds without it.
+    """
 
     name: str
     source: Float
@@ -56,20 +61,22 @@ class PaperPair:
     T_target_source: Float = field(default_factory=lambda: np.eye(4))
 
     def of_vehicle(self) -> Float:
-        """(n,3) metres by which the vehicle's motion, as far as it is known, moves the source."""
+        """Return the (n,3) metres by which the vehicle's motion moves the source."""
         moved: Float = poses.transform(self.T_target_source, self.source) - self.source
         return moved
 
 
 def has_truth(spec: str) -> bool:
-    """Whether a recording has exact truth."""
+    """Return True if a recording has exact truth."""
     return open_sequence(spec).truth is not None
 
 
 def pair_of_recording(spec: str, key: int) -> PaperPair:
-    """A sweep and its next one, without ground and the motion of the vehicle. Where the recording
-    has no truth, the flow is what this package's engine finds in the sweeps around. Raises
-    InputError for a key without a next sweep, ComputationError where one cannot be placed."""
+    """Return a sweep and its next one, without ground and the motion of the vehicle.
+
+    Where the recording has no truth, the flow is what this package's engine finds. Raises
+    InputError for a key without a next sweep, ComputationError where one cannot be registered.
+    """
     sequence = open_sequence(spec)
     labels, settings = "engine", resolve(None)
     if sequence.truth is not None:
@@ -87,9 +94,11 @@ def pair_of_recording(spec: str, key: int) -> PaperPair:
 
 
 def pairs_of_boxes(specs: Sequence[str], most: int) -> Iterator[PaperPair]:
-    """The sweeps of recordings with tracked boxes, each with its next; of each recording the first
-    ``most``, 0 for all. Raises InputError for a recording without boxes, or one that cannot be
-    read; ComputationError where a sweep cannot be placed."""
+    """Yield the sweeps of recordings with tracked boxes, each with its next.
+
+    most: pairs of each recording, 0 for all. Raises InputError for a recording without boxes or one
+    that cannot be read, ComputationError where a sweep cannot be registered.
+    """
     config = resolve({"register": {"source": "dataset"}})
     for spec in specs:
         sequence = open_sequence(spec)
@@ -109,40 +118,33 @@ def _pair_of_label(name: str, label: Label, config: Config) -> PaperPair:
     source, target = label.registered.sweep.points[row], label.after.sweep.points[there.row]
     if not (len(source) and len(target)):
         raise InputError(f"{name}: no labelled point above the ground")
-    moved = label.field.total[row]
     placed = AboveGround(row, poses.transform(T, source), here.height_m[known])
     sweeps = tuple(
         s.cloud(T[:3, 3]) for s in (placed, AboveGround(there.row, target, there.height_m))
     )
-    flow = poses.transform(T, source + moved) - source
+    flow = poses.transform(T, source + label.field.total[row]) - source
     return PaperPair(name, source, target, flow, label.field.moving[row], sweeps, T)
 
 
 def pairs_of_kitti(folder: Path, most: int) -> Iterator[PaperPair]:
-    """KITTI's scene flow 2015, or the .npz files made of it; see `pairs_of_files`."""
+    """Yield the pairs of KITTI's scene flow 2015, or of .npz files made of it."""
     training = scene_flow.training_folder(folder)
     if training is None:
         yield from pairs_of_files(folder, most, "; nor KITTI's training/disp_occ_0")
         return
     for name in scene_flow.image_names(training)[: most or None]:
-        yield lift_pair(training, name)
-
-
-def lift_pair(training: Path, name: str) -> PaperPair:
-    """One pair of KITTI's images, within 35 m and without the road. No point is in both clouds:
-    pixels take turns, as the squares of a chessboard. Raises InputError for a file of another
-    form, or no points."""
-    moments = scene_flow.read_moments(training, name)
-    kept = moments.above_ground()
-    here, there = (x[kept] @ _R_FLU_CAMERA.T for x in moments[:2])
-    first = moments.is_white[kept]
-    where = f"{training}: {name}"
-    return _pair(name, here[first], there[~first], (there - here)[first], where)
+        moments = scene_flow.read_moments(training, name)
+        kept = moments.above_ground()
+        here, there = (x[kept] @ _R_FLU_CAMERA.T for x in moments[:2])
+        # No point is in both clouds: pixels alternate, as the squares of a chessboard.
+        first = moments.is_white[kept]
+        where = f"{training}: {name}"
+        yield _pair(name, here[first], there[~first], (there - here)[first], where)
 
 
 def pairs_of_files(folder: Path, most: int, beside: str = "") -> Iterator[PaperPair]:
-    """The first ``most`` files of a folder, by name; 0 for all. beside: what else was looked for.
-    Raises InputError for a folder without any, or a file of another form."""
+    """Yield the first ``most`` files of a folder, by name; 0 for all. beside: what else was looked
+    for. Raises InputError for a folder without any, or a file of another form."""
     paths = sorted(folder.glob("*.npz"))
     if not paths:
         raise InputError(
@@ -153,7 +155,7 @@ def pairs_of_files(folder: Path, most: int, beside: str = "") -> Iterator[PaperP
 
 
 def read_pair(path: Path) -> PaperPair:
-    """One file. Points farther than 35 m ahead in either cloud are left out."""
+    """Return the pair of one file, without points farther than 35 m ahead."""
     arrays = read_arrays(path)
     found = next((names for names in _NAMES if all(n in arrays for n in names[:3])), None)
     if found is None:
@@ -178,7 +180,8 @@ def read_pair(path: Path) -> PaperPair:
 
 
 def _pair(name: str, source: Float, target: Float, flow: Float, where: str) -> PaperPair:
-    """Within 35 m ahead (x). Raises InputError, which begins with ``where``, for nothing there."""
+    """Return the pair within 35 m ahead (x). Raises InputError, which begins with ``where``, for no
+    points there."""
     near = np.abs(source[:, 0]) < FARTHEST_M
     source, flow = source[near], flow[near]
     target = target[np.abs(target[:, 0]) < FARTHEST_M]

@@ -2,7 +2,7 @@
 """The command line: a thin shell over the Python API.
 
 Results and paths go to stdout, progress and log to stderr. Only this package prints. Modules that
-load numpy and heavier things are imported by the verb that needs them, so that help is instant.
+load numpy and heavier things are imported by the verb that needs them: help answers at once.
 """
 
 from __future__ import annotations
@@ -11,13 +11,18 @@ import atexit
 import io
 import logging
 import os
+import platform
 import signal
 import sys
+import tempfile
+import time
+import traceback
 from collections.abc import Sequence
 from typing import NoReturn, TextIO
 
-from densify.cli.arguments import parse
+from densify import __version__
 from densify.cli.screen import Screen
+from densify.cli.verbs import parse
 from densify.config.errors import ComputationError, InputError, brief, is_out_of_memory
 from densify.pipeline.heap import keep_freed_memory
 
@@ -27,8 +32,9 @@ DONE, FAILED, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command and return its exit code.
 
-    0 done; 1 a ComputationError, or anything unforeseen, whose traceback is put into a file; 2 an
-    InputError or what the system refuses (argparse exits with 2 as well); 130 interrupted.
+    0: done. 1: a ComputationError, or an unforeseen error, whose traceback is written to a file.
+    2: an InputError, an error of the system, or (by argparse, which exits) a bad argument.
+    130: interrupted.
     """
     with Screen() as screen:
         try:
@@ -45,16 +51,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
             return DONE
         except OSError as error:
             _let_go_of(sys.stdout)
-            said = f"{error.filename or 'stdout'}: {error.strerror or error}"
-            return screen.end(BAD_INPUT, said)
+            where = error.filename or "stdout"
+            return screen.end(BAD_INPUT, f"{where}: {error.strerror or error}")
         except Exception as error:
             if is_out_of_memory(error):
                 advice = "try a smaller --window, fewer --workers or one --camera"
                 return screen.end(FAILED, f"out of memory; {advice}")
-            from densify.cli.bugs import kept
             from densify.config.plugins.table import owner_of
 
-            blame, log = owner_of(error), kept(error)
+            blame, log = owner_of(error), _write_bug_report(error)
             said = f"this is a bug in densify; please report it with the log at {log}"
             if blame:
                 said = f"{blame}: {type(error).__name__}: {error}; its makers can use the log {log}"
@@ -62,8 +67,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def script() -> NoReturn:
-    """`main` as a process of its own: the console script and ``python -m densify``."""
-    _open_what_is_closed()
+    """Run `main` as a process of its own: the console script and ``python -m densify``."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")  # what a terminal's encoding lacks
     # Work is shared out among our own threads; OpenBLAS's would wait beside them in busy loops.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     keep_freed_memory()
@@ -72,40 +79,15 @@ def script() -> NoReturn:
         if signal.getsignal(number) == signal.SIG_DFL:  # nohup has it ignored
             signal.signal(number, signal.default_int_handler)
     code: int | None = None
-    # The last to be called at exit: Python would search all that it is about to give back, half a
-    # second after a run, and of what is kept from that search (gc.freeze) packages say it leaked.
+    # The last function called at exit: Python would search all that it is about to give back, half
+    # a second after a run.
     atexit.register(lambda: None if code is None else os._exit(code))
     code = main()
     for stream in (sys.stdout, sys.stderr):
         _let_go_of(stream)
     if code == INTERRUPTED:
-        # Python dies of the signal, not with 130, where an extension module was being imported,
-        # and waits for threads that are at work.
-        os._exit(code)
+        os._exit(code)  # Python would wait for threads at work
     sys.exit(code)
-
-
-def _open_what_is_closed() -> None:
-    """Standard streams that the caller has closed: else the first file opened would take their
-    place. What a terminal's encoding lacks is shown by its number."""
-    for number in range(3):
-        try:
-            os.fstat(number)
-        except OSError:
-            os.open(os.devnull, os.O_RDWR)
-    sys.stdout = sys.stdout or os.fdopen(1, "w", closefd=False)
-    sys.stderr = sys.stderr or os.fdopen(2, "w", closefd=False)
-    for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors="backslashreplace")
-
-
-def _let_go_of(stream: TextIO) -> None:
-    """Keep the interpreter from flushing once more into what cannot be written."""
-    try:
-        stream.flush()
-    except OSError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
 def _run(arguments: Sequence[str] | None, screen: Screen) -> None:
@@ -117,3 +99,22 @@ def _run(arguments: Sequence[str] | None, screen: Screen) -> None:
     screen.heed(options)
     for answer in options.verb(options):
         screen.show(answer)
+
+
+def _let_go_of(stream: TextIO) -> None:
+    """Keep the interpreter from flushing once more into what cannot be written."""
+    try:
+        stream.flush()
+    except OSError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
+
+
+def _write_bug_report(error: BaseException) -> str:
+    """Write the versions, the command and the traceback to a temporary file; return its path."""
+    prefix = time.strftime("densify-bug-%Y%m%d-%H%M%S-")
+    number, path = tempfile.mkstemp(".log", prefix)
+    with open(number, "w", encoding="utf-8", errors="backslashreplace") as file:
+        print("densify", __version__, platform.python_version(), platform.platform(), file=file)
+        print("command:", sys.argv, file=file)
+        traceback.print_exception(error, file=file)
+    return path

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What a verb says on stdout."""
+"""What a verb says on stdout: an answer, and tables of text."""
 
 from __future__ import annotations
 
@@ -8,11 +8,20 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+NONE = "-"
+Column = tuple[str, tuple[str, ...], str]
+"""Title, path of the number in a row, and its format, see `written`."""
+
 
 @dataclass(frozen=True)
 class Answer:
-    """text: for people. facts: for programs (``--json``); where a verb answers several times, lists
-    are joined. files: that were written. first: those of them to open first, and what they show."""
+    """What a verb says.
+
+    text: for people.
+    facts: for programs (``--json``); lists of several answers are joined.
+    files: the files written.
+    first: the files to open first, each with what it shows.
+    """
 
     text: str = ""
     facts: Mapping[str, Any] = field(default_factory=dict)
@@ -20,7 +29,7 @@ class Answer:
     first: Mapping[Path, str] = field(default_factory=dict)
 
     def lines(self) -> list[str]:
-        """What people read: the text, every file, and those to open first."""
+        """Return the text, every file, and the files to open first."""
         lines = [self.text] if self.text else []
         lines += map(str, self.files)
         if self.first:
@@ -31,11 +40,55 @@ class Answer:
 
 
 def first_of(files: Sequence[Path], kinds: Mapping[str, str], most: int = 3) -> dict[Path, str]:
-    """The files to open first. kinds: file, by the end of its path, to what it shows; those named
-    first come first, and of several files of a kind one."""
+    """Return the files to open first, at most one of each kind.
+
+    kinds: pattern of the end of a path -> what the file shows; the first kinds come first.
+    """
     first: dict[Path, str] = {}
     for pattern, what in kinds.items():
         found = next((f for f in files if f.match(pattern) and f not in first), None)
         if found is not None and len(first) < most:
             first[found] = what
     return first
+
+
+def table(rows: Mapping[str, Any], columns: Sequence[Column]) -> str:
+    """Return a table with a row for each mapping; columns without any number are left out."""
+    used = [c for c in columns if any(look_up(r, *c[1]) is not None for r in rows.values())]
+    body = [
+        [name, *(written(look_up(row, *path), form) for _, path, form in used)]
+        for name, row in rows.items()
+    ]
+    return aligned([["", *(title for title, _, _ in used)], *body])
+
+
+def aligned(rows: Sequence[Sequence[str]]) -> str:
+    """Return the rows as text, the first column to the left; an empty row is a blank line."""
+    widths = [max(map(len, column)) for column in zip(*filter(None, rows), strict=True)]
+    lines = []
+    for row in rows:
+        first, *others = row or [""]
+        cells = [cell.rjust(width) for cell, width in zip(others, widths[1:], strict=False)]
+        lines.append("  ".join([first.ljust(widths[0]), *cells]).rstrip())
+    return "\n".join(lines)
+
+
+def written(value: float | None, form: str) -> str:
+    """Return the number as text. form: a format, and after a blank a unit."""
+    if value is None:
+        return NONE
+    number, _, unit = form.partition(" ")
+    return f"{value:{number}}".replace("%", " %") + (f" {unit}" if unit else "")
+
+
+def percent(value: float | None, digits: int = 2) -> str:
+    """Return a share as a percentage."""
+    return written(value, f".{digits}%")
+
+
+def look_up(metrics: Mapping[str, Any], *path: str) -> Any:
+    """Return ``metrics[a][b]...``, None where a step of the path is missing."""
+    value: Any = metrics
+    for step in path:
+        value = value.get(step) if isinstance(value, Mapping) else None
+    return value

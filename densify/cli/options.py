@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: MIT
-"""Options that several verbs have, and what their values are read with."""
+"""Options that several verbs have, and how their values are read."""
 
 from __future__ import annotations
 
 import argparse
 import math
+import os
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,21 +16,13 @@ from densify.config.errors import InputError
 from densify.config.plugins.engines import described
 
 if TYPE_CHECKING:
-    from densify.config.cache import Cache
     from densify.geometry.types import LidarSequence
 
-_MOST_DIGITS = 18
-_UNITS = ("K", "M", "G", "T")
-_SHORT = {
-    "flow": "flow.engine",
-    "at": "project.at",
-    "movers": "output.movers",
-    "per": "project.per",
-}
 DATA_HELP = (
     "a recording's folder, READER:PATH, or the built-in "
     "street[:PRESET][?seed=N&sensor=NAME&hz=RATE&tilt=DEG] (default: street)"
 )
+_MOST_DIGITS = 18
 
 
 def add_verb(
@@ -39,98 +32,65 @@ def add_verb(
     about: str,
     epilog: str = "",
 ) -> argparse.ArgumentParser:
-    """A verb of the command line, which calls ``verb`` with its options."""
+    """Add a verb to the command line and return its parser; ``verb`` is called with its options."""
     parser: argparse.ArgumentParser = commands.add_parser(
         name, help=about, description=sentence(about), epilog=epilog or None
     )
     parser.set_defaults(verb=verb, name=name)
     parser.add_argument("--json", action="store_true", help="print one JSON object, nothing else")
-    parser.add_argument("--quiet", action="store_true", help="say nothing but errors")
     return parser
 
 
 def sentence(about: str) -> str:
-    """What a verb is about, as it stands above its options."""
+    """Return the text with a capital letter and a full stop."""
     return f"{about[0].upper()}{about[1:]}."
 
 
-def config_epilog() -> str:
-    """Where every knob is explained."""
-    return f"Every knob with its default and what it does: {presets()['default']}"
+def add_recording(parser: argparse.ArgumentParser, several: bool = False) -> None:
+    """Add the recording, as a positional argument and as ``--data``."""
+    parser.add_argument("recording", metavar="SPEC", nargs="*" if several else "?", help=DATA_HELP)
+    number = "+" if several else 1
+    parser.add_argument(
+        "--data", metavar="SPEC", nargs=number, action="extend", default=[], help="the same"
+    )
+
+
+def recordings_of(options: argparse.Namespace, default: str = "street") -> list[str]:
+    """Return the specs of the recordings that a command names."""
+    given = options.recording or []
+    return [*([given] if isinstance(given, str) else given), *options.data] or [default]
+
+
+def recording_of(options: argparse.Namespace) -> str:
+    """Return the spec of the one recording that a command names."""
+    specs = recordings_of(options)
+    if len(specs) > 1:
+        raise InputError(f"got {len(specs)} recordings, {', '.join(specs)}; expected one")
+    return specs[0]
 
 
 def add_window(parser: argparse.ArgumentParser) -> None:
-    """``--window``"""
-    parser.add_argument(
-        "--window",
-        type=natural,
-        default=5,
-        metavar="W",
-        help="sweeps on each side of the key from which what moves is taken (default: 5; at 10 Hz "
-        "0.5 s, at 12 m/s 6 m); what stands still comes from accumulate.far_m",
-    )
+    """Add ``--window``."""
+    about = "sweeps on each side of the key for moving objects (default: 5, at 10 Hz 0.5 s)"
+    parser.add_argument("--window", type=natural, default=5, metavar="W", help=about)
 
 
 def add_method(parser: argparse.ArgumentParser) -> None:
-    """``--method``"""
-    parser.add_argument(
-        "--method",
-        choices=("flow", "icp", "none"),
-        default="flow",
-        help="flow: registration and scene flow; icp: registration only; none: the key sweep alone "
-        "(default: flow)",
-    )
+    """Add ``--method``."""
+    about = "flow (default): with scene flow; icp: registration only; none: the key sweep alone"
+    parser.add_argument("--method", choices=("flow", "icp", "none"), default="flow", help=about)
 
 
 def add_camera(parser: argparse.ArgumentParser) -> None:
-    """``--camera``"""
-    parser.add_argument(
-        "--camera",
-        action="append",
-        metavar="NAME",
-        dest="cameras",
-        help="only this camera; may be given several times (default: all)",
-    )
-
-
-def add_short_options(parser: argparse.ArgumentParser) -> None:
-    """Options that are short for a knob."""
-    parser.add_argument(
-        "--flow",
-        metavar="ENGINE",
-        help=f"{described()} (short for --set flow.engine=ENGINE)",
-    )
-    parser.add_argument(
-        "--at",
-        choices=("camera", "sweep"),
-        help="the moment the maps show: each image's own exposure, or the key sweep's reference "
-        "time (short for --set project.at=…; default: camera)",
-    )
-    parser.add_argument(
-        "--per",
-        choices=("sweep", "image"),
-        help="one depth map for each camera, or one for every image exposed nearer to this sweep "
-        "than to another (short for --set project.per=…; default: sweep)",
-    )
-    parser.add_argument(
-        "--movers",
-        choices=("keep", "drop", "separate"),
-        help="moving objects in the maps, left out, or left out and written one by one (short for "
-        "--set output.movers=…; default: keep)",
-    )
-    parser.add_argument(
-        "--report",
-        action="store_true",
-        help="a page to look at each key in a browser, with what was left out and why (short for "
-        "--set output.report=true --set output.rejected=true; densify report makes it later)",
-    )
+    """Add ``--camera``."""
+    about = "only this camera; may be given several times (default: all)"
+    parser.add_argument("--camera", action="append", metavar="NAME", dest="cameras", help=about)
 
 
 def add_config_options(parser: argparse.ArgumentParser) -> None:
-    """``--config`` and ``--set``"""
-    parser.add_argument(
-        "--config", metavar="FILE|NAME", help=f"a YAML file or a preset: {', '.join(presets())}"
-    )
+    """Add ``--config`` and ``--set``."""
+    known = ", ".join(presets())
+    parser.add_argument("--config", metavar="FILE|NAME", help=f"a YAML file or a preset: {known}")
     parser.add_argument(
         "--set",
         action="append",
@@ -142,67 +102,63 @@ def add_config_options(parser: argparse.ArgumentParser) -> None:
 
 
 def add_key_options(parser: argparse.ArgumentParser) -> None:
-    """What ``run`` and ``compare`` share."""
+    """Add what ``run`` and ``compare`` share."""
+    parser.epilog = f"Every knob with its default and what it does: {presets()['default']}"
+    add_recording(parser)
     add_window(parser)
-    parser.add_argument(
-        "--cache",
-        action="store_true",
-        help="keep poses, ground, evidence and motion on disk, and take what an earlier run with "
-        "the same sweeps and settings left there (default: nothing is kept, since hashing and "
-        "writing cost more than a single run gains)",
-    )
-    parser.add_argument(
-        "--cache-size",
-        type=size_bytes,
-        default="10G",
-        metavar="SIZE",
-        help="bound of what --cache keeps (default: 10G)",
-    )
-    parser.add_argument("--data", metavar="SPEC", default="street", help=DATA_HELP)
     add_camera(parser)
-    add_short_options(parser)
-    add_config_options(parser)
-
-
-def add_output_options(parser: argparse.ArgumentParser) -> None:
-    """``--out`` of a run, and ``--overwrite``"""
+    parser.add_argument("--flow", metavar="ENGINE", help=f"flow.engine. {described()}")
     parser.add_argument(
-        "--out",
-        metavar="DIR",
-        type=Path,
-        default=Path("densify-out"),
-        help="(default: ./densify-out)",
+        "--report",
+        action="store_true",
+        help="a page to look at each key in a browser, with the rejected pixels (short for --set "
+        "output.report=true --set output.rejected=true; densify report makes it later)",
+    )
+    add_config_options(parser)
+    folder = Path("densify-out")
+    parser.add_argument(
+        "--out", metavar="DIR", type=Path, default=folder, help=f"(default: ./{folder})"
     )
     add_overwrite(parser)
 
 
 def add_overwrite(parser: argparse.ArgumentParser) -> None:
-    """``--overwrite``"""
-    parser.add_argument(
-        "--overwrite", action="store_true", help="replace what is already there (default: keep it)"
-    )
+    """Add ``--overwrite``."""
+    about = "replace what is already there (default: keep it)"
+    parser.add_argument("--overwrite", action="store_true", help=about)
 
 
 def config_of(options: argparse.Namespace) -> Config:
-    """The configuration with the options that are short for a knob."""
-    given = {knob: getattr(options, name) for name, knob in _SHORT.items()}
-    named = [f"{knob}={value}" for knob, value in given.items() if value is not None]
-    if options.report:
-        named += ["output.report=true", "output.rejected=true"]
-    return resolve(options.config, [*options.overrides, *named])
+    """Return the configuration that ``--config``, ``--set``, ``--flow`` and ``--report`` make."""
+    short = []
+    if getattr(options, "flow", None) is not None:
+        short.append(f"flow.engine={options.flow}")
+    if getattr(options, "report", False):
+        short += ["output.report=true", "output.rejected=true"]
+    return resolve(options.config, [*options.overrides, *short])
 
 
-def cache_of(options: argparse.Namespace) -> Cache | None:
-    """What ``--cache`` keeps."""
-    if not options.cache:
-        return None
-    from densify.config.cache import Cache
-
-    return Cache(options.cache_size)
+def check_new_file(
+    path: Path, overwrite: bool, suffix: str = ".npz", option: str = "--out"
+) -> None:
+    """Raise InputError, before the computation, if the file exists or cannot be made."""
+    if path.suffix != suffix:
+        raise InputError(f"{option} {path}: expected a name that ends in {suffix}")
+    if path.is_dir():
+        raise InputError(f"{option} {path}: is a folder, expected the name of a {suffix} file")
+    if path.exists() and not overwrite:
+        raise InputError(
+            f"{option} {path}: already there and kept; give --overwrite or another name"
+        )
+    place = path.parent
+    while not os.path.lexists(place):
+        place = place.parent
+    if not (place.is_dir() and os.access(place, os.W_OK | os.X_OK)):
+        raise InputError(f"{option} {path}: cannot write in {place}; choose another")
 
 
 def sliced(sequence: LidarSequence, keys: slice) -> list[int]:
-    """The frames of ``--keys``. Raises InputError if there is none."""
+    """Return the frames of ``--keys``. Raises InputError if there is none."""
     from densify.readers.timeline import format_frames
 
     chosen = frozenset(range(keys.start, keys.stop, keys.step or 1))
@@ -216,14 +172,14 @@ def sliced(sequence: LidarSequence, keys: slice) -> list[int]:
 
 
 def natural(text: str) -> int:
-    """A whole number from 0 up."""
+    """Read a whole number from 0 up."""
     if not _are_digits(text):
         raise argparse.ArgumentTypeError(f"got {text!r}, expected a whole number from 0 up")
     return int(text)
 
 
 def positive(text: str) -> float:
-    """A number above 0."""
+    """Read a number above 0."""
     try:
         number = float(text)
     except ValueError:
@@ -234,71 +190,39 @@ def positive(text: str) -> float:
 
 
 def words(text: str) -> list[str]:
-    """Words parted by commas."""
+    """Read words separated by commas."""
     return [word.strip() for word in text.split(",") if word.strip()]
 
 
 def frame_range(text: str) -> range:
-    """``A:B``, frames A to B-1."""
-    first, colon, end = text.partition(":")
-    if not (colon and _are_digits(first, end) and int(first) < int(end)):
-        raise argparse.ArgumentTypeError(
-            f"got {text!r}, expected A:B with A < B, for example 115:126 for frames 115 to 125"
-        )
-    return range(int(first), int(end))
+    """Read ``A:B[:S]`` as a range."""
+    keys = key_slice(text)
+    return range(keys.start, keys.stop, keys.step)
 
 
 def key_slice(text: str, other: str = "") -> slice:
-    """``A:B[:S]``; ``other``: what the option takes too, for the message."""
+    """Read ``A:B[:S]``. other: what is accepted too, for the message."""
     numbers = text.split(":")
     if len(numbers) in (2, 3) and _are_digits(*numbers):
-        first, end = int(numbers[0]), int(numbers[1])
-        step = int(numbers[2]) if len(numbers) == 3 else 1
+        first, end, step = (*map(int, numbers), 1)[:3]
         if first < end and step > 0:
             return slice(first, end, step)
     raise argparse.ArgumentTypeError(
-        f"got {text!r}, expected {other}A:B[:S] with A < B, for example 0:100:5 for frames 0, 5 "
-        f"to 95"
+        f"got {text!r}, expected {other}A:B[:S] with A < B, such as 0:100:5 for frames 0, 5 to 95"
     )
 
 
 def all_or_slice(text: str) -> slice | None:
-    """``all``, which is None, or ``A:B[:S]``."""
+    """Read ``all``, which is None, or ``A:B[:S]``."""
     return None if text == "all" else key_slice(text, "all, or ")
 
 
-def recording_keys(text: str) -> tuple[str, list[int]]:
-    """``SPEC@KEYS``: a recording and its frames, ``K,K,…`` or ``A:B[:S]``."""
-    spec, _, keys = text.rpartition("@")
-    numbers = keys.split(",")
-    if spec and _are_digits(*numbers):
-        return spec, [int(number) for number in numbers]
-    frames = key_slice(keys) if spec and ":" in keys else None
-    if frames is None:
-        raise argparse.ArgumentTypeError(
-            f"got {text!r}, expected a recording and frames such as street?seed=51@60,80 or "
-            f"drive@101:126:4"
-        )
-    return spec, list(range(frames.start, frames.stop, frames.step))
-
-
 def shard(text: str) -> tuple[int, int]:
-    """``i/n`` with i from 1 to n."""
+    """Read ``i/n`` with i from 1 to n."""
     i, slash, n = text.partition("/")
     if slash and _are_digits(i, n) and 1 <= int(i) <= int(n):
         return int(i), int(n)
     raise argparse.ArgumentTypeError(f"got {text!r}, expected i/n with i from 1 to n, as in 2/4")
-
-
-def size_bytes(text: str) -> int:
-    """A size such as 8G, in powers of 1024."""
-    number, unit = text[:-1], text[-1:].upper()
-    size = positive(number) * 1024.0 ** (1 + "KMGT".index(unit)) if unit in _UNITS else 0
-    if not 1 <= size <= 1024**5:
-        raise argparse.ArgumentTypeError(
-            f"got {text!r}, expected a size such as 8G or 500M, up to 1024T"
-        )
-    return int(size)
 
 
 def _are_digits(*texts: str) -> bool:

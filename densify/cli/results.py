@@ -1,19 +1,18 @@
 # SPDX-License-Identifier: MIT
-"""What is said of results and exports. Reads `Result.metrics`:
+"""What is said of results, comparisons and exports, to people and (``*_facts``) to programs.
 
-- ``ghosts``: `densify.scores.cloud_scores.ghost_scores`;
-- ``held_out``: camera -> the same for the key densified from its neighbours alone;
-- ``depth``: camera -> `densify.scores.depth_metrics.depth_scores`, where there is truth.
+Read from `Result.metrics`: ``ghosts``, ``held_out`` by camera (scores of the map made without the
+key sweep against its returns) and ``depth`` by camera (scores against exact truth).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
-from densify.cli.tables import NONE, aligned, look_up, percent
+from densify.cli.answer import aligned, look_up, percent, written
 from densify.geometry.types import Result
 from densify.outputs import Export
 from densify.outputs.plain import plain
@@ -36,21 +35,24 @@ FIRST_OF_COMPARISON = {
     "compare.json": "their scores",
     "compare/cloud.laz": "the last method's cloud",
 }
-_SCORES: tuple[tuple[str, str, Callable[[float], str]], ...] = (
-    ("coverage", "coverage", lambda value: f"{100 * value:.1f} %"),
-    ("mae_m", "MAE", lambda value: f"{value:.3f} m"),
-    ("rmse_m", "RMSE", lambda value: f"{value:.3f} m"),
-    ("outliers", "outliers", lambda value: f"{100 * value:.2f} %"),
+_SCORES = (
+    ("coverage", "coverage", ".1%"),
+    ("mae_m", "MAE", ".3f m"),
+    ("rmse_m", "RMSE", ".3f m"),
+    ("outliers", "outliers", ".2%"),
 )
-_PARTS = ("all", "moving", "static")
 
 
 def summary(result: Result) -> str:
-    """Three or so lines about one densified key."""
+    """Return a few lines about one densified key."""
     cloud = result.cloud
+    moving = f"{np.count_nonzero(cloud.moving):,} on moving objects"
+    if result.movers:
+        num_apart = sum(len(mover.cloud) for mover in result.movers.values())
+        moving = f"{num_apart:,} more apart, on {len(result.movers)} moving objects"
     lines = [
         f"key {result.key}, {result.method}: {len(cloud):,} points of {len(result.frames)} sweeps "
-        f"({format_frames(result.frames)}), {_moving(result)}"
+        f"({format_frames(result.frames)}), {moving}"
     ]
     for name in result.depth:
         measured, filled = (_density(result, name, product) for product in ("measured", "filled"))
@@ -58,66 +60,36 @@ def summary(result: Result) -> str:
         if name in result.full:
             line += f", {_density(result, name, 'full')} with those from the prior"
         lines.append(line)
-    ghosts = percent(look_up(result.metrics, "ghosts", "all"))
-    if ghosts != NONE:
-        baseline = NONE
-        if "icp" in result.baselines:
-            baseline = percent(look_up(result.baselines["icp"].metrics, "ghosts", "all"))
-        beside = "" if baseline == NONE else f" ({baseline} by registration alone)"
-        lines.append(f"ghosts: {ghosts} of the accumulated points{beside}")
-    lines += [line for name in result.depth if (line := _held_out_line(result, name))]
+    ghosts = _beside_icp(result, "ghosts", "all")
+    if ghosts:
+        ghost_rate, beside = ghosts
+        lines.append(f"ghosts: {ghost_rate} of the accumulated points{beside}")
+    for name in result.depth:
+        said = []
+        for part, where in (("all", ""), ("moving", " on moving objects")):
+            outliers = _beside_icp(result, "held_out", name, "measured", part, "outliers")
+            if outliers:
+                said.append(f"{outliers[0]} outliers{outliers[1]}{where}")
+        if said:
+            lines.append(f"{name}, key held out: {', '.join(said)}")
     return "\n".join(lines)
 
 
-def _moving(result: Result) -> str:
-    if not result.movers:
-        return f"{np.count_nonzero(result.cloud.moving):,} on moving objects"
-    num_apart = sum(len(mover.cloud) for mover in result.movers.values())
-    return f"{num_apart:,} more apart, on {len(result.movers)} moving objects"
-
-
-def _held_out_line(result: Result, camera: str) -> str:
-    """The key from its neighbours alone, against its own returns."""
-    said = []
-    for part in ("all", "moving"):
-        path = ("held_out", camera, "measured", part, "outliers")
-        mine = look_up(result.metrics, *path)
-        if mine is None:
-            continue
-        icp = result.baselines.get("icp")
-        other = None if icp is None else look_up(icp.metrics, *path)
-        beside = "" if other is None else f" ({percent(other)} by registration alone)"
-        said.append(f"{percent(mine)} wrong{beside}{'' if part == 'all' else ' where it moves'}")
-    return f"{camera}, key held out: {', '.join(said)}" if said else ""
-
-
-def export_summary(exported: Export) -> str:
-    """A line for each camera, the share of its pixels with a depth, before and after, and one for
-    the cloud."""
-    lines = []
-    for camera, products in exported.density.items():
-        measured, filled = (
-            f"{percent(products[p].before, digits=1)} -> {percent(products[p].after, digits=1)}"
-            for p in ("measured", "filled")
-        )
-        lines.append(f"{camera}: depth in {measured} of the pixels, {filled} with filled ones")
-    if exported.num_points is not None:
-        lines.append(
-            f"cloud: {exported.num_points.after:,} of {exported.num_points.before:,} points"
-        )
-    return "\n".join(lines)
+def _beside_icp(result: Result, *path: str) -> tuple[str, str] | None:
+    """Return a share as text, and in brackets that of rigid accumulation where it was made."""
+    share = look_up(result.metrics, *path)
+    if share is None:
+        return None
+    rigid = None
+    if "icp" in result.baselines:
+        rigid = look_up(result.baselines["icp"].metrics, *path)
+    return percent(share), "" if rigid is None else f" ({percent(rigid)} by registration alone)"
 
 
 def key_facts(result: Result) -> dict[str, Any]:
-    """The numbers of one method's result, for programs."""
+    """Return the numbers of one method's result."""
     metrics = result.metrics
-    held_out = metrics.get("held_out")
-    known = {
-        "density": metrics.get("density"),
-        "ghosts": look_up(metrics, "ghosts", "all"),
-        "held_out": {c: look_up(held_out or {}, c, "measured", "all") for c in result.depth},
-        "depth": {c: look_up(metrics, "depth", c, "measured", "all") for c in result.depth},
-    }
+    held_out = metrics.get("held_out") or {}
     facts = {
         "key": result.key,
         "method": result.method,
@@ -126,22 +98,22 @@ def key_facts(result: Result) -> dict[str, Any]:
         "num_moving": int(np.count_nonzero(result.cloud.moving)),
         "seconds": sum(cost.seconds for cost in result.costs),
         "error": None,
+        "density": metrics.get("density"),
+        "ghosts": look_up(metrics, "ghosts", "all"),
+        "held_out": {c: look_up(held_out, c, "measured", "all") for c in result.depth},
+        "depth": {c: look_up(metrics, "depth", c, "measured", "all") for c in result.depth},
     }
-    return dict(plain({**facts, **known}))
+    return dict(plain(facts))
 
 
 def comparison(results: Mapping[str, Result]) -> str:
-    """A table with one column per method.
+    """Return a table with one column per method.
 
-    Rows: points, image density per camera, ghost rate, and coverage, MAE, RMSE and KITTI outliers
-    of the measured depth at all, moving and static pixels, with the key held out (neither needs
-    truth) and against truth where there is some.
+    Rows: points, image density per camera, ghost rate, and coverage, MAE, RMSE and outliers of the
+    measured depth at all, moving and static pixels, with the key held out and against exact truth.
     """
     columns = list(results.values())
-    rows = [
-        ["", *results],
-        ["points", *(f"{len(result.cloud):,}" for result in columns)],
-    ]
+    rows = [["", *results], ["points", *(f"{len(result.cloud):,}" for result in columns)]]
     for name in columns[0].depth:
         for product in ("measured", "filled"):
             densities = [_density(result, name, product) for result in columns]
@@ -157,20 +129,34 @@ def comparison(results: Mapping[str, Result]) -> str:
 
 def _score_rows(columns: Sequence[Result], source: str, camera: str, title: str) -> list[list[str]]:
     rows: list[list[str]] = [[]]
-    for part in _PARTS:
-        for key, score, write in _SCORES:
-            values = [
-                look_up(result.metrics, source, camera, "measured", part, key) for result in columns
-            ]
-            cells = [NONE if value is None else write(value) for value in values]
+    for part in ("all", "moving", "static"):
+        for key, score, form in _SCORES:
+            path = (source, camera, "measured", part, key)
+            cells = [written(look_up(result.metrics, *path), form) for result in columns]
             rows.append([f"{camera} {title}, {part}, {score}", *cells])
     return rows
 
 
 def _density(result: Result, camera: str, product: str) -> str:
+    """Return the share of the pixels with a depth."""
     if product == "full":
         image = result.full[camera].depth_m
     else:
         depth = result.depth[camera]
         image = depth.depth_m if product == "measured" else depth.filled_m
     return percent(np.count_nonzero(image) / image.size, digits=1)
+
+
+def export_summary(exported: Export) -> str:
+    """Return a line for each camera, its density before and after, and one for the cloud."""
+    lines = []
+    for camera, products in exported.density.items():
+        measured, filled = (
+            f"{percent(products[p].before, digits=1)} -> {percent(products[p].after, digits=1)}"
+            for p in ("measured", "filled")
+        )
+        lines.append(f"{camera}: depth in {measured} of the pixels, {filled} with filled ones")
+    points = exported.num_points
+    if points is not None:
+        lines.append(f"cloud: {points.after:,} of {points.before:,} points")
+    return "\n".join(lines)

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: MIT
-"""The two ways a densify command can fail that are not a bug.
-
-A message is one line: what, where, got, expected, what to do.
-"""
+"""The errors that are no bugs of densify, and their one line: what happened, where, what was
+expected, what to do."""
 
 from __future__ import annotations
 
+import difflib
 import re
+from collections.abc import Iterable
 
 _LONG_VALUE = re.compile(r"""(?<!\w)'[^']{201,}'|"[^"]{201,}"|\S{301,}""")
 _BREAK = re.compile(r"[\x00-\x1f\x7f\x85\u2028\u2029]+")
@@ -14,16 +14,20 @@ _MOST_CHARACTERS = 1000
 
 
 def brief(message: str) -> str:
-    """A message on one line, whose echo of the input is cut: quoted texts beyond 200 characters,
-    words beyond 300 (paths are words), and what is still beyond 1,000 in its middle."""
-    message = _BREAK.sub(" ", message)
-    message = _LONG_VALUE.sub(lambda found: _cut(found[0], 200), message)
+    """Return the message on one line, with long values (quoted, or a long word) cut."""
+    message = _LONG_VALUE.sub(lambda found: _cut(found[0], 200), _BREAK.sub(" ", message))
     return _cut(message, _MOST_CHARACTERS) if len(message) > _MOST_CHARACTERS else message
 
 
 def _cut(text: str, num_characters: int) -> str:
     end = num_characters // 4
     return f"{text[: num_characters - end - 3]}...{text[-end:]}"
+
+
+def did_you_mean(got: str, known: Iterable[str]) -> str:
+    """Return ``did you mean NAME? `` with the known name most like ``got``, "" if none is."""
+    close = difflib.get_close_matches(got, list(known), n=1, cutoff=0.6)
+    return f"did you mean {close[0]}? " if close else ""
 
 
 class _ShortError(Exception):
@@ -36,7 +40,7 @@ class InputError(_ShortError):
 
 
 class OutputError(InputError):
-    """What is computed cannot be written: no permission, a full disk."""
+    """A result that cannot be written: no permission, a full disk."""
 
 
 class ComputationError(_ShortError):
@@ -44,7 +48,7 @@ class ComputationError(_ShortError):
 
 
 class SweepError(_ShortError):
-    """One sweep is in the way: without ``frame`` the others could be used."""
+    """One sweep cannot be used; without sweep ``frame`` the others could be."""
 
     def __init__(self, message: str, frame: int) -> None:
         super().__init__(message, frame)
@@ -55,13 +59,13 @@ class SweepError(_ShortError):
 
 
 class UnfitSweepError(SweepError, InputError):
-    """It holds too few points, or its stamp cannot be right."""
+    """A sweep has too few points, or its stamp cannot be right."""
 
 
 class UnplacedSweepError(SweepError, ComputationError):
-    """Registration does not find where it is."""
+    """Registration does not find the pose of a sweep."""
 
 
 def is_out_of_memory(error: Exception) -> bool:
-    """Whether the system had none left: also for the stack of one more thread."""
+    """Return True if the system had no memory left, also for the stack of one more thread."""
     return isinstance(error, MemoryError) or str(error) == "can't start new thread"

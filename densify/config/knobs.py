@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What a knob of the configuration is, and how its values are checked."""
+"""Knobs of the configuration, and how their values are checked."""
 
 from __future__ import annotations
 
@@ -21,10 +21,11 @@ def knob(
     high: float | None = None,
     choices: tuple[str, ...] | None = None,
 ) -> Any:
-    """A dataclass field with what `Section` checks and default.yaml says.
+    """Return a dataclass field that `Section` checks and configs/default.yaml explains.
 
-    help: what turning the knob does, unit in brackets. low, high: inclusive bounds of a number.
-    choices: the words a text knob accepts.
+    help: what turning the knob does, unit in brackets.
+    low, high: inclusive bounds of a number.
+    choices: the words that a text knob accepts.
     """
     metadata = {"help": help, "low": low, "high": high, "choices": choices}
     return dataclasses.field(default=default, metadata=metadata)
@@ -41,8 +42,12 @@ class Section:
 
 
 def checked(section: type[Section], key: str, value: Any, where: str) -> Any:
-    """The value as its knob's type; InputError if it has another type or is out of range."""
-    field = section.__dataclass_fields__[key]
+    """Return the value as its knob's type.
+
+    where: file or option that the value comes from, for the message.
+    Raises InputError for another type or a value out of range.
+    """
+    metadata = section.__dataclass_fields__[key].metadata
     kind = _kinds(section)[key]  # type: ignore[arg-type]  # a class is hashable
     optional = isinstance(kind, types.UnionType)
     if optional:
@@ -50,35 +55,29 @@ def checked(section: type[Section], key: str, value: Any, where: str) -> Any:
         if value is None:
             return None
     typed = _as(kind, value)
-    low, high, choices = (field.metadata[m] for m in ("low", "high", "choices"))
-    if typed is not None:
-        if choices is not None and typed in choices:
-            return typed
-        if choices is None and (kind in (bool, str) or low <= typed <= high):
-            return typed
+    low, high, choices = (metadata[name] for name in ("low", "high", "choices"))
     if choices is not None:
-        expected = f"one of {', '.join(choices)}"
-    elif kind is bool:
-        expected = "true or false"
-    elif kind is str:
-        expected = "text"
+        fits, expected = typed in choices, f"one of {', '.join(choices)}"
+    elif kind in (bool, str):
+        fits, expected = typed is not None, "true or false" if kind is bool else "text"
     else:
+        fits = typed is not None and low <= typed <= high
         expected = f"{'a whole number' if kind is int else 'a number'} from {low:g} to {high:g}"
-    expected += " or null" if optional else ""
+    if fits:
+        return typed
+    expected += " or null" * optional
     name = f"{section.__name__.removesuffix('Settings').lower()}.{key}"
-    raise InputError(
-        f"{where}{name}: got {value!r}, expected {expected} ({field.metadata['help']})"
-    )
+    raise InputError(f"{where}{name}: got {value!r}, expected {expected} ({metadata['help']})")
 
 
 @cache
 def _kinds(section: type[Section]) -> dict[str, Any]:
-    """The knobs' types, which are texts until they are asked for."""
+    """Return the types of the knobs by name."""
     return typing.get_type_hints(section)
 
 
 def _as(kind: Any, value: Any) -> Any:
-    """`value` as bool, int, float or str, None if it is not one."""
+    """Return the value as bool, int, float or str, None if it is not one."""
     if kind is float and isinstance(value, str | int) and not isinstance(value, bool):
         try:
             value = float(value)  # text too: YAML 1.1 reads 1e-3 as text

@@ -1,16 +1,15 @@
 # SPDX-License-Identifier: MIT
-"""A checked `Config` is made of a preset, a file, a mapping and single knobs."""
+"""Makes a checked `Config` of a preset, a file, a mapping and single knobs."""
 
 from __future__ import annotations
 
 import dataclasses
-import difflib
 import typing
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from densify.config.errors import InputError
+from densify.config.errors import InputError, did_you_mean
 from densify.config.file_content import parse_yaml, read_yaml
 from densify.config.knobs import checked
 from densify.config.sections import REPLACED, Config
@@ -19,7 +18,7 @@ from densify.config.sections import REPLACED, Config
 def resolve(
     config: Config | str | Path | Mapping[str, Any] | None = None, overrides: Sequence[str] = ()
 ) -> Config:
-    """The configuration that `config` and the overrides name.
+    """Return the configuration that `config` and the overrides name.
 
     config: None for the defaults; a Config; a mapping ``{section: {key: value}}``; a Path to a YAML
         file of that form; or a str, the name of a preset (`presets`) or else a file. Only
@@ -27,34 +26,31 @@ def resolve(
     overrides: ``section.key=value`` each, values written as in YAML; later ones win.
 
     Raises InputError for anything unknown (suggesting the right name), of the wrong type or out of
-    range, naming the file or ``--set`` it comes from.
+    range, naming the file or ``--set`` that it comes from.
     """
-    if isinstance(config, Config):
-        values = as_mapping(config)
-    else:
-        values = as_mapping(Config())
-        if isinstance(config, Mapping):
-            _apply(values, config, "configuration")
-        elif isinstance(config, str | Path):
-            path = _config_path(config)
-            _apply(values, read_yaml(path)[0] or {}, str(path))
-        elif config is not None:
-            raise InputError(
-                f"configuration: got {type(config).__name__}, expected a densify.Config, a "
-                f"mapping, or the name of a preset or YAML file"
-            )
+    values = as_mapping(config if isinstance(config, Config) else Config())
+    if isinstance(config, Mapping):
+        _apply(values, config, "configuration")
+    elif isinstance(config, str | Path):
+        path = _config_path(config)
+        _apply(values, read_yaml(path)[0] or {}, str(path))
+    elif not isinstance(config, Config | None):
+        raise InputError(
+            f"configuration: got {type(config).__name__}, expected a densify.Config, a mapping, or "
+            f"the name of a preset or YAML file"
+        )
     for override in overrides:
         _apply(values, _parse_override(override), f"--set {override}")
     return Config(**{name: section(**values[name]) for name, section in _sections().items()})
 
 
 def as_mapping(config: Config) -> dict[str, dict[str, Any]]:
-    """Plain ``{section: {key: value}}``, every key; ``resolve(as_mapping(config)) == config``."""
+    """Return ``{section: {key: value}}`` with every key; `resolve` makes the Config again."""
     return dataclasses.asdict(config)
 
 
 def presets() -> dict[str, Path]:
-    """Preset name -> its YAML file."""
+    """Return the YAML file of each preset by name."""
     package = Path(__file__).parents[1]
     inside = package / "configs"  # installed
     folder = inside if inside.is_dir() else package.parent / "configs"  # checkout
@@ -68,8 +64,7 @@ def _config_path(name: str | Path) -> Path:
     if path.is_file():
         return path
     raise InputError(
-        f"configuration {name}: no such preset or file; "
-        f"{_suggestion(str(name), list(presets()), 'preset')}"
+        f"configuration {name}: no such preset or file; {_expected(str(name), presets(), 'preset')}"
     )
 
 
@@ -89,19 +84,21 @@ def _apply(values: dict[str, dict[str, Any]], changes: Any, where: str) -> None:
     _require_mapping(changes, where, "sections")
     for name, keys in changes.items():
         if name not in values:
+            if name in REPLACED:
+                raise InputError(f"{where}: unknown section {name}; {REPLACED[name]}")
             raise InputError(
-                f"{where}: unknown section {name}; {_suggestion(name, list(values), 'section')}"
+                f"{where}: unknown section {name}; {_expected(str(name), values, 'section')}"
             )
         _require_mapping(keys, f"{where}: section {name}", "keys")
         for key, value in keys.items():
             if key not in values[name]:
-                hint = _key_suggestion(name, str(key), values)
+                hint = _key_hint(name, str(key), values)
                 raise InputError(f"{where}: unknown key {name}.{key}; {hint}")
             values[name][key] = checked(_sections()[name], key, value, f"{where}: ")
 
 
 def _sections() -> dict[str, Any]:
-    """Section name -> its class."""
+    """Return the classes of the sections by name."""
     return typing.get_type_hints(Config)
 
 
@@ -113,17 +110,15 @@ def _require_mapping(value: Any, where: str, content: str) -> None:
         )
 
 
-def _key_suggestion(section: str, key: str, values: Mapping[str, Mapping[str, Any]]) -> str:
-    """What replaced the key, the same key in another section, or the nearest one of this."""
+def _key_hint(section: str, key: str, values: Mapping[str, Mapping[str, Any]]) -> str:
+    """Return what became of the key, its section if that is another, or the key most like it."""
     if f"{section}.{key}" in REPLACED:
-        return f"it is {REPLACED[f'{section}.{key}']} now"
+        return REPLACED[f"{section}.{key}"]
     for other, keys in values.items():
         if key in keys:
             return f"did you mean {other}.{key}?"
-    return _suggestion(key, list(values[section]), f"key of {section}")
+    return _expected(key, values[section], f"key of {section}")
 
 
-def _suggestion(got: str, known: Sequence[str], kind: str) -> str:
-    close = difflib.get_close_matches(str(got), known, n=1, cutoff=0.6)
-    hint = f"did you mean {close[0]}? " if close else ""
-    return f"{hint}expected a {kind}: {', '.join(known)}"
+def _expected(got: str, known: Mapping[str, Any], kind: str) -> str:
+    return f"{did_you_mean(got, known)}expected a {kind}: {', '.join(known)}"

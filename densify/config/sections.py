@@ -242,7 +242,7 @@ class Config:
 
 
 REPLACED = {
-    f"flow.{key}": f"objective.{key}"
+    f"flow.{key}": f"it is objective.{key} now"
     for key in (
         "solver",
         "alpha",

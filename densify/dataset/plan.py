@@ -61,7 +61,7 @@ class Gate:
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
-            option = f"--{name.replace('_', '-')}"
+            option = f"dataset.{name}"
             if value is None:
                 continue
             if name == "min_sweeps" and value < 1:
@@ -112,8 +112,9 @@ class Recipe:
         check_window(self.window)
         if self.layout == "kitti-depth" and self.config.project.per == "image":
             raise InputError(
-                "--layout kitti-depth: has one map of a camera for each sweep; got --per image, "
-                "expected --per sweep; to get one for every image, add --layout densify"
+                "--layout kitti-depth: has one map of a camera for each sweep; got "
+                "project.per=image, "
+                "expected sweep; to get one for every image, add --layout densify"
             )
         for option, value, known in (
             ("method", self.method, METHODS),

@@ -9,9 +9,8 @@ from itertools import chain
 from pathlib import Path
 from typing import NamedTuple, Protocol, cast
 
-from densify.config.errors import InputError
+from densify.config.errors import InputError, did_you_mean
 from densify.config.plugins.readers import READERS, Reader
-from densify.config.plugins.table import did_you_mean
 from densify.geometry.types import LidarSequence
 
 _MOST_PLACES = 200  # are looked at for a recording, where the one named is none itself

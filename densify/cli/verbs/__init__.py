@@ -1,4 +1,145 @@
 # SPDX-License-Identifier: MIT
-"""The verbs, a module each: ``add`` has its options, ``answer`` opens, calls the Python API,
-writes, and gives what there is to say. What is heavy is imported when a verb is called, so that
-help answers at once."""
+"""The verbs, and the parser of them all.
+
+Each module of a verb has ``add``, which adds its options, and ``answer``, which opens, calls the
+Python API, writes, and yields what there is to say. Heavy packages are imported when a verb is
+called: help answers at once.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any, NoReturn
+
+from densify import __version__
+from densify.cli.answer import Answer
+from densify.cli.options import add_verb
+from densify.cli.verbs import (
+    bench,
+    dataset,
+    doctor,
+    evaluate,
+    export,
+    flow,
+    report,
+    run,
+    simulate,
+    train,
+    view,
+)
+from densify.config.errors import brief, did_you_mean
+
+_REMOVED = {
+    "--at": "--set project.at=camera|sweep",
+    "--per": "--set project.per=sweep|image",
+    "--movers": "--set output.movers=keep|drop|separate",
+    "--max-ghost": "--set dataset.max_ghost=SHARE",
+    "--min-density": "--set dataset.min_density=SHARE",
+    "--max-outliers": "--set dataset.max_outliers=SHARE",
+    "--min-sweeps": "--set dataset.min_sweeps=N",
+    "--split": "--set dataset.split=train|val",
+}
+"""Options of earlier versions -> what to give instead."""
+
+
+def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
+    """Return the options of one command; ``options.verb(options)`` runs it.
+
+    Exits with 2 on a bad argument.
+    """
+    parser = _command_line()
+    given = list(sys.argv[1:] if arguments is None else arguments)
+    if "" in given:  # an empty path would be the current folder
+        before = " ".join(given[: given.index("")][-1:])
+        parser.error(f"got an empty argument after {before!r}; is a shell's variable not set?")
+    return parser.parse_args(given)
+
+
+def _command_line() -> argparse.ArgumentParser:
+    parser = _Parser(
+        prog="densify",
+        description="Dense depth maps from lidar recordings, with the moving objects kept sharp.",
+        epilog="Exit codes: 0 done, 1 the computation failed, 2 bad input, 130 interrupted.",
+    )
+    parser.add_argument("--version", action="version", version=f"densify {__version__}")
+    commands = parser.add_subparsers(title="verbs", metavar="VERB", required=True)
+    for add in (
+        run.add_run,
+        run.add_compare,
+        dataset.add,
+        flow.add_flow,
+        train.add,
+        flow.add_labels,
+        doctor.add_info,
+        doctor.add_doctor,
+        simulate.add,
+        export.add,
+        report.add,
+        view.add,
+        evaluate.add,
+        _add_completion,
+        bench.add,
+    ):
+        add(commands)
+    parser.set_defaults(command_line=parser)
+    return parser
+
+
+class _Parser(argparse.ArgumentParser):
+    """Complains in one line, suggests what may be meant, and takes no abbreviated options."""
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(**options, allow_abbrev=False)
+
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
+        """Parse the arguments; refuse an unknown option here, where its verb's are known."""
+        found, others = super().parse_known_args(args, namespace)
+        unknown = next((text for text in others if text.startswith("--")), None)
+        if unknown is not None:
+            name = unknown.partition("=")[0]
+            hint = did_you_mean(name, self._option_string_actions)
+            if name in _REMOVED:
+                hint = f"give {_REMOVED[name]} instead"
+            self.error(f"unknown option {name}; {hint}".rstrip("; "))
+        return found, others
+
+    def _check_value(self, action: argparse.Action, value: Any) -> None:
+        """Refuse a word that is not among the choices, and suggest one."""
+        if action.choices is not None and value not in action.choices:
+            expected = f"expected one of {', '.join(map(str, action.choices))}"
+            hint = did_you_mean(str(value), action.choices)
+            raise argparse.ArgumentError(action, f"got {value!r}; {hint}{expected}")
+
+    def _print_message(self, message: str, file: Any = None) -> None:
+        """Print the message; errors of writing are not hidden."""
+        if message:
+            print(message, end="", file=file or sys.stderr)
+
+    def error(self, message: str) -> NoReturn:
+        self.exit(2, f"densify: {brief(message)}; see {self.prog} --help\n")
+
+
+def _add_completion(commands: Any) -> None:
+    about = "the shell's completion of verbs, options and files"
+    where = 'bash: add  eval "$(densify completion bash)"  to ~/.bashrc'
+    parser = add_verb(commands, "completion", _answer_completion, about, where)
+    parser.add_argument("shell", choices=("bash", "zsh", "tcsh"), help="whose completion")
+
+
+def _answer_completion(options: argparse.Namespace) -> Iterator[Answer]:
+    import shtab
+
+    def complete_paths(parser: argparse.ArgumentParser) -> None:
+        for action in parser._actions:
+            if isinstance(action, argparse._SubParsersAction):
+                for verb in action.choices.values():
+                    complete_paths(verb)
+            elif action.type is Path or action.dest in ("recording", "data"):
+                action.complete = shtab.FILE  # type: ignore[attr-defined]
+
+    complete_paths(options.command_line)
+    script = shtab.complete(options.command_line, shell=options.shell)
+    yield Answer(script, {"script": script})

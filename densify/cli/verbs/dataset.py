@@ -5,42 +5,68 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterator
+from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from densify.cli.answer import Answer, first_of
 from densify.cli.options import (
-    DATA_HELP,
     add_camera,
     add_config_options,
     add_method,
-    add_short_options,
+    add_recording,
     add_verb,
     add_window,
     all_or_slice,
-    config_epilog,
-    config_of,
     natural,
+    recordings_of,
     shard,
 )
-from densify.cli.progress import keys_on_stderr
+from densify.cli.progress import progress_on_stderr
 from densify.cli.screen import tell_doubts
-from densify.config.errors import ComputationError, InputError
+from densify.config import presets, resolve
+from densify.config.errors import ComputationError, InputError, did_you_mean
+from densify.config.file_content import parse_yaml
+from densify.config.knobs import Section, checked, knob
+
+if TYPE_CHECKING:
+    from densify.dataset.make import Summary
+
+_FIRST = {
+    "README.txt": "what the set holds and how to read it",
+    "manifest.jsonl": "every key with its files and scores",
+    "dataset.json": "how it was made",
+}
+_SCORES = {"density": "density", "ghost": "ghosts", "outliers": "held-out outliers"}
+_MOST_SHOWN = 20
+
+
+@dataclass(frozen=True)
+class DatasetSettings(Section):
+    """What ``--set dataset.NAME=VALUE`` takes. A key that misses a limit is put aside: it is in the
+    manifest, not in the set."""
+
+    max_ghost: float | None = knob(None, "limit: ghosts among the accumulated points", 0, 1)
+    min_density: float | None = knob(None, "limit: pixels with a measured depth", 0, 1)
+    max_outliers: float | None = knob(None, "limit: outliers, the key held out", 0, 1)
+    min_sweeps: int | None = knob(None, "limit: sweeps of the window", 1, 101)
+    split: str = knob("kitti", "of the tree", choices=("kitti", "train", "val"))
 
 
 def add(commands: Any) -> None:
-    """Its options."""
-    parser = add_verb(
-        commands,
-        "dataset",
-        answer,
-        "every key of whole recordings, as a training set",
-        "Run again, the same command goes on where it was stopped. Shares are from 0 to 1. "
-        + config_epilog(),
+    """Add the options of ``dataset``."""
+    about = "every key of whole recordings, as a training set"
+    knobs = (f"dataset.{f.name}, {f.metadata['help']}" for f in fields(DatasetSettings))
+    epilog = (
+        "Run again, the same command goes on where it was stopped. --set takes, beside the knobs "
+        f"in {presets()['default']}: {'; '.join(knobs)}."
     )
-    parser.add_argument(
-        "--data", metavar="SPEC", nargs="+", action="extend", help=f"{DATA_HELP}; one or more"
-    )
+    parser = add_verb(commands, "dataset", answer, about, epilog)
+    add_recording(parser, several=True)
+    add_window(parser)
+    add_method(parser)
+    add_camera(parser)
+    add_config_options(parser)
     parser.add_argument(
         "--keys",
         type=all_or_slice,
@@ -48,7 +74,6 @@ def add(commands: Any) -> None:
         metavar="all|A:B[:S]",
         help="frames A to B-1, every S-th, those that exist (default: all)",
     )
-    add_window(parser)
     parser.add_argument(
         "--out", metavar="DIR", type=Path, help="the set's folder: a new one, or one to go on with"
     )
@@ -56,18 +81,25 @@ def add(commands: Any) -> None:
         "--layout",
         choices=("kitti-depth", "densify"),
         default="kitti-depth",
-        help="kitti-depth: the tree of KITTI's depth completion benchmark; densify: what run "
-        "writes, for every key (default: kitti-depth)",
+        help="KITTI's depth completion tree (default), or what densify run writes",
     )
-    add_method(parser)
-    add_camera(parser)
     parser.add_argument(
-        "--split",
-        choices=("train", "val"),
-        help="of the tree (default: KITTI's official one, train for other recordings)",
+        "--workers", type=natural, metavar="N", help="processes (default: as many as fit)"
     )
-    _add_gate(parser)
-    _add_workers(parser)
+    parser.add_argument(
+        "--scheduler",
+        metavar="ADDRESS",
+        help="of a running Dask scheduler, whose workers are used; they need the same files at the "
+        "same paths. tcp://host:8786 trusts everybody on that network: whoever reaches the "
+        "scheduler can run anything on its workers and here. tls://host:8786 lets in only who has "
+        "a certificate, by Dask's configuration (distributed.comm.tls)",
+    )
+    parser.add_argument(
+        "--shard",
+        type=shard,
+        metavar="i/n",
+        help="the i-th of n parts, for several machines",
+    )
     parser.add_argument(
         "--status", metavar="DIR", type=Path, help="how far the set in DIR is; makes nothing"
     )
@@ -77,72 +109,20 @@ def add(commands: Any) -> None:
         help="compare all finished files with the hashes in the manifest: damaged ones are made "
         "anew, or with --status listed (exit code 1)",
     )
-    add_short_options(parser)
-    add_config_options(parser)
-
-
-def _add_gate(parser: argparse.ArgumentParser) -> None:
-    gate = parser.add_argument_group(
-        "quality gate", "a key that misses a limit is put aside: into the manifest, not the set"
-    )
-    gate.add_argument(
-        "--max-ghost",
-        type=float,
-        metavar="SHARE",
-        help="of the accumulated points that stand where the key sweep saw through",
-    )
-    gate.add_argument(
-        "--min-density", type=float, metavar="SHARE", help="of the pixels with a measured depth"
-    )
-    gate.add_argument(
-        "--max-outliers",
-        type=float,
-        metavar="SHARE",
-        help="of the key sweep's returns that the map made without it misses",
-    )
-    gate.add_argument(
-        "--min-sweeps", type=natural, metavar="N", help="in the window, cut at ends and gaps"
-    )
-
-
-def _add_workers(parser: argparse.ArgumentParser) -> None:
-    work = parser.add_argument_group("where it is made")
-    work.add_argument(
-        "--workers",
-        type=natural,
-        metavar="N",
-        help="processes on this machine (default: one on each core, or as many as the free memory "
-        "suffices for and as have eight keys each)",
-    )
-    work.add_argument(
-        "--scheduler",
-        metavar="ADDRESS",
-        help="of a running Dask scheduler, whose workers are used; they need the same files at the "
-        "same paths. tcp://host:8786 trusts everybody on that network: whoever reaches the "
-        "scheduler can run anything on its workers and here. tls://host:8786 lets in only who has "
-        "a certificate, by Dask's configuration (distributed.comm.tls)",
-    )
-    work.add_argument(
-        "--shard",
-        type=shard,
-        metavar="i/n",
-        help="the i-th of n parts of the work, for machines that share DIR",
-    )
 
 
 def answer(options: argparse.Namespace) -> Iterator[Answer]:
-    """Every key of whole recordings, or how far that is."""
+    """Make the set, or say how far it is."""
     yield from _made(options) if options.status is None else _so_far(options)
 
 
 def _so_far(options: argparse.Namespace) -> Iterator[Answer]:
-    from densify.cli.sets import set_facts, set_summary
     from densify.dataset.make import damaged, status
 
     so_far = status(options.status)
     files = damaged(options.status) if options.verify else []
-    text = "\n".join([set_summary(so_far), *(f"damaged: {name}" for name in files)])
-    yield Answer(text, {**set_facts(so_far), "damaged": files})
+    lines = [_describe(so_far), *(f"damaged: {name}" for name in files)]
+    yield Answer("\n".join(lines), {**_facts(so_far), "damaged": files})
     if files:
         raise ComputationError(
             f"--verify: {len(files)} damaged or missing files in {options.status}; run the "
@@ -153,24 +133,25 @@ def _so_far(options: argparse.Namespace) -> Iterator[Answer]:
 def _made(options: argparse.Namespace) -> Iterator[Answer]:
     if options.out is None:
         raise InputError("--out DIR: expected the set's folder, a new one or one to go on with")
-    config = config_of(options)
-    from densify.cli.sets import FIRST_OF_SET, set_facts, set_summary
+    own = [text for text in options.overrides if text.strip().startswith("dataset.")]
+    config = resolve(options.config, [text for text in options.overrides if text not in own])
+    settings = _settings(own)
     from densify.dataset.make import make_dataset
     from densify.dataset.plan import Gate, Recipe
 
-    limits = ("max_ghost", "min_density", "max_outliers", "min_sweeps")
+    limits = {field.name: getattr(settings, field.name) for field in fields(Gate)}
     recipe = Recipe(
         window=options.window,
         method=options.method,
         layout=options.layout,
         cameras=None if options.cameras is None else tuple(options.cameras),
-        split=options.split,
-        gate=Gate(**{limit: getattr(options, limit) for limit in limits}),
+        split=None if settings.split == "kitti" else settings.split,
+        gate=Gate(**limits),
         config=config,
     )
-    with keys_on_stderr() as report:
+    with progress_on_stderr(lines=True) as show:
         summary = make_dataset(
-            options.data or ["street"],
+            recordings_of(options),
             options.out,
             options.keys,
             recipe,
@@ -178,11 +159,70 @@ def _made(options: argparse.Namespace) -> Iterator[Answer]:
             scheduler=options.scheduler,
             shard=options.shard,
             verify=options.verify,
-            report=report,
+            report=lambda so_far: show(
+                "keys", len(so_far.records), so_far.num_keys, _scores(so_far)
+            ),
         )
-    told = [options.out / name for name in FIRST_OF_SET if (options.out / name).is_file()]
-    first = first_of(told, FIRST_OF_SET)
-    yield Answer(set_summary(summary), set_facts(summary), [options.out], first)
+    told = [options.out / name for name in _FIRST if (options.out / name).is_file()]
+    yield Answer(_describe(summary), _facts(summary), [options.out], first_of(told, _FIRST))
     tell_doubts((w, r.drive, r.key) for r in summary.records.values() for w in r.warnings)
     if summary.count("failed"):
         raise ComputationError(f"{summary.count('failed')} of {summary.num_keys} keys not made")
+
+
+def _settings(overrides: list[str]) -> DatasetSettings:
+    """Return the settings of ``dataset.NAME=VALUE``."""
+    known = [field.name for field in fields(DatasetSettings)]
+    values = {}
+    for text in overrides:
+        name, _, given = text.strip().removeprefix("dataset.").partition("=")
+        if name not in known:
+            hint = f"{did_you_mean(name, known)}expected one of {', '.join(known)}"
+            raise InputError(f"--set {text}: unknown key dataset.{name}; {hint}")
+        value, _ = parse_yaml(given, f"--set {text}")
+        values[name] = checked(DatasetSettings, name, value, f"--set {text}: ")
+    return DatasetSettings(**values)
+
+
+def _describe(summary: Summary) -> str:
+    """Return what was made, and what is missing and why."""
+    counts = [
+        f"{summary.count(status)} {said}"
+        for status, said in (("done", "done"), ("aside", "put aside"), ("failed", "failed"))
+        if summary.count(status) or status == "done"
+    ]
+    if summary.num_left:
+        counts.append(f"{summary.num_left} to make")
+    lines = [f"{summary.num_keys} keys: {', '.join(counts)}"]
+    if summary.num_made:
+        pace = summary.seconds / summary.num_made
+        lines[0] += f"; {summary.num_made} now, {pace:.2f} s a key"
+    lines.append(_scores(summary))
+    missing = [r for r in summary.records.values() if r.status != "done"]
+    lines += [f"{r.drive} {r.key} {r.status}: {r.reason}" for r in missing[:_MOST_SHOWN]]
+    if len(missing) > _MOST_SHOWN:
+        lines.append(f"... and {len(missing) - _MOST_SHOWN} more, see the manifest")
+    return "\n".join(line for line in lines if line)
+
+
+def _facts(summary: Summary) -> dict[str, Any]:
+    """Return the numbers of `_describe`."""
+    missing = [r for r in summary.records.values() if r.status != "done"]
+    return {
+        "num_keys": summary.num_keys,
+        **{f"num_{status}": summary.count(status) for status in ("done", "aside", "failed")},
+        "num_left": summary.num_left,
+        "num_made": summary.num_made,
+        "seconds": summary.seconds,
+        "means": {score: summary.mean(score) for score in _SCORES},
+        "missing": [
+            {"drive": r.drive, "key": r.key, "status": r.status, "reason": r.reason}
+            for r in missing
+        ],
+    }
+
+
+def _scores(summary: Summary) -> str:
+    """Return the means over the keys so far; empty before the first."""
+    means = [(said, summary.mean(score)) for score, said in _SCORES.items()]
+    return ", ".join(f"{said} {100 * mean:.2f} %" for said, mean in means if mean is not None)

@@ -1,20 +1,41 @@
 # SPDX-License-Identifier: MIT
-"""``densify evaluate``: depth maps against the truth."""
+"""``densify evaluate``: depth maps against true ones."""
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from densify.cli.answer import Answer
-from densify.cli.options import add_overwrite, add_verb, positive
+from densify.cli.answer import Answer, Column, percent, table
+from densify.cli.options import add_overwrite, add_verb, check_new_file, positive
 from densify.cli.progress import progress_on_stderr
+
+_COLUMNS: tuple[Column, ...] = (
+    ("pixels", ("num_pixels",), ",d"),
+    ("coverage", ("coverage",), ".1%"),
+    ("MAE mm", ("mae_mm",), ",.1f"),
+    ("RMSE mm", ("rmse_mm",), ",.1f"),
+    ("iMAE 1/km", ("imae_per_km",), ".3f"),
+    ("iRMSE 1/km", ("irmse_per_km",), ".3f"),
+    ("AbsRel", ("abs_rel",), ".2%"),
+    ("SqRel", ("sq_rel",), ".2%"),
+    ("d<1.25", ("delta_1",), ".2%"),
+    ("d<1.25^2", ("delta_2",), ".2%"),
+    ("d<1.25^3", ("delta_3",), ".2%"),
+    ("outliers", ("outliers",), ".3%"),
+)
+_MISSING = {
+    "without_truth": "predicted without truth",
+    "without_prediction": "truth without prediction",
+    "without_mask": "truth without mask",
+}
+_MOST_NAMED = 5
 
 
 def add(commands: Any) -> None:
-    """Its options."""
+    """Add the options of ``evaluate``."""
     parser = add_verb(
         commands,
         "evaluate",
@@ -32,7 +53,7 @@ def add(commands: Any) -> None:
         "--mask",
         type=Path,
         metavar="PNG|DIR",
-        help="what moves, not 0 in an image or a folder of them: scores of moving and static "
+        help="moving objects, not 0 in an image or a folder of them: scores of moving and static "
         "pixels too",
     )
     parser.add_argument(
@@ -40,28 +61,18 @@ def add(commands: Any) -> None:
         action="store_true",
         help="of what densify made, score depth_filled (of a set, groundtruth_filled)",
     )
-    parser.add_argument(
-        "--focal-px",
-        type=positive,
-        metavar="F",
-        help="the camera's fx, for outliers and edges (default: KITTI's, 721.5377)",
-    )
-    parser.add_argument(
-        "--baseline-m",
-        type=positive,
-        metavar="B",
-        help="stereo baseline that outliers are told by (default: KITTI's, 0.54)",
-    )
+    for name, what in (
+        ("--focal-px", "the camera's fx, for outliers and edges (default: KITTI's, 721.5377)"),
+        ("--baseline-m", "stereo baseline that defines outliers (default: KITTI's, 0.54)"),
+    ):
+        parser.add_argument(name, type=positive, metavar="X", help=what)
     parser.add_argument("--out", metavar="FILE.json", type=Path, help="write every number there")
     add_overwrite(parser)
 
 
 def answer(options: argparse.Namespace) -> Iterator[Answer]:
-    """Depth maps against the truth."""
-    from densify.bench import evaluation
-    from densify.bench.table_file import write_table
-    from densify.cli.bench_tables import evaluation_table
-    from densify.cli.point_files import check_new_file
+    """Score depth maps against the truth."""
+    from densify.bench.evaluation import evaluate, write_numbers
     from densify.readers.depth_trees import pair_depth_files
 
     if options.out is not None:
@@ -70,7 +81,30 @@ def answer(options: argparse.Namespace) -> Iterator[Answer]:
     given = {name: getattr(options, name) for name in ("focal_px", "baseline_m")}
     stereo = {name: value for name, value in given.items() if value is not None}
     with progress_on_stderr() as progress:
-        scores = evaluation.evaluate(pairs, **stereo, progress=progress)
+        scores = evaluate(pairs, **stereo, progress=progress)
     if options.out is not None:
-        write_table(options.out, scores)
-    yield Answer(evaluation_table(scores), {"scores": scores}, [options.out] if options.out else [])
+        write_numbers(options.out, scores)
+    yield Answer(_describe(scores), {"scores": scores}, [options.out] if options.out else [])
+
+
+def _describe(scores: Mapping[str, Any]) -> str:
+    """Return a row per part of the pixels, in the units of KITTI's leaderboard; files without a
+    counterpart are counted, and the first are named."""
+    num, density = scores["num_images"], scores["density"]
+    lines = [
+        f"{num:,} image{'s' if num != 1 else ''}: predicted {percent(density['predicted'])} of "
+        f"the pixels, truth {percent(density['truth'])}; outliers with fx "
+        f"{scores['focal_px']:g} px, baseline {scores['baseline_m']:g} m"
+    ]
+    for name, what in _MISSING.items():
+        if paths := scores[name]:
+            num_more = len(paths) - _MOST_NAMED
+            rest = f", ... and {num_more:,} more" if num_more > 0 else ""
+            lines.append(f"{what}: {len(paths):,}: {', '.join(paths[:_MOST_NAMED])}{rest}")
+    rows = {name: _in_mm(part) for name, part in scores["parts"].items() if part["num_pixels"]}
+    return "\n".join([*lines, table(rows, _COLUMNS)])
+
+
+def _in_mm(part: Mapping[str, Any]) -> dict[str, Any]:
+    metres = {name: part[f"{name}_m"] for name in ("mae", "rmse")}
+    return {**part, **{f"{n}_mm": None if m is None else 1000 * m for n, m in metres.items()}}

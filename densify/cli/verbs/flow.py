@@ -1,111 +1,182 @@
 # SPDX-License-Identifier: MIT
-"""``densify flow``: scene flow between two point files, or of a recording."""
+"""``densify flow``: scene flow of two point files or of a recording; ``densify labels``: scene flow
+from tracked boxes."""
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import densify
 from densify.cli.answer import Answer
 from densify.cli.options import (
-    DATA_HELP,
     add_config_options,
     add_overwrite,
+    add_recording,
     add_verb,
+    check_new_file,
+    config_of,
     key_slice,
+    positive,
+    recording_of,
     sliced,
 )
 from densify.cli.progress import progress_on_stderr
 from densify.config import Config, resolve
 from densify.config.errors import ComputationError, InputError
 
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
 
-def add(commands: Any) -> None:
-    """Its options."""
-    about = "scene flow of a recording, or between two point files in one coordinate frame"
+    from densify.geometry.types import Float, Int
+
+
+class PointCloud(NamedTuple):
+    """The points of a file.
+
+    points: (N,3) float64 metres.
+    offset_ns: (N,) int64, when each was measured, None where the file does not say.
+    lidar: (N,) int64, the number of the scanner, None where the file does not say.
+    """
+
+    points: Float
+    offset_ns: Int | None = None
+    lidar: Int | None = None
+
+
+def add_flow(commands: Any) -> None:
+    """Add the options of ``flow``."""
     parser = add_verb(
         commands,
         "flow",
-        answer,
-        about,
+        answer_flow,
+        "scene flow of a recording, or between two point files in one coordinate frame",
         "Point files: .npy (N,3 or more columns), .npz (array 'points'), .txt and .csv (columns), "
         ".bin (float32 columns, as KITTI's), .pcd, .ply, .las, .laz. Where both are .npz and "
         "hold when each point was measured ('offset_ns', or 'time' in seconds) or by which "
         "scanner ('lidar'), that is used. "
         "The result holds 'residual_flow' (N,3) float32 metres, "
         "'moving' (N,) bool, 'instance' (N,) int32 (-1 none) and 'lost' (N,) bool, row by row as "
-        "SOURCE. Of a recording, the flow of each sweep to the next is written: npz: "
-        "DIR/FRAME_NEXT.npz, flow files as --flow npz:DIR reads them; av2: DIR/NAME/STAMP.feather, "
-        "the files of the Argoverse 2 scene flow challenge (all points, without the ego-motion); "
-        "opensceneflow: DIR/NAME.h5, all sweeps with their flow.",
+        "SOURCE. Of a recording, with --all or --keys, the flow of each sweep to the next is "
+        "written: npz: DIR/FRAME_NEXT.npz, flow files as flow.engine=npz:DIR reads them; av2: "
+        "DIR/NAME/STAMP.feather, the files of the Argoverse 2 scene flow challenge (all points, "
+        "without the ego-motion); opensceneflow: DIR/NAME.h5, all sweeps with their flow.",
     )
-    for name, when in (("source", "first"), ("target", "second")):
-        parser.add_argument(
-            name, metavar=name.upper(), type=Path, nargs="?", help=f"points at the {when} time"
-        )
-    parser.add_argument("--data", metavar="SPEC", help=f"instead: {DATA_HELP.partition(' (')[0]}")
-    parser.add_argument("--all", action="store_true", help="every sweep of it")
+    parser.add_argument("source", metavar="SOURCE|SPEC", nargs="?", help="points, or a recording")
+    parser.add_argument("target", metavar="TARGET", type=Path, nargs="?", help="points, later")
+    parser.add_argument("--data", metavar="SPEC", help="the recording as an option")
+    parser.add_argument("--all", action="store_true", help="every sweep of the recording")
     parser.add_argument(
         "--keys", type=key_slice, metavar="A:B[:S]", help="sweeps A to B-1, every S-th"
     )
+    formats = ("npz", "av2", "opensceneflow")
+    parser.add_argument("--format", choices=formats, help="for a recording (default: npz)")
     parser.add_argument(
-        "--format",
-        choices=("npz", "av2", "opensceneflow"),
-        help="of what is written (default: npz)",
+        "--out", metavar="F.npz|DIR", type=Path, help="(default: densify-out/flow.npz, densify-out)"
     )
     add_config_options(parser)
-    parser.add_argument(
-        "--out",
-        metavar="F.npz|DIR",
-        type=Path,
-        help="(default: ./densify-out/flow.npz, of a recording ./densify-out)",
-    )
     add_overwrite(parser)
 
 
-def answer(options: argparse.Namespace) -> Iterator[Answer]:
-    """Scene flow between two point files, or of a recording."""
-    config = resolve(options.config, options.overrides)
-    if options.data is not None:
-        yield from _of_recording(options, config)
+def answer_flow(options: argparse.Namespace) -> Iterator[Answer]:
+    """Estimate scene flow between two point files, or of a recording."""
+    config = config_of(options)
+    asks_for_sweeps = options.all or options.keys is not None
+    if options.target is not None and options.data is None and not asks_for_sweeps:
+        if options.format is not None:
+            raise InputError(f"--format {options.format}: of recordings, got two point files")
+        yield _of_two_files(options, config)
         return
-    from densify.cli.point_files import check_new_file, read_points, write_flow
-
-    if options.target is None or options.keys is not None or options.all or options.format:
+    specs = [spec for spec in (options.source, options.data) if spec is not None]
+    if options.target is not None or len(specs) != 1 or options.all == (options.keys is not None):
         raise InputError(
-            "densify flow: expected SOURCE and TARGET, two point files, or --data SPEC with --all "
-            "or --keys A:B[:S]; see densify flow --help"
+            "densify flow: expected SOURCE and TARGET, two point files, or a recording with either "
+            "--all or --keys A:B[:S]; see densify flow --help"
         )
-    options.out = options.out or Path("densify-out/flow.npz")
-    check_new_file(options.out, options.overwrite)
-    source, target = read_points(options.source), read_points(options.target)
-    columns = {
-        f"{side}_{name}": getattr(file, name)
-        for name in ("offset_ns", "lidar")
-        if getattr(source, name) is not None and getattr(target, name) is not None
-        for side, file in (("source", source), ("target", target))
-    }
+    yield from _of_recording(specs[0], options, config)
+
+
+def _of_two_files(options: argparse.Namespace, config: Config) -> Answer:
+    from densify.outputs.atomic import write_file
+    from densify.outputs.flow_writers import flow_npz
+
+    out = options.out or Path("densify-out/flow.npz")
+    check_new_file(out, options.overwrite)
+    source, target = read_points(Path(options.source)), read_points(options.target)
+    columns = {**_columns("source", source, target), **_columns("target", target, source)}
     field = densify.estimate_flow(source.points, target.points, config, **columns)
-    write_flow(options.out, field)
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        write_file(out, flow_npz(field))
+    except OSError as error:
+        raise InputError(f"--out {out}: cannot be written: {error.strerror or error}") from error
     num_moving = int(field.moving.sum())
     facts = {"num_points": len(source.points), "num_moving": num_moving}
-    text = f"{len(source.points):,} points, {num_moving:,} moving"
-    yield Answer(text, facts, [options.out])
+    return Answer(f"{len(source.points):,} points, {num_moving:,} moving", facts, [out])
 
 
-def _of_recording(options: argparse.Namespace, config: Config) -> Iterator[Answer]:
+def read_points(path: Path) -> PointCloud:
+    """Return every row of a point file in its order; flow is written row by row.
+
+    An .npz file may hold, beside ``points``, ``offset_ns`` or ``time`` (seconds) and ``lidar``,
+    (N,) each. Raises InputError for a file of another form, without points, or with points that are
+    not finite.
+    """
+    import numpy as np
+
+    from densify.readers.point_files import read_table
+
+    table = read_table(path)
+    missing = [name for name in "xyz" if name not in table.columns]
+    if missing:
+        raise InputError(
+            f"{path}: no column {missing[0]}: got {', '.join(table.columns)}, expected x, y and z"
+        )
+    points = np.column_stack([table.columns[name].astype(np.float64) for name in "xyz"])
+    bad = np.flatnonzero(~np.isfinite(points).all(axis=1))
+    if len(bad):
+        raise InputError(
+            f"{path}: {len(bad)} of {len(points)} points are not finite, the first in row "
+            f"{bad[0]}; remove them"
+        )
+    columns = {}
+    for name in ("offset_ns" if "offset_ns" in table.beside else "time", "lidar"):
+        if name in table.beside:
+            column = _checked_column(path, name, table.beside[name], len(points))
+            columns[name.replace("time", "offset_ns")] = column
+    return PointCloud(points, **columns)
+
+
+def _checked_column(path: Path, name: str, array: NDArray[Any], num_points: int) -> Int:
+    """Return a column beside the points as int64, ``time`` in nanoseconds."""
+    import numpy as np
+
+    kinds = "iuf" if name == "time" else "iu"
+    fits = array.shape == (num_points,) and array.dtype.kind in kinds
+    if not fits or not np.isfinite(array).all():
+        raise InputError(
+            f"{path}: array {name}: got shape {array.shape} and type {array.dtype}, expected "
+            f"({num_points},) {'seconds' if name == 'time' else 'whole numbers'}, one for each "
+            f"point"
+        )
+    return np.rint(array * 1e9 if name == "time" else array).astype(np.int64)
+
+
+def _columns(side: str, cloud: PointCloud, other: PointCloud) -> dict[str, Any]:
+    """Return the columns beside the points that both clouds have, as `estimate_flow` names them."""
+    names = ("offset_ns", "lidar")
+    both = [n for n in names if getattr(cloud, n) is not None and getattr(other, n) is not None]
+    return {f"{side}_{name}": getattr(cloud, name) for name in both}
+
+
+def _of_recording(spec: str, options: argparse.Namespace, config: Config) -> Iterator[Answer]:
     from densify.outputs.flow_writers import flow_writer
     from densify.pipeline.run import flow_steps
     from densify.readers import open_sequence
 
-    if options.source is not None or options.all == (options.keys is not None):
-        raise InputError(
-            "densify flow --data SPEC: expected either --all or --keys A:B[:S], and no point files"
-        )
-    sequence, out = open_sequence(options.data), options.out or Path("densify-out")
+    sequence, out = open_sequence(spec), options.out or Path("densify-out")
     frames = list(sequence.frames)
     if options.keys is not None:
         frames = sliced(sequence, options.keys)
@@ -123,10 +194,77 @@ def _of_recording(options: argparse.Namespace, config: Config) -> Iterator[Answe
             paths[write(frame, flow)] = None
             num_moving += sum(int(field.moving.sum()) for field in flow.steps.values())
     num_made = len(frames) - len(failed)
-    sweeps = "sweep" if num_made == 1 else "sweeps"
-    text = f"{num_made:,} {sweeps}, {num_moving:,} points moving"
+    text = f"{_sweeps(num_made)}, {num_moving:,} points moving"
     facts = {"num_sweeps": num_made, "num_moving": num_moving}
     yield Answer(text, facts, list(dict.fromkeys(path.parent for path in paths)))
+    _raise_failed(failed, len(frames), "made")
+
+
+def _sweeps(num: int) -> str:
+    return f"{num:,} sweep{'' if num == 1 else 's'}"
+
+
+def _raise_failed(failed: Mapping[int, Exception], num: int, what: str) -> None:
     if failed:
         told = "; ".join(f"sweep {frame}: {error}" for frame, error in failed.items())
-        raise ComputationError(f"{len(failed)} of {len(frames)} sweeps not made: {told}")
+        raise ComputationError(f"{len(failed)} of {num} sweeps not {what}: {told}")
+
+
+def add_labels(commands: Any) -> None:
+    """Add the options of ``labels``."""
+    parser = add_verb(
+        commands,
+        "labels",
+        answer_labels,
+        "scene flow of every sweep to the next from tracked boxes and poses",
+        "Flow files as flow.engine=npz:DIR and bench flow --truth read them, with 'valid' (N,) "
+        "bool: False in two boxes, just outside one, at the foot of one that moves, in a box that "
+        "the next sweep lacks, and where nobody drew boxes. Poses are the recording's own (--set "
+        "register.source=kiss-icp: estimated).",
+    )
+    add_recording(parser)
+    parser.add_argument("--out", metavar="DIR", type=Path, required=True, help="for the flow files")
+    parser.add_argument("--keys", type=key_slice, metavar="A:B[:S]", help="(default: all sweeps)")
+    grown = "metres by which boxes grow on each side (default: 0.1)"
+    parser.add_argument("--grown", type=positive, default=0.1, metavar="M", help=grown)
+    ground = "points of the ground are not valid"
+    parser.add_argument("--without-ground", action="store_true", help=ground)
+    add_config_options(parser)
+    add_overwrite(parser)
+
+
+def answer_labels(options: argparse.Namespace) -> Iterator[Answer]:
+    """Label every sweep."""
+    config = resolve(options.config, ["register.source=dataset", *options.overrides])
+    from densify.flow.boxes import BoxMargins
+    from densify.learning.labels import Label, label_sweeps, write_label
+    from densify.readers import open_sequence
+
+    sequence = open_sequence(recording_of(options))
+    frames = list(sequence.frames)
+    if options.keys is not None:
+        frames = sliced(sequence, options.keys)
+    failed: dict[int, Exception] = {}
+    num_made = num_points = num_moving = num_sure = 0
+    with progress_on_stderr() as progress:
+        margins = BoxMargins(grown_m=options.grown)
+        labels = label_sweeps(sequence, frames, config, margins, options.without_ground, progress)
+        for frame, label in labels:
+            if not isinstance(label, Label):
+                failed[frame] = label
+                continue
+            write_label(options.out, label, options.overwrite)
+            num_made += 1
+            num_points += len(label.sure)
+            num_sure += int(label.sure.sum())
+            num_moving += int(label.field.moving.sum())
+    if not num_made and not failed:
+        raise InputError(
+            f"--data {recording_of(options)}: none of {len(frames)} sweeps has boxes and is "
+            f"followed by one that has; choose others by --keys"
+        )
+    share = num_sure / max(num_points, 1)
+    facts: dict[str, Any] = {"num_sweeps": num_made, "num_moving": num_moving, "share_valid": share}
+    text = f"{_sweeps(num_made)}, {num_moving:,} points moving, {100 * share:.1f} % valid"
+    yield Answer(text, facts, [options.out] if num_made else [])
+    _raise_failed(failed, len(frames), "labelled")

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: MIT
-"""``densify run``: one key or several."""
+"""``densify run``: one key or several; ``densify compare``: methods side by side."""
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,16 +12,15 @@ from densify.cli.answer import Answer, first_of
 from densify.cli.options import (
     add_key_options,
     add_method,
-    add_output_options,
     add_verb,
-    cache_of,
-    config_epilog,
     config_of,
     key_slice,
     natural,
+    recording_of,
     sliced,
+    words,
 )
-from densify.cli.progress import Course, course_on_stderr
+from densify.cli.progress import progress_on_stderr
 from densify.cli.screen import tell_doubts
 from densify.config import Config, as_mapping
 from densify.config.errors import ComputationError, InputError
@@ -30,9 +29,9 @@ if TYPE_CHECKING:
     from densify.geometry.types import LidarSequence, Result
 
 
-def add(commands: Any) -> None:
-    """Its options."""
-    parser = add_verb(commands, "run", answer, "densify one key or several", config_epilog())
+def add_run(commands: Any) -> None:
+    """Add the options of ``run``."""
+    parser = add_verb(commands, "run", answer_run, "densify one key or several")
     parser.add_argument(
         "--key",
         type=natural,
@@ -55,39 +54,41 @@ def add(commands: Any) -> None:
         type=Path,
         metavar="DIR|FILE",
         help="depth images of your own, as of a monocular network: DIR/CAMERA/FRAME.npy, .exr or "
-        ".png (16 bit), or one FRAME.npy of one camera; of any scale, depth or inverse depth; "
-        "fitted to what is measured they make depth_full/, where nothing is measured or filled; "
-        "masks in DIR/sky/CAMERA/FRAME.png",
+        ".png (16 bit), or one FRAME.npy of one camera; of any scale, depth or inverse depth. "
+        "Fitted to the measured pixels they complete depth_full/; masks of the sky in "
+        "DIR/sky/CAMERA/FRAME.png",
     )
     parser.add_argument(
         "--film",
         type=Path,
         metavar="FILE",
         help="of one key: a film of 8 s, .webp (half a megabyte) or .gif: registration alone "
-        "turns into ours, then sweep by sweep",
+        "turns into scene flow, then sweep by sweep",
     )
-    add_output_options(parser)
 
 
-def answer(options: argparse.Namespace) -> Iterator[Answer]:
+def answer_run(options: argparse.Namespace) -> Iterator[Answer]:
     """Densify one key or several."""
     config = config_of(options)
     from densify.cli.results import FIRST_OF_RUN, key_facts, summary
     from densify.outputs import check_writable
     from densify.pipeline import run as pipeline
     from densify.pipeline.memory import check_fits
-    from densify.pipeline.methods import engines, with_baselines
     from densify.readers import open_sequence
 
-    sequence = open_sequence(options.data)
+    sequence = open_sequence(recording_of(options))
     keys = _keys_of(sequence, options)
     for key in keys:
         check_writable(options.out, key, options.overwrite, "run", config.output.also)
-    _check_film(options, keys)
+    if options.film is not None:
+        from densify.outputs.report.film import check_film
+
+        if len(keys) > 1:
+            raise InputError(f"--film {options.film}: got {len(keys)} keys, expected one")
+        check_film(options.film, options.overwrite)
     failed: dict[int, Exception] = {}
     doubts: list[tuple[str, str, int]] = []
-    course = Course(engines(with_baselines(options.method), config.flow.engine), len(keys))
-    with course_on_stderr(course):
+    with progress_on_stderr() as progress:
         made = pipeline.run_keys(
             sequence,
             keys,
@@ -95,21 +96,17 @@ def answer(options: argparse.Namespace) -> Iterator[Answer]:
             options.method,
             options.cameras,
             config,
-            course.step,
-            cache_of(options),
-            options.prior,
+            progress,
+            prior=options.prior,
         )
         check_fits(sequence, keys[0], options.window, options.cameras, config)
         for key, result in made:
             if isinstance(result, Exception):
                 failed[key] = result
-                course.key_done()
                 yield Answer(facts={"keys": [{"key": key, "error": str(result)}]})
                 continue
-            course.step("write", 0, 1)
             paths = _written(result, options, config)
             first = first_of(paths, FIRST_OF_RUN)
-            course.key_done()
             yield Answer(summary(result), {"keys": [key_facts(result)]}, paths, first)
             doubts += [(warning, "", key) for warning in result.warnings]
     tell_doubts(doubts)
@@ -120,18 +117,8 @@ def answer(options: argparse.Namespace) -> Iterator[Answer]:
         raise ComputationError(f"{len(failed)} of {len(keys)} keys not made: {told}")
 
 
-def _check_film(options: argparse.Namespace, keys: Sequence[int]) -> None:
-    if options.film is None:
-        return
-    from densify.outputs.report.film import check_film
-
-    if len(keys) > 1:
-        raise InputError(f"--film {options.film}: got {len(keys)} keys, expected one")
-    check_film(options.film, options.overwrite)
-
-
 def _written(result: Result, options: argparse.Namespace, config: Config) -> list[Path]:
-    """The files written of a key."""
+    """Write the files of a key and return their paths."""
     from densify.outputs import write_result
 
     paths = write_result(
@@ -139,7 +126,7 @@ def _written(result: Result, options: argparse.Namespace, config: Config) -> lis
         result.images,
         options.out,
         config=as_mapping(config),
-        data=options.data,
+        data=recording_of(options),
         overwrite=options.overwrite,
         also=config.output.also,
     )
@@ -152,7 +139,7 @@ def _written(result: Result, options: argparse.Namespace, config: Config) -> lis
 
 
 def _keys_of(sequence: LidarSequence, options: argparse.Namespace) -> list[int]:
-    """``--key`` and ``--keys`` together, ascending."""
+    """Return the frames of ``--key`` and ``--keys``, ascending."""
     from densify.readers.timeline import format_frames
 
     frames = frozenset(sequence.frames)
@@ -170,3 +157,63 @@ def _keys_of(sequence: LidarSequence, options: argparse.Namespace) -> list[int]:
             "see densify run --help"
         )
     return sorted(wanted)
+
+
+def add_compare(commands: Any) -> None:
+    """Add the options of ``compare``."""
+    about = "methods side by side, on the same registration"
+    parser = add_verb(commands, "compare", answer_compare, about)
+    parser.add_argument(
+        "--key", type=natural, required=True, metavar="K", help="the frame to densify"
+    )
+    add_key_options(parser)
+    parser.add_argument(
+        "--methods",
+        type=words,
+        metavar="NAME,…",
+        help="of none (the key sweep), icp (registration only), icp-far (the same of all sweeps "
+        "within accumulate.far_m), icp-visible (registration with our visibility), flow-plain (our "
+        "scene flow without it), paper (the published scene flow), flow (ours); default: "
+        "none,icp,icp-far,paper,flow",
+    )
+
+
+def answer_compare(options: argparse.Namespace) -> Iterator[Answer]:
+    """Densify one key by several methods."""
+    config = config_of(options)
+    from densify.cli.results import FIRST_OF_COMPARISON, comparison, key_facts
+    from densify.outputs import check_writable, write_comparison
+    from densify.pipeline import run as pipeline
+    from densify.pipeline.memory import check_fits
+    from densify.pipeline.methods import COMPARED
+    from densify.readers import open_sequence
+
+    check_writable(options.out, options.key, options.overwrite, "compare")
+    sequence = open_sequence(recording_of(options))
+    check_fits(sequence, options.key, options.window, options.cameras, config)
+    with progress_on_stderr() as progress:
+        results = pipeline.compare(
+            sequence,
+            options.key,
+            options.window,
+            options.cameras,
+            config,
+            progress,
+            options.methods or COMPARED,
+        )
+    paths = write_comparison(
+        results,
+        next(iter(results.values())).images,
+        options.out,
+        config=as_mapping(config),
+        data=recording_of(options),
+        overwrite=options.overwrite,
+    )
+    if config.output.report:
+        from densify.dataset.report import write_comparison_page
+
+        paths.append(write_comparison_page(paths[0].parent))
+    facts = {"key": options.key, "methods": {n: key_facts(r) for n, r in results.items()}}
+    yield Answer(comparison(results), facts, paths, first_of(paths, FIRST_OF_COMPARISON))
+    told = dict.fromkeys(w for r in results.values() for w in r.warnings)
+    tell_doubts((warning, "", options.key) for warning in told)

@@ -9,15 +9,14 @@ The entry point's name is the plug-in's, its value a module::
 
 from __future__ import annotations
 
-import difflib
 import traceback
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, fields
 from importlib import import_module
 from types import ModuleType
 from typing import TYPE_CHECKING, Generic, TypeVar
 
-from densify.config.errors import InputError
+from densify.config.errors import InputError, did_you_mean
 
 if TYPE_CHECKING:
     from importlib.metadata import EntryPoint
@@ -46,12 +45,6 @@ class Row:
 
 
 R = TypeVar("R", bound=Row)
-
-
-def did_you_mean(name: str, known: Iterable[str]) -> str:
-    """Return "did you mean X? " for the known name that is like this one, "" if none is."""
-    close = difflib.get_close_matches(name, [*known], n=1)
-    return f"did you mean {close[0]}? " if close else ""
 
 
 def owner_of(error: BaseException) -> str:

@@ -1,0 +1,361 @@
+# SPDX-License-Identifier: MIT
+"""``densify bench``: measured tables."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from densify.cli.answer import Answer, Column, look_up, table
+from densify.cli.options import (
+    add_camera,
+    add_config_options,
+    add_overwrite,
+    add_recording,
+    add_verb,
+    add_window,
+    check_new_file,
+    config_of,
+    natural,
+    recording_of,
+    recordings_of,
+    sentence,
+    words,
+)
+from densify.cli.progress import progress_on_stderr
+from densify.config import as_mapping, resolve
+from densify.config.errors import InputError
+
+if TYPE_CHECKING:
+    from densify.bench.paper_pairs import PaperPair
+
+_UNSEEN = (
+    "street?seed=41@70",
+    "street:crossing?seed=42@90",
+    "street:highway?seed=43@60",
+    "street?seed=44@100",
+)
+
+
+def add(commands: Any) -> None:
+    """Add ``bench`` and its tables."""
+    about = "measured tables: this package's methods beside published ones"
+    parser = commands.add_parser("bench", help=about, description=sentence(about))
+    benches = parser.add_subparsers(title="benches", metavar="WHAT", required=True)
+    _add_flow(benches)
+    _add_depth(benches)
+    _add_paper(benches)
+    parser = add_verb(
+        benches,
+        "readme",
+        _answer_readme,
+        "the tables of docs/results.md made again, as Markdown on stdout; all of them take an hour",
+    )
+    names = "methods, depth, parts, flow, rings, rates, registration"
+    parser.add_argument("tables", nargs="*", metavar="TABLE", help=f"of {names} (default: all)")
+    for name, what in (("kitti", "drive 2011_09_26_drive_0013_sync"), ("pandaset", "sequence 002")):
+        parser.add_argument(f"--{name}", metavar="DIR", type=Path, help=f"{what}, for its rows")
+
+
+def _add_flow(benches: Any) -> None:
+    parser = add_verb(
+        benches,
+        "flow",
+        _answer_flow,
+        "engines of scene flow on the same windows: errors, seconds",
+        "Methods: ours (the configured engine, all sweeps), ours-pair (two sweeps), paper (the "
+        "published objective, our solver), paper-adam (its own solver, 1,500 steps: minutes), "
+        "rigid. Errors need --truth, or a recording with exact truth. The last tables are scored "
+        "as the Argoverse 2 challenges are: within 35 m, without the ground, moving from 0.05 m a "
+        "sweep; three-way end-point errors, and errors as parts of the speed in buckets of it.",
+    )
+    add_recording(parser, several=True)
+    _add_common(parser)
+    fast = "(default: all but paper-adam)"
+    parser.add_argument("--methods", type=words, metavar="NAME,…", help=fast)
+    truth = (
+        "true flow of the sweeps to the next ones: FRAME_NEXT.npz (flow files), STAMP.feather "
+        "(Argoverse 2's labels), or OpenSceneFlow's .h5; pairs before the key are scored"
+    )
+    parser.add_argument("--truth", metavar="DIR|FILE.h5", type=Path, help=truth)
+
+
+def _add_depth(benches: Any) -> None:
+    parser = add_verb(
+        benches,
+        "depth",
+        _answer_depth,
+        "depth maps of several configurations side by side, against every truth there is",
+        "Truths: exact depth of the built-in street, where a scanner in the key sweep can reach; "
+        "the key sweep's returns, for the key made without them; with --scanner the returns of one "
+        "of several scanners, for maps made without it.",
+    )
+    add_recording(parser)
+    _add_common(parser)
+    add_camera(parser)
+    method = "as of compare (default: flow)"
+    parser.add_argument("--method", default="flow", metavar="NAME", help=method)
+    parser.add_argument(
+        "--variant",
+        nargs="+",
+        action="append",
+        default=[],
+        metavar=("NAME", "section.key=value"),
+        help="a configuration beside the given one; may be given several times",
+    )
+    parser.add_argument("--scanner", type=natural, metavar="N", help="whose returns are the truth")
+
+
+def _add_paper(benches: Any) -> None:
+    parser = add_verb(
+        benches,
+        "paper",
+        _answer_paper,
+        "the tables of Pontes, Hays, Lucey (3DV 2020), with the published figures beside",
+        "Of recordings (--data, default: four streets) the frame and the next sweep; without exact "
+        "truth the flow is that of this package's engine. Methods: rest, icp, pointpwc (its loss "
+        "without learning), paper-adam (as published), paper (this package's solver), no-laplacian "
+        "(Table 2), ours. pointpwc and paper-adam take minutes a pair. On streets the motion of "
+        "the vehicle is removed, in the published sets it is not; ours and networks know it where "
+        "the recording has poses.",
+    )
+    made = "as FlowNet3D's authors made them"
+    for name, what in (
+        ("flyingthings", f".npz files of FlyingThings3D {made}"),
+        ("kitti", f"KITTI's scene flow 2015 with its calibration, or .npz files {made}"),
+    ):
+        parser.add_argument(f"--{name}", metavar="DIR", type=Path, help=what)
+    for name, where in (("argoverse", "DIR[#LOG]"), ("nuscenes", "DIR[#SCENE]")):
+        boxes = "a recording with tracked boxes"
+        parser.add_argument(f"--{name}", metavar=where, action="append", help=boxes)
+    parser.add_argument("--data", action="append", metavar="SPEC@K,…", help="recordings and frames")
+    parser.add_argument("--methods", type=words, metavar="NAME,…", help="(default: the fast ones)")
+    model = "a network of densify train flow; may be given several times"
+    parser.add_argument(
+        "--model", type=Path, action="append", default=[], dest="models", help=model
+    )
+    for name, default, what in (("points", 2048, "drawn"), ("pairs", 0, "of a set, 0: all")):
+        about = f"{what} (default: {default})"
+        parser.add_argument(f"--{name}", type=natural, default=default, metavar="N", help=about)
+    curves = "also over neighbours and over the number of points"
+    parser.add_argument("--curves", action="store_true", help=curves)
+    _add_file(parser)
+
+
+def _add_common(parser: argparse.ArgumentParser) -> None:
+    keys = "frame in the middle; may be given several times (default: 120)"
+    parser.add_argument("--key", type=natural, action="append", dest="keys", metavar="K", help=keys)
+    add_window(parser)
+    add_config_options(parser)
+    _add_file(parser)
+
+
+def _add_file(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--out", metavar="FILE.json", type=Path, help="write every number there")
+    add_overwrite(parser)
+
+
+def _written(options: argparse.Namespace, numbers: Mapping[str, Any]) -> list[Path]:
+    """Write the file of numbers where one is asked for, and return its path."""
+    from densify.bench.evaluation import write_numbers
+
+    if options.out is None:
+        return []
+    write_numbers(options.out, numbers)
+    return [options.out]
+
+
+def _answer_flow(options: argparse.Namespace) -> Iterator[Answer]:
+    config = config_of(options)
+    from densify.bench import flow as bench
+    from densify.readers import open_sequence
+
+    if options.out is not None:
+        check_new_file(options.out, options.overwrite, ".json")
+    methods = bench.DEFAULT_METHODS if options.methods is None else options.methods
+    runs = []
+    for sequence in [open_sequence(spec) for spec in recordings_of(options)]:
+        for key in options.keys or [120]:
+            with progress_on_stderr() as progress:
+                measured = bench.bench_flow(
+                    sequence, key, options.window, config, methods, progress, options.truth
+                )
+            runs.append(measured)
+            yield Answer(_flow_table(measured) + "\n", {"runs": [measured]})
+    yield Answer(files=_written(options, {"runs": runs, "config": as_mapping(config)}))
+
+
+_FLOW_TABLES: tuple[tuple[Column, ...], ...] = (
+    (
+        ("moving", ("step", "movers_m"), ".3f m"),
+        ("static objects", ("step", "static_objects_m"), ".4f m"),
+        ("background", ("step", "background_m"), ".4f m"),
+        ("found", ("step", "found"), ".1%"),
+        ("falsely moving", ("step", "falsely_moving"), ".3%"),
+        ("seconds", ("seconds_per_pair",), ".3f"),
+    ),
+    (
+        ("window: coverage", ("window", "coverage"), ".3f"),
+        ("lost", ("window", "lost"), ".1%"),
+        ("ghosts", ("window", "ghost_rate"), ".2%"),
+        ("IoU of moving", ("segmentation", "moving_iou"), ".3f"),
+        ("panoptic quality", ("segmentation", "panoptic_quality"), ".3f"),
+    ),
+    (
+        ("challenge: dynamic", ("challenge", "three_way", "foreground_dynamic_m"), ".4f m"),
+        ("static objects", ("challenge", "three_way", "foreground_static_m"), ".4f m"),
+        ("background", ("challenge", "three_way", "background_static_m"), ".4f m"),
+        ("three-way", ("challenge", "three_way", "mean_m"), ".4f m"),
+    ),
+)
+
+
+def _flow_table(measured: Mapping[str, Any]) -> str:
+    """Return the scores of steps, of the window, and of the challenges."""
+    methods: Mapping[str, Any] = measured["methods"]
+    frames, some = measured["frames"], next(iter(methods.values()))
+    hops = [
+        (f"{n} hops", ("window", "movers_m_by_hops", n), ".3f m")
+        for n in some["window"].get("movers_m_by_hops", ())
+    ]
+    buckets = [
+        (f"{name.lower().replace('_', ' ')} {kind}", ("challenge", "bucketed", name, key), form)
+        for name in (some["challenge"] or {"bucketed": ()})["bucketed"]
+        for kind, key, form in (("static", "static_m", ".4f m"), ("dynamic", "dynamic", ".3f"))
+    ]
+    lines = [
+        f"{measured['data']}, key {measured['key']}, frames {frames[0]}-{frames[-1]}, "
+        f"{measured['num_pairs']} pairs"
+    ]
+    for columns in (*_FLOW_TABLES, hops, buckets):
+        numbers = [look_up(row, *path) for _, path, _ in columns for row in methods.values()]
+        if any(number is not None for number in numbers):
+            lines += [table(methods, columns), ""]
+    return "\n".join(lines)
+
+
+def _answer_depth(options: argparse.Namespace) -> Iterator[Answer]:
+    variants = {"as configured": config_of(options)}
+    for name, *changes in options.variant:
+        variants[name] = resolve(options.config, [*options.overrides, *changes])
+    from densify.bench.depth import bench_depth
+    from densify.readers import open_sequence
+
+    if options.out is not None:
+        check_new_file(options.out, options.overwrite, ".json")
+    sequence, keys = open_sequence(recording_of(options)), options.keys or [120]
+    with progress_on_stderr() as progress:
+        measured = bench_depth(
+            sequence,
+            keys,
+            options.window,
+            variants,
+            options.cameras,
+            options.scanner,
+            options.method,
+            progress,
+        )
+    configs = {name: as_mapping(config) for name, config in variants.items()}
+    files = _written(options, {**measured, "config": configs})
+    yield Answer(_depth_table(measured), measured, files)
+
+
+def _depth_table(measured: Mapping[str, Any]) -> str:
+    """Return a table for each truth: coverage and outliers of each product by variant."""
+    from densify.readers.timeline import format_frames
+
+    variants: Mapping[str, Any] = measured["variants"]
+    lines = []
+    for source in dict.fromkeys(source for row in variants.values() for source in row["scores"]):
+        columns: list[Column] = []
+        for product in ("measured", "filled"):
+            columns.append((product, ("density", product), ".1%"))
+            for part in ("all", "moving"):
+                path = ("scores", source, product, part)
+                columns.append((f"coverage, {part}", (*path, "coverage"), ".3f"))
+                columns.append((f"outliers, {part}", (*path, "outliers"), ".3%"))
+        columns.append(("s/key", ("seconds",), ".2f"))
+        keys = format_frames(measured["keys"])
+        lines.append(f"{measured['data']}, keys {keys}, against {source}")
+        lines.append(table(variants, columns) + "\n")
+    return "\n".join(lines)
+
+
+def _answer_paper(options: argparse.Namespace) -> Iterator[Answer]:
+    from densify.bench import paper as bench
+
+    if options.out is not None:
+        check_new_file(options.out, options.overwrite, ".json")
+    methods = bench.DEFAULT_METHODS if options.methods is None else options.methods
+    measured: dict[str, dict[str, Any]] = {}
+    for name, pairs in _paper_sets(options).items():
+        with progress_on_stderr() as progress:
+            measured[name] = bench.bench_paper(
+                pairs, methods, options.models, options.points, options.curves, progress
+            )
+        text = _paper_table(name, measured[name], bench.PUBLISHED.get(name))
+        yield Answer(text + "\n", {"sets": [{"set": name, **measured[name]}]})
+    numbers = {"sets": measured, "published": bench.PUBLISHED}
+    yield Answer(files=_written(options, numbers))
+
+
+def _paper_sets(options: argparse.Namespace) -> dict[str, Iterable[PaperPair]]:
+    from densify.bench import paper_pairs
+
+    sets: dict[str, Iterable[PaperPair]] = {}
+    if options.flyingthings is not None:
+        sets["flyingthings"] = paper_pairs.pairs_of_files(options.flyingthings, options.pairs)
+    if options.kitti is not None:
+        sets["kitti"] = paper_pairs.pairs_of_kitti(options.kitti, options.pairs)
+    for name, reader in (("argoverse", "argoverse2"), ("nuscenes", "nuscenes")):
+        if places := getattr(options, name):
+            specs = [f"{reader}:{place}" for place in places]
+            sets[name] = paper_pairs.pairs_of_boxes(specs, options.pairs)
+    chosen: dict[str, list[tuple[str, int]]] = {}
+    for text in options.data or (() if sets else _UNSEEN):
+        spec, keys = _recording_keys(text)
+        kind = "streets" if paper_pairs.has_truth(spec) else "against this package's engine"
+        chosen.setdefault(kind, []).extend((spec, key) for key in keys)
+    for kind, places in chosen.items():
+        sets[kind] = map(paper_pairs.pair_of_recording, *zip(*places, strict=True))
+    return sets
+
+
+def _recording_keys(text: str) -> tuple[str, list[int]]:
+    """Read ``SPEC@K,K,…``."""
+    spec, _, keys = text.rpartition("@")
+    if not spec or not all(key.isdecimal() for key in keys.split(",")):
+        raise InputError(f"--data {text}: expected a recording and frames, as street@60,80")
+    return spec, [int(key) for key in keys.split(",")]
+
+
+def _paper_table(name: str, measured: Mapping[str, Any], published: Any) -> str:
+    """Return a set's rows, the published one last, then the curves."""
+    columns: tuple[Column, ...] = (
+        ("epe", ("epe_m",), ".3f m"),
+        ("within 5", ("within_5",), ".1%"),
+        ("within 10", ("within_10",), ".1%"),
+        ("angle", ("angle_rad",), ".3f"),
+        ("moving", ("moving_m",), ".3f m"),
+        ("static", ("static_m",), ".4f m"),
+        ("seconds", ("seconds",), ".2f"),
+    )
+    rows = dict(measured["methods"])
+    if published is not None:
+        rows["paper, as published"] = published
+    pairs = f"{measured['num_pairs']} pair{'s' if measured['num_pairs'] != 1 else ''}"
+    parts = [f"{name}: {pairs}, {measured['num_points']} points drawn", table(rows, columns)]
+    for kind, what in (("neighbors", "neighbours k"), ("points", "points drawn")):
+        if kind in measured:
+            parts += [f"{name}: paper over {what}", table(measured[kind], columns)]
+    return "\n".join(parts)
+
+
+def _answer_readme(options: argparse.Namespace) -> Iterator[Answer]:
+    from densify.bench.readme import tables
+
+    with progress_on_stderr() as progress:
+        for line in tables(options.tables, options.kitti, options.pandaset, progress):
+            yield Answer(line, {"lines": [line]})

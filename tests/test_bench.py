@@ -1,0 +1,209 @@
+# SPDX-License-Identifier: MIT
+"""The benches of depth and flow: counts against independent ones, flow where the truth is known,
+and the commands."""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from densify.bench import readme
+from densify.bench.depth import bench_depth
+from densify.bench.flow import DEFAULT_METHODS, METHODS, bench_flow, open_window
+from densify.bench.scoring import Scorer
+from densify.cli import main
+from densify.config import resolve
+from densify.config.errors import InputError
+from densify.geometry.types import FlowField
+from densify.readers import open_sequence
+from densify.scores.segmentation import LEAST_POINTS
+from tests.command import exit_code, refused
+from tests.scenes import Arc, Scanner, Scene, TinySequence, World, by_flow, car, street
+from tests.small_street import KEY, one_car
+
+CONFIG = resolve({"register": {"source": "dataset"}, "flow": {"look_around_s": 0.0}})
+RESULTS = Path(__file__).parents[1] / "docs" / "results.md"
+
+
+class TwoScanners(TinySequence):
+    """Every second column of each sweep is another scanner's, which measures ``off_m`` too far."""
+
+    off_m = 0.0
+
+    def __getitem__(self, frame):
+        sweep = super().__getitem__(frame)
+        azimuth_deg = np.rad2deg(np.arctan2(sweep.points[:, 1], sweep.points[:, 0]))
+        other = (np.floor(azimuth_deg) % 4 == 0).astype(np.uint8)
+        away = sweep.points / np.linalg.norm(sweep.points, axis=1, keepdims=True)
+        return replace(sweep, lidar=other, points=sweep.points + self.off_m * away * other[:, None])
+
+
+def test_depth_counts_are_those_of_an_image_of_truth():
+    sequence = one_car()
+    bare = resolve({"register": {"source": "dataset"}}, ["project.visibility=false"])
+    found = bench_depth(sequence, [KEY], 2, {"usual": CONFIG, "bare": bare})["variants"]
+    made = by_flow(sequence, KEY, 2, config=CONFIG)
+    camera = sequence.cameras["front"]
+    true_m = sequence.truth.depth_m("front", KEY)
+    # Straight ahead of a level scanner the top ring is a curve of constant elevation.
+    v, u = np.indices(true_m.shape)
+    right, down = (u - camera.K[0, 2]) / camera.K[0, 0], (v - camera.K[1, 2]) / camera.K[1, 1]
+    forward = true_m + 0.2
+    rise = -(down * true_m + 0.1) / np.hypot(right * true_m, forward)
+    points = sequence[KEY].points
+    top = np.quantile(points[:, 2] / np.linalg.norm(points[:, :2], axis=1), 0.999)
+    known = (true_m > 0) & (rise <= top)
+    for product, depth_m in (
+        ("measured", made.depth["front"].depth_m),
+        ("filled", made.depth["front"].filled_m),
+    ):
+        score = found["usual"]["scores"]["truth"][product]["all"]
+        assert score["num_pixels"] == pytest.approx(known.sum(), rel=0.02)
+        both = known & (depth_m > 0)
+        assert score["coverage"] == pytest.approx(both.sum() / known.sum(), abs=0.01)
+        disparity_px, true_px = (0.54 * 150 / d[both] for d in (depth_m, true_m))
+        off_px = np.abs(disparity_px - true_px)
+        wrong = (off_px > 3) & (off_px > 0.05 * true_px)
+        assert score["outliers"] == pytest.approx(wrong.mean(), abs=0.002)
+        assert found["usual"]["density"][product] == np.mean(depth_m > 0)
+    assert found["bare"]["density"]["measured"] != found["usual"]["density"]["measured"]
+
+
+@pytest.mark.parametrize(("off_m", "wrong"), [(0.0, (0, 0.02)), (2.5, (0.7, 1))])
+def test_the_scanner_held_out_is_the_truth_and_not_in_the_maps(off_m, wrong):
+    sequence = TwoScanners(one_car().scene, range(7))
+    sequence.off_m = off_m
+    found = bench_depth(sequence, [KEY], 2, {"usual": CONFIG}, scanner=1)["variants"]["usual"]
+    score = found["scores"]["scanner"]["filled"]["all"]
+    assert score["num_pixels"] > 500 and score["coverage"] > 0.5
+    assert wrong[0] <= score["outliers"] <= wrong[1]
+    assert found["scores"]["truth"]["measured"]["all"]["outliers"] < 0.02
+
+
+def tiny(**options) -> TinySequence:
+    movers = (car(6, 1.8, 9, 1), car(25, 1.8, 8, 2, yaw=np.pi))
+    scene = Scene(World((*street(40.0), *movers)), Arc(0, -1.5, 0, 5.0), Scanner(32, 450))
+    return TinySequence(scene, range(8), **options)
+
+
+@pytest.fixture(scope="module")
+def measured() -> dict:
+    return bench_flow(tiny(), 4, 2, CONFIG, ("rigid", "paper", "ours"))
+
+
+def test_methods_of_flow_do_what_they_are_for(measured):
+    rows = measured["methods"]
+    assert tuple(rows) == ("ours", "paper", "rigid")  # in the table's order
+    assert measured["frames"] == [2, 3, 4, 5, 6] and measured["num_pairs"] == 4
+    json.dumps(measured, allow_nan=False)
+    step, hops = rows["rigid"]["step"], rows["rigid"]["window"]["movers_m_by_hops"]
+    assert step["movers_m"] == pytest.approx(0.85, abs=0.05)  # 9 and 8 m/s for 0.1 s
+    assert step["found"] == step["falsely_moving"] == 0 and step["found_movers_m"] is None
+    assert hops["2"] == pytest.approx(2 * hops["1"], rel=0.02)
+    ours = rows["ours"]
+    assert ours["step"]["movers_m"] < 0.5 * step["movers_m"]
+    assert ours["step"]["background_m"] == 0 < ours["seconds_per_pair"]
+    assert ours["window"]["coverage"] > rows["rigid"]["window"]["coverage"]
+    assert rows["paper"]["step"]["movers_m"] < step["movers_m"]
+    assert rows["paper"]["step"]["background_m"] > 0  # every point moves
+    for n, error_m in ours["window"]["found_movers_m_by_hops"].items():
+        assert error_m <= ours["window"]["movers_m_by_hops"][n] + 1e-9
+
+
+def test_without_truth_seconds_and_ghosts_are_left():
+    found = bench_flow(tiny(with_truth=False), 4, 1, CONFIG, ("ours",))["methods"]["ours"]
+    assert set(found["step"]) == {"called_moving"} and found["seconds_per_pair"] > 0
+    assert found["window"]["ghost_rate"] is not None and "coverage" not in found["window"]
+    assert found["challenge"] is found["segmentation"] is None
+
+
+def test_objects_are_the_methods_own_or_what_moves_together():
+    """Two cars: told apart by the true labels, and by the space between them; one object if a
+    method calls them so."""
+    sequence = tiny()
+    window = open_window(sequence, 4, 1, CONFIG)
+    scorer = Scorer.of(sequence, window, (3, 5))
+    still = {f: FlowField.zero(len(window.stretch[f].sweep)) for f in (3, 5)}
+    truths = {f: scorer.truths[f].segment for f in (3, 5)}
+    assert {len(np.unique(t[t >= 0])) for t in truths.values()} == {2}
+    loose = {f: replace(still[f], moving=t >= 0) for f, t in truths.items()}
+    told = {f: replace(loose[f], instance=(t + 7).astype(np.int32)) for f, t in truths.items()}
+    as_one = {f: replace(loose[f], instance=np.zeros(len(t), np.int32)) for f, t in truths.items()}
+    seen = [t[window.above[f] & (t >= 0)] for f, t in truths.items()]
+    large = sum(int((np.bincount(t) >= LEAST_POINTS).sum()) for t in seen)
+    assert large > 0
+    for steps in (loose, told):
+        scores = scorer.segmentation_scores(steps)
+        assert scores["moving_iou"] == scores["panoptic_quality"] == 1
+        assert (scores["num_found"], scores["num_missed"], scores["num_false"]) == (large, 0, 0)
+    assert scorer.segmentation_scores(as_one)["panoptic_quality"] < 0.95
+    assert scorer.segmentation_scores(still)["moving_iou"] == 0
+
+
+@pytest.mark.parametrize(
+    ("measure", "words"),
+    [
+        (lambda: bench_flow(tiny(), 4, 1, CONFIG, ("ours", "magic")), "--methods: got magic"),
+        (lambda: bench_flow(tiny(), 4, 1, CONFIG, ()), "--methods: got none"),
+        (lambda: bench_flow(tiny(), 4, 0, CONFIG), "no pair to score"),
+        (lambda: bench_flow(tiny(), 99, 1, CONFIG), "--key 99: no such frame"),
+        (lambda: bench_depth(one_car(), [KEY], 2, {"": CONFIG}, scanner=3), "--scanner 3: .* 3"),
+        (lambda: bench_depth(one_car(), [KEY], 2, {"": CONFIG}, method="best"), "--method best"),
+    ],
+)
+def test_bad_input_is_named(measure, words):
+    with pytest.raises(InputError, match=words):
+        measure()
+
+
+def test_the_commands_print_tables_and_write_numbers(border_drive, tmp_path, capsys):
+    given = [border_drive, "--window", "1", "--key", "40", "--set", "register.source=dataset"]
+    given += ["--set", "accumulate.far_m=0"]
+    out = tmp_path / "new" / "flow.json"
+    command = ["bench", "flow", *given, "--methods", "rigid,ours", "--out", out]
+    assert exit_code(*command) == 0
+    printed = capsys.readouterr().out
+    assert printed.splitlines()[-1] == str(out) and printed.count("\nours ") == 2
+    assert set(json.loads(out.read_text())["runs"][0]["methods"]) == {"rigid", "ours"}
+    assert "--overwrite" in refused(capsys, 2, *command)
+    out = tmp_path / "depth.json"
+    variant = ["--variant", "bare", "project.visibility=false", "--out", out]
+    assert exit_code("bench", "depth", *given, *variant) == 0
+    assert "keys 40, against key held out" in capsys.readouterr().out
+    assert list(json.loads(out.read_text())["variants"]) == ["as configured", "bare"]
+    assert "paper-adam" in METHODS and "paper-adam" not in DEFAULT_METHODS
+    assert "did you mean flow?" in refused(capsys, 2, "bench", "readme", "flows")
+
+
+def test_scenes_of_the_readme_open_and_its_tables_are_in_the_results():
+    text = RESULTS.read_text("utf-8")
+    for name, table in readme.TABLES.items():
+        assert f"densify bench readme {name}" in text
+        for scene in table.scenes:
+            sequence = open_sequence(scene.data)
+            assert set(scene.keys) <= set(sequence.frames) and scene.camera in sequence.cameras
+
+
+def test_rows_of_the_readme(capsys, monkeypatch):
+    scene = readme.Scene("street:static?seed=5&sensor=vlp16", (30,), window=1)
+    chosen = {
+        name: readme.TABLES[name]._replace(scenes=(scene,)) for name in ("flow", "registration")
+    }
+    monkeypatch.setattr(readme, "TABLES", chosen)
+    assert main(["bench", "readme"]) == 0
+    flow, _, registration = capsys.readouterr().out.partition(chosen["registration"].about)
+    titles, rule, row = (line for line in flow.splitlines() if line.startswith("|"))
+    assert rule.count("---") == titles.count("|") - 1
+    cells = [cell.strip() for cell in row.strip("|").split("|")]
+    # Nothing moves on this street, and nothing is said to.
+    assert cells[:5] == [str(scene), "– %", "– (–)", "– (–)", "0.0000 %"]
+    assert re.fullmatch(r"0\.\d\d %", cells[5])
+    millimetres, degrees = map(float, re.findall(r"([\d.]+) mm \| ([\d.]+)°", registration)[0])
+    assert millimetres < 50 and degrees < 0.2
+    real = readme.TABLES["flow"]._replace(real=True)
+    assert readme._scenes(real, Path("k"), Path("p"))[-1].scanner == 1
