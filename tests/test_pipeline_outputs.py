@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import json
-from dataclasses import fields
 
 import cv2
 import numpy as np
@@ -71,11 +70,6 @@ def test_the_images_of_map_and_movers_together_are_the_whole(kept, apart):
     assert both.sum() >= 5 and (still > whole + 0.5)[both].mean() > 0.95
 
 
-def test_a_mover_has_the_colour_of_its_pixels(apart):
-    rgb = np.concatenate([mover.cloud.rgb for mover in apart.movers.values()])
-    assert np.isin(rgb, [0, 128]).all() and (rgb == 128).mean() > 0.2
-
-
 def test_dropped_movers_are_nowhere(apart):
     dropped = with_movers("drop")
     assert not dropped.movers and same_points(dropped.cloud, apart.cloud)
@@ -83,12 +77,6 @@ def test_dropped_movers_are_nowhere(apart):
         a, b = (getattr(r.depth["front"], name) for r in (dropped, apart))
         assert a.tobytes() == b.tobytes(), name
     assert dropped.metrics == apart.metrics and dropped.metrics["num_moving"] == 0
-
-
-def test_without_flow_nothing_moves_and_nothing_is_left_out():
-    result = run(one_car(), KEY, 1, "icp", config=POSES_GIVEN | {"output": {"movers": "separate"}})
-    assert result.movers == {}
-    assert same_points(result.cloud, run(one_car(), KEY, 1, "icp", config=POSES_GIVEN).cloud)
 
 
 def test_everything_asked_for_is_written(apart, tmp_path):
@@ -111,13 +99,6 @@ def test_everything_asked_for_is_written(apart, tmp_path):
     assert np.array_equal(image[..., 0] == 1, known)
 
 
-def test_files_that_are_no_longer_asked_for_go(apart, kept, tmp_path):
-    write_result(apart, {}, tmp_path, config=NPZ, data="tiny")
-    write_result(kept, {}, tmp_path, config=NPZ, data="tiny", overwrite=True)
-    left = {path.name for path in (tmp_path / "000003").iterdir()}
-    assert not left & {"movers", "flow", "optical_flow"} and "cloud.laz" in left
-
-
 # --- speed, and parts of a cloud ------------------------------------------------------------------
 
 
@@ -128,13 +109,6 @@ def test_a_movers_velocity_is_its_own(kept):
     assert on_car.sum() > 1000
     median = np.median(cloud.velocity_m_s[on_car], axis=0)
     np.testing.assert_allclose(median, [CAR.path.speed_m_s, 0, 0], atol=0.3)
-
-
-def test_parts_of_a_cloud_keep_their_rows(kept):
-    keep = np.arange(len(kept.cloud)) % 3 == 1
-    part = kept.cloud.select(keep)
-    for field in fields(Cloud):
-        assert np.array_equal(getattr(part, field.name), getattr(kept.cloud, field.name)[keep])
 
 
 # --- the key held out -----------------------------------------------------------------------------

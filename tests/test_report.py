@@ -22,10 +22,7 @@ from densify.outputs.png import encode_png
 from densify.outputs.report import key_page
 from densify.outputs.report.key_files import KeyFiles
 from densify.outputs.report.page_data import (
-    in_space_order,
-    packed_camera,
     packed_cloud,
-    smallest,
     thinned,
 )
 from densify.outputs.report.page_file import Blobs, page_file
@@ -74,17 +71,6 @@ class TestPacking:
         entry = blobs.add(array)
         assert unpacked(blobs, entry).tobytes() == array.tobytes()
 
-    def test_the_smaller_way_is_taken(self) -> None:
-        ramp, noise = np.arange(4000, dtype=np.uint16), np.random.default_rng(0)
-        blobs = Blobs()
-        assert blobs.add(ramp)["delta"] and blobs.num_bytes < 200
-        assert not blobs.add(noise.integers(0, 2, 4000, np.uint16))["delta"]
-
-    def test_as_few_bits_as_numbers_need(self) -> None:
-        assert [smallest(np.array([n])).dtype for n in (255, 256, 65536)] == [*KINDS.values()]
-        with pytest.raises(ValueError, match="32 bits"):
-            smallest(np.array([1 << 32]))
-
 
 def test_thinning_keeps_moving_and_distant_points() -> None:
     rng = np.random.default_rng(1)
@@ -97,14 +83,6 @@ def test_thinning_keeps_moving_and_distant_points() -> None:
     left = np.linalg.norm(points[rows], axis=1) > 40
     all_far = np.linalg.norm(points, axis=1) > 40
     assert left.mean() > 1.5 * all_far.mean()
-
-
-def test_space_order_keeps_neighbours_together() -> None:
-    levels = np.random.default_rng(0).integers(0, 65536, (5000, 3)).astype(np.uint16)
-    order = in_space_order(levels)
-    assert np.array_equal(np.sort(order), np.arange(5000))
-    steps = np.abs(np.diff(levels[order].astype(int), axis=0)).sum(axis=1)
-    assert np.median(steps) < 0.15 * np.median(np.abs(np.diff(levels.astype(int), axis=0)).sum(1))
 
 
 def cloud_of(num_points: int, moving) -> StoredCloud:
@@ -237,17 +215,6 @@ class TestPage:
         said = "".join(f" --set {knob}" for knob in knobs)
         assert data["command"].endswith(f"--methods none,icp,flow{said}")
 
-    def test_a_run_of_before_has_what_is_there(self, run: Path, tmp_path: Path) -> None:
-        for name in ("run.yaml", "metrics.json"):
-            (tmp_path / name).write_bytes((run / name).read_bytes())
-        for kind in ("depth", "depth_filled"):
-            (tmp_path / kind).mkdir()
-            (tmp_path / kind / "front.png").write_bytes((run / kind / "front.png").read_bytes())
-        (page,) = write_report(tmp_path)
-        data = data_of(page.read_bytes())
-        assert data["cloud"] is None and data["missing"] == ["cloud.laz: not there, no view in 3-D"]
-        assert "confidence" not in data["cameras"]["front"]
-
     def test_a_record_that_says_nothing_is_told_of(self, run: Path, tmp_path: Path) -> None:
         folder = shutil.copytree(run, tmp_path / "run")
         (folder / "run.yaml").write_text("text")
@@ -303,12 +270,6 @@ class TestErrors:
             write_report(tmp_path)
         assert not (tmp_path / "report.html").exists()
 
-    def test_a_page_is_kept(self, run: Path, capsys) -> None:
-        before = (run / "report.html").stat().st_mtime_ns
-        assert "already there and kept; give --overwrite" in refused(capsys, 2, "report", run)
-        assert (run / "report.html").stat().st_mtime_ns == before
-        write_report(run, overwrite=True)
-
     def test_a_map_of_another_size_is_left_out(self, tmp_path: Path) -> None:
         folder = write_run(tmp_path, report=False)
         (folder / "confidence" / "front.png").write_bytes(encode_png(np.zeros((3, 3), np.uint8)))
@@ -320,16 +281,3 @@ class TestErrors:
         assert any(t.startswith("age/front.png: not a complete image") for t in told)
         assert any("metrics.json" in t for t in told) and len(told) == 3
         assert str(tmp_path) not in " ".join(told)
-
-
-def test_a_hundred_thousand_sources_pack() -> None:
-    """More than damaged files could name with 16 bits."""
-    rng = np.random.default_rng(0)
-    shape = (200, 400)
-    maps = {"depth": np.full(shape, 9, np.uint16)}
-    maps |= {k: rng.integers(0, 65536, shape, np.uint16) for k in ("sweep", "age")}
-    blobs = Blobs()
-    entry = packed_camera(blobs, maps, None, {}, 1)
-    sources = np.array(entry["sources"])[unpacked(blobs, entry["source"])]
-    assert np.array_equal(sources[..., 0], maps["sweep"])
-    assert np.array_equal(sources[..., 1], maps["age"])

@@ -15,7 +15,6 @@ import yaml
 
 from densify.dataset.report import write_report
 from densify.outputs import export_run
-from densify.outputs.depth_png import read_stored
 from densify.readers.decoded_files import decode_image
 from tests.browser import Opened, chromium
 from tests.report_runs import results, write_compared, write_run
@@ -76,17 +75,7 @@ def test_its_numbers_are_those_of_the_run(opened: Opened, run: Path) -> None:
     assert all(stage["name"] in opened.text("#costs") for stage in stages)
 
 
-def test_its_maps_are_those_of_the_files(opened: Opened, run: Path) -> None:
-    for kind, place, bits in (
-        ("filled", "depth_filled", np.uint16),
-        ("confidence", "confidence", np.uint8),
-        ("truth", "scene/truth", np.uint16),
-    ):
-        stored = read_stored(run / place / "front.png", bits, kind)
-        assert opened.value(f"[...imagePane.maps.{kind}]") == stored.ravel().tolist(), kind
-
-
-@pytest.mark.parametrize(("confidence", "age_ms"), [(0.5, None), (0.0, 100), (0.35, 150)])
+@pytest.mark.parametrize(("confidence", "age_ms"), [(0.5, None), (0.35, 150)])
 def test_sliders_keep_what_export_keeps(
     confidence: float, age_ms: int | None, opened: Opened, run: Path, tmp_path: Path
 ) -> None:
@@ -163,8 +152,7 @@ def test_the_cloud_is_drawn_and_its_controls_change_it(opened: Opened) -> None:
     everything = drawn(opened)
     last = opened.picture("#space")
     for control, value in (
-        *(("colouring", n) for n in "12345"),
-        *(("morph", 0), ("morph", 1), ("sweeps-shown", "one"), ("sweep", 0), ("sweep", 4)),
+        *(("colouring", "1"), ("morph", 0), ("sweeps-shown", "one"), ("sweep", 0)),
         *(("sweeps-shown", "all"), ("point-size", 3)),
     ):
         opened.set(control, value)
@@ -192,36 +180,6 @@ def test_the_trail_collapses(opened: Opened) -> None:
     assert lengths[0] > 1.4 * lengths[1] > 0
 
 
-def test_the_keyboard_moves_the_view(opened: Opened) -> None:
-    opened.page.locator("#space").focus()
-    seen = {opened.picture("#space")}
-    for key in ("ArrowLeft", "ArrowUp", "+", "w"):
-        opened.page.keyboard.press(key)
-        opened.page.wait_for_timeout(400)
-        seen.add(opened.picture("#space"))
-    assert len(seen) == 5
-
-
-def test_a_slow_gpu_is_given_one_frame_at_a_time(opened: Opened) -> None:
-    """Else frames pile up where it draws them, for minutes."""
-    opened.value(
-        """(() => {
-          const painter = cloudPane.painter, draw = painter.draw;
-          window.drawn = 0; window.busy = true;
-          painter.draw = (...all) => { window.drawn += 1; draw.apply(painter, all); };
-          painter.isBusy = () => window.busy;
-        })()"""
-    )
-    opened.settle()
-    for _ in range(5):
-        opened.value("cloudPane.orbit(0.1, 0)")
-        opened.settle()
-    assert opened.value("drawn") == 0
-    opened.value("busy = false")
-    opened.page.wait_for_timeout(1000)
-    assert 1 <= opened.value("drawn") <= 3  # and the last with all points
-
-
 def test_every_control_has_a_name_and_is_reached_by_tab(opened: Opened) -> None:
     unnamed = opened.value(
         """[...document.querySelectorAll("input, select, button, [tabindex], summary, [role=img]")]
@@ -244,28 +202,6 @@ def test_every_control_has_a_name_and_is_reached_by_tab(opened: Opened) -> None:
         "colouring",
     } <= reached
     assert {"morph", "morph-play", "sweep", "space", "turn", "copy"} <= reached
-
-
-def test_dark_and_light_can_be_read(opened: Opened) -> None:
-    def contrast() -> float:
-        rgb = opened.value(
-            """["color", "backgroundColor"].map((k) =>
-            getComputedStyle(document.body)[k].match(/[0-9.]+/g).slice(0, 3).map(Number))"""
-        )
-        share = np.array(rgb) / 255
-        linear = np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)
-        bright, dark = sorted((linear @ [0.2126, 0.7152, 0.0722]).tolist(), reverse=True)
-        return (bright + 0.05) / (dark + 0.05)
-
-    first = contrast()
-    opened.value("document.getElementById('theme').click()")
-    assert min(first, contrast()) > 7
-
-
-def test_a_narrow_screen_does_not_scroll_sideways(browser: Any, run: Path) -> None:
-    page = Opened(browser, run / "report.html", width=380)
-    assert page.value("document.documentElement.scrollWidth") <= 380
-    page.page.close()
 
 
 def test_a_comparison(browser: Any, tmp_path: Path) -> None:

@@ -12,8 +12,7 @@ from collections.abc import Collection, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-LEFT_AFTER_S = 600.0
-"""No file takes as long to write."""
+LEFT_AFTER_S = 600.0  # no file takes as long to write
 
 
 def write_file(path: Path, data: bytes) -> None:
@@ -32,23 +31,25 @@ def file_aside(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def staged_folder(folder: Path, owned: Collection[str]) -> Iterator[Path]:
-    """Yield a folder to write into, which becomes ``folder`` when the block ends well.
+    """Yield a folder to write into, which becomes ``folder`` when the block ends well. On any
+    exception ``folder`` and the folders above it are as they were before.
 
-    owned: names of entries that belong to the writer. Where ``folder`` exists, these are replaced
-        or vanish, and every other entry is kept. Where it is a link, the link stays.
-
-    On any exception ``folder`` and the folders above it are as they were before.
+    owned: entries of the writer, replaced or removed where ``folder`` exists. Others are kept.
     """
     folder = Path(os.path.realpath(folder))
     missing = [place for place in folder.parents if not place.exists()]
     folder.parent.mkdir(parents=True, exist_ok=True)
+
+    def skip(place: str, names: list[str]) -> Collection[str]:
+        return owned if Path(place) == folder else ()
+
     try:
         with _hidden_folder(folder) as hidden:
             staging = hidden / "new"
             staging.mkdir()
             yield staging
             if folder.exists():
-                _copy_others(folder, staging, owned)
+                shutil.copytree(folder, staging, symlinks=True, ignore=skip, dirs_exist_ok=True)
                 os.rename(folder, hidden / "old")
             try:
                 os.rename(staging, folder)
@@ -68,13 +69,10 @@ def clear_leftovers(root: Path, age_s: float = LEFT_AFTER_S) -> None:
 
     age_s: only what is older, because other processes may be writing there; 0 where none does.
     """
-    for place, folders, _ in os.walk(root):
-        for name in [n for n in folders if n.startswith(".") and n.endswith(".tmp")]:
-            folders.remove(name)
-            hidden = Path(place, name)
-            with suppress(OSError):  # finished meanwhile
-                if time.time() - hidden.stat().st_mtime >= age_s:
-                    shutil.rmtree(hidden)
+    with suppress(OSError):  # others may finish theirs meanwhile
+        for hidden in [place for place in root.rglob(".*.tmp") if place.is_dir()]:
+            if time.time() - hidden.stat().st_mtime >= age_s:
+                shutil.rmtree(hidden)
 
 
 @contextmanager
@@ -83,10 +81,3 @@ def _hidden_folder(path: Path) -> Iterator[Path]:
         ".tmp", f".{path.name[:100]}.", path.parent, ignore_cleanup_errors=True
     ) as place:
         yield Path(place)
-
-
-def _copy_others(folder: Path, staging: Path, owned: Collection[str]) -> None:
-    def ignore(place: str, names: list[str]) -> set[str]:
-        return {*owned} & {*names} if Path(place) == folder else set()
-
-    shutil.copytree(folder, staging, symlinks=True, ignore=ignore, dirs_exist_ok=True)

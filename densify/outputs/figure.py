@@ -18,7 +18,6 @@ from densify.outputs.plots import DPI, write_plot
 from densify.outputs.png import Picture
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
     from matplotlib.cm import ScalarMappable
     from matplotlib.figure import Figure
 
@@ -82,14 +81,16 @@ def draw_figure(
         wins. Near is red, far is blue, logarithmic from 3 to 80 m.
     notes: title -> what stands behind the title and the fraction of pixels with a depth.
     """
-    for title, depth_m in panels.items():
-        if depth_m.shape != image.shape[:2]:
-            raise ValueError(f"panel {title}: expected {image.shape[:2]}, got {depth_m.shape}")
-    figure, scale = _panels(image, len(panels)), _depth_scale()
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import LogNorm
+
+    scale = ScalarMappable(LogNorm(_NEAR_M, _FAR_M, clip=True), "turbo_r")
+    figure = _panels(image, len(panels))
     for axes, (title, depth_m) in zip(figure.axes, panels.items(), strict=True):
         density = np.count_nonzero(depth_m) / depth_m.size
         text = f"{title}: {density:.1%} of pixels{(notes or {}).get(title, '')}"
-        _set_title(axes, text, figure.bbox.width)
+        size = min(_FONT_PT, figure.bbox.width / (_LETTER_PX * len(text)))
+        axes.set_title(text, loc="left", x=0.01, fontsize=size)
         axes.imshow(_overlay(image, depth_m, scale), interpolation="nearest", aspect="auto")
     height = figure.bbox.height
     bar = figure.add_axes((0.05, 0.6 * _SCALE_PX / height, 0.9, 0.25 * _SCALE_PX / height))
@@ -137,18 +138,6 @@ def _panels(image: Picture, number: int) -> Figure:
         bottom = height - (i + 1) * (panel + _TITLE_PX)
         figure.add_axes((0, bottom / height, 1, panel / height)).set_axis_off()
     return figure
-
-
-def _set_title(axes: Axes, text: str, width_px: float) -> None:
-    size = min(_FONT_PT, width_px / (_LETTER_PX * len(text)))
-    axes.set_title(text, loc="left", x=0.01, fontsize=size)
-
-
-def _depth_scale() -> ScalarMappable:
-    from matplotlib.cm import ScalarMappable
-    from matplotlib.colors import LogNorm
-
-    return ScalarMappable(LogNorm(_NEAR_M, _FAR_M, clip=True), "turbo_r")
 
 
 def _overlay(image: Picture, depth_m: Float32, scale: ScalarMappable) -> Picture:

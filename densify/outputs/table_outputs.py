@@ -47,7 +47,7 @@ from __future__ import annotations
 
 import platform
 from collections.abc import Sequence
-from dataclasses import asdict, fields
+from dataclasses import asdict
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -56,7 +56,7 @@ import numpy as np
 import yaml
 
 from densify import __version__
-from densify.geometry.types import Camera, CameraView, ObjectTrack, Result
+from densify.geometry.types import CameraView, ObjectTrack, Result
 from densify.outputs.atomic import write_file
 from densify.outputs.context import Context
 from densify.outputs.depth_png import write_depth_png
@@ -67,16 +67,8 @@ from densify.outputs.png import encode_jpeg, encode_png
 SCHEMA_VERSION = 1
 """Version of each JSON file; grows when a field changes its meaning or goes."""
 _PACKAGES = (
-    "numpy",
-    "scipy",
-    "torch",
-    "embreex",
-    "kiss-icp",
-    "small-gicp",
-    "opencv-python-headless",
-    "laspy",
-    "lazrs",
-    "PyYAML",
+    *("numpy", "scipy", "torch", "embreex", "kiss-icp", "small-gicp", "opencv-python-headless"),
+    *("laspy", "lazrs", "PyYAML"),
 )
 
 
@@ -105,19 +97,18 @@ def write_tracks(result: Result, context: Context, folder: Path) -> None:
 
 def tracks_table(key: int, tracks: Sequence[ObjectTrack]) -> dict[str, Any]:
     """Return the content of movers.json."""
-    objects = []
-    for track in tracks:
-        poses = [
-            {
-                "frame": frame,
-                "stamp_ns": track.stamp_ns[i],
-                "num_points": track.num_points[i],
-                "T_key_object": track.T_key_object[i],
-                "velocity_m_s": track.velocity_m_s[i],
-            }
-            for i, frame in enumerate(track.frames)
-        ]
-        objects.append({"instance": track.instance, "size_m": track.size_m, "poses": poses})
+    names = ("stamp_ns", "num_points", "T_key_object", "velocity_m_s")
+    objects = [
+        {
+            "instance": track.instance,
+            "size_m": track.size_m,
+            "poses": [
+                {"frame": frame, **{name: getattr(track, name)[i] for name in names}}
+                for i, frame in enumerate(track.frames)
+            ],
+        }
+        for track in tracks
+    ]
     return {"schema_version": SCHEMA_VERSION, "key": key, "objects": objects}
 
 
@@ -220,5 +211,4 @@ def _sweeps(result: Result) -> list[dict[str, Any]]:
 
 
 def _view(view: CameraView) -> dict[str, Any]:
-    camera = {f.name: getattr(view.camera, f.name) for f in fields(Camera)}
-    return {**camera, "T_cam_key": view.T_cam_key, "late_s": view.late_s, "number": view.number}
+    return {**vars(view.camera), **{n: v for n, v in vars(view).items() if n != "camera"}}

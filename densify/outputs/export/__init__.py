@@ -16,7 +16,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +26,6 @@ import yaml
 from densify import __version__
 from densify.config.errors import InputError
 from densify.config.plugins.exports import EXPORTS
-from densify.outputs.atomic import write_file
 from densify.outputs.export.finished_run import FinishedRun, Kept, finished_runs
 from densify.outputs.plain import plain
 from densify.outputs.store import writing
@@ -34,9 +33,8 @@ from densify.outputs.store import writing
 _RECORD = "export.yaml"
 
 WriteExport = Callable[[FinishedRun, Path], None]
-"""Writes the files of a form into a folder that appears when all are there. The same run gives the
-same bytes. Raises InputError where the run lacks what the form needs. A form of drives takes a
-list of runs, ascending by key."""
+"""Writes the files of a form into a folder that appears when all are there. Raises InputError where
+the run lacks what the form needs. A form of drives takes a list of runs, ascending by key."""
 
 
 @dataclass(frozen=True)
@@ -71,12 +69,10 @@ def export_run(
     min_confidence: 0 to 1. Pixels and points with less are left out.
     max_age_ms: greatest time between the exposure, or the key, and the sweep that measured the
         pixel or point; None for any. A filled pixel has the age of the nearest measured pixel.
-    cameras: only these; all if None.
-    overwrite: replace an earlier export.
+    cameras: only these; all if None. overwrite: replace an earlier export.
 
-    Raises InputError for a folder that is no run, thresholds out of range, files that are missing,
-    damaged or inconsistent, a form that cannot hold the run, and an ``out`` that holds an export
-    already or is a run.
+    Raises InputError for thresholds out of range, files that are missing, damaged or inconsistent,
+    a form that cannot hold the run, and an ``out`` that holds an export or a run.
     """
     if not 0 <= min_confidence <= 1:
         raise InputError(f"--min-confidence {min_confidence}: expected a number from 0 to 1")
@@ -92,25 +88,12 @@ def export_run(
     owned = (*form.owned, _RECORD)
     with writing(folder, owned, folder, overwrite) as staging:
         write(runs if form.of_drive else runs[0], staging)
-        if strays := sorted({entry.name for entry in staging.iterdir()} - {*form.owned}):
-            raise InputError(
-                f"--to {to}: wrote {', '.join(strays)}, expected nothing but "
-                f"{', '.join(form.owned) or 'what OWNED names'}; mend {form.module}"
-            )
-        density = runs[0].density if len(runs) == 1 else {}
-        num_points = _total([run.num_points for run in runs])
-        record = {
-            "run": str(run),
-            "to": to,
-            "min_confidence": float(min_confidence),
-            "max_age_ms": None if max_age_ms is None else float(max_age_ms),
-            **facts(Export([], density, num_points)),
-            "version": __version__,
-        }
-        text = yaml.safe_dump(plain(record), sort_keys=False, allow_unicode=True)
-        write_file(staging / _RECORD, text.encode())
+        export = Export([], runs[0].density if len(runs) == 1 else {}, _total(runs))
+        asked = {"run": str(run), "to": to, "min_confidence": float(min_confidence)}
+        record = {**asked, "max_age_ms": max_age_ms, **facts(export), "version": __version__}
+        (staging / _RECORD).write_text(yaml.safe_dump(plain(record), sort_keys=False), "utf-8")
         files = sorted(path.relative_to(staging) for path in staging.rglob("*") if path.is_file())
-    return Export([folder / path for path in files], density, num_points)
+    return replace(export, paths=[folder / path for path in files])
 
 
 def facts(export: Export) -> dict[str, Any]:
@@ -126,6 +109,6 @@ def facts(export: Export) -> dict[str, Any]:
     return known
 
 
-def _total(counts: Sequence[Kept | None]) -> Kept | None:
-    known = [count for count in counts if count is not None]
+def _total(runs: Sequence[FinishedRun]) -> Kept | None:
+    known = [run.num_points for run in runs if run.num_points is not None]
     return Kept(sum(k.before for k in known), sum(k.after for k in known)) if known else None

@@ -1,9 +1,6 @@
 # SPDX-License-Identifier: MIT
-"""Maps as floating-point arrays: .npy and OpenEXR.
-
-A form has ``depth`` and ``depth_filled`` in metres, 0 none, and ``confidence``, 0 to 1, with a file
-``CAMERA.npy`` or ``CAMERA.exr`` each.
-"""
+"""Maps as floating-point arrays, .npy and OpenEXR: ``depth`` and ``depth_filled`` in metres, 0
+none, and ``confidence``, 0 to 1, with a file for each camera."""
 
 from __future__ import annotations
 

@@ -35,10 +35,10 @@ class Kept(NamedTuple):
 
 
 class FinishedRun:
-    """One key's folder. Files are read when they are asked for; each may raise InputError.
+    """One key's folder. Its files are read when they are asked for; each may raise InputError.
 
-    density: camera -> ``measured``, ``filled`` of the maps that were read. num_points: of the
-    clouds that were read, None before the first.
+    key: its frame. data: the recording. density: camera -> ``measured``, ``filled`` of the maps
+    that were read. num_points: of the clouds that were read, None before the first.
     """
 
     def __init__(
@@ -50,31 +50,22 @@ class FinishedRun:
     ) -> None:
         """Arguments as `densify.outputs.export.export_run`. Raises InputError if the folder holds
         no run."""
-        if not (folder / "run.yaml").is_file():
+        path = folder / "run.yaml"
+        if not path.is_file():
             raise InputError(
                 f"{folder}: no run.yaml in it; expected the folder of a finished run and key, such "
                 f"as densify-out/000120"
             )
-        self.folder = folder
+        record, _ = read_yaml(path)
+        if not isinstance(record, dict) or not isinstance(record.get("key"), int):
+            raise InputError(f"{path}: names no key; densify the key again")
+        self.folder, self.data = folder, str(record.get("data"))
+        self.key: int = record["key"]
         self._min_confidence = stored_confidence(min_confidence)
         self._max_age = None if max_age_ms is None else stored_age(max_age_ms / 1000)
         self._chosen = cameras
         self.density: dict[str, dict[str, Kept]] = {}
         self.num_points: Kept | None = None
-
-    @cached_property
-    def record(self) -> Mapping[str, Any]:
-        """Content of run.yaml."""
-        path = self.folder / "run.yaml"
-        record, _ = read_yaml(path)
-        if not isinstance(record, dict) or not isinstance(record.get("key"), int):
-            raise InputError(f"{path}: names no key; densify the key again")
-        return record
-
-    @property
-    def key(self) -> int:
-        """Frame of the key."""
-        return int(self.record["key"])
 
     @cached_property
     def cameras(self) -> list[str]:
@@ -84,13 +75,10 @@ class FinishedRun:
         names = sorted(path.with_suffix("").as_posix() for path in paths)
         if not names:
             raise InputError(f"{self.folder}: no depth maps in it; run densify with a camera first")
-        if self._chosen is None:
-            return names
-        there = {name.partition("/")[0] for name in names}
-        for name in self._chosen:
-            if name not in there:
-                raise InputError(f"--camera {name}: expected one of {', '.join(sorted(there))}")
-        return [name for name in names if name.partition("/")[0] in self._chosen]
+        there = sorted({name.partition("/")[0] for name in names})
+        if unknown := {*(self._chosen or ())} - {*there}:
+            raise InputError(f"--camera {min(unknown)}: expected one of {', '.join(there)}")
+        return [n for n in names if n.partition("/")[0] in (self._chosen or there)]
 
     @cached_property
     def scene(self) -> SceneFile:
@@ -177,10 +165,7 @@ class FinishedRun:
         cloud = read_cloud(path)
         own = cloud.gps_time[cloud.frame == self.key]
         if not len(own):
-            raise InputError(
-                f"{path}: has no point of the key sweep {self.key} to tell ages from; leave "
-                f"--max-age-ms out"
-            )
+            raise InputError(f"{path}: no point of the key sweep {self.key}; omit --max-age-ms")
         return float(own[0])
 
 
@@ -195,4 +180,4 @@ def finished_runs(
     if (folder / "run.yaml").is_file() or not places:
         places = [folder]
     runs = [FinishedRun(place, min_confidence, max_age_ms, cameras) for place in places]
-    return sorted(runs, key=lambda run: run.key) if len(runs) > 1 else runs
+    return sorted(runs, key=lambda run: run.key)

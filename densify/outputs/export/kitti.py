@@ -24,11 +24,10 @@ def write_kitti(runs: Sequence[FinishedRun], folder: Path) -> None:
     ``CAMERA/data/0000000120.png`` and ``intrinsics/CAMERA/0000000120.txt``, K row by row.
 
     KIND is groundtruth (measured), groundtruth_filled, confidence, and velodyne_raw, the key sweep
-    alone, where the run has it. SPLIT and DRIVE are the benchmark's own; any other recording is in
-    train.
+    alone, where the run has it. Recordings that the benchmark lacks are in train.
     """
     for run in runs:
-        name = str(run.record.get("data")).rstrip("/").rpartition("/")[2]
+        name = run.data.rstrip("/").rpartition("/")[2]
         if not name:
             raise InputError(f"{run.folder}/run.yaml: data: expected the recording's name")
         drive = folder / split_of(name) / drive_folder(name)

@@ -71,21 +71,15 @@ def _of_shot(m: Any, shot: Shot) -> Iterator[tuple[str, Any]]:
     if shot.jpeg is not None:
         yield "image", m.CompressedImage(**about, data=shot.jpeg, format="jpeg")
     camera = shot.view.camera
+    size = {"width": camera.width_px, "height": camera.height_px}
     if (lens := _lens(camera)) is not None:
-        about_camera = {
-            "width": camera.width_px,
-            "height": camera.height_px,
-            "distortion_model": lens[0],
-            "D": lens[1],
-            "K": camera.K.ravel().tolist(),
-            "R": np.eye(3).ravel().tolist(),
-            "P": np.hstack([camera.K, np.zeros((3, 1))]).ravel().tolist(),
-        }
-        yield "calibration", m.CameraCalibration(**about, **about_camera)
+        matrices = {"K": camera.K, "R": np.eye(3), "P": np.hstack([camera.K, np.zeros((3, 1))])}
+        flat = {name: matrix.ravel().tolist() for name, matrix in matrices.items()}
+        named = {"distortion_model": lens[0], "D": lens[1]}
+        yield "calibration", m.CameraCalibration(**about, **size, **named, **flat)
     for kind, depth_m in (("depth", shot.depth_m), ("depth_filled", shot.filled_m)):
-        height, width = depth_m.shape
-        size = {"width": width, "height": height, "step": 4 * width}
-        yield kind, m.RawImage(**about, **size, encoding="32FC1", data=depth_m.tobytes())
+        image = {"encoding": "32FC1", "step": 4 * camera.width_px, "data": depth_m.tobytes()}
+        yield kind, m.RawImage(**about, **size, **image)
 
 
 def _lens(camera: Camera) -> tuple[str, list[float]] | None:
@@ -101,9 +95,8 @@ def _lens(camera: Camera) -> tuple[str, list[float]] | None:
 
 
 def _cloud(m: Any, stamp_ns: int, points: Any, rgb: Any, beside: dict[str, NDArray[Any]]) -> Any:
-    """beside: more columns, of float32, int32 or uint8."""
-    columns = dict(zip("xyz", points.T.astype(np.float32), strict=True))
-    columns |= dict(zip(("red", "green", "blue"), colours(rgb).T, strict=True))
+    values = [*points.T.astype(np.float32), *colours(rgb).T]
+    columns = dict(zip(("x", "y", "z", "red", "green", "blue"), values, strict=True))
     rows = table(columns | {"alpha": np.full(len(points), 255, np.uint8), **beside})
     types = m.PackedElementFieldNumericType
     kinds = {"f4": types.Float32, "i4": types.Int32, "u1": types.Uint8}
@@ -111,57 +104,43 @@ def _cloud(m: Any, stamp_ns: int, points: Any, rgb: Any, beside: dict[str, NDArr
         m.PackedElementField(name=name, offset=offset, type=kinds[kind.str[1:]])
         for name, (kind, offset, *_) in (rows.dtype.fields or {}).items()
     ]
-    return m.PointCloud(
-        timestamp=_stamp(m, stamp_ns),
-        frame_id="key",
-        pose=_pose(m, np.eye(4)),
-        point_stride=rows.dtype.itemsize,
-        fields=fields,
-        data=rows.tobytes(),
-    )
+    about = {"timestamp": _stamp(m, stamp_ns), "frame_id": "key", "pose": _pose(m, np.eye(4))}
+    layout = {"point_stride": rows.dtype.itemsize, "fields": fields}
+    return m.PointCloud(**about, **layout, data=rows.tobytes())
 
 
 def _boxes(m: Any, stamp_ns: int, tracks: Sequence[ObjectTrack], frame: int) -> Any:
     """Return the boxes of that sweep, in place of all before."""
     stamp, entities = _stamp(m, stamp_ns), []
-    for track in tracks:
-        if frame in track.frames:
-            i = track.frames.index(frame)
-            x, y, z = track.size_m.tolist()
-            pose, size = _pose(m, track.T_key_object[i]), m.Vector3(x=x, y=y, z=z)
-            cube = m.CubePrimitive(pose=pose, size=size, color=m.Color(**_BOX))
-            speed = f"{np.linalg.norm(track.velocity_m_s[i]):.2f} m/s"
-            entity = m.SceneEntity(
-                timestamp=stamp,
-                frame_id="key",
-                id=f"object {track.instance}",
-                cubes=[cube],
-                metadata=[m.KeyValuePair(key="speed", value=speed)],
-            )
-            entities.append(entity)
+    for track, i in [(t, t.frames.index(frame)) for t in tracks if frame in t.frames]:
+        pose, size = _pose(m, track.T_key_object[i]), _vector(m, track.size_m)
+        cube = m.CubePrimitive(pose=pose, size=size, color=m.Color(**_BOX))
+        speed = f"{np.linalg.norm(track.velocity_m_s[i]):.2f} m/s"
+        about = {"id": f"object {track.instance}", "frame_id": "key", "timestamp": stamp}
+        metadata = [m.KeyValuePair(key="speed", value=speed)]
+        entities.append(m.SceneEntity(**about, cubes=[cube], metadata=metadata))
     everything = m.SceneEntityDeletion(timestamp=stamp, type=m.SceneEntityDeletionType.All)
     return m.SceneUpdate(deletions=[everything], entities=entities)
 
 
-def _transform(m: Any, stamp_ns: int, parent: str, child: str, T_parent_child: Float) -> Any:
-    x, y, z = T_parent_child[:3, 3].tolist()
-    return m.FrameTransform(
-        timestamp=_stamp(m, stamp_ns),
-        parent_frame_id=parent,
-        child_frame_id=child,
-        translation=m.Vector3(x=x, y=y, z=z),
-        rotation=_quaternion(m, T_parent_child),
-    )
+def _transform(m: Any, stamp_ns: int, parent: str, child: str, T: Float) -> Any:
+    """T: (4,4) from child to parent."""
+    frames = {"parent_frame_id": parent, "child_frame_id": child}
+    placed = {"translation": _vector(m, T[:3, 3]), "rotation": _quaternion(m, T)}
+    return m.FrameTransform(timestamp=_stamp(m, stamp_ns), **frames, **placed)
 
 
 def _pose(m: Any, T: Float) -> Any:
-    x, y, z = T[:3, 3].tolist()
-    return m.Pose(position=m.Vector3(x=x, y=y, z=z), orientation=_quaternion(m, T))
+    return m.Pose(position=_vector(m, T[:3, 3]), orientation=_quaternion(m, T))
 
 
 def _quaternion(m: Any, T: Float) -> Any:
     x, y, z, w = Rotation.from_matrix(T[:3, :3]).as_quat().tolist()
     return m.Quaternion(x=x, y=y, z=z, w=w)
+
+
+def _vector(m: Any, xyz: Float) -> Any:
+    return m.Vector3(**dict(zip("xyz", xyz.tolist(), strict=True)))
 
 
 def _stamp(m: Any, stamp_ns: int) -> Any:

@@ -13,7 +13,7 @@ Two time lines, ``time`` (the recording's clock as UNIX time) and ``frame``, hav
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -26,8 +26,8 @@ from densify.outputs.export.finished_run import FinishedRun
 from densify.outputs.export.timeline import Shot, Timeline, colours, timelines
 from densify.readers.extras import needed
 
+_KEY = "world/key"
 _POINT, _SWEEP_POINT = -1.5, -2.5  # radii in points of the screen, as rerun writes them
-_FRUSTUM_M = 3.0
 
 
 def write_rrd(runs: Sequence[FinishedRun], folder: Path) -> None:
@@ -35,8 +35,7 @@ def write_rrd(runs: Sequence[FinishedRun], folder: Path) -> None:
     InputError without rerun, and as `timelines`."""
     with _stream(runs) as stream:
         stream.save(folder / "recording.rrd", default_blueprint=_blueprint(runs))
-        for timeline in timelines(runs):
-            _log(stream, timeline)
+        _log(stream, runs)
 
 
 def show(runs: Sequence[FinishedRun], port: int = 9876) -> None:
@@ -44,15 +43,14 @@ def show(runs: Sequence[FinishedRun], port: int = 9876) -> None:
     Raises InputError as `write_rrd`."""
     with _stream(runs) as stream:
         stream.spawn(port=port, default_blueprint=_blueprint(runs))
-        for timeline in timelines(runs):
-            _log(stream, timeline)
+        _log(stream, runs)
         stream.flush()
 
 
 def _stream(runs: Sequence[FinishedRun]) -> Any:
     rr = needed("rerun", "rerun", "Recordings for rerun")
-    keys = "-".join(str(key) for key in sorted({runs[0].key, runs[-1].key}))
-    stream = rr.RecordingStream("densify", recording_id=f"key-{keys}", send_properties=False)
+    name = f"key-{runs[0].key}-{runs[-1].key}"
+    stream = rr.RecordingStream("densify", recording_id=name, send_properties=False)
     stream.set_log_time_enabled(False)
     stream.set_log_tick_enabled(False)
     return stream
@@ -62,71 +60,69 @@ def _blueprint(runs: Sequence[FinishedRun]) -> Any:
     """Return the scene beside the images."""
     import rerun.blueprint as b
 
-    hidden = {"world/key/cloud/trails": b.EntityBehavior(visible=False)}
+    hidden = {f"{_KEY}/cloud/trails": b.EntityBehavior(visible=False)}
     scene = b.Spatial3DView(origin="world", name="scene", overrides=hidden)
     names = dict.fromkeys(name for run in runs for name in run.views)
-    views = [b.Spatial2DView(origin=f"world/key/{name}", name=name) for name in names]
+    views = [b.Spatial2DView(origin=f"{_KEY}/{name}", name=name) for name in names]
     layout = b.Horizontal(scene, b.Vertical(*views), column_shares=[3, 2]) if views else scene
     return b.Blueprint(layout, collapse_panels=True)
 
 
-def _log(stream: Any, timeline: Timeline) -> None:
+def _log(stream: Any, runs: Sequence[FinishedRun]) -> None:
     import rerun as rr
 
-    def log(name: str, shown: Any) -> None:
-        stream.log(f"world/key/{name}".rstrip("/"), shown, strict=True)
-
-    def at(stamp_ns: int, frame: int) -> None:
+    stream.log("world", rr.ViewCoordinates.FLU, static=True, strict=True)
+    entities = (entity for timeline in timelines(runs) for entity in _entities(timeline))
+    for frame, stamp_ns, name, shown in entities:
         stream.set_time("time", timestamp=np.datetime64(stamp_ns, "ns"))
         stream.set_time("frame", sequence=frame)
-
-    def points(xyz: Any, rgb: Any, radius: float) -> Any:
-        return rr.Points3D(xyz, colors=colours(rgb), radii=radius)
-
-    cloud, moving, tracks = timeline.cloud, timeline.cloud.moving, timeline.tracks
-    stream.log("world", rr.ViewCoordinates.FLU, static=True, strict=True)
-    at(timeline.sweeps[0].stamp_ns, timeline.sweeps[0].frame)
-    log("", _transform(timeline.T_world_key))
-    log("cloud/static", points(cloud.points[~moving], cloud.rgb[~moving], _POINT))
-    log("cloud/moving", points(cloud.points[moving], cloud.rgb[moving], _POINT))
-    log("cloud/trails", points(cloud.rigid_points[moving], cloud.rgb[moving], _POINT))
-    log("movers/path", rr.LineStrips3D([track.T_key_object[:, :3, 3] for track in tracks]))
-    for sweep in timeline.sweeps:
-        at(sweep.stamp_ns, sweep.frame)
-        log("sweep", points(sweep.points, sweep.rgb, _SWEEP_POINT))
-        log("vehicle", _transform(sweep.T_key_lidar))
-        log("movers/box", _boxes(tracks, sweep.frame))
-    for shot in timeline.shots:
-        at(shot.stamp_ns, timeline.key)
-        for name, shown in _of_shot(shot):
-            log(f"{shot.name}/{name}", shown)
+        stream.log(f"{_KEY}/{name}".rstrip("/"), shown, strict=True)
 
 
-def _of_shot(shot: Shot) -> list[tuple[str, Any]]:
+def _entities(timeline: Timeline) -> Iterator[tuple[int, int, str, Any]]:
+    """Yield frame, stamp, name and content."""
     import rerun as rr
 
-    shown = [("", _transform(poses.inverse(shot.view.T_cam_key)))]
+    def points(xyz: Any, rgb: Any, radius: float = _POINT) -> Any:
+        return rr.Points3D(xyz, colors=colours(rgb), radii=radius)
+
+    cloud, moving = timeline.cloud, timeline.cloud.moving
+    start = timeline.sweeps[0][:2]
+    yield *start, "", _transform(timeline.T_world_key)
+    yield *start, "cloud/static", points(cloud.points[~moving], cloud.rgb[~moving])
+    yield *start, "cloud/moving", points(cloud.points[moving], cloud.rgb[moving])
+    yield *start, "cloud/trails", points(cloud.rigid_points[moving], cloud.rgb[moving])
+    paths = [track.T_key_object[:, :3, 3] for track in timeline.tracks]
+    yield *start, "movers/path", rr.LineStrips3D(paths)
+    for sweep in timeline.sweeps:
+        now = sweep[:2]
+        yield *now, "sweep", points(sweep.points, sweep.rgb, _SWEEP_POINT)
+        yield *now, "vehicle", _transform(sweep.T_key_lidar)
+        yield *now, "movers/box", _boxes(timeline.tracks, sweep.frame)
+    for shot in timeline.shots:
+        for name, shown in _of_shot(shot):
+            yield timeline.key, shot.stamp_ns, f"{shot.name}/{name}", shown
+
+
+def _of_shot(shot: Shot) -> Iterator[tuple[str, Any]]:
+    import rerun as rr
+
+    yield "", _transform(poses.inverse(shot.view.T_cam_key))
     if shot.is_pinhole:
-        camera = shot.view.camera
-        pinhole = rr.Pinhole(
-            image_from_camera=camera.K,
-            resolution=[camera.width_px, camera.height_px],
-            camera_xyz=rr.ViewCoordinates.RDF,
-            image_plane_distance=_FRUSTUM_M,
-        )
-        shown.append(("", pinhole))
+        camera, axes = shot.view.camera, rr.ViewCoordinates.RDF
+        size_px = [camera.width_px, camera.height_px]
+        yield "", rr.Pinhole(image_from_camera=camera.K, resolution=size_px, camera_xyz=axes)
     if shot.jpeg is not None:
-        shown.append(("image", rr.EncodedImage(contents=shot.jpeg, media_type="image/jpeg")))
+        yield "image", rr.EncodedImage(contents=shot.jpeg, media_type="image/jpeg")
     for name, depth_m in (("depth", shot.depth_m), ("depth_filled", shot.filled_m)):
-        shown.append((name, rr.DepthImage(depth_m, meter=1.0, colormap="viridis")))
-    return shown
+        yield name, rr.DepthImage(depth_m, meter=1.0, colormap="viridis")
 
 
 def _boxes(tracks: Sequence[ObjectTrack], frame: int) -> Any:
     import rerun as rr
 
     seen = [(t, t.frames.index(frame)) for t in tracks if frame in t.frames]
-    speeds = [float(np.linalg.norm(t.velocity_m_s[i])) for t, i in seen]
+    speeds = [np.linalg.norm(t.velocity_m_s[i]) for t, i in seen]
     return rr.Boxes3D(
         centers=[t.T_key_object[i, :3, 3] for t, i in seen],
         half_sizes=[t.size_m / 2 for t, _ in seen],

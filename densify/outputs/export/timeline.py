@@ -20,8 +20,7 @@ _UNOBSERVED = np.array([140, 140, 140], np.uint8)
 
 
 class ShownSweep(NamedTuple):
-    """A sweep as it was measured, in the key frame. stamp_ns: its reference time. T_key_lidar:
-    (4,4). points: (N,3) metres. rgb: (N,3) uint8. moving: (N,)."""
+    """A sweep as it was measured, in the key frame, metres. stamp_ns: its reference time."""
 
     frame: int
     stamp_ns: int
@@ -32,8 +31,8 @@ class ShownSweep(NamedTuple):
 
 
 class Shot(NamedTuple):
-    """A map. stamp_ns: of its exposure. jpeg: its image or None. depth_m, filled_m: (H,W), 0 none.
-    is_pinhole: without distortion and with depth along the axis."""
+    """A map. stamp_ns: of its exposure. depth_m, filled_m: (H,W), 0 none. is_pinhole: without
+    distortion, with depth along the axis."""
 
     name: str
     view: CameraView
@@ -66,7 +65,7 @@ def timelines(runs: Sequence[FinishedRun]) -> Iterator[Timeline]:
     for before, run in zip([None, *runs], runs, strict=False):
         if before is not None:
             T_world_key = T_world_key @ _relative_pose(before, run)
-        cloud, stamps_ns = run.cloud(), {}
+        cloud = run.cloud()
         frames, rows = np.unique(cloud.frame, return_index=True)
         stamps_ns = dict(zip(frames.tolist(), cloud.stamp_ns[rows].tolist(), strict=True))
         for track in run.tracks:  # exact, and of sweeps without a point that is left
@@ -91,9 +90,8 @@ def _relative_pose(run: FinishedRun, other: FinishedRun) -> Float:
     if run.key in other.scene.T_key_lidar:
         return poses.inverse(other.scene.T_key_lidar[run.key])
     raise InputError(
-        f"{other.folder}: key {other.key} is in no window of key {run.key}, nor the other way "
-        f"round, and their relative pose is unknown; densify keys nearer to each other, or export "
-        f"them one by one"
+        f"{other.folder}: neither key {other.key} nor {run.key} is in the other's window, and "
+        f"their relative pose is unknown; densify keys nearer to each other"
     )
 
 

@@ -41,7 +41,7 @@ def key_page(files: KeyFiles, folder: str) -> bytes:
     if not cameras and stored is None:
         raise InputError(f"{files.maps}: no depth map and no cloud in it that can be read")
     about, methods = files.about, list(files.methods)
-    sweeps = _sweeps(files, scene, stored)
+    sweeps = _sweeps(scene)
     movers = [_mover(track, about.get("key")) for track in files.tracks()]
     key, data = about.get("key"), str(about.get("data"))
     name = data.rstrip("/").rpartition("/")[2] or data
@@ -103,16 +103,10 @@ def _cloud(
         most = max(_FEWEST_POINTS, int(0.95 * most * room / own.num_bytes))
 
 
-def _sweeps(
-    files: KeyFiles, scene: Mapping[str, Any], stored: StoredCloud | None
-) -> list[dict[str, Any]]:
-    """Return the sweeps of the scene; without a scene the cloud's frames, without their times."""
+def _sweeps(scene: Mapping[str, Any]) -> list[dict[str, Any]]:
     sweeps = scene.get("sweeps")
-    if isinstance(sweeps, list) and all("frame" in mapping(sweep) for sweep in sweeps):
-        return sweeps
-    frames = sorted({*stored.frame.tolist()}) if stored is not None else []
-    far = {*(files.about.get("far_frames") or ())}
-    return [{"frame": f, "since_key_s": None, "far": f in far} for f in frames]
+    is_whole = isinstance(sweeps, list) and all("frame" in mapping(sweep) for sweep in sweeps)
+    return list(sweeps) if is_whole and sweeps else []
 
 
 def _mover(track: ObjectTrack, key: Any) -> dict[str, Any]:

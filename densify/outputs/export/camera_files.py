@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: MIT
-"""Images with cameras and points for structure-from-motion and splatting tools, as a COLMAP model
-in text (https://colmap.github.io/format.html).
+"""Images with cameras and points: COLMAP's text model (https://colmap.github.io/format.html), what
+Gaussian splatting starts from, and nerfstudio's folder (``ns-train depth-nerfacto --data DIR``).
 
-The world is the key frame. The centre of the upper left pixel is (0.5, 0.5), lenses are OpenCV's,
-and poses are world to camera.
+The world is the key frame, the centre of the upper left pixel is (0.5, 0.5), and lenses are
+OpenCV's. COLMAP's poses are world to camera. nerfstudio's are camera to world with OpenGL's axes: x
+right, y up, the camera looks along -z; its depth is in millimetres.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from densify.config.errors import InputError
 from densify.geometry import poses
 from densify.geometry.types import Camera, CameraView, Float
 from densify.outputs.cloud_laz import StoredCloud
+from densify.outputs.export.array_files import metres
 from densify.outputs.export.cloud_files import save_ply
 from densify.outputs.export.finished_run import FinishedRun
 from densify.outputs.map_outputs import map_path
@@ -28,6 +30,8 @@ from densify.outputs.table_outputs import tracks_table
 
 _LENS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 _FISHEYE_LENS = ("k1", "k2", "k3", "k4")
+_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
+_VERTEX = ("x", "y", "z", "red", "green", "blue")
 
 
 class Picture(NamedTuple):
@@ -38,7 +42,7 @@ class Picture(NamedTuple):
     view: CameraView
 
 
-def write_pictures(run: FinishedRun, folder: Path) -> list[Picture]:
+def _write_pictures(run: FinishedRun, folder: Path) -> list[Picture]:
     """Write the images of the run's maps as ``images/CAMERA.jpg``. Raises InputError if there is
     none."""
     pictures = []
@@ -54,7 +58,7 @@ def write_pictures(run: FinishedRun, folder: Path) -> list[Picture]:
     return pictures
 
 
-def intrinsics(camera: Camera) -> dict[str, float]:
+def _intrinsics(camera: Camera) -> dict[str, float]:
     """Return fx, fy, cx, cy in pixels and the lens: k1 k2 p1 p2 and as many of k3 k4 k5 k6 as it
     has, or k1 to k4 of a fisheye.
 
@@ -76,8 +80,8 @@ def intrinsics(camera: Camera) -> dict[str, float]:
 def write_colmap(run: FinishedRun, folder: Path) -> None:
     """Write ``images/`` and ``sparse/0/`` with cameras.txt, images.txt and points3D.txt, the points
     that a camera observed. Raises InputError for lenses that COLMAP has no model of."""
-    sparse = _write_cameras(write_pictures(run, folder), folder)
-    _write_points(sparse / "points3D.txt", observed(run.cloud()))
+    sparse = _write_cameras(_write_pictures(run, folder), folder)
+    _write_points(sparse / "points3D.txt", _observed(run.cloud()))
 
 
 def write_splats(run: FinishedRun, folder: Path) -> None:
@@ -85,12 +89,11 @@ def write_splats(run: FinishedRun, folder: Path) -> None:
     of the static world, also as points3D.ply, and each moving object in its own frame.
 
     ``movers/0003.ply`` has all points of object 3, ``movers/others.ply`` moving points without a
-    track, in the key frame. ``tracks.json`` is the run's movers.json. Points have x y z, normals
-    of 0 and a colour, as the method's own code reads them.
+    track, in the key frame. ``tracks.json`` is the run's movers.json.
     """
-    sparse = _write_cameras(write_pictures(run, folder), folder)
+    sparse = _write_cameras(_write_pictures(run, folder), folder)
     whole = run.cloud()
-    static = observed(whole.select(~whole.moving))
+    static = _observed(whole.select(~whole.moving))
     _write_points(sparse / "points3D.txt", static)
     _save_splats(sparse / "points3D.ply", static.points, static.rgb)
     moving = [whole.select(whole.moving), *run.mover_clouds()]
@@ -112,7 +115,7 @@ def write_splats(run: FinishedRun, folder: Path) -> None:
     write_json(folder / "tracks.json", tracks_table(run.key, run.tracks))
 
 
-def observed(cloud: StoredCloud) -> StoredCloud:
+def _observed(cloud: StoredCloud) -> StoredCloud:
     """Return the points that a camera observed. Others have no colour."""
     return cloud.select(np.any(cloud.rgb > 0, axis=1))
 
@@ -138,7 +141,7 @@ def _write_cameras(pictures: Sequence[Picture], folder: Path) -> Path:
 
 
 def _model(camera: Camera) -> tuple[str, list[float]]:
-    params = list(intrinsics(camera).values())
+    params = list(_intrinsics(camera).values())
     if camera.model == "fisheye":
         return "OPENCV_FISHEYE", params
     if len(params) in (4, 8):
@@ -157,8 +160,60 @@ def _write_points(path: Path, cloud: StoredCloud) -> None:
 
 
 def _save_splats(path: Path, points: Float, rgb: NDArray[np.uint8]) -> None:
-    columns: dict[str, NDArray[Any]] = {
-        axis: points[:, i].astype(np.float32) for i, axis in enumerate("xyz")
-    }
+    """Write points with normals of 0, as the method's own code reads them."""
+    columns: dict[str, NDArray[Any]] = dict(zip("xyz", points.T.astype(np.float32), strict=True))
     columns |= {name: np.zeros(len(points), np.float32) for name in ("nx", "ny", "nz")}
     save_ply(path, columns | {n: rgb[:, i] for i, n in enumerate(("red", "green", "blue"))})
+
+
+def write_nerfstudio(run: FinishedRun, folder: Path) -> None:
+    """Write ``transforms.json``, ``images/``, ``depth/CAMERA.npy`` (measured, float32 millimetres,
+    0 none) and ``cloud.ply``, the points that a camera observed.
+
+    Raises InputError for maps of ranges, lenses other than OpenCV's with k1 k2 k3 p1 p2, and
+    fisheyes together with others.
+    """
+    pictures = _write_pictures(run, folder)
+    fisheyes = {picture.view.camera.model == "fisheye" for picture in pictures}
+    if len(fisheyes) > 1:
+        raise InputError(
+            "--to nerfstudio: it has one camera model for all images, and there are fisheyes and "
+            "others; choose among them with --camera"
+        )
+    for picture in pictures:
+        path = map_path(folder, "depth", picture.name, ".npy")
+        np.save(path, metres(run.maps(picture.name)["depth"]) * np.float32(1000))
+    columns = _observed(run.cloud()).columns()
+    save_ply(folder / "cloud.ply", {name: columns[name] for name in _VERTEX})
+    transforms = {
+        "camera_model": "OPENCV_FISHEYE" if fisheyes.pop() else "OPENCV",
+        "ply_file_path": "cloud.ply",
+        "frames": [_frame(run, picture) for picture in pictures],
+    }
+    write_json(folder / "transforms.json", transforms)
+
+
+def _frame(run: FinishedRun, picture: Picture) -> dict[str, Any]:
+    camera, name = picture.view.camera, picture.name
+    if run.measure(name) != "z":
+        raise InputError(
+            f"{name}: its depth is the range from the lens, and nerfstudio takes camera z; densify "
+            f"it with --set project.depth=z, or leave it out by naming the others with --camera"
+        )
+    lens = _intrinsics(camera)
+    K = {"fl_x": lens.pop("fx"), "fl_y": lens.pop("fy"), "cx": lens.pop("cx"), "cy": lens.pop("cy")}
+    known = _FISHEYE_LENS if camera.model == "fisheye" else _LENS[:5]
+    if unknown := [n for n, value in lens.items() if value and n not in known]:
+        raise InputError(
+            f"{name}: nerfstudio has no lens with {', '.join(unknown)}; leave it out by naming the "
+            f"others with --camera"
+        )
+    return {
+        "file_path": f"images/{picture.file}",
+        "depth_file_path": f"depth/{name}.npy",
+        **K,
+        "w": camera.width_px,
+        "h": camera.height_px,
+        **{n: lens.get(n, 0.0) for n in known},
+        "transform_matrix": poses.inverse(picture.view.T_cam_key) @ _OPENGL,
+    }
