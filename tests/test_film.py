@@ -16,9 +16,6 @@ from densify.outputs.report import film
 from tests.command import refused
 from tests.report_runs import results, write_run
 
-animated = pytest.mark.skipif(
-    not hasattr(cv2, "imwriteanimation"), reason="this opencv writes no animations"
-)
 ORANGE = np.array([0, 159, 230])  # BGR of the first object
 
 
@@ -49,7 +46,6 @@ def test_the_trail_collapses_and_sweeps_fill(run: Path) -> None:
     assert 4 < sum(seconds for _, seconds in pictures) < 12
 
 
-@animated
 @pytest.mark.parametrize(("suffix", "coarse"), [(".gif", 15), (".webp", 6)])  # 256 colours
 def test_every_kind_can_be_played(suffix: str, coarse: float, run: Path, tmp_path: Path) -> None:
     path = tmp_path / "new" / f"film{suffix}"
@@ -73,7 +69,6 @@ def test_what_cannot_be_filmed(run: Path, tmp_path: Path, capsys) -> None:
     assert not (tmp_path / "film.gif").exists()
 
 
-@animated
 def test_a_run_in_which_nothing_moves(tmp_path: Path) -> None:
     cloud = results()["flow"].cloud
     write_cloud(tmp_path / "cloud.laz", cloud.select(~cloud.moving))

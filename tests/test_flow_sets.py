@@ -128,9 +128,8 @@ def labels_of(log: Path, folder: Path, by_number: bool) -> Path:
     return folder
 
 
-@pytest.mark.parametrize("by_number", [False, True])
-def test_labels_score_as_the_truth_they_are_made_of(log, by_number, tmp_path, capsys):
-    labels, out = labels_of(log, tmp_path / "labels", by_number), tmp_path / "scores.json"
+def test_labels_score_as_the_truth_they_are_made_of(log, tmp_path, capsys):
+    labels, out = labels_of(log, tmp_path / "labels", by_number=True), tmp_path / "scores.json"
     command = ["bench", "flow", "--data", str(log), "--key", "2", "--window", "2", *GIVEN]
     command += ["--methods", "ours,rigid"]
     assert main([*command, "--truth", str(labels), "--out", str(out)]) == 0
@@ -150,18 +149,6 @@ def test_labels_score_as_the_truth_they_are_made_of(log, by_number, tmp_path, ca
     assert ours["three_way"]["foreground_static_m"] < 1e-4
 
 
-def test_our_own_flow_as_the_truth_is_nearly_right(log, tmp_path):
-    """Of a window of other sweeps, so not the same; an object is followed or not."""
-    assert flow(log, tmp_path, "--keys", "0:2") == 0
-    settings = resolve({"register": {"source": "dataset"}})
-    scores = bench_flow(open_sequence(log), 2, 2, settings, ("ours", "rigid"), truth=tmp_path)
-    ours, rigid = (
-        scores["methods"][name]["challenge"]["three_way"]["foreground_dynamic_m"]
-        for name in ("ours", "rigid")
-    )
-    assert ours < 0.2 * rigid
-
-
 # --- what is refused ------------------------------------------------------------------------------
 
 
@@ -169,11 +156,8 @@ def test_our_own_flow_as_the_truth_is_nearly_right(log, tmp_path):
     ("more", "words"),
     [
         (["--data", "street"], "either --all or --keys"),
-        (["--data", "street", "--all", "--keys", "1:2"], "either --all or --keys"),
-        (["--data", "street", "--all", "a.npz"], "either --all or --keys"),
         (["--data", "street", "--keys", "900:901"], "no sweep among them"),
         (["a.npz"], "two point files"),
-        (["a.npz", "b.npz", "--all"], "two point files"),
         (["a.npz", "b.npz", "--format", "av2"], "two point files"),
     ],
 )

@@ -28,12 +28,8 @@ _NEAR_M, _FAR_M = 1.0, 200.0
 _SHADING, _MOST_SHADED = 1.6, 0.35
 _BACKGROUND = 5, 7, 10
 _GRAY = 60.0, 190.0
-# Okabe and Ito's colours, which colour-blind people can distinguish.
-_OBJECTS = np.array(
-    [
-        *((230, 159, 0), (86, 180, 233), (0, 158, 115), (240, 228, 66)),
-        *((0, 114, 178), (213, 94, 0), (204, 121, 167), (200, 200, 200)),
-    ],
+_OBJECTS = np.array(  # Okabe and Ito's colours, which colour-blind people can distinguish
+    [[230, 159, 0], [86, 180, 233], [0, 158, 115], [240, 228, 66], [213, 94, 0], [204, 121, 167]],
     np.uint8,
 )
 _WEBP_QUALITY = 60
@@ -59,11 +55,6 @@ def check_film(out: Path, overwrite: bool = False) -> None:
         raise InputError(f"--film {out}: expected a name that ends in {' or '.join(SUFFIXES)}")
     if out.exists() and not overwrite:
         raise InputError(f"--film {out}: already there and kept; give --overwrite or another name")
-    if not hasattr(cv2, "imwriteanimation"):
-        raise InputError(
-            f"--film {out}: needs opencv-python-headless 4.11, got {cv2.__version__}; "
-            f"pip install -U opencv-python-headless"
-        )
 
 
 def write_film(run: Path, out: Path, overwrite: bool = False) -> None:

@@ -6,7 +6,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -65,17 +64,11 @@ def packed_camera(
     }
     entry |= {k: blobs.add(small[k]) for k in ("confidence", "reason", "truth") if k in small}
     if jpeg is not None:
-        entry["image"] = blobs.add_file(_resized(jpeg, every), "image/jpeg")
+        if every > 1:
+            rgb = decode_image(jpeg, "image")[::every, ::every, ::-1]
+            jpeg = encode_jpeg(rgb, _JPEG_QUALITY)
+        entry["image"] = blobs.add_file(jpeg, "image/jpeg")
     return entry
-
-
-def _resized(jpeg: bytes, every: int) -> bytes:
-    if every == 1:
-        return jpeg
-    rgb = decode_image(jpeg, "image")[:, :, ::-1]
-    size_px = -(-rgb.shape[1] // every), -(-rgb.shape[0] // every)
-    small = cv2.resize(np.ascontiguousarray(rgb), size_px, interpolation=cv2.INTER_AREA)
-    return encode_jpeg(small.astype(np.uint8), _JPEG_QUALITY)
 
 
 def _focal_px(view: Mapping[str, Any]) -> float | None:
@@ -158,13 +151,8 @@ def in_space_order(levels: NDArray[np.uint16]) -> Int:
 
 
 def smallest(array: NDArray[Any]) -> NDArray[Any]:
-    """Return whole numbers, 0 or more, in 8, 16 or 32 bits as they need. Raises ValueError beyond
-    32 bits."""
-    largest = int(array.max(initial=0))
-    for kind in (np.uint8, np.uint16, np.uint32):
-        if largest <= np.iinfo(kind).max:
-            return array.astype(kind)
-    raise ValueError(f"numbers up to {largest}, expected 32 bits at most")
+    """Return whole numbers, 0 or more and below 2^32, in 8, 16 or 32 bits as they need."""
+    return array.astype(np.min_scalar_type(int(array.max(initial=0))))
 
 
 def _colours(cloud: StoredCloud) -> NDArray[np.uint8]:
