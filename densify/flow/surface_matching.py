@@ -1,28 +1,32 @@
 # SPDX-License-Identifier: MIT
-"""Rigid motions about the vertical, and what their aligners take for a match with a surface.
+"""Rigid motions about the vertical, and alignment of points with a surface.
 
-Segal, Haehnel, Thrun, "Generalized-ICP", RSS 2009, with yaw as the only rotation. Two aligners find
-such motions: that of an object's points with its accumulated shape (`densify.flow.tracking.align`),
-whose height the ground tells, and that of many groups at once between two clouds, whose points were
-measured at times of their own and whose height is free (`densify.flow.pairs.hypotheses`).
+Segal, Haehnel, Thrun, "Generalized-ICP", RSS 2009, with yaw as the only rotation. A state (4,) is a
+displacement x y z (m) and a yaw (rad) about an object's centre.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from densify.geometry.types import Float
+from densify.geometry.nearest import BoxTree
+from densify.geometry.types import Bool, Float, Int
 
-GATES_M = (0.8, 0.5, 0.3, 0.2, 0.2)  # distances of partners, in turn, twice each
-SURFACE_M = 0.05  # noise of a surface point
+GATES_M = np.repeat([0.8, 0.5, 0.3, 0.2, 0.2], 2)  # greatest distance of a match, step by step
 MAX_WEIGHT = 60.0  # of all matches together: neighbours on a surface do not err independently
-NUM_NEAR = 12  # neighbours that tell a surface
-RIDGE = 0.02  # of their mean variance, where they lie on a line
+NUM_NEAR = 12  # neighbours that span a surface
+MIN_FIT = 5  # matches
+_SURFACE_M = 0.05  # noise of a surface point
+_RIDGE = 0.02  # of the mean variance, for points on a line
+_MAX_MODEL_POINTS = 1500
+_LOOSE = 10.0  # of the covariance: sliding along a surface must not be held up by its own points
 
 
 def apply(state: Float, points: Float, centre: Float) -> Float:
-    """The object's points (N,3) in a state, or one each: x y z displacement (m) and yaw (rad) about
-    ``centre``. state: (4,), (1,4) or (N,4). centre: (3,) or (N,3)."""
+    """Move (N,3) points of an object by a state (4,) or by one state each (N,4).
+
+    centre: (3,) or (N,3).
+    """
     return _turned(points - centre, state[..., 3]) + centre + state[..., :3]
 
 
@@ -32,7 +36,80 @@ def undo(state: Float, points: Float, centre: Float) -> Float:
 
 
 def _turned(arms: Float, yaw: float | Float) -> Float:
-    """(N,3), () or (N,) -> (N,3) about the vertical."""
     c, s = np.cos(yaw), np.sin(yaw)
     x, y, z = arms.T
     return np.stack([c * x - s * y, s * x + c * y, z], axis=1)
+
+
+def surface_information(points: Float, near: Int, loose: float = 1.0) -> Float:
+    """Return (N,3,3) the inverse covariance (1/m²) of the surface around each point.
+
+    points: (M,3). near: (N,k) rows of the neighbours of each point. loose: factor of the covariance.
+    """
+    away = points[near]
+    away -= away.mean(axis=1, keepdims=True)
+    covariance = loose / near.shape[1] * (away.transpose(0, 2, 1) @ away)
+    ridge = _SURFACE_M**2 + _RIDGE / 3 * np.trace(covariance, axis1=1, axis2=2)
+    return np.asarray(np.linalg.inv(covariance + ridge[:, None, None] * np.eye(3)))
+
+
+class Model:
+    """The accumulated points of an object, to which other points are aligned.
+
+    height_weight: weight of height differences relative to horizontal distances.
+    """
+
+    def __init__(self, points: Float, height_weight: float = 1.0) -> None:
+        self.points = np.zeros((0, 3))
+        self._scale = np.array([1.0, 1.0, height_weight])
+        self.add(points)
+
+    def add(self, points: Float) -> None:
+        """Add (N,3) points in the object's frame."""
+        points = np.concatenate([self.points, points])
+        if len(points) > _MAX_MODEL_POINTS:
+            points = points[:: len(points) // _MAX_MODEL_POINTS + 1]
+        self.points, self._flat = points, np.ascontiguousarray(points * self._scale)
+        self._tree = BoxTree(self._flat)
+        _, near = self._tree.nearest_k(self._flat, min(NUM_NEAR, len(points)))
+        self.information = surface_information(self._flat, near, _LOOSE)
+
+    def covers(self, points: Float, within_m: float) -> Bool:
+        """Return (N,) True for the (N,3) points closer to the model than ``within_m``."""
+        distance_m, _ = self._tree.nearest(points * self._scale, within_m)
+        return np.isfinite(distance_m)
+
+    def align(
+        self, points: Float, centre: Float, predicted: Float, prediction_std: Float
+    ) -> Float | None:
+        """Return the state (4,) in which the model fits the points; None for too few matches.
+
+        The height is not aligned: what few beams hit would climb with the beams. Weights are
+        Tukey's.
+
+        points: (N,3), all at one time. centre: (3,). predicted: (4,) where to start.
+        prediction_std: (3,) standard deviation of the predicted x, y (m) and yaw (rad).
+        """
+        scale = np.append(self._scale, 1.0)
+        points, centre, state = points * self._scale, centre * self._scale, predicted * scale
+        start, prior = state.copy(), prediction_std**-2
+        for gate_m in GATES_M:
+            at_model = undo(state, points, centre)
+            distance_m, row = self._tree.nearest(at_model, gate_m)
+            found = np.flatnonzero(row >= 0)
+            if len(found) < MIN_FIT:
+                return None
+            row, arm = row[found], at_model[found] - centre
+            weight = (1 - (distance_m[found] / gate_m) ** 2) ** 2
+            cos, sin = np.cos(state[3]), np.sin(state[3])
+            J = np.zeros((len(found), 3, 3))  # of the model's point by x, y and yaw
+            J[:, 0, 0], J[:, 1, 0] = cos, -sin
+            J[:, 0, 1], J[:, 1, 1] = sin, cos
+            J[:, 0, 2], J[:, 1, 2] = -arm[:, 1], arm[:, 0]
+            weight *= min(1.0, MAX_WEIGHT / len(found))
+            JA = J.transpose(0, 2, 1) @ (self.information[row] * weight[:, None, None])
+            H = (JA @ J).sum(axis=0) + np.diag(prior)
+            off = at_model[found] - self._flat[row]
+            g = (JA @ off[:, :, None]).sum(axis=0)[:, 0] + prior * (start - state)[[0, 1, 3]]
+            state[[0, 1, 3]] += np.linalg.solve(H, g)
+        return np.asarray(state / scale)

@@ -49,7 +49,7 @@ def estimate_motion(scene: Scene, settings: Config, argument: str) -> GroupMotio
         grouped, common_m_s = _grouped(scene, i, candidates, standing[i], velocity_m_s)
         found.append(grouped)
         velocities.append(common_m_s)
-    return motion_of(scene, tuple(found), settings, velocities)
+    return motion_of(scene, tuple(found), velocities)
 
 
 def flows_of(network: Voxels, standing: list[AboveGround], origins: list[Float]) -> list[Float]:

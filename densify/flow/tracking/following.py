@@ -1,91 +1,195 @@
 # SPDX-License-Identifier: MIT
-"""One group of candidates followed from look to look as a rigid object, both ways in time.
+"""Tracking one cluster of candidates as a rigid object from batch to batch, both ways in time.
 
-Each look's candidates are aligned with everything seen of the object so far, from where constant
-speed and turn rate lead it.
+The candidates of each batch are aligned with all points of the object so far, starting from the
+pose that constant speed and turn rate predict.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
-from densify.flow.surface_matching import GATES_M, apply, undo
-from densify.flow.tracking.align import MIN_FIT, Model
+from densify.flow.surface_matching import GATES_M, MIN_FIT, Model, apply, undo
 from densify.flow.tracking.candidates import Batch, Obstacles
-from densify.flow.tracking.sightings import Track
-from densify.free_space.ground import HeightMap
+from densify.flow.tracking.objects import MovingObject, Track
+from densify.free_space.height_map import HeightMap
 from densify.geometry.clock import Clock
-from densify.geometry.types import Bool, Float
+from densify.geometry.nearest import BoxTree
+from densify.geometry.types import Bool, Float, Int
 
+MIN_POINTS = 8  # to start a track
+_MIN_SEED_SHARE = 0.4
+_AROUND_S = 0.5  # from both ends of the recording, any start is equally good
+_NEARER_END, _NEARER_END_S = 0.7, 0.1  # nearer to an end, it is worth 0.7 for each 0.1 s
+_SLIDES_M = 1.5  # longer objects may slide along their own side
+_HOLE_S = 0.25
+_BESIDE_M = 1.0  # from a towing vehicle to what it tows
 _FIT_M = 0.3
-_SHARE_UNSEEN = 0.5  # of the points a look usually shows
-# m, m, rad: of what is foretold by up to so long, and in proportion by longer.
+_SHARE_UNSEEN = 0.5  # of the points that a batch usually has
+# m, m, rad: of a prediction over 0.25 s, and in proportion over longer times.
 _PREDICTION_STD, _PREDICTION_S = np.array([0.3, 0.3, 0.06]), 0.25
-_RECENT_S = 0.4  # the states in so long tell a rate
-# What a track starts with tells it as states do of that sum of squared times, but no turning.
+_RECENT_S = 0.4  # states that tell a rate
+# The given velocity counts as much as states with this sum of squared times; it tells no turning.
 _GIVEN_S2 = np.array([0.02, 0.02, 0.02, 0.0])
-_STEADY = np.array([1.0, 1.0, 1.0, 0.9])  # of what it was then: turns level out
-_MISSES_ALLOWED, _MISSED_S = 1, 0.2  # either: a track ends when both are exceeded
+_STEADY = np.array([1.0, 1.0, 1.0, 0.9])  # turns level out
+_MISSES_ALLOWED, _MISSED_S = 1, 0.2  # a track ends when both are exceeded
 
 
-def follow(
-    members: np.ndarray,
-    start: int,
-    velocity: Float,
-    looks: Sequence[Batch],
-    free: Sequence[Bool],
-    ground: HeightMap,
-    clock: Clock,
-    weight: float,
-) -> Track:
-    """Forwards, then backwards, with everything seen so far as the model. clock: of the looks.
-    weight: of heights."""
-    here = looks[start].obstacles
-    rate = np.append(velocity, 0.0)
-    seen_s = float(here.time_s[members].mean())
-    points = _at_once(here, members, rate, seen_s)
-    track = Track(points.mean(0))
-    track.add(start, looks[start], np.zeros(4), seen_s, members)
-    model = Model(points, weight)
-    recent = clock.num_in(_RECENT_S)
-    for direction in (1, -1):
-        last, n = start, start + direction
-        while 0 <= n < len(looks) and (
-            abs(n - last) <= 1 + _MISSES_ALLOWED or clock.near(n, last, _MISSED_S)
-        ):
-            found = _find(model, track, rate, recent, looks[n], free, ground)
-            if found is not None:
-                last = n
-                state, seen_s, rows, points = found
-                track.add(n, looks[n], state, seen_s, rows)
-                model.add(undo(state, points, track.centre))
-            n += direction
-    return track
+def find_starts(batches: Sequence[Obstacles], clock: Clock) -> list[tuple[int, Int]]:
+    """Return the batch and the rows of each cluster that may start a track, the best first.
+
+    Large clusters make good models, and far from the ends of the recording both sides tell how the
+    object moves. clock: of the batches.
+    """
+    starts = []
+
+    def worth(start: tuple[int, Int]) -> float:
+        n, members = start
+        nearer_s = max(0.0, _AROUND_S - clock.from_end_s(n))
+        return float(len(members) * _NEARER_END ** (nearer_s / _NEARER_END_S))
+
+    for n, c in enumerate(batches):
+        size = np.bincount(c.cluster[c.candidate], minlength=c.num_clusters)
+        seeds = np.bincount(c.cluster[c.candidate & c.seed], minlength=c.num_clusters)
+        good = np.flatnonzero((size >= MIN_POINTS) & (seeds >= _MIN_SEED_SHARE * size))
+        starts += [(n, np.flatnonzero(c.cluster == k)) for k in good]
+    return sorted(starts, key=worth, reverse=True)
 
 
-def _at_once(c: Obstacles, rows: np.ndarray, rate: Float, time_s: float) -> Float:
-    """(N,3) candidates of one look, seen one after the other, where they all were at one time."""
+def velocities_beside(
+    batch: Batch, members: Int, objects: Sequence[MovingObject]
+) -> Iterator[Float]:
+    """Yield the velocities (3,) at a cluster of the objects close to it, such as its towing
+    vehicle: little else tells how fast a long side slides along itself."""
+    points = batch.obstacles.points[members]
+    tree, middle = BoxTree(points), points.mean(0, keepdims=True)
+    for track, shape in objects:
+        at_s = track.seen_at(batch.time_ns)
+        if np.isfinite(tree.nearest(track.place(shape.points, at_s), _BESIDE_M)[0]).any():
+            yield track.velocity_m_s(middle, at_s)[0]
+
+
+def find_ends(track: Track, batches: Sequence[Batch]) -> Iterator[tuple[Int, int]]:
+    """Yield the rows and the batch of a long track's first and last observation.
+
+    Tracking can start there again: more of the object may be in view than a side that slides along
+    itself. Short objects cannot slide, and tracks with a gap in time are not tracked again.
+    """
+    start, *_ = track.observations
+    side = batches[start].obstacles.points[_rows_in(track, batches[start])]
+    seen_s = np.sort([seen.seen_s for seen in track.observations.values()])
+    if np.linalg.norm(np.ptp(side[:, :2], axis=0)) < _SLIDES_M or (np.diff(seen_s) > _HOLE_S).any():
+        return
+    for n in sorted({min(track.observations), max(track.observations)} - {start}):
+        if track.num_points(n) >= MIN_POINTS:
+            yield _rows_in(track, batches[n]), n
+
+
+def _rows_in(track: Track, batch: Batch) -> Int:
+    """Return the rows of a batch that are the track's."""
+    sweeps = zip(batch.sweeps, batch.begins, strict=True)
+    return np.concatenate([track.claimed[j] + begin for j, begin in sweeps if j in track.claimed])
+
+
+@dataclass(frozen=True)
+class Follower:
+    """Tracks clusters through the batches.
+
+    free: per sweep (C,) True for points that no track has claimed. clock: of the batches.
+    """
+
+    batches: Sequence[Batch]
+    free: Sequence[Bool]
+    ground: HeightMap
+    clock: Clock
+
+    def follow(self, members: Int, start: int, velocity: Float, weight: float) -> Track:
+        """Track a cluster forwards, then backwards, with all points so far as the model.
+
+        members: rows of batch ``start``. velocity: (3,) m/s at first. weight: of heights.
+        """
+        here, rate = self.batches[start].obstacles, np.append(velocity, 0.0)
+        seen_s = float(here.time_s[members].mean())
+        points = _at_once(here, members, rate, seen_s)
+        track = Track(points.mean(0))
+        track.add(start, self.batches[start], np.zeros(4), seen_s, members)
+        model = Model(points, weight)
+        for direction in (1, -1):
+            last, n = start, start + direction
+            while 0 <= n < len(self.batches) and (
+                abs(n - last) <= 1 + _MISSES_ALLOWED or self.clock.near(n, last, _MISSED_S)
+            ):
+                found = self._find(model, track, rate, n)
+                if found is not None:
+                    last = n
+                    state, seen_s, rows, points = found
+                    track.add(n, self.batches[n], state, seen_s, rows)
+                    model.add(undo(state, points, track.centre))
+                n += direction
+        return track
+
+    def _find(
+        self, model: Model, track: Track, rate: Float, n: int
+    ) -> tuple[Float, float, Int, Float] | None:
+        """Align the candidates of batch n with the model.
+
+        Returns the state, its time, the rows that fit and where those points were at that time;
+        None where too few fit.
+        """
+        batch, recent = self.batches[n], self.clock.num_in(_RECENT_S)
+        c, centre = batch.obstacles, track.centre
+        about, about_rate, _ = _predict(track, rate, recent, track.seen_at(batch.time_ns))
+        expected = apply(about, model.points, centre)
+        slack_m = GATES_M[0] + batch.half_s * np.abs(about_rate[:3])
+        inside = c.strips.rows_inside(expected.min(0) - slack_m, expected.max(0) + slack_m)
+        inside = inside[batch.gather(self.free)[inside]]
+        rows, enough = inside[c.cluster[inside] >= 0], float(MIN_FIT)
+        if len(rows) < MIN_FIT:  # no sweep saw through it, but it may be there
+            usual = float(np.median([track.num_points(m) for m in track.observations]))
+            rows, enough = inside, max(MIN_FIT, _SHARE_UNSEEN * usual)
+        if len(rows) < enough:
+            return None
+        seen_s = float(c.time_s[rows].mean())
+        predicted, rate, std = _predict(track, rate, recent, seen_s)
+        predicted[2] = track.rise_m(self.ground, predicted)
+        target = _at_once(c, rows, rate, seen_s)
+        state = model.align(target, centre, predicted, std)
+        if state is None:
+            return None
+        state[2] = track.rise_m(self.ground, state)
+        fit = model.covers(undo(state, target, centre), _FIT_M)
+        if fit.sum() < enough:
+            return None
+        return state, seen_s, rows[fit], target[fit]
+
+
+def _at_once(c: Obstacles, rows: Int, rate: Float, time_s: float) -> Float:
+    """Move (N,3) points, measured one after the other, to where they all were at one time."""
     return c.points[rows] + (time_s - c.time_s[rows])[:, None] * rate[:3]
 
 
 def _predict(track: Track, rate: Float, num: int, time_s: float) -> tuple[Float, Float, Float]:
-    """State, its rate, and how far off (3,) the state may be in x y and yaw, by the constant speed
-    and turn rate of the ``num`` states nearest in time. rate: given at the start.
+    """Predict from the constant speed and turn rate of the ``num`` states nearest in time.
 
     The velocity turns as the object does (Schubert, Richter, Wanielik, "Comparison and Evaluation
-    of Advanced Motion Models for Vehicle Tracking", FUSION 2008): a flat front slides along itself
-    as it is foretold to.
+    of Advanced Motion Models for Vehicle Tracking", FUSION 2008).
+
+    rate: (4,) given at the start.
+    Returns the state (4,), its rate (4,), and the standard deviation (3,) of x, y and yaw.
     """
-    nearest_first = sorted(track.sightings.items(), key=lambda s: (abs(s[1].seen_s - time_s), s[0]))
+    nearest_first = sorted(
+        track.observations.items(), key=lambda s: (abs(s[1].seen_s - time_s), s[0])
+    )
     known = dict(nearest_first[:num])
-    states = np.stack([sighting.state for sighting in known.values()])
-    t = np.array([sighting.seen_s for sighting in known.values()])
+    states = np.stack([seen.state for seen in known.values()])
+    t = np.array([seen.seen_s for seen in known.values()])
     ahead_s, middle_s = time_s - t[0], t.mean()
     if len(t) > 1:
         t -= middle_s
-        given_s2 = _GIVEN_S2 * (next(iter(track.sightings)) in known)
+        given_s2 = _GIVEN_S2 * (next(iter(track.observations)) in known)
         rate = (t @ states + given_s2 * rate) / (t @ t + given_s2) * _STEADY
     std = _PREDICTION_STD * max(1.0, abs(ahead_s) / _PREDICTION_S)
     on_the_way = _turned(rate, time_s - 0.5 * ahead_s - middle_s)
@@ -93,47 +197,7 @@ def _predict(track: Track, rate: Float, num: int, time_s: float) -> tuple[Float,
 
 
 def _turned(rate: Float, later_s: float) -> Float:
-    """The rate (4,) of a state so much later, of what keeps its speed and turn rate."""
+    """Return the rate (4,) so much later, at constant speed and turn rate."""
     cos, sin = np.cos(rate[3] * later_s), np.sin(rate[3] * later_s)
     x, y = rate[:2]
     return np.array([cos * x - sin * y, sin * x + cos * y, *rate[2:]])
-
-
-def _find(
-    model: Model,
-    track: Track,
-    rate: Float,
-    num_recent: int,
-    look: Batch,
-    free: Sequence[Bool],
-    ground: HeightMap,
-) -> tuple[Float, float, np.ndarray, Float] | None:
-    """Align one look's candidates with the model.
-
-    Returns the state, when it held, the rows that fit and where those points were at that time;
-    None where too few fit.
-    """
-    c, centre = look.obstacles, track.centre
-    about, about_rate, _ = _predict(track, rate, num_recent, track.seen_at(look.time_ns))
-    expected = apply(about, model.points, centre)
-    slack_m = GATES_M[0] + look.half_s * np.abs(about_rate[:3])
-    low, high = expected.min(0) - slack_m, expected.max(0) + slack_m
-    inside = c.strips.rows_inside(low, high)
-    inside = inside[look.gather(free)[inside]]
-    rows, enough = inside[c.cluster[inside] >= 0], float(MIN_FIT)
-    if len(rows) < MIN_FIT:  # seen by nobody else, it may be there all the same
-        rows, enough = inside, max(MIN_FIT, _SHARE_UNSEEN * track.typical_size())
-    if len(rows) < enough:
-        return None
-    seen_s = float(c.time_s[rows].mean())
-    predicted, rate, std = _predict(track, rate, num_recent, seen_s)
-    predicted[2] = track.rise_m(ground, predicted)
-    target = _at_once(c, rows, rate, seen_s)
-    state = model.align(target, centre, predicted, std)
-    if state is None:
-        return None
-    state[2] = track.rise_m(ground, state)
-    fit = model.covers(undo(state, target, centre), _FIT_M)
-    if fit.sum() < enough:
-        return None
-    return state, seen_s, rows[fit], target[fit]

@@ -1,195 +1,96 @@
 # SPDX-License-Identifier: MIT
-"""The proof that what was followed moves: its smooth motion explains what was measured."""
+"""The test that confirms a track: its smooth motion must explain the measurements.
+
+A static object seen differently from sweep to sweep, such as a fence or a tree's crown, can look as
+if it moved. A moving object differs in three ways: its motion is smooth, it removes the free-space
+violations that the points have if they are static, and it leaves its positions empty.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
 from densify.flow.tracking.candidates import Obstacles
-from densify.flow.tracking.left_places import LeftPlaces, left_places
+from densify.flow.tracking.objects import MovingObject, Track
 from densify.flow.tracking.radial import Radial
-from densify.flow.tracking.shapes import Body
-from densify.flow.tracking.sightings import Track
 from densify.free_space.seen_through import FreeSpace
-from densify.geometry import poses
+from densify.geometry.nearest import BoxTree
+from densify.geometry.types import Float
 
-_ROUGH_M, _ROUGH_PER_GAP, _ROUGH_S = 0.04, 0.2, 0.003  # by gap of rings, by speed
-# Without rings each sweep meets other places of an object: so much more, if those that it left or
-# comes to are mostly bare.
-_ROUGHER = 1.5
-_LEAST_WAY_M, _LEAST_WAY_PER_RESIDUAL, _LEAST_WAY_PER_ROUGH = 0.35, 8.0, 1.5
-_NUM_ASKED = 60
 _LEAST_STATES, _LEAST_S = 3, 0.15
-# Where no sweep meets the points of the one before, three crowns of trees may lie on a line.
-_LEAST_STATES_SCATTERED = 4
-_SHORT_S, _MAX_OF_SHORT = 0.35, 0.03  # three places of a tree's crown may lie on a line,
-_SHORT_OF_FEW_S, _FEW = 0.6, 0.2  # and even more where few looks contradict its obstacles still,
-_MAX_OF_FEW = 0.1  # of which its motion may leave so many, unless it left its places bare
-# But a crown does not leave its places bare, least of all so many.
-_MAX_OF_SHORT_BARE, _MAX_OF_SHORT_MANY_BARE = 0.06, 0.12
-_STRAY = 0.005  # so few of all looks are echoes at an object's rim
-# Of those that obstacles still leaves; of what leaves all its places bare more: limbs swing.
-_MAX_CONTRADICTIONS, _MAX_OF_LIMBS, _FAR_M = 0.3, 0.5, 3.0
-# They are so many, or of few looks this share, and of many at least that one.
-_LEAST_CONTRADICTIONS, _SHARE_OF_FEW, _LEAST_SHARE = 20, 0.08, 0.01
-_LEAST_OF_BARE = 8  # are enough if nothing was ever seen at its places before or after
-_ALONG = np.cos(np.deg2rad(45))
-_AS_FAST, _RAIL_M, _SLENDER, _SHARE_OF_RAIL = 0.1, 2.0, 8.0, 0.3
+_ROUGH_M, _ROUGH_PER_GAP, _ROUGH_S = 0.04, 0.2, 0.003  # residual; by ring gap, by speed
+_LEAST_WAY_M, _LEAST_WAY_PER_RESIDUAL, _LEAST_WAY_PER_ROUGH = 0.35, 8.0, 1.5
+_NUM_ASKED = 60  # points of a batch
+# Violations if the points are static: a number, or a share of few tests, and of many at least one.
+_LEAST_VIOLATIONS, _SHARE_OF_FEW, _LEAST_SHARE = 20, 0.08, 0.01
+# Violations that the motion may leave, as a share of those; limbs swing, so more are allowed where
+# all positions are empty.
+_MAX_LEFT, _MAX_LEFT_OF_LIMBS, _FAR_M = 0.3, 0.5, 3.0
+_FEW, _MAX_LEFT_OF_FEW = 0.2, 0.1  # fewer violations than this share prove less
+_SHORT_S, _MAX_LEFT_OF_SHORT = 0.35, 0.03  # three positions of a tree's crown may lie on a line
+_LEFT_M = 0.6  # from all of the object
+_ROOM_M, _ROOM_S = 2.0, 0.5  # in front of and behind the object, by its speed
+_THERE_M, _THERE_PER_GAP = 0.2, 0.5
+_MOSTLY = 2  # times as often taken as empty
+_LEAST_EMPTY, _MANY_EMPTY = 20, 100  # positions; the latter where all are on one side
+_SELDOM, _HARDLY = 0.03, 0.1  # taken, as a share of empty
 
 
-def left_contradicted(
-    track: Track, obstacles: Sequence[Obstacles], space: FreeSpace, proven: Sequence[Body]
+def violations_left(
+    track: Track,
+    obstacles: Sequence[Obstacles],
+    space: FreeSpace,
+    objects: Sequence[MovingObject],
 ) -> float | None:
-    """Fit the smooth motion of a track; None unless it certainly moves, or how much contradicts
-    that, see `share_contradicted`."""
-    num_states = len(track.sightings)
-    if num_states < _LEAST_STATES:
-        return None
-    if num_states < _LEAST_STATES_SCATTERED and space.sensors.scattered:
+    """Fit the smooth motion of a track and test it.
+
+    objects: other confirmed ones.
+    Returns None unless the track certainly moves, else the share of tests in which another sweep
+    sees through its moved points: of two motions, the one with the lower share is right.
+    """
+    if len(track.observations) < _LEAST_STATES:
         return None
     track.smooth()
-    return share_contradicted(track, obstacles, space, proven)
+    seen_s = track.duration_s()
+    if seen_s < _LEAST_S or not _is_smooth(track, space, seen_s):
+        return None
+    if not _is_as_fast_as_measured(track, obstacles):
+        return None
+    static, moved, num_tests = count_violations(track, obstacles, space)
+    least = max(min(_LEAST_VIOLATIONS, _SHARE_OF_FEW * num_tests), _LEAST_SHARE * num_tests)
+    if static < least or moved > _MAX_LEFT_OF_LIMBS * static:
+        return None
+    left = find_places_left(track, obstacles, space, objects)
+    if left.still_there():
+        return None
+    empty = left.empty(far=track.path.travelled_m() >= _FAR_M)
+    if moved > (_MAX_LEFT_OF_LIMBS if empty else _MAX_LEFT) * static:
+        return None
+    few = static < _FEW * num_tests and not left.mostly_empty()
+    if few and moved > _MAX_LEFT_OF_FEW * static:
+        return None
+    long_s = min(_SHORT_S, float(np.ptp(space.clock.time_s)) / 2)
+    if moved > _MAX_LEFT_OF_SHORT * static and seen_s < long_s:
+        return None
+    return moved / num_tests
 
 
-def share_contradicted(
-    track: Track, obstacles: Sequence[Obstacles], space: FreeSpace, proven: Sequence[Body]
-) -> float | None:
-    """None unless a track's smooth motion certainly is one, or the share of looks that contradict
-    even that motion, 0 at best: of two motions the one with less of them is the truth.
-
-    The motion must be smooth, long enough to be told from noise, and must do away with the
-    contradictions that brought the group here: where the sweeps see through its points at their
-    rigid places, they must not see through them at the moved ones, but for limbs, which swing about
-    it. A few looks through a piece of a side that slides along itself prove nothing. What it has
-    left must be empty. Where radial velocities were measured, it must have them.
-
-    proven: other objects that certainly move.
-    """
-    seen_s = np.ptp([sighting.seen_s for sighting in track.sightings.values()])
-    if seen_s < _LEAST_S:
-        return None
-    over_m = _over_noise_m(track, space, seen_s)
-    if over_m is None or (over_m > 0 and not space.sensors.scattered):
-        return None
-    if not _as_fast_as_measured(track, obstacles):
-        return None
-    still, moved, num_asked = contradictions(track, obstacles, space)
-    least = min(_LEAST_CONTRADICTIONS, _SHARE_OF_FEW * num_asked)
-    least_of_bare = max(min(least, _LEAST_OF_BARE), _LEAST_SHARE * num_asked)
-    if still < least_of_bare or moved > _MAX_OF_LIMBS * still:
-        return None
-    left = left_places(track, obstacles, space, proven)
-    none_taken = seen_s >= _SHORT_S and left.none_taken()
-    if still < max(least, _LEAST_SHARE * num_asked) and not none_taken:
-        return None
-    if left.still_there() or (over_m > 0 and not left.mostly_bare()):
-        return None
-    # What never left its place may be a ring that glides over a bonnet: only contradictions tell.
-    if still < _SHARE_OF_FEW * num_asked and left.unknown():
-        return None
-    bare = left.bare(far=_travelled_m(track) >= _FAR_M)
-    if moved > (_MAX_OF_LIMBS if bare else _MAX_CONTRADICTIONS) * still:
-        return None
-    few, mostly_bare = still < _FEW * num_asked, left.mostly_bare()
-    # Where something is still there, few contradictions of which many are left prove nothing.
-    if few and not (mostly_bare or none_taken) and moved > _MAX_OF_FEW * still:
-        return None
-    short_s = _SHORT_OF_FEW_S if few else _SHORT_S
-    if moved > max(_most_of_short(left) * still, _STRAY * num_asked):
-        # Nor may rings that glide over a parked car, which is still there behind them.
-        glides = still < _SHARE_OF_FEW * num_asked and left.one_still_there()
-        if glides or seen_s < min(short_s, np.ptp(space.clock.time_s) / 2):
-            return None
-    as_few_as_a_rail = still < _SHARE_OF_RAIL * num_asked
-    if as_few_as_a_rail and not mostly_bare and _like_a_rail(track, obstacles, space):
-        return None
-    return moved / num_asked
-
-
-def _over_noise_m(track: Track, space: FreeSpace, seen_s: float) -> float | None:
-    """How much farther off the smooth motion its places lie than noise makes them; None where they
-    lie too far off, or the way is too short, to tell of any motion. seen_s: how long it is."""
-    residual_m = track.path.residual_m
-    travelled = _travelled_m(track)
+def _is_smooth(track: Track, space: FreeSpace, seen_s: float) -> bool:
+    """Return True if the states lie on a smooth path, long enough to be told from noise."""
+    residual_m, travelled_m = track.path.residual_m, track.path.travelled_m()
     gap_m = space.gap_m(track.centre, next(iter(track.claimed)))
-    by_gap_m = _ROUGH_M + _ROUGH_PER_GAP * gap_m
-    rough_m = by_gap_m + _ROUGH_S * travelled / seen_s
-    # Of few places far apart rings, which may be so rough, some lie on a line by chance.
-    least_m = max(_LEAST_WAY_PER_RESIDUAL * residual_m, _LEAST_WAY_PER_ROUGH * rough_m)
-    if travelled < max(_LEAST_WAY_M, least_m) or residual_m > rough_m + _ROUGHER * by_gap_m:
-        return None
-    return max(0.0, residual_m - rough_m)
-
-
-def _travelled_m(track: Track) -> float:
-    begin, end = track.path(track.path.begin_s), track.path(track.path.end_s)
-    return float(np.linalg.norm((end - begin)[:2]))
-
-
-def may_be_a_rail(
-    track: Track, obstacles: Sequence[Obstacles], space: FreeSpace, proven: Sequence[Body]
-) -> bool:
-    """Whether few looks contradict that the track stands, which is shaped like a guard rail, and
-    does not leave nearly all its places bare."""
-    still, _, num_asked = contradictions(track, obstacles, space)
-    if still >= _SHARE_OF_RAIL * num_asked or not _like_a_rail(track, obstacles, space):
-        return False
-    return not left_places(track, obstacles, space, proven).mostly_bare()
-
-
-def _most_of_short(left: LeftPlaces) -> float:
-    """The share of its contradictions that a motion seen for a short time may leave."""
-    if not left.mostly_bare():
-        return _MAX_OF_SHORT
-    return _MAX_OF_SHORT_MANY_BARE if left.many_empty() else _MAX_OF_SHORT_BARE
-
-
-def _goes_along(track: Track, space: FreeSpace) -> bool:
-    """Whether the object moves about as the scanner does."""
-    nearest = [
-        int(np.abs(space.clock.time_s - at_s).argmin())
-        for at_s in (track.path.begin_s, track.path.end_s)
-    ]
-    here, there = (poses.inverse(space.T_lidar_world[j])[:2, 3] for j in nearest)
-    seconds = max(float(np.ptp(space.clock.time_s[nearest])), 1e-6)
-    own_m_s = (there - here) / seconds
-    path = track.path
-    its_m_s = (path(path.end_s) - path(path.begin_s))[:2] / (path.end_s - path.begin_s)
-    apart_m_s = float(np.linalg.norm(its_m_s - own_m_s))
-    return apart_m_s < _AS_FAST * float(np.linalg.norm(own_m_s))
-
-
-def _like_a_rail(track: Track, obstacles: Sequence[Obstacles], space: FreeSpace) -> bool:
-    """Whether the object goes about where it points, and is much longer than high, and than wide or
-    moving about as the scanner does. Nothing of a guard rail tells its motion along itself; where
-    it lies between two rings, sweeps see through it; and rings go with the scanner, so that it
-    seems to go with it too."""
-    parts = [
-        track.undo(obstacles[i].points[rows], obstacles[i].time_s[rows])
-        for i, rows in track.claimed.items()
-    ]
-    body = np.concatenate(parts)
-    body -= body.mean(axis=0)
-    _, axes = np.linalg.eigh(body[:, :2].T @ body[:, :2])
-    across_m, along_m = (body[:, :2] @ axes).T
-    way = (track.path(track.path.end_s) - track.path(track.path.begin_s))[:2]
-    if abs(way @ axes[:, 1]) < _ALONG * np.linalg.norm(way):
-        return False
-    slope = along_m @ body[:, 2] / max(float(along_m @ along_m), 1e-6)
-    high_m, wide_m = (
-        float(np.subtract(*np.percentile(spread, [90, 10])))
-        for spread in (body[:, 2] - slope * along_m, across_m)
+    rough_m = _ROUGH_M + _ROUGH_PER_GAP * gap_m + _ROUGH_S * travelled_m / seen_s
+    least_m = max(
+        _LEAST_WAY_M, _LEAST_WAY_PER_RESIDUAL * residual_m, _LEAST_WAY_PER_ROUGH * rough_m
     )
-    long_m = float(np.ptp(along_m))
-    if long_m < _RAIL_M or long_m <= _SLENDER * high_m:
-        return False
-    return long_m > _SLENDER * wide_m or _goes_along(track, space)
+    return travelled_m >= least_m and residual_m <= rough_m
 
 
-def _as_fast_as_measured(track: Track, obstacles: Sequence[Obstacles]) -> bool:
-    """Whether the motion has the radial velocities that were measured, where any were."""
+def _is_as_fast_as_measured(track: Track, obstacles: Sequence[Obstacles]) -> bool:
+    """Return True if the motion agrees with the measured radial velocities, where there are any."""
     parts, velocities = [], []
     for j, rows in track.claimed.items():
         radial = obstacles[j].radial
@@ -200,29 +101,120 @@ def _as_fast_as_measured(track: Track, obstacles: Sequence[Obstacles]) -> bool:
     return not parts or Radial.together(parts).agrees(np.concatenate(velocities))
 
 
-def contradictions(
+def count_violations(
     track: Track, obstacles: Sequence[Obstacles], space: FreeSpace
 ) -> tuple[int, int, int]:
-    """How many looks through the track's points the sweeps have, obstacles still and moved, and how
-    many there may have been."""
-    asked = {}
-    for look in space.batches:
-        num = _NUM_ASKED // len(look)
-        for i in look:
+    """Test some points of the track against all sweeps around them.
+
+    Returns the number of free-space violations of the points at their static positions, that at
+    the positions to which the motion moves them, and the number of tests.
+    """
+    tested = {}
+    for batch in space.batches:
+        num = _NUM_ASKED // len(batch)
+        for i in batch:
             if i in track.claimed:
                 rows = track.claimed[i]
-                asked[i] = rows[:: len(rows) // num + 1]
-    others = {i: frozenset(space.others(i)) for i in asked}
-    points = {i: obstacles[i].points[rows] for i, rows in asked.items()}
-    body = {i: track.undo(points[i], obstacles[i].time_s[rows]) for i, rows in asked.items()}
-    still = moved = num_asked = 0
+                tested[i] = rows[:: len(rows) // num + 1]
+    others = {i: frozenset(space.others(i)) for i in tested}
+    points = {i: obstacles[i].points[rows] for i, rows in tested.items()}
+    body = {i: track.undo(points[i], obstacles[i].time_s[rows]) for i, rows in tested.items()}
+    static = moved = num_tests = 0
     for j, *_ in space.batches:
-        from_others = [i for i in asked if j in others[i]]
-        if not from_others:
-            continue
-        of_others = np.concatenate([body[i] for i in from_others])
-        moved += int(track.seen_through(of_others, j, space).sum())
-        standing_still = np.concatenate([points[i] for i in from_others])
-        still += int(space.seen_through(standing_still, j).sum())
-        num_asked += len(of_others)
-    return still, moved, num_asked
+        sources = [i for i in tested if j in others[i]]
+        if sources:
+            in_object = np.concatenate([body[i] for i in sources])
+            moved += int(track.seen_through(in_object, j, space).sum())
+            in_world = np.concatenate([points[i] for i in sources])
+            static += int(space.seen_through(in_world, j).sum())
+            num_tests += len(in_object)
+    return static, moved, num_tests
+
+
+class Places(NamedTuple):
+    """How often another return was at a position of the object, and how often it was empty."""
+
+    taken: int
+    empty: int
+
+
+class PlacesLeft(NamedTuple):
+    """The positions of an object before it arrived there, and after it left."""
+
+    before: Places
+    after: Places
+
+    def still_there(self) -> bool:
+        """Return True if most positions are taken, before and after: by a static object."""
+        taken = all(p.taken >= _MOSTLY * p.empty for p in self)
+        return taken and sum(p.taken for p in self) > 0
+
+    def empty(self, far: bool) -> bool:
+        """Return True if nearly no position is taken, on both sides. far: the object travels so
+        far that many positions on one side are enough."""
+        each = all(p.empty >= _LEAST_EMPTY and p.taken <= _SELDOM * p.empty for p in self)
+        taken, empty = self._total()
+        return each or (far and empty >= _MANY_EMPTY and taken <= _SELDOM * empty)
+
+    def mostly_empty(self) -> bool:
+        """Return True if hardly any position is taken, before or after."""
+        taken, empty = self._total()
+        return empty >= _LEAST_EMPTY and taken <= _HARDLY * empty
+
+    def _total(self) -> tuple[int, int]:
+        return sum(p.taken for p in self), sum(p.empty for p in self)
+
+
+def find_places_left(
+    track: Track,
+    obstacles: Sequence[Obstacles],
+    space: FreeSpace,
+    objects: Sequence[MovingObject],
+) -> PlacesLeft:
+    """Count what other sweeps observed at the positions of the track.
+
+    A wire fence is seen through from beside and not from ahead. The border between the two moves
+    along the fence with the scanner, but the fence stays where it is. Returns of the other confirmed
+    objects do not count.
+    """
+    some = {i: rows[:: len(rows) // _NUM_ASKED + 1] for i, rows in track.claimed.items()}
+    tree = BoxTree(track.points_in(obstacles, track.claimed))
+    rate = track.path.rate((track.path.begin_s + track.path.end_s) / 2)
+    room_m = _ROOM_M + _ROOM_S * float(np.linalg.norm(rate[:2]))
+    there_m = max(_THERE_M, _THERE_PER_GAP * space.gap_m(track.centre, next(iter(track.claimed))))
+
+    def count(batch: tuple[int, ...], sweeps: Sequence[int]) -> Places:
+        places = np.concatenate([np.zeros((0, 3)), *(obstacles[i].points[some[i]] for i in sweeps)])
+        in_object = track.undo(places, space.clock.time_s[batch[0]])
+        away_m, _ = tree.nearest(in_object, room_m)
+        places = places[(away_m > _LEFT_M) & np.isfinite(away_m)]
+        if not len(places):
+            return Places(0, 0)
+        returns = np.concatenate(
+            [_returns_near(places, there_m, obstacles[j], objects) for j in batch]
+        )
+        taken = np.zeros(len(places), bool)
+        if len(returns):
+            taken = np.isfinite(BoxTree(returns).nearest(places, there_m)[0])
+        empty = space.seen_through(places, batch[0]) & ~taken
+        return Places(int(taken.sum()), int(empty.sum()))
+
+    def total(parts: Sequence[Places]) -> Places:
+        return Places(sum(p.taken for p in parts), sum(p.empty for p in parts))
+
+    return PlacesLeft(
+        total([count(batch, [i for i in some if i > batch[-1]]) for batch in space.batches]),
+        total([count(batch, [i for i in some if i < batch[0]]) for batch in space.batches]),
+    )
+
+
+def _returns_near(
+    places: Float, reach_m: float, c: Obstacles, objects: Sequence[MovingObject]
+) -> Float:
+    """Return (N,3) the points of a sweep close to some positions, without those of the objects."""
+    rows = c.strips.rows_inside(places.min(0) - reach_m, places.max(0) + reach_m)
+    rows = rows[np.isfinite(BoxTree(places).nearest(c.points[rows], reach_m)[0])]
+    for track, shape in objects:
+        if len(rows):
+            rows = rows[~shape.near(track.undo(c.points[rows], c.time_s[rows]), _LEFT_M)]
+    return c.points[rows]

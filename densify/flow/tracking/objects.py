@@ -1,0 +1,206 @@
+# SPDX-License-Identifier: MIT
+"""Tracks: where each object was observed, its smooth motion, and its accumulated shape."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+from scipy.spatial import ConvexHull, QhullError
+
+from densify.flow.surface_matching import apply, undo
+from densify.flow.tracking.candidates import Batch, Obstacles
+from densify.flow.tracking.paths import Path
+from densify.free_space.height_map import HeightMap
+from densify.free_space.seen_through import FreeSpace
+from densify.geometry.nearest import BoxTree
+from densify.geometry.types import Bool, Float, Int
+
+_MANY_POINTS = 100  # more do not locate an object better
+_BESIDE_M = 1.0
+_OUTLINE_M = 0.05
+_LONG_M = 3.0
+_QUARTERS_RAD = np.arange(4) * np.pi / 2
+_SOME_POINTS, _ANGLE_DEG, _BIN_M = 1000, 0.5, 0.05
+
+
+@dataclass(frozen=True)
+class Observation:
+    """The pose of an object in one batch of sweeps.
+
+    state: (4,) x y z displacement (m) and yaw (rad) since the first observation; z follows the
+    ground. seen_s: when that was. time_ns: the batch's own time. sweeps: those with its points.
+    """
+
+    state: Float
+    seen_s: float
+    time_ns: int
+    sweeps: tuple[int, ...]
+
+
+@dataclass
+class Track:
+    """One rigid object.
+
+    centre: (3,) about which it turns, world. observations: by batch, in the order of tracking.
+    claimed: by sweep, the rows of `Obstacles` that are its points. path: its smooth motion.
+    """
+
+    centre: Float
+    observations: dict[int, Observation] = field(default_factory=dict)
+    claimed: dict[int, Int] = field(default_factory=dict)
+    path: Path = field(init=False)
+
+    def add(self, n: int, batch: Batch, state: Float, seen_s: float, rows: Int) -> None:
+        """Add the observation in batch n, with its ascending rows."""
+        mine = batch.split(rows)
+        self.observations[n] = Observation(state, seen_s, batch.time_ns, tuple(mine))
+        self.claimed |= mine
+
+    def smooth(self) -> None:
+        """Fit the path to the states; observations with many points weigh more."""
+        batches = sorted(self.observations)
+        times_s = np.array([self.observations[n].seen_s for n in batches])
+        states = np.stack([self.observations[n].state for n in batches])
+        weights = np.array([min(self.num_points(n), _MANY_POINTS) for n in batches], float)
+        self.path = Path.fit(times_s, states, weights)
+
+    def place(self, points: Float, time_s: float | Float) -> Float:
+        """Move (N,3) points from the object's own frame to the world at a time, or one time each."""
+        return apply(self.path(time_s), points, self.centre)
+
+    def undo(self, points: Float, time_s: float | Float) -> Float:
+        """Inverse of `place`."""
+        return undo(self.path(time_s), points, self.centre)
+
+    def carry(self, points: Float, from_s: float | Float, to_s: float | Float) -> Float:
+        """Move (N,3) points of the object from one time to another, world."""
+        return self.place(self.undo(points, from_s), to_s)
+
+    def velocity_m_s(self, points: Float, time_s: float) -> Float:
+        """Return (N,3) the velocity of points of the object at that time, world."""
+        state, rate = self.path(time_s), self.path.rate(time_s)
+        velocity_m_s = np.tile(rate[:3], (len(points), 1))
+        velocity_m_s[:, 0] -= rate[3] * (points[:, 1] - self.centre[1] - state[1])
+        velocity_m_s[:, 1] += rate[3] * (points[:, 0] - self.centre[0] - state[0])
+        return velocity_m_s
+
+    def seen_through(self, points: Float, j: int, space: FreeSpace) -> Bool:
+        """Return (N,) True for points in the object's own frame that sweep j sees through."""
+        at_s = space.clock.time_s[j]
+        carried = self.place(points, at_s)
+        return space.seen_through(carried, j, self.velocity_m_s(carried, at_s))
+
+    def points_in(self, obstacles: Sequence[Obstacles], sweeps: Iterable[int]) -> Float:
+        """Return (N,3) the points of these sweeps, in the object's own frame."""
+        parts = [np.zeros((0, 3))]
+        for j in sweeps:
+            c, rows = obstacles[j], self.claimed[j]
+            parts.append(self.undo(c.points[rows], c.time_s[rows]))
+        return np.concatenate(parts)
+
+    def num_points(self, n: int) -> int:
+        """Return the number of its points in batch n."""
+        return sum(len(self.claimed[j]) for j in self.observations[n].sweeps)
+
+    def total_points(self) -> int:
+        return sum(map(len, self.claimed.values()))
+
+    def duration_s(self) -> float:
+        """Return the time between the first and the last observation."""
+        return float(np.ptp([seen.seen_s for seen in self.observations.values()]))
+
+    def rise_m(self, ground: HeightMap, state: Float) -> float:
+        """Return how much higher the ground is in that state: the median of the object's place and
+        both sides of it, since the road below an object may never be observed."""
+        way = state[:2] / max(float(np.linalg.norm(state[:2])), 1e-9)
+        start = self.centre[:2] + np.outer([-_BESIDE_M, 0.0, _BESIDE_M], [-way[1], way[0]])
+        return float(np.median(ground.under(start + state[:2]) - ground.under(start)))
+
+    def seen_at(self, time_ns: int) -> float:
+        """Return when a sweep of that reference time measures, or would measure, the object."""
+        nearest = min(
+            self.observations.items(), key=lambda item: (abs(item[1].time_ns - time_ns), item[0])
+        )[1]
+        return time_ns * 1e-9 + nearest.seen_s - nearest.time_ns * 1e-9
+
+
+@dataclass(frozen=True)
+class Shape:
+    """The accumulated points of one object, upright in its own frame.
+
+    points: (M,3). tree: of the points. rim: (K,3) those points that reach farthest in each
+    horizontal direction, up and down. edges: (E,3) normals and offsets of the convex outline seen
+    from above; (0,3) where the points span none.
+    """
+
+    points: Float
+    tree: BoxTree
+    rim: Float
+    edges: Float
+
+    @staticmethod
+    def of(points: Float) -> Shape:
+        """points: (M,3), M at least 1."""
+        try:
+            hull = ConvexHull(points[:, :2])
+        except (QhullError, ValueError):  # too few points, or all on a line
+            return Shape(points, BoxTree(points), points, np.zeros((0, 3)))
+        z = points[:, 2]
+        rim = points[[*hull.vertices, z.argmin(), z.argmax()]]
+        return Shape(points, BoxTree(points), rim, hull.equations)
+
+    def within_outline(self, points: Float) -> Bool:
+        """Return (N,) True for (N,3) points inside the outline, seen from above."""
+        if not len(self.edges):
+            return np.zeros(len(points), bool)
+        inside: Bool = (points[:, :2] @ self.edges[:, :2].T + self.edges[:, 2] < _OUTLINE_M).all(1)
+        return inside
+
+    def near(self, points: Float, within_m: float) -> Bool:
+        """Return (N,) True for (N,3) points within the outline or closer than ``within_m``."""
+        return np.isfinite(self.tree.nearest(points, within_m)[0]) | self.within_outline(points)
+
+    @cached_property
+    def side_rad(self) -> float:
+        """Direction of one side seen from above, in [0, pi / 2); the others are parallel to it or
+        perpendicular. It maximises the sum of squares of the histograms along both axes."""
+        points = self.points[:: len(self.points) // _SOME_POINTS + 1, :2]
+        points = points - points.mean(axis=0)
+        reach_m = float(np.linalg.norm(points, axis=1).max())
+        num = int(2 * reach_m / _BIN_M) + 2
+        angles = np.deg2rad(np.arange(0.0, 90.0, _ANGLE_DEG))
+        score = np.zeros(len(angles))
+        for turned in (angles, angles + np.pi / 2):
+            across = np.outer(np.cos(turned), points[:, 0]) + np.outer(np.sin(turned), points[:, 1])
+            place = ((across + reach_m) / _BIN_M).astype(np.int64)
+            place += num * np.arange(len(angles))[:, None]
+            counts = np.bincount(place.ravel(), minlength=num * len(angles))
+            score += (counts.reshape(-1, num) ** 2).sum(axis=1)
+        return float(angles[np.argmax(score)])
+
+
+class MovingObject(NamedTuple):
+    """A confirmed track with its shape."""
+
+    track: Track
+    shape: Shape
+
+    def heading(self, at_s: float) -> Float:
+        """Return (2,) the unit vector along the object at a time.
+
+        Long objects point along the side nearest to their velocity, others along their velocity:
+        a trailer that turns does not move where it points.
+        """
+        ahead = self.track.path.rate(at_s)[:2]
+        ahead = ahead / max(float(np.linalg.norm(ahead)), 1e-6)
+        rim = self.track.place(self.shape.rim, at_s)[:, :2]
+        if np.linalg.norm(np.ptp(rim, axis=0)) < _LONG_M:
+            return ahead
+        sides_rad = self.shape.side_rad + float(self.track.path(at_s)[3]) + _QUARTERS_RAD
+        sides = np.stack([np.cos(sides_rad), np.sin(sides_rad)], axis=1)
+        side: Float = sides[np.argmax(sides @ ahead)]
+        return side if np.ptp(rim @ side) >= _LONG_M else ahead
