@@ -7,9 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from densify.flow.surface_matching import GATES_M, apply, undo
-from densify.flow.tracking.align import MIN_FIT, Model
-from densify.flow.tracking.candidates import Strips, surface_information
+from densify.flow.surface_matching import GATES_M, MIN_FIT, Model, apply, surface_information, undo
 
 CENTRE = np.array([12.0, -3.0, 0.8])
 STD = np.array([0.3, 0.3, 0.06])
@@ -38,7 +36,7 @@ def slow_align(model: Model, points, predicted) -> np.ndarray | None:
     _, near = tree.query(model.points, min(12, len(model.points)))
     information = slow_information(model.points, near.reshape(len(model.points), -1))
     state = predicted.copy()
-    for gate_m in np.repeat(GATES_M, 2):
+    for gate_m in GATES_M:
         at_model = undo(state, points, CENTRE)
         distance, row = tree.query(at_model, distance_upper_bound=gate_m)
         near = np.isfinite(distance)
@@ -59,9 +57,9 @@ def slow_align(model: Model, points, predicted) -> np.ndarray | None:
     return state
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("num_points", [6, 40, 600])
-def test_the_compiled_loop_is_its_slow_twin(num_points: int, seed: int) -> None:
+def test_the_alignment_is_its_slow_twin(num_points: int, seed: int) -> None:
     rng = np.random.default_rng(seed)
     model = Model(corner(900, seed))
     true = np.array([*rng.normal(0, 0.5, 2), rng.normal(0, 0.1), rng.normal(0, 0.3)])
@@ -133,19 +131,4 @@ def test_surface_information_is_the_inverse_covariance(flat: bool) -> None:
     points = rng.normal(size=(200, 3)) * ([3.0, 2.0, 0.0] if flat else [3.0, 2.0, 0.5])
     near = rng.integers(0, 200, (200, 12))
     expected = slow_information(points, near)
-    found = surface_information(points, near, 10.0, 0.05, 0.02)
-    rows, columns = [0, 0, 1, 0, 1], [0, 1, 1, 2, 2]
-    np.testing.assert_allclose(found, expected[:, rows, columns], rtol=1e-8, atol=1e-9)
-
-
-@pytest.mark.parametrize("ordered", [False, True], ids=["shuffled", "in order"])
-def test_rows_inside_a_box(ordered: bool) -> None:
-    rng = np.random.default_rng(5)
-    points = rng.integers(-3, 4, (5000, 3)).astype(float)  # many exactly on the faces: outside
-    if ordered:  # most strips have nothing inside
-        points = points[np.lexsort(points.T)]
-    low, high = np.array([-2.0, -1.0, -3.0]), np.array([2.0, np.inf, 1.0])
-    expected = np.flatnonzero(((points > low) & (points < high)).all(1))
-    assert 100 < len(expected) < 2000
-    np.testing.assert_array_equal(Strips(points).rows_inside(low, high), expected)
-    assert Strips(points[:0]).rows_inside(low, high).shape == (0,)
+    np.testing.assert_allclose(surface_information(points, near, 10.0), expected, rtol=1e-8)

@@ -8,10 +8,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from densify.flow.tracking.candidates import Obstacles
-from densify.flow.tracking.extent import Seen, leave_out_alone, shape_of
-from densify.flow.tracking.lone_rays import columns_apart_m
-from densify.flow.tracking.sightings import Sighting, Track
+from densify.flow.tracking.extent import SweepPoints, columns_apart_m, leave_out_isolated
+from densify.flow.tracking.objects import MovingObject, Observation, Shape, Track
 from densify.geometry import poses
 from densify.geometry.clock import Clock
 from tests.found_motion import KEY, NOISE, Found
@@ -75,50 +73,6 @@ def test_a_wall_that_somebody_walks_along_stays():
     assert len(still) > 20_000 and still.mean() < 0.04  # an arm's length of it
 
 
-@pytest.mark.parametrize(("speed_m_s", "num_kept"), [(1.4, 240), (5.0, 241)])
-def test_what_one_sweep_saw_far_from_who_walks_is_none_of_it(speed_m_s, num_kept):
-    """An echo that melted with that of a wall. Of what drives it may be a part that just came into
-    view."""
-    body = np.random.default_rng(0).uniform(-0.3, 0.3, (40, 3)) * [1, 1, 3]
-    echo = np.array([[0.0, 0.9, 0.0]])
-    claimed = [np.concatenate([body, echo[: i == 3]]) for i in range(6)]
-    seeds = [np.ones(len(points), bool) for points in claimed]
-    assert num_in_shape(claimed, seeds, speed_m_s) == num_kept
-
-
-@pytest.mark.parametrize(
-    ("length_m", "speed_m_s", "num_kept"), [(0.6, 1.4, 240), (4.2, 1.4, 480), (0.6, 5.0, 480)]
-)
-def test_a_wall_beside_who_walks_is_no_part_of_his_shape(length_m, speed_m_s, num_kept):
-    """Though each sweep's candidates hold as much of it as of him: nothing is seen through it. A
-    car's side that slides along itself is no other, so what is long or drives keeps it."""
-    rng = np.random.default_rng(0)
-    body = rng.uniform(-0.5, 0.5, (40, 3)) * [length_m, 0.5, 1.8]
-    wall = rng.uniform(-0.5, 0.5, (40, 3)) * [2.0, 0.0, 1.8] + [0.0, 0.7, 0.0]
-    claimed, seeds = [np.concatenate([body, wall])] * 6, [np.arange(80) < 40] * 6
-    assert num_in_shape(claimed, seeds, speed_m_s) == num_kept
-
-
-@pytest.mark.parametrize(("stands", "num_kept"), [(True, 440), (False, 704)])
-def test_a_bush_that_is_seen_through_beside_who_walks_is_no_part_of_his_shape(stands, num_kept):
-    """Its places are taken sweep after sweep; those of what he carries go with him."""
-    rng = np.random.default_rng(0)
-    body = rng.uniform(-0.5, 0.5, (40, 3)) * [0.5, 0.5, 1.8]
-    bush = rng.uniform(-0.5, 0.5, (24, 3)) * [0.8, 0.3, 1.0] + [0.0, 0.6, 0.0]
-    shifts = [[0.14 * n * stands, 0.0, 0.0] for n in range(11)]
-    claimed = [np.concatenate([body, bush - shift]) for shift in shifts]
-    assert num_in_shape(claimed, [np.ones(64, bool)] * 11, 1.4) == num_kept
-
-
-def test_a_bush_that_every_sweep_sees_at_other_places_is_no_part_of_who_walks_by():
-    """Some of its points are seen where they would have moved to, but not most around them."""
-    rng = np.random.default_rng(0)
-    body = rng.uniform(-0.5, 0.5, (40, 3)) * [0.5, 0.5, 1.8]
-    bushes = rng.uniform(-0.5, 0.5, (11, 12, 3)) * [1.2, 0.6, 1.0] + [0.0, 0.9, 0.0]
-    claimed = [np.concatenate([body, b - [0.14 * n, 0, 0]]) for n, b in enumerate(bushes)]
-    assert num_in_shape(claimed, [np.ones(52, bool)] * 11, 1.4) == 440
-
-
 def test_columns_of_rays_lie_the_farther_apart_the_more_a_side_falls_away():
     """Seen along a wall 3 m aside, from a lidar that has turned and moved."""
     step_rad, to_right = np.deg2rad(0.2), np.array([3.0, 0.0, 1.0])
@@ -130,28 +84,11 @@ def test_columns_of_rays_lie_the_farther_apart_the_more_a_side_falls_away():
     )
     apart_m = columns_apart_m(
         np.array([50.0, 3.0, 0.0]) + to_right,
-        np.array([2.0, 0.0]),
+        np.array([1.0, 0.0]),
         T_lidar_world,
         SimpleNamespace(models=models),
     )
     assert apart_m == pytest.approx(-np.gradient(meets_m)[40], rel=0.02)
-
-
-def num_in_shape(claimed, seeds, speed_m_s) -> int:
-    """Points of the shape of a track that claims these points in the object's frame, (N,3) a sweep,
-    of which some are seeds, (N,)."""
-    track, standing = Track(np.zeros(3)), []
-    time_s = 0.1 * np.arange(len(claimed))
-    for i, (at_s, points, seed) in enumerate(zip(time_s, claimed, seeds, strict=True)):
-        state, rows = np.array([speed_m_s * at_s, 0.0, 0.0, 0.0]), np.arange(len(points))
-        placed = points + state[:3]
-        standing.append(Obstacles(rows, placed, np.full(len(rows), at_s), seed, 0 * rows, 1))
-        track.claimed[i] = rows
-        track.sightings[i] = Sighting(state, at_s, round(at_s * 1e9), (i,))
-    track.smooth()
-    clock = Clock(np.rint(time_s * 1e9).astype(np.int64))
-    space = SimpleNamespace(clock=clock, gap_m=lambda *_: 0.1)
-    return len(shape_of(track, standing, space).points)
 
 
 @pytest.mark.parametrize(
@@ -169,15 +106,17 @@ def test_what_lies_off_all_of_an_object_in_its_sweep_is_left_out(speed_m_s, left
     heights_m = np.where(np.arange(num) < 18, 0.5, height_m).astype(np.float32)
     gap_m = np.full(num, 0.1)
     row = np.arange(num)
-    seen = Seen(row, points, np.zeros(num), heights_m, gap_m, 3 * gap_m, np.zeros(num, bool))
+    seen = SweepPoints(row, points, np.zeros(num), heights_m, gap_m, 3 * gap_m, np.zeros(num, bool))
     track = Track(np.zeros(3))
     for i in range(3):
         state = np.array([0.1 * speed_m_s * i, 0.0, 0.0, 0.0])
-        track.sightings[i] = Sighting(state, 0.1 * i, i * 100_000_000, (i,))
+        track.observations[i] = Observation(state, 0.1 * i, i * 100_000_000, (i,))
         track.claimed[i] = row
     track.smooth()
     instance = np.zeros(num, np.int32)
-    leave_out_alone(instance, seen, 0, [track], Clock(np.arange(3) * 100_000_000))
+    leave_out_isolated(
+        instance, seen, 0, [MovingObject(track, Shape.of(body))], Clock(np.arange(3) * 100_000_000)
+    )
     assert (instance[:18] == 0).all()
     expected = [False, True, True] if height_m == 0.12 else left_out
     assert (instance[18:21] < 0).tolist() == expected and instance[21] == instance[20]

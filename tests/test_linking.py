@@ -46,14 +46,6 @@ def test_wherever_the_origin_lies_and_however_the_axes_are_turned(points: np.nda
         np.testing.assert_array_equal(link(moved, DISTANCE_M)[1], label)
 
 
-def test_the_order_of_the_points_changes_only_the_numbers() -> None:
-    points = clouds()[0]
-    order = np.random.default_rng(1).permutation(len(points))
-    np.testing.assert_array_equal(
-        link(points[order], DISTANCE_M)[1], numbered(link(points, DISTANCE_M)[1][order])
-    )
-
-
 def test_points_on_one_place() -> None:
     num, label = link(np.repeat([[1.0, 2, 3], [1.0, 2, 3.7]], 100, axis=0), DISTANCE_M)
     assert num == 2 and (label == np.repeat([0, 1], 100)).all()

@@ -51,7 +51,7 @@ def moving(stretch: Stretch) -> np.ndarray:
 def test_candidates_are_the_same_groups(stretch: Stretch) -> None:
     def found(there: Stretch):
         heights = ground(there)
-        return find_candidates(there, FreeSpace.of(there), heights, 0.3)
+        return find_candidates(there, FreeSpace.of(there), heights)
 
     here = found(stretch)
     assert sum(c.num_clusters for c in here) > 20

@@ -5,11 +5,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from scipy.interpolate import BSpline
 
 from densify.flow.surface_matching import apply, undo
+from densify.flow.tracking.objects import Track
 from densify.flow.tracking.paths import Path
-from densify.flow.tracking.sightings import Track
 
 STEP_S = 0.1
 NOISE_M = 0.03
@@ -48,15 +47,6 @@ def test_constant_acceleration_is_recovered_exactly_and_of_few_sweeps_constant_v
     within = np.linspace(t[0], t[-1], 50)
     np.testing.assert_allclose(path(within), polynomial(within, degree), atol=1e-5)
     assert path.residual_m < 1e-5
-
-
-@pytest.mark.parametrize("missing", [(1,), (4, 5), (9,)])
-def test_sweeps_that_did_not_see_it_leave_no_mark(missing):
-    t = np.delete(times_of(11), missing)
-    within = np.linspace(t[0], t[-1], 50)
-    np.testing.assert_allclose(
-        fitted(t, polynomial(t, 2))(within), polynomial(within, 2), atol=1e-5
-    )
 
 
 def test_weights_say_whom_to_believe():
@@ -152,16 +142,6 @@ def test_the_residual_of_noise_is_about_the_noise(num):
     assert 0.75 * expected_m < np.sqrt(np.mean(np.square(found_m))) < 1.3 * expected_m
 
 
-def test_the_residual_tells_what_no_smooth_path_explains():
-    t = times_of(7)
-    states = polynomial(t, 2)
-    states[::2, 1] += 0.5
-    assert fitted(t, states).residual_m > 0.2
-    states = polynomial(t, 2)
-    states[::2, 2:] += 0.5  # height and yaw do not count
-    assert fitted(t, states).residual_m < 1e-5
-
-
 # --- in time --------------------------------------------------------------------------------------
 
 
@@ -196,26 +176,6 @@ def test_one_time_or_many(soft):
         assert soft(float(time_s)).shape == soft.rate(float(time_s)).shape == (4,)
         np.testing.assert_allclose(soft(float(time_s)), soft(at)[i], atol=1e-12)
     assert soft(at.reshape(2, 3)).shape == (2, 3, 4)
-
-
-def test_it_does_not_matter_when_time_begins():
-    t = times_of(15)
-    late = fitted(t + 500.0, from_rest(t))
-    np.testing.assert_allclose(late(t + 500.0), fitted(t, from_rest(t))(t), atol=1e-6)
-
-
-# --- compiled -------------------------------------------------------------------------------------
-
-
-def test_within_and_beyond_as_scipy_evaluates_the_spline():
-    t = times_of(20)
-    path = fitted(t, np.random.default_rng(3).normal(size=(20, 4)).cumsum(axis=0))
-    spline = BSpline(path.knots_s, path.coefficients, 3)
-    asked = np.append(np.linspace(t[0] - 1, t[-1] + 1, 200), t)
-    inside = np.clip(asked, t[0], t[-1])
-    expected = spline(inside) + (asked - inside)[:, None] * spline.derivative()(inside)
-    np.testing.assert_allclose(path(asked), expected, rtol=1e-12)
-    np.testing.assert_allclose(path.rate(asked), spline.derivative()(inside), rtol=1e-12)
 
 
 def test_points_are_placed_each_at_its_time_and_brought_back():

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from densify.geometry.nearest import BoxTree
+from densify.geometry.nearest import nearest, nearest_k, tree_of
 from densify.geometry.types import Bool, Float, Int
 
 GATES_M = np.repeat([0.8, 0.5, 0.3, 0.2, 0.2], 2)  # greatest distance of a match, step by step
@@ -44,7 +44,7 @@ def _turned(arms: Float, yaw: float | Float) -> Float:
 def surface_information(points: Float, near: Int, loose: float = 1.0) -> Float:
     """Return (N,3,3) the inverse covariance (1/m²) of the surface around each point.
 
-    points: (M,3). near: (N,k) rows of the neighbours of each point. loose: factor of the covariance.
+    points: (M,3). near: (N,k) rows of each point's neighbours. loose: factor of the covariance.
     """
     away = points[near]
     away -= away.mean(axis=1, keepdims=True)
@@ -70,13 +70,13 @@ class Model:
         if len(points) > _MAX_MODEL_POINTS:
             points = points[:: len(points) // _MAX_MODEL_POINTS + 1]
         self.points, self._flat = points, np.ascontiguousarray(points * self._scale)
-        self._tree = BoxTree(self._flat)
-        _, near = self._tree.nearest_k(self._flat, min(NUM_NEAR, len(points)))
+        self._tree = tree_of(self._flat)
+        _, near = nearest_k(self._tree, self._flat, NUM_NEAR)
         self.information = surface_information(self._flat, near, _LOOSE)
 
     def covers(self, points: Float, within_m: float) -> Bool:
         """Return (N,) True for the (N,3) points closer to the model than ``within_m``."""
-        distance_m, _ = self._tree.nearest(points * self._scale, within_m)
+        distance_m, _ = nearest(self._tree, points * self._scale, within_m)
         return np.isfinite(distance_m)
 
     def align(
@@ -95,7 +95,7 @@ class Model:
         start, prior = state.copy(), prediction_std**-2
         for gate_m in GATES_M:
             at_model = undo(state, points, centre)
-            distance_m, row = self._tree.nearest(at_model, gate_m)
+            distance_m, row = nearest(self._tree, at_model, gate_m)
             found = np.flatnonzero(row >= 0)
             if len(found) < MIN_FIT:
                 return None

@@ -7,6 +7,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from densify.geometry.compiled import Kernel, inlined
+from densify.geometry.nearest import is_near, tree_of
 from densify.geometry.types import Bool, Float, Int
 
 _WITHIN = 1 - 1e-9  # rounding must not part the points of a cell
@@ -58,12 +59,7 @@ def close_to_seeds(points: Float, seed: Bool, within_m: float, least_share: floa
     seeds = seeds[num_seeds >= least_share * num_points]
     if not len(seeds):
         return np.zeros(len(points), bool)
-    return np.isfinite(tree_of(seeds).query(points, distance_upper_bound=within_m)[0])
-
-
-def tree_of(points: Float) -> cKDTree:
-    """Return SciPy's tree of the (N,d) points, built fast for few searches."""
-    return cKDTree(points, balanced_tree=False, compact_nodes=False)
+    return is_near(tree_of(seeds), points, within_m)
 
 
 @Kernel

@@ -7,9 +7,10 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import cKDTree
 
-from densify.flow.pairs.hypotheses import PairCloud, tree_of
+from densify.flow.pairs.hypotheses import PairCloud
 from densify.free_space.ground import HeightMap
 from densify.geometry.linking import link
+from densify.geometry.nearest import tree_of
 from densify.geometry.types import Bool, Float, Float32, Int
 
 EXPLAINED_M = 0.1  # a nearer point is a counterpart,

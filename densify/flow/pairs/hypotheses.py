@@ -18,11 +18,11 @@ from densify.flow.surface_matching import (
     GATES_M,
     MAX_WEIGHT,
     NUM_NEAR,
-    RIDGE,
-    SURFACE_M,
     apply,
+    surface_information,
 )
 from densify.free_space.ground import HeightMap
+from densify.geometry.nearest import nearest_k, tree_of
 from densify.geometry.types import Float, Int
 
 _EVEN_M = 0.06
@@ -96,17 +96,9 @@ class Surface:
     def __init__(self, target: PairCloud, rows: Int) -> None:
         self.points, self.lag = target.points[rows], target.lag[rows]
         self.tree = tree_of(target.places(self.points, rows))
-        k = min(NUM_NEAR, len(rows))
         tree = self.tree if target.lidar is None else tree_of(self.points)
-        _, near = tree.query(self.points, k, workers=-1)
-        x = self.points[np.reshape(near, (len(rows), k))]
-        x = x - x.mean(1, keepdims=True)
-        covariance = np.einsum("nki,nkj->nij", x, x) / k
-        scale = np.trace(covariance, axis1=1, axis2=2)[:, None, None] / 3
-        # Capped along the surface: far along it a point still tells a little.
-        self.information = np.linalg.inv(
-            covariance + SURFACE_M**2 * np.eye(3) + RIDGE * scale * np.eye(3)
-        )
+        _, near = nearest_k(tree, self.points, NUM_NEAR)
+        self.information = surface_information(self.points, near)
 
 
 @dataclass
@@ -177,7 +169,7 @@ class Hypotheses:
         measured to when the target's was."""
         start = self.state.copy()
         lag = self.source.lag[self.row]
-        for gate_m in np.repeat(GATES_M, 2):
+        for gate_m in GATES_M:
             place = self.source.places(self.seen(self.share[self.of_point]), self.row)
             far, index = surface.tree.query(place, distance_upper_bound=gate_m, workers=-1)
             far, index = np.asarray(far), np.asarray(index)
@@ -278,7 +270,3 @@ def one_per_voxel(places: Float, side_m: float) -> Int:
 def thinned(rows: Int, num: int) -> Int:
     """The rows, or ``num`` of more, evenly."""
     return rows[:: (len(rows) - 1) // num + 1] if len(rows) else rows
-
-
-def tree_of(points: Float) -> cKDTree:
-    return cKDTree(points, balanced_tree=False, compact_nodes=False)

@@ -21,11 +21,11 @@ from densify.flow.pairs.hypotheses import (
     PairCloud,
     RigidMotion,
     Surface,
-    tree_of,
 )
 from densify.flow.pairs.refine import Refined, refined
 from densify.flow.pairs.trials import Trial, promising
 from densify.free_space.ground import HeightMap
+from densify.geometry.nearest import tree_of
 from densify.geometry.types import Float, Int
 
 _CLOSE_BY_M = 1.0

@@ -22,10 +22,10 @@ from densify.flow.pairs.hypotheses import (
     one_per_voxel,
     slope_of,
     thinned,
-    tree_of,
 )
 from densify.flow.pairs.thinness import settle
 from densify.free_space.ground import HeightMap
+from densify.geometry.nearest import tree_of
 from densify.geometry.types import Bool, Float, Int
 
 _MIN_POINTS = 40  # fewer show no surfaces

@@ -14,8 +14,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from densify.flow.pairs.evidence import EXPLAINED_M, MIN_UNEXPLAINED, Unexplained, distances_m
-from densify.flow.pairs.hypotheses import Hypotheses, RigidMotion, thinned, tree_of
+from densify.flow.pairs.hypotheses import Hypotheses, RigidMotion, thinned
 from densify.flow.pairs.refine import Refined
+from densify.geometry.nearest import tree_of
 from densify.geometry.types import Bool, Float, Int
 
 _MIN_TOGETHER, _MIN_TOGETHER_PER_M = 10, 3.5  # the farther, the more places fit by chance

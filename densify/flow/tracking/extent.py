@@ -11,14 +11,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from densify.flow.tracking.candidates import Obstacles, Strips, firing_times_s
-from densify.flow.tracking.objects import MovingObject, Track
+from densify.flow.tracking.objects import MovingObject, Shape, Track
 from densify.flow.tracking.radial import Radial
-from densify.free_space.height_map import ABOVE_GROUND_M, HeightMap
+from densify.free_space.ground import ABOVE_GROUND_M, HeightMap
 from densify.free_space.seen_through import FreeSpace
 from densify.free_space.sensor import Sensors
 from densify.geometry import poses
 from densify.geometry.clock import Clock
-from densify.geometry.nearest import BoxTree
+from densify.geometry.linking import close_to_seeds
+from densify.geometry.nearest import is_near, nearest, nearest_k, tree_of
 from densify.geometry.types import Bool, Float, Float32, Int, Stretch
 
 Instance = NDArray[np.int32]
@@ -28,6 +29,8 @@ _GAPS_REACHED, _GAPS_REACHED_UNSEEN = 0.8, 0.5  # or so many gaps between rings
 _LEAST_HEIGHT_M, _LEAST_HEIGHT_OF_WALKERS_M, _AS_LOW_AS_ROAD_M = 0.08, 0.1, 0.15
 _WHEELS_M = 1.0
 _WALKS_M_S = 2.0
+_AROUND_M, _LEAST_SEEDS, _WALKER_M = 0.3, 0.1, 1.5
+_WIDER_M, _MOSTLY = 0.5, 0.5  # so many of the points so close must move too
 _ALONE_GAPS, _NUM_BESIDE = 2.0, 2
 _LENGTH_M, _SIDE_M = 15.0, 0.1
 # Along a side that falls away from the scanner, so many columns of rays.
@@ -85,6 +88,57 @@ class SweepPoints:
         return Strips(self.points)
 
 
+def find_shape(track: Track, obstacles: Sequence[Obstacles], space: FreeSpace) -> Shape:
+    """Return the shape of all points of a track; those of a walker without their surroundings.
+
+    Echoes that merged with those of a wall occur in even or in odd sweeps only. The points of a
+    bush are static, or lie among static points. Hardly any sweep sees through a wall itself, but
+    slow cars have such sides too: only objects shorter than 1.5 m are cut.
+    """
+    sweeps = sorted(track.claimed)
+    parts = {j: track.points_in(obstacles, [j]) for j in sweeps}
+    points = np.concatenate(list(parts.values()))
+    if _speed_m_s(track, sweeps[len(sweeps) // 2], space.clock) > _WALKS_M_S:
+        return Shape.of(points)
+    gap_m = space.gap_m(track.centre, sweeps[0])
+    of = np.repeat(np.arange(len(sweeps)), [len(part) for part in parts.values()])
+    again = np.zeros(len(points), bool)
+    for odd in (False, True):
+        mine = of % 2 == odd
+        if not mine.all():
+            tree = tree_of(points[~mine])
+            again[mine] = is_near(tree, points[mine], max(_ATTACH_M, _GAPS_REACHED * gap_m))
+    reach_m = max(_THERE_M, _GAPS_REACHED_UNSEEN * gap_m)
+    moves = ~_is_static(track, obstacles, parts, of, reach_m)
+    again &= moves & close_to_seeds(points, moves, _WIDER_M, _MOSTLY)
+    seed = np.concatenate([obstacles[j].seed[track.claimed[j]] for j in sweeps])
+    own = again & close_to_seeds(points, seed, _AROUND_M, _LEAST_SEEDS)
+    if own.any() and np.linalg.norm(np.ptp(points[own, :2], axis=0)) < _WALKER_M:
+        return Shape.of(points[own])
+    return Shape.of(points[again] if again.any() else points)
+
+
+def _is_static(
+    track: Track, obstacles: Sequence[Obstacles], parts: dict[int, Float], of: Int, reach_m: float
+) -> Bool:
+    """Return (N,) True for the points whose positions are taken in more of the other sweeps than
+    the positions that they would have moved to.
+
+    parts: by sweep, in the object's own frame, N in all. of: (N,) number of the point's sweep.
+    """
+    in_object = np.concatenate(list(parts.values()))
+    places = np.concatenate([obstacles[j].points[track.claimed[j]] for j in parts])
+    low, high = places.min(0) - reach_m, places.max(0) + reach_m
+    static, moved = np.zeros((2, len(places)), np.int64)
+    for number, (j, own) in enumerate(parts.items()):
+        others, c = of != number, obstacles[j]
+        there = c.points[c.strips.rows_inside(low, high)]
+        for num, asked, among in ((static, places, there), (moved, in_object, own)):
+            if len(among):
+                num[others] += is_near(tree_of(among), asked[others], reach_m)
+    return np.asarray(static > moved)
+
+
 def assign_points(
     batch: Sequence[int],
     stretch: Stretch,
@@ -118,16 +172,14 @@ def assign_points(
     return instances
 
 
-def attach(
-    seen: SweepPoints, i: int, objects: Sequence[MovingObject], clock: Clock
-) -> Instance:
+def attach(seen: SweepPoints, i: int, objects: Sequence[MovingObject], clock: Clock) -> Instance:
     """Return (N,) the object of each point of sweep i, -1 for none.
 
     A point belongs to an object if it is close to the object's accumulated points, or lies within
     their outline.
     """
     instance = np.full(len(seen.points), -1, np.int32)
-    nearest = np.full(len(seen.points), np.inf)
+    least_m = np.full(len(seen.points), np.inf)
     for k, (track, shape) in enumerate(objects):
         if not is_known_at(track, i, clock):
             continue
@@ -138,12 +190,12 @@ def attach(
         if not len(rows):
             continue
         in_object = track.undo(seen.points[rows], seen.time_s[rows])
-        distance_m, _ = shape.tree.nearest(in_object)
+        distance_m, _ = nearest(shape.tree, in_object)
         belongs = (distance_m < seen.reach_m[rows]) & (seen.height_m[rows] >= ABOVE_GROUND_M)
         belongs |= shape.within_outline(in_object)
-        closer = belongs & (distance_m < nearest[rows])
+        closer = belongs & (distance_m < least_m[rows])
         instance[rows[closer]] = k
-        nearest[rows[closer]] = distance_m[closer]
+        least_m[rows[closer]] = distance_m[closer]
     return instance
 
 
@@ -164,14 +216,14 @@ def detach(
         rows = np.flatnonzero((instance == k) & ~seen.seed)
         for j in {min(track.claimed), max(track.claimed)} - {i}:
             in_object = track.undo(seen.points[rows], clock.time_s[j])
-            away = rows[~np.isfinite(shape.tree.nearest(in_object, _LEFT_M)[0])]
+            away = rows[~is_near(shape.tree, in_object, _LEFT_M)]
             if not len(away):
                 continue
             places, c = seen.points[away], obstacles[j]
             near = c.strips.rows_inside(places.min(0) - _THERE_M, places.max(0) + _THERE_M)
             static = c.points[near[~c.candidate[near]]]
             if len(static):
-                there = np.isfinite(BoxTree(static).nearest(places, _THERE_M)[0])
+                there = is_near(tree_of(static), places, _THERE_M)
                 instance[away[there]] = -1
 
 
@@ -188,7 +240,7 @@ def leave_out_isolated(
             doubtful = mine[low[mine]]
         if len(mine) <= _NUM_BESIDE or not len(doubtful):
             continue
-        away_m, _ = BoxTree(seen.points[mine]).nearest_k(seen.points[doubtful], 1 + _NUM_BESIDE)
+        away_m, _ = nearest_k(tree_of(seen.points[mine]), seen.points[doubtful], 1 + _NUM_BESIDE)
         instance[doubtful[away_m[:, -1] > _ALONE_GAPS * seen.gap_m[doubtful]]] = -1
 
 

@@ -15,9 +15,9 @@ import numpy as np
 from densify.flow.surface_matching import GATES_M, MIN_FIT, Model, apply, undo
 from densify.flow.tracking.candidates import Batch, Obstacles
 from densify.flow.tracking.objects import MovingObject, Track
-from densify.free_space.height_map import HeightMap
+from densify.free_space.ground import HeightMap
 from densify.geometry.clock import Clock
-from densify.geometry.nearest import BoxTree
+from densify.geometry.nearest import is_near, tree_of
 from densify.geometry.types import Bool, Float, Int
 
 MIN_POINTS = 8  # to start a track
@@ -65,10 +65,10 @@ def velocities_beside(
     """Yield the velocities (3,) at a cluster of the objects close to it, such as its towing
     vehicle: little else tells how fast a long side slides along itself."""
     points = batch.obstacles.points[members]
-    tree, middle = BoxTree(points), points.mean(0, keepdims=True)
+    tree, middle = tree_of(points), points.mean(0, keepdims=True)
     for track, shape in objects:
         at_s = track.seen_at(batch.time_ns)
-        if np.isfinite(tree.nearest(track.place(shape.points, at_s), _BESIDE_M)[0]).any():
+        if is_near(tree, track.place(shape.points, at_s), _BESIDE_M).any():
             yield track.velocity_m_s(middle, at_s)[0]
 
 

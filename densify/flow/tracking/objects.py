@@ -9,14 +9,14 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial import ConvexHull, QhullError
+from scipy.spatial import ConvexHull, QhullError, cKDTree
 
 from densify.flow.surface_matching import apply, undo
 from densify.flow.tracking.candidates import Batch, Obstacles
 from densify.flow.tracking.paths import Path
-from densify.free_space.height_map import HeightMap
+from densify.free_space.ground import HeightMap
 from densify.free_space.seen_through import FreeSpace
-from densify.geometry.nearest import BoxTree
+from densify.geometry.nearest import is_near, tree_of
 from densify.geometry.types import Bool, Float, Int
 
 _MANY_POINTS = 100  # more do not locate an object better
@@ -69,7 +69,7 @@ class Track:
         self.path = Path.fit(times_s, states, weights)
 
     def place(self, points: Float, time_s: float | Float) -> Float:
-        """Move (N,3) points from the object's own frame to the world at a time, or one time each."""
+        """Move (N,3) points from the object's frame to the world at a time, or at one time each."""
         return apply(self.path(time_s), points, self.centre)
 
     def undo(self, points: Float, time_s: float | Float) -> Float:
@@ -138,7 +138,7 @@ class Shape:
     """
 
     points: Float
-    tree: BoxTree
+    tree: cKDTree
     rim: Float
     edges: Float
 
@@ -148,10 +148,10 @@ class Shape:
         try:
             hull = ConvexHull(points[:, :2])
         except (QhullError, ValueError):  # too few points, or all on a line
-            return Shape(points, BoxTree(points), points, np.zeros((0, 3)))
+            return Shape(points, tree_of(points), points, np.zeros((0, 3)))
         z = points[:, 2]
         rim = points[[*hull.vertices, z.argmin(), z.argmax()]]
-        return Shape(points, BoxTree(points), rim, hull.equations)
+        return Shape(points, tree_of(points), rim, hull.equations)
 
     def within_outline(self, points: Float) -> Bool:
         """Return (N,) True for (N,3) points inside the outline, seen from above."""
@@ -162,7 +162,7 @@ class Shape:
 
     def near(self, points: Float, within_m: float) -> Bool:
         """Return (N,) True for (N,3) points within the outline or closer than ``within_m``."""
-        return np.isfinite(self.tree.nearest(points, within_m)[0]) | self.within_outline(points)
+        return is_near(self.tree, points, within_m) | self.within_outline(points)
 
     @cached_property
     def side_rad(self) -> float:

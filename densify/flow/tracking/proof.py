@@ -17,7 +17,7 @@ from densify.flow.tracking.candidates import Obstacles
 from densify.flow.tracking.objects import MovingObject, Track
 from densify.flow.tracking.radial import Radial
 from densify.free_space.seen_through import FreeSpace
-from densify.geometry.nearest import BoxTree
+from densify.geometry.nearest import is_near, nearest, tree_of
 from densify.geometry.types import Float
 
 _LEAST_STATES, _LEAST_S = 3, 0.15
@@ -31,6 +31,7 @@ _LEAST_VIOLATIONS, _SHARE_OF_FEW, _LEAST_SHARE = 20, 0.08, 0.01
 _MAX_LEFT, _MAX_LEFT_OF_LIMBS, _FAR_M = 0.3, 0.5, 3.0
 _FEW, _MAX_LEFT_OF_FEW = 0.2, 0.1  # fewer violations than this share prove less
 _SHORT_S, _MAX_LEFT_OF_SHORT = 0.35, 0.03  # three positions of a tree's crown may lie on a line
+_RAIL_M, _SLENDER, _ALONG, _SHARE_OF_RAIL = 2.0, 8.0, 0.7, 0.3
 _LEFT_M = 0.6  # from all of the object
 _ROOM_M, _ROOM_S = 2.0, 0.5  # in front of and behind the object, by its speed
 _THERE_M, _THERE_PER_GAP = 0.2, 0.5
@@ -131,6 +132,33 @@ def count_violations(
     return static, moved, num_tests
 
 
+def is_rail(
+    track: Track,
+    obstacles: Sequence[Obstacles],
+    space: FreeSpace,
+    objects: Sequence[MovingObject],
+) -> bool:
+    """Return True if the track may be a guard rail: long, low, moving along itself, with few
+    violations if static, and not leaving its positions empty.
+
+    Nothing of a rail tells its motion along itself. Between two rings, sweeps see through it.
+    """
+    points = track.points_in(obstacles, track.claimed)
+    points -= points.mean(axis=0)
+    _, axes = np.linalg.eigh(points[:, :2].T @ points[:, :2])
+    along_m = points[:, :2] @ axes[:, 1]
+    way = (track.path(track.path.end_s) - track.path(track.path.begin_s))[:2]
+    slope = along_m @ points[:, 2] / max(float(along_m @ along_m), 1e-6)
+    high_m = float(np.subtract(*np.percentile(points[:, 2] - slope * along_m, [90, 10])))
+    long_m = float(np.ptp(along_m))
+    if long_m < max(_RAIL_M, _SLENDER * high_m) or abs(way @ axes[:, 1]) < _ALONG * np.hypot(*way):
+        return False
+    static, _, num_tests = count_violations(track, obstacles, space)
+    if static >= _SHARE_OF_RAIL * num_tests:
+        return False
+    return not find_places_left(track, obstacles, space, objects).mostly_empty()
+
+
 class Places(NamedTuple):
     """How often another return was at a position of the object, and how often it was empty."""
 
@@ -174,11 +202,11 @@ def find_places_left(
     """Count what other sweeps observed at the positions of the track.
 
     A wire fence is seen through from beside and not from ahead. The border between the two moves
-    along the fence with the scanner, but the fence stays where it is. Returns of the other confirmed
+    along the fence with the scanner, but the fence stays where it is. Returns of other confirmed
     objects do not count.
     """
     some = {i: rows[:: len(rows) // _NUM_ASKED + 1] for i, rows in track.claimed.items()}
-    tree = BoxTree(track.points_in(obstacles, track.claimed))
+    tree = tree_of(track.points_in(obstacles, track.claimed))
     rate = track.path.rate((track.path.begin_s + track.path.end_s) / 2)
     room_m = _ROOM_M + _ROOM_S * float(np.linalg.norm(rate[:2]))
     there_m = max(_THERE_M, _THERE_PER_GAP * space.gap_m(track.centre, next(iter(track.claimed))))
@@ -186,7 +214,7 @@ def find_places_left(
     def count(batch: tuple[int, ...], sweeps: Sequence[int]) -> Places:
         places = np.concatenate([np.zeros((0, 3)), *(obstacles[i].points[some[i]] for i in sweeps)])
         in_object = track.undo(places, space.clock.time_s[batch[0]])
-        away_m, _ = tree.nearest(in_object, room_m)
+        away_m, _ = nearest(tree, in_object, room_m)
         places = places[(away_m > _LEFT_M) & np.isfinite(away_m)]
         if not len(places):
             return Places(0, 0)
@@ -195,7 +223,7 @@ def find_places_left(
         )
         taken = np.zeros(len(places), bool)
         if len(returns):
-            taken = np.isfinite(BoxTree(returns).nearest(places, there_m)[0])
+            taken = is_near(tree_of(returns), places, there_m)
         empty = space.seen_through(places, batch[0]) & ~taken
         return Places(int(taken.sum()), int(empty.sum()))
 
@@ -213,7 +241,7 @@ def _returns_near(
 ) -> Float:
     """Return (N,3) the points of a sweep close to some positions, without those of the objects."""
     rows = c.strips.rows_inside(places.min(0) - reach_m, places.max(0) + reach_m)
-    rows = rows[np.isfinite(BoxTree(places).nearest(c.points[rows], reach_m)[0])]
+    rows = rows[is_near(tree_of(places), c.points[rows], reach_m)]
     for track, shape in objects:
         if len(rows):
             rows = rows[~shape.near(track.undo(c.points[rows], c.time_s[rows]), _LEFT_M)]

@@ -17,8 +17,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.sparse import coo_array, csr_array, diags_array
 from scipy.sparse.linalg import cg
-from scipy.spatial import cKDTree
 
+from densify.geometry.nearest import nearest, nearest_k, tree_of
 from densify.geometry.types import Float, Int
 
 _ALPHAS = tuple(np.geomspace(100.0, 0.5, 7).tolist())  # from stiff to soft
@@ -152,8 +152,8 @@ def _held_out(parts: tuple[Part, ...]) -> Float:
 
 def _squared_distance(a: Float, b: Float) -> float:
     """Return the mean of the squared, capped distances to the other cloud's nearest points."""
-    there = np.minimum(cKDTree(b).query(a)[0], _CAP_M)
-    back = np.minimum(cKDTree(a).query(b)[0], _CAP_M)
+    there = np.minimum(nearest(tree_of(b), a)[0], _CAP_M)
+    back = np.minimum(nearest(tree_of(a), b)[0], _CAP_M)
     return float((there**2).mean() + (back**2).mean()) / 2
 
 
@@ -177,7 +177,7 @@ class _Bending:
         self._start = np.cumsum([0] + [len(self._nodes[a]) for a, _ in self._hops])
         self._source = self._side_by_side([self._nodes[a] for a, _ in self._hops])
         self._laplacian = _laplacian(self._source)
-        self._around = _nearest(self._source, self._source, _NUM_BLURRED)
+        self._around = nearest_k(tree_of(self._source), self._source, _NUM_BLURRED)[1]
         self._steady = self._steadiness()
         self._flow = np.zeros_like(self._source)
         self._target = self._side_by_side([self._nodes[b] for _, b in self._hops])
@@ -185,7 +185,7 @@ class _Bending:
     def refine(self, level: int) -> None:
         """Find the targets anew and solve, at the stiffness of a level."""
         moved = self._source + self._flow
-        near = _nearest(self._target, moved, _NUM_BLURRED)
+        near = nearest_k(tree_of(self._target), moved, _NUM_BLURRED)[1]
         there, distance_m = _blurred(self._target, near, moved, _BLURS_M[level])
         own, _ = _blurred(moved, self._around, moved, _BLURS_M[level])
         weight = np.clip(1 - (distance_m / _REACHES_M[level]) ** 2, 0, 1) ** 2  # Tukey
@@ -263,7 +263,7 @@ def _laplacian(points: Float) -> csr_array:
     within 0.5 m; 1 on the diagonal.
     """
     n = len(points)
-    distance_m, near = cKDTree(points).query(points, np.arange(1, min(_NUM_NEIGHBORS + 1, n) + 1))
+    distance_m, near = nearest_k(tree_of(points), points, _NUM_NEIGHBORS + 1)
     row, rank = np.nonzero(distance_m <= _LINK_M)
     weights = coo_array(
         (np.exp(-(distance_m[row, rank] ** 2)), (row, near[row, rank])), shape=(n, n)
@@ -294,12 +294,6 @@ def _one_per_voxel(points: Float) -> Int:
     return np.sort(np.unique(voxel, axis=0, return_index=True)[1]).astype(np.int64)
 
 
-def _nearest(points: Float, at: Float, num_neighbors: int) -> Int:
-    """Return (N,k) rows of the points nearest to each of (N,d) positions, k at most their number."""
-    ranks = np.arange(1, min(num_neighbors, len(points)) + 1)
-    return np.asarray(cKDTree(points, balanced_tree=False).query(at, ranks)[1], np.int64)
-
-
 def _blurred(points: Float, near: Int, at: Float, blur_m: float) -> tuple[Float, Float]:
     """Return (N,3) the Gaussian-weighted mean of ``points[near]`` around each position, and (N,)
     the distance to the nearest of them."""
@@ -318,7 +312,7 @@ def _look_up(at: Float, came: Float, points: Float, known_came: Float, values: F
     at, came: (N,3). points, known_came, values: (M,3). Legs that cross differ in the way they came.
     """
     known, asked = np.hstack([points, known_came]), np.hstack([at, came])
-    near = _nearest(known, asked, _NUM_LOOKED_UP)
+    near = nearest_k(tree_of(known), asked, _NUM_LOOKED_UP)[1]
     distance_m = np.linalg.norm(known[near] - asked[:, None], axis=2)
     weight = 1 / (distance_m + 1e-3) ** 2
     weight /= weight.sum(axis=1, keepdims=True)

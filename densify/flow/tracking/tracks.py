@@ -13,9 +13,11 @@ from dataclasses import replace
 from itertools import chain
 
 import numpy as np
+from scipy import ndimage
 
 from densify.flow.surface_matching import Model
-from densify.flow.tracking.candidates import Batch, Obstacles, height_weight
+from densify.flow.tracking.candidates import LINK_M, Batch, Obstacles, height_weight
+from densify.flow.tracking.extent import columns_apart_m
 from densify.flow.tracking.following import (
     MIN_POINTS,
     Follower,
@@ -24,11 +26,14 @@ from densify.flow.tracking.following import (
     velocities_beside,
 )
 from densify.flow.tracking.objects import MovingObject, Shape, Track
-from densify.flow.tracking.proof import find_places_left, violations_left
+from densify.flow.tracking.proof import find_places_left, is_rail, violations_left
 from densify.flow.tracking.vote import DistanceField, Group, vote
 from densify.free_space.ground import HeightMap
 from densify.free_space.seen_through import FreeSpace
+from densify.free_space.sensor import Sensors
+from densify.geometry import poses
 from densify.geometry.clock import Clock
+from densify.geometry.linking import link
 from densify.geometry.types import Bool, Float, Int
 
 _FIT_M = 0.3
@@ -38,6 +43,9 @@ _CLEARLY = 0.5  # of the violations of another motion
 _DOUBTFUL = 0.0025  # share of violations from which on a track is followed from its ends too
 _AS_WHOLE = 0.9  # of its points
 _MOSTLY = 0.5
+_AHEAD_M, _SIDE_M = 15.0, 0.1
+_COLUMNS_IN_GAP, _GAPS_IN_LINE_M = 2.0, (1.5, 4.0)
+_ONE_RING, _ONE_COLUMN = 0.5, 2.5  # spread of one, in steps of rings and of columns
 
 
 def find_tracks(
@@ -136,11 +144,14 @@ class _Search:
         confirmed = bool(np.isfinite(left))
         if confirmed:
             self._gather(track)
+            # A piece of a guard rail is recognised by the rest of it.
+            confirmed = not is_rail(track, self._obstacles, self._space, self._objects)
         if confirmed and weights[0] < 1.0:  # rings glide over parked cars the more easily then
             left_places = find_places_left(track, self._obstacles, self._space, self._objects)
             confirmed = left_places.mostly_empty()
         if confirmed:
             _refine(track, self._obstacles, self._ground)
+            self._claim_in_line(track)
         return track, confirmed
 
     def _take(self, track: Track) -> None:
@@ -193,14 +204,80 @@ class _Search:
             c = self._obstacles[j]
             there = track.place(shape.rim, track.seen_at(self._space.clock.time_ns[j]))
             rows = c.strips.rows_inside(there.min(0) - 2 * _FIT_M, there.max(0) + 2 * _FIT_M)
-            rows = rows[self._free[j][rows] & (c.cluster[rows] >= 0)]
-            rows = np.setdiff1d(rows, own, assume_unique=True)
+            rows = self._unclaimed(j, rows, own)
             rows = rows[shape.near(track.undo(c.points[rows], c.time_s[rows]), _FIT_M)]
-            for i in self._space.others(j):
-                if self._space.clock.near(i, j, _NEAR_S) and len(rows):
-                    in_object = track.undo(c.points[rows], c.time_s[rows])
-                    rows = rows[~track.seen_through(in_object, i, self._space)]
-            track.claimed[j] = np.concatenate([own, rows])
+            track.claimed[j] = np.concatenate([own, self._without_violations(track, j, rows)])
+
+    def _claim_in_line(self, track: Track) -> None:
+        """Claim the free clusters of single rings and columns ahead of and behind the object.
+
+        On a roof, or a side that falls away from the scanner, they lie too far apart to be linked.
+        Tracked alone, such a cluster would stay where the rays are.
+        """
+        space = self._space
+        shape = Shape.of(track.points_in(self._obstacles, sorted(track.claimed)))
+        ahead = MovingObject(track, shape).heading(next(iter(track.observations.values())).seen_s)
+        across = np.array([-ahead[1], ahead[0]])
+        aside = shape.rim[:, :2] @ across
+        found, parts = {}, [shape.points]
+        for j, own in track.claimed.items():
+            c, T_lidar_world = self._obstacles[j], space.T_lidar_world[j]
+            there = track.place(shape.rim, track.seen_at(space.clock.time_ns[j]))
+            rows = c.strips.rows_inside(there.min(0) - _AHEAD_M, there.max(0) + _AHEAD_M)
+            rows = self._unclaimed(j, rows, own)
+            rows = rows[_few_rays(c, rows, T_lidar_world, space.sensors)]
+            points = track.undo(c.points[rows], c.time_s[rows])
+            side = points[:, :2] @ across
+            fits = (side > aside.min() - _SIDE_M) & (side < aside.max() + _SIDE_M)
+            fits &= points[:, 2] < shape.rim[:, 2].max() + _SIDE_M
+            found[j] = self._without_violations(track, j, rows[fits])
+            parts.append(track.undo(c.points[found[j]], c.time_s[found[j]]))
+        j = next(iter(track.claimed))
+        columns_m = columns_apart_m(track.centre, ahead, space.T_lidar_world[j], space.sensors)
+        gap_m = float(np.clip(_COLUMNS_IN_GAP * columns_m, *_GAPS_IN_LINE_M))
+        points = np.concatenate(parts)
+        points[:, :2] -= (1 - LINK_M / gap_m) * (points[:, :2] @ ahead)[:, None] * ahead
+        _, group = link(points, LINK_M)
+        linked = np.isin(group, group[: len(shape.points)])
+        ends = np.cumsum([len(part) for part in parts])
+        for (j, rows), together in zip(found.items(), np.split(linked, ends)[1:-1], strict=True):
+            track.claimed[j] = np.concatenate([track.claimed[j], rows[together]])
+
+    def _unclaimed(self, j: int, rows: Int, own: Int) -> Int:
+        """Return the free candidates among rows of sweep j, without the track's own."""
+        rows = rows[self._free[j][rows] & (self._obstacles[j].cluster[rows] >= 0)]
+        return np.setdiff1d(rows, own, assume_unique=True)
+
+    def _without_violations(self, track: Track, j: int, rows: Int) -> Int:
+        """Return the rows of sweep j that no sweep close in time sees through, once moved."""
+        c = self._obstacles[j]
+        for i in self._space.others(j):
+            if self._space.clock.near(i, j, _NEAR_S) and len(rows):
+                in_object = track.undo(c.points[rows], c.time_s[rows])
+                rows = rows[~track.seen_through(in_object, i, self._space)]
+        return rows
+
+
+def _few_rays(c: Obstacles, rows: Int, T_lidar_world: Float, sensors: Sensors) -> Bool:
+    """Return (N,) True where the cluster of a row is hit by one ring, or one column, only."""
+    if not len(rows):
+        return np.zeros(0, bool)
+    clusters, of_row = np.unique(c.cluster[rows], return_inverse=True)
+    members = np.flatnonzero(np.isin(c.cluster, clusters))
+    label, in_lidar = c.cluster[members], poses.transform(T_lidar_world, c.points[members])
+
+    def spread(values: Float) -> Float:
+        low, high = (f(values, label, clusters) for f in (ndimage.minimum, ndimage.maximum))
+        return np.asarray(high) - np.asarray(low)
+
+    range_m = np.linalg.norm(in_lidar, axis=1)
+    ring_rad = ndimage.minimum(sensors.finest_gap_m(in_lidar) / range_m, label, clusters)
+    column_rad = min(model.azimuth_step_rad for model in sensors.models.values())
+    x, y = in_lidar[:, :2].mean(axis=0)
+    azimuth_rad = np.arctan2(in_lidar[:, :2] @ [-y, x], in_lidar[:, :2] @ [x, y])
+    single = spread(np.arcsin(in_lidar[:, 2] / range_m)) < _ONE_RING * np.asarray(ring_rad)
+    single |= spread(azimuth_rad) < _ONE_COLUMN * column_rad
+    return np.asarray(single[of_row.ravel()])
 
 
 def _best_of(tried: Iterable[tuple[Track, float | None]]) -> tuple[Track, float]:

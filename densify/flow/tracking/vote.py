@@ -8,10 +8,11 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from densify.geometry.clock import Clock
 from densify.geometry.compiled import Kernel
-from densify.geometry.nearest import BoxTree
+from densify.geometry.nearest import nearest, tree_of
 from densify.geometry.types import Float, Int
 
 Bytes = NDArray[np.uint8]
@@ -34,7 +35,7 @@ class DistanceField:
 
     nearness: Bytes
     low: Float
-    tree: BoxTree | None
+    tree: cKDTree | None
     time_s: Float
 
     @staticmethod
@@ -51,7 +52,7 @@ class DistanceField:
         far = np.linalg.norm(offsets, axis=1) * _STEP_M / _REACH_M
         values = (255 - np.round(255 * far[far < 1])).astype(np.uint8)
         _spread(points, low, _STEP_M, offsets[far < 1], values, nearness)
-        return DistanceField(nearness, low, BoxTree(points), time_s)
+        return DistanceField(nearness, low, tree_of(points), time_s)
 
     def raise_to(self, found: Bytes, group: Group, velocities: Float) -> None:
         """Raise ``found`` (V,N), in place, to the nearness of the group's N points, moved with each
@@ -60,7 +61,7 @@ class DistanceField:
             return
         elapsed_s = np.zeros(len(velocities))
         for _ in range(_TIMES_ASKED):
-            _, row = self.tree.nearest(group.middle + elapsed_s[:, None] * velocities)
+            _, row = nearest(self.tree, group.middle + elapsed_s[:, None] * velocities)
             elapsed_s = self.time_s[row] - group.middle_s
         _look_up.over_rows(
             len(velocities),
@@ -145,7 +146,9 @@ def _grid(n: int) -> Float:
 
 
 @Kernel
-def _spread(points: Float, low: Float, step: float, offsets: Int, values: Bytes, grid: Bytes) -> None:
+def _spread(
+    points: Float, low: Float, step: float, offsets: Int, values: Bytes, grid: Bytes
+) -> None:
     """Raise the cells of ``grid`` around each of (N,3) points to the (K,) values, in place.
 
     low: (3,) corner of the grid. step: side of a cell. offsets: (K,3) cells from the point's own.
