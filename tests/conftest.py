@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import gc
 import os
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -38,6 +39,13 @@ LONGEST = (
 )
 """Files of tests that take long begin, so that no process works on one while the others wait at the
 end. What simulates stands beside what compiles; what compiles the same stands apart."""
+
+
+def pytest_configure() -> None:
+    """Steps that earlier code left in a given cache are made again; their versions stay the same
+    while somebody works on them."""
+    if "PYTEST_XDIST_WORKER" not in os.environ and "DENSIFY_CACHE_DIR" in os.environ:
+        shutil.rmtree(Path(os.environ["DENSIFY_CACHE_DIR"]) / "steps", ignore_errors=True)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

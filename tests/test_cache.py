@@ -127,7 +127,7 @@ def test_once_for_everybody_and_each_version(tmp_path: Path, monkeypatch) -> Non
     assert [get(Cache(LIMIT, tmp_path)) for _ in range(3)] == [1, 0, 0]
     assert get(Cache(LIMIT, tmp_path), 2) == 1
     assert get(Cache(LIMIT, tmp_path / "other")) == 1
-    monkeypatch.setattr(cache_module, "_STEPS", cache_module._STEPS.replace("far 1", "far 2"))
+    monkeypatch.setattr(cache_module, "_STEP_VERSIONS", cache_module._STEP_VERSIONS.replace("far 1", "far 2"))
     assert [get(Cache(LIMIT, tmp_path)) for _ in range(2)] == [1, 0]
 
 
@@ -159,7 +159,7 @@ def test_damaged_and_foreign_entries_are_made_again(tmp_path: Path, monkeypatch,
     assert not (tmp_path / "planted").exists() and not caplog.records
 
 
-def test_what_was_used_longest_ago_goes_first(tmp_path: Path) -> None:
+def test_what_was_used_longest_ago_goes_first(tmp_path: Path, monkeypatch) -> None:
     cache = Cache(LIMIT, tmp_path)
     for inputs in range(6):
         get(cache, inputs)
@@ -174,6 +174,9 @@ def test_what_was_used_longest_ago_goes_first(tmp_path: Path) -> None:
     assert len(list(tmp_path.iterdir())) == 6
     Cache(int(2.5 * one), tmp_path).trim()
     assert [get(cache, inputs) for inputs in (2, 4, 3, 0)] == [0, 0, 1, 1]
+    monkeypatch.setattr(cache_module, "_MOST_ENTRIES", 1)
+    cache.trim()
+    assert len(list(tmp_path.iterdir())) == 1
     Cache(0, tmp_path).trim()
     assert list(tmp_path.iterdir()) == []
 

@@ -28,7 +28,8 @@ T = TypeVar("T")
 _log = logging.getLogger("densify")
 # Raise a step's number when it makes something else of the same inputs. Steps build on each other,
 # so an entry depends on all of them.
-_STEPS = "bag 1, digests 1, registration 1, images 1, ground 1, evidence 1, motion 1, far 1"
+_STEP_VERSIONS = "bag 1, digests 1, registration 1, images 1, ground 1, evidence 1, motion 1, far 1"
+_MOST_ENTRIES = 10_000
 _field_types = functools.cache(typing.get_type_hints)
 
 
@@ -46,7 +47,7 @@ class Cache:
     def get(self, step: str, kind: type[T], inputs: Any, make: Callable[[], T]) -> T:
         """Return what ``make`` returns, now or when it was made of the same inputs before. kind:
         its type, by which an entry is read. inputs: all that it depends on, as `digest` takes."""
-        path = self._folder / f"{step}-{digest((__version__, _STEPS, inputs))}.npz"
+        path = self._folder / f"{step}-{digest((__version__, _STEP_VERSIONS, inputs))}.npz"
         try:
             with np.load(path, allow_pickle=False) as arrays:
                 value: T = _unpacked(json.loads(arrays["json"].tobytes()), kind, arrays)
@@ -69,8 +70,8 @@ class Cache:
         with suppress(OSError):  # another process deletes too
             entries = [(e.stat().st_mtime_ns, e, e.stat().st_size) for e in self._folder.iterdir()]
             left = sum(num_bytes for *_, num_bytes in entries)
-            for _, entry, num_bytes in sorted(entries):
-                if left > self._limit_bytes:
+            for number, (_, entry, num_bytes) in enumerate(sorted(entries)):
+                if left > self._limit_bytes or len(entries) - number > _MOST_ENTRIES:
                     entry.unlink()
                     left -= num_bytes
 
@@ -134,9 +135,8 @@ def _unpacked(tree: Any, kind: Any, arrays: Mapping[str, np.ndarray]) -> Any:
     made, of = typing.get_origin(kind) or kind, typing.get_args(kind)
     if issubclass(made, Mapping):
         return {_unpacked(k, of[0], arrays): _unpacked(v, of[1], arrays) for k, v in tree}
-    names = [f.name for f in fields(made)] if is_dataclass(made) else getattr(made, "_fields", ())
-    if names:
-        of = tuple(_field_types(made)[name] for name in names)
+    if names := _field_types(made):  # of a dataclass or named tuple
+        of = tuple(names.values())
     elif len(of) == 1 or of[1] is ...:
         of = (of[0],) * len(tree)
     parts = [_unpacked(part, k, arrays) for part, k in zip(tree, of, strict=True)]
