@@ -89,10 +89,10 @@ class Gate:
 class Recipe:
     """How every key of a set is made.
 
-    window: sweeps on each side of a key. method: flow, icp or none. layout: ``kitti-depth``,
-    KITTI's depth tree, or ``densify``, what ``densify run`` writes. cameras: names, None for all.
-    split: train or val, None for KITTI's official one. gate: what puts keys aside. config: such as
-    `densify.config.resolve` makes of a preset's name, a file or a mapping.
+    window: sweeps on each side of a key. method: flow, icp or none.
+    layout: ``kitti-depth``, KITTI's depth tree, or ``densify``, what ``densify run`` writes.
+    cameras: names, None for all. split: train or val, None for KITTI's official one.
+    gate: limits of the scores. config: what `densify.config.resolve` returns.
     """
 
     window: int = 5
@@ -222,7 +222,7 @@ def write_plan(out: Path, recipe: Recipe, drives: Sequence[PlannedDrive]) -> Non
 
 
 def read_plan(out: Path) -> dict[str, Any] | None:
-    """dataset.json, None where there is none. Raises InputError for a damaged or foreign one."""
+    """Return dataset.json; None if there is none. Raises InputError for a damaged one."""
     path = out / _FILE
     if not path.is_file():
         return None
@@ -231,12 +231,10 @@ def read_plan(out: Path) -> dict[str, Any] | None:
         if not isinstance(table, dict):
             raise TypeError("it holds no mapping")
         if table["schema_version"] == SCHEMA_VERSION:
-            (
-                stored_drives(table),
-                planned_keys(table),
-                table["config"].items(),
-                table["gate"].items(),
-            )
+            stored_drives(table)
+            planned_keys(table)
+            if not all(isinstance(table[part], dict) for part in ("config", "gate")):
+                raise TypeError("got no mapping where one is expected")
             return {name: table[name] for name in ("schema_version", *_SAME, "drives")}
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         told = f"it has no {error.args[0]}" if isinstance(error, KeyError) else str(error)
