@@ -258,12 +258,6 @@ def test_thresholds_leave_exactly_these_points(run: Path, confidence: float, age
     assert exported.num_points == (NUM_POINTS, keep.sum()) and 0 < keep.sum() < NUM_POINTS
 
 
-@pytest.mark.parametrize("to", ["ply", "pcd"])
-def test_a_cloud_of_no_points(to: str, run: Path) -> None:
-    write_cloud(run / "cloud.laz", cloud_of(0), KEY_NS)
-    assert export_run(run, to).num_points == (0, 0)
-
-
 # --- bad input ------------------------------------------------------------------------------------
 
 

@@ -166,13 +166,6 @@ def test_cameras_that_nerfstudio_lacks(put, lenses, measure: str, words: str) ->
     refused(words, "--camera" if measure == "z" else "project.depth=z", run=run, to="nerfstudio")
 
 
-def test_a_fisheye_in_nerfstudio(put) -> None:
-    table = transforms(put({"image_02": "fisheye"})[0])
-    assert table["camera_model"] == "OPENCV_FISHEYE"
-    lens = [table["frames"][0][k] for k in ("k1", "k2", "k3", "k4")]
-    assert lens == [0.02, -0.01, 0.003, -0.0004]
-
-
 # --- splats ---------------------------------------------------------------------------------------
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from densify.config.errors import InputError
-from densify.outputs import read_cloud, write_cloud
+from densify.outputs import read_cloud
 from densify.outputs.report import film
 from tests.command import refused
 from tests.report_runs import results, write_run
@@ -46,15 +46,16 @@ def test_the_trail_collapses_and_sweeps_fill(run: Path) -> None:
     assert 4 < sum(seconds for _, seconds in pictures) < 12
 
 
-@pytest.mark.parametrize(("suffix", "coarse"), [(".gif", 15), (".webp", 6)])  # 256 colours
-def test_every_kind_can_be_played(suffix: str, coarse: float, run: Path, tmp_path: Path) -> None:
-    path = tmp_path / "new" / f"film{suffix}"
-    film.write_film(run, path)
-    frames = frames_of(path)
-    first = next(film._pictures(read_cloud(run / "cloud.laz")))[0]
-    assert frames[0].shape == first.shape and len(frames) >= 20
-    assert np.abs(frames[0].astype(int) - first).mean() < coarse
-    assert path.stat().st_size < 3_000_000
+def test_both_kinds_can_be_played(run: Path, tmp_path: Path, monkeypatch) -> None:
+    pictures = list(film._pictures(read_cloud(run / "cloud.laz")))
+    monkeypatch.setattr(film, "_pictures", lambda _: pictures)
+    for suffix, coarse in ((".gif", 15), (".webp", 6)):  # 256 colours
+        path = tmp_path / "new" / f"film{suffix}"
+        film.write_film(run, path)
+        frames = frames_of(path)
+        assert frames[0].shape == pictures[0][0].shape and len(frames) >= 20
+        assert np.abs(frames[0].astype(int) - pictures[0][0]).mean() < coarse
+        assert path.stat().st_size < 3_000_000
 
 
 def test_what_cannot_be_filmed(run: Path, tmp_path: Path, capsys) -> None:
@@ -67,10 +68,3 @@ def test_what_cannot_be_filmed(run: Path, tmp_path: Path, capsys) -> None:
     with pytest.raises(InputError, match="cannot be read"):
         film.write_film(tmp_path, tmp_path / "film.gif")
     assert not (tmp_path / "film.gif").exists()
-
-
-def test_a_run_in_which_nothing_moves(tmp_path: Path) -> None:
-    cloud = results()["flow"].cloud
-    write_cloud(tmp_path / "cloud.laz", cloud.select(~cloud.moving))
-    film.write_film(tmp_path, tmp_path / "film.webp")
-    assert frames_of(tmp_path / "film.webp")

@@ -123,17 +123,12 @@ def test_values_that_are_no_depth_confidence_or_age(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("kind", ["absent", "text", "8 bit", "colour"])
-def test_files_that_are_no_depth_map(tmp_path, kind):
-    path = tmp_path / "a.png"
-    if kind == "text":
-        path.write_bytes(b"hello")
-    elif kind != "absent":
-        shape, dtype = ((4, 4), np.uint8) if kind == "8 bit" else ((4, 4, 3), np.uint16)
-        cv2.imwrite(str(path), np.zeros(shape, dtype))
+@pytest.mark.parametrize("image", [np.zeros((4, 4), np.uint8), np.zeros((4, 4, 3), np.uint16)])
+def test_images_that_are_no_depth_map(tmp_path, image):
+    cv2.imwrite(str(tmp_path / "a.png"), image)
     with pytest.raises(InputError) as error:
-        read_depth_png(path)
-    one_line(error, path)
+        read_depth_png(tmp_path / "a.png")
+    one_line(error, tmp_path / "a.png")
 
 
 def test_the_official_depth_map_reencodes_to_the_same_pixels(tmp_path, test_data):

@@ -17,7 +17,7 @@ from densify.dataset.report import write_report
 from densify.outputs import export_run
 from densify.readers.decoded_files import decode_image
 from tests.browser import Opened, chromium
-from tests.report_runs import results, write_compared, write_run
+from tests.report_runs import results, write_run
 
 
 @pytest.fixture(scope="module")
@@ -178,41 +178,6 @@ def test_the_trail_collapses(opened: Opened) -> None:
         opened.page.wait_for_timeout(400)
         lengths.append(np.ptp(np.flatnonzero(foreground(opened).any(axis=1))))
     assert lengths[0] > 1.4 * lengths[1] > 0
-
-
-def test_every_control_has_a_name_and_is_reached_by_tab(opened: Opened) -> None:
-    unnamed = opened.value(
-        """[...document.querySelectorAll("input, select, button, [tabindex], summary, [role=img]")]
-        .filter((e) => !(e.getAttribute("aria-label") || e.closest("label") || e.textContent.trim()
-          || e.querySelector("title") || e.hidden)).map((e) => e.outerHTML)"""
-    )
-    assert unnamed == []
-    reached = set()
-    for _ in range(60):
-        opened.page.keyboard.press("Tab")
-        reached.add(opened.value("document.activeElement.id"))
-    assert {
-        "camera",
-        "left",
-        "right",
-        "picture",
-        "split",
-        "confidence",
-        "age",
-        "colouring",
-    } <= reached
-    assert {"morph", "morph-play", "sweep", "space", "turn", "copy"} <= reached
-
-
-def test_a_comparison(browser: Any, tmp_path: Path) -> None:
-    folder = write_compared(tmp_path)
-    page = Opened(browser, write_report(folder)[0])
-    assert page.text("h1") == "tiny street, key 3: none, icp, flow"
-    assert page.problems() == page.told == page.foreign() == []
-    layers = page.value("[...document.getElementById('left').options].map((o) => o.value)")
-    assert {"none", "icp", "measured", "filled", "truth"} <= {*layers}
-    assert drawn(page) > 0.05
-    page.page.close()
 
 
 def test_a_damaged_run_says_what_is_damaged(browser: Any, run: Path, tmp_path: Path) -> None:

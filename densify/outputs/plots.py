@@ -103,19 +103,9 @@ def draw_arrows(points: Float, flows: Mapping[str, Float]) -> Figure:
         moves = np.linalg.norm(flow[:, :2], axis=1) >= _LEAST_FLOW_M
         axes.scatter(points[~moves, 1], points[~moves, 0], s=2, color="0.6", linewidths=0)
         x, y, u, v = points[moves, 1], points[moves, 0], flow[moves, 1], flow[moves, 0]
-        arrows = axes.quiver(
-            x,
-            y,
-            u,
-            v,
-            np.arctan2(v, u),
-            angles="xy",
-            scale_units="xy",
-            scale=1 / _ARROW_LENGTH,
-            width=0.003,
-            cmap="hsv",
-        )
+        arrows = axes.quiver(x, y, u, v, np.arctan2(v, u), cmap="hsv", angles="xy", width=0.003)
         arrows.set_clim(-np.pi, np.pi)
+        arrows.scale, arrows.scale_units = 1 / _ARROW_LENGTH, "xy"
         axes.set(title=title, aspect="equal", xlabel="y, m", ylabel="x, m")
         axes.set(xlim=(_HALF_M, -_HALF_M), ylim=(-_HALF_M, _HALF_M))
     return figure
