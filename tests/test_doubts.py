@@ -13,7 +13,7 @@ from densify.geometry.types import Camera
 from densify.outputs import write_result
 from densify.pipeline.run import run
 from densify.readers.kitti.raw import KittiRaw
-from densify.readers.window import choose_cameras
+from densify.readers.timeline import choose_cameras
 from tests.command import exit_code
 from tests.dataset_scenes import FRAMES, OPTIONS, copy_drive, records
 from tests.scenes import CAMERA, TinySequence, stamp_ns

@@ -39,8 +39,8 @@ from densify.readers.flow_files import load_flow_file
 from densify.readers.kitti.calibration import Stamps
 from densify.readers.kitti.tracking import LabelFile
 from densify.readers.point_files import read_table, read_viewpoint
-from densify.readers.pose_files import PoseFile
 from densify.readers.prior_files import PriorFiles
+from densify.readers.recorded_poses import PoseFile
 from densify.readers.stamp_files import StampFile
 from densify.readers.street import Street
 

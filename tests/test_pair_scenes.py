@@ -13,7 +13,7 @@ from densify.config import RegisterSettings
 from densify.config.errors import InputError
 from densify.flow.pairs.estimate import estimate_flow
 from densify.geometry import poses
-from densify.readers.window import read_sweep
+from densify.readers.timeline import read_sweep
 from densify.registration.deskew import deskew
 from densify.registration.trajectory import find_trajectory
 from tests.scenes import Arc, Box, Scanner, Scene, World, car, street

@@ -15,7 +15,7 @@ from densify.geometry import poses
 from densify.geometry.types import Result
 from densify.pipeline.methods import METHODS
 from densify.pipeline.run import compare, run
-from densify.readers.window import read_sweep
+from densify.readers.timeline import read_sweep
 from densify.scores.cloud_scores import ghosts
 from tests.scenes import CAMERA, SWEEP_S, Arc, Scanner, Scene, TinySequence, World, street
 from tests.small_street import one_car

@@ -13,7 +13,7 @@ from densify.config.errors import ComputationError, InputError
 from densify.dataset.make import make_dataset
 from densify.geometry import poses
 from densify.pipeline.run import compare, run
-from densify.readers.window import read_sweep
+from densify.readers.timeline import read_sweep
 from tests.scenes import TinySequence, by_flow
 from tests.small_street import KEY, POSES_GIVEN, one_car
 

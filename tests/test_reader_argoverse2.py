@@ -17,7 +17,7 @@ from densify.geometry.poses import inverse, transform
 from densify.readers import open_sequence
 from densify.readers.argoverse2 import Argoverse2
 from densify.readers.street import Street
-from densify.readers.window import recorded_trajectory
+from densify.readers.timeline import recorded_trajectory
 from densify.registration.deskew import deskew
 from densify.street.sensors import SENSORS
 from tests.reader_checks import check_cameras, check_depth, check_sweeps, check_truth

@@ -22,7 +22,7 @@ from densify.pipeline import blocks, steps
 from densify.pipeline import run as pipeline
 from densify.pipeline.recording import Recording
 from densify.readers.street import Street
-from densify.readers.window import read_sweep
+from densify.readers.timeline import read_sweep
 from densify.registration.deskew import deskew
 from densify.registration.trajectory import find_trajectory
 from tests.dataset_scenes import BORDER, across_border

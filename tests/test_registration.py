@@ -13,7 +13,7 @@ from densify.config.errors import ComputationError, InputError, SweepError
 from densify.geometry import poses
 from densify.geometry.types import Sweep, Trajectory
 from densify.readers.street import Street
-from densify.readers.window import read_sweep, recorded_trajectory
+from densify.readers.timeline import read_sweep, recorded_trajectory
 from densify.registration.alignment import subsample
 from densify.registration.deskew import deskew
 from densify.registration.odometry import find_odometry, register

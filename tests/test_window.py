@@ -10,8 +10,7 @@ import pytest
 
 from densify.config import RegisterSettings
 from densify.config.errors import InputError
-from densify.readers.timeline import Timeline
-from densify.readers.window import choose_cameras, read_sweep
+from densify.readers.timeline import Timeline, choose_cameras, read_sweep
 from tests.scenes import CAMERA, TinySequence, stamp_ns
 from tests.tiny_street import tiny
 

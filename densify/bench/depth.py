@@ -25,7 +25,7 @@ from densify.pipeline import run as pipeline
 from densify.pipeline.costs import Watch
 from densify.pipeline.methods import METHODS, looks_around
 from densify.pipeline.recording import Recording
-from densify.readers.window import choose_cameras
+from densify.readers.timeline import choose_cameras
 from densify.scores.depth_metrics import image_density, is_outlier_depth
 
 PRODUCTS = ("measured", "filled")

@@ -30,8 +30,7 @@ from densify.outputs.kitti_tree import drive_folder, split_of
 from densify.outputs.plain import plain
 from densify.pipeline.blocks import Cut
 from densify.readers import Spec, open_sequence
-from densify.readers.timeline import Timeline, check_window, format_frames, runs
-from densify.readers.window import choose_cameras
+from densify.readers.timeline import Timeline, check_window, choose_cameras, format_frames, runs
 
 SCHEMA_VERSION = 1
 LAYOUTS = ("kitti-depth", "densify")

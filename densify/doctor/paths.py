@@ -13,7 +13,7 @@ from densify.doctor.findings import Finding, Verdict, fine, suspicious, unknown,
 from densify.doctor.sample import Sample, Spot
 from densify.geometry import poses
 from densify.geometry.types import Float
-from densify.readers.pose_track import PoseTrack
+from densify.readers.recorded_poses import PoseTrack
 
 _LEAST_WAY_M = 1.0
 _OFF_M, _OFF_PER_M, _OFF_DEG = 0.3, 0.1, 2.0  # over a spot of five sweeps

@@ -12,7 +12,7 @@ from densify.doctor.findings import Finding, Verdict, fine, suspicious, unknown,
 from densify.doctor.sample import Sample, Spot
 from densify.free_space.sensor import Sensors
 from densify.geometry.types import Float
-from densify.readers.window import in_range
+from densify.readers.timeline import in_range
 
 _MEDIAN_RANGE_M = (1.5, 60.0)
 _UNITS = {"millimetres": 1e-3, "centimetres": 1e-2, "kilometres": 1e3}

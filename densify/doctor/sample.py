@@ -12,8 +12,7 @@ import numpy as np
 from densify.config import RegisterSettings
 from densify.config.errors import InputError, SweepError
 from densify.geometry.types import Float, LidarSequence, Stretch, Sweep, Trajectory
-from densify.readers.timeline import Timeline
-from densify.readers.window import in_range
+from densify.readers.timeline import Timeline, in_range
 from densify.registration.deskew import deskew
 from densify.registration.trajectory import find_trajectory
 

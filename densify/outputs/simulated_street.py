@@ -28,7 +28,7 @@ from densify.outputs.atomic import staged_folder
 from densify.outputs.png import encode_png
 from densify.readers.file_sequence import camera_named
 from densify.readers.folder.config import NAME
-from densify.readers.pose_track import PoseTrack
+from densify.readers.recorded_poses import PoseTrack
 from densify.readers.street import Street
 from densify.readers.truth_files import write_bodies, write_depth, write_points
 from densify.street.simulator import Bodies

@@ -11,7 +11,7 @@ from pathlib import Path
 from densify.config import Config
 from densify.config.errors import ComputationError, InputError
 from densify.geometry.types import LidarSequence
-from densify.readers.window import choose_cameras
+from densify.readers.timeline import choose_cameras
 
 # Measured on streets: what is loaded; a point of the window, and around it; of one sweep, what
 # comes from beyond the window; a pixel of an image.

@@ -33,7 +33,7 @@ from densify.pipeline.key_result import KeyScene, result_of_method
 from densify.pipeline.methods import COMPARED, METHODS, looks_around, with_baselines
 from densify.pipeline.recording import Recording
 from densify.pipeline.warnings import add_warnings, warn_of_window
-from densify.readers.window import choose_cameras
+from densify.readers.timeline import choose_cameras
 
 if TYPE_CHECKING:
     from densify.readers.prior_files import PriorFiles

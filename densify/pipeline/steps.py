@@ -41,8 +41,7 @@ from densify.pipeline.blocks import Cut
 from densify.pipeline.costs import Watch
 from densify.pipeline.road import Road
 from densify.pipeline.sweeps import Sweeps
-from densify.readers.timeline import Timeline
-from densify.readers.window import recorded_trajectory
+from densify.readers.timeline import Timeline, recorded_trajectory
 from densify.registration.deskew import deskew
 from densify.registration.trajectory import LeftOut, Registration, find_trajectory
 

@@ -12,8 +12,7 @@ from densify.config.cache import Cache, digest, kept
 from densify.config.errors import InputError
 from densify.geometry.types import Float, LidarSequence, MakesFrames, Sweep
 from densify.pipeline.costs import Watch
-from densify.readers.timeline import Timeline
-from densify.readers.window import read_sweep
+from densify.readers.timeline import Timeline, read_sweep
 
 
 class Sweeps:

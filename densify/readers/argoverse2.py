@@ -45,7 +45,7 @@ from densify.readers.file_sequence import (
     scanner_axes,
     truth_beside,
 )
-from densify.readers.pose_track import PoseTrack
+from densify.readers.recorded_poses import PoseTrack
 
 POSES = "city_SE3_egovehicle.feather"
 ANNOTATIONS = "annotations.feather"

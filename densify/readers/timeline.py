@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The times of a recording's sweeps, and which sweeps are neighbours.
+"""The times of a recording's sweeps, which sweeps are neighbours, and what a run reads of them.
 
 Neighbours are told by stamps, not by numbers: a drive of which every second file is missing has
 half the rate.
@@ -8,15 +8,16 @@ half the rate.
 from __future__ import annotations
 
 from bisect import bisect_left
-from collections.abc import Collection, Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 
+from densify.config import RegisterSettings
 from densify.config.errors import InputError
-from densify.geometry.types import Int, LidarSequence
+from densify.geometry.types import Camera, Int, LidarSequence, Sweep, Trajectory
 
 _HOLE_PERIODS = 3.1  # three periods and some jitter
 _MOST_RANGES = 8
@@ -212,3 +213,44 @@ def _out_of_order(stamps_ns: Int) -> list[int]:
         row = before[row]
     wrong = [row for row in range(len(stamps_ns)) if row not in series]
     return wrong if 2 * len(wrong) < len(stamps_ns) else []
+
+
+def read_sweep(sequence: LidarSequence, frame: int, settings: RegisterSettings) -> Sweep:
+    """Return a sweep of the returns `in_range`, without times if it is not to be deskewed. Raises
+    InputError if it cannot be read."""
+    sweep = in_range(sequence[frame], settings)
+    return sweep if settings.deskew else replace(sweep, offset_ns=None)
+
+
+def in_range(sweep: Sweep, settings: RegisterSettings) -> Sweep:
+    """Return the sweep without the own vehicle's returns and those too far to trust, both measured
+    from the scanner."""
+    origins_m = sweep.scanner_origins
+    x, y, z = (sweep.points if origins_m is None else sweep.points - origins_m[sweep.lidar]).T
+    range_m = np.sqrt(x * x + y * y + z * z)
+    return sweep.select((range_m >= settings.min_range_m) & (range_m <= settings.max_range_m))
+
+
+def choose_cameras(sequence: LidarSequence, names: Sequence[str] | None) -> list[Camera]:
+    """Return the cameras of these names; if None all with images, or all where none has any.
+    Raises InputError naming those that exist."""
+    if isinstance(names, str) or not isinstance(names, Iterable | None):
+        one = [*sequence.cameras][:1]
+        raise InputError(f"cameras: got {names!r}, expected a list of names, such as {one}")
+    for name in names or ():
+        if name not in sequence.cameras:
+            known = ", ".join(sequence.cameras)
+            expected = f"expected one of {known}" if known else "it has none; leave --camera out"
+            raise InputError(f"--camera {name}: no such camera in {sequence.name}; {expected}")
+    if names is None:
+        names = [n for n in sequence.cameras if sequence.image_stamps_ns(n)] or [*sequence.cameras]
+    return [sequence.cameras[name] for name in names]
+
+
+def recorded_trajectory(sequence: LidarSequence, sweeps: Sequence[Sweep]) -> Trajectory:
+    """Return the data set's own poses of the sweeps."""
+    return Trajectory(
+        frames=tuple(s.frame for s in sweeps),
+        stamp_ns=np.array([s.stamp_ns for s in sweeps], np.int64),
+        T_world_lidar=np.stack([sequence.T_world_lidar(s.frame) for s in sweeps]),
+    )

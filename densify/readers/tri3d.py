@@ -44,7 +44,7 @@ from densify.config.file_content import read_bytes, read_json
 from densify.geometry.types import Camera, Float, Int
 from densify.readers.extras import needed
 from densify.readers.file_sequence import FileSequence, Returns, chosen_scene, rigid
-from densify.readers.pose_track import PoseTrack
+from densify.readers.recorded_poses import PoseTrack
 
 _MODELS = {"pinhole": "pinhole", "kannala": "fisheye"}
 _ANONYMIZED = ("dnat", "blur", "original")

@@ -33,31 +33,33 @@ ENGINES = Table(
         Engine(
             "groups",
             "densify.flow.tracking.groups",
-            "groups of points whose motion is proven, rigid and softened",
+            about="groups of points whose motion is proven, rigid and softened",
             shared=True,
         ),
-        Engine("pairs", "densify.flow.pairs.engine", "two sweeps at a time, as estimate_flow"),
+        Engine(
+            "pairs", "densify.flow.pairs.engine", about="two sweeps at a time, as estimate_flow"
+        ),
         Engine(
             "paper",
             "densify.flow.objective.engine",
-            "the published objective, see the section objective",
+            about="the published objective, see the section objective",
         ),
         Engine(
             "network",
             "densify.learning.engine",
-            "what a network of densify train flow sees move, proven as with groups",
+            about="what a network of densify train flow sees move, proven as with groups",
             argument="MODEL",
         ),
         Engine(
             "npz",
             "densify.readers.flow_files",
-            "files of others, see docs/formats.md",
+            about="files of others, see docs/formats.md",
             argument="DIR",
         ),
         Engine(
             "opensceneflow",
             "densify.readers.open_scene_flow.labels",
-            "labels or a network's flow in OpenSceneFlow's file of the recording",
+            about="labels or a network's flow in OpenSceneFlow's file of the recording",
             argument="FILE[#NAME]",
         ),
     ),

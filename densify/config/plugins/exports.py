@@ -24,7 +24,7 @@ def _built_in(
     name: str, module: str, about: str, *owned: str, of_drive: bool = False
 ) -> ExportFormat:
     path = f"densify.outputs.export.{module}"
-    return ExportFormat(name, path, about, "", f"write_{name}", owned, of_drive)
+    return ExportFormat(name, path, f"write_{name}", owned, of_drive, about=about)
 
 
 _MAPS = ("depth", "depth_filled", "confidence")

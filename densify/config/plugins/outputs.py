@@ -21,7 +21,7 @@ class Output(Row):
 
 
 def _built_in(name: str, module: str, function: str, *owned: str) -> Output:
-    return Output(name, f"densify.{module}", "", "", function, owned)
+    return Output(name, f"densify.{module}", function, owned)
 
 
 _MAPS, _TABLES = "outputs.map_outputs", "outputs.table_outputs"

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import traceback
 from collections.abc import Iterator
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from importlib import import_module
 from types import ModuleType
 from typing import TYPE_CHECKING, Generic, TypeVar
@@ -35,8 +35,8 @@ class Row:
 
     name: str
     module: str
-    about: str = ""
-    version: str = ""
+    about: str = field(default="", kw_only=True)
+    version: str = field(default="", kw_only=True)
 
     @property
     def usage(self) -> str:
@@ -138,7 +138,7 @@ class Table(Generic[R]):
         return row_type(
             name,
             module.__name__,
-            (module.__doc__ or "").strip().partition("\n")[0],
-            point.dist.version if point.dist else "",
+            about=(module.__doc__ or "").strip().partition("\n")[0],
+            version=point.dist.version if point.dist else "",
             **{n: value for n, value in values.items() if value is not None},
         )

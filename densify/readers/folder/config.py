@@ -14,9 +14,8 @@ from typing import Any, TypeVar, cast
 
 import numpy as np
 
-from densify.config.errors import InputError
+from densify.config.errors import InputError, did_you_mean
 from densify.config.file_content import read_yaml
-from densify.config.plugins.table import did_you_mean
 from densify.geometry.types import Camera, Float
 from densify.readers.file_sequence import rigid
 from densify.readers.point_fields import REFERENCES, UNIT_NS

@@ -15,7 +15,7 @@ from densify.readers.decoded_files import image_size_px
 from densify.readers.folder.series import find_images, find_pose_file, in_time, sweep_folders
 from densify.readers.point_fields import find_fields, find_times, full_scale
 from densify.readers.point_files import read_table, unnamed
-from densify.readers.pose_files import PoseFile
+from densify.readers.recorded_poses import PoseFile
 from densify.readers.stamp_files import named
 
 _PERIOD_NS = 100_000_000

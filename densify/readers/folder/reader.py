@@ -47,8 +47,7 @@ from densify.readers.folder.series import (
     in_time,
 )
 from densify.readers.point_files import read_viewpoint
-from densify.readers.pose_files import PoseFile
-from densify.readers.pose_track import PoseTrack
+from densify.readers.recorded_poses import PoseFile, PoseTrack
 from densify.readers.timeline import format_frames
 
 _NO_VIEWPOINT = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)

@@ -46,7 +46,7 @@ from densify.readers.kitti.calibration import (
     turned_ns,
     usual_period_ns,
 )
-from densify.readers.pose_track import PoseTrack
+from densify.readers.recorded_poses import PoseTrack
 
 _FOLDERS = {
     "image_00": "data_rect",

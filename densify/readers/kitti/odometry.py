@@ -47,7 +47,7 @@ from densify.readers.kitti.calibration import (
     turned_ns,
     usual_period_ns,
 )
-from densify.readers.pose_track import PoseTrack
+from densify.readers.recorded_poses import PoseTrack
 from densify.readers.stamp_files import in_ns
 
 _NUM_ROUNDS = 3  # the azimuth changes by degrees at most

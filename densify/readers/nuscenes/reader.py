@@ -34,7 +34,7 @@ from densify.geometry.types import Int
 from densify.readers.file_sequence import Returns, chosen_scene
 from densify.readers.nuscenes.scene import Scene, SceneSequence
 from densify.readers.nuscenes.tables import read_table
-from densify.readers.pose_track import PoseTrack
+from densify.readers.recorded_poses import PoseTrack
 
 NUM_RINGS = 32
 COLUMN_NS = 46_080

@@ -20,7 +20,7 @@ from densify.geometry.types import Boxes, Camera, Float
 from densify.readers.file_sequence import FileSequence, quaternion_pose, truth_beside
 from densify.readers.nuscenes.annotations import Annotations
 from densify.readers.nuscenes.tables import Record, find_records, read_table
-from densify.readers.pose_track import PoseTrack
+from densify.readers.recorded_poses import PoseTrack
 
 _LIDARS, _CAMERAS = "lidar", "camera"
 

@@ -41,7 +41,7 @@ from densify.readers.file_sequence import (
     scanner_axes,
     truth_beside,
 )
-from densify.readers.pose_track import PoseTrack
+from densify.readers.recorded_poses import PoseTrack
 
 _UNITS_NS = (1, 1_000, 1_000_000, 1_000_000_000)
 _LEAST_STEP_NS, _MOST_STEP_NS = 10_000_000, 2_000_000_000

@@ -52,7 +52,7 @@ from densify.readers.file_sequence import (
 )
 from densify.readers.pandaset.cuboids import read_cuboids
 from densify.readers.pandaset.pickled_frame import read_columns
-from densify.readers.pose_track import PoseTrack
+from densify.readers.recorded_poses import PoseTrack
 
 _AXIS = np.array([-0.0157, 0.00045, 1.0])  # of the Pandar64, forward left up
 _PLACE_M = np.array([0.777, 0.002, 1.8593])

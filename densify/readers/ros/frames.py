@@ -13,7 +13,7 @@ from densify.config.errors import InputError
 from densify.geometry.poses import inverse
 from densify.geometry.types import Float
 from densify.readers.file_sequence import quaternion_pose
-from densify.readers.pose_track import PoseTrack
+from densify.readers.recorded_poses import PoseTrack
 from densify.readers.ros.bag import Bag
 
 _TF = "tf2_msgs/msg/TFMessage"

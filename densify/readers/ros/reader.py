@@ -47,7 +47,7 @@ from densify.readers.point_fields import (
     radial_velocities,
     scaled,
 )
-from densify.readers.pose_track import PoseTrack
+from densify.readers.recorded_poses import PoseTrack
 from densify.readers.ros.bag import Bag, Entry
 from densify.readers.ros.frames import Frames, plain, recorded_track
 from densify.readers.ros.messages import camera_of, cloud_columns, image_rgb

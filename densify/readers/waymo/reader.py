@@ -48,7 +48,7 @@ from densify.readers.file_sequence import (
     scanner_axes,
     truth_beside,
 )
-from densify.readers.pose_track import PoseTrack
+from densify.readers.recorded_poses import PoseTrack
 from densify.readers.waymo.components import (
     CAMERA,
     CAMERAS,

@@ -8,7 +8,7 @@ import pytest
 
 from densify.config.errors import InputError
 from densify.geometry.poses import exp, inverse, transform
-from densify.readers.pose_track import PoseTrack
+from densify.readers.recorded_poses import PoseTrack
 
 STAMPS_NS = 5_000_000_000 + np.arange(0, 400_000_001, 10_000_000)
 
