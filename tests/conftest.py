@@ -33,9 +33,9 @@ hypothesis.settings.load_profile("densify")
 
 LONGEST = (
     *("examples", "street", "notebooks", "dataset", "recording", "learning_training"),
-    *("bench_flow", "fuzz", "registration", "pipeline", "far", "executor", "bench_readme", "cli"),
-    *("bench_confidence", "doctor", "report_browser", "groups", "labels", "memory"),
-    *("bench_depth", "bench_paper", "reader_pandaset", "flow_sets", "film"),
+    *("bench", "fuzz", "registration", "pipeline", "far", "executor", "cli"),
+    *("doctor", "report_browser", "groups", "labels", "memory"),
+    *("bench_paper", "reader_pandaset", "flow_sets", "film"),
 )
 """Files of tests that take long begin, so that no process works on one while the others wait at the
 end. What simulates stands beside what compiles; what compiles the same stands apart."""

@@ -1,6 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""`densify bench doctor`: mistakes that recordings often have, made on purpose in a good one, and
-which of them `densify doctor` names.
+"""Mistakes that recordings often have, made on purpose in a good one.
 
 A fault is a view of the good recording; nothing is copied or written.
 """
@@ -16,7 +15,6 @@ from scipy.spatial.transform import Rotation
 
 from densify.config import Config
 from densify.config.errors import InputError
-from densify.doctor import Verdict, examine
 from densify.doctor.paths import scaled, with_rotation
 from densify.geometry import poses
 from densify.geometry.types import Camera, Float, LidarSequence, Sweep
@@ -240,28 +238,3 @@ FAULTS: tuple[Fault, ...] = (
     ),
     _fault("images black", "calibration", image=lambda image: np.zeros_like(image)),
 )
-
-
-def bench_doctor(
-    sequence: LidarSequence, config: Config, progress: Callable[[str, int, int], None] | None = None
-) -> dict[str, Any]:
-    """Examine the recording as it is and with each of `FAULTS`.
-
-    Returns "false_alarms": checks of the good recording that are suspicious or wrong; "faults":
-    name -> "verdict" of the check that must name it (the worst of several), "evidence".
-    """
-    good = examine(sequence, config)
-    alarms = [f.check for f in good.findings if f.verdict >= Verdict.SUSPICIOUS]
-    found: dict[str, Any] = {}
-    for done, fault in enumerate(FAULTS):
-        if progress:
-            progress("doctor", done, len(FAULTS))
-        findings = examine(fault.make(sequence, config), config).findings
-        asked = [f for f in findings if any(name in f.check for name in fault.named_by)]
-        worst = max(asked, key=lambda f: f.verdict, default=None)
-        found[fault.name] = {
-            "verdict": "none" if worst is None else str(worst.verdict),
-            "found": worst is not None and worst.verdict >= Verdict.SUSPICIOUS,
-            "evidence": "" if worst is None else worst.evidence,
-        }
-    return {"false_alarms": alarms, "faults": found}

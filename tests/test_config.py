@@ -35,7 +35,7 @@ FREE_TEXT = {("flow", "engine"), ("output", "also")}  # checked by their section
 
 
 def rendered_defaults() -> str:
-    """configs/default.yaml as the knobs say it must be."""
+    """Return configs/default.yaml as the knobs say it must be."""
     lines = [
         "# Every knob with its default. Copy the lines you change into a file of your own and give",
         "# it with --config, or set single ones: --set project.support=6. (From densify/config.)",
@@ -71,79 +71,51 @@ def test_default_yaml_holds_every_knob_with_its_default_and_its_comment() -> Non
     text = presets()["default"].read_text("utf-8")
     assert text == rendered_defaults(), "write it again with: python tests/test_config.py"
     assert yaml.safe_load(text) == as_mapping(Config())
+    assert len(KNOBS) <= 28
 
 
-def test_presets_exist_and_name_only_differences() -> None:
+def test_presets_name_only_differences() -> None:
     assert {"default", "fast", "paper"} <= set(presets())
     defaults = as_mapping(Config())
     for name, path in presets().items():
         if name == "default":
             continue
-        named = yaml.safe_load(path.read_text("utf-8"))
-        for section, values in named.items():
+        for section, values in yaml.safe_load(path.read_text("utf-8")).items():
             for key, value in values.items():
                 assert value != defaults[section][key], f"{name}: {section}.{key} is the default"
                 assert getattr(getattr(resolve(name), section), key) == value
 
 
 @pytest.mark.parametrize("section,field", KNOBS, ids=lambda v: getattr(v, "name", v))
-def test_every_knob_is_documented_and_bounded(section: str, field: Any) -> None:
-    meta = field.metadata
-    assert len(meta["help"]) > 10
-    if isinstance(field.default, bool) or (section, field.name) in FREE_TEXT:
-        return
-    numbers = meta["low"] is not None and meta["high"] is not None and meta["low"] < meta["high"]
-    assert numbers != bool(meta["choices"]), f"{section}.{field.name}: needs bounds or choices"
-
-
-@pytest.mark.parametrize("section,field", KNOBS, ids=lambda v: getattr(v, "name", v))
 def test_every_knob_takes_its_limits_and_refuses_what_is_beyond(section: str, field: Any) -> None:
     meta, name = field.metadata, f"{section}.{field.name}"
     if meta["choices"]:
-        for choice in meta["choices"]:
-            assert (
-                getattr(getattr(resolve(None, [f"{name}={choice}"]), section), field.name) == choice
-            )
-        assert meta["choices"][0] in error_of(None, (f"{name}=nonsense",))
+        good, bad, expected = meta["choices"], ["nonsense", 3], meta["choices"][0]
     elif isinstance(field.default, bool):
-        assert getattr(getattr(resolve(None, [f"{name}=false"]), section), field.name) is False
-        assert "true or false" in error_of(None, (f"{name}=3",))
+        good, bad, expected = [False, True], [3, "maybe"], "true or false"
     elif (section, field.name) in FREE_TEXT:
-        for value in (3, True, None, ["groups"]):
-            message = error_of({section: {field.name: value}})
-            assert f"{name}: got {value!r}, expected text" in message
+        good, bad, expected = [field.default], [3, True, None, ["groups"]], "expected text"
     else:
-        for value in (meta["low"], meta["high"]):
-            got = getattr(getattr(resolve({section: {field.name: value}}), section), field.name)
-            assert got == value
-        for value in (
-            meta["low"] - 1,
-            meta["high"] * 2 + 1,
-            "ten",
-            True,
-            [1],
-            10**400,
-            float("nan"),
-        ):
-            message = error_of({section: {field.name: value}})
-            assert (
-                name in message and repr(value)[:100] in message and f"{meta['low']:g}" in message
-            )
-
-
-def test_round_trip() -> None:
-    config = resolve("paper", ["register.voxel_size_m=0.7", "flow.look_around_s=0.5"])
-    text = yaml.safe_dump(as_mapping(config))
-    assert resolve(yaml.safe_load(text)) == config != Config()
+        low, high = meta["low"], meta["high"]
+        bad = [low - 1, high * 2 + 1, "ten", True, [1], 10**400, float("nan")]
+        good, expected = [low, high], f"from {low:g} to {high:g}"
+    for value in good:
+        assert getattr(getattr(resolve({section: {field.name: value}}), section), field.name) == (
+            value
+        )
+    for value in bad:
+        message = error_of({section: {field.name: value}})
+        assert name in message and repr(value)[:100] in message and expected in message
 
 
 @settings(max_examples=20)
-@given(st.floats(0.05, 10), st.floats(0, 1e6), st.booleans(), st.sampled_from(["rigid", "drop"]))
+@given(st.floats(0, 5), st.floats(0, 1e6), st.booleans(), st.sampled_from(["rigid", "drop"]))
 def test_round_trip_through_yaml_text(
-    voxel_size_m: float, alpha: float, deskew: bool, word: str
+    look_around_s: float, alpha: float, deskew: bool, word: str
 ) -> None:
     changes = {
-        "register": {"voxel_size_m": voxel_size_m, "deskew": deskew},
+        "flow": {"look_around_s": look_around_s},
+        "register": {"deskew": deskew},
         "objective": {"alpha": alpha},
         "accumulate": {"unfollowed": word},
     }
@@ -165,12 +137,8 @@ def test_file_preset_mapping_and_config_agree(tmp_path: Path) -> None:
 
 def test_overrides_win_over_the_file_and_later_over_earlier() -> None:
     config = resolve("paper", ["objective.solver=pcg", "objective.alpha=1e1", "objective.alpha=4"])
-    assert (config.flow.engine, config.objective.solver, config.objective.alpha) == (
-        "paper",
-        "pcg",
-        4.0,
-    )
-    assert isinstance(config.objective.alpha, float)
+    assert (config.flow.engine, config.objective.solver) == ("paper", "pcg")
+    assert config.objective.alpha == 4.0 and isinstance(config.objective.alpha, float)
     assert resolve(None, ["objective.alpha=1e1"]).objective.alpha == 10.0
     assert resolve(None, ["flow.look_around_s=null"]).flow.look_around_s is None
 
@@ -179,27 +147,17 @@ def test_overrides_win_over_the_file_and_later_over_earlier() -> None:
     ("override", "parts"),
     [
         ("objective.alfa=3", ["unknown key objective.alfa", "did you mean alpha?"]),
-        (
-            "flow.alpha=3",
-            ["--set flow.alpha=3", "unknown key flow.alpha; it is objective.alpha now"],
-        ),
+        ("flow.alpha=3", ["--set flow.alpha=3", "did you mean objective.alpha?"]),
+        ("project.veto_m=3", ["unknown key project.veto_m", "fixed value"]),
+        ("ground.cell_m=3", ["unknown section ground", "fixed value"]),
         ("flwo.alpha=3", ["unknown section flwo", "did you mean flow?", "register, flow"]),
         ("flow.voxel_size_m=3", ["did you mean register.voxel_size_m?"]),
         ("flow.qqq=3", ["expected a key of flow: "]),
-        (
-            "objective.alpha=ten",
-            ["--set objective.alpha=ten", "got 'ten'", "a number from 0 to 1e+06"],
-        ),
-        ("objective.alpha=-1", ["got -1", "from 0"]),
         ("objective.alpha=", ["got ''"]),
         ("objective.num_neighbors=2.5", ["got 2.5", "a whole number from 1 to 500"]),
         ("flow.look_around_s=-1", ["got -1", "or null"]),
-        ("register.deskew=maybe", ["got 'maybe'", "true or false"]),
-        ("register.source=oxts", ["got 'oxts'", "one of kiss-icp, dataset"]),
         ("flow.engine=magic", ["got 'magic'", "one of groups, pairs, paper, network:MODEL"]),
-        ("project.at=noon", ["got 'noon'", "one of camera, sweep"]),
         ("output.also=rainbow", ["output.also: got 'rainbow'", "one of depth, full, flow"]),
-        ("output.movers=hide", ["got 'hide'", "one of keep, drop, separate"]),
         ("objective.alpha", ["expected section.key=value"]),
         ("alpha=3", ["expected section.key=value"]),
         ("objective.alpha=[1", ["--set objective.alpha=[1", "not YAML"]),
@@ -214,50 +172,36 @@ def test_bad_override(override: str, parts: list[str]) -> None:
 @pytest.mark.parametrize(
     ("text", "parts"),
     [
-        ("objective:\n  alfa: 3\n", ["unknown key objective.alfa", "did you mean alpha?"]),
-        ("flow: 3\n", ["section flow", "got 3", "mapping of keys"]),
-        ("flow:\n", ["section flow", "got None"]),
-        ("- flow\n", ["got ['flow']", "mapping of sections"]),
-        ("objective: {alpha: [}\n", ["not YAML"]),
-        (
-            "objective: {alpha: 1}\nregister: {}\nobjective: {solver: adam}\n",
-            ["objective is given twice"],
-        ),
-        ("objective: {alpha: .nan}\n", ["objective.alpha: got nan"]),
-        ("3: {alpha: 1}\n", ["unknown section 3"]),
+        (b"objective:\n  alfa: 3\n", ["unknown key objective.alfa", "did you mean alpha?"]),
+        (b"flow: 3\n", ["section flow", "got 3", "mapping of keys"]),
+        (b"- flow\n", ["got ['flow']", "mapping of sections"]),
+        (b"objective: {alpha: [}\n", ["not YAML"]),
+        (b"flow: {engine: pairs}\nflow: {engine: paper}\n", ["flow is given twice"]),
+        (b"objective: {alpha: .nan}\n", ["objective.alpha: got nan"]),
+        (b"3: {alpha: 1}\n", ["unknown section 3"]),
+        (b"\xff\xfe\x00\x80", ["not a text file"]),
     ],
 )
-def test_bad_file_is_named(tmp_path: Path, text: str, parts: list[str]) -> None:
+def test_bad_file_is_named(tmp_path: Path, text: bytes, parts: list[str]) -> None:
     file = tmp_path / "bad.yaml"
-    file.write_text(text)
+    file.write_bytes(text)
     message = error_of(file)
     for part in [str(file), *parts]:
         assert part in message
 
 
-def test_binary_file_is_an_input_error(tmp_path: Path) -> None:
-    file = tmp_path / "bad.yaml"
-    file.write_bytes(b"\xff\xfe\x00\x80")
-    assert str(file) in error_of(file)
-
-
-def test_an_engine_may_be_a_folder_of_flow_files() -> None:
+def test_engines_with_arguments_and_unknown_presets() -> None:
     assert resolve(None, ["flow.engine=npz:some/flow"]).flow.engine == "npz:some/flow"
     with pytest.raises(InputError, match="got 'npz:', expected npz:DIR"):
         FlowSettings(engine="npz:")
-    with pytest.raises(InputError, match="got 'groups:9', expected groups"):
-        FlowSettings(engine="groups:9")
-
-
-def test_unknown_preset_suggests_one() -> None:
     message = error_of("papre")
     assert "papre" in message and "did you mean paper?" in message and "fast" in message
 
 
 def test_python_users_are_checked_too() -> None:
     assert RegisterSettings(voxel_size_m=2).voxel_size_m == 2.0
-    with pytest.raises(InputError, match=r"register\.voxel_size_m: got -1"):
-        RegisterSettings(voxel_size_m=-1)
+    with pytest.raises(InputError, match=r"flow\.look_around_s: got -1"):
+        FlowSettings(look_around_s=-1)
     with pytest.raises(InputError, match="min_range_m"):
         RegisterSettings(min_range_m=50, max_range_m=20)
     far = resolve(None, ["register.min_range_m=20", "register.max_range_m=300"])

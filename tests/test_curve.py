@@ -80,17 +80,3 @@ def test_losses_with_their_running_median(num_steps: int) -> None:
         dots, median = (np.asarray(line.get_ydata()) for line in axes.lines)
         np.testing.assert_array_equal(dots, losses)
         assert (np.diff(median[20:-20]) <= 1e-9).all()  # no outlier of the losses is left
-
-
-def test_arrows_are_as_long_as_the_flow_and_coloured_by_its_direction() -> None:
-    points = np.array([[10.0, 10, 0], [0, -10, 0], [-10, 0, 0]])
-    flow = np.array([[3.0, 0, 0], [0, 3.0, 0], [0.01, 0, 0]])
-    figure = plots.draw_arrows(points, {"truth": flow, "nothing": np.zeros_like(flow)})
-    truth, nothing = figure.axes
-    dots, arrows = truth.collections
-    np.testing.assert_array_equal(dots.get_offsets(), [[0, -10]])  # y, x
-    np.testing.assert_array_equal(arrows.get_offsets(), [[10, 10], [-10, 0]])
-    np.testing.assert_array_equal(np.stack([arrows.U, arrows.V], axis=1), [[0, 3], [3, 0]])
-    assert arrows.scale == pytest.approx(1 / 3) and np.ptp(arrows.get_array()) > 1
-    assert len(nothing.collections[0].get_offsets()) == 3
-    assert truth.get_xlim() == (35, -35) and truth.get_ylim() == (-35, 35)

@@ -216,7 +216,7 @@ def _rows_of_rates(scene: Scene) -> list[list[str]]:
 def _flow_cells(scene: Scene, num_sweeps: int) -> list[str]:
     sequence, key = open_sequence(scene.data), scene.keys[0]
     ours = bench_flow(sequence, key, scene.window, resolve(None), ["ours"])["methods"]["ours"]
-    step, window, segments = ours["step"], ours["window"], ours["segmentation"]
+    step, window = ours["step"], ours["window"]
     hops = str(num_sweeps)
     all_m, found_m = (window[f"{which}movers_m_by_hops"].get(hops) for which in ("", "found_"))
     return [
@@ -225,7 +225,6 @@ def _flow_cells(scene: Scene, num_sweeps: int) -> list[str]:
         f"{_centimetres(all_m)} ({_centimetres(found_m)})",
         f"{_percent(step['falsely_moving'], 4)} %",
         f"{_percent(window['ghost_rate'])} %",
-        f"{_percent(segments['panoptic_quality'], 1)} %",
     ]
 
 
@@ -247,7 +246,7 @@ def _rows_of_registration(scene: Scene) -> list[list[str]]:
     return [[str(scene), f"{1000 * translation:.0f} mm", f"{np.rad2deg(rotation):.3f}°"]]
 
 
-_FLOW_TITLES = ("found", "one sweep", "five sweeps", "falsely moving", "ghosts", "panoptic quality")
+_FLOW_TITLES = ("found", "one sweep", "five sweeps", "falsely moving", "ghosts")
 _DEPTH_TITLES = ("measured", "outliers", "filled", "outliers", "moving, filled", "outliers")
 TABLES: Mapping[str, _Table] = {
     "methods": _Table(
@@ -275,7 +274,7 @@ TABLES: Mapping[str, _Table] = {
     ),
     "flow": _Table(
         "Moving points found, their error with missed points counted as static, and in brackets of "
-        "those found; panoptic quality of moving objects.",
+        "those found.",
         _FLOW_TITLES,
         _FLOW,
         _rows_of_flow,

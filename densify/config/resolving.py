@@ -12,7 +12,7 @@ from typing import Any
 from densify.config.errors import InputError, did_you_mean
 from densify.config.file_content import parse_yaml, read_yaml
 from densify.config.knobs import checked
-from densify.config.sections import REPLACED, Config
+from densify.config.sections import REMOVED, Config
 
 
 def resolve(
@@ -84,11 +84,8 @@ def _apply(values: dict[str, dict[str, Any]], changes: Any, where: str) -> None:
     _require_mapping(changes, where, "sections")
     for name, keys in changes.items():
         if name not in values:
-            if name in REPLACED:
-                raise InputError(f"{where}: unknown section {name}; {REPLACED[name]}")
-            raise InputError(
-                f"{where}: unknown section {name}; {_expected(str(name), values, 'section')}"
-            )
+            hint = _removed(name) or _expected(str(name), values, "section")
+            raise InputError(f"{where}: unknown section {name}; {hint}")
         _require_mapping(keys, f"{where}: section {name}", "keys")
         for key, value in keys.items():
             if key not in values[name]:
@@ -112,12 +109,16 @@ def _require_mapping(value: Any, where: str, content: str) -> None:
 
 def _key_hint(section: str, key: str, values: Mapping[str, Mapping[str, Any]]) -> str:
     """Return what became of the key, its section if that is another, or the key most like it."""
-    if f"{section}.{key}" in REPLACED:
-        return REPLACED[f"{section}.{key}"]
     for other, keys in values.items():
         if key in keys:
             return f"did you mean {other}.{key}?"
-    return _expected(key, values[section], f"key of {section}")
+    return _removed(section, key) or _expected(key, values[section], f"key of {section}")
+
+
+def _removed(section: Any, key: str = "") -> str:
+    """Return what to do about a knob or section of an earlier version, "" if there was none."""
+    known = key in REMOVED.get(section, "").split() if key else section in REMOVED
+    return "this version has a fixed value for it: leave it out" if known else ""
 
 
 def _expected(got: str, known: Mapping[str, Any], kind: str) -> str:

@@ -5,7 +5,7 @@ The stages of a map rank its pixels: by sweeps and points that agree, distance t
 roughness, how far was filled, votes of the image. The probability that a pixel is wrong is a sum:
 a share for its rank, and another in proportion to how far the surroundings contradict each other.
 Both fall with the rank. They were measured against exact truth by group: how a pixel came to its
-depth, and how ragged its surroundings are. ``densify bench confidence`` makes these tables,
+depth, and how ragged its surroundings are. ``examples/fit_confidence.py`` makes these tables,
 ``confidence.json`` beside this file.
 
 Within a map the order of the ranks stays, of measured and of filled pixels. Each rank gets the mean
@@ -194,12 +194,12 @@ def _own_tables() -> Float:
 
 
 def own_file() -> dict[str, Any]:
-    """Return the package's own tables, as `densify.bench.confidence` wrote them."""
+    """Return the package's own tables, as examples/fit_confidence.py wrote them."""
     return read_json(_FILE)
 
 
 def tables_of(written: dict[str, Any]) -> Float:
-    """Return (G,2,R) the share that is wrong, from what `densify.bench.confidence` wrote."""
+    """Return (G,2,R) the share that is wrong, from what examples/fit_confidence.py wrote."""
     middle = (np.arange(NUM_RANKS) + 0.5) / NUM_RANKS
     knots = [[np.array(written["tables"][g][c]).T for c in CAUSES] for g in GROUPS]
     return np.array([[np.interp(middle, *ends) for ends in row] for row in knots])

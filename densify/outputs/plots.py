@@ -8,8 +8,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from densify.geometry.types import Float, Result
 from densify.outputs.atomic import write_file
 from densify.outputs.context import Context
@@ -23,9 +21,6 @@ Curve = Sequence[Mapping[str, Any]]
 
 DPI = 100
 _FEWEST_OUTLIERS = 1e-4  # below, the scale is linear down to 0
-_HALF_M = 35.0  # of the scene, to each side of the sensor
-_ARROW_LENGTH = 3.0  # times the flow
-_LEAST_FLOW_M = 0.05
 _MEDIAN_SHARE = 20  # the running median covers one part in so many of all steps
 
 
@@ -89,25 +84,6 @@ def draw_losses(losses: Float, title: str) -> Figure:
         axes.plot(losses, ".", markersize=2, color="C0", alpha=0.4)
         axes.plot(median_filter(losses, size, mode="nearest"), color="C0", linewidth=2)
     axes.grid(alpha=0.3)
-    return figure
-
-
-def draw_arrows(points: Float, flows: Mapping[str, Float]) -> Figure:
-    """Draw scene flows of one sweep from above, three times as long as they are.
-
-    points: (N,3) metres, x forward, which is up in the picture, y to the left.
-    flows: title -> (N,3) metres. Flow below 0.05 m is a gray dot. The colour is the direction.
-    """
-    figure, panels = _figure(len(flows), 5.0, 5.0)
-    for axes, (title, flow) in zip(panels, flows.items(), strict=True):
-        moves = np.linalg.norm(flow[:, :2], axis=1) >= _LEAST_FLOW_M
-        axes.scatter(points[~moves, 1], points[~moves, 0], s=2, color="0.6", linewidths=0)
-        x, y, u, v = points[moves, 1], points[moves, 0], flow[moves, 1], flow[moves, 0]
-        arrows = axes.quiver(x, y, u, v, np.arctan2(v, u), cmap="hsv", angles="xy", width=0.003)
-        arrows.set_clim(-np.pi, np.pi)
-        arrows.scale, arrows.scale_units = 1 / _ARROW_LENGTH, "xy"
-        axes.set(title=title, aspect="equal", xlabel="y, m", ylabel="x, m")
-        axes.set(xlim=(_HALF_M, -_HALF_M), ylim=(-_HALF_M, _HALF_M))
     return figure
 
 
