@@ -1,6 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Files and folders that appear only when they are complete: each is written into a hidden folder
-beside its place, on the same file system, and then renamed."""
+"""Files and folders that appear when they are complete: written in a hidden folder, renamed."""
 
 from __future__ import annotations
 
@@ -65,10 +64,8 @@ def staged_folder(folder: Path, owned: Collection[str]) -> Iterator[Path]:
 
 
 def clear_leftovers(root: Path, age_s: float = LEFT_AFTER_S) -> None:
-    """Remove what killed processes left aside anywhere under a folder.
-
-    age_s: only what is older, because other processes may be writing there; 0 where none does.
-    """
+    """Remove what killed processes left aside anywhere under a folder, if it is older than that,
+    because other processes may be writing there; 0 where none does."""
     with suppress(OSError):  # others may finish theirs meanwhile
         for hidden in [place for place in root.rglob(".*.tmp") if place.is_dir()]:
             if time.time() - hidden.stat().st_mtime >= age_s:
