@@ -57,18 +57,9 @@ def test_how_many_sweeps_a_time_holds(hz, num):
     assert regular(hz).num_in(0.4) == num
 
 
-@pytest.fixture(scope="module")
-def scene() -> Scene:
-    movers = car(14, -1.6, 10, 1), car(-6, 3.0, 20, 2)
-    return Scene(World((*street(), *movers)), Arc(0, -1.5, 0, 6.0), NOISE)
-
-
-@pytest.mark.parametrize(
-    "frames",
-    [range(1, 10, 2), (0, 1, 2, 5, 6, 7, 8), (2, 3, 4, 5, 8, 9)],
-    ids=["every second", "a hole before", "a hole after"],
-)
-def test_a_recording_with_sweeps_missing_is_one_that_is_slower_there(scene, frames):
+def test_a_recording_with_sweeps_missing_is_one_that_is_slower_there():
+    frames, movers = (0, 1, 2, 5, 6, 7, 8), (car(14, -1.6, 10, 1), car(-6, 3.0, 20, 2))
+    scene = Scene(World((*street(), *movers)), Arc(0, -1.5, 0, 6.0), NOISE)
     whole = scene.stretch(KEY, 5)
     stretch = Stretch(tuple(whole[f] for f in frames))
     motion = motion_in(stretch, ground(stretch))

