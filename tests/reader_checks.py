@@ -7,10 +7,13 @@ from collections.abc import Mapping
 from functools import cache
 
 import numpy as np
+import pytest
 from writers.excerpt import Excerpt
 
+from densify.config.errors import InputError
 from densify.geometry.poses import inverse, transform
 from densify.geometry.types import LidarSequence
+from densify.readers import open_sequence
 from densify.readers.street import Street
 from densify.scores.depth_metrics import DepthErrors, depth_errors
 from tests.scenes import by_flow
@@ -138,3 +141,16 @@ def depth_score(recording: LidarSequence, key: int, camera: str) -> DepthErrors:
 def street_score(name: str, key: int, camera: str) -> DepthErrors:
     """The same of the street itself, which several formats are written of."""
     return depth_score(Street.from_spec(name), key, camera)
+
+
+def check_refused(spec: object, says: str, place: object = "", frame: int = 0) -> None:
+    """Opening the recording and reading one sweep, pose and image of each camera ends in one line
+    that names the place."""
+    with pytest.raises(InputError, match=says) as error:
+        sequence = open_sequence(str(spec))
+        _ = sequence[frame]
+        for camera in sequence.cameras:
+            for number in [*sequence.image_stamps_ns(camera)][:1]:
+                sequence.image(camera, number)
+        sequence.T_world_lidar(frame)
+    assert "\n" not in str(error.value) and str(place) in str(error.value)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from densify.readers.ros.bag import message_types
+from densify.readers.ros_bag import message_types
 
 STAMP_NS = 1_700_000_000_000_000_000
 PERIOD_NS = 100_000_000

@@ -27,9 +27,9 @@ from densify.geometry.types import Boxes, BoxView, Camera, RegisteredSweep, Swee
 from densify.learning.labels import label_sweeps
 from densify.readers import open_sequence
 from densify.readers.kitti.calibration import Calibration
-from densify.readers.nuscenes.annotations import Annotations
+from densify.readers.nuscenes_tables import Annotations
 from densify.readers.street import Street
-from densify.readers.waymo.components import BOX_HEADING, BOX_SIZE, STAMP
+from densify.readers.waymo_components import BOX_HEADING, BOX_SIZE, STAMP
 
 pyarrow = pytest.importorskip("pyarrow")
 FRAMES = range(60, 63)

@@ -237,7 +237,7 @@ DOORS: dict[str, str | tuple[str, ...]] = {
     "kiss_icp": "densify/registration/odometry.py",
     "laspy": ("densify/readers/decoded_files.py", "densify/outputs/cloud_laz.py"),
     "numba": ("densify/geometry/compiled.py", "densify/geometry/threads.py"),
-    "pickle": ("densify/readers/pandaset/pickled_frame.py",),
+    "pickle": ("densify/readers/pickled_frame.py",),
     "simplejpeg": "densify/readers/decoded_files.py",
     "small_gicp": "densify/registration/alignment.py",
     "torch": ("densify/flow/", "densify/dataset/loader.py", "densify/learning/"),

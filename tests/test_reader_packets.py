@@ -116,7 +116,7 @@ def test_what_is_no_capture_is_refused_in_a_line(tmp_path, content, says):
 
 def test_another_model_is_refused_in_a_line(vlp16):
     pytest.importorskip("velodyne_decoder")
-    with pytest.raises(InputError, match="no such file"):
+    with pytest.raises(InputError, match="cannot be read: No such file"):
         open_sequence(f"velodyne:{vlp16.parent / 'other.pcap'}#VLP-16")
     with pytest.raises(InputError, match="no sweep of frame 7; frames that exist: 0-1"):
         open_sequence(f"velodyne:{vlp16}#VLP-16")[7]
@@ -166,7 +166,7 @@ def test_a_real_velodyne(test_data):
     rings_deg = np.degrees(find_rings(elevation))
     np.testing.assert_allclose(rings_deg, np.linspace(-30.67, 10.67, 32), atol=0.02)
     # the first block of the sweep by hand: ranges in 2 mm, laser by laser
-    begin = int(sequence._packets.begin[sequence._turns[5].start])
+    begin = int(sequence._begin[sequence._turns[5].start])
     block = path.read_bytes()[begin : begin + 100]
     ranges_m = np.frombuffer(block[4:], [("r", "<u2"), ("i", "u1")], 32)["r"] * 0.002
     heard = ranges_m[(ranges_m > 0.1) & (ranges_m < 200)]

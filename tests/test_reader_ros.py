@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import re
 import shutil
 
 import cv2
@@ -17,9 +16,9 @@ from writers.excerpt import Excerpt
 from densify.config.errors import InputError
 from densify.geometry.poses import inverse, transform
 from densify.readers import open_sequence
-from densify.readers.ros.reader import RosBag
+from densify.readers.ros import RosBag
 from densify.readers.street import Street
-from tests.reader_checks import check_cameras, check_depth, check_sweeps, check_truth
+from tests.reader_checks import check_cameras, check_refused, check_sweeps, check_truth
 
 pytest.importorskip("rosbags")
 
@@ -45,10 +44,6 @@ def test_the_street_is_given_back(format, written, excerpt):
     check_sweeps(sequence, excerpt, -HALF_NS)
     check_cameras(sequence, excerpt)
     check_truth(sequence, excerpt)
-
-
-def test_depth_is_that_of_the_street(written, excerpt):
-    check_depth(open_sequence(written["ros2"]), excerpt, worse=0.02)
 
 
 # Points
@@ -399,112 +394,40 @@ def lone(topic, type_, make):
     return made
 
 
-def named_poses(T, stamp_ns=STAMP_NS):
-    def make():
-        maker = Maker()
-        maker.sweeps(2)
-        for i in range(2):
-            maker.odometry(T if i else np.eye(4), stamp_ns + i * PERIOD_NS, child="lidar")
-        return maker
-
-    return make
-
-
 def long_quaternion():
-    maker = named_poses(np.eye(4))()
+    maker = bad_cloud()()
+    for i in range(2):
+        maker.odometry(np.eye(4), STAMP_NS + i * PERIOD_NS, child="lidar")
     object.__setattr__(maker.written[-1][3].pose.pose.orientation, "w", 3.0)
     return maker
 
 
-def without(name):
-    maker = Maker()
-    maker.sweeps(2)
-    for written in maker.written:
-        fields = [field for field in written[3].fields if field.name != name]
-        object.__setattr__(written[3], "fields", fields)
-    return maker
-
-
-SCAN = "velodyne_msgs/msg/VelodyneScan"
+SCAN, RAW = "velodyne_msgs/msg/VelodyneScan", "#images=/front/image_raw"
 BAGS = {
     "raw packets": (
-        lone(
-            "/velodyne_packets",
-            SCAN,
-            lambda m: m.make(SCAN, m.header(1, "v"), np.zeros(9, np.uint8)),
-        ),
+        lone("/scan", SCAN, lambda m: m.make(SCAN, m.header(1, "v"), np.zeros(9, np.uint8))),
         "",
-        r"raw packets only \(/velodyne_packets \(VelodyneScan, 1\)\).*play it through",
-    ),
-    "nothing of a lidar": (
-        lone("/odom", "std_msgs/msg/String", lambda m: m.make("std_msgs/msg/String", "hello")),
-        "",
-        r"no PointCloud2; got /odom \(String, 1\)",
+        r"raw packets only \(/scan \(VelodyneScan, 1\)\).*play it through",
     ),
     "unknown option": (bad_cloud(), "#topic=/a", r"got topic, expected #points="),
-    "no option": (bad_cloud(), "#points", r"expected #points=|no such topic"),
     "unknown topic": (bad_cloud(), "#points=/other", r"no such topic; topics that fit: /points"),
-    "topic of another type": (
-        with_camera,
-        "#points=/front/image_raw",
-        "a topic of sensor_msgs/msg/Im",
-    ),
-    "unknown images": (
-        bad_cloud(),
-        "#images=/a",
-        "images=/a: no such topic; topics that fit: none",
-    ),
-    "unknown poses": (bad_cloud(), "#poses=/a", "poses=/a: no such topic"),
     "no way by tf": (bad_cloud(), "#poses=tf", "nothing tells where lidar was"),
     "field outside": (bad_field(offset=40), "", "field t: got type 6 at byte 40 of"),
-    "field of no type": (bad_field(datatype=9), "", "field t: got type 9"),
     "field gone": (bad_field(name="u"), "", "no field t, which other messages have"),
-    "no x": (lambda: without("x"), "", "no field x; got y, z"),
     "cut data": (bad_cloud(data=np.zeros(99, np.uint8)), "", "got 99 bytes and rows of"),
-    "rows too short": (bad_cloud(row_step=9), "", "rows of 9, expected 1 rows of 60"),
-    "no points": (
-        bad_cloud(width=0, row_step=0, data=np.zeros(0, np.uint8)),
-        "",
-        "holds no points",
-    ),
     "encoding": (lambda: with_camera("32FC1"), "", "got the encoding 32FC1, expected one of rgb8"),
-    "image of another size": (
-        lambda: with_camera(info={"size": (9, 9)}),
-        "",
-        "image of 8 x 6 px; expected 9 x 9",
-    ),
     "lens": (
         lambda: with_camera(info={"model": "ftheta", "d": [1.0]}),
-        "#images=/front/image_raw",
+        RAW,
         "distortion model 'ftheta', expected one of plumb_bob",
     ),
     "coefficients": (
         lambda: with_camera(info={"d": [0.1] * 3}),
-        "#images=/front/image_raw",
-        "3 coefficients of plumb_bob, expected 4 or 5",
+        RAW,
+        "3 coefficients of .*'plumb_bob'.* 4 or 5",
     ),
-    "no focal length": (
-        lambda: with_camera(info={"k": [0.0] * 9}),
-        "#images=/front/image_raw",
-        "positive focal lengths",
-    ),
-    "no size": (
-        lambda: with_camera(info={"size": (0, 0)}),
-        "#images=/front/image_raw",
-        "got 0 x 0 px, expected",
-    ),
-    "pose not a number": (
-        named_poses(pose(0, np.nan, 0, 0)),
-        "#poses=/odom",
-        "expected a unit quat",
-    ),
+    "no focal length": (lambda: with_camera(info={"k": [0.0] * 9}), RAW, "positive focal lengths"),
     "quaternion too long": (long_quaternion, "#poses=/odom", "quaternion of length 3"),
-    "poses of another day": (named_poses(np.eye(4), 10**15), "#poses=/odom", "no pose at"),
-    "one pose": (
-        lambda: (m := bad_cloud()(), m.odometry(np.eye(4), STAMP_NS, child="lidar"))[0],
-        "#poses=/odom",
-        "got 1 poses, expected two",
-    ),
     "poses of a frame that nothing joins": (
         lambda: (m := bad_cloud()(), m.odometry(np.eye(4), STAMP_NS, child="imu"))[0],
         "#poses=/odom",
@@ -526,14 +449,7 @@ BAGS = {
 def test_bad_bags_are_refused_in_a_line(damage, tmp_path):
     make, options, says = BAGS[damage]
     place = make().write(tmp_path)
-    with pytest.raises(InputError) as error:
-        sequence = open_sequence(f"ros:{place}{options}")
-        sequence[0], sequence[1]
-        if "front" in sequence.cameras:
-            sequence.image("front", 0)
-        sequence.T_world_lidar(1)
-    message = str(error.value)
-    assert "\n" not in message and str(place) in message and re.search(says, message), message
+    check_refused(f"ros:{place}{options}", says, place, frame=1)
 
 
 def test_a_camera_that_cannot_be_placed_is_left_out_with_a_word(tmp_path):
@@ -547,7 +463,7 @@ def test_a_camera_that_cannot_be_placed_is_left_out_with_a_word(tmp_path):
         open_sequence(f"ros:{place}#images=/front/image_raw")
 
 
-@pytest.mark.parametrize("share", [0.0, 0.01, 0.5, 0.97])
+@pytest.mark.parametrize("share", [0.0, 0.5])
 @pytest.mark.parametrize("suffix", [".db3", ".mcap", ".bag"])
 def test_cut_off_bags_are_refused_in_a_line(suffix, share, tmp_path):
     maker = Maker(suffix)
@@ -578,18 +494,6 @@ def test_places_without_a_bag(tmp_path):
     shutil.copy(next(place.glob("*.db3")), place / "second.db3")
     with pytest.raises(InputError, match=r"2 \.db3 files without metadata\.yaml"):
         open_sequence(place)
-
-
-def test_the_index_of_a_large_bag_is_kept(tmp_path, empty_cache, monkeypatch):
-    maker = Maker(".mcap")
-    maker.sweeps(3)
-    place = maker.write(tmp_path)
-    whole = open_sequence(place)
-    monkeypatch.setattr("densify.readers.ros.bag._LARGE_BYTES", 0)
-    stamps_ns = [open_sequence(place).stamp_ns(1) for _ in range(2)]
-    assert stamps_ns == [whole.stamp_ns(1)] * 2 and any(empty_cache.rglob("bag-*"))
-    monkeypatch.setattr("densify.readers.ros.bag.Bag._read_index", None)  # not asked again
-    np.testing.assert_array_equal(open_sequence(place)[2].points, whole[2].points)
 
 
 def test_stamps_that_drivers_leave_at_zero_are_those_of_the_recording(tmp_path):

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from densify.config.errors import InputError
 from densify.geometry.poses import transform
 from densify.readers import open_sequence
-from densify.readers.nuscenes.truckscenes import TruckScenes
+from densify.readers.nuscenes import TruckScenes
 
 START_US = 1_695_473_372_700_000
 SPEED_M_S = 20.0

@@ -1,52 +1,50 @@
 # SPDX-License-Identifier: MIT
-"""Scenes in the format of TRI's Dataset Governance Policy (DGP): DDAD (Guizilini et al., "3D
-Packing for Self-Supervised Monocular Depth Estimation", CVPR 2020) and its relatives::
+"""Scenes in the format of TRI's Dataset Governance Policy (DGP): DDAD (Guizilini et al., CVPR 2020)
+and its relatives::
 
     ROOT/scene_02/scene_<hash>.json        samples, and the files, poses and stamps of their data
     ROOT/scene_02/calibration/<hash>.json  extrinsics (on the vehicle) and intrinsics, by name
     ROOT/scene_02/point_cloud/LIDAR/<stamp>.npz    ROOT/scene_02/rgb/CAMERA_01/<stamp>.jpg
 
-- A scene's folder, or its name behind ``#``; the list of scenes in the root names some that may not
-  be there and is not read. Sweeps are numbered from 0 in the order of time, each camera's images
-  likewise; what is not on the disk leaves a gap.
+- A scene is its folder, or its name behind ``#``. Sweeps are numbered from 0 in the order of time,
+  and so are each camera's images. A file that is not there leaves a gap.
 - Stamps are ISO dates. DDAD's are tenths of microseconds taken for microseconds, of the year 2464:
-  what lies beyond 2200 is divided by ten. DDAD's images are stamped 9 ms before
-  the sweep, and their poses are those of 5 to 6 ms later.
-- Points have no times, so that nothing can be undone: ``offset_ns`` is None. They are in the frame
-  of the sweep's sensor, and poses (one for every sweep and image) are the sensors'.
-- DDAD's sweeps are put together from several solid-state scanners, in the vehicle's frame, whose
-  origin is on the ground: its lidar has no extrinsics. Where rays start is not said. Scan lines of
-  three sides are smoothest from 1.54 to 1.56 m above the ground, as high as the cameras, so that
-  the rays are taken to start in the cameras' midst.
+  dates beyond 2200 are divided by ten. DDAD's images are stamped 9 ms before the sweep, and their
+  poses are those of 5 to 6 ms later.
+- Points have no times, so ``offset_ns`` is None. They are in the frame of the sweep's sensor. Each
+  sweep and image has a pose of its sensor.
+- DDAD's sweeps are put together from several solid-state scanners, in the vehicle's frame with its
+  origin on the ground: its lidar has no extrinsics. The origins of the rays are not published. Scan
+  lines of three sides are smoothest from 1.54 to 1.56 m above the ground, as high as the cameras
+  are. The rays are therefore taken to start at the mean position of the cameras.
 - Images are pinholes without distortion.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping
 from datetime import datetime, timedelta, timezone
 from os.path import isfile
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from densify.config.errors import InputError
-from densify.config.file_content import read_bytes, read_json
+from densify.config.file_content import read_json
 from densify.geometry import poses
-from densify.geometry.types import Camera, Float
+from densify.geometry.types import Float
 from densify.readers.decoded_files import read_arrays
 from densify.readers.file_sequence import (
     FileSequence,
     Returns,
     chosen_scene,
+    pinhole,
     quaternion_pose,
     truth_beside,
 )
 
 _BOGUS_YEAR = 2200
-_FIELDS = ("X", "Y", "Z")
 
 
 def open_recording(path: Path, scene: str | None) -> Dgp:
@@ -60,19 +58,18 @@ def open_recording(path: Path, scene: str | None) -> Dgp:
 
 
 def find_scene(folder: Path) -> Path | None:
-    """The file that describes the folder's scene, None if there is none."""
+    """Return the file that describes the folder's scene, None if there is none."""
     found = [p for p in folder.glob("scene_*.json") if not p.name.startswith("scene_dataset")]
     return min(found, default=None)
 
 
-@dataclass(frozen=True)
-class _Datum:
-    """One sweep or image. size_px: of an image. T_world_sensor: (4,4)."""
+class _Datum(NamedTuple):
+    """One sweep or image. size_px: of an image. T_world_sensor: (4,4). columns: of a sweep."""
 
     path: Path
     stamp_ns: int
     T_world_sensor: Float
-    fields: tuple[str, ...]
+    columns: tuple[str, ...]
     size_px: tuple[int, int]
 
 
@@ -85,55 +82,60 @@ class Dgp(FileSequence):
         file = find_scene(path)
         if file is None:
             raise InputError(f"{path}: no DGP scene; expected scene_<hash>.json in it")
-        sweeps, images, calibration = _read_scene(file)
+        sweeps, self._images, calibration = _read_scene(file)
         lidar = min(sweeps)
         self._sweeps = sweeps[lidar]
-        self._images = images
-        T_ego_sensor, K = _read_calibration(calibration)
-        T_ego_lidar = _of_sensor(T_ego_sensor, lidar, calibration)
-        cameras = {}
-        for name, of_camera in images.items():
-            T_cam_lidar = poses.inverse(_of_sensor(T_ego_sensor, name, calibration)) @ T_ego_lidar
-            of_name = _of_sensor(K, name, calibration)
-            if of_name[0, 0] <= 0 or of_name[1, 1] <= 0:
-                raise InputError(f"{calibration}: {name}: expected positive fx and fy")
-            size_px = next(iter(of_camera.values())).size_px
-            cameras[name] = Camera(name, *size_px, of_name, T_cam_lidar)
+        mounts = _read_calibration(calibration)
+        missing = [name for name in (lidar, *self._images) if name not in mounts]
+        if missing:
+            raise InputError(
+                f"{calibration}: no calibration of {missing[0]}; got {', '.join(map(str, mounts))}"
+            )
+        T_ego_lidar, cameras = mounts[lidar][0], {}
+        for name, data in self._images.items():
+            (T_ego_cam, lens), size_px = mounts[name], next(iter(data.values())).size_px
+            T_cam_lidar = poses.inverse(T_ego_cam) @ T_ego_lidar
+            cameras[name] = pinhole(name, size_px, lens, T_cam_lidar, f"{calibration}: {name}")
         self._origins_m = None
         if np.array_equal(T_ego_lidar, np.eye(4)) and cameras:
             places = [poses.inverse(camera.T_cam_lidar)[:3, 3] for camera in cameras.values()]
             self._origins_m = np.mean(places, axis=0)[None]
-        exposed_ns = {n: {i: d.stamp_ns for i, d in data.items()} for n, data in images.items()}
         super().__init__(
             path.resolve().name,
             path,
             tuple(self._sweeps),
             cameras,
-            exposed_ns,
+            {n: {i: d.stamp_ns for i, d in data.items()} for n, data in self._images.items()},
             truth_beside(path),
+            images={n: {i: d.path for i, d in data.items()} for n, data in self._images.items()},
         )
 
     def stamp_ns(self, frame: int) -> int:
-        """The data set's own."""
+        """Return the data set's own stamp."""
         self.check_frame(frame)
         return self._sweeps[frame].stamp_ns
 
     def T_world_cam(self, camera: str, number: int) -> Float:
-        """(4,4) the data set's own pose of an image."""
+        """Return the data set's own (4,4) pose of an image."""
         self.check_image(camera, number)
         return self._images[camera][number].T_world_sensor
 
     def _returns(self, frame: int) -> tuple[Path, Returns]:
-        datum = self._sweeps[frame]
-        columns = _read_points(datum)
-        points = np.column_stack([columns[name] for name in _FIELDS]).astype(np.float64)
+        path, names = self._sweeps[frame].path, self._sweeps[frame].columns
+        rows = read_arrays(path, ("data",)).get("data")
+        if rows is None:
+            raise InputError(f"{path}: holds no array data, expected its points there")
+        fits = rows.ndim == 2 and rows.shape[1] == len(names) and rows.dtype.kind in "fiu"
+        if not fits or not {"X", "Y", "Z"} <= set(names):
+            raise InputError(
+                f"{path}: got an array {rows.shape} of {rows.dtype}, expected numbers, a column "
+                f"for each of {' '.join(names) or 'X Y Z INTENSITY'}, X Y Z among them"
+            )
+        columns = dict(zip(names, rows.T, strict=True))
+        points = np.column_stack([columns[name] for name in "XYZ"]).astype(np.float64)
         brightness = columns.get("INTENSITY")
         intensity = None if brightness is None else np.clip(brightness, 0, 1).astype(np.float32)
-        return datum.path, Returns(points, intensity, scanner_origins=self._origins_m)
-
-    def _encoded_image(self, camera: str, number: int) -> tuple[Path, bytes]:
-        path = self._images[camera][number].path
-        return path, read_bytes(path)
+        return path, Returns(points, intensity, scanner_origins=self._origins_m)
 
     def _pose(self, frame: int) -> Float:
         return self._sweeps[frame].T_world_sensor
@@ -143,7 +145,8 @@ _Numbered = dict[str, dict[int, _Datum]]
 
 
 def _read_scene(file: Path) -> tuple[_Numbered, _Numbered, Path]:
-    """Sweeps and images that are there, by sensor and number, and the calibration's file."""
+    """Return the sweeps and images that are there, by sensor and number, and the calibration's
+    file."""
     content = read_json(file)
     found: dict[str, _Numbered] = {"point_cloud": {}, "image": {}}
     try:
@@ -152,17 +155,14 @@ def _read_scene(file: Path) -> tuple[_Numbered, _Numbered, Path]:
         missing = keys - set(data)
         if missing:
             raise KeyError(f"{min(missing)} among its data, which a sample names")
-        ids = {key: (data[key]["id"]["timestamp"], data[key]["id"]["name"]) for key in keys}
-        entries = [data[key] for key in sorted(keys, key=lambda key: ids[key])]
-        for kind, by_sensor in found.items():
-            every: dict[str, list[Any]] = {}
-            for entry in (e for e in entries if kind in e["datum"]):
-                every.setdefault(entry["id"]["name"], []).append(entry)
-            for name, of_sensor in every.items():
-                numbered = {i: _datum(file, kind, entry) for i, entry in enumerate(of_sensor)}
-                there = {i: datum for i, datum in numbered.items() if isfile(datum.path)}
-                if there:
-                    by_sensor[name] = there
+        numbered: dict[str, int] = {}
+        for entry in sorted((data[key] for key in keys), key=lambda e: e["id"]["timestamp"]):
+            kind, name = next(iter(entry["datum"])), entry["id"]["name"]
+            number = numbered[name] = numbered.get(name, -1) + 1
+            if kind in found:
+                datum = _datum(file, kind, entry)
+                if isfile(datum.path):
+                    found[kind].setdefault(name, {})[number] = datum
         key = content["samples"][0]["calibration_key"]
     except (KeyError, IndexError, TypeError, AttributeError) as error:
         raise InputError(
@@ -170,7 +170,8 @@ def _read_scene(file: Path) -> tuple[_Numbered, _Numbered, Path]:
         ) from None
     if not found["point_cloud"]:
         raise InputError(f"{file}: none of its sweeps is there; expected point_cloud/LIDAR/*.npz")
-    return found["point_cloud"], found["image"], file.parent / "calibration" / f"{key}.json"
+    images = dict(sorted(found["image"].items()))
+    return found["point_cloud"], images, file.parent / "calibration" / f"{key}.json"
 
 
 def _datum(file: Path, kind: str, entry: Mapping[str, Any]) -> _Datum:
@@ -202,46 +203,19 @@ def _read_pose(given: Mapping[str, Any], where: str) -> Float:
     return quaternion_pose(quaternion, [place[key] for key in "xyz"], where)
 
 
-def _read_calibration(file: Path) -> tuple[dict[str, Float], dict[str, Float]]:
-    """T_ego_sensor (4,4) and K (3,3) by name."""
+def _read_calibration(file: Path) -> dict[str, tuple[Float, list[float]]]:
+    """Return T_ego_sensor (4,4) and fx fy cx cy by the sensor's name."""
     given = read_json(file)
     try:
-        names: Sequence[str] = given["names"]
-        T_ego_sensor = {
-            name: _read_pose(extrinsic, f"{file}: extrinsics of {name}")
-            for name, extrinsic in zip(names, given["extrinsics"], strict=True)
-        }
-        K = {
-            name: np.array(
-                [[i["fx"], i.get("skew", 0.0), i["cx"]], [0, i["fy"], i["cy"]], [0, 0, 1]], float
+        sensors = zip(given["names"], given["extrinsics"], given["intrinsics"], strict=True)
+        return {
+            name: (
+                _read_pose(extrinsic, f"{file}: extrinsics of {name}"),
+                [float(lens[key]) for key in ("fx", "fy", "cx", "cy")],
             )
-            for name, i in zip(names, given["intrinsics"], strict=True)
+            for name, extrinsic, lens in sensors
         }
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise InputError(
             f"{file}: {error}; expected names, and extrinsics and intrinsics of each"
         ) from None
-    return T_ego_sensor, K
-
-
-def _of_sensor(values: Mapping[str, Float], name: str, file: Path) -> Float:
-    if name not in values or not np.isfinite(values[name]).all():
-        raise InputError(
-            f"{file}: no finite calibration of {name}; got {', '.join(map(str, values))}"
-        )
-    return values[name]
-
-
-def _read_points(datum: _Datum) -> dict[str, Float]:
-    """Columns by name; no Python objects are read."""
-    arrays = read_arrays(datum.path, ("data",))
-    if "data" not in arrays:
-        raise InputError(f"{datum.path}: holds no array data, expected its points there")
-    points = arrays["data"]
-    fits = points.ndim == 2 and points.shape[1] == len(datum.fields) and points.dtype.kind in "fiu"
-    if not fits or not set(_FIELDS) <= set(datum.fields):
-        raise InputError(
-            f"{datum.path}: got an array {points.shape} of {points.dtype}, expected numbers, a "
-            f"column for each of {' '.join(datum.fields) or 'X Y Z INTENSITY'}, X Y Z among them"
-        )
-    return dict(zip(datum.fields, points.T, strict=True))

@@ -234,6 +234,29 @@ def check_image_size(shape: tuple[int, ...], camera: Camera, where: Path | str) 
         )
 
 
+def pinhole(
+    name: str,
+    size_px: tuple[int, int],
+    fx_fy_cx_cy: Sequence[float],
+    T_cam_lidar: Float,
+    where: str,
+    **lens: Any,
+) -> Camera:
+    """Return a camera without skew. Raises InputError, which starts with ``where``, unless the
+    numbers are finite and the focal lengths and the size (width, height) are positive.
+
+    lens: further arguments of `Camera`, such as its distortion.
+    """
+    fx, fy, cx, cy = (float(value) for value in fx_fy_cx_cy)
+    if not (np.isfinite([fx, fy, cx, cy]).all() and min(fx, fy, *size_px) > 0):
+        raise InputError(
+            f"{where}: got fx {fx:g}, fy {fy:g}, cx {cx:g}, cy {cy:g} and {size_px[0]} x "
+            f"{size_px[1]} px, expected finite numbers, positive focal lengths and sizes"
+        )
+    K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+    return Camera(name, *size_px, K, T_cam_lidar, **lens)
+
+
 def chosen_scene(reader: str, path: Path, scene: str | None, names: Sequence[str]) -> str:
     """Return which recording of a place is meant: the one named, or the only one.
 

@@ -3,13 +3,12 @@
 
 ``000119_000120.npz`` holds the flow of the points of sweep 119 to the time of sweep 120::
 
-    residual_flow  (N,3) metres, without the ego motion: 0 for what stands still; in the lidar frame
-                   of the source sweep, or, instead of it,
+    residual_flow  (N,3) metres, ego motion removed, in the source's lidar frame, or instead of it
     total_flow     (N,3) metres with the ego motion: from the point in the source's lidar frame to
-                   where it is in the target's (then our registration takes the ego motion out)
+                   its position in the target's (then our registration removes the ego motion)
     row            (N,) row of each point in the source sweep's file; without it N is their number
-    moving         (N,) bool; without it everything with a residual flow of 5 cm or more
-    object         (N,) which moving object, the same number in every file, -1 none; without it none
+    moving         (N,) bool; without it everything with a residual flow of 0.05 m or more
+    object         (N,) moving object, the same number in every file, -1 none; without it none
     valid          (N,) bool, of labels: the point's flow is known; read for scoring alone
     to_reference   (N,3) metres, own motion from the point's firing to the sweep's reference time;
                    without it 0
@@ -33,16 +32,13 @@ from densify.readers.decoded_files import read_arrays
 
 MOVES_M = 0.05
 FARTHEST_M = 1000.0
-"""From sweep to sweep nothing on a road goes farther."""
+"""The longest step between sweeps that is believed."""
 _WIDE = ("residual_flow", "total_flow", "to_reference")
 _KNOWN = (*_WIDE, "row", "moving", "object", "valid")
 
 
 def estimate_motion(scene: Scene, settings: Config, argument: str) -> Motion:
-    """The flow files of a folder as an engine, see `densify.flow.engines.EngineModule`.
-
-    argument: the folder.
-    """
+    """Read the flow files of a folder as an engine, see `densify.flow.engines.EngineModule`."""
     files = FlowFiles(Path(argument), scene.stretch)
     return ChainedMotion(scene.stretch, files.step)
 
@@ -54,58 +50,63 @@ def check_argument(argument: str) -> None:
 
 
 class FlowFiles:
-    """The flow files of a folder, for the sweeps of a stretch.
-
-    Raises InputError for a folder that is not there.
-    """
+    """The flow files of a folder, for the sweeps of a stretch. Raises InputError for a folder that
+    is not there."""
 
     def __init__(self, folder: Path, stretch: Stretch) -> None:
         check_argument(str(folder))
         self._folder, self._stretch = folder, stretch
 
     def step(self, here: int, there: int) -> FlowField:
-        """Flow of sweep number ``here`` to number ``there``; points of other rows do not move.
+        """Return the flow of sweep number ``here`` to number ``there``. Points that the file does
+        not have are static.
 
         Raises InputError for a file that is missing, damaged, or of another form.
         """
         frame, target = (self._stretch.frames[i] for i in (here, there))
+        sweep = self._stretch.sweeps[here].sweep
+        T_here_there = self._stretch.T_target_source(frame, target)
         path = self._folder / f"{frame:06d}_{target:06d}.npz"
-        arrays = load_flow_file(path)
-        row = self._stretch.sweeps[here].sweep.row
-        at, known = rows_in_file(path, arrays, row)
-
-        def column(name: str, width: int | None, default: Any) -> NDArray[Any]:
-            found = np.full(len(row) if width is None else (len(row), width), default)
-            if name in arrays:
-                found[known] = arrays[name][at]
-            return found
-
-        residual = column("residual_flow", 3, 0.0)
-        if "residual_flow" not in arrays:
-            points = self._stretch.sweeps[here].sweep.points
-            moved = points + column("total_flow", 3, 0.0)
-            back = poses.transform(self._stretch.T_target_source(frame, target), moved)
-            residual[known] = (back - points - column("to_reference", 3, 0.0))[known]
-        moving = column("moving", None, False)
-        if "moving" not in arrays:
-            moving = np.linalg.norm(residual, axis=1) >= MOVES_M
+        columns = sweep_columns(path, sweep.row, sweep.points, T_here_there)
+        residual = columns["residual_flow"]
+        moving = columns["moving"].astype(bool)
         residual[~moving] = 0.0
-        return FlowField(
-            residual,
-            moving,
-            column("object", None, np.int32(-1)),
-            np.zeros(len(row), bool),
-            column("to_reference", 3, 0.0) if "to_reference" in arrays else None,
-        )
+        instance = columns["object"].astype(np.int32)
+        lost = np.zeros(len(moving), bool)
+        return FlowField(residual, moving, instance, lost, columns.get("to_reference"))
 
 
-def rows_in_file(
+def sweep_columns(
+    path: Path, row: NDArray[np.int64], points: NDArray[np.float64], T_here_there: NDArray[Any]
+) -> dict[str, NDArray[Any]]:
+    """Return a flow file's columns at the (N,) rows of a sweep.
+
+    row, points: (N,) and (N,3) of the sweep. T_here_there: (4,4) from the target's lidar frame.
+    Returns residual_flow, moving, object and valid, completed where the file lacks one, and
+    to_reference if the file has it; points of other rows have flow 0, object -1 and are not valid.
+    """
+    arrays = load_flow_file(path)
+    at, known = _rows_in_file(path, arrays, row)
+    found = {}
+    for name in arrays:
+        values = np.zeros((len(row), *arrays[name].shape[1:]))
+        values[known] = arrays[name][at]
+        found[name] = values
+    if "residual_flow" not in arrays:
+        back = poses.transform(T_here_there, points + found["total_flow"])
+        residual = back - points - found.get("to_reference", 0.0)
+        found["residual_flow"] = np.where(known[:, None], residual, 0.0)
+    if "moving" not in arrays:
+        found["moving"] = np.linalg.norm(found["residual_flow"], axis=1) >= MOVES_M
+    found["object"] = np.where(known, found.get("object", -1), -1)
+    found["valid"] = known & found.get("valid", known).astype(bool)
+    return found
+
+
+def _rows_in_file(
     path: Path, arrays: dict[str, NDArray[Any]], row: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-    """Where in the file each of the sweep's points is that the file knows, and which those are.
-
-    row: (N,) of the points in the sweep's file. Raises InputError where the file has too few.
-    """
+    """Return where in the file each known point is, and a mask (N,) of the known ones."""
     num_points = len(next(iter(arrays.values())))
     rows = arrays.get("row", np.arange(num_points))
     if "row" not in arrays and len(row) and row.max() >= num_points:
@@ -121,7 +122,7 @@ def rows_in_file(
 
 
 def load_flow_file(path: Path) -> dict[str, NDArray[Any]]:
-    """A flow file's arrays. Raises InputError if it is missing, damaged, or of another form."""
+    """Return the arrays. Raises InputError if the file is missing, damaged, or of another form."""
     if not path.is_file():
         raise InputError(f"{path}: no such flow file; expected one for every step to the key")
     arrays = read_arrays(path, _KNOWN)
@@ -140,10 +141,11 @@ def load_flow_file(path: Path) -> dict[str, NDArray[Any]]:
             )
         if not np.isfinite(array).all():
             raise InputError(f"{path}: array {name}: got NaN or infinite, expected finite numbers")
-        if name in _WIDE and (np.abs(array, dtype=np.float64) > FARTHEST_M).any():
+        most = np.abs(array, dtype=np.float64).max(initial=0) if name in _WIDE else 0.0
+        if most > FARTHEST_M:
             raise InputError(
-                f"{path}: array {name}: got a step of {np.abs(array, dtype=np.float64).max():g} m, "
-                f"expected metres, {FARTHEST_M:g} at most"
+                f"{path}: array {name}: got a step of {most:g} m, expected metres, {FARTHEST_M:g} "
+                f"at most"
             )
     if (arrays.get("row", np.zeros(1)) < 0).any():
         raise InputError(f"{path}: array row: got a negative one, expected row numbers from 0 up")

@@ -2,15 +2,15 @@
 """Packets of an Ouster scanner: a ``.pcap`` file and the metadata ``.json`` that the sensor gives,
 decoded by the maker's ouster-sdk (densify[ouster]).
 
-The metadata is the ``.json`` beside whose name the capture's begins with, or the only one there, or
-the one named behind ``#``. A sweep is a frame of the sensor, numbered from 0; frames are found when
-the file is opened, their packets read when a sweep is asked for.
+The metadata is the ``.json`` whose name the capture's begins with, or the only one beside it, or
+the one named behind ``#``. A sweep is a frame of the sensor, numbered from 0. Opening finds the
+frames; their packets are read when a sweep is asked for.
 
 - The stamp is the computer's: when the first packet of the frame was captured. The sensor's own
-  clock may count from when it was switched on; it tells how long after the first column each other
-  column was measured (``offset_ns``).
-- Points are the sensor's, as measured, in its frame (x forward, y left, z up, origin on its base);
-  rays start on the spinning axis (they leave it 1 to 2 cm ahead, in their own direction).
+  clock may count from when it was switched on; it gives the time of each column since the first
+  (``offset_ns``).
+- Points are the sensor's, as measured, in its frame (x forward, y left, z up, origin on its base).
+  Rays start on the spinning axis (they leave it 1 to 2 cm ahead, in their own direction).
 - Rows count over the image of returns, ring by ring. Of two returns the first is taken.
 - There are neither cameras nor poses.
 """
@@ -19,17 +19,13 @@ from __future__ import annotations
 
 import warnings
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from densify.config.errors import InputError
-from densify.config.file_content import read_json
-from densify.geometry.types import Float32
+from densify.config.file_content import read_json, reason
 from densify.readers.extras import needed
 from densify.readers.file_sequence import FileSequence, Returns
-
-_WHAT = "Ouster captures"
 
 
 def open_recording(path: Path, scene: str | None) -> Ouster:
@@ -47,7 +43,7 @@ def open_recording(path: Path, scene: str | None) -> Ouster:
 
 
 def find_metadata(path: Path) -> Path | None:
-    """The metadata beside a capture, from names alone; None where that does not tell."""
+    """Return the metadata beside a capture, from names alone; None where that does not tell."""
     found = sorted(path.parent.glob("*.json"))
     named = [p for p in found if path.stem.startswith(p.stem)]
     if named:
@@ -61,17 +57,17 @@ class Ouster(FileSequence):
     def __init__(self, path: Path, metadata: Path) -> None:
         """Raises InputError if the file is no capture, the metadata no Ouster's, or they do not
         belong together."""
-        self._core = needed("ouster.sdk.core", "ouster", _WHAT)
-        pcap = needed("ouster.sdk.pcap", "ouster", _WHAT)
+        core = needed("ouster.sdk.core", "ouster", "Ouster captures")
+        pcap = needed("ouster.sdk.pcap", "ouster", "Ouster captures")
         read_json(metadata)
         try:
             self._source = pcap.PcapFrameSetSource(str(path), meta=[str(metadata)], index=True)
             index = self._source.individual_index[0]
-            self._table = self._core.XYZLut(self._source.sensor_info[0])
+            self._table = core.XYZLut(self._source.sensor_info[0])
         except Exception as error:  # of the library's many kinds
             raise InputError(
-                f"{path}: cannot be decoded with {metadata.name}: {_line(error)}; expected a .pcap "
-                f"of an Ouster and the metadata of the same sensor"
+                f"{path}: cannot be decoded with {metadata.name}: {reason(error)}; expected a "
+                f".pcap of an Ouster and the metadata of the same sensor"
             ) from error
         if not len(index):
             raise InputError(
@@ -79,10 +75,14 @@ class Ouster(FileSequence):
                 f"metadata by ouster:{path}#NAME.json"
             )
         self._captured_us = index[:, 0].astype(np.int64)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # deprecated names
+            T = np.asarray(self._source.sensor_info[0].lidar_to_sensor_transform, np.float64)
+        self._origins_m = T[None, :3, 3] * 1e-3
         super().__init__(path.stem, path, range(len(index)))
 
     def stamp_ns(self, frame: int) -> int:
-        """When the sweep's first packet was captured."""
+        """Return when the sweep's first packet was captured."""
         self.check_frame(frame)
         return int(self._captured_us[frame]) * 1000
 
@@ -92,7 +92,7 @@ class Ouster(FileSequence):
             points = np.asarray(self._table(scan), np.float64)
         except Exception as error:  # of the library's many kinds
             raise InputError(
-                f"{self.where}: frame {frame} cannot be decoded: {_line(error)}; choose a key or "
+                f"{self.where}: frame {frame} cannot be decoded: {reason(error)}; choose a key or "
                 f"window without it"
             ) from error
         measured = (scan.status & 1).astype(bool)
@@ -101,27 +101,12 @@ class Ouster(FileSequence):
             column_ns = scan.timestamp.astype(np.int64)
             since_ns[measured] = column_ns[measured] - column_ns[measured].min()
         points[:, ~measured] = 0
+        intensity = np.zeros((scan.h, scan.w))
+        if scan.has_field("REFLECTIVITY"):
+            intensity = np.clip(scan.field("REFLECTIVITY") / 255, 0, 1)
         return self.where, Returns(
             points.reshape(-1, 3),
-            _intensity(scan).reshape(-1),
+            intensity.astype(np.float32).reshape(-1),
             np.broadcast_to(since_ns, (scan.h, scan.w)).reshape(-1),
-            scanner_origins=self._origin_m()[None],
+            scanner_origins=self._origins_m,
         )
-
-    def _origin_m(self) -> np.ndarray:
-        info = self._source.sensor_info[0]
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of names that are on their way out
-            to_sensor = np.asarray(info.lidar_to_sensor_transform, np.float64)
-        return to_sensor[:3, 3] * 1e-3
-
-
-def _intensity(scan: Any) -> Float32:
-    """(H,W) 0 to 1, calibrated by the sensor; 0 where its profile has none."""
-    if not scan.has_field("REFLECTIVITY"):
-        return np.zeros((scan.h, scan.w), np.float32)
-    return np.clip(scan.field("REFLECTIVITY").astype(np.float32) / 255, 0, 1)
-
-
-def _line(error: Exception) -> str:
-    return " ".join(str(error).split()) or repr(error)

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: MIT
-"""The built-in street as a recording: frames are made when asked for and kept in a cache folder.
+"""The built-in street as a recording. Frames are rendered when asked for and kept in a folder.
 
-``street[:PRESET][?seed=N&sensor=NAME&hz=RATE&tilt=DEG&cameras=NAME,NAME]``. 16 seconds: at 10 Hz
-frames 0 to 159. The cache lies in the user's cache directory, or in the folder named by the
-environment variable DENSIFY_CACHE_DIR; it can be deleted at any time. A cached frame equals one
-made anew, byte for byte.
+``street[:PRESET][?seed=N&sensor=NAME&hz=RATE&tilt=DEG&cameras=NAME,NAME]``. It lasts 16 seconds: at
+10 Hz frames 0 to 159. The cache lies in the user's cache directory, or in the folder named by the
+environment variable DENSIFY_CACHE_DIR. It can be deleted at any time: a frame rendered again is the
+same, byte for byte.
 """
 
 from __future__ import annotations
@@ -16,7 +16,6 @@ from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cached_property, partial
-from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qsl
 
@@ -35,14 +34,10 @@ from densify.street.scenes import PRESETS
 from densify.street.sensors import SENSORS
 from densify.street.simulator import VERSION, Bodies, Simulator
 
-Arrays = dict[str, NDArray[Any]]
 _log = logging.getLogger("densify")
 _progress = logging.getLogger("densify.progress")
 _KEPT_IN_MEMORY = 16
-_RATES_HZ = ("5", "10", "20")
-_SEED_DIGITS = 18
-_MAX_TILT_DEG = 45
-_NO_CAMERA = "none"
+_OPTIONS = {"seed": "0", "sensor": "hdl64", "hz": "10", "tilt": "0", "cameras": ",".join(USUAL)}
 
 
 class Street:
@@ -50,14 +45,12 @@ class Street:
 
     preset: street, static (nothing else moves), crossing (the ego vehicle stands) or highway.
     seed: another number is another scene of that kind. sensor: a row of
-    `densify.street.sensors.SENSORS`. hz: sweeps per second, 5, 10 or 20; the scene is the same at
-    the same time, so frame 120 at 10 Hz is frame 240 at 20 Hz and frame 60 at 5 Hz. Scanners fire
-    at a constant rate, as real ones do: a spinning one has half the columns at 20 Hz and twice as
-    many at 5 Hz. tilt_deg: the sensor's mount is pitched nose down by this angle, -45 to 45; the
-    cameras stay where they are on the vehicle. cameras: names, none if empty. image_02 and image_03
-    expose once for each sweep, the second 15 ms after its reference time; the others have clocks of
-    their own: fast (30 Hz), rolling (a rolling shutter, 0.1 ms from row to row), fisheye (190
-    degrees, to the left).
+    `densify.street.sensors.SENSORS`. hz: sweeps per second, 5, 10 or 20. The scene is the same at
+    the same time: frame 120 at 10 Hz is frame 240 at 20 Hz. Scanners fire at a constant rate, so a
+    spinning one has half the columns at 20 Hz. tilt_deg: pitch of the sensor's mount, nose down,
+    -45 to 45; the cameras stay. cameras: names, none if empty. image_02 and image_03 expose once
+    per sweep, the second 15 ms after its reference time. The others have clocks of their own: fast
+    (30 Hz), rolling (a rolling shutter, 0.1 ms per row), fisheye (190 degrees, to the left).
 
     Raises InputError for a value that does not exist.
     """
@@ -71,21 +64,18 @@ class Street:
         tilt_deg: float = 0.0,
         cameras: tuple[str, ...] = USUAL,
     ) -> None:
-        _choice("preset", preset, tuple(PRESETS))
-        _choice("sensor", sensor, tuple(SENSORS))
-        _choice("hz", str(hz), _RATES_HZ)
+        _check("preset", preset, PRESETS)
+        _check("sensor", sensor, SENSORS)
+        _check("hz", str(hz), ("5", "10", "20"))
         if seed < 0:
             raise InputError(f"street seed {seed}: expected a whole number from 0")
-        if not abs(tilt_deg) <= _MAX_TILT_DEG:
-            raise InputError(
-                f"street tilt {tilt_deg:g}: expected degrees from -{_MAX_TILT_DEG} to "
-                f"{_MAX_TILT_DEG}, nose down, as in street?tilt=10"
-            )
+        if not abs(tilt_deg) <= 45:
+            raise InputError(f"street tilt {tilt_deg:g}: expected degrees from -45 to 45")
         for name in cameras:
-            _choice("camera", name, tuple(CAMERAS))
+            _check("camera", name, CAMERAS)
         changed = [("hz", hz)] * (hz != 10) + [("tilt", f"{tilt_deg:g}")] * (tilt_deg != 0)
         options = "".join(f"&{key}={value}" for key, value in changed)
-        shown = f"&cameras={','.join(cameras) or _NO_CAMERA}" * (cameras != USUAL)
+        shown = f"&cameras={','.join(cameras) or 'none'}" * (cameras != USUAL)
         self.name = f"street:{preset}?seed={seed}&sensor={sensor}{options}{shown}"
         self.simulator = Simulator(preset, seed, SENSORS[sensor], hz, tilt_deg)
         self.frames = range(self.simulator.num_frames)
@@ -98,10 +88,8 @@ class Street:
 
     @staticmethod
     def from_spec(spec: str) -> Street:
-        """``street``, ``street:highway``, ``street:crossing?seed=2&sensor=vlp16`` and the like.
-
-        Raises InputError for anything else.
-        """
+        """Parse ``street``, ``street:highway``, ``street:crossing?seed=2&sensor=vlp16`` and so on.
+        Raises InputError for anything else."""
         head, _, query = spec.partition("?")
         reader, _, preset = head.partition(":")
         if reader != "street":
@@ -110,29 +98,27 @@ class Street:
                 f"&cameras=NAME,NAME]"
             )
         given = parse_qsl(query, keep_blank_values=True)
-        options = dict(given)
-        for key in options:
-            _choice("option", key, ("seed", "sensor", "hz", "tilt", "cameras"))
-        if len(options) < len(given):
+        for key, _ in given:
+            _check("option", key, _OPTIONS)
+        options = _OPTIONS | dict(given)
+        if len(dict(given)) < len(given):
             raise InputError(f"{spec!r}: an option is given twice; keep one of each")
-        seed, hz, tilt = (
-            options.get(k, v) for k, v in (("seed", "0"), ("hz", "10"), ("tilt", "0"))
-        )
-        if not (seed.isascii() and seed.isdigit() and len(seed) <= _SEED_DIGITS):
+        seed, tilt, cameras = options["seed"], options["tilt"], options["cameras"]
+        if not (seed.isascii() and seed.isdigit() and len(seed) <= 18):
             raise InputError(
-                f"street seed {seed!r}: expected a whole number from 0, of up to {_SEED_DIGITS} "
-                f"digits, as in street?seed=7"
+                f"street seed {seed!r}: expected a whole number from 0, of up to 18 digits, as in "
+                f"street?seed=7"
             )
-        _choice("hz", hz, _RATES_HZ)
-        cameras = options.get("cameras", ",".join(USUAL))
-        return Street(
-            preset or "street",
-            int(seed),
-            options.get("sensor", "hdl64"),
-            int(hz),
-            _degrees(tilt),
-            () if cameras == _NO_CAMERA else tuple(cameras.split(",")),
-        )
+        _check("hz", options["hz"], ("5", "10", "20"))
+        try:
+            tilt_deg = float(tilt)
+        except ValueError:
+            raise InputError(
+                f"street tilt {tilt!r}: expected degrees, nose down, as in street?tilt=10"
+            ) from None
+        names = () if cameras == "none" else tuple(cameras.split(","))
+        hz = int(options["hz"])
+        return Street(preset or "street", int(seed), options["sensor"], hz, tilt_deg, names)
 
     def __getitem__(self, frame: int) -> Sweep:
         returns = self.returns(frame)
@@ -153,70 +139,66 @@ class Street:
         self._store.on_disk = False
 
     def stamp_ns(self, frame: int) -> int:
-        """Reference time of a sweep."""
+        """Return the reference time of a sweep."""
         self.check(frame)
         return self.simulator.stamp_ns(frame)
 
     def returns(self, frame: int) -> Returns:
-        """The sweep's returns with the bodies they are from."""
+        """Return the sweep's returns with the bodies they are from."""
         self.check(frame)
-        return Returns(
-            **self._store.get(
-                f"{self._swept}/sweep/{frame}",
-                lambda: {
-                    k: v for k, v in vars(self.simulator.returns(frame)).items() if v is not None
-                },
-            )
-        )
+
+        def make() -> dict[str, NDArray[Any]]:
+            found = vars(self.simulator.returns(frame))
+            return {name: array for name, array in found.items() if array is not None}
+
+        return Returns(**self._store.get(f"{self._swept}/sweep/{frame}", make))
 
     def prepare(self, frames: Sequence[int], images: Sequence[tuple[str, int]] = ()) -> None:
         """Render what is not in the cache yet, on all cores."""
-        wanted: dict[str, Callable[[], object]] = {}
-        wanted |= {f"{self._pictured}/{c}/{n}": partial(self.picture, c, n) for c, n in images}
-        wanted |= {f"{self._swept}/sweep/{frame}": partial(self.returns, frame) for frame in frames}
+        wanted: dict[str, Callable[[], object]] = {
+            **{f"{self._pictured}/{c}/{n}": partial(self.picture, c, n) for c, n in images},
+            **{f"{self._swept}/sweep/{frame}": partial(self.returns, frame) for frame in frames},
+        }
         missing = [make for name, make in wanted.items() if name not in self._store]
         if missing:
-            _ = self.simulator.scene.world.triangles  # else each thread might make them
+            _ = self.simulator.scene.world.triangles  # otherwise each thread might make them
             with ThreadPoolExecutor(num_threads()) as pool:
                 for made in [pool.submit(make) for make in missing]:
                     made.result()
 
     def picture(self, camera: str, number: int) -> Picture:
-        """A camera's image with its exact depth and the bodies seen."""
+        """Return a camera's image with its exact depth and the bodies in it."""
         stamps_ns = self.image_stamps_ns(camera)
         if number not in stamps_ns:
             raise InputError(
                 f"street: no image {number} of {camera}; there are images 0 to {max(stamps_ns)}"
             )
-        return Picture(
-            **self._store.get(
-                f"{self._pictured}/{camera}/{number}",
-                lambda: vars(self.simulator.picture(camera, number)),
-            )
-        )
+        name = f"{self._pictured}/{camera}/{number}"
+        make = partial(self.simulator.picture, camera, number)
+        return Picture(**self._store.get(name, lambda: vars(make())))
 
     def image(self, camera: str, number: int) -> NDArray[np.uint8]:
-        """(H,W,3) RGB."""
+        """Return (H,W,3) RGB."""
         return self.picture(camera, number).image
 
     def image_stamps_ns(self, camera: str) -> Mapping[int, int]:
-        """When the camera exposes, by the image's number from 0."""
-        _choice("camera", camera, tuple(self.cameras))
+        """Return when the camera exposes, by the image's number from 0."""
+        _check("camera", camera, self.cameras)
         return self.simulator.image_stamps_ns(camera)
 
     @cached_property
     def bodies(self) -> Bodies:
-        """Where every body is at every frame's reference time, kept as frames are."""
+        """The poses of every body at every frame's reference time."""
         name = f"{self._posed}/bodies"
         return Bodies(**self._store.get(name, lambda: vars(self.simulator.bodies), is_frame=False))
 
     def T_world_lidar(self, frame: int) -> Float:
-        """(4,4) true pose at the sweep's reference time."""
+        """Return the true (4,4) pose at the sweep's reference time."""
         self.check(frame)
         return self.bodies.T_world_lidar[frame]
 
     def check(self, frame: int) -> None:
-        """Raises InputError for a frame that does not exist."""
+        """Raise InputError for a frame that does not exist."""
         if frame not in self.frames:
             raise InputError(f"street: no frame {frame}; there are frames 0 to {self.frames[-1]}")
 
@@ -228,19 +210,17 @@ class StreetTruth:
         self._street = street
 
     def sweep(self, frame: int) -> SweepTruth:
-        """points: where the measured raw points are at the reference time, each carried on by the
-        body it belongs to."""
+        """Return the truth. Its points are the raw points at the reference time, each moved with
+        its body."""
         returns = self._street.returns(frame)
-        simulator = self._street.simulator
-        points = simulator.in_bodies(frame, returns)
+        points = self._street.simulator.in_bodies(frame, returns)
         return self._street.bodies.sweep(frame, returns.body, returns.instance, points)
 
     def displacement(self, frame: int, target: int) -> Float:
-        """(N,3), exactly 0 for everything that stands still between the two frames."""
+        """Return (N,3), exactly 0 for what is static between the two frames."""
         self._street.check(target)
         returns = self._street.returns(frame)
-        simulator = self._street.simulator
-        points = simulator.in_bodies(frame, returns)
+        points = self._street.simulator.in_bodies(frame, returns)
         return self._street.bodies.displacement(frame, target, returns.body, points)
 
     def depth_m(self, camera: str, number: int) -> Float32:
@@ -255,18 +235,9 @@ class StreetTruth:
         return moving
 
 
-def _choice(what: str, got: str, there_are: tuple[str, ...]) -> None:
-    if got not in there_are:
-        raise InputError(f"street: no {what} {got!r}; there are {', '.join(there_are)}")
-
-
-def _degrees(text: str) -> float:
-    try:
-        return float(text)
-    except ValueError:
-        raise InputError(
-            f"street tilt {text!r}: expected degrees, nose down, as in street?tilt=10"
-        ) from None
+def _check(what: str, got: str, known: Sequence[str] | Mapping[str, Any]) -> None:
+    if got not in known:
+        raise InputError(f"street: no {what} {got!r}; there are {', '.join(known)}")
 
 
 def _digest(identity: str) -> str:
@@ -274,24 +245,24 @@ def _digest(identity: str) -> str:
 
 
 class _Store:
-    """Arrays made once and then kept, a few in memory and all in the cache folder.
-
-    Files are written aside and renamed, so that several processes can share the folder; a file
-    that cannot be read is made anew; a folder that cannot be written only costs time.
-    """
+    """Arrays by name, some in memory and all in the cache folder, which processes share. A file
+    that cannot be read is made again; a folder that cannot be written only costs time."""
 
     def __init__(self) -> None:
         self._folder = own_folder("street")
-        self._memory: OrderedDict[str, Arrays] = OrderedDict()
+        self._memory: OrderedDict[str, dict[str, NDArray[Any]]] = OrderedDict()
         self._lock = threading.Lock()
-        self._told = False
+        self._announced = False
         self.on_disk = True
 
     def __contains__(self, name: str) -> bool:
-        return name in self._memory or (self.on_disk and self._path(name).exists())
+        in_folder = self.on_disk and (self._folder / f"{name}.npz").exists()
+        return name in self._memory or in_folder
 
-    def get(self, name: str, make: Callable[[], Arrays], is_frame: bool = True) -> Arrays:
-        """May be called by several threads, each for another name. is_frame: takes long to make,
+    def get(
+        self, name: str, make: Callable[[], dict[str, NDArray[Any]]], is_frame: bool = True
+    ) -> dict[str, NDArray[Any]]:
+        """Return the arrays. Threads may ask for different names. is_frame: making it takes long,
         which is said before the first."""
         with self._lock:
             arrays = self._memory.pop(name, None)
@@ -303,35 +274,23 @@ class _Store:
                 self._memory.popitem(last=False)
         return arrays
 
-    def _read_or_make(self, name: str, make: Callable[[], Arrays], is_frame: bool) -> Arrays:
+    def _read_or_make(
+        self, name: str, make: Callable[[], dict[str, NDArray[Any]]], is_frame: bool
+    ) -> dict[str, NDArray[Any]]:
         if not self.on_disk:
             return make()
-        path = self._path(name)
-        arrays = _read(path)
-        if arrays is None:
-            with self._lock:
-                tell = is_frame and not self._told
-                self._told |= is_frame
-            if tell:
-                _progress.info("rendering the street, 1 to 2 s a sweep; kept in %s", self._folder)
-            arrays = make()
-            _write(path, arrays)
+        path = self._folder / f"{name}.npz"
+        try:
+            return read_arrays(path)
+        except InputError:
+            pass  # not there, or damaged
+        if is_frame and not self._announced:
+            self._announced = True
+            _progress.info("rendering the street, 1 to 2 s a sweep; kept in %s", self._folder)
+        arrays = make()
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            save_arrays(path, arrays)
+        except OSError as error:
+            _log.debug("street frame not kept in the cache: %s", error)
         return arrays
-
-    def _path(self, name: str) -> Path:
-        return self._folder / f"{name}.npz"
-
-
-def _read(path: Path) -> Arrays | None:
-    try:
-        return read_arrays(path)
-    except InputError:
-        return None  # not there, or damaged: it is made anew
-
-
-def _write(path: Path, arrays: Arrays) -> None:
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        save_arrays(path, arrays)
-    except OSError as error:
-        _log.debug("street frame not kept in the cache: %s", error)

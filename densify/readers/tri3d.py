@@ -1,29 +1,26 @@
 # SPDX-License-Identifier: MIT
-"""What the library tri3d (https://github.com/CEA-LIST/tri3d, 0.2) opens and no reader here does:
-ONCE (https://once-for-auto-driving.github.io) and the Frames of the Zenseact Open Dataset (ZOD)::
+"""ONCE (https://once-for-auto-driving.github.io) and the Frames of the Zenseact Open Dataset (ZOD),
+through the library tri3d (https://github.com/CEA-LIST/tri3d, 0.2)::
 
     tri3d:/data/once#Once/000076        ROOT/data/000076/ or ROOT/SPLIT/data/000076/,
                                         each with 000076.json, lidar_roof/*.bin, cam01/*.jpg
     tri3d:/data/zod#ZODFrames/000001    ROOT/trainval-frames-*.json, ROOT/single_frames/000001/
 
-Its other classes (Argoverse2, NuScenes, SemanticKITTI, Waymo) tell less than the readers here and
-are not offered. Both classes read JSON, plain arrays (``np.load`` without pickles) and the headers
-of images; nothing in the data is run. Limits that the library and the data bring:
+The library reads JSON, plain arrays (``np.load`` without pickles) and the headers of images, and
+runs nothing in the data. Limits of the library and the data:
 
-- No point times, so that nothing is deskewed or undone: ``offset_ns`` is None. ZOD's files have
-  them, but the library leaves them out, and the intensities too. ZOD's sweeps are compensated to
-  their stamps (https://github.com/zenseact/zod/issues/59); ONCE does not say.
-- Stamps are float seconds, made of ONCE's milliseconds (the names of its files) and ZOD's
-  microseconds, to which they are rounded. ONCE has two sweeps a second.
+- No point times, so nothing is deskewed: ``offset_ns`` is None. ZOD's sweeps are compensated to
+  their stamps (https://github.com/zenseact/zod/issues/59) and have no intensities here; ONCE does
+  not say.
+- Stamps are float seconds, made of ONCE's milliseconds and ZOD's microseconds, to which they are
+  rounded. ONCE has two sweeps a second.
 - Points, calibration and poses are in the scanner's frame, turned by the library to x forward, y
-  left. ONCE has a pose for each sweep, ZOD a track of the vehicle, which is interpolated here (the
+  left. ONCE has a pose per sweep, ZOD a track of the vehicle, which is interpolated here (the
   library turns the long way round where a quaternion changes its sign).
-- ONCE's images have the stamps of the sweeps and the lens of their calibration (OpenCV's pinhole),
-  as its own tools read them; its documentation calls them undistorted. ZOD's front camera is a
-  fisheye, with one image in the midst of each recording.
-- A whole split is opened at once: the JSON files of all its sequences. Of ONCE these must have
-  labels: the library stumbles over a sequence that has not a single one, as the raw ones and the
-  test split's are.
+- ONCE's images have the stamps of the sweeps and an OpenCV pinhole. ZOD's front camera is a
+  fisheye, with one image in the middle of each recording.
+- A whole split is opened at once. ONCE's sequences must all have labels: the library fails on the
+  raw sequences and on the test split.
 - A damaged rotation is not noticed: the library makes a proper one of any matrix or quaternion.
 
 Frames, and each camera's images, are numbered from 0 in the library's order.
@@ -43,7 +40,7 @@ from densify.config.errors import InputError
 from densify.config.file_content import read_bytes, read_json
 from densify.geometry.types import Camera, Float, Int
 from densify.readers.extras import needed
-from densify.readers.file_sequence import FileSequence, Returns, chosen_scene, rigid
+from densify.readers.file_sequence import FileSequence, Returns, chosen_scene, pinhole, rigid
 from densify.readers.recorded_poses import PoseTrack
 
 _MODELS = {"pinhole": "pinhole", "kannala": "fisheye"}
@@ -51,8 +48,8 @@ _ANONYMIZED = ("dnat", "blur", "original")
 
 
 class _Class(NamedTuple):
-    """What is to be known of a class of the library. tick_ns: its stamps are whole numbers of.
-    compensation: whether its sweeps are compensated, in words."""
+    """A class of the library. tick_ns: unit of its stamps. compensation: of its sweeps, in
+    words."""
 
     lidar: str
     tick_ns: int
@@ -82,26 +79,26 @@ class Tri3d(FileSequence):
     """A sequence of tri3d as a `LidarSequence`."""
 
     def __init__(self, path: Path, scene: str, options: Mapping[str, Any]) -> None:
-        """path: the data set's. scene: CLASS/SEQUENCE. options: the class is made with.
+        """path: the data set's. scene: CLASS/SEQUENCE. options: of the library's class.
 
         Raises InputError if the library is not installed or cannot read the split."""
         kind, _, name = scene.partition("/")
         library = needed("tri3d", "tri3d", "ONCE and ZOD (from Python 3.11 on)")
-        self._class = _CLASSES[kind]
-        self._place = f"{path}#{scene}"
+        self._class, self._place = _CLASSES[kind], f"{path}#{scene}"
         self._as_matrix = library.geometry.as_matrix
         with self._asked("the JSON files of its split (ONCE's sequences all need labels)"):
             self._data = getattr(library.datasets, kind)(**options)
-            self._number = _names(self._data, kind).index(name)
-            stamp_ns = self._stamps_ns(self._class.lidar)
+            names = self._data.scenes if kind == "Once" else [s["id"] for s in self._data.metadata]
+            self._number = list(names).index(name)
+            self._stamp_ns = self._stamps_ns(self._class.lidar)
             self._ego_ns = self._stamps_ns("ego")
             self._T_world_ego = self._data.poses(self._number, "ego")
             self._T_ego_lidar = self._calibrated(self._class.lidar, "ego")
-        if not len(stamp_ns) or np.any(np.diff(stamp_ns) <= 0):
+        if not len(self._stamp_ns) or np.any(np.diff(self._stamp_ns) <= 0):
             raise InputError(
-                f"{self._place}: got {len(stamp_ns)} sweeps, expected some with stamps that ascend"
+                f"{self._place}: got {len(self._stamp_ns)} sweeps, expected some with stamps that "
+                f"ascend"
             )
-        self._stamp_ns = stamp_ns
         cameras, exposed_ns = {}, {}
         for sensor in self._data.cam_sensors:
             with self._asked(f"images of {sensor}"):
@@ -109,29 +106,24 @@ class Tri3d(FileSequence):
             if exposed:
                 cameras[sensor] = self._camera(sensor, sizes_px)
                 exposed_ns[sensor] = exposed
-        super().__init__(name, path, range(len(stamp_ns)), cameras, exposed_ns)
+        super().__init__(name, path, range(len(self._stamp_ns)), cameras, exposed_ns)
 
     def findings(self) -> Sequence[tuple[str, str]]:
         """See `SaysWhatItFound`."""
         return [("compensated", self._class.compensation)]
 
     def stamp_ns(self, frame: int) -> int:
-        """The data set's own."""
+        """Return the data set's own stamp."""
         self.check_frame(frame)
         return int(self._stamp_ns[frame])
 
     def _returns(self, frame: int) -> tuple[Path, Returns]:
         with self._asked(f"sweep {frame}"):
             columns = np.asarray(self._data.points(self._number, frame, self._class.lidar))
-        if columns.ndim != 2 or columns.shape[1] not in (3, 4) or columns.dtype.kind != "f":
-            raise InputError(
-                f"{self._place}: sweep {frame}: got an array {columns.shape} of {columns.dtype}, "
-                f"expected x y z, also intensity, of each point"
-            )
-        intensity = None
-        if columns.shape[1] == 4:
-            intensity = np.clip(np.nan_to_num(columns[:, 3]), 0, 1).astype(np.float32)
-        return self.where, Returns(columns[:, :3].astype(np.float64), intensity)
+            points = columns[:, :3].astype(np.float64)
+            intensity = np.zeros(len(points)) if columns.shape[1] < 4 else columns[:, 3]
+        brightness = np.clip(np.nan_to_num(intensity), 0, 1).astype(np.float32)
+        return self.where, Returns(points, brightness)
 
     def _encoded_image(self, camera: str, number: int) -> tuple[Path, bytes]:
         with (
@@ -147,8 +139,7 @@ class Tri3d(FileSequence):
         if i >= 0 and self._ego_ns[i] == at_ns:
             return self._ego_pose(i) @ self._T_ego_lidar
         i = int(np.clip(i, 0, max(len(self._ego_ns) - 2, 0)))
-        around = range(i, min(i + 2, len(self._ego_ns)))
-        T = np.stack([self._ego_pose(n) for n in around])
+        T = np.stack([self._ego_pose(n) for n in range(i, min(i + 2, len(self._ego_ns)))])
         return PoseTrack(self._place, self._ego_ns[i : i + 2], T).at(at_ns) @ self._T_ego_lidar
 
     def _ego_pose(self, number: int) -> Float:
@@ -157,19 +148,18 @@ class Tri3d(FileSequence):
         return rigid(T, f"{self._place}: pose {number}")
 
     def _calibrated(self, source: str, target: str) -> Float:
-        """(4,4) T_target_source: the library's public alignment would add the vehicle's motion."""
+        """Return (4,4) T_target_source. The library's public alignment would add the vehicle's
+        motion."""
         T = self._as_matrix(self._data._calibration(self._number, source, target))
         return rigid(T, f"{self._place}: calibration of {source} and {target}")
 
     def _stamps_ns(self, sensor: str) -> Int:
         seconds = np.asarray(self._data.timestamps(self._number, sensor), np.float64)
-        if not np.isfinite(seconds).all():
-            raise InputError(f"{self._place}: stamps of {sensor}: expected finite seconds")
         ticks = np.rint(seconds * (1e9 / self._class.tick_ns))
         return ticks.astype(np.int64) * self._class.tick_ns
 
     def _find_images(self, sensor: str) -> tuple[list[tuple[int, int]], dict[int, int]]:
-        """Sizes and exposures of the camera's images that are there."""
+        """Return sizes and exposure times of the camera's images that are there."""
         sizes_px, exposed_ns = [], {}
         for number, stamp_ns in enumerate(self._stamps_ns(sensor).tolist()):
             try:
@@ -178,35 +168,31 @@ class Tri3d(FileSequence):
             except FileNotFoundError:
                 continue
             except OSError:
-                pass  # is there, but damaged, which is said when it is asked for
+                pass  # damaged, which is said when it is asked for
             exposed_ns[number] = stamp_ns
         return sizes_px, exposed_ns
 
     def _camera(self, sensor: str, sizes_px: Sequence[tuple[int, int]]) -> Camera:
-        where = f"{self._place}: calibration of {sensor}"
         with self._asked(f"calibration of {sensor}"):
             image = self._data.img_sensors[self._data.cam_sensors.index(sensor)]
             lens = self._data._calibration(self._number, sensor, image).operations[-1]
             values = np.asarray(lens.intrinsics, np.float64)
             T_cam_lidar = self._calibrated(self._class.lidar, sensor)
-        if values.ndim != 1 or not np.isfinite(values).all() or values[:2].min() <= 0:
-            raise InputError(
-                f"{where}: got {values.tolist()}, expected finite fx fy cx cy and coefficients, "
-                f"fx and fy positive"
-            )
         if not sizes_px:
             raise InputError(f"{self._place}: none of the images of {sensor} is a whole one")
-        fx, fy, cx, cy = values[:4].tolist()
-        K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
-        coefficients = tuple(values[4:].tolist())
-        model = _MODELS[lens.model]
-        if model == "pinhole" and not any(coefficients):
-            coefficients = ()
-        return Camera(sensor, *sizes_px[0], K, T_cam_lidar, coefficients, model)
+        return pinhole(
+            sensor,
+            sizes_px[0],
+            values[:4].tolist(),
+            T_cam_lidar,
+            f"{self._place}: calibration of {sensor}",
+            distortion=tuple(values[4:].tolist()) if values[4:].any() else (),
+            model=_MODELS[lens.model],
+        )
 
     @contextmanager
     def _asked(self, what: str) -> Iterator[None]:
-        """Turns whatever the library says of a damaged file into an InputError."""
+        """Turn whatever the library raises for a damaged file into an InputError."""
         try:
             with np.errstate(all="ignore"):
                 yield
@@ -219,13 +205,8 @@ class Tri3d(FileSequence):
             ) from error
 
 
-def _names(data: Any, kind: str) -> list[str]:
-    """The sequences' names in the library's order."""
-    return list(data.scenes) if kind == "Once" else [sequence["id"] for sequence in data.metadata]
-
-
 def _find_once(path: Path) -> dict[str, dict[str, Any]]:
-    """How each sequence's split is opened, by the sequence's name."""
+    """Return the options that open each sequence's split, by the sequence's name."""
     files = (*path.glob("data/*/*.json"), *path.glob("*/data/*/*.json"))
     return {
         file.stem: {"root": file.parents[2], "subset": "."}
@@ -235,7 +216,7 @@ def _find_once(path: Path) -> dict[str, dict[str, Any]]:
 
 
 def _find_zod(path: Path) -> dict[str, dict[str, Any]]:
-    """The same of ZOD: those in the shortest list of frames that is there."""
+    """Return the same of ZOD, from the shortest list of frames that is there."""
     lists = sorted(path.glob("trainval-frames-*.json"), key=lambda file: file.stat().st_size)
     if not lists:
         return {}
@@ -259,7 +240,7 @@ def _find_zod(path: Path) -> dict[str, dict[str, Any]]:
 
 
 def _anonymized(path: Path, images: Mapping[str, Any]) -> str:
-    """How the front camera's images that are there were made anonymous."""
+    """Return how the front camera's images that are there were made anonymous."""
     for method in _ANONYMIZED:
         listed = images.get(f"front_{method}")
         if listed and isfile(path / listed[0]["filepath"]):

@@ -1,18 +1,16 @@
 # SPDX-License-Identifier: MIT
-"""True scene flow beside a recording, for scoring: labels of every point's flow to the next sweep.
+"""Read true scene flow beside a recording, for scoring: labels of every point's flow to the next
+sweep, in one of three forms, told apart by what lies there::
 
-One of three forms, told apart by what lies there::
-
-    DIR/000119_000120.npz   as `densify.readers.flow_files` describes: residual_flow or total_flow,
-                            object (N,) -1 none, row; and valid (N,) bool, without it all are
+    DIR/000119_000120.npz   a flow file (`densify.readers.flow_files`)
     DIR/[LOG/]STAMP.feather Argoverse 2's labels as BucketedSceneFlowEval stores them: flow_tx_m
-                            flow_ty_m flow_tz_m without ego-motion, in the vehicle's frame at the
+                            flow_ty_m flow_tz_m without ego motion, in the vehicle's frame at the
                             stamp; is_valid; classes_0, -1 the background, else the category's
                             place in `CATEGORIES`. Named by stamps, or 0000000000, 0000000001, …
-    LOG.h5                  OpenSceneFlow's: flow with ego-motion, flow_is_valid,
+    LOG.h5                  OpenSceneFlow's: flow with ego motion, flow_is_valid,
                             flow_category_indices, 0 the background, else one more than above
 
-All points of the sweep's file are in it, row by row.
+A feather or .h5 file has all points of the sweep's file, row by row.
 """
 
 from __future__ import annotations
@@ -24,12 +22,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from densify.config.errors import InputError
-from densify.geometry import poses
 from densify.geometry.types import Bool, Float, Stretch
 from densify.readers.arrow_columns import read_feather
-from densify.readers.flow_files import load_flow_file, rows_in_file
-from densify.readers.open_scene_flow.labels import FlowLabels
-from densify.readers.open_scene_flow.reader import SweepFile
+from densify.readers.flow_files import sweep_columns
+from densify.readers.open_scene_flow import FlowLabels, SweepFile
 from densify.scores.challenge import CLASSES, IGNORED
 
 CATEGORIES = {
@@ -79,7 +75,7 @@ _WHAT = "Argoverse 2's flow labels"
 class LabelledFlow:
     """The truth of a registered sweep's N points.
 
-    flow: (N,3) metres to the next sweep, ego-motion removed, in the lidar frame. classes: (N,)
+    flow: (N,3) metres to the next sweep, ego motion removed, in the lidar frame. classes: (N,)
     uint8 as in `densify.scores.challenge`. valid: (N,) bool, its flow is known.
     """
 
@@ -89,7 +85,7 @@ class LabelledFlow:
 
 
 def labelled_flow(place: Path, name: str, stretch: Stretch, frame: int) -> LabelledFlow:
-    """The labels of one sweep's flow to the next sweep of the stretch.
+    """Return the labels of one sweep's flow to the next sweep of the stretch.
 
     place: as above. name: of the recording, whose folder may lie there. Raises InputError where
     there are no labels of that sweep, or they are damaged or not its own.
@@ -103,7 +99,10 @@ def labelled_flow(place: Path, name: str, stretch: Stretch, frame: int) -> Label
     target = stretch.frames[stretch.frames.index(frame) + 1]
     path = place / f"{frame:06d}_{target:06d}.npz"
     if path.is_file() or any(place.glob("*_*.npz")):
-        return _from_npz(path, stretch, frame, target)
+        sweep, T = stretch[frame].sweep, stretch.T_target_source(frame, target)
+        found = sweep_columns(path, sweep.row, sweep.points, T)
+        classes = np.where(found["object"] >= 0, _OBJECT, 0).astype(np.uint8)
+        return LabelledFlow(found["residual_flow"], classes, found["valid"])
     here = place / name if (place / name).is_dir() else place
     files = {int(p.stem): p for p in here.glob("*.feather") if p.stem.isdecimal()}
     if not files:
@@ -113,15 +112,11 @@ def labelled_flow(place: Path, name: str, stretch: Stretch, frame: int) -> Label
         )
     stamp_ns = stretch[frame].sweep.stamp_ns
     path = files.get(stamp_ns, files.get(frame, here / f"{stamp_ns}.feather"))
-    return _from_feather(path, stretch, frame)
-
-
-def _from_feather(path: Path, stretch: Stretch, frame: int) -> LabelledFlow:
     kinds = {**dict.fromkeys(_FLOW, "m"), "is_valid": "t", "classes_0": "i"}
     columns = read_feather(path, kinds, _WHAT)
     flow = np.stack([columns[axis].astype(np.float64) for axis in _FLOW], axis=1)
     classes = _classes(path, columns["classes_0"].astype(np.int64) + 1)
-    return _of_sweep(path, flow, columns["is_valid"], classes, stretch, frame)
+    return _of_sweep(path, flow, columns["is_valid"], classes, stretch[frame].sweep.row)
 
 
 def _from_h5(path: Path, stretch: Stretch, frame: int) -> LabelledFlow:
@@ -133,19 +128,13 @@ def _from_h5(path: Path, stretch: Stretch, frame: int) -> LabelledFlow:
         if "flow_category_indices" in group:
             number = file.array(group, "flow_category_indices", (len(flow),), "iu")
             classes = _classes(path, number.astype(np.int64))
-    return _of_sweep(path, flow, valid, classes, stretch, frame)
+    return _of_sweep(path, flow, valid, classes, stretch[frame].sweep.row)
 
 
 def _of_sweep(
-    path: Path,
-    flow: Float,
-    valid: Bool,
-    classes: NDArray[np.uint8],
-    stretch: Stretch,
-    frame: int,
+    path: Path, flow: Float, valid: Bool, classes: NDArray[np.uint8], row: NDArray[np.int64]
 ) -> LabelledFlow:
-    """What is known of all rows of a file, at the sweep's points."""
-    row = stretch[frame].sweep.row
+    """Select the sweep's points from all rows of a file."""
     if len(row) and row.max() >= len(flow):
         raise InputError(
             f"{path}: holds {len(flow)} labels, expected one for each row of the sweep's file "
@@ -164,22 +153,3 @@ def _classes(path: Path, number: NDArray[np.int64]) -> NDArray[np.uint8]:
             f"{len(CATEGORIES) - 1}"
         )
     return _CLASS_OF[number]
-
-
-def _from_npz(path: Path, stretch: Stretch, frame: int, target: int) -> LabelledFlow:
-    arrays = load_flow_file(path)
-    sweep = stretch[frame].sweep
-    at, known = rows_in_file(path, arrays, sweep.row)
-    flow, classes = np.zeros((len(sweep), 3)), np.zeros(len(sweep), np.uint8)
-    if "residual_flow" in arrays:
-        flow[known] = arrays["residual_flow"][at]
-    else:
-        moved = sweep.points[known] + arrays["total_flow"][at]
-        T_here_next = stretch.T_target_source(frame, target)
-        flow[known] = poses.transform(T_here_next, moved) - sweep.points[known]
-    if "object" in arrays:
-        classes[known] = np.where(arrays["object"][at] >= 0, _OBJECT, 0)
-    valid = known.copy()
-    if "valid" in arrays:
-        valid[known] = arrays["valid"][at].astype(bool)
-    return LabelledFlow(flow, classes, valid)

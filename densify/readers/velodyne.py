@@ -1,23 +1,20 @@
 # SPDX-License-Identifier: MIT
 """Packets of a Velodyne scanner: a ``.pcap`` file, decoded by velodyne-decoder (densify[velodyne]).
-The packets do not tell the model reliably, so that it is named: ``velodyne:FILE.pcap#HDL-32E``.
+The packets do not tell the model reliably, so it is named: ``velodyne:FILE.pcap#HDL-32E``.
 
-- A sweep is a turn that begins and ends straight behind (azimuth 180 degrees), to a packet; turns
-  cut off at the ends of the file are left out. Sweeps are numbered from 0. Opening the file finds
-  the packets; they are decoded when a sweep is asked for.
+- A sweep is a turn that begins and ends straight behind (azimuth 180 degrees), to a packet. Turns
+  cut off at the ends of the file are left out. Sweeps are numbered from 0. Opening finds the
+  packets; they are decoded when a sweep is asked for.
 - The stamp is the computer's: when the last packet of the sweep was captured. ``offset_ns`` is from
   the packets' own clock and the model's firing order.
-- Points are as measured, in the scanner's frame: x forward (azimuth 0), y left, z up. Rays start
-  at the frame's origin, or a few centimetres ahead of it in their own direction (HDL-32E: 2.9 cm).
+- Points are as measured, in the scanner's frame: x forward (azimuth 0), y left, z up. Rays start at
+  the frame's origin, or a few centimetres ahead in their own direction (HDL-32E: 2.9 cm).
 - There are neither cameras nor poses; packets of a GPS are not used.
 """
 
 from __future__ import annotations
 
-import mmap
 import struct
-from array import array
-from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -39,7 +36,7 @@ MODELS = {
     "VLP-32C": "VLP32C",
     "VLS-128": "VLS128",
 }
-"""What a user calls a model, and what the decoder does."""
+"""A user's name of a model, and the decoder's."""
 
 _PAYLOAD = 1206  # bytes of a packet of returns
 _MAX_HEADERS = 64  # bytes before it: Ethernet, perhaps a VLAN's, IP, UDP
@@ -56,8 +53,6 @@ _PCAP = {  # magic number -> byte order, nanoseconds per unit of the fraction
 
 def open_recording(path: Path, scene: str | None) -> Velodyne:
     """See `densify.readers.ReaderModule`. path: the capture; scene: the model."""
-    if not path.is_file():
-        raise InputError(f"{path}: no such file; expected a Velodyne capture (.pcap)")
     if scene not in MODELS:
         got = "no model" if scene is None else f"the model {scene}"
         raise InputError(
@@ -65,16 +60,6 @@ def open_recording(path: Path, scene: str | None) -> Velodyne:
             f"{', '.join(MODELS)} (an Ouster's capture needs its metadata .json beside it)"
         )
     return Velodyne(path, scene)
-
-
-@dataclass(frozen=True)
-class _Packets:
-    """The packets of returns in a file. begin: (P,) where each payload begins. captured_ns: (P,).
-    azimuth: (P,) of the first firing, hundredths of a degree."""
-
-    begin: Int
-    captured_ns: Int
-    azimuth: Int
 
 
 class Velodyne(FileSequence):
@@ -85,26 +70,26 @@ class Velodyne(FileSequence):
         one turn."""
         self._library = needed("velodyne_decoder", "velodyne", "Velodyne captures")
         self._model = getattr(self._library.Model, MODELS[model])
-        self._packets = _find_packets(path)
-        self._turns = _turns(self._packets.azimuth)
+        self._begin, self._captured_ns, azimuth = _find_packets(path)
+        self._turns = _turns(azimuth)
         if not self._turns:
             raise InputError(
-                f"{path}: no whole turn: got {len(self._packets.begin)} packets of returns, "
-                f"expected those of a tenth of a second or more"
+                f"{path}: no whole turn: got {len(azimuth)} packets of returns, expected those of "
+                f"a tenth of a second or more"
             )
         super().__init__(path.stem, path, range(len(self._turns)))
 
     def stamp_ns(self, frame: int) -> int:
-        """When the sweep's last packet was captured."""
+        """Return when the sweep's last packet was captured."""
         self.check_frame(frame)
-        return int(self._packets.captured_ns[self._turns[frame].stop - 1])
+        return int(self._captured_ns[self._turns[frame].stop - 1])
 
     def _returns(self, frame: int) -> tuple[Path, Returns]:
         library, packets = self._library, []
         with open_file(self.where) as file:
             for row in self._turns[frame]:
-                file.seek(int(self._packets.begin[row]))
-                captured_s = float(self._packets.captured_ns[row] * 1e-9)
+                file.seek(int(self._begin[row]))
+                captured_s = float(self._captured_ns[row] * 1e-9)
                 packets.append(library.VelodynePacket(captured_s, file.read(_PAYLOAD)))
         try:
             decoder = library.ScanDecoder(library.Config(model=self._model))
@@ -121,39 +106,42 @@ class Velodyne(FileSequence):
         )
 
 
-def _find_packets(path: Path) -> _Packets:
-    """Every record of the file whose last bytes are a packet of returns."""
-    found = array("q")
-    try:
-        with open_file(path) as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
-            if data[:4] not in _PCAP:
-                raise ValueError(
-                    "it does not begin as a .pcap; a .pcapng becomes one with editcap -F pcap"
-                )
-            order, unit_ns = _PCAP[data[:4]]
-            record, at = struct.Struct(f"{order}IIII"), 24
-            while at + record.size <= len(data):
-                seconds, fraction, size, _ = record.unpack_from(data, at)
-                at += record.size + size
-                begin = at - _PAYLOAD
-                if at > len(data):
-                    break  # cut off
-                if _PAYLOAD < size <= _PAYLOAD + _MAX_HEADERS and data[begin : begin + 2] in _FLAGS:
-                    azimuth = data[begin + 2] + 256 * data[begin + 3]
-                    found.extend((begin, seconds * 10**9 + fraction * unit_ns, azimuth))
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path}: not a capture of packets: {error}") from error
+def _find_packets(path: Path) -> tuple[Int, Int, Int]:
+    """Return of the (P,) packets of returns where the payload begins, when it was captured (ns),
+    and the azimuth of the first firing (hundredths of a degree)."""
+    found = []
+    with open_file(path) as file:
+        magic = file.read(24)[:4]
+        if magic not in _PCAP:
+            raise InputError(
+                f"{path}: not a capture of packets: it does not begin as a .pcap; a .pcapng "
+                f"becomes one with editcap -F pcap"
+            )
+        order, unit_ns = _PCAP[magic]
+        record, at = struct.Struct(f"{order}IIII"), 24
+        while len(head := file.read(record.size)) == record.size:
+            seconds, fraction, size, _ = record.unpack(head)
+            at += record.size + size
+            if not _PAYLOAD < size <= _PAYLOAD + _MAX_HEADERS:
+                file.seek(at)
+                continue
+            payload = file.read(size)[size - _PAYLOAD :]
+            if len(payload) < _PAYLOAD:
+                break  # cut off
+            if payload[:2] in _FLAGS:
+                azimuth = payload[2] + 256 * payload[3]
+                found.append((at - _PAYLOAD, seconds * 10**9 + fraction * unit_ns, azimuth))
     if not found:
         raise InputError(
             f"{path}: no Velodyne packets (of {_PAYLOAD} bytes); is it an Ouster's? Then put its "
             f"metadata .json beside it"
         )
-    begin, captured_ns, azimuth = np.array(found).reshape(-1, 3).T
-    return _Packets(begin, captured_ns, azimuth)
+    begin, captured_ns, azimuths = np.array(found, np.int64).T
+    return begin, captured_ns, azimuths
 
 
 def _turns(azimuth: Int) -> list[range]:
-    """Packets of each whole turn."""
+    """Return the packets of each whole turn."""
     from_behind = (azimuth - _BEHIND) % 36_000
     first = [0, *(np.flatnonzero(np.diff(from_behind) < -_BEHIND) + 1).tolist(), len(azimuth)]
     turns = [range(a, b) for a, b in pairwise(first)]

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from densify.geometry import poses
 from densify.geometry.types import Float, Int
-from densify.readers.pandaset.reader import T_POSE_LIDAR
+from densify.readers.pandaset import T_POSE_LIDAR
 from densify.readers.recorded_poses import PoseTrack
 from writers.excerpt import Excerpt, drawn_boxes, put, quaternion
 

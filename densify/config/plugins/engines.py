@@ -58,7 +58,7 @@ ENGINES = Table(
         ),
         Engine(
             "opensceneflow",
-            "densify.readers.open_scene_flow.labels",
+            "densify.readers.open_scene_flow",
             about="labels or a network's flow in OpenSceneFlow's file of the recording",
             argument="FILE[#NAME]",
         ),

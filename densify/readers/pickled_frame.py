@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""Columns of a pickled pandas data frame, without pandas and without running what the file says.
+"""Read columns of a pickled pandas data frame without pandas and without running the pickle.
 
-A pickle is a program: it may name any function of any package and call it. Here every name stands
-for a record that only notes what it was called with, and names that a data frame's file does not
-have are refused, so nothing is ever run; the columns are then taken from the notes.
+A pickle is a program: it may name any function of any package and call it. Here each name stands
+for a record that only notes what it was called with. Names that a data frame's file does not
+have are refused. The columns are then taken from the notes.
 """
 
 from __future__ import annotations
@@ -11,7 +11,6 @@ from __future__ import annotations
 import io
 import pickle
 import re
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -19,14 +18,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from densify.config.errors import InputError
-from densify.config.file_content import gunzipped, read_bytes
+from densify.config.file_content import gunzipped, read_bytes, reason
 
 _NUMBERS = re.compile(r"[fiu][1248]|b1")
-_OBJECTS = "O8"
 
 
 class _Record:
-    """What a file says of one object: how it is made, and what is set on it."""
+    """Notes how an object of the file is made, and the state set on it."""
 
     args: tuple[Any, ...]
     state: Any = None
@@ -40,27 +38,26 @@ class _Record:
         self.state = state
 
 
-_NAMES = {
-    "pandas.core.frame.DataFrame",
-    "pandas.core.internals.managers.BlockManager",
-    "pandas.core.indexes.base._new_Index",
-    "pandas.core.indexes.base.Index",
-    "pandas.core.indexes.numeric.Int64Index",
-    "pandas.core.indexes.range.RangeIndex",
-    "numpy.core.multiarray._reconstruct",
-    "numpy._core.multiarray._reconstruct",
-    "numpy.ndarray",
-    "numpy.dtype",
-    "builtins.slice",
-}
 _RECORDS: dict[str, type[_Record]] = {
-    name: type(name.rpartition(".")[2], (_Record,), {}) for name in _NAMES
+    name: type(name.rpartition(".")[2], (_Record,), {})
+    for name in (
+        "pandas.core.frame.DataFrame",
+        "pandas.core.internals.managers.BlockManager",
+        "pandas.core.indexes.base._new_Index",
+        "pandas.core.indexes.base.Index",
+        "pandas.core.indexes.numeric.Int64Index",
+        "pandas.core.indexes.range.RangeIndex",
+        "numpy.core.multiarray._reconstruct",
+        "numpy._core.multiarray._reconstruct",
+        "numpy.ndarray",
+        "numpy.dtype",
+        "builtins.slice",
+    )
 }
 
 
 class _Unpickler(pickle._Unpickler):
-    """The one written in Python: a damaged file cannot reach past its buffers, and files have few
-    instructions, whatever their size."""
+    """The one in Python, where a damaged file cannot reach past its buffers."""
 
     def find_class(self, module: str, name: str) -> type[_Record]:
         named = f"{module}.{name}"
@@ -70,20 +67,19 @@ class _Unpickler(pickle._Unpickler):
 
 
 def read_columns(path: Path) -> dict[str, NDArray[Any]]:
-    """Columns of a gzipped pickle of a data frame of numbers and texts, by name, (N,) each; where
-    there are texts, of objects, each of which the caller must check.
+    """Return the columns of a gzipped pickle of a data frame of numbers and texts, (N,) each by
+    name. Columns of texts are arrays of objects, each of which the caller must check.
 
     Raises InputError if the file is missing, damaged, or anything else than such a frame, above all
-    if it names a function that frames do not need; nothing in it is run.
+    if it names a function that frames do not need. Nothing in the file is run.
     """
     data = read_bytes(path)
     try:
         return _columns(_Unpickler(io.BytesIO(gunzipped(data, path))).load())
-    except Exception as error:  # any kind: the file decides which
+    except Exception as error:  # the file decides which
         raise InputError(
-            f"{path}: not a gzipped pandas data frame of numbers and texts "
-            f"({str(error) or repr(error)}); nothing in it was run; fetch the file again from "
-            f"where the data set is published"
+            f"{path}: not a gzipped pandas data frame of numbers and texts ({reason(error)}); "
+            f"nothing in it was run; fetch the file again from where the data set is published"
         ) from error
 
 
@@ -91,7 +87,7 @@ def _columns(frame: Any) -> dict[str, NDArray[Any]]:
     """pandas stores columns of one kind together, (C,N), and says which they are."""
     if not isinstance(frame, _RECORDS["pandas.core.frame.DataFrame"]):
         raise ValueError(f"it holds a {type(frame).__name__}")
-    managed: Mapping[str, Any] = frame.state["_data"].state[-1]["0.14.1"]
+    managed = frame.state["_data"].state[-1]["0.14.1"]
     names = managed["axes"][0].args[1]["data"].state[-1]
     columns = {}
     for block in managed["blocks"]:
@@ -105,11 +101,11 @@ def _columns(frame: Any) -> dict[str, NDArray[Any]]:
 def _array(record: _Record) -> NDArray[Any]:
     _, shape, dtype, by_columns, data = record.state
     kind, order = dtype.args[0], dtype.state[1]
-    if kind == _OBJECTS and isinstance(data, list):
-        objects = np.empty(len(data), object)
-        objects[:] = data
-        return objects.reshape(shape, order="F" if by_columns else "C")
-    if not _NUMBERS.fullmatch(kind):
+    if kind == "O8" and isinstance(data, list):
+        array: NDArray[Any] = np.empty(len(data), object)
+        array[:] = data
+    elif _NUMBERS.fullmatch(kind):
+        array = np.frombuffer(data, np.dtype(kind).newbyteorder(order))
+    else:
         raise ValueError(f"a column of the kind {kind!r}")
-    array = np.frombuffer(data, np.dtype(kind).newbyteorder(order))
     return array.reshape(shape, order="F" if by_columns else "C")

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: MIT
-"""The component tables of Waymo's version 2: how its lidars and cameras are calibrated, and where
-and when its images were taken. See `densify.readers.waymo.reader`.
-"""
+"""The component tables of Waymo's version 2: calibration of lidars and cameras, poses and times of
+the images, boxes. See `densify.readers.waymo`."""
 
 from __future__ import annotations
 
@@ -17,21 +16,20 @@ from densify.config.errors import InputError
 from densify.geometry.poses import inverse
 from densify.geometry.types import Boxes, Camera, Float, Int
 from densify.readers.arrow_columns import read_parquet
-from densify.readers.file_sequence import checked_boxes, rigid, upright_poses
+from densify.readers.file_sequence import checked_boxes, pinhole, rigid, upright_poses
 
 OBJECT = "key.laser_object_id"
-_BOX = "[LiDARBoxComponent].box"
-BOX_CENTRE = tuple(f"{_BOX}.center.{axis}" for axis in "xyz")
-BOX_SIZE = tuple(f"{_BOX}.size.{axis}" for axis in "xyz")  # length, width, height
-BOX_HEADING = f"{_BOX}.heading"
+BOX_CENTRE = tuple(f"[LiDARBoxComponent].box.center.{axis}" for axis in "xyz")
+BOX_SIZE = tuple(f"[LiDARBoxComponent].box.size.{axis}" for axis in "xyz")  # length, width, height
+BOX_HEADING = "[LiDARBoxComponent].box.heading"
 LASERS = ("TOP", "FRONT", "SIDE_LEFT", "SIDE_RIGHT", "REAR")
 CAMERAS = ("FRONT", "FRONT_LEFT", "FRONT_RIGHT", "SIDE_LEFT", "SIDE_RIGHT")
 STAMP, LASER, CAMERA = "key.frame_timestamp_micros", "key.laser_name", "key.camera_name"
-T_OPTICAL_WAYMO = np.array(  # its camera frame is x forward, y left, z up
+T_OPTICAL_WAYMO = np.array(  # Waymo's camera frame is x forward, y left, z up
     [[0.0, -1.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
 )
 DOWN, RIGHT, UP, LEFT = 1, 2, 3, 4
-"""Where a rolling shutter runs to."""
+"""Directions of a rolling shutter."""
 
 _LENS = ("f_u", "f_v", "c_u", "c_v", "k1", "k2", "p1", "p2", "k3")
 
@@ -49,20 +47,20 @@ class Components:
     def read(
         self, component: str, columns: Mapping[str, str], where: Mapping[str, int] | None = None
     ) -> dict[str, NDArray[Any]]:
-        """As `densify.readers.arrow_columns.read_parquet`."""
+        """See `densify.readers.arrow_columns.read_parquet`."""
         return read_parquet(self.file(component), columns, "Waymo recordings", where)
 
 
 class Laser(NamedTuple):
-    """T_vehicle_laser: (4,4). inclinations_rad: from the lowest beam up, or None for ``num``
-    between ``bounds_rad``."""
+    """T_vehicle_laser: (4,4). inclinations_rad: from the lowest beam up, or None for beams spread
+    evenly between ``bounds_rad``."""
 
     T_vehicle_laser: Float
     inclinations_rad: Float | None
     bounds_rad: tuple[float, float]
 
     def directions(self, size: tuple[int, ...], where: str) -> Float:
-        """(H,W,3) unit vectors in the laser's frame of the pixels of an image of that size."""
+        """Return (H,W,3) unit vectors in the laser's frame of the pixels of a range image."""
         (height, width), beams = size, self.inclinations_rad
         if beams is None:
             low, high = self.bounds_rad
@@ -80,8 +78,8 @@ class Laser(NamedTuple):
 
 
 class Image(NamedTuple):
-    """pose_ns: when the vehicle was at T_world_vehicle. exposed_ns: its middle. readout_s: from the
-    first row or column to the last."""
+    """pose_ns: time of T_world_vehicle (4,4). exposed_ns: of its middle. readout_s: from the first
+    row or column to the last."""
 
     pose_ns: int
     exposed_ns: int
@@ -90,33 +88,30 @@ class Image(NamedTuple):
 
 
 def read_lasers(parts: Components) -> dict[int, Laser]:
-    """The lidars by number, from 1. Raises InputError if one is malformed."""
+    """Return the lidars by number, from 1. Raises InputError if one is malformed."""
     head = "[LiDARCalibrationComponent]"
     extrinsic, beams = f"{head}.extrinsic.transform", f"{head}.beam_inclination"
     columns = {LASER: "i", extrinsic: "l", f"{beams}.values": "l"}
-    bounds = {f"{beams}.min": "m", f"{beams}.max": "m"}
-    rows = parts.read("lidar_calibration", {**columns, **bounds})
-    path, lasers = parts.file("lidar_calibration"), {}
-    for row, laser in enumerate(rows[LASER]):
-        where = f"{path}: lidar {laser}"
+    rows = parts.read("lidar_calibration", {**columns, f"{beams}.min": "m", f"{beams}.max": "m"})
+    lasers = {}
+    for row, laser in enumerate(rows[LASER].tolist()):
+        where = f"{parts.file('lidar_calibration')}: lidar {laser}"
         values = rows[f"{beams}.values"][row]
         low, high = float(rows[f"{beams}.min"][row]), float(rows[f"{beams}.max"][row])
-        if values is None or not len(values):
-            values = None
-        checked = np.array([low, high]) if values is None else np.diff(values)
-        if not np.isfinite(checked).all() or (low >= high if values is None else False):
+        given = values is not None and len(values) > 0
+        if not (np.isfinite(values).all() if given else -np.inf < low < high < np.inf):
             raise InputError(
                 f"{where}: got beams from {low:g} to {high:g}, expected inclinations in rad"
             )
         T_vehicle_laser = transform_of(rows[extrinsic][row], where)
-        beams_rad = None if values is None else values.astype(np.float64)
-        lasers[int(laser)] = Laser(T_vehicle_laser, beams_rad, (low, high))
+        beams_rad = values.astype(np.float64) if given else None
+        lasers[laser] = Laser(T_vehicle_laser, beams_rad, (low, high))
     return lasers
 
 
 def read_boxes(parts: Components) -> dict[int, Boxes]:
-    """The boxes by the frame's stamp in µs, in the vehicle's frame at its pose; frames without any
-    are not there. Raises InputError if the component is malformed."""
+    """Return the boxes by the frame's stamp in µs, in the vehicle's frame at its pose. Frames
+    without boxes are not there. Raises InputError if the component is malformed."""
     numbers = (*BOX_CENTRE, *BOX_SIZE, BOX_HEADING)
     rows = parts.read("lidar_box", {STAMP: "i", OBJECT: "s", **dict.fromkeys(numbers, "n")})
     centre_m, size_m = (
@@ -133,7 +128,7 @@ def read_boxes(parts: Components) -> dict[int, Boxes]:
 
 
 def read_images(parts: Components, starts_us: Int) -> dict[str, dict[int, Image]]:
-    """What is known of each image, without its pixels, by camera and number.
+    """Return times and poses of the images, without pixels, by camera and frame number.
 
     starts_us: (n,) stamps of the frames. Raises InputError if a row is malformed.
     """
@@ -142,73 +137,69 @@ def read_images(parts: Components, starts_us: Int) -> dict[str, dict[int, Image]
     times = [f"{shutter}.{name}" for name in ("camera_trigger_time", "camera_readout_done_time")]
     numbers = [f"{head}.pose_timestamp", *times, f"{shutter}.shutter"]
     columns = {STAMP: "i", CAMERA: "i", pose: "l", **dict.fromkeys(numbers, "n")}
-    rows = parts.read("camera_image", columns)
-    path, found = parts.file("camera_image"), dict[str, dict[int, Image]]()
+    rows, found = parts.read("camera_image", columns), dict[str, dict[int, Image]]()
     frame_of = {int(us): number for number, us in enumerate(starts_us)}
     for row in np.argsort(rows[STAMP], kind="stable").tolist():
-        camera, us = int(rows[CAMERA][row]), int(rows[STAMP][row])
+        camera, frame = int(rows[CAMERA][row]), frame_of.get(int(rows[STAMP][row]))
+        where = f"{parts.file('camera_image')}: camera {camera}, frame {frame}"
         if camera not in range(1, len(CAMERAS) + 1):
-            raise InputError(f"{path}: got camera {camera}, expected 1 to {len(CAMERAS)}")
-        if us not in frame_of:
+            raise InputError(f"{where}: got camera {camera}, expected 1 to {len(CAMERAS)}")
+        if frame is None:
             continue
         pose_s, trigger_s, done_s, shutter_s = (float(rows[name][row]) for name in numbers)
         readout_s = done_s - trigger_s - shutter_s
         if not -1e-3 < readout_s < 1:
             raise InputError(
-                f"{path}: camera {camera}, frame {frame_of[us]}: got {readout_s:g} s from "
-                f"trigger to end of readout less the shutter's time, expected 0 to 1"
+                f"{where}: got {readout_s:g} s from trigger to end of readout less the shutter's "
+                f"time, expected 0 to 1"
             )
-        T = transform_of(rows[pose][row], f"{path}: camera {camera}, frame {frame_of[us]}")
+        T = transform_of(rows[pose][row], where)
         exposed_ns = _whole_us((trigger_s + done_s) / 2)
         image = Image(_whole_us(pose_s), exposed_ns, max(readout_s, 0.0), T)
-        found.setdefault(CAMERAS[camera - 1], {})[frame_of[us]] = image
+        found.setdefault(CAMERAS[camera - 1], {})[frame] = image
     return {name: found[name] for name in CAMERAS if name in found}
 
 
 def read_cameras(parts: Components, images: Mapping[str, Mapping[int, Image]]) -> dict[str, Camera]:
-    """Those that have images. Raises InputError if one is malformed."""
+    """Return the cameras that have images. Raises InputError if one is malformed."""
     head = "[CameraCalibrationComponent]"
     lens = [f"{head}.intrinsic.{n}" for n in _LENS]
     size = [f"{head}.{n}" for n in ("width", "height", "rolling_shutter_direction")]
     extrinsic = f"{head}.extrinsic.transform"
     columns = {CAMERA: "i", extrinsic: "l", **dict.fromkeys(lens, "n")}
     rows = parts.read("camera_calibration", {**columns, **dict.fromkeys(size, "i")})
-    path, cameras = parts.file("camera_calibration"), {}
+    cameras = {}
     for name, taken in images.items():
+        where = f"{parts.file('camera_calibration')}: {name}"
         row = np.flatnonzero(rows[CAMERA] == CAMERAS.index(name) + 1)
         if len(row) != 1:
-            raise InputError(f"{path}: {name}: got {len(row)} rows, expected one")
+            raise InputError(f"{where}: got {len(row)} rows, expected one")
         f_u, f_v, c_u, c_v, *distortion = (float(rows[n][row[0]]) for n in lens)
         width, height, direction = (int(rows[n][row[0]]) for n in size)
-        if min(f_u, f_v, width, height) <= 0:
-            raise InputError(
-                f"{path}: {name}: got focal lengths {f_u:g}, {f_v:g} and {width} x {height} "
-                f"px, expected positive ones"
-            )
         readout_s = float(np.median([image.readout_s for image in taken.values()]))
-        T_vehicle_cam = transform_of(rows[extrinsic][row[0]], f"{path}: {name}")
-        cameras[name] = Camera(
+        T_cam_vehicle = T_OPTICAL_WAYMO @ inverse(transform_of(rows[extrinsic][row[0]], where))
+        cameras[name] = pinhole(
             name,
-            width,
-            height,
-            np.array([[f_u, 0, c_u - 0.5], [0, f_v, c_v - 0.5], [0, 0, 1.0]]),
-            T_OPTICAL_WAYMO @ inverse(T_vehicle_cam),
-            tuple(distortion) if any(distortion) else (),
-            row_time_s={DOWN: 1.0, UP: -1.0}.get(direction, 0.0) * readout_s / height,
-            column_time_s={RIGHT: 1.0, LEFT: -1.0}.get(direction, 0.0) * readout_s / width,
+            (width, height),
+            (f_u, f_v, c_u - 0.5, c_v - 0.5),
+            T_cam_vehicle,
+            where,
+            distortion=tuple(distortion) if any(distortion) else (),
+            row_time_s={DOWN: 1.0, UP: -1.0}.get(direction, 0.0) * readout_s / max(height, 1),
+            column_time_s={RIGHT: 1.0, LEFT: -1.0}.get(direction, 0.0) * readout_s / max(width, 1),
         )
     return cameras
 
 
 def _whole_us(seconds: float) -> int:
-    """Nanoseconds; seconds since 1970 as float64 are good to a quarter of a microsecond."""
+    """Return nanoseconds; seconds since 1970 as float64 are good to 0.25 µs."""
     return round(seconds * 1e6) * 1000
 
 
 def image_of(
     values: NDArray[Any], shape: NDArray[Any] | None, num_channels: int, where: str
 ) -> Float:
-    """(H,W,C) of a flattened one."""
+    """Return the (H,W,C) of a flattened one."""
     size = () if shape is None else tuple(int(n) for n in shape)
     if len(size) != 3 or size[2] != num_channels or np.prod(size) != len(values) or min(size) < 1:
         raise InputError(
@@ -219,10 +210,8 @@ def image_of(
 
 
 def transform_of(values: NDArray[Any] | None, where: str) -> Float:
-    """(4,4) of 16 numbers, row by row."""
+    """Return the (4,4) of 16 numbers, row by row."""
     if values is None or values.shape != (16,):
-        raise InputError(
-            f"{where}: got a transform of {0 if values is None else len(values)} "
-            f"numbers, expected 16"
-        )
+        num = 0 if values is None else len(values)
+        raise InputError(f"{where}: got a transform of {num} numbers, expected 16")
     return rigid(values.reshape(4, 4), where)

@@ -6,10 +6,9 @@ fits, and must be named where several do; ``images=none`` and ``poses=none`` lea
 
 points
     PointCloud2 of any layout, or Livox's CustomMsg, in the frame that their header names, taken as
-    fired: drivers do not compensate unless told to. Rays start at that frame's origin. Points of
-    several lidars make one sweep in the frame of the first one named, each message with the one
-    of the first lidar nearest to it in time, and each lidar's rays start at its own frame's
-    origin, by /tf_static.
+    fired. Rays start at that frame's origin. Points of several lidars make one sweep in the frame
+    of the first one named: each of its messages takes the nearest in time of the others, and
+    /tf_static gives where each lidar's rays start.
 stamps
     of the header (when it was recorded, if that is 0): the reference time. Times of points count
     from it, or are absolute; field, unit and clock are found out (`densify.readers.point_fields`).
@@ -17,10 +16,10 @@ stamps
 images
     Image or CompressedImage with the CameraInfo beside them: raw ones with K and D, ``image_rect``
     with P and R. Their frame is that of the image's header, fixed to the lidar's by /tf_static (or
-    what never moves in /tf); a P that moves the camera sideways (stereo) is taken to agree with it.
+    by a /tf that never moves). A P that moves the camera sideways (stereo) is taken to agree.
 poses
-    Odometry, PoseStamped, or /tf: of the lidar's frame by what is fixed, interpolated to the
-    sweeps' stamps.
+    Odometry, PoseStamped, or /tf: of the lidar's frame by fixed frames, interpolated to the sweeps'
+    stamps.
 """
 
 from __future__ import annotations
@@ -35,7 +34,7 @@ from numpy.typing import NDArray
 
 from densify.config.errors import InputError
 from densify.geometry import poses
-from densify.geometry.types import Camera, Float, Float32
+from densify.geometry.types import Camera, Float
 from densify.readers.file_sequence import FileSequence, Returns, check_image_size, truth_beside
 from densify.readers.point_fields import (
     Fields,
@@ -48,12 +47,17 @@ from densify.readers.point_fields import (
     scaled,
 )
 from densify.readers.recorded_poses import PoseTrack
-from densify.readers.ros.bag import Bag, Entry
-from densify.readers.ros.frames import Frames, plain, recorded_track
-from densify.readers.ros.messages import camera_of, cloud_columns, image_rgb
-from densify.readers.ros.topics import POSES, Images, Topics
+from densify.readers.ros_bag import POSES, Bag, Entry, Images, Topics
+from densify.readers.ros_messages import (
+    Transforms,
+    camera_of,
+    cloud_columns,
+    image_rgb,
+    plain,
+    recorded_track,
+)
 
-_NUM_TRIED = 5  # sweeps, until one holds points
+_NUM_TRIED = 5  # messages, until one holds points
 _USUAL_PERIOD_NS = 100_000_000
 
 
@@ -63,14 +67,16 @@ def open_recording(path: Path, scene: str | None) -> RosBag:
 
 
 class Lidar(NamedTuple):
-    """A lidar's topic. entries: its messages. T: (4,4) to the first lidar's frame. times, scale: of
-    its points and intensities; words: what was found of the times."""
+    """A lidar's topic. entries: its messages. T_first_lidar: (4,4) to the first lidar's frame.
+    period_ns: median step of its messages. times, scale: of its points and intensities. words: what
+    was found of the times."""
 
     topic: str
     frame: str
     entries: list[Entry]
     T_first_lidar: Float
     fields: Fields
+    period_ns: int
     times: PointTimes | None
     scale: float
     words: str
@@ -80,36 +86,30 @@ class RosBag(FileSequence):
     """A bag as a `LidarSequence`; `findings` says what was found."""
 
     def __init__(self, path: Path, options: str | None = None) -> None:
-        """Reads the bag through once, for the stamps of its messages. Raises InputError if it is
+        """Read the bag through once, for the stamps of its messages. Raises InputError if it is
         damaged, or its topics, frames or calibrations do not tell what is needed."""
         self._bag = Bag(path)
         self._topics = Topics.choose(self._bag, options)
         self._left_out = list(self._topics.left_out)
         images = self._topics.images
         self._index = self._bag.index([*self._topics.points, *(i.topic for i in images)])
+        self._transforms = Transforms.read(self._bag)
+        self._lidars: list[Lidar] = []
         for topic in self._topics.points:
-            if not self._index[topic]:
-                raise InputError(f"{path}: {topic}: holds no messages")
-        self._transforms = Frames.read(self._bag)
-        self._lidars = self._open_lidars()
+            self._lidars.append(self._lidar(topic))
         cameras = {i.camera: camera for i in images if (camera := self._camera(i)) is not None}
-        self._images = {i.camera: i.topic for i in images}
+        self._image_topics = {i.camera: i.topic for i in images}
         stamps = {
-            name: {n: e.stamp_ns for n, e in enumerate(self._index[self._images[name]])}
+            name: {n: e.stamp_ns for n, e in enumerate(self._index[self._image_topics[name]])}
             for name in cameras
         }
         self._sweeps = self._lidars[0].entries
-        super().__init__(
-            path.resolve().name,
-            path,
-            range(len(self._sweeps)),
-            cameras,
-            stamps,
-            truth_beside(path if path.is_dir() else path.parent),
-        )
+        truth = truth_beside(path if path.is_dir() else path.parent)
+        frames = range(len(self._sweeps))
+        super().__init__(path.resolve().name, path, frames, cameras, stamps, truth)
 
     def stamp_ns(self, frame: int) -> int:
-        """Reference time of a sweep."""
+        """Return the reference time of a sweep."""
         self.check_frame(frame)
         return self._sweeps[frame].stamp_ns
 
@@ -120,36 +120,34 @@ class RosBag(FileSequence):
             used = [f"{part} = {name}" for part, name in vars(lidar.fields).items() if name]
             lines.append(("lidar", f"{lidar.topic} in {lidar.frame}: {', '.join(used)}"))
             lines.append(("times", f"{lidar.words}; intensity divided by {lidar.scale:g}"))
-        for name, topic in self._images.items():
-            lines.append(("images", f"{topic} ({name})"))
+        lines += [("images", f"{topic} ({name})") for name, topic in self._image_topics.items()]
         lines += [("no camera", text) for text in self._left_out]
         return [*lines, ("poses from", self._track_and_words[1])]
 
     def _returns(self, frame: int) -> tuple[Path, Returns]:
-        at = self._sweeps[frame]
-        parts = [self._returns_of(self._lidars[0], at, at.stamp_ns)]
-        for lidar in self._lidars[1:]:
+        at, found = self._sweeps[frame], list[tuple[int, Returns]]()
+        for number, lidar in enumerate(self._lidars):
             near = min(lidar.entries, key=lambda e: abs(e.stamp_ns - at.stamp_ns))
-            if abs(near.stamp_ns - at.stamp_ns) <= self._period_ns // 2:
-                parts.append(self._returns_of(lidar, near, at.stamp_ns))
-            else:
-                parts.append(
-                    Returns(np.zeros((0, 3)), np.zeros(0, np.float32), np.zeros(0, np.int64))
-                )
+            near = near if number else at
+            if abs(near.stamp_ns - at.stamp_ns) <= self._lidars[0].period_ns // 2:
+                found.append((number, self._returns_of(lidar, near, at.stamp_ns)))
+        parts = [part for _, part in found]
         timed = all(part.offset_ns is not None for part in parts)
-        numbers = [np.full(len(part.points), n, np.uint8) for n, part in enumerate(parts)]
+        measured = any(part.radial_velocity_m_s is not None for part in parts)
         origins = np.stack([lidar.T_first_lidar[:3, 3] for lidar in self._lidars])
         return self.where, Returns(
             np.concatenate([part.points for part in parts]),
             np.concatenate([part.intensity for part in parts]),
             np.concatenate([part.offset_ns for part in parts]) if timed else None,
-            np.concatenate(numbers),
+            np.concatenate([np.full(len(part.points), n, np.uint8) for n, part in found]),
             origins if len(self._lidars) > 1 else None,
-            radial_velocity_m_s=_together([part.radial_velocity_m_s for part in parts], numbers),
+            radial_velocity_m_s=(
+                np.concatenate([_radial_velocity(part) for part in parts]) if measured else None
+            ),
         )
 
     def _returns_of(self, lidar: Lidar, entry: Entry, stamp_ns: int) -> Returns:
-        """A message's points in the first lidar's frame, timed since the sweep's stamp."""
+        """Return a message's points in the first lidar's frame, timed since the sweep's stamp."""
         where = f"{self._bag.path}: {lidar.topic} at {entry.stamp_ns} ns"
         columns = cloud_columns(self._bag.message(lidar.topic, entry), where)
         for name in vars(lidar.fields).values():
@@ -176,7 +174,7 @@ class RosBag(FileSequence):
         return Returns(points, intensity, offset_ns, radial_velocity_m_s=radial_m_s)
 
     def _image(self, camera: Camera, number: int) -> NDArray[np.uint8]:
-        topic = self._images[camera.name]
+        topic = self._image_topics[camera.name]
         where = f"{self._bag.path}: {topic}: image {number}"
         rgb = image_rgb(self._bag.message(topic, self._index[topic][number]), where)
         check_image_size(rgb.shape, camera, where)
@@ -201,70 +199,52 @@ class RosBag(FileSequence):
                 raise
             return None, str(error)
         found = self._transforms.track_of(lidar)
-        if found is None and self._topics.poses_named:
+        if found is not None:
+            return found[1], f"/tf, {found[0]} to {lidar}"
+        if self._topics.poses_named:
             raise InputError(f"{self._bag.path}: /tf: nothing tells where {lidar} was")
-        if found is None:
-            names = ", ".join(topic.name for topic in self._bag.of_type(*POSES))
-            hint = f"; name one of {names}: #poses=" if names else ", and there is no odometry"
-            return None, f"none: /tf does not tell where {lidar} was{hint}"
-        return found[1], f"/tf, {found[0]} to {lidar}"
+        names = ", ".join(topic.name for topic in self._bag.of_type(*POSES))
+        hint = f"; name one of {names}: #poses=" if names else ", and there is no odometry"
+        return None, f"none: /tf does not tell where {lidar} was{hint}"
 
-    @cached_property
-    def _period_ns(self) -> int:
-        stamps_ns = [entry.stamp_ns for entry in self._lidars[0].entries]
-        return (
-            max(1, int(np.median(np.diff(stamps_ns)))) if len(stamps_ns) > 1 else _USUAL_PERIOD_NS
-        )
-
-    def _open_lidars(self) -> list[Lidar]:
-        found: list[Lidar] = []
-        for topic in self._topics.points:
-            entries = self._index[topic]
-            frame, columns, entry = self._sample(topic, entries)
-            first = found[0].frame if found else frame
-            T = self._transforms.between(first, frame)
-            if T is None:
-                raise InputError(
-                    f"{self._bag.path}: nothing in /tf_static joins the frame {frame} of {topic} "
-                    f"to {first}; name the topic of one lidar: #points={topic}"
-                )
-            fields = find_fields(columns)
-            missing = [axis for axis in "xyz" if not getattr(fields, axis)]
-            if missing:
-                raise InputError(
-                    f"{self._bag.path}: {topic}: no field {', '.join(missing)}; got "
-                    f"{', '.join(columns)}"
-                )
-            times, words = None, "no field of times"
-            if fields.time:
-                steps = np.diff([e.stamp_ns for e in entries])
-                period_ns = max(1, int(np.median(steps))) if len(steps) else _USUAL_PERIOD_NS
-                times, words = find_times(
-                    columns[fields.time], fields.time, period_ns, entry.stamp_ns
-                )
-            scale = full_scale(columns[fields.intensity]) if fields.intensity else 1.0
-            found.append(Lidar(topic, frame, entries, T, fields, times, scale or 1.0, words))
-        return found
-
-    def _sample(self, topic: str, entries: Sequence[Entry]) -> tuple[str, dict[str, Any], Entry]:
-        """Frame and fields of the first message that holds points."""
+    def _lidar(self, topic: str) -> Lidar:
+        where, entries = f"{self._bag.path}: {topic}", self._index[topic]
         for entry in entries[:_NUM_TRIED]:
             message = self._bag.message(topic, entry)
-            columns = cloud_columns(message, f"{self._bag.path}: {topic}")
+            columns = cloud_columns(message, where)
             if len(next(iter(columns.values()), ())):
-                return plain(message.header.frame_id), columns, entry
-        raise InputError(f"{self._bag.path}: {topic}: its first messages hold no points")
+                break
+        else:
+            raise InputError(f"{where}: its first messages hold no points")
+        frame = plain(message.header.frame_id)
+        first = self._lidars[0].frame if self._lidars else frame
+        T = self._transforms.between(first, frame)
+        if T is None:
+            raise InputError(
+                f"{self._bag.path}: nothing in /tf_static joins the frame {frame} of {topic} to "
+                f"{first}; name the topic of one lidar: #points={topic}"
+            )
+        fields = find_fields(columns)
+        missing = [axis for axis in "xyz" if not getattr(fields, axis)]
+        if missing:
+            raise InputError(f"{where}: no field {', '.join(missing)}; got {', '.join(columns)}")
+        steps = np.diff([e.stamp_ns for e in entries])
+        period_ns = max(1, int(np.median(steps))) if len(steps) else _USUAL_PERIOD_NS
+        times, words = None, "no field of times"
+        if fields.time:
+            column = columns[fields.time]
+            times, words = find_times(column, fields.time, period_ns, entry.stamp_ns)
+        scale = full_scale(columns[fields.intensity]) if fields.intensity else 1.0
+        return Lidar(topic, frame, entries, T, fields, period_ns, times, scale or 1.0, words)
 
     def _camera(self, images: Images) -> Camera | None:
-        """None, with a note, where a camera that nobody named does not tell where it stands."""
+        """Return None, with a note, where a camera that nobody named does not tell its place."""
         where = f"{self._bag.path}: {images.info}"
         try:
-            if not self._index[images.topic]:
-                raise InputError(f"{where}: no messages of {images.topic}")
-            info = next(iter(self._bag.messages(images.info)), None)
-            if info is None:
-                raise InputError(f"{where}: its messages cannot be found; the bag is damaged")
-            image = self._bag.message(images.topic, self._index[images.topic][0])
+            entries, info = self._index[images.topic], next(self._bag.messages(images.info), None)
+            if not entries or info is None:
+                raise InputError(f"{where}: no messages of {images.topic} or its calibration")
+            image = self._bag.message(images.topic, entries[0])
             frame, lidar = plain(image.header.frame_id), self._lidars[0].frame
             T = self._transforms.between(frame, lidar)
             if T is None:
@@ -280,14 +260,7 @@ class RosBag(FileSequence):
             return None
 
 
-def _together(measured: Sequence[Float32 | None], like: Sequence[NDArray[Any]]) -> Float32 | None:
-    """What several lidars measured, one after the other, NaN of those that do not; None if none
-    does. like: a row for each of their points."""
-    if all(column is None for column in measured):
-        return None
-    return np.concatenate(
-        [
-            np.full(len(rows), np.nan, np.float32) if column is None else column
-            for column, rows in zip(measured, like, strict=True)
-        ]
-    )
+def _radial_velocity(part: Returns) -> NDArray[Any]:
+    """Return (N,) m/s, NaN of a lidar that does not measure it."""
+    measured = part.radial_velocity_m_s
+    return np.full(len(part.points), np.nan, np.float32) if measured is None else measured

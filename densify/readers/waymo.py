@@ -1,33 +1,32 @@
 # SPDX-License-Identifier: MIT
-"""Waymo Open Dataset, perception, version 2 (Sun et al., "Scalability in Perception for Autonomous
-Driving: Waymo Open Dataset", CVPR 2020), read without TensorFlow::
+"""Waymo Open Dataset, perception, version 2 (Sun et al., CVPR 2020), read without TensorFlow::
 
     ROOT/{lidar,lidar_pose,lidar_calibration,vehicle_pose}/CONTEXT.parquet
     ROOT/{camera_image,camera_calibration}/CONTEXT.parquet    optional
     ROOT/lidar_box/CONTEXT.parquet    optional: tracked boxes, in the vehicle's frame
 
-ROOT is ``training``, ``validation`` or ``testing``; a segment is named by ``#CONTEXT``. Frames are
+ROOT is ``training``, ``validation`` or ``testing``. A segment is named by ``#CONTEXT``. Frames are
 numbered from 0 in the order of time, images by the number of their frame.
 
-Five lidars, lidar 0 to 4: TOP, FRONT, SIDE_LEFT, SIDE_RIGHT, REAR. Each return is a pixel of a
-range image: azimuth by its column, inclination by its row (waymo_open_dataset/utils/
-range_image_utils.py), first and second returns one after the other. What that gives is where the
-pulse met something in the vehicle's frame (x forward, y left, z up) *when it was fired*: not
-compensated. The per-pixel poses (TOP only), with which others compensate, tell when that was: the
-places along the vehicle's path are laid on its motion. Where it drives too slowly for that, the
+Five lidars, lidar 0 to 4: TOP, FRONT, SIDE_LEFT, SIDE_RIGHT, REAR. A return is a pixel of a range
+image, with the azimuth by its column and the inclination by its row
+(waymo_open_dataset/utils/range_image_utils.py); first and second returns follow each other. The
+point is in the vehicle's frame (x forward, y left, z up) *when it was fired*: not compensated. The
+poses per pixel (TOP only), which others compensate with, tell the firing time: a straight line is
+fitted to the positions along the vehicle's path. Where the vehicle is too slow for that, the
 columns are spread over the frame's period, from ``frame_timestamp_micros``, when the spin begins.
-The other four are taken, as in the data set's own conversion, as measured at the frame's pose.
+The other four lidars are taken as measured at the frame's pose, as in the data set's conversion.
 
-``vehicle_pose`` belongs to the middle of the spin, not to ``frame_timestamp_micros``: it is the
-pose of the FRONT camera's image (https://github.com/waymo-research/waymo-open-dataset/issues/464).
-The sweep's stamp is therefore that image's ``pose_timestamp``, or half a period after the frame's
-stamp where there are no images. The world is the data set's. Intensity has no bound: tanh of it.
+``vehicle_pose`` belongs to the middle of the spin: it is the pose of the FRONT camera's image
+(https://github.com/waymo-research/waymo-open-dataset/issues/464). The sweep's stamp is therefore
+that image's ``pose_timestamp``, or half a period after the frame's stamp where there are no images.
+Intensity has no bound, so its tanh is used.
 
-Cameras have lenses (k1 k2 p1 p2 k3, as OpenCV) and shutters that usually run sideways. An image's
-middle is exposed half-way between trigger and end of readout; its own pose, of a moment close to
-that, is carried there. Pixel 0 of the calibration is the left edge of the first pixel.
+Cameras have lenses (k1 k2 p1 p2 k3, as OpenCV) and shutters that usually run sideways. The middle
+of an image is exposed half-way between trigger and end of readout; its own pose, of a time close
+to that, is carried there. Pixel 0 of the calibration is the left edge of the first pixel.
 
-Built on the published formulas and component documentation; not tried on real files.
+Built on the published formulas and documentation; not tried on real files.
 """
 
 from __future__ import annotations
@@ -49,7 +48,7 @@ from densify.readers.file_sequence import (
     truth_beside,
 )
 from densify.readers.recorded_poses import PoseTrack
-from densify.readers.waymo.components import (
+from densify.readers.waymo_components import (
     CAMERA,
     CAMERAS,
     LASER,
@@ -65,7 +64,7 @@ from densify.readers.waymo.components import (
 )
 
 _NOMINAL_PERIOD_NS = 100_000_000
-_LEAST_WAY_M = 0.3  # of the vehicle in a sweep, from which its poses tell time
+_LEAST_WAY_M = 0.3  # of the vehicle in a sweep, for its poses to tell time
 _MOST_OFF_NS = 10_000_000
 
 
@@ -84,13 +83,12 @@ class Waymo(FileSequence):
     """A segment as a `LidarSequence`; the lidar frame is the vehicle's."""
 
     def __init__(self, root: Path, context: str) -> None:
-        """Reads stamps, poses and calibration. Raises InputError if a component is missing or
+        """Read stamps, poses and calibration. Raises InputError if a component is missing or
         malformed."""
         parts = self._parts = Components(root, context)
-        keys = self._parts.read("lidar", {STAMP: "i"})
-        self._starts_us = np.unique(keys[STAMP])
+        self._starts_us = np.unique(parts.read("lidar", {STAMP: "i"})[STAMP])
         if not len(self._starts_us):
-            raise InputError(f"{self._parts.file('lidar')}: holds no frames")
+            raise InputError(f"{parts.file('lidar')}: holds no frames")
         starts_ns = self._starts_us * 1000
         steps = np.diff(starts_ns)
         self._period_ns = int(np.median(steps)) if len(steps) else _NOMINAL_PERIOD_NS
@@ -112,7 +110,7 @@ class Waymo(FileSequence):
         )
 
     def stamp_ns(self, frame: int) -> int:
-        """About the middle of the spin, when the vehicle was at its recorded pose."""
+        """Return about the middle of the spin, the time of the recorded pose."""
         self.check_frame(frame)
         return self._stamps_ns[frame]
 
@@ -120,8 +118,7 @@ class Waymo(FileSequence):
         return self._T_world_vehicle[frame]
 
     def boxes(self, frame: int) -> Boxes | None:
-        """See `KnowsBoxes`; the test split has none. Raises InputError if they are
-        malformed."""
+        """See `KnowsBoxes`; the test split has none. Raises InputError if they are malformed."""
         self.check_frame(frame)
         return self._boxes.get(int(self._starts_us[frame]))
 
@@ -130,41 +127,35 @@ class Waymo(FileSequence):
         return read_boxes(self._parts) if self._parts.file("lidar_box").is_file() else {}
 
     def T_world_cam(self, camera: str, number: int) -> Float:
-        """(4,4) at the exposure of the image's middle."""
-        exposed_ns = self.image_stamps_ns(camera)[number]
+        """Return the (4,4) pose at the exposure of the image's middle."""
         image = self._images[camera][number]
         T_world_vehicle = image.T_world_vehicle
         if len(self.frames) > 1:
-            before, after = (self._track.at(ns) for ns in (image.pose_ns, exposed_ns))
+            before, after = (self._track.at(ns) for ns in (image.pose_ns, image.exposed_ns))
             T_world_vehicle = T_world_vehicle @ inverse(before) @ after
         return T_world_vehicle @ inverse(self.cameras[camera].T_cam_lidar)
-
-    # Sweeps
 
     def _returns(self, frame: int) -> tuple[Path, Returns]:
         path, images = self._parts.file("lidar"), self._range_images(frame)
         if not images:
             raise InputError(f"{path}: no range image of frame {frame}; fetch it again")
         points, intensity, offset_ns, lidar = [], [], [], []
-        for (laser, _), image in images.items():
-            if laser not in self._lasers:
+        for (number, _), image in images.items():
+            if number not in self._lasers:
                 raise InputError(
-                    f"{self._parts.file('lidar_calibration')}: no lidar {laser}; got "
+                    f"{self._parts.file('lidar_calibration')}: no lidar {number}; got "
                     f"{', '.join(map(str, self._lasers))}"
                 )
-            where = f"{path}: frame {frame}, lidar {laser}"
-            away = self._lasers[laser].directions(image.shape[:2], where) * image[..., :1]
-            met = transform(self._lasers[laser].T_vehicle_laser, away.reshape(-1, 3))
+            laser, where = self._lasers[number], f"{path}: frame {frame}, lidar {number}"
+            away = laser.directions(image.shape[:2], where) * image[..., :1]
+            met = transform(laser.T_vehicle_laser, away.reshape(-1, 3))
             points.append(np.where(image[..., 0].ravel()[:, None] > 0, met, np.nan))
             intensity.append(np.tanh(image[..., 1].ravel()))
-            offset_ns.append(self._offset_ns(frame, laser, images[laser, 1]).ravel())
-            lidar.append(np.full(len(met), laser - 1, np.uint8))
-        T = np.stack(
-            [
-                self._lasers[laser].T_vehicle_laser if laser in self._lasers else np.eye(4)
-                for laser in range(1, len(LASERS) + 1)
-            ]
-        )
+            offset_ns.append(self._offset_ns(frame, number, images[number, 1]).ravel())
+            lidar.append(np.full(len(met), number - 1, np.uint8))
+        T = np.tile(np.eye(4), (len(LASERS), 1, 1))
+        for number, laser in self._lasers.items():
+            T[number - 1] = laser.T_vehicle_laser
         return path, Returns(
             np.concatenate(points),
             np.concatenate(intensity).astype(np.float32),
@@ -175,7 +166,7 @@ class Waymo(FileSequence):
         )
 
     def _range_images(self, frame: int) -> dict[tuple[int, int], Float]:
-        """(H,W,4) by lidar and return."""
+        """Return (H,W,4) by lidar and return."""
         names = {number: f"[LiDARComponent].range_image_return{number}" for number in (1, 2)}
         columns = {f"{name}.{part}": "l" for name in names.values() for part in ("values", "shape")}
         start_us = int(self._starts_us[frame])
@@ -184,11 +175,9 @@ class Waymo(FileSequence):
         for row in np.argsort(rows[LASER], kind="stable"):
             laser = int(rows[LASER][row])
             where = f"{self._parts.file('lidar')}: frame {frame}, lidar {laser}"
-            if laser not in range(1, len(LASERS) + 1):
-                raise InputError(f"{where}: expected lidars 1 to {len(LASERS)}")
+            if laser not in range(1, len(LASERS) + 1) or (laser, 1) in found:
+                raise InputError(f"{where}: expected lidars 1 to {len(LASERS)}, each once")
             for number, name in names.items():
-                if (laser, number) in found:
-                    raise InputError(f"{where}: is there twice; fetch the file again")
                 values, shape = rows[f"{name}.values"][row], rows[f"{name}.shape"][row]
                 if values is not None and len(values):
                     found[laser, number] = image_of(values, shape, 4, where)
@@ -197,29 +186,26 @@ class Waymo(FileSequence):
         return found
 
     def _offset_ns(self, frame: int, laser: int, image: Float) -> Int:
-        """(H,W) since the sweep's stamp."""
+        """Return (H,W) firing times since the sweep's stamp."""
         height, width = image.shape[:2]
         if laser != 1:
             return np.zeros((height, width), np.int64)
         share = (np.arange(width) + 0.5) / width
-        begin_ns = int(self._starts_us[frame]) * 1000 - self._stamps_ns[frame]
-        column_ns = begin_ns + share * self._period_ns
-        told = self._told_ns(frame, share, image[..., 0] > 0)
-        if told is not None:
-            column_ns = told
+        column_ns = self._fitted_ns(frame, share, image[..., 0] > 0)
+        if column_ns is None:
+            begin_ns = int(self._starts_us[frame]) * 1000 - self._stamps_ns[frame]
+            column_ns = begin_ns + share * self._period_ns
         return np.broadcast_to(np.rint(column_ns).astype(np.int64), (height, width))
 
-    def _told_ns(self, frame: int, share: Float, measured: Bool) -> Float | None:
-        """(W,) when the columns were fired, by where the vehicle was then: a straight line through
-        the times of all columns. None if it hardly moved, or its poses tell something else."""
+    def _fitted_ns(self, frame: int, share: Float, measured: Bool) -> Float | None:
+        """Return (W,) firing times of the columns by the vehicle's positions then: a straight line
+        through all columns. None if it hardly moved, or the fit contradicts the period."""
         if len(self.frames) < 2:
             return None
         name = "[LiDARPoseComponent].range_image_return1"
-        rows = self._parts.read(
-            "lidar_pose",
-            {f"{name}.values": "l", f"{name}.shape": "l"},
-            {STAMP: int(self._starts_us[frame]), LASER: 1},
-        )
+        columns = {f"{name}.values": "l", f"{name}.shape": "l"}
+        of_frame_and_top = {STAMP: int(self._starts_us[frame]), LASER: 1}
+        rows = self._parts.read("lidar_pose", columns, of_frame_and_top)
         if not len(rows[f"{name}.values"]):
             return None
         where = f"{self._parts.file('lidar_pose')}: frame {frame}"
@@ -228,14 +214,14 @@ class Waymo(FileSequence):
             raise InputError(
                 f"{where}: got {pose.shape[:2]} pixels, expected {measured.shape} as the ranges"
             )
-        T, half_ns = self._T_world_vehicle[frame], self._period_ns // 2
-        stamp_ns = self._stamps_ns[frame]
+        half_ns, stamp_ns = self._period_ns // 2, self._stamps_ns[frame]
         before, after = (self._track.at(stamp_ns + sign * half_ns) for sign in (-1, 1))
         way = (after - before)[:3, 3]
         valid = measured & np.isfinite(pose).all(axis=2) & pose.any(axis=2)
         if np.linalg.norm(way) < _LEAST_WAY_M or valid.any(axis=0).sum() < len(share) // 4:
             return None
-        along = (pose[..., 3:] - T[:3, 3]) @ way / (way @ way) * 2 * half_ns
+        away = pose[..., 3:] - self._T_world_vehicle[frame][:3, 3]
+        along = away @ way / (way @ way) * 2 * half_ns
         column = np.broadcast_to(share, along.shape)[valid]
         slope_ns, middle_ns = np.polyfit(column - 0.5, along[valid], 1)
         if abs(abs(slope_ns) - self._period_ns) > _MOST_OFF_NS or abs(middle_ns) > half_ns:
@@ -244,26 +230,24 @@ class Waymo(FileSequence):
 
     @cached_property
     def _T_world_vehicle(self) -> dict[int, Float]:
-        """Poses of the vehicle, by frame."""
+        """Poses of the vehicle by frame."""
         name = "[VehiclePoseComponent].world_from_vehicle.transform"
-        rows = self._parts.read("vehicle_pose", {STAMP: "i", name: "l"})
-        where = self._parts.file("vehicle_pose")
+        rows, where = (
+            self._parts.read("vehicle_pose", {STAMP: "i", name: "l"}),
+            self._parts.file("vehicle_pose"),
+        )
         poses = {
             int(us): transform_of(values, f"{where}: frame_timestamp_micros {us}")
             for us, values in zip(rows[STAMP], rows[name], strict=True)
         }
         of = {number: poses[int(us)] for number, us in enumerate(self._starts_us) if us in poses}
-        for frame in self.frames:
-            of_frame(of, frame, "vehicle pose", where)
-        return of
+        return {frame: of_frame(of, frame, "vehicle pose", where) for frame in self.frames}
 
     @cached_property
     def _track(self) -> PoseTrack:
         T = np.stack([self._T_world_vehicle[frame] for frame in self.frames])
         path = self._parts.file("vehicle_pose")
         return PoseTrack(str(path), np.array(self._stamps_ns, np.int64), T)
-
-    # Images
 
     def _encoded_image(self, camera: str, number: int) -> tuple[Path, bytes]:
         name = "[CameraImageComponent].image"

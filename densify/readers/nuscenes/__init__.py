@@ -1,2 +1,0 @@
-# SPDX-License-Identifier: MIT
-"""nuScenes, and TruckScenes in the same tables."""

@@ -1,2 +1,0 @@
-# SPDX-License-Identifier: MIT
-"""The .h5 files of OpenSceneFlow: recordings, and sources of flow."""

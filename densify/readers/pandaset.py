@@ -1,0 +1,241 @@
+# SPDX-License-Identifier: MIT
+"""PandaSet (Xiao et al., ITSC 2021): one sequence's folder, as downloaded::
+
+    002/lidar/{00.pkl.gz, ..., poses.json, timestamps.json}
+    002/camera/front_camera/{00.jpg, ..., poses.json, timestamps.json, intrinsics.json}
+    002/annotations/cuboids/{00.pkl.gz, ...}    optional: tracked boxes
+
+- A frame's number is that of its files. Its stamp is the end of the sweep; each point has a time of
+  its own, 0.14 s before the stamp to 0.015 s after it. The first scanner (``d`` 0, Pandar64) turns
+  once in a sweep; the second (``d`` 1, PandarGT, forward, solid state) runs free of it.
+- Points are in the world, compensated: each was placed with the vehicle's pose at its own time.
+  Poses are the vehicle's, x right, y forward, z up, 10 Hz. That their clock is the points' own is
+  known to 20 ms only: the sequence measured (002) goes 0.4 m/s at most.
+- The positions of the scanners are not published. The Pandar64's position and axis below are those
+  that make its rings sharpest: the entropy of the elevations, minimised over position and tilt,
+  gives all 64 rings, and the same position to 1 cm in different sweeps. The PandarGT's position
+  makes the points of each of its mirror swings lie on the smoothest curve. The same vehicle drove
+  all sequences.
+- The lidar frame is the Pandar64's: x forward, y left, z along its axis.
+- Boxes are in the world. A moving object that both scanners see has two boxes with names of their
+  own, each around the points of one scanner (``cuboids.sensor_id``). ``dimensions`` are width,
+  length, height, and ``yaw`` turns the front from the world's y (the devkit's documentation; not
+  tried on real boxes).
+- Cameras are pinholes without distortion; their size is that of the images. Each image has a pose
+  and a stamp of its own, 19 to 100 ms before the sweep's. A camera's mounting is taken from the
+  image at which the vehicle moved least.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from densify.config.errors import InputError
+from densify.config.file_content import read_json
+from densify.geometry import poses
+from densify.geometry.types import Boxes, Camera, Float, Int
+from densify.readers.decoded_files import image_size_px
+from densify.readers.file_sequence import (
+    FileSequence,
+    Returns,
+    checked_boxes,
+    numbered_files,
+    pinhole,
+    quaternion_pose,
+    truth_beside,
+    upright_poses,
+)
+from densify.readers.pickled_frame import read_columns
+from densify.readers.recorded_poses import PoseTrack
+
+_AXIS = np.array([-0.0157, 0.00045, 1.0])  # of the Pandar64, forward left up
+_POSITION_M = np.array([0.777, 0.002, 1.8593])
+PANDAR_GT_M = np.array([0.580, 0.027, -0.294])
+"""(3,) origin of the PandarGT's rays in the Pandar64's frame."""
+
+_LATEST_S = 4e9  # of stamps: the year 2096
+_CENTRE = tuple(f"position.{axis}" for axis in "xyz")
+_WIDTH_LENGTH_HEIGHT = tuple(f"dimensions.{axis}" for axis in "xyz")
+
+
+def _T_pose_lidar() -> Float:
+    forward_left_up = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    up = _AXIS / np.linalg.norm(_AXIS)
+    forward = np.array([1.0, 0.0, 0.0]) - up[0] * up
+    forward /= np.linalg.norm(forward)
+    T = np.eye(4)
+    T[:3, :3] = forward_left_up @ np.column_stack([forward, np.cross(up, forward), up])
+    T[:3, 3] = forward_left_up @ _POSITION_M
+    return T
+
+
+T_POSE_LIDAR = _T_pose_lidar()
+"""(4,4) from the Pandar64's frame to that of the poses in the files."""
+
+
+def open_recording(path: Path, scene: str | None) -> PandaSet:
+    """See `densify.readers.ReaderModule`; a sequence has no scenes."""
+    return PandaSet(path)
+
+
+class PandaSet(FileSequence):
+    """A sequence as a `LidarSequence` with poses of its images."""
+
+    def __init__(self, path: Path) -> None:
+        """path: the sequence's folder. Raises InputError if it holds no sweeps, or poses, stamps or
+        intrinsics are missing or malformed."""
+        lidar = path / "lidar"
+        found = {file.name.removesuffix(".pkl.gz"): file for file in sorted(lidar.glob("*.pkl.gz"))}
+        sweeps = {int(name): file for name, file in found.items() if name.isdecimal()}
+        if not sweeps:
+            raise InputError(
+                f"{path}: no sweeps; expected a PandaSet sequence with files such as "
+                f"lidar/00.pkl.gz"
+            )
+        stamps_ns, T_world_pose = _stamped_poses(lidar, max(sweeps))
+        self._track = PoseTrack(str(lidar / "poses.json"), stamps_ns, T_world_pose @ T_POSE_LIDAR)
+        images, self._T_world_cam, cameras, exposed_ns = {}, dict[str, Float](), {}, {}
+        for folder in sorted(path.glob("camera/*")):
+            files, name = numbered_files(folder, ".jpg", ".png"), folder.name
+            if files:
+                images_ns, self._T_world_cam[name] = _stamped_poses(folder, max(files))
+                exposed_ns[name] = {n: int(images_ns[n]) for n in files}
+                calm = min(files, key=lambda n: self._step_m(exposed_ns[name][n]))
+                T_world_lidar = self._track.at(exposed_ns[name][calm])
+                T_cam_lidar = poses.inverse(self._T_world_cam[name][calm]) @ T_world_lidar
+                cameras[name], images[name] = _camera(folder, files[min(files)], T_cam_lidar), files
+        super().__init__(
+            path.resolve().name,
+            path,
+            tuple(sorted(sweeps)),
+            cameras,
+            exposed_ns,
+            truth_beside(path),
+            sweeps,
+            images,
+        )
+
+    def stamp_ns(self, frame: int) -> int:
+        """Return the end of the Pandar64's turn."""
+        self.check_frame(frame)
+        return int(self._track.stamp_ns[frame])
+
+    def T_world_cam(self, camera: str, number: int) -> Float:
+        """Return the data set's own (4,4) pose of an image."""
+        self.check_image(camera, number)
+        return self._T_world_cam[camera][number]
+
+    def _step_m(self, stamp_ns: int) -> float:
+        """Return the distance between the poses around that time. The smaller it is, the better is
+        an interpolated pose."""
+        after = np.searchsorted(self._track.stamp_ns, stamp_ns)
+        if not 0 < after < len(self._track.stamp_ns):
+            return np.inf
+        here, there = self._track.T_world_ego[after - 1 : after + 1, :3, 3]
+        return float(np.linalg.norm(there - here))
+
+    def _returns(self, frame: int) -> tuple[Path, Returns]:
+        path, stamp_ns = self._files[frame], self.stamp_ns(frame)
+        x, y, z, brightness, time_s, scanner = _numbers(path, ("x", "y", "z", "i", "t", "d"))[0]
+        since_s = time_s - stamp_ns * 1e-9
+        if not (np.abs(since_s) < 1.0).all():
+            raise InputError(
+                f"{path}: got times t up to {np.abs(since_s).max():.3g} s from the sweep's stamp, "
+                f"expected seconds since 1970 within a second of it"
+            )
+        offset_ns = np.rint(since_s * 1e9).astype(np.int64)
+        T_lidar_world = poses.inverse(self._track.at(stamp_ns))
+        points = poses.transform(T_lidar_world, np.column_stack([x, y, z]).astype(np.float64))
+        return path, Returns(
+            self._track.as_fired(points, stamp_ns, offset_ns),
+            (brightness / 255).astype(np.float32),
+            offset_ns,
+            np.clip(scanner, 0, 1).astype(np.uint8),
+            np.stack([np.zeros(3), PANDAR_GT_M]),
+        )
+
+    def _pose(self, frame: int) -> Float:
+        return self._track.at(self.stamp_ns(frame))
+
+    def boxes(self, frame: int) -> Boxes | None:
+        """See `KnowsBoxes`; None without the frame's file. Raises InputError for a malformed
+        file."""
+        self.check_frame(frame)
+        path = self.where / "annotations" / "cuboids" / f"{frame:02d}.pkl.gz"
+        if not path.is_file():
+            return None
+        names = (*_CENTRE, *_WIDTH_LENGTH_HEIGHT, "yaw", "cuboids.sensor_id")
+        (x, y, z, width, length, height, yaw, scanner), (uuid,) = _numbers(path, names, ("uuid",))
+        if not np.isin(scanner, (-1, 0, 1)).all():
+            raise InputError(f"{path}: column cuboids.sensor_id: expected -1, 0 or 1")
+        T_world_box = upright_poses(np.stack([x, y, z], axis=1).astype(float), yaw + np.pi / 2)
+        return checked_boxes(
+            uuid,
+            poses.inverse(self._pose(frame)) @ T_world_box,
+            np.stack([length, width, height], axis=1).astype(np.float64),
+            str(path),
+            lidar=scanner.astype(np.int64),
+        )
+
+
+def _numbers(
+    path: Path, numbers: tuple[str, ...], texts: tuple[str, ...] = ()
+) -> tuple[list[Float], list[list[str]]]:
+    """Return columns of finite numbers, and columns of texts. Raises InputError if one is absent or
+    holds something else."""
+    columns = read_columns(path)
+    missing = [name for name in (*numbers, *texts) if name not in columns]
+    if missing:
+        raise InputError(
+            f"{path}: no column {missing[0]}: got {' '.join(columns) or 'none'}; use the data "
+            f"set's own files"
+        )
+    for name in numbers:
+        if columns[name].dtype.kind not in "fiu" or np.isinf(columns[name]).any():
+            raise InputError(f"{path}: column {name}: expected finite numbers")
+    found = [columns[name].tolist() for name in texts]
+    if not all(isinstance(text, str) and text for column in found for text in column):
+        raise InputError(f"{path}: column {', '.join(texts)}: expected a text in each row")
+    return [columns[name] for name in numbers], found
+
+
+def _stamped_poses(folder: Path, last: int) -> tuple[Int, Float]:
+    """Return (n,) stamps and (n,4,4) poses of the files up to number ``last`` at least."""
+    path = folder / "timestamps.json"
+    try:
+        stamps_s = np.array(read_json(path), np.float64)
+        if stamps_s.ndim != 1 or not (np.abs(stamps_s) < _LATEST_S).all():
+            raise ValueError("it is not a plain list of numbers, or they are no dates")
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{path}: {error}; expected a list of seconds") from None
+    stamps_ns = np.rint(stamps_s * 1e6).astype(np.int64) * 1000  # six digits after the point
+    path, T = folder / "poses.json", []
+    entries = read_json(path)
+    for number, entry in enumerate(entries if isinstance(entries, list) else []):
+        try:
+            turn, place = entry["heading"], entry["position"]
+            values = [turn[k] for k in "wxyz"], [place[k] for k in "xyz"]
+        except (KeyError, TypeError) as error:
+            raise InputError(
+                f"{path}: entry {number}: no {error}; expected heading w x y z and position x y z"
+            ) from None
+        T.append(quaternion_pose(*values, f"{path}: entry {number}"))
+    num = min(len(stamps_ns), len(T))
+    if last >= num:
+        raise InputError(
+            f"{folder}: got {num} entries in poses.json and timestamps.json, expected one for each "
+            f"file up to number {last}"
+        )
+    return stamps_ns[:num], np.stack(T[:num])
+
+
+def _camera(folder: Path, image: Path, T_cam_lidar: Float) -> Camera:
+    path = folder / "intrinsics.json"
+    given = read_json(path)
+    try:
+        fx_fy_cx_cy = [float(given[name]) for name in ("fx", "fy", "cx", "cy")]
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(f"{path}: {error}; expected fx fy cx cy in pixels") from None
+    return pinhole(folder.name, image_size_px(image), fx_fy_cx_cy, T_cam_lidar, str(path))

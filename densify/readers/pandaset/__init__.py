@@ -1,2 +1,0 @@
-# SPDX-License-Identifier: MIT
-"""PandaSet, whose tables are pickles."""

@@ -1,0 +1,352 @@
+# SPDX-License-Identifier: MIT
+"""Messages of ROS 1 and ROS 2 bags, by the rosbags package: no ROS is needed.
+
+A bag is read through once, for the time stamp in the header of every message that matters. The
+index of a large bag is kept in the user's cache. Messages are then read one at a time.
+"""
+
+from __future__ import annotations
+
+import heapq
+import re
+import struct
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from threading import RLock
+from typing import Any, NamedTuple
+from urllib.parse import parse_qsl
+
+import numpy as np
+
+from densify.config.errors import InputError
+from densify.config.file_content import reason
+from densify.geometry.types import Int
+from densify.readers.extras import needed
+
+_LARGE_BYTES = 2**28
+_KEPT_BYTES = 2**30
+_MEND = "a bag that was cut off can be mended: rosbag reindex, ros2 bag reindex, mcap recover"
+
+_DRIVERS = ("livox_ros_driver", "livox_ros_driver2", "livox_interfaces")
+_LIVOX_POINT = "uint32 offset_time\nfloat32 x\nfloat32 y\nfloat32 z\nuint8 reflectivity\n"
+_LIVOX_POINT += "uint8 tag\nuint8 line"
+_LIVOX = (
+    "std_msgs/Header header\nuint64 timebase\nuint32 point_num\nuint8 lidar_id\nuint8[3] rsvd\n"
+)
+_TRANSFORMS = "geometry_msgs/TransformStamped[] transforms"
+_DEFINITIONS = {"tf2_msgs/msg/TFMessage": _TRANSFORMS, "tf/msg/tfMessage": _TRANSFORMS}
+for _package in _DRIVERS:
+    _DEFINITIONS[f"{_package}/msg/CustomPoint"] = _LIVOX_POINT
+    _DEFINITIONS[f"{_package}/msg/CustomMsg"] = f"{_LIVOX}{_package}/CustomPoint[] points"
+
+_CLOUDS = ("sensor_msgs/msg/PointCloud2", *(f"{package}/msg/CustomMsg" for package in _DRIVERS))
+_IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
+_ODOMETRY = "nav_msgs/msg/Odometry"
+POSES = (
+    _ODOMETRY,
+    "geometry_msgs/msg/PoseStamped",
+    "geometry_msgs/msg/PoseWithCovarianceStamped",
+)
+_USAGE = "#points=/topic,/topic&images=/topic,/topic&poses=/topic, tf or none"
+_PACKETS = re.compile(
+    r"Velodyne(Scan|Packet)|PacketMsg|PandarScan|HesaiPacket|UdpFrame|NebulaPackets|"
+    r"Rslidar(Scan|Packet)|LivoxPacket|BlickfeldPackets"
+)
+_NO_SWEEPS = re.compile(
+    r"map|depth|filtered|obstacle|ground|cluster|voxel|radar|local|global|accumulated|registered"
+)
+_NO_PICTURES = re.compile(r"depth|disparity|theora|mask|confidence")
+_BEST_IMAGES = ("image_rect_color", "image_rect", "image_color", "image_raw", "image")
+
+
+class Entry(NamedTuple):
+    """Where a message is. stamp_ns: of its header, or when it was recorded if that is 0. log_ns:
+    when it was recorded. turn: which of the topic's messages recorded then."""
+
+    stamp_ns: int
+    log_ns: int
+    turn: int
+
+
+class Topic(NamedTuple):
+    """type: such as sensor_msgs/msg/PointCloud2, whichever ROS it is from."""
+
+    name: str
+    type: str
+    num_messages: int
+
+
+class Bag:
+    """path: a .bag, .db3 or .mcap file, a ROS 2 bag's folder, or a folder of .bag files that are
+    parts of one recording. topics: by name."""
+
+    def __init__(self, path: Path) -> None:
+        """Raises InputError if it is no bag, or a damaged one."""
+        self.path = path
+        self._files = _bag_files(path)
+        self._is_ros2 = not (self._files[0].suffix == ".bag" and self._files[0].is_file())
+        self._types = message_types(self._is_ros2)
+        package = needed(f"rosbags.rosbag{2 if self._is_ros2 else 1}", "ros", "ROS bags")
+        self._lock = RLock()
+        try:
+            self._readers = [package.Reader(file) for file in self._files]
+            for reader in self._readers:
+                reader.open()
+            self.topics: Mapping[str, Topic] = _topics(self._readers)
+        except Exception as error:  # a damaged bag makes the parser raise anything
+            raise self._unreadable(error) from error
+
+    def of_type(self, *types: str) -> list[Topic]:
+        """Return the topics of one of these types, by name."""
+        return [topic for topic in self.topics.values() if topic.type in types]
+
+    def index(self, topics: Collection[str]) -> dict[str, list[Entry]]:
+        """Return every message of these topics, whose types begin with a header, by ascending
+        stamp."""
+        names, files = sorted(topics), self._files
+        files = [f for one in files for f in (sorted(one.iterdir()) if one.is_dir() else [one])]
+        if sum(file.stat().st_size for file in files) < _LARGE_BYTES:
+            found = self._read_index(names)
+        else:
+            from densify.config.cache import Cache
+
+            state = [(str(f.absolute()), f.stat().st_size, f.stat().st_mtime_ns) for f in files]
+            found = Cache(_KEPT_BYTES).get(
+                "bag", dict[str, Int], [state, names], lambda: self._read_index(names)
+            )
+        return {name: [Entry(*row) for row in found[name].tolist()] for name in names}
+
+    def message(self, topic: str, entry: Entry) -> Any:
+        """Raises InputError if it cannot be read."""
+        found = list(self._messages([topic], entry.log_ns, entry.log_ns + 1))
+        if len(found) <= entry.turn:
+            raise InputError(f"{self.path}: no message of {topic} at {entry.log_ns} ns any more")
+        _, _, raw, type_ = found[entry.turn]
+        return self._decoded(raw, type_, topic)
+
+    def messages(self, topic: str) -> Iterator[Any]:
+        """Yield all of a topic, in the order in which they were recorded."""
+        for name, _, raw, type_ in self._messages([topic]):
+            yield self._decoded(raw, type_, name)
+
+    def _read_index(self, topics: Sequence[str]) -> dict[str, Int]:
+        """Return (n,3) of each topic, the rows `Entry`s."""
+        found: dict[str, list[Entry]] = {topic: [] for topic in topics}
+        for topic, log_ns, raw, _ in self._messages(topics) if topics else ():
+            before = found[topic][-1] if found[topic] else None
+            turn = before.turn + 1 if before is not None and before.log_ns == log_ns else 0
+            try:
+                stamp_ns = _stamp_ns(raw, self._is_ros2)
+            except struct.error:
+                raise InputError(f"{self.path}: {topic}: a message of {len(raw)} bytes") from None
+            found[topic].append(Entry(stamp_ns or log_ns, log_ns, turn))
+        return {t: np.array(sorted(e), np.int64).reshape(-1, 3) for t, e in found.items()}
+
+    def _messages(
+        self, topics: Sequence[str], start_ns: int | None = None, stop_ns: int | None = None
+    ) -> Iterator[tuple[str, int, bytes, str]]:
+        parts = []
+        for reader in self._readers:
+            wanted = [c for c in reader.connections if c.topic in topics]
+            if wanted:  # an empty list would mean all
+                parts.append(reader.messages(wanted, start_ns, stop_ns))
+        with self._lock:
+            try:
+                for connection, log_ns, raw in heapq.merge(*parts, key=lambda part: part[1]):
+                    yield connection.topic, log_ns, raw, connection.msgtype
+            except Exception as error:  # as above
+                raise self._unreadable(error) from error
+
+    def _decoded(self, raw: bytes, type_: str, topic: str) -> Any:
+        decode = self._types.deserialize_cdr if self._is_ros2 else self._types.deserialize_ros1
+        try:
+            return decode(raw, type_)
+        except Exception as error:  # as above
+            raise InputError(
+                f"{self.path}: {topic}: a message of {len(raw)} bytes is no whole {type_} "
+                f"({reason(error)})"
+            ) from error
+
+    def _unreadable(self, error: Exception) -> InputError:
+        return InputError(f"{self.path}: not a whole bag: {reason(error)}; {_MEND}")
+
+
+def message_types(is_ros2: bool) -> Any:
+    """Return the types of messages as ROS defines them, never as a bag does: rosbags makes code of
+    definitions."""
+    typesys = needed("rosbags.typesys", "ros", "ROS bags")
+    stores = typesys.Stores
+    types = typesys.get_typestore(stores.ROS2_JAZZY if is_ros2 else stores.ROS1_NOETIC)
+    for name, text in _DEFINITIONS.items():
+        if name not in types.types:
+            types.register(typesys.get_types_from_msg(text, name))
+    return types
+
+
+def _topics(readers: Sequence[Any]) -> dict[str, Topic]:
+    """Return the topics with messages, of all parts of the recording, by name."""
+    found: dict[str, Topic] = {}
+    for connection in (c for reader in readers for c in reader.connections if c.msgcount):
+        name = connection.topic
+        before = found.get(name, Topic(name, connection.msgtype, 0))
+        type_ = before.type if before.type == connection.msgtype else "of several types"
+        found[name] = Topic(name, type_, before.num_messages + connection.msgcount)
+    return dict(sorted(found.items()))
+
+
+def _bag_files(path: Path) -> list[Path]:
+    """Return what is to be opened: the file, a ROS 2 bag's folder, or the bags in a folder. Raises
+    InputError if there are none."""
+    suffixes = (".bag", ".db3", ".mcap")
+    if (path.is_file() and path.suffix in suffixes) or (path / "metadata.yaml").is_file():
+        return [path]
+    for suffix in suffixes:
+        found = sorted(path.glob(f"*{suffix}")) if path.is_dir() else []
+        if found and (suffix == ".bag" or len(found) == 1):
+            return found
+        if found:
+            raise InputError(
+                f"{path}: {len(found)} {suffix} files without metadata.yaml; name one of them, or "
+                f"write it with ros2 bag reindex"
+            )
+    raise InputError(
+        f"{path}: no bag; expected a .bag, .mcap or .db3 file, or a ROS 2 bag's folder"
+    )
+
+
+def _stamp_ns(raw: bytes, is_ros2: bool) -> int:
+    """Return the stamp in the header that a message begins with."""
+    if is_ros2:  # an encapsulation of four bytes, whose second tells the order
+        seconds, nanoseconds = struct.unpack_from("<iI" if raw[1] & 1 else ">iI", raw, 4)
+    else:  # a sequence number
+        seconds, nanoseconds = struct.unpack_from("<II", raw, 4)
+    return int(seconds) * 1_000_000_000 + int(nanoseconds)
+
+
+# Topics
+
+
+class Images(NamedTuple):
+    """camera: its name. topic: of its images. info: topic of its calibration. named: by the user,
+    so that whatever is wrong with it is an error."""
+
+    camera: str
+    topic: str
+    info: str
+    named: bool
+
+    @property
+    def rectified(self) -> bool:
+        return "rect" in self.topic.removesuffix("/compressed").rpartition("/")[2]
+
+
+@dataclass(frozen=True)
+class Topics:
+    """points: of the lidars; the first one's messages are the sweeps. poses: a topic, ``tf``, or ""
+    for none; poses_named: by the user. left_out: images that are not used, and why."""
+
+    points: tuple[str, ...]
+    images: tuple[Images, ...]
+    poses: str
+    poses_named: bool
+    left_out: tuple[str, ...]
+
+    @staticmethod
+    def choose(bag: Bag, options: str | None) -> Topics:
+        """options: what follows ``#``. Raises InputError for topics that do not exist, several that
+        could be the sweeps, and bags without any."""
+        given = dict(parse_qsl(options or "", keep_blank_values=True))
+        wrong = [key for key in given if key not in ("points", "images", "poses")]
+        if wrong or (options and not given):
+            raise InputError(
+                f"{bag.path}#{options}: got {wrong[0] if wrong else options}, expected {_USAGE}"
+            )
+        points = tuple(t.name for t in _points(bag, given.get("points")))
+        images, left_out = _images(bag, given.get("images"))
+        poses = given.get("poses", "")
+        if poses and poses not in ("none", "tf"):
+            _existing(bag, [poses], POSES, "poses")
+        if not poses:
+            odometry = bag.of_type(_ODOMETRY)
+            poses = odometry[0].name if len(odometry) == 1 else "tf"
+        poses = "" if poses == "none" else poses
+        return Topics(points, images, poses, "poses" in given, left_out)
+
+
+def _points(bag: Bag, given: str | None) -> list[Topic]:
+    if given is not None:
+        return _existing(bag, given.split(","), _CLOUDS, "points")
+    found = bag.of_type(*_CLOUDS)
+    likely = [t for t in found if not _NO_SWEEPS.search(t.name.lower())]
+    if len(likely) == 1 or len(found) == 1:
+        return likely or found
+    if found:
+        raise InputError(
+            f"{bag.path}: several topics could be the sweeps: {_listed(likely or found)}; name one "
+            f"or all lidars of the vehicle: --data 'ros:{bag.path}#points=/topic,/topic'"
+        )
+    packets = [t for t in bag.topics.values() if _PACKETS.fullmatch(t.type.rpartition("/")[2])]
+    if packets:
+        raise InputError(
+            f"{bag.path}: holds raw packets only ({_listed(packets)}), no PointCloud2; play it "
+            f"through the sensor's driver (such as velodyne_pointcloud or ouster_ros) and record "
+            f"the points that come out, or give the packets as .pcap"
+        )
+    raise InputError(
+        f"{bag.path}: no PointCloud2; got {_listed(list(bag.topics.values())) or 'no messages'}"
+    )
+
+
+def _images(bag: Bag, given: str | None) -> tuple[tuple[Images, ...], tuple[str, ...]]:
+    if given == "none":
+        return (), ()
+    if given is not None:
+        chosen = [t.name for t in _existing(bag, given.split(","), _IMAGES, "images")]
+    else:
+        chosen = _guessed_images([t.name for t in bag.of_type(*_IMAGES)])
+    places = [_place(topic) for topic in chosen]
+    found, left_out = [], []
+    for topic, place in zip(chosen, places, strict=True):
+        info = f"{place}/camera_info"
+        name = (place if places.count(place) == 1 else topic).strip("/").replace("/", "_")
+        if info in bag.topics:
+            found.append(Images(name or "camera", topic, info, given is not None))
+        elif given is not None:
+            raise InputError(
+                f"{bag.path}: no {info} with the calibration of {topic}; leave it out of #images="
+            )
+        else:
+            left_out.append(f"{topic}: no {info} with its calibration")
+    return tuple(found), tuple(left_out)
+
+
+def _guessed_images(topics: Sequence[str]) -> list[str]:
+    """Return the best of each place: rectified before raw, whole before compressed."""
+    best: dict[str, tuple[int, str]] = {}
+    for topic in topics:
+        if not _NO_PICTURES.search(topic.lower()):
+            last = topic.removesuffix("/compressed").rpartition("/")[2]
+            rank = _BEST_IMAGES.index(last) if last in _BEST_IMAGES else len(_BEST_IMAGES)
+            order = (2 * rank + topic.endswith("/compressed"), topic)
+            best[_place(topic)] = min(best.get(_place(topic), order), order)
+    return [topic for _, topic in best.values()]
+
+
+def _place(topic: str) -> str:
+    """``/front/image_raw/compressed`` -> ``/front``, which has its calibration too."""
+    return topic.removesuffix("/compressed").rpartition("/")[0]
+
+
+def _existing(bag: Bag, names: Sequence[str], types: Sequence[str], what: str) -> list[Topic]:
+    for name in names:
+        topic = bag.topics.get(name)
+        if topic is None or topic.type not in types:
+            got = "no such topic" if topic is None else f"a topic of {topic.type}"
+            fit = _listed(bag.of_type(*types)) or "none"
+            raise InputError(f"{bag.path}: {what}={name}: {got}; topics that fit: {fit}")
+    return [bag.topics[name] for name in names]
+
+
+def _listed(topics: Sequence[Topic]) -> str:
+    return ", ".join(f"{t.name} ({t.type.rpartition('/')[2]}, {t.num_messages})" for t in topics)

@@ -1,0 +1,274 @@
+# SPDX-License-Identifier: MIT
+"""Contents of ROS messages: points of any layout, images of any encoding, calibrations, transforms
+and poses."""
+
+from __future__ import annotations
+
+from collections import defaultdict, deque
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from densify.config.errors import InputError
+from densify.geometry.poses import inverse
+from densify.geometry.types import Camera, Float
+from densify.readers.decoded_files import decode_image
+from densify.readers.file_sequence import quaternion_pose, rigid
+from densify.readers.recorded_poses import PoseTrack
+from densify.readers.ros_bag import Bag
+
+_DATATYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
+_LIVOX = {"x": "f4", "y": "f4", "z": "f4", "reflectivity": "u1", "offset_time": "u4", "line": "u1"}
+_MODELS = {  # densify's name of a lens's model, and possible numbers of coefficients
+    "plumb_bob": ("pinhole", (4, 5)),
+    "radtan": ("pinhole", (4, 5)),
+    "rational_polynomial": ("pinhole", (8, 12, 14)),
+    "thin_prism": ("pinhole", (12, 14)),
+    "equidistant": ("fisheye", (4,)),
+    "fisheye": ("fisheye", (4,)),
+    "kannala_brandt4": ("fisheye", (4,)),
+}
+_PACKED = {  # channels, and OpenCV's conversion to RGB
+    "rgb8": (3, None),
+    "bgr8": (3, "COLOR_BGR2RGB"),
+    "rgba8": (4, "COLOR_RGBA2RGB"),
+    "bgra8": (4, "COLOR_BGRA2RGB"),
+    "8uc3": (3, "COLOR_BGR2RGB"),
+    "mono8": (1, "COLOR_GRAY2RGB"),
+    "8uc1": (1, "COLOR_GRAY2RGB"),
+    # OpenCV names a mosaic by the second row's second and third pixel, ROS by its first two
+    "bayer_rggb8": (1, "COLOR_BayerBG2RGB"),
+    "bayer_bggr8": (1, "COLOR_BayerRG2RGB"),
+    "bayer_gbrg8": (1, "COLOR_BayerGR2RGB"),
+    "bayer_grbg8": (1, "COLOR_BayerGB2RGB"),
+    "yuv422": (2, "COLOR_YUV2RGB_UYVY"),
+    "uyvy": (2, "COLOR_YUV2RGB_UYVY"),
+    "yuv422_yuy2": (2, "COLOR_YUV2RGB_YUYV"),
+    "yuyv": (2, "COLOR_YUV2RGB_YUYV"),
+}
+_FIXED_M = 1e-6  # what moves less, in metres or radians, is fixed
+
+
+def cloud_columns(message: Any, where: str) -> dict[str, NDArray[Any]]:
+    """Return the fields of a PointCloud2 or Livox's CustomMsg by name, (N,) each as stored. Fields
+    of several numbers are left out. Raises InputError if its layout contradicts itself."""
+    if not hasattr(message, "point_step"):
+        rows = [tuple(getattr(point, name) for name in _LIVOX) for point in message.points]
+        table = np.array(rows, list(_LIVOX.items()))
+        return {name: table[name] for name in _LIVOX}
+    order, layout = ">" if message.is_bigendian else "<", dict[str, tuple[str, int]]()
+    for entry in message.fields:
+        if entry.count > 1 or not entry.name or entry.name in layout:
+            continue
+        kind = _DATATYPES.get(entry.datatype)
+        if kind is None or entry.offset + int(kind[1]) > message.point_step:
+            raise InputError(
+                f"{where}: field {entry.name}: got type {entry.datatype} at byte {entry.offset} of "
+                f"{message.point_step}, expected one of ROS's eight types inside the point"
+            )
+        layout[entry.name] = (order + kind, entry.offset)
+    formats, offsets = [kind for kind, _ in layout.values()], [at for _, at in layout.values()]
+    spec: Any = {"names": [*layout], "formats": formats, "offsets": offsets}
+    points_of_rows = _rows(message, message.row_step, message.point_step, where)
+    points = points_of_rows.reshape(-1).view(np.dtype(spec | {"itemsize": message.point_step}))
+    return {name: points[name] for name in layout}
+
+
+def _rows(message: Any, step: int, item_bytes: int, where: str) -> NDArray[np.uint8]:
+    """Return the rows of a message's data without their padding, (height, width · item_bytes)."""
+    data, used = np.ascontiguousarray(message.data, np.uint8), message.width * item_bytes
+    if step < used or len(data) < message.height * step:
+        raise InputError(
+            f"{where}: got {len(data)} bytes and rows of {step}, expected {message.height} rows of "
+            f"{message.width} times {item_bytes} bytes"
+        )
+    rows = data[: message.height * step].reshape(message.height, step)
+    return np.ascontiguousarray(rows[:, :used])
+
+
+def image_rgb(message: Any, where: str) -> NDArray[np.uint8]:
+    """Return the (H,W,3) of an Image or CompressedImage. Raises InputError if its encoding is not
+    known, or it is damaged."""
+    import cv2
+
+    if hasattr(message, "format"):
+        bgr = decode_image(np.ascontiguousarray(message.data, np.uint8).tobytes(), where)
+        return np.ascontiguousarray(bgr[:, :, ::-1], dtype=np.uint8)
+    encoding, size = message.encoding.lower(), (message.height, message.width)
+    if encoding in ("mono16", "16uc1"):
+        order = ">u2" if message.is_bigendian else "<u2"
+        gray = _rows(message, message.step, 2, where).view(order).reshape(size) >> 8
+        return cv2.cvtColor(gray.astype(np.uint8), cv2.COLOR_GRAY2RGB).astype(np.uint8)
+    if encoding not in _PACKED:
+        raise InputError(
+            f"{where}: got the encoding {message.encoding}, expected one of "
+            f"{', '.join(_PACKED)}, mono16; leave the camera out: name others with #images="
+        )
+    channels, conversion = _PACKED[encoding]
+    pixels = _rows(message, message.step, channels, where).reshape(*size, channels)
+    if conversion is None:
+        return pixels
+    return np.ascontiguousarray(cv2.cvtColor(pixels, getattr(cv2, conversion)), dtype=np.uint8)
+
+
+def camera_of(info: Any, name: str, T_optical_lidar: Float, rectified: bool, where: str) -> Camera:
+    """Return the camera of a CameraInfo, with its binning and region of interest.
+
+    T_optical_lidar: (4,4) to the frame of the message. rectified: the images are rectified: their
+    calibration is P, turned by R; else it is K with D. Raises InputError for a model that is not
+    known or numbers that are no calibration.
+    """
+    matrix = {  # ROS 1 writes K, ROS 2 k
+        key: np.asarray(getattr(info, key if hasattr(info, key) else key.upper()), np.float64)
+        for key in "kdrp"
+    }
+    K = (matrix["p"].reshape(3, 4)[:, :3] if rectified else matrix["k"].reshape(3, 3)).copy()
+    if not np.isfinite(K).all() or min(K[0, 0], K[1, 1]) <= 0 or abs(K[2, 2] - 1) > 1e-6:
+        raise InputError(
+            f"{where}: got {'P' if rectified else 'K'} = {np.round(K.ravel(), 4).tolist()}, "
+            f"expected a calibration with positive focal lengths"
+        )
+    if min(info.width, info.height) < 1:
+        raise InputError(f"{where}: got {info.width} x {info.height} px, expected the image's size")
+    T, model, distortion = T_optical_lidar, "pinhole", tuple[float, ...]()
+    if not rectified:
+        model, distortion = _lens(info.distortion_model, tuple(matrix["d"].tolist()), where)
+    elif matrix["r"].any():  # drivers leave zeros where they do not say
+        T = rigid(np.column_stack([matrix["r"].reshape(3, 3), np.zeros(3)]), where) @ T
+    camera = Camera(name, int(info.width), int(info.height), K, T, distortion, model)
+    return _binned(camera, info)
+
+
+def _lens(named: str, distortion: tuple[float, ...], where: str) -> tuple[str, tuple[float, ...]]:
+    model, counts = _MODELS.get(named, ("pinhole", ()))
+    if not any(distortion) and model == "pinhole":
+        return "pinhole", ()
+    if len(distortion) not in counts:
+        raise InputError(
+            f"{where}: got {len(distortion)} coefficients of the distortion model {named!r}, "
+            f"expected one of {', '.join(_MODELS)}, with "
+            f"{' or '.join(str(n) for n in counts) or 'its'} coefficients; name rectified images "
+            f"with #images="
+        )
+    return model, distortion
+
+
+def _binned(camera: Camera, info: Any) -> Camera:
+    """Adapt the calibration to an image that is a part of the sensor or has fewer pixels. A pixel
+    of the image is the mean of several, so centres shift by half a pixel."""
+    roi, by = info.roi, np.array([max(1, info.binning_x), max(1, info.binning_y)])
+    size = [roi.width or camera.width_px, roi.height or camera.height_px]
+    K = camera.K.copy()
+    K[:2, 2] -= (roi.x_offset, roi.y_offset)
+    K[:2, 2] = (K[:2, 2] + 0.5) / by - 0.5
+    K[[0, 1], [0, 1]] /= by
+    return replace(camera, K=K, width_px=int(size[0] // by[0]), height_px=int(size[1] // by[1]))
+
+
+# Transforms
+
+
+@dataclass(frozen=True)
+class Transforms:
+    """fixed: T_parent_child by child, with its parent. moving: the same over time."""
+
+    where: str
+    fixed: dict[str, tuple[str, Float]] = field(default_factory=dict)
+    moving: dict[str, tuple[str, PoseTrack]] = field(default_factory=dict)
+
+    @staticmethod
+    def read(bag: Bag) -> Transforms:
+        """Read all of /tf_static and /tf. Frames that never move in /tf are fixed too. Raises
+        InputError for a transform that is no rigid motion."""
+        found = Transforms(str(bag.path))
+        heard: dict[tuple[str, str], dict[int, Float]] = defaultdict(dict)
+        for topic in bag.of_type("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage"):
+            transforms = (t for message in bag.messages(topic.name) for t in message.transforms)
+            for transform in transforms:
+                parent, child = plain(transform.header.frame_id), plain(transform.child_frame_id)
+                where = f"{bag.path}: {topic.name}: {parent} to {child}"
+                T = _pose(transform.transform.translation, transform.transform.rotation, where)
+                if topic.name.endswith("tf_static"):
+                    found.fixed[child] = (parent, T)
+                else:
+                    heard[parent, child][stamp_of(transform.header)] = T
+        for (parent, child), by_stamp in heard.items():
+            T = np.stack([by_stamp[stamp] for stamp in sorted(by_stamp)])
+            if child not in found.fixed and np.abs(T - T[0]).max() < _FIXED_M:
+                found.fixed[child] = (parent, T[0])
+            elif child not in found.fixed:
+                track = _track(f"{bag.path}: /tf: {parent} to {child}", by_stamp)
+                found.moving[child] = (parent, track)
+        return found
+
+    def between(self, target: str, source: str) -> Float | None:
+        """Return (4,4) T_target_source over fixed frames, None if nothing joins them."""
+        ways: dict[str, list[tuple[str, Float]]] = defaultdict(list)
+        for child, (parent, T) in self.fixed.items():
+            ways[child].append((parent, T))
+            ways[parent].append((child, inverse(T)))
+        found, waiting = {source: np.eye(4)}, deque([source])
+        while waiting:
+            at = waiting.popleft()
+            for other, T_other_at in ways[at]:
+                if other not in found:
+                    found[other] = T_other_at @ found[at]
+                    waiting.append(other)
+        return found.get(target)
+
+    def track_of(self, frame: str) -> tuple[str, PoseTrack] | None:
+        """Return the path of a frame by /tf, in the nearest moving parent, whose name comes first:
+        ``odom`` rather than ``map``, which jumps where a place is recognised."""
+        T_body_frame, body, passed = np.eye(4), frame, {frame}
+        while body in self.fixed and body not in self.moving:
+            parent, T = self.fixed[body]
+            T_body_frame, body = T @ T_body_frame, parent
+            if body in passed:
+                raise InputError(f"{self.where}: /tf_static: {body} is above itself")
+            passed.add(body)
+        if body not in self.moving:
+            return None
+        world, track = self.moving[body]
+        return world, PoseTrack(track.where, track.stamp_ns, track.T_world_ego @ T_body_frame)
+
+
+def recorded_track(bag: Bag, topic: str, transforms: Transforms, lidar: str) -> PoseTrack:
+    """Return the lidar's path by a topic of odometry or poses.
+
+    Odometry is that of its child frame; a pose without one is the lidar's. Raises InputError if
+    nothing joins that frame to the lidar's, or there are fewer than two poses.
+    """
+    found, where = dict[int, Float](), f"{bag.path}: {topic}"
+    for message in bag.messages(topic):
+        pose = message.pose.pose if hasattr(message.pose, "pose") else message.pose
+        child = plain(getattr(message, "child_frame_id", "")) or lidar
+        T_child_lidar = transforms.between(child, lidar)
+        if T_child_lidar is None:
+            raise InputError(
+                f"{where}: nothing in /tf_static joins its frame {child} to the lidar's, {lidar}; "
+                f"name other poses, or none: #poses=none"
+            )
+        T = _pose(pose.position, pose.orientation, where)
+        found[stamp_of(message.header)] = T @ T_child_lidar
+    return _track(where, found)
+
+
+def _track(where: str, by_stamp: dict[int, Float]) -> PoseTrack:
+    T = np.reshape([by_stamp[stamp] for stamp in sorted(by_stamp)], (-1, 4, 4))
+    return PoseTrack(where, np.array(sorted(by_stamp), np.int64), T)
+
+
+def plain(frame: str) -> str:
+    """Return a frame's name as ROS 2 writes it."""
+    return frame.strip("/")
+
+
+def stamp_of(header: Any) -> int:
+    return int(header.stamp.sec) * 1_000_000_000 + int(header.stamp.nanosec)
+
+
+def _pose(place: Any, turn: Any, where: str) -> Float:
+    quaternion = (turn.w, turn.x, turn.y, turn.z)
+    return quaternion_pose(quaternion, (place.x, place.y, place.z), where)

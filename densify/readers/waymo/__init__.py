@@ -1,2 +1,0 @@
-# SPDX-License-Identifier: MIT
-"""The Waymo Open Dataset, perception, version 2."""
