@@ -76,45 +76,6 @@ def test_the_key_sweep_stays_where_it_is(key):
     assert cloud.confidence[own].min() > cloud.confidence[~own].max()
 
 
-def test_displaced_is_the_length_of_the_flow():
-    motion = scene()
-    fields = to_key(motion)
-    fields[0] = replace(fields[0], to_reference=fields[1].displacement)
-    cloud = accumulate(motion.stretch, fields, KEY, drop_lost=True)
-    moved = [f.displacement for f in fields]
-    moved[0] = moved[0] + moved[1]  # from where they were measured
-    lengths = np.concatenate([np.linalg.norm(m, axis=1) for m in moved])
-    np.testing.assert_allclose(cloud.displaced, lengths, atol=1e-5)
-    assert cloud.displaced.dtype == np.float32
-
-
-def test_columns_say_where_points_come_from():
-    motion = scene()
-    cloud = accumulate(motion.stretch, to_key(motion), KEY, drop_lost=True)
-    assert len(cloud) == sum(len(s.sweep) for s in motion.stretch.sweeps)
-    for frame in FRAMES:
-        mine, sweep = cloud.frame == frame, motion.stretch[frame].sweep
-        assert np.array_equal(cloud.row[mine], sweep.row)
-        assert np.array_equal(cloud.intensity[mine], sweep.intensity)
-        assert np.array_equal(cloud.rigid_points[mine], at_key(motion, frame))
-    kinds = {
-        "points": np.float64,
-        "rigid_points": np.float64,
-        "frame": np.int32,
-        "row": np.int64,
-        "moving": np.bool_,
-        "instance": np.int32,
-        "velocity_m_s": np.float32,
-        "confidence": np.float32,
-        "intensity": np.float32,
-        "rgb": np.uint8,
-    }
-    for name, kind in kinds.items():
-        column = getattr(cloud, name)
-        assert column.dtype == kind and len(column) == len(cloud), name
-    assert cloud.rgb.shape == (len(cloud), 3)
-
-
 def test_lost_points_are_dropped_or_kept_rigid():
     motion = scene(sizes={f: 0 if f == KEY - 1 else NUM_MOVING for f in FRAMES})
     fields = to_key(motion)
@@ -135,19 +96,6 @@ def test_lost_points_are_dropped_or_kept_rigid():
         kept_here = np.isin(sweep.row, dropped.row[mine])
         assert kept_here.sum() == mine.sum()
         assert np.array_equal(dropped.intensity[mine], sweep.intensity[kept_here])
-
-
-def test_confidence_falls_away_from_the_key_and_for_what_was_moved():
-    motion = scene()
-    cloud = accumulate(motion.stretch, to_key(motion), KEY, drop_lost=True)
-    assert (cloud.confidence > 0).all() and (cloud.confidence <= 1).all()
-    away = np.abs(cloud.frame - KEY)
-    of_still = [cloud.confidence[(away == d) & ~cloud.moving] for d in range(4)]
-    of_moved = [cloud.confidence[(away == d) & cloud.moving] for d in range(4)]
-    assert all(np.ptp(c) == 0 for c in of_still)
-    assert (np.diff([c[0] for c in of_still]) < 0).all()
-    assert (np.diff([c[0] for c in of_moved]) < 0).all()
-    assert all(m[0] < s[0] for m, s in zip(of_moved[1:], of_still[1:], strict=True))
 
 
 def test_movers_know_their_velocity_at_the_key():

@@ -121,16 +121,6 @@ def test_buckets_as_a_loop():
         )
 
 
-def test_order_and_parts_do_not_matter():
-    whole = ChallengeScorer()
-    parts = [np.concatenate(column) for column in zip(*reversed(frames()), strict=True)]
-    points, estimated, true, kind = parts
-    whole.add(points, estimated, true, np.array(CLASS_OF)[kind])
-    together, apart = whole.scores(), scored().scores()
-    assert together.mean == pytest.approx(apart.mean)
-    assert together.three_way == pytest.approx(apart.three_way)
-
-
 def test_nothing_scored_is_nan():
     scores = ChallengeScorer().scores()
     assert scores.num_points == 0 and not scores.by_class

@@ -67,13 +67,6 @@ def test_a_map_expects_what_its_own_pixels_are_worth():
             assert scale.wrong(confidence[part]).mean() == pytest.approx(expected.mean(), rel=0.03)
 
 
-def test_no_more_are_wrong_than_all():
-    rank = np.full((4, 5), 0.5, np.float32)
-    ranked = Ranked(rank, np.zeros(rank.shape, np.uint8), np.ones_like(rank))
-    confidence = scale.calibrated(ranked, rank > 0, tables(0.9, 5.0))
-    assert (confidence >= 0).all() and confidence.max() < 0.002
-
-
 def test_groups_are_how_a_pixel_came_and_how_ragged_it_is_around():
     shape = (60, 120)
     none, everywhere = np.zeros(shape, np.float32), np.ones(shape, np.float32)
@@ -91,21 +84,6 @@ def test_groups_are_how_a_pixel_came_and_how_ragged_it_is_around():
         ragged = 0.5 if how == "filled" else 0.1
         assert names[row, 11] == f"{how}, rough from {ragged}"
         assert names[row, 90] == f"{how}, rough from 0"
-
-
-def test_only_what_is_shown_tells_how_contradicted_it_is_around():
-    shape = (20, 60)
-    none = np.zeros(shape, np.float32)
-    column = np.arange(shape[1])
-    shown = column % 2 == 0
-    filled_m = np.where(shown, np.ones(shape, np.float32), none)
-    layers = layers_of(filled_m, shown < 0, confidence=1.0, spacing_px=(1, 1))
-    contradicted = np.where(column >= 30, np.float32(0.05), none)
-    around = scale.rank_pixels(layers, none > 0, np.where(shown, contradicted, 1)).contradicted
-    assert around[10, 20] == 0 and around[10, 40] == pytest.approx(0.05)
-    assert 0 < around[10, 28] < around[10, 30] < 0.05  # four gaps to all sides
-    assert around[10, 24] == 0 and around[10, 34] == pytest.approx(0.05)
-    assert (around[:, ~shown] == 0).all()
 
 
 def test_the_packages_own_tables_fall_with_the_rank():
@@ -133,13 +111,6 @@ def test_reliability_counts_what_is_wrong():
     assert shares["measured"] == pytest.approx(scale.wrong(confidence[:, ::2]).mean())
 
 
-def test_nothing_is_expected_of_an_empty_map():
-    empty = np.zeros((4, 6), np.float32)
-    maps = made(empty, empty)
-    assert scale.expected_outliers(maps) == {"measured": None, "filled": None}
-    assert scale.reliability(maps, empty, CAMERA) == []
-
-
 # --- agreement with pixels around -----------------------------------------------------------------
 
 FOCAL_PX, GAP_PX, WALL_M = 700.0, 3.0, 12.0
@@ -165,14 +136,6 @@ def test_a_pixel_is_contradicted_by_surfaces_that_would_make_it_wrong(there_m, w
     assert share[SPOT] == (pytest.approx(48 / 50) if wrong else 0)
     assert share[SPOT[0], SPOT[1] + 3] == (pytest.approx(1 / 50) if wrong else 0)
     assert share[SPOT[0], SPOT[1] + 4] == 0
-
-
-def test_what_is_measured_at_depth_edges_tells_too_and_fill_does_not():
-    filled_m, none = wall(), np.zeros(SHAPE, np.float32)
-    filled_m[SPOT] = WALL_M / 2
-    layers = gapped(filled_m, none, rim_m=wall())
-    assert scale.contradicted(layers, FOCAL_PX)[SPOT] == pytest.approx(48 / 50)
-    assert not scale.contradicted(replace(layers, rim_m=none), FOCAL_PX).any()
 
 
 def test_surfaces_go_on_with_their_slope():
@@ -216,15 +179,3 @@ def test_what_is_behind_a_closed_window_does_not_contradict_it():
     assert not open_.without(share > stage._MOST_CONTRADICTED).filled_m[window].any()
     kept = closed.without(of_closed > stage._MOST_CONTRADICTED)
     assert np.array_equal(kept.filled_m[window], filled_m[window])
-
-
-def test_a_few_around_tell_nothing():
-    """A single sweep measures one pixel in twenty."""
-    for num, lost in ((4, False), (6, True)):
-        depth_m = np.zeros(SHAPE, np.float32)
-        depth_m[SPOT[0] - 2, SPOT[1] - 3 : SPOT[1] - 3 + num] = WALL_M
-        filled_m = depth_m.copy()
-        filled_m[SPOT] = WALL_M / 2
-        layers = gapped(filled_m, depth_m)
-        made = layers.without(scale.contradicted(layers, FOCAL_PX) > stage._MOST_CONTRADICTED)
-        assert (made.filled_m[SPOT] == 0) == lost

@@ -12,7 +12,6 @@ import pytest
 from densify.depth import fill as stage
 from densify.depth.fill import FILL_CONFIDENCE, fill, fill_between, fill_stars, without_shreds
 from densify.depth.neighbours import DIRECTIONS, first_known
-from densify.geometry import threads
 from tests.depth_layers import layers_of
 
 SHAPE = (60, 80)
@@ -63,14 +62,6 @@ def test_the_image_lets_the_fill_come_closer_to_an_edge():
         return (filled[edges] > 0).mean()
 
     assert share(image) > share(None)
-
-
-def test_confidence_covers_what_is_filled():
-    sparse = np.where(np.random.default_rng(1).uniform(size=SHAPE) < 0.1, 12.0, 0)
-    layers = layers_of(sparse, spacing_px=(3, 6))
-    made = fill(layers, 1.5)
-    assert np.array_equal(made.confidence > 0, made.filled_m > 0)
-    assert np.array_equal(made.depth_m, layers.depth_m)
 
 
 def test_slopes_of_filled_pixels_are_the_planes():
@@ -181,16 +172,6 @@ def ragged(rng):
     """A plane, a nearer block, and holes of all sizes."""
     depth_m = np.where((COLUMN > 50) & (ROW > 20), 6.0, TILTED * rng.uniform(0.99, 1.01, SHAPE))
     return np.where((rng.random(SHAPE) < 0.5) | disc(8), 0, depth_m)
-
-
-def test_threads_change_no_byte(monkeypatch):
-    layers, results = layers_of(ragged(np.random.default_rng(6)), spacing_px=WIDE), []
-    for cores in (1, 3):
-        monkeypatch.setattr(threads, "num_threads", lambda cores=cores: cores)
-        monkeypatch.setattr(threads, "_LEAST_ROWS", 64)
-        filled = fill_stars(fill(layers, 0.2))
-        results.append(filled.filled_m.tobytes() + filled.confidence.tobytes())
-    assert results[0] == results[1]
 
 
 def star_twin(row, column, inverse, slope, known, spacing_px):

@@ -9,7 +9,7 @@ import pytest
 from densify.config import ProjectSettings
 from densify.depth.exposure import Exposure
 from densify.depth.project import project
-from densify.geometry.cameras import converted, image_points, rays
+from densify.geometry.cameras import converted, rays
 from densify.geometry.types import Camera, Patches, Reason
 from tests.test_project import make_camera, make_cloud
 
@@ -78,44 +78,6 @@ def test_depth_of_a_plane_is_that_in_the_middle_of_the_pixel(measure):
     assert np.median(error) < 1e-3 and np.quantile(error, 0.99) < 0.02
     behind = np.linalg.norm([column - 199.5, row - 199.5], axis=0) > 124 * 1.52
     assert (behind.sum() > 100) == (measure == "range")  # beyond 90 degrees there is no z
-
-
-@pytest.mark.parametrize("angle_deg", [0.0, 50.0, 90.0])
-def test_patches_are_as_large_as_the_lens_shows_them(angle_deg):
-    """A panel at 6 m of 0.4 times the spacing, and 0.05 m, to each side."""
-    there = np.radians(angle_deg)
-    spot = 6.0 * np.array([[np.sin(there), 0.0, np.cos(there)]])
-    back = 20 * rays(FISHEYE, pixels(FISHEYE))
-    points = np.vstack([spot, back[np.isfinite(back[:, 0])]])
-    facing = points / np.sum(points**2, axis=1, keepdims=True)
-    # azimuth turns about the key's z, here the camera's axis: aside is up and down
-    exposure = np.eye(4)
-    exposure[:3, :3] = [[1, 0, 0], [0, 0, -1], [0, 1, 0]]  # key z up
-    n = len(points)
-    spacing = np.zeros((n, 2), np.float32)
-    spacing[0] = (0.6 - 0.1) / 0.8, (0.4 - 0.1) / 0.8
-    patches = Patches(
-        (facing @ exposure[:3, :3]).astype(np.float32),
-        spacing,
-        np.zeros(n, bool),
-        np.zeros(n, np.int32),
-        np.full(n, -1, np.int32),
-    )
-    cloud = make_cloud(points @ exposure[:3, :3])
-    seen = Exposure(FISHEYE, exposure, measure="range")
-    maps = project(cloud, seen, ProjectSettings(support=1), patches, filled=False)
-    uv, inside = image_points(FISHEYE, points)
-    assert inside.all()
-    hidden = np.rint(uv[1:][maps.reason[1:] == Reason.HIDDEN])
-    width, height = np.ptp(hidden, axis=0) + 1
-
-    def at(azimuth, elevation):
-        ray = [np.sin(azimuth) * np.cos(elevation), -np.sin(elevation), np.cos(azimuth)]
-        return image_points(FISHEYE, 6.0 * np.array([ray]))[0][0]
-
-    wide = np.abs(at(there + 0.04, 0.0) - at(there - 0.04, 0.0))[0] * 0.1 / 0.08
-    high = np.abs(at(there, 0.4 / 12) - at(there, -0.4 / 12))[1]
-    assert abs(width - wide) <= 1.1 and abs(height - high) <= 1.1
 
 
 def test_depth_turns_from_one_measure_into_the_other():

@@ -6,7 +6,6 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import pytest
 
 from densify.depth.accumulate import object_tracks
 from densify.geometry import poses
@@ -92,31 +91,6 @@ def test_sweeps_with_few_points_of_it_are_left_out_and_the_key_never():
     assert track.num_points.tolist() == [sizes[f] for f in track.frames]
     motion = scene(sizes={**dict.fromkeys(FRAMES, 0), 101: 9})
     assert object_tracks(motion.stretch, exact_fields(motion), KEY) == ()
-
-
-@pytest.mark.parametrize("what", ["lost", "still", "nobody"])
-def test_what_cannot_be_followed_has_no_track(what):
-    motion = scene()
-    fields = []
-    for flow in exact_fields(motion):
-        nobody = np.full(len(flow.moving), -1, np.int32)
-        changed = {
-            "lost": {"lost": flow.moving},
-            "still": {"moving": np.zeros_like(flow.moving)},
-            "nobody": {"instance": nobody},
-        }[what]
-        fields.append(replace(flow, **changed))
-    assert object_tracks(motion.stretch, fields, KEY) == ()
-
-
-def test_points_on_a_line_turn_no_more_than_they_tell():
-    rng = np.random.default_rng(2)
-    along = np.outer(rng.uniform(-2, 2, 30), [1.0, 0.2, 0.0])
-    from densify.depth.accumulate import _rigid
-
-    T = poses.exp(np.array([0, 0, 0.2, 1.0, 2.0, 0.1]))
-    found = _rigid(along, poses.transform(T, along))
-    np.testing.assert_allclose(found, T, atol=1e-5)
 
 
 def test_the_street_car_is_followed():

@@ -77,16 +77,6 @@ def test_unknown_where_nothing_was_measured_or_it_falls_behind_the_other_camera(
     assert np.isnan(flow_of(cloud.select(np.zeros(2, bool)), nothing)).all()
 
 
-def test_the_point_that_made_the_pixels_depth_is_followed():
-    """Not what is hidden behind it, nor what shines through before it."""
-    pixel = np.array([[2.4, 1.9], [2.3, 2.4], [1.8, 2.2], [2.1, 2.0]])
-    z = np.array([2.0, 4.05, 4.0, 12.0])
-    alone = flow_of(seen(pixel[2], z[2]), map_of([[2, 2]], [4.0]))[2, 2]
-    assert np.isfinite(alone).all()
-    depth = map_of([[2, 2]], [4.0], kept=np.arange(4) == 2)
-    assert np.array_equal(flow_of(seen(pixel, z), depth)[2, 2], alone)
-
-
 # --- the pipeline ---------------------------------------------------------------------------------
 
 
@@ -162,13 +152,3 @@ def test_flow_png_is_kittis(tmp_path):
     assert np.abs(read - flow)[known].max() <= 1 / 128
     raw = cv2.imread(str(tmp_path / "f.png"), cv2.IMREAD_UNCHANGED)
     assert not raw[~known].any()
-
-
-def test_what_flow_png_cannot_say_is_unknown(tmp_path):
-    across = [-512.0, -512.1, 511.98, 512.0, 1e9, -1e9, np.inf, -np.inf, 0.0]
-    flow = np.zeros((2, len(across), 2), np.float32)
-    flow[0, :, 0] = flow[1, :, 1] = across
-    write_flow_png(tmp_path / "f.png", flow)
-    read, valid = read_as_kitti(tmp_path / "f.png")
-    assert valid.tolist() == [[1, 0, 1, 0, 0, 0, 0, 0, 1]] * 2
-    assert read[0, 0].tolist() == [-512, 0] and read[1, 2].tolist() == [0, 511.984375]

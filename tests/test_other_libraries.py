@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import replace
 
 import numpy as np
@@ -62,13 +61,6 @@ def test_to_open3d_holds_everything():
         if name not in ("x", "y", "z", "red", "green", "blue"):
             np.testing.assert_array_equal(made.point[name].numpy()[:, 0], values, err_msg=name)
     assert len(made.to_legacy().points) == 300
-
-
-@pytest.mark.parametrize("package", ["pandas", "open3d"])
-def test_without_the_library(package, monkeypatch):
-    monkeypatch.setitem(sys.modules, package, None)
-    with pytest.raises(InputError, match=f"needs the package {package} .*pip install {package}"):
-        getattr(cloud_of(3), f"to_{package}")()
 
 
 def test_a_map_s_points_project_onto_their_pixels():

@@ -94,16 +94,6 @@ def test_a_post_before_a_wall_faces_the_scanner():
     assert towards[post].min() > 0.99
 
 
-def test_order_of_the_points_does_not_matter():
-    rng = np.random.default_rng(3)
-    points, _ = scanned(directions(*SENSORS["16 beams"])[:4000] + [1e-3, 0, 0])
-    order = rng.permutation(len(points))
-    one = patches_of(make_cloud(points))
-    other = patches_of(make_cloud(points[order]))
-    assert one.normal[order].tobytes() == other.normal.tobytes()
-    assert one.spacing_m[order].tobytes() == other.spacing_m.tobytes()
-
-
 @pytest.mark.parametrize("name", ["panda", "rosette"])
 def test_equal_points_have_equal_patches(name):
     registered = in_a_room(name)
@@ -131,14 +121,6 @@ def test_veto_of_what_the_key_saw_through():
     found = patches_of(cloud, None, key_image).free
     assert found[n:].tolist() == [True, False, False, False] and not found[:n].any()
     assert not patches_of(cloud).free.any()
-
-
-def test_empty_and_tiny_clouds():
-    for n in (0, 1, 3):
-        found = patches_of(make_cloud(np.ones((n, 3))))
-        assert found.normal.shape == (n, 3) and found.spacing_m.shape == (n, 2)
-        assert found.free.shape == (n,) and found.sweep.shape == (n,)
-        assert np.isfinite(found.normal).all() and (found.spacing_m > 0).all()
 
 
 # --- scanners of other kinds, and several ---------------------------------------------------------

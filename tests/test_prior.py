@@ -7,7 +7,6 @@ import cv2
 import numpy as np
 import pytest
 
-from densify.depth import prior as stage
 from densify.depth.prior import complete, fit_prior
 from densify.geometry.types import DepthMap, Prior
 
@@ -46,11 +45,6 @@ def prior(value, sky=SKY):
     return Prior(np.where(sky, 0, value).astype(np.float32), sky, "test")
 
 
-def smooth(seed=0, sigma=0.1):
-    field = cv2.GaussianBlur(np.random.default_rng(seed).standard_normal((H, W)), (0, 0), 25)
-    return np.exp(sigma * field / field.std())
-
-
 def off(full, where):
     return np.abs(np.log(full.depth_m[where] / TRUE_M[where]))
 
@@ -83,7 +77,7 @@ def test_any_scale_shift_and_kind_is_undone(name):
 def test_what_is_known_stays_as_it_is(name):
     maps = measured()
     before = [a.tobytes() for a in (maps.depth_m, maps.filled_m, maps.confidence)]
-    full = complete(maps, prior(VALUES[name][0] * smooth(sigma=0.02)), AUTO)
+    full = complete(maps, prior(VALUES[name][0]), AUTO)
     assert [a.tobytes() for a in (maps.depth_m, maps.filled_m, maps.confidence)] == before
     known = maps.filled_m > 0
     assert np.array_equal(full.depth_m[known], maps.filled_m[known])
@@ -94,17 +88,6 @@ def test_what_is_known_stays_as_it_is(name):
     of_prior = full.confidence[full.from_prior]
     assert of_prior.min() > 0 and of_prior.max() <= 0.2
     assert not full.confidence[full.depth_m == 0].any()
-
-
-def test_smooth_errors_are_taken_off():
-    value = SAFE * smooth(3)
-    full = complete(measured(), prior(value), "depth")
-    where = full.from_prior
-    p = value[where] if full.fit.kind == "depth" else np.log(value[where])
-    by_curve = full.fit.scale * p + full.fit.shift
-    log_depth = np.log(by_curve) if full.fit.kind == "depth" else by_curve
-    assert where.sum() > 5000
-    assert off(full, where).mean() < 0.6 * np.abs(log_depth - np.log(TRUE_M[where])).mean()
 
 
 def test_where_a_prior_deviates_it_is_less_certain():
@@ -129,42 +112,6 @@ def test_a_correction_does_not_cross_depth_edges():
         assert np.percentile(off(full, here), 95) < 0.03
 
 
-def test_the_membrane_ties_neighbours_of_one_surface():
-    """Against the same matrix written out cell by cell."""
-    rng = np.random.default_rng(0)
-    guide = (2 + 0.02 * rng.standard_normal((9, 11))).astype(np.float32)
-    guide[:, 6:] += 0.5
-    cells = stage._Cells.over(guide)
-    assert cells.size == 1 and np.array_equal(cells.of.ravel(), np.arange(99))
-    A = np.zeros((99, 99))
-    for r in range(9):
-        for c in range(11):
-            for r2, c2 in ((r + 1, c), (r, c + 1)):
-                if r2 < 9 and c2 < 11:
-                    step = (float(guide[r, c]) - float(guide[r2, c2])) / stage._EDGE
-                    tied = stage._SMOOTHNESS * np.exp(-(step**2))
-                    i, j = 11 * r + c, 11 * r2 + c2
-                    A[[i, j], [i, j]] += tied
-                    A[[i, j], [j, i]] -= tied
-    np.testing.assert_allclose(cells.membrane().toarray(), A, rtol=1e-9, atol=1e-12)
-
-
-def test_values_of_cells_come_back_at_pixels():
-    guide = np.full((300, 500), 2, np.float32)
-    guide[:, 250:] = 3
-    cells = stage._Cells.over(guide)
-    assert cells.size == 2 and cells.of.max() == cells.guide.size - 1
-    constant = np.full((1, cells.guide.size), 0.3)
-    np.testing.assert_allclose(cells.at_pixels(constant, guide), 0.3)
-    two = np.where(cells.guide.ravel() < 2.5, 1.0, 5.0)[None]
-    at = cells.at_pixels(two, guide)[0]
-    assert np.abs(at[:, :250] - 1).max() < 1e-4 and np.abs(at[:, 250:] - 5).max() < 1e-4
-    column = np.arange(cells.guide.size) % cells.guide.shape[1]
-    flat = stage._Cells.over(np.full_like(guide, 2))
-    ramp = flat.at_pixels((2.0 * column + 1)[None], np.full_like(guide, 2))[0]
-    np.testing.assert_allclose(ramp[:, 1:-1], np.tile(np.arange(1, 499.0), (300, 1)), atol=1e-6)
-
-
 # --- what stays empty -----------------------------------------------------------------------------
 
 
@@ -182,14 +129,6 @@ def test_the_priors_own_far_limit_is_no_depth(inverse):
     value = 1 / clipped if inverse else clipped
     full = complete(measured(), Prior(value, np.zeros_like(SKY), "test"), AUTO)
     assert full.fit.used and not full.depth_m[SKY].any() and full.from_prior.sum() > 3000
-
-
-def test_a_wall_that_the_lidar_sees_is_no_far_limit():
-    true_m = np.full((H, W), 30.0, np.float32)
-    true_m[90:] = 10
-    maps = measured(true_m, np.arange(H)[:, None] * np.ones((1, W)) > 60)
-    full = complete(maps, Prior(true_m * 2, np.zeros((H, W), bool), "test"), AUTO)
-    assert full.from_prior[:50].all() and np.allclose(full.depth_m[:50], 30, rtol=1e-3)
 
 
 def test_pixels_between_two_surfaces_are_left_out():
@@ -248,11 +187,3 @@ def test_a_tenth_of_wrong_pixels_does_not_bend_the_curve():
     fit = fit_prior(p.astype(np.float32), z.astype(np.float32), AUTO)
     assert fit.kind == "inverse" and fit.used
     np.testing.assert_allclose([fit.scale, fit.shift], [1 / 5, -0.1 / 5], rtol=0.03)
-
-
-def test_octaves_count_alike():
-    """A prior that is right on the road alone does not fit."""
-    z = np.concatenate([np.full(8000, 6.0), np.full(900, 30.0), np.full(1100, 50.0)])
-    p = np.concatenate([z[:8000], np.full(2000, 12.0)]) * (1 + 1e-3 * np.sin(np.arange(10_000)))
-    fit = fit_prior(p.astype(np.float32), z.astype(np.float32), "depth")
-    assert fit.wrong > 0.25 and not fit.used

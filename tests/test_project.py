@@ -11,7 +11,6 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from densify.config import ProjectSettings
-from densify.depth.boundary_pixels import accept_boundary_pixels
 from densify.depth.exposure import Exposure
 from densify.depth.fill import fill_between as fill_by_spacing
 from densify.depth.image_points import paint
@@ -123,15 +122,6 @@ def test_image_edges_and_points_behind_the_camera():
     row, column = np.nonzero(depth.depth_m)
     assert set(zip(column.tolist(), row.tolist(), strict=True)) == {(0, 0), (9, 1), (4, 0), (5, 5)}
     assert np.all(depth.depth_m[row, column] == 5)
-
-
-def test_empty_cloud_gives_an_empty_map():
-    depth = view(make_cloud([]), make_camera(), np.eye(4), ProjectSettings())
-    assert not depth.depth_m.any() and not depth.filled_m.any() and not depth.confidence.any()
-    assert (depth.frame == -1).all()
-    assert depth.depth_m.shape == (48, 64)
-    types = [depth.depth_m.dtype, depth.filled_m.dtype, depth.confidence.dtype, depth.frame.dtype]
-    assert types == [np.float32, np.float32, np.float32, np.int32]
 
 
 # --- which point wins a pixel ---------------------------------------------------------------------
@@ -336,31 +326,6 @@ def test_depth_is_the_planes_in_the_middle_of_the_pixel():
     np.testing.assert_allclose(depth[row, column], truth, rtol=1e-5)
 
 
-def test_unsure_rims_are_in_the_filled_map_alone(monkeypatch):
-    camera = make_camera(80, 60, 100.0)
-    points, frame = wall(camera, 10.0, SWEEPS, step=3)
-    knobs = ProjectSettings()
-    unsure = np.broadcast_to(np.arange(80) % 8 < 3, (60, 80))
-    sure = see(camera, points, frame, knobs, (3.0, 3.0), filled=False)
-    monkeypatch.setattr(
-        "densify.depth.project.accept_boundary_pixels",
-        lambda layers, rims: replace(accept_boundary_pixels(layers, rims), unsure=unsure),
-    )
-    made = see(camera, points, frame, knobs, (3.0, 3.0), filled=False)
-    assert (sure.depth_m[unsure] > 0).mean() > 0.2
-    np.testing.assert_array_equal(made.filled_m, sure.filled_m)
-    np.testing.assert_array_equal(made.confidence, sure.confidence)
-    np.testing.assert_array_equal(made.depth_m, np.where(unsure, 0, sure.depth_m))
-    assert (made.frame[unsure] == -1).all()
-
-
-def test_noise_is_averaged():
-    camera = make_camera(80, 60, 100.0)
-    points, frame = wall(camera, 10.0, SWEEPS, noise_m=0.03, step=3)
-    depth = see(camera, points, frame, ProjectSettings(), (3.0, 3.0)).depth_m
-    assert 0 < np.std(depth[depth > 0]) < 0.015
-
-
 def test_nearest_in_time_wins_among_the_visible_only():
     camera = make_camera()
     points, frame = wall(camera, 10.0, SWEEPS)
@@ -421,24 +386,6 @@ def test_what_few_sweeps_or_not_the_key_saw_is_unsupported():
     assert kept([KEY])  # a single sweep is enough where there is one
 
 
-def test_what_the_key_sweep_alone_saw_is_kept_where_it_has_several_returns():
-    """What moves and was not noticed hides the wall now, where other sweeps saw the wall."""
-    camera = make_camera(120, 90, 300.0)
-    back, back_frame = wall(camera, 20.0, SWEEPS)
-    front, front_frame = wall(camera, 10.0, [KEY])
-    panel = np.rint(front[:, 0] / front[:, 2] * 300 + camera.K[0, 2])
-    panel = (panel >= 40) & (panel < 80)
-    unseen = (back_frame != KEY) | ~np.isin(np.arange(len(back)), np.flatnonzero(panel))
-    lone = at_pixel(camera, [20], [30], 10.0)
-    points = np.vstack([front[panel], lone, back[unseen]])
-    frame = np.concatenate([front_frame[panel], [KEY], back_frame[unseen]])
-    depth = see(camera, points, frame, ProjectSettings(), (2.0, 2.0), filled=False)
-    assert (np.abs(depth.depth_m[20:70:2, 44:76:2] - 10) < 0.01).all()
-    assert (np.abs(depth.depth_m[20:70, 40:80] - 20) > 1).all()
-    assert not (np.abs(depth.depth_m[:, :38] - 10) < 1).any()
-    assert depth.reason[panel.sum()] == Reason.UNSUPPORTED
-
-
 def test_no_point_is_believed_at_the_edge_of_its_surface():
     """A panel before a wall: its outline is as wide as the beams, its inside stays."""
     camera = make_camera(120, 90, 300.0)
@@ -484,29 +431,6 @@ def test_a_swinging_limb_ends_where_the_key_sweep_saw_past_it(moves):
     assert near[:, 61:64].any() != moves  # of what stands still every sweep tells
 
 
-@pytest.mark.parametrize("moves", [True, False])
-def test_what_the_key_sweep_should_have_met_on_a_mover_is_not_taken_from_others(moves):
-    """It has one ray of three by three pixels. In a hole of nine by nine two went past the mover:
-    what other sweeps saw there is out as far as the rays that met it are clearly farther away."""
-    camera = make_camera(120, 90, 300.0)
-    v, u = np.mgrid[0:90, 40:80]
-    hole = (abs(u - 60) <= 4) & (abs(v - 45) <= 4)
-    met = ~hole & (u % 3 == 0) & (v % 3 == 0)
-    frame = np.repeat(SWEEPS, u.size)
-    seen = np.where(frame == KEY, np.tile(met.ravel(), len(SWEEPS)), True)
-    points = np.concatenate([at_pixel(camera, u, v, 10.0)] * len(SWEEPS))[seen]
-    past = at_pixel(camera, [57, 63], 45, 20.0)
-    frame = [*frame[seen], KEY, KEY]
-    moving = np.arange(len(frame)) < seen.sum() if moves else False
-    knobs, points = ProjectSettings(rims="keep"), np.vstack([points, past])
-    depth = see(camera, points, frame, knobs, (3.0, 3.0), moving=moving, filled=False)
-    near = abs(depth.depth_m - 10) < 1
-    beside = np.ix_([44, 46], [56, 57, 63, 64])
-    assert near[beside].any() != moves
-    assert near[beside].all() != moves
-    assert near[20:35, 45:75].all() and near[45, 45:54].all()
-
-
 def test_every_point_has_one_reason():
     camera = make_camera(60, 40)
     points, frame = wall(camera, 10.0, SWEEPS)
@@ -524,22 +448,6 @@ def test_every_point_has_one_reason():
     assert depth.reason[-3:].tolist() == [Reason.OUTSIDE, Reason.VETOED, Reason.HIDDEN]
     assert (depth.reason == Reason.KEPT).sum() == (depth.depth_m > 0).sum()
     assert depth.depth_m[20, 30] == pytest.approx(10)  # what was vetoed hides nothing
-
-
-def test_confidence_falls_with_fewer_sweeps_and_with_noise():
-    camera = make_camera(60, 40)
-
-    def mean(frames, noise_m, more=()):
-        points, frame = wall(camera, 10.0, frames, noise_m)
-        far = at_pixel(camera, [0] * len(more), [0] * len(more), 90.0)
-        depth = see(camera, np.vstack([points, far]), [*frame, *more], ProjectSettings(), (2, 2))
-        assert np.array_equal(depth.confidence > 0, depth.filled_m > 0)
-        assert depth.confidence.max() <= 1
-        return depth.confidence[depth.depth_m > 0].mean()
-
-    best = mean(SWEEPS, 0.0)
-    assert best > mean(SWEEPS, 0.05)
-    assert best > mean(range(KEY - 2, KEY + 3), 0.0, [KEY - 4, KEY - 3, KEY + 3, KEY + 4])
 
 
 def test_threads_change_no_byte():
@@ -614,14 +522,6 @@ def test_two_sided_rule_equals_a_slow_twin(seed, share, reach):
     assert np.array_equal(confidence > 0, filled > 0)
 
 
-def test_nothing_is_filled_outside_the_measured_block():
-    depth = np.zeros((30, 30), np.float32)
-    depth[10:20:2, 10:20:2] = 5
-    filled, _ = fill_between(depth, (depth > 0) * np.float32(1), (2, 3))
-    row, column = np.nonzero(filled)
-    assert (row.min(), row.max(), column.min(), column.max()) == (10, 18, 10, 18)
-
-
 @pytest.mark.parametrize("step", [1.3, 2.0, 5.0])
 def test_no_depth_is_invented_between_two_surfaces(step):
     rng = np.random.default_rng(5)
@@ -647,35 +547,3 @@ def test_filled_depth_and_confidence_stay_within_those_around(seed):
 
 
 # --- real -----------------------------------------------------------------------------------------
-
-
-def kitti_calibration(path):
-    rows = (line.partition(":") for line in path.read_text().splitlines())
-    return {name: text.split() for name, _, text in rows}
-
-
-def test_real_sweep_hides_what_its_camera_cannot_see(test_data):
-    sweep = test_data / (
-        "kitti/2011_09_26/2011_09_26_drive_0013_sync/velodyne_points/data/0000000120.bin"
-    )
-    day = test_data / "kitti/2011_09_26"
-    camera_text = kitti_calibration(day / "calib_cam_to_cam.txt")
-    lidar_text = kitti_calibration(day / "calib_velo_to_cam.txt")
-    P = np.array(camera_text["P_rect_02"], float).reshape(3, 4)
-    T_cam_lidar, T_rect = np.eye(4), np.eye(4)
-    T_cam_lidar[:3, :3] = np.array(lidar_text["R"], float).reshape(3, 3)
-    T_cam_lidar[:3, 3] = np.array(lidar_text["T"], float)
-    T_rect[:3, :3] = np.array(camera_text["R_rect_00"], float).reshape(3, 3)
-    T_rect[:3, 3] = np.linalg.solve(P[:, :3], P[:, 3])
-    T_cam_lidar = T_rect @ T_cam_lidar
-    camera = Camera("image_02", 1242, 375, P[:, :3], T_cam_lidar)
-    points = np.fromfile(sweep, np.float32).reshape(-1, 4)[:, :3].astype(float)
-    cloud = make_cloud(points[np.linalg.norm(points, axis=1) > 3])
-
-    plain = view(cloud, camera, T_cam_lidar, PLAIN)
-    depth = view(cloud, camera, T_cam_lidar, ProjectSettings())
-    num = (depth.reason == Reason.KEPT).sum()
-    # the scanner sits above the camera, so a little of what it sees is hidden, and only a little
-    assert 0.9 < num / (plain.depth_m > 0).sum() < 1.0
-    assert 0.035 < num / depth.depth_m.size < 0.045
-    assert 9 < (depth.filled_m > 0).sum() / num < 14

@@ -116,24 +116,6 @@ def shut(measured):
     return layers_of(depth_m, depth_m > 0 if measured else depth_m < 0, spacing_px=(2.1, 5.0))
 
 
-def test_where_some_rays_go_through_what_is_filled_goes_before_what_is_measured():
-    """Among leaves rays stop and go through side by side."""
-    lost = {}
-    for share_open in (0.05, 0.2):
-        chance = np.random.default_rng(0)
-        cloud, _, rays = scanned(lambda y, z: chance.random(y.shape) > share_open)  # noqa: B023
-        view = Exposure(CAMERA, T_CAM_LIDAR).sees(cloud)
-        front = cloud.points[:, 0] < 0.5 * (FRONT_M + WALL_M)
-        reason = np.where(front, Reason.KEPT, Reason.HIDDEN).astype(np.uint8)
-        for measured in (True, False):
-            before = shut(measured)
-            made = without_seen_through(before, cloud, view, rays, reason)
-            inside = (slice(10, 50), slice(40, 360))
-            lost[share_open, measured] = (made.filled_m == 0)[inside].mean()
-    assert lost[0.2, False] > 1.5 * lost[0.2, True]
-    assert lost[0.05, False] < 0.1
-
-
 def test_near_a_mover_the_rays_of_the_key_sweep_alone_tell():
     """Legs swing: what lies between them is open now and shut at other times, or the other way
     round; the map has it shut."""
@@ -155,9 +137,9 @@ def test_near_a_mover_the_rays_of_the_key_sweep_alone_tell():
 @pytest.mark.parametrize("measure", ["z", "range"])
 def test_rays_cross_a_surface_where_geometry_says(measure):
     rng = np.random.default_rng(1)
-    start = np.column_stack([rng.uniform(-3, 3, (500, 3))]) * [1, 1, 0.2]
+    start = np.column_stack([rng.uniform(-3, 3, (120, 3))]) * [1, 1, 0.2]
     end = np.column_stack(
-        [rng.uniform(15, 25, 500), rng.uniform(-6, 6, 500), rng.uniform(-1, 1, 500)]
+        [rng.uniform(15, 25, 120), rng.uniform(-6, 6, 120), rng.uniform(-1, 1, 120)]
     )
     exposure = Exposure(CAMERA, T_CAM_LIDAR, measure=measure)
     v, u = np.mgrid[0 : CAMERA.height_px, 0 : CAMERA.width_px]
@@ -176,7 +158,7 @@ def test_rays_cross_a_surface_where_geometry_says(measure):
         num_known += all(known)
         num_found += all(known) and len(found) == 1
         assert len(found) == 0 or np.all((uv > -0.6) & (uv < [301, CAMERA.height_px - 0.4]))
-    assert num_known > 50 and num_found >= 0.95 * num_known
+    assert num_known > 12 and num_found >= 0.95 * num_known
     before_it = start + 0.99 * share * (end - start)
     assert len(crossings(surface_m, start, before_it, exposure)) == 0
 

@@ -22,35 +22,6 @@ def test_what_is_right_is_1_whatever_its_numbers() -> None:
     assert (found["num_found"], found["num_missed"], found["num_false"]) == (2, 0, 0)
 
 
-def test_by_hand() -> None:
-    """One object of four points found by three and one beside; one missed, one false."""
-    true = [0, 0, 0, 0, -1, 1, 1, -1, -1]
-    estimated = [5, 5, 5, -1, 5, -1, -1, 6, -1]
-    found = scored(estimated, true)
-    assert found["moving_iou"] == pytest.approx(3 / 8)
-    assert found["segmentation"] == pytest.approx(3 / 5)
-    assert found["recognition"] == pytest.approx(1 / 2)
-    assert found["panoptic_quality"] == pytest.approx(3 / 10)
-
-
-def test_halves_and_two_in_one_are_not_found() -> None:
-    halves = scored([1, 1, 2, 2], [0, 0, 0, 0])
-    assert halves["moving_iou"] == 1 and halves["panoptic_quality"] == 0
-    assert (halves["num_missed"], halves["num_false"]) == (1, 2)
-    two = scored([1, 1, 1, 1], [0, 0, 2, 2])
-    assert (two["num_missed"], two["num_false"]) == (2, 1)
-
-
-def test_the_small_count_nowhere() -> None:
-    true = [0] * 10 + [1] * 3 + [-1] * 4
-    estimated = [0] * 10 + [-1] * 3 + [9] * 4
-    assert scored(estimated, true, least_points=5)["panoptic_quality"] == 1
-    assert scored(estimated, true, least_points=4)["recognition"] == pytest.approx(2 / 3)
-    assert scored(estimated, true, least_points=3)["recognition"] == pytest.approx(1 / 2)
-    found = scored(estimated, estimated, least_points=5)
-    assert (found["num_found"], found["num_missed"], found["num_false"]) == (1, 0, 0)
-
-
 def test_sweeps_add_up_and_nothing_is_none() -> None:
     scorer = SegmentationScorer(1)
     assert scorer.scores()["moving_iou"] is None

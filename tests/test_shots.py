@@ -11,7 +11,7 @@ import pytest
 
 from densify.config import ProjectSettings
 from densify.config.errors import InputError
-from densify.depth.exposure import Exposure, key_shots, load_images
+from densify.depth.exposure import Exposure, key_shots
 from densify.geometry import poses
 from densify.geometry.cameras import image_points
 from densify.pipeline.run import compare, run
@@ -97,13 +97,6 @@ def test_without_its_image_a_key_has_depth_but_no_colour():
     assert result.depth["front"].depth_m.tobytes() == whole.depth["front"].depth_m.tobytes()
     assert not result.cloud.rgb.any() and whole.cloud.rgb.any()
     assert result.images == {} and "depth" not in result.metrics
-
-
-def test_without_a_camera_there_is_a_cloud_and_scores(tmp_path):
-    sequence = one_car(cameras=())
-    result = run(sequence, KEY, 1, "icp", config=POSES_GIVEN)
-    assert result.depth == {} and len(result.cloud) > 1000
-    assert result.metrics["ghosts"]["num_points"] > 0
 
 
 def test_maps_between_two_sweeps_are_the_streets():
@@ -241,14 +234,6 @@ def static_street():
     return seen_by()
 
 
-def test_ignoring_the_time_of_rows_is_worse(static_street):
-    _, errors_m = static_street
-    _, without_m = seen_by(row_time_s=0.0)
-    off, ignored = (np.nanmean(np.abs(e["rolling"])) for e in (errors_m, without_m))
-    assert np.isfinite(errors_m["rolling"]).mean() > 0.1
-    assert off < 0.8 * ignored
-
-
 def test_a_fisheye_of_190_degrees_measures_the_street(static_street):
     result, errors_m = static_street
     maps, off_m = result.depth["fisheye"], np.abs(errors_m["fisheye"])
@@ -260,20 +245,3 @@ def test_a_fisheye_of_190_degrees_measures_the_street(static_street):
     rim = np.hypot(u - 199.5, v - 199.5) > 188  # beyond 90 degrees
     assert rim.sum() > 20 and np.median(off_m[known][rim]) < 0.1
     assert result.cloud.rgb.any()
-
-
-def test_cameras_on_request_leave_the_usual_ones_as_they_are():
-    street, more = Street(), Street.from_spec("street?cameras=fast,image_02")
-    assert list(more.cameras) == ["fast", "image_02"] and list(street.cameras) == [
-        "image_02",
-        "image_03",
-    ]
-    exposed = np.array(list(more.image_stamps_ns("fast").values()))
-    assert set(np.diff(exposed)) == {33_333_333} and exposed[0] - more.stamp_ns(0) == 7 * MS
-    assert Street.from_spec("street?cameras=none").cameras == {}
-    for bad in ("left", "fast,left", ""):
-        with pytest.raises(InputError, match="no camera"):
-            Street.from_spec(f"street?cameras={bad}")
-    with pytest.raises(InputError, match="no image 500 of fast; there are images 0 to 479"):
-        more.image("fast", 500)
-    assert set(load_images(more, key_shots(more, [more.cameras["fast"]], 0, SWEEP))) == {"fast"}

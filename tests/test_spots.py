@@ -79,19 +79,6 @@ def test_unsure_rims_stay_so():
     np.testing.assert_array_equal(made.depth_m > 0, covered & (COLUMN <= 16))
 
 
-def test_a_spot_within_its_pixel_covers_no_other():
-    layers, points = measured_at([[16.2, 12.1], [0, 0]], 1.2)
-    made = measure_spots(layers, points)
-    np.testing.assert_array_equal(made.depth_m, layers.depth_m)
-
-
-def test_at_the_border_and_with_nothing_measured():
-    layers, points = measured_at([[0, 0], [WIDTH - 1, HEIGHT - 1]], 3.0)
-    assert (measure_spots(layers, points).depth_m > 0).sum() == 6
-    none = replace(layers, depth_m=np.zeros_like(PLANE), point=np.full(PLANE.shape, -1, np.int32))
-    assert not measure_spots(none, points).depth_m.any()
-
-
 @pytest.mark.parametrize("spacing_px", [50.0, 1e6])
 def test_right_before_the_lens_a_spot_does_not_fill_the_image(spacing_px):
     layers, points = measured_at([[16, 12]], spacing_px)

@@ -266,26 +266,6 @@ def _steps_inside(row, column, d, shape, most):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def _upright_below(row, column, depth, near, focal_px, reach_px):  # type: ignore[no-untyped-def]
-    """Return True if straight below, before the cell, a surface as high as a plate may stand
-    upright: a quick test without a plane. Ground seen from afar does not."""
-    begin, first = 0, 0.0
-    for k in range(1, min(reach_px, near.shape[0] - 1 - row) + 1):
-        there = near[row + k, column]
-        if there == 0:
-            continue
-        if there * (depth - _EACH_M) <= 1:
-            first = 0.0
-            continue
-        gone = (k - begin) / (focal_px * first) if first > 0 else 0.0  # metres downwards
-        if first == 0 or abs(1 / there - 1 / first) > _LEAN * gone + 2 * _PLATE_OFF_M:
-            begin, first = k, there
-        elif gone >= _PLATE_M:
-            return True
-    return False
-
-
-@inlined
 def _nearest_parts(row, column, depth, near, focal_px, reach_px, parts, which):  # type: ignore[no-untyped-def]
     """Find the nearest surface in each direction, where it lies before the cell; return how many.
     Gives up once too many directions are open, or the one straight down."""
@@ -306,9 +286,7 @@ def _nearest_parts(row, column, depth, near, focal_px, reach_px, parts, which): 
             num += 1
         elif i - num >= len(DIRECTIONS) - _LEAST:
             return 0
-        if i == 0 and (
-            num == 0 or not _upright_below(row, column, depth, near, focal_px, reach_px)
-        ):
+        if i == 0 and num == 0:
             return 0
     return num
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields
 from itertools import pairwise
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -68,14 +67,6 @@ class PointsInImage:
         return 1 / self.depth.astype(np.float64)
 
 
-class _Local(NamedTuple):
-    """How surface shows around each of K points; see `PointsInImage`."""
-
-    focal_px: Float
-    slope: Float
-    spacing_px: Float
-
-
 def points_in_image(cloud: Cloud, view: InView, patches: Patches, vetoed: bool) -> PointsInImage:
     """Return the points of the cloud in the view; vetoed: without those the key sweep saw
     through."""
@@ -88,18 +79,18 @@ def points_in_image(cloud: Cloud, view: InView, patches: Patches, vetoed: bool) 
     depth = exposure.depth_m(points_cam).astype(np.float32)
     normal = rotate(exposure.T_cam_key, patches.normal.take(index, axis=0).astype(np.float64))
     plain = exposure.camera.is_rectified and exposure.measure == "z"
-    local = (_pinhole if plain else _any_lens)(
+    focal_px, slope, spacing_px = (_pinhole if plain else _any_lens)(
         exposure, points_cam, depth, normal, patches.spacing_m.take(index, axis=0)
     )
     most, far = _MAX_TILT / depth[:, None], patches.place >= 0
-    slope = np.nan_to_num(local.slope, posinf=0.0, neginf=0.0)
+    slope = np.nan_to_num(slope, posinf=0.0, neginf=0.0)
     return PointsInImage(
         index=index,
         uv=view.uv.take(kept, axis=0),
         depth=depth,
-        focal_px=local.focal_px,
+        focal_px=focal_px,
         slope=np.clip(slope, -most, most),
-        spacing_px=local.spacing_px,
+        spacing_px=spacing_px,
         moving=cloud.moving[index],
         frame=cloud.frame[index],
         sweep=_witness(patches, far)[index],
@@ -110,21 +101,22 @@ def points_in_image(cloud: Cloud, view: InView, patches: Patches, vetoed: bool) 
 
 def _pinhole(
     exposure: Exposure, points_cam: Float, depth: Float32, normal: Float, spacing_m: Float32
-) -> _Local:
-    """Scale for the camera z of a rectified image, where patches count as facing it."""
+) -> tuple[Float, Float, Float]:
+    """Return focal_px, slope and spacing_px for the camera z of a rectified image, where patches
+    count as facing it."""
     focal_px = exposure.camera.K[[0, 1], [0, 1]]
     # On the plane n · p = d the inverse depth is n · ray / d: linear over the image.
     d = np.einsum("ij,ij->i", normal, points_cam)
     with np.errstate(divide="ignore", invalid="ignore"):
         slope = normal[:, :2] / (d[:, None] * focal_px)
     everywhere = np.broadcast_to(focal_px, points_cam[:, :2].shape)
-    return _Local(everywhere, slope, spacing_m * focal_px / depth[:, None])
+    return everywhere, slope, spacing_m * focal_px / depth[:, None]
 
 
 def _any_lens(
     exposure: Exposure, points_cam: Float, depth: Float32, normal: Float, spacing_m: Float32
-) -> _Local:
-    """Scale by the Jacobian J (2,3) of the projection at each point p.
+) -> tuple[Float, Float, Float]:
+    """Return focal_px, slope and spacing_px by the Jacobian J (2,3) of the projection at points p.
 
     Moving on the plane n · p = d so that the image moves by one pixel, p moves by
     δ = J⁺ - p (n · J⁺) / d, and the inverse depth by -δ_z / z², the inverse range by -p · δ / r³.
@@ -147,7 +139,7 @@ def _any_lens(
     rise /= np.linalg.norm(rise, axis=1, keepdims=True)
     sides = [np.einsum("ijk,ik->ij", J, axis) for axis in (level, rise)]
     spacing_px = np.hypot(sides[0] * spacing_m[:, :1], sides[1] * spacing_m[:, 1:])
-    return _Local(focal_px, slope, spacing_px)
+    return focal_px, slope, spacing_px
 
 
 def _witness(patches: Patches, far: Bool) -> NDArray[np.int32]:

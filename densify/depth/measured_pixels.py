@@ -8,7 +8,6 @@ It counts if enough sweeps agree; if a depth edge is near, it is a boundary pixe
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -49,36 +48,31 @@ _GOES_ON = 1.2  # spacings within which a surface shows again
 _ANY_AGE_NS = 1 << 62
 _ALL_ROUND = 3.0  # edges' reaches: no edge near
 _DIAGONAL = np.sqrt(0.5)
-_LEAST_ALONE = 5  # returns of the key sweep that agree around one, itself among them, of nine
 _NEVER_NS = np.iinfo(np.int64).max
 
 
-@dataclass(frozen=True)
-class MeasuredPixels:
-    """P measured pixels: ``pixel`` (P,) row by row, ``winner`` (P,) which of the points in the
-    image, ``depth_m``, ``confidence`` (P,), ``tilt`` (P,2) of the inverse depth, 1/m per px,
-    ``inside`` no depth edge near; the others as in `densify.depth.layers.Layers`."""
+class MeasuredPixels(NamedTuple):
+    """The H·W pixels of an image, row by row.
 
-    pixel: Int
+    winner: int, which of the points in the image gives the depth, -1 none. depth_m, confidence:
+    float32. inside: no depth edge is near. veiled, refused: as in `densify.depth.layers.Layers`.
+    """
+
     winner: Int
     depth_m: Float32
     confidence: Float32
-    tilt: Float
     inside: Bool
     veiled: Bool
     refused: Bool
-    alone: Bool
 
-    def select(self, keep: Bool | Int) -> MeasuredPixels:
-        """Return some of the pixels."""
-        return MeasuredPixels(**{name: column[keep] for name, column in vars(self).items()})
-
-    def replaced(self, others: MeasuredPixels) -> MeasuredPixels:
-        """Return the pixels with others of the same points, which count where both know one."""
-        kept = self.select(~np.isin(self.pixel, others.pixel))
-        more = vars(others)
-        both = MeasuredPixels(**{n: np.concatenate([c, more[n]]) for n, c in vars(kept).items()})
-        return both.select(np.argsort(both.pixel))
+    @staticmethod
+    def at(camera: Camera, pixel: Int, *columns: np.ndarray) -> MeasuredPixels:
+        """Return the pixels (P,) with these columns (P,), the others without a depth."""
+        num = camera.height_px * camera.width_px
+        images = [np.full(num, -1, np.int64), *(np.zeros(num, c.dtype) for c in columns[1:])]
+        for image, column in zip(images, columns, strict=True):
+            image[pixel] = column
+        return MeasuredPixels(*images)
 
 
 def nearest_pixels(
@@ -89,18 +83,9 @@ def nearest_pixels(
     pixel = np.flatnonzero(np.diff(start))
     nearest = order[start[pixel]]
     reason[points.index] = Reason.NOT_CHOSEN
-    nowhere = np.zeros(len(pixel), bool)
-    return MeasuredPixels(
-        pixel=pixel,
-        winner=nearest,
-        depth_m=points.depth[nearest],
-        confidence=own[nearest],
-        tilt=points.slope[nearest],
-        inside=~nowhere,
-        veiled=nowhere,
-        refused=nowhere,
-        alone=nowhere,
-    )
+    no = np.zeros(len(pixel), bool)
+    depth_m, confidence = points.depth[nearest], own[nearest]
+    return MeasuredPixels.at(camera, pixel, nearest, depth_m, confidence, ~no, no, no)
 
 
 def visible_pixels(
@@ -117,16 +102,18 @@ def visible_pixels(
     Points beyond the window come second. They give pixels where the window has none away from depth
     edges, and support there what the window saw too rarely.
     """
-    near = ~points.far
-    pixels, why = _settled(points.select(near), own[near], camera, support)
-    pixels = replace(pixels, winner=np.flatnonzero(near)[pixels.winner])
+    near = np.flatnonzero(~points.far)
+    pixels, why = _settled(points.select(~points.far), own[near], camera, support)
     reason[points.index[near]] = why
-    if near.all():
+    if len(near) == len(own):
         return pixels
-    taken = pixels.pixel[pixels.inside]
-    others, why = _settled(points, own, camera, support, taken)
-    reason[points.index[~near]] = why[~near]
-    return pixels.replaced(others.select(others.inside))
+    if len(near):
+        winner = np.where(pixels.winner < 0, -1, near[pixels.winner])
+        pixels = pixels._replace(winner=winner)
+    beyond, why = _settled(points, own, camera, support, taken=pixels.inside)
+    reason[points.index[points.far]] = why[points.far]
+    better = beyond.inside
+    return MeasuredPixels(*(np.where(better, b, n) for n, b in zip(pixels, beyond, strict=True)))
 
 
 def _settled(
@@ -134,31 +121,27 @@ def _settled(
     own: Float32,
     camera: Camera,
     support: int,
-    taken: Int | None = None,
+    taken: Bool | None = None,
 ) -> tuple[MeasuredPixels, NDArray[np.uint8]]:
     """Return the pixels that points measure, and the `Reason` of every point.
 
-    taken: where given, pixels to leave alone; the others get the stricter rules of points beyond
-    the window. Else too little support is enough where the key sweep has several returns of the
-    surface: what moves unnoticed was elsewhere at other times.
+    taken: (H·W,) where given, pixels to leave alone; the others get the stricter rules of points
+    beyond the window.
     """
-    many = int(points.sweep.max(initial=0)) + 1
-    least = min(support, max(1, many // 2))
     behind = distance_behind(points, camera)
     hidden = behind > 1
     reason = np.where(hidden, Reason.HIDDEN, Reason.NOT_CHOSEN).astype(np.uint8)
-    pixel, winner, found = _found(points, hidden, own, camera, least, taken)
-    depth_m, num_sweeps, youngest_ns, num_points, residual_m, edge, num_alone = found
+    pixel, winner, found = _found(points, hidden, own, camera, taken)
+    depth_m, num_sweeps, youngest_ns, num_points, residual_m, edge = found
     veiled = hidden[winner]
     refused = veiled & (points.age_ns[winner] > NOW_NS)
     if refused.any():
         refused &= distance_behind(points, camera, points.moving)[winner] > 1
     refused |= edge < 0
-    alone = num_alone >= _LEAST_ALONE
+    many = int(points.sweep.max(initial=0)) + 1
     if taken is None:
-        supported = num_sweeps >= least
+        supported = num_sweeps >= min(support, max(1, many // 2))
         supported &= youngest_ns <= np.float32(points.age_ns.min(initial=_NEVER_NS))
-        supported |= alone
         inside = edge >= 1
     else:
         many, supported, inside = 2 * _FAR_SUPPORT, num_sweeps >= _FAR_SUPPORT, edge >= _FAR_EDGE
@@ -175,18 +158,9 @@ def _settled(
     )
     confidence = np.maximum(own[winner] * (1 - _DOUBTS @ doubts), MOST_CONFIDENCE)
     inside &= ~veiled
-    every = MeasuredPixels(
-        pixel=pixel,
-        winner=winner,
-        depth_m=depth_m,
-        confidence=confidence.astype(np.float32),
-        tilt=points.slope[winner],
-        inside=inside,
-        veiled=veiled,
-        refused=refused & ~inside,
-        alone=alone,
-    )
-    return every.select(supported), reason
+    columns = winner, depth_m, confidence.astype(np.float32), inside, veiled, refused & ~inside
+    kept = [column[supported] for column in columns]
+    return MeasuredPixels.at(camera, pixel[supported], *kept), reason
 
 
 class _Visible(NamedTuple):
@@ -214,16 +188,15 @@ def _found(
     hidden: Bool,
     own: Float32,
     camera: Camera,
-    least: int,
-    taken: Int | None,
+    taken: Bool | None,
 ) -> tuple[Int, Int, Float32]:
-    """Return the pixels (P,) with points, the first point of each (P,), and (7,P) what `_settle`
+    """Return the pixels (P,) with points, the first point of each (P,), and (6,P) what `_settle`
     finds around it; with pixels ``taken`` neither these nor those with hidden points alone."""
     last = int(points.age_ns.max(initial=0)) + 1
     late = points.age_ns > NOW_NS
     rank = np.where(hidden, last + late, points.age_ns)
     start, order = sorted_by_pixel(points, rank, own, camera)
-    found = np.zeros((7, len(start) - 1), np.float32)
+    found = np.zeros((6, len(start) - 1), np.float32)
     done = np.zeros(len(start) - 1, bool)
     if taken is not None:
         some = np.flatnonzero(np.diff(start))
@@ -243,8 +216,7 @@ def _found(
         points.moving[order],
         points.age_ns[order],
     )
-    shape, few = (camera.height_px, camera.width_px), least if taken is None else 0
-    _settle.over_rows(len(done), visible, few, shape, done, found)
+    _settle.over_rows(len(done), visible, (camera.height_px, camera.width_px), done, found)
     pixel = np.flatnonzero(found[0])
     return pixel, order[start[pixel]], found[:, pixel]
 
@@ -288,8 +260,7 @@ def _look_round(points, shape, i, u0, v0, centre, agree, inner, witness_ns, m, r
     static points. Fills the moments m (9,) and how far the surface goes on, reach (8,). Returns a
     bit for each sweep that agrees, the age of the youngest, the number of points in the fit, their
     weighted squares, True if something lies behind close by, and of a moving point the squared
-    distances in spacings to the key sweep's returns of its surface and behind it, and the number of
-    its returns that agree.
+    distances in spacings to the key sweep's returns of its surface and behind it.
     """
     start, uv = points.start, points.uv
     inverse, hidden, age_ns = points.inverse, points.hidden, points.age_ns
@@ -304,7 +275,7 @@ def _look_round(points, shape, i, u0, v0, centre, agree, inner, witness_ns, m, r
     wide_u, wide_v = max(support_u, _window(outer)), max(support_v, _window(on_v))
     fit_u, fit_v = _fit(_PLANE_REACH * across), _fit(_PLANE_REACH * along)
     seen, num, youngest, behind, squares = np.int64(0), 0, age_ns[i], False, 0.0
-    now, now_behind, num_now = np.inf, np.inf, 0
+    now, now_behind = np.inf, np.inf
     left, right = max(u0 - wide_u, 0), min(u0 + wide_u, shape[1] - 1)
     for v in range(max(v0 - wide_v, 0), min(v0 + wide_v, shape[0] - 1) + 1):
         for j in range(start[v * shape[1] + left], start[v * shape[1] + right + 1]):
@@ -324,8 +295,6 @@ def _look_round(points, shape, i, u0, v0, centre, agree, inner, witness_ns, m, r
                 continue
             if moving:
                 now = min(now, away)
-                around = abs(du) <= _GOES_ON * across and abs(dv) <= _GOES_ON * along
-                num_now += around and away < np.inf
             # No branches: half of them would be predicted wrongly.
             vouches = abs(du) <= support_u + 0.5 and abs(v - v0) <= support_v
             seen |= np.int64(vouches) << np.int64(points.sweep[k])
@@ -344,19 +313,17 @@ def _look_round(points, shape, i, u0, v0, centre, agree, inner, witness_ns, m, r
             m[8] += weight * dv * off
             squares += weight * off * off
             num += abs(du) < fit_u and abs(dv) < fit_v
-    return seen, youngest, num, squares, behind, now, now_behind, num_now
+    return seen, youngest, num, squares, behind, now, now_behind
 
 
 @Kernel
-def _settle(first, last, points, few, shape, taken, found):  # type: ignore[no-untyped-def]
+def _settle(first, last, points, shape, taken, found):  # type: ignore[no-untyped-def]
     """Find each pixel's depth from the points around that agree with its first point.
 
-    points: `_Visible`. few: with fewer sweeps that agree a return of the key sweep is judged by the
-    key sweep alone, as a moving point is. taken: (P,) pixels to leave alone. found: (7,P) float32,
-    filled with depth, number of sweeps that agree, age of the youngest of them, points in the fit,
-    their root mean square residual (m), how far the surface goes on to all sides as a share of the
-    reach of edges, and the number of returns of the key sweep alone that agree. Hidden points agree
-    with a hidden one only.
+    points: `_Visible`. taken: (P,) pixels to leave alone. found: (6,P) float32, filled with depth,
+    number of sweeps that agree, age of the youngest of them, points in the fit, their root mean
+    square residual (m), and how far the surface goes on to all sides as a share of the reach of
+    edges. Hidden points agree with a hidden one only.
 
     Limbs swing, so the key sweep says more of a moving object's outline than others. Where it saw
     past the object nearer by than it saw the object, an edge is near (0). At half the distance, or
@@ -377,16 +344,9 @@ def _settle(first, last, points, few, shape, taken, found):  # type: ignore[no-u
         m[:], reach[:] = 0.0, 0.0
         # Other sweeps saw the background where the moving object was not yet, or no more.
         witness_ns = _MOVING_WITNESS_NS if points.moving[i] else _ANY_AGE_NS
-        seen, youngest, num, squares, behind, now, now_behind, num_now = _look_round(
+        seen, youngest, num, squares, behind, now, now_behind = _look_round(
             points, shape, i, u0, v0, centre, agree, inner, witness_ns, m, reach
         )
-        if points.age_ns[i] <= NOW_NS and not points.hidden[i] and _count(seen) < few:
-            m[:], reach[:] = 0.0, 0.0
-            now_ns = np.int64(NOW_NS)  # of the type of witness_ns, or this is compiled twice
-            seen, youngest, num, squares, behind, now, now_behind, num_now = _look_round(
-                points, shape, i, u0, v0, centre, agree, inner, now_ns, m, reach
-            )
-            found[6, p] = num_now
         off, _, _ = plane(m[0], m[1], m[2], m[3], m[4], m[5], m[6], m[7], m[8], _RIDGE_PX2)
         found[0, p] = 1 / (centre + min(max(off, -agree), agree))
         found[1, p], found[2, p], found[3, p] = _count(seen), youngest, num

@@ -86,28 +86,30 @@ def _layers_of(
 ) -> Layers:
     """Return measured pixels as layers, those at depth edges as boundary pixels."""
     shape = (camera.height_px, camera.width_px)
+    known, inside = pixels.winner >= 0, pixels.inside
+    winner = pixels.winner[known]
 
     def image(values: np.ndarray, none: float = 0) -> np.ndarray:
-        """(P,…) -> (H,W,…)."""
-        made = np.full((shape[0] * shape[1], *values.shape[1:]), none, values.dtype)
-        made[pixels.pixel] = values
+        """(H,W,…) of the points that give pixels their depth."""
+        made = np.full((known.size, *values.shape[1:]), none, values.dtype)
+        made[known] = values[winner]
         return made.reshape(*shape, *values.shape[1:])
 
-    depth_m = image(np.where(pixels.inside, pixels.depth_m, np.float32(0)))
+    least = np.where(known, _LEAST_CONFIDENCE, np.float32(0))
+    depth_m = np.where(inside, pixels.depth_m, np.float32(0)).reshape(shape)
     near = points if points.far.all() else points.select(~points.far)
     return Layers(
         depth_m=depth_m,
-        rim_m=image(np.where(pixels.inside, np.float32(0), pixels.depth_m)),
-        veiled=image(pixels.veiled),
-        refused=image(pixels.refused),
+        rim_m=np.where(inside, np.float32(0), pixels.depth_m).reshape(shape),
+        veiled=pixels.veiled.reshape(shape),
+        refused=pixels.refused.reshape(shape),
         filled_m=depth_m,
-        confidence=image(np.maximum(pixels.confidence, _LEAST_CONFIDENCE)),
-        point=image(points.index[pixels.winner].astype(np.int32), -1),
-        tilt=image(pixels.tilt.astype(np.float32)),
+        confidence=np.maximum(pixels.confidence, least).reshape(shape),
+        point=image(points.index.astype(np.int32), -1),
+        tilt=image(points.slope.astype(np.float32)),
         spacing_px=_spacing_px(near, shape),
         lab=lab,
-        alone=image(pixels.alone),
-        moving=image(points.moving[pixels.winner]),
+        moving=image(points.moving),
     )
 
 

@@ -7,7 +7,6 @@ A camera with a long focal length has several pixels to a beam: a return measure
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 
@@ -15,20 +14,9 @@ from densify.depth.image_points import PointsInImage
 from densify.depth.layers import Layers
 from densify.depth.measured_pixels import AGREE_FRACTION, AGREE_M
 from densify.geometry.compiled import Kernel
-from densify.geometry.types import Float32
 
 _SPOT = 0.35  # half width, in spacings of rays along the azimuth
 _MOST_PX = 4  # of it
-
-
-class _Spots(NamedTuple):
-    """The measured pixels, (H,W): from their middles to the returns' (H,W,2) px, radius in px (0
-    none), depth in m, and (H,W,2) slope of inverse depth, 1/m per px."""
-
-    middle_px: Float32
-    radius_px: Float32
-    depth_m: Float32
-    tilt: Float32
 
 
 def measure_spots(layers: Layers, points: PointsInImage) -> Layers:
@@ -43,21 +31,14 @@ def measure_spots(layers: Layers, points: PointsInImage) -> Layers:
     if not len(measured):
         return layers
     point = points.at(layers.point.flat[measured])
-    spots = _Spots(
-        middle_px=np.zeros((*shape, 2), np.float32),
-        radius_px=np.zeros(shape, np.float32),
-        depth_m=layers.depth_m,
-        tilt=layers.tilt,
-    )
-    middle = np.stack(np.divmod(measured, shape[1])[::-1], axis=1)
-    spots.middle_px.reshape(-1, 2)[measured] = points.uv[point] - middle
-    spots.radius_px.flat[measured] = np.minimum(_SPOT * points.spacing_px[point, 0], _MOST_PX)
+    radius_px = np.minimum(_SPOT * points.spacing_px[point, 0], _MOST_PX)
     fills = layers.depth_m == 0
     if layers.unsure is not None:
         fills &= ~layers.unsure
     filled_m = np.where(fills, layers.filled_m, np.float32(0))
     found = np.full(shape, -1)
-    _cover(measured, filled_m, spots, found, np.full(shape, np.inf))
+    nearest, uv = np.full(shape, np.inf), points.uv[point]
+    _cover(measured, uv, radius_px, layers.depth_m, layers.tilt, filled_m, found, nearest)
     covered = np.flatnonzero(found >= 0)
     depth_m, of_point = layers.depth_m.copy(), layers.point.copy()
     depth_m.flat[covered] = layers.filled_m.flat[covered]
@@ -66,28 +47,28 @@ def measure_spots(layers: Layers, points: PointsInImage) -> Layers:
 
 
 @Kernel
-def _cover(pixel, filled_m, spots, found, nearest):  # type: ignore[no-untyped-def]
+def _cover(pixel, uv, radius_px, depth_m, tilt, filled_m, found, nearest):  # type: ignore[no-untyped-def]
     """Find the measured pixel whose spot covers a filled one, nearest in the image.
 
-    pixel: (P,) the measured ones. filled_m: (H,W) of the pixels that may be covered, 0 elsewhere.
-    found: (H,W) int64, set to the measured pixel. nearest: (H,W) inf, squared distance to its spot.
+    pixel, radius_px: (P,) of the measured ones. uv: (P,2) px of their returns. depth_m: (H,W).
+    tilt: (H,W,2) slope of inverse depth, 1/m per px. filled_m: (H,W) of the pixels that may be
+    covered, 0 elsewhere. found: (H,W) int64, set to the measured pixel. nearest: (H,W) inf, squared
+    distance to its spot.
     """
     height, width = filled_m.shape
-    for p in pixel:
-        v, u = p // width, p % width
-        radius_px, here = spots.radius_px[v, u], spots.depth_m[v, u]
-        middle_u, middle_v = spots.middle_px[v, u, 0], spots.middle_px[v, u, 1]
-        reach = int(radius_px + 0.5)  # a spot's middle lies in its pixel
+    for i in range(len(pixel)):
+        v, u = pixel[i] // width, pixel[i] % width
+        here = depth_m[v, u]
+        reach = int(radius_px[i] + 0.5)  # a spot's middle lies in its pixel
         for row in range(max(v - reach, 0), min(v + reach + 1, height)):
             for column in range(max(u - reach, 0), min(u + reach + 1, width)):
                 z = filled_m[row, column]
                 if z == 0:
                     continue
-                du, dv = column - u, row - v
-                away = (du - middle_u) ** 2 + (dv - middle_v) ** 2
-                if away > radius_px * radius_px or away >= nearest[row, column]:
+                away = (column - uv[i, 0]) ** 2 + (row - uv[i, 1]) ** 2
+                if away > radius_px[i] * radius_px[i] or away >= nearest[row, column]:
                     continue
-                inverse = 1 / here + du * spots.tilt[v, u, 0] + dv * spots.tilt[v, u, 1]
+                inverse = 1 / here + (column - u) * tilt[v, u, 0] + (row - v) * tilt[v, u, 1]
                 if abs(z * inverse - 1) <= (AGREE_M + AGREE_FRACTION * here) * abs(inverse):
                     nearest[row, column] = away
-                    found[row, column] = p
+                    found[row, column] = pixel[i]
