@@ -17,6 +17,7 @@ from densify.geometry.clouds import thinned
 from densify.pipeline import run as pipeline
 from densify.pipeline.recording import Recording
 from densify.readers.timeline import Timeline
+from densify.registration import road_poses
 from densify.registration.road_poses import follow_road
 from densify.scores.depth_metrics import depth_scores
 from tests.scenes import CAMERA, Arc, Scanner, Scene, TinySequence, World, by_flow, car, street

@@ -66,7 +66,7 @@ def test_the_image_lets_the_fill_come_closer_to_an_edge():
 
 def test_slopes_of_filled_pixels_are_the_planes():
     sparse = np.random.default_rng(8).random(SHAPE) < 0.3
-    made = fill(layers_of(np.where(sparse, TILTED, 0), spacing_px=(4, 4)), 1.5)
+    made = fill(layers_of(np.where(sparse, TILTED, 0), spacing_px=(12, 12)), 1.5)
     inside = (made.filled_m > 0) & ~sparse
     assert inside.mean() > 0.5
     np.testing.assert_allclose(np.median(made.tilt[inside], axis=0), TILT, rtol=1e-3)
