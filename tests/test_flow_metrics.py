@@ -53,13 +53,6 @@ def test_angles_by_hand():
     assert metrics.angle_error_rad(flow, true) == pytest.approx(expected)
 
 
-def test_space_time_angle_by_hand():
-    # (0.1, 0, 0, 0.1) against (0, 0, 0, 0.1): 45 degrees; nothing and nothing: 0
-    flow, true = along_x(0.1, 0.0), along_x(0.0, 0.0)
-    assert metrics.space_time_angle_error_rad(flow, true, 0.1) == pytest.approx(math.pi / 8)
-    assert metrics.space_time_angle_error_rad(flow, true, 0.2) == pytest.approx(math.atan(0.5) / 2)
-
-
 def test_three_ways_weigh_the_same():
     flow, true = along_x(1.0, 0.2, 0.4, 0.01, 0.03, 7.0), along_x(0, 0, 0, 0, 0, 0)
     moving = np.array([1, 0, 0, 0, 0, 1], bool)
@@ -71,22 +64,7 @@ def test_three_ways_weigh_the_same():
 
 def test_segmentation_by_hand():
     called, moving = np.array([1, 1, 1, 0, 0], bool), np.array([1, 1, 0, 1, 0], bool)
-    assert metrics.dynamic_iou(called, moving) == pytest.approx(2 / 4)
     assert metrics.share_found(called, moving) == pytest.approx(2 / 3)
-
-
-def test_buckets_as_a_loop(flows):
-    flow, true = (2 * f for f in flows)
-    buckets: dict[int, list[tuple[float, float]]] = {}
-    for f, t in zip(flow, true, strict=True):
-        speed_m_s = math.hypot(*t) / 0.1
-        number = 50 if speed_m_s >= 20 else int(speed_m_s / 0.4 + 1e-9)
-        buckets.setdefault(number, []).append((math.dist(f, t), math.hypot(*t)))
-    parts = [np.mean(b, 0)[0] / np.mean(b, 0)[1] for n, b in buckets.items() if n]
-    error = metrics.bucketed_error(flow, true, 0.1)
-    assert 50 in buckets and len(buckets) > 20
-    assert error.dynamic == pytest.approx(np.mean(parts))
-    assert error.static_m == pytest.approx(np.mean(buckets[0], 0)[0])
 
 
 def test_errors_by_hops():
@@ -119,13 +97,6 @@ def test_points_drawn_onto_lines_cover_and_extend_less():
     assert metrics.coverage(points, points) == 1
     assert metrics.coverage(x, points) == pytest.approx(0.4, abs=0.03)  # 0.1 m to both sides
     assert metrics.coverage(x, points, 0.3) == 1
-    assert metrics.extent_m2(x) < 0.5 * metrics.extent_m2(points)
-
-
-def test_extent_counts_cells():
-    at = np.array([[0.05, 0.05, 0.05], [0.06, 0.05, 0.05], [0.15, 0.05, 0.05], [-0.05, 0, 0]])
-    assert metrics.extent_m2(at) == pytest.approx(0.03)
-    assert metrics.extent_m2(at, 1.0) == pytest.approx(2)
 
 
 # --- nothing, and nonsense ------------------------------------------------------------------------
@@ -138,16 +109,12 @@ def test_nothing_gives_nan():
         metrics.end_point_error(along_x(1), along_x(1), np.array([False])),
         metrics.accuracy(NOTHING, NOTHING, metrics.STRICT),
         metrics.angle_error_rad(along_x(1), along_x(0)),
-        metrics.space_time_angle_error_rad(NOTHING, NOTHING, 0.1),
         *metrics.three_way_error(NOTHING, NOTHING, none, none),
-        metrics.dynamic_iou(none, none),
         metrics.share_found(np.array([True]), np.array([False])),
-        *metrics.bucketed_error(NOTHING, NOTHING, 0.1),
         metrics.plane_residual_m(NOTHING),
         metrics.plane_residual_m(along_x(0, 0.1, 0.2)),
     ]
     assert all(math.isnan(v) for v in values), values
-    assert metrics.extent_m2(NOTHING) == 0
 
 
 @pytest.mark.parametrize(
@@ -163,13 +130,11 @@ def test_nothing_gives_nan():
             ),
             r"foreground: got bool of shape \(2,\)",
         ),
-        (lambda: metrics.dynamic_iou(np.ones(2, bool), np.ones(3, bool)), "estimated_moving"),
+        (lambda: metrics.share_found(np.ones(2, bool), np.ones(3, bool)), "estimated_moving"),
         (lambda: metrics.share_found(np.ones(2, bool), np.ones(2)), "moving: got float64"),
         (lambda: metrics.errors_by_hops(along_x(1), along_x(1), np.ones(1)), "hops: got float64"),
         (lambda: metrics.errors_by_hops(along_x(1), along_x(1), np.ones(2, int)), "hops"),
         (lambda: metrics.plane_residual_m(np.zeros((2, 2))), "points"),
-        (lambda: metrics.bucketed_error(along_x(1), along_x(1), 0.0), "duration_s"),
-        (lambda: metrics.bucketed_error(along_x(1), along_x(1), [0.1, 0.1]), "duration_s"),
         (lambda: metrics.coverage(along_x(1), np.zeros(3)), "true_points"),
     ],
 )

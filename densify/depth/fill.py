@@ -28,7 +28,6 @@ _LEAST_SHARE, _LEAST_STAR_SHARE = 0.9, 0.8  # of the votes
 _AROUND, _LEAST_KNOWN = 0.35, 0.3  # gaps between rays to all sides; share of the pixels there
 _RIDGE_PX2 = 1e-7
 _MIN_PLANE_PX = 6  # fewer do not tell a plane from a step
-_MIN_SLOPED_PX = 15  # a plane through fewer is not extended beyond the window
 _MOST_PX = 120  # half a window's size
 _ROWS = 8  # rows that are skipped together if they hold no measured pixel
 _STAR_REACH = 1.0  # spacings of rays
@@ -247,7 +246,7 @@ def _fill(first, last, known, spacing_px, reaches, filled_m, confidence, tilt, s
             if centre > 0:
                 filled_m[row, column] = 1 / min(max(centre, far), near)
                 confidence[row, column] = inside.confidence[:num].min()
-                sloped = num >= _MIN_SLOPED_PX
+                sloped = num >= _MIN_PLANE_PX
                 tilt[row, column, 0] = slope_u if sloped else 0.0
                 tilt[row, column, 1] = slope_v if sloped else 0.0
                 share[row, column] = (step + 1) / len(reaches)

@@ -6,9 +6,11 @@ ego-motion removed:
 
 - three-way end-point error (Chodosh, Ramanan, Lucey, WACV 2024; the package av2): means over points
   of objects that move by 0.05 m a sweep or more, of other objects, and of static background;
-- bucket normalised error (Khatri et al., ECCV 2024; the package bucketed-scene-flow-eval): as
-  `densify.scores.flow_metrics.bucketed_error`, per class, by the length of the true flow in
-  ``linspace(0, 2.0, 51)`` metres a sweep, averaged over the classes.
+- bucket normalised error (Khatri et al., "I Can't Believe It's Not Scene Flow!", ECCV 2024; the
+  package bucketed-scene-flow-eval): per class, points are sorted by the length of their true flow
+  into ``linspace(0, 2.0, 51)`` metres a sweep and one bucket beyond. The first is static: its mean
+  error, metres. In every other one the mean error is divided by the mean length of the true flow;
+  the quotients are averaged over the buckets that hold points, and over the classes.
 """
 
 from __future__ import annotations

@@ -19,8 +19,6 @@ from densify.geometry.types import Bool, Float, Int
 STRICT, RELAXED = 0.05, 0.1
 """Metres, and parts of the true flow: the two limits of `accuracy`."""
 
-_BUCKET_M_S = 0.4
-_NUM_BUCKETS = 51  # 50 up to 20 m/s and one beyond
 _MIN_IN_PATCH = 8
 _MAX_PATCHES = 3000
 
@@ -74,19 +72,6 @@ def angle_error_rad(estimated: ArrayLike, true: ArrayLike) -> float:
     return _mean(_angles_rad(flow[moves], truth[moves]))
 
 
-def space_time_angle_error_rad(
-    estimated: ArrayLike, true: ArrayLike, duration_s: ArrayLike
-) -> float:
-    """Return the mean angle between (flow, duration_s) and (true flow, duration_s), radians.
-
-    duration_s: of the flow, one or (N,). One second weighs as much as one metre, as in
-    ``compute_angle_error`` of the Argoverse 2 API (av2.evaluation.scene_flow).
-    """
-    flow, truth = _flows(estimated, true)
-    time = _durations_s(duration_s, len(flow))[:, None]
-    return _mean(_angles_rad(np.hstack([flow, time]), np.hstack([truth, time])))
-
-
 def three_way_error(
     estimated: ArrayLike, true: ArrayLike, moving: ArrayLike, foreground: ArrayLike
 ) -> ThreeWayError:
@@ -103,38 +88,11 @@ def three_way_error(
     return ThreeWayError(parts[0], parts[1], parts[2], sum(parts) / 3)
 
 
-def dynamic_iou(estimated_moving: ArrayLike, moving: ArrayLike) -> float:
-    """Return the intersection over union (0 to 1) of estimated and truly moving points."""
-    found, true = _two_masks(estimated_moving, moving)
-    return _ratio((found & true).sum(), (found | true).sum())
-
-
 def share_found(estimated_moving: ArrayLike, moving: ArrayLike) -> float:
     """Return the recall (0 to 1): the share of the moving points that are called moving."""
-    found, true = _two_masks(estimated_moving, moving)
-    return _ratio((found & true).sum(), true.sum())
-
-
-def bucketed_error(estimated: ArrayLike, true: ArrayLike, duration_s: ArrayLike) -> BucketedError:
-    """Return the bucket normalised end-point error of one class of points (Khatri et al., "I Can't
-    Believe It's Not Scene Flow!", ECCV 2024).
-
-    Points are sorted by true speed into buckets of 0.4 m/s up to 20 m/s and one beyond. The first
-    is static: its mean error, metres. In every other one the mean error is divided by the mean
-    length of the true flow, and the quotients are averaged over the buckets that hold points.
-    duration_s: of the flow, one or (N,).
-    """
-    flow, truth = _flows(estimated, true)
-    error_m = np.linalg.norm(flow - truth, axis=1)
-    length_m = np.linalg.norm(truth, axis=1)
-    speed_m_s = length_m / _durations_s(duration_s, len(flow))
-    bucket = np.digitize(speed_m_s, _BUCKET_M_S * np.arange(1, _NUM_BUCKETS))
-    num, error_sum, length_sum = (
-        np.bincount(bucket, weights, _NUM_BUCKETS) for weights in (None, error_m, length_m)
-    )
-    filled = num[1:] > 0
-    parts = error_sum[1:][filled] / length_sum[1:][filled]
-    return BucketedError(_ratio(error_sum[0], num[0]), _mean(parts))
+    true = np.asarray(moving)
+    found = _mask(estimated_moving, true.size, "estimated_moving")
+    return _mean(found[_mask(true, true.size, "moving")])
 
 
 def errors_by_hops(estimated: ArrayLike, true: ArrayLike, hops: ArrayLike) -> dict[int, float]:
@@ -173,13 +131,6 @@ def plane_residual_m(points: ArrayLike, radius_m: float = 0.3) -> float:
     return _mean(np.sqrt(np.maximum(spreads, 0.0)))
 
 
-def extent_m2(points: ArrayLike, cell_m: float = 0.1) -> float:
-    """Return the surface that accumulated points occupy, square metres: occupied cells of a grid
-    times ``cell_m`` squared. Points drawn onto scan lines lower it, wrong motion raises it."""
-    cells = np.unique(np.floor(_points(points, "points") / cell_m), axis=0)
-    return len(cells) * cell_m**2
-
-
 def coverage(points: ArrayLike, true_points: ArrayLike, reach_m: float = 0.1) -> float:
     """Return the share (0 to 1) of the true accumulated points (K,3) that have an estimated one of
     (M,3) within ``reach_m``, metres, one frame."""
@@ -191,7 +142,7 @@ def coverage(points: ArrayLike, true_points: ArrayLike, reach_m: float = 0.1) ->
 
 
 def _angles_rad(a: Float, b: Float) -> Float:
-    """Return (N,) angles between the rows (N,D); a right angle where one of them is 0."""
+    """Return (N,) angles between rows (N,3); a right angle where one of them is 0."""
     lengths = np.linalg.norm(a, axis=1) * np.linalg.norm(b, axis=1)
     dot = np.einsum("nd,nd->n", a, b)
     cosine = np.divide(dot, lengths, out=np.zeros(len(a)), where=lengths > 0)
@@ -215,16 +166,6 @@ def _points(values: ArrayLike, name: str) -> Float:
     return array
 
 
-def _durations_s(values: ArrayLike, num_points: int) -> Float:
-    array = np.asarray(values, dtype=np.float64)
-    if array.shape not in ((), (num_points,)) or not (array > 0).all():
-        raise InputError(
-            f"flow metrics: duration_s: got shape {array.shape}, expected seconds above 0, one or "
-            f"({num_points},)"
-        )
-    return np.broadcast_to(array, (num_points,))
-
-
 def _mask(values: ArrayLike, num_points: int, name: str) -> Bool:
     array = np.asarray(values)
     if array.shape != (num_points,) or array.dtype != bool:
@@ -235,15 +176,6 @@ def _mask(values: ArrayLike, num_points: int, name: str) -> Bool:
     return array
 
 
-def _two_masks(estimated: ArrayLike, true: ArrayLike) -> tuple[Bool, Bool]:
-    num_points = np.size(np.asarray(true))
-    return _mask(estimated, num_points, "estimated_moving"), _mask(true, num_points, "moving")
-
-
 def _mean(values: ArrayLike) -> float:
     array = np.asarray(values)
     return float(array.mean()) if array.size else float("nan")
-
-
-def _ratio(part: float, whole: float) -> float:
-    return float(part / whole) if whole else float("nan")
