@@ -3,12 +3,14 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import os
 import shutil
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -145,9 +147,10 @@ def test_a_scheduler_needs_dask(monkeypatch: pytest.MonkeyPatch) -> None:
         check_scheduler("tcp://127.0.0.1:9")
 
 
-def test_a_scheduler_that_ends(tmp_path: Path) -> None:
+def test_a_scheduler_behind_tls_that_ends(tmp_path: Path) -> None:
     """In the middle of a call; and whoever has no certificate is not let in."""
-    distributed = pytest.importorskip("distributed")
+    dask_module = pytest.importorskip("dask")
+    pytest.importorskip("distributed")
     place, openssl = tmp_path / "scheduler.json", shutil.which("openssl")
     if openssl is None:
         pytest.skip("no openssl here to make certificates")
@@ -168,19 +171,14 @@ def test_a_scheduler_that_ends(tmp_path: Path) -> None:
     worker = [*dask, "worker", "--nthreads", "1", "--no-dashboard", *common]
     worker_process = subprocess.Popen(worker, **options)
     try:
-        address = distributed.utils.json.loads(place.read_text())["address"]
+        address = json.loads(place.read_text())["address"]
         with pytest.raises(InputError, match="certificates that the scheduler trusts"):
             check_scheduler(address)
         names = ("ca-file", "client.cert", "client.key")
-        with distributed.utils.dask.config.set(
-            {f"distributed.comm.tls.{name}": str(pem) for name in names}
-        ):
+        with dask_module.config.set({f"distributed.comm.tls.{name}": str(pem) for name in names}):
             outcomes = call_all(worker_calls.square, [[3]], scheduler=address)
             assert next(outcomes) == (3, 9)
             left = call_all(worker_calls.wait, [[tmp_path / "long.pid"]], scheduler=address)
-            os.killpg(worker_process.pid, 0)
-            import threading
-
             threading.Timer(1.0, scheduler.kill).start()
             with pytest.raises(ComputationError, match="scheduler was lost; run the same command"):
                 next(left)

@@ -40,6 +40,7 @@ _DEATH = (
     "a worker process died of it twice (killed, or out of memory?); fewer --workers or a smaller "
     "--window take less memory"
 )
+_LOST = "the Dask scheduler was lost; run the same command again to go on"
 
 
 def call_all(
@@ -134,12 +135,8 @@ def _outcome(future: Future[Any]) -> Any:
         value = future.result()
     except BrokenExecutor as error:
         return error
-    except (InputError, ComputationError):
-        raise
-    except CancelledError:  # by nobody here: a client that loses its scheduler cancels all
-        raise ComputationError(
-            "the Dask scheduler was lost; run the same command again to go on"
-        ) from None
+    except (InputError, ComputationError, CancelledError):
+        raise  # CancelledError: by nobody here; a client that loses its scheduler cancels all
     except Exception as error:
         return ComputationError(f"{type(error).__name__}: {error}")
     if not isinstance(value, _Logged):
@@ -163,7 +160,10 @@ def _open_executor(
     if scheduler is not None:
         with _dask(scheduler) as client:
             executor = client.get_executor(pure=False)  # pure: two equal calls would be one
-            yield executor, lambda: max(1, sum(client.nthreads().values()))
+            try:
+                yield executor, lambda: max(1, sum(client.nthreads().values()))
+            except (OSError, RuntimeError, CancelledError) as error:
+                raise ComputationError(_LOST) from error
     elif num_workers == 1:
         yield _HERE, lambda: 1
     else:
