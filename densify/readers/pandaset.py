@@ -183,8 +183,8 @@ class PandaSet(FileSequence):
 def _numbers(
     path: Path, numbers: tuple[str, ...], texts: tuple[str, ...] = ()
 ) -> tuple[list[Float], list[list[str]]]:
-    """Return columns of finite numbers, and columns of texts. Raises InputError if one is absent or
-    holds something else."""
+    """Return columns of numbers, finite but for x y z, and columns of texts. Raises InputError if
+    one is absent or holds something else."""
     columns = read_columns(path)
     missing = [name for name in (*numbers, *texts) if name not in columns]
     if missing:
@@ -193,7 +193,8 @@ def _numbers(
             f"set's own files"
         )
     for name in numbers:
-        if columns[name].dtype.kind not in "fiu" or np.isinf(columns[name]).any():
+        column = columns[name]
+        if column.dtype.kind not in "fiu" or not (name in "xyz" or np.isfinite(column).all()):
             raise InputError(f"{path}: column {name}: expected finite numbers")
     found = [columns[name].tolist() for name in texts]
     if not all(isinstance(text, str) and text for column in found for text in column):

@@ -98,9 +98,7 @@ def _put_table(path: Path, columns: Mapping[str, NDArray[Any]]) -> None:
 
     path.parent.mkdir(parents=True, exist_ok=True)
     arrays = {
-        name: pyarrow.array(column.tolist(), pyarrow.string() if column.dtype == object else None)
-        if column.dtype == object
-        else pyarrow.array(np.ascontiguousarray(column))
+        name: pyarrow.array(column.tolist() if column.dtype == object else column.copy())
         for name, column in columns.items()
     }
     pyarrow.feather.write_feather(pyarrow.table(arrays), path)
