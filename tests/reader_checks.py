@@ -120,7 +120,7 @@ def check_depth(
     read = depth_score(sequence, middle, name or own)
     true = street_score(excerpt.street.name, excerpt.frames[middle], own)
     assert true.num_compared > 5_000
-    assert abs(read.num_compared / true.num_compared - 1) < worse
+    assert abs(read.num_compared / true.num_compared - 1) < worse, (read, true)
     assert read.mae_m < (1 + worse) * true.mae_m and read.rmse_m < (1 + 2 * worse) * true.rmse_m
 
 
