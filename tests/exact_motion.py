@@ -15,7 +15,6 @@ FRAMES = range(100, 107)
 KEY = 103
 PAIRS = [(f, t) for f in FRAMES for t in FRAMES if f != t]
 STEP_S = 0.1
-MAX_GAP_M = 0.5
 NUM_STATIC, NUM_MOVING = 20, 15
 CAR = 4
 
@@ -43,7 +42,6 @@ def chained(
     points: Mapping[int, np.ndarray],
     moved: Callable[[int, int], np.ndarray],
     instance: Mapping[int, np.ndarray],
-    max_gap_m: float = MAX_GAP_M,
 ) -> ChainedMotion:
     """points: world, of every frame. moved: (frame, target) -> displacement in the world."""
     frames = tuple(points)
@@ -53,7 +51,7 @@ def chained(
         return flow_field(frames[here], moved(frames[here], frames[there]), instance[frames[here]])
 
     stretch = Stretch(tuple(registered(f, p) for f, p in points.items()))
-    return ChainedMotion(stretch, step, max_gap_m)
+    return ChainedMotion(stretch, step)
 
 
 def flow_field(frame: int, moved: np.ndarray, instance: np.ndarray) -> FlowField:

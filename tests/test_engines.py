@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from densify.config import Config, resolve
+from densify.config import Config
 from densify.config.cache import Cache
 from densify.config.errors import InputError
 from densify.config.plugins.engines import ENGINES, engine
@@ -96,12 +96,6 @@ def test_shared_motion_is_kept_without_points(driving: Scene, row, tmp_path: Pat
     got, wanted = again.flow(4, 5), motion.flow(4, 5)
     np.testing.assert_array_equal(got.displacement, wanted.displacement)
     assert wanted.moving.any()
-
-
-def test_the_configured_engine_is_the_default(driving: Scene) -> None:
-    given = estimate_motion(driving, Config(), "paper")
-    assert type(given) is type(estimate_motion(driving, resolve({"flow": {"engine": "paper"}})))
-    assert type(given) is not type(estimate_motion(driving, Config()))
 
 
 def test_an_engine_that_cannot_work_is_known_before_anything_is_computed() -> None:

@@ -10,9 +10,8 @@ import numpy as np
 import pytest
 
 from densify import open_sequence
-from densify.flow.pairs.estimate import estimate_flow
-from densify.flow.pairs.scanners import scanners_told
-from densify.flow.pairs.thinness import settle
+from densify.flow.pairs.estimate import _tell_scanners, estimate_flow
+from densify.flow.pairs.refine import _settle
 from densify.geometry import poses
 from densify.readers.street import Street
 from densify.street.lidar import T_ego_lidar, at_offsets
@@ -70,7 +69,7 @@ def test_movers_come_out_right_with_whatever_is_known(street, clouds, given):
 
 def test_times_tell_the_scanners(street, clouds):
     lag = tuple(street.returns(f).offset_ns * 1e-8 for f in (FRAME, FRAME + 1))
-    told = scanners_told(clouds, lag)
+    told = _tell_scanners(clouds, lag)
     assert told is not None
     far = [np.linalg.norm(cloud[:, :2], axis=1) > 5 for cloud in clouds]
     same = [
@@ -78,16 +77,6 @@ def test_times_tell_the_scanners(street, clouds):
         for lidar, f, k in zip(told, far, (FRAME, FRAME + 1), strict=True)
     ]
     assert min(same) > 0.999 or max(same) < 0.001  # the same names in both clouds, whichever
-
-
-def test_times_of_one_scanner_tell_of_no_second():
-    rng = np.random.default_rng(0)
-    azimuth = rng.uniform(-np.pi, np.pi, (2, 4000))
-    clouds = tuple(20 * np.column_stack([np.cos(a), np.sin(a), 0 * a]) for a in azimuth)
-    spinning = tuple(-a / (2 * np.pi) for a in azimuth)
-    assert scanners_told(clouds, spinning) is None
-    assert scanners_told(clouds, tuple(0 * a for a in azimuth)) is None  # a flash
-    assert scanners_told(clouds, tuple(rng.uniform(-0.5, 0.5, a.shape) for a in azimuth)) is None
 
 
 def corner(rng: np.random.Generator, num: int) -> np.ndarray:
@@ -103,10 +92,8 @@ def corner(rng: np.random.Generator, num: int) -> np.ndarray:
 def settled(points, share, sampling, judges, state, gates_m=(), reach_m=0.4):
     state, told = np.array(state, float), np.empty(2)
     precision = np.array([1e3, 1e3, 3e5, 1e4])
-    settle(
-        points, share, sampling, judges, points.mean(0), reach_m, np.array(gates_m, float),
-        0.15, 60.0, precision, state, told,
-    )  # fmt: skip
+    gates = np.array(gates_m, float)
+    _settle(points, share, sampling, judges, points.mean(0), reach_m, gates, precision, state, told)
     return state, told
 
 
@@ -169,7 +156,7 @@ def test_what_hangs_above_the_road_does_not_drive():
     assert low.moving[4000:].mean() > 0.9 and not high.moving.any()
 
 
-@pytest.mark.parametrize("given", ["nothing", "times", "scanners", "both"])
+@pytest.mark.parametrize("given", ["nothing", "both"])
 def test_a_real_car_beside_two_scanners(given):
     """A log of Argoverse 2: the car's profile is one line at 0.8 to 0.86 m a sweep."""
     folder = os.environ.get("DENSIFY_TEST_DATA")

@@ -18,7 +18,6 @@ _LEAST_POINTS = 10  # of an object in all sweeps
 _LEAST_SEEN = 3  # of it in one sweep: fewer do not tell how it is turned
 _PERCENTILES = (1.0, 99.0)
 _LEAST_SPEED_M_S = 0.3  # below, an object points to where it went over the window
-_HOLD = 1e-6  # against turning about a line that the points lie on
 
 
 def accumulate(stretch: Stretch, fields: Sequence[FlowField], key: int, drop_lost: bool) -> Cloud:
@@ -118,7 +117,9 @@ def _track(
 ) -> ObjectTrack:
     at_key = np.concatenate([s.at_key for s in seen.values()])
     T_there_key = {
-        frame: _rigid(s.at_key, s.there) for frame, s in seen.items() if len(s.there) >= _LEAST_SEEN
+        frame: poses.fit_rigid(s.at_key, s.there)
+        for frame, s in seen.items()
+        if len(s.there) >= _LEAST_SEEN
     }
     T_there_key[key] = np.eye(4)
     frames = sorted(T_there_key)
@@ -147,17 +148,3 @@ def _track(
         velocity_m_s=speeds_m_s,
         num_points=np.array([len(seen[f].there) if f in seen else 0 for f in frames], np.int64),
     )
-
-
-def _rigid(source: Float, target: Float) -> Float:
-    """Return (4,4) the rigid motion that brings points (N,3) nearest to others (Kabsch, "A solution
-    for the best rotation to relate two sets of vectors", 1976)."""
-    from_m, to_m = source.mean(axis=0), target.mean(axis=0)
-    # einsum and not BLAS: the same sums whatever the number of threads.
-    spread = np.einsum("ni,nj->ij", target - to_m, source - from_m)
-    spread += _HOLD * np.square(source - from_m).sum() * np.eye(3)
-    left, _, right = np.linalg.svd(spread)
-    turn = left @ np.diag([1, 1, np.linalg.det(left @ right)]) @ right
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = turn, to_m - turn @ from_m
-    return T

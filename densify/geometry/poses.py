@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 from densify.geometry.arrays import Float
 
 _ROWS = 8192  # at once: for more, OpenBLAS wakes threads that spin longer than the work takes
+_HOLD = 1e-9  # against turning about a line that the points lie on
 
 
 def inverse(T_a_b: Float) -> Float:
@@ -74,3 +75,19 @@ def transform_each(twist: Float, points: Float) -> Float:
 def interpolate(T_world_a: Float, T_world_b: Float, fraction: float) -> Float:
     """Return the pose ``fraction`` of the way from a (0) to b (1); outside it extrapolates."""
     return T_world_a @ exp(fraction * log(inverse(T_world_a) @ T_world_b))
+
+
+def fit_rigid(source: Float, target: Float) -> Float:
+    """Return the (4,4) pose that brings (N,3) points nearest to others (Kabsch 1976).
+
+    Points on a line do not turn about it, and a single point does not turn.
+    """
+    from_m, to_m = source.mean(axis=0), target.mean(axis=0)
+    # einsum and not BLAS: the same sums whatever the number of threads.
+    spread = np.einsum("ni,nj->ij", target - to_m, source - from_m)
+    spread += _HOLD * np.square(source - from_m).sum() * np.eye(3)
+    left, _, right = np.linalg.svd(spread)
+    T = np.eye(4)
+    T[:3, :3] = left @ np.diag([1, 1, np.linalg.det(left @ right)]) @ right
+    T[:3, 3] = to_m - T[:3, :3] @ from_m
+    return T

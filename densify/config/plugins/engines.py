@@ -37,7 +37,7 @@ ENGINES = Table(
             shared=True,
         ),
         Engine(
-            "pairs", "densify.flow.pairs.engine", about="two sweeps at a time, as estimate_flow"
+            "pairs", "densify.flow.pairs.estimate", about="two sweeps at a time, as estimate_flow"
         ),
         Engine(
             "paper",

@@ -15,14 +15,17 @@ from scipy.spatial import cKDTree
 
 from densify.config import Config, ObjectiveSettings, resolve
 from densify.config.errors import InputError
+from densify.flow.chained import ChainedMotion
+from densify.flow.engines import Scene
 from densify.flow.objective.graph import checked_cloud
 from densify.flow.objective.solvers import SolverSettings, solve
 from densify.flow.pairs.hypotheses import PairCloud
 from densify.flow.pairs.movers import find_movers
-from densify.flow.pairs.scanners import scanners_told
 from densify.free_space.ground import ABOVE_GROUND_M, HeightMap
+from densify.geometry import poses
 from densify.geometry.linking import link
-from densify.geometry.types import Float, FlowField, Int
+from densify.geometry.nearest import nearest, tree_of
+from densify.geometry.types import Float, FlowField, Int, Motion, Stretch, Sweep
 
 _LEAST_MOTION_M = 0.15
 _LINK_M = 0.6
@@ -32,6 +35,8 @@ _MIN_GAIN_M = 0.07
 _MAX_EXTENT_M = 400.0
 _MIN_LOW_M = 0.04
 _BELOW_M = 0.3
+_MIDDLE_M = 3.0  # nearer, the direction is not that from a scanner
+_MIN_AGREEMENT, _MAX_SINGLE = 0.8, 0.3
 
 
 def estimate_flow(
@@ -77,7 +82,7 @@ def estimate_flow(
     times = _times(_columns(source_offset_ns, target_offset_ns, clouds, "offset_ns"))
     lidars = _columns(source_lidar, target_lidar, clouds, "lidar")
     if lidars is None and times is not None:
-        lidars = scanners_told(clouds, times.lag)
+        lidars = _tell_scanners(clouds, times.lag)
     if not settings.objective.static_prior or settings.flow.engine == "paper":
         return flow_between(*clouds, settings.objective, initial)
     start = None if initial is None else checked_cloud(initial, "initial")
@@ -147,14 +152,36 @@ def _flow_of_groups(
 
 
 def _attach_below(points: Float, field: FlowField, low: Int) -> None:
-    """What is just below a mover is its wheels and feet."""
+    """Assign the points just below a moving group to it: wheels and feet."""
     members = np.flatnonzero(field.instance >= 0)
-    if not len(members) or not len(low):
-        return
-    tree = cKDTree(points[members, :2], balanced_tree=False, compact_nodes=False)
-    far, nearest = tree.query(points[low, :2], distance_upper_bound=_BELOW_M)
-    close = np.isfinite(far)
-    field.instance[low[close]] = field.instance[members[np.asarray(nearest)[close]]]
+    if len(members) and len(low):
+        _, row = nearest(tree_of(points[members, :2]), points[low, :2], _BELOW_M)
+        field.instance[low[row >= 0]] = field.instance[members[row[row >= 0]]]
+
+
+def _tell_scanners(clouds: tuple[Float, Float], lag: tuple[Float, Float]) -> tuple[Int, Int] | None:
+    """Return (N,) and (M,) 0 or 1 for two scanners that spin half a turn apart; None if there are
+    no such.
+
+    Time plus or minus azimuth is one number for all points of a spinning scanner, its phase. Where
+    the phases of two scanners are half a turn apart, only the doubled phases agree.
+
+    lag: of the points, as a share of the time between the clouds, a whole number of turns.
+    """
+    both = np.concatenate(clouds)
+    far = np.hypot(both[:, 0], both[:, 1]) > _MIDDLE_M
+    share = max(float(np.ptp(late)) for late in lag)  # of a sweep in the time between the clouds
+    if not far.any() or share <= 0:
+        return None
+    turned = np.concatenate(lag) * (2 * np.pi * max(1, round(1 / share)))
+    azimuth = np.arctan2(both[:, 1], both[:, 0])
+    for phase in (turned + azimuth, turned - azimuth):
+        doubled = np.exp(2j * phase[far]).mean()
+        if abs(doubled) < _MIN_AGREEMENT or abs(np.exp(1j * phase[far]).mean()) > _MAX_SINGLE:
+            continue
+        lidar = (np.cos(phase - np.angle(doubled) / 2) < 0).astype(np.int64)
+        return lidar[: len(clouds[0])], lidar[len(clouds[0]) :]
+    return None
 
 
 def _columns(
@@ -241,3 +268,47 @@ def _beats_standing_still(
     there = target[reached]
     backward = mean_distance(source_tree, there) - mean_distance(cKDTree(arrived), there)
     return min(forward, backward) >= _MIN_GAIN_M
+
+
+# --- as an engine
+
+
+def estimate_motion(scene: Scene, settings: Config, argument: str) -> Motion:
+    """Chain the flow of neighbouring sweeps: the engine ``pairs``, for recordings of two sweeps.
+
+    As `densify.flow.engines.EngineModule`; takes no argument.
+    """
+    of_groups = replace(settings, flow=replace(settings.flow, engine="groups"))
+
+    def step(here: int, there: int) -> FlowField:
+        return _step(scene.stretch, here, there, of_groups)
+
+    return ChainedMotion(scene.stretch, step)
+
+
+def _step(stretch: Stretch, here: int, there: int, settings: Config) -> FlowField:
+    """Flow of one sweep's points to another's reference time; sweeps by number."""
+    pair = [stretch.sweeps[i] for i in (here, there)]
+    sweeps = [s.sweep for s in pair]
+    if min(map(len, sweeps)) == 0:
+        return FlowField.zero(len(sweeps[0]))
+    source, target = (poses.transform(s.T_world_lidar, s.sweep.points) for s in pair)
+    times_ns = _offsets_ns(*sweeps)
+    lidars = [s.lidar for s in sweeps] if any(s.lidar.any() for s in sweeps) else [None, None]
+    field = estimate_flow(source, target, settings, None, *times_ns, *lidars)
+    R_lidar_world = pair[0].T_world_lidar[:3, :3].T
+    displacement = field.displacement @ R_lidar_world.T
+    to_reference = None
+    if field.to_reference is not None and times_ns[0] is not None:
+        # It leads to the middle of the firing times, on which sweeps need not be stamped.
+        late = int(times_ns[0].min()) + np.ptp(times_ns[0]) / 2
+        apart_ns = sweeps[1].stamp_ns - sweeps[0].stamp_ns
+        to_reference = field.to_reference @ R_lidar_world.T - displacement * (late / apart_ns)
+    return replace(field, displacement=displacement, to_reference=to_reference)
+
+
+def _offsets_ns(source: Sweep, target: Sweep) -> tuple[Int | None, Int | None]:
+    """When the points were measured, since the source's reference time."""
+    if source.offset_ns is None or target.offset_ns is None:
+        return None, None
+    return source.offset_ns, target.offset_ns + (target.stamp_ns - source.stamp_ns)

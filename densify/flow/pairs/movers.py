@@ -15,7 +15,6 @@ from dataclasses import replace
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from densify.flow.pairs.evidence import Unexplained, distances_m
 from densify.flow.pairs.hypotheses import (
     Hypotheses,
     PairCloud,
@@ -24,6 +23,7 @@ from densify.flow.pairs.hypotheses import (
 )
 from densify.flow.pairs.refine import Refined, refined
 from densify.flow.pairs.trials import Trial, promising
+from densify.flow.pairs.unexplained import Unexplained, distances_m
 from densify.free_space.ground import HeightMap
 from densify.geometry.nearest import tree_of
 from densify.geometry.types import Float, Int

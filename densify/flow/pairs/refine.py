@@ -23,8 +23,8 @@ from densify.flow.pairs.hypotheses import (
     slope_of,
     thinned,
 )
-from densify.flow.pairs.thinness import settle
 from densify.free_space.ground import HeightMap
+from densify.geometry.compiled import Kernel, inlined
 from densify.geometry.nearest import tree_of
 from densify.geometry.types import Bool, Float, Int
 
@@ -39,6 +39,9 @@ _STANDING = np.zeros(4)
 _LIMIT_M = 0.15
 _MAX_THICK_M = 0.09  # thicker ones are sparse or no surfaces: nothing is learnt from them
 _MAX_WEIGHT = 60.0
+_MIN_NEIGHBORS = 6
+_MIN_WIDTH_M2 = 0.05**2  # neighbours on one ring alone span no plane
+_SIGMA_M2 = 0.02**2  # noise of a surface point
 _PRECISION = np.array([1e3, 1e3, 3e5, 1e4])  # 1/m² from where it starts; 1/rad²
 _SHIFTS_M = (0.3, -0.3)
 _FACTORS = (2.0, 2 / 3)  # where one appearance was taken for the other
@@ -130,7 +133,7 @@ def _arrivals(
 
 @dataclass(frozen=True)
 class _Surfaces:
-    """An object's points in both clouds, see `densify.flow.pairs.thinness.settle`."""
+    """An object's points in both clouds, see `_settle`."""
 
     points: Float
     share: Float
@@ -166,7 +169,7 @@ class _Surfaces:
         """The state after a step for each gate, how thick it leaves the surfaces (m), and the share
         of points that lie on one."""
         state, told = start.copy(), np.empty(2)
-        settle(
+        _settle(
             self.points,
             self.share,
             self.sampling,
@@ -174,8 +177,6 @@ class _Surfaces:
             self.centre,
             self.reach_m,
             gates_m,
-            _LIMIT_M,
-            _MAX_WEIGHT,
             _PRECISION,
             state,
             told,
@@ -191,3 +192,130 @@ def _evenly(cloud: PairCloud, rows: Int) -> Int:
         if len(first) <= _MAX_POINTS:
             return rows[first]
         side_m *= _WIDER
+
+
+@Kernel
+def _settle(
+    points: Float,
+    share: Float,
+    sampling: Int,
+    judges: Bool,
+    centre: Float,
+    reach_m: float,
+    gates_m: Float,
+    precision: Float,
+    state: Float,
+    told: Float,
+) -> None:
+    """Move ``state`` (4,), in place, to where the surfaces are thin, by Gauss-Newton steps.
+
+    points, share: (n,3) as measured after that share (n,) of the motion. A point's distance is that
+    from the plane of the points within ``reach_m`` whose sampling judges its own: sampling (n,),
+    judges (samplings, samplings). gates_m: for each step the distance from which on a point counts
+    nothing. told: (2,) filled with the mean distance, at most ``_LIMIT_M``, and with the share of
+    points that have a plane.
+    """
+    H, g = np.empty((4, 4)), np.empty(4)
+    start, at = state.copy(), np.empty_like(points)
+    for gate_m in gates_m:
+        _bring_back(points, share, centre, state, at)
+        total = _add_up(at, share, sampling, judges, centre, reach_m, gate_m, H, g, told)
+        if total <= 0:
+            break
+        scale = min(1.0, _MAX_WEIGHT / total) / _SIGMA_M2
+        for m in range(4):
+            g[m] = scale * g[m] + precision[m] * (state[m] - start[m])
+            for n in range(4):
+                H[m, n] = scale * H[m, n] + precision[m] * (m == n)
+        state -= np.linalg.solve(H, g)
+    _bring_back(points, share, centre, state, at)
+    _add_up(at, share, sampling, judges, centre, reach_m, _LIMIT_M, H, g, told)
+
+
+@inlined
+def _bring_back(points, share, centre, state, at):  # type: ignore[no-untyped-def]
+    """Fill ``at`` with where the points are at time 0."""
+    for i in range(len(points)):
+        yaw = share[i] * state[3]
+        c, s = np.cos(yaw), np.sin(yaw)
+        dx = points[i, 0] - centre[0] - share[i] * state[0]
+        dy = points[i, 1] - centre[1] - share[i] * state[1]
+        at[i, 0] = c * dx + s * dy + centre[0]
+        at[i, 1] = c * dy - s * dx + centre[1]
+        at[i, 2] = points[i, 2] - share[i] * state[2]
+
+
+@inlined
+def _add(H, g, J, weight, off_m):  # type: ignore[no-untyped-def]
+    """One residual, by its derivatives J (4,), to the normal equations."""
+    for m in range(4):
+        g[m] += weight * J[m] * off_m
+        for n in range(4):
+            H[m, n] += weight * J[m] * J[n]
+
+
+@inlined
+def _add_up(at, share, sampling, judges, centre, reach_m, gate_m, H, g, told):  # type: ignore[no-untyped-def]
+    """Fill the normal equations, by Tukey's weights, and ``told``; returns the weights' sum."""
+    H[:], g[:] = 0.0, 0.0
+    total, distance_m, num_planes, first = 0.0, 0.0, 0, 0
+    squared_reach = reach_m * reach_m
+    J, C = np.empty(4), np.zeros((3, 3))
+    order = np.argsort(at[:, 0])
+    px, py, pz = at[order, 0], at[order, 1], at[order, 2]
+    when, kind = share[order], sampling[order]
+    for k in range(len(px)):
+        x, y, z = px[k], py[k], pz[k]
+        while x - px[first] > reach_m:
+            first += 1
+        W, t, num = 0.0, 0.0, 0
+        mx = my = mz = xx = xy = xz = yy = yz = zz = 0.0
+        for j in range(first, len(px)):
+            dx = px[j] - x
+            if dx > reach_m:
+                break
+            dy, dz = py[j] - y, pz[j] - z
+            squared = dx * dx + dy * dy + dz * dz
+            if squared >= squared_reach or not judges[kind[k], kind[j]]:
+                continue
+            w = 1 - squared / squared_reach
+            w *= w
+            num += 1
+            W += w
+            t += w * when[j]
+            mx += w * dx
+            my += w * dy
+            mz += w * dz
+            xx += w * dx * dx
+            xy += w * dx * dy
+            xz += w * dx * dz
+            yy += w * dy * dy
+            yz += w * dy * dz
+            zz += w * dz * dz
+        if num < _MIN_NEIGHBORS:
+            distance_m += _LIMIT_M
+            continue
+        t, mx, my, mz = t / W, mx / W, my / W, mz / W
+        xx, xy, xz = xx / W - mx * mx, xy / W - mx * my, xz / W - mx * mz
+        yy, yz, zz = yy / W - my * my, yz / W - my * mz, zz / W - mz * mz
+        C[0, 0], C[1, 1], C[2, 2] = xx, yy, zz
+        C[1, 0], C[2, 0], C[2, 1] = xy, xz, yz  # of a symmetric matrix the lower half is read
+        variances, axes = np.linalg.eigh(C)
+        thick, a, b, c = max(variances[0], 0.0), axes[0, 0], axes[1, 0], axes[2, 0]
+        if variances[1] < _MIN_WIDTH_M2:
+            distance_m += _LIMIT_M
+            continue
+        off_m = -(a * mx + b * my + c * mz)
+        distance_m += min(abs(off_m), _LIMIT_M)
+        num_planes += 1
+        if abs(off_m) >= gate_m:
+            continue
+        weight = (1 - (off_m / gate_m) ** 2) ** 2 * _SIGMA_M2 / (_SIGMA_M2 + thick)
+        # The more of the motion the plane was seen after than the point, the farther it is back.
+        later = t - when[k]
+        J[0], J[1], J[2] = a * later, b * later, c * later
+        J[3] = (b * (x - centre[0]) - a * (y - centre[1])) * later
+        total += weight
+        _add(H, g, J, weight, off_m)
+    told[0], told[1] = distance_m / len(px), num_planes / len(px)
+    return total

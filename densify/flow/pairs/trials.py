@@ -13,9 +13,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from densify.flow.pairs.evidence import EXPLAINED_M, MIN_UNEXPLAINED, Unexplained, distances_m
 from densify.flow.pairs.hypotheses import Hypotheses, RigidMotion, thinned
 from densify.flow.pairs.refine import Refined
+from densify.flow.pairs.unexplained import EXPLAINED_M, MIN_UNEXPLAINED, Unexplained, distances_m
 from densify.geometry.nearest import tree_of
 from densify.geometry.types import Bool, Float, Int
 

@@ -1,6 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What of two clouds tells that something moves: points of one without a counterpart in the
-other."""
+"""The evidence of motion in two clouds: points of one without a counterpart in the other."""
 
 from __future__ import annotations
 
@@ -9,7 +8,7 @@ from scipy.spatial import cKDTree
 
 from densify.flow.pairs.hypotheses import PairCloud
 from densify.free_space.ground import HeightMap
-from densify.geometry.linking import link
+from densify.geometry.linking import close_to_seeds, link
 from densify.geometry.nearest import tree_of
 from densify.geometry.types import Bool, Float, Float32, Int
 
@@ -28,11 +27,11 @@ _MAX_LOW_M, _MAX_HIGH_M = 3.4, 6.0  # above the ground, of its lowest and highes
 
 
 class Unexplained:
-    """Which points of a cloud the other one does not explain, and the groups they form.
+    """The points of a cloud that the other one does not explain, and the groups they form.
 
-    distance_m: (N,) to the other cloud, at most the reach. unexplained: (N,). firmly: (N,) nor does
-    another scanner: where two of them see a rail by different rings, each has posts of its own.
-    candidates: (C,) rows that belong to a group. group: (N,) its label, -1 none.
+    distance_m: (N,) to the other cloud, at most 0.6 m. unexplained: (N,). firmly: (N,) unexplained
+    by the other scanners too: two scanners see the posts of a rail by different rings.
+    candidates: (C,) rows that belong to a group. group: (N,) its label, -1 for none.
     """
 
     def __init__(self, cloud: PairCloud, distance_m: Float, alone: Bool) -> None:
@@ -55,15 +54,14 @@ class Unexplained:
         return Unexplained(cloud, own_m, alone)
 
     def tolerance_m(self, rows: Int) -> Float:
-        """How far from a point a counterpart may be: what is sparse in one cloud is in both."""
+        """Return how far from each point a counterpart may be: sparse parts are sparse in both."""
         k = min(_NUM_SPACING + 1, self.cloud.even_tree.n)
         place = self.cloud.places(self.cloud.points[rows], rows)
         spacing_m = np.asarray(self.cloud.even_tree.query(place, [k])[0])[:, 0]
         return np.clip(spacing_m, EXPLAINED_M, _MAX_EXPLAINED_M)
 
     def groups(self, ground: HeightMap) -> list[Int]:
-        """Members of those that are worth a try, by label: crowns of trees and walls of houses are
-        not."""
+        """Return the rows of each group that may be a road user: no crowns of trees, no walls."""
         order = self.candidates[np.argsort(self.group[self.candidates], kind="stable")]
         parts = np.split(order, np.flatnonzero(np.diff(self.group[order])) + 1)
         return [
@@ -75,8 +73,8 @@ class Unexplained:
         ]
 
     def _grouped(self) -> Int:
-        """What is connected is one group if it is no longer than a vehicle and much of it is
-        unexplained; elsewhere only what is close to unexplained points that are not alone."""
+        """Return (N,) labels. Connected points are one group if it is no longer than a vehicle and
+        much of it is unexplained; elsewhere only the points close to unexplained ones."""
         points = self.cloud.points
         num, label = link(points, _LINK_M)
         size = np.bincount(label, minlength=num)
@@ -84,24 +82,14 @@ class Unexplained:
         whole = (share >= _MIN_SHARE) & (_extents_m(points, label, num) <= _MAX_EXTENT_M)
         group = np.where(whole[label], label, -1)
         rest = np.flatnonzero(~whole[label])
-        seeds = rest[self.unexplained[rest]]
-        if not len(seeds):
-            return group
-        tree = tree_of(points[rest])
-        num_near = tree.query_ball_point(points[seeds], _NEAR_M, return_length=True)
-        num_seeds = tree_of(points[seeds]).query_ball_point(
-            points[seeds], _NEAR_M, return_length=True
-        )
-        seeds = seeds[num_seeds >= _MIN_SEED_SHARE * num_near]
-        if len(seeds):
-            far, _ = tree_of(points[seeds]).query(points[rest], distance_upper_bound=_NEAR_M)
-            near = rest[np.isfinite(far)]
-            group[near] = num + link(points[near], _LINK_M)[1]
+        seed = self.unexplained[rest]
+        near = rest[close_to_seeds(points[rest], seed, _NEAR_M, _MIN_SEED_SHARE)]
+        group[near] = num + link(points[near], _LINK_M)[1]
         return group
 
 
 def _extents_m(points: Float, label: Int, num: int) -> Float:
-    """(num,) diagonals of the groups' bounding boxes in the plane."""
+    """Return (num,) the diagonals of the groups' bounding boxes, seen from above."""
     low, high = np.full((num, 2), np.inf), np.full((num, 2), -np.inf)
     np.minimum.at(low, label, points[:, :2])
     np.maximum.at(high, label, points[:, :2])
@@ -109,12 +97,12 @@ def _extents_m(points: Float, label: Int, num: int) -> Float:
 
 
 def _may_drive(height_m: Float32) -> bool:
-    """Whether a group with those heights above the ground may be a road user."""
+    """Return True if a group with those heights above the ground may be a road user."""
     low_m, high_m = np.percentile(height_m, (5, 95))
     return bool(low_m <= _MAX_LOW_M and high_m <= _MAX_HIGH_M)
 
 
 def distances_m(points: Float, tree: cKDTree, workers: int = 1) -> Float:
-    """(N,) to the nearest point of the tree, at most the reach."""
+    """Return (N,) distances to the nearest point of the tree, at most 0.6 m."""
     far = tree.query(points, distance_upper_bound=_REACH_M, workers=workers)[0]
     return np.minimum(far, _REACH_M)
