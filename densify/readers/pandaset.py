@@ -168,8 +168,11 @@ class PandaSet(FileSequence):
             return None
         names = (*_CENTRE, *_WIDTH_LENGTH_HEIGHT, "yaw", "cuboids.sensor_id")
         (x, y, z, width, length, height, yaw, scanner), (uuid,) = _numbers(path, names, ("uuid",))
-        if not np.isin(scanner, (-1, 0, 1)).all():
-            raise InputError(f"{path}: column cuboids.sensor_id: expected -1, 0 or 1")
+        wrong = scanner[~np.isin(scanner, (-1, 0, 1))]
+        if len(wrong):
+            raise InputError(
+                f"{path}: column cuboids.sensor_id: got {wrong[0]}, expected -1, 0 or 1"
+            )
         T_world_box = upright_poses(np.stack([x, y, z], axis=1).astype(float), yaw + np.pi / 2)
         return checked_boxes(
             uuid,
