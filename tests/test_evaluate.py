@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import json
 import re
-import shutil
 from dataclasses import asdict
 from pathlib import Path
 
@@ -16,7 +15,7 @@ import pytest
 from densify.bench.evaluation import evaluate
 from densify.cli import main
 from densify.config.errors import InputError
-from densify.outputs import read_depth_png, read_mask_png, write_depth_png
+from densify.outputs import read_depth_png, write_depth_png
 from densify.readers.depth_trees import DepthPair, pair_depth_files
 from densify.scores.depth_metrics import depth_errors
 
@@ -98,27 +97,6 @@ def test_drive_and_camera_tell_files_apart_where_both_sides_say_them(tmp_path: P
     assert len(pair_depth_files(tmp_path / "run", tmp_path / "t" / DRIVE).pairs) == 1
 
 
-def test_maps_of_single_images_pair_by_their_numbers(tmp_path: Path) -> None:
-    ours = [
-        put(tmp_path / "out" / "000120" / "depth" / "fast" / f"{n:06d}.png") for n in (359, 360)
-    ]
-    ours.append(put(tmp_path / "out" / "000121" / "depth" / "fast" / "000361.png"))
-    put(tmp_path / "out" / "000120" / "confidence" / "fast" / "000359.png")
-    truth = [put(tmp_path / "truth" / f"{n}.png") for n in (359, 360, 361)]
-    pairs = pair_depth_files(tmp_path / "out", tmp_path / "truth").pairs
-    assert [(p.predicted, p.truth) for p in pairs] == list(zip(ours, truth, strict=True))
-
-
-def test_equal_names_pair_in_plain_folders(tmp_path: Path) -> None:
-    for side, names in (("p", ("a", "left_5", "0007")), ("t", ("a", "right_5", "7"))):
-        for name in names:
-            put(tmp_path / side / f"{name}.png")
-    pairs = pair_depth_files(tmp_path / "p", tmp_path / "t")
-    assert [(p.predicted.stem, p.truth.stem) for p in pairs.pairs] == [("0007", "7"), ("a", "a")]
-    assert [path.stem for path in pairs.without_truth] == ["left_5"]
-    assert [path.stem for path in pairs.without_prediction] == ["right_5"]
-
-
 def test_of_our_output_one_product_and_nothing_beside_it(tmp_path: Path) -> None:
     truth = put(tmp_path / "t" / "120.png")
     for product in ("depth", "depth_filled", "confidence"):
@@ -176,43 +154,6 @@ def test_a_set_in_kittis_layout(tmp_path: Path, filled: bool, product: str) -> N
     assert len(both) == 6 and all("/groundtruth/" in p.truth.as_posix() for p in both)
     one = pair_depth_files(made / "train" / NAMES[1], truth).pairs
     assert {p.truth.parents[3].name for p in one} == {NAMES[1]}
-
-
-@pytest.mark.parametrize(("filled", "product"), [(False, "depth"), (True, "depth_filled")])
-def test_a_set_of_runs(tmp_path: Path, filled: bool, product: str) -> None:
-    made, truth = tmp_path / "set", tmp_path / "truth"
-    for drive in NAMES:
-        for kind in ("depth", "depth_filled", "confidence", "age"):
-            put(own(made / drive, 5, kind, "front"))
-        put(made / drive / "000005" / "figure.png")
-        put(tree(truth, drive, "groundtruth", 5))
-    expected = {
-        (own(made / d, 5, product, "front"), tree(truth, d, "groundtruth", 5)) for d in NAMES
-    }
-    pairs = pair_depth_files(made, truth, filled=filled).pairs
-    assert {(p.predicted, p.truth) for p in pairs} == expected
-    assert len(pair_depth_files(made, made, filled=filled).pairs) == 3
-    # A folder that is no drive's says nothing: two drives are too many for it, one is not.
-    made.joinpath(NAMES[0]).rename(tmp_path / "runs")
-    assert "one drive" in refusal(tmp_path, truth)
-    alone = pair_depth_files(tmp_path / "runs", truth / NAMES[0]).pairs
-    assert [p.truth for p in alone] == [tree(truth, NAMES[0], "groundtruth", 5)]
-
-
-@pytest.mark.parametrize("layout", ["kitti-depth", "densify"])
-def test_what_dataset_made(layout: str, tmp_path: Path, border_drive: Path, capsys) -> None:
-    """The whole way: two drives made, one set is evaluated against the other."""
-    other = shutil.copytree(border_drive.parent, tmp_path / "raw") / border_drive.name
-    other = other.rename(other.with_name("night_drive"))
-    options = ["--method", "none", "--keys", "39:41", "--layout", layout]
-    out = tmp_path / "out"
-    arguments = ["dataset", "--data", border_drive, other, *options, "--out", out]
-    assert main([str(argument) for argument in arguments]) == 0
-    capsys.readouterr()
-    assert main(["evaluate", str(out), str(out)]) == 0
-    lines = capsys.readouterr().out.splitlines()
-    assert lines[0].startswith("4 images: ") and not lines[1].startswith("truth")
-    assert " 100.0 % " in next(line for line in lines if line.startswith("all "))
 
 
 def test_masks_pair_too_and_may_be_missing(tmp_path: Path) -> None:
@@ -283,20 +224,6 @@ def test_maps_of_another_size_are_refused(tmp_path: Path) -> None:
         evaluate(pair_depth_files(a, a, mask))
 
 
-def test_masks_of_every_kind(tmp_path: Path) -> None:
-    expected = np.array([[False, True, True]])
-    gray = np.array([[0, 1, 255]])
-    colour = np.array([[[0, 0, 0], [0, 0, 3], [9, 0, 0]]], np.uint8)
-    opaque = np.concatenate([colour, np.full((1, 3, 1), 255, np.uint8)], axis=2)
-    for image in (gray.astype(np.uint8), gray.astype(np.uint16), colour, opaque):
-        assert np.array_equal(read_mask_png(put_mask(tmp_path / "m.png", image)), expected)
-    (tmp_path / "m.png").write_bytes(b"no image")
-    with pytest.raises(InputError, match="not a complete image"):
-        read_mask_png(tmp_path / "m.png")
-    with pytest.raises(InputError, match="cannot be read"):
-        read_mask_png(tmp_path / "nothing.png")
-
-
 def test_kittis_own_truth(test_data) -> None:
     path = test_data / "kitti/depth_annotated_sample" / "groundtruth_0000000050.png"
     same = evaluate(pair_depth_files(path, path))["parts"]
@@ -364,38 +291,6 @@ def test_the_verb_prints_a_table_and_writes_json(
     assert captured.out == "" and "--overwrite" in captured.err
     assert main([*command, "--out", str(file), "--overwrite"]) == 0
     assert file.read_bytes() == before
-
-
-def test_the_verb_scores_filled_maps_on_request(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    put(own(tmp_path / "out", 5), 10.0, 0.0)
-    put(own(tmp_path / "out", 5, "depth_filled"), 10.0, 20.0)
-    put(official(tmp_path / "t", 5), 10.0, 20.0)
-    for options, coverage in (([], "50.0 %"), (["--filled"], "100.0 %")):
-        assert main(["evaluate", str(tmp_path / "out"), str(tmp_path / "t"), *options]) == 0
-        assert coverage in capsys.readouterr().out.splitlines()[2]
-
-
-def test_the_verb_takes_focal_length_and_baseline(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    found, truth = put(tmp_path / "p.png", 11.0), put(tmp_path / "t.png", 10.0)
-    for options, outliers in (
-        ([], "100.000 %"),  # 38.96 px: 3.5 px off
-        (["--focal-px", "600"], "0.000 %"),  # 32.4 px: 2.9 px off
-        (["--focal-px", "600", "--baseline-m", "0.6"], "100.000 %"),  # 36 px: 3.3 px off
-    ):
-        assert main(["evaluate", str(found), str(truth), *options]) == 0
-        assert capsys.readouterr().out.splitlines()[2].endswith(outliers), options
-
-
-@pytest.mark.parametrize("value", ["0", "-1", "nan", "inf", "wide"])
-def test_a_bad_focal_length_is_refused(value: str, capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit) as end:
-        main(["evaluate", "p.png", "t.png", f"--focal-px={value}"])
-    assert end.value.code == 2
-    assert "expected a number above 0" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

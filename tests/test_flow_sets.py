@@ -133,7 +133,7 @@ def test_labels_score_as_the_truth_they_are_made_of(log, tmp_path, capsys):
     command = ["bench", "flow", "--data", str(log), "--key", "2", "--window", "2", *GIVEN]
     command += ["--methods", "ours,rigid"]
     assert main([*command, "--truth", str(labels), "--out", str(out)]) == 0
-    assert "car dynamic" in capsys.readouterr().out
+    assert "challenge bucketed CAR dynamic" in capsys.readouterr().out
     found = json.loads(out.read_text("utf-8"))["runs"][0]
     assert found["num_pairs"] == 2
     exact = bench_flow(

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -60,6 +60,23 @@ def table(rows: Mapping[str, Any], columns: Sequence[Column]) -> str:
         for name, row in rows.items()
     ]
     return aligned([["", *(title for title, _, _ in used)], *body])
+
+
+def numbers_table(columns: Mapping[str, Mapping[str, Any]]) -> str:
+    """Return a table with a column for each mapping and a row for each number in any of them, named
+    by its path."""
+    flat = {title: dict(_numbers(numbers, "")) for title, numbers in columns.items()}
+    names = dict.fromkeys(name for numbers in flat.values() for name in numbers)
+    body = [[name, *(written(c.get(name), ".4g") for c in flat.values())] for name in names]
+    return aligned([["", *columns], *body])
+
+
+def _numbers(values: Mapping[str, Any], path: str) -> Iterator[tuple[str, float]]:
+    for name, value in values.items():
+        if isinstance(value, Mapping):
+            yield from _numbers(value, f"{path}{name} ")
+        elif isinstance(value, float | int):
+            yield f"{path}{name}", value
 
 
 def aligned(rows: Sequence[Sequence[str]]) -> str:

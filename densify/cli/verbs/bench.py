@@ -8,7 +8,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from densify.cli.answer import Answer, Column, look_up, table
+from densify.cli.answer import Answer, numbers_table
 from densify.cli.options import (
     add_camera,
     add_config_options,
@@ -183,57 +183,10 @@ def _answer_flow(options: argparse.Namespace) -> Iterator[Answer]:
                     sequence, key, options.window, config, methods, progress, options.truth
                 )
             runs.append(measured)
-            yield Answer(_flow_table(measured) + "\n", {"runs": [measured]})
+            title = f"{measured['data']}, key {key}, {measured['num_pairs']} pairs"
+            text = f"{title}\n{numbers_table(measured['methods'])}\n"
+            yield Answer(text, {"runs": [measured]})
     yield Answer(files=_written(options, {"runs": runs, "config": as_mapping(config)}))
-
-
-_FLOW_TABLES: tuple[tuple[Column, ...], ...] = (
-    (
-        ("moving", ("step", "movers_m"), ".3f m"),
-        ("static objects", ("step", "static_objects_m"), ".4f m"),
-        ("background", ("step", "background_m"), ".4f m"),
-        ("found", ("step", "found"), ".1%"),
-        ("falsely moving", ("step", "falsely_moving"), ".3%"),
-        ("seconds", ("seconds_per_pair",), ".3f"),
-    ),
-    (
-        ("window: coverage", ("window", "coverage"), ".3f"),
-        ("lost", ("window", "lost"), ".1%"),
-        ("ghosts", ("window", "ghost_rate"), ".2%"),
-        ("IoU of moving", ("segmentation", "moving_iou"), ".3f"),
-        ("panoptic quality", ("segmentation", "panoptic_quality"), ".3f"),
-    ),
-    (
-        ("challenge: dynamic", ("challenge", "three_way", "foreground_dynamic_m"), ".4f m"),
-        ("static objects", ("challenge", "three_way", "foreground_static_m"), ".4f m"),
-        ("background", ("challenge", "three_way", "background_static_m"), ".4f m"),
-        ("three-way", ("challenge", "three_way", "mean_m"), ".4f m"),
-    ),
-)
-
-
-def _flow_table(measured: Mapping[str, Any]) -> str:
-    """Return the scores of steps, of the window, and of the challenges."""
-    methods: Mapping[str, Any] = measured["methods"]
-    frames, some = measured["frames"], next(iter(methods.values()))
-    hops = [
-        (f"{n} hops", ("window", "movers_m_by_hops", n), ".3f m")
-        for n in some["window"].get("movers_m_by_hops", ())
-    ]
-    buckets = [
-        (f"{name.lower().replace('_', ' ')} {kind}", ("challenge", "bucketed", name, key), form)
-        for name in (some["challenge"] or {"bucketed": ()})["bucketed"]
-        for kind, key, form in (("static", "static_m", ".4f m"), ("dynamic", "dynamic", ".3f"))
-    ]
-    lines = [
-        f"{measured['data']}, key {measured['key']}, frames {frames[0]}-{frames[-1]}, "
-        f"{measured['num_pairs']} pairs"
-    ]
-    for columns in (*_FLOW_TABLES, hops, buckets):
-        numbers = [look_up(row, *path) for _, path, _ in columns for row in methods.values()]
-        if any(number is not None for number in numbers):
-            lines += [table(methods, columns), ""]
-    return "\n".join(lines)
 
 
 def _answer_depth(options: argparse.Namespace) -> Iterator[Answer]:
@@ -259,28 +212,8 @@ def _answer_depth(options: argparse.Namespace) -> Iterator[Answer]:
         )
     configs = {name: as_mapping(config) for name, config in variants.items()}
     files = _written(options, {**measured, "config": configs})
-    yield Answer(_depth_table(measured), measured, files)
-
-
-def _depth_table(measured: Mapping[str, Any]) -> str:
-    """Return a table for each truth: coverage and outliers of each product by variant."""
-    from densify.readers.timeline import format_frames
-
-    variants: Mapping[str, Any] = measured["variants"]
-    lines = []
-    for source in dict.fromkeys(source for row in variants.values() for source in row["scores"]):
-        columns: list[Column] = []
-        for product in ("measured", "filled"):
-            columns.append((product, ("density", product), ".1%"))
-            for part in ("all", "moving"):
-                path = ("scores", source, product, part)
-                columns.append((f"coverage, {part}", (*path, "coverage"), ".3f"))
-                columns.append((f"outliers, {part}", (*path, "outliers"), ".3%"))
-        columns.append(("s/key", ("seconds",), ".2f"))
-        keys = format_frames(measured["keys"])
-        lines.append(f"{measured['data']}, keys {keys}, against {source}")
-        lines.append(table(variants, columns) + "\n")
-    return "\n".join(lines)
+    text = f"{measured['data']}, keys {', '.join(map(str, keys))}"
+    yield Answer(f"{text}\n{numbers_table(measured['variants'])}", measured, files)
 
 
 def _answer_paper(options: argparse.Namespace) -> Iterator[Answer]:
@@ -295,8 +228,13 @@ def _answer_paper(options: argparse.Namespace) -> Iterator[Answer]:
             measured[name] = bench.bench_paper(
                 pairs, methods, options.models, options.points, options.curves, progress
             )
-        text = _paper_table(name, measured[name], bench.PUBLISHED.get(name))
-        yield Answer(text + "\n", {"sets": [{"set": name, **measured[name]}]})
+        published = {"as published": bench.PUBLISHED[name]} if name in bench.PUBLISHED else {}
+        lines = [f"{name}: {measured[name]['num_pairs']} pairs, {options.points} points drawn"]
+        lines.append(numbers_table({**measured[name]["methods"], **published}))
+        for kind in ("neighbors", "points"):
+            if kind in measured[name]:
+                lines += [f"paper over {kind}", numbers_table(measured[name][kind])]
+        yield Answer("\n".join([*lines, ""]), {"sets": [{"set": name, **measured[name]}]})
     numbers = {"sets": measured, "published": bench.PUBLISHED}
     yield Answer(files=_written(options, numbers))
 
@@ -329,28 +267,6 @@ def _recording_keys(text: str) -> tuple[str, list[int]]:
     if not spec or not all(key.isdecimal() for key in keys.split(",")):
         raise InputError(f"--data {text}: expected a recording and frames, as street@60,80")
     return spec, [int(key) for key in keys.split(",")]
-
-
-def _paper_table(name: str, measured: Mapping[str, Any], published: Any) -> str:
-    """Return a set's rows, the published one last, then the curves."""
-    columns: tuple[Column, ...] = (
-        ("epe", ("epe_m",), ".3f m"),
-        ("within 5", ("within_5",), ".1%"),
-        ("within 10", ("within_10",), ".1%"),
-        ("angle", ("angle_rad",), ".3f"),
-        ("moving", ("moving_m",), ".3f m"),
-        ("static", ("static_m",), ".4f m"),
-        ("seconds", ("seconds",), ".2f"),
-    )
-    rows = dict(measured["methods"])
-    if published is not None:
-        rows["paper, as published"] = published
-    pairs = f"{measured['num_pairs']} pair{'s' if measured['num_pairs'] != 1 else ''}"
-    parts = [f"{name}: {pairs}, {measured['num_points']} points drawn", table(rows, columns)]
-    for kind, what in (("neighbors", "neighbours k"), ("points", "points drawn")):
-        if kind in measured:
-            parts += [f"{name}: paper over {what}", table(measured[kind], columns)]
-    return "\n".join(parts)
 
 
 def _answer_readme(options: argparse.Namespace) -> Iterator[Answer]:
