@@ -92,7 +92,7 @@ class _Table(NamedTuple):
     """rows: the cells of a scene, a line each. real: has rows of real recordings."""
 
     about: str
-    titles: tuple[str, ...]
+    titles: str
     scenes: tuple[Scene, ...]
     rows: Callable[[Scene], Sequence[Sequence[str]]]
     real: bool = False
@@ -118,8 +118,8 @@ def tables(
     done = 0
     for number, table in enumerate(chosen):
         yield "\n" * (number > 0) + f"{table.about}\n"
-        yield _line(("", *table.titles))
-        yield _line(["---"] * (len(table.titles) + 1))
+        yield f"| | {table.titles} |"
+        yield _line(["---"] * (table.titles.count("|") + 2))
         for scene in scenes[number]:
             for cells in table.rows(scene):
                 yield _line(cells)
@@ -179,10 +179,6 @@ def _rows_of_methods(scene: Scene) -> list[list[str]]:
     ]
 
 
-def _rows_of_depth(scene: Scene) -> list[list[str]]:
-    return [[str(scene), *cells] for _, cells in _depth_cells(scene, {"": resolve(None)})]
-
-
 def _rows_of_parts(scene: Scene) -> list[list[str]]:
     variants = {name: resolve(None, changes) for name, changes in _PARTS.items()}
     return [[f"{scene}: {name}", *cells] for name, cells in _depth_cells(scene, variants)]
@@ -201,10 +197,6 @@ def _depth_cells(scene: Scene, variants: Mapping[str, Config]) -> Iterator[tuple
             cells.append("–" if score["coverage"] is None else f"{score['coverage']:.2f}")
             cells.append(f"{_percent(score['outliers'])} %")
         yield name, cells
-
-
-def _rows_of_flow(scene: Scene) -> list[list[str]]:
-    return [[str(scene), *_flow_cells(scene, scene.window)]]
 
 
 def _rows_of_rates(scene: Scene) -> list[list[str]]:
@@ -246,19 +238,13 @@ def _rows_of_registration(scene: Scene) -> list[list[str]]:
     return [[str(scene), f"{1000 * translation:.0f} mm", f"{np.rad2deg(rotation):.3f}°"]]
 
 
-_FLOW_TITLES = ("found", "one sweep", "five sweeps", "falsely moving", "ghosts")
-_DEPTH_TITLES = ("measured", "outliers", "filled", "outliers", "moving, filled", "outliers")
+_FLOW_TITLES = "found | one sweep | five sweeps | falsely moving | ghosts"
+_DEPTH_TITLES = "measured | outliers | filled | outliers | moving, filled | outliers"
 TABLES: Mapping[str, _Table] = {
     "methods": _Table(
         "One sweep, ICP, ICP over 40 m of road each way, ours; measured depth except where filled.",
-        (
-            "density",
-            "outliers",
-            "outliers, moving objects",
-            "coverage, moving objects",
-            "ours, filled: outliers at density",
-            "ghosts: ICP, ours",
-        ),
+        "density | outliers | outliers, moving objects | coverage, moving objects "
+        "| ours, filled: outliers at density | ghosts: ICP, ours",
         _PRESETS,
         _rows_of_methods,
     ),
@@ -266,7 +252,7 @@ TABLES: Mapping[str, _Table] = {
         "Coverage of the true pixels within a scanner's reach, and outliers.",
         _DEPTH_TITLES,
         _DEPTH,
-        _rows_of_depth,
+        lambda scene: [[str(scene), *c] for _, c in _depth_cells(scene, {"": resolve(None)})],
         real=True,
     ),
     "parts": _Table(
@@ -277,20 +263,23 @@ TABLES: Mapping[str, _Table] = {
         "those found.",
         _FLOW_TITLES,
         _FLOW,
-        _rows_of_flow,
+        lambda scene: [[str(scene), *_flow_cells(scene, scene.window)]],
     ),
     "rings": _Table(
-        "The same with 32 and 16 rings, and a rosette.", _FLOW_TITLES, _RINGS, _rows_of_flow
+        "The same with 32 and 16 rings, and a rosette.",
+        _FLOW_TITLES,
+        _RINGS,
+        lambda scene: [[str(scene), *_flow_cells(scene, scene.window)]],
     ),
     "rates": _Table(
         "The same streets at 5, 10 and 20 Hz, half a second on each side.",
-        (*_FLOW_TITLES[:2], "0.4 s", *_FLOW_TITLES[3:], *_DEPTH_TITLES[:4]),
+        f"{_FLOW_TITLES.replace('five sweeps', '0.4 s')} | measured | outliers | filled | outliers",
         _RATES,
         _rows_of_rates,
     ),
     "registration": _Table(
         "Errors of the poses of eleven sweeps relative to the key's, root mean square.",
-        ("translation", "rotation"),
+        "translation | rotation",
         _REGISTERED,
         _rows_of_registration,
     ),
