@@ -115,16 +115,6 @@ def test_too_few_partners_are_none() -> None:
     assert model.align(corner(MIN_FIT, 1), CENTRE, still, STD) is not None
 
 
-def test_a_model_of_few_and_of_many_points() -> None:
-    for num_points in (1, 2, 8, 5000):
-        model = Model(corner(num_points, 0))
-        assert len(model.points) <= 1500 and len(model.information) == len(model.points)
-        assert np.isfinite(model.information).all()
-        before = model.points
-        model.add(corner(10, 1))
-        assert len(model.points) <= 1500 and (model.points[0] == before[0]).all()
-
-
 @pytest.mark.parametrize("flat", [False, True])
 def test_surface_information_is_the_inverse_covariance(flat: bool) -> None:
     rng = np.random.default_rng(4)

@@ -126,16 +126,6 @@ def test_sweeps_within_a_tenth_of_a_second_are_one_batch(time_ms, together):
         assert batch.half_s == pytest.approx((last - first) / 2000)
 
 
-def test_rows_go_to_the_batch_and_back():
-    seen = [line(np.arange(n), np.zeros(n, int), n) for n in (4, 0, 3)]
-    batch = Batch.of((0, 1, 2), seen, Clock(np.array([0, 33, 66]) * MS))
-    assert batch.obstacles.time_s.tolist() == [4, 4, 4, 4, 3, 3, 3]
-    free = [np.array(c, bool) for c in ([1, 0, 1, 1], [], [0, 1, 0])]
-    assert batch.gather(free).tolist() == [1, 0, 1, 1, 0, 1, 0]
-    own = batch.split(np.array([0, 2, 4, 6]))
-    assert {j: rows.tolist() for j, rows in own.items()} == {0: [0, 2], 2: [0, 2]}
-
-
 def test_clusters_that_come_close_in_another_sweep_are_one():
     """The second sweep's first cluster bridges two of the first's. Its second is far from all."""
     first = line([0.0, 1.0, 5.0, 1.5], [0, 1, 2, -1])

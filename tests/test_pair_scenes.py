@@ -102,16 +102,6 @@ def test_similar_cars_in_a_row_keep_their_places():
     check(pair, estimated(pair))
 
 
-def test_oncoming_and_turning():
-    pair = pair_of(car(16.0, 1.8, 8.0, 1, np.pi), car(13.0, -3.0, 6.0, 2, 0.3, 0.6))
-    field = estimated(pair)
-    check(pair, field)
-    turning = (pair.instance == 2) & field.moving
-    truth = pair.truth[turning]
-    assert np.ptp(truth, axis=0).max() > 0.1  # a translation cannot do it
-    assert np.linalg.norm(field.displacement[turning] - truth, axis=1).mean() < 0.06
-
-
 def test_without_the_ground():
     pair = pair_of(car(14.0, 1.5, 12.0, 1))
     a, b = pair.source_height_m > 0.2, pair.target_height_m > 0.2

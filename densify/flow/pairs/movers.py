@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: MIT
-"""Rigid groups of one cloud that certainly moved to where another cloud has them.
+"""The rigid groups of one cloud that certainly moved to their place in another cloud.
 
-A point is unexplained if the other cloud has no counterpart for it where it stands. Connected
-groups with many such points are aligned with the other cloud where they may have gone
-(`densify.flow.pairs.hypotheses`), and move if that explains, in both clouds, what standing still
-leaves unexplained.
+A point is unexplained if the other cloud has no counterpart at its position. Connected groups with
+many such points are aligned with the other cloud at several candidate positions
+(`densify.flow.pairs.hypotheses`). A group moves if that explains, in both clouds, the points that
+are unexplained if it is static.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ def find_movers(
     initial: Float | None = None,
     apart_s: float | None = None,
 ) -> tuple[list[RigidMotion], Int]:
-    """The motions, and (N,) which of them each source point takes, -1 none.
+    """Return the motions, and (N,) the motion of each source point, -1 for none.
 
     ground: under both clouds. initial: (N,3) flow; a group is also tried at the median of its
     members'. apart_s: the time between the clouds, None where unknown: what moves at up to 38 m/s
@@ -78,7 +78,7 @@ def find_movers(
 def _choose(
     trials: list[Trial], groups: list[Int], ours: Unexplained, theirs: Unexplained
 ) -> tuple[list[RigidMotion], Int]:
-    """The motions that are taken, at most one per group; each target is explained once."""
+    """Choose at most one motion per group, so that each target is explained once."""
     free = np.ones(len(theirs.unexplained), bool)
     trials = _thinnest([t for t in trials if t.proves(free)])
     assigned = _assigned(trials, theirs.group)
@@ -95,8 +95,8 @@ def _choose(
 
 
 def _thinnest(trials: list[Trial]) -> list[Trial]:
-    """The trials without those that leave an object's surfaces thicker than another motion close by
-    does: that tells better than nearest points, which are content with any ring."""
+    """Drop the trials whose surfaces are thicker than those of another motion close by: nearest
+    points fit any ring."""
     kept = []
     for trial in trials:
         others_m = [
@@ -112,10 +112,10 @@ def _thinnest(trials: list[Trial]) -> list[Trial]:
 
 
 def _assigned(trials: list[Trial], target_group: Int) -> list[Trial]:
-    """Each group to another group of the target, all together as well as possible: among similar
-    cars in a row every one could take the next one's place, but the last finds none.
+    """Assign groups to groups of the target with the greatest total gain.
 
-    A group that is only a part of an object may go unassigned for what it gains alone.
+    In a row of similar cars, each could take the place of the next, but the last would find none.
+    A group that is only a part of an object may stay unassigned, for its own gain.
     """
     best: dict[tuple[int, int], Trial] = {}
     for trial in trials:
@@ -137,8 +137,8 @@ def _assigned(trials: list[Trial], target_group: Int) -> list[Trial]:
 def _attach(
     motions: list[RigidMotion], instance: Int, ours: Unexplained, theirs: Unexplained
 ) -> None:
-    """Give points close to a mover its motion if that explains them: those that standing still
-    leaves unexplained from farther away."""
+    """Give points close to a moving group its motion if that explains them; unexplained points
+    from farther away."""
     points = ours.cloud.points
     members, others = np.flatnonzero(instance >= 0), np.flatnonzero(instance < 0)
     if not len(members) or not len(others):

@@ -1,12 +1,11 @@
 # SPDX-License-Identifier: MIT
 """Motions refined until an object's surfaces, brought to one time, are thin.
 
-The rings of a scanner lie elsewhere on an object that has moved, and nearest points, content with
-any ring, hold it back; where two scanners share a sweep it is there twice, half of the motion
-apart, and they are content between. A plane through the points around, several rings of them, is
-not: it lets a surface slide along itself, and the other surfaces say how far (as surfel maps are
-registered: Stückler and Behnke, "Multi-Resolution Surfel Maps", JVCI 2014; here the planes are made
-anew in every step, from whatever else was measured of the object, each point at its own time).
+The rings of a scanner lie elsewhere on an object that has moved. Nearest points fit any ring, so
+they hold the motion back. Where two scanners share a sweep, an object appears twice, half of the
+motion apart. Planes through several rings let a surface slide along itself, and the other surfaces
+tell how far (as in Stückler, Behnke, "Multi-Resolution Surfel Maps", JVCI 2014). Here the planes
+are made anew in every step, from all other points of the object, each at its own time.
 """
 
 from __future__ import annotations
@@ -52,8 +51,8 @@ _ARRIVED_POINTS = 300
 
 
 class Refined(NamedTuple):
-    """A motion, and how thick it leaves the object's surfaces (m), as a share of how thick they are
-    if it stands besides; None where too few points lie on surfaces."""
+    """A motion with the thickness of the object's surfaces (m), and its ratio to that of the static
+    object; None where too few points lie on surfaces."""
 
     motion: RigidMotion
     thickness_m: float | None = None
@@ -69,7 +68,7 @@ def refined(
     ground: HeightMap,
     timed: bool,
 ) -> Refined:
-    """The motion of the source's ``members`` where that makes the object thinner, else as it is.
+    """Refine the motion of the source's ``members``; keep it as it is if that is no thinner.
 
     candidates: rows of the target that may be the object's. timed: lags are known: every scanner's
     points are compared with those of all others, each at its own time; otherwise with the other
@@ -102,7 +101,7 @@ def refined(
 
 
 def _starts(motion: RigidMotion, slope: Float, source: PairCloud, timed: bool) -> list[Float]:
-    """Where to begin, on the ground: at the motion, and where it may have been held back from."""
+    """Return starts on the ground: the motion, and others from which it may be held back."""
     way = motion.state[:2]
     length_m = np.linalg.norm(way)
     factors = (1.0, *(1 + shift / length_m for shift in _SHIFTS_M if length_m + shift > 0))
@@ -120,7 +119,7 @@ def _arrivals(
     target: PairCloud,
     candidates: Int,
 ) -> Int:
-    """Which of the target's candidates are near where one of the motions takes the members."""
+    """Return the target's candidates near the members after one of the motions."""
     points = source.points[thinned(members, _ARRIVED_POINTS)]
     arrived = np.concatenate([motion.seen(points) for motion in motions])
     low, high = arrived.min(0) - _NEAR_M, arrived.max(0) + _NEAR_M
@@ -166,8 +165,8 @@ class _Surfaces:
         )
 
     def settled(self, start: Float, gates_m: Float) -> tuple[Float, float, float]:
-        """The state after a step for each gate, how thick it leaves the surfaces (m), and the share
-        of points that lie on one."""
+        """Return the state after a step for each gate, the thickness of the surfaces (m), and the
+        share of points that lie on one."""
         state, told = start.copy(), np.empty(2)
         _settle(
             self.points,
@@ -185,7 +184,7 @@ class _Surfaces:
 
 
 def _evenly(cloud: PairCloud, rows: Int) -> Int:
-    """One of each scanner's points in a voxel, of the size that leaves few enough."""
+    """Thin the rows to one point of each scanner per voxel, few enough in all."""
     side_m = _SIDE_M
     while True:
         first = one_per_voxel(cloud.places(cloud.points[rows], rows), side_m)

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: MIT
-"""What motions of groups explain in two clouds, and whether that proves them.
+"""The test of a group's motion between two clouds: does it explain what differs?
 
-Nearest points alone cannot tell: a scanner's rings lie elsewhere on an object that has moved, the
-more the nearer it is. So each motion that may be right is refined until the object's surfaces are
-thin (`densify.flow.pairs.refine`) and judged by both: by what it explains, and by how thin the
-surfaces are, compared with those of the same points if they stand.
+Nearest points alone cannot tell. The rings of a scanner lie elsewhere on an object that has moved.
+Each promising motion is refined until the object's surfaces are thin (`densify.flow.pairs.refine`).
+It is judged by the points that it explains, and by the thickness of the surfaces compared with that
+of a static object.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ class Trial:
     def of(
         group: int, members: Int, refined: Refined, ours: Unexplained, theirs: Unexplained
     ) -> Trial:
-        """The motion of the source's ``members`` judged by nearest points."""
+        """Judge the motion of the source's ``members`` by nearest points."""
         sample = thinned(members, _LOOK_POINTS)
         place = ours.cloud.places(refined.motion.seen(ours.cloud.points[sample]), sample)
         far, tolerance_m = distances_m(place, theirs.cloud.tree), ours.tolerance_m(sample)
@@ -87,18 +87,17 @@ class Trial:
         )
 
     def after(self, found: Refined, settled: Trial) -> Trial:
-        """The trial with the motion that was found from this one, judged by nearest points where
-        they fit better: here, or as ``settled`` has it. A ring drawn onto another fits, but holds
-        back."""
+        """Return the trial of the refined motion. It is judged by nearest points before or after
+        the refinement, whichever fits better: rings drawn onto each other fit, but hold back."""
         here, there = (t._off(len(t.around) - len(t.explained)) for t in (self, settled))
         return replace(self, refined=found) if here < there else settled
 
     def left_there(self, free: Bool) -> int:
-        """free: (M,) targets that no other motion explains."""
+        """Return the targets left unexplained. free: (M,) those that no other motion explains."""
         return len(self.around) - int(free[self.explained].sum())
 
     def may_prove(self) -> bool:
-        """Whether it explains enough if its surfaces come out thin."""
+        """Return True if it explains enough, provided that its surfaces come out thin."""
         far_m = float(np.linalg.norm(self.refined.motion.state[:2]))
         return (
             self.firmly >= MIN_UNEXPLAINED[0]
@@ -109,8 +108,8 @@ class Trial:
         )
 
     def proves(self, free: Bool) -> bool:
-        """Whether that is enough: less need be explained where surfaces are thin, nearly all where
-        they are as thin without the motion."""
+        """Return True if the motion is confirmed. Less must be explained where the surfaces are
+        thin, and nearly all where they are as thin without the motion."""
         left_there = self.left_there(free)
         off = self._off(left_there)
         if (
@@ -169,10 +168,10 @@ def promising(
 
 
 def _ambiguous(points: Float, way: Float) -> bool:
-    """Whether a flat group moves along itself, or it is but a line: so does the strip of a wall
-    that shows through a gap when the scanner moves, and its edge is any other's like. So does a
-    piece of a rail, that can be any other piece, also of the rail beside: a level bar is proven to
-    move only if it may be the back of a car, so far away that few rings meet it, and across itself.
+    """Return True if the group cannot be told from another part of the same surface.
+
+    A flat group that moves along itself may be the strip of a wall seen through a gap. A level bar
+    may be any piece of a rail, unless it moves across itself and has the size of a far car's back.
     """
     _, scale, axes = np.linalg.svd(points - points.mean(0), full_matrices=False)
     length_m, width_m, thickness_m = scale / np.sqrt(len(points))

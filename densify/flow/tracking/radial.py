@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Radial velocities, as FMCW lidars measure them: what they say of motion without any other sweep.
-
-They tell one of the three components of a point's velocity, the one along its ray.
-"""
+"""Radial velocities, as FMCW lidars measure them: the component of velocity along the ray."""
 
 from __future__ import annotations
 
@@ -22,10 +19,10 @@ _SWINGS_M_S = 3.0
 
 @dataclass(frozen=True)
 class Radial:
-    """What a sweep's points measured, own motion removed.
+    """The radial velocities of a sweep's points, ego motion removed.
 
-    ray: (N,3) unit vectors from the scanner, world axes. m_s: (N,) away along it, NaN where it was
-    not measured. spread_m_s: standard deviation of what stands, robust.
+    ray: (N,3) unit vectors from the scanner, world axes. m_s: (N,) along the ray, NaN where not
+    measured. spread_m_s: robust standard deviation, mostly of static points.
     """
 
     ray: Float
@@ -44,12 +41,12 @@ class Radial:
         return Radial(poses.rotate(registered.T_world_lidar, ray), m_s, spread_m_s)
 
     def rows(self, rows: Int | Bool) -> Radial:
-        """Those of some points."""
+        """Return the radial velocities of some points."""
         return Radial(self.ray[rows], self.m_s[rows], self.spread_m_s)
 
     @staticmethod
     def together(parts: list[Radial]) -> Radial:
-        """Those of several sweeps, one after the other."""
+        """Concatenate those of several sweeps."""
         return Radial(
             np.concatenate([part.ray for part in parts]),
             np.concatenate([part.m_s for part in parts]),
@@ -57,12 +54,12 @@ class Radial:
         )
 
     def moving(self) -> Bool:
-        """(N,) faster along the ray than noise can be."""
+        """Return (N,) True for points faster along the ray than noise can be."""
         return np.abs(np.nan_to_num(self.m_s)) > max(_LEAST_M_S, _SPREADS * self.spread_m_s)
 
     def corrected(self, velocity_m_s: Float) -> Float:
-        """(3,) of a rigid object: along the mean ray of its points as measured, across it as
-        given."""
+        """Return the velocity (3,) of a rigid object with its component along the mean ray of its
+        points replaced by the measured one."""
         known = np.isfinite(self.m_s)
         if not known.any():
             return velocity_m_s
@@ -74,13 +71,13 @@ class Radial:
         return velocity_m_s + missing_m_s * ray / length**2
 
     def contradicts(self, velocity_m_s: Float) -> Bool:
-        """(N,) points measured much slower or faster than (N,3); limbs swing at some m/s."""
+        """Return (N,) True for points much slower or faster than (N,3); limbs swing at some m/s."""
         off_m_s = np.abs(self.m_s - np.einsum("ni,ni->n", self.ray, velocity_m_s))
         return np.nan_to_num(off_m_s) > max(_SWINGS_M_S, _SPREADS * self.spread_m_s)
 
     def agrees(self, velocity_m_s: Float) -> bool:
-        """Whether points that move so, (N,3), have these radial velocities, at least in the median;
-        True where none was measured."""
+        """Return True if velocities (N,3) have these radial velocities, in the median; True where
+        none was measured."""
         known = np.isfinite(self.m_s)
         if not known.any():
             return True
