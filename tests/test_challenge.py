@@ -66,39 +66,6 @@ def test_the_numbers_of_the_challenges_own_package():
     assert scores.three_way.mean_m == pytest.approx(sum(THREE_WAY) / 3, rel=1e-6)
 
 
-@pytest.mark.parametrize("close", [True, False])
-def test_three_way_of_av2(close):
-    """The package's own evaluation, run here. It counts signs and animals as objects, which the
-    challenge of 2024 leaves out: they get no label."""
-    evaluation = pytest.importorskip(
-        "av2.evaluation.scene_flow.eval", reason="av2 is not installed (it pulls torch and kornia)"
-    )
-    pandas = pytest.importorskip("pandas")
-    from av2.evaluation.scene_flow.constants import FOREGROUND_BACKGROUND_BREAKDOWN
-
-    tables = []
-    for points, estimated, true, kind in frames():
-        moving = np.linalg.norm(true, axis=1) >= 0.05
-        results = evaluation.compute_metrics(
-            estimated,
-            np.linalg.norm(estimated, axis=1) >= 0.05,
-            true,
-            kind,
-            moving,
-            np.logical_and.reduce(np.abs(points[:, :2]) <= 35.0, axis=1),
-            np.array(CLASS_OF)[kind] != IGNORED,
-            FOREGROUND_BACKGROUND_BREAKDOWN,
-        )
-        tables.append(pandas.DataFrame(results))
-    theirs = evaluation.results_to_dict(pandas.concat(tables))
-    end = "/Close" if close else ""
-    ours = scored(35.0 if close else math.inf).scores().three_way
-    parts = ("Foreground/Dynamic", "Foreground/Static", "Background/Static")
-    assert ours[:3] == pytest.approx([theirs[f"EPE/{part}{end}"] for part in parts], rel=1e-6)
-    if not close:
-        assert ours.mean_m == pytest.approx(theirs["EPE 3-Way Average"], rel=1e-6)
-
-
 def test_buckets_as_a_loop():
     cells: dict[tuple[str, int], list[tuple[float, float]]] = {}
     for points, estimated, true, kind in frames():

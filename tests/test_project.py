@@ -528,18 +528,4 @@ def test_no_depth_is_invented_between_two_surfaces(step):
     assert (filled[5:25, 5:15] > 0).mean() > 0.95
 
 
-@given(st.integers(0, 2**32 - 1))
-@settings(max_examples=20, deadline=None)
-def test_filled_depth_and_confidence_stay_within_those_around(seed):
-    rng = np.random.default_rng(seed)
-    depth = (rng.uniform(4, 6, (16, 20)) * (rng.uniform(size=(16, 20)) < 0.2)).astype(np.float32)
-    given_confidence = (rng.uniform(0.2, 1, depth.shape) * (depth > 0)).astype(np.float32)
-    filled, confidence = fill_between(depth, given_confidence, (2, 3))
-    for v, u in zip(*np.nonzero((depth == 0) & (filled > 0)), strict=True):
-        window = np.s_[max(0, v - 3) : v + 4, max(0, u - 2) : u + 3]
-        around = depth[window][depth[window] > 0]
-        assert around.min() * 0.999 <= filled[v, u] <= around.max() * 1.001
-        assert 0 < confidence[v, u] <= 0.84 * given_confidence[window].max()
-
-
 # --- real -----------------------------------------------------------------------------------------
