@@ -114,14 +114,14 @@ def _own_time_ns(sequence: LidarSequence, key: int) -> tuple[int, int]:
         return np.iinfo(np.int64).min, np.iinfo(np.int64).max
     half_ns = int(_JITTER / 2 * np.median(np.diff(list(stamps_ns.values()))))
     middle_ns = stamps_ns[key]
-    before = [s for s in stamps_ns.values() if s < middle_ns]
-    after = [s for s in stamps_ns.values() if s > middle_ns]
-    begin_ns, end_ns = middle_ns - half_ns, middle_ns + half_ns
-    if before:
-        begin_ns = max(begin_ns, (before[-1] + middle_ns) // 2)
-    if after:
-        end_ns = min(end_ns, (middle_ns + after[0]) // 2)
-    return begin_ns, end_ns
+    before_ns = max(
+        (s for s in stamps_ns.values() if s < middle_ns), default=middle_ns - 2 * half_ns
+    )
+    after_ns = min(
+        (s for s in stamps_ns.values() if s > middle_ns), default=middle_ns + 2 * half_ns
+    )
+    begin_ns = max(middle_ns - half_ns, (before_ns + middle_ns) // 2)
+    return begin_ns, min(middle_ns + half_ns, (middle_ns + after_ns) // 2)
 
 
 class InView(NamedTuple):
@@ -174,7 +174,9 @@ class Exposure:
             for name, row in (("previous", at - 1), ("next", at + 1)):
                 if 0 <= row < len(numbers):
                     exposed_ns = stamps_ns[numbers[row]]
-                    frame = _nearest(stretch, exposed_ns)
+                    sweeps_ns = [s.sweep.stamp_ns for s in stretch.sweeps]
+                    nearest = np.argmin(np.abs(np.array(sweeps_ns) - exposed_ns))
+                    frame = stretch.frames[int(nearest)]
                     begin_ns, end_ns = _own_time_ns(sequence, frame)
                     if not begin_ns < exposed_ns <= end_ns:
                         continue
@@ -193,23 +195,18 @@ class Exposure:
         late = points + self.late_s * velocity_m_s if velocity_m_s.any() else points
         points_cam = poses.transform(self.T_cam_key, late)
         uv, inside = image_points(self.camera, points_cam)
-        if not self.camera.is_rolling:
-            return self._sight(points_cam, uv, inside)
+        there = points_cam
         velocity_cam = poses.rotate(self.T_cam_key, velocity_m_s.astype(np.float64))
         last = np.array([self.camera.width_px - 1, self.camera.height_px - 1])
         time_s = np.array([self.camera.column_time_s, self.camera.row_time_s])
-        row_s, there = np.zeros((len(points), 1)), points_cam
-        for _ in range(_NUM_ROW_STEPS):
+        for _ in range(_NUM_ROW_STEPS if self.camera.is_rolling else 0):
             pixel = np.where(np.isnan(uv), last / 2, np.clip(uv, 0, last))
             row_s = ((pixel - last / 2) * time_s).sum(axis=1, keepdims=True)
             turn = np.hstack([-row_s * self.twist[:3], np.zeros((len(points), 3))])
             ahead = points_cam + row_s * (velocity_cam - self.twist[3:])
             there = poses.transform_each(turn, ahead)
             uv, inside = image_points(self.camera, there)
-        return self._sight(there, uv, inside)
-
-    def _sight(self, points_cam: Float, uv: Float, on_image: Bool) -> Sight:
-        return Sight(points_cam, uv, on_image & (self.depth_m(points_cam) > NEAREST_M))
+        return Sight(there, uv, inside & (self.depth_m(there) > NEAREST_M))
 
     def sees(self, cloud: Cloud) -> InView:
         """Return the part of a cloud, at the key's reference time, that is on the image."""
@@ -221,11 +218,6 @@ class Exposure:
     def depth_m(self, points_cam: Float) -> Float:
         """Return (N,) depth of points (N,3), as ``measure`` says."""
         return depth_along(points_cam, self.measure)
-
-
-def _nearest(stretch: Stretch, stamp_ns: int) -> int:
-    """Return the frame of the sweep nearest in time."""
-    return min(stretch.sweeps, key=lambda s: abs(s.sweep.stamp_ns - stamp_ns)).frame
 
 
 def _exposure(
