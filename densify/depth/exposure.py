@@ -112,16 +112,11 @@ def _own_time_ns(sequence: LidarSequence, key: int) -> tuple[int, int]:
                 raise
     if len(stamps_ns) < 2:
         return np.iinfo(np.int64).min, np.iinfo(np.int64).max
-    half_ns = int(_JITTER / 2 * np.median(np.diff(list(stamps_ns.values()))))
-    middle_ns = stamps_ns[key]
-    before_ns = max(
-        (s for s in stamps_ns.values() if s < middle_ns), default=middle_ns - 2 * half_ns
-    )
-    after_ns = min(
-        (s for s in stamps_ns.values() if s > middle_ns), default=middle_ns + 2 * half_ns
-    )
-    begin_ns = max(middle_ns - half_ns, (before_ns + middle_ns) // 2)
-    return begin_ns, min(middle_ns + half_ns, (middle_ns + after_ns) // 2)
+    every_ns, middle_ns = [*stamps_ns.values()], stamps_ns[key]
+    most_ns = int(_JITTER * np.median(np.diff(every_ns)))
+    before_ns = max([middle_ns - most_ns, *(s for s in every_ns if s < middle_ns)])
+    after_ns = min([middle_ns + most_ns, *(s for s in every_ns if s > middle_ns)])
+    return (before_ns + middle_ns) // 2, (middle_ns + after_ns) // 2
 
 
 class InView(NamedTuple):
@@ -196,12 +191,12 @@ class Exposure:
         points_cam = poses.transform(self.T_cam_key, late)
         uv, inside = image_points(self.camera, points_cam)
         there = points_cam
-        velocity_cam = poses.rotate(self.T_cam_key, velocity_m_s.astype(np.float64))
         last = np.array([self.camera.width_px - 1, self.camera.height_px - 1])
         time_s = np.array([self.camera.column_time_s, self.camera.row_time_s])
         for _ in range(_NUM_ROW_STEPS if self.camera.is_rolling else 0):
             pixel = np.where(np.isnan(uv), last / 2, np.clip(uv, 0, last))
             row_s = ((pixel - last / 2) * time_s).sum(axis=1, keepdims=True)
+            velocity_cam = poses.rotate(self.T_cam_key, velocity_m_s.astype(np.float64))
             turn = np.hstack([-row_s * self.twist[:3], np.zeros((len(points), 3))])
             ahead = points_cam + row_s * (velocity_cam - self.twist[3:])
             there = poses.transform_each(turn, ahead)
