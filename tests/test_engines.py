@@ -15,9 +15,7 @@ from densify.config.cache import Cache
 from densify.config.errors import InputError
 from densify.config.plugins.engines import ENGINES, engine
 from densify.flow.engines import Scene, check_engine, estimate_motion, motion_type
-from densify.flow.tracking.candidates import find_candidates
 from densify.free_space.ground import ground
-from densify.free_space.seen_through import FreeSpace
 from densify.geometry.types import Stretch
 from tests import scenes
 
@@ -56,27 +54,6 @@ def test_sweeps_that_are_not_asked_for_tell_what_moves_all_the_same(driving: Sce
     alone = Scene(Stretch(driving.stretch.sweeps[1:4]), driving.ground)
     few = estimate_motion(alone, config)
     assert any((part.flow(f, 5).total != few.flow(f, 5).total).any() for f in asked)
-
-
-def test_what_a_scene_is_asked_for_is_made_once(driving: Scene) -> None:
-    assert driving.space is driving.space and driving.candidates is driving.candidates
-    space, candidates = driving.space, driving.candidates
-    made = []
-
-    def of(found):
-        return lambda: (made.append(found), found)[1]
-
-    handed = Scene(driving.stretch, driving.ground, of(space), of(candidates))
-    motion = estimate_motion(handed, Config())
-    assert handed.space is space and handed.candidates is candidates and len(made) == 2
-    expected = estimate_motion(driving, Config())
-    for frame in driving.stretch.frames:
-        got, wanted = motion.flow(frame, 5), expected.flow(frame, 5)
-        np.testing.assert_array_equal(got.displacement, wanted.displacement)
-        assert wanted.moving.any()
-    fresh = find_candidates(driving.stretch, FreeSpace.of(driving.stretch), driving.ground)
-    for found, again in zip(candidates, fresh, strict=True):
-        np.testing.assert_array_equal(found.cluster, again.cluster)
 
 
 @pytest.mark.parametrize("row", [r for r in ENGINES.built_in if r.shared], ids=lambda r: r.name)

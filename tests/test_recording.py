@@ -6,7 +6,6 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import replace
-from itertools import pairwise, product
 from pathlib import Path
 
 import numpy as np
@@ -15,18 +14,15 @@ import pytest
 from densify.config import Config, resolve
 from densify.config.cache import Cache
 from densify.config.errors import InputError, SweepError
-from densify.free_space.range_image import RangeImage
 from densify.geometry import poses
-from densify.geometry.types import Stretch, Sweep
-from densify.pipeline import blocks, steps
+from densify.geometry.types import Sweep
+from densify.pipeline import blocks
+from densify.pipeline import recording as recording_module
 from densify.pipeline import run as pipeline
 from densify.pipeline.recording import Recording
 from densify.readers.street import Street
-from densify.readers.timeline import read_sweep
-from densify.registration.deskew import deskew
-from densify.registration.trajectory import find_trajectory
 from tests.dataset_scenes import BORDER, across_border
-from tests.scenes import SWEEP_S, Arc, Scanner, Scene, TinySequence, World, by_flow, car, street
+from tests.scenes import Arc, Scanner, Scene, TinySequence, World, by_flow, car, street
 from tests.small_street import POSES_GIVEN
 
 LIMIT = 10**9
@@ -35,10 +31,9 @@ GIVEN = resolve(POSES_GIVEN)
 
 @pytest.fixture
 def small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Blocks of 6 sweeps that look 6 beyond, so that short recordings have many."""
-    for name, seconds in (("BLOCK_S", 0.6), ("MARGIN_S", 0.6), ("BEYOND_WINDOW_S", 0.4)):
-        monkeypatch.setattr(blocks, name, seconds)
-    monkeypatch.setattr(steps, "REACH_S", 0.4)
+    """Blocks of 6 sweeps that look 4 beyond, so that short recordings have many."""
+    monkeypatch.setattr(blocks, "BLOCK_S", 0.6)
+    monkeypatch.setattr(blocks, "AROUND_S", 0.4)
 
 
 @pytest.fixture(scope="module")
@@ -103,74 +98,7 @@ def test_keys_do_not_depend_on_others(small_blocks, long_street, tmp_path: Path)
     assert_same_maps(maps_of(drive_of(long_street, tmp_path / "a"), 6).depth, first)
 
 
-# Seams
-
-
-def test_neighbouring_blocks_say_the_same_of_what_both_know(
-    small_blocks, long_street, tmp_path: Path
-) -> None:
-    drive = drive_of(long_street, tmp_path)
-    for last in (5, 11):
-        before, after = drive.motion(last), drive.motion(last + 1)
-        both = [f for f in drive.window(last).frames if f in drive.window(last + 1).frames]
-        assert both == list(range(last - 1, last + 3))
-        num_moving, num_differing, apart_m = 0, 0, []
-        for frame, target in product(both, (last, last + 1)):
-            a, b = before.flow(frame, target), after.flow(frame, target)
-            num_moving += (a.moving & b.moving).sum()
-            num_differing += (a.moving != b.moving).sum()
-            known = a.moving & b.moving & ~a.lost & ~b.lost
-            apart_m.append(np.linalg.norm(a.displacement - b.displacement, axis=1)[known])
-        assert num_differing < 0.02 * num_moving
-        assert num_moving > 500
-        median_m, most_m = np.percentile(np.concatenate(apart_m), [50, 90])
-        assert median_m < 0.01
-        assert most_m < 0.05
-
-
-# Poses
-
-
-def steps_between(stretch) -> np.ndarray:
-    T = [sweep.T_world_lidar for sweep in stretch.sweeps]
-    return np.stack([poses.inverse(a) @ b for a, b in pairwise(T)])
-
-
-def test_poses_over_a_border_are_those_registered_in_one_go(tmp_path: Path) -> None:
-    sequence = across_border(scanner=Scanner(48, 720))
-    config = resolve({})
-    drive = drive_of(sequence, tmp_path, 4, config)
-    sweeps = [read_sweep(sequence, frame, config.register) for frame in sequence.frames]
-    whole = deskew(sweeps, find_trajectory(sweeps, config.register))
-    for key in (BORDER - 1, BORDER):
-        window = drive.window(key)
-        assert window.frames == tuple(f for f in sequence.frames if abs(f - key) <= 4)
-        part = Stretch(tuple(whole[f] for f in window.frames))
-        np.testing.assert_allclose(steps_between(window), steps_between(part), atol=0.01)
-
-
-def test_sweeps_at_a_border_are_deskewed_by_their_neighbours_in_the_other_block(
-    tmp_path: Path,
-) -> None:
-    sequence = across_border()
-    sequence.T_world_lidar = lambda f: sequence.scene.T_world_lidar(
-        0.1 * (f + 0.02 * (f - 36) ** 2)
-    )
-    drive = drive_of(sequence, tmp_path, 4)
-    early, late = drive.window(BORDER - 1), drive.window(BORDER)
-    for frame in (BORDER - 1, BORDER):
-        i = early.frames.index(frame)
-        here, there = early[frame], late[frame]
-        for name in ("twist_before", "twist_after"):
-            np.testing.assert_allclose(getattr(here, name), getattr(there, name), atol=1e-9)
-        np.testing.assert_allclose(here.sweep.points, there.sweep.points, atol=1e-12)
-        np.testing.assert_allclose(
-            here.twist_after, poses.log(steps_between(early)[i]) / SWEEP_S, atol=1e-9
-        )
-        np.testing.assert_allclose(
-            here.twist_before, poses.log(steps_between(early)[i - 1]) / SWEEP_S, atol=1e-9
-        )
-        assert abs(here.twist_after - here.twist_before).max() > 0.05
+# Windows
 
 
 def test_no_window_is_cut_at_a_border(tmp_path: Path) -> None:
@@ -185,7 +113,7 @@ def test_no_window_is_cut_at_a_border(tmp_path: Path) -> None:
 def test_odometry_starts_half_a_second_before_the_window_at_any_rate(step: int, first: int) -> None:
     frames = [f for f in range(BORDER - 12, BORDER + 5) if (f - BORDER) % step == 0]
     recording = Recording(across_border(frames), GIVEN, 2, [BORDER])
-    (piece,) = recording.steps.registration(0).pieces
+    (piece,) = recording.registration(0).pieces
     assert piece.frames[0] - BORDER == first
     assert recording.window(BORDER).frames[0] - BORDER == -2 * step
 
@@ -203,8 +131,6 @@ def test_a_hole_in_time_ends_windows_and_begins_a_world(tmp_path: Path) -> None:
     for key, around in pieces.items():
         window = drive.window(key)
         assert window.frames == tuple(BORDER + i for i in around)
-        own = next(s for s in window.sweeps if s.frame // 20 == key // 20)
-        np.testing.assert_array_equal(own.T_world_lidar, np.eye(4))
         assert drive.motion(key).flow(key, key).displacement.shape[1] == 3
     assert "lie between frames" in drive.window_frames(BORDER - 1).cuts[0]
     end = drive.window(BORDER + 7)[BORDER + 7]
@@ -289,13 +215,13 @@ def counted(monkeypatch: pytest.MonkeyPatch) -> Counter[str]:
 
         return count
 
-    for name in ("find_trajectory", "ground", "find_candidates", "estimate_motion"):
-        monkeypatch.setattr(steps, name, counting(name, getattr(steps, name)))
-    monkeypatch.setattr(RangeImage, "of", staticmethod(counting("images", RangeImage.of)))
+    for name in ("find_trajectory", "ground", "estimate_motion"):
+        found = getattr(recording_module, name)
+        monkeypatch.setattr(recording_module, name, counting(name, found))
     return counts
 
 
-ONCE = {"find_trajectory": 2, "ground": 2, "find_candidates": 2, "estimate_motion": 2}
+ONCE = {"find_trajectory": 1, "ground": 2, "estimate_motion": 2}  # both blocks look at all
 
 
 def use(sequence, folder: Path, config: Config = GIVEN, window: int = 2) -> None:
@@ -307,14 +233,13 @@ def use(sequence, folder: Path, config: Config = GIVEN, window: int = 2) -> None
 def test_each_step_is_made_once_of_the_same_inputs(counted: Counter[str], tmp_path: Path) -> None:
     sequence = across_border()
     use(sequence, tmp_path)
-    assert counted == {**ONCE, "images": len(sequence.frames)}
+    assert counted == ONCE
     counted.clear()
     use(sequence, tmp_path)
-    use(sequence, tmp_path, window=3)  # only the keys' windows are larger
     use(sequence, tmp_path, resolve({**POSES_GIVEN, "project": {"support": 3}}))
     assert counted == {}
     use(sequence, tmp_path, resolve({**POSES_GIVEN, "objective": {"alpha": 3}}))
-    assert counted == {"estimate_motion": 2}
+    assert counted == {"estimate_motion": 2, "ground": 2}
     counted.clear()
     whole = Damaged(sequence)
     last = sequence.frames[-1]
@@ -324,8 +249,7 @@ def test_each_step_is_made_once_of_the_same_inputs(counted: Counter[str], tmp_pa
     scans[last] = replace(scans[last], sweep=nudged)
     sequence.scene.scan = scans.__getitem__
     use(whole, tmp_path)
-    assert counted["find_trajectory"] == 1  # of the block with the sweep
-    assert counted["ground"] == counted["find_candidates"] == counted["estimate_motion"] == 2
+    assert counted == ONCE
 
 
 # Several keys
@@ -339,13 +263,7 @@ def test_keys_whose_windows_overlap_share_what_they_can(counted: Counter[str], l
         (4, 5, 6, 7, 8),
         (7, 8, 9, 10, 11),
     ]
-    assert counted == {
-        "find_trajectory": 1,
-        "ground": 1,
-        "find_candidates": 1,
-        "estimate_motion": 1,
-        "images": 13,  # of ten sweeps, and of each key by itself
-    }
+    assert counted == {"find_trajectory": 1, "ground": 1, "estimate_motion": 1}
 
 
 @pytest.mark.parametrize("bad", [None, 12], ids="sweep {} cannot be read".format)
@@ -396,8 +314,8 @@ def test_a_long_row_of_keys_is_parted(long_street) -> None:
     timeline = Recording(long_street, GIVEN, 1).timeline
     long = replace(timeline, frames=tuple(range(100)), stamp_ns=10**8 * np.arange(100))
     parted = blocks.Cut.around(long, 3, range(10, 90))
-    assert [len(b.frames) for b in parted.blocks] == [26, 26, 26, 26]
-    assert all(parted.blocks[n].frames[0] + 3 <= k for k, n in parted.number_of.items())
+    assert [len(frames) for frames in parted.blocks] == [26, 26, 26, 26]
+    assert all(parted.blocks[n][0] + 3 <= k for k, n in parted.number_of.items())
 
 
 def test_of_two_sweeps_the_pair_alone_tells_what_moves() -> None:

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection
+from collections.abc import Collection
 from dataclasses import dataclass, is_dataclass
 from functools import cached_property
 from typing import Protocol, cast, get_type_hints
@@ -21,27 +21,22 @@ from densify.geometry.types import Motion, Stretch
 class Scene:
     """The input of an engine: registered sweeps in one world, their ground and free space.
 
-    ground: under all sweeps. make_space, make_candidates: return what is known already, as from a
-    cache. asked: frames whose flow will be asked for, None for all; the other sweeps only help to
-    find what moves.
+    ground: under all sweeps. asked: frames whose flow will be asked for, None for all; the other
+    sweeps only help to find what moves.
     """
 
     stretch: Stretch
     ground: HeightMap
-    make_space: Callable[[], FreeSpace] | None = None
-    make_candidates: Callable[[], tuple[Candidates, ...]] | None = None
     asked: Collection[int] | None = None
 
     @cached_property
     def space(self) -> FreeSpace:
         """The free space that each sweep observed."""
-        return FreeSpace.of(self.stretch) if self.make_space is None else self.make_space()
+        return FreeSpace.of(self.stretch)
 
     @cached_property
     def candidates(self) -> tuple[Candidates, ...]:
         """The points of each sweep that may move."""
-        if self.make_candidates is not None:
-            return self.make_candidates()
         return find_candidates(self.stretch, self.space, self.ground)
 
     def is_asked(self, i: int) -> bool:

@@ -1,46 +1,33 @@
 # SPDX-License-Identifier: MIT
-"""The blocks of sweeps that a recording is cut into; each step works on one block."""
+"""The blocks of sweeps that a recording is cut into: keys that share registration and motion."""
 
 from __future__ import annotations
 
 from bisect import bisect_right
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
 
 from densify.readers.timeline import Timeline, check_key, check_window
 
 BLOCK_S = 2.0
-MARGIN_S = 1.5  # around a block within which its motion is found,
-BEYOND_WINDOW_S = 0.5  # and at least this far beyond the windows of its keys
-
-
-class Block(NamedTuple):
-    """Sweeps whose results are made together. begin_ns, end_ns: the time they fill."""
-
-    frames: tuple[int, ...]
-    begin_ns: int
-    end_ns: int
+AROUND_S = 1.0  # what moves is looked for at least this far around a block of a whole recording
 
 
 @dataclass(frozen=True)
 class Cut:
-    """A recording cut into blocks.
+    """Blocks, ascending in time, which may overlap.
 
-    blocks: ascending in time. number_of: frame of a key -> its block. margin_s: how far around a
-    block its steps look; 0: blocks are independent and may overlap. num_kept: deskewed sweeps that
-    are worth keeping in memory.
+    blocks: the frames of each: the windows of its keys, and what is between and around them.
+    number_of: key -> its block.
     """
 
-    blocks: tuple[Block, ...]
+    blocks: tuple[tuple[int, ...], ...]
     number_of: Mapping[int, int]
-    margin_s: float
-    num_kept: int
 
     def number_near(self, frame: int) -> int:
-        """Return the block of a frame, or of the last sweep before it where it has none."""
-        frames = sorted(self.number_of)
-        return self.number_of[frames[max(0, bisect_right(frames, frame) - 1)]]
+        """Return the block of a frame, or of the last key before it."""
+        keys = sorted(self.number_of)
+        return self.number_of[keys[max(0, bisect_right(keys, frame) - 1)]]
 
     def keys_of(self, number: int) -> list[int]:
         """Return the keys of a block."""
@@ -48,22 +35,15 @@ class Cut:
 
     @staticmethod
     def whole(timeline: Timeline, window: int) -> Cut:
-        """Cut all sweeps into blocks of `BLOCK_S`, counted from time 0.
+        """Cut all sweeps, as keys, into blocks of `BLOCK_S`, counted from time 0.
 
         The same sweeps make the same maps, whatever keys are asked for.
         """
-        check_window(window)
-        length_ns = round(BLOCK_S * 1e9)
-        members: dict[int, list[int]] = {}
+        groups: dict[int, list[int]] = {}
         for frame in timeline.frames:
-            members.setdefault(timeline.stamp_of(frame) // length_ns, []).append(frame)
-        blocks = tuple(
-            Block(tuple(frames), at * length_ns, (at + 1) * length_ns)
-            for at, frames in sorted(members.items())
-        )
-        number_of = {f: number for number, block in enumerate(blocks) for f in block.frames}
-        margin_s = max(MARGIN_S, window * timeline.period_ns * 1e-9 + BEYOND_WINDOW_S)
-        return Cut(blocks, number_of, margin_s, 2 * window + 3)
+            groups.setdefault(timeline.stamp_of(frame) // round(BLOCK_S * 1e9), []).append(frame)
+        window = max(_checked(window), timeline.num_in(AROUND_S))
+        return _cut(timeline, window, [groups[at] for at in sorted(groups)])
 
     @staticmethod
     def around(
@@ -76,27 +56,31 @@ class Cut:
         """
         for key in keys:
             check_key(key)
-        check_window(window)
-        window += round(beyond_s * 1e9 / timeline.period_ns)
+        window = _checked(window) + round(beyond_s * 1e9 / timeline.period_ns)
         groups: list[list[int]] = []
-        spans: list[tuple[int, int]] = []
         for key in sorted(set(keys)):
-            frames = timeline.window(key, window).frames
-            first, last = timeline.row[frames[0]], timeline.row[frames[-1]]
-            together = groups and (
-                first <= spans[-1][1]
+            first = timeline.row[timeline.window(key, window).frames[0]]
+            if (
+                groups
+                and first <= timeline.row[timeline.window(groups[-1][-1], window).frames[-1]]
                 and timeline.stamp_of(key) - timeline.stamp_of(groups[-1][0]) < BLOCK_S * 1e9
-            )
-            if together:
+            ):
                 groups[-1].append(key)
-                spans[-1] = (spans[-1][0], last)
             else:
                 groups.append([key])
-                spans.append((first, last))
-        blocks = []
-        for first, last in spans:
-            frames = timeline.frames[first : last + 1]
-            end_ns = timeline.stamp_of(frames[-1]) + 1
-            blocks.append(Block(frames, timeline.stamp_of(frames[0]), end_ns))
-        number_of = {key: number for number, group in enumerate(groups) for key in group}
-        return Cut(tuple(blocks), number_of, 0.0, max((len(b.frames) for b in blocks), default=0))
+        return _cut(timeline, window, groups)
+
+
+def _checked(window: int) -> int:
+    check_window(window)
+    return window
+
+
+def _cut(timeline: Timeline, window: int, groups: Sequence[Sequence[int]]) -> Cut:
+    blocks = []
+    for keys in groups:
+        first = timeline.window(keys[0], window).frames[0]
+        last = timeline.window(keys[-1], window).frames[-1]
+        blocks.append(timeline.frames[timeline.row[first] : timeline.row[last] + 1])
+    number_of = {key: number for number, keys in enumerate(groups) for key in keys}
+    return Cut(tuple(blocks), number_of)

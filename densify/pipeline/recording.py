@@ -1,23 +1,32 @@
 # SPDX-License-Identifier: MIT
-"""A recording, and what is known around each of its keys.
+"""A recording, and the steps that its keys share, each made once for a block of sweeps::
 
-The sweeps are cut into blocks (`densify.pipeline.blocks`), and the steps that keys share are made
-block by block (`densify.pipeline.steps`). `run` and `compare` cut around a few keys, which look at
-nothing else; `dataset` and `flow_steps` cut the whole recording, so that the same sweeps make the
-same maps whatever else is asked for.
+    registration   poses of the block's sweeps, piece by piece
+    deskewed       sweeps in the world of their piece
+    ground         height map
+    motion         motion of everything, by free-space violations
+    far            static surfaces along the road, measured beyond the windows
+
+Sweeps that cannot be read or registered, and holes in time, split a block into pieces, each with a
+world of its own. `run` and `compare` cut blocks around a few keys, which look at nothing else;
+`dataset` and `flow_steps` cut the whole recording (`densify.pipeline.blocks`). Registration, motion
+and far are kept in the cache.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection
-from typing import NamedTuple
+import types
+from collections.abc import Callable, Collection, Iterable, Sequence
+from functools import lru_cache
+from typing import Any, NamedTuple, TypeVar, cast
 
 from densify.config import Config
-from densify.config.cache import Cache
-from densify.config.errors import InputError
+from densify.config.cache import Cache, kept
+from densify.config.errors import InputError, SweepError, UnfitSweepError
 from densify.config.plugins.engines import engine as engine_row
 from densify.depth.accumulate import accumulate, object_tracks
-from densify.flow.engines import Scene, estimate_motion
+from densify.flow.engines import Scene, SharedMotion, estimate_motion, motion_type
+from densify.free_space.ground import HeightMap, ground
 from densify.geometry import poses
 from densify.geometry.types import (
     Cloud,
@@ -30,12 +39,18 @@ from densify.geometry.types import (
     StandingWorld,
     Stretch,
     StretchFlow,
+    Trajectory,
 )
 from densify.pipeline.blocks import Cut
 from densify.pipeline.costs import Watch
-from densify.pipeline.steps import Steps
-from densify.readers.timeline import Timeline, WindowFrames
-from densify.registration.trajectory import LeftOut
+from densify.pipeline.road import Road
+from densify.pipeline.sweeps import Sweeps
+from densify.readers.timeline import Timeline, WindowFrames, recorded_trajectory
+from densify.registration.deskew import deskew
+from densify.registration.trajectory import LeftOut, Registration, find_trajectory
+
+T = TypeVar("T")
+LEAD_IN_S = 0.5  # sweeps before a block from which odometry learns the speed
 
 
 class Moment(NamedTuple):
@@ -54,7 +69,7 @@ class Beyond(NamedTuple):
 
 
 class Recording:
-    """A sequence with settings, and what the steps find in it."""
+    """A sequence with settings, and what the steps find in it. The last results stay in memory."""
 
     def __init__(
         self,
@@ -77,19 +92,29 @@ class Recording:
         Raises InputError if a key does not exist.
         """
         self.sequence, self.settings = sequence, settings
-        self.timeline = Timeline.of(sequence)
-        self._num_around, self._watch = window, watch or Watch()
+        self.timeline = timeline = Timeline.of(sequence)
+        self._num_around, self._watch, self._cache = window, watch or Watch(), cache
         if keys is None:
-            self.cut = Cut.whole(self.timeline, window)
+            self.cut = Cut.whole(timeline, window)
         else:
-            self.cut = Cut.around(self.timeline, window, keys)
+            self.cut = Cut.around(timeline, window, keys)
             if looks_around and engine_row(settings.flow.engine)[0].shared:
-                self.cut = Cut.around(self.timeline, window, keys, self._around_s(keys))
-        self.steps = Steps(
-            sequence, settings, self.timeline, self.cut, window, cache, run, self._watch
+                self.cut = Cut.around(timeline, window, keys, self._look_around_s(keys))
+        self._is_whole = keys is None
+        most = max((len(block) for block in self.cut.blocks), default=0)
+        num_raw = most + timeline.num_in(LEAD_IN_S)
+        self._sweeps = Sweeps(
+            sequence, timeline, settings.register, num_raw, cache, run, self._watch
         )
+        self.registration = lru_cache(maxsize=2)(self._registration)
+        self._pieces = lru_cache(maxsize=2)(self._find_pieces)
+        self._deskewed = lru_cache(maxsize=most)(self._deskew)
+        self._stretch = lru_cache(maxsize=1)(self._make_stretch)
+        self._ground = lru_cache(maxsize=2)(self._find_ground)
+        self._motion = lru_cache(maxsize=2)(self._find_motion)
+        self._far = lru_cache(maxsize=1)(self._find_far)
 
-    def _around_s(self, keys: Collection[int]) -> float:
+    def _look_around_s(self, keys: Collection[int]) -> float:
         """Return how far beyond the windows to look, by the number of points of the first key."""
         settings = self.settings.flow
         if settings.look_around_s is not None or not keys:
@@ -100,6 +125,8 @@ class Recording:
             return 0.0
         return settings.around_s(num_points / (self.timeline.period_ns * 1e-9))
 
+    # A key
+
     def window_frames(self, key: int) -> WindowFrames:
         """Return the frames of a key's window, and where it is cut and why.
 
@@ -107,15 +134,14 @@ class Recording:
         cannot be registered; SweepError if none of its neighbours can.
         """
         whole = self.timeline.window(key, self._num_around)
-        bad: dict[int, LeftOut] = {}
-        for b in self.steps.blocks_around(self.cut.number_of[key]):
-            own = self.cut.blocks[b].frames
-            bad |= {f: why for f, why in self.steps.registration(b).bad.items() if f in own}
+        number = self.cut.number_of[key]
+        block = self.cut.blocks[number]
+        bad = {f: why for f, why in self.registration(number).bad.items() if f in block}
         if key in bad:
             raise bad[key].error(key)
         reasons = {f: why.reason for f, why in bad.items()}
         window = self.timeline.window(key, self._num_around, reasons)
-        piece = self.steps.pieces(self.cut.number_of[key])[self._piece(key)]
+        piece = self._piece(key)
         window = WindowFrames(tuple(f for f in window.frames if f in piece.frames), window.cuts)
         failed = [f for f in whole.frames if f in bad and not bad[f].unreadable]
         if failed and len(window.frames) == 1:
@@ -124,11 +150,11 @@ class Recording:
 
     def window(self, key: int) -> Stretch:
         """Return the registered, deskewed sweeps of a key's window. Errors as `window_frames`."""
-        return self.steps.stretch(self.cut.number_of[key], self.window_frames(key).frames)
+        return self._stretch(self.cut.number_of[key], self.window_frames(key).frames)
 
     def around(self, key: int) -> Stretch:
         """Return the sweeps in which the motion in a key's window is found."""
-        return self.steps.stretch(self.cut.number_of[key], self._frames_around(key))
+        return self._stretch(self.cut.number_of[key], self._frames_around(key))
 
     def is_pair(self, key: int) -> bool:
         """Return True if there are two sweeps around a key: a track needs three."""
@@ -140,20 +166,20 @@ class Recording:
         engine: None for that of ``flow.engine``; for two sweeps ``pairs`` replaces ``groups``.
         """
         engine, number = engine or self.settings.flow.engine, self.cut.number_of[key]
-        window, index = self.window(key), self._piece(key)
+        window, index = self.window(key), self._piece_number(key)
         if engine == "groups" and self.is_pair(key):
             engine = "pairs"
         if not engine_row(engine)[0].shared:
-            scene = Scene(window, self.steps.ground(number)[index])
-            return estimate_motion(scene, self.settings, engine)
-        motion = self.steps.motion(number, engine)[index]
+            return estimate_motion(
+                Scene(window, self._ground(number)[index]), self.settings, engine
+            )
         # All poses, but the points of the window only.
-        at_hand, piece = {s.frame: s for s in window.sweeps}, self.steps.pieces(number)[index]
+        at_hand, piece = {s.frame: s for s in window.sweeps}, self._piece(key)
         sweeps = [
             at_hand.get(f) or RegisteredSweep.without_points(piece, f)
             for f in self._frames_around(key)
         ]
-        return motion.with_stretch(Stretch(tuple(sweeps)))
+        return self._motion(number, engine)[index].with_stretch(Stretch(tuple(sweeps)))
 
     def step(self, frame: int) -> StretchFlow:
         """Return the flow of a sweep to the next; no step where none follows.
@@ -198,16 +224,160 @@ class Recording:
         """
         if not self.settings.accumulate.far_m:
             return None
-        number, index = self.cut.number_of[key], self._piece(key)
-        found, piece = self.steps.far(number)[index], self.steps.pieces(number)[index]
+        found = self._far(self.cut.number_of[key])[self._piece_number(key)]
         if not len(found.frames):
             return None
+        piece = self._piece(key)
         return Beyond(found, poses.inverse(piece.T_world_lidar[piece.frames.index(key)]))
 
-    def _piece(self, key: int) -> int:
+    def _piece_number(self, key: int) -> int:
         """Return which of the pieces of its block holds the key."""
-        pieces = self.steps.pieces(self.cut.number_of[key])
+        pieces = self._pieces(self.cut.number_of[key])
         return next(i for i, piece in enumerate(pieces) if key in piece.frames)
 
+    def _piece(self, key: int) -> Trajectory:
+        return self._pieces(self.cut.number_of[key])[self._piece_number(key)]
+
     def _frames_around(self, key: int) -> tuple[int, ...]:
-        return self.steps.frames(self.cut.number_of[key])[self._piece(key)]
+        return self._frames(self.cut.number_of[key])[self._piece_number(key)]
+
+    # The steps of a block
+
+    def _registration(self, number: int) -> Registration:
+        """Register each run of neighbouring sweeps, split again at a sweep that fails."""
+        settings, frames = self.settings.register, self._registered_together(number)
+
+        def make() -> Registration:
+            self._sweeps.prepare(frames)
+            sweeps, bad, pieces = {}, {}, []
+            for frame in frames:
+                try:
+                    self._sweeps.recorded_pose(frame)
+                    sweeps[frame] = self._sweeps.read(frame)
+                except InputError as error:
+                    bad[frame] = LeftOut(str(error), unreadable=True)
+            left = self.timeline.runs(sweeps)
+            while left:
+                together = left.pop()
+                run = [sweeps[f] for f in together]
+                recorded = None
+                if settings.source == "dataset":
+                    recorded = recorded_trajectory(self.sequence, run)
+                try:
+                    with self._watch.stage("register"):
+                        pieces.append(find_trajectory(run, settings, recorded))
+                except SweepError as error:
+                    unfit = isinstance(error, UnfitSweepError)
+                    bad[error.frame] = LeftOut(str(error), unreadable=False, unfit=unfit)
+                    left += self.timeline.runs([f for f in together if f != error.frame])
+            return Registration(tuple(sorted(pieces, key=lambda p: p.frames)), bad)
+
+        return self._kept("registration", Registration, frames, make)
+
+    def _registered_together(self, number: int) -> list[int]:
+        """Return the frames of a block, behind those of its lead-in."""
+        block = self.cut.blocks[number]
+        return [*self.timeline.before(block[0], self.timeline.num_in(LEAD_IN_S)), *block]
+
+    def _find_pieces(self, number: int) -> list[Trajectory]:
+        """Return the poses of each piece, and of one sweep before it to tell how the lidar moved.
+
+        The world is the lidar of the piece's first sweep in the block, upright.
+        """
+        block = frozenset(self.cut.blocks[number])
+        wanted = block.union(self.timeline.before(self.cut.blocks[number][0], 1))
+        pieces = []
+        for piece in self.registration(number).pieces:
+            in_block = [f for f in piece.frames if f in block]
+            if in_block:
+                part = piece.part([f for f in piece.frames if f in wanted])
+                pieces.append(part.seen_from(in_block[0]))
+        return pieces
+
+    def _frames(self, number: int) -> list[tuple[int, ...]]:
+        """Return the frames of each piece, without the one before it."""
+        block = frozenset(self.cut.blocks[number])
+        return [tuple(f for f in p.frames if f in block) for p in self._pieces(number)]
+
+    def _deskew(self, number: int, frame: int) -> RegisteredSweep:
+        piece = next(p for p in self._pieces(number) if frame in p.frames)
+        sweep = self._sweeps.read(frame)
+        with self._watch.stage("deskew"):
+            return deskew([sweep], piece).sweeps[0]
+
+    def _make_stretch(self, number: int, frames: tuple[int, ...]) -> Stretch:
+        """Return these sweeps of one piece, deskewed, in its world."""
+        return Stretch(tuple(self._deskewed(number, f) for f in frames))
+
+    def _find_ground(self, number: int) -> list[HeightMap]:
+        """Return the ground under each piece."""
+        found = []
+        for frames in self._frames(number):
+            stretch = self._stretch(number, frames)
+            with self._watch.stage("ground"):
+                found.append(ground(stretch))
+        return found
+
+    def _find_motion(self, number: int, engine: str) -> list[SharedMotion]:
+        """Return the motion in each piece, without its points."""
+        asked = self._in_windows(number)
+
+        def make() -> list[SharedMotion]:
+            motions = []
+            for frames, heights in zip(self._frames(number), self._ground(number), strict=True):
+                scene = Scene(self._stretch(number, frames), heights, asked=asked)
+                with self._watch.stage("flow"):
+                    motion = estimate_motion(scene, self.settings, engine)
+                motions.append(cast(SharedMotion, motion).with_stretch(Stretch(())))
+            return motions
+
+        kind: Any = types.GenericAlias(list, (motion_type(engine),))
+        settings = [engine, self.settings.flow, self.settings.objective, sorted(asked)]
+        frames = self._registered_together(number)
+        found: list[SharedMotion] = self._kept("motion", kind, frames, make, settings)
+        return found
+
+    def _find_far(self, number: int) -> list[StandingWorld]:
+        """Return the static surfaces along the road of each piece, in its world."""
+        cameras = list(self.sequence.cameras.values())
+        far_m, settings = self.settings.accumulate.far_m, self.settings.register
+        road = Road(self.timeline, self._sweeps, cameras, settings, far_m)
+        # Sweeps of the block beyond the windows are as far as the rest of the road.
+        inside, pieces = self._in_windows(number), self._frames(number)
+        near = [tuple(f for f in frames if f in inside) or frames for frames in pieces]
+
+        def make() -> list[StandingWorld]:
+            worlds = []
+            for frames in near:
+                keys = [k for k in self.cut.keys_of(number) if k in frames]
+                stretch = self._stretch(number, frames)
+                with self._watch.stage("far"):
+                    worlds.append(road.find_standing(stretch, keys, with_near=len(keys) > 1))
+            return worlds
+
+        if not self._is_whole:  # to make it costs less than to read the road for a digest
+            return make()
+        along = sorted({f for frames in near for f in road.frames(frames)})
+        return self._kept("far", list[StandingWorld], along, make, [far_m, cameras, near])
+
+    def _in_windows(self, number: int) -> frozenset[int]:
+        """Return the frames of the windows of a block's keys."""
+        keys = self.cut.keys_of(number)
+        windows = (self.timeline.window(key, self._num_around).frames for key in keys)
+        return frozenset(frame for frames in windows for frame in frames)
+
+    def _kept(
+        self,
+        step: str,
+        kind: type[T],
+        frames: Iterable[int],
+        make: Callable[[], T],
+        settings: Sequence[Any] = (),
+    ) -> T:
+        """Return what ``make`` returns, or the cache has of the same sweeps and settings."""
+
+        def inputs() -> Any:
+            content = [(f, self._sweeps.content(f)) for f in frames]
+            return [self.settings.register, self.timeline.period_ns, content, list(settings)]
+
+        return kept(self._cache, step, kind, inputs, make)
