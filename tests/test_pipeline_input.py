@@ -31,13 +31,6 @@ def test_progress_names_every_stage():
         assert steps[0][0] == 0 and steps[-1][0] == steps[-1][1]
 
 
-def test_only_the_frames_needed_are_read():
-    sequence = one_car(())
-    run(sequence, KEY, 1, "icp", config={"register": {"source": "dataset"}})
-    assert set(sequence.read) == set(range(KEY - 3, KEY + 2))
-    assert len(sequence.read) == 5
-
-
 def test_the_data_sets_poses_are_taken_as_they_are():
     sequence = one_car(())
     result = run(sequence, KEY, 1, "icp", config=POSES_GIVEN)
@@ -85,19 +78,6 @@ def test_without_truth_there_are_no_errors_of_depth():
     assert "depth" not in result.metrics and result.metrics["ghosts"]["num_points"] > 0
 
 
-def test_a_window_of_the_key_alone():
-    usual = ("none", "icp", "flow")
-    results = compare(one_car(()), KEY, 0, config=POSES_GIVEN, methods=usual)
-    for other in ("icp", "flow"):
-        assert np.array_equal(results["none"].cloud.points, results[other].cloud.points)
-
-
-def test_at_the_start_of_the_recording():
-    result = by_flow(one_car(), 0, 2, config=POSES_GIVEN)
-    assert result.frames == (0, 1, 2)
-    assert result.warnings[0] == "the window is cut to frames 0-2: the recording begins at frame 0"
-
-
 def test_a_sweep_without_times_is_not_deskewed():
     class Timeless(TinySequence):
         def __getitem__(self, frame):
@@ -108,16 +88,6 @@ def test_a_sweep_without_times_is_not_deskewed():
     result = by_flow(sequence, KEY, 1, config=POSES_GIVEN)
     own = result.cloud.frame == KEY
     kept = read_sweep(sequence, KEY, RegisterSettings())
-    np.testing.assert_allclose(result.cloud.points[own], kept.points, atol=1e-9)
-
-
-def test_deskewing_can_be_switched_off():
-    """For recordings that were compensated before."""
-    sequence = one_car(())
-    config = {"register": {"source": "dataset", "deskew": False}}
-    result = run(sequence, KEY, 1, "icp", config=config)
-    kept = read_sweep(sequence, KEY, RegisterSettings())
-    own = result.cloud.frame == KEY
     np.testing.assert_allclose(result.cloud.points[own], kept.points, atol=1e-9)
 
 

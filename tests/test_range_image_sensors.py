@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy import ndimage, signal
 
-from densify.free_space import range_image, rings, sensor
+from densify.free_space import range_image, rings
 from densify.free_space.range_image import RangeImage
 from densify.free_space.rings import find_rings
 from densify.free_space.sensor import Aimed
@@ -142,16 +142,6 @@ def test_rings_are_found_wherever_the_beams_point(name):
         assert inside.sum() == 1
 
 
-@pytest.mark.parametrize("towards_deg", [2.5, 7.5, 12.5, 170.0])
-def test_a_narrow_view_is_measured_too(monkeypatch, towards_deg):
-    monkeypatch.setattr(sensor, "_MANY_POINTS", 1000)
-    azimuth, elevation = on_rings(TABLES["hdl64"], num_columns=7200)
-    ahead = np.abs(azimuth - np.deg2rad(towards_deg)) < np.deg2rad(2.4)
-    edges, num_columns = cells(azimuth[ahead], elevation[ahead])
-    assert len(edges) == 49
-    assert 7200 / 1.5 < num_columns <= 7200
-
-
 def test_where_there_are_no_rings_rows_are_uniform():
     rng = np.random.default_rng(0)
     smeared = on_rings(TABLES["vlp16"], noise_deg=0.6)
@@ -218,12 +208,3 @@ def test_rays_taken_to_start_elsewhere_claim_what_they_did_not_cross():
     shadow = np.array([6.0, 0, 0]) + np.outer(np.linspace(1.5, 6, 40), [6.0, -2.5, -0.3]) / 6.5
     assert not RangeImage.of(second).sees_through(shadow, *MARGIN).any()
     assert RangeImage.of(unknown).sees_through(shadow, *MARGIN).any()
-
-
-@pytest.mark.parametrize("origins", [np.zeros((1, 3)), np.zeros(3), np.zeros((2, 2))])
-def test_every_scanner_needs_an_origin(origins):
-    lidar = np.array([0, 1], np.uint8)
-    with pytest.raises(
-        ValueError, match=r"Sweep.scanner_origins: expected a row \(3,\) for each of 2"
-    ):
-        Sweep(0, 0, np.ones((2, 3)), np.zeros(2, np.float32), None, lidar, np.arange(2), origins)

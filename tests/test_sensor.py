@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from densify.config.errors import InputError
 from densify.free_space.range_image import RangeImage
 from densify.free_space.sensor import SensorModel, Sensors, aimed
 from densify.geometry.types import RegisteredSweep, Sweep
@@ -94,12 +93,6 @@ def test_a_scanner_that_hangs_upside_down_has_axes_with_z_upwards():
     np.testing.assert_allclose(axes[1], axes[0], atol=1e-12)
 
 
-@pytest.mark.parametrize("shape", [(3, 3), (1, 3, 3), (2, 4, 4)])
-def test_every_scanner_has_axes_or_none(shape):
-    with pytest.raises(ValueError, match=r"a rotation .3,3. for each of 2 scanners"):
-        replace(sweeps_of("dual32")[0].sweep, R_scanner_lidar=np.zeros(shape))
-
-
 # --- rings ----------------------------------------------------------------------------------------
 
 
@@ -144,14 +137,6 @@ def test_uneven_rings_are_close_in_the_middle_and_far_at_the_ends(name, elevatio
     np.testing.assert_allclose(range_m, 30.0)
     found = model.table.at(azimuth, elevation)[:, 1]
     np.testing.assert_allclose(np.rad2deg(found), spacing_deg, rtol=0.03)
-
-
-@pytest.mark.parametrize(("period_ns", "columns"), [(50_000_000, 1041), (200_000_000, 4166)])
-def test_at_other_rates(period_ns, columns):
-    model = SensorModel.of([fired("hdl64", twist=DRIVING, period_ns=period_ns)], 0)
-    assert len(model.rings_rad) == 64
-    assert model.order.period_s == pytest.approx(period_ns * 1e-9, rel=0.002)
-    assert np.rad2deg(model.azimuth_step_rad) == pytest.approx(360 / columns, rel=0.02)
 
 
 def test_a_scanner_that_turns_the_other_way():
@@ -221,54 +206,7 @@ def test_a_scanner_that_looks_ahead_sees_nothing_else():
     assert model.sees(azimuth, elevation).tolist() == [True] * 3 + [False] * 5
 
 
-def test_a_view_over_the_direction_backwards():
-    registered = fired("vlp16")
-    azimuth = aimed(registered, 0).azimuth
-    behind = replace(registered, sweep=registered.sweep.select(np.abs(azimuth) > np.deg2rad(120)))
-    model = SensorModel.of([behind], 0)
-    right, left = np.rad2deg(model.azimuth_rad)
-    assert right == pytest.approx(120, abs=0.5) and left == pytest.approx(-120, abs=0.5)
-    assert model.sees(np.deg2rad([180.0, 150.0, -150.0, 0.0, 90.0]), np.zeros(5)).tolist() == [
-        *(True, True, True, False, False)
-    ]
-
-
 # --- several scanners -----------------------------------------------------------------------------
-
-
-def test_each_scanner_counts_from_where_it_stands():
-    """Of the panda's scanners, 1.6 m from each other, each tells of its own points; a place is seen
-    as finely as the finer one of those that look there sees it."""
-    sensors, registered = sensors_of("panda"), sweeps_of("panda")[0]
-    sweep = registered.sweep
-    gap_m = sensors.gap_m(sweep.points, sweep.lidar)
-    for number, model in sensors.models.items():
-        mine = sweep.lidar == number
-        range_m = np.linalg.norm(sweep.points[mine] - model.origin_m, axis=1)
-        azimuth, elevation, _ = model.directions(sweep.points[mine])
-        along = model.table.at(azimuth, elevation)[:, 1]
-        np.testing.assert_allclose(gap_m[mine], range_m * (along + np.deg2rad(1 / 6)), rtol=1e-6)
-    np.testing.assert_array_equal(sensors.origins_m, SENSORS["panda"].origins_m)
-    ahead, behind = np.array([[20.0, 0, -5.0]]), np.array([[-20.0, 0, -5.0]])
-    both = np.repeat(np.concatenate([ahead, behind]), 2, axis=0)
-    of_each = sensors.gap_m(both, np.array([0, 1, 0, 1], np.uint8))
-    # 14 degrees below the horizon rings are 3 degrees apart; only ahead the other sees more finely
-    finest = sensors.finest_gap_m(np.concatenate([ahead, behind]))
-    assert finest[0] < 0.5 * of_each[0] or not sensors.models[1].sees(
-        *sensors.models[1].directions(ahead)[:2]
-    )
-    assert finest[1] == of_each[2]
-
-
-def test_128_rings_count_as_fine_as_they_are():
-    """Rows of the range image are joined; the spacing is not."""
-    at = np.array([[40.0, 0.0, -1.0]])
-    metres = {
-        n: float(sensors_of(n).finest_gap_m(at)[0]) for n in ("vls128", "os128", "hdl64", "vlp16")
-    }
-    assert metres["vls128"] < metres["os128"] <= 1.05 * metres["hdl64"] < metres["vlp16"]
-    beam_rad = np.deg2rad(1 / 6)
-    assert metres["vls128"] == pytest.approx(40 * (np.deg2rad(0.11) + beam_rad), rel=0.05)
 
 
 # --- little, or nothing ---------------------------------------------------------------------------
@@ -285,14 +223,3 @@ def test_too_little_to_measure_is_taken_for_a_usual_scanner():
     spacing = sensors.models[2].table.at(np.array([0.0]), np.array([0.3]))
     np.testing.assert_allclose(np.rad2deg(spacing), [[0.18, 0.40]], rtol=1e-5)
     assert sensors.origins_m.shape == (3, 3)
-
-
-def test_no_sweeps_have_no_scanners():
-    assert not Sensors.of([]).models
-    nothing = fired("vlp16", share_heard=0.0)
-    assert not Sensors.of([nothing]).models
-
-
-def test_a_scanner_that_is_not_there_cannot_be_measured():
-    with pytest.raises(InputError, match="lidar 3: no returns of that scanner in 2 sweeps"):
-        SensorModel.of(sweeps_of("vlp16"), 3)

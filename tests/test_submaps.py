@@ -15,7 +15,7 @@ from densify.pipeline import road
 from densify.pipeline import run as pipeline
 from densify.registration import road_poses
 from densify.registration.alignment import Alignment, subsample
-from densify.registration.road_poses import num_in_submap, relax_poses
+from densify.registration.road_poses import relax_poses
 from tests.scenes import Arc, Scanner, Scene, TinySequence, World, street
 
 NUM, KNOWN = 14, np.arange(14) < 4
@@ -81,34 +81,6 @@ def test_what_cannot_be_mended_is_left_out():
     found = relax_poses(points, displaced(7.0), KNOWN, 1)
     assert found.holds[:9].all() and not found.holds[9:].any()
     assert errors(found.T_world_lidar)[0][:9].max() < 0.02
-
-
-def test_the_same_bytes_by_any_number_of_threads(monkeypatch):
-    _, points, _ = true()
-    found = []
-    for num in (1, 3):
-        monkeypatch.setattr(road_poses, "num_threads", lambda num=num: num)
-        found.append(relax_poses(points, displaced(0.3), KNOWN, 1))
-    assert found[0].T_world_lidar.tobytes() == found[1].T_world_lidar.tobytes()
-
-
-@pytest.mark.parametrize("known", [[0], [3, 4, 5], [9], list(range(10))])
-@pytest.mark.parametrize("num_sweeps", [1, 3, 5])
-def test_submaps_part_the_sweeps(known, num_sweeps):
-    is_known = np.isin(np.arange(10), known)
-    member, middle = road_poses._submaps(is_known, num_sweeps)
-    assert (np.diff(member) >= 0).all() and (np.diff(member) <= 1).all() and member[0] == 0
-    assert (member[middle] == np.arange(member[-1] + 1)).all()
-    for i in range(member[-1] + 1):
-        rows = np.flatnonzero(member == i)
-        assert len(set(is_known[rows])) == 1 and len(rows) <= num_sweeps
-    for first in (known[0] - 1, known[-1] + 1):  # beside the known ones they are complete
-        if num_sweeps <= first < 10 - num_sweeps:
-            assert (member == member[first]).sum() == num_sweeps
-
-
-def test_sparse_scanners_have_submaps_of_several_sweeps():
-    assert [num_in_submap(n) for n in (120_000, 60_000, 25_000, 5_000, 0)] == [1, 2, 4, 5, 5]
 
 
 def test_the_solver_finds_what_a_slow_one_does():

@@ -13,7 +13,7 @@ from densify.free_space.ground import find_up_axis, find_upright, ground
 from densify.geometry import poses
 from densify.geometry.types import Sweep
 from densify.registration.deskew import deskew
-from tests.scenes import ROOM, Arc, Scanner, Scene, World, on_sphere, street
+from tests.scenes import Arc, Scanner, Scene, World, on_sphere, street
 
 STREET = World(street(60.0))
 
@@ -73,11 +73,6 @@ def test_where_no_ground_is_seen_nothing_is_turned():
     for sweeps in ([strewn], [nothing], []):
         assert np.array_equal(find_upright(sweeps), np.eye(3))
     assert find_up_axis(strewn) == find_up_axis(nothing) == ""
-
-
-def test_walls_and_roofs_are_no_ground():
-    sweeps, _ = leaning(World(ROOM), (0, 0, 0), 1)
-    assert np.array_equal(find_upright(sweeps), np.eye(3))
 
 
 def test_the_world_of_a_leaning_lidar_is_level():

@@ -1,16 +1,16 @@
 # SPDX-License-Identifier: MIT
-"""Rows shared out among plain threads, around functions that let go of Python's lock.
+"""Rows shared among plain threads, for functions that release Python's lock.
 
-Numba's own parallel loops are not used: their order of summation follows the number of threads,
-their pools abort the process when two threads enter them at once or after a fork, and OpenMP waits
-in busy loops, which costs tenfold where cores are shared."""
+Numba's own parallel loops are not used: their order of summation depends on the number of threads,
+their pools abort the process after a fork or when two threads enter them at once, and OpenMP waits
+in busy loops, which costs tenfold where cores are shared.
+"""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator
-from concurrent.futures import Executor, ThreadPoolExecutor, wait
-from contextlib import contextmanager
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor, wait
 from functools import cache
 from itertools import pairwise
 from typing import Any
@@ -21,31 +21,14 @@ _LEAST_ROWS = 4096  # to hand fewer to a second thread takes longer than most ke
 
 
 def num_threads() -> int:
-    """The cores this process may use, or fewer where NUMBA_NUM_THREADS says so."""
+    """Return the number of cores this process may use, or NUMBA_NUM_THREADS if that is fewer."""
     return int(numba.config.NUMBA_NUM_THREADS)  # type: ignore[attr-defined]
 
 
-@contextmanager
-def tasks() -> Iterator[Executor]:
-    """A pool of `num_threads` threads, of tasks that wait for none but those submitted before: so
-    one thread is enough. What has not begun when an error leaves the block never does; an
-    interruption does not wait for the rest either."""
-    pool = ThreadPoolExecutor(num_threads())
-    try:
-        yield pool
-    except KeyboardInterrupt:
-        pool.shutdown(wait=False, cancel_futures=True)
-        raise
-    except BaseException:
-        pool.shutdown(cancel_futures=True)
-        raise
-    pool.shutdown()
-
-
 def over_rows(function: Callable[..., None], num_rows: int, *arguments: Any) -> None:
-    """Call ``function(begin, end, *arguments)`` so that the ranges cover 0 to ``num_rows``.
+    """Call ``function(begin, end, *arguments)`` for ranges that cover 0 to ``num_rows``.
 
-    function: what it writes for a row must depend on that row alone. It may not call this one.
+    function: its result for a row must depend on that row alone. It may not call this one.
     """
     num_parts = min(num_threads(), num_rows // _LEAST_ROWS)
     if num_parts <= 1:

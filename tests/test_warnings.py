@@ -52,12 +52,6 @@ def moved(T_change) -> Camera:
     return replace(CAMERA, T_cam_lidar=T_change @ CAMERA.T_cam_lidar)
 
 
-def in_millimetres() -> Camera:
-    T = CAMERA.T_cam_lidar.copy()
-    T[:3, 3] = 1000 * T[:3, 3] + [0, -200.0, 0]
-    return replace(CAMERA, T_cam_lidar=T)
-
-
 def warnings_of(sequence, **options) -> tuple[str, ...]:
     return run(sequence, KEY, 1, "icp", config=POSES_GIVEN, **options).warnings
 
@@ -70,14 +64,8 @@ def test_nothing_is_said_of_what_is_right():
     ("sequence", "says"),
     [
         (lambda: Changed(), "a file is missing"),
-        (lambda: Changed([in_millimetres()]), "is the translation in metres?"),
-        (lambda: Changed([replace(CAMERA, T_cam_lidar=np.eye(4))]), "looks up by 90 deg"),
         (lambda: Changed(axes=(-2, -3, 1)), "the ground lies as if -y pointed up, not z"),
         (lambda: Changed(times=lambda sweep: None), "the points have no times of their own"),
-        (
-            lambda: Changed(times=lambda sweep: np.linspace(0, 5e9, len(sweep)).astype(np.int64)),
-            "a sweep takes 5000 ms by the times of its points, and the next comes after 100 ms",
-        ),
         (
             lambda: Changed(images_ms={"front": {0: 10**12}}),
             "front: no image belongs to the sweep, the nearest was taken 1e+09 s away",
