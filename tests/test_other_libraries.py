@@ -42,27 +42,6 @@ def test_to_numpy_holds_everything(num_points):
     check(cloud, rows.__getitem__)
 
 
-def test_to_pandas_holds_everything():
-    pytest.importorskip("pandas")
-    cloud = cloud_of(300)
-    frame = cloud.to_pandas()
-    assert tuple(frame.columns) == NAMES and len(frame) == 300
-    check(cloud, lambda name: frame[name].to_numpy())
-    assert frame.groupby("frame").size().sum() == 300
-
-
-def test_to_open3d_holds_everything():
-    pytest.importorskip("open3d")
-    cloud = cloud_of(300)
-    made = cloud.to_open3d()
-    np.testing.assert_array_equal(made.point.positions.numpy(), cloud.points)
-    np.testing.assert_allclose(made.point.colors.numpy() * 255, cloud.rgb, atol=1e-4)
-    for name, values in cloud.columns().items():
-        if name not in ("x", "y", "z", "red", "green", "blue"):
-            np.testing.assert_array_equal(made.point[name].numpy()[:, 0], values, err_msg=name)
-    assert len(made.to_legacy().points) == 300
-
-
 def test_a_map_s_points_project_onto_their_pixels():
     view, maps = view_of("image_02", "plain", 4), map_of("image_02", 1)
     for filled, depth_m in ((True, maps.filled_m), (False, maps.depth_m)):

@@ -7,7 +7,6 @@ sweep's lidar), ``cam``.
 """
 
 from densify.geometry.arrays import Bool, Float, Float32, Int
-from densify.geometry.types.boxes import Boxes, BoxView
 from densify.geometry.types.depth import (
     Camera,
     CameraView,
@@ -19,9 +18,9 @@ from densify.geometry.types.depth import (
     Reason,
     StandingWorld,
 )
-from densify.geometry.types.flow import FlowField, Motion, StretchFlow
-from densify.geometry.types.prior import FullDepth, Prior, PriorFit
 from densify.geometry.types.recordings import (
+    Boxes,
+    BoxView,
     KnowsBoxes,
     KnowsFiles,
     KnowsImagePoses,
@@ -33,9 +32,24 @@ from densify.geometry.types.recordings import (
     SweepTruth,
     Truth,
 )
-from densify.geometry.types.results import Progress, Result, StageCost
-from densify.geometry.types.sweeps import RegisteredSweep, Stretch, Sweep, Trajectory
-from densify.geometry.types.tracks import ObjectTrack
+from densify.geometry.types.results import (
+    FullDepth,
+    ObjectTrack,
+    Prior,
+    PriorFit,
+    Progress,
+    Result,
+    StageCost,
+)
+from densify.geometry.types.sweeps import (
+    FlowField,
+    Motion,
+    RegisteredSweep,
+    Stretch,
+    StretchFlow,
+    Sweep,
+    Trajectory,
+)
 
 __all__ = [
     "Bool",

@@ -6,7 +6,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from enum import IntEnum
-from importlib import import_module
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -87,36 +86,8 @@ class Cloud:
         """(M,) structured, a field for each of `columns`."""
         return table(self.columns())
 
-    def to_pandas(self) -> Any:
-        """A ``pandas.DataFrame`` of M rows with `columns`. Raises InputError without pandas."""
-        return _needed("pandas", "to_pandas()").DataFrame(self.columns())
-
-    def to_open3d(self) -> Any:
-        """An ``open3d.t.geometry.PointCloud``: positions (float64) and colors (0 to 1, float32),
-        and the other `columns` as attributes (M,1) by their names. Raises InputError without
-        open3d."""
-        open3d = _needed("open3d", "to_open3d()")
-        cloud = open3d.t.geometry.PointCloud()
-        cloud.point.positions = open3d.core.Tensor(np.ascontiguousarray(self.points))
-        cloud.point.colors = open3d.core.Tensor(self.rgb.astype(np.float32) / np.float32(255))
-        for name, values in self.columns().items():
-            if name not in ("x", "y", "z", "red", "green", "blue"):
-                column = values.astype(np.uint8) if values.dtype == bool else values
-                cloud.point[name] = open3d.core.Tensor(np.ascontiguousarray(column[:, None]))
-        return cloud
-
     def __len__(self) -> int:
         return len(self.points)
-
-
-def _needed(package: str, what: str) -> Any:
-    """The imported module."""
-    try:
-        return import_module(package)
-    except ImportError as error:
-        raise InputError(
-            f"{what} needs the package {package} ({error}); install it with pip install {package}"
-        ) from None
 
 
 @dataclass(frozen=True)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""One densified key, and what it cost."""
+"""One densified key: its maps, tracks and costs, and its maps completed with a prior."""
 
 from __future__ import annotations
 
@@ -10,11 +10,84 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from densify.geometry.arrays import Float, Float32
+from densify.geometry.arrays import Bool, Float, Float32, Int
 from densify.geometry.types.depth import CameraView, Cloud, DepthMap, Mover
-from densify.geometry.types.flow import StretchFlow
-from densify.geometry.types.prior import FullDepth
-from densify.geometry.types.tracks import ObjectTrack
+from densify.geometry.types.sweeps import StretchFlow
+
+
+@dataclass(frozen=True)
+class ObjectTrack:
+    """One moving object at n moments: the reference times of the sweeps that saw it, and of the
+    key.
+
+    instance: as in `Cloud`. size_m: (3,) length, width and height of the box around
+    its points, in its own frame: x to where it moves at the key's moment, z along the key's, origin
+    in the box's middle. frames: n sweeps, ascending. stamp_ns: (n,). T_key_object: (n,4,4), with
+    the vehicle's own motion removed: the key's coordinates do not move. velocity_m_s: (n,3) of the
+    box's middle, key frame. num_points: (n,) returns of that sweep.
+    """
+
+    instance: int
+    size_m: Float
+    frames: tuple[int, ...]
+    stamp_ns: Int
+    T_key_object: Float
+    velocity_m_s: Float
+    num_points: Int
+
+
+@dataclass(frozen=True)
+class Prior:
+    """A depth image that the user brings, as large as the map it is for.
+
+    value: (H,W) float32, 0 none: depth or inverse depth, relative or metric. sky: (H,W) bool, to be
+    left empty. source: where it is from, for messages.
+    """
+
+    value: Float32
+    sky: Bool
+    source: str
+
+
+@dataclass(frozen=True)
+class PriorFit:
+    """How a prior's values p become depth z in metres over the whole image, before the local
+    correction: kind ``depth``, z = scale p + shift_m; ``inverse``, 1/z = scale p + shift_per_m;
+    ``log``, ln z = scale ln p + shift.
+
+    residual: mean of |ln z - ln measured| over the measured pixels, held to ln 1.25, each octave of
+    depth counted alike. wrong: share of them, in the same way, that are off by more than 25 %.
+    used: whether the prior fits well enough to be used.
+    """
+
+    kind: str
+    scale: float
+    shift: float
+    residual: float
+    wrong: float
+    used: bool
+
+
+@dataclass(frozen=True)
+class FullDepth:
+    """A depth map completed with a prior; (H,W) each.
+
+    depth_m: float32 metres, 0 none: ``DepthMap.filled_m`` where that has a depth. confidence:
+    float32 0 to 1, of the prior's pixels less than of all others. from_prior: bool, the prior's.
+    source: where the prior is from.
+    """
+
+    depth_m: Float32
+    confidence: Float32
+    from_prior: Bool
+    fit: PriorFit
+    source: str
+
+    @property
+    def share(self) -> float:
+        """Share of the image's pixels that came from the prior."""
+        return float(np.mean(self.from_prior)) if self.from_prior.size else 0.0
+
 
 Progress = Callable[[str, int, int], None]
 """Called as ``(stage, done, total)`` while something takes its time."""
