@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -24,7 +23,6 @@ from densify.scores.cloud_scores import ghost_scores, radial_velocity_scores
 Image = NDArray[np.uint8]
 
 
-@dataclass(frozen=True)
 class KeyScene:
     """What all methods of a key share.
 
@@ -34,20 +32,8 @@ class KeyScene:
     map. held_out: the key sweep as the truth of what is made without it.
     """
 
-    recording: Recording
-    key: int
-    stretch: Stretch
-    images: Mapping[str, Image]
-    beyond: Beyond | None
-    with_images: bool
-    watch: Watch
-    key_image: RangeImage
-    views: Views
-    truth: Mapping[str, tuple[Float32, Bool]]
-    held_out: HeldOut
-
-    @staticmethod
-    def of(
+    def __init__(
+        self,
         recording: Recording,
         key: int,
         stretch: Stretch,
@@ -57,29 +43,19 @@ class KeyScene:
         beyond: Beyond | None,
         with_images: bool,
         watch: Watch,
-    ) -> KeyScene:
+    ) -> None:
         """moment: of the last method, which says what moves in the key sweep."""
         sequence, settings = recording.sequence, recording.settings
-        key_image = RangeImage.of(stretch[key])
-        views = Views.of(sequence, stretch, key, key_image, shots, images, settings)
-        truth = {}
+        self.settings, self.key, self.stretch, self.beyond = settings, key, stretch, beyond
+        self.with_images, self.watch = with_images, watch
+        self.images = images if with_images else {}
+        self.key_image = RangeImage.of(stretch[key])
+        self.views = Views.of(sequence, stretch, key, self.key_image, shots, images, settings)
+        self.truth: Mapping[str, tuple[Float32, Bool]] = {}
         if with_images and sequence.truth is not None:
-            truth = views.truth(sequence.truth)
+            self.truth = self.views.truth(sequence.truth)
         with watch.stage("held out"):
-            held_out = HeldOut.of(views, moment.cloud)
-        return KeyScene(
-            recording=recording,
-            key=key,
-            stretch=stretch,
-            images=images if with_images else {},
-            beyond=beyond,
-            with_images=with_images,
-            watch=watch,
-            key_image=key_image,
-            views=views,
-            truth=truth,
-            held_out=held_out,
-        )
+            self.held_out = HeldOut.of(self.views, moment.cloud)
 
 
 def result_of_method(scene: KeyScene, name: str, moment: Moment) -> Result:
@@ -87,9 +63,9 @@ def result_of_method(scene: KeyScene, name: str, moment: Moment) -> Result:
 
     moment: the points at the key's moment, as the method accumulates them.
     """
-    method, output = METHODS[name], scene.recording.settings.output
+    method, output = METHODS[name], scene.settings.output
     views, watch, stretch = scene.views, scene.watch, scene.stretch
-    visible = method.visible and scene.recording.settings.project.visibility
+    visible = method.visible and scene.settings.project.visibility
 
     far = _see_far(scene, method)
     with watch.stage("project"):
@@ -187,6 +163,6 @@ def _metrics(
         metrics["expected_outliers"] = {n: expected_outliers(m) for n, m in depth.items()}
     metrics["measure"] = {name: maps.measure for name, maps in depth.items()}
     metrics["held_out"] = None  # its place; the scores come later
-    if scene.recording.settings.output.rejected:
+    if scene.settings.output.rejected:
         metrics["rejected"] = {name: maps.counts() for name, maps in depth.items()}
     return metrics

@@ -90,11 +90,9 @@ def run_keys(
     cache: keeps on disk what is shared. The rest as `run`. Raises InputError at once for what no
     key could be made with.
     """
-    settings, methods, watch = resolve(config), with_baselines(method), Watch(progress)
-    _check(sequence, settings, methods, cameras)
+    methods, watch = with_baselines(method), Watch(progress)
+    recording = _open(sequence, keys, window, methods, cameras, config, cache, watch)
     priors = _open_prior(prior, sequence, cameras)
-    looks = looks_around(methods)
-    recording = Recording(sequence, settings, window, keys, cache, None, watch, looks)
 
     def results() -> Iterator[tuple[int, Result | ComputationError | InputError]]:
         for key in sorted(set(keys)):
@@ -122,11 +120,9 @@ def compare(
     methods: some of `METHODS`. cache: keeps the results of steps. prior: completes the maps of the
     last method. The rest as `run`.
     """
-    settings, watch = resolve(config), Watch(progress)
-    _check(sequence, settings, methods, cameras)
+    watch = Watch(progress)
+    recording = _open(sequence, [key], window, methods, cameras, config, cache, watch)
     priors = _open_prior(prior, sequence, cameras)
-    looks = looks_around(methods)
-    recording = Recording(sequence, settings, window, [key], cache, None, watch, looks)
     return densify(recording, key, methods, cameras, watch, priors=priors)
 
 
@@ -144,9 +140,7 @@ def flow_steps(
     frames: ascending. cache: keeps the results of steps. Raises InputError at once for what nothing
     can be made with.
     """
-    settings = resolve(config)
-    _check(sequence, settings, ["flow"], None)
-    recording = Recording(sequence, settings, 1, cache=cache)
+    recording = _open(sequence, None, 1, ["flow"], None, config, cache, None)
 
     def steps() -> Iterator[tuple[int, StretchFlow | ComputationError | InputError]]:
         for done, frame in enumerate(frames):
@@ -192,7 +186,7 @@ def densify(
                 key, method.all_sweeps, method.engine, settings.output.flow != "none"
             )
         beyond = far.result() if far is not None else None
-        scene = KeyScene.of(
+        scene = KeyScene(
             recording, key, stretch, shots, images, moments[methods[-1]], beyond, with_images, watch
         )
         made = list(pool.map(partial(result_of_method, scene), methods, moments.values()))
@@ -221,13 +215,18 @@ def _open_prior(
     return PriorFiles.open(Path(prior), [c.name for c in choose_cameras(sequence, cameras)])
 
 
-def _check(
+def _open(
     sequence: LidarSequence,
-    settings: Config,
+    keys: Sequence[int] | None,
+    window: int,
     methods: Sequence[str],
     cameras: Sequence[str] | None,
-) -> None:
-    """Raise InputError before anything is read."""
+    config: ConfigLike,
+    cache: Cache | None,
+    watch: Watch | None,
+) -> Recording:
+    """Return the recording; raise InputError before any sweep is read."""
+    settings = resolve(config)
     if not hasattr(sequence, "frames"):
         raise InputError(
             f"sequence: got {reprlib.repr(sequence)}, expected what densify.open_sequence returns"
@@ -239,3 +238,4 @@ def _check(
             raise InputError(f"--methods {name}: expected some of {', '.join(METHODS)}")
     check_engine(settings.flow.engine)
     choose_cameras(sequence, cameras)
+    return Recording(sequence, settings, window, keys, cache, None, watch, looks_around(methods))

@@ -58,7 +58,7 @@ def twists(trajectory: Trajectory, i: int) -> tuple[Float, Float]:
 
     def toward(j: int) -> Float:
         seconds = (trajectory.stamp_ns[j] - trajectory.stamp_ns[i]) * 1e-9
-        return poses.log(poses.inverse(T[i]) @ T[j]) / seconds
+        return poses.twist_between(T[i], T[j], seconds)
 
     return toward(i - 1 if i > 0 else 1), toward(i + 1 if i < last else i - 1)
 

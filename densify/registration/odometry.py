@@ -94,9 +94,8 @@ def register(
 
 def _twist(trajectory: Trajectory, i: int) -> Float:
     """Return the (6,) twist per second from sweep i to the next."""
-    T = trajectory.T_world_lidar
     seconds = (trajectory.stamp_ns[i + 1] - trajectory.stamp_ns[i]) * 1e-9
-    return poses.log(poses.inverse(T[i]) @ T[i + 1]) / seconds
+    return poses.twist_between(*trajectory.T_world_lidar[i : i + 2], seconds)
 
 
 def _joined(sweeps: Sequence[Sweep], points: Sequence[Float]) -> Sweep:
