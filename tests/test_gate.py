@@ -1,0 +1,110 @@
+# SPDX-License-Identifier: MIT
+"""The gate: the main figures of two streets and a real drive must not become worse.
+
+``gate.yaml`` holds them. A change that makes a figure worse than its tolerance fails here. To
+accept new figures, run ``python -m tests.test_gate`` and commit the file with the reason.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+
+from densify.config import resolve
+from densify.geometry.types import Result
+from densify.pipeline.recording import Recording
+from densify.pipeline.run import densify as densify_key
+from densify.readers import open_sequence
+
+TABLE = Path(__file__).with_name("gate.yaml")
+DRIVE = "kitti/2011_09_26/2011_09_26_drive_0013_sync"
+KEY, WINDOW, CAMERA = 120, 5, "image_02"
+RECORDINGS = {"street": "street", "street:crossing": "street:crossing", "drive 0013": DRIVE}
+
+TOLERANCE = {
+    "coverage": -0.003,
+    "outliers_percent": 0.02,
+    "ghosts_percent": 0.02,
+    "recall_percent": -0.2,
+    "false_percent": 0.0005,
+    "error_m": 0.002,
+}
+"""How much worse a figure may become, by the end of its name; negative where more is better."""
+
+
+def depth_figures(result: Result) -> dict[str, float]:
+    """Coverage and outliers against exact truth, else with the key held out."""
+    metrics = result.metrics
+    scores = metrics["depth"][CAMERA] if "depth" in metrics else metrics["held_out"][CAMERA]
+    found = {"image coverage": metrics["density"][CAMERA]["filled"]}
+    for kind in ("measured", "filled"):
+        for part in ("all", "moving"):
+            score = scores[kind][part]
+            found[f"{kind} {part} coverage"] = score["coverage"]
+            found[f"{kind} {part} outliers_percent"] = 100 * score["outliers"]
+    return {**found, "ghosts_percent": 100 * metrics["ghosts"]["all"]}
+
+
+def flow_figures(recording: Recording) -> dict[str, float]:
+    """Recall, false positives and mean error of the moving points over one sweep of the window."""
+    truth, motion = recording.sequence.truth, recording.motion(KEY)
+    moves, found, errors_m = [], [], []
+    for registered in recording.window(KEY).sweeps[:-1]:
+        frame, row = registered.frame, registered.sweep.row
+        field = motion.flow(frame, frame + 1)
+        true = truth.displacement(frame, frame + 1)[row]
+        moves.append(truth.sweep(frame).moving[row])
+        found.append(field.moving)
+        errors_m.append(np.linalg.norm(field.displacement - true, axis=1)[moves[-1]])
+    moving, told = np.concatenate(moves), np.concatenate(found)
+    return {
+        "flow recall_percent": 100 * float(told[moving].mean()),
+        "flow false_percent": 100 * float(told[~moving].mean()),
+        "flow error_m": float(np.concatenate(errors_m).mean()),
+    }
+
+
+def figures(spec: str) -> dict[str, float]:
+    """Return every figure of one recording."""
+    sequence, settings = open_sequence(spec), resolve(None)
+    recording = Recording(sequence, settings, WINDOW, [KEY], looks_around=True)
+    methods = ["none", "icp", "flow"]
+    found = depth_figures(densify_key(recording, KEY, methods, [CAMERA])["flow"])
+    if sequence.truth is not None:
+        found |= flow_figures(recording)
+    return {name: round(value, 5) for name, value in found.items()}
+
+
+@pytest.mark.parametrize("name", RECORDINGS)
+def test_no_figure_becomes_worse(name: str, request: pytest.FixtureRequest) -> None:
+    spec = RECORDINGS[name]
+    if spec == DRIVE:
+        spec = str(request.getfixturevalue("test_data") / DRIVE)
+    expected, now = yaml.safe_load(TABLE.read_text("utf-8"))[name], figures(spec)
+    assert set(now) == set(expected)
+    worse = {}
+    for figure, was in expected.items():
+        tolerance = TOLERANCE[figure.split()[-1]]
+        sign = np.sign(tolerance)
+        if sign * (now[figure] - was) > abs(tolerance):
+            worse[figure] = f"{was} -> {now[figure]}"
+    assert not worse
+
+
+def main() -> None:
+    """Write the figures as they are now."""
+    folder = Path(os.environ["DENSIFY_TEST_DATA"])
+    table: dict[str, Any] = {
+        name: figures(str(folder / spec) if spec == DRIVE else spec)
+        for name, spec in RECORDINGS.items()
+    }
+    TABLE.write_text(f"# Written by: python -m tests.test_gate\n{yaml.safe_dump(table)}")
+
+
+if __name__ == "__main__":
+    main()
