@@ -45,22 +45,6 @@ def test_the_sweeps_own_returns_are_never_seen_through():
     assert not image.sees_through(registered.sweep.points, 0.0, 1e-4).any()
 
 
-@pytest.mark.parametrize(
-    ("x", "margin_m", "margin_fraction", "expected"),
-    [
-        (19.5, 0.4, 0.0, True),
-        (19.7, 0.4, 0.0, False),
-        (19.7, 0.2, 0.0, True),
-        (18.9, 0.0, 0.05, True),  # 1.10 m before the wall, 0.95 asked for
-        (19.2, 0.0, 0.05, False),  # 0.80, 0.96
-        (19.2, 0.4, 0.05, False),  # the larger of the two counts
-    ],
-)
-def test_margins(room, x, margin_m, margin_fraction, expected):
-    points = np.array([[x, 0.1, 0.3]])
-    assert room.sees_through(points, margin_m, margin_fraction)[0] == expected
-
-
 def test_wraps_behind_the_scanner(room):
     azimuth = 180 + np.linspace(-3, 3, 601)
     assert room.sees_through(on_sphere(azimuth, 1.0, 8.0), *MARGIN, min_filled=8).all()

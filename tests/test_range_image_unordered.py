@@ -72,18 +72,6 @@ def when_around(image: ScannerImage, points) -> tuple[np.ndarray, np.ndarray]:
     return middle - spread, middle + spread
 
 
-@pytest.mark.parametrize(("name", "share"), [("panda", 0.95), ("rosette", 0.7)])
-def test_free_before_a_wall_and_not_on_it(name, share):
-    image = RangeImage.of(sweep_of(name, moving=False, world=WALL))
-    rng = np.random.default_rng(0)
-    inside = on_sphere(rng.uniform(-20, 20, 2000), rng.uniform(-2, 6, 2000), 1.0)
-    origin_m = image.scanners[0].origin_m
-    near = inside * (20 / inside[:, :1]) + origin_m
-    assert image.sees_through(near, *MARGIN).mean() > share
-    on_wall = inside * ((39.5 - origin_m[0]) / inside[:, :1]) + origin_m
-    assert not image.sees_through(on_wall, *MARGIN).any()
-
-
 @pytest.mark.parametrize("name", UNORDERED)
 def test_what_stands_is_not_free_however_fast_the_scanner_drives(name):
     """And where no cell knew its time, it would be."""

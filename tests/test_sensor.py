@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from densify.free_space.range_image import RangeImage
 from densify.free_space.sensor import SensorModel, Sensors, aimed
-from densify.geometry.types import RegisteredSweep, Sweep
+from densify.geometry.types import RegisteredSweep
 from densify.readers.file_sequence import scanner_axes
 from densify.street.sensors import SENSORS, Spinning
 from tests.fired import fired
@@ -139,13 +139,6 @@ def test_uneven_rings_are_close_in_the_middle_and_far_at_the_ends(name, elevatio
     np.testing.assert_allclose(np.rad2deg(found), spacing_deg, rtol=0.03)
 
 
-def test_a_scanner_that_turns_the_other_way():
-    (sweep,) = (s.sweep for s in [fired("vlp16")])
-    mirrored = replace(sweep, points=sweep.points * [1, -1, 1])
-    model = SensorModel.of([RegisteredSweep(mirrored, np.eye(4), np.zeros(6), np.zeros(6))], 0)
-    assert model.order.turn == 1 and len(model.rings_rad) == 16
-
-
 def test_without_firing_times_rings_are_known_and_the_order_is_not():
     registered = fired("hdl32")
     timeless = replace(registered, sweep=replace(registered.sweep, offset_ns=None))
@@ -210,16 +203,3 @@ def test_a_scanner_that_looks_ahead_sees_nothing_else():
 
 
 # --- little, or nothing ---------------------------------------------------------------------------
-
-
-def test_too_little_to_measure_is_taken_for_a_usual_scanner():
-    n = 20
-    sweep = Sweep(
-        *(0, 0, on_sphere(np.arange(n) * 3.0, 0.0, 10.0), np.zeros(n, np.float32), None),
-        *(np.full(n, 2, np.uint8), np.arange(n)),
-    )
-    sensors = Sensors.of([RegisteredSweep(sweep, np.eye(4), np.zeros(6), np.zeros(6))])
-    assert list(sensors.models) == [2] and sensors.models[2].rings_rad is None
-    spacing = sensors.models[2].table.at(np.array([0.0]), np.array([0.3]))
-    np.testing.assert_allclose(np.rad2deg(spacing), [[0.18, 0.40]], rtol=1e-5)
-    assert sensors.origins_m.shape == (3, 3)

@@ -13,7 +13,7 @@ from densify.free_space.ground import find_up_axis, find_upright, ground
 from densify.geometry import poses
 from densify.geometry.types import Sweep
 from densify.registration.deskew import deskew
-from tests.scenes import Arc, Scanner, Scene, World, on_sphere, street
+from tests.scenes import Arc, Scanner, Scene, World, street
 
 STREET = World(street(60.0))
 
@@ -59,20 +59,6 @@ def test_what_leans_little_is_left_alone(rotvec_deg):
 def test_axes_that_do_not_stand_on_the_ground_are_named(R, name):
     (sweep,), _ = leaning(STREET, (0, 0, 0), 1)
     assert find_up_axis(replace(sweep, points=sweep.points @ R.T)) == name
-
-
-def test_where_no_ground_is_seen_nothing_is_turned():
-    one = leaning(STREET, (0, 0, 0), 1)[0][0]
-    rng = np.random.default_rng(0)
-    cloud = on_sphere(
-        rng.uniform(-180, 180, 3000), rng.uniform(-40, 40, 3000), rng.uniform(5, 25, 3000)
-    )
-    n = len(cloud)
-    strewn = Sweep(0, 0, cloud, np.zeros(n, np.float32), None, np.zeros(n, np.uint8), np.arange(n))
-    nothing = one.select(np.zeros(len(one), bool))
-    for sweeps in ([strewn], [nothing], []):
-        assert np.array_equal(find_upright(sweeps), np.eye(3))
-    assert find_up_axis(strewn) == find_up_axis(nothing) == ""
 
 
 def test_the_world_of_a_leaning_lidar_is_level():

@@ -95,7 +95,8 @@ def register(
 def _twist(trajectory: Trajectory, i: int) -> Float:
     """Return the (6,) twist per second from sweep i to the next."""
     seconds = (trajectory.stamp_ns[i + 1] - trajectory.stamp_ns[i]) * 1e-9
-    return poses.twist_between(*trajectory.T_world_lidar[i : i + 2], seconds)
+    T = trajectory.T_world_lidar
+    return poses.twist_between(T[i], T[i + 1], seconds)
 
 
 def _joined(sweeps: Sequence[Sweep], points: Sequence[Float]) -> Sweep:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Accumulated clouds and what cameras see of them."""
+"""Accumulated clouds, cameras and depth maps."""
 
 from __future__ import annotations
 
@@ -47,28 +47,27 @@ class Cloud:
 
     @property
     def displaced(self) -> Float32:
-        """(M,) metres moved beyond the rigid alignment."""
+        """Return (M,) metres moved beyond the rigid alignment."""
         x, y, z = (self.points - self.rigid_points).T
         return np.sqrt(x * x + y * y + z * z).astype(np.float32)
 
     def after(self, seconds: float) -> Cloud:
-        """Shortly after (or before) the key's moment: what moves goes on at its velocity."""
+        """Return the cloud shortly after (or before) the key's moment, at constant velocity."""
         return replace(self, points=self.points + seconds * self.velocity_m_s)
 
     def joined(self, other: Cloud) -> Cloud:
-        """The cloud with another's points behind its own."""
+        """Return the cloud with another's points behind its own."""
         names = [f.name for f in fields(self)]
         return Cloud(**{n: np.concatenate([getattr(self, n), getattr(other, n)]) for n in names})
 
     def select(self, keep: Bool) -> Cloud:
-        """The points where ``keep`` (M,) is True."""
+        """Return the points where ``keep`` (M,) is True."""
         rows = np.flatnonzero(keep)  # once for all columns
         return Cloud(**{f.name: getattr(self, f.name).take(rows, axis=0) for f in fields(self)})
 
     def columns(self) -> dict[str, NDArray[Any]]:
-        """Everything as (M,) columns in the types they have here, vectors by axis: x y z, rigid_x
-        rigid_y rigid_z, velocity_x velocity_y velocity_z (m/s), red green blue, and the rest by the
-        names above."""
+        """Return all columns (M,) by name, vectors by axis: x y z, rigid_x rigid_y rigid_z,
+        velocity_x velocity_y velocity_z (m/s), red green blue, and the rest as above."""
         by_axis = {
             "points": ("x", "y", "z"),
             "rigid_points": ("rigid_x", "rigid_y", "rigid_z"),
@@ -83,7 +82,7 @@ class Cloud:
         return columns
 
     def to_numpy(self) -> NDArray[Any]:
-        """(M,) structured, a field for each of `columns`."""
+        """Return an (M,) structured array with a field for each of `columns`."""
         return table(self.columns())
 
     def __len__(self) -> int:
@@ -92,13 +91,13 @@ class Cloud:
 
 @dataclass(frozen=True)
 class Patches:
-    """What each of a cloud's M points stands for; see `densify.depth.patches`.
+    """The surface patch of each of a cloud's M points; see `densify.depth.patches`.
 
     normal: (M,3) float32 key frame, of any length, of the tangent plane. spacing_m: (M,2) float32
     to the neighbouring rays of the same sweep, across and along elevation. free: (M,) bool, the key
-    sweep saw through the place. sweep: (M,) int32, which of the cloud's sweeps, counted by
-    frame, those beyond the window last. place: (M,) int32, number of the stretch of road from which
-    a sweep beyond the window measured the point; -1 of those within.
+    sweep saw through the point. sweep: (M,) int32, number of the point's sweep by frame, those
+    beyond the window last. place: (M,) int32, number of the piece of road from which a sweep
+    beyond the window measured the point; -1 within the window.
     """
 
     normal: Float32
@@ -108,7 +107,7 @@ class Patches:
     place: NDArray[np.int32]
 
     def joined(self, other: Patches) -> Patches:
-        """The patches with those of another cloud behind them; no sweep is in both."""
+        """Return the patches with those of another cloud behind them; no sweep is in both."""
         num_sweeps = np.int32(self.sweep.max(initial=-1) + 1)
         return Patches(
             np.concatenate([self.normal, other.normal]),
@@ -119,7 +118,7 @@ class Patches:
         )
 
     def select(self, keep: Bool) -> Patches:
-        """The patches of ``cloud.select(keep)``."""
+        """Return the patches of ``cloud.select(keep)``."""
         rows = np.flatnonzero(keep)
         sweep = self.sweep[rows]
         number = np.cumsum(np.bincount(sweep) > 0) - 1
@@ -134,14 +133,13 @@ class Patches:
 
 @dataclass(frozen=True)
 class StandingWorld:
-    """K points of the standing world, measured along a stretch of road.
+    """K points of static surfaces, measured along the road.
 
     points: (K,3) float32 metres. normal: (K,3) float32 of any length, of the tangent plane.
     spacing_m: (K,2) float32 to the neighbouring rays of the same sweep. source: (K,) int32, which
     of the sweeps ``frames`` measured it. row, lidar, intensity: as in `Cloud`. frames: n sweeps.
-    stamp_ns: (n,) int64. travel_m: (n,) float64, where along the road they were: 0 at the key's
-    window, negative behind it. left_out:
-    sweeps beyond that hang on bad pairs only.
+    stamp_ns: (n,) int64. travel_m: (n,) float64 along the road: 0 at the key's window, negative
+    behind it. left_out: sweeps that could not be registered well.
     """
 
     points: Float32
@@ -158,11 +156,11 @@ class StandingWorld:
 
     @property
     def stamps_ns(self) -> dict[int, int]:
-        """Reference times by frame."""
+        """Return the reference times by frame."""
         return dict(zip(self.frames, self.stamp_ns.tolist(), strict=True))
 
     def select(self, keep: Bool | Int) -> StandingWorld:
-        """Some of the points."""
+        """Return some of the points."""
         rows = np.flatnonzero(keep) if keep.dtype == bool else keep
         kept = {name: getattr(self, name).take(rows, axis=0) for name in _COLUMNS_OF_STANDING}
         return replace(self, **kept)
@@ -214,39 +212,38 @@ class Camera:
 
     @property
     def is_rolling(self) -> bool:
-        """Whether its rows or columns are exposed one after another."""
+        """Return True if its rows or columns are exposed one after another."""
         return bool(self.row_time_s or self.column_time_s)
 
     @property
     def readout_s(self) -> float:
-        """Between the exposures of the first and the last row or column, about."""
+        """Return about the seconds from the exposure of the first row or column to the last."""
         along = abs(self.row_time_s) * self.height_px
         return along + abs(self.column_time_s) * self.width_px
 
     @property
     def is_rectified(self) -> bool:
-        """A pinhole without distortion."""
+        """Return True for a pinhole without distortion."""
         return self.model == "pinhole" and not self.distortion
 
     @property
     def measure(self) -> str:
-        """What depth is unless asked otherwise: camera ``z``; the ``range`` of a lens that may see
+        """Return the default measure of depth: camera ``z``, or ``range`` for a lens that may see
         behind its image plane, where z is negative."""
         return "z" if self.model == "pinhole" else "range"
 
     @property
     def focal_px(self) -> float:
-        """Pixels to the right per radian, in the middle of the image."""
+        """Return pixels to the right per radian, in the middle of the image."""
         xi = self.distortion[0] if self.model == "mei" else 0.0
         return float(self.K[0, 0] / (1 + xi))
 
 
 class Ranked(NamedTuple):
-    """What the confidence of a map's pixels was made from (`densify.depth.confidence`); (H,W).
+    """The inputs of the confidence of a map's pixels (`densify.depth.confidence`); (H,W).
 
-    rank: float32 0 to 1, the greater the surer, 0 where ``filled_m`` has none. group: uint8, which
-    pixels are alike. contradicted: float32 0 to 1, how far what is measured around contradicts
-    itself.
+    rank: float32 0 to 1, larger is more certain, 0 where ``filled_m`` has none. group: uint8, kind
+    of the pixel. contradicted: float32 0 to 1, how far measurements around contradict each other.
     """
 
     rank: Float32
@@ -256,7 +253,7 @@ class Ranked(NamedTuple):
 
 @dataclass(frozen=True)
 class CameraView:
-    """Where a depth map looks from.
+    """The viewpoint of a depth map.
 
     T_cam_key: (4,4) at the moment the map shows. late_s: seconds from the key's reference time to
     that moment. number: of the image, None where there is none.
@@ -294,11 +291,12 @@ class DepthMap:
     ranked: Ranked | None = None
 
     def to_points(self, view: CameraView, filled: bool = True) -> Float:
-        """(K,3) the map's pixels as points in the key frame, metres, row by row.
+        """Return the map's pixels as points (K,3) in the key frame, metres, row by row.
 
-        view: ``Result.views`` of the same name. filled: with the interpolated pixels, else the
-        measured ones alone. What moves is where it was when the image was exposed. Raises
-        InputError for a camera that is not rectified, or a map of ranges.
+        Moving objects are where they were at the exposure.
+
+        view: ``Result.views`` of the same name. filled: with the interpolated pixels.
+        Raises InputError for a camera that is not rectified, or a map of ranges.
         """
         camera = view.camera
         if not camera.is_rectified or self.measure != "z":
@@ -315,14 +313,14 @@ class DepthMap:
         return np.asarray(points_cam @ T_key_cam[:3, :3].T + T_key_cam[:3, 3])
 
     def counts(self) -> dict[str, int]:
-        """Points of the cloud by what became of them."""
+        """Return the number of points for each `Reason`."""
         counts = np.bincount(self.reason, minlength=len(Reason))
         return {which.name.lower(): int(counts[which]) for which in Reason}
 
 
 @dataclass(frozen=True)
 class Mover:
-    """One moving object by itself: its points, and the depth it has in each camera."""
+    """One moving object alone: its points, and its depth map in each camera."""
 
     cloud: Cloud
     depth: Mapping[str, DepthMap]

@@ -72,7 +72,7 @@ class Sweep:
         return len(self.points)
 
     def select(self, keep: Bool | slice) -> Sweep:
-        """The returns where ``keep`` (N,) is True, or of a slice."""
+        """Return the returns where ``keep`` (N,) is True, or of a slice."""
         rows = np.arange(len(self))[keep]
         return replace(
             self,
@@ -87,11 +87,11 @@ class Sweep:
         )
 
     def axes(self, lidar: int) -> Float:
-        """(3,3) from the lidar frame's axes to that scanner's."""
+        """Return the rotation (3,3) from the lidar frame's axes to that scanner's."""
         return np.eye(3) if self.R_scanner_lidar is None else self.R_scanner_lidar[lidar]
 
     def origin_m(self, lidar: int) -> Float:
-        """(3,) where the rays of that scanner start, lidar frame."""
+        """Return (3,) where the rays of that scanner start, lidar frame."""
         return np.zeros(3) if self.scanner_origins is None else self.scanner_origins[lidar]
 
 
@@ -108,7 +108,7 @@ class Trajectory:
     R_level_lidar: Float = field(default_factory=lambda: np.eye(3))
 
     def part(self, frames: Sequence[int]) -> Trajectory:
-        """The poses of these frames alone."""
+        """Return the poses of these frames alone."""
         rows = [self.frames.index(f) for f in frames]
         return replace(
             self,
@@ -117,21 +117,8 @@ class Trajectory:
             T_world_lidar=self.T_world_lidar[rows],
         )
 
-    def joined(self, following: Trajectory, frames: Sequence[int]) -> Trajectory:
-        """The trajectory with these frames of another one, which has its last frame too."""
-        T_world_last = self.T_world_lidar[-1]
-        T_other_last = following.T_world_lidar[following.frames.index(self.frames[-1])]
-        T_world_other = T_world_last @ inverse(T_other_last)
-        part = following.part(frames)
-        return replace(
-            self,
-            frames=self.frames + part.frames,
-            stamp_ns=np.concatenate([self.stamp_ns, part.stamp_ns]),
-            T_world_lidar=np.concatenate([self.T_world_lidar, T_world_other @ part.T_world_lidar]),
-        )
-
     def seen_from(self, frame: int) -> Trajectory:
-        """The same in the world of that frame's lidar, upright."""
+        """Return the poses in the world of that frame's lidar, upright."""
         T_new_lidar = np.eye(4)
         T_new_lidar[:3, :3] = self.R_level_lidar
         T_new_old = T_new_lidar @ inverse(self.T_world_lidar[self.frames.index(frame)])
@@ -159,8 +146,8 @@ class RegisteredSweep:
         return self.sweep.frame
 
     def rays(self) -> tuple[Float, Float]:
-        """Unit vectors (N,3) from where each scanner was when it fired to the points, and its
-        velocity (N,3) in m/s then; lidar frame at the reference time."""
+        """Return unit vectors (N,3) from each scanner at its firing time to the points, and the
+        scanner's velocity (N,3) in m/s then; lidar frame at the reference time."""
         sweep = self.sweep
         start = np.zeros((len(sweep), 3))
         if sweep.scanner_origins is not None:
@@ -179,7 +166,7 @@ class RegisteredSweep:
 
     @staticmethod
     def without_points(trajectory: Trajectory, frame: int) -> RegisteredSweep:
-        """The place and time of a sweep of the trajectory."""
+        """Return the pose and time of a sweep of the trajectory, without points."""
         i, nothing = trajectory.frames.index(frame), np.zeros(0)
         sweep = Sweep(
             frame=frame,
@@ -207,7 +194,7 @@ class Stretch:
         return self.sweeps[self.frames.index(frame)]
 
     def T_target_source(self, target: int, source: int) -> Float:
-        """(4,4) from the lidar frame of one sweep to that of another, by frame number."""
+        """Return (4,4) from the lidar frame of one sweep to that of another, by frame number."""
         if target == source:
             return np.eye(4)
         return inverse(self[target].T_world_lidar) @ self[source].T_world_lidar
@@ -238,14 +225,14 @@ class FlowField:
 
     @property
     def total(self) -> Float:
-        """(N,3) from where a point was measured to where it is at the target time."""
+        """Return (N,3) from where a point was measured to where it is at the target time."""
         if self.to_reference is None:
             return self.displacement
         return self.to_reference + self.displacement
 
     @staticmethod
     def zero(num_points: int) -> FlowField:
-        """Nothing moves."""
+        """Return the flow of points that do not move."""
         return FlowField(
             displacement=np.zeros((num_points, 3)),
             moving=np.zeros(num_points, bool),
@@ -255,11 +242,10 @@ class FlowField:
 
 
 class Motion(Protocol):
-    """How everything in a stretch moves, whatever found it out."""
+    """The motion of everything in a stretch, found by any engine."""
 
     def flow(self, frame: int, target: int) -> FlowField:
-        """Flow of every point of a sweep to another sweep's reference time; both by frame
-        number."""
+        """Return the flow of every point of a sweep to another sweep's reference time."""
         ...
 
 
@@ -272,7 +258,7 @@ class StretchFlow:
 
     @staticmethod
     def towards(key: int, stretch: Stretch, motion: Motion) -> StretchFlow:
-        """Flow of every sweep to the next one on the way to the key, and of the key to a
+        """Return the flow of each sweep to the next one towards the key, and of the key to a
         neighbour."""
         before = [f for f in stretch.frames if f <= key]
         after = [f for f in reversed(stretch.frames) if f >= key]
