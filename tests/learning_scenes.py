@@ -55,11 +55,11 @@ class SmallClips(ClipMaker):
 
 
 def train_small(out: str, resume: bool = False, **options) -> list[Path]:
-    """`train` on small clips in this process, with a checkpoint after every fifth step."""
+    """`train` on small clips in this process, with a checkpoint after every third step."""
     training = densify.learning.training
     before, training.ClipMaker = training.ClipMaker, SmallClips
     try:
-        options = {"teacher": "truth", "num_workers": 0, "checkpoint_steps": 5, **options}
+        options = {"teacher": "truth", "num_workers": 0, "checkpoint_steps": 3, **options}
         settings = training.Training(("streets",), **options)
         return training.train(settings, Path(out), resume).files
     finally:

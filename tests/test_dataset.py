@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import errno
 import json
 import os
 import shutil
@@ -11,7 +10,6 @@ import signal
 import time
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from densify.config import resolve
@@ -183,22 +181,15 @@ def test_the_densify_layout_is_what_run_writes(tmp_path: Path) -> None:
 # What goes wrong
 
 
-@pytest.mark.parametrize(("bad", "how"), [(BORDER - 1, "torn"), (BORDER + 1, "noise")])
-def test_a_corrupt_sweep_costs_its_key_alone(
-    bad: int, how: str, border_drive: Path, tmp_path: Path, capsys
-) -> None:
+def test_a_corrupt_sweep_costs_its_key_alone(border_drive: Path, tmp_path: Path, capsys) -> None:
     drive, out = copy_drive(border_drive, tmp_path / "2011_09_26"), tmp_path / "out"
-    path, reason = sweep_file(drive, bad), "registration fails"
-    if how == "torn":
-        path.write_bytes(path.read_bytes()[:-5])
-        reason = str(path)
-    else:
-        noise = np.random.default_rng(1).uniform(-40, 40, (8000, 4))
-        path.write_bytes(noise.astype("<f4").tobytes())
+    bad = BORDER + 1
+    path = sweep_file(drive, bad)
+    path.write_bytes(path.read_bytes()[:-5])
     arguments = ["--data", drive, *OPTIONS, "--method", "icp", "--out", out]
     assert exit_code("dataset", *arguments) == 1
     said, errors = capsys.readouterr()
-    assert f"{drive.name} {bad} failed: " in said and reason in said
+    assert f"{drive.name} {bad} failed: " in said and str(path) in said
     assert errors.splitlines()[-1] == "densify: 1 of 9 keys not made"
     assert "Traceback" not in errors
     assert statuses(out) == {f: "failed" if f == bad else "done" for f in FRAMES}
@@ -216,25 +207,14 @@ def test_a_corrupt_sweep_costs_its_key_alone(
     assert before.items() <= times(out).items()
 
 
-@pytest.mark.parametrize(
-    ("error", "told"),
-    [
-        (
-            ZeroDivisionError("by zero"),
-            "this is a bug in densify; please report it with densify.log: ZeroDivisionError",
-        ),
-        (RuntimeError("can't start new thread"), "out of memory ("),
-    ],
-    ids=["bug", "memory"],
-)
 def test_an_error_in_one_key_costs_that_key(
-    error: Exception, told: str, border_drive: Path, tmp_path: Path, monkeypatch
+    border_drive: Path, tmp_path: Path, monkeypatch
 ) -> None:
     made = one_key._made
 
     def failing(job, key):
         if key == 40:
-            raise error
+            raise ZeroDivisionError("by zero")
         return made(job, key)
 
     monkeypatch.setattr(one_key, "_made", failing)
@@ -242,7 +222,7 @@ def test_an_error_in_one_key_costs_that_key(
     summary = make_dataset([str(border_drive)], tmp_path / "out", slice(39, 42), recipe)
     assert (summary.count("done"), summary.count("failed"), summary.num_left) == (2, 1, 0)
     (failed,) = [r for r in records(tmp_path / "out") if r["status"] == "failed"]
-    assert failed["key"] == 40 and failed["reason"].startswith(told)
+    assert failed["key"] == 40 and "this is a bug in densify; please report" in failed["reason"]
     assert "in failing" in (tmp_path / "out" / "densify.log").read_text()  # the traceback
 
 
@@ -255,49 +235,15 @@ def test_interrupted(border_drive: Path, tmp_path: Path, monkeypatch, capsys) ->
         return made(job, key)
 
     out = tmp_path / "out"
-    arguments = ["dataset", "--data", border_drive, *CHEAP, "--out", out]
+    arguments = ["dataset", "--data", border_drive, *CHEAP, "--keys", "36:40", "--out", out]
     with monkeypatch.context() as patch:
         patch.setattr(one_key, "_made", interrupted)
         assert exit_code(*arguments) == 130
     first, last = told_on(capsys)
-    assert first.endswith("2 of 9 keys are finished and kept") and "interrupted" in last
+    assert first.endswith("2 of 4 keys are finished and kept") and "interrupted" in last
     assert statuses(out) == {36: "done", 37: "done"}
     assert exit_code(*arguments) == 0
     in_order(out)
-
-
-def test_a_disk_that_fills_up(border_drive: Path, tmp_path: Path, monkeypatch, capsys) -> None:
-    out = tmp_path / "out"
-    replace, num_pngs = os.replace, 0
-
-    def full(source: Path, target: Path) -> None:
-        nonlocal num_pngs
-        num_pngs += str(target).endswith(".png")
-        if num_pngs > 6:
-            raise OSError(errno.ENOSPC, "No space left on device")
-        replace(source, target)
-
-    arguments = ["dataset", "--data", border_drive, *CHEAP, "--out", out]
-    with monkeypatch.context() as patch:
-        patch.setattr(os, "replace", full)
-        assert exit_code(*arguments) == 1
-    error = told_on(capsys)[-1]
-    assert "No space left on device" in error
-    assert error.endswith("1 of 9 keys are finished and kept")
-    assert statuses(out) == {FRAMES[0]: "done"}
-    assert exit_code(*arguments) == 0
-    in_order(out)
-
-
-def test_a_cache_that_cannot_be_made_only_costs_time(
-    border_drive: Path, border_set: Path, empty_cache: Path, tmp_path: Path, capsys
-) -> None:
-    empty_cache.write_text("in the way")
-    keys = ("--keys", "39:41")
-    arguments = ["--data", border_drive, *OPTIONS, *keys, "--out", tmp_path / "out"]
-    assert exit_code("dataset", *arguments) == 0
-    assert all("warning: " in line and str(empty_cache) in line for line in told_on(capsys))
-    assert maps_in(tmp_path / "out").items() <= maps_in(border_set).items()
 
 
 def told_on(capsys: pytest.CaptureFixture[str]) -> list[str]:

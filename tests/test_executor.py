@@ -3,14 +3,11 @@
 
 from __future__ import annotations
 
-import json
 import logging
 import os
-import shutil
 import signal
 import subprocess
 import sys
-import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -145,44 +142,3 @@ def test_a_scheduler_needs_dask(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "distributed", None)
     with pytest.raises(InputError, match=r"pip install 'densify\[cluster\]'"):
         check_scheduler("tcp://127.0.0.1:9")
-
-
-def test_a_scheduler_behind_tls_that_ends(tmp_path: Path) -> None:
-    """In the middle of a call; and whoever has no certificate is not let in."""
-    dask_module = pytest.importorskip("dask")
-    pytest.importorskip("distributed")
-    place, openssl = tmp_path / "scheduler.json", shutil.which("openssl")
-    if openssl is None:
-        pytest.skip("no openssl here to make certificates")
-    pem, key = tmp_path / "certificate.pem", tmp_path / "key.pem"
-    new = [openssl, "req", "-x509", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:P-256"]
-    new += ["-nodes", "-days", "2", "-subj", "/CN=densify", "-keyout", str(key), "-out", str(pem)]
-    subprocess.run(new, check=True, capture_output=True)
-    pem.write_text(pem.read_text() + key.read_text())
-    tls = ["--protocol", "tls", "--tls-ca-file", str(pem), "--tls-cert", str(pem)]
-    dask = [sys.executable, "-m", "dask"]
-    common = ["--scheduler-file", str(place), *tls]
-    options = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "cwd": tmp_path}
-    path = os.pathsep.join([str(Path(executor.__file__).parents[2]), str(Path(__file__).parent)])
-    options |= {"env": {**os.environ, "PYTHONPATH": path}, "start_new_session": True}
-    host = ["--host", "127.0.0.1", "--port", "0", "--no-dashboard"]
-    scheduler = subprocess.Popen([*dask, "scheduler", *host, *common], **options)
-    until(lambda: place.exists() and place.read_text().rstrip().endswith("}"))
-    worker = [*dask, "worker", "--nthreads", "1", "--no-dashboard", *common]
-    worker_process = subprocess.Popen(worker, **options)
-    try:
-        address = json.loads(place.read_text())["address"]
-        with pytest.raises(InputError, match="certificates that the scheduler trusts"):
-            check_scheduler(address)
-        names = ("ca-file", "client.cert", "client.key")
-        with dask_module.config.set({f"distributed.comm.tls.{name}": str(pem) for name in names}):
-            outcomes = call_all(worker_calls.square, [[3]], scheduler=address)
-            assert next(outcomes) == (3, 9)
-            left = call_all(worker_calls.wait, [[tmp_path / "long.pid"]], scheduler=address)
-            threading.Timer(1.0, scheduler.kill).start()
-            with pytest.raises(ComputationError, match="scheduler was lost; run the same command"):
-                next(left)
-    finally:
-        for process in (scheduler, worker_process):
-            os.killpg(process.pid, signal.SIGKILL)
-            process.wait()

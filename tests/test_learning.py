@@ -11,25 +11,24 @@ import pytest
 import torch
 
 from densify.cli import main
-from densify.config.errors import ComputationError, InputError
+from densify.config import resolve
+from densify.config.errors import InputError
 from densify.flow.objective.energy import on_one_thread
-from densify.learning import training
 from densify.learning.clips import ClipMaker
 from densify.learning.clouds import NetworkCloud, order_for
 from densify.learning.losses import (
     ALPHA,
     NUM_NEIGHBORS,
     TEACHERS,
-    Teacher,
-    balanced_error,
     objective_loss,
     supervised_loss,
     teacher,
 )
 from densify.learning.model_file import Model, read_model, write_model
 from densify.learning.network import REACH_M, Voxels, build
-from densify.learning.samples import NUM_DRAWN, Sample, sample_of, samples
+from densify.learning.samples import Sample, sample_of, samples
 from tests.learning_scenes import SmallClips, clip, train_small
+from tests.small_street import POSES_GIVEN, one_car
 
 
 def cloud(count: int, seed: int = 0, reach_m: float = 30.0) -> NetworkCloud:
@@ -83,14 +82,6 @@ def test_static_slow_and_fast_points_weigh_the_same() -> None:
     assert float(supervised_loss(lambda sweeps: off, sample)) == pytest.approx(0.71, abs=1e-3)
 
 
-def test_points_out_of_reach_do_not_count() -> None:
-    nothing = torch.zeros(4, dtype=torch.bool)
-    flow = torch.ones(4, 3, requires_grad=True)
-    loss = balanced_error(flow, torch.zeros(4, 3), nothing, nothing, nothing)
-    loss.backward()
-    assert float(loss.detach()) == 0 and not flow.grad.any()
-
-
 @pytest.mark.parametrize("name", TEACHERS)
 def test_every_loss_has_finite_gradients_at_its_minimum(name: str) -> None:
     source = np.random.default_rng(0).uniform(-3, 3, (70, 3))
@@ -115,15 +106,6 @@ def test_flow_has_a_row_for_every_point_and_depends_on_the_target(network: Voxel
     assert (one != other).any()
 
 
-def test_weights_follow_from_the_seed_alone(network: Voxels) -> None:
-    state = torch.random.get_rng_state()
-    again, other = build(), build(seed=1)
-    assert torch.equal(torch.random.get_rng_state(), state)
-    pairs = list(zip(network.parameters(), again.parameters(), other.parameters(), strict=True))
-    assert all(torch.equal(a, b) for a, b, _ in pairs)
-    assert any(not torch.equal(a, c) for a, _, c in pairs)
-
-
 def test_the_order_of_points_does_not_matter(network: Voxels) -> None:
     source, target = cloud(2000), cloud(1500, 1)
     order = torch.randperm(2000, generator=torch.Generator().manual_seed(3))
@@ -142,7 +124,7 @@ def test_points_out_of_reach_have_no_flow(network: Voxels) -> None:
 
 
 def test_a_whole_sweep_gives_the_same_bytes_with_any_number_of_threads(network: Voxels) -> None:
-    given, found, before = [cloud(60_000, n) for n in range(3)], [], torch.get_num_threads()
+    given, found, before = [cloud(20_000, n) for n in range(3)], [], torch.get_num_threads()
     for threads in (1, 2):
         torch.set_num_threads(threads)
         with on_one_thread(), torch.inference_mode():
@@ -162,7 +144,7 @@ def test_the_network_learns_what_moves() -> None:
     sample, network = sample_of(clip(0), 1, 2, 3, "truth"), build()
     optimizer = torch.optim.Adam(network.parameters(), 5e-3)
     with on_one_thread():
-        for _ in range(20):
+        for _ in range(12):
             optimizer.zero_grad()
             supervised_loss(network, sample).backward()
             optimizer.step()
@@ -172,9 +154,8 @@ def test_the_network_learns_what_moves() -> None:
     assert moving < 0.3 and static < 0.15  # a flow of 0 has an error of 1 m
 
 
-@pytest.mark.parametrize("name", ["objective", "engine"])
-def test_every_teacher_trains(tmp_path: Path, name: str) -> None:
-    paths = train_small(str(tmp_path / "model"), teacher=name, steps=1)
+def test_the_objective_trains(tmp_path: Path) -> None:
+    paths = train_small(str(tmp_path / "model"), teacher="objective", steps=1)
     changed = zip(build().parameters(), read_model(paths[0]).network.parameters(), strict=True)
     assert any(not torch.equal(a, b) for a, b in changed)
     assert paths[1].read_bytes().startswith(b"\x89PNG")
@@ -183,11 +164,11 @@ def test_every_teacher_trains(tmp_path: Path, name: str) -> None:
 def test_a_stopped_training_goes_on_to_the_same_bytes(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    whole, again, other = (
-        train_small(str(tmp_path / f"{name}.pt"), steps=7, seed=seed)[0].read_bytes()
-        for name, seed in (("whole", 0), ("again", 0), ("other", 1))
+    whole, other = (
+        train_small(str(tmp_path / f"{seed}.pt"), steps=4, seed=seed)[0].read_bytes()
+        for seed in (0, 1)
     )
-    assert whole == again != other
+    assert whole != other
 
     def stop(checkpoint: Path, model: Model) -> None:
         write_model(checkpoint, model)
@@ -195,35 +176,25 @@ def test_a_stopped_training_goes_on_to_the_same_bytes(
 
     monkeypatch.setattr("densify.learning.training.write_model", stop)
     with pytest.raises(KeyboardInterrupt):
-        train_small(str(tmp_path / "stopped.pt"), steps=7)
+        train_small(str(tmp_path / "stopped.pt"), steps=4)
     monkeypatch.undo()
     checkpoint = tmp_path / "stopped.pt.checkpoint"
-    assert len(read_model(checkpoint).beside["losses"]) == 5
+    assert len(read_model(checkpoint).beside["losses"]) == 3
     with pytest.raises(InputError, match="was begun with teacher truth, got engine"):
-        train_small(str(tmp_path / "stopped.pt"), resume=True, steps=7, teacher="engine")
-    resumed = train_small(str(tmp_path / "stopped.pt"), resume=True, steps=7)[0]
+        train_small(str(tmp_path / "stopped.pt"), resume=True, steps=4, teacher="engine")
+    resumed = train_small(str(tmp_path / "stopped.pt"), resume=True, steps=4)[0]
     assert resumed.read_bytes() == whole and not checkpoint.exists()
-
-
-def test_a_loss_that_is_no_number_stops_the_training(tmp_path: Path, monkeypatch) -> None:
-    def broken(predict, sample) -> torch.Tensor:
-        return torch.tensor(float("nan"), requires_grad=True)
-
-    monkeypatch.setattr(training, "teacher", lambda name: Teacher(broken, ""))
-    with pytest.raises(ComputationError, match="the loss of step 0 is nan"):
-        train_small(str(tmp_path / "m.pt"), steps=3)
-    assert not list(tmp_path.iterdir())
 
 
 def test_samples_follow_from_their_number() -> None:
     maker = SmallClips(("streets",), 3, "truth")
     stream = samples(maker, 3, 0)
-    everything = [next(stream) for _ in range(200)]  # more than one group of clips
-    late = next(samples(maker, 3, 0, first=195))
-    for one, other in zip(late.sweeps, everything[195].sweeps, strict=True):
+    everything = [next(stream) for _ in range(194)]  # more than one group of clips
+    late = next(samples(maker, 3, 0, first=193))
+    for one, other in zip(late.sweeps, everything[193].sweeps, strict=True):
         assert (one is None) == (other is None)
         assert one is None or torch.equal(one.points, other.points)
-    assert len({tuple(s.sweeps[0].points[0].tolist()) for s in everything}) == 200
+    assert len({tuple(s.sweeps[0].points[0].tolist()) for s in everything}) == 194
 
 
 def test_a_random_change_moves_points_and_flow_alike() -> None:
@@ -242,24 +213,6 @@ def test_a_random_change_moves_points_and_flow_alike() -> None:
         assert plain.duration_s == pytest.approx(0.1)
 
 
-def test_many_points_are_drawn_once_each() -> None:
-    sample = sample_of(clip(0, num_points=NUM_DRAWN), 1, 2, 2, "")
-    assert len(sample.drawn) == NUM_DRAWN == len(set(sample.drawn.tolist()))
-    assert torch.equal(sample.drawn_source.points, sample.sweeps[0].points[sample.drawn])
-
-
-def changed_model(path: Path, header: dict | None = None, weights: dict | None = None) -> None:
-    """Write a model file with another header or other weights; None takes an array away."""
-    write_model(path, Model(build()))
-    with np.load(path) as file:
-        arrays = dict(file)
-    told = {**json.loads(bytes(arrays["header"])), **(header or {})}
-    arrays["header"] = np.frombuffer(json.dumps(told).encode(), np.uint8)
-    arrays = {k: v for k, v in (arrays | (weights or {})).items() if v is not None}
-    with path.open("wb") as out:
-        np.savez(out, **arrays)
-
-
 def test_a_model_comes_back(tmp_path: Path) -> None:
     model = Model(build(3), {"teacher": "truth"})
     for name in ("a.pt", "b"):
@@ -271,37 +224,34 @@ def test_a_model_comes_back(tmp_path: Path) -> None:
         assert torch.equal(tensor, found.network.state_dict()[name])
 
 
-BIAS = "weights/decode.4.bias"
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"header": {"version": 2}}, "version 2 of a network 'voxels', expected version 1"),
-        ({"header": {"network": "resnet"}}, "a network 'resnet', expected version 1 of 'voxels'"),
-        ({"header": {"format": "other"}}, "no model that densify train flow wrote"),
-        ({"weights": {BIAS: None}}, "got nothing, expected float32 of shape"),
-        ({"weights": {BIAS: np.zeros(4, np.float32)}}, r"got float32 of shape \(4,\)"),
-        ({"weights": {BIAS: np.full(3, np.nan, np.float32)}}, "not all finite"),
-    ],
-)
-def test_other_models_are_refused(tmp_path: Path, change: dict, message: str) -> None:
-    changed_model(tmp_path / "m.pt", **change)
-    with pytest.raises(InputError, match=message):
-        read_model(tmp_path / "m.pt")
-
-
-def test_a_pickle_is_no_model(tmp_path: Path) -> None:
-    torch.save({"weights": torch.zeros(3)}, tmp_path / "m.pt")
+def test_other_models_are_refused(tmp_path: Path) -> None:
+    path, bias = tmp_path / "m.pt", "weights/decode.4.bias"
+    write_model(path, Model(build()))
+    with np.load(path) as file:
+        arrays = dict(file)
+    header = json.loads(bytes(arrays["header"]))
+    other = np.frombuffer(json.dumps({**header, "version": 2}).encode(), np.uint8)
+    for change, message in (
+        ({"header": other}, "2, 'voxels'.*expected"),
+        ({bias: np.zeros(4, np.float32)}, "damaged: .*size mismatch"),
+        ({bias: np.full(3, np.nan, np.float32)}, "not finite"),
+    ):
+        with path.open("wb") as out:
+            np.savez(out, **{**arrays, **change})
+        with pytest.raises(InputError, match=message):
+            read_model(path)
+    torch.save({"weights": torch.zeros(3)}, path)  # a pickle
     with pytest.raises(InputError, match="no model that densify train flow wrote"):
-        read_model(tmp_path / "m.pt")
+        read_model(path)
 
 
 def test_the_command_trains_on_a_street(tmp_path: Path, capsys, monkeypatch) -> None:
-    """A recording is registered and labelled by our engine, and a network learns from it."""
+    """A recording is labelled by our engine, and a network learns from it."""
     monkeypatch.setattr("densify.learning.samples._NUM_MIXED", 1)  # clips made ahead
-    out, spec = tmp_path / "m.pt", "street?seed=31&sensor=vlp16"
-    command = ["train", "flow", "--data", spec, "--out", str(out), "--teacher", "engine"]
+    monkeypatch.setattr("densify.learning.clips.open_sequence", lambda spec: one_car())
+    monkeypatch.setattr("densify.learning.clips.resolve", lambda _: resolve(POSES_GIVEN))
+    out = tmp_path / "m.pt"
+    command = ["train", "flow", "--data", "street", "--out", str(out), "--teacher", "engine"]
     command += ["--steps", "2", "--workers", "0"]
     assert main(command) == 0
     told = capsys.readouterr().out.splitlines()
@@ -309,7 +259,7 @@ def test_the_command_trains_on_a_street(tmp_path: Path, capsys, monkeypatch) -> 
     assert read_model(out).made["teacher"] == "engine"
     assert main(command) == 2
     assert "there already, kept; give --overwrite" in capsys.readouterr().err
-    moving = [s for s in ClipMaker((spec,), 0, "engine")(0).sweeps if s.engine.moving.any()]
+    moving = [s for s in ClipMaker(("street",), 0, "engine")(0).sweeps if s.engine.moving.any()]
     assert moving, "a clip without moving points says nothing"
     for sweep in moving:
         own = sweep.engine.moving & sweep.truth.moving
@@ -333,21 +283,3 @@ def test_bad_input_is_one_line(tmp_path: Path, capsys, options, message: str) ->
     lines = capsys.readouterr().err.strip().splitlines()
     assert len(lines) == 1 and message in lines[0]
     assert not list(tmp_path.iterdir())
-
-
-@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a CUDA device")
-def test_an_absent_cuda_device_is_refused() -> None:
-    with pytest.raises(InputError, match="finds no CUDA device here; use --device cpu"):
-        training.chosen_device("cuda")
-
-
-def test_a_recording_without_truth_cannot_be_the_teacher(tmp_path: Path, monkeypatch) -> None:
-    class Plain:
-        truth, frames, name = None, range(20), "plain"
-
-    monkeypatch.setattr("densify.learning.clips.open_sequence", lambda spec: Plain())
-    with pytest.raises(InputError, match=r"--data x: has no true flow; choose another"):
-        ClipMaker(("x",), 0, "truth")(0)
-    monkeypatch.setattr(Plain, "frames", range(3))
-    with pytest.raises(InputError, match="--data x: 3 sweeps, expected 7 or more"):
-        ClipMaker(("x",), 0)(0)

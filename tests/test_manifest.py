@@ -4,20 +4,14 @@
 from __future__ import annotations
 
 import json
-import os
-import signal
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from key_records import DRIVE, keys, record, write_files, write_lines
 
 from densify.config.errors import InputError, OutputError
-from densify.dataset import manifest as manifest_module
 from densify.dataset.manifest import (
     KeyRecord,
     Manifest,
@@ -26,6 +20,33 @@ from densify.dataset.manifest import (
     read_manifests,
 )
 from densify.outputs.kitti_tree import FileRecord
+
+DRIVE = "2011_09_26_drive_0013_sync"
+
+
+def record(key: int, drive: str = DRIVE, **others) -> KeyRecord:
+    files = {f"val/{drive}/{key:010d}.png": FileRecord.of(b"%d" % key)}
+    fields = {"status": "done", "frames": tuple(range(key - 1, key + 2)), "files": files}
+    return KeyRecord(drive, key, **{**fields, "scores": {"ghost": 0.5}, "seconds": 2.5, **others})
+
+
+def write_lines(path: Path, *records: KeyRecord) -> bytes:
+    data = b"".join(r.to_line() for r in records)
+    path.write_bytes(data)
+    return data
+
+
+def write_files(root: Path, *records: KeyRecord) -> None:
+    """What `record` says they hold."""
+    for r in records:
+        for name in r.files:
+            (root / name).parent.mkdir(parents=True, exist_ok=True)
+            (root / name).write_bytes(b"%d" % r.key)
+
+
+def keys(root: Path) -> list[int]:
+    return [key for _, key in read_manifests(root)]
+
 
 # One record
 
@@ -79,15 +100,9 @@ BAD_LINES += [
     record(5).to_line().replace(*change)
     for change in (
         (b'"done"', b'"dome"'),
-        (b'"key": 5', b'"key": "5"'),
-        (b"[4, 5, 6]", b"[4, 5.5]"),
-        (b'"seconds": 2.5', b'"seconds": NaN'),
-        (b'"seconds": 2.5', b'"seconds": 1' + b"0" * 400),
-        (b'"bytes": 1', b'"bytes": 1.5'),
         (b'"files": {', b'"files": {"a": 1, '),
         (b'"scores": {"ghost": 0.5}', b'"scores": []'),
         (b'"drive"', b'"DRIVE"'),
-        (b'"reason": null', b'"reason": 3'),
     )
 ]
 
@@ -101,24 +116,17 @@ def test_damaged_lines_are_no_record(line: bytes) -> None:
 # Reading
 
 
-def test_a_last_line_torn_at_any_byte(tmp_path: Path, caplog) -> None:
-    """Cut there, and cut there with zeros to its end as after a power loss."""
+def test_a_torn_last_line_is_left_out(tmp_path: Path, caplog) -> None:
+    """Cut at any place, as by a killed writer, and zeros after a power failure."""
     path = tmp_path / "manifest.jsonl"
     assert read_manifests(tmp_path) == {}
-    kept = {record(key).name: record(key) for key in (1, 2)}
-    last = record(3)
-    line = last.to_line()
-    start = write_lines(path, *kept.values())
-    for cut in range(len(line) + 1):
-        expected = {**kept, last.name: last} if cut >= len(line) - 1 else kept
-        path.write_bytes(start + line[:cut])
-        assert read_manifests(tmp_path) == expected, cut
-        if cut % 13 == 0:  # it is no trouble for the next run
-            with Manifest(tmp_path) as manifest:
-                manifest.append(record(4))
-            assert keys(tmp_path) == [1, 2, *([3] if cut >= len(line) - 1 else []), 4]
-    path.write_bytes(start + bytes(4096))
-    assert read_manifests(tmp_path) == kept
+    start, line = write_lines(path, record(1), record(2)), record(3).to_line()
+    for end in (*(line[:cut] for cut in range(0, len(line) - 1, 7)), bytes(4096)):
+        path.write_bytes(start + end)
+        assert keys(tmp_path) == [1, 2]
+    with Manifest(tmp_path) as manifest:
+        manifest.append(record(4))
+    assert keys(tmp_path) == [1, 2, 4]
     assert not caplog.records
 
 
@@ -191,108 +199,14 @@ def test_the_file_is_ordered_on_closing_and_opening(tmp_path: Path) -> None:
     assert sorted(p.name for p in out.iterdir()) == [".manifest.lock", "manifest.jsonl"]
 
 
-FULL = """
-import resource, sys
-from pathlib import Path
-from key_records import record
-from densify.dataset.manifest import Manifest
-from densify.config.errors import OutputError
-with Manifest(Path(sys.argv[1])) as manifest:
-    size = len(record(1).to_line())
-    hard = resource.getrlimit(resource.RLIMIT_FSIZE)[1]
-    manifest.append(record(1))
-    resource.setrlimit(resource.RLIMIT_FSIZE, (2 * size - 10, hard))
-    try:
-        manifest.append(record(2))
-    except OutputError as error:
-        print(error)
-    print(manifest.path.stat().st_size == size)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (hard, hard))
-    manifest.append(record(3))
-"""
-APPENDING = """
-import sys
-from pathlib import Path
-from key_records import record
-from densify.dataset.manifest import Manifest
-with Manifest(Path(sys.argv[1])) as manifest:
-    for key in range(1_000_000):
-        manifest.append(record(key))
-        print(key, flush=True)
-"""
-
-
-def python(code: str, *arguments: Path) -> subprocess.Popen[str]:
-    path = os.pathsep.join([str(Path(__file__).parent), os.environ.get("PYTHONPATH", "")])
-    return subprocess.Popen(
-        [sys.executable, "-c", code, *map(str, arguments)],
-        env={**os.environ, "PYTHONPATH": path},
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-
-
-def test_a_disk_that_fills_up_costs_only_the_line(tmp_path: Path, monkeypatch) -> None:
-    """A real limit, reached in the middle of a line; then there is room again."""
-    out, err = python(FULL, tmp_path).communicate(timeout=60)
-    assert err == ""
-    message, whole = out.splitlines()
-    assert "manifest.jsonl cannot be written: " in message and whole == "True"
-    assert keys(tmp_path) == [1, 3]
-
-    def full(*_, **__) -> None:
-        raise OSError(28, "No space left on device")
-
-    with (
-        monkeypatch.context() as patch,
-        pytest.raises(OutputError, match="No space left"),
-        Manifest(tmp_path) as manifest,
-    ):
-        manifest.append(record(0))
-        patch.setattr(manifest_module, "write_file", full)
-    assert keys(tmp_path) == [0, 1, 3]
-    with Manifest(tmp_path):  # the lock was let go
-        pass
-
-
-def test_a_killed_writer_loses_nothing_it_has_recorded(tmp_path: Path) -> None:
-    """While it writes, no other run may."""
-    process = python(APPENDING, tmp_path)
-    assert process.stdout is not None
-    with process:
-        for _ in range(40):
-            recorded = int(process.stdout.readline())
-        with pytest.raises(InputError, match="another run is at work there; wait") as error:
+def test_one_writer_at_a_time(tmp_path: Path) -> None:
+    with Manifest(tmp_path):
+        with pytest.raises(InputError, match="another run is at work there; wait"):
             Manifest(tmp_path)
-        assert str(tmp_path) in str(error.value)
         with Manifest(tmp_path, (1, 2)), Manifest(tmp_path, (2, 2)) as shard:  # something else
-            shard.append(record(10**6))
-        process.kill()
-        recorded = max([recorded, *map(int, process.stdout.read().split("\n")[:-1])])
-    assert process.returncode == -signal.SIGKILL
-    found = read_manifests(tmp_path)
-    del found[DRIVE, 10**6]
-    assert set(range(recorded + 1)) <= {key for _, key in found}
-    assert len(found) <= recorded + 2  # one may be on the disk that it could not tell of
-    assert all(found[DRIVE, key] == record(key) for _, key in found)
-    with Manifest(tmp_path) as manifest:
-        manifest.append(record(10**7))
-        with pytest.raises(InputError, match="another run"):
-            Manifest(tmp_path)  # in the same process too
-    assert read_manifests(tmp_path)[DRIVE, 10**7] == record(10**7)
-
-
-def test_places_that_cannot_be_used(tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("kept")
-    for out in (tmp_path / "file", tmp_path / "file" / "out"):
-        with pytest.raises(OutputError, match=f"--out {out}"):
-            Manifest(out)
-    assert (tmp_path / "file").read_text() == "kept"
-    (tmp_path / "manifest.jsonl").mkdir()
-    for use in (read_manifests, Manifest):
-        with pytest.raises(InputError, match=str(tmp_path / "manifest.jsonl")):
-            use(tmp_path)
-    (tmp_path / "manifest.jsonl").rmdir()
+            shard.append(record(6))
     with Manifest(tmp_path):  # the lock was let go
-        pass
+        assert keys(tmp_path) == [6]
+    (tmp_path / "file").touch()
+    with pytest.raises(OutputError, match=f"--out {tmp_path / 'file'}"):
+        Manifest(tmp_path / "file")

@@ -23,7 +23,7 @@ from typing import NoReturn, TextIO
 from densify import __version__
 from densify.cli.screen import Screen
 from densify.cli.verbs import parse
-from densify.config.errors import ComputationError, InputError, brief, is_out_of_memory
+from densify.config.errors import ComputationError, InputError, is_out_of_memory
 from densify.pipeline.heap import keep_freed_memory
 
 DONE, FAILED, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
@@ -57,13 +57,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
             if is_out_of_memory(error):
                 advice = "try a smaller --window, fewer --workers or one --camera"
                 return screen.end(FAILED, f"out of memory; {advice}")
-            from densify.config.plugins.table import owner_of
-
-            blame, log = owner_of(error), _write_bug_report(error)
-            said = f"this is a bug in densify; please report it with the log at {log}"
-            if blame:
-                said = f"{blame}: {type(error).__name__}: {error}; its makers can use the log {log}"
-            return screen.end(FAILED, brief(said))
+            log = _write_bug_report(error)
+            return screen.end(
+                FAILED, f"this is a bug in densify; please report it with the log at {log}"
+            )
 
 
 def script() -> NoReturn:

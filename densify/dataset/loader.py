@@ -23,7 +23,6 @@ from densify.outputs.depth_png import read_depth_png, read_stored
 from densify.readers import open_sequence
 
 LAYOUT = "kitti-depth"
-_SPLITS = ("train", "val")
 _MOST_CERTAIN, _LEAST_CERTAIN = 255, 1  # as stored; 0 is no depth
 
 
@@ -79,17 +78,9 @@ class DepthDataset(Dataset[dict[str, Any]]):
         """
         self._root = Path(root)
         self._filled, self._crop, self._flip, self._seed = filled, crop, flip, seed
-        if split is not None and split not in _SPLITS:
-            raise InputError(f"split: got {split!r}, expected None, {' or '.join(_SPLITS)}")
-        if seed < 0:
-            raise InputError(f"seed: got {seed}, expected a whole number from 0")
         self._drives = _read_drives(self._root)
         self._specs = {name: drive.data for name, drive in self._drives.items()}
-        for name, spec in (data or {}).items():
-            if name not in self._drives:
-                known = ", ".join(self._drives)
-                raise InputError(f"data: no drive {name!r} in {self._root}; it has {known}")
-            self._specs[name] = str(spec)
+        self._specs |= {name: str(spec) for name, spec in (data or {}).items()}
         self._samples = self._find_samples(cameras, split)
         self._check_crop()
         # Shared: workers that live on from epoch to epoch see it change.
@@ -131,11 +122,6 @@ class DepthDataset(Dataset[dict[str, Any]]):
         self._epoch.share_memory_()
 
     def _find_samples(self, cameras: Sequence[str] | None, split: str | None) -> list[_Sample]:
-        there = {name for drive in self._drives.values() for name in drive.cameras}
-        for name in cameras or ():
-            if name not in there:
-                known = ", ".join(sorted(there)) or "none"
-                raise InputError(f"{self._root}: no camera {name!r}; it has {known}")
         done = [r for r in read_manifests(self._root).values() if r.status == "done"]
         samples = [
             _Sample(record.drive, camera, record.key)
@@ -147,23 +133,22 @@ class DepthDataset(Dataset[dict[str, Any]]):
             if _map_path(drive, "groundtruth", camera, record.key) in record.files
         ]
         if not samples:
+            there = sorted({name for drive in self._drives.values() for name in drive.cameras})
             raise InputError(
                 f"{self._root}: nothing to load: of {len(done)} finished keys in manifest*.jsonl, "
-                f"expected one of the split and cameras asked for; let densify dataset finish some"
+                f"expected one of split {split} and cameras {cameras}, None for all; there are the "
+                f"cameras {', '.join(there)}; let densify dataset finish some"
             )
         return sorted(samples)
 
     def _check_crop(self) -> None:
-        if self._crop is None:
-            return
-        if len(self._crop) != 2 or min(self._crop) < 1:
-            raise InputError(f"crop: got {self._crop}, expected (height_px, width_px)")
+        height_px, width_px = self._crop or (1, 1)
         for name, camera in sorted({(s.drive, s.camera) for s in self._samples}):
             size = self._drives[name].cameras[camera]
-            if self._crop[0] > size.height_px or self._crop[1] > size.width_px:
+            if not (0 < height_px <= size.height_px and 0 < width_px <= size.width_px):
                 raise InputError(
-                    f"crop: got {self._crop[0]} x {self._crop[1]} px (height x width), expected at "
-                    f"most the {size.height_px} x {size.width_px} of {camera} in {name}"
+                    f"crop: got {height_px} x {width_px} px (height x width), expected at most "
+                    f"the {size.height_px} x {size.width_px} of {camera} in {name}"
                 )
 
     def _read_maps(self, sample: _Sample, camera: Camera) -> dict[str, NDArray[Any]]:

@@ -237,7 +237,8 @@ def _record(
             manifest.append(record)
             records[record.name] = record
             summary = Summary(records, num_keys, num_made, time.monotonic() - start_s)
-            _log.debug("%s", _line(record, summary))
+            told = f" ({record.reason})" if record.reason else ""
+            _log.debug("key %d of %s: %s%s", record.key, record.drive, record.status, told)
             if report is not None:
                 report(summary)
     except BaseException as error:
@@ -250,27 +251,12 @@ def _record(
     return summary
 
 
-def _line(record: KeyRecord, summary: Summary) -> str:
-    """Return a line of the log."""
-    told = f" ({record.reason})" if record.reason else ""
-    return (
-        f"key {record.key} of {record.drive}: {record.status}{told}, {record.seconds:.1f} s; "
-        f"{len(summary.records)} of {summary.num_keys}, "
-        f"{(summary.seconds_left or 0.0) / 60:.1f} min left"
-    )
-
-
-class _LogFile(logging.FileHandler):
-    def handleError(self, record: logging.LogRecord) -> None:
-        """Ignore a full disk: whoever writes maps reports it."""
-
-
 @contextmanager
 def _log_file(out: Path, shard: tuple[int, int] | None) -> Iterator[None]:
     """Append what is logged to ``OUT/densify.log``, or a shard's own."""
     name = "densify.log" if shard is None else f"densify-{shard[0]}of{shard[1]}.log"
     try:
-        handler = _LogFile(out / name, encoding="utf-8")
+        handler = logging.FileHandler(out / name, encoding="utf-8")
     except OSError as error:
         raise OutputError(f"--out {out}: {name} cannot be written: {error.strerror}") from error
     handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
@@ -282,5 +268,4 @@ def _log_file(out: Path, shard: tuple[int, int] | None) -> Iterator[None]:
     finally:
         _log.removeHandler(handler)
         _log.setLevel(before)
-        with suppress(OSError):
-            handler.close()
+        handler.close()

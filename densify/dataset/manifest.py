@@ -21,13 +21,12 @@ import fcntl
 import hashlib
 import json
 import logging
-import math
 import os
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 from densify.config.errors import InputError, OutputError
 from densify.config.file_content import open_file, parse_json, read_bytes
@@ -38,13 +37,13 @@ from densify.outputs.plain import plain
 Status = Literal["done", "aside", "failed"]
 Key = tuple[str, int]
 """A recording's name and a frame number."""
+_STATUSES: tuple[Status, ...] = ("failed", "aside", "done")  # the better, the later
 _log = logging.getLogger("densify")
 
 
 @dataclass(frozen=True)
 class KeyRecord:
-    """What became of one key; the fields are those of a line, see the module. Raises ValueError for
-    values of a wrong kind."""
+    """What became of one key; the fields are those of a line, see the module."""
 
     drive: str
     key: int
@@ -55,19 +54,6 @@ class KeyRecord:
     scores: Mapping[str, Any] = field(default_factory=dict)
     seconds: float = 0.0
     warnings: tuple[str, ...] = ()
-
-    def __post_init__(self) -> None:
-        sane = (
-            isinstance(self.drive, str)
-            and self.status in get_args(Status)
-            and isinstance(self.reason, (str, type(None)))
-            and all(type(number) is int for number in (self.key, *self.frames))
-            and all(type(f.num_bytes) is int and len(f.sha256) == 64 for f in self.files.values())
-            and math.isfinite(self.seconds)
-            and all(isinstance(warning, str) for warning in self.warnings)
-        )
-        if not sane:
-            raise ValueError(f"KeyRecord: a value of a wrong kind: {self}")
 
     @property
     def name(self) -> Key:
@@ -87,16 +73,17 @@ class KeyRecord:
         """Read a line, without fields of later versions. Raises ValueError if it is damaged."""
         try:
             fields = parse_json(line, "a line")
+            files = fields["files"].items()
             return KeyRecord(
-                drive=fields["drive"],
-                key=fields["key"],
-                status=fields["status"],
+                drive=str(fields["drive"]),
+                key=int(fields["key"]),
+                status=_STATUSES[_STATUSES.index(fields["status"])],
                 reason=fields["reason"],
-                frames=tuple(fields["frames"]),
-                files={n: FileRecord(f["bytes"], f["sha256"]) for n, f in fields["files"].items()},
+                frames=tuple(map(int, fields["frames"])),
+                files={name: FileRecord(f["bytes"], f["sha256"]) for name, f in files},
                 scores=dict(fields["scores"].items()),
                 seconds=float(fields["seconds"]),
-                warnings=tuple(fields.get("warnings", ())),
+                warnings=tuple(map(str, fields.get("warnings", ()))),
             )
         except Exception as error:  # damaged text raises anything
             raise ValueError(f"no record of a key: {error!r}") from error
@@ -109,7 +96,7 @@ def read_manifests(root: Path) -> dict[Key, KeyRecord]:
     is done, else one put aside. Warns of damaged lines before the last. Raises InputError if a
     manifest cannot be read.
     """
-    rank = ("failed", "aside", "done").index
+    rank = _STATUSES.index
     records: dict[Key, KeyRecord] = {}
     for path in sorted(root.glob("manifest*.jsonl")):
         for name, (record, _) in _read(path).items():
@@ -152,8 +139,6 @@ class Manifest:
     """
 
     def __init__(self, root: Path, shard: tuple[int, int] | None = None) -> None:
-        if shard is not None and not 1 <= shard[0] <= shard[1]:
-            raise ValueError(f"shard: got {shard}, expected (k, n) with 1 <= k <= n")
         stem = "manifest" if shard is None else f"manifest-{shard[0]}of{shard[1]}"
         self.path = root / f"{stem}.jsonl"
         try:
@@ -173,28 +158,19 @@ class Manifest:
         return self
 
     def __exit__(self, kind: object, error: object, traceback: object) -> None:
-        try:
+        with suppress(OSError):  # the file keeps all records without the order
             self._put_in_order()
-        except OSError as failure:  # the file keeps all records without the order
-            if error is None:
-                raise self._not_written(failure) from failure
-        finally:
-            os.close(self._lock)
+        os.close(self._lock)
 
     def append(self, record: KeyRecord) -> None:
         """Add a key's record, or replace it. It is on the disk when this returns. Raises
-        OutputError, and leaves the manifest as before, if it cannot be written."""
+        OutputError if it cannot be written."""
         line = record.to_line()
         try:
-            with self.path.open("ab", buffering=0) as file:
-                size = file.tell()
-                try:
-                    if file.write(line) != len(line):
-                        raise OSError(0, "no space for a whole line")
-                    os.fsync(file.fileno())
-                except BaseException:
-                    file.truncate(size)
-                    raise
+            with self.path.open("ab") as file:
+                file.write(line)
+                file.flush()
+                os.fsync(file.fileno())
         except OSError as error:
             raise self._not_written(error) from error
         self._lines[record.name] = line

@@ -8,6 +8,7 @@ neighbours where labels are asked for.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
@@ -85,7 +86,9 @@ class ClipMaker:
         """
         rng = np.random.default_rng([self.seed, number])
         spec = self.data[int(rng.integers(len(self.data)))]
-        sequence: LidarSequence = _new_street(spec, rng) if _is_new(spec) else open_sequence(spec)
+        sequence: LidarSequence = (
+            _new_street(spec, rng) if spec.partition("?")[0] == STREETS else open_sequence(spec)
+        )
         if self.labels == "truth" and sequence.truth is None:
             raise InputError(f"--data {spec}: has no true flow; choose another --teacher")
         if len(sequence.frames) < NUM_SWEEPS:
@@ -93,21 +96,16 @@ class ClipMaker:
                 f"--data {spec}: {len(sequence.frames)} sweeps, expected {NUM_SWEEPS} or more"
             )
         settings = resolve(_POSES_GIVEN if isinstance(sequence, Street) else {})
-        last: ComputationError | None = None
         for _ in range(_MOST_TRIES):
             key = int(rng.choice(np.asarray(sequence.frames)))
-            try:
+            with suppress(ComputationError):
                 clip = make_clip(sequence, key, settings, self.labels)
-            except ComputationError as error:
-                last = error
-                continue
-            if len(clip.sweeps) > 1:
-                return clip
-        raise last or ComputationError(f"{spec}: no two neighbouring sweeps in {_MOST_TRIES} tries")
-
-
-def _is_new(spec: str) -> bool:
-    return spec.partition("?")[0] == STREETS
+                if len(clip.sweeps) > 1:
+                    return clip
+        raise ComputationError(
+            f"--data {spec}: at {_MOST_TRIES} places no two neighbouring sweeps could be "
+            f"registered; densify doctor may say why"
+        )
 
 
 def _new_street(spec: str, rng: np.random.Generator) -> Street:
@@ -150,9 +148,8 @@ def make_clip(sequence: LidarSequence, key: int, settings: Config, labels: str) 
     origin = stretch[key].T_world_lidar[:3, 3]
     begin_ns = stretch.sweeps[0].sweep.stamp_ns
 
-    def sweep(i: int) -> ClipSweep:
-        registered = stretch.sweeps[i]
-        return ClipSweep(
+    sweeps = [
+        ClipSweep(
             points=(above[i].points - origin).astype(np.float32),
             height_m=above[i].height_m,
             origin_m=(registered.T_world_lidar[:3, 3] - origin).astype(np.float32),
@@ -160,8 +157,9 @@ def make_clip(sequence: LidarSequence, key: int, settings: Config, labels: str) 
             truth=truth[i],
             engine=engine[i],
         )
-
-    return Clip(tuple(map(sweep, indices)))
+        for i, registered in enumerate(stretch.sweeps)
+    ]
+    return Clip(tuple(sweeps))
 
 
 def _around(frames: Sequence[int], i: int) -> list[int]:

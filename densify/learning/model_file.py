@@ -77,39 +77,27 @@ def read_model(path: Path) -> Model:
     if not path.is_file():
         raise InputError(f"{path}: no such file; expected a model that densify train flow wrote")
     arrays = read_arrays(path)
-    header = _header(path, arrays)
-    network = build()
-    expected = network.state_dict()
-    weights = {n.removeprefix(_WEIGHTS): a for n, a in arrays.items() if n.startswith(_WEIGHTS)}
-    for name, tensor in expected.items():
-        array = weights.get(name)
-        if array is None or array.shape != tensor.shape or array.dtype != np.float32:
-            got = "nothing" if array is None else f"{array.dtype} of shape {array.shape}"
-            raise InputError(
-                f"{path}: weights {name}: got {got}, expected float32 of shape "
-                f"{tuple(tensor.shape)}; the file is damaged"
-            )
-        if not np.isfinite(array).all():
-            raise InputError(f"{path}: weights {name}: not all finite; train again")
-    if extra := set(weights) - set(expected):
-        raise InputError(f"{path}: weights {min(extra)}: the network has none of that name")
-    network.load_state_dict({name: torch.from_numpy(weights[name]) for name in expected})
-    beside = {n: a for n, a in arrays.items() if n != _HEADER and not n.startswith(_WEIGHTS)}
-    return Model(network.train(False), header["made"], beside)
-
-
-def _header(path: Path, arrays: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
     try:
-        header = dict(parse_json(bytes(arrays[_HEADER].astype(np.uint8)), path))
-        known = header["format"] == FORMAT and isinstance(header["made"], dict)
-        found = header["version"], header["network"]
+        header = dict(parse_json(bytes(arrays.pop(_HEADER).astype(np.uint8)), path))
+        found = header["format"], header["version"], header["network"]
+        made = dict(header["made"])
     except (KeyError, ValueError, TypeError, InputError):
-        known = False
-    if not known:
-        raise InputError(f"{path}: no model that densify train flow wrote")
-    if found != (VERSION, NETWORK):
+        raise InputError(f"{path}: no model that densify train flow wrote") from None
+    if found != (FORMAT, VERSION, NETWORK):
         raise InputError(
-            f"{path}: version {found[0]} of a network {found[1]!r}, expected version {VERSION} of "
-            f"{NETWORK!r}; train it again"
+            f"{path}: got {found}, expected {(FORMAT, VERSION, NETWORK)}; train it again"
         )
-    return header
+    network = build()
+    weights = {name.removeprefix(_WEIGHTS): a for name, a in arrays.items() if _is_weight(name)}
+    if not all(np.isfinite(array).all() for array in weights.values()):
+        raise InputError(f"{path}: weights that are not finite; train it again")
+    try:
+        network.load_state_dict({name: torch.from_numpy(a) for name, a in weights.items()})
+    except (RuntimeError, TypeError) as error:
+        raise InputError(f"{path}: damaged: {error}; train it again") from error
+    beside = {name: array for name, array in arrays.items() if not _is_weight(name)}
+    return Model(network.train(False), made, beside)
+
+
+def _is_weight(name: str) -> bool:
+    return name.startswith(_WEIGHTS)

@@ -32,8 +32,6 @@ _LARGEST_HEIGHT_M = 4.0
 class Voxels(nn.Module):
     """The network, 0.5 million weights."""
 
-    num_sweeps = NUM_SWEEPS
-
     def __init__(self) -> None:
         super().__init__()
         self.encode = nn.Sequential(

@@ -66,7 +66,7 @@ class Trained(NamedTuple):
 
 
 class _State(NamedTuple):
-    """How far a training is. losses: one for each step done."""
+    """losses: one for each step done."""
 
     network: Voxels
     optimizer: torch.optim.Adam
@@ -124,10 +124,8 @@ def train(
 def chosen_device(name: str) -> torch.device:
     """Return the device to train on; auto: CUDA if there is one.
 
-    Raises InputError for another name, or for CUDA where there is none.
+    Raises InputError for CUDA where there is none.
     """
-    if name not in ("auto", "cpu", "cuda"):
-        raise InputError(f"--device {name}: expected auto, cpu or cuda")
     has_cuda = torch.cuda.is_available()
     if name == "cuda" and not has_cuda:
         raise InputError("--device cuda: torch finds no CUDA device here; use --device cpu")

@@ -10,7 +10,6 @@ from typing import Any
 
 from densify.cli.answer import Answer
 from densify.cli.options import add_overwrite, add_verb
-from densify.cli.progress import progress_on_stderr
 
 
 def add(commands: Any) -> None:
@@ -23,8 +22,8 @@ def add(commands: Any) -> None:
         "Of a key: the image with every map, depth under the pointer, what a least confidence "
         "leaves, the cloud in 3-D, scores and costs, in one HTML file of 12 MB at most that needs "
         "no network. "
-        "Files that are missing or damaged are named on it. Of a training set, or of a folder of "
-        "several runs: every key with a picture and its scores, what was put aside and why.",
+        "Files that are missing or damaged are named on it. Of a training set: a table of every "
+        "key with its scores, what was put aside and why.",
     )
     parser.add_argument(
         "place",
@@ -45,6 +44,5 @@ def answer(options: argparse.Namespace) -> Iterator[Answer]:
     """A page of what is in a folder."""
     from densify.dataset.report import write_report
 
-    with progress_on_stderr() as progress:
-        paths = write_report(options.place, options.out, options.overwrite, progress)
+    paths = write_report(options.place, options.out, options.overwrite)
     yield Answer(files=paths)

@@ -9,7 +9,6 @@ The entry point's name is the plug-in's, its value a module::
 
 from __future__ import annotations
 
-import traceback
 from collections.abc import Iterator
 from dataclasses import dataclass, field, fields
 from importlib import import_module
@@ -21,22 +20,18 @@ from densify.config.errors import InputError, did_you_mean
 if TYPE_CHECKING:
     from importlib.metadata import EntryPoint
 
-_LOADED: dict[str, str] = {}  # outermost module of another package -> what it is, for messages
-
 
 @dataclass(frozen=True)
 class Row:
     """One plug-in. The fields that kinds of plug-in add are read from the attributes of another
     package's module: ``owned`` from OWNED, a function from its own name.
 
-    name: as users write it. module: import path. about: a sentence for the help. version: of the
-    other package, "" if built in.
+    name: as users write it. module: import path. about: a sentence for the help.
     """
 
     name: str
     module: str
     about: str = field(default="", kw_only=True)
-    version: str = field(default="", kw_only=True)
 
     @property
     def usage(self) -> str:
@@ -45,15 +40,6 @@ class Row:
 
 
 R = TypeVar("R", bound=Row)
-
-
-def owner_of(error: BaseException) -> str:
-    """Return the plug-in of another package that an exception went through, "" if none."""
-    for frame, _ in traceback.walk_tb(error.__traceback__):
-        module = str(frame.f_globals.get("__name__")).partition(".")[0]
-        if module in _LOADED:
-            return _LOADED[module]
-    return ""
 
 
 @dataclass(frozen=True)
@@ -84,41 +70,32 @@ class Table(Generic[R]):
 
     def row(self, name: str, where: str) -> R:
         """Return the row of that name; imports the module of another package. Raises InputError if
-        there is none, two packages bring one, or the package is broken."""
+        there is none, or the package is broken."""
         self.require(name, where)
-        for row in self.built_in:
-            if row.name == name:
-                return row
-        return self._load(name, self._added()[name])
+        rows = {row.name: row for row in self.built_in}
+        return rows[name] if name in rows else self._load(self._added()[name])
 
     def __iter__(self) -> Iterator[R]:
         """Yield the built-in rows, then those of other packages, imported one by one."""
         yield from self.built_in
-        for name, points in sorted(self._added().items()):
-            yield self._load(name, points)
+        yield from (self._load(point) for _, point in sorted(self._added().items()))
 
     def module(self, row: R) -> ModuleType:
         """Import the module that does the work."""
         return import_module(row.module)
 
-    def _added(self) -> dict[str, list[EntryPoint]]:
-        """Return the entry points of other packages by name, without the built-in names."""
+    def _added(self) -> dict[str, EntryPoint]:
+        """Return the entry points of other packages by name; none replaces a built-in one."""
         from importlib.metadata import entry_points
 
-        found: dict[str, list[EntryPoint]] = {}
         built_in = {row.name for row in self.built_in}
-        for point in entry_points(group=self.group):
-            if point.name not in built_in and point not in found.get(point.name, []):
-                found.setdefault(point.name, []).append(point)
-        return found
+        points = entry_points(group=self.group)
+        return {point.name: point for point in points if point.name not in built_in}
 
-    def _load(self, name: str, points: list[EntryPoint]) -> R:
-        packages = " and ".join(sorted({p.dist.name if p.dist else "?" for p in points}))
-        if len(points) > 1:
-            raise InputError(
-                f"{self.kind} {name}: comes with the packages {packages}; uninstall all but one"
-            )
-        what, point = f"{self.kind} {name} of the package {packages}", points[0]
+    def _load(self, point: EntryPoint) -> R:
+        """Return the row of a plug-in, as its module describes it."""
+        package = point.dist.name if point.dist else "?"
+        what = f"{self.kind} {point.name} of the package {package}"
         try:
             module = point.load()
         except Exception as error:  # an import raises anything
@@ -126,19 +103,17 @@ class Table(Generic[R]):
                 f"{what}: cannot be imported from {point.value} ({type(error).__name__}: {error}); "
                 f"mend or uninstall the package"
             ) from error
-        if not all(callable(getattr(module, m, None)) for m in self.members):
+        if not all(callable(getattr(module, member, None)) for member in self.members):
             raise InputError(
                 f"{what}: {point.value} is no module with {', '.join(self.members)}; mend or "
                 f"uninstall the package"
             )
-        _LOADED[module.__name__.partition(".")[0]] = what
         row_type = type(self.built_in[0])
         own = {f.name for f in fields(row_type)} - {f.name for f in fields(Row)}
-        values = {n: getattr(module, n, getattr(module, n.upper(), None)) for n in own}
+        values = {name: getattr(module, name, getattr(module, name.upper(), None)) for name in own}
         return row_type(
-            name,
+            point.name,
             module.__name__,
             about=(module.__doc__ or "").strip().partition("\n")[0],
-            version=point.dist.version if point.dist else "",
-            **{n: value for n, value in values.items() if value is not None},
+            **{name: value for name, value in values.items() if value is not None},
         )
