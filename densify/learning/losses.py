@@ -56,7 +56,8 @@ def objective_loss(predict: Predict, sample: Sample) -> Tensor:
 
 def supervised_loss(predict: Predict, sample: Sample) -> Tensor:
     """Return the balanced error of a sample with labels, metres."""
-    assert sample.flow is not None and sample.moving is not None  # as Teacher.labels says
+    if sample.flow is None or sample.moving is None:
+        raise ValueError("expected a sample with labels")
     flow = predict(sample.sweeps)
     fast = sample.flow.norm(dim=1) >= FAST_M_S * sample.duration_s
     return balanced_error(flow, sample.flow, sample.moving, fast, sample.in_reach)
