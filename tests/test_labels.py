@@ -26,7 +26,7 @@ from densify.geometry.poses import transform
 from densify.geometry.types import Boxes, BoxView, Camera, RegisteredSweep, Sweep
 from densify.learning.labels import label_sweeps
 from densify.readers import open_sequence
-from densify.readers.kitti.calibration import Calibration
+from densify.readers.kitti.drive import Calibration
 from densify.readers.nuscenes_tables import Annotations
 from densify.readers.street import Street
 from densify.readers.waymo_components import BOX_HEADING, BOX_SIZE, STAMP

@@ -249,7 +249,7 @@ DAMAGE = [
     (ODOMETRY, "image_2/000000.png", write("x"), "not a complete image"),
     (TRACKING, CALIBRATION, swap("R_rect", "R"), "no key R_rect"),
     (TRACKING, "oxts/0000.txt", short(70), "line 1: got"),
-    (DRIVE_360, STAMPS, remove, "missing"),
+    (DRIVE_360, STAMPS, remove, "cannot be read"),
     (DRIVE_360, PERSPECTIVE, swap("1242.0", "1240"), "expected 1240 x 375"),
     (DRIVE_360, POSES_360, write("0 1 0\n"), "got 3 values"),
     (DRIVE_360, POSES_360, lambda p: p.write_text(p.read_text().split("\n")[0]), "two"),
@@ -273,7 +273,7 @@ def test_damage_is_refused_in_a_line(copied, name, file, harm, says):
     ("old", "new", "says"),
     [
         ("   xi: 2.2\n", "", "expected image_width"),
-        ("1336.0", "-3", "not positive"),
+        ("1336.0", "-3", "positive focal"),
         ("k1: 0.016", "k1: abc", "abc"),
         ("model_type: MEI", "model_type: [", "not YAML"),
         ("1400", "140", "expected 140 x 1400"),

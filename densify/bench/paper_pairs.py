@@ -3,9 +3,9 @@
 
 Sets of others are folders of .npz files as FlowNet3D's authors made them (Liu et al., CVPR 2019):
 ``points1``, ``points2``, ``flow`` and ``valid_mask1`` (FlyingThings3D; camera axes, z forward), or
-``pos1``, ``pos2`` and ``gt`` (KITTI without ground; z up). KITTI's own scene flow 2015 is lifted as
-in `densify.readers.kitti.scene_flow`, without the road. Recordings with boxes are labelled as in
-`densify.learning.labels`, without the ground and uncertain labels; as in the paper, flow there
+``pos1``, ``pos2`` and ``gt`` (KITTI without ground; z up). KITTI's own scene flow 2015 (Menze
+and Geiger, CVPR 2015) is lifted to points, without the road. Recordings with boxes are labelled as
+in `densify.learning.labels`, without the ground and uncertain labels; as in the paper, flow there
 includes the motion of the vehicle.
 """
 
@@ -27,10 +27,13 @@ from densify.learning.clouds import AboveGround, Sweeps
 from densify.learning.labels import Label, label_sweeps
 from densify.learning.samples import sample_of
 from densify.readers import open_sequence
-from densify.readers.decoded_files import read_arrays
-from densify.readers.kitti import scene_flow
+from densify.readers.decoded_files import read_arrays, read_image
+from densify.readers.kitti.drive import Calibration
 
 FARTHEST_M = 35.0
+GROUND_M = 1.4
+"""Below the camera, which rides 1.65 m above the road."""
+_IMAGES = ("disp_occ_0", "disp_occ_1", "flow_occ")
 _MOST_SWEEPS = 5
 _NAMES = (
     ("points1", "points2", "flow", "valid_mask1"),
@@ -128,18 +131,64 @@ def _pair_of_label(name: str, label: Label, config: Config) -> PaperPair:
 
 def pairs_of_kitti(folder: Path, most: int) -> Iterator[PaperPair]:
     """Yield the pairs of KITTI's scene flow 2015, or of .npz files made of it."""
-    training = scene_flow.training_folder(folder)
+    training = next((p for p in (folder, folder / "training") if (p / _IMAGES[0]).is_dir()), None)
     if training is None:
         yield from pairs_of_files(folder, most, "; nor KITTI's training/disp_occ_0")
         return
-    for name in scene_flow.image_names(training)[: most or None]:
-        moments = scene_flow.read_moments(training, name)
-        kept = moments.above_ground()
-        here, there = (x[kept] @ _R_FLU_CAMERA.T for x in moments[:2])
+    names = sorted(path.stem for path in (training / _IMAGES[0]).glob("*_10.png"))
+    if not names:
+        raise InputError(f"{training / _IMAGES[0]}: no images such as 000000_10.png")
+    for name in names[: most or None]:
+        here, there, is_white = read_moments(training, name)
+        # Points below that at both moments are the road (Gu et al., "HPLFlowNet", CVPR 2019).
+        kept = np.minimum(here[:, 1], there[:, 1]) < GROUND_M
+        here, there = (x[kept] @ _R_FLU_CAMERA.T for x in (here, there))
         # No point is in both clouds: pixels alternate, as the squares of a chessboard.
-        first = moments.is_white[kept]
+        first = is_white[kept]
         where = f"{training}: {name}"
         yield _pair(name, here[first], there[~first], (there - here)[first], where)
+
+
+def read_moments(training: Path, name: str) -> tuple[Float, Float, Bool]:
+    """Lift the pixels of one pair that have both disparities and flow.
+
+    Returns (n,3) metres of the points at the first and at the second image, in the axes of the left
+    camera (x right, y down, z forward), and (n,) whether the pixel is a white square of a
+    chessboard. Raises InputError for a file that is missing or of another form.
+    """
+    first, second, flow = (_image(training / kind / f"{name}.png") for kind in _IMAGES)
+    calibration = Calibration.read(training / "calib_cam_to_cam" / f"{name.partition('_')[0]}.txt")
+    left, right = (
+        calibration.rectified_camera(f"P_rect_{n}", n, (1, 1), np.eye(4)) for n in ("02", "03")
+    )
+    baseline_m, K = left.T_cam_lidar[0, 3] - right.T_cam_lidar[0, 3], left.K
+    if not first.shape == second.shape == flow.shape[:2]:
+        raise InputError(f"{training}: {name}: the images of {', '.join(_IMAGES)} differ in size")
+    if baseline_m <= 0:
+        raise InputError(f"{calibration.path}: P_rect_03 is not to the right of P_rect_02")
+    # Images come with blue first: valid, v, u.
+    known = (first > 0) & (second > 0) & (flow[..., 0] > 0)
+    v, u = np.nonzero(known)
+    at_px = np.stack([u, v], axis=1).astype(np.float64)
+    moved_px = (flow[known][:, [2, 1]].astype(np.float64) - 2**15) / 64
+
+    def lifted(px: Float, disparity: Float) -> Float:
+        depth_m = K[0, 0] * baseline_m * 256 / disparity
+        across = (px - K[:2, 2]) / K[[0, 1], [0, 1]]
+        return np.column_stack([across * depth_m[:, None], depth_m])
+
+    here = lifted(at_px, first[known].astype(np.float64))
+    there = lifted(at_px + moved_px, second[known].astype(np.float64))
+    return here, there, (u + v) % 2 == 0
+
+
+def _image(path: Path) -> np.ndarray:
+    image = read_image(path, as_stored=True)
+    if image.dtype != np.uint16 or image.ndim != (3 if path.parent.name == _IMAGES[2] else 2):
+        raise InputError(
+            f"{path}: got {image.dtype} of shape {image.shape}, expected 16 bit as KITTI writes it"
+        )
+    return image
 
 
 def pairs_of_files(folder: Path, most: int, beside: str = "") -> Iterator[PaperPair]:

@@ -9,7 +9,6 @@ carried every point there. That smears moving objects, hides their times, and be
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,16 +17,13 @@ import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
 from densify.config.errors import InputError
-from densify.config.file_content import read_text
 from densify.geometry import poses
 from densify.geometry.types import Float, Int
 from densify.readers.file_sequence import parse_numbers, quaternion_pose, rigid
-from densify.readers.stamp_files import in_ns, unit_of
+from densify.readers.stamp_files import TIME_COLUMNS, TextTable
 
 _MAX_BEYOND_NS = 200_000_000  # a pose is extrapolated at constant velocity for so long
-Line = tuple[int, list[str]]  # number and words
 
-_TIMES = ("timestamp", "time", "stamp", "t")
 _PLACES = tuple((a, f"t{a}", f"p{a}", f"pos_{a}", f"position_{a}") for a in "xyz")
 _TURNS = tuple((f"q{a}", f"q_{a}", f"rot_{a}", f"orientation_{a}") for a in "wxyz")
 _NUMBERS = ("frame", "index", "number", "id")
@@ -114,100 +110,46 @@ class PoseFile:
     @staticmethod
     def read(path: Path, unit: str = "") -> PoseFile:
         """unit: of the times, "" finds it out. Raises InputError that names file and line."""
-        lines = [
-            (number, re.split(r"[\s,;]+", line.strip().strip(",;")))
-            for number, line in enumerate(read_text(path).splitlines(), 1)
-            if line.strip()
-        ]
-        names = _header(lines)
-        lines = [(number, words) for number, words in lines if not words[0].startswith("#")]
-        if names and lines and lines[0][1][0].strip('"').lower() in names:
-            lines = lines[1:]
-        if not lines:
-            raise InputError(f"{path}: holds no poses")
-        table = _numbers(path, lines)
-        at = [number for number, _ in lines]
-        if names:
-            return _of_columns(path, names, table, lines, unit)
-        num_columns = table.shape[1]
-        if num_columns == 4 and len(table) % 4 == 0:
-            return PoseFile(path, "4x4 blocks", _rigid(path, table.reshape(-1, 4, 4), at[::4]))
-        if num_columns in (12, 13, 16, 17):
-            values = table[:, num_columns % 4 :].reshape(len(table), -1, 4)
-            form = "KITTI 3x4" if num_columns < 16 else "4x4 rows"
-            numbers = tuple(int(n) for n in table[:, 0]) if num_columns % 4 else None
-            return PoseFile(path, form, _rigid(path, values, at), None, numbers)
-        if num_columns == 8:
-            T = _of_quaternions(path, table[:, [7, 4, 5, 6]], table[:, 1:4], at)
-            return PoseFile(path, "TUM", T, _stamps(path, [words[0] for _, words in lines], unit))
-        raise InputError(
-            f"{path}: line {at[0]}: got {num_columns} numbers, expected 12 (KITTI), 16 (4x4), 8 "
-            f"(TUM: time x y z qx qy qz qw), 4 in blocks of four lines, or a first line of names"
-        )
-
-
-def _header(lines: Sequence[Line]) -> list[str] | None:
-    """Return the names of the columns in lower case, if the first line has them."""
-    words = [word.strip('"').lower() for word in lines[0][1]] if lines else []
-    words = [word.lstrip("#") for word in words if word != "#"]
-    named = [word for word in words if any(word in one for one in _TURNS)]
-    return words if len(named) == 4 else None
-
-
-def _of_columns(
-    path: Path, names: Sequence[str], table: Float, lines: Sequence[Line], unit: str
-) -> PoseFile:
-    def column(choices: Sequence[str]) -> int | None:
-        return next((names.index(name) for name in choices if name in names), None)
-
-    found = [column(choices) for choices in (*_TURNS, *_PLACES)]
-    columns = [c for c in found if c is not None]
-    if len(columns) < len(found) or len(names) != table.shape[1]:
-        raise InputError(
-            f"{path}: got the columns {', '.join(names)} above {table.shape[1]} numbers, expected "
-            f"x y z qw qx qy qz, and a time or frame where the rows are not those of the sweeps"
-        )
-    at = [number for number, _ in lines]
-    T = _of_quaternions(path, table[:, columns[:4]], table[:, columns[4:]], at)
-    time, number = column(_TIMES), column(_NUMBERS)
-    stamps_ns = numbers = None
-    if time is not None:
-        stamps_ns = _stamps(path, [words[time] for _, words in lines], unit)
-    elif number is not None:
-        numbers = tuple(int(n) for n in table[:, number])
-    return PoseFile(path, "table with quaternions", T, stamps_ns, numbers)
-
-
-def _stamps(path: Path, times: Sequence[str], unit: str) -> tuple[int, ...]:
-    try:
-        unit = unit or unit_of(times)
-        if not unit:
-            raise ValueError(f"the unit of its times cannot be told ({times[0]}, {times[-1]})")
-        return tuple(in_ns(text, unit) for text in times)
-    except ValueError as error:
-        raise InputError(
-            f"{path}: {error}; name the unit in densify.yaml: poses: {{stamps_unit: s}}"
-        ) from None
-
-
-def _numbers(path: Path, lines: Sequence[Line]) -> Float:
-    width = len(lines[0][1])
-    rows = []
-    for number, words in lines:
-        if len(words) != width:
+        table = TextTable.read(path, [name for names in _TURNS for name in names])
+        width, time, number = len(table.rows[0]), None, None
+        columns = [i for names in (*_TURNS, *_PLACES) if (i := table.column(names)) is not None]
+        form = "table with quaternions"
+        if len(columns) == 7:
+            time = table.column(TIME_COLUMNS)
+            number = table.column(_NUMBERS) if time is None else None
+        elif width == 8:
+            form, columns, time = "TUM", [7, 4, 5, 6, 1, 2, 3], 0
+        elif width == 4 and len(table.rows) % 4 == 0:
+            T = _numbers(table).reshape(-1, 4, 4)
+            return PoseFile(path, "4x4 blocks", _rigid(path, T, table.lines[::4]))
+        elif width in (12, 13, 16, 17):
+            values = _numbers(table)
+            T = values[:, width % 4 :].reshape(len(values), -1, 4)
+            form = "KITTI 3x4" if width < 16 else "4x4 rows"
+            numbers = tuple(map(int, values[:, 0])) if width % 4 else None
+            return PoseFile(path, form, _rigid(path, T, table.lines), None, numbers)
+        else:
             raise InputError(
-                f"{path}: line {number}: got {len(words)} numbers, expected {width} as in the "
-                f"lines before; it may be cut off"
+                f"{path}: line {table.lines[0]}: got {width} numbers, expected 12 (KITTI), 16 "
+                f"(4x4), 8 (TUM: time x y z qx qy qz qw), 4 in blocks of four lines, or a first "
+                f"line that names x y z qw qx qy qz"
             )
-        rows.append(parse_numbers(" ".join(words), f"{path}: line {number}", width))
+        values = _numbers(table, columns)
+        lines = zip(values, table.lines, strict=True)
+        T = np.stack([quaternion_pose(v[:4], v[4:], f"{path}: line {n}") for v, n in lines])
+        stamps_ns = None if time is None else table.times_ns(time, unit)[0]
+        numbers = None if number is None else tuple(map(int, _numbers(table, [number])[:, 0]))
+        return PoseFile(path, form, T, stamps_ns, numbers)
+
+
+def _numbers(table: TextTable, columns: Sequence[int] | None = None) -> Float:
+    rows = []
+    for line, words in zip(table.lines, table.rows, strict=True):
+        chosen = words if columns is None else [words[i] for i in columns]
+        width = len(table.rows[0] if columns is None else columns)
+        rows.append(parse_numbers(" ".join(chosen), f"{table.path}: line {line}", width))
     return np.array(rows)
 
 
-def _of_quaternions(path: Path, w_x_y_z: Float, places: Float, at: Sequence[int]) -> Float:
-    """(n,4) and (n,3) -> (n,4,4)."""
-    rows = zip(w_x_y_z, places, at, strict=True)
-    return np.stack([quaternion_pose(q, place, f"{path}: line {n}") for q, place, n in rows])
-
-
-def _rigid(path: Path, T: Float, at: Sequence[int]) -> Float:
-    return np.stack([rigid(one, f"{path}: line {n}") for one, n in zip(T, at, strict=True)])
+def _rigid(path: Path, T: Float, lines: Sequence[int]) -> Float:
+    return np.stack([rigid(one, f"{path}: line {n}") for one, n in zip(T, lines, strict=True)])

@@ -3,9 +3,8 @@
 
 from __future__ import annotations
 
-import csv
 import re
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
 from typing import NamedTuple
@@ -21,7 +20,7 @@ _STEP_S = (0.002, 3.9)  # from sweep to sweep, or image to image
 _SECONDS_AND_NS = re.compile(r"(?<!\d)(\d{10})[_-](\d{9})(?!\d)")
 _NUMBER = re.compile(r"\d+(?:\.\d+)?")
 _FILE_COLUMNS = ("filename", "file", "name", "image", "sweep", "path")
-_TIME_COLUMNS = ("timestamp", "time", "stamp", "t")
+TIME_COLUMNS = ("timestamp", "time", "stamp", "t")
 _MAX_NUMBER_DIGITS = 18  # a longer number is no frame's
 _MOST_NS = 2**63
 
@@ -108,6 +107,72 @@ def _epoch_unit(value: Decimal) -> str:
     return ""
 
 
+class TextTable(NamedTuple):
+    """Words of a text file, parted by blanks, commas, semicolons or tabs. names: of the columns, in
+    lower case, where the first line has them. lines: the number of each row."""
+
+    path: Path
+    names: list[str]
+    lines: list[int]
+    rows: list[list[str]]
+
+    @staticmethod
+    def read(path: Path, known: Collection[str]) -> TextTable:
+        """known: a first line with one of these words names the columns, or one behind a #. Raises
+        InputError if there are no rows, or one has fewer words than the first."""
+        names: list[str] = []
+        lines: list[int] = []
+        rows: list[list[str]] = []
+        for number, line in enumerate(read_text(path).splitlines(), 1):
+            text = re.sub(r"(\d-\d\d) (\d\d:)", r"\1T\2", line.strip().strip("#,;").strip())
+            words = [word.strip('"') for word in re.split(r"[\s,;]+", text)]
+            lower = [word.lower().split("[")[0] for word in words]
+            is_comment = line.lstrip().startswith("#")
+            if not rows and not names and (is_comment or any(word in known for word in lower)):
+                names = lower
+            elif text and not is_comment:
+                lines.append(number)
+                rows.append(words)
+                if len(words) < len(rows[0]):
+                    raise InputError(
+                        f"{path}: line {number}: got {len(words)} columns, expected "
+                        f"{len(rows[0])} as in the lines before; it may be cut off"
+                    )
+        if not rows:
+            raise InputError(f"{path}: holds no lines with numbers")
+        return TextTable(path, names, lines, rows)
+
+    def column(self, choices: Collection[str]) -> int | None:
+        """Return the number of the first column with one of these names."""
+        found = (self.names.index(name) for name in choices if name in self.names)
+        return next((i for i in found if i < len(self.rows[0])), None)
+
+    def times_ns(self, column: int, unit: str) -> tuple[tuple[int, ...], str]:
+        """Return the times of a column, dates or numbers of this unit, "" to find it out; and the
+        unit."""
+        times = [words[column] for words in self.rows]
+        dates = "-" in times[0][1:] and ":" in times[0]
+        try:
+            unit = "date" if dates else unit or unit_of(times)
+        except ValueError as error:
+            raise InputError(f"{self.path}: {error} in each line") from None
+        if not unit:
+            raise InputError(
+                f"{self.path}: the unit of its times cannot be told ({times[0]}, {times[-1]}); "
+                f"name it in densify.yaml: stamps_unit: s, ms, us or ns"
+            )
+        found = []
+        for line, text in zip(self.lines, times, strict=True):
+            try:
+                found.append(date_ns(text.rstrip("Z")) if dates else in_ns(text, unit))
+            except ValueError:
+                raise InputError(
+                    f"{self.path}: line {line}: got {text!r}, expected a time in {unit}, from 1970 "
+                    f"to 2261"
+                ) from None
+        return tuple(found), unit
+
+
 class StampFile(NamedTuple):
     """Times of a text file, line by line. unit: what was found or given. names: the file that each
     line belongs to, where it says so."""
@@ -124,69 +189,14 @@ class StampFile(NamedTuple):
 
         unit: "" finds it out. Raises InputError that names file and line.
         """
-        rows = _rows(path)
-        header = [word.lower().split("[")[0].strip() for word in rows[0][1]] if rows else []
-        at_time = next((header.index(n) for n in _TIME_COLUMNS if n in header), None)
-        at_name = next((header.index(n) for n in _FILE_COLUMNS if n in header), None)
-        if at_time is not None or at_name is not None or (rows and rows[0][0] < 0):
-            rows = rows[1:]
-        if at_time is None and at_name is None and rows:
-            words = rows[0][1]
-            names = [i for i, word in enumerate(words) if Path(word).suffix[1:2].isalpha()]
-            at_time = next((i for i in range(len(words)) if i not in names), 0)
-            at_name = names[0] if names else None
-        if not rows:
-            raise InputError(f"{path}: holds no times, expected one in each line")
-        at_time = at_time or 0
-        width = 1 + max(at_time, at_name or 0)
-        for line, words in rows:
-            if len(words) < width:
-                raise InputError(f"{path}: line {line}: got {len(words)} columns, expected {width}")
-        times = [words[at_time] for _, words in rows]
-        files = None if at_name is None else tuple(Path(words[at_name]).name for _, words in rows)
-        return StampFile(path, *_parse(path, [line for line, _ in rows], times, unit), files)
-
-
-def _parse(
-    path: Path, lines: Sequence[int], times: Sequence[str], unit: str
-) -> tuple[tuple[int, ...], str]:
-    dates = "-" in times[0][1:] and ":" in times[0]
-    if not (dates or unit):
-        try:
-            unit = unit_of(times)
-        except ValueError as error:
-            raise InputError(f"{path}: {error} in each line") from None
-        if not unit:
-            raise InputError(
-                f"{path}: the unit of its times cannot be told ({times[0]}, {times[-1]}); name it "
-                f"in densify.yaml: stamps_unit: s, ms, us or ns"
-            )
-    found = []
-    for line, text in zip(lines, times, strict=True):
-        try:
-            found.append(date_ns(text.rstrip("Z")) if dates else in_ns(text, unit))
-        except ValueError:
-            raise InputError(
-                f"{path}: line {line}: got {text!r}, expected "
-                f"{'a date and time from 1970 to 2261' if dates else f'a time in {unit}'}"
-            ) from None
-    return tuple(found), "date" if dates else unit
-
-
-def _rows(path: Path) -> list[tuple[int, list[str]]]:
-    """Return line number and words of each line that is neither empty nor a comment. A comment in
-    the first line may name the columns and has the number -1. A blank between date and time does
-    not part words."""
-    rows: list[tuple[int, list[str]]] = []
-    lines = read_text(path).splitlines()
-    delimiter = next((d for d in (",", ";", "\t") if lines and d in lines[0]), None)
-    for number, line in enumerate(lines, 1):
-        text = line.strip()
-        if not text or (text.startswith("#") and rows):
-            continue
-        if delimiter:
-            words = [w.strip() for w in next(csv.reader([text.lstrip("# ")], delimiter=delimiter))]
-        else:
-            words = re.sub(r"(\d-\d\d) (\d\d:)", r"\1T\2", text.lstrip("# ")).split()
-        rows.append((-1 if text.startswith("#") else number, words))
-    return rows
+        table = TextTable.read(path, (*TIME_COLUMNS, *_FILE_COLUMNS))
+        at_time, at_name = table.column(TIME_COLUMNS), table.column(_FILE_COLUMNS)
+        words = table.rows[0]
+        if at_time is None and at_name is None:
+            named = [i for i, word in enumerate(words) if Path(word).suffix[1:2].isalpha()]
+            at_name = named[0] if named else None
+        if at_time is None:
+            at_time = next((i for i in range(len(words)) if i != at_name), 0)
+        stamps_ns, unit = table.times_ns(at_time, unit)
+        files = None if at_name is None else tuple(Path(row[at_name]).name for row in table.rows)
+        return StampFile(path, stamps_ns, unit, files)

@@ -39,23 +39,18 @@ _NUM_TRIED = 5  # sweeps, until one can be read
 _RATES_HZ = (5, 10, 15, 20, 25)
 
 
-class Period(NamedTuple):
-    """The time from sweep to sweep, and how it was found; "" where the sweeps have stamps."""
-
-    ns: int
-    told_by: str
-
-
-@dataclass(frozen=True)
-class Layout:
+class Layout(NamedTuple):
     """The meaning of the columns of all sweeps. times: None where no column tells them. time_words:
-    what was found of times. unused: columns that play no part, with their ranges."""
+    what was found of times. unused: columns that play no part, with their ranges. period_ns: from
+    sweep to sweep; period_words: how it was found, "" where the sweeps have stamps."""
 
     fields: Fields
     times: PointTimes | None
     time_words: str
     intensity_scale: float
     unused: tuple[str, ...]
+    period_ns: int
+    period_words: str
 
 
 @dataclass(frozen=True)
@@ -69,13 +64,13 @@ class SweepColumns:
     def returns(self, frame: int, stamp_ns: int) -> tuple[Path, Returns]:
         """Return a sweep's file and its rows. Raises InputError if the file is damaged or lacks
         columns of the first."""
-        path = self.series.paths[frame]
-        columns, fields = self._columns(path), self.layout.fields
-        for name in vars(fields).values():
-            if name and name not in columns:
-                raise InputError(
-                    f"{path}: no column {name}, which other sweeps have; got {', '.join(columns)}"
-                )
+        path, fields = self.series.paths[frame], self.layout.fields
+        columns = self._columns(path)
+        missing = [n for n in vars(fields).values() if n and n not in columns]
+        if missing:
+            raise InputError(
+                f"{path}: no column {missing[0]}, which other sweeps have; got {', '.join(columns)}"
+            )
         points = self.settings.scale_m * points_of(columns, fields)
         if self.settings.axes is not None:
             points = points @ self.settings.axes.T
@@ -95,12 +90,12 @@ class SweepColumns:
     @cached_property
     def layout(self) -> Layout:
         """Find the meaning of the columns in the first sweep that can be read."""
-        frame, _, columns = self._sample
+        frame, columns = self._sample
         fields, times, words = self._fields, None, "none: no column of that kind"
+        period_ns, period_words = self._period()
         if fields.time:
             stamps_ns = self.series.stamps_ns
-            stamp_ns = None if stamps_ns is None else stamps_ns[frame]
-            times, words = self._times(columns, self.period.ns, stamp_ns)
+            times, words = self._times(columns, period_ns, (stamps_ns or {}).get(frame))
             if times is not None and times.absolute and stamps_ns is None:
                 times = replace(times, other_clock=True)  # numbers for stamps are no clock
         scale = self.settings.intensity_scale
@@ -111,56 +106,49 @@ class SweepColumns:
             for name, column in columns.items()
             if name not in vars(fields).values()
         )
-        return Layout(fields, times, words, scale or 1.0, unused)
+        return Layout(fields, times, words, scale or 1.0, unused, period_ns, period_words)
 
-    @cached_property
-    def period(self) -> Period:
+    def _period(self) -> tuple[int, str]:
         """Find the period by the stamps, the rate that is known, or the points' own times."""
         stamps_ns, rate_hz = self.series.stamps_ns, self.settings.rate_hz
         if stamps_ns is not None and len(stamps_ns) > 1:
-            return Period(max(1, int(np.median(np.diff(list(stamps_ns.values()))))), "")
+            return max(1, int(np.median(np.diff(list(stamps_ns.values()))))), ""
         if rate_hz:
-            return Period(round(1e9 / rate_hz), f"number, at the {rate_hz:g} Hz of densify.yaml")
-        assumed = "number, at an assumed 10 Hz; say rate_hz in densify.yaml"
-        return self._period_of_times() or Period(_ASSUMED_PERIOD_NS, assumed)
-
-    def _period_of_times(self) -> Period | None:
-        """Return the time from one sweep's first point to the next one's, or that a sweep takes."""
-        if not self._fields.time:
-            return None
-        frame, _, columns = self._sample
-        times, _ = self._times(columns, _ASSUMED_PERIOD_NS, None)
-        if times is None:
-            return None
-        values = widened(columns[times.field])
-        if not times.absolute:
+            return round(1e9 / rate_hz), f"number, at the {rate_hz:g} Hz of densify.yaml"
+        frame, columns = self._sample
+        times = None
+        if self._fields.time:
+            times, _ = self._times(columns, _ASSUMED_PERIOD_NS, None)
+        if times is not None:
+            values = widened(columns[times.field])
             share_s = float(np.ptp(times.offset_ns(values, 0))) * 1e-9
-            for hz in _RATES_HZ:
+            for hz in () if times.absolute else _RATES_HZ:
                 if abs(share_s * hz - 1) < 0.05:
-                    return Period(10**9 // hz, f"number, at {hz} Hz: a sweep takes 1/{hz} s")
-            return None
-        number = next((n for n in self.series.paths if n > frame), frame)
-        later = self._columns(self.series.paths[number]).get(times.field)
-        if number == frame or later is None:
-            return None
-        first = np.array([np.nanmin(values), np.nanmin(widened(later))])
-        step_ns = int(np.diff(times.offset_ns(first, 0))[0]) // (number - frame)
-        return Period(step_ns, "number, at the rate of the points' times") if step_ns > 0 else None
+                    return 10**9 // hz, f"number, at {hz} Hz: a sweep takes 1/{hz} s"
+            number = next((n for n in self.series.paths if n > frame), frame)
+            later = self._columns(self.series.paths[number]).get(times.field)
+            if times.absolute and number > frame and later is not None:
+                first = np.array([np.nanmin(values), np.nanmin(widened(later))])
+                step_ns = int(np.diff(times.offset_ns(first, 0))[0]) // (number - frame)
+                if step_ns > 0:
+                    return step_ns, "number, at the rate of the points' times"
+        return _ASSUMED_PERIOD_NS, "number, at an assumed 10 Hz; say rate_hz in densify.yaml"
 
     @cached_property
-    def _sample(self) -> tuple[int, Path, Columns]:
-        """Read the first sweep that can be read: its number, file and columns."""
+    def _sample(self) -> tuple[int, Columns]:
+        """Read the first sweep that can be read: its number and columns."""
         errors = []
         for number, path in list(self.series.paths.items())[:_NUM_TRIED]:
             try:
-                return number, path, self._columns(path)
+                return number, self._columns(path)
             except InputError as error:
                 errors.append(error)
         raise errors[0]
 
     @cached_property
     def _fields(self) -> Fields:
-        _, path, columns = self._sample
+        frame, columns = self._sample
+        path = self.series.paths[frame]
         named = {part: name for part in _NAMED if (name := getattr(self.settings, part))}
         for part, name in named.items():
             if name not in columns:
@@ -211,8 +199,8 @@ class SweepColumns:
         numbers, most = columns[name][valid], 255 if origins is None else len(origins) - 1
         if not ((numbers >= 0) & (numbers <= most) & (numbers == np.rint(numbers))).all():
             raise InputError(
-                f"{path}: {name}: got {numbers.min():g} to {numbers.max():g}, expected the number "
-                f"of a scanner, 0 to {most}; check sweeps.scanner_origins in densify.yaml"
+                f"{path}: {name}: expected the number of a scanner, 0 to {most}; check "
+                f"sweeps.scanner_origins in densify.yaml"
             )
         lidar = np.zeros(len(valid), np.uint8)
         lidar[valid] = numbers

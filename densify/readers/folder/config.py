@@ -7,10 +7,10 @@ from __future__ import annotations
 
 import re
 import reprlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import Any, TypeVar, cast
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -21,7 +21,7 @@ from densify.readers.file_sequence import rigid
 from densify.readers.point_fields import REFERENCES, UNIT_NS
 
 NAME = "densify.yaml"
-_MODELS = {"pinhole": (0, 4, 5, 8, 12, 14), "fisheye": (4,), "mei": (5,)}
+_NUM_COEFFICIENTS = {"pinhole": (0, 4, 5, 8, 12, 14), "fisheye": (4,), "mei": (5,)}
 _AXES = {s + a: (-1.0 if s else 1.0) * np.eye(3)[i] for s in ("", "-") for i, a in enumerate("xyz")}
 
 C = TypeVar("C")
@@ -36,17 +36,16 @@ class Section:
     values: Mapping[str, Any]
     lines: Mapping[str, int]
 
-    def place(self, key: str) -> str:
-        """Return file, line and key, to begin a message with."""
-        full = f"{self.name}.{key}" if self.name else key
-        line = f"line {self.lines[full]}: " if full in self.lines else ""
-        return f"{self.path}: {line}{full}"
-
     def wrong(self, key: str, expected: str) -> InputError:
         """Return the error that the value of this key is not what was expected."""
         got = self.values.get(key)
         shown = "nothing" if got is None else reprlib.repr(got)
-        return InputError(f"{self.place(key)}: got {shown}, expected {expected}")
+        return InputError(f"{self._place(key)}: got {shown}, expected {expected}")
+
+    def _place(self, key: str) -> str:
+        full = f"{self.name}.{key}".lstrip(".")
+        line = f"line {self.lines[full]}: " if full in self.lines else ""
+        return f"{self.path}: {line}{full}"
 
     def section(self, key: str) -> Section:
         """Return the mapping below this key, empty if it is not there."""
@@ -54,118 +53,121 @@ class Section:
         value = {} if value is None else value
         if not isinstance(value, dict) or not all(isinstance(k, str) for k in value):
             raise self.wrong(key, "a mapping of keys to values")
-        name = f"{self.name}.{key}" if self.name else key
-        return Section(self.path, name, value, self.lines)
+        return Section(self.path, f"{self.name}.{key}".lstrip("."), value, self.lines)
 
     def fill(self, kind: type[C]) -> C:
-        """Return the dataclass whose fields, made by `_key`, are the keys of this section."""
-        readers = {f.name: f.metadata["read"] for f in fields(kind)}  # type: ignore[arg-type]
-        self.check_keys(readers)
-        given = [key for key in readers if self.values.get(key) is not None]
-        return kind(**{key: readers[key](self, key) for key in given})
+        """Return the dataclass whose fields are the keys of this section. Raises InputError for
+        other keys and other values."""
+        known, found = {f.name: f for f in fields(kind)}, {}  # type: ignore[arg-type]
+        self.check_keys(known)
+        for key, value in self.values.items():
+            given = known[key]
+            convert, expected = given.metadata.get("is") or _PLAIN[type(given.default)]
+            try:
+                if value is not None:
+                    found[key] = convert(value)
+            except (ValueError, TypeError, KeyError, OverflowError, InputError):
+                raise self.wrong(key, expected) from None
+        return kind(**found)
 
-    def check_keys(self, known: Mapping[str, Any] | Sequence[str]) -> None:
-        """Raise InputError for a key that is none of these."""
+    def check_keys(self, known: Collection[str]) -> None:
         for key in self.values:
             if key not in known:
                 raise InputError(
-                    f"{self.place(key)}: unknown key; {did_you_mean(key, known)}expected some of "
+                    f"{self._place(key)}: unknown key; {did_you_mean(key, known)}expected some of "
                     f"{', '.join(sorted(known))}"
                 )
 
 
-Read = Callable[[Section, str], Any]
+def _key(convert: Callable[[Any], Any], expected: str, default: Any = None) -> Any:
+    """Return a field. convert: raises ValueError or the like for a wrong value."""
+    return field(default=default, metadata={"is": (convert, expected)})
 
 
-def _key(read: Read, default: Any = "") -> Any:
-    return field(default=default, metadata={"read": read})
+def _only(kind: type) -> Callable[[Any], Any]:
+    def convert(value: Any) -> Any:
+        if not isinstance(value, kind):
+            raise ValueError
+        return value
+
+    return convert
 
 
-def _text(section: Section, key: str) -> str:
-    value = section.values[key]
-    if not isinstance(value, str):
-        raise section.wrong(key, "a text")
-    return value
+def _choice(choices: Collection[str], default: str = "") -> Any:
+    named = {name: name for name in choices}
+    return _key(named.__getitem__, f"one of {', '.join(choices)}", default)
 
 
-def _choice(*choices: str) -> Read:
-    def read(section: Section, key: str) -> str:
-        if section.values[key] not in choices:
-            raise section.wrong(key, f"one of {', '.join(choices)}")
-        return str(section.values[key])
-
-    return read
+def _number(value: Any) -> float:
+    return float(_as_array(value))  # YAML 1.1 reads 1e-3 as text
 
 
-def _flag(section: Section, key: str) -> bool:
-    value = section.values[key]
-    if not isinstance(value, bool):
-        raise section.wrong(key, "true or false")
-    return value
+def _above_0(default: float) -> Any:
+    def convert(value: Any) -> float:
+        if _number(value) <= 0:
+            raise ValueError
+        return _number(value)
+
+    return _key(convert, "a finite number above 0", default)
 
 
-def _number(above: float = -np.inf) -> Read:
-    def read(section: Section, key: str) -> float:
-        value = section.values[key]
-        try:  # YAML 1.1 reads 1e-3 as text
-            number = float("nan" if isinstance(value, bool) else value)
-        except (TypeError, ValueError, OverflowError):
-            number = np.nan
-        if not (np.isfinite(number) and number > above):
-            beyond = "" if above == -np.inf else f" above {above:g}"
-            raise section.wrong(key, f"a finite number{beyond}")
-        return number
-
-    return read
+def _as_array(value: Any, *shape: int) -> Float:
+    array = np.array(value, dtype=np.float64).reshape(shape)
+    if not np.isfinite(array).all():
+        raise ValueError
+    return array
 
 
-def _names(section: Section, key: str) -> tuple[str, ...]:
-    value = section.values[key]
+def _names(value: Any) -> tuple[str, ...]:
     if not (isinstance(value, list) and value and all(isinstance(v, str) for v in value)):
-        raise section.wrong(key, "a list of names")
+        raise ValueError
     return tuple(value)
 
 
-def _array(*shapes: tuple[int, ...]) -> Read:
-    """An array of one of these shapes (-1: any number of rows), also written as one long list."""
-    texts = ["(" + ", ".join("N" if n < 0 else str(n) for n in shape) + ")" for shape in shapes]
-    expected = f"finite numbers of shape {' or '.join(texts)}"
-
-    def read(section: Section, key: str) -> Float:
-        try:
-            array = np.array(section.values[key], dtype=np.float64)
-        except (ValueError, TypeError, OverflowError):
-            raise section.wrong(key, expected) from None
-        for shape in shapes:
-            size = int(np.prod(shape))
-            fits = array.size == size if size > 0 else array.size % -size == 0
-            if fits and array.ndim in (1, len(shape)) and np.isfinite(array).all():
-                return array.reshape(shape)
-        raise section.wrong(key, expected)
-
-    return read
-
-
-def _axes(section: Section, key: str) -> Float:
+def _axes(value: Any) -> Float:
     """(3,3) of three names such as [z, -x, -y]: where the lidar's x, y and z are in the file."""
-    R = np.array([_AXES.get(name, np.zeros(3)) for name in _names(section, key)])
+    R = np.array([_AXES[name] for name in _names(value)])
     if R.shape != (3, 3) or not np.allclose(R @ R.T, np.eye(3)):
-        raise section.wrong(key, "x, y and z in some order, some with a -, such as [z, -x, -y]")
+        raise ValueError
     return R
 
 
-def _pose(section: Section, key: str) -> Float:
-    return rigid(_array((4, 4), (3, 4))(section, key), section.place(key))
+def _numbers(value: Any) -> tuple[float, ...]:
+    return tuple(_as_array(value, -1).tolist())
 
 
-def _intrinsics(section: Section, key: str) -> Float:
-    K = _array((3, 3), (4,))(section, key)
-    if K.shape == (4,):
-        fx, fy, cx, cy = K
-        K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
+def _places(value: Any) -> Float:
+    return _as_array(value, -1, 3)
+
+
+def _pose(value: Any) -> Float:
+    return rigid(_as_array(value, -1, 4), "")
+
+
+def _intrinsics(value: Any) -> Float:
+    numbers = _as_array(value, -1)
+    if len(numbers) == 4:
+        fx, fy, cx, cy = numbers
+        numbers = np.array([fx, 0, cx, 0, fy, cy, 0, 0, 1.0])
+    K = numbers.reshape(3, 3)
     if min(K[0, 0], K[1, 1]) <= 0 or not np.allclose(K[[1, 2, 2, 2], [0, 0, 1, 2]], [0, 0, 0, 1]):
-        raise section.wrong(key, _REQUIRED["K"])
+        raise ValueError
     return K
+
+
+def _size_px(value: Any) -> tuple[int, int]:
+    width, height = _as_array(value, 2).tolist()
+    if min(width, height) < 1 or width % 1 or height % 1:
+        raise ValueError
+    return int(width), int(height)
+
+
+_PLAIN = {
+    bool: (_only(bool), "true or false"),
+    str: (_only(str), "a text"),
+    float: (_number, "a finite number"),
+}
+_MOTION = "three or four rows of a rotation and translation"
 
 
 @dataclass(frozen=True)
@@ -183,23 +185,23 @@ class SweepFiles:
     (S,3) metres, None where rays start at 0 0 0.
     """
 
-    files: str = _key(_text)
-    columns: tuple[str, ...] | None = _key(_names, None)
-    scale_m: float = _key(_number(above=0.0), 1.0)
-    axes: Float | None = _key(_axes, None)
-    intensity: str = _key(_text)
-    intensity_scale: float = _key(_number(above=0.0), 0.0)
-    time: str = _key(_text)
-    time_unit: str = _key(_choice(*UNIT_NS))
-    time_is: str = _key(_choice("relative", "absolute"))
-    reference: str = _key(_choice(*REFERENCES))
-    lidar: str = _key(_text)
-    radial_velocity: str = _key(_text)
-    stamps: str = _key(_text)
-    stamps_unit: str = _key(_choice(*UNIT_NS))
-    rate_hz: float = _key(_number(above=0.0), 0.0)
-    compensated: bool = _key(_flag, False)
-    scanner_origins: Float | None = _key(_array((-1, 3)), None)
+    files: str = ""
+    columns: tuple[str, ...] | None = _key(_names, "a list of names")
+    scale_m: float = _above_0(1.0)
+    axes: Float | None = _key(_axes, "x, y and z in some order, such as [z, -x, -y]")
+    intensity: str = ""
+    intensity_scale: float = _above_0(0.0)
+    time: str = ""
+    time_unit: str = _choice(UNIT_NS)
+    time_is: str = _choice(("relative", "absolute"))
+    reference: str = _choice(REFERENCES)
+    lidar: str = ""
+    radial_velocity: str = ""
+    stamps: str = ""
+    stamps_unit: str = _choice(UNIT_NS)
+    rate_hz: float = _above_0(0.0)
+    compensated: bool = False
+    scanner_origins: Float | None = _key(_places, "finite numbers of shape (N, 3)")
 
 
 @dataclass(frozen=True)
@@ -207,10 +209,10 @@ class Poses:
     """Section ``poses``. file: "" to look for it. T_frame_lidar: (4,4) the lidar in the frame whose
     poses these are. inverse: the file has T_lidar_world, not T_world_lidar."""
 
-    file: str = _key(_text)
-    stamps_unit: str = _key(_choice(*UNIT_NS))
-    T_frame_lidar: Float | None = _key(_pose, None)
-    inverse: bool = _key(_flag, False)
+    file: str = ""
+    stamps_unit: str = _choice(UNIT_NS)
+    T_frame_lidar: Float | None = _key(_pose, _MOTION)
+    inverse: bool = False
 
 
 @dataclass(frozen=True)
@@ -220,25 +222,17 @@ class CameraFiles:
     of its number is stamped), or a file, "" to look for them. clock_offset_s: is added to the
     stamps, to bring them to the sweeps' clock."""
 
-    files: str = _key(_text)
-    size: Float | None = _key(_array((2,)), None)
-    K: Float | None = _key(_intrinsics, None)
-    T_cam_lidar: Float | None = _key(_pose, None)
-    model: str = _key(_choice(*_MODELS), "pinhole")
-    distortion: Float | tuple[float, ...] = _key(_array((-1,)), ())
-    max_angle_deg: float = _key(_number(above=0.0), 180.0)
-    row_time_s: float = _key(_number(), 0.0)
-    stamps: str = _key(_text)
-    stamps_unit: str = _key(_choice(*UNIT_NS))
-    clock_offset_s: float = _key(_number(), 0.0)
-
-
-_REQUIRED = {
-    "files": "the folder of its images",
-    "size": "[width, height] in whole pixels",
-    "K": "[fx, fy, cx, cy] or three rows, the last one 0 0 1, with fx and fy above 0",
-    "T_cam_lidar": "four rows, from the lidar's frame to the camera's (x right, y down, z forward)",
-}
+    size: tuple[int, int] = _key(_size_px, "[width, height] in whole pixels")
+    K: Float = _key(_intrinsics, "[fx, fy, cx, cy] or three rows, with fx and fy above 0")
+    T_cam_lidar: Float = _key(_pose, _MOTION)
+    files: str = ""
+    model: str = _choice(_NUM_COEFFICIENTS, "pinhole")
+    distortion: tuple[float, ...] = _key(_numbers, "finite numbers", ())
+    max_angle_deg: float = _above_0(180.0)
+    row_time_s: float = 0.0
+    stamps: str = ""
+    stamps_unit: str = _choice(UNIT_NS)
+    clock_offset_s: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -246,8 +240,8 @@ class FolderConfig:
     """path: of the file, None where there is none. cameras: each with its files, by name."""
 
     path: Path | None = None
-    sweeps: SweepFiles = field(default_factory=SweepFiles)
-    poses: Poses = field(default_factory=Poses)
+    sweeps: SweepFiles = SweepFiles()
+    poses: Poses = Poses()
     cameras: Mapping[str, tuple[Camera, CameraFiles]] = field(default_factory=dict)
 
     @staticmethod
@@ -257,46 +251,37 @@ class FolderConfig:
         if not path.is_file():
             return FolderConfig()
         values, lines = read_yaml(path)
-        values = {} if values is None else values
-        if not isinstance(values, dict) or not all(isinstance(key, str) for key in values):
-            raise InputError(
-                f"{path}: got {reprlib.repr(values)}, expected a mapping such as sweeps: {{...}}"
-            )
-        root = Section(path, "", values, lines)
-        root.check_keys(("sweeps", "poses", "cameras"))
-        cameras = root.section("cameras")
+        root = Section(path, "", {"": values}, lines).section("")
+        parts = {key: root.section(key) for key in ("sweeps", "poses", "cameras")}
+        root.check_keys(parts)
+        cameras = parts["cameras"]
         return FolderConfig(
             path,
-            root.section("sweeps").fill(SweepFiles),
-            root.section("poses").fill(Poses),
-            {name: _camera(cameras.section(name), name) for name in cameras.values},
+            parts["sweeps"].fill(SweepFiles),
+            parts["poses"].fill(Poses),
+            {name: _camera(cameras, name) for name in cameras.values},
         )
 
 
-def _camera(section: Section, name: str) -> tuple[Camera, CameraFiles]:
-    if not re.fullmatch(r"[\w.-]+", name) or name.startswith("."):
-        raise InputError(
-            f"{section.path}: cameras: got the name {name!r}, expected letters, digits, _ - ."
-        )
+def _camera(cameras: Section, name: str) -> tuple[Camera, CameraFiles]:
+    if not re.fullmatch(r"[\w-][\w.-]*", name):
+        raise cameras.wrong(name, "a name of letters, digits, _ - .")
+    section = cameras.section(name)
     given = section.fill(CameraFiles)
-    for key, expected in _REQUIRED.items():
-        if section.values.get(key) is None:
-            raise section.wrong(key, expected)
-    size, K, T_cam_lidar = (cast(Float, v) for v in (given.size, given.K, given.T_cam_lidar))
-    if min(size) < 1 or any(size % 1):
-        raise section.wrong("size", _REQUIRED["size"])
-    coefficients = tuple(float(d) for d in given.distortion)
+    for key in ("size", "K", "T_cam_lidar"):
+        if getattr(given, key) is None:
+            raise section.wrong(key, "it: cameras need size, K and T_cam_lidar")
+    coefficients = given.distortion
     if given.model == "pinhole" and not any(coefficients):
         coefficients = ()
-    if len(coefficients) not in _MODELS[given.model]:
-        counts = ", ".join(str(n) for n in _MODELS[given.model])
+    if len(coefficients) not in _NUM_COEFFICIENTS[given.model]:
+        counts = ", ".join(str(n) for n in _NUM_COEFFICIENTS[given.model])
         raise section.wrong("distortion", f"{counts} coefficients for a {given.model} camera")
     camera = Camera(
-        name=name,
-        width_px=int(size[0]),
-        height_px=int(size[1]),
-        K=K,
-        T_cam_lidar=T_cam_lidar,
+        name,
+        *given.size,
+        given.K,
+        given.T_cam_lidar,
         distortion=coefficients,
         model=given.model,
         max_angle_deg=given.max_angle_deg,

@@ -12,8 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from densify.readers.decoded_files import image_size_px
+from densify.readers.folder.columns import SweepColumns
+from densify.readers.folder.config import SweepFiles
 from densify.readers.folder.series import find_images, find_pose_file, in_time, sweep_folders
-from densify.readers.point_fields import find_fields, find_times, full_scale
+from densify.readers.point_fields import find_times
 from densify.readers.point_files import read_table, unnamed
 from densify.readers.recorded_poses import PoseFile
 from densify.readers.stamp_files import named
@@ -81,22 +83,24 @@ def _sweep_lines(folder: Path, groups: Mapping[str, Sequence[Path]]) -> list[str
     (choice, paths), *others = groups.items()
     series = in_time(folder, paths, "", "")
     columns = read_table(next(iter(series.paths.values()))).columns
-    names, stamps_ns, period_ns = list(columns), series.stamps_ns, _PERIOD_NS
     either = f"or: {', '.join(name for name, _ in others)}" if others else f"{len(paths)} sweeps"
-    lines = ["sweeps:", f"  files: {choice}  # {either}"]
-    if stamps_ns is not None and len(stamps_ns) > 1:
-        period_ns = int(np.median(np.diff(list(stamps_ns.values()))))
-    if tuple(names) == unnamed(len(names)):
-        names = _guessed(columns, period_ns)
+    lines, names = ["sweeps:", f"  files: {choice}  # {either}"], None
+    if tuple(columns) == unnamed(len(columns)):
+        names = _guessed(columns)
         lines.append(f"  columns: [{', '.join(names)}]  # guessed by their values: check them")
-    columns = dict(zip(names, columns.values(), strict=True))
-    fields = find_fields(names)
-    if fields.intensity:
-        scale = full_scale(columns[fields.intensity])
-        lines.append(f"  intensity: {fields.intensity}")
-        lines.append(f"  intensity_scale: {scale:g}  # what full brightness is")
-    lines += _time_lines(columns, fields.time, period_ns, stamps_ns)
-    if stamps_ns is None:
+    found = SweepColumns(series, SweepFiles(columns=names), None).layout
+    if found.fields.intensity:
+        lines.append(f"  intensity: {found.fields.intensity}")
+        lines.append(f"  intensity_scale: {found.intensity_scale:g}  # what full brightness is")
+    if found.times is None:
+        lines.append(f"  # time: NAME           # {found.time_words}")
+    else:
+        lines.append(f"  time: {found.times.field}")
+        lines.append(
+            f"  time_unit: {found.times.unit}  # a sweep takes about a period in this unit"
+        )
+        lines.append(f"  time_is: {'absolute' if found.times.absolute else 'relative'}")
+    if series.stamps_ns is None:
         lines.append("  rate_hz: 10  # assumed; or name a file with one time for each sweep:")
         lines.append("  # stamps: timestamps.txt")
     elif series.told_by.startswith("the names"):
@@ -106,7 +110,7 @@ def _sweep_lines(folder: Path, groups: Mapping[str, Sequence[Path]]) -> list[str
     return lines
 
 
-def _guessed(columns: Mapping[str, NDArray[Any]], period_ns: int) -> list[str]:
+def _guessed(columns: Mapping[str, NDArray[Any]]) -> tuple[str, ...]:
     """Guess names for the columns of a file without names by their values, from the fifth on."""
     names: list[str] = []
     for name, column in columns.items():
@@ -115,31 +119,11 @@ def _guessed(columns: Mapping[str, NDArray[Any]], period_ns: int) -> list[str]:
             names.append(name)
         elif whole and column.min() >= 0 and 0 < column.max() < 256 and "ring" not in names:
             names.append("ring")
-        elif find_times(column, name, period_ns, None)[0] is not None and "time" not in names:
+        elif find_times(column, name, _PERIOD_NS, None)[0] is not None and "time" not in names:
             names.append("time")
         else:
             names.append(f"unknown{len(names)}")
-    return names
-
-
-def _time_lines(
-    columns: Mapping[str, NDArray[Any]],
-    field: str,
-    period_ns: int,
-    stamps_ns: Mapping[int, int] | None,
-) -> list[str]:
-    if not field:
-        return ["  # time: NAME           # no column tells when each point was measured"]
-    stamp_ns = None if stamps_ns is None else next(iter(stamps_ns.values()))
-    times, words = find_times(columns[field], field, period_ns, stamp_ns)
-    if times is None:
-        return [f"  # time_unit: ns        # {words}"]
-    other = "  # by another clock than the stamps" if times.other_clock else ""
-    return [
-        f"  time: {field}",
-        f"  time_unit: {times.unit}  # a sweep takes about a period in this unit",
-        f"  time_is: {'absolute' if times.absolute else 'relative'}{other}",
-    ]
+    return tuple(names)
 
 
 def _cameras(folder: Path) -> str:

@@ -4,21 +4,18 @@ poses and images. A small ``densify.yaml`` in the folder (`densify.readers.folde
 the files cannot; a folder without one opens as far as can be told.
 
 points
-    in the lidar's frame, as fired. ``sweeps: {compensated: true}`` says that they were carried to
-    the stamp by the vehicle's motion; it is undone where points have times and poses have stamps,
-    else the times are left out. Intensity is brought to 0 to 1.
+    in the lidar's frame, as fired. ``compensated`` says that they were carried to the stamp by the
+    vehicle's motion; it is undone where points have times and poses have stamps, else the times are
+    left out.
 numbers and stamps
     files are numbered as their names say, or from 0 in the order of time where the names are times
     (``1317042651.468569638.pcd``). Times come from names, from a file beside the sweeps such as
-    ``timestamps.txt``, or else from the rate.
-the stamp
-    is the reference time; points' times are since it (or absolute, on its clock) unless
-    ``reference`` says that it is the start, middle or end of the sweep. Their unit is the one in
-    which a sweep takes about a period.
+    ``timestamps.txt``, or else from the rate. The stamp is the reference time; points' times are
+    since it (or absolute, on its clock) unless ``reference`` says otherwise. Their unit is the one
+    in which a sweep takes about a period.
 poses
-    KITTI's 3x4, 4x4, TUM, tables with quaternions, or the VIEWPOINT of .pcd files: T_world_lidar,
-    or those of a frame fixed to it (``T_frame_lidar``), or inverse. With stamps they are
-    interpolated to the sweeps' stamps; without, there is one for each sweep or for each number.
+    KITTI's 3x4, 4x4, TUM, tables with quaternions, or the VIEWPOINT of .pcd files. With stamps they
+    are interpolated to the sweeps' stamps; without, there is one for each sweep or each number.
 images
     need a calibration. Their stamps come from names, a file, or the sweeps of the same numbers.
 """
@@ -65,8 +62,6 @@ class Folder(FileSequence):
         """Reads names, densify.yaml, stamps and poses at once, sweeps and images on demand. Raises
         InputError if there are no sweeps, or what is beside them is malformed or contradicts."""
         folder = Path(path)
-        if not folder.is_dir():
-            raise InputError(f"{folder}: no such folder; expected one with numbered sweeps")
         self._config = FolderConfig.read(folder)
         known, cameras = self._config.sweeps, self._config.cameras
         files = find_sweeps(folder, known.files)
@@ -91,7 +86,7 @@ class Folder(FileSequence):
         """Return the reference time of a sweep."""
         self.check_frame(frame)
         if self._sweeps.stamps_ns is None:
-            return int(frame) * self._columns.period.ns
+            return int(frame) * self._columns.layout.period_ns
         return self._sweeps.stamps_ns[frame]
 
     def findings(self) -> Sequence[tuple[str, str]]:
@@ -109,7 +104,7 @@ class Folder(FileSequence):
             ("fields", ", ".join(fields) + unused),
             ("intensity", f"divided by {layout.intensity_scale:g}"),
             ("times", times),
-            ("stamped by", self._sweeps.told_by or self._columns.period.told_by),
+            ("stamped by", self._sweeps.told_by or layout.period_words),
         ]
         if self._poses is not None:
             lines.append(("poses from", f"{self._poses.path.name} ({self._poses.form})"))

@@ -29,23 +29,8 @@ from densify.config.errors import InputError
 from densify.config.file_content import parse_yaml, read_text
 from densify.geometry import poses
 from densify.geometry.types import Camera, Float
-from densify.readers.file_sequence import (
-    FileSequence,
-    Returns,
-    chosen_scene,
-    numbered_files,
-    parse_numbers,
-    rigid,
-    truth_beside,
-)
-from densify.readers.kitti.calibration import (
-    Calibration,
-    Stamps,
-    find_sweeps,
-    read_points,
-    turned_ns,
-    usual_period_ns,
-)
+from densify.readers.file_sequence import chosen_scene, of_frame, parse_numbers, pinhole, rigid
+from densify.readers.kitti.drive import Calibration, Drive, read_stamps, usual_period_ns
 from densify.readers.recorded_poses import PoseTrack
 
 _FOLDERS = {
@@ -68,82 +53,52 @@ def open_recording(path: Path, scene: str | None) -> Kitti360:
     return Kitti360(path, chosen_scene("kitti-360", path, scene, names))
 
 
-class Kitti360(FileSequence):
+class Kitti360(Drive):
     """A drive as a `LidarSequence`."""
 
     def __init__(self, path: Path, drive: str) -> None:
         """path: the folder that holds data_3d_raw/. Raises InputError if the drive holds no sweeps,
         or stamps, or the calibration of cameras with images, are missing or malformed."""
         velodyne = path / "data_3d_raw" / drive / "velodyne_points"
-        sweeps = find_sweeps(velodyne / "data", "0000000000.bin")
-        self._stamps = _stamps(velodyne)
-        self._poses_file = path / "data_poses" / drive / "poses.txt"
-        cameras, exposed_ns, image_files = {}, {}, {}
-        for name, folder in _FOLDERS.items():
-            around = path / "data_2d_raw" / drive / name
-            images = numbered_files(around / folder, ".png", ".jpg")
-            if images:
-                stamps = _stamps(around)
-                image_files[name] = images
-                cameras[name] = _camera(path / "calibration", name)
-                exposed_ns[name] = {f: ns for f in images if (ns := stamps.get(f)) is not None}
-        super().__init__(
-            drive,
-            path,
-            tuple(sweeps),
-            cameras,
-            exposed_ns,
-            truth_beside(velodyne.parent),
-            sweeps,
-            image_files,
-        )
+        around = path / "data_2d_raw" / drive
+        images = {name: around / name / folder for name, folder in _FOLDERS.items()}
+        super().__init__(drive, path, velodyne / "data", velodyne.parent, images)
+        self._stamp_file = velodyne / "timestamps.txt"
+        self._stamps_ns = read_stamps(self._stamp_file)
+        self.revolution_ns = usual_period_ns(self._stamps_ns.values())
+        self._pose_file = path / "data_poses" / drive / "poses.txt"
+        self.cameras = {name: _camera(path / "calibration", name) for name in self._image_files}
+        stamps_ns = {n: read_stamps(around / n / "timestamps.txt") for n in self._image_files}
+        self._exposed_ns = {
+            name: {f: stamps_ns[name][f] for f in files if f in stamps_ns[name]}
+            for name, files in self._image_files.items()
+        }
 
     def stamp_ns(self, frame: int) -> int:
         """When the scanner faced forward."""
         self.check_frame(frame)
-        return self._stamps[frame]
-
-    def _returns(self, frame: int) -> tuple[Path, Returns]:
-        columns = read_points(self._files[frame])
-        points = columns[:, :3].astype(np.float64)
-        offset_ns = turned_ns(points, self._revolution_ns)
-        return self._files[frame], Returns(points, columns[:, 3], offset_ns)
+        return of_frame(self._stamps_ns, frame, "stamp", self._stamp_file)
 
     def _pose(self, frame: int) -> Float:
-        if not self._poses_file.exists():
+        if not self._pose_file.exists():
             return super()._pose(frame)
-        T_pose_lidar = _T_pose_lidar(self.where / "calibration")
-        return self._track.at(self.stamp_ns(frame)) @ T_pose_lidar
-
-    @cached_property
-    def _revolution_ns(self) -> int:
-        return usual_period_ns(self._stamps.lines)
+        return self._track.at(self.stamp_ns(frame)) @ _T_pose_lidar(self.where / "calibration")
 
     @cached_property
     def _track(self) -> PoseTrack:
         """The vehicle's, at the stamps of the sweeps of the same number."""
-        stamps_ns, T_world_pose = [], []
-        for number, line in enumerate(read_text(self._poses_file).splitlines(), 1):
-            where = f"{self._poses_file}: line {number}"
-            frame, *numbers = parse_numbers(line, where, 13)
-            if not 0 <= frame < 1 << 31:
-                raise InputError(f"{where}: got {frame:g}, expected the number of a frame")
-            stamp_ns = self._stamps.get(int(frame))
-            if stamp_ns is not None:
-                stamps_ns.append(stamp_ns)
-                T_world_pose.append(rigid(np.reshape(numbers, (3, 4)), where))
+        T_world_pose = {}
+        for number, line in enumerate(read_text(self._pose_file).splitlines(), 1):
+            where = f"{self._pose_file}: line {number}"
+            frame, *numbers = parse_numbers(line, where, 13).tolist()
+            if frame in self._stamps_ns:
+                stamp_ns = self._stamps_ns[int(frame)]
+                T_world_pose[stamp_ns] = rigid(np.reshape(numbers, (3, 4)), where)
         return PoseTrack(
-            str(self._poses_file),
-            np.array(stamps_ns, np.int64),
-            np.stack(T_world_pose) if T_world_pose else np.zeros((0, 4, 4)),
+            str(self._pose_file),
+            np.array(list(T_world_pose), np.int64),
+            np.reshape(list(T_world_pose.values()), (-1, 4, 4)),
         )
-
-
-def _stamps(folder: Path) -> Stamps:
-    stamps = Stamps.read(folder / "timestamps.txt")
-    if stamps is None:
-        raise InputError(f"{folder / 'timestamps.txt'}: missing; expected a stamp for each frame")
-    return stamps
 
 
 def _T_pose_lidar(folder: Path) -> Float:
@@ -169,21 +124,25 @@ def _camera(folder: Path, name: str) -> Camera:
 
 def _fisheye(path: Path, name: str, T_cam_lidar: Float) -> Camera:
     """OpenCV writes ``%YAML:1.0`` where YAML has ``%YAML 1.0``."""
-    text = read_text(path).replace("%YAML:1.0", "", 1)
-    given, _ = parse_yaml(text, path)
+    given, _ = parse_yaml(read_text(path).replace("%YAML:1.0", "", 1), path)
     try:
         lens, onto = given["distortion_parameters"], given["projection_parameters"]
-        numbers = [given["mirror_parameters"]["xi"], *(lens[k] for k in ("k1", "k2", "p1", "p2"))]
-        fx, fy, cx, cy = (float(onto[k]) for k in ("gamma1", "gamma2", "u0", "v0"))
-        distortion = tuple(float(number) for number in numbers)
-        width, height = int(given["image_width"]), int(given["image_height"])
-        if not np.isfinite([*distortion, fx, fy, cx, cy]).all() or min(fx, fy, width, height) <= 0:
-            raise ValueError("a value is not finite or not positive")
-    except (KeyError, TypeError, ValueError, OverflowError) as error:
-        what = " ".join(str(error).split())
+        words = [given["image_width"], given["image_height"]]
+        words += [onto[key] for key in ("gamma1", "gamma2", "u0", "v0")]
+        words += [given["mirror_parameters"]["xi"], *(lens[k] for k in ("k1", "k2", "p1", "p2"))]
+    except (KeyError, TypeError) as error:
         raise InputError(
-            f"{path}: {what}; expected image_width, image_height, xi, k1 k2 p1 p2, gamma1 gamma2 "
-            f"u0 v0 of a fisheye as KITTI-360 has them"
+            f"{path}: no {error}; expected image_width, image_height, xi, k1 k2 p1 p2, gamma1 "
+            f"gamma2 u0 v0 of a fisheye as KITTI-360 has them"
         ) from None
-    K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
-    return Camera(name, width, height, K, T_cam_lidar, distortion, "mei", _HALF_VIEW_DEG)
+    width, height, *numbers = parse_numbers(" ".join(map(str, words)), str(path), 11).tolist()
+    return pinhole(
+        name,
+        (int(width), int(height)),
+        numbers[:4],
+        T_cam_lidar,
+        str(path),
+        distortion=tuple(numbers[4:]),
+        model="mei",
+        max_angle_deg=_HALF_VIEW_DEG,
+    )

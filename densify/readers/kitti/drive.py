@@ -1,0 +1,193 @@
+# SPDX-License-Identifier: MIT
+"""What KITTI's forms share: sweeps of the HDL-64E, images, stamps, calibration, and poses by GPS
+and inertial unit (oxts)."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from densify.config.errors import InputError
+from densify.config.file_content import read_bytes, read_text
+from densify.geometry.types import Camera, Float, Int
+from densify.readers.file_sequence import (
+    FileSequence,
+    Returns,
+    check_rotation,
+    numbered_files,
+    parse_numbers,
+    pinhole,
+    rigid,
+    truth_beside,
+)
+from densify.readers.stamp_files import date_ns
+
+NOMINAL_PERIOD_NS = 100_000_000
+"""Time from sweep to sweep where no stamps are recorded: the scanner turns at 10 Hz."""
+
+_EARTH_RADIUS_M = 6_378_137.0  # of the devkit's Mercator projection
+_ENTRY = re.compile(r"\s*([^\s:]+)[:\s]\s*(.*)")
+_STAMP = re.compile(r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d(\.\d{1,9})?")
+
+
+class Drive(FileSequence):
+    """Numbered sweeps of an HDL-64E, which turns clockwise and is stamped as it faces forward."""
+
+    revolution_ns: int = NOMINAL_PERIOD_NS
+
+    def __init__(
+        self, name: str, where: Path, sweeps: Path, truth: Path, images: Mapping[str, Path]
+    ) -> None:
+        """sweeps: folder of the .bin files. truth: folder that may hold exact truth. images:
+        folders by camera. Raises InputError if there are no sweeps."""
+        files = numbered_files(sweeps, ".bin")
+        if not files:
+            raise InputError(f"{sweeps}: no sweeps; expected files such as 0000000120.bin")
+        found = {n: numbered_files(p, ".png", ".jpg", ".jpeg") for n, p in images.items()}
+        super().__init__(
+            name,
+            where,
+            tuple(files),
+            truth=truth_beside(truth),
+            files=files,
+            images={name: numbers for name, numbers in found.items() if numbers},
+        )
+
+    def _returns(self, frame: int) -> tuple[Path, Returns]:
+        path = self._files[frame]
+        points, intensity = read_points(path)
+        return path, Returns(points, intensity, turned_ns(points, self.revolution_ns))
+
+
+def read_points(path: Path) -> tuple[Float, np.ndarray]:
+    """Return (N,3) metres and (N,) reflectance; zeros where a row is not finite."""
+    data = read_bytes(path)
+    if len(data) % 16:
+        raise InputError(
+            f"{path}: truncated: got {len(data)} bytes, expected a multiple of 16 (x y z "
+            f"reflectance as float32); fetch the file again"
+        )
+    columns = np.frombuffer(data, "<f4").reshape(-1, 4).astype(np.float32)
+    columns[~np.isfinite(columns).all(axis=1)] = 0
+    return columns[:, :3].astype(np.float64), columns[:, 3]
+
+
+def turned_ns(points: Float, revolution_ns: int) -> Int:
+    """Return when each of (N,3) raw points was fired, since the scanner faced forward:
+    ``-azimuth / 2π`` of the revolution."""
+    revolution = -np.arctan2(points[:, 1], points[:, 0]) / (2 * np.pi)
+    return np.rint(revolution * revolution_ns).astype(np.int64)
+
+
+def read_stamps(path: Path) -> dict[int, int]:
+    """Return the stamps (ns) of a timestamps file by line from 0, which is the frame's number.
+    Lines that are no stamps are left out. Raises InputError if none is one."""
+    lines = [line.strip() for line in read_text(path).splitlines()]
+    stamps_ns = {}
+    for frame, line in enumerate(lines):
+        try:
+            if _STAMP.fullmatch(line):
+                stamps_ns[frame] = date_ns(line)
+        except ValueError:  # a thirteenth month
+            continue
+    wrong = next((line for line in lines if line), None)
+    if wrong is not None and not stamps_ns:
+        raise InputError(
+            f"{path}: got {wrong!r}, expected stamps such as 2011-09-26 13:10:51.158069617, from "
+            f"1970 to 2261, a line for each frame"
+        )
+    return stamps_ns
+
+
+def usual_period_ns(stamps_ns: Iterable[int]) -> int:
+    """Return the median time from one stamp to the next, the nominal one for fewer than two."""
+    steps_ns = np.diff(list(stamps_ns))
+    return int(np.median(steps_ns)) if len(steps_ns) else NOMINAL_PERIOD_NS
+
+
+def parse_oxts(text: str, where: str) -> Float:
+    """Return the (30,) numbers of an oxts record: latitude and longitude (deg), altitude (m), roll,
+    pitch, yaw (rad), ... Raises InputError, which starts with ``where``."""
+    values = parse_numbers(text, where, 30)
+    if abs(values[0]) >= 90:
+        raise InputError(f"{where}: got a latitude of {values[0]:g} deg, expected -90 to 90")
+    return values
+
+
+def T_mercator_imu(oxts: Float, first: Float) -> Float:
+    """Return the (4,4) pose on the Mercator plane (east, north, up), as the devkit's
+    convertOxtsToPose.
+
+    oxts, first: (30,) the record, and the first one of the drive, whose latitude gives the scale.
+    """
+    lat_deg, lon_deg, alt_m, roll, pitch, yaw = oxts[:6]
+    scale_m = _EARTH_RADIUS_M * np.cos(np.deg2rad(first[0]))
+    T = np.eye(4)
+    T[:3, :3] = Rotation.from_euler("ZYX", [yaw, pitch, roll]).as_matrix()
+    T[0, 3] = scale_m * np.deg2rad(lon_deg)
+    T[1, 3] = scale_m * np.log(np.tan(np.deg2rad(90 + lat_deg) / 2))
+    T[2, 3] = alt_m
+    return T
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """A calibration file of lines ``KEY: numbers``, with or without the colon. Malformed entries
+    raise InputError when asked for, naming file and key."""
+
+    path: Path
+    entries: Mapping[str, str]
+
+    @staticmethod
+    def read(path: Path) -> Calibration:
+        if not path.is_file():
+            raise InputError(
+                f"{path}: missing; expected KITTI's calibration there (it is a download of its own)"
+            )
+        matches = (_ENTRY.match(line) for line in read_text(path).splitlines())
+        return Calibration(path, {found[1]: found[2] for found in matches if found})
+
+    def numbers(self, key: str, *shape: int) -> Float:
+        if key not in self.entries:
+            raise InputError(f"{self.path}: no key {key}; got {', '.join(self.entries)}")
+        where = f"{self.path}: {key}"
+        return parse_numbers(self.entries[key], where, int(np.prod(shape))).reshape(shape)
+
+    def rotation(self, key: str) -> Float:
+        """Return (4,4) of the key's (3,3) rotation."""
+        T = np.eye(4)
+        T[:3, :3] = check_rotation(self.numbers(key, 3, 3), f"{self.path}: {key}")
+        return T
+
+    def motion(self, key: str) -> Float:
+        """Return (4,4) of the twelve numbers of a key, the upper rows."""
+        return rigid(self.numbers(key, 3, 4), f"{self.path}: {key}")
+
+    def pose(self) -> Float:
+        """Return (4,4) of the keys R and T."""
+        T = self.rotation("R")
+        T[:3, 3] = self.numbers("T", 3)
+        return T
+
+    def size_px(self, key: str) -> tuple[int, int]:
+        """Return width and height."""
+        width, height = self.numbers(key, 2)
+        return int(width), int(height)
+
+    def rectified_camera(
+        self, key: str, name: str, size_px: tuple[int, int], T_rect_lidar: Float
+    ) -> Camera:
+        """Return the camera of a projection matrix.
+
+        T_rect_lidar: (4,4) to the rectified camera 0, from which P = K [I | t] moves by t.
+        """
+        P = self.numbers(key, 3, 4)
+        onto, T_cam_rect = P[[0, 1, 0, 1], [0, 1, 2, 2]].tolist(), np.eye(4)
+        camera = pinhole(name, size_px, onto, T_rect_lidar, f"{self.path}: {key}")
+        T_cam_rect[:3, 3] = np.linalg.solve(camera.K, P[:, 3])
+        return replace(camera, T_cam_lidar=T_cam_rect @ T_rect_lidar)
