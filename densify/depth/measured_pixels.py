@@ -113,7 +113,8 @@ def visible_pixels(
     beyond, why = _settled(points, own, camera, support, taken=pixels.inside)
     reason[points.index[points.far]] = why[points.far]
     better = beyond.inside
-    return MeasuredPixels(*(np.where(better, b, n) for n, b in zip(pixels, beyond, strict=True)))
+    both = zip(pixels, beyond, strict=True)
+    return MeasuredPixels(*(np.where(better, b, n) for n, b in both))  # type: ignore[call-overload]
 
 
 def _settled(
