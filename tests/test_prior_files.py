@@ -18,9 +18,7 @@ from densify.config.errors import InputError
 from densify.geometry.types import Camera
 from densify.outputs import read_depth_png, write_result
 from densify.outputs.depth_png import read_stored
-from densify.pipeline import run as pipeline
 from densify.readers.prior_files import PriorFiles
-from tests.command import refused
 from tests.small_street import KEY, POSES_GIVEN, one_car
 
 CAMERA = Camera("left", 8, 4, np.eye(3), np.eye(4))
@@ -62,17 +60,6 @@ def test_files_are_found_by_number(name, tmp_path):
     assert read(tmp_path, 122) is None
     alone = PriorFiles.open(tmp_path / name, ["left"])
     assert alone.values == {"left": {120: tmp_path / name}} and alone.sky == {"left": {}}
-
-
-@pytest.mark.parametrize(
-    "stored",
-    [VALUE[None, None], VALUE[..., None], VALUE.astype(np.float16), VALUE.astype(int)],
-)
-def test_arrays_of_any_number_type_and_with_empty_axes(stored, tmp_path):
-    put(tmp_path / "left" / "120.npy", stored)
-    put(tmp_path / "left" / "120.png", np.full((4, 8, 3), 9, np.uint8))  # a picture of it
-    (tmp_path / "left" / "120.txt").write_text("notes")
-    assert np.array_equal(read(tmp_path).value, VALUE)
 
 
 def test_what_is_no_number_above_0_is_no_value(tmp_path):
@@ -127,11 +114,6 @@ def test_what_cannot_be_right_is_refused(bad, tmp_path):
     with pytest.raises(InputError) as error:
         read(tmp_path)
     assert says in str(error.value) and name in str(error.value) and "\n" not in str(error.value)
-
-
-def test_channels_of_exr(tmp_path):
-    put(tmp_path / "120.exr", {"A": 0 * VALUE, "Z": VALUE})
-    assert np.array_equal(read(tmp_path).value, VALUE)
 
 
 def test_places_that_cannot_be_right(tmp_path):
@@ -200,13 +182,6 @@ def test_the_priors_pixels_are_scored_by_themselves(runs):
     assert full.confidence[full.from_prior].max() < sure.min()
 
 
-def test_several_keys_with_a_prior_for_one(runs):
-    keys = [KEY, KEY + 1]
-    made = dict(pipeline.run_keys(one_car(), keys, 1, "icp", config=POSES_GIVEN, prior=runs.place))
-    assert made[KEY].full["front"].from_prior.any()
-    assert isinstance(made[KEY + 1], InputError) and "there are 3" in str(made[KEY + 1])
-
-
 def test_a_prior_that_does_not_fit_is_not_used_with_a_warning(tmp_path, caplog):
     noise = np.random.default_rng(0).uniform(1, 9, one_car().truth.depth_m("front", KEY).shape)
     put(tmp_path / f"{KEY}.npy", noise)
@@ -214,8 +189,3 @@ def test_a_prior_that_does_not_fit_is_not_used_with_a_warning(tmp_path, caplog):
         made = densify.run(one_car(), KEY, 1, "none", config=POSES_GIVEN, prior=tmp_path)
     assert any("is not used" in m and f"{KEY}.npy" in m for m in caplog.messages)
     assert np.array_equal(made.full["front"].depth_m, made.depth["front"].filled_m)
-
-
-def test_the_command_line_refuses_a_folder_that_is_not_there(tmp_path, capsys):
-    line = refused(capsys, 2, "run", "--key", "120", "--prior", tmp_path / "no", "--out", tmp_path)
-    assert "--prior" in line and "no such folder" in line

@@ -109,21 +109,6 @@ def test_numbered_files_alone_open(tmp_path):
         sequence.T_world_lidar(3)
 
 
-@pytest.mark.parametrize("suffix", ["npy", "csv", "txt"])
-def test_numbered_tables_alone_open(suffix, tmp_path):
-    for number in (3, 4):
-        points = np.random.default_rng(number).uniform(-20, 20, (50, 4))
-        if suffix == "npy":
-            np.save(tmp_path / f"{number:06d}.npy", points)
-        else:
-            np.savetxt(tmp_path / f"{number:06d}.{suffix}", points, delimiter=",")
-    (tmp_path / "timestamps.txt").write_text("0.0\n0.1\n")
-    assert tuple(open_sequence(str(tmp_path)).frames) == (3, 4)
-    (tmp_path / "notes.md").write_text("not sweeps alone")
-    with pytest.raises(InputError, match="no known recording there"):
-        open_sequence(str(tmp_path))
-
-
 def test_pcd_files_open_with_times_and_viewpoints(tmp_path):
     for number in (1, 2):
         write_pcd(tmp_path / f"scan_{number:03d}.pcd", "binary")
@@ -160,23 +145,6 @@ def test_stamps_in_a_file(text, step_ns, tmp_path):
     (tmp_path / "timestamps.txt").write_text(text)
     sequence = Folder(bare(tmp_path, ["a_1.bin", "b_2.bin", "c_3.bin"]))
     assert sequence.stamp_ns(3) - sequence.stamp_ns(2) == step_ns
-
-
-@pytest.mark.parametrize("time", ["1e999999999", "inf", "9" * 400, "9999-09-26 13:10:51"])
-def test_times_beyond_64_bits_are_refused(time, tmp_path):
-    first = "2011-09-26 13:10:51\n" if "-" in time else "0.1\n"
-    (tmp_path / "timestamps.txt").write_text(f"{first}{time}\n")
-    with pytest.raises(InputError, match=r"timestamps\.txt: .*(finite|line 2: got)"):
-        Folder(bare(tmp_path, ["1.bin", "2.bin"]))
-
-
-def test_absolute_times_tell_the_rate(tmp_path):
-    for i in range(3):
-        times = 1_700_000_000.25 + 0.05 * i + np.linspace(0, 0.0499, 600)
-        np.savez(tmp_path / f"{i}.npz", points=scan(), timestamp=times)
-    sequence = open_sequence(f"folder:{tmp_path}")
-    assert sequence.stamp_ns(2) == pytest.approx(10**8, abs=1000)
-    assert sequence[1].offset_ns[[0, -1]] == pytest.approx([0, 49_900_000], abs=1000)
 
 
 # --- poses ----------------------------------------------------------------------------------------

@@ -20,7 +20,7 @@ from densify.readers.kitti.kitti_360 import Kitti360
 from densify.readers.kitti.odometry import KittiOdometry
 from densify.readers.kitti.tracking import KittiTracking
 from densify.readers.street import Street
-from tests.reader_checks import check_cameras, check_depth, check_sweeps, check_truth
+from tests.reader_checks import check_cameras, check_sweeps, check_truth
 
 FRAMES, CAMERA = (59, 60, 61), "image_02"
 DRIVE = "2026_06_12_drive_0000_sync"
@@ -101,10 +101,6 @@ def test_kitti_360_is_given_back(written, excerpt):
     check_truth(sequence, excerpt)
 
 
-def test_depth_is_that_of_the_street(written, excerpt):
-    check_depth(open_sequence(written["kitti-odometry"]), excerpt, 0.05, "image_2")
-
-
 def test_scenes(written):
     root = written["kitti-odometry"].parent.parent
     assert open_sequence(root).name == open_sequence(f"kitti-odometry:{root}#00").name == "00"
@@ -116,19 +112,6 @@ def test_scenes(written):
             open_sequence(f"{reader}:{spec}#77")
         with pytest.raises(InputError, match=r"no KITTI.* expected"):
             open_sequence(f"{reader}:{spec.parent}")
-
-
-def test_semantic_kittis_poses_are_found_too(copied):
-    sequence = copied("kitti-odometry")
-    poses = sequence.parent.parent / "poses/00.txt"
-    expected = KittiOdometry(sequence).T_world_lidar(2)
-    shutil.move(poses, sequence / "poses.txt")
-    np.testing.assert_array_equal(KittiOdometry(sequence).T_world_lidar(2), expected)
-    (sequence / "poses.txt").unlink()
-    with pytest.raises(InputError, match="no poses; let the sweeps register"):
-        KittiOdometry(sequence).T_world_lidar(2)
-    (sequence / "times.txt").unlink()
-    assert KittiOdometry(sequence).stamp_ns(2) == 200_000_000
 
 
 def test_sparse_poses_are_interpolated(copied):

@@ -45,14 +45,6 @@ def test_points_at_their_own_times_follow_the_path(track):
     assert np.linalg.norm(at_stamp - fired, axis=1).max() > 0.7
 
 
-def test_one_time_and_no_points(track):
-    nothing = np.zeros((0, 3))
-    assert len(track.as_fired(nothing, 5_200_000_000, np.zeros(0, np.int64))) == 0
-    points = np.ones((2, 3))
-    same = track.as_fired(points, 5_200_000_000, np.zeros(2, np.int64))
-    np.testing.assert_allclose(same, points, atol=1e-9)
-
-
 def test_rows_that_formats_pad_with_stay_zeros(track):
     points = np.array([[0.0, 0, 0], [5, 0, 0]])
     fired = track.as_fired(points, 5_200_000_000, np.array([40_000_000, 40_000_000]))

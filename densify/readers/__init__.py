@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from itertools import chain
 from pathlib import Path
 from typing import NamedTuple, Protocol, cast
 
@@ -124,16 +123,7 @@ def _reader_of(parsed: Spec, where: str) -> Reader:
 def _recording_in(path: Path, readers: Sequence[Reader]) -> Path | None:
     """Return the first recording in a folder or its folders: one of a known form, or else a folder
     of sweeps."""
-    near = _entries(path)
-    places = [*near, *chain.from_iterable(map(_entries, near))][:_MOST_PLACES]
-    for general in (False, True):
-        asked = [reader for reader in readers if reader.general == general]
-        for place in places:
-            if any(reader.recognises(place) for reader in asked):
-                return place
-    return None
-
-
-def _entries(path: Path) -> list[Path]:
-    """Return what lies in a folder, without links to nowhere and to themselves."""
-    return sorted(p for p in path.iterdir() if p.exists()) if path.is_dir() else []
+    places = [*path.glob("*"), *path.glob("*/*")][:_MOST_PLACES] if path.is_dir() else []
+    places = [place for place in sorted(places) if place.exists()]  # links may lead nowhere
+    found = (place for reader in readers for place in places if reader.recognises(place))
+    return next(found, None)

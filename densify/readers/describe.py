@@ -36,12 +36,13 @@ def findings(sequence: LidarSequence) -> list[tuple[str, str]]:
     unreadable = dict(timeline.unknown)
     first = _readable(sequence, timeline.frames, unreadable)
     last = _readable(sequence, timeline.frames[::-1], unreadable)
+    num_read = 1 + (first.frame != last.frame)
     return [
         ("name", sequence.name),
         ("frames", _frames(sequence)),
         ("rate", _hertz(timeline.stamp_ns) if len(timeline.frames) > 1 else "unknown, one sweep"),
-        ("stamps", _stamps(first, last)),
-        ("points", _points(first, last)),
+        ("stamps", f"{first.stamp_ns} to {last.stamp_ns} ns ({_seconds(first, last):.2f} s)"),
+        ("points", ", ".join(f"{len(s):,} in frame {s.frame}" for s in (first, last)[:num_read])),
         ("point times", _point_times(first)),
         *_cameras(sequence),
         ("poses", _poses(sequence, [f for f in timeline.frames if f not in unreadable])),
@@ -82,15 +83,8 @@ def _hertz(stamps_ns: Sequence[int] | Int) -> str:
     return f"{1e9 / period_ns:.2f} Hz" if period_ns > 0 else "unknown, stamps do not advance"
 
 
-def _stamps(first: Sweep, last: Sweep) -> str:
-    seconds = (last.stamp_ns - first.stamp_ns) / 1e9
-    return f"{first.stamp_ns} to {last.stamp_ns} ns ({seconds:.2f} s)"
-
-
-def _points(first: Sweep, last: Sweep) -> str:
-    if first.frame == last.frame:
-        return f"{len(first):,} in frame {first.frame}"
-    return f"{len(first):,} in frame {first.frame}, {len(last):,} in frame {last.frame}"
+def _seconds(first: Sweep, last: Sweep) -> float:
+    return (last.stamp_ns - first.stamp_ns) / 1e9
 
 
 def _point_times(first: Sweep) -> str:

@@ -214,7 +214,7 @@ def camera_named(cameras: Mapping[str, Camera], name: str, where: Path) -> Camer
     return cameras[name]
 
 
-def decoded_image(data: bytes, camera: Camera, where: Path) -> NDArray[np.uint8]:
+def decoded_image(data: bytes, camera: Camera, where: Path | str) -> NDArray[np.uint8]:
     """Return (H,W,3) uint8 RGB of an image file's bytes, gray in three equal channels.
 
     Raises InputError, which names the place, if it is no whole image or not of the camera's size.
@@ -226,11 +226,10 @@ def decoded_image(data: bytes, camera: Camera, where: Path) -> NDArray[np.uint8]
 
 def check_image_size(shape: tuple[int, ...], camera: Camera, where: Path | str) -> None:
     """Raise InputError if an image (H,W,...) is not of the camera's size."""
-    height, width = shape[:2]
-    if (width, height) != (camera.width_px, camera.height_px):
+    if shape[:2] != (camera.height_px, camera.width_px):
         raise InputError(
-            f"{where}: got an image of {width} x {height} px; expected "
-            f"{camera.width_px} x {camera.height_px}, as the calibration of {camera.name} says"
+            f"{where}: got an image of {shape[1]} x {shape[0]} px; expected {camera.width_px} x "
+            f"{camera.height_px}, as the calibration of {camera.name} says"
         )
 
 
@@ -262,13 +261,9 @@ def chosen_scene(reader: str, path: Path, scene: str | None, names: Sequence[str
 
     Raises InputError, which lists them, if that does not tell.
     """
-    if scene in names:
-        return str(scene)
-    if scene is None and len(names) == 1:
-        return names[0]
-    shown = ", ".join(names[:4])
-    if len(names) > 4:
-        shown += f", ... {names[-1]} ({len(names)} in all)"
+    if scene in names or (scene is None and len(names) == 1):
+        return scene or names[0]
+    shown = ", ".join(names[:4]) + f", ... {names[-1]} ({len(names)} in all)" * (len(names) > 4)
     got = f"holds {len(names)} recordings" if scene is None else f"no recording {scene}"
     raise InputError(f"{path}: {got}; choose one by {reader}:{path}#NAME, NAME one of {shown}")
 
@@ -285,13 +280,12 @@ def truth_beside(recording: Path) -> Truth | None:
 def parse_numbers(text: str, where: str, count: int) -> Float:
     """Return the (count,) finite numbers of a line or file. Raises InputError that starts with
     ``where``."""
-    words = text.split()
-    if len(words) != count:
-        raise InputError(f"{where}: got {len(words)} values, expected {count} numbers")
     try:
-        values = np.array(words, np.float64)
+        values = np.array(text.split(), np.float64)
     except ValueError as error:
         raise InputError(f"{where}: {error}; expected {count} numbers") from None
+    if len(values) != count:
+        raise InputError(f"{where}: got {len(values)} values, expected {count} numbers")
     if not np.isfinite(values).all():
         raise InputError(f"{where}: got a value that is not finite, expected {count} numbers")
     return values
@@ -301,10 +295,8 @@ def rigid(T: Float, where: str) -> Float:
     """(4,4) or (3,4) -> (4,4) float64. Raises InputError, which starts with ``where``, if it is not
     finite or its upper left is no rotation."""
     T = np.asarray(T, np.float64)
-    if T.shape not in ((4, 4), (3, 4)):
-        raise InputError(f"{where}: got a matrix of shape {T.shape}, expected (4, 4)")
-    if not np.isfinite(T).all():
-        raise InputError(f"{where}: got a value that is not finite, expected a rigid motion")
+    if T.shape not in ((4, 4), (3, 4)) or not np.isfinite(T).all():
+        raise InputError(f"{where}: expected (4, 4) finite numbers, got shape {T.shape}")
     check_rotation(T[:3, :3], where)
     return np.vstack([T[:3], [0.0, 0.0, 0.0, 1.0]])
 
@@ -338,22 +330,17 @@ def quaternion_pose(
     from scipy.spatial.transform import Rotation
 
     try:
-        quaternion = np.asarray(w_x_y_z, np.float64)
-        translation = np.asarray(translation_m, np.float64)
+        numbers = np.array([*w_x_y_z, *translation_m], np.float64)
     except (TypeError, ValueError) as error:
         raise InputError(f"{where}: {error}; expected numbers") from None
-    if quaternion.shape != (4,) or translation.shape != (3,):
-        raise InputError(
-            f"{where}: got {quaternion.size} and {translation.size} numbers, expected a quaternion "
-            f"w x y z and a translation x y z"
-        )
     with np.errstate(over="ignore"):
-        length = float(np.linalg.norm(quaternion))
-    if not (np.isfinite(translation).all() and abs(length - 1) < 0.01):
+        length = float(np.linalg.norm(numbers[:4]))
+    if numbers.shape != (7,) or not np.isfinite(numbers).all() or abs(length - 1) > 0.01:
         raise InputError(
             f"{where}: got a quaternion of length {length:.4g} and the translation "
-            f"{translation.tolist()}, expected a unit quaternion w x y z and metres"
+            f"{numbers[4:].tolist()}, expected a unit quaternion w x y z and metres x y z"
         )
+    quaternion, translation = numbers[:4], numbers[4:]
     T = np.eye(4)
     T[:3, :3] = Rotation.from_quat(quaternion[[1, 2, 3, 0]]).as_matrix()
     T[:3, 3] = translation

@@ -18,6 +18,7 @@ from densify.config.errors import InputError
 from densify.config.file_content import check_size, open_file, read_bytes, reason
 from densify.readers.decoded_files import read_array, read_arrays, read_las
 from densify.readers.extras import needed
+from densify.readers.file_sequence import parse_numbers
 
 Columns = dict[str, NDArray[Any]]
 
@@ -34,12 +35,10 @@ class PointTable:
     """The N points of a file.
 
     columns: by name, (N,) numbers each, as they are stored; `unnamed` names those without names.
-    viewpoint: pose of the sensor as tx ty tz qw qx qy qz, of a .pcd file. beside: the other arrays
-    of an .npz file.
+    beside: the other arrays of an .npz file.
     """
 
     columns: Columns
-    viewpoint: tuple[float, ...] | None = None
     beside: Mapping[str, NDArray[Any]] = field(default_factory=dict)
 
     def __len__(self) -> int:
@@ -63,8 +62,6 @@ def read_table(path: Path, names: Sequence[str] | None = None) -> PointTable:
     columns as make neighbouring rows alike. Raises InputError if the file is missing, damaged, of
     another form, or has no rows.
     """
-    if not path.is_file():
-        raise InputError(f"{path}: no such file; expected a point file ({', '.join(SUFFIXES)})")
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
         raise InputError(
@@ -90,15 +87,11 @@ def read_viewpoint(path: Path) -> tuple[float, ...] | None:
     try:
         with open_file(path) as file:
             lines = _pcd_header(file)
-        values = [line.split()[1:] for line in lines if line.startswith("VIEWPOINT")]
-        found = tuple(float(v) for v in values[0]) if values else None
     except (OSError, ValueError) as error:
         raise InputError(f"{path}: not a readable .pcd point file: {error}") from error
-    if found is not None and len(found) != 7:
-        raise InputError(
-            f"{path}: VIEWPOINT: got {len(found)} numbers, expected tx ty tz qw qx qy qz"
-        )
-    return found
+    found = next((line.split()[1:] for line in lines if line.startswith("VIEWPOINT")), None)
+    where = f"{path}: VIEWPOINT, tx ty tz qw qx qy qz"
+    return None if found is None else tuple(parse_numbers(" ".join(found), where, 7).tolist())
 
 
 def unnamed(num_columns: int) -> tuple[str, ...]:
@@ -260,18 +253,20 @@ def _pcd_header(file: Any) -> list[str]:
     missing = [key for key in ("FIELDS", "SIZE", "TYPE", "WIDTH", "DATA") if not table.get(key)]
     if missing:
         raise ValueError(f"the header has no {', '.join(missing)}")
-    table.setdefault("HEIGHT", ["1"])
-    table.setdefault("COUNT", ["1"] * len(table["FIELDS"]))
-    table.setdefault("POINTS", [str(int(table["WIDTH"][0]) * int(table["HEIGHT"][0]))])
-    table.setdefault("VERSION", ["0.7"])
+    table = {
+        "VERSION": ["0.7"],
+        "HEIGHT": ["1"],
+        "COUNT": ["1"] * len(table["FIELDS"]),
+        "POINTS": [str(int(table["WIDTH"][0]) * int(table.get("HEIGHT", ["1"])[0]))],
+        **table,
+    }
     per_field = ("FIELDS", "SIZE", "TYPE", "COUNT")
     if len({len(table[key]) for key in per_field}) != 1:
         raise ValueError(
             "the header names " + ", ".join(f"{len(table[key])} {key}" for key in per_field)
         )
     kept = [i for i, count in enumerate(table["COUNT"]) if count != "0"]
-    for key in per_field:
-        table[key] = [table[key][i] for i in kept]
+    table |= {key: [table[key][i] for i in kept] for key in per_field}
     data = table.pop("DATA")
     return [f"{key} {' '.join(values)}" for key, values in table.items()] + [f"DATA {data[0]}"]
 
@@ -300,15 +295,12 @@ def _read_pcd(path: Path, names: Sequence[str] | None) -> PointTable:
             f"got {len(rows)} points, expected {cloud.points} as its header says; it is cut off"
         )
     columns = {name: rows[name] for name in rows.dtype.names or () if not name.startswith("#")}
-    return PointTable(columns, tuple(cloud.metadata.viewpoint))
+    return PointTable(columns)
 
 
 def _read_ply(path: Path, names: Sequence[str] | None) -> PointTable:
     ply = needed("trimesh.exchange.ply", "ply", ".ply files")
-    raw = ply.load_ply(io.BytesIO(read_bytes(path)))["metadata"]["_ply_raw"]
-    if "vertex" not in raw:
-        raise ValueError(f"holds {', '.join(raw) or 'nothing'}, expected vertices")
-    vertex = raw["vertex"]
+    vertex = ply.load_ply(io.BytesIO(read_bytes(path)))["metadata"]["_ply_raw"]["vertex"]
     names = [name for name, kind in vertex["properties"].items() if "LIST" not in kind]
     columns = {name: np.ravel(vertex["data"][name]) for name in names}
     if any(len(column) != vertex["length"] for column in columns.values()):

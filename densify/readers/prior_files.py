@@ -29,7 +29,7 @@ from densify.readers.decoded_files import check_pixels, read_array, read_image
 from densify.readers.extras import needed
 from densify.readers.timeline import format_frames
 
-_SUFFIXES = (".npy", ".exr", ".png")  # the finest first
+_SUFFIXES = {".npy": 0, ".exr": 1, ".png": 2}  # the finest first
 _STEM = re.compile(r"(\d+)(?:[_-](?:depth|disp|disparity|pred|prior))?", re.IGNORECASE)
 _CHANNELS = ("Z", "Y", "depth", "Depth")
 _SAME_ASPECT = 0.02
@@ -90,24 +90,20 @@ class PriorFiles:
 
 def _in(folder: Path) -> dict[int, Path]:
     """Return number -> file, in the folder or its ``data``; of a file, itself."""
-    places = (folder, folder / "data")
-    groups = [sorted(f.iterdir()) for f in places if f.is_dir()]
+    groups = [sorted(f.iterdir()) for f in (folder, folder / "data") if f.is_dir()]
     for paths in [[folder]] if folder.is_file() else groups:
         found: dict[int, Path] = {}
         # The finest first: a coarser file of the same number may be a picture of it.
-        for suffix in _SUFFIXES:
-            here: dict[int, Path] = {}
-            for path in paths:
-                stem = _STEM.fullmatch(path.stem)
-                if stem is None or path.suffix.lower() != suffix:
-                    continue
-                if int(stem[1]) in here:
-                    raise InputError(
-                        f"--prior: {here[int(stem[1])]} and {path.name} are both of image "
-                        f"{int(stem[1])}; leave one there"
-                    )
-                here[int(stem[1])] = path
-            found = here | found
+        for path in sorted(paths, key=lambda path: _SUFFIXES.get(path.suffix.lower(), 9)):
+            stem = _STEM.fullmatch(path.stem)
+            if stem is None or path.suffix.lower() not in _SUFFIXES:
+                continue
+            known = found.setdefault(int(stem[1]), path)
+            if known is not path and known.suffix.lower() == path.suffix.lower():
+                raise InputError(
+                    f"--prior: {known} and {path.name} are both of image {int(stem[1])}; leave one "
+                    f"there"
+                )
         if found:
             return dict(sorted(found.items()))
     return {}
@@ -141,21 +137,20 @@ def _read_exr(path: Path) -> NDArray[Any]:
         channels = library.File(str(path)).channels()
     except (RuntimeError, KeyError, TypeError, ValueError) as error:
         raise InputError(f"{path}: not a whole EXR file ({reason(error)})") from error
-    named = [name for name in (*_CHANNELS, *channels) if name in channels]
-    if named[0] not in _CHANNELS and len(channels) > 1:
+    named = [name for name in _CHANNELS if name in channels]
+    if not named and len(channels) > 1:
         raise InputError(
             f"{path}: has the channels {', '.join(channels)}, expected one, or Z, Y or depth"
         )
-    return np.asarray(channels[named[0]].pixels)
+    return np.asarray(channels[(named or list(channels))[0]].pixels)
 
 
 def _read_png(path: Path) -> NDArray[Any]:
     image = read_image(path, as_stored=True)
     if image.dtype != np.uint16 or image.ndim != 2:
-        bits = 8 * image.dtype.itemsize
         raise InputError(
-            f"{path}: got {bits} bit of shape {image.shape}, expected 16 bit and one channel; "
-            f"pictures of depth are too coarse: save it as .npy"
+            f"{path}: got {8 * image.dtype.itemsize} bit of shape {image.shape}, expected 16 bit "
+            f"and one channel; pictures of depth are too coarse: save it as .npy"
         )
     return image
 

@@ -41,15 +41,13 @@ def named(path: Path, unit: str = "") -> Named:
 
     unit: the last number in the name is a time in this unit.
     """
-    words = _NUMBER.findall(path.stem)
+    stem = _SECONDS_AND_NS.sub(r"\1.\2", path.stem)
+    words = _NUMBER.findall(stem)
     if unit:
         try:
-            return Named(path, None, in_ns(words[-1], unit) if words else None)
+            return Named(path, None, in_ns(words[-1] if words else "", unit))
         except ValueError:
             return Named(path, None, None)
-    split = _SECONDS_AND_NS.search(path.stem)
-    if split and _epoch_unit(Decimal(split[1])) == "s":
-        return Named(path, None, in_ns(f"{split[1]}.{split[2]}", "s"))
     for word in reversed(words):
         epoch = _epoch_unit(Decimal(word))
         # ten digits without a fraction are a number with zeros before it, as KITTI's

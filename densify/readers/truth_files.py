@@ -25,15 +25,12 @@ from densify.geometry.types import Bool, Float, Float32, SweepTruth
 from densify.readers.decoded_files import read_arrays
 from densify.street.simulator import Bodies
 
+_BODIES = ("T_world_lidar", "T_world_body", "moving")
+
 
 def write_bodies(folder: Path, bodies: Bodies) -> None:
     """folder: the ``truth`` folder, made if need be."""
-    _save(
-        folder / "bodies.npz",
-        T_world_lidar=bodies.T_world_lidar,
-        T_world_body=bodies.T_world_body,
-        moving=bodies.moving,
-    )
+    _save(folder / "bodies.npz", **{name: getattr(bodies, name) for name in _BODIES})
 
 
 def write_points(
@@ -67,8 +64,7 @@ class FileTruth:
     def __init__(self, folder: Path) -> None:
         """Raises InputError if the folder's bodies.npz is missing or malformed."""
         self._folder = folder
-        names = ("T_world_lidar", "T_world_body", "moving")
-        T_world_lidar, T_world_body, moving = _load(folder / "bodies.npz", *names)
+        T_world_lidar, T_world_body, moving = _load(folder / "bodies.npz", *_BODIES)
         shape = T_world_body.shape
         expected = ((shape[0], 4, 4), (*shape[:2], 4, 4), shape[:2])
         if (T_world_lidar.shape, shape, moving.shape) != expected:

@@ -20,63 +20,49 @@ from densify.readers.point_files import read_table, unnamed
 from densify.readers.recorded_poses import PoseFile
 from densify.readers.stamp_files import named
 
-_PERIOD_NS = 100_000_000
 _HEAD = """\
 # What the files of this folder cannot say themselves; every key may be left out. Lines with a # in
 # front are examples or guesses: take the # away where they are right.
 
 """
-_MORE_OF_SWEEPS = """\
+_MORE = """\
   # scale_m: 0.001       # metres of a unit of the points
   # axes: [z, -x, -y]    # which stored axes are x (forward), y (left) and z (up)
-  # reference: start     # the stamp is the sweep's start, middle or end; without it the
-  #                      # points' times are since the stamp
+  # reference: start     # the stamp is the sweep's start, middle or end
   # compensated: true    # the vehicle's own motion in a sweep was taken out already
   # scanner_origins: [[0, 0, 0]]  # where rays start, metres, if not at 0 0 0
 
-"""
-_NO_POSES = """\
-# poses:
-#   file: poses.txt       # KITTI 3x4, 4x4, TUM, or a table with qw qx qy qz
-"""
-_MORE_OF_POSES = """\
+{poses}
 #   inverse: true         # the file has world-to-lidar, not lidar-to-world
-#   T_frame_lidar: [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
-#                         # the lidar in the frame whose poses these are
+#   T_frame_lidar: [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]  # if poses are another frame's
 
-"""
-_CAMERAS = """\
 # Cameras: K and T_cam_lidar are to be filled in (p_cam = T_cam_lidar p_lidar; the camera looks
-# along z, x to the right, y down). model: pinhole (distortion k1 k2 p1 p2 k3 ..., none if
-# rectified), fisheye (k1 k2 k3 k4) or mei (xi k1 k2 p1 p2). stamps: names, a file, or sweeps (an
-# image was exposed at the stamp of the sweep of its number). row_time_s: of a rolling shutter, from
-# one row's exposure to the next one's. clock_offset_s: is added to the stamps.
+# along z, x to the right, y down). model: pinhole, fisheye or mei. stamps: names, a file, or sweeps
+# (an image was exposed at the stamp of the sweep of its number).
 # cameras:
 """
 _CAMERA = """\
 #   {name}:
 #     files: {files}
 #     stamps: {stamps}
-#     clock_offset_s: 0
 #     size: [{width}, {height}]
 #     model: pinhole
 #     distortion: []
 #     row_time_s: 0
 #     K: [fx, fy, cx, cy]
-#     T_cam_lidar: [[0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]]
+#     T_cam_lidar: [[0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0]]
 """
 
 
 def draft_config(folder: Path) -> str:
     """Return the text of a commented densify.yaml that opens as it is. Reads one sweep and one
     image of each folder. Raises InputError if there are no sweeps, or the first cannot be read."""
-    groups = sweep_folders(folder)
-    sweeps = "\n".join(_sweep_lines(folder, groups)) + "\n" + _MORE_OF_SWEEPS
     path = find_pose_file(folder, "")
-    poses = _NO_POSES
+    poses = "# poses:\n#   file: poses.txt       # KITTI 3x4, 4x4, TUM, or a table"
     if path is not None:
-        poses = f"poses:\n  file: {path.name}  # {PoseFile.read(path).form}\n"
-    return _HEAD + sweeps + poses + _MORE_OF_POSES + _cameras(folder)
+        poses = f"poses:\n  file: {path.name}  # {PoseFile.read(path).form}"
+    sweeps = "\n".join(_sweep_lines(folder, sweep_folders(folder))) + "\n"
+    return _HEAD + sweeps + _MORE.format(poses=poses) + _cameras(folder)
 
 
 def _sweep_lines(folder: Path, groups: Mapping[str, Sequence[Path]]) -> list[str]:
@@ -96,15 +82,10 @@ def _sweep_lines(folder: Path, groups: Mapping[str, Sequence[Path]]) -> list[str
         lines.append(f"  # time: NAME           # {found.time_words}")
     else:
         lines.append(f"  time: {found.times.field}")
-        lines.append(
-            f"  time_unit: {found.times.unit}  # a sweep takes about a period in this unit"
-        )
+        lines.append(f"  time_unit: {found.times.unit}  # a sweep takes about a period in it")
         lines.append(f"  time_is: {'absolute' if found.times.absolute else 'relative'}")
     if series.stamps_ns is None:
-        lines.append("  rate_hz: 10  # assumed; or name a file with one time for each sweep:")
-        lines.append("  # stamps: timestamps.txt")
-    elif series.told_by.startswith("the names"):
-        lines.append("  stamps: names")
+        lines.append("  rate_hz: 10  # assumed; or a file with a time a sweep: stamps: times.txt")
     else:
         lines.append(f"  # stamps are taken from {series.told_by}")
     return lines
@@ -119,7 +100,7 @@ def _guessed(columns: Mapping[str, NDArray[Any]]) -> tuple[str, ...]:
             names.append(name)
         elif whole and column.min() >= 0 and 0 < column.max() < 256 and "ring" not in names:
             names.append("ring")
-        elif find_times(column, name, _PERIOD_NS, None)[0] is not None and "time" not in names:
+        elif "time" not in names and find_times(column, name, 10**8, None)[0] is not None:
             names.append("time")
         else:
             names.append(f"unknown{len(names)}")
@@ -127,7 +108,7 @@ def _guessed(columns: Mapping[str, NDArray[Any]]) -> tuple[str, ...]:
 
 
 def _cameras(folder: Path) -> str:
-    text = _CAMERAS
+    text = ""
     for files, images in find_images(folder).items():
         place, first = folder / files, images[0]
         width, height = image_size_px(first)
