@@ -34,7 +34,7 @@ hypothesis.settings.load_profile("densify")
 LONGEST = (
     *("examples", "street", "notebooks", "dataset", "recording", "learning_training"),
     *("bench", "fuzz", "registration", "pipeline", "far", "executor", "cli"),
-    *("doctor", "report_browser", "groups", "labels", "memory"),
+    *("doctor", "report_browser", "groups", "labels"),
     *("bench_paper", "reader_pandaset", "flow_sets", "film"),
 )
 """Files of tests that take long begin, so that no process works on one while the others wait at the

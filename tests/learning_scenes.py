@@ -59,7 +59,7 @@ def train_small(out: str, resume: bool = False, **options) -> list[Path]:
     training = densify.learning.training
     before, training.ClipMaker = training.ClipMaker, SmallClips
     try:
-        options = {"teacher": "truth", "num_workers": 0, "checkpoint_steps": 3, **options}
+        options = {"teacher": "truth", "checkpoint_steps": 3, **options}
         settings = training.Training(("streets",), **options)
         return training.train(settings, Path(out), resume).files
     finally:

@@ -176,19 +176,19 @@ def test_a_second_run_at_once(border_drive: Path, tmp_path: Path, capsys) -> Non
 def test_as_many_workers_as_cores_free_memory_and_keys_suffice_for(
     border_drive: Path, monkeypatch
 ) -> None:
-    recipe = Recipe(window=2)
-    drives = 32 * plan([str(border_drive)], slice(39, 41), recipe)  # 64 keys
+    assert make._free_bytes() > 1e8
+    drives = 32 * plan([str(border_drive)], slice(39, 41), Recipe())  # 64 keys
     monkeypatch.setattr(make, "num_threads", lambda: 6)
     for free, wanted, num_drives, num in (
         (900e9, None, 32, 6),
         (900e9, None, 16, 4),
         (900e9, None, 1, 1),
+        (10e9, None, 32, 3),
+        (1e9, None, 32, 1),
         (900e9, 9, 32, 9),
     ):
-        monkeypatch.setattr(make, "available_bytes", lambda free=free: free)
-        assert make._num_processes(wanted, recipe, drives[:num_drives]) == num
-    monkeypatch.setattr(make, "available_bytes", lambda: 3e9)
-    assert 1 <= make._num_processes(None, recipe, drives) < 6
+        monkeypatch.setattr(make, "_free_bytes", lambda free=free: free)
+        assert make._num_processes(wanted, Recipe(), drives[:num_drives]) == num
 
 
 # Gate

@@ -188,9 +188,9 @@ def test_a_stopped_training_goes_on_to_the_same_bytes(
 
 def test_samples_follow_from_their_number() -> None:
     maker = SmallClips(("streets",), 3, "truth")
-    stream = samples(maker, 3, 0)
+    stream = samples(maker, 3)
     everything = [next(stream) for _ in range(194)]  # more than one group of clips
-    late = next(samples(maker, 3, 0, first=193))
+    late = next(samples(maker, 3, first=193))
     for one, other in zip(late.sweeps, everything[193].sweeps, strict=True):
         assert (one is None) == (other is None)
         assert one is None or torch.equal(one.points, other.points)
@@ -252,7 +252,7 @@ def test_the_command_trains_on_a_street(tmp_path: Path, capsys, monkeypatch) -> 
     monkeypatch.setattr("densify.learning.clips.resolve", lambda _: resolve(POSES_GIVEN))
     out = tmp_path / "m.pt"
     command = ["train", "flow", "--data", "street", "--out", str(out), "--teacher", "engine"]
-    command += ["--steps", "2", "--workers", "0"]
+    command += ["--steps", "2"]
     assert main(command) == 0
     told = capsys.readouterr().out.splitlines()
     assert told[0].startswith("2 steps, loss") and told[1:] == [str(out), f"{out}.png"]
@@ -279,7 +279,7 @@ def test_the_command_trains_on_a_street(tmp_path: Path, capsys, monkeypatch) -> 
 )
 def test_bad_input_is_one_line(tmp_path: Path, capsys, options, message: str) -> None:
     out = str(tmp_path / "m.pt")
-    assert main(["train", "flow", "--out", out, "--workers", "0", *options]) == 2
+    assert main(["train", "flow", "--out", out, *options]) == 2
     lines = capsys.readouterr().err.strip().splitlines()
     assert len(lines) == 1 and message in lines[0]
     assert not list(tmp_path.iterdir())

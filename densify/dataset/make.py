@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import logging
 import math
+import re
 import time
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
@@ -40,12 +41,10 @@ from densify.flow.engines import check_engine
 from densify.geometry.threads import num_threads
 from densify.outputs.atomic import LEFT_AFTER_S, clear_leftovers
 from densify.outputs.kitti_tree import write_readme
-from densify.pipeline.memory import available_bytes, check_free, need_of_run
-from densify.readers import open_sequence
 
 _log = logging.getLogger("densify")
 _LEAST_KEYS = 8  # of a process; fewer are made before another one has begun
-_SHARE_OF_FREE = 0.7  # of the memory; files that are read want some too
+_BASE_BYTES, _SWEEP_BYTES = 1.5e9, 0.15e9  # of a process, and of a sweep of a 64-ring scanner
 Block = tuple[PlannedDrive, list[int]]
 """A recording and the keys of one of its blocks."""
 
@@ -74,11 +73,11 @@ class Summary:
 
     def mean(self, score: str) -> float | None:
         """Return the mean over the keys that are done, and their cameras."""
-        values: list[Any] = []  # a manifest of others may hold anything
+        values: list[Any] = []
         for record in self.records.values():
             value = record.scores.get(score) if record.status == "done" else None
             values += value.values() if isinstance(value, Mapping) else [value]
-        known = [value for value in values if isinstance(value, float | int)]
+        known = [value for value in values if value is not None]
         return sum(known) / len(known) if known else None
 
 
@@ -171,23 +170,25 @@ def damaged(out: Path) -> list[str]:
 
 
 def _num_processes(wanted: int | None, recipe: Recipe, drives: Sequence[PlannedDrive]) -> int:
-    """Return the number wanted; if None, as many as cores, free memory and keys suffice for.
-    Raises InputError if the memory does not suffice for one."""
-    if wanted is not None and wanted < 1:
-        raise InputError(f"--workers {wanted}: expected 1 or more processes")
-    need_bytes, source = 1.0, drives[0].source
-    sequence = open_sequence(source.data)
-    for key in drives[0].keys:
-        with suppress(InputError):  # a sweep that cannot be read
-            need_bytes = need_of_run(sequence, key, recipe.window, source.cameras, recipe.config)
-            break
-    check_free(need_bytes, f"--window {recipe.window}: a process")
+    """Return the number wanted; if None, as many as cores, free memory and keys suffice for."""
     if wanted is not None:
+        if wanted < 1:
+            raise InputError(f"--workers {wanted}: expected 1 or more processes")
         return wanted
+    need_bytes = _BASE_BYTES + _SWEEP_BYTES * (2 * recipe.window + 1)
     num_keys = sum(len(drive.keys) for drive in drives)
-    free_bytes = available_bytes() or float("inf")
-    fitting = [_SHARE_OF_FREE * free_bytes / need_bytes, num_threads(), num_keys // _LEAST_KEYS]
+    fitting = (_free_bytes() / need_bytes, num_threads(), num_keys / _LEAST_KEYS)
     return max(1, int(min(fitting)))
+
+
+def _free_bytes() -> float:
+    """Return the memory that the system has free, in a container its limit if that is less."""
+    found = []
+    with suppress(OSError, ValueError, TypeError):
+        table = Path("/proc/meminfo").read_text()
+        found.append(1024.0 * int(re.findall(r"MemAvailable:\s+(\d+)", table)[0]))
+        found.append(float(Path("/sys/fs/cgroup/memory.max").read_text()))  # or the word max
+    return min(found, default=float("inf"))
 
 
 def _blocks(drives: Sequence[PlannedDrive], shard: tuple[int, int] | None) -> list[Block]:

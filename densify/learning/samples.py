@@ -7,10 +7,7 @@ are turned about the vertical, mirrored and scaled at random.
 
 from __future__ import annotations
 
-import multiprocessing
-from collections import deque
-from collections.abc import Generator
-from concurrent.futures import Future, ProcessPoolExecutor
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -61,28 +58,21 @@ class Sample:
         )
 
 
-def samples(
-    make: ClipMaker, num_wanted: int, num_workers: int, first: int = 0
-) -> Generator[Sample, None, None]:
+def samples(make: ClipMaker, num_wanted: int, first: int = 0) -> Iterator[Sample]:
     """Yield samples from number ``first`` on, without end.
 
-    num_wanted: sweeps that the network takes. num_workers: processes that make clips ahead; 0 makes
-    them in this process.
+    num_wanted: sweeps that the network takes.
     """
     group, skip = divmod(first, _NUM_MIXED * _PAIRS_OF_CLIP)
-    clips = _clips(make, group * _NUM_MIXED, num_workers)
-    try:
-        while True:
-            mixed = [next(clips) for _ in range(_NUM_MIXED)]
-            rng = np.random.default_rng([make.seed, group, 1])
-            pairs = [pair for c, clip in enumerate(mixed) for pair in _pairs(c, clip, rng)]
-            for place in rng.permutation(len(pairs))[skip:]:
-                own = np.random.default_rng([make.seed, group, 2, int(place)])
-                c, source, target = pairs[place]
-                yield sample_of(mixed[c], source, target, num_wanted, make.labels, own)
-            group, skip = group + 1, 0
-    finally:
-        clips.close()
+    while True:
+        mixed = [make(group * _NUM_MIXED + n) for n in range(_NUM_MIXED)]
+        rng = np.random.default_rng([make.seed, group, 1])
+        pairs = [pair for c, clip in enumerate(mixed) for pair in _pairs(c, clip, rng)]
+        for place in rng.permutation(len(pairs))[skip:]:
+            own = np.random.default_rng([make.seed, group, 2, int(place)])
+            c, source, target = pairs[place]
+            yield sample_of(mixed[c], source, target, num_wanted, make.labels, own)
+        group, skip = group + 1, 0
 
 
 def _pairs(c: int, clip: Clip, rng: np.random.Generator) -> list[tuple[int, int, int]]:
@@ -154,23 +144,3 @@ def _draw(within: np.ndarray, rng: np.random.Generator | None) -> Tensor:
         every = np.arange(NUM_DRAWN) * len(rows) // NUM_DRAWN
         rows = rows[every] if rng is None else np.sort(rng.choice(rows, NUM_DRAWN, replace=False))
     return torch.from_numpy(rows)
-
-
-def _clips(make: ClipMaker, number: int, num_workers: int) -> Generator[Clip, None, None]:
-    """Yield clips from a number on, made ahead by worker processes."""
-    if num_workers == 0:
-        while True:
-            yield make(number)
-            number += 1
-    # A forked process would inherit torch's threads, which it does not have.
-    with ProcessPoolExecutor(num_workers, multiprocessing.get_context("spawn")) as pool:
-        waiting: deque[Future[Clip]] = deque()
-        try:
-            while True:
-                while len(waiting) < num_workers + _NUM_MIXED:
-                    waiting.append(pool.submit(make, number))
-                    number += 1
-                yield waiting.popleft().result()
-        finally:
-            for one in waiting:
-                one.cancel()

@@ -40,8 +40,8 @@ Report = Callable[[int, float, float], None]
 class Training:
     """What is trained on which recordings.
 
-    data: specifications of recordings. steps: pairs of sweeps to train on. num_workers: processes
-    that make samples. checkpoint_steps: steps between two checkpoints.
+    data: specifications of recordings. steps: pairs of sweeps to train on. checkpoint_steps: steps
+    between two checkpoints.
     """
 
     data: tuple[str, ...]
@@ -49,7 +49,6 @@ class Training:
     teacher: str = "objective"
     seed: int = 0
     device: str = "auto"
-    num_workers: int = 1
     checkpoint_steps: int = 50
 
     def identity(self) -> dict[str, Any]:
@@ -90,29 +89,26 @@ def train(
     network, optimizer, losses = state
     network.to(device).train()
     maker = ClipMaker(training.data, training.seed, taught.labels)
-    drawn = samples(maker, NUM_SWEEPS, training.num_workers, len(losses))
-    try:
-        with on_one_thread():
-            while len(losses) < training.steps:
-                sample = next(drawn).to(device)
-                for group in optimizer.param_groups:
-                    group["lr"] = _learning_rate(len(losses) / training.steps)
-                optimizer.zero_grad()
-                loss = taught.loss(network, sample)
-                if not torch.isfinite(loss):
-                    raise ComputationError(
-                        f"the loss of step {len(losses)} is {loss.item()}; try another --seed"
-                    )
-                loss.backward()
-                nn.utils.clip_grad_norm_(network.parameters(), _LARGEST_GRADIENT)
-                optimizer.step()
-                losses.append(loss.item())
-                if report is not None:
-                    report(len(losses), len(losses) / training.steps, losses[-1])
-                if len(losses) % training.checkpoint_steps == 0:
-                    write_model(checkpoint, _checkpoint(training, state))
-    finally:
-        drawn.close()
+    drawn = samples(maker, NUM_SWEEPS, len(losses))
+    with on_one_thread():
+        while len(losses) < training.steps:
+            sample = next(drawn).to(device)
+            for group in optimizer.param_groups:
+                group["lr"] = _learning_rate(len(losses) / training.steps)
+            optimizer.zero_grad()
+            loss = taught.loss(network, sample)
+            if not torch.isfinite(loss):
+                raise ComputationError(
+                    f"the loss of step {len(losses)} is {loss.item()}; try another --seed"
+                )
+            loss.backward()
+            nn.utils.clip_grad_norm_(network.parameters(), _LARGEST_GRADIENT)
+            optimizer.step()
+            losses.append(loss.item())
+            if report is not None:
+                report(len(losses), len(losses) / training.steps, losses[-1])
+            if len(losses) % training.checkpoint_steps == 0:
+                write_model(checkpoint, _checkpoint(training, state))
     write_model(out, Model(network, training.identity()))
     picture = out.with_name(out.name + ".png")
     title = f"teacher {training.teacher}, {', '.join(training.data)}"

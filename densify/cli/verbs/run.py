@@ -73,7 +73,6 @@ def answer_run(options: argparse.Namespace) -> Iterator[Answer]:
     from densify.cli.results import FIRST_OF_RUN, key_facts, summary
     from densify.outputs import check_writable
     from densify.pipeline import run as pipeline
-    from densify.pipeline.memory import check_fits
     from densify.readers import open_sequence
 
     sequence = open_sequence(recording_of(options))
@@ -99,7 +98,6 @@ def answer_run(options: argparse.Namespace) -> Iterator[Answer]:
             progress,
             prior=options.prior,
         )
-        check_fits(sequence, keys[0], options.window, options.cameras, config)
         for key, result in made:
             if isinstance(result, Exception):
                 failed[key] = result
@@ -184,13 +182,11 @@ def answer_compare(options: argparse.Namespace) -> Iterator[Answer]:
     from densify.cli.results import FIRST_OF_COMPARISON, comparison, key_facts
     from densify.outputs import check_writable, write_comparison
     from densify.pipeline import run as pipeline
-    from densify.pipeline.memory import check_fits
     from densify.pipeline.methods import COMPARED
     from densify.readers import open_sequence
 
     check_writable(options.out, options.key, options.overwrite, "compare")
     sequence = open_sequence(recording_of(options))
-    check_fits(sequence, options.key, options.window, options.cameras, config)
     with progress_on_stderr() as progress:
         results = pipeline.compare(
             sequence,

@@ -50,8 +50,6 @@ def add(commands: Any) -> None:
     resume = "go on from MODEL.checkpoint of a stopped training"
     flow.add_argument("--resume", action="store_true", help=resume)
     flow.add_argument("--device", choices=devices, default="auto", help="(default: auto)")
-    workers = "processes that prepare sweeps beside the training, 0 for none (default: 1)"
-    flow.add_argument("--workers", type=natural, default=1, metavar="N", help=workers)
 
 
 def answer(options: argparse.Namespace) -> Iterator[Answer]:
@@ -66,7 +64,6 @@ def answer(options: argparse.Namespace) -> Iterator[Answer]:
         seed=options.seed,
         steps=options.steps,
         device=options.device,
-        num_workers=options.workers,
     )
     smooth = 0.0
     with progress_on_stderr(lines=True) as show:
