@@ -130,12 +130,11 @@ def test_workers_end_with_the_command(how: signal.Signals, tmp_path: Path) -> No
 # Schedulers
 
 
-@pytest.mark.parametrize("address", ["tcp://127.0.0.1:9", "localhost", "tls://127.0.0.1:9"])
+@pytest.mark.parametrize("address", ["tcp://127.0.0.1:9", "tls://127.0.0.1:9"])
 def test_a_scheduler_that_is_not_reached(address: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(executor, "_CONNECT_S", 0.5)
-    with pytest.raises(InputError, match=f"scheduler {address}: not reached .* expected") as error:
+    with pytest.raises(InputError, match=f"scheduler {address}: not reached .* expected"):
         check_scheduler(address)
-    assert ("certificates that the scheduler trusts" in str(error.value)) == ("tls" in address)
 
 
 def test_a_scheduler_needs_dask(monkeypatch: pytest.MonkeyPatch) -> None:

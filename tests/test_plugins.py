@@ -136,10 +136,7 @@ def test_a_module_says_what_a_row_says(package) -> None:
 @pytest.mark.parametrize(
     ("code", "words"),
     [
-        (
-            "raise RuntimeError('a\\nb')",
-            "cannot be imported from stranger_code (RuntimeError: a",
-        ),
+        ("raise RuntimeError('a\\nb')", "cannot be imported from stranger_code (RuntimeError: a"),
         ("x = 1", "stranger_code is no module with estimate_motion"),
     ],
 )

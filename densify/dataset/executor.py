@@ -235,14 +235,10 @@ def _dask(scheduler: str) -> Iterator[Any]:
     try:
         client = Client(scheduler, timeout=_CONNECT_S, set_as_default=False)
     except Exception as error:  # of many types
-        told = "expected the address of a running Dask scheduler, such as tcp://host:8786"
-        if scheduler.startswith("tls://"):
-            told += (
-                "; tls:// needs certificates that the scheduler trusts in Dask's configuration "
-                "(distributed.comm.tls.ca-file, .client.cert, .client.key)"
-            )
         raise InputError(
-            f"scheduler {scheduler}: not reached within {_CONNECT_S} s ({error}), {told}"
+            f"scheduler {scheduler}: not reached within {_CONNECT_S} s ({error}), expected the "
+            f"address of a running Dask scheduler, such as tcp://host:8786; tls:// needs "
+            f"certificates that the scheduler trusts in Dask's configuration"
         ) from error
     with client:
         yield client
