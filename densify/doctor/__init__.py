@@ -7,20 +7,81 @@ recording says with what it would say under the usual mistakes.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from pathlib import Path
+
+import numpy as np
 
 from densify.config import Config
-from densify.doctor import cameras, clocks, deskewing, files, paths, points, rings
-from densify.doctor.findings import Finding, Verdict, fine, unknown, wrong
+from densify.doctor import cameras, clocks, paths, points, rings
+from densify.doctor.findings import Finding, Verdict, fine, suspicious, unknown, wrong
 from densify.doctor.sample import Sample, Spot
-from densify.geometry.types import LidarSequence
+from densify.geometry.types import KnowsFiles, LidarSequence
+from densify.readers.timeline import format_frames
 
 __all__ = ["CHECKS", "Diagnosis", "Finding", "Sample", "Spot", "Verdict", "examine"]
 
+_SHORT = 0.3  # of the usual size
+_CAUSES = ("unit of points", "axes", "stamps", "point times")
+
+
+def check_sweep_files(sample: Sample) -> list[Finding]:
+    """Compare the sizes of the sweeps' files; name sweeps that cannot be read."""
+    findings = []
+    if sample.unreadable:
+        frame, reason = next(iter(sample.unreadable.items()))
+        findings.append(
+            wrong(
+                "reading",
+                f"{len(sample.unreadable)} of the sweeps looked at cannot be read: frames "
+                f"{format_frames(sample.unreadable)}; frame {frame}: {reason}",
+                "fetch these files again; windows end before them",
+                num_unreadable=len(sample.unreadable),
+            )
+        )
+    if isinstance(sample.sequence, KnowsFiles):
+        sizes = sample.sequence.sweep_bytes()
+        findings += [_sizes(sizes)] if sizes else []
+    return findings
+
+
+def _sizes(sizes: Mapping[int, int]) -> Finding:
+    usual = float(np.median(list(sizes.values())))
+    empty = [frame for frame, size in sizes.items() if size == 0]
+    short = [frame for frame, size in sizes.items() if 0 < size < _SHORT * usual]
+    values = {"num_empty": len(empty), "num_short": len(short), "usual_bytes": int(usual)}
+    if not empty and not short:
+        text = f"{len(sizes)} sweeps of {usual / 1e6:.2f} MB, none empty or much shorter"
+        return fine("files", text, **values)
+    verdict = wrong if empty else suspicious
+    return verdict(
+        "files",
+        f"empty: {format_frames(empty)}; much shorter than the usual {usual / 1e6:.2f} MB: "
+        f"{format_frames(short)}",
+        "fetch these files again; windows end before sweeps that cannot be read",
+        **values,
+    )
+
+
+def check_registration(sample: Sample) -> list[Finding]:
+    """Report where odometry cannot register the sweeps."""
+    failures = [spot.failure for spot in sample.spots if spot.trajectory is None]
+    if len(sample.timeline.frames) < 2:
+        return [unknown("registration", failures[0])]
+    if not failures:
+        speeds = ", ".join(f"{spot.speed_m_s:.1f}" for spot in sample.spots)
+        return [fine("registration", f"odometry finds {speeds} m/s")]
+    return [
+        wrong(
+            "registration",
+            f"{len(failures)} of {len(sample.spots)} places cannot be registered: {failures[0]}",
+            f"mend what is wrong above first ({', '.join(_CAUSES)})",
+        )
+    ]
+
+
 CHECKS: tuple[Callable[[Sample, Config], list[Finding]], ...] = (
-    lambda sample, _: files.check_sweep_files(sample),
+    lambda sample, _: check_sweep_files(sample),
     lambda sample, _: clocks.check_stamps(sample),
     lambda sample, _: clocks.check_point_times(sample),
     lambda sample, _: points.check_units(sample),
@@ -28,13 +89,12 @@ CHECKS: tuple[Callable[[Sample, Config], list[Finding]], ...] = (
     lambda sample, config: points.check_sensors(sample, config.register),
     lambda sample, config: points.check_own_vehicle(sample, config.register),
     lambda sample, _: points.check_intensity(sample),
-    lambda sample, _: registration_of(sample),
+    lambda sample, _: check_registration(sample),
     lambda sample, _: rings.check_rings(sample),
-    lambda sample, config: deskewing.check_deskewing(sample, config.register),
+    lambda sample, config: clocks.check_deskewing(sample, config.register),
     lambda sample, _: paths.check_poses(sample),
     lambda sample, _: cameras.check_cameras(sample),
 )
-_CAUSES = ("unit of points", "axes", "stamps", "point times")
 
 
 @dataclass(frozen=True)
@@ -49,32 +109,12 @@ class Diagnosis:
         return max((finding.verdict for finding in self.findings), default=Verdict.FINE)
 
 
-def examine(sequence: LidarSequence, config: Config, folder: Path | None = None) -> Diagnosis:
+def examine(sequence: LidarSequence, config: Config) -> Diagnosis:
     """Check a recording. At most fifteen of its sweeps and three images of each camera are read,
     however long it is.
 
-    folder: where a data set would be written; its free space is checked. Raises InputError if not
-    one of the sweeps looked at can be read.
+    Raises InputError if none of these sweeps can be read.
     """
     sample = Sample.of(sequence, config.register)
     findings = [finding for check in CHECKS for finding in check(sample, config)]
-    if folder is not None:
-        findings += files.check_room(sample, folder)
     return Diagnosis(sample, tuple(findings))
-
-
-def registration_of(sample: Sample) -> list[Finding]:
-    """Whether odometry can lay the sweeps upon each other."""
-    failures = [spot.failure for spot in sample.spots if spot.trajectory is None]
-    if len(sample.timeline.frames) < 2:
-        return [unknown("registration", failures[0])]
-    if not failures:
-        speeds = ", ".join(f"{spot.speed_m_s:.1f}" for spot in sample.spots)
-        return [fine("registration", f"odometry finds {speeds} m/s")]
-    return [
-        wrong(
-            "registration",
-            f"{len(failures)} of {len(sample.spots)} places cannot be registered: {failures[0]}",
-            f"mend what is wrong above first ({', '.join(_CAUSES)})",
-        )
-    ]

@@ -8,7 +8,7 @@ Online Calibration of Cameras and Lasers", RSS 2013).
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import cv2
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from densify.config.errors import InputError
-from densify.doctor.findings import Finding, Verdict, fine, suspicious, unknown, wrong
+from densify.doctor.findings import Finding, fine, suspicious, unknown, wrong
 from densify.doctor.sample import Sample, Spot
 from densify.geometry import poses
 from densify.geometry.cameras import image_points
@@ -37,12 +37,6 @@ _AS_MANY = 0.5  # edges as with the given calibration; one object may lie on an 
 _SHIFT_DEG, _SHIFT_STEP_DEG, _OFF_DEG = 2.0, 0.1, 0.4
 _CLOCK_S, _CLOCK_STEP_S, _CLOCK_OFF_S = 0.2, 0.01, 0.02
 _LEAST_SPEED_M_S = 3.0
-_TURNS = {
-    "the inverse of the given pose (T_lidar_cam instead of T_cam_lidar)": "inverse",
-    "a camera whose pose is that of a body (x forward, y left, z up)": "body",
-    "the pose for a lidar with x right, y forward": "right_forward",
-    "the transposed rotation": "transposed",
-}
 
 
 @dataclass(frozen=True)
@@ -107,16 +101,10 @@ def _check_images(sample: Sample, camera: Camera) -> list[Finding]:
     text = f"{len(exposed_ns)}, usually {apart_ms:.1f} ms from a sweep's reference time"
     if not without:
         return [fine(name, text, **values)]
-    all_of_them = len(without) == len(stamp_ns)
-    return [
-        Finding(
-            name,
-            Verdict.WRONG if all_of_them else Verdict.SUSPICIOUS,
-            f"{text}; {len(without)} sweeps have none within a period: {format_frames(without)}",
-            "put sweeps and images on one clock" if all_of_them else "choose other keys than these",
-            values,
-        )
-    ]
+    text += f"; {len(without)} sweeps have none within a period: {format_frames(without)}"
+    if len(without) == len(stamp_ns):
+        return [wrong(name, text, "put sweeps and images on one clock", **values)]
+    return [suspicious(name, text, "choose other keys than these", **values)]
 
 
 def image_pairs(sample: Sample, camera: Camera) -> tuple[list[Pair], str]:
@@ -218,20 +206,20 @@ def _score(camera: Camera, seen: list[tuple[Pair, Float, Bool]], right_px: float
 
 
 def alternatives(camera: Camera) -> Iterator[tuple[str, Camera]]:
-    """What calibrations often are instead of the given one."""
+    """Yield the name of each usual mistake and the camera (``T_cam_lidar``) without it."""
     T = camera.T_cam_lidar
     body = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
     turned = np.array([[0.0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
     transposed = T.copy()
     transposed[:3, :3] = T[:3, :3].T
-    changed: Mapping[str, Float] = {
-        "inverse": poses.inverse(T),
-        "body": body @ T,
-        "right_forward": T @ turned,
-        "transposed": transposed,
+    changed = {
+        "the inverse of the given pose (T_lidar_cam instead of T_cam_lidar)": poses.inverse(T),
+        "a camera whose pose is that of a body (x forward, y left, z up)": body @ T,
+        "the pose for a lidar with x right, y forward": T @ turned,
+        "the transposed rotation": transposed,
     }
-    for name, which in _TURNS.items():
-        yield name, replace(camera, T_cam_lidar=changed[which])
+    for name, T_cam_lidar in changed.items():
+        yield name, replace(camera, T_cam_lidar=T_cam_lidar)
 
 
 def _check_calibration(camera: Camera, pairs: list[Pair]) -> list[Finding]:
@@ -259,25 +247,27 @@ def _check_calibration(camera: Camera, pairs: list[Pair]) -> list[Finding]:
     elif at_shift == most > clearly and abs(shift_deg) > _OFF_DEG:
         side = "right" if shift_deg > 0 else "left"
         text += f", by {most:.1f} if they were {abs(shift_deg):.1f} deg farther to the {side}"
-        remedy = "look at the overlay; correct T_cam_lidar or K"
+        remedy = "correct T_cam_lidar or K"
         finding = suspicious(name, text, remedy, **values)
     elif most < _CLEAR:
         text += f", and nowhere around by more than {most:.1f}: images and sweeps do not show the"
         text += " same, or too little"
-        remedy = "look at the overlay; check T_cam_lidar, K and the clocks"
+        remedy = "check T_cam_lidar, K and the clocks"
         finding = suspicious(name, text, remedy, **values)
     else:
         text += f", by {at_shift:.1f} {abs(shift_deg):.1f} deg beside"
         finding = fine(name, text, **values)
     if clock is None:
         return [finding]
-    remedy = f"shift the stamps of {camera.name} by {clock.late_s * 1e3:+.0f} ms" if late else ""
-    verdict = Verdict.SUSPICIOUS if late else Verdict.FINE
-    evidence = (
+    name = f"{camera.name}: clock"
+    text = (
         f"depth and image fit best {clock.late_s * 1e3:+.0f} ms ({clock.low_s * 1e3:+.0f} to "
         f"{clock.high_s * 1e3:+.0f}) after the image's stamp"
     )
-    return [finding, Finding(f"{camera.name}: clock", verdict, evidence, remedy, vars(clock))]
+    if not late:
+        return [finding, fine(name, text, **vars(clock))]
+    remedy = f"shift the stamps of {camera.name} by {clock.late_s * 1e3:+.0f} ms"
+    return [finding, suspicious(name, text, remedy, **vars(clock))]
 
 
 def _one_image(name: str, text: str, given: float, values: dict[str, float]) -> Finding:

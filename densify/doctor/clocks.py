@@ -1,12 +1,18 @@
 # SPDX-License-Identifier: MIT
-"""Stamps of sweeps and points: order, gaps, unit, and where in a sweep its reference time lies."""
+"""Check the stamps of sweeps and points: order, gaps, unit, span, and whether they deskew."""
 
 from __future__ import annotations
 
-import numpy as np
+from dataclasses import replace
 
-from densify.doctor.findings import Finding, Verdict, fine, suspicious, unknown, wrong
-from densify.doctor.sample import Sample
+import numpy as np
+from scipy.spatial import cKDTree
+
+from densify.config import RegisterSettings
+from densify.doctor.findings import Finding, fine, suspicious, unknown, wrong
+from densify.doctor.sample import Sample, Spot, spot_of
+from densify.geometry import poses
+from densify.geometry.types import Float, Sweep
 from densify.readers.timeline import format_frames
 
 _PERIODS_S = (0.015, 1.1)  # of scanners that are built: 50 Hz to 1 Hz
@@ -19,8 +25,12 @@ _UNITS = {
     "nanoseconds taken for milliseconds": 1e-6,
     "nanoseconds taken for seconds": 1e-9,
 }
-_YEAR_NS = 31_556_952 * 10**9
-_YEARS = (1980 - 1970, 2040 - 1970)  # the clock of GPS counts from 1980
+_LEAST_SPEED_M_S = 3.0
+_NEAR_M = 25.0
+_LEAST_HEIGHT_M = 0.5
+_CLOSE_M = 1.0
+_LEAST_POINTS = 50
+_CLEARLY, _TOLD = 1.2, 1.05
 _WHOLE_SWEEP = (0.5, 1.5)  # of a period: from the first to the last point
 
 
@@ -54,7 +64,7 @@ def check_stamps(sample: Sample) -> list[Finding]:
                 num_backward=len(backward),
             )
         ]
-    return [_rate(sample), *_holes(sample), *_year(sample)]
+    return [_rate(sample), *_holes(sample)]
 
 
 def _rate(sample: Sample) -> Finding:
@@ -64,14 +74,13 @@ def _rate(sample: Sample) -> Finding:
         return fine("stamps", f"{1 / period_s:.2f} Hz, ascending", **values)
     fits = [name for name, f in _UNITS.items() if _PERIODS_S[0] <= period_s * f <= _PERIODS_S[1]]
     guess = f"; it would be {1 / (period_s * _UNITS[fits[0]]):.1f} Hz with {fits[0]}" * bool(fits)
-    verdict = Verdict.WRONG if fits else Verdict.SUSPICIOUS
-    return Finding(
+    verdict = wrong if fits else suspicious
+    return verdict(
         "stamps",
-        verdict,
         f"from sweep to sweep {period_s:.3g} s pass, expected {_PERIODS_S[0]} to "
         f"{_PERIODS_S[1]} s{guess}",
         "correct the unit of the stamps",
-        values,
+        **values,
     )
 
 
@@ -94,21 +103,6 @@ def _holes(sample: Sample) -> list[Finding]:
     ]
 
 
-def _year(sample: Sample) -> list[Finding]:
-    years = int(sample.timeline.stamp_ns[0]) / _YEAR_NS
-    if years < 1 or _YEARS[0] <= years <= _YEARS[1]:  # counted from power-on, or a date
-        return []
-    return [
-        suspicious(
-            "date",
-            f"the first sweep is stamped in the year {1970 + years:.0f}, expected a date from 1980 "
-            f"to 2040 or a clock that starts at 0",
-            "nothing, as long as sweeps, images and poses share the clock",
-            year=1970 + years,
-        )
-    ]
-
-
 def check_point_times(sample: Sample) -> list[Finding]:
     """The firing times within a sweep."""
     speed_m_s = max((spot.speed_m_s for spot in sample.spots), default=0.0)
@@ -118,7 +112,7 @@ def check_point_times(sample: Sample) -> list[Finding]:
     if len(sample.timeline.frames) < 2:
         return []
     if any(s.offset_ns is None for s in sweeps):
-        return []  # whether that matters, `check_compensation` says
+        return []  # `check_rings` says if they are needed
     for lidar in sorted({int(n) for s in sweeps for n in np.unique(s.lidar)}):
         low_s, high_s = _span_s(sample, lidar)
         span = (high_s - low_s) / period_s
@@ -130,12 +124,13 @@ def check_point_times(sample: Sample) -> list[Finding]:
             f"the stamp is at {round(100 * where)} % of the sweep"
         )
         if _WHOLE_SWEEP[0] <= span <= _WHOLE_SWEEP[1]:
-            verdict, remedy = Verdict.FINE, ""
+            finding = fine(name, text, **values)
         elif span < 0.02 or span > 10:
-            verdict, remedy = Verdict.WRONG, "correct the unit of the point times"
+            finding = wrong(name, text, "correct the unit of the point times", **values)
         else:
-            verdict, remedy = Verdict.SUSPICIOUS, "compare the point times with the scanner's rate"
-        findings.append(Finding(name, verdict, text, remedy, values))
+            remedy = "compare the point times with the scanner's rate"
+            finding = suspicious(name, text, remedy, **values)
+        findings.append(finding)
     return findings
 
 
@@ -148,3 +143,71 @@ def _span_s(sample: Sample, lidar: int) -> tuple[float, float]:
             ends.append(np.percentile(sweep.offset_ns[mine], [0.1, 99.9]) * 1e-9)
     low_s, high_s = np.median(ends, axis=0)
     return float(low_s), float(high_s)
+
+
+def check_deskewing(sample: Sample, settings: RegisterSettings) -> list[Finding]:
+    """Compare the alignment of sweeps with the point times given, reversed and left out."""
+    spot = sample.fastest
+    if spot is None or spot.sweeps[0].offset_ns is None:
+        return []
+    if spot.speed_m_s < _LEAST_SPEED_M_S:
+        text = (
+            f"the vehicle drives at {spot.speed_m_s:.1f} m/s where it was looked at, "
+            f"{_LEAST_SPEED_M_S:g} are needed"
+        )
+        return [unknown("deskewing", text)]
+    given_m = apart_m(spot)
+    others = {
+        "with the times reversed": apart_m(_changed(spot, -1, settings)),
+        "without times": apart_m(_changed(spot, 0, settings)),
+    }
+    best = min(others, key=lambda name: others[name])
+    values = {"given_m": given_m, "reversed_m": others["with the times reversed"]}
+    values |= {"without_m": others["without times"]}
+    text = (
+        f"sweeps {len(spot.sweeps) - 1} apart lie {given_m * 100:.1f} cm from each other with the "
+        f"point times as given, " + ", ".join(f"{m * 100:.1f} cm {n}" for n, m in others.items())
+    )
+    if others[best] * _CLEARLY < given_m:
+        return [
+            wrong(
+                "deskewing",
+                f"{text}: best {best}",
+                "correct the sign of the point times, or --set register.deskew=false",
+                **values,
+            )
+        ]
+    if given_m * _TOLD < min(others.values()):
+        return [fine("deskewing", text, **values)]
+    return [unknown("deskewing", f"{text}: too slow here to tell", **values)]
+
+
+def _changed(spot: Spot, sign: int, settings: RegisterSettings) -> Spot:
+    def with_times(sweep: Sweep) -> Sweep:
+        offset_ns = None if sign == 0 or sweep.offset_ns is None else sign * sweep.offset_ns
+        return replace(sweep, offset_ns=offset_ns)
+
+    return spot_of(tuple(with_times(sweep) for sweep in spot.sweeps), settings)
+
+
+def apart_m(spot: Spot) -> float:
+    """Return the median distance (m) of near points above the ground in the last sweep from the
+    first sweep; 1 m where they cannot be registered."""
+    if spot.trajectory is None:
+        return _CLOSE_M
+    first, last = (_above_ground(spot.stretch.sweeps[row].sweep.points) for row in (0, -1))
+    if min(len(first), len(last)) < _LEAST_POINTS:
+        return _CLOSE_M
+    T_first_last = poses.inverse(spot.stretch.sweeps[0].T_world_lidar) @ (
+        spot.stretch.sweeps[-1].T_world_lidar
+    )
+    moved = poses.transform(T_first_last, last)
+    distance_m, _ = cKDTree(first).query(moved[::4], distance_upper_bound=_CLOSE_M, workers=-1)
+    return float(np.median(np.minimum(distance_m, _CLOSE_M)))
+
+
+def _above_ground(points: Float) -> Float:
+    points = points[np.linalg.norm(points, axis=1) < _NEAR_M]
+    if not len(points):
+        return points
+    return points[points[:, 2] > np.percentile(points[:, 2], 10) + _LEAST_HEIGHT_M]

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from densify.config.errors import InputError
-from densify.doctor.findings import Finding, Verdict, fine, suspicious, unknown, wrong
+from densify.doctor.findings import Finding, fine, suspicious, unknown, wrong
 from densify.doctor.sample import Sample, Spot
 from densify.geometry import poses
 from densify.geometry.types import Float
@@ -21,10 +21,6 @@ _CLOCK_S, _CLOCK_STEP_S, _CLOCK_OFF_S = 0.3, 0.02, 0.04
 _NOISE_M, _NOISE_RAD, _EVEN_COST = 0.05, 1.5e-3, 4.0
 _MUCH_BETTER, _EXACT = 0.4, 0.15  # of what is allowed
 _CAM_AXES = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
-
-
-def _inverted(T: Float) -> Float:
-    return poses.inverse(T)
 
 
 def with_rotation(change: Callable[[Float], Float]) -> Callable[[Float], Float]:
@@ -63,7 +59,7 @@ def _angle_scaled(factor: float) -> Callable[[Float], Float]:
 
 
 HYPOTHESES: Mapping[str, Callable[[Float], Float]] = {
-    "they are inverted (T_lidar_world instead of T_world_lidar)": _inverted,
+    "they are inverted (T_lidar_world instead of T_world_lidar)": poses.inverse,
     "they are a camera's, not the lidar's": lambda T: poses.inverse(_CAM_AXES) @ T @ _CAM_AXES,
     "they are in millimetres": scaled(1e-3),
     "they are in kilometres": scaled(1e3),
@@ -109,10 +105,10 @@ def check_poses(sample: Sample) -> list[Finding]:
             )
         ]
     if cost <= 1:
-        slow = way_m < _LEAST_WAY_M
-        verdict = Verdict.UNKNOWN if slow else Verdict.FINE
-        text += "; the vehicle hardly moves" if slow else ""
-        return [Finding("poses", verdict, text, values=values), *_check_clock(sample, found)]
+        clock = _check_clock(sample, found)
+        if way_m < _LEAST_WAY_M:
+            return [unknown("poses", f"{text}; the vehicle hardly moves", **values), *clock]
+        return [fine("poses", text, **values), *clock]
     return [
         suspicious(
             "poses",

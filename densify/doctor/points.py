@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from densify.config import RegisterSettings
-from densify.doctor.findings import Finding, Verdict, fine, suspicious, unknown, wrong
+from densify.doctor.findings import Finding, fine, suspicious, unknown, wrong
 from densify.doctor.sample import Sample, Spot
 from densify.free_space.sensor import Sensors
 from densify.geometry.types import Float
@@ -21,12 +21,9 @@ _LEAST_OWN = 20
 _LEAST_WITHOUT = 0.005  # of the rows
 _NEAR_M = 25.0
 _UP = {
-    "z": (0, 0, 1),
-    "-z": (0, 0, -1),
-    "y": (0, 1, 0),
-    "-y": (0, -1, 0),
-    "x": (1, 0, 0),
-    "-x": (-1, 0, 0),
+    sign + axis: (-1.0 if sign else 1.0) * np.eye(3)["xyz".index(axis)]
+    for axis in "zyx"
+    for sign in ("", "-")
 }
 _UP_MEANS = {
     "-z": "x forward, y right, z down",
@@ -59,14 +56,14 @@ def check_units(sample: Sample) -> list[Finding]:
         ]
     fits = [u for u, f in _UNITS.items() if _MEDIAN_RANGE_M[0] <= range_m * f <= _MEDIAN_RANGE_M[1]]
     guess = f", as if they were in {fits[0]}" if fits else ""
+    verdict = wrong if fits else suspicious
     return [
-        Finding(
+        verdict(
             "unit of points",
-            Verdict.WRONG if fits else Verdict.SUSPICIOUS,
             f"half of the returns are farther than {range_m:.4g} m, expected "
             f"{_MEDIAN_RANGE_M[0]} to {_MEDIAN_RANGE_M[1]:.0f} m{guess}",
             "scale the points to metres (sweeps: scale_m in densify.yaml)",
-            values,
+            **values,
         )
     ]
 
@@ -78,7 +75,7 @@ def _median_range_m(points: Float) -> float:
 def check_axes(sample: Sample) -> list[Finding]:
     """Which axis points up: the one along which a layer holds most returns and hardly any lie
     below."""
-    level = {name: _ground_share(sample, np.array(up, float)) for name, up in _UP.items()}
+    level = {name: _ground_share(sample, up) for name, up in _UP.items()}
     best = max(level, key=lambda name: level[name])
     values = {f"share_{name}": share for name, share in level.items()}
     text = (
@@ -213,18 +210,12 @@ def check_sensors(sample: Sample, settings: RegisterSettings) -> list[Finding]:
         )
         if max(without) > _LEAST_WITHOUT:
             text += f", {100 * max(without):.0f} % of the rows without a return"
-        short = min(counts) < 0.5 * max(counts)
-        findings.append(
-            Finding(
-                f"scanner {number}",
-                Verdict.SUSPICIOUS if short else Verdict.FINE,
-                text + "; some sweeps are broken off" * short,
-                "leave the sweeps with few returns out" * short,
-                {
-                    "returns_least": min(counts),
-                    "returns_most": max(counts),
-                    "without_return": max(without),
-                },
-            )
-        )
+        values: dict[str, float] = {"returns_least": min(counts), "returns_most": max(counts)}
+        values["without_return"] = max(without)
+        if min(counts) < 0.5 * max(counts):
+            text += "; some sweeps are broken off"
+            remedy = "leave the sweeps with few returns out"
+            findings.append(suspicious(f"scanner {number}", text, remedy, **values))
+        else:
+            findings.append(fine(f"scanner {number}", text, **values))
     return findings

@@ -15,7 +15,6 @@ from densify.cli.options import (
     add_overwrite,
     add_recording,
     add_verb,
-    check_new_file,
     config_of,
     recording_of,
 )
@@ -60,13 +59,6 @@ def add_doctor(commands: Any) -> None:
         action="store_true",
         help="instead: draft the densify.yaml of a folder of sweeps from what is found in it",
     )
-    parser.add_argument(
-        "--picture",
-        type=Path,
-        metavar="FILE.png",
-        help="draw neighbouring sweeps upon each other, depth over the image, and depth "
-        "discontinuities over image edges",
-    )
     add_config_options(parser)
     add_overwrite(parser)
 
@@ -81,17 +73,9 @@ def answer_doctor(options: argparse.Namespace) -> Iterator[Answer]:
     if options.write_config:
         yield _write_folder_config(Path(spec), options.overwrite)
         return
-    if options.picture is not None:
-        check_new_file(options.picture, options.overwrite, ".png", "--picture")
     sequence = open_sequence(spec)
-    diagnosis = examine(sequence, config, Path())
+    diagnosis = examine(sequence, config)
     yield Answer(f"{describe(sequence)}\n\n{_describe(diagnosis)}", _facts(diagnosis))
-    if options.picture is not None:
-        from densify.doctor.picture import draw
-        from densify.outputs.png import write_picture
-
-        write_picture(options.picture, draw(diagnosis.sample))
-        yield Answer(files=[options.picture])
     wrong = [f.check for f in diagnosis.findings if f.verdict == Verdict.WRONG]
     if wrong:
         raise InputError(f"{spec}: wrong: {', '.join(wrong)}; the remedies are above")
