@@ -10,14 +10,12 @@ from densify.config.errors import InputError
 from densify.geometry.poses import inverse, transform
 from densify.readers.street import Street
 from densify.street.actors import TRAILER_WHEELBASE_M
-from densify.street.footprints import Rectangles, overlap
 from densify.street.lidar import Mounted, scan
 from densify.street.materials import GLASS_PASSES, LASER_PASSES, Material
 from densify.street.mesh import Mesh, box
-from densify.street.motion import Driving, Poses, Still, Towed
-from densify.street.scenes import build_scene
+from densify.street.motion import Driving, Poses, Rectangles, Still, Towed, overlap
 from densify.street.sensors import SENSORS, firings
-from densify.street.simulator import Simulator, seconds
+from densify.street.simulator import Simulator, build_scene, seconds
 from densify.street.terrain import Curve, Lane, Road, Speed, Terrain, polyline
 from densify.street.traffic import EGO_BOX, SPAN_S, Scene
 from densify.street.world import Body, Rays, World

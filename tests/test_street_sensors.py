@@ -11,10 +11,9 @@ from densify.geometry.poses import inverse, transform
 from densify.readers.describe import describe
 from densify.readers.kitti.raw import KittiRaw
 from densify.readers.street import Street
-from densify.street.footprints import Rectangles
 from densify.street.materials import Material
 from densify.street.mesh import box
-from densify.street.motion import Driving, Still
+from densify.street.motion import Driving, Rectangles, Still
 from densify.street.sensors import SENSORS, Raster, Rosette, Slots, Spinning, firings
 from densify.street.simulator import Simulator
 from densify.street.terrain import Curve, Ground, Speed, Terrain

@@ -30,9 +30,8 @@ from densify.geometry.types import Bool, Camera, Float, Float32, Sweep, SweepTru
 from densify.readers.decoded_files import read_arrays
 from densify.street.cameras import CAMERAS, USUAL, Picture, cameras_beside
 from densify.street.lidar import Returns
-from densify.street.scenes import PRESETS
 from densify.street.sensors import SENSORS
-from densify.street.simulator import VERSION, Bodies, Simulator
+from densify.street.simulator import PRESETS, VERSION, Bodies, Simulator
 
 _log = logging.getLogger("densify")
 _progress = logging.getLogger("densify.progress")

@@ -6,6 +6,7 @@ from __future__ import annotations
 import numpy as np
 
 from densify.street.actors import TRACTOR_WHEELBASE_M, Actor, truck
+from densify.street.mesh import Mesh
 from densify.street.motion import Driving
 from densify.street.scenery import (
     Scenery,
@@ -14,9 +15,8 @@ from densify.street.scenery import (
     line_with_plots,
     mark_lanes,
     park_cars,
-    zebra,
 )
-from densify.street.terrain import Curve, Ground, Lane, Road, Speed, Terrain, polyline
+from densify.street.terrain import Curve, Ground, Lane, Road, Speed, Terrain, polyline, strip
 from densify.street.traffic import (
     FIRST_PARKED,
     MEETING_S,
@@ -97,3 +97,10 @@ def _people_crossing(
     for forward, station in ((True, 186.0), (False, 216.0), (True, 221.0)):
         ways.walker(across, (-8.7, -7.3), forward, station)
     ways.walker(main, (-8.2, -7.0), True, here + 4.0)
+
+
+def zebra(ground: Ground, road: Road, station_m: float) -> Mesh:
+    """A crossing for walkers, 3 m deep, over the whole road."""
+    offsets = np.arange(-road.right_m + 0.5, road.left_m - 0.3, 1.0)
+    span = [(station_m - 1.5, station_m + 1.5)]
+    return Mesh.join([strip(ground, road.curve, float(o), 0.5, span) for o in offsets])

@@ -3,18 +3,20 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 
 from densify.geometry.types import Float
+from densify.street.materials import Material
+from densify.street.mesh import Mesh, box, frustum
 from densify.street.motion import Driving
 from densify.street.scenery import (
     Scenery,
     Side,
-    guard_rail,
     hedge,
     lamp_post,
     mark_lanes,
-    noise_barrier,
     sign_post,
     tree,
 )
@@ -67,6 +69,26 @@ def highway(rng: np.random.Generator) -> Scene:
             gap = 62.0 * jitter(rng, 0.2)
             ways.car(back[lane], here + first + k * gap, Speed((0.0, speed)), 6.0)
     return assemble(scenery, parts, ego, traffic)
+
+
+@cache
+def guard_rail(length_m: float) -> Mesh:
+    half = length_m / 2 + 0.02
+    post = box((-0.05, -0.05, -0.3), (0.05, 0.05, 0.72), Material.METAL)
+    beams = [frustum((-half, -0.08, z), (half, 0.0, z + 0.13), Material.METAL, (1.15, 1.15, 1.15),
+                     (1.0, 0.6)) for z in (0.45, 0.60)]  # fmt: skip
+    return Mesh.join([post, *beams])
+
+
+@cache
+def noise_barrier(length_m: float) -> Mesh:
+    half = length_m / 2
+    return Mesh.join(
+        [
+            box((-half, -0.08, -0.8), (half, 0.08, 3.2), Material.CONCRETE, (0.9, 0.95, 0.85)),
+            box((-half - 0.1, -0.16, -0.8), (-half + 0.1, 0.16, 3.4), Material.METAL),
+        ]
+    )
 
 
 def _dress_highway(scenery: Scenery, road: Road) -> None:

@@ -11,10 +11,9 @@ import numpy as np
 
 from densify.geometry.types import Float
 from densify.street.actors import CAR_WHEELBASE_M, any_paint, car_mesh
-from densify.street.footprints import Rectangles, overlap
 from densify.street.materials import Material
-from densify.street.mesh import Mesh, box, boxes, frustum, leaves, tube
-from densify.street.motion import on_ground
+from densify.street.mesh import Mesh, box, boxes, leaves, tube
+from densify.street.motion import Rectangles, on_ground, overlap
 from densify.street.terrain import Ground, Road, strip
 
 _PANEL_M = 2.0
@@ -201,26 +200,6 @@ def picket_fence(height_m: float, tint: tuple[float, float, float]) -> Callable[
 
 
 @cache
-def guard_rail(length_m: float) -> Mesh:
-    half = length_m / 2 + 0.02
-    post = box((-0.05, -0.05, -0.3), (0.05, 0.05, 0.72), Material.METAL)
-    beams = [frustum((-half, -0.08, z), (half, 0.0, z + 0.13), Material.METAL, (1.15, 1.15, 1.15),
-                     (1.0, 0.6)) for z in (0.45, 0.60)]  # fmt: skip
-    return Mesh.join([post, *beams])
-
-
-@cache
-def noise_barrier(length_m: float) -> Mesh:
-    half = length_m / 2
-    return Mesh.join(
-        [
-            box((-half, -0.08, -0.8), (half, 0.08, 3.2), Material.CONCRETE, (0.9, 0.95, 0.85)),
-            box((-half - 0.1, -0.16, -0.8), (-half + 0.1, 0.16, 3.4), Material.METAL),
-        ]
-    )
-
-
-@cache
 def lamp_post() -> Mesh:
     """The arm reaches out along -y."""
     return Mesh.join(
@@ -373,10 +352,3 @@ def mark_lanes(
     parts = [strip(ground, road.curve, offset, 0.12, dashes) for offset in dashed]
     parts += [strip(ground, road.curve, offset, 0.12, spans) for offset in solid]
     return Mesh.join(parts)
-
-
-def zebra(ground: Ground, road: Road, station_m: float) -> Mesh:
-    """A crossing for walkers, 3 m deep, over the whole road."""
-    offsets = np.arange(-road.right_m + 0.5, road.left_m - 0.3, 1.0)
-    span = [(station_m - 1.5, station_m + 1.5)]
-    return Mesh.join([strip(ground, road.curve, float(o), 0.5, span) for o in offsets])

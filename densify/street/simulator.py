@@ -8,7 +8,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
+from importlib import import_module
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,10 +19,33 @@ from densify.geometry.poses import transform
 from densify.geometry.types import Bool, Float, SweepTruth
 from densify.street.cameras import CAMERAS, SHUTTERS, Picture, T_world_lidar, expose
 from densify.street.lidar import Mounted, Returns, T_ego_lidar, at_offsets, scan
-from densify.street.scenes import build_scene
 from densify.street.sensors import Sensor
 from densify.street.traffic import DURATION_S, Scene
 from densify.street.world import Body
+
+PRESETS = {
+    "street": ("densify.street.town", "street"),
+    "static": ("densify.street.town", "static_street"),
+    "crossing": ("densify.street.crossing", "crossing"),
+    "highway": ("densify.street.highway", "highway"),
+}
+"""Module and function that builds the scene from a random generator."""
+
+
+@lru_cache(maxsize=2)
+def build_scene(preset: str, seed: int) -> Scene:
+    """Return the scene of a preset and seed, always the same one.
+
+    Building takes 1 to 2 s; the last two scenes are shared by all sensors and rates.
+    Raises InputError for an unknown preset.
+    """
+    if preset not in PRESETS:
+        raise InputError(
+            f"street preset {preset!r}: no such preset; there are {', '.join(PRESETS)}"
+        )
+    module, function = PRESETS[preset]
+    scene: Scene = getattr(import_module(module), function)(np.random.default_rng([seed, 0]))
+    return scene
 
 
 @dataclass(frozen=True)

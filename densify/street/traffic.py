@@ -26,10 +26,9 @@ from densify.street.actors import (
     truck,
     walker,
 )
-from densify.street.footprints import Rectangles, overlap, tracks
 from densify.street.materials import Material
 from densify.street.mesh import Mesh, box
-from densify.street.motion import Driving, Still
+from densify.street.motion import Driving, Rectangles, Still, overlap
 from densify.street.scenery import Scenery
 from densify.street.terrain import Curve, Ground, Lane, Speed
 from densify.street.world import Body, World
@@ -55,6 +54,19 @@ class Scene:
     ego: Driving
     actors: tuple[Actor, ...]
     footprints: Rectangles
+
+
+def tracks(actor: Actor, times_s: Float) -> list[Rectangles]:
+    """(T,) rectangles of each solid body of an actor; swinging limbs get room."""
+    slack_m = 0.3 if len(actor.bodies) > actor.num_solid else 0.1
+    ways = (
+        b.trajectory.from_above() if isinstance(b.trajectory, Driving) else b.trajectory
+        for b in actor.bodies
+    )
+    return [
+        Rectangles.moving(b.mesh, way, times_s, slack_m)
+        for b, way in zip(actor.bodies[: actor.num_solid], ways, strict=False)
+    ]
 
 
 class Traffic:
