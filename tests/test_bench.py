@@ -14,14 +14,11 @@ import pytest
 
 from densify.bench import readme
 from densify.bench.depth import bench_depth
-from densify.bench.flow import DEFAULT_METHODS, METHODS, bench_flow, open_window
-from densify.bench.scoring import Scorer
+from densify.bench.flow import DEFAULT_METHODS, METHODS, bench_flow
 from densify.cli import main
 from densify.config import resolve
 from densify.config.errors import InputError
-from densify.geometry.types import FlowField
 from densify.readers import open_sequence
-from densify.scores.segmentation import LEAST_POINTS
 from tests.command import exit_code, refused
 from tests.scenes import Arc, Scanner, Scene, TinySequence, World, by_flow, car, street
 from tests.small_street import KEY, one_car
@@ -119,30 +116,7 @@ def test_without_truth_seconds_and_ghosts_are_left():
     found = bench_flow(tiny(with_truth=False), 4, 1, CONFIG, ("ours",))["methods"]["ours"]
     assert set(found["step"]) == {"called_moving"} and found["seconds_per_pair"] > 0
     assert found["window"]["ghost_rate"] is not None and "coverage" not in found["window"]
-    assert found["challenge"] is found["segmentation"] is None
-
-
-def test_objects_are_the_methods_own_or_what_moves_together():
-    """Two cars: told apart by the true labels, and by the space between them; one object if a
-    method calls them so."""
-    sequence = tiny()
-    window = open_window(sequence, 4, 1, CONFIG)
-    scorer = Scorer.of(sequence, window, (3, 5))
-    still = {f: FlowField.zero(len(window.stretch[f].sweep)) for f in (3, 5)}
-    truths = {f: scorer.truths[f].segment for f in (3, 5)}
-    assert {len(np.unique(t[t >= 0])) for t in truths.values()} == {2}
-    loose = {f: replace(still[f], moving=t >= 0) for f, t in truths.items()}
-    told = {f: replace(loose[f], instance=(t + 7).astype(np.int32)) for f, t in truths.items()}
-    as_one = {f: replace(loose[f], instance=np.zeros(len(t), np.int32)) for f, t in truths.items()}
-    seen = [t[window.above[f] & (t >= 0)] for f, t in truths.items()]
-    large = sum(int((np.bincount(t) >= LEAST_POINTS).sum()) for t in seen)
-    assert large > 0
-    for steps in (loose, told):
-        scores = scorer.segmentation_scores(steps)
-        assert scores["moving_iou"] == scores["panoptic_quality"] == 1
-        assert (scores["num_found"], scores["num_missed"], scores["num_false"]) == (large, 0, 0)
-    assert scorer.segmentation_scores(as_one)["panoptic_quality"] < 0.95
-    assert scorer.segmentation_scores(still)["moving_iou"] == 0
+    assert found["challenge"] is None
 
 
 @pytest.mark.parametrize(

@@ -192,31 +192,20 @@ RUN = ["run", "--key", "120", "--out", "{tmp}/out"]
 BAD_COMMANDS: dict[str, tuple[list[str], list[str]]] = {
     "no verb": ([], ["VERB"]),
     "misspelt verb": (["comapre"], ["'comapre'", "did you mean compare?"]),
-    "misspelt bench": (["bench", "dept"], ["'dept'", "did you mean depth?"]),
     "misspelt option": (
         [*RUN, "--windw", "3"],
         ["--windw", "did you mean --window?", "run --help"],
     ),
     "misspelt reader": (["info", "kiti:{tmp}/x"], ["kiti:{tmp}/x", "did you mean kitti?"]),
-    "misspelt method": ([*RUN, "--method", "flo"], ["'flo'", "did you mean flow?"]),
     "abbreviated option": ([*RUN, "--win", "3"], ["--win"]),
     "removed option": ([*RUN, "--at", "sweep"], ["--at", "--set project.at"]),
     "no key": (["run"], ["--key", "densify run --help"]),
     "key is no number": (["run", "--key", "x"], ["--key", "'x'", "whole number"]),
     "a very long number": (["run", "--key", "1" * 5000], ["argument --key: got '1111"]),
-    "a very long name": (["info", "x" * 5000], ["File name too long"]),
     "empty argument": (["run", "--out", ""], ["got an empty argument after '--out'"]),
-    "unknown methods": (
-        ["compare", "--key", "120", STREET, "--methods", "icp,magic", "--out", "{tmp}/o"],
-        ["--methods magic", "none, icp, "],
-    ),
-    "unknown engine": ([*RUN, "--flow", "magic"], ["flow.engine", "'magic'", "npz:DIR"]),
     "missing folder": ([*RUN, "{tmp}/absent"], ["{tmp}/absent", "no such folder"]),
-    "empty folder": ([*RUN, "{tmp}"], ["{tmp}", "velodyne_points"]),
     "key out of range": (["run", STREET, "--key", "4000"], ["4000", "159"]),
-    "keys out of range": (["run", STREET, "--keys", "500:510"], ["--keys 500:510", "0-159"]),
     "unknown camera": ([*RUN, STREET, "--camera", "image_07"], ["image_07", "image_02"]),
-    "unknown preset of the street": ([*RUN, "street:strt"], ["strt", "highway"]),
     "unknown config": ([*RUN, "--config", "fats"], ["fats", "did you mean fast?"]),
     "unknown knob": (
         [*RUN, "--set", "objective.alfa=3"],
@@ -226,20 +215,7 @@ BAD_COMMANDS: dict[str, tuple[list[str], list[str]]] = {
         ["dataset", "--out", "{tmp}/o", "--set", "dataset.max_gost=1"],
         ["dataset.max_gost", "did you mean max_ghost?"],
     ),
-    "no share": (
-        ["dataset", "--out", "{tmp}/o", "--set", "dataset.max_ghost=30"],
-        ["dataset.max_ghost: got 30", "from 0 to 1"],
-    ),
-    "no worker": (
-        ["dataset", "--out", "{tmp}/o", "--keys", "100:102", "--workers", "0"],
-        ["--workers 0"],
-    ),
-    "no scheduler": (
-        ["dataset", "--out", "{tmp}/o", "--keys", "100:102", "--scheduler", "x"],
-        ["scheduler x: "],
-    ),
     "frames reversed": (["simulate", "--out", "{tmp}/o", "--frames", "5:2"], ["A:B", "'5:2'"]),
-    "frames beyond": (["simulate", "--out", "{tmp}/o", "--frames", "5:999"], ["5:999", "0:160"]),
 }
 
 
@@ -258,11 +234,8 @@ def test_bad_command(case: str, tmp_path: Path, capsys: pytest.CaptureFixture[st
 SWEEP, CALIB = "velodyne_points/data/{:010d}.bin", "../calib_{}.txt"
 BAD_DRIVES: dict[str, tuple[str, int | None, list[str]]] = {
     "truncated sweep": (SWEEP.format(BORDER), 1601, [f"{BORDER:010d}.bin", "1601"]),
-    "missing key": (SWEEP.format(BORDER), None, [f"--key {BORDER}", "no such frame"]),
-    "sweep of no points": (SWEEP.format(BORDER), 0, [f"{BORDER:010d}.bin", "no points"]),
     "sweep of few points": (SWEEP.format(BORDER), 50 * 16, [f"sweep {BORDER}", "50 points"]),
     "missing calibration": (CALIB.format("velo_to_cam"), None, ["velo_to_cam.txt: missing"]),
-    "malformed calibration": (CALIB.format("velo_to_cam"), 9, ["velo_to_cam.txt: R"]),
 }
 
 
@@ -360,17 +333,6 @@ def test_what_is_opened_first() -> None:
     files = [Path(f"out/000120/{name}") for name in ("depth_filled/a.png", "cloud.laz", "run.yaml")]
     names = [path.name for path in first_of([*files, Path("film.webp")], FIRST_OF_RUN)]
     assert names == ["film.webp", "a.png", "cloud.laz"]
-
-
-def test_bash_completes(tmp_path: Path, capsys) -> None:
-    assert exit_code("completion", "bash") == 0
-    (tmp_path / "script").write_text(capsys.readouterr().out)
-    code = (
-        f"source {tmp_path}/script; COMP_WORDS=(densify run --ke); COMP_CWORD=2; "
-        "$(complete -p densify | sed 's/.*-F \\([^ ]*\\).*/\\1/'); echo \"${COMPREPLY[@]}\""
-    )
-    done = subprocess.run(["bash", "-c", code], capture_output=True, text=True, check=True)
-    assert set(done.stdout.split()) == {"--key", "--keys"}
 
 
 def test_a_reader_that_stops_reading_is_no_error_and_a_full_disk_is() -> None:

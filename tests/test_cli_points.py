@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from densify.cli.verbs.flow import read_points
-from densify.config.errors import InputError
 from tests.command import exit_code, refused
 
 
@@ -66,68 +65,9 @@ def test_point_files_of_every_kind_agree(tmp_path: Path) -> None:
     np.savetxt(tmp_path / "p.txt", points)
     points.tofile(tmp_path / "p.bin")
     for name in ("p.npy", "p.npz", "p.txt", "p.bin"):
-        read = read_points(tmp_path / name).points
+        read = read_points(tmp_path / name)
         assert read.dtype == np.float64
         assert np.array_equal(read, points[:, :3])
-
-
-def test_times_and_scanners_beside_the_points(tmp_path: Path) -> None:
-    points, time_s, lidar = (
-        np.ones((3, 3)),
-        np.array([1.5, 1.6, 1.75]),
-        np.array([0, 1, 1], np.uint8),
-    )
-    np.savez(tmp_path / "time.npz", points=points, time=time_s, lidar=lidar)
-    np.savez(tmp_path / "offset.npz", points=points, time=time_s, offset_ns=np.arange(3))
-    np.savez(tmp_path / "none.npz", points=points)
-    timed = read_points(tmp_path / "time.npz")
-    assert timed.offset_ns is not None and timed.lidar is not None
-    assert timed.offset_ns.tolist() == [1_500_000_000, 1_600_000_000, 1_750_000_000]
-    assert timed.offset_ns.dtype == np.int64 and timed.lidar.tolist() == [0, 1, 1]
-    offset = read_points(tmp_path / "offset.npz")
-    assert offset.offset_ns is not None and offset.offset_ns.tolist() == [0, 1, 2]
-    assert offset.lidar is None
-    none = read_points(tmp_path / "none.npz")
-    assert none.offset_ns is None and none.lidar is None
-
-
-@pytest.mark.parametrize(
-    ("name", "column"),
-    [
-        ("offset_ns", np.arange(4)),
-        ("offset_ns", np.arange(3.0)),
-        ("time", np.array([0, np.nan, 1])),
-        ("lidar", np.array(["a", "b", "c"])),
-        ("lidar", np.zeros((3, 1), int)),
-    ],
-)
-def test_bad_columns_beside_the_points(name: str, column: np.ndarray, tmp_path: Path) -> None:
-    np.savez(tmp_path / "p.npz", points=np.ones((3, 3)), **{name: column})
-    with pytest.raises(InputError, match=rf"p\.npz: array {name}: .*expected \(3,\)") as caught:
-        read_points(tmp_path / "p.npz")
-    assert "\n" not in str(caught.value)
-
-
-def test_flow_uses_times_where_both_files_have_them(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    rng = np.random.default_rng(0)
-    wall = np.column_stack([rng.uniform(-9, 9, 900), np.full(900, 6.0), rng.uniform(0, 3, 900)])
-    box = rng.uniform(0, 1, (500, 3)) * [1.5, 1.5, 1.5]
-    times = np.concatenate([rng.integers(0, 10**8, 900), np.full(500, 2 * 10**7)])
-    later = np.concatenate([times[:900], np.full(500, 6 * 10**7)])  # the box 40 ms late
-    np.savez(tmp_path / "a.npz", points=np.vstack([wall, box]), offset_ns=times)
-    np.savez(tmp_path / "b.npz", points=np.vstack([wall, box + [1.4, 0, 0]]), offset_ns=later)
-    np.savez(tmp_path / "c.npz", points=np.vstack([wall, box + [1.4, 0, 0]]))
-    for target, step_m in (("b.npz", 1.0), ("c.npz", 1.4)):
-        out = tmp_path / f"flow_{target}"
-        assert exit_code("flow", tmp_path / "a.npz", tmp_path / target, "--out", out) == 0
-        with np.load(out) as arrays:
-            assert arrays["moving"][900:].mean() > 0.8 and not arrays["moving"][:900].any()
-            moved = arrays["residual_flow"][arrays["moving"], 0]
-            assert abs(np.median(moved) - step_m) < 0.05
-            assert ("to_reference" in arrays) == (target == "b.npz")
-    capsys.readouterr()
 
 
 @pytest.mark.parametrize("out", ["flow.txt", "folder.npz", "file/deep/flow.npz"])

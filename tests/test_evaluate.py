@@ -234,22 +234,6 @@ def test_kittis_own_truth(test_data) -> None:
     assert 0.005 < same["edge"]["num_pixels"] / same["all"]["num_pixels"] < 0.05
 
 
-def test_a_scaled_real_map_has_the_errors_of_its_scale(tmp_path: Path, test_data) -> None:
-    path = test_data / "kitti/depth_annotated_sample" / "groundtruth_0000000050.png"
-    truth_m = read_depth_png(path)
-    write_depth_png(tmp_path / "twice.png", 2 * truth_m)
-    everything = evaluate(pair_depth_files(tmp_path / "twice.png", path))["parts"]["all"]
-    known = truth_m[truth_m > 0].astype(float)
-    assert everything["coverage"] == 1  # twice 83 m still fits
-    assert everything["mae_m"] == pytest.approx(known.mean())
-    assert everything["rmse_m"] == pytest.approx(np.sqrt((known**2).mean()))
-    assert everything["imae_per_km"] == pytest.approx((500 / known).mean())
-    assert everything["abs_rel"] == everything["sq_rel"] == pytest.approx(1)
-    assert everything["delta_3"] == 0
-    # Half the disparity is missing: more than 3 px nearer than 721.5377 * 0.54 / 6 = 64.9 m
-    assert everything["outliers"] == pytest.approx((known < 721.5377 * 0.54 / 6).mean())
-
-
 # --- the verb -------------------------------------------------------------------------------------
 
 

@@ -28,14 +28,6 @@ def output_of(script: str, cwd: Path, *arguments: str) -> str:
     return done.stdout
 
 
-def test_kitti_says_what_it_takes(tmp_path: Path) -> None:
-    done = subprocess.run(
-        [sys.executable, str(EXAMPLES / "kitti.py")], capture_output=True, text=True, cwd=tmp_path
-    )
-    assert done.returncode == 1 and "Traceback" not in done.stderr
-    assert "python examples/kitti.py ..." in done.stderr and "[KEY]" in done.stderr
-
-
 def number_before(text: str, words: str) -> float:
     found = re.search(rf"([\d.,]+) ?%? {words}", text)
     assert found, text
@@ -118,9 +110,3 @@ def test_the_tables_of_confidence_are_found_again(monkeypatch) -> None:
         for group, rows in zip(scale.GROUPS, shares, strict=True)
     }
     np.testing.assert_allclose(scale.tables_of({"tables": written}), shares, rtol=2e-3, atol=1e-9)
-
-
-def test_examples_to_begin_with_are_short() -> None:
-    for name in ("street.py", "kitti.py"):
-        text = (EXAMPLES / name).read_text("utf-8")
-        assert len([line for line in text.splitlines() if line.strip()]) <= 25, name

@@ -84,12 +84,6 @@ def plane(rng: np.random.Generator, num: int = 4000, sigma_m: float = 0.0) -> np
     return points @ np.array([[1, 0, 0], [0, c, -s], [0, s, c]]).T + [30.0, -5, 1]
 
 
-@pytest.mark.parametrize("sigma_m", [0.0, 0.01, 0.03])
-def test_plane_residual_is_the_noise_across(sigma_m):
-    points = plane(np.random.default_rng(1), sigma_m=sigma_m)
-    assert metrics.plane_residual_m(points) == pytest.approx(sigma_m, rel=0.05, abs=1e-6)
-
-
 def test_points_drawn_onto_lines_cover_and_extend_less():
     points = plane(np.random.default_rng(4))
     x = points.copy()
@@ -111,8 +105,6 @@ def test_nothing_gives_nan():
         metrics.angle_error_rad(along_x(1), along_x(0)),
         *metrics.three_way_error(NOTHING, NOTHING, none, none),
         metrics.share_found(np.array([True]), np.array([False])),
-        metrics.plane_residual_m(NOTHING),
-        metrics.plane_residual_m(along_x(0, 0.1, 0.2)),
     ]
     assert all(math.isnan(v) for v in values), values
 
@@ -134,7 +126,6 @@ def test_nothing_gives_nan():
         (lambda: metrics.share_found(np.ones(2, bool), np.ones(2)), "moving: got float64"),
         (lambda: metrics.errors_by_hops(along_x(1), along_x(1), np.ones(1)), "hops: got float64"),
         (lambda: metrics.errors_by_hops(along_x(1), along_x(1), np.ones(2, int)), "hops"),
-        (lambda: metrics.plane_residual_m(np.zeros((2, 2))), "points"),
         (lambda: metrics.coverage(along_x(1), np.zeros(3)), "true_points"),
     ],
 )

@@ -11,7 +11,6 @@ from typing import Any
 import cv2
 import nbformat
 import numpy as np
-import pytest
 from nbclient import NotebookClient
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
@@ -42,14 +41,9 @@ def test_street(tmp_path: Path) -> None:
     assert sparse.shape == dense.shape == (375, 1242, 3) and sparse.std() < dense.std()
 
 
-@pytest.mark.parametrize("real", [False, True], ids=["simulated", "KITTI"])
-def test_your_data(real: bool, tmp_path: Path, monkeypatch, request) -> None:
-    if real:
-        monkeypatch.setenv("DENSIFY_DATA", str(request.getfixturevalue("short_drive")))
-        monkeypatch.setenv("DENSIFY_KEY", "120")
-    else:
-        monkeypatch.delenv("DENSIFY_DATA", raising=False)
-        monkeypatch.delenv("DENSIFY_KEY", raising=False)
+def test_your_data(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.delenv("DENSIFY_DATA", raising=False)
+    monkeypatch.delenv("DENSIFY_KEY", raising=False)
     text, (figure,) = run("your_data.ipynb", tmp_path)
     assert figure.shape[0] > 200 and figure.std() > 20
     assert "fine" in text and "open first:" in text

@@ -216,7 +216,6 @@ def test_no_arrow_runs_upward() -> None:
 DOORS: dict[str, str | tuple[str, ...]] = {
     "dask": "densify/dataset/executor.py",
     "distributed": "densify/dataset/executor.py",
-    "shtab": "densify/cli/verbs/__init__.py",
     "foxglove": "densify/outputs/export/mcap.py",
     "open3d": "densify/outputs/export/open3d_window.py",
     "rerun": "densify/outputs/export/rrd.py",

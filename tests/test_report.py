@@ -190,14 +190,6 @@ class TestPage:
         assert np.array_equal(small, whole[:: camera["every"], :: camera["every"]])
         assert data_of(page)["cloud"]["num_points"] < data_of(page)["cloud"]["num_all"]
 
-    def test_the_command_makes_it_again(self, run: Path) -> None:
-        data = data_of((run / "report.html").read_bytes())
-        assert data["command"] == (
-            "densify run --data 'tiny street' --key 3 --window 2 --method flow "
-            "--set register.source=dataset --set flow.look_around_s=0.0 "
-            "--set accumulate.far_m=0.0 --set output.rejected=true --set output.report=true"
-        )
-
     def test_a_comparison_has_all_methods(self, tmp_path: Path) -> None:
         folder = write_compared(tmp_path)
         (page,) = write_report(tmp_path)
@@ -206,9 +198,6 @@ class TestPage:
         assert list(data["methods"]) == ["none", "icp", "flow"] and data["method"] == "flow"
         assert list(data["cameras"]["front"]["others"]) == ["none", "icp"]
         assert data["cloud"]["displaced"] and data["about"]["stages"]
-        knobs = "register.source=dataset", "flow.look_around_s=0.0", "accumulate.far_m=0.0"
-        said = "".join(f" --set {knob}" for knob in knobs)
-        assert data["command"].endswith(f"--methods none,icp,flow{said}")
 
 
 class TestNothingRuns:
@@ -235,7 +224,7 @@ class TestNothingRuns:
             content = re.search(part, text, re.DOTALL)[1]
             digest = base64.b64encode(hashlib.sha256(content.encode()).digest()).decode()
             assert rules[rule] == f"'sha256-{digest}'"
-        assert not re.search(r"https?://(?!www\.w3\.org/2000/svg)", text)
+        assert not re.search("https?://", text)
 
 
 class TestErrors:

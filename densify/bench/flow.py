@@ -50,7 +50,7 @@ def bench_flow(
         are scored. None for the exact truth of the sequence, where it has one.
 
     Returns ``methods`` by name, each with ``seconds_per_pair`` and the scores of
-    `densify.bench.scoring`: ``step``, ``challenge``, ``segmentation``, ``window``.
+    `densify.bench.scoring`: ``step``, ``challenge``, ``window``.
     Raises InputError for unknown methods, a window without neighbours, or missing frames.
     """
     unknown = [method for method in methods if method not in METHODS]
@@ -75,7 +75,6 @@ def bench_flow(
             "seconds_per_pair": seconds / len(others),
             "step": scorer.step_scores(steps),
             "challenge": scorer.challenge_scores(steps),
-            "segmentation": scorer.segmentation_scores(steps),
             "window": scorer.window_scores(to_key),
         }
     facts = {"data": sequence.name, "key": key, "frames": list(opened.frames)}

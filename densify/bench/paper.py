@@ -3,7 +3,7 @@
 without Learning" (3DV 2020), measured again.
 
 Methods see 2,048 points drawn of each cloud within 35 m, as in the paper; this package and trained
-networks see all points, registered where poses are known, and are scored at the drawn ones. Scores
+networks see all points, and are scored at the drawn ones. Scores
 are the paper's: mean end-point error; share of points within 5 cm or 5 %, within 10 cm or 10 %;
 mean angle to the true flow where that is not 0. Means over pairs.
 """
@@ -29,13 +29,9 @@ from densify.learning.model_file import read_model
 from densify.scores import flow_metrics as metrics
 
 NUM_POINTS = 2048
-NEIGHBORS = (5, 10, 20, 50, 100)
-POINTS = (512, 1024, 2048, 4096, 8192)
 PUBLISHED: Mapping[str, Mapping[str, float]] = {
     "flyingthings": {"epe_m": 0.259, "within_5": 0.163, "within_10": 0.416, "angle_rad": 0.369},
     "kitti": {"epe_m": 0.093, "within_5": 0.648, "within_10": 0.821, "angle_rad": 0.137},
-    "argoverse": {"epe_m": 0.257, "within_5": 0.253, "within_10": 0.475, "angle_rad": 0.467},
-    "nuscenes": {"epe_m": 0.288, "within_5": 0.202, "within_10": 0.436, "angle_rad": 0.337},
 }
 """The paper's row without learning, by set."""
 
@@ -84,16 +80,11 @@ def _objective(solver: str, **settings: Any) -> Flow:
 
 
 def _ours(source: Float, target: Float, pair: PaperPair) -> Float:
-    own = pair.of_vehicle()
-    return own + estimate_flow(pair.source + own, pair.target, Config()).displacement
+    return estimate_flow(pair.source, pair.target, Config()).displacement
 
 
 METHODS = {
-    "rest": Row(
-        "nothing moves but the vehicle, where poses are known",
-        lambda s, t, pair: pair.of_vehicle(),
-        whole=True,
-    ),
+    "rest": Row("nothing moves", lambda s, t, pair: np.zeros_like(s)),
     "icp": Row("rigid ICP of the whole cloud", lambda s, t, pair: rigid_icp(s, t)),
     "paper-adam": Row("the objective as published: Adam, 1,500 steps", _objective("adam")),
     "paper": Row("the objective, this package's solver", _objective("pcg")),
@@ -108,43 +99,28 @@ def bench_paper(
     methods: Sequence[str] = DEFAULT_METHODS,
     models: Sequence[Path] = (),
     num_points: int = NUM_POINTS,
-    curves: bool = False,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
     """Measure methods and trained models on pairs; plain numbers ready for JSON.
 
-    Returns ``num_pairs``, ``methods`` (rows by name), and with ``curves`` the errors of ``paper``
-    over the graph's neighbours and over the number of points.
+    Returns ``num_pairs``, ``num_points`` and ``methods``, rows by name.
     Raises InputError for an unknown method, no pairs, or a file that is no model.
     """
     if num_points < 1:
         raise InputError(f"--points {num_points}: expected 1 or more")
-    tables = {"methods": {name: (row, num_points) for name, row in _rows(methods, models).items()}}
-    if curves:
-        by_neighbors = {k: Row("", _objective("pcg", num_neighbors=k)) for k in NEIGHBORS}
-        tables["neighbors"] = {str(k): (row, num_points) for k, row in by_neighbors.items()}
-        tables["points"] = {str(n): (METHODS["paper"], n) for n in POINTS}
-    found: dict[str, dict[str, list[dict[str, float]]]] = {
-        kind: {name: [] for name in rows} for kind, rows in tables.items()
-    }
+    rows = _rows(methods, models)
+    found: dict[str, list[dict[str, float]]] = {name: [] for name in rows}
     num_pairs = 0
     for pair in pairs:
         if progress is not None:
             progress(pair.name, num_pairs, num_pairs + 1)
         num_pairs += 1
-        for kind, rows in tables.items():
-            for name, (row, num) in rows.items():
-                found[kind][name].append(_measured(row, pair, num))
+        for name, row in rows.items():
+            found[name].append(_measured(row, pair, num_points))
     if not num_pairs:
         raise InputError("densify bench paper: no pairs of sweeps; choose another recording")
-    means = {
-        kind: {
-            name: {"about": tables[kind][name][0].about, **_mean(measured)}
-            for name, measured in rows.items()
-        }
-        for kind, rows in found.items()
-    }
-    return {"num_pairs": num_pairs, "num_points": num_points, **means}
+    means = {name: {"about": rows[name].about, **_mean(found[name])} for name in rows}
+    return {"num_pairs": num_pairs, "num_points": num_points, "methods": means}
 
 
 def _rows(methods: Sequence[str], models: Sequence[Path]) -> dict[str, Row]:
@@ -158,7 +134,7 @@ def _rows(methods: Sequence[str], models: Sequence[Path]) -> dict[str, Row]:
 def _learned(path: Path) -> Row:
     model = read_model(path)
     about = f"network, teacher {model.made.get('teacher')}, {model.made.get('steps')} steps"
-    return Row(about, lambda s, t, pair: pair.of_vehicle() + model.flow(pair.sweeps), whole=True)
+    return Row(about, lambda s, t, pair: model.flow(pair.sweeps), whole=True)
 
 
 def _measured(row: Row, pair: PaperPair, num_points: int) -> dict[str, float]:

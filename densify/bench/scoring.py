@@ -14,18 +14,14 @@ import numpy as np
 from densify.depth.accumulate import accumulate
 from densify.free_space.range_image import RangeImage
 from densify.geometry import poses
-from densify.geometry.linking import link
-from densify.geometry.types import Bool, Float, FlowField, Int, LidarSequence, Stretch, Truth
+from densify.geometry.types import Bool, Float, FlowField, LidarSequence, Stretch, Truth
 from densify.readers.true_flow import LabelledFlow, labelled_flow
 from densify.scores import flow_metrics as metrics
 from densify.scores.challenge import CLASSES, ChallengeScorer
 from densify.scores.cloud_scores import ghost_rate
-from densify.scores.segmentation import SegmentationScorer
 
 _MIN_RETURNS = 30
 _LEAST_MOTION_M = 0.5
-_LINK_M = 0.6
-"""Moving points so near each other are one object, where a method says nothing of objects."""
 
 
 @dataclass(frozen=True)
@@ -70,7 +66,6 @@ class SweepTruth:
     at_key: (N,3) key frame, positions at the key's time.
     moving, foreground: (N,) moves now; belongs to an object.
     certain: (N,) moves, at least 0.5 m over the window, on an object of 30 returns.
-    segment: (N,) the moving object that the point belongs to, -1 none.
     """
 
     step: Float
@@ -79,7 +74,6 @@ class SweepTruth:
     moving: Bool
     foreground: Bool
     certain: Bool
-    segment: Int
 
     @staticmethod
     def of(truth: Truth, window: Window, frame: int) -> SweepTruth:
@@ -101,7 +95,6 @@ class SweepTruth:
             moving=moving,
             foreground=instance >= 0,
             certain=moving & many & far,
-            segment=np.where(moving, instance, -1).astype(np.int64),
         )
 
 
@@ -189,19 +182,6 @@ class Scorer:
             ),
         }
 
-    def segmentation_scores(self, steps: Mapping[int, FlowField]) -> dict[str, Any] | None:
-        """Score moving points above the ground and moving objects, all pairs together, see
-        `densify.scores.segmentation`; None without exact truth. Moving points that a method puts
-        in no object are one where they lie within 0.6 m of each other."""
-        if self.truths is None:
-            return None
-        scorer = SegmentationScorer()
-        for frame in self.sources:
-            above = self.window.above[frame]
-            found = _segments(steps[frame], points_in_world(self.window.stretch, frame))
-            scorer.add(found[above], self.truths[frame].segment[above])
-        return scorer.scores()
-
     def window_scores(self, to_key: Mapping[int, FlowField]) -> dict[str, Any]:
         """Score the flow to the key. Accumulated moving points, the key's own left out, are the
         true ones above the ground, without truth those called moving."""
@@ -218,7 +198,6 @@ class Scorer:
             "ghost_rate": ghost_rate(cloud, RangeImage.of(stretch[key]), key),
             "num_movers": num_movers,
             "lost": 1 - len(points) / num_movers if num_movers else None,
-            "plane_residual_m": _plain(metrics.plane_residual_m(points)),
         }
         if self.truths is None:
             return scores
@@ -258,15 +237,6 @@ class Scorer:
         stretch = self.window.stretch
         T_key_lidar = stretch.T_target_source(self.window.key, frame)
         return poses.transform(T_key_lidar, stretch[frame].sweep.points + flow)
-
-
-def _segments(field: FlowField, points: Float) -> Int:
-    """Return the (N,) object of each moving point, -1 for static points."""
-    found = np.where(field.moving, field.instance, -1).astype(np.int64)
-    loose = np.flatnonzero(field.moving & (found < 0))
-    _, group = link(points[loose], _LINK_M)
-    found[loose] = found.max(initial=-1) + 1 + group
-    return found
 
 
 def _plain(value: float) -> float | None:

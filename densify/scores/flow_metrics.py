@@ -19,9 +19,6 @@ from densify.geometry.types import Bool, Float, Int
 STRICT, RELAXED = 0.05, 0.1
 """Metres, and parts of the true flow: the two limits of `accuracy`."""
 
-_MIN_IN_PATCH = 8
-_MAX_PATCHES = 3000
-
 
 class ThreeWayError(NamedTuple):
     """Metres. mean_m: of the three, NaN where one is."""
@@ -106,29 +103,6 @@ def errors_by_hops(estimated: ArrayLike, true: ArrayLike, hops: ArrayLike) -> di
             f"{error_m.shape}, one for each point"
         )
     return {int(n): _mean(error_m[steps == n]) for n in np.unique(steps)}
-
-
-def plane_residual_m(points: ArrayLike, radius_m: float = 0.3) -> float:
-    """Return the thickness of accumulated surfaces, metres: the mean over points of the standard
-    deviation, across the best plane, of all points within ``radius_m``.
-
-    points: (M,3) of moving objects brought to one time. Edges and curvature add to it, the same for
-    every flow of the same objects. Points drawn onto a few lines look thin: read it together with
-    `coverage`. Patches of fewer than 8 points are left out; at most 3,000 are looked at. (The
-    smallest eigenvalue of the local covariance; Hoppe et al., "Surface reconstruction from
-    unorganized points", SIGGRAPH 1992.)
-    """
-    cloud = _points(points, "points")
-    if not len(cloud):
-        return float("nan")
-    centres = cloud[:: -(-len(cloud) // _MAX_PATCHES)]
-    patches = np.asarray(cKDTree(cloud).query_ball_point(centres, radius_m), dtype=object)
-    spreads = [
-        np.linalg.eigvalsh(np.cov(cloud[rows].T, bias=True))[0]
-        for rows in patches
-        if len(rows) >= _MIN_IN_PATCH
-    ]
-    return _mean(np.sqrt(np.maximum(spreads, 0.0)))
 
 
 def coverage(points: ArrayLike, true_points: ArrayLike, reach_m: float = 0.1) -> float:

@@ -10,13 +10,10 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Iterator, Sequence
-from pathlib import Path
+from collections.abc import Sequence
 from typing import Any, NoReturn
 
 from densify import __version__
-from densify.cli.answer import Answer
-from densify.cli.options import add_verb
 from densify.cli.verbs import (
     bench,
     dataset,
@@ -80,11 +77,9 @@ def _command_line() -> argparse.ArgumentParser:
         report.add,
         view.add,
         evaluate.add,
-        _add_completion,
         bench.add,
     ):
         add(commands)
-    parser.set_defaults(command_line=parser)
     return parser
 
 
@@ -120,26 +115,3 @@ class _Parser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         self.exit(2, f"densify: {brief(message)}; see {self.prog} --help\n")
-
-
-def _add_completion(commands: Any) -> None:
-    about = "the shell's completion of verbs, options and files"
-    where = 'bash: add  eval "$(densify completion bash)"  to ~/.bashrc'
-    parser = add_verb(commands, "completion", _answer_completion, about, where)
-    parser.add_argument("shell", choices=("bash", "zsh", "tcsh"), help="whose completion")
-
-
-def _answer_completion(options: argparse.Namespace) -> Iterator[Answer]:
-    import shtab
-
-    def complete_paths(parser: argparse.ArgumentParser) -> None:
-        for action in parser._actions:
-            if isinstance(action, argparse._SubParsersAction):
-                for verb in action.choices.values():
-                    complete_paths(verb)
-            elif action.type is Path or action.dest in ("recording", "data"):
-                action.complete = shtab.FILE  # type: ignore[attr-defined]
-
-    complete_paths(options.command_line)
-    script = shtab.complete(options.command_line, shell=options.shell)
-    yield Answer(script, {"script": script})

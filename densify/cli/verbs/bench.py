@@ -53,7 +53,7 @@ def add(commands: Any) -> None:
         _answer_readme,
         "the tables of docs/results.md made again, as Markdown on stdout; all of them take an hour",
     )
-    names = "methods, depth, parts, flow, rings, rates, registration"
+    names = "depth, flow, registration"
     parser.add_argument("tables", nargs="*", metavar="TABLE", help=f"of {names} (default: all)")
     for name, what in (("kitti", "drive 2011_09_26_drive_0013_sync"), ("pandaset", "sequence 002")):
         parser.add_argument(f"--{name}", metavar="DIR", type=Path, help=f"{what}, for its rows")
@@ -114,22 +114,14 @@ def _add_paper(benches: Any) -> None:
         "paper",
         _answer_paper,
         "the tables of Pontes, Hays, Lucey (3DV 2020), with the published figures beside",
-        "Of recordings (--data, default: four streets) the frame and the next sweep; without exact "
-        "truth the flow is that of this package's engine. Methods: rest, icp, pointpwc (its loss "
-        "without learning), paper-adam (as published), paper (this package's solver), no-laplacian "
-        "(Table 2), ours. pointpwc and paper-adam take minutes a pair. On streets the motion of "
-        "the vehicle is removed, in the published sets it is not; ours and networks know it where "
-        "the recording has poses.",
+        "Of recordings (--data, default: four streets) the frame and the next sweep, without the "
+        "motion of the vehicle; without exact truth the flow is that of this package's engine. "
+        "Methods: rest, icp, paper-adam (as published: minutes a pair), paper (this package's "
+        "solver), no-laplacian (Table 2), ours.",
     )
-    made = "as FlowNet3D's authors made them"
-    for name, what in (
-        ("flyingthings", f".npz files of FlyingThings3D {made}"),
-        ("kitti", f"KITTI's scene flow 2015 with its calibration, or .npz files {made}"),
-    ):
-        parser.add_argument(f"--{name}", metavar="DIR", type=Path, help=what)
-    for name, where in (("argoverse", "DIR[#LOG]"), ("nuscenes", "DIR[#SCENE]")):
-        boxes = "a recording with tracked boxes"
-        parser.add_argument(f"--{name}", metavar=where, action="append", help=boxes)
+    for name, what in (("flyingthings", "FlyingThings3D"), ("kitti", "KITTI's scene flow 2015")):
+        about = f".npz files of {what} as FlowNet3D's authors made them"
+        parser.add_argument(f"--{name}", metavar="DIR", type=Path, help=about)
     parser.add_argument("--data", action="append", metavar="SPEC@K,…", help="recordings and frames")
     parser.add_argument("--methods", type=words, metavar="NAME,…", help="(default: the fast ones)")
     model = "a network of densify train flow; may be given several times"
@@ -139,8 +131,6 @@ def _add_paper(benches: Any) -> None:
     for name, default, what in (("points", 2048, "drawn"), ("pairs", 0, "of a set, 0: all")):
         about = f"{what} (default: {default})"
         parser.add_argument(f"--{name}", type=natural, default=default, metavar="N", help=about)
-    curves = "also over neighbours and over the number of points"
-    parser.add_argument("--curves", action="store_true", help=curves)
     _add_file(parser)
 
 
@@ -226,14 +216,11 @@ def _answer_paper(options: argparse.Namespace) -> Iterator[Answer]:
     for name, pairs in _paper_sets(options).items():
         with progress_on_stderr() as progress:
             measured[name] = bench.bench_paper(
-                pairs, methods, options.models, options.points, options.curves, progress
+                pairs, methods, options.models, options.points, progress
             )
         published = {"as published": bench.PUBLISHED[name]} if name in bench.PUBLISHED else {}
         lines = [f"{name}: {measured[name]['num_pairs']} pairs, {options.points} points drawn"]
         lines.append(numbers_table({**measured[name]["methods"], **published}))
-        for kind in ("neighbors", "points"):
-            if kind in measured[name]:
-                lines += [f"paper over {kind}", numbers_table(measured[name][kind])]
         yield Answer("\n".join([*lines, ""]), {"sets": [{"set": name, **measured[name]}]})
     numbers = {"sets": measured, "published": bench.PUBLISHED}
     yield Answer(files=_written(options, numbers))
@@ -243,14 +230,9 @@ def _paper_sets(options: argparse.Namespace) -> dict[str, Iterable[PaperPair]]:
     from densify.bench import paper_pairs
 
     sets: dict[str, Iterable[PaperPair]] = {}
-    if options.flyingthings is not None:
-        sets["flyingthings"] = paper_pairs.pairs_of_files(options.flyingthings, options.pairs)
-    if options.kitti is not None:
-        sets["kitti"] = paper_pairs.pairs_of_kitti(options.kitti, options.pairs)
-    for name, reader in (("argoverse", "argoverse2"), ("nuscenes", "nuscenes")):
-        if places := getattr(options, name):
-            specs = [f"{reader}:{place}" for place in places]
-            sets[name] = paper_pairs.pairs_of_boxes(specs, options.pairs)
+    for name in ("flyingthings", "kitti"):
+        if (folder := getattr(options, name)) is not None:
+            sets[name] = paper_pairs.pairs_of_files(folder, options.pairs)
     chosen: dict[str, list[tuple[str, int]]] = {}
     for text in options.data or (() if sets else _UNSEEN):
         spec, keys = _recording_keys(text)

@@ -7,7 +7,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import densify
 from densify.cli.answer import Answer
@@ -19,7 +19,6 @@ from densify.cli.options import (
     check_new_file,
     config_of,
     key_slice,
-    positive,
     recording_of,
     sliced,
 )
@@ -28,22 +27,7 @@ from densify.config import Config, resolve
 from densify.config.errors import ComputationError, InputError
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from densify.geometry.types import Float, Int
-
-
-class PointCloud(NamedTuple):
-    """The points of a file.
-
-    points: (N,3) float64 metres.
-    offset_ns: (N,) int64, when each was measured, None where the file does not say.
-    lidar: (N,) int64, the number of the scanner, None where the file does not say.
-    """
-
-    points: Float
-    offset_ns: Int | None = None
-    lidar: Int | None = None
+    from densify.geometry.types import Float
 
 
 def add_flow(commands: Any) -> None:
@@ -54,9 +38,7 @@ def add_flow(commands: Any) -> None:
         answer_flow,
         "scene flow of a recording, or between two point files in one coordinate frame",
         "Point files: .npy (N,3 or more columns), .npz (array 'points'), .txt and .csv (columns), "
-        ".bin (float32 columns, as KITTI's), .pcd, .ply, .las, .laz. Where both are .npz and "
-        "hold when each point was measured ('offset_ns', or 'time' in seconds) or by which "
-        "scanner ('lidar'), that is used. "
+        ".bin (float32 columns, as KITTI's), .pcd, .ply, .las, .laz. "
         "The result holds 'residual_flow' (N,3) float32 metres, "
         "'moving' (N,) bool, 'instance' (N,) int32 (-1 none) and 'lost' (N,) bool, row by row as "
         "SOURCE. Of a recording, with --all or --keys, the flow of each sweep to the next is "
@@ -105,24 +87,22 @@ def _of_two_files(options: argparse.Namespace, config: Config) -> Answer:
     out = options.out or Path("densify-out/flow.npz")
     check_new_file(out, options.overwrite)
     source, target = read_points(Path(options.source)), read_points(options.target)
-    columns = {**_columns("source", source, target), **_columns("target", target, source)}
-    field = densify.estimate_flow(source.points, target.points, config, **columns)
+    field = densify.estimate_flow(source, target, config)
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
         write_file(out, flow_npz(field))
     except OSError as error:
         raise InputError(f"--out {out}: cannot be written: {error.strerror or error}") from error
     num_moving = int(field.moving.sum())
-    facts = {"num_points": len(source.points), "num_moving": num_moving}
-    return Answer(f"{len(source.points):,} points, {num_moving:,} moving", facts, [out])
+    facts = {"num_points": len(source), "num_moving": num_moving}
+    return Answer(f"{len(source):,} points, {num_moving:,} moving", facts, [out])
 
 
-def read_points(path: Path) -> PointCloud:
-    """Return every row of a point file in its order; flow is written row by row.
+def read_points(path: Path) -> Float:
+    """Return the (N,3) float64 points of a file, metres, row by row as in the file.
 
-    An .npz file may hold, beside ``points``, ``offset_ns`` or ``time`` (seconds) and ``lidar``,
-    (N,) each. Raises InputError for a file of another form, without points, or with points that are
-    not finite.
+    Raises InputError for a file of another form, without points, or with points that are not
+    finite.
     """
     import numpy as np
 
@@ -141,34 +121,7 @@ def read_points(path: Path) -> PointCloud:
             f"{path}: {len(bad)} of {len(points)} points are not finite, the first in row "
             f"{bad[0]}; remove them"
         )
-    columns = {}
-    for name in ("offset_ns" if "offset_ns" in table.beside else "time", "lidar"):
-        if name in table.beside:
-            column = _checked_column(path, name, table.beside[name], len(points))
-            columns[name.replace("time", "offset_ns")] = column
-    return PointCloud(points, **columns)
-
-
-def _checked_column(path: Path, name: str, array: NDArray[Any], num_points: int) -> Int:
-    """Return a column beside the points as int64, ``time`` in nanoseconds."""
-    import numpy as np
-
-    kinds = "iuf" if name == "time" else "iu"
-    fits = array.shape == (num_points,) and array.dtype.kind in kinds
-    if not fits or not np.isfinite(array).all():
-        raise InputError(
-            f"{path}: array {name}: got shape {array.shape} and type {array.dtype}, expected "
-            f"({num_points},) {'seconds' if name == 'time' else 'whole numbers'}, one for each "
-            f"point"
-        )
-    return np.rint(array * 1e9 if name == "time" else array).astype(np.int64)
-
-
-def _columns(side: str, cloud: PointCloud, other: PointCloud) -> dict[str, Any]:
-    """Return the columns beside the points that both clouds have, as `estimate_flow` names them."""
-    names = ("offset_ns", "lidar")
-    both = [n for n in names if getattr(cloud, n) is not None and getattr(other, n) is not None]
-    return {f"{side}_{name}": getattr(cloud, name) for name in both}
+    return points
 
 
 def _of_recording(spec: str, options: argparse.Namespace, config: Config) -> Iterator[Answer]:
@@ -225,10 +178,6 @@ def add_labels(commands: Any) -> None:
     add_recording(parser)
     parser.add_argument("--out", metavar="DIR", type=Path, required=True, help="for the flow files")
     parser.add_argument("--keys", type=key_slice, metavar="A:B[:S]", help="(default: all sweeps)")
-    grown = "metres by which boxes grow on each side (default: 0.1)"
-    parser.add_argument("--grown", type=positive, default=0.1, metavar="M", help=grown)
-    ground = "points of the ground are not valid"
-    parser.add_argument("--without-ground", action="store_true", help=ground)
     add_config_options(parser)
     add_overwrite(parser)
 
@@ -236,7 +185,6 @@ def add_labels(commands: Any) -> None:
 def answer_labels(options: argparse.Namespace) -> Iterator[Answer]:
     """Label every sweep."""
     config = resolve(options.config, ["register.source=dataset", *options.overrides])
-    from densify.flow.boxes import BoxMargins
     from densify.learning.labels import Label, label_sweeps, write_label
     from densify.readers import open_sequence
 
@@ -247,8 +195,7 @@ def answer_labels(options: argparse.Namespace) -> Iterator[Answer]:
     failed: dict[int, Exception] = {}
     num_made = num_points = num_moving = num_sure = 0
     with progress_on_stderr() as progress:
-        margins = BoxMargins(grown_m=options.grown)
-        labels = label_sweeps(sequence, frames, config, margins, options.without_ground, progress)
+        labels = label_sweeps(sequence, frames, config, progress=progress)
         for frame, label in labels:
             if not isinstance(label, Label):
                 failed[frame] = label

@@ -9,7 +9,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from densify.cli.answer import Answer
-from densify.cli.options import add_camera, add_overwrite, add_verb, frame_range, natural
+from densify.cli.options import (
+    add_camera,
+    add_overwrite,
+    add_recording,
+    add_verb,
+    frame_range,
+    recording_of,
+)
 from densify.cli.progress import progress_on_stderr
 from densify.config.errors import InputError
 
@@ -21,6 +28,7 @@ def add(commands: Any) -> None:
     """Its options."""
     about = "write the built-in street as a recording with exact ground truth"
     parser = add_verb(commands, "simulate", answer, about)
+    add_recording(parser)
     parser.add_argument("--out", metavar="DIR", type=Path, required=True, help="folder to make")
     parser.add_argument(
         "--format",
@@ -28,28 +36,6 @@ def add(commands: Any) -> None:
         metavar="NAME",
         help="kitti (a raw drive, default) or folder (numbered sweeps with densify.yaml)",
     )
-    parser.add_argument(
-        "--preset",
-        default="street",
-        metavar="NAME",
-        help="street, static, crossing or highway (default: street)",
-    )
-    parser.add_argument(
-        "--sensor",
-        metavar="NAME",
-        help="the scanner: hdl64, hdl32, vlp16, os128, vls128, dual32, panda, pandaset, fmcw, "
-        "rosette (default: hdl64)",
-    )
-    parser.add_argument(
-        "--hz",
-        choices=("5", "10", "20"),
-        help="sweeps per second (default: 10); at 20 Hz a scanner "
-        "measures half the columns in a sweep, at 5 Hz twice as many",
-    )
-    parser.add_argument(
-        "--tilt", metavar="DEG", help="pitch of the scanner's mount, nose down (default: 0)"
-    )
-    parser.add_argument("--seed", type=natural, metavar="N", help="another seed, another street")
     parser.add_argument(
         "--frames", type=frame_range, metavar="A:B", help="frames A to B-1 only (default: all)"
     )
@@ -62,7 +48,10 @@ def answer(options: argparse.Namespace) -> Iterator[Answer]:
     from densify.outputs.simulated_street import write_street
     from densify.readers.street import Street
 
-    street = Street.from_spec(_street_spec(options))
+    spec = recording_of(options)
+    if not spec.startswith("street"):
+        raise InputError(f"simulate {spec}: expected street[:PRESET][?seed=N&sensor=NAME&hz=RATE]")
+    street = Street.from_spec(spec)
     frames = _frames_of(street, options.frames)
     with progress_on_stderr() as progress:
         place = write_street(
@@ -76,14 +65,6 @@ def answer(options: argparse.Namespace) -> Iterator[Answer]:
         )
     text = f"{len(frames)} frames; open them with --data {place}"
     yield Answer(text, {"data": str(place), "num_frames": len(frames)})
-
-
-def _street_spec(options: argparse.Namespace) -> str:
-    preset = options.preset.removeprefix("street:")
-    name = "street" if preset == "street" else f"street:{preset}"
-    keys = ("seed", "sensor", "hz", "tilt")
-    query = [f"{k}={v}" for k in keys if (v := getattr(options, k)) is not None]
-    return f"{name}?{'&'.join(query)}" if query else name
 
 
 def _frames_of(street: LidarSequence, wanted: range | None) -> list[int]:

@@ -9,7 +9,6 @@ from collections.abc import Mapping
 from typing import Any
 
 from densify import __version__
-from densify.config import Config, as_mapping
 from densify.config.errors import InputError
 from densify.geometry.types import ObjectTrack
 from densify.outputs.cloud_laz import StoredCloud
@@ -24,7 +23,7 @@ _MOST_POINTS, _FEWEST_POINTS = 500_000, 10_000
 _OF_THE_PAGE = 300_000  # scores, scripts
 _SCRIPTS = (
     *("unpack.js", "dom.js", "colours.js", "maps.js", "matrices.js", "gl.js", "cloud.js"),
-    *("charts.js", "key.js"),
+    *("scores.js", "key.js"),
 )
 
 
@@ -60,10 +59,7 @@ def key_page(files: KeyFiles, folder: str) -> bytes:
         "sweeps": sweeps,
         "movers": movers,
         "cloud": _cloud(blobs, stored, sweeps, movers) if stored is not None else None,
-        "about": {name: about.get(name) for name in ("stages", "versions")},
-        "input": _input(about),
-        "config": [(knob, str(value)) for knob, value in _knobs(about.get("config")).items()],
-        "command": command(about, methods if compared else None),
+        "about": {"stages": about.get("stages")},
         "warnings": [str(w) for w in about.get("warnings") or ()],
         "missing": files.missing,
     }
@@ -121,45 +117,3 @@ def _mover(track: ObjectTrack, key: Any) -> dict[str, Any]:
         "velocity_m_s": track.velocity_m_s[at],
         "path": [{"frame": frame, "position_m": place_m} for frame, place_m in path],
     }
-
-
-def _input(about: Mapping[str, Any]) -> list[tuple[str, str]]:
-    entries = {
-        "recording": about.get("data"),
-        "key": about.get("key"),
-        "method": about.get("method"),
-        "sweeps of the window": about.get("frames"),
-        "sweeps beyond it": about.get("far_frames"),
-        "cameras": about.get("cameras"),
-    }
-    lists = {n: ", ".join(map(str, v)) for n, v in entries.items() if isinstance(v, list)}
-    return [(n, str(v)) for n, v in {**entries, **lists}.items() if v not in (None, "")]
-
-
-def _knobs(config: Any) -> dict[str, Any]:
-    """Return section.knob -> value."""
-    return {
-        f"{section}.{knob}": value
-        for section, knobs in mapping(config).items()
-        for knob, value in mapping(knobs).items()
-    }
-
-
-def command(about: Mapping[str, Any], methods: list[str] | None) -> str:
-    """Return the command that makes the result again. methods: of a comparison, None for a run."""
-    frames, key = about.get("frames"), about.get("key")
-    words = ["densify", "compare" if methods else "run"]
-    words += ["--data", str(about.get("data")), "--key", str(key)]
-    if isinstance(frames, list) and key in frames:
-        at = frames.index(key)
-        words += ["--window", str(max(at, len(frames) - 1 - at))]
-    if methods:
-        words += ["--methods", ",".join(methods)]
-    elif about.get("method"):
-        words += ["--method", str(about["method"])]
-    usual = _knobs(as_mapping(Config()))
-    for knob, value in _knobs(about.get("config")).items():
-        if usual.get(knob) != value:
-            text = str(value).lower() if isinstance(value, bool) or value is None else str(value)
-            words += ["--set", f"{knob}={text}"]
-    return shlex.join(words)

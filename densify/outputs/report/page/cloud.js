@@ -103,7 +103,6 @@ class CloudPane {
     $("sweeps-shown").addEventListener("change", () => this.tellSweep());
     $("morph-play").addEventListener("click", () => this.playMorph());
     $("sweep-play").addEventListener("click", () => this.playSweeps());
-    $("turn").addEventListener("change", () => this.turning());
     $("only-moving").disabled = !page.cloud.num_moving;
     this.presets();
     this.pointer();
@@ -239,16 +238,6 @@ class CloudPane {
       }
       return this.window.length > 1;
     });
-  }
-  turning() {
-    let before = performance.now();
-    const next = (now) => {
-      if (!$("turn").checked) return;
-      this.orbit(0.0004 * Math.min(now - before, 100), 0);
-      before = now;
-      requestAnimationFrame(next);
-    };
-    requestAnimationFrame(next);
   }
   lines() {
     const segments = [], labels = [];

@@ -14,13 +14,6 @@ function element(name, attributes = {}, ...children) {
   return made;
 }
 
-function svg(name, attributes = {}, ...children) {
-  const made = document.createElementNS("http://www.w3.org/2000/svg", name);
-  for (const [key, value] of Object.entries(attributes)) made.setAttribute(key, value);
-  made.append(...children);
-  return made;
-}
-
 const isNumber = (value) => typeof value === "number" && Number.isFinite(value);
 const known = (value, write) => (isNumber(value) ? write(value) : "–");
 const percent = (value, digits = 2) => known(value, (v) => `${(100 * v).toFixed(digits)} %`);

@@ -23,24 +23,8 @@ function facts() {
   $("facts").replaceChildren(...list);
 }
 
-function plainTable(table, entries) {
-  table.replaceChildren(...entries.map(([key, value]) => row(key, value === null || value === undefined ? "–" : String(value))));
-}
-
-function howItWasMade() {
+function warnings() {
   for (const warning of page.warnings) $("warnings").append(element("p", { class: "note" }, warning));
-  $("command").textContent = page.command;
-  $("copy").addEventListener("click", async () => {
-    try {
-      await navigator.clipboard.writeText(page.command);
-    } catch (_) {
-      getSelection().selectAllChildren($("command"));
-    }
-    $("copy").textContent = "Copied";
-  });
-  plainTable($("versions"), Object.entries(page.about.versions || {}));
-  plainTable($("input"), page.input);
-  plainTable($("config"), page.config);
   $("footer").textContent = page.footer;
 }
 
@@ -51,11 +35,11 @@ async function start() {
   $("subtitle").textContent = page.subtitle;
   for (const problem of page.missing) tell(problem);
   await section("The summary", facts);
-  await section("How it was made", howItWasMade);
+  await section("Warnings", warnings);
   await section("The cost", costs);
   const names = Object.keys(page.cameras);
   const scored = names.length ? names : [...new Set(Object.values(page.methods).flatMap((s) => Object.keys(s?.density || {})))];
-  const showScores = (camera) => section("The scores", () => { scoreTables(camera); curveCharts(camera); });
+  const showScores = (camera) => section("The scores", () => scoreTables(camera));
   if (scored.length) await showScores(scored[0]);
   $("image").hidden = !names.length;
   if (names.length) {

@@ -1,0 +1,66 @@
+// SPDX-License-Identifier: MIT
+// Scores and costs as tables.
+
+const PARTS = ["all", "moving", "static"];
+const SOURCES = [["depth", "Against the truth"], ["held_out", "Key sweep held out, against its own returns"]];
+
+function scoreTables(camera) {
+  const tables = [];
+  for (const [source, title] of SOURCES) {
+    for (const product of ["measured", "filled"]) {
+      const found = Object.entries(page.methods).filter(([, scores]) => scores?.[source]?.[camera]?.[product]);
+      if (found.length) tables.push(scoreTable(`${title}: ${product}, ${camera}`, found, source, product, camera));
+    }
+  }
+  const ghosts = Object.entries(page.methods).filter(([, s]) => isNumber(s?.ghosts?.all));
+  if (ghosts.length) {
+    const table = element("table", {}, element("caption", {}, "Accumulated points where the key sweep saw through (ghosts), and points"));
+    table.append(headRow("", "ghosts", "of what moves", "of what stands", "points", "on moving objects", "pixels measured", "filled"));
+    for (const [name, s] of ghosts) {
+      const density = s.density?.[camera] || {};
+      table.append(methodRow(name, [percent(s.ghosts.all), percent(s.ghosts.moving), percent(s.ghosts.static), whole(s.num_points), whole(s.num_moving), percent(density.measured, 1), percent(density.filled, 1)]));
+    }
+    tables.push(element("div", { class: "scroll" }, table));
+  }
+  $("score-tables").replaceChildren(...(tables.length ? tables : [element("p", { class: "small" }, "There are no scores here.")]));
+}
+
+const headRow = (...texts) => element("tr", {}, ...texts.map((t, i) => element("th", { scope: "col", class: i ? "number" : "" }, t)));
+function methodRow(name, cells) {
+  const tr = row(methodName(name) === name ? name : `${methodName(name)} (${name})`, ...cells.map(numberCell));
+  if (name === page.method) tr.className = "ours";
+  return tr;
+}
+
+function scoreTable(title, found, source, product, camera) {
+  const table = element("table", {}, element("caption", {}, title));
+  const parts = PARTS.filter((part) => found.some(([, s]) => isNumber(s[source][camera][product][part]?.outliers)));
+  table.append(headRow("", ...parts.flatMap((p) => [`${p}: wrong`, "MAE", "RMSE", "coverage"])));
+  for (const [name, scores] of found) {
+    const cells = parts.flatMap((part) => {
+      const s = scores[source][camera][product][part] || {};
+      return [percent(s.outliers), metres(s.mae_m, 3), metres(s.rmse_m, 2), percent(s.coverage, 1)];
+    });
+    table.append(methodRow(name, cells));
+  }
+  return element("div", { class: "scroll" }, table);
+}
+
+function costs() {
+  const stages = page.about.stages;
+  if (!Array.isArray(stages) || !stages.length) {
+    $("costs").append(element("p", { class: "small" }, "This folder does not say what the stages took."));
+    return;
+  }
+  const most = Math.max(...stages.map((s) => s.seconds || 0), 1e-9);
+  const table = element("table", {}, headRow("stage", "seconds", "", "peak memory so far"));
+  for (const stage of stages) {
+    const bar = element("i");
+    bar.style.width = `${(100 * (stage.seconds || 0)) / most}%`;
+    table.append(row(String(stage.name), numberCell(known(stage.seconds, (v) => v.toFixed(2))),
+      element("td", {}, element("div", { class: "track" }, bar)), numberCell(known(stage.peak_memory_mb, (v) => `${whole(v)} MB`))));
+  }
+  const total = stages.reduce((all, s) => all + (s.seconds || 0), 0);
+  table.append(row("together", numberCell(total.toFixed(2)), "", ""));
+  $("costs").append(table, element("p", { class: "small" }, "Wall seconds; stages of several methods run side by side, so they can add up to more than the run took."));
+}
