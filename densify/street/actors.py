@@ -104,20 +104,18 @@ def car_mesh(paint: Tint, rng: np.random.Generator) -> Mesh:
     head = [(rear_roof, roof), (middle - 0.05, roof), (middle + 0.05, roof), (screen, roof)]
     low = [np.array([x, wide, z]) for x, z in base]
     high = [np.array([x, top, z]) for x, z in head]
-    for i, (a, b) in enumerate(((0, 1), (2, 3))):
-        inset = 0.13 if i == 0 else 0.10
-        l0, l1 = low[a] + (low[b] - low[a]) * inset, low[b]
-        h0, h1 = high[a] + (high[b] - high[a]) * inset, high[b]
-        if i == 1:
-            l0, l1 = low[a], low[b] - (low[b] - low[a]) * inset
-            h0, h1 = high[a], high[b] - (high[b] - high[a]) * inset
-        shell.append(_both_sides(np.array([[l0, l1, h1, h0]]), Material.GLASS))
+    rear_low, rear_high = (p[0] + (p[1] - p[0]) * 0.13 for p in (low, high))
+    front_low, front_high = (p[3] - (p[3] - p[2]) * 0.10 for p in (low, high))
+    panes = [
+        [rear_low, low[1], high[1], rear_high],
+        [low[2], front_low, front_high, high[2]],
+    ]
+    shell += [_both_sides(np.array([pane]), Material.GLASS) for pane in panes]
     pillars = [
-        [low[0], low[0] + (low[1] - low[0]) * 0.13, high[0] + (high[1] - high[0]) * 0.13, high[0]],
+        [low[0], rear_low, rear_high, high[0]],
         [low[1], low[2], high[2], high[1]],
-        [low[3] - (low[3] - low[2]) * 0.10, low[3], high[3],
-         high[3] - (high[3] - high[2]) * 0.10],
-    ]  # fmt: skip
+        [front_low, low[3], high[3], front_high],
+    ]
     shell.append(_both_sides(np.array(pillars), Material.BODYWORK, paint))
     shell.append(_across([(cowl, belt, wide), (screen, roof, top)], Material.GLASS, (1, 1, 1)))
     shell.append(_across([(rear_roof, roof, top), (deck, belt, wide)], Material.GLASS, (1, 1, 1)))
