@@ -163,11 +163,6 @@ BAD_ARRAYS = {
     "no flow": ({"flow": FLOW}, "holds none of the arrays .*total_flow"),
     "narrow": ({"residual_flow": FLOW[:, :2]}, r"residual_flow: got shape \(30, 2\).* \(30, 3\)"),
     "NaN": ({"residual_flow": FLOW * np.nan}, "residual_flow: got NaN or infinite"),
-    "huge": ({"residual_flow": FLOW + 1e300}, r"got a step of 1e\+300 m, expected .* 1000 at most"),
-    "fractional rows": (
-        {"residual_flow": FLOW, "row": np.arange(30.0)},
-        "row: .*float64, expected row numbers",
-    ),
     "negative row": ({"residual_flow": FLOW, "row": np.arange(30) - 1}, "row: got a negative one"),
     "too few": ({"residual_flow": FLOW[:20]}, "holds 20 points, expected .*more than 27.*'row'"),
 }

@@ -89,11 +89,6 @@ def edit(change):
     return harm
 
 
-def of_sweep(change):
-    """Change the first sweep's entry."""
-    return edit(lambda c: change(next(e for e in c["data"] if "point_cloud" in e["datum"])))
-
-
 def holds(**arrays):
     def harm(path):
         file = io.BytesIO()
@@ -107,30 +102,9 @@ SCENE, CALIBRATION = "scene_*.json", "calibration/*.json"
 SWEEP, IMAGE = "point_cloud/LIDAR/*.npz", f"rgb/{CAMERA}/*.png"
 DAMAGE = {
     "scene cut": (SCENE, lambda p: p.write_bytes(p.read_bytes()[:-9]), "not a whole JSON"),
-    "scene of another kind": (SCENE, lambda p: p.write_text("[]"), "expected a DGP scene"),
-    "datum absent": (SCENE, edit(lambda c: c["data"].pop()), "which a sample names"),
     "no sweeps": (SWEEP, lambda p: shutil.rmtree(p.parent), "none of its sweeps is there"),
-    "date": (SCENE, of_sweep(lambda e: e["id"].update(timestamp="now")), "got 'now'"),
-    "pose absent": (SCENE, of_sweep(lambda e: e["datum"]["point_cloud"].pop("pose")), "no 'pose'"),
-    "quaternion not of unit length": (
-        SCENE,
-        of_sweep(lambda e: e["datum"]["point_cloud"]["pose"]["rotation"].update(qw=5)),
-        "unit quaternion",
-    ),
     "calibration of fewer": (CALIBRATION, edit(lambda c: c["extrinsics"].pop()), "names"),
-    "no calibration of the camera": (
-        CALIBRATION,
-        edit(lambda c: c["names"].__setitem__(1, "other")),
-        f"calibration of {CAMERA}",
-    ),
-    "focal length 0": (
-        CALIBRATION,
-        edit(lambda c: c["intrinsics"][1].update(fx=0)),
-        "positive focal",
-    ),
-    "sweep of three columns": (SWEEP, holds(data=np.zeros((3, 3))), "a column for each"),
     "sweep of a pickle": (SWEEP, lambda p: p.write_bytes(pickle.dumps([1])), "not a readable .npz"),
-    "image cut": (IMAGE, lambda p: p.write_bytes(b"x"), "not a complete image"),
 }
 
 

@@ -114,14 +114,6 @@ def test_what_is_no_capture_is_refused_in_a_line(tmp_path, content, says):
     assert "\n" not in str(error.value) and str(path) in str(error.value)
 
 
-def test_another_model_is_refused_in_a_line(vlp16):
-    pytest.importorskip("velodyne_decoder")
-    with pytest.raises(InputError, match="cannot be read: No such file"):
-        open_sequence(f"velodyne:{vlp16.parent / 'other.pcap'}#VLP-16")
-    with pytest.raises(InputError, match="no sweep of frame 7; frames that exist: 0-1"):
-        open_sequence(f"velodyne:{vlp16}#VLP-16")[7]
-
-
 @pytest.mark.parametrize(
     ("package", "reader", "scene"),
     [("velodyne_decoder", "velodyne", "VLP-16"), ("ouster.sdk.core", "ouster", "drive.json")],

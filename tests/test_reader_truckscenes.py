@@ -146,32 +146,14 @@ def test_boxes_are_in_the_vehicles_frame_between_key_frames(root):
         np.testing.assert_array_equal(boxes.size_m, [[12.0, 2.5, 4.0]])
 
 
-def change(root, **columns):
-    path = sorted((root / "samples/LIDAR_RIGHT").iterdir())[0]
-    kept = {k: v for k, v in (points_of("LIDAR_RIGHT", 0) | columns).items() if v is not None}
-    write_pcd(path, kept)
-
-
 DAMAGE = {
     "truncated": (
         lambda root: [p.write_bytes(p.read_bytes()[:400]) for p in root.glob("samples/*/*.pcd")],
         "not a readable .pcd",
     ),
-    "no times": (lambda root: change(root, timestamp=None), "no field timestamp"),
-    "times in nanoseconds": (
-        lambda root: change(root, timestamp=points_of("LIDAR_RIGHT", 0)["timestamp"] * 1000),
-        "expected microseconds",
-    ),
     "missing": (
         lambda root: [p.unlink() for p in (root / "samples/LIDAR_RIGHT").iterdir()],
         "no such file",
-    ),
-    "several lidars in nuScenes' files": (
-        lambda root: [
-            p.write_text(p.read_text().replace(".pcd", ".pcd.bin"))
-            for p in (root / "v1.0-mini").glob("sample_data.json")
-        ],
-        "expected one in .pcd.bin",
     ),
 }
 
