@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The built-in street as a recording. Frames are rendered when asked for and kept in a folder.
+"""The built-in street as a recording. Frames are rendered when asked for and kept in the cache.
 
 ``street[:PRESET][?seed=N&sensor=NAME&hz=RATE&tilt=DEG&cameras=NAME,NAME]``. It lasts 16 seconds: at
 10 Hz frames 0 to 159. The cache lies in the user's cache directory, or in the folder named by the
@@ -9,34 +9,36 @@ same, byte for byte.
 
 from __future__ import annotations
 
-import hashlib
 import logging
-import threading
-from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from functools import cached_property, partial
-from typing import Any
+from dataclasses import dataclass
+from functools import cached_property, lru_cache, partial
+from typing import Any, TypeVar
 from urllib.parse import parse_qsl
 
 import numpy as np
 from numpy.typing import NDArray
 
-from densify.config.cache import save_arrays
+from densify.config.cache import Cache, kept
 from densify.config.errors import InputError
 from densify.config.user_folder import own_folder
 from densify.geometry.threads import num_threads
 from densify.geometry.types import Bool, Camera, Float, Float32, Sweep, SweepTruth
-from densify.readers.decoded_files import read_arrays
 from densify.street.cameras import CAMERAS, USUAL, Picture, cameras_beside
 from densify.street.lidar import Returns
 from densify.street.sensors import SENSORS
 from densify.street.simulator import PRESETS, VERSION, Bodies, Simulator
 
-_log = logging.getLogger("densify")
+T = TypeVar("T")
 _progress = logging.getLogger("densify.progress")
-_KEPT_IN_MEMORY = 16
+_SWEEPS_IN_MEMORY, _IMAGES_IN_MEMORY = 16, 8
 _OPTIONS = {"seed": "0", "sensor": "hdl64", "hz": "10", "tilt": "0", "cameras": ",".join(USUAL)}
+_NUMBERS = {
+    "seed": (int, "a whole number from 0, below 10^18"),
+    "hz": (int, "5, 10, 20"),
+    "tilt": (float, "degrees from -45 to 45"),
+}
 
 
 class Street:
@@ -44,12 +46,9 @@ class Street:
 
     preset: street, static (nothing else moves), crossing (the ego vehicle stands) or highway.
     seed: another number is another scene of that kind. sensor: a row of
-    `densify.street.sensors.SENSORS`. hz: sweeps per second, 5, 10 or 20. The scene is the same at
-    the same time: frame 120 at 10 Hz is frame 240 at 20 Hz. Scanners fire at a constant rate, so a
-    spinning one has half the columns at 20 Hz. tilt_deg: pitch of the sensor's mount, nose down,
-    -45 to 45; the cameras stay. cameras: names, none if empty. image_02 and image_03 expose once
-    per sweep, the second 15 ms after its reference time. The others have clocks of their own: fast
-    (30 Hz), rolling (a rolling shutter, 0.1 ms per row), fisheye (190 degrees, to the left).
+    `densify.street.sensors.SENSORS`. hz: sweeps per second, 5, 10 or 20; frame 120 at 10 Hz is
+    frame 240 at 20 Hz. tilt_deg: pitch of the sensor's mount, nose down; the cameras stay. cameras:
+    names of `densify.street.cameras.CAMERAS`.
 
     Raises InputError for a value that does not exist.
     """
@@ -65,25 +64,25 @@ class Street:
     ) -> None:
         _check("preset", preset, PRESETS)
         _check("sensor", sensor, SENSORS)
-        _check("hz", str(hz), ("5", "10", "20"))
-        if seed < 0:
-            raise InputError(f"street seed {seed}: expected a whole number from 0")
-        if not abs(tilt_deg) <= 45:
-            raise InputError(f"street tilt {tilt_deg:g}: expected degrees from -45 to 45")
+        numbers = {"seed": seed, "hz": hz, "tilt": tilt_deg}
+        exist = {"seed": 0 <= seed < 10**18, "hz": hz in (5, 10, 20), "tilt": abs(tilt_deg) <= 45}
+        for key in (key for key in numbers if not exist[key]):
+            raise InputError(f"street {key} {numbers[key]:g}: expected {_NUMBERS[key][1]}")
         for name in cameras:
             _check("camera", name, CAMERAS)
-        changed = [("hz", hz)] * (hz != 10) + [("tilt", f"{tilt_deg:g}")] * (tilt_deg != 0)
-        options = "".join(f"&{key}={value}" for key, value in changed)
+        options = f"&hz={hz}" * (hz != 10) + f"&tilt={tilt_deg:g}" * (tilt_deg != 0)
         shown = f"&cameras={','.join(cameras) or 'none'}" * (cameras != USUAL)
         self.name = f"street:{preset}?seed={seed}&sensor={sensor}{options}{shown}"
         self.simulator = Simulator(preset, seed, SENSORS[sensor], hz, tilt_deg)
         self.frames = range(self.simulator.num_frames)
         self.cameras: Mapping[str, Camera] = cameras_beside(tilt_deg, cameras)
         self.truth = StreetTruth(self)
-        self._store = _Store()
-        self._posed = _digest(f"{VERSION} {preset} {seed}{options}, with any sensor")
-        self._swept = _digest(f"{VERSION} {preset} {seed} {sensor}{options}")
-        self._pictured = _digest(f"{VERSION} {preset} {seed} {hz} Hz, with any sensor")
+        self._cache: Cache | None = Cache(folder=own_folder("street"))
+        self._posed = f"{VERSION} {preset} {seed}{options}, with any sensor"
+        self._swept = f"{VERSION} {preset} {seed} {sensor}{options}"
+        self._pictured = f"{VERSION} {preset} {seed} {hz} Hz, with any sensor"
+        self._returns = lru_cache(_SWEEPS_IN_MEMORY)(self._kept_returns)
+        self._picture = lru_cache(_IMAGES_IN_MEMORY)(self._kept_picture)
 
     @staticmethod
     def from_spec(spec: str) -> Street:
@@ -92,32 +91,19 @@ class Street:
         head, _, query = spec.partition("?")
         reader, _, preset = head.partition(":")
         if reader != "street":
-            raise InputError(
-                f"{spec!r}: expected street[:PRESET][?seed=N&sensor=NAME&hz=RATE&tilt=DEG"
-                f"&cameras=NAME,NAME]"
-            )
-        given = parse_qsl(query, keep_blank_values=True)
-        for key, _ in given:
+            raise InputError(f"{spec!r}: expected street[:PRESET][?OPTION=VALUE&OPTION=VALUE]")
+        given = dict(parse_qsl(query, keep_blank_values=True))
+        for key in given:
             _check("option", key, _OPTIONS)
-        options = _OPTIONS | dict(given)
-        if len(dict(given)) < len(given):
-            raise InputError(f"{spec!r}: an option is given twice; keep one of each")
-        seed, tilt, cameras = options["seed"], options["tilt"], options["cameras"]
-        if not (seed.isascii() and seed.isdigit() and len(seed) <= 18):
-            raise InputError(
-                f"street seed {seed!r}: expected a whole number from 0, of up to 18 digits, as in "
-                f"street?seed=7"
-            )
-        _check("hz", options["hz"], ("5", "10", "20"))
-        try:
-            tilt_deg = float(tilt)
-        except ValueError:
-            raise InputError(
-                f"street tilt {tilt!r}: expected degrees, nose down, as in street?tilt=10"
-            ) from None
-        names = () if cameras == "none" else tuple(cameras.split(","))
-        hz = int(options["hz"])
-        return Street(preset or "street", int(seed), options["sensor"], hz, tilt_deg, names)
+        options, numbers = _OPTIONS | given, dict[str, Any]()
+        for key, (kind, expected) in _NUMBERS.items():
+            try:
+                numbers[key] = kind(options[key])
+            except ValueError:
+                raise InputError(f"street {key} {options[key]!r}: expected {expected}") from None
+        names = () if options["cameras"] == "none" else tuple(options["cameras"].split(","))
+        seed, hz, tilt_deg = numbers.values()
+        return Street(preset or "street", seed, options["sensor"], hz, tilt_deg, names)
 
     def __getitem__(self, frame: int) -> Sweep:
         returns = self.returns(frame)
@@ -135,7 +121,7 @@ class Street:
 
     def keep_nothing(self) -> None:
         """Leave the cache folder alone from now on: nobody will ask for this street again."""
-        self._store.on_disk = False
+        self._cache = None
 
     def stamp_ns(self, frame: int) -> int:
         """Return the reference time of a sweep."""
@@ -145,25 +131,14 @@ class Street:
     def returns(self, frame: int) -> Returns:
         """Return the sweep's returns with the bodies they are from."""
         self.check(frame)
-
-        def make() -> dict[str, NDArray[Any]]:
-            found = vars(self.simulator.returns(frame))
-            return {name: array for name, array in found.items() if array is not None}
-
-        return Returns(**self._store.get(f"{self._swept}/sweep/{frame}", make))
+        return self._returns(frame)
 
     def prepare(self, frames: Sequence[int], images: Sequence[tuple[str, int]] = ()) -> None:
         """Render what is not in the cache yet, on all cores."""
-        wanted: dict[str, Callable[[], object]] = {
-            **{f"{self._pictured}/{c}/{n}": partial(self.picture, c, n) for c, n in images},
-            **{f"{self._swept}/sweep/{frame}": partial(self.returns, frame) for frame in frames},
-        }
-        missing = [make for name, make in wanted.items() if name not in self._store]
-        if missing:
-            _ = self.simulator.scene.world.triangles  # otherwise each thread might make them
-            with ThreadPoolExecutor(num_threads()) as pool:
-                for made in [pool.submit(make) for make in missing]:
-                    made.result()
+        _ = self.simulator.scene.world.triangles  # otherwise each thread might make them
+        with ThreadPoolExecutor(num_threads()) as pool:
+            list(pool.map(lambda image: self.picture(*image), images))
+            list(pool.map(self.returns, frames))
 
     def picture(self, camera: str, number: int) -> Picture:
         """Return a camera's image with its exact depth and the bodies in it."""
@@ -172,9 +147,7 @@ class Street:
             raise InputError(
                 f"street: no image {number} of {camera}; there are images 0 to {max(stamps_ns)}"
             )
-        name = f"{self._pictured}/{camera}/{number}"
-        make = partial(self.simulator.picture, camera, number)
-        return Picture(**self._store.get(name, lambda: vars(make())))
+        return self._picture(camera, number)
 
     def image(self, camera: str, number: int) -> NDArray[np.uint8]:
         """Return (H,W,3) RGB."""
@@ -188,8 +161,22 @@ class Street:
     @cached_property
     def bodies(self) -> Bodies:
         """The poses of every body at every frame's reference time."""
-        name = f"{self._posed}/bodies"
-        return Bodies(**self._store.get(name, lambda: vars(self.simulator.bodies), is_frame=False))
+        return self._kept("bodies", Bodies, self._posed, lambda: self.simulator.bodies)
+
+    def _kept_returns(self, frame: int) -> Returns:
+        make = partial(self.simulator.returns, frame)
+        return self._kept("sweep", Returns, (self._swept, frame), make)
+
+    def _kept_picture(self, camera: str, number: int) -> Picture:
+        make = partial(self.simulator.picture, camera, number)
+        return self._kept("image", Picture, (self._pictured, camera, number), make)
+
+    def _kept(self, step: str, kind: type[T], inputs: Any, make: Callable[[], T]) -> T:
+        def rendered() -> T:
+            _announce()
+            return make()
+
+        return kept(self._cache, step, kind, lambda: inputs, rendered)
 
     def T_world_lidar(self, frame: int) -> Float:
         """Return the true (4,4) pose at the sweep's reference time."""
@@ -202,11 +189,11 @@ class Street:
             raise InputError(f"street: no frame {frame}; there are frames 0 to {self.frames[-1]}")
 
 
+@dataclass(frozen=True)
 class StreetTruth:
     """Exact truth of a street; members as in `Truth`."""
 
-    def __init__(self, street: Street) -> None:
-        self._street = street
+    _street: Street
 
     def sweep(self, frame: int) -> SweepTruth:
         """Return the truth. Its points are the raw points at the reference time, each moved with
@@ -239,57 +226,6 @@ def _check(what: str, got: str, known: Sequence[str] | Mapping[str, Any]) -> Non
         raise InputError(f"street: no {what} {got!r}; there are {', '.join(known)}")
 
 
-def _digest(identity: str) -> str:
-    return hashlib.sha256(identity.encode()).hexdigest()[:16]
-
-
-class _Store:
-    """Arrays by name, some in memory and all in the cache folder, which processes share. A file
-    that cannot be read is made again; a folder that cannot be written only costs time."""
-
-    def __init__(self) -> None:
-        self._folder = own_folder("street")
-        self._memory: OrderedDict[str, dict[str, NDArray[Any]]] = OrderedDict()
-        self._lock = threading.Lock()
-        self._announced = False
-        self.on_disk = True
-
-    def __contains__(self, name: str) -> bool:
-        in_folder = self.on_disk and (self._folder / f"{name}.npz").exists()
-        return name in self._memory or in_folder
-
-    def get(
-        self, name: str, make: Callable[[], dict[str, NDArray[Any]]], is_frame: bool = True
-    ) -> dict[str, NDArray[Any]]:
-        """Return the arrays. Threads may ask for different names. is_frame: making it takes long,
-        which is said before the first."""
-        with self._lock:
-            arrays = self._memory.pop(name, None)
-        if arrays is None:
-            arrays = self._read_or_make(name, make, is_frame)
-        with self._lock:
-            self._memory[name] = arrays
-            if len(self._memory) > _KEPT_IN_MEMORY:
-                self._memory.popitem(last=False)
-        return arrays
-
-    def _read_or_make(
-        self, name: str, make: Callable[[], dict[str, NDArray[Any]]], is_frame: bool
-    ) -> dict[str, NDArray[Any]]:
-        if not self.on_disk:
-            return make()
-        path = self._folder / f"{name}.npz"
-        try:
-            return read_arrays(path)
-        except InputError:
-            pass  # not there, or damaged
-        if is_frame and not self._announced:
-            self._announced = True
-            _progress.info("rendering the street, 1 to 2 s a sweep; kept in %s", self._folder)
-        arrays = make()
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            save_arrays(path, arrays)
-        except OSError as error:
-            _log.debug("street frame not kept in the cache: %s", error)
-        return arrays
+@lru_cache(1)
+def _announce() -> None:
+    _progress.info("rendering the street, 1 to 2 s a sweep; kept in the cache")
