@@ -20,13 +20,9 @@ class Maker:
     """Messages, and bags of them. suffix: .db3, .mcap or .bag."""
 
     def __init__(self, suffix: str = ".db3") -> None:
-        from rosbags.typesys import get_types_from_msg
-
         self.is_ros2 = suffix != ".bag"
         self.suffix = suffix
         self.types = message_types(self.is_ros2)
-        scan_text = "std_msgs/Header header\nuint8[] packets"
-        self.types.register(get_types_from_msg(scan_text, "velodyne_msgs/msg/VelodyneScan"))
         self.written: list[tuple[int, str, str, Any]] = []
 
     def make(self, type_: str, *values: Any) -> Any:

@@ -152,21 +152,6 @@ def test_labels_score_as_the_truth_they_are_made_of(log, tmp_path, capsys):
 # --- what is refused ------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("more", "words"),
-    [
-        (["--data", "street"], "either --all or --keys"),
-        (["--data", "street", "--keys", "900:901"], "no sweep among them"),
-        (["a.npz"], "two point files"),
-        (["a.npz", "b.npz", "--format", "av2"], "two point files"),
-    ],
-)
-def test_one_of_two_ways(more, words, capsys):
-    assert main(["flow", *more]) == 2
-    error = capsys.readouterr().err
-    assert words in error and len(error.splitlines()) == 1
-
-
 def test_what_is_there_is_kept(log, submission, capsys):
     before = {p: p.read_bytes() for p in (submission / log.name).iterdir()}
     assert flow(log, submission, "--all", "--format", "av2") == 2

@@ -145,12 +145,6 @@ def test_damage_is_refused_in_a_line(broken, damage):
     check_refused(f"argoverse2:{broken}", says, broken)
 
 
-def test_without_the_package_the_remedy_is_named(log, monkeypatch):
-    monkeypatch.setitem(__import__("sys").modules, "pyarrow", None)
-    with pytest.raises(InputError, match=r"pip install 'densify\[argoverse\]'"):
-        open_sequence(log)
-
-
 # A real log
 
 

@@ -235,9 +235,3 @@ def test_the_flow_of_another_recording_is_refused(copy, folder):
         densify.run(
             open_sequence(folder), 1, 1, config={"flow": {"engine": "opensceneflow:nowhere.h5"}}
         )
-
-
-def test_without_the_package_the_remedy_is_named(folder, monkeypatch):
-    monkeypatch.setitem(__import__("sys").modules, "h5py", None)
-    with pytest.raises(InputError, match=r"pip install 'densify\[opensceneflow\]'"):
-        open_sequence(folder)

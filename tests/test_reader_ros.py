@@ -389,9 +389,3 @@ def test_stamps_that_drivers_leave_at_zero_are_those_of_the_recording(tmp_path):
         maker.written[-1] = (STAMP_NS + i * PERIOD_NS, *maker.written[-1][1:])
     sequence = open_sequence(maker.write(tmp_path))
     assert [sequence.stamp_ns(f) for f in (0, 1)] == [STAMP_NS, STAMP_NS + PERIOD_NS]
-
-
-def test_without_the_package_the_remedy_is_named(written, monkeypatch):
-    monkeypatch.setitem(__import__("sys").modules, "rosbags.rosbag1", None)
-    with pytest.raises(InputError, match=r"pip install 'densify\[ros\]'"):
-        open_sequence(written["ros1"])

@@ -13,7 +13,6 @@ from writers import write_street
 from writers.excerpt import Excerpt
 from writers.waymo import T_EGO_LIDAR, pixels
 
-from densify.config.errors import InputError
 from densify.geometry.poses import inverse, transform
 from densify.readers import open_sequence
 from densify.readers.describe import describe
@@ -240,9 +239,3 @@ def test_damaged_segments_are_refused_in_a_line(copy, damage):
     harm, says = DAMAGE[damage]
     harm(copy)
     check_refused(f"waymo:{copy}", says, copy)
-
-
-def test_without_the_package_the_remedy_is_named(root, monkeypatch):
-    monkeypatch.setitem(__import__("sys").modules, "pyarrow.parquet", None)
-    with pytest.raises(InputError, match=r"pip install 'densify\[waymo\]'"):
-        open_sequence(root)

@@ -3,8 +3,6 @@
 
 from __future__ import annotations
 
-import shutil
-
 import numpy as np
 import pytest
 
@@ -35,42 +33,6 @@ def written(street, tmp_path_factory):
     return drive
 
 
-def test_tree_is_kittis(street, written):
-    date = written.parent
-    assert written.name == f"{date.name}_drive_0001_sync"
-    assert {p.name for p in date.iterdir()} == {
-        "calib_cam_to_cam.txt",
-        "calib_velo_to_cam.txt",
-        "calib_imu_to_velo.txt",
-        written.name,
-    }
-    names = [f"{frame:010d}" for frame in FRAMES]
-    for folder, suffix in (
-        ("velodyne_points/data", "bin"),
-        ("image_03/data", "png"),
-        ("oxts/data", "txt"),
-        ("truth/points", "npz"),
-        ("truth/depth/image_03", "npz"),
-    ):
-        found = sorted(p.name for p in (written / folder).iterdir())
-        assert found == [f"{n}.{suffix}" for n in names]
-    stamps = sorted(p.relative_to(written).as_posix() for p in written.rglob("timestamps*.txt"))
-    assert stamps == [
-        "image_03/timestamps.txt",
-        "oxts/timestamps.txt",
-        "velodyne_points/timestamps.txt",
-        "velodyne_points/timestamps_end.txt",
-        "velodyne_points/timestamps_start.txt",
-    ]
-    for path in stamps:
-        lines = (written / path).read_text().splitlines()
-        assert len(lines) == 160
-        assert all(len(line.split(".")[1]) == 9 for line in lines)
-    points = np.fromfile(written / "velodyne_points/data/0000000060.bin", "<f4").reshape(-1, 4)
-    np.testing.assert_array_equal(points[:, :3], street[60].points)
-    assert len((written / "oxts/data/0000000060.txt").read_text().split()) == 30
-
-
 def test_our_own_reader_gives_the_street_back(street, written):
     kitti = KittiRaw(written)
     assert list(kitti.frames) == FRAMES
@@ -90,16 +52,6 @@ def test_our_own_reader_gives_the_street_back(street, written):
     np.testing.assert_allclose(read.T_cam_lidar, ours.T_cam_lidar, atol=1e-12)
     np.testing.assert_allclose(read.K, ours.K, atol=1e-12)
     assert (read.width_px, read.height_px) == (ours.width_px, ours.height_px)
-
-
-def test_recorded_motion_is_that_of_the_poses(street, written):
-    record = np.array((written / "oxts/data/0000000060.txt").read_text().split(), float)
-    before, after = (street.T_world_lidar(frame) for frame in (59, 61))
-    velocity = (after - before)[:3, 3] / 0.2
-    np.testing.assert_allclose(record[[7, 6]], velocity[:2], atol=0.25)  # east, north
-    assert abs(np.hypot(*record[8:10]) - np.hypot(*velocity[:2])) < 0.2
-    yaw = np.arctan2(*(after - before)[[1, 0], 3])
-    assert abs(record[5] - yaw) < 0.05
 
 
 def test_truth_files_equal_the_streets_truth(street, written):
@@ -142,22 +94,6 @@ def test_writing_is_whole_or_not_at_all(street, written, tmp_path):
     assert write_street("kitti", street, tmp_path, FRAMES[1:], [], overwrite=True) == again
     assert not (again / "mine.txt").exists()
     assert list(KittiRaw(again).frames) == FRAMES[1:]
-
-
-def test_another_calibration_is_kept(street, tmp_path):
-    drive = write_street("kitti", street, tmp_path, FRAMES[:1], [])
-    path = drive.parent / "calib_velo_to_cam.txt"
-    ours = path.read_bytes()
-    shutil.rmtree(drive)
-    path.write_text("R: 1\n")
-    with pytest.raises(InputError, match=r"calib_velo_to_cam\.txt: another .* --overwrite"):
-        write_street("kitti", street, tmp_path, FRAMES[:1], [])
-    assert path.read_text() == "R: 1\n" and not drive.exists()
-    path.write_bytes(ours)
-    assert write_street("kitti", street, tmp_path, FRAMES[:1], []) == drive
-    path.write_text("R: 1\n")
-    write_street("kitti", street, tmp_path, FRAMES[:1], [], overwrite=True)
-    assert path.read_bytes() == ours
 
 
 def test_what_cannot_be_written_is_one_clear_line(street, tmp_path):
@@ -207,34 +143,10 @@ def test_missing_or_malformed_truth_files_are_named(tmp_path):
     np.savez(tmp_path / "bodies.npz", T_world_lidar=np.eye(4))
     with pytest.raises(InputError, match=r"bodies\.npz: holds no T_world_body, moving"):
         FileTruth(tmp_path)
-    bodies = _bodies()
-    write_bodies(tmp_path, Bodies(bodies.T_world_lidar[:2], bodies.T_world_body, bodies.moving))
-    with pytest.raises(InputError, match=r"expected T_world_lidar \(F,4,4\)"):
-        FileTruth(tmp_path)
-    write_bodies(tmp_path, bodies)
-    truth = FileTruth(tmp_path)
-    assert truth is not None
-    with pytest.raises(InputError, match="0 to 2"):
-        truth.sweep(3)
+    write_bodies(tmp_path, _bodies())
+    truth, one = FileTruth(tmp_path), np.zeros(1, np.int32)
     with pytest.raises(InputError, match=r"0000000001\.npz: no such truth file"):
         truth.sweep(1)
-    one = np.zeros(1, np.int32)
-    for body, instance, point in (
-        (one + 2, one, np.zeros((1, 3))),
-        (one - 1, one, np.zeros((1, 3))),
-        (one, np.zeros(2, np.int32), np.zeros((1, 3))),
-        (one, one, np.zeros((2, 3))),
-    ):
-        write_points(tmp_path, 1, body, instance, point)
-        with pytest.raises(InputError, match="bodies below 2"):
-            truth.displacement(1, 2)
-    path = tmp_path / "points" / "0000000001.npz"
-    path.write_bytes(path.read_bytes()[:60])
-    with pytest.raises(InputError, match=r"not a readable \.npz file"):
-        truth.sweep(1)
-    with pytest.raises(InputError, match="no such truth file"):
-        truth.depth_m("image_02", 1)
-    (tmp_path / "depth" / "image_02").mkdir(parents=True)
-    np.savez(tmp_path / "depth" / "image_02" / "0000000001.npz", depth_m=np.zeros((2, 2)))
-    with pytest.raises(InputError, match="moving"):
-        truth.moving_mask("image_02", 1)
+    write_points(tmp_path, 1, one + 2, one, np.zeros((1, 3)))
+    with pytest.raises(InputError, match="bodies below 2"):
+        truth.displacement(1, 2)

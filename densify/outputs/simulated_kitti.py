@@ -39,29 +39,22 @@ T_LEVEL_IMU[:3, :3] = Rotation.from_rotvec([0.012, -0.003, -0.001]).as_matrix()
 T_LEVEL_IMU[:3, 3] = [-0.81, 0.32, -0.80]
 _LATITUDE_DEG, _LONGITUDE_DEG, _ALTITUDE_M = 49.0, 8.4, 115.0
 _EARTH_RADIUS_M = 6_378_137.0
-_STEP_NS = 5_000_000  # of the differences that give velocities
 
 
 def write_drive(excerpt: Excerpt, out: Path, overwrite: bool) -> Path:
     """Write the drive and return its folder, complete or not there.
 
     Raises InputError for a camera other than image_02 and image_03, a sensor whose azimuths do not
-    tell the points' times, and for a drive or another calibration that exists, unless
-    ``overwrite`` is set.
+    tell the points' times, and for a drive or calibration that exists, unless ``overwrite`` is set.
     """
     street = excerpt.street
     for name in excerpt.cameras:
         camera_named({n: street.cameras[n] for n in excerpt.cameras if n in USUAL}, name, out)
     check_azimuth_tells_time(street)
     folder, calibration = out / _DATE, _calibration(street.simulator.tilt_deg)
-    for path, data in ((folder / name, data) for name, data in calibration.items()):
-        if path.exists() and not overwrite and path.read_text() != data:
-            raise InputError(
-                f"{path}: another calibration exists; choose another --out, or give --overwrite "
-                f"to replace it"
-            )
-    if (folder / _DRIVE).exists() and not overwrite:
-        raise InputError(f"{folder / _DRIVE}: exists; give --overwrite to replace it")
+    for name in (_DRIVE, *calibration):
+        if (folder / name).exists() and not overwrite:
+            raise InputError(f"{folder / name}: exists; give --overwrite to replace it")
     with staged_folder(folder, (_DRIVE, *calibration)) as staging:
         for name, data in calibration.items():
             put(staging / name, data)
@@ -155,25 +148,20 @@ def _write_stamps(drive: Path, street: Street, cameras: Sequence[str]) -> None:
 
 
 def oxts_line(street: Street, frame: int, first: int) -> str:
-    """An oxts record of the true pose and velocity; its accelerations and turn rates are 0.
+    """An oxts record of the true pose; its velocities, accelerations and turn rates are 0.
 
     first: the frame at the fixed latitude, which is the first frame written: readers take the scale
     of the Mercator projection from the first record.
     """
-    simulator, stamp = street.simulator, street.stamp_ns(frame)
-
-    def T_world_imu(time_ns: int) -> Float:
-        return simulator.T_world_lidar_at(time_ns) @ T_lidar_imu(simulator.tilt_deg)
-
-    before, here, after = (T_world_imu(stamp + i * _STEP_NS) for i in (-1, 0, 1))
-    east_north_up = here[:3, 3] - T_world_imu(street.stamp_ns(first))[:3, 3]
+    T_lidar = T_lidar_imu(street.simulator.tilt_deg)
+    here, start = (
+        street.simulator.T_world_lidar_at(street.stamp_ns(f)) @ T_lidar for f in (frame, first)
+    )
+    east_north_up = here[:3, 3] - start[:3, 3]
     scale_m = np.cos(np.radians(_LATITUDE_DEG)) * _EARTH_RADIUS_M
     lon_deg = _LONGITUDE_DEG + np.degrees(east_north_up[0] / scale_m)
     mercator = np.log(np.tan(np.radians(90 + _LATITUDE_DEG) / 2)) + east_north_up[1] / scale_m
     lat_deg = np.degrees(2 * np.arctan(np.exp(mercator))) - 90
     yaw, pitch, roll = Rotation.from_matrix(here[:3, :3]).as_euler("ZYX")
-    level = Rotation.from_euler("Z", yaw).as_matrix()
-    velocity = (after - before)[:3, 3] / (2e-9 * _STEP_NS)
     place = [lat_deg, lon_deg, _ALTITUDE_M + east_north_up[2], roll, pitch, yaw]
-    motion = [velocity[1], velocity[0], *(level.T @ velocity), *[0.0] * 12]
-    return f"{numbers(np.array([*place, *motion, 0.05, 0.02]))} 4 10 4 4 0\n"
+    return f"{numbers(np.array([*place, *[0.0] * 17, 0.05, 0.02]))} 4 10 4 4 0\n"

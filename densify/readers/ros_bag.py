@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Messages of ROS 1 and ROS 2 bags, by the rosbags package: no ROS is needed.
 
-A bag is read through once, for the time stamp in the header of every message that matters. The
-index of a large bag is kept in the user's cache. Messages are then read one at a time.
+A bag is read through once, for the time stamp in the header of every message that matters.
+Messages are then read one at a time.
 """
 
 from __future__ import annotations
@@ -17,15 +17,10 @@ from threading import RLock
 from typing import Any, NamedTuple
 from urllib.parse import parse_qsl
 
-import numpy as np
-
 from densify.config.errors import InputError
 from densify.config.file_content import reason
-from densify.geometry.types import Int
 from densify.readers.extras import needed
 
-_LARGE_BYTES = 2**28
-_KEPT_BYTES = 2**30
 _MEND = "a bag that was cut off can be mended: rosbag reindex, ros2 bag reindex, mcap recover"
 
 _DRIVERS = ("livox_ros_driver", "livox_ros_driver2", "livox_interfaces")
@@ -49,15 +44,10 @@ POSES = (
     "geometry_msgs/msg/PoseWithCovarianceStamped",
 )
 _USAGE = "#points=/topic,/topic&images=/topic,/topic&poses=/topic, tf or none"
-_PACKETS = re.compile(
-    r"Velodyne(Scan|Packet)|PacketMsg|PandarScan|HesaiPacket|UdpFrame|NebulaPackets|"
-    r"Rslidar(Scan|Packet)|LivoxPacket|BlickfeldPackets"
-)
 _NO_SWEEPS = re.compile(
     r"map|depth|filtered|obstacle|ground|cluster|voxel|radar|local|global|accumulated|registered"
 )
 _NO_PICTURES = re.compile(r"depth|disparity|theora|mask|confidence")
-_BEST_IMAGES = ("image_rect_color", "image_rect", "image_color", "image_raw", "image")
 
 
 class Entry(NamedTuple):
@@ -104,18 +94,16 @@ class Bag:
     def index(self, topics: Collection[str]) -> dict[str, list[Entry]]:
         """Return every message of these topics, whose types begin with a header, by ascending
         stamp."""
-        names, files = sorted(topics), self._files
-        files = [f for one in files for f in (sorted(one.iterdir()) if one.is_dir() else [one])]
-        if sum(file.stat().st_size for file in files) < _LARGE_BYTES:
-            found = self._read_index(names)
-        else:
-            from densify.config.cache import Cache
-
-            state = [(str(f.absolute()), f.stat().st_size, f.stat().st_mtime_ns) for f in files]
-            found = Cache(_KEPT_BYTES).get(
-                "bag", dict[str, Int], [state, names], lambda: self._read_index(names)
-            )
-        return {name: [Entry(*row) for row in found[name].tolist()] for name in names}
+        found: dict[str, list[Entry]] = {topic: [] for topic in topics}
+        for topic, log_ns, raw, _ in self._messages(topics) if topics else ():
+            before = found[topic][-1] if found[topic] else None
+            turn = before.turn + 1 if before is not None and before.log_ns == log_ns else 0
+            try:
+                stamp_ns = _stamp_ns(raw, self._is_ros2)
+            except struct.error:
+                raise InputError(f"{self.path}: {topic}: a message of {len(raw)} bytes") from None
+            found[topic].append(Entry(stamp_ns or log_ns, log_ns, turn))
+        return {topic: sorted(entries) for topic, entries in found.items()}
 
     def message(self, topic: str, entry: Entry) -> Any:
         """Raises InputError if it cannot be read."""
@@ -130,21 +118,8 @@ class Bag:
         for name, _, raw, type_ in self._messages([topic]):
             yield self._decoded(raw, type_, name)
 
-    def _read_index(self, topics: Sequence[str]) -> dict[str, Int]:
-        """Return (n,3) of each topic, the rows `Entry`s."""
-        found: dict[str, list[Entry]] = {topic: [] for topic in topics}
-        for topic, log_ns, raw, _ in self._messages(topics) if topics else ():
-            before = found[topic][-1] if found[topic] else None
-            turn = before.turn + 1 if before is not None and before.log_ns == log_ns else 0
-            try:
-                stamp_ns = _stamp_ns(raw, self._is_ros2)
-            except struct.error:
-                raise InputError(f"{self.path}: {topic}: a message of {len(raw)} bytes") from None
-            found[topic].append(Entry(stamp_ns or log_ns, log_ns, turn))
-        return {t: np.array(sorted(e), np.int64).reshape(-1, 3) for t, e in found.items()}
-
     def _messages(
-        self, topics: Sequence[str], start_ns: int | None = None, stop_ns: int | None = None
+        self, topics: Collection[str], start_ns: int | None = None, stop_ns: int | None = None
     ) -> Iterator[tuple[str, int, bytes, str]]:
         parts = []
         for reader in self._readers:
@@ -286,15 +261,9 @@ def _points(bag: Bag, given: str | None) -> list[Topic]:
             f"{bag.path}: several topics could be the sweeps: {_listed(likely or found)}; name one "
             f"or all lidars of the vehicle: --data 'ros:{bag.path}#points=/topic,/topic'"
         )
-    packets = [t for t in bag.topics.values() if _PACKETS.fullmatch(t.type.rpartition("/")[2])]
-    if packets:
-        raise InputError(
-            f"{bag.path}: holds raw packets only ({_listed(packets)}), no PointCloud2; play it "
-            f"through the sensor's driver (such as velodyne_pointcloud or ouster_ros) and record "
-            f"the points that come out, or give the packets as .pcap"
-        )
     raise InputError(
-        f"{bag.path}: no PointCloud2; got {_listed(list(bag.topics.values())) or 'no messages'}"
+        f"{bag.path}: no PointCloud2; got {_listed(list(bag.topics.values())) or 'no messages'}; "
+        f"play raw packets through the sensor's driver and record the points that come out"
     )
 
 
@@ -323,14 +292,12 @@ def _images(bag: Bag, given: str | None) -> tuple[tuple[Images, ...], tuple[str,
 
 def _guessed_images(topics: Sequence[str]) -> list[str]:
     """Return the best of each place: rectified before raw, whole before compressed."""
-    best: dict[str, tuple[int, str]] = {}
+    best: dict[str, tuple[bool, bool, str]] = {}
     for topic in topics:
         if not _NO_PICTURES.search(topic.lower()):
-            last = topic.removesuffix("/compressed").rpartition("/")[2]
-            rank = _BEST_IMAGES.index(last) if last in _BEST_IMAGES else len(_BEST_IMAGES)
-            order = (2 * rank + topic.endswith("/compressed"), topic)
+            order = ("image_rect" not in topic, topic.endswith("/compressed"), topic)
             best[_place(topic)] = min(best.get(_place(topic), order), order)
-    return [topic for _, topic in best.values()]
+    return [topic for *_, topic in best.values()]
 
 
 def _place(topic: str) -> str:
