@@ -34,11 +34,9 @@ T = TypeVar("T")
 _progress = logging.getLogger("densify.progress")
 _SWEEPS_IN_MEMORY, _IMAGES_IN_MEMORY = 16, 8
 _OPTIONS = {"seed": "0", "sensor": "hdl64", "hz": "10", "tilt": "0", "cameras": ",".join(USUAL)}
-_NUMBERS = {
-    "seed": (int, "a whole number from 0, below 10^18"),
-    "hz": (int, "5, 10, 20"),
-    "tilt": (float, "degrees from -45 to 45"),
-}
+_NUMBERS = "expected degrees of tilt from -45 to 45, hz 5, 10, 20, seed a whole number from 0"
+    "expected degrees of tilt from -45 to 45, hz 5, 10, 20, and a whole number from 0 as seed"
+)
 
 
 class Street:
@@ -64,10 +62,8 @@ class Street:
     ) -> None:
         _check("preset", preset, PRESETS)
         _check("sensor", sensor, SENSORS)
-        numbers = {"seed": seed, "hz": hz, "tilt": tilt_deg}
-        exist = {"seed": 0 <= seed < 10**18, "hz": hz in (5, 10, 20), "tilt": abs(tilt_deg) <= 45}
-        for key in (key for key in numbers if not exist[key]):
-            raise InputError(f"street {key} {numbers[key]:g}: expected {_NUMBERS[key][1]}")
+        if not (0 <= seed < 10**18 and hz in (5, 10, 20) and abs(tilt_deg) <= 45):
+            raise InputError(f"street: got seed {seed}, hz {hz}, tilt {tilt_deg:g}; {_NUMBERS}")
         for name in cameras:
             _check("camera", name, CAMERAS)
         options = f"&hz={hz}" * (hz != 10) + f"&tilt={tilt_deg:g}" * (tilt_deg != 0)
@@ -95,15 +91,12 @@ class Street:
         given = dict(parse_qsl(query, keep_blank_values=True))
         for key in given:
             _check("option", key, _OPTIONS)
-        options, numbers = _OPTIONS | given, dict[str, Any]()
-        for key, (kind, expected) in _NUMBERS.items():
-            try:
-                numbers[key] = kind(options[key])
-            except ValueError:
-                raise InputError(f"street {key} {options[key]!r}: expected {expected}") from None
-        names = () if options["cameras"] == "none" else tuple(options["cameras"].split(","))
-        seed, hz, tilt_deg = numbers.values()
-        return Street(preset or "street", seed, options["sensor"], hz, tilt_deg, names)
+        seed, sensor, hz, tilt, cameras = (_OPTIONS | given).values()
+        names = () if cameras == "none" else tuple(cameras.split(","))
+        try:
+            return Street(preset or "street", int(seed), sensor, int(hz), float(tilt), names)
+        except ValueError as error:
+            raise InputError(f"{spec!r}: {error}; {_NUMBERS}") from None
 
     def __getitem__(self, frame: int) -> Sweep:
         returns = self.returns(frame)
