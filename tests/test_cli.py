@@ -21,8 +21,7 @@ import pytest
 import yaml
 
 from densify.cli import verbs
-from densify.cli.answer import Answer, first_of
-from densify.cli.results import FIRST_OF_RUN
+from densify.cli.answer import Answer
 from densify.cli.verbs import doctor
 from densify.config import Config, as_mapping, resolve
 from densify.config.errors import ComputationError, InputError
@@ -327,12 +326,6 @@ def test_warnings_are_lines_on_stderr_and_those_of_others_are_not_shown(monkeypa
     captured = capsys.readouterr()
     assert captured.out == "result\n" * 2
     assert captured.err == "densify: warning: window cut to frames 0 to 5\n" * 2
-
-
-def test_what_is_opened_first() -> None:
-    files = [Path(f"out/000120/{name}") for name in ("depth_filled/a.png", "cloud.laz", "run.yaml")]
-    names = [path.name for path in first_of([*files, Path("film.webp")], FIRST_OF_RUN)]
-    assert names == ["film.webp", "a.png", "cloud.laz"]
 
 
 def test_a_reader_that_stops_reading_is_no_error_and_a_full_disk_is() -> None:

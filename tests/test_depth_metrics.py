@@ -102,18 +102,6 @@ def test_depth_scores_split_measured_filled_moving_static():
     assert nothing["num_pixels"] == 0 and nothing["coverage"] is None
 
 
-def test_kittis_other_errors_by_hand():
-    # 1/z: 100 - 125, 50 - 40, 20 - 10 per km; ratios 1.25, 1.25 and 2: not below 1.25
-    found, truth = image([8.0, 25.0, 100.0]), image([10.0, 20.0, 50.0])
-    errors = depth_errors(found, truth, focal_px=700.0)
-    assert errors.imae_per_km == pytest.approx((25 + 10 + 10) / 3)
-    assert errors.irmse_per_km == pytest.approx(np.sqrt((625 + 100 + 100) / 3))
-    assert errors.abs_rel == pytest.approx((0.2 + 0.25 + 1) / 3)
-    assert errors.sq_rel == pytest.approx((0.04 + 0.0625 + 1) / 3)
-    assert errors.delta_1 == 0
-    assert errors.delta_2 == errors.delta_3 == pytest.approx(2 / 3)
-
-
 depth_lists = st.lists(
     st.tuples(*[st.just(0.0) | st.floats(0.5, 200.0, width=32)] * 2), min_size=1, max_size=30
 )

@@ -64,7 +64,7 @@ def test_two_files_are_a_pair_whatever_their_names(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("predicted_layout", ["official", "own", "plain", "selected", "drive/own"])
-@pytest.mark.parametrize("truth_layout", ["official", "plain", "selected"])
+@pytest.mark.parametrize("truth_layout", ["official", "selected"])
 def test_layouts_pair_by_frame(tmp_path: Path, predicted_layout: str, truth_layout: str) -> None:
     def path(side: str, layout: str, frame: int) -> Path:
         root = tmp_path / side

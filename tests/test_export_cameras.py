@@ -254,23 +254,16 @@ def test_runs_without_images_or_scene(put) -> None:
 DAMAGE = {
     "scene/scene.json": {
         "views": 3,
-        "views image_02": [],
         "views image_02 K": [[1, 0, 0], [0, 1, 0]],
-        "views image_02 T_cam_key": [[1, 0, 0, "x"]] * 4,
         "views image_02 T_cam_lidar": (2 * np.eye(4)).tolist(),
-        "views image_03 T_cam_key": np.diag([1, 1, -1, 1]).tolist(),
         "views image_02 model": "cone",
         "views image_02 width_px": 0,
-        "views image_02 row_time_s": None,
         "sweeps": {"frame": 1},
     },
     "movers.json": {
         "objects": {"x": 1},
-        "objects 0 size_m": [1, 2],
         "objects 0 poses": [],
-        "objects 0 poses 0 stamp_ns": 1.5,
         "objects 0 poses 1 T_key_object": np.zeros((4, 4)).tolist(),
-        "objects 0 poses 0 velocity_m_s": "fast",
         "objects 0 poses 0 frame": 7,
     },
 }

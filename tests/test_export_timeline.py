@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import subprocess
-import sys
 from collections import defaultdict
 from pathlib import Path
 from typing import Any
@@ -18,7 +17,6 @@ from densify.outputs import export_run, read_cloud, read_depth_png, write_result
 from densify.outputs.export.finished_run import finished_runs
 from densify.outputs.export.timeline import timelines
 from densify.pipeline.run import run
-from tests.command import refused
 from tests.exported import street_result, write_street, write_views
 from tests.small_street import KEY, POSES_GIVEN, one_car
 
@@ -228,10 +226,3 @@ def test_rrd_of_one_key_and_of_a_drive(street: Path, drive: Path, tmp_path: Path
     path = tmp_path / "a" / "recording.rrd"
     done = subprocess.run(["rerun", "rrd", "verify", path], capture_output=True, text=True)
     assert done.returncode == 0 and "without error" in done.stdout + done.stderr
-
-
-def test_a_viewer_that_is_not_installed_is_named(street: Path, monkeypatch, capsys) -> None:
-    for package in ("rerun", "open3d"):
-        monkeypatch.setitem(sys.modules, package, None)
-        line = refused(capsys, 2, "view", street, "--with", package)
-        assert f"pip install 'densify[{package}]'" in line

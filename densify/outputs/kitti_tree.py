@@ -157,12 +157,9 @@ Confidence is an 8-bit gray PNG: 255 is most certain, 0 is no depth. It ranks pi
 probability: (value - 1) / 254 is 0 to 1.
 
   depth_m = cv2.imread(path, cv2.IMREAD_UNCHANGED) / 256.0
-  depth_m = np.asarray(PIL.Image.open(path), np.float32) / 256.0
 
 All maps show the moment in which their own image was exposed (the middle of the sweep, where the
-settings say "at: sweep"). velodyne_raw is densify's own projection: the sweep with the sensor's
-motion undone, seen from where the camera was at that moment. KITTI's files of that name were
-projected otherwise and differ.
+settings say "at: sweep"). velodyne_raw is densify's own projection and differs from KITTI's files.
 
 Images are not copied; they are those of the recordings. dataset.json says which recordings these
 are, and has the cameras' calibration. manifest.jsonl (or manifest-1of4.jsonl and so on) has one
