@@ -138,23 +138,19 @@ def config_of(options: argparse.Namespace) -> Config:
     return resolve(options.config, [*options.overrides, *short])
 
 
-def check_new_file(
-    path: Path, overwrite: bool, suffix: str = ".npz", option: str = "--out"
-) -> None:
+def check_new_file(path: Path, overwrite: bool, suffix: str = ".npz") -> None:
     """Raise InputError, before the computation, if the file exists or cannot be made."""
     if path.suffix != suffix:
-        raise InputError(f"{option} {path}: expected a name that ends in {suffix}")
+        raise InputError(f"--out {path}: expected a name that ends in {suffix}")
     if path.is_dir():
-        raise InputError(f"{option} {path}: is a folder, expected the name of a {suffix} file")
+        raise InputError(f"--out {path}: is a folder, expected the name of a {suffix} file")
     if path.exists() and not overwrite:
-        raise InputError(
-            f"{option} {path}: already there and kept; give --overwrite or another name"
-        )
+        raise InputError(f"--out {path}: already there and kept; give --overwrite or another name")
     place = path.parent
     while not os.path.lexists(place):
         place = place.parent
     if not (place.is_dir() and os.access(place, os.W_OK | os.X_OK)):
-        raise InputError(f"{option} {path}: cannot write in {place}; choose another")
+        raise InputError(f"--out {path}: cannot write in {place}; choose another")
 
 
 def sliced(sequence: LidarSequence, keys: slice) -> list[int]:

@@ -10,7 +10,6 @@ from densify.outputs.depth_png import (
     write_depth_png,
 )
 from densify.outputs.export import Export, export_run
-from densify.outputs.png import write_picture
 from densify.outputs.store import check_writable, write_comparison, write_result
 
 __all__ = [
@@ -26,6 +25,5 @@ __all__ = [
     "write_comparison",
     "write_confidence_png",
     "write_depth_png",
-    "write_picture",
     "write_result",
 ]
