@@ -37,7 +37,7 @@ def test_flow_between_two_files(tmp_path: Path, capsys: pytest.CaptureFixture[st
 @pytest.mark.parametrize(
     ("name", "content", "part"),
     [
-        ("absent.npy", None, "no such file"),
+        ("absent.npy", None, "No such file"),
         ("flat.npy", np.zeros(9), "shape (9,)"),
         ("none.npy", np.zeros((0, 3)), "holds no points"),
         ("nan.npy", np.array([[1, 2, 3], [1, np.nan, 3]]), "1 of 2 points are not finite"),
