@@ -35,8 +35,6 @@ _progress = logging.getLogger("densify.progress")
 _SWEEPS_IN_MEMORY, _IMAGES_IN_MEMORY = 16, 8
 _OPTIONS = {"seed": "0", "sensor": "hdl64", "hz": "10", "tilt": "0", "cameras": ",".join(USUAL)}
 _NUMBERS = "expected degrees of tilt from -45 to 45, hz 5, 10, 20, seed a whole number from 0"
-    "expected degrees of tilt from -45 to 45, hz 5, 10, 20, and a whole number from 0 as seed"
-)
 
 
 class Street:
