@@ -172,8 +172,8 @@ def test_what_cannot_be_paired_is_refused(tmp_path: Path) -> None:
     truth, other = put(tmp_path / "t" / "5.png"), put(tmp_path / "p" / "6.png")
     (tmp_path / "empty").mkdir()
     line = refusal(other.parent, truth.parent)
-    assert line.startswith("no pair: ") and "frame 6" in line and "frame 5" in line
-    assert "holds no PNG" in refusal(tmp_path / "empty", truth)
+    assert line.startswith("no pair of ") and "6.png" in line and "5.png" in line
+    assert "with PNG files" in refusal(tmp_path / "empty", truth)
     assert "no such file" in refusal(other.parent, tmp_path / "nowhere")
     assert refusal(other, truth.parent).startswith("no pair")
 

@@ -76,10 +76,9 @@ def pair_depth_files(
     """Pair the PNG files of two places, and masks with them.
 
     predicted, truth, mask: a file or a folder with everything under it; two files are a pair
-    whatever their names. The drive or camera is compared only if both sides' names say it. Where a
-    folder holds a layout other than the plain one, files outside it are no depth maps. Of densify's
-    own maps the measured ones are taken (``depth``, or ``groundtruth`` of a set), or the filled
-    ones if ``filled``; of a truth with KITTI's ``groundtruth`` nothing else.
+    whatever their names. The drive or camera is compared only if both sides' names say it. Files
+    outside a known layout are passed over. Of densify's own maps the measured ones are taken, or
+    the filled ones if ``filled``; of a truth with KITTI's ``groundtruth`` nothing else.
 
     Raises InputError if a place is missing, names are ambiguous, or nothing pairs.
     """
@@ -95,8 +94,8 @@ def pair_depth_files(
     matched = _match(found, true, predicted, truth)
     if not matched:
         raise InputError(
-            f"no pair: {_example(found, predicted)}, {_example(true, truth)}; expected the same "
-            f"drive, camera and frame, or equal names, on both sides"
+            f"no pair of {found[0].path} and {len(found) - 1} more with {true[0].path} and "
+            f"{len(true) - 1} more; expected the same drive, camera and frame, or equal names"
         )
     masks: Mapping[Path, Path] = {}
     if mask is not None:
@@ -115,16 +114,13 @@ def _found(place: Path, what: str) -> list[_File]:
     """Return the PNG files of a place by path; plain ones only if there are no others."""
     if place.is_file():
         return [_parsed(place, place.parent)]
-    if not place.is_dir():
-        raise InputError(f"{what} {place}: no such file or folder")
+    paths = sorted(place.rglob("*.png"))
     # Hidden files are unfinished results.
-    paths = [
-        path
-        for path in sorted(place.rglob("*.png"))
-        if not any(part.startswith(".") for part in path.relative_to(place).parts)
-    ]
+    paths = [p for p in paths if "/." not in f"/{p.relative_to(place).as_posix()}"]
     if not paths:
-        raise InputError(f"{what} {place}: holds no PNG files, expected depth maps")
+        raise InputError(
+            f"{what} {place}: no such file or folder with PNG files, expected depth maps"
+        )
     files = [_parsed(path, place) for path in paths]
     return [file for file in files if file.product is not None] or files
 
@@ -172,10 +168,8 @@ def _match(
     left, right = _with_drives(left, right), _with_drives(right, left)
     everything = (*left, *right)
     told = [n for n in ("drive", "camera") if all(getattr(f, n) is not None for f in everything)]
-    here, there = (
-        _keyed(files, ["frame", *told], place)
-        for files, place in ((left, left_place), (right, right_place))
-    )
+    here = _keyed(left, ["frame", *told], left_place)
+    there = _keyed(right, ["frame", *told], right_place)
     return {path: here[key] for key, path in there.items() if key in here}
 
 
@@ -187,22 +181,15 @@ def _with_drives(files: Sequence[_File], others: Sequence[_File]) -> Sequence[_F
     return [replace(file, drive=file.drive or file.folder) for file in files]
 
 
-def _keyed(
-    files: Sequence[_File], names: Sequence[str], place: Path
-) -> dict[tuple[str, ...], Path]:
-    keyed: dict[tuple[str, ...], Path] = {}
+def _keyed(files: Sequence[_File], names: Sequence[str], place: Path) -> dict[str, Path]:
+    keyed: dict[str, Path] = {}
     for file in files:
-        key = tuple(getattr(file, name) for name in names)
+        key = " ".join(f"{name} {getattr(file, name)}" for name in names)
         if key in keyed:
             raise InputError(
                 f"{place}: {keyed[key].relative_to(place)} and {file.path.relative_to(place)} are "
-                f"both {' '.join(f'{n} {k}' for n, k in zip(names, key, strict=True))}, by what "
-                f"the names on both sides say; give one drive, camera and product at a time"
+                f"both {key}, by what the names on both sides say; give one drive, camera and "
+                f"product at a time"
             )
         keyed[key] = file.path
     return keyed
-
-
-def _example(files: Sequence[_File], place: Path) -> str:
-    says = [f"{n} {v}" for n in ("drive", "camera", "frame") if (v := getattr(files[0], n))]
-    return f"{place} has {len(files)} file{'s' * (len(files) != 1)} such as {' '.join(says)}"

@@ -6,6 +6,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 
 from densify.config.errors import InputError
@@ -108,28 +109,34 @@ def in_time(
     are times are numbered from 0, others as their names say. Raises InputError if a name or a line
     is missing, two files have one number, or the stamps do not ascend.
     """
-    names = [named(path, unit if stamps == "names" else "") for path in paths]
+    by_names = stamps == "names"
+    names = [named(path, unit if by_names else "") for path in paths]
     unnamed = [name.path for name in names if name.stamp_ns is None]
-    if stamps == "names" and unnamed:
+    if by_names and unnamed:
         raise InputError(
             f"{unnamed[0]}: its name is no time; expected such as 1317042651.468569638, or a "
             f"stamps_unit beside stamps: names in densify.yaml"
         )
-    if stamps == "sweeps":
-        return Series(_numbered(names), None, "")
-    file = None if stamps == "names" else _stamp_file(root, paths[0].parent, stamps, shared)
-    if file is None and not unnamed:
-        ordered = sorted(names, key=lambda name: (name.stamp_ns or 0, name))
+    file = None
+    if stamps not in ("names", "sweeps"):
+        file = _stamp_file(root, paths[0].parent, stamps, shared)
+    if file is None and not unnamed and stamps != "sweeps":
+        ordered = sorted(names, key=lambda name: (name.stamp_ns or 0, name.path))
         found = {number: name.stamp_ns or 0 for number, name in enumerate(ordered)}
-        _check_ascending(found, [name.path for name in ordered])
-        return Series({n: o.path for n, o in enumerate(ordered)}, found, "the names of the files")
-    by_number = _numbered(names)
-    if file is None:
-        return Series(by_number, None, "")
-    read = StampFile.read(file, unit)
-    found = _matched(read, by_number)
-    _check_ascending(found, [file] * len(found))
-    return Series(by_number, found, f"{file.name} in {read.unit}")
+        by_number, told_by = {n: o.path for n, o in enumerate(ordered)}, "the names of the files"
+    else:
+        by_number = _numbered(names)
+        if file is None:
+            return Series(by_number, None, "")
+        read = StampFile.read(file, unit)
+        found, told_by = _matched(read, by_number), f"{file.name} in {read.unit}"
+    for before, number in pairwise(found):
+        if found[number] <= found[before]:
+            raise InputError(
+                f"{file or by_number[number]}: the time of number {number} is {found[number]} ns, "
+                f"not after {found[before]} ns of the one before; expected times that ascend"
+            )
+    return Series(by_number, found, told_by)
 
 
 def _numbered(names: Sequence[Named]) -> dict[int, Path]:
@@ -168,16 +175,6 @@ def _matched(file: StampFile, paths: Mapping[int, Path]) -> dict[int, int]:
         f"{file.path}: got {len(file.stamp_ns)} times for {len(paths)} files numbered up to "
         f"{max(paths)}, expected one for each file, or one for each number from 0"
     )
-
-
-def _check_ascending(stamps_ns: Mapping[int, int], where: Sequence[Path]) -> None:
-    values = list(stamps_ns.values())
-    for i in range(1, len(values)):
-        if values[i] <= values[i - 1]:
-            raise InputError(
-                f"{where[i]}: the time of number {list(stamps_ns)[i]} is {values[i]} ns, not after "
-                f"{values[i - 1]} ns of the one before; expected times that ascend"
-            )
 
 
 def _stamp_file(root: Path, folder: Path, name: str, shared: bool) -> Path | None:
