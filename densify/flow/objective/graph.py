@@ -9,13 +9,11 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.sparse import coo_array, csr_array
+from scipy.sparse import csr_array, diags_array, eye_array
 from scipy.spatial import cKDTree
 
 from densify.config.errors import InputError
 from densify.geometry.types import Float
-
-LAPLACIANS = ("symmetric", "row-sum-zero")
 
 
 def checked_cloud(values: ArrayLike, name: str) -> Float:
@@ -50,58 +48,30 @@ def knn_graph(points: Float, num_neighbors: int) -> csr_array:
     either point is among the k nearest of the other, 1 on the diagonal, 0 elsewhere.
     Raises InputError for no points, NaN, or k < 1.
     """
-    return radius_graph(points, np.inf, num_neighbors)
-
-
-def radius_graph(points: Float, radius_m: float, max_neighbors: int) -> csr_array:
-    """Return weights as `knn_graph` does, with edges no longer than ``radius_m``.
-
-    max_neighbors: each point lists at most this many points, the nearest ones.
-    Raises InputError as `knn_graph` does, and for a radius that is not positive.
-    """
-    if not radius_m > 0:
-        raise InputError(f"radius_m: got {radius_m:g}, expected a positive number of metres")
-    if max_neighbors < 1:
-        raise InputError(f"num_neighbors: got {max_neighbors}, expected at least 1")
+    if num_neighbors < 1:
+        raise InputError(f"num_neighbors: got {num_neighbors}, expected at least 1")
     points = checked_cloud(points, "points")
     num = len(points)
-    num_listed = min(max_neighbors, num - 1) + 1  # the point itself is among them
+    num_listed = min(num_neighbors, num - 1) + 1  # the point itself is among them
     nearest = cKDTree(points).query(points, np.arange(1, num_listed + 1))
     distance_m, column = (np.ravel(found) for found in nearest)
     row = np.repeat(np.arange(num), num_listed)
-    # Among more than k duplicates a point may not find itself: the diagonal is set apart.
-    linked = (distance_m <= radius_m) & (column != row)
-    weight = np.exp(-(distance_m[linked] ** 2))
-    listed = csr_array((weight, (row[linked], column[linked])), shape=(num, num))
-    own = coo_array((np.ones(num), (np.arange(num), np.arange(num))), shape=(num, num))
-    union = csr_array(listed.maximum(listed.T) + own.tocsr())
-    union.sort_indices()
-    return union
+    other = column != row  # among more than k duplicates a point may not find itself
+    listed = csr_array(
+        (np.exp(-(distance_m[other] ** 2)), (row[other], column[other])), shape=(num, num)
+    )
+    weights = csr_array(listed.maximum(listed.T) + eye_array(num))
+    weights.sort_indices()
+    return weights
 
 
-def laplacian(weights: csr_array, kind: str = "symmetric") -> csr_array:
-    """Return the (n,n) Laplacian L of a graph: symmetric, positive semi-definite, float64.
+def laplacian(weights: csr_array) -> csr_array:
+    """Return ``L = D^-1/2 (D - W) D^-1/2``, (n,n) symmetric, positive semi-definite, float64.
 
-    weights: W of `knn_graph` or `radius_graph`. The degree D holds the row sums of W with the
-    self-weight ``W_ii = 1``, as in the paper. A point without neighbours has a row of zeros.
-
-    kind:
-        "symmetric" (the paper's): ``L = D^-1/2 (D - W) D^-1/2``. Eigenvalues in [0, 2). Its null
-        space is ``D^1/2 · 1``: a constant flow costs energy where the density changes.
-        "row-sum-zero": ``L = (D - W) / mean(D)``. Its null space is the constant flows of each
-        connected part. Dense parts are stiffer than sparse ones.
-
-    Raises InputError for another kind.
+    weights: W of `knn_graph`. The degree D holds the row sums of W with the self-weight
+    ``W_ii = 1``, as in the paper. The null space of L is ``D^1/2 · 1``: a constant flow costs
+    energy where the density changes.
     """
-    if kind not in LAPLACIANS:
-        raise InputError(f"laplacian: got {kind!r}, expected one of {', '.join(LAPLACIANS)}")
     degree = weights.sum(axis=1)
-    row = np.repeat(np.arange(len(degree)), np.diff(weights.indptr))
-    column = weights.indices
-    values = np.where(row == column, degree[row], 0.0) - weights.data
-    if kind == "symmetric":
-        scale = 1.0 / np.sqrt(degree)
-        values *= scale[row] * scale[column]
-    else:
-        values /= degree.mean()
-    return csr_array((values, column, weights.indptr), shape=weights.shape)
+    scale = diags_array(1.0 / np.sqrt(degree))
+    return csr_array(scale @ (diags_array(degree) - weights) @ scale)
