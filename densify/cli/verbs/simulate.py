@@ -48,10 +48,7 @@ def answer(options: argparse.Namespace) -> Iterator[Answer]:
     from densify.outputs.simulated_street import write_street
     from densify.readers.street import Street
 
-    spec = recording_of(options)
-    if not spec.startswith("street"):
-        raise InputError(f"simulate {spec}: expected street[:PRESET][?seed=N&sensor=NAME&hz=RATE]")
-    street = Street.from_spec(spec)
+    street = Street.from_spec(recording_of(options))
     frames = _frames_of(street, options.frames)
     with progress_on_stderr() as progress:
         place = write_street(
