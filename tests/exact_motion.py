@@ -14,7 +14,6 @@ from densify.geometry.types import FlowField, RegisteredSweep, Stretch, Sweep
 FRAMES = range(100, 107)
 KEY = 103
 PAIRS = [(f, t) for f in FRAMES for t in FRAMES if f != t]
-STEP_S = 0.1
 NUM_STATIC, NUM_MOVING = 20, 15
 CAR = 4
 

@@ -57,9 +57,8 @@ def slow_align(model: Model, points, predicted) -> np.ndarray | None:
     return state
 
 
-@pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("num_points", [6, 40, 600])
-def test_the_alignment_is_its_slow_twin(num_points: int, seed: int) -> None:
+def test_the_alignment_is_its_slow_twin(num_points: int, seed: int = 0) -> None:
     rng = np.random.default_rng(seed)
     model = Model(corner(900, seed))
     true = np.array([*rng.normal(0, 0.5, 2), rng.normal(0, 0.1), rng.normal(0, 0.3)])

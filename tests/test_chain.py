@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from densify.flow.chained import ChainedMotion
-from densify.geometry import poses
 from densify.geometry.types import FlowField
 from tests.exact_motion import (
     FRAMES,
@@ -15,7 +14,6 @@ from tests.exact_motion import (
     NUM_MOVING,
     NUM_STATIC,
     PAIRS,
-    STEP_S,
     T_world_lidar,
     chained,
     drifting,
@@ -34,14 +32,6 @@ def test_steps_compose_exactly_though_every_sweep_has_other_points(body):
         found = in_world(frame, flow.displacement)[NUM_STATIC:]
         np.testing.assert_allclose(found, true_flow(motion, frame, target, body), atol=1e-6)
         assert not flow.lost.any()
-
-
-def test_to_itself_a_sweep_does_not_move():
-    motion = scene()
-    for frame in FRAMES:
-        flow = motion.flow(frame, frame)
-        assert flow.displacement.shape == motion.stretch[frame].sweep.points.shape
-        assert not flow.total.any() and not flow.lost.any()
 
 
 def test_each_step_is_asked_for_once_when_needed_and_never_written_to():
@@ -81,38 +71,12 @@ def test_lost_where_a_sweep_in_between_has_nothing_of_the_object(missing):
             np.testing.assert_allclose(found, true_flow(motion, frame, target), atol=1e-6)
 
 
-def test_what_was_lost_before_stays_lost():
-    motion = scene()
-
-    def step(here: int, there: int) -> FlowField:
-        flow = motion.step(here, there)
-        flow.lost[NUM_STATIC] = here == 0
-        return flow
-
-    for target in FRAMES[1:]:
-        lost = ChainedMotion(motion.stretch, step).flow(FRAMES[0], target).lost
-        assert np.flatnonzero(lost).tolist() == [NUM_STATIC]
-
-
 @pytest.mark.parametrize("num_points", [1, 2])
 def test_objects_of_one_or_two_points_move_without_turning(num_points):
     motion = scene(drifting, sizes=dict.fromkeys(FRAMES, num_points))
     for frame, target in PAIRS:
         found = in_world(frame, motion.flow(frame, target).displacement)[NUM_STATIC:]
         np.testing.assert_allclose(found, true_flow(motion, frame, target, drifting), atol=1e-6)
-
-
-def test_points_on_a_line_do_not_spin_about_it():
-    rng = np.random.default_rng(1)
-    line = {f: np.outer(rng.uniform(-2, 2, 8), [1.0, 0.2, 0.0]) for f in FRAMES}
-    points = {f: poses.transform(drifting(f), line[f]) for f in FRAMES}
-    step = np.array([1.5, -0.5, 0.1])
-    motion = chained(
-        points, lambda f, t: np.tile(step * (t - f), (8, 1)), dict.fromkeys(FRAMES, np.zeros(8))
-    )
-    for frame, target in PAIRS:
-        found = in_world(frame, motion.flow(frame, target).displacement)
-        np.testing.assert_allclose(found, np.tile(step * (target - frame), (8, 1)), atol=1e-6)
 
 
 def test_what_is_not_rigid_follows_its_nearest():
@@ -168,13 +132,3 @@ def test_the_velocity_is_that_of_the_last_step():
         np.testing.assert_allclose(
             velocity_m_s, np.tile([15.0, -5.0, 1.0], (NUM_MOVING, 1)), atol=1e-6
         )
-    slower = chained(  # 0.6, 0.5, 0.4, … m per sweep
-        {f: np.full((1, 3), 0.05 * (f - 107) ** 2) for f in FRAMES},
-        lambda f, t: np.full((1, 3), 0.05 * ((t - 107) ** 2 - (f - 107) ** 2)),
-        dict.fromkeys(FRAMES, np.zeros(1)),
-    )
-    for frame, target in PAIRS:
-        before = target - int(np.sign(target - frame))
-        expected = 0.05 * ((target - 107) ** 2 - (before - 107) ** 2) / (STEP_S * (target - before))
-        found = in_world(frame, slower.flow(frame, target).velocity_m_s)
-        np.testing.assert_allclose(found, np.full((1, 3), expected), atol=1e-6)

@@ -112,15 +112,6 @@ def test_same_input_gives_the_same_bytes(settings: SolverSettings) -> None:
     assert first.energies == second.energies
 
 
-def test_input_is_left_alone_and_may_be_any_real_type() -> None:
-    source, target = (x.astype(np.float32) for x in street(9, 200))
-    initial = np.zeros(source.shape)
-    kept = source.copy(), target.copy()
-    solution = solve(source, target, initial=initial)
-    assert solution.flow.any() and not initial.any()
-    assert np.array_equal(source, kept[0]) and np.array_equal(target, kept[1])
-
-
 def test_map_coordinates_lose_nothing() -> None:
     source, target = street(10, 400)
     origin = np.array([2.0**19, 2.0**22, 64.0])

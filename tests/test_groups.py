@@ -14,6 +14,7 @@ from tests.scenes import SWEEP_S, Arc, Box, Scanner, Scene, World, car, street
 # --- nothing moves --------------------------------------------------------------------------------
 
 
+SPARSE = Scanner(32, 1080, (-30.7, 10.7), 0.01)
 FOLIAGE = [
     Box((6, 1.5, 2.0), Arc(x, y), solid=0.5) for x, y in ((8, 5.5), (15, -6), (-6, 6), (20, 4.6))
 ]
@@ -23,12 +24,10 @@ FOLIAGE = [
     ("extra", "scanner", "ego"),
     [
         ((), Scanner(), Arc(0, -1.5, 0, 12.0, 0.2)),
-        ((), Scanner(sigma_m=0.03), Arc(0, -1.5, 0, 12.0, -0.1)),
         ((), NOISE, Arc(0, -1.5)),
-        (FOLIAGE, NOISE, Arc(0, -1.5, 0, 8.0, 0.1)),
         (FOLIAGE, Scanner(32, 900, (-25.0, 5.0), 0.02), Arc(0, -1.5, 0, 8.0, 0.1)),
     ],
-    ids=["clean, turning", "noise", "standing", "foliage", "foliage, 32 beams"],
+    ids=["turning", "standing", "foliage, 32 beams"],
 )
 def test_a_static_world_has_no_flow_to_the_last_bit(extra, scanner, ego):
     found = Found.of((), ego, size=3, scanner=scanner, extra=extra)
@@ -38,17 +37,12 @@ def test_a_static_world_has_no_flow_to_the_last_bit(extra, scanner, ego):
         assert (flow.instance == -1).all()
 
 
-@pytest.mark.parametrize(
-    "scanner",
-    [Scanner(32, 1080, (-30.7, 10.7), 0.01), Scanner(16, 900, (-15.0, 15.0), 0.01)],
-    ids=["32 beams", "16 beams"],
-)
-def test_guard_rails_seen_between_rings_stay(scanner):
+def test_guard_rails_seen_between_rings_stay():
     """They lie 6.5 and 7 m beside a vehicle at 25 m/s; 5 to 11 % of them moved with it."""
     rails = [Box((200.0, 0.08, 0.28), Arc(60.0, y), base_m=0.45) for y in (-7.0, 6.5)]
     posts = [Box((0.1, 0.1, 0.7), Arc(x, y)) for x in range(-40, 160, 4) for y in (-7.0, 6.5)]
     poles = [Box((0.3, 0.3, 6.0), Arc(x, y)) for x in range(-40, 160, 17) for y in (-16.0, 15.0)]
-    highway = Scene(World((*rails, *posts, *poles)), Arc(0, 0, 0, 25.0), scanner)
+    highway = Scene(World((*rails, *posts, *poles)), Arc(0, 0, 0, 25.0), SPARSE)
     found = Found.around(8, highway, 5)
     assert not any(flow.moving.any() for flow in found.fields)
 
@@ -106,13 +100,9 @@ def test_same_bytes_every_time(traffic):
         assert a.instance.tobytes() == b.instance.tobytes()
 
 
-@pytest.fixture(scope="module")
-def truck() -> Found:
+def test_a_turning_truck():
     box = car(26, 1.5, 5, 1, yaw=np.pi * 0.75, turn_rad_s=0.4, size_m=(9.0, 2.4, 3.0))
-    return Found.of([box], Arc(0, -1.5, 0, 3.0))
-
-
-def test_a_turning_truck(truck):
+    truck = Found.of([box], Arc(0, -1.5, 0, 3.0))
     assert truck.share_moving(1) > 0.6
     assert np.median(truck.errors_m(1)) < 0.05
     assert truck.false_share() < 2e-4
@@ -121,13 +111,10 @@ def test_a_turning_truck(truck):
     assert np.ptp(true, axis=0).max() > 0.1
 
 
-@pytest.mark.parametrize(
-    ("x", "least_share", "median_m", "most_m"), [(20, 0.8, 0.05, 0.1), (30, 0.88, 0.2, 0.3)]
-)
-def test_the_trailer_of_a_turning_truck_is_found(x, least_share, median_m, most_m):
+def test_the_trailer_of_a_turning_truck_is_found():
     """Its long side slides along itself: nothing but the tractor tells how fast. Half of it is seen
     to move and goes where it does not point; the other half lies where it points."""
-    tractor, lag_rad, wheelbase_m = Arc(x, 1.0, np.pi * 0.75, 4.0, 0.4), 0.45, 9.0
+    tractor, lag_rad, wheelbase_m = Arc(20, 1.0, np.pi * 0.75, 4.0, 0.4), 0.45, 9.0
     at_key_s = KEY * SWEEP_S
     x, y, yaw = tractor.at(at_key_s)
     kingpin = np.array([x - 1.5 * np.cos(yaw), y - 1.5 * np.sin(yaw)])
@@ -140,9 +127,9 @@ def test_the_trailer_of_a_turning_truck_is_found(x, least_share, median_m, most_
     boxes = [Box((5.5, 2.5, 3.2), tractor, 0.5, 1), Box((10.5, 2.5, 3.0), trailer, 0.9, 2)]
     found = Found.of(boxes, Arc(0, -1.5, 0, 2.0), 5, Scanner(64, 1800, (-24.8, 2.0), 0.01))
     assert found.share_moving(1) > 0.9
-    assert found.share_moving(2) > least_share
-    assert np.median(found.errors_m(2)) < median_m
-    assert np.quantile(found.errors_m(2), 0.9) < most_m
+    assert found.share_moving(2) > 0.8
+    assert np.median(found.errors_m(2)) < 0.05
+    assert np.quantile(found.errors_m(2), 0.9) < 0.1
     assert found.false_share() < 1e-3
 
 
@@ -156,14 +143,13 @@ def test_a_flat_back_that_is_followed_for_long_does_not_slide_aside():
     assert np.abs(np.concatenate(aside)).max() < 0.25
 
 
-@pytest.mark.parametrize(("behind_m", "yaw_rad", "ego_m_s"), [(12, 0.0, 12), (14, 0.15, 10)])
-def test_a_flat_front_that_turns_does_not_slide_aside(behind_m, yaw_rad, ego_m_s):
+def test_a_flat_front_that_turns_does_not_slide_aside():
     """It goes where its heading does, and the front alone hardly tells where that is."""
     middle, turn_rad_s = 8, 0.4
-    ego = Arc(0, -1.5, 0, ego_m_s)
-    turning = Arc(0, 0, yaw_rad - turn_rad_s * middle * SWEEP_S, 12, turn_rad_s)
+    ego = Arc(0, -1.5, 0, 10)
+    turning = Arc(0, 0, 0.15 - turn_rad_s * middle * SWEEP_S, 12, turn_rad_s)
     x, y, _ = np.array(ego.at(middle * SWEEP_S)) - turning.at(middle * SWEEP_S)
-    box = Box((4.4, 1.8, 1.5), replace(turning, x=x - behind_m, y=y), 0.25, 1)
+    box = Box((4.4, 1.8, 1.5), replace(turning, x=x - 14, y=y), 0.25, 1)
     scene = Scene(World((*street(60.0), box)), ego, FLAT_BACK)
     found = Found.around(middle, scene, 6)
     assert found.share_moving(1, reach=6) > 0.9
@@ -202,14 +188,10 @@ def test_cars_in_a_row_keep_their_own_motion():
                 assert np.median(length) == pytest.approx(0.1 * speed_m_s, abs=0.08)
 
 
-@pytest.fixture(scope="module")
-def pillar() -> Found:
-    """A car crosses behind it."""
+def test_a_car_that_passes_behind_a_pillar():
     standing = Box((0.8, 0.8, 5.0), Arc(15, -1.2))
-    return Found.of([car(22, 3, 9, 1, yaw=-np.pi / 2)], Arc(0, -1.5, 0, 3.0), extra=[standing])
-
-
-def test_a_car_that_passes_behind_a_pillar(pillar):
+    car_behind = car(22, 3, 9, 1, yaw=-np.pi / 2)
+    pillar = Found.of([car_behind], Arc(0, -1.5, 0, 3.0), extra=[standing])
     assert pillar.share_moving(1) > 0.7
     # on both sides of the pillar it is the same car
     before = [f.instance[(s.instance == 1) & f.moving] for k, s, f in pillar.near_key() if k < KEY]
@@ -230,7 +212,7 @@ def test_a_stretch_of_one_sweep_has_no_flow():
 # --- from any sweep to any other ------------------------------------------------------------------
 
 
-ANY_PAIRS = [(1, 9), (8, 1), (3, 4), (4, 7), (8, 6)]
+ANY_PAIRS = [(1, 9), (8, 1), (3, 4)]
 
 
 @pytest.mark.parametrize(("frame", "target"), ANY_PAIRS)

@@ -38,7 +38,7 @@ def rms(off: np.ndarray) -> float:
 # --- exact ----------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("degree", "num"), [(1, 3), (1, 4), (2, 5), (2, 7), (2, 11), (2, 40)])
+@pytest.mark.parametrize(("degree", "num"), [(1, 4), (2, 5), (2, 40)])
 def test_constant_acceleration_is_recovered_exactly_and_of_few_sweeps_constant_velocity(
     degree, num
 ):
@@ -106,7 +106,7 @@ def test_four_sweeps_do_not_tell_an_acceleration(num):
 # --- noise ----------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("num", [5, 7, 11, 20])
+@pytest.mark.parametrize("num", [5, 11])
 def test_the_residual_of_noise_is_about_the_noise(num):
     """Though the fit swallows some of it."""
     t = times_of(num)

@@ -3,14 +3,12 @@
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from densify.flow.objective.solvers import SolverSettings, solve
 from densify.flow.tracking import soften as module
 from densify.flow.tracking.soften import Part, Softened, soften
 
@@ -31,9 +29,9 @@ class Body:
     @staticmethod
     def walker() -> Body:
         rng = np.random.default_rng(5)
-        trunk = tube(rng, 30000, (0.0, 0.0), 0.9, 1.7, 0.17)
-        left = tube(rng, 20000, (0.0, 0.12), 0.0, 0.9, 0.08)
-        right = tube(rng, 20000, (0.0, -0.12), 0.0, 0.9, 0.08)
+        trunk = tube(rng, 15000, (0.0, 0.0), 0.9, 1.7, 0.17)
+        left = tube(rng, 10000, (0.0, 0.12), 0.0, 0.9, 0.08)
+        right = tube(rng, 10000, (0.0, -0.12), 0.0, 0.9, 0.08)
         limb = np.repeat([TRUNK, LEFT, RIGHT], [len(trunk), len(left), len(right)])
         return Body(np.concatenate([trunk, left, right]), limb)
 
@@ -41,7 +39,7 @@ class Body:
     def column(length_m: float = 0.0) -> Body:
         """Two upright tubes that do not move, as far apart as is said."""
         rng = np.random.default_rng(6)
-        near = tube(rng, 40000, (0.0, 0.0), 0.0, 1.7, 0.25)
+        near = tube(rng, 20000, (0.0, 0.0), 0.0, 1.7, 0.25)
         points = np.concatenate([near, near + [length_m, 0.0, 0.0]]) if length_m else near
         return Body(points, np.zeros(len(points), int))
 
@@ -174,21 +172,12 @@ def test_accumulated_legs_are_thin_again_and_keep_their_coverage(walker):
     assert covered[1] > covered[0]
 
 
-def test_the_same_bytes_alone_and_beside_others(walker):
-    parts = parts_of(walker.seen)
-    with ThreadPoolExecutor(3) as pool:
-        for again in pool.map(soften, [parts] * 3):
-            for a, b in zip(again.to_next, walker.soft.to_next, strict=True):
-                assert a.tobytes() == b.tobytes()
-
-
 # --- what is rigid --------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("sigma_m", [0.0, 0.02])
-def test_a_rigid_object_stays_rigid_to_the_bit(seed, sigma_m):
-    parts = parts_of(scans(Body.column(), seed=seed, sigma_m=sigma_m))
+def test_a_rigid_object_stays_rigid_to_the_bit(sigma_m):
+    parts = parts_of(scans(Body.column(), sigma_m=sigma_m))
     result = soften(parts)
     assert result.alpha == np.inf
     assert result.held_out_m  # it was tried
@@ -206,21 +195,6 @@ def test_what_cannot_be_told_is_not_tried(body, num, every):
     result = soften(parts)
     assert result.alpha == np.inf and not result.held_out_m
     assert not any(flow.any() for flow in (*result.to_next, *result.to_previous))
-
-
-def test_scan_lines_do_not_pull():
-    parts = parts_of(scans(Body.column(), num=5, sigma_m=0.005))
-    key = 2
-    wide = len(voxels(accumulated(rigid(parts), key), 0.02))
-    ours = len(voxels(accumulated(forced(parts), key), 0.02))
-    snapped = [parts[key].points]
-    settings = SolverSettings(alpha=module._ALPHAS[-1], num_neighbors=6)
-    for part in (parts[key - 1], parts[key + 1]):
-        flow = solve(part.points, parts[key].points, settings, np.zeros_like(part.points)).flow
-        snapped.append(part.points + flow)
-    three = np.concatenate([p.points for p in parts[key - 1 : key + 2]])
-    assert ours > 0.93 * wide
-    assert len(voxels(np.concatenate(snapped), 0.02)) < 0.8 * len(voxels(three, 0.02))
 
 
 def test_edges_and_gaps_do_not_pull():

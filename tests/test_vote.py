@@ -33,11 +33,6 @@ def test_the_field_is_the_distance_between_voxels() -> None:
     np.testing.assert_allclose(1 - _nearness(field, together, asked[:1])[0], share[:7], atol=1e-12)
 
 
-def test_a_field_of_nothing_is_far_everywhere() -> None:
-    nothing = DistanceField.of(np.zeros((0, 3)), np.zeros(0))
-    assert not _nearness(nothing, Group.of(np.zeros((2, 3)), np.zeros(2)), np.zeros((4, 3))).any()
-
-
 @pytest.mark.parametrize("num_together", [1, 2])
 @pytest.mark.parametrize("early_s", [0.0, 0.008])
 def test_what_passes_is_measured_earlier_or_later_in_each_sweep(
