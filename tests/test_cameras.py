@@ -190,10 +190,3 @@ def test_the_sphere_of_mei_ends_where_its_radius_does(xi, ends_deg):
 def test_bad_distortion_is_named(lens):
     with pytest.raises(InputError, match="camera cam: distortion: expected 0, 4, 5, 8, 12 or 14"):
         image_points(make_camera(lens), np.ones((1, 3)))
-
-
-def test_bad_models_are_named():
-    with pytest.raises(InputError, match="camera cam: model: got 'ladybug', expected one of pin"):
-        image_points(make_camera((), "ladybug"), np.ones((1, 3)))
-    with pytest.raises(InputError, match="expected 4 finite coefficients of a fisheye lens"):
-        rays(make_camera((), "fisheye"), np.ones((1, 2)))

@@ -30,7 +30,7 @@ from densify.config import resolve
 from densify.config.errors import ComputationError, InputError
 from densify.config.file_content import gunzipped, read_bytes, read_json
 from densify.dataset.plan import read_plan
-from densify.geometry.types import Camera, KnowsBoxes
+from densify.geometry.types import Camera
 from densify.outputs import read_cloud
 from densify.readers import Spec, open_sequence
 from densify.readers.decoded_files import read_array, read_arrays, read_image
@@ -289,7 +289,7 @@ def read_all(place: Path, what: str) -> None:
     for frame in list(sequence.frames)[:4]:
         check(lambda frame=frame: sequence[frame], what)
         check(lambda frame=frame: sequence.T_world_lidar(frame), what)
-        if isinstance(sequence, KnowsBoxes):
+        if hasattr(sequence, "boxes"):
             check(lambda frame=frame: sequence.boxes(frame), what)
     for camera in sequence.cameras:
         for image in list(sequence.image_stamps_ns(camera))[:2]:

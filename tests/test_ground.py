@@ -10,7 +10,7 @@ import pytest
 from scipy import ndimage
 
 from densify.free_space import ground as module
-from densify.free_space.ground import ABOVE_GROUND_M, CELL_M, MAX_SLOPE, HeightMap, ground
+from densify.free_space.ground import ABOVE_GROUND_M, HeightMap, ground
 from densify.geometry import poses
 from densify.geometry.types import Stretch
 from tests.scenes import GROUND, KERB_M, KERB_Y_M, Arc, Box, Scanner, Scene, World, street
@@ -189,40 +189,3 @@ def test_humps_against_a_slow_twin():
         opened[row, column] = lowest[row + 3 : row + 10, column + 3 : column + 10].max()
     expected = np.where(heights > opened + 0.2, opened, heights)
     np.testing.assert_array_equal(module._without_humps(heights), expected)
-
-
-def slow_map(points: np.ndarray) -> np.ndarray:
-    """Two lowest and the mean, cell by cell, of one cloud; what is between them from the module."""
-    cell_m = CELL_M
-    low = np.floor(points[:, :2].min(0) / cell_m) * cell_m
-    index = ((points[:, :2] - low) / cell_m).astype(int)
-    heights = np.full(index.max(0) + 1, np.inf)
-    for x, y in np.unique(index, axis=0):
-        z = np.unique(points[(index == [x, y]).all(1), 2])
-        heights[x, y] = z[min(1, len(z) - 1)]
-    known = np.isfinite(heights)
-    nearest = ndimage.distance_transform_edt(~known, return_distances=False, return_indices=True)
-    around = ndimage.median_filter(heights[tuple(nearest)], 5)
-    heights = np.where(known & (heights < around - 0.4), around, heights)
-    heights = module._slope_limited(heights, MAX_SLOPE * cell_m)[tuple(nearest)]
-    heights = module._without_humps(heights)
-    over_m = points[:, 2] - HeightMap(heights, low, cell_m).under(points)
-    number, total_m = np.zeros((2, *heights.shape))
-    for (x, y), over in zip(index, over_m, strict=True):
-        if abs(over) < 0.15:
-            number[x, y] += 1
-            total_m[x, y] += over
-    number = ndimage.uniform_filter(number, 3, mode="constant") * 9
-    total_m = ndimage.uniform_filter(total_m, 3, mode="constant") * 9
-    return heights + np.where(number >= 3, total_m / np.maximum(number, 1), 0.0)
-
-
-@pytest.mark.parametrize("num_clouds", [1, 2, 7])
-def test_sweep_by_sweep_it_is_the_map_of_all_points_together(num_clouds: int) -> None:
-    rng = np.random.default_rng(num_clouds)
-    points = rng.uniform(-17, 13, (6000, 3)) * [1, 0.6, 0.05]
-    points[::3, 2] = 0.25  # the lowest more than once
-    points[::50, 2] -= 3.0
-    clouds = [*np.array_split(points, num_clouds), points[:0]]
-    found = HeightMap.of(clouds)
-    np.testing.assert_array_equal(found.heights_m, slow_map(points))

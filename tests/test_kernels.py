@@ -4,7 +4,6 @@ threads row by row."""
 
 from __future__ import annotations
 
-import gc
 import importlib.util
 import os
 import signal
@@ -54,14 +53,6 @@ def test_compiled_code_is_kept(double, tmp_path):
     assert sum(again._compiled.stats.cache_hits.values()) == 1
 
 
-@pytest.mark.parametrize(("suffix", "content"), [("nbi", b""), ("nbc", b"damaged")])
-def test_damaged_caches_do_not_matter(double, tmp_path, suffix, content):
-    check(kernels.Kernel(double))
-    (kept,) = tmp_path.rglob(f"*.{suffix}")
-    kept.write_bytes(content)
-    check(kernels.Kernel(double))
-
-
 @pytest.mark.parametrize("name", ["", "kernels"])
 def test_code_that_others_could_have_put_there_is_not_loaded(
     name, double, tmp_path, monkeypatch, caplog
@@ -80,21 +71,6 @@ def test_code_that_others_could_have_put_there_is_not_loaded(
     assert {path: path.read_bytes() for path in own.iterdir()} == kept
     assert [r.levelname for r in caplog.records] == ["WARNING"]
     assert "others can write to it" in caplog.text
-
-
-def test_compiling_is_announced_once_and_loading_is_not(double, caplog, monkeypatch):
-    monkeypatch.setattr(kernels._compiling, "said", False)
-    caplog.set_level("INFO", "densify.progress")
-    double.__module__ = "densify.geometry.compiled.doubling"
-    monkeypatch.setitem(sys.modules, double.__module__, sys.modules["doubling"])
-    check(kernels.Kernel(double))
-    assert [r.getMessage().split()[0] for r in caplog.records] == ["compiling"]
-    kernels.Kernel(double)(0, 2, np.arange(2), np.zeros(2))  # other types
-    assert len(caplog.records) == 1
-    monkeypatch.setattr(kernels._compiling, "said", False)
-    gc.collect()  # what was compiled, or it lives on in memory
-    check(kernels.Kernel(double))  # from the cache
-    assert len(caplog.records) == 1
 
 
 @pytest.fixture

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from scipy.cluster.hierarchy import fcluster, linkage
 from scipy.spatial.distance import cdist
-from scipy.spatial.transform import Rotation
 
 from densify.geometry.linking import close_to_seeds, link
 
@@ -34,29 +33,6 @@ def test_single_linkage(points: np.ndarray) -> None:
     expected = fcluster(linkage(points, "single"), DISTANCE_M, "distance")
     np.testing.assert_array_equal(label, numbered(expected))
     assert num == label.max() + 1 and label.dtype == np.int64
-
-
-@pytest.mark.parametrize("points", clouds()[:2], ids=["thin", "clumps"])
-def test_wherever_the_origin_lies_and_however_the_axes_are_turned(points: np.ndarray) -> None:
-    rng = np.random.default_rng(0)
-    _, label = link(points, DISTANCE_M)
-    for _ in range(8):
-        R = Rotation.random(random_state=int(rng.integers(1 << 30))).as_matrix()
-        moved = points @ R.T + rng.uniform(-1000, 1000, 3)
-        np.testing.assert_array_equal(link(moved, DISTANCE_M)[1], label)
-
-
-def test_points_on_one_place() -> None:
-    num, label = link(np.repeat([[1.0, 2, 3], [1.0, 2, 3.7]], 100, axis=0), DISTANCE_M)
-    assert num == 2 and (label == np.repeat([0, 1], 100)).all()
-
-
-def test_a_point_very_far_away_changes_no_other_group() -> None:
-    points = np.random.default_rng(8).uniform(-5, 5, (400, 3))
-    num, label = link(points, 0.9)
-    num_more, more = link(np.append(points, [[4e6, -5e6, 6e6]], axis=0), 0.9)
-    assert num_more == num + 1 and more[-1] == num
-    np.testing.assert_array_equal(more[:-1], label)
 
 
 def test_nothing() -> None:

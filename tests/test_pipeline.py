@@ -77,15 +77,6 @@ def test_shapes_and_types_as_documented(moving):
         assert (depth.filled_m[depth.depth_m > 0] > 0).all()
 
 
-def test_costs_of_every_stage(moving):
-    costs = {c.name: c for c in moving["flow"].costs}
-    stages = ["read", "register", "images", "deskew", "ground", "flow"]
-    assert set(costs) == {*stages, "accumulate", "held out", "project", "colour", "score"}
-    for cost in costs.values():
-        assert cost.seconds >= 0 and cost.peak_memory_mb > 10
-    assert costs["flow"].peak_memory_mb >= costs["images"].peak_memory_mb  # of the process so far
-
-
 # --- truth ----------------------------------------------------------------------------------------
 
 

@@ -10,25 +10,11 @@ import pytest
 
 from densify.config import RegisterSettings
 from densify.config.errors import ComputationError, InputError
-from densify.dataset.make import make_dataset
 from densify.geometry import poses
 from densify.pipeline.run import compare, run
 from densify.readers.timeline import read_sweep
 from tests.scenes import TinySequence, by_flow
 from tests.small_street import KEY, POSES_GIVEN, one_car
-
-
-def test_progress_names_every_stage():
-    seen: list[tuple[str, int, int]] = []
-    run(one_car(()), KEY, 1, "icp", config=POSES_GIVEN, progress=lambda *step: seen.append(step))
-    names = list(dict.fromkeys(name for name, _, _ in seen))
-    assert names[:5] == ["read", "register", "images", "deskew", "accumulate"]
-    # These are worked out side by side.
-    assert sorted(names[5:]) == ["colour", "held out", "project", "score"]
-    assert all(0 <= done <= total for _, done, total in seen)
-    for name in names:
-        steps = [(done, total) for n, done, total in seen if n == name]
-        assert steps[0][0] == 0 and steps[-1][0] == steps[-1][1]
 
 
 def test_the_data_sets_poses_are_taken_as_they_are():
@@ -66,16 +52,6 @@ def test_poses_of_the_data_set_are_checked_too():
 
     with pytest.raises(ComputationError, match="registration jumps"):
         run(Alone(good.scene, good.frames), KEY, 2, "icp", config=POSES_GIVEN)
-
-
-def test_without_a_camera_there_is_a_cloud_and_no_depth():
-    result = run(one_car(()), KEY, 1, "icp", cameras=[], config=POSES_GIVEN)
-    assert len(result.cloud) and not result.depth and not result.metrics["density"]
-
-
-def test_without_truth_there_are_no_errors_of_depth():
-    result = run(one_car((), with_truth=False), KEY, 1, "icp", config=POSES_GIVEN)
-    assert "depth" not in result.metrics and result.metrics["ghosts"]["num_points"] > 0
 
 
 def test_a_sweep_without_times_is_not_deskewed():
@@ -124,18 +100,6 @@ def test_unknown_methods_are_refused_before_anything_is_read():
     assert not sequence.read
 
 
-def test_texts_are_no_lists_and_no_recordings() -> None:
-    sequence = one_car(())
-    for other in ("street", None, 3):
-        with pytest.raises(InputError, match=f"sequence: got {other!r}, expected what densify"):
-            run(other, KEY, 1)
-    with pytest.raises(InputError, match="methods: got 'flow', expected a list of names"):
-        compare(sequence, KEY, 1, methods="flow")
-    with pytest.raises(InputError, match="data: got 'street', expected a list of recordings"):
-        make_dataset("street", "nowhere")
-    assert not sequence.read
-
-
 class Sparse(TinySequence):
     """One sweep has next to no returns."""
 
@@ -161,13 +125,3 @@ def test_an_almost_empty_sweep_beside_the_key_ends_its_window():
     result = run(sequence, KEY, 1, "icp")
     assert result.frames == (KEY - 1, KEY)
     assert f"sweep {KEY + 1} has 50 points" in result.warnings[0]
-
-
-@pytest.mark.parametrize("num_points", [0, 50])
-@pytest.mark.parametrize("sparse", [KEY, KEY + 1])
-def test_an_almost_empty_sweep_of_known_pose_does_no_harm(num_points, sparse):
-    sequence = Sparse(one_car().scene, range(7))
-    sequence.sparse, sequence.num_points = sparse, num_points
-    cloud = by_flow(sequence, KEY, 1, config=POSES_GIVEN).cloud
-    assert (cloud.frame == sparse).sum() <= num_points
-    assert np.isfinite(cloud.points).all() and not cloud.moving[cloud.frame == sparse].any()

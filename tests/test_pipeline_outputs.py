@@ -57,19 +57,6 @@ def test_map_and_movers_together_are_the_whole(kept, apart):
     assert not apart.cloud.moving.any()
 
 
-def test_the_images_of_map_and_movers_together_are_the_whole(kept, apart):
-    whole, still = (r.depth["front"].depth_m for r in (kept, apart))
-    alone = [m.depth["front"].depth_m for m in apart.movers.values()]
-    shown = np.any([(a > 0) & (a == whole) for a in alone], axis=0)
-    moving = one_car().truth.moving_mask("front", KEY)
-    assert shown.sum() > 300 and moving[shown].mean() > 0.95
-    measured = whole > 0
-    assert (shown | (whole == still))[measured].mean() > 0.9
-    # behind the car the map shows what other sweeps saw of the street, never the car
-    both = (still > 0) & shown
-    assert both.sum() >= 5 and (still > whole + 0.5)[both].mean() > 0.95
-
-
 def test_dropped_movers_are_nowhere(apart):
     dropped = with_movers("drop")
     assert not dropped.movers and same_points(dropped.cloud, apart.cloud)
@@ -160,13 +147,3 @@ def test_every_point_is_accounted_for_and_the_picture_shows_what_was_left_out(tm
 
 
 # --- precision over density -----------------------------------------------------------------------
-
-
-def test_a_higher_least_confidence_keeps_less_and_the_curve_starts_with_everything(kept):
-    held_out = kept.metrics["held_out"]["front"]
-    curve = held_out["curve"]
-    assert [p["min_confidence"] for p in curve] == [round(0.05 * i, 2) for i in range(20)]
-    for product in ("measured", "filled"):
-        density = [p[f"density_{product}"] for p in curve]
-        assert density == sorted(density, reverse=True) and density[0] > density[-1]
-        assert curve[0][f"outliers_{product}"] == held_out[product]["all"]["outliers"]

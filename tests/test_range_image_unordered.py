@@ -3,20 +3,18 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 from functools import cache
 from itertools import pairwise
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
 from densify.free_space.range_image import RangeImage, ScannerImage
 from densify.geometry import poses
 from densify.geometry.types import RegisteredSweep
 from tests.fired import fired
-from tests.scenes import Arc, Box, World, on_sphere
+from tests.scenes import Arc, Box, World
 
 MARGIN = (0.4, 0.015)
 FAST = np.array([0.0, 0.0, 0.2, 15.0, 0.0, 0.0])
@@ -107,57 +105,3 @@ def test_what_moves_with_its_velocity_is_not_free(name):
 
 
 # --- a slow twin ----------------------------------------------------------------------------------
-
-
-def look(image: ScannerImage, point, velocity, min_filled):
-    """One image's answer for one point, step by step in double precision; None where a step falls
-    so close to an edge that rounding decides."""
-    rows, columns = image.nearest_m.shape
-    edges = [float(e) for e in image.row_edges_rad]
-
-    def cell_of(seen):
-        across = (math.atan2(seen[1], seen[0]) + math.pi) / (2 * math.pi) * columns
-        elevation = math.atan2(seen[2], math.hypot(seen[0], seen[1]))
-        row = sum(elevation >= e for e in edges) - 1
-        close = abs(across - round(across)) < 0.02
-        close |= min(abs(elevation - e) for e in edges) < 1e-4
-        return (row if 0 <= row < rows else -1), int(across) % columns, close
-
-    seen, time_s, twist = point - image.origin_m, 0.0, image.twists[0].astype(float)
-    for _ in range(2):
-        row, column, close = cell_of(seen)
-        if close:
-            return None
-        time_s = float(image.offset_s[max(row, 0), column])
-        twist = image.twists[0 if time_s < 0 else 1].astype(float)
-        back = Rotation.from_rotvec(time_s * twist[:3]).inv()
-        seen = back.apply(point + time_s * velocity - time_s * twist[3:]) - image.origin_m
-    row, column, close = cell_of(seen)
-    if close:
-        return None
-    if row < 0 or image.num_filled[row, column] < min_filled:
-        return False
-    by_m_s = np.linalg.norm(velocity - twist[3:] - np.cross(twist[:3], point))
-    away_s = abs(image.offset_s[row, column] - time_s) + image.spread_s[row, column]
-    range_m = float(np.linalg.norm(seen))
-    margin_m = max(MARGIN[0], MARGIN[1] * range_m) + away_s * by_m_s
-    gap_m = image.nearest_m[row, column] - range_m - margin_m
-    return None if abs(gap_m) < 2e-3 else bool(gap_m > 0)
-
-
-@pytest.mark.parametrize("name", UNORDERED)
-def test_lookup_against_a_slow_twin(name):
-    image = RangeImage.of(sweep_of(name, moving=True))
-    rng = np.random.default_rng(1)
-    points = on_sphere(rng.uniform(-32, 32, 800), rng.uniform(-12, 10, 800), 1.0)
-    points *= rng.uniform(2, 70, (800, 1))
-    velocity = rng.normal(0, 6, (800, 3))
-    fast = image.sees_through(points, *MARGIN, velocity_m_s=velocity)
-    answers = [
-        [look(s, p, v, 6) for s in image.scanners] for p, v in zip(points, velocity, strict=True)
-    ]
-    sure = np.array([None not in a or any(x is True for x in a) for a in answers])
-    assert sure.mean() > 0.6
-    slow = [any(x is True for x in a) for a in answers]
-    assert fast[sure].tolist() == [s for s, k in zip(slow, sure, strict=True) if k]
-    assert 0.1 < fast[sure].mean() < 0.9

@@ -109,15 +109,6 @@ def test_no_window_is_cut_at_a_border(tmp_path: Path) -> None:
         assert drive.window(BORDER).frames == tuple(range(BORDER - 2, BORDER + 3))
 
 
-@pytest.mark.parametrize(("step", "first"), [(1, -7), (2, -10)])
-def test_odometry_starts_half_a_second_before_the_window_at_any_rate(step: int, first: int) -> None:
-    frames = [f for f in range(BORDER - 12, BORDER + 5) if (f - BORDER) % step == 0]
-    recording = Recording(across_border(frames), GIVEN, 2, [BORDER])
-    (piece,) = recording.registration(0).pieces
-    assert piece.frames[0] - BORDER == first
-    assert recording.window(BORDER).frames[0] - BORDER == -2 * step
-
-
 def test_a_hole_in_time_ends_windows_and_begins_a_world(tmp_path: Path) -> None:
     holes = [BORDER + i for i in (-5, -4, -3, 3, 4, 5)]
     frames = [f for f in range(BORDER - 8, BORDER + 8) if f not in holes]
@@ -221,49 +212,7 @@ def counted(monkeypatch: pytest.MonkeyPatch) -> Counter[str]:
     return counts
 
 
-ONCE = {"find_trajectory": 1, "ground": 2, "estimate_motion": 2}  # both blocks look at all
-
-
-def use(sequence, folder: Path, config: Config = GIVEN, window: int = 2) -> None:
-    drive = drive_of(sequence, folder, window, config)
-    for key in sequence.frames:
-        drive.motion(key)
-
-
-def test_each_step_is_made_once_of_the_same_inputs(counted: Counter[str], tmp_path: Path) -> None:
-    sequence = across_border()
-    use(sequence, tmp_path)
-    assert counted == ONCE
-    counted.clear()
-    use(sequence, tmp_path)
-    use(sequence, tmp_path, resolve({**POSES_GIVEN, "project": {"support": 3}}))
-    assert counted == {}
-    use(sequence, tmp_path, resolve({**POSES_GIVEN, "objective": {"alpha": 3}}))
-    assert counted == {"estimate_motion": 2, "ground": 2}
-    counted.clear()
-    whole = Damaged(sequence)
-    last = sequence.frames[-1]
-    scans = {frame: sequence.scene.scan(frame) for frame in sequence.frames}
-    sweep = scans[last].sweep
-    nudged = replace(sweep, points=sweep.points + [0, 0, 1e-3])
-    scans[last] = replace(scans[last], sweep=nudged)
-    sequence.scene.scan = scans.__getitem__
-    use(whole, tmp_path)
-    assert counted == ONCE
-
-
 # Several keys
-
-
-def test_keys_whose_windows_overlap_share_what_they_can(counted: Counter[str], long_street) -> None:
-    results = dict(pipeline.run_keys(long_street, [9, 4, 6], 2, config=GIVEN))
-    assert list(results) == [4, 6, 9]
-    assert [r.frames for r in results.values()] == [
-        (2, 3, 4, 5, 6),
-        (4, 5, 6, 7, 8),
-        (7, 8, 9, 10, 11),
-    ]
-    assert counted == {"find_trajectory": 1, "ground": 1, "estimate_motion": 1}
 
 
 @pytest.mark.parametrize("bad", [None, 12], ids="sweep {} cannot be read".format)
@@ -306,16 +255,6 @@ def test_a_cache_gives_the_same_bytes_and_saves_the_work(
         assert (counted["find_trajectory"] == 0) == (which == "old")
     for which in ("new", "old"):
         assert_same_maps(made[which]["flow"].depth, made["none"]["flow"].depth)
-
-
-def test_a_long_row_of_keys_is_parted(long_street) -> None:
-    cut = Recording(long_street, GIVEN, 1, range(2, 16)).cut
-    assert len(cut.blocks) == 1
-    timeline = Recording(long_street, GIVEN, 1).timeline
-    long = replace(timeline, frames=tuple(range(100)), stamp_ns=10**8 * np.arange(100))
-    parted = blocks.Cut.around(long, 3, range(10, 90))
-    assert [len(frames) for frames in parted.blocks] == [26, 26, 26, 26]
-    assert all(parted.blocks[n][0] + 3 <= k for k, n in parted.number_of.items())
 
 
 def test_of_two_sweeps_the_pair_alone_tells_what_moves() -> None:

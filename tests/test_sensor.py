@@ -139,14 +139,6 @@ def test_uneven_rings_are_close_in_the_middle_and_far_at_the_ends(name, elevatio
     np.testing.assert_allclose(np.rad2deg(found), spacing_deg, rtol=0.03)
 
 
-def test_without_firing_times_rings_are_known_and_the_order_is_not():
-    registered = fired("hdl32")
-    timeless = replace(registered, sweep=replace(registered.sweep, offset_ns=None))
-    model = SensorModel.of([timeless], 0)
-    assert len(model.rings_rad) == 32
-    assert model.order == (True, 0, None)
-
-
 def test_lasers_that_share_no_origin_make_lines():
     """As KITTI's HDL-64E: the returns of a ring smear over those of others where they are near."""
     registered = fired("hdl64")

@@ -12,7 +12,6 @@ import yaml
 from densify.geometry.types import Camera
 from densify.outputs import write_result
 from densify.pipeline.run import run
-from densify.readers.kitti.raw import KittiRaw
 from densify.readers.timeline import choose_cameras
 from tests.command import exit_code
 from tests.dataset_scenes import FRAMES, OPTIONS, copy_drive, records
@@ -117,17 +116,6 @@ def test_cameras_without_images_are_left_out_unless_none_has_any():
     assert [camera.name for camera in choose_cameras(nowhere, None)] == ["front", "rear"]
 
 
-def test_a_run_ends_with_its_warnings_each_once(monkeypatch, tmp_path, capsys):
-    import densify.readers
-
-    monkeypatch.setattr(densify.readers, "open_sequence", lambda spec: Changed())
-    settings = ["--set", "register.source=dataset", "--set", "accumulate.far_m=0"]
-    keys = ["--keys", "2:5", "--window", "1", "--method", "icp"]
-    assert exit_code("run", *keys, *settings, "--out", tmp_path / "out") == 0
-    told = [line for line in capsys.readouterr().err.splitlines() if "a file is missing" in line]
-    assert told == ["densify: warning: key 2-4: a file is missing"]
-
-
 def test_a_set_ends_with_its_warnings_and_keeps_them(border_drive, tmp_path, capsys):
     drive, out = copy_drive(border_drive, tmp_path / "2011_09_26"), tmp_path / "out"
     (drive / "velodyne_points" / "timestamps_start.txt").unlink()
@@ -148,20 +136,3 @@ def test_a_set_ends_with_its_warnings_and_keeps_them(border_drive, tmp_path, cap
         assert untimed in record["warnings"] and len(record["warnings"]) == 2 + cut
         (path,) = out.glob(f"**/{record['key']:06d}/run.yaml")
         assert yaml.safe_load(path.read_text())["warnings"] == record["warnings"]
-
-
-class TestKitti:
-    @pytest.fixture
-    def drive(self, border_drive, tmp_path):
-        return copy_drive(border_drive, tmp_path / "2011_09_26")
-
-    def test_gaps(self, drive):
-        assert KittiRaw(drive).gaps() == []
-        (drive / "image_03").mkdir()
-        calibration = drive.parent / "calib_cam_to_cam.txt"
-        lines = calibration.read_text().splitlines(keepends=True)
-        calibration.write_text("".join(line for line in lines if "P_rect_03" not in line))
-        (drive / "velodyne_points" / "timestamps_start.txt").unlink()
-        start, camera = KittiRaw(drive).gaps()
-        assert start.endswith("velodyne_points has no timestamps_start.txt")
-        assert camera == "image_03 is left out: calib_cam_to_cam.txt has no P_rect_03"

@@ -25,9 +25,7 @@ from densify.geometry.types import (
     Float,
     Float32,
     Int,
-    KnowsImagePoses,
     LidarSequence,
-    MakesFrames,
     Stretch,
 )
 
@@ -93,7 +91,7 @@ def key_shots(
 def load_images(sequence: LidarSequence, shots: Mapping[str, Shot]) -> dict[str, NDArray[np.uint8]]:
     """Return (H,W,3) RGB of the shots that are images, by name."""
     images = {n: (s.camera.name, s.number) for n, s in shots.items() if s.number is not None}
-    if isinstance(sequence, MakesFrames):
+    if hasattr(sequence, "prepare"):
         sequence.prepare((), list(images.values()))
     return {name: sequence.image(*image) for name, image in images.items()}
 
@@ -230,7 +228,7 @@ def _exposure(
     twist = registered.twist_before if late_s < 0 else registered.twist_after
     T_cam_lidar = camera.T_cam_lidar @ poses.inverse(poses.exp(late_s * twist))
     at_image = settings.project.at == "camera" and shot.number is not None
-    if at_image and isinstance(sequence, KnowsImagePoses):
+    if at_image and hasattr(sequence, "T_world_cam"):
         T_cam_world = poses.inverse(sequence.T_world_cam(camera.name, shot.number or 0))
         T_cam_lidar = T_cam_world @ sequence.T_world_lidar(frame)
     measure = settings.project.depth

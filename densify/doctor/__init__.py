@@ -16,7 +16,7 @@ from densify.config import Config
 from densify.doctor import cameras, clocks, paths, points, rings
 from densify.doctor.findings import Finding, Verdict, fine, suspicious, unknown, wrong
 from densify.doctor.sample import Sample, Spot
-from densify.geometry.types import KnowsFiles, LidarSequence
+from densify.geometry.types import LidarSequence
 from densify.readers.timeline import format_frames
 
 __all__ = ["CHECKS", "Diagnosis", "Finding", "Sample", "Spot", "Verdict", "examine"]
@@ -39,7 +39,7 @@ def check_sweep_files(sample: Sample) -> list[Finding]:
                 num_unreadable=len(sample.unreadable),
             )
         )
-    if isinstance(sample.sequence, KnowsFiles):
+    if hasattr(sample.sequence, "sweep_bytes"):
         sizes = sample.sequence.sweep_bytes()
         findings += [_sizes(sizes)] if sizes else []
     return findings

@@ -11,7 +11,6 @@ from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
 from densify.geometry import poses
-from densify.geometry.compiled import Kernel, inlined
 from densify.geometry.types import Float, Float32, Int, Stretch, Sweep
 
 ABOVE_GROUND_M = 0.2
@@ -67,12 +66,16 @@ class HeightMap:
         cell far below the median of its neighbours is repaired. The slope limit then cuts cars and
         walls away, and humps are removed. The points near this lower hull are averaged.
 
-        clouds: (N,3) each, metres, z up, at least one point in all; iterated three times.
+        clouds: (N,3) each, metres, z up, at least one point in all; iterated four times.
         """
         low, shape = _grid(clouds)
         lowest, second = np.full((2, *shape), np.inf)
         for points in clouds:
-            _two_lowest(points, low, CELL_M, lowest, second)
+            np.minimum.at(lowest, _cells(points, low), points[:, 2])
+        for points in clouds:
+            cells = _cells(points, low)
+            rows = np.flatnonzero(points[:, 2] > lowest[cells])
+            np.minimum.at(second, (cells[0][rows], cells[1][rows]), points[rows, 2])
         heights = np.where(np.isfinite(second), second, lowest)
 
         known = np.isfinite(heights)
@@ -90,10 +93,8 @@ class HeightMap:
 
         Beyond the grid the height is that of the nearest edge.
         """
-        ground_m = np.empty(len(points))
-        _heights_under.over_rows(
-            len(points), points, self.low_m, self.cell_m, self.heights_m, ground_m
-        )
+        x, y = ((points[:, :2] - self.low_m) / self.cell_m - 0.5).T
+        ground_m: Float = ndimage.map_coordinates(self.heights_m, (x, y), order=1, mode="nearest")
         return ground_m
 
     def above(self, points: Float) -> Float32:
@@ -114,6 +115,12 @@ def _grid(clouds: Iterable[Float]) -> tuple[Float, tuple[int, int]]:
     return low, (int(num_x), int(num_y))
 
 
+def _cells(points: Float, low_m: Float) -> tuple[Int, Int]:
+    """Return the row and the column (N,) of the grid cell of each point."""
+    x, y = ((points[:, :2] - low_m) / CELL_M).astype(np.int64).T
+    return x, y
+
+
 def _averaged(hull: HeightMap, clouds: Iterable[Float]) -> Float:
     """Return the (X,Y) mean height of the points close to the hull, around each cell.
 
@@ -124,7 +131,10 @@ def _averaged(hull: HeightMap, clouds: Iterable[Float]) -> Float:
     total = np.zeros(hull.heights_m.shape)
     for points in clouds:
         over_m = points[:, 2] - hull.under(points)
-        _add_near(points, over_m, hull.low_m, hull.cell_m, number, total)
+        rows = np.flatnonzero(np.abs(over_m) < _GROUND_M)
+        cells = _cells(points[rows], hull.low_m)
+        np.add.at(number, cells, 1)
+        np.add.at(total, cells, over_m[rows])
     number = ndimage.uniform_filter(number.astype(float), 3, mode="constant") * 9
     total = ndimage.uniform_filter(total, 3, mode="constant") * 9
     mean: Float = hull.heights_m + np.where(number >= _FEW, total / np.maximum(number, 1), 0.0)
@@ -150,67 +160,6 @@ def _slope_limited(heights: Float, rise: float) -> Float:
         if np.array_equal(lower, heights):
             return lower
         heights = lower
-
-
-@inlined
-def _cell(points, i, low_m, cell_m):  # type: ignore[no-untyped-def]
-    return int((points[i, 0] - low_m[0]) / cell_m), int((points[i, 1] - low_m[1]) / cell_m)
-
-
-@Kernel
-def _two_lowest(points: Float, low_m: Float, cell_m: float, lowest: Float, second: Float) -> None:
-    """Lower the two lowest different heights of each cell to those of the points, in place.
-
-    points: (N,3) inside the grid. lowest, second: (X,Y), inf where there is none.
-    """
-    for i in range(len(points)):
-        x, y = _cell(points, i, low_m, cell_m)
-        z = points[i, 2]
-        if z < lowest[x, y]:
-            lowest[x, y], second[x, y] = z, lowest[x, y]
-        elif lowest[x, y] < z < second[x, y]:
-            second[x, y] = z
-
-
-@Kernel
-def _heights_under(
-    first: int,
-    last: int,
-    points: Float,
-    low_m: Float,
-    cell_m: float,
-    heights_m: Float,
-    ground_m: Float,
-) -> None:
-    """Fill ``ground_m`` (N,) with the grid's heights at the points, linear between the cells."""
-    end_x, end_y = heights_m.shape[0] - 1, heights_m.shape[1] - 1
-    for i in range(first, last):
-        x = min(max((points[i, 0] - low_m[0]) / cell_m - 0.5, 0.0), float(end_x))
-        y = min(max((points[i, 1] - low_m[1]) / cell_m - 0.5, 0.0), float(end_y))
-        left, near = int(x), int(y)
-        right, far = min(left + 1, end_x), min(near + 1, end_y)
-        x, y = x - left, y - near
-        ground_m[i] = (
-            heights_m[left, near] * (1 - x) * (1 - y)
-            + heights_m[left, far] * (1 - x) * y
-            + heights_m[right, near] * x * (1 - y)
-            + heights_m[right, far] * x * y
-        )
-
-
-@Kernel
-def _add_near(
-    points: Float, over_m: Float, low_m: Float, cell_m: float, number: Int, total_m: Float
-) -> None:
-    """Count and add up, by cell and in place, the heights ``over_m`` (N,) close to 0.
-
-    points: (N,3) inside the grid. number, total_m: (X,Y).
-    """
-    for i in range(len(points)):
-        if np.abs(over_m[i]) < _GROUND_M:
-            x, y = _cell(points, i, low_m, cell_m)
-            number[x, y] += 1
-            total_m[x, y] += over_m[i]
 
 
 def find_upright(sweeps: Sequence[Sweep]) -> Float:

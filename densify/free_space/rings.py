@@ -11,9 +11,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
+from scipy import ndimage, signal
 
-from densify.geometry.arrays import Float, Float32, Int
+from densify.geometry.arrays import Float, Float32
 
 _RING_BIN_RAD = np.deg2rad(0.02)
 _MIN_PROMINENCE = 0.5
@@ -45,8 +45,8 @@ def find_rings(elevation: Float32) -> Float | None:
     of_return = ((elevation + 0.5 * np.pi) / _RING_BIN_RAD).astype(np.int64)
     returns = np.bincount(of_return, minlength=int(np.pi / _RING_BIN_RAD) + 2).astype(float)
     count = ndimage.gaussian_filter1d(returns, 1.0)
-    peaks, prominence = _peaks(count)
-    peaks = peaks[prominence >= _MIN_PROMINENCE * count[peaks]]
+    peaks, found = signal.find_peaks(count, prominence=0)
+    peaks = peaks[found["prominences"] >= _MIN_PROMINENCE * count[peaks]]
     if not 3 <= len(peaks) <= len(elevation) / _MIN_RETURNS_PER_RING:
         return None
     rings: Float = (peaks + 0.5) * _RING_BIN_RAD - 0.5 * np.pi
@@ -56,26 +56,6 @@ def find_rings(elevation: Float32) -> Float | None:
         return None
     total = np.bincount(nearest[close], elevation[close].astype(float), len(rings))
     return total / np.bincount(nearest[close], minlength=len(rings))
-
-
-def _peaks(count: Float) -> tuple[Int, Float]:
-    """Where a curve has its local maxima (of a plateau, the middle), and how far one must descend
-    from each before going up to a higher place or to the curve's end.
-
-    As scipy.signal.find_peaks, whose import takes longer than all of a sweep's rings.
-    """
-    starts = np.append(0, np.flatnonzero(np.diff(count)) + 1)
-    ends = np.append(starts[1:], len(count)) - 1
-    level = count[starts]
-    top = np.flatnonzero((level[1:-1] > level[:-2]) & (level[1:-1] > level[2:])) + 1
-    prominence = np.empty(len(top))
-    for i, k in enumerate(top):
-        higher = np.flatnonzero(level > level[k])
-        after = np.searchsorted(higher, k)
-        first = higher[after - 1] + 1 if after > 0 else 0
-        last = higher[after] if after < len(higher) else len(level)
-        prominence[i] = level[k] - max(level[first:k].min(), level[k + 1 : last].min())
-    return (starts[top] + ends[top]) // 2, prominence
 
 
 def step_between(azimuth: Float32, elevation: Float32) -> float:

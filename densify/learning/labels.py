@@ -18,7 +18,6 @@ from densify.geometry import poses
 from densify.geometry.types import (
     Bool,
     FlowField,
-    KnowsBoxes,
     LidarSequence,
     Progress,
     RegisteredSweep,
@@ -57,7 +56,7 @@ def label_sweeps(
     without_ground: points of the ground do not count. Raises InputError for a recording without
     boxes.
     """
-    if not isinstance(sequence, KnowsBoxes) or all(
+    if not hasattr(sequence, "boxes") or all(
         sequence.boxes(frame) is None for frame in sequence.frames
     ):
         known = ", ".join(f"{row.boxes} ({row.name})" for row in READERS if row.boxes)
@@ -81,7 +80,7 @@ def label_sweeps(
 
 def _label(
     recording: Recording,
-    sequence: KnowsBoxes,
+    sequence: LidarSequence,
     frame: int,
     margins: BoxMargins | None,
     without_ground: bool,

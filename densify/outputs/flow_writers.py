@@ -29,7 +29,7 @@ import numpy as np
 
 from densify.config.errors import InputError, OutputError
 from densify.geometry import poses
-from densify.geometry.types import FlowField, KnowsRows, LidarSequence, Result, StretchFlow
+from densify.geometry.types import FlowField, LidarSequence, Result, StretchFlow
 from densify.outputs.atomic import file_aside, write_file
 from densify.outputs.context import Context
 from densify.readers.extras import needed
@@ -175,7 +175,7 @@ def _write_feather(folder: Path, sequence: LidarSequence, frame: int, flow: Stre
     """Rows without a valid return are static, as the ground is."""
     arrow, feather = (needed(m, "argoverse", "") for m in ("pyarrow", "pyarrow.feather"))
     sweep = flow.stretch[frame].sweep
-    num_rows = sequence.num_rows(frame) if isinstance(sequence, KnowsRows) else len(sequence[frame])
+    num_rows = sequence.num_rows(frame) if hasattr(sequence, "num_rows") else len(sequence[frame])
     residual = np.zeros((num_rows, 3), np.float16)
     for field in flow.steps.values():
         residual[sweep.row] = field.displacement

@@ -10,7 +10,7 @@ from uuid import uuid4
 from densify.config import RegisterSettings
 from densify.config.cache import Cache, digest, kept
 from densify.config.errors import InputError
-from densify.geometry.types import Float, LidarSequence, MakesFrames, Sweep
+from densify.geometry.types import Float, LidarSequence, Sweep
 from densify.pipeline.costs import Watch
 from densify.readers.timeline import Timeline, read_sweep
 
@@ -37,7 +37,7 @@ class Sweeps:
 
     def prepare(self, frames: Sequence[int]) -> None:
         """Let a recording that makes its sweeps make these side by side."""
-        if isinstance(self._sequence, MakesFrames):
+        if hasattr(self._sequence, "prepare"):
             with self._watch.stage("read"):
                 self._sequence.prepare(frames)
 

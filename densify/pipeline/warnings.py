@@ -11,7 +11,7 @@ import numpy as np
 from densify.config import Config
 from densify.depth.exposure import Shot
 from densify.free_space.ground import find_up_axis
-from densify.geometry.types import KnowsItsGaps, LidarSequence, Result, Stretch
+from densify.geometry.types import LidarSequence, Result, Stretch
 from densify.pipeline.methods import METHODS
 from densify.readers.timeline import WindowFrames, format_frames
 from densify.scores.depth_metrics import image_density
@@ -44,7 +44,7 @@ def add_warnings(
     cameras = {shot.camera.name for shot in shots.values()}
     shared = [
         *first,
-        *(sequence.gaps() if isinstance(sequence, KnowsItsGaps) else ()),
+        *(sequence.gaps() if hasattr(sequence, "gaps") else ()),
         *(
             f"{name} is left out: the recording has no images of it; ask with --camera {name}"
             for name in sequence.cameras

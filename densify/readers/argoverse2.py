@@ -137,7 +137,7 @@ class Argoverse2(FileSequence):
         return self._track.at(self._stamps_ns[frame])
 
     def boxes(self, frame: int) -> Boxes | None:
-        """See `KnowsBoxes`; the test split has none. Raises InputError for a malformed table."""
+        """See `LidarSequence`; the test split has none. Raises InputError for a malformed table."""
         if self._annotations is None:
             return None
         path, columns = self.where / "annotations.feather", self._annotations

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from densify.config.errors import InputError
-from densify.geometry.types import Int, LidarSequence, SaysWhatItFound, Sweep
+from densify.geometry.types import Int, LidarSequence, Sweep
 from densify.readers.timeline import Timeline, format_frames
 
 _MOST_NAMED = 3  # sweeps that cannot be used, each with its reason
@@ -47,7 +47,7 @@ def findings(sequence: LidarSequence) -> list[tuple[str, str]]:
         *_cameras(sequence),
         ("poses", _poses(sequence, [f for f in timeline.frames if f not in unreadable])),
         ("truth", "none" if sequence.truth is None else "exact, simulated"),
-        *(sequence.findings() if isinstance(sequence, SaysWhatItFound) else ()),
+        *(sequence.findings() if hasattr(sequence, "findings") else ()),
         *_unreadable(unreadable),
     ]
 

@@ -89,7 +89,7 @@ class FileSequence(ABC):
         """Return the rows of an existing sweep, and the file for messages."""
 
     def sweep_bytes(self) -> dict[int, int]:
-        """See `KnowsFiles`; empty where sweeps share files."""
+        """See `LidarSequence`; empty where sweeps share files."""
         return {frame: path.stat().st_size for frame, path in self._files.items()}
 
     def _image(self, camera: Camera, number: int) -> NDArray[np.uint8]:
@@ -140,7 +140,7 @@ class FileSequence(ABC):
         )
 
     def num_rows(self, frame: int) -> int:
-        """See `KnowsRows`."""
+        """See `LidarSequence`."""
         self.check_frame(frame)
         return len(self._returns(frame)[1].points)
 

@@ -205,7 +205,7 @@ class SceneSequence(FileSequence):
         return self._scene.track.at(self._lidar.stamps_ns[frame]) @ self._T_ego_frame
 
     def boxes(self, frame: int) -> Boxes | None:
-        """See `KnowsBoxes`; the test split has none. Raises InputError for a malformed table."""
+        """See `LidarSequence`; the test split has none. Raises InputError for a malformed table."""
         self.check_frame(frame)
         if self._annotations is None:
             return None

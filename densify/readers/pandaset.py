@@ -160,7 +160,7 @@ class PandaSet(FileSequence):
         return self._track.at(self.stamp_ns(frame))
 
     def boxes(self, frame: int) -> Boxes | None:
-        """See `KnowsBoxes`; None without the frame's file. Raises InputError for a malformed
+        """See `LidarSequence`; None without the frame's file. Raises InputError for a malformed
         file."""
         self.check_frame(frame)
         path = self.where / "annotations" / "cuboids" / f"{frame:02d}.pkl.gz"

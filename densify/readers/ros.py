@@ -114,7 +114,7 @@ class RosBag(FileSequence):
         return self._sweeps[frame].stamp_ns
 
     def findings(self) -> Sequence[tuple[str, str]]:
-        """See `SaysWhatItFound`."""
+        """See `LidarSequence`."""
         lines = []
         for lidar in self._lidars:
             used = [f"{part} = {name}" for part, name in vars(lidar.fields).items() if name]

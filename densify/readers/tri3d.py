@@ -109,7 +109,7 @@ class Tri3d(FileSequence):
         super().__init__(name, path, range(len(self._stamp_ns)), cameras, exposed_ns)
 
     def findings(self) -> Sequence[tuple[str, str]]:
-        """See `SaysWhatItFound`."""
+        """See `LidarSequence`."""
         return [("compensated", self._class.compensation)]
 
     def stamp_ns(self, frame: int) -> int:

@@ -118,7 +118,7 @@ class Waymo(FileSequence):
         return self._T_world_vehicle[frame]
 
     def boxes(self, frame: int) -> Boxes | None:
-        """See `KnowsBoxes`; the test split has none. Raises InputError if they are malformed."""
+        """See `LidarSequence`; the test split has none. Raises InputError if they are malformed."""
         self.check_frame(frame)
         return self._boxes.get(int(self._starts_us[frame]))
 

@@ -9,10 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from densify.geometry import poses
-from densify.geometry.compiled import Kernel
 from densify.geometry.types import Float, RegisteredSweep, Stretch, Sweep, Trajectory
-
-_SMALL_RAD = 1e-3  # below it the sine's series is exact
 
 
 def deskew(sweeps: Sequence[Sweep], trajectory: Trajectory) -> Stretch:
@@ -36,9 +33,9 @@ def deskew_sweep(
     """Deskew one raw sweep by the (6,) twists per second before and after its reference time."""
     points: Float = sweep.points
     if sweep.offset_ns is not None:
-        points = np.empty(points.shape)
-        twist = np.stack([twist_before, twist_after])
-        _move.over_rows(len(points), sweep.points, sweep.offset_ns * 1e-9, twist, points)
+        offset_s = sweep.offset_ns[:, None] * 1e-9
+        twist = np.where(offset_s < 0, twist_before, twist_after)
+        points = poses.transform_each(np.asarray(offset_s * twist, np.float64), points)
     deskewed = replace(sweep, points=points)
     registered = RegisteredSweep(deskewed, T_world_lidar, twist_before, twist_after)
     if sweep.radial_velocity_m_s is None:
@@ -61,32 +58,3 @@ def twists(trajectory: Trajectory, i: int) -> tuple[Float, Float]:
         return poses.twist_between(T[i], T[j], seconds)
 
     return toward(i - 1 if i > 0 else 1), toward(i + 1 if i < last else i - 1)
-
-
-@Kernel
-def _move(begin, end, points, offset_s, twists, moved):  # type: ignore[no-untyped-def]
-    """Fill ``moved`` (N,3) with ``exp(offset · twist) @ point``.
-
-    The sums are in the order of SciPy's Rotation, for the same bits.
-
-    points: (N,3). offset_s: (N,). twists: (2,6) for offsets below 0 and for the others.
-    """
-    for i in range(begin, end):
-        time_s = offset_s[i]
-        twist = twists[0 if time_s < 0 else 1]
-        rx, ry, rz = time_s * twist[0], time_s * twist[1], time_s * twist[2]
-        angle = np.sqrt(rx * rx + ry * ry + rz * rz)
-        if angle <= _SMALL_RAD:
-            square = angle * angle
-            scale = 0.5 - square / 48 + square * square / 3840
-        else:
-            scale = np.sin(angle / 2) / angle
-        x, y, z, w = scale * rx, scale * ry, scale * rz, np.cos(angle / 2)
-        xx, yy, zz, ww = x * x, y * y, z * z, w * w
-        a, b, c = points[i, 0], points[i, 1], points[i, 2]
-        ahead = (xx - yy - zz + ww) * a + 2 * (x * z + y * w) * c + 2 * (x * y - z * w) * b
-        left = 2 * (x * y + z * w) * a + 2 * (y * z - x * w) * c + (-xx + yy - zz + ww) * b
-        up = 2 * (x * z - y * w) * a + (-xx - yy + zz + ww) * c + 2 * (y * z + x * w) * b
-        moved[i, 0] = ahead + time_s * twist[3]
-        moved[i, 1] = left + time_s * twist[4]
-        moved[i, 2] = up + time_s * twist[5]

@@ -9,13 +9,12 @@ using Doppler Radar", ITSC 2013).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from itertools import pairwise
 
 import numpy as np
-from scipy.spatial import cKDTree
 
-from densify.config.errors import InputError
+from densify.geometry.nearest import tree_of
 from densify.geometry.types import Float, Sweep
 
 MAX_SPEED_M_S = 60.0  # a faster step between two sweeps is an error of registration
@@ -24,7 +23,6 @@ _NUM_POINTS = 800
 _CLOSE_M = 1.0
 _RAYS_RAD = 0.01  # between rays: objects along the road are met by the same rays at any speed
 _ABOVE_GROUND_M = 0.4
-_AT_REST_M_S, _DRIVES_M_S, _MUCH_BETTER = 2.0, 5.0, 0.6  # by radial velocities, by the search
 _NUM_ROUNDS, _NUM_LAST = 30, 3
 _NOISE_M_S = 0.2
 _AGREES_M_S = 0.6  # a sweep takes 0.1 s, in which the speed changes
@@ -40,29 +38,16 @@ def search_twist(sweeps: Sequence[Sweep]) -> Float:
     at rest and from one that follows it. The grid moves the second sweep by steps of 1 m, then of
     0.5 m around the best, or less where the sweeps follow within 0.1 s.
     """
-    cost = _misfit(sweeps)
     first_s = (sweeps[1].stamp_ns - sweeps[0].stamp_ns) * 1e-9
     step_m = _STEP_M * min(1.0, first_s / _STEP_S)
-    coarse_m = _grid(np.zeros(2), MAX_SPEED_M_S * first_s, 2 * step_m)
-    coarse = coarse_m[np.argmin(cost(coarse_m))]
-    fine_m = _grid(coarse[:2], 2 * step_m, step_m)
-    return np.append(np.zeros(3), fine_m[np.argmin(cost(fine_m))] / first_s)
-
-
-def _misfit(sweeps: Sequence[Sweep]) -> Callable[[Float], Float]:
-    """Return the cost (n,) of (n,3) motions between the first two sweeps.
-
-    It is the mean distance between points above the ground; of equal motions the slowest is best.
-    """
     above = [above_ground(s.points) for s in sweeps[:3]]
-    first_s = (sweeps[1].stamp_ns - sweeps[0].stamp_ns) * 1e-9
     pairs = []
     for i, (earlier, later) in enumerate(pairwise(above)):
         _, rows = np.unique(np.floor(later), axis=0, return_index=True)  # even over 1 m voxels
         sample = later[rows[:: len(rows) // _NUM_POINTS + 1]]
         ratio = (sweeps[i + 1].stamp_ns - sweeps[i].stamp_ns) * 1e-9 / first_s
         apart_m = _RAYS_RAD * np.linalg.norm(sample, axis=1)
-        pairs.append((quick_tree(earlier), sample, ratio, apart_m))
+        pairs.append((tree_of(earlier), sample, ratio, apart_m))
 
     def cost(steps_m: Float) -> Float:
         sums = 1e-3 * np.linalg.norm(steps_m, axis=1)
@@ -73,7 +58,10 @@ def _misfit(sweeps: Sequence[Sweep]) -> Callable[[Float], Float]:
             sums += np.maximum(distance_m - apart_m, 0.0).mean(1)
         return sums
 
-    return cost
+    coarse_m = _grid(np.zeros(2), MAX_SPEED_M_S * first_s, 2 * step_m)
+    coarse = coarse_m[np.argmin(cost(coarse_m))]
+    fine_m = _grid(coarse[:2], 2 * step_m, step_m)
+    return np.append(np.zeros(3), fine_m[np.argmin(cost(fine_m))] / first_s)
 
 
 def _grid(center: Float, reach_m: float, step_m: float) -> Float:
@@ -81,11 +69,6 @@ def _grid(center: Float, reach_m: float, step_m: float) -> Float:
     span = np.arange(-np.ceil(reach_m / step_m), np.ceil(reach_m / step_m) + 1) * step_m
     x, y = np.meshgrid(center[0] + span, center[1] + span, indexing="ij")
     return np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], 1)
-
-
-def quick_tree(points: Float) -> cKDTree:
-    """Build an unbalanced tree: for few queries, balancing takes longer than it saves."""
-    return cKDTree(points, balanced_tree=False, compact_nodes=False)
 
 
 def above_ground(points: Float) -> Float:
@@ -132,31 +115,3 @@ def measure_velocity(sweep: Sweep) -> Float | None:
         velocity_m_s = np.linalg.solve(normal, -weighted.T @ away_m_s)
         off_m_s = np.abs(away_m_s + ray @ velocity_m_s)
     return velocity_m_s if (off_m_s <= _AGREES_M_S).mean() >= _MIN_SHARE else None
-
-
-def check_velocity(sweeps: Sequence[Sweep], velocity_m_s: Float) -> None:
-    """Raise InputError where the first sweeps contradict their radial velocities.
-
-    Either the opposite velocity (3,) aligns them better, or the vehicle drives although the radial
-    velocities say that it is at rest, as if its own motion had been removed from them.
-    """
-    if len(sweeps) < 2:
-        return
-    first_s = (sweeps[1].stamp_ns - sweeps[0].stamp_ns) * 1e-9
-    speed_m_s = float(np.linalg.norm(velocity_m_s))
-    if speed_m_s >= _AT_REST_M_S:
-        other_m_s, seen, share = -velocity_m_s, "the opposite", 1.0
-    else:
-        other_m_s, share = search_twist(sweeps)[3:], _MUCH_BETTER
-        other_speed_m_s = float(np.linalg.norm(other_m_s))
-        if other_speed_m_s <= _DRIVES_M_S:
-            return
-        seen = f"{other_speed_m_s:.0f} m/s"
-    own, other = _misfit(sweeps)(np.stack([velocity_m_s, other_m_s]) * first_s)
-    if other < share * own:
-        raise InputError(
-            f"registration: by the radial velocities of sweep {sweeps[0].frame} the scanner goes "
-            f"at {speed_m_s:.1f} m/s, by its points at {seen}; expected m/s away from the scanner "
-            f"and relative to it, as measured; change their sign, leave the vehicle's own motion "
-            f"in, or leave the column out"
-        )

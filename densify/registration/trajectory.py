@@ -16,16 +16,11 @@ from densify.config import RegisterSettings
 from densify.config.errors import InputError, SweepError, UnfitSweepError, UnplacedSweepError
 from densify.free_space.ground import find_upright
 from densify.geometry import poses
+from densify.geometry.nearest import tree_of
 from densify.geometry.types import Float, Int, Sweep, Trajectory
 from densify.registration.deskew import deskew
 from densify.registration.odometry import find_odometry
-from densify.registration.start_speed import (
-    MAX_SPEED_M_S,
-    above_ground,
-    check_velocity,
-    measure_velocity,
-    quick_tree,
-)
+from densify.registration.start_speed import MAX_SPEED_M_S, above_ground, measure_velocity
 from densify.registration.surfaces import refine, register_on_surfaces
 
 MIN_OVERLAP = 0.55
@@ -80,8 +75,7 @@ def find_trajectory(
     sparse ones, and those with radial velocities, on surfaces alone.
 
     recorded: the recording's own poses, which are checked and used; None to register.
-    Raises SweepError naming the frame where the poses cannot be right, InputError where the radial
-    velocities cannot.
+    Raises SweepError naming the frame where the poses cannot be right.
     """
     if recorded is not None:
         check_plausible(recorded, settings)
@@ -95,8 +89,6 @@ def find_trajectory(
         odometry, deskewed = find_odometry(sweeps, settings)
         found = refine(sweeps, odometry)
     else:
-        if measured[0] is not None:
-            check_velocity(sweeps, measured[0])
         found = register_on_surfaces(sweeps, measured)
         deskewed = [s.sweep for s in deskew(sweeps, found).sweeps]
     check_plausible(found, settings)
@@ -185,8 +177,8 @@ def check_overlap(
         share = _share_on(points, trees)
         if share < MIN_OVERLAP and stamp_ns[i] - stamp_ns[0] < _OVERLAP_NS:
             end = np.searchsorted(stamp_ns, stamp_ns[i] + _OVERLAP_NS)
-            after = [quick_tree(in_world(j)) for j in range(i + 1, int(end))]
-            own = quick_tree(points)
+            after = [tree_of(in_world(j)) for j in range(i + 1, int(end))]
+            own = tree_of(points)
             both_ways = min(
                 _share_on(points, trees + after), _share_on(in_world(i - 1), [own, *after])
             )
@@ -198,7 +190,7 @@ def check_overlap(
                 f"expected at least {100 * MIN_OVERLAP:.1f} %; {_advice(settings)}",
                 frames[i],
             )
-        before.append((int(stamp_ns[i]), quick_tree(points)))
+        before.append((int(stamp_ns[i]), tree_of(points)))
 
 
 def _share_on(points: Float, trees: Sequence[cKDTree]) -> float:

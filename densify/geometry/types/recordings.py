@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,8 +18,16 @@ from densify.geometry.types.sweeps import Sweep
 class LidarSequence(Protocol):
     """A recording, opened lazily. A reader is one class with these members.
 
-    It may also have members of the protocols below. Frames are absolute numbers. Methods raise
-    InputError with a full sentence for anything missing or malformed.
+    Frames are absolute numbers. Methods raise InputError with a full sentence for anything missing
+    or malformed. A reader may also have these methods, which are asked for by name:
+
+    findings() -> Sequence[tuple[str, str]]: what it found or assumed, short labels and texts.
+    gaps() -> Sequence[str]: what is missing and what is assumed instead, a sentence each.
+    prepare(frames, images=()): make these sweeps and images (camera, number), which are read next.
+    T_world_cam(camera, number) -> (4,4): pose of an image's exposure, in the world of the lidar's.
+    boxes(frame) -> Boxes | None: around objects in a sweep; None where nobody drew any.
+    sweep_bytes() -> Mapping[int, int]: size of each sweep's file; empty where sweeps share files.
+    num_rows(frame) -> int: how many rows the sweep's file has, valid or not.
     """
 
     @property
@@ -55,55 +63,6 @@ class LidarSequence(Protocol):
 
     def T_world_lidar(self, frame: int) -> Float:
         """Return the data set's own pose (4,4) at the sweep's reference time."""
-        ...
-
-
-@runtime_checkable
-class SaysWhatItFound(Protocol):
-    def findings(self) -> Sequence[tuple[str, str]]:
-        """Return what was found out or assumed about the recording: short labels and texts."""
-        ...
-
-
-@runtime_checkable
-class KnowsItsGaps(Protocol):
-    def gaps(self) -> Sequence[str]:
-        """Return what is missing and what is assumed instead, a sentence each."""
-        ...
-
-
-@runtime_checkable
-class MakesFrames(Protocol):
-    def prepare(self, frames: Sequence[int], images: Sequence[tuple[str, int]] = ()) -> None:
-        """Make these sweeps and images (camera and number) in parallel; they are read next."""
-        ...
-
-
-@runtime_checkable
-class KnowsImagePoses(Protocol):
-    def T_world_cam(self, camera: str, number: int) -> Float:
-        """Return the pose (4,4) of an image's exposure, in the world of `T_world_lidar`."""
-        ...
-
-
-@runtime_checkable
-class KnowsBoxes(Protocol):
-    def boxes(self, frame: int) -> Boxes | None:
-        """Return the boxes around objects in a sweep; None where nobody drew any."""
-        ...
-
-
-@runtime_checkable
-class KnowsFiles(Protocol):
-    def sweep_bytes(self) -> Mapping[int, int]:
-        """Return the size of each sweep's file, by frame; empty where sweeps share files."""
-        ...
-
-
-@runtime_checkable
-class KnowsRows(Protocol):
-    def num_rows(self, frame: int) -> int:
-        """Return how many rows the sweep's file has, valid or not."""
         ...
 
 

@@ -90,7 +90,7 @@ class Folder(FileSequence):
         return self._sweeps.stamps_ns[frame]
 
     def findings(self) -> Sequence[tuple[str, str]]:
-        """See `SaysWhatItFound`."""
+        """See `LidarSequence`."""
         layout, first = self._columns.layout, self._sweeps.paths[self.frames[0]]
         fields = [f"{part} = {name}" for part, name in vars(layout.fields).items() if name]
         unused = f"; not used: {', '.join(layout.unused)}" if layout.unused else ""

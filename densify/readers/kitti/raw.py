@@ -70,7 +70,7 @@ class KittiRaw(Drive):
         self._exposed_ns = {name: self._exposures_ns(name) for name in self._image_files}
 
     def gaps(self) -> list[str]:
-        """See `KnowsItsGaps`."""
+        """See `LidarSequence`."""
         missing = [p.name for n, p in self._stamp_files.items() if n not in self._stamps_ns]
         told = [f"{self.where / 'velodyne_points'} has no {', '.join(missing)}"] * bool(missing)
         if "" not in self._stamps_ns:

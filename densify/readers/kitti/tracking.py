@@ -99,7 +99,7 @@ class KittiTracking(Drive):
         return T_world_imu @ poses.inverse(T_lidar_imu)
 
     def boxes(self, frame: int) -> Boxes | None:
-        """See `KnowsBoxes`; ``testing`` has none. Without images the smallest size of KITTI's is
+        """See `LidarSequence`; ``testing`` has none. Without images the smallest size of KITTI's is
         assumed. Raises InputError for labels or a calibration that are missing or malformed."""
         self.check_frame(frame)
         path = self.where / "label_02" / self._scene_file
