@@ -69,7 +69,7 @@ def errors(found: Trajectory, true: Trajectory) -> tuple[np.ndarray, np.ndarray]
 
 @pytest.mark.parametrize("rate", [1, 2])
 def test_the_drive_is_recovered(drive, raw, second_pass, rate):
-    """At twice the rate, 24 m/s at 20 Hz, two sweeps are registered together."""
+    """At twice the rate too, 24 m/s at 20 Hz."""
     fast = [replace(s, stamp_ns=s.stamp_ns // 2, offset_ns=s.offset_ns // 2) for s in raw]
     found = second_pass if rate == 1 else find_odometry(fast, SETTINGS)[0]
     assert found.frames == tuple(FRAMES)

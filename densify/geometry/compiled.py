@@ -10,7 +10,6 @@ once takes 1.6 s to compile. A literal handed to an inlined function compiles it
 
 from __future__ import annotations
 
-import gc
 import hashlib
 import logging
 from collections.abc import Callable
@@ -36,15 +35,9 @@ _NOT_FROM_PYTHON: dict[str, Any] = {"no_cpython_wrapper": True}
 
 
 class _Compiling(event.Listener):
-    """Says once that the first run takes longer; numba tells what it has to compile. The garbage
-    collector rests meanwhile: it would go through all that the compiler builds, again and again,
-    which takes a sixth of the time and finds next to nothing.
-
-    Numba compiles one function at a time, and what that one calls within it.
-    """
+    """Says once that the first run takes longer; numba tells when it compiles."""
 
     said = False
-    _depth, _collects = 0, False
 
     def on_start(self, event: event.Event) -> None:
         if not self.said and str(event.data["dispatcher"].__module__).startswith("densify."):
@@ -52,15 +45,9 @@ class _Compiling(event.Listener):
             _progress.info(
                 "compiling the inner loops, once for this installation: about half a minute in all"
             )
-        if not self._depth:
-            self._collects = gc.isenabled()
-            gc.disable()
-        self._depth += 1
 
     def on_end(self, event: event.Event) -> None:
-        self._depth -= 1
-        if not self._depth and self._collects:
-            gc.enable()
+        """Do nothing; numba asks for it."""
 
 
 _compiling = _Compiling()

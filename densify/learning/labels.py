@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,6 +17,7 @@ from densify.free_space.ground import ABOVE_GROUND_M, ground
 from densify.geometry import poses
 from densify.geometry.types import (
     Bool,
+    Boxes,
     FlowField,
     LidarSequence,
     Progress,
@@ -56,9 +57,8 @@ def label_sweeps(
     without_ground: points of the ground do not count. Raises InputError for a recording without
     boxes.
     """
-    if not hasattr(sequence, "boxes") or all(
-        sequence.boxes(frame) is None for frame in sequence.frames
-    ):
+    boxes = getattr(sequence, "boxes", None)
+    if boxes is None or all(boxes(frame) is None for frame in sequence.frames):
         known = ", ".join(f"{row.boxes} ({row.name})" for row in READERS if row.boxes)
         raise InputError(f"{sequence.name}: no tracked boxes; expected one of {known}")
     recording = Recording(sequence, config, 1)
@@ -68,7 +68,7 @@ def label_sweeps(
             if progress:
                 progress("label", done, len(frames))
             try:
-                label = _label(recording, sequence, frame, margins, without_ground)
+                label = _label(recording, boxes, frame, margins, without_ground)
             except (ComputationError, InputError) as error:
                 yield frame, error
                 continue
@@ -80,7 +80,7 @@ def label_sweeps(
 
 def _label(
     recording: Recording,
-    sequence: LidarSequence,
+    boxes: Callable[[int], Boxes | None],
     frame: int,
     margins: BoxMargins | None,
     without_ground: bool,
@@ -89,7 +89,7 @@ def _label(
     following = [f for f in stretch.frames if f > frame]
     if not following:
         return None
-    own, others = sequence.boxes(frame), sequence.boxes(following[0])
+    own, others = boxes(frame), boxes(following[0])
     if own is None or others is None:
         return None
     registered, after = stretch[frame], stretch[following[0]]
