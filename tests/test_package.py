@@ -73,8 +73,7 @@ def test_the_default_run_waits_for_no_torch() -> None:
         "from tests.small_street import KEY, POSES_GIVEN, one_car\n"
         "import densify\n"
         "result = densify.run(one_car(), KEY, 2, config=POSES_GIVEN)\n"
-        "assert result.cloud.moving.any()\n"
-        "import sys; assert 'scipy.signal' not in sys.modules"
+        "assert result.cloud.moving.any()"
     )
     assert not {"torch", "kiss_icp", "dask"} & modules_after(code, CHECKOUT)
 
