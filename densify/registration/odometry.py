@@ -30,7 +30,8 @@ def find_odometry(
     """Return the trajectory of raw, dense sweeps, and the sweeps deskewed by the first pass.
 
     Sweeps of a fast scanner are grouped in time (`densify.geometry.clock.Clock.batches`), so that
-    sparse sweeps are not registered against each other.
+    sparse sweeps are not registered against each other. One by one, the sweeps of a highway at
+    20 Hz look as if the vehicle stood: 19 m off after 0.75 s.
 
     sweeps: ascending in time, one or more.
     """
