@@ -12,8 +12,7 @@ import numpy as np
 from densify.config import Config
 from densify.config.errors import ComputationError, InputError, OutputError
 from densify.config.plugins.readers import READERS
-from densify.flow.boxes import BoxMargins, flow_of_boxes
-from densify.free_space.ground import ABOVE_GROUND_M, ground
+from densify.flow.boxes import flow_of_boxes
 from densify.geometry import poses
 from densify.geometry.types import (
     Bool,
@@ -47,15 +46,12 @@ def label_sweeps(
     sequence: LidarSequence,
     frames: Sequence[int],
     config: Config,
-    margins: BoxMargins | None = None,
-    without_ground: bool = False,
     progress: Progress | None = None,
 ) -> Iterator[tuple[int, Label | ComputationError | InputError]]:
     """Yield the label of each sweep, or the error that prevents it, with its frame.
 
     Sweeps without a next sweep or without boxes are left out. config: where poses come from.
-    without_ground: points of the ground do not count. Raises InputError for a recording without
-    boxes.
+    Raises InputError for a recording without boxes.
     """
     boxes = getattr(sequence, "boxes", None)
     if boxes is None or all(boxes(frame) is None for frame in sequence.frames):
@@ -68,7 +64,7 @@ def label_sweeps(
             if progress:
                 progress("label", done, len(frames))
             try:
-                label = _label(recording, boxes, frame, margins, without_ground)
+                label = _label(recording, boxes, frame)
             except (ComputationError, InputError) as error:
                 yield frame, error
                 continue
@@ -78,13 +74,7 @@ def label_sweeps(
     return labels()
 
 
-def _label(
-    recording: Recording,
-    boxes: Callable[[int], Boxes | None],
-    frame: int,
-    margins: BoxMargins | None,
-    without_ground: bool,
-) -> Label | None:
+def _label(recording: Recording, boxes: Callable[[int], Boxes | None], frame: int) -> Label | None:
     stretch = recording.window(frame)
     following = [f for f in stretch.frames if f > frame]
     if not following:
@@ -93,11 +83,7 @@ def _label(
     if own is None or others is None:
         return None
     registered, after = stretch[frame], stretch[following[0]]
-    field, sure = flow_of_boxes(registered, after, own, others, margins)
-    if without_ground:
-        heights = ground(stretch)
-        in_world = poses.transform(registered.T_world_lidar, registered.sweep.points)
-        sure &= heights.above(in_world) >= ABOVE_GROUND_M
+    field, sure = flow_of_boxes(registered, after, own, others)
     T_next_here = stretch.T_target_source(following[0], frame)
     return Label(registered, after, field, sure, T_next_here)
 
