@@ -235,34 +235,6 @@ def test_back_wall_does_not_shine_through_the_gaps_of_the_front_wall():
     assert (plain.depth_m[:88, :58] == 20).mean() > 0.5  # what the test removes
 
 
-def test_the_gap_below_the_last_of_dense_rings_is_closed():
-    """Rings 3 px apart, and 24 px apart from row 39 on: that ring's own patches are small."""
-    camera = make_camera(120, 90, 300.0)
-    rings, width = np.array([*range(0, 42, 3), 63, 87]), np.arange(120)
-    v, u = (part.ravel() for part in np.meshgrid(rings, width, indexing="ij"))
-    spacing = np.where((v < 40)[:, None], (1.0, 3.0), (1.0, 24.0))
-    filled = see(camera, at_pixel(camera, u, v, 10.0), KEY, PLAIN, spacing).filled_m
-    assert (filled[1:87, 5:-5] > 0).all()
-
-
-def test_patch_grows_with_the_spacing_and_slack():
-    """Half a patch is 0.4 spacings and 0.05 m, which is 1.5 px at 10 m."""
-    camera = make_camera(121, 91, 300.0)
-    spot, back = at_pixel(camera, 60, 45, 10.0), on_every_pixel(camera, 20.0)
-    points = np.vstack([spot, back])
-
-    def hole(*spacing_px):
-        spacing = np.vstack([[spacing_px], np.zeros((len(back), 2))])
-        seen = see(camera, points, KEY, ProjectSettings(), spacing, filled=False)
-        rows, columns = np.divmod(np.flatnonzero(seen.reason[1:] == Reason.HIDDEN), 121)
-        return int(np.ptp(columns)) + 1, int(np.ptp(rows)) + 1
-
-    assert hole(0.0, 0.0) == (3, 3)
-    assert hole(4.0, 0.0) == (7, 3)
-    assert hole(0.0, 9.0) == (3, 11)
-    assert hole(1e6, 1e6) == (49, 49)  # it never hides the whole image
-
-
 def test_slanted_ground_does_not_hide_itself():
     camera = make_camera(200, 100, 300.0)
     camera.K[1, 2] = 10.0  # the horizon near the top
@@ -366,8 +338,11 @@ def test_what_few_sweeps_or_not_the_key_saw_is_unsupported():
     camera = make_camera(60, 40)
     knobs = ProjectSettings(support=4)
 
-    def kept(frames, others=()):
+    def kept(frames, others=(), lone=False):
         points, frame = wall(camera, 10.0, frames)
+        if lone:  # the key sweep has a single return of it
+            only = (frame != KEY) | (np.cumsum(frame == KEY) == 300)
+            points, frame = points[only], frame[only]
         aside = at_pixel(
             camera, [0] * len(others), [0] * len(others), 90.0
         )  # they exist, elsewhere
@@ -376,10 +351,29 @@ def test_what_few_sweeps_or_not_the_key_saw_is_unsupported():
 
     assert kept([KEY, KEY + 1, KEY + 2, KEY + 3], [KEY - 1, KEY - 2, KEY - 3, KEY - 4])
     three, others = [KEY, KEY + 1, KEY + 2], [KEY - 1, KEY - 2, KEY - 3, KEY - 4, KEY + 3]
-    assert not kept(three, others)
+    assert kept(three, others)  # the key sweep has several returns of it
+    assert not kept(three, others, lone=True)
     assert not kept([KEY + 1, KEY + 2, KEY + 3, KEY + 4], [KEY, KEY - 1, KEY - 2, KEY - 3])
     assert kept([KEY + 1, KEY + 2, KEY - 1, KEY - 2])  # a key held out asks for its neighbours
     assert kept([KEY])  # a single sweep is enough where there is one
+
+
+def test_what_the_key_sweep_alone_saw_is_kept_where_it_has_several_returns():
+    """What moves and was not noticed hides the wall now, where other sweeps saw the wall."""
+    camera = make_camera(120, 90, 300.0)
+    back, back_frame = wall(camera, 20.0, SWEEPS)
+    front, front_frame = wall(camera, 10.0, [KEY])
+    panel = np.rint(front[:, 0] / front[:, 2] * 300 + camera.K[0, 2])
+    panel = (panel >= 40) & (panel < 80)
+    unseen = (back_frame != KEY) | ~np.isin(np.arange(len(back)), np.flatnonzero(panel))
+    lone = at_pixel(camera, [20], [30], 10.0)
+    points = np.vstack([front[panel], lone, back[unseen]])
+    frame = np.concatenate([front_frame[panel], [KEY], back_frame[unseen]])
+    depth = see(camera, points, frame, ProjectSettings(), (2.0, 2.0), filled=False)
+    assert (np.abs(depth.depth_m[20:70:2, 44:76:2] - 10) < 0.01).all()
+    assert (np.abs(depth.depth_m[20:70, 40:80] - 20) > 1).all()
+    assert not (np.abs(depth.depth_m[:, :38] - 10) < 1).any()
+    assert depth.reason[panel.sum()] == Reason.UNSUPPORTED
 
 
 def test_no_point_is_believed_at_the_edge_of_its_surface():
@@ -526,6 +520,3 @@ def test_no_depth_is_invented_between_two_surfaces(step):
     filled, _ = fill_between(sparse, (sparse > 0) * np.float32(1), (2, 3))
     assert set(np.unique(np.round(filled, 3))) <= {0.0, 10.0, np.float32(10 * step)}
     assert (filled[5:25, 5:15] > 0).mean() > 0.95
-
-
-# --- real -----------------------------------------------------------------------------------------

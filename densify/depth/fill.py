@@ -246,9 +246,7 @@ def _fill(first, last, known, spacing_px, reaches, filled_m, confidence, tilt, s
             if centre > 0:
                 filled_m[row, column] = 1 / min(max(centre, far), near)
                 confidence[row, column] = inside.confidence[:num].min()
-                sloped = num >= _MIN_PLANE_PX
-                tilt[row, column, 0] = slope_u if sloped else 0.0
-                tilt[row, column, 1] = slope_v if sloped else 0.0
+                tilt[row, column, 0], tilt[row, column, 1] = slope_u, slope_v
                 share[row, column] = (step + 1) / len(reaches)
                 break
 

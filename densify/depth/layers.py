@@ -23,8 +23,9 @@ class Layers:
     surface's inverse depth to the right and down, 1/m per px. spacing_px: (H,W,2) between
     neighbouring rays of one sweep, across and down, everywhere. lab: (H,W,3) the image in L*a*b*,
     if there is one. warnings: what could not be done as asked. window: inside car windows. glass:
-    where a measured pixel was taken out of one. moving: of a moving object. unsure: an accepted
-    boundary pixel with too few votes to count as measured.
+    where a measured pixel was taken out of one. key_only: only the key sweep has returns of the
+    surface. moving: of a moving object. unsure: an accepted boundary pixel with too few votes to
+    count as measured.
     """
 
     depth_m: Float32
@@ -40,6 +41,7 @@ class Layers:
     warnings: tuple[str, ...] = ()
     window: Bool | None = None
     glass: Bool | None = None
+    key_only: Bool | None = None
     moving: Bool | None = None
     unsure: Bool | None = None
 

@@ -48,6 +48,7 @@ _GOES_ON = 1.2  # spacings within which a surface shows again
 _ANY_AGE_NS = 1 << 62
 _ALL_ROUND = 3.0  # edges' reaches: no edge near
 _DIAGONAL = np.sqrt(0.5)
+_LEAST_ALONE = 5  # returns of the key sweep that agree around one, itself among them, of nine
 _NEVER_NS = np.iinfo(np.int64).max
 
 
@@ -55,7 +56,8 @@ class MeasuredPixels(NamedTuple):
     """The H·W pixels of an image, row by row.
 
     winner: int, which of the points in the image gives the depth, -1 none. depth_m, confidence:
-    float32. inside: no depth edge is near. veiled, refused: as in `densify.depth.layers.Layers`.
+    float32. inside: no depth edge is near. veiled, refused, key_only: as in
+    `densify.depth.layers.Layers`.
     """
 
     winner: Int
@@ -64,6 +66,7 @@ class MeasuredPixels(NamedTuple):
     inside: Bool
     veiled: Bool
     refused: Bool
+    key_only: Bool
 
     @staticmethod
     def at(camera: Camera, pixel: Int, *columns: np.ndarray) -> MeasuredPixels:
@@ -85,7 +88,7 @@ def nearest_pixels(
     reason[points.index] = Reason.NOT_CHOSEN
     no = np.zeros(len(pixel), bool)
     depth_m, confidence = points.depth[nearest], own[nearest]
-    return MeasuredPixels.at(camera, pixel, nearest, depth_m, confidence, ~no, no, no)
+    return MeasuredPixels.at(camera, pixel, nearest, depth_m, confidence, ~no, no, no, no)
 
 
 def visible_pixels(
@@ -127,22 +130,26 @@ def _settled(
     """Return the pixels that points measure, and the `Reason` of every point.
 
     taken: (H·W,) where given, pixels to leave alone; the others get the stricter rules of points
-    beyond the window.
+    beyond the window. Elsewhere several returns of the key sweep are enough: an object that moves
+    without being noticed was elsewhere at other times.
     """
+    many = int(points.sweep.max(initial=0)) + 1
+    least = min(support, max(1, many // 2))
     behind = distance_behind(points, camera)
     hidden = behind > 1
     reason = np.where(hidden, Reason.HIDDEN, Reason.NOT_CHOSEN).astype(np.uint8)
-    pixel, winner, found = _found(points, hidden, own, camera, taken)
-    depth_m, num_sweeps, youngest_ns, num_points, residual_m, edge = found
+    pixel, winner, found = _found(points, hidden, own, camera, least, taken)
+    depth_m, num_sweeps, youngest_ns, num_points, residual_m, edge, num_now = found
     veiled = hidden[winner]
     refused = veiled & (points.age_ns[winner] > NOW_NS)
     if refused.any():
         refused &= distance_behind(points, camera, points.moving)[winner] > 1
     refused |= edge < 0
-    many = int(points.sweep.max(initial=0)) + 1
+    key_only = num_now >= _LEAST_ALONE
     if taken is None:
-        supported = num_sweeps >= min(support, max(1, many // 2))
+        supported = num_sweeps >= least
         supported &= youngest_ns <= np.float32(points.age_ns.min(initial=_NEVER_NS))
+        supported |= key_only
         inside = edge >= 1
     else:
         many, supported, inside = 2 * _FAR_SUPPORT, num_sweeps >= _FAR_SUPPORT, edge >= _FAR_EDGE
@@ -159,7 +166,8 @@ def _settled(
     )
     confidence = np.maximum(own[winner] * (1 - _DOUBTS @ doubts), MOST_CONFIDENCE)
     inside &= ~veiled
-    columns = winner, depth_m, confidence.astype(np.float32), inside, veiled, refused & ~inside
+    confidence, refused = confidence.astype(np.float32), refused & ~inside
+    columns = winner, depth_m, confidence, inside, veiled, refused, key_only
     kept = [column[supported] for column in columns]
     return MeasuredPixels.at(camera, pixel[supported], *kept), reason
 
@@ -189,15 +197,16 @@ def _found(
     hidden: Bool,
     own: Float32,
     camera: Camera,
+    least: int,
     taken: Bool | None,
 ) -> tuple[Int, Int, Float32]:
-    """Return the pixels (P,) with points, the first point of each (P,), and (6,P) what `_settle`
+    """Return the pixels (P,) with points, the first point of each (P,), and (7,P) what `_settle`
     finds around it; with pixels ``taken`` neither these nor those with hidden points alone."""
     last = int(points.age_ns.max(initial=0)) + 1
     late = points.age_ns > NOW_NS
     rank = np.where(hidden, last + late, points.age_ns)
     start, order = sorted_by_pixel(points, rank, own, camera)
-    found = np.zeros((6, len(start) - 1), np.float32)
+    found = np.zeros((7, len(start) - 1), np.float32)
     done = np.zeros(len(start) - 1, bool)
     if taken is not None:
         some = np.flatnonzero(np.diff(start))
@@ -217,7 +226,8 @@ def _found(
         points.moving[order],
         points.age_ns[order],
     )
-    _settle.over_rows(len(done), visible, (camera.height_px, camera.width_px), done, found)
+    few, shape = 0 if taken is not None else least, (camera.height_px, camera.width_px)
+    _settle.over_rows(len(done), visible, few, shape, done, found)
     pixel = np.flatnonzero(found[0])
     return pixel, order[start[pixel]], found[:, pixel]
 
@@ -261,7 +271,8 @@ def _look_round(points, shape, i, u0, v0, centre, agree, inner, witness_ns, m, r
     static points. Fills the moments m (9,) and how far the surface goes on, reach (8,). Returns a
     bit for each sweep that agrees, the age of the youngest, the number of points in the fit, their
     weighted squares, True if something lies behind close by, and of a moving point the squared
-    distances in spacings to the key sweep's returns of its surface and behind it.
+    distances in spacings to the key sweep's returns of its surface and behind it, and the number of
+    its returns that agree.
     """
     start, uv = points.start, points.uv
     inverse, hidden, age_ns = points.inverse, points.hidden, points.age_ns
@@ -276,7 +287,7 @@ def _look_round(points, shape, i, u0, v0, centre, agree, inner, witness_ns, m, r
     wide_u, wide_v = max(support_u, _window(outer)), max(support_v, _window(on_v))
     fit_u, fit_v = _fit(_PLANE_REACH * across), _fit(_PLANE_REACH * along)
     seen, num, youngest, behind, squares = np.int64(0), 0, age_ns[i], False, 0.0
-    now, now_behind = np.inf, np.inf
+    now, now_behind, num_now = np.inf, np.inf, 0
     left, right = max(u0 - wide_u, 0), min(u0 + wide_u, shape[1] - 1)
     for v in range(max(v0 - wide_v, 0), min(v0 + wide_v, shape[0] - 1) + 1):
         for j in range(start[v * shape[1] + left], start[v * shape[1] + right + 1]):
@@ -296,6 +307,8 @@ def _look_round(points, shape, i, u0, v0, centre, agree, inner, witness_ns, m, r
                 continue
             if moving:
                 now = min(now, away)
+                around = abs(du) <= _GOES_ON * across and abs(dv) <= _GOES_ON * along
+                num_now += around and away < np.inf
             # No branches: half of them would be predicted wrongly.
             vouches = abs(du) <= support_u + 0.5 and abs(v - v0) <= support_v
             seen |= np.int64(vouches) << np.int64(points.sweep[k])
@@ -314,17 +327,19 @@ def _look_round(points, shape, i, u0, v0, centre, agree, inner, witness_ns, m, r
             m[8] += weight * dv * off
             squares += weight * off * off
             num += abs(du) < fit_u and abs(dv) < fit_v
-    return seen, youngest, num, squares, behind, now, now_behind
+    return seen, youngest, num, squares, behind, now, now_behind, num_now
 
 
 @Kernel
-def _settle(first, last, points, shape, taken, found):  # type: ignore[no-untyped-def]
+def _settle(first, last, points, few, shape, taken, found):  # type: ignore[no-untyped-def]
     """Find each pixel's depth from the points around that agree with its first point.
 
-    points: `_Visible`. taken: (P,) pixels to leave alone. found: (6,P) float32, filled with depth,
-    number of sweeps that agree, age of the youngest of them, points in the fit, their root mean
-    square residual (m), and how far the surface goes on to all sides as a share of the reach of
-    edges. Hidden points agree with a hidden one only.
+    points: `_Visible`. few: where fewer sweeps agree, a return of the key sweep is judged by the
+    key sweep only, as a moving point is. taken: (P,) pixels to leave alone. found: (7,P) float32:
+    depth (m), number of sweeps that agree, age of the youngest (ns), points in the fit, their root
+    mean square residual (m), how far the surface goes on to all sides as a share of the reach of
+    edges, and number of returns that agree where the key sweep only is asked. Hidden points agree
+    with a hidden one only.
 
     Limbs swing, so the key sweep says more of a moving object's outline than others. Where it saw
     past the object nearer by than it saw the object, an edge is near (0). At half the distance, or
@@ -345,9 +360,16 @@ def _settle(first, last, points, shape, taken, found):  # type: ignore[no-untype
         m[:], reach[:] = 0.0, 0.0
         # Other sweeps saw the background where the moving object was not yet, or no more.
         witness_ns = _MOVING_WITNESS_NS if points.moving[i] else _ANY_AGE_NS
-        seen, youngest, num, squares, behind, now, now_behind = _look_round(
+        seen, youngest, num, squares, behind, now, now_behind, num_now = _look_round(
             points, shape, i, u0, v0, centre, agree, inner, witness_ns, m, reach
         )
+        if points.age_ns[i] <= NOW_NS and not points.hidden[i] and _count(seen) < few:
+            m[:], reach[:] = 0.0, 0.0
+            now_ns = np.int64(NOW_NS)  # of the type of witness_ns, or this is compiled twice
+            seen, youngest, num, squares, behind, now, now_behind, num_now = _look_round(
+                points, shape, i, u0, v0, centre, agree, inner, now_ns, m, reach
+            )
+            found[6, p] = num_now
         off, _, _ = plane(m[0], m[1], m[2], m[3], m[4], m[5], m[6], m[7], m[8], _RIDGE_PX2)
         found[0, p] = 1 / (centre + min(max(off, -agree), agree))
         found[1, p], found[2, p], found[3, p] = _count(seen), youngest, num

@@ -24,7 +24,7 @@ from densify.depth.layers import Layers
 from densify.depth.measured_pixels import MeasuredPixels, nearest_pixels, visible_pixels
 from densify.depth.seen_through import Rays, without_seen_through
 from densify.depth.spots import measure_spots
-from densify.geometry.types import Bool, Camera, Cloud, DepthMap, Float32, Patches, Ranked, Reason
+from densify.geometry.types import Camera, Cloud, DepthMap, Float32, Patches, Ranked, Reason
 
 _BLOCK_PX = 16  # over which rays lie about equally dense
 _JUMP = 1.6  # by which rays lie farther apart beyond the last of a scanner's denser rings
@@ -71,7 +71,10 @@ def project(
         against = contradicted(layers, camera.focal_px)
         if filled:
             layers = layers.without(against > _MOST_CONTRADICTED)
-        rank = rank_pixels(layers, _far(layers, cloud), against)
+        measured = layers.depth_m > 0
+        far = np.zeros(measured.shape, bool)
+        far[measured] = cloud.far[layers.point[measured]]
+        rank = rank_pixels(layers, far, against)
         layers = replace(layers, confidence=calibrated(rank, layers.filled_m > 0))
         if layers.unsure is not None:
             layers = replace(layers, depth_m=np.where(layers.unsure, 0, layers.depth_m))
@@ -109,6 +112,7 @@ def _layers_of(
         tilt=image(points.slope.astype(np.float32)),
         spacing_px=_spacing_px(near, shape),
         lab=lab,
+        key_only=pixels.key_only.reshape(shape),
         moving=image(points.moving),
     )
 
@@ -137,14 +141,6 @@ def _spacing_px(points: PointsInImage, shape: tuple[int, int]) -> Float32:
     return np.ascontiguousarray(every[: shape[0], : shape[1]])
 
 
-def _far(layers: Layers, cloud: Cloud) -> Bool:
-    """Return (H,W) the measured pixels whose point is from beyond the window."""
-    measured = layers.depth_m > 0
-    far = np.zeros(measured.shape, bool)
-    far[measured] = cloud.far[layers.point[measured]]
-    return far
-
-
 def _set_reasons(layers: Layers, reason: NDArray[np.uint8]) -> None:
     """Set the ``reason`` of points in the map, and of those taken out of it."""
     reason[layers.point[(layers.rim_m > 0) & ~layers.veiled]] = Reason.EDGE
@@ -160,10 +156,10 @@ def _finished(
     reason: NDArray[np.uint8],
     rank: Ranked | None,
 ) -> DepthMap:
-    measured = layers.depth_m > 0
+    """Return the layers as a depth map, with the sweep that measured each pixel."""
+    measured, shown = layers.depth_m > 0, layers.filled_m > 0
     frame = np.full(measured.shape, -1, np.int32)
     frame[measured] = cloud.frame[layers.point[measured]]
-    shown = layers.filled_m > 0
     return DepthMap(
         camera=exposure.camera.name,
         depth_m=layers.depth_m,

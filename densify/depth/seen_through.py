@@ -71,8 +71,8 @@ def without_seen_through(
     A ray of a hidden point went through where it crosses the surface of the map, clearly before its
     end. A ray of another point stopped in its pixel. Both are blurred by a quarter of the gap
     between rays; a pixel goes if a quarter of the rays went through. A filled pixel also goes if
-    an eighth did, blurred by 0.7 gaps, and no less in the pixel itself. Near moving objects only
-    the key's own rays count. Closed car windows stay.
+    an eighth did, blurred by 0.7 gaps, and no less in the pixel itself. Near moving objects, and
+    near surfaces of the key sweep only, only the key's own rays count. Closed car windows stay.
     """
     counts = np.isin(cloud.frame, rays.stretch.frames)
     counts &= (reason != Reason.OUTSIDE) & (reason != Reason.VETOED)
@@ -140,6 +140,8 @@ def _near_movers(layers: Layers, cloud: Cloud, view: InView, seen: Bool, reach_p
     """Return (H,W) True within ``reach_px`` of moving points that are not hidden. seen: (M,)."""
     moving = (seen & cloud.moving)[view.rows]
     movers = _counts(view.uv[moving], layers.depth_m.shape) > 0
+    if layers.key_only is not None:
+        movers |= layers.key_only
     near: Bool = ndimage.maximum_filter(movers, 2 * reach_px + 1)
     return near
 
