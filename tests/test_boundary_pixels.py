@@ -14,8 +14,6 @@ from densify.depth.boundary_pixels import Voters, accept_boundary_pixels, vote
 from densify.depth.image_alignment import align_image, lab
 from densify.depth.neighbours import DIRECTIONS, first_known
 from tests.depth_layers import layers_of
-from tests.scenes import by_flow
-from tests.small_street import KEY, POSES_GIVEN, one_car
 
 HEIGHT, WIDTH = 200, 320
 WALL_M, FAT_PX = 20.0, 3
@@ -150,25 +148,6 @@ def test_an_image_that_does_not_belong_is_noticed(how):
     assert made.warnings and np.array_equal(made.depth_m, layers.depth_m)
 
 
-def hedge(layers, image, beyond_row=70):
-    """The same above a hedge: leaves at any depth, which no colour tells apart."""
-    rng = np.random.default_rng(3)
-    leaves = np.mgrid[0:HEIGHT, 0:WIDTH][0] >= beyond_row
-    known = leaves & (rng.uniform(size=leaves.shape) < 0.4)
-    depth = np.where(leaves, np.float32(0), layers.depth_m)
-    rim = np.where(leaves, known * rng.uniform(6, 14, leaves.shape), layers.rim_m)
-    colours = ndimage.gaussian_filter(rng.uniform(0, 255, image.shape), (1, 1, 0))
-    image = np.where(leaves[..., None], 127 + 3 * (colours - 127), image).clip(0, 255)
-    return replace(layers, depth_m=depth, rim_m=rim.astype(np.float32)), image.astype(np.uint8)
-
-
-def test_a_right_image_stays_where_it_is_beside_a_hedge_too():
-    layers, image, _ = scene(1)
-    layers, image = hedge(layers, image)
-    assert pictured(image, layers)[1:] == (0, 0)
-    assert pictured(image[:, ::-1].copy(), layers) is None
-
-
 def pictured(image, layers):
     return align_image(replace(layers, lab=lab(image)))
 
@@ -255,12 +234,3 @@ def test_votes_equal_those_of_a_slow_twin(surely):
     expected = [vote_twin(p, z, *rest) for p, z in zip(pixel, depth_m, strict=True)]
     np.testing.assert_allclose(share, expected, rtol=1e-4)
     assert np.ptp(share) > 0.5
-
-
-def test_the_run_says_that_an_image_does_not_fit():
-    grey = by_flow(one_car(), KEY, 2, config=POSES_GIVEN)  # its images show nothing
-    strict = by_flow(one_car(), KEY, 2, config={**POSES_GIVEN, "project": {"rims": "strict"}})
-    (name,) = grey.depth
-    assert any(w.startswith(f"{name}: image edges") for w in grey.warnings)
-    assert grey.depth[name].warnings and not strict.depth[name].warnings
-    assert np.array_equal(grey.depth[name].depth_m, strict.depth[name].depth_m)

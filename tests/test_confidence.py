@@ -67,25 +67,6 @@ def test_a_map_expects_what_its_own_pixels_are_worth():
             assert scale.wrong(confidence[part]).mean() == pytest.approx(expected.mean(), rel=0.03)
 
 
-def test_groups_are_how_a_pixel_came_and_how_ragged_it_is_around():
-    shape = (60, 120)
-    none, everywhere = np.zeros(shape, np.float32), np.ones(shape, np.float32)
-    column = np.arange(shape[1])
-    depth_m = everywhere.copy()
-    depth_m[30:] = 0
-    rim_m = np.where((column < 60) & (column % 2 == 0), everywhere, none)
-    layers = layers_of(everywhere, depth_m > 0, rim_m, 0.5, (1, 1))
-    far = np.zeros(shape, bool)
-    far[:10] = True
-    rank, group, contradicted = scale.rank_pixels(layers, far, none)
-    assert (rank == 0.5).all() and not contradicted.any()
-    names = np.array(scale.GROUPS)[group]
-    for row, how in ((5, "beyond"), (20, "window"), (45, "filled")):
-        ragged = 0.5 if how == "filled" else 0.1
-        assert names[row, 11] == f"{how}, rough from {ragged}"
-        assert names[row, 90] == f"{how}, rough from 0"
-
-
 def test_the_packages_own_tables_fall_with_the_rank():
     own = scale.tables_of(scale.own_file())
     assert own.shape == (len(scale.GROUPS), len(scale.CAUSES), scale.NUM_RANKS)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from densify.depth import fill as stage
-from densify.depth.fill import FILL_CONFIDENCE, fill, fill_between, fill_stars, without_shreds
+from densify.depth.fill import FILL_CONFIDENCE, fill, fill_stars, without_shreds
 from densify.depth.neighbours import DIRECTIONS, first_known
 from tests.depth_layers import layers_of
 
@@ -31,21 +31,6 @@ def test_windows_reach_as_far_as_rays_lie_apart_there():
     assert not filled[49:].any()
     narrow = fill(layers_of(rings * 10.0, spacing_px=(1, 3)), 1.0).filled_m
     assert (narrow[1:48, 42:-2] > 0).mean() < 0.6
-
-
-def test_filling_does_not_depend_on_the_size_of_pixels():
-    """Twice the resolution, twice the spacing: the same is filled."""
-    rng = np.random.default_rng(2)
-    depth = np.where(rng.uniform(size=(40, 50)) < 0.15, 10.0, 0).astype(np.float32)
-    wide = np.zeros((80, 100), np.float32)
-    wide[::2, ::2] = depth
-
-    def share(of, spacing):
-        two = (*of.shape, 2)
-        spacing_px, tilt = np.full(two, spacing, np.float32), np.zeros(two, np.float32)
-        return (fill_between(of, of / 10, tilt, spacing_px, 1.5)[0] > 0).mean()
-
-    assert abs(share(depth, (2, 4)) - share(wide, (4, 8))) < 0.06
 
 
 def test_the_image_lets_the_fill_come_closer_to_an_edge():
@@ -116,14 +101,6 @@ def test_a_hole_in_a_plane_gets_the_planes_depth():
     np.testing.assert_allclose(filled.filled_m, TILTED, rtol=2e-3)
     assert not filled.depth_m[hole].any()
     np.testing.assert_allclose(filled.confidence[hole], 0.8 * FILL_CONFIDENCE)
-
-
-def test_the_comb_at_the_lower_border_is_closed_and_nothing_below_it():
-    teeth = np.where(COLUMN % 6 == 0, 50, 42)
-    filled = star(np.where(teeth > ROW, TILTED, 0)).filled_m
-    between = (ROW < 48) & (COLUMN > 0) & (COLUMN < 78)
-    np.testing.assert_allclose(filled[between], TILTED[between], rtol=5e-3)
-    assert not filled[ROW >= 50].any()
 
 
 @pytest.mark.parametrize("height_px", [1, 6])

@@ -5,11 +5,7 @@ threads row by row."""
 from __future__ import annotations
 
 import importlib.util
-import os
-import signal
 import sys
-import threading
-import time
 
 import numpy as np
 import pytest
@@ -91,22 +87,6 @@ def test_a_kernel_does_every_row(double, shared_out, num_rows):
 # --- threads --------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("cores", [1, 2, 7])
-@pytest.mark.parametrize("num_rows", [0, 1, 5000, 40001])
-def test_parts_cover_every_row_once(monkeypatch, cores, num_rows):
-    monkeypatch.setattr(threads, "num_threads", lambda: cores)
-    seen, parts = np.zeros(num_rows, int), []
-
-    def visit(begin, end):
-        seen[begin:end] += 1
-        parts.append(threading.current_thread())
-
-    threads.over_rows(visit, num_rows)
-    assert (seen == 1).all()
-    assert len(parts) <= cores and threading.current_thread() in parts
-    assert num_rows < 40000 or len(parts) == cores
-
-
 @pytest.mark.parametrize("where", ["first", "others"])
 def test_errors_come_through_once_all_are_done(shared_out, where):
     done = []
@@ -119,27 +99,3 @@ def test_errors_come_through_once_all_are_done(shared_out, where):
     with pytest.raises(ValueError, match="here"):
         threads.over_rows(fail, 300)
     assert len(done) == 3
-
-
-@pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork here")
-@pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
-def test_a_forked_process_has_threads_of_its_own(double, shared_out):
-    kernel = kernels.Kernel(double)
-    check(kernel)  # the pool's threads are there, and stay behind
-    child = os.fork()
-    if child == 0:
-        try:
-            check(kernel)
-            os._exit(0)
-        finally:
-            os._exit(1)
-    for _ in range(200):
-        ended, status = os.waitpid(child, os.WNOHANG)
-        if ended:
-            break
-        time.sleep(0.05)
-    else:
-        os.kill(child, signal.SIGKILL)
-        os.waitpid(child, 0)
-        pytest.fail("the forked process hangs")
-    assert status == 0

@@ -94,17 +94,6 @@ def test_a_post_before_a_wall_faces_the_scanner():
     assert towards[post].min() > 0.99
 
 
-@pytest.mark.parametrize("name", ["panda", "rosette"])
-def test_equal_points_have_equal_patches(name):
-    registered = in_a_room(name)
-    sweep, sensors = registered.sweep, Sensors.of([registered])
-    rows = np.random.default_rng(4).permutation(np.repeat(np.arange(len(sweep)), 2))
-    cloud = replace(make_cloud(sweep.points[rows]), lidar=sweep.lidar[rows])
-    found = patches(cloud, KEY, sensors, {KEY: sensors.origins_m})
-    one, other = np.argsort(rows, kind="stable").reshape(-1, 2).T
-    assert found.normal[one].tobytes() == found.normal[other].tobytes()
-
-
 def test_veto_of_what_the_key_saw_through():
     """Points of another sweep before the wall are free, behind it or near it not; the key's own
     points never are."""

@@ -72,13 +72,6 @@ def test_what_is_open_or_of_another_surface_stays_so():
     np.testing.assert_array_equal(made.depth_m > 0, expected)
 
 
-def test_unsure_rims_stay_so():
-    layers, points = measured_at([[16, 12]], 6.0)
-    made = measure_spots(replace(layers, unsure=COLUMN > 16), points)
-    covered = measure_spots(layers, points).depth_m > 0
-    np.testing.assert_array_equal(made.depth_m > 0, covered & (COLUMN <= 16))
-
-
 @pytest.mark.parametrize("spacing_px", [50.0, 1e6])
 def test_right_before_the_lens_a_spot_does_not_fill_the_image(spacing_px):
     layers, points = measured_at([[16, 12]], spacing_px)

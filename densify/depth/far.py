@@ -5,6 +5,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import fields
+from typing import Any
 
 import numpy as np
 
@@ -121,18 +123,10 @@ def joined(parts: Sequence[StandingWorld]) -> StandingWorld:
     parts = [_NOTHING, *sorted(parts, key=lambda part: part.frames)]
     counts = np.cumsum([0, *(len(part.frames) for part in parts)])
     sources = [p.source + np.int32(first) for p, first in zip(parts, counts, strict=False)]
-    return StandingWorld(
-        points=np.concatenate([p.points for p in parts]),
-        normal=np.concatenate([p.normal for p in parts]),
-        spacing_m=np.concatenate([p.spacing_m for p in parts]),
-        source=np.concatenate(sources),
-        row=np.concatenate([p.row for p in parts]),
-        lidar=np.concatenate([p.lidar for p in parts]),
-        intensity=np.concatenate([p.intensity for p in parts]),
-        frames=tuple(f for p in parts for f in p.frames),
-        stamp_ns=np.concatenate([p.stamp_ns for p in parts]),
-        travel_m=np.concatenate([p.travel_m for p in parts]),
-    )
+    names = {field.name for field in fields(StandingWorld)} - {"source", "frames", "left_out"}
+    columns: dict[str, Any] = {n: np.concatenate([getattr(p, n) for p in parts]) for n in names}
+    frames = tuple(frame for part in parts for frame in part.frames)
+    return StandingWorld(**columns, source=np.concatenate(sources), frames=frames)
 
 
 _NOTHING = StandingWorld(

@@ -235,10 +235,6 @@ def _correction(
 
 def _settled(membrane: sparse.csr_array, tied: Float, pulled: Float) -> Float:
     """Return where the membrane comes to rest if each cell is pulled to ``pulled / tied``."""
-    solver = linalg.splu(
-        (membrane + sparse.diags_array(tied)).tocsc(),
-        permc_spec="MMD_AT_PLUS_A",
-        options={"SymmetricMode": True},
-    )
-    at_rest: Float = solver.solve(pulled)
+    system = (membrane + sparse.diags_array(tied)).tocsc()
+    at_rest: Float = linalg.spsolve(system, pulled, permc_spec="MMD_AT_PLUS_A")
     return at_rest
