@@ -153,7 +153,7 @@ DAMAGE = {
     ),
     "missing": (
         lambda root: [p.unlink() for p in (root / "samples/LIDAR_RIGHT").iterdir()],
-        "no such file",
+        "(?i)no such file",
     ),
 }
 

@@ -230,7 +230,7 @@ DAMAGE = {
     "no calibration": (lambda r: shutil.rmtree(r / "lidar_calibration"), "no such file"),
     "lidar truncated": (cut("lidar"), "not a whole parquet file"),
     "ranges of another shape": (sets("lidar", f"{LIDAR}1.shape", [1, 2, 4]), "expected .H, W, 4"),
-    "pose not a number": (sets("vehicle_pose", VEHICLE, np.full(16, np.nan)), "not finite"),
+    "pose not a number": (sets("vehicle_pose", VEHICLE, np.full(16, np.nan)), "finite numbers"),
 }
 
 

@@ -226,7 +226,7 @@ def _bytes(street: Street, frame: int) -> tuple[bytes, ...]:
 def test_same_bytes_fresh_and_cached(highway, tmp_path, monkeypatch):
     first = _bytes(highway, 30)
     again = Street.from_spec("street:highway?sensor=vlp16")
-    monkeypatch.setattr(type(again.simulator), "returns", None)  # must come from the cache
+    monkeypatch.setattr(type(again.simulator), "returns", pytest.fail)  # must come from the cache
     assert _bytes(again, 30) == first
     monkeypatch.undo()
     monkeypatch.setenv("DENSIFY_CACHE_DIR", str(tmp_path))
