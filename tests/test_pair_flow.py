@@ -117,18 +117,31 @@ def test_initial_is_where_it_starts(sense):
     assert np.abs(np.median(field.displacement[moved], 0) - sense * far).max() < 0.2
 
 
+def test_same_bytes_every_time(pair):
+    source, target, _ = pair
+    a, b = (estimate_flow(source, target) for _ in range(2))
+    assert a.displacement.tobytes() == b.displacement.tobytes()
+    assert a.instance.tobytes() == b.instance.tobytes()
+
+
 CLOUD = np.random.default_rng(0).normal(size=(60, 3))
 NAN = CLOUD.copy()
 NAN[7, 1] = np.nan
+INFINITE = CLOUD.copy()
+INFINITE[9] = np.inf
 
 
 @pytest.mark.parametrize(
     ("source", "target", "initial", "message"),
     [
         (np.empty((0, 3)), CLOUD, None, "source: .*no points"),
+        (CLOUD, np.empty((0, 3)), None, "target: .*no points"),
+        (CLOUD[:, :2], CLOUD, None, r"source: .*\(60, 2\)"),
         (CLOUD, CLOUD[0], None, r"target: .*\(3,\)"),
         (NAN, CLOUD, None, "source: .*row 7"),
+        (CLOUD, INFINITE, None, "target: .*row 9"),
         (CLOUD, CLOUD, CLOUD[:-1], "initial"),
+        (CLOUD, CLOUD, NAN, "initial"),
         ("points.bin", CLOUD, None, "source"),
     ],
 )

@@ -296,7 +296,7 @@ def rigid(T: Float, where: str) -> Float:
     finite or its upper left is no rotation."""
     T = np.asarray(T, np.float64)
     if T.shape not in ((4, 4), (3, 4)) or not np.isfinite(T).all():
-        got = "NaN or infinity" if T.shape == (4, 4) else f"shape {T.shape}"
+        got = "NaN or infinity" if T.shape in ((4, 4), (3, 4)) else f"shape {T.shape}"
         raise InputError(f"{where}: got {got}, expected a (4,4) pose of finite numbers")
     check_rotation(T[:3, :3], where)
     return np.vstack([T[:3], [0.0, 0.0, 0.0, 1.0]])

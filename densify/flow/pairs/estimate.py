@@ -35,6 +35,8 @@ _MIN_GAIN_M = 0.07
 _MAX_EXTENT_M = 400.0
 _MIN_LOW_M = 0.04
 _BELOW_M = 0.3
+_MIDDLE_M = 3.0  # nearer, the direction is not that from a scanner
+_MIN_AGREEMENT, _MAX_SINGLE = 0.8, 0.3
 
 
 def estimate_flow(
@@ -47,26 +49,28 @@ def estimate_flow(
     source_lidar: ArrayLike | None = None,
     target_lidar: ArrayLike | None = None,
 ) -> FlowField:
-    """Return the scene flow of two clouds in one frame, z up, with or without the ground.
+    """Scene flow of two clouds in one coordinate frame, metres, z up, with or without the ground.
 
-    source: (N,3) metres. target: (M,3) metres.
-    config: its ``flow`` and ``objective`` sections are used.
-    initial: (N,3) flow to start from, metres. It is needed only where an object moves farther than
-        38 m/s over the time between the clouds, at most 0.4 s; 3.8 m if that time is unknown.
-    source_offset_ns, target_offset_ns: (N,), (M,) firing times, both or neither. They are on one
-        clock, or each since its own sweep's reference time; then the target is the next revolution.
-        With them the flow spans the time between the middles of the two clouds' times, and
-        ``to_reference`` leads from a point's own time to the source's middle.
-    source_lidar, target_lidar: (N,), (M,) integers, the scanner of each point, both or neither.
-        Each scanner's points are compared with its own, since scanners see a moving object at
-        different times.
+    source: (N,3), target: (M,3). config: its ``flow`` and ``ground`` sections are used.
+    initial: (N,3) flow to start from; needed only where something moves farther than is looked
+    for: 38 m/s over the time between the clouds, at most 0.4 s; 3.8 m where that is not known.
 
-    With ``objective.static_prior``, a group of points moves only if its motion explains the points
-    that both clouds leave unexplained if it is static; all other flow is exactly 0, also beyond
-    400 m. ``flow.engine=paper`` takes the published objective's flow for the groups. Without the
-    prior every point takes the objective's flow.
+    source_offset_ns, target_offset_ns: (N,), (M,) when each point was measured, both or neither.
+    On one clock, or each from its own sweep's reference time: then the target is taken for the next
+    revolution. With them the flow is that between the middles of the two clouds' times, and
+    ``to_reference`` that from a point's own time to the source's middle. Without them an object the
+    scanner meets earlier or later in the second sweep comes out too slow or too fast.
+    source_lidar, target_lidar: (N,), (M,) whole numbers, which scanner measured each point, both or
+    neither: each scanner's points are compared with its own, for each sees a mover at another time;
+    with the times, with the others' too, each at its own. Times alone tell two scanners that spin
+    half a turn apart about the frame's origin, as the source's own frame has them.
 
-    Raises InputError for no points, wrong shapes, NaN, or an engine that needs a recording.
+    With ``objective.static_prior`` only groups of points move whose motion explains in both clouds
+    what standing still leaves unexplained; the flow of all others is exactly 0, as it is farther
+    than 400 m from the middle. ``flow.engine=paper`` takes the published objective's flow for them.
+    Without the prior every point takes the objective's flow.
+
+    Raises InputError for no points, wrong shapes, NaN or another engine, which needs a recording.
     """
     settings = resolve(config)
     if settings.flow.engine not in ("groups", "paper"):
@@ -77,6 +81,8 @@ def estimate_flow(
     clouds = checked_cloud(source, "source"), checked_cloud(target, "target")
     times = _times(_columns(source_offset_ns, target_offset_ns, clouds, "offset_ns"))
     lidars = _columns(source_lidar, target_lidar, clouds, "lidar")
+    if lidars is None and times is not None:
+        lidars = _tell_scanners(clouds, times.lag)
     if not settings.objective.static_prior or settings.flow.engine == "paper":
         return flow_between(*clouds, settings.objective, initial)
     start = None if initial is None else checked_cloud(initial, "initial")
@@ -151,6 +157,31 @@ def _attach_below(points: Float, field: FlowField, low: Int) -> None:
     if len(members) and len(low):
         _, row = nearest(tree_of(points[members, :2]), points[low, :2], _BELOW_M)
         field.instance[low[row >= 0]] = field.instance[members[row[row >= 0]]]
+
+
+def _tell_scanners(clouds: tuple[Float, Float], lag: tuple[Float, Float]) -> tuple[Int, Int] | None:
+    """Return (N,) and (M,) 0 or 1 for two scanners that spin half a turn apart; None if there are
+    no such.
+
+    Time plus or minus azimuth is one number for all points of a spinning scanner, its phase. Where
+    the phases of two scanners are half a turn apart, only the doubled phases agree.
+
+    lag: of the points, as a share of the time between the clouds, a whole number of turns.
+    """
+    both = np.concatenate(clouds)
+    far = np.hypot(both[:, 0], both[:, 1]) > _MIDDLE_M
+    share = max(float(np.ptp(late)) for late in lag)  # of a sweep in the time between the clouds
+    if not far.any() or share <= 0:
+        return None
+    turned = np.concatenate(lag) * (2 * np.pi * max(1, round(1 / share)))
+    azimuth = np.arctan2(both[:, 1], both[:, 0])
+    for phase in (turned + azimuth, turned - azimuth):
+        doubled = np.exp(2j * phase[far]).mean()
+        if abs(doubled) < _MIN_AGREEMENT or abs(np.exp(1j * phase[far]).mean()) > _MAX_SINGLE:
+            continue
+        lidar = (np.cos(phase - np.angle(doubled) / 2) < 0).astype(np.int64)
+        return lidar[: len(clouds[0])], lidar[len(clouds[0]) :]
+    return None
 
 
 def _columns(

@@ -10,6 +10,7 @@ are unexplained if it is static.
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
@@ -20,12 +21,14 @@ from densify.flow.pairs.hypotheses import (
     RigidMotion,
     Surface,
 )
+from densify.flow.pairs.refine import Refined, refined
 from densify.flow.pairs.trials import Trial, promising
 from densify.flow.pairs.unexplained import Unexplained, distances_m
 from densify.free_space.ground import HeightMap
 from densify.geometry.nearest import tree_of
 from densify.geometry.types import Float, Int
 
+_CLOSE_BY_M = 1.0
 _ATTACH_M = 0.3
 _ATTACH_UNEXPLAINED_M = 1.0
 
@@ -52,9 +55,21 @@ def find_movers(
     hypotheses = Hypotheses.of(groups, source, target, there, initial, apart_s, ground)
     hypotheses.align(Surface(target, there))
 
+    timed = apart_s is not None
+
+    def tried(start: tuple[int, RigidMotion]) -> Trial | None:
+        k, motion = start
+        trial = Trial.of(k, groups[k], Refined(motion), ours, theirs)
+        if not trial.may_prove():
+            return None
+        found = refined(motion, groups[k], source, target, there, ground, timed)
+        if found.motion is motion:
+            return replace(trial, refined=found)
+        return trial.after(found, Trial.of(k, groups[k], found, ours, theirs))
+
     starts = promising(hypotheses, ours, theirs)
     with ThreadPoolExecutor(2) as pool:
-        trials = list(pool.map(lambda s: Trial.of(s[0], groups[s[0]], s[1], ours, theirs), starts))
+        trials = [trial for trial in pool.map(tried, starts) if trial is not None]
     motions, instance = _choose(trials, groups, ours, theirs)
     _attach(motions, instance, ours, theirs)
     return motions, instance
@@ -65,7 +80,7 @@ def _choose(
 ) -> tuple[list[RigidMotion], Int]:
     """Choose at most one motion per group, so that each target is explained once."""
     free = np.ones(len(theirs.unexplained), bool)
-    trials = [trial for trial in trials if trial.proves(free)]
+    trials = _thinnest([t for t in trials if t.proves(free)])
     assigned = _assigned(trials, theirs.group)
     motions: list[RigidMotion] = []
     instance = np.full(len(ours.unexplained), -1)
@@ -75,8 +90,25 @@ def _choose(
             done.add(trial.group)
             free[trial.explained] = False
             instance[groups[trial.group]] = len(motions)
-            motions.append(trial.motion)
+            motions.append(trial.refined.motion)
     return motions, instance
+
+
+def _thinnest(trials: list[Trial]) -> list[Trial]:
+    """Drop the trials whose surfaces are thicker than those of another motion close by: nearest
+    points fit any ring."""
+    kept = []
+    for trial in trials:
+        others_m = [
+            t.refined.thickness_m
+            for t in trials
+            if t.group == trial.group
+            and t.refined.thickness_m is not None
+            and np.abs(t.refined.motion.state - trial.refined.motion.state)[:2].max() < _CLOSE_BY_M
+        ]
+        if trial.refined.thickness_m is None or trial.refined.thickness_m <= min(others_m):
+            kept.append(trial)
+    return kept
 
 
 def _assigned(trials: list[Trial], target_group: Int) -> list[Trial]:

@@ -1,17 +1,20 @@
 # SPDX-License-Identifier: MIT
 """The test of a group's motion between two clouds: does it explain what differs?
 
-A motion is judged by the points of both clouds that are unexplained if the group is static and that
-have a counterpart if it moves.
+Nearest points alone cannot tell. The rings of a scanner lie elsewhere on an object that has moved.
+Each promising motion is refined until the object's surfaces are thin (`densify.flow.pairs.refine`).
+It is judged by the points that it explains, and by the thickness of the surfaces compared with that
+of a static object.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from densify.flow.pairs.hypotheses import Hypotheses, RigidMotion, thinned
+from densify.flow.pairs.refine import Refined
 from densify.flow.pairs.unexplained import EXPLAINED_M, MIN_UNEXPLAINED, Unexplained, distances_m
 from densify.geometry.nearest import tree_of
 from densify.geometry.types import Bool, Float, Int
@@ -26,8 +29,11 @@ _BAR_M, _LEVEL, _ACROSS = 0.12, 0.5, 0.2  # of a rail: its width (rms), its rise
 _MAX_BAR_M, _MAX_BAR_POINTS = 0.75, 60  # length (rms) of the back of a car, far away
 _AROUND_M = 0.5
 _MAX_LEFT = 0.4  # of what standing still leaves unexplained, in both clouds together
-_MAX_LEFT_EACH, _MAX_LEFT_START = 0.6, 0.75  # in each cloud; of a first look
+_MAX_LEFT_EACH, _MAX_LEFT_START = 0.6, 0.75  # before a motion is refined
 _MAX_MISFIT = 0.82  # share left and mean distance in tolerances, together
+_MAX_MISFIT_THIN = 1.2  # where surfaces are so thin,
+_THIN_SURFACES_M, _THIN_OF_STANDING = 0.075, 0.65  # also compared with an object that stands
+_MAX_OF_STANDING = 0.82  # where much is left
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +49,7 @@ class Trial:
     """
 
     group: int
-    motion: RigidMotion
+    refined: Refined
     still: int
     firmly: int
     left: int
@@ -57,17 +63,17 @@ class Trial:
 
     @staticmethod
     def of(
-        group: int, members: Int, motion: RigidMotion, ours: Unexplained, theirs: Unexplained
+        group: int, members: Int, refined: Refined, ours: Unexplained, theirs: Unexplained
     ) -> Trial:
         """Judge the motion of the source's ``members`` by nearest points."""
         sample = thinned(members, _LOOK_POINTS)
-        place = ours.cloud.places(motion.seen(ours.cloud.points[sample]), sample)
+        place = ours.cloud.places(refined.motion.seen(ours.cloud.points[sample]), sample)
         far, tolerance_m = distances_m(place, theirs.cloud.tree), ours.tolerance_m(sample)
-        around, explained, back_m = _looked_back(motion, members, ours, theirs)
+        around, explained, back_m = _looked_back(refined.motion, members, ours, theirs)
         own_gain_m = float((ours.distance_m[sample] - far).mean() * len(members))
         return Trial(
             group=group,
-            motion=motion,
+            refined=refined,
             still=int(ours.unexplained[sample].sum()),
             firmly=int(ours.firmly[members].sum()),
             left=int((far > tolerance_m).sum()),
@@ -80,22 +86,53 @@ class Trial:
             gain_m=own_gain_m + back_m,
         )
 
-    def proves(self, free: Bool) -> bool:
-        """Return True if the motion is confirmed. free: (M,) targets that no other motion
-        explains."""
-        left_there = len(self.around) - int(free[self.explained].sum())
-        left, still = self.left + left_there, self.still + self.still_there
-        far_m = float(np.linalg.norm(self.motion.state[:2]))
+    def after(self, found: Refined, settled: Trial) -> Trial:
+        """Return the trial of the refined motion. It is judged by nearest points before or after
+        the refinement, whichever fits better: rings drawn onto each other fit, but hold back."""
+        here, there = (t._off(len(t.around) - len(t.explained)) for t in (self, settled))
+        return replace(self, refined=found) if here < there else settled
+
+    def left_there(self, free: Bool) -> int:
+        """Return the targets left unexplained. free: (M,) those that no other motion explains."""
+        return len(self.around) - int(free[self.explained].sum())
+
+    def may_prove(self) -> bool:
+        """Return True if it explains enough, provided that its surfaces come out thin."""
+        far_m = float(np.linalg.norm(self.refined.motion.state[:2]))
         return (
             self.firmly >= MIN_UNEXPLAINED[0]
             and self.firmly_there >= MIN_UNEXPLAINED[1]
             and self.firmly + self.firmly_there >= _MIN_TOGETHER + _MIN_TOGETHER_PER_M * far_m
-            and self.left <= _MAX_LEFT_EACH * self.still
-            and left_there <= _MAX_LEFT_EACH * self.still_there
-            and left <= _MAX_LEFT * still
-            # A sample of many points may hold none that are unexplained.
-            and left / max(still, 1) + self.misfit <= _MAX_MISFIT
+            and self.left <= _MAX_LEFT_START * self.still
+            and self._off(len(self.around) - len(self.explained)) <= _MAX_MISFIT_THIN
         )
+
+    def proves(self, free: Bool) -> bool:
+        """Return True if the motion is confirmed. Less must be explained where the surfaces are
+        thin, and nearly all where they are as thin without the motion."""
+        left_there = self.left_there(free)
+        off = self._off(left_there)
+        if (
+            not self.may_prove()
+            or self.left > _MAX_LEFT_EACH * self.still
+            or off > _MAX_MISFIT_THIN
+        ):
+            return False
+        thickness_m, of_standing = self.refined.thickness_m, self.refined.of_standing
+        if thickness_m is not None and of_standing is not None:
+            if of_standing > _MAX_OF_STANDING and 2 * off > _MAX_MISFIT:
+                return False
+            if of_standing <= _THIN_OF_STANDING and thickness_m <= _THIN_SURFACES_M:
+                return True
+        return (
+            left_there <= _MAX_LEFT_EACH * self.still_there
+            and self.left + left_there <= _MAX_LEFT * (self.still + self.still_there)
+            and off <= _MAX_MISFIT
+        )
+
+    def _off(self, left_there: int) -> float:
+        # A sample of many points may hold none that are unexplained.
+        return (self.left + left_there) / max(self.still + self.still_there, 1) + self.misfit
 
 
 def promising(

@@ -1,0 +1,320 @@
+# SPDX-License-Identifier: MIT
+"""Motions refined until an object's surfaces, brought to one time, are thin.
+
+The rings of a scanner lie elsewhere on an object that has moved. Nearest points fit any ring, so
+they hold the motion back. Where two scanners share a sweep, an object appears twice, half of the
+motion apart. Planes through several rings let a surface slide along itself, and the other surfaces
+tell how far (as in Stückler, Behnke, "Multi-Resolution Surfel Maps", JVCI 2014). Here the planes
+are made anew in every step, from all other points of the object, each at its own time.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from densify.flow.pairs.hypotheses import (
+    PairCloud,
+    RigidMotion,
+    one_per_voxel,
+    slope_of,
+    thinned,
+)
+from densify.free_space.ground import HeightMap
+from densify.geometry.compiled import Kernel, inlined
+from densify.geometry.nearest import tree_of
+from densify.geometry.types import Bool, Float, Int
+
+_MIN_POINTS = 40  # fewer show no surfaces
+_MAX_POINTS = 600  # of each cloud; of 400 the thickness hangs on how the axes lie
+_SIDE_M = 0.06
+_REACH_M, _MAX_REACH_M, _WIDER = 0.4, 1.0, 1.5
+_MIN_PLANES = 0.6  # share of points that must have one
+_GATES_M, _LAST_GATES_M = np.array([0.3, 0.3, 0.3, 0.2, 0.2]), np.array([0.15, 0.15, 0.1, 0.1, 0.1])
+_NO_GATES = np.zeros(0)
+_STANDING = np.zeros(4)
+_LIMIT_M = 0.15
+_MAX_THICK_M = 0.09  # thicker ones are sparse or no surfaces: nothing is learnt from them
+_MAX_WEIGHT = 60.0
+_MIN_NEIGHBORS = 6
+_MIN_WIDTH_M2 = 0.05**2  # neighbours on one ring alone span no plane
+_SIGMA_M2 = 0.02**2  # noise of a surface point
+_PRECISION = np.array([1e3, 1e3, 3e5, 1e4])  # 1/m² from where it starts; 1/rad²
+_SHIFTS_M = (0.3, -0.3)
+_FACTORS = (2.0, 2 / 3)  # where one appearance was taken for the other
+_CLEARLY = 0.9  # how much thinner another start must come out,
+_SURELY = 0.95  # and the refined motion where times are not known
+_NEAR_M = 0.5  # of where the object may arrive
+_ARRIVED_POINTS = 300
+
+
+class Refined(NamedTuple):
+    """A motion with the thickness of the object's surfaces (m), and its ratio to that of the static
+    object; None where too few points lie on surfaces."""
+
+    motion: RigidMotion
+    thickness_m: float | None = None
+    of_standing: float | None = None
+
+
+def refined(
+    motion: RigidMotion,
+    members: Int,
+    source: PairCloud,
+    target: PairCloud,
+    candidates: Int,
+    ground: HeightMap,
+    timed: bool,
+) -> Refined:
+    """Refine the motion of the source's ``members``; keep it as it is if that is no thinner.
+
+    candidates: rows of the target that may be the object's. timed: lags are known: every scanner's
+    points are compared with those of all others, each at its own time; otherwise with the other
+    cloud's, of the same scanner if that is known.
+    """
+    if len(members) < _MIN_POINTS:
+        return Refined(motion)
+    starts = _starts(motion, slope_of(ground, motion.centre), source, timed)
+    places = [replace(motion, state=s) for s in (*starts, _STANDING)]
+    near = _arrivals(places, members, source, target, candidates)
+    if len(near) < _MIN_POINTS:
+        return Refined(motion)
+    surfaces = _Surfaces.of(motion.centre, members, near, source, target, timed)
+    while surfaces.settled(starts[0], _NO_GATES)[2] <= _MIN_PLANES:
+        if surfaces.reach_m * _WIDER > _MAX_REACH_M:
+            return Refined(motion)
+        surfaces = replace(surfaces, reach_m=surfaces.reach_m * _WIDER)
+    best, thick_m = starts[0], np.inf
+    for start in starts:
+        state, found_m, _ = surfaces.settled(start, _GATES_M)
+        if found_m < _CLEARLY * thick_m:
+            best, thick_m = state, found_m
+    best, thick_m, _ = surfaces.settled(best, _LAST_GATES_M)
+    _, before_m, _ = surfaces.settled(motion.state, _NO_GATES)
+    enough_m = before_m if timed else _SURELY * before_m
+    _, standing_m, _ = surfaces.settled(_STANDING, _NO_GATES)
+    if thick_m < min(enough_m, _MAX_THICK_M):
+        motion, before_m = replace(motion, state=best), thick_m
+    return Refined(motion, before_m, before_m / max(standing_m, _SIDE_M * 1e-3))
+
+
+def _starts(motion: RigidMotion, slope: Float, source: PairCloud, timed: bool) -> list[Float]:
+    """Return starts on the ground: the motion, and others from which it may be held back."""
+    way = motion.state[:2]
+    length_m = np.linalg.norm(way)
+    factors = (1.0, *(1 + shift / length_m for shift in _SHIFTS_M if length_m + shift > 0))
+    if not timed and source.lidar is None:
+        factors += _FACTORS
+    ways = [way * factor for factor in factors]
+    yaws = [motion.state[3]] + [0.0] * (len(ways) - 1)
+    return [np.array([*w, w @ slope, yaw]) for w, yaw in zip(ways, yaws, strict=True)]
+
+
+def _arrivals(
+    motions: list[RigidMotion],
+    members: Int,
+    source: PairCloud,
+    target: PairCloud,
+    candidates: Int,
+) -> Int:
+    """Return the target's candidates near the members after one of the motions."""
+    points = source.points[thinned(members, _ARRIVED_POINTS)]
+    arrived = np.concatenate([motion.seen(points) for motion in motions])
+    low, high = arrived.min(0) - _NEAR_M, arrived.max(0) + _NEAR_M
+    at = target.points[candidates]
+    box = candidates[((at > low) & (at < high)).all(1)]
+    far, _ = tree_of(arrived).query(target.points[box], distance_upper_bound=_NEAR_M)
+    near: Int = box[np.isfinite(far)]
+    return near
+
+
+@dataclass(frozen=True)
+class _Surfaces:
+    """An object's points in both clouds, see `_settle`."""
+
+    points: Float
+    share: Float
+    sampling: Int
+    judges: Bool
+    centre: Float
+    reach_m: float
+
+    @staticmethod
+    def of(
+        centre: Float, here: Int, there: Int, source: PairCloud, target: PairCloud, timed: bool
+    ) -> _Surfaces:
+        here, there = _evenly(source, here), _evenly(target, there)
+        cloud = np.repeat([0, 1], [len(here), len(there)])
+        lidar = np.zeros_like(cloud)
+        if source.lidar is not None and target.lidar is not None:
+            lidars = np.concatenate([source.lidar[here], target.lidar[there]])
+            lidar = np.unique(lidars, return_inverse=True)[1].ravel()
+        num_lidars = int(lidar.max()) + 1
+        cloud_of, lidar_of = np.divmod(np.arange(2 * num_lidars), num_lidars)
+        others = cloud_of[:, None] != cloud_of
+        same = lidar_of[:, None] == lidar_of
+        return _Surfaces(
+            points=np.concatenate([source.points[here], target.points[there]]),
+            share=np.concatenate([source.lag[here], 1 + target.lag[there]]),
+            sampling=cloud * num_lidars + lidar,
+            judges=others | ~same if timed else others & same,
+            centre=centre,
+            reach_m=_REACH_M,
+        )
+
+    def settled(self, start: Float, gates_m: Float) -> tuple[Float, float, float]:
+        """Return the state after a step for each gate, the thickness of the surfaces (m), and the
+        share of points that lie on one."""
+        state, told = start.copy(), np.empty(2)
+        _settle(
+            self.points,
+            self.share,
+            self.sampling,
+            self.judges,
+            self.centre,
+            self.reach_m,
+            gates_m,
+            _PRECISION,
+            state,
+            told,
+        )
+        return state, float(told[0]), float(told[1])
+
+
+def _evenly(cloud: PairCloud, rows: Int) -> Int:
+    """Thin the rows to one point of each scanner per voxel, few enough in all."""
+    side_m = _SIDE_M
+    while True:
+        first = one_per_voxel(cloud.places(cloud.points[rows], rows), side_m)
+        if len(first) <= _MAX_POINTS:
+            return rows[first]
+        side_m *= _WIDER
+
+
+@Kernel
+def _settle(
+    points: Float,
+    share: Float,
+    sampling: Int,
+    judges: Bool,
+    centre: Float,
+    reach_m: float,
+    gates_m: Float,
+    precision: Float,
+    state: Float,
+    told: Float,
+) -> None:
+    """Move ``state`` (4,), in place, to where the surfaces are thin, by Gauss-Newton steps.
+
+    points, share: (n,3) as measured after that share (n,) of the motion. A point's distance is that
+    from the plane of the points within ``reach_m`` whose sampling judges its own: sampling (n,),
+    judges (samplings, samplings). gates_m: for each step the distance from which on a point counts
+    nothing. told: (2,) filled with the mean distance, at most ``_LIMIT_M``, and with the share of
+    points that have a plane.
+    """
+    H, g = np.empty((4, 4)), np.empty(4)
+    start, at = state.copy(), np.empty_like(points)
+    for gate_m in gates_m:
+        _bring_back(points, share, centre, state, at)
+        total = _add_up(at, share, sampling, judges, centre, reach_m, gate_m, H, g, told)
+        if total <= 0:
+            break
+        scale = min(1.0, _MAX_WEIGHT / total) / _SIGMA_M2
+        for m in range(4):
+            g[m] = scale * g[m] + precision[m] * (state[m] - start[m])
+            for n in range(4):
+                H[m, n] = scale * H[m, n] + precision[m] * (m == n)
+        state -= np.linalg.solve(H, g)
+    _bring_back(points, share, centre, state, at)
+    _add_up(at, share, sampling, judges, centre, reach_m, _LIMIT_M, H, g, told)
+
+
+@inlined
+def _bring_back(points, share, centre, state, at):  # type: ignore[no-untyped-def]
+    """Fill ``at`` with where the points are at time 0."""
+    for i in range(len(points)):
+        yaw = share[i] * state[3]
+        c, s = np.cos(yaw), np.sin(yaw)
+        dx = points[i, 0] - centre[0] - share[i] * state[0]
+        dy = points[i, 1] - centre[1] - share[i] * state[1]
+        at[i, 0] = c * dx + s * dy + centre[0]
+        at[i, 1] = c * dy - s * dx + centre[1]
+        at[i, 2] = points[i, 2] - share[i] * state[2]
+
+
+@inlined
+def _add(H, g, J, weight, off_m):  # type: ignore[no-untyped-def]
+    """One residual, by its derivatives J (4,), to the normal equations."""
+    for m in range(4):
+        g[m] += weight * J[m] * off_m
+        for n in range(4):
+            H[m, n] += weight * J[m] * J[n]
+
+
+@inlined
+def _add_up(at, share, sampling, judges, centre, reach_m, gate_m, H, g, told):  # type: ignore[no-untyped-def]
+    """Fill the normal equations, by Tukey's weights, and ``told``; returns the weights' sum."""
+    H[:], g[:] = 0.0, 0.0
+    total, distance_m, num_planes, first = 0.0, 0.0, 0, 0
+    squared_reach = reach_m * reach_m
+    J, C = np.empty(4), np.zeros((3, 3))
+    order = np.argsort(at[:, 0])
+    px, py, pz = at[order, 0], at[order, 1], at[order, 2]
+    when, kind = share[order], sampling[order]
+    for k in range(len(px)):
+        x, y, z = px[k], py[k], pz[k]
+        while x - px[first] > reach_m:
+            first += 1
+        W, t, num = 0.0, 0.0, 0
+        mx = my = mz = xx = xy = xz = yy = yz = zz = 0.0
+        for j in range(first, len(px)):
+            dx = px[j] - x
+            if dx > reach_m:
+                break
+            dy, dz = py[j] - y, pz[j] - z
+            squared = dx * dx + dy * dy + dz * dz
+            if squared >= squared_reach or not judges[kind[k], kind[j]]:
+                continue
+            w = 1 - squared / squared_reach
+            w *= w
+            num += 1
+            W += w
+            t += w * when[j]
+            mx += w * dx
+            my += w * dy
+            mz += w * dz
+            xx += w * dx * dx
+            xy += w * dx * dy
+            xz += w * dx * dz
+            yy += w * dy * dy
+            yz += w * dy * dz
+            zz += w * dz * dz
+        if num < _MIN_NEIGHBORS:
+            distance_m += _LIMIT_M
+            continue
+        t, mx, my, mz = t / W, mx / W, my / W, mz / W
+        xx, xy, xz = xx / W - mx * mx, xy / W - mx * my, xz / W - mx * mz
+        yy, yz, zz = yy / W - my * my, yz / W - my * mz, zz / W - mz * mz
+        C[0, 0], C[1, 1], C[2, 2] = xx, yy, zz
+        C[1, 0], C[2, 0], C[2, 1] = xy, xz, yz  # of a symmetric matrix the lower half is read
+        variances, axes = np.linalg.eigh(C)
+        thick, a, b, c = max(variances[0], 0.0), axes[0, 0], axes[1, 0], axes[2, 0]
+        if variances[1] < _MIN_WIDTH_M2:
+            distance_m += _LIMIT_M
+            continue
+        off_m = -(a * mx + b * my + c * mz)
+        distance_m += min(abs(off_m), _LIMIT_M)
+        num_planes += 1
+        if abs(off_m) >= gate_m:
+            continue
+        weight = (1 - (off_m / gate_m) ** 2) ** 2 * _SIGMA_M2 / (_SIGMA_M2 + thick)
+        # The more of the motion the plane was seen after than the point, the farther it is back.
+        later = t - when[k]
+        J[0], J[1], J[2] = a * later, b * later, c * later
+        J[3] = (b * (x - centre[0]) - a * (y - centre[1])) * later
+        total += weight
+        _add(H, g, J, weight, off_m)
+    told[0], told[1] = distance_m / len(px), num_planes / len(px)
+    return total
