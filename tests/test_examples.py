@@ -55,7 +55,7 @@ def test_kitti(short_drive: Path, tmp_path: Path) -> None:
 
 def test_train_completion(tmp_path: Path) -> None:
     street = Street("street", 0, "vlp16")
-    frames = range(118, 121)  # of the notebook's recording too: rendered once for both
+    frames = range(118, 121)
     drive = write_street("kitti", street, tmp_path, frames, ["image_02"])
     text = output_of(
         "train_completion.py",

@@ -73,8 +73,7 @@ def figures(spec: str) -> dict[str, float]:
     """Return every figure of one recording."""
     sequence, settings = open_sequence(spec), resolve(None)
     recording = Recording(sequence, settings, WINDOW, [KEY], looks_around=True)
-    methods = ["none", "icp", "flow"]
-    found = depth_figures(densify_key(recording, KEY, methods, [CAMERA])["flow"])
+    found = depth_figures(densify_key(recording, KEY, ["flow"], [CAMERA])["flow"])
     if sequence.truth is not None:
         found |= flow_figures(recording)
     return {name: round(value, 5) for name, value in found.items()}

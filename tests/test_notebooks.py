@@ -28,19 +28,6 @@ def run(name: str, folder: Path) -> tuple[str, list[np.ndarray[Any, Any]]]:
     return "\n".join(texts), [cv2.imdecode(p, cv2.IMREAD_COLOR) for p in pixels]
 
 
-def test_street(tmp_path: Path) -> None:
-    text, pictures = run("street.ipynb", tmp_path)
-    shares = [float(x) for x in re.findall(r"of the image, ([\d.]+)% of it wrong", text)]
-    alone, ours, certain = shares
-    assert alone > 5 > 1 > ours > 0 and certain < ours
-    ghosts = [float(x) for x in re.findall(r"([\d.]+)% of the points stand", text)]
-    assert ghosts[0] > 5 * ghosts[1]
-    speeds = [float(x) for x in re.findall(r"object \d+: ([\d.]+) m/s", text)]
-    assert len(speeds) == 5 and max(speeds) > 5
-    sparse, dense = pictures
-    assert sparse.shape == dense.shape == (375, 1242, 3) and sparse.std() < dense.std()
-
-
 def test_your_data(tmp_path: Path, monkeypatch) -> None:
     monkeypatch.delenv("DENSIFY_DATA", raising=False)
     monkeypatch.delenv("DENSIFY_KEY", raising=False)
