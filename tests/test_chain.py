@@ -30,7 +30,7 @@ def test_steps_compose_exactly_though_every_sweep_has_other_points(body):
     for frame, target in PAIRS:
         flow = motion.flow(frame, target)
         found = in_world(frame, flow.displacement)[NUM_STATIC:]
-        np.testing.assert_allclose(found, true_flow(motion, frame, target, body), atol=1e-6)
+        np.testing.assert_allclose(found, true_flow(motion, frame, target, body), atol=1e-9)
         assert not flow.lost.any()
 
 
@@ -68,7 +68,7 @@ def test_lost_where_a_sweep_in_between_has_nothing_of_the_object(missing):
         assert not flow.lost[:NUM_STATIC].any()
         if not behind:
             found = in_world(frame, flow.displacement)[NUM_STATIC:]
-            np.testing.assert_allclose(found, true_flow(motion, frame, target), atol=1e-6)
+            np.testing.assert_allclose(found, true_flow(motion, frame, target), atol=1e-9)
 
 
 @pytest.mark.parametrize("num_points", [1, 2])
@@ -76,7 +76,7 @@ def test_objects_of_one_or_two_points_move_without_turning(num_points):
     motion = scene(drifting, sizes=dict.fromkeys(FRAMES, num_points))
     for frame, target in PAIRS:
         found = in_world(frame, motion.flow(frame, target).displacement)[NUM_STATIC:]
-        np.testing.assert_allclose(found, true_flow(motion, frame, target, drifting), atol=1e-6)
+        np.testing.assert_allclose(found, true_flow(motion, frame, target, drifting), atol=1e-9)
 
 
 def test_what_is_not_rigid_follows_its_nearest():
@@ -112,7 +112,7 @@ def test_points_without_an_object_follow_the_nearest():
         flow = motion.flow(frame, target)
         assert flow.moving.all() and not flow.lost.any()
         expected = np.tile([0.4 * (target - frame), 0, 0], (200, 1))
-        np.testing.assert_allclose(in_world(frame, flow.displacement), expected, atol=1e-6)
+        np.testing.assert_allclose(in_world(frame, flow.displacement), expected, atol=1e-9)
 
 
 def test_points_without_an_object_are_lost_over_a_gap():

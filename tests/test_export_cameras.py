@@ -136,7 +136,7 @@ def test_nerfstudio_frames(put) -> None:
         np.testing.assert_allclose(T_cam_world, view.T_cam_key, atol=1e-12)
         # As nerfstudio's get_depth_image_from_path reads it with its usual scale
         depth_m = np.load(folder / frame["depth_file_path"]) * 1e-3
-        np.testing.assert_allclose(depth_m, read_depth_png(run / "depth" / f"{name}.png"), 1e-6)
+        np.testing.assert_allclose(depth_m, read_depth_png(run / "depth" / f"{name}.png"), 1e-7)
     vertex = PlyData.read(folder / table["ply_file_path"])["vertex"].data
     assert vertex.dtype.names == ("x", "y", "z", "red", "green", "blue")
     assert len(vertex) == read_cloud(run / "cloud.laz").rgb.any(axis=1).sum()

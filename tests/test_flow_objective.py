@@ -85,11 +85,11 @@ def test_as_a_training_loss_it_reaches_the_parameters_of_a_network() -> None:
     shift = torch.tensor([0.05, -0.02, 0.03])
     parameter = torch.zeros(3, requires_grad=True)
     optimizer = torch.optim.SGD([parameter], lr=2e-3)
-    for _ in range(100):
+    for _ in range(100):  # without smoothness, which costs a constant flow a little
         optimizer.zero_grad()
-        energy(parameter.expand(50, 3), source, source + shift, matrix, 4.0).total.backward()
+        energy(parameter.expand(50, 3), source, source + shift, matrix, 0.0).total.backward()
         optimizer.step()
-    np.testing.assert_allclose(parameter.detach(), shift, atol=0.01)
+    np.testing.assert_allclose(parameter.detach(), shift, atol=1e-4)
 
 
 @given(n=st.integers(1, 40), k=st.integers(1, 60), seed=st.integers(0, 99))

@@ -13,6 +13,7 @@ from densify.geometry.nearest import nearest_k, tree_of
 from densify.geometry.types import Float, FlowField, Int, Stretch
 
 _NUM_NEIGHBORS = 3
+_LINE_M = 0.05  # points that scatter less about a line lie on it
 _MAX_GAP_M = 0.5
 
 
@@ -81,7 +82,7 @@ class ChainedMotion:
             weight /= weight.sum(axis=1, keepdims=True)
             flow, rest = np.zeros_like(arrived), onward.displacement[theirs]
             if instance >= 0:
-                T = poses.fit_rigid(known_at[theirs], known_at[theirs] + rest)
+                T = _object_motion(known_at[theirs], known_at[theirs] + rest)
                 flow = poses.transform(T, arrived) - arrived
                 rest = known_at[theirs] + rest - poses.transform(T, known_at[theirs])
             else:
@@ -92,6 +93,18 @@ class ChainedMotion:
                 theirs_m_s = onward.velocity_m_s[theirs]
                 velocity_m_s[mine] = _mean(theirs_m_s, nearest, weight) @ R_there_here
         return replace(step, displacement=displacement, lost=lost, velocity_m_s=velocity_m_s)
+
+
+def _object_motion(source: Float, target: Float) -> Float:
+    """Return the (4,4) motion of an object from (N,3) points to others.
+
+    Fewer than three points, and points on a line, do not tell a rotation: they are translated.
+    """
+    if np.linalg.matrix_rank(source - source.mean(axis=0), tol=_LINE_M) < 2:
+        T = np.eye(4)
+        T[:3, 3] = (target - source).mean(axis=0)
+        return T
+    return poses.fit_rigid(source, target)
 
 
 def _mean(values: Float, rows: Int, weight: Float) -> Float:
