@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What a verb says on stdout: an answer, and tables of text."""
+"""The answer of a verb on stdout, and tables of text."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Column = tuple[str, tuple[str, ...], str]
 
 @dataclass(frozen=True)
 class Answer:
-    """What a verb says.
+    """The answer of a verb.
 
     text: for people.
     facts: for programs (``--json``); lists of several answers are joined.

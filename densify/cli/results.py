@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What is said of results, comparisons and exports, to people and (``*_facts``) to programs.
+"""Summaries of results, comparisons and exports, for people and (``*_facts``) for programs.
 
 Read from `Result.metrics`: ``ghosts``, ``held_out`` by camera (scores of the map made without the
 key sweep against its returns) and ``depth`` by camera (scores against exact truth).

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What a command shows: answers on stdout, log lines and the one error on stderr."""
+"""Answers on stdout, log lines and the one error on stderr."""
 
 from __future__ import annotations
 

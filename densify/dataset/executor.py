@@ -109,7 +109,7 @@ def share_of_cores(num_workers: int) -> dict[str, str]:
 
 
 class _Logged(NamedTuple):
-    """What a call returned and logged in another process."""
+    """The value and the log of a call in another process."""
 
     value: Any
     records: list[logging.LogRecord]

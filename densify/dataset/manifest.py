@@ -43,7 +43,7 @@ _log = logging.getLogger("densify")
 
 @dataclass(frozen=True)
 class KeyRecord:
-    """What became of one key; the fields are those of a line, see the module."""
+    """The outcome of one key; the fields are those of a manifest line."""
 
     drive: str
     key: int

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What a training set is to be: which keys of which recordings, and how they are made.
+"""The plan of a training set: which keys of which recordings, and how they are made.
 
 ``OUT/dataset.json`` holds it, so that a later run goes on with the same set:
 

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: MIT
-"""What cameras see of registered sweeps: accumulation, visibility, filling, colour, age."""
+"""From registered sweeps to depth maps: accumulation, visibility, filling, colour, age."""

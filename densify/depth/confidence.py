@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What a confidence means: the probability that a pixel's depth is wrong by KITTI's rule.
+"""Confidence: the probability that a pixel's depth is wrong by KITTI's rule.
 
 The stages of a map rank its pixels: by sweeps and points that agree, distance to an edge,
 roughness, how far was filled, votes of the image. The probability that a pixel is wrong is a sum:

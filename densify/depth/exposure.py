@@ -38,7 +38,7 @@ _NUM_ROW_STEPS = 4  # of the search for the row that sees a point
 
 @dataclass(frozen=True)
 class Shot:
-    """What a depth map shows: the image with this number, None for the time of the key sweep, at
+    """The subject of a depth map: the image of this number, None for the key sweep's time, at
     ``stamp_ns``."""
 
     camera: Camera

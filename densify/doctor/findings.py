@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What a check finds."""
+"""The findings of a check and their verdicts."""
 
 from __future__ import annotations
 

@@ -69,7 +69,7 @@ HYPOTHESES: Mapping[str, Callable[[Float], Float]] = {
     "their angles are in degrees, read as radians": with_rotation(_angle_scaled(np.pi / 180)),
     "their angles are in radians, read as degrees": with_rotation(_angle_scaled(180 / np.pi)),
 }
-"""What poses often are instead, as a change that mends them: (4,4) -> (4,4)."""
+"""The usual mistakes of poses, each with the change (4,4) -> (4,4) that mends it."""
 
 
 def check_poses(sample: Sample) -> list[Finding]:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What the points themselves tell: units, axes, the own vehicle, reflectances, scanners."""
+"""Checks of the points: units, axes, the own vehicle, reflectances, scanners."""
 
 from __future__ import annotations
 
@@ -190,7 +190,7 @@ def check_intensity(sample: Sample) -> list[Finding]:
 
 
 def check_sensors(sample: Sample, settings: RegisterSettings) -> list[Finding]:
-    """What each scanner is like, as the pipeline will take it."""
+    """Describe each scanner as the pipeline models it."""
     spot = sample.fastest
     if spot is None:
         return []

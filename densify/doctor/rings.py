@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What the rings of a spinning scanner tell: they are cones about its own axis only if the points
+"""Checks by the rings of a spinning scanner: they are cones about its own axis only if the points
 are seen from where it stood, as they were fired."""
 
 from __future__ import annotations

@@ -89,7 +89,7 @@ def some_sectors(rays: Aimed) -> Aimed:
 
 
 def in_lines(rays: Aimed) -> bool:
-    """Whether returns of one elevation follow each other at even steps, in the order of time."""
+    """Return True if returns of one elevation follow at even steps in the order of time."""
     _, even = measure.even_step(rays.azimuth, rays.elevation)
     return even >= _MIN_EVEN_SHARE and measure.firing_order(rays.azimuth, rays.offset_s).by_azimuth
 
@@ -237,7 +237,7 @@ class Sensors:
 
     @property
     def scattered(self) -> bool:
-        """Whether no scanner has rings or lines: each sweep meets other places of an object."""
+        """Return True if no scanner has rings or lines, so each sweep hits other places."""
         return all(model.unordered for model in self.models.values())
 
     @property

@@ -75,7 +75,7 @@ def _imported_code(function: Callable[..., Any]) -> str:
 
 @cache
 def _is_open(folder: Path) -> bool:
-    """Whether others can write to it or to the folder it is in; says so."""
+    """Return True, with a warning, if others can write to the folder or to its parent."""
     found = next((f for f in (folder, folder.parent) if others_can_write(f)), None)
     if found is not None:
         _log.warning(

@@ -27,7 +27,7 @@ from densify.learning.model_file import read_model
 from densify.learning.network import NUM_SWEEPS, Voxels
 
 MOVES_M_S = 0.5
-"""What the network sees move more slowly starts no group (Chodosh et al., WACV 2024)."""
+"""Points that the network sees move more slowly start no track (Chodosh et al., WACV 2024)."""
 
 
 def check_argument(argument: str) -> None:
@@ -90,7 +90,7 @@ def _standing(scene: Scene) -> list[AboveGround]:
 def _grouped(
     scene: Scene, i: int, candidates: Candidates, standing: AboveGround, velocity_m_s: Float
 ) -> tuple[Candidates, Float]:
-    """What of sweep number i may start a group, and (n,3) m/s with which.
+    """Return the points of sweep i that may start a track, and their (n,3) velocities, m/s.
 
     Clusters of points that the network sees move may start one; those of the evidence alone may
     only be found again by one that was started elsewhere.

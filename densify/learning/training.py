@@ -38,7 +38,7 @@ Report = Callable[[int, float, float], None]
 
 @dataclass(frozen=True)
 class Training:
-    """What is trained on which recordings.
+    """The settings of a training.
 
     data: specifications of recordings. steps: pairs of sweeps to train on. checkpoint_steps: steps
     between two checkpoints.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What an output is told beside the result."""
+"""The facts that an output gets beside the result."""
 
 from __future__ import annotations
 

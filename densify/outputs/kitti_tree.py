@@ -33,7 +33,7 @@ README = "README.txt"
 
 @dataclass(frozen=True)
 class FileRecord:
-    """What a file must hold. sha256: of its content, hexadecimal."""
+    """The expected content of a file. sha256: hexadecimal."""
 
     num_bytes: int
     sha256: str

@@ -24,7 +24,7 @@ Image = NDArray[np.uint8]
 
 
 class KeyScene:
-    """What all methods of a key share.
+    """The inputs that all methods of a key share.
 
     stretch: the key's window. images: (H,W,3) RGB of the maps that show one. beyond: None where
     nothing is known or wanted. with_images: colour the cloud, and compare depth with the truth.

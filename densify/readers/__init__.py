@@ -16,7 +16,7 @@ _MOST_PLACES = 200  # are looked at for a recording, where the one named is none
 
 
 class ReaderModule(Protocol):
-    """What the module of a reader has."""
+    """The members of a reader's module."""
 
     def open_recording(self, path: Path, scene: str | None) -> LidarSequence:
         """Open the recording there lazily: only small files are read before a sweep is asked for.
@@ -29,7 +29,7 @@ class ReaderModule(Protocol):
 
 
 class Spec(NamedTuple):
-    """What ``--data`` names.
+    """A recording as ``--data`` names it.
 
     reader: the name of a row of `READERS`, "street" for the built-in one, None where the place
     tells. place: a path; of the street, preset and options. scene: what follows ``#``, None for no

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What readers of recorded files share: a sequence that checks what is asked for and what is read.
+"""The base of readers of recorded files: a sequence that checks what is asked for and what is read.
 
 A reader derives from `FileSequence`, says in ``__init__`` what there is, and reads one sweep's
 returns, one image and one pose at a time. Requests for a frame, camera or image that does not exist

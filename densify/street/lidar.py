@@ -159,7 +159,7 @@ def _spot(direction: Float) -> list[Float]:
 def _echo(
     echoes: list[Hits], spot: list[Float], rng: np.random.Generator
 ) -> tuple[Float, Hits, Bool]:
-    """What the receiver makes of a spot: range (N,), the surface it is from, and edges (N,).
+    """Return the echo of a spot: range (N,), the surface it is from, and edges (N,).
 
     On one plane the centre counts. At an edge each part of the spot is as likely to be the
     strongest echo, and now and then two that lie close together melt into one between them.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What surfaces are made of: colour and texture for cameras, reflectivity for lasers, and how
+"""The materials of surfaces: colour and texture for cameras, reflectivity for lasers, and how
 often a ray goes through."""
 
 from __future__ import annotations

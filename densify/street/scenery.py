@@ -36,7 +36,7 @@ class Scenery:
         self.footprints.append(Rectangles.standing(solid or mesh, xy, heading))
 
     def is_free(self, mesh: Mesh, xy: Float, heading: float, kerb_gap_m: float) -> bool:
-        """Whether the mesh would stand clear of the carriageway and of everything else."""
+        """Return True if the mesh would be clear of the carriageway and of all else."""
         place = Rectangles.standing(mesh, xy, heading, 0.3)
         if self.footprints and overlap(self._stacked(), place).any():
             return False

@@ -152,17 +152,17 @@ class Sensor:
 
     @property
     def measures_velocity(self) -> bool:
-        """Whether all its returns have a radial velocity."""
+        """Return True if all returns have a radial velocity."""
         return all(scanner.velocity_sigma_m_s is not None for scanner in self.scanners)
 
     @property
     def spins(self) -> bool:
-        """Whether all its scanners do, with a beam for each ring."""
+        """Return True if all scanners spin, with a beam for each ring."""
         return all(isinstance(scanner.pattern, Spinning) for scanner in self.scanners)
 
     @property
     def azimuth_tells_time(self) -> bool:
-        """Whether a single scanner spins about the lidar frame's origin."""
+        """Return True if a single scanner spins about the lidar frame's origin."""
         return len(self.scanners) == 1 and self.spins and not any(self.scanners[0].origin_m)
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What every scene shares: a cast of traffic put on lanes so that it meets around the ego vehicle
+"""The traffic of every scene: a cast put on lanes so that it meets around the ego vehicle
 after 12 seconds and touches nothing at any time.
 
 Time zero is frame 0's, whatever the rate of the sweeps. Traffic that would touch anything is drawn

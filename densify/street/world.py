@@ -124,7 +124,7 @@ class Rays(NamedTuple):
 
 
 class Hits(NamedTuple):
-    """What N rays met. range_m: (N,), inf where nothing. triangle: (N,) index over all bodies'
+    """The hits of N rays. range_m: (N,), inf where nothing. triangle: (N,) index over all bodies'
     triangles, -1 nothing. barycentric: (N,2) as in ``(1-u-v) a + u b + v c``. normal: (N,3) of
     that triangle, world axes, either side."""
 

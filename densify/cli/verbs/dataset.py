@@ -43,7 +43,9 @@ _MOST_SHOWN = 20
 
 @dataclass(frozen=True)
 class DatasetSettings(Section):
-    """What ``--set dataset.NAME=VALUE`` takes. A key that misses a limit is put aside: it is in the
+    """The settings of ``--set dataset.NAME=VALUE``.
+
+    A key that misses a limit is put aside: it is in the
     manifest, not in the set."""
 
     max_ghost: float | None = knob(None, "limit: ghosts among the accumulated points", 0, 1)

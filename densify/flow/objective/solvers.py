@@ -32,7 +32,7 @@ _MAX_PRODUCTS, _RESIDUAL_DROP = 20, 0.2  # the matches are provisional: a full s
 
 @dataclass(frozen=True)
 class SolverSettings:
-    """What is minimised, and how; the defaults are the paper's except for the solver.
+    """The settings of a solver; the defaults are the paper's except for the solver.
 
     solver: "pcg" or "adam".
     alpha: weight of smoothness, at least 0. A larger alpha moves neighbours more alike.

@@ -38,7 +38,7 @@ _MAX_OF_STANDING = 0.82  # where much is left
 
 @dataclass(frozen=True, eq=False)
 class Trial:
-    """What a motion explains of a group, and of the target around where the group arrives.
+    """The evidence for a motion of a group, in the group and around its place in the target.
 
     group: its number. still: unexplained source points without the motion, left: with it, both of a
     sample. misfit: mean distance to the target with it, as a share of the tolerance. still_there:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What the stages hand to each other. All are frozen; columns stay aligned row by row.
+"""The types that stages hand to each other. All are frozen; columns stay aligned row by row.
 
 Poses are named ``T_target_source``: ``p_target = T_target_source @ p_source``. Frames of reference:
 ``world`` (the first sweep's lidar), ``lidar`` (at the sweep's reference time), ``key`` (the key

@@ -179,7 +179,7 @@ class Folder(FileSequence):
 
     @cached_property
     def _has_viewpoints(self) -> bool:
-        """Whether VIEWPOINT says anything: the first sweeps of many drives stand at the origin."""
+        """Return True if VIEWPOINT holds poses; many drives begin with sweeps at the origin."""
         tried = {self.frames[0], self.frames[len(self.frames) // 2], self.frames[-1]}
         found = [read_viewpoint(self._sweeps.paths[frame]) for frame in sorted(tried)]
         return any(one not in (None, _NO_VIEWPOINT) for one in found)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What lies in a folder of no known form: sweeps, their stamps, poses, and images."""
+"""The series of files in a plain folder: sweeps, their stamps, poses, and images."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: MIT
-"""What KITTI's forms share: sweeps of the HDL-64E, images, stamps, calibration, and poses by GPS
-and inertial unit (oxts)."""
+"""The parts that KITTI's layouts share: sweeps of the HDL-64E, images, stamps, calibration, and
+poses by GPS and inertial unit (oxts)."""
 
 from __future__ import annotations
 
