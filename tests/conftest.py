@@ -35,7 +35,7 @@ LONGEST = (
     *("examples", "street", "notebooks", "dataset", "recording", "learning_training"),
     *("bench", "fuzz", "registration", "pipeline", "far", "executor", "cli"),
     *("doctor", "report_browser", "groups", "labels"),
-    *("bench_paper", "reader_pandaset", "flow_sets", "film"),
+    *("bench_paper", "reader_pandaset", "flow_sets"),
 )
 """Files of tests that take long begin, so that no process works on one while the others wait at the
 end. What simulates stands beside what compiles; what compiles the same stands apart."""

@@ -113,7 +113,7 @@ def write_views(
         T_key_lidar={frame: np.eye(4) for frame in STAMPS_NS},
         **changes,
     )
-    write_result(result, images, out, config={}, data="street")
+    write_result(result, out, config={}, data="street")
     return out / "000120", result
 
 
@@ -126,7 +126,7 @@ def street_result() -> Result:
 def write_street(out: Path) -> Path:
     """The folder of `street_result`."""
     result = street_result()
-    write_result(result, result.images, out, config={}, data="tiny street")
+    write_result(result, out, config={}, data="tiny street")
     return out / f"{KEY:06d}"
 
 

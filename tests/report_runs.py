@@ -27,12 +27,11 @@ def write_run(out: Path, report: bool = True) -> Path:
     config = as_mapping(resolve(CONFIG))
     if not report:
         config = {**config, "output": {**config["output"], "report": False}}
-    write_result(result, result.images, out, config=config, data="tiny street")
+    write_result(result, out, config=config, data="tiny street")
     return out / FOLDER
 
 
 def write_compared(out: Path) -> Path:
     config = as_mapping(resolve(POSES_GIVEN))
-    images = results()["flow"].images
-    write_comparison(results(), images, out, config=config, data="tiny street")
+    write_comparison(results(), out, config=config, data="tiny street")
     return out / FOLDER

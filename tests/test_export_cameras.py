@@ -216,7 +216,7 @@ def test_objects_that_the_run_has_apart_are_there(tmp_path: Path) -> None:
     run, result = write_views(tmp_path, TWO, tracks=(track_of(3),))
     parts = {i: type("Mover", (), {"cloud": c, "depth": {}}) for i, c in movers.items()}
     apart = replace(result, cloud=cloud.select(~cloud.moving), movers=parts)
-    write_result(apart, result.images, tmp_path, config={}, data="street", overwrite=True)
+    write_result(apart, tmp_path, config={}, data="street", overwrite=True)
     export_run(run, "splats", min_confidence=0.5)
     folder = run / "export" / "splats" / "movers"
     found = [len(PlyData.read(folder / n)["vertex"].data) for n in ("0003.ply", "others.ply")]

@@ -31,7 +31,7 @@ def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two keys of one drive."""
     out = tmp_path_factory.mktemp("drive")
     for result in (street_result(), run(one_car(), KEY + 1, 1, "icp", config=POSES_GIVEN)):
-        write_result(result, result.images, out, config={}, data="tiny street")
+        write_result(result, out, config={}, data="tiny street")
     return out
 
 
@@ -41,11 +41,14 @@ def test_sweeps_are_where_they_were_measured(street: Path) -> None:
     stamps_ns = [one_car().stamp_ns(frame) for frame in (KEY - 1, KEY, KEY + 1)]
     assert [s.stamp_ns for s in timeline.sweeps] == stamps_ns
     cloud = read_cloud(street / "cloud.laz")
-    (track,) = timeline.tracks
+    (track,) = timeline.run.tracks
     for sweep in timeline.sweeps:  # the box of that sweep is around what moves in it
-        assert len(sweep.points) == np.count_nonzero((cloud.frame == sweep.frame) & ~cloud.far)
+        assert len(sweep.points.frame) == np.count_nonzero(
+            (cloud.frame == sweep.frame) & ~cloud.far
+        )
         T = track.T_key_object[track.frames.index(sweep.frame)]
-        in_object = (sweep.points[sweep.moving] - T[:3, 3]) @ T[:3, :3]
+        moving = sweep.points.select(sweep.points.moving)
+        in_object = (moving.rigid_points - T[:3, 3]) @ T[:3, :3]
         inside = (np.abs(in_object) < track.size_m / 2 + 0.2).all(axis=1)
         assert len(inside) > 50 and inside.mean() > 0.95
     (shot,) = timeline.shots
@@ -116,7 +119,7 @@ def test_mcap_of_one_key(topics, street: Path) -> None:
     (timeline,) = timelines(finished_runs(street))
     assert start_ns == timeline.sweeps[0].stamp_ns
     assert [ns for ns, _ in topics["/sweep"]] == [s.stamp_ns for s in timeline.sweeps]
-    (track,) = timeline.tracks
+    (track,) = timeline.run.tracks
     for (_, update), frame in zip(topics["/movers"], track.frames, strict=True):
         (cube,) = update.entities[0].cubes
         T = track.T_key_object[track.frames.index(frame)]
@@ -216,7 +219,7 @@ def test_rrd_of_one_key_and_of_a_drive(street: Path, drive: Path, tmp_path: Path
     times = {n for chunk in found["/world/key/sweep"] for n in chunk.timeline_names}
     assert times == {"time", "frame"}
     centers = values_of(found["/world/key/movers/box"], "centers")
-    np.testing.assert_allclose(centers, timeline.tracks[0].T_key_object[:, :3, 3], atol=1e-5)
+    np.testing.assert_allclose(centers, timeline.run.tracks[0].T_key_object[:, :3, 3], atol=1e-5)
     assert "/world/key/front/depth" in found
     export_run(drive, "rrd", tmp_path / "b")
     _, second = timelines(finished_runs(drive))

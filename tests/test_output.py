@@ -22,8 +22,8 @@ from densify.config.errors import InputError
 from densify.geometry.types import FullDepth, PriorFit, Result
 from densify.outputs import (
     check_writable,
-    cloud_laz,
-    figure,
+    key_outputs,
+    plots,
     read_cloud,
     read_depth_png,
     write_age_png,
@@ -33,7 +33,6 @@ from densify.outputs import (
     write_depth_png,
     write_result,
 )
-from densify.outputs.context import Context
 from tests.exported import CAMERAS, KEY_NS, H, W, cloud_of, result_of, tree
 
 CONFIG = {"objective": {"alpha": 10.0, "radius_m": None}, "register": {"source": "kiss-icp"}}
@@ -50,7 +49,7 @@ def put(tmp_path):
     def write(result=None, **options):
         result = result or result_of()
         options = {"config": CONFIG, "data": "street", **options}
-        return write_result(result, images, tmp_path / "out", **options)
+        return write_result(replace(result, images=images), tmp_path / "out", **options)
 
     return write
 
@@ -103,23 +102,15 @@ def test_age_is_milliseconds_plus_1_and_0_without_depth(tmp_path):
     np.testing.assert_array_equal(steps, [[0, 1, 1, 2, 301, 65534, 0, 65535]])
 
 
-def test_values_that_are_no_depth_confidence_or_age(tmp_path):
-    ones, path = np.ones((1, 2), np.float32), tmp_path / "a.png"
+def test_values_that_are_no_depth(tmp_path):
+    path = tmp_path / "a.png"
     for bad in (np.nan, np.inf, -1.0):
         wrong = np.array([[1, bad]], np.float32)
         with pytest.raises(ValueError, match="finite depths, 0 or more"):
             write_depth_png(path, wrong)
-        with pytest.raises(ValueError, match="0 to 1"):
-            write_confidence_png(path, wrong, ones)
-        with pytest.raises(ValueError, match="0 or more"):
-            write_age_png(path, wrong, ones)
-    with pytest.raises(ValueError, match=r"expected \(H,W\)"):
-        write_depth_png(path, np.ones((2, 2, 1), np.float32))
-    with pytest.raises(ValueError, match=r"expected \(1, 2\)"):
-        write_confidence_png(path, ones.T, ones)
     ageless = {n: replace(depth, age_s=None) for n, depth in result_of().depth.items()}
     with pytest.raises(ValueError, match="image_02: expected ages"):
-        write_result(replace(result_of(), depth=ageless), {}, tmp_path, config={}, data="street")
+        write_result(replace(result_of(), depth=ageless), tmp_path, config={}, data="street")
     assert not list(tmp_path.iterdir())
 
 
@@ -297,7 +288,7 @@ def test_a_failure_in_the_middle_leaves_nothing(put, tmp_path, monkeypatch, fail
         path.with_suffix(".half").write_bytes(b"half")
         raise failure
 
-    monkeypatch.setattr(cloud_laz, "write_cloud", fail)
+    monkeypatch.setattr(key_outputs, "write_cloud", fail)
     with pytest.raises((KeyboardInterrupt, InputError)) as error:
         put(result_of(seed=9), overwrite=existing)
     if isinstance(error.value, InputError):
@@ -327,7 +318,7 @@ def test_the_figure_shows_each_return_at_its_place(tmp_path):
     image = np.full((400, 800, 3), 200, np.uint8)
     depth = np.zeros(image.shape[:2], np.float32)
     depth[100, 200], depth[300, 600], depth[300, 601] = 4, 70, 5
-    figure.write_plot(tmp_path / "f.png", figure.draw_figure(image, {"a": 0 * depth, "b": depth}))
+    plots.write_plot(tmp_path / "f.png", plots.draw_figure(image, {"a": 0 * depth, "b": depth}))
     picture = cv2.imread(str(tmp_path / "f.png")).astype(int)
     assert picture.shape[1] == 800 and 880 < picture.shape[0] < 960
     coloured = (np.ptp(picture, axis=2) > 40)[: 2 * (400 + 36)]
@@ -358,8 +349,8 @@ def test_titles_of_the_figure_say_error_beside_density(tmp_path, monkeypatch):
     icp, none = result_of("icp", held_out=scores), result_of("none", held_out=None)
     results: dict[str, Result] = {"none": none, "icp": icp, "flow": known}
     drawn: list = []
-    monkeypatch.setattr(figure, "write_plot", lambda path, made: drawn.append(made))
-    figure.write_figure(tmp_path / "figure.png", results, Context({}, {}, "street"))
+    monkeypatch.setattr(plots, "write_plot", lambda path, made: drawn.append(made))
+    plots.write_figure(tmp_path / "figure.png", results)
     density = [f"{np.mean(r.depth['image_02'].depth_m > 0):.1%}" for r in results.values()]
     assert titles(drawn[0]) == [
         f"sparse: {density[0]} of pixels",
@@ -377,7 +368,7 @@ def compare(out: Path, overwrite: bool = False, seed: int = 0) -> list[Path]:
         method: result_of(method, seed + i, ghost_rate=float("nan") if i == 0 else 0.1 * i)
         for i, method in enumerate(("none", "icp", "flow"))
     }
-    return write_comparison(results, {}, out, config=CONFIG, data="street", overwrite=overwrite)
+    return write_comparison(results, out, config=CONFIG, data="street", overwrite=overwrite)
 
 
 def test_comparison_is_written_beside_the_run(put, tmp_path):

@@ -67,7 +67,7 @@ def test_dropped_movers_are_nowhere(apart):
 
 
 def test_everything_asked_for_is_written(apart, tmp_path):
-    paths = write_result(apart, {}, tmp_path, config=NPZ, data="tiny")
+    paths = write_result(apart, tmp_path, config=NPZ, data="tiny")
     names = {path.relative_to(tmp_path / "000003").as_posix() for path in paths}
     movers = {
         f"movers/{i:04d}/{name}" for i in apart.movers for name in ("cloud.laz", "depth/front.png")
@@ -140,7 +140,7 @@ def test_every_point_is_accounted_for_and_the_picture_shows_what_was_left_out(tm
     assert shown and shown <= {"vetoed", "hidden", "unsupported", "edge", "glass"}
     for name in shown:
         assert (left_out == Reason[name.upper()]).sum() <= counts[name]
-    write_result(result, {}, tmp_path, config=NPZ, data="street")
+    write_result(result, tmp_path, config=NPZ, data="street")
     picture = cv2.imread(str(tmp_path / f"{KEY:06d}" / "rejected" / "front.png"))
     assert picture.shape[1] == 480 == 2 * left_out.shape[1]  # small images are enlarged
     assert picture.shape[0] > 2 * left_out.shape[0]

@@ -183,13 +183,14 @@ RESULT = SimpleNamespace(
     **{"baselines": {}, "flow": None, "key": 3, "method": "flow", "frames": (3,), "costs": ()},
     **{"far_frames": (), "warnings": (), "stamp_ns": 0, "T_key_lidar": {}},
     far_left_out=(),
+    images={},
     cloud=None,
 )
 
 
 def written(out: Path, monkeypatch: pytest.MonkeyPatch, also: str) -> list[str]:
-    monkeypatch.setattr("densify.outputs.cloud_laz.write_cloud", lambda *_: None)
-    paths = write_result(RESULT, {}, out, config={}, data="here", also=also)
+    monkeypatch.setattr("densify.outputs.key_outputs.write_cloud", lambda *_: None)
+    paths = write_result(RESULT, out, config={}, data="here", also=also)
     return [path.relative_to(out / "000003").as_posix() for path in paths]
 
 

@@ -149,7 +149,7 @@ def runs(tmp_path_factory):
 
 def test_a_prior_changes_nothing_of_what_is_measured_or_filled(runs, tmp_path):
     for name, result in (("plain", runs.plain), ("full", runs.full)):
-        write_result(result, result.images, tmp_path / name, config={}, data="tiny")
+        write_result(result, tmp_path / name, config={}, data="tiny")
     plain, full = ({
         p.relative_to(tmp_path / name / "000003").as_posix(): p.read_bytes()
         for p in (tmp_path / name).rglob("*") if p.is_file()

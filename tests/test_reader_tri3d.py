@@ -18,7 +18,7 @@ from writers.excerpt import Excerpt
 from densify.config.errors import InputError
 from densify.geometry.cameras import image_points
 from densify.geometry.poses import inverse
-from densify.outputs.png import encode_png
+from densify.outputs.depth_png import encode_png
 from densify.readers import open_sequence
 from densify.readers.street import Street
 from densify.readers.tri3d import Tri3d

@@ -82,7 +82,7 @@ def test_nothing_is_said_of_what_is_right():
 def test_what_looks_wrong_is_said(sequence, says, tmp_path):
     result = run(sequence(), KEY, 1, "icp", config=POSES_GIVEN)
     assert sum(says in warning for warning in result.warnings) == 1, result.warnings
-    write_result(result, result.images, tmp_path, config={}, data="tiny")
+    write_result(result, tmp_path, config={}, data="tiny")
     record = yaml.safe_load((tmp_path / f"{KEY:06d}" / "run.yaml").read_text())
     assert set(result.warnings) <= set(record["warnings"])
 

@@ -20,8 +20,6 @@ from densify.readers.timeline import format_frames
 
 FIRST_OF_RUN = {
     "report.html": "all of it, in a browser",
-    "*.webp": "the film",
-    "*.gif": "the film",
     "figure.png": "what was gained, at a glance",
     "depth_filled/*.png": "a depth map: 256 x metres",
     "depth_filled/*/*.png": "a depth map: 256 x metres",

@@ -113,7 +113,6 @@ def _write(job: Job, results: Mapping[str, Result]) -> dict[str, FileRecord]:
         return write_key(job.out, job.source.folder, result.key, sparse, result.depth)
     paths = write_result(
         result,
-        result.images,
         job.out / job.source.folder,
         config=as_mapping(job.recipe.config),
         data=job.source.data,

@@ -19,9 +19,8 @@ from densify.dataset.manifest import KeyRecord, read_manifests
 from densify.dataset.plan import planned_keys, read_plan
 from densify.geometry.types import Result
 from densify.outputs.atomic import write_file
-from densify.outputs.context import Context
-from densify.outputs.report.key_files import KeyFiles
-from densify.outputs.report.key_page import key_page
+from densify.outputs.key_outputs import Context
+from densify.outputs.report.key_page import KeyFiles, key_page
 
 _SHOWN_MAP = re.compile(r"(^|/)(proj_depth/groundtruth|\d{6,}/depth)/[^/]+(/[^/]+)?\.png")
 _WHOLE = ("num_points", "num_moving", "ghost")

@@ -11,18 +11,23 @@ from collections.abc import Collection, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
+from densify.config.errors import OutputError
+
 LEFT_AFTER_S = 600.0  # no file takes as long to write
 
 
 def write_file(path: Path, data: bytes) -> None:
-    """Write or replace a file. On any failure the old file stays and nothing is left aside."""
+    """Write or replace a file, and make its folder. On any failure the old file stays and nothing
+    is left aside."""
     with file_aside(path) as aside:
         aside.write_bytes(data)
 
 
 @contextmanager
 def file_aside(path: Path) -> Iterator[Path]:
-    """Yield a place to write a file to, which becomes ``path`` when the block ends well."""
+    """Yield a place to write a file to, which becomes ``path`` when the block ends well. The folder
+    of ``path`` is made."""
+    path.parent.mkdir(parents=True, exist_ok=True)
     with _hidden_folder(path) as hidden:
         yield hidden / path.name
         os.replace(hidden / path.name, path)
@@ -70,6 +75,15 @@ def clear_leftovers(root: Path, age_s: float = LEFT_AFTER_S) -> None:
         for hidden in [place for place in root.rglob(".*.tmp") if place.is_dir()]:
             if time.time() - hidden.stat().st_mtime >= age_s:
                 shutil.rmtree(hidden)
+
+
+@contextmanager
+def writing_to(out: Path) -> Iterator[None]:
+    """Raise OutputError, which names ``--out``, for what cannot be written in the block."""
+    try:
+        yield
+    except OSError as error:
+        raise OutputError(f"--out {out}: cannot be written: {error.strerror or error}") from error
 
 
 @contextmanager

@@ -13,9 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from densify.config.errors import InputError
-from densify.geometry.types import Bool, Cloud, Float, Float32, Int, Result
+from densify.geometry.types import Bool, Cloud, Float, Float32, Int
 from densify.outputs.atomic import write_file
-from densify.outputs.context import Context
 from densify.readers.decoded_files import read_las
 
 _SCALE_M = 0.001
@@ -85,11 +84,6 @@ class StoredCloud:
         columns |= {n: getattr(self, n) for n in ("intensity", "confidence", "frame", "instance")}
         columns |= {n: getattr(self, n).astype(np.uint8) for n in ("moving", "far")}
         return columns | {"displaced": self.displaced} | vectors | {"gps_time": self.gps_time}
-
-
-def write_output(result: Result, context: Context, folder: Path) -> None:
-    """Write ``cloud.laz``."""
-    write_cloud(folder / "cloud.laz", result.cloud, result.stamp_ns)
 
 
 def write_cloud(path: Path, cloud: Cloud, stamp_ns: int = 0) -> None:

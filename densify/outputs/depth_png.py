@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Depth, confidence, age and optical flow as PNG.
+"""Depth, confidence, age, optical flow and pictures as PNG and JPEG.
 
 Depth is in the format of KITTI's depth completion benchmark (Uhrig et al., "Sparsity Invariant
 CNNs", 3DV 2017): 16 bit, one channel, ``value / 256`` metres, 0 = none.
@@ -10,14 +10,17 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from densify.config.errors import InputError
 from densify.geometry.types import Bool, Float32
 from densify.outputs.atomic import write_file
-from densify.outputs.png import encode_png
 from densify.readers.decoded_files import read_image
+
+Picture = NDArray[np.uint8]
+"""(H,W,3) RGB."""
 
 _STEPS_PER_M = 256.0
 _STEPS_OF_CONFIDENCE = 254.0
@@ -26,47 +29,50 @@ _STEPS_PER_PX = 64.0
 _MAX_VALUE = np.iinfo(np.uint16).max
 
 
+def encode_png(image: NDArray[np.uint16] | NDArray[np.uint8]) -> bytes:
+    """Return the PNG of (H,W) gray or (H,W,3) blue, green, red; 8 or 16 bit."""
+    return cv2.imencode(".png", np.ascontiguousarray(image))[1].tobytes()
+
+
+def encode_jpeg(picture: Picture, quality: int = 92) -> bytes:
+    """Return the JPEG of an RGB picture. quality: 0 to 100; lower is smaller, with blocks."""
+    bgr = np.ascontiguousarray(picture[:, :, ::-1])
+    return cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()
+
+
+def map_path(folder: Path, kind: str, name: str, suffix: str = ".png") -> Path:
+    """Return ``folder/kind/name.png``. A map of one image of several (``project.per=image``) is
+    named ``CAMERA/NUMBER``."""
+    return folder / kind / f"{name}{suffix}"
+
+
 def write_depth_png(path: Path, depth_m: Float32) -> None:
-    """Write `encode_depth`."""
-    write_file(path, encode_depth(depth_m))
-
-
-def encode_depth(depth_m: Float32) -> bytes:
-    """Return the PNG of ``rint(256 * depth_m)``.
+    """Write ``rint(256 * depth_m)``.
 
     depth_m: (H,W) metres, 0 none. Depths beyond 65535/256 = 256 m and below half a step, 2 mm,
         become 0, none. Raises ValueError for depths that are negative or not finite.
     """
-    return encode_png(_quantised(depth_m))
+    write_file(path, encode_png(_quantised(depth_m)))
 
 
 def write_confidence_png(path: Path, confidence: Float32, depth_m: Float32) -> None:
-    """Write `encode_confidence`."""
-    write_file(path, encode_confidence(confidence, depth_m))
-
-
-def encode_confidence(confidence: Float32, depth_m: Float32) -> bytes:
-    """Return the 8-bit PNG of `stored_confidence`, 0 where `encode_depth` has no depth.
+    """Write `stored_confidence` as 8 bit, 0 where `write_depth_png` has no depth.
 
     confidence: (H,W), 0 to 1. depth_m: (H,W) metres, the depth it belongs to.
     """
-    has_depth = _has_depth("confidence", confidence, depth_m)
-    if not ((confidence[has_depth] >= 0) & (confidence[has_depth] <= 1)).all():
-        raise ValueError("confidence: expected 0 to 1 wherever there is depth")
     levels = np.zeros(depth_m.shape, np.uint8)
+    has_depth = _quantised(depth_m) > 0
     levels[has_depth] = stored_confidence(confidence[has_depth])
-    return encode_png(levels)
+    write_file(path, encode_png(levels))
 
 
 def write_age_png(path: Path, age_s: Float32, depth_m: Float32) -> None:
-    """Write `stored_age` as 16 bit, 0 where `encode_depth` has no depth.
+    """Write `stored_age` as 16 bit, 0 where `write_depth_png` has no depth.
 
     age_s: (H,W) seconds, 0 or more wherever there is depth. depth_m: (H,W) metres.
     """
-    has_depth = _has_depth("age_s", age_s, depth_m)
-    if not (np.isfinite(age_s[has_depth]) & (age_s[has_depth] >= 0)).all():
-        raise ValueError("age_s: expected 0 or more wherever there is depth")
     steps = np.zeros(depth_m.shape, np.uint16)
+    has_depth = _quantised(depth_m) > 0
     steps[has_depth] = stored_age(age_s[has_depth])
     write_file(path, encode_png(steps))
 
@@ -90,18 +96,20 @@ def write_flow_png(path: Path, flow_px: Float32) -> None:
     flow_px: (H,W,2) pixels, NaN where unknown. Flow beyond 512 pixels is written as unknown.
     """
     levels = np.rint(_STEPS_PER_PX * flow_px.astype(np.float64)) + 2**15
-    with np.errstate(invalid="ignore"):
-        known = ((levels >= 0) & (levels <= _MAX_VALUE)).all(axis=2)
+    known = ((levels >= 0) & (levels <= _MAX_VALUE)).all(axis=2)
     image = np.zeros((*flow_px.shape[:2], 3), np.uint16)
-    image[known, 0] = 1
-    image[known, 1], image[known, 2] = levels[known, 1], levels[known, 0]
+    image[known] = np.column_stack([np.ones(known.sum()), levels[known][:, ::-1]])
     write_file(path, encode_png(image))
+
+
+def metres(stored: NDArray[np.uint16]) -> Float32:
+    """Return (H,W) float32 metres of a stored depth map, exact to the last bit."""
+    return stored.astype(np.float32) / np.float32(_STEPS_PER_M)
 
 
 def read_depth_png(path: Path) -> Float32:
     """Return (H,W) metres, 0 none. Raises InputError for anything but a 16-bit gray PNG."""
-    stored = read_stored(path, np.uint16, "a depth map")
-    return stored.astype(np.float32) / np.float32(_STEPS_PER_M)
+    return metres(read_stored(path, np.uint16, "a depth map"))
 
 
 def read_stored(path: Path, kind: type[np.uint8] | type[np.uint16], what: str) -> NDArray[Any]:
@@ -124,16 +132,7 @@ def read_mask_png(path: Path) -> Bool:
     return mask
 
 
-def _has_depth(name: str, values: Float32, depth_m: Float32) -> NDArray[np.bool_]:
-    if values.shape != depth_m.shape:
-        raise ValueError(f"{name}: expected {depth_m.shape}, got {values.shape}")
-    has_depth: NDArray[np.bool_] = _quantised(depth_m) > 0
-    return has_depth
-
-
 def _quantised(depth_m: Float32) -> NDArray[np.uint16]:
-    if depth_m.ndim != 2:
-        raise ValueError(f"depth_m: expected (H,W), got {depth_m.shape}")
     if not (np.isfinite(depth_m) & (depth_m >= 0)).all():
         raise ValueError("depth_m: expected finite depths, 0 or more")
     steps = np.rint(_STEPS_PER_M * depth_m.astype(np.float64))

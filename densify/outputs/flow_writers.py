@@ -21,31 +21,30 @@ from __future__ import annotations
 
 import io
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from densify.config.errors import InputError, OutputError
+from densify.config.errors import InputError
 from densify.geometry import poses
 from densify.geometry.types import FlowField, LidarSequence, Result, StretchFlow
-from densify.outputs.atomic import file_aside, write_file
-from densify.outputs.context import Context
+from densify.outputs.atomic import file_aside, write_file, writing_to
+from densify.outputs.key_outputs import Context
 from densify.readers.extras import needed
 
 FORMATS = ("npz", "av2", "opensceneflow")
 
 FlowWriter = Callable[[int, StretchFlow], Path]
 """Writes a sweep and its flow to the next, the only step it is given (none: the last sweep), and
-returns the file."""
+returns the folder of its file."""
 
 
 def write_flow(result: Result, context: Context, folder: Path) -> None:
     """Write ``flow/`` in the form of ``output.flow``: npz or opensceneflow."""
     if result.flow is None:
         return
-    (folder / "flow").mkdir()
     if context.config["output"]["flow"] == "opensceneflow":
         write_flow_h5(folder / "flow" / f"{result.key:06d}.h5", result.flow)
     else:
@@ -75,18 +74,12 @@ def _total_flow(flow: StretchFlow, frame: int, target: int) -> np.ndarray:
 def flow_npz(field: FlowField, **beside: Any) -> bytes:
     """Return a file with ``residual_flow`` float32, ``moving``, ``instance`` (-1 none), ``lost``,
     ``to_reference`` float32 if it is known, and the arrays given beside."""
+    arrays: dict[str, Any] = {"residual_flow": field.displacement}
+    arrays |= {name: getattr(field, name) for name in ("moving", "instance", "lost")} | beside
     if field.to_reference is not None:
-        beside["to_reference"] = field.to_reference
-    arrays = {
-        "residual_flow": field.displacement,
-        "moving": field.moving,
-        "instance": field.instance,
-        "lost": field.lost,
-        **beside,
-    }
+        arrays["to_reference"] = field.to_reference
     for name, array in arrays.items():
-        if array.dtype == np.float64:
-            arrays[name] = array.astype(np.float32)
+        arrays[name] = array.astype(np.float32) if array.dtype == np.float64 else array
     buffer = io.BytesIO()
     np.savez_compressed(buffer, **arrays)
     return buffer.getvalue()
@@ -94,41 +87,40 @@ def flow_npz(field: FlowField, **beside: Any) -> bytes:
 
 def write_flow_h5(path: Path, flow: StretchFlow) -> None:
     """Write all sweeps of a window in OpenSceneFlow's form. Raises InputError without h5py."""
-    with file_aside(path) as aside, _flow_h5(aside) as put:
+    with _h5_aside(path) as file:
         for frame in flow.stretch.frames:
-            put(frame, flow)
+            _add_sweep(file, frame, flow)
 
 
 @contextmanager
-def _flow_h5(path: Path) -> Iterator[Callable[[int, StretchFlow], None]]:
-    """Yield a function that adds a sweep, with its flow to the next one where that is known."""
+def _h5_aside(path: Path) -> Iterator[Any]:
     h5py = needed("h5py", "opensceneflow", "OpenSceneFlow's files")
-    with h5py.File(path, "w") as file:
+    with file_aside(path) as aside, h5py.File(aside, "w") as file:
+        yield file
 
-        def put(frame: int, flow: StretchFlow) -> None:
-            registered = flow.stretch[frame]
-            sweep = registered.sweep
-            lidar = np.column_stack([sweep.points, 255 * sweep.intensity]).astype(np.float32)
-            arrays = {
-                "lidar": lidar,
-                "pose": registered.T_world_lidar,
-                "lidar_id": sweep.lidar,
-                "ground_mask": np.zeros(len(sweep), bool),
-                "row": sweep.row,
+
+def _add_sweep(file: Any, frame: int, flow: StretchFlow) -> None:
+    """Add a sweep to an open file, with its flow to the next one where that is known."""
+    registered = flow.stretch[frame]
+    sweep = registered.sweep
+    arrays = {
+        "lidar": np.column_stack([sweep.points, 255 * sweep.intensity]).astype(np.float32),
+        "pose": registered.T_world_lidar,
+        "lidar_id": sweep.lidar,
+        "ground_mask": np.zeros(len(sweep), bool),
+        "row": sweep.row,
+    }
+    for (here, following), field in flow.steps.items():
+        if here == frame < following:
+            arrays |= {
+                "flow": _total_flow(flow, frame, following).astype(np.float32),
+                "flow_is_valid": ~field.lost,
+                "flow_instance_id": (field.instance + 1).astype(np.int16),
+                "ego_motion": flow.stretch.T_target_source(following, frame).astype("f4"),
             }
-            for (here, following), field in flow.steps.items():
-                if here == frame < following:
-                    arrays |= {
-                        "flow": _total_flow(flow, frame, following).astype(np.float32),
-                        "flow_is_valid": ~field.lost,
-                        "flow_instance_id": (field.instance + 1).astype(np.int16),
-                        "ego_motion": flow.stretch.T_target_source(following, frame).astype("f4"),
-                    }
-            group = file.create_group(str(sweep.stamp_ns))
-            for name, array in arrays.items():
-                group.create_dataset(name, data=array)
-
-        yield put
+    group = file.create_group(str(sweep.stamp_ns))
+    for name, array in arrays.items():
+        group.create_dataset(name, data=array)
 
 
 @contextmanager
@@ -142,46 +134,44 @@ def flow_writer(
     there and not to be overwritten, OutputError if nothing can be written.
     """
     name = "".join(c if c.isalnum() or c in "-_." else "_" for c in sequence.name)
-    folder = out / name if form == "av2" else out
+    following = dict(zip(sequence.frames[:-1], sequence.frames[1:], strict=True))
     if form == "av2":
-        paths = [folder / f"{sequence.stamp_ns(frame)}.feather" for frame in frames]
+        paths = {f: out / name / f"{sequence.stamp_ns(f)}.feather" for f in frames}
         needed("pyarrow.feather", "argoverse", "Argoverse 2's flow files")
     elif form == "opensceneflow":
-        paths = [folder / f"{name}.h5"]
+        paths = dict.fromkeys(frames, out / f"{name}.h5")
     else:
-        steps = dict(zip(sequence.frames[:-1], sequence.frames[1:], strict=True))
-        paths = [folder / f"{f:06d}_{steps[f]:06d}.npz" for f in frames if f in steps]
-    there = [path.name for path in paths if path.exists()]
+        paths = {f: out / f"{f:06d}_{following[f]:06d}.npz" for f in frames if f in following}
+    there = sorted({path.name for path in paths.values() if path.exists()})
     if there and not overwrite:
-        others = f" and {len(there) - 1} more" if len(there) > 1 else ""
         raise InputError(
-            f"{folder}: {there[0]}{others} already there and kept; give --overwrite to replace "
-            f"them or another --out DIR"
+            f"--out {out}: {there[0]} already there and kept ({len(there)} such files); give "
+            f"--overwrite to replace them or another --out DIR"
         )
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
+    with writing_to(out), ExitStack() as stack:
         if form == "opensceneflow":
-            with file_aside(paths[0]) as aside, _flow_h5(aside) as put:
-                yield lambda frame, flow: put(frame, flow) or paths[0]
-        elif form == "av2":
-            yield lambda frame, flow: _write_feather(folder, sequence, frame, flow)
-        else:
-            yield lambda frame, flow: next(iter(write_flow_npz(folder, flow)), folder)
-    except OSError as error:
-        raise OutputError(f"--out {out}: cannot be written: {error.strerror or error}") from error
+            file = stack.enter_context(_h5_aside(out / f"{name}.h5"))
+
+        def write(frame: int, flow: StretchFlow) -> Path:
+            if form == "opensceneflow":
+                _add_sweep(file, frame, flow)
+            elif form == "av2":
+                _write_feather(paths[frame], sequence, frame, flow)
+            else:
+                write_flow_npz(out, flow)
+            return out / name if form == "av2" else out
+
+        yield write
 
 
-def _write_feather(folder: Path, sequence: LidarSequence, frame: int, flow: StretchFlow) -> Path:
+def _write_feather(path: Path, sequence: LidarSequence, frame: int, flow: StretchFlow) -> None:
     """Rows without a valid return are static, as the ground is."""
     arrow, feather = (needed(m, "argoverse", "") for m in ("pyarrow", "pyarrow.feather"))
-    sweep = flow.stretch[frame].sweep
     num_rows = sequence.num_rows(frame) if hasattr(sequence, "num_rows") else len(sequence[frame])
     residual = np.zeros((num_rows, 3), np.float16)
     for field in flow.steps.values():
-        residual[sweep.row] = field.displacement
+        residual[flow.stretch[frame].sweep.row] = field.displacement
     columns = {"is_valid": np.ones(num_rows, bool)}
     columns |= dict(zip(("flow_tx_m", "flow_ty_m", "flow_tz_m"), residual.T.copy(), strict=True))
-    path = folder / f"{sequence.stamp_ns(frame)}.feather"
     with file_aside(path) as aside:
         feather.write_feather(arrow.table(columns), aside)
-    return path

@@ -20,10 +20,9 @@ from typing import Any, Literal
 import yaml
 
 from densify import __version__
-from densify.config.errors import OutputError
 from densify.geometry.types import DepthMap
-from densify.outputs.atomic import write_file
-from densify.outputs.depth_png import encode_confidence, encode_depth
+from densify.outputs.atomic import write_file, writing_to
+from densify.outputs.depth_png import write_confidence_png, write_depth_png
 from densify.outputs.plain import plain
 
 Split = Literal["train", "val"]
@@ -90,23 +89,21 @@ def write_key(
     sparse, dense: camera -> map, of the key sweep alone and of all sweeps.
 
     Returns path relative to root -> what the file holds. The same maps give the same bytes. Raises
-    OutputError if the files cannot be written, ValueError if the cameras differ.
+    OutputError if the files cannot be written.
     """
-    if sparse.keys() != dense.keys():
-        raise ValueError(f"cameras: got {sorted(sparse)} sparse and {sorted(dense)} dense")
-    records = {}
-    for camera, maps in dense.items():
-        products = {
-            "velodyne_raw": encode_depth(sparse[camera].depth_m),
-            "groundtruth": encode_depth(maps.depth_m),
-            "groundtruth_filled": encode_depth(maps.filled_m),
-            "confidence": encode_confidence(maps.confidence, maps.filled_m),
-        }
-        for product, data in products.items():
-            name = f"{folder}/proj_depth/{product}/{camera}/{frame:010d}.png"
-            _put(root, name, data)
-            records[name] = FileRecord.of(data)
-    return records
+    paths = []
+    with writing_to(root):
+        for camera, maps in dense.items():
+            raw, measured, filled, confidence = (
+                root / folder / "proj_depth" / product / camera / f"{frame:010d}.png"
+                for product in ("velodyne_raw", "groundtruth", "groundtruth_filled", "confidence")
+            )
+            write_depth_png(raw, sparse[camera].depth_m)
+            write_depth_png(measured, maps.depth_m)
+            write_depth_png(filled, maps.filled_m)
+            write_confidence_png(confidence, maps.confidence, maps.filled_m)
+            paths += [raw, measured, filled, confidence]
+    return {p.relative_to(root).as_posix(): FileRecord.of(p.read_bytes()) for p in paths}
 
 
 def write_readme(root: Path, *, method: str, window: int, settings: Mapping[str, Any]) -> None:
@@ -122,18 +119,8 @@ def write_readme(root: Path, *, method: str, window: int, settings: Mapping[str,
         sweeps=2 * window + 1,
         settings=yaml.safe_dump(plain(settings), sort_keys=False, allow_unicode=True).rstrip(),
     )
-    _put(root, README, text.encode())
-
-
-def _put(root: Path, name: str, data: bytes) -> None:
-    path = root / name
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_file(path, data)
-    except OSError as error:
-        raise OutputError(
-            f"--out {root}: {name} cannot be written: {error.strerror or error}"
-        ) from error
+    with writing_to(root):
+        write_file(root / README, text.encode())
 
 
 _README = """\

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: MIT
-"""Plots: curve.png, outliers over density; the loss of a training; scene flow from above."""
+"""Pictures by matplotlib: figure.png and compare.png, depth over the camera's image; rejected/;
+curve.png, outliers over density; the loss of a training."""
 
 from __future__ import annotations
 
@@ -8,18 +9,39 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from densify.geometry.types import Float, Result
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from densify.geometry.types import Float, Float32, Reason, Result
 from densify.outputs.atomic import write_file
-from densify.outputs.context import Context
+from densify.outputs.depth_png import Picture, map_path
+from densify.outputs.key_outputs import Context
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 Curve = Sequence[Mapping[str, Any]]
 """`densify.scores.depth_metrics.precision_density`."""
 
-DPI = 100
+_DPI = 100
+# Fixed, so that the pictures of different keys compare.
+_NEAR_M, _FAR_M = 3.0, 80.0
+_TICKS_M = (3, 5, 10, 20, 40, 80)
+_NO_DEPTH_M = np.float32(1e6)
+_BRIGHTNESS = 0.45
+_MIN_WIDTH_PX = 480
+_POINT_SIZE_PX = 3
+_TITLE_PX, _SCALE_PX = 36, 60
+_FONT_PT, _LETTER_PX = 13.0, 0.85  # width of a letter, per point of the font
+_TITLES = {"none": "sparse"}
+_REASON_COLOURS = {
+    Reason.VETOED: "#ff4646",
+    Reason.HIDDEN: "#508cff",
+    Reason.UNSUPPORTED: "#ffd23c",
+    Reason.EDGE: "#5ae678",
+    Reason.GLASS: "#eb78ff",
+}
 _FEWEST_OUTLIERS = 1e-4  # below, the scale is linear down to 0
 _MEDIAN_SHARE = 20  # the running median covers one part in so many of all steps
 
@@ -29,6 +51,113 @@ def write_plot(path: Path, figure: Figure) -> None:
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", metadata={"Software": None})
     write_file(path, buffer.getvalue())
+
+
+def write_key_figure(result: Result, context: Context, folder: Path) -> None:
+    """Write ``figure.png``: the baselines from top to bottom, then the result."""
+    write_figure(folder / "figure.png", {**result.baselines, result.method: result})
+
+
+def write_figure(path: Path, results: Mapping[str, Result]) -> None:
+    """Write the measured depth of each method in the first camera, and the last method's depth
+    completed with a prior, if there is one. Without a camera nothing is written."""
+    method, last = list(results.items())[-1]
+    if not last.depth:
+        return
+    camera = next(iter(last.depth))
+    panels = [(_TITLES.get(m, m), r, "measured") for m, r in results.items()]
+    if camera in last.full:
+        panels.append((f"{method} and prior", last, "full"))
+    drawn = {}
+    for title, result, product in panels:
+        depth_m = (result.full if product == "full" else result.depth)[camera].depth_m
+        text = f"{title}: {np.count_nonzero(depth_m) / depth_m.size:.1%} of pixels"
+        drawn[text + _error(result, camera, product)] = depth_m
+    write_plot(path, draw_figure(_image(last, camera), drawn))
+
+
+def _image(result: Result, camera: str) -> Picture:
+    """Return (H,W,3) the camera's image, black where there is none."""
+    shape = (*result.depth[camera].depth_m.shape, 3)
+    return result.images.get(camera, np.zeros(shape, np.uint8))
+
+
+def _error(result: Result, camera: str, product: str) -> str:
+    """Return the fraction of outliers, against the truth if there is one, else the held-out key."""
+    for source, against in (("depth", "truth"), ("held_out", "key held out")):
+        scores = (result.metrics.get(source) or {}).get(camera, {}).get(product)
+        if scores and scores["all"]["outliers"] is not None:
+            return f", {scores['all']['outliers']:.2%} outliers ({against})"
+    return ""
+
+
+def draw_figure(image: Picture, panels: Mapping[str, Float32]) -> Figure:
+    """Draw depth maps over an image, from top to bottom in the mapping's order.
+
+    image: (H,W,3) uint8 RGB, drawn in gray.
+    panels: title -> (H,W) depth in metres, 0 none. A depth covers 3 x 3 pixels, and the nearest
+        wins. Near is red, far is blue, logarithmic from 3 to 80 m.
+    """
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import LogNorm
+
+    scale = ScalarMappable(LogNorm(_NEAR_M, _FAR_M, clip=True), "turbo_r")
+    kernel = np.ones((_POINT_SIZE_PX, _POINT_SIZE_PX), np.uint8)
+    figure = _images(image, len(panels))
+    for axes, (title, depth_m) in zip(figure.axes, panels.items(), strict=True):
+        size = min(_FONT_PT, figure.bbox.width / (_LETTER_PX * len(title)))
+        axes.set_title(title, loc="left", x=0.01, fontsize=size)
+        nearest = cv2.erode(np.where(depth_m > 0, depth_m, _NO_DEPTH_M), kernel)
+        colours = scale.to_rgba(nearest, bytes=True)
+        colours[nearest >= _NO_DEPTH_M] = 0
+        axes.imshow(colours, interpolation="nearest", aspect="auto")
+    height = figure.bbox.height
+    bar = figure.add_axes((0.05, 0.6 * _SCALE_PX / height, 0.9, 0.25 * _SCALE_PX / height))
+    shown = figure.colorbar(scale, bar, orientation="horizontal", ticks=_TICKS_M, format="%d m")
+    shown.minorticks_off()
+    return figure
+
+
+def write_rejected(result: Result, context: Context, folder: Path) -> None:
+    """Write ``rejected/CAMERA.png``, if it was asked for."""
+    for camera, reason in result.rejected.items():
+        figure = draw_rejected(_image(result, camera), reason)
+        write_plot(map_path(folder, "rejected", camera), figure)
+
+
+def draw_rejected(image: Picture, reason: NDArray[np.uint8]) -> Figure:
+    """Draw over an image in gray what was rejected, in a colour for each `Reason`.
+
+    image: (H,W,3) uint8 RGB. reason: (H,W), 0 none.
+    """
+    from matplotlib.colors import to_rgba_array
+    from matplotlib.patches import Patch
+
+    figure = _images(image, 1)
+    colours = to_rgba_array([_REASON_COLOURS.get(which, "none") for which in Reason])
+    figure.axes[0].imshow(colours[reason], interpolation="nearest", aspect="auto")
+    handles = [Patch(color=c, label=which.name.lower()) for which, c in _REASON_COLOURS.items()]
+    look = {"frameon": False, "fontsize": "small", "handlelength": 1, "columnspacing": 1}
+    figure.legend(handles=handles, loc="lower center", ncols=len(handles), **look)
+    return figure
+
+
+def _images(image: Picture, number: int) -> Figure:
+    """Return a figure with axes that show the image in dark gray, a title's room above each."""
+    from matplotlib.figure import Figure
+
+    height_px, width_px = image.shape[:2]
+    enlarge = max(1.0, _MIN_WIDTH_PX / width_px)
+    width, panel = enlarge * width_px, enlarge * height_px
+    height = number * (panel + _TITLE_PX) + _SCALE_PX
+    figure = Figure(figsize=(width / _DPI, height / _DPI), dpi=_DPI)
+    gray = _BRIGHTNESS * (image @ np.array([0.299, 0.587, 0.114]))
+    for i in range(number):
+        bottom = height - (i + 1) * (panel + _TITLE_PX)
+        axes = figure.add_axes((0, bottom / height, 1, panel / height))
+        axes.set_axis_off()
+        axes.imshow(gray, "gray", vmin=0, vmax=255, interpolation="nearest", aspect="auto")
+    return figure
 
 
 def write_curve(result: Result, context: Context, folder: Path) -> None:
@@ -47,8 +176,12 @@ def draw_curves(curves: Mapping[str, Mapping[str, Curve]]) -> Figure:
     curves: camera -> method -> curve. Each camera has its own axes, two in a row. A thin line is of
         measured pixels, a thick line of filled pixels too.
     """
-    figure, panels = _figure(len(curves), 8.6, 4.8)
-    for axes, (camera, methods) in zip(panels, curves.items(), strict=True):
+    from matplotlib.figure import Figure
+
+    columns, rows = min(2, len(curves)), -(-len(curves) // 2)
+    figure = Figure(figsize=(8.6 * columns, 4.8 * rows), dpi=_DPI, layout="constrained")
+    for place, (camera, methods) in enumerate(curves.items(), 1):
+        axes = figure.add_subplot(rows, columns, place)
         for number, (method, curve) in enumerate(methods.items()):
             for kind, width in (("measured", 1.0), ("filled", 2.5)):
                 known = [p for p in curve if p[f"outliers_{kind}"] is not None]
@@ -75,24 +208,14 @@ def draw_losses(losses: Float, title: str) -> Figure:
 
     losses: (S,) positive.
     """
+    from matplotlib.figure import Figure
     from scipy.ndimage import median_filter
 
-    figure, (axes,) = _figure(1, 8.6, 4.2)
-    axes.set(title=title, xlabel="step", ylabel="loss", yscale="log")
+    figure = Figure(figsize=(8.6, 4.2), dpi=_DPI, layout="constrained")
+    axes = figure.add_subplot(title=title, xlabel="step", ylabel="loss", yscale="log")
     if len(losses):
         size = len(losses) // _MEDIAN_SHARE | 1
         axes.plot(losses, ".", markersize=2, color="C0", alpha=0.4)
         axes.plot(median_filter(losses, size, mode="nearest"), color="C0", linewidth=2)
     axes.grid(alpha=0.3)
     return figure
-
-
-def _figure(number: int, width_in: float, height_in: float) -> tuple[Figure, list[Axes]]:
-    """Return a figure with that many axes of a size, two in a row."""
-    from matplotlib.figure import Figure
-
-    columns = min(2, number)
-    rows = -(-number // columns)
-    size = columns * width_in, rows * height_in
-    figure = Figure(figsize=size, dpi=DPI, layout="constrained")
-    return figure, [figure.add_subplot(rows, columns, 1 + i) for i in range(number)]

@@ -1,56 +1,63 @@
 # SPDX-License-Identifier: MIT
-"""A key's scene.json and movers.json (`densify.outputs.table_outputs`), read and checked."""
+"""A key's scene.json and movers.json (`densify.outputs.key_outputs`), read and checked."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 
 from densify.config.errors import InputError, brief
 from densify.config.file_content import read_json
 from densify.geometry.types import Camera, CameraView, Float, ObjectTrack
-
-T = TypeVar("T")
-
-_MODELS = ("pinhole", "fisheye", "mei")
-_MOST_PX = 1 << 16
-_LARGEST = 1e20
+from densify.readers.file_sequence import rigid
 
 
 @dataclass(frozen=True)
 class SceneFile:
-    """views: map -> its camera and pose. T_key_lidar: frame -> (4,4), sweeps of the window."""
+    """table: the whole file. views: map -> its camera and pose. T_key_lidar: frame -> (4,4), sweeps
+    of the window."""
 
+    table: Mapping[str, Any]
     views: Mapping[str, CameraView]
     T_key_lidar: Mapping[int, Float]
 
 
 def read_scene(path: Path) -> SceneFile:
     """Read scene.json. Raises InputError if it is missing or damaged."""
-
-    def scene(table: Any) -> SceneFile:
-        known = [sweep for sweep in table["sweeps"] if sweep["T_key_lidar"] is not None]
+    with damage_named(path):
+        table = read_json(path)
+        poses = {sweep["frame"]: sweep["T_key_lidar"] for sweep in table["sweeps"]}
         return SceneFile(
+            table,
             {name: _view(view) for name, view in table["views"].items()},
-            {_whole(sweep["frame"]): _pose(sweep["T_key_lidar"]) for sweep in known},
+            {frame: rigid(T, "T_key_lidar") for frame, T in poses.items() if T is not None},
         )
-
-    return _checked(path, scene)
 
 
 def read_tracks(path: Path) -> list[ObjectTrack]:
-    """Read movers.json. Raises InputError if it is missing or damaged."""
-    return _checked(path, lambda table: [_track(entry) for entry in table["objects"]])
+    """Read movers.json. Raises InputError if it is missing or damaged, or an object has no pose at
+    the key."""
+    with damage_named(path):
+        table = read_json(path)
+        tracks = [_track(entry) for entry in table["objects"]]
+        if any(table["key"] not in track.frames for track in tracks):
+            raise ValueError("an object has no pose at the key")
+        return tracks
 
 
-def _checked(path: Path, build: Callable[[Any], T]) -> T:
+@contextmanager
+def damage_named(path: Path) -> Iterator[None]:
+    """Raise InputError, which names the file, for content that is not as expected."""
     try:
-        return build(read_json(path))
-    except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
+        yield
+    except (KeyError, TypeError, ValueError, AttributeError, OverflowError, InputError) as error:
+        if str(error).startswith(str(path)):
+            raise
         reason = brief(f"{type(error).__name__}: {error}")
         raise InputError(
             f"{path}: damaged, or of another version ({reason}); densify the key again"
@@ -58,59 +65,31 @@ def _checked(path: Path, build: Callable[[Any], T]) -> T:
 
 
 def _view(view: Mapping[str, Any]) -> CameraView:
-    number = view.get("number")
-    camera = Camera(
-        name=str(view["name"]),
-        width_px=_whole(view["width_px"]),
-        height_px=_whole(view["height_px"]),
-        K=_array(view["K"], 3, 3),
-        T_cam_lidar=_pose(view["T_cam_lidar"]),
-        distortion=tuple(_array(view["distortion"], len(view["distortion"])).tolist()),
-        model=str(view["model"]),
-        row_time_s=float(_array(view["row_time_s"])),
-        column_time_s=float(_array(view["column_time_s"])),
-    )
-    if camera.model not in _MODELS or min(camera.K[0, 0], camera.K[1, 1]) <= 0:
-        raise ValueError(f"camera {camera.name}: model or K")
-    if not (0 < camera.width_px <= _MOST_PX and 0 < camera.height_px <= _MOST_PX):
-        raise ValueError(f"camera {camera.name}: {camera.width_px} x {camera.height_px} px")
-    late_s = float(_array(view["late_s"]))
-    return CameraView(
-        camera, _pose(view["T_cam_key"]), late_s, None if number is None else _whole(number)
-    )
+    own = {f.name: view[f.name] for f in fields(Camera)}
+    own |= {"K": _array(view["K"], 3, 3), "T_cam_lidar": rigid(view["T_cam_lidar"], "T_cam_lidar")}
+    camera = Camera(**{**own, "distortion": tuple(map(float, view["distortion"]))})
+    is_known = camera.model in ("pinhole", "fisheye", "mei")
+    if not is_known or not min(camera.width_px, camera.height_px, camera.K[0, 0]) > 0:
+        raise ValueError(f"camera {camera.name}: size, model or K")
+    T_cam_key = rigid(view["T_cam_key"], "T_cam_key")
+    return CameraView(camera, T_cam_key, float(view["late_s"]), view["number"])
 
 
 def _track(entry: Mapping[str, Any]) -> ObjectTrack:
     poses = entry["poses"]
     return ObjectTrack(
-        instance=_whole(entry["instance"]),
+        instance=int(entry["instance"]),
         size_m=_array(entry["size_m"], 3),
-        frames=tuple(_whole(pose["frame"]) for pose in poses),
-        stamp_ns=np.array([_whole(pose["stamp_ns"]) for pose in poses], np.int64),
-        T_key_object=np.stack([_pose(pose["T_key_object"]) for pose in poses]),
-        velocity_m_s=np.stack([_array(pose["velocity_m_s"], 3) for pose in poses]),
-        num_points=np.array([_whole(pose["num_points"]) for pose in poses], np.int64),
+        frames=tuple(int(pose["frame"]) for pose in poses),
+        stamp_ns=np.array([pose["stamp_ns"] for pose in poses], np.int64),
+        T_key_object=np.stack([rigid(pose["T_key_object"], "T_key_object") for pose in poses]),
+        velocity_m_s=_array([pose["velocity_m_s"] for pose in poses], len(poses), 3),
+        num_points=np.array([pose["num_points"] for pose in poses], np.int64),
     )
-
-
-def _whole(value: Any) -> int:
-    if type(value) is not int or abs(value) >= 1 << 63:
-        raise ValueError(f"got {value!r}, expected a whole number")
-    return value
 
 
 def _array(value: Any, *shape: int) -> Float:
     array = np.array(value, np.float64)
-    if array.shape != shape or not (np.abs(array) < _LARGEST).all():
-        raise ValueError(f"got {value!r}, expected {' x '.join(map(str, shape)) or 'a'} number")
+    if array.shape != shape or not np.isfinite(array).all():
+        raise ValueError(f"expected {' x '.join(map(str, shape))} numbers")
     return array
-
-
-def _pose(value: Any) -> Float:
-    """Return (4,4), a rotation and a translation."""
-    T = _array(value, 4, 4)
-    R = T[:3, :3]
-    is_rotation = np.allclose(R @ R.T, np.eye(3), atol=1e-3) and np.linalg.det(R) > 0
-    if not is_rotation or T[3].tolist() != [0, 0, 0, 1]:
-        raise ValueError(f"got {value!r}, expected a rotation and a translation")
-    return T

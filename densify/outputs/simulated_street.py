@@ -1,7 +1,16 @@
 # SPDX-License-Identifier: MIT
 """Write frames of the built-in street, with exact truth, as a KITTI raw drive or a plain folder.
 
-The plain folder, which `densify.readers.folder` opens::
+``truth/`` is described in `densify.readers.truth_files`. KITTI's form, for
+`densify.readers.kitti.raw`; a timestamps file has a line per frame of the street::
+
+    OUT/2026_06_12/calib_cam_to_cam.txt calib_velo_to_cam.txt calib_imu_to_velo.txt
+    OUT/2026_06_12/2026_06_12_drive_0001_sync/
+        velodyne_points/{data/0000000120.bin, timestamps.txt, timestamps_start.txt, ..._end.txt}
+        image_02/{data/0000000120.png, timestamps.txt}  image_03/...
+        oxts/{data/0000000120.txt, timestamps.txt}  truth/
+
+The plain folder, for `densify.readers.folder`::
 
     OUT/street/densify.yaml
     OUT/street/sweeps/000000.bin, ...  float32 x y z intensity time lidar, time in s since the
@@ -9,7 +18,7 @@ The plain folder, which `densify.readers.folder` opens::
     OUT/street/timestamps.txt          one time per sweep, s since 1970
     OUT/street/poses.txt               the lidar's path (TUM): time x y z qx qy qz qw
     OUT/street/images/CAMERA/1781258406000000000.png, ...  named by their times in ns
-    OUT/street/truth/                  see `densify.readers.truth_files`
+    OUT/street/truth/                  sweeps and images are numbered from 0
 """
 
 from __future__ import annotations
@@ -17,25 +26,38 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
+import yaml
 from scipy.spatial.transform import Rotation
 
 from densify.config.errors import InputError
-from densify.geometry.types import Camera, Float, Int, Progress
+from densify.geometry import poses
+from densify.geometry.types import Float, Float32, Int, Progress
 from densify.outputs.atomic import staged_folder
-from densify.outputs.png import encode_png
+from densify.outputs.depth_png import encode_png
 from densify.readers.file_sequence import camera_named
 from densify.readers.folder.config import NAME
+from densify.readers.kitti.raw import KITTI_TRIGGER_LATENCY_NS
 from densify.readers.recorded_poses import PoseTrack
 from densify.readers.street import Street
 from densify.readers.truth_files import write_bodies, write_depth, write_points
-from densify.street.simulator import Bodies
+from densify.street.cameras import CAMERAS, T_RECTIFIED_LIDAR, USUAL, T_level_lidar
+from densify.street.sensors import SENSORS
+from densify.street.simulator import EPOCH_NS, Bodies
 
 FORMATS = ("kitti", "folder")
+_DATE = np.datetime64(EPOCH_NS, "ns").astype("datetime64[D]").astype(str).replace("-", "_")
+_DRIVE = f"{_DATE}_drive_0001_sync"
+_CALIBRATION = ("calib_cam_to_cam.txt", "calib_velo_to_cam.txt", "calib_imu_to_velo.txt")
+_FOLDER = (NAME, "sweeps", "timestamps.txt", "poses.txt", "images", "truth")
 _POSE_STEP_NS = 5_000_000
 _MARGIN_NS = 150_000_000  # poses start this long before the first sweep and end after the last
+T_LEVEL_IMU = np.eye(4)  # the inertial unit is behind and below the scanner, slightly turned
+T_LEVEL_IMU[:3, :3] = Rotation.from_rotvec([0.012, -0.003, -0.001]).as_matrix()
+T_LEVEL_IMU[:3, 3] = [-0.81, 0.32, -0.80]
+_LATITUDE_DEG, _LONGITUDE_DEG, _ALTITUDE_M = 49.0, 8.4, 115.0
+_EARTH_RADIUS_M = 6_378_137.0
 
 
 def write_street(
@@ -55,15 +77,20 @@ def write_street(
     """
     if format not in FORMATS:
         raise InputError(f"--format {format}: expected one of {', '.join(FORMATS)}")
-    excerpt = Excerpt.of(street, frames, cameras, progress)
+    excerpt, is_kitti = Excerpt.of(street, frames, cameras), format == "kitti"
+    if is_kitti:
+        _check_fits_kitti(excerpt, out)
+    place, owned = (_DATE, (_DRIVE, *_CALIBRATION)) if is_kitti else ("street", _FOLDER)
+    for name in owned:
+        if (out / place / name).exists() and not overwrite:
+            raise InputError(f"{out / place / name}: exists; give --overwrite to replace it")
+    write = _write_kitti if is_kitti else _write_folder
     try:
-        if format == "folder":
-            return _write_folder(excerpt, out / "street", overwrite)
-        from densify.outputs.simulated_kitti import write_drive
-
-        return write_drive(excerpt, out, overwrite)
+        with staged_folder(out / place, owned) as folder:
+            write(excerpt, folder, progress or (lambda *_: None))
     except OSError as error:
         raise InputError(f"{out}: cannot be written: {error.strerror or error}") from error
+    return out / place / _DRIVE if is_kitti else out / place
 
 
 @dataclass(frozen=True)
@@ -73,15 +100,10 @@ class Excerpt:
     street: Street
     frames: tuple[int, ...]
     cameras: tuple[str, ...]
-    progress: Progress | None = None
 
     @classmethod
     def of(
-        cls,
-        street: Street,
-        frames: Sequence[int],
-        cameras: Sequence[str] | None = None,
-        progress: Progress | None = None,
+        cls, street: Street, frames: Sequence[int], cameras: Sequence[str] | None = None
     ) -> Excerpt:
         """cameras: None for all of the street. Raises InputError for what does not exist."""
         names = tuple(street.cameras if cameras is None else cameras)
@@ -93,16 +115,7 @@ class Excerpt:
                 f"{street.name}: frames to write: got {unknown[:5] or 'none'}, expected some of 0 "
                 f"to {street.frames[-1]}"
             )
-        return cls(street, tuple(sorted(frames)), names, progress)
-
-    def numbered(self) -> Iterator[tuple[int, int]]:
-        """Each sweep's number from 0 and its frame; tells the progress."""
-        for number, frame in enumerate(self.frames):
-            if self.progress:
-                self.progress("simulate", number, len(self.frames))
-            yield number, frame
-        if self.progress:
-            self.progress("simulate", len(self.frames), len(self.frames))
+        return cls(street, tuple(sorted(frames)), names)
 
     def image_numbers(self, camera: str) -> list[int]:
         """The images exposed from half a period before the first stamp to half a period after the
@@ -115,7 +128,7 @@ class Excerpt:
 
     def png_image(self, camera: str, number: int) -> bytes:
         """Bytes of a PNG file."""
-        return encode_png(np.ascontiguousarray(self.street.image(camera, number)[:, :, ::-1]))
+        return encode_png(self.street.image(camera, number)[:, :, ::-1])
 
     def T_world_ego(self, stamp_ns: Int, T_lidar_ego: Float | None = None) -> Float:
         """(n,) times -> (n,4,4) true poses of the scanner, or of a frame fixed to it."""
@@ -129,17 +142,29 @@ class Excerpt:
         return PoseTrack(self.street.name, stamp_ns, self.T_world_ego(stamp_ns, T_lidar_ego))
 
 
-def write_truth(folder: Path, excerpt: Excerpt, bodies: Bodies, renumbered: bool) -> None:
-    """Write the truth folder of the layout in `densify.readers.truth_files`.
+def put(path: Path, data: bytes | str) -> None:
+    """Write a file and make the folders above it."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(data.encode() if isinstance(data, str) else data)
 
-    bodies: poses at the stamp of each sweep. renumbered: sweeps and images are numbered from 0.
-    """
+
+def _numbered(frames: Sequence[int], progress: Progress) -> Iterator[tuple[int, int]]:
+    for number, frame in enumerate(frames):
+        progress("simulate", number, len(frames))
+        yield number, frame
+    progress("simulate", len(frames), len(frames))
+
+
+def _write_truth(folder: Path, excerpt: Excerpt, bodies: Bodies, renumbered: bool) -> None:
+    """bodies: poses at the stamp of each sweep. renumbered: files are numbered from 0."""
     street = excerpt.street
     write_bodies(folder, bodies)
     for number, frame in enumerate(excerpt.frames):
         returns = street.returns(frame)
-        points = street.simulator.in_bodies(frame, returns)
-        written = number if renumbered else frame
+        points, written = (
+            street.simulator.in_bodies(frame, returns),
+            number if renumbered else frame,
+        )
         write_points(folder, written, returns.body, returns.instance, points)
     for camera in excerpt.cameras:
         images = excerpt.image_numbers(camera) if renumbered else excerpt.frames
@@ -149,57 +174,52 @@ def write_truth(folder: Path, excerpt: Excerpt, bodies: Bodies, renumbered: bool
             write_depth(folder, camera, number if renumbered else image, depth_m, moving)
 
 
-def put(path: Path, data: bytes | str) -> None:
-    """Write a file and make the folders above it."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_bytes(data.encode() if isinstance(data, str) else data)
-
-
-def _write_folder(excerpt: Excerpt, place: Path, overwrite: bool) -> Path:
-    if place.exists() and not overwrite:
-        raise InputError(f"{place}: exists; give --overwrite to replace it")
+def _write_folder(excerpt: Excerpt, folder: Path, progress: Progress) -> None:
     street = excerpt.street
     stamps_ns = [street.stamp_ns(frame) for frame in excerpt.frames]
-    owned = [path.name for path in place.iterdir()] if place.is_dir() else []
-    with staged_folder(place, owned) as folder:
-        for number, frame in excerpt.numbered():
-            returns = street.returns(frame)
-            columns = [returns.intensity, returns.offset_ns * 1e-9, returns.lidar]
-            if returns.radial_velocity_m_s is not None:
-                columns.append(returns.radial_velocity_m_s)
-            table = np.column_stack([returns.points, *columns]).astype("<f4")
-            put(folder / "sweeps" / f"{number:06d}.bin", table.tobytes())
-        put(folder / "timestamps.txt", "".join(f"{_seconds(ns)}\n" for ns in stamps_ns))
-        put(folder / "poses.txt", _tum(excerpt.poses()))
-        for name in excerpt.cameras:
-            exposed_ns = street.image_stamps_ns(name)
-            for image in excerpt.image_numbers(name):
-                path = folder / "images" / name / f"{exposed_ns[image]}.png"
-                put(path, excerpt.png_image(name, image))
-        put(folder / NAME, config_text(excerpt))
-        write_truth(folder / "truth", excerpt, street.simulator.bodies_at(stamps_ns), True)
-    return place
+    for number, frame in _numbered(excerpt.frames, progress):
+        returns = street.returns(frame)
+        columns = [returns.points, returns.intensity, returns.offset_ns * 1e-9, returns.lidar]
+        if returns.radial_velocity_m_s is not None:
+            columns.append(returns.radial_velocity_m_s)
+        table = np.column_stack(columns).astype("<f4")
+        put(folder / "sweeps" / f"{number:06d}.bin", table.tobytes())
+    put(folder / "timestamps.txt", "".join(f"{_seconds(ns)}\n" for ns in stamps_ns))
+    lines = ["# time x y z qx qy qz qw: the lidar's pose in the world\n"]
+    track = excerpt.poses()
+    for stamp_ns, T in zip(track.stamp_ns.tolist(), track.T_world_ego, strict=True):
+        x_y_z_w = Rotation.from_matrix(T[:3, :3]).as_quat(canonical=True)
+        values = " ".join(f"{float(v):.12g}" for v in (*T[:3, 3], *x_y_z_w))
+        lines.append(f"{_seconds(stamp_ns)} {values}\n")
+    put(folder / "poses.txt", "".join(lines))
+    for name in excerpt.cameras:
+        exposed_ns = street.image_stamps_ns(name)
+        for image in excerpt.image_numbers(name):
+            path = folder / "images" / name / f"{exposed_ns[image]}.png"
+            put(path, excerpt.png_image(name, image))
+    put(folder / NAME, config_text(excerpt))
+    _write_truth(folder / "truth", excerpt, street.simulator.bodies_at(stamps_ns), renumbered=True)
 
 
 def _seconds(time_ns: int) -> str:
     return f"{time_ns // 10**9}.{time_ns % 10**9:09d}"
 
 
-def _tum(track: PoseTrack) -> str:
-    lines = ["# time x y z qx qy qz qw: the lidar's pose in the world"]
-    for stamp_ns, T in zip(track.stamp_ns.tolist(), track.T_world_ego, strict=True):
-        x_y_z_w = Rotation.from_matrix(T[:3, :3]).as_quat(canonical=True)
-        values = " ".join(f"{float(v):.12g}" for v in (*T[:3, 3], *x_y_z_w))
-        lines.append(f"{_seconds(stamp_ns)} {values}")
-    return "\n".join(lines) + "\n"
-
-
 def config_text(excerpt: Excerpt) -> str:
     """The densify.yaml of the excerpt."""
-    import yaml
-
     sensor = excerpt.street.simulator.sensor
     columns = ["x", "y", "z", "intensity", "time", "lidar"]
+    cameras = {}
+    for name in excerpt.cameras:
+        camera = excerpt.street.cameras[name]
+        cameras[name] = {
+            **{"files": f"images/{name}", "stamps": "names", "stamps_unit": "ns"},
+            **{key: getattr(camera, key) for key in ("model", "max_angle_deg", "row_time_s")},
+            "size": [camera.width_px, camera.height_px],
+            "K": camera.K.tolist(),
+            "distortion": list(camera.distortion),
+            "T_cam_lidar": camera.T_cam_lidar.tolist(),
+        }
     config = {
         "sweeps": {
             "files": "sweeps",
@@ -212,18 +232,103 @@ def config_text(excerpt: Excerpt) -> str:
             "scanner_origins": sensor.origins_m.tolist(),
         },
         "poses": {"file": "poses.txt", "stamps_unit": "s"},
-        "cameras": {name: _camera(excerpt.street.cameras[name]) for name in excerpt.cameras},
+        "cameras": cameras,
     }
     text = yaml.safe_dump(config, sort_keys=False, default_flow_style=None, width=100)
     return f"# What the other files of this folder do not say.\n{text}"
 
 
-def _camera(camera: Camera) -> dict[str, Any]:
-    return {
-        **{"files": f"images/{camera.name}", "stamps": "names", "stamps_unit": "ns"},
-        **{name: getattr(camera, name) for name in ("model", "max_angle_deg", "row_time_s")},
-        "size": [camera.width_px, camera.height_px],
-        "K": camera.K.tolist(),
-        "distortion": list(camera.distortion),
-        "T_cam_lidar": camera.T_cam_lidar.tolist(),
-    }
+def _check_fits_kitti(excerpt: Excerpt, out: Path) -> None:
+    """Raise InputError for a camera other than image_02 and image_03, and for a sensor whose
+    azimuths do not tell the points' times."""
+    for name in excerpt.cameras:
+        camera_named({usual: CAMERAS[usual] for usual in USUAL}, name, out)
+    if not excerpt.street.simulator.sensor.azimuth_tells_time:
+        fit = [sensor.name for sensor in SENSORS.values() if sensor.azimuth_tells_time]
+        raise InputError(
+            f"{excerpt.street.name}: cannot be written as KITTI, whose points have neither a time "
+            f"nor a scanner; choose a single scanner that spins: {', '.join(fit)}"
+        )
+
+
+def _write_kitti(excerpt: Excerpt, folder: Path, progress: Progress) -> None:
+    street, drive = excerpt.street, folder / _DRIVE
+    tilt_deg, usual = street.simulator.tilt_deg, CAMERAS[USUAL[0]]
+    sizes = [f"S_rect_0{n}: {usual.width_px} {usual.height_px}\n" for n in range(4)]
+    turns = [f"R_rect_0{n}: {numbers(np.eye(3))}\n" for n in range(4)]
+    calibration = ["".join([projections("P_rect_0{}"), *sizes, *turns])]
+    for T in (T_RECTIFIED_LIDAR @ T_level_lidar(tilt_deg), T_lidar_imu(tilt_deg)):
+        calibration.append(f"R: {numbers(T[:3, :3])}\nT: {numbers(T[:3, 3])}\n")
+    for name, text in zip(_CALIBRATION, calibration, strict=True):
+        put(folder / name, text)
+    for _, frame in _numbered(excerpt.frames, progress):
+        put(drive / "velodyne_points" / "data" / f"{frame:010d}.bin", sweep_data(street, frame))
+        for name in excerpt.cameras:
+            put(drive / name / "data" / f"{frame:010d}.png", excerpt.png_image(name, frame))
+        record = oxts_line(street, frame, excerpt.frames[0])
+        put(drive / "oxts" / "data" / f"{frame:010d}.txt", record)
+    centre = np.array([street.stamp_ns(frame) for frame in street.frames])
+    half = street.simulator.period_ns // 2
+    stamps = {"oxts/timestamps": centre, "velodyne_points/timestamps": centre}
+    stamps["velodyne_points/timestamps_start"] = centre - half
+    stamps["velodyne_points/timestamps_end"] = centre + half
+    for name in excerpt.cameras:
+        exposed_ns = np.array(list(street.image_stamps_ns(name).values()))
+        stamps[f"{name}/timestamps"] = exposed_ns + KITTI_TRIGGER_LATENCY_NS
+    for name, stamps_ns in stamps.items():
+        put(drive / f"{name}.txt", stamp_lines(stamps_ns))
+    _write_truth(drive / "truth", excerpt, street.bodies, renumbered=False)
+
+
+def numbers(values: Float) -> str:
+    """A line of KITTI's text files, with every digit."""
+    return " ".join(repr(float(v)) for v in np.ravel(values))
+
+
+def projections(key: str) -> str:
+    """Lines of the keys of cameras 0 to 3, such as ``P{}``: K [I | t], with t from the rectified
+    camera 0."""
+    lines = ""
+    for number in range(4):  # 0 and 1 are the gray cameras beside them
+        camera = CAMERAS[f"image_0{2 + number % 2}"]
+        away = (camera.T_cam_lidar - T_RECTIFIED_LIDAR)[:3, 3]
+        lines += f"{key.format(number)}: {numbers(camera.K @ np.column_stack([np.eye(3), away]))}\n"
+    return lines
+
+
+def stamp_lines(stamps_ns: Int) -> str:
+    """A timestamps file."""
+    texts = stamps_ns.astype("datetime64[ns]").astype(str)
+    return "".join(text.replace("T", " ") + "\n" for text in texts)
+
+
+def sweep_data(street: Street, frame: int, points: Float | Float32 | None = None) -> bytes:
+    """A sweep's file. points: (N,3), None for the points as fired."""
+    returns = street.returns(frame)
+    columns = [returns.points if points is None else points, returns.intensity]
+    return np.column_stack(columns).astype("<f4").tobytes()
+
+
+def T_lidar_imu(tilt_deg: float) -> Float:
+    """(4,4) from the inertial unit to the scanner, whose mount is tilted."""
+    return poses.inverse(T_level_lidar(tilt_deg)) @ T_LEVEL_IMU
+
+
+def oxts_line(street: Street, frame: int, first: int) -> str:
+    """An oxts record of the true pose; its velocities, accelerations and turn rates are 0.
+
+    first: the frame at the fixed latitude, which is the first frame written: readers take the scale
+    of the Mercator projection from the first record.
+    """
+    T_lidar = T_lidar_imu(street.simulator.tilt_deg)
+    here, start = (
+        street.simulator.T_world_lidar_at(street.stamp_ns(f)) @ T_lidar for f in (frame, first)
+    )
+    east_north_up = here[:3, 3] - start[:3, 3]
+    scale_m = np.cos(np.radians(_LATITUDE_DEG)) * _EARTH_RADIUS_M
+    lon_deg = _LONGITUDE_DEG + np.degrees(east_north_up[0] / scale_m)
+    mercator = np.log(np.tan(np.radians(90 + _LATITUDE_DEG) / 2)) + east_north_up[1] / scale_m
+    lat_deg = np.degrees(2 * np.arctan(np.exp(mercator))) - 90
+    yaw, pitch, roll = Rotation.from_matrix(here[:3, :3]).as_euler("ZYX")
+    place = [lat_deg, lon_deg, _ALTITUDE_M + east_north_up[2], roll, pitch, yaw]
+    return f"{numbers(np.array([*place, *[0.0] * 17, 0.05, 0.02]))} 4 10 4 4 0\n"

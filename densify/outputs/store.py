@@ -10,17 +10,15 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Literal
 
-from densify.config.errors import InputError, OutputError
+from densify.config.errors import InputError
 from densify.config.plugins.outputs import OUTPUTS, Output, chosen
 from densify.geometry.types import Result
-from densify.outputs import cloud_laz, map_outputs, table_outputs
-from densify.outputs.atomic import staged_folder
-from densify.outputs.context import Context
-from densify.outputs.figure import write_figure
+from densify.outputs import key_outputs
+from densify.outputs.atomic import staged_folder, writing_to
+from densify.outputs.key_outputs import Context
 from densify.outputs.plain import write_json
-from densify.outputs.png import Picture
+from densify.outputs.plots import write_figure
 
-Verb = Literal["run", "compare"]
 WriteOutput = Callable[[Result, Context, Path], None]
 """Writes the files that an output owns into the key's folder, where the result has something for
 them. The folder appears when every output is done. Same result and context, same bytes."""
@@ -29,7 +27,11 @@ _COMPARISON = ("compare.json", "compare.png", "compare", "compare.html")
 
 
 def check_writable(
-    out: Path, key: int, overwrite: bool = False, verb: Verb = "run", also: str = ""
+    out: Path,
+    key: int,
+    overwrite: bool = False,
+    verb: Literal["run", "compare"] = "run",
+    also: str = "",
 ) -> None:
     """Raise InputError if a result could not be written. Nothing is touched.
 
@@ -48,13 +50,8 @@ def writing(folder: Path, owned: Collection[str], out: Path, overwrite: bool) ->
     Raises InputError as `check_writable`.
     """
     _check_place(folder, owned, out, overwrite)
-    try:
-        with staged_folder(folder, owned) as staging:
-            yield staging
-    except OSError as error:
-        raise OutputError(
-            f"--out {out}: cannot be written: {error.strerror or error}; nothing was kept"
-        ) from error
+    with writing_to(out), staged_folder(folder, owned) as staging:
+        yield staging
 
 
 def _check_place(folder: Path, owned: Collection[str], out: Path, overwrite: bool) -> None:
@@ -80,7 +77,6 @@ def _check_place(folder: Path, owned: Collection[str], out: Path, overwrite: boo
 
 def write_result(
     result: Result,
-    images: Mapping[str, Picture],
     out: Path,
     *,
     config: Mapping[str, Any],
@@ -90,7 +86,6 @@ def write_result(
 ) -> list[Path]:
     """Write one densified key as ``out/KEY/``, and return the files written.
 
-    images: camera -> (H,W,3) RGB; a camera without one is drawn on black.
     config: the merged configuration, as plain mappings.
     data: the recording, as the user named it.
     overwrite: replace an earlier result. Whatever else lies in the folder is kept.
@@ -99,7 +94,7 @@ def write_result(
     Raises InputError if the place cannot be written to, or holds a result already.
     """
     rows = chosen(also)
-    owned, context = _owned(rows), Context(images, config, data)
+    owned, context = _owned(rows), Context(config, data)
     with writing(_key_folder(out, result.key), owned, out, overwrite) as folder:
         for row in rows:
             getattr(OUTPUTS.module(row), row.function)(result, context, folder)
@@ -113,7 +108,6 @@ def write_result(
 
 def write_comparison(
     results: Mapping[str, Result],
-    images: Mapping[str, Picture],
     out: Path,
     *,
     config: Mapping[str, Any],
@@ -126,28 +120,22 @@ def write_comparison(
     results: method -> result, of one key. The rest as `write_result`.
     """
     last = list(results.values())[-1]
-    key, context = last.key, Context(images, config, data)
+    key, context = last.key, Context(config, data)
     table = {
-        "schema_version": table_outputs.SCHEMA_VERSION,
+        "schema_version": key_outputs.SCHEMA_VERSION,
         "key": key,
         "data": data,
-        "methods": {method: table_outputs.scores_of(result) for method, result in results.items()},
+        "methods": {method: key_outputs.scores_of(result) for method, result in results.items()},
         "config": config,
-        "stages": table_outputs.stages(last),
+        "stages": key_outputs.stages(last),
         "warnings": list(dict.fromkeys(w for r in results.values() for w in r.warnings)),
-        "versions": table_outputs.versions(),
+        "versions": key_outputs.versions(),
     }
     with writing(_key_folder(out, key), _COMPARISON, out, overwrite) as folder:
         write_json(folder / "compare.json", table)
-        write_figure(folder / "compare.png", results, context)
-        (folder / "compare").mkdir()
-        for write in (
-            map_outputs.write_depth,
-            cloud_laz.write_output,
-            table_outputs.write_tracks,
-            table_outputs.write_scene,
-        ):
-            write(last, context, folder / "compare")
+        write_figure(folder / "compare.png", results)
+        for name in ("write_depth", "write_cloud_laz", "write_tracks", "write_scene"):
+            getattr(key_outputs, name)(last, context, folder / "compare")
     return _written(out, key, _COMPARISON)
 
 

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from densify.geometry import poses
 from densify.geometry.types import Camera, Float
-from densify.outputs.simulated_kitti import (
+from densify.outputs.simulated_street import (
     T_lidar_imu,
     numbers,
     oxts_line,

@@ -149,7 +149,7 @@ def _of_recording(spec: str, options: argparse.Namespace, config: Config) -> Ite
     num_made = len(frames) - len(failed)
     text = f"{_sweeps(num_made)}, {num_moving:,} points moving"
     facts = {"num_sweeps": num_made, "num_moving": num_moving}
-    yield Answer(text, facts, list(dict.fromkeys(path.parent for path in paths)))
+    yield Answer(text, facts, list(paths))
     _raise_failed(failed, len(frames), "made")
 
 

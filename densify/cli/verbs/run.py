@@ -58,13 +58,6 @@ def add_run(commands: Any) -> None:
         "Fitted to the measured pixels they complete depth_full/; masks of the sky in "
         "DIR/sky/CAMERA/FRAME.png",
     )
-    parser.add_argument(
-        "--film",
-        type=Path,
-        metavar="FILE",
-        help="of one key: a film of 8 s, .webp (half a megabyte) or .gif: registration alone "
-        "turns into scene flow, then sweep by sweep",
-    )
 
 
 def answer_run(options: argparse.Namespace) -> Iterator[Answer]:
@@ -79,12 +72,6 @@ def answer_run(options: argparse.Namespace) -> Iterator[Answer]:
     keys = _keys_of(sequence, options)
     for key in keys:
         check_writable(options.out, key, options.overwrite, "run", config.output.also)
-    if options.film is not None:
-        from densify.outputs.report.film import check_film
-
-        if len(keys) > 1:
-            raise InputError(f"--film {options.film}: got {len(keys)} keys, expected one")
-        check_film(options.film, options.overwrite)
     failed: dict[int, Exception] = {}
     doubts: list[tuple[str, str, int]] = []
     with progress_on_stderr() as progress:
@@ -119,21 +106,14 @@ def _written(result: Result, options: argparse.Namespace, config: Config) -> lis
     """Write the files of a key and return their paths."""
     from densify.outputs import write_result
 
-    paths = write_result(
+    return write_result(
         result,
-        result.images,
         options.out,
         config=as_mapping(config),
         data=recording_of(options),
         overwrite=options.overwrite,
         also=config.output.also,
     )
-    if options.film is not None:
-        from densify.outputs.report.film import write_film
-
-        write_film(options.out / f"{result.key:06d}", options.film, overwrite=True)
-        paths.append(options.film)
-    return paths
 
 
 def _keys_of(sequence: LidarSequence, options: argparse.Namespace) -> list[int]:
@@ -199,7 +179,6 @@ def answer_compare(options: argparse.Namespace) -> Iterator[Answer]:
         )
     paths = write_comparison(
         results,
-        next(iter(results.values())).images,
         options.out,
         config=as_mapping(config),
         data=recording_of(options),

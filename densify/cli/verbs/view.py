@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""``densify view``: a finished run live, in rerun's or in open3d's viewer."""
+"""``densify view``: a finished run live, in rerun's viewer."""
 
 from __future__ import annotations
 
@@ -21,23 +21,14 @@ def add(commands: Any) -> None:
         "view",
         answer,
         "a run, or keys of a drive, live: cloud, sweeps, images, depth and objects over time",
-        "Needs a screen, and pip install 'densify[rerun]' or 'densify[open3d]', which shows cloud "
-        "and moving objects alone. densify export --to rrd writes what rerun shows as a file; "
-        "densify report needs nothing but a browser.",
+        "Needs a screen, and pip install 'densify[rerun]'. densify export --to rrd writes the same "
+        "as a file; densify report needs nothing but a browser.",
     )
     parser.add_argument(
         "place",
         metavar="DIR",
         type=Path,
         help="folder of one key, such as densify-out/000120, or of several of a drive",
-    )
-    parser.add_argument(
-        "--with",
-        dest="viewer",
-        choices=("rerun", "open3d"),
-        default="rerun",
-        help="rerun: its viewer, which stays open; open3d: a window, until it is closed (default: "
-        "rerun)",
     )
     parser.add_argument(
         "--port",
@@ -51,17 +42,11 @@ def add(commands: Any) -> None:
 
 
 def answer(options: argparse.Namespace) -> Iterator[Answer]:
-    """Show it. rerun's viewer stays open; the verb ends when open3d's window is closed."""
+    """Show it. rerun's viewer stays open."""
+    from densify.outputs.export import rrd
     from densify.outputs.export.finished_run import finished_runs
 
     runs = finished_runs(options.place, cameras=options.cameras)
-    if options.viewer == "open3d":
-        from densify.outputs.export import open3d_window
-
-        open3d_window.show(runs)
-    else:
-        from densify.outputs.export import rrd
-
-        rrd.show(runs, options.port)
+    rrd.show(runs, options.port)
     keys = [run.key for run in runs]
     yield Answer(f"shown: key {', '.join(map(str, keys))}", {"keys": keys})

@@ -24,26 +24,26 @@ def _built_in(name: str, module: str, function: str, *owned: str) -> Output:
     return Output(name, f"densify.{module}", function, owned)
 
 
-_MAPS, _TABLES = "outputs.map_outputs", "outputs.table_outputs"
+_KEY, _PLOTS = "outputs.key_outputs", "outputs.plots"
 
 OUTPUTS = Table(
     "output",
     "densify.outputs",
     ("write_output",),
     (
-        _built_in("depth", _MAPS, "write_depth", "depth", "depth_filled", "confidence", "age"),
-        _built_in("full", _MAPS, "write_full", "depth_full", "confidence_full"),
+        _built_in("depth", _KEY, "write_depth", "depth", "depth_filled", "confidence", "age"),
+        _built_in("full", _KEY, "write_full", "depth_full", "confidence_full"),
         _built_in("flow", "outputs.flow_writers", "write_flow", "flow"),
-        _built_in("movers", _MAPS, "write_movers", "movers"),
-        _built_in("tracks", _TABLES, "write_tracks", "movers.json"),
-        _built_in("optical_flow", _MAPS, "write_optical_flow", "optical_flow"),
-        _built_in("rejected", "outputs.figure", "write_rejected", "rejected"),
-        _built_in("cloud", "outputs.cloud_laz", "write_output", "cloud.laz"),
-        _built_in("scene", _TABLES, "write_scene", "scene"),
-        _built_in("metrics", _TABLES, "write_metrics", "metrics.json"),
-        _built_in("figure", "outputs.figure", "write_key_figure", "figure.png"),
-        _built_in("curve", "outputs.plots", "write_curve", "curve.png"),
-        _built_in("run", _TABLES, "write_run_yaml", "run.yaml"),
+        _built_in("movers", _KEY, "write_movers", "movers"),
+        _built_in("tracks", _KEY, "write_tracks", "movers.json"),
+        _built_in("optical_flow", _KEY, "write_optical_flow", "optical_flow"),
+        _built_in("rejected", _PLOTS, "write_rejected", "rejected"),
+        _built_in("cloud", _KEY, "write_cloud_laz", "cloud.laz"),
+        _built_in("scene", _KEY, "write_scene", "scene"),
+        _built_in("metrics", _KEY, "write_metrics", "metrics.json"),
+        _built_in("figure", _PLOTS, "write_key_figure", "figure.png"),
+        _built_in("curve", _PLOTS, "write_curve", "curve.png"),
+        _built_in("run", _KEY, "write_run_yaml", "run.yaml"),
         # Last, because it reads what the others wrote.
         _built_in("report", "dataset.report", "write_output", "report.html"),
     ),

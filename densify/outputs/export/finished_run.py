@@ -15,8 +15,8 @@ from densify.config.errors import InputError
 from densify.config.file_content import read_bytes, read_json, read_yaml
 from densify.geometry.types import CameraView, ObjectTrack
 from densify.outputs.cloud_laz import StoredCloud, read_cloud
-from densify.outputs.depth_png import read_stored, stored_age, stored_confidence
-from densify.outputs.scene_file import SceneFile, read_scene, read_tracks
+from densify.outputs.depth_png import map_path, read_stored, stored_age, stored_confidence
+from densify.outputs.scene_file import SceneFile, damage_named, read_scene, read_tracks
 from densify.readers.decoded_files import decode_image
 
 _KINDS: Mapping[str, type[np.uint8] | type[np.uint16]] = {
@@ -37,8 +37,9 @@ class Kept(NamedTuple):
 class FinishedRun:
     """One key's folder. Its files are read when they are asked for; each may raise InputError.
 
-    key: its frame. data: the recording. density: camera -> ``measured``, ``filled`` of the maps
-    that were read. num_points: of the clouds that were read, None before the first.
+    key: its frame. stamp_ns: its reference time. data: the recording. density: camera ->
+    ``measured``, ``filled`` of the maps that were read. num_points: of the clouds that were read,
+    None before the first.
     """
 
     def __init__(
@@ -56,13 +57,13 @@ class FinishedRun:
                 f"{folder}: no run.yaml in it; expected the folder of a finished run and key, such "
                 f"as densify-out/000120"
             )
-        record, _ = read_yaml(path)
-        if not isinstance(record, dict) or not isinstance(record.get("key"), int):
-            raise InputError(f"{path}: names no key; densify the key again")
-        self.folder, self.data = folder, str(record.get("data"))
-        self.key: int = record["key"]
+        with damage_named(path):
+            record = read_yaml(path)[0]
+            self.key, self.stamp_ns = int(record["key"]), int(record["stamp_ns"])
+            self.data = str(record["data"])
+        self.folder = folder
         self._min_confidence = stored_confidence(min_confidence)
-        self._max_age = None if max_age_ms is None else stored_age(max_age_ms / 1000)
+        self._max_age = stored_age(np.inf if max_age_ms is None else max_age_ms / 1000)
         self._chosen = cameras
         self.density: dict[str, dict[str, Kept]] = {}
         self.num_points: Kept | None = None
@@ -70,9 +71,7 @@ class FinishedRun:
     @cached_property
     def cameras(self) -> list[str]:
         """The chosen maps: CAMERA, or CAMERA/NUMBER of one of its images."""
-        depth = self.folder / "depth"
-        paths = [path.relative_to(depth) for path in depth.rglob("*.png")]
-        names = sorted(path.with_suffix("").as_posix() for path in paths)
+        names = map_names(self.folder / "depth")
         if not names:
             raise InputError(f"{self.folder}: no depth maps in it; run densify with a camera first")
         there = sorted({name.partition("/")[0] for name in names})
@@ -92,24 +91,17 @@ class FinishedRun:
     @cached_property
     def tracks(self) -> list[ObjectTrack]:
         """Tracks of moving objects, each with a pose at the key."""
-        path = self.folder / "movers.json"
-        tracks = read_tracks(path)
-        if any(self.key not in track.frames for track in tracks):
-            raise InputError(f"{path}: an object has no pose at key {self.key}; densify it again")
-        return tracks
+        return read_tracks(self.folder / "movers.json")
 
     def measure(self, camera: str) -> str:
         """Return ``z`` or ``range``, what the depth of a map is."""
         path = self.folder / "metrics.json"
-        scores = read_json(path)
-        measures = scores.get("measure") if isinstance(scores, dict) else None
-        if not isinstance(measures, dict) or measures.get(camera) not in ("z", "range"):
-            raise InputError(f"{path}: measure: does not say z or range of {camera}")
-        return str(measures[camera])
+        with damage_named(path):
+            return str(read_json(path)["measure"][camera])
 
     def jpeg(self, camera: str) -> bytes | None:
         """Return the image of a map as it is stored, None if there is none."""
-        path = self.folder / "scene" / "image" / f"{camera}.jpg"
+        path = map_path(self.folder / "scene", "image", camera, ".jpg")
         if camera not in self.scene.views or not path.is_file():
             return None
         known, data = self.scene.views[camera].camera, read_bytes(path)
@@ -124,18 +116,16 @@ class FinishedRun:
     def maps(self, camera: str) -> dict[str, NDArray[Any]]:
         """Return kind -> (H,W) as stored (`densify.outputs.depth_png`), 0 where a pixel is left
         out: depth, depth_filled, confidence and age."""
-        maps = {}
+        maps: dict[str, NDArray[Any]] = {}
         for kind, dtype in _KINDS.items():
-            path = self.folder / kind / f"{camera}.png"
+            path = map_path(self.folder, kind, camera)
             maps[kind] = read_stored(path, dtype, f"a map of {kind}")
-            filled = maps.get("depth_filled", maps[kind])
-            if maps[kind].shape != maps["depth"].shape or (
-                kind in ("confidence", "age") and ((maps[kind] > 0) != (filled > 0)).any()
-            ):
+            is_same = maps[kind].shape == maps["depth"].shape
+            if is_same and kind in ("confidence", "age"):
+                is_same = np.array_equal(maps[kind] > 0, maps["depth_filled"] > 0)
+            if not is_same:
                 raise InputError(f"{path}: does not belong to the others; densify the key again")
-        keep = maps["confidence"] >= self._min_confidence
-        if self._max_age is not None:
-            keep &= maps["age"] <= self._max_age
+        keep = (maps["confidence"] >= self._min_confidence) & (maps["age"] <= self._max_age)
         self.density[camera] = {
             product: Kept(float((maps[kind] > 0).mean()), float(((maps[kind] > 0) & keep).mean()))
             for product, kind in (("measured", "depth"), ("filled", "depth_filled"))
@@ -152,21 +142,19 @@ class FinishedRun:
         return [self._select(read_cloud(path)) for path in paths]
 
     def _select(self, cloud: StoredCloud) -> StoredCloud:
-        keep = stored_confidence(cloud.confidence) >= self._min_confidence
-        if self._max_age is not None:
-            keep &= stored_age(np.abs(cloud.gps_time - self._key_gps_time)) <= self._max_age
+        age = stored_age(1e-9 * np.abs(cloud.stamp_ns - self.stamp_ns))
+        keep = (stored_confidence(cloud.confidence) >= self._min_confidence) & (
+            age <= self._max_age
+        )
         before = self.num_points or Kept(0, 0)
         self.num_points = Kept(before.before + len(keep), before.after + int(keep.sum()))
         return cloud.select(keep)
 
-    @cached_property
-    def _key_gps_time(self) -> float:
-        path = self.folder / "cloud.laz"
-        cloud = read_cloud(path)
-        own = cloud.gps_time[cloud.frame == self.key]
-        if not len(own):
-            raise InputError(f"{path}: no point of the key sweep {self.key}; omit --max-age-ms")
-        return float(own[0])
+
+def map_names(folder: Path) -> list[str]:
+    """Return the maps in a folder: CAMERA, or CAMERA/NUMBER of one of its images."""
+    paths = [path.relative_to(folder) for path in folder.rglob("*.png")]
+    return sorted(path.with_suffix("").as_posix() for path in paths)
 
 
 def finished_runs(

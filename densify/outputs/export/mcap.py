@@ -52,13 +52,13 @@ def _messages(m: Any, timeline: Timeline) -> Iterator[tuple[str, int, Any]]:
     start_ns, cloud = timeline.sweeps[0].stamp_ns, timeline.cloud
     yield "/tf", start_ns, _transform(m, start_ns, "world", "key", timeline.T_world_key)
     beside = {name: getattr(cloud, name) for name in ("confidence", "instance", "frame")}
-    yield "/cloud", start_ns, _cloud(m, start_ns, cloud.points, cloud.rgb, beside)
+    yield "/cloud", start_ns, _cloud(m, start_ns, cloud.points, colours(cloud), beside)
     for sweep in timeline.sweeps:
         now_ns = sweep.stamp_ns
         yield "/tf", now_ns, _transform(m, now_ns, "key", "vehicle", sweep.T_key_lidar)
-        moving = {"moving": sweep.moving.astype(np.uint8)}
-        yield "/sweep", now_ns, _cloud(m, now_ns, sweep.points, sweep.rgb, moving)
-        yield "/movers", now_ns, _boxes(m, now_ns, timeline.tracks, sweep.frame)
+        own, moving = sweep.points, {"moving": sweep.points.moving.astype(np.uint8)}
+        yield "/sweep", now_ns, _cloud(m, now_ns, own.rigid_points, colours(own), moving)
+        yield "/movers", now_ns, _boxes(m, now_ns, timeline.run.tracks, sweep.frame)
     for shot in timeline.shots:
         T_key_cam = poses.inverse(shot.view.T_cam_key)
         yield "/tf", start_ns, _transform(m, start_ns, "key", shot.name, T_key_cam)
@@ -95,7 +95,7 @@ def _lens(camera: Camera) -> tuple[str, list[float]] | None:
 
 
 def _cloud(m: Any, stamp_ns: int, points: Any, rgb: Any, beside: dict[str, NDArray[Any]]) -> Any:
-    values = [*points.T.astype(np.float32), *colours(rgb).T]
+    values = [*points.T.astype(np.float32), *rgb.T]
     columns = dict(zip(("x", "y", "z", "red", "green", "blue"), values, strict=True))
     rows = table(columns | {"alpha": np.full(len(points), 255, np.uint8), **beside})
     types = m.PackedElementFieldNumericType

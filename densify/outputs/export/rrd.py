@@ -22,6 +22,7 @@ from scipy.spatial.transform import Rotation
 
 from densify.geometry import poses
 from densify.geometry.types import Float, ObjectTrack
+from densify.outputs.cloud_laz import StoredCloud
 from densify.outputs.export.finished_run import FinishedRun
 from densify.outputs.export.timeline import Shot, Timeline, colours, timelines
 from densify.readers.extras import needed
@@ -83,25 +84,26 @@ def _entities(timeline: Timeline) -> Iterator[tuple[int, int, str, Any]]:
     """Yield frame, stamp, name and content."""
     import rerun as rr
 
-    def points(xyz: Any, rgb: Any, radius: float = _POINT) -> Any:
-        return rr.Points3D(xyz, colors=colours(rgb), radii=radius)
+    def points(xyz: Any, cloud: StoredCloud, radius: float = _POINT) -> Any:
+        return rr.Points3D(xyz, colors=colours(cloud), radii=radius)
 
-    cloud, moving = timeline.cloud, timeline.cloud.moving
-    start = timeline.sweeps[0][:2]
+    moving = timeline.cloud.select(timeline.cloud.moving)
+    static = timeline.cloud.select(~timeline.cloud.moving)
+    start, tracks = timeline.sweeps[0][:2], timeline.run.tracks
     yield *start, "", _transform(timeline.T_world_key)
-    yield *start, "cloud/static", points(cloud.points[~moving], cloud.rgb[~moving])
-    yield *start, "cloud/moving", points(cloud.points[moving], cloud.rgb[moving])
-    yield *start, "cloud/trails", points(cloud.rigid_points[moving], cloud.rgb[moving])
-    paths = [track.T_key_object[:, :3, 3] for track in timeline.tracks]
+    yield *start, "cloud/static", points(static.points, static)
+    yield *start, "cloud/moving", points(moving.points, moving)
+    yield *start, "cloud/trails", points(moving.rigid_points, moving)
+    paths = [track.T_key_object[:, :3, 3] for track in tracks]
     yield *start, "movers/path", rr.LineStrips3D(paths)
     for sweep in timeline.sweeps:
         now = sweep[:2]
-        yield *now, "sweep", points(sweep.points, sweep.rgb, _SWEEP_POINT)
+        yield *now, "sweep", points(sweep.points.rigid_points, sweep.points, _SWEEP_POINT)
         yield *now, "vehicle", _transform(sweep.T_key_lidar)
-        yield *now, "movers/box", _boxes(timeline.tracks, sweep.frame)
+        yield *now, "movers/box", _boxes(tracks, sweep.frame)
     for shot in timeline.shots:
         for name, shown in _of_shot(shot):
-            yield timeline.key, shot.stamp_ns, f"{shot.name}/{name}", shown
+            yield timeline.run.key, shot.stamp_ns, f"{shot.name}/{name}", shown
 
 
 def _of_shot(shot: Shot) -> Iterator[tuple[str, Any]]:

@@ -11,23 +11,22 @@ from numpy.typing import NDArray
 
 from densify.config.errors import InputError
 from densify.geometry import poses
-from densify.geometry.types import Bool, CameraView, Float, Float32, ObjectTrack
+from densify.geometry.types import CameraView, Float, Float32
 from densify.outputs.cloud_laz import StoredCloud
-from densify.outputs.export.array_files import metres
+from densify.outputs.depth_png import metres
 from densify.outputs.export.finished_run import FinishedRun
 
 _UNOBSERVED = np.array([140, 140, 140], np.uint8)
 
 
 class ShownSweep(NamedTuple):
-    """A sweep as it was measured, in the key frame, metres. stamp_ns: its reference time."""
+    """A sweep as it was measured: its points where registration places them (``rigid_points``).
+    stamp_ns: its reference time."""
 
     frame: int
     stamp_ns: int
     T_key_lidar: Float
-    points: Float32
-    rgb: NDArray[np.uint8]
-    moving: Bool
+    points: StoredCloud
 
 
 class Shot(NamedTuple):
@@ -47,12 +46,11 @@ class Timeline(NamedTuple):
     """A key. T_world_key: (4,4), the world is the first key's frame. cloud: at the key's time.
     sweeps: one or more, by time."""
 
-    key: int
+    run: FinishedRun
     T_world_key: Float
     cloud: StoredCloud
     sweeps: list[ShownSweep]
     shots: list[Shot]
-    tracks: list[ObjectTrack]
 
 
 def timelines(runs: Sequence[FinishedRun]) -> Iterator[Timeline]:
@@ -65,22 +63,20 @@ def timelines(runs: Sequence[FinishedRun]) -> Iterator[Timeline]:
     for before, run in zip([None, *runs], runs, strict=False):
         if before is not None:
             T_world_key = T_world_key @ _relative_pose(before, run)
-        cloud = run.cloud()
-        frames, rows = np.unique(cloud.frame, return_index=True)
-        stamps_ns = dict(zip(frames.tolist(), cloud.stamp_ns[rows].tolist(), strict=True))
-        for track in run.tracks:  # exact, and of sweeps without a point that is left
-            stamps_ns |= dict(zip(track.frames, track.stamp_ns.tolist(), strict=True))
-        key_ns = stamps_ns.setdefault(run.key, 0)
-        shown = {*run.scene.T_key_lidar, run.key} if len(runs) == 1 else {run.key}
-        sweeps = [_sweep(run, cloud, f, ns) for f, ns in stamps_ns.items() if f in shown]
-        sweeps.sort(key=lambda sweep: sweep.stamp_ns)
-        shots = [_shot(run, name, key_ns) for name in run.views]
-        yield Timeline(run.key, T_world_key, cloud, sweeps, shots, run.tracks)
+        cloud, sweeps = run.cloud(), []
+        for sweep in run.scene.table["sweeps"]:
+            frame, since_s, T = sweep["frame"], sweep["since_key_s"], sweep["T_key_lidar"]
+            if frame == run.key or (len(runs) == 1 and None not in (since_s, T)):
+                own = cloud.select((cloud.frame == frame) & ~cloud.far)
+                stamp_ns = run.stamp_ns + round(1e9 * (since_s or 0.0))
+                sweeps.append(ShownSweep(frame, stamp_ns, np.array(T), own))
+        shots = [_shot(run, name) for name in run.views]
+        yield Timeline(run, T_world_key, cloud, sweeps, shots)
 
 
-def colours(rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
+def colours(cloud: StoredCloud) -> NDArray[np.uint8]:
     """Return (N,3) colours, gray for points that no camera observed."""
-    return np.where(rgb.any(axis=1, keepdims=True), rgb, _UNOBSERVED)
+    return np.where(cloud.rgb.any(axis=1, keepdims=True), cloud.rgb, _UNOBSERVED)
 
 
 def _relative_pose(run: FinishedRun, other: FinishedRun) -> Float:
@@ -95,16 +91,9 @@ def _relative_pose(run: FinishedRun, other: FinishedRun) -> Float:
     )
 
 
-def _sweep(run: FinishedRun, cloud: StoredCloud, frame: int, stamp_ns: int) -> ShownSweep:
-    own = cloud.select((cloud.frame == frame) & ~cloud.far)
-    T_key_lidar = run.scene.T_key_lidar.get(frame, np.eye(4))
-    points = own.rigid_points.astype(np.float32)
-    return ShownSweep(frame, stamp_ns, T_key_lidar, points, own.rgb, own.moving)
-
-
-def _shot(run: FinishedRun, name: str, key_ns: int) -> Shot:
+def _shot(run: FinishedRun, name: str) -> Shot:
     view, maps = run.views[name], run.maps(name)
-    stamp_ns = key_ns + round(1e9 * view.late_s)
+    stamp_ns = run.stamp_ns + round(1e9 * view.late_s)
     depth_m, filled_m = metres(maps["depth"]), metres(maps["depth_filled"])
     is_pinhole = view.camera.is_rectified and run.measure(name) == "z"
     return Shot(name, view, stamp_ns, run.jpeg(name), depth_m, filled_m, is_pinhole)

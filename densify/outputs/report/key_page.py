@@ -1,30 +1,120 @@
 # SPDX-License-Identifier: MIT
-"""The page of one key: a run's or a comparison's."""
+"""The page of one key, of the files of a run or a comparison as far as they are there and whole."""
 
 from __future__ import annotations
 
 import math
 import shlex
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
 
 from densify import __version__
 from densify.config.errors import InputError
+from densify.config.file_content import read_bytes, read_json, read_yaml
 from densify.geometry.types import ObjectTrack
-from densify.outputs.cloud_laz import StoredCloud
-from densify.outputs.report.key_files import KeyFiles, mapping
-from densify.outputs.report.page_data import packed_camera, packed_cloud
-from densify.outputs.report.page_file import Blobs, page_file
+from densify.outputs.cloud_laz import StoredCloud, read_cloud
+from densify.outputs.depth_png import read_stored
+from densify.outputs.export.finished_run import map_names
+from densify.outputs.report.page_file import Blobs, packed_camera, packed_cloud, page_file
+from densify.outputs.scene_file import read_scene, read_tracks
+from densify.readers.decoded_files import decode_image
 
+T = TypeVar("T")
 MOST_BYTES = 12_000_000
 _MOST_FOR_MAPS = 7_500_000
 _COARSEST = 8
 _MOST_POINTS, _FEWEST_POINTS = 500_000, 10_000
 _OF_THE_PAGE = 300_000  # scores, scripts
-_SCRIPTS = (
-    *("unpack.js", "dom.js", "colours.js", "maps.js", "matrices.js", "gl.js", "cloud.js"),
-    *("scores.js", "key.js"),
-)
+_MAPS: Mapping[str, type[np.uint8] | type[np.uint16]] = {
+    "depth": np.uint16,
+    "depth_filled": np.uint16,
+    "depth_full": np.uint16,
+    "confidence": np.uint8,
+    "age": np.uint16,
+    "scene/truth": np.uint16,
+    "scene/sweep": np.uint16,
+    "scene/reason": np.uint8,
+}
+
+
+@dataclass
+class KeyFiles:
+    """One key's files. What cannot be read is noted in ``missing``, a sentence each.
+
+    maps: the folder of depth maps, cloud and scene.
+    about: content of run.yaml, or what compare.json says of the same.
+    methods: method -> its scores, the last one that of the maps.
+    """
+
+    maps: Path
+    about: Mapping[str, Any]
+    methods: Mapping[str, Mapping[str, Any]]
+    missing: list[str] = field(default_factory=list)
+
+    @staticmethod
+    def of_run(folder: Path) -> KeyFiles:
+        """Raises InputError if run.yaml is missing or damaged."""
+        files = KeyFiles(folder, _mapping(read_yaml(folder / "run.yaml")[0]), {})
+        metrics = _mapping(files.read(read_json, "metrics.json"))
+        method = str(files.about.get("method", "run"))
+        files.methods = {**_mapping(metrics.get("baselines")), method: metrics}
+        return files
+
+    @staticmethod
+    def of_comparison(folder: Path) -> KeyFiles:
+        """Raises InputError if compare.json is missing or damaged."""
+        about = _mapping(read_json(folder / "compare.json"))
+        methods = {str(m): _mapping(s) for m, s in _mapping(about.get("methods")).items()}
+        if not methods:
+            raise InputError(f"{folder}/compare.json: names no methods; compare the key again")
+        return KeyFiles(folder / "compare", about, methods)
+
+    def read(self, read: Callable[[Path], T], name: str, optional: bool = False) -> T | None:
+        """Return the content of a file, None if it is damaged or missing. optional: files may be
+        missing without a note."""
+        path = self.maps / name
+        if optional and not path.is_file():
+            return None
+        try:
+            return read(path)
+        except InputError as error:
+            self.missing.append(str(error).replace(f"{self.maps}/", ""))
+            return None
+
+    def camera(self, name: str) -> dict[str, NDArray[Any]]:
+        """Return kind -> (H,W) as stored: maps of the run and of its scene, and by method the
+        measured depth of the baselines."""
+        maps: dict[str, NDArray[Any]] = {}
+        of_methods = {f"scene/{method}": np.uint16 for method in self.methods}
+        for place, bits in {**_MAPS, **of_methods}.items():
+            stored = partial(read_stored, kind=bits, what="a map")
+            image = self.read(stored, f"{place}/{name}.png", optional=True)
+            kind = place.removeprefix("scene/")
+            if image is not None and maps and image.shape != next(iter(maps.values())).shape:
+                self.missing.append(f"{kind}/{name}.png: not as large as the others; left out")
+            elif image is not None:
+                maps[kind] = image
+        return maps
+
+    def image(self, name: str) -> bytes | None:
+        """Return the JPEG of a map's image, None if there is none."""
+
+        def jpeg(path: Path) -> bytes:
+            decode_image(data := read_bytes(path), path)
+            return data
+
+        return self.read(jpeg, f"scene/image/{name}.jpg", optional=True)
+
+
+def _mapping(value: Any) -> Mapping[str, Any]:
+    """Return a mapping from a file, an empty one for anything else."""
+    return value if isinstance(value, dict) else {}
 
 
 def key_page(files: KeyFiles, folder: str) -> bytes:
@@ -34,48 +124,52 @@ def key_page(files: KeyFiles, folder: str) -> bytes:
     that are too many are thinned, and the page says it. Raises InputError if there is neither a
     depth map nor a cloud.
     """
-    scene = files.scene()
-    cameras, blobs = _cameras(files, mapping(scene.get("views")))
-    stored = files.cloud()
+    scene = files.read(read_scene, "scene/scene.json", optional=True)
+    views, sweeps = (scene.table["views"], scene.table["sweeps"]) if scene else ({}, [])
+    focal_px = {name: view.camera.focal_px for name, view in (scene.views if scene else {}).items()}
+    cameras, blobs = _cameras(files, focal_px)
+    stored = files.read(read_cloud, "cloud.laz")
     if not cameras and stored is None:
         raise InputError(f"{files.maps}: no depth map and no cloud in it that can be read")
+    tracks = files.read(read_tracks, "movers.json", optional=True) or []
+    tracks.sort(key=lambda track: -int(track.num_points.sum()))
     about, methods = files.about, list(files.methods)
-    sweeps = _sweeps(scene)
-    movers = [_mover(track, about.get("key")) for track in files.tracks()]
     key, data = about.get("key"), str(about.get("data"))
     name = data.rstrip("/").rpartition("/")[2] or data
-    compared = not folder
-    title = f"{name}, key {key}" + (f": {', '.join(methods)}" if compared else "")
     page = {
-        "title": title,
         "subtitle": f"{name}, key {key}",
         "footer": f"densify {__version__}; this file needs nothing but itself.",
         "folder": shlex.quote(folder) if folder else "",
         "key": key,
-        "method": methods[-1] if methods else "",
+        "method": methods[-1],
         "methods": files.methods,
         "cameras": cameras,
-        "views": mapping(scene.get("views")),
+        "views": views,
         "sweeps": sweeps,
-        "movers": movers,
-        "cloud": _cloud(blobs, stored, sweeps, movers) if stored is not None else None,
+        "movers": [_mover(track, key) for track in tracks],
+        "cloud": None,
         "about": {"stages": about.get("stages")},
         "warnings": [str(w) for w in about.get("warnings") or ()],
         "missing": files.missing,
     }
-    return page_file("key.html", _SCRIPTS, title, page, blobs)
+    if stored is not None and len(stored.points):
+        instances = [track.instance for track in tracks]
+        page["cloud"] = _cloud(blobs, stored, [sweep["frame"] for sweep in sweeps], instances)
+    title = f"{name}, key {key}" + ("" if folder else f": {', '.join(methods)}")
+    return page_file(title, page, blobs)
 
 
-def _cameras(files: KeyFiles, views: Mapping[str, Any]) -> tuple[dict[str, Any], Blobs]:
+def _cameras(files: KeyFiles, focal_px: Mapping[str, float]) -> tuple[dict[str, Any], Blobs]:
     """Return all cameras, with as many of their pixels as there is room for."""
-    loaded = {name: (files.camera(name), files.image(name)) for name in files.names()}
-    loaded = {name: some for name, some in loaded.items() if some[0]}
+    names = sorted({*map_names(files.maps / "depth"), *map_names(files.maps / "depth_filled")})
+    loaded = {name: (files.camera(name), files.image(name)) for name in names}
     every = 1
     while True:
         blobs = Blobs()
         cameras = {
-            name: packed_camera(blobs, maps, jpeg, mapping(views.get(name)), every)
+            name: packed_camera(blobs, maps, jpeg, focal_px.get(name), every)
             for name, (maps, jpeg) in loaded.items()
+            if maps
         }
         if blobs.num_bytes <= _MOST_FOR_MAPS or every == _COARSEST:
             return cameras, blobs
@@ -83,12 +177,9 @@ def _cameras(files: KeyFiles, views: Mapping[str, Any]) -> tuple[dict[str, Any],
 
 
 def _cloud(
-    blobs: Blobs, stored: StoredCloud, sweeps: list[dict[str, Any]], movers: list[dict[str, Any]]
-) -> dict[str, Any] | None:
-    """Return the cloud, with as many of its points as there is room for. None if it is empty."""
-    if not len(stored.points):
-        return None
-    frames, instances = [s["frame"] for s in sweeps], [m["instance"] for m in movers]
+    blobs: Blobs, stored: StoredCloud, frames: list[int], instances: list[int]
+) -> dict[str, Any]:
+    """Return the cloud, with as many of its points as there is room for."""
     room, most = MOST_BYTES - _OF_THE_PAGE - blobs.num_bytes, _MOST_POINTS
     while True:
         own = Blobs(first=len(blobs.texts))
@@ -99,14 +190,8 @@ def _cloud(
         most = max(_FEWEST_POINTS, int(0.95 * most * room / own.num_bytes))
 
 
-def _sweeps(scene: Mapping[str, Any]) -> list[dict[str, Any]]:
-    sweeps = scene.get("sweeps")
-    is_whole = isinstance(sweeps, list) and all("frame" in mapping(sweep) for sweep in sweeps)
-    return list(sweeps) if is_whole and sweeps else []
-
-
 def _mover(track: ObjectTrack, key: Any) -> dict[str, Any]:
-    at = track.frames.index(key) if key in track.frames else len(track.frames) // 2
+    at = track.frames.index(key)
     places_m = track.T_key_object[:, :3, 3]
     path = zip(track.frames, places_m, strict=True)
     return {

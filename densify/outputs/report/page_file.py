@@ -22,16 +22,29 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from densify.geometry.types import Bool, Float, Int
+from densify.outputs.cloud_laz import StoredCloud
+from densify.outputs.depth_png import encode_jpeg
 from densify.outputs.plain import plain
+from densify.readers.decoded_files import decode_image
 
+_SCRIPTS = (
+    *("unpack.js", "dom.js", "colours.js", "maps.js", "matrices.js", "gl.js", "cloud.js"),
+    *("scores.js", "key.js"),
+)
 _COLOUR_MAPS = {
     "viridis": cv2.COLORMAP_VIRIDIS,
     "cividis": cv2.COLORMAP_CIVIDIS,
     "inferno": cv2.COLORMAP_INFERNO,
     "turbo": cv2.COLORMAP_TURBO,
 }
-_NOT_IN_SCRIPT = {"<": "\\u003c", ">": "\\u003e", "&": "\\u0026", "\u2028": "\\u2028"}
-_TRIAL_LEVEL, _LEVEL = 1, 7
+_NOT_OF_METHODS = {"depth", "depth_filled", "confidence", "age", "sweep", "reason", "truth"}
+_TRIAL_LEVEL, _LEVEL, _JPEG_QUALITY = 1, 7, 85
+_LEVELS = 65535
+_MOST_DISPLACED_M = 65.0
+_CONFIDENCE_STEPS = 31
+_GRAY = 50, 190  # reflectance 0 and 1, where no camera observed the point
+_NEAR_M, _MOVING_WEIGHT = 4.0, 100.0
 
 
 class Blobs:
@@ -51,12 +64,13 @@ class Blobs:
         """Size of all texts."""
         return sum(map(len, self.texts.values()))
 
-    def add(self, array: NDArray[Any]) -> Mapping[str, Any]:
-        """Pack an unsigned array (N,) or (H,W) of 8, 16 or 32 bits, and return what the page needs
-        to unpack it.
+    def add(self, array: NDArray[Any]) -> dict[str, Any]:
+        """Pack whole numbers (N,) or (H,W), 0 or more and below 2^32, in 8, 16 or 32 bits, and
+        return what the page needs to unpack them.
 
         Values are stored as they are or as differences along the last axis, whichever is smaller.
         """
+        array = array.astype(np.min_scalar_type(int(array.max(initial=0))))
         steps = np.diff(array, axis=-1, prepend=array.dtype.type(0))
         plain_size, step_size = (len(_deflated(v, _TRIAL_LEVEL)) for v in (array, steps))
         is_delta = step_size < plain_size
@@ -67,7 +81,7 @@ class Blobs:
             "delta": is_delta,
         }
 
-    def add_file(self, data: bytes, mime: str) -> Mapping[str, Any]:
+    def add_file(self, data: bytes, mime: str) -> dict[str, Any]:
         """Keep an image file as it is."""
         return {"blob": self._keep(data), "mime": mime}
 
@@ -83,16 +97,138 @@ def _deflated(array: NDArray[Any], level: int) -> bytes:
     return zlib.compress(planes.tobytes(), level)
 
 
-def page_file(
-    template: str, scripts: Sequence[str], title: str, data: Mapping[str, Any], blobs: Blobs
-) -> bytes:
+def packed_camera(
+    blobs: Blobs,
+    maps: Mapping[str, NDArray[Any]],
+    jpeg: bytes | None,
+    focal_px: float | None,
+    every: int,
+) -> dict[str, Any]:
+    """Return a camera's entry of the page.
+
+    maps: kind -> (H,W) as stored, see `outputs.report.key_page.KeyFiles.camera`.
+    jpeg: its image. every: 2 keeps every second pixel of every second row.
+
+    Measured, source sweep and age are one map: ``source`` numbers the rows of ``sources``, which
+    are [row of the sweep + 1, age in ms + 1, measured 0 or 1], 0 where unknown.
+    """
+    height, width = next(iter(maps.values())).shape
+    nothing = np.zeros((height, width), np.uint16)
+    whole = {kind: maps.get(kind, nothing) for kind in ("depth", "depth_filled", "sweep", "age")}
+    small = {kind: image[::every, ::every] for kind, image in {**maps, **whole}.items()}
+    measured = small["depth"] > 0
+    codes = (small["sweep"].astype(np.int64) << 17) | (small["age"].astype(np.int64) << 1)
+    known, source = np.unique(codes | measured, return_inverse=True)
+    entry: dict[str, Any] = {
+        "size_px": [width, height],
+        "every": every,
+        "focal_px": focal_px,
+        "filled": blobs.add(np.where(measured, small["depth"], small["depth_filled"])),
+        "source": blobs.add(source.reshape(codes.shape)),
+        "sources": np.stack([known >> 17, (known >> 1) & 0xFFFF, known & 1], axis=1),
+        "density": {
+            "measured": np.mean(whole["depth"] > 0),
+            "filled": np.mean(whole["depth_filled"] > 0),
+        },
+        "others": {k: blobs.add(m) for k, m in small.items() if k not in _NOT_OF_METHODS},
+    }
+    entry |= {k: blobs.add(small[k]) for k in ("confidence", "reason", "truth") if k in small}
+    if jpeg is not None:
+        if every > 1:
+            rgb = decode_image(jpeg, "image")[::every, ::every, ::-1]
+            jpeg = encode_jpeg(rgb, _JPEG_QUALITY)
+        entry["image"] = blobs.add_file(jpeg, "image/jpeg")
+    return entry
+
+
+def packed_cloud(
+    blobs: Blobs,
+    cloud: StoredCloud,
+    frames: Sequence[int],
+    instances: Sequence[int],
+    most_points: int,
+) -> dict[str, Any]:
+    """Return the cloud's entry of the page: the points of `thinned`, moving ones first, each part
+    in space order. Positions are 16-bit numbers in a box.
+
+    frames: the sweeps that ``sweep`` numbers. instances: the tracked objects; ``mover`` is 0 of
+    static points, 1 of moving points without a track, 2 and up of these. ``displaced``, metres
+    beyond the rigid alignment, is of moving points alone, in ``displaced_step_m`` plus 32768.
+    """
+    rows = thinned(cloud.points, cloud.moving, most_points)
+    points = cloud.points[rows]
+    low = points.min(axis=0, initial=0.0)
+    step_m = float(max((points - low).max(initial=0.0), 1e-3) / _LEVELS)
+    places = np.rint((points - low) / step_m).astype(np.int64)
+    order = np.lexsort((_space_code(places), ~cloud.moving[rows]))
+    chosen, places = cloud.select(rows[order]), places[order]
+    num_moving = int(chosen.moving.sum())
+    movers = _numbers(chosen.instance, [-1, *instances]) + 1
+    displaced = np.clip(chosen.displacement[:num_moving], -_MOST_DISPLACED_M, _MOST_DISPLACED_M)
+    displaced_step_m = max(float(np.abs(displaced).max(initial=0)) / 32767, 1e-4)
+    displaced = np.rint(displaced / displaced_step_m) + 32768
+    return {
+        "num_points": len(rows),
+        "num_all": len(cloud.points),
+        "num_moving": num_moving,
+        "low_m": low,
+        "step_m": step_m,
+        "places": [blobs.add(column) for column in places.T],
+        "rgb": [blobs.add(column) for column in _colours(chosen).T],
+        "sweep": blobs.add(_numbers(chosen.frame, frames)),
+        "mover": blobs.add(np.where(chosen.moving, movers, 0)),
+        "confidence": blobs.add(np.rint(_CONFIDENCE_STEPS * chosen.confidence)),
+        "confidence_steps": _CONFIDENCE_STEPS,
+        "displaced": [blobs.add(column) for column in displaced.T],
+        "displaced_step_m": displaced_step_m,
+    }
+
+
+def thinned(points: Float, moving: Bool, most: int) -> Int:
+    """Return rows (K,) of at most so many points, ascending, chosen at random with a fixed seed.
+
+    points: (N,3) key frame. moving: (N,). A point counts by its squared distance, which makes the
+    rest about as dense in angle everywhere, and moving points count more.
+    """
+    if len(points) <= most:
+        return np.arange(len(points))
+    weight = np.maximum((points**2).sum(axis=1), _NEAR_M**2)
+    weight[moving] *= _MOVING_WEIGHT
+    order = np.argsort(np.random.default_rng(0).exponential(size=len(points)) / weight)
+    return np.sort(order[:most])
+
+
+def _space_code(levels: Int) -> Int:
+    """Return numbers by which (N,3) quantised positions follow their neighbours (Morton, 1966),
+    which packs well."""
+    code = np.zeros(len(levels), np.int64)
+    for bit in range(16):
+        for axis in range(3):
+            code |= ((levels[:, axis] >> bit) & 1) << (3 * bit + axis)
+    return code
+
+
+def _colours(cloud: StoredCloud) -> NDArray[np.uint8]:
+    """Return (N,3) in 64 levels, gray by reflectance where no camera observed the point."""
+    dark, bright = _GRAY
+    gray = dark + (bright - dark) * np.sqrt(np.clip(cloud.intensity, 0, 1))
+    observed = cloud.rgb.any(axis=1, keepdims=True)
+    return (np.where(observed, cloud.rgb, gray[:, None]).astype(np.uint8) >> 2).astype(np.uint8)
+
+
+def _numbers(values: NDArray[np.int32], known: Sequence[int]) -> Int:
+    """Return the place of each value (N,) in a list, 0 for others."""
+    number_of = {value: number for number, value in enumerate(known)}
+    return np.array([number_of.get(value, 0) for value in values.tolist()], np.int64)
+
+
+def page_file(title: str, data: Mapping[str, Any], blobs: Blobs) -> bytes:
     """Return a whole page.
 
-    template, scripts: files of the folder ``page``; the scripts become one, in this order.
     title: any text.
     data: plain numbers, texts, lists and mappings, ``page`` in the script.
     """
-    script, style = "\n".join(_source(name) for name in scripts), _source("page.css")
+    script, style = "\n".join(map(_source, _SCRIPTS)), _source("page.css")
     policy = (
         f"default-src 'none'; script-src {_hash(script)}; style-src {_hash(style)}; "
         f"img-src data: blob:; base-uri 'none'; form-action 'none'"
@@ -108,7 +244,7 @@ def page_file(
             for name, text in blobs.texts.items()
         ),
     }
-    filled = re.sub(r"\{\{(\w+)\}\}", lambda match: parts[match[1]], _source(template))
+    filled = re.sub(r"\{\{(\w+)\}\}", lambda match: parts[match[1]], _source("key.html"))
     return filled.encode("utf-8", "backslashreplace")
 
 
@@ -124,7 +260,7 @@ def _hash(text: str) -> str:
 def _json(value: Mapping[str, Any]) -> str:
     """Return JSON that cannot end the script element it is in."""
     text = json.dumps(plain(value), ensure_ascii=False, allow_nan=False, separators=(",", ":"))
-    return re.sub("[<>&\u2028]", lambda match: _NOT_IN_SCRIPT[match[0]], text)
+    return re.sub("[<>&\u2028]", lambda match: f"\\u{ord(match[0]):04x}", text)
 
 
 def _palettes() -> dict[str, str]:

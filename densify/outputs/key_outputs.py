@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The outputs that are tables, for programs: metrics.json, movers.json, run.yaml, scene.json.
+"""The outputs of a key: depth maps, moving objects, metrics.json, movers.json, run.yaml, scene/.
 
 metrics.json. compare.json holds the fields from ``frames`` on, by method, under ``methods``::
 
@@ -46,8 +46,8 @@ scene/, for pages, viewers and other tools::
 from __future__ import annotations
 
 import platform
-from collections.abc import Sequence
-from dataclasses import asdict
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -56,13 +56,19 @@ import numpy as np
 import yaml
 
 from densify import __version__
-from densify.geometry.types import CameraView, ObjectTrack, Result
+from densify.geometry.types import ObjectTrack, Result
 from densify.outputs.atomic import write_file
-from densify.outputs.context import Context
-from densify.outputs.depth_png import write_depth_png
-from densify.outputs.map_outputs import map_path
+from densify.outputs.cloud_laz import write_cloud
+from densify.outputs.depth_png import (
+    encode_jpeg,
+    encode_png,
+    map_path,
+    write_age_png,
+    write_confidence_png,
+    write_depth_png,
+    write_flow_png,
+)
 from densify.outputs.plain import plain, write_json
-from densify.outputs.png import encode_jpeg, encode_png
 
 SCHEMA_VERSION = 1
 """Version of each JSON file; grows when a field changes its meaning or goes."""
@@ -70,6 +76,62 @@ _PACKAGES = (
     *("numpy", "scipy", "torch", "embreex", "kiss-icp", "small-gicp", "opencv-python-headless"),
     *("laspy", "lazrs", "PyYAML"),
 )
+
+
+@dataclass(frozen=True)
+class Context:
+    """What an output gets beside the result. config: the merged configuration as plain mappings, by
+    section. data: the recording, as the user named it."""
+
+    config: Mapping[str, Any]
+    data: str
+
+
+def write_depth(result: Result, context: Context, folder: Path) -> None:
+    """Write ``depth``, ``depth_filled``, ``confidence`` and ``age``.
+
+    Age is the time between the camera's exposure and the sweep that measured the pixel. A filled
+    pixel has the age of the nearest measured pixel. Raises ValueError for maps without ages.
+    """
+    for camera, depth in result.depth.items():
+        if depth.age_s is None:
+            raise ValueError(f"depth map of {camera}: expected ages (with_ages)")
+        write_depth_png(map_path(folder, "depth", camera), depth.depth_m)
+        write_depth_png(map_path(folder, "depth_filled", camera), depth.filled_m)
+        path = map_path(folder, "confidence", camera)
+        write_confidence_png(path, depth.confidence, depth.filled_m)
+        write_age_png(map_path(folder, "age", camera), depth.age_s, depth.filled_m)
+
+
+def write_full(result: Result, context: Context, folder: Path) -> None:
+    """Write ``depth_full``, depth completed with the user's prior, and ``confidence_full``, which
+    is at most 0.2 where the depth is the prior's."""
+    for camera, full in result.full.items():
+        write_depth_png(map_path(folder, "depth_full", camera), full.depth_m)
+        path = map_path(folder, "confidence_full", camera)
+        write_confidence_png(path, full.confidence, full.depth_m)
+
+
+def write_optical_flow(result: Result, context: Context, folder: Path) -> None:
+    """Write ``optical_flow/previous`` and ``optical_flow/next``, if they were asked for."""
+    for camera, flows in result.optical_flow.items():
+        for other, flow_px in flows.items():
+            write_flow_png(map_path(folder / "optical_flow", other, camera), flow_px)
+
+
+def write_cloud_laz(result: Result, context: Context, folder: Path) -> None:
+    """Write ``cloud.laz``."""
+    write_cloud(folder / "cloud.laz", result.cloud, result.stamp_ns)
+
+
+def write_movers(result: Result, context: Context, folder: Path) -> None:
+    """Write cloud and depth of each object, if they are separated: ``movers/0007/`` for instance 7,
+    ``movers/others/`` for moving points of no object."""
+    for instance, mover in result.movers.items():
+        place = folder / "movers" / (f"{instance:04d}" if instance >= 0 else "others")
+        for name, maps in mover.depth.items():
+            write_depth_png(map_path(place, "depth", name), maps.depth_m)
+        write_cloud(place / "cloud.laz", mover.cloud, result.stamp_ns)
 
 
 def write_metrics(result: Result, context: Context, folder: Path) -> None:
@@ -98,17 +160,13 @@ def write_tracks(result: Result, context: Context, folder: Path) -> None:
 def tracks_table(key: int, tracks: Sequence[ObjectTrack]) -> dict[str, Any]:
     """Return the content of movers.json."""
     names = ("stamp_ns", "num_points", "T_key_object", "velocity_m_s")
-    objects = [
-        {
-            "instance": track.instance,
-            "size_m": track.size_m,
-            "poses": [
-                {"frame": frame, **{name: getattr(track, name)[i] for name in names}}
-                for i, frame in enumerate(track.frames)
-            ],
-        }
-        for track in tracks
-    ]
+    objects = []
+    for track in tracks:
+        poses = [
+            {"frame": frame, **{name: getattr(track, name)[i] for name in names}}
+            for i, frame in enumerate(track.frames)
+        ]
+        objects.append({"instance": track.instance, "size_m": track.size_m, "poses": poses})
     return {"schema_version": SCHEMA_VERSION, "key": key, "objects": objects}
 
 
@@ -118,6 +176,7 @@ def write_run_yaml(result: Result, context: Context, folder: Path) -> None:
     record = {
         "data": context.data,
         "key": result.key,
+        "stamp_ns": result.stamp_ns,
         "method": result.method,
         "frames": result.frames,
         "far_frames": result.far_frames,
@@ -169,13 +228,12 @@ def write_scene(result: Result, context: Context, folder: Path) -> None:
     if not result.T_key_lidar:
         return
     place = folder / "scene"
-    place.mkdir()
     sweeps = _sweeps(result)
     row_of = {sweep["frame"]: row for row, sweep in enumerate(sweeps)}
     for name, maps in result.depth.items():
-        if name in context.images:
+        if name in result.images:
             path = map_path(place, "image", name, ".jpg")
-            write_file(path, encode_jpeg(context.images[name]))
+            write_file(path, encode_jpeg(result.images[name]))
         for method, baseline in result.baselines.items():
             write_depth_png(map_path(place, method, name), baseline.depth[name].depth_m)
         if name in result.truth_m:
@@ -189,7 +247,10 @@ def write_scene(result: Result, context: Context, folder: Path) -> None:
         "schema_version": SCHEMA_VERSION,
         "key": result.key,
         "sweeps": sweeps,
-        "views": {name: _view(view) for name, view in result.views.items()},
+        "views": {
+            name: {**vars(view.camera), **{n: v for n, v in vars(view).items() if n != "camera"}}
+            for name, view in result.views.items()
+        },
     }
     write_json(place / "scene.json", table)
 
@@ -208,7 +269,3 @@ def _sweeps(result: Result) -> list[dict[str, Any]]:
         }
         for frame in sorted({*since_s, *result.T_key_lidar})
     ]
-
-
-def _view(view: CameraView) -> dict[str, Any]:
-    return {**vars(view.camera), **{n: v for n, v in vars(view).items() if n != "camera"}}

@@ -1,0 +1,127 @@
+# SPDX-License-Identifier: MIT
+"""Forms of maps (npy, exr, kitti) and of the cloud (ply, pcd)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from densify.config.errors import InputError
+from densify.geometry.arrays import table
+from densify.geometry.types import Float32
+from densify.outputs.atomic import write_file
+from densify.outputs.depth_png import encode_png, map_path, metres
+from densify.outputs.export.finished_run import FinishedRun
+from densify.outputs.kitti_tree import drive_folder, split_of
+from densify.readers.decoded_files import decode_image
+from densify.readers.extras import needed
+
+_TREE = {"groundtruth": "depth", "groundtruth_filled": "depth_filled", "confidence": "confidence"}
+_PLY_TYPES = {"f4": "float", "f8": "double", "i4": "int", "u1": "uchar"}
+
+
+def write_npy(run: FinishedRun, folder: Path) -> None:
+    """Write (H,W) float32 arrays: ``depth`` and ``depth_filled`` in metres, 0 none, and
+    ``confidence``, 0 to 1, with a file for each camera."""
+    _write_maps(run, folder, ".npy", lambda path, _, values: np.save(path, values))
+
+
+def write_exr(run: FinishedRun, folder: Path) -> None:
+    """Write the same as OpenEXR files of one 32-bit channel, ``Z`` of depth and ``Y`` of
+    confidence, without loss. Raises InputError without OpenEXR."""
+    library = needed("OpenEXR", "exr", "EXR files")
+    header = {"compression": library.ZIP_COMPRESSION, "type": library.scanlineimage}
+
+    def save(path: Path, kind: str, values: Float32) -> None:
+        channel = "Y" if kind == "confidence" else "Z"
+        library.File(header, {channel: values}).write(str(path))
+
+    _write_maps(run, folder, ".exr", save)
+
+
+def _write_maps(
+    run: FinishedRun, folder: Path, suffix: str, save: Callable[[Path, str, Float32], None]
+) -> None:
+    for camera in run.cameras:
+        maps = run.maps(camera)
+        levels = np.maximum(maps["confidence"].astype(np.float32) - 1, 0)
+        values = {kind: metres(maps[kind]) for kind in ("depth", "depth_filled")}
+        for kind, array in {**values, "confidence": levels / np.float32(254)}.items():
+            path = map_path(folder, kind, camera, suffix)
+            path.parent.mkdir(parents=True, exist_ok=True)
+            save(path, kind, array)
+
+
+def write_kitti(runs: Sequence[FinishedRun], folder: Path) -> None:
+    """Write the tree of KITTI depth completion (`densify.outputs.kitti_tree`):
+    ``SPLIT/DRIVE/proj_depth/KIND/CAMERA/0000000120.png``, and beside proj_depth the image
+    ``CAMERA/data/0000000120.png`` and ``intrinsics/CAMERA/0000000120.txt``, K row by row.
+
+    KIND is groundtruth (measured), groundtruth_filled, confidence, and velodyne_raw, the key sweep
+    alone, where the run has it. Recordings that the benchmark lacks are in train.
+    """
+    for run in runs:
+        name = run.data.rstrip("/").rpartition("/")[2]
+        if not name:
+            raise InputError(f"{run.folder}/run.yaml: data: expected the recording's name")
+        drive = folder / split_of(name) / drive_folder(name)
+        for view in run.cameras:
+            _write_view(run, view, drive)
+
+
+def _write_view(run: FinishedRun, view: str, drive: Path) -> None:
+    camera, _, number = view.partition("/")
+    file, maps = number or f"{run.key:010d}", run.maps(view)
+    for kind, product in _TREE.items():
+        write_file(map_path(drive / "proj_depth" / kind, camera, file), encode_png(maps[product]))
+    sweep = map_path(run.folder / "scene", "none", view)
+    if sweep.is_file():
+        raw = map_path(drive / "proj_depth" / "velodyne_raw", camera, file)
+        write_file(raw, sweep.read_bytes())
+    if (jpeg := run.jpeg(view)) is not None:
+        write_file(map_path(drive / camera, "data", file), encode_png(decode_image(jpeg, view)))
+    if view in run.views:
+        numbers = " ".join(f"{value:.6f}" for value in run.views[view].camera.K.ravel())
+        path = map_path(drive / "intrinsics", camera, file, ".txt")
+        write_file(path, f"{numbers}\n".encode())
+
+
+def write_ply(run: FinishedRun, folder: Path) -> None:
+    """Write ``cloud.ply`` with every column of cloud.laz (`StoredCloud.columns`)."""
+    save_ply(folder / "cloud.ply", run.cloud().columns())
+
+
+def save_ply(path: Path, columns: Mapping[str, NDArray[Any]]) -> None:
+    """Write vertices as PLY (Turk, 1994), binary, little-endian.
+
+    columns: (N,) float32, float64, int32 or uint8 each.
+    """
+    rows = table(columns)
+    rows = rows.astype(rows.dtype.newbyteorder("<"), copy=False)
+    kinds = {name: _PLY_TYPES[rows.dtype[name].str.lstrip("<|")] for name in columns}
+    header = [
+        "ply",
+        "format binary_little_endian 1.0",
+        "comment densify, metres",
+        f"element vertex {len(rows)}",
+        *(f"property {kind} {name}" for name, kind in kinds.items()),
+        "end_header",
+    ]
+    write_file(path, "\n".join(header).encode("ascii") + b"\n" + rows.tobytes())
+
+
+def write_pcd(run: FinishedRun, folder: Path) -> None:
+    """Write ``cloud.pcd``, PCD 0.7 of the Point Cloud Library, binary, with the same columns. The
+    colour is the column ``rgb``, three bytes packed into a float."""
+    from pypcd4 import Encoding, PointCloud
+
+    columns = run.cloud().columns()
+    rgb = np.stack([columns.pop(name) for name in ("red", "green", "blue")], axis=1)
+    columns["rgb"] = PointCloud.encode_rgb(rgb)
+    kinds = [column.dtype.type for column in columns.values()]
+    cloud = PointCloud.from_points(list(columns.values()), list(columns), kinds)
+    cloud.save(folder / "cloud.pcd", Encoding.BINARY)
