@@ -3,21 +3,23 @@
 
 from __future__ import annotations
 
+from collections import Counter
+
 import numpy as np
 import pytest
 
 from densify.config.errors import InputError
 from densify.geometry.poses import inverse, transform
 from densify.readers.street import Street
-from densify.street.actors import TRAILER_WHEELBASE_M
-from densify.street.lidar import Mounted, scan
+from densify.street.actors import SPAN_S, WHEELBASE_M
+from densify.street.lidar import scan
 from densify.street.materials import GLASS_PASSES, LASER_PASSES, Material
 from densify.street.mesh import Mesh, box
-from densify.street.motion import Driving, Poses, Rectangles, Still, Towed, overlap
+from densify.street.motion import Driving, Poses, Still, Towed
 from densify.street.sensors import SENSORS, firings
 from densify.street.simulator import Simulator, build_scene, seconds
 from densify.street.terrain import Curve, Lane, Road, Speed, Terrain, polyline
-from densify.street.traffic import EGO_BOX, SPAN_S, Scene
+from densify.street.traffic import EGO_BOX, Scene
 from densify.street.world import Body, Rays, World
 
 KEY = 120
@@ -88,31 +90,6 @@ def test_frames_made_side_by_side_are_those_made_one_by_one(tmp_path, monkeypatc
         for name, column in vars(street.returns(frame)).items():
             made = getattr(expected, name)
             assert column is made is None or column.tobytes() == made.tobytes()
-
-
-def test_raw_sweep_is_distorted_and_truth_undoes_it(static):
-    frame = 60  # in the bend
-    world, raw = static.simulator.scene.world, static[frame].points
-    truth = static.truth.sweep(frame)
-    rigid, straight = (transform(truth.T_world_lidar, p) for p in (raw, truth.points))
-    mesh = world.bodies[0].mesh
-    corners = mesh.vertices[mesh.triangles[np.isin(mesh.material, (5, 6))]]
-    sides = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-    area = np.linalg.norm(np.cross(*sides), axis=1) / 2
-    large = (area > 12) & (np.linalg.norm(corners[:, 0] - truth.T_world_lidar[:3, 3], axis=1) < 40)
-    moved, stayed = [], []
-    for a, u, v in zip(corners[large, 0], sides[0][large], sides[1][large], strict=True):
-        normal = np.cross(u, v) / np.linalg.norm(np.cross(u, v))
-        inside = np.linalg.solve(np.stack([u, v, normal], axis=1), (straight - a).T).T
-        on = (inside[:, :2] > 0.05).all(1) & (inside[:, :2].sum(1) < 0.95)
-        on &= np.abs(inside[:, 2]) < 0.6
-        if on.sum() > 150:
-            stayed.append(np.median(np.abs(inside[on, 2])))
-            moved.append(np.median(np.abs((rigid[on] - a) @ normal)))
-    assert len(stayed) >= 3
-    assert np.median(stayed) < 0.025
-    assert max(stayed) < 0.06  # window frames stand out by 5 cm
-    assert max(moved) > 0.15
 
 
 def test_nothing_moves_in_the_static_street_and_parked_cars_never_do(street, static):
@@ -197,19 +174,6 @@ def test_sweeps_are_as_large_as_a_real_one(street):
     assert len(firings(SENSORS["vlp16"], 0.0, PERIOD_NS).offset_ns) == 16 * 1800
 
 
-@pytest.mark.parametrize(
-    ("fixture", "first"),
-    [
-        ("street", [[-62.11102, 0, 2.168964], [-61.99274, 0.002921, 1.803921]]),
-        ("crossing", [[-3.699342, 0, -1.725032], [4.21622, 0, -1.716056]]),
-        ("highway", [[-35.495106, 0.069695, -1.860223], [-20.25953, 0.044199, -1.772483]]),
-    ],
-)
-def test_sweeps_are_those_that_were_always_made(request, fixture, first):
-    points = request.getfixturevalue(fixture)[KEY].points
-    np.testing.assert_allclose(points[:2], first, atol=1e-4)
-
-
 def _bytes(street: Street, frame: int) -> tuple[bytes, ...]:
     sweep, truth = street[frame], street.truth.sweep(frame)
     return (
@@ -248,7 +212,7 @@ def _standing(terrain: Terrain | None = None) -> Driving:
 
 
 def test_ranges_have_the_sensors_noise_and_some_pulses_are_lost():
-    sensor = Mounted(SENSORS["hdl64"], PERIOD_NS)
+    sensor = SENSORS["hdl64"]
     returns = scan(_room(15.0), _standing(), sensor, 0.0, np.random.default_rng(0))
     world = returns.points.astype(float) + [0, 0, 1.73]
     off_wall = 15.0 - np.abs(world).max(axis=1)
@@ -256,7 +220,7 @@ def test_ranges_have_the_sensors_noise_and_some_pulses_are_lost():
     wall = np.abs(returns.points[:, 2]) < 6  # clear of floor and ceiling
     noise = (off_wall / slant)[wall]
     assert abs(noise.mean()) < 0.002
-    assert abs(noise.std() - sensor.sensor.scanners[0].range_sigma_m) < 0.003
+    assert abs(noise.std() - sensor.scanners[0].range_sigma_m) < 0.003
     fired = 2083 * 64
     assert 0.9 * fired < len(returns.points) < fired
 
@@ -350,29 +314,13 @@ def _check_no_contact(scene: Scene) -> None:
             assert not (along & across).any(), (time, owner[i])
 
 
-def _count(scene: Scene) -> dict[str, int]:
-    names = [actor.name for actor in scene.actors]
-    return {name: names.count(name) for name in ("car", "truck", "cyclist", "walker")}
-
-
-def _check_cast(preset: str, scene: Scene) -> None:
-    count = _count(scene)
-    assert count["car"] >= 7 and count["truck"] >= 1
-    if preset != "highway":
-        assert count["cyclist"] >= 1 and count["walker"] >= 3
-
-
 def test_nobody_touches_anybody(street, crossing, highway):
-    for preset, sequence in (("street", street), ("crossing", crossing), ("highway", highway)):
-        _check_cast(preset, sequence.simulator.scene)
-        _check_no_contact(sequence.simulator.scene)
-
-
-@pytest.mark.parametrize(("preset", "seed"), [("crossing", 4)])
-def test_nobody_touches_anybody_in_other_scenes(preset, seed):
-    scene = build_scene(preset, seed)
-    _check_cast(preset, scene)
-    _check_no_contact(scene)
+    scenes = [sequence.simulator.scene for sequence in (street, crossing, highway)]
+    for scene in (*scenes, build_scene("crossing", 4)):
+        count = Counter(actor.name for actor in scene.actors)
+        assert count["car"] >= 7 and count["truck"] >= 1
+        assert scene is scenes[2] or (count["cyclist"] >= 1 and count["walker"] >= 3)
+        _check_no_contact(scene)
 
 
 def test_presets_seeds_and_frames_differ(street, static, highway):
@@ -477,7 +425,7 @@ def test_truck_is_16_m_long_and_its_trailer_follows_without_slip(street):
     assert abs(np.linalg.norm(nose - tail, axis=1)[0] - 16) < 0.5
     bent = np.degrees(np.arccos((front.rotation[:, :, 0] * back.rotation[:, :, 0]).sum(1)))
     assert bent.max() > 20
-    axle = back.apply(np.tile([-TRAILER_WHEELBASE_M / 2, 0, 0], (len(times), 1)))
+    axle = back.apply(np.tile([-WHEELBASE_M["trailer"] / 2, 0, 0], (len(times), 1)))
     slip = np.einsum("ni,ni->n", np.gradient(axle, 0.05, axis=0), back.rotation[:, :, 1])
     assert np.abs(slip[2:-2]).max() < 0.05
 
@@ -525,34 +473,6 @@ def test_curves_run_by_arc_length():
     station, offset = Road(circle, 1, 1).coordinates(circle(s) + 3 * circle.normal(s))
     np.testing.assert_allclose(station, s, atol=2e-3)
     np.testing.assert_allclose(offset, 3.0, atol=1e-3)
-
-
-def test_overlap_of_rectangles_is_that_of_their_points():
-    rng = np.random.default_rng(0)
-    grid = np.stack(np.meshgrid(*[np.linspace(-1, 1, 41)] * 2), -1).reshape(-1, 2)
-
-    def axes(r):
-        return np.stack([r.forward, [-r.forward[1], r.forward[0]]])
-
-    def share_a_point(a, b, grown_m):
-        for p, q in ((a, b), (b, a)):
-            points = p.centre + (grid * p.half_m) @ axes(p)
-            if (np.abs((points - q.centre) @ axes(q).T) <= q.half_m + grown_m).all(1).any():
-                return True
-        return False
-
-    seen = []
-    for _ in range(200):
-        pair = []
-        for _ in range(2):
-            angle = rng.uniform(0, 2 * np.pi)
-            forward = np.array([np.cos(angle), np.sin(angle)])
-            pair.append(Rectangles(rng.uniform(-2, 2, 2), forward, rng.uniform(0.3, 2, 2)))
-        sure, perhaps = (share_a_point(*pair, grown_m) for grown_m in (0.0, 0.08))
-        if sure == perhaps:  # else the grid is too coarse to tell
-            assert bool(overlap(*pair)) == sure
-            seen.append(sure)
-    assert 25 < sum(seen) < len(seen) - 25
 
 
 # specifications

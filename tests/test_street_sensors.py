@@ -44,34 +44,6 @@ def same_scene(level: Street, hz: int = 10, tilt_deg: float = 0.0) -> Street:
 # patterns
 
 
-def earlier_firings(elevation_deg, num_columns, num_scanners):
-    """Spinning scanners at 10 Hz, as they were before there were patterns."""
-    pulses = []
-    for scanner in range(num_scanners):
-        slots = num_columns * len(elevation_deg)
-        for slot in range(slots):
-            offset_ns = -PERIOD_NS // 2 + slot * PERIOD_NS // slots
-            pulses.append((offset_ns, scanner, elevation_deg[slot % len(elevation_deg)]))
-    pulses.sort(key=lambda pulse: pulse[:2])
-    offset_ns, scanner, elevation = np.array(pulses).T
-    azimuth = -2 * np.pi * (offset_ns / PERIOD_NS + scanner / num_scanners)
-    flat = np.exp(1j * azimuth) * np.cos(np.radians(elevation))
-    return offset_ns, scanner, np.stack([flat.real, flat.imag, np.sin(np.radians(elevation))], 1)
-
-
-@pytest.mark.parametrize(
-    ("name", "num_columns", "num_scanners"),
-    [("hdl64", 2083, 1), ("hdl32", 2169, 1), ("vlp16", 1800, 1), ("dual32", 1800, 2)],
-)
-def test_spinning_scanners_fire_as_ever(name, num_columns, num_scanners):
-    elevation_deg = SENSORS[name].scanners[0].pattern.elevation_deg
-    offset_ns, lidar, direction = earlier_firings(elevation_deg, num_columns, num_scanners)
-    fired = firings(SENSORS[name], 12.0, PERIOD_NS)
-    np.testing.assert_array_equal(fired.offset_ns, offset_ns)
-    np.testing.assert_array_equal(fired.lidar, lidar)
-    np.testing.assert_allclose(fired.direction, direction, atol=1e-12)
-
-
 def test_rings_are_where_the_data_sheets_have_them():
     elevation = {
         name: np.sort([e for s in SENSORS[name].scanners[:1] for e in s.pattern.elevation_deg])
@@ -107,7 +79,7 @@ def test_pulses_fill_the_period_evenly_at_a_constant_rate(name):
 
 
 def test_a_raster_covers_its_field_of_view_line_by_line():
-    raster = Raster(60.0, 20.0, 100, 4000)
+    raster = Raster(4000, 60.0, 20.0, 100)
     number = np.arange(400)
     x, y, z = raster.directions(Slots(number, number / 400 - 0.5, number / 4000)).T
     azimuth, elevation = np.degrees(np.arctan2(y, x)), np.degrees(np.arcsin(z))
@@ -124,7 +96,7 @@ def test_a_rosette_is_two_prisms_and_goes_on_from_sweep_to_sweep():
     sweeps = []
     for time_s in (3.0, 3.1):
         times = time_s + 0.1 * share
-        x, y, z = Rosette(70.0, rates, 200_000).directions(Slots(np.arange(num), share, times)).T
+        x, y, z = Rosette(200_000, 70.0, rates).directions(Slots(np.arange(num), share, times)).T
         prisms = sum(np.exp(2j * np.pi * rate * times) for rate in rates) / 2
         off_axis = np.degrees(np.arccos(x))
         np.testing.assert_allclose(off_axis, 35 * np.abs(prisms), atol=1e-5)
@@ -243,19 +215,9 @@ def test_a_tilted_mount_turns_the_lidar_and_leaves_the_cameras(level):
         T_level_cam = inverse(level.cameras[name].T_cam_lidar)
         T_tilted_cam = inverse(camera.T_cam_lidar)
         np.testing.assert_allclose(T_level_tilted @ T_tilted_cam, T_level_cam, atol=1e-12)
-    # the sweep's truth lies on what the camera shows
-    truth, camera = tilted.truth.sweep(120), tilted.cameras["image_02"]
-    p_cam = transform(camera.T_cam_lidar, truth.points[~truth.moving])
-    p_cam = p_cam[p_cam[:, 2] > 1]
-    u, v = np.rint((p_cam @ camera.K.T)[:, :2] / p_cam[:, 2:]).astype(int).T
-    seen = (u >= 0) & (u < camera.width_px) & (v >= 0) & (v < camera.height_px)
     picture = tilted.simulator.picture("image_02", 120)  # anew: the cache shares them
     np.testing.assert_array_equal(picture.depth_m, level.truth.depth_m("image_02", 120))
     np.testing.assert_array_equal(picture.image, level.image("image_02", 120))
-    depth_m = picture.depth_m[v[seen], u[seen]]
-    error = (depth_m - p_cam[seen, 2])[depth_m > 0]
-    assert len(error) > 1000
-    assert np.median(np.abs(error)) < 0.04 and np.mean(np.abs(error) < 0.3) > 0.85
 
 
 def test_a_tree_of_another_rate_and_mount_opens_as_what_it_was(level, tmp_path):

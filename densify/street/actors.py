@@ -16,15 +16,13 @@ import numpy as np
 
 from densify.geometry.types import Float
 from densify.street.materials import Material
-from densify.street.mesh import Mesh, Tint, ball, box, boxes, frustum, tube
+from densify.street.mesh import WHITE, Mesh, Tint, ball, box, boxes, frustum, tube
 from densify.street.motion import Driving, Limb, Towed
 from densify.street.world import Body
 
-CAR_WHEELBASE_M = 2.6
-TRACTOR_WHEELBASE_M = 3.4
-TRAILER_WHEELBASE_M = 8.0
-BICYCLE_WHEELBASE_M = 1.05
-WALKER_BASE_M = 0.2
+WHEELBASE_M = {"car": 2.6, "truck": 3.4, "trailer": 8.0, "cyclist": 1.05, "walker": 0.2}
+DURATION_S = 16
+SPAN_S = (-1.0, DURATION_S + 1.0)  # in which poses are asked for
 _KINGPIN_M = -1.2
 _PAINTS: tuple[Tint, ...] = (
     (0.92, 0.92, 0.92), (0.62, 0.64, 0.66), (0.14, 0.14, 0.16), (0.62, 0.10, 0.09),
@@ -50,24 +48,27 @@ def any_cloth(rng: np.random.Generator) -> Tint:
     return (r, g, b)
 
 
-def _wheel(x: float, y: float, radius: float, width: float) -> Mesh:
-    tyre = tube((x, y - width / 2, radius), (x, y + width / 2, radius), radius, Material.RUBBER,
-                num_sides=16)  # fmt: skip
-    rim = tube((x, y - width / 2 - 0.01, radius), (x, y + width / 2 + 0.01, radius), radius * 0.6,
-               Material.METAL, num_sides=12)  # fmt: skip
-    return Mesh.join([tyre, rim])
+def _wheels(xs: Sequence[float], y: float, radius: float, width: float) -> list[Mesh]:
+    """Tyres and rims on both sides of axles at ``xs``."""
+    kinds = ((0.0, 1.0, Material.RUBBER, 16), (0.01, 0.6, Material.METAL, 12))
+    return [
+        tube((x, s * y - width / 2 - out, radius), (x, s * y + width / 2 + out, radius),
+             radius * share, material, num_sides=sides)
+        for x in xs for s in (-1, 1) for out, share, material, sides in kinds
+    ]  # fmt: skip
 
 
-def _both_sides(left: Float, material: Material, tint: Tint = (1.0, 1.0, 1.0)) -> Mesh:
+def _both_sides(left: Float, material: Material, tint: Tint = WHITE) -> Mesh:
     """(K,4,3) quads on the left and their mirror images on the right."""
     right = left * [1.0, -1.0, 1.0]
     return Mesh.quads(np.concatenate([left, right]), material, tint)
 
 
-def _across(profile: Sequence[tuple[float, float, float]], material: Material, tint: Tint) -> Mesh:
+def _across(
+    profile: Sequence[tuple[float, float, float]], material: Material, tint: Tint = WHITE
+) -> Mesh:
     """A sheet across the car through (x, z, half width) lines."""
-    p = np.array(profile)
-    left = np.column_stack([p[:, 0], p[:, 2], p[:, 1]])
+    left = np.array(profile)[:, [0, 2, 1]]
     right = left * [1.0, -1.0, 1.0]
     corners = np.stack([right[:-1], right[1:], left[1:], left[:-1]], axis=1)
     return Mesh.quads(corners, material, tint)
@@ -82,44 +83,35 @@ def car_mesh(paint: Tint, rng: np.random.Generator) -> Mesh:
     cowl, screen, rear_roof = 1.05, 0.35, rear + (0.45 if estate else 0.95)
     deck = rear + (0.08 if estate else 0.45)
     # side panels between the sill and the shoulder line
-    line = [(rear, 0.62), (rear + 0.03, belt), (deck, belt), (cowl, belt), (front - 0.12, 0.74),
-            (front, 0.60)]  # fmt: skip
-    sill = [0.30, 0.24, 0.22, 0.22, 0.26, 0.30]
-    side = [
-        [(x0, wide, s0), (x1, wide, s1), (x1, wide, z1), (x0, wide, z0)]
-        for (x0, z0), (x1, z1), s0, s1 in zip(line[:-1], line[1:], sill[:-1], sill[1:], strict=True)
-    ]
-    shell = [
-        _both_sides(np.array(side), Material.BODYWORK, paint),
-        _across([(front - 0.02, 0.28, wide), (front, 0.60, wide), (front - 0.12, 0.74, wide),
-                 (cowl, belt, wide)], Material.BODYWORK, paint),
-        _across([(deck, belt, wide), (rear + 0.03, belt, wide), (rear, 0.62, wide),
-                 (rear + 0.02, 0.28, wide)], Material.BODYWORK, paint),
+    line = np.array([(rear, 0.62), (rear + 0.03, belt), (deck, belt), (cowl, belt),
+                     (front - 0.12, 0.74), (front, 0.60)])  # fmt: skip
+    sill = line.copy()
+    sill[:, 1] = [0.30, 0.24, 0.22, 0.22, 0.26, 0.30]
+    side = np.stack([sill[:-1], sill[1:], line[1:], line[:-1]], axis=1)
+    # pillars and glass in turn, between shoulder line and roof
+    low, high = (
+        np.array([(x, y, z) for x in (a, a + 0.13 * (-0.35 - a), -0.35, -0.25,
+                                      b - 0.10 * (b + 0.25), b)])
+        for a, b, y, z in ((deck, cowl, wide, belt), (rear_roof, screen, top, roof))
+    )  # fmt: skip
+    band = np.stack([low[:-1], low[1:], high[1:], high[:-1]], axis=1)
+    nose = [(front - 0.02, 0.28, wide), (front, 0.60, wide), (front - 0.12, 0.74, wide),
+            (cowl, belt, wide)]  # fmt: skip
+    tail = [(deck, belt, wide), (rear + 0.03, belt, wide), (rear, 0.62, wide),
+            (rear + 0.02, 0.28, wide)]  # fmt: skip
+    return Mesh.join([
+        _both_sides(np.insert(side, 1, wide, axis=2), Material.BODYWORK, paint),
+        _across(nose, Material.BODYWORK, paint),
+        _across(tail, Material.BODYWORK, paint),
         _across([(rear_roof, roof, top), (screen, roof + 0.01, top)], Material.BODYWORK, paint),
-        _across([(front - 0.02, 0.24, wide), (rear, 0.24, wide)], Material.RUBBER, (1, 1, 1)),
-    ]  # fmt: skip
-    # pillars and glass between shoulder line and roof
-    middle = -0.30
-    base = [(deck, belt), (middle - 0.05, belt), (middle + 0.05, belt), (cowl, belt)]
-    head = [(rear_roof, roof), (middle - 0.05, roof), (middle + 0.05, roof), (screen, roof)]
-    low = [np.array([x, wide, z]) for x, z in base]
-    high = [np.array([x, top, z]) for x, z in head]
-    rear_low, rear_high = (p[0] + (p[1] - p[0]) * 0.13 for p in (low, high))
-    front_low, front_high = (p[3] - (p[3] - p[2]) * 0.10 for p in (low, high))
-    panes = [
-        [rear_low, low[1], high[1], rear_high],
-        [low[2], front_low, front_high, high[2]],
-    ]
-    shell += [_both_sides(np.array([pane]), Material.GLASS) for pane in panes]
-    pillars = [
-        [low[0], rear_low, rear_high, high[0]],
-        [low[1], low[2], high[2], high[1]],
-        [front_low, low[3], high[3], front_high],
-    ]
-    shell.append(_both_sides(np.array(pillars), Material.BODYWORK, paint))
-    shell.append(_across([(cowl, belt, wide), (screen, roof, top)], Material.GLASS, (1, 1, 1)))
-    shell.append(_across([(rear_roof, roof, top), (deck, belt, wide)], Material.GLASS, (1, 1, 1)))
-    return Mesh.join([*shell, _inside_and_wheels(), *_lights(front, rear, wide)])
+        _across([(front - 0.02, 0.24, wide), (rear, 0.24, wide)], Material.RUBBER),
+        _both_sides(band[::2], Material.BODYWORK, paint),
+        _both_sides(band[1::2], Material.GLASS),
+        _across([(cowl, belt, wide), (screen, roof, top)], Material.GLASS),
+        _across([(rear_roof, roof, top), (deck, belt, wide)], Material.GLASS),
+        _inside_and_wheels(),
+        *_lights(front, rear, wide),
+    ])  # fmt: skip
 
 
 @lru_cache(maxsize=1)
@@ -138,8 +130,8 @@ def _inside_and_wheels() -> Mesh:
         frustum((-0.2, 0.18, 0.55), (0.1, 0.58, 1.10), Material.CLOTH, (0.3, 0.3, 0.4), (0.8, 0.7)),
         ball((-0.05, 0.38, 1.22), (0.10, 0.09, 0.12), Material.SKIN),
     ]
-    half = CAR_WHEELBASE_M / 2
-    wheels = [_wheel(x, y, 0.32, 0.2) for x in (-half, half) for y in (-0.79, 0.79)]
+    half = WHEELBASE_M["car"] / 2
+    wheels = _wheels((-half, half), 0.79, 0.32, 0.2)
     return Mesh.join([boxes([*seats, dashboard], Material.UPHOLSTERY), *driver, *wheels])
 
 
@@ -159,45 +151,36 @@ def car(motion: Driving, instance: int, rng: np.random.Generator) -> Actor:
     return Actor("car", (Body(car_mesh(any_paint(rng), rng), motion, instance),))
 
 
-def truck(
-    motion: Driving, span_s: tuple[float, float], instance: int, rng: np.random.Generator
-) -> Actor:
+def truck(motion: Driving, instance: int, rng: np.random.Generator) -> Actor:
     """A 16 m articulated truck: the trailer follows the tractor through turns."""
     paint, tarpaulin = any_paint(rng), any_cloth(rng)
-    front = TRACTOR_WHEELBASE_M / 2 + 1.3
+    half, trailer_half = WHEELBASE_M["truck"] / 2, WHEELBASE_M["trailer"] / 2
+    front, back = half + 1.3, -trailer_half - 3.7
+    # the corners of the windscreen at its foot and its head, and of the side windows
+    foot, head = np.array([[(x, -1.2, z), (x, 1.2, z)]
+                           for x, z in ((front, 1.75), (front - 0.15, 2.6))])  # fmt: skip
+    panes = [[foot[0], foot[1], head[1], head[0]]]
+    for a, b in zip(foot, head, strict=True):
+        panes.append([(front - 0.9, *a[1:]), a, b, (front - 0.9, *b[1:])])
     cab = [
         box((front - 2.2, -1.22, 0.55), (front, 1.22, 1.75), Material.BODYWORK, paint),
         frustum((front - 2.2, -1.22, 2.6), (front - 0.15, 1.22, 3.5), Material.BODYWORK, paint,
                 (0.85, 0.9)),
         box((front - 2.2, -1.22, 1.75), (front - 0.9, 1.22, 2.6), Material.BODYWORK, paint),
-        Mesh.quads(
-            np.array([
-                [(front, -1.2, 1.75), (front, 1.2, 1.75), (front - 0.15, 1.2, 2.6),
-                 (front - 0.15, -1.2, 2.6)],
-                [(front - 0.9, 1.2, 1.75), (front, 1.2, 1.75), (front - 0.15, 1.2, 2.6),
-                 (front - 0.9, 1.2, 2.6)],
-                [(front - 0.9, -1.2, 1.75), (front, -1.2, 1.75), (front - 0.15, -1.2, 2.6),
-                 (front - 0.9, -1.2, 2.6)],
-            ]),
-            Material.GLASS,
-        ),
+        Mesh.quads(np.array(panes), Material.GLASS),
         box((-3.0, -0.5, 0.7), (front - 2.2, 0.5, 1.05), Material.METAL),
-        *(box((front - 0.05, y - 0.25, 0.7), (front + 0.02, y + 0.25, 0.95), Material.LAMP)
-          for y in (-0.9, 0.9)),
+        boxes([((front - 0.05, y - 0.25, 0.7), (front + 0.02, y + 0.25, 0.95))
+               for y in (-0.9, 0.9)], Material.LAMP),
+        *_wheels((-half, half), 1.05, 0.5, 0.32),
     ]  # fmt: skip
-    half = TRACTOR_WHEELBASE_M / 2
-    cab += [_wheel(x, y, 0.5, 0.32) for x in (-half, half) for y in (-1.05, 1.05)]
-    trailer_half = TRAILER_WHEELBASE_M / 2
     load = [
-        box((-trailer_half - 3.7, -1.25, 1.2), (trailer_half + 1.0, 1.25, 3.9), Material.CLOTH,
-            tarpaulin),
-        box((-trailer_half - 3.7, -0.5, 0.9), (trailer_half + 0.5, 0.5, 1.2), Material.METAL),
-        *(box((-trailer_half - 3.75, y - 0.2, 0.95), (-trailer_half - 3.6, y + 0.2, 1.15),
-              Material.LAMP, (0.7, 0.1, 0.1)) for y in (-1.0, 1.0)),
+        box((back, -1.25, 1.2), (trailer_half + 1.0, 1.25, 3.9), Material.CLOTH, tarpaulin),
+        box((back, -0.5, 0.9), (trailer_half + 0.5, 0.5, 1.2), Material.METAL),
+        boxes([((back - 0.05, y - 0.2, 0.95), (back + 0.1, y + 0.2, 1.15))
+               for y in (-1.0, 1.0)], Material.LAMP, (0.7, 0.1, 0.1)),
+        *_wheels([-trailer_half + x for x in (-1.3, 0.0, 1.3)], 1.05, 0.5, 0.32),
     ]  # fmt: skip
-    axles = (-trailer_half - 1.3, -trailer_half, -trailer_half + 1.3)
-    load += [_wheel(x, y, 0.5, 0.32) for x in axles for y in (-1.05, 1.05)]
-    towed = Towed(motion, _KINGPIN_M, TRAILER_WHEELBASE_M, *span_s)
+    towed = Towed(motion, _KINGPIN_M, WHEELBASE_M["trailer"], *SPAN_S)
     bodies = (Body(Mesh.join(cab), motion, instance), Body(Mesh.join(load), towed, instance))
     return Actor("truck", bodies, num_solid=2)
 
@@ -248,29 +231,26 @@ def walker(motion: Driving, instance: int, rng: np.random.Generator) -> Actor:
 
 def cyclist(motion: Driving, instance: int, rng: np.random.Generator) -> Actor:
     """A bicycle with its rider, whose legs pedal."""
-    half, paint, cloth = BICYCLE_WHEELBASE_M / 2, any_cloth(rng), any_cloth(rng)
+    half, paint, cloth = WHEELBASE_M["cyclist"] / 2, any_cloth(rng), any_cloth(rng)
     parts = []
     for x in (-half, half):
         angle = np.linspace(0, 2 * np.pi, 17)
-        rim = np.stack(
-            [x + 0.33 * np.cos(angle), np.zeros(17), 0.34 + 0.33 * np.sin(angle)], axis=1
-        )
-        parts += [tube(a, b, 0.022, Material.RUBBER, num_sides=4)
-                  for a, b in pairwise(rim)]  # fmt: skip
-        parts += [
-            tube(rim[i], rim[i + 8], 0.006, Material.METAL, num_sides=4) for i in range(0, 8, 2)
-        ]
+        rim = np.column_stack([x + 0.33 * np.cos(angle), 0 * angle, 0.34 + 0.33 * np.sin(angle)])
+        parts += [tube(*ends, 0.022, Material.RUBBER, num_sides=4) for ends in pairwise(rim)]
+        parts += [tube(rim[i], rim[i + 8], 0.006, Material.METAL, num_sides=4)
+                  for i in range(0, 8, 2)]  # fmt: skip
     seat, crank, head, bar = (-0.22, 0, 0.92), (-0.08, 0, 0.34), (0.36, 0, 0.86), (0.34, 0, 1.02)
-    hub_rear, hub_front = (-half, 0, 0.34), (half, 0, 0.34)
-    for a, b in ((seat, crank), (crank, head), (seat, head), (seat, hub_rear), (crank, hub_rear),
-                 (hub_front, bar)):  # fmt: skip
-        parts.append(tube(a, b, 0.02, Material.METAL, paint))
-    parts.append(tube((0.34, -0.28, 1.02), (0.34, 0.28, 1.02), 0.018, Material.METAL))
-    parts.append(tube((-0.20, 0, 0.94), (0.08, 0, 1.42), (0.15, 0.19), Material.CLOTH, cloth))
-    parts.append(ball((0.20, 0, 1.60), (0.10, 0.085, 0.12), Material.SKIN))
-    parts.append(ball((0.18, 0, 1.65), (0.12, 0.10, 0.10), Material.CLOTH, any_cloth(rng)))
-    for y in (-0.2, 0.2):
-        parts.append(tube((0.06, y, 1.38), (0.33, y * 1.2, 1.04), 0.045, Material.CLOTH, cloth))
+    rear, ahead = (-half, 0, 0.34), (half, 0, 0.34)
+    frame = (seat, crank), (crank, head), (seat, head), (seat, rear), (crank, rear), (ahead, bar)
+    parts += [
+        *(tube(*ends, 0.02, Material.METAL, paint) for ends in frame),
+        tube((0.34, -0.28, 1.02), (0.34, 0.28, 1.02), 0.018, Material.METAL),
+        tube((-0.20, 0, 0.94), (0.08, 0, 1.42), (0.15, 0.19), Material.CLOTH, cloth),
+        ball((0.20, 0, 1.60), (0.10, 0.085, 0.12), Material.SKIN),
+        ball((0.18, 0, 1.65), (0.12, 0.10, 0.10), Material.CLOTH, any_cloth(rng)),
+        *(tube((0.06, y, 1.38), (0.33, y * 1.2, 1.04), 0.045, Material.CLOTH, cloth)
+          for y in (-0.2, 0.2)),
+    ]  # fmt: skip
     bodies = [Body(Mesh.join(parts), motion, instance)]
     for side, phase in ((1, 0.0), (-1, np.pi)):
         leg = Limb(motion, (-0.16, 0.1 * side, 0.95), 0.35, 5.0, phase)

@@ -17,12 +17,13 @@ from densify.street.lidar import T_ego_lidar
 from densify.street.materials import (
     COLOUR,
     GLASS_PASSES,
+    GLOSS,
     NOTHING_PASSES,
     Material,
     shade_factor,
     smooth_noise,
 )
-from densify.street.motion import Driving
+from densify.street.motion import Driving, poses_at
 from densify.street.world import Hits, Rays, World
 
 # how KITTI's cameras sit: axes turned, a little off true, below and before the scanner
@@ -52,34 +53,22 @@ def _pinhole(name: str, right_m: float, share: float = 1.0, row_time_s: float = 
     T_cam_lidar = T_RECTIFIED_LIDAR.copy()
     T_cam_lidar[0, 3] -= right_m
     f, (u, v) = FOCAL_PX * share, ((c + 0.5) * share - 0.5 for c in CENTRE_PX)
-    if share == 1.0:
-        u, v = CENTRE_PX
     K = np.array([[f, 0, u], [0, f, v], [0, 0, 1.0]])
     size_px = round(1242 * share), round(375 * share)
     return Camera(name, *size_px, K, T_cam_lidar, row_time_s=row_time_s)
 
 
-_FISHEYE = Camera(
-    name="fisheye",
-    width_px=400,
-    height_px=400,
-    K=np.array([[124.0, 0, 199.5], [0, 124.0, 199.5], [0, 0, 1.0]]),
-    T_cam_lidar=T_FISHEYE_LIDAR,
-    distortion=(-0.02, 0.003, -0.001, 0.0001),
-    model="fisheye",
-    max_angle_deg=95.0,
-)
-
+_FISHEYE_K = np.array([[124.0, 0, 199.5], [0, 124.0, 199.5], [0, 0, 1.0]])
 CAMERAS = {
-    c.name: c
-    for c in (
-        _pinhole("image_02", _LEFT),
-        _pinhole("image_03", _RIGHT),
-        _pinhole("fast", _LEFT, 1 / 3),
-        _pinhole("rolling", _LEFT, 1 / 2, 100e-6),
-        _FISHEYE,
-    )
-}
+    "image_02": _pinhole("image_02", _LEFT),
+    "image_03": _pinhole("image_03", _RIGHT),
+    "fast": _pinhole("fast", _LEFT, 1 / 3),
+    "rolling": _pinhole("rolling", _LEFT, 1 / 2, 100e-6),
+    "fisheye": Camera(
+        "fisheye", 400, 400, _FISHEYE_K, T_FISHEYE_LIDAR, (-0.02, 0.003, -0.001, 0.0001),
+        model="fisheye", max_angle_deg=95.0,
+    ),
+}  # fmt: skip
 """The cameras, beside a level mount."""
 
 SHUTTERS = {
@@ -121,11 +110,6 @@ class Picture:
     body: NDArray[np.int32]
 
 
-def T_world_lidar(ego: Driving, time_s: float, tilt_deg: float = 0.0) -> Float:
-    """(4,4) pose of the lidar frame."""
-    return ego.poses(np.array([time_s])).matrix() @ T_ego_lidar(tilt_deg)
-
-
 def expose(world: World, ego: Driving, camera: Camera, time_s: float) -> Picture:
     """Every row at its own time. camera: beside a level mount. time_s: of the middle row."""
     h, w = camera.height_px, camera.width_px
@@ -154,54 +138,41 @@ def expose(world: World, ego: Driving, camera: Camera, time_s: float) -> Picture
 def _in_world(ego: Driving, camera: Camera, ray: Float, time_s: float, row: Float) -> Rays:
     """(N,3) camera frame and (N,) rows below the middle, ascending."""
     time = time_s + row * camera.row_time_s
-    origin, direction = np.empty_like(ray), np.empty_like(ray)
-    begins = np.flatnonzero(np.diff(time, prepend=np.nan) != 0)
-    for begin, end in zip(begins, [*begins[1:], len(ray)], strict=True):
-        T_world_cam = T_world_lidar(ego, time[begin]) @ inverse(camera.T_cam_lidar)
-        origin[begin:end] = T_world_cam[:3, 3]
-        direction[begin:end] = ray[begin:end] @ T_world_cam[:3, :3].T
-    return Rays(origin, direction, time)
+    poses, T_ego_cam = poses_at(ego, time), T_ego_lidar() @ inverse(camera.T_cam_lidar)
+    origin = poses.apply(np.broadcast_to(T_ego_cam[:3, 3], ray.shape))
+    return Rays(origin, poses.turn(ray @ T_ego_cam[:3, :3].T), time)
 
 
 def _is_glass(world: World, hits: Hits) -> Bool:
-    is_glass: Bool = (hits.triangle >= 0) & (
-        world.triangles.material[hits.triangle] == Material.GLASS
-    )
-    return is_glass
+    return (hits.triangle >= 0) & (world.triangles.material[hits.triangle] == Material.GLASS)
 
 
 def _colours(world: World, rays: Rays, hits: Hits) -> Float:
     """(N,3) linear light: sun with shadows, sky light from above, haze."""
     colour = _sky(rays.direction)
     rows = np.flatnonzero(hits.triangle >= 0)
-    triangle = hits.triangle[rows]
-    material = world.triangles.material[triangle]
+    triangle, direction, normal = hits.triangle[rows], rays.direction[rows], hits.normal[rows]
+    material, range_m = world.triangles.material[triangle], hits.range_m[rows, None]
     a, b = hits.barycentric[rows, 0, None], hits.barycentric[rows, 1, None]
     uv = world.triangles.uv[triangle]
     at = uv[:, 0] * (1 - a - b) + uv[:, 1] * a + uv[:, 2] * b
-    painted = (
-        COLOUR[material] * world.triangles.tint[triangle] * shade_factor(material, at)[:, None]
-    )
-    direction = rays.direction[rows]
-    normal = hits.normal[rows]
+    texture = shade_factor(material, at)[:, None]
+    painted = COLOUR[material] * world.triangles.tint[triangle] * texture
     facing = np.einsum("ni,ni->n", normal, direction)
     normal = np.where(facing[:, None] > 0, -normal, normal)
     towards_sun = normal @ _SUN
     leafy = material == Material.LEAF  # light shines through leaves too
     towards_sun = np.where(leafy, 0.35 + 0.4 * np.abs(towards_sun), np.maximum(towards_sun, 0.0))
     sunny = np.flatnonzero(towards_sun > 0)
-    point = rays.origin[rows] + direction * hits.range_m[rows, None] + 0.015 * normal
+    point = rays.origin[rows] + direction * range_m + 0.015 * normal
     shadow_rays = Rays(point[sunny], np.tile(_SUN, (len(sunny), 1)), rays.time_s[rows[sunny]])
     lit = np.zeros(len(rows))
-    lit[sunny] = world.is_lit(shadow_rays)
+    lit[sunny] = ~np.isfinite(world.cast(shadow_rays, GLASS_PASSES, np.zeros(len(sunny))).range_m)
     sun = 1.15 * (lit * towards_sun)[:, None] * np.array([1.0, 0.95, 0.86])
     ambient = (0.34 + 0.16 * normal[:, 2:]) * np.array([0.88, 0.95, 1.08])
-    light = np.clip(painted, 0, 1) ** 2.2 * (sun + ambient)
-    shiny = np.isin(material, (Material.PANE, Material.BODYWORK))
     mirrored = direction - 2 * np.einsum("ni,ni->n", direction, normal)[:, None] * normal
-    gloss = np.where(shiny, np.where(material == Material.PANE, 0.25, 0.06), 0.0)
-    light = light + gloss[:, None] * _sky(mirrored)
-    haze = np.exp(-hits.range_m[rows, None] / 700.0)
+    light = np.clip(painted, 0, 1) ** 2.2 * (sun + ambient) + GLOSS[material, None] * _sky(mirrored)
+    haze = np.exp(-range_m / 700.0)
     colour[rows] = light * haze + (1 - haze) * np.array([0.62, 0.72, 0.82])
     return colour
 

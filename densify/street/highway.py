@@ -8,20 +8,13 @@ from functools import cache
 import numpy as np
 
 from densify.geometry.types import Float
+from densify.street.actors import car, truck
 from densify.street.materials import Material
 from densify.street.mesh import Mesh, box, frustum
 from densify.street.motion import Driving
-from densify.street.scenery import (
-    Scenery,
-    Side,
-    hedge,
-    lamp_post,
-    mark_lanes,
-    sign_post,
-    tree,
-)
+from densify.street.scenery import Scenery, Side, hedge, lamp_post, mark_lanes, sign_post, tree
 from densify.street.terrain import Curve, Ground, Lane, Road, Speed, Terrain
-from densify.street.traffic import MEETING_S, Scene, Traffic, Ways, assemble, jitter
+from densify.street.traffic import MEETING_S, Scene, Traffic, assemble, jitter
 
 _LANE_M = 3.6
 _MEDIAN_M = 1.6
@@ -42,33 +35,28 @@ def highway(rng: np.random.Generator) -> Scene:
     scenery = Scenery(ground, rng)
     _dress_highway(scenery, road)
     lines = [_MEDIAN_M + _LANE_M * i for i in range(4)]
-    spans = [(0.0, 1090.0)]
-    parts = [
-        ground.mesh(24.0, 2.0),
-        mark_lanes(ground, road, [o * s for o in lines[1:3] for s in (1, -1)], (), spans),
-        mark_lanes(ground, road, (), [o * s for o in lines[::3] for s in (1, -1)], spans),
-    ]
+    dashed, solid = ([o * s for o in which for s in (1, -1)] for which in (lines[1:3], lines[::3]))
+    parts = [ground.mesh(24.0, 2.0), mark_lanes(ground, road, dashed, solid, [(0.0, 1090.0)])]
     lanes = [Lane(main, -_MEDIAN_M - _LANE_M * (i + 0.5)) for i in range(3)]
     back = [Lane(main, _MEDIAN_M + _LANE_M * (i + 0.5), forward=False) for i in range(3)]
     fast, middle, slow = lanes
-    at_zero = middle.at(start_m)
-    ego = Driving(middle.curve, Speed((0.0, 25.0)), at_zero, 0.0, ground.terrain, 2.7)
+    ego = Driving(middle.curve, Speed((0.0, 25.0)), middle.at(start_m), 0.0, ground.terrain, 2.7)
     traffic = Traffic(ego, scenery, rng)
-    ways = Ways(ground, traffic)
+    drive = traffic.drive
     here = start_m + 25.0 * MEETING_S
-    ways.truck(slow, here + 26.0, Speed((0.0, 22.0)))
-    ways.car(fast, here + 14.0, Speed((0.0, 31.0 * jitter(rng, 0.03))))
-    ways.car(middle, here + 32.0, Speed((-1.0, 26.5), (10.5, 26.5), (14.0, 22.0)))
-    ways.car(slow, here - 30.0, Speed((0.0, 23.0)))
-    ways.car(fast, here - 55.0, Speed((0.0, 29.0)), 8.0)
-    ways.car(slow, here + 62.0, Speed((0.0, 23.0)), 4.0)
-    ways.car(fast, here + 75.0, Speed((0.0, 30.0)), 6.0)
-    ways.truck(back[2], here + 28.0, Speed((0.0, 24.0)))
+    drive(truck, slow, here + 26.0, Speed((0.0, 22.0)), 1.0)
+    drive(car, fast, here + 14.0, Speed((0.0, 31.0 * jitter(rng, 0.03))))
+    drive(car, middle, here + 32.0, Speed((-1.0, 26.5), (10.5, 26.5), (14.0, 22.0)))
+    drive(car, slow, here - 30.0, Speed((0.0, 23.0)))
+    drive(car, fast, here - 55.0, Speed((0.0, 29.0)), 8.0)
+    drive(car, slow, here + 62.0, Speed((0.0, 23.0)), 4.0)
+    drive(car, fast, here + 75.0, Speed((0.0, 30.0)), 6.0)
+    drive(truck, back[2], here + 28.0, Speed((0.0, 24.0)), 1.0)
     for lane, first, speed in ((0, 18.0, 33.0), (1, 34.0, 30.0), (2, 60.0, 27.0)):
         for k in range(-9, 7):
             gap = 62.0 * jitter(rng, 0.2)
-            ways.car(back[lane], here + first + k * gap, Speed((0.0, speed)), 6.0)
-    return assemble(scenery, parts, ego, traffic)
+            drive(car, back[lane], here + first + k * gap, Speed((0.0, speed)), 6.0)
+    return assemble(scenery, parts, traffic)
 
 
 @cache
@@ -83,24 +71,17 @@ def guard_rail(length_m: float) -> Mesh:
 @cache
 def noise_barrier(length_m: float) -> Mesh:
     half = length_m / 2
-    return Mesh.join(
-        [
-            box((-half, -0.08, -0.8), (half, 0.08, 3.2), Material.CONCRETE, (0.9, 0.95, 0.85)),
-            box((-half - 0.1, -0.16, -0.8), (-half + 0.1, 0.16, 3.4), Material.METAL),
-        ]
-    )
+    slab = box((-half, -0.08, -0.8), (half, 0.08, 3.2), Material.CONCRETE, (0.9, 0.95, 0.85))
+    post = box((-half - 0.1, -0.16, -0.8), (-half + 0.1, 0.16, 3.4), Material.METAL)
+    return Mesh.join([slab, post])
 
 
 def _dress_highway(scenery: Scenery, road: Road) -> None:
     rng = scenery.rng
     end = road.curve.length_m - 20
     for station in np.arange(10.0, end, 4.0):
-        for side, beyond in (
-            (1, 0.7),
-            (-1, 0.7),
-            (1, -road.left_m + 0.5),
-            (-1, -road.right_m + 0.5),
-        ):
+        median_m = -road.left_m + 0.5
+        for side, beyond in ((1, 0.7), (-1, 0.7), (1, median_m), (-1, median_m)):
             at = Side(road, side, 0.0, end)
             scenery.put(guard_rail(4.0), at.at(station, beyond), at.heading(station))
     median = Side(road, 1, 0.0, end)

@@ -13,13 +13,14 @@ from densify.geometry.poses import rotate, transform
 from densify.geometry.types import Bool, Float, Float32, Int
 from densify.street.materials import LASER_PASSES, REFLECTIVITY
 from densify.street.mesh import across, lengths
-from densify.street.motion import Driving, poses_at
+from densify.street.motion import Driving, Trajectory, poses_at
 from densify.street.sensors import Sensor, firings
 from densify.street.world import Hits, Rays, World
 
 LIDAR_HEIGHT_M = 1.73
 _MIN_RANGE_M = 1.0
 _SPOT_RAD = 1.05e-3  # of a beam's spot, along each axis from its centre to the outer rays
+_SPOT = np.array([(0, 0), (1, 1), (1, -1), (-1, 1), (-1, -1)])  # its rays, left and up
 _FLAT_M = 0.10  # off the plane through the centre's echo: an edge
 _MERGE_M = 2.0  # echoes closer than this can melt into one
 _MELT_PROBABILITY = 0.2
@@ -45,15 +46,6 @@ class Returns:
     radial_velocity_m_s: Float32 | None = None
 
 
-@dataclass(frozen=True)
-class Mounted:
-    """A sensor on the vehicle; tilt_deg: as in `T_ego_lidar`. period_ns: from sweep to sweep."""
-
-    sensor: Sensor
-    period_ns: int
-    tilt_deg: float = 0.0
-
-
 def T_ego_lidar(tilt_deg: float = 0.0) -> Float:
     """(4,4) the lidar frame, which is the mount's.
 
@@ -66,46 +58,48 @@ def T_ego_lidar(tilt_deg: float = 0.0) -> Float:
 
 
 def scan(
-    world: World, ego: Driving, mounted: Mounted, time_s: float, rng: np.random.Generator
-) -> Returns:
-    """The sweep whose reference time is ``time_s``, seconds from frame 0."""
-    sensor, T = mounted.sensor, T_ego_lidar(mounted.tilt_deg)
-    fired = firings(sensor, time_s, mounted.period_ns)
+    world: World, ego: Driving, sensor: Sensor, time_s: float, rng: np.random.Generator,
+    period_ns: int = 100_000_000, tilt_deg: float = 0.0,
+) -> Returns:  # fmt: skip
+    """The sweep whose reference time is ``time_s``, seconds from frame 0, from a mount that is
+    tilted as in `T_ego_lidar`. period_ns: from sweep to sweep."""
+    T = T_ego_lidar(tilt_deg)
+    fired = firings(sensor, time_s, period_ns)
     n = len(fired.offset_ns)
     times = at_offsets(time_s, fired.offset_ns)
     ego_poses = poses_at(ego, times)
+    origin_m = sensor.origins_m[fired.lidar]
     origin = ego_poses.apply(transform(T, sensor.origins_m)[fired.lidar])
-    spot = [ego_poses.turn(rotate(T, ray)) for ray in _spot(fired.direction)]
-    lucks = [rng.random(n) for _ in spot]
-    beams = Rays(origin, spot[0], times)
-    echoes = world.cast_bundle(beams, spot, LASER_PASSES, lucks, spread=2 * _SPOT_RAD)
+    spot = np.stack([ego_poses.turn(rotate(T, ray)) for ray in _spot(fired.direction)], axis=1)
+    luck = rng.random((len(_SPOT), n)).T
+    beams = (np.repeat(column, len(_SPOT), axis=0) for column in (origin, times))
+    echoes = world.cast(
+        Rays(next(beams), spot.reshape(-1, 3), next(beams)),
+        LASER_PASSES, luck.ravel(), len(_SPOT), 2 * _SPOT_RAD,
+    )  # fmt: skip
     range_m, hit, edge = _echo(echoes, spot, rng)
-    surface = world.triangles.material[hit.triangle]
-    reflectivity = REFLECTIVITY[surface] * (
-        0.6 + 0.4 * world.triangles.tint[hit.triangle].mean(axis=1)
-    )
-    grazing = np.abs(np.einsum("ni,ni->n", hit.normal, spot[0]))
+    tint = world.triangles.tint[hit.triangle].mean(axis=1)
+    reflectivity = REFLECTIVITY[world.triangles.material[hit.triangle]] * (0.6 + 0.4 * tint)
+    grazing = np.abs(np.einsum("ni,ni->n", hit.normal, spot[:, 0]))
     signal = reflectivity * np.sqrt(grazing) * (60.0 / np.maximum(range_m, 5.0)) ** 2
     heard = 0.995 * (1 - np.exp(-8.0 * signal)) * np.where(edge, 0.85, 1.0)
     keep = np.isfinite(range_m) & (rng.random(n) < heard)
-    sigma_m = np.array([scanner.range_sigma_m for scanner in sensor.scanners])[fired.lidar]
-    reach_m = np.array([scanner.max_range_m for scanner in sensor.scanners])[fired.lidar]
-    range_m = np.where(keep, range_m, 0.0) + sigma_m * rng.normal(size=n)
-    keep &= (range_m > _MIN_RANGE_M) & (range_m < reach_m)
+    range_m = np.where(keep, range_m, 0.0)
+    range_m += sensor.each("range_sigma_m")[fired.lidar] * rng.normal(size=n)
+    keep &= (range_m > _MIN_RANGE_M) & (range_m < sensor.each("max_range_m")[fired.lidar])
     points = fired.direction * range_m[:, None]
-    origin_m = sensor.origins_m[fired.lidar]
     np.add(points, origin_m, out=points, where=origin_m != 0)  # a coordinate of -0.0 stays one
     brightness = reflectivity * (0.35 + 0.65 * grazing) * (1 + 0.05 * rng.normal(size=n))
     body = world.triangles.body[hit.triangle[keep]]
     radial_m_s = None
     if sensor.measures_velocity:
-        sigmas_m_s = [scanner.velocity_sigma_m_s for scanner in sensor.scanners]
-        places = origin[keep] + spot[0][keep] * range_m[keep, None]
+        places = origin[keep] + spot[keep, 0] * range_m[keep, None]
+        mounts = transform(T, origin_m[keep])
         v_m_s = velocities_m_s(world, body, places, times[keep])
-        v_m_s -= _at_rest_on(ego, T, sensor.origins_m[fired.lidar[keep]], times[keep])
-        radial_m_s = np.einsum("ni,ni->n", v_m_s, spot[0][keep])
-        noise = np.array(sigmas_m_s, np.float64)[fired.lidar[keep]] * rng.normal(size=len(v_m_s))
-        radial_m_s = (radial_m_s + noise).astype(np.float32)
+        v_m_s -= _velocity(ego, mounts, times[keep])
+        sigma_m_s = sensor.each("velocity_sigma_m_s")[fired.lidar[keep]]
+        radial = np.einsum("ni,ni->n", v_m_s, spot[keep, 0])
+        radial_m_s = (radial + sigma_m_s * rng.normal(size=len(radial))).astype(np.float32)
     return Returns(
         points[keep].astype(np.float32),
         np.clip(np.round(brightness[keep], 2), 0, 1).astype(np.float32),
@@ -122,20 +116,15 @@ def velocities_m_s(world: World, body: NDArray[np.int32], places: Float, times: 
     found = np.zeros_like(places)
     for index in np.unique(body[body > 0]):
         rows = np.flatnonzero(body == index)
-        in_body = world.poses(int(index), times[rows]).undo(places[rows])
-        ends = [
-            world.poses(int(index), times[rows] + h).apply(in_body) for h in (-_STEP_S, _STEP_S)
-        ]
-        found[rows] = (ends[1] - ends[0]) / (2 * _STEP_S)
+        way = world.bodies[index].trajectory
+        found[rows] = _velocity(way, way.poses(times[rows]).undo(places[rows]), times[rows])
     return found
 
 
-def _at_rest_on(ego: Driving, T_ego: Float, origins: Float, times: Float) -> Float:
-    """(N,3) m/s, world axes: of scanners at these places (N,3) of the lidar frame."""
-    mounts = transform(T_ego, origins)
-    ends = [ego.poses(times + h).apply(mounts) for h in (-_STEP_S, _STEP_S)]
-    moved: Float = ends[1] - ends[0]
-    return moved / (2 * _STEP_S)
+def _velocity(way: Trajectory, points: Float, times: Float) -> Float:
+    """(N,3) m/s, world axes, of points (N,3) of what moves along a way."""
+    before, after = (way.poses(times + shift_s).apply(points) for shift_s in (-_STEP_S, _STEP_S))
+    return (after - before) / (2 * _STEP_S)
 
 
 def at_offsets(time_s: float, offset_ns: Int) -> Float:
@@ -149,40 +138,31 @@ def _spot(direction: Float) -> list[Float]:
     level = np.stack([-direction[:, 1], direction[:, 0], np.zeros(len(direction))], axis=1)
     level /= lengths(level)
     upward = across(direction, level)
-    rays = [direction]
-    for a, b in ((1, 1), (1, -1), (-1, 1), (-1, -1)):
-        ray = direction + _SPOT_RAD * (a * level + b * upward)
-        rays.append(ray / lengths(ray))
-    return rays
+    rays = [direction + _SPOT_RAD * (a * level + b * upward) for a, b in _SPOT[1:]]
+    return [direction, *(ray / lengths(ray) for ray in rays)]
 
 
-def _echo(
-    echoes: list[Hits], spot: list[Float], rng: np.random.Generator
-) -> tuple[Float, Hits, Bool]:
-    """Return the echo of a spot: range (N,), the surface it is from, and edges (N,).
+def _echo(echoes: Hits, spot: Float, rng: np.random.Generator) -> tuple[Float, Hits, Bool]:
+    """Return the echo of each spot: range (N,), the surface it is from, and edges (N,).
 
+    echoes: of the rays of all spots. spot: (N,S,3) their directions, the centre's first.
     On one plane the centre counts. At an edge each part of the spot is as likely to be the
     strongest echo, and now and then two that lie close together melt into one between them.
     """
-    centre = echoes[0]
-    n = len(centre.range_m)
+    n, num = spot.shape[:2]
     rows = np.arange(n)
-    range_m = np.stack([e.range_m for e in echoes])
-    slant = [np.einsum("ni,ni->n", centre.normal, ray) for ray in spot]
+    range_m = echoes.range_m.reshape(n, num)
+    slant = np.einsum("ni,nsi->ns", echoes.normal[::num], spot)
     with np.errstate(divide="ignore", invalid="ignore"):  # nothing met is infinitely far
-        off_plane = [
-            np.abs(r - centre.range_m * slant[0] / s) for r, s in zip(range_m, slant, strict=True)
-        ]
+        off_plane = np.abs(range_m - (range_m * slant)[:, :1] / slant)
     some = np.isfinite(range_m)
-    flat = (np.stack(off_plane) < _FLAT_M).all(axis=0)
-    edge = np.logical_and(some.any(axis=0), np.logical_not(flat))
+    edge = some.any(axis=1) & ~(off_plane < _FLAT_M).all(axis=1)
     # one of the rays that met something, each as likely
-    pick = np.argmax(rng.random(range_m.shape) * some, axis=0)
+    pick = np.argmax(rng.random((num, n)) * some.T, axis=0)
     pick = np.where(edge, pick, 0)
-    chosen = range_m[pick, rows]
-    other = range_m[rng.integers(len(spot), size=n), rows]
+    chosen = range_m[rows, pick]
+    other = range_m[rows, rng.integers(num, size=n)]
     melts = edge & np.isfinite(other) & (rng.random(n) < _MELT_PROBABILITY)
     melts[melts] = np.abs(other[melts] - chosen[melts]) < _MERGE_M
-    chosen = np.where(melts, (chosen + np.where(melts, other, 0.0)) / 2, chosen)
-    columns = (np.stack(column)[pick, rows] for column in zip(*echoes, strict=True))
-    return chosen, Hits(*columns), edge
+    chosen[melts] = (chosen[melts] + other[melts]) / 2
+    return chosen, Hits(*(column[rows * num + pick] for column in echoes)), edge

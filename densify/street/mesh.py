@@ -4,8 +4,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from functools import cache, cached_property
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,44 +45,29 @@ class Mesh:
     def join(meshes: Sequence[Mesh]) -> Mesh:
         meshes = [m for m in meshes if len(m.triangles)]
         starts = np.cumsum([0] + [len(m.vertices) for m in meshes])
-        return Mesh(
-            np.concatenate([m.vertices for m in meshes]),
-            np.concatenate([m.triangles + s for m, s in zip(meshes, starts, strict=False)]),
-            np.concatenate([m.uv for m in meshes]),
-            np.concatenate([m.material for m in meshes]),
-            np.concatenate([m.tint for m in meshes]),
-            np.concatenate([m.instance for m in meshes]),
-        )
+        columns = {
+            f.name: np.concatenate([getattr(m, f.name) for m in meshes]) for f in fields(Mesh)
+        }
+        columns["triangles"] += np.repeat(starts[:-1], [len(m.triangles) for m in meshes])[:, None]
+        return Mesh(**columns)
 
     @staticmethod
     def quads(corners: Float, material: Material, tint: Tint | Float = WHITE) -> Mesh:
         """(K,4,3) corners in order round each quad; uv are metres along its first side and away
         from it."""
         k = len(corners)
-        axes = np.empty((k, 2, 3))  # along the first side, and away from it
-        side = corners[:, 1] - corners[:, 0]
-        along = np.divide(side, np.maximum(lengths(side), 1e-9), out=axes[:, 0])
-        away = corners[:, 3] - corners[:, 0]
+        side, away = corners[:, 1] - corners[:, 0], corners[:, 3] - corners[:, 0]
+        along = side / np.maximum(lengths(side), 1e-9)
         up = away - np.einsum("ki,ki->k", away, along)[:, None] * along
-        np.divide(up, np.maximum(lengths(up), 1e-9), out=axes[:, 1])
-        tints = np.empty((k, 2, 3))
-        tints[:] = np.asarray(tint, float).reshape(-1, 1, 3)
+        axes = np.stack([along, up / np.maximum(lengths(up), 1e-9)], axis=1)
         return Mesh(
             corners.reshape(-1, 3),
             (np.arange(0, 4 * k, 4)[:, None] + _HALVES).reshape(-1, 3),
             np.einsum("kci,kai->kca", corners, axes).reshape(-1, 2),
             np.full(2 * k, material, np.int16),
-            tints.reshape(-1, 3),
+            np.repeat(np.broadcast_to(tint, (k, 3)), 2, axis=0),
             np.full(2 * k, -1, np.int32),
         )
-
-    def moved(
-        self, x_m: float = 0.0, y_m: float = 0.0, z_m: float = 0.0, heading: float = 0.0
-    ) -> Mesh:
-        """Turned about the vertical by ``heading`` (rad), then shifted."""
-        c, s = np.cos(heading), np.sin(heading)
-        turn = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1.0]])
-        return replace(self, vertices=self.vertices @ turn.T + [x_m, y_m, z_m])
 
     def posed(self, T_a_mesh: Float) -> Mesh:
         """(4,4) rigid motion of all vertices."""
@@ -94,9 +79,7 @@ class Mesh:
     @cached_property
     def bounds(self) -> tuple[Float, Float]:
         """Lowest and highest corner, (3,) each."""
-        # Column by column, which is quicker than along an axis of the whole.
-        low, high = zip(*((c.min(), c.max()) for c in self.vertices.T), strict=True)
-        return np.array(low), np.array(high)
+        return self.vertices.min(axis=0), self.vertices.max(axis=0)
 
 
 def box(
@@ -123,14 +106,11 @@ def frustum(
     taper: tuple[float, float] = (1.0, 1.0),
 ) -> Mesh:
     """A box whose top is scaled by ``taper`` in x and y about its own middle."""
-    (x0, y0, z0), (x1, y1, z1) = low, high
-    middle, half = (
-        np.array([(x0 + x1) / 2, (y0 + y1) / 2]),
-        np.array([(x1 - x0) / 2, (y1 - y0) / 2]),
-    )
+    a, b = np.asarray(low, float), np.asarray(high, float)
+    middle, half = (a + b)[:2] / 2, (b - a)[:2] / 2
     ring = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]], float)
-    bottom = np.column_stack([middle + ring * half, np.full(4, z0)])
-    top = np.column_stack([middle + ring * half * taper, np.full(4, z1)])
+    bottom = np.column_stack([middle + ring * half, np.full(4, a[2])])
+    top = np.column_stack([middle + ring * half * taper, np.full(4, b[2])])
     after = [1, 2, 3, 0]
     sides = np.stack([bottom, bottom[after], top[after], top], axis=1)
     caps = np.stack([bottom[[3, 2, 1, 0]], top])
@@ -153,23 +133,13 @@ def tube(
     u = across(helper, axis)
     u /= np.linalg.norm(u)
     v = across(axis, u)
-    cos, sin, after = _circle(num_sides)
-    ring = cos * u + sin * v
+    angle = 2 * np.pi * np.arange(num_sides)[:, None] / num_sides
+    ring, after = np.cos(angle) * u + np.sin(angle) * v, np.roll(np.arange(num_sides), -1)
     low, high = a + radii[0] * ring, b + radii[1] * ring
     around = (low, low[after], high[after], high)
-    caps = ((a, around[1], low, a), (b, high, around[2], b))
-    corners = np.empty((3, num_sides, 4, 3))
-    for part, quads in zip(corners, (around, *caps), strict=True):
-        for i, corner in enumerate(quads):
-            part[:, i] = corner
-    return Mesh.quads(corners.reshape(-1, 4, 3), material, tint)
-
-
-@cache
-def _circle(num_sides: int) -> tuple[Float, Float, NDArray[np.int64]]:
-    """Cosines and sines (N,1) around it, and which corner comes after each (N,)."""
-    angle = 2 * np.pi * np.arange(num_sides)[:, None] / num_sides
-    return np.cos(angle), np.sin(angle), np.roll(np.arange(num_sides), -1)
+    caps = ((a, low[after], low, a), (b, high, high[after], b))
+    quads = [np.stack(np.broadcast_arrays(*quad), axis=1) for quad in (around, *caps)]
+    return Mesh.quads(np.concatenate(quads), material, tint)
 
 
 def across(a: Float, b: Float) -> Float:
@@ -190,9 +160,9 @@ def ball(
     centre: Sequence[float], radius_m: Sequence[float], material: Material, tint: Tint = WHITE
 ) -> Mesh:
     """An ellipsoid with radii along x, y, z."""
-    lat = np.linspace(-np.pi / 2, np.pi / 2, 7)
-    lon = np.linspace(0, 2 * np.pi, 11)
-    la, lo = np.meshgrid(lat, lon, indexing="ij")
+    la, lo = np.meshgrid(
+        np.linspace(-np.pi / 2, np.pi / 2, 7), np.linspace(0, 2 * np.pi, 11), indexing="ij"
+    )
     p = np.stack([np.cos(la) * np.cos(lo), np.cos(la) * np.sin(lo), np.sin(la)], axis=2)
     p = p * np.asarray(radius_m) + np.asarray(centre)
     corners = np.stack([p[:-1, :-1], p[:-1, 1:], p[1:, 1:], p[1:, :-1]], axis=2)

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from densify.geometry.types import Bool, Float, Int
 from densify.street.mesh import Mesh, across, lengths
-from densify.street.terrain import Curve, Speed, Terrain
+from densify.street.terrain import Curve, Speed, Terrain, left_of
 
 
 class Poses(NamedTuple):
@@ -47,6 +47,12 @@ class Poses(NamedTuple):
         T_world_body = np.eye(4)
         T_world_body[:3, :3], T_world_body[:3, 3] = self.rotation[row], self.position[row]
         return T_world_body
+
+
+def upright(xyz: Sequence[float], heading: float) -> Poses:
+    """One pose: at a place (3,), x turned from the world's by ``heading`` (rad)."""
+    turn = Rotation.from_euler("z", heading).as_matrix()
+    return Poses(turn[None], np.asarray(xyz, float)[None])
 
 
 class Trajectory(Protocol):
@@ -102,10 +108,6 @@ class Driving:
         lift = np.zeros(len(station)) if self.lift_m is None else self.lift_m(station)
         return on_ground(self.terrain, rear, front, lift, self.upright)
 
-    def from_above(self) -> Driving:
-        """One that is at the same places of a map, where heights do not matter."""
-        return replace(self, lift_m=None) if self.upright else self
-
 
 def on_ground(
     terrain: Terrain, rear: Float, front: Float, lift_m: Float, upright: bool = False
@@ -114,18 +116,12 @@ def on_ground(
     a = np.column_stack([rear, terrain.height(rear) + lift_m])
     b = np.column_stack([front, terrain.height(front) + lift_m])
     middle = (a + b) / 2
-    forward, up = b - a, np.zeros(a.shape)
-    up[:, 2] = 1.0
-    if upright:
-        forward[:, 2] = 0.0
-    else:
-        np.negative(terrain.slope(middle[:, :2]), out=up[:, :2])
-    axes = np.empty((len(rear), 3, 3))
-    x = np.divide(forward, lengths(forward), out=axes[:, :, 0])
-    y = across(up, x)
-    y = np.divide(y, lengths(y), out=axes[:, :, 1])
-    axes[:, :, 2] = across(x, y)
-    return Poses(axes, middle)
+    slope = terrain.slope(middle[:, :2]) * (not upright)
+    forward = (b - a) * (1.0, 1.0, not upright)
+    x = forward / lengths(forward)
+    y = across(np.column_stack([-slope, np.ones(len(slope))]), x)
+    y /= lengths(y)
+    return Poses(np.stack([x, y, across(x, y)], axis=2), middle)
 
 
 class Towed:
@@ -178,8 +174,7 @@ class Limb:
         return Poses(parent.rotation @ turn, parent.apply(hinge))
 
 
-@dataclass(frozen=True)
-class Rectangles:
+class Rectangles(NamedTuple):
     """Any number of rectangles. centre: (...,2). forward: (...,2) of length 1. half_m: (...,2)
     half length and half width."""
 
@@ -188,41 +183,23 @@ class Rectangles:
     half_m: Float
 
     @staticmethod
-    def standing(mesh: Mesh, xy: Float, heading: float, slack_m: float = 0.0) -> Rectangles:
-        """One rectangle, that of a mesh put there."""
+    def of(mesh: Mesh, poses: Poses, slack_m: float = 0.0) -> Rectangles:
+        """(N,) rectangles, that of a mesh at N poses."""
         low, high = mesh.bounds
-        forward = np.array([np.cos(heading), np.sin(heading)])
-        middle = (low + high)[:2] / 2
-        centre = xy + middle[0] * forward + middle[1] * _left(forward)
-        return Rectangles(centre, forward, (high - low)[:2] / 2 + slack_m)
-
-    @staticmethod
-    def moving(mesh: Mesh, way: Trajectory, times_s: Float, slack_m: float = 0.0) -> Rectangles:
-        """(T,) rectangles, that of a mesh at T times."""
-        low, high = mesh.bounds
-        n = len(times_s)
-        poses = way.poses(times_s)
+        n = len(poses.position)
         middle = np.append((low + high)[:2] / 2, 0.0)
-        centre = poses.apply(np.broadcast_to(middle, (n, 3)))[:, :2]
         forward = poses.rotation[:, :2, 0]
         forward = forward / np.linalg.norm(forward, axis=1, keepdims=True)
         half = np.broadcast_to((high - low)[:2] / 2 + slack_m, (n, 2))
-        return Rectangles(centre, forward, half)
-
-    @staticmethod
-    def stack(single: Sequence[Rectangles]) -> Rectangles:
-        """(S,) rectangles from S single ones."""
-        columns = ((r.centre, r.forward, r.half_m) for r in single)
-        return Rectangles(*(np.array(c).reshape(-1, 2) for c in zip(*columns, strict=True)))
+        return Rectangles(poses.apply(np.tile(middle, (n, 1)))[:, :2], forward, half)
 
     @staticmethod
     def joined(parts: Sequence[Rectangles]) -> Rectangles:
         """All of them, along the first axis."""
-        columns = ((p.centre, p.forward, p.half_m) for p in parts)
-        return Rectangles(*(np.concatenate(c) for c in zip(*columns, strict=True)))
+        return Rectangles(*(np.concatenate(c) for c in zip(*parts, strict=True)))
 
-    def __getitem__(self, rows: Int | None) -> Rectangles:
-        return Rectangles(self.centre[rows], self.forward[rows], self.half_m[rows])
+    def rows(self, rows: Int | slice) -> Rectangles:
+        return Rectangles(*(column[rows] for column in self))
 
 
 def overlap(a: Rectangles, b: Rectangles) -> Bool:
@@ -230,9 +207,9 @@ def overlap(a: Rectangles, b: Rectangles) -> Bool:
     away = b.centre - a.centre
     apart = np.zeros(away.shape[:-1], bool)
     for p, q in ((a, b), (b, a)):
-        for side, axis in enumerate((p.forward, _left(p.forward))):
+        for side, axis in enumerate((p.forward, left_of(p.forward))):
             reach = p.half_m[..., side] + q.half_m[..., 0] * np.abs(_dot(axis, q.forward))
-            reach = reach + q.half_m[..., 1] * np.abs(_dot(axis, _left(q.forward)))
+            reach = reach + q.half_m[..., 1] * np.abs(_dot(axis, left_of(q.forward)))
             apart |= np.abs(_dot(axis, away)) > reach
     return ~apart
 
@@ -241,10 +218,3 @@ def _dot(a: Float, b: Float) -> Float:
     """Inner product of (...,2) vectors; quicker than a sum over two."""
     product: Float = a[..., 0] * b[..., 0] + a[..., 1] * b[..., 1]
     return product
-
-
-def _left(forward: Float) -> Float:
-    left = np.empty(forward.shape)
-    np.negative(forward[..., 1], out=left[..., 0])
-    left[..., 1] = forward[..., 0]
-    return left

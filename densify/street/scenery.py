@@ -10,13 +10,18 @@ from functools import cache
 import numpy as np
 
 from densify.geometry.types import Float
-from densify.street.actors import CAR_WHEELBASE_M, any_paint, car_mesh
+from densify.street.actors import WHEELBASE_M, any_paint, car_mesh
 from densify.street.materials import Material
 from densify.street.mesh import Mesh, box, boxes, leaves, tube
-from densify.street.motion import Rectangles, on_ground, overlap
-from densify.street.terrain import Ground, Road, strip
+from densify.street.motion import Poses, Rectangles, on_ground, overlap, upright
+from densify.street.terrain import Ground, Road, Spans, strip
 
+FIRST_PARKED = 1000  # instances of parked cars count from here
 _PANEL_M = 2.0
+_AROUND = np.array([(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1)], float)
+
+Panel = Callable[[float], Mesh]
+"""Makes a piece of a fence, wall or hedge of a length in metres."""
 
 
 class Scenery:
@@ -27,51 +32,43 @@ class Scenery:
         self.rng = rng
         self.meshes: list[Mesh] = []
         self.footprints: list[Rectangles] = []
-        self._known = Rectangles(*np.empty((3, 0, 2)))
+        self._num_parked = 0
 
     def put(self, mesh: Mesh, xy: Float, heading: float = 0.0, solid: Mesh | None = None) -> None:
         """Stand a mesh (origin on the ground) somewhere. solid: the part one can run into."""
         z = float(self.ground.terrain.height(xy)) + self.ground.kerb_m
-        self.meshes.append(mesh.moved(xy[0], xy[1], z, heading))
-        self.footprints.append(Rectangles.standing(solid or mesh, xy, heading))
+        self._stand(mesh, upright((*xy, z), heading), solid or mesh)
+
+    def _stand(self, mesh: Mesh, pose: Poses, solid: Mesh) -> None:
+        self.meshes.append(mesh.posed(pose.matrix()))
+        self.footprints.append(Rectangles.of(solid, pose))
 
     def is_free(self, mesh: Mesh, xy: Float, heading: float, kerb_gap_m: float) -> bool:
         """Return True if the mesh would be clear of the carriageway and of all else."""
-        place = Rectangles.standing(mesh, xy, heading, 0.3)
-        if self.footprints and overlap(self._stacked(), place).any():
-            return False
-        forward = place.forward * place.half_m[0]
-        left = np.array([-place.forward[1], place.forward[0]]) * place.half_m[1]
-        around = np.array([place.centre + i * forward + j * left
-                           for i in (-1, 0, 1) for j in (-1, 0, 1)])  # fmt: skip
+        place = Rectangles.of(mesh, upright((*xy, 0.0), heading), 0.3)
+        if self.footprints:
+            self.footprints = [Rectangles.joined(self.footprints)]
+            if overlap(self.footprints[0], place).any():
+                return False
+        (x, y), half = place.forward[0], place.half_m[0]
+        around = place.centre + _AROUND * half @ [(x, y), (-y, x)]
         return float(self.ground.distance(around).min()) >= kerb_gap_m
 
-    def _stacked(self) -> Rectangles:
-        """All footprints; only the new ones are stacked."""
-        first = len(self._known.centre)
-        if first < len(self.footprints):
-            new = Rectangles.stack(self.footprints[first:])
-            self._known = Rectangles.joined([self._known, new])
-        return self._known
-
-    def put_if_free(self, mesh: Mesh, xy: Float, heading: float, kerb_gap_m: float) -> None:
-        if self.is_free(mesh, xy, heading, kerb_gap_m):
-            self.put(mesh, xy, heading)
-
-    def park(self, xy: Float, forward: Float, instance: int) -> None:
-        """A parked car; it leans with the slope as one that drives."""
-        mesh = car_mesh(any_paint(self.rng), self.rng).of_instance(instance)
-        half = forward * CAR_WHEELBASE_M / 2
-        pose = on_ground(
-            self.ground.terrain, (xy - half)[None], (xy + half)[None], np.zeros(1)
-        ).matrix()
-        self.meshes.append(mesh.posed(pose))
-        heading = float(np.arctan2(forward[1], forward[0]))
-        self.footprints.append(Rectangles.standing(mesh, xy, heading))
-
-    def row(
-        self, panel: Callable[[float], Mesh], start: Float, end: Float, kerb_gap_m: float
+    def put_if_free(
+        self, mesh: Mesh, xy: Float, heading: float, kerb_gap_m: float, solid: Mesh | None = None
     ) -> None:
+        if self.is_free(solid or mesh, xy, heading, kerb_gap_m):
+            self.put(mesh, xy, heading, solid)
+
+    def park(self, xy: Float, forward: Float) -> None:
+        """A parked car; it leans with the slope as one that drives."""
+        mesh = car_mesh(any_paint(self.rng), self.rng).of_instance(FIRST_PARKED + self._num_parked)
+        self._num_parked += 1
+        half = forward * WHEELBASE_M["car"] / 2
+        pose = on_ground(self.ground.terrain, (xy - half)[None], (xy + half)[None], np.zeros(1))
+        self._stand(mesh, pose, mesh)
+
+    def row(self, panel: Panel, start: Float, end: Float, kerb_gap_m: float) -> None:
         """A fence, wall or hedge from start to end, panel by panel, each at its own height."""
         length = float(np.linalg.norm(end - start))
         count = max(1, round(length / _PANEL_M))
@@ -92,18 +89,9 @@ def house(rng: np.random.Generator, width_m: float, depth_m: float) -> Mesh:
     parts = [box((-w, -d, -1.5), (w, d, height), wall, tint)]
     ridge = height + rng.uniform(0.3, 0.45) * depth_m
     eaves, o = height - 0.1, 0.4
-    roof = np.array(
-        [
-            [
-                (-w - o, -d - o, eaves),
-                (w + o, -d - o, eaves),
-                (w + o, 0, ridge),
-                (-w - o, 0, ridge),
-            ],
-            [(w + o, d + o, eaves), (-w - o, d + o, eaves), (-w - o, 0, ridge), (w + o, 0, ridge)],
-        ]
-    )
-    parts.append(Mesh.quads(roof, Material.ROOF, tint))
+    front = np.array([(-w - o, -d - o, eaves), (w + o, -d - o, eaves), (w + o, 0, ridge),
+                      (-w - o, 0, ridge)])  # fmt: skip
+    parts.append(Mesh.quads(np.array([front, front * (-1, -1, 1)]), Material.ROOF, tint))
     gable = np.array([[(s, -d, height), (s, d, height), (s, 0, ridge - 0.1), (s, 0, ridge - 0.1)]
                       for s in (-w, w)])  # fmt: skip
     parts.append(Mesh.quads(gable, wall, tint))
@@ -158,7 +146,7 @@ def tree(rng: np.random.Generator) -> tuple[Mesh, Mesh]:
     return Mesh.join(parts), foot
 
 
-def hedge(rng: np.random.Generator, height_m: float) -> Callable[[float], Mesh]:
+def hedge(rng: np.random.Generator, height_m: float) -> Panel:
     def panel(length_m: float) -> Mesh:
         half = np.array([length_m / 2, 0.35, height_m / 2])
         centres = rng.uniform(-1, 1, (int(75 * length_m * height_m), 3))
@@ -175,7 +163,7 @@ def hedge(rng: np.random.Generator, height_m: float) -> Callable[[float], Mesh]:
     return panel
 
 
-def wall(height_m: float, material: Material) -> Callable[[float], Mesh]:
+def wall(height_m: float, material: Material) -> Panel:
     @cache
     def panel(length_m: float) -> Mesh:
         half = length_m / 2 + 0.02
@@ -185,7 +173,7 @@ def wall(height_m: float, material: Material) -> Callable[[float], Mesh]:
     return panel
 
 
-def picket_fence(height_m: float, tint: tuple[float, float, float]) -> Callable[[float], Mesh]:
+def picket_fence(height_m: float, tint: tuple[float, float, float]) -> Panel:
     @cache
     def panel(length_m: float) -> Mesh:
         half = length_m / 2
@@ -202,32 +190,21 @@ def picket_fence(height_m: float, tint: tuple[float, float, float]) -> Callable[
 @cache
 def lamp_post() -> Mesh:
     """The arm reaches out along -y."""
-    return Mesh.join(
-        [
-            tube((0, 0, -0.3), (0, 0, 7.0), (0.09, 0.05), Material.METAL),
-            tube((0, 0, 6.9), (0, -1.6, 7.2), 0.04, Material.METAL),
-            box((-0.12, -2.1, 7.12), (0.12, -1.5, 7.24), Material.METAL),
-        ]
-    )
+    pole = tube((0, 0, -0.3), (0, 0, 7.0), (0.09, 0.05), Material.METAL)
+    arm = tube((0, 0, 6.9), (0, -1.6, 7.2), 0.04, Material.METAL)
+    return Mesh.join([pole, arm, box((-0.12, -2.1, 7.12), (0.12, -1.5, 7.24), Material.METAL)])
 
 
 def sign_post(rng: np.random.Generator) -> Mesh:
     """Faces -x."""
     tint = [(0.25, 0.4, 1.0), (1.0, 0.25, 0.2), (1.0, 0.9, 0.3)][int(rng.integers(3))]
-    return Mesh.join(
-        [
-            tube((0, 0, -0.3), (0, 0, 2.9), 0.035, Material.METAL),
-            box((-0.06, -0.32, 2.2), (-0.04, 0.32, 2.84), Material.PAINT, tint),
-        ]
-    )
+    pole = tube((0, 0, -0.3), (0, 0, 2.9), 0.035, Material.METAL)
+    return Mesh.join([pole, box((-0.06, -0.32, 2.2), (-0.04, 0.32, 2.84), Material.PAINT, tint)])
 
 
 @cache
 def litter_bin() -> Mesh:
     return tube((0, 0, 0.0), (0, 0, 0.9), (0.22, 0.25), Material.METAL, (0.45, 0.6, 0.45), 10)
-
-
-Span = tuple[float, float]
 
 
 @dataclass(frozen=True)
@@ -249,8 +226,7 @@ class Side:
 
     def heading(self, station_m: float) -> float:
         """Such that a mesh's +y points away from the road."""
-        tangent = self.road.curve.tangent(np.array([station_m]))[0] * self.side
-        return float(np.arctan2(tangent[1], tangent[0]))
+        return float(np.arctan2(*-self.forward(station_m)[::-1]))
 
     def forward(self, station_m: float) -> Float:
         """(2,) direction of the traffic on this side, which keeps to the right."""
@@ -258,9 +234,9 @@ class Side:
         return tangent
 
 
-def line_with_plots(scenery: Scenery, side: Side, pavement_m: float) -> None:
+def line_with_plots(scenery: Scenery, side: Side) -> None:
     """Houses behind front gardens, each closed off by a hedge, a wall or a fence."""
-    rng = scenery.rng
+    rng, pavement_m = scenery.rng, scenery.ground.pavement_m
     station = side.begin_m
     while station < side.end_m - 8:
         width = rng.uniform(11.0, 17.0)
@@ -277,8 +253,7 @@ def line_with_plots(scenery: Scenery, side: Side, pavement_m: float) -> None:
         if rng.random() < (0.45 if built else 1.0):
             shoot, foot = tree(rng)
             at = side.at(station + rng.uniform(2.0, width - 2.0), boundary + rng.uniform(1.2, 2.6))
-            if scenery.is_free(foot, at, 0.0, pavement_m):
-                scenery.put(shoot, at, solid=foot)
+            scenery.put_if_free(shoot, at, 0.0, pavement_m, foot)
         _close_off(scenery, side, station, station + width, boundary, gate=built)
         station += width
 
@@ -289,7 +264,7 @@ def _close_off(
     rng = scenery.rng
     kind = int(rng.integers(5))
     light = float(rng.uniform(0.8, 1.9))
-    panel: Callable[[float], Mesh] = [
+    panel: Panel = [
         hedge(rng, float(rng.uniform(0.9, 1.7))),
         hedge(rng, float(rng.uniform(0.9, 1.3))),
         wall(float(rng.uniform(0.6, 1.6)), Material.BRICK),
@@ -313,8 +288,7 @@ def furnish(scenery: Scenery, side: Side, spacing_m: float, trees: bool) -> None
                 if rng.random() < 0.5:
                     shoot, foot = tree(rng)
                     at = side.at(station + ahead * spacing_m, 0.75)
-                    if scenery.is_free(foot, at, 0.0, 0.2):
-                        scenery.put(shoot, at, solid=foot)
+                    scenery.put_if_free(shoot, at, 0.0, 0.2, foot)
         if rng.random() < 0.35:
             turned = heading + (np.pi if side.side > 0 else 0.0)
             scenery.put_if_free(sign_post(rng), side.at(station + 4.0, 0.5), turned, 0.1)
@@ -322,11 +296,9 @@ def furnish(scenery: Scenery, side: Side, spacing_m: float, trees: bool) -> None
             scenery.put_if_free(litter_bin(), side.at(station + 1.5, 0.5), heading, 0.2)
 
 
-def park_cars(
-    scenery: Scenery, side: Side, share: float, first_instance: int, keep_free: Sequence[Span]
-) -> int:
-    """Cars along the kerb. share: of the places taken. Returns the next instance."""
-    rng, instance = scenery.rng, first_instance
+def park_cars(scenery: Scenery, side: Side, share: float, keep_free: Spans) -> None:
+    """Cars along the kerb. share: of the places taken."""
+    rng = scenery.rng
     station = side.begin_m + 4.0
     while station < side.end_m - 4.0:
         taken = rng.random() < share
@@ -334,18 +306,12 @@ def park_cars(
         free = not any(a - 3.0 < station < b + 3.0 for a, b in keep_free)
         on_edge = float(scenery.ground.distance(at[None])[0])
         if taken and free and on_edge > -1.6:  # not in the mouth of a side road
-            scenery.park(at, side.forward(station), instance)
-            instance += 1
+            scenery.park(at, side.forward(station))
         station += rng.uniform(5.4, 6.6)
-    return instance
 
 
 def mark_lanes(
-    ground: Ground,
-    road: Road,
-    dashed: Sequence[float],
-    solid: Sequence[float],
-    spans: Sequence[Span],
+    ground: Ground, road: Road, dashed: Sequence[float], solid: Sequence[float], spans: Spans
 ) -> Mesh:
     """Lines at the given offsets to the left of the centreline, only within the spans."""
     dashes = [(s, s + 3.0) for a, b in spans for s in np.arange(a, b - 3.0, 9.0)]

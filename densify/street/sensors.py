@@ -1,10 +1,14 @@
 # SPDX-License-Identifier: MIT
-"""The sensors: which scanners they are made of, and every pulse of a sweep."""
+"""The sensors: which scanners they are made of, and every pulse of a sweep.
+
+A pattern has ``num_pulses(period_s)``, the pulses in a sweep, and ``directions(slots)``, (N,3) unit
+vectors in the axes of the scanner.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,18 +24,6 @@ class Slots(NamedTuple):
     number: Int
     share: Float
     time_s: Float
-
-
-class Pattern(Protocol):
-    """How one scanner fires."""
-
-    def num_pulses(self, period_s: float) -> int:
-        """Pulses in a sweep that lasts so long."""
-        ...
-
-    def directions(self, slots: Slots) -> Float:
-        """(N,3) unit vectors, axes of the scanner."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -58,7 +50,17 @@ class Spinning:
 
 
 @dataclass(frozen=True)
-class Raster:
+class _Steady:
+    """pulses_per_s: evenly spaced in time."""
+
+    pulses_per_s: int
+
+    def num_pulses(self, period_s: float) -> int:
+        return int(self.pulses_per_s * period_s + 1e-6)
+
+
+@dataclass(frozen=True)
+class Raster(_Steady):
     """A fast mirror swings from side to side while a slow one goes from top to bottom, once in a
     sweep. No two pulses of a sweep share an elevation.
 
@@ -69,10 +71,6 @@ class Raster:
     width_deg: float
     height_deg: float
     lines_per_s: int
-    pulses_per_s: int
-
-    def num_pulses(self, period_s: float) -> int:
-        return int(self.pulses_per_s * period_s + 1e-6)
 
     def directions(self, slots: Slots) -> Float:
         line = slots.number * (self.lines_per_s / self.pulses_per_s)
@@ -82,7 +80,7 @@ class Raster:
 
 
 @dataclass(frozen=True)
-class Rosette:
+class Rosette(_Steady):
     """Two prisms of equal power that turn at different rates draw a rose around the forward axis,
     which goes on from sweep to sweep and does not repeat (as in Livox's scanners).
 
@@ -92,35 +90,18 @@ class Rosette:
 
     width_deg: float
     turns_per_s: tuple[float, float]
-    pulses_per_s: int
-
-    def num_pulses(self, period_s: float) -> int:
-        return int(self.pulses_per_s * period_s + 1e-6)
 
     def directions(self, slots: Slots) -> Float:
         one, other = (np.pi * rate * slots.time_s for rate in self.turns_per_s)
         off_axis = np.radians(self.width_deg / 2) * np.cos(one - other)
-        roll = one + other
-        return np.stack(
-            [
-                np.cos(off_axis),
-                np.sin(off_axis) * np.cos(roll),
-                np.sin(off_axis) * np.sin(roll),
-            ],
-            axis=1,
-        )
+        roll, flat = one + other, np.sin(off_axis)
+        return np.stack([np.cos(off_axis), flat * np.cos(roll), flat * np.sin(roll)], axis=1)
 
 
 def _pointing(azimuth: Float, elevation: Float) -> Float:
     """(N,) rad each -> (N,3) unit vectors."""
-    return np.stack(
-        [
-            np.cos(elevation) * np.cos(azimuth),
-            np.cos(elevation) * np.sin(azimuth),
-            np.sin(elevation),
-        ],
-        axis=1,
-    )
+    flat = np.cos(elevation)
+    return np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)], axis=1)
 
 
 @dataclass(frozen=True)
@@ -131,7 +112,7 @@ class Scanner:
     lidar frame. velocity_sigma_m_s: noise of the radial velocity, None if it does not measure it.
     """
 
-    pattern: Pattern
+    pattern: Spinning | Raster | Rosette
     max_range_m: float
     range_sigma_m: float
     origin_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -145,10 +126,14 @@ class Sensor:
     name: str
     scanners: tuple[Scanner, ...]
 
+    def each(self, field: str) -> Float:
+        """Return a field of all scanners, (S,) or (S,3)."""
+        return np.array([getattr(scanner, field) for scanner in self.scanners], np.float64)
+
     @property
     def origins_m(self) -> Float:
         """(S,3) where the rays of each scanner start, lidar frame."""
-        return np.array([scanner.origin_m for scanner in self.scanners])
+        return self.each("origin_m")
 
     @property
     def measures_velocity(self) -> bool:
@@ -156,18 +141,15 @@ class Sensor:
         return all(scanner.velocity_sigma_m_s is not None for scanner in self.scanners)
 
     @property
-    def spins(self) -> bool:
-        """Return True if all scanners spin, with a beam for each ring."""
-        return all(isinstance(scanner.pattern, Spinning) for scanner in self.scanners)
-
-    @property
     def azimuth_tells_time(self) -> bool:
         """Return True if a single scanner spins about the lidar frame's origin."""
-        return len(self.scanners) == 1 and self.spins and not any(self.scanners[0].origin_m)
+        first = self.scanners[0]
+        spins = isinstance(first.pattern, Spinning)
+        return len(self.scanners) == 1 and spins and not any(first.origin_m)
 
 
-def _beams(*parts: NDArray[np.floating[Any]]) -> tuple[float, ...]:
-    return tuple(float(e) for e in np.concatenate(parts))
+def _beams(*parts: NDArray[Any]) -> tuple[float, ...]:
+    return tuple(np.concatenate(parts).tolist())
 
 
 def _widening(first_deg: float, last_deg: float, num: int) -> Float:
@@ -182,7 +164,6 @@ _VLP32_DEG = (
 )  # fmt: skip
 # two blocks of 32 lasers, the upper one with a third of a degree between beams
 _HDL64_DEG = _beams(np.linspace(2.0, -8.33, 32), np.linspace(-8.83, -24.33, 32))
-_OS128_DEG = _beams(np.linspace(22.5, -22.5, 128))
 # like the Pandar64: a sixth of a degree apart in the middle, 6 degrees at the lower end
 _PANDAR64_DEG = _beams(
     np.array([15.0, 11.0, 8.0, 5.0, 3.0]),
@@ -198,61 +179,43 @@ _VLS128_DEG = _beams(
     -3.9 - np.arange(1, 21) * 0.18,
     _widening(-7.5, -25.0, 23),
 )
+_HDL64 = Spinning(_HDL64_DEG, 20830)
+_HDL32 = Spinning(_beams(np.linspace(10.67, -30.67, 32)), 21690)
+_VLP16 = Spinning(_beams(np.linspace(15.0, -15.0, 16)), 18000)
+_OS128 = Spinning(_beams(np.linspace(22.5, -22.5, 128)), 10240)  # 1024 columns at 10 Hz
+_VLS128 = Spinning(_VLS128_DEG, 18000)
+_PANDAR64 = Spinning(_PANDAR64_DEG, 18000)
+_PANDAR_GT = Raster(400_000, 60.0, 20.0, 1000)
+_LIVOX = Rosette(200_000, 70.0, (121.6, -77.7))  # prisms at 7294 and -4664 turns a minute
+_AEVA = Raster(1_000_000, 110.0, 28.0, 900)
 
 SENSORS: dict[str, Sensor] = {
-    s.name: s
-    for s in (
-        Sensor("hdl64", (Scanner(Spinning(_HDL64_DEG, 20830), 100.0, 0.018),)),
-        Sensor(
-            "hdl32",
-            (Scanner(Spinning(_beams(np.linspace(10.67, -30.67, 32)), 21690), 90.0, 0.02),),
-        ),
-        Sensor(
-            "vlp16",
-            (Scanner(Spinning(_beams(np.linspace(15.0, -15.0, 16)), 18000), 100.0, 0.025),),
-        ),
+    name: Sensor(name, scanners)
+    for name, scanners in {
+        "hdl64": (Scanner(_HDL64, 100.0, 0.018),),
+        "hdl32": (Scanner(_HDL32, 90.0, 0.02),),
+        "vlp16": (Scanner(_VLP16, 100.0, 0.025),),
         # as Argoverse 2's: one above the other, half a turn apart
-        Sensor(
-            "dual32",
-            (
-                Scanner(Spinning(_VLP32_DEG, 18000), 120.0, 0.022),
-                Scanner(Spinning(_VLP32_DEG, 18000, 0.5), 120.0, 0.022, (0.0, 0.0, 0.25)),
-            ),
+        "dual32": (
+            Scanner(Spinning(_VLP32_DEG, 18000), 120.0, 0.022),
+            Scanner(Spinning(_VLP32_DEG, 18000, 0.5), 120.0, 0.022, (0.0, 0.0, 0.25)),
         ),
-        # like the OS1-128 with 1024 columns
-        Sensor("os128", (Scanner(Spinning(_OS128_DEG, 10240), 120.0, 0.02),)),
-        Sensor("vls128", (Scanner(Spinning(_VLS128_DEG, 18000), 150.0, 0.02),)),
+        "os128": (Scanner(_OS128, 120.0, 0.02),),
+        "vls128": (Scanner(_VLS128, 150.0, 0.02),),
         # as PandaSet's: one on the roof, and one in front of it, 0.6 m lower, that only looks ahead
-        Sensor(
-            "panda",
-            (
-                Scanner(Spinning(_PANDAR64_DEG, 18000), 120.0, 0.02, (0.2, -0.2, 0.1)),
-                Scanner(Raster(60.0, 20.0, 1000, 400_000), 150.0, 0.02, (1.7, -0.2, -0.5)),
-            ),
+        "panda": (
+            Scanner(_PANDAR64, 120.0, 0.02, (0.2, -0.2, 0.1)),
+            Scanner(_PANDAR_GT, 150.0, 0.02, (1.7, -0.2, -0.5)),
         ),
         # the same two exactly as far apart as on PandaSet's vehicle
-        Sensor(
-            "pandaset",
-            (
-                Scanner(Spinning(_PANDAR64_DEG, 18000), 120.0, 0.02),
-                Scanner(Raster(60.0, 20.0, 1000, 400_000), 150.0, 0.02, (0.58, 0.027, -0.294)),
-            ),
+        "pandaset": (
+            Scanner(_PANDAR64, 120.0, 0.02),
+            Scanner(_PANDAR_GT, 150.0, 0.02, (0.58, 0.027, -0.294)),
         ),
-        # like Aeva's: frequency-modulated, so that each return has its radial velocity
-        Sensor(
-            "fmcw",
-            (
-                Scanner(
-                    Raster(110.0, 28.0, 900, 1_000_000),
-                    150.0,
-                    0.02,
-                    velocity_sigma_m_s=0.05,
-                ),
-            ),
-        ),
-        # like Livox's: its prisms turn at 7294 and -4664 turns a minute
-        Sensor("rosette", (Scanner(Rosette(70.0, (121.6, -77.7), 200_000), 120.0, 0.02),)),
-    )
+        # frequency-modulated, so that each return has its radial velocity
+        "fmcw": (Scanner(_AEVA, 150.0, 0.02, velocity_sigma_m_s=0.05),),
+        "rosette": (Scanner(_LIVOX, 120.0, 0.02),),
+    }.items()
 }
 
 

@@ -22,6 +22,7 @@ from densify.street.materials import Material
 from densify.street.mesh import Mesh
 
 _STEP_M = 0.5
+Spans = Sequence[tuple[float, float]]
 
 
 class Curve:
@@ -40,13 +41,10 @@ class Curve:
 
     def __call__(self, station_m: Float) -> Float:
         """(N,) arc length -> (N,2)."""
-        inside = np.clip(station_m, 0.0, self.length_m)
-        beyond = (station_m - inside)[..., None]
-        xy: Float = self._spline(inside)
-        return xy + beyond * self.tangent(inside) if np.any(beyond) else xy
+        return self.with_tangent(station_m)[0]
 
     def with_tangent(self, station_m: Float) -> tuple[Float, Float]:
-        """The curve and its `tangent` there; quicker than one by one."""
+        """(N,) arc length -> the curve (N,2) and its `tangent` there."""
         inside = np.clip(station_m, 0.0, self.length_m)
         tangent = self.tangent(inside)
         return self._spline(inside) + (station_m - inside)[..., None] * tangent, tangent
@@ -60,8 +58,7 @@ class Curve:
 
     def normal(self, station_m: Float) -> Float:
         """(N,) -> (N,2) unit vector to the left of the direction of travel."""
-        tangent = self.tangent(station_m)
-        return np.stack([-tangent[..., 1], tangent[..., 0]], axis=-1)
+        return left_of(self.tangent(station_m))
 
     @staticmethod
     def bending(
@@ -81,6 +78,11 @@ class Curve:
         return Curve(xy[:: round(_STEP_M / step)])
 
 
+def left_of(forward: Float) -> Float:
+    """(...,2) -> (...,2) turned by a right angle."""
+    return np.stack([-forward[..., 1], forward[..., 0]], axis=-1)
+
+
 class Lane:
     """A path along a road: the road's centreline shifted sideways, possibly driven backwards."""
 
@@ -92,17 +94,15 @@ class Lane:
         offset = offset_m(stations) if callable(offset_m) else np.full(len(stations), offset_m)
         xy = road(stations) + road.normal(stations) * offset[:, None]
         self.curve = Curve(xy if forward else xy[::-1])
-        self._stations = stations if forward else stations[::-1]
-        self._sign = 1.0 if forward else -1.0
+        self._abreast_m = self.curve.knots_m[:: 1 if forward else -1]
+        self._stations = stations
 
     def at(self, station_m: float) -> float:
         """Arc length on this lane abreast of the road's station."""
-        return float(
-            np.interp(self._sign * station_m, self._sign * self._stations, self.curve.knots_m)
-        )
+        return float(np.interp(station_m, self._stations, self._abreast_m))
 
 
-def polyline(corners: Sequence[tuple[float, float]], radius_m: float) -> Float:
+def polyline(corners: Sequence[Float | tuple[float, float]], radius_m: float) -> Float:
     """(N,2) points every half metre along straight lines whose corners are rounded with arcs."""
     pieces = [np.asarray(corners[0], float)[None]]
     for before, corner, after in zip(corners[:-2], corners[1:-1], corners[2:], strict=True):
@@ -270,25 +270,22 @@ class Ground:
     def _flat(self, corners: Float, side: int) -> Mesh:
         """(K,3,2) triangles of the road (side 0) or of what lies beside it (side 1)."""
         flat = corners.reshape(-1, 2)
-        z = self.terrain.height(flat) + self.kerb_m * side
-        material = np.full(len(corners), Material.ASPHALT)
-        if side:
-            beside = self.distance(corners.mean(axis=1)) < self.pavement_m
-            material = np.where(beside, Material.PAVING, Material.GRASS)
+        k = len(corners)
+        beside = self.distance(corners.mean(axis=1)) < self.pavement_m if side else np.zeros(k)
+        kinds = Material.ASPHALT, Material.GRASS, Material.PAVING
         return Mesh(
-            vertices=np.column_stack([flat, z]),
-            triangles=np.arange(len(flat)).reshape(-1, 3),
+            vertices=np.column_stack([flat, self.terrain.height(flat) + self.kerb_m * side]),
+            triangles=np.arange(3 * k).reshape(k, 3),
             uv=flat,
-            material=material.astype(np.int16),
-            tint=np.ones((len(corners), 3)),
-            instance=np.full(len(corners), -1, np.int32),
+            material=np.array(kinds, np.int16)[(side + beside).astype(int)],
+            tint=np.ones((k, 3)),
+            instance=np.full(k, -1, np.int32),
         )
 
     def _upright(self, edges: Float) -> Mesh:
         """(K,2,2) -> kerb faces."""
-        low = np.concatenate(
-            [edges, self.terrain.height(edges.reshape(-1, 2)).reshape(-1, 2, 1)], 2
-        )
+        z = self.terrain.height(edges.reshape(-1, 2)).reshape(-1, 2, 1)
+        low = np.concatenate([edges, z], axis=2)
         high = low + [0.0, 0.0, self.kerb_m]
         corners = np.stack([low[:, 1], low[:, 0], high[:, 0], high[:, 1]], axis=1)
         return Mesh.quads(corners, Material.KERB)
@@ -308,21 +305,13 @@ def _grid(low: Float, high: Float, cell_m: float) -> tuple[Float, Float]:
     return np.column_stack([x.ravel(), y.ravel()]), np.stack([i, i + 1, i + nx + 1, i + nx], axis=1)
 
 
-def strip(
-    ground: Ground,
-    curve: Curve,
-    offset_m: float,
-    width_m: float,
-    spans: Sequence[tuple[float, float]],
-) -> Mesh:
+def strip(ground: Ground, curve: Curve, offset_m: float, width_m: float, spans: Spans) -> Mesh:
     """Paint on the road: a band along the curve, only over the given spans of stations."""
     meshes = []
     for begin, end in spans:
         stations = np.linspace(begin, end, max(2, int((end - begin) / 1.0) + 1))
-        sides = [
-            curve(stations) + curve.normal(stations) * (offset_m + shift)
-            for shift in (-width_m / 2, width_m / 2)
-        ]
+        middle, normal = curve(stations), curve.normal(stations)
+        sides = (middle + normal * (offset_m + shift) for shift in (-width_m / 2, width_m / 2))
         right, left = (np.column_stack([s, ground.terrain.height(s) + 0.006]) for s in sides)
         corners = np.stack([right[:-1], right[1:], left[1:], left[:-1]], axis=1)
         meshes.append(Mesh.quads(corners, Material.PAINT))
