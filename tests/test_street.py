@@ -12,13 +12,12 @@ from densify.config.errors import InputError
 from densify.geometry.poses import inverse, transform
 from densify.readers.street import Street
 from densify.street.actors import SPAN_S, WHEELBASE_M
-from densify.street.lidar import scan
 from densify.street.materials import GLASS_PASSES, LASER_PASSES, Material
 from densify.street.mesh import Mesh, box
-from densify.street.motion import Driving, Poses, Still, Towed
+from densify.street.motion import Poses, Still, Towed
 from densify.street.sensors import SENSORS, firings
 from densify.street.simulator import Simulator, build_scene, seconds
-from densify.street.terrain import Curve, Lane, Road, Speed, Terrain, polyline
+from densify.street.terrain import Curve, Lane, Road, Speed, polyline
 from densify.street.traffic import EGO_BOX, Scene
 from densify.street.world import Body, Rays, World
 
@@ -198,31 +197,6 @@ def test_same_bytes_fresh_and_cached(highway, tmp_path, monkeypatch):
     fresh = Street.from_spec("street:highway?sensor=vlp16")
     assert fresh.simulator.scene is not highway.simulator.scene
     assert _bytes(fresh, 30) == first
-
-
-def _room(half_m: float) -> World:
-    room = box((-half_m,) * 3, (half_m,) * 3, Material.PLASTER)
-    return World([Body(room, Still())])
-
-
-def _standing(terrain: Terrain | None = None) -> Driving:
-    flat = terrain or Terrain(np.ones((1, 2)), np.zeros(1), np.zeros(1))
-    line = Curve(np.column_stack([np.arange(-50, 50.5, 0.5), np.zeros(201)]))
-    return Driving(line, Speed((0.0, 0.0)), 50.0, 0.0, flat, 2.7)
-
-
-def test_ranges_have_the_sensors_noise_and_some_pulses_are_lost():
-    sensor = SENSORS["hdl64"]
-    returns = scan(_room(15.0), _standing(), sensor, 0.0, np.random.default_rng(0))
-    world = returns.points.astype(float) + [0, 0, 1.73]
-    off_wall = 15.0 - np.abs(world).max(axis=1)
-    slant = np.abs(world / 15.0).max(axis=1) * 15.0 / np.linalg.norm(returns.points, axis=1)
-    wall = np.abs(returns.points[:, 2]) < 6  # clear of floor and ceiling
-    noise = (off_wall / slant)[wall]
-    assert abs(noise.mean()) < 0.002
-    assert abs(noise.std() - sensor.scanners[0].range_sigma_m) < 0.003
-    fired = 2083 * 64
-    assert 0.9 * fired < len(returns.points) < fired
 
 
 class _Sliding:
@@ -494,15 +468,6 @@ def test_bad_specs_are_one_clear_line(spec, message):
     with pytest.raises(InputError) as error:
         Street.from_spec(spec)
     assert message in str(error.value) and "\n" not in str(error.value)
-
-
-def test_specs_name_what_they_open():
-    opened = Street.from_spec("street:crossing?seed=3&sensor=dual32")
-    simulator = opened.simulator
-    assert (simulator.preset, simulator.seed, simulator.sensor.name) == ("crossing", 3, "dual32")
-    assert Street.from_spec(opened.name).name == opened.name
-    with pytest.raises(InputError, match="seed"):
-        Street("street", -2)
 
 
 def test_frames_and_cameras_that_do_not_exist_are_named(street):

@@ -145,15 +145,21 @@ def test_rays_start_at_their_scanner_and_truth_lies_on_the_walls(name, hz, tilt_
         ray = returns.points[own] - sensor.origins_m[lidar]
         ray /= np.linalg.norm(ray, axis=1, keepdims=True)
         fired = firings(sensor, time_s, simulator.period_ns)
-        row = np.flatnonzero(fired.lidar == lidar)
-        row = row[np.searchsorted(fired.offset_ns[row], offset_ns[own])]
+        pulses = np.flatnonzero(fired.lidar == lidar)
+        row = pulses[np.searchsorted(fired.offset_ns[pulses], offset_ns[own])]
         np.testing.assert_allclose(ray, fired.direction[row], atol=1e-6)
         on_wall = np.sort(np.abs(world[own]), axis=1)
         clear = on_wall[:, 1] < ROOM_M - 1  # of the room's edges
         off_wall = on_wall[clear, 2] - ROOM_M
         assert clear.sum() > 500
+        assert 0.9 * len(pulses) < own.sum() < len(pulses)  # some pulses are lost
         assert np.abs(off_wall).max() < 5 * scanner.range_sigma_m
         assert abs(off_wall.mean()) < 0.1 * scanner.range_sigma_m
+        slant = np.max(np.abs(world[own] - T_world_lidar[:3, 3]), axis=1)[clear]
+        noise_m = (
+            off_wall / slant * np.linalg.norm(world[own] - T_world_lidar[:3, 3], axis=1)[clear]
+        )
+        assert noise_m.std() == pytest.approx(scanner.range_sigma_m, rel=0.2)
         raw_wall = np.sort(np.abs(raw[own]), axis=1)[clear, 2] - ROOM_M
         assert np.abs(raw_wall).max() > 0.1  # without truth the sweep is distorted
 
