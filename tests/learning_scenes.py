@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 import densify.learning.training
-from densify.learning.clips import Clip, ClipMaker, ClipSweep, Labels
+from densify.learning.clips import Clip, ClipMaker, ClipSweep
 
 NUM_SWEEPS = 4
 PERIOD_S = 0.1
@@ -30,20 +30,18 @@ def clip(number: int, seed: int = 0, num_points: int = 300) -> Clip:
         moves = np.arange(2 * num_points) >= num_points
         step = np.array([*speed, 0.0]) * PERIOD_S
         flow = np.stack([-step * moves[:, None] * (i > 0), step * moves[:, None]])
-        labels = Labels(flow.astype(np.float32), moves)
-        if i == NUM_SWEEPS - 1:
-            labels.flow[1] = 0
+        flow[1] *= i < NUM_SWEEPS - 1
         sweeps.append(
             ClipSweep(
                 points.astype(np.float32),
                 height_m.astype(np.float32),
                 np.zeros(3, np.float32),
                 i * PERIOD_S,
-                labels,
-                labels,
+                flow.astype(np.float32),
+                moves,
             )
         )
-    return Clip(tuple(sweeps))
+    return tuple(sweeps)
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,7 @@ import yaml
 
 from densify.cli import verbs
 from densify.cli.answer import Answer
-from densify.cli.verbs import doctor
+from densify.cli.verbs import recordings
 from densify.config import Config, as_mapping, resolve
 from densify.config.errors import ComputationError, InputError
 from tests.command import exit_code, files_in, refused
@@ -197,7 +197,6 @@ BAD_COMMANDS: dict[str, tuple[list[str], list[str]]] = {
     ),
     "misspelt reader": (["info", "kiti:{tmp}/x"], ["kiti:{tmp}/x", "did you mean kitti?"]),
     "abbreviated option": ([*RUN, "--win", "3"], ["--win"]),
-    "removed option": ([*RUN, "--at", "sweep"], ["--at", "--set project.at"]),
     "no key": (["run"], ["--key", "densify run --help"]),
     "key is no number": (["run", "--key", "x"], ["--key", "'x'", "whole number"]),
     "a very long number": (["run", "--key", "1" * 5000], ["argument --key: got '1111"]),
@@ -274,7 +273,7 @@ def answering(monkeypatch: pytest.MonkeyPatch, *answers: Answer | BaseException)
                 raise answer
             yield answer
 
-    monkeypatch.setattr(doctor, "answer_info", verb)
+    monkeypatch.setattr(recordings, "answer_info", verb)
 
 
 @pytest.mark.parametrize(
@@ -321,7 +320,7 @@ def test_warnings_are_lines_on_stderr_and_those_of_others_are_not_shown(monkeypa
         logging.getLogger("densify").warning("window cut to frames %d to %d", 0, 5)
         return [Answer("result")]
 
-    monkeypatch.setattr(doctor, "answer_info", warn)
+    monkeypatch.setattr(recordings, "answer_info", warn)
     assert exit_code("info") == 0 and exit_code("info") == 0
     captured = capsys.readouterr()
     assert captured.out == "result\n" * 2

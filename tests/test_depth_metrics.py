@@ -12,14 +12,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from densify.config.errors import InputError
 from densify.geometry.types import Camera, DepthMap
 from densify.scores.depth_metrics import (
     DepthErrors,
     depth_edges,
     depth_errors,
     depth_scores,
-    errors_by_part,
     mean_errors,
 )
 
@@ -169,14 +167,6 @@ def test_depth_edges_agree_with_the_slow_twin(density):
     edges = depth_edges(truth, focal_px=700.0, baseline_m=0.5)
     assert np.array_equal(edges, slow_edges(truth.astype(float), 350.0))
     assert 0.1 < edges[truth > 0].mean() < 0.9
-
-
-def test_parts_name_a_wrong_shape():
-    a, b = np.ones((2, 3), np.float32), np.ones((3, 2), np.float32)
-    with pytest.raises(InputError, match="truth"):
-        errors_by_part(a, b, focal_px=700.0)
-    with pytest.raises(InputError, match="mask"):
-        errors_by_part(a, a, b > 0, focal_px=700.0)
 
 
 def test_means_are_over_images_not_pixels():

@@ -13,7 +13,7 @@ import yaml
 from plyfile import PlyData
 
 import densify
-from densify.config.plugins.exports import EXPORTS
+from densify.config.written import EXPORTS
 from densify.outputs import export_run, read_cloud, read_depth_png
 from densify.outputs.depth_png import stored_age, stored_confidence
 from densify.readers.depth_trees import pair_depth_files

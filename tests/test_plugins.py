@@ -18,8 +18,7 @@ import pytest
 import densify
 from densify.config import resolve
 from densify.config.errors import InputError
-from densify.config.plugins.engines import engine
-from densify.config.plugins.readers import READERS
+from densify.config.plugins import READERS, engine
 from densify.flow.engines import check_engine
 from densify.outputs.store import check_writable, write_result
 from densify.readers import Spec
@@ -102,9 +101,6 @@ def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
 
 
 STILL = """
-    '''Nothing moves.
-
-    And more.'''
     from dataclasses import dataclass
     ARGUMENT, SHARED = "N", True
     @dataclass
@@ -124,7 +120,7 @@ def test_a_module_says_what_a_row_says(package) -> None:
     assert resolve(None, ["flow.engine=still:3"]).flow.engine == "still:3"
     assert module not in sys.modules  # the configuration imports none
     row, argument = engine("still:3")
-    assert (row.name, row.module, row.about) == ("still", module, "Nothing moves.")
+    assert (row.name, row.module) == ("still", module)
     assert row.shared and row.usage == "still:N" and argument == "3"
     check_engine("still:3")
     with pytest.raises(InputError, match="still:x: expected a number"):
@@ -163,7 +159,7 @@ def test_a_reader_of_another_package(package, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no known recording there; expected a KITTI raw drive"):
         densify.open_sequence(there)
     package("densify.readers", "marked", code)
-    with pytest.raises(InputError, match=", marks"):
+    with pytest.raises(InputError, match=", marks or a folder"):
         densify.open_sequence(there)
     (there / "mark").touch()
     (data / "labels").mkdir()  # numbered, and named before it
@@ -175,7 +171,7 @@ def test_a_reader_of_another_package(package, tmp_path: Path) -> None:
     assert densify.open_sequence(there) == (there, None)
     assert densify.open_sequence(f"marked:{data}#night") == (data, "night")
     assert Spec.parse("marked:here").absolute() == f"marked:{Path.cwd()}/here"
-    assert [row.name for row in READERS][-1] == "marked"
+    assert [row.name for row in READERS][-2:] == ["marked", "folder"]
 
 
 RESULT = SimpleNamespace(

@@ -37,7 +37,6 @@ KITTI_FOCAL_PX = 721.5377
 
 def evaluate(
     pairs: DepthPairs,
-    *,
     focal_px: float = KITTI_FOCAL_PX,
     baseline_m: float = KITTI_BASELINE_M,
     progress: Progress | None = None,
@@ -72,23 +71,23 @@ def evaluate(
         images.append({**paths, "density": densities, **asdict(parts["all"])})
         if progress is not None:
             progress("evaluate", number + 1, len(pairs.pairs))
-    density = {
-        side: float(np.mean([image["density"][side] for image in images]))
-        for side in ("predicted", "truth")
-    }
+    sides, lonely = ("predicted", "truth"), ("truth", "prediction", "mask")
     means = {
         name: {
-            "num_images": sum(errors.num_compared > 0 for errors in several),
+            "num_images": sum(e.num_compared > 0 for e in several),
             **asdict(mean_errors(several)),
         }
         for name, several in by_part.items()
     }
-    alone = {
-        name: [str(path) for path in getattr(pairs, name)]
-        for name in ("without_truth", "without_prediction", "without_mask")
+    return {
+        "schema_version": SCHEMA_VERSION,
+        **stereo,
+        "num_images": len(images),
+        "density": {s: float(np.mean([image["density"][s] for image in images])) for s in sides},
+        "parts": means,
+        "images": images,
+        **{f"without_{side}": [*map(str, getattr(pairs, f"without_{side}"))] for side in lonely},
     }
-    found = {"num_images": len(images), "density": density, "parts": means, "images": images}
-    return {"schema_version": SCHEMA_VERSION, **stereo, **found, **alone}
 
 
 def _read(pair: DepthPair) -> tuple[Float32, Float32, Bool | None]:

@@ -13,11 +13,12 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from densify.bench.scoring import Scorer, Window, points_in_world
+from densify.bench.scoring import Scorer, Window
 from densify.config import Config, as_mapping, resolve
 from densify.config.errors import InputError
 from densify.flow.engines import Scene, estimate_motion
 from densify.free_space.ground import ABOVE_GROUND_M, ground
+from densify.geometry import poses
 from densify.geometry.types import FlowField, LidarSequence, Progress, Stretch
 from densify.pipeline.recording import Recording
 
@@ -87,9 +88,10 @@ def open_window(sequence: LidarSequence, key: int, size: int, config: Config) ->
     recording = Recording(sequence, config, size, [key], looks_around=True)
     stretch = recording.window(key)
     heights = ground(stretch)
-    above = {
-        f: heights.above(points_in_world(stretch, f)) >= ABOVE_GROUND_M for f in stretch.frames
-    }
+    above = {}
+    for registered in stretch.sweeps:
+        points = poses.transform(registered.T_world_lidar, registered.sweep.points)
+        above[registered.sweep.frame] = heights.above(points) >= ABOVE_GROUND_M
     return Window(stretch, key, recording.around(key), above)
 
 
@@ -103,7 +105,8 @@ def _flows(
         return still, still, 0.0
     config = resolve(as_mapping(config), changes)
     if method == "ours":  # what is compiled must not count
-        _motion(window.around_key(), config)
+        here = frames.index(window.key)
+        _motion(Stretch(window.stretch.sweeps[max(0, here - 1) : here + 2]), config)
     start = time.perf_counter()
     motion = _motion(window.around if method == "ours" else window.stretch, config, frames)
     steps = {f: motion.flow(f, window.towards_key(f)) for f in frames if f != window.key}

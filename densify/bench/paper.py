@@ -3,9 +3,9 @@
 without Learning" (3DV 2020), measured again.
 
 Methods see 2,048 points drawn of each cloud within 35 m, as in the paper; this package and trained
-networks see all points, and are scored at the drawn ones. Scores
-are the paper's: mean end-point error; share of points within 5 cm or 5 %, within 10 cm or 10 %;
-mean angle to the true flow where that is not 0. Means over pairs.
+networks see all points, and are scored at the drawn ones. Scores are the paper's: mean end-point
+error; share of points within 5 cm or 5 %, within 10 cm or 10 %; mean angle to the true flow where
+that is not 0. Means over pairs.
 """
 
 from __future__ import annotations
@@ -13,11 +13,9 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
-from scipy.spatial import cKDTree
-from scipy.spatial.transform import Rotation
 
 from densify.bench.paper_pairs import FARTHEST_M, PaperPair
 from densify.config import Config
@@ -35,41 +33,10 @@ PUBLISHED: Mapping[str, Mapping[str, float]] = {
 }
 """The paper's row without learning, by set."""
 
-_ICP_REACH_M, _ICP_STEPS, _ICP_SETTLED_M = 1.0, 20, 1e-3
 _SEED = 0
 
 Flow = Callable[[Float, Float, PaperPair], Float]
 """Drawn source and target, and the whole pair -> flow of the drawn source, or of the whole one."""
-
-
-class Row(NamedTuple):
-    """A method. whole: its flow is of all points."""
-
-    about: str
-    flow: Flow
-    whole: bool = False
-
-
-def rigid_icp(source: Float, target: Float) -> Float:
-    """Return the (n,3) flow of one rigid motion of the whole cloud, from rest.
-
-    source, target: (n,3), (m,3) metres, one frame.
-    Point to point: Besl and McKay, "A Method for Registration of 3-D Shapes", PAMI 1992.
-    """
-    tree, moved = cKDTree(target), source
-    for _ in range(_ICP_STEPS):
-        distance_m, near = tree.query(moved, distance_upper_bound=_ICP_REACH_M)
-        hit = np.isfinite(distance_m)
-        if hit.sum() < 3:
-            break
-        own, goal = moved[hit], target[np.asarray(near)[hit]]
-        turn, _ = Rotation.align_vectors(goal - goal.mean(axis=0), own - own.mean(axis=0))
-        new = turn.apply(moved - own.mean(axis=0)) + goal.mean(axis=0)
-        step_m = np.abs(new - moved).max()
-        moved = new
-        if step_m < _ICP_SETTLED_M:
-            break
-    return moved - source
 
 
 def _objective(solver: str, **settings: Any) -> Flow:
@@ -83,14 +50,15 @@ def _ours(source: Float, target: Float, pair: PaperPair) -> Float:
     return estimate_flow(pair.source, pair.target, Config()).displacement
 
 
-METHODS = {
-    "rest": Row("nothing moves", lambda s, t, pair: np.zeros_like(s)),
-    "icp": Row("rigid ICP of the whole cloud", lambda s, t, pair: rigid_icp(s, t)),
-    "paper-adam": Row("the objective as published: Adam, 1,500 steps", _objective("adam")),
-    "paper": Row("the objective, this package's solver", _objective("pcg")),
-    "no-laplacian": Row("Table 2: without the Laplacian", _objective("pcg", alpha=0.0)),
-    "ours": Row("this package on two whole clouds", _ours, whole=True),
+METHODS: dict[str, Flow] = {
+    "rest": lambda source, target, pair: np.zeros_like(source),
+    "paper-adam": _objective("adam"),
+    "paper": _objective("pcg"),
+    "no-laplacian": _objective("pcg", alpha=0.0),
+    "ours": _ours,
 }
+"""rest: nothing moves. paper-adam: the objective as published, Adam, 1,500 steps. paper: by this
+package's solver. no-laplacian: the paper's Table 2. ours: this package on two whole clouds."""
 DEFAULT_METHODS = tuple(name for name in METHODS if name != "paper-adam")
 
 
@@ -108,42 +76,41 @@ def bench_paper(
     """
     if num_points < 1:
         raise InputError(f"--points {num_points}: expected 1 or more")
-    rows = _rows(methods, models)
-    found: dict[str, list[dict[str, float]]] = {name: [] for name in rows}
+    flows = _flows(methods, models)
+    found: dict[str, list[dict[str, float]]] = {name: [] for name in flows}
     num_pairs = 0
     for pair in pairs:
         if progress is not None:
             progress(pair.name, num_pairs, num_pairs + 1)
         num_pairs += 1
-        for name, row in rows.items():
-            found[name].append(_measured(row, pair, num_points))
+        for name, flow in flows.items():
+            found[name].append(_measured(flow, pair, num_points))
     if not num_pairs:
         raise InputError("densify bench paper: no pairs of sweeps; choose another recording")
-    means = {name: {"about": rows[name].about, **_mean(found[name])} for name in rows}
+    means = {name: _mean(measured) for name, measured in found.items()}
     return {"num_pairs": num_pairs, "num_points": num_points, "methods": means}
 
 
-def _rows(methods: Sequence[str], models: Sequence[Path]) -> dict[str, Row]:
+def _flows(methods: Sequence[str], models: Sequence[Path]) -> dict[str, Flow]:
     for name in methods:
         if name not in METHODS:
             raise InputError(f"--methods {name}: expected some of {', '.join(METHODS)}")
-    rows = {name: METHODS[name] for name in METHODS if name in methods}
-    return rows | {path.name: _learned(path) for path in models}
+    flows = {name: METHODS[name] for name in METHODS if name in methods}
+    return flows | {path.name: _learned(path) for path in models}
 
 
-def _learned(path: Path) -> Row:
+def _learned(path: Path) -> Flow:
     model = read_model(path)
-    about = f"network, teacher {model.made.get('teacher')}, {model.made.get('steps')} steps"
-    return Row(about, lambda s, t, pair: model.flow(pair.sweeps), whole=True)
+    return lambda source, target, pair: model.flow(pair.sweeps)
 
 
-def _measured(row: Row, pair: PaperPair, num_points: int) -> dict[str, float]:
+def _measured(method: Flow, pair: PaperPair, num_points: int) -> dict[str, float]:
     rng = np.random.default_rng(_SEED)
     drawn, of_target = (_drawn(cloud, num_points, rng) for cloud in (pair.source, pair.target))
     start = time.perf_counter()
-    flow = row.flow(pair.source[drawn], pair.target[of_target], pair)
+    flow = method(pair.source[drawn], pair.target[of_target], pair)
     seconds = time.perf_counter() - start
-    flow = flow[drawn] if row.whole else flow
+    flow = flow[drawn] if len(flow) == len(pair.source) else flow
     true = pair.flow[drawn]
     scores = {
         "epe_m": metrics.end_point_error(flow, true),

@@ -63,17 +63,15 @@ def pair_of_recording(spec: str, key: int) -> PaperPair:
     InputError for a key without a next sweep, ComputationError where one cannot be registered.
     """
     sequence = open_sequence(spec)
-    labels, settings = "engine", resolve(None)
+    teacher, settings = "engine", resolve(None)
     if sequence.truth is not None:
-        labels, settings = "truth", resolve({"register": {"source": "dataset"}})
-    clip = make_clip(sequence, key, settings, labels)
-    here = next(i for i, s in enumerate(clip.sweeps) if not s.origin_m.any())
-    if here + 1 == len(clip.sweeps):
+        teacher, settings = "truth", resolve({"register": {"source": "dataset"}})
+    clip = make_clip(sequence, key, settings, teacher)
+    here = next(i for i, s in enumerate(clip) if not s.origin_m.any())
+    if here + 1 == len(clip):
         raise InputError(f"--data {spec}: no sweep after {key}; choose an earlier one")
-    sample = sample_of(clip, here, here + 1, _MOST_SWEEPS, labels)
-    if sample.flow is None or sample.moving is None:
-        raise ValueError("expected a sample with labels")
-    source, target = (clip.sweeps[n].points.astype(np.float64) for n in (here, here + 1))
+    sample = sample_of(clip, here, here + 1, _MOST_SWEEPS)
+    source, target = (clip[n].points.astype(np.float64) for n in (here, here + 1))
     flow, moving = sample.flow.double().numpy(), sample.moving.numpy()
     return PaperPair(f"{spec}@{key}", source, target, flow, moving, sample.sweeps)
 
@@ -103,31 +101,20 @@ def read_pair(path: Path) -> PaperPair:
     for name, array in zip(found, (source, target, flow), strict=False):
         if array.ndim != 2 or array.shape[1] != 3 or not np.isfinite(array).all():
             raise InputError(f"{path}: {name}: got shape {array.shape}, expected (N,3) numbers")
-    if len(flow) != len(source):
-        raise InputError(f"{path}: {found[2]}: got {len(flow)} rows, expected {len(source)}")
-    valid = np.ones(len(source), bool)
-    if found[3] in arrays:
-        valid = np.asarray(arrays[found[3]]).astype(bool).ravel()
-        if len(valid) != len(source):
-            raise InputError(f"{path}: {found[3]}: got {len(valid)}, expected {len(source)}")
+    valid = np.asarray(arrays.get(found[3], np.ones(len(source)))).astype(bool).ravel()
+    for name, rows in ((found[2], flow), (found[3], valid)):
+        if len(rows) != len(source):
+            raise InputError(f"{path}: {name}: got {len(rows)} rows, expected {len(source)}")
     if found is _NAMES[0]:
         source, target, flow = (x @ _R_FLU_CAMERA.T for x in (source, target, flow))
-    return _pair(path.stem, source[valid], target, flow[valid], str(path))
-
-
-def _pair(name: str, source: Float, target: Float, flow: Float, where: str) -> PaperPair:
-    """Return the pair within 35 m ahead (x). Raises InputError, which begins with ``where``, for no
-    points there."""
-    near = np.abs(source[:, 0]) < FARTHEST_M
-    source, flow = source[near], flow[near]
+    valid &= np.abs(source[:, 0]) < FARTHEST_M
+    source, flow = source[valid], flow[valid]
     target = target[np.abs(target[:, 0]) < FARTHEST_M]
     if not (len(source) and len(target)):
-        raise InputError(f"{where}: no valid point within {FARTHEST_M:g} m ahead")
+        raise InputError(f"{path}: no valid point within {FARTHEST_M:g} m ahead")
     lowest = min(source[:, 2].min(), target[:, 2].min())
-    sweeps = []
-    for points in (source, target):
-        given = AboveGround(
-            np.arange(len(points)), points, (points[:, 2] - lowest).astype(np.float32)
-        )
-        sweeps.append(given.cloud(np.zeros(3)))
-    return PaperPair(name, source, target, flow, None, tuple(sweeps))
+    sweeps = [
+        AboveGround(np.arange(len(x)), x, (x[:, 2] - lowest).astype(np.float32)).cloud(np.zeros(3))
+        for x in (source, target)
+    ]
+    return PaperPair(path.stem, source, target, flow, None, sweeps)

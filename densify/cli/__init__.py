@@ -21,7 +21,7 @@ from collections.abc import Sequence
 from typing import NoReturn, TextIO
 
 from densify import __version__
-from densify.cli.screen import Screen
+from densify.cli.screen import Screen, screen
 from densify.cli.verbs import parse
 from densify.config.errors import ComputationError, InputError, is_out_of_memory
 from densify.pipeline.heap import keep_freed_memory
@@ -36,29 +36,29 @@ def main(arguments: Sequence[str] | None = None) -> int:
     2: an InputError, an error of the system, or (by argparse, which exits) a bad argument.
     130: interrupted.
     """
-    with Screen() as screen:
+    with screen() as shown:
         try:
-            _run(arguments, screen)
-            return screen.end(DONE)
+            _run(arguments, shown)
+            return shown.end(DONE)
         except InputError as error:
-            return screen.end(BAD_INPUT, str(error))
+            return shown.end(BAD_INPUT, str(error))
         except ComputationError as error:
-            return screen.end(FAILED, str(error))
+            return shown.end(FAILED, str(error))
         except KeyboardInterrupt:
-            return screen.end(INTERRUPTED, "interrupted; what was unfinished is not kept")
+            return shown.end(INTERRUPTED, "interrupted; what was unfinished is not kept")
         except BrokenPipeError:
             _let_go_of(sys.stdout)  # its reader has seen enough
             return DONE
         except OSError as error:
             _let_go_of(sys.stdout)
             where = error.filename or "stdout"
-            return screen.end(BAD_INPUT, f"{where}: {error.strerror or error}")
+            return shown.end(BAD_INPUT, f"{where}: {error.strerror or error}")
         except Exception as error:
             if is_out_of_memory(error):
                 advice = "try a smaller --window, fewer --workers or one --camera"
-                return screen.end(FAILED, f"out of memory; {advice}")
+                return shown.end(FAILED, f"out of memory; {advice}")
             log = _write_bug_report(error)
-            return screen.end(
+            return shown.end(
                 FAILED, f"this is a bug in densify; please report it with the log at {log}"
             )
 
@@ -87,15 +87,15 @@ def script() -> NoReturn:
     sys.exit(code)
 
 
-def _run(arguments: Sequence[str] | None, screen: Screen) -> None:
+def _run(arguments: Sequence[str] | None, shown: Screen) -> None:
     try:
         options = parse(arguments)
     except SystemExit:  # help, version or a bad argument; a closed stdout shows only on flushing
         sys.stdout.flush()
         raise
-    screen.heed(options)
+    shown.heed(options)
     for answer in options.verb(options):
-        screen.show(answer)
+        shown.show(answer)
 
 
 def _let_go_of(stream: TextIO) -> None:

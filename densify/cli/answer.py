@@ -8,7 +8,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-NONE = "-"
 Column = tuple[str, tuple[str, ...], str]
 """Title, path of the number in a row, and its format, see `written`."""
 
@@ -33,9 +32,8 @@ class Answer:
         lines = [self.text] if self.text else []
         lines += map(str, self.files)
         if self.first:
-            width = max(len(str(path)) for path in self.first)
-            lines += ["open first:"]
-            lines += [f"  {path!s:<{width}}  {what}" for path, what in self.first.items()]
+            rows = [[f"  {path}", what] for path, what in self.first.items()]
+            lines += ["open first:", aligned(rows, "<")]
         return lines
 
 
@@ -52,14 +50,15 @@ def first_of(files: Sequence[Path], kinds: Mapping[str, str], most: int = 3) -> 
     return first
 
 
-def table(rows: Mapping[str, Any], columns: Sequence[Column]) -> str:
-    """Return a table with a row for each mapping; columns without any number are left out."""
+def table(rows: Mapping[str, Any], columns: Sequence[Column]) -> list[list[str]]:
+    """Return the cells of a table, a row for each mapping; columns without any number are left
+    out."""
     used = [c for c in columns if any(look_up(r, *c[1]) is not None for r in rows.values())]
     body = [
         [name, *(written(look_up(row, *path), form) for _, path, form in used)]
         for name, row in rows.items()
     ]
-    return aligned([["", *(title for title, _, _ in used)], *body])
+    return [["", *(title for title, _, _ in used)], *body]
 
 
 def numbers_table(columns: Mapping[str, Mapping[str, Any]]) -> str:
@@ -79,21 +78,21 @@ def _numbers(values: Mapping[str, Any], path: str) -> Iterator[tuple[str, float]
             yield f"{path}{name}", value
 
 
-def aligned(rows: Sequence[Sequence[str]]) -> str:
-    """Return the rows as text, the first column to the left; an empty row is a blank line."""
-    widths = [max(map(len, column)) for column in zip(*filter(None, rows), strict=True)]
-    lines = []
-    for row in rows:
-        first, *others = row or [""]
-        cells = [cell.rjust(width) for cell, width in zip(others, widths[1:], strict=False)]
-        lines.append("  ".join([first.ljust(widths[0]), *cells]).rstrip())
-    return "\n".join(lines)
+def aligned(rows: Sequence[Sequence[str]], side: str = ">") -> str:
+    """Return the rows as text, the first column to the left, the others to the right or left."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    sides = ["<", *(side * (len(widths) - 1))]
+    lines = (
+        "  ".join(f"{cell:{s}{w}}" for cell, s, w in zip(row, sides, widths, strict=True))
+        for row in rows
+    )
+    return "\n".join(line.rstrip() for line in lines)
 
 
 def written(value: float | None, form: str) -> str:
-    """Return the number as text. form: a format, and after a blank a unit."""
+    """Return the number as text, "-" for None. form: a format, and after a blank a unit."""
     if value is None:
-        return NONE
+        return "-"
     number, _, unit = form.partition(" ")
     return f"{value:{number}}".replace("%", " %") + (f" {unit}" if unit else "")
 

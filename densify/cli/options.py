@@ -13,12 +13,11 @@ from typing import TYPE_CHECKING, Any
 from densify.cli.answer import Answer
 from densify.config import Config, presets, resolve
 from densify.config.errors import InputError
-from densify.config.plugins.engines import described
 
 if TYPE_CHECKING:
     from densify.geometry.types import LidarSequence
 
-DATA_HELP = (
+_DATA = (
     "a recording's folder, READER:PATH, or the built-in "
     "street[:PRESET][?seed=N&sensor=NAME&hz=RATE&tilt=DEG] (default: street)"
 )
@@ -28,31 +27,54 @@ _MOST_DIGITS = 18
 def add_verb(
     commands: Any,
     name: str,
-    verb: Callable[[argparse.Namespace], Iterable[Answer]],
+    verb: Callable[[argparse.Namespace], Iterable[Answer]] | None,
     about: str,
     epilog: str = "",
 ) -> argparse.ArgumentParser:
-    """Add a verb to the command line and return its parser; ``verb`` is called with its options."""
+    """Add a verb to the command line and return its parser; ``verb`` is called with its options,
+    None for a verb that has others below it."""
+    description = f"{about[0].upper()}{about[1:]}."
     parser: argparse.ArgumentParser = commands.add_parser(
-        name, help=about, description=sentence(about), epilog=epilog or None
+        name, help=about, description=description, epilog=epilog or None
     )
-    parser.set_defaults(verb=verb, name=name)
-    parser.add_argument("--json", action="store_true", help="print one JSON object, nothing else")
+    if verb is not None:
+        parser.set_defaults(verb=verb, name=name)
+        option(parser, "--json", "print one JSON object, nothing else")
     return parser
 
 
-def sentence(about: str) -> str:
-    """Return the text with a capital letter and a full stop."""
-    return f"{about[0].upper()}{about[1:]}."
+def option(parser: argparse.ArgumentParser, usage: str, about: str, **more: Any) -> None:
+    """Add an option. usage: ``--name METAVAR``, or ``--name`` alone for one without a value."""
+    name, _, metavar = usage.partition(" ")
+    kind: dict[str, Any] = {"metavar": metavar} if metavar else {"action": "store_true"}
+    parser.add_argument(name, help=about, **kind, **more)
 
 
 def add_recording(parser: argparse.ArgumentParser, several: bool = False) -> None:
     """Add the recording, as a positional argument and as ``--data``."""
-    parser.add_argument("recording", metavar="SPEC", nargs="*" if several else "?", help=DATA_HELP)
+    parser.add_argument("recording", metavar="SPEC", nargs="*" if several else "?", help=_DATA)
     number = "+" if several else 1
-    parser.add_argument(
-        "--data", metavar="SPEC", nargs=number, action="extend", default=[], help="the same"
-    )
+    option(parser, "--data SPEC", "the same", nargs=number, action="extend", default=[])
+
+
+def add_common(parser: argparse.ArgumentParser, *names: str) -> None:
+    """Add those of the options that several verbs have: window, method, camera, config (with
+    ``--set``), overwrite."""
+    if "window" in names:
+        about = "sweeps on each side of the key for moving objects (default: 5, at 10 Hz 0.5 s)"
+        option(parser, "--window W", about, type=natural, default=5)
+    if "method" in names:
+        about = "flow (default): with scene flow; icp: registration only; none: the key sweep alone"
+        parser.add_argument("--method", choices=("flow", "icp", "none"), default="flow", help=about)
+    if "camera" in names:
+        about = "only this camera; may be given several times (default: all)"
+        option(parser, "--camera NAME", about, action="append", dest="cameras")
+    if "config" in names:
+        option(parser, "--config FILE|NAME", f"a YAML file or a preset: {', '.join(presets())}")
+        knob, about = "--set section.key=value", "set one knob; may be given several times"
+        option(parser, knob, about, action="append", default=[], dest="overrides")
+    if "overwrite" in names:
+        option(parser, "--overwrite", "replace what is already there (default: keep it)")
 
 
 def recordings_of(options: argparse.Namespace, default: str = "street") -> list[str]:
@@ -69,65 +91,6 @@ def recording_of(options: argparse.Namespace) -> str:
     return specs[0]
 
 
-def add_window(parser: argparse.ArgumentParser) -> None:
-    """Add ``--window``."""
-    about = "sweeps on each side of the key for moving objects (default: 5, at 10 Hz 0.5 s)"
-    parser.add_argument("--window", type=natural, default=5, metavar="W", help=about)
-
-
-def add_method(parser: argparse.ArgumentParser) -> None:
-    """Add ``--method``."""
-    about = "flow (default): with scene flow; icp: registration only; none: the key sweep alone"
-    parser.add_argument("--method", choices=("flow", "icp", "none"), default="flow", help=about)
-
-
-def add_camera(parser: argparse.ArgumentParser) -> None:
-    """Add ``--camera``."""
-    about = "only this camera; may be given several times (default: all)"
-    parser.add_argument("--camera", action="append", metavar="NAME", dest="cameras", help=about)
-
-
-def add_config_options(parser: argparse.ArgumentParser) -> None:
-    """Add ``--config`` and ``--set``."""
-    known = ", ".join(presets())
-    parser.add_argument("--config", metavar="FILE|NAME", help=f"a YAML file or a preset: {known}")
-    parser.add_argument(
-        "--set",
-        action="append",
-        default=[],
-        metavar="section.key=value",
-        dest="overrides",
-        help="set one knob; may be given several times",
-    )
-
-
-def add_key_options(parser: argparse.ArgumentParser) -> None:
-    """Add what ``run`` and ``compare`` share."""
-    parser.epilog = f"Every knob with its default and what it does: {presets()['default']}"
-    add_recording(parser)
-    add_window(parser)
-    add_camera(parser)
-    parser.add_argument("--flow", metavar="ENGINE", help=f"flow.engine. {described()}")
-    parser.add_argument(
-        "--report",
-        action="store_true",
-        help="a page to look at each key in a browser, with the rejected pixels (short for --set "
-        "output.report=true --set output.rejected=true; densify report makes it later)",
-    )
-    add_config_options(parser)
-    folder = Path("densify-out")
-    parser.add_argument(
-        "--out", metavar="DIR", type=Path, default=folder, help=f"(default: ./{folder})"
-    )
-    add_overwrite(parser)
-
-
-def add_overwrite(parser: argparse.ArgumentParser) -> None:
-    """Add ``--overwrite``."""
-    about = "replace what is already there (default: keep it)"
-    parser.add_argument("--overwrite", action="store_true", help=about)
-
-
 def config_of(options: argparse.Namespace) -> Config:
     """Return the configuration that ``--config``, ``--set``, ``--flow`` and ``--report`` make."""
     short = []
@@ -138,28 +101,27 @@ def config_of(options: argparse.Namespace) -> Config:
     return resolve(options.config, [*options.overrides, *short])
 
 
-def check_new_file(path: Path, overwrite: bool, suffix: str = ".npz") -> None:
+def check_new_file(path: Path, overwrite: bool, suffix: str = "") -> None:
     """Raise InputError, before the computation, if the file exists or cannot be made."""
-    if path.suffix != suffix:
+    if path.suffix != (suffix or path.suffix):
         raise InputError(f"--out {path}: expected a name that ends in {suffix}")
     if path.is_dir():
-        raise InputError(f"--out {path}: is a folder, expected the name of a {suffix} file")
+        raise InputError(
+            f"--out {path}: is a folder, expected the name of a {suffix or 'new'} file"
+        )
     if path.exists() and not overwrite:
         raise InputError(f"--out {path}: already there and kept; give --overwrite or another name")
-    place = path.parent
-    while not os.path.lexists(place):
-        place = place.parent
+    place = next(place for place in path.parents if os.path.lexists(place))
     if not (place.is_dir() and os.access(place, os.W_OK | os.X_OK)):
         raise InputError(f"--out {path}: cannot write in {place}; choose another")
 
 
-def sliced(sequence: LidarSequence, keys: slice) -> list[int]:
-    """Return the frames of ``--keys``. Raises InputError if there is none."""
+def sliced(sequence: LidarSequence, keys: range | None) -> list[int]:
+    """Return the frames of ``--keys``, all for None. Raises InputError if there is none."""
     from densify.readers.timeline import format_frames
 
-    chosen = frozenset(range(keys.start, keys.stop, keys.step or 1))
-    there = [frame for frame in sequence.frames if frame in chosen]
-    if not there:
+    there = [frame for frame in sequence.frames if keys is None or frame in keys]
+    if keys is not None and not there:
         raise InputError(
             f"--keys {keys.start}:{keys.stop}: {sequence.name} has no sweep among them; it has "
             f"{format_frames(sequence.frames)}"
@@ -180,7 +142,7 @@ def positive(text: str) -> float:
         number = float(text)
     except ValueError:
         number = math.nan
-    if not (number > 0 and math.isfinite(number)):
+    if not 0 < number < math.inf:
         raise argparse.ArgumentTypeError(f"got {text!r}, expected a number above 0")
     return number
 
@@ -190,27 +152,21 @@ def words(text: str) -> list[str]:
     return [word.strip() for word in text.split(",") if word.strip()]
 
 
-def frame_range(text: str) -> range:
-    """Read ``A:B[:S]`` as a range."""
-    keys = key_slice(text)
-    return range(keys.start, keys.stop, keys.step)
-
-
-def key_slice(text: str, other: str = "") -> slice:
+def key_range(text: str, other: str = "") -> range:
     """Read ``A:B[:S]``. other: what is accepted too, for the message."""
     numbers = text.split(":")
     if len(numbers) in (2, 3) and _are_digits(*numbers):
         first, end, step = (*map(int, numbers), 1)[:3]
         if first < end and step > 0:
-            return slice(first, end, step)
+            return range(first, end, step)
     raise argparse.ArgumentTypeError(
         f"got {text!r}, expected {other}A:B[:S] with A < B, such as 0:100:5 for frames 0, 5 to 95"
     )
 
 
-def all_or_slice(text: str) -> slice | None:
+def all_or_range(text: str) -> range | None:
     """Read ``all``, which is None, or ``A:B[:S]``."""
-    return None if text == "all" else key_slice(text, "all, or ")
+    return None if text == "all" else key_range(text, "all, or ")
 
 
 def shard(text: str) -> tuple[int, int]:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A progress bar on stderr."""
+"""A progress bar on stderr, or a line now and then where stderr is no terminal."""
 
 from __future__ import annotations
 
@@ -8,57 +8,42 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Protocol
+from typing import TYPE_CHECKING
 
-_LINE_EVERY_S = 30.0
-_LAYOUT = (
-    "{desc:<10} {percentage:3.0f}%|{bar}| {n_fmt}/{total_fmt} [{elapsed}<{remaining}{postfix}]"
-)
+if TYPE_CHECKING:
+    from densify.geometry.types import Progress
 
-
-class Show(Protocol):
-    """Shows that ``done`` of ``total`` parts of a stage are done. text: what else there is."""
-
-    def __call__(self, stage: str, done: int, total: int, text: str = "", /) -> None: ...
+_LINE_EVERY_S = 60.0
+_LAYOUT = "{desc:<10} {percentage:3.0f}%|{bar}| {n_fmt}/{total_fmt} [{elapsed}<{remaining}]"
 
 
 @contextmanager
-def progress_on_stderr(lines: bool = False) -> Iterator[Show]:
-    """Yield a function that moves a bar, which begins anew with each stage.
-
-    lines: log a line every 30 s where stderr is no terminal (else nothing is shown there).
-    """
-    is_shown = logging.getLogger("densify.progress").isEnabledFor(logging.INFO)
-    if not (sys.stderr.isatty() and is_shown):
-        yield _log_now_and_then() if lines else _show_nothing
+def progress_on_stderr() -> Iterator[Progress]:
+    """Yield a function that shows that ``done`` of ``total`` parts of a stage are done."""
+    if not sys.stderr.isatty():
+        yield _log_now_and_then()
         return
     from tqdm import tqdm
 
     with tqdm(total=1, file=sys.stderr, leave=False, bar_format=_LAYOUT) as bar:
 
-        def show(stage: str, done: int, total: int, text: str = "", /) -> None:
-            if bar.desc.rstrip(": ") != stage:
+        def show(stage: str, done: int, total: int) -> None:
+            if done < bar.n or total != bar.total:  # another stage
                 bar.reset(total)
                 bar.initial = done
-                bar.set_description(stage, refresh=False)
-            bar.total, bar.n = total, done
-            bar.set_postfix_str(text)
+            bar.n = done
+            bar.set_description(stage)
 
         yield show
 
 
-def _show_nothing(stage: str, done: int, total: int, text: str = "", /) -> None:
-    """Show no progress."""
-
-
-def _log_now_and_then() -> Show:
+def _log_now_and_then() -> Progress:
     shown_s = time.monotonic()
 
-    def show(stage: str, done: int, total: int, text: str = "", /) -> None:
+    def show(stage: str, done: int, total: int) -> None:
         nonlocal shown_s
         if time.monotonic() > shown_s + _LINE_EVERY_S:
             shown_s = time.monotonic()
-            told = f"{stage}: {done} of {total}"
-            logging.getLogger("densify").info("%s", f"{told}, {text}" if text else told)
+            logging.getLogger("densify").info("%s: %d of %d", stage, done, total)
 
     return show

@@ -1,18 +1,19 @@
 # SPDX-License-Identifier: MIT
 """Summaries of results, comparisons and exports, for people and (``*_facts``) for programs.
 
-Read from `Result.metrics`: ``ghosts``, ``held_out`` by camera (scores of the map made without the
-key sweep against its returns) and ``depth`` by camera (scores against exact truth).
+Read from `Result.metrics`: ``density`` and ``ghosts``, ``held_out`` by camera (scores of the map
+made without the key sweep against its returns) and ``depth`` by camera (scores against exact
+truth).
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
-from densify.cli.answer import aligned, look_up, percent, written
+from densify.cli.answer import Column, aligned, look_up, percent, table
 from densify.geometry.types import Result
 from densify.outputs import Export
 from densify.outputs.plain import plain
@@ -35,8 +36,8 @@ FIRST_OF_COMPARISON = {
 }
 _SCORES = (
     ("coverage", "coverage", ".1%"),
-    ("mae_m", "MAE", ".3f m"),
-    ("rmse_m", "RMSE", ".3f m"),
+    ("MAE", "mae_m", ".3f m"),
+    ("RMSE", "rmse_m", ".3f m"),
     ("outliers", "outliers", ".2%"),
 )
 
@@ -53,41 +54,32 @@ def summary(result: Result) -> str:
         f"({format_frames(result.frames)}), {moving}"
     ]
     for name in result.depth:
-        measured, filled = (_density(result, name, product) for product in ("measured", "filled"))
-        line = f"{name}: depth in {measured} of the pixels, {filled} with filled ones"
-        if name in result.full:
-            line += f", {_density(result, name, 'full')} with those from the prior"
+        share = {p: percent(s, 1) for p, s in result.metrics["density"][name].items()}
+        line = f"{name}: depth in {share['measured']} of the pixels, {share['filled']} with filled"
+        line += f" ones, {share['full']} with those from the prior" if "full" in share else " ones"
         lines.append(line)
-    ghosts = _beside_icp(result, "ghosts", "all")
-    if ghosts:
-        ghost_rate, beside = ghosts
-        lines.append(f"ghosts: {ghost_rate} of the accumulated points{beside}")
+    if ghosts := _beside_icp(result, "ghosts", "all"):
+        lines.append(f"ghosts of the accumulated points: {ghosts}")
     for name in result.depth:
-        said = []
-        for part, where in (("all", ""), ("moving", " on moving objects")):
-            outliers = _beside_icp(result, "held_out", name, "measured", part, "outliers")
-            if outliers:
-                said.append(f"{outliers[0]} outliers{outliers[1]}{where}")
-        if said:
-            lines.append(f"{name}, key held out: {', '.join(said)}")
+        for part, where in (("all", ""), ("moving", ", on moving objects")):
+            if outliers := _beside_icp(result, "held_out", name, "measured", part, "outliers"):
+                lines.append(f"{name}, key held out: outliers{where}: {outliers}")
     return "\n".join(lines)
 
 
-def _beside_icp(result: Result, *path: str) -> tuple[str, str] | None:
-    """Return a share as text, and in brackets that of rigid accumulation where it was made."""
+def _beside_icp(result: Result, *path: str) -> str:
+    """Return a share as text, "" for none, and in brackets that of rigid accumulation where it was
+    made."""
     share = look_up(result.metrics, *path)
-    if share is None:
-        return None
-    rigid = None
-    if "icp" in result.baselines:
-        rigid = look_up(result.baselines["icp"].metrics, *path)
-    return percent(share), "" if rigid is None else f" ({percent(rigid)} by registration alone)"
+    rigid = result.baselines.get("icp")
+    by_icp = look_up(rigid.metrics, *path) if rigid is not None else None
+    beside = "" if by_icp is None else f" ({percent(by_icp)} by registration alone)"
+    return "" if share is None else percent(share) + beside
 
 
 def key_facts(result: Result) -> dict[str, Any]:
     """Return the numbers of one method's result."""
     metrics = result.metrics
-    held_out = metrics.get("held_out") or {}
     facts = {
         "key": result.key,
         "method": result.method,
@@ -98,7 +90,7 @@ def key_facts(result: Result) -> dict[str, Any]:
         "error": None,
         "density": metrics.get("density"),
         "ghosts": look_up(metrics, "ghosts", "all"),
-        "held_out": {c: look_up(held_out, c, "measured", "all") for c in result.depth},
+        "held_out": {c: look_up(metrics, "held_out", c, "measured", "all") for c in result.depth},
         "depth": {c: look_up(metrics, "depth", c, "measured", "all") for c in result.depth},
     }
     return dict(plain(facts))
@@ -110,39 +102,20 @@ def comparison(results: Mapping[str, Result]) -> str:
     Rows: points, image density per camera, ghost rate, and coverage, MAE, RMSE and outliers of the
     measured depth at all, moving and static pixels, with the key held out and against exact truth.
     """
-    columns = list(results.values())
-    rows = [["", *results], ["points", *(f"{len(result.cloud):,}" for result in columns)]]
-    for name in columns[0].depth:
+    cameras = list(next(iter(results.values())).depth)
+    rows: list[Column] = [("points", ("num_points",), ",d")]
+    for camera in cameras:
         for product in ("measured", "filled"):
-            densities = [_density(result, name, product) for result in columns]
-            rows.append([f"{name} density, {product}", *densities])
-    rates = [look_up(result.metrics, "ghosts", "all") for result in columns]
-    rows.append(["ghost rate", *map(percent, rates)])
-    for name in columns[0].depth:
-        for source, title in (("held_out", "key held out"), ("depth", "truth")):
-            if any(look_up(result.metrics, source, name) for result in columns):
-                rows += _score_rows(columns, source, name, title)
-    return aligned(rows)
-
-
-def _score_rows(columns: Sequence[Result], source: str, camera: str, title: str) -> list[list[str]]:
-    rows: list[list[str]] = [[]]
-    for part in ("all", "moving", "static"):
-        for key, score, form in _SCORES:
-            path = (source, camera, "measured", part, key)
-            cells = [written(look_up(result.metrics, *path), form) for result in columns]
-            rows.append([f"{camera} {title}, {part}, {score}", *cells])
-    return rows
-
-
-def _density(result: Result, camera: str, product: str) -> str:
-    """Return the share of the pixels with a depth."""
-    if product == "full":
-        image = result.full[camera].depth_m
-    else:
-        depth = result.depth[camera]
-        image = depth.depth_m if product == "measured" else depth.filled_m
-    return percent(np.count_nonzero(image) / image.size, digits=1)
+            rows.append((f"{camera} density, {product}", ("density", camera, product), ".1%"))
+    rows.append(("ghost rate", ("ghosts", "all"), ".2%"))
+    for camera in cameras:
+        for source, said in (("held_out", "key held out"), ("depth", "truth")):
+            for part in ("all", "moving", "static"):
+                for score, key, form in _SCORES:
+                    path = (source, camera, "measured", part, key)
+                    rows.append((f"{camera} {said}, {part}, {score}", path, form))
+    metrics = {name: result.metrics for name, result in results.items()}
+    return aligned(list(zip(*table(metrics, rows), strict=True)))
 
 
 def export_summary(exported: Export) -> str:

@@ -8,8 +8,8 @@ import json
 import logging
 import sys
 import warnings
-from collections.abc import Iterable
-from contextlib import AbstractContextManager, ExitStack, nullcontext, suppress
+from collections.abc import Iterable, Iterator
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from typing import Any
 
 from densify.cli.answer import Answer
@@ -19,14 +19,15 @@ _SCHEMA = 1
 """Version of what ``--json`` prints; grows when a key changes its meaning or goes."""
 
 
-class Screen:
-    """Shows what one command says while it is entered: text, or one JSON object at the end."""
+class Screen(logging.Handler):
+    """Shows what one command says: text, or one JSON object at the end. As a handler of the log it
+    prints one line per record, above a progress bar if there is one."""
 
     def __init__(self) -> None:
+        super().__init__(logging.INFO)
         self._json = False
         self._facts: dict[str, Any] = {}
-        self._lines = _Lines()
-        self._left = ExitStack()
+        self._warnings: list[str] = []
 
     def heed(self, options: argparse.Namespace) -> None:
         """Take ``--json`` of a command."""
@@ -53,62 +54,47 @@ class Screen:
         if self._json:
             from densify.outputs.plain import plain
 
-            outcome = {"exit_code": exit_code, "error": error, "warnings": self._lines.warnings}
+            outcome = {"exit_code": exit_code, "error": error, "warnings": self._warnings}
             facts = plain({**self._facts, **outcome})
             print(json.dumps(facts, indent=1, allow_nan=False, default=str), flush=True)
         return exit_code
 
-    def __enter__(self) -> Screen:
-        """Send the package's log to stderr; that of ``densify.progress`` only on a terminal, unless
-        its level is set."""
-        log, progress = logging.getLogger("densify"), logging.getLogger("densify.progress")
-        before = log.level, log.propagate, progress.level
-        log.addHandler(self._lines)
-        log.setLevel(logging.INFO)
-        log.propagate = False
-        if not progress.level:
-            progress.setLevel(logging.INFO if sys.stderr.isatty() else logging.WARNING)
-
-        def undo() -> None:
-            log.removeHandler(self._lines)
-            log.setLevel(before[0])
-            log.propagate = before[1]
-            progress.setLevel(before[2])
-
-        self._left.callback(undo)
-        self._left.enter_context(warnings.catch_warnings())
-        warnings.showwarning = _log_warning  # type: ignore[assignment]
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._left.close()
-
-
-class _Lines(logging.Handler):
-    """Prints one line per record, above a progress bar if there is one; keeps the warnings."""
-
-    def __init__(self) -> None:
-        super().__init__(logging.INFO)
-        self.warnings: list[str] = []
-
     def emit(self, record: logging.LogRecord) -> None:
+        """Print a line, and keep it if it is a warning."""
         text = brief(" ".join(record.getMessage().split()))
         is_warning = record.levelno == logging.WARNING
         if is_warning:
-            self.warnings.append(text)
+            self._warnings.append(text)
         with suppress(OSError, ValueError), _above_bars():  # stderr may be closed or full
             print(f"densify: {'warning: ' * is_warning}{text}", file=sys.stderr, flush=True)
+
+
+@contextmanager
+def screen() -> Iterator[Screen]:
+    """Send the package's log to a new screen; that of ``densify.progress`` only on a terminal,
+    unless its level is set. Warnings of numpy and others, for developers, are debug messages."""
+    log, progress = logging.getLogger("densify"), logging.getLogger("densify.progress")
+    before, shown = (log.level, log.propagate, progress.level), Screen()
+    log.addHandler(shown)
+    log.setLevel(logging.INFO)
+    log.propagate = False
+    if not progress.level:
+        progress.setLevel(logging.INFO if sys.stderr.isatty() else logging.WARNING)
+    try:
+        with warnings.catch_warnings():
+            warnings.showwarning = lambda message, *_: log.debug("%s", message)  # type: ignore
+            yield shown
+    finally:
+        log.removeHandler(shown)
+        log.setLevel(before[0])
+        log.propagate = before[1]
+        progress.setLevel(before[2])
 
 
 def _above_bars() -> AbstractContextManager[None]:
     """Hide progress bars within the block."""
     bars = sys.modules.get("tqdm")
     return nullcontext() if bars is None else bars.tqdm.external_write_mode(sys.stderr)
-
-
-def _log_warning(message: Warning | str, category: type[Warning], *where: Any) -> None:
-    """Log warnings of numpy and others as debug messages: they are for developers."""
-    logging.getLogger("densify").debug("%s: %s (%s:%s)", category.__name__, message, *where[:2])
 
 
 def tell_doubts(doubts: Iterable[tuple[str, str, int]], most: int = 20) -> None:

@@ -4,15 +4,15 @@
 from __future__ import annotations
 
 import dataclasses
-import typing
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from densify.config.errors import InputError, did_you_mean
 from densify.config.file_content import parse_yaml, read_yaml
-from densify.config.knobs import checked
-from densify.config.sections import REMOVED, Config
+from densify.config.sections import Config, Section, checked
+
+_SECTIONS: dict[str, Any] = {f.name: type(f.default) for f in dataclasses.fields(Config)}
 
 
 def resolve(
@@ -30,18 +30,18 @@ def resolve(
     """
     values = as_mapping(config if isinstance(config, Config) else Config())
     if isinstance(config, Mapping):
-        _apply(values, config, "configuration")
+        apply_changes(values, config, "configuration")
     elif isinstance(config, str | Path):
         path = _config_path(config)
-        _apply(values, read_yaml(path)[0] or {}, str(path))
+        apply_changes(values, read_yaml(path)[0] or {}, str(path))
     elif not isinstance(config, Config | None):
         raise InputError(
             f"configuration: got {type(config).__name__}, expected a densify.Config, a mapping, or "
             f"the name of a preset or YAML file"
         )
     for override in overrides:
-        _apply(values, _parse_override(override), f"--set {override}")
-    return Config(**{name: section(**values[name]) for name, section in _sections().items()})
+        apply_changes(values, parse_override(override), f"--set {override}")
+    return Config(**{name: section(**values[name]) for name, section in _SECTIONS.items()})
 
 
 def as_mapping(config: Config) -> dict[str, dict[str, Any]]:
@@ -57,18 +57,9 @@ def presets() -> dict[str, Path]:
     return {path.stem: path for path in sorted(folder.glob("*.yaml"))}
 
 
-def _config_path(name: str | Path) -> Path:
-    if isinstance(name, str) and name in presets():
-        return presets()[name]
-    path = Path(name)
-    if path.is_file():
-        return path
-    raise InputError(
-        f"configuration {name}: no such preset or file; {_expected(str(name), presets(), 'preset')}"
-    )
-
-
-def _parse_override(override: str) -> Mapping[str, Any]:
+def parse_override(override: str) -> dict[str, dict[str, Any]]:
+    """Return ``{section: {key: value}}`` of ``section.key=value``. Raises InputError for other
+    text."""
     name, equals, text = override.partition("=")
     section, dot, key = name.strip().partition(".")
     if not (equals and dot and section and key):
@@ -79,46 +70,42 @@ def _parse_override(override: str) -> Mapping[str, Any]:
     return {section: {key: value if text.strip() else ""}}
 
 
-def _apply(values: dict[str, dict[str, Any]], changes: Any, where: str) -> None:
-    """Write the checked `changes` over `values`."""
-    _require_mapping(changes, where, "sections")
-    for name, keys in changes.items():
+def _config_path(name: str | Path) -> Path:
+    path = presets().get(name, Path(name)) if isinstance(name, str) else name
+    if path.is_file():
+        return path
+    hint = _expected(str(name), presets(), "preset")
+    raise InputError(f"configuration {name}: no such preset or file; {hint}")
+
+
+def apply_changes(
+    values: dict[str, dict[str, Any]],
+    changes: Any,
+    where: str,
+    sections: Mapping[str, type[Section]] = _SECTIONS,
+) -> None:
+    """Write ``{section: {key: value}}`` over values of that form. Raises InputError, which begins
+    with ``where``, as `resolve`."""
+    for name, keys in _mapping(changes, where, "sections"):
         if name not in values:
-            hint = _removed(name) or _expected(str(name), values, "section")
+            hint = _expected(str(name), values, "section")
             raise InputError(f"{where}: unknown section {name}; {hint}")
-        _require_mapping(keys, f"{where}: section {name}", "keys")
-        for key, value in keys.items():
+        for key, value in _mapping(keys, f"{where}: section {name}", "keys"):
             if key not in values[name]:
-                hint = _key_hint(name, str(key), values)
+                hint = _expected(str(key), values[name], f"key of {name}")
+                others = [other for other, known in values.items() if key in known]
+                hint = f"did you mean {others[0]}.{key}?" if others else hint
                 raise InputError(f"{where}: unknown key {name}.{key}; {hint}")
-            values[name][key] = checked(_sections()[name], key, value, f"{where}: ")
+            values[name][key] = checked(sections[name], key, value, f"{where}: ")
 
 
-def _sections() -> dict[str, Any]:
-    """Return the classes of the sections by name."""
-    return typing.get_type_hints(Config)
-
-
-def _require_mapping(value: Any, where: str, content: str) -> None:
+def _mapping(value: Any, where: str, content: str) -> Iterable[tuple[Any, Any]]:
     if not isinstance(value, Mapping):
         raise InputError(
             f"{where}: got {value!r}, expected a mapping of {content}, for example "
             f"project: {{support: 6}}"
         )
-
-
-def _key_hint(section: str, key: str, values: Mapping[str, Mapping[str, Any]]) -> str:
-    """Return what became of the key, its section if that is another, or the key most like it."""
-    for other, keys in values.items():
-        if key in keys:
-            return f"did you mean {other}.{key}?"
-    return _removed(section, key) or _expected(key, values[section], f"key of {section}")
-
-
-def _removed(section: Any, key: str = "") -> str:
-    """Return what to do about a knob or section of an earlier version, "" if there was none."""
-    known = key in REMOVED.get(section, "").split() if key else section in REMOVED
-    return "this version has a fixed value for it: leave it out" if known else ""
+    return value.items()
 
 
 def _expected(got: str, known: Mapping[str, Any], kind: str) -> str:

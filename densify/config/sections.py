@@ -1,41 +1,82 @@
 # SPDX-License-Identifier: MIT
-"""Every knob of the pipeline, in one place: a frozen dataclass per stage, collected in `Config`.
+"""Every knob of the pipeline: a frozen dataclass per stage, collected in `Config`.
 
-To add a knob, add it to a section here and run ``python tests/test_config.py``, which writes it
-into configs/default.yaml. To add a section, add its class and one line in `Config`.
+To add a knob, add it to a section here, and to configs/default.yaml with a comment that explains
+it. To add a section, add its class and one line in `Config`.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from contextlib import suppress
+from dataclasses import dataclass, field, fields
+from typing import Any
 
 from densify.config.errors import InputError
-from densify.config.knobs import Section, knob
-from densify.config.plugins import engines, outputs
+from densify.config.plugins import check_engine_spec
 
 _FEW_POINTS_PER_S = 800_000  # 64 rings have 1.2 million, 32 have 700,000
 _AROUND_FEW_S = 0.5
+
+
+def within(default: float | None, low: float, high: float) -> Any:
+    """Return a dataclass field for a number with inclusive bounds."""
+    return field(default=default, metadata={"limits": (low, high)})
+
+
+def one_of(*words: str) -> Any:
+    """Return a dataclass field for one of these words, the first by default."""
+    return field(default=words[0], metadata={"words": words})
+
+
+@dataclass(frozen=True)
+class Section:
+    """The knobs of one stage, checked whenever one is made."""
+
+    def __post_init__(self) -> None:
+        for knob in fields(self):
+            value = checked(type(self), knob.name, getattr(self, knob.name), "")
+            object.__setattr__(self, knob.name, value)
+
+
+def checked(section: type[Section], key: str, value: Any, where: str) -> Any:
+    """Return the value as its knob's type.
+
+    where: file or option that the value comes from, for the message.
+    Raises InputError for another type or a value out of range.
+    """
+    knob = section.__dataclass_fields__[key]
+    kind, _, optional = str(knob.type).partition(" | ")
+    if optional and value is None:
+        return None
+    got = value
+    if kind == "float" and isinstance(value, str | int) and not isinstance(value, bool):
+        with suppress(ValueError, OverflowError):
+            value = float(value)  # text too: YAML 1.1 reads 1e-3 as text
+    fits = type(value).__name__ == kind
+    if words := knob.metadata.get("words"):
+        fits, expected = fits and value in words, f"one of {', '.join(words)}"
+    elif limits := knob.metadata.get("limits"):
+        fits = fits and limits[0] <= value <= limits[1]
+        expected = f"a {'whole ' * (kind == 'int')}number from {limits[0]:g} to {limits[1]:g}"
+    else:
+        expected = "true or false" if kind == "bool" else "text"
+    if fits:
+        return value
+    name = f"{section.__name__.removesuffix('Settings').lower()}.{key}"
+    raise InputError(
+        f"{where}{name}: got {got!r}, expected {expected}{' or null' * bool(optional)}"
+    )
 
 
 @dataclass(frozen=True)
 class RegisterSettings(Section):
     """The pose of the lidar at every sweep."""
 
-    source: str = knob(
-        "kiss-icp",
-        "kiss-icp: estimate the poses from the sweeps; dataset: take the recording's own",
-        choices=("kiss-icp", "dataset"),
-    )
-    voxel_size_m: float = knob(
-        0.5,
-        "[m] cell of KISS-ICP's local map; smaller is finer and slower, too small loses track. "
-        "Sweeps of fewer than 30,000 points are aligned point to plane instead",
-        0.05,
-        10,
-    )
-    min_range_m: float = knob(2.8, "[m] nearer returns, of the own vehicle, are left out", 0, 50)
-    max_range_m: float = knob(120.0, "[m] farther returns are left out", 5, 500)
-    deskew: bool = knob(True, "undo the motion within each sweep; off only for compensated sweeps")
+    source: str = one_of("kiss-icp", "dataset")
+    voxel_size_m: float = within(0.5, 0.05, 10)
+    min_range_m: float = within(2.8, 0, 50)
+    max_range_m: float = within(120.0, 5, 500)
+    deskew: bool = True
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -50,21 +91,12 @@ class RegisterSettings(Section):
 class FlowSettings(Section):
     """Which points move, and how."""
 
-    engine: str = knob(
-        "groups", f"{engines.described()}; others by name where their package is installed"
-    )
-    look_around_s: float | None = knob(
-        None,
-        "[s] sweeps up to this long before and after the window are searched for moving points "
-        "too; null: 0.5 for scanners of fewer than 800,000 points a second, else 0. With 0.5 the "
-        "error falls by a third to four fifths, for twice the CPU seconds",
-        0,
-        5,
-    )
+    engine: str = "groups"
+    look_around_s: float | None = within(None, 0, 5)
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        engines.check_spec(self.engine)
+        check_engine_spec(self.engine)
 
     def around_s(self, points_per_s: float) -> float:
         """Return ``look_around_s``, for a scanner of ``points_per_s`` where it is null.
@@ -80,93 +112,32 @@ class FlowSettings(Section):
 class ObjectiveSettings(Section):
     """The published objective: engine paper, and the flow of two files without static_prior."""
 
-    solver: str = knob(
-        "pcg",
-        "pcg: conjugate gradients, fast; adam: 1,500 steps as published",
-        choices=("pcg", "adam"),
-    )
-    alpha: float = knob(10.0, "weight of smoothness; larger moves neighbours more alike", 0, 1e6)
-    num_neighbors: int = knob(
-        50, "neighbours of a point in the graph; more is stiffer and slower", 1, 500
-    )
-    static_prior: bool = knob(
-        True,
-        "points without a free-space violation move rigidly with the vehicle; off moves every "
-        "point, with engine paper and in the flow of two files",
-    )
+    solver: str = one_of("pcg", "adam")
+    alpha: float = within(10.0, 0, 1e6)
+    num_neighbors: int = within(50, 1, 500)
+    static_prior: bool = True
 
 
 @dataclass(frozen=True)
 class AccumulateSettings(Section):
     """All points at the key's time."""
 
-    unfollowed: str = knob(
-        "drop",
-        "moving points without a track. drop: leave them out; rigid: keep them where registration "
-        "puts them, as ghosts",
-        choices=("rigid", "drop"),
-    )
-    far_m: float = knob(
-        40.0,
-        "[m] of travel before and after the window from which static points are taken too; more "
-        "covers more of far surfaces and takes longer; 0: only the window",
-        0,
-        500,
-    )
+    unfollowed: str = one_of("drop", "rigid")
+    far_m: float = within(40.0, 0, 500)
 
 
 @dataclass(frozen=True)
 class ProjectSettings(Section):
     """From the accumulated cloud to each camera's depth map."""
 
-    at: str = knob(
-        "camera",
-        "the time a depth map shows. camera: the image's own exposure, ego-motion and moving "
-        "objects included; sweep: the key sweep's reference time",
-        choices=("camera", "sweep"),
-    )
-    per: str = knob(
-        "sweep",
-        "sweep: for each camera the map of the image exposed nearest to the key sweep; image: maps "
-        "of all images nearer to that sweep than to any other",
-        choices=("sweep", "image"),
-    )
-    depth: str = knob(
-        "auto",
-        "the measure of depth. z: along the camera's axis; range: from the lens; auto: z for a "
-        "pinhole, range for a fisheye or MEI camera, which may see behind its image plane",
-        choices=("auto", "z", "range"),
-    )
-    visibility: bool = knob(
-        True, "off: each pixel's nearest point as it is; occluded points shine through (a baseline)"
-    )
-    support: int = knob(
-        4,
-        "number of sweeps that must agree with a point, the one nearest to the key among them, at "
-        "most half of all; more removes badly registered points and thins far surfaces",
-        1,
-        20,
-    )
-    rims: str = knob(
-        "image",
-        "pixels measured close to a depth discontinuity. image: keep those that the camera's image "
-        "assigns to the measured surface (strict without an image, or with one that does not fit); "
-        "strict: leave them out; keep: keep them all, which fattens outlines",
-        choices=("image", "strict", "keep"),
-    )
-    fill_reach: float = knob(
-        1.5,
-        "how far the two-sided fill looks for measured pixels, in spacings of neighbouring rays; "
-        "below 1 nothing is filled between the lines of a single sweep",
-        0.1,
-        5,
-    )
-    glass: str = knob(
-        "plane",
-        "car windows. plane: points behind them are left out, and the filled map has the plane of "
-        "their frames; keep: they stay",
-        choices=("plane", "keep"),
-    )
+    at: str = one_of("camera", "sweep")
+    per: str = one_of("sweep", "image")
+    depth: str = one_of("auto", "z", "range")
+    visibility: bool = True
+    support: int = within(4, 1, 20)
+    rims: str = one_of("image", "strict", "keep")
+    fill_reach: float = within(1.5, 0.1, 5)
+    glass: str = one_of("plane", "keep")
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -181,72 +152,36 @@ class ProjectSettings(Section):
 class PriorSettings(Section):
     """Depth images that the user brings (--prior), where nothing is measured."""
 
-    kind: str = knob(
-        "auto",
-        "what their values are. depth; inverse: inverse depth, disparity; auto: whichever fits the "
-        "measured pixels better",
-        choices=("auto", "depth", "inverse"),
-    )
+    kind: str = one_of("auto", "depth", "inverse")
 
 
 @dataclass(frozen=True)
 class OutputSettings(Section):
     """Files beside those that every run writes."""
 
-    flow: str = knob(
-        "none",
-        "flow/: scene flow of every sweep to the next one. npz: flow files, see docs/formats.md, "
-        "towards the key; opensceneflow: an .h5 file for OpenSceneFlow, up to the key",
-        choices=("none", "npz", "opensceneflow"),
-    )
-    optical_flow: bool = knob(
-        False,
-        "optical_flow/: of every pixel with a measured depth to the previous and the next image, "
-        "as KITTI flow PNG",
-    )
-    rejected: bool = knob(
-        False, "rejected/: a picture of the points that visibility rejects, and why"
-    )
-    report: bool = knob(
-        False, "report.html: the result to look at in a browser, with output.rejected its causes"
-    )
-    also: str = knob(
-        "", "outputs that other packages bring, by name, separated by commas; see examples/plugin"
-    )
-    movers: str = knob(
-        "keep",
-        "moving objects. keep: as all else; drop: left out of maps and cloud; separate: left out "
-        "and written object by object under movers/",
-        choices=("keep", "drop", "separate"),
-    )
+    flow: str = one_of("none", "npz", "opensceneflow")
+    optical_flow: bool = False
+    rejected: bool = False
+    report: bool = False
+    also: str = ""
+    movers: str = one_of("keep", "drop", "separate")
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        outputs.check_also(self.also)
+        if self.also:
+            from densify.config.written import check_also
+
+            check_also(self.also)
 
 
 @dataclass(frozen=True)
 class Config:
     """The whole configuration; ``Config()`` is the default one. Sections mirror the stages."""
 
-    register: RegisterSettings = field(default_factory=RegisterSettings)
-    flow: FlowSettings = field(default_factory=FlowSettings)
-    objective: ObjectiveSettings = field(default_factory=ObjectiveSettings)
-    accumulate: AccumulateSettings = field(default_factory=AccumulateSettings)
-    project: ProjectSettings = field(default_factory=ProjectSettings)
-    prior: PriorSettings = field(default_factory=PriorSettings)
-    output: OutputSettings = field(default_factory=OutputSettings)
-
-
-REMOVED = {
-    "register": "lead_in_s max_speed_m_s min_overlap min_num_points",
-    "ground": "cell_m max_slope",
-    "flow": "min_height_m soft solver alpha num_neighbors static_prior",
-    "objective": "radius_m laplacian max_gap_m device",
-    "project": "veto_m veto_fraction footprint slack_m hidden_m hidden_fraction seen_through "
-    "support_reach plane_reach agree_m agree_fraction edge_reach edge_slack_m spot edge_m "
-    "edge_fraction star_reach fill_confidence",
-    "prior": "far_m max_wrong",
-    "output": "flow_as",
-}
-"""Knobs of earlier versions by section: they have a fixed value now, or another section."""
+    register: RegisterSettings = RegisterSettings()
+    flow: FlowSettings = FlowSettings()
+    objective: ObjectiveSettings = ObjectiveSettings()
+    accumulate: AccumulateSettings = AccumulateSettings()
+    project: ProjectSettings = ProjectSettings()
+    prior: PriorSettings = PriorSettings()
+    output: OutputSettings = OutputSettings()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""One call for all engines of scene flow; `densify.config.plugins.engines` has their table."""
+"""One call for all engines of scene flow; `densify.config.plugins` has their table."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Protocol, cast, get_type_hints
 
 from densify.config import Config
 from densify.config.errors import InputError
-from densify.config.plugins.engines import ENGINES, engine
+from densify.config.plugins import engine
 from densify.flow.tracking.candidates import Candidates, find_candidates
 from densify.free_space.ground import HeightMap
 from densify.free_space.seen_through import FreeSpace
@@ -76,7 +76,7 @@ class EngineModule(Protocol):
 def estimate_motion(scene: Scene, settings: Config, spec: str | None = None) -> Motion:
     """Estimate by the engine ``NAME[:ARGUMENT]``, that of ``flow.engine`` if None."""
     row, argument = engine(spec or settings.flow.engine)
-    module = cast(EngineModule, ENGINES.module(row))
+    module = cast(EngineModule, row.work())
     return module.estimate_motion(scene, settings, argument)
 
 
@@ -84,7 +84,7 @@ def motion_type(spec: str) -> type[SharedMotion]:
     """Return the dataclass that the engine's ``estimate_motion`` is annotated to return. Raises
     InputError if it is none."""
     row, _ = engine(spec)
-    found = get_type_hints(ENGINES.module(row).estimate_motion).get("return")
+    found = get_type_hints(row.work().estimate_motion).get("return")
     if not (isinstance(found, type) and is_dataclass(found)):
         raise InputError(
             f"flow.engine: {row.name} shares its motion among keys, expected an estimate_motion "
@@ -98,6 +98,6 @@ def check_engine(spec: str) -> None:
     row, argument = engine(spec)
     if row.shared:
         motion_type(spec)
-    check = getattr(ENGINES.module(row), "check_argument", None)
+    check = getattr(row.work(), "check_argument", None)
     if check is not None:
         check(argument)

@@ -7,10 +7,8 @@ neighbours where labels are asked for.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -18,7 +16,7 @@ from densify.config import Config, resolve
 from densify.config.errors import ComputationError, InputError
 from densify.flow.engines import Scene, estimate_motion
 from densify.free_space.ground import ground
-from densify.geometry.types import Bool, Float, Float32, LidarSequence, Stretch
+from densify.geometry.types import Bool, Float32, LidarSequence
 from densify.learning.clouds import AboveGround
 from densify.pipeline.recording import Recording
 from densify.readers import open_sequence
@@ -33,50 +31,36 @@ _POSES_GIVEN = {"register": {"source": "dataset"}}
 
 
 @dataclass(frozen=True)
-class Labels:
-    """Known flow of one sweep.
-
-    flow: (2,n,3) metres, axes of the clip, to the previous sweep and to the next; 0 where there is
-    none. moving: (n,).
-    """
-
-    flow: Float32
-    moving: Bool
-
-
-@dataclass(frozen=True)
 class ClipSweep:
     """The points of a sweep above the ground.
 
     points: (n,3) metres, world axes about the clip's origin. height_m: (n,) above the ground.
-    origin_m: (3,) the scanner. time_s: since the first sweep.
+    origin_m: (3,) the scanner. time_s: since the first sweep. flow: (2,n,3) metres, to the previous
+    sweep and to the next, 0 where there is none. moving: (n,). Both are None without labels.
     """
 
     points: Float32
     height_m: Float32
     origin_m: Float32
     time_s: float
-    truth: Labels | None = None
-    engine: Labels | None = None
+    flow: Float32 | None = None
+    moving: Bool | None = None
 
 
-@dataclass(frozen=True)
-class Clip:
-    """Neighbouring sweeps in the order of time."""
-
-    sweeps: tuple[ClipSweep, ...]
+Clip = tuple[ClipSweep, ...]
+"""Neighbouring sweeps in the order of time."""
 
 
 @dataclass(frozen=True)
 class ClipMaker:
     """Makes clips by number: the same number, the same clip, in any process.
 
-    data: specifications of recordings, or `STREETS`. labels: "", "engine" or "truth".
+    data: specifications of recordings, or `STREETS`. teacher: as of `make_clip`.
     """
 
     data: tuple[str, ...]
     seed: int
-    labels: str = ""
+    teacher: str = "objective"
 
     def __call__(self, number: int) -> Clip:
         """Make one clip.
@@ -89,7 +73,7 @@ class ClipMaker:
         sequence: LidarSequence = (
             _new_street(spec, rng) if spec.partition("?")[0] == STREETS else open_sequence(spec)
         )
-        if self.labels == "truth" and sequence.truth is None:
+        if self.teacher == "truth" and sequence.truth is None:
             raise InputError(f"--data {spec}: has no true flow; choose another --teacher")
         if len(sequence.frames) < NUM_SWEEPS:
             raise InputError(
@@ -99,8 +83,8 @@ class ClipMaker:
         for _ in range(_MOST_TRIES):
             key = int(rng.choice(np.asarray(sequence.frames)))
             with suppress(ComputationError):
-                clip = make_clip(sequence, key, settings, self.labels)
-                if len(clip.sweeps) > 1:
+                clip = make_clip(sequence, key, settings, self.teacher)
+                if len(clip) > 1:
                     return clip
         raise ComputationError(
             f"--data {spec}: at {_MOST_TRIES} places no two neighbouring sweeps could be "
@@ -120,55 +104,41 @@ def _new_street(spec: str, rng: np.random.Generator) -> Street:
     return street
 
 
-def make_clip(sequence: LidarSequence, key: int, settings: Config, labels: str) -> Clip:
-    """Return the sweeps around a key, with labels.
+def make_clip(sequence: LidarSequence, key: int, settings: Config, teacher: str) -> Clip:
+    """Return the sweeps around a key.
 
-    labels: "" or "truth" adds the truth where there is one; "engine" adds the scene flow of this
-    package's engine too.
+    teacher: "truth" or "engine" labels them with the truth or the scene flow of this package's
+    engine; any other word leaves them without.
     """
     stretch = Recording(sequence, settings, NUM_SWEEPS // 2, [key]).window(key)
-    heights = ground(stretch)
-    above = [AboveGround.of(s, heights) for s in stretch.sweeps]
-    frames, indices = stretch.frames, range(len(stretch.frames))
-    truth: list[Labels | None] = [None] * len(frames)
-    engine = list(truth)
-    if sequence.truth is not None:
-        for i in indices:
-            row = stretch.sweeps[i].sweep.row[above[i].row]
-            true = [sequence.truth.displacement(frames[i], f)[row] for f in _around(frames, i)]
-            moving = sequence.truth.sweep(frames[i]).moving[row]
-            truth[i] = _labels(stretch, i, true, moving)
-    if labels == "engine":
+    heights, frames = ground(stretch), stretch.frames
+    motion = None
+    if teacher == "engine":
         motion = estimate_motion(Scene(stretch, heights), settings, "groups")
-        for i in indices:
-            row = above[i].row
-            fields = [motion.flow(frames[i], f) for f in _around(frames, i)]
+    origin, begin_ns = stretch[key].T_world_lidar[:3, 3], stretch.sweeps[0].sweep.stamp_ns
+    sweeps = []
+    for i, registered in enumerate(stretch.sweeps):
+        above, frame = AboveGround.of(registered, heights), frames[i]
+        around = frames[max(i - 1, 0)], frames[min(i + 1, len(frames) - 1)]
+        flow = moving = None
+        if teacher == "truth" and sequence.truth is not None:
+            row = registered.sweep.row[above.row]
+            found = [sequence.truth.displacement(frame, other)[row] for other in around]
+            flow, moving = np.stack(found), sequence.truth.sweep(frame).moving[row]
+        elif motion is not None:
+            row, fields = above.row, [motion.flow(frame, other) for other in around]
+            flow = np.stack([field.displacement[row] for field in fields])
             moving = fields[0].moving[row] & ~fields[0].lost[row]
-            engine[i] = _labels(stretch, i, [f.displacement[row] for f in fields], moving)
-    origin = stretch[key].T_world_lidar[:3, 3]
-    begin_ns = stretch.sweeps[0].sweep.stamp_ns
-
-    sweeps = [
-        ClipSweep(
-            points=(above[i].points - origin).astype(np.float32),
-            height_m=above[i].height_m,
-            origin_m=(registered.T_world_lidar[:3, 3] - origin).astype(np.float32),
-            time_s=(registered.sweep.stamp_ns - begin_ns) * 1e-9,
-            truth=truth[i],
-            engine=engine[i],
+        if flow is not None:
+            flow = (flow @ registered.T_world_lidar[:3, :3].T).astype(np.float32)
+        sweeps.append(
+            ClipSweep(
+                points=(above.points - origin).astype(np.float32),
+                height_m=above.height_m,
+                origin_m=(registered.T_world_lidar[:3, 3] - origin).astype(np.float32),
+                time_s=(registered.sweep.stamp_ns - begin_ns) * 1e-9,
+                flow=flow,
+                moving=moving,
+            )
         )
-        for i, registered in enumerate(stretch.sweeps)
-    ]
-    return Clip(tuple(sweeps))
-
-
-def _around(frames: Sequence[int], i: int) -> list[int]:
-    """Return the previous and the next frame; the frame itself where there is none."""
-    return [frames[max(i - 1, 0)], frames[min(i + 1, len(frames) - 1)]]
-
-
-def _labels(stretch: Stretch, i: int, flow: Sequence[Any], moving: Bool) -> Labels:
-    """Return labels in world axes. flow: two of (n,3), lidar frame of sweep number i."""
-    R_world_lidar: Float = stretch.sweeps[i].T_world_lidar[:3, :3]
-    turned = [(f @ R_world_lidar.T).astype(np.float32) for f in flow]
-    return Labels(np.stack(turned), moving)
+    return tuple(sweeps)

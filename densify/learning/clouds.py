@@ -28,14 +28,6 @@ class NetworkCloud(NamedTuple):
     points: Tensor
     height_m: Tensor
 
-    def rows(self, index: Tensor) -> NetworkCloud:
-        """Return some of the points."""
-        return NetworkCloud(self.points[index], self.height_m[index])
-
-    def to(self, device: torch.device) -> NetworkCloud:
-        """Return the cloud on another device."""
-        return NetworkCloud(self.points.to(device), self.height_m.to(device))
-
 
 class AboveGround(NamedTuple):
     """The points of a sweep above the ground.
@@ -48,11 +40,11 @@ class AboveGround(NamedTuple):
     height_m: Float32
 
     @staticmethod
-    def of(registered: RegisteredSweep, ground: HeightMap) -> AboveGround:
-        """Select the points above the ground."""
+    def of(registered: RegisteredSweep, ground: HeightMap, row: Int | None = None) -> AboveGround:
+        """Select the points above the ground, or those of the rows (n,)."""
         points = poses.transform(registered.T_world_lidar, registered.sweep.points)
         height_m = ground.above(points)
-        row = np.flatnonzero(height_m >= ABOVE_GROUND_M)
+        row = np.flatnonzero(height_m >= ABOVE_GROUND_M) if row is None else row
         return AboveGround(row, points[row], height_m[row])
 
     def cloud(self, origin: Float) -> NetworkCloud:

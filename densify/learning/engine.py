@@ -1,30 +1,24 @@
 # SPDX-License-Identifier: MIT
 """A trained network as an engine: its flow proposes, the proof of `densify.flow.tracking` decides.
 
-Where the network sees points move, groups start with the velocity that it sees; they are followed
-through all sweeps and count as moving only if their path is smooth and does away with what
-contradicts that they stand, exactly as for the engine ``groups``. Whatever else the network says
-moves nothing.
+Where the network sees points move, groups start with the velocity that it sees. They are followed
+and proven as by the engine ``groups``. Whatever else the network says moves nothing.
 """
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
-import torch
 
 from densify.config import Config
 from densify.flow.engines import Scene
 from densify.flow.tracking.candidates import Candidates, closer_rings, cluster_around
 from densify.flow.tracking.groups import GroupMotion, motion_of
-from densify.geometry import poses
-from densify.geometry.threads import num_threads
 from densify.geometry.types import Float
 from densify.learning.clouds import AboveGround, order_for
-from densify.learning.model_file import read_model
-from densify.learning.network import NUM_SWEEPS, Voxels
+from densify.learning.model_file import Model, read_model
+from densify.learning.network import NUM_SWEEPS
 
 MOVES_M_S = 0.5
 """Points that the network sees move more slowly start no track (Chodosh et al., WACV 2024)."""
@@ -37,10 +31,11 @@ def check_argument(argument: str) -> None:
 
 def estimate_motion(scene: Scene, settings: Config, argument: str) -> GroupMotion:
     """See `densify.flow.engines.EngineModule`. argument: the model's file."""
-    network = read_model(Path(argument)).network
-    standing = _standing(scene)
-    flows = flows_of(network, standing, [s.T_world_lidar[:3, 3] for s in scene.stretch.sweeps])
-    stamps_s = [s.sweep.stamp_ns * 1e-9 for s in scene.stretch.sweeps]
+    model, sweeps = read_model(Path(argument)), scene.stretch.sweeps
+    rows = zip(sweeps, scene.candidates, strict=True)
+    standing = [AboveGround.of(sweep, scene.ground, found.row) for sweep, found in rows]
+    flows = flows_of(model, standing, [s.T_world_lidar[:3, 3] for s in sweeps])
+    stamps_s = [s.sweep.stamp_ns * 1e-9 for s in sweeps]
     found, velocities = [], []
     for i, candidates in enumerate(scene.candidates):
         duration_s = stamps_s[_neighbor(i, len(standing))] - stamps_s[i] if len(standing) > 1 else 1
@@ -52,39 +47,25 @@ def estimate_motion(scene: Scene, settings: Config, argument: str) -> GroupMotio
     return motion_of(scene, tuple(found), velocities)
 
 
-def flows_of(network: Voxels, standing: list[AboveGround], origins: list[Float]) -> list[Float]:
-    """(n,3) metres for each sweep: to the next, of the last one to the one before; world.
+def flows_of(model: Model, standing: list[AboveGround], origins: list[Float]) -> list[Float]:
+    """Return (n,3) metres for each sweep: to the next, of the last one to the one before; world.
 
     origins: (3,) world, the scanner at each sweep.
     """
-
-    def of_sweep(i: int) -> Float:
-        if len(standing) < 2 or not len(standing[i].row):
-            return np.zeros((len(standing[i].row), 3))
+    flows = []
+    for i, own in enumerate(standing):
+        if len(standing) < 2 or not len(own.row):
+            flows.append(np.zeros((len(own.row), 3)))
+            continue
         numbers = order_for(i, _neighbor(i, len(standing)), len(standing), NUM_SWEEPS)
-        sweeps = [None if n is None else standing[n].cloud(origins[i]) for n in numbers]
-        with torch.inference_mode():
-            flow: Float = network(sweeps).double().numpy()
-        return flow
-
-    with ThreadPoolExecutor(
-        num_threads(), initializer=torch.set_num_threads, initargs=(1,)
-    ) as pool:
-        return list(pool.map(of_sweep, range(len(standing))))
+        flows.append(
+            model.flow([None if n is None else standing[n].cloud(origins[i]) for n in numbers])
+        )
+    return flows
 
 
 def _neighbor(i: int, count: int) -> int:
     return i + 1 if i + 1 < count else i - 1
-
-
-def _standing(scene: Scene) -> list[AboveGround]:
-    """The points of `Scene.candidates`, as in training."""
-    found = []
-    for registered, candidates in zip(scene.stretch.sweeps, scene.candidates, strict=True):
-        row = candidates.row
-        points = poses.transform(registered.T_world_lidar, registered.sweep.points[row])
-        found.append(AboveGround(row, points, scene.ground.above(points)))
-    return found
 
 
 def _grouped(

@@ -11,7 +11,7 @@ import numpy as np
 
 from densify.config import Config
 from densify.config.errors import ComputationError, InputError, OutputError
-from densify.config.plugins.readers import READERS
+from densify.config.plugins import READERS
 from densify.flow.boxes import flow_of_boxes
 from densify.geometry import poses
 from densify.geometry.types import (
@@ -58,20 +58,16 @@ def label_sweeps(
         known = ", ".join(f"{row.boxes} ({row.name})" for row in READERS if row.boxes)
         raise InputError(f"{sequence.name}: no tracked boxes; expected one of {known}")
     recording = Recording(sequence, config, 1)
-
-    def labels() -> Iterator[tuple[int, Label | ComputationError | InputError]]:
-        for done, frame in enumerate(frames):
-            if progress:
-                progress("label", done, len(frames))
-            try:
-                label = _label(recording, boxes, frame)
-            except (ComputationError, InputError) as error:
-                yield frame, error
-                continue
-            if label is not None:
-                yield frame, label
-
-    return labels()
+    for done, frame in enumerate(frames):
+        if progress:
+            progress("label", done, len(frames))
+        try:
+            label = _label(recording, boxes, frame)
+        except (ComputationError, InputError) as error:
+            yield frame, error
+            continue
+        if label is not None:
+            yield frame, label
 
 
 def _label(recording: Recording, boxes: Callable[[int], Boxes | None], frame: int) -> Label | None:

@@ -18,12 +18,11 @@ slower than 1 m/s, and faster points::
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
-from densify.config.errors import InputError
 from densify.flow.objective.energy import energy
 from densify.flow.objective.graph import knn_graph, laplacian
 from densify.learning.clouds import Sweeps
@@ -36,40 +35,25 @@ ALPHA, NUM_NEIGHBORS = 4.0, 50
 FAST_M_S = 1.0
 
 
-class Teacher(NamedTuple):
-    """loss: of a network and a sample, a 0-d tensor. labels: which the samples need, "" for none,
-    else "engine" or "truth"."""
-
-    loss: Callable[[Predict, Sample], Tensor]
-    labels: str
-
-
 def objective_loss(predict: Predict, sample: Sample) -> Tensor:
     """Return the published objective of a sample's drawn points, m² per point."""
-    source = sample.drawn_source.points
+    source: Tensor = sample.sweeps[0].points[sample.drawn]  # type: ignore[union-attr]
     graph = knn_graph(source.detach().cpu().double().numpy(), NUM_NEIGHBORS)
     flow = predict(sample.sweeps)[sample.drawn]
-    return energy(flow, source, sample.drawn_target.points, laplacian(graph), ALPHA).total / len(
-        source
-    )
+    found = energy(flow, source, sample.drawn_target, laplacian(graph), ALPHA)
+    return found.total / len(source)
 
 
 def supervised_loss(predict: Predict, sample: Sample) -> Tensor:
-    """Return the balanced error of a sample with labels, metres."""
-    if sample.flow is None or sample.moving is None:
-        raise ValueError("expected a sample with labels")
-    flow = predict(sample.sweeps)
-    fast = sample.flow.norm(dim=1) >= FAST_M_S * sample.duration_s
-    return balanced_error(flow, sample.flow, sample.moving, fast, sample.in_reach)
-
-
-def balanced_error(
-    flow: Tensor, true: Tensor, moving: Tensor, fast: Tensor, counted: Tensor
-) -> Tensor:
-    """Return the sum of the mean errors over static, slow and fast points, metres.
-
-    flow, true: (n,3). moving, fast, counted: (n,) bool; points that are not counted are left out.
-    """
+    """Return the sum of the mean errors over static, slow and fast points of a sample with labels,
+    metres."""
+    flow, true, moving, counted = (
+        predict(sample.sweeps),
+        sample.flow,
+        sample.moving,
+        sample.in_reach,
+    )
+    fast = true.norm(dim=1) >= FAST_M_S * sample.duration_s
     # The gradient of the norm itself is not a number at 0.
     error_m = ((flow - true) ** 2).sum(dim=1).add(1e-8).sqrt()
     sets = (~moving, moving & ~fast, moving & fast)
@@ -77,15 +61,5 @@ def balanced_error(
     return torch.stack(means).sum() if means else (flow * 0).sum()
 
 
-TEACHERS = {
-    "objective": Teacher(objective_loss, ""),
-    "engine": Teacher(supervised_loss, "engine"),
-    "truth": Teacher(supervised_loss, "truth"),
-}
-
-
-def teacher(name: str) -> Teacher:
-    """Return a teacher by name. Raises InputError for another name."""
-    if name not in TEACHERS:
-        raise InputError(f"--teacher {name}: expected one of {', '.join(TEACHERS)}")
-    return TEACHERS[name]
+TEACHERS = {"objective": objective_loss, "engine": supervised_loss, "truth": supervised_loss}
+"""The loss of a network and a sample, a 0-d tensor."""

@@ -8,7 +8,7 @@ are turned about the vertical, mirrored and scaled at random.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -26,36 +26,31 @@ _PAIRS_OF_CLIP = 48
 _SCALES = (0.95, 1.05)
 
 
-@dataclass(frozen=True)
-class Sample:
+class Sample(NamedTuple):
     """One pair of sweeps.
 
     sweeps: source, target, and those before the source. drawn: (d,) rows of the source that the
-    objective is computed for; drawn_source, drawn_target: the drawn points. in_reach: (n,) mask of
-    the source's points that count. flow: (n,3), moving: (n,), None without labels.
+    objective is computed for. drawn_target: (e,3) points of the target. in_reach: (n,) mask of the
+    source's points that count. flow: (n,3) tensor, moving: (n,), None without labels.
     """
 
     sweeps: Sweeps
     drawn: Tensor
-    drawn_source: NetworkCloud
-    drawn_target: NetworkCloud
+    drawn_target: Tensor
     in_reach: Tensor
     duration_s: float
-    flow: Tensor | None = None
-    moving: Tensor | None = None
+    flow: Any = None
+    moving: Any = None
 
-    def to(self, device: torch.device) -> Sample:
-        """Return the sample on another device."""
-        return Sample(
-            tuple(None if s is None else s.to(device) for s in self.sweeps),
-            self.drawn.to(device),
-            self.drawn_source.to(device),
-            self.drawn_target.to(device),
-            self.in_reach.to(device),
-            self.duration_s,
-            None if self.flow is None else self.flow.to(device),
-            None if self.moving is None else self.moving.to(device),
-        )
+
+def on_device(value: Any, device: torch.device) -> Any:
+    """Return a tensor, or a tuple with tensors in it, on a device; other values as they are."""
+    if isinstance(value, Tensor):
+        return value.to(device)
+    if isinstance(value, tuple):
+        parts = [on_device(part, device) for part in value]
+        return type(value)(*parts) if hasattr(value, "_fields") else tuple(parts)
+    return value
 
 
 def samples(make: ClipMaker, num_wanted: int, first: int = 0) -> Iterator[Sample]:
@@ -71,13 +66,13 @@ def samples(make: ClipMaker, num_wanted: int, first: int = 0) -> Iterator[Sample
         for place in rng.permutation(len(pairs))[skip:]:
             own = np.random.default_rng([make.seed, group, 2, int(place)])
             c, source, target = pairs[place]
-            yield sample_of(mixed[c], source, target, num_wanted, make.labels, own)
+            yield sample_of(mixed[c], source, target, num_wanted, own)
         group, skip = group + 1, 0
 
 
 def _pairs(c: int, clip: Clip, rng: np.random.Generator) -> list[tuple[int, int, int]]:
     """Return as many (clip, source, target) of every clip, in rounds of all its pairs."""
-    count = len(clip.sweeps)
+    count = len(clip)
     found = [(c, i, j) for i in range(count) for j in (i - 1, i + 1) if 0 <= j < count]
     num_rounds = -(-_PAIRS_OF_CLIP // len(found))
     order = [place for _ in range(num_rounds) for place in rng.permutation(len(found))]
@@ -89,43 +84,33 @@ def sample_of(
     source: int,
     target: int,
     num_wanted: int,
-    labels: str,
     rng: np.random.Generator | None = None,
 ) -> Sample:
     """Return the sample of two neighbouring sweeps of a clip, by their numbers in it.
 
-    labels: as of `ClipMaker`. rng: turns, mirrors, scales and draws at random; None leaves the
-    clouds as they are and draws evenly.
+    rng: turns, mirrors, scales and draws at random; None leaves the clouds as they are and draws
+    evenly.
     """
-    here, there = clip.sweeps[source], clip.sweeps[target]
+    here, there = clip[source], clip[target]
     change = np.eye(3, dtype=np.float32) if rng is None else _random_change(rng)
     scale = np.float32(np.linalg.norm(change[2]))
 
     def cloud(number: int) -> NetworkCloud:
-        sweep = clip.sweeps[number]
+        sweep = clip[number]
         points = torch.from_numpy((sweep.points - here.origin_m) @ change.T)
         return NetworkCloud(points, torch.from_numpy(sweep.height_m * scale))
 
-    numbers = order_for(source, target, len(clip.sweeps), num_wanted)
-    sweeps = [None if n is None else cloud(n) for n in numbers]
-    first, second = cloud(source), cloud(target)
-    in_reach = [(c.points[:, :2].abs() < REACH_M).all(dim=1) for c in (first, second)]
+    numbers = order_for(source, target, len(clip), num_wanted)
+    sweeps = tuple(None if n is None else cloud(n) for n in numbers)
+    points = cloud(source).points, cloud(target).points
+    in_reach = [(each[:, :2].abs() < REACH_M).all(dim=1) for each in points]
     drawn = [_draw(within.numpy(), rng) for within in in_reach]
     flow = moving = None
-    if labels:
-        found = getattr(here, labels)
-        flow = torch.from_numpy(found.flow[int(target > source)] @ change.T)
-        moving = torch.from_numpy(found.moving)
-    return Sample(
-        tuple(sweeps),
-        drawn[0],
-        first.rows(drawn[0]),
-        second.rows(drawn[1]),
-        in_reach[0],
-        abs(there.time_s - here.time_s),
-        flow,
-        moving,
-    )
+    if here.flow is not None:
+        flow = torch.from_numpy(here.flow[int(target > source)] @ change.T)
+        moving = torch.from_numpy(here.moving)
+    duration_s = abs(there.time_s - here.time_s)
+    return Sample(sweeps, drawn[0], points[1][drawn[1]], in_reach[0], duration_s, flow, moving)
 
 
 def _random_change(rng: np.random.Generator) -> Float32:

@@ -7,7 +7,6 @@ sample follows from the seed and its number, and torch computes on one thread.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -19,21 +18,18 @@ from torch import nn
 
 from densify.config.errors import ComputationError, InputError
 from densify.flow.objective.energy import on_one_thread
+from densify.geometry.types import Progress
 from densify.learning.clips import ClipMaker
-from densify.learning.losses import teacher
+from densify.learning.losses import TEACHERS
 from densify.learning.model_file import Model, read_model, write_model
 from densify.learning.network import NUM_SWEEPS, Voxels, build
-from densify.learning.samples import samples
+from densify.learning.samples import on_device, samples
 from densify.outputs.plots import draw_losses, write_plot
 
 _LEARNING_RATE = 2e-3
 _LARGEST_GRADIENT = 1.0
 _WARM_UP, _COOL_DOWN = 0.05, 0.5  # shares of the training
 _NUM_AVERAGED = 50  # losses
-_OPTIMIZER = "optimizer/"
-
-Report = Callable[[int, float, float], None]
-"""Called with the number of steps done, the share of the training done, and the last loss."""
 
 
 @dataclass(frozen=True)
@@ -64,16 +60,12 @@ class Trained(NamedTuple):
     loss: float
 
 
-class _State(NamedTuple):
-    """losses: one for each step done."""
-
-    network: Voxels
-    optimizer: torch.optim.Adam
-    losses: list[float]
+_State = tuple[Voxels, list[float], dict[int, dict[str, torch.Tensor]] | None]
+"""A network, the loss of each step so far, and Adam's state, None before the first."""
 
 
 def train(
-    training: Training, out: Path, resume: bool = False, report: Report | None = None
+    training: Training, out: Path, resume: bool = False, progress: Progress | None = None
 ) -> Trained:
     """Train a network and write the model, and beside it a picture of its loss (``.png``).
 
@@ -81,22 +73,25 @@ def train(
     Raises InputError for settings or recordings that cannot be used, ComputationError if the loss
     is not a number.
     """
-    taught, device = teacher(training.teacher), chosen_device(training.device)
+    loss_of, device = TEACHERS[training.teacher], chosen_device(training.device)
     if training.steps < 1:
         raise InputError(f"--steps {training.steps}: expected 1 or more")
     checkpoint = out.with_name(out.name + ".checkpoint")
-    state = _resumed(training, checkpoint) if resume else _begun(build(training.seed))
-    network, optimizer, losses = state
+    begun: _State = (build(training.seed), [], None)
+    network, losses, moments = _resumed(training, checkpoint) if resume else begun
     network.to(device).train()
-    maker = ClipMaker(training.data, training.seed, taught.labels)
+    optimizer = torch.optim.Adam(network.parameters(), lr=_LEARNING_RATE)
+    if moments is not None:
+        optimizer.load_state_dict({**optimizer.state_dict(), "state": moments})
+    maker = ClipMaker(training.data, training.seed, training.teacher)
     drawn = samples(maker, NUM_SWEEPS, len(losses))
     with on_one_thread():
         while len(losses) < training.steps:
-            sample = next(drawn).to(device)
+            sample = on_device(next(drawn), device)
             for group in optimizer.param_groups:
                 group["lr"] = _learning_rate(len(losses) / training.steps)
             optimizer.zero_grad()
-            loss = taught.loss(network, sample)
+            loss = loss_of(network, sample)
             if not torch.isfinite(loss):
                 raise ComputationError(
                     f"the loss of step {len(losses)} is {loss.item()}; try another --seed"
@@ -105,10 +100,11 @@ def train(
             nn.utils.clip_grad_norm_(network.parameters(), _LARGEST_GRADIENT)
             optimizer.step()
             losses.append(loss.item())
-            if report is not None:
-                report(len(losses), len(losses) / training.steps, losses[-1])
+            if progress is not None:
+                mean = float(np.mean(losses[-_NUM_AVERAGED:]))
+                progress(f"train, loss {mean:.3g}", len(losses), training.steps)
             if len(losses) % training.checkpoint_steps == 0:
-                write_model(checkpoint, _checkpoint(training, state))
+                write_model(checkpoint, _checkpoint(training, network, losses, optimizer))
     write_model(out, Model(network, training.identity()))
     picture = out.with_name(out.name + ".png")
     title = f"teacher {training.teacher}, {', '.join(training.data)}"
@@ -128,10 +124,6 @@ def chosen_device(name: str) -> torch.device:
     return torch.device("cuda" if has_cuda and name != "cpu" else "cpu")
 
 
-def _begun(network: Voxels) -> _State:
-    return _State(network, torch.optim.Adam(network.parameters(), lr=_LEARNING_RATE), [])
-
-
 def _learning_rate(done: float) -> float:
     """Return the rate at a share of the training: it rises, stays, and falls as half a cosine."""
     rate = min(1.0, (done + 0.002) / _WARM_UP)
@@ -140,13 +132,16 @@ def _learning_rate(done: float) -> float:
     return _LEARNING_RATE * max(float(rate), 0.01)
 
 
-def _checkpoint(training: Training, state: _State) -> Model:
-    """Return the model with all that is needed to resume."""
-    beside: dict[str, NDArray[Any]] = {"losses": np.array(state.losses)}
-    for index, moments in state.optimizer.state_dict()["state"].items():
+def _checkpoint(
+    training: Training, network: Voxels, losses: list[float], optimizer: torch.optim.Adam
+) -> Model:
+    """Return the model with all that is needed to resume: the losses, and Adam's state, arrays
+    ``PARAMETER.NAME``."""
+    beside: dict[str, NDArray[Any]] = {"losses": np.array(losses)}
+    for index, moments in optimizer.state_dict()["state"].items():
         for name, value in moments.items():
-            beside[f"{_OPTIMIZER}{index}.{name}"] = value.detach().cpu().numpy()
-    return Model(state.network, training.identity(), beside)
+            beside[f"{index}.{name}"] = value.detach().cpu().numpy()
+    return Model(network, training.identity(), beside)
 
 
 def _resumed(training: Training, checkpoint: Path) -> _State:
@@ -159,22 +154,12 @@ def _resumed(training: Training, checkpoint: Path) -> _State:
                 f"--resume: {checkpoint} was begun with {key} {model.made.get(key)}, got {value}; "
                 f"resume with the same, or begin without --resume"
             )
-    state = _begun(model.network)
+    state: dict[int, dict[str, torch.Tensor]] = {}
     try:
-        state.losses.extend(model.beside["losses"].tolist())
-        whole = state.optimizer.state_dict()
-        whole["state"] = _moments(model.beside)
-        state.optimizer.load_state_dict(whole)
+        losses = model.beside["losses"].tolist()
+        for name in model.beside.keys() - {"losses"}:
+            index, _, moment = name.partition(".")
+            state.setdefault(int(index), {})[moment] = torch.from_numpy(model.beside[name])
     except (KeyError, ValueError, TypeError) as error:
         raise InputError(f"{checkpoint}: no checkpoint, or damaged; begin anew") from error
-    return state
-
-
-def _moments(beside: Mapping[str, NDArray[Any]]) -> dict[int, dict[str, torch.Tensor]]:
-    """Return Adam's state by parameter from the arrays of a checkpoint."""
-    found: dict[int, dict[str, torch.Tensor]] = {}
-    for name, array in beside.items():
-        if name.startswith(_OPTIMIZER):
-            index, _, moment = name.removeprefix(_OPTIMIZER).partition(".")
-            found.setdefault(int(index), {})[moment] = torch.from_numpy(array)
-    return found
+    return model.network, losses, state

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: MIT
 """The files of one key, ``OUT/000120/...``: results of ``run`` and tables of ``compare``, whole or
-not at all. The table of what ``run`` writes is `config.plugins.outputs`."""
+not at all. The table of what ``run`` writes is `config.written`."""
 
 from __future__ import annotations
 
@@ -11,7 +11,8 @@ from pathlib import Path
 from typing import Any, Literal
 
 from densify.config.errors import InputError
-from densify.config.plugins.outputs import OUTPUTS, Output, chosen
+from densify.config.plugins import Plugin
+from densify.config.written import chosen_outputs
 from densify.geometry.types import Result
 from densify.outputs import key_outputs
 from densify.outputs.atomic import staged_folder, writing_to
@@ -38,7 +39,7 @@ def check_writable(
     out: the folder of ``--out``, which need not exist. also: as ``output.also``. Causes are files
     of ``verb`` that are there and not to be overwritten, and a place without permission.
     """
-    owned = _owned(chosen(also)) if verb == "run" else _COMPARISON
+    owned = _owned(chosen_outputs(also)) if verb == "run" else _COMPARISON
     _check_place(_key_folder(out, key), owned, out, overwrite)
 
 
@@ -93,11 +94,11 @@ def write_result(
 
     Raises InputError if the place cannot be written to, or holds a result already.
     """
-    rows = chosen(also)
+    rows = chosen_outputs(also)
     owned, context = _owned(rows), Context(config, data)
     with writing(_key_folder(out, result.key), owned, out, overwrite) as folder:
         for row in rows:
-            getattr(OUTPUTS.module(row), row.function)(result, context, folder)
+            getattr(row.work(), row.function)(result, context, folder)
             if strays := sorted({entry.name for entry in folder.iterdir()} - {*owned}):
                 raise InputError(
                     f"output {row.name}: wrote {', '.join(strays)}, expected nothing but "
@@ -143,7 +144,7 @@ def _key_folder(out: Path, key: int) -> Path:
     return out / f"{key:06d}"
 
 
-def _owned(rows: Sequence[Output]) -> tuple[str, ...]:
+def _owned(rows: Sequence[Plugin]) -> tuple[str, ...]:
     return tuple(name for row in rows for name in row.owned)
 
 

@@ -23,7 +23,7 @@ from typing import Any, NamedTuple, TypeVar, cast
 from densify.config import Config
 from densify.config.cache import Cache, kept
 from densify.config.errors import InputError, SweepError, UnfitSweepError
-from densify.config.plugins.engines import engine as engine_row
+from densify.config.plugins import engine as engine_row
 from densify.depth.accumulate import accumulate, object_tracks
 from densify.flow.engines import Scene, SharedMotion, estimate_motion, motion_type
 from densify.free_space.ground import HeightMap, ground

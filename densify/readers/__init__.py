@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Opening recordings. `densify.config.plugins.readers` is the table of readers."""
+"""Opening recordings. `densify.config.plugins` has the table of readers."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import NamedTuple, Protocol, cast
 
 from densify.config.errors import InputError, did_you_mean
-from densify.config.plugins.readers import READERS, Reader
+from densify.config.plugins import READERS, Plugin
 from densify.geometry.types import LidarSequence
 
 _MOST_PLACES = 200  # are looked at for a recording, where the one named is none itself
@@ -51,7 +51,7 @@ class Spec(NamedTuple):
         if text == "street" or text.startswith(("street:", "street?")):
             return Spec("street", text)
         name, colon, place = text.partition(":")
-        reader = name if colon and name in READERS else None
+        reader = name if colon and name in READERS.names() else None
         place = text if reader is None else place
         path, mark, scene = place.rpartition("#")
         if not mark or _exists(place) or (reader is None and not _exists(path)):
@@ -94,11 +94,11 @@ def open_sequence(spec: str | Path = "street") -> LidarSequence:
         raise InputError(
             f"--data {spec}: {reader.name} recordings have no scenes; leave #{parsed.scene} out"
         )
-    module = cast(ReaderModule, READERS.module(reader))
+    module = cast(ReaderModule, reader.work())
     return module.open_recording(parsed.path, parsed.scene)
 
 
-def _reader_of(parsed: Spec, where: str) -> Reader:
+def _reader_of(parsed: Spec, where: str) -> Plugin:
     """Return the reader that is named, or the first that recognises the place."""
     if parsed.reader is not None:
         return READERS.row(parsed.reader, where)
@@ -109,7 +109,7 @@ def _reader_of(parsed: Spec, where: str) -> Reader:
             f"{where}: no such folder; {hint}expected a recording's folder, READER:PATH with "
             f"READER one of {', '.join(READERS.names())}, or street[:PRESET]"
         )
-    readers = sorted(READERS, key=lambda reader: reader.general)
+    readers = list(READERS)
     for reader in readers:
         if reader.recognises(parsed.path):
             return reader
@@ -120,7 +120,7 @@ def _reader_of(parsed: Spec, where: str) -> Reader:
     raise InputError(f"{where}: no known recording there; expected {', '.join(most)} or {last}")
 
 
-def _recording_in(path: Path, readers: Sequence[Reader]) -> Path | None:
+def _recording_in(path: Path, readers: Sequence[Plugin]) -> Path | None:
     """Return the first recording in a folder or its folders: one of a known form, or else a folder
     of sweeps."""
     places = [*path.glob("*"), *path.glob("*/*")][:_MOST_PLACES] if path.is_dir() else []

@@ -16,15 +16,13 @@ ego-motion removed:
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
-from densify.config.errors import InputError
-from densify.geometry.arrays import Bool, Float
-from densify.scores.flow_metrics import BucketedError, ThreeWayError, end_point_errors
+from densify.geometry.arrays import Float
+from densify.scores.flow_metrics import end_point_errors, mean_of
 
 CLASSES = ("BACKGROUND", "CAR", "OTHER_VEHICLES", "PEDESTRIAN", "WHEELED_VRU", "OBJECT")
 """A point's class is the index of its name here. OBJECT: of a kind that nobody named."""
@@ -33,6 +31,22 @@ IGNORED = 255
 WITHIN_M = 35.0
 MOVES_M = 0.05
 EDGES_M = np.linspace(0, 2.0, 51)
+
+
+class ThreeWayError(NamedTuple):
+    """Metres. mean_m: of the three, NaN where one is."""
+
+    foreground_dynamic_m: float
+    foreground_static_m: float
+    background_static_m: float
+    mean_m: float
+
+
+class BucketedError(NamedTuple):
+    """static_m: metres. dynamic: error as a part of the speed; zero flow has 1."""
+
+    static_m: float
+    dynamic: float
 
 
 class ChallengeScores(NamedTuple):
@@ -45,31 +59,25 @@ class ChallengeScores(NamedTuple):
     num_points: int
 
 
-@dataclass
 class ChallengeScorer:
     """Sums over pairs of sweeps. within_m: half a side of the square that counts."""
 
-    within_m: float = WITHIN_M
-    _three_way: Float = field(default_factory=lambda: np.zeros((3, 2)), repr=False)
-    _buckets: Float = field(
-        default_factory=lambda: np.zeros((3, len(CLASSES), len(EDGES_M))), repr=False
-    )
+    def __init__(self, within_m: float = WITHIN_M) -> None:
+        self._within_m = within_m
+        self._three_way = np.zeros((3, 2))
+        self._buckets = np.zeros((3, len(CLASSES), len(EDGES_M)))
 
-    def add(
-        self, points: ArrayLike, estimated: ArrayLike, true: ArrayLike, classes: ArrayLike
-    ) -> None:
+    def add(self, points: Float, estimated: Float, true: Float, classes: NDArray[Any]) -> None:
         """Add one pair, without unlabelled points and the ground.
 
         points: (N,3) metres, vehicle frame. estimated, true: (N,3) metres to the next sweep.
-        classes: (N,) indices in `CLASSES`, or `IGNORED`. Raises InputError if these do not fit.
+        classes: (N,) indices in `CLASSES`, or `IGNORED`.
         """
-        error_m = end_point_errors(estimated, true)
-        length_m = np.linalg.norm(np.asarray(true, np.float64), axis=1)
-        at, named = _checked(points, classes, len(error_m))
-        counted: Bool = (np.abs(at[:, :2]).max(axis=1, initial=0) < self.within_m) & (
-            named < len(CLASSES)
-        )
-        error_m, length_m, named = error_m[counted], length_m[counted], named[counted]
+        counted = np.abs(points[:, :2]).max(axis=1, initial=0) < self._within_m
+        counted &= classes < len(CLASSES)
+        error_m = end_point_errors(estimated, true)[counted]
+        length_m = np.linalg.norm(np.asarray(true, np.float64), axis=1)[counted]
+        named = classes[counted].astype(np.intp)
         moves, objects = length_m >= MOVES_M, named > 0
         for row, part in enumerate((objects & moves, objects & ~moves, ~objects & ~moves)):
             self._three_way[row] += error_m[part].sum(), part.sum()
@@ -90,30 +98,10 @@ class ChallengeScorer:
             if num.any():
                 filled = num[1:] > 0
                 quotients = error_m[1:][filled] / length_m[1:][filled]
-                by_class[name] = BucketedError(_ratio(error_m[0], num[0]), _mean(quotients))
+                by_class[name] = BucketedError(_ratio(error_m[0], num[0]), mean_of(quotients))
         columns = np.array([*by_class.values()]).reshape(-1, 2).T
-        mean = BucketedError(*(_mean(column[np.isfinite(column)]) for column in columns))
+        mean = BucketedError(*(mean_of(column[np.isfinite(column)]) for column in columns))
         return ChallengeScores(three_way, by_class, mean, int(self._buckets[0].sum()))
-
-
-def _checked(points: ArrayLike, classes: ArrayLike, num: int) -> tuple[Float, NDArray[np.intp]]:
-    at, named = np.asarray(points, np.float64), np.asarray(classes)
-    if at.shape != (num, 3) or named.shape != (num,) or named.dtype.kind not in "iu":
-        raise InputError(
-            f"challenge scores: got points of shape {at.shape} and {named.dtype} classes of shape "
-            f"{named.shape}, expected ({num}, 3) and whole numbers of shape ({num},)"
-        )
-    bad = (named < 0) | ((named >= len(CLASSES)) & (named != IGNORED))
-    if bad.any():
-        raise InputError(
-            f"challenge scores: got class {named[bad][0]}, expected 0 to {len(CLASSES) - 1}, or "
-            f"{IGNORED} for points left out"
-        )
-    return at, named.astype(np.intp)
-
-
-def _mean(values: Float) -> float:
-    return float(values.mean()) if len(values) else math.nan
 
 
 def _ratio(part: float, whole: float) -> float:

@@ -16,7 +16,6 @@ from typing import Any
 import numpy as np
 from scipy import ndimage
 
-from densify.config.errors import InputError
 from densify.geometry.types import Bool, Camera, DepthMap, Float, Float32
 
 KITTI_BASELINE_M = 0.54
@@ -67,9 +66,8 @@ def depth_errors(
 
     predicted_m, truth_m: camera z in metres, 0 none; maps (H,W) or lists of pixels (N,). A depth is
     an outlier if its disparity focal_px · baseline_m / z is off by more than 3 px *and* by more
-    than 5 % of the true one. focal_px: the camera's fx. Raises InputError if the shapes differ.
+    than 5 % of the true one. focal_px: the camera's fx.
     """
-    _check_shapes(predicted_m, truth=truth_m, mask=mask)
     known = truth_m > 0 if mask is None else (truth_m > 0) & mask
     compared = known & (predicted_m > 0)
     num_pixels, num_compared = int(known.sum()), int(compared.sum())
@@ -123,8 +121,7 @@ def errors_by_part(
 ) -> dict[str, DepthErrors]:
     """Return `depth_errors` of ``all`` pixels, by true depth (``0-10 m`` … ``over 80 m``), on
     `depth_edges` (``edge``) and off them (``not edge``), and, with a mask of moving pixels (H,W),
-    of ``moving`` and ``static`` ones. Raises InputError if shapes differ."""
-    _check_shapes(predicted_m, truth=truth_m, mask=moving)
+    of ``moving`` and ``static`` ones."""
     known = truth_m > 0
     z, t = predicted_m[known], truth_m[known]
     parts: dict[str, Bool | None] = {"all": None}
@@ -215,15 +212,6 @@ def _is_outlier(disparity_px: Float, true_px: Float) -> Bool:
     off_px = np.abs(disparity_px - true_px)
     wrong: Bool = (off_px > OUTLIER_PX) & (off_px > OUTLIER_FRACTION * true_px)
     return wrong
-
-
-def _check_shapes(predicted_m: np.ndarray, **others: np.ndarray | None) -> None:
-    for name, image in others.items():
-        if image is not None and image.shape != predicted_m.shape:
-            raise InputError(
-                f"depth errors: {name}: expected the depth map's shape {predicted_m.shape}, got "
-                f"{image.shape}; give maps of the same camera"
-            )
 
 
 def _mean(values: np.ndarray) -> float | None:

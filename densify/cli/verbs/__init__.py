@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
 """The verbs, and the parser of them all.
 
-Each module of a verb has ``add``, which adds its options, and ``answer``, which opens, calls the
-Python API, writes, and yields what there is to say. Heavy packages are imported when a verb is
-called: help answers at once.
+Each verb has a function ``add``, which adds its options, and a function ``answer``, which opens,
+calls the Python API, writes, and yields what there is to say. Heavy packages are imported when a
+verb is called: help answers at once.
 """
 
 from __future__ import annotations
@@ -14,32 +14,14 @@ from collections.abc import Sequence
 from typing import Any, NoReturn
 
 from densify import __version__
-from densify.cli.verbs import (
-    bench,
-    dataset,
-    doctor,
-    evaluate,
-    export,
-    flow,
-    report,
-    run,
-    simulate,
-    train,
-    view,
-)
+from densify.cli.verbs import bench, dataset, evaluate, finished, flow, recordings, run, train
 from densify.config.errors import brief, did_you_mean
 
-_REMOVED = {
-    "--at": "--set project.at=camera|sweep",
-    "--per": "--set project.per=sweep|image",
-    "--movers": "--set output.movers=keep|drop|separate",
-    "--max-ghost": "--set dataset.max_ghost=SHARE",
-    "--min-density": "--set dataset.min_density=SHARE",
-    "--max-outliers": "--set dataset.max_outliers=SHARE",
-    "--min-sweeps": "--set dataset.min_sweeps=N",
-    "--split": "--set dataset.split=train|val",
-}
-"""Options of earlier versions -> what to give instead."""
+_ADD = (
+    *(run.add_run, run.add_compare, dataset.add, flow.add_flow, train.add, flow.add_labels),
+    *(recordings.add_info, recordings.add_doctor, recordings.add_simulate, finished.add_export),
+    *(finished.add_report, finished.add_view, evaluate.add, bench.add),
+)
 
 
 def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
@@ -63,22 +45,7 @@ def _command_line() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=f"densify {__version__}")
     commands = parser.add_subparsers(title="verbs", metavar="VERB", required=True)
-    for add in (
-        run.add_run,
-        run.add_compare,
-        dataset.add,
-        flow.add_flow,
-        train.add,
-        flow.add_labels,
-        doctor.add_info,
-        doctor.add_doctor,
-        simulate.add,
-        export.add,
-        report.add,
-        view.add,
-        evaluate.add,
-        bench.add,
-    ):
+    for add in _ADD:
         add(commands)
     return parser
 
@@ -96,8 +63,6 @@ class _Parser(argparse.ArgumentParser):
         if unknown is not None:
             name = unknown.partition("=")[0]
             hint = did_you_mean(name, self._option_string_actions)
-            if name in _REMOVED:
-                hint = f"give {_REMOVED[name]} instead"
             self.error(f"unknown option {name}; {hint}".rstrip("; "))
         return found, others
 

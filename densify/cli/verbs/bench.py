@@ -10,18 +10,15 @@ from typing import TYPE_CHECKING, Any
 
 from densify.cli.answer import Answer, numbers_table
 from densify.cli.options import (
-    add_camera,
-    add_config_options,
-    add_overwrite,
+    add_common,
     add_recording,
     add_verb,
-    add_window,
     check_new_file,
     config_of,
     natural,
+    option,
     recording_of,
     recordings_of,
-    sentence,
     words,
 )
 from densify.cli.progress import progress_on_stderr
@@ -42,21 +39,17 @@ _UNSEEN = (
 def add(commands: Any) -> None:
     """Add ``bench`` and its tables."""
     about = "measured tables: this package's methods beside published ones"
-    parser = commands.add_parser("bench", help=about, description=sentence(about))
+    parser = add_verb(commands, "bench", None, about)
     benches = parser.add_subparsers(title="benches", metavar="WHAT", required=True)
     _add_flow(benches)
     _add_depth(benches)
     _add_paper(benches)
-    parser = add_verb(
-        benches,
-        "readme",
-        _answer_readme,
-        "the tables of docs/results.md made again, as Markdown on stdout; all of them take an hour",
-    )
+    about = "the tables of docs/results.md made again, as Markdown on stdout; all take an hour"
+    parser = add_verb(benches, "readme", _answer_readme, about)
     names = "depth, flow, registration"
     parser.add_argument("tables", nargs="*", metavar="TABLE", help=f"of {names} (default: all)")
-    for name, what in (("kitti", "drive 2011_09_26_drive_0013_sync"), ("pandaset", "sequence 002")):
-        parser.add_argument(f"--{name}", metavar="DIR", type=Path, help=f"{what}, for its rows")
+    option(parser, "--kitti DIR", "drive 2011_09_26_drive_0013_sync, for its rows", type=Path)
+    option(parser, "--pandaset DIR", "sequence 002, for its rows", type=Path)
 
 
 def _add_flow(benches: Any) -> None:
@@ -73,13 +66,12 @@ def _add_flow(benches: Any) -> None:
     )
     add_recording(parser, several=True)
     _add_common(parser)
-    fast = "(default: all but paper-adam)"
-    parser.add_argument("--methods", type=words, metavar="NAME,…", help=fast)
-    truth = (
+    option(parser, "--methods NAME,…", "(default: all but paper-adam)", type=words)
+    about = (
         "true flow of the sweeps to the next ones: FRAME_NEXT.npz (flow files), STAMP.feather "
         "(Argoverse 2's labels), or OpenSceneFlow's .h5; pairs before the key are scored"
     )
-    parser.add_argument("--truth", metavar="DIR|FILE.h5", type=Path, help=truth)
+    option(parser, "--truth DIR|FILE.h5", about, type=Path)
 
 
 def _add_depth(benches: Any) -> None:
@@ -94,18 +86,16 @@ def _add_depth(benches: Any) -> None:
     )
     add_recording(parser)
     _add_common(parser)
-    add_camera(parser)
-    method = "as of compare (default: flow)"
-    parser.add_argument("--method", default="flow", metavar="NAME", help=method)
-    parser.add_argument(
-        "--variant",
-        nargs="+",
-        action="append",
-        default=[],
-        metavar=("NAME", "section.key=value"),
-        help="a configuration beside the given one; may be given several times",
+    add_common(parser, "camera")
+    option(parser, "--method NAME", "as of compare (default: flow)", default="flow")
+    names, about = (
+        ("NAME", "section.key=value"),
+        "a configuration beside the given one; several times",
     )
-    parser.add_argument("--scanner", type=natural, metavar="N", help="whose returns are the truth")
+    parser.add_argument(
+        "--variant", nargs="+", action="append", default=[], metavar=names, help=about
+    )
+    option(parser, "--scanner N", "whose returns are the truth", type=natural)
 
 
 def _add_paper(benches: Any) -> None:
@@ -119,32 +109,33 @@ def _add_paper(benches: Any) -> None:
         "Methods: rest, icp, paper-adam (as published: minutes a pair), paper (this package's "
         "solver), no-laplacian (Table 2), ours.",
     )
-    for name, what in (("flyingthings", "FlyingThings3D"), ("kitti", "KITTI's scene flow 2015")):
-        about = f".npz files of {what} as FlowNet3D's authors made them"
-        parser.add_argument(f"--{name}", metavar="DIR", type=Path, help=about)
-    parser.add_argument("--data", action="append", metavar="SPEC@K,…", help="recordings and frames")
-    parser.add_argument("--methods", type=words, metavar="NAME,…", help="(default: the fast ones)")
-    model = "a network of densify train flow; may be given several times"
-    parser.add_argument(
-        "--model", type=Path, action="append", default=[], dest="models", help=model
-    )
-    for name, default, what in (("points", 2048, "drawn"), ("pairs", 0, "of a set, 0: all")):
-        about = f"{what} (default: {default})"
-        parser.add_argument(f"--{name}", type=natural, default=default, metavar="N", help=about)
+    files = "as FlowNet3D's authors made them"
+    option(parser, "--flyingthings DIR", f".npz files of FlyingThings3D {files}", type=Path)
+    option(parser, "--kitti DIR", f".npz files of KITTI's scene flow 2015 {files}", type=Path)
+    option(parser, "--data SPEC@K,…", "recordings and frames", action="append")
+    option(parser, "--methods NAME,…", "(default: the fast ones)", type=words)
+    about = "a network of densify train flow; may be given several times"
+    option(parser, "--model FILE", about, type=Path, action="append", default=[], dest="models")
+    option(parser, "--points N", "drawn (default: 2048)", type=natural, default=2048)
+    option(parser, "--pairs N", "of a set (default: 0, all)", type=natural, default=0)
     _add_file(parser)
 
 
 def _add_common(parser: argparse.ArgumentParser) -> None:
-    keys = "frame in the middle; may be given several times (default: 120)"
-    parser.add_argument("--key", type=natural, action="append", dest="keys", metavar="K", help=keys)
-    add_window(parser)
-    add_config_options(parser)
+    about = "frame in the middle; may be given several times (default: 120)"
+    option(parser, "--key K", about, type=natural, action="append", dest="keys")
+    add_common(parser, "window", "config")
     _add_file(parser)
 
 
 def _add_file(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--out", metavar="FILE.json", type=Path, help="write every number there")
-    add_overwrite(parser)
+    option(parser, "--out FILE.json", "write every number there", type=Path)
+    add_common(parser, "overwrite")
+
+
+def _check_file(options: argparse.Namespace) -> None:
+    if options.out is not None:
+        check_new_file(options.out, options.overwrite, ".json")
 
 
 def _written(options: argparse.Namespace, numbers: Mapping[str, Any]) -> list[Path]:
@@ -159,18 +150,17 @@ def _written(options: argparse.Namespace, numbers: Mapping[str, Any]) -> list[Pa
 
 def _answer_flow(options: argparse.Namespace) -> Iterator[Answer]:
     config = config_of(options)
-    from densify.bench import flow as bench
+    from densify.bench.flow import DEFAULT_METHODS, bench_flow
     from densify.readers import open_sequence
 
-    if options.out is not None:
-        check_new_file(options.out, options.overwrite, ".json")
-    methods = bench.DEFAULT_METHODS if options.methods is None else options.methods
-    runs = []
+    _check_file(options)
+    methods = DEFAULT_METHODS if options.methods is None else options.methods
+    runs, window = [], options.window
     for sequence in [open_sequence(spec) for spec in recordings_of(options)]:
         for key in options.keys or [120]:
             with progress_on_stderr() as progress:
-                measured = bench.bench_flow(
-                    sequence, key, options.window, config, methods, progress, options.truth
+                measured = bench_flow(
+                    sequence, key, window, config, methods, progress, options.truth
                 )
             runs.append(measured)
             title = f"{measured['data']}, key {key}, {measured['num_pairs']} pairs"
@@ -186,19 +176,12 @@ def _answer_depth(options: argparse.Namespace) -> Iterator[Answer]:
     from densify.bench.depth import bench_depth
     from densify.readers import open_sequence
 
-    if options.out is not None:
-        check_new_file(options.out, options.overwrite, ".json")
+    _check_file(options)
     sequence, keys = open_sequence(recording_of(options)), options.keys or [120]
+    window, cameras, scanner = options.window, options.cameras, options.scanner
     with progress_on_stderr() as progress:
         measured = bench_depth(
-            sequence,
-            keys,
-            options.window,
-            variants,
-            options.cameras,
-            options.scanner,
-            options.method,
-            progress,
+            sequence, keys, window, variants, cameras, scanner, options.method, progress
         )
     configs = {name: as_mapping(config) for name, config in variants.items()}
     files = _written(options, {**measured, "config": configs})
@@ -207,23 +190,20 @@ def _answer_depth(options: argparse.Namespace) -> Iterator[Answer]:
 
 
 def _answer_paper(options: argparse.Namespace) -> Iterator[Answer]:
-    from densify.bench import paper as bench
+    from densify.bench.paper import DEFAULT_METHODS, PUBLISHED, bench_paper
 
-    if options.out is not None:
-        check_new_file(options.out, options.overwrite, ".json")
-    methods = bench.DEFAULT_METHODS if options.methods is None else options.methods
+    _check_file(options)
+    methods = DEFAULT_METHODS if options.methods is None else options.methods
+    models, num_points = options.models, options.points
     measured: dict[str, dict[str, Any]] = {}
     for name, pairs in _paper_sets(options).items():
         with progress_on_stderr() as progress:
-            measured[name] = bench.bench_paper(
-                pairs, methods, options.models, options.points, progress
-            )
-        published = {"as published": bench.PUBLISHED[name]} if name in bench.PUBLISHED else {}
-        lines = [f"{name}: {measured[name]['num_pairs']} pairs, {options.points} points drawn"]
-        lines.append(numbers_table({**measured[name]["methods"], **published}))
-        yield Answer("\n".join([*lines, ""]), {"sets": [{"set": name, **measured[name]}]})
-    numbers = {"sets": measured, "published": bench.PUBLISHED}
-    yield Answer(files=_written(options, numbers))
+            measured[name] = bench_paper(pairs, methods, models, num_points, progress)
+        published = {"as published": PUBLISHED[name]} if name in PUBLISHED else {}
+        title = f"{name}: {measured[name]['num_pairs']} pairs, {num_points} points drawn"
+        text = numbers_table({**measured[name]["methods"], **published})
+        yield Answer(f"{title}\n{text}\n", {"sets": [{"set": name, **measured[name]}]})
+    yield Answer(files=_written(options, {"sets": measured, "published": PUBLISHED}))
 
 
 def _paper_sets(options: argparse.Namespace) -> dict[str, Iterable[PaperPair]]:
@@ -235,20 +215,14 @@ def _paper_sets(options: argparse.Namespace) -> dict[str, Iterable[PaperPair]]:
             sets[name] = paper_pairs.pairs_of_files(folder, options.pairs)
     chosen: dict[str, list[tuple[str, int]]] = {}
     for text in options.data or (() if sets else _UNSEEN):
-        spec, keys = _recording_keys(text)
+        spec, _, keys = text.rpartition("@")
+        if not spec or not all(key.isdecimal() for key in keys.split(",")):
+            raise InputError(f"--data {text}: expected a recording and frames, as street@60,80")
         kind = "streets" if paper_pairs.has_truth(spec) else "against this package's engine"
-        chosen.setdefault(kind, []).extend((spec, key) for key in keys)
+        chosen.setdefault(kind, []).extend((spec, int(key)) for key in keys.split(","))
     for kind, places in chosen.items():
         sets[kind] = map(paper_pairs.pair_of_recording, *zip(*places, strict=True))
     return sets
-
-
-def _recording_keys(text: str) -> tuple[str, list[int]]:
-    """Read ``SPEC@K,K,…``."""
-    spec, _, keys = text.rpartition("@")
-    if not spec or not all(key.isdecimal() for key in keys.split(",")):
-        raise InputError(f"--data {text}: expected a recording and frames, as street@60,80")
-    return spec, [int(key) for key in keys.split(",")]
 
 
 def _answer_readme(options: argparse.Namespace) -> Iterator[Answer]:

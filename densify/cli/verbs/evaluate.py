@@ -8,8 +8,8 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from densify.cli.answer import Answer, Column, percent, table
-from densify.cli.options import add_overwrite, add_verb, check_new_file, positive
+from densify.cli.answer import Answer, Column, aligned, percent, table
+from densify.cli.options import add_common, add_verb, check_new_file, option, positive
 from densify.cli.progress import progress_on_stderr
 
 _COLUMNS: tuple[Column, ...] = (
@@ -49,25 +49,18 @@ def add(commands: Any) -> None:
     )
     parser.add_argument("predicted", metavar="PREDICTED", type=Path, help="a PNG or a folder")
     parser.add_argument("truth", metavar="TRUTH", type=Path, help="a PNG or a folder")
-    parser.add_argument(
-        "--mask",
-        type=Path,
-        metavar="PNG|DIR",
-        help="moving objects, not 0 in an image or a folder of them: scores of moving and static "
-        "pixels too",
+    about = (
+        "moving objects, not 0 in an image or a folder of them: their scores and the others' too"
     )
-    parser.add_argument(
-        "--filled",
-        action="store_true",
-        help="of what densify made, score depth_filled (of a set, groundtruth_filled)",
-    )
-    for name, what in (
-        ("--focal-px", "the camera's fx, for outliers and edges (default: KITTI's, 721.5377)"),
-        ("--baseline-m", "stereo baseline that defines outliers (default: KITTI's, 0.54)"),
-    ):
-        parser.add_argument(name, type=positive, metavar="X", help=what)
-    parser.add_argument("--out", metavar="FILE.json", type=Path, help="write every number there")
-    add_overwrite(parser)
+    option(parser, "--mask PNG|DIR", about, type=Path)
+    about = "of what densify made, score depth_filled (of a set, groundtruth_filled)"
+    option(parser, "--filled", about)
+    about = "the camera's fx, for outliers and edges (default: KITTI's, 721.5377)"
+    option(parser, "--focal-px X", about, type=positive, default=721.5377)
+    about = "stereo baseline that defines outliers (default: KITTI's, 0.54)"
+    option(parser, "--baseline-m X", about, type=positive, default=0.54)
+    option(parser, "--out FILE.json", "write every number there", type=Path)
+    add_common(parser, "overwrite")
 
 
 def answer(options: argparse.Namespace) -> Iterator[Answer]:
@@ -78,10 +71,8 @@ def answer(options: argparse.Namespace) -> Iterator[Answer]:
     if options.out is not None:
         check_new_file(options.out, options.overwrite, ".json")
     pairs = pair_depth_files(options.predicted, options.truth, options.mask, filled=options.filled)
-    given = {name: getattr(options, name) for name in ("focal_px", "baseline_m")}
-    stereo = {name: value for name, value in given.items() if value is not None}
     with progress_on_stderr() as progress:
-        scores = evaluate(pairs, **stereo, progress=progress)
+        scores = evaluate(pairs, options.focal_px, options.baseline_m, progress)
     if options.out is not None:
         write_numbers(options.out, scores)
     yield Answer(_describe(scores), {"scores": scores}, [options.out] if options.out else [])
@@ -102,7 +93,7 @@ def _describe(scores: Mapping[str, Any]) -> str:
             rest = f", ... and {num_more:,} more" if num_more > 0 else ""
             lines.append(f"{what}: {len(paths):,}: {', '.join(paths[:_MOST_NAMED])}{rest}")
     rows = {name: _in_mm(part) for name, part in scores["parts"].items() if part["num_pixels"]}
-    return "\n".join([*lines, table(rows, _COLUMNS)])
+    return "\n".join([*lines, aligned(table(rows, _COLUMNS))])
 
 
 def _in_mm(part: Mapping[str, Any]) -> dict[str, Any]:

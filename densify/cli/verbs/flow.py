@@ -12,13 +12,13 @@ from typing import TYPE_CHECKING, Any
 import densify
 from densify.cli.answer import Answer
 from densify.cli.options import (
-    add_config_options,
-    add_overwrite,
+    add_common,
     add_recording,
     add_verb,
     check_new_file,
     config_of,
-    key_slice,
+    key_range,
+    option,
     recording_of,
     sliced,
 )
@@ -48,18 +48,13 @@ def add_flow(commands: Any) -> None:
     )
     parser.add_argument("source", metavar="SOURCE|SPEC", nargs="?", help="points, or a recording")
     parser.add_argument("target", metavar="TARGET", type=Path, nargs="?", help="points, later")
-    parser.add_argument("--data", metavar="SPEC", help="the recording as an option")
-    parser.add_argument("--all", action="store_true", help="every sweep of the recording")
-    parser.add_argument(
-        "--keys", type=key_slice, metavar="A:B[:S]", help="sweeps A to B-1, every S-th"
-    )
+    option(parser, "--data SPEC", "the recording as an option")
+    option(parser, "--all", "every sweep of the recording")
+    option(parser, "--keys A:B[:S]", "sweeps A to B-1, every S-th", type=key_range)
     formats = ("npz", "av2", "opensceneflow")
     parser.add_argument("--format", choices=formats, help="for a recording (default: npz)")
-    parser.add_argument(
-        "--out", metavar="F.npz|DIR", type=Path, help="(default: densify-out/flow.npz, densify-out)"
-    )
-    add_config_options(parser)
-    add_overwrite(parser)
+    option(parser, "--out F.npz|DIR", "(default: densify-out/flow.npz, densify-out)", type=Path)
+    add_common(parser, "config", "overwrite")
 
 
 def answer_flow(options: argparse.Namespace) -> Iterator[Answer]:
@@ -85,14 +80,11 @@ def _of_two_files(options: argparse.Namespace, config: Config) -> Answer:
     from densify.outputs.flow_writers import flow_npz
 
     out = options.out or Path("densify-out/flow.npz")
-    check_new_file(out, options.overwrite)
+    check_new_file(out, options.overwrite, ".npz")
     source, target = read_points(Path(options.source)), read_points(options.target)
     field = densify.estimate_flow(source, target, config)
-    try:
-        out.parent.mkdir(parents=True, exist_ok=True)
-        write_file(out, flow_npz(field))
-    except OSError as error:
-        raise InputError(f"--out {out}: cannot be written: {error.strerror or error}") from error
+    out.parent.mkdir(parents=True, exist_ok=True)
+    write_file(out, flow_npz(field))
     num_moving = int(field.moving.sum())
     facts = {"num_points": len(source), "num_moving": num_moving}
     return Answer(f"{len(source):,} points, {num_moving:,} moving", facts, [out])
@@ -108,13 +100,12 @@ def read_points(path: Path) -> Float:
 
     from densify.readers.point_files import read_table
 
-    table = read_table(path)
-    missing = [name for name in "xyz" if name not in table.columns]
-    if missing:
+    columns = read_table(path).columns
+    if missing := [name for name in "xyz" if name not in columns]:
         raise InputError(
-            f"{path}: no column {missing[0]}: got {', '.join(table.columns)}, expected x, y and z"
+            f"{path}: no column {missing[0]}: got {', '.join(columns)}, expected x, y and z"
         )
-    points = np.column_stack([table.columns[name].astype(np.float64) for name in "xyz"])
+    points = np.column_stack([columns[name].astype(np.float64) for name in "xyz"])
     bad = np.flatnonzero(~np.isfinite(points).all(axis=1))
     if len(bad):
         raise InputError(
@@ -130,10 +121,8 @@ def _of_recording(spec: str, options: argparse.Namespace, config: Config) -> Ite
     from densify.readers import open_sequence
 
     sequence, out = open_sequence(spec), options.out or Path("densify-out")
-    frames = list(sequence.frames)
-    if options.keys is not None:
-        frames = sliced(sequence, options.keys)
-    paths: dict[Path, None] = {}
+    frames = sliced(sequence, options.keys)
+    folders: dict[Path, None] = {}
     failed: dict[int, Exception] = {}
     num_moving = 0
     with (
@@ -144,23 +133,18 @@ def _of_recording(spec: str, options: argparse.Namespace, config: Config) -> Ite
             if isinstance(flow, Exception):
                 failed[frame] = flow
                 continue
-            paths[write(frame, flow)] = None
+            folders[write(frame, flow)] = None
             num_moving += sum(int(field.moving.sum()) for field in flow.steps.values())
     num_made = len(frames) - len(failed)
-    text = f"{_sweeps(num_made)}, {num_moving:,} points moving"
     facts = {"num_sweeps": num_made, "num_moving": num_moving}
-    yield Answer(text, facts, list(paths))
-    _raise_failed(failed, len(frames), "made")
+    yield Answer(f"{num_made:,} sweeps, {num_moving:,} points moving", facts, [*folders])
+    _raise_failed(failed, len(frames))
 
 
-def _sweeps(num: int) -> str:
-    return f"{num:,} sweep{'' if num == 1 else 's'}"
-
-
-def _raise_failed(failed: Mapping[int, Exception], num: int, what: str) -> None:
+def _raise_failed(failed: Mapping[int, Exception], num: int) -> None:
     if failed:
         told = "; ".join(f"sweep {frame}: {error}" for frame, error in failed.items())
-        raise ComputationError(f"{len(failed)} of {num} sweeps not {what}: {told}")
+        raise ComputationError(f"{len(failed)} of {num} sweeps not made: {told}")
 
 
 def add_labels(commands: Any) -> None:
@@ -176,10 +160,9 @@ def add_labels(commands: Any) -> None:
         "register.source=kiss-icp: estimated).",
     )
     add_recording(parser)
-    parser.add_argument("--out", metavar="DIR", type=Path, required=True, help="for the flow files")
-    parser.add_argument("--keys", type=key_slice, metavar="A:B[:S]", help="(default: all sweeps)")
-    add_config_options(parser)
-    add_overwrite(parser)
+    option(parser, "--out DIR", "for the flow files", type=Path, required=True)
+    option(parser, "--keys A:B[:S]", "(default: all sweeps)", type=key_range)
+    add_common(parser, "config", "overwrite")
 
 
 def answer_labels(options: argparse.Namespace) -> Iterator[Answer]:
@@ -189,14 +172,11 @@ def answer_labels(options: argparse.Namespace) -> Iterator[Answer]:
     from densify.readers import open_sequence
 
     sequence = open_sequence(recording_of(options))
-    frames = list(sequence.frames)
-    if options.keys is not None:
-        frames = sliced(sequence, options.keys)
+    frames = sliced(sequence, options.keys)
     failed: dict[int, Exception] = {}
     num_made = num_points = num_moving = num_sure = 0
     with progress_on_stderr() as progress:
-        labels = label_sweeps(sequence, frames, config, progress=progress)
-        for frame, label in labels:
+        for frame, label in label_sweeps(sequence, frames, config, progress):
             if not isinstance(label, Label):
                 failed[frame] = label
                 continue
@@ -212,6 +192,6 @@ def answer_labels(options: argparse.Namespace) -> Iterator[Answer]:
         )
     share = num_sure / max(num_points, 1)
     facts: dict[str, Any] = {"num_sweeps": num_made, "num_moving": num_moving, "share_valid": share}
-    text = f"{_sweeps(num_made)}, {num_moving:,} points moving, {100 * share:.1f} % valid"
+    text = f"{num_made:,} sweeps, {num_moving:,} points moving, {100 * share:.1f} % valid"
     yield Answer(text, facts, [options.out] if num_made else [])
-    _raise_failed(failed, len(frames), "labelled")
+    _raise_failed(failed, len(frames))

@@ -10,61 +10,83 @@ from typing import TYPE_CHECKING, Any
 
 from densify.cli.answer import Answer, first_of
 from densify.cli.options import (
-    add_key_options,
-    add_method,
+    add_common,
+    add_recording,
     add_verb,
     config_of,
-    key_slice,
+    key_range,
     natural,
+    option,
     recording_of,
     sliced,
     words,
 )
 from densify.cli.progress import progress_on_stderr
 from densify.cli.screen import tell_doubts
-from densify.config import Config, as_mapping
+from densify.config import as_mapping, presets
 from densify.config.errors import ComputationError, InputError
+from densify.config.plugins import ENGINES
 
 if TYPE_CHECKING:
-    from densify.geometry.types import LidarSequence, Result
+    from densify.geometry.types import LidarSequence
 
 
 def add_run(commands: Any) -> None:
     """Add the options of ``run``."""
     parser = add_verb(commands, "run", answer_run, "densify one key or several")
-    parser.add_argument(
-        "--key",
-        type=natural,
-        action="append",
-        default=[],
-        metavar="K",
-        help="the frame to densify; may be given several times",
-    )
-    parser.add_argument(
-        "--keys",
-        type=key_slice,
-        metavar="A:B[:S]",
-        help="frames A to B-1, every S-th, of those that exist; keys whose windows overlap share "
-        "registration and motion",
-    )
-    add_key_options(parser)
-    add_method(parser)
-    parser.add_argument(
-        "--prior",
-        type=Path,
-        metavar="DIR|FILE",
-        help="depth images of your own, as of a monocular network: DIR/CAMERA/FRAME.npy, .exr or "
+    about = "the frame to densify; may be given several times"
+    option(parser, "--key K", about, type=natural, action="append", default=[])
+    about = "frames A to B-1, every S-th, of those that exist; keys whose windows overlap share "
+    option(parser, "--keys A:B[:S]", f"{about}registration and motion", type=key_range)
+    _add_key_options(parser)
+    add_common(parser, "method")
+    about = (
+        "depth images of your own, as of a monocular network: DIR/CAMERA/FRAME.npy, .exr or "
         ".png (16 bit), or one FRAME.npy of one camera; of any scale, depth or inverse depth. "
         "Fitted to the measured pixels they complete depth_full/; masks of the sky in "
-        "DIR/sky/CAMERA/FRAME.png",
+        "DIR/sky/CAMERA/FRAME.png"
     )
+    option(parser, "--prior DIR|FILE", about, type=Path)
+
+
+def add_compare(commands: Any) -> None:
+    """Add the options of ``compare``."""
+    about = "methods side by side, on the same registration"
+    parser = add_verb(commands, "compare", answer_compare, about)
+    option(parser, "--key K", "the frame to densify", type=natural, required=True)
+    _add_key_options(parser)
+    about = (
+        "of none (the key sweep), icp (registration only), icp-far (the same of all sweeps "
+        "within accumulate.far_m), icp-visible (registration with our visibility), flow-plain (our "
+        "scene flow without it), paper (the published scene flow), flow (ours); default: "
+        "none,icp,icp-far,paper,flow"
+    )
+    option(parser, "--methods NAME,…", about, type=words)
+
+
+def _add_key_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options that ``run`` and ``compare`` share."""
+    parser.epilog = f"Every knob with its default and what it does: {presets()['default']}"
+    add_recording(parser)
+    add_common(parser, "window", "camera")
+    engines = ", ".join(row.usage for row in ENGINES.built_in)
+    option(parser, "--flow ENGINE", f"flow.engine (default: groups): {engines}")
+    about = (
+        "a page to look at each key in a browser, with the rejected pixels (short for --set "
+        "output.report=true --set output.rejected=true; densify report makes it later)"
+    )
+    option(parser, "--report", about)
+    add_common(parser, "config")
+    out = "densify-out"
+    option(parser, "--out DIR", f"(default: ./{out})", type=Path, default=Path(out))
+    add_common(parser, "overwrite")
 
 
 def answer_run(options: argparse.Namespace) -> Iterator[Answer]:
     """Densify one key or several."""
     config = config_of(options)
     from densify.cli.results import FIRST_OF_RUN, key_facts, summary
-    from densify.outputs import check_writable
+    from densify.outputs import check_writable, write_result
     from densify.pipeline import run as pipeline
     from densify.readers import open_sequence
 
@@ -74,23 +96,24 @@ def answer_run(options: argparse.Namespace) -> Iterator[Answer]:
         check_writable(options.out, key, options.overwrite, "run", config.output.also)
     failed: dict[int, Exception] = {}
     doubts: list[tuple[str, str, int]] = []
+    window, method, cameras = options.window, options.method, options.cameras
     with progress_on_stderr() as progress:
         made = pipeline.run_keys(
-            sequence,
-            keys,
-            options.window,
-            options.method,
-            options.cameras,
-            config,
-            progress,
-            prior=options.prior,
+            sequence, keys, window, method, cameras, config, progress, prior=options.prior
         )
         for key, result in made:
             if isinstance(result, Exception):
                 failed[key] = result
                 yield Answer(facts={"keys": [{"key": key, "error": str(result)}]})
                 continue
-            paths = _written(result, options, config)
+            paths = write_result(
+                result,
+                options.out,
+                config=as_mapping(config),
+                data=recording_of(options),
+                overwrite=options.overwrite,
+                also=config.output.also,
+            )
             first = first_of(paths, FIRST_OF_RUN)
             yield Answer(summary(result), {"keys": [key_facts(result)]}, paths, first)
             doubts += [(warning, "", key) for warning in result.warnings]
@@ -102,33 +125,16 @@ def answer_run(options: argparse.Namespace) -> Iterator[Answer]:
         raise ComputationError(f"{len(failed)} of {len(keys)} keys not made: {told}")
 
 
-def _written(result: Result, options: argparse.Namespace, config: Config) -> list[Path]:
-    """Write the files of a key and return their paths."""
-    from densify.outputs import write_result
-
-    return write_result(
-        result,
-        options.out,
-        config=as_mapping(config),
-        data=recording_of(options),
-        overwrite=options.overwrite,
-        also=config.output.also,
-    )
-
-
 def _keys_of(sequence: LidarSequence, options: argparse.Namespace) -> list[int]:
     """Return the frames of ``--key`` and ``--keys``, ascending."""
     from densify.readers.timeline import format_frames
 
-    frames = frozenset(sequence.frames)
     wanted = {*options.key}
     if options.keys is not None:
         wanted |= {*sliced(sequence, options.keys)}
-    for key in sorted(wanted - frames):
-        raise InputError(
-            f"--key {key}: no such frame in {sequence.name}; "
-            f"it has {format_frames(sequence.frames)}"
-        )
+    for key in sorted(wanted - {*sequence.frames}):
+        there = format_frames(sequence.frames)
+        raise InputError(f"--key {key}: no such frame in {sequence.name}; it has {there}")
     if not wanted:
         raise InputError(
             "--key K or --keys A:B[:S]: expected the frame or frames to densify; "
@@ -137,45 +143,21 @@ def _keys_of(sequence: LidarSequence, options: argparse.Namespace) -> list[int]:
     return sorted(wanted)
 
 
-def add_compare(commands: Any) -> None:
-    """Add the options of ``compare``."""
-    about = "methods side by side, on the same registration"
-    parser = add_verb(commands, "compare", answer_compare, about)
-    parser.add_argument(
-        "--key", type=natural, required=True, metavar="K", help="the frame to densify"
-    )
-    add_key_options(parser)
-    parser.add_argument(
-        "--methods",
-        type=words,
-        metavar="NAME,…",
-        help="of none (the key sweep), icp (registration only), icp-far (the same of all sweeps "
-        "within accumulate.far_m), icp-visible (registration with our visibility), flow-plain (our "
-        "scene flow without it), paper (the published scene flow), flow (ours); default: "
-        "none,icp,icp-far,paper,flow",
-    )
-
-
 def answer_compare(options: argparse.Namespace) -> Iterator[Answer]:
     """Densify one key by several methods."""
     config = config_of(options)
     from densify.cli.results import FIRST_OF_COMPARISON, comparison, key_facts
+    from densify.dataset.report import write_comparison_page
     from densify.outputs import check_writable, write_comparison
     from densify.pipeline import run as pipeline
     from densify.pipeline.methods import COMPARED
     from densify.readers import open_sequence
 
     check_writable(options.out, options.key, options.overwrite, "compare")
-    sequence = open_sequence(recording_of(options))
+    sequence, methods = open_sequence(recording_of(options)), options.methods or COMPARED
     with progress_on_stderr() as progress:
         results = pipeline.compare(
-            sequence,
-            options.key,
-            options.window,
-            options.cameras,
-            config,
-            progress,
-            options.methods or COMPARED,
+            sequence, options.key, options.window, options.cameras, config, progress, methods
         )
     paths = write_comparison(
         results,
@@ -185,8 +167,6 @@ def answer_compare(options: argparse.Namespace) -> Iterator[Answer]:
         overwrite=options.overwrite,
     )
     if config.output.report:
-        from densify.dataset.report import write_comparison_page
-
         paths.append(write_comparison_page(paths[0].parent))
     facts = {"key": options.key, "methods": {n: key_facts(r) for n, r in results.items()}}
     yield Answer(comparison(results), facts, paths, first_of(paths, FIRST_OF_COMPARISON))

@@ -10,24 +10,23 @@ from typing import Any
 
 from densify.cli.answer import Answer
 from densify.cli.options import (
-    add_overwrite,
+    add_common,
     add_recording,
     add_verb,
+    check_new_file,
     natural,
+    option,
     recordings_of,
-    sentence,
 )
 from densify.cli.progress import progress_on_stderr
-from densify.config.errors import InputError
 
 
 def add(commands: Any) -> None:
     """Add the options of ``train flow``."""
     about = "train a network for scene flow; a trained one is the engine network:MODEL"
-    parser = commands.add_parser("train", help=about, description=sentence(about))
-    kinds = parser.add_subparsers(title="trainings", metavar="WHAT", required=True)
+    parser = add_verb(commands, "train", None, about)
     flow = add_verb(
-        kinds,
+        parser.add_subparsers(title="trainings", metavar="WHAT", required=True),
         "flow",
         answer,
         "train a network for scene flow, with labels or without",
@@ -37,18 +36,14 @@ def add(commands: Any) -> None:
         "loses at most 50 steps: go on with --resume.",
     )
     add_recording(flow, several=True)
-    flow.add_argument(
-        "--out", metavar="MODEL", type=Path, required=True, help="the model; MODEL.png: its loss"
-    )
-    add_overwrite(flow)
+    option(flow, "--out MODEL", "the model; MODEL.png: its loss", type=Path, required=True)
+    add_common(flow, "overwrite")
     teachers, devices = ("objective", "engine", "truth"), ("auto", "cpu", "cuda")
     flow.add_argument("--teacher", choices=teachers, default="objective", help="(objective)")
-    steps = "train on N pairs of sweeps"
-    flow.add_argument("--steps", type=natural, required=True, metavar="N", help=steps)
+    option(flow, "--steps N", "train on N pairs of sweeps", type=natural, required=True)
     seed = "of the first weights and the choice of sweeps (default: 0)"
-    flow.add_argument("--seed", type=natural, default=0, metavar="N", help=seed)
-    resume = "go on from MODEL.checkpoint of a stopped training"
-    flow.add_argument("--resume", action="store_true", help=resume)
+    option(flow, "--seed N", seed, type=natural, default=0)
+    option(flow, "--resume", "go on from MODEL.checkpoint of a stopped training")
     flow.add_argument("--device", choices=devices, default="auto", help="(default: auto)")
 
 
@@ -56,8 +51,7 @@ def answer(options: argparse.Namespace) -> Iterator[Answer]:
     """Train a network for scene flow."""
     from densify.learning.training import Training, train
 
-    if options.out.exists() and not options.overwrite:
-        raise InputError(f"{options.out}: there already, kept; give --overwrite to replace it")
+    check_new_file(options.out, options.overwrite)
     training = Training(
         data=tuple(recordings_of(options, default="streets")),
         teacher=options.teacher,
@@ -65,15 +59,8 @@ def answer(options: argparse.Namespace) -> Iterator[Answer]:
         steps=options.steps,
         device=options.device,
     )
-    smooth = 0.0
-    with progress_on_stderr(lines=True) as show:
-
-        def report(num_steps: int, done: float, loss: float) -> None:
-            nonlocal smooth
-            smooth = loss if num_steps == 1 or not smooth else 0.95 * smooth + 0.05 * loss
-            show("train", min(100, round(100 * done)), 100, f"{num_steps} steps, loss {smooth:.4g}")
-
-        trained = train(training, options.out, options.resume, report)
+    with progress_on_stderr() as show:
+        trained = train(training, options.out, options.resume, show)
     text = f"{training.steps:,} steps, loss {trained.loss:.4g}"
     facts = {"num_steps": training.steps, "loss": trained.loss}
     yield Answer(text, facts, trained.files)

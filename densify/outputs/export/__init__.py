@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """A finished run in other tools' formats, optionally with only the certain and recent pixels.
 
-`config.plugins.exports` is the table of forms. Beside the files of the form lies export.yaml::
+`config.written` is the table of forms. Beside the files of the form lies export.yaml::
 
     run             the folder of the run, as the user named it
     to              the form
@@ -25,7 +25,7 @@ import yaml
 
 from densify import __version__
 from densify.config.errors import InputError
-from densify.config.plugins.exports import EXPORTS
+from densify.config.written import EXPORTS
 from densify.outputs.export.finished_run import FinishedRun, Kept, finished_runs
 from densify.outputs.plain import plain
 from densify.outputs.store import writing
@@ -64,7 +64,7 @@ def export_run(
 
     run: the folder of one key, such as ``densify-out/000120``, or of several keys for forms of
         drives.
-    to: a name of `densify.config.plugins.exports.EXPORTS`.
+    to: a name of `densify.config.written.EXPORTS`.
     out: the folder to make; ``RUN/export/FORM`` if None.
     min_confidence: 0 to 1. Pixels and points with less are left out.
     max_age_ms: greatest time between the exposure, or the key, and the sweep that measured the
@@ -84,7 +84,7 @@ def export_run(
     folder = out or run / "export" / to
     if (folder / "run.yaml").exists():
         raise InputError(f"--out {folder}: holds a run and is kept; choose another folder")
-    write = getattr(EXPORTS.module(form), form.function)
+    write = getattr(form.work(), form.function)
     owned = (*form.owned, _RECORD)
     with writing(folder, owned, folder, overwrite) as staging:
         write(runs if form.of_drive else runs[0], staging)

@@ -1,23 +1,28 @@
 # SPDX-License-Identifier: MIT
-"""``densify doctor``: what may be wrong with a recording; ``densify info``: what it holds."""
+"""Verbs of recordings: ``densify info`` says what one holds, ``densify doctor`` what may be wrong
+with it, ``densify simulate`` writes the built-in street as one."""
 
 from __future__ import annotations
 
 import argparse
 import textwrap
 from collections.abc import Iterator
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from densify.cli.answer import Answer
 from densify.cli.options import (
-    add_config_options,
-    add_overwrite,
+    add_common,
     add_recording,
     add_verb,
+    check_new_file,
     config_of,
+    key_range,
+    option,
     recording_of,
 )
+from densify.cli.progress import progress_on_stderr
 from densify.config.errors import InputError
 
 if TYPE_CHECKING:
@@ -54,24 +59,25 @@ def add_doctor(commands: Any) -> None:
         "line that mends it. Exit code 2 if something is wrong.",
     )
     add_recording(parser)
-    parser.add_argument(
-        "--write-config",
-        action="store_true",
-        help="instead: draft the densify.yaml of a folder of sweeps from what is found in it",
-    )
-    add_config_options(parser)
-    add_overwrite(parser)
+    about = "instead: draft the densify.yaml of a folder of sweeps from what is found in it"
+    option(parser, "--write-config", about)
+    add_common(parser, "config", "overwrite")
 
 
 def answer_doctor(options: argparse.Namespace) -> Iterator[Answer]:
     """Say what may be wrong with a recording."""
     config, spec = config_of(options), recording_of(options)
     from densify.doctor import Verdict, examine
+    from densify.outputs.atomic import write_file
     from densify.readers import open_sequence
     from densify.readers.describe import describe
+    from densify.readers.folder.draft import draft_config
 
     if options.write_config:
-        yield _write_folder_config(Path(spec), options.overwrite)
+        path = Path(spec) / "densify.yaml"
+        check_new_file(path, options.overwrite)
+        write_file(path, draft_config(path.parent).encode())
+        yield Answer(files=[path])
         return
     sequence = open_sequence(spec)
     diagnosis = examine(sequence, config)
@@ -81,49 +87,58 @@ def answer_doctor(options: argparse.Namespace) -> Iterator[Answer]:
         raise InputError(f"{spec}: wrong: {', '.join(wrong)}; the remedies are above")
 
 
-def _write_folder_config(folder: Path, overwrite: bool) -> Answer:
-    from densify.outputs.atomic import write_file
-    from densify.readers.folder.draft import draft_config
-
-    path = folder / "densify.yaml"
-    if path.exists() and not overwrite:
-        raise InputError(f"{path}: there already, kept; give --overwrite to replace it")
-    write_file(path, draft_config(folder).encode())
-    return Answer(files=[path])
-
-
 def _describe(diagnosis: Diagnosis) -> str:
     """Return verdict, check and evidence of each finding, its remedy below, and the counts."""
     from densify.doctor import Verdict
 
-    columns = 2 + max(len(str(v)) for v in Verdict)
+    margin = " " * (2 + max(len(str(v)) for v in Verdict))
     lines = []
     for finding in diagnosis.findings:
-        lines += textwrap.wrap(
-            f"{finding.check}: {finding.evidence}",
-            _WIDTH,
-            initial_indent=f"{finding.verdict!s:<{columns}}",
-            subsequent_indent=" " * columns,
-        )
+        said = f"{finding.check}: {finding.evidence}"
+        begin = f"{finding.verdict!s:<{len(margin)}}"
+        lines += textwrap.wrap(said, _WIDTH, initial_indent=begin, subsequent_indent=margin)
         if finding.remedy:
-            lines.append(" " * columns + f"-> {finding.remedy}")
+            lines.append(f"{margin}-> {finding.remedy}")
     counts = {v: sum(f.verdict == v for f in diagnosis.findings) for v in Verdict}
     return "\n".join([*lines, "", ", ".join(f"{n} {v}" for v, n in counts.items())])
 
 
 def _facts(diagnosis: Diagnosis) -> dict[str, Any]:
     """Return the findings with their values."""
-    from densify.outputs.plain import plain
-
-    findings = [
-        {
-            "check": f.check,
-            "verdict": str(f.verdict),
-            "evidence": f.evidence,
-            "remedy": f.remedy,
-            "values": plain(f.values),
-        }
-        for f in diagnosis.findings
-    ]
+    findings = [{**asdict(f), "verdict": str(f.verdict)} for f in diagnosis.findings]
     worst = str(diagnosis.worst)
     return {"recording": diagnosis.sample.sequence.name, "worst": worst, "findings": findings}
+
+
+def add_simulate(commands: Any) -> None:
+    """Add the options of ``simulate``."""
+    about = "write the built-in street as a recording with exact ground truth"
+    parser = add_verb(commands, "simulate", answer_simulate, about)
+    add_recording(parser)
+    option(parser, "--out DIR", "folder to make", type=Path, required=True)
+    about = "kitti (a raw drive, default) or folder (numbered sweeps with densify.yaml)"
+    option(parser, "--format NAME", about, default="kitti")
+    option(parser, "--frames A:B", "frames A to B-1 only (default: all)", type=key_range)
+    add_common(parser, "camera", "overwrite")
+
+
+def answer_simulate(options: argparse.Namespace) -> Iterator[Answer]:
+    """Write the street and say where it is."""
+    from densify.outputs.simulated_street import write_street
+    from densify.readers.street import Street
+
+    street = Street.from_spec(recording_of(options))
+    frames, wanted = list(street.frames), options.frames
+    if wanted is not None and (wanted[0] < frames[0] or wanted[-1] > frames[-1]):
+        raise InputError(
+            f"--frames {wanted.start}:{wanted.stop}: expected frames within "
+            f"{frames[0]}:{frames[-1] + 1}"
+        )
+    frames = frames if wanted is None else list(wanted)
+    form, out, cameras = options.format, options.out, options.cameras
+    with progress_on_stderr() as progress:
+        place = write_street(
+            form, street, out, frames, cameras, progress, overwrite=options.overwrite
+        )
+    text = f"{len(frames)} frames; open them with --data {place}"
+    yield Answer(text, {"data": str(place), "num_frames": len(frames)})

@@ -1,0 +1,108 @@
+# SPDX-License-Identifier: MIT
+"""Verbs of finished runs: ``densify export`` for other tools, ``densify report`` for a page to look
+at, ``densify view`` live in a viewer."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from densify.cli.answer import Answer
+from densify.cli.options import add_common, add_verb, natural, option
+from densify.config.written import EXPORTS
+
+_ONE = "folder of one key, such as densify-out/000120"
+
+
+def add_export(commands: Any) -> None:
+    """Add the options of ``export``."""
+    parser = add_verb(
+        commands,
+        "export",
+        answer_export,
+        "a finished run in other tools' formats, optionally with only the certain, recent pixels",
+        "Nothing is computed again and the run stays as it is. A filled pixel has the age of the "
+        "measured pixel nearest to it.",
+    )
+    parser.add_argument("run", metavar="RUN", type=Path, help=_ONE)
+    forms = ", ".join(form.name for form in EXPORTS.built_in)
+    option(parser, "--to FORMAT", f"{forms}; see docs/formats.md", required=True)
+    about = "drop pixels and points less certain, 0 to 1 (default: 0, keep all)"
+    option(parser, "--min-confidence C", about, type=float, default=0.0)
+    about = "drop pixels and points measured longer before or after (default: keep all)"
+    option(parser, "--max-age-ms MS", about, type=float)
+    option(parser, "--out DIR", "(default: RUN/export/FORMAT)", type=Path)
+    add_common(parser, "camera", "overwrite")
+
+
+def answer_export(options: argparse.Namespace) -> Iterator[Answer]:
+    """Export the run."""
+    from densify.cli.results import export_summary
+    from densify.outputs.export import export_run, facts
+
+    exported = export_run(
+        options.run,
+        options.to,
+        options.out,
+        min_confidence=options.min_confidence,
+        max_age_ms=options.max_age_ms,
+        cameras=options.cameras,
+        overwrite=options.overwrite,
+    )
+    yield Answer(export_summary(exported), facts(exported), exported.paths)
+
+
+def add_report(commands: Any) -> None:
+    """Add the options of ``report``."""
+    parser = add_verb(
+        commands,
+        "report",
+        answer_report,
+        "one self-contained page to look at a run, a comparison or a training set in a browser",
+        "Of a key: the image with every map, depth under the pointer, what a least confidence "
+        "leaves, the cloud in 3-D, scores and costs, in one HTML file of 12 MB at most that needs "
+        "no network. Files that are missing or damaged are named on it. Of a training set: a table "
+        "of every key with its scores, what was put aside and why.",
+    )
+    about = f"{_ONE}, one of several, or a training set"
+    parser.add_argument("place", metavar="DIR", type=Path, help=about)
+    about = "(default: DIR/report.html, and compare.html of a comparison)"
+    option(parser, "--out FILE.html", about, type=Path)
+    add_common(parser, "overwrite")
+
+
+def answer_report(options: argparse.Namespace) -> Iterator[Answer]:
+    """Write a page of what is in a folder."""
+    from densify.dataset.report import write_report
+
+    yield Answer(files=write_report(options.place, options.out, options.overwrite))
+
+
+def add_view(commands: Any) -> None:
+    """Add the options of ``view``."""
+    parser = add_verb(
+        commands,
+        "view",
+        answer_view,
+        "a run, or keys of a drive, live: cloud, sweeps, images, depth and objects over time",
+        "Needs a screen, and pip install 'densify[rerun]'. densify export --to rrd writes the same "
+        "as a file; densify report needs nothing but a browser.",
+    )
+    about = f"{_ONE}, or of several of a drive"
+    parser.add_argument("place", metavar="DIR", type=Path, help=about)
+    about = "of a rerun viewer that is open already; else a new one is opened (default: 9876)"
+    option(parser, "--port N", about, type=natural, default=9876)
+    add_common(parser, "camera")
+
+
+def answer_view(options: argparse.Namespace) -> Iterator[Answer]:
+    """Show it. rerun's viewer stays open."""
+    from densify.outputs.export import rrd
+    from densify.outputs.export.finished_run import finished_runs
+
+    runs = finished_runs(options.place, cameras=options.cameras)
+    rrd.show(runs, options.port)
+    keys = [run.key for run in runs]
+    yield Answer(f"shown: key {', '.join(map(str, keys))}", {"keys": keys})

@@ -1,0 +1,244 @@
+# SPDX-License-Identifier: MIT
+"""Plug-ins: the built-in readers and engines, and those that other packages add by entry points.
+The outputs and exports are in `densify.config.written`. Rows name modules and import none.
+
+The entry point's name is the plug-in's, its value a module::
+
+    [project.entry-points."densify.readers"]
+    npy = "densify_npy.reader"
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, fields
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from densify.config.errors import InputError, did_you_mean
+
+if TYPE_CHECKING:
+    from importlib.metadata import EntryPoint
+
+
+@dataclass(frozen=True)
+class Plugin:
+    """One plug-in. Another package's module has the other fields as attributes: ``owned`` as OWNED,
+    ``recognises`` as it is.
+
+    name: as users write it. module: import path. Of readers, ``recognises`` returns True if a
+    place, which exists, holds such recordings, judged by names alone; ``holds`` says what is there,
+    and ``boxes`` where tracked boxes are, for messages; ``scenes``: a place may hold several, named
+    by ``#SCENE``. Of outputs and exports, ``function`` does the work and alone writes the files and
+    folders ``owned``; ``of_drive``: it takes several keys of a drive. Of engines, ``argument`` is
+    what follows the name after a colon; ``shared``: the motion of a long stretch serves every key
+    in it (`densify.flow.engines.SharedMotion`).
+    """
+
+    name: str
+    module: str
+    recognises: Callable[[Path], bool] = lambda path: False
+    holds: str = "a recording of another package's reader"
+    boxes: str = ""
+    scenes: bool = False
+    function: str = ""
+    owned: tuple[str, ...] = ()
+    of_drive: bool = False
+    argument: str = ""
+    shared: bool = False
+
+    @property
+    def usage(self) -> str:
+        """How users write it."""
+        return f"{self.name}:{self.argument}" if self.argument else self.name
+
+    def work(self) -> Any:
+        """Import the module that does the work."""
+        return import_module(self.module)
+
+
+@dataclass(frozen=True)
+class Table:
+    """kind: for messages. group: of the entry points. members: functions that the module of another
+    package has, the first one does the work."""
+
+    kind: str
+    group: str
+    members: tuple[str, ...]
+    built_in: tuple[Plugin, ...]
+
+    def names(self) -> list[str]:
+        """Return the built-in names, then those of other packages."""
+        return [row.name for row in self.built_in] + sorted(self._added())
+
+    def require(self, name: str, where: str) -> None:
+        """Raise InputError, which begins with ``where``, unless there is such a plug-in. Imports
+        none."""
+        if name not in self.names():
+            usages = [row.usage for row in self.built_in] + sorted(self._added())
+            raise InputError(
+                f"{where}: got {name!r}, {did_you_mean(name, self.names())}expected one of "
+                f"{', '.join(usages)} (packages add others by entry points in {self.group})"
+            )
+
+    def row(self, name: str, where: str) -> Plugin:
+        """Return the row of that name; imports the module of another package. Raises InputError if
+        there is none, or the package is broken."""
+        self.require(name, where)
+        rows = {row.name: row for row in self.built_in}
+        return rows[name] if name in rows else self._load(self._added()[name])
+
+    def __iter__(self) -> Iterator[Plugin]:
+        """Yield the built-in rows and those of other packages, imported one by one; last the last
+        built-in one, the most general."""
+        yield from self.built_in[:-1]
+        yield from (self._load(point) for _, point in sorted(self._added().items()))
+        yield self.built_in[-1]
+
+    def _added(self) -> dict[str, EntryPoint]:
+        """Return the entry points of other packages by name; none replaces a built-in one."""
+        from importlib.metadata import entry_points
+
+        built_in = {row.name for row in self.built_in}
+        points = entry_points(group=self.group)
+        return {point.name: point for point in points if point.name not in built_in}
+
+    def _load(self, point: EntryPoint) -> Plugin:
+        """Return the row of a plug-in, as its module describes it."""
+        what = f"{self.kind} {point.name} of the package {point.dist.name if point.dist else '?'}"
+        try:
+            module = point.load()
+        except Exception as error:  # an import raises anything
+            raise InputError(
+                f"{what}: cannot be imported from {point.value} ({type(error).__name__}: {error}); "
+                f"mend or uninstall the package"
+            ) from error
+        if not all(callable(getattr(module, member, None)) for member in self.members):
+            raise InputError(
+                f"{what}: {point.value} is no module with {', '.join(self.members)}; mend or "
+                f"uninstall the package"
+            )
+        own = {f.name: f.name.upper() for f in fields(Plugin)} | {"recognises": "recognises"}
+        said = {name: getattr(module, told) for name, told in own.items() if hasattr(module, told)}
+        known = {"name": point.name, "module": module.__name__, "function": self.members[0]}
+        return Plugin(**{**said, **known})
+
+
+ENGINES = Table(
+    "engine",
+    "densify.flow_engines",
+    ("estimate_motion",),
+    (
+        Plugin("groups", "densify.flow.tracking.groups", shared=True),
+        Plugin("pairs", "densify.flow.pairs.estimate"),
+        Plugin("paper", "densify.flow.objective.engine"),
+        Plugin("network", "densify.learning.engine", argument="MODEL"),
+        Plugin("npz", "densify.readers.flow_files", argument="DIR"),
+        Plugin("opensceneflow", "densify.readers.open_scene_flow", argument="FILE[#NAME]"),
+    ),
+)
+"""The module of each has the functions of `densify.flow.engines.EngineModule`."""
+
+
+def check_engine_spec(spec: str) -> tuple[str, str]:
+    """Return name and argument of an engine's ``NAME[:ARGUMENT]``; imports none. Raises InputError
+    unless there is one, with an argument or without as it needs."""
+    name, _, argument = spec.partition(":")
+    ENGINES.require(name, "flow.engine")
+    for row in ENGINES.built_in:
+        if row.name == name and bool(row.argument) != bool(argument):
+            raise InputError(f"flow.engine: got {spec!r}, expected {row.usage}")
+    return name, argument
+
+
+def engine(spec: str) -> tuple[Plugin, str]:
+    """Return row and argument of ``NAME[:ARGUMENT]``. Raises InputError for no such engine."""
+    name, argument = check_engine_spec(spec)
+    return ENGINES.row(name, "flow.engine"), argument
+
+
+def _any(*patterns: str) -> Callable[[Path], bool]:
+    """Return a function that recognises a folder in which one of the patterns is found."""
+    return lambda path: any(any(path.glob(pattern)) for pattern in patterns)
+
+
+def _suffix(*suffixes: str) -> Callable[[Path], bool]:
+    """Return a function that recognises a file with the suffix, or a folder with such files."""
+    inside = _any(*(f"*{suffix}" for suffix in suffixes))
+    return lambda path: path.suffix in suffixes if path.is_file() else inside(path)
+
+
+def _capture(with_metadata: bool) -> Callable[[Path], bool]:
+    return lambda path: path.suffix == ".pcap" and any(path.parent.glob("*.json")) == with_metadata
+
+
+def _is_odometry(path: Path) -> bool:
+    if (path / "velodyne").is_dir():
+        return path.resolve().parent.name == "sequences" or (path / "times.txt").is_file()
+    return any(path.glob("sequences/*/velodyne"))
+
+
+_SWEEP = re.compile(r".*\d.*\.(bin|pcd|ply|las|laz)", re.IGNORECASE)
+_TABLE = re.compile(r".*\d.*\.(npy|npz|csv|txt)", re.IGNORECASE)  # which may be anything
+_BESIDE = re.compile(r"\..*|(timestamps?|times|stamps|poses?|trajectory)\.\w+", re.IGNORECASE)
+
+
+def _holds_sweeps(path: Path) -> bool:
+    """Look down to two folders below; tables of numbers count only where nothing else lies beside
+    them."""
+    near = (found for pattern in ("*", "*/*", "*/*/*") for found in path.glob(pattern))
+    if (path / "densify.yaml").is_file() or any(_SWEEP.fullmatch(found.name) for found in near):
+        return True
+    names = [entry.name for entry in path.glob("*") if entry.is_file()]
+    names = [name for name in names if not _BESIDE.fullmatch(name)]
+    return bool(names) and all(_TABLE.fullmatch(name) for name in names)
+
+
+_AV2, _DGP = "city_SE3_egovehicle.feather", "scene_[0-9a-f][0-9a-f][0-9a-f]*.json"
+
+READERS = Table(
+    "reader",
+    "densify.readers",
+    ("open_recording", "recognises"),
+    (
+        Plugin("kitti", "densify.readers.kitti.raw", _any("velodyne_points"),
+               "a KITTI raw drive (with velodyne_points/)"),
+        Plugin("argoverse2", "densify.readers.argoverse2",
+               _any(_AV2, *(f"{folder}*/{_AV2}" for folder in ("", "train/", "val/", "test/"))),
+               f"an Argoverse 2 log (with {_AV2})", "annotations.feather", True),
+        Plugin("nuscenes", "densify.readers.nuscenes",
+               _any("sample_data.json", "v*/sample_data.json"),
+               "nuScenes or TruckScenes (with v1.0-*/sample_data.json)",
+               "v1.0-*/sample_annotation.json", True),
+        Plugin("waymo", "densify.readers.waymo", _any("lidar/*.parquet"),
+               "Waymo's version 2 (with lidar/*.parquet)", "lidar_box/CONTEXT.parquet", True),
+        Plugin("opensceneflow", "densify.readers.open_scene_flow", _suffix(".h5"),
+               "OpenSceneFlow files (LOG.h5)", scenes=True),
+        Plugin("pandaset", "densify.readers.pandaset", _any("lidar/poses.json"),
+               "a PandaSet sequence (with lidar/poses.json)", "annotations/cuboids/00.pkl.gz"),
+        Plugin("kitti-360", "densify.readers.kitti.kitti_360", _any("data_3d_raw"),
+               "KITTI-360 (with data_3d_raw/)", scenes=True),
+        Plugin("kitti-tracking", "densify.readers.kitti.tracking",
+               _any("velodyne/[0-9][0-9][0-9][0-9]/"), "KITTI tracking (with velodyne/0000/)",
+               "label_02/0000.txt", True),
+        Plugin("kitti-odometry", "densify.readers.kitti.odometry", _is_odometry,
+               "KITTI odometry or SemanticKITTI (sequences/, or a folder in it with velodyne/)",
+               scenes=True),
+        Plugin("ros", "densify.readers.ros", _suffix(".bag", ".db3", ".mcap"),
+               "a ROS bag (.bag, .db3, .mcap, or a folder of them)", scenes=True),
+        Plugin("dgp", "densify.readers.dgp", _any(_DGP, f"*/{_DGP}"),
+               "a DGP scene such as DDAD's (with scene_<hash>.json)", scenes=True),
+        Plugin("tri3d", "densify.readers.tri3d",
+               _any("data/*/lidar_roof/", "*/data/*/lidar_roof/", "trainval-frames-*.json"),
+               "ONCE (data/*/lidar_roof/) or ZOD Frames (trainval-frames-*.json)", scenes=True),
+        Plugin("ouster", "densify.readers.ouster", _capture(with_metadata=True),
+               "an Ouster capture (.pcap with the sensor's .json beside it)", scenes=True),
+        Plugin("velodyne", "densify.readers.velodyne", _capture(with_metadata=False),
+               "a Velodyne capture (.pcap), with its model behind #", scenes=True),
+        Plugin("folder", "densify.readers.folder.reader", _holds_sweeps,
+               "a folder of numbered sweeps (000120.bin, .pcd, .ply, .npy, .csv, ...)"),
+    ),
+)  # fmt: skip
+"""The module of each has the function of `densify.readers.ReaderModule`."""
