@@ -53,7 +53,7 @@ def test_sweeps_are_where_they_were_measured(street: Path) -> None:
         assert len(inside) > 50 and inside.mean() > 0.95
     (shot,) = timeline.shots
     stored_m = read_depth_png(street / "depth" / f"{shot.name}.png")
-    np.testing.assert_array_equal(shot.depth_m, stored_m)
+    np.testing.assert_array_equal(shot.maps_m["depth"], stored_m)
 
 
 def test_keys_of_a_drive_lie_in_one_world(drive: Path) -> None:
@@ -133,7 +133,7 @@ def test_mcap_of_one_key(topics, street: Path) -> None:
     assert image.format == "jpeg" and image.data == shot.jpeg
     ((shot_ns, depth),) = topics[f"/{shot.name}/depth"]
     maps = np.frombuffer(depth.data, "<f4").reshape(depth.height, depth.width)
-    np.testing.assert_array_equal(maps, shot.depth_m)
+    np.testing.assert_array_equal(maps, shot.maps_m["depth"])
     assert (depth.encoding, shot_ns) == ("32FC1", shot.stamp_ns)
 
 

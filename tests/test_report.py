@@ -17,7 +17,6 @@ from densify.config.errors import InputError
 from densify.dataset.report import write_report
 from densify.outputs import StoredCloud, read_cloud
 from densify.outputs.depth_png import encode_png, read_stored
-from densify.outputs.report.key_page import KeyFiles, key_page
 from densify.outputs.report.page_file import Blobs, packed_cloud, page_file, thinned
 from tests.command import refused
 from tests.report_runs import write_compared, write_run
@@ -172,17 +171,6 @@ class TestPage:
             [0.1 * speed] * 4, abs=0.05
         )
         assert abs(speed - 8) < 0.3
-
-    def test_too_large_maps_lose_pixels_and_points(self, run: Path, monkeypatch) -> None:
-        monkeypatch.setattr("densify.outputs.report.key_page._MOST_FOR_MAPS", 30_000)
-        monkeypatch.setattr("densify.outputs.report.key_page.MOST_BYTES", 460_000)
-        page = key_page(KeyFiles.of_run(run), "x")
-        camera = data_of(page)["cameras"]["front"]
-        assert camera["every"] > 1 and len(page) < 460_000
-        whole = read_stored(run / "depth_filled" / "front.png", np.uint16, "")
-        small = unpacked(blobs_of(page), camera["filled"])
-        assert np.array_equal(small, whole[:: camera["every"], :: camera["every"]])
-        assert data_of(page)["cloud"]["num_points"] < data_of(page)["cloud"]["num_all"]
 
     def test_a_comparison_has_all_methods(self, tmp_path: Path) -> None:
         folder = write_compared(tmp_path)

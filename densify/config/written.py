@@ -31,7 +31,6 @@ OUTPUTS = Table(
         _output("movers", _KEY, "movers"),
         _output("tracks", _KEY, "movers.json"),
         _output("optical_flow", _KEY, "optical_flow"),
-        _output("rejected", _PLOTS, "rejected"),
         _output("cloud", _KEY, "cloud.laz", function="write_cloud_laz"),
         _output("scene", _KEY, "scene"),
         _output("metrics", _KEY, "metrics.json"),

@@ -32,6 +32,7 @@ _EXTRA_DIMENSIONS = (
     ("displaced_y", "float32", "m"),
     ("displaced_z", "float32", "m"),
 )
+_DISPLACED = ("displaced_x", "displaced_y", "displaced_z")
 _STANDARD_DIMENSIONS = {"intensity", "gps_time", "red", "green", "blue"}
 
 
@@ -71,19 +72,17 @@ class StoredCloud:
         return StoredCloud(**{f.name: getattr(self, f.name)[keep] for f in fields(self)})
 
     def columns(self) -> dict[str, NDArray[Any]]:
-        """Return (M,) columns: x y z red green blue intensity confidence frame instance moving far
-        displaced displaced_x displaced_y displaced_z gps_time. Booleans are uint8. Positions are
+        """Return (M,) columns: x y z displaced_x displaced_y displaced_z red green blue intensity
+        confidence displaced frame instance gps_time moving far. Booleans are uint8. Positions are
         float32, which keeps the millimetre up to 8 km."""
-        vectors: dict[str, NDArray[Any]] = {
-            f"{name}{axis}": np.ascontiguousarray(values[:, i], np.float32)
-            for name, values in (("", self.points), ("displaced_", self.displacement))
-            for i, axis in enumerate("xyz")
+        names = ("intensity", "confidence", "displaced", "frame", "instance", "gps_time")
+        return {
+            **dict(zip("xyz", self.points.T.astype(np.float32), strict=True)),
+            **dict(zip(_DISPLACED, self.displacement.T, strict=True)),
+            **dict(zip(("red", "green", "blue"), self.rgb.T, strict=True)),
+            **{name: getattr(self, name) for name in names},
+            **{name: getattr(self, name).astype(np.uint8) for name in ("moving", "far")},
         }
-        columns = {name: vectors.pop(name) for name in "xyz"}
-        columns |= {n: self.rgb[:, i].copy() for i, n in enumerate(("red", "green", "blue"))}
-        columns |= {n: getattr(self, n) for n in ("intensity", "confidence", "frame", "instance")}
-        columns |= {n: getattr(self, n).astype(np.uint8) for n in ("moving", "far")}
-        return columns | {"displaced": self.displaced} | vectors | {"gps_time": self.gps_time}
 
 
 def write_cloud(path: Path, cloud: Cloud, stamp_ns: int = 0) -> None:
@@ -117,8 +116,7 @@ def write_cloud(path: Path, cloud: Cloud, stamp_ns: int = 0) -> None:
     las.red, las.green, las.blue = (cloud.rgb.astype(np.uint16) * 257).T
     las.return_number = np.ones(len(cloud), np.uint8)
     las.number_of_returns = np.ones(len(cloud), np.uint8)
-    displacement = cloud.points - cloud.rigid_points
-    vector = dict(zip(("displaced_x", "displaced_y", "displaced_z"), displacement.T, strict=True))
+    vector = dict(zip(_DISPLACED, (cloud.points - cloud.rigid_points).T, strict=True))
     for name, kind, _ in _EXTRA_DIMENSIONS:
         las[name] = (vector[name] if name in vector else getattr(cloud, name)).astype(kind)
     buffer = io.BytesIO()
@@ -135,18 +133,14 @@ def read_cloud(path: Path) -> StoredCloud:
             f"{path}: no dimension {', '.join(sorted(missing))}; expected a cloud of this version "
             f"of densify; densify the key again"
         )
-    rgb = np.stack([las.red, las.green, las.blue], axis=1)
-    displacement = [np.array(las[f"displaced_{axis}"], np.float32) for axis in "xyz"]
+    own: dict[str, Any] = {n: np.array(las[n], kind) for n, kind, _ in _EXTRA_DIMENSIONS}
+    displacement = np.stack([own.pop(name) for name in _DISPLACED], axis=1)
     return StoredCloud(
         points=np.array(las.xyz),
-        frame=np.array(las["frame"], np.int32),
-        moving=np.array(las["moving"], bool),
-        instance=np.array(las["instance"], np.int32),
-        confidence=np.array(las["confidence"], np.float32),
-        displaced=np.array(las["displaced"], np.float32),
         intensity=np.array(las.intensity, np.float32) / np.float32(65535),
-        rgb=(rgb // 257).astype(np.uint8),
-        far=np.array(las["far"], bool),
-        displacement=np.stack(displacement, axis=1),
+        rgb=(np.stack([las.red, las.green, las.blue], axis=1) // 257).astype(np.uint8),
         gps_time=np.array(las.gps_time),
+        displacement=displacement,
+        **{name: own.pop(name) > 0 for name in ("moving", "far")},
+        **own,
     )

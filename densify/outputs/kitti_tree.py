@@ -139,11 +139,9 @@ The folders and files are those of KITTI's depth completion benchmark, whose loa
 
 val holds KITTI's 13 validation drives, train every other recording.
 
-Depth is a 16-bit gray PNG: value / 256 is metres along the camera's optical axis, 0 is none.
-Confidence is an 8-bit gray PNG: 255 is most certain, 0 is no depth. It ranks pixels and is no
-probability: (value - 1) / 254 is 0 to 1.
-
-  depth_m = cv2.imread(path, cv2.IMREAD_UNCHANGED) / 256.0
+Depth is a 16-bit gray PNG, metres along the camera's optical axis, 0 is none:
+depth_m = cv2.imread(path, cv2.IMREAD_UNCHANGED) / 256.0. Confidence is an 8-bit gray PNG: 255 is
+most certain, 0 is no depth. It ranks pixels and is no probability: (value - 1) / 254 is 0 to 1.
 
 All maps show the moment in which their own image was exposed (the middle of the sweep, where the
 settings say "at: sweep"). velodyne_raw is densify's own projection and differs from KITTI's files.

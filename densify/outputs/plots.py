@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Pictures by matplotlib: figure.png and compare.png, depth over the camera's image; rejected/;
+"""Pictures by matplotlib: figure.png and compare.png, depth over the camera's image;
 curve.png, outliers over density; the loss of a training."""
 
 from __future__ import annotations
@@ -11,11 +11,10 @@ from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from densify.geometry.types import Float, Float32, Reason, Result
+from densify.geometry.types import Float, Float32, Result
 from densify.outputs.atomic import write_file
-from densify.outputs.depth_png import Picture, map_path
+from densify.outputs.depth_png import Picture
 from densify.outputs.key_outputs import Context
 
 if TYPE_CHECKING:
@@ -35,13 +34,6 @@ _POINT_SIZE_PX = 3
 _TITLE_PX, _SCALE_PX = 36, 60
 _FONT_PT, _LETTER_PX = 13.0, 0.85  # width of a letter, per point of the font
 _TITLES = {"none": "sparse"}
-_REASON_COLOURS = {
-    Reason.VETOED: "#ff4646",
-    Reason.HIDDEN: "#508cff",
-    Reason.UNSUPPORTED: "#ffd23c",
-    Reason.EDGE: "#5ae678",
-    Reason.GLASS: "#eb78ff",
-}
 _FEWEST_OUTLIERS = 1e-4  # below, the scale is linear down to 0
 _MEDIAN_SHARE = 20  # the running median covers one part in so many of all steps
 
@@ -100,63 +92,29 @@ def draw_figure(image: Picture, panels: Mapping[str, Float32]) -> Figure:
     """
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import LogNorm
+    from matplotlib.figure import Figure
 
     scale = ScalarMappable(LogNorm(_NEAR_M, _FAR_M, clip=True), "turbo_r")
     kernel = np.ones((_POINT_SIZE_PX, _POINT_SIZE_PX), np.uint8)
-    figure = _images(image, len(panels))
-    for axes, (title, depth_m) in zip(figure.axes, panels.items(), strict=True):
-        size = min(_FONT_PT, figure.bbox.width / (_LETTER_PX * len(title)))
+    enlarge = max(1.0, _MIN_WIDTH_PX / image.shape[1])
+    panel, width = (enlarge * size_px for size_px in image.shape[:2])
+    height = len(panels) * (panel + _TITLE_PX) + _SCALE_PX
+    figure = Figure(figsize=(width / _DPI, height / _DPI), dpi=_DPI)
+    gray = _BRIGHTNESS * (image @ np.array([0.299, 0.587, 0.114]))
+    for number, (title, depth_m) in enumerate(panels.items(), 1):
+        bottom = height - number * (panel + _TITLE_PX)
+        axes = figure.add_axes((0, bottom / height, 1, panel / height))
+        axes.set_axis_off()
+        size = min(_FONT_PT, width / (_LETTER_PX * len(title)))
         axes.set_title(title, loc="left", x=0.01, fontsize=size)
+        axes.imshow(gray, "gray", vmin=0, vmax=255, interpolation="nearest", aspect="auto")
         nearest = cv2.erode(np.where(depth_m > 0, depth_m, _NO_DEPTH_M), kernel)
         colours = scale.to_rgba(nearest, bytes=True)
         colours[nearest >= _NO_DEPTH_M] = 0
         axes.imshow(colours, interpolation="nearest", aspect="auto")
-    height = figure.bbox.height
     bar = figure.add_axes((0.05, 0.6 * _SCALE_PX / height, 0.9, 0.25 * _SCALE_PX / height))
     shown = figure.colorbar(scale, bar, orientation="horizontal", ticks=_TICKS_M, format="%d m")
     shown.minorticks_off()
-    return figure
-
-
-def write_rejected(result: Result, context: Context, folder: Path) -> None:
-    """Write ``rejected/CAMERA.png``, if it was asked for."""
-    for camera, reason in result.rejected.items():
-        figure = draw_rejected(_image(result, camera), reason)
-        write_plot(map_path(folder, "rejected", camera), figure)
-
-
-def draw_rejected(image: Picture, reason: NDArray[np.uint8]) -> Figure:
-    """Draw over an image in gray what was rejected, in a colour for each `Reason`.
-
-    image: (H,W,3) uint8 RGB. reason: (H,W), 0 none.
-    """
-    from matplotlib.colors import to_rgba_array
-    from matplotlib.patches import Patch
-
-    figure = _images(image, 1)
-    colours = to_rgba_array([_REASON_COLOURS.get(which, "none") for which in Reason])
-    figure.axes[0].imshow(colours[reason], interpolation="nearest", aspect="auto")
-    handles = [Patch(color=c, label=which.name.lower()) for which, c in _REASON_COLOURS.items()]
-    look = {"frameon": False, "fontsize": "small", "handlelength": 1, "columnspacing": 1}
-    figure.legend(handles=handles, loc="lower center", ncols=len(handles), **look)
-    return figure
-
-
-def _images(image: Picture, number: int) -> Figure:
-    """Return a figure with axes that show the image in dark gray, a title's room above each."""
-    from matplotlib.figure import Figure
-
-    height_px, width_px = image.shape[:2]
-    enlarge = max(1.0, _MIN_WIDTH_PX / width_px)
-    width, panel = enlarge * width_px, enlarge * height_px
-    height = number * (panel + _TITLE_PX) + _SCALE_PX
-    figure = Figure(figsize=(width / _DPI, height / _DPI), dpi=_DPI)
-    gray = _BRIGHTNESS * (image @ np.array([0.299, 0.587, 0.114]))
-    for i in range(number):
-        bottom = height - (i + 1) * (panel + _TITLE_PX)
-        axes = figure.add_axes((0, bottom / height, 1, panel / height))
-        axes.set_axis_off()
-        axes.imshow(gray, "gray", vmin=0, vmax=255, interpolation="nearest", aspect="auto")
     return figure
 
 

@@ -62,7 +62,7 @@ def add_report(commands: Any) -> None:
         answer_report,
         "one self-contained page to look at a run, a comparison or a training set in a browser",
         "Of a key: the image with every map, depth under the pointer, what a least confidence "
-        "leaves, the cloud in 3-D, scores and costs, in one HTML file of 12 MB at most that needs "
+        "leaves, the cloud in 3-D, scores and costs, in one HTML file that needs "
         "no network. Files that are missing or damaged are named on it. Of a training set: a table "
         "of every key with its scores, what was put aside and why.",
     )

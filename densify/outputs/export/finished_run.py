@@ -151,9 +151,9 @@ class FinishedRun:
         return cloud.select(keep)
 
 
-def map_names(folder: Path) -> list[str]:
-    """Return the maps in a folder: CAMERA, or CAMERA/NUMBER of one of its images."""
-    paths = [path.relative_to(folder) for path in folder.rglob("*.png")]
+def map_names(*folders: Path) -> list[str]:
+    """Return the maps in folders: CAMERA, or CAMERA/NUMBER of one of its images."""
+    paths = {path.relative_to(folder) for folder in folders for path in folder.rglob("*.png")}
     return sorted(path.with_suffix("").as_posix() for path in paths)
 
 

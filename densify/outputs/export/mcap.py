@@ -77,7 +77,7 @@ def _of_shot(m: Any, shot: Shot) -> Iterator[tuple[str, Any]]:
         flat = {name: matrix.ravel().tolist() for name, matrix in matrices.items()}
         named = {"distortion_model": lens[0], "D": lens[1]}
         yield "calibration", m.CameraCalibration(**about, **size, **named, **flat)
-    for kind, depth_m in (("depth", shot.depth_m), ("depth_filled", shot.filled_m)):
+    for kind, depth_m in shot.maps_m.items():
         image = {"encoding": "32FC1", "step": 4 * camera.width_px, "data": depth_m.tobytes()}
         yield kind, m.RawImage(**about, **size, **image)
 

@@ -4,7 +4,6 @@
 Two time lines, ``time`` (the recording's clock as UNIX time) and ``frame``, have in ``world/key``::
 
     cloud/static, cloud/moving  the accumulated cloud, at the key's time
-    cloud/trails                moving points where registration alone places them; hidden at first
     sweep, vehicle              each sweep as it was measured, and the pose of the sensor
     movers/box, movers/path     moving objects; labels give object and speed
     CAMERA/image, CAMERA/depth, CAMERA/depth_filled
@@ -35,7 +34,7 @@ def write_rrd(runs: Sequence[FinishedRun], folder: Path) -> None:
     """Write ``recording.rrd``. rerun numbers its chunks by the clock, so bytes differ. Raises
     InputError without rerun, and as `timelines`."""
     with _stream(runs) as stream:
-        stream.save(folder / "recording.rrd", default_blueprint=_blueprint(runs))
+        stream.save(folder / "recording.rrd")
         _log(stream, runs)
 
 
@@ -43,7 +42,7 @@ def show(runs: Sequence[FinishedRun], port: int = 9876) -> None:
     """Show the same in the viewer that listens on the port, else in a new one, which stays open.
     Raises InputError as `write_rrd`."""
     with _stream(runs) as stream:
-        stream.spawn(port=port, default_blueprint=_blueprint(runs))
+        stream.spawn(port=port)
         _log(stream, runs)
         stream.flush()
 
@@ -55,18 +54,6 @@ def _stream(runs: Sequence[FinishedRun]) -> Any:
     stream.set_log_time_enabled(False)
     stream.set_log_tick_enabled(False)
     return stream
-
-
-def _blueprint(runs: Sequence[FinishedRun]) -> Any:
-    """Return the scene beside the images."""
-    import rerun.blueprint as b
-
-    hidden = {f"{_KEY}/cloud/trails": b.EntityBehavior(visible=False)}
-    scene = b.Spatial3DView(origin="world", name="scene", overrides=hidden)
-    names = dict.fromkeys(name for run in runs for name in run.views)
-    views = [b.Spatial2DView(origin=f"{_KEY}/{name}", name=name) for name in names]
-    layout = b.Horizontal(scene, b.Vertical(*views), column_shares=[3, 2]) if views else scene
-    return b.Blueprint(layout, collapse_panels=True)
 
 
 def _log(stream: Any, runs: Sequence[FinishedRun]) -> None:
@@ -93,7 +80,6 @@ def _entities(timeline: Timeline) -> Iterator[tuple[int, int, str, Any]]:
     yield *start, "", _transform(timeline.T_world_key)
     yield *start, "cloud/static", points(static.points, static)
     yield *start, "cloud/moving", points(moving.points, moving)
-    yield *start, "cloud/trails", points(moving.rigid_points, moving)
     paths = [track.T_key_object[:, :3, 3] for track in tracks]
     yield *start, "movers/path", rr.LineStrips3D(paths)
     for sweep in timeline.sweeps:
@@ -116,7 +102,7 @@ def _of_shot(shot: Shot) -> Iterator[tuple[str, Any]]:
         yield "", rr.Pinhole(image_from_camera=camera.K, resolution=size_px, camera_xyz=axes)
     if shot.jpeg is not None:
         yield "image", rr.EncodedImage(contents=shot.jpeg, media_type="image/jpeg")
-    for name, depth_m in (("depth", shot.depth_m), ("depth_filled", shot.filled_m)):
+    for name, depth_m in shot.maps_m.items():
         yield name, rr.DepthImage(depth_m, meter=1.0, colormap="viridis")
 
 

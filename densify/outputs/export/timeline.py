@@ -30,15 +30,14 @@ class ShownSweep(NamedTuple):
 
 
 class Shot(NamedTuple):
-    """A map. stamp_ns: of its exposure. depth_m, filled_m: (H,W), 0 none. is_pinhole: without
-    distortion, with depth along the axis."""
+    """A camera. stamp_ns: of its exposure. maps_m: "depth" and "depth_filled", (H,W) float32, 0
+    none. is_pinhole: without distortion, with depth along the axis."""
 
     name: str
     view: CameraView
     stamp_ns: int
     jpeg: bytes | None
-    depth_m: Float32
-    filled_m: Float32
+    maps_m: dict[str, Float32]
     is_pinhole: bool
 
 
@@ -94,6 +93,6 @@ def _relative_pose(run: FinishedRun, other: FinishedRun) -> Float:
 def _shot(run: FinishedRun, name: str) -> Shot:
     view, maps = run.views[name], run.maps(name)
     stamp_ns = run.stamp_ns + round(1e9 * view.late_s)
-    depth_m, filled_m = metres(maps["depth"]), metres(maps["depth_filled"])
+    maps_m = {kind: metres(maps[kind]) for kind in ("depth", "depth_filled")}
     is_pinhole = view.camera.is_rectified and run.measure(name) == "z"
-    return Shot(name, view, stamp_ns, run.jpeg(name), depth_m, filled_m, is_pinhole)
+    return Shot(name, view, stamp_ns, run.jpeg(name), maps_m, is_pinhole)

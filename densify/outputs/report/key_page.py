@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import math
 import shlex
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -18,7 +17,7 @@ from densify import __version__
 from densify.config.errors import InputError
 from densify.config.file_content import read_bytes, read_json, read_yaml
 from densify.geometry.types import ObjectTrack
-from densify.outputs.cloud_laz import StoredCloud, read_cloud
+from densify.outputs.cloud_laz import read_cloud
 from densify.outputs.depth_png import read_stored
 from densify.outputs.export.finished_run import map_names
 from densify.outputs.report.page_file import Blobs, packed_camera, packed_cloud, page_file
@@ -26,11 +25,6 @@ from densify.outputs.scene_file import read_scene, read_tracks
 from densify.readers.decoded_files import decode_image
 
 T = TypeVar("T")
-MOST_BYTES = 12_000_000
-_MOST_FOR_MAPS = 7_500_000
-_COARSEST = 8
-_MOST_POINTS, _FEWEST_POINTS = 500_000, 10_000
-_OF_THE_PAGE = 300_000  # scores, scripts
 _MAPS: Mapping[str, type[np.uint8] | type[np.uint16]] = {
     "depth": np.uint16,
     "depth_filled": np.uint16,
@@ -118,16 +112,19 @@ def _mapping(value: Any) -> Mapping[str, Any]:
 
 
 def key_page(files: KeyFiles, folder: str) -> bytes:
-    """Return the page, 12 MB at most.
+    """Return the page.
 
-    files: of the key. folder: of a run, as the user names it; "" of a comparison. Maps and points
-    that are too many are thinned, and the page says it. Raises InputError if there is neither a
-    depth map nor a cloud.
+    files: of the key. folder: of a run, as the user names it; "" of a comparison. Points that are
+    too many are thinned, and the page says it. Raises InputError if there is neither a depth map
+    nor a cloud.
     """
     scene = files.read(read_scene, "scene/scene.json", optional=True)
     views, sweeps = (scene.table["views"], scene.table["sweeps"]) if scene else ({}, [])
     focal_px = {name: view.camera.focal_px for name, view in (scene.views if scene else {}).items()}
-    cameras, blobs = _cameras(files, focal_px)
+    blobs, cameras = Blobs(), {}
+    for name in map_names(files.maps / "depth", files.maps / "depth_filled"):
+        if maps := files.camera(name):
+            cameras[name] = packed_camera(blobs, maps, files.image(name), focal_px.get(name))
     stored = files.read(read_cloud, "cloud.laz")
     if not cameras and stored is None:
         raise InputError(f"{files.maps}: no depth map and no cloud in it that can be read")
@@ -154,40 +151,10 @@ def key_page(files: KeyFiles, folder: str) -> bytes:
     }
     if stored is not None and len(stored.points):
         instances = [track.instance for track in tracks]
-        page["cloud"] = _cloud(blobs, stored, [sweep["frame"] for sweep in sweeps], instances)
+        frames = [sweep["frame"] for sweep in sweeps]
+        page["cloud"] = packed_cloud(blobs, stored, frames, instances)
     title = f"{name}, key {key}" + ("" if folder else f": {', '.join(methods)}")
     return page_file(title, page, blobs)
-
-
-def _cameras(files: KeyFiles, focal_px: Mapping[str, float]) -> tuple[dict[str, Any], Blobs]:
-    """Return all cameras, with as many of their pixels as there is room for."""
-    names = sorted({*map_names(files.maps / "depth"), *map_names(files.maps / "depth_filled")})
-    loaded = {name: (files.camera(name), files.image(name)) for name in names}
-    every = 1
-    while True:
-        blobs = Blobs()
-        cameras = {
-            name: packed_camera(blobs, maps, jpeg, focal_px.get(name), every)
-            for name, (maps, jpeg) in loaded.items()
-            if maps
-        }
-        if blobs.num_bytes <= _MOST_FOR_MAPS or every == _COARSEST:
-            return cameras, blobs
-        every = min(_COARSEST, math.ceil(every * math.sqrt(blobs.num_bytes / _MOST_FOR_MAPS)))
-
-
-def _cloud(
-    blobs: Blobs, stored: StoredCloud, frames: list[int], instances: list[int]
-) -> dict[str, Any]:
-    """Return the cloud, with as many of its points as there is room for."""
-    room, most = MOST_BYTES - _OF_THE_PAGE - blobs.num_bytes, _MOST_POINTS
-    while True:
-        own = Blobs(first=len(blobs.texts))
-        cloud = packed_cloud(own, stored, frames, instances, most)
-        if own.num_bytes <= room or most == _FEWEST_POINTS:
-            blobs.texts |= own.texts
-            return cloud
-        most = max(_FEWEST_POINTS, int(0.95 * most * room / own.num_bytes))
 
 
 def _mover(track: ObjectTrack, key: Any) -> dict[str, Any]:

@@ -24,9 +24,7 @@ from numpy.typing import NDArray
 
 from densify.geometry.types import Bool, Float, Int
 from densify.outputs.cloud_laz import StoredCloud
-from densify.outputs.depth_png import encode_jpeg
 from densify.outputs.plain import plain
-from densify.readers.decoded_files import decode_image
 
 _SCRIPTS = (
     *("unpack.js", "dom.js", "colours.js", "maps.js", "matrices.js", "gl.js", "cloud.js"),
@@ -39,8 +37,9 @@ _COLOUR_MAPS = {
     "turbo": cv2.COLORMAP_TURBO,
 }
 _NOT_OF_METHODS = {"depth", "depth_filled", "confidence", "age", "sweep", "reason", "truth"}
-_TRIAL_LEVEL, _LEVEL, _JPEG_QUALITY = 1, 7, 85
+_TRIAL_LEVEL, _LEVEL = 1, 7
 _LEVELS = 65535
+_MOST_POINTS = 500_000
 _MOST_DISPLACED_M = 65.0
 _CONFIDENCE_STEPS = 31
 _GRAY = 50, 190  # reflectance 0 and 1, where no camera observed the point
@@ -54,15 +53,8 @@ class Blobs:
     texts: name -> base64.
     """
 
-    def __init__(self, first: int = 0) -> None:
-        """first: number of the first name."""
-        self._first = first
+    def __init__(self) -> None:
         self.texts: dict[str, str] = {}
-
-    @property
-    def num_bytes(self) -> int:
-        """Size of all texts."""
-        return sum(map(len, self.texts.values()))
 
     def add(self, array: NDArray[Any]) -> dict[str, Any]:
         """Pack whole numbers (N,) or (H,W), 0 or more and below 2^32, in 8, 16 or 32 bits, and
@@ -86,7 +78,7 @@ class Blobs:
         return {"blob": self._keep(data), "mime": mime}
 
     def _keep(self, data: bytes) -> str:
-        name = f"blob-{self._first + len(self.texts)}"
+        name = f"blob-{len(self.texts)}"
         self.texts[name] = base64.b64encode(data).decode()
         return name
 
@@ -102,41 +94,32 @@ def packed_camera(
     maps: Mapping[str, NDArray[Any]],
     jpeg: bytes | None,
     focal_px: float | None,
-    every: int,
 ) -> dict[str, Any]:
     """Return a camera's entry of the page.
 
     maps: kind -> (H,W) as stored, see `outputs.report.key_page.KeyFiles.camera`.
-    jpeg: its image. every: 2 keeps every second pixel of every second row.
+    jpeg: its image.
 
     Measured, source sweep and age are one map: ``source`` numbers the rows of ``sources``, which
     are [row of the sweep + 1, age in ms + 1, measured 0 or 1], 0 where unknown.
     """
-    height, width = next(iter(maps.values())).shape
-    nothing = np.zeros((height, width), np.uint16)
-    whole = {kind: maps.get(kind, nothing) for kind in ("depth", "depth_filled", "sweep", "age")}
-    small = {kind: image[::every, ::every] for kind, image in {**maps, **whole}.items()}
-    measured = small["depth"] > 0
-    codes = (small["sweep"].astype(np.int64) << 17) | (small["age"].astype(np.int64) << 1)
-    known, source = np.unique(codes | measured, return_inverse=True)
+    nothing = np.zeros_like(next(iter(maps.values())), np.uint16)
+    depth, filled, sweep, age = (
+        maps.get(kind, nothing) for kind in ("depth", "depth_filled", "sweep", "age")
+    )
+    measured = depth > 0
+    codes = (sweep.astype(np.int64) << 17) | (age.astype(np.int64) << 1) | measured
+    known, source = np.unique(codes, return_inverse=True)
     entry: dict[str, Any] = {
-        "size_px": [width, height],
-        "every": every,
         "focal_px": focal_px,
-        "filled": blobs.add(np.where(measured, small["depth"], small["depth_filled"])),
+        "filled": blobs.add(np.where(measured, depth, filled)),
         "source": blobs.add(source.reshape(codes.shape)),
         "sources": np.stack([known >> 17, (known >> 1) & 0xFFFF, known & 1], axis=1),
-        "density": {
-            "measured": np.mean(whole["depth"] > 0),
-            "filled": np.mean(whole["depth_filled"] > 0),
-        },
-        "others": {k: blobs.add(m) for k, m in small.items() if k not in _NOT_OF_METHODS},
+        "density": {"measured": np.mean(measured), "filled": np.mean(filled > 0)},
+        "others": {k: blobs.add(m) for k, m in maps.items() if k not in _NOT_OF_METHODS},
     }
-    entry |= {k: blobs.add(small[k]) for k in ("confidence", "reason", "truth") if k in small}
+    entry |= {k: blobs.add(maps[k]) for k in ("confidence", "reason", "truth") if k in maps}
     if jpeg is not None:
-        if every > 1:
-            rgb = decode_image(jpeg, "image")[::every, ::every, ::-1]
-            jpeg = encode_jpeg(rgb, _JPEG_QUALITY)
         entry["image"] = blobs.add_file(jpeg, "image/jpeg")
     return entry
 
@@ -146,7 +129,7 @@ def packed_cloud(
     cloud: StoredCloud,
     frames: Sequence[int],
     instances: Sequence[int],
-    most_points: int,
+    most_points: int = _MOST_POINTS,
 ) -> dict[str, Any]:
     """Return the cloud's entry of the page: the points of `thinned`, moving ones first, each part
     in space order. Positions are 16-bit numbers in a box.

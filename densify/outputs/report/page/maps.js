@@ -289,9 +289,9 @@ class ImagePane {
     this.read();
   }
   read() {
-    const maps = this.maps, [x, y] = this.at, i = y * maps.width + x, every = maps.entry.every;
+    const maps = this.maps, [x, y] = this.at, i = y * maps.width + x;
     const { sweep, ageMs, measured } = maps.sourceAt(i), depth = maps.filled[i];
-    const rows = [row("pixel", `u ${x * every}, v ${y * every}`)];
+    const rows = [row("pixel", `u ${x}, v ${y}`)];
     const ours = methodName(page.method);
     const out = depth && !this.kept[i] ? " (below the sliders)" : "";
     rows.push(row(ours, depth ? `${metres(depth * M_PER_STEP)}, ${measured ? "measured" : "filled"}${out}` : "no depth"));
@@ -331,10 +331,9 @@ class ImagePane {
       element("tr", {}, ...head.map((text, i) => element("th", { scope: "col", class: i ? "number" : "" }, text))),
       ...rows.map((r) => row(r.product, ...cells(r))),
     );
-    const part = maps.entry.every > 1 ? `Numbers are of every ${maps.entry.every}th pixel of every ${maps.entry.every}th row, as this page has them. ` : "";
     const curve = heldOutAt(maps.name, confidence);
     const held = isNumber(curve) ? `With the key sweep held out, ${percent(curve)} of the measured pixels this certain are wrong.` : "";
-    $("kept-note").textContent = part + held;
+    $("kept-note").textContent = held;
     const age = ageMs === Infinity ? "" : ` --max-age-ms ${ageMs}`;
     $("export-command").parentElement.hidden = !page.folder;
     $("export-command").textContent = page.folder ? `densify export ${page.folder} --to npy --min-confidence ${confidence}${age}` : "";
