@@ -11,13 +11,13 @@ import pytest
 from densify.config import RegisterSettings
 from densify.config.errors import ComputationError, InputError, SweepError
 from densify.geometry import poses
-from densify.geometry.types import Sweep, Trajectory
+from densify.geometry.types import Trajectory
 from densify.readers.street import Street
 from densify.readers.timeline import read_sweep
 from densify.registration.alignment import subsample
 from densify.registration.deskew import deskew
 from densify.registration.odometry import find_odometry
-from densify.registration.start_speed import measure_velocity, search_twist
+from densify.registration.start_speed import search_twist
 from densify.registration.surfaces import refine, register_on_surfaces
 from densify.registration.trajectory import check_plausible, find_trajectory
 from tests.scenes import SWEEP_S, Arc, Box, Scanner, Scene, World, street
@@ -178,16 +178,12 @@ def few(raw):
     return [subsample(s, 12_000) for s in raw]
 
 
-def on_surfaces(sweeps):
-    return register_on_surfaces(sweeps, [None] * len(sweeps))
-
-
 def test_few_points_are_laid_on_the_surfaces_of_the_last_second(drive, few):
-    found = on_surfaces(few)
+    found = register_on_surfaces(few)
     assert (found.frames, found.T_world_lidar[0].tolist()) == (tuple(FRAMES), np.eye(4).tolist())
     off_m, off_deg = errors(found, drive.trajectory(FRAMES))
     assert off_m.max() < 0.04 and off_deg.max() < 0.1
-    again, other = on_surfaces(few[:3]), on_surfaces(few[:3])
+    again, other = register_on_surfaces(few[:3]), register_on_surfaces(few[:3])
     assert again.T_world_lidar.tobytes() == other.T_world_lidar.tobytes()
 
 
@@ -197,7 +193,7 @@ def test_the_road_ahead_does_not_tip_a_scanner_of_few_rings() -> None:
     road, frames = Street("street", 59, "vlp16"), range(75, 86)
     raw = [read_sweep(road, f, SETTINGS) for f in frames]
     T_true = [poses.inverse(road.T_world_lidar(80)) @ road.T_world_lidar(f) for f in (75, 85)]
-    found = dict(zip(frames, on_surfaces(raw).T_world_lidar, strict=True))
+    found = dict(zip(frames, register_on_surfaces(raw).T_world_lidar, strict=True))
     for T, f in zip(T_true, (75, 85), strict=True):
         off = poses.log(poses.inverse(T) @ poses.inverse(found[80]) @ found[f])
         assert np.rad2deg(np.linalg.norm(off[:3])) < 0.2 and np.linalg.norm(off[3:]) < 0.03
@@ -212,44 +208,6 @@ def test_a_pattern_that_turns_from_sweep_to_sweep_does_not_take_the_poses_with_i
     off = np.array([poses.log(T) for T in found.T_world_lidar])
     assert np.linalg.norm(off[:, 3:], axis=1).max() < 0.08
     assert np.rad2deg(np.linalg.norm(off[:, :3], axis=1)).max() < 1
-
-
-def test_measured_velocities_hold_along_a_road_where_nothing_else_tells() -> None:
-    """A forward scanner sees rails and the traffic that it goes with: point to point, it stays 2 m
-    behind from each sweep to the next but one."""
-    highway, frames = Street("highway", 2026, "fmcw"), range(75, 83)
-    raw = [read_sweep(highway, f, SETTINGS) for f in frames]
-    true = [highway.T_world_lidar(f) for f in frames]
-    found = find_trajectory(raw, SETTINGS).T_world_lidar
-    away = [poses.inverse(true[0]) @ T for T in true] - found
-    assert np.linalg.norm(away[:, :3, 3], axis=1).max() < 0.05
-    for sweep in raw[::3]:
-        assert measure_velocity(sweep) == pytest.approx([25, 0, 0], abs=0.05)
-
-
-@pytest.mark.parametrize("share", [0.0, 0.4, 0.7], ids=["all stands", "traffic", "most moves"])
-def test_the_velocity_is_that_of_what_stands(share):
-    rng = np.random.default_rng(9)
-    points, own = 30 * rng.normal(size=(4000, 3)), np.array([12.0, -1.5, 0.4])
-    origins = np.array([[0.0, 0.0, 0.0], [1.2, 0.3, -0.8]])
-    lidar = rng.integers(0, 2, 4000)
-    away = points - origins[lidar]
-    moves = (rng.random(4000) < share)[:, None] * rng.uniform(5, 30, (4000, 3))
-    ray = away / np.linalg.norm(away, axis=1, keepdims=True)
-    radial_m_s = np.einsum("ni,ni->n", ray, moves - own) + 0.03 * rng.normal(size=4000)
-    radial_m_s[::7] = np.nan
-    sweep = Sweep(
-        *(0, 0, points, np.zeros(4000, np.float32), None, lidar.astype(np.uint8), np.arange(4000)),
-        scanner_origins=origins,
-        radial_velocity_m_s=radial_m_s.astype(np.float32),
-    )
-    found = measure_velocity(sweep)
-    if share > 0.5:
-        assert found is None
-    else:
-        np.testing.assert_allclose(found, own, atol=0.02)
-    assert measure_velocity(replace(sweep, radial_velocity_m_s=None)) is None
-    assert measure_velocity(sweep.select(np.arange(100))) is None
 
 
 # --- what cannot be registered --------------------------------------------------------------------

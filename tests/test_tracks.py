@@ -93,7 +93,6 @@ def test_what_is_confirmed(step_m, num_states, gap_m, counts, places, confirmed,
     space = SimpleNamespace(
         gap_m=lambda *_: gap_m, clock=SimpleNamespace(time_s=0.1 * np.arange(11))
     )
-    monkeypatch.setattr(proof, "_is_as_fast_as_measured", lambda *_: True)
     monkeypatch.setattr(proof, "count_violations", lambda *_: counts)
     left = PlacesLeft(*(Places(*side) for side in places))
     monkeypatch.setattr(proof, "find_places_left", lambda *_: left)

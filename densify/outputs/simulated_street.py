@@ -13,8 +13,8 @@
 The plain folder, for `densify.readers.folder`::
 
     OUT/street/densify.yaml
-    OUT/street/sweeps/000000.bin, ...  float32 x y z intensity time lidar, time in s since the
-                                       stamp, and radial_velocity of sensors that measure it
+    OUT/street/sweeps/000000.bin, ...  float32 x y z intensity time lidar, time in s since
+                                       the stamp
     OUT/street/timestamps.txt          one time per sweep, s since 1970
     OUT/street/poses.txt               the lidar's path (TUM): time x y z qx qy qz qw
     OUT/street/images/CAMERA/1781258406000000000.png, ...  named by their times in ns
@@ -180,8 +180,6 @@ def _write_folder(excerpt: Excerpt, folder: Path, progress: Progress) -> None:
     for number, frame in _numbered(excerpt.frames, progress):
         returns = street.returns(frame)
         columns = [returns.points, returns.intensity, returns.offset_ns * 1e-9, returns.lidar]
-        if returns.radial_velocity_m_s is not None:
-            columns.append(returns.radial_velocity_m_s)
         table = np.column_stack(columns).astype("<f4")
         put(folder / "sweeps" / f"{number:06d}.bin", table.tobytes())
     put(folder / "timestamps.txt", "".join(f"{_seconds(ns)}\n" for ns in stamps_ns))
@@ -223,7 +221,7 @@ def config_text(excerpt: Excerpt) -> str:
     config = {
         "sweeps": {
             "files": "sweeps",
-            "columns": columns + ["radial_velocity"] * sensor.measures_velocity,
+            "columns": columns,
             "intensity_scale": 1.0,
             "time_unit": "s",
             "time_is": "relative",

@@ -18,7 +18,7 @@ from densify.pipeline.costs import Watch
 from densify.pipeline.methods import METHODS, Method
 from densify.pipeline.recording import Beyond, Moment, Recording
 from densify.scores import depth_metrics
-from densify.scores.cloud_scores import ghost_scores, radial_velocity_scores
+from densify.scores.cloud_scores import ghost_scores
 
 Image = NDArray[np.uint8]
 
@@ -146,9 +146,6 @@ def _metrics(
         },
         "ghosts": ghost_scores(cloud, scene.key_image, scene.key),
     }
-    radial = radial_velocity_scores(cloud, scene.stretch[scene.key])
-    if radial is not None:
-        metrics["radial_velocity"] = radial
     if scene.truth:
         cameras = {name: scene.views.exposures[name].camera for name in depth}
         metrics["depth"] = {

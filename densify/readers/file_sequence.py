@@ -37,7 +37,7 @@ class Returns:
     (N,) uint8, which of several scanners fired, None if there is one. scanner_origins: (S,3)
     metres, lidar frame, None where all rays start at the frame's origin. R_scanner_lidar: (S,3,3)
     from the lidar frame's axes to each scanner's, z along the axis it spins about, None where they
-    are the frame's. radial_velocity_m_s: (N,) float32, away from the scanner, None if not measured.
+    are the frame's.
     """
 
     points: Float
@@ -46,7 +46,6 @@ class Returns:
     lidar: NDArray[np.uint8] | None = None
     scanner_origins: Float | None = None
     R_scanner_lidar: Float | None = None
-    radial_velocity_m_s: Float32 | None = None
 
 
 class FileSequence(ABC):
@@ -136,7 +135,6 @@ class FileSequence(ABC):
             row=row.astype(np.int64, copy=False),
             scanner_origins=returns.scanner_origins,
             R_scanner_lidar=returns.R_scanner_lidar,
-            radial_velocity_m_s=_rows(returns.radial_velocity_m_s, row),
         )
 
     def num_rows(self, frame: int) -> int:

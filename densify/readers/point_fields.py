@@ -29,14 +29,11 @@ _NAMES = {
     "time": "time t timestamp time_stamp offset_time time_offset timeoffset offset_ns offset_us "
     "time_us time_ns stamp gps_time scalar_time",
     "ring": "ring line channel laser_id laser_number laserid beam scalar_ring",
-    "radial_velocity": "radial_velocity radial_speed doppler doppler_velocity velocity v_r vr "
-    "radial_velocity_m_s",
     "lidar": "lidar lidar_id scanner sensor_id scanner_channel",
 }
 _SHORTEST_SHARE, _LONGEST_SHARE = 0.08, 4.0  # of a period that the times of a sweep span
 _SAME_CLOCK_NS = 2_000_000_000
 _RELATIVE_NS = 3_000_000_000
-_FASTEST_M_S = 200.0
 _FULL_SCALES = (1.0, 255.0, 65535.0)
 
 
@@ -51,7 +48,6 @@ class Fields:
     time: str = ""
     ring: str = ""
     lidar: str = ""
-    radial_velocity: str = ""
 
 
 def find_fields(names: Collection[str]) -> Fields:
@@ -167,12 +163,3 @@ def scaled(intensity: NDArray[Any], scale: float) -> Float32:
 def points_of(columns: Mapping[str, NDArray[Any]], fields: Fields) -> NDArray[np.float64]:
     """Return (N,3) float64, in the file's unit."""
     return np.column_stack([columns[n] for n in (fields.x, fields.y, fields.z)]).astype(np.float64)
-
-
-def radial_velocities(columns: Mapping[str, NDArray[Any]], fields: Fields) -> Float32 | None:
-    """Return (N,) m/s away from the scanner, NaN where not measured; None without such a field."""
-    if not fields.radial_velocity:
-        return None
-    found = columns[fields.radial_velocity].astype(np.float32)
-    found[~(np.abs(found) < _FASTEST_M_S)] = np.nan
-    return found

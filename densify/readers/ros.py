@@ -27,7 +27,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,7 +43,6 @@ from densify.readers.point_fields import (
     find_times,
     full_scale,
     points_of,
-    radial_velocities,
     scaled,
 )
 from densify.readers.recorded_poses import PoseTrack
@@ -133,7 +132,6 @@ class RosBag(FileSequence):
                 found.append((number, self._returns_of(lidar, near, at.stamp_ns)))
         parts = [part for _, part in found]
         timed = all(part.offset_ns is not None for part in parts)
-        measured = any(part.radial_velocity_m_s is not None for part in parts)
         origins = np.stack([lidar.T_first_lidar[:3, 3] for lidar in self._lidars])
         return self.where, Returns(
             np.concatenate([part.points for part in parts]),
@@ -141,9 +139,6 @@ class RosBag(FileSequence):
             np.concatenate([part.offset_ns for part in parts]) if timed else None,
             np.concatenate([np.full(len(part.points), n, np.uint8) for n, part in found]),
             origins if len(self._lidars) > 1 else None,
-            radial_velocity_m_s=(
-                np.concatenate([_radial_velocity(part) for part in parts]) if measured else None
-            ),
         )
 
     def _returns_of(self, lidar: Lidar, entry: Entry, stamp_ns: int) -> Returns:
@@ -170,8 +165,7 @@ class RosBag(FileSequence):
             offset_ns[valid] = lidar.times.offset_ns(values[valid], entry.stamp_ns) + since_ns
         points[valid] = poses.transform(lidar.T_first_lidar, points[valid])
         points[~valid] = 0.0
-        radial_m_s = radial_velocities(columns, lidar.fields)
-        return Returns(points, intensity, offset_ns, radial_velocity_m_s=radial_m_s)
+        return Returns(points, intensity, offset_ns)
 
     def _image(self, camera: Camera, number: int) -> NDArray[np.uint8]:
         topic = self._image_topics[camera.name]
@@ -258,9 +252,3 @@ class RosBag(FileSequence):
                 raise
             self._left_out.append(f"{images.topic}: {error}")
             return None
-
-
-def _radial_velocity(part: Returns) -> NDArray[Any]:
-    """Return (N,) m/s, NaN of a lidar that does not measure it."""
-    measured = part.radial_velocity_m_s
-    return np.full(len(part.points), np.nan, np.float32) if measured is None else measured

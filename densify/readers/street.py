@@ -107,7 +107,6 @@ class Street:
             lidar=returns.lidar,
             row=np.arange(len(returns.points)),
             scanner_origins=self.simulator.sensor.origins_m,
-            radial_velocity_m_s=returns.radial_velocity_m_s,
         )
 
     def keep_nothing(self) -> None:

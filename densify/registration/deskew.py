@@ -37,13 +37,7 @@ def deskew_sweep(
         twist = np.where(offset_s < 0, twist_before, twist_after)
         points = poses.transform_each(np.asarray(offset_s * twist, np.float64), points)
     deskewed = replace(sweep, points=points)
-    registered = RegisteredSweep(deskewed, T_world_lidar, twist_before, twist_after)
-    if sweep.radial_velocity_m_s is None:
-        return registered
-    ray, own_m_s = registered.rays()
-    over_ground = sweep.radial_velocity_m_s + np.einsum("ni,ni->n", ray, own_m_s)
-    measured = replace(deskewed, radial_velocity_m_s=over_ground.astype(np.float32))
-    return replace(registered, sweep=measured)
+    return RegisteredSweep(deskewed, T_world_lidar, twist_before, twist_after)
 
 
 def twists(trajectory: Trajectory, i: int) -> tuple[Float, Float]:

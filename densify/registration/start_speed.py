@@ -1,11 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The lidar's speed at the start of a recording: searched in the first sweeps, or measured by
-radial velocities.
-
-A static point approaches the scanner as fast as the scanner approaches it: its radial velocity is
-minus the scanner's velocity along the ray (Kellner et al., "Instantaneous Ego-Motion Estimation
-using Doppler Radar", ITSC 2013).
-"""
+"""The lidar's speed at the start of a recording, searched in the first sweeps."""
 
 from __future__ import annotations
 
@@ -23,11 +17,6 @@ _NUM_POINTS = 800
 _CLOSE_M = 1.0
 _RAYS_RAD = 0.01  # between rays: objects along the road are met by the same rays at any speed
 _ABOVE_GROUND_M = 0.4
-_NUM_ROUNDS, _NUM_LAST = 30, 3
-_NOISE_M_S = 0.2
-_AGREES_M_S = 0.6  # a sweep takes 0.1 s, in which the speed changes
-_MIN_POINTS, _MIN_SHARE = 200, 0.5
-_RIDGE = 1e-6  # keeps at 0 what no ray measures, for example along a single wall
 
 
 def search_twist(sweeps: Sequence[Sweep]) -> Float:
@@ -83,35 +72,3 @@ def above_ground(points: Float) -> Float:
     np.minimum.at(lowest, cell, z)
     above = points.take(np.flatnonzero(z > lowest[cell] + _ABOVE_GROUND_M), axis=0)
     return above if len(above) else points
-
-
-def measure_velocity(sweep: Sweep) -> Float | None:
-    """Return the (3,) velocity of the scanner in m/s, in its own frame, by radial velocities.
-
-    Least absolute deviations (iteratively reweighted), then least squares over the points that
-    agree to 0.6 m/s. A rotation moves nothing along a ray from the scanner and is not seen.
-
-    Returns None where too few radial velocities were measured, or fewer than half agree because
-    most points are on moving objects.
-    """
-    if sweep.radial_velocity_m_s is None:
-        return None
-    known = np.flatnonzero(np.isfinite(sweep.radial_velocity_m_s))
-    if len(known) < _MIN_POINTS:
-        return None
-    away_m_s = sweep.radial_velocity_m_s[known].astype(np.float64)
-    ray = sweep.points[known]
-    if sweep.scanner_origins is not None:
-        ray = ray - sweep.scanner_origins[sweep.lidar[known]]
-    ray = ray / np.linalg.norm(ray, axis=1, keepdims=True)
-    off_m_s = np.zeros(len(known))
-    for left in reversed(range(_NUM_ROUNDS)):
-        if left < _NUM_LAST:
-            weight = (off_m_s <= _AGREES_M_S).astype(np.float64)
-        else:
-            weight = _NOISE_M_S / np.maximum(off_m_s, _NOISE_M_S)
-        weighted = ray * weight[:, None]
-        normal = weighted.T @ ray + _RIDGE * len(ray) * np.eye(3)
-        velocity_m_s = np.linalg.solve(normal, -weighted.T @ away_m_s)
-        off_m_s = np.abs(away_m_s + ray @ velocity_m_s)
-    return velocity_m_s if (off_m_s <= _AGREES_M_S).mean() >= _MIN_SHARE else None

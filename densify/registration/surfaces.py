@@ -53,24 +53,20 @@ def refine(sweeps: Sequence[Sweep], rough: Trajectory) -> Trajectory:
     return replace(rough, T_world_lidar=rough.T_world_lidar[0] @ T_first_lidar)
 
 
-def register_on_surfaces(sweeps: Sequence[Sweep], measured: Sequence[Float | None]) -> Trajectory:
+def register_on_surfaces(sweeps: Sequence[Sweep]) -> Trajectory:
     """Register sparse sweeps without other odometry, raw and ascending in time.
 
-    Each sweep starts at constant velocity, or at the measured one, which decides along a road where
-    nothing else tells. The first second is registered twice: from `search_twist`, which is some
-    metres per second off, then from the twist that this finds.
-
-    measured: (3,) m/s of each, see `densify.registration.start_speed.measure_velocity`.
+    Each sweep starts at constant velocity. The first second is registered twice: from
+    `search_twist`, which is some metres per second off, then from the twist that this finds.
     """
 
-    def expected(i: int, before: Float) -> Float:
-        return _as_measured(before, measured[i - 1 : i + 1])
+    def expected(_: int, before: Float) -> Float:
+        return before
 
     row = _SweepRow(sweeps, _NUM_NEIGHBORS_OF_FEW, _MATCH_GUESSED_M)
     twist = np.zeros(6)
     if len(sweeps) > 1:
-        known = all(velocity is not None for velocity in measured[:2])
-        twist = _as_measured(twist, measured[:2]) if known else search_twist(sweeps)
+        twist = search_twist(sweeps)
         num = int(np.searchsorted(row.stamp_ns, row.stamp_ns[0] + _START_NS, side="right"))
         start = _SweepRow(sweeps[:num], _NUM_NEIGHBORS_OF_FEW, _MATCH_GUESSED_M)
         T = start.register(twist, expected)
@@ -148,12 +144,6 @@ class _SweepRow:
     def _seconds(self, i: int) -> float:
         """Return the time from the sweep before to sweep i."""
         return float(self.stamp_ns[i] - self.stamp_ns[i - 1]) * 1e-9
-
-
-def _as_measured(twist: Float, measured: Sequence[Float | None]) -> Float:
-    """Return the (6,) twist per second with the mean measured velocity, where all are known."""
-    known = [velocity for velocity in measured if velocity is not None]
-    return np.append(twist[:3], np.mean(known, axis=0)) if len(known) == len(measured) else twist
 
 
 def _deskewed(sweep: Sweep, twist: Float) -> Float:

@@ -20,7 +20,7 @@ from densify.geometry.nearest import tree_of
 from densify.geometry.types import Float, Int, Sweep, Trajectory
 from densify.registration.deskew import deskew
 from densify.registration.odometry import find_odometry
-from densify.registration.start_speed import MAX_SPEED_M_S, above_ground, measure_velocity
+from densify.registration.start_speed import MAX_SPEED_M_S, above_ground
 from densify.registration.surfaces import refine, register_on_surfaces
 
 MIN_OVERLAP = 0.55
@@ -71,8 +71,8 @@ def find_trajectory(
 ) -> Trajectory:
     """Return the poses of raw sweeps, ascending in time.
 
-    Dense sweeps are registered point to point and then aligned with the surfaces of those before;
-    sparse ones, and those with radial velocities, on surfaces alone.
+    Dense sweeps are registered point to point and then aligned with the surfaces of those before,
+    sparse ones on surfaces alone.
 
     recorded: the recording's own poses, which are checked and used; None to register.
     Raises SweepError naming the frame where the poses cannot be right.
@@ -84,12 +84,11 @@ def find_trajectory(
     _check_number_of_points(sweeps, settings)
     _check_stamps([s.frame for s in sweeps], np.array([s.stamp_ns for s in sweeps], np.int64))
     dense = bool(np.median([len(sweep) for sweep in sweeps]) >= _MANY_POINTS)
-    measured = [measure_velocity(sweep) for sweep in sweeps]
-    if dense and any(velocity is None for velocity in measured):
+    if dense:
         odometry, deskewed = find_odometry(sweeps, settings)
         found = refine(sweeps, odometry)
     else:
-        found = register_on_surfaces(sweeps, measured)
+        found = register_on_surfaces(sweeps)
         deskewed = [s.sweep for s in deskew(sweeps, found).sweeps]
     check_plausible(found, settings)
     check_overlap(deskewed, found, settings)

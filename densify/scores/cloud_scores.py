@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Scores of an accumulated cloud without truth: its ghosts, and measured radial velocities.
+"""Scores of an accumulated cloud without truth: its ghosts.
 
 Every ``*_scores`` dictionary holds plain numbers ready for JSON; what is undefined is None.
 """
@@ -12,10 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from densify.free_space.range_image import RangeImage
-from densify.geometry.types import Bool, Cloud, RegisteredSweep
+from densify.geometry.types import Bool, Cloud
 
 _GHOST_MARGIN_M, _GHOST_MARGIN_FRACTION, _MIN_FILLED = 0.5, 0.02, 6
-_LEAST_M_S = 0.5
 
 
 def ghosts(cloud: Cloud, key_image: RangeImage, key: int) -> Bool:
@@ -58,35 +57,6 @@ def ghost_scores(cloud: Cloud, key_image: RangeImage, key: int) -> dict[str, Any
     }
 
 
-def radial_velocity_scores(cloud: Cloud, registered: RegisteredSweep) -> dict[str, Any] | None:
-    """Compare the velocities of a key's own points with its measured radial velocities (FMCW
-    lidars); None where none were measured.
-
-    cloud: at the key's reference time, in its frame. registered: the key's sweep. Returns
-    ``num_points`` with a velocity; ``num_moving`` that move by the flow or by more than 0.5 m/s
-    along their rays; over these ``rms_m_s`` of measured minus estimated, ``rms_standing_m_s`` if
-    nothing moved, and ``unexplained``, the share that is off by more than 0.5 m/s.
-    """
-    sweep = registered.sweep
-    if sweep.radial_velocity_m_s is None:
-        return None
-    own = np.flatnonzero((cloud.frame == sweep.frame) & ~cloud.far)
-    order = np.argsort(sweep.row)
-    at = order[np.searchsorted(sweep.row, cloud.row[own], sorter=order)]
-    measured = sweep.radial_velocity_m_s[at].astype(np.float64)
-    estimated = np.einsum("ni,ni->n", registered.rays()[0][at], cloud.velocity_m_s[own])
-    known = np.isfinite(measured)
-    moving = known & (cloud.moving[own] | (np.abs(measured) > _LEAST_M_S))
-    off_m_s = np.abs(measured - estimated)[moving]
-    return {
-        "num_points": int(known.sum()),
-        "num_moving": int(moving.sum()),
-        "rms_m_s": _rms(off_m_s),
-        "rms_standing_m_s": _rms(measured[moving]),
-        "unexplained": _mean(off_m_s > _LEAST_M_S),
-    }
-
-
 def _others(cloud: Cloud, key: int) -> Bool:
     """Return (M,) True for points of the window that are not from the key sweep."""
     return (cloud.frame != key) & ~cloud.far
@@ -100,7 +70,3 @@ def _rates(ghost: Bool, group: NDArray[np.integer]) -> dict[int, float]:
 
 def _mean(values: np.ndarray) -> float | None:
     return float(np.mean(values)) if len(values) else None
-
-
-def _rms(values: np.ndarray) -> float | None:
-    return float(np.sqrt(np.mean(values**2))) if len(values) else None

@@ -13,7 +13,7 @@ from densify.geometry.poses import rotate, transform
 from densify.geometry.types import Bool, Float, Float32, Int
 from densify.street.materials import LASER_PASSES, REFLECTIVITY
 from densify.street.mesh import across, lengths
-from densify.street.motion import Driving, Trajectory, poses_at
+from densify.street.motion import Driving, poses_at
 from densify.street.sensors import Sensor, firings
 from densify.street.world import Hits, Rays, World
 
@@ -24,7 +24,6 @@ _SPOT = np.array([(0, 0), (1, 1), (1, -1), (-1, 1), (-1, -1)])  # its rays, left
 _FLAT_M = 0.10  # off the plane through the centre's echo: an edge
 _MERGE_M = 2.0  # echoes closer than this can melt into one
 _MELT_PROBABILITY = 0.2
-_STEP_S = 1e-3  # of velocities
 
 
 @dataclass(frozen=True)
@@ -33,8 +32,7 @@ class Returns:
 
     points: (N,3) float32, lidar axes, each at its own firing time. intensity: (N,) 0 to 1.
     offset_ns: (N,) int64 from the reference time. lidar: (N,) scanner. body: (N,) index of the
-    body met. instance: (N,) object met, -1 none. radial_velocity_m_s: (N,) relative to the scanner,
-    away from it; None for sensors that do not measure it.
+    body met. instance: (N,) object met, -1 none.
     """
 
     points: Float32
@@ -43,7 +41,6 @@ class Returns:
     lidar: NDArray[np.uint8]
     body: NDArray[np.int32]
     instance: NDArray[np.int32]
-    radial_velocity_m_s: Float32 | None = None
 
 
 def T_ego_lidar(tilt_deg: float = 0.0) -> Float:
@@ -91,15 +88,6 @@ def scan(
     np.add(points, origin_m, out=points, where=origin_m != 0)  # a coordinate of -0.0 stays one
     brightness = reflectivity * (0.35 + 0.65 * grazing) * (1 + 0.05 * rng.normal(size=n))
     body = world.triangles.body[hit.triangle[keep]]
-    radial_m_s = None
-    if sensor.measures_velocity:
-        places = origin[keep] + spot[keep, 0] * range_m[keep, None]
-        mounts = transform(T, origin_m[keep])
-        v_m_s = velocities_m_s(world, body, places, times[keep])
-        v_m_s -= _velocity(ego, mounts, times[keep])
-        sigma_m_s = sensor.each("velocity_sigma_m_s")[fired.lidar[keep]]
-        radial = np.einsum("ni,ni->n", v_m_s, spot[keep, 0])
-        radial_m_s = (radial + sigma_m_s * rng.normal(size=len(radial))).astype(np.float32)
     return Returns(
         points[keep].astype(np.float32),
         np.clip(np.round(brightness[keep], 2), 0, 1).astype(np.float32),
@@ -107,24 +95,7 @@ def scan(
         fired.lidar[keep],
         body,
         world.triangles.instance[hit.triangle[keep]],
-        radial_m_s,
     )
-
-
-def velocities_m_s(world: World, body: NDArray[np.int32], places: Float, times: Float) -> Float:
-    """(N,3) world axes: of the points of bodies that are at these places (N,3) at these times."""
-    found = np.zeros_like(places)
-    for index in np.unique(body[body > 0]):
-        rows = np.flatnonzero(body == index)
-        way = world.bodies[index].trajectory
-        found[rows] = _velocity(way, way.poses(times[rows]).undo(places[rows]), times[rows])
-    return found
-
-
-def _velocity(way: Trajectory, points: Float, times: Float) -> Float:
-    """(N,3) m/s, world axes, of points (N,3) of what moves along a way."""
-    before, after = (way.poses(times + shift_s).apply(points) for shift_s in (-_STEP_S, _STEP_S))
-    return (after - before) / (2 * _STEP_S)
 
 
 def at_offsets(time_s: float, offset_ns: Int) -> Float:

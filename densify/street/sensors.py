@@ -109,14 +109,13 @@ class Scanner:
     """One scanner of a sensor.
 
     max_range_m, range_sigma_m: reach, and noise along the ray. origin_m: where its rays start,
-    lidar frame. velocity_sigma_m_s: noise of the radial velocity, None if it does not measure it.
+    lidar frame.
     """
 
     pattern: Spinning | Raster | Rosette
     max_range_m: float
     range_sigma_m: float
     origin_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    velocity_sigma_m_s: float | None = None
 
 
 @dataclass(frozen=True)
@@ -134,11 +133,6 @@ class Sensor:
     def origins_m(self) -> Float:
         """(S,3) where the rays of each scanner start, lidar frame."""
         return self.each("origin_m")
-
-    @property
-    def measures_velocity(self) -> bool:
-        """Return True if all returns have a radial velocity."""
-        return all(scanner.velocity_sigma_m_s is not None for scanner in self.scanners)
 
     @property
     def azimuth_tells_time(self) -> bool:
@@ -187,7 +181,6 @@ _VLS128 = Spinning(_VLS128_DEG, 18000)
 _PANDAR64 = Spinning(_PANDAR64_DEG, 18000)
 _PANDAR_GT = Raster(400_000, 60.0, 20.0, 1000)
 _LIVOX = Rosette(200_000, 70.0, (121.6, -77.7))  # prisms at 7294 and -4664 turns a minute
-_AEVA = Raster(1_000_000, 110.0, 28.0, 900)
 
 SENSORS: dict[str, Sensor] = {
     name: Sensor(name, scanners)
@@ -212,8 +205,6 @@ SENSORS: dict[str, Sensor] = {
             Scanner(_PANDAR64, 120.0, 0.02),
             Scanner(_PANDAR_GT, 150.0, 0.02, (0.58, 0.027, -0.294)),
         ),
-        # frequency-modulated, so that each return has its radial velocity
-        "fmcw": (Scanner(_AEVA, 150.0, 0.02, velocity_sigma_m_s=0.05),),
         "rosette": (Scanner(_LIVOX, 120.0, 0.02),),
     }.items()
 }

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from densify.flow.tracking.radial import Radial
 from densify.free_space.ground import ABOVE_GROUND_M, HeightMap
 from densify.free_space.seen_through import FreeSpace
 from densify.geometry import poses
@@ -68,9 +67,8 @@ class Obstacles:
 
     row: (C,) index into the sweep's points. points: (C,3) world, rigidly registered.
     time_s: (C,) firing time since the first sweep's reference time.
-    seed: (C,) True if another sweep saw through the point, or its radial velocity is not static.
+    seed: (C,) True if another sweep saw through the point.
     cluster: (C,) label of the cluster of candidates, -1 for points that are no candidates.
-    radial: None where no scanner measures radial velocity.
     """
 
     row: Int
@@ -79,13 +77,11 @@ class Obstacles:
     seed: Bool
     cluster: Int
     num_clusters: int
-    radial: Radial | None = None
 
     @staticmethod
     def of(stretch: Stretch, i: int, found: Candidates) -> Obstacles:
         """Place the candidates of sweep i in the world."""
         registered = stretch.sweeps[i]
-        radial = Radial.of(registered)
         return Obstacles(
             row=found.row,
             points=poses.transform(registered.T_world_lidar, registered.sweep.points[found.row]),
@@ -93,7 +89,6 @@ class Obstacles:
             seed=found.seed,
             cluster=found.cluster,
             num_clusters=found.num_clusters,
-            radial=None if radial is None else radial.rows(found.row),
         )
 
     @property
@@ -156,7 +151,6 @@ def _merged(parts: Sequence[Obstacles]) -> Obstacles:
     together = coo_array((np.ones(len(candidate), bool), ends), shape=(num, num))
     num_clusters, cluster = connected_components(together, directed=False)
     label[candidate] = cluster[label[candidate]]
-    radial = [part.radial for part in parts if part.radial is not None]
     return Obstacles(
         row=np.concatenate([part.row for part in parts]),
         points=points,
@@ -164,7 +158,6 @@ def _merged(parts: Sequence[Obstacles]) -> Obstacles:
         seed=np.concatenate([part.seed for part in parts]),
         cluster=label,
         num_clusters=int(num_clusters),
-        radial=Radial.together(radial) if len(radial) == len(parts) else None,
     )
 
 
@@ -174,8 +167,7 @@ def find_candidates(
     """Return the points above the ground of each sweep, and which of them may move.
 
     A point is a seed if another sweep saw through it. Points close to seeds are candidates too,
-    since a moving object's points are not all seen through. Where radial velocity is measured, the
-    other points that move along their ray form clusters of their own.
+    since a moving object's points are not all seen through.
 
     among: sweeps to work on; None for all.
     """
@@ -192,12 +184,6 @@ def find_candidates(
         gap_m = space.sensors.gap_m(registered.sweep.points[above], registered.sweep.lidar[above])
         close = closer_rings(points - registered.T_world_lidar[:3, 3], gap_m)
         num_clusters, cluster = cluster_around(close, seed)
-        radial = Radial.of(registered)
-        if radial is not None:
-            fast = np.flatnonzero(radial.moving()[above] & (cluster < 0))
-            num_more, more = link(close[fast], LINK_M)
-            seed[fast], cluster[fast] = True, num_clusters + more
-            num_clusters += num_more
         return Candidates(above, seed, cluster, num_clusters)
 
     with ThreadPoolExecutor() as pool:

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from densify.flow.tracking.candidates import Obstacles, Strips, firing_times_s
 from densify.flow.tracking.objects import MovingObject, Shape, Track
-from densify.flow.tracking.radial import Radial
 from densify.free_space.ground import ABOVE_GROUND_M, HeightMap
 from densify.free_space.seen_through import FreeSpace
 from densify.free_space.sensor import Sensors
@@ -163,9 +162,6 @@ def assign_points(
     instances = []
     for i, points, mine in zip(batch, parts, attached, strict=True):
         leave_out_isolated(mine, points, i, objects, space.clock)
-        radial = Radial.of(stretch.sweeps[i])
-        if radial is not None:
-            leave_out_slower(mine, points, radial.rows(points.row), objects)
         instance = np.full(len(stretch.sweeps[i].sweep), -1, np.int32)
         instance[points.row] = mine
         instances.append(instance)
@@ -242,17 +238,6 @@ def leave_out_isolated(
             continue
         away_m, _ = nearest_k(tree_of(seen.points[mine]), seen.points[doubtful], 1 + _NUM_BESIDE)
         instance[doubtful[away_m[:, -1] > _ALONE_GAPS * seen.gap_m[doubtful]]] = -1
-
-
-def leave_out_slower(
-    instance: Instance, seen: SweepPoints, radial: Radial, objects: Sequence[MovingObject]
-) -> None:
-    """Take the points from the objects whose measured radial velocities differ from theirs."""
-    for k in np.unique(instance[instance >= 0]):
-        rows = np.flatnonzero(instance == k)
-        at_s = float(seen.time_s[rows].mean())
-        velocity_m_s = objects[k].track.velocity_m_s(seen.points[rows], at_s)
-        instance[rows[radial.rows(rows).contradicts(velocity_m_s)]] = -1
 
 
 def lengthen(

@@ -15,7 +15,6 @@ import numpy as np
 
 from densify.flow.tracking.candidates import Obstacles
 from densify.flow.tracking.objects import MovingObject, Track
-from densify.flow.tracking.radial import Radial
 from densify.free_space.seen_through import FreeSpace
 from densify.geometry.nearest import is_near, nearest, tree_of
 from densify.geometry.types import Float
@@ -58,8 +57,6 @@ def violations_left(
     seen_s = track.duration_s()
     if seen_s < _LEAST_S or not _is_smooth(track, space, seen_s):
         return None
-    if not _is_as_fast_as_measured(track, obstacles):
-        return None
     static, moved, num_tests = count_violations(track, obstacles, space)
     least = max(min(_LEAST_VIOLATIONS, _SHARE_OF_FEW * num_tests), _LEAST_SHARE * num_tests)
     if static < least or moved > _MAX_LEFT_OF_LIMBS * static:
@@ -88,18 +85,6 @@ def _is_smooth(track: Track, space: FreeSpace, seen_s: float) -> bool:
         _LEAST_WAY_M, _LEAST_WAY_PER_RESIDUAL * residual_m, _LEAST_WAY_PER_ROUGH * rough_m
     )
     return travelled_m >= least_m and residual_m <= rough_m
-
-
-def _is_as_fast_as_measured(track: Track, obstacles: Sequence[Obstacles]) -> bool:
-    """Return True if the motion agrees with the measured radial velocities, where there are any."""
-    parts, velocities = [], []
-    for j, rows in track.claimed.items():
-        radial = obstacles[j].radial
-        if radial is not None:
-            at_s = float(obstacles[j].time_s[rows].mean())
-            parts.append(radial.rows(rows))
-            velocities.append(track.velocity_m_s(obstacles[j].points[rows], at_s))
-    return not parts or Radial.together(parts).agrees(np.concatenate(velocities))
 
 
 def count_violations(

@@ -186,7 +186,7 @@ class _Search:
             velocity = vote(group, n, self._fields, self.clock)
         else:
             velocity = np.median(self.batches[n].gather(self._velocities_m_s)[members], axis=0)
-        return velocity if c.radial is None else c.radial.rows(members).corrected(velocity)
+        return velocity
 
     def _follow(
         self, members: Int, n: int, velocity: Float, weight: float

@@ -30,9 +30,6 @@ class Sweep:
         start at the frame's origin.
     R_scanner_lidar: (S,3,3) turns the lidar frame's axes into each scanner's, z along the one it
         spins about, upwards; None where they are the frame's.
-    radial_velocity_m_s: (N,) float32, away from the scanner, as FMCW lidars measure it, NaN where
-        it was not; as read, relative to the scanner, and after deskewing with the scanner's own
-        motion removed, so that what stands has 0. None for scanners that do not measure it.
     """
 
     frame: int
@@ -44,11 +41,10 @@ class Sweep:
     row: Int
     scanner_origins: Float | None = None
     R_scanner_lidar: Float | None = None
-    radial_velocity_m_s: Float32 | None = None
 
     def __post_init__(self) -> None:
         n = len(self.points)
-        for name in ("intensity", "offset_ns", "lidar", "row", "radial_velocity_m_s"):
+        for name in ("intensity", "offset_ns", "lidar", "row"):
             column = getattr(self, name)
             if column is not None and column.shape != (n,):
                 raise ValueError(f"Sweep.{name}: expected ({n},), got {column.shape}")
@@ -81,9 +77,6 @@ class Sweep:
             offset_ns=None if self.offset_ns is None else self.offset_ns[rows],
             lidar=self.lidar[rows],
             row=self.row[rows],
-            radial_velocity_m_s=(
-                None if self.radial_velocity_m_s is None else self.radial_velocity_m_s[rows]
-            ),
         )
 
     def axes(self, lidar: int) -> Float:
@@ -144,25 +137,6 @@ class RegisteredSweep:
     @property
     def frame(self) -> int:
         return self.sweep.frame
-
-    def rays(self) -> tuple[Float, Float]:
-        """Return unit vectors (N,3) from each scanner at its firing time to the points, and the
-        scanner's velocity (N,3) in m/s then; lidar frame at the reference time."""
-        sweep = self.sweep
-        start = np.zeros((len(sweep), 3))
-        if sweep.scanner_origins is not None:
-            start = sweep.scanner_origins[sweep.lidar]
-        twist = np.broadcast_to((self.twist_before + self.twist_after) / 2, (len(sweep), 6))
-        arm = start
-        if sweep.offset_ns is not None:
-            offset_s = sweep.offset_ns[:, None] * 1e-9
-            twist = np.where(offset_s < 0, self.twist_before, self.twist_after)
-            arm = start + offset_s * np.cross(twist[:, :3], start)
-            start = arm + offset_s * twist[:, 3:]
-        away = sweep.points - start
-        length_m = np.linalg.norm(away, axis=1, keepdims=True)
-        velocity_m_s: Float = twist[:, 3:] + np.cross(twist[:, :3], arm)
-        return away / np.maximum(length_m, 1e-9), velocity_m_s
 
     @staticmethod
     def without_points(trajectory: Trajectory, frame: int) -> RegisteredSweep:

@@ -25,7 +25,6 @@ from densify.readers.point_fields import (
     find_times,
     full_scale,
     points_of,
-    radial_velocities,
     scaled,
     widened,
 )
@@ -34,7 +33,7 @@ from densify.readers.point_files import read_table
 Columns = Mapping[str, NDArray[Any]]
 
 _ASSUMED_PERIOD_NS = 100_000_000
-_NAMED = ("intensity", "time", "lidar", "radial_velocity")
+_NAMED = ("intensity", "time", "lidar")
 _NUM_TRIED = 5  # sweeps, until one can be read
 _RATES_HZ = (5, 10, 15, 20, 25)
 
@@ -84,7 +83,6 @@ class SweepColumns:
             self._offset_ns(path, columns, stamp_ns, valid),
             self._lidar(path, columns, valid),
             self.settings.scanner_origins,
-            radial_velocity_m_s=radial_velocities(columns, fields),
         )
 
     @cached_property

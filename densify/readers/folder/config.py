@@ -176,8 +176,8 @@ class SweepFiles:
 
     files: folder of the sweeps, "" to look for it. columns: of files without names. scale_m:
     metres of a unit of the points. axes: (3,3) turns (or mirrors) stored points to the lidar's
-    frame, x forward, y left, z up; None leaves them. intensity, time, lidar, radial_velocity: which
-    column plays that part, "" to find it by its name. intensity_scale: what is full brightness, 0
+    frame, x forward, y left, z up; None leaves them. intensity, time, lidar: which column
+    plays that part, "" to find it by its name. intensity_scale: what is full brightness, 0
     to find it. time_unit, time_is, reference: see `densify.readers.point_fields.find_times`.
     stamps: ``names`` (of the files) or a file with one time for each sweep, "" to look for them;
     stamps_unit: theirs. rate_hz: of sweeps without stamps, 0 to take it from the points' times.
@@ -196,7 +196,6 @@ class SweepFiles:
     time_is: str = _choice(("relative", "absolute"))
     reference: str = _choice(REFERENCES)
     lidar: str = ""
-    radial_velocity: str = ""
     stamps: str = ""
     stamps_unit: str = _choice(UNIT_NS)
     rate_hz: float = _above_0(0.0)
