@@ -103,11 +103,9 @@ def test_age_is_milliseconds_plus_1_and_0_without_depth(tmp_path):
 
 
 def test_values_that_are_no_depth(tmp_path):
-    path = tmp_path / "a.png"
     for bad in (np.nan, np.inf, -1.0):
-        wrong = np.array([[1, bad]], np.float32)
         with pytest.raises(ValueError, match="finite depths, 0 or more"):
-            write_depth_png(path, wrong)
+            write_depth_png(tmp_path / "a.png", np.array([[1, bad]], np.float32))
     ageless = {n: replace(depth, age_s=None) for n, depth in result_of().depth.items()}
     with pytest.raises(ValueError, match="image_02: expected ages"):
         write_result(replace(result_of(), depth=ageless), tmp_path, config={}, data="street")

@@ -46,7 +46,7 @@ scene/, for pages, viewers and other tools::
 from __future__ import annotations
 
 import platform
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -56,7 +56,7 @@ import numpy as np
 import yaml
 
 from densify import __version__
-from densify.geometry.types import ObjectTrack, Result
+from densify.geometry.types import Result
 from densify.outputs.atomic import write_file
 from densify.outputs.cloud_laz import write_cloud
 from densify.outputs.depth_png import (
@@ -153,21 +153,18 @@ def scores_of(result: Result) -> dict[str, Any]:
 
 def write_tracks(result: Result, context: Context, folder: Path) -> None:
     """Write ``movers.json``, if the result has poses."""
-    if result.T_key_lidar:
-        write_json(folder / "movers.json", tracks_table(result.key, result.tracks))
-
-
-def tracks_table(key: int, tracks: Sequence[ObjectTrack]) -> dict[str, Any]:
-    """Return the content of movers.json."""
+    if not result.T_key_lidar:
+        return
     names = ("stamp_ns", "num_points", "T_key_object", "velocity_m_s")
     objects = []
-    for track in tracks:
+    for track in result.tracks:
         poses = [
             {"frame": frame, **{name: getattr(track, name)[i] for name in names}}
             for i, frame in enumerate(track.frames)
         ]
         objects.append({"instance": track.instance, "size_m": track.size_m, "poses": poses})
-    return {"schema_version": SCHEMA_VERSION, "key": key, "objects": objects}
+    table = {"schema_version": SCHEMA_VERSION, "key": result.key, "objects": objects}
+    write_json(folder / "movers.json", table)
 
 
 def write_run_yaml(result: Result, context: Context, folder: Path) -> None:

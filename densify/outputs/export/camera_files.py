@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from densify.config.errors import InputError
+from densify.config.file_content import read_bytes
 from densify.geometry import poses
 from densify.geometry.types import Camera, CameraView, Float
 from densify.outputs.atomic import write_file
@@ -25,7 +26,6 @@ from densify.outputs.cloud_laz import StoredCloud
 from densify.outputs.depth_png import map_path, metres
 from densify.outputs.export.finished_run import FinishedRun
 from densify.outputs.export.maps_and_clouds import save_ply
-from densify.outputs.key_outputs import tracks_table
 from densify.outputs.plain import write_json
 
 _LENS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
@@ -65,7 +65,7 @@ def write_splats(run: FinishedRun, folder: Path) -> None:
             _save_splats(folder / "movers" / f"{track.instance:04d}.ply", in_object, rgb[own])
     if not tracked.all():
         _save_splats(folder / "movers" / "others.ply", points[~tracked], rgb[~tracked])
-    write_json(folder / "tracks.json", tracks_table(run.key, run.tracks))
+    write_file(folder / "tracks.json", read_bytes(run.folder / "movers.json"))
 
 
 def write_nerfstudio(run: FinishedRun, folder: Path) -> None:
