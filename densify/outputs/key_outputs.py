@@ -47,6 +47,7 @@ from __future__ import annotations
 
 import platform
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -140,15 +141,11 @@ def write_metrics(result: Result, context: Context, folder: Path) -> None:
         "schema_version": SCHEMA_VERSION,
         "key": result.key,
         "method": result.method,
-        **scores_of(result),
-        "baselines": {m: scores_of(baseline) for m, baseline in result.baselines.items()},
+        "frames": result.frames,
+        **result.metrics,
+        "baselines": {m: {"frames": b.frames, **b.metrics} for m, b in result.baselines.items()},
     }
     write_json(folder / "metrics.json", table)
-
-
-def scores_of(result: Result) -> dict[str, Any]:
-    """Return frames and scores of one method."""
-    return {"frames": result.frames, **result.metrics}
 
 
 def write_tracks(result: Result, context: Context, folder: Path) -> None:
@@ -168,9 +165,21 @@ def write_tracks(result: Result, context: Context, folder: Path) -> None:
 
 
 def write_run_yaml(result: Result, context: Context, folder: Path) -> None:
-    """Write ``run.yaml``: data, key, frames, cameras, warnings, configuration, cost of each stage,
-    and versions."""
-    record = {
+    """Write ``run.yaml``, `record`."""
+    text = yaml.safe_dump(plain(record(result, context)), sort_keys=False, allow_unicode=True)
+    write_file(folder / "run.yaml", text.encode())
+
+
+def record(result: Result, context: Context) -> dict[str, Any]:
+    """Return how a result was made: data, key, frames, cameras, warnings, configuration, cost of
+    each stage, and versions. A package that goes by another name, as in system builds, has None."""
+    versions: dict[str, str | None] = {"densify": __version__, "python": platform.python_version()}
+    versions["platform"] = platform.platform()
+    for package in _PACKAGES:
+        versions[package] = None
+        with suppress(PackageNotFoundError):
+            versions[package] = version(package)
+    return {
         "data": context.data,
         "key": result.key,
         "stamp_ns": result.stamp_ns,
@@ -185,39 +194,16 @@ def write_run_yaml(result: Result, context: Context, folder: Path) -> None:
         },
         "warnings": result.warnings,
         "config": context.config,
-        "stages": stages(result),
-        "versions": versions(),
+        "stages": [
+            {
+                "name": cost.name,
+                "seconds": round(cost.seconds, 3),
+                "peak_memory_mb": round(cost.peak_memory_mb, 1),
+            }
+            for cost in result.costs
+        ],
+        "versions": versions,
     }
-    text = yaml.safe_dump(plain(record), sort_keys=False, allow_unicode=True)
-    write_file(folder / "run.yaml", text.encode())
-
-
-def stages(result: Result) -> list[dict[str, Any]]:
-    """Return name, seconds and peak_memory_mb of each stage."""
-    return [
-        {
-            "name": cost.name,
-            "seconds": round(cost.seconds, 3),
-            "peak_memory_mb": round(cost.peak_memory_mb, 1),
-        }
-        for cost in result.costs
-    ]
-
-
-def versions() -> dict[str, str | None]:
-    """Return the versions of densify, Python, the platform and the packages that results depend
-    on. A package that goes by another name, as in system builds, has None."""
-    found: dict[str, str | None] = {
-        "densify": __version__,
-        "python": platform.python_version(),
-        "platform": platform.platform(),
-    }
-    for package in _PACKAGES:
-        try:
-            found[package] = version(package)
-        except PackageNotFoundError:
-            found[package] = None
-    return found
 
 
 def write_scene(result: Result, context: Context, folder: Path) -> None:

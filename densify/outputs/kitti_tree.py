@@ -146,12 +146,10 @@ most certain, 0 is no depth. It ranks pixels and is no probability: (value - 1) 
 All maps show the moment in which their own image was exposed (the middle of the sweep, where the
 settings say "at: sweep"). velodyne_raw is densify's own projection and differs from KITTI's files.
 
-Images are not copied; they are those of the recordings. dataset.json says which recordings these
-are, and has the cameras' calibration. manifest.jsonl (or manifest-1of4.jsonl and so on) has one
-line for every key: whether it is here, is missing and why, and size and SHA-256 of its files.
-
-The maps are made from the recordings, whose licences go on holding for them. KITTI is CC BY-NC-SA
-3.0: name its authors, no commercial use, share alike.
+The images stay with the recordings, whose licences go on holding for the maps. KITTI is CC BY-NC-SA
+3.0: name its authors, no commercial use, share alike. dataset.json says which recordings these are,
+and has the cameras' calibration. manifest.jsonl (or manifest-1of4.jsonl and so on) has one line for
+every key: whether it is here, is missing and why, and size and SHA-256 of its files.
 
 Settings:
 

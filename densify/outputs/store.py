@@ -124,13 +124,9 @@ def write_comparison(
     key, context = last.key, Context(config, data)
     table = {
         "schema_version": key_outputs.SCHEMA_VERSION,
-        "key": key,
-        "data": data,
-        "methods": {method: key_outputs.scores_of(result) for method, result in results.items()},
-        "config": config,
-        "stages": key_outputs.stages(last),
+        **key_outputs.record(last, context),
+        "methods": {m: {"frames": r.frames, **r.metrics} for m, r in results.items()},
         "warnings": list(dict.fromkeys(w for r in results.values() for w in r.warnings)),
-        "versions": key_outputs.versions(),
     }
     with writing(_key_folder(out, key), _COMPARISON, out, overwrite) as folder:
         write_json(folder / "compare.json", table)

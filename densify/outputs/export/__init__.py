@@ -98,15 +98,13 @@ def export_run(
 
 def facts(export: Export) -> dict[str, Any]:
     """Return density and num_points as plain mappings, without those that are not known."""
-    known: dict[str, Any] = {}
-    if export.density:
-        known["density"] = {
-            camera: {product: kept._asdict() for product, kept in products.items()}
-            for camera, products in export.density.items()
-        }
-    if export.num_points is not None:
-        known["num_points"] = export.num_points._asdict()
-    return known
+    density = {
+        camera: {product: kept._asdict() for product, kept in products.items()}
+        for camera, products in export.density.items()
+    }
+    num_points = export.num_points and export.num_points._asdict()
+    known = {"density": density, "num_points": num_points}
+    return {name: value for name, value in known.items() if value}
 
 
 def _total(runs: Sequence[FinishedRun]) -> Kept | None:

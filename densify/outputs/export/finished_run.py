@@ -61,10 +61,9 @@ class FinishedRun:
             record = read_yaml(path)[0]
             self.key, self.stamp_ns = int(record["key"]), int(record["stamp_ns"])
             self.data = str(record["data"])
-        self.folder = folder
+        self.folder, self._chosen = folder, cameras
         self._min_confidence = stored_confidence(min_confidence)
         self._max_age = stored_age(np.inf if max_age_ms is None else max_age_ms / 1000)
-        self._chosen = cameras
         self.density: dict[str, dict[str, Kept]] = {}
         self.num_points: Kept | None = None
 
