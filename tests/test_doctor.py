@@ -39,7 +39,7 @@ def good(street: Faulty) -> Sample:
 
 
 def findings(sample: Sample) -> dict[str, Verdict]:
-    return {f.check: f.verdict for check in CHECKS for f in check(sample, CONFIG)}
+    return {f.check: f.verdict for check in CHECKS for f in check(sample)}
 
 
 def with_fault(good: Sample, street: Faulty, **changes) -> Sample:
@@ -73,7 +73,7 @@ WHO_NAMES = {
     "stamps": clocks.check_stamps,
     "point times": clocks.check_point_times,
     "intensity": points.check_intensity,
-    "scanner 0": lambda sample: points.check_sensors(sample, CONFIG.register),
+    "scanner 0": points.check_sensors,
     "calibration": cameras.check_cameras,
     "images": cameras.check_cameras,
 }
@@ -125,11 +125,11 @@ def test_the_clock_of_a_camera_is_measured(good: Sample) -> None:
     pairs, broken = cameras.image_pairs(good, camera)
     assert not broken and len(pairs) == 2
     late_s = np.arange(-0.2, 0.21, 0.05)
-    scores = [cameras.score(camera, pairs, t) for t in late_s]
+    scores = [cameras.score(camera, pairs, t)[0] for t in late_s]
     assert abs(late_s[int(np.argmax(scores))]) < 0.06
     assert max(scores) > 5 * abs(scores[-1]) or max(scores) > scores[-1] + 3
     shifted = [replace(p, exposed_s=p.exposed_s + 0.15) for p in pairs]
-    again = [cameras.score(camera, shifted, t) for t in late_s]
+    again = [cameras.score(camera, shifted, t)[0] for t in late_s]
     assert abs(late_s[int(np.argmax(again))] + 0.15) < 0.06
 
 
@@ -140,10 +140,10 @@ def with_points(sweep: Sweep, points: np.ndarray) -> Sweep:
 def test_own_vehicle_is_what_stays_beside_it(good: Sample) -> None:
     hood = np.random.default_rng(0).uniform([3.6, -0.5, -0.4], [3.9, 0.5, -0.3], (400, 3))
     sample = with_sweeps(good, lambda sweep: with_points(sweep, hood))
-    (found,) = points.check_own_vehicle(sample, CONFIG.register)
+    (found,) = points.check_own_vehicle(sample)
     assert found.verdict == Verdict.SUSPICIOUS
     assert found.remedy in ("--set register.min_range_m=3.9", "--set register.min_range_m=4.0")
-    (before,) = points.check_own_vehicle(good, CONFIG.register)
+    (before,) = points.check_own_vehicle(good)
     assert before.verdict == Verdict.FINE
 
 
@@ -152,14 +152,14 @@ def test_returns_of_the_own_vehicle_are_no_rings(good: Sample) -> None:
     roof = np.stack([np.cos(turn) * np.cos(down), np.sin(turn) * np.cos(down), np.sin(down)], 1)
 
     for sample in (good, with_sweeps(good, lambda sweep: with_points(sweep, roof))):
-        (found,) = points.check_sensors(sample, CONFIG.register)
+        (found,) = points.check_sensors(sample)
         assert "16 rings, -15.0 to 15.0 deg up" in found.evidence
 
 
 def test_a_sweep_that_cannot_be_read_is_named_and_the_rest_looked_at(street: Faulty) -> None:
     broken = Faulty(street, frames=range(112, 117), unreadable=[114])
     sample = Sample.of(broken, CONFIG.register)
-    (found,) = (f for check in CHECKS[:1] for f in check(sample, CONFIG))
+    (found,) = (f for check in CHECKS[:1] for f in check(sample))
     assert found.verdict == Verdict.WRONG
     assert "frame 114" in found.evidence and "truncated" in found.evidence
     with pytest.raises(InputError, match="no sweep can be read"):

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from densify.config.errors import InputError
-from densify.doctor.findings import Finding, fine, suspicious, unknown, wrong
+from densify.doctor.findings import FINE, SUSPICIOUS, UNKNOWN, WRONG, Finding, finding
 from densify.doctor.sample import Sample, Spot
 from densify.geometry import poses
 from densify.geometry.cameras import image_points
@@ -56,59 +56,51 @@ class Pair:
     number: int
 
     def seen_at(self, later_s: float) -> Float:
-        """(N,3) in the lidar frame at the exposure and ``later_s``."""
+        """Return (N,3) in the lidar frame at the exposure and ``later_s``."""
         return poses.transform(
             poses.inverse(poses.exp((self.exposed_s + later_s) * self.twist)), self.points
         )
 
 
 def check_cameras(sample: Sample) -> list[Finding]:
-    """Every camera of the recording."""
+    """Check the images, the calibration and the clock of every camera."""
     if not sample.sequence.cameras:
-        return [fine("cameras", "none: the cloud and the scores alone")]
+        return [finding("cameras", FINE, "none: the cloud and the scores alone")]
     findings = []
     for camera in sample.sequence.cameras.values():
-        findings += _check_images(sample, camera)
+        findings.append(_check_images(sample, camera))
         pairs, broken = image_pairs(sample, camera)
         if broken:
             remedy = "fetch the image again, or give size and calibration of images like it"
-            findings.append(wrong(f"{camera.name}: images", broken, remedy))
+            findings.append(finding(f"{camera.name}: images", WRONG, broken, remedy))
         if pairs:
             findings += _check_calibration(camera, pairs)
     return findings
 
 
-def _check_images(sample: Sample, camera: Camera) -> list[Finding]:
-    name, period_ns = f"{camera.name}: images", sample.timeline.period_ns
+def _check_images(sample: Sample, camera: Camera) -> Finding:
+    name, timeline = f"{camera.name}: images", sample.timeline
     exposed_ns = np.array(sorted(sample.sequence.image_stamps_ns(camera.name).values()), np.int64)
     if not len(exposed_ns):
-        return [
-            suspicious(
-                name,
-                "not a single image",
-                f"leave the camera out (--camera with the others), or fetch {camera.name}",
-            )
-        ]
-    stamp_ns = sample.timeline.stamp_ns
-    after = np.clip(np.searchsorted(exposed_ns, stamp_ns), 1, len(exposed_ns)) - 1
-    nearest = np.minimum(
-        np.abs(exposed_ns[after] - stamp_ns),
-        np.abs(exposed_ns[np.minimum(after + 1, len(exposed_ns) - 1)] - stamp_ns),
-    )
-    without = [f for f, ns in zip(sample.timeline.frames, nearest, strict=True) if ns > period_ns]
+        remedy = f"leave the camera out (--camera with the others), or fetch {camera.name}"
+        return finding(name, SUSPICIOUS, "not a single image", remedy)
+    images = cKDTree(exposed_ns[:, None] - exposed_ns[0])
+    nearest = np.asarray(images.query(timeline.stamp_ns[:, None] - exposed_ns[0])[0])
+    without = [f for f, ns in zip(timeline.frames, nearest, strict=True) if ns > timeline.period_ns]
     apart_ms = float(np.median(nearest)) * 1e-6
-    values = {"num_images": len(exposed_ns), "num_without": len(without), "apart_ms": apart_ms}
     text = f"{len(exposed_ns)}, usually {apart_ms:.1f} ms from a sweep's reference time"
-    if not without:
-        return [fine(name, text, **values)]
-    text += f"; {len(without)} sweeps have none within a period: {format_frames(without)}"
-    if len(without) == len(stamp_ns):
-        return [wrong(name, text, "put sweeps and images on one clock", **values)]
-    return [suspicious(name, text, "choose other keys than these", **values)]
+    verdict, remedy = FINE, "choose other keys than these"
+    if without:
+        verdict = SUSPICIOUS
+        text += f"; {len(without)} sweeps have none within a period: {format_frames(without)}"
+    if len(without) == len(timeline.frames):
+        verdict, remedy = WRONG, "put sweeps and images on one clock"
+    values = {"num_images": len(exposed_ns), "num_without": len(without), "apart_ms": apart_ms}
+    return finding(name, verdict, text, remedy, **values)
 
 
 def image_pairs(sample: Sample, camera: Camera) -> tuple[list[Pair], str]:
-    """A sweep of each registered spot and its nearest image; and why an image cannot be read."""
+    """Return a sweep of each registered spot with its nearest image; and why one cannot be read."""
     exposed_ns = sample.sequence.image_stamps_ns(camera.name)
     pairs: list[Pair] = []
     for spot in sample.registered:
@@ -150,8 +142,10 @@ def _pair(
 
 
 def depth_edges(points: Float) -> Bool:
-    """(N,3) points of one scanner, from where it stands -> (N,) whether something much farther is
-    seen right beside the point."""
+    """Return (N,) True where something much farther is seen right beside the point.
+
+    points: (N,3) of one scanner, from where it stands.
+    """
     x, y, z = points.T
     range_m = np.linalg.norm(points, axis=1)
     seen = np.column_stack([np.arctan2(y, x), _STEEPLY * np.arcsin(z / range_m)])
@@ -164,7 +158,7 @@ def depth_edges(points: Float) -> Bool:
 
 
 def edge_strength(image: NDArray[np.uint8], focal_px: float) -> Float32:
-    """(H,W,3) -> (H,W): the gradient's size against that around, at most 4."""
+    """Return (H,W) the gradient's size against that around, at most 4, of an image (H,W,3)."""
     scale = focal_px / _FOCAL_PX
     gray = cv2.GaussianBlur(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), (0, 0), max(0.8, scale))
     x, y = (cv2.Sobel(gray, cv2.CV_32F, *order) for order in ((1, 0), (0, 1)))
@@ -174,35 +168,29 @@ def edge_strength(image: NDArray[np.uint8], focal_px: float) -> Float32:
     return strength
 
 
-def score(camera: Camera, pairs: list[Pair], later_s: float = 0.0) -> float:
-    """Standard errors by which the image is edged where depth is, over all pairs; 0 where too few
-    points are seen. later_s: what the images' clock is late."""
-    return _score(camera, [(p, *_on_image(camera, p, later_s)) for p in pairs], 0.0)
+def score(
+    camera: Camera, pairs: list[Pair], later_s: float = 0.0, right_px: float = 0.0
+) -> tuple[float, int]:
+    """Return the standard errors by which the image is edged where depth is, over all pairs, 0
+    where too few points are seen; and the number of edges of depth in the images.
 
-
-def _on_image(camera: Camera, pair: Pair, later_s: float) -> tuple[Float, Bool]:
-    """(n,2) pixels of the points that are seen, and which of them are edges."""
-    uv, seen = image_points(camera, poses.transform(camera.T_cam_lidar, pair.seen_at(later_s)))
-    return uv[seen], pair.edge[seen]
-
-
-def _num_edges(camera: Camera, pairs: list[Pair]) -> int:
-    """Edges of depth that are seen in the images."""
-    return sum(int(_on_image(camera, pair, 0.0)[1].sum()) for pair in pairs)
-
-
-def _score(camera: Camera, seen: list[tuple[Pair, Float, Bool]], right_px: float) -> float:
-    on, off = [], []
-    for pair, uv, edge in seen:
-        column, line = np.rint(uv + (right_px, 0.0)).astype(np.int64).T
-        inside = (column >= 0) & (column < camera.width_px)
+    later_s: what the images' clock is late. right_px: what the depth is moved in the images.
+    """
+    on, off, num_edges = [], [], 0
+    for pair in pairs:
+        points = poses.transform(camera.T_cam_lidar, pair.seen_at(later_s))
+        uv, seen = image_points(camera, points)
+        column, line = np.rint(uv[seen] + (right_px, 0.0)).astype(np.int64).T
+        inside, edge = (column >= 0) & (column < camera.width_px), pair.edge[seen]
+        num_edges += int(edge.sum())
         value = pair.strength[line[inside], column[inside]]
         on.append(value[edge[inside]])
         off.append(value[~edge[inside]])
     edged, other = np.concatenate(on), np.concatenate(off)
     if min(len(edged), len(other)) < _LEAST_SEEN:
-        return 0.0
-    return float((edged.mean() - other.mean()) / (other.std() / np.sqrt(len(edged)) + 1e-9))
+        return 0.0, num_edges
+    error = other.std() / np.sqrt(len(edged)) + 1e-9
+    return float((edged.mean() - other.mean()) / error), num_edges
 
 
 def alternatives(camera: Camera) -> Iterator[tuple[str, Camera]]:
@@ -223,93 +211,69 @@ def alternatives(camera: Camera) -> Iterator[tuple[str, Camera]]:
 
 
 def _check_calibration(camera: Camera, pairs: list[Pair]) -> list[Finding]:
-    """The calibration and the clock as given against others, the best of which explains most."""
-    given, num_given = score(camera, pairs), _num_edges(camera, pairs)
-    others = {
-        what: score(other, pairs) if _num_edges(other, pairs) > _AS_MANY * num_given else 0.0
-        for what, other in alternatives(camera)
-    }
-    other = max(others, key=lambda what: others[what])
-    shift_deg, at_shift = _best_shift(camera, pairs)
-    clock = _clock(camera, pairs)
-    at_clock = 0.0 if clock is None else clock.best
-    values = {"given": given, "best_other": others[other], "shift_deg": shift_deg}
-    values |= {"at_shift": at_shift, "at_clock": at_clock}
-    text = f"depth edges lie on image edges by {given:.1f} standard errors as given"
-    most = max(others[other], at_shift, at_clock)
-    name, clearly = f"{camera.name}: calibration", max(_CLEAR, _CLEARLY * given)
+    """Compare the calibration and the clock as given with others; the best of all explains most."""
+    given, num_given = score(camera, pairs)
+    name, text = f"{camera.name}: calibration", f"depth edges lie on image edges by {given:.1f}"
+    text += " standard errors as given"
     if len(pairs) < _LEAST_PAIRS:
-        return [_one_image(name, text, given, values)]
-    late = clock is not None and at_clock == most and clock.is_off and most > clearly
-    if others[other] == most > clearly:
-        text += f", by {most:.1f} with {other}"
-        finding = wrong(name, text, "correct T_cam_lidar", **values)
+        is_clear = given >= _CLEAR
+        text += ": one image is too little to tell" * (not is_clear)
+        return [finding(name, FINE if is_clear else UNKNOWN, text, given=given)]
+    others = {}
+    for what, mended in alternatives(camera):
+        at_mended, num_edges = score(mended, pairs)
+        others[what] = at_mended if num_edges > _AS_MANY * num_given else 0.0
+    best = max(others, key=lambda what: others[what])
+    # Edges of depth between returns of one ring are upright: up and down cannot be told as well.
+    shifts_deg = np.arange(-_SHIFT_DEG, _SHIFT_DEG + 1e-9, _SHIFT_STEP_DEG)
+    px_per_deg = camera.focal_px * np.pi / 180
+    at_shifts = [score(camera, pairs, 0.0, shift * px_per_deg)[0] for shift in shifts_deg]
+    row = int(np.argmax(at_shifts))
+    shift_deg, at_shift = float(shifts_deg[row]), at_shifts[row]
+    at_clock, clock = _check_clock(
+        camera, pairs, max(_CLEAR, _CLEARLY * given, *others.values(), at_shift)
+    )
+    most, clearly = max(others[best], at_shift, at_clock), max(_CLEAR, _CLEARLY * given)
+    verdict, remedy = SUSPICIOUS, "correct T_cam_lidar or K"
+    if others[best] == most > clearly:
+        verdict, remedy = WRONG, "correct T_cam_lidar"
+        text += f", by {most:.1f} with {best}"
     elif at_shift == most > clearly and abs(shift_deg) > _OFF_DEG:
         side = "right" if shift_deg > 0 else "left"
         text += f", by {most:.1f} if they were {abs(shift_deg):.1f} deg farther to the {side}"
-        remedy = "correct T_cam_lidar or K"
-        finding = suspicious(name, text, remedy, **values)
     elif most < _CLEAR:
+        remedy = "check T_cam_lidar, K and the clocks"
         text += f", and nowhere around by more than {most:.1f}: images and sweeps do not show the"
         text += " same, or too little"
-        remedy = "check T_cam_lidar, K and the clocks"
-        finding = suspicious(name, text, remedy, **values)
     else:
+        verdict = FINE
         text += f", by {at_shift:.1f} {abs(shift_deg):.1f} deg beside"
-        finding = fine(name, text, **values)
-    if clock is None:
-        return [finding]
-    name = f"{camera.name}: clock"
-    text = (
-        f"depth and image fit best {clock.late_s * 1e3:+.0f} ms ({clock.low_s * 1e3:+.0f} to "
-        f"{clock.high_s * 1e3:+.0f}) after the image's stamp"
-    )
-    if not late:
-        return [finding, fine(name, text, **vars(clock))]
-    remedy = f"shift the stamps of {camera.name} by {clock.late_s * 1e3:+.0f} ms"
-    return [finding, suspicious(name, text, remedy, **vars(clock))]
+    values = {"given": given, "best_other": others[best], "shift_deg": shift_deg}
+    values |= {"at_shift": at_shift, "at_clock": at_clock}
+    return [finding(name, verdict, text, remedy, **values), *clock]
 
 
-def _one_image(name: str, text: str, given: float, values: dict[str, float]) -> Finding:
-    if given >= _CLEAR:
-        return fine(name, text, **values)
-    return unknown(name, f"{text}: one image is too little to tell", **values)
+def _check_clock(camera: Camera, pairs: list[Pair], clearly: float) -> tuple[float, list[Finding]]:
+    """Measure the difference between the clocks of camera and lidar; nothing where the vehicle is
+    too slow, or too few images are there, to tell.
 
-
-def _best_shift(camera: Camera, pairs: list[Pair]) -> tuple[float, float]:
-    """The degrees to the right by which the depth edges fit best, and the score there. Edges of
-    depth between returns of one ring are upright, so that up and down cannot be told as well."""
-    seen = [(p, *_on_image(camera, p, 0.0)) for p in pairs]
-    shifts_deg = np.arange(-_SHIFT_DEG, _SHIFT_DEG + 1e-9, _SHIFT_STEP_DEG)
-    px_per_deg = camera.focal_px * np.pi / 180
-    scores = [_score(camera, seen, shift * px_per_deg) for shift in shifts_deg]
-    row = int(np.argmax(scores))
-    return float(shifts_deg[row]), scores[row]
-
-
-@dataclass(frozen=True)
-class _Clock:
-    """late_s: after an image's stamp depth and image fit best; low_s, high_s: hardly worse between.
-    best: the score there."""
-
-    late_s: float
-    low_s: float
-    high_s: float
-    best: float
-
-    @property
-    def is_off(self) -> bool:
-        return self.low_s > _CLOCK_OFF_S or self.high_s < -_CLOCK_OFF_S
-
-
-def _clock(camera: Camera, pairs: list[Pair]) -> _Clock | None:
-    """The difference between the clocks of camera and lidar; None where the vehicle is too slow, or
-    too few images are there, to tell."""
+    clearly: the score that the best clock must have to be said to be off. Returns the score with
+    the best clock, 0 where there is none, and the finding.
+    """
     moving = [p for p in pairs if np.linalg.norm(p.twist[3:]) > _LEAST_SPEED_M_S]
     if len(moving) < _LEAST_PAIRS:
-        return None
-    late_s = np.arange(-_CLOCK_S, _CLOCK_S + 1e-9, _CLOCK_STEP_S)
-    scores = np.array([score(camera, moving, later_s=t) for t in late_s])
+        return 0.0, []
+    times_s = np.arange(-_CLOCK_S, _CLOCK_S + 1e-9, _CLOCK_STEP_S)
+    scores = np.array([score(camera, moving, later_s=t)[0] for t in times_s])
     best = float(scores.max())
-    good = late_s[scores > best - max(1.0, 0.05 * best)]
-    return _Clock(float(late_s[np.argmax(scores)]), float(good.min()), float(good.max()), best)
+    good = times_s[scores > best - max(1.0, 0.05 * best)]
+    late_s, low_s, high_s = (float(t) for t in (times_s[np.argmax(scores)], good.min(), good.max()))
+    text = (
+        f"depth and image fit best {late_s * 1e3:+.0f} ms ({low_s * 1e3:+.0f} to "
+        f"{high_s * 1e3:+.0f}) after the image's stamp"
+    )
+    is_off = best > clearly and (low_s > _CLOCK_OFF_S or high_s < -_CLOCK_OFF_S)
+    verdict = SUSPICIOUS if is_off else FINE
+    remedy = f"shift the stamps of {camera.name} by {late_s * 1e3:+.0f} ms"
+    values = {"late_s": late_s, "low_s": low_s, "high_s": high_s, "best": best}
+    return best, [finding(f"{camera.name}: clock", verdict, text, remedy, **values)]

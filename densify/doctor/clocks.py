@@ -8,8 +8,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial import cKDTree
 
-from densify.config import RegisterSettings
-from densify.doctor.findings import Finding, fine, suspicious, unknown, wrong
+from densify.doctor.findings import FINE, SUSPICIOUS, UNKNOWN, WRONG, Finding, finding
 from densify.doctor.sample import Sample, Spot, spot_of
 from densify.geometry import poses
 from densify.geometry.types import Float, Sweep
@@ -35,172 +34,123 @@ _WHOLE_SWEEP = (0.5, 1.5)  # of a period: from the first to the last point
 
 
 def check_stamps(sample: Sample) -> list[Finding]:
-    """The sweeps' reference times."""
+    """Check the sweeps' reference times: order, rate and holes."""
     timeline = sample.timeline
+    frames, step_ns = timeline.frames, np.diff(timeline.stamp_ns)
     if timeline.unknown:
         frame, reason = next(iter(timeline.unknown.items()))
-        return [
-            wrong(
-                "stamps",
-                f"{len(timeline.unknown)} of {len(timeline.frames)} sweeps have no stamp that can "
-                f"be right, the first of them frame {frame} ({reason})",
-                "correct the stamps of these sweeps, or remove their files",
-            )
-        ]
-    if len(timeline.frames) < 2:
-        return [unknown("stamps", "one sweep tells no rate")]
-    step_ns = np.diff(timeline.stamp_ns)
+        text = (
+            f"{len(timeline.unknown)} of {len(frames)} sweeps have no stamp that can be right, the "
+            f"first of them frame {frame} ({reason})"
+        )
+        remedy = "correct the stamps of these sweeps, or remove their files"
+        return [finding("stamps", WRONG, text, remedy)]
+    if len(frames) < 2:
+        return [finding("stamps", UNKNOWN, "one sweep tells no rate")]
     backward = np.flatnonzero(step_ns <= 0)
     if len(backward):
         row = int(backward[0])
-        pair = timeline.frames[row], timeline.frames[row + 1]
-        what = "the same as" if step_ns[row] == 0 else f"{-step_ns[row] * 1e-6:.1f} ms before"
-        return [
-            wrong(
-                "stamps",
-                f"{len(backward)} of {len(step_ns)} steps do not go on in time; the first: the "
-                f"stamp of frame {pair[1]} is {what} that of frame {pair[0]}",
-                "sort the sweeps by their stamps, or correct the file of stamps",
-                num_backward=len(backward),
-            )
-        ]
-    return [_rate(sample), *_holes(sample)]
-
-
-def _rate(sample: Sample) -> Finding:
-    period_s = sample.timeline.period_ns * 1e-9
-    values = {"period_s": period_s}
-    if _PERIODS_S[0] <= period_s <= _PERIODS_S[1]:
-        return fine("stamps", f"{1 / period_s:.2f} Hz, ascending", **values)
-    fits = [name for name, f in _UNITS.items() if _PERIODS_S[0] <= period_s * f <= _PERIODS_S[1]]
-    guess = f"; it would be {1 / (period_s * _UNITS[fits[0]]):.1f} Hz with {fits[0]}" * bool(fits)
-    verdict = wrong if fits else suspicious
-    return verdict(
-        "stamps",
-        f"from sweep to sweep {period_s:.3g} s pass, expected {_PERIODS_S[0]} to "
-        f"{_PERIODS_S[1]} s{guess}",
-        "correct the unit of the stamps",
-        **values,
-    )
-
-
-def _holes(sample: Sample) -> list[Finding]:
-    timeline = sample.timeline
-    step_ns = np.diff(timeline.stamp_ns)
-    rows = np.flatnonzero(step_ns > _HOLE_PERIODS * timeline.period_ns)
-    if not len(rows):
-        return []
-    longest = int(rows[np.argmax(step_ns[rows])])
-    return [
-        suspicious(
-            "holes in time",
-            f"{len(rows)} of more than three periods, the longest of {step_ns[longest] * 1e-9:.1f} "
-            f"s after frame {timeline.frames[longest]}; windows end there (after frames "
-            f"{format_frames(timeline.frames[row] for row in rows)})",
-            "nothing, if the sweeps were never recorded; else fetch them again",
-            num_holes=len(rows),
+        text = (
+            f"{len(backward)} of {len(step_ns)} steps do not go on in time; the first: the stamp "
+            f"of frame {frames[row + 1]} is {-step_ns[row] * 1e-6:.1f} ms before that of frame "
+            f"{frames[row]}"
         )
-    ]
+        remedy = "sort the sweeps by their stamps, or correct the file of stamps"
+        return [finding("stamps", WRONG, text, remedy, num_backward=len(backward))]
+    findings = [_rate(timeline.period_ns * 1e-9)]
+    rows = np.flatnonzero(step_ns > _HOLE_PERIODS * timeline.period_ns)
+    if len(rows):
+        longest = int(rows[np.argmax(step_ns[rows])])
+        text = (
+            f"{len(rows)} of more than three periods, the longest of {step_ns[longest] * 1e-9:.1f} "
+            f"s after frame {frames[longest]}; windows end there (after frames "
+            f"{format_frames(frames[row] for row in rows)})"
+        )
+        remedy = "nothing, if the sweeps were never recorded; else fetch them again"
+        findings.append(finding("holes in time", SUSPICIOUS, text, remedy, num_holes=len(rows)))
+    return findings
+
+
+def _rate(period_s: float) -> Finding:
+    least_s, most_s = _PERIODS_S
+    if least_s <= period_s <= most_s:
+        return finding("stamps", FINE, f"{1 / period_s:.2f} Hz, ascending", period_s=period_s)
+    text = f"from sweep to sweep {period_s:.3g} s pass, expected {least_s} to {most_s} s"
+    fits = [name for name, f in _UNITS.items() if least_s <= period_s * f <= most_s]
+    if fits:
+        text += f"; it would be {1 / (period_s * _UNITS[fits[0]]):.1f} Hz with {fits[0]}"
+    verdict = WRONG if fits else SUSPICIOUS
+    return finding("stamps", verdict, text, "correct the unit of the stamps", period_s=period_s)
 
 
 def check_point_times(sample: Sample) -> list[Finding]:
-    """The firing times within a sweep."""
-    speed_m_s = max((spot.speed_m_s for spot in sample.spots), default=0.0)
+    """Check how much of a period the firing times within a sweep span; none if there are none."""
+    findings, sweeps = [], [spot.sweeps[spot.middle] for spot in sample.spots]
     period_s = sample.timeline.period_ns * 1e-9
-    findings = []
-    sweeps = [spot.sweeps[spot.middle] for spot in sample.spots]
-    if len(sample.timeline.frames) < 2:
+    if len(sample.timeline.frames) < 2 or any(s.offset_ns is None for s in sweeps):
         return []
-    if any(s.offset_ns is None for s in sweeps):
-        return []  # `check_rings` says if they are needed
-    for lidar in sorted({int(n) for s in sweeps for n in np.unique(s.lidar)}):
-        low_s, high_s = _span_s(sample, lidar)
-        span = (high_s - low_s) / period_s
-        where = -low_s / max(high_s - low_s, 1e-12)
-        name = "point times" if lidar == 0 else f"point times of scanner {lidar}"
-        values = {"first_s": low_s, "last_s": high_s, "speed_m_s": speed_m_s}
+    for lidar in sample.lidars:
+        offsets_s = [
+            s.offset_ns[s.lidar == lidar] * 1e-9 for s in sweeps if s.offset_ns is not None
+        ]
+        ends_s = [np.percentile(offset_s, [0.1, 99.9]) for offset_s in offsets_s if len(offset_s)]
+        low_s, high_s = np.median(ends_s, axis=0).tolist()
+        span, where = (high_s - low_s) / period_s, -low_s / max(high_s - low_s, 1e-12)
         text = (
             f"{low_s * 1e3:+.1f} to {high_s * 1e3:+.1f} ms around the stamp, {span:.3g} periods; "
             f"the stamp is at {round(100 * where)} % of the sweep"
         )
+        verdict, remedy = SUSPICIOUS, "compare the point times with the scanner's rate"
         if _WHOLE_SWEEP[0] <= span <= _WHOLE_SWEEP[1]:
-            finding = fine(name, text, **values)
+            verdict = FINE
         elif span < 0.02 or span > 10:
-            finding = wrong(name, text, "correct the unit of the point times", **values)
-        else:
-            remedy = "compare the point times with the scanner's rate"
-            finding = suspicious(name, text, remedy, **values)
-        findings.append(finding)
+            verdict, remedy = WRONG, "correct the unit of the point times"
+        name = "point times" + f" of scanner {lidar}" * (lidar > 0)
+        findings.append(finding(name, verdict, text, remedy, first_s=low_s, last_s=high_s))
     return findings
 
 
-def _span_s(sample: Sample, lidar: int) -> tuple[float, float]:
-    """The earliest and the latest time of one scanner, medians over the spots."""
-    ends = []
-    for spot in sample.spots:
-        sweep = spot.sweeps[spot.middle]
-        if sweep.offset_ns is not None and (mine := sweep.lidar == lidar).any():
-            ends.append(np.percentile(sweep.offset_ns[mine], [0.1, 99.9]) * 1e-9)
-    low_s, high_s = np.median(ends, axis=0)
-    return float(low_s), float(high_s)
-
-
-def check_deskewing(sample: Sample, settings: RegisterSettings) -> list[Finding]:
+def check_deskewing(sample: Sample) -> list[Finding]:
     """Compare the alignment of sweeps with the point times given, reversed and left out."""
     spot = sample.fastest
     if spot is None or spot.sweeps[0].offset_ns is None:
         return []
     if spot.speed_m_s < _LEAST_SPEED_M_S:
-        text = (
-            f"the vehicle drives at {spot.speed_m_s:.1f} m/s where it was looked at, "
-            f"{_LEAST_SPEED_M_S:g} are needed"
-        )
-        return [unknown("deskewing", text)]
-    given_m = apart_m(spot)
-    others = {
-        "with the times reversed": apart_m(_changed(spot, -1, settings)),
-        "without times": apart_m(_changed(spot, 0, settings)),
-    }
-    best = min(others, key=lambda name: others[name])
-    values = {"given_m": given_m, "reversed_m": others["with the times reversed"]}
-    values |= {"without_m": others["without times"]}
+        return [finding("deskewing", UNKNOWN, spot.too_slow(_LEAST_SPEED_M_S))]
+
+    def with_times(sign: int) -> Spot:
+        def changed(sweep: Sweep) -> Sweep:
+            if sweep.offset_ns is None or sign == 0:
+                return replace(sweep, offset_ns=None)
+            return replace(sweep, offset_ns=sign * sweep.offset_ns)
+
+        return spot_of(tuple(map(changed, spot.sweeps)), sample.settings)
+
+    given_m, reversed_m, without_m = map(_apart_m, (spot, with_times(-1), with_times(0)))
+    values = {"given_m": given_m, "reversed_m": reversed_m, "without_m": without_m}
     text = (
         f"sweeps {len(spot.sweeps) - 1} apart lie {given_m * 100:.1f} cm from each other with the "
-        f"point times as given, " + ", ".join(f"{m * 100:.1f} cm {n}" for n, m in others.items())
+        f"point times as given, {reversed_m * 100:.1f} cm with the times reversed, "
+        f"{without_m * 100:.1f} cm without times"
     )
-    if others[best] * _CLEARLY < given_m:
-        return [
-            wrong(
-                "deskewing",
-                f"{text}: best {best}",
-                "correct the sign of the point times, or --set register.deskew=false",
-                **values,
-            )
-        ]
-    if given_m * _TOLD < min(others.values()):
-        return [fine("deskewing", text, **values)]
-    return [unknown("deskewing", f"{text}: too slow here to tell", **values)]
+    verdict, remedy = FINE, "correct the sign of the point times, or --set register.deskew=false"
+    if min(reversed_m, without_m) * _CLEARLY < given_m:
+        verdict = WRONG
+    elif given_m * _TOLD >= min(reversed_m, without_m):
+        verdict, text = UNKNOWN, f"{text}: too slow here to tell"
+    return [finding("deskewing", verdict, text, remedy, **values)]
 
 
-def _changed(spot: Spot, sign: int, settings: RegisterSettings) -> Spot:
-    def with_times(sweep: Sweep) -> Sweep:
-        offset_ns = None if sign == 0 or sweep.offset_ns is None else sign * sweep.offset_ns
-        return replace(sweep, offset_ns=offset_ns)
-
-    return spot_of(tuple(with_times(sweep) for sweep in spot.sweeps), settings)
-
-
-def apart_m(spot: Spot) -> float:
+def _apart_m(spot: Spot) -> float:
     """Return the median distance (m) of near points above the ground in the last sweep from the
     first sweep; 1 m where they cannot be registered."""
     if spot.trajectory is None:
         return _CLOSE_M
-    first, last = (_above_ground(spot.stretch.sweeps[row].sweep.points) for row in (0, -1))
+    ends = spot.stretch.sweeps[0], spot.stretch.sweeps[-1]
+    first, last = (_above_ground(end.sweep.points) for end in ends)
     if min(len(first), len(last)) < _LEAST_POINTS:
         return _CLOSE_M
-    T_first_last = poses.inverse(spot.stretch.sweeps[0].T_world_lidar) @ (
-        spot.stretch.sweeps[-1].T_world_lidar
-    )
+    T_first_last = poses.inverse(ends[0].T_world_lidar) @ ends[1].T_world_lidar
     moved = poses.transform(T_first_last, last)
     distance_m, _ = cKDTree(first).query(moved[::4], distance_upper_bound=_CLOSE_M, workers=-1)
     return float(np.median(np.minimum(distance_m, _CLOSE_M)))

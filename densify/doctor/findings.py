@@ -21,6 +21,7 @@ class Verdict(IntEnum):
         return self.name.lower()
 
 
+FINE, UNKNOWN, SUSPICIOUS, WRONG = Verdict
 Value = float | int | str | list[float]
 
 
@@ -40,21 +41,8 @@ class Finding:
     values: Mapping[str, Value] = field(default_factory=dict)
 
 
-def fine(check: str, evidence: str, **values: Value) -> Finding:
-    """Return a finding that nothing is wrong."""
-    return Finding(check, Verdict.FINE, evidence, values=values)
-
-
-def unknown(check: str, evidence: str, **values: Value) -> Finding:
-    """Return a finding that the recording does not show."""
-    return Finding(check, Verdict.UNKNOWN, evidence, values=values)
-
-
-def suspicious(check: str, evidence: str, remedy: str, **values: Value) -> Finding:
-    """Return a finding that may be wrong."""
-    return Finding(check, Verdict.SUSPICIOUS, evidence, remedy, values)
-
-
-def wrong(check: str, evidence: str, remedy: str, **values: Value) -> Finding:
-    """Return a finding that is wrong."""
-    return Finding(check, Verdict.WRONG, evidence, remedy, values)
+def finding(
+    check: str, verdict: Verdict, evidence: str, remedy: str = "", **values: Value
+) -> Finding:
+    """Return a finding; without the remedy unless something may be wrong."""
+    return Finding(check, verdict, evidence, remedy if verdict >= SUSPICIOUS else "", values)

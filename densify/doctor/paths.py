@@ -9,10 +9,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from densify.config.errors import InputError
-from densify.doctor.findings import Finding, fine, suspicious, unknown, wrong
+from densify.doctor.findings import FINE, SUSPICIOUS, UNKNOWN, WRONG, Finding, finding
 from densify.doctor.sample import Sample, Spot
 from densify.geometry import poses
-from densify.geometry.types import Float
+from densify.geometry.types import Float, Sweep
 from densify.readers.recorded_poses import PoseTrack
 
 _LEAST_WAY_M = 1.0
@@ -24,7 +24,7 @@ _CAM_AXES = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]
 
 
 def with_rotation(change: Callable[[Float], Float]) -> Callable[[Float], Float]:
-    """A change of (4,4) poses that changes their (3,3) rotations."""
+    """Return the change of (4,4) poses that changes their (3,3) rotations."""
 
     def changed(T: Float) -> Float:
         turned = T.copy()
@@ -35,7 +35,7 @@ def with_rotation(change: Callable[[Float], Float]) -> Callable[[Float], Float]:
 
 
 def scaled(factor: float) -> Callable[[Float], Float]:
-    """A change of (4,4) poses that scales their translations."""
+    """Return the change of (4,4) poses that scales their translations."""
 
     def changed(T: Float) -> Float:
         moved = T.copy()
@@ -46,16 +46,15 @@ def scaled(factor: float) -> Callable[[Float], Float]:
 
 
 def _rolled(by: int) -> Callable[[Float], Float]:
-    """A quaternion whose numbers were taken in another order."""
+    """Return the change of rotations whose quaternion was read in another order."""
     return lambda R: Rotation.from_quat(np.roll(Rotation.from_matrix(R).as_quat(), by)).as_matrix()
 
 
 def _angle_scaled(factor: float) -> Callable[[Float], Float]:
-    def changed(R: Float) -> Float:
-        yaw, pitch, roll = Rotation.from_matrix(R).as_euler("ZYX") * factor
-        return Rotation.from_euler("ZYX", [yaw, pitch, roll]).as_matrix()
-
-    return changed
+    """Return the change of rotations that scales their yaw, pitch and roll."""
+    return lambda R: Rotation.from_euler(
+        "ZYX", Rotation.from_matrix(R).as_euler("ZYX") * factor
+    ).as_matrix()
 
 
 HYPOTHESES: Mapping[str, Callable[[Float], Float]] = {
@@ -73,17 +72,17 @@ HYPOTHESES: Mapping[str, Callable[[Float], Float]] = {
 
 
 def check_poses(sample: Sample) -> list[Finding]:
-    """Poses as given and as they would be under each of `HYPOTHESES`."""
+    """Compare the poses as given, and as under each of `HYPOTHESES`, with odometry."""
     spots = sample.registered
     try:
-        given = [_given(sample, spot) for spot in spots]
+        given = [[sample.sequence.T_world_lidar(end.frame) for end in _ends(s)] for s in spots]
     except InputError as error:
         if "no poses" in str(error):
-            return [fine("poses", "none; the sweeps register themselves")]
-        return [wrong("poses", str(error), "--set register.source=kiss-icp")]
+            return [finding("poses", FINE, "none; the sweeps register themselves")]
+        return [finding("poses", WRONG, str(error), "--set register.source=kiss-icp")]
     if not spots:
-        return [unknown("poses", "no sweeps could be registered to compare with")]
-    found = [_step(spot) for spot in spots]
+        return [finding("poses", UNKNOWN, "no sweeps could be registered to compare with")]
+    found = [_between([s.stretch.sweeps[row].T_world_lidar for row in (0, -1)]) for s in spots]
     way_m = max(float(np.linalg.norm(T[:3, 3])) for T in found)
     off = _off([_between(T) for T in given], found)
     values = {"off_m": off[0], "off_deg": off[1], "way_m": way_m}
@@ -94,67 +93,54 @@ def check_poses(sample: Sample) -> list[Finding]:
     }
     best = min(others, key=lambda name: _cost(others[name], way_m))
     cost, other = _cost(off, way_m), _cost(others[best], way_m)
+    remedy = "leave them out with --set register.source=kiss-icp"
     if other < _MUCH_BETTER * cost and cost > _EXACT and other < 1:
-        better = f"{others[best][0]:.2f} m and {others[best][1]:.2f} deg"
-        return [
-            wrong(
-                "poses",
-                f"{text}, but only by {better} if {best}",
-                "correct the poses, or leave them out with --set register.source=kiss-icp",
-                **values,
-            )
-        ]
-    if cost <= 1:
-        clock = _check_clock(sample, found)
-        if way_m < _LEAST_WAY_M:
-            return [unknown("poses", f"{text}; the vehicle hardly moves", **values), *clock]
-        return [fine("poses", text, **values), *clock]
-    return [
-        suspicious(
-            "poses",
-            f"{text}; no usual mistake explains it (another frame than the points', another "
-            f"clock, or noise)",
-            "leave them out with --set register.source=kiss-icp",
-            **values,
-        ),
-        *_check_clock(sample, found),
-    ]
+        text += f", but only by {others[best][0]:.2f} m and {others[best][1]:.2f} deg if {best}"
+        return [finding("poses", WRONG, text, f"correct the poses, or {remedy}", **values)]
+    verdict = FINE if way_m >= _LEAST_WAY_M else UNKNOWN
+    if cost > 1:
+        verdict = SUSPICIOUS
+        text += "; no usual mistake explains it (another frame than the points', another clock, or"
+        text += " noise)"
+    elif verdict == UNKNOWN:
+        text += "; the vehicle hardly moves"
+    return [finding("poses", verdict, text, remedy, **values), *_check_clock(sample, found)]
 
 
 def _check_clock(sample: Sample, found: list[Float]) -> list[Finding]:
-    """The difference between the clocks of poses and sweeps: the shift with which the poses agree
-    best with odometry. It shows where the vehicle turns or changes its speed."""
-    stamps_ns = [(s.sweeps[0].stamp_ns, s.sweeps[-1].stamp_ns) for s in sample.registered]
+    """Measure the difference between the clocks of poses and sweeps: the shift with which the poses
+    agree best with odometry. It shows where the vehicle turns or changes its speed."""
     late_s = np.arange(-_CLOCK_S, _CLOCK_S + 1e-9, _CLOCK_STEP_S)
-    cost = np.zeros(len(late_s))
-    tracks = [_track(sample, *ends_ns) for ends_ns in stamps_ns]
-    for (first_ns, last_ns), step, track in zip(stamps_ns, found, tracks, strict=True):
+    cost, num_used = np.zeros(len(late_s)), 0
+    for spot, step in zip(sample.registered, found, strict=True):
+        first_ns, last_ns = (end.stamp_ns for end in _ends(spot))
+        track = _track(sample, first_ns, last_ns)
         if track is None:  # at the recording's ends
             continue
+        num_used += 1
         for row, seconds in enumerate(late_s):
             ends_ns = [int(ns + 1e9 * seconds) for ns in (first_ns, last_ns)]
             off = poses.log(poses.inverse(_between([track.at(ns) for ns in ends_ns])) @ step)
             cost[row] += np.sum((off[3:] / _NOISE_M) ** 2) + np.sum((off[:3] / _NOISE_RAD) ** 2)
-    if all(track is None for track in tracks):
+    if not num_used:
         return []
     good = late_s[cost < cost.min() + _EVEN_COST]
     low_s, high_s, best_s = float(good.min()), float(good.max()), float(late_s[np.argmin(cost)])
-    values = {"late_s": best_s, "low_s": low_s, "high_s": high_s}
     text = (
         f"odometry agrees best with the poses stamped {best_s * 1e3:+.0f} ms "
         f"({low_s * 1e3:+.0f} to {high_s * 1e3:+.0f}) later"
     )
+    verdict, remedy = FINE, f"shift the poses' stamps by {-best_s * 1e3:+.0f} ms"
     if high_s - low_s > _CLOCK_S:
-        text += "; the vehicle drives too evenly to tell"
-        return [unknown("clock of poses", text, **values)]
-    if low_s > _CLOCK_OFF_S or high_s < -_CLOCK_OFF_S:
-        remedy = f"shift the poses' stamps by {-best_s * 1e3:+.0f} ms"
-        return [suspicious("clock of poses", text, remedy, **values)]
-    return [fine("clock of poses", text, **values)]
+        verdict, text = UNKNOWN, f"{text}; the vehicle drives too evenly to tell"
+    elif low_s > _CLOCK_OFF_S or high_s < -_CLOCK_OFF_S:
+        verdict = SUSPICIOUS
+    values = {"late_s": best_s, "low_s": low_s, "high_s": high_s}
+    return [finding("clock of poses", verdict, text, remedy, **values)]
 
 
 def _track(sample: Sample, first_ns: int, last_ns: int) -> PoseTrack | None:
-    """The recording's poses around a spot; None at its ends, or where one is missing."""
+    """Return the recording's poses around a spot; None at its ends, or where one is missing."""
     reach_ns = int(1e9 * _CLOCK_S)
     timeline = sample.timeline
     frames = timeline.within(first_ns - 2 * reach_ns, last_ns + 2 * reach_ns)
@@ -168,14 +154,8 @@ def _track(sample: Sample, first_ns: int, last_ns: int) -> PoseTrack | None:
         return None
 
 
-def _given(sample: Sample, spot: Spot) -> list[Float]:
-    frames = spot.sweeps[0].frame, spot.sweeps[-1].frame
-    return [sample.sequence.T_world_lidar(frame) for frame in frames]
-
-
-def _step(spot: Spot) -> Float:
-    sweeps = spot.stretch.sweeps
-    return _between([sweeps[0].T_world_lidar, sweeps[-1].T_world_lidar])
+def _ends(spot: Spot) -> tuple[Sweep, Sweep]:
+    return spot.sweeps[0], spot.sweeps[-1]
 
 
 def _between(pair: list[Float]) -> Float:
@@ -183,7 +163,7 @@ def _between(pair: list[Float]) -> Float:
 
 
 def _off(given: list[Float], found: list[Float]) -> tuple[float, float]:
-    """Metres and degrees, the median over the spots."""
+    """Return metres and degrees, the median over the spots."""
     apart = [poses.log(poses.inverse(a) @ b) for a, b in zip(given, found, strict=True)]
     return (
         float(np.median([np.linalg.norm(d[3:]) for d in apart])),
@@ -192,5 +172,5 @@ def _off(given: list[Float], found: list[Float]) -> tuple[float, float]:
 
 
 def _cost(off: tuple[float, float], way_m: float) -> float:
-    """The larger of both errors, as a share of what is allowed."""
+    """Return the larger of both errors, as a share of what is allowed."""
     return max(off[0] / (_OFF_M + _OFF_PER_M * way_m), off[1] / _OFF_DEG)

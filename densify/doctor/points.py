@@ -7,8 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from densify.config import RegisterSettings
-from densify.doctor.findings import Finding, fine, suspicious, unknown, wrong
+from densify.doctor.findings import FINE, SUSPICIOUS, UNKNOWN, WRONG, Finding, finding
 from densify.doctor.sample import Sample, Spot
 from densify.free_space.sensor import Sensors
 from densify.geometry.types import Float
@@ -37,35 +36,27 @@ _FAR_OFF = 10.0  # times as far as the points are apart
 
 
 def check_units(sample: Sample) -> list[Finding]:
-    """Metres, or not."""
+    """Check that the points are in metres, and around the scanner."""
+    name, (least_m, most_m) = "unit of points", _MEDIAN_RANGE_M
     middle = [spot.sweeps[spot.middle].points for spot in sample.spots]
     range_m = float(np.median([_median_range_m(points) for points in middle]))
-    values = {"median_range_m": range_m}
-    if _MEDIAN_RANGE_M[0] <= range_m <= _MEDIAN_RANGE_M[1]:
-        return [fine("unit of points", f"half of the returns within {range_m:.1f} m", **values)]
+    if least_m <= range_m <= most_m:
+        text = f"half of the returns within {range_m:.1f} m"
+        return [finding(name, FINE, text, median_range_m=range_m)]
     around_m = float(np.median([_median_range_m(p - np.median(p, axis=0)) for p in middle]))
-    if _MEDIAN_RANGE_M[0] <= around_m <= _MEDIAN_RANGE_M[1] and range_m > _FAR_OFF * around_m:
-        return [
-            wrong(
-                "unit of points",
-                f"half of the returns are farther than {range_m:.4g} m, and within {around_m:.1f} m"
-                f" of each other's middle, as if they were in a map's coordinates",
-                "bring each sweep into its scanner's frame, by the inverse of its pose",
-                **values,
-            )
-        ]
-    fits = [u for u, f in _UNITS.items() if _MEDIAN_RANGE_M[0] <= range_m * f <= _MEDIAN_RANGE_M[1]]
-    guess = f", as if they were in {fits[0]}" if fits else ""
-    verdict = wrong if fits else suspicious
-    return [
-        verdict(
-            "unit of points",
-            f"half of the returns are farther than {range_m:.4g} m, expected "
-            f"{_MEDIAN_RANGE_M[0]} to {_MEDIAN_RANGE_M[1]:.0f} m{guess}",
-            "scale the points to metres (sweeps: scale_m in densify.yaml)",
-            **values,
-        )
-    ]
+    fits = [u for u, f in _UNITS.items() if least_m <= range_m * f <= most_m]
+    text = f"half of the returns are farther than {range_m:.4g} m"
+    verdict, remedy = SUSPICIOUS, "scale the points to metres (sweeps: scale_m in densify.yaml)"
+    if least_m <= around_m <= most_m and range_m > _FAR_OFF * around_m:
+        text += f", and within {around_m:.1f} m of each other's middle, as if they were in a map's"
+        text += " coordinates"
+        verdict = WRONG
+        remedy = "bring each sweep into its scanner's frame, by the inverse of its pose"
+    else:
+        text += f", expected {least_m} to {most_m:.0f} m"
+        if fits:
+            verdict, text = WRONG, f"{text}, as if they were in {fits[0]}"
+    return [finding(name, verdict, text, remedy, median_range_m=range_m)]
 
 
 def _median_range_m(points: Float) -> float:
@@ -73,8 +64,8 @@ def _median_range_m(points: Float) -> float:
 
 
 def check_axes(sample: Sample) -> list[Finding]:
-    """Which axis points up: the one along which a layer holds most returns and hardly any lie
-    below."""
+    """Check which axis points up: the one along which a layer holds most returns and hardly any
+    lie below."""
     level = {name: _ground_share(sample, up) for name, up in _UP.items()}
     best = max(level, key=lambda name: level[name])
     values = {f"share_{name}": share for name, share in level.items()}
@@ -82,25 +73,20 @@ def check_axes(sample: Sample) -> list[Finding]:
         f"{100 * level[best]:.0f} % of the near returns lie in one layer below the scanner if "
         f"{best} is up" + (f", {100 * max(level['z'], 0):.0f} % if z is" if best != "z" else "")
     )
-    if level["z"] < _LEAST_LEVEL and level[best] < _LEAST_LEVEL:
-        return [unknown("axes", "no ground was found along any axis", **values)]
-    if level["z"] >= _LEAST_LEVEL or level[best] < _CLEARLY * level["z"]:
-        return [fine("axes", text, **values)]
-    means = f" ({_UP_MEANS[best]})" if best in _UP_MEANS else ""
-    return [
-        wrong(
-            "axes",
-            f"{text}{means}",
-            "turn the points so that z is up (sweeps: axes in densify.yaml)",
-            **values,
-        )
-    ]
+    verdict, remedy = WRONG, "turn the points so that z is up (sweeps: axes in densify.yaml)"
+    if max(level["z"], level[best]) < _LEAST_LEVEL:
+        verdict, text = UNKNOWN, "no ground was found along any axis"
+    elif level["z"] >= _LEAST_LEVEL or level[best] < _CLEARLY * level["z"]:
+        verdict = FINE
+    elif best in _UP_MEANS:
+        text += f" ({_UP_MEANS[best]})"
+    return [finding("axes", verdict, text, remedy, **values)]
 
 
 def _ground_share(sample: Sample, up: Float) -> float:
-    """The share of the near returns in the fullest layer that is not above the origin and has few
-    returns below it, beyond what an even spread over all heights would have there; the median over
-    the spots."""
+    """Return the share of the near returns in the fullest layer that is not above the origin and
+    has few returns below it, beyond what an even spread over all heights would have there; the
+    median over the spots."""
     shares = []
     for spot in sample.spots:
         points = spot.sweeps[spot.middle].points
@@ -118,42 +104,32 @@ def _ground_share(sample: Sample, up: Float) -> float:
     return float(np.median(shares)) if shares else 0.0
 
 
-def check_own_vehicle(sample: Sample, settings: RegisterSettings) -> list[Finding]:
-    """Returns of the vehicle that carries the scanner: they are at the same place in sweeps far
-    apart in time, while the vehicle drives."""
+def check_own_vehicle(sample: Sample) -> list[Finding]:
+    """Look for returns of the vehicle that carries the scanner: they are at the same place in
+    sweeps far apart in time, while the vehicle drives."""
     moving = [
         spot
         for spot in sample.registered
         if spot.speed_m_s > 1.0 and (np.linalg.norm(spot.sweeps[0].points, axis=1) < _NEAR_M).any()
     ]
     if len(moving) < 2:
-        text = (
-            "the vehicle drives in one of the places looked at only, two are needed"
-            if moving
-            else "the vehicle hardly moves where it was looked at"
-        )
-        return [unknown("own vehicle", text)]
+        text = f"the vehicle drives in {len(moving)} of the places looked at, two are needed"
+        return [finding("own vehicle", UNKNOWN, text)]
     range_m, num = _own_returns(moving)
-    values = {"farthest_m": range_m, "num_returns": num}
+    values, least_m = {"farthest_m": range_m, "num_returns": num}, sample.settings.min_range_m
     if num < _LEAST_OWN:
-        return [fine("own vehicle", "no returns of it", **values)]
-    text = f"{num} returns a sweep, at most {range_m:.1f} m away"
-    if range_m <= settings.min_range_m:
-        text += f", all within register.min_range_m = {settings.min_range_m:g}"
-        return [fine("own vehicle", text, **values)]
-    return [
-        suspicious(
-            "own vehicle",
-            f"{text}, beyond register.min_range_m = {settings.min_range_m:g}",
-            f"--set register.min_range_m={np.ceil(10 * range_m) / 10:.1f}",
-            **values,
-        )
-    ]
+        return [finding("own vehicle", FINE, "no returns of it", "", **values)]
+    where, verdict = "all within", FINE
+    if range_m > least_m:
+        where, verdict = "beyond", SUSPICIOUS
+    text = f"{num} returns a sweep, at most {range_m:.1f} m away, {where} register.min_range_m"
+    remedy = f"--set register.min_range_m={np.ceil(10 * range_m) / 10:.1f}"
+    return [finding("own vehicle", verdict, f"{text} = {least_m:g}", remedy, **values)]
 
 
 def _own_returns(spots: list[Spot]) -> tuple[float, int]:
-    """How far away they are, and how many a sweep has. Ground looks the same everywhere as well:
-    what lies in the lowest layer does not count."""
+    """Return how far away they are, and how many a sweep has. Ground looks the same everywhere as
+    well: the lowest layer does not count."""
     cells = []
     for sweep in [s for spot in spots for s in (spot.sweeps[0], spot.sweeps[-1])]:
         range_m = np.linalg.norm(sweep.points, axis=1)
@@ -173,29 +149,24 @@ def _own_returns(spots: list[Spot]) -> tuple[float, int]:
 
 
 def check_intensity(sample: Sample) -> list[Finding]:
-    """Reflectances are from 0 to 1."""
-    high = max(float(spot.sweeps[spot.middle].intensity.max()) for spot in sample.spots)
-    low = min(float(spot.sweeps[spot.middle].intensity.min()) for spot in sample.spots)
-    text, values = f"{low:g} to {high:g}", {"lowest": low, "highest": high}
-    if low >= 0 and high <= 1:
-        return [fine("intensity", text, **values)]
-    return [
-        suspicious(
-            "intensity",
-            f"{text}, expected 0 to 1; only pictures and the clouds' column suffer",
-            "scale the intensities (sweeps: intensity_scale in densify.yaml)",
-            **values,
-        )
-    ]
+    """Check that reflectances are from 0 to 1."""
+    values = np.concatenate([spot.sweeps[spot.middle].intensity for spot in sample.spots])
+    low, high = float(values.min()), float(values.max())
+    text, is_fine = f"{low:g} to {high:g}", low >= 0 and high <= 1
+    if not is_fine:
+        text += ", expected 0 to 1; only pictures and the clouds' column suffer"
+    remedy = "scale the intensities (sweeps: intensity_scale in densify.yaml)"
+    verdict = FINE if is_fine else SUSPICIOUS
+    return [finding("intensity", verdict, text, remedy, lowest=low, highest=high)]
 
 
-def check_sensors(sample: Sample, settings: RegisterSettings) -> list[Finding]:
+def check_sensors(sample: Sample) -> list[Finding]:
     """Describe each scanner as the pipeline models it."""
     spot = sample.fastest
     if spot is None:
         return []
     findings = []
-    used = [replace(s, sweep=in_range(s.sweep, settings)) for s in spot.stretch.sweeps]
+    used = [replace(s, sweep=in_range(s.sweep, sample.settings)) for s in spot.stretch.sweeps]
     for number, model in Sensors.of(used).models.items():
         kind = "lines" if model.rings_rad is None else f"{len(model.rings_rad)} rings"
         kind = "no rings" if model.unordered else kind
@@ -210,12 +181,15 @@ def check_sensors(sample: Sample, settings: RegisterSettings) -> list[Finding]:
         )
         if max(without) > _LEAST_WITHOUT:
             text += f", {100 * max(without):.0f} % of the rows without a return"
-        values: dict[str, float] = {"returns_least": min(counts), "returns_most": max(counts)}
-        values["without_return"] = max(without)
-        if min(counts) < 0.5 * max(counts):
-            text += "; some sweeps are broken off"
-            remedy = "leave the sweeps with few returns out"
-            findings.append(suspicious(f"scanner {number}", text, remedy, **values))
-        else:
-            findings.append(fine(f"scanner {number}", text, **values))
+        is_broken = min(counts) < 0.5 * max(counts)
+        found = finding(
+            f"scanner {number}",
+            SUSPICIOUS if is_broken else FINE,
+            text + "; some sweeps are broken off" * is_broken,
+            "leave the sweeps with few returns out",
+            returns_least=min(counts),
+            returns_most=max(counts),
+            without_return=max(without),
+        )
+        findings.append(found)
     return findings

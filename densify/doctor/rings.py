@@ -4,12 +4,10 @@ are seen from where it stood, as they were fired."""
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 
-from densify.doctor.findings import Finding, fine, suspicious, unknown, wrong
-from densify.doctor.sample import Sample, Spot
+from densify.doctor.findings import FINE, SUSPICIOUS, UNKNOWN, WRONG, Finding, finding
+from densify.doctor.sample import Sample
 from densify.geometry import poses
 from densify.geometry.types import Float, Sweep
 
@@ -25,13 +23,12 @@ _REACH_M = np.array([3.0, 0.8, 2.4])
 _GRID_M = (0.5, 0.4, 0.05)
 _COARSE_FROM_M, _COARSE_POINTS, _COARSE_BINS, _NUM_STARTS = 18.0, 3000, 3, 8
 _FINER = ((0.1, 3), (0.05, 2), (0.02, 1))  # step in metres, bins
-_OFF_M = (
-    0.3  # KITTI's HDL-64E, whose two blocks of lasers stand apart, is sharpest from 0.2 m higher
-)
+# KITTI's HDL-64E, whose two blocks of lasers stand apart, is sharpest from 0.2 m higher.
+_OFF_M = 0.3
 
 
 def sharpness(points: Float, origin_m: Float, bins: int = 1) -> float:
-    """How much the elevations seen from the origin stand in rings, 1 for an even spread.
+    """Return how much the elevations seen from the origin stand in rings, 1 for an even spread.
 
     In each window of elevation: the chance that two of its returns share a cell of ``bins`` times
     0.02 degrees, relative to an even spread; then the mean over the windows, each counted alike,
@@ -51,9 +48,9 @@ def sharpness(points: Float, origin_m: Float, bins: int = 1) -> float:
 
 
 def check_rings(sample: Sample) -> list[Finding]:
-    """Where each scanner stands, and whether its sweeps are as they were fired."""
+    """Check where each scanner stands, and that its sweeps are as they were fired."""
     findings = []
-    for lidar in sorted({int(n) for s in sample.spots for n in np.unique(s.sweeps[0].lidar)}):
+    for lidar in sample.lidars:
         R = sample.spots[0].sweeps[0].axes(lidar)  # rings are level in the scanner's own axes
         given_m = R @ sample.spots[0].sweeps[0].origin_m(lidar)
         points = _still_points(sample, lidar) @ R.T
@@ -68,66 +65,58 @@ def check_rings(sample: Sample) -> list[Finding]:
 def _check_compensation(
     sample: Sample, lidar: int, R: Float, origins_m: tuple[Float, Float]
 ) -> Finding:
+    """Check that the motion within a sweep is not undone already.
+
+    R: into the scanner's axes. origins_m: where the scanner may be.
+    """
     name = "motion compensation" + f" of scanner {lidar}" * (lidar > 0)
     spot = sample.fastest
     if spot is None:
-        return unknown(name, "no sweeps could be registered")
+        return finding(name, UNKNOWN, "no sweeps could be registered")
     if spot.speed_m_s < _LEAST_SPEED_M_S:
-        text = (
-            f"the vehicle drives at {spot.speed_m_s:.1f} m/s where it was looked at, "
-            f"{_LEAST_SPEED_M_S:g} are needed"
-        )
-        return unknown(name, text)
+        return finding(name, UNKNOWN, spot.too_slow(_LEAST_SPEED_M_S))
     sweep = spot.sweeps[spot.middle]
     sweep = sweep.select(sweep.lidar == lidar)
+    is_untimed = sweep.offset_ns is None
     offset_s = _turning_s(sweep, sample) if sweep.offset_ns is None else sweep.offset_ns * 1e-9
     near = _sample_of(sweep, _COMPENSATED_M)
-    found, moment = _sharpness_by_motion(
-        sweep.points[near], offset_s[near], spot.twist, R, origins_m
-    )
-    as_stored, undone = found.as_stored, found.undone
-    values = found._asdict()
+    found = _sharpness_by_motion(sweep.points[near], offset_s[near], spot.twist, R, origins_m)
+    as_stored, undone, done, moment = found
     text = (
         f"at {spot.speed_m_s:.1f} m/s the rings' sharpness is {as_stored:.2f} as stored, "
-        f"{undone:.2f} with a compensation undone, {found.done:.2f} with the motion compensated"
+        f"{undone:.2f} with a compensation undone, {done:.2f} with the motion compensated"
     )
+    verdict, remedy = FINE, "--set register.deskew=false"
     if max(as_stored, undone) < _LEAST_SHARPNESS:
-        return unknown(name, f"{text}; no distinct rings", **values)
-    if undone > _CLEARLY * as_stored:
-        if sweep.offset_ns is None:
-            return fine(name, f"{text}: compensated to {moment}, without times", **values)
-        return wrong(
-            name,
-            f"{text}: the sweeps are compensated already, to {moment}, and would be a second time",
-            "--set register.deskew=false",
-            **values,
-        )
-    if as_stored < _CLEARLY * undone:
-        return unknown(name, f"{text}: too alike to tell", **values)
-    if sweep.offset_ns is None:
-        return _raw_without_times(name, text, values, spot, sample)
-    return fine(name, f"{text}: as they were fired", **values)
-
-
-class _Sharpness(NamedTuple):
-    """Sharpness of rings as they are, with a compensation of motion undone, and with one done."""
-
-    as_stored: float
-    undone: float
-    done: float
+        verdict, text = UNKNOWN, f"{text}; no distinct rings"
+    elif undone > _CLEARLY * as_stored and is_untimed:
+        text += f": compensated to {moment}, without times"
+    elif undone > _CLEARLY * as_stored:
+        verdict = WRONG
+        text += f": the sweeps are compensated already, to {moment}, and would be a second time"
+    elif as_stored < _CLEARLY * undone:
+        verdict, text = UNKNOWN, f"{text}: too alike to tell"
+    elif is_untimed:
+        stretched_m = spot.speed_m_s * sample.timeline.period_ns * 1e-9
+        verdict, remedy = SUSPICIOUS, "give the points times (a column t in the files)"
+        text += ": the sweeps are as they were fired and no point has a time, so they stay"
+        text += f" stretched by {stretched_m:.2f} m"
+    else:
+        text += ": as they were fired"
+    return finding(name, verdict, text, remedy, as_stored=as_stored, undone=undone, done=done)
 
 
 def _sharpness_by_motion(
     points: Float, offset_s: Float, twist: Float, R: Float, origins_m: tuple[Float, Float]
-) -> tuple[_Sharpness, str]:
-    """How sharp the rings are, and the moment that they would be compensated to.
+) -> tuple[float, float, float, str]:
+    """Return how sharp the rings are as they are, with a compensation of motion undone, and with
+    one done; and the moment that they would be compensated to.
 
-    points: (N,3) raw, fired at offset_s: (N,). twist: (6,) of the lidar, per second. R: into the
-    scanner's axes. origins_m: where the scanner may be.
+    points: (N,3) raw, fired at offset_s: (N,). twist: (6,) of the lidar, per second.
     """
 
-    def sharpest(*variants: Float) -> float:
-        return max(sharpness(moved, origin_m) for moved in variants for origin_m in origins_m)
+    def sharpest(moved: Float) -> float:
+        return max(sharpness(moved, origin_m) for origin_m in origins_m)
 
     def carried(since_s: Float) -> Float:
         return poses.transform_each(since_s[:, None] * twist, points) @ R.T
@@ -141,29 +130,15 @@ def _sharpness_by_motion(
     as_stored = sharpest(points @ R.T)
     undone_to = {name: sharpest(carried(at_s - offset_s)) for name, at_s in moments_s.items()}
     moment = max(undone_to, key=lambda name: undone_to[name])
-    undone = undone_to[moment]
-    done = sharpest(carried(offset_s))
+    undone, done = undone_to[moment], sharpest(carried(offset_s))
     if max(as_stored, undone) < _LEAST_SHARPNESS:  # the origin was looked for in smeared rings
         straight = carried(-offset_s)
         undone = sharpness(straight, found_origin(straight, origins_m[0]))
-    return _Sharpness(as_stored, undone, done), moment
-
-
-def _raw_without_times(
-    name: str, text: str, values: dict[str, float], spot: Spot, sample: Sample
-) -> Finding:
-    stretched_m = spot.speed_m_s * sample.timeline.period_ns * 1e-9
-    return suspicious(
-        name,
-        f"{text}: the sweeps are as they were fired and no point has a time, so they stay "
-        f"stretched by {stretched_m:.2f} m",
-        "give the points times (a column t in the files)",
-        **values,
-    )
+    return as_stored, undone, done, moment
 
 
 def _turning_s(sweep: Sweep, sample: Sample) -> Float:
-    """Times of a scanner that turns clockwise and faces forward at the stamp."""
+    """Return the times of a scanner that turns clockwise and faces forward at the stamp."""
     turn = -np.arctan2(sweep.points[:, 1], sweep.points[:, 0]) / (2 * np.pi)
     return turn * (sample.timeline.period_ns * 1e-9)
 
@@ -175,7 +150,7 @@ def _sample_of(sweep: Sweep, far_m: float) -> np.ndarray:
 
 
 def _still_points(sample: Sample, lidar: int) -> Float:
-    """(N,3) returns of one scanner from all spots."""
+    """Return (N,3) returns of one scanner from all spots."""
     parts = []
     for spot in sample.spots:
         sweep = spot.sweeps[spot.middle]
@@ -185,7 +160,10 @@ def _still_points(sample: Sample, lidar: int) -> Float:
 
 
 def _check_origin(lidar: int, points: Float, R: Float, given_m: Float, found_m: Float) -> Finding:
-    """points, given_m, found_m: in the scanner's axes, into which R turns the lidar frame's."""
+    """Compare the given and the found place of a scanner.
+
+    points, given_m, found_m: in the scanner's axes, into which R turns the lidar frame's.
+    """
     name = "scanner's place" if lidar == 0 else f"place of scanner {lidar}"
     given, found = sharpness(points, given_m), sharpness(points, found_m)
     off_m = float(np.linalg.norm(found_m - given_m))
@@ -196,13 +174,13 @@ def _check_origin(lidar: int, points: Float, R: Float, given_m: Float, found_m: 
         f"rings are sharpest ({found:.2f}) seen from {_text(found_m)}; from the given "
         f"{_text(given_m)}: {given:.2f}"
     )
+    line = f"scanner_origins: {[[round(float(v), 2) for v in found_m]]}"
+    verdict, remedy = FINE, f"give the scanner's place in the points' frame ({line})"
     if found < _LEAST_SHARPNESS:
-        return unknown(name, f"{text}; no distinct rings", **values)
-    if off_m > _OFF_M and found > _CLEARLY * given:
-        line = f"scanner_origins: {[[round(float(v), 2) for v in found_m]]}"
-        remedy = f"give the scanner's place in the points' frame ({line})"
-        return wrong(name, text, remedy, **values)
-    return fine(name, text, **values)
+        verdict, text = UNKNOWN, f"{text}; no distinct rings"
+    elif off_m > _OFF_M and found > _CLEARLY * given:
+        verdict = WRONG
+    return finding(name, verdict, text, remedy, **values)
 
 
 def _text(place_m: Float) -> str:
@@ -210,8 +188,8 @@ def _text(place_m: Float) -> str:
 
 
 def found_origin(points: Float, start_m: Float) -> Float:
-    """(3,) from where the rings are sharpest, searched up to 3 m ahead and behind, 1.2 m aside and
-    2.4 m above and below a place. Heights are tried closely, since they move every ring."""
+    """Return (3,) from where the rings are sharpest, searched up to 3 m ahead and behind a place,
+    0.8 m aside, 2.4 m above and below. Heights are tried closely, since they move every ring."""
     axes = [np.arange(-r, r + 1e-9, step) for r, step in zip(_REACH_M, _GRID_M, strict=True)]
     grid = start_m + np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
     far = points[np.linalg.norm(points, axis=1) > _COARSE_FROM_M]

@@ -4,7 +4,7 @@ poses it has."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -32,17 +32,17 @@ class Spot:
 
     @cached_property
     def stretch(self) -> Stretch:
-        """The sweeps deskewed, in the odometry's world; empty where they are not registered."""
+        """Return the sweeps deskewed, in the odometry's world; empty without registration."""
         return Stretch(()) if self.trajectory is None else deskew(self.sweeps, self.trajectory)
 
     @property
     def middle(self) -> int:
-        """Row of the sweep in the middle."""
+        """Return the row of the sweep in the middle."""
         return len(self.sweeps) // 2
 
     @property
     def twist(self) -> Float:
-        """(6,) rad/s and m/s in the middle, lidar frame; zeros where it is not registered."""
+        """Return (6,) rad/s and m/s in the middle, lidar frame; zeros if it is not registered."""
         if self.trajectory is None:
             return np.zeros(6)
         sweep = self.stretch.sweeps[self.middle]
@@ -52,16 +52,25 @@ class Spot:
     def speed_m_s(self) -> float:
         return float(np.linalg.norm(self.twist[3:]))
 
+    def too_slow(self, least_m_s: float) -> str:
+        """Say that a check needs a faster vehicle."""
+        return (
+            f"the vehicle drives at {self.speed_m_s:.1f} m/s where it was looked at, "
+            f"{least_m_s:g} are needed"
+        )
+
 
 @dataclass(frozen=True)
 class Sample:
     """sequence: the recording. timeline: when its sweeps were taken. spots: in order of time.
-    unreadable: frame -> why a sweep that was to be looked at could not be read."""
+    unreadable: frame -> why a sweep that was to be looked at could not be read. settings: of the
+    registration."""
 
     sequence: LidarSequence
     timeline: Timeline
     spots: tuple[Spot, ...]
     unreadable: dict[int, str]
+    settings: RegisterSettings = field(default_factory=RegisterSettings)
 
     @staticmethod
     def of(sequence: LidarSequence, settings: RegisterSettings) -> Sample:
@@ -81,21 +90,26 @@ class Sample:
         if not spots:
             frame, reason = next(iter(unreadable.items()))
             raise InputError(f"{sequence.name}: no sweep can be read; frame {frame}: {reason}")
-        return Sample(sequence, timeline, tuple(spots), unreadable)
+        return Sample(sequence, timeline, tuple(spots), unreadable, settings)
+
+    @property
+    def lidars(self) -> list[int]:
+        """Return the numbers of the scanners."""
+        return sorted({int(n) for s in self.spots for n in np.unique(s.sweeps[s.middle].lidar)})
 
     @property
     def registered(self) -> list[Spot]:
-        """Spots that could be registered."""
+        """Return the spots that could be registered."""
         return [spot for spot in self.spots if spot.trajectory is not None]
 
     @property
     def fastest(self) -> Spot | None:
-        """The registered spot where the vehicle is fastest."""
+        """Return the registered spot where the vehicle is fastest."""
         return max(self.registered, key=lambda spot: spot.speed_m_s, default=None)
 
 
 def _chosen(timeline: Timeline) -> list[list[int]]:
-    """Frames of each spot: sweeps about 0.1 s apart; none twice."""
+    """Return the frames of each spot: sweeps about 0.1 s apart; none twice."""
     frames = timeline.frames
     stride = max(1, round(_STEP_S * 1e9 / timeline.period_ns))
     length = min(len(frames), stride * (_NUM_SWEEPS - 1) + 1)
@@ -105,7 +119,7 @@ def _chosen(timeline: Timeline) -> list[list[int]]:
 
 
 def spot_of(sweeps: tuple[Sweep, ...], settings: RegisterSettings) -> Spot:
-    """Registered by odometry, if they can be."""
+    """Register sweeps by odometry, if they can be."""
     if len(sweeps) < 2:
         return Spot(sweeps, None, "one sweep alone cannot be registered")
     try:
