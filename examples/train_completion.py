@@ -9,7 +9,7 @@ python examples/train_completion.py [--data SPEC] [--test SPEC] [--keys A:B:S] [
 import argparse
 import copy
 import sys
-from itertools import count, islice, pairwise
+from itertools import islice, pairwise
 from pathlib import Path
 
 import torch
@@ -102,15 +102,15 @@ def batches(dataset, seed):
     """For ever; every epoch in another order, and cut and mirrored anew."""
     order = torch.Generator().manual_seed(seed)
     loader = DataLoader(dataset, 4, shuffle=True, generator=order)
-    for epoch in count():
-        dataset.set_epoch(epoch)
+    while True:
         yield from loader
 
 
 def trained(network, folder, steps, seed, filled):
     """A copy of the network after some steps on the maps of a set."""
+    torch.manual_seed(seed)  # of the crops and flips
     network = copy.deepcopy(network).train()
-    dataset = densify.DepthDataset(folder, filled=filled, crop=CROP_PX, flip=True, seed=seed)
+    dataset = densify.DepthDataset(folder, filled=filled, crop=CROP_PX, flip=True)
     optimiser = torch.optim.Adam(network.parameters())
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, 6e-3, total_steps=steps)
     for batch in islice(batches(dataset, seed), steps):

@@ -52,8 +52,8 @@ def test_keys_that_are_chosen(border_drive: Path, tmp_path: Path) -> None:
     ):
         (planned,) = plan([str(border_drive)], keys, Recipe())
         assert list(planned.keys) == chosen
-    assert planned.source.folder == f"val/{DRIVE}"
-    assert planned.source.cameras == ("image_02",)
+    assert planned.folder == f"val/{DRIVE}"
+    assert tuple(planned.cameras) == ("image_02",)
     drive, out = copy_drive(border_drive, tmp_path / "2011_09_26"), tmp_path / "out"
     sweep_file(drive, 40).unlink()
     assert run(drive, out) == 0

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import json
-import pickle
 import shutil
 from pathlib import Path
 from types import SimpleNamespace
@@ -191,76 +190,41 @@ def points_by_depth(sample) -> dict[float, np.ndarray]:
 
 def test_crops_and_flips_keep_every_point_in_its_place(made):
     whole = {where_of(s): points_by_depth(s) for s in DepthDataset(made.root)}
-    cut = DepthDataset(made.root, crop=(16, 31), flip=True, seed=3)
+    cut = DepthDataset(made.root, crop=(16, 31), flip=True)
     mirrored = set()
-    for epoch in range(3):
-        cut.set_epoch(epoch)
-        for sample in cut:
-            (_, skew, centre_px), *_ = sample["intrinsics"].tolist()
-            step = 1 if skew > 0 else -1
-            left = round(K[0, 2] - (centre_px if step == 1 else 31 - 1 - centre_px))
-            image = made.images[where_of(sample)][H - 16 :, left : left + 31][:, ::step] / 255
-            np.testing.assert_allclose(sample["image"], image.transpose(2, 0, 1), atol=1e-6)
-            assert sample["dense_depth_m"].shape == (1, 16, 31)
-            sign = None
-            for z, points in points_by_depth(sample).items():
-                before = whole[where_of(sample)][z]
-                if before.shape[1] > 1:  # two pixels of one depth: which is which?
-                    continue
-                here = points[:, 0]
-                if sign is None:
-                    sign = 1 if abs(here[0] - before[0, 0]) < 1e-4 else -1
-                np.testing.assert_allclose(here, before[:, 0] * [sign, 1, 1], atol=1e-4)
-            mirrored.add(sign)
-    assert mirrored == {1, -1}
+    for sample in (sample for _ in range(3) for sample in cut):
+        (_, skew, centre_px), *_ = sample["intrinsics"].tolist()
+        step = 1 if skew > 0 else -1
+        left = round(K[0, 2] - (centre_px if step == 1 else 31 - 1 - centre_px))
+        image = made.images[where_of(sample)][H - 16 :, left : left + 31][:, ::step] / 255
+        np.testing.assert_allclose(sample["image"], image.transpose(2, 0, 1), atol=1e-6)
+        assert sample["dense_depth_m"].shape == (1, 16, 31)
+        for z, points in points_by_depth(sample).items():
+            before = whole[where_of(sample)][z]
+            if before.shape[1] == 1:  # of two pixels of one depth: which is which?
+                np.testing.assert_allclose(points, before * [[step], [1], [1]], atol=1e-4)
+        mirrored.add((step, left))
+    assert {step for step, _ in mirrored} == {1, -1} and len(mirrored) > 5
 
 
 def same(a, b) -> bool:
     return all(torch.equal(a[n], b[n]) for n in ("image", "dense_depth_m", "intrinsics"))
 
 
-def test_random_is_what_seed_epoch_and_index_say(made):
-    options = {"crop": (12, 20), "flip": True}
-    dataset, again = (DepthDataset(made.root, seed=1, **options) for _ in range(2))
-    first = list(dataset)
-    assert all(map(same, first, again))
-    dataset.set_epoch(1)
-    assert not all(map(same, first, dataset))
-    dataset.set_epoch(0)
-    assert same(first[3], dataset[3]) and same(first[-1], dataset[-1])
-    assert not all(map(same, first, DepthDataset(made.root, seed=2, **options)))
-    dataset.set_epoch(4)
-    assert all(map(same, dataset, pickle.loads(pickle.dumps(dataset))))
-    whole = DepthDataset(made.root)
-    first = list(whole)
-    whole.set_epoch(7)
-    assert all(map(same, first, whole))
-
-
-# Other processes
-
-
-def test_workers_give_what_one_process_gives(made):
+@pytest.mark.parametrize("num_workers", [0, 2])
+def test_a_seed_repeats_crops_and_flips_in_workers_too(made, num_workers):
     dataset = DepthDataset(made.root, crop=(12, 20), flip=True, cameras=["image_02"])
-    loader = DataLoader(
-        dataset,
-        batch_size=2,
-        num_workers=2,
-        multiprocessing_context="fork",
-        persistent_workers=True,  # these must hear of the new epoch too
-    )
-    drawn = []
-    for epoch in range(2):
-        dataset.set_epoch(epoch)
-        batches = list(loader)
-        alone = list(dataset)
-        for name in ("image", "sparse_depth_m", "dense_depth_m", "confidence", "intrinsics"):
-            together = torch.cat([batch[name] for batch in batches])
-            assert torch.equal(together, torch.stack([sample[name] for sample in alone]))
-        assert [f for b in batches for f in b["frame"].tolist()] == [s["frame"] for s in alone]
-        assert [d for b in batches for d in b["drive"]] == [s["drive"] for s in alone]
-        drawn.append(alone)
-    assert not all(map(same, *drawn))
+    options = {"multiprocessing_context": "fork"} if num_workers else {}
+    loader = DataLoader(dataset, batch_size=2, num_workers=num_workers, **options)
+
+    def drawn(seed: int) -> list:
+        torch.manual_seed(seed)
+        return list(loader)
+
+    first, again, other = map(drawn, (1, 1, 2))
+    assert all(map(same, first, again)) and not all(map(same, first, other))
+    assert [n for batch in first for n in batch["frame"].tolist()] == [0, 2, 3, 5, 8]
+    assert [name for batch in first for name in batch["drive"]] == 2 * [TRAIN] + 3 * [VAL]
 
 
 # What is wrong

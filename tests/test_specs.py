@@ -62,8 +62,8 @@ def test_a_set_of_a_recording_with_its_reader(
     monkeypatch.chdir(border_drive.parent)
     (planned,) = plan([f"kitti:{DRIVE}"], None, Recipe())
     (as_path,) = plan([str(border_drive)], None, Recipe())
-    assert planned.source.data == f"kitti:{border_drive}"
-    assert planned.source.folder == as_path.source.folder == f"val/{DRIVE}"
+    assert planned.data == f"kitti:{border_drive}"
+    assert planned.folder == as_path.folder == f"val/{DRIVE}"
     assert planned.keys == as_path.keys == tuple(FRAMES)
 
     out = tmp_path / "out"

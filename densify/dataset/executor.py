@@ -1,18 +1,14 @@
 # SPDX-License-Identifier: MIT
-"""Calls done by a standard executor: in this process, in several processes of this machine, or by
-the workers of a Dask scheduler.
+"""Calls done in this process, or in several processes of this machine.
 
 This module imports nothing heavy: a worker process loads it before it knows its number of threads.
-By ``tcp://`` Dask trusts everybody who reaches the scheduler; ``tls://`` needs a certificate.
 """
 
 from __future__ import annotations
 
 import logging
-import logging.handlers
 import multiprocessing
 import os
-import queue
 import signal
 import threading
 from collections import deque
@@ -20,7 +16,6 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import (
     FIRST_COMPLETED,
     BrokenExecutor,
-    CancelledError,
     Executor,
     Future,
     ProcessPoolExecutor,
@@ -28,76 +23,65 @@ from concurrent.futures import (
 )
 from contextlib import contextmanager
 from functools import partial
-from typing import Any, NamedTuple, TypeVar
+from pathlib import Path
+from typing import Any, TypeVar
 
 from densify.config.errors import ComputationError, InputError
 from densify.pipeline.heap import keep_freed_memory
 
 Item = TypeVar("Item")
-_log = logging.getLogger("densify")
-_CONNECT_S = 10
 _DEATH = (
     "a worker process died of it twice (killed, or out of memory?); fewer --workers or a smaller "
     "--window take less memory"
 )
-_LOST = "the Dask scheduler was lost; run the same command again to go on"
 
 
 def call_all(
     call: Callable[[Item], Any],
     groups: Sequence[Sequence[Item]],
     num_workers: int = 1,
-    scheduler: str | None = None,
+    log: Path | None = None,
 ) -> Iterator[tuple[Item, Any]]:
     """Call ``call(item)`` for every item and yield each with its outcome as soon as it is over.
 
-    call: a function of a module. What it logs below ``densify`` is logged in this process.
+    call: a function of a module.
     groups: none empty. The first item of a group is over before the others of the group begin; what
         these have in common is then in the cache. Items are hashable and picklable.
-    num_workers: processes of this machine; 1 is this one. scheduler: address of a Dask scheduler
-        whose workers are used instead.
+    num_workers: processes; 1 is this one. log: the file to which other processes append their log.
 
     An item whose process dies is tried once more, alone. Its outcome is a ComputationError if that
     process dies too. InputError and ComputationError of ``call`` are raised; any other error is the
-    item's outcome as a ComputationError. Raises InputError for a scheduler that is not reached, and
-    ComputationError if the workers cannot begin or the scheduler is lost.
+    item's outcome as a ComputationError. Raises ComputationError if the workers cannot begin.
     """
+    if num_workers == 1:
+        for group in groups:
+            for item in group:
+                yield item, _outcome(partial(call, item))
+        return
     ready = deque(group[0] for group in groups)
     others = {group[0]: group[1:] for group in groups}
     suspects: deque[Item] = deque()  # at work when a process died
-    while ready or suspects:  # a new pool follows a broken one
-        with _open_executor(num_workers, scheduler) as (executor, num_slots):
-            there = call if executor is _HERE else partial(_call_with_log, call)
-            running: dict[Future[Any], Item] = {}
-            is_broken = False
-            while not is_broken:
-                alone = bool(suspects)
-                waiting = suspects or ready
-                while waiting and len(running) < (1 if alone else num_slots()):
-                    try:
-                        running[executor.submit(there, waiting[0])] = waiting[0]
-                    except BrokenExecutor:
-                        is_broken = True
-                        break
-                    waiting.popleft()
-                if not running:
-                    break
-                done = wait(running, return_when=FIRST_COMPLETED).done
-                if is_broken := any(_is_death(_outcome(future)) for future in done):
-                    done = wait(running).done
-                for future in done:
-                    item, outcome = running.pop(future), _outcome(future)
-                    if _is_death(outcome) and not alone:
-                        suspects.append(item)
-                        continue
-                    ready.extendleft(reversed(others.pop(item, ())))
-                    yield item, ComputationError(_DEATH) if _is_death(outcome) else outcome
+    while ready or suspects:
+        alone = bool(suspects)
+        waiting, most = (suspects, 1) if alone else (ready, num_workers)
+        for item, outcome in _until_a_death(call, waiting, most, log):
+            if isinstance(outcome, BrokenExecutor):
+                if not alone:
+                    suspects.append(item)
+                    continue
+                outcome = ComputationError(_DEATH)
+            ready.extendleft(reversed(others.pop(item, ())))
+            yield item, outcome
 
 
-def check_scheduler(scheduler: str) -> None:
-    """Raise InputError unless a Dask scheduler answers at this address."""
-    with _dask(scheduler):
-        pass
+def log_to(path: Path) -> logging.Handler:
+    """Append what is logged below ``densify`` in this process to a file; return its handler."""
+    handler = logging.FileHandler(path, encoding="utf-8")
+    handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
+    log = logging.getLogger("densify")
+    log.addHandler(handler)
+    log.setLevel(logging.DEBUG)
+    return handler
 
 
 def share_of_cores(num_workers: int) -> dict[str, str]:
@@ -108,90 +92,46 @@ def share_of_cores(num_workers: int) -> dict[str, str]:
     }
 
 
-class _Logged(NamedTuple):
-    """The value and the log of a call in another process."""
+def _until_a_death(
+    call: Callable[[Item], Any], waiting: deque[Item], num_workers: int, log: Path | None
+) -> Iterator[tuple[Item, Any]]:
+    """Call what waits until nothing does or a process dies, which costs all that are at work: their
+    outcome is a BrokenExecutor."""
+    running: dict[Future[Any], Item] = {}
+    with _open_pool(num_workers, log) as pool:
+        is_broken = False
+        while (waiting or running) and not is_broken:
+            try:
+                while waiting and len(running) < num_workers:
+                    running[pool.submit(call, waiting[0])] = waiting[0]
+                    waiting.popleft()
+            except BrokenExecutor:
+                is_broken = True
+            done = wait(running, return_when=FIRST_COMPLETED).done
+            if is_broken or any(isinstance(f.exception(), BrokenExecutor) for f in done):
+                is_broken, done = True, wait(running).done
+            for future in done:
+                yield running.pop(future), _outcome(future.result)
 
-    value: Any
-    records: list[logging.LogRecord]
 
-
-def _call_with_log(call: Callable[[Any], Any], item: Any) -> _Logged:
-    thread, records = threading.get_ident(), queue.SimpleQueue[logging.LogRecord]()
-    handler = logging.handlers.QueueHandler(records)
-    handler.addFilter(lambda record: record.thread == thread)  # a Dask worker may have several
-    level = _log.level
-    _log.addHandler(handler)
-    _log.setLevel(logging.DEBUG)
-    try:
-        return _Logged(call(item), [records.get() for _ in range(records.qsize())])
-    finally:
-        _log.removeHandler(handler)
-        _log.setLevel(level)
-
-
-def _outcome(future: Future[Any]) -> Any:
+def _outcome(result: Callable[[], Any]) -> Any:
     """Return a call's value, the BrokenExecutor, or an error that costs this item alone."""
     try:
-        value = future.result()
+        return result()
     except BrokenExecutor as error:
         return error
-    except (InputError, ComputationError, CancelledError):
-        raise  # CancelledError: by nobody here; a client that loses its scheduler cancels all
+    except (InputError, ComputationError):
+        raise
     except Exception as error:
         return ComputationError(f"{type(error).__name__}: {error}")
-    if not isinstance(value, _Logged):
-        return value
-    while value.records:
-        record = value.records.pop(0)
-        if (log := logging.getLogger(record.name)).isEnabledFor(record.levelno):
-            log.handle(record)
-    return value.value
-
-
-def _is_death(outcome: Any) -> bool:
-    return isinstance(outcome, BrokenExecutor)
 
 
 @contextmanager
-def _open_executor(
-    num_workers: int, scheduler: str | None
-) -> Iterator[tuple[Executor, Callable[[], int]]]:
-    """Open an executor; the function returns the number of calls that it can do at once."""
-    if scheduler is not None:
-        with _dask(scheduler) as client:
-            executor = client.get_executor(pure=False)  # pure: two equal calls would be one
-            try:
-                yield executor, lambda: max(1, sum(client.nthreads().values()))
-            except (OSError, RuntimeError, CancelledError) as error:
-                raise ComputationError(_LOST) from error
-    elif num_workers == 1:
-        yield _HERE, lambda: 1
-    else:
-        with _processes(num_workers) as pool:
-            yield pool, lambda: num_workers
-
-
-class _InThisProcess(Executor):
-    """Calls at once."""
-
-    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
-        future: Future[Any] = Future()
-        try:
-            future.set_result(fn(*args, **kwargs))
-        except Exception as error:
-            future.set_exception(error)
-        return future
-
-
-_HERE = _InThisProcess()
-
-
-@contextmanager
-def _processes(num_workers: int) -> Iterator[Executor]:
+def _open_pool(num_workers: int, log: Path | None) -> Iterator[Executor]:
     """Open processes of this machine, which end with the block, whatever they are at."""
     spawn, before = multiprocessing.get_context("spawn"), multiprocessing.active_children()
-    environment = share_of_cores(num_workers)
-    with ProcessPoolExecutor(num_workers, spawn, _begin, (environment,)) as pool:
+    given = (share_of_cores(num_workers), log)
+    with ProcessPoolExecutor(num_workers, spawn, _begin, given) as pool:
         try:
             pool.submit(os.getpid).result()
             yield pool
@@ -206,12 +146,14 @@ def _processes(num_workers: int) -> Iterator[Executor]:
             raise
 
 
-def _begin(environment: dict[str, str]) -> None:
+def _begin(environment: dict[str, str], log: Path | None) -> None:
     """Begin a worker process."""
     os.environ.update(environment)
     keep_freed_memory()
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # of the terminal: the command ends its workers
     threading.Thread(target=_end_with_parent, daemon=True).start()
+    if log is not None:
+        log_to(log)
 
 
 def _end_with_parent() -> None:
@@ -219,26 +161,3 @@ def _end_with_parent() -> None:
     if parent is not None:
         parent.join()
         os._exit(1)
-
-
-@contextmanager
-def _dask(scheduler: str) -> Iterator[Any]:
-    """Open a client of the scheduler."""
-    try:
-        from distributed import Client
-    except ImportError:
-        raise InputError(
-            f"scheduler {scheduler}: needs Dask, which is not installed; "
-            "pip install 'densify[cluster]'"
-        ) from None
-    logging.getLogger("distributed").setLevel(logging.CRITICAL + 1)  # no help for users
-    try:
-        client = Client(scheduler, timeout=_CONNECT_S, set_as_default=False)
-    except Exception as error:  # of many types
-        raise InputError(
-            f"scheduler {scheduler}: not reached within {_CONNECT_S} s ({error}), expected the "
-            f"address of a running Dask scheduler, such as tcp://host:8786; tls:// needs "
-            f"certificates that the scheduler trusts in Dask's configuration"
-        ) from error
-    with client:
-        yield client

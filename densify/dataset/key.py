@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import logging
-import platform
 import time
 import traceback
 from collections.abc import Mapping
@@ -13,17 +12,16 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-from densify import __version__
 from densify.config import as_mapping
 from densify.config.cache import Cache
 from densify.config.errors import ComputationError, InputError, OutputError, is_out_of_memory
 from densify.dataset.manifest import KeyRecord
-from densify.dataset.plan import Recipe, Source
+from densify.dataset.plan import Recipe
 from densify.geometry.types import Result
 from densify.outputs.kitti_tree import FileRecord, write_key
 from densify.outputs.store import write_result
 from densify.pipeline import run as pipeline
-from densify.pipeline.methods import with_baselines
+from densify.pipeline.key_result import with_baselines
 from densify.pipeline.recording import Recording
 from densify.readers import open_sequence
 
@@ -32,14 +30,19 @@ _log = logging.getLogger("densify")
 
 @dataclass(frozen=True)
 class Job:
-    """A recording of a set. out: the set's folder. run: another text for each run, because files
-    may change between runs while workers live on. version: of the densify that gives the job."""
+    """A recording of a set, as every process opens it.
 
-    source: Source
+    drive, data, folder, cameras: as `densify.dataset.plan.Drive`, the cameras' names. out: the
+    set's folder. run: another text for each run, because files may change between runs.
+    """
+
+    drive: str
+    data: str
+    folder: str
+    cameras: tuple[str, ...]
     recipe: Recipe
     out: Path
     run: str
-    version: str = __version__
 
 
 def make_key(job_and_key: tuple[Job, int]) -> KeyRecord:
@@ -51,22 +54,46 @@ def make_key(job_and_key: tuple[Job, int]) -> KeyRecord:
     except OutputError:
         raise
     except (InputError, ComputationError) as error:
-        record = KeyRecord(job.source.name, key, "failed", str(error))
+        record = KeyRecord(job.drive, key, "failed", str(error))
     except Exception as error:  # the other keys may go well
-        _log.debug("key %d of %s: %s", key, job.source.name, traceback.format_exc())
+        _log.debug("key %d of %s: %s", key, job.drive, traceback.format_exc())
         told = f"{type(error).__name__}: {error}"
         if is_out_of_memory(error):
             told = f"out of memory ({told}); fewer --workers or a smaller --window take less"
         else:
             told = f"this is a bug in densify; please report it with densify.log: {told}"
-        record = KeyRecord(job.source.name, key, "failed", told)
+        record = KeyRecord(job.drive, key, "failed", told)
     return replace(record, seconds=time.perf_counter() - start_s)
 
 
-def scores_of_metrics(metrics: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the scores that a manifest records, of ``Result.metrics`` or a metrics.json:
-    ``num_points``, ``num_moving``, ``ghost``, and by camera ``density``, ``density_filled``,
-    ``outliers`` and ``mae_m`` of the key held out. None: nothing can be said."""
+def _made(job: Job, key: int) -> KeyRecord:
+    recipe = job.recipe
+    recording, cache = _opened(job)
+    is_tree = recipe.layout == "kitti-depth"
+    # The tree's sparse input is the key sweep alone; the figure of a run shows all baselines.
+    methods = ["none", recipe.method] if is_tree else with_baselines(recipe.method)
+    results = pipeline.densify(
+        recording, key, tuple(dict.fromkeys(methods)), job.cameras, with_images=not is_tree
+    )
+    cache.trim()
+    result = results[recipe.method]
+    scores = _scores(result.metrics)
+    reason = recipe.gate.reason(scores, len(result.frames))
+    return KeyRecord(
+        job.drive,
+        key,
+        "done" if reason is None else "aside",
+        reason,
+        frames=result.frames,
+        files=_write(job, results) if reason is None else {},
+        scores=scores,
+        warnings=result.warnings,
+    )
+
+
+def _scores(metrics: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the scores of a manifest: ``num_points``, ``num_moving``, ``ghost``, and by camera
+    ``density``, ``density_filled``, ``outliers`` and ``mae_m`` of the key held out."""
     held_out = metrics["held_out"] or {}
     errors = {name: scores["measured"]["all"] for name, scores in held_out.items()}
     return {
@@ -80,42 +107,16 @@ def scores_of_metrics(metrics: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def _made(job: Job, key: int) -> KeyRecord:
-    recipe = job.recipe
-    recording, cache = _opened(job)
-    is_tree = recipe.layout == "kitti-depth"
-    # The tree's sparse input is the key sweep alone; the figure of a run shows all baselines.
-    methods = ["none", recipe.method] if is_tree else with_baselines(recipe.method)
-    results = pipeline.densify(
-        recording, key, tuple(dict.fromkeys(methods)), job.source.cameras, with_images=not is_tree
-    )
-    cache.trim()
-    result = results[recipe.method]
-    scores = scores_of_metrics(result.metrics)
-    record = KeyRecord(
-        job.source.name,
-        key,
-        "done",
-        frames=result.frames,
-        scores=scores,
-        warnings=result.warnings,
-    )
-    reason = recipe.gate.reason(scores, len(result.frames))
-    if reason is not None:
-        return replace(record, status="aside", reason=reason)
-    return replace(record, files=_write(job, results))
-
-
 def _write(job: Job, results: Mapping[str, Result]) -> dict[str, FileRecord]:
     result = results[job.recipe.method]
     if job.recipe.layout == "kitti-depth":
         sparse = results["none"].depth
-        return write_key(job.out, job.source.folder, result.key, sparse, result.depth)
+        return write_key(job.out, job.folder, result.key, sparse, result.depth)
     paths = write_result(
         result,
-        job.out / job.source.folder,
+        job.out / job.folder,
         config=as_mapping(job.recipe.config),
-        data=job.source.data,
+        data=job.data,
         overwrite=True,
         also=job.recipe.config.output.also,
     )
@@ -124,11 +125,6 @@ def _write(job: Job, results: Mapping[str, Result]) -> dict[str, FileRecord]:
 
 @lru_cache(maxsize=1)
 def _opened(job: Job) -> tuple[Recording, Cache]:
-    if job.version != __version__:
-        raise ComputationError(
-            f"the worker on {platform.node()} has densify {__version__}, the command has "
-            f"{job.version}; install the same on both"
-        )
-    cache, sequence = Cache(), open_sequence(job.source.data)
+    cache, sequence = Cache(), open_sequence(job.data)
     recording = Recording(sequence, job.recipe.config, job.recipe.window, cache=cache, run=job.run)
     return recording, cache

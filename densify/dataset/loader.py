@@ -6,8 +6,9 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Mapping, Sequence
+from functools import cache
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -16,20 +17,11 @@ from torch.utils.data import Dataset
 
 from densify.config.errors import InputError
 from densify.dataset.manifest import read_manifests
-from densify.dataset.plan import StoredDrive, read_plan, stored_drives
+from densify.dataset.plan import Drive, drives_of, read_plan
 from densify.depth.exposure import key_shots
-from densify.geometry.types import Camera, Float, Float32, LidarSequence
+from densify.geometry.types import Camera, LidarSequence
 from densify.outputs.depth_png import read_depth_png, read_stored
 from densify.readers import open_sequence
-
-LAYOUT = "kitti-depth"
-_MOST_CERTAIN, _LEAST_CERTAIN = 255, 1  # as stored; 0 is no depth
-
-
-class _Sample(NamedTuple):
-    drive: str
-    camera: str
-    frame: int
 
 
 class DepthDataset(Dataset[dict[str, Any]]):
@@ -45,10 +37,8 @@ class DepthDataset(Dataset[dict[str, Any]]):
         frame           int, absolute; drive, camera: str
 
     A flipped sample is a mirrored world: camera x becomes -x, the focal lengths stay positive. Of a
-    recording that is not rectified, ``intrinsics`` leave the lens's distortion out.
-
-    Each process opens recordings when it first needs them, so the set can be handed to the workers
-    of a DataLoader. Seed, epoch and index alone decide what is random.
+    recording that is not rectified, ``intrinsics`` leave the lens's distortion out. Crops and flips
+    are drawn by torch's generator: `torch.manual_seed` repeats them, in a DataLoader's workers too.
     """
 
     def __init__(
@@ -58,7 +48,6 @@ class DepthDataset(Dataset[dict[str, Any]]):
         filled: bool = False,
         crop: tuple[int, int] | None = None,
         flip: bool = False,
-        seed: int = 0,
         data: Mapping[str, str | Path] | None = None,
         split: Literal["train", "val"] | None = None,
     ) -> None:
@@ -68,7 +57,6 @@ class DepthDataset(Dataset[dict[str, Any]]):
         crop: (height_px, width_px), cut out at the bottom of the image, where the depth is, and at
             a random place from left to right.
         flip: mirror every other sample, at random.
-        seed: from 0; see `set_epoch`.
         data: drive -> where its recording is now, for `densify.open_sequence`; needed for those
             that have moved since the set was made.
         split: "train" or "val", KITTI's; both if None.
@@ -76,174 +64,124 @@ class DepthDataset(Dataset[dict[str, Any]]):
         Raises InputError if there is no set of this layout, nothing in it is left to load, or a
         crop is larger than an image; loading raises it for files that are missing or damaged.
         """
-        self._root = Path(root)
-        self._filled, self._crop, self._flip, self._seed = filled, crop, flip, seed
+        self._root, self._crop, self._flip = Path(root), crop, flip
+        self._dense = "groundtruth_filled" if filled else "groundtruth"
         self._drives = _read_drives(self._root)
         self._specs = {name: drive.data for name, drive in self._drives.items()}
         self._specs |= {name: str(spec) for name, spec in (data or {}).items()}
-        self._samples = self._find_samples(cameras, split)
-        self._check_crop()
-        # Shared: workers that live on from epoch to epoch see it change.
-        self._epoch = torch.zeros((), dtype=torch.int64).share_memory_()
-        self._opened: dict[tuple[int, str], LidarSequence] = {}
-
-    def set_epoch(self, epoch: int) -> None:
-        """Draw new crops and flips: call it before each epoch with its number, from 0."""
-        self._epoch.fill_(epoch)
+        self._samples = sorted(
+            (record.drive, camera, record.key)
+            for record in read_manifests(self._root).values()
+            if record.status == "done" and (drive := self._drives.get(record.drive)) is not None
+            if split is None or drive.folder.startswith(f"{split}/")
+            for camera in drive.cameras
+            if cameras is None or camera in cameras
+            if _map_path(drive, "groundtruth", camera, record.key) in record.files
+        )
+        if not self._samples:
+            there = sorted({name for drive in self._drives.values() for name in drive.cameras})
+            raise InputError(
+                f"{self._root}: nothing to load: no finished key in manifest*.jsonl of split "
+                f"{split} and cameras {cameras}, None for all; there are the cameras "
+                f"{', '.join(there)}; let densify dataset finish some"
+            )
+        for name, camera in sorted({sample[:2] for sample in self._samples}):
+            self._cut(name, self._drives[name].cameras[camera])
 
     def __len__(self) -> int:
         return len(self._samples)
 
     def __getitem__(self, index: int) -> dict[str, Any]:
         """Return the sample; see the class. Raises InputError for what is missing or damaged."""
-        sample = self._samples[index]
-        camera = self._drives[sample.drive].cameras[sample.camera]
-        maps = self._read_maps(sample, camera)
-        maps["image"] = self._read_image(sample, camera)
-        rows, columns, mirrored = self._view(camera, index % len(self))
-        step = -1 if mirrored else 1
-        tensors = {
-            name: torch.from_numpy(np.ascontiguousarray(array[..., rows, columns][..., ::step]))
-            for name, array in maps.items()
-        }
-        tensors["image"] = tensors["image"].to(torch.float32).div_(255)
-        K = _viewed_K(camera.K, rows.start, columns, mirrored)
-        return {
-            **tensors,
-            "intrinsics": torch.from_numpy(K.astype(np.float32)),
-            **sample._asdict(),
-        }
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_opened": {}}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__dict__.update(state)
-        self._epoch.share_memory_()
-
-    def _find_samples(self, cameras: Sequence[str] | None, split: str | None) -> list[_Sample]:
-        done = [r for r in read_manifests(self._root).values() if r.status == "done"]
-        samples = [
-            _Sample(record.drive, camera, record.key)
-            for record in done
-            if (drive := self._drives.get(record.drive)) is not None
-            if split is None or drive.folder.startswith(f"{split}/")
-            for camera in drive.cameras
-            if cameras is None or camera in cameras
-            if _map_path(drive, "groundtruth", camera, record.key) in record.files
-        ]
-        if not samples:
-            there = sorted({name for drive in self._drives.values() for name in drive.cameras})
-            raise InputError(
-                f"{self._root}: nothing to load: of {len(done)} finished keys in manifest*.jsonl, "
-                f"expected one of split {split} and cameras {cameras}, None for all; there are the "
-                f"cameras {', '.join(there)}; let densify dataset finish some"
-            )
-        return sorted(samples)
-
-    def _check_crop(self) -> None:
-        height_px, width_px = self._crop or (1, 1)
-        for name, camera in sorted({(s.drive, s.camera) for s in self._samples}):
-            size = self._drives[name].cameras[camera]
-            if not (0 < height_px <= size.height_px and 0 < width_px <= size.width_px):
-                raise InputError(
-                    f"crop: got {height_px} x {width_px} px (height x width), expected at most "
-                    f"the {size.height_px} x {size.width_px} of {camera} in {name}"
-                )
-
-    def _read_maps(self, sample: _Sample, camera: Camera) -> dict[str, NDArray[Any]]:
-        """Return the maps, (1,H,W) each."""
+        name, camera_name, frame = self._samples[index]
+        drive = self._drives[name]
+        camera, K = drive.cameras[camera_name], drive.cameras[camera_name].K.copy()
 
         def read(kind: str, reader: Callable[[Path], NDArray[Any]]) -> NDArray[Any]:
-            drive = self._drives[sample.drive]
-            path = self._root / _map_path(drive, kind, sample.camera, sample.frame)
+            path = self._root / _map_path(drive, kind, camera_name, frame)
             try:
-                stored = reader(path)
-                _check_size(str(path), stored, camera)
+                return _of_size(camera, str(path), reader(path))[None]
             except InputError as error:
                 raise InputError(
                     f"{error}; run densify dataset again with --verify, as the set was made: it "
                     f"makes missing and damaged files in {self._root} anew"
                 ) from None
-            return stored[None]
 
-        dense_m = read("groundtruth_filled" if self._filled else "groundtruth", read_depth_png)
+        dense_m = read(self._dense, read_depth_png)
         levels = read("confidence", lambda path: read_stored(path, np.uint8, "a confidence map"))
-        return {
+        maps = {
+            "image": self._image(name, camera, frame).transpose(2, 0, 1) / np.float32(255),
             "sparse_depth_m": read("velodyne_raw", read_depth_png),
             "dense_depth_m": dense_m,
-            "confidence": _confidence(levels, dense_m),
+            # 1 to 255, as `densify.outputs.depth_png.stored_confidence` gives
+            "confidence": np.where(dense_m > 0, (levels - np.float32(1)) / 254, 0).clip(0),
+        }
+        top, room_px, width_px = self._cut(name, camera)
+        left = int(torch.randint(room_px + 1, ()))
+        K[:2, 2] -= left, top
+        step = -1 if self._flip and torch.randint(2, ()) else 1
+        if step < 0:  # pixel u becomes width - 1 - u
+            K[0, 1:] = -K[0, 1], width_px - 1 - K[0, 2]
+        arrays = {n: array[:, top:, left : left + width_px] for n, array in maps.items()}
+        return {
+            **{n: torch.from_numpy(array[..., ::step].copy()) for n, array in arrays.items()},
+            "intrinsics": torch.from_numpy(K.astype(np.float32)),
+            **{"drive": name, "camera": camera_name, "frame": frame},
         }
 
-    def _read_image(self, sample: _Sample, camera: Camera) -> NDArray[np.uint8]:
-        """Return the image, (3,H,W)."""
-        recording = self._recording(sample.drive)
-        where = f"{self._specs[sample.drive]}: {sample.camera} of frame {sample.frame}"
-        number = key_shots(recording, [camera], sample.frame)[sample.camera].number
+    def _cut(self, drive: str, camera: Camera) -> tuple[int, int, int]:
+        """Return the first row of the crop, the columns it leaves over, and its width."""
+        height_px, width_px = self._crop or (camera.height_px, camera.width_px)
+        if 0 < height_px <= camera.height_px and 0 < width_px <= camera.width_px:
+            return camera.height_px - height_px, camera.width_px - width_px, width_px
+        raise InputError(
+            f"crop: got {height_px} x {width_px} px (height x width), expected at most the "
+            f"{camera.height_px} x {camera.width_px} of {camera.name} in {drive}"
+        )
+
+    def _image(self, drive: str, camera: Camera, frame: int) -> NDArray[np.uint8]:
+        """Return the image, (H,W,3)."""
+        spec = self._specs[drive]
+        try:
+            recording = _open(spec, os.getpid())
+        except InputError as error:
+            raise InputError(
+                f"{self._root}: drive {drive}: {error}; if the recording has moved, give "
+                f"data={{{drive!r}: where it is now}}"
+            ) from None
+        where = f"{spec}: {camera.name} of frame {frame}"
+        number = key_shots(recording, [camera], frame)[camera.name].number
         if number is None:
             raise InputError(f"{where}: the recording has no image near that sweep")
-        image = recording.image(sample.camera, number)
-        _check_size(where, image, camera)
-        return image.transpose(2, 0, 1)
-
-    def _recording(self, drive: str) -> LidarSequence:
-        here = (os.getpid(), drive)  # a forked worker opens its own
-        if here not in self._opened:
-            try:
-                self._opened[here] = open_sequence(self._specs[drive])
-            except InputError as error:
-                raise InputError(
-                    f"{self._root}: drive {drive}: {error}; if the recording has moved, give "
-                    f"data={{{drive!r}: where it is now}}"
-                ) from None
-        return self._opened[here]
-
-    def _view(self, camera: Camera, index: int) -> tuple[slice, slice, bool]:
-        """Return the rows and columns that are cut out, and whether they are mirrored."""
-        height_px, width_px = self._crop or (camera.height_px, camera.width_px)
-        random = np.random.default_rng([self._seed, int(self._epoch), index])
-        left = int(random.integers(camera.width_px - width_px + 1))
-        mirrored = bool(random.integers(2)) and self._flip
-        rows = slice(camera.height_px - height_px, camera.height_px)
-        return rows, slice(left, left + width_px), mirrored
+        return _of_size(camera, where, recording.image(camera.name, number))
 
 
-def _read_drives(root: Path) -> dict[str, StoredDrive]:
-    table = read_plan(root)
-    wanted = f"expected a set that densify dataset --layout {LAYOUT} made"
+@cache
+def _open(spec: str, process: int) -> LidarSequence:
+    """Open a recording; a forked process opens its own."""
+    return open_sequence(spec)
+
+
+def _read_drives(root: Path) -> dict[str, Drive]:
+    table, wanted = read_plan(root), "expected a set that densify dataset --layout kitti-depth made"
     if table is None:
         raise InputError(f"{root / 'dataset.json'}: no such file; {wanted}")
-    if table["layout"] != LAYOUT:
+    if table["layout"] != "kitti-depth":
         raise InputError(f"{root / 'dataset.json'}: got layout {table['layout']!r}; {wanted}")
-    return stored_drives(table)
+    return drives_of(table)
 
 
-def _map_path(drive: StoredDrive, kind: str, camera: str, frame: int) -> str:
+def _map_path(drive: Drive, kind: str, camera: str, frame: int) -> str:
     """Return the map's path in the set, as the manifest names it."""
     return f"{drive.folder}/proj_depth/{kind}/{camera}/{frame:010d}.png"
 
 
-def _check_size(where: str, image: NDArray[Any], camera: Camera) -> None:
+def _of_size(camera: Camera, where: str, image: NDArray[Any]) -> NDArray[Any]:
+    """Return the image. Raises InputError unless it has the camera's size."""
     height_px, width_px = image.shape[:2]
     if (height_px, width_px) != (camera.height_px, camera.width_px):
         raise InputError(
             f"{where}: got {width_px} x {height_px} px, expected {camera.width_px} x "
             f"{camera.height_px} as dataset.json says"
         )
-
-
-def _confidence(levels: NDArray[np.uint8], depth_m: Float32) -> Float32:
-    """Return 0 to 1, of what `densify.outputs.depth_png.stored_confidence` gave."""
-    known = (levels > 0) & (depth_m > 0)
-    scale = np.float32(1 / (_MOST_CERTAIN - _LEAST_CERTAIN))
-    return np.where(known, (levels.astype(np.float32) - _LEAST_CERTAIN) * scale, np.float32(0))
-
-
-def _viewed_K(K: Float, top: int, columns: slice, mirrored: bool) -> Float:
-    """Return K (3,3) after the crop and then the flip, which takes pixel u to width - 1 - u."""
-    viewed = K.copy()
-    viewed[:2, 2] -= columns.start, top
-    if mirrored:
-        viewed[0, 1] = -viewed[0, 1]
-        viewed[0, 2] = columns.stop - columns.start - 1 - viewed[0, 2]
-    return viewed
+    return image

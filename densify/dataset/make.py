@@ -10,7 +10,6 @@ import time
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from itertools import groupby
 from pathlib import Path
 from typing import Any
 from uuid import uuid4
@@ -18,7 +17,7 @@ from uuid import uuid4
 from densify.config import as_mapping
 from densify.config.cache import Cache
 from densify.config.errors import ComputationError, InputError, OutputError
-from densify.dataset.executor import call_all, check_scheduler
+from densify.dataset.executor import call_all, log_to
 from densify.dataset.key import Job, make_key
 from densify.dataset.manifest import (
     Key,
@@ -29,7 +28,7 @@ from densify.dataset.manifest import (
     read_manifests,
 )
 from densify.dataset.plan import (
-    PlannedDrive,
+    Drive,
     Recipe,
     check_place,
     plan,
@@ -45,7 +44,7 @@ from densify.outputs.kitti_tree import write_readme
 _log = logging.getLogger("densify")
 _LEAST_KEYS = 8  # of a process; fewer are made before another one has begun
 _BASE_BYTES, _SWEEP_BYTES = 1.5e9, 0.15e9  # of a process, and of a sweep of a 64-ring scanner
-Block = tuple[PlannedDrive, list[int]]
+Block = tuple[Drive, tuple[int, ...]]
 """A recording and the keys of one of its blocks."""
 
 
@@ -88,7 +87,6 @@ def make_dataset(
     recipe: Recipe | None = None,
     *,
     num_workers: int | None = 1,
-    scheduler: str | None = None,
     shard: tuple[int, int] | None = None,
     verify: bool = False,
     report: Callable[[Summary], None] | None = None,
@@ -100,9 +98,6 @@ def make_dataset(
     recipe: window, method, cameras and the like; the usual ones if None.
     num_workers: processes; 1 works in this one, None takes as many as cores, free memory and keys
         suffice for. A script that starts several needs ``if __name__ == "__main__"``.
-    scheduler: address of a Dask scheduler whose workers are used instead; they need the same files
-        at the same paths. ``tcp://`` trusts everybody on that network, ``tls://`` takes
-        certificates.
     shard: (i, n), the i-th of n parts of the work, from 1. Parts may run at the same time on
         machines that share ``out``.
     verify: compare finished files with their recorded hashes, and make damaged ones again.
@@ -122,19 +117,17 @@ def make_dataset(
     drives = plan(data, keys, recipe)
     check_place(out)
     Cache()  # refuses a folder that others can write to
-    if scheduler is not None:
-        check_scheduler(scheduler)
     num_workers = _num_processes(num_workers, recipe, drives)
     leftover_age_s = 0.0 if shard is None else LEFT_AFTER_S
     with Manifest(out, shard) as manifest:
         write_plan(out, recipe, drives)
-        with _log_file(out, shard):
+        with _log_file(out, shard) as log:
             clear_leftovers(out, leftover_age_s)
             if recipe.layout == "kitti-depth":
                 settings = as_mapping(recipe.config)
                 write_readme(out, method=recipe.method, window=recipe.window, settings=settings)
             blocks = _blocks(drives, shard)
-            wanted = {(drive.source.name, key) for drive, keys in blocks for key in keys}
+            wanted = {(drive.name, key) for drive, keys in blocks for key in keys}
             before = read_manifests(out)
             done = finished(before.values(), out, verify)
             records = {name: before[name] for name in sorted(wanted & done)}
@@ -146,7 +139,7 @@ def make_dataset(
                 num_workers,
             )
             left = _jobs(blocks, records.keys(), recipe, out, num_workers)
-            made = _made(call_all(make_key, left, num_workers, scheduler))
+            made = _made(call_all(make_key, left, num_workers, log))
             summary = _record(made, manifest, records, len(wanted), report)
             clear_leftovers(out, leftover_age_s)  # of workers that were killed
     return summary
@@ -169,7 +162,7 @@ def damaged(out: Path) -> list[str]:
     return [name for r in records if r.status != "failed" for name in damaged_files(r, out)]
 
 
-def _num_processes(wanted: int | None, recipe: Recipe, drives: Sequence[PlannedDrive]) -> int:
+def _num_processes(wanted: int | None, recipe: Recipe, drives: Sequence[Drive]) -> int:
     """Return the number wanted; if None, as many as cores, free memory and keys suffice for."""
     if wanted is not None:
         if wanted < 1:
@@ -191,10 +184,10 @@ def _free_bytes() -> float:
     return min(found, default=float("inf"))
 
 
-def _blocks(drives: Sequence[PlannedDrive], shard: tuple[int, int] | None) -> list[Block]:
+def _blocks(drives: Sequence[Drive], shard: tuple[int, int] | None) -> list[Block]:
     """Return the blocks of all drives, or the neighbouring ones of a shard."""
     i, n = shard or (1, 1)
-    blocks = [(d, [*keys]) for d in drives for _, keys in groupby(d.keys, d.cut.number_near)]
+    blocks = [(drive, keys) for drive in drives for keys in drive.blocks]
     return blocks[len(blocks) * (i - 1) // n : len(blocks) * i // n]
 
 
@@ -204,8 +197,9 @@ def _jobs(
     """Return the keys to make, in groups: the first key of a block makes what all of them share."""
     run, groups = uuid4().hex, []
     for drive, keys in blocks:
-        job = Job(drive.source, recipe, out.absolute(), run)
-        if group := [(job, key) for key in keys if (drive.source.name, key) not in done]:
+        cameras, place = tuple(drive.cameras), out.absolute()
+        job = Job(drive.name, drive.data, drive.folder, cameras, recipe, place, run)
+        if group := [(job, key) for key in keys if (drive.name, key) not in done]:
             groups.append(group)
     # Workers begin far from each other, because neighbouring blocks share steps too.
     step = math.ceil(len(groups) / num_workers)
@@ -215,7 +209,7 @@ def _jobs(
 def _made(outcomes: Iterator[tuple[tuple[Job, int], Any]]) -> Iterator[KeyRecord]:
     for (job, key), outcome in outcomes:
         if isinstance(outcome, Exception):
-            yield KeyRecord(job.source.name, key, "failed", str(outcome))
+            yield KeyRecord(job.drive, key, "failed", str(outcome))
         else:
             yield outcome
 
@@ -253,19 +247,16 @@ def _record(
 
 
 @contextmanager
-def _log_file(out: Path, shard: tuple[int, int] | None) -> Iterator[None]:
-    """Append what is logged to ``OUT/densify.log``, or a shard's own."""
+def _log_file(out: Path, shard: tuple[int, int] | None) -> Iterator[Path]:
+    """Append what is logged to ``OUT/densify.log``, or a shard's own; return its path."""
     name = "densify.log" if shard is None else f"densify-{shard[0]}of{shard[1]}.log"
+    before = _log.level
     try:
-        handler = logging.FileHandler(out / name, encoding="utf-8")
+        handler = log_to(out.absolute() / name)
     except OSError as error:
         raise OutputError(f"--out {out}: {name} cannot be written: {error.strerror}") from error
-    handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
-    before = _log.level
-    _log.addHandler(handler)
-    _log.setLevel(logging.DEBUG)
     try:
-        yield
+        yield out.absolute() / name
     finally:
         _log.removeHandler(handler)
         _log.setLevel(before)

@@ -18,7 +18,6 @@ The key of a damaged line is made again. A later line of a key replaces an earli
 from __future__ import annotations
 
 import fcntl
-import hashlib
 import json
 import logging
 import os
@@ -29,7 +28,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from densify.config.errors import InputError, OutputError
-from densify.config.file_content import open_file, parse_json, read_bytes
+from densify.config.file_content import parse_json, read_bytes
 from densify.outputs.atomic import write_file
 from densify.outputs.kitti_tree import FileRecord
 from densify.outputs.plain import plain
@@ -105,9 +104,22 @@ def read_manifests(root: Path) -> dict[Key, KeyRecord]:
     return dict(sorted(records.items()))
 
 
-def damaged_files(record: KeyRecord, root: Path) -> list[str]:
-    """Return the record's files, relative to ``root``, that are missing or hold something else."""
-    return [name for name, file in record.files.items() if _content(root / name) != file]
+def damaged_files(record: KeyRecord, root: Path, by_content: bool = True) -> list[str]:
+    """Return the record's files, relative to ``root``, that are missing or hold something else.
+
+    by_content: compare their hashes too, else their sizes alone.
+    """
+    damaged = []
+    for name, file in record.files.items():
+        try:
+            is_whole = (root / name).stat().st_size == file.num_bytes and (
+                not by_content or FileRecord.of(read_bytes(root / name, file.num_bytes)) == file
+            )
+        except (InputError, OSError):
+            is_whole = False
+        if not is_whole:
+            damaged.append(name)
+    return damaged
 
 
 def finished(records: Iterable[KeyRecord], root: Path, verify: bool = False) -> set[Key]:
@@ -118,10 +130,8 @@ def finished(records: Iterable[KeyRecord], root: Path, verify: bool = False) -> 
     return {
         r.name
         for r in records
-        if r.status != "failed"
-        and (r.files or r.status == "aside")
-        and all(_size(root / name) == file.num_bytes for name, file in r.files.items())
-        and not (verify and damaged_files(r, root))
+        if r.status == "aside" or (r.status == "done" and r.files)
+        if not damaged_files(r, root, verify)
     }
 
 
@@ -146,7 +156,6 @@ class Manifest:
             self._lock = os.open(root / f".{stem}.lock", os.O_RDWR | os.O_CREAT, 0o666)
             try:
                 _lock(self._lock, root)
-                self._lines = {name: line for name, (_, line) in _read(self.path).items()}
                 self._put_in_order()
             except BaseException:
                 os.close(self._lock)
@@ -165,18 +174,16 @@ class Manifest:
     def append(self, record: KeyRecord) -> None:
         """Add a key's record, or replace it. It is on the disk when this returns. Raises
         OutputError if it cannot be written."""
-        line = record.to_line()
         try:
             with self.path.open("ab") as file:
-                file.write(line)
+                file.write(record.to_line())
                 file.flush()
                 os.fsync(file.fileno())
         except OSError as error:
             raise self._not_written(error) from error
-        self._lines[record.name] = line
 
     def _put_in_order(self) -> None:
-        data = b"".join(line for _, line in sorted(self._lines.items()))
+        data = b"".join(line for _, (_, line) in sorted(_read(self.path).items()))
         if not self.path.exists() or read_bytes(self.path) != data:
             write_file(self.path, data)
 
@@ -208,22 +215,6 @@ def _read(path: Path) -> dict[Key, tuple[KeyRecord, bytes]]:
             damaged[0],
         )
     return records
-
-
-def _size(path: Path) -> int | None:
-    try:
-        return path.stat().st_size
-    except OSError:
-        return None
-
-
-def _content(path: Path) -> FileRecord | None:
-    with suppress(InputError, OSError), open_file(path) as file:
-        digest = hashlib.sha256()
-        while block := file.read(1 << 20):
-            digest.update(block)
-        return FileRecord(file.tell(), digest.hexdigest())
-    return None
 
 
 def _lock(lock: int, root: Path) -> None:

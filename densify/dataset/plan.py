@@ -15,8 +15,9 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
+from itertools import chain, groupby
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -28,7 +29,7 @@ from densify.geometry.types import Camera, LidarSequence
 from densify.outputs.atomic import write_file
 from densify.outputs.kitti_tree import drive_folder, split_of
 from densify.outputs.plain import plain
-from densify.pipeline.blocks import Cut
+from densify.pipeline.sweeps import Cut
 from densify.readers import Spec, open_sequence
 from densify.readers.timeline import Timeline, check_window, choose_cameras, format_frames, runs
 
@@ -60,16 +61,16 @@ class Gate:
 
     def reason(self, scores: Mapping[str, Any], num_sweeps: int) -> str | None:
         """Return why a key with these `scores` is put aside; None if it is not."""
+        ghost, outliers = scores["ghost"], scores["outliers"]
         if self.min_sweeps is not None and num_sweeps < self.min_sweeps:
             return f"{num_sweeps} sweeps, expected at least {self.min_sweeps}"
-        ghost = scores["ghost"]
-        if self.max_ghost is not None and ghost is not None and ghost > self.max_ghost:
+        if self.max_ghost is not None and (ghost or 0) > self.max_ghost:
             return f"ghost rate {ghost:.5f}, expected at most {self.max_ghost:g}"
         for camera, density in scores["density"].items():
             if self.min_density is not None and density < self.min_density:
                 return f"density {density:.4f} in {camera}, expected at least {self.min_density:g}"
-        for camera, share in scores["outliers"].items():
-            if self.max_outliers is not None and (share or 0) > self.max_outliers:
+            share = outliers.get(camera) or 0
+            if self.max_outliers is not None and share > self.max_outliers:
                 return f"outliers {share:.5f} in {camera}, expected at most {self.max_outliers:g}"
         return None
 
@@ -109,27 +110,26 @@ class Recipe:
 
 
 @dataclass(frozen=True)
-class Source:
-    """A recording, as every process opens it. name: as a folder's. data: what ``--data`` takes,
-    with an absolute path. folder: of its files, relative to the set's. cameras: those wanted."""
+class Drive:
+    """A recording of a set.
+
+    name: as a folder's. data: what ``--data`` takes, with an absolute path. folder: of its files,
+    relative to the set's. cameras: those wanted. blocks: its keys, ascending, those together that
+    share the steps of the pipeline.
+    """
 
     name: str
     data: str
     folder: str
-    cameras: tuple[str, ...]
+    cameras: Mapping[str, Camera]
+    blocks: tuple[tuple[int, ...], ...]
+
+    @property
+    def keys(self) -> tuple[int, ...]:
+        return tuple(chain.from_iterable(self.blocks))
 
 
-@dataclass(frozen=True)
-class PlannedDrive:
-    """A recording and its keys, ascending. cut: how the whole recording is cut into blocks."""
-
-    source: Source
-    keys: tuple[int, ...]
-    cameras: tuple[Camera, ...]
-    cut: Cut
-
-
-def plan(data: Sequence[str], keys: slice | None, recipe: Recipe) -> list[PlannedDrive]:
+def plan(data: Sequence[str], keys: slice | None, recipe: Recipe) -> list[Drive]:
     """Open every recording and choose its keys.
 
     data: what ``--data`` takes. keys: all if None, else of the frames ``start`` to ``stop`` - 1 by
@@ -138,25 +138,25 @@ def plan(data: Sequence[str], keys: slice | None, recipe: Recipe) -> list[Planne
     Raises InputError for recordings that cannot be opened, have equal names, no such camera, or
     none of the keys.
     """
-    drives: dict[str, PlannedDrive] = {}
+    drives: dict[str, Drive] = {}
     for spec in data:
         sequence = open_sequence(spec)
         name = drive_folder(sequence.name)
         if name in drives:
             raise InputError(
-                f"--data {spec}: {drives[name].source.data} is called {name} as well; give every "
+                f"--data {spec}: {drives[name].data} is called {name} as well; give every "
                 f"recording once, or make two sets with two --out"
             )
-        cameras = tuple(choose_cameras(sequence, recipe.cameras))
+        cameras = {camera.name: camera for camera in choose_cameras(sequence, recipe.cameras)}
         if not cameras:
             raise InputError(f"--data {spec}: has no camera; expected one to make depth maps for")
         folder = f"{recipe.split or split_of(sequence.name)}/{name}"
         if recipe.layout == "densify":
             folder = name if len(data) > 1 else "."
-        where = Spec.parse(spec).absolute()
-        source = Source(name, where, folder, tuple(camera.name for camera in cameras))
         cut = Cut.whole(Timeline.of(sequence), recipe.window)
-        drives[name] = PlannedDrive(source, _keys(sequence, keys, spec), cameras, cut)
+        grouped = groupby(_keys(sequence, keys, spec), cut.number_near)
+        blocks = tuple(tuple(block) for _, block in grouped)
+        drives[name] = Drive(name, Spec.parse(spec).absolute(), folder, cameras, blocks)
     return list(drives.values())
 
 
@@ -183,7 +183,7 @@ def check_place(out: Path) -> None:
         raise InputError(f"--out {out}: not empty, and no dataset.json in it; choose another")
 
 
-def write_plan(out: Path, recipe: Recipe, drives: Sequence[PlannedDrive]) -> None:
+def write_plan(out: Path, recipe: Recipe, drives: Sequence[Drive]) -> None:
     """Begin a set, or widen one made the same way.
 
     Raises InputError if another set is there, OutputError if it cannot be written.
@@ -212,8 +212,7 @@ def read_plan(out: Path) -> dict[str, Any] | None:
     try:
         table = read_json(path)
         if table["schema_version"] == SCHEMA_VERSION:
-            stored_drives(table)
-            planned_keys(table)
+            drives_of(table)
             return {name: table[name] for name in ("schema_version", *_SAME, "drives")}
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         told = f"it has no {error.args[0]}" if isinstance(error, KeyError) else str(error)
@@ -226,45 +225,37 @@ def read_plan(out: Path) -> dict[str, Any] | None:
     )
 
 
-class StoredDrive(NamedTuple):
-    """A recording of dataset.json. data: what ``--data`` takes. folder: of its files, relative to
-    the set's."""
-
-    data: str
-    folder: str
-    cameras: Mapping[str, Camera]
-
-
-def stored_drives(table: Mapping[str, Any]) -> dict[str, StoredDrive]:
-    """Return the recordings of what `read_plan` gave, by name."""
+def drives_of(table: Mapping[str, Any]) -> dict[str, Drive]:
+    """Return the recordings of what `read_plan` gave, by name, each as one block."""
     found = {}
     for name, drive in table["drives"].items():
         cameras = {n: _camera(n, camera) for n, camera in drive["cameras"].items()}
-        found[name] = StoredDrive(drive["data"], drive["folder"], cameras)
+        blocks = (tuple(_frames(drive["frames"])),)
+        found[name] = Drive(name, drive["data"], drive["folder"], cameras, blocks)
     return found
 
 
 def planned_keys(table: Mapping[str, Any]) -> set[tuple[str, int]]:
     """Return (drive, frame) of every key in a dataset.json."""
-    return {(n, f) for n, drive in table["drives"].items() for f in _frames(drive["frames"])}
+    return {(name, key) for name, drive in drives_of(table).items() for key in drive.keys}
 
 
-def _table(recipe: Recipe, drives: Sequence[PlannedDrive]) -> dict[str, Any]:
+def _table(recipe: Recipe, drives: Sequence[Drive]) -> dict[str, Any]:
     table = {
         "schema_version": SCHEMA_VERSION,
         "densify": __version__,
-        "layout": recipe.layout,
-        "method": recipe.method,
-        "window": recipe.window,
-        "cameras": recipe.cameras,
+        **{name: getattr(recipe, name) for name in ("layout", "method", "window", "cameras")},
         "gate": asdict(recipe.gate),
         "config": as_mapping(recipe.config),
         "drives": {
-            d.source.name: {
-                "data": d.source.data,
-                "folder": d.source.folder,
+            d.name: {
+                "data": d.data,
+                "folder": d.folder,
                 "frames": _as_runs(d.keys),
-                "cameras": {c.name: {n: getattr(c, n) for n in _CAMERA} for c in d.cameras},
+                "cameras": {
+                    name: {part: getattr(camera, part) for part in _CAMERA}
+                    for name, camera in d.cameras.items()
+                },
             }
             for d in drives
         },
