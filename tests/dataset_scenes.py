@@ -17,7 +17,7 @@ import numpy as np
 
 import densify
 from densify.dataset.manifest import damaged_files, read_manifests
-from densify.pipeline.blocks import BLOCK_S
+from densify.pipeline.sweeps import BLOCK_S
 from tests.command import files_in
 from tests.scenes import (
     CAMERA,

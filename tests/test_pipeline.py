@@ -11,7 +11,7 @@ from densify.config import RegisterSettings
 from densify.free_space.range_image import RangeImage
 from densify.geometry import poses
 from densify.geometry.types import Result
-from densify.pipeline.methods import METHODS
+from densify.pipeline.key_result import METHODS
 from densify.pipeline.run import compare
 from densify.readers.timeline import read_sweep
 from densify.scores.cloud_scores import ghosts

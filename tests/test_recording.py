@@ -16,9 +16,9 @@ from densify.config.cache import Cache
 from densify.config.errors import InputError, SweepError
 from densify.geometry import poses
 from densify.geometry.types import Sweep
-from densify.pipeline import blocks
 from densify.pipeline import recording as recording_module
 from densify.pipeline import run as pipeline
+from densify.pipeline import sweeps
 from densify.pipeline.recording import Recording
 from densify.readers.street import Street
 from tests.dataset_scenes import BORDER, across_border
@@ -32,8 +32,8 @@ GIVEN = resolve(POSES_GIVEN)
 @pytest.fixture
 def small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
     """Blocks of 6 sweeps that look 4 beyond, so that short recordings have many."""
-    monkeypatch.setattr(blocks, "BLOCK_S", 0.6)
-    monkeypatch.setattr(blocks, "AROUND_S", 0.4)
+    monkeypatch.setattr(sweeps, "BLOCK_S", 0.6)
+    monkeypatch.setattr(sweeps, "AROUND_S", 0.4)
 
 
 @pytest.fixture(scope="module")

@@ -23,7 +23,7 @@ from densify.geometry.cameras import converted, depth_along, rays
 from densify.geometry.types import Bool, Camera, Float32, LidarSequence, Progress, Result, Sweep
 from densify.pipeline import run as pipeline
 from densify.pipeline.costs import Watch
-from densify.pipeline.methods import METHODS, looks_around
+from densify.pipeline.key_result import METHODS, looks_around
 from densify.pipeline.recording import Recording
 from densify.readers.timeline import choose_cameras
 from densify.scores.depth_metrics import image_density, is_outlier_depth

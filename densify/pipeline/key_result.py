@@ -1,26 +1,70 @@
 # SPDX-License-Identifier: MIT
-"""One method's result for a key: see the cloud, project, fill, score."""
+"""The methods of accumulation, and one method's result for a key: see the cloud, project, fill,
+score."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from densify.config.errors import InputError
 from densify.depth.confidence import expected_outliers, reliability
 from densify.depth.exposure import Shot
 from densify.depth.views import HeldOut, SeenCloud, Views, with_ages
 from densify.free_space.range_image import RangeImage
 from densify.geometry.types import Bool, Cloud, DepthMap, Float32, Result, Stretch
 from densify.pipeline.costs import Watch
-from densify.pipeline.methods import METHODS, Method
 from densify.pipeline.recording import Beyond, Moment, Recording
 from densify.scores import depth_metrics
 from densify.scores.cloud_scores import ghost_scores
 
-Image = NDArray[np.uint8]
+
+class Method(NamedTuple):
+    """One method.
+
+    all_sweeps: of the window; else the key sweep alone. engine: of scene flow (``flow.engine``),
+    "" for the configured one, None for rigid accumulation. visible: occluded and doubtful points
+    are rejected; else each pixel shows its nearest point. far: with static surfaces beyond the
+    window (``accumulate.far_m``).
+    """
+
+    all_sweeps: bool
+    engine: str | None
+    visible: bool
+    far: bool
+
+
+METHODS = {
+    "none": Method(False, None, False, False),
+    "icp": Method(True, None, False, False),
+    "icp-far": Method(True, None, False, True),
+    "icp-visible": Method(True, None, True, True),
+    "flow-plain": Method(True, "", False, False),
+    "paper": Method(True, "paper", True, True),
+    "flow": Method(True, "", True, True),
+}
+"""Single sweep; rigid accumulation of the window, with the road beyond it, with visibility; our
+scene flow without visibility; the published scene flow; ours."""
+
+RUN = ("none", "icp", "flow")
+"""The methods of `run`, each with those before it as its baselines."""
+COMPARED = ("none", "icp", "icp-far", "paper", "flow")
+"""The methods that `compare` shows by default."""
+
+
+def with_baselines(method: str) -> tuple[str, ...]:
+    """Return a method of `RUN` behind the simpler ones. Raises InputError for another one."""
+    if method not in RUN:
+        raise InputError(f"--method {method}: expected one of {', '.join(RUN)}")
+    return RUN[: RUN.index(method) + 1]
+
+
+def looks_around(methods: Sequence[str]) -> bool:
+    """Return True if one of the methods finds what moves."""
+    return any(METHODS[name].engine is not None for name in methods if name in METHODS)
 
 
 class KeyScene:
@@ -38,7 +82,7 @@ class KeyScene:
         key: int,
         stretch: Stretch,
         shots: Mapping[str, Shot],
-        images: Mapping[str, Image],
+        images: Mapping[str, NDArray[np.uint8]],
         moment: Moment,
         beyond: Beyond | None,
         with_images: bool,

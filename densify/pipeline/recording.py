@@ -9,13 +9,12 @@
 
 Sweeps that cannot be read or registered, and holes in time, split a block into pieces, each with a
 world of its own. `run` and `compare` cut blocks around a few keys, which look at nothing else;
-`dataset` and `flow_steps` cut the whole recording (`densify.pipeline.blocks`). Registration, motion
+`dataset` and `flow_steps` cut the whole recording (`densify.pipeline.sweeps`). Registration, motion
 and far are kept in the cache.
 """
 
 from __future__ import annotations
 
-import types
 from collections.abc import Callable, Collection, Iterable, Sequence
 from functools import lru_cache
 from typing import Any, NamedTuple, TypeVar, cast
@@ -41,16 +40,29 @@ from densify.geometry.types import (
     StretchFlow,
     Trajectory,
 )
-from densify.pipeline.blocks import Cut
 from densify.pipeline.costs import Watch
 from densify.pipeline.road import Road
-from densify.pipeline.sweeps import Sweeps
+from densify.pipeline.sweeps import Cut, Sweeps
 from densify.readers.timeline import Timeline, WindowFrames, recorded_trajectory
 from densify.registration.deskew import deskew
 from densify.registration.trajectory import LeftOut, Registration, find_trajectory
 
 T = TypeVar("T")
 LEAD_IN_S = 0.5  # sweeps before a block from which odometry learns the speed
+
+
+class Piece(NamedTuple):
+    """Registered sweeps of one block and one world.
+
+    number: of the block. row: of the piece in it. poses: of its sweeps, and of one before them
+    to tell how the lidar moved; the world is the lidar of the first of ``frames``, upright.
+    frames: of its sweeps.
+    """
+
+    number: int
+    row: int
+    poses: Trajectory
+    frames: tuple[int, ...]
 
 
 class Moment(NamedTuple):
@@ -108,6 +120,7 @@ class Recording:
         )
         self.registration = lru_cache(maxsize=2)(self._registration)
         self._pieces = lru_cache(maxsize=2)(self._find_pieces)
+        # By the number of a block and the row of a piece, because a piece cannot be hashed.
         self._deskewed = lru_cache(maxsize=most)(self._deskew)
         self._stretch = lru_cache(maxsize=1)(self._make_stretch)
         self._ground = lru_cache(maxsize=2)(self._find_ground)
@@ -141,8 +154,8 @@ class Recording:
             raise bad[key].error(key)
         reasons = {f: why.reason for f, why in bad.items()}
         window = self.timeline.window(key, self._num_around, reasons)
-        piece = self._piece(key)
-        window = WindowFrames(tuple(f for f in window.frames if f in piece.frames), window.cuts)
+        piece = frozenset(self._piece(key).poses.frames)
+        window = WindowFrames(tuple(f for f in window.frames if f in piece), window.cuts)
         failed = [f for f in whole.frames if f in bad and not bad[f].unreadable]
         if failed and len(window.frames) == 1:
             raise bad[failed[0]].error(failed[0])
@@ -154,32 +167,35 @@ class Recording:
 
     def around(self, key: int) -> Stretch:
         """Return the sweeps in which the motion in a key's window is found."""
-        return self._stretch(self.cut.number_of[key], self._frames_around(key))
+        piece = self._piece(key)
+        return self._stretch(piece.number, piece.frames)
 
     def is_pair(self, key: int) -> bool:
         """Return True if there are two sweeps around a key: a track needs three."""
-        return len(self._frames_around(key)) == 2
+        return len(self._piece(key).frames) == 2
 
     def motion(self, key: int, engine: str | None = None) -> Motion:
         """Return the motion of everything in a key's window.
 
         engine: None for that of ``flow.engine``; for two sweeps ``pairs`` replaces ``groups``.
         """
-        engine, number = engine or self.settings.flow.engine, self.cut.number_of[key]
-        window, index = self.window(key), self._piece_number(key)
+        engine, window, piece = (
+            engine or self.settings.flow.engine,
+            self.window(key),
+            self._piece(key),
+        )
         if engine == "groups" and self.is_pair(key):
             engine = "pairs"
         if not engine_row(engine)[0].shared:
-            return estimate_motion(
-                Scene(window, self._ground(number)[index]), self.settings, engine
-            )
+            scene = Scene(window, self._ground(piece.number, piece.row))
+            return estimate_motion(scene, self.settings, engine)
         # All poses, but the points of the window only.
-        at_hand, piece = {s.frame: s for s in window.sweeps}, self._piece(key)
+        at_hand = {s.frame: s for s in window.sweeps}
         sweeps = [
-            at_hand.get(f) or RegisteredSweep.without_points(piece, f)
-            for f in self._frames_around(key)
+            at_hand.get(f) or RegisteredSweep.without_points(piece.poses, f) for f in piece.frames
         ]
-        return self._motion(number, engine)[index].with_stretch(Stretch(tuple(sweeps)))
+        motion = self._motion(piece.number, piece.row, engine)
+        return motion.with_stretch(Stretch(tuple(sweeps)))
 
     def step(self, frame: int) -> StretchFlow:
         """Return the flow of a sweep to the next; no step where none follows.
@@ -224,22 +240,17 @@ class Recording:
         """
         if not self.settings.accumulate.far_m:
             return None
-        found = self._far(self.cut.number_of[key])[self._piece_number(key)]
+        piece = self._piece(key)
+        found = self._far(piece.number, piece.row)
         if not len(found.frames):
             return None
-        piece = self._piece(key)
-        return Beyond(found, poses.inverse(piece.T_world_lidar[piece.frames.index(key)]))
+        return Beyond(
+            found, poses.inverse(piece.poses.T_world_lidar[piece.poses.frames.index(key)])
+        )
 
-    def _piece_number(self, key: int) -> int:
-        """Return which of the pieces of its block holds the key."""
+    def _piece(self, key: int) -> Piece:
         pieces = self._pieces(self.cut.number_of[key])
-        return next(i for i, piece in enumerate(pieces) if key in piece.frames)
-
-    def _piece(self, key: int) -> Trajectory:
-        return self._pieces(self.cut.number_of[key])[self._piece_number(key)]
-
-    def _frames_around(self, key: int) -> tuple[int, ...]:
-        return self._frames(self.cut.number_of[key])[self._piece_number(key)]
+        return next(piece for piece in pieces if key in piece.frames)
 
     # The steps of a block
 
@@ -279,86 +290,67 @@ class Recording:
         block = self.cut.blocks[number]
         return [*self.timeline.before(block[0], self.timeline.num_in(LEAD_IN_S)), *block]
 
-    def _find_pieces(self, number: int) -> list[Trajectory]:
-        """Return the poses of each piece, and of one sweep before it to tell how the lidar moved.
-
-        The world is the lidar of the piece's first sweep in the block, upright.
-        """
+    def _find_pieces(self, number: int) -> list[Piece]:
+        """Return the pieces of a block."""
         block = frozenset(self.cut.blocks[number])
         wanted = block.union(self.timeline.before(self.cut.blocks[number][0], 1))
-        pieces = []
+        pieces = list[Piece]()
         for piece in self.registration(number).pieces:
-            in_block = [f for f in piece.frames if f in block]
-            if in_block:
-                part = piece.part([f for f in piece.frames if f in wanted])
-                pieces.append(part.seen_from(in_block[0]))
+            frames = tuple(f for f in piece.frames if f in block)
+            if frames:
+                part = piece.part([f for f in piece.frames if f in wanted]).seen_from(frames[0])
+                pieces.append(Piece(number, len(pieces), part, frames))
         return pieces
-
-    def _frames(self, number: int) -> list[tuple[int, ...]]:
-        """Return the frames of each piece, without the one before it."""
-        block = frozenset(self.cut.blocks[number])
-        return [tuple(f for f in p.frames if f in block) for p in self._pieces(number)]
 
     def _deskew(self, number: int, frame: int) -> RegisteredSweep:
         piece = next(p for p in self._pieces(number) if frame in p.frames)
         sweep = self._sweeps.read(frame)
         with self._watch.stage("deskew"):
-            return deskew([sweep], piece).sweeps[0]
+            return deskew([sweep], piece.poses).sweeps[0]
 
     def _make_stretch(self, number: int, frames: tuple[int, ...]) -> Stretch:
         """Return these sweeps of one piece, deskewed, in its world."""
         return Stretch(tuple(self._deskewed(number, f) for f in frames))
 
-    def _find_ground(self, number: int) -> list[HeightMap]:
-        """Return the ground under each piece."""
-        found = []
-        for frames in self._frames(number):
-            stretch = self._stretch(number, frames)
-            with self._watch.stage("ground"):
-                found.append(ground(stretch))
-        return found
+    def _find_ground(self, number: int, row: int) -> HeightMap:
+        """Return the ground under a piece."""
+        stretch = self._stretch(number, self._pieces(number)[row].frames)
+        with self._watch.stage("ground"):
+            return ground(stretch)
 
-    def _find_motion(self, number: int, engine: str) -> list[SharedMotion]:
-        """Return the motion in each piece, without its points."""
-        asked = self._in_windows(number)
+    def _find_motion(self, number: int, row: int, engine: str) -> SharedMotion:
+        """Return the motion in a piece, without its points."""
+        asked, frames = self._in_windows(number), self._pieces(number)[row].frames
 
-        def make() -> list[SharedMotion]:
-            motions = []
-            for frames, heights in zip(self._frames(number), self._ground(number), strict=True):
-                scene = Scene(self._stretch(number, frames), heights, asked=asked)
-                with self._watch.stage("flow"):
-                    motion = estimate_motion(scene, self.settings, engine)
-                motions.append(cast(SharedMotion, motion).with_stretch(Stretch(())))
-            return motions
+        def make() -> SharedMotion:
+            stretch, heights = self._stretch(number, frames), self._ground(number, row)
+            with self._watch.stage("flow"):
+                scene = Scene(stretch, heights, asked=asked)
+                motion = estimate_motion(scene, self.settings, engine)
+            return cast(SharedMotion, motion).with_stretch(Stretch(()))
 
-        kind: Any = types.GenericAlias(list, (motion_type(engine),))
-        settings = [engine, self.settings.flow, self.settings.objective, sorted(asked)]
-        frames = self._registered_together(number)
-        found: list[SharedMotion] = self._kept("motion", kind, frames, make, settings)
-        return found
+        settings = [engine, self.settings.flow, self.settings.objective, sorted(asked), row]
+        together = self._registered_together(number)
+        return self._kept("motion", motion_type(engine), together, make, settings)
 
-    def _find_far(self, number: int) -> list[StandingWorld]:
-        """Return the static surfaces along the road of each piece, in its world."""
+    def _find_far(self, number: int, row: int) -> StandingWorld:
+        """Return the static surfaces along the road of a piece, in its world."""
         cameras = list(self.sequence.cameras.values())
         far_m, settings = self.settings.accumulate.far_m, self.settings.register
         road = Road(self.timeline, self._sweeps, cameras, settings, far_m)
         # Sweeps of the block beyond the windows are as far as the rest of the road.
-        inside, pieces = self._in_windows(number), self._frames(number)
-        near = [tuple(f for f in frames if f in inside) or frames for frames in pieces]
+        inside, frames = self._in_windows(number), self._pieces(number)[row].frames
+        near = tuple(f for f in frames if f in inside) or frames
 
-        def make() -> list[StandingWorld]:
-            worlds = []
-            for frames in near:
-                keys = [k for k in self.cut.keys_of(number) if k in frames]
-                stretch = self._stretch(number, frames)
-                with self._watch.stage("far"):
-                    worlds.append(road.find_standing(stretch, keys, with_near=len(keys) > 1))
-            return worlds
+        def make() -> StandingWorld:
+            keys = [k for k in self.cut.keys_of(number) if k in near]
+            stretch = self._stretch(number, near)
+            with self._watch.stage("far"):
+                return road.find_standing(stretch, keys, with_near=len(keys) > 1)
 
         if not self._is_whole:  # to make it costs less than to read the road for a digest
             return make()
-        along = sorted({f for frames in near for f in road.frames(frames)})
-        return self._kept("far", list[StandingWorld], along, make, [far_m, cameras, near])
+        return self._kept("far", StandingWorld, road.frames(near), make, [far_m, cameras, near])
 
     def _in_windows(self, number: int) -> frozenset[int]:
         """Return the frames of the windows of a block's keys."""

@@ -29,8 +29,14 @@ from densify.flow.engines import check_engine
 from densify.geometry.threads import num_threads
 from densify.geometry.types import LidarSequence, Progress, Result, StretchFlow
 from densify.pipeline.costs import Watch
-from densify.pipeline.key_result import KeyScene, result_of_method
-from densify.pipeline.methods import COMPARED, METHODS, looks_around, with_baselines
+from densify.pipeline.key_result import (
+    COMPARED,
+    METHODS,
+    KeyScene,
+    looks_around,
+    result_of_method,
+    with_baselines,
+)
 from densify.pipeline.recording import Recording
 from densify.pipeline.warnings import add_warnings, warn_of_window
 from densify.readers.timeline import choose_cameras

@@ -12,7 +12,7 @@ from densify.config import Config
 from densify.depth.exposure import Shot
 from densify.free_space.ground import find_up_axis
 from densify.geometry.types import LidarSequence, Result, Stretch
-from densify.pipeline.methods import METHODS
+from densify.pipeline.key_result import METHODS
 from densify.readers.timeline import WindowFrames, format_frames
 from densify.scores.depth_metrics import image_density
 

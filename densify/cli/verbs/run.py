@@ -150,7 +150,7 @@ def answer_compare(options: argparse.Namespace) -> Iterator[Answer]:
     from densify.dataset.report import write_comparison_page
     from densify.outputs import check_writable, write_comparison
     from densify.pipeline import run as pipeline
-    from densify.pipeline.methods import COMPARED
+    from densify.pipeline.key_result import COMPARED
     from densify.readers import open_sequence
 
     check_writable(options.out, options.key, options.overwrite, "compare")
