@@ -34,8 +34,6 @@ from densify.outputs.atomic import file_aside, write_file, writing_to
 from densify.outputs.key_outputs import Context
 from densify.readers.extras import needed
 
-FORMATS = ("npz", "av2", "opensceneflow")
-
 FlowWriter = Callable[[int, StretchFlow], Path]
 """Writes a sweep and its flow to the next, the only step it is given (none: the last sweep), and
 returns the folder of its file."""
@@ -130,7 +128,7 @@ def flow_writer(
     """Yield a writer for these sweeps. Each file appears when it is complete, opensceneflow's with
     all sweeps in it.
 
-    form: of `FORMATS`. Raises InputError for a package that is not installed and for files that are
+    form: npz, av2 or opensceneflow. Raises InputError for a missing package and for files that are
     there and not to be overwritten, OutputError if nothing can be written.
     """
     name = "".join(c if c.isalnum() or c in "-_." else "_" for c in sequence.name)

@@ -78,8 +78,14 @@ def write_street(
     if format not in FORMATS:
         raise InputError(f"--format {format}: expected one of {', '.join(FORMATS)}")
     excerpt, is_kitti = Excerpt.of(street, frames, cameras), format == "kitti"
-    if is_kitti:
-        _check_fits_kitti(excerpt, out)
+    if is_kitti and not street.simulator.sensor.azimuth_tells_time:
+        fit = [sensor.name for sensor in SENSORS.values() if sensor.azimuth_tells_time]
+        raise InputError(
+            f"{street.name}: cannot be written as KITTI, whose points have neither a time nor a "
+            f"scanner; choose a single scanner that spins: {', '.join(fit)}"
+        )
+    for name in excerpt.cameras if is_kitti else ():
+        camera_named({usual: CAMERAS[usual] for usual in USUAL}, name, out)
     place, owned = (_DATE, (_DRIVE, *_CALIBRATION)) if is_kitti else ("street", _FOLDER)
     for name in owned:
         if (out / place / name).exists() and not overwrite:
@@ -234,19 +240,6 @@ def config_text(excerpt: Excerpt) -> str:
     }
     text = yaml.safe_dump(config, sort_keys=False, default_flow_style=None, width=100)
     return f"# What the other files of this folder do not say.\n{text}"
-
-
-def _check_fits_kitti(excerpt: Excerpt, out: Path) -> None:
-    """Raise InputError for a camera other than image_02 and image_03, and for a sensor whose
-    azimuths do not tell the points' times."""
-    for name in excerpt.cameras:
-        camera_named({usual: CAMERAS[usual] for usual in USUAL}, name, out)
-    if not excerpt.street.simulator.sensor.azimuth_tells_time:
-        fit = [sensor.name for sensor in SENSORS.values() if sensor.azimuth_tells_time]
-        raise InputError(
-            f"{excerpt.street.name}: cannot be written as KITTI, whose points have neither a time "
-            f"nor a scanner; choose a single scanner that spins: {', '.join(fit)}"
-        )
 
 
 def _write_kitti(excerpt: Excerpt, folder: Path, progress: Progress) -> None:

@@ -40,7 +40,6 @@ _NOT_OF_METHODS = {"depth", "depth_filled", "confidence", "age", "sweep", "reaso
 _TRIAL_LEVEL, _LEVEL = 1, 7
 _LEVELS = 65535
 _MOST_POINTS = 500_000
-_MOST_DISPLACED_M = 65.0
 _CONFIDENCE_STEPS = 31
 _GRAY = 50, 190  # reflectance 0 and 1, where no camera observed the point
 _NEAR_M, _MOVING_WEIGHT = 4.0, 100.0
@@ -125,31 +124,24 @@ def packed_camera(
 
 
 def packed_cloud(
-    blobs: Blobs,
-    cloud: StoredCloud,
-    frames: Sequence[int],
-    instances: Sequence[int],
-    most_points: int = _MOST_POINTS,
+    blobs: Blobs, cloud: StoredCloud, frames: Sequence[int], instances: Sequence[int]
 ) -> dict[str, Any]:
-    """Return the cloud's entry of the page: the points of `thinned`, moving ones first, each part
-    in space order. Positions are 16-bit numbers in a box.
+    """Return the cloud's entry of the page: the points of `thinned`, moving ones first. Positions
+    are 16-bit numbers in a box.
 
     frames: the sweeps that ``sweep`` numbers. instances: the tracked objects; ``mover`` is 0 of
     static points, 1 of moving points without a track, 2 and up of these. ``displaced``, metres
     beyond the rigid alignment, is of moving points alone, in ``displaced_step_m`` plus 32768.
     """
-    rows = thinned(cloud.points, cloud.moving, most_points)
-    points = cloud.points[rows]
-    low = points.min(axis=0, initial=0.0)
-    step_m = float(max((points - low).max(initial=0.0), 1e-3) / _LEVELS)
-    places = np.rint((points - low) / step_m).astype(np.int64)
-    order = np.lexsort((_space_code(places), ~cloud.moving[rows]))
-    chosen, places = cloud.select(rows[order]), places[order]
+    rows = thinned(cloud.points, cloud.moving, _MOST_POINTS)
+    chosen = cloud.select(rows[np.argsort(~cloud.moving[rows], kind="stable")])
+    low = chosen.points.min(axis=0, initial=0.0)
+    step_m = float(max((chosen.points - low).max(initial=0.0), 1e-3) / _LEVELS)
+    places = np.rint((chosen.points - low) / step_m)
     num_moving = int(chosen.moving.sum())
     movers = _numbers(chosen.instance, [-1, *instances]) + 1
-    displaced = np.clip(chosen.displacement[:num_moving], -_MOST_DISPLACED_M, _MOST_DISPLACED_M)
-    displaced_step_m = max(float(np.abs(displaced).max(initial=0)) / 32767, 1e-4)
-    displaced = np.rint(displaced / displaced_step_m) + 32768
+    displaced_step_m = float(np.abs(chosen.displacement).max(initial=1.0)) / 32767
+    displaced = np.rint(chosen.displacement[:num_moving] / displaced_step_m) + 32768
     return {
         "num_points": len(rows),
         "num_all": len(cloud.points),
@@ -179,16 +171,6 @@ def thinned(points: Float, moving: Bool, most: int) -> Int:
     weight[moving] *= _MOVING_WEIGHT
     order = np.argsort(np.random.default_rng(0).exponential(size=len(points)) / weight)
     return np.sort(order[:most])
-
-
-def _space_code(levels: Int) -> Int:
-    """Return numbers by which (N,3) quantised positions follow their neighbours (Morton, 1966),
-    which packs well."""
-    code = np.zeros(len(levels), np.int64)
-    for bit in range(16):
-        for axis in range(3):
-            code |= ((levels[:, axis] >> bit) & 1) << (3 * bit + axis)
-    return code
 
 
 def _colours(cloud: StoredCloud) -> NDArray[np.uint8]:
