@@ -32,9 +32,9 @@ hypothesis.settings.load_profile("densify")
 
 
 LONGEST = (
-    *("examples", "street", "notebooks", "dataset", "recording", "learning_training"),
+    *("gate", "street", "examples", "dataset", "recording", "learning_training"),
     *("bench", "fuzz", "registration", "pipeline", "far", "executor", "cli"),
-    *("doctor", "report_browser", "groups", "labels"),
+    *("doctor", "report_browser", "groups", "labels", "notebooks"),
     *("bench_paper", "reader_pandaset", "flow_sets"),
 )
 """Files of tests that take long begin, so that no process works on one while the others wait at the

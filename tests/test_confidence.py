@@ -92,8 +92,6 @@ def test_reliability_counts_what_is_wrong():
     assert shares["measured"] == pytest.approx(scale.wrong(confidence[:, ::2]).mean())
 
 
-# --- agreement with pixels around -----------------------------------------------------------------
-
 FOCAL_PX, GAP_PX, WALL_M = 700.0, 3.0, 12.0
 SHAPE = (40, 60)
 SPOT = (20, 30)

@@ -4,11 +4,12 @@
 from __future__ import annotations
 
 import re
-import subprocess
-import sys
+import runpy
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from densify.depth import confidence as scale
 from densify.readers.street import Street
@@ -17,15 +18,18 @@ from tests.writers import write_street
 EXAMPLES = Path(__file__).parents[1] / "examples"
 
 
-def output_of(script: str, cwd: Path, *arguments: str) -> str:
-    done = subprocess.run(
-        [sys.executable, str(EXAMPLES / script), *arguments],
-        capture_output=True,
-        text=True,
-        cwd=cwd,
-    )
-    assert done.returncode == 0, done.stderr
-    return done.stdout
+@pytest.fixture
+def output_of(tmp_path: Path, monkeypatch, capsys) -> Callable[..., str]:
+    """Return a function that runs a script in an empty folder and returns what it prints."""
+
+    def run(script: str, *arguments: str) -> str:
+        path = str(EXAMPLES / script)
+        monkeypatch.chdir(tmp_path)
+        monkeypatch.setattr("sys.argv", [path, *arguments])
+        runpy.run_path(path, run_name="__main__")
+        return capsys.readouterr().out
+
+    return run
 
 
 def number_before(text: str, words: str) -> float:
@@ -34,8 +38,8 @@ def number_before(text: str, words: str) -> float:
     return float(found.group(1).replace(",", ""))
 
 
-def test_street(tmp_path: Path) -> None:
-    text = output_of("street.py", tmp_path, "depth.npy")
+def test_street(output_of, tmp_path: Path) -> None:
+    text = output_of("street.py", "depth.npy")
     depth_m = np.load(tmp_path / "depth.npy")
     assert depth_m.shape == (375, 1242) and depth_m.dtype == np.float32
     found = re.search(r"median error ([\d.]+) m", text)
@@ -45,33 +49,19 @@ def test_street(tmp_path: Path) -> None:
     assert f"depth in {np.mean(depth_m > 0):.1%} of the pixels" in text
 
 
-def test_kitti(short_drive: Path, tmp_path: Path) -> None:
-    text = output_of("kitti.py", tmp_path, str(short_drive), "120")
+def test_kitti(output_of, short_drive: Path, tmp_path: Path) -> None:
+    text = output_of("kitti.py", str(short_drive), "120")
     assert text.startswith("key 120: sweeps 118 to 122, ")
     assert number_before(text, "points\n") > 5 * 100_000
     assert number_before(text, "points moved") > 100
     assert not list(tmp_path.iterdir())
 
 
-def test_train_completion(tmp_path: Path) -> None:
+def test_train_completion(output_of, tmp_path: Path) -> None:
     street = Street("street", 0, "vlp16")
-    frames = range(118, 121)
-    drive = write_street("kitti", street, tmp_path, frames, ["image_02"])
-    text = output_of(
-        "train_completion.py",
-        tmp_path,
-        *(
-            "--data",
-            str(drive),
-            "--test",
-            str(drive),
-            "--keys",
-            "119:120",
-            "--test-keys",
-            "119:120",
-        ),
-        *("--window", "1", "--steps", "2"),
-    )
+    drive = str(write_street("kitti", street, tmp_path, range(118, 121), ["image_02"]))
+    data = ["--data", drive, "--test", drive, "--keys", "119:120", "--test-keys", "119:120"]
+    text = output_of("train_completion.py", *data, "--window", "1", "--steps", "2")
     rows = re.findall(r"^(nothing|icp, seed 0|flow, seed 0)  +(.*)$", text, re.MULTILINE)
     scores = {name: [float(number) for number in re.findall(r"[\d.]+", row)] for name, row in rows}
     assert len(scores) == 3, text

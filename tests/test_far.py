@@ -9,13 +9,9 @@ from functools import cache
 import numpy as np
 import pytest
 
-from densify.config import resolve
-from densify.config.cache import Cache
 from densify.config.errors import InputError
 from densify.geometry import poses
 from densify.geometry.clouds import thinned
-from densify.pipeline import run as pipeline
-from densify.pipeline.recording import Recording
 from densify.readers.timeline import Timeline
 from densify.registration import road_poses
 from densify.registration.road_poses import follow_road
@@ -139,31 +135,6 @@ def test_the_chain_finds_the_true_poses(side, monkeypatch):
         error = poses.log(poses.inverse(T_true) @ T_world_lidar)
         assert np.linalg.norm(error[3:]) < 0.03, sweep.frame
         assert np.rad2deg(np.linalg.norm(error[:3])) < 0.1, sweep.frame
-
-
-def whole(folder, settings=FAR) -> Recording:
-    """The recording as `dataset` takes it: in blocks, whatever keys are asked for."""
-    sequence = TinySequence(drive((LEAVES,)).scene, range(KEY - 7, KEY + 9))
-    return Recording(sequence, resolve(settings), WINDOW, cache=Cache(1 << 30, folder))
-
-
-def made(recording: Recording, key: int):
-    return pipeline.densify(recording, key, ["flow"], with_images=False)["flow"]
-
-
-def same(a, b) -> bool:
-    names = ("depth_m", "filled_m", "confidence", "frame", "age_s")
-    one, other = a.depth["front"], b.depth["front"]
-    return all(getattr(one, n).tobytes() == getattr(other, n).tobytes() for n in names)
-
-
-def test_a_key_of_a_set_does_not_depend_on_others(tmp_path):
-    """Nor on what is in memory, or on disk already."""
-    first = {key: made(whole(tmp_path / "a"), key) for key in (KEY, KEY + 1)}
-    assert same(made(whole(tmp_path / "b"), KEY + 1), first[KEY + 1])
-    frames = np.unique(first[KEY].cloud.frame[first[KEY].cloud.far])
-    assert set(frames).isdisjoint(first[KEY].frames)
-    assert first[KEY].far_frames == tuple(frames)
 
 
 def test_thinning_keeps_the_first_of_each_cell():

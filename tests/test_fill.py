@@ -83,9 +83,6 @@ def test_a_pillar_with_few_measured_pixels_is_not_filled_over():
     assert (fill(veiled, 1.5).filled_m[inside] > 0).all()
 
 
-# --- stars ----------------------------------------------------------------------------------------
-
-
 def star(depth_m, **more):
     return fill_stars(layers_of(depth_m, **{"tilt": TILT, "spacing_px": WIDE, **more}))
 

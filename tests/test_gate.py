@@ -69,22 +69,29 @@ def flow_figures(recording: Recording) -> dict[str, float]:
     }
 
 
-def figures(spec: str) -> dict[str, float]:
+def densified(spec: str, *methods: str) -> tuple[Recording, dict[str, Result]]:
+    recording = Recording(open_sequence(spec), resolve(None), WINDOW, [KEY], looks_around=True)
+    return recording, densify_key(recording, KEY, methods, [CAMERA])
+
+
+def figures(recording: Recording, results: dict[str, Result]) -> dict[str, float]:
     """Return every figure of one recording."""
-    sequence, settings = open_sequence(spec), resolve(None)
-    recording = Recording(sequence, settings, WINDOW, [KEY], looks_around=True)
-    found = depth_figures(densify_key(recording, KEY, ["flow"], [CAMERA])["flow"])
-    if sequence.truth is not None:
+    found = depth_figures(results["flow"])
+    if recording.sequence.truth is not None:
         found |= flow_figures(recording)
     return {name: round(value, 5) for name, value in found.items()}
+
+
+@pytest.fixture(scope="module")
+def drive(test_data) -> tuple[Recording, dict[str, Result]]:
+    return densified(str(test_data / DRIVE), "none", "icp", "flow")
 
 
 @pytest.mark.parametrize("name", RECORDINGS)
 def test_no_figure_becomes_worse(name: str, request: pytest.FixtureRequest) -> None:
     spec = RECORDINGS[name]
-    if spec == DRIVE:
-        spec = str(request.getfixturevalue("test_data") / DRIVE)
-    expected, now = yaml.safe_load(TABLE.read_text("utf-8"))[name], figures(spec)
+    made = request.getfixturevalue("drive") if spec == DRIVE else densified(spec, "flow")
+    expected, now = yaml.safe_load(TABLE.read_text("utf-8"))[name], figures(*made)
     assert set(now) == set(expected)
     worse = {}
     for figure, was in expected.items():
@@ -95,11 +102,30 @@ def test_no_figure_becomes_worse(name: str, request: pytest.FixtureRequest) -> N
     assert not worse
 
 
+def test_a_real_drive(drive) -> None:
+    results = drive[1]
+    icp, flow = results["icp"], results["flow"]
+    assert flow.frames == tuple(range(115, 126))
+    assert flow.metrics["ghosts"]["all"] <= 0.5 * icp.metrics["ghosts"]["all"]
+    assert flow.cloud.far.sum() > 100_000 and not icp.cloud.far.any()
+    assert flow.cloud.frame.min() < 110 and flow.cloud.frame.max() > 130
+    cloud = flow.cloud.select(~flow.cloud.far)
+    assert cloud.moving.sum() > 1000
+    still = ~cloud.moving
+    assert cloud.points[still].tobytes() == cloud.rigid_points[still].tobytes()
+    place = np.full((11, cloud.row.max() + 1), -1)
+    place[icp.cloud.frame - 115, icp.cloud.row] = np.arange(len(icp.cloud))
+    rigid = icp.cloud.points[place[cloud.frame - 115, cloud.row]]
+    assert cloud.rigid_points.tobytes() == rigid.tobytes()
+    density = {m: r.metrics["density"]["image_02"]["measured"] for m, r in results.items()}
+    assert density["flow"] > 2 * density["none"]
+
+
 def main() -> None:
     """Write the figures as they are now."""
     folder = Path(os.environ["DENSIFY_TEST_DATA"])
     table: dict[str, Any] = {
-        name: figures(str(folder / spec) if spec == DRIVE else spec)
+        name: figures(*densified(str(folder / spec) if spec == DRIVE else spec, "flow"))
         for name, spec in RECORDINGS.items()
     }
     TABLE.write_text(f"# Written by: python -m tests.test_gate\n{yaml.safe_dump(table)}")

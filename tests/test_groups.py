@@ -11,9 +11,6 @@ import pytest
 from tests.found_motion import KEY, NOISE, Found, motion_in, toward_key
 from tests.scenes import SWEEP_S, Arc, Box, Scanner, Scene, World, car, street
 
-# --- nothing moves --------------------------------------------------------------------------------
-
-
 SPARSE = Scanner(32, 1080, (-30.7, 10.7), 0.01)
 FOLIAGE = [
     Box((6, 1.5, 2.0), Arc(x, y), solid=0.5) for x, y in ((8, 5.5), (15, -6), (-6, 6), (20, 4.6))
@@ -45,9 +42,6 @@ def test_guard_rails_seen_between_rings_stay():
     highway = Scene(World((*rails, *posts, *poles)), Arc(0, 0, 0, 25.0), SPARSE)
     found = Found.around(8, highway, 5)
     assert not any(flow.moving.any() for flow in found.fields)
-
-
-# --- movers ---------------------------------------------------------------------------------------
 
 
 CAR, FAST, WALKER = 1, 2, 3
@@ -207,9 +201,6 @@ def test_a_stretch_of_one_sweep_has_no_flow():
     found = Found.of([car(14, -1.6, 10, 1)], size=0)
     assert len(found.fields) == 1
     assert not found.fields[0].displacement.any() and not found.fields[0].moving.any()
-
-
-# --- from any sweep to any other ------------------------------------------------------------------
 
 
 ANY_PAIRS = [(1, 9), (8, 1), (3, 4)]

@@ -112,9 +112,6 @@ def test_veto_of_what_the_key_saw_through():
     assert not patches_of(cloud).free.any()
 
 
-# --- scanners of other kinds, and several ---------------------------------------------------------
-
-
 def in_a_room(name):
     """A deskewed sweep of a scanner in a corner: ground 1.7 m below, a wall 15 m ahead."""
     wall = World((Box((1.0, 200.0, 40.0), Arc(15.5, 0.0), base_m=-20.0),))

@@ -103,9 +103,6 @@ def test_a_correction_does_not_cross_depth_edges():
         assert np.percentile(off(full, here), 95) < 0.03
 
 
-# --- what stays empty -----------------------------------------------------------------------------
-
-
 def test_sky_stays_empty_by_mask_and_by_distance():
     value = 5 / np.where(SKY, 1e6, TRUE_M)
     masked = complete(measured(), Prior(value.astype(np.float32), SKY, "test"), AUTO)
@@ -129,9 +126,6 @@ def test_pixels_between_two_surfaces_are_left_out():
     wrong = full.from_prior & (np.abs(full.depth_m / np.where(SKY, 1, TRUE_M) - 1) > 0.2)
     assert wrong.sum() < 0.02 * full.from_prior.sum()
     assert 0.8 * sharp.from_prior.sum() < full.from_prior.sum() < sharp.from_prior.sum()
-
-
-# --- what does not fit ----------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(

@@ -92,9 +92,6 @@ def on_every_pixel(camera, z, step=1):
     return at_pixel(camera, u, v, z)
 
 
-# --- pixels ---------------------------------------------------------------------------------------
-
-
 def test_tilted_plane_from_a_known_pose_has_its_analytic_depth():
     camera = make_camera()
     rng = np.random.default_rng(0)
@@ -122,9 +119,6 @@ def test_image_edges_and_points_behind_the_camera():
     row, column = np.nonzero(depth.depth_m)
     assert set(zip(column.tolist(), row.tolist(), strict=True)) == {(0, 0), (9, 1), (4, 0), (5, 5)}
     assert np.all(depth.depth_m[row, column] == 5)
-
-
-# --- which point wins a pixel ---------------------------------------------------------------------
 
 
 def z_buffer_twin(cloud, camera):
@@ -176,9 +170,6 @@ def test_order_of_the_points_changes_no_byte(seed):
     for name in ("depth_m", "filled_m", "confidence", "frame"):
         assert getattr(one, name).tobytes() == getattr(other, name).tobytes(), name
     assert (one.reason[order] == other.reason).mean() > 0.95  # equal points may change places
-
-
-# --- visibility -----------------------------------------------------------------------------------
 
 
 def facing(points, spacing_px, focal):
@@ -260,9 +251,6 @@ def test_patches_are_painted_like_a_slow_twin():
     canvas = np.zeros((15, 20), np.float32)
     paint(uv, inverse, slope, half_px, canvas)
     np.testing.assert_allclose(canvas, truth, rtol=1e-6)
-
-
-# --- which of the visible points is believed ------------------------------------------------------
 
 
 def wall(camera, z, frames, noise_m=0.0, step=2):
@@ -453,9 +441,6 @@ def test_threads_change_no_byte():
         one = maps()
         patch.setattr("numba.config.NUMBA_NUM_THREADS", 2)
         assert maps() == one
-
-
-# --- fill -----------------------------------------------------------------------------------------
 
 
 def fill_between(depth, confidence, reach_px):

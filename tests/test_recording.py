@@ -55,7 +55,7 @@ def maps_of(drive: Recording, key: int) -> pipeline.Result:
 def assert_same_maps(a, b) -> None:
     assert a.keys() == b.keys()
     for name in a:
-        for field in ("depth_m", "filled_m", "confidence", "frame"):
+        for field in ("depth_m", "filled_m", "confidence", "frame", "age_s"):
             np.testing.assert_array_equal(getattr(a[name], field), getattr(b[name], field), field)
 
 
@@ -91,11 +91,16 @@ def test_a_recording_within_the_window_is_what_run_makes(
 
 
 def test_keys_do_not_depend_on_others(small_blocks, long_street, tmp_path: Path) -> None:
-    """Nor on their order, nor on what is in memory or on disk already."""
-    upward, downward = drive_of(long_street, tmp_path / "a"), drive_of(long_street, tmp_path / "b")
-    first = [maps_of(upward, key).depth for key in (5, 6)][1]
-    assert_same_maps(maps_of(downward, 6).depth, first)
-    assert_same_maps(maps_of(drive_of(long_street, tmp_path / "a"), 6).depth, first)
+    """Nor on their order, nor on what is in memory or on disk already, near or far."""
+    config = resolve({**POSES_GIVEN, "accumulate": {"far_m": 20.0}})
+    upward, downward = (drive_of(long_street, tmp_path / n, config=config) for n in "ab")
+    first = [maps_of(upward, key) for key in (5, 6)][1]
+    frames = np.unique(first.cloud.frame[first.cloud.far])
+    assert len(frames) > 0 and set(frames).isdisjoint(first.frames)
+    assert first.far_frames == tuple(frames)
+    assert_same_maps(maps_of(downward, 6).depth, first.depth)
+    again = drive_of(long_street, tmp_path / "a", config=config)
+    assert_same_maps(maps_of(again, 6).depth, first.depth)
 
 
 # Windows

@@ -64,9 +64,6 @@ def errors(found: Trajectory, true: Trajectory) -> tuple[np.ndarray, np.ndarray]
     return np.linalg.norm(off[:, 3:], axis=1), np.rad2deg(np.linalg.norm(off[:, :3], axis=1))
 
 
-# --- the analytic drive ---------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("rate", [1, 2])
 def test_the_drive_is_recovered(drive, raw, second_pass, rate):
     """At twice the rate too, 24 m/s at 20 Hz."""
@@ -129,9 +126,6 @@ def test_what_odometry_leaves_is_mended_and_the_first_sweep_stays(drive, raw):
     assert (found.frames, found.stamp_ns.tobytes()) == (off.frames, off.stamp_ns.tobytes())
 
 
-# --- deskewing ------------------------------------------------------------------------------------
-
-
 @pytest.fixture(scope="module")
 def walled() -> Scene:
     walls = (Box((120, 2, 6), Arc(0, 12)), Box((120, 2, 6), Arc(0, -14)), *street())
@@ -165,12 +159,6 @@ def test_each_half_moves_with_its_own_twist():
     moved = registered.sweep.points - sweep.points
     np.testing.assert_allclose(moved[:, 0], t * np.where(t < 0, 15, 5), atol=1e-9)
     assert np.abs(moved[:, 1:]).max() < 1e-9
-
-
-# --- KISS-ICP's traps -----------------------------------------------------------------------------
-
-
-# --- sweeps of few points -------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -208,9 +196,6 @@ def test_a_pattern_that_turns_from_sweep_to_sweep_does_not_take_the_poses_with_i
     off = np.array([poses.log(T) for T in found.T_world_lidar])
     assert np.linalg.norm(off[:, 3:], axis=1).max() < 0.08
     assert np.rad2deg(np.linalg.norm(off[:, :3], axis=1)).max() < 1
-
-
-# --- what cannot be registered --------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("num_points", [0, 999])
