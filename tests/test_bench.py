@@ -23,7 +23,13 @@ from tests.command import exit_code, refused
 from tests.scenes import Arc, Scanner, Scene, TinySequence, World, by_flow, car, street
 from tests.small_street import KEY, one_car
 
-CONFIG = resolve({"register": {"source": "dataset"}, "flow": {"look_around_s": 0.0}})
+CONFIG = resolve(
+    {
+        "register": {"source": "dataset"},
+        "flow": {"look_around_s": 0.0},
+        "objective": {"num_neighbors": 10},
+    }
+)
 RESULTS = Path(__file__).parents[1] / "docs" / "results.md"
 
 
