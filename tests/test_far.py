@@ -21,7 +21,6 @@ from tests.scenes import CAMERA, Arc, Scanner, Scene, TinySequence, World, by_fl
 KEY, WINDOW, NUM_FRAMES = 15, 2, 36
 EGO = Arc(0, -1.5, 0, 8.0, 0.02)
 LEAVES = car(22, 3.0, 6.0, 1)  # ahead of the vehicle in the lane beside it
-AHEAD = car(14, 0.0, EGO.speed_m_s, 1)
 SETTINGS = {"register": {"source": "dataset"}}
 FAR = {**SETTINGS, "accumulate": {"far_m": 20.0}}
 OFF = {**SETTINGS, "accumulate": {"far_m": 0.0}}

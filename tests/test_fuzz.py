@@ -155,7 +155,6 @@ HEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS 40\nDATA """
 PLY = "ply\nformat ascii 1.0\nelement vertex 40\n" + "".join(
     f"property float {name}\n" for name in ("x", "y", "z", "intensity")
 )
-EYE = np.eye(4).tolist()
 CONFIGS = Path(__file__).parents[1] / "configs"
 LABEL = "0 1 Car 0 0 -1.5 296 161 455 292 2.0 1.8 4.4 -4.5 1.8 13.4 -2.1\n"
 

@@ -17,7 +17,7 @@ from densify.readers.kitti.raw import KITTI_TRIGGER_LATENCY_NS, KittiRaw
 from densify.readers.timeline import format_frames, runs
 
 # The epoch nanoseconds of this text do not survive a float64 (multiples of 256 there).
-BASE_TEXT, BASE_NS = "2011-09-26 13:10:51", 1317042651_000_000_000
+BASE_NS = 1317042651_000_000_000
 PERIOD_NS = 103_500_007
 NUM_LINES = 8
 FRAMES = (2, 3, 5)

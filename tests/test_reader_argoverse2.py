@@ -120,7 +120,7 @@ def first(value):
 
 
 POSES, SWEEPS = "city_SE3_egovehicle.feather", "sensors/lidar/*.feather"
-SENSORS_FILE, LENSES = "calibration/egovehicle_SE3_sensor.feather", "calibration/intrinsics.feather"
+LENSES = "calibration/intrinsics.feather"
 DAMAGE = {
     "poses truncated": (POSES, lambda p: p.write_bytes(p.read_bytes()[:-99]), "not a whole"),
     "pose column absent": (POSES, lambda p: change(p, "qx", None), "no column qx"),

@@ -333,7 +333,7 @@ def bad_cloud(**changes):
     return make
 
 
-SCAN, RAW = "velodyne_msgs/msg/VelodyneScan", "#images=/front/image_raw"
+RAW = "#images=/front/image_raw"
 BAGS = {
     "unknown option": (bad_cloud(), "#topic=/a", r"got topic, expected #points="),
     "unknown topic": (bad_cloud(), "#points=/other", r"no such topic; topics that fit: /points"),

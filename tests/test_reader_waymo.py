@@ -225,7 +225,6 @@ def sets(component, column, value, row=slice(None)):
 
 VEHICLE = "[VehiclePoseComponent].world_from_vehicle.transform"
 IMAGE, LENS = "[CameraImageComponent]", "[CameraCalibrationComponent]"
-SHEARED = np.eye(4) + 0.1
 DAMAGE = {
     "no calibration": (lambda r: shutil.rmtree(r / "lidar_calibration"), "no such file"),
     "lidar truncated": (cut("lidar"), "not a whole parquet file"),
