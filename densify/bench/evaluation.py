@@ -110,8 +110,4 @@ def write_numbers(path: Path, numbers: Mapping[str, Any]) -> None:
     """
     machine = {"python": platform.python_version(), "num_cores": os.cpu_count()}
     whole = {"densify": __version__, "machine": machine, **numbers}
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_file(path, (json.dumps(whole, indent=2, allow_nan=False) + "\n").encode())
-    except OSError as error:
-        raise InputError(f"--out {path}: cannot be written: {error.strerror or error}") from error
+    write_file(path, (json.dumps(whole, indent=2, allow_nan=False) + "\n").encode())

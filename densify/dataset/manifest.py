@@ -167,7 +167,7 @@ class Manifest:
         return self
 
     def __exit__(self, kind: object, error: object, traceback: object) -> None:
-        with suppress(OSError):  # the file keeps all records without the order
+        with suppress(OSError, OutputError):  # the file keeps all records without the order
             self._put_in_order()
         os.close(self._lock)
 

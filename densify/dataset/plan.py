@@ -23,7 +23,7 @@ import numpy as np
 
 from densify import __version__
 from densify.config import Config, as_mapping
-from densify.config.errors import InputError, OutputError
+from densify.config.errors import InputError
 from densify.config.file_content import read_json
 from densify.geometry.types import Camera, LidarSequence
 from densify.outputs.atomic import write_file
@@ -195,13 +195,7 @@ def write_plan(out: Path, recipe: Recipe, drives: Sequence[Drive]) -> None:
         table["drives"] = _united(out, before["drives"], table["drives"])
     if before is None or table != before:
         text = json.dumps(table, indent=1) + "\n"
-        try:
-            out.mkdir(parents=True, exist_ok=True)
-            write_file(out / _FILE, text.encode())
-        except OSError as error:
-            raise OutputError(
-                f"--out {out}: {_FILE} cannot be written: {error.strerror or error}"
-            ) from error
+        write_file(out / _FILE, text.encode())
 
 
 def read_plan(out: Path) -> dict[str, Any] | None:

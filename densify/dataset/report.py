@@ -14,7 +14,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from densify import __version__
-from densify.config.errors import InputError, OutputError
+from densify.config.errors import InputError
 from densify.dataset.manifest import KeyRecord, read_manifests
 from densify.dataset.plan import planned_keys, read_plan
 from densify.geometry.types import Result
@@ -82,11 +82,7 @@ def write_report(place: Path, out: Path | None = None, overwrite: bool = False) 
             )
     for path, make in places.items():
         page = make(path.parent)
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            write_file(path, page)
-        except OSError as error:
-            raise OutputError(f"{path}: cannot be written: {error.strerror or error}") from error
+        write_file(path, page)
     return list(places)
 
 

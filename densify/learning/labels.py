@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from densify.config import Config
-from densify.config.errors import ComputationError, InputError, OutputError
+from densify.config.errors import ComputationError, InputError
 from densify.config.plugins import READERS
 from densify.flow.boxes import flow_of_boxes
 from densify.geometry import poses
@@ -101,9 +101,5 @@ def write_label(folder: Path, label: Label, overwrite: bool) -> Path:
         object=field.instance,
         valid=label.sure,
     )
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        write_file(path, data)
-    except OSError as error:
-        raise OutputError(f"--out {path}: cannot be written: {error.strerror or error}") from error
+    write_file(path, data)
     return path

@@ -65,11 +65,7 @@ def write_model(path: Path, model: Model) -> None:
     arrays.update(model.beside)
     buffer = io.BytesIO()
     np.savez(buffer, **arrays)  # type: ignore[arg-type]
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_file(path, buffer.getvalue())
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written: {error.strerror or error}") from error
+    write_file(path, buffer.getvalue())
 
 
 def read_model(path: Path) -> Model:

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: MIT
-"""Files and folders that appear when they are complete: written in a hidden folder, renamed."""
+"""Files and folders that appear when they are complete: written in a hidden folder, renamed. The
+folders above them are made. What cannot be written is an OutputError that names the place."""
 
 from __future__ import annotations
 
@@ -17,17 +18,14 @@ LEFT_AFTER_S = 600.0  # no file takes as long to write
 
 
 def write_file(path: Path, data: bytes) -> None:
-    """Write or replace a file, and make its folder. On any failure the old file stays and nothing
-    is left aside."""
+    """Write or replace a file. On any failure the old file stays and nothing is left aside."""
     with file_aside(path) as aside:
         aside.write_bytes(data)
 
 
 @contextmanager
 def file_aside(path: Path) -> Iterator[Path]:
-    """Yield a place to write a file to, which becomes ``path`` when the block ends well. The folder
-    of ``path`` is made."""
-    path.parent.mkdir(parents=True, exist_ok=True)
+    """Yield a place to write a file to, which becomes ``path`` when the block ends well."""
     with _hidden_folder(path) as hidden:
         yield hidden / path.name
         os.replace(hidden / path.name, path)
@@ -42,7 +40,6 @@ def staged_folder(folder: Path, owned: Collection[str]) -> Iterator[Path]:
     """
     folder = Path(os.path.realpath(folder))
     missing = [place for place in folder.parents if not place.exists()]
-    folder.parent.mkdir(parents=True, exist_ok=True)
 
     def skip(place: str, names: list[str]) -> Collection[str]:
         return owned if Path(place) == folder else ()
@@ -78,17 +75,13 @@ def clear_leftovers(root: Path, age_s: float = LEFT_AFTER_S) -> None:
 
 
 @contextmanager
-def writing_to(out: Path) -> Iterator[None]:
-    """Raise OutputError, which names ``--out``, for what cannot be written in the block."""
-    try:
-        yield
-    except OSError as error:
-        raise OutputError(f"--out {out}: cannot be written: {error.strerror or error}") from error
-
-
-@contextmanager
 def _hidden_folder(path: Path) -> Iterator[Path]:
-    with tempfile.TemporaryDirectory(
-        ".tmp", f".{path.name[:100]}.", path.parent, ignore_cleanup_errors=True
-    ) as place:
-        yield Path(place)
+    prefix = f".{path.name[:100]}."
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(
+            ".tmp", prefix, path.parent, ignore_cleanup_errors=True
+        ) as place:
+            yield Path(place)
+    except OSError as error:
+        raise OutputError(f"{path}: cannot be written: {error.strerror or error}") from error

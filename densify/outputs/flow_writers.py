@@ -30,7 +30,7 @@ import numpy as np
 from densify.config.errors import InputError
 from densify.geometry import poses
 from densify.geometry.types import FlowField, LidarSequence, Result, StretchFlow
-from densify.outputs.atomic import file_aside, write_file, writing_to
+from densify.outputs.atomic import file_aside, write_file
 from densify.outputs.key_outputs import Context
 from densify.readers.extras import needed
 
@@ -146,7 +146,7 @@ def flow_writer(
             f"--out {out}: {there[0]} already there and kept ({len(there)} such files); give "
             f"--overwrite to replace them or another --out DIR"
         )
-    with writing_to(out), ExitStack() as stack:
+    with ExitStack() as stack:
         if form == "opensceneflow":
             file = stack.enter_context(_h5_aside(out / f"{name}.h5"))
 

@@ -21,7 +21,7 @@ import yaml
 
 from densify import __version__
 from densify.geometry.types import DepthMap
-from densify.outputs.atomic import write_file, writing_to
+from densify.outputs.atomic import write_file
 from densify.outputs.depth_png import write_confidence_png, write_depth_png
 from densify.outputs.plain import plain
 
@@ -92,17 +92,16 @@ def write_key(
     OutputError if the files cannot be written.
     """
     paths = []
-    with writing_to(root):
-        for camera, maps in dense.items():
-            raw, measured, filled, confidence = (
-                root / folder / "proj_depth" / product / camera / f"{frame:010d}.png"
-                for product in ("velodyne_raw", "groundtruth", "groundtruth_filled", "confidence")
-            )
-            write_depth_png(raw, sparse[camera].depth_m)
-            write_depth_png(measured, maps.depth_m)
-            write_depth_png(filled, maps.filled_m)
-            write_confidence_png(confidence, maps.confidence, maps.filled_m)
-            paths += [raw, measured, filled, confidence]
+    for camera, maps in dense.items():
+        raw, measured, filled, confidence = (
+            root / folder / "proj_depth" / product / camera / f"{frame:010d}.png"
+            for product in ("velodyne_raw", "groundtruth", "groundtruth_filled", "confidence")
+        )
+        write_depth_png(raw, sparse[camera].depth_m)
+        write_depth_png(measured, maps.depth_m)
+        write_depth_png(filled, maps.filled_m)
+        write_confidence_png(confidence, maps.confidence, maps.filled_m)
+        paths += [raw, measured, filled, confidence]
     return {p.relative_to(root).as_posix(): FileRecord.of(p.read_bytes()) for p in paths}
 
 
@@ -119,8 +118,7 @@ def write_readme(root: Path, *, method: str, window: int, settings: Mapping[str,
         sweeps=2 * window + 1,
         settings=yaml.safe_dump(plain(settings), sort_keys=False, allow_unicode=True).rstrip(),
     )
-    with writing_to(root):
-        write_file(root / README, text.encode())
+    write_file(root / README, text.encode())
 
 
 _README = """\

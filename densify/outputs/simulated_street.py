@@ -91,11 +91,8 @@ def write_street(
         if (out / place / name).exists() and not overwrite:
             raise InputError(f"{out / place / name}: exists; give --overwrite to replace it")
     write = _write_kitti if is_kitti else _write_folder
-    try:
-        with staged_folder(out / place, owned) as folder:
-            write(excerpt, folder, progress or (lambda *_: None))
-    except OSError as error:
-        raise InputError(f"{out}: cannot be written: {error.strerror or error}") from error
+    with staged_folder(out / place, owned) as folder:
+        write(excerpt, folder, progress or (lambda *_: None))
     return out / place / _DRIVE if is_kitti else out / place
 
 

@@ -15,7 +15,7 @@ from densify.config.plugins import Plugin
 from densify.config.written import chosen_outputs
 from densify.geometry.types import Result
 from densify.outputs import key_outputs
-from densify.outputs.atomic import staged_folder, writing_to
+from densify.outputs.atomic import staged_folder
 from densify.outputs.key_outputs import Context
 from densify.outputs.plain import write_json
 from densify.outputs.plots import write_figure
@@ -51,7 +51,7 @@ def writing(folder: Path, owned: Collection[str], out: Path, overwrite: bool) ->
     Raises InputError as `check_writable`.
     """
     _check_place(folder, owned, out, overwrite)
-    with writing_to(out), staged_folder(folder, owned) as staging:
+    with staged_folder(folder, owned) as staging:
         yield staging
 
 
