@@ -4,20 +4,19 @@ frame, whatever layout each side has::
 
     <drive>/proj_depth/<product>/image_02/0000000005.png    KITTI's depth trees
     <drive>_sync_<product>_0000000005_image_02.png          KITTI's selected validation images
-    [<drive>/]000005/depth/image_02.png                     densify's own output (or depth_filled)
-    [<drive>/]000005/depth/image_02/000007.png              its maps of single images, by number
-    [<drive>/][image_02/]0000000005.png, scene_a.png        plain folders; the name is the frame
+    000005/depth/image_02.png                               densify's own output (or depth_filled)
+    000005/depth/image_02/000007.png                        its maps of single images, by number
+    [image_02/]0000000005.png, scene_a.png                  plain folders; the name is the frame
 
 The sets of `densify dataset` have the first or the third layout. A drive is KITTI's dated name
-anywhere in a path, or the name of the folder in that place. The folder around keys counts as a
-drive only if the other side knows a drive of that name.
+anywhere in a path, or the folder that holds proj_depth.
 """
 
 from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 from densify.config.errors import InputError
@@ -31,7 +30,6 @@ _LAYOUTS = (
     rf"/(?P<frame>\d{{6,}})/{_KEY}\.png$",
     rf"/\d{{6,}}/{_KEY}/(?P<frame>\d+)\.png$",
 )
-_OWN_DEPTH = {_LAYOUTS[2]: 3, _LAYOUTS[3]: 4}  # parts of a path from the key's folder on
 _TRUTH_PRODUCTS = ("groundtruth", "groundtruth_depth")
 _MEASURED, _FILLED = ("depth", "groundtruth"), ("depth_filled", "groundtruth_filled")
 _OURS = ("depth", *_FILLED, "confidence")  # no other trees have these
@@ -60,14 +58,11 @@ class DepthPairs:
 
 @dataclass(frozen=True)
 class _File:
-    """folder: around the key, perhaps its drive."""
-
     path: Path
     frame: str
     drive: str | None
     camera: str | None
     product: str | None = None
-    folder: str | None = None
 
 
 def pair_depth_files(
@@ -113,7 +108,7 @@ def pair_depth_files(
 def _found(place: Path, what: str) -> list[_File]:
     """Return the PNG files of a place by path; plain ones only if there are no others."""
     if place.is_file():
-        return [_parsed(place, place.parent)]
+        return [_parsed(place)]
     paths = sorted(place.rglob("*.png"))
     # Hidden files are unfinished results.
     paths = [p for p in paths if "/." not in f"/{p.relative_to(place).as_posix()}"]
@@ -121,25 +116,18 @@ def _found(place: Path, what: str) -> list[_File]:
         raise InputError(
             f"{what} {place}: no such file or folder with PNG files, expected depth maps"
         )
-    files = [_parsed(path, place) for path in paths]
+    files = [_parsed(path) for path in paths]
     return [file for file in files if file.product is not None] or files
 
 
-def _parsed(path: Path, place: Path) -> _File:
+def _parsed(path: Path) -> _File:
     text = path.absolute().as_posix()
     for layout in _LAYOUTS:
         if match := re.search(layout, text):
             parts = match.groupdict()
-            dated = _last(_DRIVE, text[: match.end("product")])
-            around = path.relative_to(place).parts[: -_OWN_DEPTH.get(layout, 99)]
-            return _File(
-                path,
-                str(int(parts["frame"])),
-                dated or parts.get("folder"),
-                parts["camera"],
-                parts["product"],
-                around[-1] if around else None,
-            )
+            drive = _last(_DRIVE, text[: match.end("product")]) or parts.get("folder")
+            frame = str(int(parts["frame"]))
+            return _File(path, frame, drive, parts["camera"], parts["product"])
     frame = str(int(path.stem)) if path.stem.isdecimal() else path.stem
     folder = path.absolute().parent.as_posix()
     return _File(path, frame, _last(_DRIVE, folder), _last(_CAMERA, folder))
@@ -165,20 +153,11 @@ def _match(
     left: Sequence[_File], right: Sequence[_File], left_place: Path, right_place: Path
 ) -> dict[Path, Path]:
     """Return right path -> left path, by frame and by what all the files of both sides say."""
-    left, right = _with_drives(left, right), _with_drives(right, left)
     everything = (*left, *right)
     told = [n for n in ("drive", "camera") if all(getattr(f, n) is not None for f in everything)]
     here = _keyed(left, ["frame", *told], left_place)
     there = _keyed(right, ["frame", *told], right_place)
     return {path: here[key] for key, path in there.items() if key in here}
-
-
-def _with_drives(files: Sequence[_File], others: Sequence[_File]) -> Sequence[_File]:
-    """Take the folders around the keys for drives if the others know one of that name."""
-    known = {file.drive or file.folder for file in others} - {None}
-    if not any(file.folder in known for file in files):
-        return files
-    return [replace(file, drive=file.drive or file.folder) for file in files]
 
 
 def _keyed(files: Sequence[_File], names: Sequence[str], place: Path) -> dict[str, Path]:

@@ -23,11 +23,10 @@ from densify.readers.file_sequence import parse_numbers
 Columns = dict[str, NDArray[Any]]
 
 _UNNAMED = ("x", "y", "z", "intensity")  # KITTI's order, which most others follow
-_BIN_COLUMNS = range(3, 17)
+_BIN_COLUMNS = range(3, 8)
 _MOST_COLUMNS = 100  # more are rows
 _ROWS_LOOKED_AT = 4000
 _PLACES_M = (1e-20, 1e8)  # sizes of coordinates that are not zero
-_ALIKE = 0.7  # of the variance that columns explain
 
 
 @dataclass(frozen=True)
@@ -58,9 +57,9 @@ def read_table(path: Path, names: Sequence[str] | None = None) -> PointTable:
     .las, .laz                dimensions
     ========================= ==================================================================
 
-    names: of the columns, where the file has none; a .bin file without them is cut into as many
-    columns as make neighbouring rows alike. Raises InputError if the file is missing, damaged, of
-    another form, or has no rows.
+    names: of the columns, where the file has none; a .bin file without them has 3 to 7, the first
+    of them x y z intensity. Raises InputError if the file is missing, damaged, of another form, or
+    has no rows.
     """
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
@@ -142,32 +141,18 @@ def _are_places(rows: NDArray[np.float32]) -> bool:
 
 
 def _num_columns(data: bytes) -> int:
-    """Return the number of float32 columns that makes the positions of neighbouring rows most
-    alike; a wrong number mixes x with y. Rings that fire by turns make every second or third row
-    more alike still: then the smallest divisor wins whose columns differ in their values as
-    much."""
+    """Return the number of float32 columns, 3 to 7, that makes the positions of neighbouring rows
+    most alike; a wrong number mixes x with y."""
     with np.errstate(invalid="ignore"):  # other bytes may be any sort of NaN
         values = np.frombuffer(data[: len(data) // 4 * 4], "<f4").astype(np.float64)
-    fit = [k for k in _BIN_COLUMNS if len(values) % k == 0 and len(data) % 4 == 0]
-    if len(fit) < 2 or len(values) < 16 * 20:
-        return 4 if len(data) % 16 == 0 or not fit else fit[0]
     values = np.nan_to_num(values, posinf=0, neginf=0)
-    best = min(fit, key=lambda k: _steps(values.reshape(-1, k)[:_ROWS_LOOKED_AT]))
-    told = {k: _told_by_column(values.reshape(-1, k)) for k in fit if best % k == 0}
-    return min(k for k, share in told.items() if share >= _ALIKE * told[best])
-
-
-def _steps(rows: NDArray[np.float64]) -> float:
-    """Return the mean step between neighbouring rows, in proportion to their distance."""
-    places = rows[:, :3]
-    size = np.abs(places[1:]).sum(axis=1) + np.abs(places[:-1]).sum(axis=1) + 1e-9
-    return float(np.mean(np.abs(np.diff(places, axis=0)).sum(axis=1) / size))
-
-
-def _told_by_column(rows: NDArray[np.float64]) -> float:
-    """Return the share of the variance of the values' sizes that the columns explain."""
-    size = np.arcsinh(np.abs(rows))
-    return float(size.mean(axis=0).var() / max(size.var(), 1e-12))
+    steps = {}
+    for k in _BIN_COLUMNS:
+        if len(data) % (4 * k) == 0 and len(values) > k:
+            places = values.reshape(-1, k)[:_ROWS_LOOKED_AT, :3]
+            size = np.abs(places[1:]).sum(axis=1) + np.abs(places[:-1]).sum(axis=1) + 1e-9
+            steps[k] = np.mean(np.abs(np.diff(places, axis=0)).sum(axis=1) / size)
+    return min(steps, key=lambda k: steps[k], default=4)
 
 
 def _read_npy(path: Path, names: Sequence[str] | None) -> PointTable:

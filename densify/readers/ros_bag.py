@@ -44,9 +44,6 @@ POSES = (
     "geometry_msgs/msg/PoseWithCovarianceStamped",
 )
 _USAGE = "#points=/topic,/topic&images=/topic,/topic&poses=/topic, tf or none"
-_NO_SWEEPS = re.compile(
-    r"map|depth|filtered|obstacle|ground|cluster|voxel|radar|local|global|accumulated|registered"
-)
 _NO_PICTURES = re.compile(r"depth|disparity|theora|mask|confidence")
 
 
@@ -253,12 +250,11 @@ def _points(bag: Bag, given: str | None) -> list[Topic]:
     if given is not None:
         return _existing(bag, given.split(","), _CLOUDS, "points")
     found = bag.of_type(*_CLOUDS)
-    likely = [t for t in found if not _NO_SWEEPS.search(t.name.lower())]
-    if len(likely) == 1 or len(found) == 1:
-        return likely or found
+    if len(found) == 1:
+        return found
     if found:
         raise InputError(
-            f"{bag.path}: several topics could be the sweeps: {_listed(likely or found)}; name one "
+            f"{bag.path}: several topics could be the sweeps: {_listed(found)}; name one "
             f"or all lidars of the vehicle: --data 'ros:{bag.path}#points=/topic,/topic'"
         )
     raise InputError(

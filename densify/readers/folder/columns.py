@@ -26,7 +26,6 @@ from densify.readers.point_fields import (
     full_scale,
     points_of,
     scaled,
-    widened,
 )
 from densify.readers.point_files import read_table
 
@@ -35,7 +34,6 @@ Columns = Mapping[str, NDArray[Any]]
 _ASSUMED_PERIOD_NS = 100_000_000
 _NAMED = ("intensity", "time", "lidar")
 _NUM_TRIED = 5  # sweeps, until one can be read
-_RATES_HZ = (5, 10, 15, 20, 25)
 
 
 class Layout(NamedTuple):
@@ -107,29 +105,12 @@ class SweepColumns:
         return Layout(fields, times, words, scale or 1.0, unused, period_ns, period_words)
 
     def _period(self) -> tuple[int, str]:
-        """Find the period by the stamps, the rate that is known, or the points' own times."""
+        """Return the period by the stamps, the rate given, or 10 Hz; and how it is known."""
         stamps_ns, rate_hz = self.series.stamps_ns, self.settings.rate_hz
         if stamps_ns is not None and len(stamps_ns) > 1:
             return max(1, int(np.median(np.diff(list(stamps_ns.values()))))), ""
         if rate_hz:
             return round(1e9 / rate_hz), f"number, at the {rate_hz:g} Hz of densify.yaml"
-        frame, columns = self._sample
-        times = None
-        if self._fields.time:
-            times, _ = self._times(columns, _ASSUMED_PERIOD_NS, None)
-        if times is not None:
-            values = widened(columns[times.field])
-            share_s = float(np.ptp(times.offset_ns(values, 0))) * 1e-9
-            for hz in () if times.absolute else _RATES_HZ:
-                if abs(share_s * hz - 1) < 0.05:
-                    return 10**9 // hz, f"number, at {hz} Hz: a sweep takes 1/{hz} s"
-            number = next((n for n in self.series.paths if n > frame), frame)
-            later = self._columns(self.series.paths[number]).get(times.field)
-            if times.absolute and number > frame and later is not None:
-                first = np.array([np.nanmin(values), np.nanmin(widened(later))])
-                step_ns = int(np.diff(times.offset_ns(first, 0))[0]) // (number - frame)
-                if step_ns > 0:
-                    return step_ns, "number, at the rate of the points' times"
         return _ASSUMED_PERIOD_NS, "number, at an assumed 10 Hz; say rate_hz in densify.yaml"
 
     @cached_property

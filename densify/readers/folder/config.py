@@ -180,7 +180,7 @@ class SweepFiles:
     plays that part, "" to find it by its name. intensity_scale: what is full brightness, 0
     to find it. time_unit, time_is, reference: see `densify.readers.point_fields.find_times`.
     stamps: ``names`` (of the files) or a file with one time for each sweep, "" to look for them;
-    stamps_unit: theirs. rate_hz: of sweeps without stamps, 0 to take it from the points' times.
+    stamps_unit: theirs. rate_hz: of sweeps without stamps, 0 for 10 Hz.
     compensated: the points were carried to the stamp by the vehicle's motion. scanner_origins:
     (S,3) metres, None where rays start at 0 0 0.
     """
