@@ -81,17 +81,6 @@ def test_a_set_is_what_it_says(border_set: Path, tmp_path: Path, capsys) -> None
     assert json.dumps(json.loads(scores.read_text())).count('"outliers": 0.0') > 0
 
 
-def test_keys_do_not_depend_on_which_are_asked_for(
-    border_drive: Path, border_set: Path, empty_cache: Path, tmp_path: Path
-) -> None:
-    out, keys = tmp_path / "out", ("--keys", "36:45:4")
-    assert exit_code("dataset", "--data", border_drive, *OPTIONS, *keys, "--out", out) == 0
-    in_order(out)
-    asked = keys_of(maps_in(out))
-    assert asked == {36, 40, 44}
-    assert maps_in(out) == {n: d for n, d in maps_in(border_set).items() if keys_of([n]) <= asked}
-
-
 def test_workers_and_shards_make_what_one_makes(
     border_drive: Path, border_set: Path, empty_cache: Path, tmp_path: Path, monkeypatch
 ) -> None:

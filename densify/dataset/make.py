@@ -65,11 +65,6 @@ class Summary:
     def num_left(self) -> int:
         return self.num_keys - len(self.records)
 
-    @property
-    def seconds_left(self) -> float | None:
-        """The time that is left at the rate so far; None before the first key."""
-        return self.seconds / self.num_made * self.num_left if self.num_made else None
-
     def mean(self, score: str) -> float | None:
         """Return the mean over the keys that are done, and their cameras."""
         values: list[Any] = []
@@ -139,7 +134,7 @@ def make_dataset(
                 num_workers,
             )
             left = _jobs(blocks, records.keys(), recipe, out, num_workers)
-            made = _made(call_all(make_key, left, num_workers, log))
+            made = call_all(make_key, left, num_workers, log)
             summary = _record(made, manifest, records, len(wanted), report)
             clear_leftovers(out, leftover_age_s)  # of workers that were killed
     return summary
@@ -206,29 +201,23 @@ def _jobs(
     return [group for start in range(step) for group in groups[start::step]]
 
 
-def _made(outcomes: Iterator[tuple[tuple[Job, int], Any]]) -> Iterator[KeyRecord]:
-    for (job, key), outcome in outcomes:
-        if isinstance(outcome, Exception):
-            yield KeyRecord(job.drive, key, "failed", str(outcome))
-        else:
-            yield outcome
-
-
 def _record(
-    made: Iterator[KeyRecord],
+    made: Iterator[tuple[tuple[Job, int], Any]],
     manifest: Manifest,
     records: dict[Key, KeyRecord],
     num_keys: int,
     report: Callable[[Summary], None] | None,
 ) -> Summary:
-    """Record and report every key. records: those before, to which the new ones are added. If it
-    ends early, it tells what is kept; a full disk is a ComputationError."""
+    """Record and report every key. made: of `call_all`. records: those before, to which the new
+    ones are added. If it ends early, it tells what is kept; a full disk is a ComputationError."""
     start_s = time.monotonic()
     summary = Summary(records, num_keys)
     try:
         if report is not None:
             report(summary)
-        for num_made, record in enumerate(made, start=1):
+        for num_made, ((job, key), record) in enumerate(made, start=1):
+            if isinstance(record, Exception):
+                record = KeyRecord(job.drive, key, "failed", str(record))
             manifest.append(record)
             records[record.name] = record
             summary = Summary(records, num_keys, num_made, time.monotonic() - start_s)

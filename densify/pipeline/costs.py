@@ -3,14 +3,16 @@
 
 from __future__ import annotations
 
-import resource
 import sys
 import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from resource import RUSAGE_SELF, getrusage
 
 from densify.geometry.types import Progress, StageCost
+
+_PER_MB = 1024 * 1024 if sys.platform == "darwin" else 1024  # of getrusage(2)
 
 
 class Watch:
@@ -40,7 +42,7 @@ class Watch:
             with self._lock:
                 own_s = total_s - self._thread.inner_s
                 self._seconds[name] = self._seconds.get(name, 0.0) + own_s
-                self._peak_mb[name] = _peak_memory_mb()
+                self._peak_mb[name] = getrusage(RUSAGE_SELF).ru_maxrss / _PER_MB
             self._thread.inner_s = inner_s + total_s
         self._report(name, 1)
 
@@ -52,9 +54,3 @@ class Watch:
         if self._progress is not None:
             with self._lock:
                 self._progress(name, done, 1)
-
-
-def _peak_memory_mb() -> float:
-    """Return the most memory that this process had at once."""
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak / (1024 * 1024 if sys.platform == "darwin" else 1024)

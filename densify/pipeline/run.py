@@ -14,12 +14,12 @@
 from __future__ import annotations
 
 import reprlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from densify.config import Config, resolve
 from densify.config.cache import Cache
@@ -38,12 +38,13 @@ from densify.pipeline.key_result import (
     with_baselines,
 )
 from densify.pipeline.recording import Recording
-from densify.pipeline.warnings import add_warnings, warn_of_window
+from densify.pipeline.warnings import add_warnings
 from densify.readers.timeline import choose_cameras
 
 if TYPE_CHECKING:
     from densify.readers.prior_files import PriorFiles
 
+T = TypeVar("T")
 ConfigLike = Config | str | Path | Mapping[str, Any] | None
 
 
@@ -100,14 +101,10 @@ def run_keys(
     recording = _open(sequence, keys, window, methods, cameras, config, cache, watch)
     priors = _open_prior(prior, sequence, cameras)
 
-    def results() -> Iterator[tuple[int, Result | ComputationError | InputError]]:
-        for key in sorted(set(keys)):
-            try:
-                yield key, densify(recording, key, methods, cameras, watch, priors=priors)[method]
-            except (ComputationError, InputError) as error:
-                yield key, error
+    def make(key: int) -> Result:
+        return densify(recording, key, methods, cameras, watch, priors=priors)[method]
 
-    return results()
+    return ((key, _or_error(make, key)) for key in sorted(set(keys)))
 
 
 def compare(
@@ -152,10 +149,7 @@ def flow_steps(
         for done, frame in enumerate(frames):
             if progress:
                 progress("flow", done, len(frames))
-            try:
-                yield frame, recording.step(frame)
-            except (ComputationError, InputError) as error:
-                yield frame, error
+            yield frame, _or_error(recording.step, frame)
 
     return steps()
 
@@ -176,11 +170,10 @@ def densify(
     Errors as `run`.
     """
     watch, sequence, settings = watch or Watch(), recording.sequence, recording.settings
-    window = recording.window_frames(key)
+    stretch = recording.window(key)
     shots = key_shots(sequence, choose_cameras(sequence, cameras), key, settings.project)
     with watch.stage("images"):
         images = load_images(sequence, shots)
-    stretch = recording.window(key)
 
     with ThreadPoolExecutor(num_threads()) as pool:
         wants_far = any(METHODS[name].far for name in methods)
@@ -207,8 +200,14 @@ def densify(
     results: dict[str, Result] = {}
     for result in made:
         results[result.method] = replace(result, costs=watch.costs(), baselines=dict(results))
-    pair = looks_around(methods) and recording.is_pair(key)
-    return add_warnings(results, sequence, stretch, shots, settings, warn_of_window(window, pair))
+    return add_warnings(results, recording, key, shots)
+
+
+def _or_error(make: Callable[[int], T], frame: int) -> T | ComputationError | InputError:
+    try:
+        return make(frame)
+    except (ComputationError, InputError) as error:
+        return error
 
 
 def _open_prior(

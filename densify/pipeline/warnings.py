@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -12,8 +12,9 @@ from densify.config import Config
 from densify.depth.exposure import Shot
 from densify.free_space.ground import find_up_axis
 from densify.geometry.types import LidarSequence, Result, Stretch
-from densify.pipeline.key_result import METHODS
-from densify.readers.timeline import WindowFrames, format_frames
+from densify.pipeline.key_result import METHODS, looks_around
+from densify.pipeline.recording import Recording
+from densify.readers.timeline import format_frames
 from densify.scores.depth_metrics import image_density
 
 _LEAST_DENSITY = 0.001  # sixteen rings alone measure 0.5 % of an image
@@ -21,44 +22,39 @@ _SLOW_S = 0.15  # from sweep to sweep; at 5 Hz trucks slide along their own side
 _OTHER_CLOCK_S = 1.0  # from a sweep to the nearest image
 
 
-def warn_of_window(window: WindowFrames, is_pair: bool) -> list[str]:
-    """Say why a key's window has fewer sweeps than asked for, or too few to follow anything."""
-    frames = format_frames(window.frames)
-    warnings = [f"the window is cut to frames {frames}: {cut}" for cut in window.cuts]
-    if is_pair:
-        warnings.append(
-            "two sweeps show what moves less well than three or more, which can be followed"
-        )
-    return warnings
-
-
 def add_warnings(
     results: Mapping[str, Result],
-    sequence: LidarSequence,
-    stretch: Stretch,
+    recording: Recording,
+    key: int,
     shots: Mapping[str, Shot],
-    settings: Config,
-    first: Sequence[str],
 ) -> dict[str, Result]:
-    """Return the results of a key's methods with `Result.warnings`, ``first`` among them."""
+    """Return the results of a key's methods, by name, with `Result.warnings`.
+
+    shots: of the maps, by name.
+    """
+    sequence, stretch = recording.sequence, recording.window(key)
     cameras = {shot.camera.name for shot in shots.values()}
     shared = [
-        *first,
+        *_of_window(recording, key, looks_around([*results])),
         *(sequence.gaps() if hasattr(sequence, "gaps") else ()),
         *(
             f"{name} is left out: the recording has no images of it; ask with --camera {name}"
             for name in sequence.cameras
             if name not in cameras and not sequence.image_stamps_ns(name)
         ),
-        *_of_sweeps(stretch, settings),
+        *_of_sweeps(stretch, recording.settings),
         *_of_images(sequence, shots),
     ]
-    return {
-        name: replace(
-            result, warnings=tuple(dict.fromkeys([*shared, *_of_result(result, stretch)]))
-        )
-        for name, result in results.items()
-    }
+    told = {n: dict.fromkeys([*shared, *_of_result(r, stretch)]) for n, r in results.items()}
+    return {name: replace(result, warnings=tuple(told[name])) for name, result in results.items()}
+
+
+def _of_window(recording: Recording, key: int, follows: bool) -> Iterator[str]:
+    window = recording.window_frames(key)
+    for cut in window.cuts:
+        yield f"the window is cut to frames {format_frames(window.frames)}: {cut}"
+    if follows and recording.is_pair(key):
+        yield "two sweeps show what moves less well than three or more, which can be followed"
 
 
 def _of_sweeps(stretch: Stretch, settings: Config) -> Iterator[str]:
