@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from pathlib import Path
 
@@ -107,17 +106,16 @@ def log(tmp_path_factory) -> Path:
 
 
 def test_the_command_measures_and_names_what_is_published(tmp_path: Path, capsys) -> None:
-    folder, out, model = tmp_path / "set", tmp_path / "t.json", tmp_path / "m.pt"
+    folder, model = tmp_path / "set", tmp_path / "m.pt"
     folder.mkdir()
     kitti_file(folder / "a.npz")
     write_model(model, Model(build(), {"teacher": "truth", "steps": 0}))
-    command = ["bench", "paper", "--kitti", str(folder), "--methods", "rest", "--out", str(out)]
+    command = ["bench", "paper", "--kitti", str(folder), "--methods", "rest"]
     assert main([*command, "--model", str(model), "--points", "100"]) == 0
     told = capsys.readouterr().out
     assert "1 pairs, 100 points drawn" in told and "m.pt" in told
     rows = {line.split()[0]: line.split()[-1] for line in told.splitlines() if line}
     assert (rows["epe_m"], rows["within_5"], rows["angle_rad"]) == ("0.093", "0.648", "0.137")
-    assert json.loads(out.read_text())["sets"]["kitti"]["methods"]["rest"]["epe_m"] > 0.3
 
 
 def test_without_truth_networks_are_held_against_the_engine(log: Path, tmp_path: Path) -> None:

@@ -27,7 +27,7 @@ VALUE = {"noise": np.random.default_rng(1).random((300, 3)), "few": np.arange(5)
 def get(cache: Cache, inputs: Any = 1) -> int:
     """How often it was made; whatever happens, the value is right."""
     calls: list[int] = []
-    found = cache.get("stage", dict[str, NDArray], inputs, lambda: calls.append(1) or VALUE)
+    found = cache.get("stage", inputs, lambda: calls.append(1) or VALUE)
     assert found.keys() == VALUE.keys()
     assert all(np.array_equal(found[name], VALUE[name]) for name in VALUE)
     return len(calls)
@@ -83,8 +83,8 @@ def test_what_is_kept_comes_back(maybe, tmp_path: Path) -> None:
     value = Outer((inner, scalars), (1 << 60, 1 / 3), by_frame, maybe, ([True], []))
     value.later = np.zeros((0, 3), np.float32)
     cache = Cache(LIMIT, tmp_path)
-    assert cache.get("outer", Outer, 1, lambda: value) is value
-    found = cache.get("outer", Outer, 1, lambda: None)
+    assert cache.get("outer", 1, lambda: value) is value
+    found = cache.get("outer", 1, lambda: None)
     assert same(found, value)
     found.later += 1  # writable
 
@@ -92,10 +92,10 @@ def test_what_is_kept_comes_back(maybe, tmp_path: Path) -> None:
 def test_what_has_other_parts_is_not_kept(tmp_path: Path) -> None:
     cache = Cache(LIMIT, tmp_path)
     for value in (object(), np.array([{}]), {1, 2}):
-        assert cache.get("stage", Any, 1, lambda value=value: value) is value
+        assert cache.get("stage", 1, lambda value=value: value) is value
     assert list(tmp_path.iterdir()) == []
     with pytest.raises(ZeroDivisionError):
-        cache.get("stage", Any, 1, lambda: 1 / 0)
+        cache.get("stage", 1, lambda: 1 / 0)
     assert get(cache) == 1
 
 

@@ -65,28 +65,6 @@ def test_the_numbers_of_the_challenges_own_package():
     assert scores.three_way.mean_m == pytest.approx(sum(THREE_WAY) / 3, rel=1e-6)
 
 
-def test_buckets_as_a_loop():
-    cells: dict[tuple[str, int], list[tuple[float, float]]] = {}
-    for points, estimated, true, kind in frames():
-        for p, f, t, k in zip(points, estimated, true, kind, strict=True):
-            if max(abs(p[0]), abs(p[1])) < 35 and CLASS_OF[k] != IGNORED:
-                length_m = math.hypot(*t)
-                bucket = sum(length_m >= 2.0 * i / 50 for i in range(51)) - 1
-                cells.setdefault((CLASSES[CLASS_OF[k]], bucket), []).append(
-                    (math.dist(f, t), length_m)
-                )
-    scores = scored().scores()
-    assert sum(map(len, cells.values())) == scores.num_points
-    assert {bucket for _, bucket in cells} > {0, 1, 50}
-    for name, found in scores.by_class.items():
-        means = {b: np.mean(v, 0) for (n, b), v in cells.items() if n == name}
-        assert found.static_m == pytest.approx(means[0][0])
-        quotients = [error / length for b, (error, length) in means.items() if b]
-        assert found.dynamic == pytest.approx(
-            np.mean(quotients) if quotients else math.nan, nan_ok=True
-        )
-
-
 def test_nothing_scored_is_nan():
     scores = ChallengeScorer().scores()
     assert scores.num_points == 0 and not scores.by_class

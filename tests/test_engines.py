@@ -14,7 +14,7 @@ from densify.config import Config
 from densify.config.cache import Cache
 from densify.config.errors import InputError
 from densify.config.plugins import ENGINES, engine
-from densify.flow.engines import Scene, check_engine, estimate_motion, motion_type
+from densify.flow.engines import Scene, check_engine, estimate_motion
 from densify.free_space.ground import ground
 from densify.geometry.types import Stretch
 from tests import scenes
@@ -59,10 +59,9 @@ def test_sweeps_that_are_not_asked_for_tell_what_moves_all_the_same(driving: Sce
 @pytest.mark.parametrize("row", [r for r in ENGINES.built_in if r.shared], ids=lambda r: r.name)
 def test_shared_motion_is_kept_without_points(driving: Scene, row, tmp_path: Path) -> None:
     motion = estimate_motion(driving, Config(), row.usage)
-    kind = motion_type(row.usage)
     cache, bare = Cache(folder=tmp_path), motion.with_stretch(Stretch(()))
-    cache.get("motion", kind, 1, lambda: bare)
-    kept = cache.get("motion", kind, 1, lambda: pytest.fail("not kept"))
+    cache.get("motion", 1, lambda: bare)
+    kept = cache.get("motion", 1, lambda: pytest.fail("not kept"))
     nobody = replace(
         driving.stretch.sweeps[0],
         sweep=driving.stretch.sweeps[0].sweep.select(

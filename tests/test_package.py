@@ -60,11 +60,6 @@ def test_imports_and_help_are_light() -> None:
     assert not HEAVY & modules_after(code)
 
 
-def test_opening_a_recording_needs_no_torch() -> None:
-    heavy = {"torch", "kiss_icp", "small_gicp", "numba"}
-    assert not heavy & modules_after("import densify; densify.open_sequence")
-
-
 def test_the_default_run_waits_for_no_torch() -> None:
     """Nor for other packages that take longer to import than a stage to run."""
     code = (

@@ -17,7 +17,7 @@ from scipy import ndimage
 
 from densify.config import Config
 from densify.config.errors import InputError
-from densify.depth.exposure import Exposure, key_shots
+from densify.depth.exposure import Exposure, Shot, key_shots
 from densify.geometry import poses
 from densify.geometry.cameras import converted, depth_along, rays
 from densify.geometry.types import Bool, Camera, Float32, LidarSequence, Progress, Result, Sweep
@@ -81,24 +81,21 @@ def bench_depth(
     sums = {name: _Sums() for name in variants}
     for number, key in enumerate(keys):
         for name, config in variants.items():
+            shots = key_shots(sequence, choose_cameras(sequence, cameras), key, config.project)
             truths = {}
             if scanner is not None:
-                truths["scanner"] = _returns_of(scanner, sequence, key, window, cameras, config)
+                truths["scanner"] = _returns_of(scanner, sequence, key, window, shots, config)
             watch = Watch()
             looks = looks_around([method])
             recording = Recording(used, config, window, [key], None, None, watch, looks)
             made = pipeline.densify(recording, key, [method], cameras, watch)[method]
             key_sweep = recording.window(key)[key].sweep
-            truths["truth"] = exact_truth(used, key_sweep, key, cameras, config)
+            truths["truth"] = _exact_truth(used, key_sweep, shots, config)
             sums[name].add(made, truths, used.cameras)
         if progress is not None:
             progress("bench", number + 1, len(keys))
-    return {
-        "data": sequence.name,
-        "keys": list(keys),
-        "scanner": scanner,
-        "variants": {name: found.numbers(len(keys)) for name, found in sums.items()},
-    }
+    found = {name: variant.numbers(len(keys)) for name, variant in sums.items()}
+    return {"data": sequence.name, "keys": list(keys), "scanner": scanner, "variants": found}
 
 
 class _Without:
@@ -120,7 +117,7 @@ def _returns_of(
     sequence: LidarSequence,
     key: int,
     window: int,
-    cameras: Sequence[str] | None,
+    shots: Mapping[str, Shot],
     config: Config,
 ) -> dict[str, TruthMap]:
     """Return the depth that one scanner of the key sweep measured, by map."""
@@ -128,7 +125,6 @@ def _returns_of(
     cloud = recording.moment(key, all_sweeps=True, engine="").cloud
     cloud = cloud.select((cloud.lidar == scanner) & (cloud.frame == key))
     stretch = recording.window(key)
-    shots = key_shots(sequence, choose_cameras(sequence, cameras), key, config.project)
     maps = {}
     for name, shot in shots.items():
         view = Exposure.of(sequence, stretch, key, shot, config).sees(cloud)
@@ -147,12 +143,8 @@ def _returns_of(
     return maps
 
 
-def exact_truth(
-    sequence: LidarSequence,
-    key_sweep: Sweep,
-    key: int,
-    cameras: Sequence[str] | None,
-    config: Config,
+def _exact_truth(
+    sequence: LidarSequence, key_sweep: Sweep, shots: Mapping[str, Shot], config: Config
 ) -> dict[str, TruthMap]:
     """Return the exact depth within a scanner's reach by map, none of a real recording."""
     maps: dict[str, TruthMap] = {}
@@ -162,7 +154,6 @@ def exact_truth(
     if key_sweep.scanner_origins is not None:
         away = away - key_sweep.scanner_origins[key_sweep.lidar]
     top = np.quantile(away[:, 2] / np.linalg.norm(away[:, :2], axis=1), _TOP_QUANTILE)
-    shots = key_shots(sequence, choose_cameras(sequence, cameras), key, config.project)
     for name, shot in shots.items():
         if shot.number is None:
             continue

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import platform
 from collections import defaultdict
@@ -17,8 +16,8 @@ import numpy as np
 from densify import __version__
 from densify.config.errors import InputError
 from densify.geometry.types import Bool, Float32, Progress
-from densify.outputs.atomic import write_file
 from densify.outputs.depth_png import read_depth_png, read_mask_png
+from densify.outputs.plain import write_json
 from densify.readers.depth_trees import DepthPair, DepthPairs
 from densify.scores.depth_metrics import (
     KITTI_BASELINE_M,
@@ -106,8 +105,8 @@ def _read(pair: DepthPair) -> tuple[Float32, Float32, Bool | None]:
 def write_numbers(path: Path, numbers: Mapping[str, Any]) -> None:
     """Write numbers as JSON, with the version and the machine; the file appears when complete.
 
-    Raises InputError if it cannot be written.
+    Raises OutputError if it cannot be written.
     """
     machine = {"python": platform.python_version(), "num_cores": os.cpu_count()}
     whole = {"densify": __version__, "machine": machine, **numbers}
-    write_file(path, (json.dumps(whole, indent=2, allow_nan=False) + "\n").encode())
+    write_json(path, whole)

@@ -68,12 +68,12 @@ _REGISTERED = _streets("""
 
 
 class _Table(NamedTuple):
-    """rows: the cells of a scene, a line each. real: has rows of real recordings."""
+    """row: the cells of a scene. real: has rows of real recordings."""
 
     about: str
     titles: str
     scenes: tuple[Scene, ...]
-    rows: Callable[[Scene], Sequence[Sequence[str]]]
+    row: Callable[[Scene], Sequence[str]]
     real: bool = False
 
 
@@ -100,8 +100,7 @@ def tables(
         yield f"| | {table.titles} |"
         yield _line(["---"] * (table.titles.count("|") + 2))
         for scene in scenes[number]:
-            for cells in table.rows(scene):
-                yield _line(cells)
+            yield _line(table.row(scene))
             done += 1
             if progress is not None:
                 progress("bench", done, sum(map(len, scenes)))
@@ -121,64 +120,58 @@ def _line(cells: Sequence[str]) -> str:
     return f"| {' | '.join(cells)} |"
 
 
-def _percent(value: float | None, digits: int = 2) -> str:
-    return "–" if value is None else f"{100 * value:.{digits}f}"
+def _times_100(value: float | None, digits: int, unit: str) -> str:
+    return ("–" if value is None else f"{100 * value:.{digits}f}") + unit * (value is not None)
 
 
-def _centimetres(value_m: float | None) -> str:
-    return "–" if value_m is None else f"{100 * value_m:.1f} cm"
-
-
-def _rows_of_depth(scene: Scene) -> list[list[str]]:
+def _row_of_depth(scene: Scene) -> list[str]:
     """Return the scores against the best truth there is."""
     sequence, config = open_sequence(scene.data), {"": resolve(None)}
-    measured = bench_depth(
-        sequence, scene.keys, scene.window, config, [scene.camera], scene.scanner
-    )
+    cameras, scanner = [scene.camera], scene.scanner
+    measured = bench_depth(sequence, scene.keys, scene.window, config, cameras, scanner)
     scores = measured["variants"][""]["scores"]
     source = next(s for s in ("truth", "scanner", "key held out") if s in scores)
     cells = [str(scene)]
     for product, part in (("measured", "all"), ("filled", "all"), ("filled", "moving")):
         score = scores[source][product][part]
         cells.append("–" if score["coverage"] is None else f"{score['coverage']:.2f}")
-        cells.append(f"{_percent(score['outliers'])} %")
-    return [cells]
+        cells.append(_times_100(score["outliers"], 2, " %"))
+    return cells
 
 
-def _rows_of_flow(scene: Scene) -> list[list[str]]:
+def _row_of_flow(scene: Scene) -> list[str]:
     sequence, key = open_sequence(scene.data), scene.keys[0]
     ours = bench_flow(sequence, key, scene.window, resolve(None), ["ours"])["methods"]["ours"]
     step, window = ours["step"], ours["window"]
     hops = str(scene.window)
     all_m, found_m = (window[f"{which}movers_m_by_hops"].get(hops) for which in ("", "found_"))
+    one, one_found, five, five_found = (
+        _times_100(error_m, 1, " cm")
+        for error_m in (step["movers_m"], step["found_movers_m"], all_m, found_m)
+    )
     return [
-        [
-            str(scene),
-            f"{_percent(step['found'], 1)} %",
-            f"{_centimetres(step['movers_m'])} ({_centimetres(step['found_movers_m'])})",
-            f"{_centimetres(all_m)} ({_centimetres(found_m)})",
-            f"{_percent(step['falsely_moving'], 4)} %",
-            f"{_percent(window['ghost_rate'])} %",
-        ]
+        str(scene),
+        _times_100(step["found"], 1, " %"),
+        f"{one} ({one_found})",
+        f"{five} ({five_found})",
+        _times_100(step["falsely_moving"], 4, " %"),
+        _times_100(window["ghost_rate"], 2, " %"),
     ]
 
 
-def _rows_of_registration(scene: Scene) -> list[list[str]]:
+def _row_of_registration(scene: Scene) -> list[str]:
     """Return the root mean square errors of the window's poses relative to the key's."""
     sequence, key = open_sequence(scene.data), scene.keys[0]
     stretch = Recording(sequence, resolve(None), scene.window, [key]).window(key)
     T_true_world = poses.inverse(sequence.T_world_lidar(key))
-    off = [
-        poses.log(
-            poses.inverse(T_true_world @ sequence.T_world_lidar(frame))
-            @ stretch.T_target_source(key, frame)
-        )
-        for frame in stretch.frames
-    ]
+    off = []
+    for frame in stretch.frames:
+        T_true = T_true_world @ sequence.T_world_lidar(frame)
+        off.append(poses.log(poses.inverse(T_true) @ stretch.T_target_source(key, frame)))
     rotation, translation = (
         np.sqrt((part**2).sum(axis=1).mean()) for part in np.hsplit(np.array(off), 2)
     )
-    return [[str(scene), f"{1000 * translation:.0f} mm", f"{np.rad2deg(rotation):.3f}°"]]
+    return [str(scene), f"{1000 * translation:.0f} mm", f"{np.rad2deg(rotation):.3f}°"]
 
 
 TABLES: Mapping[str, _Table] = {
@@ -186,7 +179,7 @@ TABLES: Mapping[str, _Table] = {
         "Coverage of the true pixels within a scanner's reach, and outliers.",
         "measured | outliers | filled | outliers | moving, filled | outliers",
         _DEPTH,
-        _rows_of_depth,
+        _row_of_depth,
         real=True,
     ),
     "flow": _Table(
@@ -194,12 +187,12 @@ TABLES: Mapping[str, _Table] = {
         "those found.",
         "found | one sweep | five sweeps | falsely moving | ghosts",
         _FLOW,
-        _rows_of_flow,
+        _row_of_flow,
     ),
     "registration": _Table(
         "Errors of the poses of eleven sweeps relative to the key's, root mean square.",
         "translation | rotation",
         _REGISTERED,
-        _rows_of_registration,
+        _row_of_registration,
     ),
 }

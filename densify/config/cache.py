@@ -5,14 +5,12 @@ the user alone (`densify.config.user_folder`). A damaged entry is made again."""
 
 from __future__ import annotations
 
-import functools
 import hashlib
 import json
 import logging
 import os
+import sys
 import tempfile
-import types
-import typing
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import fields, is_dataclass
@@ -30,7 +28,6 @@ _log = logging.getLogger("densify")
 # so an entry depends on all of them.
 _STEP_VERSIONS = "digests 1, registration 1, motion 2, far 2"
 _MOST_ENTRIES = 10_000
-_field_types = functools.cache(typing.get_type_hints)
 
 
 class Cache:
@@ -44,13 +41,13 @@ class Cache:
         except OSError as error:
             _log.warning("%s: %s; nothing is kept for later", self._folder, error.strerror or error)
 
-    def get(self, step: str, kind: type[T], inputs: Any, make: Callable[[], T]) -> T:
-        """Return what ``make`` returns, now or when it was made of the same inputs before. kind:
-        its type, by which an entry is read. inputs: all that it depends on, as `digest` takes."""
+    def get(self, step: str, inputs: Any, make: Callable[[], T]) -> T:
+        """Return what ``make`` returns, now or when it was made of the same inputs before. inputs:
+        all that it depends on, as `digest` takes."""
         path = self._folder / f"{step}-{digest((__version__, _STEP_VERSIONS, inputs))}.npz"
         try:
             with np.load(path, allow_pickle=False) as arrays:
-                value: T = _unpacked(json.loads(arrays["json"].tobytes()), kind, arrays)
+                value: T = _unpacked(json.loads(arrays["json"].tobytes()), arrays)
             os.utime(path)  # the entry was used
             return value
         except FileNotFoundError:
@@ -76,11 +73,9 @@ class Cache:
                     left -= num_bytes
 
 
-def kept(
-    cache: Cache | None, step: str, kind: type[T], inputs: Callable[[], Any], make: Callable[[], T]
-) -> T:
+def kept(cache: Cache | None, step: str, inputs: Callable[[], Any], make: Callable[[], T]) -> T:
     """Return what ``make`` returns, by the cache if there is one."""
-    return make() if cache is None else cache.get(step, kind, inputs(), make)
+    return make() if cache is None else cache.get(step, inputs(), make)
 
 
 def save_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
@@ -106,42 +101,45 @@ def digest(value: Any) -> str:
 
 
 def _packed(value: Any) -> tuple[bytes, dict[str, np.ndarray]]:
-    """Return the value as JSON, and the arrays in it by the names that stand for them there.
-    Raises TypeError for other parts."""
+    """Return the value as JSON, and the arrays in it by the names that stand for them there. Values
+    that JSON lacks are ``{KIND: content}``. Raises TypeError for other parts."""
     arrays: dict[str, np.ndarray] = {}
 
     def tree(value: Any) -> Any:
+        kind = type(value)
         if isinstance(value, np.ndarray | np.generic) and not value.dtype.hasobject:
             arrays[name := str(len(arrays))] = np.asarray(value)
             return {"array" if isinstance(value, np.ndarray) else "scalar": name}
-        if is_dataclass(value):
-            return [tree(getattr(value, f.name)) for f in fields(value)]
         if isinstance(value, Mapping):
-            return [[tree(key), tree(item)] for key, item in value.items()]
-        return [tree(item) for item in value] if isinstance(value, tuple | list) else value
+            return {"mapping": [[tree(key), tree(item)] for key, item in value.items()]}
+        if is_dataclass(value) or hasattr(value, "_fields"):
+            names = getattr(value, "_fields", None) or [f.name for f in fields(value)]
+            parts = [tree(getattr(value, name)) for name in names]
+            return {f"{kind.__module__}:{kind.__qualname__}": parts}
+        if isinstance(value, tuple):
+            return {"tuple": [*map(tree, value)]}
+        return [*map(tree, value)] if isinstance(value, list) else value
 
     return json.dumps(tree(value)).encode(), arrays
 
 
-def _unpacked(tree: Any, kind: Any, arrays: Mapping[str, np.ndarray]) -> Any:
-    """Return the value of this type of `_packed`'s parts."""
-    if isinstance(tree, dict):
-        ((what, name),) = tree.items()
-        return arrays[name] if what == "array" else arrays[name][()]
-    if not isinstance(tree, list):
+def _unpacked(tree: Any, arrays: Mapping[str, np.ndarray]) -> Any:
+    """Return the value of `_packed`'s parts. Its classes are dataclasses and named tuples of
+    modules that are imported already; they are filled without calling anything of theirs."""
+    if isinstance(tree, list):
+        return [_unpacked(part, arrays) for part in tree]
+    if not isinstance(tree, dict):
         return tree
-    if typing.get_origin(kind) in (typing.Union, types.UnionType):
-        kind = next(k for k in typing.get_args(kind) if k not in (str, int, float, type(None)))
-    made, of = typing.get_origin(kind) or kind, typing.get_args(kind)
-    if issubclass(made, Mapping):
-        return {_unpacked(k, of[0], arrays): _unpacked(v, of[1], arrays) for k, v in tree}
-    if names := _field_types(made):  # of a dataclass or named tuple
-        of = tuple(names.values())
-    elif len(of) == 1 or of[1] is ...:
-        of = (of[0],) * len(tree)
-    parts = [_unpacked(part, k, arrays) for part, k in zip(tree, of, strict=True)]
-    if not is_dataclass(made):
-        return made(*parts) if names else parts if made is list else tuple(parts)
-    value: Any = object.__new__(typing.cast(type, made))
-    value.__dict__.update(zip(names, parts, strict=True))  # init=False fields too
+    ((kind, content),) = tree.items()
+    if kind in ("array", "scalar"):
+        return arrays[content] if kind == "array" else arrays[content][()]
+    parts = _unpacked(content, arrays)
+    if kind in ("tuple", "mapping"):
+        return tuple(parts) if kind == "tuple" else dict(parts)
+    module, _, name = kind.partition(":")
+    made = getattr(sys.modules[module], name)
+    if issubclass(made, tuple):
+        return tuple.__new__(made, parts)
+    value = object.__new__(made)
+    value.__dict__.update(zip((f.name for f in fields(made)), parts, strict=True))
     return value

@@ -4,12 +4,11 @@
 from __future__ import annotations
 
 from collections.abc import Collection
-from dataclasses import dataclass, is_dataclass
+from dataclasses import dataclass
 from functools import cached_property
-from typing import Protocol, cast, get_type_hints
+from typing import Protocol, cast
 
 from densify.config import Config
-from densify.config.errors import InputError
 from densify.config.plugins import engine
 from densify.flow.tracking.candidates import Candidates, find_candidates
 from densify.free_space.ground import HeightMap
@@ -47,7 +46,7 @@ class Scene:
 class SharedMotion(Motion, Protocol):
     """Motion of a long stretch that serves every key in it.
 
-    A dataclass that is kept on disk without points, by the types of its fields.
+    A dataclass that is kept on disk without points.
     """
 
     def with_stretch(self, stretch: Stretch) -> SharedMotion:
@@ -67,8 +66,8 @@ class EngineModule(Protocol):
         """Return how everything in the scene's stretch moves; same input, same bytes.
 
         argument: the part of ``flow.engine`` after the colon, "" for none. Work may be postponed
-        until the motion's ``flow`` is called. If the engine's row says ``shared``, this function
-        is annotated as returning a dataclass that is a `SharedMotion`.
+        until the motion's ``flow`` is called. If the engine's row says ``shared``, the motion is
+        a `SharedMotion`.
         """
         ...
 
@@ -80,24 +79,9 @@ def estimate_motion(scene: Scene, settings: Config, spec: str | None = None) -> 
     return module.estimate_motion(scene, settings, argument)
 
 
-def motion_type(spec: str) -> type[SharedMotion]:
-    """Return the dataclass that the engine's ``estimate_motion`` is annotated to return. Raises
-    InputError if it is none."""
-    row, _ = engine(spec)
-    found = get_type_hints(row.work().estimate_motion).get("return")
-    if not (isinstance(found, type) and is_dataclass(found)):
-        raise InputError(
-            f"flow.engine: {row.name} shares its motion among keys, expected an estimate_motion "
-            f"annotated as returning a dataclass, got {found}"
-        )
-    return cast(type[SharedMotion], found)
-
-
 def check_engine(spec: str) -> None:
     """Raise InputError if the engine is not there or cannot use its argument; imports it."""
     row, argument = engine(spec)
-    if row.shared:
-        motion_type(spec)
     check = getattr(row.work(), "check_argument", None)
     if check is not None:
         check(argument)

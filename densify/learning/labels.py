@@ -14,14 +14,7 @@ from densify.config.errors import ComputationError, InputError
 from densify.config.plugins import READERS
 from densify.flow.boxes import flow_of_boxes
 from densify.geometry import poses
-from densify.geometry.types import (
-    Bool,
-    Boxes,
-    FlowField,
-    LidarSequence,
-    Progress,
-    RegisteredSweep,
-)
+from densify.geometry.types import Bool, Boxes, FlowField, LidarSequence, Progress, RegisteredSweep
 from densify.outputs.atomic import write_file
 from densify.outputs.flow_writers import flow_npz
 from densify.pipeline.recording import Recording
@@ -43,10 +36,7 @@ class Label:
 
 
 def label_sweeps(
-    sequence: LidarSequence,
-    frames: Sequence[int],
-    config: Config,
-    progress: Progress | None = None,
+    sequence: LidarSequence, frames: Sequence[int], config: Config, progress: Progress | None = None
 ) -> Iterator[tuple[int, Label | ComputationError | InputError]]:
     """Yield the label of each sweep, or the error that prevents it, with its frame.
 
@@ -94,12 +84,7 @@ def write_label(folder: Path, label: Label, overwrite: bool) -> Path:
     if path.exists() and not overwrite:
         raise InputError(f"{path}: there already, kept; give --overwrite to replace it")
     arrived = poses.transform(label.T_next_here, sweep.points + field.total)
-    data = flow_npz(
-        field,
-        row=sweep.row,
-        total_flow=arrived - sweep.points,
-        object=field.instance,
-        valid=label.sure,
-    )
+    total = arrived - sweep.points
+    data = flow_npz(field, row=sweep.row, total_flow=total, object=field.instance, valid=label.sure)
     write_file(path, data)
     return path

@@ -55,7 +55,7 @@ class Model:
 def write_model(path: Path, model: Model) -> None:
     """Write a model file: the same bytes for the same model.
 
-    The file appears when it is complete. Raises InputError where it cannot be written.
+    The file appears when it is complete. Raises OutputError where it cannot be written.
     """
     header = {"format": FORMAT, "version": VERSION, "network": NETWORK, "made": model.made}
     text = json.dumps(header, sort_keys=True).encode()
@@ -84,16 +84,12 @@ def read_model(path: Path) -> Model:
             f"{path}: got {found}, expected {(FORMAT, VERSION, NETWORK)}; train it again"
         )
     network = build()
-    weights = {name.removeprefix(_WEIGHTS): a for name, a in arrays.items() if _is_weight(name)}
+    names = [name for name in arrays if name.startswith(_WEIGHTS)]
+    weights = {name.removeprefix(_WEIGHTS): arrays.pop(name) for name in names}
     if not all(np.isfinite(array).all() for array in weights.values()):
         raise InputError(f"{path}: weights that are not finite; train it again")
     try:
         network.load_state_dict({name: torch.from_numpy(a) for name, a in weights.items()})
     except (RuntimeError, TypeError) as error:
         raise InputError(f"{path}: damaged: {error}; train it again") from error
-    beside = {name: array for name, array in arrays.items() if not _is_weight(name)}
-    return Model(network.train(False), made, beside)
-
-
-def _is_weight(name: str) -> bool:
-    return name.startswith(_WEIGHTS)
+    return Model(network.train(False), made, arrays)

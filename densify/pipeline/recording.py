@@ -24,7 +24,7 @@ from densify.config.cache import Cache, kept
 from densify.config.errors import InputError, SweepError, UnfitSweepError
 from densify.config.plugins import engine as engine_row
 from densify.depth.accumulate import accumulate, object_tracks
-from densify.flow.engines import Scene, SharedMotion, estimate_motion, motion_type
+from densify.flow.engines import Scene, SharedMotion, estimate_motion
 from densify.free_space.ground import HeightMap, ground
 from densify.geometry import poses
 from densify.geometry.types import (
@@ -283,7 +283,7 @@ class Recording:
                     left += self.timeline.runs([f for f in together if f != error.frame])
             return Registration(tuple(sorted(pieces, key=lambda p: p.frames)), bad)
 
-        return self._kept("registration", Registration, frames, make)
+        return self._kept("registration", frames, make)
 
     def _registered_together(self, number: int) -> list[int]:
         """Return the frames of a block, behind those of its lead-in."""
@@ -331,7 +331,7 @@ class Recording:
 
         settings = [engine, self.settings.flow, self.settings.objective, sorted(asked), row]
         together = self._registered_together(number)
-        return self._kept("motion", motion_type(engine), together, make, settings)
+        return self._kept("motion", together, make, settings)
 
     def _find_far(self, number: int, row: int) -> StandingWorld:
         """Return the static surfaces along the road of a piece, in its world."""
@@ -350,7 +350,7 @@ class Recording:
 
         if not self._is_whole:  # to make it costs less than to read the road for a digest
             return make()
-        return self._kept("far", StandingWorld, road.frames(near), make, [far_m, cameras, near])
+        return self._kept("far", road.frames(near), make, [far_m, cameras, near])
 
     def _in_windows(self, number: int) -> frozenset[int]:
         """Return the frames of the windows of a block's keys."""
@@ -361,7 +361,6 @@ class Recording:
     def _kept(
         self,
         step: str,
-        kind: type[T],
         frames: Iterable[int],
         make: Callable[[], T],
         settings: Sequence[Any] = (),
@@ -372,4 +371,4 @@ class Recording:
             content = [(f, self._sweeps.content(f)) for f in frames]
             return [self.settings.register, self.timeline.period_ns, content, list(settings)]
 
-        return kept(self._cache, step, kind, inputs, make)
+        return kept(self._cache, step, inputs, make)

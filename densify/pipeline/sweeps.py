@@ -76,7 +76,7 @@ class Sweeps:
                 return str(error)
 
         inputs = [self._run, self._sequence.name, self._settings, frame]
-        return kept(self._cache, "digests", str, lambda: inputs, find)
+        return kept(self._cache, "digests", lambda: inputs, find)
 
 
 @dataclass(frozen=True)

@@ -151,22 +151,22 @@ class Street:
     @cached_property
     def bodies(self) -> Bodies:
         """The poses of every body at every frame's reference time."""
-        return self._kept("bodies", Bodies, self._posed, lambda: self.simulator.bodies)
+        return self._kept("bodies", self._posed, lambda: self.simulator.bodies)
 
     def _kept_returns(self, frame: int) -> Returns:
         make = partial(self.simulator.returns, frame)
-        return self._kept("sweep", Returns, (self._swept, frame), make)
+        return self._kept("sweep", (self._swept, frame), make)
 
     def _kept_picture(self, camera: str, number: int) -> Picture:
         make = partial(self.simulator.picture, camera, number)
-        return self._kept("image", Picture, (self._pictured, camera, number), make)
+        return self._kept("image", (self._pictured, camera, number), make)
 
-    def _kept(self, step: str, kind: type[T], inputs: Any, make: Callable[[], T]) -> T:
+    def _kept(self, step: str, inputs: Any, make: Callable[[], T]) -> T:
         def rendered() -> T:
             _announce()
             return make()
 
-        return kept(self._cache, step, kind, lambda: inputs, rendered)
+        return kept(self._cache, step, lambda: inputs, rendered)
 
     def T_world_lidar(self, frame: int) -> Float:
         """Return the true (4,4) pose at the sweep's reference time."""

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,7 +13,6 @@ from densify.cli.options import (
     add_common,
     add_recording,
     add_verb,
-    check_new_file,
     config_of,
     natural,
     option,
@@ -118,34 +117,12 @@ def _add_paper(benches: Any) -> None:
     option(parser, "--model FILE", about, type=Path, action="append", default=[], dest="models")
     option(parser, "--points N", "drawn (default: 2048)", type=natural, default=2048)
     option(parser, "--pairs N", "of a set (default: 0, all)", type=natural, default=0)
-    _add_file(parser)
 
 
 def _add_common(parser: argparse.ArgumentParser) -> None:
     about = "frame in the middle; may be given several times (default: 120)"
     option(parser, "--key K", about, type=natural, action="append", dest="keys")
     add_common(parser, "window", "config")
-    _add_file(parser)
-
-
-def _add_file(parser: argparse.ArgumentParser) -> None:
-    option(parser, "--out FILE.json", "write every number there", type=Path)
-    add_common(parser, "overwrite")
-
-
-def _check_file(options: argparse.Namespace) -> None:
-    if options.out is not None:
-        check_new_file(options.out, options.overwrite, ".json")
-
-
-def _written(options: argparse.Namespace, numbers: Mapping[str, Any]) -> list[Path]:
-    """Write the file of numbers where one is asked for, and return its path."""
-    from densify.bench.evaluation import write_numbers
-
-    if options.out is None:
-        return []
-    write_numbers(options.out, numbers)
-    return [options.out]
 
 
 def _answer_flow(options: argparse.Namespace) -> Iterator[Answer]:
@@ -153,20 +130,18 @@ def _answer_flow(options: argparse.Namespace) -> Iterator[Answer]:
     from densify.bench.flow import DEFAULT_METHODS, bench_flow
     from densify.readers import open_sequence
 
-    _check_file(options)
     methods = DEFAULT_METHODS if options.methods is None else options.methods
-    runs, window = [], options.window
+    window = options.window
     for sequence in [open_sequence(spec) for spec in recordings_of(options)]:
         for key in options.keys or [120]:
             with progress_on_stderr() as progress:
                 measured = bench_flow(
                     sequence, key, window, config, methods, progress, options.truth
                 )
-            runs.append(measured)
             title = f"{measured['data']}, key {key}, {measured['num_pairs']} pairs"
             text = f"{title}\n{numbers_table(measured['methods'])}\n"
             yield Answer(text, {"runs": [measured]})
-    yield Answer(files=_written(options, {"runs": runs, "config": as_mapping(config)}))
+    yield Answer(facts={"config": as_mapping(config)})
 
 
 def _answer_depth(options: argparse.Namespace) -> Iterator[Answer]:
@@ -176,7 +151,6 @@ def _answer_depth(options: argparse.Namespace) -> Iterator[Answer]:
     from densify.bench.depth import bench_depth
     from densify.readers import open_sequence
 
-    _check_file(options)
     sequence, keys = open_sequence(recording_of(options)), options.keys or [120]
     window, cameras, scanner = options.window, options.cameras, options.scanner
     with progress_on_stderr() as progress:
@@ -184,26 +158,24 @@ def _answer_depth(options: argparse.Namespace) -> Iterator[Answer]:
             sequence, keys, window, variants, cameras, scanner, options.method, progress
         )
     configs = {name: as_mapping(config) for name, config in variants.items()}
-    files = _written(options, {**measured, "config": configs})
     text = f"{measured['data']}, keys {', '.join(map(str, keys))}"
-    yield Answer(f"{text}\n{numbers_table(measured['variants'])}", measured, files)
+    facts = {**measured, "config": configs}
+    yield Answer(f"{text}\n{numbers_table(measured['variants'])}", facts)
 
 
 def _answer_paper(options: argparse.Namespace) -> Iterator[Answer]:
     from densify.bench.paper import DEFAULT_METHODS, PUBLISHED, bench_paper
 
-    _check_file(options)
     methods = DEFAULT_METHODS if options.methods is None else options.methods
     models, num_points = options.models, options.points
-    measured: dict[str, dict[str, Any]] = {}
     for name, pairs in _paper_sets(options).items():
         with progress_on_stderr() as progress:
-            measured[name] = bench_paper(pairs, methods, models, num_points, progress)
+            measured = bench_paper(pairs, methods, models, num_points, progress)
         published = {"as published": PUBLISHED[name]} if name in PUBLISHED else {}
-        title = f"{name}: {measured[name]['num_pairs']} pairs, {num_points} points drawn"
-        text = numbers_table({**measured[name]["methods"], **published})
-        yield Answer(f"{title}\n{text}\n", {"sets": [{"set": name, **measured[name]}]})
-    yield Answer(files=_written(options, {"sets": measured, "published": PUBLISHED}))
+        title = f"{name}: {measured['num_pairs']} pairs, {num_points} points drawn"
+        text = numbers_table({**measured["methods"], **published})
+        yield Answer(f"{title}\n{text}\n", {"sets": [{"set": name, **measured}]})
+    yield Answer(facts={"published": PUBLISHED})
 
 
 def _paper_sets(options: argparse.Namespace) -> dict[str, Iterable[PaperPair]]:
