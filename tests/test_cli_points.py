@@ -59,7 +59,8 @@ def test_bad_point_files(name, content, part, tmp_path: Path, capsys) -> None:
 
 
 def test_point_files_of_every_kind_agree(tmp_path: Path) -> None:
-    points = np.arange(12, dtype=np.float32).reshape(3, 4) / 8
+    wall = [[20.0, y / 8, -1.5, 0.25] for y in range(9)]
+    points = np.array(wall, np.float32)
     np.save(tmp_path / "p.npy", points)
     np.savez(tmp_path / "p.npz", points=points)
     np.savetxt(tmp_path / "p.txt", points)
