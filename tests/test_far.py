@@ -11,7 +11,7 @@ import pytest
 
 from densify.config.errors import InputError
 from densify.geometry import poses
-from densify.geometry.clouds import thinned
+from densify.geometry.nearest import thinned
 from densify.readers.timeline import Timeline
 from densify.registration import road_poses
 from densify.registration.road_poses import follow_road

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 from densify.geometry import compiled as kernels
-from densify.geometry import threads
 
 SOURCE = """
 def double(first, last, values, out):
@@ -72,8 +71,8 @@ def test_code_that_others_could_have_put_there_is_not_loaded(
 @pytest.fixture
 def shared_out(monkeypatch):
     """Three threads for anything worth sharing."""
-    monkeypatch.setattr(threads, "_LEAST_ROWS", 50)
-    monkeypatch.setattr(threads, "num_threads", lambda: 3)
+    monkeypatch.setattr(kernels, "_LEAST_ROWS", 50)
+    monkeypatch.setattr(kernels, "num_threads", lambda: 3)
 
 
 @pytest.mark.parametrize("num_rows", [0, 1, 99, 100, 1001])
@@ -97,5 +96,5 @@ def test_errors_come_through_once_all_are_done(shared_out, where):
             raise ValueError("here")
 
     with pytest.raises(ValueError, match="here"):
-        threads.over_rows(fail, 300)
+        kernels.over_rows(fail, 300)
     assert len(done) == 3

@@ -212,7 +212,7 @@ DOORS: dict[str, str | tuple[str, ...]] = {
     "embreex": "densify/street/world.py",
     "kiss_icp": "densify/registration/odometry.py",
     "laspy": ("densify/readers/decoded_files.py", "densify/outputs/cloud_laz.py"),
-    "numba": ("densify/geometry/compiled.py", "densify/geometry/threads.py"),
+    "numba": ("densify/geometry/compiled.py",),
     "pickle": ("densify/readers/pickled_frame.py",),
     "simplejpeg": "densify/readers/decoded_files.py",
     "small_gicp": "densify/registration/alignment.py",

@@ -16,8 +16,7 @@ from densify.readers.street import Street
 from densify.readers.timeline import read_sweep
 from densify.registration.alignment import subsample
 from densify.registration.deskew import deskew
-from densify.registration.odometry import find_odometry
-from densify.registration.start_speed import search_twist
+from densify.registration.odometry import find_odometry, search_twist
 from densify.registration.surfaces import refine, register_on_surfaces
 from densify.registration.trajectory import check_plausible, find_trajectory
 from tests.scenes import SWEEP_S, Arc, Box, Scanner, Scene, World, street
@@ -101,7 +100,9 @@ def test_sweeps_may_be_missing(fast_drive, frames):
 @pytest.mark.parametrize("period_s", [0.1, 0.2, 0.3])
 def test_the_start_is_found_at_any_rate(fast_drive, period_s):
     frames = [round(i * period_s / SWEEP_S) for i in range(3)]
-    twist = search_twist([fast_drive.scan(f).sweep for f in frames])
+    sweeps = [fast_drive.scan(f).sweep for f in frames]
+    stamp_ns = np.array([s.stamp_ns for s in sweeps])
+    twist = search_twist(stamp_ns, [s.points for s in sweeps])
     assert np.abs(twist * period_s - [0, 0, 0, 36.0 * period_s, 0, 0]).max() < 0.6
 
 

@@ -37,7 +37,7 @@ from densify.dataset.plan import (
     write_plan,
 )
 from densify.flow.engines import check_engine
-from densify.geometry.threads import num_threads
+from densify.geometry.compiled import num_threads
 from densify.outputs.atomic import LEFT_AFTER_S, clear_leftovers
 from densify.outputs.kitti_tree import write_readme
 

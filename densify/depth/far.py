@@ -14,9 +14,9 @@ from densify.depth.exposure import Exposure
 from densify.depth.patches import tangents
 from densify.free_space.range_image import RangeImage
 from densify.free_space.sensor import Sensors
-from densify.geometry import clouds as kernels
 from densify.geometry import poses
-from densify.geometry.threads import num_threads
+from densify.geometry.compiled import num_threads
+from densify.geometry.nearest import thinned
 from densify.geometry.types import (
     Bool,
     Camera,
@@ -225,7 +225,7 @@ def _seen(points: Float32, T_key_world: Float, exposure: Exposure) -> Int:
     cell = np.rint(place.astype(np.float32))
     # Neighbouring pixels are to be from many sweeps: these have to agree.
     mixed = np.arange(len(rows)) * _PRIME % max(1, len(rows))
-    return rows[kernels.thinned(cell, mixed, 1.0, 1)]
+    return rows[thinned(cell, mixed, 1.0, 1)]
 
 
 def _gone(points: Float, stretch: Stretch, key: int, witnesses: Sequence[int]) -> Bool:

@@ -6,14 +6,21 @@ of the interpreter while it works, so that its rows can be shared out among thre
 
 Compiling takes a quarter of a first run. Rows are assigned number by number: an array or a tuple at
 once takes 1.6 s to compile. A literal handed to an inlined function compiles it once more.
+
+Numba's own parallel loops are not used: their order of summation depends on the number of threads,
+their pools abort the process after a fork or when two threads enter them at once, and OpenMP waits
+in busy loops, which costs tenfold where cores are shared.
 """
 
 from __future__ import annotations
 
 import hashlib
 import logging
+import os
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor, wait
 from functools import cache
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -22,7 +29,6 @@ from numba.core import event
 from numba.core.dispatcher import Dispatcher
 
 from densify.config.user_folder import others_can_write
-from densify.geometry import threads
 
 _log = logging.getLogger("densify")
 _progress = logging.getLogger("densify.progress")
@@ -32,6 +38,7 @@ _Function = TypeVar("_Function", bound=Callable[..., Any])
 # callers that there are none of would take a tenth of the time that compiling takes.
 _OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
 _NOT_FROM_PYTHON: dict[str, Any] = {"no_cpython_wrapper": True}
+_LEAST_ROWS = 4096  # to hand fewer to a second thread takes longer than most kernels do for them
 
 
 class _Compiling(event.Listener):
@@ -121,8 +128,42 @@ class Kernel:
         The parts do not change the result where a kernel treats every row by itself.
         NUMBA_NUM_THREADS limits the threads.
         """
-        threads.over_rows(self, num_rows, *arguments)
+        over_rows(self, num_rows, *arguments)
 
     def _do_without_cache(self, error: Exception | str) -> None:
         _log.debug("%s is compiled without a cache: %s", self._function.__name__, error)
         self._compiled = numba.njit(self._function, **_OPTIONS)
+
+
+def num_threads() -> int:
+    """Return the number of cores this process may use, or NUMBA_NUM_THREADS if that is fewer."""
+    return int(numba.config.NUMBA_NUM_THREADS)  # type: ignore[attr-defined]
+
+
+def over_rows(function: Callable[..., None], num_rows: int, *arguments: Any) -> None:
+    """Call ``function(begin, end, *arguments)`` for ranges that cover 0 to ``num_rows``.
+
+    function: its result for a row must depend on that row alone. It may not call this one.
+    """
+    num_parts = min(num_threads(), num_rows // _LEAST_ROWS)
+    if num_parts <= 1:
+        function(0, num_rows, *arguments)
+        return
+    bounds = [num_rows * part // num_parts for part in range(num_parts + 1)]
+    parts = list(pairwise(bounds))
+    others = [_pool().submit(function, begin, end, *arguments) for begin, end in parts[1:]]
+    try:
+        function(*parts[0], *arguments)
+    finally:
+        wait(others)  # before any error is raised: they write into the caller's arrays
+        for other in others:
+            other.result()
+
+
+@cache
+def _pool() -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(num_threads(), "densify-kernel")
+
+
+if hasattr(os, "register_at_fork"):  # a forked process has the pool but not its threads
+    os.register_at_fork(after_in_child=_pool.cache_clear)

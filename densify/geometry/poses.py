@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from densify.geometry.arrays import Float
+from densify.geometry.arrays import Float, Int
 
 _ROWS = 8192  # at once: for more, OpenBLAS wakes threads that spin longer than the work takes
 _HOLD = 1e-9  # against turning about a line that the points lie on
@@ -57,6 +57,12 @@ def exp(twist: Float) -> Float:
 def twist_between(T_world_a: Float, T_world_b: Float, seconds: float) -> Float:
     """Return the (6,) twist per second (rad/s, m/s) from a to b, in the frame of a."""
     return log(inverse(T_world_a) @ T_world_b) / seconds
+
+
+def twist_to(T_world_lidar: Float, stamp_ns: Int, i: int) -> Float:
+    """Return the (6,) twist per second from pose i - 1 to pose i, of (n,4,4) at (n,) times."""
+    seconds = (stamp_ns[i] - stamp_ns[i - 1]) * 1e-9
+    return twist_between(T_world_lidar[i - 1], T_world_lidar[i], seconds)
 
 
 def carried(T_a_b: Float, twist_b: Float) -> Float:

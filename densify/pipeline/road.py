@@ -16,7 +16,7 @@ from densify.config.errors import InputError
 from densify.depth import far
 from densify.free_space.sensor import Sensors
 from densify.geometry import poses
-from densify.geometry.threads import num_threads
+from densify.geometry.compiled import num_threads
 from densify.geometry.types import (
     Bool,
     Camera,

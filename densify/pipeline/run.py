@@ -26,7 +26,7 @@ from densify.config.cache import Cache
 from densify.config.errors import ComputationError, InputError
 from densify.depth.exposure import key_shots, load_images
 from densify.flow.engines import check_engine
-from densify.geometry.threads import num_threads
+from densify.geometry.compiled import num_threads
 from densify.geometry.types import LidarSequence, Progress, Result, StretchFlow
 from densify.pipeline.costs import Watch
 from densify.pipeline.key_result import (

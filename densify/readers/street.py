@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from densify.config.cache import Cache, kept
 from densify.config.errors import InputError
 from densify.config.user_folder import own_folder
-from densify.geometry.threads import num_threads
+from densify.geometry.compiled import num_threads
 from densify.geometry.types import Bool, Camera, Float, Float32, Sweep, SweepTruth
 from densify.street.cameras import CAMERAS, USUAL, Picture, cameras_beside
 from densify.street.lidar import Returns

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Lidar odometry of dense sweeps by KISS-ICP, in two passes.
+"""Lidar odometry of dense sweeps by KISS-ICP, in two passes, and the search for a start speed.
 
 Vizzo et al., "KISS-ICP: In Defense of Point-to-Point ICP", RA-L 2023.
 """
@@ -7,21 +7,30 @@ Vizzo et al., "KISS-ICP: In Defense of Point-to-Point ICP", RA-L 2023.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 
 from densify.config import RegisterSettings
 from densify.geometry import poses
 from densify.geometry.clock import Clock
+from densify.geometry.nearest import tree_of
 from densify.geometry.types import Float, Int, Sweep, Trajectory
 from densify.registration.deskew import deskew
-from densify.registration.start_speed import search_twist
 
 _NUM_CATCHING_UP = 3  # sweeps registered, however far apart in time
 # Change of a sweep's pose (rad and m) below which KISS-ICP stops. The first pass only has to find
 # the motion within a sweep: 3 mm over 0.1 s bend its ends by 1.5 mm. The second pass is the start
 # of `densify.registration.surfaces`: with 3 mm there too, a highway of 32 rings slides by 0.1 m.
 _FIRST_PASS, _SECOND_PASS = 3e-3, 5e-4
+
+MAX_SPEED_M_S = 60.0  # a faster step between two sweeps is an error of registration
+_STEP_M, _STEP_S = 0.5, 0.1  # of the search for it; in a shorter time smaller in proportion
+_NUM_SAMPLES = 800
+_CLOSE_M = 1.0
+_RAYS_RAD = 0.01  # between rays: objects along the road are met by the same rays at any speed
+_ABOVE_GROUND_M = 0.4
 
 
 def find_odometry(
@@ -35,88 +44,71 @@ def find_odometry(
 
     sweeps: ascending in time, one or more.
     """
-    stamp_ns, frames = _stamps_ns(sweeps), tuple(s.frame for s in sweeps)
+    stamp_ns, frames = np.array([s.stamp_ns for s in sweeps], np.int64), [s.frame for s in sweeps]
     groups = [list(rows) for rows in Clock(stamp_ns).batches()]
-    grouped = len(groups) not in (1, len(sweeps))
-    if grouped:
-        together = [[sweeps[i] for i in rows] for rows in groups]
-        joined = [_joined(group, [s.points for s in group]) for group in together]
-        rough = _between(register(joined, settings), frames, stamp_ns)
-    else:
-        rough = register(sweeps, settings)
+    if len(groups) in (1, len(sweeps)):
+        T_world_lidar = register(stamp_ns, [s.points for s in sweeps], settings)
+        rough = Trajectory(tuple(frames), stamp_ns, T_world_lidar)
+        deskewed = [s.sweep for s in deskew(sweeps, rough).sweeps]
+        T_world_lidar = register(stamp_ns, [s.points for s in deskewed], settings, rough)
+        return replace(rough, T_world_lidar=T_world_lidar), deskewed
+    middle_ns = np.array([(stamp_ns[g[0]] + stamp_ns[g[-1]]) // 2 for g in groups])
+    points = [np.concatenate([sweeps[i].points for i in rows]) for rows in groups]
+    known = Trajectory(
+        tuple(frames[rows[0]] for rows in groups),
+        middle_ns,
+        register(middle_ns, points, settings),
+    )
+    rough = Trajectory(tuple(frames), stamp_ns, _between(known, stamp_ns))
     deskewed = [s.sweep for s in deskew(sweeps, rough).sweeps]
-    if not grouped:
-        return register(deskewed, settings, rough), deskewed
-    middles_ns = np.array([_middle_ns(stamp_ns[rows]) for rows in groups])
-    start = _between(rough, tuple(frames[rows[0]] for rows in groups), middles_ns)
-    joined = []
-    for rows, T_world_joined in zip(groups, start.T_world_lidar, strict=True):
-        T_joined_world, members = poses.inverse(T_world_joined), [deskewed[i] for i in rows]
-        T_joined_lidar = T_joined_world @ rough.T_world_lidar[rows]
-        points = [
-            poses.transform(T, s.points) for s, T in zip(members, T_joined_lidar, strict=True)
-        ]
-        joined.append(_joined(members, points))
-    return _between(register(joined, settings, start), frames, stamp_ns), deskewed
+    known = replace(known, T_world_lidar=_between(rough, middle_ns))
+    points = []
+    for rows, T_world_joined in zip(groups, known.T_world_lidar, strict=True):
+        T_joined_lidar = poses.inverse(T_world_joined) @ rough.T_world_lidar[rows]
+        moved = zip(T_joined_lidar, (deskewed[i].points for i in rows), strict=True)
+        points.append(np.concatenate([poses.transform(T, p) for T, p in moved]))
+    known = replace(known, T_world_lidar=register(middle_ns, points, settings, known))
+    return replace(rough, T_world_lidar=_between(known, stamp_ns)), deskewed
 
 
 def register(
-    sweeps: Sequence[Sweep], settings: RegisterSettings, rough: Trajectory | None = None
-) -> Trajectory:
-    """Register sweeps one after the other with KISS-ICP; the world is the first sweep's lidar.
+    stamp_ns: Int,
+    points: Sequence[Float],
+    settings: RegisterSettings,
+    rough: Trajectory | None = None,
+) -> Float:
+    """Register S sweeps one after the other; return ``T_first_lidar`` (S,4,4).
 
     The first pass starts each sweep at constant velocity, the first one at `search_twist`, because
     KISS-ICP assumes a start at rest. Its voxels are twice as large.
 
-    sweeps: ascending in time; raw in the first pass, deskewed in the second.
+    stamp_ns: (S,) ascending. points: (N,3) of each; raw in the first pass, then deskewed.
     rough: the trajectory of the first pass, around which the second pass searches.
     """
     from kiss_icp.kiss_icp import KissICP
 
-    stamp_ns = _stamps_ns(sweeps)
     step_s = np.diff(stamp_ns) * 1e-9
     voxel_size_m = settings.voxel_size_m * (2 if rough is None else 1)
     odometry = KissICP(_kiss_icp_config(settings, voxel_size_m, rough is not None))
     no_stamps = np.empty(0)  # KISS-ICP aborts the process on equal stamps; we deskew ourselves
     T_world_lidar: list[Float] = []
-    for i, sweep in enumerate(sweeps):
+    for i in range(len(points)):
         if i:
             if rough is not None:
-                twist = _twist(rough, min(max(i - 1, _NUM_CATCHING_UP), len(sweeps) - 2))
+                to = min(max(i, _NUM_CATCHING_UP + 1), len(points) - 1)
+                twist = poses.twist_to(rough.T_world_lidar, stamp_ns, to)
             elif i == 1:
-                twist = search_twist(sweeps)
+                twist = search_twist(stamp_ns, points)
             else:
                 twist = poses.log(odometry.last_delta) / step_s[i - 2]
             odometry.last_delta = poses.exp(twist * step_s[i - 1])
-        odometry.register_frame(sweep.points, no_stamps)
+        odometry.register_frame(points[i], no_stamps)
         T_world_lidar.append(odometry.last_pose)
-    return Trajectory(tuple(s.frame for s in sweeps), stamp_ns, np.stack(T_world_lidar))
+    return np.stack(T_world_lidar)
 
 
-def _twist(trajectory: Trajectory, i: int) -> Float:
-    """Return the (6,) twist per second from sweep i to the next."""
-    seconds = (trajectory.stamp_ns[i + 1] - trajectory.stamp_ns[i]) * 1e-9
-    T = trajectory.T_world_lidar
-    return poses.twist_between(T[i], T[i + 1], seconds)
-
-
-def _joined(sweeps: Sequence[Sweep], points: Sequence[Float]) -> Sweep:
-    """Return all points as one sweep in the middle of the sweeps' reference times."""
-    together = np.concatenate(points)
-    num = len(together)
-    return Sweep(
-        sweeps[0].frame,
-        _middle_ns(_stamps_ns(sweeps)),
-        together,
-        np.zeros(num, np.float32),
-        None,
-        np.zeros(num, np.uint8),
-        np.arange(num, dtype=np.int64),
-    )
-
-
-def _between(known: Trajectory, frames: tuple[int, ...], stamp_ns: Int) -> Trajectory:
-    """Interpolate poses at other times, at constant velocity between the known ones and beyond."""
+def _between(known: Trajectory, stamp_ns: Int) -> Float:
+    """Return poses (n,4,4) at other times, at constant velocity between known ones and beyond."""
     T_world_lidar = []
     for time_ns in stamp_ns:
         later = int(np.searchsorted(known.stamp_ns, time_ns, side="right"))
@@ -124,15 +116,7 @@ def _between(known: Trajectory, frames: tuple[int, ...], stamp_ns: Int) -> Traje
         a_ns, b_ns = known.stamp_ns[k : k + 2]
         a, b = known.T_world_lidar[k : k + 2]
         T_world_lidar.append(poses.interpolate(a, b, (time_ns - a_ns) / (b_ns - a_ns)))
-    return Trajectory(frames, stamp_ns, np.stack(T_world_lidar))
-
-
-def _middle_ns(stamp_ns: Int) -> int:
-    return int(stamp_ns[0] + (stamp_ns[-1] - stamp_ns[0]) // 2)
-
-
-def _stamps_ns(sweeps: Sequence[Sweep]) -> Int:
-    return np.array([s.stamp_ns for s in sweeps], np.int64)
+    return np.stack(T_world_lidar)
 
 
 def _kiss_icp_config(  # type: ignore[no-untyped-def]
@@ -168,3 +152,60 @@ def _kiss_icp_config(  # type: ignore[no-untyped-def]
             min_motion_th=0.1,
         ),
     )
+
+
+def search_twist(stamp_ns: Int, points: Sequence[Float]) -> Float:
+    """Return the (6,) twist per second at the start, without rotation, by a grid search.
+
+    The velocity is the one that best aligns the points above the ground in the first three sweeps.
+    Distances below the gap between rays count as none: a guard rail looks the same from a vehicle
+    at rest and from one that follows it. The grid moves the second sweep by steps of 1 m, then of
+    0.5 m around the best, or less where the sweeps follow within 0.1 s.
+
+    stamp_ns: (S,) ascending. points: (N,3) of each sweep.
+    """
+    step_s = np.diff(stamp_ns[:3]) * 1e-9
+    step_m = _STEP_M * min(1.0, step_s[0] / _STEP_S)
+    above = [above_ground(p) for p in points[:3]]
+    pairs = []
+    for i, (earlier, later) in enumerate(pairwise(above)):
+        _, rows = np.unique(np.floor(later), axis=0, return_index=True)  # even over 1 m voxels
+        sample = later[rows[:: len(rows) // _NUM_SAMPLES + 1]]
+        ratio = step_s[i] / step_s[0]
+        apart_m = _RAYS_RAD * np.linalg.norm(sample, axis=1)
+        pairs.append((tree_of(earlier), sample, ratio, apart_m))
+
+    def cost(steps_m: Float) -> Float:
+        sums = 1e-3 * np.linalg.norm(steps_m, axis=1)
+        for tree, sample, ratio, apart_m in pairs:
+            moved = (sample + ratio * steps_m[:, None, :]).reshape(-1, 3)
+            distance_m, _ = tree.query(moved, distance_upper_bound=_CLOSE_M, workers=-1)
+            distance_m = np.minimum(distance_m, _CLOSE_M).reshape(len(steps_m), -1)
+            sums += np.maximum(distance_m - apart_m, 0.0).mean(1)
+        return sums
+
+    coarse_m = _grid(np.zeros(2), MAX_SPEED_M_S * step_s[0], 2 * step_m)
+    coarse = coarse_m[np.argmin(cost(coarse_m))]
+    fine_m = _grid(coarse[:2], 2 * step_m, step_m)
+    return np.append(np.zeros(3), fine_m[np.argmin(cost(fine_m))] / step_s[0])
+
+
+def _grid(center: Float, reach_m: float, step_m: float) -> Float:
+    """Return (n,3) horizontal motions around a center (2,)."""
+    span = np.arange(-np.ceil(reach_m / step_m), np.ceil(reach_m / step_m) + 1) * step_m
+    x, y = np.meshgrid(center[0] + span, center[1] + span, indexing="ij")
+    return np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], 1)
+
+
+def above_ground(points: Float) -> Float:
+    """Return the points above the lowest of their 1 m cell: the ground's rings hide the motion."""
+    if not len(points):
+        return points
+    x, y, z = points.T
+    row, column = (np.floor(along).astype(np.int64) for along in (x, y))
+    row, column = row - row.min(), column - column.min()
+    cell = row * (column.max() + 1) + column
+    lowest = np.full(int(cell.max()) + 1, np.inf)
+    np.minimum.at(lowest, cell, z)
+    above = points.take(np.flatnonzero(z > lowest[cell] + _ABOVE_GROUND_M), axis=0)
+    return above if len(above) else points

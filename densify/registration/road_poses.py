@@ -19,11 +19,11 @@ from scipy.sparse.linalg import spsolve
 
 from densify.config.errors import InputError
 from densify.geometry import poses
-from densify.geometry.threads import num_threads
+from densify.geometry.compiled import num_threads
 from densify.geometry.types import Bool, Float, Int, RegisteredSweep, Sweep
 from densify.registration.alignment import Alignment, Surface, SurfaceMap, align, subsample
 from densify.registration.deskew import deskew_sweep
-from densify.registration.start_speed import MAX_SPEED_M_S
+from densify.registration.odometry import MAX_SPEED_M_S
 from densify.registration.trajectory import (
     MAX_ACCELERATION_M_S2,
     MIN_NUM_POINTS,

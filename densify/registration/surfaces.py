@@ -16,10 +16,10 @@ from dataclasses import replace
 import numpy as np
 
 from densify.geometry import poses
-from densify.geometry.types import Float, Int, Sweep, Trajectory
+from densify.geometry.types import Float, Sweep, Trajectory
 from densify.registration.alignment import Surface, align_with_planes, subsample
 from densify.registration.deskew import deskew_sweep
-from densify.registration.start_speed import search_twist
+from densify.registration.odometry import search_twist
 
 _REACH_NS = 1_050_000_000
 _NUM_IN_REACH = 10  # sweeps; of more, every second one, third, ...
@@ -44,7 +44,7 @@ def refine(sweeps: Sequence[Sweep], rough: Trajectory) -> Trajectory:
     """
 
     def expected(i: int, _: Float) -> Float:
-        return _twist(rough.T_world_lidar, rough.stamp_ns, i)
+        return poses.twist_to(rough.T_world_lidar, rough.stamp_ns, i)
 
     if len(sweeps) < 2:
         return rough
@@ -66,11 +66,11 @@ def register_on_surfaces(sweeps: Sequence[Sweep]) -> Trajectory:
     row = _SweepRow(sweeps, _NUM_NEIGHBORS_OF_FEW, _MATCH_GUESSED_M)
     twist = np.zeros(6)
     if len(sweeps) > 1:
-        twist = search_twist(sweeps)
+        twist = search_twist(row.stamp_ns, [s.points for s in sweeps])
         num = int(np.searchsorted(row.stamp_ns, row.stamp_ns[0] + _START_NS, side="right"))
         start = _SweepRow(sweeps[:num], _NUM_NEIGHBORS_OF_FEW, _MATCH_GUESSED_M)
         T = start.register(twist, expected)
-        twist = _twist(T, row.stamp_ns, min(_NUM_START + 1, len(T) - 1))
+        twist = poses.twist_to(T, row.stamp_ns, min(_NUM_START + 1, len(T) - 1))
     frames = tuple(s.frame for s in sweeps)
     return Trajectory(frames, row.stamp_ns, row.register(twist, expected))
 
@@ -109,7 +109,7 @@ class _SweepRow:
             before = range(i - 1, first - 1, -1) if i >= num_start else ()
             twist = self._place(i, i, T_guess, twist, before)
         if num > 2:
-            twist = _twist(self._T, stamp_ns, num_start + 1)
+            twist = poses.twist_to(self._T, stamp_ns, num_start + 1)
             for i in range(num_start - 1, -1, -1):
                 twist = expected(i + 1, twist)
                 T_guess = self._T[i + 1] @ poses.exp(-twist * self._seconds(i + 1))
@@ -134,7 +134,7 @@ class _SweepRow:
                 moved = align_with_planes(surface, source, _VOXEL_M, match_m, _HOLD)
                 T_guess_lidar = moved @ T_guess_lidar
                 self._T[i] = T_guess @ T_guess_lidar
-                twist = _twist(self._T, self.stamp_ns, step)
+                twist = poses.twist_to(self._T, self.stamp_ns, step)
             if np.linalg.norm(T_guess_lidar[:3, 3]) > self._most_m:
                 self._T[i], twist = T_guess, first
         points = poses.transform(self._T[i], _deskewed(self._sweeps[i], twist))
@@ -149,9 +149,3 @@ class _SweepRow:
 def _deskewed(sweep: Sweep, twist: Float) -> Float:
     """Return the sweep's points (N,3), deskewed."""
     return deskew_sweep(sweep, np.eye(4), twist, twist).sweep.points
-
-
-def _twist(T_world_lidar: Float, stamp_ns: Int, i: int) -> Float:
-    """Return the (6,) twist per second from the sweep before to sweep i."""
-    seconds = (stamp_ns[i] - stamp_ns[i - 1]) * 1e-9
-    return poses.twist_between(T_world_lidar[i - 1], T_world_lidar[i], seconds)

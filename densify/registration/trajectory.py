@@ -19,8 +19,7 @@ from densify.geometry import poses
 from densify.geometry.nearest import tree_of
 from densify.geometry.types import Float, Int, Sweep, Trajectory
 from densify.registration.deskew import deskew
-from densify.registration.odometry import find_odometry
-from densify.registration.start_speed import MAX_SPEED_M_S, above_ground
+from densify.registration.odometry import MAX_SPEED_M_S, above_ground, find_odometry
 from densify.registration.surfaces import refine, register_on_surfaces
 
 MIN_OVERLAP = 0.55

@@ -49,19 +49,12 @@ class Sweep:
             if column is not None and column.shape != (n,):
                 raise ValueError(f"Sweep.{name}: expected ({n},), got {column.shape}")
         num_scanners = int(self.lidar.max(initial=0)) + 1
-        if self.R_scanner_lidar is not None:
-            shape = self.R_scanner_lidar.shape
-            if len(shape) != 3 or shape[1:] != (3, 3) or shape[0] < num_scanners:
+        for name, one in (("scanner_origins", (3,)), ("R_scanner_lidar", (3, 3))):
+            given = getattr(self, name)
+            if given is not None and (given.shape[1:] != one or len(given) < num_scanners):
                 raise ValueError(
-                    f"Sweep.R_scanner_lidar: expected a rotation (3,3) for each of {num_scanners} "
-                    f"scanners, got {shape}"
-                )
-        if self.scanner_origins is not None:
-            shape = self.scanner_origins.shape
-            if len(shape) != 2 or shape[1] != 3 or shape[0] < num_scanners:
-                raise ValueError(
-                    f"Sweep.scanner_origins: expected a row (3,) for each of {num_scanners} "
-                    f"scanners, got {shape}"
+                    f"Sweep.{name}: expected {one} for each of {num_scanners} scanners, "
+                    f"got {given.shape}"
                 )
 
     def __len__(self) -> int:
