@@ -93,20 +93,6 @@ def test_the_prediction_holds_what_the_points_leave_open() -> None:
     assert abs(found[0] - 0.3) < 0.02 and abs(found[1]) < 0.02
 
 
-def test_rings_at_other_heights_fit_where_heights_count_less() -> None:
-    """One ring half a metre above the next, each on both sides of the car."""
-    true = np.array([1.4, -0.6, 0.25, 0.1])
-    ring, other = (corner(60, seed) for seed in (1, 2))
-    ring[:, 2], other[:, 2] = CENTRE[2] + 0.3, CENTRE[2] + 0.8
-    points, predicted = apply(true, other, CENTRE), true + [0.15, -0.1, 0.0, 0.03]
-    assert Model(ring).align(points, CENTRE, predicted, STD) is None
-    model = Model(ring, height_weight=0.25)
-    found = model.align(points, CENTRE, predicted, STD)
-    assert found is not None
-    np.testing.assert_allclose(found, true, atol=0.05)
-    assert model.covers(undo(found, points, CENTRE), 0.3).mean() > 0.9
-
-
 def test_too_few_partners_are_none() -> None:
     model, still = Model(corner(300, 0)), np.zeros(4)
     assert model.align(corner(300, 1) + [50.0, 0, 0], CENTRE, still, STD) is None

@@ -125,13 +125,6 @@ def test_laplacian_is_symmetric_positive_and_leaves_its_null_space_alone(
     np.testing.assert_allclose(matrix @ np.sqrt(weights.sum(axis=1)), 0.0, atol=1e-13)
 
 
-def test_degree_contains_the_self_weight() -> None:
-    weights = graph.knn_graph(np.array([[0.0, 0, 0], [1.0, 0, 0]]), 1)
-    degree = 1.0 + np.exp(-1.0)
-    expected = np.exp(-1.0) / degree * np.array([[1.0, -1.0], [-1.0, 1.0]])
-    np.testing.assert_allclose(graph.laplacian(weights).toarray(), expected)
-
-
 def test_bad_input_is_one_clear_line() -> None:
     flow, source, target, matrix = problem(10, 12)
     broken = target.clone()

@@ -54,14 +54,10 @@ def surface_information(points: Float, near: Int, loose: float = 1.0) -> Float:
 
 
 class Model:
-    """The accumulated points of an object, to which other points are aligned.
+    """The accumulated points of an object, to which other points are aligned."""
 
-    height_weight: weight of height differences relative to horizontal distances.
-    """
-
-    def __init__(self, points: Float, height_weight: float = 1.0) -> None:
+    def __init__(self, points: Float) -> None:
         self.points = np.zeros((0, 3))
-        self._scale = np.array([1.0, 1.0, height_weight])
         self.add(points)
 
     def add(self, points: Float) -> None:
@@ -69,14 +65,13 @@ class Model:
         points = np.concatenate([self.points, points])
         if len(points) > _MAX_MODEL_POINTS:
             points = points[:: len(points) // _MAX_MODEL_POINTS + 1]
-        self.points, self._flat = points, np.ascontiguousarray(points * self._scale)
-        self._tree = tree_of(self._flat)
-        _, near = nearest_k(self._tree, self._flat, NUM_NEAR)
-        self.information = surface_information(self._flat, near, _LOOSE)
+        self.points, self._tree = points, tree_of(points)
+        _, near = nearest_k(self._tree, points, NUM_NEAR)
+        self.information = surface_information(points, near, _LOOSE)
 
     def covers(self, points: Float, within_m: float) -> Bool:
         """Return (N,) True for the (N,3) points closer to the model than ``within_m``."""
-        distance_m, _ = nearest(self._tree, points * self._scale, within_m)
+        distance_m, _ = nearest(self._tree, points, within_m)
         return np.isfinite(distance_m)
 
     def align(
@@ -90,9 +85,7 @@ class Model:
         points: (N,3), all at one time. centre: (3,). predicted: (4,) where to start.
         prediction_std: (3,) standard deviation of the predicted x, y (m) and yaw (rad).
         """
-        scale = np.append(self._scale, 1.0)
-        points, centre, state = points * self._scale, centre * self._scale, predicted * scale
-        start, prior = state.copy(), prediction_std**-2
+        state, prior = predicted.copy(), prediction_std**-2
         for gate_m in GATES_M:
             at_model = undo(state, points, centre)
             distance_m, row = nearest(self._tree, at_model, gate_m)
@@ -109,7 +102,7 @@ class Model:
             weight *= min(1.0, MAX_WEIGHT / len(found))
             JA = J.transpose(0, 2, 1) @ (self.information[row] * weight[:, None, None])
             H = (JA @ J).sum(axis=0) + np.diag(prior)
-            off = at_model[found] - self._flat[row]
-            g = (JA @ off[:, :, None]).sum(axis=0)[:, 0] + prior * (start - state)[[0, 1, 3]]
+            off = at_model[found] - self.points[row]
+            g = (JA @ off[:, :, None]).sum(axis=0)[:, 0] + prior * (predicted - state)[[0, 1, 3]]
             state[[0, 1, 3]] += np.linalg.solve(H, g)
-        return np.asarray(state / scale)
+        return state

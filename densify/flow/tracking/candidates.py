@@ -197,13 +197,8 @@ def closer_rings(points: Float, gap_m: Float) -> Float:
     gap_m: (N,) between neighbouring rings.
     """
     squeezed = points.copy()
-    squeezed[:, 2] *= height_weight(gap_m)
+    squeezed[:, 2] *= np.minimum(1.0, _RING_GAP_M / np.maximum(gap_m, 1e-6))
     return squeezed
-
-
-def height_weight(gap_m: float | Float) -> Float:
-    """Return the factor for heights where rings lie ``gap_m`` apart, at most 1."""
-    return np.minimum(1.0, _RING_GAP_M / np.maximum(gap_m, 1e-6))
 
 
 def firing_times_s(stretch: Stretch, i: int, rows: Int) -> Float:

@@ -24,8 +24,6 @@ MIN_POINTS = 8  # to start a track
 _MIN_SEED_SHARE = 0.4
 _AROUND_S = 0.5  # from both ends of the recording, any start is equally good
 _NEARER_END, _NEARER_END_S = 0.7, 0.1  # nearer to an end, it is worth 0.7 for each 0.1 s
-_SLIDES_M = 1.5  # longer objects may slide along their own side
-_HOLE_S = 0.25
 _BESIDE_M = 1.0  # from a towing vehicle to what it tows
 _FIT_M = 0.3
 _SHARE_UNSEEN = 0.5  # of the points that a batch usually has
@@ -72,28 +70,6 @@ def velocities_beside(
             yield track.velocity_m_s(middle, at_s)[0]
 
 
-def find_ends(track: Track, batches: Sequence[Batch]) -> Iterator[tuple[Int, int]]:
-    """Yield the rows and the batch of a long track's first and last observation.
-
-    Tracking can start there again: more of the object may be in view than a side that slides along
-    itself. Short objects cannot slide, and tracks with a gap in time are not tracked again.
-    """
-    start, *_ = track.observations
-    side = batches[start].obstacles.points[_rows_in(track, batches[start])]
-    seen_s = np.sort([seen.seen_s for seen in track.observations.values()])
-    if np.linalg.norm(np.ptp(side[:, :2], axis=0)) < _SLIDES_M or (np.diff(seen_s) > _HOLE_S).any():
-        return
-    for n in sorted({min(track.observations), max(track.observations)} - {start}):
-        if track.num_points(n) >= MIN_POINTS:
-            yield _rows_in(track, batches[n]), n
-
-
-def _rows_in(track: Track, batch: Batch) -> Int:
-    """Return the rows of a batch that are the track's."""
-    sweeps = zip(batch.sweeps, batch.begins, strict=True)
-    return np.concatenate([track.claimed[j] + begin for j, begin in sweeps if j in track.claimed])
-
-
 @dataclass(frozen=True)
 class Follower:
     """Tracks clusters through the batches.
@@ -106,17 +82,17 @@ class Follower:
     ground: HeightMap
     clock: Clock
 
-    def follow(self, members: Int, start: int, velocity: Float, weight: float) -> Track:
+    def follow(self, members: Int, start: int, velocity: Float) -> Track:
         """Track a cluster forwards, then backwards, with all points so far as the model.
 
-        members: rows of batch ``start``. velocity: (3,) m/s at first. weight: of heights.
+        members: rows of batch ``start``. velocity: (3,) m/s at first.
         """
         here, rate = self.batches[start].obstacles, np.append(velocity, 0.0)
         seen_s = float(here.time_s[members].mean())
         points = _at_once(here, members, rate, seen_s)
         track = Track(points.mean(0))
         track.add(start, self.batches[start], np.zeros(4), seen_s, members)
-        model = Model(points, weight)
+        model = Model(points)
         for direction in (1, -1):
             last, n = start, start + direction
             while 0 <= n < len(self.batches) and (

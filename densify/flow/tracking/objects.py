@@ -102,6 +102,12 @@ class Track:
             parts.append(self.undo(c.points[rows], c.time_s[rows]))
         return np.concatenate(parts)
 
+    def rows_in(self, batch: Batch) -> Int:
+        """Return the rows of a batch that are its points."""
+        sweeps = zip(batch.sweeps, batch.begins, strict=True)
+        own = [self.claimed[j] + begin for j, begin in sweeps if j in self.claimed]
+        return np.concatenate(own)
+
     def num_points(self, n: int) -> int:
         """Return the number of its points in batch n."""
         return sum(len(self.claimed[j]) for j in self.observations[n].sweeps)

@@ -44,35 +44,35 @@ def violations_left(
     obstacles: Sequence[Obstacles],
     space: FreeSpace,
     objects: Sequence[MovingObject],
-) -> float | None:
+) -> float:
     """Fit the smooth motion of a track and test it.
 
     objects: other confirmed ones.
-    Returns None unless the track certainly moves, else the share of tests in which another sweep
-    sees through its moved points: of two motions, the one with the lower share is right.
+    Returns the share of tests in which another sweep sees through the moved points: of two motions,
+    the one with the lower share is right. inf unless the track certainly moves.
     """
     if len(track.observations) < _LEAST_STATES:
-        return None
+        return np.inf
     track.smooth()
     seen_s = track.duration_s()
     if seen_s < _LEAST_S or not _is_smooth(track, space, seen_s):
-        return None
+        return np.inf
     static, moved, num_tests = count_violations(track, obstacles, space)
     least = max(min(_LEAST_VIOLATIONS, _SHARE_OF_FEW * num_tests), _LEAST_SHARE * num_tests)
     if static < least or moved > _MAX_LEFT_OF_LIMBS * static:
-        return None
+        return np.inf
     left = find_places_left(track, obstacles, space, objects)
     if left.still_there():
-        return None
+        return np.inf
     empty = left.empty(far=track.path.travelled_m() >= _FAR_M)
     if moved > (_MAX_LEFT_OF_LIMBS if empty else _MAX_LEFT) * static:
-        return None
+        return np.inf
     few = static < _FEW * num_tests and not left.mostly_empty()
     if few and moved > _MAX_LEFT_OF_FEW * static:
-        return None
+        return np.inf
     long_s = min(_SHORT_S, float(np.ptp(space.clock.time_s)) / 2)
     if moved > _MAX_LEFT_OF_SHORT * static and seen_s < long_s:
-        return None
+        return np.inf
     return moved / num_tests
 
 

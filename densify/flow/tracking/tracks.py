@@ -8,7 +8,7 @@ confirmed only if the smooth motion explains the measurements.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from itertools import chain
 
@@ -16,17 +16,16 @@ import numpy as np
 from scipy import ndimage
 
 from densify.flow.surface_matching import Model
-from densify.flow.tracking.candidates import LINK_M, Batch, Obstacles, height_weight
+from densify.flow.tracking.candidates import LINK_M, Batch, Obstacles
 from densify.flow.tracking.extent import columns_apart_m
 from densify.flow.tracking.following import (
     MIN_POINTS,
     Follower,
-    find_ends,
     find_starts,
     velocities_beside,
 )
 from densify.flow.tracking.objects import MovingObject, Shape, Track
-from densify.flow.tracking.proof import find_places_left, is_rail, violations_left
+from densify.flow.tracking.proof import is_rail, violations_left
 from densify.flow.tracking.vote import DistanceField, Group, vote
 from densify.free_space.ground import HeightMap
 from densify.free_space.seen_through import FreeSpace
@@ -42,7 +41,6 @@ _REFINED_STD = np.array([0.15, 0.15, 0.03])  # m, m, rad: of the smooth motion
 _CLEARLY = 0.5  # of the violations of another motion
 _DOUBTFUL = 0.0025  # share of violations from which on a track is followed from its ends too
 _AS_WHOLE = 0.9  # of its points
-_MOSTLY = 0.5
 _AHEAD_M, _SIDE_M = 15.0, 0.1
 _COLUMNS_IN_GAP, _GAPS_IN_LINE_M = 2.0, (1.5, 4.0)
 _ONE_RING, _ONE_COLUMN = 0.5, 2.5  # spread of one, in steps of rings and of columns
@@ -59,9 +57,7 @@ def find_tracks(
     velocities_m_s: per sweep (C,3) of its obstacles, with which clusters start; None lets the
     neighbouring sweeps vote.
     """
-    search = _Search(obstacles, space, ground, velocities_m_s)
-    starts = find_starts([batch.obstacles for batch in search.batches], search.clock)
-    return search.tracks_of(starts) + search.tracks_of(starts, left_over=True)
+    return _Search(obstacles, space, ground, velocities_m_s).tracks()
 
 
 class _Search:
@@ -90,93 +86,33 @@ class _Search:
     def _all_points(self) -> list[Bool]:
         return [np.ones(len(c.points), bool) for c in self._obstacles]
 
-    def tracks_of(self, starts: Sequence[tuple[int, Int]], left_over: bool = False) -> list[Track]:
-        """Return the confirmed tracks that begin at these starts, a batch and its rows each.
-
-        left_over: track the remaining clusters where rings lie far apart, with a lower weight of
-        heights; clusters that may be a part of a known object are left out.
-        """
-        untried, tracks = self._all_points(), list[Track]()
-        for n, cluster in starts:
+    def tracks(self) -> list[Track]:
+        """Return the confirmed tracks, the best starts first."""
+        untried = self._all_points()
+        for n, cluster in find_starts([batch.obstacles for batch in self.batches], self.clock):
             batch = self.batches[n]
             untaken = batch.gather(self._free)[cluster] & batch.gather(untried)[cluster]
             members = cluster[untaken]
             if len(members) < MIN_POINTS:
                 continue
-            place = batch.obstacles.points[members].mean(axis=0)
-            gap_m = self._space.gap_m(place, batch.sweeps[0])
-            weights = self._height_weights(gap_m)[left_over:]
-            if not weights or (left_over and self._is_part(n, members, gap_m)):
-                continue
-            track, confirmed = self._track_of(members, n, weights)
+            track, left = self._track_of(members, n)
             for j, rows in track.claimed.items():
                 untried[j][rows] = False
-            if confirmed:
-                self._take(track)
-                tracks.append(track)
-        return tracks
-
-    def _height_weights(self, gap_m: float) -> list[float]:
-        """Return the weights of heights to track with. Where rings lie far apart, they hit an
-        approaching object at other heights than in the sweep before."""
-        less = float(height_weight(gap_m))
-        return [1.0, less] if less < 1.0 and not self._space.sensors.scattered else [1.0]
-
-    def _is_part(self, n: int, members: Int, reach_m: float) -> bool:
-        """Return True if most of a cluster lies within a known object or so close to it."""
-        c = self.batches[n].obstacles
-        points, time_s = c.points[members], c.time_s[members]
-        return any(
-            shape.near(track.undo(points, time_s), reach_m).mean() > _MOSTLY
-            for track, shape in self._objects
-        )
-
-    def _track_of(self, members: Int, n: int, weights: Sequence[float]) -> tuple[Track, bool]:
-        """Return the track of a cluster of batch n, complete if confirmed, and whether it is.
-
-        weights: of heights; further ones are tried where the first leaves doubts.
-        """
-        track, left = self._followed(members, n, weights[0])
-        for weight in weights[1:] if _DOUBTFUL < left < np.inf else ():
-            tried, violations = self._followed(members, n, weight)
-            if tried.total_points() >= track.total_points() and violations < _CLEARLY * left:
-                track, left = tried, violations
-        confirmed = bool(np.isfinite(left))
-        if confirmed:
+            if np.isinf(left):
+                continue
             self._gather(track)
             # A piece of a guard rail is recognised by the rest of it.
-            confirmed = not is_rail(track, self._obstacles, self._space, self._objects)
-        if confirmed and weights[0] < 1.0:  # rings glide over parked cars the more easily then
-            left_places = find_places_left(track, self._obstacles, self._space, self._objects)
-            confirmed = left_places.mostly_empty()
-        if confirmed:
+            if is_rail(track, self._obstacles, self._space, self._objects):
+                continue
             _refine(track, self._obstacles, self._ground)
             self._claim_in_line(track)
-        return track, confirmed
+            for j, rows in track.claimed.items():
+                self._free[j][rows] = False
+            self._objects.append(MovingObject(track, self._shape_of(track)))
+        return [track for track, _ in self._objects]
 
-    def _take(self, track: Track) -> None:
-        """Mark the track's points as taken, and remember the object."""
-        for j, rows in track.claimed.items():
-            self._free[j][rows] = False
-        points = track.points_in(self._obstacles, sorted(track.claimed))
-        self._objects.append(MovingObject(track, Shape.of(points)))
-
-    def _followed(self, members: Int, n: int, weight: float) -> tuple[Track, float]:
-        """Return the best track of a cluster of batch n, as `_best_of`: from there, or from one of
-        its ends if as many points have clearly fewer violations."""
-        beside = velocities_beside(self.batches[n], members, self._objects)
-        starts: Iterator[Float] = chain([self._velocity_of(members, n)], beside)
-        track, left = _best_of(self._follow(members, n, velocity, weight) for velocity in starts)
-        # What is not confirmed is only followed from where more of it was observed.
-        least = track.num_points(next(iter(track.observations))) if np.isinf(left) else 0
-        for rows, k in find_ends(track, self.batches) if left > _DOUBTFUL else ():
-            if len(rows) <= least:
-                continue
-            tried, violations = self._follow(rows, k, self._velocity_of(rows, k), weight)
-            whole = tried.total_points() >= _AS_WHOLE * track.total_points()
-            if whole and violations is not None and violations < _CLEARLY * left:
-                track, left = tried, violations
-        return track, left
+    def _shape_of(self, track: Track) -> Shape:
+        return Shape.of(track.points_in(self._obstacles, sorted(track.claimed)))
 
     def _velocity_of(self, members: Int, n: int) -> Float:
         """Return the likely velocity (3,) m/s of a cluster of batch n."""
@@ -188,18 +124,48 @@ class _Search:
             velocity = np.median(self.batches[n].gather(self._velocities_m_s)[members], axis=0)
         return velocity
 
-    def _follow(
-        self, members: Int, n: int, velocity: Float, weight: float
-    ) -> tuple[Track, float | None]:
-        """Return the track of a cluster of batch n, and its share of violations, see
-        `violations_left`."""
-        track = self._follower.follow(members, n, velocity, weight)
-        return track, violations_left(track, self._obstacles, self._space, self._objects)
+    def _track_of(self, members: Int, n: int) -> tuple[Track, float]:
+        """Return the best track of a cluster of batch n, see `_best_of`.
+
+        It starts at the velocity that most sweeps agree on, and at those of the objects beside it,
+        such as its towing vehicle's. If violations are left, it is followed from its ends too: more
+        may be in view there than a side that slides along itself.
+        """
+        beside = velocities_beside(self.batches[n], members, self._objects)
+        track, left = self._best_of(members, n, chain([self._velocity_of(members, n)], beside))
+        if not _DOUBTFUL < left < np.inf:
+            return track, left
+        for k in sorted({min(track.observations), max(track.observations)} - {n}):
+            rows = track.rows_in(self.batches[k])
+            if len(rows) >= MIN_POINTS:
+                tried, violations = self._best_of(rows, k, [self._velocity_of(rows, k)])
+                is_whole = tried.total_points() >= _AS_WHOLE * track.total_points()
+                if is_whole and violations < _CLEARLY * left:
+                    track, left = tried, violations
+        return track, left
+
+    def _best_of(self, members: Int, n: int, velocities: Iterable[Float]) -> tuple[Track, float]:
+        """Follow a cluster from each velocity, up to a track without violations.
+
+        Returns the confirmed track with clearly the lowest share of violations, and the share; the
+        last track and inf if none is confirmed.
+        """
+        best, least = Track(np.zeros(3)), np.inf
+        for velocity in velocities:
+            track = self._follower.follow(members, n, velocity)
+            left = violations_left(track, self._obstacles, self._space, self._objects)
+            if left < _CLEARLY * least:
+                best, least = track, left
+            elif np.isinf(least):
+                best = track
+            if least == 0:
+                break
+        return best, least
 
     def _gather(self, track: Track) -> None:
         """Claim the free candidates close to or within the object that its motion explains, before
         a part of it starts a track of its own."""
-        shape = Shape.of(track.points_in(self._obstacles, sorted(track.claimed)))
+        shape = self._shape_of(track)
         for j, own in track.claimed.items():
             c = self._obstacles[j]
             there = track.place(shape.rim, track.seen_at(self._space.clock.time_ns[j]))
@@ -215,7 +181,7 @@ class _Search:
         Tracked alone, such a cluster would stay where the rays are.
         """
         space = self._space
-        shape = Shape.of(track.points_in(self._obstacles, sorted(track.claimed)))
+        shape = self._shape_of(track)
         ahead = MovingObject(track, shape).heading(next(iter(track.observations.values())).seen_s)
         across = np.array([-ahead[1], ahead[0]])
         aside = shape.rim[:, :2] @ across
@@ -278,23 +244,6 @@ def _few_rays(c: Obstacles, rows: Int, T_lidar_world: Float, sensors: Sensors) -
     single = spread(np.arcsin(in_lidar[:, 2] / range_m)) < _ONE_RING * np.asarray(ring_rad)
     single |= spread(azimuth_rad) < _ONE_COLUMN * column_rad
     return np.asarray(single[of_row.ravel()])
-
-
-def _best_of(tried: Iterable[tuple[Track, float | None]]) -> tuple[Track, float]:
-    """Return the confirmed track with the lowest share of violations, and the share; the last track
-    and inf if none is confirmed. Stops at a track without violations.
-
-    tried: tracks and their shares, None if they are not confirmed.
-    """
-    best, least = Track(np.zeros(3)), np.inf
-    for track, violations in tried:
-        if violations is not None and violations < _CLEARLY * least:
-            best, least = track, violations
-        elif np.isinf(least):
-            best = track
-        if least == 0:
-            break
-    return best, least
 
 
 def _refine(track: Track, obstacles: Sequence[Obstacles], ground: HeightMap) -> None:
