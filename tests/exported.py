@@ -48,7 +48,7 @@ def map_of(camera: str, seed: int = 0) -> DepthMap:
 
 def cloud_of(num_points: int = NUM_POINTS, seed: int = 3) -> Cloud:
     rng = np.random.default_rng(seed)
-    points = rng.uniform(-120, 120, (num_points, 3))
+    points = rng.uniform(-110, 110, (num_points, 3))
     moving = rng.random(num_points) < 0.4
     frame = rng.choice([*STAMPS_NS], num_points).astype(np.int32)
     return Cloud(
