@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Calls done here and by processes of this machine."""
+"""Calls done here, by processes of this machine, and by the workers of a Dask scheduler."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 import worker_calls
 
-from densify.config.errors import ComputationError
+from densify.config.errors import ComputationError, InputError
 from densify.dataset import executor
 from densify.dataset.executor import call_all
 
@@ -36,29 +36,35 @@ def is_gone(pid: int) -> bool:
     return state == "Z"
 
 
-@pytest.fixture(params=[1, 2], ids=["here", "processes"])
-def num_workers(request: pytest.FixtureRequest) -> int:
-    return request.param
+@pytest.fixture(scope="module", params=["here", "processes", "dask"])
+def where(request: pytest.FixtureRequest):
+    if request.param != "dask":
+        yield {"num_workers": 1 if request.param == "here" else 2}
+        return
+    distributed = pytest.importorskip("distributed")
+    options = {"dashboard_address": "127.0.0.1:0", "threads_per_worker": 2}
+    with distributed.LocalCluster(n_workers=1, **options) as cluster:
+        yield {"scheduler": cluster.scheduler_address}
 
 
-def test_every_outcome_is_yielded_once(num_workers: int, tmp_path: Path) -> None:
+def test_every_outcome_is_yielded_once(where: dict, tmp_path: Path) -> None:
     groups = [[1, 2, 3], [4], [-1, 5], [1000, 1001]]
     log = tmp_path / "log"
-    found = list(call_all(worker_calls.square, groups, num_workers, log))
+    found = list(call_all(worker_calls.square, groups, log=log, **where))
     outcomes = dict(found)
     assert len(found) == len(outcomes) == 8
     error = outcomes.pop(-1)
     assert isinstance(error, ComputationError) and "KeyError: 'negative'" in str(error)
     assert outcomes == {n: n * n for n in (1, 2, 3, 4, 5, 1000, 1001)}
-    if num_workers > 1:
+    if where.get("num_workers") != 1:
         told = sorted(line.partition(" WARNING ")[2] for line in log.read_text().splitlines())
         assert told == ["large: 1000", "large: 1001"]
-    assert list(call_all(worker_calls.square, [], num_workers)) == []
+    assert list(call_all(worker_calls.square, [], **where)) == []
 
 
-def test_the_first_of_a_group_is_over_before_the_others(num_workers: int, tmp_path: Path) -> None:
+def test_the_first_of_a_group_is_over_before_the_others(where: dict, tmp_path: Path) -> None:
     groups = [[(tmp_path, 10 * g + n, n == 0) for n in range(5)] for g in range(6)]
-    for (_, _, is_first), there in call_all(worker_calls.note, groups, num_workers):
+    for (_, _, is_first), there in call_all(worker_calls.note, groups, **where):
         assert there is not is_first
 
 
@@ -119,3 +125,10 @@ def test_workers_end_with_the_command(how: signal.Signals, tmp_path: Path) -> No
         until(lambda: all(place.exists() for place in places))
         process.send_signal(how)
         until(lambda: all(is_gone(int(place.read_text())) for place in places))
+
+
+def test_a_scheduler_that_is_not_reached(monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("distributed")
+    monkeypatch.setattr(executor, "_CONNECT_S", 0.5)
+    with pytest.raises(InputError, match=r"--scheduler tcp://127.0.0.1:9: not reached .* expected"):
+        list(call_all(abs, [[1]], scheduler="tcp://127.0.0.1:9"))

@@ -29,6 +29,8 @@ HEAVY = {
     "cv2",
     "laspy",
     "numba",
+    "dask",
+    "distributed",
 }
 
 needs_installation = pytest.mark.skipif(
@@ -68,7 +70,7 @@ def test_the_default_run_waits_for_no_torch() -> None:
         "result = densify.run(one_car(), KEY, 2, config=POSES_GIVEN)\n"
         "assert result.cloud.moving.any()"
     )
-    assert not {"torch", "kiss_icp"} & modules_after(code, CHECKOUT)
+    assert not {"torch", "kiss_icp", "dask"} & modules_after(code, CHECKOUT)
 
 
 @pytest.mark.parametrize("name", [n for n in dir(densify) if not n.startswith("_")])
@@ -206,6 +208,8 @@ def test_no_arrow_runs_upward() -> None:
 
 
 DOORS: dict[str, str | tuple[str, ...]] = {
+    "dask": "densify/dataset/executor.py",
+    "distributed": "densify/dataset/executor.py",
     "foxglove": "densify/outputs/export/mcap.py",
     "rerun": "densify/outputs/export/rrd.py",
     "matplotlib": "densify/outputs/plots.py",

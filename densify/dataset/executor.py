@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: MIT
-"""Calls done in this process, or in several processes of this machine.
+"""Calls done in this process, or by a standard executor: several processes of this machine, or the
+workers of a Dask scheduler.
 
 This module imports nothing heavy: a worker process loads it before it knows its number of threads.
 """
@@ -16,12 +17,13 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import (
     FIRST_COMPLETED,
     BrokenExecutor,
+    CancelledError,
     Executor,
     Future,
     ProcessPoolExecutor,
     wait,
 )
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
@@ -30,6 +32,9 @@ from densify.config.errors import ComputationError, InputError
 from densify.pipeline.heap import keep_freed_memory
 
 Item = TypeVar("Item")
+_CONNECT_S = 10
+_Workers = AbstractContextManager[tuple[Executor, Callable[[], int]]]
+"""An open executor, and the number of calls that it can do at once."""
 _DEATH = (
     "a worker process died of it twice (killed, or out of memory?); fewer --workers or a smaller "
     "--window take less memory"
@@ -41,6 +46,7 @@ def call_all(
     groups: Sequence[Sequence[Item]],
     num_workers: int = 1,
     log: Path | None = None,
+    scheduler: str | None = None,
 ) -> Iterator[tuple[Item, Any]]:
     """Call ``call(item)`` for every item and yield each with its outcome as soon as it is over.
 
@@ -48,12 +54,14 @@ def call_all(
     groups: none empty. The first item of a group is over before the others of the group begin; what
         these have in common is then in the cache. Items are hashable and picklable.
     num_workers: processes; 1 is this one. log: the file to which other processes append their log.
+    scheduler: address of a Dask scheduler whose workers are used instead.
 
     An item whose process dies is tried once more, alone. Its outcome is a ComputationError if that
     process dies too. InputError and ComputationError of ``call`` are raised; any other error is the
-    item's outcome as a ComputationError. Raises ComputationError if the workers cannot begin.
+    item's outcome as a ComputationError. Raises ComputationError if the workers cannot begin or the
+    scheduler is lost, InputError if it is not reached.
     """
-    if num_workers == 1:
+    if num_workers == 1 and scheduler is None:
         for group in groups:
             for item in group:
                 yield item, _outcome(partial(call, item))
@@ -64,7 +72,8 @@ def call_all(
     while ready or suspects:
         alone = bool(suspects)
         waiting, most = (suspects, 1) if alone else (ready, num_workers)
-        for item, outcome in _until_a_death(call, waiting, most, log):
+        workers = _open_pool(most) if scheduler is None else _open_dask(scheduler)
+        for item, outcome in _until_a_death(partial(_call_logged, call, log), waiting, workers):
             if isinstance(outcome, BrokenExecutor):
                 if not alone:
                     suspects.append(item)
@@ -74,14 +83,22 @@ def call_all(
             yield item, outcome
 
 
-def log_to(path: Path) -> logging.Handler:
-    """Append what is logged below ``densify`` in this process to a file; return its handler."""
+@contextmanager
+def logged_to(path: Path, thread: int | None = None) -> Iterator[None]:
+    """Append what this process, or one thread of it, logs below ``densify`` to a file."""
     handler = logging.FileHandler(path, encoding="utf-8")
     handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
+    handler.addFilter(lambda record: thread in (None, record.thread))
     log = logging.getLogger("densify")
+    before = log.level
     log.addHandler(handler)
     log.setLevel(logging.DEBUG)
-    return handler
+    try:
+        yield
+    finally:
+        log.removeHandler(handler)
+        log.setLevel(before)
+        handler.close()
 
 
 def share_of_cores(num_workers: int) -> dict[str, str]:
@@ -92,18 +109,24 @@ def share_of_cores(num_workers: int) -> dict[str, str]:
     }
 
 
+def _call_logged(call: Callable[[Item], Any], log: Path | None, item: Item) -> Any:
+    # A Dask worker may have several threads.
+    with nullcontext() if log is None else logged_to(log, threading.get_ident()):
+        return call(item)
+
+
 def _until_a_death(
-    call: Callable[[Item], Any], waiting: deque[Item], num_workers: int, log: Path | None
+    call: Callable[[Item], Any], waiting: deque[Item], workers: _Workers
 ) -> Iterator[tuple[Item, Any]]:
     """Call what waits until nothing does or a process dies, which costs all that are at work: their
     outcome is a BrokenExecutor."""
     running: dict[Future[Any], Item] = {}
-    with _open_pool(num_workers, log) as pool:
+    with workers as (executor, num_at_once):
         is_broken = False
         while (waiting or running) and not is_broken:
             try:
-                while waiting and len(running) < num_workers:
-                    running[pool.submit(call, waiting[0])] = waiting[0]
+                while waiting and len(running) < num_at_once():
+                    running[executor.submit(call, waiting[0])] = waiting[0]
                     waiting.popleft()
             except BrokenExecutor:
                 is_broken = True
@@ -120,21 +143,21 @@ def _outcome(result: Callable[[], Any]) -> Any:
         return result()
     except BrokenExecutor as error:
         return error
-    except (InputError, ComputationError):
-        raise
+    except (InputError, ComputationError, CancelledError):
+        raise  # a Dask client that loses its scheduler cancels all
     except Exception as error:
         return ComputationError(f"{type(error).__name__}: {error}")
 
 
 @contextmanager
-def _open_pool(num_workers: int, log: Path | None) -> Iterator[Executor]:
+def _open_pool(num_workers: int) -> Iterator[tuple[Executor, Callable[[], int]]]:
     """Open processes of this machine, which end with the block, whatever they are at."""
     spawn, before = multiprocessing.get_context("spawn"), multiprocessing.active_children()
-    given = (share_of_cores(num_workers), log)
-    with ProcessPoolExecutor(num_workers, spawn, _begin, given) as pool:
+    environment = share_of_cores(num_workers)
+    with ProcessPoolExecutor(num_workers, spawn, _begin, (environment,)) as pool:
         try:
             pool.submit(os.getpid).result()
-            yield pool
+            yield pool, lambda: num_workers
         except BrokenExecutor:
             raise ComputationError(
                 "worker processes end before they have begun; a script that uses several needs "
@@ -146,14 +169,40 @@ def _open_pool(num_workers: int, log: Path | None) -> Iterator[Executor]:
             raise
 
 
-def _begin(environment: dict[str, str], log: Path | None) -> None:
+@contextmanager
+def _open_dask(scheduler: str) -> Iterator[tuple[Executor, Callable[[], int]]]:
+    """Open a client of the scheduler, whose workers may come and go."""
+    try:
+        from distributed import Client
+
+        logging.getLogger("distributed").setLevel(logging.CRITICAL + 1)  # no help for users
+        client = Client(scheduler, timeout=_CONNECT_S, set_as_default=False)
+    except ImportError as error:
+        raise InputError(
+            f"--scheduler {scheduler}: needs Dask, which is not installed; "
+            "pip install 'densify[cluster]'"
+        ) from error
+    except Exception as error:  # of many types
+        raise InputError(
+            f"--scheduler {scheduler}: not reached within {_CONNECT_S} s ({error}), expected the "
+            f"address of a running Dask scheduler, such as tcp://host:8786; tls:// needs "
+            f"certificates that the scheduler trusts in Dask's configuration"
+        ) from error
+    with client:
+        try:
+            # pure: two equal calls would be one.
+            yield client.get_executor(pure=False), lambda: max(1, sum(client.nthreads().values()))
+        except (OSError, RuntimeError, CancelledError) as error:
+            told = "the Dask scheduler was lost; run the same command again to go on"
+            raise ComputationError(told) from error
+
+
+def _begin(environment: dict[str, str]) -> None:
     """Begin a worker process."""
     os.environ.update(environment)
     keep_freed_memory()
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # of the terminal: the command ends its workers
     threading.Thread(target=_end_with_parent, daemon=True).start()
-    if log is not None:
-        log_to(log)
 
 
 def _end_with_parent() -> None:

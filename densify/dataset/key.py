@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import logging
+import platform
 import time
 import traceback
 from collections.abc import Mapping
@@ -12,6 +13,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
+from densify import __version__
 from densify.config import as_mapping
 from densify.config.cache import Cache
 from densify.config.errors import ComputationError, InputError, OutputError, is_out_of_memory
@@ -33,7 +35,8 @@ class Job:
     """A recording of a set, as every process opens it.
 
     drive, data, folder, cameras: as `densify.dataset.plan.Drive`, the cameras' names. out: the
-    set's folder. run: another text for each run, because files may change between runs.
+    set's folder. run: another text for each run, because files may change between runs while
+    workers live on. version: of the densify that gives the job.
     """
 
     drive: str
@@ -43,6 +46,7 @@ class Job:
     recipe: Recipe
     out: Path
     run: str
+    version: str = __version__
 
 
 def make_key(job_and_key: tuple[Job, int]) -> KeyRecord:
@@ -125,6 +129,11 @@ def _write(job: Job, results: Mapping[str, Result]) -> dict[str, FileRecord]:
 
 @lru_cache(maxsize=1)
 def _opened(job: Job) -> tuple[Recording, Cache]:
+    if job.version != __version__:
+        raise ComputationError(
+            f"the worker on {platform.node()} has densify {__version__}, the command has "
+            f"{job.version}; install the same on both"
+        )
     cache, sequence = Cache(), open_sequence(job.data)
     recording = Recording(sequence, job.recipe.config, job.recipe.window, cache=cache, run=job.run)
     return recording, cache

@@ -17,7 +17,7 @@ from uuid import uuid4
 from densify.config import as_mapping
 from densify.config.cache import Cache
 from densify.config.errors import ComputationError, InputError, OutputError
-from densify.dataset.executor import call_all, log_to
+from densify.dataset.executor import call_all, logged_to
 from densify.dataset.key import Job, make_key
 from densify.dataset.manifest import (
     Key,
@@ -82,6 +82,7 @@ def make_dataset(
     recipe: Recipe | None = None,
     *,
     num_workers: int | None = 1,
+    scheduler: str | None = None,
     shard: tuple[int, int] | None = None,
     verify: bool = False,
     report: Callable[[Summary], None] | None = None,
@@ -93,6 +94,9 @@ def make_dataset(
     recipe: window, method, cameras and the like; the usual ones if None.
     num_workers: processes; 1 works in this one, None takes as many as cores, free memory and keys
         suffice for. A script that starts several needs ``if __name__ == "__main__"``.
+    scheduler: address of a Dask scheduler whose workers are used instead; they need the same files
+        at the same paths. ``tcp://`` trusts everybody on that network, ``tls://`` takes
+        certificates.
     shard: (i, n), the i-th of n parts of the work, from 1. Parts may run at the same time on
         machines that share ``out``.
     verify: compare finished files with their recorded hashes, and make damaged ones again.
@@ -134,7 +138,7 @@ def make_dataset(
                 num_workers,
             )
             left = _jobs(blocks, records.keys(), recipe, out, num_workers)
-            made = call_all(make_key, left, num_workers, log)
+            made = call_all(make_key, left, num_workers, log, scheduler)
             summary = _record(made, manifest, records, len(wanted), report)
             clear_leftovers(out, leftover_age_s)  # of workers that were killed
     return summary
@@ -239,14 +243,10 @@ def _record(
 def _log_file(out: Path, shard: tuple[int, int] | None) -> Iterator[Path]:
     """Append what is logged to ``OUT/densify.log``, or a shard's own; return its path."""
     name = "densify.log" if shard is None else f"densify-{shard[0]}of{shard[1]}.log"
-    before = _log.level
+    path = out.absolute() / name
     try:
-        handler = log_to(out.absolute() / name)
+        path.touch()
     except OSError as error:
         raise OutputError(f"--out {out}: {name} cannot be written: {error.strerror}") from error
-    try:
-        yield out.absolute() / name
-    finally:
-        _log.removeHandler(handler)
-        _log.setLevel(before)
-        handler.close()
+    with logged_to(path):
+        yield path

@@ -73,6 +73,13 @@ def add(commands: Any) -> None:
     about = "KITTI's depth completion tree (default), or what densify run writes"
     parser.add_argument("--layout", choices=layouts, default=layouts[0], help=about)
     option(parser, "--workers N", "processes (default: as many as fit)", type=natural)
+    about = (
+        "of a running Dask scheduler, whose workers are used; they need the same files at the "
+        "same paths. tcp://host:8786 trusts everybody on that network: whoever reaches the "
+        "scheduler can run anything on its workers and here. tls://host:8786 lets in only who has "
+        "a certificate, by Dask's configuration (distributed.comm.tls)"
+    )
+    option(parser, "--scheduler ADDRESS", about)
     option(parser, "--shard i/n", "the i-th of n parts, for several machines", type=shard)
     option(parser, "--status DIR", "how far the set in DIR is; makes nothing", type=Path)
     about = (
@@ -130,6 +137,7 @@ def _made(options: argparse.Namespace) -> Iterator[Answer]:
             options.keys,
             recipe,
             num_workers=options.workers,
+            scheduler=options.scheduler,
             shard=options.shard,
             verify=options.verify,
             report=lambda so_far: show("keys", len(so_far.records), so_far.num_keys),
