@@ -125,7 +125,7 @@ def test_a_module_says_what_a_row_says(package) -> None:
     check_engine("still:3")
     with pytest.raises(InputError, match="still:x: expected a number"):
         check_engine("still:x")
-    with pytest.raises(InputError, match=r"'stil', did you mean still\? .*#NAME\], still \("):
+    with pytest.raises(InputError, match=r"'stil', did you mean still\? .*npz:DIR, still \("):
         resolve(None, ["flow.engine=stil"])
 
 

@@ -136,7 +136,6 @@ ENGINES = Table(
         Plugin("paper", "densify.flow.objective.engine"),
         Plugin("network", "densify.learning.engine", argument="MODEL"),
         Plugin("npz", "densify.readers.flow_files", argument="DIR"),
-        Plugin("opensceneflow", "densify.readers.open_scene_flow", argument="FILE[#NAME]"),
     ),
 )
 """The module of each has the functions of `densify.flow.engines.EngineModule`."""
@@ -214,8 +213,6 @@ READERS = Table(
                "v1.0-*/sample_annotation.json", True),
         Plugin("waymo", "densify.readers.waymo", _any("lidar/*.parquet"),
                "Waymo's version 2 (with lidar/*.parquet)", "lidar_box/CONTEXT.parquet", True),
-        Plugin("opensceneflow", "densify.readers.open_scene_flow", _suffix(".h5"),
-               "OpenSceneFlow files (LOG.h5)", scenes=True),
         Plugin("pandaset", "densify.readers.pandaset", _any("lidar/poses.json"),
                "a PandaSet sequence (with lidar/poses.json)", "annotations/cuboids/00.pkl.gz"),
         Plugin("kitti-360", "densify.readers.kitti.kitti_360", _any("data_3d_raw"),

@@ -8,7 +8,7 @@ NAME is the recording's::
                    bool, flow_tx_m flow_ty_m flow_tz_m float16, to the next sweep without the
                    ego-motion, in the frame of the sweep's file; a row for each of the file's
     opensceneflow  OUT/NAME.h5, a group for each sweep, named by its stamp in ns
-                   (`densify.readers.open_scene_flow.reader`): lidar (N,4) deskewed to the stamp,
+                   (https://github.com/KTH-RPL/OpenSceneFlow): lidar (N,4) deskewed to the stamp,
                    pose (4,4), lidar_id, ground_mask (all False), row (N,) in the sweep's file;
                    where flow to the next sweep is known, with the ego-motion: flow (N,3),
                    flow_is_valid, flow_instance_id (0 none), ego_motion (4,4)

@@ -39,8 +39,7 @@ _KNOWN = (*_WIDE, "row", "moving", "object", "valid")
 
 def estimate_motion(scene: Scene, settings: Config, argument: str) -> Motion:
     """Read the flow files of a folder as an engine, see `densify.flow.engines.EngineModule`."""
-    files = FlowFiles(Path(argument), scene.stretch)
-    return ChainedMotion(scene.stretch, files.step)
+    return ChainedMotion(scene.stretch, FlowFiles(Path(argument), scene.stretch).step)
 
 
 def check_argument(argument: str) -> None:
@@ -86,7 +85,18 @@ def sweep_columns(
     to_reference if the file has it; points of other rows have flow 0, object -1 and are not valid.
     """
     arrays = load_flow_file(path)
-    at, known = _rows_in_file(path, arrays, row)
+    num_points = len(next(iter(arrays.values())))
+    rows = arrays.get("row", np.arange(num_points))
+    if "row" not in arrays and len(row) and row.max() >= num_points:
+        raise InputError(
+            f"{path}: holds {num_points} points, expected one for each row of the sweep's file "
+            f"(more than {row.max()}); add their 'row' where some are left out"
+        )
+    place = np.full(int(row.max(initial=0)) + 1, -1, np.int64)
+    ours = np.flatnonzero(rows < len(place))
+    place[rows[ours]] = ours
+    known = place[row] >= 0
+    at = place[row][known]
     found = {}
     for name in arrays:
         values = np.zeros((len(row), *arrays[name].shape[1:]))
@@ -101,24 +111,6 @@ def sweep_columns(
     found["object"] = np.where(known, found.get("object", -1), -1)
     found["valid"] = known & found.get("valid", known).astype(bool)
     return found
-
-
-def _rows_in_file(
-    path: Path, arrays: dict[str, NDArray[Any]], row: NDArray[np.int64]
-) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-    """Return where in the file each known point is, and a mask (N,) of the known ones."""
-    num_points = len(next(iter(arrays.values())))
-    rows = arrays.get("row", np.arange(num_points))
-    if "row" not in arrays and len(row) and row.max() >= num_points:
-        raise InputError(
-            f"{path}: holds {num_points} points, expected one for each row of the sweep's file "
-            f"(more than {row.max()}); add their 'row' where some are left out"
-        )
-    place = np.full(int(row.max(initial=0)) + 1, -1, np.int64)
-    ours = np.flatnonzero(rows < len(place))
-    place[rows[ours]] = ours
-    found = place[row]
-    return found[found >= 0], found >= 0
 
 
 def load_flow_file(path: Path) -> dict[str, NDArray[Any]]:

@@ -1,16 +1,14 @@
 # SPDX-License-Identifier: MIT
 """Read true scene flow beside a recording, for scoring: labels of every point's flow to the next
-sweep, in one of three forms, told apart by what lies there::
+sweep, in one of two forms, told apart by what lies there::
 
     DIR/000119_000120.npz   a flow file (`densify.readers.flow_files`)
     DIR/[LOG/]STAMP.feather Argoverse 2's labels as BucketedSceneFlowEval stores them: flow_tx_m
                             flow_ty_m flow_tz_m without ego motion, in the vehicle's frame at the
                             stamp; is_valid; classes_0, -1 the background, else the category's
                             place in `CATEGORIES`. Named by stamps, or 0000000000, 0000000001, …
-    LOG.h5                  OpenSceneFlow's: flow with ego motion, flow_is_valid,
-                            flow_category_indices, 0 the background, else one more than above
 
-A feather or .h5 file has all points of the sweep's file, row by row.
+A feather file has all points of the sweep's file, row by row.
 """
 
 from __future__ import annotations
@@ -25,7 +23,6 @@ from densify.config.errors import InputError
 from densify.geometry.types import Bool, Float, Stretch
 from densify.readers.arrow_columns import read_feather
 from densify.readers.flow_files import sweep_columns
-from densify.readers.open_scene_flow import FlowLabels, SweepFile
 from densify.scores.challenge import CLASSES, IGNORED
 
 CATEGORIES = {
@@ -68,7 +65,6 @@ _CLASS_OF = np.array(
 )
 _OBJECT = CLASSES.index("OBJECT")
 _FLOW = ("flow_tx_m", "flow_ty_m", "flow_tz_m")
-_WHAT = "Argoverse 2's flow labels"
 
 
 @dataclass(frozen=True)
@@ -90,12 +86,8 @@ def labelled_flow(place: Path, name: str, stretch: Stretch, frame: int) -> Label
     place: as above. name: of the recording, whose folder may lie there. Raises InputError where
     there are no labels of that sweep, or they are damaged or not its own.
     """
-    if place.suffix == ".h5":
-        return _from_h5(place, stretch, frame)
     if not place.is_dir():
-        raise InputError(
-            f"--truth {place}: no such folder; expected true flow in it, or a .h5 file"
-        )
+        raise InputError(f"--truth {place}: no such folder; expected true flow in it")
     target = stretch.frames[stretch.frames.index(frame) + 1]
     path = place / f"{frame:06d}_{target:06d}.npz"
     if path.is_file() or any(place.glob("*_*.npz")):
@@ -112,44 +104,25 @@ def labelled_flow(place: Path, name: str, stretch: Stretch, frame: int) -> Label
         )
     stamp_ns = stretch[frame].sweep.stamp_ns
     path = files.get(stamp_ns, files.get(frame, here / f"{stamp_ns}.feather"))
+    return _read_feather(path, stretch[frame].sweep.row)
+
+
+def _read_feather(path: Path, row: NDArray[np.int64]) -> LabelledFlow:
+    """row: (N,) of the sweep's points in its file."""
     kinds = {**dict.fromkeys(_FLOW, "m"), "is_valid": "t", "classes_0": "i"}
-    columns = read_feather(path, kinds, _WHAT)
+    columns = read_feather(path, kinds, "Argoverse 2's flow labels")
     flow = np.stack([columns[axis].astype(np.float64) for axis in _FLOW], axis=1)
-    classes = _classes(path, columns["classes_0"].astype(np.int64) + 1)
-    return _of_sweep(path, flow, columns["is_valid"], classes, stretch[frame].sweep.row)
-
-
-def _from_h5(path: Path, stretch: Stretch, frame: int) -> LabelledFlow:
-    file = SweepFile(path)
-    flow, valid, instance = FlowLabels(file, "flow", stretch).read(frame, 0)
-    classes = np.where(instance >= 0, _OBJECT, 0).astype(np.uint8)
-    with file.opened() as groups:
-        group = groups[file.names[frame]]
-        if "flow_category_indices" in group:
-            number = file.array(group, "flow_category_indices", (len(flow),), "iu")
-            classes = _classes(path, number.astype(np.int64))
-    return _of_sweep(path, flow, valid, classes, stretch[frame].sweep.row)
-
-
-def _of_sweep(
-    path: Path, flow: Float, valid: Bool, classes: NDArray[np.uint8], row: NDArray[np.int64]
-) -> LabelledFlow:
-    """Select the sweep's points from all rows of a file."""
+    number = columns["classes_0"].astype(np.int64)
     if len(row) and row.max() >= len(flow):
         raise InputError(
             f"{path}: holds {len(flow)} labels, expected one for each row of the sweep's file "
             f"(more than {row.max()}); give the labels of the recording that --data names"
         )
-    valid = valid & np.isfinite(flow).all(axis=1)
-    flow = np.where(valid[:, None], flow, 0.0)
-    return LabelledFlow(flow[row], classes[row], valid[row])
-
-
-def _classes(path: Path, number: NDArray[np.int64]) -> NDArray[np.uint8]:
-    """number: of each row's category, 0 the background, from 1 its place in `CATEGORIES`."""
-    if ((number < 0) | (number >= len(_CLASS_OF))).any():
+    if ((number < -1) | (number >= len(CATEGORIES))).any():
         raise InputError(
-            f"{path}: got categories {number.min() - 1} to {number.max() - 1}, expected -1 to "
+            f"{path}: got categories {number.min()} to {number.max()}, expected -1 to "
             f"{len(CATEGORIES) - 1}"
         )
-    return _CLASS_OF[number]
+    valid = columns["is_valid"] & np.isfinite(flow).all(axis=1)
+    flow = np.where(valid[:, None], flow, 0.0)
+    return LabelledFlow(flow[row], _CLASS_OF[number + 1][row], valid[row])

@@ -13,7 +13,6 @@ from writers.dgp import write_dgp
 from writers.excerpt import Excerpt
 from writers.kitti import write_kitti_360, write_odometry, write_tracking
 from writers.nuscenes import write_nuscenes
-from writers.open_scene_flow import write_open_scene_flow
 from writers.pandaset import write_pandaset
 from writers.ros import write_ros1, write_ros2
 from writers.waymo import write_waymo
@@ -26,7 +25,6 @@ WRITERS = {
     "kitti-tracking": write_tracking,
     "kitti-360": write_kitti_360,
     "nuscenes": write_nuscenes,
-    "opensceneflow": write_open_scene_flow,
     "waymo": write_waymo,
     "dgp": write_dgp,
     "pandaset": write_pandaset,

@@ -67,10 +67,10 @@ def _add_flow(benches: Any) -> None:
     _add_common(parser)
     option(parser, "--methods NAME,…", "(default: all but paper-adam)", type=words)
     about = (
-        "true flow of the sweeps to the next ones: FRAME_NEXT.npz (flow files), STAMP.feather "
-        "(Argoverse 2's labels), or OpenSceneFlow's .h5; pairs before the key are scored"
+        "true flow of the sweeps to the next ones: FRAME_NEXT.npz (flow files) or "
+        "STAMP.feather (Argoverse 2's labels); pairs before the key are scored"
     )
-    option(parser, "--truth DIR|FILE.h5", about, type=Path)
+    option(parser, "--truth DIR", about, type=Path)
 
 
 def _add_depth(benches: Any) -> None:
