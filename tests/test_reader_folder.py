@@ -135,10 +135,10 @@ def test_names_that_are_times(form, tmp_path):
     [
         ("0.0\n0.103\n0.207\n", 104_000_000),
         ("1317042661099\n1317042661202\n1317042661306\n", 104_000_000),
-        ("# times\n10\n20\n30\n", 10_000_000),
+        ("# times\n10\n10.1\n10.3\n", 200_000_000),
         ("2011-09-26 13:10:51.1\n2011-09-26 13:10:51.261\n2011-09-26T13:10:51.4\n", 139_000_000),
         ("timestamp,filename\n0.3,c_3.bin\n0.1,a_1.bin\n0.2,b_2.bin\n", 100_000_000),
-        ("a_1.bin 5000000\nb_2.bin 5100000\nc_3.bin 5200000\n", 100_000_000),
+        ("a_1.bin 5.0\nb_2.bin 5.1\nc_3.bin 5.2\n", 100_000_000),
     ],
 )
 def test_stamps_in_a_file(text, step_ns, tmp_path):
@@ -331,8 +331,9 @@ CAMERA_EDITS = [
 ]
 WRONG_FILES = [
     ("timestamps.txt", "1317042661.1\n", "got 1 times for 2 files"),
-    ("timestamps.txt", "0.1\nnoon\n", "got '.*', expected times"),
+    ("timestamps.txt", "0.1\nnoon\n", "line 2: got 'noon', expected a time in s"),
     ("timestamps.txt", "0.2\n0.1\n", "not after"),
+    ("timestamps.txt", "100\n200\n", "too far apart for seconds.*stamps_unit"),
     ("poses.txt", "", "holds no lines"),
     ("poses.txt", "0.1 0 0 0 0 0 0 1\n0.2 0", "line 2: got 2 columns, expected 8"),
     ("poses.txt", "0.1 0 0 nan 0 0 0 1\n", "line 1: got a value that is not finite"),

@@ -75,7 +75,7 @@ class FileSequence(ABC):
         self.cameras: Mapping[str, Camera] = cameras or {}
         self.truth = truth
         self._frames = frozenset(frames)
-        self._exposed_ns = exposed_ns or {}
+        self._exposed_ns = dict(exposed_ns or {})
         self._files = files or {}
         self._image_files = images or {}
 

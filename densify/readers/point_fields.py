@@ -10,12 +10,15 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from densify.geometry.types import Float32, Int
+from densify.config.errors import InputError
+from densify.geometry.types import Bool, Float32, Int
+from densify.readers.file_sequence import Returns
 
 UNIT_NS = {"s": 1_000_000_000, "ms": 1_000_000, "us": 1_000, "ns": 1}
 REFERENCES = ("start", "middle", "end")
@@ -139,10 +142,8 @@ def find_times(
     away_ns = float(np.abs(times).max()) * UNIT_NS[unit]
     if absolute is None:
         absolute = away_ns > _RELATIVE_NS
-    other = False
-    if absolute and stamp_ns is not None:
-        first_ns = int(float(times.min()) * UNIT_NS[unit])
-        other = abs(first_ns - stamp_ns) > _SAME_CLOCK_NS
+    first_ns = int(float(times.min()) * UNIT_NS[unit])
+    other = absolute and (stamp_ns is None or abs(first_ns - stamp_ns) > _SAME_CLOCK_NS)
     found = PointTimes(field, unit, absolute, other, reference)
     return found, str(found)
 
@@ -160,6 +161,73 @@ def scaled(intensity: NDArray[Any], scale: float) -> Float32:
     return np.clip(share, 0, 1).astype(np.float32)
 
 
-def points_of(columns: Mapping[str, NDArray[Any]], fields: Fields) -> NDArray[np.float64]:
-    """Return (N,3) float64, in the file's unit."""
-    return np.column_stack([columns[n] for n in (fields.x, fields.y, fields.z)]).astype(np.float64)
+@dataclass(frozen=True)
+class PointLayout:
+    """The meaning of the fields of a sensor's sweeps, found in one of them.
+
+    times: None where no field tells them; time_words: what was found of them. intensity_scale: what
+    full brightness is.
+    """
+
+    fields: Fields
+    times: PointTimes | None
+    time_words: str
+    intensity_scale: float
+
+    @staticmethod
+    def find(
+        columns: Mapping[str, NDArray[Any]],
+        where: Path | str,
+        period_ns: int,
+        stamp_ns: int | None,
+        named: Mapping[str, str] | None = None,
+        intensity_scale: float = 0.0,
+        **times: Any,
+    ) -> PointLayout:
+        """Return the layout of a sweep's columns (N,).
+
+        named: fields by the part that they play. intensity_scale: 0 to find it. times: what else is
+        known of them, see `find_times`. Raises InputError without x, y or z.
+        """
+        fields = Fields(**(vars(find_fields(columns)) | dict(named or {})))
+        missing = [axis for axis in "xyz" if not getattr(fields, axis)]
+        if missing:
+            raise InputError(
+                f"{where}: no column {', '.join(missing)}: got {', '.join(columns)}; in a plain "
+                f"folder name them in densify.yaml: sweeps: {{columns: [x, y, z, ...]}}"
+            )
+        found, words = None, "none: no column of that kind"
+        if fields.time:
+            found, words = find_times(
+                columns[fields.time], fields.time, period_ns, stamp_ns, **times
+            )
+        if fields.intensity and not intensity_scale:
+            intensity_scale = full_scale(columns[fields.intensity])
+        return PointLayout(fields, found, words, intensity_scale or 1.0)
+
+    def returns(
+        self, columns: Mapping[str, NDArray[Any]], where: Path | str, stamp_ns: int
+    ) -> tuple[Returns, Bool]:
+        """Return the rows of a sweep of that stamp, and which of them are valid (N,). Raises
+        InputError if it lacks a field of the first, or a valid point has no time."""
+        missing = [name for name in vars(self.fields).values() if name and name not in columns]
+        if missing:
+            raise InputError(
+                f"{where}: no column {missing[0]}, which other sweeps have; got "
+                f"{', '.join(columns)}"
+            )
+        axes = (self.fields.x, self.fields.y, self.fields.z)
+        points = np.column_stack([columns[name] for name in axes]).astype(np.float64)
+        valid: Bool = np.logical_and(np.isfinite(points).all(axis=1), points.any(axis=1))
+        intensity, offset_ns = None, None
+        if self.fields.intensity:
+            intensity = scaled(columns[self.fields.intensity], self.intensity_scale)
+        if self.times is not None:
+            values = columns[self.times.field][valid]
+            if not np.isfinite(values).all():
+                raise InputError(
+                    f"{where}: {self.times.field}: got a time that is not finite beside a point"
+                )
+            offset_ns = np.zeros(len(points), np.int64)
+            offset_ns[valid] = self.times.offset_ns(values, stamp_ns)
+        return Returns(points, intensity, offset_ns), valid

@@ -24,9 +24,11 @@ Columns = dict[str, NDArray[Any]]
 
 _UNNAMED = ("x", "y", "z", "intensity")  # KITTI's order, which most others follow
 _BIN_COLUMNS = range(3, 8)
+_TRIED_COLUMNS = range(1, 33)
+_LEAST_ROWS = 20  # that tell of other numbers of columns
+_ALIKE, _UNLIKE = 0.5, 0.8  # steps from row to row, as a share of the sizes
 _MOST_COLUMNS = 100  # more are rows
 _ROWS_LOOKED_AT = 4000
-_PLACES_M = (1e-20, 1e8)  # sizes of coordinates that are not zero
 
 
 @dataclass(frozen=True)
@@ -127,32 +129,40 @@ def _read_bin(path: Path, names: Sequence[str] | None) -> PointTable:
             f"({num_columns} float32 columns); it is cut off, or has another number of columns"
         )
     rows = np.frombuffer(data, "<f4").reshape(-1, num_columns)
-    if names is None and not _are_places(rows[:_ROWS_LOOKED_AT, :3]):
-        raise ValueError("its numbers are no places in metres, read as little-endian float32")
     return PointTable(_matrix(rows, names, path))
 
 
-def _are_places(rows: NDArray[np.float32]) -> bool:
-    """Return True if most finite rows may be positions. Of other bytes, such as doubles, few have
-    such exponents."""
-    size = np.abs(rows[np.isfinite(rows).all(axis=1)])
-    likely = ((size == 0) | ((size > _PLACES_M[0]) & (size < _PLACES_M[1]))).all(axis=1)
-    return len(size) == 0 or float(likely.mean()) > 0.5
-
-
 def _num_columns(data: bytes) -> int:
-    """Return the number of float32 columns, 3 to 7, that makes the positions of neighbouring rows
-    most alike; a wrong number mixes x with y."""
+    """Return the number of float32 columns, 3 to 7: the least with which neighbouring points are
+    alike, or else the one with which they are most alike; a wrong number mixes x with y.
+
+    Raises ValueError if they are not alike, far more alike with more columns, all the same, or if
+    neighbouring numbers are alike: all x then come before all y.
+    """
     with np.errstate(invalid="ignore"):  # other bytes may be any sort of NaN
         values = np.frombuffer(data[: len(data) // 4 * 4], "<f4").astype(np.float64)
     values = np.nan_to_num(values, posinf=0, neginf=0)
     steps = {}
-    for k in _BIN_COLUMNS:
-        if len(data) % (4 * k) == 0 and len(values) > k:
+    for k in _TRIED_COLUMNS:
+        least_rows = 1 if k in _BIN_COLUMNS else _LEAST_ROWS
+        if len(data) % (4 * k) == 0 and len(values) > k * least_rows:
             places = values.reshape(-1, k)[:_ROWS_LOOKED_AT, :3]
             size = np.abs(places[1:]).sum(axis=1) + np.abs(places[:-1]).sum(axis=1) + 1e-9
-            steps[k] = np.mean(np.abs(np.diff(places, axis=0)).sum(axis=1) / size)
-    return min(steps, key=lambda k: steps[k], default=4)
+            steps[k] = float(np.mean(np.abs(np.diff(places, axis=0)).sum(axis=1) / size))
+    usual = [k for k in _BIN_COLUMNS if k in steps]
+    if not usual:
+        return 4
+    alike = [k for k in usual if steps[k] < _ALIKE]
+    k = alike[0] if alike else min(usual, key=lambda k: steps[k])
+    neighbours = min(steps.get(1, 1), steps.get(2, 1))
+    more = not alike and (steps[k] > _UNLIKE or steps[k] > 2 * min(steps.values()))
+    same = steps[k] == 0 and values.any()
+    if more or same or neighbours < min(1.2 * _ALIKE, 2 * steps[k]):
+        raise ValueError(
+            "read as rows of 3 to 7 little-endian float32 columns, neighbouring points are not "
+            "alike; in a plain folder name the columns in densify.yaml: sweeps.columns"
+        )
+    return k
 
 
 def _read_npy(path: Path, names: Sequence[str] | None) -> PointTable:
@@ -303,15 +313,16 @@ def _read_las(path: Path, names: Sequence[str] | None) -> PointTable:
 
 
 _READERS: Mapping[str, Callable[[Path, Sequence[str] | None], PointTable]] = {
+    ".pcd": _read_pcd,
+    ".bin": _read_bin,
+    ".ply": _read_ply,
+    ".las": _read_las,
+    ".laz": _read_las,
     ".npy": _read_npy,
     ".npz": _read_npy,
     ".txt": _read_text,
     ".csv": _read_text,
-    ".bin": _read_bin,
-    ".pcd": _read_pcd,
-    ".ply": _read_ply,
-    ".las": _read_las,
-    ".laz": _read_las,
 }
 
 SUFFIXES = tuple(_READERS)
+"""Those that nothing but points has come first."""

@@ -25,6 +25,7 @@ poses
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from typing import NamedTuple
@@ -34,19 +35,11 @@ from numpy.typing import NDArray
 
 from densify.config.errors import InputError
 from densify.geometry import poses
-from densify.geometry.types import Camera, Float
+from densify.geometry.types import Camera, Float, Float32
 from densify.readers.file_sequence import FileSequence, Returns, check_image_size, truth_beside
-from densify.readers.point_fields import (
-    Fields,
-    PointTimes,
-    find_fields,
-    find_times,
-    full_scale,
-    points_of,
-    scaled,
-)
+from densify.readers.point_fields import PointLayout
 from densify.readers.recorded_poses import PoseTrack
-from densify.readers.ros_bag import POSES, Bag, Entry, Images, Topics
+from densify.readers.ros_bag import POSES, Bag, Entry, Topics, place_of
 from densify.readers.ros_messages import (
     Transforms,
     camera_of,
@@ -67,18 +60,14 @@ def open_recording(path: Path, scene: str | None) -> RosBag:
 
 class Lidar(NamedTuple):
     """A lidar's topic. entries: its messages. T_first_lidar: (4,4) to the first lidar's frame.
-    period_ns: median step of its messages. times, scale: of its points and intensities. words: what
-    was found of the times."""
+    period_ns: median step of its messages."""
 
     topic: str
     frame: str
     entries: list[Entry]
     T_first_lidar: Float
-    fields: Fields
     period_ns: int
-    times: PointTimes | None
-    scale: float
-    words: str
+    layout: PointLayout
 
 
 class RosBag(FileSequence):
@@ -88,19 +77,27 @@ class RosBag(FileSequence):
         """Read the bag through once, for the stamps of its messages. Raises InputError if it is
         damaged, or its topics, frames or calibrations do not tell what is needed."""
         self._bag = Bag(path)
-        self._topics = Topics.choose(self._bag, options)
-        self._left_out = list(self._topics.left_out)
-        images = self._topics.images
-        self._index = self._bag.index([*self._topics.points, *(i.topic for i in images)])
+        self._topics = topics = Topics.choose(self._bag, options)
+        self._index = self._bag.index([*topics.points, *topics.images])
         self._transforms = Transforms.read(self._bag)
         self._lidars: list[Lidar] = []
-        for topic in self._topics.points:
+        for topic in topics.points:
             self._lidars.append(self._lidar(topic))
-        cameras = {i.camera: camera for i in images if (camera := self._camera(i)) is not None}
-        self._image_topics = {i.camera: i.topic for i in images}
+        self._image_topics: dict[str, str] = {}
+        self._left_out: list[str] = []
+        cameras = {}
+        for topic in topics.images:
+            try:
+                camera = self._camera(topic)
+            except InputError as error:
+                if "images" in topics.named:
+                    raise
+                self._left_out.append(str(error))
+                continue
+            cameras[camera.name], self._image_topics[camera.name] = camera, topic
         stamps = {
-            name: {n: e.stamp_ns for n, e in enumerate(self._index[self._image_topics[name]])}
-            for name in cameras
+            name: {n: entry.stamp_ns for n, entry in enumerate(self._index[topic])}
+            for name, topic in self._image_topics.items()
         }
         self._sweeps = self._lidars[0].entries
         truth = truth_beside(path if path.is_dir() else path.parent)
@@ -116,9 +113,11 @@ class RosBag(FileSequence):
         """See `LidarSequence`."""
         lines = []
         for lidar in self._lidars:
-            used = [f"{part} = {name}" for part, name in vars(lidar.fields).items() if name]
+            found = lidar.layout
+            used = [f"{part} = {name}" for part, name in vars(found.fields).items() if name]
             lines.append(("lidar", f"{lidar.topic} in {lidar.frame}: {', '.join(used)}"))
-            lines.append(("times", f"{lidar.words}; intensity divided by {lidar.scale:g}"))
+            scale = f"intensity divided by {found.intensity_scale:g}"
+            lines.append(("times", f"{found.time_words}; {scale}"))
         lines += [("images", f"{topic} ({name})") for name, topic in self._image_topics.items()]
         lines += [("no camera", text) for text in self._left_out]
         return [*lines, ("poses from", self._track_and_words[1])]
@@ -135,8 +134,8 @@ class RosBag(FileSequence):
         origins = np.stack([lidar.T_first_lidar[:3, 3] for lidar in self._lidars])
         return self.where, Returns(
             np.concatenate([part.points for part in parts]),
-            np.concatenate([part.intensity for part in parts]),
-            np.concatenate([part.offset_ns for part in parts]) if timed else None,
+            np.concatenate([_intensity(part) for part in parts]),
+            np.concatenate([part.offset_ns for part in parts]) if timed else None,  # type: ignore
             np.concatenate([np.full(len(part.points), n, np.uint8) for n, part in found]),
             origins if len(self._lidars) > 1 else None,
         )
@@ -145,27 +144,13 @@ class RosBag(FileSequence):
         """Return a message's points in the first lidar's frame, timed since the sweep's stamp."""
         where = f"{self._bag.path}: {lidar.topic} at {entry.stamp_ns} ns"
         columns = cloud_columns(self._bag.message(lidar.topic, entry), where)
-        for name in vars(lidar.fields).values():
-            if name and name not in columns:
-                raise InputError(
-                    f"{where}: no field {name}, which other messages have; got {', '.join(columns)}"
-                )
-        points = points_of(columns, lidar.fields)
-        valid = np.isfinite(points).all(axis=1) & points.any(axis=1)
-        intensity = np.zeros(len(points), np.float32)
-        if lidar.fields.intensity:
-            intensity = scaled(columns[lidar.fields.intensity], lidar.scale)
-        offset_ns = None
-        if lidar.times is not None:
-            values = columns[lidar.times.field]
-            if values.dtype.kind == "f" and not np.isfinite(values[valid]).all():
-                raise InputError(f"{where}: {lidar.times.field}: got a time that is not finite")
-            offset_ns = np.zeros(len(points), np.int64)
-            since_ns = entry.stamp_ns - stamp_ns
-            offset_ns[valid] = lidar.times.offset_ns(values[valid], entry.stamp_ns) + since_ns
-        points[valid] = poses.transform(lidar.T_first_lidar, points[valid])
-        points[~valid] = 0.0
-        return Returns(points, intensity, offset_ns)
+        found, valid = lidar.layout.returns(columns, where, entry.stamp_ns)
+        points = np.zeros_like(found.points)
+        points[valid] = poses.transform(lidar.T_first_lidar, found.points[valid])
+        offset_ns = found.offset_ns
+        if offset_ns is not None:
+            offset_ns = offset_ns + (entry.stamp_ns - stamp_ns)
+        return replace(found, points=points, offset_ns=offset_ns)
 
     def _image(self, camera: Camera, number: int) -> NDArray[np.uint8]:
         topic = self._image_topics[camera.name]
@@ -184,18 +169,19 @@ class RosBag(FileSequence):
         chosen, lidar = self._topics.poses, self._lidars[0].frame
         if not chosen:
             return None, "none, as asked for"
-        try:
-            if chosen != "tf":
+        named = "poses" in self._topics.named
+        if chosen != "tf":
+            try:
                 track = recorded_track(self._bag, chosen, self._transforms, lidar)
-                return track, f"{chosen}, {len(track.stamp_ns)} of them"
-        except InputError as error:
-            if self._topics.poses_named:
-                raise
-            return None, str(error)
+            except InputError as error:
+                if named:
+                    raise
+                return None, str(error)
+            return track, f"{chosen}, {len(track.stamp_ns)} of them"
         found = self._transforms.track_of(lidar)
         if found is not None:
             return found[1], f"/tf, {found[0]} to {lidar}"
-        if self._topics.poses_named:
+        if named:
             raise InputError(f"{self._bag.path}: /tf: nothing tells where {lidar} was")
         names = ", ".join(topic.name for topic in self._bag.of_type(*POSES))
         hint = f"; name one of {names}: #poses=" if names else ", and there is no odometry"
@@ -218,37 +204,33 @@ class RosBag(FileSequence):
                 f"{self._bag.path}: nothing in /tf_static joins the frame {frame} of {topic} to "
                 f"{first}; name the topic of one lidar: #points={topic}"
             )
-        fields = find_fields(columns)
-        missing = [axis for axis in "xyz" if not getattr(fields, axis)]
-        if missing:
-            raise InputError(f"{where}: no field {', '.join(missing)}; got {', '.join(columns)}")
         steps = np.diff([e.stamp_ns for e in entries])
         period_ns = max(1, int(np.median(steps))) if len(steps) else _USUAL_PERIOD_NS
-        times, words = None, "no field of times"
-        if fields.time:
-            column = columns[fields.time]
-            times, words = find_times(column, fields.time, period_ns, entry.stamp_ns)
-        scale = full_scale(columns[fields.intensity]) if fields.intensity else 1.0
-        return Lidar(topic, frame, entries, T, fields, period_ns, times, scale or 1.0, words)
+        layout = PointLayout.find(columns, where, period_ns, entry.stamp_ns)
+        return Lidar(topic, frame, entries, T, period_ns, layout)
 
-    def _camera(self, images: Images) -> Camera | None:
-        """Return None, with a note, where a camera that nobody named does not tell its place."""
-        where = f"{self._bag.path}: {images.info}"
-        try:
-            entries, info = self._index[images.topic], next(self._bag.messages(images.info), None)
-            if not entries or info is None:
-                raise InputError(f"{where}: no messages of {images.topic} or its calibration")
-            image = self._bag.message(images.topic, entries[0])
-            frame, lidar = plain(image.header.frame_id), self._lidars[0].frame
-            T = self._transforms.between(frame, lidar)
-            if T is None:
-                raise InputError(
-                    f"{where}: nothing in /tf_static joins the camera's frame {frame} to the "
-                    f"lidar's, {lidar}; record /tf_static, or leave images out: #images=none"
-                )
-            return camera_of(info, images.camera, T, images.rectified, where)
-        except InputError as error:
-            if images.named:
-                raise
-            self._left_out.append(f"{images.topic}: {error}")
-            return None
+    def _camera(self, topic: str) -> Camera:
+        """Return the camera of a topic. Raises InputError if the bag does not tell its calibration
+        or its place."""
+        place, places = place_of(topic), [place_of(t) for t in self._topics.images]
+        where, info = f"{self._bag.path}: {topic}", f"{place}/camera_info"
+        message = next(self._bag.messages(info), None) if info in self._bag.topics else None
+        if message is None:
+            raise InputError(f"{where}: no {info} with its calibration; leave it out of #images=")
+        if not self._index[topic]:
+            raise InputError(f"{where}: holds no images")
+        image = self._bag.message(topic, self._index[topic][0])
+        frame, lidar = plain(image.header.frame_id), self._lidars[0].frame
+        T = self._transforms.between(frame, lidar)
+        if T is None:
+            raise InputError(
+                f"{where}: nothing in /tf_static joins the camera's frame {frame} to the "
+                f"lidar's, {lidar}; record /tf_static, or leave images out: #images=none"
+            )
+        name = (place if places.count(place) == 1 else topic).strip("/").replace("/", "_")
+        rectified = "rect" in topic.removesuffix("/compressed").rpartition("/")[2]
+        return camera_of(message, name or "camera", T, rectified, f"{self._bag.path}: {info}")
+
+
+def _intensity(part: Returns) -> Float32:
+    return np.zeros(len(part.points), np.float32) if part.intensity is None else part.intensity

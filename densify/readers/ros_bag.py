@@ -196,33 +196,16 @@ def _stamp_ns(raw: bytes, is_ros2: bool) -> int:
     return int(seconds) * 1_000_000_000 + int(nanoseconds)
 
 
-# Topics
-
-
-class Images(NamedTuple):
-    """camera: its name. topic: of its images. info: topic of its calibration. named: by the user,
-    so that whatever is wrong with it is an error."""
-
-    camera: str
-    topic: str
-    info: str
-    named: bool
-
-    @property
-    def rectified(self) -> bool:
-        return "rect" in self.topic.removesuffix("/compressed").rpartition("/")[2]
-
-
 @dataclass(frozen=True)
 class Topics:
-    """points: of the lidars; the first one's messages are the sweeps. poses: a topic, ``tf``, or ""
-    for none; poses_named: by the user. left_out: images that are not used, and why."""
+    """points: of the lidars; the first one's messages are the sweeps. images: of cameras. poses: a
+    topic, ``tf``, or "" for none. named: what of these the user named; whatever is wrong with it is
+    an error."""
 
     points: tuple[str, ...]
-    images: tuple[Images, ...]
+    images: tuple[str, ...]
     poses: str
-    poses_named: bool
-    left_out: tuple[str, ...]
+    named: Collection[str]
 
     @staticmethod
     def choose(bag: Bag, options: str | None) -> Topics:
@@ -234,24 +217,26 @@ class Topics:
             raise InputError(
                 f"{bag.path}#{options}: got {wrong[0] if wrong else options}, expected {_USAGE}"
             )
-        points = tuple(t.name for t in _points(bag, given.get("points")))
-        images, left_out = _images(bag, given.get("images"))
-        poses = given.get("poses", "")
-        if poses and poses not in ("none", "tf"):
-            _existing(bag, [poses], POSES, "poses")
-        if not poses:
-            odometry = bag.of_type(_ODOMETRY)
-            poses = odometry[0].name if len(odometry) == 1 else "tf"
-        poses = "" if poses == "none" else poses
-        return Topics(points, images, poses, "poses" in given, left_out)
+        images = _guessed_images([topic.name for topic in bag.of_type(*_IMAGES)])
+        odometry = bag.of_type(_ODOMETRY)
+        poses = given.get("poses") or (odometry[0].name if len(odometry) == 1 else "tf")
+        if "points" not in given:
+            given["points"] = _only_cloud(bag)
+        if "images" in given:
+            named = given["images"].replace("none", "")
+            images = named.split(",") if named else []
+        _check_topics(bag, "points", given["points"].split(","), _CLOUDS)
+        _check_topics(bag, "images", images, _IMAGES)
+        _check_topics(bag, "poses", [poses] if poses not in ("none", "tf") else [], POSES)
+        points = tuple(given["points"].split(","))
+        return Topics(points, tuple(images), poses.replace("none", ""), given.keys())
 
 
-def _points(bag: Bag, given: str | None) -> list[Topic]:
-    if given is not None:
-        return _existing(bag, given.split(","), _CLOUDS, "points")
+def _only_cloud(bag: Bag) -> str:
+    """Return the topic of the points, if there is one."""
     found = bag.of_type(*_CLOUDS)
     if len(found) == 1:
-        return found
+        return found[0].name
     if found:
         raise InputError(
             f"{bag.path}: several topics could be the sweeps: {_listed(found)}; name one "
@@ -263,52 +248,27 @@ def _points(bag: Bag, given: str | None) -> list[Topic]:
     )
 
 
-def _images(bag: Bag, given: str | None) -> tuple[tuple[Images, ...], tuple[str, ...]]:
-    if given == "none":
-        return (), ()
-    if given is not None:
-        chosen = [t.name for t in _existing(bag, given.split(","), _IMAGES, "images")]
-    else:
-        chosen = _guessed_images([t.name for t in bag.of_type(*_IMAGES)])
-    places = [_place(topic) for topic in chosen]
-    found, left_out = [], []
-    for topic, place in zip(chosen, places, strict=True):
-        info = f"{place}/camera_info"
-        name = (place if places.count(place) == 1 else topic).strip("/").replace("/", "_")
-        if info in bag.topics:
-            found.append(Images(name or "camera", topic, info, given is not None))
-        elif given is not None:
-            raise InputError(
-                f"{bag.path}: no {info} with the calibration of {topic}; leave it out of #images="
-            )
-        else:
-            left_out.append(f"{topic}: no {info} with its calibration")
-    return tuple(found), tuple(left_out)
-
-
 def _guessed_images(topics: Sequence[str]) -> list[str]:
     """Return the best of each place: rectified before raw, whole before compressed."""
-    best: dict[str, tuple[bool, bool, str]] = {}
-    for topic in topics:
+    best: dict[str, str] = {}
+    for topic in sorted(topics, key=lambda t: ("rect" not in t, t.endswith("/compressed"), t)):
         if not _NO_PICTURES.search(topic.lower()):
-            order = ("image_rect" not in topic, topic.endswith("/compressed"), topic)
-            best[_place(topic)] = min(best.get(_place(topic), order), order)
-    return [topic for *_, topic in best.values()]
+            best.setdefault(place_of(topic), topic)
+    return sorted(best.values())
 
 
-def _place(topic: str) -> str:
+def place_of(topic: str) -> str:
     """``/front/image_raw/compressed`` -> ``/front``, which has its calibration too."""
     return topic.removesuffix("/compressed").rpartition("/")[0]
 
 
-def _existing(bag: Bag, names: Sequence[str], types: Sequence[str], what: str) -> list[Topic]:
+def _check_topics(bag: Bag, what: str, names: Sequence[str], types: Sequence[str]) -> None:
     for name in names:
         topic = bag.topics.get(name)
         if topic is None or topic.type not in types:
             got = "no such topic" if topic is None else f"a topic of {topic.type}"
             fit = _listed(bag.of_type(*types)) or "none"
             raise InputError(f"{bag.path}: {what}={name}: {got}; topics that fit: {fit}")
-    return [bag.topics[name] for name in names]
 
 
 def _listed(topics: Sequence[Topic]) -> str:

@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: MIT
-"""Times in the names of files and in text files, in any unit."""
+"""Times in the names of files and in text files. Times since 1970 (the years 2000 to 2099) are in
+the unit that their size tells; others are in seconds unless a unit is given."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Sequence
+from collections.abc import Collection
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
 from typing import NamedTuple
@@ -15,10 +16,9 @@ from densify.config.errors import InputError
 from densify.config.file_content import read_text
 from densify.readers.point_fields import UNIT_NS
 
-_EPOCH_S = (946_684_800, 4_102_444_800)  # what counts as a time since 1970: the years 2000 to 2099
-_STEP_S = (0.002, 3.9)  # from sweep to sweep, or image to image
+_EPOCH_NS = (946_684_800 * 10**9, 4_102_444_800 * 10**9)
+_LONGEST_STEP_NS = 3_900_000_000  # from sweep to sweep, or image to image
 _SECONDS_AND_NS = re.compile(r"(?<!\d)(\d{10})[_-](\d{9})(?!\d)")
-_NUMBER = re.compile(r"\d+(?:\.\d+)?")
 _FILE_COLUMNS = ("filename", "file", "name", "image", "sweep", "path")
 TIME_COLUMNS = ("timestamp", "time", "stamp", "t")
 _MAX_NUMBER_DIGITS = 18  # a longer number is no frame's
@@ -36,20 +36,18 @@ class Named(NamedTuple):
 
 def named(path: Path, unit: str = "") -> Named:
     """Return what a file's name says: ``0000000120`` and ``cloud_12`` are numbers;
-    ``1317042651.468569638``, ``1317042651_468569638`` and ``1317042651468`` are times since 1970 in
-    a unit that their size tells.
+    ``1317042651.468569638``, ``1317042651_468569638`` and ``1317042651468`` are times since 1970.
 
     unit: the last number in the name is a time in this unit.
     """
-    stem = _SECONDS_AND_NS.sub(r"\1.\2", path.stem)
-    words = _NUMBER.findall(stem)
+    words = re.findall(r"\d+(?:\.\d+)?", _SECONDS_AND_NS.sub(r"\1.\2", path.stem))
     if unit:
         try:
             return Named(path, None, in_ns(words[-1] if words else "", unit))
         except ValueError:
             return Named(path, None, None)
     for word in reversed(words):
-        epoch = _epoch_unit(Decimal(word))
+        epoch = _epoch_unit(word)
         # ten digits without a fraction are a number with zeros before it, as KITTI's
         if epoch and (epoch != "s" or "." in word) and not word.startswith("0"):
             return Named(path, None, in_ns(word, epoch))
@@ -80,28 +78,14 @@ def date_ns(text: str) -> int:
     return int(np.datetime64(text, "ns").astype(np.int64))  # never through a float
 
 
-def unit_of(times: Sequence[str]) -> str:
-    """Return the unit in which these are times since 1970, or else in which the usual step between
-    them is one of sweeps or images; "" if there is none. Raises ValueError for no numbers."""
-    try:
-        values = sorted(Decimal(text) for text in times)
-    except InvalidOperation:
-        raise ValueError(f"got {times[0]!r}, expected times") from None
-    if not values or not all(value.is_finite() and value.copy_abs() < _MOST_NS for value in values):
-        raise ValueError("got no finite numbers, expected times")
-    epochs = {_epoch_unit(value) for value in values}
-    if len(epochs) == 1 and epochs != {""}:
-        return epochs.pop()
-    step = float(np.median(np.diff([float(value) for value in values]))) if len(values) > 1 else 0
-    low_s, high_s = _STEP_S
-    fit = [unit for unit, ns in UNIT_NS.items() if low_s <= step * ns * 1e-9 <= high_s]
-    return fit[0] if fit else ""
-
-
-def _epoch_unit(value: Decimal) -> str:
-    for unit, ns in UNIT_NS.items():
-        if _EPOCH_S[0] <= value * ns / 1_000_000_000 < _EPOCH_S[1]:
-            return unit
+def _epoch_unit(text: str) -> str:
+    """Return the unit in which this is a time since 1970, "" if there is none."""
+    for unit in UNIT_NS:
+        try:
+            if _EPOCH_NS[0] <= in_ns(text, unit) < _EPOCH_NS[1]:
+                return unit
+        except ValueError:
+            continue
     return ""
 
 
@@ -146,34 +130,33 @@ class TextTable(NamedTuple):
         return next((i for i in found if i < len(self.rows[0])), None)
 
     def times_ns(self, column: int, unit: str) -> tuple[tuple[int, ...], str]:
-        """Return the times of a column, dates or numbers of this unit, "" to find it out; and the
-        unit."""
+        """Return the times of a column, dates or numbers of this unit, and the unit. unit: "" for
+        that of times since 1970, or else s. Raises InputError for other words, and for times of an
+        assumed unit in which the usual step is too long."""
         times = [words[column] for words in self.rows]
         dates = "-" in times[0][1:] and ":" in times[0]
-        try:
-            unit = "date" if dates else unit or unit_of(times)
-        except ValueError as error:
-            raise InputError(f"{self.path}: {error} in each line") from None
-        if not unit:
-            raise InputError(
-                f"{self.path}: the unit of its times cannot be told ({times[0]}, {times[-1]}); "
-                f"name it in densify.yaml: stamps_unit: s, ms, us or ns"
-            )
+        known = unit or _epoch_unit(times[0])
         found = []
         for line, text in zip(self.lines, times, strict=True):
             try:
-                found.append(date_ns(text.rstrip("Z")) if dates else in_ns(text, unit))
+                found.append(date_ns(text.rstrip("Z")) if dates else in_ns(text, known or "s"))
             except ValueError:
                 raise InputError(
-                    f"{self.path}: line {line}: got {text!r}, expected a time in {unit}, from 1970 "
-                    f"to 2261"
+                    f"{self.path}: line {line}: got {text!r}, expected a time in {known or 's'}, "
+                    f"from 1970 to 2261"
                 ) from None
-        return tuple(found), unit
+        steps = np.abs(np.diff(np.array(found, np.float64)))
+        if not dates and not known and len(steps) and np.median(steps) > _LONGEST_STEP_NS:
+            raise InputError(
+                f"{self.path}: its times ({times[0]}, {times[1]}, ...) are too far apart for "
+                f"seconds; name their unit in densify.yaml: stamps_unit: ms, us or ns"
+            )
+        return tuple(found), "date" if dates else known or "s"
 
 
 class StampFile(NamedTuple):
-    """Times of a text file, line by line. unit: what was found or given. names: the file that each
-    line belongs to, where it says so."""
+    """Times of a text file, line by line. unit: of them. names: the file that each line belongs to,
+    where it says so."""
 
     path: Path
     stamp_ns: tuple[int, ...]
@@ -185,14 +168,13 @@ class StampFile(NamedTuple):
         """Read one time a line, or columns of which one is the time and another may be a file's
         name; numbers, or dates such as 2011-09-26 13:10:51.158069617.
 
-        unit: "" finds it out. Raises InputError that names file and line.
+        unit: see `TextTable.times_ns`. Raises InputError that names file and line.
         """
         table = TextTable.read(path, (*TIME_COLUMNS, *_FILE_COLUMNS))
         at_time, at_name = table.column(TIME_COLUMNS), table.column(_FILE_COLUMNS)
         words = table.rows[0]
         if at_time is None and at_name is None:
-            named = [i for i, word in enumerate(words) if Path(word).suffix[1:2].isalpha()]
-            at_name = named[0] if named else None
+            at_name = next((i for i, w in enumerate(words) if Path(w).suffix[1:2].isalpha()), None)
         if at_time is None:
             at_time = next((i for i in range(len(words)) if i != at_name), 0)
         stamps_ns, unit = table.times_ns(at_time, unit)

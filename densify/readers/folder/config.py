@@ -8,9 +8,9 @@ from __future__ import annotations
 import re
 import reprlib
 from collections.abc import Callable, Collection, Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import MISSING, dataclass, field, fields
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -25,97 +25,32 @@ _NUM_COEFFICIENTS = {"pinhole": (0, 4, 5, 8, 12, 14), "fisheye": (4,), "mei": (5
 _AXES = {s + a: (-1.0 if s else 1.0) * np.eye(3)[i] for s in ("", "-") for i, a in enumerate("xyz")}
 
 C = TypeVar("C")
+Check = tuple[Callable[[Any], Any], str]
+"""A function that returns the value of a key, or raises ValueError or the like for a wrong one; and
+the value that is expected, for people."""
 
 
-@dataclass(frozen=True)
-class Section:
-    """A mapping in the file. name: keys down to it, "" for the whole. lines: of all keys."""
-
-    path: Path
-    name: str
-    values: Mapping[str, Any]
-    lines: Mapping[str, int]
-
-    def wrong(self, key: str, expected: str) -> InputError:
-        """Return the error that the value of this key is not what was expected."""
-        got = self.values.get(key)
-        shown = "nothing" if got is None else reprlib.repr(got)
-        return InputError(f"{self._place(key)}: got {shown}, expected {expected}")
-
-    def _place(self, key: str) -> str:
-        full = f"{self.name}.{key}".lstrip(".")
-        line = f"line {self.lines[full]}: " if full in self.lines else ""
-        return f"{self.path}: {line}{full}"
-
-    def section(self, key: str) -> Section:
-        """Return the mapping below this key, empty if it is not there."""
-        value = self.values.get(key)
-        value = {} if value is None else value
-        if not isinstance(value, dict) or not all(isinstance(k, str) for k in value):
-            raise self.wrong(key, "a mapping of keys to values")
-        return Section(self.path, f"{self.name}.{key}".lstrip("."), value, self.lines)
-
-    def fill(self, kind: type[C]) -> C:
-        """Return the dataclass whose fields are the keys of this section. Raises InputError for
-        other keys and other values."""
-        known, found = {f.name: f for f in fields(kind)}, {}  # type: ignore[arg-type]
-        self.check_keys(known)
-        for key, value in self.values.items():
-            given = known[key]
-            convert, expected = given.metadata.get("is") or _PLAIN[type(given.default)]
-            try:
-                if value is not None:
-                    found[key] = convert(value)
-            except (ValueError, TypeError, KeyError, OverflowError, InputError):
-                raise self.wrong(key, expected) from None
-        return kind(**found)
-
-    def check_keys(self, known: Collection[str]) -> None:
-        for key in self.values:
-            if key not in known:
-                raise InputError(
-                    f"{self._place(key)}: unknown key; {did_you_mean(key, known)}expected some of "
-                    f"{', '.join(sorted(known))}"
-                )
+def _only(kind: type, value: Any) -> Any:
+    if not isinstance(value, kind):
+        raise ValueError
+    return value
 
 
-def _key(convert: Callable[[Any], Any], expected: str, default: Any = None) -> Any:
-    """Return a field. convert: raises ValueError or the like for a wrong value."""
-    return field(default=default, metadata={"is": (convert, expected)})
-
-
-def _only(kind: type) -> Callable[[Any], Any]:
-    def convert(value: Any) -> Any:
-        if not isinstance(value, kind):
-            raise ValueError
-        return value
-
-    return convert
-
-
-def _choice(choices: Collection[str], default: str = "") -> Any:
-    named = {name: name for name in choices}
-    return _key(named.__getitem__, f"one of {', '.join(choices)}", default)
-
-
-def _number(value: Any) -> float:
-    return float(_as_array(value))  # YAML 1.1 reads 1e-3 as text
-
-
-def _above_0(default: float) -> Any:
-    def convert(value: Any) -> float:
-        if _number(value) <= 0:
-            raise ValueError
-        return _number(value)
-
-    return _key(convert, "a finite number above 0", default)
-
-
-def _as_array(value: Any, *shape: int) -> Float:
+def _array(value: Any, *shape: int) -> Float:
     array = np.array(value, dtype=np.float64).reshape(shape)
     if not np.isfinite(array).all():
         raise ValueError
     return array
+
+
+def _number(value: Any) -> float:
+    return float(_array(value))  # YAML 1.1 reads 1e-3 as text
+
+
+def _above_0(value: Any) -> float:
+    if _number(value) <= 0:
+        raise ValueError
+    return _number(value)
 
 
 def _names(value: Any) -> tuple[str, ...]:
@@ -132,20 +67,8 @@ def _axes(value: Any) -> Float:
     return R
 
 
-def _numbers(value: Any) -> tuple[float, ...]:
-    return tuple(_as_array(value, -1).tolist())
-
-
-def _places(value: Any) -> Float:
-    return _as_array(value, -1, 3)
-
-
-def _pose(value: Any) -> Float:
-    return rigid(_as_array(value, -1, 4), "")
-
-
 def _intrinsics(value: Any) -> Float:
-    numbers = _as_array(value, -1)
+    numbers = _array(value, -1)
     if len(numbers) == 4:
         fx, fy, cx, cy = numbers
         numbers = np.array([fx, 0, cx, 0, fy, cy, 0, 0, 1.0])
@@ -156,18 +79,48 @@ def _intrinsics(value: Any) -> Float:
 
 
 def _size_px(value: Any) -> tuple[int, int]:
-    width, height = _as_array(value, 2).tolist()
+    width, height = _array(value, 2).tolist()
     if min(width, height) < 1 or width % 1 or height % 1:
         raise ValueError
     return int(width), int(height)
 
 
-_PLAIN = {
-    bool: (_only(bool), "true or false"),
-    str: (_only(str), "a text"),
-    float: (_number, "a finite number"),
+def _choice(choices: Collection[str]) -> Check:
+    return {name: name for name in choices}.__getitem__, f"one of {', '.join(choices)}"
+
+
+_TEXT: Check = (lambda value: _only(str, value), "a text")
+_FLAG: Check = (lambda value: _only(bool, value), "true or false")
+_NUMBER: Check = (_number, "a finite number")
+_ABOVE_0: Check = (_above_0, "a finite number above 0")
+_MOTION: Check = (
+    lambda value: rigid(_array(value, -1, 4), ""),
+    "three or four rows of a rotation and translation",
+)
+_CHECKS: dict[str, Check] = {
+    "columns": (_names, "a list of names"),
+    "scale_m": _ABOVE_0,
+    "axes": (_axes, "x, y and z in some order, such as [z, -x, -y]"),
+    "intensity_scale": _ABOVE_0,
+    "time_unit": _choice(UNIT_NS),
+    "time_is": _choice(("relative", "absolute")),
+    "reference": _choice(REFERENCES),
+    "stamps_unit": _choice(UNIT_NS),
+    "rate_hz": _ABOVE_0,
+    "compensated": _FLAG,
+    "scanner_origins": (lambda value: _array(value, -1, 3), "finite numbers of shape (N, 3)"),
+    "T_frame_lidar": _MOTION,
+    "inverse": _FLAG,
+    "size": (_size_px, "[width, height] in whole pixels"),
+    "K": (_intrinsics, "[fx, fy, cx, cy] or three rows, with fx and fy above 0"),
+    "T_cam_lidar": _MOTION,
+    "model": _choice(_NUM_COEFFICIENTS),
+    "distortion": (lambda value: tuple(_array(value, -1).tolist()), "finite numbers"),
+    "max_angle_deg": _ABOVE_0,
+    "row_time_s": _NUMBER,
+    "clock_offset_s": _NUMBER,
 }
-_MOTION = "three or four rows of a rotation and translation"
+"""Of each key that is no text."""
 
 
 @dataclass(frozen=True)
@@ -186,21 +139,21 @@ class SweepFiles:
     """
 
     files: str = ""
-    columns: tuple[str, ...] | None = _key(_names, "a list of names")
-    scale_m: float = _above_0(1.0)
-    axes: Float | None = _key(_axes, "x, y and z in some order, such as [z, -x, -y]")
+    columns: tuple[str, ...] | None = None
+    scale_m: float = 1.0
+    axes: Float | None = None
     intensity: str = ""
-    intensity_scale: float = _above_0(0.0)
+    intensity_scale: float = 0.0
     time: str = ""
-    time_unit: str = _choice(UNIT_NS)
-    time_is: str = _choice(("relative", "absolute"))
-    reference: str = _choice(REFERENCES)
+    time_unit: str = ""
+    time_is: str = ""
+    reference: str = ""
     lidar: str = ""
     stamps: str = ""
-    stamps_unit: str = _choice(UNIT_NS)
-    rate_hz: float = _above_0(0.0)
+    stamps_unit: str = ""
+    rate_hz: float = 0.0
     compensated: bool = False
-    scanner_origins: Float | None = _key(_places, "finite numbers of shape (N, 3)")
+    scanner_origins: Float | None = None
 
 
 @dataclass(frozen=True)
@@ -209,29 +162,75 @@ class Poses:
     poses these are. inverse: the file has T_lidar_world, not T_world_lidar."""
 
     file: str = ""
-    stamps_unit: str = _choice(UNIT_NS)
-    T_frame_lidar: Float | None = _key(_pose, _MOTION)
+    stamps_unit: str = ""
+    T_frame_lidar: Float | None = None
     inverse: bool = False
 
 
 @dataclass(frozen=True)
 class CameraFiles:
-    """One of the section ``cameras``. files: folder of its images. size: width, height in pixels.
-    K: (3,3). T_cam_lidar: (4,4). stamps: ``names``, ``sweeps`` (an image is exposed when the sweep
+    """One of the section ``cameras``. size: width, height in pixels. K: (3,3). T_cam_lidar: (4,4).
+    files: folder of its images. stamps: ``names``, ``sweeps`` (an image is exposed when the sweep
     of its number is stamped), or a file, "" to look for them. clock_offset_s: is added to the
     stamps, to bring them to the sweeps' clock."""
 
-    size: tuple[int, int] = _key(_size_px, "[width, height] in whole pixels")
-    K: Float = _key(_intrinsics, "[fx, fy, cx, cy] or three rows, with fx and fy above 0")
-    T_cam_lidar: Float = _key(_pose, _MOTION)
+    size: tuple[int, int]
+    K: Float
+    T_cam_lidar: Float
     files: str = ""
-    model: str = _choice(_NUM_COEFFICIENTS, "pinhole")
-    distortion: tuple[float, ...] = _key(_numbers, "finite numbers", ())
-    max_angle_deg: float = _above_0(180.0)
+    model: str = "pinhole"
+    distortion: tuple[float, ...] = ()
+    max_angle_deg: float = 180.0
     row_time_s: float = 0.0
     stamps: str = ""
-    stamps_unit: str = _choice(UNIT_NS)
+    stamps_unit: str = ""
     clock_offset_s: float = 0.0
+
+
+class _File(NamedTuple):
+    """lines: of all keys by their dotted names."""
+
+    path: Path
+    lines: Mapping[str, int]
+
+    def error(self, key: str, said: str) -> InputError:
+        line = f"line {self.lines[key]}: " if key in self.lines else ""
+        return InputError(f"{self.path}: {line}{key}: {said}")
+
+    def unfit(self, key: str, got: Any, expected: str) -> InputError:
+        shown = "nothing" if got is None else reprlib.repr(got)
+        return self.error(key, f"got {shown}, expected {expected}")
+
+    def mapping(self, key: str, value: Any, known: Collection[str] | None) -> dict[str, Any]:
+        """Return the mapping that is the value of a key, empty for None. known: the keys that it
+        may have, None for any."""
+        value = {} if value is None else value
+        if not isinstance(value, dict) or not all(isinstance(name, str) for name in value):
+            raise self.unfit(key, value, "a mapping of keys to values")
+        for name in value:
+            if known is not None and name not in known:
+                raise self.error(
+                    f"{key}.{name}".lstrip("."),
+                    f"unknown key; {did_you_mean(name, known)}expected some of "
+                    f"{', '.join(sorted(known))}",
+                )
+        return value
+
+    def filled(self, kind: type[C], key: str, value: Any) -> C:
+        """Return the dataclass whose fields are the keys of a mapping."""
+        known = {f.name: f for f in fields(kind)}  # type: ignore[arg-type]
+        found = {}
+        for name, given in self.mapping(key, value, known).items():
+            convert, expected = _CHECKS.get(name, _TEXT)
+            try:
+                if given is not None:
+                    found[name] = convert(given)
+            except (ValueError, TypeError, KeyError, OverflowError, InputError):
+                raise self.unfit(f"{key}.{name}", given, expected) from None
+        for name, one in known.items():
+            if one.default is MISSING and name not in found:
+                raise self.unfit(f"{key}.{name}", None, _CHECKS[name][1])
+        return kind(**found)
 
 
 @dataclass(frozen=True)
@@ -250,32 +249,29 @@ class FolderConfig:
         if not path.is_file():
             return FolderConfig()
         values, lines = read_yaml(path)
-        root = Section(path, "", {"": values}, lines).section("")
-        parts = {key: root.section(key) for key in ("sweeps", "poses", "cameras")}
-        root.check_keys(parts)
-        cameras = parts["cameras"]
+        file = _File(path, lines)
+        values = file.mapping("", values, ("sweeps", "poses", "cameras"))
+        cameras = file.mapping("cameras", values.get("cameras"), None)
         return FolderConfig(
             path,
-            parts["sweeps"].fill(SweepFiles),
-            parts["poses"].fill(Poses),
-            {name: _camera(cameras, name) for name in cameras.values},
+            file.filled(SweepFiles, "sweeps", values.get("sweeps")),
+            file.filled(Poses, "poses", values.get("poses")),
+            {name: _camera(file, name, given) for name, given in cameras.items()},
         )
 
 
-def _camera(cameras: Section, name: str) -> tuple[Camera, CameraFiles]:
+def _camera(file: _File, name: str, value: Any) -> tuple[Camera, CameraFiles]:
+    key = f"cameras.{name}"
     if not re.fullmatch(r"[\w-][\w.-]*", name):
-        raise cameras.wrong(name, "a name of letters, digits, _ - .")
-    section = cameras.section(name)
-    given = section.fill(CameraFiles)
-    for key in ("size", "K", "T_cam_lidar"):
-        if getattr(given, key) is None:
-            raise section.wrong(key, "it: cameras need size, K and T_cam_lidar")
+        raise file.unfit(key, value, "a name of letters, digits, _ - .")
+    given = file.filled(CameraFiles, key, value)
     coefficients = given.distortion
     if given.model == "pinhole" and not any(coefficients):
         coefficients = ()
     if len(coefficients) not in _NUM_COEFFICIENTS[given.model]:
         counts = ", ".join(str(n) for n in _NUM_COEFFICIENTS[given.model])
-        raise section.wrong("distortion", f"{counts} coefficients for a {given.model} camera")
+        expected = f"{counts} coefficients for a {given.model} camera"
+        raise file.unfit(f"{key}.distortion", coefficients, expected)
     camera = Camera(
         name,
         *given.size,

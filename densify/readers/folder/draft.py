@@ -4,28 +4,22 @@ be filled in."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
-
-import numpy as np
-from numpy.typing import NDArray
 
 from densify.readers.decoded_files import image_size_px
 from densify.readers.folder.columns import SweepColumns
 from densify.readers.folder.config import SweepFiles
 from densify.readers.folder.series import find_images, find_pose_file, in_time, sweep_folders
 from densify.readers.point_fields import find_times
-from densify.readers.point_files import read_table, unnamed
+from densify.readers.point_files import read_table
 from densify.readers.recorded_poses import PoseFile
-from densify.readers.stamp_files import named
 
-_HEAD = """\
+_TEXT = """\
 # What the files of this folder cannot say themselves; every key may be left out. Lines with a # in
-# front are examples or guesses: take the # away where they are right.
+# front are examples: take the # away where they are right.
 
-"""
-_MORE = """\
+sweeps:
+{sweeps}
   # scale_m: 0.001       # metres of a unit of the points
   # axes: [z, -x, -y]    # which stored axes are x (forward), y (left) and z (up)
   # reference: start     # the stamp is the sweep's start, middle or end
@@ -44,7 +38,6 @@ _MORE = """\
 _CAMERA = """\
 #   {name}:
 #     files: {files}
-#     stamps: {stamps}
 #     size: [{width}, {height}]
 #     model: pinhole
 #     distortion: []
@@ -61,20 +54,29 @@ def draft_config(folder: Path) -> str:
     poses = "# poses:\n#   file: poses.txt       # KITTI 3x4, 4x4, TUM, or a table"
     if path is not None:
         poses = f"poses:\n  file: {path.name}  # {PoseFile.read(path).form}"
-    sweeps = "\n".join(_sweep_lines(folder, sweep_folders(folder))) + "\n"
-    return _HEAD + sweeps + _MORE.format(poses=poses) + _cameras(folder)
+    text = _TEXT.format(sweeps="\n".join(_sweep_lines(folder)), poses=poses)
+    for files, images in find_images(folder).items():
+        place = folder / files
+        name = place.parent.name if place.name in ("data", "images") else place.name
+        width, height = image_size_px(images[0])
+        text += _CAMERA.format(name=name, files=files, width=width, height=height)
+    return text
 
 
-def _sweep_lines(folder: Path, groups: Mapping[str, Sequence[Path]]) -> list[str]:
-    (choice, paths), *others = groups.items()
+def _sweep_lines(folder: Path) -> list[str]:
+    (choice, paths), *others = sweep_folders(folder).items()
     series = in_time(folder, paths, "", "")
     columns = read_table(next(iter(series.paths.values()))).columns
     either = f"or: {', '.join(name for name, _ in others)}" if others else f"{len(paths)} sweeps"
-    lines, names = ["sweeps:", f"  files: {choice}  # {either}"], None
-    if tuple(columns) == unnamed(len(columns)):
-        names = _guessed(columns)
-        lines.append(f"  columns: [{', '.join(names)}]  # guessed by their values: check them")
-    found = SweepColumns(series, SweepFiles(columns=names), None).layout
+    lines, names = [f"  files: {choice}  # {either}"], list(columns)
+    unknown = [name for name in columns if name.startswith("column")]
+    for name in unknown:
+        if "time" not in names and find_times(columns[name], name, 10**8, None)[0] is not None:
+            names[names.index(name)] = "time"
+    names = [f"unknown{i}" if name in unknown else name for i, name in enumerate(names)]
+    if unknown:
+        lines.append(f"  columns: [{', '.join(names)}]  # time by its values: check them")
+    found = SweepColumns(series, SweepFiles(columns=tuple(names) if unknown else None), None).layout
     if found.fields.intensity:
         lines.append(f"  intensity: {found.fields.intensity}")
         lines.append(f"  intensity_scale: {found.intensity_scale:g}  # what full brightness is")
@@ -89,34 +91,3 @@ def _sweep_lines(folder: Path, groups: Mapping[str, Sequence[Path]]) -> list[str
     else:
         lines.append(f"  # stamps are taken from {series.told_by}")
     return lines
-
-
-def _guessed(columns: Mapping[str, NDArray[Any]]) -> tuple[str, ...]:
-    """Guess names for the columns of a file without names by their values, from the fifth on."""
-    names: list[str] = []
-    for name, column in columns.items():
-        whole = np.isfinite(column).all() and not (column % 1).any()
-        if not name.startswith("column"):
-            names.append(name)
-        elif whole and column.min() >= 0 and 0 < column.max() < 256 and "ring" not in names:
-            names.append("ring")
-        elif "time" not in names and find_times(column, name, 10**8, None)[0] is not None:
-            names.append("time")
-        else:
-            names.append(f"unknown{len(names)}")
-    return tuple(names)
-
-
-def _cameras(folder: Path) -> str:
-    text = ""
-    for files, images in find_images(folder).items():
-        place, first = folder / files, images[0]
-        width, height = image_size_px(first)
-        text += _CAMERA.format(
-            name=place.parent.name if place.name in ("data", "images") else place.name,
-            files=files,
-            width=width,
-            height=height,
-            stamps="names" if named(first).stamp_ns is not None else "sweeps",
-        )
-    return text

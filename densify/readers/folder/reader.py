@@ -32,7 +32,13 @@ import numpy as np
 from densify.config.errors import InputError
 from densify.geometry import poses
 from densify.geometry.types import Float
-from densify.readers.file_sequence import FileSequence, Returns, quaternion_pose, truth_beside
+from densify.readers.file_sequence import (
+    FileSequence,
+    Returns,
+    of_frame,
+    quaternion_pose,
+    truth_beside,
+)
 from densify.readers.folder.columns import SweepColumns
 from densify.readers.folder.config import CameraFiles, FolderConfig
 from densify.readers.folder.series import (
@@ -77,34 +83,39 @@ class Folder(FileSequence):
             files=self._sweeps.paths,
             images={name: series.paths for name, series in images.items()},
         )
-        self._exposed_ns = {
-            name: self._exposures(images[name], given) for name, (_, given) in cameras.items()
-        }
-        self._poses = self._read_poses()
+        by_number = {frame: self.stamp_ns(frame) for frame in self.frames} if images else {}
+        for name, series in images.items():
+            shift_ns = round(cameras[name][1].clock_offset_s * 1e9)
+            own = series.stamps_ns or {n: ns for n, ns in by_number.items() if n in series.paths}
+            self._exposed_ns[name] = {number: ns + shift_ns for number, ns in own.items()}
+        self._read_poses()
 
     def stamp_ns(self, frame: int) -> int:
         """Return the reference time of a sweep."""
         self.check_frame(frame)
         if self._sweeps.stamps_ns is None:
-            return int(frame) * self._columns.layout.period_ns
+            return int(frame) * self._columns.period_ns
         return self._sweeps.stamps_ns[frame]
 
     def findings(self) -> Sequence[tuple[str, str]]:
         """See `LidarSequence`."""
         layout, first = self._columns.layout, self._sweeps.paths[self.frames[0]]
         fields = [f"{part} = {name}" for part, name in vars(layout.fields).items() if name]
-        unused = f"; not used: {', '.join(layout.unused)}" if layout.unused else ""
-        times = layout.time_words
+        unused = ", ".join(self._columns.unused())
+        times, told_by = layout.time_words, self._sweeps.told_by
         if self._config.sweeps.compensated and self._track is None:
             times = (
                 "left out: the points are compensated, and no poses with stamps tell by how much"
             )
+        if not told_by:
+            how = "the" if self._config.sweeps.rate_hz else "an assumed"
+            told_by = f"number, at {how} {1e9 / self._columns.period_ns:g} Hz (rate_hz)"
         lines = [
             ("files", f"{(first.parent / '*').relative_to(self.where)}{first.suffix}"),
-            ("fields", ", ".join(fields) + unused),
+            ("fields", ", ".join(fields) + (f"; not used: {unused}" if unused else "")),
             ("intensity", f"divided by {layout.intensity_scale:g}"),
             ("times", times),
-            ("stamped by", self._sweeps.told_by or layout.period_words),
+            ("stamped by", told_by),
         ]
         if self._poses is not None:
             lines.append(("poses from", f"{self._poses.path.name} ({self._poses.form})"))
@@ -124,58 +135,43 @@ class Folder(FileSequence):
             return path, found
         if self._track is None:
             return path, replace(found, offset_ns=None)
-        valid = np.isfinite(found.points).all(axis=1) & found.points.any(axis=1)
-        points = found.points.copy()
-        points[valid] = self._track.as_fired(points[valid], stamp_ns, found.offset_ns[valid])
+        points = self._track.as_fired(found.points, stamp_ns, found.offset_ns)
         return path, replace(found, points=points)
 
     def _pose(self, frame: int) -> Float:
         if self._track is not None:
             return self._track.at(self.stamp_ns(frame))
         if self._poses is not None:
-            return self._T_world_lidar(self._poses.T[self._row_of_pose(frame, self._poses)])
+            return of_frame(self._T_world_lidar, frame, "pose", self._poses.path)
         if not self._has_viewpoints:
             return super()._pose(frame)
         path = self._sweeps.paths[frame]
         x, y, z, *quaternion = read_viewpoint(path) or _NO_VIEWPOINT
         return quaternion_pose(quaternion, (x, y, z), f"{path}: VIEWPOINT")
 
-    def _read_poses(self) -> PoseFile | None:
-        path = find_pose_file(self.where, self._config.poses.file)
+    def _read_poses(self) -> None:
+        """Read the lidar's path where the poses have stamps, else its pose by frame."""
+        known, frames = self._config.poses, self.frames
+        self._poses: PoseFile | None = None
+        self._track: PoseTrack | None = None
+        path = find_pose_file(self.where, known.file)
         if path is None:
-            return None
-        found = PoseFile.read(path, self._config.poses.stamps_unit)
-        by_row = found.stamps_ns is None and found.numbers is None
-        if by_row and len(found.T) != len(self.frames) and len(found.T) <= self.frames[-1]:
+            return
+        self._poses = found = PoseFile.read(path, known.stamps_unit)
+        T = poses.inverse(found.T) if known.inverse else found.T
+        T = T if known.T_frame_lidar is None else T @ known.T_frame_lidar
+        if found.stamps_ns is not None:
+            self._track = PoseTrack(str(path), np.array(found.stamps_ns, np.int64), T)
+            return
+        numbers: Sequence[int] = found.numbers or range(len(T))
+        if found.numbers is None and len(T) == len(frames):
+            numbers = frames
+        elif found.numbers is None and len(T) <= frames[-1]:
             raise InputError(
-                f"{path}: got {len(found.T)} poses for {len(self.frames)} sweeps numbered "
-                f"{format_frames(self.frames)}, expected one for each, or for each number from 0"
+                f"{path}: got {len(T)} poses for {len(frames)} sweeps numbered "
+                f"{format_frames(frames)}, expected one for each, or for each number from 0"
             )
-        return found
-
-    @cached_property
-    def _track(self) -> PoseTrack | None:
-        """The lidar's path, where the poses have stamps."""
-        if self._poses is None or self._poses.stamps_ns is None:
-            return None
-        T_world_lidar = np.stack([self._T_world_lidar(T) for T in self._poses.T])
-        stamps_ns = np.array(self._poses.stamps_ns, np.int64)
-        return PoseTrack(str(self._poses.path), stamps_ns, T_world_lidar)
-
-    def _row_of_pose(self, frame: int, found: PoseFile) -> int:
-        if found.numbers is not None:
-            if frame not in found.numbers:
-                raise InputError(
-                    f"{found.path}: no pose of frame {frame}; it has {format_frames(found.numbers)}"
-                )
-            return found.numbers.index(frame)
-        return list(self.frames).index(frame) if len(found.T) == len(self.frames) else frame
-
-    def _T_world_lidar(self, T: Float) -> Float:
-        """(4,4) as it stands in the file -> the lidar's pose."""
-        known = self._config.poses
-        T = poses.inverse(T) if known.inverse else T
-        return T if known.T_frame_lidar is None else T @ known.T_frame_lidar
+        self._T_world_lidar = dict(zip(numbers, T, strict=True))
 
     @cached_property
     def _has_viewpoints(self) -> bool:
@@ -184,19 +180,10 @@ class Folder(FileSequence):
         found = [read_viewpoint(self._sweeps.paths[frame]) for frame in sorted(tried)]
         return any(one not in (None, _NO_VIEWPOINT) for one in found)
 
-    def _exposures(self, images: Series, given: CameraFiles) -> dict[int, int]:
-        shift_ns = round(given.clock_offset_s * 1e9)
-        stamps_ns = images.stamps_ns
-        if stamps_ns is None:
-            stamps_ns = {n: self.stamp_ns(n) for n in images.paths if n in self._frames}
-        return {number: ns + shift_ns for number, ns in stamps_ns.items()}
-
 
 def _images(folder: Path, name: str, given: CameraFiles) -> Series:
     paths = images_in(folder / given.files)
     if not paths:
-        raise InputError(
-            f"{folder / given.files}: no images, though densify.yaml names it: cameras: {{{name}: "
-            f"{{files: {given.files}}}}}"
-        )
+        key = f"cameras: {{{name}: {{files: {given.files}}}}}"
+        raise InputError(f"{folder / given.files}: no images, though densify.yaml names it: {key}")
     return in_time(folder, paths, given.stamps, given.stamps_unit, shared=False)

@@ -15,18 +15,14 @@ from densify.readers.point_files import SUFFIXES
 from densify.readers.stamp_files import Named, StampFile, named
 
 _IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
-_SURE_SUFFIXES = (".pcd", ".bin", ".ply", ".las", ".laz")
 _DEPTH = 2  # folders below the one named
 _NO_SWEEPS = ("truth", "labels", "label", "poses", "calib", "calibration")
-_STAMP_FILES = tuple(
+_STAMP_FILES = [f"{n}.{s}" for n in ("timestamps", "times", "stamps") for s in ("txt", "csv")]
+_POSE_FILES = [
     f"{name}.{suffix}"
-    for name in ("timestamps", "times", "stamps", "timestamp", "timestamps_lidar")
-    for suffix in ("txt", "csv")
-)
-_POSE_FILES = (
-    *("poses.txt", "poses.csv", "poses.tum", "pose.txt", "trajectory.txt", "trajectory.csv"),
-    *("traj.txt", "odometry.txt", "odom.txt", "groundtruth.txt", "gt_poses.txt", "slam_poses.txt"),
-)
+    for name in ("poses", "pose", "trajectory", "odometry", "groundtruth")
+    for suffix in ("txt", "csv", "tum")
+]
 
 
 @dataclass(frozen=True)
@@ -45,18 +41,13 @@ def sweep_folders(folder: Path, files: str = "") -> dict[str, list[Path]]:
     files: the folder they are in, "" to look in this one and two folders down. Raises InputError if
     there are none.
     """
-    if files and not (folder / files).is_dir():
-        raise InputError(
-            f"{folder / files}: no such folder, though densify.yaml names it: sweeps: {{files: "
-            f"{files}}}"
-        )
-    order = (*_SURE_SUFFIXES, *(suffix for suffix in SUFFIXES if suffix not in _SURE_SUFFIXES))
+    if files:
+        existing(folder, files, "sweeps: {files: ...}", is_folder=True)
     found: dict[int, dict[str, list[Path]]] = {}
     for place in [folder / files] if files else _folders(folder):
         for path in _files(place, SUFFIXES):
-            name = named(path)
-            if name.number is not None or name.stamp_ns is not None:
-                groups = found.setdefault(order.index(path.suffix.lower()), {})
+            if any(part is not None for part in named(path)[1:]):
+                groups = found.setdefault(SUFFIXES.index(path.suffix.lower()), {})
                 groups.setdefault(place.relative_to(folder).as_posix(), []).append(path)
     if not found:
         raise InputError(
@@ -90,13 +81,18 @@ def images_in(folder: Path) -> list[Path]:
 
 def find_pose_file(folder: Path, name: str) -> Path | None:
     """Return the file that is named, or one of a usual name; None if there is none."""
-    if not name:
-        return next((folder / n for n in _POSE_FILES if (folder / n).is_file()), None)
-    if not (folder / name).is_file():
-        raise InputError(
-            f"{folder / name}: no such file, though densify.yaml names it: poses: {{file: {name}}}"
-        )
-    return folder / name
+    if name:
+        return existing(folder, name, "poses: {file: ...}")
+    return next((folder / n for n in _POSE_FILES if (folder / n).is_file()), None)
+
+
+def existing(folder: Path, name: str, key: str, is_folder: bool = False) -> Path:
+    """Return what densify.yaml names under a key. Raises InputError if it is not there."""
+    path = folder / name
+    if not (path.is_dir() if is_folder else path.is_file()):
+        what = "folder" if is_folder else "file"
+        raise InputError(f"{path}: no such {what}, though densify.yaml names it: {key}")
+    return path
 
 
 def in_time(
@@ -111,62 +107,59 @@ def in_time(
     """
     by_names = stamps == "names"
     names = [named(path, unit if by_names else "") for path in paths]
-    unnamed = [name.path for name in names if name.stamp_ns is None]
-    if by_names and unnamed:
+    untimed = [name.path for name in names if name.stamp_ns is None]
+    if by_names and untimed:
         raise InputError(
-            f"{unnamed[0]}: its name is no time; expected such as 1317042651.468569638, or a "
+            f"{untimed[0]}: its name is no time; expected such as 1317042651.468569638, or a "
             f"stamps_unit beside stamps: names in densify.yaml"
         )
     file = None
     if stamps not in ("names", "sweeps"):
         file = _stamp_file(root, paths[0].parent, stamps, shared)
-    if file is None and not unnamed and stamps != "sweeps":
-        ordered = sorted(names, key=lambda name: (name.stamp_ns or 0, name.path))
-        found = {number: name.stamp_ns or 0 for number, name in enumerate(ordered)}
-        by_number, told_by = {n: o.path for n, o in enumerate(ordered)}, "the names of the files"
-    else:
-        by_number = _numbered(names)
-        if file is None:
-            return Series(by_number, None, "")
+    by_number = _numbered(names)
+    by_path = {number: name.path for number, name in by_number.items()}
+    if file is not None:
         read = StampFile.read(file, unit)
-        found, told_by = _matched(read, by_number), f"{file.name} in {read.unit}"
+        found, told_by = _matched(read, by_path), f"{file.name} in {read.unit}"
+    elif untimed or stamps == "sweeps":
+        return Series(by_path, None, "")
+    else:
+        found = {number: name.stamp_ns or 0 for number, name in by_number.items()}
+        told_by = "the names of the files"
     for before, number in pairwise(found):
         if found[number] <= found[before]:
             raise InputError(
-                f"{file or by_number[number]}: the time of number {number} is {found[number]} ns, "
+                f"{file or by_path[number]}: the time of number {number} is {found[number]} ns, "
                 f"not after {found[before]} ns of the one before; expected times that ascend"
             )
-    return Series(by_number, found, told_by)
+    return Series(by_path, found, told_by)
 
 
-def _numbered(names: Sequence[Named]) -> dict[int, Path]:
-    if any(name.number is None for name in names):  # a file of times: the names need none
-        ordered = sorted(names, key=lambda name: (name.stamp_ns or 0, name.path.name))
-        return {number: name.path for number, name in enumerate(ordered)}
-    found: dict[int, Path] = {}
-    for name in sorted(names, key=lambda name: name.path):
-        number = name.number or 0
-        if number in found:
+def _numbered(names: Sequence[Named]) -> dict[int, Named]:
+    """Return the files by their numbers, or from 0 in the order of time if names are times."""
+    if any(name.number is None for name in names):
+        return dict(enumerate(sorted(names, key=lambda name: (name.stamp_ns or 0, name.path))))
+    ordered = sorted(names, key=lambda name: (name.number, name.path))
+    for before, name in pairwise(ordered):
+        if before.number == name.number:
             raise InputError(
-                f"{name.path}: has the number {number}, as {found[number].name} has; expected "
+                f"{name.path}: has the number {name.number}, as {before.path.name} has; expected "
                 f"names that end in different numbers"
             )
-        found[number] = name.path
-    return dict(sorted(found.items()))
+    return {name.number or 0: name for name in ordered}
 
 
 def _matched(file: StampFile, paths: Mapping[int, Path]) -> dict[int, int]:
     """Return the time of each file: by its name, or its row in the order of numbers, or its
     number."""
     if file.names is not None:
-        by_name = dict(zip(file.names, file.stamp_ns, strict=True))
-        by_name |= {Path(name).stem: ns for name, ns in by_name.items()}
-        missing = [p for p in paths.values() if not {p.name, p.stem} & by_name.keys()]
+        by_name = {Path(n).stem: ns for n, ns in zip(file.names, file.stamp_ns, strict=True)}
+        missing = [path for path in paths.values() if path.stem not in by_name]
         if missing:
             raise InputError(
                 f"{file.path}: no line of {missing[0].name}; expected one of each file"
             )
-        return {n: by_name.get(p.name, by_name.get(p.stem, 0)) for n, p in paths.items()}
+        return {number: by_name[path.stem] for number, path in paths.items()}
     if len(file.stamp_ns) == len(paths):
         return dict(zip(paths, file.stamp_ns, strict=True))
     if len(file.stamp_ns) > max(paths):
@@ -179,12 +172,7 @@ def _matched(file: StampFile, paths: Mapping[int, Path]) -> dict[int, int]:
 
 def _stamp_file(root: Path, folder: Path, name: str, shared: bool) -> Path | None:
     if name:
-        places = [place / name for place in (root, folder) if (place / name).is_file()]
-        if not places:
-            raise InputError(
-                f"{root / name}: no such file, though densify.yaml names it under stamps"
-            )
-        return places[0]
+        return existing(folder if (folder / name).is_file() else root, name, "stamps")
     near = [folder] + [folder.parent] * (folder != root and (shared or folder.parent != root))
     files = (place / file for place in near for file in _STAMP_FILES)
     return next((file for file in files if file.is_file()), None)
