@@ -29,16 +29,16 @@ from tests.command import exit_code, files_in, refused
 from tests.dataset_scenes import BORDER, FRAMES, copy_drive, sweep_file
 
 STREET = "street?sensor=vlp16"
+KNOBS = ("--set", "register.source=dataset", "--set", "objective.num_neighbors=40")
 GIVEN = ("--window", "2", "--method", "icp", "--set", "register.source=dataset")
 
 
 @pytest.fixture(scope="module")
-def densified(tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
+def densified(border_drive: Path, tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
     """One command in a process of its own, as a user runs it."""
     out = tmp_path_factory.mktemp("densified") / "new" / "out"
-    small = f"{STREET}&cameras=fast"  # with a ninth of the pixels
-    command = ["run", small, "--key", "120", "--window", "1", "--config", "fast"]
-    command += ["--camera", "fast", "--out", str(out), "--set", "objective.num_neighbors=40"]
+    command = ["run", str(border_drive), "--key", str(BORDER), "--window", "1", "--config", "fast"]
+    command += ["--out", str(out), *KNOBS]
     done = subprocess.run(
         [sys.executable, "-m", "densify", *command],
         capture_output=True,
@@ -46,58 +46,66 @@ def densified(tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
         cwd=out.parent.parent,
     )
     assert done.returncode == 0, done.stderr
-    return SimpleNamespace(
-        out=out, stdout=done.stdout, stderr=done.stderr, command=command, data=small
-    )
+    return SimpleNamespace(out=out, stdout=done.stdout, stderr=done.stderr)
 
 
-def test_run_writes_the_tree_and_names_every_file(densified: SimpleNamespace) -> None:
+def test_run_writes_the_tree_and_names_every_file(
+    border_drive: Path, densified: SimpleNamespace
+) -> None:
     files = set(files_in(densified.out))
-    expected = {
-        *(f"000120/{kind}/fast.png" for kind in ("depth", "depth_filled", "confidence", "age")),
-        *(f"000120/{name}" for name in ("cloud.laz", "metrics.json", "figure.png", "curve.png")),
-        *(f"000120/{name}" for name in ("run.yaml", "movers.json", "scene/scene.json")),
-    }
+    key = f"{BORDER:06d}"
+    maps = ("depth", "depth_filled", "confidence", "age")
+    others = ("cloud.laz", "metrics.json", "figure.png", "curve.png", "run.yaml", "movers.json")
+    expected = {f"{key}/{name}" for name in (*others, "scene/scene.json")}
+    expected |= {f"{key}/{kind}/image_02.png" for kind in maps}
     assert expected <= files
     named = {line for line in densified.stdout.splitlines() if line.startswith(str(densified.out))}
     assert named == {str(densified.out / name) for name in files}
-    assert densified.stdout.startswith("key 120, flow: ")
-    assert "fast: depth in " in densified.stdout
+    assert densified.stdout.startswith(f"key {BORDER}, flow: ")
+    assert "image_02: depth in " in densified.stdout
     first = densified.stdout.partition("open first:\n")[2].splitlines()
-    assert [Path(line.split()[0]).name for line in first] == ["figure.png", "fast.png", "cloud.laz"]
+    names = ["figure.png", "image_02.png", "cloud.laz"]
+    assert [Path(line.split()[0]).name for line in first] == names
     # No terminal: no bar, and each line is densify's.
     assert "%|" not in densified.stderr
     assert all(line.startswith("densify: ") for line in densified.stderr.splitlines())
-    record = yaml.safe_load((densified.out / "000120" / "run.yaml").read_text("utf-8"))
-    expected_config = resolve("fast", ["objective.num_neighbors=40"])
+    record = yaml.safe_load((densified.out / key / "run.yaml").read_text("utf-8"))
+    expected_config = resolve("fast", KNOBS[1::2])
     assert record["config"] == as_mapping(expected_config)
     assert resolve(record["config"]) == expected_config
-    assert (record["data"], record["frames"]) == (densified.data, [119, 120, 121])
+    assert (record["data"], record["frames"]) == (
+        str(border_drive),
+        [BORDER - 1, BORDER, BORDER + 1],
+    )
 
 
-def test_output_is_kept_or_replaced_by_the_same_bytes(densified: SimpleNamespace, capsys) -> None:
-    before = files_in(densified.out)
-    line = refused(capsys, 2, *densified.command)
-    assert str(densified.out) in line and "--overwrite" in line
-    assert files_in(densified.out) == before
-    (densified.out / "000120" / "metrics.json").write_text("old")
-    assert exit_code(*densified.command, "--overwrite") == 0
-    after = files_in(densified.out)
+def test_output_is_kept_or_replaced_by_the_same_bytes(
+    border_drive: Path, tmp_path: Path, capsys
+) -> None:
+    command = ["run", border_drive, "--key", BORDER, *GIVEN, "--out", tmp_path]
+    assert exit_code(*command) == 0 and capsys.readouterr()
+    before = files_in(tmp_path)
+    line = refused(capsys, 2, *command)
+    assert str(tmp_path) in line and "--overwrite" in line
+    assert files_in(tmp_path) == before
+    (tmp_path / f"{BORDER:06d}" / "metrics.json").write_text("old")
+    assert exit_code(*command, "--overwrite") == 0
+    after = files_in(tmp_path)
     assert set(after) == set(before)
     changed = {name for name in before if after[name] != before[name]}
-    assert changed <= {"000120/run.yaml"}  # holds seconds
+    assert changed <= {f"{BORDER:06d}/run.yaml"}  # holds seconds
 
 
 def test_export_says_what_is_left(densified: SimpleNamespace, tmp_path: Path, capsys) -> None:
-    run, out = densified.out / "000120", tmp_path / "out"
+    run, out = densified.out / f"{BORDER:06d}", tmp_path / "out"
     command = ["export", run, "--to", "npy", "--out", out]
     command += ["--min-confidence", "0.5", "--max-age-ms", "80"]
     assert exit_code(*command) == 0
     line, *paths = capsys.readouterr().out.splitlines()
     shares = []
     for product in ("depth", "depth_filled"):
-        shares.append(np.mean(cv2.imread(str(run / product / "fast.png"), -1) > 0))
-        shares.append(np.mean(np.load(out / product / "fast.npy") > 0))
+        shares.append(np.mean(cv2.imread(str(run / product / "image_02.png"), -1) > 0))
+        shares.append(np.mean(np.load(out / product / "image_02.npy") > 0))
     named = [float(share) for share in re.findall(r"([\d.]+) %", line)]
     np.testing.assert_allclose(named, 100 * np.array(shares), atol=0.0501)
     assert shares[0] > shares[1] > 0 and shares[2] > shares[3] >= shares[1]

@@ -237,7 +237,7 @@ def test_kittis_own_truth(test_data) -> None:
 # --- the verb -------------------------------------------------------------------------------------
 
 
-def test_the_verb_prints_a_table_and_writes_json(
+def test_the_verb_prints_a_table_or_json(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     for frame in range(9):
@@ -245,9 +245,8 @@ def test_the_verb_prints_a_table_and_writes_json(
     for frame in (3, 20):
         put(official(tmp_path / "t", frame), 10.0, 20.0, 60.0)
     mask = put_mask(tmp_path / "m" / "3.png", np.array([[1, 0, 0]], np.uint8)).parent
-    file = tmp_path / "new" / "scores.json"
     command = ["evaluate", str(tmp_path / "out"), str(tmp_path / "t"), "--mask", str(mask)]
-    assert main([*command, "--out", str(file)]) == 0
+    assert main(command) == 0
     captured = capsys.readouterr()
     assert captured.err == ""
     lines = captured.out.splitlines()
@@ -257,24 +256,17 @@ def test_the_verb_prints_a_table_and_writes_json(
     )
     assert lines[1].startswith("predicted without truth: 8: ") and "... and 3 more" in lines[1]
     assert lines[2] == f"truth without prediction: 1: {official(tmp_path / 't', 20)}"
-    assert lines[-1] == str(file)
-    titles, *rows = (re.split(r"\s{2,}", line.strip()) for line in lines[3:-1])
+    titles, *rows = (re.split(r"\s{2,}", line.strip()) for line in lines[3:])
     table = {row[0]: dict(zip(titles, row[1:], strict=True)) for row in rows}
     assert table["all"]["MAE mm"] == "250.0" and table["all"]["coverage"] == "66.7 %"
     assert table["moving"]["MAE mm"] == "500.0" and table["moving"]["iMAE 1/km"] == "4.762"
     assert table["moving"]["AbsRel"] == "5.00 %" and table["moving"]["d<1.25"] == "100.00 %"
     assert table["20-30 m"]["MAE mm"] == "-" and table["20-30 m"]["coverage"] == "0.0 %"
     assert "over 80 m" not in table
-    written = json.loads(file.read_text("utf-8"))
-    assert written["schema_version"] == 1 and written["parts"]["all"]["mae_m"] == 0.25
-    assert len(written["without_truth"]) == 8
-
-    before = file.read_bytes()
-    assert main([*command, "--out", str(file)]) == 2
-    captured = capsys.readouterr()
-    assert captured.out == "" and "--overwrite" in captured.err
-    assert main([*command, "--out", str(file), "--overwrite"]) == 0
-    assert file.read_bytes() == before
+    assert main([*command, "--json"]) == 0
+    scores = json.loads(capsys.readouterr().out)["scores"]
+    assert scores["schema_version"] == 1 and scores["parts"]["all"]["mae_m"] == 0.25
+    assert len(scores["without_truth"]) == 8
 
 
 @pytest.mark.parametrize(
@@ -283,7 +275,6 @@ def test_the_verb_prints_a_table_and_writes_json(
         (("p", "nowhere"), "nowhere: no such file or folder"),
         (("p", "t"), "no pair"),
         (("p/1.png", "broken.png"), "broken.png: not a complete image"),
-        (("p", "p", "--out", "scores.txt"), "ends in .json"),
     ],
 )
 def test_the_verb_refuses_in_one_line(

@@ -3,21 +3,15 @@
 
 from __future__ import annotations
 
-import os
-import platform
 from collections import defaultdict
-from collections.abc import Mapping
 from dataclasses import asdict
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from densify import __version__
 from densify.config.errors import InputError
 from densify.geometry.types import Bool, Float32, Progress
 from densify.outputs.depth_png import read_depth_png, read_mask_png
-from densify.outputs.plain import write_json
 from densify.readers.depth_trees import DepthPair, DepthPairs
 from densify.scores.depth_metrics import (
     KITTI_BASELINE_M,
@@ -100,13 +94,3 @@ def _read(pair: DepthPair) -> tuple[Float32, Float32, Bool | None]:
                 f"the same camera, neither cropped nor scaled"
             )
     return predicted_m, truth_m, moving
-
-
-def write_numbers(path: Path, numbers: Mapping[str, Any]) -> None:
-    """Write numbers as JSON, with the version and the machine; the file appears when complete.
-
-    Raises OutputError if it cannot be written.
-    """
-    machine = {"python": platform.python_version(), "num_cores": os.cpu_count()}
-    whole = {"densify": __version__, "machine": machine, **numbers}
-    write_json(path, whole)

@@ -61,8 +61,8 @@ class DepthDataset(Dataset[dict[str, Any]]):
             that have moved since the set was made.
         split: "train" or "val", KITTI's; both if None.
 
-        Raises InputError if there is no set of this layout, nothing in it is left to load, or a
-        crop is larger than an image; loading raises it for files that are missing or damaged.
+        Raises InputError if there is no set of this layout or nothing in it is left to load;
+        loading raises it for a crop larger than an image, and files that are missing or damaged.
         """
         self._root, self._crop, self._flip = Path(root), crop, flip
         self._dense = "groundtruth_filled" if filled else "groundtruth"
@@ -85,8 +85,6 @@ class DepthDataset(Dataset[dict[str, Any]]):
                 f"{split} and cameras {cameras}, None for all; there are the cameras "
                 f"{', '.join(there)}; let densify dataset finish some"
             )
-        for name, camera in sorted({sample[:2] for sample in self._samples}):
-            self._cut(name, self._drives[name].cameras[camera])
 
     def __len__(self) -> int:
         return len(self._samples)
@@ -116,8 +114,14 @@ class DepthDataset(Dataset[dict[str, Any]]):
             # 1 to 255, as `densify.outputs.depth_png.stored_confidence` gives
             "confidence": np.where(dense_m > 0, (levels - np.float32(1)) / 254, 0).clip(0),
         }
-        top, room_px, width_px = self._cut(name, camera)
-        left = int(torch.randint(room_px + 1, ()))
+        size_px = camera.height_px, camera.width_px
+        height_px, width_px = self._crop or size_px
+        if not (0 < height_px <= size_px[0] and 0 < width_px <= size_px[1]):
+            raise InputError(
+                f"crop: got {height_px} x {width_px} px (height x width), expected at most the "
+                f"{size_px[0]} x {size_px[1]} of {camera.name} in {name}"
+            )
+        top, left = size_px[0] - height_px, int(torch.randint(size_px[1] - width_px + 1, ()))
         K[:2, 2] -= left, top
         step = -1 if self._flip and torch.randint(2, ()) else 1
         if step < 0:  # pixel u becomes width - 1 - u
@@ -128,16 +132,6 @@ class DepthDataset(Dataset[dict[str, Any]]):
             "intrinsics": torch.from_numpy(K.astype(np.float32)),
             **{"drive": name, "camera": camera_name, "frame": frame},
         }
-
-    def _cut(self, drive: str, camera: Camera) -> tuple[int, int, int]:
-        """Return the first row of the crop, the columns it leaves over, and its width."""
-        height_px, width_px = self._crop or (camera.height_px, camera.width_px)
-        if 0 < height_px <= camera.height_px and 0 < width_px <= camera.width_px:
-            return camera.height_px - height_px, camera.width_px - width_px, width_px
-        raise InputError(
-            f"crop: got {height_px} x {width_px} px (height x width), expected at most the "
-            f"{camera.height_px} x {camera.width_px} of {camera.name} in {drive}"
-        )
 
     def _image(self, drive: str, camera: Camera, frame: int) -> NDArray[np.uint8]:
         """Return the image, (H,W,3)."""

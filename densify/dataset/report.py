@@ -5,15 +5,11 @@ comparison. The page of a training set is one table."""
 from __future__ import annotations
 
 import html
-import os
-import re
-import urllib.parse
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
-from pathlib import Path, PurePosixPath
+from collections.abc import Callable, Iterable
+from pathlib import Path
 from typing import Any
 
-from densify import __version__
 from densify.config.errors import InputError
 from densify.dataset.manifest import KeyRecord, read_manifests
 from densify.dataset.plan import planned_keys, read_plan
@@ -22,9 +18,6 @@ from densify.outputs.atomic import write_file
 from densify.outputs.key_outputs import Context
 from densify.outputs.report.key_page import KeyFiles, key_page
 
-_SHOWN_MAP = re.compile(r"(^|/)(proj_depth/groundtruth|\d{6,}/depth)/[^/]+(/[^/]+)?\.png")
-_WHOLE = ("num_points", "num_moving", "ghost")
-_PER_CAMERA = ("density", "density_filled", "outliers", "mae_m")
 _STATUSES = ("failed", "aside", "done")
 _PAGE = """<!DOCTYPE html>
 <html lang="en"><meta charset="utf-8">
@@ -35,11 +28,10 @@ tr:nth-child(even) {{background: #eee}}</style>
 <h1>{title}</h1>
 <p>{counts}</p>
 <table>{about}</table>
-<table><thead><tr>{heads}</tr></thead>
+<table><thead>{heads}</thead>
 <tbody>
 {rows}
 </tbody></table>
-<p>densify {version}; links lead to the files beside this page.</p>
 </html>
 """
 
@@ -58,47 +50,39 @@ def write_comparison_page(folder: Path) -> Path:
     return page
 
 
-def write_report(place: Path, out: Path | None = None, overwrite: bool = False) -> list[Path]:
-    """Make the page or pages of what lies in a folder; return them.
+def write_report(place: Path, overwrite: bool = False) -> list[Path]:
+    """Make the page or pages of what lies in a folder; return them: ``report.html`` of a run or a
+    set, ``compare.html`` of a comparison, beside their files.
 
     place: a key's folder of ``run`` or ``compare``, such as densify-out/000120, the folder above
-        it if it holds no other, or a training set.
-    out: the file to write; if None ``report.html`` of a run or a set, ``compare.html`` of a
-        comparison, beside their files. overwrite: replace an earlier page.
+        it if it holds no other, or a training set. overwrite: replace an earlier page.
 
     The page tells what is damaged or missing. Raises InputError for a folder that is none of these,
     one whose main files are damaged, and a page that is there already, OutputError if it cannot be
     written.
     """
     pages = _pages(place)
-    if out is not None and len(pages) > 1:
-        names = ", ".join(path.name for path in pages)
-        raise InputError(f"--out {out}: {place} has {len(pages)} pages ({names}); leave --out away")
-    places = {path if out is None else out: make for path, make in pages.items()}
-    for path in places:
+    for path in pages:
         if path.exists() and not overwrite:
-            raise InputError(
-                f"{path}: already there and kept; give --overwrite to replace it, or --out"
-            )
-    for path, make in places.items():
-        page = make(path.parent)
-        write_file(path, page)
-    return list(places)
+            raise InputError(f"{path}: already there and kept; give --overwrite to replace it")
+    for path, make in pages.items():
+        write_file(path, make())
+    return list(pages)
 
 
-def _pages(place: Path) -> dict[Path, Callable[[Path], bytes]]:
-    """Return path -> what makes the page for the folder it will be in."""
+def _pages(place: Path) -> dict[Path, Callable[[], bytes]]:
+    """Return path -> what makes the page."""
     if not place.is_dir():
         raise InputError(
             f"{place}: no such folder; expected what densify run, compare or dataset wrote"
         )
     if (place / "dataset.json").is_file():
-        return {place / "report.html": lambda there: _set_page(place, there)}
-    pages: dict[Path, Callable[[Path], bytes]] = {}
+        return {place / "report.html": lambda: _set_page(place)}
+    pages: dict[Path, Callable[[], bytes]] = {}
     if (place / "run.yaml").is_file():
-        pages[place / "report.html"] = lambda _: key_page(KeyFiles.of_run(place), str(place))
+        pages[place / "report.html"] = lambda: key_page(KeyFiles.of_run(place), str(place))
     if (place / "compare.json").is_file():
-        pages[place / "compare.html"] = lambda _: key_page(KeyFiles.of_comparison(place), "")
+        pages[place / "compare.html"] = lambda: key_page(KeyFiles.of_comparison(place), "")
     if pages:
         return pages
     names = ("run.yaml", "compare.json")
@@ -112,77 +96,54 @@ def _pages(place: Path) -> dict[Path, Callable[[Path], bytes]]:
     )
 
 
-def _set_page(root: Path, shown_from: Path) -> bytes:
+def _set_page(root: Path) -> bytes:
     """Return the page of a training set: its keys, the failed ones and those with the highest
-    ghost rate first. shown_from: the folder to which links are relative."""
-    table = read_plan(root)
-    if table is None:
-        raise InputError(f"{root}: no dataset.json in it; expected a training set's folder")
-    records = read_manifests(root)
-    cameras = sorted({camera for r in records.values() for camera in r.scores.get("density", ())})
-    limits = [f"{name} {limit}" for name, limit in table["gate"].items() if limit is not None]
-    about = {
-        **{name: table[name] for name in ("layout", "method", "window", "densify")},
-        "quality gate": ", ".join(limits) or "none",
-        "recordings": ", ".join(table["drives"]),
-        "configuration": table["config"],
-    }
-    counts: Counter[str] = Counter(record.status for record in records.values())
+    ghost rate first."""
+    table, records = read_plan(root) or {}, read_manifests(root)
+    counts = Counter[str](record.status for record in records.values())
     counts["to make"] = len(planned_keys(table) - records.keys())
-    heads = ["recording", "key", "status", "reason or warnings", "sweeps", "seconds", *_WHOLE]
-    heads += [f"{name} {camera}" for camera in cameras for name in _PER_CAMERA]
-    ordered = sorted(records.values(), key=_badness)
+    keys = [_row(record) for record in sorted(records.values(), key=_badness)]
+    heads = dict.fromkeys(head for row in keys for head in row)
     page = _PAGE.format(
         title=html.escape(f"{root.resolve().name}: {len(records):,} keys"),
         counts=", ".join(f"{number:,} {status}" for status, number in counts.items()),
-        about=_rows([name, html.escape(str(value))] for name, value in about.items()),
-        heads="".join(f"<th>{html.escape(head)}</th>" for head in heads),
-        rows=_rows(_cells(record, cameras, root, shown_from) for record in ordered),
-        version=__version__,
+        about=_rows((name, table[name]) for name in table if name != "drives"),
+        heads=_rows([heads]),
+        rows=_rows([row.get(head) for head in heads] for row in keys),
     )
     return page.encode("utf-8", "backslashreplace")
 
 
 def _badness(record: KeyRecord) -> tuple[Any, ...]:
     """Return what records are ordered by."""
-    return _STATUSES.index(record.status), -_number(record.scores.get("ghost")), record.name
+    ghost = record.scores.get("ghost")
+    share = ghost if isinstance(ghost, int | float) else 0.0
+    return _STATUSES.index(record.status), -share, record.name
 
 
-def _rows(rows: Iterable[Sequence[str]]) -> str:
-    """Return rows of a table, of cells in HTML."""
-    cells = ("".join(f"<td>{cell}</td>" for cell in row) for row in rows)
+def _row(record: KeyRecord) -> dict[str, Any]:
+    """Return the cells of a key by the heads of their columns."""
+    row = {
+        "recording": record.drive,
+        "key": record.key,
+        "status": record.status,
+        "reason or warnings": record.reason or "; ".join(record.warnings),
+        "sweeps": len(record.frames),
+        "seconds": record.seconds,
+    }
+    for name, score in record.scores.items():
+        by_camera = score.items() if isinstance(score, dict) else [("", score)]
+        row |= {f"{name} {camera}".rstrip(): value for camera, value in by_camera}
+    return row
+
+
+def _rows(rows: Iterable[Iterable[Any]]) -> str:
+    """Return rows of a table in HTML."""
+    cells = ("".join(f"<td>{html.escape(_text(value))}</td>" for value in row) for row in rows)
     return "\n".join(f"<tr>{row}</tr>" for row in cells)
 
 
-def _cells(record: KeyRecord, cameras: Sequence[str], root: Path, shown_from: Path) -> list[str]:
-    """Return the row of a key in HTML. Its number links to the first camera's depth map, or to the
-    key's own page."""
-    key, shown = str(record.key), _first_map(record, root)
-    if shown is not None:
-        pages = [p.parent / "report.html" for p in shown.parents if p.name == "depth"]
-        linked = next((page for page in pages if page.is_file()), shown)
-        relative = os.path.relpath(linked.resolve(), shown_from.resolve())
-        key = f'<a href="{urllib.parse.quote(Path(relative).as_posix())}">{key}</a>'
-    values = [record.scores.get(name) for name in _WHOLE]
-    for camera in cameras:
-        values += [(record.scores.get(name) or {}).get(camera) for name in _PER_CAMERA]
-    reason = record.reason or "; ".join(record.warnings)
-    numbers = [len(record.frames), record.seconds, *values]
-    return [
-        html.escape(record.drive),
-        key,
-        record.status,
-        html.escape(reason),
-        *("" if value is None else f"{_number(value):.5g}" for value in numbers),
-    ]
-
-
-def _first_map(record: KeyRecord, root: Path) -> Path | None:
-    """Return the depth map of the first camera; names that lead out of the set are none."""
-    names = sorted(name for name in record.files if _SHOWN_MAP.search(name))
-    inside = [n for n in names if not PurePosixPath(n).is_absolute() and ".." not in Path(n).parts]
-    return root / inside[0] if inside else None
-
-
-def _number(value: Any) -> float:
-    return value if isinstance(value, int | float) else 0.0
+def _text(value: Any) -> str:
+    if isinstance(value, float):
+        return f"{value:.5g}"
+    return "" if value is None else str(value)

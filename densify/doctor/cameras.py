@@ -8,7 +8,6 @@ Online Calibration of Cameras and Lasers", RSS 2013).
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import cv2
@@ -18,6 +17,7 @@ from scipy.spatial import cKDTree
 
 from densify.config.errors import InputError
 from densify.doctor.findings import FINE, SUSPICIOUS, UNKNOWN, WRONG, Finding, finding
+from densify.doctor.paths import CAM_AXES, changed
 from densify.doctor.sample import Sample, Spot
 from densify.geometry import poses
 from densify.geometry.cameras import image_points
@@ -53,7 +53,6 @@ class Pair:
     twist: Float
     exposed_s: float
     strength: Float32
-    number: int
 
     def seen_at(self, later_s: float) -> Float:
         """Return (N,3) in the lidar frame at the exposure and ``later_s``."""
@@ -118,13 +117,11 @@ def image_pairs(sample: Sample, camera: Camera) -> tuple[list[Pair], str]:
             image = sample.sequence.image(camera.name, number)
         except InputError as error:
             return pairs, str(error)
-        pairs.append(_pair(spot, row, image, apart_s, number, camera))
+        pairs.append(_pair(spot, row, image, apart_s, camera))
     return pairs, ""
 
 
-def _pair(
-    spot: Spot, row: int, image: NDArray[np.uint8], apart_s: float, number: int, camera: Camera
-) -> Pair:
+def _pair(spot: Spot, row: int, image: NDArray[np.uint8], apart_s: float, camera: Camera) -> Pair:
     registered = spot.stretch.sweeps[row]
     range_m = np.linalg.norm(registered.sweep.points, axis=1)
     sweep = registered.sweep.select((range_m > _NEAREST_M) & (range_m < 2 * _FARTHEST_M))
@@ -138,7 +135,7 @@ def _pair(
     some[:: len(points) // _NUM_OTHERS + 1] = True
     twist = registered.twist_after if apart_s > 0 else registered.twist_before
     strength = edge_strength(image, camera.focal_px)
-    return Pair(points[some], edge[some], twist, apart_s, strength, number)
+    return Pair(points[some], edge[some], twist, apart_s, strength)
 
 
 def depth_edges(points: Float) -> Bool:
@@ -193,21 +190,15 @@ def score(
     return float((edged.mean() - other.mean()) / error), num_edges
 
 
-def alternatives(camera: Camera) -> Iterator[tuple[str, Camera]]:
-    """Yield the name of each usual mistake and the camera (``T_cam_lidar``) without it."""
-    T = camera.T_cam_lidar
-    body = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
+def alternatives(T: Float) -> dict[str, Float]:
+    """Return the name of each usual mistake and ``T_cam_lidar`` (4,4) without it."""
     turned = np.array([[0.0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
-    transposed = T.copy()
-    transposed[:3, :3] = T[:3, :3].T
-    changed = {
+    return {
         "the inverse of the given pose (T_lidar_cam instead of T_cam_lidar)": poses.inverse(T),
-        "a camera whose pose is that of a body (x forward, y left, z up)": body @ T,
+        "a camera whose pose is that of a body (x forward, y left, z up)": CAM_AXES @ T,
         "the pose for a lidar with x right, y forward": T @ turned,
-        "the transposed rotation": transposed,
+        "the transposed rotation": changed(np.transpose)(T),
     }
-    for name, T_cam_lidar in changed.items():
-        yield name, replace(camera, T_cam_lidar=T_cam_lidar)
 
 
 def _check_calibration(camera: Camera, pairs: list[Pair]) -> list[Finding]:
@@ -220,8 +211,8 @@ def _check_calibration(camera: Camera, pairs: list[Pair]) -> list[Finding]:
         text += ": one image is too little to tell" * (not is_clear)
         return [finding(name, FINE if is_clear else UNKNOWN, text, given=given)]
     others = {}
-    for what, mended in alternatives(camera):
-        at_mended, num_edges = score(mended, pairs)
+    for what, T_cam_lidar in alternatives(camera.T_cam_lidar).items():
+        at_mended, num_edges = score(replace(camera, T_cam_lidar=T_cam_lidar), pairs)
         others[what] = at_mended if num_edges > _AS_MANY * num_given else 0.0
     best = max(others, key=lambda what: others[what])
     # Edges of depth between returns of one ring are upright: up and down cannot be told as well.

@@ -20,29 +20,21 @@ _OFF_M, _OFF_PER_M, _OFF_DEG = 0.3, 0.1, 2.0  # over a spot of five sweeps
 _CLOCK_S, _CLOCK_STEP_S, _CLOCK_OFF_S = 0.3, 0.02, 0.04
 _NOISE_M, _NOISE_RAD, _EVEN_COST = 0.05, 1.5e-3, 4.0
 _MUCH_BETTER, _EXACT = 0.4, 0.15  # of what is allowed
-_CAM_AXES = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
+CAM_AXES = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
 
 
-def with_rotation(change: Callable[[Float], Float]) -> Callable[[Float], Float]:
-    """Return the change of (4,4) poses that changes their (3,3) rotations."""
+def changed(
+    rotation: Callable[[Float], Float] = np.copy, scale: float = 1.0
+) -> Callable[[Float], Float]:
+    """Return the change of (4,4) poses that changes their (3,3) rotations and scales their
+    translations."""
 
-    def changed(T: Float) -> Float:
-        turned = T.copy()
-        turned[:3, :3] = change(T[:3, :3])
-        return turned
+    def change(T: Float) -> Float:
+        new = np.eye(4)
+        new[:3, :3], new[:3, 3] = rotation(T[:3, :3]), scale * T[:3, 3]
+        return new
 
-    return changed
-
-
-def scaled(factor: float) -> Callable[[Float], Float]:
-    """Return the change of (4,4) poses that scales their translations."""
-
-    def changed(T: Float) -> Float:
-        moved = T.copy()
-        moved[:3, 3] *= factor
-        return moved
-
-    return changed
+    return change
 
 
 def _rolled(by: int) -> Callable[[Float], Float]:
@@ -50,23 +42,14 @@ def _rolled(by: int) -> Callable[[Float], Float]:
     return lambda R: Rotation.from_quat(np.roll(Rotation.from_matrix(R).as_quat(), by)).as_matrix()
 
 
-def _angle_scaled(factor: float) -> Callable[[Float], Float]:
-    """Return the change of rotations that scales their yaw, pitch and roll."""
-    return lambda R: Rotation.from_euler(
-        "ZYX", Rotation.from_matrix(R).as_euler("ZYX") * factor
-    ).as_matrix()
-
-
 HYPOTHESES: Mapping[str, Callable[[Float], Float]] = {
     "they are inverted (T_lidar_world instead of T_world_lidar)": poses.inverse,
-    "they are a camera's, not the lidar's": lambda T: poses.inverse(_CAM_AXES) @ T @ _CAM_AXES,
-    "they are in millimetres": scaled(1e-3),
-    "they are in kilometres": scaled(1e3),
-    "their quaternions are x y z w, read as w x y z": with_rotation(_rolled(-1)),
-    "their quaternions are w x y z, read as x y z w": with_rotation(_rolled(1)),
-    "their rotations are transposed": with_rotation(np.transpose),
-    "their angles are in degrees, read as radians": with_rotation(_angle_scaled(np.pi / 180)),
-    "their angles are in radians, read as degrees": with_rotation(_angle_scaled(180 / np.pi)),
+    "they are a camera's, not the lidar's": lambda T: poses.inverse(CAM_AXES) @ T @ CAM_AXES,
+    "they are in millimetres": changed(scale=1e-3),
+    "they are in kilometres": changed(scale=1e3),
+    "their quaternions are x y z w, read as w x y z": changed(_rolled(-1)),
+    "their quaternions are w x y z, read as x y z w": changed(_rolled(1)),
+    "their rotations are transposed": changed(np.transpose),
 }
 """The usual mistakes of poses, each with the change (4,4) -> (4,4) that mends it."""
 

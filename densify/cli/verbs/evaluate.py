@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from densify.cli.answer import Answer, Column, aligned, percent, table
-from densify.cli.options import add_common, add_verb, check_new_file, option, positive
+from densify.cli.options import add_verb, option, positive
 from densify.cli.progress import progress_on_stderr
 
 _COLUMNS: tuple[Column, ...] = (
@@ -59,23 +59,17 @@ def add(commands: Any) -> None:
     option(parser, "--focal-px X", about, type=positive, default=721.5377)
     about = "stereo baseline that defines outliers (default: KITTI's, 0.54)"
     option(parser, "--baseline-m X", about, type=positive, default=0.54)
-    option(parser, "--out FILE.json", "write every number there", type=Path)
-    add_common(parser, "overwrite")
 
 
 def answer(options: argparse.Namespace) -> Iterator[Answer]:
     """Score depth maps against the truth."""
-    from densify.bench.evaluation import evaluate, write_numbers
+    from densify.bench.evaluation import evaluate
     from densify.readers.depth_trees import pair_depth_files
 
-    if options.out is not None:
-        check_new_file(options.out, options.overwrite, ".json")
     pairs = pair_depth_files(options.predicted, options.truth, options.mask, filled=options.filled)
     with progress_on_stderr() as progress:
         scores = evaluate(pairs, options.focal_px, options.baseline_m, progress)
-    if options.out is not None:
-        write_numbers(options.out, scores)
-    yield Answer(_describe(scores), {"scores": scores}, [options.out] if options.out else [])
+    yield Answer(_describe(scores), {"scores": scores})
 
 
 def _describe(scores: Mapping[str, Any]) -> str:

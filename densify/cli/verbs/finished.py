@@ -64,12 +64,11 @@ def add_report(commands: Any) -> None:
         "Of a key: the image with every map, depth under the pointer, what a least confidence "
         "leaves, the cloud in 3-D, scores and costs, in one HTML file that needs "
         "no network. Files that are missing or damaged are named on it. Of a training set: a table "
-        "of every key with its scores, what was put aside and why.",
+        "of every key with its scores, what was put aside and why. Written to DIR/report.html, and "
+        "compare.html of a comparison.",
     )
     about = f"{_ONE}, one of several, or a training set"
     parser.add_argument("place", metavar="DIR", type=Path, help=about)
-    about = "(default: DIR/report.html, and compare.html of a comparison)"
-    option(parser, "--out FILE.html", about, type=Path)
     add_common(parser, "overwrite")
 
 
@@ -77,7 +76,7 @@ def answer_report(options: argparse.Namespace) -> Iterator[Answer]:
     """Write a page of what is in a folder."""
     from densify.dataset.report import write_report
 
-    yield Answer(files=write_report(options.place, options.out, options.overwrite))
+    yield Answer(files=write_report(options.place, options.overwrite))
 
 
 def add_view(commands: Any) -> None:
