@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 from pathlib import Path
 
 import pytest
@@ -13,7 +12,7 @@ from densify.config import resolve
 from densify.config.errors import InputError
 from densify.dataset import make
 from densify.dataset.manifest import Manifest
-from densify.dataset.plan import Gate, Recipe, plan, read_plan
+from densify.dataset.plan import Gate, Recipe, plan, read_plan, write_plan
 from tests.command import exit_code, files_in, refused
 from tests.dataset_scenes import (
     DRIVE,
@@ -144,10 +143,12 @@ def test_foreign_and_damaged_folders_stay(
     ids=str,
 )
 def test_a_set_is_made_one_way(
-    options: list[str], words: str, border_drive: Path, border_set: Path, tmp_path: Path, capsys
+    options: list[str], words: str, border_drive: Path, tmp_path: Path, capsys
 ) -> None:
     out = tmp_path / "out"
-    shutil.copytree(border_set, out)
+    recipe = Recipe(2, config=resolve(None, [*OPTIONS[3::2]]))
+    with Manifest(out):
+        write_plan(out, recipe, plan([str(border_drive)], None, recipe))
     if not options:  # made by a version with another knob
         table = json.loads((out / "dataset.json").read_text())
         table["config"]["flow"]["gone"] = 10.0

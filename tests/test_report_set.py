@@ -4,16 +4,17 @@
 from __future__ import annotations
 
 import re
-import shutil
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from densify.config.errors import InputError
-from densify.dataset.manifest import KeyRecord, read_manifests
+from densify.dataset.manifest import KeyRecord
+from densify.dataset.plan import Recipe, plan, write_plan
 from densify.dataset.report import write_report
 from tests.command import refused
+from tests.dataset_scenes import DRIVE, FRAMES
 
 
 def table_of(page: Path) -> list[list[str]]:
@@ -22,26 +23,43 @@ def table_of(page: Path) -> list[list[str]]:
     return [re.findall(r"<td>(.*?)</td>", row) for row in re.findall(r"<tr>(.*?)</tr>", body)]
 
 
-def test_every_key_with_its_scores(border_set: Path, tmp_path: Path) -> None:
-    for name in ("dataset.json", "manifest.jsonl"):
-        shutil.copy(border_set / name, tmp_path)
-    (page,) = write_report(tmp_path)
-    records = list(read_manifests(border_set).values())
+def scored(key: int) -> KeyRecord:
+    scores = {
+        "num_points": 9,
+        "num_moving": 1,
+        "ghost": key % 4 / 100,
+        "density": {"image_02": 0.5},
+    }
+    return KeyRecord(DRIVE, key, "done", frames=(key,), scores=scores)
+
+
+@pytest.fixture
+def described(border_drive: Path, tmp_path: Path) -> Path:
+    """The description of a set of nine keys."""
+    write_plan(tmp_path, Recipe(), plan([str(border_drive)], None, Recipe()))
+    return tmp_path
+
+
+def write_manifest(root: Path, *records: KeyRecord) -> None:
+    (root / "manifest.jsonl").write_bytes(b"".join(r.to_line() for r in records))
+
+
+def test_every_key_with_its_scores(described: Path) -> None:
+    write_manifest(described, *map(scored, FRAMES))
+    (page,) = write_report(described)
     rows = table_of(page)
-    assert len(rows) == len(records) and "9 done, 0 to make" in page.read_text()
+    assert len(rows) == len(FRAMES) and "9 done, 0 to make" in page.read_text()
     ghosts = {int(row[1]): float(row[8]) for row in rows}
     assert list(ghosts.values()) == sorted(ghosts.values(), reverse=True)
-    for record in records:
-        assert ghosts[record.key] == pytest.approx(record.scores["ghost"], rel=1e-4)
+    assert ghosts == {key: key % 4 / 100 for key in FRAMES}
+    assert {row[9] for row in rows} == {"0.5"}
 
 
-def test_keys_that_are_not_done_come_first_and_say_why(border_set: Path, tmp_path: Path) -> None:
-    shutil.copy(border_set / "dataset.json", tmp_path)
-    done = list(read_manifests(border_set).values())
-    aside = replace(done[3], status="aside", reason="ghost rate <b>", files={})
-    lines = [*done[:3], aside, KeyRecord(done[4].drive, 99, "failed", "torn")]
-    (tmp_path / "manifest.jsonl").write_bytes(b"".join(r.to_line() for r in lines))
-    (page,) = write_report(tmp_path)
+def test_keys_that_are_not_done_come_first_and_say_why(described: Path) -> None:
+    aside = replace(scored(FRAMES[3]), status="aside", reason="ghost rate <b>", files={})
+    torn = KeyRecord(DRIVE, 99, "failed", "torn")
+    write_manifest(described, *map(scored, FRAMES[:3]), aside, torn)
+    (page,) = write_report(described)
     assert [row[2:4] for row in table_of(page)[:2]] == [
         ["failed", "torn"],
         ["aside", "ghost rate &lt;b&gt;"],

@@ -8,9 +8,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-Column = tuple[str, tuple[str, ...], str]
-"""Title, path of the number in a row, and its format, see `written`."""
-
 
 @dataclass(frozen=True)
 class Answer:
@@ -50,24 +47,17 @@ def first_of(files: Sequence[Path], kinds: Mapping[str, str], most: int = 3) -> 
     return first
 
 
-def table(rows: Mapping[str, Any], columns: Sequence[Column]) -> list[list[str]]:
-    """Return the cells of a table, a row for each mapping; columns without any number are left
-    out."""
-    used = [c for c in columns if any(look_up(r, *c[1]) is not None for r in rows.values())]
-    body = [
-        [name, *(written(look_up(row, *path), form) for _, path, form in used)]
-        for name, row in rows.items()
-    ]
-    return [["", *(title for title, _, _ in used)], *body]
-
-
 def numbers_table(columns: Mapping[str, Mapping[str, Any]]) -> str:
     """Return a table with a column for each mapping and a row for each number in any of them, named
     by its path."""
     flat = {title: dict(_numbers(numbers, "")) for title, numbers in columns.items()}
     names = dict.fromkeys(name for numbers in flat.values() for name in numbers)
-    body = [[name, *(written(c.get(name), ".4g") for c in flat.values())] for name in names]
+    body = [[name, *(_cell(column.get(name)) for column in flat.values())] for name in names]
     return aligned([["", *columns], *body])
+
+
+def _cell(value: float | None) -> str:
+    return written(value, ",d" if isinstance(value, int) else ".4g")
 
 
 def _numbers(values: Mapping[str, Any], path: str) -> Iterator[tuple[str, float]]:

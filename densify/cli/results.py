@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from densify.cli.answer import Column, aligned, look_up, percent, table
+from densify.cli.answer import aligned, look_up, percent, written
 from densify.geometry.types import Result
 from densify.outputs import Export
 from densify.outputs.plain import plain
@@ -103,7 +103,7 @@ def comparison(results: Mapping[str, Result]) -> str:
     measured depth at all, moving and static pixels, with the key held out and against exact truth.
     """
     cameras = list(next(iter(results.values())).depth)
-    rows: list[Column] = [("points", ("num_points",), ",d")]
+    rows: list[tuple[str, tuple[str, ...], str]] = [("points", ("num_points",), ",d")]
     for camera in cameras:
         for product in ("measured", "filled"):
             rows.append((f"{camera} density, {product}", ("density", camera, product), ".1%"))
@@ -114,8 +114,12 @@ def comparison(results: Mapping[str, Result]) -> str:
                 for score, key, form in _SCORES:
                     path = (source, camera, "measured", part, key)
                     rows.append((f"{camera} {said}, {part}, {score}", path, form))
-    metrics = {name: result.metrics for name, result in results.items()}
-    return aligned(list(zip(*table(metrics, rows), strict=True)))
+    lines = [["", *results]]
+    for title, places, form in rows:
+        numbers = [look_up(result.metrics, *places) for result in results.values()]
+        if any(number is not None for number in numbers):
+            lines.append([title, *(written(number, form) for number in numbers)])
+    return aligned(lines)
 
 
 def export_summary(exported: Export) -> str:

@@ -34,8 +34,11 @@ from densify.readers import Spec, open_sequence
 from densify.readers.timeline import Timeline, check_window, choose_cameras, format_frames, runs
 
 SCHEMA_VERSION = 1
-LAYOUTS = ("kitti-depth", "densify")
-METHODS = ("flow", "icp", "none")
+_KNOWN = {
+    "method": ("flow", "icp", "none"),
+    "layout": ("kitti-depth", "densify"),
+    "split": ("train", "val", None),
+}
 _FILE = "dataset.json"
 _MOST_FRAMES = 10_000_000
 _SAME = ("densify", "layout", "method", "window", "cameras", "gate", "config")
@@ -100,13 +103,10 @@ class Recipe:
                 "--layout kitti-depth: has one map of a camera for each sweep; got "
                 "project.per=image, expected sweep; for one of every image add --layout densify"
             )
-        for option, value, known in (
-            ("method", self.method, METHODS),
-            ("layout", self.layout, LAYOUTS),
-            ("split", self.split or "train", ("train", "val")),
-        ):
-            if value not in known:
-                raise InputError(f"--{option} {value}: expected one of {', '.join(known)}")
+        for option, known in _KNOWN.items():
+            if (value := getattr(self, option)) not in known:
+                expected = ", ".join(filter(None, known))
+                raise InputError(f"--{option} {value}: expected one of {expected}")
 
 
 @dataclass(frozen=True)

@@ -8,24 +8,10 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from densify.cli.answer import Answer, Column, aligned, percent, table
+from densify.cli.answer import Answer, numbers_table, percent
 from densify.cli.options import add_verb, option, positive
 from densify.cli.progress import progress_on_stderr
 
-_COLUMNS: tuple[Column, ...] = (
-    ("pixels", ("num_pixels",), ",d"),
-    ("coverage", ("coverage",), ".1%"),
-    ("MAE mm", ("mae_mm",), ",.1f"),
-    ("RMSE mm", ("rmse_mm",), ",.1f"),
-    ("iMAE 1/km", ("imae_per_km",), ".3f"),
-    ("iRMSE 1/km", ("irmse_per_km",), ".3f"),
-    ("AbsRel", ("abs_rel",), ".2%"),
-    ("SqRel", ("sq_rel",), ".2%"),
-    ("d<1.25", ("delta_1",), ".2%"),
-    ("d<1.25^2", ("delta_2",), ".2%"),
-    ("d<1.25^3", ("delta_3",), ".2%"),
-    ("outliers", ("outliers",), ".3%"),
-)
 _MISSING = {
     "without_truth": "predicted without truth",
     "without_prediction": "truth without prediction",
@@ -73,8 +59,8 @@ def answer(options: argparse.Namespace) -> Iterator[Answer]:
 
 
 def _describe(scores: Mapping[str, Any]) -> str:
-    """Return a row per part of the pixels, in the units of KITTI's leaderboard; files without a
-    counterpart are counted, and the first are named."""
+    """Return a column for each part of the pixels; files without a counterpart are counted, and the
+    first are named."""
     num, density = scores["num_images"], scores["density"]
     lines = [
         f"{num:,} image{'s' if num != 1 else ''}: predicted {percent(density['predicted'])} of "
@@ -86,10 +72,5 @@ def _describe(scores: Mapping[str, Any]) -> str:
             num_more = len(paths) - _MOST_NAMED
             rest = f", ... and {num_more:,} more" if num_more > 0 else ""
             lines.append(f"{what}: {len(paths):,}: {', '.join(paths[:_MOST_NAMED])}{rest}")
-    rows = {name: _in_mm(part) for name, part in scores["parts"].items() if part["num_pixels"]}
-    return "\n".join([*lines, aligned(table(rows, _COLUMNS))])
-
-
-def _in_mm(part: Mapping[str, Any]) -> dict[str, Any]:
-    metres = {name: part[f"{name}_m"] for name in ("mae", "rmse")}
-    return {**part, **{f"{n}_mm": None if m is None else 1000 * m for n, m in metres.items()}}
+    parts = {name: part for name, part in scores["parts"].items() if part["num_pixels"]}
+    return "\n".join([*lines, numbers_table(parts)])
