@@ -35,6 +35,7 @@ from densify.config.file_content import read_json
 from densify.geometry import poses
 from densify.geometry.types import Float
 from densify.readers.decoded_files import read_arrays
+from densify.readers.extras import described_in
 from densify.readers.file_sequence import (
     FileSequence,
     Returns,
@@ -149,12 +150,9 @@ def _read_scene(file: Path) -> tuple[_Numbered, _Numbered, Path]:
     file."""
     content = read_json(file)
     found: dict[str, _Numbered] = {"point_cloud": {}, "image": {}}
-    try:
+    with described_in(file, "a DGP scene with samples and their data"):
         data = {entry["key"]: entry for entry in content["data"]}
         keys = {key for sample in content["samples"] for key in sample["datum_keys"]}
-        missing = keys - set(data)
-        if missing:
-            raise KeyError(f"{min(missing)} among its data, which a sample names")
         numbered: dict[str, int] = {}
         for entry in sorted((data[key] for key in keys), key=lambda e: e["id"]["timestamp"]):
             kind, name = next(iter(entry["datum"])), entry["id"]["name"]
@@ -164,10 +162,6 @@ def _read_scene(file: Path) -> tuple[_Numbered, _Numbered, Path]:
                 if isfile(datum.path):
                     found[kind].setdefault(name, {})[number] = datum
         key = content["samples"][0]["calibration_key"]
-    except (KeyError, IndexError, TypeError, AttributeError) as error:
-        raise InputError(
-            f"{file}: no {error}; expected a DGP scene with samples and their data; fetch it again"
-        ) from None
     if not found["point_cloud"]:
         raise InputError(f"{file}: none of its sweeps is there; expected point_cloud/LIDAR/*.npz")
     images = dict(sorted(found["image"].items()))
@@ -178,22 +172,17 @@ def _datum(file: Path, kind: str, entry: Mapping[str, Any]) -> _Datum:
     datum, where = entry["datum"][kind], f"{file}: datum {entry['key']}"
     return _Datum(
         file.parent / datum["filename"],
-        _stamp_ns(entry["id"]["timestamp"], where),
+        _stamp_ns(entry["id"]["timestamp"]),
         _read_pose(datum["pose"], where),
         tuple(datum.get("point_format", ())),
         (int(datum.get("width", 0)), int(datum.get("height", 0))),
     )
 
 
-def _stamp_ns(text: Any, where: str) -> int:
-    try:
-        date = datetime.fromisoformat(str(text).replace("Z", "+00:00"))
-        since = date - datetime(1970, 1, 1, tzinfo=timezone.utc)
-    except (TypeError, ValueError):
-        raise InputError(
-            f"{where}: timestamp: got {text!r}, expected a date such as 2019-06-27T14:30:25.002790Z"
-        ) from None
-    microseconds = since // timedelta(microseconds=1)
+def _stamp_ns(text: str) -> int:
+    """Return the time of an ISO date. Raises ValueError."""
+    date = datetime.fromisoformat(text.replace("Z", "+00:00"))
+    microseconds = (date - datetime(1970, 1, 1, tzinfo=timezone.utc)) // timedelta(microseconds=1)
     return microseconds * (100 if date.year >= _BOGUS_YEAR else 1000)
 
 
@@ -205,17 +194,10 @@ def _read_pose(given: Mapping[str, Any], where: str) -> Float:
 
 def _read_calibration(file: Path) -> dict[str, tuple[Float, list[float]]]:
     """Return T_ego_sensor (4,4) and fx fy cx cy by the sensor's name."""
-    given = read_json(file)
-    try:
+    given, found = read_json(file), {}
+    with described_in(file, "names, and extrinsics and intrinsics of each"):
         sensors = zip(given["names"], given["extrinsics"], given["intrinsics"], strict=True)
-        return {
-            name: (
-                _read_pose(extrinsic, f"{file}: extrinsics of {name}"),
-                [float(lens[key]) for key in ("fx", "fy", "cx", "cy")],
-            )
-            for name, extrinsic, lens in sensors
-        }
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise InputError(
-            f"{file}: {error}; expected names, and extrinsics and intrinsics of each"
-        ) from None
+        for name, extrinsic, lens in sensors:
+            T = _read_pose(extrinsic, f"{file}: extrinsics of {name}")
+            found[name] = T, [float(lens[key]) for key in ("fx", "fy", "cx", "cy")]
+    return found

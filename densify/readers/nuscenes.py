@@ -29,11 +29,13 @@ chassis; the calibration takes it as rigid. Built on the documentation; not trie
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from os.path import isfile
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,6 +44,7 @@ from densify.config.errors import InputError
 from densify.config.file_content import read_bytes
 from densify.geometry.poses import inverse, transform
 from densify.geometry.types import Bool, Boxes, Camera, Float, Float32, Int
+from densify.readers.extras import described_in
 from densify.readers.file_sequence import (
     FileSequence,
     Returns,
@@ -50,7 +53,15 @@ from densify.readers.file_sequence import (
     scanner_axes,
     truth_beside,
 )
-from densify.readers.nuscenes_tables import Annotations, Record, find_records, read_table
+from densify.readers.nuscenes_tables import (
+    EXPECTED,
+    Annotations,
+    Record,
+    find_records,
+    pose_of,
+    read_table,
+    stamp_ns,
+)
 from densify.readers.point_fields import full_scale, scaled
 from densify.readers.point_files import read_table as read_points
 from densify.readers.recorded_poses import PoseTrack
@@ -76,11 +87,11 @@ def open_recording(path: Path, scene: str | None) -> SceneSequence:
     scenes: dict[str, tuple[Path, str]] = {}
     for folder in folders:
         for token, record in read_table(folder / "scene.json").items():
-            scenes.setdefault(record.text("name"), (folder, token))
+            scenes.setdefault(str(record.get("name")), (folder, token))
     name = chosen_scene("nuscenes", path, scene, list(scenes))
     found = Scene.read(*scenes[name], name)
     lidars = list(found.lidars.values())
-    if lidars[0].records[0].text("filename").endswith(".pcd"):
+    if lidars[0].files[0].suffix == ".pcd":
         return TruckScenes(found)
     if len(lidars) > 1:
         raise InputError(
@@ -92,14 +103,14 @@ def open_recording(path: Path, scene: str | None) -> SceneSequence:
 
 @dataclass(frozen=True)
 class Channel:
-    """One sensor of a scene. records: its sample_data in the order of time. stamps_ns: of them.
-    T_ego_sensor: (4,4) for each. files: of each. calibration: of the first."""
+    """One sensor of a scene. stamps_ns: of its records, ascending; files: theirs. T_ego_sensor:
+    (4,4) for each. size_px: of its images. intrinsics: of the first record."""
 
-    records: Sequence[Record]
     stamps_ns: Sequence[int]
-    T_ego_sensor: Sequence[Float]
     files: Sequence[Path]
-    calibration: Record
+    T_ego_sensor: Sequence[Float]
+    size_px: tuple[int, int]
+    intrinsics: Any
 
     def on_disk(self) -> dict[int, Path]:
         """Return the files that are there, by number."""
@@ -121,47 +132,52 @@ class Scene:
     @staticmethod
     def read(tables: Path, token: str, name: str) -> Scene:
         """Raises InputError if a table is missing or malformed, or the scene has no sweeps."""
-        samples = find_records(tables / "sample.json", "scene_token", {token})
-        data = find_records(tables / "sample_data.json", "sample_token", set(samples))
-        poses_file = tables / "ego_pose.json"
-        wanted = {record.text("ego_pose_token") for record in data.values()}
-        poses = find_records(poses_file, "token", wanted)
-        if not data or len(poses) < len(wanted):
-            raise InputError(
-                f"{poses_file}: got {len(poses)} poses for {name}, expected the {len(wanted)} of "
-                f"its {len(data)} records in sample_data.json"
-            )
-        calibrated = read_table(tables / "calibrated_sensor.json")
-        sensors = read_table(tables / "sensor.json")
-        T_ego_sensor: dict[str, Float] = {}
-        grouped: dict[str, dict[str, list[tuple[Record, Record]]]] = {"lidar": {}, "camera": {}}
-        for record in sorted(data.values(), key=lambda r: r.whole("timestamp")):
-            calibration = record.linked("calibrated_sensor_token", calibrated)
-            sensor = calibration.linked("sensor_token", sensors)
-            if sensor.text("modality") in grouped:
-                T_ego_sensor.setdefault(calibration.where, calibration.pose())
-                channels = grouped[sensor.text("modality")]
-                channels.setdefault(sensor.text("channel"), []).append((record, calibration))
-        lidars, cameras = (
-            {
-                channel: Channel(
-                    [record for record, _ in found],
-                    [record.whole("timestamp") * 1000 for record, _ in found],
-                    [T_ego_sensor[calibration.where] for _, calibration in found],
-                    [tables.parent / record.text("filename") for record, _ in found],
-                    found[0][1],
+        file, poses_file = tables / "sample_data.json", tables / "ego_pose.json"
+        with described_in(file, EXPECTED):
+            samples = find_records(tables / "sample.json", "scene_token", {token})
+            data = find_records(file, "sample_token", set(samples))
+            records = sorted(data.values(), key=stamp_ns)
+            wanted = {record["ego_pose_token"] for record in records}
+            poses = find_records(poses_file, "token", wanted)
+            if not data or len(poses) < len(wanted):
+                raise InputError(
+                    f"{poses_file}: got {len(poses)} poses for {name}, expected the {len(wanted)} "
+                    f"of its {len(data)} records in sample_data.json"
                 )
-                for channel, found in sorted(channels.items())
+            lidars, cameras = (_channels(tables, records, kind) for kind in ("lidar", "camera"))
+            T_world_ego = {
+                stamp_ns(record): pose_of(record, f"{poses_file}: record {token}")
+                for token, record in poses.items()
             }
-            for channels in grouped.values()
-        )
         if not lidars:
-            raise InputError(f"{tables / 'sample_data.json'}: no lidar data of {name}")
-        by_stamp = {r.whole("timestamp") * 1000: r for r in poses.values()}
-        stamps_ns = np.array(sorted(by_stamp), np.int64)
-        T_world_ego = np.stack([by_stamp[ns].pose() for ns in stamps_ns.tolist()])
-        track = PoseTrack(str(poses_file), stamps_ns, T_world_ego)
+            raise InputError(f"{file}: no lidar data of {name}")
+        stamps_ns = sorted(T_world_ego)
+        T = np.stack([T_world_ego[ns] for ns in stamps_ns])
+        track = PoseTrack(str(poses_file), np.array(stamps_ns, np.int64), T)
         return Scene(name, tables, token, lidars, cameras, track)
+
+
+def _channels(tables: Path, records: Sequence[Record], modality: str) -> dict[str, Channel]:
+    """Return the sensors of one kind by name. records: of the sample data, in the order of time."""
+    path = tables / "calibrated_sensor.json"
+    calibrated, sensors = read_table(path), read_table(tables / "sensor.json")
+    found: dict[str, list[Record]] = defaultdict(list)
+    for record in records:
+        sensor = sensors[calibrated[record["calibrated_sensor_token"]]["sensor_token"]]
+        if sensor["modality"] == modality:
+            found[sensor["channel"]].append(record)
+    channels = {}
+    for name, of in sorted(found.items()):
+        tokens = [record["calibrated_sensor_token"] for record in of]
+        T = {t: pose_of(calibrated[t], f"{path}: record {t}") for t in dict.fromkeys(tokens)}
+        channels[name] = Channel(
+            [stamp_ns(record) for record in of],
+            [tables.parent / record["filename"] for record in of],
+            [T[token] for token in tokens],
+            (int(of[0].get("width") or 0), int(of[0].get("height") or 0)),
+            calibrated[tokens[0]].get("camera_intrinsic"),
+        )
+    return channels
 
 
 class SceneSequence(FileSequence):
@@ -176,7 +192,7 @@ class SceneSequence(FileSequence):
         if not there:
             raise InputError(
                 f"{root}: none of the {len(self._lidar.files)} sweeps of {scene.name} are there; "
-                f"expected files such as {self._lidar.records[0].text('filename')}"
+                f"expected files such as {self._lidar.files[0]}"
             )
         images = {name: channel.on_disk() for name, channel in scene.cameras.items()}
         super().__init__(
@@ -195,11 +211,12 @@ class SceneSequence(FileSequence):
         return self._lidar.stamps_ns[frame]
 
     def _camera(self, name: str, channel: Channel) -> Camera:
-        K = channel.calibration.numbers("camera_intrinsic", 3, 3)
-        size_px = channel.records[0].whole("width"), channel.records[0].whole("height")
+        where = f"{self._scene.tables / 'calibrated_sensor.json'}: {name}"
+        with described_in(where, "camera_intrinsic of 3 x 3 numbers"):
+            K = np.array(channel.intrinsics, np.float64).reshape(3, 3)
         T_cam_frame = inverse(channel.T_ego_sensor[0]) @ self._T_ego_frame
         fx_fy_cx_cy = K[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
-        return pinhole(name, size_px, fx_fy_cx_cy, T_cam_frame, channel.calibration.where)
+        return pinhole(name, channel.size_px, fx_fy_cx_cy, T_cam_frame, where)
 
     def _pose(self, frame: int) -> Float:
         return self._scene.track.at(self._lidar.stamps_ns[frame]) @ self._T_ego_frame

@@ -21,68 +21,30 @@ from densify.config.errors import InputError
 from densify.config.file_content import open_file, parse_json, read_json, reason
 from densify.geometry.poses import interpolate
 from densify.geometry.types import Boxes, Float, Int
+from densify.readers.extras import described_in
 from densify.readers.file_sequence import checked_boxes, quaternion_pose
 
 _RECORD = re.compile(rb"\{[^{}]*\}")
 _LENGTH_WIDTH_HEIGHT = [1, 0, 2]  # of the table's width, length, height
+EXPECTED = "a table of nuScenes: records of tokens, stamps and poses"
+
+Record = dict[str, Any]
 
 
-@dataclass(frozen=True)
-class Record:
-    """where: file and token, for messages."""
+def stamp_ns(record: Record) -> int:
+    """Return the time of a record; the tables have microseconds."""
+    return int(np.int64(int(record["timestamp"]) * 1000))
 
-    where: str
-    values: Mapping[str, Any]
 
-    def text(self, key: str) -> str:
-        return str(self._value(key, str, "a text"))
-
-    def whole(self, key: str) -> int:
-        return int(self._value(key, int, "a whole number"))
-
-    def numbers(self, key: str, *shape: int) -> Float:
-        """Return finite numbers of that shape."""
-        value = self._value(key, list, "numbers")
-        try:
-            array = np.array(value, np.float64)
-        except (TypeError, ValueError):
-            array = np.zeros(0)
-        if array.shape != shape or not np.isfinite(array).all():
-            size = " x ".join(map(str, shape))
-            raise InputError(
-                f"{self.where}: {key}: got {value!r:.60}, expected {size} finite numbers"
-            )
-        return array
-
-    def pose(self) -> Float:
-        """Return the (4,4) of its rotation and translation."""
-        rotation, translation = self.numbers("rotation", 4), self.numbers("translation", 3)
-        return quaternion_pose(rotation, translation, self.where)
-
-    def linked(self, key: str, table: Mapping[str, Record]) -> Record:
-        """Return the record of another table whose token is the value of ``key``."""
-        token = self.text(key)
-        if token not in table:
-            raise InputError(f"{self.where}: {key}: got {token}, which its table does not have")
-        return table[token]
-
-    def _value(self, key: str, kind: type, expected: str) -> Any:
-        if key not in self.values:
-            raise InputError(
-                f"{self.where}: no {key}; got {', '.join(self.values) or 'an empty record'}"
-            )
-        value = self.values[key]
-        if not isinstance(value, kind):
-            raise InputError(f"{self.where}: {key}: got {value!r:.60}, expected {expected}")
-        return value
+def pose_of(record: Record, where: str) -> Float:
+    """Return the (4,4) of its rotation and translation."""
+    return quaternion_pose(record["rotation"], record["translation"], where)
 
 
 def read_table(path: Path) -> dict[str, Record]:
     """Return all records by token. Raises InputError if the file is missing or no such table."""
-    found = read_json(_existing(path))
-    if not isinstance(found, list) or not all(isinstance(r, dict) for r in found):
-        raise InputError(f"{path}: got no list of records, expected [{{...}}, ...]")
-    return _by_token(path, found)
+    with described_in(path, EXPECTED):
+        return {str(record["token"]): record for record in read_json(_existing(path))}
 
 
 def find_records(path: Path, key: str, wanted: Collection[str]) -> dict[str, Record]:
@@ -108,18 +70,14 @@ def find_records(path: Path, key: str, wanted: Collection[str]) -> dict[str, Rec
         raise InputError(
             f"{path}: not a whole JSON table: {reason(error)}; fetch it again"
         ) from error
-    return _by_token(path, found)
+    with described_in(path, EXPECTED):
+        return {str(record["token"]): record for record in found}
 
 
 def _existing(path: Path) -> Path:
     if not path.exists():
         raise InputError(f"{path}: no such table; fetch the data set's metadata")
     return path
-
-
-def _by_token(path: Path, records: list[dict[str, Any]]) -> dict[str, Record]:
-    named = [Record(f"{path}: record {r.get('token', i)}", r) for i, r in enumerate(records)]
-    return {record.text("token"): record for record in named}
 
 
 class KeyBox(NamedTuple):
@@ -153,17 +111,18 @@ class Annotations:
         if not path.is_file():
             return None
         samples = find_records(tables / "sample.json", "scene_token", {scene})
-        stamps_ns = {token: r.whole("timestamp") * 1000 for token, r in samples.items()}
         found: dict[str, dict[str, KeyBox]] = defaultdict(dict)
-        for record in find_records(path, "sample_token", samples).values():
-            instance, of_sample = record.text("instance_token"), record.text("sample_token")
-            if instance in found[of_sample]:
-                raise InputError(
-                    f"{record.where}: a second box of the instance {instance} in the sample "
-                    f"{of_sample}, expected one"
-                )
-            size_m = record.numbers("size", 3)[_LENGTH_WIDTH_HEIGHT]
-            found[of_sample][instance] = KeyBox(record.pose(), size_m)
+        with described_in(path, EXPECTED):
+            stamps_ns = {token: stamp_ns(record) for token, record in samples.items()}
+            for token, record in find_records(path, "sample_token", samples).items():
+                where, boxes = f"{path}: record {token}", found[record["sample_token"]]
+                if record["instance_token"] in boxes:
+                    raise InputError(
+                        f"{where}: a second box of the instance {record['instance_token']} in the "
+                        f"sample {record['sample_token']}, expected one"
+                    )
+                size_m = np.array(record["size"], np.float64)[_LENGTH_WIDTH_HEIGHT]
+                boxes[record["instance_token"]] = KeyBox(pose_of(record, where), size_m)
         order = sorted(stamps_ns, key=stamps_ns.__getitem__)
         key_ns = np.array([stamps_ns[token] for token in order], np.int64)
         return Annotations(str(path), key_ns, tuple(found[t] for t in order)) if found else None

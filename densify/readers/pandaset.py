@@ -37,6 +37,7 @@ from densify.config.file_content import read_json
 from densify.geometry import poses
 from densify.geometry.types import Boxes, Camera, Float, Int
 from densify.readers.decoded_files import image_size_px
+from densify.readers.extras import described_in
 from densify.readers.file_sequence import (
     FileSequence,
     Returns,
@@ -208,24 +209,17 @@ def _numbers(
 def _stamped_poses(folder: Path, last: int) -> tuple[Int, Float]:
     """Return (n,) stamps and (n,4,4) poses of the files up to number ``last`` at least."""
     path = folder / "timestamps.json"
-    try:
-        stamps_s = np.array(read_json(path), np.float64)
-        if stamps_s.ndim != 1 or not (np.abs(stamps_s) < _LATEST_S).all():
-            raise ValueError("it is not a plain list of numbers, or they are no dates")
-    except (TypeError, ValueError) as error:
-        raise InputError(f"{path}: {error}; expected a list of seconds") from None
+    with described_in(path, "a list of seconds"):
+        stamps_s = np.array(read_json(path), np.float64).reshape(-1)
+        if not (np.abs(stamps_s) < _LATEST_S).all():
+            raise ValueError("they are no dates")
     stamps_ns = np.rint(stamps_s * 1e6).astype(np.int64) * 1000  # six digits after the point
     path, T = folder / "poses.json", []
-    entries = read_json(path)
-    for number, entry in enumerate(entries if isinstance(entries, list) else []):
-        try:
+    with described_in(path, "a list of heading w x y z and position x y z"):
+        for number, entry in enumerate(read_json(path)):
             turn, place = entry["heading"], entry["position"]
             values = [turn[k] for k in "wxyz"], [place[k] for k in "xyz"]
-        except (KeyError, TypeError) as error:
-            raise InputError(
-                f"{path}: entry {number}: no {error}; expected heading w x y z and position x y z"
-            ) from None
-        T.append(quaternion_pose(*values, f"{path}: entry {number}"))
+            T.append(quaternion_pose(*values, f"{path}: entry {number}"))
     num = min(len(stamps_ns), len(T))
     if last >= num:
         raise InputError(
@@ -238,8 +232,6 @@ def _stamped_poses(folder: Path, last: int) -> tuple[Int, Float]:
 def _camera(folder: Path, image: Path, T_cam_lidar: Float) -> Camera:
     path = folder / "intrinsics.json"
     given = read_json(path)
-    try:
+    with described_in(path, "fx fy cx cy in pixels"):
         fx_fy_cx_cy = [float(given[name]) for name in ("fx", "fy", "cx", "cy")]
-    except (KeyError, TypeError, ValueError) as error:
-        raise InputError(f"{path}: {error}; expected fx fy cx cy in pixels") from None
     return pinhole(folder.name, image_size_px(image), fx_fy_cx_cy, T_cam_lidar, str(path))

@@ -29,6 +29,7 @@ from densify.config.errors import InputError
 from densify.config.file_content import parse_yaml, read_text
 from densify.geometry import poses
 from densify.geometry.types import Camera, Float
+from densify.readers.extras import described_in
 from densify.readers.file_sequence import chosen_scene, of_frame, parse_numbers, pinhole, rigid
 from densify.readers.kitti.drive import Calibration, Drive, read_stamps, usual_period_ns
 from densify.readers.recorded_poses import PoseTrack
@@ -125,16 +126,11 @@ def _camera(folder: Path, name: str) -> Camera:
 def _fisheye(path: Path, name: str, T_cam_lidar: Float) -> Camera:
     """OpenCV writes ``%YAML:1.0`` where YAML has ``%YAML 1.0``."""
     given, _ = parse_yaml(read_text(path).replace("%YAML:1.0", "", 1), path)
-    try:
+    with described_in(path, "image_width, image_height, xi, k1 k2 p1 p2, gamma1 gamma2 u0 v0"):
         lens, onto = given["distortion_parameters"], given["projection_parameters"]
         words = [given["image_width"], given["image_height"]]
         words += [onto[key] for key in ("gamma1", "gamma2", "u0", "v0")]
         words += [given["mirror_parameters"]["xi"], *(lens[k] for k in ("k1", "k2", "p1", "p2"))]
-    except (KeyError, TypeError) as error:
-        raise InputError(
-            f"{path}: no {error}; expected image_width, image_height, xi, k1 k2 p1 p2, gamma1 "
-            f"gamma2 u0 v0 of a fisheye as KITTI-360 has them"
-        ) from None
     width, height, *numbers = parse_numbers(" ".join(map(str, words)), str(path), 11).tolist()
     return pinhole(
         name,
