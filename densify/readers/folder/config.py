@@ -120,7 +120,7 @@ _CHECKS: dict[str, Check] = {
     "row_time_s": _NUMBER,
     "clock_offset_s": _NUMBER,
 }
-"""Of each key that is no text."""
+"""Every key that is no text, with the check of its value."""
 
 
 @dataclass(frozen=True)
