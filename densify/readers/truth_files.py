@@ -62,17 +62,9 @@ class FileTruth:
     """`Truth` from a truth folder."""
 
     def __init__(self, folder: Path) -> None:
-        """Raises InputError if the folder's bodies.npz is missing or malformed."""
+        """Raises InputError if the folder's bodies.npz is missing or damaged."""
         self._folder = folder
-        T_world_lidar, T_world_body, moving = _load(folder / "bodies.npz", *_BODIES)
-        shape = T_world_body.shape
-        expected = ((shape[0], 4, 4), (*shape[:2], 4, 4), shape[:2])
-        if (T_world_lidar.shape, shape, moving.shape) != expected:
-            raise InputError(
-                f"{folder / 'bodies.npz'}: expected T_world_lidar (F,4,4), T_world_body (F,B,4,4) "
-                f"and moving (F,B), got {T_world_lidar.shape}, {shape} and {moving.shape}"
-            )
-        self.bodies = Bodies(T_world_lidar, T_world_body, moving)
+        self.bodies = Bodies(*_load(folder / "bodies.npz", *_BODIES))
 
     def sweep(self, frame: int) -> SweepTruth:
         body, instance, point = self._points(frame)
@@ -92,14 +84,12 @@ class FileTruth:
 
     def _points(self, frame: int) -> tuple[NDArray[np.int32], NDArray[np.int32], Float]:
         self.bodies.check(frame)
-        path = _points_path(self._folder, frame)
+        path, num_bodies = _points_path(self._folder, frame), self.bodies.moving.shape[1]
         body, instance, point = _load(path, "body", "instance", "point")
-        n, num_bodies = len(body), self.bodies.moving.shape[1]
-        fits = instance.shape == (n,) and point.shape == (n, 3)
-        if not fits or np.any((body < 0) | (body >= num_bodies)):
+        if ((body < 0) | (body >= num_bodies)).any():
             raise InputError(
-                f"{path}: expected instance ({n},), point ({n}, 3) and bodies below {num_bodies}, "
-                f"got {instance.shape}, {point.shape} and bodies {body.min()} to {body.max()}"
+                f"{path}: got bodies {body.min()} to {body.max()}, expected bodies below "
+                f"{num_bodies}"
             )
         return body, instance, point
 

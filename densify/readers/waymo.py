@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Waymo Open Dataset, perception, version 2 (Sun et al., CVPR 2020), read without TensorFlow::
 
-    ROOT/{lidar,lidar_pose,lidar_calibration,vehicle_pose}/CONTEXT.parquet
+    ROOT/{lidar,lidar_calibration,vehicle_pose}/CONTEXT.parquet
     ROOT/{camera_image,camera_calibration}/CONTEXT.parquet    optional
     ROOT/lidar_box/CONTEXT.parquet    optional: tracked boxes, in the vehicle's frame
 
@@ -12,10 +12,9 @@ Five lidars, lidar 0 to 4: TOP, FRONT, SIDE_LEFT, SIDE_RIGHT, REAR. A return is 
 image, with the azimuth by its column and the inclination by its row
 (waymo_open_dataset/utils/range_image_utils.py); first and second returns follow each other. The
 point is in the vehicle's frame (x forward, y left, z up) *when it was fired*: not compensated. The
-poses per pixel (TOP only), which others compensate with, tell the firing time: a straight line is
-fitted to the positions along the vehicle's path. Where the vehicle is too slow for that, the
-columns are spread over the frame's period, from ``frame_timestamp_micros``, when the spin begins.
-The other four lidars are taken as measured at the frame's pose, as in the data set's conversion.
+columns of TOP are spread over the frame's period, from ``frame_timestamp_micros``, when the spin
+begins. The other four lidars are taken as measured at the frame's pose, as in the data set's
+conversion.
 
 ``vehicle_pose`` belongs to the middle of the spin: it is the pose of the FRONT camera's image
 (https://github.com/waymo-research/waymo-open-dataset/issues/464). The sweep's stamp is therefore
@@ -38,7 +37,7 @@ import numpy as np
 
 from densify.config.errors import InputError
 from densify.geometry.poses import inverse, transform
-from densify.geometry.types import Bool, Boxes, Float, Int
+from densify.geometry.types import Boxes, Float, Int
 from densify.readers.file_sequence import (
     FileSequence,
     Returns,
@@ -64,8 +63,6 @@ from densify.readers.waymo_components import (
 )
 
 _NOMINAL_PERIOD_NS = 100_000_000
-_LEAST_WAY_M = 0.3  # of the vehicle in a sweep, for its poses to tell time
-_MOST_OFF_NS = 10_000_000
 
 
 def open_recording(path: Path, scene: str | None) -> Waymo:
@@ -151,7 +148,7 @@ class Waymo(FileSequence):
             met = transform(laser.T_vehicle_laser, away.reshape(-1, 3))
             points.append(np.where(image[..., 0].ravel()[:, None] > 0, met, np.nan))
             intensity.append(np.tanh(image[..., 1].ravel()))
-            offset_ns.append(self._offset_ns(frame, number, images[number, 1]).ravel())
+            offset_ns.append(self._offset_ns(frame, number, image.shape).ravel())
             lidar.append(np.full(len(met), number - 1, np.uint8))
         T = np.tile(np.eye(4), (len(LASERS), 1, 1))
         for number, laser in self._lasers.items():
@@ -180,53 +177,19 @@ class Waymo(FileSequence):
             for number, name in names.items():
                 values, shape = rows[f"{name}.values"][row], rows[f"{name}.shape"][row]
                 if values is not None and len(values):
-                    found[laser, number] = image_of(values, shape, 4, where)
+                    found[laser, number] = image_of(values, shape, where)
             if (laser, 1) not in found:
                 raise InputError(f"{where}: no first returns; fetch the file again")
         return found
 
-    def _offset_ns(self, frame: int, laser: int, image: Float) -> Int:
+    def _offset_ns(self, frame: int, laser: int, size: tuple[int, ...]) -> Int:
         """Return (H,W) firing times since the sweep's stamp."""
-        height, width = image.shape[:2]
+        height, width = size[:2]
         if laser != 1:
             return np.zeros((height, width), np.int64)
-        share = (np.arange(width) + 0.5) / width
-        column_ns = self._fitted_ns(frame, share, image[..., 0] > 0)
-        if column_ns is None:
-            begin_ns = int(self._starts_us[frame]) * 1000 - self._stamps_ns[frame]
-            column_ns = begin_ns + share * self._period_ns
+        begin_ns = int(self._starts_us[frame]) * 1000 - self._stamps_ns[frame]
+        column_ns = begin_ns + (np.arange(width) + 0.5) / width * self._period_ns
         return np.broadcast_to(np.rint(column_ns).astype(np.int64), (height, width))
-
-    def _fitted_ns(self, frame: int, share: Float, measured: Bool) -> Float | None:
-        """Return (W,) firing times of the columns by the vehicle's positions then: a straight line
-        through all columns. None if it hardly moved, or the fit contradicts the period."""
-        if len(self.frames) < 2:
-            return None
-        name = "[LiDARPoseComponent].range_image_return1"
-        columns = {f"{name}.values": "l", f"{name}.shape": "l"}
-        of_frame_and_top = {STAMP: int(self._starts_us[frame]), LASER: 1}
-        rows = self._parts.read("lidar_pose", columns, of_frame_and_top)
-        if not len(rows[f"{name}.values"]):
-            return None
-        where = f"{self._parts.file('lidar_pose')}: frame {frame}"
-        pose = image_of(rows[f"{name}.values"][0], rows[f"{name}.shape"][0], 6, where)
-        if pose.shape[:2] != measured.shape:
-            raise InputError(
-                f"{where}: got {pose.shape[:2]} pixels, expected {measured.shape} as the ranges"
-            )
-        half_ns, stamp_ns = self._period_ns // 2, self._stamps_ns[frame]
-        before, after = (self._track.at(stamp_ns + sign * half_ns) for sign in (-1, 1))
-        way = (after - before)[:3, 3]
-        valid = measured & np.isfinite(pose).all(axis=2) & pose.any(axis=2)
-        if np.linalg.norm(way) < _LEAST_WAY_M or valid.any(axis=0).sum() < len(share) // 4:
-            return None
-        away = pose[..., 3:] - self._T_world_vehicle[frame][:3, 3]
-        along = away @ way / (way @ way) * 2 * half_ns
-        column = np.broadcast_to(share, along.shape)[valid]
-        slope_ns, middle_ns = np.polyfit(column - 0.5, along[valid], 1)
-        if abs(abs(slope_ns) - self._period_ns) > _MOST_OFF_NS or abs(middle_ns) > half_ns:
-            return None
-        return middle_ns + slope_ns * (share - 0.5)
 
     @cached_property
     def _T_world_vehicle(self) -> dict[int, Float]:

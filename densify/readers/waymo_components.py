@@ -196,15 +196,12 @@ def _whole_us(seconds: float) -> int:
     return round(seconds * 1e6) * 1000
 
 
-def image_of(
-    values: NDArray[Any], shape: NDArray[Any] | None, num_channels: int, where: str
-) -> Float:
-    """Return the (H,W,C) of a flattened one."""
+def image_of(values: NDArray[Any], shape: NDArray[Any] | None, where: str) -> Float:
+    """Return the (H,W,4) of a flattened one."""
     size = () if shape is None else tuple(int(n) for n in shape)
-    if len(size) != 3 or size[2] != num_channels or np.prod(size) != len(values) or min(size) < 1:
+    if len(size) != 3 or size[2] != 4 or np.prod(size) != len(values) or min(size) < 1:
         raise InputError(
-            f"{where}: got {len(values)} values for an image of shape {size}, expected "
-            f"(H, W, {num_channels})"
+            f"{where}: got {len(values)} values for an image of shape {size}, expected (H, W, 4)"
         )
     return values.reshape(size).astype(np.float64)
 

@@ -19,6 +19,7 @@ SemanticKITTI (Behley et al., ICCV 2019), which has the same sequences::
 from __future__ import annotations
 
 from functools import cached_property
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -38,7 +39,7 @@ from densify.readers.kitti.drive import (
     usual_period_ns,
 )
 from densify.readers.recorded_poses import PoseTrack
-from densify.readers.stamp_files import in_ns
+from densify.readers.stamp_files import StampFile
 
 _NUM_ROUNDS = 3  # the azimuth changes by degrees at most
 
@@ -143,15 +144,10 @@ class KittiOdometry(Drive):
 
 def _read_times_ns(path: Path) -> dict[int, int]:
     """Stamps by line, from 0. Raises InputError if one is no number or not after the last."""
-    times_ns: dict[int, int] = {}
-    for number, line in enumerate(read_text(path).splitlines()):
-        try:
-            times_ns[number] = in_ns(line.strip(), "s")
-        except ValueError as error:
-            raise InputError(f"{path}: line {number + 1}: {error}") from None
-        if number and times_ns[number] <= times_ns[number - 1]:
+    times_ns = StampFile.read(path, "s").stamp_ns
+    for number, (before, now) in enumerate(pairwise(times_ns), 2):
+        if now <= before:
             raise InputError(
-                f"{path}: line {number + 1}: got {line.strip()} s, expected more than on the line "
-                f"before"
+                f"{path}: line {number}: got {now} ns, expected more than on the line before"
             )
-    return times_ns
+    return dict(enumerate(times_ns))
