@@ -28,7 +28,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
-from densify.config.errors import ComputationError, InputError
+from densify.config.errors import ComputationError, InputError, OutputError
 from densify.pipeline.heap import keep_freed_memory
 
 Item = TypeVar("Item")
@@ -85,8 +85,12 @@ def call_all(
 
 @contextmanager
 def logged_to(path: Path, thread: int | None = None) -> Iterator[None]:
-    """Append what this process, or one thread of it, logs below ``densify`` to a file."""
-    handler = logging.FileHandler(path, encoding="utf-8")
+    """Append what this process, or one thread of it, logs below ``densify`` to a file. Raises
+    OutputError if it cannot be written."""
+    try:
+        handler = logging.FileHandler(path, encoding="utf-8")
+    except OSError as error:
+        raise OutputError(f"{path}: cannot be written: {error.strerror}") from error
     handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
     handler.addFilter(lambda record: thread in (None, record.thread))
     log = logging.getLogger("densify")

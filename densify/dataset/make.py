@@ -8,7 +8,7 @@ import math
 import re
 import time
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -120,7 +120,9 @@ def make_dataset(
     leftover_age_s = 0.0 if shard is None else LEFT_AFTER_S
     with Manifest(out, shard) as manifest:
         write_plan(out, recipe, drives)
-        with _log_file(out, shard) as log:
+        name = "densify.log" if shard is None else f"densify-{shard[0]}of{shard[1]}.log"
+        log = out.absolute() / name
+        with logged_to(log):
             clear_leftovers(out, leftover_age_s)
             if recipe.layout == "kitti-depth":
                 settings = as_mapping(recipe.config)
@@ -237,16 +239,3 @@ def _record(
         _log.info(told)
         raise
     return summary
-
-
-@contextmanager
-def _log_file(out: Path, shard: tuple[int, int] | None) -> Iterator[Path]:
-    """Append what is logged to ``OUT/densify.log``, or a shard's own; return its path."""
-    name = "densify.log" if shard is None else f"densify-{shard[0]}of{shard[1]}.log"
-    path = out.absolute() / name
-    try:
-        path.touch()
-    except OSError as error:
-        raise OutputError(f"--out {out}: {name} cannot be written: {error.strerror}") from error
-    with logged_to(path):
-        yield path

@@ -153,8 +153,8 @@ def _describe(summary: Summary) -> str:
     """Return what was made, and what is missing and why."""
     facts = _facts(summary)
     states = {"done": "done", "aside": "put aside", "failed": "failed", "left": "to make"}
-    counts = [f"{facts[f'num_{state}']} {said}" for state, said in states.items()]
-    counts = counts[:1] + [said for said in counts[1:] if not said.startswith("0 ")]
+    numbers = {state: facts[f"num_{state}"] for state in states}
+    counts = [f"{n} {states[state]}" for state, n in numbers.items() if n or state == "done"]
     lines = [f"{summary.num_keys} keys: {', '.join(counts)}"]
     if summary.num_made:
         pace = summary.seconds / summary.num_made
