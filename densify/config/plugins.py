@@ -209,7 +209,7 @@ READERS = Table(
                f"an Argoverse 2 log (with {_AV2})", "annotations.feather", True),
         Plugin("nuscenes", "densify.readers.nuscenes",
                _any("sample_data.json", "v*/sample_data.json"),
-               "nuScenes or TruckScenes (with v1.0-*/sample_data.json)",
+               "nuScenes (with v1.0-*/sample_data.json)",
                "v1.0-*/sample_annotation.json", True),
         Plugin("waymo", "densify.readers.waymo", _any("lidar/*.parquet"),
                "Waymo's version 2 (with lidar/*.parquet)", "lidar_box/CONTEXT.parquet", True),

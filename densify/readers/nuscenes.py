@@ -1,6 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""nuScenes (Caesar et al., CVPR 2020) and MAN TruckScenes (Fent et al., NeurIPS Datasets 2024),
-which have the same tables, without their devkits::
+"""nuScenes (Caesar et al., CVPR 2020), without its devkit::
 
     ROOT/v1.0-trainval/{scene,sample,sample_data,ego_pose,calibrated_sensor,sensor}.json
     ROOT/v1.0-trainval/sample_annotation.json    optional: tracked boxes
@@ -18,13 +17,6 @@ columns of 32 rings in the order of firing, 46.08 µs apart (HDL-32E manual, 201
 column c of n fired (c + 1 - n) · 46.08 µs after the stamp. The compensation is undone with that: on
 a real sweep at 9 m/s the elevations of a ring then spread by 0.0016 degrees instead of 0.073. Rows
 without a return then lie at the scanner's origin and are left out.
-
-TruckScenes: several lidars at 10 Hz, each sweep a ``.pcd`` file in its scanner's frame with x y z
-intensity timestamp. The timestamp is the firing time of a point in microseconds, and points are not
-compensated (https://github.com/TUMFTM/truckscenes-devkit, issues 9 and 11). A sweep is one of the
-first lidar by name, with the nearest of the others, in the vehicle's frame (x forward, y left,
-z up); its stamp is the first lidar's in the table. Some lidars are on the cabin, which sways on the
-chassis; the calibration takes it as rigid. Built on the documentation; not tried on real files.
 """
 
 from __future__ import annotations
@@ -38,19 +30,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from densify.config.errors import InputError
 from densify.config.file_content import read_bytes
-from densify.geometry.poses import inverse, transform
-from densify.geometry.types import Bool, Boxes, Camera, Float, Float32, Int
+from densify.geometry.poses import inverse
+from densify.geometry.types import Boxes, Camera, Float, Int
 from densify.readers.extras import described_in
 from densify.readers.file_sequence import (
     FileSequence,
     Returns,
     chosen_scene,
     pinhole,
-    scanner_axes,
     truth_beside,
 )
 from densify.readers.nuscenes_tables import (
@@ -62,19 +52,14 @@ from densify.readers.nuscenes_tables import (
     read_table,
     stamp_ns,
 )
-from densify.readers.point_fields import full_scale, scaled
-from densify.readers.point_files import read_table as read_points
 from densify.readers.recorded_poses import PoseTrack
 
 _NUM_RINGS = 32
 _COLUMN_NS = 46_080  # from column to column of an HDL-32E
 _NO_RETURN_M = 0.05
-_FIELDS = ("x", "y", "z", "intensity", "timestamp")
-_PERIOD_NS = 100_000_000
-_MOST_LATE_NS = 500_000_000
 
 
-def open_recording(path: Path, scene: str | None) -> SceneSequence:
+def open_recording(path: Path, scene: str | None) -> NuScenes:
     """See `densify.readers.ReaderModule`. path: the folder that holds the tables, or the one above
     it, which may hold several versions."""
     folders = [path] if (path / "sample_data.json").is_file() else []
@@ -90,14 +75,8 @@ def open_recording(path: Path, scene: str | None) -> SceneSequence:
             scenes.setdefault(str(record.get("name")), (folder, token))
     name = chosen_scene("nuscenes", path, scene, list(scenes))
     found = Scene.read(*scenes[name], name)
-    lidars = list(found.lidars.values())
-    if lidars[0].files[0].suffix == ".pcd":
-        return TruckScenes(found)
-    if len(lidars) > 1:
-        raise InputError(
-            f"{path}: {name} has the lidars {', '.join(found.lidars)}, expected one in .pcd.bin "
-            f"files, as nuScenes has, or several in .pcd files, as TruckScenes has"
-        )
+    if len(found.lidars) > 1:
+        raise InputError(f"{path}: {name} has the lidars {', '.join(found.lidars)}, expected one")
     return NuScenes(found)
 
 
@@ -180,14 +159,14 @@ def _channels(tables: Path, records: Sequence[Record], modality: str) -> dict[st
     return channels
 
 
-class SceneSequence(FileSequence):
-    """A scene; derived classes read its sweeps, which are those of the first lidar."""
+class NuScenes(FileSequence):
+    """A scene of nuScenes as a `LidarSequence`; the lidar frame is the scanner's."""
 
-    def __init__(self, scene: Scene, T_ego_frame: Float) -> None:
-        """T_ego_frame: (4,4) the frame of the points. Raises InputError if no sweep is on the disk,
-        or a camera is malformed."""
-        self._scene, self._T_ego_frame = scene, T_ego_frame
-        self._lidar = next(iter(scene.lidars.values()))
+    def __init__(self, scene: Scene) -> None:
+        """Raises InputError if no sweep is on the disk, or a camera is malformed."""
+        self._scene, self._lidar = scene, next(iter(scene.lidars.values()))
+        self._T_ego_lidar, track = self._lidar.T_ego_sensor[0], scene.track
+        self._track = PoseTrack(track.where, track.stamp_ns, track.T_world_ego @ self._T_ego_lidar)
         root, there = scene.tables.parent, self._lidar.on_disk()
         if not there:
             raise InputError(
@@ -214,12 +193,12 @@ class SceneSequence(FileSequence):
         where = f"{self._scene.tables / 'calibrated_sensor.json'}: {name}"
         with described_in(where, "camera_intrinsic of 3 x 3 numbers"):
             K = np.array(channel.intrinsics, np.float64).reshape(3, 3)
-        T_cam_frame = inverse(channel.T_ego_sensor[0]) @ self._T_ego_frame
+        T_cam_lidar = inverse(channel.T_ego_sensor[0]) @ self._T_ego_lidar
         fx_fy_cx_cy = K[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
-        return pinhole(name, channel.size_px, fx_fy_cx_cy, T_cam_frame, where)
+        return pinhole(name, channel.size_px, fx_fy_cx_cy, T_cam_lidar, where)
 
     def _pose(self, frame: int) -> Float:
-        return self._scene.track.at(self._lidar.stamps_ns[frame]) @ self._T_ego_frame
+        return self._track.at(self._lidar.stamps_ns[frame])
 
     def boxes(self, frame: int) -> Boxes | None:
         """See `LidarSequence`; the test split has none. Raises InputError for a malformed table."""
@@ -236,15 +215,6 @@ class SceneSequence(FileSequence):
         """Return the (4,4) pose of an image."""
         T_world_ego = self._scene.track.at(self.image_stamps_ns(camera)[number])
         return T_world_ego @ self._scene.cameras[camera].T_ego_sensor[number]
-
-
-class NuScenes(SceneSequence):
-    """A scene of nuScenes as a `LidarSequence`; the lidar frame is the scanner's."""
-
-    def __init__(self, scene: Scene) -> None:
-        super().__init__(scene, next(iter(scene.lidars.values())).T_ego_sensor[0])
-        track = scene.track
-        self._track = PoseTrack(track.where, track.stamp_ns, track.T_world_ego @ self._T_ego_frame)
 
     def _returns(self, frame: int) -> tuple[Path, Returns]:
         path = self._lidar.files[frame]
@@ -266,48 +236,3 @@ class NuScenes(SceneSequence):
         points = self._track.as_fired(rows[:, :3], self._lidar.stamps_ns[frame], offset_ns)
         points[np.linalg.norm(points, axis=1) < _NO_RETURN_M] = 0.0
         return path, Returns(points, (rows[:, 3] / 255).astype(np.float32), offset_ns)
-
-
-class TruckScenes(SceneSequence):
-    """A scene of TruckScenes as a `LidarSequence`; the lidar frame is the vehicle's."""
-
-    def __init__(self, scene: Scene) -> None:
-        super().__init__(scene, np.eye(4))
-        steps = np.diff(self._lidar.stamps_ns)
-        self._period_ns = np.median(steps) if len(steps) else _PERIOD_NS
-
-    def _returns(self, frame: int) -> tuple[Path, Returns]:
-        stamp_ns = self._lidar.stamps_ns[frame]
-        parts, mounts = [], []
-        for number, channel in enumerate(self._scene.lidars.values()):
-            near = int(np.argmin(np.abs(np.array(channel.stamps_ns) - stamp_ns)))
-            mounts.append(channel.T_ego_sensor[near])
-            if abs(channel.stamps_ns[near] - stamp_ns) <= self._period_ns / 2:
-                parts.append(_truck_sweep(channel, number, near, stamp_ns))
-        points, intensity, offset_ns, lidar = (np.concatenate(c) for c in zip(*parts, strict=True))
-        T = np.stack(mounts)
-        returns = Returns(points, intensity, offset_ns, lidar, T[:, :3, 3], scanner_axes(T))
-        return self._lidar.files[frame], returns
-
-
-def _truck_sweep(
-    channel: Channel, number: int, near: int, stamp_ns: int
-) -> tuple[Float, Float32, Int, NDArray[np.uint8]]:
-    """Return points, intensities, times and number of one scanner."""
-    path = channel.files[near]
-    columns = read_points(path).columns
-    absent = [name for name in _FIELDS if name not in columns]
-    if absent:
-        raise InputError(f"{path}: no field {', '.join(absent)}; got {', '.join(columns)}")
-    fired = np.stack([columns[axis].astype(np.float64) for axis in "xyz"], axis=1)
-    valid: Bool = np.asarray(np.isfinite(fired).all(axis=1) & fired.any(axis=1))
-    points = np.where(valid[:, None], transform(channel.T_ego_sensor[near], fired), np.nan)
-    offset_ns = columns["timestamp"].astype(np.int64) * 1000 - stamp_ns
-    late_ns = np.abs(offset_ns[valid]).max(initial=0)
-    if late_ns > _MOST_LATE_NS:
-        raise InputError(
-            f"{path}: timestamp: got points {late_ns * 1e-9:g} s from the sweep's stamp, "
-            f"expected microseconds within {_MOST_LATE_NS * 1e-9:g} s of it"
-        )
-    brightness = scaled(columns["intensity"], full_scale(columns["intensity"]))
-    return points, brightness, offset_ns, np.full(len(points), number, np.uint8)

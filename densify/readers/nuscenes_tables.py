@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Tables of nuScenes and TruckScenes: JSON files of flat records with a token, and their boxes.
+"""Tables of nuScenes: JSON files of flat records with a token, and their boxes.
 
 The tables of a whole data set have millions of records. Of large files only the records asked for
 are parsed.
