@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -36,39 +36,35 @@ def findings(sequence: LidarSequence) -> list[tuple[str, str]]:
     unreadable = dict(timeline.unknown)
     first = _readable(sequence, timeline.frames, unreadable)
     last = _readable(sequence, timeline.frames[::-1], unreadable)
-    num_read = 1 + (first.frame != last.frame)
-    return [
+    num_points = {sweep.frame: len(sweep) for sweep in (first, last)}
+    named = sorted(unreadable)[:_MOST_NAMED]
+    lines = [
         ("name", sequence.name),
         ("frames", _frames(sequence)),
         ("rate", _hertz(timeline.stamp_ns) if len(timeline.frames) > 1 else "unknown, one sweep"),
         ("stamps", f"{first.stamp_ns} to {last.stamp_ns} ns ({_seconds(first, last):.2f} s)"),
-        ("points", ", ".join(f"{len(s):,} in frame {s.frame}" for s in (first, last)[:num_read])),
+        ("points", ", ".join(f"{num:,} in frame {f}" for f, num in num_points.items())),
         ("point times", _point_times(first)),
         *_cameras(sequence),
         ("poses", _poses(sequence, [f for f in timeline.frames if f not in unreadable])),
         ("truth", "none" if sequence.truth is None else "exact, simulated"),
         *(sequence.findings() if hasattr(sequence, "findings") else ()),
-        *_unreadable(unreadable),
+        *((f"frame {frame}", f"cannot be used: {unreadable[frame]}") for frame in named),
     ]
+    if len(unreadable) > len(named):
+        others = format_frames(unreadable.keys() - named)
+        lines.append(("frames", f"cannot be used either: {others}"))
+    return lines
 
 
 def _readable(sequence: LidarSequence, frames: Sequence[int], unreadable: dict[int, str]) -> Sweep:
     """Return the first of these sweeps that can be read; adds those before it to ``unreadable``."""
-    for frame in frames:
-        if frame in unreadable:
-            continue
+    for frame in (frame for frame in frames if frame not in unreadable):
         try:
             return sequence[frame]
         except InputError as error:
             unreadable[frame] = str(error)
     raise InputError(unreadable[frames[0]])
-
-
-def _unreadable(reasons: Mapping[int, str]) -> list[tuple[str, str]]:
-    frames = sorted(reasons)
-    lines = [(f"frame {f}", f"cannot be used: {reasons[f]}") for f in frames[:_MOST_NAMED]]
-    more = frames[_MOST_NAMED:]
-    return lines + [("frames", f"cannot be used either: {format_frames(more)}")] * bool(more)
 
 
 def _frames(sequence: LidarSequence) -> str:

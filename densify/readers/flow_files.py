@@ -16,6 +16,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -39,7 +40,9 @@ _KNOWN = (*_WIDE, "row", "moving", "object", "valid")
 
 def estimate_motion(scene: Scene, settings: Config, argument: str) -> Motion:
     """Read the flow files of a folder as an engine, see `densify.flow.engines.EngineModule`."""
-    return ChainedMotion(scene.stretch, FlowFiles(Path(argument), scene.stretch).step)
+    check_argument(argument)
+    step = partial(read_step, Path(argument), scene.stretch)
+    return ChainedMotion(scene.stretch, step)
 
 
 def check_argument(argument: str) -> None:
@@ -48,31 +51,17 @@ def check_argument(argument: str) -> None:
         raise InputError(f"flow.engine npz:{argument}: no such folder; expected flow files in it")
 
 
-class FlowFiles:
-    """The flow files of a folder, for the sweeps of a stretch. Raises InputError for a folder that
-    is not there."""
-
-    def __init__(self, folder: Path, stretch: Stretch) -> None:
-        check_argument(str(folder))
-        self._folder, self._stretch = folder, stretch
-
-    def step(self, here: int, there: int) -> FlowField:
-        """Return the flow of sweep number ``here`` to number ``there``. Points that the file does
-        not have are static.
-
-        Raises InputError for a file that is missing, damaged, or of another form.
-        """
-        frame, target = (self._stretch.frames[i] for i in (here, there))
-        sweep = self._stretch.sweeps[here].sweep
-        T_here_there = self._stretch.T_target_source(frame, target)
-        path = self._folder / f"{frame:06d}_{target:06d}.npz"
-        columns = sweep_columns(path, sweep.row, sweep.points, T_here_there)
-        residual = columns["residual_flow"]
-        moving = columns["moving"].astype(bool)
-        residual[~moving] = 0.0
-        instance = columns["object"].astype(np.int32)
-        lost = np.zeros(len(moving), bool)
-        return FlowField(residual, moving, instance, lost, columns.get("to_reference"))
+def read_step(folder: Path, stretch: Stretch, here: int, there: int) -> FlowField:
+    """Return the flow of sweep number ``here`` to number ``there``. Points that the file does not
+    have are static. Raises InputError for a file that is missing, damaged, or of another form."""
+    frame, target = stretch.frames[here], stretch.frames[there]
+    sweep, T_here_there = stretch.sweeps[here].sweep, stretch.T_target_source(frame, target)
+    path = folder / f"{frame:06d}_{target:06d}.npz"
+    columns = sweep_columns(path, sweep.row, sweep.points, T_here_there)
+    residual, moving = columns["residual_flow"], columns["moving"].astype(bool)
+    residual[~moving] = 0.0
+    instance, lost = columns["object"].astype(np.int32), np.zeros(len(moving), bool)
+    return FlowField(residual, moving, instance, lost, columns.get("to_reference"))
 
 
 def sweep_columns(

@@ -29,7 +29,7 @@ from densify.readers.decoded_files import check_pixels, read_array, read_image
 from densify.readers.extras import needed
 from densify.readers.timeline import format_frames
 
-_SUFFIXES = {".npy": 0, ".exr": 1, ".png": 2}  # the finest first
+_SUFFIXES = (".png", ".exr", ".npy")  # the finest last
 _STEM = re.compile(r"(\d+)(?:[_-](?:depth|disp|disparity|pred|prior))?", re.IGNORECASE)
 _CHANNELS = ("Z", "Y", "depth", "Depth")
 _SAME_ASPECT = 0.02
@@ -93,17 +93,18 @@ def _in(folder: Path) -> dict[int, Path]:
     groups = [sorted(f.iterdir()) for f in (folder, folder / "data") if f.is_dir()]
     for paths in [[folder]] if folder.is_file() else groups:
         found: dict[int, Path] = {}
-        # The finest first: a coarser file of the same number may be a picture of it.
-        for path in sorted(paths, key=lambda path: _SUFFIXES.get(path.suffix.lower(), 9)):
-            stem = _STEM.fullmatch(path.stem)
-            if stem is None or path.suffix.lower() not in _SUFFIXES:
-                continue
-            known = found.setdefault(int(stem[1]), path)
-            if known is not path and known.suffix.lower() == path.suffix.lower():
-                raise InputError(
-                    f"--prior: {known} and {path.name} are both of image {int(stem[1])}; leave one "
-                    f"there"
-                )
+        # The finest last: a coarser file of the same number may be a picture of it.
+        for suffix in _SUFFIXES:
+            for path in paths:
+                stem = _STEM.fullmatch(path.stem)
+                if stem is not None and path.suffix.lower() == suffix:
+                    known = found.get(int(stem[1]))
+                    if known is not None and known.suffix.lower() == suffix:
+                        raise InputError(
+                            f"--prior: {known} and {path.name} are both of image {int(stem[1])}; "
+                            f"leave one there"
+                        )
+                    found[int(stem[1])] = path
         if found:
             return dict(sorted(found.items()))
     return {}
@@ -137,12 +138,12 @@ def _read_exr(path: Path) -> NDArray[Any]:
         channels = library.File(str(path)).channels()
     except (RuntimeError, KeyError, TypeError, ValueError) as error:
         raise InputError(f"{path}: not a whole EXR file ({reason(error)})") from error
-    named = [name for name in _CHANNELS if name in channels]
-    if not named and len(channels) > 1:
-        raise InputError(
-            f"{path}: has the channels {', '.join(channels)}, expected one, or Z, Y or depth"
-        )
-    return np.asarray(channels[(named or list(channels))[0]].pixels)
+    for name in _CHANNELS if len(channels) > 1 else channels:
+        if name in channels:
+            return np.asarray(channels[name].pixels)
+    raise InputError(
+        f"{path}: has the channels {', '.join(channels)}, expected one, or Z, Y or depth"
+    )
 
 
 def _read_png(path: Path) -> NDArray[Any]:
@@ -157,32 +158,28 @@ def _read_png(path: Path) -> NDArray[Any]:
 
 def _resized(value: Float32, camera: Camera, path: Path) -> Float32:
     """Return the values at the camera's size: linear between two of them, none beside none."""
-    import cv2
-
-    size_px = _size_px(value, camera, path)
-    if value.shape == size_px[::-1]:
+    if value.shape == (camera.height_px, camera.width_px):
         return value
-    known = cv2.resize((value > 0).astype(np.float32), size_px, interpolation=cv2.INTER_LINEAR)
-    resized = cv2.resize(value, size_px, interpolation=cv2.INTER_LINEAR)
-    return np.where(known > 1 - 1e-3, resized, np.float32(0)).astype(np.float32)
+    known = _at_size((value > 0).astype(np.float32), camera, path)
+    return np.where(known > 1 - 1e-3, _at_size(value, camera, path), 0).astype(np.float32)
 
 
 def _sky(path: Path, camera: Camera) -> Bool:
-    import cv2
-
     mask = read_image(path, as_stored=True)
     mask = mask if mask.ndim == 2 else mask[:, :, :3].max(axis=2)
-    size_px, is_sky = _size_px(mask, camera, path), (mask > 0).astype(np.uint8)
-    sky: Bool = cv2.resize(is_sky, size_px, interpolation=cv2.INTER_NEAREST) > 0
+    sky: Bool = _at_size((mask > 0).astype(np.float32), camera, path) >= 0.5
     return sky
 
 
-def _size_px(image: NDArray[Any], camera: Camera, path: Path) -> tuple[int, int]:
-    """Return the camera's width and height. Raises InputError for an image of another aspect."""
+def _at_size(image: Float32, camera: Camera, path: Path) -> Float32:
+    """Return an image (H,W) at the camera's size. Raises InputError if it has another aspect."""
+    import cv2
+
     height, width = image.shape
     if abs(width * camera.height_px / (height * camera.width_px) - 1) > _SAME_ASPECT:
         raise InputError(
             f"{path}: got {width} x {height} px, expected {camera.width_px} x "
             f"{camera.height_px} as {camera.name} has, or another size of that aspect"
         )
-    return camera.width_px, camera.height_px
+    size_px = camera.width_px, camera.height_px
+    return np.asarray(cv2.resize(image, size_px, interpolation=cv2.INTER_LINEAR), np.float32)
