@@ -147,16 +147,6 @@ def test_several_keys_and_one_that_cannot_be_read(border_drive: Path, tmp_path: 
     assert files_in(tmp_path) == before
 
 
-def test_dataset_in_json(border_drive: Path, tmp_path: Path, capsys) -> None:
-    made = ["--keys", f"{BORDER}:{BORDER + 1}", *GIVEN, "--set", "dataset.min_density=0.001"]
-    assert exit_code("dataset", border_drive, *made, "--out", tmp_path / "set", "--json") == 0
-    answer = json.loads(capsys.readouterr().out)
-    assert (answer["num_keys"], answer["num_done"], answer["num_left"]) == (1, 1, 0)
-    assert answer["means"]["density"] > 0 and len(answer["open_first"]) == 3
-    assert exit_code("dataset", "--status", tmp_path / "set", "--json", "--verify") == 0
-    assert json.loads(capsys.readouterr().out)["damaged"] == []
-
-
 def test_short_options_are_knobs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from densify.pipeline import run as pipeline
 

@@ -101,7 +101,8 @@ def test_a_set_grows(border_drive: Path, tmp_path: Path, capsys) -> None:
     ]
     in_order(out)
     assert {name.split("/")[0] for name in maps_in(out)} == {"val", "train"}
-    capsys.readouterr()
+    for told in capsys.readouterr().out.split("open first:")[1:]:
+        assert all(f"{out}/{name}" in told for name in ("README.txt", "manifest.jsonl"))
     assert exit_code("dataset", "--status", out) == 0
     assert capsys.readouterr().out.startswith("4 keys: 4 done\n")
     assert read_plan(out)["drives"][DRIVE]["frames"] == [[39, 39], [41, 41]]
@@ -252,6 +253,10 @@ def test_status(border_drive: Path, tmp_path: Path, capsys) -> None:
     assert exit_code("dataset", "--status", out) == 0
     first, second = capsys.readouterr().out.splitlines()
     assert (first, second[:8]) == ("2 keys: 2 done", "density ")
+    assert exit_code("dataset", "--status", out, "--json", "--verify") == 0
+    answer = json.loads(capsys.readouterr().out)
+    assert (answer["num_keys"], answer["num_done"], answer["num_left"]) == (2, 2, 0)
+    assert answer["means"]["density"] > 0 and answer["damaged"] == []
     assert {p: p.stat().st_mtime_ns for p in out.rglob("*")} == before
     (out / "manifest.jsonl").write_text("")
     assert exit_code("dataset", "--status", out) == 0

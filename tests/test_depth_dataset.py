@@ -17,7 +17,9 @@ from torch.utils.data import DataLoader
 import densify
 from densify.config.errors import InputError
 from densify.dataset.loader import DepthDataset
+from densify.dataset.manifest import KeyRecord
 from densify.outputs.depth_png import stored_confidence, write_confidence_png, write_depth_png
+from densify.outputs.kitti_tree import FileRecord
 
 W, H = 60, 24
 K = np.array([[50.0, 0.25, 27.0], [0, 48.0, 10.0], [0, 0, 1]])
@@ -69,24 +71,15 @@ def write_maps(folder: Path, camera: str, frame: int, rng: np.random.Generator) 
     )
 
 
-def line_of(drive: str, frame: int, status: str = "done", cameras=CAMERAS) -> dict:
+def line_of(drive: str, frame: int, status: str = "done", cameras=CAMERAS) -> bytes:
     folder = f"{'val' if drive == VAL else 'train'}/{drive}"
     paths = [f"{folder}/proj_depth/{k}/{c}/{frame:010d}.png" for k in KINDS for c in cameras]
-    about = {"bytes": 1, "sha256": 64 * "0"}
-    return {
-        "drive": drive,
-        "key": frame,
-        "status": status,
-        "reason": None,
-        "frames": [frame],
-        "files": dict.fromkeys(paths, about) if status == "done" else {},
-        "scores": {},
-        "seconds": 1.0,
-    }
+    files = dict.fromkeys(paths, FileRecord.of(b"")) if status == "done" else {}
+    return KeyRecord(drive, frame, status, files=files).to_line()
 
 
-def write_manifest(path: Path, *lines: dict) -> None:
-    path.write_text("".join(json.dumps(line) + "\n" for line in lines))
+def write_manifest(path: Path, *lines: bytes) -> None:
+    path.write_bytes(b"".join(lines))
 
 
 @pytest.fixture
@@ -146,7 +139,6 @@ def test_every_value_comes_back(made, filled):
 
 
 def test_which_samples_are_in_the_set(made):
-    """Of the cameras and split asked for; only what is done, as the last line says."""
     assert {where_of(s)[1] for s in DepthDataset(made.root, cameras=["image_03"])} == {"image_03"}
     for split, drive in (("val", VAL), ("train", TRAIN)):
         dataset = DepthDataset(made.root, split=split)
@@ -155,14 +147,9 @@ def test_which_samples_are_in_the_set(made):
     write_manifest(made.root / "manifest.jsonl", line_of(VAL, 3, cameras=["image_03"]))
     assert [where_of(s) for s in DepthDataset(made.root)] == [(VAL, "image_03", 3)]
     (made.root / "manifest.jsonl").unlink()
-    write_manifest(
-        made.root / "manifest-1of2.jsonl",
-        line_of(VAL, 8, "failed"),
-        line_of(VAL, 3),
-        line_of(VAL, 8),
-        line_of(TRAIN, 0, "aside"),
-    )
-    write_manifest(made.root / "manifest-2of2.jsonl", line_of(VAL, 5), line_of(VAL, 5, "aside"))
+    lines = line_of(VAL, 5, "failed"), line_of(VAL, 8), line_of(TRAIN, 0, "aside")
+    write_manifest(made.root / "manifest-1of2.jsonl", *lines)
+    write_manifest(made.root / "manifest-2of2.jsonl", line_of(VAL, 3))
     dataset = DepthDataset(made.root, cameras=["image_02"])
     assert [where_of(s) for s in dataset] == [(VAL, "image_02", 3), (VAL, "image_02", 8)]
 
@@ -211,11 +198,9 @@ def same(a, b) -> bool:
     return all(torch.equal(a[n], b[n]) for n in ("image", "dense_depth_m", "intrinsics"))
 
 
-@pytest.mark.parametrize("num_workers", [0, 2])
-def test_a_seed_repeats_crops_and_flips_in_workers_too(made, num_workers):
+def test_a_seed_repeats_crops_and_flips_in_workers_too(made):
     dataset = DepthDataset(made.root, crop=(12, 20), flip=True, cameras=["image_02"])
-    options = {"multiprocessing_context": "fork"} if num_workers else {}
-    loader = DataLoader(dataset, batch_size=2, num_workers=num_workers, **options)
+    loader = DataLoader(dataset, batch_size=2, num_workers=2, multiprocessing_context="fork")
 
     def drawn(seed: int) -> list:
         torch.manual_seed(seed)
