@@ -101,8 +101,9 @@ def test_a_set_grows(border_drive: Path, tmp_path: Path, capsys) -> None:
     ]
     in_order(out)
     assert {name.split("/")[0] for name in maps_in(out)} == {"val", "train"}
-    for told in capsys.readouterr().out.split("open first:")[1:]:
-        assert all(f"{out}/{name}" in told for name in ("README.txt", "manifest.jsonl"))
+    _, first, second = capsys.readouterr().out.split("open first:")
+    for name in ("README.txt", "manifest.jsonl", "dataset.json"):
+        assert f"{out / name}" in first and f"{out / name}" in second
     assert exit_code("dataset", "--status", out) == 0
     assert capsys.readouterr().out.startswith("4 keys: 4 done\n")
     assert read_plan(out)["drives"][DRIVE]["frames"] == [[39, 39], [41, 41]]
