@@ -10,8 +10,7 @@ import pytest
 
 from densify.free_space import range_image
 from densify.free_space.range_image import RangeImage
-from densify.free_space.rings import find_rings
-from densify.free_space.sensor import Aimed
+from densify.free_space.rings import Aimed, find_rings
 from densify.geometry.types import RegisteredSweep, Sweep
 from densify.street.sensors import SENSORS
 from tests.scenes import LIDAR_HEIGHT_M, ROOM, Arc, Box, Scanner, Scene, World, on_sphere

@@ -11,7 +11,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from densify.free_space.range_image import RangeImage
-from densify.free_space.sensor import SensorModel, Sensors, aimed
+from densify.free_space.rings import aimed, fires_by_azimuth
+from densify.free_space.sensor import SensorModel, Sensors
 from densify.geometry.types import RegisteredSweep
 from densify.readers.file_sequence import scanner_axes
 from densify.street.sensors import SENSORS, Spinning
@@ -104,8 +105,7 @@ def test_a_spinning_scanner_is_found_as_it_is(name, number):
     np.testing.assert_allclose(np.rad2deg(model.rings_rad), true_deg, atol=0.02)
     step_deg = 3600 / pattern.columns_per_s
     assert np.rad2deg(model.azimuth_step_rad) == pytest.approx(step_deg, rel=0.02)
-    assert model.order.turn == -1 and model.order.by_azimuth
-    assert model.order.period_s == pytest.approx(0.1, rel=0.002)
+    assert fires_by_azimuth(aimed(sweeps_of(name)[0], number))
     assert model.azimuth_rad == (-np.pi, np.pi)
     np.testing.assert_allclose(np.rad2deg(model.elevation_rad), true_deg[[0, -1]], atol=0.05)
     np.testing.assert_array_equal(model.origin_m, SENSORS[name].scanners[number].origin_m)
@@ -172,7 +172,7 @@ def spacing_by_neighbours(rays, at: int, num: int) -> float:
 def test_without_rings_the_spacing_is_that_of_the_neighbours(name, number, num):
     model, rays = sensors_of(name).models[number], aimed(sweeps_of(name)[0], number)
     assert model.unordered and model.rings_rad is None
-    assert model.order == (False, 0, None)
+    assert not fires_by_azimuth(rays)
     inside = np.hypot(rays.azimuth, rays.elevation) < np.deg2rad(25)
     inside &= np.abs(rays.elevation) < np.deg2rad(8)
     asked = np.flatnonzero(inside)[:: inside.sum() // 40]

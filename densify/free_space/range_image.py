@@ -20,16 +20,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from densify.free_space import rings as measure
 from densify.free_space.rays import see_beyond
-from densify.free_space.sensor import (
-    FEW_POINTS,
-    Aimed,
-    aimed,
-    density_table,
-    in_lines,
-    some_sectors,
-)
+from densify.free_space.rings import FEW_POINTS, Aimed, aimed, fires_by_azimuth, measure
 from densify.geometry.types import Bool, Float, Float32, Int, RegisteredSweep
 
 _CELLS_PER_STEP = 1.15  # a cell a little larger than a step is rarely empty
@@ -181,9 +173,7 @@ def _images(
 
 def _image(registered: RegisteredSweep, lidar: int, rays: Aimed, cells: _Cells) -> ScannerImage:
     """Put one scanner's rays into cells."""
-    sweep, order = registered.sweep, measure.firing_order(rays.azimuth, rays.offset_s)
-    duration_s = order.period_s or float(np.ptp(rays.offset_s)) if len(rays.offset_s) else 0.0
-    shape = len(cells.row_edges_rad) - 1, cells.num_columns
+    sweep, shape = registered.sweep, (len(cells.row_edges_rad) - 1, cells.num_columns)
     row, column = _cell_of(rays, cells.row_edges_rad, cells.num_columns)
     inside = np.flatnonzero(row >= 0)
     cell = row[inside] * cells.num_columns + column[inside]
@@ -194,7 +184,7 @@ def _image(registered: RegisteredSweep, lidar: int, rays: Aimed, cells: _Cells) 
     if cells.lone:
         num_filled[::2] *= _OF_ONE_RING
         num_filled[1::2] = 0  # a cell between two lone rings says nothing
-    if order.by_azimuth:
+    if fires_by_azimuth(rays):
         offset_s = _offset_per_column(column, rays.offset_s, cells.num_columns)[None]
         spread_s = np.zeros_like(offset_s)
     else:
@@ -209,7 +199,7 @@ def _image(registered: RegisteredSweep, lidar: int, rays: Aimed, cells: _Cells) 
     return ScannerImage(
         offset_s=offset_s,
         spread_s=spread_s,
-        settled_s=_SETTLED * duration_s,
+        settled_s=_SETTLED * float(np.ptp(rays.offset_s)),
         nearest_m=_over_3x3(np.minimum, nearest_m, np.inf),
         num_filled=num_filled,
         row_edges_rad=cells.row_edges_rad,
@@ -256,16 +246,15 @@ def _cells(rays: Aimed, num_together: int, by_ring: bool) -> list[_Cells]:
     """Choose the cells of a scanner's images, finest first."""
     if len(rays.azimuth) < FEW_POINTS:
         return [_grid(_uniform_edges(rays.elevation, np.deg2rad(2.0)), np.deg2rad(1.0))]
-    some = some_sectors(rays)
-    rings = measure.find_rings(some.elevation)
-    if rings is not None:
-        return _cells_of_rings(rings, some, num_together, by_ring)
-    if in_lines(some):
-        row_step = measure.step_between(some.azimuth, some.elevation)
-        step = measure.step_along(some.azimuth, np.floor(some.elevation / row_step))
-        rows = _uniform_edges(rays.elevation, _CELLS_PER_STEP * row_step)
-        return [_grid(rows, _CELLS_PER_STEP * step / num_together)]
-    spacing = density_table([rays]).at(rays.azimuth, rays.elevation)[:, 1]
+    layout = measure([rays])
+    if layout.rings_rad is not None:
+        step = layout.azimuth_step_rad * _CELLS_PER_STEP / num_together
+        return _cells_of_rings(layout.rings_rad, step, by_ring)
+    if not layout.unordered:
+        row_step = _CELLS_PER_STEP * float(np.median(layout.table.along))
+        step = layout.azimuth_step_rad * _CELLS_PER_STEP / num_together
+        return [_grid(_uniform_edges(rays.elevation, row_step), step)]
+    spacing = layout.table.at(rays.azimuth, rays.elevation)[:, 1]
     finest = _CELLS_PER_STEP * float(np.percentile(spacing, _DENSEST))
     flatten = float(np.cos(np.median(rays.elevation)))
     return [
@@ -274,22 +263,18 @@ def _cells(rays: Aimed, num_together: int, by_ring: bool) -> list[_Cells]:
     ]
 
 
-def _cells_of_rings(rings: Float, some: Aimed, num_together: int, by_ring: bool) -> list[_Cells]:
-    """A ring's row reaches half way to the next ring, the outermost ones as far outwards."""
+def _cells_of_rings(rings: Float, step: float, by_ring: bool) -> list[_Cells]:
+    """Reach half way to the next ring with each row, and as far outwards with the outermost."""
     middle = 0.5 * (rings[1:] + rings[:-1])
     outer: Float = 2 * rings[[0, -1]] - middle[[0, -1]]
     edges: Float = np.concatenate([outer[:1], middle, outer[1:]])
-    step = measure.step_along(some.azimuth, np.searchsorted(edges, some.elevation))
-    step *= _CELLS_PER_STEP / num_together
     near, far = (_no_closer(edges, least) for least in (_MIN_ROW_RAD, _MIN_FAR_ROW_RAD))
-    if not by_ring:
-        return [_grid(near, step)]
-    if len(near) != len(far):
+    if by_ring and len(near) != len(far):
         far_m = _SLACK_M / (1.5 * float(np.diff(far).min()))
         return [_grid(near, step)._replace(to_m=far_m), _grid(far, step)._replace(from_m=far_m)]
     gaps = np.diff(rings, prepend=-np.inf, append=np.inf)
     lone = rings[np.minimum(gaps[:-1], gaps[1:]) >= _LONE_RAD]
-    if not len(lone):
+    if not by_ring or not len(lone):
         return [_grid(near, step)]
     on_rings: Float = (lone[:, None] + [-_ON_RING_RAD, _ON_RING_RAD]).ravel()
     return [_grid(near, step), _grid(on_rings, step)._replace(lone=True)]

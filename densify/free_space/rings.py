@@ -1,46 +1,148 @@
 # SPDX-License-Identifier: MIT
-"""What the directions and firing times of a scanner's returns tell of its rays: rings, steps and
-gaps, and whether it turns.
+"""The rays of one scanner, and how it samples directions: rings, lines, or neither.
 
-Angles are seen from where the scanner stood when it fired, in radians, float32 (N,).
+Every return is put back to the moment it was fired and seen from where its scanner stood then:
+only there do the returns of a turning scanner lie on rings. Angles are in radians.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage, signal
 
+from densify.free_space.rays import aim
 from densify.geometry.arrays import Float, Float32
+from densify.geometry.types import RegisteredSweep
 
-_RING_BIN_RAD = np.deg2rad(0.02)
+FEW_POINTS = 200  # too few to measure anything
+_DEFAULT_RAD = tuple(np.deg2rad([0.18, 0.40]))  # of a 64-beam scanner, along and between its rings
+_MANY_POINTS = 15_000
+_SECTOR_RAD = np.deg2rad(5.0)
+
+_RING_BIN_RAD, _LINE_BIN_RAD, _CELL_RAD = np.deg2rad([0.02, 0.5, 1.0])
 _MIN_PROMINENCE = 0.5
 _MIN_RETURNS_PER_RING = 30
 _MIN_RING_SHARE = 0.8
 _NEAR_RING = 0.2  # of the gap to the next
-_SECTOR_RAD = np.deg2rad(1.0)
-_MAX_GAP_RAD = np.deg2rad(4.0)
-_STRIP_RAD = np.deg2rad(0.5)
-_LEAST_GAP_RAD = np.deg2rad(0.08)
-_BAND_RAD = np.deg2rad(0.1)
-_EVEN = 0.2  # of the usual gap
-_COLUMN_RAD = np.deg2rad(1.0)
+_LEAST_STEP_RAD = np.deg2rad(0.02)
+_BEYOND_RAD = np.deg2rad(1.0)
+
+_BAND_RAD, _COLUMN_RAD = np.deg2rad([0.1, 1.0])
+_LEAST_GAP_RAD, _MAX_GAP_RAD = 1e-4, np.deg2rad(4.0)
+_EVEN, _MIN_EVEN_SHARE = 0.2, 0.5  # of the usual gap, of the returns
+_MIN_GAPS_PER_BIN = 30
 _MIN_PER_COLUMN = 5
 _AT_ONCE = 0.03  # of a sweep's duration
-_STRAIGHT = 0.02  # of a turn
-_DEFAULT_BETWEEN_RAD = np.deg2rad(0.4)
-_DEFAULT_ALONG_RAD = np.deg2rad(0.2)
+
+_MIN_COUNT = 24  # returns that tell a density
+_WINDOWS = (1, 3, 5, 9, 17, 33)  # cells
+
+
+class Aimed(NamedTuple):
+    """The rays of one scanner at their firing times, from where it stood; (N,) float32 each.
+
+    offset_s: seconds after the sweep's reference time.
+    """
+
+    azimuth: Float32
+    elevation: Float32
+    range_m: Float32
+    offset_s: Float32
+
+
+def aimed(registered: RegisteredSweep, lidar: int) -> Aimed:
+    """Return the rays of one scanner; deskewing, which moved its points, is undone."""
+    sweep = registered.sweep
+    rows = np.flatnonzero(sweep.lidar == lidar)
+    offset_s = np.zeros(len(rows), np.float32)
+    if sweep.offset_ns is not None:
+        offset_s = (sweep.offset_ns[rows] * 1e-9).astype(np.float32)
+    seen = np.empty((3, len(rows)), np.float32)
+    aim.over_rows(
+        len(rows),
+        sweep.points.take(rows, axis=0).astype(np.float32),
+        offset_s,
+        sweep.origin_m(lidar).astype(np.float32),
+        sweep.axes(lidar).astype(np.float32, order="C"),
+        np.stack([registered.twist_before, registered.twist_after]).astype(np.float32),
+        seen,
+    )
+    return Aimed(seen[0], seen[1], seen[2], offset_s)
+
+
+class RayTable(NamedTuple):
+    """Angles between neighbouring rays, (B,C) float32: ``across`` along the azimuth and ``along``
+    the elevation.
+
+    Row b is about the elevations from ``low_rad + b * bin_rad``, the outermost about all beyond;
+    column c about the azimuths from ``-pi + c * 2 pi / C``. C is 1 where they do not matter.
+    """
+
+    low_rad: float
+    bin_rad: float
+    across: Float32
+    along: Float32
+
+    def at(self, azimuth: NDArray[np.floating], elevation: NDArray[np.floating]) -> Float:
+        """Return (N,2) across and along in these directions."""
+        rows, columns = self.along.shape
+        row = np.clip((elevation - self.low_rad) / self.bin_rad, 0, rows - 1).astype(np.int64)
+        column = ((azimuth + np.pi) * (columns / (2 * np.pi))).astype(np.int64) % columns
+        return np.stack([self.across[row, column], self.along[row, column]], 1).astype(np.float64)
+
+
+@dataclass(frozen=True)
+class Layout:
+    """How a scanner samples directions.
+
+    rings_rad: (K,) elevation of every ring, ascending; None if there are no distinct rings.
+    unordered: there are no lines either, or the firing time does not go with the azimuth (solid
+        state, rosettes).
+    azimuth_step_rad: between rays of a ring or line; of an unordered scanner the usual spacing.
+    table: of the spacings.
+    """
+
+    rings_rad: Float | None
+    unordered: bool
+    azimuth_step_rad: float
+    table: RayTable
+
+
+def measure(sweeps: Sequence[Aimed]) -> Layout:
+    """Measure a scanner by its rays in a few sweeps.
+
+    The returns of lasers that do not share an origin smear over those of other rings where they
+    are near, as KITTI's HDL-64E. They still follow at even steps along the azimuth: lines.
+    """
+    if sum(len(rays.azimuth) for rays in sweeps) < FEW_POINTS:
+        step, along = _DEFAULT_RAD
+        return Layout(None, False, step, _table(0.0, 1.0, np.array([step]), np.array([along])))
+    some = [_some_sectors(rays) for rays in sweeps]
+    rings = find_rings(np.concatenate([rays.elevation for rays in some]))
+    if rings is not None:
+        middle = 0.5 * (rings[1:] + rings[:-1])
+        steps = [_step_along(r.azimuth, np.searchsorted(middle, r.elevation)) for r in some]
+        step = float(np.median(steps))
+        return Layout(rings, False, step, _table_of_rings(rings, step))
+    step, even = np.median([_even_step(rays) for rays in some], axis=0).tolist()
+    if even >= _MIN_EVEN_SHARE and fires_by_azimuth(some[0]):
+        return Layout(None, False, step, _table_of_lines(sweeps, step))
+    table = _table_of_density(sweeps)
+    step = float(np.median(table.at(sweeps[0].azimuth, sweeps[0].elevation)[:, 0]))
+    return Layout(None, True, step, table)
 
 
 def find_rings(elevation: Float32) -> Float | None:
-    """(K,) ascending elevations of the scanner's beams; None where the returns do not lie on rings:
-    several scanners taken for one, clouds already processed, scanners that have none, and lasers
-    that do not share an origin (KITTI's HDL-64E, whose near returns smear).
+    """Return (K,) ascending elevations of the beams; None if the returns do not lie on rings.
 
-    The peaks of a fine histogram, if they stand alone and hold nearly all returns; each is then the
-    mean of the returns close to it.
+    They do not for several scanners taken for one, processed clouds, scanners that have none, and
+    lasers that do not share an origin. The rings are the peaks of a fine histogram, if they stand
+    alone and hold nearly all returns; each is then the mean of the returns close to it.
     """
     of_return = ((elevation + 0.5 * np.pi) / _RING_BIN_RAD).astype(np.int64)
     returns = np.bincount(of_return, minlength=int(np.pi / _RING_BIN_RAD) + 2).astype(float)
@@ -58,78 +160,119 @@ def find_rings(elevation: Float32) -> Float | None:
     return total / np.bincount(nearest[close], minlength=len(rings))
 
 
-def step_between(azimuth: Float32, elevation: Float32) -> float:
-    """Median elevation between rings, where rings are not distinct."""
-    # A strip half a degree wide crosses every ring a few times: large gaps in elevation part rings.
-    gap = gaps(np.floor(azimuth / _STRIP_RAD), elevation)
-    between = gap[gap > max(_LEAST_GAP_RAD, 0.25 * float(np.percentile(gap, 95)))]
-    return float(np.median(between)) if len(between) else _DEFAULT_BETWEEN_RAD
+def fires_by_azimuth(rays: Aimed) -> bool:
+    """Return True if all returns of a column are fired within a moment, or nothing tells when."""
+    duration_s = float(np.ptp(rays.offset_s)) if len(rays.offset_s) else 0.0
+    if duration_s == 0.0:
+        return True
+    column = ((rays.azimuth + np.pi) / _COLUMN_RAD).astype(np.int64)
+    num = np.bincount(column)
+    mean_s = np.bincount(column, rays.offset_s) / np.maximum(num, 1)
+    square = np.bincount(column, (rays.offset_s - mean_s[column]) ** 2)
+    spread_s = np.sqrt(square / np.maximum(num, 1))[num >= _MIN_PER_COLUMN]
+    return not len(spread_s) or bool(np.mean(spread_s < _AT_ONCE * duration_s) > 0.5)
 
 
-def step_along(azimuth: Float32, ring: NDArray[Any]) -> float:
-    """Median azimuth between neighbours on a ring."""
-    along = gaps(ring, azimuth)
-    along = along[along > np.deg2rad(0.02)]
-    return float(np.median(along)) if len(along) else _DEFAULT_ALONG_RAD
+def _some_sectors(rays: Aimed) -> Aimed:
+    """Return every fourth sector of a view all round, which tells as much."""
+    if len(rays.azimuth) > _MANY_POINTS:
+        some = np.floor(rays.azimuth / _SECTOR_RAD) % 4 == 0
+        if some.mean() > 0.1:
+            return Aimed(*(column[some] for column in rays))
+    return rays
 
 
-def gaps(group: NDArray[Any], angle: Float32) -> Float:
-    """Between neighbouring angles of the same group; group: (N,) whole numbers."""
+def _gaps(group: NDArray[Any], angle: Float32) -> Float:
+    """Return the gaps between neighbouring angles of the same group; group: (N,) whole numbers."""
     apart = 4 * np.pi  # more than angles of one group can be
     found: Float = np.diff(np.sort(group * apart + angle.astype(np.float64)))
     return found[found < 2 * np.pi]
 
 
-def even_step(azimuth: Float32, elevation: Float32) -> tuple[float, float]:
-    """The usual azimuth between returns of about the same elevation, and which share of all follow
-    at that distance: more than half of a turning scanner's, a fifth of strewn ones."""
-    gap = gaps(np.floor(elevation / _BAND_RAD), azimuth)
-    gap = gap[gap > 1e-4]
+def _step_along(azimuth: Float32, ring: NDArray[Any]) -> float:
+    """Return the median azimuth between neighbours on a ring."""
+    along = _gaps(ring, azimuth)
+    along = along[along > _LEAST_STEP_RAD]
+    return float(np.median(along)) if len(along) else _DEFAULT_RAD[0]
+
+
+def _even_step(rays: Aimed) -> tuple[float, float]:
+    """Return the usual azimuth between returns of about the same elevation, and the share of all
+    that follow at that distance: more than half of a turning scanner's, a fifth of strewn ones."""
+    gap = _gaps(np.floor(rays.elevation / _BAND_RAD), rays.azimuth)
+    gap = gap[gap > _LEAST_GAP_RAD]
     if not len(gap):
-        return _DEFAULT_ALONG_RAD, 0.0
+        return _DEFAULT_RAD[0], 0.0
     usual = float(np.median(gap))
     return usual, float(np.mean(np.abs(gap - usual) < _EVEN * usual))
 
 
-def gaps_between(azimuth: Float32, elevation: Float32, least_rad: float) -> tuple[Float, Float]:
-    """Gaps between returns that follow each other in elevation within a sector of 1 degree, and
-    their middles; those of one ring and those over missing returns left out."""
-    sector = np.floor(azimuth / _SECTOR_RAD)
-    order = np.lexsort((elevation, sector))
-    gap = np.diff(elevation[order].astype(float))
-    middle = elevation[order][:-1] + gap / 2
-    kept = (np.diff(sector[order]) == 0) & (gap > max(least_rad, 1e-4)) & (gap < _MAX_GAP_RAD)
-    return gap[kept], middle[kept]
+def _table_of_rings(rings: Float, step_rad: float) -> RayTable:
+    """The spacing at a ring is the mean of the gaps to both its neighbours."""
+    low = float(rings[0]) - _BEYOND_RAD
+    num_bins = int((float(rings[-1]) + _BEYOND_RAD - low) / _RING_BIN_RAD) + 1
+    elevation = low + (np.arange(num_bins) + 0.5) * _RING_BIN_RAD
+    along = np.interp(elevation, rings, np.gradient(rings, edge_order=1))
+    return _table(low, _RING_BIN_RAD, step_rad * np.cos(elevation), along)
 
 
-class Order(NamedTuple):
-    """by_azimuth: all returns of a column are fired within a moment, or nobody knows when. turn: 1
-    left (counter-clockwise from above), -1 right, 0 unknown. period_s: of a turn, None unknown."""
+def _table_of_lines(sweeps: Sequence[Aimed], step_rad: float) -> RayTable:
+    """Medians by elevation of the gaps within sectors of 1 degree, without those of one line and
+    those over missing returns."""
+    gaps, middles = [], []
+    for rays in sweeps:
+        sector = np.floor(rays.azimuth / _COLUMN_RAD)
+        order = np.lexsort((rays.elevation, sector))
+        elevation = rays.elevation[order].astype(float)
+        gap = np.diff(elevation)
+        kept = (np.diff(sector[order]) == 0) & (gap < _MAX_GAP_RAD)
+        kept &= gap > max(step_rad / 2, _LEAST_GAP_RAD)
+        gaps.append(gap[kept])
+        middles.append((elevation[:-1] + gap / 2)[kept])
+    low = float(min(r.elevation.min() for r in sweeps)) - _LINE_BIN_RAD
+    high = float(max(r.elevation.max() for r in sweeps)) + _LINE_BIN_RAD
+    num_bins = int((high - low) / _LINE_BIN_RAD) + 2
+    in_bin = ((np.concatenate(middles) - low) / _LINE_BIN_RAD).astype(np.int64)
+    bins = np.flatnonzero(np.bincount(in_bin, minlength=num_bins) >= _MIN_GAPS_PER_BIN)
+    along = np.full(num_bins, _DEFAULT_RAD[1])
+    if len(bins):
+        medians = ndimage.median(np.concatenate(gaps), in_bin, bins)
+        along = np.interp(np.arange(num_bins), bins, medians)
+    elevation = low + (np.arange(num_bins) + 0.5) * _LINE_BIN_RAD
+    return _table(low, _LINE_BIN_RAD, step_rad * np.cos(elevation), along)
 
-    by_azimuth: bool
-    turn: int
-    period_s: float | None
+
+def _table(low: float, bin_rad: float, across: Float, along: Float) -> RayTable:
+    columns = (column[:, None].astype(np.float32) for column in (across, along))
+    return RayTable(low, float(bin_rad), *columns)
 
 
-def firing_order(azimuth: Float32, offset_s: Float32) -> Order:
-    """The order told by one sweep's returns and their firing times."""
-    duration_s = float(np.ptp(offset_s)) if len(offset_s) else 0.0
-    if duration_s == 0.0:
-        return Order(True, 0, None)
-    column = ((azimuth + np.pi) / _COLUMN_RAD).astype(np.int64)
-    num = np.bincount(column)
-    mean_s = np.bincount(column, offset_s) / np.maximum(num, 1)
-    spread_s = np.sqrt(np.bincount(column, (offset_s - mean_s[column]) ** 2) / np.maximum(num, 1))
-    seen = num >= _MIN_PER_COLUMN
-    at_once = np.flatnonzero(seen & (spread_s < _AT_ONCE * duration_s))
-    if 2 * len(at_once) <= seen.sum():
-        return Order(not seen.any(), 0, None)
-    in_time = at_once[np.argsort(mean_s[at_once])]
-    turned = np.unwrap(in_time * _COLUMN_RAD)
-    if len(in_time) < 3:
-        return Order(True, 0, None)
-    rate, start = np.polyfit(mean_s[in_time], turned, 1)
-    off = np.abs(turned - start - rate * mean_s[in_time])
-    if rate == 0.0 or np.median(off) > _STRAIGHT * 2 * np.pi:
-        return Order(True, 0, None)
-    return Order(True, 1 if rate > 0 else -1, float(2 * np.pi / abs(rate)))
+def _table_of_density(sweeps: Sequence[Aimed]) -> RayTable:
+    """The side of the square that each return of a sweep has to itself, by direction: returns are
+    counted in the smallest window around each cell of a degree that holds enough."""
+    low = float(min(r.elevation.min() for r in sweeps))
+    rows = int((float(max(r.elevation.max() for r in sweeps)) - low) / _CELL_RAD) + 1
+    columns = round(2 * np.pi / _CELL_RAD)
+    count = np.zeros((rows, columns))
+    for rays in sweeps:
+        row = ((rays.elevation - low) / _CELL_RAD).astype(np.int64)
+        column = ((rays.azimuth + np.pi) / _CELL_RAD).astype(np.int64) % columns
+        np.add.at(count, (row, column), 1)
+    in_view = ndimage.binary_closing(np.pad(count > 0, 1))[1:-1, 1:-1] | (count > 0)
+    cell_sr = _CELL_RAD**2 * np.cos(low + (np.arange(rows) + 0.5) * _CELL_RAD)[:, None] * in_view
+    density = np.zeros((rows, columns))
+    for cells in reversed(_WINDOWS):
+        held, sr = (_in_windows(values, cells) for values in (count, cell_sr))
+        enough = (held >= _MIN_COUNT) | (cells == _WINDOWS[-1])
+        density = np.where(enough & (sr > 0), held / np.maximum(sr, 1e-12), density)
+    known = in_view & (density > 0)
+    spacing = np.sqrt(len(sweeps) / np.where(known, density, 1.0))
+    nearest = ndimage.distance_transform_edt(~known, return_indices=True)[1]
+    spacing = spacing[tuple(nearest)].astype(np.float32)
+    return RayTable(low, float(_CELL_RAD), spacing, spacing)
+
+
+def _in_windows(values: Float, cells: int) -> Float:
+    """Return the sums over square windows; azimuth goes round."""
+    mean: Float = ndimage.uniform_filter(values, cells, mode=("constant", "wrap"))
+    return mean * cells**2
