@@ -5,6 +5,8 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from functools import cache
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -12,8 +14,9 @@ from scipy.spatial.transform import Rotation
 
 from densify.free_space.range_image import RangeImage, ScannerImage
 from densify.geometry import poses
-from densify.geometry.types import RegisteredSweep
-from tests.scenes import ROOM, Arc, Box, Scanner, Scene, World, on_sphere
+from densify.geometry.types import RegisteredSweep, Sweep
+from tests.fired import fired
+from tests.scenes import LIDAR_HEIGHT_M, ROOM, Arc, Box, Scanner, Scene, World, on_sphere
 
 MARGIN = (0.4, 0.015)
 STANDING = Arc(0.0, 0.0)
@@ -76,17 +79,6 @@ def test_nothing_is_known_above_and_below_the_beams(room):
         assert not room.sees_through(
             on_sphere(np.arange(0, 360, 5.0), elevation_deg, 1.2), 0, 0
         ).any()
-
-
-def test_one_scanner_cannot_veto_what_the_other_saw():
-    registered = standing_sweep()
-    front = registered.sweep.points[:, 0] > 0
-    both = replace(registered, sweep=replace(registered.sweep, lidar=front.astype(np.uint8)))
-    image = RangeImage.of(both)
-    assert len(image.scanners) == 2
-    ahead_and_behind = on_sphere([0, 20, 160, 180, 200, 340], 0.0, 8.0)
-    assert image.sees_through(ahead_and_behind, *MARGIN).all()
-    assert not image.sees_through(on_sphere([0, 180], 0.0, 25.0), *MARGIN).any()
 
 
 # --- rolling shutter ------------------------------------------------------------------------------
@@ -209,3 +201,181 @@ def test_tiny_sweeps_know_little_and_never_fail(num_points):
     image = RangeImage.of(replace(registered, sweep=registered.sweep.select(few)))
     hung = on_sphere(np.arange(-180, 180, 5.0), -14.0, 2.0)
     assert image.sees_through(hung, *MARGIN).mean() < 0.2
+
+
+# --- rings one by one ----------------------------------------------------------------------------
+
+
+def test_far_away_dense_rings_tell_of_a_slit_between_them():
+    """What is seen over a wall close by, by few rings: far away each ring is a row, nearby two."""
+    wall = Box((0.4, 8.0, LIDAR_HEIGHT_M), Arc(5.0, 0.0))  # as high as the scanner: up to 0 degrees
+    low = Box((0.4, 4.0, LIDAR_HEIGHT_M + 0.6), Arc(18.0, 0.0))  # up to 1.93 degrees
+    scanner = Scanner(128, 900, elevation_deg=(-15.0, 15.0))  # 0.236 degrees apart
+    sweep = Scene(World((*ROOM, wall, low)), Arc(0, 0), scanner).stretch(2, 0).sweeps[0]
+    usual, finer = RangeImage.of(sweep), RangeImage.of(sweep, by_ring=True)
+    near, far = finer.scanners
+    assert len(usual.scanners) == 1
+    assert len(near.row_edges_rad) == len(usual.scanners[0].row_edges_rad) < len(far.row_edges_rad)
+    assert near.to_m == far.from_m == pytest.approx(0.1 / (1.5 * np.deg2rad(30 / 127)), rel=0.02)
+
+    def share(image: RangeImage, elevation_deg: float, range_m: float, azimuth_deg: float) -> float:
+        azimuths_deg = np.linspace(-azimuth_deg, azimuth_deg, 50)
+        hung = on_sphere(azimuths_deg, elevation_deg, range_m)
+        return float(image.sees_through(hung, *MARGIN).mean())
+
+    assert share(finer, 0.4, 17.0, 4) == 1 and share(usual, 0.4, 17.0, 4) == 0
+    assert share(finer, 0.4, 10.0, 4) == 0  # a slight error of registration is more than two rings
+    assert share(finer, 3.0, 10.0, 4) == share(usual, 3.0, 10.0, 4) == 1
+    highest_deg = 7.5 * 30 / 127  # of the rings that meet what stands there
+    for off_m in (-0.05, 0.0, 0.05):  # badly registered
+        assert share(finer, highest_deg + np.rad2deg(off_m / 17.8), 17.8, 4) == 0
+
+
+def test_a_ring_far_from_all_others_tells_of_what_is_on_its_rays():
+    """The next one below meets the road before it."""
+    scanner = Scanner(16, 900, elevation_deg=(-15.0, 15.0))  # 2 degrees apart
+    sweep = Scene(World(ROOM), Arc(0, 0), scanner).stretch(2, 0).sweeps[0]
+    usual, by_ring = RangeImage.of(sweep), RangeImage.of(sweep, by_ring=True)
+    road_m = LIDAR_HEIGHT_M / np.sin(np.deg2rad(5.0))
+
+    def share(image: RangeImage, elevation_deg: float, range_m: float) -> float:
+        hung = on_sphere(np.linspace(-10, 10, 50), elevation_deg, range_m)
+        return float(image.sees_through(hung, *MARGIN).mean())
+
+    assert share(by_ring, -5.0, road_m - 1.5) == 1 and share(usual, -5.0, road_m - 1.5) == 0
+    assert share(by_ring, -5.0, road_m - 0.1) == share(by_ring, -5.0, road_m + 1.0) == 0
+    assert share(by_ring, -4.5, road_m - 1.5) == share(usual, -4.5, road_m - 1.5) == 0
+    assert share(by_ring, 4.0, 8.0) == share(usual, 4.0, 8.0) == 1
+
+
+# --- two scanners ---------------------------------------------------------------------------------
+
+
+def two_scanners(origins, pillar) -> RegisteredSweep:
+    """In a round room of 20 m about the origin, with a round pillar (x, y, radius)."""
+    parts = []
+    for origin in origins:
+        a, e = np.meshgrid(np.deg2rad(np.arange(-180, 180, 0.4)), np.deg2rad(np.arange(-15, 16, 2)))
+        ray = on_sphere(np.rad2deg(a.ravel()), np.rad2deg(e.ravel()), 1.0)
+        flat = ray[:, :2] / np.linalg.norm(ray[:, :2], axis=1, keepdims=True)
+
+        def meets(x, y, radius, far, flat=flat, origin=origin):
+            to = origin[:2] - (x, y)
+            b, c = flat @ to, to @ to - radius**2
+            root = np.sqrt(np.where(b * b > c, b * b - c, np.nan))
+            return -b + (root if far else -root)
+
+        near = meets(*pillar, far=False)
+        wall = meets(0.0, 0.0, 20.0, far=True)
+        range_m = np.where(near > 0, near, wall) / np.linalg.norm(ray[:, :2], axis=1)
+        parts.append(origin + ray * range_m[:, None])
+    points = np.concatenate(parts)
+    n = len(points)
+    lidar = np.repeat(np.arange(len(parts)), len(parts[0])).astype(np.uint8)
+    sweep = Sweep(0, 0, points, np.zeros(n, np.float32), None, lidar, np.arange(n), origins)
+    return RegisteredSweep(sweep, np.eye(4), np.zeros(6), np.zeros(6))
+
+
+def test_free_space_is_what_either_of_two_scanners_saw():
+    origins, pillar = np.array([[0.0, 0, 0], [0.0, 2.5, 0.8]]), (6.0, 0.0, 0.8)
+    both = two_scanners(origins, pillar)
+    image = RangeImage.of(both)
+    assert [len(s.nearest_m) for s in image.scanners] == [16, 16]
+    behind = np.array([[12.0, 0.0, 0.5], [10.0, 0.3, 0.3]])  # of the pillar, for the first one
+    assert image.sees_through(behind, *MARGIN).all()
+    only_first = replace(both, sweep=both.sweep.select(both.sweep.lidar == 0))
+    assert not RangeImage.of(only_first).sees_through(behind, *MARGIN).any()
+    on_surfaces = both.sweep.points
+    assert not image.sees_through(on_surfaces, *MARGIN).any()
+    around = np.arange(-180, 180, 3.0)
+    inside = on_sphere(around[np.abs(around + 6) > 3], 1.0, 14.0)  # not hidden from both
+    assert image.sees_through(inside, *MARGIN).all()
+
+
+# --- scanners whose firing time does not go with the azimuth: raster and rosette -----------------
+
+FAST = np.array([0.0, 0.0, 0.2, 15.0, 0.0, 0.0])
+WALL = World((Box((1.0, 200.0, 40.0), Arc(40.0, 0.0), base_m=-20.0),))
+POSTS = World(
+    (
+        *(Box((0.5, 0.5, 6.0), Arc(x, y)) for x in (9, 14, 20, 27) for y in (-6, -3, -1, 2, 4, 7)),
+        Box((1.0, 300.0, 60.0), Arc(60.0, 0.0), base_m=-20.0),
+    )
+)
+
+
+def only(registered: RegisteredSweep, lidar: int) -> RegisteredSweep:
+    return replace(registered, sweep=registered.sweep.select(registered.sweep.lidar == lidar))
+
+
+@cache
+def sweep_of(name: str, moving: bool, frame: int = 0, world: World = POSTS) -> RegisteredSweep:
+    registered = fired(name, world, FAST if moving else np.zeros(6), frame, share_heard=1.0)
+    return only(registered, int(registered.sweep.lidar.max()))
+
+
+UNORDERED = ["panda", "rosette"]
+
+
+@pytest.mark.parametrize("name", UNORDERED)
+def test_each_cell_has_a_time_of_its_own(name):
+    registered = sweep_of(name, moving=False)
+    images = RangeImage.of(registered).scanners
+    assert 1 < len(images) <= 5
+    sizes = [image.nearest_m.shape for image in images]
+    for (rows, columns), (half_rows, half_columns) in pairwise(sizes):
+        assert half_rows == pytest.approx(rows / 2, abs=1)
+        assert half_columns == pytest.approx(columns / 2, abs=1) or columns < 200
+    for image in images:
+        assert image.offset_s.shape == image.spread_s.shape == image.nearest_m.shape
+        asked = registered.sweep.points[::7]
+        first, last = when_around(image, asked)
+        offset_s = registered.sweep.offset_ns[::7] * 1e-9
+        # a return on the edge of a cell may fall on either side
+        assert np.mean((first - 1e-6 <= offset_s) & (offset_s <= last + 1e-6)) > 0.99
+
+
+def when_around(image: ScannerImage, points) -> tuple[np.ndarray, np.ndarray]:
+    """First and last time at which the cells around each point's were looked at."""
+    x, y, z = (points - image.origin_m).T
+    rows, columns = image.nearest_m.shape
+    row = np.searchsorted(image.row_edges_rad, np.arctan2(z, np.hypot(x, y))) - 1
+    column = ((np.arctan2(y, x) + np.pi) / (2 * np.pi) * columns).astype(int) % columns
+    middle, spread = (
+        t[np.clip(row, 0, rows - 1), column] for t in (image.offset_s, image.spread_s)
+    )
+    return middle - spread, middle + spread
+
+
+@pytest.mark.parametrize("name", UNORDERED)
+def test_what_stands_is_not_free_however_fast_the_scanner_drives(name):
+    """And where no cell knew its time, it would be."""
+    one, other = sweep_of(name, moving=True), sweep_of(name, moving=True, frame=2)
+    T_other_one = poses.inverse(other.T_world_lidar) @ one.T_world_lidar
+    on_post = np.linalg.norm(one.sweep.points, axis=1) < 40
+    points = poses.transform(T_other_one, one.sweep.points[on_post])
+    assert len(points) > 1000
+    image = RangeImage.of(other)
+    assert image.sees_through(points, *MARGIN).mean() < 0.002
+    timeless = [
+        s._replace(offset_s=np.zeros_like(s.offset_s), spread_s=np.zeros_like(s.spread_s))
+        for s in image.scanners
+    ]
+    assert RangeImage(tuple(timeless)).sees_through(points, *MARGIN).mean() > 0.004
+
+
+@pytest.mark.parametrize("name", UNORDERED)
+def test_what_moves_with_its_velocity_is_not_free(name):
+    """A van that comes closer is met somewhere else by each ray; with its velocity known its own
+    points are not taken for free, and standing still some of them are."""
+    van = Box((4.0, 2.0, 2.2), Arc(18.0, -3.0, 1.5, 12.0))
+    world = World((van, *WALL.boxes))
+    sweep = sweep_of(name, moving=False, world=world).sweep
+    image = RangeImage.of(sweep_of(name, moving=False, world=world))
+    on_van = (sweep.points[:, 0] < 30) & (sweep.points[:, 2] > -1.5)
+    velocity = np.tile([12 * np.cos(1.5), 12 * np.sin(1.5), 0.0], (on_van.sum(), 1))
+    at_reference = sweep.points[on_van] - velocity * sweep.offset_ns[on_van][:, None] * 1e-9
+    assert len(velocity) > 50
+    assert image.sees_through(at_reference, *MARGIN, velocity_m_s=velocity).mean() < 0.02
+    gone = at_reference + [0, 0, 0] + 3.0 * velocity / 12  # where it never was within the sweep
+    assert image.sees_through(gone, *MARGIN).mean() > 0.1

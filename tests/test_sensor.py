@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Models of scanners, measured from sweeps whose every pulse is known."""
+"""Models of scanners, measured from sweeps whose every pulse is known; cells that follow them."""
 
 from __future__ import annotations
 
@@ -10,15 +10,17 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from densify.free_space import range_image
 from densify.free_space.range_image import RangeImage
-from densify.free_space.rings import aimed, fires_by_azimuth
+from densify.free_space.rings import Aimed, aimed, find_rings, fires_by_azimuth
 from densify.free_space.sensor import SensorModel, Sensors
 from densify.geometry.types import RegisteredSweep
 from densify.readers.file_sequence import scanner_axes
 from densify.street.sensors import SENSORS, Spinning
 from tests.fired import fired
-from tests.scenes import on_sphere
+from tests.scenes import ROOM, Arc, Scanner, Scene, World, on_sphere
 
+MARGIN = (0.4, 0.015)
 DRIVING = np.array([0.0, 0.02, 0.3, 12.0, 0.0, 0.1])
 SPINNING = [
     (name, number)
@@ -99,44 +101,19 @@ def test_a_scanner_that_hangs_upside_down_has_axes_with_z_upwards():
 
 @pytest.mark.parametrize(("name", "number"), SPINNING)
 def test_a_spinning_scanner_is_found_as_it_is(name, number):
+    """Its spacing is at every ring the mean of the gaps above and below, however close."""
     model, pattern = sensors_of(name).models[number], pattern_of(name, number)
-    true_deg = np.sort(pattern.elevation_deg)
-    assert not model.unordered
+    true_deg, step_deg = np.sort(pattern.elevation_deg), 3600 / pattern.columns_per_s
+    assert not model.unordered and fires_by_azimuth(aimed(sweeps_of(name)[0], number))
     np.testing.assert_allclose(np.rad2deg(model.rings_rad), true_deg, atol=0.02)
-    step_deg = 3600 / pattern.columns_per_s
     assert np.rad2deg(model.azimuth_step_rad) == pytest.approx(step_deg, rel=0.02)
-    assert fires_by_azimuth(aimed(sweeps_of(name)[0], number))
     assert model.azimuth_rad == (-np.pi, np.pi)
     np.testing.assert_allclose(np.rad2deg(model.elevation_rad), true_deg[[0, -1]], atol=0.05)
     np.testing.assert_array_equal(model.origin_m, SENSORS[name].scanners[number].origin_m)
-
-
-@pytest.mark.parametrize(("name", "number"), SPINNING)
-def test_spacing_is_that_of_the_true_rings(name, number):
-    """At every ring the mean of the gaps above and below, however close: none are merged."""
-    model, true_deg = (
-        sensors_of(name).models[number],
-        np.sort(pattern_of(name, number).elevation_deg),
-    )
     found = np.rad2deg(model.table.at(np.zeros(len(true_deg)), np.deg2rad(true_deg)))
-    gaps = np.diff(true_deg)
-    mean = 0.5 * (np.append(gaps[0], gaps) + np.append(gaps, gaps[-1]))
-    np.testing.assert_allclose(found[:, 1], mean, rtol=0.12, atol=0.01)
-    across = 3600 / pattern_of(name, number).columns_per_s * np.cos(np.deg2rad(true_deg))
+    np.testing.assert_allclose(found[:, 1], np.gradient(true_deg), rtol=0.12, atol=0.01)
+    across = step_deg * np.cos(np.deg2rad(true_deg))
     np.testing.assert_allclose(found[:, 0], across, rtol=0.03)
-
-
-@pytest.mark.parametrize(
-    ("name", "elevation_deg", "spacing_deg"),
-    [("panda", -0.5, 1 / 6), ("panda", -25, 6.0), ("vls128", -1, 0.11), ("os128", -10, 45 / 127)],
-)
-def test_uneven_rings_are_close_in_the_middle_and_far_at_the_ends(name, elevation_deg, spacing_deg):
-    points = on_sphere(np.arange(0, 360, 7.0), elevation_deg, 30.0)
-    model = sensors_of(name).models[0]
-    azimuth, elevation, range_m = model.directions(points + model.origin_m)
-    np.testing.assert_allclose(range_m, 30.0)
-    found = model.table.at(azimuth, elevation)[:, 1]
-    np.testing.assert_allclose(np.rad2deg(found), spacing_deg, rtol=0.03)
 
 
 def test_lasers_that_share_no_origin_make_lines():
@@ -191,7 +168,75 @@ def test_a_scanner_that_looks_ahead_sees_nothing_else():
     assert model.sees(azimuth, elevation).tolist() == [True] * 3 + [False] * 5
 
 
-# --- several scanners -----------------------------------------------------------------------------
+# --- cells of range images ------------------------------------------------------------------------
+
+TABLES = {
+    name: np.sort(SENSORS[name].scanners[0].pattern.elevation_deg)
+    for name in ("hdl64", "hdl32", "vlp16", "dual32")
+}
+TABLES["128 beams"] = np.concatenate([np.arange(-25, -6, 0.5), np.arange(-6, 5.25, 0.125)])
 
 
-# --- little, or nothing ---------------------------------------------------------------------------
+def on_rings(elevation_deg, noise_deg=0.01, num_columns=600, seed=0):
+    """(3,N) azimuth and elevation (rad) of returns, each ring with a share of its own missing."""
+    rng = np.random.default_rng(seed)
+    azimuth = np.tile(np.arange(num_columns) * 360 / num_columns - 180, len(elevation_deg))
+    elevation = np.repeat(elevation_deg, num_columns) + rng.normal(0, noise_deg, len(azimuth))
+    heard = rng.random(len(azimuth)) < np.repeat(
+        rng.uniform(0.2, 1, len(elevation_deg)), num_columns
+    )
+    return np.deg2rad(azimuth[heard], dtype=np.float32), np.deg2rad(
+        elevation[heard], dtype=np.float32
+    )
+
+
+def cells(azimuth, elevation):
+    """Edges of the rows and number of columns of the finest image."""
+    nothing = np.zeros(len(azimuth), np.float32)
+    found, *_ = range_image._cells(Aimed(azimuth, elevation, nothing, nothing), 1, by_ring=False)
+    return found.row_edges_rad, found.num_columns
+
+
+@pytest.mark.parametrize("name", TABLES)
+def test_rings_are_found_wherever_the_beams_point(name):
+    azimuth, elevation = on_rings(TABLES[name])
+    found = find_rings(elevation)
+    np.testing.assert_allclose(np.rad2deg(found), TABLES[name], atol=0.03)
+    edges, num_columns = cells(azimuth, elevation)
+    assert 600 / 1.5 < num_columns <= 600
+    rows = np.diff(np.rad2deg(edges))
+    assert rows.min() > 0.44
+    lone = np.flatnonzero(np.gradient(TABLES[name]) > 1.0)  # a row each, half the way to the next
+    row_of = np.searchsorted(np.rad2deg(edges), TABLES[name])
+    assert all((row_of == row_of[ring]).sum() == 1 for ring in lone)
+
+
+def test_where_there_are_no_rings_rows_are_uniform():
+    rng = np.random.default_rng(0)
+    smeared = on_rings(TABLES["vlp16"], noise_deg=0.6)
+    anywhere = rng.uniform(-3, 3, 30000), rng.uniform(-0.4, 0.1, 30000)
+    sparse = rng.uniform(-3, 3, 600), rng.uniform(-0.4, 0.1, 600)
+    for azimuth, elevation in (smeared, anywhere, sparse):
+        azimuth, elevation = azimuth.astype(np.float32), elevation.astype(np.float32)
+        assert find_rings(elevation) is None
+        edges, _ = cells(azimuth, elevation)
+        np.testing.assert_allclose(np.diff(edges), np.diff(edges)[0], rtol=1e-3)
+        assert edges[0] <= elevation.min() and edges[-1] > elevation.max()
+
+
+@pytest.mark.parametrize(("num_beams", "num_azimuths"), [(16, 1800), (32, 450), (64, 900)])
+def test_cells_follow_the_sensor(num_beams, num_azimuths):
+    scanner = Scanner(num_beams, num_azimuths, elevation_deg=(-15.0, 15.0))
+    image = RangeImage.of(Scene(World(ROOM), Arc(0, 0), scanner).stretch(2, 0).sweeps[0])
+    (only,) = image.scanners
+    # no finer than the rays, or cells stay empty; no coarser than twice, or movers hide in them
+    spacing = 30 / (num_beams - 1)
+    rows = np.diff(np.rad2deg(only.row_edges_rad)) / spacing
+    np.testing.assert_allclose(rows, 1, atol=0.08)
+    assert 1 <= num_azimuths / only.nearest_m.shape[1] < 1.5
+    rng = np.random.default_rng(0)
+    # clear of the ground and of the upper edge, where the 3 x 3 cells leave the image
+    hung = on_sphere(rng.uniform(-180, 180, 2000), rng.uniform(-5, 15 - 1.5 * spacing, 2000), 9.0)
+    assert image.sees_through(hung, *MARGIN).mean() > 0.995
+    wall = on_sphere(rng.uniform(-40, 40, 500), rng.uniform(-3, 3, 500), 1.0)
+    assert not image.sees_through(wall * (20 / wall[:, :1]), *MARGIN).any()

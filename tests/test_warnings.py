@@ -20,14 +20,13 @@ from tests.small_street import KEY, POSES_GIVEN, one_car
 
 
 class Changed(TinySequence):
-    """The small street with other cameras, image stamps (ms after the first sweep), times of points
-    and axes."""
+    """The small street with other cameras, image stamps (ms) and times of points."""
 
-    def __init__(self, cameras=(CAMERA,), images_ms=None, times=None, axes=(1, 2, 3)):
+    def __init__(self, cameras=(CAMERA,), images_ms=None, times=None):
         usual = one_car()
         super().__init__(usual.scene, usual.frames)
         self.cameras = {camera.name: camera for camera in cameras}
-        self._images_ms, self._times, self._axes = images_ms, times, np.array(axes)
+        self._images_ms, self._times = images_ms, times
 
     def image_stamps_ns(self, camera):
         if self._images_ms is None:
@@ -39,8 +38,6 @@ class Changed(TinySequence):
 
     def __getitem__(self, frame):
         sweep = super().__getitem__(frame)
-        turned = sweep.points[:, abs(self._axes) - 1] * np.sign(self._axes)
-        sweep = replace(sweep, points=turned)
         return sweep if self._times is None else replace(sweep, offset_ns=self._times(sweep))
 
     def gaps(self):
@@ -63,7 +60,6 @@ def test_nothing_is_said_of_what_is_right():
     ("sequence", "says"),
     [
         (lambda: Changed(), "a file is missing"),
-        (lambda: Changed(axes=(-2, -3, 1)), "the ground lies as if -y pointed up, not z"),
         (lambda: Changed(times=lambda sweep: None), "the points have no times of their own"),
         (
             lambda: Changed(images_ms={"front": {0: 10**12}}),

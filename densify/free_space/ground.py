@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -34,17 +34,7 @@ _MAX_LEAN_RAD, _MIN_LEAN_RAD = np.deg2rad([50.0, 6.0])  # less is the road's slo
 
 def ground(stretch: Stretch) -> HeightMap:
     """Return the ground height under all sweeps, in the world frame with z up."""
-    return HeightMap.of(_WorldPoints(stretch))
-
-
-@dataclass(frozen=True)
-class _WorldPoints:
-    """The (N,3) points of each sweep, world frame, made one sweep at a time to save memory."""
-
-    stretch: Stretch
-
-    def __iter__(self) -> Iterator[Float]:
-        return (poses.transform(s.T_world_lidar, s.sweep.points) for s in self.stretch.sweeps)
+    return HeightMap.of([poses.transform(s.T_world_lidar, s.sweep.points) for s in stretch.sweeps])
 
 
 @dataclass(frozen=True)
@@ -59,14 +49,14 @@ class HeightMap:
     cell_m: float
 
     @staticmethod
-    def of(clouds: Iterable[Float]) -> HeightMap:
+    def of(clouds: Sequence[Float]) -> HeightMap:
         """Find the ground under point clouds.
 
         The second lowest point of a cell is its ground (the lowest may be a stray reflection). A
         cell far below the median of its neighbours is repaired. The slope limit then cuts cars and
         walls away, and humps are removed. The points near this lower hull are averaged.
 
-        clouds: (N,3) each, metres, z up, at least one point in all; iterated four times.
+        clouds: (N,3) each, metres, z up, at least one point in all.
         """
         low, shape = _grid(clouds)
         lowest, second = np.full((2, *shape), np.inf)
@@ -103,13 +93,10 @@ class HeightMap:
         return height_m
 
 
-def _grid(clouds: Iterable[Float]) -> tuple[Float, tuple[int, int]]:
+def _grid(clouds: Sequence[Float]) -> tuple[Float, tuple[int, int]]:
     """Return the (2,) lower corner of a grid that holds all points, and its numbers of cells."""
-    low, high = np.full(2, np.inf), np.full(2, -np.inf)
-    for points in clouds:
-        if len(points):
-            low = np.minimum(low, points[:, :2].min(axis=0))
-            high = np.maximum(high, points[:, :2].max(axis=0))
+    low = np.min([p[:, :2].min(axis=0, initial=np.inf) for p in clouds], axis=0)
+    high = np.max([p[:, :2].max(axis=0, initial=-np.inf) for p in clouds], axis=0)
     low = np.floor(low / CELL_M) * CELL_M
     num_x, num_y = ((high - low) / CELL_M).astype(np.int64) + 1
     return low, (int(num_x), int(num_y))
@@ -121,7 +108,7 @@ def _cells(points: Float, low_m: Float) -> tuple[Int, Int]:
     return x, y
 
 
-def _averaged(hull: HeightMap, clouds: Iterable[Float]) -> Float:
+def _averaged(hull: HeightMap, clouds: Sequence[Float]) -> Float:
     """Return the (X,Y) mean height of the points close to the hull, around each cell.
 
     The hull itself is lower where more points were measured; an object that drives from one such
@@ -177,19 +164,6 @@ def find_upright(sweeps: Sequence[Sweep]) -> Float:
         if normals:
             return _level(np.median(normals, axis=0)) @ R_hung_lidar
     return np.eye(3)
-
-
-def find_up_axis(sweep: Sweep) -> str:
-    """Return the axis that points up, such as ``-y``; "" where it is z or -z, or not known."""
-    if any(_ground_normal(sweep.points @ R.T) is not None for R in (np.eye(3), _UPSIDE_DOWN)):
-        return ""
-    for name in ("-y", "y", "-x", "x"):
-        up = np.eye(3)["xyz".index(name[-1])] * (-1.0 if name[0] == "-" else 1.0)
-        forward = np.roll(up, 1)
-        R_hung_lidar = np.stack([forward, np.cross(up, forward), up])
-        if _ground_normal(sweep.points @ R_hung_lidar.T) is not None:
-            return name
-    return ""
 
 
 def _level(up: Float) -> Float:

@@ -10,7 +10,6 @@ import numpy as np
 
 from densify.config import Config
 from densify.depth.exposure import Shot
-from densify.free_space.ground import find_up_axis
 from densify.geometry.types import LidarSequence, Result, Stretch
 from densify.pipeline.key_result import METHODS, looks_around
 from densify.pipeline.recording import Recording
@@ -58,14 +57,7 @@ def _of_window(recording: Recording, key: int, follows: bool) -> Iterator[str]:
 
 
 def _of_sweeps(stretch: Stretch, settings: Config) -> Iterator[str]:
-    sweeps = [registered.sweep for registered in stretch.sweeps]
-    up = find_up_axis(sweeps[len(sweeps) // 2])
-    if up:
-        yield (
-            f"the ground lies as if {up} pointed up, not z: moving objects are hardly found so; "
-            f"densify doctor says which axes the points have"
-        )
-    if settings.register.deskew and any(sweep.offset_ns is None for sweep in sweeps):
+    if settings.register.deskew and any(s.sweep.offset_ns is None for s in stretch.sweeps):
         yield "the points have no times of their own: motion within a sweep is not undone"
 
 
