@@ -228,8 +228,8 @@ def moved(trajectory: Trajectory, index: int, twist) -> Trajectory:
         ([0, 0, 0, 8, 0, 0], "from frame 5 to 6: 9[0-9] m/s"),
         ([0, 0, 0, 0, -9, 0], "from frame 5 to 6"),
         ([0, 0, 0.5, 0, 0, 0], "from frame 5 to 6: .* deg/s"),
-        ([0, 0, 0, 2, 0, 0], "at frame 5: the speed changes by 2[0-9]"),
-        ([0, 0, 0, -1.5, 0, 0], "at frame 5"),
+        ([0, 0, 0, 2, 0, 0], "from frame 5 to 6: the speed changes by 2[0-9]"),
+        ([0, 0, 0, -1.5, 0, 0], "from frame 5 to 6: the speed changes"),
     ],
 )
 def test_jumps_name_their_frames(drive, twist, what):

@@ -23,13 +23,7 @@ from densify.geometry.compiled import num_threads
 from densify.geometry.types import Bool, Float, Int, RegisteredSweep, Sweep
 from densify.registration.alignment import Alignment, Surface, SurfaceMap, align, subsample
 from densify.registration.deskew import deskew_sweep
-from densify.registration.odometry import MAX_SPEED_M_S
-from densify.registration.trajectory import (
-    MAX_ACCELERATION_M_S2,
-    MIN_NUM_POINTS,
-    MIN_OVERLAP,
-    POSE_NOISE_M,
-)
+from densify.registration.trajectory import MIN_NUM_POINTS, MIN_OVERLAP, find_jump
 
 _CHAIN_MATCH_M = 2.0
 _MAP_NS = 550_000_000  # the known sweeps within it make the first map
@@ -110,7 +104,7 @@ class _ChainEnd:
         guess = self.T_world_lidar @ poses.exp(self.twist * step_s)
         found = self._map.align(surface, guess, _CHAIN_MATCH_M)
         twist = poses.twist_between(self.T_world_lidar, found.T_target_source, step_s)
-        if found.overlap < MIN_OVERLAP or not _plausible(self.twist, twist, abs(step_s)):
+        if found.overlap < MIN_OVERLAP or find_jump(twist, self.twist, abs(step_s)):
             return False
         self.T_world_lidar, self.stamp_ns = found.T_target_source, sweep.stamp_ns
         self.twist = twist
@@ -131,16 +125,6 @@ def _next_rows(stamp_ns: Int, row: int, last_ns: int, step_m: float, speed_m_s: 
         if len(rows) == _TOGETHER:
             break
     return rows or [len(stamp_ns) - 1]
-
-
-def _plausible(before: Float, after: Float, step_s: float) -> bool:
-    slack_m_s = POSE_NOISE_M / step_s
-    change_m_s = float(np.linalg.norm(after[3:] - before[3:]))
-    return bool(
-        np.isfinite(after).all()
-        and np.linalg.norm(after[3:]) <= MAX_SPEED_M_S + slack_m_s
-        and change_m_s <= MAX_ACCELERATION_M_S2 * step_s + slack_m_s
-    )
 
 
 class Relaxed(NamedTuple):
