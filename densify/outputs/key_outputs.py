@@ -189,7 +189,11 @@ def record(result: Result, context: Context) -> dict[str, Any]:
         "far_left_out": result.far_left_out,
         "cameras": list(result.depth),
         "prior": {
-            name: {"source": full.source, **asdict(full.fit), "share": full.share}
+            name: {
+                "source": full.source,
+                **asdict(full.fit),
+                "share": float(full.from_prior.mean()),
+            }
             for name, full in result.full.items()
         },
         "warnings": result.warnings,

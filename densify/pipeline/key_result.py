@@ -10,14 +10,14 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from densify.config import Config
 from densify.config.errors import InputError
 from densify.depth.confidence import expected_outliers, reliability
-from densify.depth.exposure import Shot
 from densify.depth.views import HeldOut, SeenCloud, Views, with_ages
 from densify.free_space.range_image import RangeImage
 from densify.geometry.types import Bool, Cloud, DepthMap, Float32, Result, Stretch
 from densify.pipeline.costs import Watch
-from densify.pipeline.recording import Beyond, Moment, Recording
+from densify.pipeline.recording import Beyond, Moment
 from densify.scores import depth_metrics
 from densify.scores.cloud_scores import ghost_scores
 
@@ -67,39 +67,24 @@ def looks_around(methods: Sequence[str]) -> bool:
     return any(METHODS[name].engine is not None for name in methods if name in METHODS)
 
 
-class KeyScene:
+class KeyScene(NamedTuple):
     """The inputs that all methods of a key share.
 
-    stretch: the key's window. images: (H,W,3) RGB of the maps that show one. beyond: None where
-    nothing is known or wanted. with_images: colour the cloud, and compare depth with the truth.
-    key_image: range image of the key sweep. views: of the maps. truth: depth and what moves, by
-    map. held_out: the key sweep as the truth of what is made without it.
+    stretch: the key's window. beyond: None where nothing is known or wanted. key_image: range image
+    of the key sweep. views: of the maps. images: (H,W,3) RGB of the maps that are coloured. truth:
+    depth and what moves, by map. held_out: the key sweep as the truth of what is made without it.
     """
 
-    def __init__(
-        self,
-        recording: Recording,
-        key: int,
-        stretch: Stretch,
-        shots: Mapping[str, Shot],
-        images: Mapping[str, NDArray[np.uint8]],
-        moment: Moment,
-        beyond: Beyond | None,
-        with_images: bool,
-        watch: Watch,
-    ) -> None:
-        """moment: of the last method, which says what moves in the key sweep."""
-        sequence, settings = recording.sequence, recording.settings
-        self.settings, self.key, self.stretch, self.beyond = settings, key, stretch, beyond
-        self.with_images, self.watch = with_images, watch
-        self.images = images if with_images else {}
-        self.key_image = RangeImage.of(stretch[key])
-        self.views = Views.of(sequence, stretch, key, self.key_image, shots, images, settings)
-        self.truth: Mapping[str, tuple[Float32, Bool]] = {}
-        if with_images and sequence.truth is not None:
-            self.truth = self.views.truth(sequence.truth)
-        with watch.stage("held out"):
-            self.held_out = HeldOut.of(self.views, moment.cloud)
+    settings: Config
+    key: int
+    stretch: Stretch
+    beyond: Beyond | None
+    key_image: RangeImage
+    views: Views
+    images: Mapping[str, NDArray[np.uint8]]
+    truth: Mapping[str, tuple[Float32, Bool]]
+    held_out: HeldOut
+    watch: Watch
 
 
 def result_of_method(scene: KeyScene, name: str, moment: Moment) -> Result:
@@ -125,7 +110,7 @@ def result_of_method(scene: KeyScene, name: str, moment: Moment) -> Result:
             seen = views.see(static, visible).joined(far)
         depth = _add_ages(scene, method, views.depth(seen, visible))
     cloud = seen.cloud
-    if scene.with_images:
+    if scene.images:
         with watch.stage("colour"):
             cloud = views.coloured(seen, depth, scene.images)
     with watch.stage("score"):

@@ -298,7 +298,7 @@ class Recording:
         for piece in self.registration(number).pieces:
             frames = tuple(f for f in piece.frames if f in block)
             if frames:
-                part = piece.part([f for f in piece.frames if f in wanted]).seen_from(frames[0])
+                part = piece.part([f for f in piece.frames if f in wanted], origin=frames[0])
                 pieces.append(Piece(number, len(pieces), part, frames))
         return pieces
 

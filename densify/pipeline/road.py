@@ -99,15 +99,15 @@ class Road:
         last = near.sweeps[0 if side < 0 else -1].T_world_lidar[:3, 3]
         begin_m = 0.0 if side < 0 else _travel_m(near)[-1]
         found, last_m, travel_m = list[_Passed](), 0.0, 0.0
-        for sweep, T_world_lidar, before, after in self._sweeps_beyond(near, side):
+        for sweep, T_world_lidar, twist in self._sweeps_beyond(near, side):
             travel_m += float(np.linalg.norm(T_world_lidar[:3, 3] - last))
             last = T_world_lidar[:3, 3]
             if travel_m - last_m < _LEAST_STEP_M:
                 continue
             last_m = travel_m
             seen = sweep.select(_in_view(sweep, T_world_lidar, views))
-            sample = deskew_sweep(subsample(sweep), T_world_lidar, before, after).sweep.points
-            registered = RegisteredSweep(seen, T_world_lidar, before, after)
+            sample = deskew_sweep(subsample(sweep), T_world_lidar, twist, twist).sweep.points
+            registered = RegisteredSweep(seen, T_world_lidar, twist, twist)
             found.append(_Passed(registered, sample, begin_m + side * travel_m, known=False))
         return found
 
@@ -125,25 +125,16 @@ class Road:
             for T in chosen
         ]
 
-    def _sweeps_beyond(
-        self, near: Stretch, side: int
-    ) -> Iterator[tuple[Sweep, Float, Float, Float]]:
-        """Yield raw sweeps, the nearest first, their poses, and twists before and after."""
+    def _sweeps_beyond(self, near: Stretch, side: int) -> Iterator[tuple[Sweep, Float, Float]]:
+        """Yield raw sweeps, the nearest first, their poses, and twists per second."""
         known = near.sweeps[::side]
-        num = self._most_sweeps(near)
-        if side < 0:
-            frames = self.timeline.before(known[-1].frame, num)[::-1]
-        else:
-            frames = self.timeline.after(known[-1].frame, num)
+        beside = self.timeline.before if side < 0 else self.timeline.after
+        frames = beside(known[-1].frame, self._most_sweeps(near))[::side]
         if self.settings.source == "dataset":
-            yield from self._recorded(known[-1], frames)
-            return
+            return self._recorded(known[-1], frames)
         stamp_ns = np.array([self.timeline.stamp_of(f) for f in frames], np.int64)
         read, prepare = self.sweeps.read, self.sweeps.prepare
-        for sweep, T_world_lidar, twist in follow_road(
-            known, frames, stamp_ns, read, prepare, self.far_m, _STEP_M
-        ):
-            yield sweep, T_world_lidar, twist, twist
+        return follow_road(known, frames, stamp_ns, read, prepare, self.far_m, _STEP_M)
 
     def _most_sweeps(self, near: Stretch) -> int:
         """Return how many sweeps on each side may be needed, at half the window's speed."""
@@ -157,32 +148,27 @@ class Road:
 
     def _recorded(
         self, known: RegisteredSweep, frames: Sequence[int]
-    ) -> Iterator[tuple[Sweep, Float, Float, Float]]:
+    ) -> Iterator[tuple[Sweep, Float, Float]]:
         """Yield the same by the recording's own poses."""
-        chosen, T_recorded = [], []
-        for frame in (known.frame, *frames):
-            try:
-                T_recorded.append(cast(Float, self.sweeps.recorded_pose(frame)))
-            except InputError:
-                break
-            chosen.append(frame)
-        T = known.T_world_lidar @ poses.inverse(T_recorded[0]) @ np.stack(T_recorded)
-        order = np.argsort(chosen)
-        stamp_ns = np.array([self.timeline.stamp_of(f) for f in chosen], np.int64)
-        trajectory = Trajectory(tuple(sorted(chosen)), stamp_ns[order], T[order])
-        travel_m = np.cumsum(np.linalg.norm(np.diff(T[:, :3, 3], axis=0), axis=1))
-        last_m = 0.0
-        for i, at_m in enumerate(travel_m.tolist(), start=1):
-            if at_m > self.far_m:
-                return
-            if at_m - last_m < _LEAST_STEP_M:
-                continue
-            last_m = at_m
-            try:
-                sweep = self.sweeps.read(chosen[i])
-            except InputError:
-                return
-            yield sweep, T[i], *twists(trajectory, trajectory.frames.index(chosen[i]))
+        travel_m, last_m, last, last_ns = 0.0, 0.0, known.T_world_lidar, known.sweep.stamp_ns
+        try:
+            T_world_recorded = last @ poses.inverse(self._pose(known.frame))
+            for frame in frames:
+                T = T_world_recorded @ self._pose(frame)
+                stamp_ns = self.timeline.stamp_of(frame)
+                twist = poses.twist_between(last, T, (stamp_ns - last_ns) * 1e-9)
+                travel_m += float(np.linalg.norm(T[:3, 3] - last[:3, 3]))
+                last, last_ns = T, stamp_ns
+                if travel_m > self.far_m:
+                    return
+                if travel_m - last_m >= _LEAST_STEP_M:
+                    last_m = travel_m
+                    yield self.sweeps.read(frame), T, twist
+        except InputError:  # the road ends where there is no pose or sweep
+            return
+
+    def _pose(self, frame: int) -> Float:
+        return cast(Float, self.sweeps.recorded_pose(frame))
 
 
 def _deskewed(p: _Passed) -> RegisteredSweep:

@@ -25,7 +25,9 @@ from densify.config import Config, resolve
 from densify.config.cache import Cache
 from densify.config.errors import ComputationError, InputError
 from densify.depth.exposure import key_shots, load_images
+from densify.depth.views import HeldOut, Views
 from densify.flow.engines import check_engine
+from densify.free_space.range_image import RangeImage
 from densify.geometry.compiled import num_threads
 from densify.geometry.types import LidarSequence, Progress, Result, StretchFlow
 from densify.pipeline.costs import Watch
@@ -185,8 +187,14 @@ def densify(
                 key, method.all_sweeps, method.engine, settings.output.flow != "none"
             )
         beyond = far.result() if far is not None else None
+        key_image = RangeImage.of(stretch[key])
+        views = Views.of(sequence, stretch, key, key_image, shots, images, settings)
+        truth = views.truth(sequence.truth) if with_images and sequence.truth else {}
+        with watch.stage("held out"):
+            held_out = HeldOut.of(views, moments[methods[-1]].cloud)
+        shown = images if with_images else {}
         scene = KeyScene(
-            recording, key, stretch, shots, images, moments[methods[-1]], beyond, with_images, watch
+            settings, key, stretch, beyond, key_image, views, shown, truth, held_out, watch
         )
         made = list(pool.map(partial(result_of_method, scene), methods, moments.values()))
 
@@ -194,9 +202,7 @@ def densify(
         from densify.pipeline.prior import complete_with_prior
 
         with watch.stage("prior"):
-            made[-1] = complete_with_prior(
-                made[-1], priors, shots, scene.truth, settings.prior.kind
-            )
+            made[-1] = complete_with_prior(made[-1], priors, shots, truth, settings.prior.kind)
     results: dict[str, Result] = {}
     for result in made:
         results[result.method] = replace(result, costs=watch.costs(), baselines=dict(results))

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from enum import IntEnum
 from typing import Any, NamedTuple
 
@@ -51,34 +51,28 @@ class Cloud:
         x, y, z = (self.points - self.rigid_points).T
         return np.sqrt(x * x + y * y + z * z).astype(np.float32)
 
-    def after(self, seconds: float) -> Cloud:
-        """Return the cloud shortly after (or before) the key's moment, at constant velocity."""
-        return replace(self, points=self.points + seconds * self.velocity_m_s)
-
     def joined(self, other: Cloud) -> Cloud:
         """Return the cloud with another's points behind its own."""
-        names = [f.name for f in fields(self)]
-        return Cloud(**{n: np.concatenate([getattr(self, n), getattr(other, n)]) for n in names})
+        return Cloud(**{n: np.concatenate([c, vars(other)[n]]) for n, c in vars(self).items()})
 
     def select(self, keep: Bool) -> Cloud:
         """Return the points where ``keep`` (M,) is True."""
         rows = np.flatnonzero(keep)  # once for all columns
-        return Cloud(**{f.name: getattr(self, f.name).take(rows, axis=0) for f in fields(self)})
+        return Cloud(**{name: column.take(rows, axis=0) for name, column in vars(self).items()})
 
     def columns(self) -> dict[str, NDArray[Any]]:
         """Return all columns (M,) by name, vectors by axis: x y z, rigid_x rigid_y rigid_z,
         velocity_x velocity_y velocity_z (m/s), red green blue, and the rest as above."""
         by_axis = {
-            "points": ("x", "y", "z"),
-            "rigid_points": ("rigid_x", "rigid_y", "rigid_z"),
-            "velocity_m_s": ("velocity_x", "velocity_y", "velocity_z"),
-            "rgb": ("red", "green", "blue"),
+            "points": "x y z",
+            "rigid_points": "rigid_x rigid_y rigid_z",
+            "velocity_m_s": "velocity_x velocity_y velocity_z",
+            "rgb": "red green blue",
         }
         columns: dict[str, NDArray[Any]] = {}
-        for f in fields(self):
-            values = getattr(self, f.name)
-            names = by_axis.get(f.name)
-            columns |= dict(zip(names, values.T, strict=True)) if names else {f.name: values}
+        for name, values in vars(self).items():
+            names = by_axis.get(name, name).split()
+            columns |= zip(names, np.atleast_2d(values.T), strict=True)
         return columns
 
     def to_numpy(self) -> NDArray[Any]:
@@ -109,26 +103,15 @@ class Patches:
     def joined(self, other: Patches) -> Patches:
         """Return the patches with those of another cloud behind them; no sweep is in both."""
         num_sweeps = np.int32(self.sweep.max(initial=-1) + 1)
-        return Patches(
-            np.concatenate([self.normal, other.normal]),
-            np.concatenate([self.spacing_m, other.spacing_m]),
-            np.concatenate([self.free, other.free]),
-            np.concatenate([self.sweep, num_sweeps + other.sweep]),
-            np.concatenate([self.place, other.place]),
-        )
+        behind = vars(other) | {"sweep": num_sweeps + other.sweep}
+        return Patches(**{n: np.concatenate([c, behind[n]]) for n, c in vars(self).items()})
 
     def select(self, keep: Bool) -> Patches:
         """Return the patches of ``cloud.select(keep)``."""
         rows = np.flatnonzero(keep)
-        sweep = self.sweep[rows]
-        number = np.cumsum(np.bincount(sweep) > 0) - 1
-        return Patches(
-            self.normal.take(rows, axis=0),
-            self.spacing_m.take(rows, axis=0),
-            self.free[rows],
-            number[sweep].astype(np.int32),
-            self.place[rows],
-        )
+        kept = {name: column.take(rows, axis=0) for name, column in vars(self).items()}
+        number = np.cumsum(np.bincount(kept["sweep"]) > 0) - 1
+        return Patches(**kept | {"sweep": number[kept["sweep"]].astype(np.int32)})
 
 
 @dataclass(frozen=True)

@@ -83,11 +83,6 @@ class FullDepth:
     fit: PriorFit
     source: str
 
-    @property
-    def share(self) -> float:
-        """Share of the image's pixels that came from the prior."""
-        return float(np.mean(self.from_prior)) if self.from_prior.size else 0.0
-
 
 Progress = Callable[[str, int, int], None]
 """Called as ``(stage, done, total)`` while something takes its time."""

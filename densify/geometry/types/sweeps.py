@@ -48,14 +48,6 @@ class Sweep:
             column = getattr(self, name)
             if column is not None and column.shape != (n,):
                 raise ValueError(f"Sweep.{name}: expected ({n},), got {column.shape}")
-        num_scanners = int(self.lidar.max(initial=0)) + 1
-        for name, one in (("scanner_origins", (3,)), ("R_scanner_lidar", (3, 3))):
-            given = getattr(self, name)
-            if given is not None and (given.shape[1:] != one or len(given) < num_scanners):
-                raise ValueError(
-                    f"Sweep.{name}: expected {one} for each of {num_scanners} scanners, "
-                    f"got {given.shape}"
-                )
 
     def __len__(self) -> int:
         return len(self.points)
@@ -93,22 +85,18 @@ class Trajectory:
     T_world_lidar: Float
     R_level_lidar: Float = field(default_factory=lambda: np.eye(3))
 
-    def part(self, frames: Sequence[int]) -> Trajectory:
-        """Return the poses of these frames alone."""
+    def part(self, frames: Sequence[int], origin: int) -> Trajectory:
+        """Return the poses of these frames, in the upright world of that ``origin``."""
         rows = [self.frames.index(f) for f in frames]
+        T_new_lidar = np.eye(4)
+        T_new_lidar[:3, :3] = self.R_level_lidar
+        T_new_old = T_new_lidar @ inverse(self.T_world_lidar[self.frames.index(origin)])
         return replace(
             self,
             frames=tuple(frames),
             stamp_ns=self.stamp_ns[rows],
-            T_world_lidar=self.T_world_lidar[rows],
+            T_world_lidar=T_new_old @ self.T_world_lidar[rows],
         )
-
-    def seen_from(self, frame: int) -> Trajectory:
-        """Return the poses in the world of that frame's lidar, upright."""
-        T_new_lidar = np.eye(4)
-        T_new_lidar[:3, :3] = self.R_level_lidar
-        T_new_old = T_new_lidar @ inverse(self.T_world_lidar[self.frames.index(frame)])
-        return replace(self, T_world_lidar=T_new_old @ self.T_world_lidar)
 
 
 @dataclass(frozen=True)
