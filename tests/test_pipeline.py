@@ -91,12 +91,6 @@ def test_what_stands_still_among_movers_is_icp_to_the_last_bit(moving):
     assert flow.rigid_points.tobytes() == icp.points[rows].tobytes()
 
 
-def test_ghosts_are_halved(moving):
-    icp, flow = (moving[m].metrics["ghosts"]["all"] for m in ("icp", "flow"))
-    assert icp > 0.001
-    assert flow < 0.5 * icp
-
-
 def test_movers_are_moved_to_the_key(moving):
     """Their points from all sweeps lie on the car as it stood at the key's moment."""
     cloud, scene = moving["flow"].cloud, tiny(MOVERS).scene
@@ -111,22 +105,6 @@ def test_movers_are_moved_to_the_key(moving):
         assert cloud.displaced[cloud.moving][inside].max() > 1.5
     strays = cloud.moving & (cloud.displaced == 0) & (cloud.frame != KEY)
     assert strays.sum() < 0.02 * cloud.moving.sum()
-
-
-def test_depth_of_movers_is_right(moving):
-    """KITTI's outliers on what moves, against the analytic image."""
-    outliers = {
-        m: r.metrics["depth"]["front"]["measured"]["moving"]["outliers"] for m, r in moving.items()
-    }
-    assert outliers["flow"] <= 0.5 * outliers["icp"]
-    assert outliers["flow"] < 0.1
-
-
-def test_depth_of_the_static_street_is_the_analytic_one(static):
-    for method in USUAL:
-        errors = static[method].metrics["depth"]["front"]["measured"]["all"]
-        assert errors["outliers"] < 0.03
-        assert errors["num_compared"] > 500
 
 
 def test_the_published_engine_runs_too():

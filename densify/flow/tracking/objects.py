@@ -106,7 +106,7 @@ class Track:
         """Return the rows of a batch that are its points."""
         sweeps = zip(batch.sweeps, batch.begins, strict=True)
         own = [self.claimed[j] + begin for j, begin in sweeps if j in self.claimed]
-        return np.concatenate(own)
+        return np.concatenate([np.zeros(0, np.int64), *own])  # all may have been taken away
 
     def num_points(self, n: int) -> int:
         """Return the number of its points in batch n."""
