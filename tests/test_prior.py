@@ -70,7 +70,6 @@ def test_any_scale_shift_and_kind_is_undone_and_known_pixels_stay(name):
     assert full.from_prior.sum() > 0.9 * (BLIND & ~SKY).sum()
     assert not (full.from_prior & (SKY | (maps.filled_m > 0))).any()
     assert off(full, full.from_prior).max() < 2e-3
-    assert full.share == full.from_prior.mean()
     known = maps.filled_m > 0
     assert np.array_equal(full.depth_m[known], maps.filled_m[known])
     certain = 0.2 + 0.8 * maps.confidence
@@ -141,7 +140,7 @@ def test_pixels_between_two_surfaces_are_left_out():
 def test_what_does_not_fit_is_not_used(value):
     maps = measured()
     full = complete(maps, prior(np.maximum(value, 0.01)), "depth")
-    assert not full.fit.used and not full.from_prior.any() and full.share == 0
+    assert not full.fit.used and not full.from_prior.any()
     assert full.depth_m.tobytes() == maps.filled_m.tobytes()
     assert (full.confidence[maps.filled_m > 0] > 0.2).all()
     assert not full.confidence[maps.filled_m == 0].any()

@@ -24,7 +24,8 @@ from densify.free_space.rays import see_beyond
 from densify.free_space.rings import FEW_POINTS, Aimed, aimed, fires_by_azimuth, measure
 from densify.geometry.types import Bool, Float, Float32, Int, RegisteredSweep
 
-_CELLS_PER_STEP = 1.14  # a cell a little larger than a step is rarely empty
+_CELLS_PER_STEP = 1.15  # a cell a little larger than a step is rarely empty
+_CELLS_PER_LINE = 1.14  # the even step of lines is 1 % longer than the usual one
 _MIN_ROW_RAD = np.deg2rad(0.45)
 # Closer rings share a row everywhere. Other rings have a row of their own from the range on at
 # which three of them span more than the error of registration.
@@ -247,12 +248,12 @@ def _cells(rays: Aimed, num_together: int, by_ring: bool) -> list[_Cells]:
     if len(rays.azimuth) < FEW_POINTS:
         return [_grid(_uniform_edges(rays.elevation, np.deg2rad(2.0)), np.deg2rad(1.0))]
     layout = measure([rays])
-    step = _CELLS_PER_STEP * layout.azimuth_step_rad / num_together
+    step = layout.azimuth_step_rad / num_together
     if layout.rings_rad is not None:
-        return _cells_of_rings(layout.rings_rad, step, by_ring)
+        return _cells_of_rings(layout.rings_rad, _CELLS_PER_STEP * step, by_ring)
     if not layout.unordered:
-        row_step = _CELLS_PER_STEP * float(np.median(layout.table.along))
-        return [_grid(_uniform_edges(rays.elevation, row_step), step)]
+        row_step = _CELLS_PER_LINE * float(np.median(layout.table.along))
+        return [_grid(_uniform_edges(rays.elevation, row_step), _CELLS_PER_LINE * step)]
     spacing = layout.table.at(rays.azimuth, rays.elevation)[:, 1]
     finest = _CELLS_PER_STEP * float(np.percentile(spacing, _DENSEST))
     flatten = float(np.cos(np.median(rays.elevation)))
