@@ -29,7 +29,7 @@ from densify.readers import open_sequence
 from densify.readers.kitti.drive import Calibration
 from densify.readers.nuscenes_tables import Annotations
 from densify.readers.street import Street
-from densify.readers.waymo_components import BOX_HEADING, BOX_SIZE, STAMP
+from densify.readers.waymo_components import STAMP
 
 pyarrow = pytest.importorskip("pyarrow")
 FRAMES = range(60, 63)
@@ -249,26 +249,6 @@ def test_damaged_boxes_are_refused(log: Path, tmp_path: Path) -> None:
 
 
 # Waymo
-
-
-def test_damaged_waymo_boxes_are_refused(places, tmp_path: Path, capsys) -> None:
-    from pyarrow import parquet
-
-    copy = shutil.copytree(places("waymo"), tmp_path / "street")
-    path = copy / "lidar_box" / "street.parquet"
-    whole = path.read_bytes()
-    table = parquet.read_table(path)
-    heading, size = BOX_HEADING, BOX_SIZE[0]
-    for wrong, said in (
-        (with_column(table, size, np.zeros(len(table))), "a box has no size"),
-        (with_column(table, heading, np.full(len(table), np.nan)), "not finite"),
-    ):
-        parquet.write_table(wrong, path)
-        assert said in refused(copy, tmp_path, capsys)
-    path.write_bytes(whole[: len(whole) // 2])
-    assert "not a whole parquet file" in refused(copy, tmp_path, capsys)
-    path.unlink()
-    assert "lidar_box/CONTEXT.parquet (waymo)" in refused(copy, tmp_path, capsys)
 
 
 def test_a_waymo_frame_without_boxes_has_no_label(places, tmp_path: Path) -> None:

@@ -131,12 +131,6 @@ def test_a_pickle_runs_nothing(tmp_path):
     assert not trace.exists()
 
 
-def test_columns_are_those_of_the_frame(written):
-    columns = read_columns(written / "lidar" / "00.pkl.gz")
-    assert list(columns) == ["x", "y", "z", "i", "t", "d"]
-    assert columns["d"].dtype == np.int64 and columns["t"].dtype == np.float64
-
-
 # A real sequence
 
 
