@@ -162,7 +162,6 @@ def numbers(*arrays):
 PLACE, ONE = numbers(POSE[:3, 3]), np.eye(4)
 POSE_TEXTS = {
     "KITTI": f"{numbers(ONE[:3])}\n{numbers(POSE[:3])}\n",
-    "KITTI with numbers": f"2 {numbers(POSE[:3])}\n1 {numbers(ONE[:3])}\n",
     "4x4 rows": f"{numbers(ONE)}\n{numbers(POSE)}\n",
     "4x4 blocks": "\n".join(numbers(row) for T in (ONE, POSE) for row in T),
     "TUM": f"# time\n0.09 0 0 0 0 0 0 1\n0.1 0 0 0 0 0 0 1\n0.2 {PLACE} {QX} {QY} {QZ} {QW}",

@@ -26,7 +26,6 @@ _MAX_BEYOND_NS = 200_000_000  # a pose is extrapolated at constant velocity for 
 
 _PLACES = tuple((a, f"t{a}", f"p{a}", f"pos_{a}", f"position_{a}") for a in "xyz")
 _TURNS = tuple((f"q{a}", f"q_{a}", f"rot_{a}", f"orientation_{a}") for a in "wxyz")
-_NUMBERS = ("frame", "index", "number", "id")
 
 
 @dataclass(frozen=True)
@@ -97,37 +96,33 @@ class PoseTrack:
 class PoseFile:
     """Poses as they are written, T_world_body if nothing else is known.
 
-    form: for people. T: (n,4,4). stamps_ns: when each was, None if the file has no times. numbers:
-    of the frames that they belong to, None if the file does not say.
+    form: for people. T: (n,4,4). stamps_ns: when each was, None if the file has no times.
     """
 
     path: Path
     form: str
     T: Float
     stamps_ns: tuple[int, ...] | None = None
-    numbers: tuple[int, ...] | None = None
 
     @staticmethod
     def read(path: Path, unit: str = "") -> PoseFile:
         """unit: of the times, "" finds it out. Raises InputError that names file and line."""
         table = TextTable.read(path, [name for names in _TURNS for name in names])
-        width, time, number = len(table.rows[0]), None, None
+        width, time = len(table.rows[0]), None
         columns = [i for names in (*_TURNS, *_PLACES) if (i := table.column(names)) is not None]
         form = "table with quaternions"
         if len(columns) == 7:
             time = table.column(TIME_COLUMNS)
-            number = table.column(_NUMBERS) if time is None else None
         elif width == 8:
             form, columns, time = "TUM", [7, 4, 5, 6, 1, 2, 3], 0
         elif width == 4 and len(table.rows) % 4 == 0:
             T = _numbers(table).reshape(-1, 4, 4)
             return PoseFile(path, "4x4 blocks", _rigid(path, T, table.lines[::4]))
-        elif width in (12, 13, 16, 17):
-            values = _numbers(table)
-            T = values[:, width % 4 :].reshape(len(values), -1, 4)
-            form = "KITTI 3x4" if width < 16 else "4x4 rows"
-            numbers = tuple(map(int, values[:, 0])) if width % 4 else None
-            return PoseFile(path, form, _rigid(path, T, table.lines), None, numbers)
+        elif width in (12, 16):
+            T = _numbers(table).reshape(len(table.rows), -1, 4)
+            return PoseFile(
+                path, "KITTI 3x4" if width == 12 else "4x4 rows", _rigid(path, T, table.lines)
+            )
         else:
             raise InputError(
                 f"{path}: line {table.lines[0]}: got {width} numbers, expected 12 (KITTI), 16 "
@@ -138,8 +133,7 @@ class PoseFile:
         lines = zip(values, table.lines, strict=True)
         T = np.stack([quaternion_pose(v[:4], v[4:], f"{path}: line {n}") for v, n in lines])
         stamps_ns = None if time is None else table.times_ns(time, unit)[0]
-        numbers = None if number is None else tuple(map(int, _numbers(table, [number])[:, 0]))
-        return PoseFile(path, form, T, stamps_ns, numbers)
+        return PoseFile(path, form, T, stamps_ns)
 
 
 def _numbers(table: TextTable, columns: Sequence[int] | None = None) -> Float:

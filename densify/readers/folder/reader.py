@@ -163,14 +163,12 @@ class Folder(FileSequence):
         if found.stamps_ns is not None:
             self._track = PoseTrack(str(path), np.array(found.stamps_ns, np.int64), T)
             return
-        numbers: Sequence[int] = found.numbers or range(len(T))
-        if found.numbers is None and len(T) == len(frames):
-            numbers = frames
-        elif found.numbers is None and len(T) <= frames[-1]:
+        if len(T) != len(frames) and len(T) <= frames[-1]:
             raise InputError(
                 f"{path}: got {len(T)} poses for {len(frames)} sweeps numbered "
                 f"{format_frames(frames)}, expected one for each, or for each number from 0"
             )
+        numbers = frames if len(T) == len(frames) else range(len(T))
         self._T_world_lidar = dict(zip(numbers, T, strict=True))
 
     @cached_property
