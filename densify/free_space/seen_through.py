@@ -10,7 +10,7 @@ from functools import cached_property, partial
 
 import numpy as np
 
-from densify.free_space.range_image import RangeImage
+from densify.free_space.range_image import MIN_FILLED, RangeImage
 from densify.free_space.sensor import Sensors
 from densify.geometry import poses
 from densify.geometry.clock import Clock, num_in_batch
@@ -20,7 +20,6 @@ REACH_S = 1.0
 """Sweeps up to this long before and after a sweep are tested against its points."""
 _MOST_TESTED = 10  # sweeps on each side; more cost more and find the same
 _MARGIN_M, _MARGIN_FRACTION = 0.4, 0.015  # the larger one; forgives errors of registration
-_MIN_FILLED = 6  # of the 3 x 3 cells around a direction
 
 
 def range_images(sweeps: Sequence[RegisteredSweep], num_together: int) -> list[RangeImage]:
@@ -93,11 +92,11 @@ class FreeSpace:
                 self.images[k].num_beyond(
                     poses.transform(T_lidar_world, there),
                     (_MARGIN_M, _MARGIN_FRACTION),
-                    _MIN_FILLED if len(batch) == 1 else 1,
+                    MIN_FILLED if len(batch) == 1 else 1,
                     None if velocity_m_s is None else poses.rotate(T_lidar_world, velocity_m_s),
                 )
             )
         # Sweeps that lack a scanner cannot be added up with the others.
         together = [num for num in num_beyond if len(num) == len(num_beyond[0])]
-        free: Bool = (np.sum(together, axis=0) >= _MIN_FILLED).any(axis=0)
+        free: Bool = (np.sum(together, axis=0) >= MIN_FILLED).any(axis=0)
         return free

@@ -66,9 +66,11 @@ def twist_to(T_world_lidar: Float, stamp_ns: Int, i: int) -> Float:
 
 
 def carried(T_a_b: Float, twist_b: Float) -> Float:
-    """Return the (6,) twist of a frame b as that of a frame a fixed to it (the adjoint)."""
-    turn = T_a_b[:3, :3] @ twist_b[:3]
-    return np.concatenate([turn, T_a_b[:3, :3] @ twist_b[3:] + np.cross(T_a_b[:3, 3], turn)])
+    """Return (...,6) twists of frames b as those of frames a fixed to them (the adjoint)."""
+    R_a_b = T_a_b[..., :3, :3]
+    turn = np.einsum("...ij,...j->...i", R_a_b, twist_b[..., :3])
+    along = np.einsum("...ij,...j->...i", R_a_b, twist_b[..., 3:])
+    return np.concatenate([turn, along + np.cross(T_a_b[..., :3, 3], turn)], axis=-1)
 
 
 def transform_each(twist: Float, points: Float) -> Float:

@@ -151,7 +151,8 @@ def _add_ages(
     """Add to each pixel the time between the exposure and its sweep."""
     stamps_ns = {s.frame: s.sweep.stamp_ns for s in scene.stretch.sweeps}
     if method.far and scene.beyond is not None:
-        stamps_ns |= scene.beyond.standing.stamps_ns
+        far = scene.beyond.standing
+        stamps_ns |= zip(far.frames, far.stamp_ns.tolist(), strict=True)
     exposures = scene.views.exposures
     return {
         name: with_ages(maps, stamps_ns, scene.key, exposures[name].late_s)

@@ -262,8 +262,9 @@ class _Graph:
         """Return the (free,6) next motion of every free submap, in its own frame."""
         apart = self._apart(T)
         weight = 1 / (1 + (self.off_m(apart) / _USUAL_M) ** 2)
+        adjoint = poses.carried(poses.inverse(self._between(T))[:, None], np.eye(6))
         slope = np.zeros((len(apart), 6, 12))  # by the motions of target and source
-        slope[:, :, :6], slope[:, :, 6:] = -_adjoints(poses.inverse(self._between(T))), np.eye(6)
+        slope[:, :, :6], slope[:, :, 6:] = -adjoint.transpose(0, 2, 1), np.eye(6)
         pull = slope.transpose(0, 2, 1) @ (weight[:, None, None] * self._information)
         # A fixed submap's unknowns are put behind all others, and cut off.
         num = 6 * int((~self._fixed).sum())
@@ -273,14 +274,3 @@ class _Graph:
         left = sparse.csc_matrix(((pull @ slope).ravel(), (row.ravel(), column.ravel())))
         right = np.bincount(at.ravel(), (pull @ apart[:, :, None]).ravel())
         return -spsolve(left[:num, :num], right[:num]).reshape(-1, 6)
-
-
-def _adjoints(T: Float) -> Float:
-    """Return (n,6,6) that carry twists along (n,4,4), as `densify.geometry.poses.carried`."""
-    R, t = T[:, :3, :3], T[:, :3, 3]
-    cross = np.zeros_like(R)
-    cross[:, 0, 1], cross[:, 0, 2], cross[:, 1, 2] = -t[:, 2], t[:, 1], -t[:, 0]
-    cross -= cross.transpose(0, 2, 1)
-    found = np.zeros((len(T), 6, 6))
-    found[:, :3, :3], found[:, 3:, 3:], found[:, 3:, :3] = R, R, cross @ R
-    return found

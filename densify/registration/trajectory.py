@@ -76,12 +76,12 @@ def find_trajectory(
     recorded: the recording's own poses, which are checked and used; None to register.
     Raises SweepError naming the frame where the poses cannot be right.
     """
+    _check_stamps([s.frame for s in sweeps], np.array([s.stamp_ns for s in sweeps], np.int64))
     if recorded is not None:
         check_plausible(recorded, settings)
         check_overlap(sweeps, recorded, settings)
         return replace(recorded, R_level_lidar=find_upright(sweeps))
     _check_number_of_points(sweeps, settings)
-    _check_stamps([s.frame for s in sweeps], np.array([s.stamp_ns for s in sweeps], np.int64))
     dense = bool(np.median([len(sweep) for sweep in sweeps]) >= _MANY_POINTS)
     if dense:
         odometry, deskewed = find_odometry(sweeps, settings)
@@ -121,7 +121,6 @@ def _check_stamps(frames: Sequence[int], stamp_ns: Int) -> None:
 
 def check_plausible(trajectory: Trajectory, settings: RegisterSettings) -> None:
     """Raise UnplacedSweepError where the trajectory jumps as no vehicle does."""
-    _check_stamps(trajectory.frames, trajectory.stamp_ns)
     T, before = trajectory.T_world_lidar, None
     if not np.isfinite(T).all():
         bad = trajectory.frames[int(np.argmin(np.isfinite(T).all((1, 2))))]

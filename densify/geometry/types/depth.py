@@ -137,11 +137,6 @@ class StandingWorld:
     travel_m: Float
     left_out: tuple[int, ...] = ()
 
-    @property
-    def stamps_ns(self) -> dict[int, int]:
-        """Return the reference times by frame."""
-        return dict(zip(self.frames, self.stamp_ns.tolist(), strict=True))
-
     def select(self, keep: Bool | Int) -> StandingWorld:
         """Return some of the points."""
         rows = np.flatnonzero(keep) if keep.dtype == bool else keep
