@@ -64,11 +64,10 @@ def in_another_frame(registered: RegisteredSweep, R: np.ndarray) -> RegisteredSw
     return RegisteredSweep(turned, T_world_lidar, *twists)
 
 
-@pytest.mark.parametrize("name", ["dual32", "panda"])
-def test_the_axes_of_the_frame_do_not_matter(name):
+def test_the_axes_of_the_frame_do_not_matter():
     """Taken for the scanner's, they would tear its rings apart."""
     R = Rotation.from_euler("xyz", [4.0, -3.0, 20.0], degrees=True).as_matrix()
-    here = sweeps_of(name)[0]
+    here = sweeps_of("dual32")[0]
     there = in_another_frame(here, R)
     model, turned = (SensorModel.of([s], 0) for s in (here, there))
     np.testing.assert_allclose(turned.rings_rad, model.rings_rad, atol=2e-4)
